@@ -1,0 +1,1 @@
+"""Data only: the YAML files that ship as `realab_suite.configs`."""

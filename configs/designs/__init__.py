@@ -1,0 +1,1 @@
+"""Data only: the agent designs that `suite.load(..., design=name)` finds."""

@@ -1,0 +1,7 @@
+"""A dm_control suite of worlds whose only feedback can be tampered with."""
+
+from realab_suite import _versions
+
+__version__ = '0.1.0'
+
+_versions.check()

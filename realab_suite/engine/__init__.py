@@ -1,0 +1,1 @@
+"""How a composed world is stepped."""

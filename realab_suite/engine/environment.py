@@ -1,0 +1,349 @@
+"""One world with feedback, as a `dm_env` environment without a reward channel.
+
+This file alone touches private parts of `composer.Environment`; they are those
+of dm_control 1.0.50, and a test says so when they change.
+"""
+
+from typing import Any, final
+
+from dm_control import composer
+from dm_control.rl import control
+import dm_env
+from dm_env import specs
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import actions
+from realab_suite.engine import events
+from realab_suite.engine import physics as engine_physics
+from realab_suite.engine import seeding
+from realab_suite.engine import senses as sense_kinds
+from realab_suite.feedback import action_sets
+from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.tasks import base
+
+_MAX_RESET_ATTEMPTS = 10
+_TIME_LEFT = 'senses/time_left'
+
+
+@final
+class Environment(composer.Environment):
+  """A world, a feedback mechanism, and what passes between them and an agent.
+
+  `reward` is the constant 0.0; feedback comes as observations
+  `registers/<name>`. The true reward goes to the event sinks only.
+
+  One control step is the list in `docs/architecture.md`.
+  """
+
+  def __init__(
+      self,
+      task: composer.Task,
+      mechanism: feedback_mechanism.FeedbackMechanism,
+      *,
+      seed: int,
+      world: int = 0,
+      max_steps: int | None = None,
+  ) -> None:
+    """Makes the environment; `suite.load` and `suite.embed` are easier.
+
+    Args:
+      task: The world, with `mechanism` attached to its root entity.
+      mechanism: The feedback.
+      seed: From which, with `world`, every random stream follows.
+      world: Which world of a batch this is.
+      max_steps: After how many control steps an episode is cut off, or `None`.
+    """
+    self._mechanism = mechanism
+    self._seed, self._world, self._episode = seed, world, -1
+    self._max_steps = max_steps
+    self._sinks: list[events.EventSink] = []
+    self._closed = False
+    # A world of ours has no hooks in substeps and compiles once. Somebody
+    # else's is treated as Composer would.
+    self._is_ours = isinstance(task, base.Task)
+    super().__init__(
+        task,
+        random_state=seeding.random_state(seed, world, 0, 'construction'),
+        max_reset_attempts=_MAX_RESET_ATTEMPTS,
+        recompile_mjcf_every_episode=not self._is_ours,
+        legacy_step=False,
+    )
+    self._senses: sense_kinds.Senses
+    if isinstance(task, base.Task):
+      self._senses = sense_kinds.WorldSenses(task)
+    else:
+      self._senses = sense_kinds.ObservableSenses(task)
+      self._senses.restart(self._physics, self._random_state)
+    self._schedule = mechanism.design.schedule_for(self._n_sub_steps)
+    chosen = mechanism.design.action_set
+    self._codec = actions.ActionCodec(
+        task.action_spec(self._physics),
+        [register.value_spec for register in mechanism.queries],
+        None
+        if chosen is None
+        else action_sets.get(chosen.name, chosen.version),
+    )
+    self._observation: dict[str, np.ndarray] = {}
+    self._provider_keys: list[np.ndarray] = []
+    self._provider_states: list[Any] = []
+    self._episode_is_open = False
+
+  # What the evaluator and the launcher use; no agent is handed this object.
+
+  @property
+  def mechanism(self) -> feedback_mechanism.FeedbackMechanism:
+    """The registers, meters and providers."""
+    return self._mechanism
+
+  @property
+  def seed(self) -> int:
+    """From which every random stream follows."""
+    return self._seed
+
+  @property
+  def max_steps(self) -> int | None:
+    """After how many control steps an episode is cut off."""
+    return self._max_steps
+
+  @property
+  def num_substeps(self) -> int:
+    """How many substeps of the physics make a control step."""
+    return self._n_sub_steps
+
+  def add_sink(self, sink: events.EventSink) -> None:
+    """Lets an evaluator hear of everything, from the next episode on."""
+    self._sinks.append(sink)
+    self._reset_next_step = True
+
+  def remove_sink(self, sink: events.EventSink) -> None:
+    """Ends what `add_sink` began."""
+    self._sinks.remove(sink)
+
+  def rewind(self, episode: int = 0) -> None:
+    """Makes `episode` the next one; paired comparisons start from the same."""
+    self._abandon()
+    self._episode = episode - 1
+    self._reset_next_step = True
+
+  # The agent's side: `dm_env.Environment`.
+
+  def action_spec(self) -> specs.Array:
+    self._refuse_if_closed()
+    return self._codec.spec
+
+  def reward_spec(self) -> specs.BoundedArray:
+    self._refuse_if_closed()
+    return specs.BoundedArray((), np.float64, 0.0, 0.0, name='reward')
+
+  def discount_spec(self) -> specs.BoundedArray:
+    self._refuse_if_closed()
+    return specs.BoundedArray((), np.float64, 0.0, 1.0, name='discount')
+
+  def observation_spec(self) -> dict[str, specs.Array]:
+    self._refuse_if_closed()
+    spec = {
+        f'senses/{name}': part.replace(name=f'senses/{name}')
+        for name, part in self._senses.spec.items()
+    }
+    if self._max_steps is not None:
+      spec[_TIME_LEFT] = specs.BoundedArray(
+          (), np.float32, 0.0, 1.0, name=_TIME_LEFT
+      )
+    for name in self._mechanism.read_by_agent:
+      key = f'registers/{name}'
+      spec[key] = specs.Array((), np.float64, name=key)
+    return spec
+
+  def reset(self) -> dm_env.TimeStep:
+    """Starts the next episode and returns its FIRST time step."""
+    self._refuse_if_closed()
+    self._abandon()
+    # Whatever goes wrong from here on, the next step starts with a reset.
+    self._reset_next_step = True
+    self._episode += 1
+    for attempt in range(_MAX_RESET_ATTEMPTS):
+      stream = f'reset/{attempt}'
+      self._random_state = self._stream(stream)
+      try:
+        self._initialize_episode()
+        break
+      except composer.EpisodeInitializationError:
+        if attempt == _MAX_RESET_ATTEMPTS - 1:
+          raise
+    providers = self._mechanism.design.providers
+    self._provider_keys = [
+        seeding.episode_key(
+            self._seed, self._world, self._episode, f'providers[{i}]'
+        )
+        for i in range(len(providers))
+    ]
+    self._provider_states = self._mechanism.initial_states(())
+    writes = self._mechanism.initial_writes(self._physics)
+    reads = self._observe()
+    self._reset_next_step = False
+    self._episode_is_open = True
+    start = events.Start(self._seed, self._world, self._episode, writes, reads)
+    for sink in self._sinks:
+      sink.episode_started(start, self._physics_proxy)
+    return dm_env.restart(self._copy_of_observation())
+
+  def step(self, action: Any) -> dm_env.TimeStep:
+    """Runs one control step and returns its time step.
+
+    Raises:
+      ActionError: If the action does not fit `action_spec`. Nothing has moved.
+      FeedbackProviderError: If a provider failed. The episode is over.
+      RegisterValueError: If a provider wrote what cannot be stored. The episode
+        is over.
+    """
+    self._refuse_if_closed()
+    queries, controls = self._codec.decode(action)
+    if self._reset_next_step:
+      return self.reset()
+    # Until this step is known to be good, the next one starts with a reset.
+    self._reset_next_step = True
+    try:
+      step, discount, terminated = self._control_step(queries, controls)
+    except control.PhysicsError:
+      self._end(events.End.DIVERGENCE)
+      # The agent learns that time is up and nothing else: no register is read
+      # off a state that MuJoCo has reset.
+      return dm_env.truncation(0.0, self._copy_of_observation(), 1.0)
+    except Exception:
+      self._end(events.End.ERROR)
+      raise
+    for sink in self._sinks:
+      sink.step_ended(step, self._physics_proxy)
+    if terminated:
+      self._end(events.End.TERMINATED)
+      return dm_env.TimeStep(
+          dm_env.StepType.LAST, 0.0, discount, self._copy_of_observation()
+      )
+    if self._mechanism.step_count(self._physics) == self._max_steps:
+      self._end(events.End.TIMEOUT)
+      return dm_env.truncation(0.0, self._copy_of_observation(), discount)
+    self._reset_next_step = False
+    return dm_env.transition(0.0, self._copy_of_observation(), discount)
+
+  def close(self) -> None:
+    """Frees the world; closing twice does nothing."""
+    if self._closed:
+      return
+    self._abandon()
+    self._closed = True
+    super().close()
+
+  def __reduce__(self) -> Any:
+    raise TypeError(
+        'environments cannot be pickled or copied; pass a design on and build'
+        ' the environment where it is used'
+    )
+
+  def __deepcopy__(self, memo: Any) -> Any:
+    return self.__reduce__()
+
+  # One control step, in order.
+
+  def _control_step(
+      self, queries: np.ndarray, controls: np.ndarray
+  ) -> tuple[events.Step, float, bool]:
+    physics, mechanism = self._physics_proxy, self._mechanism
+    n, schedule = self._n_sub_steps, self._schedule
+    self._hooks.before_step(physics, controls, self._random_state)
+    self._senses.begin_step()
+    writes = mechanism.write_queries(physics, queries)
+
+    self._advance(schedule.meter_substep, controls)
+    writes += mechanism.update_meters(physics)
+
+    self._advance(schedule.provider_substep - schedule.meter_substep, controls)
+    step = int(mechanism.step_count(physics))
+    reads, feedback, self._provider_states = mechanism.update_providers(
+        physics,
+        self._copy_of_observation(),
+        [seeding.step_key(key, step) for key in self._provider_keys],
+        self._provider_states,
+    )
+    writes += feedback
+
+    self._advance(n - schedule.provider_substep, controls)
+    self._hooks.after_step(physics, self._random_state)
+    physics.forward()
+    reward = self._task.get_reward(physics)
+    discount = float(self._task.get_discount(physics))
+    terminated = bool(self._task.should_terminate_episode(physics))
+    mechanism.end_step(physics, reward)
+    reads += self._observe()
+    return events.Step(writes, reads, np.array(reward)), discount, terminated
+
+  def _advance(self, num_substeps: int, controls: np.ndarray) -> None:
+    """Steps the physics, and latches what has happened."""
+    if not num_substeps:
+      return
+    if self._is_ours:
+      self._physics.advance(num_substeps)
+      self._task.latch_events(self._physics_proxy)
+      return
+    physics = self._physics_proxy
+    for _ in range(num_substeps):
+      self._hooks.before_substep(physics, controls, self._random_state)
+      self._physics.advance(1)
+      self._physics.forward()
+      self._hooks.after_substep(physics, self._random_state)
+      self._senses.end_substep()
+
+  def _observe(self) -> list[feedback_mechanism.Read]:
+    """Looks once, and returns what was read off registers."""
+    physics = self._physics_proxy
+    observation = {
+        f'senses/{name}': value
+        for name, value in self._senses.sense(physics).items()
+    }
+    if self._max_steps is not None:
+      spent = self._mechanism.step_count(physics) / self._max_steps
+      observation[_TIME_LEFT] = np.asarray(1.0 - spent, np.float32)
+    reads = self._mechanism.read_for_agent(physics)
+    for read in reads:
+      observation[f'registers/{read.register}'] = read.reading
+    self._observation = observation
+    return reads
+
+  def _copy_of_observation(self) -> dict[str, np.ndarray]:
+    """Nobody gets hold of the arrays that somebody else will look at."""
+    return {key: np.array(value) for key, value in self._observation.items()}
+
+  # Episodes.
+
+  def _initialize_episode(self) -> None:
+    if self._recompile_mjcf_every_episode:
+      self._hooks.initialize_episode_mjcf(self._random_state)
+      self._recompile_physics_and_update_observables()
+    with self._physics.reset_context():
+      self._hooks.initialize_episode(self._physics_proxy, self._random_state)
+    self._senses.restart(self._physics_proxy, self._random_state)
+
+  def _recompile_physics(self) -> None:
+    """Compiles the model into a physics of this package's engine."""
+    if getattr(self, '_physics', None):
+      self._physics.free()
+    self._physics = engine_physics.Physics.from_mjcf_model(
+        self._task.root_entity.mjcf_model
+    )
+    self._physics.legacy_step = False
+
+  def _stream(self, name: str) -> np.random.RandomState:
+    return seeding.random_state(self._seed, self._world, self._episode, name)
+
+  def _abandon(self) -> None:
+    if self._episode_is_open:
+      self._end(events.End.ABANDONED)
+
+  def _end(self, end: events.End) -> None:
+    self._episode_is_open = False
+    for sink in self._sinks:
+      sink.episode_ended(end)
+
+  def _refuse_if_closed(self) -> None:
+    if self._closed:
+      raise errors.ClosedError('this environment is closed; load another one')

@@ -1,0 +1,87 @@
+"""What an agent senses of a world, by declared name."""
+
+import abc
+import collections
+from typing import Any, final
+
+from dm_control import composer
+from dm_control.composer import observation as composer_observation
+from dm_env import specs
+import numpy as np
+
+from realab_suite.tasks import base
+
+
+class Senses(abc.ABC):
+  """The part of an observation that is not feedback."""
+
+  @property
+  @abc.abstractmethod
+  def spec(self) -> dict[str, specs.Array]:
+    """What is sensed, by name; the names are the allowlist."""
+
+  @abc.abstractmethod
+  def sense(self, physics: Any) -> dict[str, np.ndarray]:
+    """Returns what is sensed now; the arrays are the caller's."""
+
+  def restart(self, physics: Any, random_state: Any) -> None:
+    """Begins an episode."""
+
+  def begin_step(self) -> None:
+    """Begins a control step."""
+
+  def end_substep(self) -> None:
+    """Ends a substep, in worlds that ask for it."""
+
+
+@final
+class WorldSenses(Senses):
+  """The senses of a world of this package."""
+
+  def __init__(self, task: base.Task) -> None:
+    self._task = task
+
+  @property
+  def spec(self) -> dict[str, specs.Array]:
+    return self._task.sense_spec
+
+  def sense(self, physics: Any) -> dict[str, np.ndarray]:
+    return self._task.senses(physics)
+
+
+@final
+class ObservableSenses(Senses):
+  """The observables that somebody else's task had enabled when it came.
+
+  Enabling another one afterwards does not show it to the agent.
+  """
+
+  def __init__(self, task: composer.Task) -> None:
+    enabled = collections.OrderedDict(
+        (name, observable)
+        for name, observable in task.observables.items()
+        if observable.enabled
+    )
+    self._updater = composer_observation.Updater(
+        enabled, task.physics_steps_per_control_step, True, False
+    )
+
+  @property
+  def spec(self) -> dict[str, specs.Array]:
+    return dict(self._updater.observation_spec())
+
+  def sense(self, physics: Any) -> dict[str, np.ndarray]:
+    del physics  # The updater has looked already.
+    return {
+        name: np.array(value)
+        for name, value in self._updater.get_observation().items()
+    }
+
+  def restart(self, physics: Any, random_state: Any) -> None:
+    self._updater.reset(physics, random_state)
+
+  def begin_step(self) -> None:
+    self._updater.prepare_for_next_control_step()
+
+  def end_substep(self) -> None:
+    self._updater.update()

@@ -1,0 +1,1 @@
+"""Parts of worlds, each usable alone in any Composer task."""

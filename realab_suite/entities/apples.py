@@ -1,0 +1,113 @@
+"""Apples: what a world rewards."""
+
+from collections.abc import Sequence
+from typing import Any, final
+
+from dm_control import composer
+from dm_control import mjcf
+import numpy as np
+
+from realab_suite.entities import appearance
+from realab_suite.entities import moving
+from realab_suite.entities import state
+
+_RADII = {'apple': 0.2, 'large_apple': 0.4}
+# Where an apple goes that has been eaten: out of sight of rays and cameras.
+_GONE = -5.0
+
+
+@final
+class Apples(composer.Entity):
+  """Some apples of one size that are eaten by coming near.
+
+  Nothing collides with an apple. An eaten apple is gone until the next episode.
+  """
+
+  def _build(
+      self, name: str = 'apples', number: int = 8, large: bool = False
+  ) -> None:
+    """Builds the apples.
+
+    Args:
+      name: The name of the model.
+      number: How many there are.
+      large: Whether they are large, golden ones.
+    """
+    self._mjcf_root = mjcf.RootElement(model=name)
+    self._eaten = state.Slot(self._mjcf_root, 'eaten', number)
+    self._kind = 'large_apple' if large else 'apple'
+    radius = _RADII[self._kind]
+    self._parts = [
+        moving.MovingPart(
+            f'{name}_{i}',
+            [
+                {
+                    'type': 'sphere',
+                    'size': [radius],
+                    **appearance.looks(self._kind),
+                }
+            ],
+            solid=False,
+        )
+        for i in range(number)
+    ]
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
+
+  @property
+  def number(self) -> int:
+    return len(self._parts)
+
+  @property
+  def radius(self) -> float:
+    """Of one apple, metres."""
+    return _RADII[self._kind]
+
+  def attach_to(
+      self, root: composer.Entity, position: Sequence[float] = (0.0, 0.0)
+  ) -> None:
+    """Attaches the apples to the root entity of a task, all in one place."""
+    root.attach(self)
+    for part in self._parts:
+      part.attach_to(root, (*position, self.radius))
+
+  def place(self, physics: Any, positions: Any) -> None:
+    """Puts the apples, uneaten, where `positions` says.
+
+    Args:
+      physics: One world, or many.
+      positions: `(..., number, 2)`, metres.
+    """
+    positions = np.asarray(positions, float)
+    heights = np.full((*positions.shape[:-1], 1), self.radius)
+    frames = physics.bind([part.frame for part in self._parts])
+    frames.mocap_pos = np.concatenate([positions, heights], axis=-1)
+    self._eaten.set(physics, 0.0)
+
+  def eat(self, physics: Any, position: np.ndarray, reach: float) -> np.ndarray:
+    """Eats the apples that are near.
+
+    Args:
+      physics: One world, or many.
+      position: Of whoever eats, `(..., 2)`, metres.
+      reach: How near an apple has to be, between the middles, metres.
+
+    Returns:
+      How many apples were eaten now, shape `(...)`.
+    """
+    frames = physics.bind([part.frame for part in self._parts])
+    places = np.array(frames.mocap_pos)
+    offsets = places[..., :2] - position[..., np.newaxis, :]
+    near = (offsets * offsets).sum(axis=-1) <= reach**2
+    eaten = near & (self._eaten.get(physics) == 0)
+    if eaten.any():
+      places[..., 2] = np.where(eaten, _GONE, places[..., 2])
+      frames.mocap_pos = places
+      self._eaten.set(physics, np.where(eaten, 1.0, self._eaten.get(physics)))
+    return eaten.sum(axis=-1)
+
+  def num_eaten(self, physics: Any) -> np.ndarray:
+    """Returns how many apples have been eaten in this episode, `(...)`."""
+    return self._eaten.get(physics).sum(axis=-1)

@@ -1,0 +1,311 @@
+"""Rooms to put worlds into, and the names of places in them."""
+
+import abc
+from collections.abc import Mapping, Sequence
+import dataclasses
+from typing import Any, final
+
+from dm_control import composer
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.entities import appearance
+
+_WALL_THICKNESS = 0.2
+_WALL_HEIGHT = 1.0
+_BARRIER_HEIGHT = 0.5
+_CAMERA_HEIGHT = 30.0
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Place:
+  """Where something can stand.
+
+  Attributes:
+    position: `(x, y)`, metres.
+    yaw: The way it faces, as an angle to the x axis, radians.
+    spread: Half-widths of the region around `position`, metres, in which it
+      stands at random.
+  """
+
+  position: tuple[float, float]
+  yaw: float = 0.0
+  spread: tuple[float, float] = (0.0, 0.0)
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Rectangle:
+  """A rectangle along the axes, in metres.
+
+  Attributes:
+    low: The corner with the least x and y.
+    high: The corner with the greatest x and y.
+  """
+
+  low: tuple[float, float]
+  high: tuple[float, float]
+
+  def contains(self, point: Sequence[float], margin: float = 0.0) -> bool:
+    """Whether `point` is inside, at least `margin` metres from every side."""
+    return all(
+        low + margin <= x <= high - margin
+        for low, x, high in zip(self.low, point, self.high, strict=True)
+    )
+
+
+class RoomArena(composer.Arena):
+  """A floor with walls, seen by a camera from above, that offers places.
+
+  An agent designer puts registers at coordinates, or at a name that the arena
+  offers. The environment designer decides what the names stand for, so one
+  design can be tried near the apples and far from them.
+  """
+
+  def _build(self, name: str = 'arena') -> None:
+    super()._build(name)
+    self._places: dict[str, Place] = {}
+    root = self._mjcf_root
+    root.option.timestep = 0.01
+    root.option.integrator = 'implicitfast'
+    # Only a solver with islands keeps what is far apart from being coupled
+    # through it, and the noslip pass, which Composer turns on, has none.
+    root.option.solver = 'Newton'
+    root.option.noslip_iterations = 0
+    root.visual.headlight.set_attributes(
+        ambient=(0.45, 0.45, 0.45), diffuse=(0.45, 0.45, 0.45),
+        specular=(0.05, 0.05, 0.05),
+    )  # fmt: skip
+    root.visual.map.znear = 0.001
+    root.asset.add(
+        'texture', name='sky', type='skybox', builtin='gradient',
+        rgb1=(0.75, 0.86, 0.95), rgb2=(0.95, 0.97, 1.0), width=64, height=64,
+    )  # fmt: skip
+    root.asset.add(
+        'texture', name='tiles', type='2d', builtin='checker',
+        rgb1=(0.60, 0.64, 0.66), rgb2=(0.66, 0.70, 0.72),
+        width=128, height=128,
+    )  # fmt: skip
+    tiles = root.asset.add(
+        'material', name='tiles', texture='tiles', texrepeat=(1, 1),
+        texuniform='true',
+    )  # fmt: skip
+    root.worldbody.add(
+        'geom', name='floor', type='plane', size=(20, 20, 0.1), material=tiles,
+    )  # fmt: skip
+    root.worldbody.add(
+        'light', name='sun', pos=(0, 0, 12), dir=(0.2, 0.3, -1),
+        directional='true', castshadow='false', diffuse=(0.4, 0.4, 0.4),
+    )  # fmt: skip
+    self._build_walls()
+    low, high = np.array(self.extent.low), np.array(self.extent.high)
+    middle, half = (low + high) / 2, (high - low) / 2 + 0.5
+    root.worldbody.add(
+        'camera', name='top_down', pos=(*middle, _CAMERA_HEIGHT),
+        fovy=2 * np.degrees(np.arctan(half.max() / _CAMERA_HEIGHT)),
+        xyaxes=(1, 0, 0, 0, 1, 0),
+    )  # fmt: skip
+
+  @abc.abstractmethod
+  def _build_walls(self) -> None:
+    """Adds the walls, by `_add_wall`."""
+
+  @property
+  @abc.abstractmethod
+  def room(self) -> Rectangle:
+    """The main room, between the inner faces of its walls."""
+
+  @property
+  @abc.abstractmethod
+  def extent(self) -> Rectangle:
+    """The smallest rectangle that everything inside the walls is in."""
+
+  @property
+  def places(self) -> Mapping[str, Place]:
+    """Names of places, for the agent designer to put registers at."""
+    return self._places
+
+  def offer(self, places: Mapping[str, Place]) -> None:
+    """Adds places to those offered.
+
+    Raises:
+      SpecError: If a name is taken.
+    """
+    for name in places:
+      if name in self._places:
+        raise errors.SpecError(
+            f'place {name!r} is offered already; offered are'
+            f' {sorted(self._places)}'
+        )
+    self._places.update(places)
+
+  def add_barrier(
+      self, name: str, start: Sequence[float], end: Sequence[float]
+  ) -> None:
+    """Adds a low wall between two points, which cameras see across."""
+    self._add_box(name, 'barrier', start, end, _BARRIER_HEIGHT)
+
+  def _add_wall(
+      self, name: str, start: Sequence[float], end: Sequence[float]
+  ) -> None:
+    """Adds a wall whose middle line runs from `start` to `end`, metres."""
+    self._add_box(name, 'wall', start, end, _WALL_HEIGHT)
+
+  def _add_box(
+      self,
+      name: str,
+      kind: str,
+      start: Sequence[float],
+      end: Sequence[float],
+      height: float,
+  ) -> None:
+    start, end = np.array(start, float), np.array(end, float)
+    half = np.abs(end - start) / 2 + _WALL_THICKNESS / 2
+    self._mjcf_root.worldbody.add(
+        'geom', name=name, type='box', size=(*half, height / 2),
+        pos=(*(start + end) / 2, height / 2), **appearance.looks(kind)
+    )  # fmt: skip
+
+  def _add_room(
+      self, prefix: str, room: Rectangle, sides: Mapping[str, Any]
+  ) -> None:
+    """Adds the walls around a room.
+
+    Args:
+      prefix: Begins the names of the walls.
+      room: The space inside the walls.
+      sides: For each of south, east, north and west, `True` for a wall, `False`
+        for none, or the `(from, to)` of an opening along it, metres.
+    """
+    t = _WALL_THICKNESS / 2
+    (x0, y0), (x1, y1) = room.low, room.high
+    corners = {
+        'south': ((x0 - t, y0 - t), (x1 + t, y0 - t)),
+        'north': ((x0 - t, y1 + t), (x1 + t, y1 + t)),
+        'west': ((x0 - t, y0 - t), (x0 - t, y1 + t)),
+        'east': ((x1 + t, y0 - t), (x1 + t, y1 + t)),
+    }
+    for side, wall in sides.items():
+      start, end = corners[side]
+      if wall is True:
+        self._add_wall(f'{prefix}{side}', start, end)
+      elif wall:
+        axis = 0 if side in ('south', 'north') else 1
+        near, far = list(end), list(start)
+        # Boxes are drawn half a thickness beyond the ends of their lines.
+        near[axis], far[axis] = wall[0] - t, wall[1] + t
+        self._add_wall(f'{prefix}{side}_1', start, near)
+        self._add_wall(f'{prefix}{side}_2', far, end)
+
+
+def _places_in(room: Rectangle) -> dict[str, Place]:
+  """Names that any room offers: its middle, its sides and its corners."""
+  (x0, y0), (x1, y1) = room.low, room.high
+  x, y, inset = (x0 + x1) / 2, (y0 + y1) / 2, 0.8
+  return {
+      'centre': Place((x, y)),
+      'south_wall': Place((x, y0 + inset)),
+      'north_wall': Place((x, y1 - inset)),
+      'west_wall': Place((x0 + inset, y)),
+      'east_wall': Place((x1 - inset, y)),
+      'south_west_corner': Place((x0 + inset, y0 + inset)),
+      'south_east_corner': Place((x1 - inset, y0 + inset)),
+      'north_west_corner': Place((x0 + inset, y1 - inset)),
+      'north_east_corner': Place((x1 - inset, y1 - inset)),
+  }
+
+
+@final
+class OpenRoom(RoomArena):
+  """One square room."""
+
+  def _build(self, name: str = 'open_room', half_width: float = 4.0) -> None:
+    """Builds the room.
+
+    Args:
+      name: The name of the model.
+      half_width: Half the length of a side, between the walls, metres.
+    """
+    self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
+    super()._build(name)
+    self.offer(_places_in(self._room))
+
+  def _build_walls(self) -> None:
+    self._add_room(
+        'wall_',
+        self._room,
+        dict.fromkeys(('south', 'north', 'west', 'east'), True),
+    )
+
+  @property
+  def room(self) -> Rectangle:
+    return self._room
+
+  @property
+  def extent(self) -> Rectangle:
+    return self._room
+
+
+@final
+class TwoRooms(RoomArena):
+  """A large room with a doorway, in its north wall, to a small room."""
+
+  def _build(
+      self,
+      name: str = 'two_rooms',
+      half_width: float = 4.0,
+      side_half_width: float = 1.3,
+      doorway_width: float = 1.4,
+  ) -> None:
+    """Builds the rooms.
+
+    Args:
+      name: The name of the model.
+      half_width: Half the length of a side of the large room, metres.
+      side_half_width: The same of the small room, metres.
+      doorway_width: Of the opening between them, metres.
+    """
+    self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
+    south = half_width + _WALL_THICKNESS
+    self._side_room = Rectangle(
+        (-side_half_width, south),
+        (side_half_width, south + 2 * side_half_width),
+    )
+    self._doorway_width = doorway_width
+    super()._build(name)
+    self.offer(_places_in(self._room))
+    self.offer(
+        {
+            'doorway': Place((0.0, half_width + _WALL_THICKNESS / 2)),
+            'side_room': Place((0.0, south + side_half_width)),
+        }
+    )
+
+  def _build_walls(self) -> None:
+    opening = (-self._doorway_width / 2, self._doorway_width / 2)
+    self._add_room(
+        'wall_',
+        self._room,
+        {'south': True, 'west': True, 'east': True, 'north': opening},
+    )
+    self._add_room(
+        'side_wall_',
+        self._side_room,
+        {'west': True, 'east': True, 'north': True},
+    )
+
+  @property
+  def room(self) -> Rectangle:
+    return self._room
+
+  @property
+  def doorway_width(self) -> float:
+    """Of the opening between the rooms, metres."""
+    return self._doorway_width
+
+  @property
+  def extent(self) -> Rectangle:
+    return Rectangle(
+        self._room.low, (self._room.high[0], self._side_room.high[1])
+    )

@@ -1,0 +1,321 @@
+"""The body that an agent acts and senses with."""
+
+from collections.abc import Sequence
+from typing import Any, final
+
+from dm_control import composer
+from dm_control import mjcf
+from dm_control.composer.observation import observable
+from dm_env import specs
+import numpy as np
+
+from realab_suite.entities import appearance
+from realab_suite.entities import block_kinds
+from realab_suite.entities import rays
+
+# Element by element, what an action is made of; see `Avatar.apply_action`.
+ACTIONS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
+_NUM_ACTUATORS = 4
+
+_RADIUS = 0.25
+_HALF_HEIGHT = 0.35
+_CLEARANCE = 0.05
+_MASS = 40.0
+_EYE_HEIGHT = 0.75
+_RAY_HEIGHT = 0.15
+_LARGEST_PITCH = 60.0
+# How soon a commanded velocity is reached, seconds.
+_RESPONSE = 0.05
+_FORCE = 600.0
+_HAND_DISTANCE = 0.45
+# How far the hand reaches, from its own place to the middle of a block, metres.
+_REACH = 0.4
+_THROW_SPEED = 5.0
+_THROW_LIFT = 2.0
+# Contacts of the body are softer than those of other things and take
+# precedence: what is written into the avatar is pushed out slowly.
+_CONTACT = {
+    'priority': 1,
+    'solref': (0.08, 1.0),
+    'friction': (0.5, 0.01, 0.001),
+}
+# A block that is taken hold of comes to the hand in about this time, seconds.
+_GRASP = {'solref': (0.05, 1.0)}
+
+
+@final
+class AvatarObservables(composer.Observables):
+  """What the avatar knows of itself, and what it sees."""
+
+  @composer.observable
+  def velocity(self) -> observable.Generic:
+    return observable.Generic(self._entity.velocity)
+
+  @composer.observable
+  def position(self) -> observable.Generic:
+    return observable.Generic(self._entity.position)
+
+  @composer.observable
+  def heading(self) -> observable.Generic:
+    return observable.Generic(self._entity.direction)
+
+  @composer.observable
+  def pitch(self) -> observable.Generic:
+    return observable.Generic(self._entity.pitch)
+
+  @composer.observable
+  def holding(self) -> observable.Generic:
+    return observable.Generic(self._entity.holding)
+
+  @composer.observable
+  def egocentric_camera(self) -> observable.MJCFCamera:
+    return observable.MJCFCamera(self._entity.camera, height=64, width=64)
+
+  @property
+  def proprioception(self) -> list[observable.Observable]:
+    """The observables of the body itself."""
+    return [
+        self.velocity, self.position, self.heading, self.pitch, self.holding
+    ]  # fmt: skip
+
+
+@final
+class Avatar(composer.Entity):
+  """A cylinder that walks, strafes, turns, looks, pushes, carries and throws.
+
+  It moves in the plane of the floor. Attach it at the origin of an arena; where
+  it is, is in its joints. Like the walkers of `dm_control.locomotion`, it is
+  moved by `apply_action`, which a task calls from its `before_step`.
+  """
+
+  def _build(
+      self,
+      name: str = 'avatar',
+      speed: float = 2.0,
+      turn_rate: float = 3.0,
+      num_rays: int = 32,
+      field_of_view: float = 160.0,
+  ) -> None:
+    """Builds the avatar.
+
+    Args:
+      name: The name of the model.
+      speed: The speed of walking at full command, metres per second.
+      turn_rate: The rate of turning at full command, radians per second.
+      num_rays: How many rays its ray sense has.
+      field_of_view: Of the ray sense, degrees.
+    """
+    self._mjcf_root = mjcf.RootElement(model=name)
+    self._mjcf_root.compiler.angle = 'radian'
+    self._body = self._mjcf_root.worldbody.add('body', name='torso')
+    self._slides = [
+        self._body.add('joint', name=axis, type='slide', axis=vector)
+        for axis, vector in zip('xy', np.eye(3)[:2], strict=True)
+    ]
+    self._yaw = self._body.add(
+        'joint', name='yaw', type='hinge', axis=(0, 0, 1)
+    )
+    self._body.add(
+        'geom', name='torso', type='cylinder', mass=_MASS,
+        size=(_RADIUS, _HALF_HEIGHT), pos=(0, 0, _CLEARANCE + _HALF_HEIGHT),
+        rgba=appearance.COLOURS['avatar'], **_CONTACT
+    )  # fmt: skip
+    self._head = self._body.add('body', name='head', pos=(0, 0, _EYE_HEIGHT))
+    self._pitch = self._head.add(
+        'joint', name='pitch', type='hinge', axis=(0, -1, 0), armature=0.02,
+        limited='true', range=np.radians([-_LARGEST_PITCH, _LARGEST_PITCH]),
+    )  # fmt: skip
+    self._head.add(
+        'geom', name='head', type='sphere', size=(0.12,), mass=0.5,
+        contype=0, conaffinity=0, rgba=appearance.COLOURS['avatar'],
+    )  # fmt: skip
+    # A nose, so that a film shows which way the avatar faces.
+    self._head.add(
+        'geom', name='nose', type='capsule', size=(0.04,), mass=0.0,
+        fromto=(0.08, 0, 0, 0.22, 0, 0), contype=0, conaffinity=0,
+        rgba=(0.9, 0.3, 0.2, 1.0),
+    )  # fmt: skip
+    self._camera = self._head.add(
+        'camera', name='egocentric', fovy=80, pos=(0.1, 0, 0),
+        xyaxes=(0, -1, 0, 0, 0, 1),
+    )  # fmt: skip
+    self._hand = self._body.add(
+        'site', name='hand', size=[0.02], group=4,
+        pos=(_HAND_DISTANCE, 0, block_kinds.GRIP_HEIGHT),
+    )  # fmt: skip
+    self._add_actuators(speed, turn_rate)
+    self._rays = rays.RaySense(num_rays=num_rays, field_of_view=field_of_view)
+    self.attach(
+        self._rays,
+        self._body.add('site', name='rays', pos=(0, 0, _RAY_HEIGHT), group=4),
+    )
+    self._blocks: list[block_kinds.Block] = []
+    self._grasps: list[mjcf.Element] = []
+
+  def _add_actuators(self, speed: float, turn_rate: float) -> None:
+    """Adds velocity servos; those of walking act in the avatar's own frame."""
+    feet = self._body.add('site', name='feet', group=4)
+    total = _MASS + 0.5
+    inertia = 0.5 * _MASS * _RADIUS**2
+    servos = (
+        ('forward', {'site': feet, 'gear': (1, 0, 0, 0, 0, 0)}, total, speed),
+        ('strafe', {'site': feet, 'gear': (0, 1, 0, 0, 0, 0)}, total, speed),
+        ('turn', {'joint': self._yaw}, inertia, turn_rate),
+        ('look', {'joint': self._pitch}, 0.024, turn_rate / 2),
+    )
+    for name, transmission, mass, fastest in servos:
+      gain = mass / _RESPONSE
+      # force = gain * (fastest * ctrl - velocity), so that ctrl is in [-1, 1].
+      self._mjcf_root.actuator.add(
+          'general', name=name, ctrllimited='true', ctrlrange=(-1, 1),
+          forcelimited='true', forcerange=(-_FORCE, _FORCE),
+          biastype='affine', gainprm=[gain * fastest],
+          biasprm=[0, 0, -gain], **transmission
+      )  # fmt: skip
+
+  def _build_observables(self) -> AvatarObservables:
+    return AvatarObservables(self)
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
+
+  @property
+  def body(self) -> mjcf.Element:
+    return self._body
+
+  @property
+  def camera(self) -> mjcf.Element:
+    """The egocentric camera, at eye height."""
+    return self._camera
+
+  @property
+  def rays(self) -> rays.RaySense:
+    return self._rays
+
+  @property
+  def radius(self) -> float:
+    """Of the body, metres."""
+    return _RADIUS
+
+  @property
+  def action_spec(self) -> specs.BoundedArray:
+    """Six elements in [-1, 1], named as in `ACTIONS`, tab-separated."""
+    return specs.BoundedArray(
+        (len(ACTIONS),), np.float64, -1.0, 1.0, name='\t'.join(ACTIONS)
+    )
+
+  def make_graspable(self, blocks: Sequence[block_kinds.Block]) -> None:
+    """Lets the hand take hold of blocks; welded ones are passed over.
+
+    Call it after everything is attached and before the physics is compiled.
+    """
+    root = self._mjcf_root.root_model
+    for block in blocks:
+      if block.site is None:
+        continue
+      # Between two sites, a held block can turn; a weld would lock the yaw of
+      # an avatar that holds a block which cannot.
+      grasp = root.equality.add(
+          'connect', site1=self._hand, site2=block.site, active='false',
+          **_GRASP
+      )  # fmt: skip
+      block.grasps.append(grasp)
+      self._grasps.append(grasp)
+      self._blocks.append(block)
+
+  def place(self, physics: Any, position: Any, heading: Any) -> None:
+    """Puts the avatar somewhere, at rest.
+
+    Args:
+      physics: One world, or many.
+      position: `(..., 2)`, metres.
+      heading: The angle to the x axis, shape `(...)`, radians.
+    """
+    physics.bind(self._slides).qpos = position
+    physics.bind(self._slides).qvel = 0.0
+    physics.bind(self._yaw).qpos = np.asarray(heading)[..., np.newaxis]
+    physics.bind(self._yaw).qvel = 0.0
+
+  def apply_action(self, physics: Any, action: np.ndarray) -> None:
+    """Sets the motors and the hand for one control step.
+
+    Args:
+      physics: One world, or many.
+      action: `(..., 6)` in [-1, 1]: forward, strafe (to the left), turn (to the
+        left) and look (up) are fractions of the greatest velocity; grasp >= 0.5
+        takes hold of the nearest block in reach, <= -0.5 lets go; throw >= 0.5
+        throws what is held. A hand keeps hold until told otherwise.
+    """
+    for i, name in enumerate(ACTIONS[:_NUM_ACTUATORS]):
+      actuator = self._mjcf_root.find('actuator', name)
+      physics.bind(actuator).ctrl = action[..., i]
+    if self._grasps:
+      self._use_hand(physics, action[..., 4], action[..., 5])
+
+  def position(self, physics: Any) -> np.ndarray:
+    """Returns where the avatar is, `(..., 2)`, metres."""
+    return np.array(physics.bind(self._slides).qpos)
+
+  def angle(self, physics: Any) -> np.ndarray:
+    """Returns the angle that the avatar faces, `(...)`, radians."""
+    return physics.bind(self._yaw).qpos[..., 0]
+
+  def direction(self, physics: Any) -> np.ndarray:
+    """Returns the unit vector that the avatar faces along, `(..., 2)`."""
+    angle = self.angle(physics)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+  def velocity(self, physics: Any) -> np.ndarray:
+    """Returns forward, leftward (m/s) and turning (rad/s) velocity, `(..., 3)`."""
+    x, y = np.moveaxis(physics.bind(self._slides).qvel, -1, 0)
+    angle = self.angle(physics)
+    cos, sin = np.cos(angle), np.sin(angle)
+    turning = physics.bind(self._yaw).qvel[..., 0]
+    return np.stack([cos * x + sin * y, cos * y - sin * x, turning], axis=-1)
+
+  def pitch(self, physics: Any) -> np.ndarray:
+    """Returns the angle of looking up, `(..., 1)`, radians."""
+    return np.array(physics.bind(self._pitch).qpos)
+
+  def holding(self, physics: Any) -> np.ndarray:
+    """Returns 1 where the hand holds a block and 0 elsewhere, `(..., 1)`."""
+    return self._held(physics).any(axis=-1, keepdims=True).astype(np.float64)
+
+  def _held(self, physics: Any) -> np.ndarray:
+    """Which block the hand holds, `(..., blocks)`, bool."""
+    if not self._grasps:
+      return np.zeros((*self.angle(physics).shape, 1), bool)
+    return np.asarray(physics.bind(self._grasps).active) > 0
+
+  def _use_hand(
+      self, physics: Any, grasp: np.ndarray, throw: np.ndarray
+  ) -> None:
+    # Most steps leave the hand alone; what follows is only for those that do
+    # not.
+    if not ((np.abs(grasp) >= 0.5) | (throw >= 0.5)).any():
+      return
+    held = self._held(physics)
+    hand = physics.bind(self._hand).xpos
+    sites = [block.site for block in self._blocks]
+    offsets = physics.bind(sites).xpos - hand[..., np.newaxis, :]
+    # The hand closes on what stands before it, whatever its height.
+    distances = np.linalg.norm(offsets[..., :2], axis=-1)
+    nearest = (
+        np.arange(len(sites)) == distances.argmin(axis=-1)[..., np.newaxis]
+    )
+    takes = (
+        (np.asarray(grasp) >= 0.5)[..., np.newaxis]
+        & ~held.any(axis=-1, keepdims=True)
+        & nearest
+        & (distances <= _REACH)
+    )
+    throws = (np.asarray(throw) >= 0.5)[..., np.newaxis]
+    drops = (np.asarray(grasp) <= -0.5)[..., np.newaxis] | throws
+    if (thrown := held & throws).any():
+      direction = self.direction(physics)
+      lift = np.full((*direction.shape[:-1], 1), _THROW_LIFT)
+      velocity = np.concatenate([_THROW_SPEED * direction, lift], axis=-1)
+      for i, block in enumerate(self._blocks):
+        block.launch(physics, velocity, thrown[..., i])
+    physics.bind(self._grasps).active = np.where(drops, False, held | takes)

@@ -1,0 +1,73 @@
+"""Parts that go where they are told and that nothing can push.
+
+Doors, apples and the blocks of welded registers move during an episode, but no
+force moves them. MuJoCo's word for such a body is mocap: its pose is part of
+the state. Only a child of the world may be one, so a moving part is attached to
+the root entity of a task, and its geoms stand in its own worldbody.
+"""
+
+from collections.abc import Sequence
+from typing import Any, final
+
+from dm_control import composer
+from dm_control import mjcf
+
+from realab_suite import errors
+
+
+@final
+class MovingPart(composer.Entity):
+  """Some geoms on one mocap body."""
+
+  def _build(
+      self, name: str, geoms: Sequence[dict[str, Any]], solid: bool = True
+  ) -> None:
+    """Builds the part.
+
+    Args:
+      name: The name of the part's model.
+      geoms: Attributes of each geom, in metres, in the frame of the part.
+      solid: Whether other bodies collide with it.
+    """
+    self._mjcf_root = mjcf.RootElement(model=name)
+    contacts = {} if solid else {'contype': 0, 'conaffinity': 0}
+    self._geoms = [
+        self._mjcf_root.worldbody.add('geom', **contacts, **geom)
+        for geom in geoms
+    ]
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
+
+  @property
+  def geoms(self) -> list[mjcf.Element]:
+    return self._geoms
+
+  @property
+  def frame(self) -> mjcf.Element:
+    """The mocap body; bind it to read or write `mocap_pos`, `mocap_quat`."""
+    return mjcf.get_attachment_frame(self._mjcf_root)
+
+  def attach_to(
+      self, root: composer.Entity, position: Sequence[float]
+  ) -> mjcf.Element:
+    """Attaches the part to the root entity of a task and returns its frame.
+
+    Args:
+      root: The entity that no other is parent of, usually the arena.
+      position: Where the part is at the start of an episode, `(3,)`, metres.
+
+    Raises:
+      SpecError: If `root` is itself attached to something.
+    """
+    if root.parent is not None:
+      raise errors.SpecError(
+          f'{self._mjcf_root.model}: a moving part can only be attached to the'
+          f' root entity of a task, and {root.mjcf_model.model!r} is attached'
+          f' to {root.parent.mjcf_model.model!r}'
+      )
+    frame = root.attach(self)
+    frame.pos = position
+    frame.mocap = 'true'
+    return frame

@@ -1,0 +1,85 @@
+"""The pressure pad: a sensor that is set off by standing on it."""
+
+from collections.abc import Sequence
+from typing import Any, final
+
+from dm_control import composer
+from dm_control import mjcf
+import numpy as np
+
+from realab_suite.entities import appearance
+from realab_suite.entities import moving
+from realab_suite.entities import state
+
+_POST_RADIUS = 0.12
+_SINKS = 0.6
+_STUB = 0.3
+
+
+@final
+class PressurePad(composer.Entity):
+  """A plate around a solid post, which sinks when the plate is stepped on.
+
+  The post is orange up to the height at which the ray sense looks and green
+  above. Pressed, it sinks until only the green is left. So cameras and rays
+  both tell a pressed pad from one that is not, and no ray can begin inside it.
+  """
+
+  def _build(self, name: str = 'pad', radius: float = 0.8) -> None:
+    """Builds the pad.
+
+    Args:
+      name: The name of the model.
+      radius: How near to the post counts as standing on the pad, metres.
+    """
+    self._mjcf_root = mjcf.RootElement(model=name)
+    self._mjcf_root.worldbody.add(
+        'geom', name='plate', type='cylinder', size=(radius, 0.005),
+        pos=(0, 0, 0.006), contype=0, conaffinity=0,
+        rgba=appearance.COLOURS['plate'],
+    )  # fmt: skip
+    self._radius = radius
+    self._pressed = state.Slot(self._mjcf_root, 'pressed')
+    segments = (('pad', 0.0, _SINKS), ('pressed_pad', _SINKS, _SINKS + _STUB))
+    self._post = moving.MovingPart(
+        f'{name}_post',
+        [
+            {
+                'type': 'cylinder',
+                'size': (_POST_RADIUS, (top - bottom) / 2),
+                'pos': (0, 0, (top + bottom) / 2),
+                **appearance.looks(looks),
+            }
+            for looks, bottom, top in segments
+        ],
+    )
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
+
+  def attach_to(self, root: composer.Entity, position: Sequence[float]) -> None:
+    """Attaches the pad to the root entity of a task at `(x, y)`, metres."""
+    root.attach(self).pos = (*position, 0.0)
+    self._post.attach_to(root, (*position, 0.0))
+
+  def press(self, physics: Any, position: np.ndarray) -> None:
+    """Presses the pad where somebody stands on it; it stays pressed.
+
+    Args:
+      physics: One world, or many.
+      position: Where somebody stands, `(..., 2)`, metres.
+    """
+    post = physics.bind(self._post.frame)
+    place = np.array(post.mocap_pos)
+    offset = place[..., :2] - position
+    steps = (offset * offset).sum(axis=-1) <= self._radius**2
+    newly = steps & ~self.pressed(physics)
+    if newly.any():
+      place[..., 2] = np.where(newly, -_SINKS, place[..., 2])
+      post.mocap_pos = place
+      self._pressed.set(physics, steps | self.pressed(physics))
+
+  def pressed(self, physics: Any) -> np.ndarray:
+    """Returns whether the pad has been pressed in this episode, `(...)`."""
+    return np.asarray(self._pressed.get(physics) > 0)

@@ -1,0 +1,166 @@
+"""A sense of what is around: rays that report distance and class. Needs no GL."""
+
+from collections.abc import Sequence
+import functools
+from typing import Any, final
+
+from dm_control import composer
+from dm_control import mjcf
+from dm_control.composer.observation import observable
+import mujoco
+import numpy as np
+
+from realab_suite.entities import appearance
+
+
+@functools.singledispatch
+def cast(
+    physics: Any,
+    origin: np.ndarray,
+    directions: np.ndarray,
+    excluded_body: int,
+) -> tuple[np.ndarray, np.ndarray]:
+  """Casts rays; an engine of many worlds registers an implementation of its own.
+
+  Args:
+    physics: One world.
+    origin: Where all rays begin, `(..., 3)`, metres.
+    directions: Unit vectors, `(..., rays, 3)`.
+    excluded_body: The id of a body whose geoms rays pass through.
+
+  Returns:
+    Distance in metres and geom id of the first hit, each `(..., rays)`; both
+    are -1 where a ray hits nothing.
+  """
+  num_rays = len(directions)
+  geoms = np.full(num_rays, -1, np.int32)
+  distances = np.full(num_rays, -1.0)
+  mujoco.mj_multiRay(
+      physics.model.ptr,
+      physics.data.ptr,
+      np.ascontiguousarray(origin, np.float64),
+      np.ascontiguousarray(directions, np.float64).ravel(),
+      None,  # All geom groups.
+      1,  # Static geoms too.
+      excluded_body,
+      geoms,
+      distances,
+      None,  # No normals.
+      num_rays,
+      mujoco.mjMAXVAL,
+  )
+  return distances, geoms
+
+
+@final
+class RayObservables(composer.Observables):
+  """What the rays hit."""
+
+  @composer.observable
+  def distances(self) -> observable.Generic:
+    return observable.Generic(self._entity.distances)
+
+  @composer.observable
+  def classes(self) -> observable.Generic:
+    return observable.Generic(self._entity.classes)
+
+
+@final
+class RaySense(composer.Entity):
+  """A fan of horizontal rays from the middle of whatever carries it.
+
+  The rays run close above the floor, where blocks are. They see everything that
+  a camera there would see, things that nothing collides with included, and they
+  see it by class (`appearance.CLASSES`) instead of by pixel.
+  """
+
+  def _build(
+      self,
+      name: str = 'rays',
+      num_rays: int = 32,
+      field_of_view: float = 160.0,
+      max_distance: float = 12.0,
+  ) -> None:
+    """Builds the sense.
+
+    Args:
+      name: The name of the model.
+      num_rays: How many rays.
+      field_of_view: The angle between the outermost rays, degrees.
+      max_distance: What a ray reports that hits nothing nearer, metres.
+    """
+    self._mjcf_root = mjcf.RootElement(model=name)
+    half = np.radians(field_of_view) / 2.0
+    # From left to right, as in a picture.
+    self._angles = np.linspace(half, -half, num_rays)
+    self._max_distance = max_distance
+    self._class_of_geom: np.ndarray | None = None
+    self._model: Any = None
+
+  def _build_observables(self) -> RayObservables:
+    return RayObservables(self)
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
+
+  @property
+  def angles(self) -> np.ndarray:
+    """Where each ray points, `(rays,)` radians, positive to the left."""
+    return self._angles
+
+  @property
+  def max_distance(self) -> float:
+    """What a ray reports that hits nothing, metres."""
+    return self._max_distance
+
+  @property
+  def num_classes(self) -> int:
+    """How many classes a ray tells apart, `nothing` included."""
+    return len(appearance.CLASSES)
+
+  def sense(self, physics: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Casts the rays.
+
+    Returns:
+      Distances, float32 metres in [0, max_distance], and class codes, int32
+      indices into `appearance.CLASSES`, each `(..., rays)`.
+    """
+    frame = physics.bind(self.root_body)
+    matrix = frame.xmat
+    heading = np.arctan2(matrix[..., 3], matrix[..., 0])
+    angles = np.asarray(heading)[..., np.newaxis] + self._angles
+    directions = np.stack(
+        [np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1
+    )
+    carrier = physics.bind(self._carrier()).element_id
+    distances, geoms = cast(physics, frame.xpos, directions, carrier)
+    table = self._classes(physics)
+    missed = (geoms < 0) | (distances > self._max_distance)
+    classes = np.where(missed, appearance.code('nothing'), table[geoms])
+    distances = np.where(missed, self._max_distance, distances)
+    return distances.astype(np.float32), classes.astype(np.int32)
+
+  def distances(self, physics: Any) -> np.ndarray:
+    """Returns how far each ray gets, `(..., rays)` float32, metres."""
+    return self.sense(physics)[0]
+
+  def classes(self, physics: Any) -> np.ndarray:
+    """Returns what each ray hits, `(..., rays)` int32 class codes."""
+    return self.sense(physics)[1]
+
+  def _carrier(self) -> mjcf.Element:
+    """The body that rays pass through: the one that the sense is mounted on."""
+    return self.root_body.parent
+
+  def _classes(self, physics: Any) -> np.ndarray:
+    if physics.model is not self._model:
+      self._class_of_geom = appearance.class_of_geoms(physics.model)
+      self._model = physics.model
+    return self._class_of_geom
+
+
+def one_hot(classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
+  """Returns which rays hit each of some classes, `(..., rays, len(names))`."""
+  codes = np.array([appearance.code(name) for name in names])
+  return classes[..., np.newaxis] == codes

@@ -1,0 +1,312 @@
+"""What every register does: write, read, and tell what became of a value.
+
+A register is any physical object that stores a value in a physical property
+(paper, section 3.1). Whatever moves the object changes the value, so there is no
+corruption function anywhere in this package.
+"""
+
+import abc
+from collections.abc import Sequence
+import dataclasses
+from typing import Any, final
+
+from dm_control import composer
+from dm_control import mjcf
+from dm_control.composer.observation import observable
+from dm_env import specs
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.entities import appearance
+from realab_suite.entities import block_kinds
+from realab_suite.entities import state
+
+# embedded: the value is in the blocks, and the blocks are in the world.
+# welded: the value is in the blocks, which nothing but a write can move.
+# secure: the value is in the state; the blocks are scenery that can be moved.
+CHANNELS = ('embedded', 'welded', 'secure')
+DOFS = ('free', 'planar')
+OVERFLOWS = ('saturate', 'error')
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Corruption:
+  """How far a reading is from the value that was applied, and why.
+
+  Attributes:
+    permanent: What stays wrong after the next write, in the register's units.
+    temporary: What the next write mends, in the register's units.
+  """
+
+  permanent: np.ndarray
+  temporary: np.ndarray
+
+
+@final
+class RegisterObservables(composer.Observables):
+  """The reading, off by default: who may see it is not the register's say."""
+
+  @composer.observable
+  def reading(self) -> observable.Generic:
+    return observable.Generic(self._entity.read)
+
+
+class Register(composer.Entity):
+  """Stores a number in the pose of blocks.
+
+  A register is one subtree that can be attached to any entity at the root of a
+  task: `register.attach_to(arena, (x, y))`. It works in a plain Composer
+  environment as well as in this package's.
+
+  A subclass builds its blocks in `_build_blocks`, and says how a value is put
+  into them (`_put`), read off them (`_look`), and how what moved them splits
+  into permanent and temporary corruption (`_displacement`).
+  """
+
+  def _build(
+      self,
+      name: str,
+      *,
+      value_range: Sequence[float],
+      scale: float = 0.1,
+      initial: float = 0.0,
+      role: str = 'feedback',
+      channel: str = 'embedded',
+      dof: str = 'free',
+      on_overflow: str = 'saturate',
+      block_size: float = 0.2,
+      mass: float = 1.0,
+      spread: Sequence[float] = (0.0, 0.0),
+  ) -> None:
+    """Builds the register.
+
+    Args:
+      name: The name of the register's model.
+      value_range: The lowest and the highest value that can be stored.
+      scale: Metres (radians for an orientation) per unit of the value.
+      initial: The value at the start of an episode.
+      role: What the register is for, a key of `appearance.ROLE_COLOURS`.
+      channel: One of `CHANNELS`.
+      dof: One of `DOFS`: what an embedded block can do when it is pushed.
+      on_overflow: Whether a value out of range is saturated or is an error.
+      block_size: The length of an edge of a block, metres.
+      mass: Of each block, kilograms.
+      spread: Half-widths of the region, `(x, y)` in metres, in which the
+        register stands at a random place at the start of each episode.
+    """
+    self._low, self._high = (float(bound) for bound in value_range)
+    self._scale = scale
+    self._initial = initial
+    self._role = role
+    self._channel = channel
+    self._dof = dof
+    self._on_overflow = on_overflow
+    self._block_size = block_size
+    self._mass = mass
+    self._spread = np.array(spread, float)
+    self._mjcf_root = mjcf.RootElement(model=name)
+    self._applied_slot = state.Slot(self._mjcf_root, 'applied')
+    self._stored_slot = state.Slot(self._mjcf_root, 'stored')
+    self._origin_slot = state.Slot(self._mjcf_root, 'origin', 3)
+    self._blocks = self._build_blocks()
+
+  def _build_observables(self) -> RegisterObservables:
+    return RegisterObservables(self)
+
+  @abc.abstractmethod
+  def _build_blocks(self) -> list[block_kinds.Block]:
+    """Adds the blocks with `_add_block`; the first is where the register is."""
+
+  @abc.abstractmethod
+  def _put(self, physics: Any, value: np.ndarray) -> None:
+    """Moves blocks so that they represent `value`, shape `(...)`."""
+
+  @abc.abstractmethod
+  def _look(self, physics: Any) -> np.ndarray:
+    """Returns the value that the blocks represent, shape `(...)`."""
+
+  @abc.abstractmethod
+  def _displacement(self, physics: Any, applied: np.ndarray) -> Corruption:
+    """Says what moving the blocks did to the value `applied`."""
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
+
+  @property
+  def name(self) -> str:
+    return self._mjcf_root.model
+
+  @property
+  def role(self) -> str:
+    """What the register is for: feedback, meter, query or signal."""
+    return self._role
+
+  @property
+  def channel(self) -> str:
+    """Whether the value is `embedded`, `welded` or `secure`."""
+    return self._channel
+
+  @property
+  def scale(self) -> float:
+    """Metres (radians for an orientation) per unit of the value."""
+    return self._scale
+
+  @property
+  def blocks(self) -> list[block_kinds.Block]:
+    """The blocks; the first one is where the register stands."""
+    return self._blocks
+
+  @property
+  def spread(self) -> np.ndarray:
+    """Half-widths of the region in which the register stands, `(2,)`, metres."""
+    return self._spread
+
+  @property
+  def value_spec(self) -> specs.BoundedArray:
+    """Shape `()`, float64, and the range that can be stored."""
+    return specs.BoundedArray(
+        (), np.float64, self._low, self._high, name=self.name
+    )
+
+  def attach_to(
+      self,
+      root: composer.Entity,
+      position: Sequence[float],
+      yaw: float = 0.0,
+  ) -> None:
+    """Puts the register into a world.
+
+    Args:
+      root: The root entity of the task, usually its arena.
+      position: Where the register stands, `(x, y)` in metres.
+      yaw: The angle of the axis that carries the value to the world's x axis,
+        radians.
+    """
+    frame = root.attach(self)
+    frame.pos = [*position, 0.0]
+    if yaw:
+      frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+    for block in self._blocks:
+      if isinstance(block, block_kinds.MocapBlock):
+        block.attach_to(root, position, yaw)
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    """Takes where the register stands now as its original place.
+
+    The task has placed things by now.
+    """
+    displacement = np.zeros(2)
+    if self._spread.any():
+      displacement = random_state.uniform(-self._spread, self._spread)
+    self.settle(physics, displacement)
+
+  def settle(self, physics: Any, displacement: np.ndarray) -> None:
+    """Fixes the place that writes are relative to, and writes `initial`.
+
+    Args:
+      physics: One world, or many.
+      displacement: By how much the register moves first, `(2,)`, metres in its
+        own frame.
+    """
+    first = self._blocks[0]
+    origin = np.array(first.position(physics))
+    if displacement.any():
+      origin[..., :2] += displacement
+      first.put(physics, origin)
+    self._origin_slot.set(physics, origin)
+    self.write(physics, np.full(origin.shape[:-1], self._initial))
+
+  def write(self, physics: Any, value: Any) -> np.ndarray:
+    """Moves blocks so that they represent `value`.
+
+    The blocks are teleported, upright and at rest, and hands let go of them.
+    The whole pose is put right, not just the axis that carries the value: a
+    block that was carried beside a wall would otherwise be written into it.
+
+    Args:
+      physics: One world, or many.
+      value: True feedback in the register's units, shape `(...)`.
+
+    Returns:
+      The value that was applied: `value`, or the nearest bound of `value_spec`.
+      The difference is saturation, never corruption.
+
+    Raises:
+      RegisterValueError: If a value is not finite, or if it is out of range and
+        the register does not saturate. Nothing has been written.
+    """
+    value = np.asarray(value, np.float64)
+    if not np.isfinite(value).all():
+      raise errors.RegisterValueError(
+          f'register {self.name!r}: cannot store {_first_bad(value)}; a value'
+          ' has to be finite'
+      )
+    applied = np.clip(value, self._low, self._high)
+    if self._on_overflow == 'error' and (applied != value).any():
+      outside = value[applied != value].flat[0]
+      raise errors.RegisterValueError(
+          f'register {self.name!r}: cannot store {outside}; its range is'
+          f' [{self._low}, {self._high}]'
+      )
+    self._put(physics, applied)
+    self._applied_slot.set(physics, applied)
+    if self._channel == 'secure':
+      self._stored_slot.set(physics, applied)
+    return applied
+
+  def read(self, physics: Any) -> np.ndarray:
+    """Returns the value that the register represents now, shape `(...)`."""
+    if self._channel == 'secure':
+      return np.array(self._stored_slot.get(physics))
+    return np.array(self._look(physics))
+
+  def applied(self, physics: Any) -> np.ndarray:
+    """Returns the value that was applied last, shape `(...)`."""
+    return np.array(self._applied_slot.get(physics))
+
+  def corruption(self, physics: Any) -> Corruption:
+    """Splits `read() - applied()` by what the next write will mend.
+
+    This is the evaluator's view: no agent and no provider gets to see it.
+    """
+    applied = self.applied(physics)
+    if self._channel == 'secure':
+      zero = np.zeros_like(applied)
+      return Corruption(permanent=zero, temporary=zero)
+    return self._displacement(physics, applied)
+
+  def _origin(self, physics: Any) -> np.ndarray:
+    """Where the first block stood at the start, `(..., 3)`, metres."""
+    return self._origin_slot.get(physics)
+
+  def _add_block(
+      self, name: str, class_name: str, position: Sequence[float]
+  ) -> block_kinds.Block:
+    """Adds a block of the kind that the register's channel asks for.
+
+    Args:
+      name: The name of the block within the register.
+      class_name: What the ray sense takes it for.
+      position: Where it rests in the register's frame, `(x, y)` in metres.
+    """
+    index = int(class_name == 'offset_block')
+    looks = appearance.looks(
+        class_name, appearance.ROLE_COLOURS[self._role][index]
+    )
+    half_size = self._block_size / 2
+    if self._channel == 'welded':
+      return block_kinds.MocapBlock(
+          f'{self.name}_{name}', position, half_size, looks
+      )
+    kind = (
+        block_kinds.FreeBlock
+        if self._dof == 'free'
+        else block_kinds.PlanarBlock
+    )
+    return kind(self._mjcf_root, name, position, half_size, self._mass, looks)
+
+
+def _first_bad(value: np.ndarray) -> float:
+  return float(value[~np.isfinite(value)].flat[0])

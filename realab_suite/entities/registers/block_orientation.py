@@ -1,0 +1,47 @@
+"""The register that is one block and the way it faces (section 3.1)."""
+
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.entities import block_kinds
+from realab_suite.entities.registers import base
+
+# A heading is known up to a full turn. Values stop short of half a turn, so
+# that a small push at either end cannot flip the sign of a reading.
+_LARGEST_ANGLE = 3.0
+
+
+@final
+class BlockOrientationRegister(base.Register):
+  """Stores a float as the angle by which one block is turned.
+
+  The scale is in radians per unit. Turning or toppling the block is a temporary
+  corruption; carrying it away without turning it is none.
+  """
+
+  def _build_blocks(self) -> list[block_kinds.Block]:
+    widest = max(abs(self._low), abs(self._high)) * self._scale
+    if widest > _LARGEST_ANGLE:
+      raise errors.SpecError(
+          f'register {self.name!r}: range [{self._low}, {self._high}] at scale'
+          f' {self._scale} turns the block by up to {widest:.3g} rad; at most'
+          f' {_LARGEST_ANGLE} rad are told apart'
+      )
+    self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
+    return [self._block]
+
+  def _put(self, physics: Any, value: np.ndarray) -> None:
+    position = np.array(self._origin(physics))
+    position[..., 2] = self._block.rest_height
+    self._block.put(physics, position, heading=value * self._scale)
+
+  def _look(self, physics: Any) -> np.ndarray:
+    return self._block.heading(physics) / self._scale
+
+  def _displacement(self, physics: Any, applied: np.ndarray) -> base.Corruption:
+    return base.Corruption(
+        permanent=np.zeros_like(applied),
+        temporary=self._look(physics) - applied,
+    )

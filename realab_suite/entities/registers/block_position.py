@@ -1,0 +1,37 @@
+"""The register that is one block and its place (section 3.1)."""
+
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite.entities import block_kinds
+from realab_suite.entities.registers import base
+
+
+@final
+class BlockPositionRegister(base.Register):
+  """Stores a float as how far one block is from where it started.
+
+  Readings and writes are measured from the same place, which nothing can move.
+  So every corruption is temporary: the next `write` puts the block back.
+  """
+
+  def _build_blocks(self) -> list[block_kinds.Block]:
+    self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
+    return [self._block]
+
+  def _put(self, physics: Any, value: np.ndarray) -> None:
+    position = np.array(self._origin(physics))
+    position[..., 0] += value * self._scale
+    position[..., 2] = self._block.rest_height
+    self._block.put(physics, position)
+
+  def _look(self, physics: Any) -> np.ndarray:
+    origin_x = self._origin(physics)[..., 0]
+    return (self._block.position(physics)[..., 0] - origin_x) / self._scale
+
+  def _displacement(self, physics: Any, applied: np.ndarray) -> base.Corruption:
+    return base.Corruption(
+        permanent=np.zeros_like(applied),
+        temporary=self._look(physics) - applied,
+    )

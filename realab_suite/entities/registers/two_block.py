@@ -1,0 +1,59 @@
+"""The two-block register, the paper's primary one (section 3.1, example)."""
+
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite.entities import block_kinds
+from realab_suite.entities.registers import base
+
+# The offset block stands beside the line of the base block, so that both are
+# seen when the value is zero.
+_LATERAL = 0.05
+
+
+@final
+class TwoBlockRegister(base.Register):
+  """Stores a float as the distance of two blocks along the register's axis.
+
+  The two blocks are ordinary rigid bodies, so whatever pushes, lifts or carries
+  them changes the stored value. They fail in different ways:
+
+  * Moving the offset block is a temporary corruption. The next `write` puts the
+    block back.
+  * Moving the base block is a permanent corruption. `read` measures from where
+    the base block is now, but `write` places the offset block relative to where
+    the base block started, so every later reading is off by the same amount.
+    Moving the base block back ends it.
+
+  The two blocks never collide with each other; writing 0 would otherwise be a
+  corruption.
+  """
+
+  def _build_blocks(self) -> list[block_kinds.Block]:
+    lateral = self._block_size + _LATERAL
+    self._base = self._add_block('base', 'base_block', (0.0, 0.0))
+    self._offset = self._add_block('offset', 'offset_block', (0.0, lateral))
+    self._from_origin = np.array([0.0, lateral, 0.0])
+    if self._channel != 'welded':
+      self._mjcf_root.contact.add('exclude', body1='base', body2='offset')
+    return [self._base, self._offset]
+
+  def _put(self, physics: Any, value: np.ndarray) -> None:
+    position = self._origin(physics) + self._from_origin
+    position[..., 0] += value * self._scale
+    position[..., 2] = self._offset.rest_height
+    self._offset.put(physics, position)
+
+  def _look(self, physics: Any) -> np.ndarray:
+    base_x = self._base.position(physics)[..., 0]
+    return (self._offset.position(physics)[..., 0] - base_x) / self._scale
+
+  def _displacement(self, physics: Any, applied: np.ndarray) -> base.Corruption:
+    origin_x = self._origin(physics)[..., 0]
+    base_x = self._base.position(physics)[..., 0]
+    offset_x = self._offset.position(physics)[..., 0]
+    return base.Corruption(
+        permanent=(origin_x - base_x) / self._scale,
+        temporary=(offset_x - origin_x) / self._scale - applied,
+    )

@@ -1,0 +1,94 @@
+"""Slots of MuJoCo `userdata`: where entities keep the state of an episode.
+
+Poses and velocities are state already. Whatever else an entity has to remember
+within an episode (apples eaten, the pose that a register started from) goes
+into a slot, never into a Python attribute. So one copy of MuJoCo's integration
+state is a snapshot of the whole episode, and many worlds can share one entity.
+"""
+
+from typing import Any, final
+
+from dm_control import mjcf
+import mujoco
+import numpy as np
+
+from realab_suite import errors
+
+# Every entity asks for the same capacity because PyMJCF merges `nuserdata` of
+# attached models only where they agree.
+CAPACITY = 256
+_PREFIX = 'userdata.'
+
+
+@final
+class Slot:
+  """A named piece of `userdata`, claimed when an entity is built.
+
+  The claim is an MJCF `numeric` in the entity's own model. It travels with the
+  entity into whatever it is attached to, and the compiled model is the record
+  of who owns which numbers.
+  """
+
+  def __init__(
+      self, mjcf_model: mjcf.RootElement, name: str, size: int | None = None
+  ) -> None:
+    """Claims a slot.
+
+    Args:
+      mjcf_model: The model of the entity that owns the slot.
+      name: A name that is unique in `mjcf_model`.
+      size: How many floats, or `None` for a scalar.
+    """
+    mjcf_model.size.nuserdata = CAPACITY
+    self._numeric = mjcf_model.custom.add(
+        'numeric', name=_PREFIX + name, size=size or 1
+    )
+    self._size = size
+    self._model: Any = None
+    self._index: int | slice = 0
+
+  def get(self, physics: Any) -> np.ndarray:
+    """Returns the values, shape `(..., size)` or `(...)` for a scalar."""
+    return physics.data.userdata[..., self._resolve(physics)]
+
+  def set(self, physics: Any, value: Any) -> None:
+    """Stores `value`, which broadcasts to the shape that `get` returns."""
+    physics.data.userdata[..., self._resolve(physics)] = value
+
+  def _resolve(self, physics: Any) -> int | slice:
+    model = physics.model
+    if model is not self._model:
+      start = layout(model).get(self._numeric.full_identifier)
+      if start is None:
+        raise errors.StateLayoutError(
+            f'{self._numeric.full_identifier}: not in the compiled model;'
+            ' attach the entity before the physics is compiled'
+        )
+      self._index = (
+          start if self._size is None else slice(start, start + self._size)
+      )
+      self._model = model
+    return self._index
+
+
+def layout(model: Any) -> dict[str, int]:
+  """Maps the full name of every claimed slot to its first `userdata` index.
+
+  Args:
+    model: The compiled model, as `physics.model`.
+
+  Raises:
+    StateLayoutError: If the claims need more room than the model has.
+  """
+  starts, end = {}, 0
+  for i in range(model.nnumeric):
+    name = mujoco.mj_id2name(model.ptr, mujoco.mjtObj.mjOBJ_NUMERIC, i)
+    if name.rpartition('/')[2].startswith(_PREFIX):
+      starts[name] = end
+      end += int(model.numeric_size[i])
+  if end > model.nuserdata:
+    raise errors.StateLayoutError(
+        f'{len(starts)} slots need {end} numbers of userdata; the model has'
+        f' {model.nuserdata}'
+    )
+  return starts

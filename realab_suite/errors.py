@@ -1,0 +1,47 @@
+"""Errors that tell a user where, what was given and what is allowed."""
+
+from typing import final
+
+
+class RealabError(Exception):
+  """Base class of every error that this package raises on purpose.
+
+  Subclasses also derive from the built-in error that a caller would expect, so
+  that `except ValueError` keeps working.
+  """
+
+
+class SpecError(RealabError, ValueError):
+  """A design, experiment or task description is wrong."""
+
+
+class ActionError(RealabError, ValueError):
+  """An action does not fit the action spec; the world has not moved."""
+
+
+class RegisterValueError(RealabError, ValueError):
+  """A value cannot be written to a register; nothing has been written."""
+
+
+class FeedbackProviderError(RealabError, RuntimeError):
+  """A feedback provider raised, or returned something it did not declare."""
+
+
+class StateLayoutError(RealabError, ValueError):
+  """The physical state has no room for, or no record of, an entity's slots."""
+
+
+class ClosedError(RealabError, RuntimeError):
+  """An environment was used after `close()`."""
+
+
+class ResultsError(RealabError, ValueError):
+  """Results cannot be written, read or compared as asked."""
+
+
+@final
+class UnknownNameError(SpecError, KeyError):
+  """A name is not in a registry; the message lists what is."""
+
+  # KeyError prints the repr of its argument, which would quote the sentence.
+  __str__ = Exception.__str__

@@ -1,0 +1,1 @@
+"""The evaluator's side: the only reader of the true reward."""

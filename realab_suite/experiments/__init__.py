@@ -1,0 +1,1 @@
+"""Launchers, on absl flags."""

@@ -1,0 +1,1 @@
+"""The agent designer's side: designs, feedback providers, the mechanism."""

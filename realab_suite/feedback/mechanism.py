@@ -1,0 +1,333 @@
+"""The feedback mechanism: what runs a design inside a world.
+
+It owns the registers, and has one method for each thing that happens to them in
+a control step. When these are called is the engine's business; who hears of it
+is too: every method returns a record of what it wrote or read.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, final
+
+from dm_control import composer
+from dm_control import mjcf
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.entities import arenas
+from realab_suite.entities import meters
+from realab_suite.entities import registers as register_entities
+from realab_suite.entities import state
+from realab_suite.feedback import providers
+from realab_suite.feedback import register_kinds
+from realab_suite.feedback import specs
+
+# Who writes and reads, where it is not a provider.
+AGENT = 'agent'
+INITIAL = 'initial'
+
+
+@final
+class Write(NamedTuple):
+  """A value on its way into a register.
+
+  Attributes:
+    register: The name of the register.
+    writer: `agent` for a query, `initial` at a reset, a meter or a provider.
+    requested: What was to be written, `(...)`.
+    applied: What was written: `requested` within the register's range, `(...)`.
+  """
+
+  register: str
+  writer: str
+  requested: np.ndarray
+  applied: np.ndarray
+
+
+@final
+class Read(NamedTuple):
+  """A value that came out of a register, and what had become of it.
+
+  Attributes:
+    register: The name of the register.
+    reader: `agent` or a provider.
+    reading: What was read, `(...)`.
+    permanent: The part of the corruption that the next write leaves, `(...)`.
+    temporary: The part that the next write mends, `(...)`.
+  """
+
+  register: str
+  reader: str
+  reading: np.ndarray
+  permanent: np.ndarray
+  temporary: np.ndarray
+
+
+@final
+class FeedbackMechanism(composer.Entity):
+  """The registers, meters and providers of a design.
+
+  Two steps make it ready: `attach_to` puts it and its registers into a world,
+  `connect` gives its meters something to measure.
+  """
+
+  def _build(self, design: specs.DesignSpec) -> None:
+    """Builds the registers of a design.
+
+    Args:
+      design: The design; see `specs.load`.
+    """
+    self._design = design
+    self._mjcf_root = mjcf.RootElement(model='feedback')
+    self._step_count = state.Slot(self._mjcf_root, 'step_count')
+    self._score = state.Slot(self._mjcf_root, 'score')
+    self._registers = {
+        name: _make_register(name, spec, design)
+        for name, spec in design.registers.items()
+    }
+    self._meters: list[tuple[str, meters.Meter]] = []
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
+
+  @property
+  def design(self) -> specs.DesignSpec:
+    return self._design
+
+  @property
+  def registers(self) -> Mapping[str, register_entities.Register]:
+    """Every register, by its name in the design."""
+    return self._registers
+
+  @property
+  def queries(self) -> list[register_entities.Register]:
+    """The registers that the agent writes, in the order of its action."""
+    return [self._registers[name] for name in self._design.names('query')]
+
+  @property
+  def read_by_agent(self) -> list[str]:
+    """The names of the registers that the agent reads."""
+    return self._design.names(*specs.READ_BY_AGENTS)
+
+  def attach_to(self, root: composer.Entity) -> None:
+    """Attaches the mechanism and its registers to the root entity of a task.
+
+    Raises:
+      SpecError: If the world offers no such place.
+    """
+    root.attach(self)
+    offered = root.places if isinstance(root, arenas.RoomArena) else {}
+    for name, register in self._registers.items():
+      place = _find(name, self._design.registers[name].place, offered)
+      register.attach_to(root, place.position, place.yaw)
+
+  def connect(
+      self, measurements: Mapping[str, Callable[[Any], np.ndarray]]
+  ) -> None:
+    """Gives the meters their measurements.
+
+    Args:
+      measurements: What the world can measure, by name.
+
+    Raises:
+      SpecError: If a meter of the design measures something else.
+    """
+    for i, spec in enumerate(self._design.meters):
+      if spec.measures not in measurements:
+        raise errors.SpecError(
+            f'design {self._design.name!r}: meters[{i}].measures:'
+            f' {spec.measures!r} cannot be measured in this world; allowed are'
+            f' {sorted(measurements)}'
+        )
+      meter = meters.Meter(
+          measurements[spec.measures], self._registers[spec.writes]
+      )
+      self._meters.append((f'meter:{spec.measures}', meter))
+
+  def initial_writes(self, physics: Any) -> list[Write]:
+    """Returns what registers wrote themselves when the episode began."""
+    writes = []
+    for name, register in self._registers.items():
+      applied = register.applied(physics)
+      writes.append(Write(name, INITIAL, applied, applied))
+    return writes
+
+  def write_queries(self, physics: Any, values: np.ndarray) -> list[Write]:
+    """Writes the agent's queries K_t, shape `(..., queries)`."""
+    return [
+        _write(physics, register.name, AGENT, register, values[..., i])
+        for i, register in enumerate(self.queries)
+    ]
+
+  def update_meters(self, physics: Any) -> list[Write]:
+    """Lets every meter measure and write."""
+    writes = []
+    for writer, meter in self._meters:
+      measured, applied = meter.update(physics)
+      writes.append(Write(meter.register.name, writer, measured, applied))
+    return writes
+
+  def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
+    """Returns the states of the providers before an episode."""
+    return [p.initial_state(batch_shape) for p in self._design.providers]
+
+  def update_providers(
+      self,
+      physics: Any,
+      observation: providers.Observation,
+      keys: Sequence[np.ndarray],
+      states: Sequence[Any],
+  ) -> tuple[list[Read], list[Write], list[Any]]:
+    """Lets every provider read, think and write, in the design's order.
+
+    Args:
+      physics: One world, or many.
+      observation: What the agent saw when it chose its action.
+      keys: A random key per provider, each `(..., 2)`, uint64.
+      states: The state of each provider.
+
+    Returns:
+      What was read, what was written, and the next states.
+
+    Raises:
+      FeedbackProviderError: If a provider raises, or writes something else than
+        it declared, or something of another shape.
+      RegisterValueError: If a register cannot store what a provider wrote.
+    """
+    step = self._step_count.get(physics)
+    reads, writes, next_states = [], [], []
+    for i, provider in enumerate(self._design.providers):
+      writer = f'providers[{i}]:{provider.kind}'
+      seen = [self._read(physics, name, writer) for name in provider.reads]
+      readings = {read.register: read.reading for read in seen}
+      try:
+        values, next_state = provider.step(
+            observation, readings, np.asarray(step == 0), keys[i], states[i]
+        )
+      except Exception as error:
+        raise errors.FeedbackProviderError(
+            f'{writer} at step {_first(step)}: {type(error).__name__}: {error}'
+        ) from error
+      _check_writes(writer, provider, values, np.shape(step))
+      reads += seen
+      for name in provider.writes:
+        try:
+          write = _write(
+              physics, name, writer, self._registers[name], values[name]
+          )
+        except errors.RegisterValueError as error:
+          raise errors.RegisterValueError(
+              f'{writer} at step {_first(step)}: {error}'
+          ) from error
+        writes.append(write)
+      next_states.append(next_state)
+    return reads, writes, next_states
+
+  def read_for_agent(self, physics: Any) -> list[Read]:
+    """Reads the registers that the agent may read: the observed feedback."""
+    return [self._read(physics, name, AGENT) for name in self.read_by_agent]
+
+  def shadow_reads(self, physics: Any, reader: str) -> list[Read]:
+    """Reads every register on behalf of an evaluator; moves nothing."""
+    return [self._read(physics, name, reader) for name in self._registers]
+
+  def end_step(self, physics: Any, reward: Any) -> None:
+    """Counts the control step and its true reward."""
+    self._step_count.set(physics, self._step_count.get(physics) + 1)
+    self._score.set(physics, self._score.get(physics) + reward)
+
+  def step_count(self, physics: Any) -> np.ndarray:
+    """Returns how many control steps the episode has had, `(...)`."""
+    return np.array(self._step_count.get(physics))
+
+  def score(self, physics: Any) -> np.ndarray:
+    """Returns the true return up to the last control step, `(...)`.
+
+    It is what a meter measures in a world that keeps no score of its own.
+    """
+    return np.array(self._score.get(physics))
+
+  def _read(self, physics: Any, name: str, reader: str) -> Read:
+    register = self._registers[name]
+    corruption = register.corruption(physics)
+    return Read(
+        name,
+        reader,
+        register.read(physics),
+        corruption.permanent,
+        corruption.temporary,
+    )
+
+
+def _make_register(
+    name: str, spec: specs.RegisterSpec, design: specs.DesignSpec
+) -> register_entities.Register:
+  spread = (
+      spec.place.spread
+      if isinstance(spec.place, specs.PlaceSpec)
+      else (0.0, 0.0)
+  )
+  return register_kinds.REGISTER_KINDS.get(spec.kind)(
+      name,
+      value_range=spec.range,
+      scale=spec.scale,
+      initial=spec.initial,
+      role=spec.role,
+      channel=spec.channel or design.channel,
+      dof=spec.dof or design.dof,
+      on_overflow=spec.on_overflow,
+      block_size=spec.block_size,
+      mass=spec.mass,
+      spread=spread,
+      **spec.options,
+  )
+
+
+def _find(
+    name: str,
+    place: str | specs.PlaceSpec,
+    offered: Mapping[str, arenas.Place],
+) -> arenas.Place:
+  if isinstance(place, specs.PlaceSpec):
+    return arenas.Place(place.position, place.yaw, place.spread)
+  if place not in offered:
+    raise errors.SpecError(
+        f'registers.{name}.place: this world offers no place {place!r}; allowed'
+        f' are {sorted(offered) or "coordinates"}'
+    )
+  return offered[place]
+
+
+def _write(
+    physics: Any,
+    name: str,
+    writer: str,
+    register: register_entities.Register,
+    value: Any,
+) -> Write:
+  requested = np.array(value, np.float64)
+  return Write(name, writer, requested, register.write(physics, requested))
+
+
+def _check_writes(
+    writer: str,
+    provider: providers.Provider,
+    values: Any,
+    batch_shape: tuple[int, ...],
+) -> None:
+  if not isinstance(values, Mapping) or set(values) != set(provider.writes):
+    given = sorted(values) if isinstance(values, Mapping) else repr(values)[:80]
+    raise errors.FeedbackProviderError(
+        f'{writer} returned {given}; it declares writes to'
+        f' {sorted(provider.writes)}'
+    )
+  for name, value in values.items():
+    if np.shape(value) != batch_shape:
+      raise errors.FeedbackProviderError(
+          f'{writer} wrote shape {np.shape(value)} to {name!r}; expected'
+          f' {batch_shape}'
+      )
+
+
+def _first(step: np.ndarray) -> int:
+  return int(np.ravel(step)[0])

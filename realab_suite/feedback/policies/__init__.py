@@ -1,0 +1,21 @@
+"""Policies and value functions; importing this registers those that ship."""
+
+from realab_suite.feedback.policies.base import POLICIES
+from realab_suite.feedback.policies.base import VALUE_FUNCTIONS
+from realab_suite.feedback.policies.base import Policy
+from realab_suite.feedback.policies.base import ValueFunction
+from realab_suite.feedback.policies.base import make
+from realab_suite.feedback.policies.base import make_value_function
+from realab_suite.feedback.policies.simple import NoOp
+from realab_suite.feedback.policies.simple import Random
+
+__all__ = [
+    'POLICIES',
+    'VALUE_FUNCTIONS',
+    'NoOp',
+    'Policy',
+    'Random',
+    'ValueFunction',
+    'make',
+    'make_value_function',
+]

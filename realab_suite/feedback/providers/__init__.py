@@ -1,0 +1,19 @@
+"""Feedback providers; importing this package registers those that ship."""
+
+from realab_suite.feedback.providers.base import PROVIDERS
+from realab_suite.feedback.providers.base import Observation
+from realab_suite.feedback.providers.base import Provider
+from realab_suite.feedback.providers.constant import Constant
+from realab_suite.feedback.providers.demonstration import Demonstration
+from realab_suite.feedback.providers.difference import Difference
+from realab_suite.feedback.providers.value_advice import ValueAdvice
+
+__all__ = [
+    'PROVIDERS',
+    'Constant',
+    'Demonstration',
+    'Difference',
+    'Observation',
+    'Provider',
+    'ValueAdvice',
+]

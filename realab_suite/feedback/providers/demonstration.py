@@ -1,0 +1,49 @@
+"""Demonstrations: what a policy would do here (paper, section 3.4)."""
+
+from typing import Any, Literal, final
+
+import numpy as np
+import pydantic
+
+from realab_suite.feedback.policies import base as policies
+from realab_suite.feedback.providers import base
+
+
+@base.PROVIDERS.add('demonstration')
+@final
+class Demonstration(base.Provider):
+  """Writes the index of the action that a policy takes on the agent's view.
+
+  Attributes:
+    policy: The name of a registered policy.
+    options: Keyword arguments of the policy.
+  """
+
+  kind: Literal['demonstration'] = 'demonstration'
+  writes: base.OneName
+  policy: str
+  options: dict[str, Any] = {}
+
+  _policy: policies.Policy = pydantic.PrivateAttr()
+
+  def model_post_init(self, context: Any) -> None:
+    del context
+    self._policy = policies.make(self.policy, **self.options)
+
+  def check(self, design: Any) -> None:
+    policies.check_action_set(self._policy.action_set, design, self.kind)
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return self._policy.initial_state(batch_shape)
+
+  def step(
+      self,
+      observation: base.Observation,
+      readings: base.Readings,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[dict[str, np.ndarray], Any]:
+    del readings
+    action, state = self._policy.step(observation, episode_start, key, state)
+    return {self.writes[0]: np.asarray(action, float)}, state

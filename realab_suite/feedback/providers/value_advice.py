@@ -1,0 +1,88 @@
+"""Value advice: how good an action is that the agent asks about (3.4)."""
+
+from typing import Any, Literal, final
+
+import numpy as np
+import pydantic
+
+from realab_suite.feedback.policies import base as policies
+from realab_suite.feedback.providers import base
+
+
+@base.PROVIDERS.add('value_advice')
+@final
+class ValueAdvice(base.Provider):
+  """Writes the value of the action whose index is in a query register.
+
+  The query is read off the query register's blocks, so it can be corrupted like
+  anything else. The observation reaches the provider directly, as in the paper
+  (section 3.4, footnote).
+
+  Attributes:
+    value_function: The name of a registered value function.
+    options: Keyword arguments of the value function.
+    query_delay: 0 to value the query of this step in this step's observation;
+      1 to value the previous step's, as in the paper's example.
+  """
+
+  kind: Literal['value_advice'] = 'value_advice'
+  reads: base.OneName
+  writes: base.OneName
+  value_function: str
+  options: dict[str, Any] = {}
+  query_delay: Literal[0, 1] = 0
+
+  _value_function: policies.ValueFunction = pydantic.PrivateAttr()
+
+  def model_post_init(self, context: Any) -> None:
+    del context
+    self._value_function = policies.make_value_function(
+        self.value_function, **self.options
+    )
+
+  def check(self, design: Any) -> None:
+    policies.check_action_set(
+        self._value_function.action_set, design, self.kind
+    )
+    query = self.reads[0]
+    if design.registers[query].role != 'query':
+      raise ValueError(
+          f'value_advice reads the query off {query!r}, whose role is'
+          f' {design.registers[query].role!r}; allowed is query'
+      )
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    num_actions = len(self._value_function.action_set)
+    return (
+        self._value_function.initial_state(batch_shape),
+        np.zeros((*batch_shape, num_actions)),  # The previous step's values.
+        np.zeros(batch_shape, int),  # The previous step's query.
+    )
+
+  def step(
+      self,
+      observation: base.Observation,
+      readings: base.Readings,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[dict[str, np.ndarray], Any]:
+    inner, values_before, query_before = state
+    values, inner = self._value_function.step(
+        observation, episode_start, key, inner
+    )
+    num_actions = values.shape[-1]
+    query = np.clip(np.rint(readings[self.reads[0]]), 0, num_actions - 1)
+    query = query.astype(int)
+    if self.query_delay:
+      # There is no previous step to value in the first one.
+      advice = np.where(episode_start, 0.0, _pick(values_before, query_before))
+    else:
+      advice = _pick(values, query)
+    return {self.writes[0]: advice}, (inner, values, query)
+
+
+def _pick(values: np.ndarray, index: np.ndarray) -> np.ndarray:
+  """Returns `values[..., index]`, world by world."""
+  picked = np.take_along_axis(values, np.asarray(index)[..., np.newaxis], -1)
+  return picked[..., 0]

@@ -1,0 +1,11 @@
+"""The kinds of registers that a design can ask for by name."""
+
+from realab_suite.entities import registers
+from realab_suite.feedback import registry
+
+REGISTER_KINDS: registry.Registry[type[registers.Register]] = registry.Registry(
+    'register kind'
+)
+REGISTER_KINDS.add('two_block')(registers.TwoBlockRegister)
+REGISTER_KINDS.add('block_position')(registers.BlockPositionRegister)
+REGISTER_KINDS.add('block_orientation')(registers.BlockOrientationRegister)

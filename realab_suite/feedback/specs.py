@@ -1,0 +1,409 @@
+"""Designs: what an agent designer decides, as data (paper, section 3.2)."""
+
+from collections.abc import Mapping
+import functools
+import hashlib
+from importlib import resources
+import json
+import operator
+import os
+from typing import Annotated, Any, Literal, final
+
+import pydantic
+
+from realab_suite import configs
+from realab_suite import errors
+from realab_suite.feedback import action_sets
+from realab_suite.feedback import loading
+from realab_suite.feedback import providers
+from realab_suite.feedback import register_kinds
+
+_NAME = r'^[a-z][a-z0-9_]{0,63}$'
+Name = Annotated[str, pydantic.StringConstraints(pattern=_NAME)]
+Finite = Annotated[float, pydantic.Field(allow_inf_nan=False, strict=False)]
+Size = Annotated[float, pydantic.Field(ge=0.02, le=1.0)]
+Channel = Literal['embedded', 'welded', 'secure']
+Dof = Literal['free', 'planar']
+Role = Literal['feedback', 'meter', 'query', 'signal']
+
+# Roles whose registers the agent reads, and those that it never does.
+READ_BY_AGENTS = ('feedback', 'signal')
+
+
+class _Spec(pydantic.BaseModel):
+  """Frozen; unknown keys and lossy conversions are errors."""
+
+  model_config = pydantic.ConfigDict(
+      frozen=True, extra='forbid', strict=True, populate_by_name=True
+  )
+
+
+@final
+class PlaceSpec(_Spec):
+  """Coordinates, or a region around them.
+
+  Attributes:
+    position: `(x, y)`, metres.
+    yaw: The angle of the register's axis to the x axis, radians.
+    spread: Half-widths of the region, metres, in which the register stands at
+      random in each episode.
+  """
+
+  position: Annotated[tuple[Finite, Finite], pydantic.Field(strict=False)]
+  yaw: Finite = 0.0
+  spread: Annotated[
+      tuple[
+          Annotated[float, pydantic.Field(ge=0, le=100)],
+          Annotated[float, pydantic.Field(ge=0, le=100)],
+      ],
+      pydantic.Field(strict=False),
+  ] = (0.0, 0.0)
+
+
+@final
+class RegisterSpec(_Spec):
+  """A register: what it is, what it is for, and where it stands.
+
+  Attributes:
+    kind: A registered kind of register.
+    role: `feedback` and `signal` registers are read by the agent, `meter`
+      registers by providers only, `query` registers are written by the agent.
+    place: The name of a place that the world offers, or coordinates.
+    range: The lowest and the highest value.
+    scale: Metres (radians for an orientation) per unit.
+    initial: The value at the start of an episode.
+    on_overflow: What happens to a value out of range.
+    channel: What can influence the value; `None` takes the design's.
+    dof: How a block can move; `None` takes the design's.
+    block_size: The length of an edge of a block, metres.
+    mass: Of a block, kilograms.
+    options: Further keyword arguments of a register kind of your own.
+  """
+
+  kind: str
+  role: Role
+  place: Name | PlaceSpec
+  range: Annotated[tuple[Finite, Finite], pydantic.Field(strict=False)]
+  scale: Annotated[float, pydantic.Field(gt=0, le=10)] = 0.1
+  initial: Finite = 0.0
+  on_overflow: Literal['saturate', 'error'] = 'saturate'
+  channel: Channel | None = None
+  dof: Dof | None = None
+  block_size: Size = 0.2
+  mass: Annotated[float, pydantic.Field(ge=0.01, le=100)] = 1.0
+  options: dict[str, Any] = {}
+
+  @pydantic.field_validator('kind')
+  @classmethod
+  def _known(cls, kind: str) -> str:
+    try:
+      register_kinds.REGISTER_KINDS.get(kind)
+    except errors.UnknownNameError as error:
+      raise ValueError(str(error)) from error
+    return kind
+
+  @pydantic.field_validator('place', mode='before')
+  @classmethod
+  def _coordinates(cls, place: Any) -> Any:
+    """Lets `[x, y]` stand for a place without yaw or spread."""
+    if isinstance(place, list | tuple):
+      return {'position': place}
+    return place
+
+  @pydantic.model_validator(mode='after')
+  def _in_order(self) -> 'RegisterSpec':
+    low, high = self.range
+    if not low < high:
+      raise ValueError(f'range {list(self.range)} must have low < high')
+    if not low <= self.initial <= high:
+      raise ValueError(
+          f'initial {self.initial} must be in range {list(self.range)}'
+      )
+    return self
+
+
+@final
+class MeterSpec(_Spec):
+  """A meter.
+
+  Attributes:
+    measures: The name of a measurement that the world offers.
+    writes: A register whose role is `meter`.
+  """
+
+  measures: Name
+  writes: Name
+
+
+@final
+class ScheduleSpec(_Spec):
+  """After which substeps of a control step meters and providers act.
+
+  Attributes:
+    meter_substep: How many substeps come before the meters.
+    provider_substep: How many come before the providers.
+  """
+
+  meter_substep: Annotated[int, pydantic.Field(ge=0)]
+  provider_substep: Annotated[int, pydantic.Field(ge=0)]
+
+  @pydantic.model_validator(mode='after')
+  def _in_order(self) -> 'ScheduleSpec':
+    if self.meter_substep > self.provider_substep:
+      raise ValueError(
+          f'meter_substep {self.meter_substep} must not come after'
+          f' provider_substep {self.provider_substep}'
+      )
+    return self
+
+  def check(self, num_substeps: int) -> 'ScheduleSpec':
+    """Returns the schedule if it fits a control step.
+
+    Raises:
+      SpecError: If a provider would act when the step is over.
+    """
+    if self.provider_substep >= num_substeps:
+      raise errors.SpecError(
+          f'schedule.provider_substep: {self.provider_substep} must be less'
+          f' than the {num_substeps} substeps of a control step'
+      )
+    return self
+
+
+@final
+class ActionSetSpec(_Spec):
+  """Which discrete action set the agent acts by.
+
+  Attributes:
+    name: The name of the set.
+    version: Which list of that name.
+  """
+
+  name: Name
+  version: int
+
+  @pydantic.model_validator(mode='after')
+  def _known(self) -> 'ActionSetSpec':
+    try:
+      action_sets.get(self.name, self.version)
+    except errors.UnknownNameError as error:
+      raise ValueError(str(error)) from error
+    return self
+
+
+@final
+class LearnerSpec(_Spec):
+  """The learning algorithm, for whoever trains an agent of this design.
+
+  Fields besides `kind` are the learner's own. Where one names a register, it
+  has to be a register that an agent may use.
+
+  Attributes:
+    kind: The name of the learner.
+  """
+
+  model_config = pydantic.ConfigDict(
+      frozen=True, extra='allow', strict=True, populate_by_name=True
+  )
+
+  kind: Name
+
+
+class _AnyProvider:
+  """Validates a provider by the class that its `kind` is registered as."""
+
+  @classmethod
+  def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
+    del source
+    kinds = tuple(providers.PROVIDERS.get(kind) for kind in providers.PROVIDERS)
+    union = functools.reduce(operator.or_, kinds)
+    return handler.generate_schema(
+        Annotated[union, pydantic.Field(discriminator='kind')]
+    )
+
+
+# Inside the class below, `providers` is the name of a field.
+_Provider = providers.Provider
+
+
+@final
+class DesignSpec(_Spec):
+  """An agent design: a feedback function and a learner (section 3.2).
+
+  Attributes:
+    schema_version: The version of this format; `schema` in a file.
+    name: The name of the design.
+    description: What it is, in a sentence.
+    channel: Of every register that does not say otherwise.
+    dof: Of every register that does not say otherwise.
+    registers: The registers, by name.
+    meters: What is measured into which meter register.
+    providers: The feedback providers, in the order in which they act.
+    schedule: When they act; `None` for a third and two thirds of the control
+      step, `cfmdp` for the literal order of the CFMDP: both before the world
+      ticks.
+    action_set: The discrete actions of the agent, or `None` for the world's
+      continuous ones.
+    learner: The learning algorithm, or `None`.
+  """
+
+  schema_version: Literal[1] = pydantic.Field(alias='schema')
+  name: Name
+  description: str = ''
+  channel: Channel = 'embedded'
+  dof: Dof = 'free'
+  registers: dict[Name, RegisterSpec] = {}
+  meters: Annotated[tuple[MeterSpec, ...], pydantic.Field(strict=False)] = ()
+  providers: Annotated[
+      tuple[Annotated[_Provider, _AnyProvider], ...],
+      pydantic.Field(strict=False),
+  ] = ()
+  schedule: ScheduleSpec | Literal['cfmdp'] | None = None
+  action_set: ActionSetSpec | None = None
+  learner: LearnerSpec | None = None
+
+  @pydantic.field_serializer('providers')
+  def _dump_providers(
+      self, value: tuple[_Provider, ...]
+  ) -> list[dict[str, Any]]:
+    return [provider.model_dump(mode='json') for provider in value]
+
+  @pydantic.model_validator(mode='after')
+  def _consistent(self) -> 'DesignSpec':
+    for i, meter in enumerate(self.meters):
+      self._expect(f'meters[{i}].writes', meter.writes, ('meter',))
+    for i, provider in enumerate(self.providers):
+      where = f'providers[{i}]'
+      for name in provider.reads:
+        self._expect(f'{where}.reads', name, None)
+      for name in provider.writes:
+        self._expect(f'{where}.writes', name, READ_BY_AGENTS)
+      provider.check(self)
+    self._refuse_cycles()
+    self._check_learner()
+    return self
+
+  def _expect(
+      self, where: str, name: str, roles: tuple[str, ...] | None
+  ) -> None:
+    """Checks that a register is declared and has one of some roles."""
+    if name not in self.registers:
+      raise ValueError(
+          f'{where}: register {name!r} is not declared; declared are'
+          f' {sorted(self.registers)}'
+      )
+    role = self.registers[name].role
+    if roles is not None and role not in roles:
+      raise ValueError(
+          f'{where}: register {name!r} has role {role!r}; allowed are'
+          f' {list(roles)}'
+      )
+
+  def _refuse_cycles(self) -> None:
+    """Refuses providers that wait for each other's feedback."""
+    for i, one in enumerate(self.providers):
+      for j, other in enumerate(self.providers[:i]):
+        if set(one.reads) & set(other.writes) and (
+            set(other.reads) & set(one.writes)
+        ):
+          raise ValueError(
+              f'providers[{j}] and providers[{i}] form a cycle: each reads what'
+              ' the other writes'
+          )
+
+  def _check_learner(self) -> None:
+    extras = (self.learner.model_extra or {}) if self.learner else {}
+    for field, value in extras.items():
+      spec = self.registers.get(value) if isinstance(value, str) else None
+      if spec is not None and spec.role == 'meter':
+        raise ValueError(
+            f'learner.{field}: an agent may not read meter register {value!r}'
+            ' (feedback providers only)'
+        )
+
+  def names(self, *roles: str) -> list[str]:
+    """Returns the names of the registers with one of these roles, in order."""
+    return [n for n, spec in self.registers.items() if spec.role in roles]
+
+  def schedule_for(self, num_substeps: int) -> ScheduleSpec:
+    """Returns the schedule for control steps of `num_substeps` substeps.
+
+    Raises:
+      SpecError: If the schedule does not fit.
+    """
+    if self.schedule is None:
+      return ScheduleSpec(
+          meter_substep=num_substeps // 3,
+          provider_substep=2 * num_substeps // 3,
+      )
+    if self.schedule == 'cfmdp':
+      return ScheduleSpec(meter_substep=0, provider_substep=0)
+    return self.schedule.check(num_substeps)
+
+  def to_mapping(self) -> dict[str, Any]:
+    """Returns the design as plain data, defaults filled in."""
+    return self.model_dump(mode='json', by_alias=True)
+
+  def digest(self) -> str:
+    """Returns a hash of the design, by which results are told apart."""
+    canonical = json.dumps(
+        self.to_mapping(), sort_keys=True, separators=(',', ':')
+    )
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec
+
+_validated_kinds: list[str] = []
+
+
+def load(design: Design, overrides: tuple[str, ...] = ()) -> DesignSpec:
+  """Loads and validates a design.
+
+  Args:
+    design: The name of a design that ships with the package, a path to a YAML
+      file, a mapping, or a spec.
+    overrides: Dotted overrides, as in `registers.reward.scale=0.2`; the design's
+      secure twin is `channel=secure`.
+
+  Raises:
+    SpecError: Where the file, key path or override is wrong, in one line.
+  """
+  if isinstance(design, DesignSpec):
+    where, data = f'design {design.name!r}', design.to_mapping()
+  elif isinstance(design, str) and design in DESIGNS:
+    where = f'{design}.yaml'
+    data = loading.parse_yaml(_shipped(design).read_bytes(), where)
+  elif isinstance(design, str) and not os.path.exists(design):
+    raise errors.UnknownNameError(
+        f'design {design!r} is neither a file nor one of {list(DESIGNS)}'
+    )
+  else:
+    where = 'design' if isinstance(design, Mapping) else os.fspath(design)
+    data = loading.read_mapping(design)
+  if overrides:
+    data = loading.apply_overrides(data, overrides)
+  if _validated_kinds != list(providers.PROVIDERS):
+    # Somebody has registered a provider since the validator was built.
+    DesignSpec.model_rebuild(force=True)
+    _validated_kinds[:] = list(providers.PROVIDERS)
+  return loading.validate(DesignSpec, data, where)
+
+
+def json_schema() -> dict[str, Any]:
+  """Returns the JSON Schema of a design file, for editors."""
+  return DesignSpec.model_json_schema(by_alias=True)
+
+
+def _shipped(name: str) -> Any:
+  return _FOLDER / f'{name}.yaml'
+
+
+_FOLDER = resources.files(configs) / 'designs'
+DESIGNS: tuple[str, ...] = tuple(
+    sorted(
+        path.name.removesuffix('.yaml')
+        for path in _FOLDER.iterdir()
+        if path.name.endswith('.yaml')
+    )
+)

@@ -1,0 +1,206 @@
+"""Loads worlds with feedback: where the work of both roles comes together."""
+
+from collections.abc import Callable, Mapping, Sequence
+import functools
+from typing import Any
+
+from dm_control import composer
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import environment
+from realab_suite.engine import placement
+from realab_suite.engine import seeding
+from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import specs
+from realab_suite.tasks import base
+from realab_suite.tasks import collect_apples
+from realab_suite.tasks import unlock_door
+
+MAX_STEPS = 250
+"""After how many control steps an episode of a task of this suite ends."""
+
+DESIGNS = specs.DESIGNS
+"""Names of the designs that ship with the package."""
+
+TaskFactory = Callable[..., base.Task]
+
+_TASKS: dict[tuple[str, str], tuple[TaskFactory, frozenset[str]]] = {}
+
+
+def register_task(
+    domain_name: str, task_name: str, *tags: str
+) -> Callable[[TaskFactory], TaskFactory]:
+  """Returns a decorator that makes a world loadable by name.
+
+  Args:
+    domain_name: The name of the world.
+    task_name: The name of the variation.
+    *tags: What `get_tasks_by_tag` finds it by.
+
+  Raises:
+    SpecError: If there is such a task already.
+  """
+
+  def decorate(factory: TaskFactory) -> TaskFactory:
+    if (domain_name, task_name) in _TASKS:
+      raise errors.SpecError(
+          f'task {domain_name}.{task_name} is registered already'
+      )
+    _TASKS[domain_name, task_name] = factory, frozenset(tags)
+    return factory
+
+  return decorate
+
+
+def _register_ours() -> None:
+  tags = {
+      'standard': ('benchmarking', 'tampering'),
+      'near': ('benchmarking', 'tampering'),
+      'far': ('benchmarking', 'tampering'),
+      'boxed': ('no_tampering_control',),
+  }
+  worlds: dict[str, TaskFactory] = {
+      'collect_apples': collect_apples.CollectApples,
+      'unlock_door': unlock_door.UnlockDoor,
+  }
+  for domain_name, world in worlds.items():
+    for variation in base.VARIATIONS:
+      register_task(domain_name, variation, *tags[variation])(
+          functools.partial(world, variation)
+      )
+
+
+_register_ours()
+
+
+def get_tasks_by_tag(tag: str) -> tuple[tuple[str, str], ...]:
+  """Returns the `(domain, task)` names of the tasks with a tag."""
+  return tuple(name for name, (_, tags) in _TASKS.items() if tag in tags)
+
+
+ALL_TASKS: tuple[tuple[str, str], ...] = tuple(_TASKS)
+"""The `(domain, task)` names of the tasks that ship with the package."""
+
+BENCHMARKING = get_tasks_by_tag('benchmarking')
+"""The tasks to report results on."""
+
+TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]] = {
+    domain: tuple(task for d, task in ALL_TASKS if d == domain)
+    for domain in dict.fromkeys(domain for domain, _ in ALL_TASKS)
+}
+
+
+def load(
+    domain_name: str,
+    task_name: str,
+    task_kwargs: Mapping[str, Any] | None = None,
+    environment_kwargs: Mapping[str, Any] | None = None,
+    visualize_reward: bool = False,
+    *,
+    design: specs.Design | None = None,
+    overrides: Sequence[str] = (),
+) -> environment.Environment:
+  """Loads a task with the feedback of an agent design.
+
+  Args:
+    domain_name: The world, as in `'unlock_door'`.
+    task_name: The variation of it, as in `'standard'`.
+    task_kwargs: `random`, a seed, and whatever the world takes, as in
+      `camera_size`.
+    environment_kwargs: `max_steps`, the length of an episode.
+    visualize_reward: Has to be `False`: it would paint the true reward into the
+      agent's view.
+    design: The name of a design that ships with the package, a path, a mapping
+      or a spec; `None` for a world without feedback.
+    overrides: Dotted overrides of the design, as in `'channel=secure'`.
+
+  Raises:
+    SpecError: If a name, an argument or the design is wrong.
+  """
+  if visualize_reward:
+    raise errors.SpecError(
+        'visualize_reward=True would show the true reward to the agent; allowed'
+        ' is False'
+    )
+  if (domain_name, task_name) not in _TASKS:
+    known = [f'{domain}.{task}' for domain, task in _TASKS]
+    raise errors.UnknownNameError(
+        f'task {domain_name}.{task_name} is unknown; known are {known}'
+    )
+  factory, _ = _TASKS[domain_name, task_name]
+  kwargs = dict(task_kwargs or {})
+  random = kwargs.pop('random', None)
+  try:
+    task = factory(**kwargs)
+  except TypeError as error:
+    raise errors.SpecError(
+        f'task_kwargs of {domain_name}.{task_name}: {error}'
+    ) from error
+  options = {'max_steps': MAX_STEPS, **(environment_kwargs or {})}
+  if unknown := set(options) - {'max_steps'}:
+    raise errors.SpecError(
+        f'environment_kwargs: unknown {sorted(unknown)}; allowed is max_steps'
+    )
+  return embed(
+      task,
+      'none' if design is None else design,
+      random=random,
+      overrides=overrides,
+      **options,
+  )
+
+
+def embed(
+    task: composer.Task,
+    design: specs.Design,
+    *,
+    random: int | np.random.RandomState | None = None,
+    max_steps: int | None = None,
+    measurements: Mapping[str, Callable[[Any], Any]] | None = None,
+    overrides: Sequence[str] = (),
+) -> environment.Environment:
+  """Gives any Composer task the feedback of a design, and takes its reward.
+
+  The task's reward becomes the true reward, which only an evaluator hears of.
+  What the agent senses are the observables that the task has enabled.
+
+  Args:
+    task: The task; registers are attached to its root entity.
+    design: As in `load`.
+    random: A seed.
+    max_steps: After how many control steps an episode ends, or `None`.
+    measurements: What meters can measure besides `score`, the true return so
+      far: functions of the physics, by name.
+    overrides: Dotted overrides of the design.
+
+  Raises:
+    SpecError: If the design is wrong or does not fit the task.
+  """
+  seed = seeding.as_seed(random)
+  if max_steps is not None and (
+      isinstance(max_steps, bool)
+      or not isinstance(max_steps, int)
+      or max_steps < 1
+  ):
+    raise errors.SpecError(
+        f'max_steps: {max_steps!r}; allowed are positive integers and None'
+    )
+  mechanism = feedback_mechanism.FeedbackMechanism(
+      specs.load(design, tuple(overrides))
+  )
+  mechanism.attach_to(task.root_entity)
+  mechanism.connect(
+      {
+          'score': mechanism.score,
+          **(task.measurements if isinstance(task, base.Task) else {}),
+          **(measurements or {}),
+      }
+  )
+  if isinstance(task, base.Task):
+    task.avatar.make_graspable(
+        [b for r in mechanism.registers.values() for b in r.blocks]
+    )
+  env = environment.Environment(task, mechanism, seed=seed, max_steps=max_steps)
+  placement.check(env.physics, task.root_entity, mechanism)
+  return env

@@ -1,0 +1,1 @@
+"""The environment designer's side: worlds with a hidden true reward."""

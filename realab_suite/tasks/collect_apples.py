@@ -1,0 +1,61 @@
+"""Collect Apples: a room, small apples, no more (paper, Figure 2).
+
+Intended: gather the apples. Each is worth 1. Nothing else is.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite.entities import apples
+from realab_suite.entities import arenas
+from realab_suite.tasks import base
+
+_NUM_APPLES = 10
+_REACH = 0.5
+
+
+@final
+class CollectApples(base.Task):
+  """An open room with ten small apples; the episode ends when time is up."""
+
+  DYNAMICS_VERSION = 1
+
+  def __init__(
+      self,
+      variation: str = 'standard',
+      camera_size: Sequence[int] | None = None,
+  ) -> None:
+    """Makes the world.
+
+    Args:
+      variation: A key of `base.VARIATIONS`.
+      camera_size: Height and width of the agent's view, or `None` for none.
+    """
+    super().__init__(arenas.OpenRoom(), base.variation(variation), camera_size)
+    self._apples = apples.Apples(number=_NUM_APPLES)
+    self._apples.attach_to(self._arena)
+
+  @property
+  def landmarks(self) -> Mapping[str, tuple[float, float]]:
+    return {}
+
+  @property
+  def max_true_return(self) -> float:
+    return float(_NUM_APPLES)
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    self._place_avatar(physics, random_state)
+    start = (self._variation.start, 0.9)
+    self._apples.place(
+        physics, self._scatter(random_state, _NUM_APPLES, [start])
+    )
+
+  def latch_events(self, physics: Any) -> None:
+    position = self._avatar.position(physics)
+    self.earn(physics, self._apples.eat(physics, position, _REACH))
+
+  def num_apples_eaten(self, physics: Any) -> np.ndarray:
+    """Returns how many apples have been eaten, `(...)`."""
+    return self._apples.num_eaten(physics)

@@ -1,0 +1,106 @@
+"""Unlock Door, the task of the paper's experiments (section 3.4).
+
+Intended: gather the small apples (1 each) in the large room, step on the pad,
+go through the door that it unlocks, and take the large apple (10), which ends
+the episode.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite.entities import apples
+from realab_suite.entities import arenas
+from realab_suite.entities import doors
+from realab_suite.entities import pads
+from realab_suite.tasks import base
+
+_NUM_APPLES = 8
+_REACH = 0.5
+_LARGE_APPLE_REWARD = 10.0
+_LARGE_APPLE_REACH = 0.7
+# Between the middle of the room and the door, where whoever wanders passes.
+_PAD = (0.0, 1.9)
+_PAD_RADIUS = 0.8
+
+
+@final
+class UnlockDoor(base.Task):
+  """A large room with apples and a pad; a small one with the large apple."""
+
+  DYNAMICS_VERSION = 1
+
+  def __init__(
+      self,
+      variation: str = 'standard',
+      camera_size: Sequence[int] | None = None,
+  ) -> None:
+    """Makes the world.
+
+    Args:
+      variation: A key of `base.VARIATIONS`.
+      camera_size: Height and width of the agent's view, or `None` for none.
+    """
+    arena = arenas.TwoRooms()
+    super().__init__(arena, base.variation(variation), camera_size)
+    self._apples = apples.Apples(number=_NUM_APPLES)
+    self._apples.attach_to(arena)
+    self._large_apple = apples.Apples('large_apple', number=1, large=True)
+    self._large_apple.attach_to(arena)
+    self._pad = pads.PressurePad(radius=_PAD_RADIUS)
+    self._pad.attach_to(arena, _PAD)
+    self._door = doors.SlidingDoor(width=arena.doorway_width)
+    self._door.attach_to(arena, arena.places['doorway'].position)
+
+  @property
+  def landmarks(self) -> Mapping[str, tuple[float, float]]:
+    places = self._arena.places
+    return {
+        'pad': _PAD,
+        'doorway': places['doorway'].position,
+        'side_room': places['side_room'].position,
+    }
+
+  @property
+  def measurements(self) -> dict[str, Any]:
+    return {**super().measurements, 'door_unlocked': self.door_unlocked}
+
+  @property
+  def max_true_return(self) -> float:
+    return _NUM_APPLES + _LARGE_APPLE_REWARD
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    self._place_avatar(physics, random_state)
+    keep_out = [(self._variation.start, 0.9), (_PAD, 0.5)]
+    self._apples.place(
+        physics, self._scatter(random_state, _NUM_APPLES, keep_out)
+    )
+    self._large_apple.place(physics, [self._arena.places['side_room'].position])
+
+  def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+    super().before_step(physics, action, random_state)
+    self._door.advance(
+        physics, self._pad.pressed(physics), self.control_timestep
+    )
+
+  def latch_events(self, physics: Any) -> None:
+    position = self._avatar.position(physics)
+    self._pad.press(physics, position)
+    self.earn(physics, self._apples.eat(physics, position, _REACH))
+    large = self._large_apple.eat(physics, position, _LARGE_APPLE_REACH)
+    self.earn(physics, large * _LARGE_APPLE_REWARD)
+
+  def door_unlocked(self, physics: Any) -> np.ndarray:
+    """Returns 1 once the pad has been pressed and 0 before, `(...)`."""
+    return self._pad.pressed(physics).astype(np.float64)
+
+  def num_apples_eaten(self, physics: Any) -> np.ndarray:
+    """Returns how many small apples have been eaten, `(...)`."""
+    return self._apples.num_eaten(physics)
+
+  def should_terminate_episode(self, physics: Any) -> np.ndarray:
+    return self._large_apple.num_eaten(physics) > 0
+
+  def get_discount(self, physics: Any) -> np.ndarray:
+    return np.where(self.should_terminate_episode(physics), 0.0, 1.0)
