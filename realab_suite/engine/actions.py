@@ -37,8 +37,8 @@ class ActionCodec:
     names = [f'query/{spec.name}' for spec in query_specs]
     low = [float(spec.minimum) for spec in query_specs]
     high = [float(spec.maximum) for spec in query_specs]
-    shape = (self._num_queries + control_spec.shape[0],)
-    dtype = np.dtype(np.float64)
+    shape: tuple[int, ...] = (self._num_queries + control_spec.shape[0],)
+    dtype: np.dtype[Any] = np.dtype(np.float64)
     if action_set is None:
       names += (control_spec.name or '').split('\t')
       low += list(np.broadcast_to(control_spec.minimum, control_spec.shape))

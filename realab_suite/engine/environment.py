@@ -54,6 +54,7 @@ class Environment(composer.Environment):
       world: Which world of a batch this is.
       max_steps: After how many control steps an episode is cut off, or `None`.
     """
+    self._physics: engine_physics.Physics
     self._mechanism = mechanism
     self._seed, self._world, self._episode = seed, world, -1
     self._max_steps = max_steps
@@ -179,11 +180,11 @@ class Environment(composer.Environment):
         for i in range(len(providers))
     ]
     self._provider_states = self._mechanism.initial_states(())
-    writes = self._mechanism.initial_writes(self._physics)
-    reads = self._observe()
+    records: list[Any] = [*self._mechanism.initial_writes(self._physics)]
+    records += self._observe()
     self._reset_next_step = False
     self._episode_is_open = True
-    start = events.Start(self._seed, self._world, self._episode, writes, reads)
+    start = events.Start(self._seed, self._world, self._episode, records)
     for sink in self._sinks:
       sink.episode_started(start, self._physics_proxy)
     return dm_env.restart(self._copy_of_observation())
@@ -252,20 +253,20 @@ class Environment(composer.Environment):
     n, schedule = self._n_sub_steps, self._schedule
     self._hooks.before_step(physics, controls, self._random_state)
     self._senses.begin_step()
-    writes = mechanism.write_queries(physics, queries)
+    records: list[Any] = [*mechanism.write_queries(physics, queries)]
 
     self._advance(schedule.meter_substep, controls)
-    writes += mechanism.update_meters(physics)
+    records += mechanism.update_meters(physics)
 
     self._advance(schedule.provider_substep - schedule.meter_substep, controls)
     step = int(mechanism.step_count(physics))
-    reads, feedback, self._provider_states = mechanism.update_providers(
+    feedback, self._provider_states = mechanism.update_providers(
         physics,
         self._copy_of_observation(),
         [seeding.step_key(key, step) for key in self._provider_keys],
         self._provider_states,
     )
-    writes += feedback
+    records += feedback
 
     self._advance(n - schedule.provider_substep, controls)
     self._hooks.after_step(physics, self._random_state)
@@ -274,8 +275,8 @@ class Environment(composer.Environment):
     discount = float(self._task.get_discount(physics))
     terminated = bool(self._task.should_terminate_episode(physics))
     mechanism.end_step(physics, reward)
-    reads += self._observe()
-    return events.Step(writes, reads, np.array(reward)), discount, terminated
+    records += self._observe()
+    return events.Step(records, np.array(reward)), discount, terminated
 
   def _advance(self, num_substeps: int, controls: np.ndarray) -> None:
     """Steps the physics, and latches what has happened."""

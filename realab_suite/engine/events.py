@@ -9,6 +9,8 @@ import numpy as np
 
 from realab_suite.feedback import mechanism
 
+Records = Sequence[mechanism.Write | mechanism.Read]
+
 
 @final
 class End(enum.Enum):
@@ -29,15 +31,13 @@ class Start(NamedTuple):
     seed: The seed of the environment.
     world: Which world of a batch; 0 for one alone.
     episode: The number of the episode, from 0.
-    writes: What was written to registers at the reset.
-    reads: What the agent read then.
+    records: What was written to registers and read off them at the reset.
   """
 
   seed: int
   world: int
   episode: int
-  writes: Sequence[mechanism.Write]
-  reads: Sequence[mechanism.Read]
+  records: Records
 
 
 @final
@@ -45,13 +45,11 @@ class Step(NamedTuple):
   """A control step.
 
   Attributes:
-    writes: Every write to a register, in order.
-    reads: Every read, in order; the agent's come last.
+    records: Every write to a register and every read, in the order of time.
     true_reward: The true reward of the step, `(...)`.
   """
 
-  writes: Sequence[mechanism.Write]
-  reads: Sequence[mechanism.Read]
+  records: Records
   true_reward: np.ndarray
 
 

@@ -24,13 +24,15 @@ class Senses(abc.ABC):
   def sense(self, physics: Any) -> dict[str, np.ndarray]:
     """Returns what is sensed now; the arrays are the caller's."""
 
-  def restart(self, physics: Any, random_state: Any) -> None:
+  def restart(  # noqa: B027 - most senses need not know.
+      self, physics: Any, random_state: Any
+  ) -> None:
     """Begins an episode."""
 
-  def begin_step(self) -> None:
+  def begin_step(self) -> None:  # noqa: B027 - most senses need not know.
     """Begins a control step."""
 
-  def end_substep(self) -> None:
+  def end_substep(self) -> None:  # noqa: B027 - most senses need not know.
     """Ends a substep, in worlds that ask for it."""
 
 

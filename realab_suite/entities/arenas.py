@@ -160,11 +160,11 @@ class RoomArena(composer.Arena):
       end: Sequence[float],
       height: float,
   ) -> None:
-    start, end = np.array(start, float), np.array(end, float)
-    half = np.abs(end - start) / 2 + _WALL_THICKNESS / 2
+    line = np.array([start, end], float)
+    half = np.ptp(line, axis=0) / 2 + _WALL_THICKNESS / 2
     self._mjcf_root.worldbody.add(
         'geom', name=name, type='box', size=(*half, height / 2),
-        pos=(*(start + end) / 2, height / 2), **appearance.looks(kind)
+        pos=(*line.mean(axis=0), height / 2), **appearance.looks(kind)
     )  # fmt: skip
 
   def _add_room(

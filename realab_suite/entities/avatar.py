@@ -149,7 +149,7 @@ class Avatar(composer.Entity):
         self._rays,
         self._body.add('site', name='rays', pos=(0, 0, _RAY_HEIGHT), group=4),
     )
-    self._blocks: list[block_kinds.Block] = []
+    self._blocks: list[block_kinds.JointedBlock] = []
     self._grasps: list[mjcf.Element] = []
 
   def _add_actuators(self, speed: float, turn_rate: float) -> None:
@@ -212,7 +212,7 @@ class Avatar(composer.Entity):
     """
     root = self._mjcf_root.root_model
     for block in blocks:
-      if block.site is None:
+      if not isinstance(block, block_kinds.JointedBlock):
         continue
       # Between two sites, a held block can turn; a weld would lock the yaw of
       # an avatar that holds a block which cannot.
@@ -267,7 +267,7 @@ class Avatar(composer.Entity):
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
   def velocity(self, physics: Any) -> np.ndarray:
-    """Returns forward, leftward (m/s) and turning (rad/s) velocity, `(..., 3)`."""
+    """Returns velocity forward, to the left (m/s) and about (rad/s), `(..., 3)`."""
     x, y = np.moveaxis(physics.bind(self._slides).qvel, -1, 0)
     angle = self.angle(physics)
     cos, sin = np.cos(angle), np.sin(angle)
@@ -280,7 +280,8 @@ class Avatar(composer.Entity):
 
   def holding(self, physics: Any) -> np.ndarray:
     """Returns 1 where the hand holds a block and 0 elsewhere, `(..., 1)`."""
-    return self._held(physics).any(axis=-1, keepdims=True).astype(np.float64)
+    held = self._held(physics).any(axis=-1, keepdims=True)
+    return np.asarray(held, np.float64)
 
   def _held(self, physics: Any) -> np.ndarray:
     """Which block the hand holds, `(..., blocks)`, bool."""

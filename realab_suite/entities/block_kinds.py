@@ -16,8 +16,8 @@ import numpy as np
 
 from realab_suite.entities import moving
 
-# Contacts keep MuJoCo's own stiffness: with softer ones a block takes so long to
-# settle after a write that its value drifts (3e-8 m measured, 2e-15 as it is).
+# Contacts keep MuJoCo's own stiffness: with softer ones a block takes so long
+# to settle after a write that its value drifts (3e-8 m, 2e-15 as it is).
 _CONTACT = {'friction': (0.8, 0.01, 0.001)}
 # The height at which an avatar carries a block, metres.
 GRIP_HEIGHT = 0.2
@@ -43,11 +43,6 @@ class Block(abc.ABC):
   @abc.abstractmethod
   def geom(self) -> mjcf.Element:
     """The cube."""
-
-  @property
-  @abc.abstractmethod
-  def site(self) -> mjcf.Element | None:
-    """What a hand takes hold of, or `None` if nothing can move the block."""
 
   @property
   @abc.abstractmethod
@@ -86,7 +81,7 @@ class Block(abc.ABC):
       physics.bind(self._grasps).active = 0
 
 
-class _JointedBlock(Block):
+class JointedBlock(Block):
   """A block that hangs from joints of its own in its register's model.
 
   A free joint would be simpler, but MuJoCo only accepts free joints on children
@@ -145,6 +140,7 @@ class _JointedBlock(Block):
 
   @property
   def site(self) -> mjcf.Element:
+    """What a hand takes hold of."""
     return self._site
 
   def launch(self, physics: Any, velocity: np.ndarray, where: Any) -> None:
@@ -173,7 +169,7 @@ class _JointedBlock(Block):
 
 
 @final
-class FreeBlock(_JointedBlock):
+class FreeBlock(JointedBlock):
   """A block that can be pushed, lifted, carried, thrown and toppled."""
 
   def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -216,8 +212,8 @@ class FreeBlock(_JointedBlock):
 
 
 @final
-class PlanarBlock(_JointedBlock):
-  """A block that slides and turns on the floor: cheaper, never off the floor."""
+class PlanarBlock(JointedBlock):
+  """A block that slides and turns on the floor: cheaper, and never off it."""
 
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
@@ -299,10 +295,6 @@ class MocapBlock(Block):
     return self._part.geoms[0]
 
   @property
-  def site(self) -> None:
-    return None
-
-  @property
   def rest_height(self) -> float:
     return self._half_size
 
@@ -318,7 +310,7 @@ class MocapBlock(Block):
     """
     self._origin = np.array([*position, 0.0])
     self._yaw = yaw
-    frame = self._part.attach_to(root, self._to_world(self._rest))
+    frame = self._part.attach_to(root, list(self._to_world(self._rest)))
     frame.quat = _quaternion(yaw)
 
   def position(self, physics: Any) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A sense of what is around: rays that report distance and class. Needs no GL."""
+"""A sense of what is around: rays that tell distance and class. Needs no GL."""
 
 from collections.abc import Sequence
 import functools
@@ -20,7 +20,7 @@ def cast(
     directions: np.ndarray,
     excluded_body: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Casts rays; an engine of many worlds registers an implementation of its own.
+  """Casts rays; an engine of many worlds registers its own implementation.
 
   Args:
     physics: One world.
@@ -94,7 +94,7 @@ class RaySense(composer.Entity):
     # From left to right, as in a picture.
     self._angles = np.linspace(half, -half, num_rays)
     self._max_distance = max_distance
-    self._class_of_geom: np.ndarray | None = None
+    self._class_of_geom = np.zeros(0, np.int32)
     self._model: Any = None
 
   def _build_observables(self) -> RayObservables:

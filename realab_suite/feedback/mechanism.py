@@ -177,7 +177,7 @@ class FeedbackMechanism(composer.Entity):
       observation: providers.Observation,
       keys: Sequence[np.ndarray],
       states: Sequence[Any],
-  ) -> tuple[list[Read], list[Write], list[Any]]:
+  ) -> tuple[list[Write | Read], list[Any]]:
     """Lets every provider read, think and write, in the design's order.
 
     Args:
@@ -187,7 +187,7 @@ class FeedbackMechanism(composer.Entity):
       states: The state of each provider.
 
     Returns:
-      What was read, what was written, and the next states.
+      What was read and written, in order, and the next states.
 
     Raises:
       FeedbackProviderError: If a provider raises, or writes something else than
@@ -195,7 +195,8 @@ class FeedbackMechanism(composer.Entity):
       RegisterValueError: If a register cannot store what a provider wrote.
     """
     step = self._step_count.get(physics)
-    reads, writes, next_states = [], [], []
+    records: list[Write | Read] = []
+    next_states = []
     for i, provider in enumerate(self._design.providers):
       writer = f'providers[{i}]:{provider.kind}'
       seen = [self._read(physics, name, writer) for name in provider.reads]
@@ -209,7 +210,7 @@ class FeedbackMechanism(composer.Entity):
             f'{writer} at step {_first(step)}: {type(error).__name__}: {error}'
         ) from error
       _check_writes(writer, provider, values, np.shape(step))
-      reads += seen
+      records += seen
       for name in provider.writes:
         try:
           write = _write(
@@ -219,9 +220,9 @@ class FeedbackMechanism(composer.Entity):
           raise errors.RegisterValueError(
               f'{writer} at step {_first(step)}: {error}'
           ) from error
-        writes.append(write)
+        records.append(write)
       next_states.append(next_state)
-    return reads, writes, next_states
+    return records, next_states
 
   def read_for_agent(self, physics: Any) -> list[Read]:
     """Reads the registers that the agent may read: the observed feedback."""

@@ -20,4 +20,4 @@ def uniform(key: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
   """
   flat = key.reshape(-1, 2)
   draws = np.stack([generator(one).random(shape) for one in flat])
-  return draws.reshape(*key.shape[:-1], *shape)
+  return draws.reshape((*key.shape[:-1], *shape))

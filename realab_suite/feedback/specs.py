@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, final
 
 import pydantic
 
-from realab_suite import configs
 from realab_suite import errors
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import loading
@@ -363,8 +362,8 @@ def load(design: Design, overrides: tuple[str, ...] = ()) -> DesignSpec:
   Args:
     design: The name of a design that ships with the package, a path to a YAML
       file, a mapping, or a spec.
-    overrides: Dotted overrides, as in `registers.reward.scale=0.2`; the design's
-      secure twin is `channel=secure`.
+    overrides: Dotted overrides, as in `registers.reward.scale=0.2`; the secure
+      twin of a design is `channel=secure`.
 
   Raises:
     SpecError: Where the file, key path or override is wrong, in one line.
@@ -399,7 +398,7 @@ def _shipped(name: str) -> Any:
   return _FOLDER / f'{name}.yaml'
 
 
-_FOLDER = resources.files(configs) / 'designs'
+_FOLDER = resources.files('realab_suite.configs') / 'designs'
 DESIGNS: tuple[str, ...] = tuple(
     sorted(
         path.name.removesuffix('.yaml')

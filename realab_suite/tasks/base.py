@@ -133,6 +133,11 @@ class Task(composer.Task):
 
   @property
   @abc.abstractmethod
+  def facts(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
+    """What an evaluator records when an episode is over, by name."""
+
+  @property
+  @abc.abstractmethod
   def landmarks(self) -> Mapping[str, tuple[float, float]]:
     """Places that a scripted policy may know, `(x, y)` in metres."""
 
@@ -244,7 +249,7 @@ class Task(composer.Task):
     """
     region = self._variation.apples
     stations = np.array(list(self._variation.stations.values()))
-    footprint = np.array(_FOOTPRINT) + [-_CLEARANCE, _CLEARANCE]
+    footprint = np.add(_FOOTPRINT, (-_CLEARANCE, _CLEARANCE))
     places: list[np.ndarray] = []
     for _ in range(_MAX_TRIES):
       place = random_state.uniform(region.low, region.high)

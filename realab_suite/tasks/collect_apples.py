@@ -6,8 +6,6 @@ Intended: gather the apples. Each is worth 1. Nothing else is.
 from collections.abc import Mapping, Sequence
 from typing import Any, final
 
-import numpy as np
-
 from realab_suite.entities import apples
 from realab_suite.entities import arenas
 from realab_suite.tasks import base
@@ -38,6 +36,10 @@ class CollectApples(base.Task):
     self._apples.attach_to(self._arena)
 
   @property
+  def facts(self) -> dict[str, Any]:
+    return {'apples_eaten': self._apples.num_eaten}
+
+  @property
   def landmarks(self) -> Mapping[str, tuple[float, float]]:
     return {}
 
@@ -55,7 +57,3 @@ class CollectApples(base.Task):
   def latch_events(self, physics: Any) -> None:
     position = self._avatar.position(physics)
     self.earn(physics, self._apples.eat(physics, position, _REACH))
-
-  def num_apples_eaten(self, physics: Any) -> np.ndarray:
-    """Returns how many apples have been eaten, `(...)`."""
-    return self._apples.num_eaten(physics)

@@ -54,6 +54,14 @@ class UnlockDoor(base.Task):
     self._door.attach_to(arena, arena.places['doorway'].position)
 
   @property
+  def facts(self) -> dict[str, Any]:
+    return {
+        'apples_eaten': self._apples.num_eaten,
+        'door_unlocked': self.door_unlocked,
+        'large_apple_eaten': self._large_apple.num_eaten,
+    }
+
+  @property
   def landmarks(self) -> Mapping[str, tuple[float, float]]:
     places = self._arena.places
     return {
@@ -94,10 +102,6 @@ class UnlockDoor(base.Task):
   def door_unlocked(self, physics: Any) -> np.ndarray:
     """Returns 1 once the pad has been pressed and 0 before, `(...)`."""
     return self._pad.pressed(physics).astype(np.float64)
-
-  def num_apples_eaten(self, physics: Any) -> np.ndarray:
-    """Returns how many small apples have been eaten, `(...)`."""
-    return self._apples.num_eaten(physics)
 
   def should_terminate_episode(self, physics: Any) -> np.ndarray:
     return self._large_apple.num_eaten(physics) > 0

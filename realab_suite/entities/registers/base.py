@@ -1,8 +1,8 @@
 """What every register does: write, read, and tell what became of a value.
 
 A register is any physical object that stores a value in a physical property
-(paper, section 3.1). Whatever moves the object changes the value, so there is no
-corruption function anywhere in this package.
+(paper, section 3.1). Whatever moves the object changes the value, so there is
+no corruption function anywhere in this package.
 """
 
 import abc
@@ -160,7 +160,7 @@ class Register(composer.Entity):
 
   @property
   def spread(self) -> np.ndarray:
-    """Half-widths of the region in which the register stands, `(2,)`, metres."""
+    """Half-widths of the region that the register stands in, `(2,)` metres."""
     return self._spread
 
   @property

@@ -62,7 +62,7 @@ class Provider(pydantic.BaseModel, abc.ABC):
       observation: What the agent saw when it chose its action; keys
         `senses/<name>` and `registers/<name>`.
       readings: What each register in `reads` holds now, shape `(...)`.
-      episode_start: Whether this is the first step of an episode, `(...)`, bool.
+      episode_start: Whether this is an episode's first step, `(...)`, bool.
         Worlds start their episodes at different times.
       key: A random key per world, `(..., 2)`, uint64; see `random_keys`.
       state: What `initial_state` or the last `step` returned.

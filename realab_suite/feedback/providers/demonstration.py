@@ -22,7 +22,7 @@ class Demonstration(base.Provider):
   kind: Literal['demonstration'] = 'demonstration'
   writes: base.OneName
   policy: str
-  options: dict[str, Any] = {}
+  options: dict[str, Any] = pydantic.Field(default_factory=dict)
 
   _policy: policies.Policy = pydantic.PrivateAttr()
 

@@ -29,7 +29,7 @@ class ValueAdvice(base.Provider):
   reads: base.OneName
   writes: base.OneName
   value_function: str
-  options: dict[str, Any] = {}
+  options: dict[str, Any] = pydantic.Field(default_factory=dict)
   query_delay: Literal[0, 1] = 0
 
   _value_function: policies.ValueFunction = pydantic.PrivateAttr()

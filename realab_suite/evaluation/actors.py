@@ -1,0 +1,135 @@
+"""Actors: policies, fitted to the action spec of an environment."""
+
+from collections.abc import Callable
+from typing import Any, Protocol, final
+
+import dm_env
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import environment
+from realab_suite.engine import seeding
+from realab_suite.feedback import action_sets
+from realab_suite.feedback import policies
+from realab_suite.feedback import random_keys
+
+# What dm_control's viewer calls a policy, and what an agent of yours may be.
+PlainPolicy = Callable[[dm_env.TimeStep], Any]
+
+TAKEN_ACTION = 'taken_action'
+INDEPENDENT_ACTION = 'independent_action'
+_QUERY_POLICIES = (TAKEN_ACTION, INDEPENDENT_ACTION)
+
+
+class Actor(Protocol):
+  """What runs in an environment: it is told of episodes, and it acts."""
+
+  def begin(self, episode: int) -> None:
+    """An episode begins."""
+
+  def act(self, time_step: dm_env.TimeStep) -> Any:
+    """Returns an action that fits the environment's `action_spec`."""
+
+
+@final
+class PlainActor:
+  """An actor that calls a function of the time step."""
+
+  def __init__(self, policy: PlainPolicy) -> None:
+    self._policy = policy
+
+  def begin(self, episode: int) -> None:
+    """Does nothing: whatever `policy` remembers is its own business."""
+
+  def act(self, time_step: dm_env.TimeStep) -> Any:
+    return self._policy(time_step)
+
+
+@final
+class PolicyActor:
+  """An actor that runs one of this package's policies.
+
+  A policy names actions by index. Where the environment takes vectors, the
+  index becomes one; where the design has query registers, each is asked about
+  the action taken, or about one drawn independently, as the design's learner
+  says in `query_policy`.
+  """
+
+  def __init__(
+      self, policy: policies.Policy, env: environment.Environment
+  ) -> None:
+    """Fits a policy to an environment.
+
+    Raises:
+      SpecError: If the environment's actions are not those of the policy.
+    """
+    self._policy = policy
+    self._seed = env.seed
+    design = env.mechanism.design
+    self._queries = [register.value_spec for register in env.mechanism.queries]
+    self._query_policy = TAKEN_ACTION
+    if design.learner is not None:
+      extras = design.learner.model_extra or {}
+      self._query_policy = extras.get('query_policy', TAKEN_ACTION)
+    if self._query_policy not in _QUERY_POLICIES:
+      raise errors.SpecError(
+          f'design {design.name!r}: learner.query_policy:'
+          f' {self._query_policy!r}; allowed are {list(_QUERY_POLICIES)}'
+      )
+    self._table: np.ndarray | None = None
+    ours = policy.action_set
+    if design.action_set is None:
+      elements = (env.action_spec().name or '').split('\t')
+      elements = elements[len(self._queries) :]
+      self._table = ours.table(
+          tuple(name.rpartition('/')[2] for name in elements)
+      )
+    elif ours != action_sets.get(
+        design.action_set.name, design.action_set.version
+    ):
+      raise errors.SpecError(
+          f'the policy acts by {ours.name} v{ours.version}, the design by'
+          f' {design.action_set.name} v{design.action_set.version}'
+      )
+    self.begin(0)
+
+  def begin(self, episode: int) -> None:
+    """Forgets, and takes up the random stream of an episode."""
+    self._key = seeding.episode_key(self._seed, 0, episode, 'policy')
+    self._query_key = seeding.episode_key(self._seed, 0, episode, 'query')
+    self._state = self._policy.initial_state(())
+    self._step = 0
+
+  def act(self, time_step: dm_env.TimeStep) -> Any:
+    index, self._state = self._policy.step(
+        time_step.observation,
+        np.asarray(self._step == 0),
+        seeding.step_key(self._key, self._step),
+        self._state,
+    )
+    action: Any = np.int32(index)
+    if self._table is not None:
+      action = self._table[int(index)]
+    if self._queries:
+      action = np.concatenate([self._ask(int(index)), np.atleast_1d(action)])
+    self._step += 1
+    return action
+
+  def _ask(self, taken: int) -> np.ndarray:
+    """Returns what goes into the query registers."""
+    asked = taken
+    if self._query_policy == INDEPENDENT_ACTION:
+      key = seeding.step_key(self._query_key, self._step)
+      asked = int(random_keys.uniform(key) * len(self._policy.action_set))
+    return np.array(
+        [np.clip(asked, spec.minimum, spec.maximum) for spec in self._queries]
+    )
+
+
+def make(
+    policy: policies.Policy | PlainPolicy, env: environment.Environment
+) -> Actor:
+  """Returns an actor for a policy of either kind."""
+  if isinstance(policy, policies.Policy):
+    return PolicyActor(policy, env)
+  return PlainActor(policy)

@@ -1,0 +1,150 @@
+"""Runs a policy, and reads off what the environment hides from it."""
+
+from collections.abc import Callable, Sequence
+import dataclasses
+from typing import final
+
+from realab_suite import errors
+from realab_suite.engine import environment
+from realab_suite.engine import events
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import metrics
+from realab_suite.feedback import policies
+from realab_suite.tasks import base
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class EpisodeResult:
+  """What an evaluator knows of one episode.
+
+  Attributes:
+    seed: The seed of the environment.
+    world: Which world of a batch.
+    episode: The number of the episode.
+    end: Why it ended.
+    is_valid: Whether figures may be drawn from it.
+    true_return: Sum of true rewards.
+    observed_return: Sum of what the agent read off its feedback registers.
+    corruption: Mean displacement of the values of all registers, metres.
+    registers: Metrics by register.
+    facts: What the world counts besides its reward, by name.
+    num_steps: Control steps.
+    num_substeps: Steps of the physics.
+    num_provider_calls: How often providers were asked.
+    num_queries: How many values the agent sent to providers.
+  """
+
+  seed: int
+  world: int
+  episode: int
+  end: events.End
+  is_valid: bool
+  true_return: float
+  observed_return: float
+  corruption: float
+  registers: dict[str, metrics.RegisterMetrics]
+  facts: dict[str, float]
+  num_steps: int
+  num_substeps: int
+  num_provider_calls: int
+  num_queries: int
+
+
+def evaluate(
+    env: environment.Environment,
+    policy: policies.Policy | actors.PlainPolicy,
+    num_episodes: int,
+    *,
+    first_episode: int = 0,
+    sinks: Sequence[events.EventSink] = (),
+    on_episode: Callable[[EpisodeResult], None] | None = None,
+) -> list[EpisodeResult]:
+  """Runs a policy for some episodes.
+
+  Episode k of a seed begins in the same state whatever the policy and whatever
+  came before, so results of two policies can be compared in pairs.
+
+  Args:
+    env: The environment.
+    policy: A policy, or a function from a time step to an action.
+    num_episodes: How many episodes.
+    first_episode: The number of the first one.
+    sinks: Others who want to hear, as in a recorder of films.
+    on_episode: Called with each result as it comes.
+
+  Returns:
+    A result per episode, the invalid ones included.
+
+  Raises:
+    ResultsError: If `num_episodes` is not positive.
+  """
+  if num_episodes < 1:
+    raise errors.ResultsError(
+        f'num_episodes: {num_episodes}; allowed are positive integers'
+    )
+  actor = actors.make(policy, env)
+  ledger = ledgers.Ledger()
+  listeners = (ledger, *sinks)
+  for sink in listeners:
+    env.add_sink(sink)
+  results = []
+  try:
+    env.rewind(first_episode)
+    for episode in range(first_episode, first_episode + num_episodes):
+      actor.begin(episode)
+      time_step = env.reset()
+      while not time_step.last():
+        time_step = env.step(actor.act(time_step))
+      result = _result(env, ledger.last)
+      results.append(result)
+      if on_episode is not None:
+        on_episode(result)
+  finally:
+    for sink in listeners:
+      env.remove_sink(sink)
+  return results
+
+
+def _result(
+    env: environment.Environment, episode: ledgers.EpisodeLedger
+) -> EpisodeResult:
+  mechanism = env.mechanism
+  by_register = {
+      name: metrics.register_metrics(
+          episode.entries.get(name, ()), register.scale
+      )
+      for name, register in mechanism.registers.items()
+  }
+  end = episode.end
+  if end is None:
+    raise errors.ResultsError(f'episode {episode.episode} has not ended')
+  num_steps = episode.num_steps
+  return EpisodeResult(
+      seed=episode.seed,
+      world=episode.world,
+      episode=episode.episode,
+      end=end,
+      is_valid=episode.is_valid,
+      true_return=ledgers.true_return(episode),
+      observed_return=sum(
+          by_register[name].agent_reading_sum
+          for name in mechanism.design.names('feedback')
+      ),
+      corruption=metrics.episode_corruption(list(by_register.values())),
+      registers=by_register,
+      facts=_facts(env) if episode.is_valid else {},
+      num_steps=num_steps,
+      num_substeps=num_steps * env.num_substeps,
+      num_provider_calls=num_steps * len(mechanism.design.providers),
+      num_queries=num_steps * len(mechanism.queries),
+  )
+
+
+def _facts(env: environment.Environment) -> dict[str, float]:
+  if not isinstance(env.task, base.Task):
+    return {}
+  return {
+      name: float(fact(env.physics)) for name, fact in env.task.facts.items()
+  }

@@ -1,0 +1,216 @@
+"""How scripted policies look around and walk, by the ray sense alone."""
+
+from collections.abc import Sequence
+import dataclasses
+import functools
+from typing import final
+
+import numpy as np
+
+from realab_suite.entities import appearance
+from realab_suite.feedback import action_sets
+from realab_suite.feedback.policies import base
+
+_FIELD_OF_VIEW = np.radians(160.0)
+# What is walked round, and how far the middle of the avatar stays from it,
+# metres. Its radius is 0.25; blocks, which give way, get a wider berth.
+_BERTHS = {
+    'other': 0.32,
+    'wall': 0.32,
+    'barrier': 0.32,
+    'door': 0.32,
+    'pad': 0.34,
+    'pressed_pad': 0.34,
+    'base_block': 0.42,
+    'offset_block': 0.42,
+}
+_BERTH = np.array([_BERTHS.get(name, -1.0) for name in appearance.CLASSES])
+# How far ahead the way has to be free, metres.
+_LOOKAHEAD = 1.0
+# An error of the heading that needs no turn, and one that is turned away while
+# walking, radians.
+_STRAIGHT = 0.16
+_BEND = 0.7
+# For how long the avatar keeps turning as it does now, seconds.
+_COAST = 0.045
+_PREFER_AHEAD = 0.15
+_BLOCKED = 100.0
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class View:
+  """What a policy sees; leading axes of every array are worlds.
+
+  Attributes:
+    position: Where the avatar is, `(..., 2)`, metres.
+    angle: The way it faces, `(...)`, radians.
+    distances: How far each ray gets, `(..., rays)`, metres.
+    classes: What each ray hits, `(..., rays)`.
+    rays: Where each ray points in the world, `(..., rays)`, radians.
+  """
+
+  position: np.ndarray
+  angle: np.ndarray
+  distances: np.ndarray
+  classes: np.ndarray
+  rays: np.ndarray
+
+  def hits(self, name: str) -> np.ndarray:
+    """Returns which rays hit something of a class, `(..., rays)`, bool."""
+    return self.classes == appearance.code(name)
+
+  def points(self, depth: float) -> np.ndarray:
+    """Returns where rays would end that went on for `depth` metres.
+
+    Args:
+      depth: From the surface that is seen to the middle of the thing, metres.
+
+    Returns:
+      `(..., rays, 2)`, metres.
+    """
+    reach = (self.distances + depth)[..., np.newaxis]
+    ends = np.stack([np.cos(self.rays), np.sin(self.rays)], axis=-1)
+    return self.position[..., np.newaxis, :] + reach * ends
+
+  def mean_point(self, hit: np.ndarray, depth: float) -> np.ndarray:
+    """Returns the mean of `points(depth)` of some rays, `(..., 2)`.
+
+    Args:
+      hit: Which rays, `(..., rays)`; the mean of none is the origin.
+      depth: See `points`.
+    """
+    total = (self.points(depth) * hit[..., np.newaxis]).sum(axis=-2)
+    return total / np.maximum(hit.sum(axis=-1), 1)[..., np.newaxis]
+
+  def bearing(self, target: np.ndarray) -> np.ndarray:
+    """Returns how far to the left of ahead places are, radians.
+
+    Args:
+      target: `(..., 2)`, or `(..., places, 2)`, metres.
+    """
+    position, angle = self.position, self.angle
+    if target.ndim > position.ndim:
+      position, angle = position[..., np.newaxis, :], angle[..., np.newaxis]
+    x, y = np.moveaxis(target - position, -1, 0)
+    return wrap(np.arctan2(y, x) - angle)
+
+  def distance(self, target: np.ndarray) -> np.ndarray:
+    """Returns how far away places are, metres.
+
+    Args:
+      target: `(..., 2)`, or `(..., places, 2)`, metres.
+    """
+    position = self.position
+    if target.ndim > position.ndim:
+      position = position[..., np.newaxis, :]
+    return np.linalg.norm(target - position, axis=-1)
+
+
+def look(observation: base.Observation) -> View:
+  """Returns what there is to see."""
+  x, y = np.moveaxis(np.asarray(observation['senses/heading'], float), -1, 0)
+  turning = np.asarray(observation['senses/velocity'], float)[..., 2]
+  angle = np.arctan2(y, x)
+  distances = np.asarray(observation['senses/ray_distances'], float)
+  return View(
+      position=np.asarray(observation['senses/position'], float),
+      # The heading that a command given now starts from.
+      angle=angle + _COAST * turning,
+      distances=distances,
+      classes=np.asarray(observation['senses/ray_classes']),
+      rays=angle[..., np.newaxis] + ray_angles(distances.shape[-1]),
+  )
+
+
+@functools.cache
+def ray_angles(num_rays: int) -> np.ndarray:
+  """Returns where rays point, from left to right, `(rays,)`, radians."""
+  half = _FIELD_OF_VIEW / 2
+  return np.linspace(half, -half, num_rays)
+
+
+def wrap(angle: np.ndarray) -> np.ndarray:
+  """Returns the same angle in [-pi, pi)."""
+  return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def free_way(view: View, ignored: Sequence[str] = ()) -> np.ndarray:
+  """Returns how far the avatar can walk along each ray, `(..., rays)`, metres.
+
+  Args:
+    view: What is seen.
+    ignored: Classes of things that are not in the way.
+  """
+  berths = _BERTH[view.classes]
+  for name in ignored:
+    berths = np.where(view.hits(name), -1.0, berths)
+  angles = ray_angles(view.distances.shape[-1])
+  between = angles[:, np.newaxis] - angles
+  distances = view.distances[..., np.newaxis, :]
+  along = distances * np.cos(between)
+  beside = distances * np.abs(np.sin(between))
+  in_way = (along > 0) & (beside < berths[..., np.newaxis, :])
+  return np.where(in_way, along, np.inf).min(axis=-1)
+
+
+def walk(
+    view: View,
+    target: np.ndarray,
+    reach: np.ndarray | float = 0.0,
+    ignored: Sequence[str] = (),
+) -> np.ndarray:
+  """Returns the index of the action that goes to a place, round what is solid.
+
+  Args:
+    view: What is seen.
+    target: The place, `(..., 2)`, metres.
+    reach: How far from the place what is solid is in the way no more, metres.
+    ignored: Classes of things that are walked into.
+  """
+  free = free_way(view, ignored)
+  angles = ray_angles(free.shape[-1])
+  # Where the rays point once the avatar stops turning.
+  relative = view.rays - view.angle[..., np.newaxis]
+  bearing = view.bearing(target)
+  needed = np.clip(view.distance(target) - reach, 0.0, _LOOKAHEAD)
+  is_free = free >= needed[..., np.newaxis]
+  cost = (
+      np.abs(wrap(relative - bearing[..., np.newaxis]))
+      + _PREFER_AHEAD * np.abs(relative)
+      + np.where(is_free, 0.0, _BLOCKED - free.clip(0.0, _LOOKAHEAD))
+  )
+  best = cost.argmin(axis=-1)[..., np.newaxis]
+  way = np.take_along_axis(relative, best, -1)[..., 0]
+  open_way = np.take_along_axis(is_free, best, -1)[..., 0]
+  # What is behind is turned to first; nothing is known of it.
+  behind = np.abs(bearing) > angles[0]
+  way = np.where(behind, bearing, way)
+  ahead = np.abs(relative).argmin(axis=-1)[..., np.newaxis]
+  room = np.take_along_axis(free, ahead, -1)[..., 0]
+  clear = room >= np.minimum(needed, 0.6)
+  return head(way, moving=clear & open_way & ~behind)
+
+
+def head(bearing: np.ndarray, moving: np.ndarray | bool = False) -> np.ndarray:
+  """Returns the index of the action that turns to a bearing, and walks.
+
+  Args:
+    bearing: How far to the left to turn, `(...)`, radians.
+    moving: Whether to walk as well, as soon as the heading allows, `(...)`.
+  """
+  left = bearing > 0
+  turn = np.where(left, action('turn_left'), action('turn_right'))
+  bend = np.where(
+      left, action('forward_turn_left'), action('forward_turn_right')
+  )
+  straight = np.where(moving, action('forward'), action('wait'))
+  error = np.abs(bearing)
+  turning = np.where(moving & (error < _BEND), bend, turn)
+  return np.where(error <= _STRAIGHT, straight, turning)
+
+
+@functools.cache
+def action(name: str) -> int:
+  """Returns the index of an action by its name."""
+  return action_sets.DMLAB_LIKE.index(name)

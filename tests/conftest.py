@@ -1,0 +1,73 @@
+"""What holds for every test: no GL unless asked for, the same examples always.
+
+Tests run with `MUJOCO_GL=disable`. One that renders is marked `camera` and is
+run by a process of its own with `MUJOCO_GL=egl`, because the choice of renderer
+is made when dm_control is imported. Where there is no EGL it is skipped.
+"""
+
+import functools
+import os
+import pathlib
+import subprocess
+import sys
+
+# Before anything imports dm_control.
+os.environ.setdefault('MUJOCO_GL', 'disable')
+
+import hypothesis
+import pytest
+
+hypothesis.settings.register_profile(
+    'realab', deadline=None, derandomize=True, database=None
+)
+hypothesis.settings.load_profile('realab')
+
+_ROOT = pathlib.Path(__file__).parents[1]
+_PATIENCE_SECONDS = 120
+_RENDERS_SOMETHING = """
+from dm_control import mujoco
+xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
+mujoco.Physics.from_xml_string(xml).render(8, 8)
+"""
+
+
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+  """Runs tests that render in a process that has a renderer."""
+  marked = pyfuncitem.get_closest_marker('camera') is not None
+  if not marked or os.environ['MUJOCO_GL'] == 'egl':
+    return None
+  if complaint := _why_egl_does_not_work():
+    pytest.skip(f'no EGL: {complaint}')
+  ran = _python_with_egl(
+      '-m', 'pytest', '-q', '-p', 'no:cacheprovider', pyfuncitem.nodeid
+  )
+  if ran.returncode:
+    pytest.fail(ran.stdout + ran.stderr, pytrace=False)
+  return True
+
+
+@functools.cache
+def _why_egl_does_not_work() -> str:
+  """Returns the last line of what goes wrong, or '' if nothing does."""
+  try:
+    ran = _python_with_egl('-c', _RENDERS_SOMETHING)
+  except subprocess.TimeoutExpired:
+    return 'it hangs'
+  return ran.stderr.strip().splitlines()[-1] if ran.returncode else ''
+
+
+def _python_with_egl(*arguments: str) -> subprocess.CompletedProcess[str]:
+  inherited = {
+      name: value
+      for name, value in os.environ.items()
+      if not name.startswith('PYTEST_')
+  }
+  return subprocess.run(
+      [sys.executable, *arguments],
+      cwd=_ROOT,
+      env={**inherited, 'MUJOCO_GL': 'egl'},
+      capture_output=True,
+      text=True,
+      timeout=_PATIENCE_SECONDS,
+      check=False,
+  )

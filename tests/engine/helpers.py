@@ -1,0 +1,174 @@
+"""What the tests of a running environment share."""
+
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
+import copy
+import struct
+from typing import Any
+
+from dm_control import composer
+from dm_control.composer.observation import observable
+from dm_env import specs
+import mujoco
+import numpy as np
+
+from realab_suite.engine import events
+from realab_suite.feedback import registry
+
+
+class RecordingSink(events.EventSink):
+  """Keeps what the engine says, in order."""
+
+  def __init__(self) -> None:
+    self.heard: list[Any] = []
+
+  def episode_started(self, start: events.Start, physics: Any) -> None:
+    self.heard.append(copy.deepcopy(start))
+
+  def step_ended(self, step: events.Step, physics: Any) -> None:
+    self.heard.append(copy.deepcopy(step))
+
+  def episode_ended(self, end: events.End) -> None:
+    self.heard.append(end)
+
+  @property
+  def starts(self) -> list[events.Start]:
+    return [h for h in self.heard if isinstance(h, events.Start)]
+
+  @property
+  def steps(self) -> list[events.Step]:
+    return [h for h in self.heard if isinstance(h, events.Step)]
+
+  @property
+  def ends(self) -> list[events.End]:
+    return [h for h in self.heard if isinstance(h, events.End)]
+
+  def true_return(self) -> float:
+    return float(sum(step.true_reward for step in self.steps))
+
+  def requested(self, register: str) -> list[float]:
+    """What was to be written to a register, step by step."""
+    return [
+        float(write.requested)
+        for step in self.steps
+        for write in step.writes
+        if write.register == register
+    ]
+
+  def read(self, register: str, reader: str = 'agent') -> list[float]:
+    """What somebody read off a register, step by step."""
+    return [
+        float(read.reading)
+        for step in self.steps
+        for read in step.reads
+        if read.register == register and read.reader == reader
+    ]
+
+
+class PointTask(composer.Task):
+  """Somebody else's task: a bead on a wire, over a bare floor.
+
+  Every hook that a test may want to misbehave is an attribute.
+  """
+
+  def __init__(self) -> None:
+    self._arena = composer.Arena()
+    root = self._arena.mjcf_model
+    body = root.worldbody.add('body', name='bead', pos=(0, 0, 1))
+    self.joint = body.add('joint', name='wire', type='slide', axis=(1, 0, 0))
+    body.add('geom', type='sphere', size=(0.1,), mass=1.0)
+    root.actuator.add(
+        'motor', name='push', joint=self.joint, ctrllimited='true',
+        ctrlrange=(-1, 1),
+    )  # fmt: skip
+    self.bead = observable.MJCFFeature('qpos', self.joint)
+    self.bead.enabled = True
+    self.secret = observable.MJCFFeature('qvel', self.joint)
+    self.set_timesteps(control_timestep=0.05, physics_timestep=0.01)
+    self.reward: Callable[[Any], Any] = self._bead_position
+    self.begin: Callable[[Any, Any], None] = lambda physics, random: None
+    self.end_step: Callable[[Any, Any], None] = lambda physics, random: None
+
+  def _bead_position(self, physics: Any) -> float:
+    return float(physics.bind(self.joint).qpos[0])
+
+  @property
+  def root_entity(self) -> composer.Arena:
+    return self._arena
+
+  @property
+  def task_observables(self) -> Mapping[str, observable.Observable]:
+    return {'bead': self.bead, 'secret': self.secret}
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    physics.bind(self.joint).qpos = random_state.uniform(-0.1, 0.1)
+    self.begin(physics, random_state)
+
+  def after_step(self, physics: Any, random_state: Any) -> None:
+    self.end_step(physics, random_state)
+
+  def get_reward(self, physics: Any) -> Any:
+    return self.reward(physics)
+
+
+@contextlib.contextmanager
+def registered(
+    names: registry.Registry[Any], name: str, entry: Any
+) -> Iterator[None]:
+  """Registers something for as long as the context lasts."""
+  names.add(name)(entry)
+  try:
+    yield
+  finally:
+    del names._entries[name]
+
+
+def state_bytes(physics: Any) -> bytes:
+  """Returns the whole state that decides what happens next."""
+  model, data = physics.model.ptr, physics.data.ptr
+  kind = mujoco.mjtState.mjSTATE_INTEGRATION
+  state = np.empty(mujoco.mj_stateSize(model, kind))
+  mujoco.mj_getState(model, data, state, kind)
+  return state.tobytes()
+
+
+def to_bytes(time_step: Any, leave_out: tuple[str, ...] = ()) -> bytes:
+  """Returns everything that an agent gets in a time step, canonically."""
+  parts = [repr((int(time_step.step_type), type(time_step.reward))).encode()]
+  for number in (time_step.reward, time_step.discount):
+    parts.append(b'-' if number is None else struct.pack('<d', number))
+  for key, value in time_step.observation.items():
+    if key not in leave_out:
+      parts.append(f'{key} {value.dtype.str} {value.shape}'.encode())
+      parts.append(value.tobytes())
+  return b'\n'.join(parts)
+
+
+def spec_text(env: Any) -> str:
+  """Returns every spec that an agent can ask for, canonically."""
+  return repr(
+      [
+          env.observation_spec(),
+          env.action_spec(),
+          env.reward_spec(),
+          env.discount_spec(),
+      ]
+  )
+
+
+def random_actions(env: Any, number: int, seed: int = 0) -> list[np.ndarray]:
+  """Draws actions that fit an environment's spec."""
+  spec = env.action_spec()
+  generator = np.random.default_rng(seed)
+  if isinstance(spec, specs.DiscreteArray):
+    draws = generator.integers(0, spec.num_values, number)
+    return [np.asarray(draw, spec.dtype) for draw in draws]
+  actions = generator.uniform(spec.minimum, spec.maximum, (number, *spec.shape))
+  if spec.name.endswith('/v1'):  # The last element indexes an action set.
+    actions[:, -1] = np.floor(actions[:, -1])
+  return list(actions)
+
+
+def no_op(env: Any) -> np.ndarray:
+  """Returns the action that does nothing, where 0 is one."""
+  return np.zeros(env.action_spec().shape, env.action_spec().dtype)

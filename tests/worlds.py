@@ -1,0 +1,74 @@
+"""Small worlds for tests, and what tests do to them."""
+
+from typing import Any
+
+from dm_control import composer
+from dm_control import mjcf
+import mujoco
+import numpy as np
+
+
+def compile_world(root: composer.Entity) -> mjcf.Physics:
+  """Returns the physics of a world."""
+  return mjcf.Physics.from_mjcf_model(root.mjcf_model)
+
+
+def step(physics: mjcf.Physics, steps: int = 1) -> None:
+  """Steps a world from the state as it is.
+
+  Composer's steps begin in the middle of the engine's, with what was derived
+  before anything was written.
+  """
+  physics.forward()
+  physics.step(steps)
+
+
+def start_episode(physics: Any, *entities: Any, seed: int = 0) -> None:
+  """Resets the physics and tells the entities, as Composer would."""
+  with physics.reset_context():
+    random_state = np.random.RandomState(seed)
+    for entity in entities:
+      entity.initialize_episode(physics, random_state)
+
+
+def state_bytes(physics: mjcf.Physics) -> bytes:
+  """Returns all that the future depends on."""
+  kind = mujoco.mjtState.mjSTATE_INTEGRATION
+  model, data = physics.model.ptr, physics.data.ptr
+  state = np.empty(mujoco.mj_stateSize(model, kind))
+  mujoco.mj_getState(model, data, state, kind)
+  return state.tobytes()
+
+
+def body_of(physics: mjcf.Physics, block: Any) -> int:
+  """Returns the id of the body that a block's cube belongs to."""
+  return physics.model.geom_bodyid[physics.bind(block.geom).element_id]
+
+
+def world_position(physics: mjcf.Physics, block: Any) -> np.ndarray:
+  """Returns the centre of a block in the frame of the world, `(3,)`."""
+  return np.array(physics.bind(block.geom).xpos)
+
+
+def shove(
+    physics: mjcf.Physics,
+    block: Any,
+    force: Any,
+    torque: Any = (0.0, 0.0, 0.0),
+    steps: int = 20,
+) -> None:
+  """Applies a force to a block for some steps, then leaves it to itself."""
+  body = body_of(physics, block)
+  physics.data.xfrc_applied[body] = (*force, *torque)
+  step(physics, steps)
+  physics.data.xfrc_applied[body] = 0.0
+
+
+def act(avatar: Any, physics: Any, steps: int, **commands: float) -> None:
+  """Lets an avatar act for some steps; `forward=1.0` and so on."""
+  names = avatar.action_spec.name.split('\t')
+  action = np.zeros(len(names))
+  for name, value in commands.items():
+    action[names.index(name)] = value
+  avatar.apply_action(physics, action)
+  step(physics, steps)
