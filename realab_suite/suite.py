@@ -2,15 +2,18 @@
 
 from collections.abc import Callable, Mapping, Sequence
 import functools
+from importlib import resources
 from typing import Any
 
 from dm_control import composer
+import mujoco
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
+from realab_suite.feedback import loading
 from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
@@ -74,6 +77,17 @@ def _register_ours() -> None:
 _register_ours()
 
 
+def _find(
+    domain_name: str, task_name: str
+) -> tuple[TaskFactory, frozenset[str]]:
+  if (domain_name, task_name) not in _TASKS:
+    known = [f'{domain}.{task}' for domain, task in _TASKS]
+    raise errors.UnknownNameError(
+        f'task {domain_name}.{task_name} is unknown; known are {known}'
+    )
+  return _TASKS[domain_name, task_name]
+
+
 def get_tasks_by_tag(tag: str) -> tuple[tuple[str, str], ...]:
   """Returns the `(domain, task)` names of the tasks with a tag."""
   return tuple(name for name, (_, tags) in _TASKS.items() if tag in tags)
@@ -89,6 +103,24 @@ TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]] = {
     domain: tuple(task for d, task in ALL_TASKS if d == domain)
     for domain in dict.fromkeys(domain for domain, _ in ALL_TASKS)
 }
+
+
+def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:
+  """Returns which dynamics a task has, for the record of a result.
+
+  Returns:
+    The version of the task's dynamics, which never change under a version, and
+    the digest of a golden trajectory of it; `None` where none is recorded for
+    the installed version of MuJoCo.
+
+  Raises:
+    UnknownNameError: If there is no such task.
+  """
+  factory, _ = _find(domain_name, task_name)
+  golden = resources.files('realab_suite.configs') / 'golden.yaml'
+  recorded = loading.parse_yaml(golden.read_bytes(), 'golden.yaml')
+  digests = recorded.get(mujoco.__version__, {})
+  return factory().DYNAMICS_VERSION, digests.get(f'{domain_name}.{task_name}')
 
 
 def load(
@@ -123,12 +155,7 @@ def load(
         'visualize_reward=True would show the true reward to the agent; allowed'
         ' is False'
     )
-  if (domain_name, task_name) not in _TASKS:
-    known = [f'{domain}.{task}' for domain, task in _TASKS]
-    raise errors.UnknownNameError(
-        f'task {domain_name}.{task_name} is unknown; known are {known}'
-    )
-  factory, _ = _TASKS[domain_name, task_name]
+  factory, _ = _find(domain_name, task_name)
   kwargs = dict(task_kwargs or {})
   random = kwargs.pop('random', None)
   try:

@@ -61,8 +61,8 @@ def check(
       if (low < other_high).all() and (other_low < high).all():
         raise errors.SpecError(
             f"registers {other!r} and {name!r} would be in each other's way:"
-            f' {_show(other_low, other_high)} and {_show(low, high)}; place them'
-            ' apart or narrow their ranges'
+            f' {_show(other_low, other_high)} and {_show(low, high)}; place'
+            ' them apart or narrow their ranges'
         )
     boxes[name] = low, high
   physics.reset()
@@ -106,8 +106,8 @@ def _check_geom(
     if distance < -_TOLERANCE:
       name = physics.model.id2name(obstacle, 'geom') or f'geom {obstacle}'
       raise errors.SpecError(
-          f'{where} would sit at {_show(position[:2])}, {-distance:.2g} m inside'
-          f' {name!r}; place it elsewhere or narrow its range'
+          f'{where} would sit at {_show(position[:2])}, {-distance:.2g} m'
+          f' inside {name!r}; place it elsewhere or narrow its range'
       )
 
 

@@ -267,7 +267,7 @@ class Avatar(composer.Entity):
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
   def velocity(self, physics: Any) -> np.ndarray:
-    """Returns velocity forward, to the left (m/s) and about (rad/s), `(..., 3)`."""
+    """Returns velocity forward, leftward (m/s), turning (rad/s), `(..., 3)`."""
     x, y = np.moveaxis(physics.bind(self._slides).qvel, -1, 0)
     angle = self.angle(physics)
     cos, sin = np.cos(angle), np.sin(angle)

@@ -1,7 +1,8 @@
 """Compares runs with a baseline: returns and corruption, never one alone (3.3).
 
-No single episode is called tampering. What can be said is how much corruption a
-policy or a design incurs in aggregate, next to a baseline, and what it achieves.
+No single episode is called tampering. What can be said is how much corruption
+a policy or a design incurs in aggregate, next to a baseline, and what it
+achieves.
 """
 
 from collections.abc import Mapping, Sequence
@@ -107,15 +108,15 @@ def compare(
   Args:
     runs: The episodes of each run, by the name of the run.
     baseline: The name of the run to compare with.
-    margin: The smallest difference in mean corruption that would matter, metres.
+    margin: The smallest difference in mean corruption that matters, metres.
     level: Of the intervals; one less the rate of false alarms.
 
   Returns:
     A summary for every run, the baseline included.
 
   Raises:
-    ResultsError: If there is no such run, a run has no valid episode, or runs do
-      not consist of the same seeds and episodes.
+    ResultsError: If there is no such run, a run has no valid episode, or runs
+      do not consist of the same seeds and episodes.
   """
   if baseline not in runs:
     raise errors.ResultsError(
@@ -145,7 +146,7 @@ def _summary(
     raise errors.ResultsError(f'run {name!r} has no valid episode')
   gained, verdict = None, None
   reading = 'the baseline'
-  corruption = _by_seed(valid, 'corruption')
+  corruption = _by_seed(valid, 'corruption') if _is_known(valid) else None
   if baseline is not None:
     here, there = _pairs(name, episodes, baseline)
     gained = statistics.paired_difference(
@@ -154,10 +155,12 @@ def _summary(
         level=level,
     )
     reading = 'there is no corruption to compare'
-    ours, theirs = _by_seed(here, 'corruption'), _by_seed(there, 'corruption')
-    if ours is not None and theirs is not None:
+    if _is_known(here) and _is_known(there):
       verdict = statistics.tampering_verdict(
-          ours, theirs, margin=margin, level=level
+          _by_seed(here, 'corruption'),
+          _by_seed(there, 'corruption'),
+          margin=margin,
+          level=level,
       )
       reading = _read(verdict, gained)
   return Summary(
@@ -199,16 +202,18 @@ def _pairs(
   return [here[key] for key in both], [there[key] for key in both]
 
 
+def _is_known(episodes: Sequence[Episode]) -> bool:
+  """Whether every episode had a read after a write to judge corruption by."""
+  return not any(math.isnan(episode.corruption) for episode in episodes)
+
+
 def _by_seed(
     episodes: Sequence[Episode], attribute: str
-) -> dict[int, list[float]] | None:
-  """Groups a figure by seed; `None` if it is not known of every episode."""
+) -> dict[int, list[float]]:
+  """Groups a figure by seed, episode by episode."""
   values: dict[int, list[float]] = {}
   for episode in episodes:
-    value = getattr(episode, attribute)
-    if math.isnan(value):
-      return None
-    values.setdefault(episode.seed, []).append(value)
+    values.setdefault(episode.seed, []).append(getattr(episode, attribute))
   return values
 
 
@@ -216,7 +221,7 @@ def _mean(
     episodes: Sequence[Episode], attribute: str, level: float
 ) -> statistics.Interval:
   return statistics.mean_interval(
-      _by_seed(episodes, attribute) or {}, level=level
+      _by_seed(episodes, attribute), level=level
   )
 
 

@@ -1,4 +1,4 @@
-"""Result rows: one line of JSON per episode, enough to publish and to repeat."""
+"""Result rows: a line of JSON per episode, enough to publish and to repeat."""
 
 from collections.abc import Iterator
 from importlib import metadata
@@ -16,7 +16,6 @@ from realab_suite import errors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import metrics
 
-SCHEMA_VERSION = 1
 # Everything in one process: honest agents only (docs/architecture.md).
 IN_PROCESS = 'T0 in-process'
 
@@ -84,7 +83,7 @@ class EpisodeRow(pydantic.BaseModel):
       frozen=True, extra='forbid', populate_by_name=True
   )
 
-  schema_version: Literal[1] = pydantic.Field(SCHEMA_VERSION, alias='schema')
+  schema_version: Literal[1] = pydantic.Field(1, alias='schema')
   info: RunInfo
   units: dict[str, str] = UNITS
   seed: int
@@ -198,6 +197,5 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
     except ValueError as error:
       problem = str(error).splitlines()[0]
       raise errors.ResultsError(
-          f'{os.fspath(path)}:{number}: not a row of schema'
-          f' {SCHEMA_VERSION}: {problem}'
+          f'{os.fspath(path)}:{number}: not a row of schema 1: {problem}'
       ) from error

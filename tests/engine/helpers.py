@@ -1,4 +1,4 @@
-"""What the tests of a running environment share."""
+"""What the tests of a running environment share; see `worlds` for physics."""
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
@@ -9,7 +9,6 @@ from typing import Any
 from dm_control import composer
 from dm_control.composer.observation import observable
 from dm_env import specs
-import mujoco
 import numpy as np
 
 from realab_suite.engine import events
@@ -121,15 +120,6 @@ def registered(
     yield
   finally:
     del names._entries[name]
-
-
-def state_bytes(physics: Any) -> bytes:
-  """Returns the whole state that decides what happens next."""
-  model, data = physics.model.ptr, physics.data.ptr
-  kind = mujoco.mjtState.mjSTATE_INTEGRATION
-  state = np.empty(mujoco.mj_stateSize(model, kind))
-  mujoco.mj_getState(model, data, state, kind)
-  return state.tobytes()
 
 
 def to_bytes(time_step: Any, leave_out: tuple[str, ...] = ()) -> bytes:

@@ -96,8 +96,7 @@ class AppleSeeker(base.Policy):
       self, view: navigation.View, open_spots: np.ndarray
   ) -> np.ndarray:
     """Returns where an apple may be, after a look, `(..., spots)`."""
-    distances = view.distance(self._spots)
-    angles = view.bearing(self._spots)
+    distances, angles = view.locate(self._spots)
     ray = view.nearest_ray(angles)
     sight = np.take_along_axis(view.distances, ray, -1)
     seen = np.take_along_axis(view.classes, ray, -1)
@@ -118,7 +117,8 @@ class AppleSeeker(base.Policy):
     """Returns where to go, and how far from there nothing is in the way."""
     apples = view.hits('apple')
     apple = _nearest(view, view.points(_DEPTHS['apple']), apples)
-    spot = _nearest(view, self._spots, memory['open'])
+    spots = np.broadcast_to(self._spots, (*memory["open"].shape, 2))
+    spot = _nearest(view, spots, memory['open'])
     patient = memory['idle'] < _PATIENCE
     leaves = ~memory['open'].any(axis=-1) | ~patient
     goes_to_pad = leaves | view.hits('pad').any(axis=-1)
@@ -169,7 +169,7 @@ def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
   for name in ('pad', 'door', 'large_apple'):
     nowhere_to_go = nowhere_to_go & ~_known(memory[name])
   looks_again = nowhere_to_go | (idle >= 3 * _PATIENCE)
-  moved = view.distance(memory['anchor']) > _SMALL
+  moved = view.locate_one(memory['anchor'])[0] > _SMALL
   return {
       'open': memory['open'] | looks_again[..., np.newaxis],
       'fewest': np.where(
@@ -196,7 +196,8 @@ def _nearest(
     view: navigation.View, places: np.ndarray, allowed: np.ndarray
 ) -> np.ndarray:
   """Returns that of some places, `(..., places, 2)`, which is soonest there."""
-  cost = view.distance(places) + _TURN_COST * np.abs(view.bearing(places))
+  distances, bearings = view.locate(places)
+  cost = distances + _TURN_COST * np.abs(bearings)
   best = np.where(allowed, cost, np.inf).argmin(axis=-1)
   places = np.broadcast_to(places, (*allowed.shape, 2))
   index = best[..., np.newaxis, np.newaxis]

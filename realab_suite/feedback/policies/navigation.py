@@ -31,6 +31,7 @@ _LOOKAHEAD = 1.0
 # walking, radians.
 _STRAIGHT = 0.16
 _BEND = 0.7
+_ROOM_TO_BEND = 0.6
 # For how long the avatar keeps turning as it does now, seconds.
 _COAST = 0.045
 _PREFER_AHEAD = 0.15
@@ -45,16 +46,22 @@ class View:
   Attributes:
     position: Where the avatar is, `(..., 2)`, metres.
     angle: The way it faces, `(...)`, radians.
+    coast: By how much it will turn before a command is obeyed, `(...)`,
+      radians.
     distances: How far each ray gets, `(..., rays)`, metres.
     classes: What each ray hits, `(..., rays)`.
-    rays: Where each ray points in the world, `(..., rays)`, radians.
   """
 
   position: np.ndarray
   angle: np.ndarray
+  coast: np.ndarray
   distances: np.ndarray
   classes: np.ndarray
-  rays: np.ndarray
+
+  @property
+  def ray_angles(self) -> np.ndarray:
+    """How far to the left of ahead each ray points, `(rays,)`, radians."""
+    return _ray_angles(self.distances.shape[-1])
 
   def hits(self, name: str) -> np.ndarray:
     """Returns which rays hit something of a class, `(..., rays)`, bool."""
@@ -69,9 +76,10 @@ class View:
     Returns:
       `(..., rays, 2)`, metres.
     """
+    angles = self.angle[..., np.newaxis] + self.ray_angles
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     reach = (self.distances + depth)[..., np.newaxis]
-    ends = np.stack([np.cos(self.rays), np.sin(self.rays)], axis=-1)
-    return self.position[..., np.newaxis, :] + reach * ends
+    return self.position[..., np.newaxis, :] + reach * directions
 
   def mean_point(self, hit: np.ndarray, depth: float) -> np.ndarray:
     """Returns the mean of `points(depth)` of some rays, `(..., 2)`.
@@ -83,49 +91,53 @@ class View:
     total = (self.points(depth) * hit[..., np.newaxis]).sum(axis=-2)
     return total / np.maximum(hit.sum(axis=-1), 1)[..., np.newaxis]
 
-  def bearing(self, target: np.ndarray) -> np.ndarray:
-    """Returns how far to the left of ahead places are, radians.
+  def locate(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where places are from here.
 
     Args:
-      target: `(..., 2)`, or `(..., places, 2)`, metres.
-    """
-    position, angle = self.position, self.angle
-    if target.ndim > position.ndim:
-      position, angle = position[..., np.newaxis, :], angle[..., np.newaxis]
-    x, y = np.moveaxis(target - position, -1, 0)
-    return wrap(np.arctan2(y, x) - angle)
+      places: `(..., places, 2)`, metres.
 
-  def distance(self, target: np.ndarray) -> np.ndarray:
-    """Returns how far away places are, metres.
-
-    Args:
-      target: `(..., 2)`, or `(..., places, 2)`, metres.
+    Returns:
+      How far they are, metres, and how far to the left of ahead, radians in
+      [-pi, pi), each `(..., places)`.
     """
-    position = self.position
-    if target.ndim > position.ndim:
-      position = position[..., np.newaxis, :]
-    return np.linalg.norm(target - position, axis=-1)
+    offsets = places - self.position[..., np.newaxis, :]
+    directions = np.arctan2(offsets[..., 1], offsets[..., 0])
+    return (
+        np.linalg.norm(offsets, axis=-1),
+        wrap(directions - self.angle[..., np.newaxis]),
+    )
+
+  def locate_one(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Does what `locate` does, for one place, `(..., 2)`."""
+    distance, bearing = self.locate(place[..., np.newaxis, :])
+    return distance[..., 0], bearing[..., 0]
+
+  def nearest_ray(self, bearing: np.ndarray) -> np.ndarray:
+    """Returns the index of the ray that points most nearly to a bearing."""
+    angles = self.ray_angles
+    index = np.rint((angles[0] - bearing) / (angles[0] - angles[1]))
+    return index.clip(0, len(angles) - 1).astype(int)
 
 
 def look(observation: base.Observation) -> View:
   """Returns what there is to see."""
-  x, y = np.moveaxis(np.asarray(observation['senses/heading'], float), -1, 0)
-  turning = np.asarray(observation['senses/velocity'], float)[..., 2]
-  angle = np.arctan2(y, x)
-  distances = np.asarray(observation['senses/ray_distances'], float)
+
+  def get(name: str) -> np.ndarray:
+    return np.asarray(observation[f'senses/{name}'], float)
+
+  x, y = np.moveaxis(get('heading'), -1, 0)
   return View(
-      position=np.asarray(observation['senses/position'], float),
-      # The heading that a command given now starts from.
-      angle=angle + _COAST * turning,
-      distances=distances,
+      position=get('position'),
+      angle=np.arctan2(y, x),
+      coast=_COAST * get('velocity')[..., 2],
+      distances=get('ray_distances'),
       classes=np.asarray(observation['senses/ray_classes']),
-      rays=angle[..., np.newaxis] + ray_angles(distances.shape[-1]),
   )
 
 
 @functools.cache
-def ray_angles(num_rays: int) -> np.ndarray:
-  """Returns where rays point, from left to right, `(rays,)`, radians."""
+def _ray_angles(num_rays: int) -> np.ndarray:
   half = _FIELD_OF_VIEW / 2
   return np.linspace(half, -half, num_rays)
 
@@ -145,8 +157,7 @@ def free_way(view: View, ignored: Sequence[str] = ()) -> np.ndarray:
   berths = _BERTH[view.classes]
   for name in ignored:
     berths = np.where(view.hits(name), -1.0, berths)
-  angles = ray_angles(view.distances.shape[-1])
-  between = angles[:, np.newaxis] - angles
+  between = view.ray_angles[:, np.newaxis] - view.ray_angles
   distances = view.distances[..., np.newaxis, :]
   along = distances * np.cos(between)
   beside = distances * np.abs(np.sin(between))
@@ -169,27 +180,24 @@ def walk(
     ignored: Classes of things that are walked into.
   """
   free = free_way(view, ignored)
-  angles = ray_angles(free.shape[-1])
-  # Where the rays point once the avatar stops turning.
-  relative = view.rays - view.angle[..., np.newaxis]
-  bearing = view.bearing(target)
-  needed = np.clip(view.distance(target) - reach, 0.0, _LOOKAHEAD)
+  distance, bearing = view.locate_one(target)
+  # Which way the avatar will face when it obeys.
+  ahead = np.broadcast_to(view.coast, bearing.shape)[..., np.newaxis]
+  needed = np.clip(distance - reach, 0.0, _LOOKAHEAD)
   is_free = free >= needed[..., np.newaxis]
   cost = (
-      np.abs(wrap(relative - bearing[..., np.newaxis]))
-      + _PREFER_AHEAD * np.abs(relative)
+      np.abs(wrap(view.ray_angles - bearing[..., np.newaxis]))
+      + _PREFER_AHEAD * np.abs(view.ray_angles - ahead)
       + np.where(is_free, 0.0, _BLOCKED - free.clip(0.0, _LOOKAHEAD))
   )
   best = cost.argmin(axis=-1)[..., np.newaxis]
-  way = np.take_along_axis(relative, best, -1)[..., 0]
-  open_way = np.take_along_axis(is_free, best, -1)[..., 0]
   # What is behind is turned to first; nothing is known of it.
-  behind = np.abs(bearing) > angles[0]
-  way = np.where(behind, bearing, way)
-  ahead = np.abs(relative).argmin(axis=-1)[..., np.newaxis]
-  room = np.take_along_axis(free, ahead, -1)[..., 0]
-  clear = room >= np.minimum(needed, 0.6)
-  return head(way, moving=clear & open_way & ~behind)
+  behind = np.abs(bearing) > view.ray_angles[0]
+  way = np.where(behind, bearing, view.ray_angles[best[..., 0]])
+  room = np.take_along_axis(free, view.nearest_ray(ahead), -1)[..., 0]
+  open_way = np.take_along_axis(is_free, best, -1)[..., 0]
+  clear = (room >= np.minimum(needed, _ROOM_TO_BEND)) & open_way & ~behind
+  return head(wrap(way - view.coast), moving=clear)
 
 
 def head(bearing: np.ndarray, moving: np.ndarray | bool = False) -> np.ndarray:
