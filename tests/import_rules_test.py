@@ -50,6 +50,7 @@ _UNSAFE_YAML = re.compile(r'yaml\.(load|(full|unsafe)_load)(_all)?')
 _LOCAL_GENERATORS = (
     'BitGenerator',
     'Generator',
+    'MT19937',
     'PCG64',
     'PCG64DXSM',
     'Philox',

@@ -11,7 +11,7 @@ from typing import Any, Literal, final
 
 import pydantic
 
-import realab_suite as package
+from realab_suite import __version__
 from realab_suite import errors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import metrics
@@ -115,7 +115,7 @@ class EpisodeRow(pydantic.BaseModel):
 def versions() -> dict[str, str]:
   """Returns the versions of what results depend on."""
   return {
-      'realab_suite': package.__version__,
+      'realab_suite': __version__,
       'python': platform.python_version(),
       **{
           name: metadata.version(name)

@@ -208,6 +208,7 @@ class LearnerSpec(_Spec):
   kind: Name
 
 
+@final
 class _AnyProvider:
   """Validates a provider by the class that its `kind` is registered as."""
 

@@ -195,27 +195,32 @@ def walk(
   behind = np.abs(bearing) > view.ray_angles[0]
   way = np.where(behind, bearing, view.ray_angles[best[..., 0]])
   room = np.take_along_axis(free, view.nearest_ray(ahead), -1)[..., 0]
-  open_way = np.take_along_axis(is_free, best, -1)[..., 0]
-  clear = (room >= np.minimum(needed, _ROOM_TO_BEND)) & open_way & ~behind
-  return head(wrap(way - view.coast), moving=clear)
+  clear = (room >= np.minimum(needed, _ROOM_TO_BEND)) & ~behind
+  return _head(wrap(way - view.coast), clear)
 
 
-def head(bearing: np.ndarray, moving: np.ndarray | bool = False) -> np.ndarray:
-  """Returns the index of the action that turns to a bearing, and walks.
+def face(view: View, bearing: np.ndarray, then: str) -> np.ndarray:
+  """Returns the index of the action that turns to a bearing, or what is next.
 
   Args:
-    bearing: How far to the left to turn, `(...)`, radians.
-    moving: Whether to walk as well, as soon as the heading allows, `(...)`.
+    view: What is seen.
+    bearing: How far to the left of ahead, `(...)`, radians.
+    then: The action for when the avatar faces that way.
   """
-  left = bearing > 0
+  error = wrap(bearing - view.coast)
+  turn = np.where(error > 0, action('turn_left'), action('turn_right'))
+  return np.where(np.abs(error) <= _STRAIGHT, action(then), turn)
+
+
+def _head(error: np.ndarray, clear: np.ndarray) -> np.ndarray:
+  """Turns by an angle, walking as well where the way ahead is clear."""
+  left = error > 0
   turn = np.where(left, action('turn_left'), action('turn_right'))
   bend = np.where(
       left, action('forward_turn_left'), action('forward_turn_right')
   )
-  straight = np.where(moving, action('forward'), action('wait'))
-  error = np.abs(bearing)
-  turning = np.where(moving & (error < _BEND), bend, turn)
-  return np.where(error <= _STRAIGHT, straight, turning)
+  walks = np.where(np.abs(error) <= _STRAIGHT, action('forward'), bend)
+  return np.where(clear & (np.abs(error) < _BEND), walks, turn)
 
 
 @functools.cache
