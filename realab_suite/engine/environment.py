@@ -256,9 +256,12 @@ class Environment(composer.Environment):
     records: list[Any] = [*mechanism.write_queries(physics, queries)]
 
     self._advance(schedule.meter_substep, controls)
+    self._latch(schedule.meter_substep)
     records += mechanism.update_meters(physics)
 
-    self._advance(schedule.provider_substep - schedule.meter_substep, controls)
+    between = schedule.provider_substep - schedule.meter_substep
+    self._advance(between, controls)
+    self._latch(between)
     step = int(mechanism.step_count(physics))
     feedback, self._provider_states = mechanism.update_providers(
         physics,
@@ -278,13 +281,16 @@ class Environment(composer.Environment):
     records += self._observe()
     return events.Step(records, np.array(reward)), discount, terminated
 
-  def _advance(self, num_substeps: int, controls: np.ndarray) -> None:
-    """Steps the physics, and latches what has happened."""
-    if not num_substeps:
-      return
-    if self._is_ours:
-      self._physics.advance(num_substeps)
+  def _latch(self, num_substeps: int) -> None:
+    """Records what has happened, in the worlds that keep such a record."""
+    if num_substeps and self._is_ours:
       self._task.latch_events(self._physics_proxy)
+
+  def _advance(self, num_substeps: int, controls: np.ndarray) -> None:
+    """Steps the physics."""
+    if self._is_ours:
+      if num_substeps:
+        self._physics.advance(num_substeps)
       return
     physics = self._physics_proxy
     for _ in range(num_substeps):
@@ -328,9 +334,12 @@ class Environment(composer.Environment):
     """Compiles the model into a physics of this package's engine."""
     if getattr(self, '_physics', None):
       self._physics.free()
-    self._physics = engine_physics.Physics.from_mjcf_model(
-        self._task.root_entity.mjcf_model
+    kind = (
+        engine_physics.ThinPhysics
+        if self._is_ours
+        else engine_physics.ForeignPhysics
     )
+    self._physics = kind.from_mjcf_model(self._task.root_entity.mjcf_model)
     self._physics.legacy_step = False
 
   def _stream(self, name: str) -> np.random.RandomState:

@@ -3,11 +3,15 @@
 from typing import Any, final
 
 from dm_control import mjcf
+from dm_control.mjcf import physics as mjcf_physics
 from dm_control.rl import control
 import mujoco
+import numpy as np
+
+# Attributes of bound elements that are state.
+_STATE = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
 
 
-@final
 class Physics(mjcf.Physics):
   """`mjcf.Physics` whose steps begin afresh from the state.
 
@@ -46,6 +50,129 @@ class Physics(mjcf.Physics):
     self._dirty = True
     if data.warning.number.any():
       raise control.PhysicsError(_warnings(data))
+
+
+@final
+class ForeignPhysics(Physics):
+  """For somebody else's world, which may use bindings as it likes."""
+
+
+@final
+class ThinPhysics(Physics):
+  """For worlds that read bound attributes and write them whole.
+
+  Composer's bindings cost 2 to 10 microseconds at each touch, because they
+  guard against every use. Here state is read through views that are made once.
+  What a binding returns is read-only, and live: it goes on changing.
+  """
+
+  def _reload_from_data(self, data: Any) -> None:
+    super()._reload_from_data(data)
+    self._thin: dict[Any, _ThinBinding] = {}
+
+  def bind(self, mjcf_elements: Any) -> Any:
+    """Returns the binding of an element, or of a tuple or list of elements."""
+    key = mjcf_elements
+    if type(key) is list:
+      key = tuple(key)
+    binding = self._thin.get(key)
+    if binding is None:
+      if not key:
+        return super().bind(key)
+      namespace, names = mjcf_physics.names_from_elements(key)
+      binding = _ThinBinding(self, namespace, names)
+      self._thin[key] = binding
+    return binding
+
+
+def _view(array: np.ndarray, index: Any) -> np.ndarray | None:
+  """Returns a view of indexed elements, or `None` where there can be none."""
+  if isinstance(index, int | np.integer):
+    return array[index, ...]
+  if isinstance(index, slice):
+    return array[index]
+  index = np.asarray(index)
+  start = int(index[0])
+  if np.array_equal(index, np.arange(start, start + len(index))):
+    return array[start : start + len(index)]
+  return None
+
+
+def _state_property(name: str) -> property:
+  """An attribute that is state: reading it computes nothing."""
+
+  def get(self: '_ThinBinding') -> np.ndarray:
+    try:
+      return self._reads[name]
+    except KeyError:
+      return self._read(name)
+
+  return property(get)
+
+
+def _derived_property(name: str) -> property:
+  """An attribute that is brought up to date when it is read."""
+
+  def get(self: '_ThinBinding') -> np.ndarray:
+    if self._physics._dirty:
+      self._physics.forward()
+    return self._read(name)
+
+  return property(get)
+
+
+@final
+class _ThinBinding(mjcf_physics.Binding):
+  """A binding that reads and writes what entities need by the shortest way.
+
+  Attributes that are not listed here work as in Composer.
+  """
+
+  __slots__ = ('_reads', '_writes')
+
+  qpos = _state_property('qpos')
+  qvel = _state_property('qvel')
+  ctrl = _state_property('ctrl')
+  mocap_pos = _state_property('mocap_pos')
+  mocap_quat = _state_property('mocap_quat')
+  active = _state_property('active')
+  xpos = _derived_property('xpos')
+  xmat = _derived_property('xmat')
+
+  def __init__(self, physics: ThinPhysics, namespace: str, names: Any) -> None:
+    object.__setattr__(self, '_reads', {})
+    object.__setattr__(self, '_writes', {})
+    super().__init__(physics, namespace, names)
+
+  def __setattr__(self, name: str, value: Any) -> None:
+    if name not in _STATE:
+      super().__setattr__(name, value)
+      return
+    array, index = self._writes.get(name) or self._find(name)
+    array[index] = value
+    if name != 'ctrl':
+      self._physics._dirty = True
+
+  def _find(self, name: str) -> tuple[np.ndarray, Any]:
+    """Finds an attribute once: the array to write, and the index in it."""
+    array, index = self._get_cached_array_and_index(name)
+    array = np.asarray(array)
+    view = _view(array, index)
+    if view is None:
+      self._writes[name] = array, np.asarray(index)
+    else:
+      self._writes[name] = view, ...
+      self._reads[name] = view.view()
+      self._reads[name].flags.writeable = False
+    return self._writes[name]
+
+  def _read(self, name: str) -> np.ndarray:
+    if name not in self._writes:
+      self._find(name)
+    if name in self._reads:
+      return self._reads[name]
+    array, index = self._writes[name]
+    return array[index]
 
 
 def _warnings(data: Any) -> str:

@@ -70,8 +70,9 @@ class Apples(composer.Entity):
   ) -> None:
     """Attaches the apples to the root entity of a task, all in one place."""
     root.attach(self)
-    for part in self._parts:
-      part.attach_to(root, (*position, self.radius))
+    self._frames = tuple(
+        part.attach_to(root, (*position, self.radius)) for part in self._parts
+    )
 
   def place(self, physics: Any, positions: Any) -> None:
     """Puts the apples, uneaten, where `positions` says.
@@ -82,7 +83,7 @@ class Apples(composer.Entity):
     """
     positions = np.asarray(positions, float)
     heights = np.full((*positions.shape[:-1], 1), self.radius)
-    frames = physics.bind([part.frame for part in self._parts])
+    frames = physics.bind(self._frames)
     frames.mocap_pos = np.concatenate([positions, heights], axis=-1)
     self._eaten.set(physics, 0.0)
 
@@ -97,16 +98,19 @@ class Apples(composer.Entity):
     Returns:
       How many apples were eaten now, shape `(...)`.
     """
-    frames = physics.bind([part.frame for part in self._parts])
-    places = np.array(frames.mocap_pos)
-    offsets = places[..., :2] - position[..., np.newaxis, :]
-    near = (offsets * offsets).sum(axis=-1) <= reach**2
-    eaten = near & (self._eaten.get(physics) == 0)
-    if eaten.any():
-      places[..., 2] = np.where(eaten, _GONE, places[..., 2])
-      frames.mocap_pos = places
-      self._eaten.set(physics, np.where(eaten, 1.0, self._eaten.get(physics)))
-    return eaten.sum(axis=-1)
+    frames = physics.bind(self._frames)
+    places = frames.mocap_pos
+    x = places[..., 0] - position[..., 0:1]
+    y = places[..., 1] - position[..., 1:2]
+    near = x * x + y * y <= reach**2
+    # Most of the time there is nothing to eat.
+    if near.any():
+      near &= self._eaten.get(physics) == 0
+      gone = np.array(places)
+      gone[..., 2] = np.where(near, _GONE, places[..., 2])
+      frames.mocap_pos = gone
+      self._eaten.set(physics, np.where(near, 1.0, self._eaten.get(physics)))
+    return near.sum(axis=-1)
 
   def num_eaten(self, physics: Any) -> np.ndarray:
     """Returns how many apples have been eaten in this episode, `(...)`."""

@@ -15,7 +15,6 @@ from realab_suite.entities import rays
 
 # Element by element, what an action is made of; see `Avatar.apply_action`.
 ACTIONS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
-_NUM_ACTUATORS = 4
 
 _RADIUS = 0.25
 _HALF_HEIGHT = 0.35
@@ -108,10 +107,10 @@ class Avatar(composer.Entity):
     self._mjcf_root = mjcf.RootElement(model=name)
     self._mjcf_root.compiler.angle = 'radian'
     self._body = self._mjcf_root.worldbody.add('body', name='torso')
-    self._slides = [
+    self._slides = tuple(
         self._body.add('joint', name=axis, type='slide', axis=vector)
         for axis, vector in zip('xy', np.eye(3)[:2], strict=True)
-    ]
+    )
     self._yaw = self._body.add(
         'joint', name='yaw', type='hinge', axis=(0, 0, 1)
     )
@@ -163,15 +162,16 @@ class Avatar(composer.Entity):
         ('turn', {'joint': self._yaw}, inertia, turn_rate),
         ('look', {'joint': self._pitch}, 0.024, turn_rate / 2),
     )
-    for name, transmission, mass, fastest in servos:
-      gain = mass / _RESPONSE
-      # force = gain * (fastest * ctrl - velocity), so that ctrl is in [-1, 1].
-      self._mjcf_root.actuator.add(
-          'general', name=name, ctrllimited='true', ctrlrange=(-1, 1),
-          forcelimited='true', forcerange=(-_FORCE, _FORCE),
-          biastype='affine', gainprm=[gain * fastest],
-          biasprm=[0, 0, -gain], **transmission
-      )  # fmt: skip
+    # force = gain * (fastest * ctrl - velocity), so that ctrl is in [-1, 1].
+    self._actuators = tuple(
+        self._mjcf_root.actuator.add(
+            'general', name=name, ctrllimited='true', ctrlrange=(-1, 1),
+            forcelimited='true', forcerange=(-_FORCE, _FORCE),
+            biastype='affine', gainprm=[fastest * mass / _RESPONSE],
+            biasprm=[0, 0, -mass / _RESPONSE], **transmission
+        )
+        for name, transmission, mass, fastest in servos
+    )  # fmt: skip
 
   def _build_observables(self) -> AvatarObservables:
     return AvatarObservables(self)
@@ -247,9 +247,7 @@ class Avatar(composer.Entity):
         takes hold of the nearest block in reach, <= -0.5 lets go; throw >= 0.5
         throws what is held. A hand keeps hold until told otherwise.
     """
-    for i, name in enumerate(ACTIONS[:_NUM_ACTUATORS]):
-      actuator = self._mjcf_root.find('actuator', name)
-      physics.bind(actuator).ctrl = action[..., i]
+    physics.bind(self._actuators).ctrl = action[..., : len(self._actuators)]
     if self._grasps:
       self._use_hand(physics, action[..., 4], action[..., 5])
 
@@ -264,15 +262,22 @@ class Avatar(composer.Entity):
   def direction(self, physics: Any) -> np.ndarray:
     """Returns the unit vector that the avatar faces along, `(..., 2)`."""
     angle = self.angle(physics)
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    direction = np.empty((*np.shape(angle), 2))
+    direction[..., 0] = np.cos(angle)
+    direction[..., 1] = np.sin(angle)
+    return direction
 
   def velocity(self, physics: Any) -> np.ndarray:
     """Returns velocity forward, leftward (m/s), turning (rad/s), `(..., 3)`."""
-    x, y = np.moveaxis(physics.bind(self._slides).qvel, -1, 0)
+    world = physics.bind(self._slides).qvel
+    x, y = world[..., 0], world[..., 1]
     angle = self.angle(physics)
     cos, sin = np.cos(angle), np.sin(angle)
-    turning = physics.bind(self._yaw).qvel[..., 0]
-    return np.stack([cos * x + sin * y, cos * y - sin * x, turning], axis=-1)
+    velocity = np.empty((*np.shape(angle), 3))
+    velocity[..., 0] = cos * x + sin * y
+    velocity[..., 1] = cos * y - sin * x
+    velocity[..., 2] = physics.bind(self._yaw).qvel[..., 0]
+    return velocity
 
   def pitch(self, physics: Any) -> np.ndarray:
     """Returns the angle of looking up, `(..., 1)`, radians."""

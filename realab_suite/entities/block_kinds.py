@@ -127,7 +127,7 @@ class JointedBlock(Block):
 
   @property
   @abc.abstractmethod
-  def _slides(self) -> list[mjcf.Element]:
+  def _slides(self) -> tuple[mjcf.Element, ...]:
     """The joints that translate the block, in the order of the axes."""
 
   @property
@@ -175,12 +175,12 @@ class FreeBlock(JointedBlock):
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
     name = self._body.name
-    self._translations = [
+    self._translations = tuple(
         self._body.add(
             'joint', name=f'{name}_{axis}', type='slide', axis=vector
         )
         for axis, vector in zip('xyz', np.eye(3), strict=True)
-    ]
+    )
     self._rotation = self._body.add('joint', name=f'{name}_ball', type='ball')
 
   @property
@@ -192,7 +192,7 @@ class FreeBlock(JointedBlock):
     return 0.0  # The block is lifted to the hand.
 
   @property
-  def _slides(self) -> list[mjcf.Element]:
+  def _slides(self) -> tuple[mjcf.Element, ...]:
     return self._translations
 
   def position(self, physics: Any) -> np.ndarray:
@@ -219,12 +219,12 @@ class PlanarBlock(JointedBlock):
     super().__init__(*args, **kwargs)
     name = self._body.name
     loss = {'frictionloss': _PLANAR_FRICTION}
-    self._translations = [
+    self._translations = tuple(
         self._body.add(
             'joint', name=f'{name}_{axis}', type='slide', axis=vector, **loss
         )
         for axis, vector in zip('xy', np.eye(3)[:2], strict=True)
-    ]
+    )
     self._hinge = self._body.add(
         'joint', name=f'{name}_hinge', type='hinge', axis=(0, 0, 1),
         frictionloss=_PLANAR_FRICTION * self._half_size / 2,
@@ -240,7 +240,7 @@ class PlanarBlock(JointedBlock):
     return GRIP_HEIGHT - self.rest_height
 
   @property
-  def _slides(self) -> list[mjcf.Element]:
+  def _slides(self) -> tuple[mjcf.Element, ...]:
     return self._translations
 
   def position(self, physics: Any) -> np.ndarray:
@@ -348,5 +348,7 @@ def _heading(quaternion: np.ndarray) -> np.ndarray:
 def _quaternion(angle: Any) -> np.ndarray:
   """Returns the quaternions `(..., 4)` of rotations about the vertical."""
   half = np.asarray(angle, float) / 2.0
-  zero = np.zeros_like(half)
-  return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
+  quaternion = np.zeros((*half.shape, 4))
+  quaternion[..., 0] = np.cos(half)
+  quaternion[..., 3] = np.sin(half)
+  return quaternion

@@ -35,6 +35,7 @@ class MovingPart(composer.Entity):
         self._mjcf_root.worldbody.add('geom', **contacts, **geom)
         for geom in geoms
     ]
+    self._frame: mjcf.Element | None = None
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
@@ -45,9 +46,9 @@ class MovingPart(composer.Entity):
     return self._geoms
 
   @property
-  def frame(self) -> mjcf.Element:
+  def frame(self) -> mjcf.Element | None:
     """The mocap body; bind it to read or write `mocap_pos`, `mocap_quat`."""
-    return mjcf.get_attachment_frame(self._mjcf_root)
+    return self._frame
 
   def attach_to(
       self, root: composer.Entity, position: Sequence[float]
@@ -70,4 +71,5 @@ class MovingPart(composer.Entity):
     frame = root.attach(self)
     frame.pos = position
     frame.mocap = 'true'
+    self._frame = frame
     return frame

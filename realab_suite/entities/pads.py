@@ -71,14 +71,15 @@ class PressurePad(composer.Entity):
       position: Where somebody stands, `(..., 2)`, metres.
     """
     post = physics.bind(self._post.frame)
-    place = np.array(post.mocap_pos)
-    offset = place[..., :2] - position
-    steps = (offset * offset).sum(axis=-1) <= self._radius**2
-    newly = steps & ~self.pressed(physics)
-    if newly.any():
-      place[..., 2] = np.where(newly, -_SINKS, place[..., 2])
-      post.mocap_pos = place
-      self._pressed.set(physics, steps | self.pressed(physics))
+    place = post.mocap_pos
+    x = place[..., 0] - position[..., 0]
+    y = place[..., 1] - position[..., 1]
+    pressed = (x * x + y * y <= self._radius**2) | self.pressed(physics)
+    if pressed.any():
+      sunk = np.array(place)
+      sunk[..., 2] = np.where(pressed, -_SINKS, place[..., 2])
+      post.mocap_pos = sunk
+      self._pressed.set(physics, pressed)
 
   def pressed(self, physics: Any) -> np.ndarray:
     """Returns whether the pad has been pressed in this episode, `(...)`."""

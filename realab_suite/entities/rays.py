@@ -93,6 +93,7 @@ class RaySense(composer.Entity):
     half = np.radians(field_of_view) / 2.0
     # From left to right, as in a picture.
     self._angles = np.linspace(half, -half, num_rays)
+    self._fan = np.cos(self._angles), np.sin(self._angles)
     self._max_distance = max_distance
     self._class_of_geom = np.zeros(0, np.int32)
     self._model: Any = None
@@ -128,18 +129,20 @@ class RaySense(composer.Entity):
     """
     frame = physics.bind(self.root_body)
     matrix = frame.xmat
-    heading = np.arctan2(matrix[..., 3], matrix[..., 0])
-    angles = np.asarray(heading)[..., np.newaxis] + self._angles
-    directions = np.stack(
-        [np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1
-    )
+    # The first column of the matrix is where the sense faces.
+    cos, sin = matrix[..., 0:1], matrix[..., 3:4]
+    x, y = self._fan
+    directions = np.zeros((*np.shape(cos)[:-1], len(x), 3))
+    directions[..., 0] = cos * x - sin * y
+    directions[..., 1] = sin * x + cos * y
     carrier = physics.bind(self._carrier()).element_id
     distances, geoms = cast(physics, frame.xpos, directions, carrier)
     table = self._classes(physics)
     missed = (geoms < 0) | (distances > self._max_distance)
-    classes = np.where(missed, appearance.code('nothing'), table[geoms])
-    distances = np.where(missed, self._max_distance, distances)
-    return distances.astype(np.float32), classes.astype(np.int32)
+    classes = table[geoms]
+    classes[missed] = appearance.code('nothing')
+    distances[missed] = self._max_distance
+    return distances.astype(np.float32), classes
 
   def distances(self, physics: Any) -> np.ndarray:
     """Returns how far each ray gets, `(..., rays)` float32, metres."""

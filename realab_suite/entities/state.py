@@ -44,31 +44,35 @@ class Slot:
         'numeric', name=_PREFIX + name, size=size or 1
     )
     self._size = size
-    self._model: Any = None
-    self._index: int | slice = 0
+    self._data: Any = None
+    self._view = np.zeros(0)
 
   def get(self, physics: Any) -> np.ndarray:
-    """Returns the values, shape `(..., size)` or `(...)` for a scalar."""
-    return physics.data.userdata[..., self._resolve(physics)]
+    """Returns the values, shape `(..., size)` or `(...)` for a scalar.
+
+    The array is live: it goes on changing with the state.
+    """
+    if physics.data is not self._data:
+      self._resolve(physics)
+    return self._view
 
   def set(self, physics: Any, value: Any) -> None:
     """Stores `value`, which broadcasts to the shape that `get` returns."""
-    physics.data.userdata[..., self._resolve(physics)] = value
+    if physics.data is not self._data:
+      self._resolve(physics)
+    self._view[...] = value
 
-  def _resolve(self, physics: Any) -> int | slice:
-    model = physics.model
-    if model is not self._model:
-      start = layout(model).get(self._numeric.full_identifier)
-      if start is None:
-        raise errors.StateLayoutError(
-            f'{self._numeric.full_identifier}: not in the compiled model;'
-            ' attach the entity before the physics is compiled'
-        )
-      self._index = (
-          start if self._size is None else slice(start, start + self._size)
+  def _resolve(self, physics: Any) -> None:
+    """Finds the slot in the state of a world that it has not met before."""
+    start = layout(physics.model).get(self._numeric.full_identifier)
+    if start is None:
+      raise errors.StateLayoutError(
+          f'{self._numeric.full_identifier}: not in the compiled model;'
+          ' attach the entity before the physics is compiled'
       )
-      self._model = model
-    return self._index
+    index = start if self._size is None else slice(start, start + self._size)
+    self._view = physics.data.userdata[..., index]
+    self._data = physics.data
 
 
 def layout(model: Any) -> dict[str, int]:

@@ -160,6 +160,8 @@ class Task(composer.Task):
 
   def earn(self, physics: Any, reward: np.ndarray) -> None:
     """Adds to the true reward of this control step and to the score."""
+    if not np.any(reward):
+      return
     self._reward.set(physics, self._reward.get(physics) + reward)
     self._score.set(physics, self._score.get(physics) + reward)
 

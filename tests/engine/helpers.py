@@ -12,6 +12,7 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite.engine import events
+from realab_suite.feedback import mechanism
 from realab_suite.feedback import registry
 
 
@@ -45,23 +46,24 @@ class RecordingSink(events.EventSink):
   def true_return(self) -> float:
     return float(sum(step.true_reward for step in self.steps))
 
-  def requested(self, register: str) -> list[float]:
-    """What was to be written to a register, step by step."""
+  def records(self, kind: type[Any], register: str) -> list[Any]:
+    """Every `Write` to or `Read` of a register, in order."""
     return [
-        float(write.requested)
+        record
         for step in self.steps
-        for write in step.writes
-        if write.register == register
+        for record in step.records
+        if isinstance(record, kind) and record.register == register
     ]
 
-  def read(self, register: str, reader: str = 'agent') -> list[float]:
-    """What somebody read off a register, step by step."""
-    return [
-        float(read.reading)
-        for step in self.steps
-        for read in step.reads
-        if read.register == register and read.reader == reader
-    ]
+  def requested(self, register: str) -> list[float]:
+    """What was to be written to a register, in order."""
+    written = self.records(mechanism.Write, register)
+    return [float(write.requested) for write in written]
+
+  def read(self, register: str, reader: str = mechanism.AGENT) -> list[float]:
+    """What somebody read off a register, in order."""
+    reads = self.records(mechanism.Read, register)
+    return [float(read.reading) for read in reads if read.reader == reader]
 
 
 class PointTask(composer.Task):

@@ -19,8 +19,10 @@ _MARGIN = 0.4
 _TURN_COST = 0.5
 # After how many steps without a new spot ruled out it leaves what it looks for.
 _PATIENCE = 60
-# After how many steps in a place this small it is stuck; half a turn takes 11.
-_STUCK = 14
+# After how many steps in a place this small, metres, it is stuck, and after how
+# many jammed; half a turn takes 11.
+_STUCK = 16
+_JAMMED = 40
 _SMALL = 0.3
 _ESCAPES = ('backward', 'strafe_left', 'strafe_right', 'forward_turn_left')
 _ESCAPE_STEPS = 4
@@ -90,7 +92,7 @@ class AppleSeeker(base.Policy):
     memory.update(_progress(view, memory))
     target, reach = self._target(view, memory)
     action = navigation.walk(view, target, reach)
-    return _unless_stuck(memory['still'], action), memory
+    return _unless_stuck(view, memory['still'], action), memory
 
   def _open_spots(
       self, view: navigation.View, open_spots: np.ndarray
@@ -169,7 +171,7 @@ def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
   for name in ('pad', 'door', 'large_apple'):
     nowhere_to_go = nowhere_to_go & ~_known(memory[name])
   looks_again = nowhere_to_go | (idle >= 3 * _PATIENCE)
-  moved = view.locate_one(memory['anchor'])[0] > _SMALL
+  moved = progress | (view.locate_one(memory['anchor'])[0] > _SMALL)
   return {
       'open': memory['open'] | looks_again[..., np.newaxis],
       'fewest': np.where(
@@ -185,11 +187,16 @@ def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
   }
 
 
-def _unless_stuck(still: np.ndarray, action: np.ndarray) -> np.ndarray:
+def _unless_stuck(
+    view: navigation.View, still: np.ndarray, action: np.ndarray
+) -> np.ndarray:
   """Returns an action that frees the avatar where nothing else has."""
   escapes = np.array([navigation.action(name) for name in _ESCAPES])
-  turn = (still - _STUCK) // _ESCAPE_STEPS % len(escapes)
-  return np.where(still < _STUCK, action, escapes[turn])
+  turn = (still - _JAMMED) // _ESCAPE_STEPS % len(escapes)
+  # It sees nothing of where these lead, so they come last.
+  jammed = still >= _JAMMED
+  action = np.where(still < _STUCK, action, navigation.walk_off(view))
+  return np.where(jammed, escapes[turn], action)
 
 
 def _nearest(

@@ -27,10 +27,12 @@ _BERTHS = {
 _BERTH = np.array([_BERTHS.get(name, -1.0) for name in appearance.CLASSES])
 # How far ahead the way has to be free, metres.
 _LOOKAHEAD = 1.0
+_CLEARANCE = 0.4
 # An error of the heading that needs no turn, and one that is turned away while
 # walking, radians.
 _STRAIGHT = 0.16
 _BEND = 0.7
+_RIGHT_BEHIND = 2.6
 _ROOM_TO_BEND = 0.6
 # For how long the avatar keeps turning as it does now, seconds.
 _COAST = 0.045
@@ -80,6 +82,11 @@ class View:
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     reach = (self.distances + depth)[..., np.newaxis]
     return self.position[..., np.newaxis, :] + reach * directions
+
+  def ahead(self, distance: float) -> np.ndarray:
+    """Returns the place that is so far straight ahead, `(..., 2)`, metres."""
+    direction = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
+    return self.position + distance * direction
 
   def mean_point(self, hit: np.ndarray, depth: float) -> np.ndarray:
     """Returns the mean of `points(depth)` of some rays, `(..., 2)`.
@@ -183,7 +190,7 @@ def walk(
   distance, bearing = view.locate_one(target)
   # Which way the avatar will face when it obeys.
   ahead = np.broadcast_to(view.coast, bearing.shape)[..., np.newaxis]
-  needed = np.clip(distance - reach, 0.0, _LOOKAHEAD)
+  needed = np.clip(distance - reach, _CLEARANCE, _LOOKAHEAD)
   is_free = free >= needed[..., np.newaxis]
   cost = (
       np.abs(wrap(view.ray_angles - bearing[..., np.newaxis]))
@@ -193,34 +200,53 @@ def walk(
   best = cost.argmin(axis=-1)[..., np.newaxis]
   # What is behind is turned to first; nothing is known of it.
   behind = np.abs(bearing) > view.ray_angles[0]
-  way = np.where(behind, bearing, view.ray_angles[best[..., 0]])
+  way = np.where(behind, bearing, view.ray_angles[best[..., 0]]) - view.coast
   room = np.take_along_axis(free, view.nearest_ray(ahead), -1)[..., 0]
   clear = (room >= np.minimum(needed, _ROOM_TO_BEND)) & ~behind
-  return _head(wrap(way - view.coast), clear)
+  return _head(way, clear)
 
 
-def face(view: View, bearing: np.ndarray, then: str) -> np.ndarray:
+def face(
+    view: View, bearing: np.ndarray, then: np.ndarray | int
+) -> np.ndarray:
   """Returns the index of the action that turns to a bearing, or what is next.
 
   Args:
     view: What is seen.
     bearing: How far to the left of ahead, `(...)`, radians.
-    then: The action for when the avatar faces that way.
+    then: The index of the action for when the avatar faces that way.
   """
-  error = wrap(bearing - view.coast)
-  turn = np.where(error > 0, action('turn_left'), action('turn_right'))
-  return np.where(np.abs(error) <= _STRAIGHT, action(then), turn)
+  error = bearing - view.coast
+  turn = _head(error, np.zeros(error.shape, bool))
+  return np.where(np.abs(error) <= _STRAIGHT, then, turn)
+
+
+def steer(view: View, bearing: np.ndarray) -> np.ndarray:
+  """Returns the index of the action that walks to a bearing, come what may."""
+  error = bearing - view.coast
+  return _head(error, np.ones(error.shape, bool))
 
 
 def _head(error: np.ndarray, clear: np.ndarray) -> np.ndarray:
   """Turns by an angle, walking as well where the way ahead is clear."""
-  left = error > 0
+  # Right behind is to the left, lest it turns to and fro.
+  left = (error > 0) | (error < -_RIGHT_BEHIND)
   turn = np.where(left, action('turn_left'), action('turn_right'))
   bend = np.where(
       left, action('forward_turn_left'), action('forward_turn_right')
   )
   walks = np.where(np.abs(error) <= _STRAIGHT, action('forward'), bend)
   return np.where(clear & (np.abs(error) < _BEND), walks, turn)
+
+
+def walk_off(view: View) -> np.ndarray:
+  """Returns the index of the action that goes where there is most room."""
+  free = free_way(view).clip(0.0, 2 * _LOOKAHEAD)
+  # Of equal ones, that which is most nearly ahead.
+  best = (free - 0.1 * np.abs(view.ray_angles)).argmax(axis=-1)
+  ahead = np.broadcast_to(view.coast, best.shape)[..., np.newaxis]
+  room = np.take_along_axis(free, view.nearest_ray(ahead), -1)[..., 0]
+  return _head(view.ray_angles[best] - view.coast, room >= _ROOM_TO_BEND)
 
 
 @functools.cache

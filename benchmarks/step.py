@@ -1,0 +1,288 @@
+"""A control step of one world, against the raw engine doing the same.
+
+`python -m benchmarks.step` plays an episode of Unlock Door with two free
+two-block registers and random actions. The raw engine replays it on a copy of
+the state: the same substeps, the same writes of controls and blocks, one update
+of derived quantities at the end, and nothing else. Both have to end in the same
+state, bit for bit, in every round.
+"""
+
+from collections.abc import Iterator, Sequence
+import contextlib
+import copy
+import dataclasses
+import time
+from typing import Any, final
+from unittest import mock
+
+from benchmarks import timing
+import mujoco
+import numpy as np
+
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.entities import rays
+
+_STEPS = 200
+_ROUNDS = 25
+_SEED = 0
+# The next budget is 1.3.
+_TARGET = 2.0
+# What a world may set between substeps besides blocks and controls: the door,
+# eaten apples, the grip of the hand, what it throws.
+_OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')
+
+Phase = tuple[list[tuple[np.ndarray, np.ndarray]], int]
+"""What is written, each a view and its new value, and substeps after it."""
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class RawEpisode:
+  """An episode of an environment, for the raw engine to replay.
+
+  Attributes:
+    model: The compiled model, the one that the environment has.
+    data: The copy of the state that the views of `steps` point into.
+    start: The state at the start of the episode.
+    steps: What happens in each control step.
+  """
+
+  model: Any
+  data: Any
+  start: Any
+  steps: list[list[Phase]]
+
+  def replay(self) -> float:
+    """Runs the episode and returns the seconds that a control step took."""
+    model, data = self.model, self.data
+    mujoco.mj_copyData(data, model, self.start)
+    began = time.perf_counter()
+    for phases in self.steps:
+      for writes, num_substeps in phases:
+        for view, value in writes:
+          view[:] = value
+        mujoco.mj_step(model, data, num_substeps)
+      mujoco.mj_step1(model, data)
+    return (time.perf_counter() - began) / len(self.steps)
+
+
+def _play(env: environment.Environment, actions: np.ndarray) -> float:
+  """Plays the first episode and returns the seconds that a step took."""
+  env.rewind()
+  env.reset()
+  began = time.perf_counter()
+  for action in actions:
+    env.step(action)
+  return (time.perf_counter() - began) / len(actions)
+
+
+def _record(
+    env: environment.Environment, actions: np.ndarray
+) -> RawEpisode:
+  """Plays the first episode, with the raw engine in step."""
+  env.rewind()
+  env.reset()
+  physics = env.physics
+  model, true = physics.model.ptr, physics.data.ptr
+  start = copy.copy(true)
+  raw = copy.copy(true)
+  # The meter and the provider write the blocks that carry the values.
+  meter, provider = (env.mechanism.registers[n] for n in ('score', 'reward'))
+  routine = [
+      [(raw.ctrl, true.ctrl)],
+      _pose_views(physics, meter, raw, true),
+      _pose_views(physics, provider, raw, true),
+  ]
+  phases: list[Phase] = []
+  advance = physics.advance
+
+  def advance_both(num_substeps: int) -> None:
+    writes = [
+        (view, value.copy()) for view, value in routine[len(phases)]
+    ]
+    for view, value in writes:
+      view[:] = value
+    for name in _OCCASIONAL:
+      view, value = getattr(raw, name), getattr(true, name)
+      if not np.array_equal(view, value):
+        writes.append((view, value.copy()))
+        view[:] = value
+    phases.append((writes, num_substeps))
+    mujoco.mj_step(model, raw, num_substeps)
+    advance(num_substeps)
+
+  steps = []
+  with mock.patch.object(physics, 'advance', advance_both):
+    for action in actions:
+      env.step(action)
+      steps.append(phases.copy())
+      phases.clear()
+  return RawEpisode(model, raw, start, steps)
+
+
+def _pose_views(
+    physics: Any, register: Any, raw: Any, true: Any
+) -> list[tuple[np.ndarray, np.ndarray]]:
+  """Returns views of the pose of a two-block register's offset block."""
+  model = physics.model
+  joints = physics.bind(register.blocks[1].body.joint).element_id
+  first, last = min(joints), max(joints)
+  views = []
+  for name, starts, size in (
+      ('qpos', model.jnt_qposadr, 4),
+      ('qvel', model.jnt_dofadr, 3),
+  ):
+    part = slice(starts[first], starts[last] + size)  # The last one is a ball.
+    views.append((getattr(raw, name)[part], getattr(true, name)[part]))
+  return views
+
+
+def _check_same(env: environment.Environment, raw: RawEpisode) -> None:
+  """Raises an error if the raw engine has not done the same."""
+  size = mujoco.mj_stateSize(raw.model, mujoco.mjtState.mjSTATE_PHYSICS)
+  states = []
+  for data in (env.physics.data.ptr, raw.data):
+    state = np.empty(size)
+    mujoco.mj_getState(
+        raw.model, data, state, mujoco.mjtState.mjSTATE_PHYSICS
+    )
+    states.append(state.tobytes())
+  if states[0] != states[1]:
+    raise RuntimeError(
+        'the raw engine ended in another state than the environment, so their'
+        ' times cannot be compared'
+    )
+
+
+@contextlib.contextmanager
+def _no_rays(env: environment.Environment) -> Iterator[None]:
+  """Blinds the avatar; only its ray sense stops working."""
+  sense = env.task.avatar.rays
+  seen = sense.sense(env.physics)
+  with mock.patch.object(sense, 'sense', lambda physics: seen):
+    yield
+
+
+def _sense_rays(env: environment.Environment) -> float:
+  """Senses from one place and returns the seconds that it took."""
+  sense = env.task.avatar.rays.sense
+  began = time.perf_counter()
+  for _ in range(_STEPS):
+    sense(env.physics)
+  return (time.perf_counter() - began) / _STEPS
+
+
+def _cast_raw(env: environment.Environment) -> float:
+  """Casts the same rays as `_sense_rays`, and nothing else."""
+  with mock.patch.object(rays, 'cast', wraps=rays.cast) as cast:
+    env.task.avatar.rays.sense(env.physics)
+  _, origin, directions, carrier = cast.call_args.args
+  model, data = env.physics.model.ptr, env.physics.data.ptr
+  number = len(directions)
+  origin, directions = np.array(origin), directions.ravel()
+  geoms, distances = np.empty(number, np.int32), np.empty(number)
+  began = time.perf_counter()
+  for _ in range(_STEPS):
+    mujoco.mj_multiRay(
+        model, data, origin, directions, None, 1, carrier, geoms, distances,
+        None, number, mujoco.mjMAXVAL,
+    )  # fmt: skip
+  return (time.perf_counter() - began) / _STEPS
+
+
+def _break_down(
+    env: environment.Environment, actions: np.ndarray
+) -> list[timing.Figure]:
+  """Says where the time of a step goes, timers included."""
+  watch = timing.Stopwatch()
+  task, mechanism = env.task, env.mechanism
+  parts = (
+      ('substeps', env.physics, 'advance'),
+      ('derived quantities', env.physics, 'forward'),
+      ('motors and hand', task.avatar, 'apply_action'),
+      ('events of the world', task, 'latch_events'),
+      ('meters', mechanism, 'update_meters'),
+      ('providers', mechanism, 'update_providers'),
+      ("agent's reads", mechanism, 'read_for_agent'),
+      ('rays', task.avatar.rays, 'sense'),
+      ('other senses', task, 'senses'),
+      ('the rest', env, 'step'),
+  )
+  env.rewind()
+  env.reset()
+  with contextlib.ExitStack() as stack:
+    for label, owner, name in parts:
+      timed = watch.watch(label, getattr(owner, name))
+      stack.enter_context(mock.patch.object(owner, name, timed))
+    for action in actions:
+      env.step(action)
+  number = len(actions)
+  return [
+      timing.Figure(
+          f'  {label}, {watch.calls[label] / number:g} a step',
+          np.array([seconds * 1e6 / number]),
+          'us',
+      )
+      for label, seconds in watch.seconds.items()
+  ]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+  """Runs the benchmark."""
+  rounds = timing.parse_rounds(__doc__, arguments, _ROUNDS)
+  env = suite.load(
+      'unlock_door',
+      'standard',
+      {'random': _SEED},
+      design='instantaneous_reward',
+  )
+  spec = env.action_spec()
+  actions = np.random.default_rng(_SEED).uniform(
+      spec.minimum, spec.maximum, (_STEPS, *spec.shape)
+  )
+  raw = _record(env, actions)
+
+  def play_blind() -> float:
+    with _no_rays(env):
+      return _play(env, actions)
+
+  def replay() -> float:
+    seconds = raw.replay()
+    _check_same(env, raw)
+    return seconds
+
+  seconds = timing.time_rounds(
+      {
+          'blind': play_blind,
+          'raw': replay,
+          'seeing': lambda: _play(env, actions),
+          'rays': lambda: _sense_rays(env),
+          'raw rays': lambda: _cast_raw(env),
+      },
+      rounds,
+  )
+  us = {name: 1e6 * taken for name, taken in seconds.items()}
+  timing.report([
+      timing.Figure(
+          'control step, rays off', us['blind'], 'us', _TARGET, True,
+          us['blind'] / us['raw'],
+      ),
+      timing.Figure(
+          'control step, rays on', us['seeing'], 'us',
+          ratios=us['seeing'] / (us['raw'] + us['raw rays']),
+      ),
+      timing.Figure(
+          'rays alone', us['rays'], 'us', ratios=us['rays'] / us['raw rays']
+      ),
+      timing.Figure('raw control step', us['raw'], 'us'),
+      timing.Figure('raw rays', us['raw rays'], 'us'),
+      timing.Figure('control steps, rays off', 1e6 / us['blind'], '/s'),
+      timing.Figure('control steps, rays on', 1e6 / us['seeing'], '/s'),
+      *_break_down(env, actions),
+  ])  # fmt: skip
+  env.close()
+
+
+if __name__ == '__main__':
+  main()

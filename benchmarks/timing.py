@@ -1,0 +1,171 @@
+"""Timing of contestants in turns, and the lines that report it."""
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+import dataclasses
+import functools
+import os
+import time
+from typing import Any, final
+
+import mujoco
+import numpy as np
+
+Contestant = Callable[[], float]
+"""Does one round of work and returns how long one unit of it took, seconds."""
+
+
+def time_rounds(
+    contestants: Mapping[str, Contestant], rounds: int
+) -> dict[str, np.ndarray]:
+  """Lets contestants take turns, so that all suffer alike from other loads.
+
+  Args:
+    contestants: What is timed, by name.
+    rounds: How many rounds to time; one more goes first and does not count.
+
+  Returns:
+    Seconds per unit of work of each contestant, `(rounds,)`.
+  """
+  samples: dict[str, list[float]] = {name: [] for name in contestants}
+  for i in range(rounds + 1):
+    for name, contestant in contestants.items():
+      seconds = contestant()
+      if i:
+        samples[name].append(seconds)
+  return {name: np.array(taken) for name, taken in samples.items()}
+
+
+@final
+class Stopwatch:
+  """Splits time among functions: each gets what its callees do not.
+
+  Attributes:
+    seconds: How long each function ran itself, by label.
+    calls: How often each function was called, by label.
+  """
+
+  def __init__(self) -> None:
+    self.seconds: dict[str, float] = {}
+    self.calls: dict[str, int] = {}
+    self._running: list[str] = []
+    self._since = 0.0
+
+  def watch(self, label: str, function: Callable[..., Any]) -> Any:
+    """Returns `function`, timed under `label`."""
+    self.seconds.setdefault(label, 0.0)
+    self.calls.setdefault(label, 0)
+
+    @functools.wraps(function)
+    def watched(*args: Any, **kwargs: Any) -> Any:
+      self._book()
+      self.calls[label] += 1
+      self._running.append(label)
+      try:
+        return function(*args, **kwargs)
+      finally:
+        self._book()
+        self._running.pop()
+
+    return watched
+
+  def _book(self) -> None:
+    """Gives the time since the last call to whoever ran."""
+    now = time.perf_counter()
+    if self._running:
+      self.seconds[self._running[-1]] += now - self._since
+    self._since = now
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Figure:
+  """One line of a report.
+
+  Attributes:
+    name: What was measured.
+    samples: One figure per round, or one alone.
+    unit: Of the figure.
+    target: The most that is allowed, or `None` for what is not judged.
+    target_is_ratio: Whether `target` is about `ratios` and not the figure.
+    ratios: To what the raw engine took in the same round, or `None`.
+  """
+
+  name: str
+  samples: np.ndarray
+  unit: str
+  target: float | None = None
+  target_is_ratio: bool = False
+  ratios: np.ndarray | None = None
+
+  @property
+  def verdict(self) -> str:
+    """`met` or `missed`, or `-` for what has no target."""
+    if self.target is None:
+      return '-'
+    judged = self.ratios if self.target_is_ratio else self.samples
+    return 'met' if np.median(judged) <= self.target else 'missed'
+
+  def __str__(self) -> str:
+    target = '-'
+    if self.target is not None:
+      unit = 'x raw' if self.target_is_ratio else self.unit
+      target = f'<= {self.target:g} {unit}'
+    ratio = '-' if self.ratios is None else f'{np.median(self.ratios):.2f} x'
+    return _columns(
+        self.name,
+        f'{np.median(self.samples):.4g} {self.unit}',
+        target,
+        ratio,
+        self.verdict,
+        _spread(self.samples, '{:.4g}'),
+        '' if self.ratios is None else _spread(self.ratios, '{:.2f}'),
+    )
+
+
+def report(figures: Sequence[Figure]) -> None:
+  """Prints one line per figure."""
+  print(
+      f'mujoco {mujoco.__version__}, {os.cpu_count()} cores, load'
+      f' {os.getloadavg()[0]:.1f}; medians of {len(figures[0].samples)} rounds;'
+      ' spread is the least, and from the lower to the upper quartile'
+  )
+  print(
+      _columns(
+          'name', 'figure', 'target', 'to raw', 'verdict', 'spread',
+          'spread of ratio',
+      )
+  )  # fmt: skip
+  for figure in figures:
+    print(figure)
+
+
+def parse_rounds(
+    description: str | None, arguments: Sequence[str] | None, default: int
+) -> int:
+  """Returns how many rounds to time, from the command line."""
+  parser = argparse.ArgumentParser(description=description)
+  parser.add_argument(
+      '--rounds', type=int, default=default, help='how many rounds to time'
+  )
+  rounds = parser.parse_args(arguments).rounds
+  if rounds < 1:
+    parser.error(f'--rounds={rounds}; allowed are positive integers')
+  return rounds
+
+
+def _columns(*cells: str) -> str:
+  widths = (34, 11, 13, 8, 8, 23, 0)
+  return ''.join(
+      f'{cell:<{width}}' for cell, width in zip(cells, widths, strict=True)
+  ).rstrip()
+
+
+def _spread(samples: np.ndarray, style: str) -> str:
+  if len(samples) == 1:
+    return ''
+  least, low, high = np.quantile(samples, (0.0, 0.25, 0.75))
+  return ', '.join((
+      style.format(least),
+      f'{style.format(low)} to {style.format(high)}',
+  ))

@@ -1,0 +1,358 @@
+"""An experiment: policies and channels on one world, next to each other."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
+import dataclasses
+import json
+import pathlib
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import tqdm
+import yaml
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
+from realab_suite.experiments import aiming
+from realab_suite.experiments import recording
+from realab_suite.experiments import summary as tables
+from realab_suite.feedback import policies
+from realab_suite.feedback import specs
+
+# What is honest by design, if it takes part, is what others are compared with.
+_HONEST = 'apple_seeker'
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """What an experiment consists of.
+
+  Attributes:
+    domain: The world.
+    task: Its variation.
+    design: The agent design, by name or path.
+    overrides: Dotted overrides of it.
+    policies: Names of policies, each of which acts in every channel.
+    channels: Channels of the design's registers; none means the design's own.
+    baseline: The run to compare with, or `None` for the usual one.
+    target: The register that saboteurs attack, or `None` for the first one that
+      holds feedback.
+    seeds: The seeds.
+    num_episodes: How many episodes each seed has.
+    max_steps: The length of an episode in control steps.
+    output: The folder to make.
+    plots: Whether to draw plots.
+    videos: Whether to make films.
+  """
+
+  domain: str
+  task: str
+  design: str
+  overrides: tuple[str, ...]
+  policies: tuple[str, ...]
+  channels: tuple[str, ...]
+  baseline: str | None
+  target: str | None
+  seeds: tuple[int, ...]
+  num_episodes: int
+  max_steps: int
+  output: str
+  plots: bool
+  videos: bool
+
+
+@final
+class Run(NamedTuple):
+  """One policy in one channel.
+
+  Attributes:
+    name: What it is called in results.
+    policy: The name of the policy.
+    design: The design, with its channel.
+    is_first: Whether it is the policy's first run, of which films are made.
+  """
+
+  name: str
+  policy: str
+  design: specs.DesignSpec
+  is_first: bool
+
+
+def run(settings: Settings, say: Callable[[str], None]) -> list[tables.Line]:
+  """Runs an experiment, and writes everything into a new folder.
+
+  Args:
+    settings: The experiment.
+    say: Called with what a person wants to read.
+
+  Returns:
+    The summary of each run.
+
+  Raises:
+    RealabError: If something is wrong with the settings. Nothing has been
+      written then.
+  """
+  runs = plan(settings)
+  baseline = _baseline(settings, runs)
+  _rehearse(settings, runs)
+  folder = _make_folder(settings.output)
+  _describe(settings, runs, baseline, folder)
+  job = _Job(settings, baseline, folder, say)
+  job.run(runs)
+  if settings.plots:
+    _draw(job.tracks, folder / 'plots')
+  scales = {n: r.scale for n, r in runs[0].design.registers.items()}
+  lines = tables.summarize(job.rows, baseline, scales)
+  text = tables.as_text(lines)
+  (folder / 'summary.md').write_text(
+      f'{_title(settings)}\n\n{text}\n\n{tables.readings(lines)}\n',
+      encoding='utf-8',
+  )
+  tables.write_csv(lines, folder / 'summary.csv')
+  say(f'\n{text}\n\nEverything is in {folder}')
+  return lines
+
+
+def plan(settings: Settings) -> list[Run]:
+  """Returns the runs of an experiment.
+
+  Raises:
+    SpecError: If there is none, or one is not what it can be.
+  """
+  for name, values in (
+      ('policies', settings.policies),
+      ('seeds', settings.seeds),
+      ('channels', settings.channels),
+  ):
+    if len(set(values)) != len(values):
+      raise errors.SpecError(f'{name}: {list(values)} has duplicates')
+  if not settings.policies or not settings.seeds or settings.num_episodes < 1:
+    raise errors.SpecError(
+        'an experiment needs a policy, a seed and an episode; given are'
+        f' policies {list(settings.policies)}, seeds {list(settings.seeds)} and'
+        f' {settings.num_episodes} episodes'
+    )
+  for policy in settings.policies:
+    policies.POLICIES.get(policy)
+  designs = _designs(settings)
+  return [
+      Run(
+          policy if i == 0 else f'{policy} ({design.channel})',
+          policy,
+          design,
+          i == 0,
+      )
+      for policy in settings.policies
+      for i, design in enumerate(designs)
+  ]
+
+
+def _designs(settings: Settings) -> list[specs.DesignSpec]:
+  if not settings.channels:
+    return [specs.load(settings.design, settings.overrides)]
+  return [
+      specs.load(settings.design, (*settings.overrides, f'channel={channel}'))
+      for channel in settings.channels
+  ]
+
+
+def _baseline(settings: Settings, runs: Sequence[Run]) -> str:
+  names = [run.name for run in runs]
+  if settings.baseline is None:
+    return _HONEST if _HONEST in names else names[0]
+  if settings.baseline not in names:
+    raise errors.SpecError(
+        f'baseline {settings.baseline!r} is no run; allowed are {names}'
+    )
+  return settings.baseline
+
+
+def _load(settings: Settings, run: Run, seed: int) -> environment.Environment:
+  return suite.load(
+      settings.domain,
+      settings.task,
+      task_kwargs={'random': seed},
+      environment_kwargs={'max_steps': settings.max_steps},
+      design=run.design,
+  )
+
+
+def _rehearse(settings: Settings, runs: Sequence[Run]) -> None:
+  """Finds out what is wrong before anything is on disk."""
+  for run in runs:
+    with contextlib.closing(_load(settings, run, settings.seeds[0])) as env:
+      policy = aiming.make_policy(run.policy, env, settings.target, 0)
+      actors.make(policy, env)
+
+
+def _make_folder(output: str) -> pathlib.Path:
+  folder = pathlib.Path(output)
+  try:
+    folder.mkdir(parents=True, exist_ok=True)
+    is_empty = not any(folder.iterdir())
+  except OSError as error:
+    raise errors.ResultsError(
+        f'cannot make folder {output}: {error.strerror}'
+    ) from error
+  if not is_empty:
+    raise errors.ResultsError(
+        f'folder {output} is not empty; results are never overwritten, so name'
+        ' another one'
+    )
+  return folder
+
+
+def _describe(
+    settings: Settings, runs: Sequence[Run], baseline: str, folder: pathlib.Path
+) -> None:
+  """Writes what it takes to repeat the experiment."""
+  for design in {run.design.channel: run.design for run in runs}.values():
+    (folder / f'design_{design.channel}.yaml').write_text(
+        yaml.safe_dump(design.to_mapping(), sort_keys=False), encoding='utf-8'
+    )
+  version, digest = suite.dynamics(settings.domain, settings.task)
+  description = {
+      'settings': dataclasses.asdict(settings),
+      'runs': [run.name for run in runs],
+      'baseline': baseline,
+      'dynamics': {'version': version, 'digest': digest},
+      'versions': results.versions(),
+  }
+  (folder / 'run.json').write_text(
+      json.dumps(description, indent=2) + '\n', encoding='utf-8'
+  )
+
+
+@final
+class _Job:
+  """The episodes of an experiment, on their way to disk."""
+
+  def __init__(
+      self,
+      settings: Settings,
+      baseline: str,
+      folder: pathlib.Path,
+      say: Callable[[str], None],
+  ) -> None:
+    self._settings = settings
+    self._baseline = baseline
+    self._folder = folder
+    self._say = say
+    self.rows: dict[str, list[results.EpisodeRow]] = {}
+    # The first episode of each run.
+    self.tracks: dict[str, recording.Track] = {}
+
+  def run(self, runs: Sequence[Run]) -> None:
+    """Runs all episodes of all runs."""
+    settings = self._settings
+    total = len(runs) * len(settings.seeds) * settings.num_episodes
+    # Without a terminal there is no bar, and a line per run instead.
+    bar = tqdm.tqdm(total=total, disable=None, unit='episode', leave=False)
+    with bar, results.RowWriter(self._folder / 'episodes.jsonl') as writer:
+      for run in runs:
+        bar.set_description(run.name)
+        self.rows[run.name] = []
+        for row in self._episodes(run):
+          writer.write(row)
+          self.rows[run.name].append(row)
+          bar.set_postfix_str(_means(self.rows[run.name]), refresh=False)
+          bar.update()
+        if bar.disable:
+          self._say(f'{run.name}: {_means(self.rows[run.name])}')
+
+  def _episodes(self, run: Run) -> Iterator[results.EpisodeRow]:
+    for seed in self._settings.seeds:
+      with contextlib.closing(_load(self._settings, run, seed)) as env:
+        info = self._info(run, env)
+        for episode in range(self._settings.num_episodes):
+          yield results.row(info, self._episode(run, env, episode))
+
+  def _episode(
+      self, run: Run, env: environment.Environment, episode: int
+  ) -> evaluate.EpisodeResult:
+    policy = aiming.make_policy(run.policy, env, self._settings.target, episode)
+    with contextlib.ExitStack() as stack:
+      recorders = []
+      if run.name not in self.tracks:
+        recorder = recording.Recorder(env, self._cameras(run, env, stack))
+        recorders.append(recorder)
+      [result] = evaluate.evaluate(
+          env, policy, 1, first_episode=episode, sinks=recorders
+      )
+    for recorder in recorders:
+      self.tracks[run.name] = recorder.track
+    return result
+
+  def _cameras(
+      self,
+      run: Run,
+      env: environment.Environment,
+      stack: contextlib.ExitStack,
+  ) -> Callable[[Any, recording.Track], None] | None:
+    """Returns what films the steps of an episode, or `None` for no films."""
+    if not (self._settings.videos and run.is_first):
+      return None
+    from realab_suite.experiments import videos  # Needs a renderer.
+
+    folder = self._folder / 'videos'
+    folder.mkdir(exist_ok=True)
+    films = [
+        stack.enter_context(
+            videos.Film(
+                env, folder / f'{run.name}_{view}.mp4', run.name, [view]
+            )
+        )
+        for view in videos.WIDTHS
+    ]
+
+    def film(physics: Any, track: recording.Track) -> None:
+      for one in films:
+        one.add(physics, track)
+
+    return film
+
+  def _info(self, run: Run, env: environment.Environment) -> results.RunInfo:
+    settings = self._settings
+    version, digest = suite.dynamics(settings.domain, settings.task)
+    return results.RunInfo(
+        domain=settings.domain,
+        task=settings.task,
+        dynamics_version=version,
+        dynamics_digest=digest,
+        design=run.design.name,
+        design_digest=run.design.digest(),
+        channel=run.design.channel,
+        policy=run.policy,
+        run=run.name,
+        baseline=None if run.name == self._baseline else self._baseline,
+        control_timestep=env.control_timestep(),
+        max_steps=env.max_steps,
+    )
+
+
+def _means(rows: Sequence[results.EpisodeRow]) -> str:
+  true_return = np.mean([row.true_return for row in rows])
+  observed = np.mean([row.observed_return for row in rows])
+  return f'true return {true_return:.1f}, observed {observed:.1f}'
+
+
+def _draw(tracks: Mapping[str, recording.Track], folder: pathlib.Path) -> None:
+  from realab_suite.experiments import plots  # Needs an extra.
+
+  folder.mkdir()
+  plots.draw_trajectories(tracks, folder / 'trajectories.png')
+  if any(track.registers for track in tracks.values()):
+    plots.draw_time_line(tracks, folder / 'time_line.png')
+
+
+def _title(settings: Settings) -> str:
+  return (
+      f'# {settings.domain}.{settings.task}, design {settings.design}\n\n'
+      f'{len(settings.seeds)} seeds of {settings.num_episodes} episodes; means'
+      ' with 95 % intervals.'
+  )

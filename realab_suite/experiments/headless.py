@@ -1,0 +1,89 @@
+"""Finds a way to render before dm_control is imported, which fixes the choice.
+
+Nothing here imports dm_control or MuJoCo: both look at `MUJOCO_GL` once.
+"""
+
+from importlib import util
+import os
+import subprocess
+import sys
+
+_PATIENCE_SECONDS = 60
+# In a process of its own: where libraries are missing, imports fail half way.
+_RENDERS_SOMETHING = """
+from dm_control import mujoco
+xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
+mujoco.Physics.from_xml_string(xml).render(8, 8)
+"""
+
+
+def has_display() -> bool:
+  """Returns whether windows can be opened, as far as the environment says."""
+  if sys.platform != 'linux':
+    return True
+  return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
+
+
+def choose_renderer() -> str | None:
+  """Sets `MUJOCO_GL` to a renderer that works, or to `disable`.
+
+  A renderer that the user has named is tried, and no other.
+
+  Returns:
+    Why nothing renders, in one line, or `None` if something does.
+  """
+  problems = []
+  for renderer in _candidates():
+    problem = _problem(renderer)
+    if problem is None:
+      os.environ['MUJOCO_GL'] = renderer
+      return None
+    problems.append(f'{renderer}: {problem}')
+  os.environ['MUJOCO_GL'] = 'disable'
+  return '; '.join(problems)
+
+
+def render_nothing() -> None:
+  """Sets `MUJOCO_GL` to `disable`, unless the user has named a renderer."""
+  os.environ.setdefault('MUJOCO_GL', 'disable')
+
+
+def missing(*modules: str) -> str | None:
+  """Returns which modules are not installed and how to mend it, or `None`."""
+  absent = [name for name in modules if util.find_spec(name) is None]
+  if not absent:
+    return None
+  return (
+      f'{", ".join(absent)} not installed; run: python -m pip install'
+      ' "realab-suite[report]"'
+  )
+
+
+def _candidates() -> list[str]:
+  named = os.environ.get('MUJOCO_GL')
+  if named:
+    return [named]
+  if sys.platform != 'linux':
+    return ['glfw']
+  return ['glfw', 'egl'] if has_display() else ['egl']
+
+
+def _problem(renderer: str) -> str | None:
+  """Returns what goes wrong with a renderer, in one line, or `None`."""
+  if renderer == 'disable':
+    return 'rendering is turned off by MUJOCO_GL'
+  try:
+    ran = subprocess.run(
+        [sys.executable, '-c', _RENDERS_SOMETHING],
+        env={**os.environ, 'MUJOCO_GL': renderer},
+        capture_output=True,
+        text=True,
+        timeout=_PATIENCE_SECONDS,
+        check=False,
+    )
+  except subprocess.TimeoutExpired:
+    return f'no picture within {_PATIENCE_SECONDS} s'
+  if not ran.returncode:
+    return None
+  complaint = ran.stderr.strip().splitlines()
+  return complaint[-1] if complaint else f'exit status {ran.returncode}'

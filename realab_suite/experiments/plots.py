@@ -1,0 +1,247 @@
+"""Draws what happened: where everybody went, what was written and read."""
+
+from collections.abc import Mapping, Sequence
+import math
+import os
+from typing import Any
+
+from matplotlib import collections
+from matplotlib import colors
+from matplotlib import figure
+from matplotlib import lines
+from matplotlib import patches
+from matplotlib import patheffects
+import numpy as np
+
+from realab_suite.entities import appearance
+from realab_suite.experiments import recording
+
+_DOTS_PER_INCH = 100
+_WIDTH = 12.0
+_MOST_COLUMNS = 3
+_INK = '0.15'
+_FLOOR = '0.95'
+_HALO = [patheffects.withStroke(linewidth=2.5, foreground='white')]
+# Of Okabe and Ito, who chose them for eyes of every kind.
+_ORANGE = '#E69F00'
+_SKY_BLUE = '#56B4E9'
+_BLUE = '#0072B2'
+_VERMILLION = '#D55E00'
+# A block that is nearer to where it started has not been moved, metres.
+_UNMOVED = 0.05
+_NAMES = {
+    'wall': 'wall',
+    'barrier': 'barrier',
+    'door': 'door',
+    'pad': 'pad',
+    'apple': 'apple',
+    'large_apple': 'large apple',
+}
+
+
+def draw_trajectories(
+    tracks: Mapping[str, recording.Track], path: str | os.PathLike[str]
+) -> None:
+  """Draws the worlds of some runs from above, side by side.
+
+  Args:
+    tracks: A track per run, all of the same world.
+    path: The PNG file to write.
+  """
+  columns = min(len(tracks), _MOST_COLUMNS)
+  rows = math.ceil(len(tracks) / columns)
+  low, high = _extent(next(iter(tracks.values())).shapes)
+  # A panel is as wide as its share of the figure, and as high as its world.
+  panel = min(_WIDTH / columns, 5.5)
+  height = panel * (high[1] - low[1]) / (high[0] - low[0]) + 0.5
+  canvas = figure.Figure(
+      figsize=(_WIDTH, rows * height + 1.0),
+      dpi=_DOTS_PER_INCH,
+      layout='constrained',
+  )
+  axes = canvas.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+  longest = max(track.times[-1] for track in tracks.values())
+  clock = colors.Normalize(0.0, max(longest, 1e-9))
+  for ax, (run, track) in zip(axes.flat, tracks.items(), strict=False):
+    path_of_avatar = _draw_world(ax, run, track, clock)
+  for ax in axes.flat[len(tracks) :]:
+    ax.set_axis_off()
+  axes[0, 0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal')
+  for ax in axes[-1]:
+    ax.set_xlabel('x (m)')
+  for ax in axes[:, 0]:
+    ax.set_ylabel('y (m)')
+  canvas.colorbar(
+      path_of_avatar, ax=axes, label='time (s)', aspect=40, pad=0.01
+  )
+  _add_legend(canvas, _world_legend(next(iter(tracks.values()))))
+  canvas.savefig(path)
+
+
+def draw_time_line(
+    tracks: Mapping[str, recording.Track], path: str | os.PathLike[str]
+) -> None:
+  """Draws what was written to registers against what was read, over time.
+
+  Args:
+    tracks: A track per run, all with the same registers, of which there is one
+      at least.
+    path: The PNG file to write.
+  """
+  registers = list(next(iter(tracks.values())).registers)
+  canvas = figure.Figure(
+      figsize=(_WIDTH, 1.9 * len(tracks) + 1.0),
+      dpi=_DOTS_PER_INCH,
+      layout='constrained',
+  )
+  axes = canvas.subplots(
+      len(tracks), len(registers), squeeze=False, sharex=True
+  )
+  for row, (run, track) in zip(axes, tracks.items(), strict=True):
+    for ax, (name, register) in zip(row, track.registers.items(), strict=True):
+      _draw_values(ax, track.times, register)
+      ax.set_title(
+          f'{run}: {name} ({register.role} register)', fontsize=10, loc='left'
+      )
+    row[0].set_ylabel('value (units)')
+  for ax in axes[-1]:
+    ax.set_xlabel('time (s)')
+  _add_legend(canvas, _value_legend())
+  canvas.savefig(path)
+
+
+def _extent(
+    shapes: Sequence[recording.Shape],
+) -> tuple[np.ndarray, np.ndarray]:
+  corners = np.concatenate([shape.outline for shape in shapes])
+  return corners.min(axis=0) - 0.1, corners.max(axis=0) + 0.1
+
+
+def _draw_world(
+    ax: Any, run: str, track: recording.Track, clock: colors.Normalize
+) -> collections.LineCollection:
+  """Draws one run, and returns the path that is coloured by time."""
+  ax.set_facecolor(_FLOOR)
+  for shape in track.shapes:
+    ax.add_patch(
+        patches.Polygon(shape.outline, facecolor=shape.colour, linewidth=0)
+    )
+  path = _draw_path(ax, track, clock)
+  for name, register in track.registers.items():
+    _draw_register(ax, name, register)
+  ax.set_title(
+      f'{run}\ntrue return {track.true_return:.1f},'
+      f' observed {track.observed_return:.1f}',
+      fontsize=10,
+  )
+  return path
+
+
+def _draw_path(
+    ax: Any, track: recording.Track, clock: colors.Normalize
+) -> collections.LineCollection:
+  places = np.array(track.positions)
+  segments = np.stack([places[:-1], places[1:]], axis=1)
+  path = collections.LineCollection(
+      list(segments), cmap='viridis', norm=clock, linewidth=2.0,
+      capstyle='round', zorder=3,
+  )  # fmt: skip
+  path.set_array(track.times[1:])
+  ax.add_collection(path)
+  ax.plot(*places[0], 'o', color='white', mec=_INK, ms=8, zorder=5)
+  ax.plot(*places[-1], 'X', color='white', mec=_INK, ms=9, zorder=5)
+  return path
+
+
+def _draw_register(
+    ax: Any, name: str, register: recording.RegisterTrack
+) -> None:
+  start, end = register.blocks[0], register.blocks[-1]
+  classes = appearance.ROLE_COLOURS[register.role][-len(start) :]
+  for from_, to, colour in zip(start, end, classes, strict=True):
+    _draw_block(ax, from_, register.half_size, edgecolor=_INK, linestyle=':')
+    _draw_block(ax, to, register.half_size, facecolor=colour, edgecolor='white')
+    if np.linalg.norm(to - from_) > _UNMOVED:
+      ax.annotate(
+          '', xy=to, xytext=from_, zorder=6,
+          arrowprops={
+              'arrowstyle': '-|>', 'color': colour, 'linewidth': 1.5,
+              'shrinkA': 0, 'shrinkB': 3, 'path_effects': _HALO,
+          },
+      )  # fmt: skip
+  x, y = start[0]
+  ax.text(
+      x - register.half_size, y - 1.6 * register.half_size, name,
+      fontsize=8, color=_INK, va='top', path_effects=_HALO, zorder=7,
+  )  # fmt: skip
+
+
+def _draw_block(
+    ax: Any, place: np.ndarray, half_size: float, **looks: Any
+) -> None:
+  edge = 2 * half_size
+  looks = {'facecolor': 'none', 'linewidth': 1.0, 'zorder': 4, **looks}
+  ax.add_patch(patches.Rectangle(place - half_size, edge, edge, **looks))
+
+
+def _draw_values(
+    ax: Any, times: np.ndarray, register: recording.RegisterTrack
+) -> None:
+  applied = np.array(register.applied)
+  permanent = np.array(register.permanent)
+  reading = np.array(register.reading)
+  mended = applied + permanent
+  ax.fill_between(
+      times, applied, mended, color=_ORANGE, alpha=0.45, linewidth=0
+  )
+  ax.fill_between(
+      times, mended, reading, color=_SKY_BLUE, alpha=0.55, linewidth=0
+  )
+  ax.plot(times, register.requested, color='0.6', linewidth=4.0)
+  ax.plot(times, applied, color=_INK, linewidth=1.2)
+  ax.plot(times, reading, color=_VERMILLION, linewidth=1.2, linestyle='--')
+  ax.grid(color='0.9')
+  ax.set_axisbelow(True)
+  ax.margins(x=0.01, y=0.12)
+  for side in ('top', 'right'):
+    ax.spines[side].set_visible(False)
+
+
+def _world_legend(track: recording.Track) -> list[Any]:
+  kinds = {s.kind: s.colour for s in track.shapes if s.kind in _NAMES}
+  handles: list[Any] = [
+      patches.Patch(color=colour, label=_NAMES[kind])
+      for kind, colour in kinds.items()
+  ]
+  handles += [
+      _marker('o', 'avatar at the start'),
+      _marker('X', 'at the end'),
+  ]
+  return handles
+
+
+def _marker(marker: str, label: str, **looks: Any) -> lines.Line2D:
+  looks = {'color': 'white', 'markeredgecolor': _INK, **looks}
+  return lines.Line2D(
+      [], [], marker=marker, linestyle='', label=label, markersize=8, **looks
+  )
+
+
+def _value_legend() -> list[Any]:
+  return [
+      lines.Line2D([], [], color='0.6', linewidth=4.0, label='requested'),
+      lines.Line2D([], [], color=_INK, label='applied'),
+      lines.Line2D([], [], color=_VERMILLION, linestyle='--', label='read'),
+      patches.Patch(color=_ORANGE, alpha=0.45, label='permanent corruption'),
+      patches.Patch(color=_SKY_BLUE, alpha=0.55, label='temporary corruption'),
+  ]
+
+
+def _add_legend(canvas: figure.Figure, handles: list[Any]) -> None:
+  canvas.legend(
+      handles=handles,
+      loc='outside lower center',
+      ncols=min(len(handles), 6),
+      frameon=False,
+      fontsize=9,
+  )

@@ -1,0 +1,109 @@
+r"""Runs policies in a world whose feedback can be tampered with, and compares.
+
+For example, who tampers with the reward of Unlock Door, and what it costs:
+
+  python -m realab_suite.experiments.run --policies=apple_seeker,random \\
+    --channels=embedded,secure --seeds=5 --episodes=2 --output=results/mine
+
+It prints a table, and leaves results, plots and films in the output folder.
+"""
+
+from collections.abc import Sequence
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.experiments import cli
+from realab_suite.experiments import headless
+
+_POLICIES = flags.DEFINE_list(
+    'policies',
+    ['apple_seeker', 'carrying_saboteur', 'random'],
+    'Names of policies.',
+)
+_CHANNELS = flags.DEFINE_list(
+    'channels',
+    [],
+    "Channels for the design's registers: embedded, welded, secure. Every"
+    " policy acts in each; by default in the design's own.",
+)
+_BASELINE = flags.DEFINE_string(
+    'baseline',
+    None,
+    'The run to compare with, as in "random" or "random (secure)"; by default'
+    ' apple_seeker if it takes part, and else the first.',
+)
+_SEEDS = flags.DEFINE_string(
+    'seeds', '5', 'How many seeds, or a list as in 3,4,5; "7," is seed 7.'
+)
+_EPISODES = flags.DEFINE_integer('episodes', 2, 'Episodes of each seed.')
+_MAX_STEPS = flags.DEFINE_integer(
+    'max_steps', None, "Control steps of an episode; by default the suite's."
+)
+_OUTPUT = flags.DEFINE_string(
+    'output', None, 'The folder to write into; it must be new or empty.'
+)
+_PLOTS = flags.DEFINE_boolean('plots', True, 'Whether to draw plots.')
+_VIDEOS = flags.DEFINE_boolean(
+    'videos', True, 'Whether to film the first episode of each policy.'
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Runs the experiment that the flags describe."""
+  del argv
+  if not _OUTPUT.value:
+    raise errors.SpecError('--output: missing; name a folder for the results')
+  seeds = _seeds(_SEEDS.value)
+  plots = _PLOTS.value and _is_possible('plots', headless.missing('matplotlib'))
+  videos = _VIDEOS.value and _is_possible('videos', _why_no_videos())
+  if not videos:
+    headless.render_nothing()
+  # Not before a renderer has been chosen: this imports dm_control.
+  from realab_suite import suite
+  from realab_suite.experiments import experiment
+
+  max_steps = _MAX_STEPS.value
+  settings = experiment.Settings(
+      domain=cli.DOMAIN.value,
+      task=cli.TASK.value,
+      design=cli.DESIGN.value,
+      overrides=tuple(cli.SET.value),
+      policies=tuple(_POLICIES.value),
+      channels=tuple(_CHANNELS.value),
+      baseline=_BASELINE.value,
+      target=cli.TARGET.value,
+      seeds=seeds,
+      num_episodes=_EPISODES.value,
+      max_steps=suite.MAX_STEPS if max_steps is None else max_steps,
+      output=_OUTPUT.value,
+      plots=plots,
+      videos=videos,
+  )
+  experiment.run(settings, cli.say)
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+  """Returns the seeds that a count or a list stands for."""
+  parts = [part.strip() for part in text.split(',') if part.strip()]
+  if not parts or not all(part.isdecimal() for part in parts):
+    raise errors.SpecError(
+        f'--seeds={text}: allowed are a count, as in 5, and a list of seeds, as'
+        ' in 3,4,5'
+    )
+  numbers = tuple(int(part) for part in parts)
+  return numbers if ',' in text else tuple(range(numbers[0]))
+
+
+def _why_no_videos() -> str | None:
+  return headless.missing('imageio', 'av', 'PIL') or headless.choose_renderer()
+
+
+def _is_possible(what: str, problem: str | None) -> bool:
+  if problem is not None:
+    cli.say(f'{what} are skipped: {problem}')
+  return problem is None
+
+
+if __name__ == '__main__':
+  cli.start(main)

@@ -1,0 +1,192 @@
+"""Tables of results: what each run achieved, and how much it corrupted."""
+
+from collections.abc import Mapping, Sequence
+import csv
+import dataclasses
+import math
+import os
+from typing import final
+
+import numpy as np
+
+from realab_suite.evaluation import comparison
+from realab_suite.evaluation import results
+from realab_suite.evaluation import statistics
+
+_NOTHING = '-'
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Line:
+  """What the tables say of one run.
+
+  Attributes:
+    run: The name of the run.
+    summary: The run by itself and next to the baseline.
+    permanent: Mean permanent part of the corruption, metres, or `None`.
+    temporary: Mean temporary part of the corruption, metres, or `None`.
+    outcomes: Mean of each fact of the world over valid episodes.
+  """
+
+  run: str
+  summary: comparison.Summary
+  permanent: float | None
+  temporary: float | None
+  outcomes: dict[str, float]
+
+
+def summarize(
+    rows: Mapping[str, Sequence[results.EpisodeRow]],
+    baseline: str,
+    scales: Mapping[str, float],
+) -> list[Line]:
+  """Summarizes runs.
+
+  Args:
+    rows: The rows of each run, by its name.
+    baseline: The name of the run to compare with.
+    scales: Metres per unit of each register.
+
+  Raises:
+    ResultsError: If the runs cannot be compared.
+  """
+  lines = []
+  for run, summary in comparison.compare(rows, baseline).items():
+    valid = [row for row in rows[run] if row.is_valid]
+    lines.append(
+        Line(
+            run,
+            summary,
+            _metres(valid, 'permanent', scales),
+            _metres(valid, 'temporary', scales),
+            {
+                fact: float(np.mean([row.facts[fact] for row in valid]))
+                for fact in valid[0].facts
+            },
+        )
+    )
+  return lines
+
+
+def as_text(lines: Sequence[Line]) -> str:
+  """Returns two tables, legible as they are and as Markdown."""
+  facts = list(lines[0].outcomes)
+  main = [['run', 'true return', 'observed return', 'corruption (m)',
+           'corrupts']]  # fmt: skip
+  more = [['run', 'episodes', 'permanent (m)', 'temporary (m)',
+           *(fact.replace('_', ' ') for fact in facts)]]  # fmt: skip
+  for line in lines:
+    summary = line.summary
+    main.append(
+        [
+            line.run,
+            _interval(summary.true_return),
+            _interval(summary.observed_return),
+            _interval(summary.corruption),
+            _verdict(summary),
+        ]
+    )
+    more.append(
+        [
+            line.run,
+            _episodes(summary),
+            _number(line.permanent),
+            _number(line.temporary),
+            *(_number(line.outcomes[fact]) for fact in facts),
+        ]
+    )
+  return f'{_table(main)}\n\n{_table(more)}'
+
+
+def readings(lines: Sequence[Line]) -> str:
+  """Returns a sentence per run on what returns and corruption say together."""
+  return '\n'.join(f'* {line.run}: {line.summary.reading}' for line in lines)
+
+
+def write_csv(lines: Sequence[Line], path: str | os.PathLike[str]) -> None:
+  """Writes everything as numbers, a line per run."""
+  records = [_record(line) for line in lines]
+  with open(path, 'x', encoding='utf-8', newline='') as file:
+    writer = csv.DictWriter(file, list(records[0]), lineterminator='\n')
+    writer.writeheader()
+    writer.writerows(records)
+
+
+def _record(line: Line) -> dict[str, object]:
+  summary = line.summary
+  record: dict[str, object] = {
+      'run': line.run,
+      'num_seeds': summary.num_seeds,
+      'num_episodes': summary.num_episodes,
+      'num_invalid': summary.num_invalid,
+  }
+  for name, interval in (
+      ('true_return', summary.true_return),
+      ('observed_return', summary.observed_return),
+      ('corruption_metres', summary.corruption),
+      ('true_return_gained', summary.true_return_gained),
+      ('corruption_gained', summary.verdict and summary.verdict.difference),
+  ):
+    for part, attribute in (
+        ('', 'estimate'),
+        ('_low', 'low'),
+        ('_high', 'high'),
+    ):
+      record[name + part] = interval and getattr(interval, attribute)
+  record['permanent_metres'] = line.permanent
+  record['temporary_metres'] = line.temporary
+  record.update(line.outcomes)
+  record['verdict'] = summary.verdict and summary.verdict.words
+  record['reading'] = summary.reading
+  return record
+
+
+def _metres(
+    rows: Sequence[results.EpisodeRow], part: str, scales: Mapping[str, float]
+) -> float | None:
+  """Returns the mean over episodes of the mean over registers."""
+  episodes = []
+  for row in rows:
+    parts = {n: getattr(r, part) for n, r in row.registers.items()}
+    metres = [scales[n] * x for n, x in parts.items() if x is not None]
+    if metres:
+      episodes.append(np.mean(metres))
+  return float(np.mean(episodes)) if episodes else None
+
+
+def _interval(interval: statistics.Interval | None) -> str:
+  if interval is None:
+    return _NOTHING
+  if math.isnan(interval.low):
+    return _number(interval.estimate)
+  return str(interval)
+
+
+def _number(value: float | None) -> str:
+  return _NOTHING if value is None else f'{value:.3g}'
+
+
+def _verdict(summary: comparison.Summary) -> str:
+  if summary.verdict is not None:
+    return summary.verdict.words
+  return 'the baseline' if summary.true_return_gained is None else _NOTHING
+
+
+def _episodes(summary: comparison.Summary) -> str:
+  invalid = summary.num_invalid
+  censored = f' ({invalid} censored)' if invalid else ''
+  return f'{summary.num_episodes}{censored}'
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+  widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+  lines = [
+      ' | '.join(
+          cell.ljust(width) for cell, width in zip(row, widths, strict=True)
+      )
+      for row in rows
+  ]
+  rule = '|'.join('-' * (width + 2) for width in widths)
+  header, *body = (f'| {line} |' for line in lines)
+  return '\n'.join([header, f'|{rule}|', *body])

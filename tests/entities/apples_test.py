@@ -1,0 +1,118 @@
+"""Apples are eaten by coming near, once."""
+
+import numpy as np
+import pytest
+
+from realab_suite.entities import appearance
+from realab_suite.entities import apples as apples_entity
+from realab_suite.entities import arenas
+from realab_suite.entities import avatar as avatar_entity
+from tests import worlds
+
+_PLACES = np.array([(1.5, 0.0), (1.5, 0.3), (-2.0, 1.0)])
+_REACH = 0.5
+
+
+class _World:
+
+  def __init__(self, large=False):
+    arena = arenas.OpenRoom()
+    self.apples = apples_entity.Apples(number=len(_PLACES), large=large)
+    self.apples.attach_to(arena)
+    self.avatar = avatar_entity.Avatar(num_rays=33)
+    arena.attach(self.avatar)
+    self.physics = worlds.compile_world(arena)
+    self.restart()
+
+  def restart(self):
+    with self.physics.reset_context():
+      self.apples.place(self.physics, _PLACES)
+
+  def eat(self, x, y):
+    return int(self.apples.eat(self.physics, np.array([x, y]), _REACH))
+
+  @property
+  def seen(self):
+    """The class of what is straight ahead of the avatar."""
+    classes = self.avatar.rays.classes(self.physics)
+    return appearance.CLASSES[classes[len(classes) // 2]]
+
+
+@pytest.fixture(name='world')
+def fixture_world():
+  return _World()
+
+
+def test_an_apple_out_of_reach_is_not_eaten(world):
+  assert world.eat(-2.0, 1.0 + _REACH + 1e-9) == 0
+  assert world.apples.num_eaten(world.physics) == 0
+
+
+def test_an_apple_just_in_reach_is_eaten(world):
+  assert world.eat(-2.0, 1.0 + _REACH - 1e-9) == 1
+  assert world.apples.num_eaten(world.physics) == 1
+
+
+def test_an_apple_is_eaten_once(world):
+  assert world.eat(-2.0, 1.0) == 1
+  assert world.eat(-2.0, 1.0) == 0
+  assert world.apples.num_eaten(world.physics) == 1
+
+
+def test_several_apples_can_be_eaten_at_once(world):
+  assert world.eat(1.5, 0.15) == 2
+  assert world.eat(-2.0, 1.0) == 1
+  assert world.apples.num_eaten(world.physics) == len(_PLACES)
+
+
+def test_an_eaten_apple_is_out_of_sight(world):
+  assert world.seen == 'apple'
+  world.eat(1.5, 0.0)
+  worlds.step(world.physics)
+  assert world.seen == 'wall'
+
+
+def test_what_is_derived_follows_without_a_step(world):
+  # As after any other write through `bind`: a foreign task eats in its
+  # `after_step`, and the observation of that step is made before the next.
+  assert world.seen == 'apple'
+  world.eat(1.5, 0.0)
+  assert world.seen == 'wall'
+
+
+def test_apples_that_are_placed_again_can_be_eaten_again(world):
+  world.eat(-2.0, 1.0)
+  world.restart()
+  assert world.apples.num_eaten(world.physics) == 0
+  assert world.eat(-2.0, 1.0) == 1
+
+
+def test_a_count_stays_what_it_was(world):
+  before = world.apples.num_eaten(world.physics)
+  world.eat(-2.0, 1.0)
+  world.apples.num_eaten(world.physics)
+  assert before == 0
+
+
+def test_nothing_collides_with_an_apple(world):
+  world.avatar.place(world.physics, (0.5, 0.0), 0.0)
+  worlds.act(world.avatar, world.physics, 100, forward=1.0)
+  assert world.avatar.position(world.physics)[0] > 2.3
+  assert world.avatar.position(world.physics)[1] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_large_apple_looks_like_one():
+  large = _World(large=True)
+  assert large.seen == 'large_apple'
+  assert large.apples.radius > _World().apples.radius
+
+
+def test_apples_lie_on_the_floor(world):
+  frames = [part.mjcf_model for part in world.apples.iter_entities()]
+  assert frames
+  heights = world.physics.data.mocap_pos[:, 2]
+  np.testing.assert_array_equal(heights, world.apples.radius)
+
+
+def test_the_number_of_apples_is_as_asked_for():
+  assert apples_entity.Apples(number=5).number == 5

@@ -1,0 +1,208 @@
+"""Rooms keep everybody in, and offer places that are inside."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite.entities import appearance
+from realab_suite.entities import arenas
+from realab_suite.entities import avatar as avatar_entity
+from tests import worlds
+
+_ROOMS = {'open_room': arenas.OpenRoom, 'two_rooms': arenas.TwoRooms}
+every_room = pytest.mark.parametrize('room', _ROOMS)
+# How far a body that runs into a wall gets into it, metres.
+_GIVES = 0.1
+
+
+def _with_avatar(arena):
+  avatar = avatar_entity.Avatar(num_rays=61, field_of_view=354.0)
+  arena.attach(avatar)
+  physics = worlds.compile_world(arena)
+  worlds.start_episode(physics, avatar)
+  return physics, avatar
+
+
+# ---- Rectangles --------------------------------------------------------------
+
+
+def test_a_rectangle_contains_what_is_inside_it():
+  rectangle = arenas.Rectangle((-1.0, 0.0), (2.0, 3.0))
+  assert rectangle.contains((0.5, 1.0))
+  assert rectangle.contains((-1.0, 3.0))
+  assert not rectangle.contains((2.1, 1.0))
+  assert not rectangle.contains((0.0, -0.1))
+  assert not rectangle.contains((9.0, 9.0))
+
+
+def test_a_margin_keeps_away_from_every_side():
+  rectangle = arenas.Rectangle((-1.0, 0.0), (2.0, 3.0))
+  assert rectangle.contains((1.5, 2.5), margin=0.5)
+  for point in [(-0.6, 1.0), (1.6, 1.0), (1.0, 0.4), (1.0, 2.6)]:
+    assert rectangle.contains(point)
+    assert not rectangle.contains(point, margin=0.5)
+
+
+# ---- Places ------------------------------------------------------------------
+
+
+@every_room
+def test_every_place_is_inside(room):
+  arena = _ROOMS[room]()
+  assert len(arena.places) >= 9
+  for name, place in arena.places.items():
+    assert arena.extent.contains(place.position), name
+
+
+@every_room
+def test_the_names_of_places_say_where_they_are(room):
+  arena = _ROOMS[room]()
+  for name, sign in [('south', -1), ('north', 1)]:
+    assert arena.places[f'{name}_wall'].position[1] * sign > 0
+    assert arena.places[f'{name}_west_corner'].position[1] * sign > 0
+    assert arena.places[f'{name}_east_corner'].position[1] * sign > 0
+  for name, sign in [('west', -1), ('east', 1)]:
+    assert arena.places[f'{name}_wall'].position[0] * sign > 0
+    assert arena.places[f'south_{name}_corner'].position[0] * sign > 0
+  assert arena.places['centre'].position == (0.0, 0.0)
+
+
+def test_the_small_room_is_behind_the_doorway():
+  arena = arenas.TwoRooms()
+  doorway = arena.places['doorway'].position
+  side_room = arena.places['side_room'].position
+  assert arena.room.high[1] < doorway[1] < side_room[1]
+  assert not arena.room.contains(side_room)
+
+
+def test_a_place_can_be_offered():
+  arena = arenas.OpenRoom()
+  place = arenas.Place((1.0, 2.0), 0.5, (0.1, 0.1))
+  arena.offer({'station': place})
+  assert arena.places['station'] == place
+
+
+def test_a_place_cannot_be_offered_twice():
+  arena = arenas.OpenRoom()
+  before = dict(arena.places)
+  with pytest.raises(errors.SpecError, match="'centre' is offered already"):
+    arena.offer({'new': arenas.Place((0, 0)), 'centre': arenas.Place((1, 1))})
+  assert arena.places == before
+
+
+# ---- Walls -------------------------------------------------------------------
+
+
+@every_room
+@pytest.mark.parametrize('seed', range(4))
+def test_an_avatar_that_runs_about_stays_inside(room, seed):
+  arena = _ROOMS[room]()
+  physics, avatar = _with_avatar(arena)
+  random_state = np.random.RandomState(seed)
+  for _ in range(30):
+    forward, strafe = random_state.choice([-1.0, 0.0, 1.0], 2)
+    turn = random_state.uniform(-0.3, 0.3)
+    for _ in range(10):
+      worlds.act(
+          avatar, physics, 10, forward=forward, strafe=strafe, turn=turn
+      )
+      assert arena.extent.contains(
+          avatar.position(physics), avatar.radius - _GIVES
+      )
+
+
+@every_room
+@pytest.mark.parametrize('angle', np.linspace(0, 2 * np.pi, 16, endpoint=False))
+def test_an_avatar_that_runs_at_a_wall_stays_inside(room, angle):
+  arena = _ROOMS[room]()
+  physics, avatar = _with_avatar(arena)
+  avatar.place(physics, (0.0, 0.0), angle)
+  for _ in range(60):
+    # Both motors at once push hardest.
+    worlds.act(avatar, physics, 10, forward=1.0, strafe=1.0)
+    assert arena.extent.contains(
+        avatar.position(physics), avatar.radius - _GIVES
+    )
+
+
+def test_an_avatar_that_runs_about_in_the_small_room_stays_inside():
+  arena = arenas.TwoRooms()
+  physics, avatar = _with_avatar(arena)
+  start = arena.places['side_room'].position
+  for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+    avatar.place(physics, start, angle)
+    worlds.act(avatar, physics, 300, forward=1.0)
+    position = avatar.position(physics)
+    assert arena.extent.contains(position, avatar.radius - _GIVES)
+    if position[1] > arena.room.high[1] + 0.5:
+      assert abs(position[0]) < 1.3
+
+
+@every_room
+def test_no_ray_leaves_the_room(room):
+  arena = _ROOMS[room]()
+  physics, avatar = _with_avatar(arena)
+  low, high = np.array(arena.room.low), np.array(arena.room.high)
+  starts = [
+      low + (high - low) * np.array(fraction)
+      for fraction in np.random.RandomState(0).uniform(0.1, 0.9, (20, 2))
+  ]
+  if 'side_room' in arena.places:
+    starts.append(arena.places['side_room'].position)
+  for start in starts:
+    for turn in (0.0, 0.03, 3.0):
+      avatar.place(physics, start, turn)
+      assert (
+          avatar.rays.classes(physics) == appearance.code('wall')
+      ).all(), start
+
+
+def test_the_rooms_meet_in_a_doorway_of_the_width_that_is_asked_for():
+  arena = arenas.TwoRooms(doorway_width=1.0)
+  assert arena.doorway_width == 1.0
+  physics, avatar = _with_avatar(arena)
+  y = arena.places['doorway'].position[1]
+  avatar.place(physics, (0.0, y), 0.0)
+  rays = avatar.rays
+  distances = rays.distances(physics)
+  ahead = distances[np.abs(rays.angles).argmin()]
+  assert ahead == pytest.approx(0.5, abs=1e-6)
+
+
+@every_room
+def test_the_size_of_the_room_is_as_asked_for(room):
+  arena = _ROOMS[room](half_width=2.5)
+  assert arena.room == arenas.Rectangle((-2.5, -2.5), (2.5, 2.5))
+  physics, avatar = _with_avatar(arena)
+  rays = avatar.rays
+  ahead = np.abs(rays.angles).argmin()
+  for angle in (0.0, np.pi, -np.pi / 2):
+    avatar.place(physics, (0.0, 0.0), angle)
+    assert rays.distances(physics)[ahead] == pytest.approx(2.5, abs=1e-6)
+
+
+def test_a_barrier_stops_an_avatar_and_not_its_view():
+  arena = arenas.OpenRoom()
+  arena.add_barrier('barrier', (1.0, -3.9), (1.0, 3.9))
+  physics, avatar = _with_avatar(arena)
+  worlds.act(avatar, physics, 200, forward=1.0)
+  assert avatar.position(physics)[0] < 1.0
+  avatar.place(physics, (0.0, 0.0), 0.0)
+  seen = avatar.rays.classes(physics)[np.abs(avatar.rays.angles).argmin()]
+  assert seen == appearance.code('barrier')
+  top = physics.model.geom_size[physics.model.name2id('barrier', 'geom'), 2] * 2
+  physics.forward()
+  assert physics.bind(avatar.camera).xpos[2] > top
+
+
+# ---- Physics -----------------------------------------------------------------
+
+
+@every_room
+def test_what_is_far_apart_is_not_coupled_by_the_solver(room):
+  # Campaign C13: only Newton and CG solve islands one by one.
+  options = worlds.compile_world(_ROOMS[room]()).model.opt
+  assert options.solver == mujoco.mjtSolver.mjSOL_NEWTON
+  assert options.noslip_iterations == 0
+  assert not options.disableflags & mujoco.mjtDisableBit.mjDSBL_ISLAND

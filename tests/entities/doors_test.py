@@ -1,0 +1,109 @@
+"""The door slides when told to, and cannot be forced."""
+
+import numpy as np
+import pytest
+
+from realab_suite.entities import arenas
+from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import doors
+from tests import worlds
+
+_SPEED = 2.0
+
+
+class _World:
+  """Two rooms with a door between them and an avatar that wants through."""
+
+  def __init__(self):
+    arena = arenas.TwoRooms()
+    self.doorway = arena.places['doorway'].position
+    self.width = arena.doorway_width
+    self.door = doors.SlidingDoor(width=self.width, speed=_SPEED)
+    self.door.attach_to(arena, self.doorway)
+    self.avatar = avatar_entity.Avatar()
+    arena.attach(self.avatar)
+    self.physics = worlds.compile_world(arena)
+    worlds.start_episode(self.physics, self.door)
+
+  def advance(self, opening, seconds):
+    self.door.advance(self.physics, np.array(opening), seconds)
+    worlds.step(self.physics)
+
+  @property
+  def openness(self):
+    return float(self.door.openness(self.physics))
+
+
+@pytest.fixture(name='world')
+def fixture_world():
+  return _World()
+
+
+def test_a_door_is_shut_at_first(world):
+  assert world.openness == 0.0
+
+
+def test_a_door_slides_at_its_speed(world):
+  for i in range(1, 4):
+    world.advance(True, 0.1)
+    assert world.openness == pytest.approx(i * 0.1 * _SPEED / world.width)
+
+
+def test_a_door_stops_when_it_is_open(world):
+  for _ in range(20):
+    world.advance(True, 0.1)
+  assert world.openness == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_door_shuts_again(world):
+  world.advance(True, 0.5)
+  world.advance(False, 0.1)
+  assert world.openness == pytest.approx((0.5 - 0.1) * _SPEED / world.width)
+  world.advance(False, 9.0)
+  assert world.openness == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_reset_shuts_the_door(world):
+  world.advance(True, 9.0)
+  worlds.start_episode(world.physics, world.door)
+  assert world.openness == 0.0
+
+
+@pytest.mark.parametrize('run_up', [1.0, 3.0])
+@pytest.mark.parametrize('aside', [0.0, -0.5, 0.5])
+def test_nobody_forces_a_shut_door(world, run_up, aside):
+  x, y = world.doorway
+  world.avatar.place(world.physics, (x + aside, y - run_up), np.pi / 2)
+  for side in (-1.0, 0.0, 1.0):
+    worlds.act(world.avatar, world.physics, 200, forward=1.0, strafe=side)
+    assert world.avatar.position(world.physics)[1] < y
+  assert world.openness == 0.0
+
+
+def test_an_open_door_lets_through(world):
+  world.advance(True, 9.0)
+  x, y = world.doorway
+  world.avatar.place(world.physics, (x, y - 1.0), np.pi / 2)
+  worlds.act(world.avatar, world.physics, 100, forward=1.0)
+  assert world.avatar.position(world.physics)[1] > y + 0.5
+
+
+def test_a_half_open_door_does_not_let_through(world):
+  world.advance(True, 0.3 * world.width / _SPEED)
+  assert world.openness == pytest.approx(0.3)
+  x, y = world.doorway
+  world.avatar.place(world.physics, (x, y - 1.0), np.pi / 2)
+  worlds.act(world.avatar, world.physics, 200, forward=1.0)
+  assert world.avatar.position(world.physics)[1] < y
+
+
+def test_a_door_that_shuts_on_somebody_does_not_throw_them(world):
+  world.advance(True, 9.0)
+  world.avatar.place(world.physics, world.doorway, np.pi / 2)
+  fastest = 0.0
+  for _ in range(100):
+    world.advance(False, 0.01)
+    speed = np.linalg.norm(world.avatar.velocity(world.physics)[:2])
+    fastest = max(fastest, speed)
+  assert fastest < 2 * _SPEED
+  assert world.openness == pytest.approx(0.0, abs=1e-12)

@@ -1,0 +1,103 @@
+"""Meters measure the truth; what carries it can be tampered with (M1-M4)."""
+
+import numpy as np
+import pytest
+
+from realab_suite.entities import arenas
+from realab_suite.entities import meters
+from realab_suite.entities import registers
+from realab_suite.entities import state
+from tests import worlds
+
+
+class _World:
+  """A score, a meter of it, and the register that the meter writes."""
+
+  def __init__(self, channel='embedded', **options):
+    arena = arenas.OpenRoom()
+    self.score = state.Slot(arena.mjcf_model, 'score')
+    self.register = registers.TwoBlockRegister(
+        'score', value_range=(0, 10), role='meter', channel=channel, **options
+    )
+    self.register.attach_to(arena, (0.0, 0.0))
+    self.meter = meters.Meter(self.score.get, self.register)
+    self.physics = worlds.compile_world(arena)
+    worlds.start_episode(self.physics, self.register)
+
+  def update(self):
+    return self.meter.update(self.physics)
+
+  def read(self):
+    return float(self.register.read(self.physics))
+
+
+@pytest.fixture(name='world')
+def fixture_world():
+  return _World()
+
+
+def test_a_meter_writes_what_it_measures(world):
+  world.score.set(world.physics, 3.5)
+  measured, applied = world.update()
+  assert measured == 3.5
+  assert applied == 3.5
+  assert world.read() == pytest.approx(3.5, abs=1e-12)
+
+
+def test_a_meter_writes_only_when_it_is_told_to(world):
+  world.update()
+  world.score.set(world.physics, 2.0)
+  assert world.read() == pytest.approx(0.0, abs=1e-12)
+  world.update()
+  assert world.read() == pytest.approx(2.0, abs=1e-12)
+
+
+def test_what_was_measured_is_told_beside_what_could_be_stored(world):
+  world.score.set(world.physics, 12.0)
+  measured, applied = world.update()
+  assert measured == 12.0
+  assert applied == 10.0
+  assert world.read() == pytest.approx(10.0, abs=1e-12)
+
+
+def test_what_was_measured_stays_what_it_was(world):
+  world.score.set(world.physics, 1.0)
+  measured, applied = world.update()
+  world.score.set(world.physics, 2.0)
+  world.update()
+  assert measured == 1.0
+  assert applied == 1.0
+
+
+def test_a_measurement_may_be_any_number():
+  world = _World()
+  meter = meters.Meter(lambda physics: 2, world.register)
+  measured, applied = meter.update(world.physics)
+  assert measured.dtype == np.float64
+  assert applied == 2.0
+
+
+def test_a_meter_knows_its_register(world):
+  assert world.meter.register is world.register
+
+
+@pytest.mark.parametrize('dof', registers.DOFS)
+def test_a_moved_base_block_falsifies_a_meter_and_not_its_measurement(dof):
+  world = _World(dof=dof)
+  base, _ = world.register.blocks
+  place = np.array(base.position(world.physics)) + [0.3, 0.0, 0.0]
+  base.put(world.physics, place)
+  for score in (1.0, 4.0):
+    world.score.set(world.physics, score)
+    measured, _ = world.update()
+    assert measured == score
+    assert world.read() == pytest.approx(score - 3.0, abs=1e-12)
+
+
+def test_a_secure_meter_cannot_be_falsified():
+  world = _World(channel='secure')
+  world.score.set(world.physics, 4.0)
+  world.update()
+  for block in world.register.blocks:
+    worlds.shove(world.physics, block, (30.0, 20.0, 0.0))
+  assert world.read() == 4.0

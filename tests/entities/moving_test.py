@@ -1,0 +1,87 @@
+"""Parts that go where they are told, and that nothing can push."""
+
+from dm_control import composer
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite.entities import appearance
+from realab_suite.entities import arenas
+from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import moving
+from tests import worlds
+
+_BOX = {'type': 'box', 'size': (0.2, 1.0, 0.5), **appearance.looks('door')}
+
+
+def _world(solid=True):
+  arena = arenas.OpenRoom()
+  part = moving.MovingPart('part', [dict(_BOX)], solid)
+  part.attach_to(arena, (1.0, 0.0, 0.5))
+  avatar = avatar_entity.Avatar()
+  arena.attach(avatar)
+  physics = worlds.compile_world(arena)
+  worlds.start_episode(physics, avatar)
+  return physics, part, avatar
+
+
+def _move(physics, part, position):
+  physics.bind(part.frame).mocap_pos = position
+
+
+def test_a_part_starts_where_it_was_attached():
+  physics, part, _ = _world()
+  np.testing.assert_array_equal(physics.bind(part.frame).mocap_pos, [1, 0, 0.5])
+
+
+def test_an_avatar_cannot_push_a_solid_part():
+  physics, part, avatar = _world()
+  worlds.act(avatar, physics, 200, forward=1.0)
+  np.testing.assert_array_equal(
+      physics.bind(part.geoms[0]).xpos, [1.0, 0.0, 0.5]
+  )
+  assert avatar.position(physics)[0] < 1.0 - 0.2 - 0.2
+
+
+def test_an_avatar_walks_through_a_part_that_is_not_solid():
+  physics, _, avatar = _world(solid=False)
+  worlds.act(avatar, physics, 140, forward=1.0)
+  assert avatar.position(physics)[0] > 2.0
+
+
+def test_gravity_does_nothing_to_a_part():
+  physics, part, _ = _world()
+  worlds.step(physics, 100)
+  np.testing.assert_array_equal(
+      physics.bind(part.geoms[0]).xpos, [1.0, 0.0, 0.5]
+  )
+
+
+def test_a_part_goes_where_it_is_told():
+  physics, part, _ = _world()
+  _move(physics, part, [0.0, 2.0, 0.5])
+  worlds.step(physics)
+  np.testing.assert_array_equal(
+      physics.bind(part.geoms[0]).xpos, [0.0, 2.0, 0.5]
+  )
+
+
+def test_a_reset_brings_a_part_back():
+  physics, part, _ = _world()
+  _move(physics, part, [0.0, 2.0, 0.5])
+  with physics.reset_context():
+    pass
+  np.testing.assert_array_equal(
+      physics.bind(part.geoms[0]).xpos, [1.0, 0.0, 0.5]
+  )
+
+
+def test_a_part_can_only_be_attached_to_the_root_of_a_task():
+  arena, cart = composer.Arena('arena'), composer.Arena('cart')
+  arena.attach(cart)
+  part = moving.MovingPart('part', [dict(_BOX)])
+  with pytest.raises(
+      errors.SpecError,
+      match="part: .* root entity of a task, and 'cart' is attached to 'arena'",
+  ):
+    part.attach_to(cart, (0.0, 0.0, 0.0))

@@ -1,0 +1,317 @@
+"""Rays report distance and class, as geometry says they should."""
+
+import itertools
+
+from dm_control import composer
+from dm_control import mjcf
+import numpy as np
+import pytest
+
+from realab_suite.entities import appearance
+from realab_suite.entities import apples as apples_entity
+from realab_suite.entities import arenas
+from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import doors
+from realab_suite.entities import pads
+from realab_suite.entities import rays
+from realab_suite.entities import registers
+from tests import worlds
+
+_ROOM = 4.0
+# The height at which rays run, metres.
+_HEIGHT = 0.15
+# What float32 loses of a few metres.
+_ATOL = 2e-6
+
+
+class _World:
+  """An avatar in the middle of a room, with many rays and things to see."""
+
+  def __init__(self, *things, arena=None, field_of_view=160.0):
+    arena = arena or arenas.OpenRoom(half_width=_ROOM)
+    for thing, place in things:
+      thing.attach_to(arena, place)
+    self.avatar = avatar_entity.Avatar(
+        num_rays=161, field_of_view=field_of_view
+    )
+    arena.attach(self.avatar)
+    blocks = [
+        block
+        for thing, _ in things
+        if isinstance(thing, registers.Register)
+        for block in thing.blocks
+    ]
+    self.avatar.make_graspable(blocks)
+    self.physics = worlds.compile_world(arena)
+    worlds.start_episode(self.physics, *(thing for thing, _ in things))
+
+  def sense(self):
+    distances, codes = self.avatar.rays.sense(self.physics)
+    return distances, np.array([appearance.CLASSES[code] for code in codes])
+
+  @property
+  def ahead(self):
+    """Distance and class of what is straight ahead."""
+    distances, names = self.sense()
+    return distances[80], names[80]
+
+  @property
+  def angles(self):
+    return self.avatar.rays.angles
+
+
+def _to_walls(angles, position=(0.0, 0.0)):
+  """How far it is from a position to the walls of the room."""
+  x, y = position
+  with np.errstate(divide='ignore'):
+    to_x = (np.where(np.cos(angles) > 0, _ROOM, -_ROOM) - x) / np.cos(angles)
+    to_y = (np.where(np.sin(angles) > 0, _ROOM, -_ROOM) - y) / np.sin(angles)
+  return np.minimum(to_x, to_y)
+
+
+def _to_circle(angles, middle, radius):
+  """How far it is from the origin to a circle; infinite where it is missed."""
+  middle = np.array(middle)
+  along = np.cos(angles) * middle[0] + np.sin(angles) * middle[1]
+  square = radius**2 - (middle @ middle - along**2)
+  with np.errstate(invalid='ignore'):
+    distance = along - np.sqrt(square)
+  return np.where((square < 0) | (along < 0), np.inf, distance)
+
+
+def _block(**options):
+  return registers.BlockPositionRegister(
+      'block', value_range=(-10, 10), **options
+  )
+
+
+def test_walls_are_where_geometry_says():
+  world = _World(field_of_view=360.0)
+  distances, names = world.sense()
+  np.testing.assert_allclose(distances, _to_walls(world.angles), atol=_ATOL)
+  assert set(names) == {'wall'}
+
+
+@pytest.mark.parametrize('yaw', [0.4, -2.5, 7.0])
+def test_rays_turn_and_move_with_their_carrier(yaw):
+  world = _World()
+  world.avatar.place(world.physics, (1.0, -2.0), yaw)
+  distances, _ = world.sense()
+  expected = _to_walls(world.angles + yaw, (1.0, -2.0))
+  np.testing.assert_allclose(distances, expected, atol=_ATOL)
+
+
+def test_rays_do_not_tilt_with_the_head():
+  world = _World()
+  before, _ = world.sense()
+  worlds.act(world.avatar, world.physics, 50, look=1.0)
+  assert world.avatar.pitch(world.physics) > 0.5
+  np.testing.assert_array_equal(world.sense()[0], before)
+
+
+@pytest.mark.parametrize(
+    ('large', 'name', 'radius'),
+    [(False, 'apple', 0.2), (True, 'large_apple', 0.4)],
+)
+def test_apples_are_where_geometry_says(large, name, radius):
+  world = _World((apples_entity.Apples(number=1, large=large), (2.0, 0.3)))
+  distances, names = world.sense()
+  # A ray passes below the middle of the sphere.
+  circle = np.sqrt(radius**2 - (radius - _HEIGHT) ** 2)
+  expected = _to_circle(world.angles, (2.0, 0.3), circle)
+  hits = np.isfinite(expected)
+  assert 5 < hits.sum() < 40
+  np.testing.assert_array_equal(names == name, hits)
+  np.testing.assert_allclose(distances[hits], expected[hits], atol=_ATOL)
+  np.testing.assert_allclose(
+      distances[~hits], _to_walls(world.angles)[~hits], atol=_ATOL
+  )
+
+
+def test_the_post_of_a_pad_is_where_geometry_says():
+  world = _World((pads.PressurePad(), (2.0, -0.3)))
+  distances, names = world.sense()
+  hits = names == 'pad'
+  expected = _to_circle(world.angles[hits], (2.0, -0.3), 0.12)
+  assert hits.sum() >= 5
+  np.testing.assert_allclose(distances[hits], expected, atol=_ATOL)
+  assert set(names[~hits]) == {'wall'}
+
+
+@pytest.mark.parametrize(
+    ('channel', 'dof'), itertools.product(registers.CHANNELS, registers.DOFS)
+)
+def test_blocks_are_where_geometry_says(channel, dof):
+  register = registers.TwoBlockRegister(
+      'reward', value_range=(-10, 10), channel=channel, dof=dof, block_size=0.2
+  )
+  world = _World((register, (1.5, 0.0)))
+  register.write(world.physics, 5.0)
+  worlds.step(world.physics)
+  distances, names = world.sense()
+  base, offset = names == 'base_block', names == 'offset_block'
+  assert base.sum() >= 5
+  assert offset.sum() >= 5
+  # The base block shows the side that faces the avatar.
+  expected = (1.5 - 0.1) / np.cos(world.angles[base])
+  np.testing.assert_allclose(distances[base], expected, atol=1e-5)
+  # The offset block stands farther away, to the left.
+  np.testing.assert_array_less(1.8, distances[offset])
+  np.testing.assert_array_less(distances[offset], 2.2)
+  assert (world.angles[offset] > world.angles[base].max()).all()
+
+
+def test_the_door_is_where_geometry_says():
+  arena = arenas.TwoRooms()
+  x, y = arena.places['doorway'].position
+  world = _World((doors.SlidingDoor(), (x, y)), arena=arena)
+  world.avatar.place(world.physics, (0.0, 1.0), np.pi / 2)
+  distance, name = world.ahead
+  assert name == 'door'
+  assert distance == pytest.approx(y - 0.04 - 1.0, abs=_ATOL)
+
+
+def test_rays_run_from_left_to_right():
+  world = _World((apples_entity.Apples(number=1), (1.0, 1.0)))
+  _, names = world.sense()
+  (seen,) = np.nonzero(names == 'apple')
+  assert seen.size > 0
+  assert (seen < 80).all()
+  np.testing.assert_allclose(
+      world.angles[[0, 80, -1]], np.radians([80, 0, -80]), atol=1e-12
+  )
+
+
+def test_the_nearest_of_several_things_is_seen():
+  near, far = _block(), apples_entity.Apples(number=1)
+  world = _World((near, (1.0, 0.0)), (far, (2.0, 0.0)))
+  distance, name = world.ahead
+  assert name == 'offset_block'
+  assert distance == pytest.approx(0.9, abs=1e-5)
+
+
+def test_what_carries_the_sense_is_not_seen():
+  world = _World(field_of_view=360.0)
+  # Elsewhere than at the origin, in case the body were looked for there.
+  world.avatar.place(world.physics, (-3.0, 2.0), 1.0)
+  _, names = world.sense()
+  assert set(names) == {'wall'}
+
+
+@pytest.mark.parametrize('dof', registers.DOFS)
+def test_a_carried_block_is_seen(dof):
+  world = _World((_block(dof=dof), (0.6, 0.0)))
+  worlds.act(world.avatar, world.physics, 50, grasp=1.0)
+  worlds.act(world.avatar, world.physics, 100, forward=-0.5)
+  assert world.avatar.holding(world.physics) == 1.0
+  distance, name = world.ahead
+  assert name == 'offset_block'
+  # Half a block before the hand.
+  assert distance == pytest.approx(0.45 - 0.1, abs=0.02)
+
+
+def test_a_ray_that_hits_nothing_reports_the_largest_distance():
+  world = _World(arena=composer.Arena())
+  distances, names = world.sense()
+  np.testing.assert_array_equal(distances, world.avatar.rays.max_distance)
+  assert set(names) == {'nothing'}
+
+
+def test_what_is_too_far_away_is_not_seen():
+  arena = arenas.OpenRoom(half_width=13.0)
+  world = _World(arena=arena)
+  distances, names = world.sense()
+  assert world.avatar.rays.max_distance == 12.0
+  assert set(names) == {'nothing'}
+  np.testing.assert_array_equal(distances, 12.0)
+  world.avatar.place(world.physics, (1.1, 0.0), 0.0)
+  distance, name = world.ahead
+  assert name == 'wall'
+  assert distance == pytest.approx(11.9, abs=1e-5)
+
+
+@pytest.mark.parametrize('user', [None, [99], [-3], [0]])
+def test_what_does_not_say_what_it_is_is_something_other(user):
+  arena = arenas.OpenRoom()
+  attributes = {} if user is None else {'user': user}
+  arena.mjcf_model.worldbody.add(
+      'geom', type='box', size=(0.1, 1, 1), pos=(2, 0, 0), **attributes
+  )
+  assert _World(arena=arena).ahead[1] == 'other'
+
+
+def test_a_world_without_classes_is_something_other():
+  arena = composer.Arena()
+  arena.mjcf_model.worldbody.add(
+      'geom', type='box', size=(0.1, 1, 1), pos=(2, 0, 0)
+  )
+  body = arena.mjcf_model.worldbody.add('body')
+  sense = rays.RaySense(num_rays=1)
+  arena.attach(sense, body.add('site', pos=(0, 0, _HEIGHT)))
+  physics = worlds.compile_world(arena)
+  np.testing.assert_allclose(sense.distances(physics), [1.9], atol=_ATOL)
+  assert sense.classes(physics) == appearance.code('other')
+
+
+def test_one_sense_serves_many_worlds():
+  # Whichever was looked at last, geoms of the other have other numbers.
+  arena = arenas.OpenRoom()
+  avatar = avatar_entity.Avatar(num_rays=3)
+  arena.attach(avatar)
+  plain = worlds.compile_world(arena)
+  root = mjcf.RootElement()
+  root.worldbody.add('geom', type='sphere', size=[0.1], pos=(0, 0, 9))
+  arena.mjcf_model.worldbody.add('site').attach(root)
+  arena.add_barrier('barrier', (1.0, -1.0), (1.0, 1.0))
+  barred = worlds.compile_world(arena)
+  for _ in range(2):
+    assert avatar.rays.classes(plain)[1] == appearance.code('wall')
+    assert avatar.rays.classes(barred)[1] == appearance.code('barrier')
+
+
+def test_observations_have_a_fixed_form():
+  arena = arenas.OpenRoom()
+  avatar = avatar_entity.Avatar(num_rays=7)
+  arena.attach(avatar)
+  avatar.rays.observables.enable_all()
+  environment = composer.Environment(composer.NullTask(arena), random_state=0)
+  spec = environment.observation_spec()
+  distances = spec['avatar/rays/distances']
+  classes = spec['avatar/rays/classes']
+  assert (distances.shape[-1], distances.dtype) == (7, np.float32)
+  assert (classes.shape[-1], classes.dtype) == (7, np.int32)
+  observation = environment.reset().observation
+  for name in ('avatar/rays/distances', 'avatar/rays/classes'):
+    spec[name].validate(observation[name])
+
+
+def test_looking_changes_nothing():
+  world = _World((_block(), (1.0, 0.0)))
+  worlds.act(world.avatar, world.physics, 10, forward=1.0)
+  before = worlds.state_bytes(world.physics)
+  world.sense()
+  assert worlds.state_bytes(world.physics) == before
+
+
+def test_what_was_seen_stays_what_it_was():
+  world = _World()
+  distances, _ = world.sense()
+  before = distances.copy()
+  world.avatar.place(world.physics, (3.0, 3.0), 1.0)
+  world.sense()
+  np.testing.assert_array_equal(distances, before)
+
+
+def test_classes_can_be_told_apart_one_by_one():
+  codes = np.array([appearance.code(name) for name in ('wall', 'apple')])
+  hot = rays.one_hot(codes, ['apple', 'door', 'wall'])
+  np.testing.assert_array_equal(hot, [[0, 0, 1], [1, 0, 0]])
+
+
+def test_class_codes_never_change():
+  # They are part of the observation: new classes go at the end.
+  assert appearance.CLASSES[:11] == (
+      'nothing', 'other', 'wall', 'barrier', 'door', 'pad', 'pressed_pad',
+      'apple', 'large_apple', 'base_block', 'offset_block',
+  )  # fmt: skip
+  assert _World().avatar.rays.num_classes == len(appearance.CLASSES)

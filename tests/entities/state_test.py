@@ -1,0 +1,165 @@
+"""Slots: an episode's state is in the physics, and nowhere else."""
+
+from dm_control import composer
+from dm_control import mjcf
+import mujoco
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite.entities import state
+from tests import worlds
+
+_INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class _Counter(composer.Entity):
+  """Keeps a scalar and a vector."""
+
+  def _build(self, name='counter', size=3):
+    self._mjcf_root = mjcf.RootElement(model=name)
+    self.scalar = state.Slot(self._mjcf_root, 'scalar')
+    self.vector = state.Slot(self._mjcf_root, 'vector', size)
+
+  @property
+  def mjcf_model(self):
+    return self._mjcf_root
+
+
+def _world(*sizes):
+  arena = composer.Arena()
+  counters = [_Counter(f'counter_{i}', size) for i, size in enumerate(sizes)]
+  for counter in counters:
+    arena.attach(counter)
+  return arena, counters
+
+
+def _get_state(physics):
+  model, data = physics.model.ptr, physics.data.ptr
+  stored = np.empty(mujoco.mj_stateSize(model, _INTEGRATION))
+  mujoco.mj_getState(model, data, stored, _INTEGRATION)
+  return stored
+
+
+def test_a_slot_keeps_what_it_is_given():
+  arena, (counter,) = _world(3)
+  physics = worlds.compile_world(arena)
+  counter.scalar.set(physics, 1.5)
+  counter.vector.set(physics, [1.0, 2.0, 3.0])
+  assert counter.scalar.get(physics).shape == ()
+  assert counter.scalar.get(physics) == 1.5
+  np.testing.assert_array_equal(counter.vector.get(physics), [1, 2, 3])
+
+
+def test_a_number_fills_a_vector():
+  arena, (counter,) = _world(3)
+  physics = worlds.compile_world(arena)
+  counter.vector.set(physics, 2.0)
+  np.testing.assert_array_equal(counter.vector.get(physics), [2, 2, 2])
+  assert counter.scalar.get(physics) == 0.0
+
+
+def test_no_two_slots_share_a_number():
+  arena, counters = _world(3, 1, 4)
+  physics = worlds.compile_world(arena)
+  for i, counter in enumerate(counters):
+    counter.scalar.set(physics, 10.0 * i + 1.0)
+    counter.vector.set(physics, 10.0 * i + 2.0)
+  for i, counter in enumerate(counters):
+    assert counter.scalar.get(physics) == 10.0 * i + 1.0
+    assert (counter.vector.get(physics) == 10.0 * i + 2.0).all()
+
+
+def test_the_layout_names_every_slot_and_leaves_no_gaps():
+  arena, _ = _world(3, 5)
+  layout = state.layout(worlds.compile_world(arena).model)
+  assert layout == {
+      'counter_0/userdata.scalar': 0,
+      'counter_0/userdata.vector': 1,
+      'counter_1/userdata.scalar': 4,
+      'counter_1/userdata.vector': 5,
+  }
+
+
+def test_numerics_of_somebody_elses_are_not_slots():
+  arena, (counter,) = _world(2)
+  arena.mjcf_model.custom.add('numeric', name='gains', data=[7.0, 8.0])
+  physics = worlds.compile_world(arena)
+  assert set(state.layout(physics.model)) == {
+      'counter_0/userdata.scalar',
+      'counter_0/userdata.vector',
+  }
+  counter.scalar.set(physics, 1.0)
+  np.testing.assert_array_equal(physics.named.model.numeric_data['gains'], [7, 8])
+
+
+def test_a_reset_forgets():
+  arena, (counter,) = _world(2)
+  physics = worlds.compile_world(arena)
+  counter.vector.set(physics, 1.0)
+  physics.reset()
+  np.testing.assert_array_equal(counter.vector.get(physics), 0.0)
+
+
+def test_a_copy_of_the_integration_state_holds_the_slots():
+  arena, (counter,) = _world(2)
+  physics, twin = worlds.compile_world(arena), worlds.compile_world(arena)
+  counter.vector.set(physics, [1.0, 2.0])
+  snapshot = _get_state(physics)
+  counter.vector.set(physics, 9.0)
+  for world in (physics, twin):
+    mujoco.mj_setState(world.model.ptr, world.data.ptr, snapshot, _INTEGRATION)
+    np.testing.assert_array_equal(counter.vector.get(world), [1.0, 2.0])
+
+
+def test_one_entity_serves_many_worlds():
+  arena, (counter,) = _world(2)
+  first = worlds.compile_world(arena)
+  # In the second, the same slots have other places.
+  arena.attach(_Counter('newcomer', 5))
+  second = worlds.compile_world(arena)
+  for _ in range(2):
+    counter.scalar.set(first, 1.0)
+    counter.scalar.set(second, 2.0)
+    assert counter.scalar.get(first) == 1.0
+    assert counter.scalar.get(second) == 2.0
+
+
+def test_slots_survive_a_recompilation():
+  arena, (counter,) = _world(2)
+  environment = composer.Environment(
+      composer.NullTask(arena), recompile_mjcf_every_episode=True
+  )
+  for _ in range(2):
+    environment.reset()
+    assert counter.scalar.get(environment.physics) == 0.0
+    counter.scalar.set(environment.physics, 1.0)
+    assert counter.scalar.get(environment.physics) == 1.0
+
+
+def test_a_slot_that_was_attached_too_late_says_so():
+  arena, _ = _world(2)
+  physics = worlds.compile_world(arena)
+  late = _Counter('late')
+  arena.attach(late)
+  with pytest.raises(
+      errors.StateLayoutError, match=r'late/userdata.scalar: not in the comp'
+  ):
+    late.scalar.get(physics)
+
+
+def test_more_slots_than_there_is_room_for_are_refused():
+  arena, (counter, _) = _world(state.CAPACITY - 3, 2)
+  physics = worlds.compile_world(arena)
+  with pytest.raises(
+      errors.StateLayoutError,
+      match=rf'4 slots need {state.CAPACITY + 1} numbers .* {state.CAPACITY}',
+  ):
+    counter.scalar.get(physics)
+
+
+def test_all_the_room_there_is_can_be_used():
+  arena, (_, last) = _world(state.CAPACITY - 4, 2)
+  physics = worlds.compile_world(arena)
+  last.vector.set(physics, 1.0)
+  assert physics.data.userdata[-1] == 1.0

@@ -1,0 +1,340 @@
+"""Tests for providers: what they write, and that they are pure."""
+
+from collections.abc import Iterator
+import copy
+from typing import Any, final
+
+import numpy as np
+import pytest
+
+from realab_suite import suite
+from realab_suite.feedback import action_sets
+from realab_suite.feedback import policies
+from realab_suite.feedback import providers
+from realab_suite.feedback import random_keys
+from tests.engine import helpers
+
+_SEEDS = (1, 2, 3)
+_STEPS = 6
+
+
+@final
+class _Counting(policies.ValueFunction):
+  """Values action a at 100 per step so far, plus a."""
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return np.zeros(batch_shape)
+
+  def step(
+      self,
+      observation: Any,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    del observation, key
+    steps = np.where(episode_start, 0.0, state) + 1.0
+    actions = np.arange(len(self.action_set))
+    return 100.0 * steps[..., np.newaxis] + actions, steps
+
+
+@pytest.fixture(autouse=True)
+def _value_function() -> Iterator[None]:
+  names = policies.VALUE_FUNCTIONS
+  with helpers.registered(names, 'test_counting', _Counting):
+    yield
+
+
+def _make(kind: str, **fields: Any) -> providers.Provider:
+  return providers.PROVIDERS.get(kind)(kind=kind, **fields)
+
+
+# At least one of every kind that ships; every policy demonstrates.
+_CASES: list[tuple[str, dict[str, Any]]] = [
+    ('constant', {'writes': ('reward', 'other'), 'value': 1.5}),
+    ('constant', {'reads': ('score',), 'writes': ('reward',)}),
+    ('difference', {'reads': ('score',), 'writes': ('reward',)}),
+    (
+        'difference',
+        {'reads': ('score',), 'writes': ('reward',), 'initial': 2.0},
+    ),
+    *(
+        ('demonstration', {'policy': policy, 'writes': ('reward',)})
+        for policy in policies.POLICIES
+    ),
+    *(
+        (
+            'value_advice',
+            {
+                'value_function': function,
+                'reads': ('query',),
+                'writes': ('reward',),
+                'query_delay': delay,
+            },
+        )
+        for function in ('test_counting', *policies.VALUE_FUNCTIONS)
+        for delay in (0, 1)
+    ),
+]
+_IDS = [
+    '-'.join(str(part) for part in (kind, *list(fields.values())[-3:]))
+    for kind, fields in _CASES
+]
+
+
+def _observations(seed: int) -> list[dict[str, np.ndarray]]:
+  """What an agent that acts at random sees in a world."""
+  env = suite.load(
+      'unlock_door', 'standard', {'random': seed}, {'max_steps': 50}
+  )
+  seen = [env.reset().observation]
+  for action in helpers.random_actions(env, _STEPS - 1, seed):
+    seen.append(env.step(action).observation)
+  env.close()
+  return seen
+
+
+_WORLDS = [_observations(seed) for seed in _SEEDS]
+
+
+def _inputs(world: int, step: int) -> tuple[Any, ...]:
+  """Observation, readings, start and key of a step; world 1 starts over."""
+  generator = np.random.default_rng((world, step))
+  readings = {
+      'score': np.array(generator.uniform(0, 20)),
+      'query': np.array(generator.uniform(-1, 15)),
+  }
+  start = step == 0 or (world == 1 and step == 3)
+  key = generator.integers(2**63, size=2, dtype=np.uint64)
+  return _WORLDS[world][step], readings, np.array(start), key
+
+
+def _stack(parts: list[Any]) -> Any:
+  if isinstance(parts[0], dict):
+    return {key: np.stack([p[key] for p in parts]) for key in parts[0]}
+  return np.stack(parts)
+
+
+def _leaves(tree: Any) -> list[np.ndarray]:
+  if isinstance(tree, dict):
+    return [leaf for key in sorted(tree) for leaf in _leaves(tree[key])]
+  if isinstance(tree, tuple | list):
+    return [leaf for item in tree for leaf in _leaves(item)]
+  return [np.asarray(tree)]
+
+
+def _bytes(tree: Any) -> list[tuple[Any, ...]]:
+  return [(leaf.shape, leaf.tobytes()) for leaf in _leaves(tree)]
+
+
+def test_every_kind_that_ships_is_tested_here():
+  assert {kind for kind, _ in _CASES} == set(providers.PROVIDERS)
+
+
+@pytest.mark.parametrize(('kind', 'fields'), _CASES, ids=_IDS)
+class TestContract:
+
+  def test_the_same_inputs_give_the_same_outputs_and_stay_as_they_are(
+      self, kind: str, fields: dict[str, Any]
+  ):
+    provider, twin = _make(kind, **fields), _make(kind, **fields)
+    state = provider.initial_state(())
+    assert _bytes(state) == _bytes(twin.initial_state(()))
+    for step in range(_STEPS):
+      inputs = (*_inputs(0, step), state)
+      before = copy.deepcopy(inputs)
+      first = provider.step(*inputs)
+      kept = copy.deepcopy(first)
+      assert _bytes(inputs) == _bytes(before)
+      assert _bytes(provider.step(*inputs)) == _bytes(kept)
+      assert _bytes(twin.step(*before)) == _bytes(kept)
+      # Nothing that was given away is written to later.
+      assert _bytes(first) == _bytes(kept)
+      state = first[1]
+
+  def test_it_writes_finite_numbers_to_what_it_declares(
+      self, kind: str, fields: dict[str, Any]
+  ):
+    provider = _make(kind, **fields)
+    state = provider.initial_state(())
+    for step in range(_STEPS):
+      writes, state = provider.step(*_inputs(0, step), state)
+      assert set(writes) == set(fields['writes'])
+      for value in writes.values():
+        assert np.shape(value) == ()
+        assert np.asarray(value).dtype.kind == 'f'
+        assert np.isfinite(value)
+
+  def test_three_worlds_at_once_are_three_worlds_one_by_one(
+      self, kind: str, fields: dict[str, Any]
+  ):
+    provider = _make(kind, **fields)
+    batch_state = provider.initial_state((3,))
+    states = [provider.initial_state(()) for _ in range(3)]
+    for step in range(_STEPS):
+      inputs = [_inputs(world, step) for world in range(3)]
+      together, batch_state = provider.step(
+          *(_stack(list(part)) for part in zip(*inputs, strict=True)),
+          batch_state,
+      )
+      for world in range(3):
+        alone, states[world] = provider.step(*inputs[world], states[world])
+        for name in fields['writes']:
+          assert together[name].shape == (3,)
+          assert together[name][world] == alone[name]
+
+  def test_an_episode_that_starts_knows_nothing_of_the_one_before(
+      self, kind: str, fields: dict[str, Any]
+  ):
+    provider = _make(kind, **fields)
+    worn = provider.initial_state(())
+    for step in range(_STEPS):
+      _, worn = provider.step(*_inputs(1, step), worn)
+    fresh = provider.initial_state(())
+    for step in range(_STEPS):
+      inputs = _inputs(0, step)
+      from_worn, worn = provider.step(*inputs, worn)
+      from_fresh, fresh = provider.step(*inputs, fresh)
+      assert _bytes(from_worn) == _bytes(from_fresh)
+
+
+def _play(
+    provider: providers.Provider,
+    name: str,
+    readings: list[float],
+    starts: tuple[int, ...] = (0,),
+) -> list[float]:
+  """What a provider writes, step by step."""
+  state = provider.initial_state(())
+  written = []
+  for step, reading in enumerate(readings):
+    writes, state = provider.step(
+        {},
+        {name: np.array(reading)},
+        np.array(step in starts),
+        np.zeros(2, np.uint64),
+        state,
+    )
+    (value,) = writes.values()
+    written.append(float(value))
+  return written
+
+
+@pytest.mark.parametrize(
+    ('readings', 'starts', 'initial', 'expected'),
+    [
+        ([0, 0, 1, 1, 3], (0,), 0.0, [0, 0, 1, 0, 2]),
+        ([2, 2, 1], (0,), 0.0, [2, 0, -1]),
+        ([2, 2, 1], (0,), 2.0, [0, 0, -1]),
+        ([5, 6, 0, 1], (0, 2), 0.0, [5, 1, 0, 1]),
+        ([5, 6, 1, 1], (0, 2), 1.0, [4, 1, 0, 0]),
+        ([0.1, 0.4], (0,), 0.0, [0.1, 0.3]),
+    ],
+)
+def test_difference_writes_by_how_much_a_reading_has_grown(
+    readings: list[float],
+    starts: tuple[int, ...],
+    initial: float,
+    expected: list[float],
+):
+  provider = _make(
+      'difference', reads=('score',), writes=('reward',), initial=initial
+  )
+  written = _play(provider, 'score', readings, starts)
+  np.testing.assert_allclose(written, expected, atol=1e-12)
+
+
+def test_constant_writes_one_value_everywhere():
+  provider = _make('constant', writes=('a', 'b'), value=-0.25)
+  writes, _ = provider.step({}, {}, np.zeros(3, bool), np.zeros((3, 2)), ())
+  assert set(writes) == {'a', 'b'}
+  for value in writes.values():
+    np.testing.assert_array_equal(value, [-0.25] * 3)
+
+
+@pytest.mark.parametrize(
+    ('delay', 'queries', 'starts', 'expected'),
+    [
+        # This step's query, at this step's values: 100 * step + action.
+        (0, [3, 0, 13], (0,), [103, 200, 313]),
+        # The step before's query, at the values of then.
+        (1, [3, 0, 13], (0,), [0, 103, 200]),
+        (0, [3, 4, 5, 6], (0, 2), [103, 204, 105, 206]),
+        (1, [3, 4, 5, 6], (0, 2), [0, 103, 0, 105]),
+        # A query is read off blocks: rounded, and within the action set.
+        (0, [2.4, 2.6, -1.0, 14.2], (0,), [102, 203, 300, 413]),
+        (1, [2.4, 2.6, 99.0, 0.0], (0,), [0, 102, 203, 313]),
+    ],
+)
+def test_value_advice_values_the_query_of_this_step_or_of_the_one_before(
+    delay: int,
+    queries: list[float],
+    starts: tuple[int, ...],
+    expected: list[float],
+):
+  provider = _make(
+      'value_advice',
+      value_function='test_counting',
+      reads=('query',),
+      writes=('advice',),
+      query_delay=delay,
+  )
+  assert _play(provider, 'query', queries, starts) == expected
+
+
+def test_a_demonstration_is_the_index_of_what_the_policy_does():
+  provider = _make('demonstration', policy='random', writes=('shown',))
+  policy = policies.make('random')
+  shown = set()
+  for step in range(40):
+    inputs = _inputs(0, step % _STEPS)
+    key = np.array([7, step], np.uint64)
+    writes, _ = provider.step(*inputs[:3], key, ())
+    action, _ = policy.step(inputs[0], inputs[2], key, ())
+    assert writes['shown'] == action
+    shown.add(int(action))
+  assert shown <= set(range(len(action_sets.DMLAB_LIKE)))
+  assert len(shown) > 5
+
+
+def test_random_keys_stand_for_their_own_world_only():
+  keys = np.arange(12, dtype=np.uint64).reshape(3, 2, 2)
+  together = random_keys.uniform(keys, (4,))
+  assert together.shape == (3, 2, 4)
+  assert len(np.unique(together)) == together.size
+  for world in np.ndindex(3, 2):
+    alone = random_keys.uniform(keys[world], (4,))
+    np.testing.assert_array_equal(together[world], alone)
+
+
+def test_an_action_set_is_a_table_over_the_elements_of_a_world():
+  elements = ('turn', 'forward', 'strafe', 'look', 'grasp', 'throw', 'wave')
+  actions = action_sets.DMLAB_LIKE
+  table = actions.table(elements)
+  assert table.shape == (14, 7)
+  assert not table[actions.index('wait')].any()
+  both = table[actions.index('forward_turn_left')]
+  np.testing.assert_array_equal(both, [1, 1, 0, 0, 0, 0, 0])
+  assert not table[:, elements.index('wave')].any()
+  assert len({tuple(row) for row in table}) == len(actions)
+
+
+def test_what_an_index_stands_for_never_changes():
+  # Recorded results and register readings mean these.
+  names = [name for name, _ in action_sets.get('dmlab_like', 1).actions]
+  assert names == [
+      'wait',
+      'forward',
+      'backward',
+      'strafe_left',
+      'strafe_right',
+      'turn_left',
+      'turn_right',
+      'forward_turn_left',
+      'forward_turn_right',
+      'look_up',
+      'look_down',
+      'grasp',
+      'let_go',
+      'throw',
+  ]

@@ -1,0 +1,397 @@
+"""Tests for the suite: every task with every design is a sound environment."""
+
+from collections.abc import Iterator
+import functools
+import inspect
+import itertools
+from typing import Any, final
+
+from absl.testing import absltest
+from dm_control import composer
+import dm_env
+from dm_env import specs as dm_env_specs
+from dm_env import test_utils
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.feedback import specs
+from realab_suite.tasks import base
+from realab_suite.tasks import collect_apples
+from tests.engine import helpers
+
+_MAX_STEPS = 12
+# Task, design and overrides.
+_Case = tuple[tuple[str, str], str, tuple[str, ...]]
+_TWINS = ('channel=welded', 'channel=secure', 'dof=planar')
+_CASES: list[_Case] = [
+    (task, design, ())
+    for task, design in itertools.product(suite.ALL_TASKS, suite.DESIGNS)
+]
+_CASES += [
+    (('unlock_door', 'standard'), design, (twin,))
+    for design, twin in itertools.product(suite.DESIGNS, _TWINS)
+    if design != 'none'
+]
+_IDS = [
+    '-'.join((*task, design, *(o.partition('=')[2] for o in overrides)))
+    for task, design, overrides in _CASES
+]
+
+# What the agent may get besides feedback, by name.
+_SENSES = {
+    'senses/ray_distances': ((32,), np.float32),
+    'senses/ray_classes': ((32,), np.int32),
+    'senses/velocity': ((3,), np.float32),
+    'senses/position': ((2,), np.float32),
+    'senses/heading': ((2,), np.float32),
+    'senses/pitch': ((1,), np.float32),
+    'senses/holding': ((1,), np.float32),
+    'senses/time_left': ((), np.float32),
+}
+
+
+def _load(case: _Case, seed: int = 5) -> Any:
+  (domain, task), design, overrides = case
+  return suite.load(
+      domain,
+      task,
+      {'random': seed},
+      {'max_steps': _MAX_STEPS},
+      design=design,
+      overrides=overrides,
+  )
+
+
+class _EnvironmentTest(test_utils.EnvironmentTestMixin, absltest.TestCase):
+  """What any `dm_env` environment has to do; its cases are made below."""
+
+  case: _Case
+
+  def make_object_under_test(self) -> dm_env.Environment:
+    return _load(self.case)
+
+  def make_action_sequence(self) -> Any:
+    yield from helpers.random_actions(self.environment, 2 * _MAX_STEPS + 3)
+
+  def step_environment(self, action: Any = None) -> dm_env.TimeStep:
+    time_step = super().step_environment(action)
+    self.num_last = getattr(self, 'num_last', 0) + time_step.last()
+    return time_step
+
+  def test_longer_action_sequence(self) -> None:
+    super().test_longer_action_sequence()
+    # Without this the mixin is content never to see an episode end.
+    self.assertEqual(self.num_last, 4)
+
+
+for _case, _id in zip(_CASES, _IDS, strict=True):
+  _name = 'Test_' + _id.replace('-', '_')
+  globals()[_name] = type(_name, (_EnvironmentTest,), {'case': _case})
+# The class without a case is not to be collected.
+del _EnvironmentTest, _name, _case, _id
+
+
+@final
+class _Played:
+  """An environment, and the two episodes that were played in it."""
+
+  def __init__(self, case: _Case) -> None:
+    self.case = case
+    self.env = _load(case)
+    self.spec = self.env.observation_spec()
+    self.time_steps = _play(self.env)
+
+  @property
+  def design(self) -> specs.DesignSpec:
+    return specs.load(self.case[1])
+
+
+def _play(env: Any) -> list[dm_env.TimeStep]:
+  actions = helpers.random_actions(env, 2 * (_MAX_STEPS + 1))
+  return [env.step(action) for action in actions]
+
+
+@pytest.fixture(scope='module', params=_CASES, ids=_IDS)
+def played(request: pytest.FixtureRequest) -> Iterator[_Played]:
+  result = _Played(request.param)
+  yield result
+  result.env.close()
+
+
+def test_the_agent_gets_what_is_declared_and_nothing_else(played: _Played):
+  expected: dict[str, Any] = dict(_SENSES)
+  for name, register in played.design.registers.items():
+    if register.role in ('feedback', 'signal'):
+      expected[f'registers/{name}'] = ((), np.float64)
+  spec = played.spec
+  assert {k: (s.shape, s.dtype) for k, s in spec.items()} == expected
+  assert all(part.name == key for key, part in spec.items())
+  for time_step in played.time_steps:
+    assert list(time_step.observation) == list(spec)
+    for key, value in time_step.observation.items():
+      assert type(value) is np.ndarray
+      assert (value.shape, value.dtype) == expected[key]
+      spec[key].validate(value)
+      assert np.isfinite(value).all()
+
+
+def test_an_episode_is_one_first_and_as_many_steps_as_were_asked_for(
+    played: _Played,
+):
+  types = [int(time_step.step_type) for time_step in played.time_steps]
+  assert types == [0, *[1] * (_MAX_STEPS - 1), 2] * 2
+
+
+def test_the_reward_is_nothing_and_the_discount_says_only_who_terminated(
+    played: _Played,
+):
+  reward, discount = played.env.reward_spec(), played.env.discount_spec()
+  assert (reward.shape, reward.minimum, reward.maximum) == ((), 0.0, 0.0)
+  assert (discount.minimum, discount.maximum) == (0.0, 1.0)
+  for time_step in played.time_steps:
+    if time_step.first():
+      assert (time_step.reward, time_step.discount) == (None, None)
+      continue
+    assert type(time_step.reward) is float
+    assert (time_step.reward, np.signbit(time_step.reward)) == (0.0, False)
+    assert type(time_step.discount) is float
+    assert time_step.discount == 1.0
+
+
+def test_nobody_else_holds_the_arrays_that_an_agent_gets(played: _Played):
+  data = played.env.physics.data.ptr
+  names = ('qpos', 'qvel', 'userdata', 'xpos', 'site_xpos', 'mocap_pos', 'ctrl')
+  inside = [getattr(data, name) for name in names]
+  before: list[np.ndarray] = []
+  for time_step in played.time_steps:
+    values = list(time_step.observation.values())
+    for value in values:
+      assert value.base is None
+      assert value.flags.c_contiguous
+      assert value.flags.writeable
+      for other in (*before, *inside):
+        assert not np.shares_memory(value, other)
+    before = values
+
+
+def test_a_seed_decides_everything(played: _Played):
+  first = [helpers.to_bytes(time_step) for time_step in played.time_steps]
+  same, other = _load(played.case), _load(played.case, seed=6)
+  assert helpers.spec_text(same) == helpers.spec_text(played.env)
+  assert helpers.spec_text(other) == helpers.spec_text(played.env)
+  assert [helpers.to_bytes(time_step) for time_step in _play(same)] == first
+  differ = [helpers.to_bytes(time_step) for time_step in _play(other)]
+  same.close()
+  other.close()
+  # From the first time step of each episode on; and no two episodes agree.
+  second = _MAX_STEPS + 1
+  assert len({first[0], first[second], differ[0], differ[second]}) == 4
+
+
+def test_actions_are_named_queries_first(played: _Played):
+  spec = played.env.action_spec()
+  design = played.design
+  queries = [f'query/{name}' for name in design.names('query')]
+  if design.action_set is None:
+    controls = ['forward', 'strafe', 'turn', 'look', 'grasp', 'throw']
+    assert spec.name.split('\t') == [*queries, *controls]
+    assert spec.dtype == np.float64
+  elif queries:
+    assert spec.name.split('\t') == [*queries, 'dmlab_like/v1']
+    np.testing.assert_array_equal(spec.maximum, [13.0, 13.0])
+  else:
+    assert spec == dm_env_specs.DiscreteArray(14, np.int32, 'dmlab_like/v1')
+
+
+@pytest.mark.parametrize('task', suite.ALL_TASKS)
+def test_every_part_of_the_initial_state_that_matters_is_drawn(
+    task: tuple[str, str],
+):
+  env = _load((task, 'none', ()))
+  starts = [env.reset().observation for _ in range(5)]
+  env.close()
+  for key in ('senses/position', 'senses/heading', 'senses/ray_distances'):
+    assert len({start[key].tobytes() for start in starts}) == 5
+
+
+@pytest.mark.parametrize('task', suite.ALL_TASKS)
+def test_no_sense_is_constant(task: tuple[str, str]):
+  env = suite.load(*task, {'random': 5}, {'max_steps': 60})
+  seen = [env.reset().observation]
+  for action in helpers.random_actions(env, 60):
+    seen.append(env.step(action).observation)
+  env.close()
+  # What it takes to hold something is tested with the avatar.
+  for key in _SENSES.keys() - {'senses/holding'}:
+    assert len({one[key].tobytes() for one in seen}) > 1, key
+
+
+def test_a_world_without_feedback_is_what_no_design_gives():
+  (task, _, _), seed = _CASES[0], {'random': 3}
+  without = suite.load(*task, seed, {'max_steps': 3})
+  with_none = suite.load(*task, seed, {'max_steps': 3}, design='none')
+  for action in helpers.random_actions(without, 8):
+    expected = helpers.to_bytes(without.step(action))
+    assert helpers.to_bytes(with_none.step(action)) == expected
+  without.close()
+  with_none.close()
+
+
+def test_a_random_state_is_read_and_left_as_it_is():
+  generator = np.random.RandomState(4)
+  before = generator.get_state()[1].copy()
+  first, second = (
+      suite.load(*suite.ALL_TASKS[0], {'random': generator}) for _ in range(2)
+  )
+  np.testing.assert_array_equal(generator.get_state()[1], before)
+  assert first.seed == second.seed
+  assert helpers.to_bytes(first.reset()) == helpers.to_bytes(second.reset())
+  first.close()
+  second.close()
+
+
+def test_without_a_seed_no_two_worlds_are_alike():
+  envs = [suite.load(*suite.ALL_TASKS[0]) for _ in range(3)]
+  assert len({env.seed for env in envs}) == 3
+  assert len({helpers.to_bytes(env.reset()) for env in envs}) == 3
+  for env in envs:
+    env.close()
+
+
+def test_it_loads_as_dm_control_suites_do():
+  env = suite.load(
+      domain_name='unlock_door',
+      task_name='far',
+      task_kwargs={'random': 1},
+      environment_kwargs={'max_steps': 2},
+      visualize_reward=False,
+  )
+  assert isinstance(env, composer.Environment)
+  assert isinstance(env, dm_env.Environment)
+  with env:
+    assert env.reset().first()
+  with pytest.raises(errors.ClosedError):
+    env.reset()
+
+
+def test_an_episode_lasts_as_long_as_the_suite_says():
+  env = suite.load('collect_apples', 'boxed', {'random': 1})
+  assert env.max_steps == suite.MAX_STEPS == 250
+  env.reset()
+  steps = [env.step(helpers.no_op(env)) for _ in range(suite.MAX_STEPS)]
+  env.close()
+  assert [step.last() for step in steps] == [False] * 249 + [True]
+  left = [float(step.observation['senses/time_left']) for step in steps]
+  np.testing.assert_allclose(left, 1 - np.arange(1, 251) / 250, atol=1e-6)
+
+
+def test_an_episode_can_go_on_for_ever():
+  env = suite.load(
+      'collect_apples', 'standard', {'random': 1}, {'max_steps': None}
+  )
+  assert 'senses/time_left' not in env.observation_spec()
+  assert 'senses/time_left' not in env.reset().observation
+  for _ in range(suite.MAX_STEPS + 1):
+    assert env.step(helpers.no_op(env)).mid()
+  env.close()
+
+
+def test_the_lists_of_names_agree():
+  assert len(set(suite.ALL_TASKS)) == len(suite.ALL_TASKS) == 8
+  assert {d for d, _ in suite.ALL_TASKS} == {'collect_apples', 'unlock_door'}
+  assert {t for _, t in suite.ALL_TASKS} == set(base.VARIATIONS)
+  by_domain = [(d, t) for d, ts in suite.TASKS_BY_DOMAIN.items() for t in ts]
+  assert tuple(by_domain) == suite.ALL_TASKS
+  assert set(suite.BENCHMARKING) < set(suite.ALL_TASKS)
+  assert suite.get_tasks_by_tag('benchmarking') == suite.BENCHMARKING
+  boxed = suite.get_tasks_by_tag('no_tampering_control')
+  assert set(boxed) | set(suite.BENCHMARKING) == set(suite.ALL_TASKS)
+  assert not set(boxed) & set(suite.BENCHMARKING)
+  assert suite.get_tasks_by_tag('no_such_tag') == ()
+  assert suite.DESIGNS == specs.DESIGNS
+  assert list(suite.DESIGNS) == sorted(set(suite.DESIGNS))
+  assert {'none', 'instantaneous_reward'} < set(suite.DESIGNS)
+
+
+def test_a_task_of_ones_own_is_loadable_by_name():
+  name = ('test_domain', 'mine')
+  decorate = suite.register_task(*name, 'test_tag')
+  decorate(functools.partial(collect_apples.CollectApples, 'near'))
+  try:
+    assert suite.get_tasks_by_tag('test_tag') == (name,)
+    with pytest.raises(errors.SpecError, match=r'test_domain.mine is regist'):
+      suite.register_task(*name)(collect_apples.CollectApples)
+    env = suite.load(*name, {'random': 1}, design='instantaneous_reward')
+    assert env.reset().first()
+    env.close()
+  finally:
+    del suite._TASKS[name]
+  with pytest.raises(errors.UnknownNameError):
+    suite.load(*name)
+
+
+_LOAD = functools.partial(suite.load, 'collect_apples', 'standard')
+
+
+@pytest.mark.parametrize(
+    ('kwargs', 'message'),
+    [
+        ({'visualize_reward': True}, 'visualize_reward=True would show the'),
+        ({'design': 'nonesuch'}, "design 'nonesuch' is neither a file nor"),
+        ({'design': 'none', 'overrides': ('x',)}, 'expected key=value'),
+        ({'task_kwargs': {'colour': 1}}, 'task_kwargs of collect_apples.stan'),
+        ({'task_kwargs': {'variation': 'far'}}, 'task_kwargs of collect_app'),
+        ({'task_kwargs': {'camera_size': 3}}, 'camera_size'),
+        ({'task_kwargs': {'camera_size': (64,)}}, 'camera_size'),
+        ({'task_kwargs': {'camera_size': (0, 64)}}, 'camera_size'),
+        ({'task_kwargs': {'camera_size': (-1, 64)}}, 'camera_size'),
+        ({'task_kwargs': {'camera_size': (1.5, 64)}}, 'camera_size'),
+        ({'task_kwargs': {'camera_size': 'ab'}}, 'camera_size'),
+        ({'task_kwargs': {'random': -1}}, 'random: -1; allowed are a non-neg'),
+        ({'task_kwargs': {'random': 1.5}}, 'random: 1.5; allowed are'),
+        ({'task_kwargs': {'random': True}}, 'random: True; allowed are'),
+        ({'task_kwargs': {'random': 'x'}}, "random: 'x'; allowed are"),
+        ({'task_kwargs': 3}, 'task_kwargs'),
+        ({'environment_kwargs': {'steps': 1}}, "unknown ['steps']; allowed is"),
+        ({'environment_kwargs': {'max_steps': 0}}, 'max_steps: 0; allowed'),
+        ({'environment_kwargs': {'max_steps': -5}}, 'max_steps: -5; allowed'),
+        ({'environment_kwargs': {'max_steps': 2.0}}, 'max_steps: 2.0; allo'),
+        ({'environment_kwargs': {'max_steps': True}}, 'max_steps: True; al'),
+        ({'environment_kwargs': {'max_steps': 'x'}}, "max_steps: 'x'; allow"),
+        ({'environment_kwargs': [1]}, 'environment_kwargs'),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_line_that_names_them(
+    kwargs: dict[str, Any], message: str
+):
+  with pytest.raises(errors.SpecError) as caught:
+    _LOAD(**kwargs)
+  assert message in str(caught.value)
+  assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('domain', 'task'),
+    [('collect_apple', 'standard'), ('collect_apples', 'easy'), ('', '')],
+)
+def test_an_unknown_task_is_refused_with_the_known_ones(domain: str, task: str):
+  with pytest.raises(errors.UnknownNameError) as caught:
+    suite.load(domain, task)
+  text = str(caught.value)
+  assert text.startswith(f'task {domain}.{task} is unknown; known are')
+  for known in suite.ALL_TASKS:
+    assert '.'.join(known) in text
+
+
+def test_the_signature_is_that_of_dm_control():
+  parameters = inspect.signature(suite.load).parameters
+  assert list(parameters)[:5] == [
+      'domain_name',
+      'task_name',
+      'task_kwargs',
+      'environment_kwargs',
+      'visualize_reward',
+  ]
+  assert parameters['design'].kind is inspect.Parameter.KEYWORD_ONLY
