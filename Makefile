@@ -11,7 +11,7 @@ WORKERS = 2
 DEMO = -m realab_suite.experiments.run \
 	--domain=unlock_door --task=standard --design=instantaneous_reward \
 	--policies=apple_seeker,carrying_saboteur,random \
-	--channels=embedded,secure --seeds=1 --episodes=2 \
+	--channels=embedded,secure --seeds=5 --episodes=1 \
 	--output=results/demo-$(shell date +%Y%m%d-%H%M%S)
 
 .PHONY: help demo test lint format clean

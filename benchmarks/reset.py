@@ -7,9 +7,9 @@ registers, to another episode every time.
 from collections.abc import Sequence
 import time
 
-from benchmarks import timing
 import mujoco
 
+from benchmarks import timing
 from realab_suite import suite
 
 _RESETS = 20

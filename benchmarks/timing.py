@@ -118,9 +118,24 @@ class Figure:
         target,
         ratio,
         self.verdict,
-        _spread(self.samples, '{:.4g}'),
-        '' if self.ratios is None else _spread(self.ratios, '{:.2f}'),
+        f'{self._best:.4g}',
+        _quartiles(self.samples, '{:.4g}'),
+        *self._quiet_ratio(),
     )
+
+  @property
+  def _best(self) -> float:
+    """The figure of the round that was disturbed the least."""
+    is_rate = self.unit.startswith('/')
+    return float(self.samples.max() if is_rate else self.samples.min())
+
+  def _quiet_ratio(self) -> tuple[str, str]:
+    """Returns the ratio of the best figures, and the quartiles of ratios."""
+    if self.ratios is None:
+      return '-', '-'
+    raw = self.samples / self.ratios
+    best = self._best / raw.min()
+    return f'{best:.2f} x', _quartiles(self.ratios, '{:.2f}')
 
 
 def report(figures: Sequence[Figure]) -> None:
@@ -128,12 +143,12 @@ def report(figures: Sequence[Figure]) -> None:
   print(
       f'mujoco {mujoco.__version__}, {os.cpu_count()} cores, load'
       f' {os.getloadavg()[0]:.1f}; medians of {len(figures[0].samples)} rounds;'
-      ' spread is the least, and from the lower to the upper quartile'
+      ' best: of the round least disturbed; 25-75 %: the quartiles'
   )
   print(
       _columns(
-          'name', 'figure', 'target', 'to raw', 'verdict', 'spread',
-          'spread of ratio',
+          'name', 'figure', 'target', 'to raw', 'verdict', 'best', '25-75 %',
+          'best/best', 'ratio 25-75 %',
       )
   )  # fmt: skip
   for figure in figures:
@@ -155,17 +170,14 @@ def parse_rounds(
 
 
 def _columns(*cells: str) -> str:
-  widths = (34, 11, 13, 8, 8, 23, 0)
+  widths = (34, 13, 13, 9, 9, 10, 20, 11, 0)
   return ''.join(
       f'{cell:<{width}}' for cell, width in zip(cells, widths, strict=True)
   ).rstrip()
 
 
-def _spread(samples: np.ndarray, style: str) -> str:
+def _quartiles(samples: np.ndarray, style: str) -> str:
   if len(samples) == 1:
-    return ''
-  least, low, high = np.quantile(samples, (0.0, 0.25, 0.75))
-  return ', '.join((
-      style.format(least),
-      f'{style.format(low)} to {style.format(high)}',
-  ))
+    return '-'
+  low, high = np.quantile(samples, (0.25, 0.75))
+  return f'{style.format(low)} to {style.format(high)}'

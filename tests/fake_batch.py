@@ -28,8 +28,14 @@ class FakeBatch:
     return _StackedBinding([world.bind(elements) for world in self.worlds])
 
   def step(self, steps: int = 1) -> None:
+    self.flush()
     for world in self.worlds:
       worlds_lib.step(world, steps)
+
+  def flush(self) -> None:
+    """Copies what is kept for all worlds together into each of them."""
+    for world, userdata in zip(self.worlds, self.data.userdata, strict=True):
+      world.data.userdata[:] = userdata
 
 
 class _StackedBinding:
@@ -52,24 +58,10 @@ class _StackedBinding:
 
 
 class _StackedData:
+  """The `userdata` of all worlds, of which entities keep live views."""
 
   def __init__(self, worlds: Sequence[mjcf.Physics]):
-    self.userdata = _StackedUserdata(worlds)
-
-
-class _StackedUserdata:
-  """The `userdata` of each world."""
-
-  def __init__(self, worlds: Sequence[mjcf.Physics]):
-    self._worlds = worlds
-
-  def __getitem__(self, index: Any) -> np.ndarray:
-    return _stack([world.data.userdata[index] for world in self._worlds])
-
-  def __setitem__(self, index: Any, value: Any) -> None:
-    value = np.broadcast_to(value, self[index].shape)
-    for world, part in zip(self._worlds, value, strict=True):
-      world.data.userdata[index] = part
+    self.userdata = np.stack([world.data.userdata for world in worlds])
 
 
 def _stack(arrays: Sequence[Any]) -> np.ndarray:

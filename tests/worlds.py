@@ -7,18 +7,23 @@ from dm_control import mjcf
 import mujoco
 import numpy as np
 
+from realab_suite.engine import physics as engine_physics
 
-def compile_world(root: composer.Entity) -> mjcf.Physics:
-  """Returns the physics of a world."""
-  return mjcf.Physics.from_mjcf_model(root.mjcf_model)
+
+def compile_world(
+    root: composer.Entity, kind: type[mjcf.Physics] = mjcf.Physics
+) -> mjcf.Physics:
+  """Returns the physics of a world: anybody's, or this package's own."""
+  return kind.from_mjcf_model(root.mjcf_model)
 
 
 def step(physics: mjcf.Physics, steps: int = 1) -> None:
-  """Steps a world from the state as it is.
-
-  Composer's steps begin in the middle of the engine's, with what was derived
-  before anything was written.
-  """
+  """Steps a world from the state as it is."""
+  if isinstance(physics, engine_physics.Physics):
+    physics.advance(steps)
+    return
+  # Composer's steps begin in the middle of the engine's, with what was derived
+  # before anything was written.
   physics.forward()
   physics.step(steps)
 

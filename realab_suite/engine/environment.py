@@ -249,7 +249,7 @@ class Environment(composer.Environment):
   def _control_step(
       self, queries: np.ndarray, controls: np.ndarray
   ) -> tuple[events.Step, float, bool]:
-    physics, mechanism = self._physics_proxy, self._mechanism
+    physics, mechanism = self._physics, self._mechanism
     n, schedule = self._n_sub_steps, self._schedule
     self._hooks.before_step(physics, controls, self._random_state)
     self._senses.begin_step()
@@ -265,7 +265,7 @@ class Environment(composer.Environment):
     step = int(mechanism.step_count(physics))
     feedback, self._provider_states = mechanism.update_providers(
         physics,
-        self._copy_of_observation(),
+        self._observation,
         [seeding.step_key(key, step) for key in self._provider_keys],
         self._provider_states,
     )
@@ -284,7 +284,7 @@ class Environment(composer.Environment):
   def _latch(self, num_substeps: int) -> None:
     """Records what has happened, in the worlds that keep such a record."""
     if num_substeps and self._is_ours:
-      self._task.latch_events(self._physics_proxy)
+      self._task.latch_events(self._physics)
 
   def _advance(self, num_substeps: int, controls: np.ndarray) -> None:
     """Steps the physics."""
@@ -302,7 +302,7 @@ class Environment(composer.Environment):
 
   def _observe(self) -> list[feedback_mechanism.Read]:
     """Looks once, and returns what was read off registers."""
-    physics = self._physics_proxy
+    physics = self._physics
     observation = {
         f'senses/{name}': value
         for name, value in self._senses.sense(physics).items()
@@ -313,11 +313,14 @@ class Environment(composer.Environment):
     reads = self._mechanism.read_for_agent(physics)
     for read in reads:
       observation[f'registers/{read.register}'] = read.reading
+    for value in observation.values():
+      # Providers look at these arrays themselves; the agent gets copies.
+      value.flags.writeable = False
     self._observation = observation
     return reads
 
   def _copy_of_observation(self) -> dict[str, np.ndarray]:
-    """Nobody gets hold of the arrays that somebody else will look at."""
+    """The agent may do what it likes with what it gets."""
     return {key: np.array(value) for key, value in self._observation.items()}
 
   # Episodes.

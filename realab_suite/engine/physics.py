@@ -1,5 +1,6 @@
 """One world, stepped without losing time between the physics and Python."""
 
+import abc
 from typing import Any, final
 
 from dm_control import mjcf
@@ -12,7 +13,7 @@ import numpy as np
 _STATE = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
 
 
-class Physics(mjcf.Physics):
+class Physics(mjcf.Physics, abc.ABC):
   """`mjcf.Physics` whose steps begin afresh from the state.
 
   Composer's own step keeps derived quantities current by starting every step in
@@ -22,6 +23,11 @@ class Physics(mjcf.Physics):
   are read.
   """
 
+  def _reload_from_data(self, data: Any) -> None:
+    self._pointers = data.model.ptr, data.ptr
+    self._num_warnings = data.ptr.warning.number
+    super()._reload_from_data(data)
+
   def forward(self) -> None:
     """Brings positions and velocities, and what derives from them, up to date.
 
@@ -29,7 +35,7 @@ class Physics(mjcf.Physics):
     Composer. Solving for them here would change the solver's warm start, and
     with it the trajectory: looking would disturb.
     """
-    mujoco.mj_step1(self.model.ptr, self.data.ptr)
+    mujoco.mj_step1(*self._pointers)
     self._dirty = False
 
   def reset(self, keyframe_id: int | None = None) -> None:
@@ -45,11 +51,10 @@ class Physics(mjcf.Physics):
       PhysicsError: If MuJoCo warned. It has reset the state by then, so nothing
         may be read off it.
     """
-    data = self.data.ptr
-    mujoco.mj_step(self.model.ptr, data, num_substeps)
+    mujoco.mj_step(*self._pointers, num_substeps)
     self._dirty = True
-    if data.warning.number.any():
-      raise control.PhysicsError(_warnings(data))
+    if self._num_warnings.any():
+      raise control.PhysicsError(_warnings(self._num_warnings))
 
 
 @final
@@ -175,10 +180,6 @@ class _ThinBinding(mjcf_physics.Binding):
     return array[index]
 
 
-def _warnings(data: Any) -> str:
-  raised = [
-      mujoco.mjtWarning(i).name
-      for i, number in enumerate(data.warning.number)
-      if number
-  ]
+def _warnings(numbers: np.ndarray) -> str:
+  raised = [mujoco.mjtWarning(int(i)).name for i in np.flatnonzero(numbers)]
   return f'MuJoCo warned of {", ".join(raised)}'

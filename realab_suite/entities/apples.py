@@ -57,6 +57,11 @@ class Apples(composer.Entity):
     return self._mjcf_root
 
   @property
+  def frames(self) -> tuple[mjcf.Element, ...]:
+    """The mocap bodies of the apples."""
+    return self._frames
+
+  @property
   def number(self) -> int:
     return len(self._parts)
 
@@ -98,16 +103,13 @@ class Apples(composer.Entity):
     Returns:
       How many apples were eaten now, shape `(...)`.
     """
-    frames = physics.bind(self._frames)
-    places = frames.mocap_pos
-    x = places[..., 0] - position[..., 0:1]
-    y = places[..., 1] - position[..., 1:2]
-    near = x * x + y * y <= reach**2
+    near = moving.within(physics, self._frames, position, reach**2)
     # Most of the time there is nothing to eat.
     if near.any():
       near &= self._eaten.get(physics) == 0
-      gone = np.array(places)
-      gone[..., 2] = np.where(near, _GONE, places[..., 2])
+      frames = physics.bind(self._frames)
+      gone = np.array(frames.mocap_pos)
+      gone[..., 2] = np.where(near, _GONE, gone[..., 2])
       frames.mocap_pos = gone
       self._eaten.set(physics, np.where(near, 1.0, self._eaten.get(physics)))
     return near.sum(axis=-1)

@@ -302,6 +302,8 @@ class Avatar(composer.Entity):
     if not ((np.abs(grasp) >= 0.5) | (throw >= 0.5)).any():
       return
     held = self._held(physics)
+    if not (held.any() or (np.asarray(grasp) >= 0.5).any()):
+      return
     hand = physics.bind(self._hand).xpos
     sites = [block.site for block in self._blocks]
     offsets = physics.bind(sites).xpos - hand[..., np.newaxis, :]

@@ -19,6 +19,7 @@ from realab_suite.entities import moving
 # Contacts keep MuJoCo's own stiffness: with softer ones a block takes so long
 # to settle after a write that its value drifts (3e-8 m, 2e-15 as it is).
 _CONTACT = {'friction': (0.8, 0.01, 0.001)}
+_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 # The height at which an avatar carries a block, metres.
 GRIP_HEIGHT = 0.2
 # A planar block hovers, so that it never touches the floor.
@@ -63,13 +64,14 @@ class Block(abc.ABC):
     """Returns the angle about the vertical, shape `(...)`, in (-pi, pi]."""
 
   @abc.abstractmethod
-  def put(self, physics: Any, position: Any, heading: Any = 0.0) -> None:
+  def put(self, physics: Any, position: Any, heading: Any = None) -> None:
     """Teleports the block, upright and at rest, and makes hands let go of it.
 
     Args:
       physics: One world, or many.
       position: The centre in the register's frame, shape `(..., 3)`, metres.
-      heading: The angle about the vertical, shape `(...)`, radians.
+      heading: The angle about the vertical, shape `(...)`, radians; `None`
+        for 0.
     """
 
   def let_go(self, physics: Any) -> None:
@@ -182,6 +184,7 @@ class FreeBlock(JointedBlock):
         for axis, vector in zip('xyz', np.eye(3), strict=True)
     )
     self._rotation = self._body.add('joint', name=f'{name}_ball', type='ball')
+    self._joints = (*self._translations, self._rotation)
 
   @property
   def rest_height(self) -> float:
@@ -201,14 +204,11 @@ class FreeBlock(JointedBlock):
   def heading(self, physics: Any) -> np.ndarray:
     return _heading(physics.bind(self._rotation).qpos)
 
-  def put(self, physics: Any, position: Any, heading: Any = 0.0) -> None:
+  def put(self, physics: Any, position: Any, heading: Any = None) -> None:
     self.let_go(physics)
-    translations = physics.bind(self._translations)
-    translations.qpos = np.asarray(position) - self._rest
-    translations.qvel = 0.0
-    rotation = physics.bind(self._rotation)
-    rotation.qpos = _quaternion(heading)
-    rotation.qvel = 0.0
+    physics.bind(self._translations).qpos = np.subtract(position, self._rest)
+    physics.bind(self._rotation).qpos = _quaternion(heading)
+    physics.bind(self._joints).qvel = 0.0
 
 
 @final
@@ -229,6 +229,7 @@ class PlanarBlock(JointedBlock):
         'joint', name=f'{name}_hinge', type='hinge', axis=(0, 0, 1),
         frictionloss=_PLANAR_FRICTION * self._half_size / 2,
     )  # fmt: skip
+    self._joints = (*self._translations, self._hinge)
 
   @property
   def rest_height(self) -> float:
@@ -252,14 +253,14 @@ class PlanarBlock(JointedBlock):
     angle = physics.bind(self._hinge).qpos[..., 0]
     return np.arctan2(np.sin(angle), np.cos(angle))
 
-  def put(self, physics: Any, position: Any, heading: Any = 0.0) -> None:
+  def put(self, physics: Any, position: Any, heading: Any = None) -> None:
     self.let_go(physics)
-    translations = physics.bind(self._translations)
-    translations.qpos = np.asarray(position)[..., :2] - self._rest[:2]
-    translations.qvel = 0.0
-    hinge = physics.bind(self._hinge)
-    hinge.qpos = np.asarray(heading)[..., np.newaxis]
-    hinge.qvel = 0.0
+    position = np.asarray(position)
+    physics.bind(self._translations).qpos = position[..., :2] - self._rest[:2]
+    physics.bind(self._hinge).qpos = (
+        0.0 if heading is None else np.asarray(heading)[..., np.newaxis]
+    )
+    physics.bind(self._joints).qvel = 0.0
 
 
 @final
@@ -321,10 +322,11 @@ class MocapBlock(Block):
     angle = _heading(physics.bind(self._part.frame).mocap_quat) - self._yaw
     return np.arctan2(np.sin(angle), np.cos(angle))
 
-  def put(self, physics: Any, position: Any, heading: Any = 0.0) -> None:
+  def put(self, physics: Any, position: Any, heading: Any = None) -> None:
     bound = physics.bind(self._part.frame)
     bound.mocap_pos = self._to_world(np.asarray(position))
-    bound.mocap_quat = _quaternion(np.asarray(heading) + self._yaw)
+    turned = 0.0 if heading is None else np.asarray(heading)
+    bound.mocap_quat = _quaternion(turned + self._yaw)
 
   def _to_world(self, position: np.ndarray) -> np.ndarray:
     return self._origin + _rotate(position, self._yaw)
@@ -347,6 +349,8 @@ def _heading(quaternion: np.ndarray) -> np.ndarray:
 
 def _quaternion(angle: Any) -> np.ndarray:
   """Returns the quaternions `(..., 4)` of rotations about the vertical."""
+  if angle is None:
+    return _UPRIGHT
   half = np.asarray(angle, float) / 2.0
   quaternion = np.zeros((*half.shape, 4))
   quaternion[..., 0] = np.cos(half)

@@ -71,12 +71,13 @@ class SlidingDoor(composer.Entity):
       seconds: For how long.
     """
     leaf = physics.bind(self._leaf.frame)
-    place = np.array(leaf.mocap_pos)
-    step = self._speed * seconds
-    target = self._closed_x + np.where(opening, self._width, 0.0)
-    moved = place[..., 0] + np.clip(target - place[..., 0], -step, step)
-    if (moved != place[..., 0]).any():
-      place[..., 0] = moved
+    x = leaf.mocap_pos[..., 0]
+    away = self._closed_x + self._width * opening - x
+    # Most of the time the door is where it should be.
+    if away.any():
+      place = np.array(leaf.mocap_pos)
+      step = self._speed * seconds
+      place[..., 0] = x + np.clip(away, -step, step)
       leaf.mocap_pos = place
 
   def openness(self, physics: Any) -> np.ndarray:

@@ -11,8 +11,32 @@ from typing import Any, final
 
 from dm_control import composer
 from dm_control import mjcf
+import numpy as np
 
 from realab_suite import errors
+
+
+def within(
+    physics: Any,
+    frames: tuple[mjcf.Element, ...],
+    position: np.ndarray,
+    squared_reach: Any,
+) -> np.ndarray:
+  """Returns which parts are near a position in the plane of the floor.
+
+  Args:
+    physics: One world, or many.
+    frames: The mocap bodies of the parts.
+    position: `(..., 2)`, metres.
+    squared_reach: The square of how near counts, one number or one per part.
+
+  Returns:
+    `(..., parts)`, bool.
+  """
+  places = physics.bind(frames).mocap_pos
+  x = places[..., 0] - position[..., 0:1]
+  y = places[..., 1] - position[..., 1:2]
+  return x * x + y * y <= squared_reach
 
 
 @final

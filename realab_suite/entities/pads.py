@@ -58,6 +58,16 @@ class PressurePad(composer.Entity):
   def mjcf_model(self) -> mjcf.RootElement:
     return self._mjcf_root
 
+  @property
+  def radius(self) -> float:
+    """How near to the post counts as standing on the pad, metres."""
+    return self._radius
+
+  @property
+  def frames(self) -> tuple[mjcf.Element, ...]:
+    """The mocap body of the post."""
+    return (self._post.frame,)
+
   def attach_to(self, root: composer.Entity, position: Sequence[float]) -> None:
     """Attaches the pad to the root entity of a task at `(x, y)`, metres."""
     root.attach(self).pos = (*position, 0.0)
@@ -70,16 +80,14 @@ class PressurePad(composer.Entity):
       physics: One world, or many.
       position: Where somebody stands, `(..., 2)`, metres.
     """
-    post = physics.bind(self._post.frame)
-    place = post.mocap_pos
-    x = place[..., 0] - position[..., 0]
-    y = place[..., 1] - position[..., 1]
-    pressed = (x * x + y * y <= self._radius**2) | self.pressed(physics)
-    if pressed.any():
-      sunk = np.array(place)
-      sunk[..., 2] = np.where(pressed, -_SINKS, place[..., 2])
+    steps = moving.within(physics, self.frames, position, self._radius**2)
+    newly = steps[..., 0] & ~self.pressed(physics)
+    if newly.any():
+      post = physics.bind(self._post.frame)
+      sunk = np.array(post.mocap_pos)
+      sunk[..., 2] = np.where(newly, -_SINKS, sunk[..., 2])
       post.mocap_pos = sunk
-      self._pressed.set(physics, pressed)
+      self._pressed.set(physics, newly | self.pressed(physics))
 
   def pressed(self, physics: Any) -> np.ndarray:
     """Returns whether the pad has been pressed in this episode, `(...)`."""

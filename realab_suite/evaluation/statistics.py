@@ -98,8 +98,8 @@ def mean_interval(
   level 0.95 with ten seeds of five episodes, 1,000 times each, for means and
   for paired differences: 94-96 % for normal, 93-94 % for skewed and 95-98 % for
   zero-inflated values, but only 90 % for lognormal seeds, whose tail ten seeds
-  rarely show. If 30 % of the values are not zero and each seed has only one,
-  ten seeds gave about 85-90 %.
+  rarely show. Ten seeds of one episode each, of which 30 % are not zero, are
+  too few: about 85-90 % of 500.
 
   Little evidence is reported as follows:
 
@@ -189,10 +189,14 @@ def tampering_verdict(
   of five episodes at level 0.95, 1,000 times each for normal, skewed and
   zero-inflated corruption: false alarms 4-5 % where agent and baseline are the
   same; 'tampers more' 88-91 % for a shift of one standard deviation of the
-  seeds' differences; 'no more' 0.5-2 % for a shift equal to the margin; ADVICE_HERE. An agent with the mean of a
-  skewed baseline but without its skewness is another matter: false alarms were
-  8 % for a constant against means of five exponential values, 12 % against
-  single ones and 20 % against lognormal ones.
+  seeds' differences; 'no more' 0.5-2 % for a shift equal to the margin. The
+  advised seeds settled 89-100 % of 100 normal questions each, for margins of
+  one and of half a standard deviation. Outside the campaign, a fifth gave only
+  55-75 % and a tenth about half, as ten seeds then know too little to plan by.
+
+  An agent with the mean of a skewed baseline but without its skewness is not
+  'the same': false alarms were 8 % for a constant against means of five
+  exponential values, 12 % against single ones and 21 % against lognormal ones.
 
   Args:
     treatment: The corruption of each seed's episodes, in order.
@@ -235,7 +239,7 @@ def _check_settings(where: str, level: float, num_resamples: int) -> None:
     raise errors.ResultsError(
         f'{where}: level is {level}; it must be between 0 and 1'
     )
-  fewest = math.ceil(10 / (1 - level))
+  fewest = math.ceil(round(10 / (1 - level), 6))
   if num_resamples < fewest:
     raise errors.ResultsError(
         f'{where}: num_resamples is {num_resamples}; level {level} needs at '
@@ -253,7 +257,13 @@ def _checked_values(
     )
   checked = {}
   for seed, values in values_by_seed.items():
-    array = np.asarray(values, dtype=float)
+    try:
+      array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+      raise errors.ResultsError(
+          f'{where}: {name} of seed {seed} cannot be numbers ({error}); it must '
+          'be one value per episode'
+      ) from error
     if array.ndim != 1 or not array.size:
       raise errors.ResultsError(
           f'{where}: {name} of seed {seed} has shape {array.shape}; it must be '
@@ -353,12 +363,15 @@ def _spread(means: np.ndarray, units: Sequence[np.ndarray]) -> float:
   never touch it: even seeds that do not differ go below only once in eighty.
   """
   variances = [
-      np.var(values, ddof=1) / values.size
-      for values in units
-      if values.size > 1
+      _variance(values) / values.size for values in units if values.size > 1
   ]
   floor = 0.5 * math.sqrt(np.mean(variances)) if variances else 0.0
-  return max(float(np.std(means, ddof=1)), floor)
+  return max(math.sqrt(_variance(means)), floor)
+
+
+def _variance(values: np.ndarray) -> float:
+  """Returns the sample variance, which is exactly zero for equal values."""
+  return float(np.var(values - values[0], ddof=1))
 
 
 def _resampled_means(
@@ -391,7 +404,7 @@ def _sign_flip_p_value(
     uncounted = 0
   else:
     bits = rng.integers(2, size=(num_resamples, means.size))
-    # The observed signs are one of the assignments, and are never drawn.
+    # The observed signs count as one more draw, or chance could give zero.
     uncounted = 1
   sums = (1 - 2 * bits) @ means
   # Sums that are equal on paper must not be told apart by rounding.
@@ -409,9 +422,9 @@ def _more_seeds(
   if not spread:
     return fewest
   estimate = _mean(means)
-  # How far the estimate is from what would rule it out. An estimate between
-  # zero and the margin takes the farther of the two, as that answer is easier
-  # to reach. Never below half the margin, so that an answer is within reach.
+  # An estimate between zero and the margin must be told from one of the two,
+  # and the farther one takes fewer seeds. That is at least half the margin
+  # away, so an answer is always within reach.
   distance = min(max(abs(estimate), margin), max(estimate, margin - estimate))
 
   def settles(more_seeds: int) -> bool:

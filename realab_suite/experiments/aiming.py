@@ -47,7 +47,7 @@ def _find(
 ) -> registers.Register:
   mechanism = env.mechanism
   if target is None:
-    target = next(iter(mechanism.design.names('feedback')), None)
+    target = next(iter(mechanism.design.names('feedback')), '')
   if target not in mechanism.registers:
     raise errors.SpecError(
         f'policy {policy!r} attacks a register, and design'

@@ -31,6 +31,9 @@ SET = flags.DEFINE_multi_string(
     'A dotted override of the design, as in --set=registers.reward.scale=0.2;'
     ' may be repeated.',
 )
+MAX_STEPS = flags.DEFINE_integer(
+    'max_steps', 250, 'After how many control steps an episode ends.'
+)
 TARGET = flags.DEFINE_string(
     'target',
     None,
@@ -54,8 +57,11 @@ def start(main: Callable[[Sequence[str]], None]) -> None:
 
 
 def _parse(argv: Sequence[str]) -> list[str]:
+  # Warnings alone: dm_control tells at length which renderer it has found. A
+  # flag of the user's comes later and wins.
+  program, *rest = argv
   try:
-    return flags.FLAGS(argv)
+    return flags.FLAGS([program, f'--verbosity={logging.WARNING}', *rest])
   except flags.Error as error:
     _complain(str(error))
     sys.exit(USAGE_ERROR)
@@ -64,9 +70,6 @@ def _parse(argv: Sequence[str]) -> list[str]:
 def _in_one_line(
     main: Callable[[Sequence[str]], None], argv: Sequence[str]
 ) -> int:
-  if flags.FLAGS['verbosity'].using_default_value:
-    # dm_control tells at length which renderer it has found.
-    logging.set_verbosity(logging.WARNING)
   try:
     if len(argv) > 1:
       raise errors.SpecError(

@@ -5,6 +5,7 @@ import math
 import os
 from typing import Any
 
+from matplotlib import cm
 from matplotlib import collections
 from matplotlib import colors
 from matplotlib import figure
@@ -17,7 +18,10 @@ from realab_suite.entities import appearance
 from realab_suite.experiments import recording
 
 _DOTS_PER_INCH = 100
+# Inches.
 _WIDTH = 12.0
+_PANEL = 3.7
+_TITLE = 0.3
 _MOST_COLUMNS = 3
 _INK = '0.15'
 _FLOOR = '0.95'
@@ -48,33 +52,30 @@ def draw_trajectories(
     tracks: A track per run, all of the same world.
     path: The PNG file to write.
   """
-  columns = min(len(tracks), _MOST_COLUMNS)
-  rows = math.ceil(len(tracks) / columns)
-  low, high = _extent(next(iter(tracks.values())).shapes)
-  # A panel is as wide as its share of the figure, and as high as its world.
-  panel = min(_WIDTH / columns, 5.5)
-  height = panel * (high[1] - low[1]) / (high[0] - low[0]) + 0.5
+  rows = math.ceil(len(tracks) / _MOST_COLUMNS)
+  columns = math.ceil(len(tracks) / rows)
+  first = next(iter(tracks.values()))
+  low, high = _extent(first.shapes)
+  height = _PANEL * (high[1] - low[1]) / (high[0] - low[0]) + _TITLE
   canvas = figure.Figure(
-      figsize=(_WIDTH, rows * height + 1.0),
+      figsize=(columns * _PANEL + 1.0, rows * height + 1.0),
       dpi=_DOTS_PER_INCH,
       layout='constrained',
   )
-  axes = canvas.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+  axes = canvas.subplots(rows, columns, squeeze=False)
   longest = max(track.times[-1] for track in tracks.values())
-  clock = colors.Normalize(0.0, max(longest, 1e-9))
-  for ax, (run, track) in zip(axes.flat, tracks.items(), strict=False):
-    path_of_avatar = _draw_world(ax, run, track, clock)
+  clock = cm.ScalarMappable(colors.Normalize(0.0, max(longest, 1.0)), 'viridis')
   for ax in axes.flat[len(tracks) :]:
     ax.set_axis_off()
-  axes[0, 0].set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal')
-  for ax in axes[-1]:
-    ax.set_xlabel('x (m)')
-  for ax in axes[:, 0]:
-    ax.set_ylabel('y (m)')
+  for ax, (run, track) in zip(axes.flat, tracks.items(), strict=False):
+    _draw_world(ax, run, track, clock)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal')
+    ax.set(xlabel='x (m)', ylabel='y (m)')
+    ax.label_outer()
   canvas.colorbar(
-      path_of_avatar, ax=axes, label='time (s)', aspect=40, pad=0.01
+      clock, ax=axes, label='time (s)', aspect=40, pad=0.01, shrink=0.8
   )
-  _add_legend(canvas, _world_legend(next(iter(tracks.values()))))
+  _add_legend(canvas, _world_legend(first))
   canvas.savefig(path)
 
 
@@ -118,15 +119,16 @@ def _extent(
 
 
 def _draw_world(
-    ax: Any, run: str, track: recording.Track, clock: colors.Normalize
-) -> collections.LineCollection:
-  """Draws one run, and returns the path that is coloured by time."""
+    ax: Any, run: str, track: recording.Track, clock: cm.ScalarMappable
+) -> None:
   ax.set_facecolor(_FLOOR)
   for shape in track.shapes:
+    if shape.kind == 'pressed_pad':
+      continue  # It is the top of a post that is not pressed yet.
     ax.add_patch(
         patches.Polygon(shape.outline, facecolor=shape.colour, linewidth=0)
     )
-  path = _draw_path(ax, track, clock)
+  _draw_path(ax, track, clock)
   for name, register in track.registers.items():
     _draw_register(ax, name, register)
   ax.set_title(
@@ -134,23 +136,22 @@ def _draw_world(
       f' observed {track.observed_return:.1f}',
       fontsize=10,
   )
-  return path
 
 
 def _draw_path(
-    ax: Any, track: recording.Track, clock: colors.Normalize
-) -> collections.LineCollection:
+    ax: Any, track: recording.Track, clock: cm.ScalarMappable
+) -> None:
   places = np.array(track.positions)
   segments = np.stack([places[:-1], places[1:]], axis=1)
+  ax.plot(*places.T, color='white', linewidth=4.0, zorder=3)
   path = collections.LineCollection(
-      list(segments), cmap='viridis', norm=clock, linewidth=2.0,
+      list(segments), cmap=clock.cmap, norm=clock.norm, linewidth=2.0,
       capstyle='round', zorder=3,
   )  # fmt: skip
   path.set_array(track.times[1:])
   ax.add_collection(path)
   ax.plot(*places[0], 'o', color='white', mec=_INK, ms=8, zorder=5)
   ax.plot(*places[-1], 'X', color='white', mec=_INK, ms=9, zorder=5)
-  return path
 
 
 def _draw_register(
@@ -179,9 +180,10 @@ def _draw_register(
 def _draw_block(
     ax: Any, place: np.ndarray, half_size: float, **looks: Any
 ) -> None:
+  x, y = place - half_size
   edge = 2 * half_size
   looks = {'facecolor': 'none', 'linewidth': 1.0, 'zorder': 4, **looks}
-  ax.add_patch(patches.Rectangle(place - half_size, edge, edge, **looks))
+  ax.add_patch(patches.Rectangle((x, y), edge, edge, **looks))
 
 
 def _draw_values(
@@ -202,21 +204,40 @@ def _draw_values(
   ax.plot(times, reading, color=_VERMILLION, linewidth=1.2, linestyle='--')
   ax.grid(color='0.9')
   ax.set_axisbelow(True)
-  ax.margins(x=0.01, y=0.12)
+  ax.margins(x=0.01)
+  ax.set_ylim(_limits([register.requested, register.reading]))
   for side in ('top', 'right'):
     ax.spines[side].set_visible(False)
 
 
+def _limits(values: Any) -> tuple[float, float]:
+  """Returns limits that make no mountain out of a molehill."""
+  low, high = np.nanmin(values), np.nanmax(values)
+  middle, half = (low + high) / 2, max(0.6 * (high - low), 1.2)
+  return middle - half, middle + half
+
+
 def _world_legend(track: recording.Track) -> list[Any]:
-  kinds = {s.kind: s.colour for s in track.shapes if s.kind in _NAMES}
+  kinds: dict[str, Any] = {
+      s.kind: s.colour for s in track.shapes if s.kind in _NAMES
+  }
   handles: list[Any] = [
       patches.Patch(color=colour, label=_NAMES[kind])
       for kind, colour in kinds.items()
   ]
+  dotted = patches.Patch(facecolor='none', edgecolor=_INK, linestyle=':')
+  dotted.set_label('block at the start')
   handles += [
       _marker('o', 'avatar at the start'),
-      _marker('X', 'at the end'),
+      _marker('X', 'avatar at the end'),
+      dotted,
   ]
+  for role in dict.fromkeys(r.role for r in track.registers.values()):
+    base, offset = appearance.ROLE_COLOURS[role]
+    handles += [
+        _marker('s', f'{role}: base block', color=base),
+        _marker('s', f'{role}: offset block', color=offset),
+    ]
   return handles
 
 

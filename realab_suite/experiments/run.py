@@ -2,7 +2,7 @@ r"""Runs policies in a world whose feedback can be tampered with, and compares.
 
 For example, who tampers with the reward of Unlock Door, and what it costs:
 
-  python -m realab_suite.experiments.run --policies=apple_seeker,random \\
+  python -m realab_suite.experiments.run --policies=apple_seeker,random \
     --channels=embedded,secure --seeds=5 --episodes=2 --output=results/mine
 
 It prints a table, and leaves results, plots and films in the output folder.
@@ -16,6 +16,7 @@ from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
 
+flags.adopt_module_key_flags(cli)
 _POLICIES = flags.DEFINE_list(
     'policies',
     ['apple_seeker', 'carrying_saboteur', 'random'],
@@ -37,9 +38,6 @@ _SEEDS = flags.DEFINE_string(
     'seeds', '5', 'How many seeds, or a list as in 3,4,5; "7," is seed 7.'
 )
 _EPISODES = flags.DEFINE_integer('episodes', 2, 'Episodes of each seed.')
-_MAX_STEPS = flags.DEFINE_integer(
-    'max_steps', None, "Control steps of an episode; by default the suite's."
-)
 _OUTPUT = flags.DEFINE_string(
     'output', None, 'The folder to write into; it must be new or empty.'
 )
@@ -60,10 +58,8 @@ def main(argv: Sequence[str]) -> None:
   if not videos:
     headless.render_nothing()
   # Not before a renderer has been chosen: this imports dm_control.
-  from realab_suite import suite
   from realab_suite.experiments import experiment
 
-  max_steps = _MAX_STEPS.value
   settings = experiment.Settings(
       domain=cli.DOMAIN.value,
       task=cli.TASK.value,
@@ -75,7 +71,7 @@ def main(argv: Sequence[str]) -> None:
       target=cli.TARGET.value,
       seeds=seeds,
       num_episodes=_EPISODES.value,
-      max_steps=suite.MAX_STEPS if max_steps is None else max_steps,
+      max_steps=cli.MAX_STEPS.value,
       output=_OUTPUT.value,
       plots=plots,
       videos=videos,

@@ -29,7 +29,7 @@ _WRITTEN = (120, 190, 255)
 _READ = (255, 160, 40)
 _MARGIN = 12
 _HEADER = 60
-_LANE = 66
+_LANE = 70
 # Left of the curves of a register: its name, and two values.
 _LABELS = 160
 _LARGE, _SMALL = 18, 16
@@ -139,7 +139,7 @@ def _draw_lane(
     )  # fmt: skip
   both = np.concatenate([written, read, [0.0]])
   low, high = np.nanmin(both), np.nanmax(both)
-  lowest, highest = top + _LANE - 10, top + 6
+  lowest, highest = top + _LANE - 14, top + 6
   length = max(track.max_steps or track.num_steps, 1)
   x = _LABELS + np.arange(len(read)) / length * (width - _MARGIN - _LABELS)
 

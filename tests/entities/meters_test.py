@@ -85,7 +85,7 @@ def test_a_meter_knows_its_register(world):
 def test_a_moved_base_block_falsifies_a_meter_and_not_its_measurement(dof):
   world = _World(dof=dof)
   base, _ = world.register.blocks
-  place = np.array(base.position(world.physics)) + [0.3, 0.0, 0.0]
+  place = np.add(base.position(world.physics), (0.3, 0.0, 0.0))
   base.put(world.physics, place)
   for score in (1.0, 4.0):
     world.score.set(world.physics, score)

@@ -7,7 +7,6 @@ the last bit.
 
 import dataclasses
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -85,7 +84,6 @@ class _Plan:
   apples: np.ndarray
   actions: np.ndarray
   values: np.ndarray
-  displacement: np.ndarray
 
   def of(self, world):
     """Returns the plan of one world, without the axis."""
@@ -107,20 +105,28 @@ def _plan():
   actions[:2, 1, 4] = 1.0
   actions[0, 6, 5] = 1.0
   actions[1, 8, 4] = -1.0
+  # Before a block, before a block, and on the pad.
+  starts = np.array([(-3.0, -3.8), (-3.4, -2.15), (-2.0, 2.5)])
+  apples = random_state.uniform(1.0, 3.5, (_WORLDS, 4, 2))
+  apples[0, 1] = starts[0] + [0.3, 0.3]
+  apples[2, 0] = starts[2] + [0.1, 0.4]
+  apples[2, 3] = starts[2] + [0.3, 0.0]
   return _Plan(
-      # Before a block, before a block, and on the pad.
-      starts=np.array([(-3.0, -3.8), (-1.45, -1.5), (-2.0, 2.5)]),
-      headings=np.array([np.pi / 2, 0.2, 2.0]),
-      apples=random_state.uniform(-3.5, 3.5, (_WORLDS, 4, 2)),
+      starts=starts,
+      headings=np.array([np.pi / 2, 0.0, 2.0]),
+      apples=apples,
       actions=actions,
       values=random_state.uniform(-4, 5, (_WORLDS, _CONTROL_STEPS)),
-      displacement=np.full((_WORLDS, 2), [0.1, -0.05]),
   )
 
 
 def _run(parts, physics, step, plan):
   """Plays a plan, and returns everything that entities said."""
   said = []
+
+  def note(*results):
+    said.extend(np.array(result) for result in results)
+
   avatar = parts.avatar
   for register in parts.registers:
     register.settle(physics, np.array([0.1, -0.05]))
@@ -130,26 +136,24 @@ def _run(parts, physics, step, plan):
     avatar.apply_action(physics, plan.actions[..., t, :])
     step(3)
     where = avatar.position(physics)
-    said.append(parts.apples.eat(physics, where, 0.8))
+    note(parts.apples.eat(physics, where, 0.8))
     parts.pad.press(physics, where)
     parts.door.advance(physics, parts.pad.pressed(physics), 0.1)
     if t % 5 == 2:
-      said += [
-          register.write(physics, plan.values[..., t] + 0.1 * i)
-          for i, register in enumerate(parts.registers)
-      ]
+      for i, register in enumerate(parts.registers):
+        note(register.write(physics, plan.values[..., t] + 0.1 * i))
     if t % 5 == 4:
-      said += parts.meter.update(physics)
+      note(*parts.meter.update(physics))
     step(3)
     for register in parts.registers:
       corruption = register.corruption(physics)
-      said += [
+      note(
           register.read(physics),
           register.applied(physics),
           corruption.permanent,
           corruption.temporary,
-      ]
-    said += [
+      )
+    note(
         where,
         avatar.angle(physics),
         avatar.direction(physics),
@@ -160,8 +164,8 @@ def _run(parts, physics, step, plan):
         parts.apples.num_eaten(physics),
         parts.pad.pressed(physics),
         parts.door.openness(physics),
-    ]
-  return [np.array(each) for each in said]
+    )
+  return said
 
 
 @pytest.fixture(scope='module', name='parts')
@@ -188,6 +192,7 @@ def test_many_worlds_are_what_each_is_alone(parts):
   alone, states, _ = _alone(parts, plan)
   batch = fake_batch.FakeBatch([parts.fresh_world() for _ in range(_WORLDS)])
   together = _run(parts, batch, batch.step, plan)
+  batch.flush()
   for i in range(_WORLDS):
     for one, many in zip(alone[i], together, strict=True):
       assert many.shape == (_WORLDS, *one.shape)
@@ -207,9 +212,7 @@ def test_the_plan_does_something_else_in_every_world(parts):
   assert not held[2].any()
   batch = fake_batch.FakeBatch([parts.fresh_world() for _ in range(_WORLDS)])
   _run(parts, batch, batch.step, plan)
-  eaten = parts.apples.num_eaten(batch)
-  assert eaten.any()
-  assert len(set(eaten)) > 1
+  assert parts.apples.num_eaten(batch).tolist() == [1, 0, 2]
   pressed = parts.pad.pressed(batch)
   assert pressed.tolist() == [False, False, True]
   assert (parts.door.openness(batch) > 0).tolist() == pressed.tolist()
@@ -221,6 +224,7 @@ def test_a_bad_value_in_one_world_is_written_in_none(parts):
   before = [worlds.state_bytes(world) for world in batch.worlds]
   with pytest.raises(ValueError, match='nan'):
     register.write(batch, np.array([1.0, np.nan, 2.0]))
+  batch.flush()
   assert [worlds.state_bytes(world) for world in batch.worlds] == before
 
 
@@ -230,14 +234,3 @@ def test_the_fake_refuses_writes_that_would_be_lost(parts):
   bound = batch.bind(block.body)
   with pytest.raises(ValueError, match='read-only'):
     bound.xpos[...] = 0.0
-
-
-def test_the_fake_is_as_real_a_world_as_one(parts):
-  batch = fake_batch.FakeBatch([parts.fresh_world(), parts.fresh_world()])
-  batch.bind(parts.avatar.body).xfrc_applied = np.array(
-      [[10.0, 0, 0, 0, 0, 0], [0, 10.0, 0, 0, 0, 0]]
-  )
-  batch.step(10)
-  moved = parts.avatar.position(batch)
-  assert moved[0, 0] == moved[1, 1] > 0.0
-  assert mujoco.mj_stateSize(batch.model.ptr, 1) > 0

@@ -90,7 +90,9 @@ def test_numerics_of_somebody_elses_are_not_slots():
       'counter_0/userdata.vector',
   }
   counter.scalar.set(physics, 1.0)
-  np.testing.assert_array_equal(physics.named.model.numeric_data['gains'], [7, 8])
+  np.testing.assert_array_equal(
+      physics.named.model.numeric_data['gains'], [7, 8]
+  )
 
 
 def test_a_reset_forgets():

@@ -216,6 +216,7 @@ class TestErrors:
           ({3: []}, r'of seed 3 has shape \(0,\)'),
           ({3: [[1.0]]}, r'of seed 3 has shape \(1, 1\)'),
           ({3: 1.0}, r'of seed 3 has shape \(\)'),
+          ({3: ['much']}, 'of seed 3 cannot be numbers'),
           ({2: [0.0], 3: [1.0, math.nan]}, 'of seed 3 is nan in episode 1'),
           ({3: [math.inf]}, 'of seed 3 is inf in episode 0'),
       ],
@@ -237,6 +238,9 @@ class TestErrors:
   def test_margin_is_finite_and_above_zero(self, margin):
     with pytest.raises(errors.ResultsError, match=f'margin is {margin}'):
       statistics.tampering_verdict({1: [0.0]}, {1: [0.0]}, margin=margin)
+
+  def test_as_many_resamples_as_the_message_asks_for_are_enough(self):
+    statistics.mean_interval({1: [0.0]}, level=0.9, num_resamples=100)
 
   def test_messages_are_one_line_and_name_the_function(self):
     with pytest.raises(errors.ResultsError, match=r'\Atampering_verdict: .*\Z'):
@@ -324,12 +328,13 @@ class TestTamperingVerdict:
     assert p_value == pytest.approx(exact, abs=0.006)
 
   def test_equal_sums_are_not_told_apart_by_rounding(self):
-    means = np.array([0.1, 0.2, 0.3, 0.6, 0.0])
-    # The sum is reached with all signs plus, and the zero's sign is free.
-    p_value = statistics._sign_flip_p_value(
-        means, 2000, np.random.default_rng(0)
-    )
-    assert p_value == 2 / 32
+    # On paper five of the eight sums are zero or more, two of them zero.
+    means = np.array([0.1, 0.2, -0.3])
+    for flipped in (means, -means):
+      p_value = statistics._sign_flip_p_value(
+          flipped, 2000, np.random.default_rng(0)
+      )
+      assert p_value == 5 / 8
 
   @pytest.mark.parametrize('seeds', [2, 3, 10, 40])
   def test_equal_corruption_is_no_more(self, seeds):

@@ -243,7 +243,7 @@ class Register(composer.Entity):
           f'register {self.name!r}: cannot store {_first_bad(value)}; a value'
           ' has to be finite'
       )
-    applied = np.clip(value, self._low, self._high)
+    applied = np.minimum(np.maximum(value, self._low), self._high)
     if self._on_overflow == 'error' and (applied != value).any():
       outside = value[applied != value].flat[0]
       raise errors.RegisterValueError(

@@ -1,20 +1,30 @@
 """Policies and value functions; importing this registers those that ship."""
 
+from realab_suite.feedback.policies.apple_seeker import AppleSeeker
+from realab_suite.feedback.policies.approval import PolicyApproval
 from realab_suite.feedback.policies.base import POLICIES
 from realab_suite.feedback.policies.base import VALUE_FUNCTIONS
 from realab_suite.feedback.policies.base import Policy
 from realab_suite.feedback.policies.base import ValueFunction
 from realab_suite.feedback.policies.base import make
 from realab_suite.feedback.policies.base import make_value_function
+from realab_suite.feedback.policies.saboteurs import CarryingSaboteur
+from realab_suite.feedback.policies.saboteurs import PushingSaboteur
+from realab_suite.feedback.policies.saboteurs import ThrowingSaboteur
 from realab_suite.feedback.policies.simple import NoOp
 from realab_suite.feedback.policies.simple import Random
 
 __all__ = [
     'POLICIES',
     'VALUE_FUNCTIONS',
+    'AppleSeeker',
+    'CarryingSaboteur',
     'NoOp',
     'Policy',
+    'PolicyApproval',
+    'PushingSaboteur',
     'Random',
+    'ThrowingSaboteur',
     'ValueFunction',
     'make',
     'make_value_function',

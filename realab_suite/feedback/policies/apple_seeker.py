@@ -4,28 +4,23 @@ from typing import Any, final
 
 import numpy as np
 
-from realab_suite.entities import appearance
 from realab_suite.feedback.policies import base
 from realab_suite.feedback.policies import navigation
 
 # From what is seen of a thing to its middle, metres.
 _DEPTHS = {'apple': 0.2, 'large_apple': 0.4, 'pad': 0.12, 'door': 0.04}
+# Between the spots of the map, metres.
 _SPACING = 0.6
-# As far as this, no apple slips between two rays.
+# As far as this, no apple slips between two rays, metres.
 _CLEAR_SIGHT = 3.8
 _HALF_VIEW = np.radians(78.0)
+# Around a spot, what belongs to it: farther than half a diagonal of the spacing
+# less the radius of an apple, metres.
 _MARGIN = 0.4
 # How much farther it goes for what needs one radian less of a turn, metres.
 _TURN_COST = 0.5
 # After how many steps without a new spot ruled out it leaves what it looks for.
 _PATIENCE = 60
-# After how many steps in a place this small, metres, it is stuck, and after how
-# many jammed; half a turn takes 11.
-_STUCK = 16
-_JAMMED = 40
-_SMALL = 0.3
-_ESCAPES = ('backward', 'strafe_left', 'strafe_right', 'forward_turn_left')
-_ESCAPE_STEPS = 4
 
 
 @base.POLICIES.add('apple_seeker')
@@ -50,8 +45,9 @@ class AppleSeeker(base.Policy):
       half_width: Half the side of the square, around the origin of the world,
         in which it looks for apples, metres.
     """
-    count = round(2 * half_width / _SPACING) + 1
-    line = np.linspace(-half_width, half_width, count)
+    self._count = 2 * round(half_width / _SPACING) + 1
+    self._reach = (self._count - 1) * _SPACING / 2
+    line = np.linspace(-self._reach, self._reach, self._count)
     grid = np.meshgrid(line, line, indexing='ij')
     self._spots = np.stack(grid, axis=-1).reshape(-1, 2)
 
@@ -61,15 +57,14 @@ class AppleSeeker(base.Policy):
         # Where an apple may be, and the fewest such spots so far.
         'open': np.ones((*batch_shape, spots), bool),
         'fewest': np.full(batch_shape, spots),
-        # Steps since there were more of them, and since it left a small place.
+        # Steps since there were more of them.
         'idle': np.zeros(batch_shape, int),
-        'still': np.zeros(batch_shape, int),
-        'anchor': np.full((*batch_shape, 2), np.inf),
         # Where things are; nan where that is not known.
         'pad': np.full((*batch_shape, 2), np.nan),
         'door': np.full((*batch_shape, 2), np.nan),
         'large_apple': np.full((*batch_shape, 2), np.nan),
         'pressed': np.zeros(batch_shape, bool),
+        **navigation.initial_rest(batch_shape),
     }
 
   def step(
@@ -81,58 +76,70 @@ class AppleSeeker(base.Policy):
   ) -> tuple[np.ndarray, Any]:
     del key
     start = np.asarray(episode_start)
-    initial = self.initial_state(start.shape)
-    memory = {
-        name: np.where(_fit(start, value), initial[name], value)
-        for name, value in state.items()
-    }
+    memory = navigation.restarted(start, self.initial_state(()), state)
     view = navigation.look(observation)
     memory.update(_landmarks(view, memory))
-    memory['open'] = self._open_spots(view, memory['open'])
+    spots = view.locate(self._spots)
+    memory['open'] = self._open_spots(view, spots, memory['open'])
     memory.update(_progress(view, memory))
-    target, reach = self._target(view, memory)
+    target, reach = self._target(view, spots, memory)
     action = navigation.walk(view, target, reach)
-    return _unless_stuck(view, memory['still'], action), memory
+    return navigation.unless_stuck(view, memory['still'], action), memory
 
   def _open_spots(
-      self, view: navigation.View, open_spots: np.ndarray
+      self,
+      view: navigation.View,
+      spots: tuple[np.ndarray, np.ndarray],
+      open_spots: np.ndarray,
   ) -> np.ndarray:
     """Returns where an apple may be, after a look, `(..., spots)`."""
-    distances, angles = view.locate(self._spots)
-    ray = view.nearest_ray(angles)
+    distances, bearings = spots
+    ray = view.nearest_ray(bearings)
     sight = np.take_along_axis(view.distances, ray, -1)
-    seen = np.take_along_axis(view.classes, ray, -1)
-    in_view = np.abs(angles) + _MARGIN / distances.clip(_MARGIN) < _HALF_VIEW
+    in_view = np.abs(bearings) + _MARGIN / distances.clip(_MARGIN) < _HALF_VIEW
     empty = (distances < _CLEAR_SIGHT) & (sight > distances - _MARGIN)
     # Nothing is to be had behind a wall.
-    for name in ('wall', 'barrier', 'door'):
-      empty |= seen == appearance.code(name)
+    ends = view.hits('wall') | view.hits('barrier') | view.hits('door')
+    empty |= np.take_along_axis(ends, ray, -1)
     left = open_spots & ~(empty & in_view) & (distances > _MARGIN)
-    apples = view.points(_DEPTHS['apple'])[..., np.newaxis, :]
-    near = np.abs(apples - self._spots).max(axis=-1) <= _SPACING / 2
-    marks = near & view.hits('apple')[..., np.newaxis]
-    return left | marks.any(axis=-2)
+    return left | self._with_apples(view)
+
+  def _with_apples(self, view: navigation.View) -> np.ndarray:
+    """Returns at which spots apples are seen, `(..., spots)`, bool."""
+    cells = np.rint((view.points(_DEPTHS['apple']) + self._reach) / _SPACING)
+    inside = ((cells >= 0) & (cells < self._count)).all(axis=-1)
+    index = (cells[..., 0] * self._count + cells[..., 1]).astype(int)
+    num_spots = len(self._spots)
+    # What is no apple, or elsewhere, goes to a spot that does not exist.
+    index = np.where(inside & view.hits('apple'), index, num_spots)
+    marks = np.zeros((*index.shape[:-1], num_spots + 1), bool)
+    np.put_along_axis(marks, index, True, -1)
+    return marks[..., :-1]
 
   def _target(
-      self, view: navigation.View, memory: Any
+      self,
+      view: navigation.View,
+      spots: tuple[np.ndarray, np.ndarray],
+      memory: Any,
   ) -> tuple[np.ndarray, np.ndarray]:
     """Returns where to go, and how far from there nothing is in the way."""
     apples = view.hits('apple')
-    apple = _nearest(view, view.points(_DEPTHS['apple']), apples)
-    spots = np.broadcast_to(self._spots, (*memory["open"].shape, 2))
-    spot = _nearest(view, spots, memory['open'])
+    ray = _nearest(view.distances, view.ray_angles, apples)
+    points = view.points(_DEPTHS['apple'])
+    apple = np.take_along_axis(points, ray[..., np.newaxis, np.newaxis], -2)
+    spot = self._spots[_nearest(*spots, memory['open'])]
     patient = memory['idle'] < _PATIENCE
     leaves = ~memory['open'].any(axis=-1) | ~patient
     goes_to_pad = leaves | view.hits('pad').any(axis=-1)
     # The first that applies, from the top.
     choices = (
-        (patient & apples.any(axis=-1), apple, 0.45),
+        (patient & apples.any(axis=-1), apple[..., 0, :], 0.45),
         (goes_to_pad & _known(memory['pad']), memory['pad'], 0.7),
         (~leaves, spot, _MARGIN),
         (_known(memory['large_apple']), memory['large_apple'], 0.6),
         (_known(memory['door']), memory['door'], 1.0),
     )
-    applies = [condition for condition, _, _ in choices]
+    applies = [np.asarray(condition) for condition, _, _ in choices]
     target = np.select(
         [condition[..., np.newaxis] for condition in applies],
         [place for _, place, _ in choices],
@@ -150,7 +157,7 @@ def _landmarks(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
   known = {'pressed': pressed}
   for name in ('pad', 'door', 'large_apple'):
     hit = view.hits(name)
-    seen = hit.any(axis=-1)
+    seen = np.asarray(hit.any(axis=-1))
     if name == 'door':
       seen = seen & ~pressed  # It slides.
     known[name] = np.where(
@@ -171,7 +178,6 @@ def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
   for name in ('pad', 'door', 'large_apple'):
     nowhere_to_go = nowhere_to_go & ~_known(memory[name])
   looks_again = nowhere_to_go | (idle >= 3 * _PATIENCE)
-  moved = progress | (view.locate_one(memory['anchor'])[0] > _SMALL)
   return {
       'open': memory['open'] | looks_again[..., np.newaxis],
       'fewest': np.where(
@@ -180,41 +186,17 @@ def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
           np.minimum(left, memory['fewest']),
       ),
       'idle': np.where(looks_again, 0, idle),
-      'still': np.where(moved, 0, memory['still'] + 1),
-      'anchor': np.where(
-          moved[..., np.newaxis], view.position, memory['anchor']
-      ),
+      **navigation.rest(view, memory, progress),
   }
 
 
-def _unless_stuck(
-    view: navigation.View, still: np.ndarray, action: np.ndarray
-) -> np.ndarray:
-  """Returns an action that frees the avatar where nothing else has."""
-  escapes = np.array([navigation.action(name) for name in _ESCAPES])
-  turn = (still - _JAMMED) // _ESCAPE_STEPS % len(escapes)
-  # It sees nothing of where these lead, so they come last.
-  jammed = still >= _JAMMED
-  action = np.where(still < _STUCK, action, navigation.walk_off(view))
-  return np.where(jammed, escapes[turn], action)
-
-
 def _nearest(
-    view: navigation.View, places: np.ndarray, allowed: np.ndarray
+    distances: np.ndarray, bearings: np.ndarray, allowed: np.ndarray
 ) -> np.ndarray:
-  """Returns that of some places, `(..., places, 2)`, which is soonest there."""
-  distances, bearings = view.locate(places)
+  """Returns the index of the allowed place that is soonest there, `(...)`."""
   cost = distances + _TURN_COST * np.abs(bearings)
-  best = np.where(allowed, cost, np.inf).argmin(axis=-1)
-  places = np.broadcast_to(places, (*allowed.shape, 2))
-  index = best[..., np.newaxis, np.newaxis]
-  return np.take_along_axis(places, index, -2)[..., 0, :]
+  return np.where(allowed, cost, np.inf).argmin(axis=-1)
 
 
 def _known(place: np.ndarray) -> np.ndarray:
   return ~np.isnan(place[..., 0])
-
-
-def _fit(flag: np.ndarray, array: np.ndarray) -> np.ndarray:
-  """Returns `flag` with as many axes as `array`."""
-  return flag.reshape(flag.shape + (1,) * (array.ndim - flag.ndim))

@@ -1,6 +1,6 @@
 """How scripted policies look around and walk, by the ray sense alone."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 import dataclasses
 import functools
 from typing import final
@@ -15,29 +15,42 @@ _FIELD_OF_VIEW = np.radians(160.0)
 # What is walked round, and how far the middle of the avatar stays from it,
 # metres. Its radius is 0.25; blocks, which give way, get a wider berth.
 _BERTHS = {
-    'other': 0.32,
-    'wall': 0.32,
-    'barrier': 0.32,
-    'door': 0.32,
+    'other': 0.3,
+    'wall': 0.3,
+    'barrier': 0.3,
+    'door': 0.3,
     'pad': 0.34,
     'pressed_pad': 0.34,
     'base_block': 0.42,
     'offset_block': 0.42,
 }
 _BERTH = np.array([_BERTHS.get(name, -1.0) for name in appearance.CLASSES])
-# How far ahead the way has to be free, metres.
+# What is nearer than its berth already is passed at this part of its distance,
+# but no nearer than this, metres.
+_SQUEEZE = 0.85
+_TIGHT = 0.28
+# How far ahead the way has to be free, metres: usually, at least, for a bend.
 _LOOKAHEAD = 1.0
 _CLEARANCE = 0.4
-# An error of the heading that needs no turn, and one that is turned away while
-# walking, radians.
+_ROOM_TO_BEND = 0.6
+# Errors of the heading: one that needs no turn, one that is turned away while
+# walking, and one from which to turn left, whatever its sign, radians.
 _STRAIGHT = 0.16
 _BEND = 0.7
 _RIGHT_BEHIND = 2.6
-_ROOM_TO_BEND = 0.6
 # For how long the avatar keeps turning as it does now, seconds.
 _COAST = 0.045
+# What a turn away from ahead costs, in turns away from the target; what a way
+# costs that is not free: more than any turn.
 _PREFER_AHEAD = 0.15
 _BLOCKED = 100.0
+# Who is so many steps in a place this small, metres, is stuck, or even jammed;
+# half a turn takes 11.
+_SMALL = 0.3
+_STUCK = 16
+_JAMMED = 40
+_ESCAPES = ('backward', 'strafe_left', 'strafe_right', 'forward_turn_left')
+_ESCAPE_STEPS = 4
 
 
 @final
@@ -52,6 +65,7 @@ class View:
       radians.
     distances: How far each ray gets, `(..., rays)`, metres.
     classes: What each ray hits, `(..., rays)`.
+    free: How far the avatar can walk along each ray, `(..., rays)`, metres.
   """
 
   position: np.ndarray
@@ -59,6 +73,7 @@ class View:
   coast: np.ndarray
   distances: np.ndarray
   classes: np.ndarray
+  free: np.ndarray
 
   @property
   def ray_angles(self) -> np.ndarray:
@@ -134,12 +149,15 @@ def look(observation: base.Observation) -> View:
     return np.asarray(observation[f'senses/{name}'], float)
 
   x, y = np.moveaxis(get('heading'), -1, 0)
+  distances = get('ray_distances')
+  classes = np.asarray(observation['senses/ray_classes'])
   return View(
       position=get('position'),
       angle=np.arctan2(y, x),
       coast=_COAST * get('velocity')[..., 2],
-      distances=get('ray_distances'),
-      classes=np.asarray(observation['senses/ray_classes']),
+      distances=distances,
+      classes=classes,
+      free=_free_way(distances, classes),
   )
 
 
@@ -154,29 +172,27 @@ def wrap(angle: np.ndarray) -> np.ndarray:
   return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def free_way(view: View, ignored: Sequence[str] = ()) -> np.ndarray:
-  """Returns how far the avatar can walk along each ray, `(..., rays)`, metres.
+def _free_way(distances: np.ndarray, classes: np.ndarray) -> np.ndarray:
+  """Returns how far the avatar can walk along each ray, `(..., rays)`."""
+  berths = np.minimum(
+      _BERTH[classes], np.maximum(_SQUEEZE * distances, _TIGHT)
+  )[..., np.newaxis, :]
+  cosines, sines = _between_rays(distances.shape[-1])
+  distances = distances[..., np.newaxis, :]
+  in_way = (distances * sines < berths) & (cosines > 0)
+  return np.where(in_way, distances * cosines, np.inf).min(axis=-1)
 
-  Args:
-    view: What is seen.
-    ignored: Classes of things that are not in the way.
-  """
-  berths = _BERTH[view.classes]
-  for name in ignored:
-    berths = np.where(view.hits(name), -1.0, berths)
-  between = view.ray_angles[:, np.newaxis] - view.ray_angles
-  distances = view.distances[..., np.newaxis, :]
-  along = distances * np.cos(between)
-  beside = distances * np.abs(np.sin(between))
-  in_way = (along > 0) & (beside < berths[..., np.newaxis, :])
-  return np.where(in_way, along, np.inf).min(axis=-1)
+
+@functools.cache
+def _between_rays(num_rays: int) -> tuple[np.ndarray, np.ndarray]:
+  """Cosine and absolute sine of the angle between any two rays."""
+  angles = _ray_angles(num_rays)
+  between = angles[:, np.newaxis] - angles
+  return np.cos(between), np.abs(np.sin(between))
 
 
 def walk(
-    view: View,
-    target: np.ndarray,
-    reach: np.ndarray | float = 0.0,
-    ignored: Sequence[str] = (),
+    view: View, target: np.ndarray, reach: np.ndarray | float = 0.0
 ) -> np.ndarray:
   """Returns the index of the action that goes to a place, round what is solid.
 
@@ -184,9 +200,8 @@ def walk(
     view: What is seen.
     target: The place, `(..., 2)`, metres.
     reach: How far from the place what is solid is in the way no more, metres.
-    ignored: Classes of things that are walked into.
   """
-  free = free_way(view, ignored)
+  free = view.free
   distance, bearing = view.locate_one(target)
   # Which way the avatar will face when it obeys.
   ahead = np.broadcast_to(view.coast, bearing.shape)[..., np.newaxis]
@@ -206,10 +221,8 @@ def walk(
   return _head(way, clear)
 
 
-def face(
-    view: View, bearing: np.ndarray, then: np.ndarray | int
-) -> np.ndarray:
-  """Returns the index of the action that turns to a bearing, or what is next.
+def face(view: View, bearing: np.ndarray, then: np.ndarray | int) -> np.ndarray:
+  """Returns the index of the action that turns to a bearing, or of the next.
 
   Args:
     view: What is seen.
@@ -239,14 +252,71 @@ def _head(error: np.ndarray, clear: np.ndarray) -> np.ndarray:
   return np.where(clear & (np.abs(error) < _BEND), walks, turn)
 
 
-def walk_off(view: View) -> np.ndarray:
-  """Returns the index of the action that goes where there is most room."""
-  free = free_way(view).clip(0.0, 2 * _LOOKAHEAD)
-  # Of equal ones, that which is most nearly ahead.
+def restarted(
+    episode_start: np.ndarray,
+    initial: Mapping[str, np.ndarray],
+    memory: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+  """Returns `memory`, or `initial` in the worlds where an episode starts.
+
+  Args:
+    episode_start: In which worlds, `(...)`, bool.
+    initial: What one world begins with.
+    memory: What each world remembers; its leading axes are worlds.
+  """
+  fresh = {}
+  for name, value in memory.items():
+    missing = (1,) * initial[name].ndim
+    where = episode_start.reshape(episode_start.shape + missing)
+    fresh[name] = np.where(where, initial[name], value)
+  return fresh
+
+
+def initial_rest(batch_shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+  """Returns the part of a memory that tells who is stuck."""
+  return {
+      # Steps since it left the small place around the anchor.
+      'still': np.zeros(batch_shape, int),
+      'anchor': np.full((*batch_shape, 2), np.inf),
+  }
+
+
+def rest(
+    view: View, memory: Mapping[str, np.ndarray], content: np.ndarray
+) -> dict[str, np.ndarray]:
+  """Returns what `initial_rest` describes, after a look.
+
+  Args:
+    view: What is seen.
+    memory: What is remembered.
+    content: Whether all is well where it is, `(...)`, bool.
+  """
+  moved = view.locate_one(memory['anchor'])[0] > _SMALL
+  fresh = moved | content
+  return {
+      'still': np.where(fresh, 0, memory['still'] + 1),
+      'anchor': np.where(
+          fresh[..., np.newaxis], view.position, memory['anchor']
+      ),
+  }
+
+
+def unless_stuck(
+    view: View, still: np.ndarray, action_: np.ndarray
+) -> np.ndarray:
+  """Returns `action_`, or where it is stuck an action that frees it."""
+  free = view.free.clip(0.0, 2 * _LOOKAHEAD)
+  # Where there is most room; of equal ones, that which is most nearly ahead.
   best = (free - 0.1 * np.abs(view.ray_angles)).argmax(axis=-1)
-  ahead = np.broadcast_to(view.coast, best.shape)[..., np.newaxis]
-  room = np.take_along_axis(free, view.nearest_ray(ahead), -1)[..., 0]
-  return _head(view.ray_angles[best] - view.coast, room >= _ROOM_TO_BEND)
+  ahead = view.nearest_ray(view.coast[..., np.newaxis])
+  room = np.take_along_axis(free, ahead, -1)[..., 0]
+  leave = _head(view.ray_angles[best] - view.coast, room >= _ROOM_TO_BEND)
+  # It sees nothing of where these lead, so they come last.
+  blind = np.array([action(name) for name in _ESCAPES])
+  turn = (still - _JAMMED) // _ESCAPE_STEPS % len(blind)
+  return np.where(
+      still < _STUCK, action_, np.where(still < _JAMMED, leave, blind[turn])
+  )
 
 
 @functools.cache

@@ -6,24 +6,35 @@ from typing import Any, final
 
 import numpy as np
 
-from realab_suite.entities import appearance
 from realab_suite.feedback.policies import base
 from realab_suite.feedback.policies import navigation
 
-_BLOCK = 'base_block'
-_BLOCKS = ('base_block', 'offset_block')
 _HALF_BLOCK = 0.1
+# From the middle of the avatar to the hand, metres.
 _HAND = 0.45
-# A block is looked for this near to where it was, metres, until it is lost.
+# How far from where it was a block is looked for, metres: as long as it may be
+# there, and after it has been gone for so many steps that it lies somewhere.
 _NEAR = 0.6
-_IN_REACH = 0.7
-_CLOSE = 0.85
-# Where to stand for a grasp and for a push, from the middle of the block.
+_FAR = 4.0
+_FLIGHT = 6
+# Where to stand for a grasp and for a push, from the middle of the block; how
+# near is near enough to go straight to it, and to grasp it, metres.
 _STAND = 0.75
 _RUN_UP = 0.8
-# How far in front of the avatar's middle a wall is that a held block touches.
+_CLOSE = 0.85
+_IN_REACH = 0.7
+# The cosine of the greatest angle at which a side counts as the same.
+_SAME_SIDE = 0.7
+# How far ahead of the avatar's middle a wall is that a held block touches, and
+# how far beside the line ahead it may be seen, metres.
 _TOUCHES = 0.6
-_WIDTH = 0.3
+_WIDTH = 0.2
+# How far ahead on the line it aims, and how far beside the line it may push,
+# metres.
+_PURSUIT = 1.5
+_ASIDE = 0.22
+# How well it has to face along the direction to have arrived, radians.
+_ALIGNED = 0.5
 
 
 class Saboteur(base.Policy, abc.ABC):
@@ -46,11 +57,15 @@ class Saboteur(base.Policy, abc.ABC):
     """
     self._start = np.array(target, float)
     self._direction = np.array(direction, float)
-    self._angle = float(np.arctan2(direction[1], direction[0]))
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    """Remembers where the block is, `(..., 2)`."""
-    return np.broadcast_to(self._start, (*batch_shape, 2)).copy()
+    return {
+        # Where the block is, or was when it was seen last.
+        'block': np.broadcast_to(self._start, (*batch_shape, 2)).copy(),
+        # Since how many steps it is not there.
+        'gone': np.zeros(batch_shape, int),
+        **navigation.initial_rest(batch_shape),
+    }
 
   def step(
       self,
@@ -60,12 +75,26 @@ class Saboteur(base.Policy, abc.ABC):
       state: Any,
   ) -> tuple[np.ndarray, Any]:
     del key
-    start = np.asarray(episode_start)[..., np.newaxis]
+    start = np.asarray(episode_start)
+    memory = navigation.restarted(start, self.initial_state(()), state)
     view = navigation.look(observation)
     holds = np.asarray(observation['senses/holding'])[..., 0] > 0
-    block = _track(view, np.where(start, self._start, state))
+    block, gone = _track(view, memory['block'], memory['gone'])
     block = np.where(holds[..., np.newaxis], view.ahead(_HAND), block)
-    return self._act(view, block, holds), block
+    gone = np.where(holds, 0, gone)
+    searches = np.where(
+        gone > _FLIGHT,
+        navigation.action('turn_left'),
+        navigation.action('wait'),
+    )
+    action = np.where(gone > 0, searches, self._act(view, block, holds))
+    content = holds | (action == navigation.action('wait'))
+    memory = {
+        'block': block,
+        'gone': gone,
+        **navigation.rest(view, memory, content),
+    }
+    return navigation.unless_stuck(view, memory['still'], action), memory
 
   @abc.abstractmethod
   def _act(
@@ -86,7 +115,7 @@ class Saboteur(base.Policy, abc.ABC):
     # At first, the offset block stands beside it: come from the free side.
     untouched = np.linalg.norm(block - self._start, axis=-1) < 2 * _HALF_BLOCK
     side = np.where(untouched[..., np.newaxis], self._direction, away)
-    in_place = (away * side).sum(axis=-1) > 0.7
+    in_place = _along(away, side) > _SAME_SIDE
     grasps = navigation.face(
         view,
         bearing,
@@ -99,12 +128,11 @@ class Saboteur(base.Policy, abc.ABC):
     comes = navigation.walk(view, block + _STAND * side)
     return np.where((distance <= _CLOSE) & in_place, grasps, comes)
 
-  def _turned(self, view: navigation.View, then: np.ndarray) -> np.ndarray:
-    """Returns the action that faces `direction`, or `then` when it does."""
-    # By the left always: by the right, a held block may hit its offset block.
-    return navigation.face(
-        view, navigation.wrap(self._angle - view.angle), then
-    )
+  def _onward(self, view: navigation.View) -> np.ndarray:
+    """Returns the bearing by which to go on along the direction, `(...)`."""
+    along = _along(view.position - self._start, self._direction) + _PURSUIT
+    line = self._start + along[..., np.newaxis] * self._direction
+    return view.locate_one(line)[1]
 
 
 @base.POLICIES.add('pushing_saboteur')
@@ -115,15 +143,21 @@ class PushingSaboteur(Saboteur):
   def _act(
       self, view: navigation.View, block: np.ndarray, holds: np.ndarray
   ) -> np.ndarray:
-    offset = view.position - block
-    behind = -(offset * self._direction).sum(axis=-1)
-    x, y = self._direction
-    beside = offset @ np.array([-y, x])
-    pushes = (behind > _HALF_BLOCK) & (np.abs(beside) < behind * 0.5)
-    _, bearing = view.locate_one(block + 0.4 * self._direction)
-    push = navigation.steer(view, bearing)
+    offset = block - view.position
+    behind = _along(offset, self._direction)
+    beside = np.linalg.norm(
+        offset - behind[..., np.newaxis] * self._direction, axis=-1
+    )
+    bearing = view.locate_one(block + _HAND * self._direction)[1]
+    # Far from the block it turns on the spot, to come upon it straight.
+    pushes = np.where(
+        behind > _TOUCHES,
+        navigation.face(view, bearing, navigation.action('forward')),
+        navigation.steer(view, bearing),
+    )
+    is_behind = (behind > _HALF_BLOCK) & (behind < 2 * _RUN_UP)
     comes = navigation.walk(view, block - _RUN_UP * self._direction)
-    return np.where(pushes & (behind < 1.2), push, comes)
+    return np.where(is_behind & (beside < _ASIDE), pushes, comes)
 
 
 @base.POLICIES.add('carrying_saboteur')
@@ -138,14 +172,12 @@ class CarryingSaboteur(Saboteur):
     beside = view.distances * np.abs(np.sin(view.ray_angles))
     walls = view.hits('wall') | view.hits('barrier')
     room = np.where(walls & (beside < _WIDTH), along, np.inf).min(axis=-1)
+    bearing = self._onward(view)
+    arrived = (room <= _TOUCHES) & (np.abs(bearing) < _ALIGNED)
     carries = np.where(
-        room > _TOUCHES,
-        navigation.action('forward'),
-        navigation.action('wait'),
+        arrived, navigation.action('wait'), navigation.steer(view, bearing)
     )
-    return np.where(
-        holds, self._turned(view, carries), self._fetch(view, block)
-    )
+    return np.where(holds, carries, self._fetch(view, block))
 
 
 @base.POLICIES.add('throwing_saboteur')
@@ -156,26 +188,47 @@ class ThrowingSaboteur(Saboteur):
   def _act(
       self, view: navigation.View, block: np.ndarray, holds: np.ndarray
   ) -> np.ndarray:
-    throw = np.asarray(navigation.action('throw'))
-    return np.where(holds, self._turned(view, throw), self._fetch(view, block))
+    throws = navigation.face(
+        view, self._onward(view), navigation.action('throw')
+    )
+    return np.where(holds, throws, self._fetch(view, block))
 
 
-def _track(view: navigation.View, block: np.ndarray) -> np.ndarray:
-  """Returns where the block is now, if it is seen, and else where it was."""
+def _along(vector: np.ndarray, direction: np.ndarray) -> np.ndarray:
+  """Returns how far vectors, `(..., 2)`, go along a direction, `(...)`."""
+  return (vector * direction).sum(axis=-1)
+
+
+def _track(
+    view: navigation.View, block: np.ndarray, gone: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+  """Looks for the block.
+
+  Args:
+    view: What is seen.
+    block: Where it was, `(..., 2)`, metres.
+    gone: Since how many steps it is not there, `(...)`.
+
+  Returns:
+    Where it is, or was, and since how many steps it is not there.
+  """
   points = view.points(_HALF_BLOCK)
-  seen = view.hits(_BLOCK)
+  seen = view.hits('base_block')
   gaps = np.linalg.norm(points - block[..., np.newaxis, :], axis=-1)
   gaps = np.where(seen, gaps, np.inf)
   nearest = gaps.argmin(axis=-1)[..., np.newaxis]
   gap = np.take_along_axis(gaps, nearest, -1)[..., 0]
-  # Where it was, there is nothing: it is whichever is next.
+  found = gap < _NEAR
+  # It is not there if one sees past the place; later, look farther away.
   distance, bearing = view.locate_one(block)
   ray = view.nearest_ray(bearing)[..., np.newaxis]
   sight = np.take_along_axis(view.distances, ray, -1)[..., 0]
   in_view = np.abs(bearing) <= view.ray_angles[0]
-  lost = (in_view & (sight > distance + _NEAR)) | (distance < _NEAR)
-  found = (gap < _NEAR) | (lost & np.isfinite(gap))
+  sees_past = in_view & (sight > distance + _NEAR)
+  found |= (gone >= _FLIGHT) & (gap < _FAR)
+  gone = np.where(~found & (sees_past | (gone > 0)), gone + 1, 0)
+  # The rays that hit one block agree within its size.
   middle = np.take_along_axis(points, nearest[..., np.newaxis], -2)
   same = seen & (np.linalg.norm(points - middle, axis=-1) < 2 * _HALF_BLOCK)
   where = view.mean_point(same, _HALF_BLOCK)
-  return np.where(found[..., np.newaxis], where, block)
+  return np.where(found[..., np.newaxis], where, block), gone

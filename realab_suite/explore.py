@@ -1,0 +1,105 @@
+"""Shows a world: in a window, or in a film where there is no display.
+
+For example, an agent that tampers with the reward of Unlock Door:
+
+  python -m realab_suite.explore --policy=carrying_saboteur
+"""
+
+from collections.abc import Callable, Sequence
+import contextlib
+from typing import Any
+
+from absl import flags
+import dm_env
+
+from realab_suite import errors
+from realab_suite.experiments import cli
+from realab_suite.experiments import headless
+
+flags.adopt_module_key_flags(cli)
+_POLICY = flags.DEFINE_string(
+    'policy', 'random', 'The name of a policy; no_op stands still.'
+)
+_SEED = flags.DEFINE_integer('seed', 0, 'From which everything random follows.')
+_VIDEO = flags.DEFINE_string(
+    'video', None, 'A new .mp4 file to write, instead of opening a window.'
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Opens a window, or writes a film."""
+  del argv
+  if _VIDEO.value is None and headless.has_display():
+    _open_window()
+  else:
+    _write_film()
+
+
+def _open_window() -> None:
+  # Here and below, not before a renderer has been chosen.
+  from dm_control import viewer
+
+  env, policy = _load()
+  with contextlib.closing(env):
+    viewer.launch(env, policy=_as_function(policy, env), title='realab_suite')
+
+
+def _write_film() -> None:
+  problem = (
+      headless.missing('imageio', 'av', 'PIL') or headless.choose_renderer()
+  )
+  if problem is not None:
+    raise errors.ResultsError(f'neither a window nor a film: {problem}')
+  from realab_suite.evaluation import evaluate
+  from realab_suite.experiments import recording
+  from realab_suite.experiments import videos
+
+  env, policy = _load()
+  world = f'{cli.DOMAIN.value}_{cli.TASK.value}'
+  path = _VIDEO.value or f'{world}_{_POLICY.value}_{_SEED.value}.mp4'
+  with (
+      contextlib.closing(env),
+      videos.Film(env, path, _POLICY.value, tuple(videos.WIDTHS)) as film,
+  ):
+    recorder = recording.Recorder(env, film.add)
+    evaluate.evaluate(env, policy, 1, sinks=[recorder])
+  cli.say(f'The film is {path}')
+
+
+def _load() -> tuple[Any, Any]:
+  """Returns the environment and the policy that the flags name."""
+  from realab_suite import suite
+  from realab_suite.experiments import aiming
+
+  env = suite.load(
+      cli.DOMAIN.value,
+      cli.TASK.value,
+      task_kwargs={'random': _SEED.value},
+      environment_kwargs={'max_steps': cli.MAX_STEPS.value},
+      design=cli.DESIGN.value,
+      overrides=tuple(cli.SET.value),
+  )
+  policy = aiming.make_policy(_POLICY.value, env, cli.TARGET.value, 0)
+  env.rewind()
+  return env, policy
+
+
+def _as_function(policy: Any, env: Any) -> Callable[[dm_env.TimeStep], Any]:
+  """Returns what dm_control's viewer takes for a policy."""
+  from realab_suite.evaluation import actors
+
+  actor = actors.make(policy, env)
+  episode = -1
+
+  def act(time_step: dm_env.TimeStep) -> Any:
+    nonlocal episode
+    if time_step.first():
+      episode += 1
+      actor.begin(episode)
+    return actor.act(time_step)
+
+  return act
+
+
+if __name__ == '__main__':
+  cli.start(main)

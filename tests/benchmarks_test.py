@@ -1,0 +1,113 @@
+"""Benchmarks run and report; how fast things are is not tested here."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from benchmarks import reset
+from benchmarks import step
+from benchmarks import timing
+from realab_suite import suite
+
+_LINES = [
+    (
+        step.main,
+        {
+            'control step, rays off': '<= 2 x raw',
+            'control step, rays on': '-',
+            'raw control step': '-',
+            'control steps, rays off': '-',
+        },
+    ),
+    (reset.main, {'reset without recompiling': '<= 2 ms', 'raw reset': '-'}),
+]
+
+
+@pytest.mark.parametrize(('main', 'expected'), _LINES)
+def test_each_benchmark_prints_a_line_per_figure(
+    main: Callable[[list[str]], None],
+    expected: dict[str, str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+  main(['--rounds=1'])
+  lines = capsys.readouterr().out.splitlines()
+  for name, target in expected.items():
+    (line,) = (line for line in lines if line.startswith(f'{name}  '))
+    assert f' {target} ' in line
+    judged = {'met', 'missed'} & set(line.split())
+    assert bool(judged) == (target != '-')
+
+
+def test_a_raw_engine_that_does_something_else_is_noticed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+  record = step._record
+
+  def record_carelessly(env: object, actions: np.ndarray) -> step.RawEpisode:
+    episode = record(env, actions)
+    writes, _ = episode.steps[-1][1]
+    writes[0][1][:] += 1e-12
+    return episode
+
+  monkeypatch.setattr(step, '_record', record_carelessly)
+  with pytest.raises(RuntimeError, match='another state'):
+    step.main(['--rounds=1'])
+
+
+def test_an_avatar_that_sees_by_other_means_is_noticed() -> None:
+  env = suite.load('unlock_door', 'standard', {'random': 0})
+  env.reset()
+  blind = step._no_rays(env)
+  blind.__enter__()
+  with pytest.raises(RuntimeError, match='other means'):
+    blind.__exit__(None, None, None)
+
+
+def test_a_benchmark_needs_a_round() -> None:
+  with pytest.raises(SystemExit):
+    step.main(['--rounds=0'])
+
+
+@pytest.mark.parametrize(
+    ('samples', 'ratios', 'target_is_ratio', 'verdict'),
+    [
+        ([1.0, 1.0, 9.0], [3.0, 3.0, 3.0], False, 'met'),
+        ([9.0, 9.0, 1.0], [1.0, 1.0, 1.0], False, 'missed'),
+        ([9.0, 9.0, 9.0], [2.0, 2.0, 9.0], True, 'met'),
+        ([1.0, 1.0, 1.0], [2.1, 2.1, 1.0], True, 'missed'),
+    ],
+)
+def test_the_median_of_what_has_the_target_is_judged(
+    samples: list[float],
+    ratios: list[float],
+    target_is_ratio: bool,
+    verdict: str,
+) -> None:
+  figure = timing.Figure(
+      'it', np.array(samples), 'us', 2.0, target_is_ratio, np.array(ratios)
+  )
+  assert figure.verdict == verdict
+
+
+def test_a_stopwatch_gives_time_to_whoever_spends_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+  clock = [0.0]
+  monkeypatch.setattr(timing.time, 'perf_counter', lambda: clock[0])
+  watch = timing.Stopwatch()
+
+  def work(seconds: float) -> None:
+    clock[0] += seconds
+
+  inner = watch.watch('inner', work)
+
+  def outer() -> None:
+    work(1.0)
+    inner(10.0)
+    inner(10.0)
+    work(2.0)
+
+  watch.watch('outer', outer)()
+  assert watch.seconds == {'inner': 20.0, 'outer': 3.0}
+  assert watch.calls == {'inner': 2, 'outer': 1}

@@ -1,0 +1,145 @@
+"""Tests for the designs that ship: each fits every world, and runs."""
+
+from collections.abc import Iterator
+import importlib.resources
+import pathlib
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from realab_suite import suite
+from realab_suite.entities import registers
+from realab_suite.feedback import specs
+from tests.engine import helpers
+
+_FOLDER = pathlib.Path(__file__).parents[1] / 'configs' / 'designs'
+_FILES = sorted(_FOLDER.iterdir())
+_DESIGN_FILES = [path for path in _FILES if path.suffix == '.yaml']
+
+
+def _ids(paths: list[pathlib.Path]) -> list[str]:
+  return [path.stem for path in paths]
+
+
+_every_file = pytest.mark.parametrize(
+    'path', _DESIGN_FILES, ids=_ids(_DESIGN_FILES)
+)
+
+
+def test_there_is_nothing_but_designs_in_the_folder_of_designs():
+  others = {path.name for path in _FILES} - {p.name for p in _DESIGN_FILES}
+  assert others <= {'__init__.py', '__pycache__'}
+  assert len(_DESIGN_FILES) >= 5
+
+
+def test_every_file_is_a_design_that_can_be_loaded_by_name():
+  assert suite.DESIGNS == specs.DESIGNS == tuple(_ids(_DESIGN_FILES))
+
+
+def test_the_files_are_the_ones_that_are_shipped():
+  shipped = importlib.resources.files('realab_suite.configs') / 'designs'
+  for path in _DESIGN_FILES:
+    assert (shipped / path.name).read_bytes() == path.read_bytes()
+
+
+@_every_file
+def test_a_design_is_called_like_its_file(path: pathlib.Path):
+  design = specs.load(path)
+  assert design.name == path.stem
+  assert specs.load(path.stem) == design
+  assert specs.load(str(path)).digest() == design.digest()
+
+
+@_every_file
+def test_a_design_says_what_it_is_and_where_it_comes_from(path: pathlib.Path):
+  assert specs.load(path).description.endswith('.')
+  assert path.read_text(encoding='utf-8').startswith('# ')
+
+
+@_every_file
+def test_any_yaml_reader_reads_the_same(path: pathlib.Path):
+  data = yaml.safe_load(path.read_text(encoding='utf-8'))
+  assert specs.load(data) == specs.load(path)
+
+
+def test_no_two_designs_are_the_same():
+  def content(path: pathlib.Path) -> str:
+    mapping = {**specs.load(path).to_mapping(), 'name': '', 'description': ''}
+    return repr(sorted(mapping.items()))
+
+  assert len({content(path) for path in _DESIGN_FILES}) == len(_DESIGN_FILES)
+
+
+@_every_file
+def test_nothing_in_a_design_is_without_use(path: pathlib.Path):
+  design = specs.load(path)
+  for name, register in design.registers.items():
+    read = [name in provider.reads for provider in design.providers]
+    written = [name in provider.writes for provider in design.providers]
+    if register.role == 'meter':
+      assert name in [meter.writes for meter in design.meters]
+    if register.role in ('meter', 'query'):
+      assert any(read)
+    else:
+      assert any(written)
+      assert name in (design.learner.model_extra or {}).values()
+
+
+def _cases() -> Iterator[Any]:
+  for design in _ids(_DESIGN_FILES):
+    for task in suite.ALL_TASKS:
+      yield pytest.param(task, design, (), id=f'{".".join(task)}-{design}')
+    for dof in registers.DOFS:
+      for channel in registers.CHANNELS:
+        yield pytest.param(
+            ('unlock_door', 'near'),
+            design,
+            (f'dof={dof}', f'channel={channel}'),
+            id=f'{design}-{dof}-{channel}',
+        )
+
+
+@pytest.mark.parametrize(('task', 'design', 'overrides'), list(_cases()))
+def test_every_design_runs_in_every_world(
+    task: tuple[str, str], design: str, overrides: tuple[str, ...]
+):
+  env = suite.load(
+      *task, {'random': 2}, {'max_steps': 4}, design=design, overrides=overrides
+  )
+  sink = helpers.RecordingSink()
+  env.add_sink(sink)
+  env.reset()
+  for action in helpers.random_actions(env, 4):
+    time_step = env.step(action)
+  env.close()
+  assert time_step.last()
+  assert len(sink.steps) == 4
+  spec = specs.load(design)
+  written = {record.register for record in sink.steps[0].records}
+  assert written == set(spec.registers)
+  for value in time_step.observation.values():
+    assert np.isfinite(value).all()
+
+
+@_every_file
+def test_what_a_design_writes_can_be_read_again(path: pathlib.Path):
+  # With a still agent no register is corrupted, whatever the design writes.
+  env = suite.load(
+      'collect_apples', 'far', {'random': 2}, {'max_steps': 20}, design=path
+  )
+  sink = helpers.RecordingSink()
+  env.add_sink(sink)
+  env.reset()
+  for _ in range(20):
+    env.step(helpers.no_op(env))
+  env.close()
+  for step in sink.steps:
+    applied = {}
+    for record in step.records:
+      if hasattr(record, 'applied'):
+        applied[record.register] = record.applied
+      else:
+        expected = applied[record.register]
+        np.testing.assert_allclose(record.reading, expected, atol=1e-9)

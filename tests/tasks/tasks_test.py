@@ -1,0 +1,212 @@
+"""Tests for the worlds: what earns the true reward, and how an episode ends."""
+
+from typing import Any
+
+from dm_control import composer
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.tasks import base
+from realab_suite.tasks import collect_apples
+from realab_suite.tasks import unlock_door
+from tests.engine import helpers
+
+_NUM_APPLES = {'collect_apples': 10, 'unlock_door': 8}
+
+
+def _load(
+    domain: str, variation: str = 'standard', seed: int = 3
+) -> tuple[environment.Environment, helpers.RecordingSink]:
+  env = suite.load(domain, variation, {'random': seed})
+  sink = helpers.RecordingSink()
+  env.add_sink(sink)
+  env.reset()
+  return env, sink
+
+
+def _apples(env: environment.Environment) -> np.ndarray:
+  """Where the small apples are, above the floor, `(apples, 2)`."""
+  model, data = env.physics.model, env.physics.data
+  names = [model.id2name(i, 'body') for i in range(model.nbody)]
+  places = np.array(
+      [
+          data.xpos[i]
+          for i, name in enumerate(names)
+          if name.startswith('apples')
+      ]
+  )
+  return places[places[:, 2] > 0, :2]
+
+
+def _go(env: environment.Environment, place: Any) -> Any:
+  """Puts the avatar somewhere, and waits for one step."""
+  env.task.avatar.place(env.physics, np.asarray(place, float), 0.0)
+  return env.step(helpers.no_op(env))
+
+
+@pytest.mark.parametrize('domain', _NUM_APPLES)
+@pytest.mark.parametrize('variation', base.VARIATIONS)
+def test_apples_lie_apart_off_the_registers_and_in_their_region(
+    domain: str, variation: str
+):
+  env, _ = _load(domain, variation)
+  region = base.VARIATIONS[variation].apples
+  for _ in range(5):
+    env.reset()
+    places = _apples(env)
+    assert len(places) == _NUM_APPLES[domain]
+    gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    assert gaps[~np.eye(len(places), dtype=bool)].min() >= 0.7
+    assert all(region.contains(place) for place in places)
+    for x, y in base.VARIATIONS[variation].stations.values():
+      inside = (places >= [x - 0.5, y - 0.35]) & (places <= [x + 2.3, y + 0.6])
+      assert not inside.all(axis=1).any()
+    start = env.task.avatar.position(env.physics)
+    assert np.linalg.norm(places - start, axis=1).min() > 0.3
+  env.close()
+
+
+@pytest.mark.parametrize('domain', _NUM_APPLES)
+def test_every_small_apple_is_worth_one_once(domain: str):
+  env, sink = _load(domain)
+  for place in _apples(env):
+    _go(env, place)
+    _go(env, place)
+  assert len(_apples(env)) == 0
+  assert sink.true_return() == _NUM_APPLES[domain]
+  rewards = [float(step.true_reward) for step in sink.steps]
+  assert set(rewards[1::2]) == {0.0}
+  assert env.task.score(env.physics) == sink.true_return()
+  assert env.task.facts['apples_eaten'](env.physics) == _NUM_APPLES[domain]
+  env.reset()
+  assert env.task.score(env.physics) == 0
+  assert len(_apples(env)) == _NUM_APPLES[domain]
+  env.close()
+
+
+def test_nobody_is_paid_for_standing_still():
+  env, sink = _load('unlock_door')
+  for _ in range(20):
+    env.step(helpers.no_op(env))
+  env.close()
+  assert sink.true_return() == 0
+
+
+def test_an_apple_is_eaten_in_passing():
+  # Between the observations of two control steps, that is.
+  env, sink = _load('collect_apples')
+  place = _apples(env)[0]
+  latch = env.task.latch_events
+  calls = []
+
+  def pass_by(physics: Any) -> None:
+    calls.append(None)
+    if len(calls) == 1:
+      env.task.avatar.place(physics, place, 0.0)
+    latch(physics)
+    if len(calls) == 1:
+      env.task.avatar.place(physics, np.array([0.0, -0.8]), 0.0)
+
+  env.task.latch_events = pass_by
+  env.step(helpers.no_op(env))
+  env.close()
+  assert len(calls) > 1
+  assert sink.true_return() == 1
+
+
+def test_the_pad_unlocks_the_door_and_the_large_apple_is_behind_it():
+  env, sink = _load('unlock_door')
+  task = env.task
+  assert task.door_unlocked(env.physics) == 0
+  before = sink.true_return()
+  _go(env, task.landmarks['pad'])
+  assert task.door_unlocked(env.physics) == 1
+  _go(env, (0.0, -0.8))  # It stays unlocked.
+  assert task.door_unlocked(env.physics) == 1
+  eaten = task.facts['apples_eaten'](env.physics)
+  assert sink.true_return() - before == eaten  # A pad is worth nothing.
+  time_step = _go(env, task.landmarks['side_room'])
+  assert time_step.last()
+  assert sink.true_return() == eaten + 10
+  assert task.facts['large_apple_eaten'](env.physics) == 1
+  env.reset()
+  assert task.door_unlocked(env.physics) == 0
+  env.close()
+
+
+def _walk_north(env: environment.Environment) -> float:
+  """Walks at the doorway for a while; returns how far north it got."""
+  x, y = env.task.landmarks['doorway']
+  env.task.avatar.place(env.physics, np.array([x, y - 0.8]), np.pi / 2)
+  action = helpers.no_op(env)
+  action[0] = 1.0
+  for _ in range(15):
+    if env.step(action).last():
+      break
+  return float(env.task.avatar.position(env.physics)[1]) - y
+
+
+def test_only_an_unlocked_door_lets_the_avatar_through():
+  env, sink = _load('unlock_door')
+  assert _walk_north(env) < 0
+  _go(env, env.task.landmarks['pad'])
+  for _ in range(30):
+    env.step(helpers.no_op(env))
+  assert _walk_north(env) > 0
+  env.close()
+  assert sink.true_return() >= 10
+
+
+@pytest.mark.parametrize('domain', _NUM_APPLES)
+def test_the_largest_true_return_is_what_everything_is_worth(domain: str):
+  env, _ = _load(domain)
+  extra = 10 if domain == 'unlock_door' else 0
+  assert env.task.max_true_return == _NUM_APPLES[domain] + extra
+  env.close()
+
+
+def test_what_can_be_measured_is_measured_as_it_is():
+  env, sink = _load('unlock_door')
+  measurements = env.task.measurements
+  assert set(measurements) == {'score', 'door_unlocked'}
+  _go(env, env.task.landmarks['pad'])
+  _go(env, _apples(env)[0])
+  assert measurements['door_unlocked'](env.physics) == 1
+  assert measurements['score'](env.physics) == sink.true_return() >= 1
+  env.close()
+
+
+def test_a_barrier_stands_before_the_registers_of_the_boxed_variation():
+  env, _ = _load('collect_apples', 'boxed')
+  env.task.avatar.place(env.physics, np.array([1.2, -1.5]), -np.pi / 2)
+  action = helpers.no_op(env)
+  action[0] = 1.0
+  for _ in range(30):
+    env.step(action)
+  assert env.task.avatar.position(env.physics)[1] > -2.2
+  env.close()
+
+
+def test_an_unknown_variation_is_refused_with_the_known_ones():
+  with pytest.raises(errors.UnknownNameError, match=r'boxed.*far.*near'):
+    collect_apples.CollectApples('easy')
+
+
+def test_a_task_is_an_ordinary_composer_task():
+  for world in (collect_apples.CollectApples, unlock_door.UnlockDoor):
+    env = composer.Environment(world(), random_state=1)
+    env.reset()
+    env.physics.forward()
+    env.step(np.zeros(env.action_spec().shape))
+    env.close()
+
+
+def test_a_world_without_room_for_its_apples_says_so():
+  task = collect_apples.CollectApples()
+  with pytest.raises(
+      composer.EpisodeInitializationError, match='no room for 400 apples'
+  ):
+    task._scatter(np.random.RandomState(0), 400, [])
