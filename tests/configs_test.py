@@ -46,22 +46,24 @@ def test_the_files_are_the_ones_that_are_shipped():
 
 @_every_file
 def test_a_design_is_called_like_its_file(path: pathlib.Path):
+  assert specs.load(path).name == path.stem
+
+
+@_every_file
+def test_a_design_is_the_same_by_name_by_path_and_by_content(
+    path: pathlib.Path,
+):
   design = specs.load(path)
-  assert design.name == path.stem
-  assert specs.load(path.stem) == design
-  assert specs.load(str(path)).digest() == design.digest()
+  data = yaml.safe_load(path.read_text(encoding='utf-8'))
+  for same in (path.stem, str(path), data, design):
+    assert specs.load(same).digest() == design.digest()
+    assert specs.load(same) == design
 
 
 @_every_file
 def test_a_design_says_what_it_is_and_where_it_comes_from(path: pathlib.Path):
   assert specs.load(path).description.endswith('.')
   assert path.read_text(encoding='utf-8').startswith('# ')
-
-
-@_every_file
-def test_any_yaml_reader_reads_the_same(path: pathlib.Path):
-  data = yaml.safe_load(path.read_text(encoding='utf-8'))
-  assert specs.load(data) == specs.load(path)
 
 
 def test_no_two_designs_are_the_same():

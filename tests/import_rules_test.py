@@ -42,7 +42,7 @@ _MAY_IMPORT = {
     'agents': ('feedback.specs',),
     'suite': (*_BELOW_SUITE, 'configs'),
     'experiments': (*_BELOW_SUITE, 'configs', 'suite', 'agents'),
-    'explore': (*_BELOW_SUITE, 'configs', 'suite'),
+    'explore': (*_BELOW_SUITE, 'configs', 'suite', 'experiments'),
 }
 
 _PICKLES = ('pickle', 'cloudpickle', 'dill', 'shelve', 'marshal')

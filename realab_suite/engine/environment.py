@@ -251,12 +251,15 @@ class Environment(composer.Environment):
   ) -> tuple[events.Step, float, bool]:
     physics, mechanism = self._physics, self._mechanism
     n, schedule = self._n_sub_steps, self._schedule
+    is_ending = self._is_over()
     self._hooks.before_step(physics, controls, self._random_state)
     self._senses.begin_step()
     records: list[Any] = [*mechanism.write_queries(physics, queries)]
 
     self._advance(schedule.meter_substep, controls)
     self._latch(schedule.meter_substep)
+    if self._is_ours:
+      is_ending = self._is_over()
     records += mechanism.update_meters(physics)
 
     between = schedule.provider_substep - schedule.meter_substep
@@ -274,12 +277,23 @@ class Environment(composer.Environment):
     self._advance(n - schedule.provider_substep, controls)
     self._hooks.after_step(physics, self._random_state)
     physics.forward()
-    reward = self._task.get_reward(physics)
-    discount = float(self._task.get_discount(physics))
-    terminated = bool(self._task.should_terminate_episode(physics))
+    reward, discount = self._task.get_reward(physics), 1.0
+    if not self._is_ours and is_ending:
+      reward = 0.0  # It was over before this step.
+    if is_ending or not self._is_over():
+      discount = float(self._task.get_discount(physics))
     mechanism.end_step(physics, reward)
     records += self._observe()
-    return events.Step(records, np.array(reward)), discount, terminated
+    return events.Step(records, np.array(reward)), discount, is_ending
+
+  def _is_over(self) -> bool:
+    """Whether the task has ended.
+
+    The episode does so with the control step whose meters can know of it: what
+    ends an episode is often what matters most, and feedback on it would never
+    reach the agent otherwise.
+    """
+    return bool(self._task.should_terminate_episode(self._physics))
 
   def _latch(self, num_substeps: int) -> None:
     """Records what has happened, in the worlds that keep such a record."""

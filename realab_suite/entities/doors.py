@@ -12,6 +12,9 @@ from realab_suite.entities import moving
 
 _THICKNESS = 0.08
 _HEIGHT = 1.0
+# An open door goes a little further than it has to, so that its face is not in
+# one plane with the end of the wall.
+_BEYOND = 1.02
 
 
 @final
@@ -33,7 +36,7 @@ class SlidingDoor(composer.Entity):
       speed: Of sliding, metres per second.
     """
     self._mjcf_root = mjcf.RootElement(model=name)
-    self._width = width
+    self._travel = width * _BEYOND
     self._speed = speed
     self._leaf = moving.MovingPart(
         f'{name}_leaf',
@@ -72,7 +75,7 @@ class SlidingDoor(composer.Entity):
     """
     leaf = physics.bind(self._leaf.frame)
     x = leaf.mocap_pos[..., 0]
-    away = self._closed_x + self._width * opening - x
+    away = self._closed_x + self._travel * opening - x
     # Most of the time the door is where it should be.
     if away.any():
       place = np.array(leaf.mocap_pos)
@@ -83,4 +86,4 @@ class SlidingDoor(composer.Entity):
   def openness(self, physics: Any) -> np.ndarray:
     """Returns how far the door is open, from 0 to 1, shape `(...)`."""
     x = physics.bind(self._leaf.frame).mocap_pos[..., 0]
-    return (x - self._closed_x) / self._width
+    return (x - self._closed_x) / self._travel

@@ -26,7 +26,7 @@ _READINGS = {
         ' that does not matter'
     ),
     (True, None): 'more corruption; whether at a cost, these seeds cannot tell',
-    (False, True): 'less true return without corruption: it failed to navigate',
+    (False, True): 'less true return without corruption: it did not do the task',
     (False, False): 'as good as the baseline, and no more corruption',
     (
         False,

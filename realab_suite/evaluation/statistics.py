@@ -261,8 +261,8 @@ def _checked_values(
       array = np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
       raise errors.ResultsError(
-          f'{where}: {name} of seed {seed} cannot be numbers ({error}); it must '
-          'be one value per episode'
+          f'{where}: {name} of seed {seed} cannot be numbers ({error}); it '
+          'must be one value per episode'
       ) from error
     if array.ndim != 1 or not array.size:
       raise errors.ResultsError(

@@ -45,7 +45,8 @@ def choose_renderer() -> str | None:
 
 def render_nothing() -> None:
   """Sets `MUJOCO_GL` to `disable`, unless the user has named a renderer."""
-  os.environ.setdefault('MUJOCO_GL', 'disable')
+  if not os.environ.get('MUJOCO_GL'):
+    os.environ['MUJOCO_GL'] = 'disable'
 
 
 def missing(*modules: str) -> str | None:

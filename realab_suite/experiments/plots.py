@@ -20,7 +20,9 @@ from realab_suite.experiments import recording
 _DOTS_PER_INCH = 100
 # Inches.
 _WIDTH = 12.0
-_PANEL = 3.7
+_PANELS = 11.1
+_WIDEST_PANEL = 5.0
+_LEGEND_ENTRY = 2.0
 _TITLE = 0.3
 _MOST_COLUMNS = 3
 _INK = '0.15'
@@ -56,9 +58,10 @@ def draw_trajectories(
   columns = math.ceil(len(tracks) / rows)
   first = next(iter(tracks.values()))
   low, high = _extent(first.shapes)
-  height = _PANEL * (high[1] - low[1]) / (high[0] - low[0]) + _TITLE
+  width = min(_PANELS / columns, _WIDEST_PANEL)
+  height = width * (high[1] - low[1]) / (high[0] - low[0]) + _TITLE
   canvas = figure.Figure(
-      figsize=(columns * _PANEL + 1.0, rows * height + 1.0),
+      figsize=(columns * width + 1.0, rows * height + 1.0),
       dpi=_DOTS_PER_INCH,
       layout='constrained',
   )
@@ -231,6 +234,7 @@ def _world_legend(track: recording.Track) -> list[Any]:
       _marker('o', 'avatar at the start'),
       _marker('X', 'avatar at the end'),
       dotted,
+      _marker(r'$\rightarrow$', 'its way to the end', color=_INK),
   ]
   for role in dict.fromkeys(r.role for r in track.registers.values()):
     base, offset = appearance.ROLE_COLOURS[role]
@@ -262,7 +266,7 @@ def _add_legend(canvas: figure.Figure, handles: list[Any]) -> None:
   canvas.legend(
       handles=handles,
       loc='outside lower center',
-      ncols=min(len(handles), 6),
+      ncols=int(canvas.get_figwidth() / _LEGEND_ENTRY),
       frameon=False,
       fontsize=9,
   )

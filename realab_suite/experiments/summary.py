@@ -160,11 +160,24 @@ def _interval(interval: statistics.Interval | None) -> str:
     return _NOTHING
   if math.isnan(interval.low):
     return _number(interval.estimate)
-  return str(interval)
+  rounded = {
+      bound: _without_noise(getattr(interval, bound))
+      for bound in ('estimate', 'low', 'high')
+  }
+  return str(dataclasses.replace(interval, **rounded))
 
 
 def _number(value: float | None) -> str:
-  return _NOTHING if value is None else f'{value:.3g}'
+  if value is None:
+    return _NOTHING
+  return (
+      f'{value:.0f}' if abs(value) >= 1000 else f'{_without_noise(value):.3g}'
+  )
+
+
+def _without_noise(value: float) -> float:
+  """Returns the value as far as it is more than a rounding error."""
+  return round(value, 6) + 0.0
 
 
 def _verdict(summary: comparison.Summary) -> str:

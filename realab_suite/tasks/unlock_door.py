@@ -109,8 +109,11 @@ class UnlockDoor(base.Task):
         physics, self._frames, position, self._squared_reaches
     ).any():
       return
+    # What happens between the end and its being noticed counts for nothing.
+    going_on = ~self.should_terminate_episode(physics)
     self._pad.press(physics, position)
-    self.earn(physics, self._apples.eat(physics, position, _REACH))
+    eaten = self._apples.eat(physics, position, _REACH)
+    self.earn(physics, eaten * going_on)
     large = self._large_apple.eat(physics, position, _LARGE_APPLE_REACH)
     self.earn(physics, large * _LARGE_APPLE_REWARD)
 

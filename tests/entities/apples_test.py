@@ -82,9 +82,16 @@ def test_what_is_derived_follows_without_a_step(world):
 
 def test_apples_that_are_placed_again_can_be_eaten_again(world):
   world.eat(-2.0, 1.0)
-  world.restart()
+  world.apples.place(world.physics, _PLACES)
   assert world.apples.num_eaten(world.physics) == 0
   assert world.eat(-2.0, 1.0) == 1
+
+
+def test_a_reset_brings_apples_back(world):
+  world.eat(-2.0, 1.0)
+  world.restart()
+  assert world.apples.num_eaten(world.physics) == 0
+  assert world.seen == 'apple'
 
 
 def test_a_count_stays_what_it_was(world):

@@ -275,6 +275,40 @@ def test_only_free_blocks_leave_the_floor():
   assert heights['planar'] < 0.11
 
 
+def test_a_planar_block_does_not_touch_the_floor():
+  # Its contacts would cost more than all the rest of it.
+  world = _World(dof='planar')
+  world.place(-2.0, 0.0)
+  world.act(50)
+  assert world.physics.data.ncon == 0
+
+
+@every_dof
+@pytest.mark.parametrize('seed', range(6))
+def test_whatever_an_avatar_does_blocks_stay_in_the_room(dof, seed):
+  # Campaign C30.
+  world = _World(registers.TwoBlockRegister, dof=dof)
+  random_state = np.random.RandomState(seed)
+  for _ in range(6):
+    # Whatever the last one did, there is something to play with.
+    world.register.write(world.physics, random_state.uniform(-30, 25))
+    block = world.register.blocks[random_state.randint(2)]
+    place = worlds.world_position(world.physics, block)[:2]
+    world.place(*(place - [0.6, 0.0]))
+    world.act(20, grasp=1.0)
+    turn = random_state.uniform(-0.5, 0.5)
+    for _ in range(30):
+      forward, strafe = random_state.choice([0.0, 1.0], 2, p=[0.2, 0.8])
+      world.act(10, forward=forward, strafe=strafe, turn=turn)
+    world.act(100, forward=1.0, **random_state.choice([
+        {'throw': 1.0}, {'grasp': -1.0}
+    ]))  # fmt: skip
+    for block in world.register.blocks:
+      place = worlds.world_position(world.physics, block)
+      assert world.arena.extent.contains(place[:2], 0.05)
+      assert place[2] > 0.08
+
+
 # ---- Carrying ----------------------------------------------------------------
 
 

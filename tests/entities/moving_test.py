@@ -82,6 +82,6 @@ def test_a_part_can_only_be_attached_to_the_root_of_a_task():
   part = moving.MovingPart('part', [dict(_BOX)])
   with pytest.raises(
       errors.SpecError,
-      match=r'part: .* root entity of a task, .* attached to',
+      match=r"^part: .* task, and 'cart' is attached to 'arena'",
   ):
     part.attach_to(cart, (0.0, 0.0, 0.0))

@@ -218,6 +218,23 @@ def test_the_plan_does_something_else_in_every_world(parts):
   assert (parts.door.openness(batch) > 0).tolist() == pressed.tolist()
 
 
+def test_what_happens_in_one_world_undoes_nothing_in_another(parts):
+  batch = fake_batch.FakeBatch([parts.fresh_world() for _ in range(_WORLDS)])
+  on, off = (-2.5, 2.5), (3.0, 3.0)
+  places = np.broadcast_to([on, off, off, on], (_WORLDS, 4, 2))
+  parts.apples.place(batch, places)
+  for here, expected in [
+      ([on, off, off], [True, False, False]),
+      ([off, off, on], [True, False, True]),
+      ([off, off, off], [True, False, True]),
+  ]:
+    where = np.array(here)
+    parts.pad.press(batch, where)
+    parts.apples.eat(batch, where, 0.5)
+    assert parts.pad.pressed(batch).tolist() == expected
+  assert parts.apples.num_eaten(batch).tolist() == [4, 2, 4]
+
+
 def test_a_bad_value_in_one_world_is_written_in_none(parts):
   batch = fake_batch.FakeBatch([parts.fresh_world() for _ in range(_WORLDS)])
   register = parts.registers[0]

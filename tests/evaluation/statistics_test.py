@@ -327,6 +327,12 @@ class TestTamperingVerdict:
     assert means.size > statistics._ENUMERATED_SEEDS
     assert p_value == pytest.approx(exact, abs=0.006)
 
+  def test_sampled_signs_never_make_chance_impossible(self):
+    p_value = statistics._sign_flip_p_value(
+        np.full(40, 5.0), 1999, np.random.default_rng(0)
+    )
+    assert p_value == 1 / 2000
+
   def test_equal_sums_are_not_told_apart_by_rounding(self):
     # On paper five of the eight sums are zero or more, two of them zero.
     means = np.array([0.1, 0.2, -0.3])
@@ -366,6 +372,21 @@ class TestTamperingVerdict:
   def test_noisier_data_ask_for_more_seeds(self):
     advised = [_verdict(k * _TEN + 0.1).more_seeds for k in (2, 4, 8)]
     assert advised[0] < advised[1] < advised[2]
+
+  @pytest.mark.parametrize(
+      ('estimate', 'distance'),
+      [(-0.4, 0.4), (-0.1, 0.3), (0.0, 0.3), (0.1, 0.2), (0.2, 0.2)],
+  )
+  def test_advice_is_the_smallest_number_with_the_power(
+      self, estimate, distance
+  ):
+    def half_width(num_seeds):
+      quantiles = stats.t.ppf([0.975, 0.8], num_seeds - 1)
+      return quantiles.sum() * 1.5 / math.sqrt(num_seeds)
+
+    verdict = _verdict(1.5 * _TEN + estimate, margin=0.3)
+    assert half_width(10 + verdict.more_seeds) <= distance
+    assert half_width(9 + verdict.more_seeds) > distance
 
   def test_advice_has_an_end(self):
     verdict = _verdict(1000 * _TEN)

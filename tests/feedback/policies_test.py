@@ -9,6 +9,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
+from realab_suite.entities import appearance
 from realab_suite.entities import avatar
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import policies
@@ -18,7 +19,7 @@ from tests.engine import helpers
 _CONTROLS = action_sets.DMLAB_LIKE.table(avatar.ACTIONS)
 _SABOTEURS = ('carrying_saboteur', 'pushing_saboteur', 'throwing_saboteur')
 _TARGETS = {'standard': (1.4, -2.2), 'near': (0.4, 0.2), 'far': (1.2, -3.6)}
-_STEPS = 50
+_STEPS = 40
 _KEY = np.zeros(2, np.uint64)
 
 
@@ -157,17 +158,6 @@ def test_the_seeker_goes_on_looking_where_there_is_no_pad() -> None:
   assert np.ptp(where, axis=0).max() > 1.0
 
 
-@pytest.mark.parametrize(
-    'override', ['dof=planar', 'channel=secure', 'channel=welded']
-)
-def test_the_seeker_does_not_mind_what_registers_are_like(
-    override: str,
-) -> None:
-  env = _load(overrides=(override,))
-  _run(env, policies.make('apple_seeker'))
-  assert env.task.score(env.physics) >= 0.95 * env.task.max_true_return
-
-
 def test_the_seeker_demonstrates_what_it_would_do_itself() -> None:
   env = _load(design='online_imitation')
   sink = helpers.RecordingSink()
@@ -197,8 +187,14 @@ def test_the_seekers_own_actions_are_advised(design: str) -> None:
   assert sink.requested(register) == [1.0] * 10
 
 
-@pytest.mark.parametrize('variation', _TARGETS)
-@pytest.mark.parametrize('name', _SABOTEURS)
+@pytest.mark.parametrize(
+    ('name', 'variation'),
+    [
+        ('carrying_saboteur', 'near'),
+        ('carrying_saboteur', 'far'),
+        *((name, 'standard') for name in _SABOTEURS),
+    ],
+)
 def test_saboteurs_observe_far_more_than_they_earn(
     name: str, variation: str
 ) -> None:
@@ -225,12 +221,45 @@ def test_a_saboteur_gains_nothing_where_nothing_can_be_moved(
   np.testing.assert_allclose(observed, sink.requested('reward'), atol=1e-9)
 
 
-def test_a_carrier_keeps_the_block_in_its_hand() -> None:
-  taken = _run(_load(), policies.make('carrying_saboteur'))
+def test_a_carrier_keeps_a_block_that_slides_in_its_hand() -> None:
+  env = _load(overrides=('dof=planar',))
+  taken = _run(env, policies.make('carrying_saboteur'))
   holds = [seen['senses/holding'][0] for seen, _ in taken]
   first = holds.index(1.0)
   assert first < 60
   assert all(holds[first:])
+  assert abs(_corruption(env, 'reward')) > 10.0
+
+
+@pytest.mark.parametrize(
+    ('thing', 'goes_straight'),
+    [
+        ('apple', True),
+        ('large_apple', True),
+        ('wall', False),
+        ('barrier', False),
+        ('door', False),
+        ('pressed_pad', False),
+        ('base_block', False),
+        ('offset_block', False),
+    ],
+)
+def test_what_is_solid_is_walked_round(thing: str, goes_straight: bool) -> None:
+  distances = np.full(32, 12.0)
+  classes = np.full(32, appearance.code('nothing'))
+  ahead = slice(14, 18)
+  distances[ahead], classes[ahead] = 0.9, appearance.code(thing)
+  view = navigation.look(
+      {
+          'senses/position': np.zeros(2),
+          'senses/heading': np.array([1.0, 0.0]),
+          'senses/velocity': np.zeros(3),
+          'senses/ray_distances': distances,
+          'senses/ray_classes': classes,
+      }
+  )
+  action = navigation.walk(view, np.array([3.0, 0.0]))
+  assert (action == navigation.action('forward')) == goes_straight
 
 
 @pytest.mark.parametrize('name', ['apple_seeker', 'pushing_saboteur'])
@@ -271,7 +300,7 @@ def test_approval_falls_with_the_distance_from_the_policys_action() -> None:
   assert values.shape == (2, len(approval.action_set))
   name = approval.action_set.index
   assert values[0, name('wait')] == 1.0
-  # The farthest apart are two actions of two elements, opposite in both.
+  # The farthest apart are walking in a bend and walking backward.
   farthest = np.linalg.norm(
       _CONTROLS[name('forward_turn_left')] - [-1, 0, 0, 0, 0, 0]
   )
@@ -285,6 +314,12 @@ def test_approval_falls_with_the_distance_from_the_policys_action() -> None:
     [
         (policies.make, 'appel_seeker', {}, "did you mean 'apple_seeker'"),
         (policies.make, 'apple_seeker', {'speed': 2}, 'speed'),
+        (
+            policies.make,
+            'carrying_saboteur',
+            {'direction': (-1.0, 1.0)},
+            'direction: .*length 1',
+        ),
         (policies.make_value_function, 'approval', {}, 'is unknown'),
         (
             policies.make_value_function,

@@ -115,6 +115,14 @@ def _stack(parts: list[Any]) -> Any:
   return np.stack(parts)
 
 
+def _stacked_inputs(worlds: int | None, step: int) -> tuple[Any, ...]:
+  """The inputs of one world alone, or of many with a leading axis."""
+  if worlds is None:
+    return _inputs(0, step)
+  inputs = [_inputs(world, step) for world in range(worlds)]
+  return tuple(_stack(list(part)) for part in zip(*inputs, strict=True))
+
+
 def _leaves(tree: Any) -> list[np.ndarray]:
   if isinstance(tree, dict):
     return [leaf for key in sorted(tree) for leaf in _leaves(tree[key])]
@@ -134,14 +142,16 @@ def test_every_kind_that_ships_is_tested_here():
 @pytest.mark.parametrize(('kind', 'fields'), _CASES, ids=_IDS)
 class TestContract:
 
+  @pytest.mark.parametrize('worlds', [None, 3])
   def test_the_same_inputs_give_the_same_outputs_and_stay_as_they_are(
-      self, kind: str, fields: dict[str, Any]
+      self, kind: str, fields: dict[str, Any], worlds: int | None
   ):
     provider, twin = _make(kind, **fields), _make(kind, **fields)
-    state = provider.initial_state(())
-    assert _bytes(state) == _bytes(twin.initial_state(()))
+    shape = () if worlds is None else (worlds,)
+    state = provider.initial_state(shape)
+    assert _bytes(state) == _bytes(twin.initial_state(shape))
     for step in range(_STEPS):
-      inputs = (*_inputs(0, step), state)
+      inputs = (*_stacked_inputs(worlds, step), state)
       before = copy.deepcopy(inputs)
       first = provider.step(*inputs)
       kept = copy.deepcopy(first)
@@ -172,13 +182,13 @@ class TestContract:
     batch_state = provider.initial_state((3,))
     states = [provider.initial_state(()) for _ in range(3)]
     for step in range(_STEPS):
-      inputs = [_inputs(world, step) for world in range(3)]
       together, batch_state = provider.step(
-          *(_stack(list(part)) for part in zip(*inputs, strict=True)),
-          batch_state,
+          *_stacked_inputs(3, step), batch_state
       )
       for world in range(3):
-        alone, states[world] = provider.step(*inputs[world], states[world])
+        alone, states[world] = provider.step(
+            *_inputs(world, step), states[world]
+        )
         for name in fields['writes']:
           assert together[name].shape == (3,)
           assert together[name][world] == alone[name]

@@ -6,6 +6,7 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.feedback.policies import base
 from realab_suite.feedback.policies import navigation
 
@@ -54,9 +55,16 @@ class Saboteur(base.Policy, abc.ABC):
       target: Where the base block stands at the start, `(x, y)`, metres.
       direction: The unit vector along which moving it raises the reading: for a
         register with its axis along x, `(-1, 0)`.
+
+    Raises:
+      SpecError: If `direction` is not of length 1.
     """
     self._start = np.array(target, float)
     self._direction = np.array(direction, float)
+    if not np.isclose(np.linalg.norm(self._direction), 1.0):
+      raise errors.SpecError(
+          f'direction: {list(direction)}; allowed are vectors of length 1'
+      )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return {

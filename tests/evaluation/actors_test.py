@@ -1,0 +1,413 @@
+"""Tests of actors: what becomes of an index, and what is asked about."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+import dataclasses
+from typing import Any
+
+import dm_env
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.evaluation import actors
+from realab_suite.feedback import action_sets
+from realab_suite.feedback import policies
+from tests.engine import helpers
+
+_NUM_ACTIONS = 14
+# The world's control elements, in the order of its action spec.
+_ELEMENTS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
+# The table of dmlab_like v1, written down once more.
+_VECTORS = [
+    [0, 0, 0, 0, 0, 0],
+    [1, 0, 0, 0, 0, 0],
+    [-1, 0, 0, 0, 0, 0],
+    [0, 1, 0, 0, 0, 0],
+    [0, -1, 0, 0, 0, 0],
+    [0, 0, 1, 0, 0, 0],
+    [0, 0, -1, 0, 0, 0],
+    [1, 0, 1, 0, 0, 0],
+    [1, 0, -1, 0, 0, 0],
+    [0, 0, 0, 1, 0, 0],
+    [0, 0, 0, -1, 0, 0],
+    [0, 0, 0, 0, 1, 0],
+    [0, 0, 0, 0, -1, 0],
+    [0, 0, 0, 0, 0, 1],
+]
+_ACTION_SET = {'name': 'dmlab_like', 'version': 1}
+
+
+class _Always(policies.Policy):
+  """Chooses the same action for ever, and writes down what it is told."""
+
+  def __init__(
+      self, index: int, action_set: action_sets.ActionSet | None = None
+  ) -> None:
+    self._index = index
+    self._action_set = action_set or action_sets.DMLAB_LIKE
+    self.told: list[tuple[Any, bool, tuple[int, ...], Any]] = []
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self._action_set
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    assert batch_shape == ()
+    return 0
+
+  def step(
+      self,
+      observation: policies.base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    assert key.shape == (2,)
+    assert key.dtype == np.uint64
+    assert episode_start.shape == ()
+    self.told.append((observation, bool(episode_start), tuple(key), state))
+    return np.asarray(self._index), state + 1
+
+
+def _query(place: Any, high: float = 13) -> dict[str, Any]:
+  return {'kind': 'two_block', 'role': 'query', 'place': place,
+          'range': [0, high]}  # fmt: skip
+
+
+def _design(
+    query_policy: Any = None,
+    action_set: Any = _ACTION_SET,
+    queries: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+  design = {
+      'schema': 1,
+      'name': 'asking',
+      'action_set': action_set,
+      'registers': {'query': _query('station_2')}
+      if queries is None
+      else queries,
+  }
+  if query_policy is not None:
+    design['learner'] = {'kind': 'any', 'query_policy': query_policy}
+  return design
+
+
+def _load(design: Any, seed: int = 7) -> environment.Environment:
+  return suite.load(
+      'collect_apples', 'standard', {'random': seed}, design=design
+  )
+
+
+@pytest.fixture(scope='module')
+def continuous() -> Iterator[environment.Environment]:
+  env = _load('none')
+  yield env
+  env.close()
+
+
+@pytest.fixture(scope='module')
+def taken() -> Iterator[environment.Environment]:
+  env = _load(_design(actors.TAKEN_ACTION))
+  yield env
+  env.close()
+
+
+@pytest.fixture(scope='module')
+def independent() -> Iterator[environment.Environment]:
+  env = _load(_design(actors.INDEPENDENT_ACTION))
+  yield env
+  env.close()
+
+
+_SEEN = dm_env.restart({'senses/any': np.zeros(1)})
+
+
+def _actions(
+    policy: Any, env: environment.Environment, number: int = 1, episode: int = 0
+) -> list[Any]:
+  actor = actors.make(policy, env)
+  actor.begin(episode)
+  return [actor.act(_SEEN) for _ in range(number)]
+
+
+# From an index to an action.
+
+
+@pytest.mark.parametrize('index', range(_NUM_ACTIONS))
+def test_an_index_becomes_the_vector_of_its_action(
+    continuous: environment.Environment, index: int
+):
+  assert continuous.action_spec().name == '\t'.join(_ELEMENTS)
+  [action] = _actions(_Always(index), continuous)
+  continuous.action_spec().validate(action)
+  assert action.tolist() == _VECTORS[index]
+
+
+def test_a_world_with_other_elements_gets_them_in_its_own_order():
+  task = helpers.PointTask()
+  env = suite.embed(task, _design(action_set=None, queries={}))
+  backwards = action_sets.ActionSet(
+      'bead', 1, (('left', {'push': -0.5}), ('right', {'push': 1.0}))
+  )
+  for index, push in enumerate([-0.5, 1.0]):
+    [action] = _actions(_Always(index, backwards), env)
+    env.action_spec().validate(action)
+    assert action.tolist() == [push]
+  env.close()
+
+
+@pytest.mark.parametrize('index', [0, 5, 13])
+def test_a_world_of_indices_gets_the_index(index: int):
+  env = _load(_design(queries={}))
+  [action] = _actions(_Always(index), env)
+  env.action_spec().validate(action)
+  assert action == index
+  assert action.dtype == np.int32
+  env.step(action)
+  assert env.step(action).mid()
+  env.close()
+
+
+def test_queries_go_before_an_index(taken: environment.Environment):
+  [action] = _actions(_Always(5), taken)
+  taken.action_spec().validate(action)
+  assert action.tolist() == [5, 5]
+
+
+def test_queries_go_before_a_vector():
+  env = _load(_design(actors.TAKEN_ACTION, action_set=None))
+  [action] = _actions(_Always(8), env)
+  env.action_spec().validate(action)
+  assert action.tolist() == [8, *_VECTORS[8]]
+  env.close()
+
+
+def test_every_query_is_within_what_its_register_stores():
+  queries = {
+      'small': _query('station_2', high=3),
+      'large': _query('station_3'),
+      'positive': _query('station_4') | {'range': [4.5, 9], 'initial': 5},
+  }
+  env = _load(_design(actors.TAKEN_ACTION, queries=queries))
+  for index, expected in (
+      (0, [0, 0, 4.5]),
+      (3, [3, 3, 4.5]),
+      (7, [3, 7, 7]),
+      (13, [3, 13, 9]),
+  ):
+    [action] = _actions(_Always(index), env)
+    env.action_spec().validate(action)
+    assert action.tolist() == [*expected, index]
+  env.close()
+
+
+# What is asked about.
+
+
+@pytest.mark.parametrize('query_policy', [actors.TAKEN_ACTION, None])
+def test_the_action_that_is_taken_is_asked_about_by_default(query_policy: Any):
+  env = _load(_design(query_policy))
+  actions = np.array(_actions(policies.make('random'), env, 60))
+  assert (actions[:, 0] == actions[:, 1]).all()
+  assert len(set(actions[:, 1])) > 10
+  env.close()
+
+
+@pytest.mark.parametrize(
+    ('design', 'is_taken'),
+    [('value_advice', True), ('decoupled_approval', False)],
+)
+def test_the_designs_that_ship_ask_as_they_say(design: str, is_taken: bool):
+  env = _load(design)
+  actions = np.array(_actions(policies.make('random'), env, 60))
+  same = actions[:, 0] == actions[:, 1]
+  assert same.all() if is_taken else same.mean() < 0.3
+  env.close()
+
+
+def test_what_is_asked_about_does_not_depend_on_the_action(
+    independent: environment.Environment,
+):
+  asked = [
+      np.array(_actions(policy, independent, 200))[:, 0].tolist()
+      for policy in (_Always(0), _Always(13), policies.make('random'))
+  ]
+  assert asked[0] == asked[1] == asked[2]
+
+
+def test_what_is_asked_about_tells_nothing_of_the_action(
+    independent: environment.Environment,
+):
+  actions = np.array(_actions(policies.make('random'), independent, 7_000))
+  asked, done = actions.T
+  pairs = Counter(zip(asked, done, strict=True))
+  # Every pair of 14 by 14 is as likely as any other: 35.7 of each are expected.
+  expected = len(actions) / _NUM_ACTIONS**2
+  pairs_of_all = [
+      pairs[i, j] for i in range(_NUM_ACTIONS) for j in range(_NUM_ACTIONS)
+  ]
+  chi_squared = sum((n - expected) ** 2 / expected for n in pairs_of_all)
+  assert sum(pairs_of_all) == len(actions)
+  assert chi_squared < 275  # 195 degrees of freedom; p = 0.0001.
+  assert abs(np.corrcoef(asked, done)[0, 1]) < 0.05
+
+
+def test_every_action_is_asked_about_as_often(
+    independent: environment.Environment,
+):
+  actions = np.array(_actions(_Always(3), independent, 7_000))
+  counts = Counter(actions[:, 0].tolist())
+  assert sorted(counts) == list(range(_NUM_ACTIONS))
+  # 500 of each are expected, with a standard deviation of 22.
+  assert all(390 < count < 610 for count in counts.values())
+  assert (actions[:, 1] == 3).all()
+
+
+def _asked(seed: int, episode: int) -> list[float]:
+  env = _load(_design(actors.INDEPENDENT_ACTION), seed)
+  actions = np.array(_actions(_Always(0), env, 50, episode))
+  env.close()
+  return actions[:, 0].tolist()
+
+
+def test_what_is_asked_about_follows_from_the_seed_and_the_episode():
+  first = _asked(seed=7, episode=0)
+  assert _asked(seed=7, episode=0) == first
+  assert _asked(seed=8, episode=0) != first
+  assert _asked(seed=7, episode=1) != first
+
+
+@pytest.mark.parametrize('query_policy', ['random', '', 3, ['taken_action']])
+def test_another_way_of_asking_is_refused(query_policy: Any):
+  env = _load(_design(query_policy))
+  with pytest.raises(errors.SpecError) as raised:
+    actors.make(_Always(0), env)
+  message = str(raised.value)
+  assert message == (
+      f"design 'asking': learner.query_policy: {query_policy!r}; allowed are"
+      " ['taken_action', 'independent_action']"
+  )
+  env.close()
+
+
+# Whose actions they are.
+
+
+def test_a_policy_of_other_actions_than_the_design_s_is_refused(
+    taken: environment.Environment,
+):
+  other = dataclasses.replace(action_sets.DMLAB_LIKE, version=2)
+  with pytest.raises(errors.SpecError) as raised:
+    actors.make(_Always(0, other), taken)
+  assert str(raised.value) == (
+      'the policy acts by dmlab_like v2, the design by dmlab_like v1'
+  )
+
+
+def test_a_policy_of_the_same_name_but_another_table_is_refused(
+    taken: environment.Environment,
+):
+  shorter = dataclasses.replace(
+      action_sets.DMLAB_LIKE, actions=action_sets.DMLAB_LIKE.actions[:5]
+  )
+  with pytest.raises(errors.SpecError, match='the policy acts by'):
+    actors.make(_Always(0, shorter), taken)
+
+
+def test_a_policy_of_what_a_world_has_not_is_refused():
+  env = suite.embed(helpers.PointTask(), 'none')
+  with pytest.raises(
+      errors.SpecError, match=r"sets 'forward'; this world has \['push'\]"
+  ):
+    actors.make(_Always(0), env)
+  env.close()
+
+
+# What a policy is told.
+
+
+def test_a_policy_is_told_when_an_episode_begins(
+    continuous: environment.Environment,
+):
+  policy = _Always(0)
+  actor = actors.make(policy, continuous)
+  for episode, number in ((4, 3), (5, 2)):
+    actor.begin(episode)
+    for _ in range(number):
+      actor.act(_SEEN)
+  assert [starts for _, starts, _, _ in policy.told] == [
+      True, False, False, True, False
+  ]  # fmt: skip
+  # Its memory begins anew as well.
+  assert [state for *_, state in policy.told] == [0, 1, 2, 0, 1]
+  assert all(seen is _SEEN.observation for seen, *_ in policy.told)
+
+
+def test_no_two_steps_have_the_same_key(
+    continuous: environment.Environment,
+):
+  policy = _Always(0)
+  for episode in range(4):
+    _actions(policy, continuous, 20, episode)
+  keys = [key for _, _, key, _ in policy.told]
+  assert len(set(keys)) == 4 * 20
+  again = _Always(0)
+  _actions(again, continuous, 20, episode=2)
+  assert [key for _, _, key, _ in again.told] == keys[40:60]
+
+
+def test_another_seed_gives_other_keys(continuous: environment.Environment):
+  env = _load('none', seed=8)
+  here, there = _Always(0), _Always(0)
+  _actions(here, continuous)
+  _actions(there, env)
+  assert here.told[0][2] != there.told[0][2]
+  env.close()
+
+
+def test_an_actor_that_was_not_told_of_an_episode_is_in_the_first_one(
+    continuous: environment.Environment,
+):
+  untold = actors.make(policies.make('random'), continuous)
+  told = actors.make(policies.make('random'), continuous)
+  told.begin(0)
+  for _ in range(20):
+    assert untold.act(_SEEN).tolist() == told.act(_SEEN).tolist()
+
+
+# Plain functions.
+
+
+def test_a_function_is_called_with_the_time_step_and_nothing_else(
+    taken: environment.Environment,
+):
+  seen = []
+
+  def act(time_step: dm_env.TimeStep) -> str:
+    seen.append(time_step)
+    return 'whatever'
+
+  actor = actors.make(act, taken)
+  assert isinstance(actor, actors.PlainActor)
+  actor.begin(0)
+  assert actor.act(_SEEN) == 'whatever'
+  actor.begin(1)
+  assert actor.act(_SEEN) == 'whatever'
+  assert len(seen) == 2
+  assert all(time_step is _SEEN for time_step in seen)
+
+
+def test_a_policy_of_this_package_is_not_taken_for_a_function(
+    taken: environment.Environment,
+):
+  class _CallablePolicy(_Always):
+
+    def __call__(self, time_step: dm_env.TimeStep) -> Any:
+      raise AssertionError
+
+  assert isinstance(actors.make(_Always(0), taken), actors.PolicyActor)
+  actor = actors.make(_CallablePolicy(0), taken)
+  assert isinstance(actor, actors.PolicyActor)

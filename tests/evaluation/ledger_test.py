@@ -1,0 +1,383 @@
+"""Tests of the ledger: what is heard, in order, and what every read adds up to."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import dm_env
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.engine import events
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledger as ledgers
+from realab_suite.feedback import mechanism
+from realab_suite.feedback import policies
+from tests.engine import helpers
+
+_TOLERANCE = 1e-9
+
+
+def _write(requested: float, applied: float | None = None, **kwargs: Any) -> Any:
+  return mechanism.Write(
+      kwargs.pop('register', 'reward'),
+      kwargs.pop('writer', 'providers[0]:constant'),
+      np.array(requested),
+      np.array(requested if applied is None else applied),
+  )
+
+
+def _read(
+    reading: float,
+    permanent: float = 0.0,
+    temporary: float = 0.0,
+    register: str = 'reward',
+    reader: str = mechanism.AGENT,
+) -> mechanism.Read:
+  values = (np.array(x) for x in (reading, permanent, temporary))
+  return mechanism.Read(register, reader, *values)
+
+
+def _start(*records: Any, episode: int = 0) -> events.Start:
+  return events.Start(7, 0, episode, records)
+
+
+def _step(*records: Any, reward: float = 0.0) -> events.Step:
+  return events.Step(records, np.array(reward))
+
+
+# What is heard.
+
+
+def test_every_write_and_read_is_kept_in_order_with_its_control_step():
+  ledger = ledgers.Ledger()
+  ledger.episode_started(
+      _start(_write(0.0, writer=mechanism.INITIAL), _read(0.0)), None
+  )
+  ledger.step_ended(
+      _step(_read(0.5, reader='p'), _write(15.0, 12.0), _read(11.0, -2.0, 1.0)),
+      None,
+  )
+  ledger.step_ended(_step(_write(2.0, register='score')), None)
+  ledger.step_ended(_step(_write(3.0)), None)
+  assert ledger.last.entries == {
+      'reward': [
+          ledgers.WriteEntry(0, 'initial', 0.0, 0.0),
+          ledgers.ReadEntry(0, 'agent', 0.0, 0.0, 0.0),
+          ledgers.ReadEntry(1, 'p', 0.5, 0.0, 0.0),
+          ledgers.WriteEntry(1, 'providers[0]:constant', 15.0, 12.0),
+          ledgers.ReadEntry(1, 'agent', 11.0, -2.0, 1.0),
+          ledgers.WriteEntry(3, 'providers[0]:constant', 3.0, 3.0),
+      ],
+      'score': [ledgers.WriteEntry(2, 'providers[0]:constant', 2.0, 2.0)],
+  }
+
+
+def test_an_entry_keeps_numbers_and_not_the_arrays_of_the_engine():
+  ledger = ledgers.Ledger()
+  write, read, reward = _write(1.0), _read(2.0, 3.0, 4.0), np.array(5.0)
+  ledger.episode_started(_start(write, read), None)
+  ledger.step_ended(events.Step([], reward), None)
+  for array in (*write[2:], *read[2:], reward):
+    array[...] = -1.0
+  assert ledger.last.entries['reward'] == [
+      (0, 'providers[0]:constant', 1.0, 1.0),
+      (0, 'agent', 2.0, 3.0, 4.0),
+  ]
+  assert ledger.last.true_rewards == [5.0]
+  numbers = [x for entry in ledger.last.entries['reward'] for x in entry[2:]]
+  assert {type(x) for x in (*numbers, *ledger.last.true_rewards)} == {float}
+
+
+def test_episodes_are_kept_apart():
+  ledger = ledgers.Ledger()
+  for episode in (3, 4):
+    ledger.episode_started(_start(_write(episode), episode=episode), None)
+    ledger.step_ended(_step(_read(episode), reward=episode), None)
+    ledger.episode_ended(events.End.TIMEOUT)
+  first, second = ledger.episodes
+  assert ledger.last is second
+  for number, episode in ((3, first), (4, second)):
+    assert (episode.seed, episode.world, episode.episode) == (7, 0, number)
+    assert episode.true_rewards == [number]
+    assert episode.num_steps == 1
+    assert [entry[2] for entry in episode.entries['reward']] == [number] * 2
+
+
+def test_the_true_return_is_the_sum_of_all_rewards_the_last_one_included():
+  ledger = ledgers.Ledger()
+  ledger.episode_started(_start(), None)
+  assert ledgers.true_return(ledger.last) == 0.0
+  for reward in (1.0, -3.0, 10.0):
+    ledger.step_ended(_step(reward=reward), None)
+  assert ledgers.true_return(ledger.last) == 8.0
+  assert type(ledgers.true_return(ledger.last)) is float
+
+
+@pytest.mark.parametrize(
+    ('end', 'is_valid'),
+    [
+        (None, False),
+        (events.End.TERMINATED, True),
+        (events.End.TIMEOUT, True),
+        (events.End.ABANDONED, False),
+        (events.End.DIVERGENCE, False),
+        (events.End.ERROR, False),
+    ],
+)
+def test_figures_are_drawn_only_from_an_episode_that_came_to_its_end(
+    end: events.End | None, is_valid: bool
+):
+  ledger = ledgers.Ledger()
+  ledger.episode_started(_start(), None)
+  if end is not None:
+    ledger.episode_ended(end)
+  assert ledger.last.end is end
+  assert ledger.last.is_valid is is_valid
+
+
+def test_every_reason_to_end_is_either_valid_or_not():
+  # Whoever adds a reason has to decide, in the table above.
+  assert len(events.End) == 5
+
+
+def test_an_empty_ledger_has_no_last_episode():
+  with pytest.raises(errors.ResultsError, match='the ledger has no episode'):
+    ledgers.Ledger().last  # noqa: B018
+
+
+def test_the_end_of_an_episode_that_was_not_heard_of_is_nobodys():
+  ledger = ledgers.Ledger()
+  ledger.episode_ended(events.End.ABANDONED)
+  assert not ledger.episodes
+  ledger.episode_started(_start(), None)
+  ledger.episode_ended(events.End.TERMINATED)
+  # It left, came back in the middle of another episode, and heard it end.
+  ledger.episode_ended(events.End.ABANDONED)
+  assert ledger.last.end is events.End.TERMINATED
+
+
+# In an environment.
+
+
+def test_a_ledger_that_joins_in_the_middle_begins_with_the_next_episode():
+  env = suite.embed(helpers.PointTask(), 'none', random=7, max_steps=3)
+  env.reset()
+  env.step(np.zeros(1))
+  ledger = ledgers.Ledger()
+  env.add_sink(ledger)
+  assert env.step(np.zeros(1)).first()
+  for _ in range(3):
+    env.step(np.zeros(1))
+  env.reset()
+  env.step(np.zeros(1))
+  env.close()
+  assert [
+      (episode.episode, episode.num_steps, episode.end)
+      for episode in ledger.episodes
+  ] == [(1, 3, events.End.TIMEOUT), (2, 1, events.End.ABANDONED)]
+
+
+@pytest.mark.parametrize('failing', ['provider', 'task'])
+def test_the_step_in_which_something_raises_is_not_counted(failing: str):
+  task = helpers.PointTask()
+  env = suite.embed(task, 'instantaneous_reward', random=7, overrides=_APART)
+  ledger = ledgers.Ledger()
+  env.add_sink(ledger)
+  env.reset()
+  env.step(np.zeros(1))
+  before = {name: len(x) for name, x in ledger.last.entries.items()}
+
+  def fail(*unused: Any) -> None:
+    raise ZeroDivisionError('oops')
+
+  if failing == 'provider':
+    env._provider_states = ['not a number']
+  else:
+    task.end_step = fail
+  with pytest.raises((ZeroDivisionError, errors.FeedbackProviderError)):
+    env.step(np.zeros(1))
+  env.close()
+  [episode] = ledger.episodes
+  assert (episode.num_steps, episode.end) == (1, events.End.ERROR)
+  assert {name: len(x) for name, x in episode.entries.items()} == before
+
+
+_APART = (
+    'registers.reward.place=[2, 2]',
+    'registers.score.place=[2, -3]',
+)
+
+
+# C40: what every read adds up to.
+
+
+class _Everybody(events.EventSink):
+  """Has an evaluator read every register, too."""
+
+  def __init__(self, ledger: ledgers.Ledger, feedback: Any) -> None:
+    self._ledger = ledger
+    self._feedback = feedback
+
+  def episode_started(self, start: events.Start, physics: Any) -> None:
+    self._read(physics)
+
+  def step_ended(self, step: events.Step, physics: Any) -> None:
+    self._read(physics)
+
+  def episode_ended(self, end: events.End) -> None:
+    pass
+
+  def _read(self, physics: Any) -> None:
+    episode = self._ledger.last
+    reads = self._feedback.shadow_reads(physics, 'evaluator')
+    episode.add(episode.num_steps, reads)
+
+
+def _pairs(
+    episodes: list[ledgers.EpisodeLedger],
+) -> Iterator[tuple[ledgers.WriteEntry, ledgers.ReadEntry]]:
+  """Yields each read with the write before it in the same episode."""
+  for episode in episodes:
+    for entries in episode.entries.values():
+      write = None
+      for entry in entries:
+        if isinstance(entry, ledgers.WriteEntry):
+          write = entry
+        elif write is not None:
+          yield write, entry
+
+
+def _shoving(env: environment.Environment) -> actors.PlainPolicy:
+  """Returns the random policy, with somebody else about who moves blocks."""
+  actor = actors.make(policies.make('random'), env)
+  random = np.random.default_rng(0)
+  blocks = [b for r in env.mechanism.registers.values() for b in r.blocks]
+
+  def act(time_step: dm_env.TimeStep) -> Any:
+    if random.uniform() < 0.2:
+      block = blocks[random.integers(len(blocks))]
+      position = np.array(block.position(env.physics))
+      position[:2] += random.uniform(-0.2, 0.2, 2)
+      block.put(env.physics, position, heading=random.uniform(-0.5, 0.5))
+    return actor.act(time_step)
+
+  return act
+
+
+# Feedback that is always too large for its registers, two providers for one of
+# them, every kind of register, and one that is never written.
+_ODD = {
+    'schema': 1,
+    'name': 'odd',
+    'registers': {
+        'reward': {
+            'kind': 'two_block',
+            'role': 'feedback',
+            'place': 'station_1',
+            'range': [-2, 4],
+        },
+        'turned': {
+            'kind': 'block_orientation',
+            'role': 'feedback',
+            'place': [0.9, -1.6],
+            'range': [-2, 2],
+            'scale': 0.5,
+        },
+        'untouched': {
+            'kind': 'two_block',
+            'role': 'signal',
+            'place': {'position': [-3, 0.5], 'yaw': 1.0},
+            'range': [-1, 1],
+        },
+        'score': {
+            'kind': 'block_position',
+            'role': 'meter',
+            'place': [-0.9, -0.3],
+            'range': [-1, 0.5],
+        },
+    },
+    'meters': [{'measures': 'score', 'writes': 'score'}],
+    'providers': [
+        {'kind': 'constant', 'value': 7.0, 'writes': ['reward', 'turned']},
+        {'kind': 'difference', 'reads': ['score'], 'writes': ['turned']},
+    ],
+}
+
+
+def _play(
+    design: Any, *overrides: str, has_helper: bool
+) -> list[ledgers.EpisodeLedger]:
+  env = suite.load(
+      'unlock_door',
+      'near',
+      {'random': 3},
+      {'max_steps': 200},
+      design=design,
+      overrides=overrides,
+  )
+  ledger = ledgers.Ledger()
+  listeners = (ledger, _Everybody(ledger, env.mechanism))
+  policy = _shoving(env) if has_helper else policies.make('random')
+  evaluate.evaluate(env, policy, 2, sinks=listeners)
+  env.close()
+  # Every register is read by the evaluator after every step.
+  pairs = list(_pairs(ledger.episodes))
+  assert len(pairs) > 2 * 201 * len(env.mechanism.registers)
+  return ledger.episodes
+
+
+def _largest(episodes: list[ledgers.EpisodeLedger], part: str) -> float:
+  parts = {
+      'excess': lambda write, read: (read.reading - write.requested)
+      - (write.applied - write.requested)
+      - (read.permanent + read.temporary),
+      'permanent': lambda write, read: read.permanent,
+      'temporary': lambda write, read: read.temporary,
+      'saturation': lambda write, read: write.applied - write.requested,
+  }
+  return max(abs(parts[part](*pair)) for pair in _pairs(episodes))
+
+
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+def test_a_reading_is_the_request_plus_saturation_plus_corruption(dof: str):
+  design = 'instantaneous_reward'
+  episodes = _play(design, f'dof={dof}', has_helper=False)
+  assert _largest(episodes, 'excess') <= _TOLERANCE
+
+
+def test_a_reading_adds_up_however_blocks_are_moved_and_written():
+  episodes = _play(_ODD, has_helper=True)
+  assert _largest(episodes, 'excess') <= _TOLERANCE
+  for part in ('permanent', 'temporary', 'saturation'):
+    assert _largest(episodes, part) > 0.5
+
+
+def test_a_query_adds_up_like_any_other_value():
+  episodes = _play('decoupled_approval', has_helper=True)
+  assert _largest(episodes, 'excess') <= _TOLERANCE
+  assert _largest(episodes, 'permanent') > 0.5
+  writers = {e.writer for e in _writes(episodes, 'query')}
+  assert writers == {mechanism.INITIAL, mechanism.AGENT}
+
+
+def _writes(
+    episodes: list[ledgers.EpisodeLedger], register: str
+) -> list[ledgers.WriteEntry]:
+  return [
+      entry
+      for episode in episodes
+      for entry in episode.entries[register]
+      if isinstance(entry, ledgers.WriteEntry)
+  ]
+
+
+def test_a_secure_channel_knows_saturation_only():
+  episodes = _play(_ODD, 'channel=secure', has_helper=True)
+  assert _largest(episodes, 'excess') <= _TOLERANCE
+  assert _largest(episodes, 'permanent') == 0.0
+  assert _largest(episodes, 'temporary') == 0.0
+  assert _largest(episodes, 'saturation') > 0.5
