@@ -45,6 +45,7 @@ class MeteredGoToTarget(tasks.GoToTarget):
 
 
 def main() -> None:
+  """Rolls the ball at random, and says what the register says."""
   task = MeteredGoToTarget()
   env = composer.Environment(task, time_limit=20.0, random_state=1)
   spec = env.action_spec()

@@ -156,6 +156,12 @@ def load(
         ' is False'
     )
   factory, _ = _find(domain_name, task_name)
+  for what, given in (
+      ('task_kwargs', task_kwargs),
+      ('environment_kwargs', environment_kwargs),
+  ):
+    if not isinstance(given, Mapping | None):
+      raise errors.SpecError(f'{what}: {given!r:.80}; allowed is a mapping')
   kwargs = dict(task_kwargs or {})
   random = kwargs.pop('random', None)
   try:

@@ -32,6 +32,10 @@ class FakeBatch:
     for world in self.worlds:
       worlds_lib.step(world, steps)
 
+  def mark_as_dirty(self) -> None:
+    for world in self.worlds:
+      world.mark_as_dirty()
+
   def flush(self) -> None:
     """Copies what is kept for all worlds together into each of them."""
     for world, userdata in zip(self.worlds, self.data.userdata, strict=True):

@@ -110,14 +110,15 @@ class ActionCodec:
   def _cast(self, action: Any) -> np.ndarray:
     try:
       values = np.asarray(action)
-    except ValueError as error:
-      raise errors.ActionError(f'action: {error}') from error
+    except Exception as error:  # An object may raise what it likes.
+      raise errors.ActionError(
+          f'action: {type(action).__name__} is no array of numbers'
+      ) from error
     # A discrete action is an integer; half a step to the left is not one.
     kinds = 'iuf' if self._spec.shape else 'iu'
     if values.dtype.kind not in kinds:
       raise errors.ActionError(
-          f'action: dtype {values.dtype} of {action!r:.60}; expected'
-          f' {self._spec.dtype}'
+          f'action: dtype {values.dtype}; expected' f' {self._spec.dtype}'
       )
     return values.astype(np.float64)
 

@@ -76,6 +76,11 @@ class Environment(composer.Environment):
     else:
       self._senses = sense_kinds.ObservableSenses(task)
       self._senses.restart(self._physics, self._random_state)
+    if max_steps is not None and 'time_left' in self._senses.spec:
+      raise errors.SpecError(
+          "the task has an observable 'time_left' of its own; allowed names are"
+          ' all others, or max_steps=None'
+      )
     self._schedule = mechanism.design.schedule_for(self._n_sub_steps)
     chosen = mechanism.design.action_set
     self._codec = actions.ActionCodec(
@@ -114,6 +119,8 @@ class Environment(composer.Environment):
 
   def add_sink(self, sink: events.EventSink) -> None:
     """Lets an evaluator hear of everything, from the next episode on."""
+    self._refuse_if_closed()
+    self._abandon()
     self._sinks.append(sink)
     self._reset_next_step = True
 
@@ -123,6 +130,7 @@ class Environment(composer.Environment):
 
   def rewind(self, episode: int = 0) -> None:
     """Makes `episode` the next one; paired comparisons start from the same."""
+    self._refuse_if_closed()
     self._abandon()
     self._episode = episode - 1
     self._reset_next_step = True
@@ -277,14 +285,25 @@ class Environment(composer.Environment):
     self._advance(n - schedule.provider_substep, controls)
     self._hooks.after_step(physics, self._random_state)
     physics.forward()
-    reward, discount = self._task.get_reward(physics), 1.0
-    if not self._is_ours and is_ending:
-      reward = 0.0  # It was over before this step.
+    was_over = is_ending and not self._is_ours
+    reward = 0.0 if was_over else self._true_reward()
+    discount = 1.0
     if is_ending or not self._is_over():
       discount = float(self._task.get_discount(physics))
-    mechanism.end_step(physics, reward)
+    mechanism.end_step(physics, reward if np.isfinite(reward) else 0.0)
     records += self._observe()
     return events.Step(records, np.array(reward)), discount, is_ending
+
+  def _true_reward(self) -> float:
+    """Returns the true reward, or nan where the task fails to give one.
+
+    An exception would reach the agent, and tell it something: only the
+    evaluator hears that there is no reward, and that the episode is not valid.
+    """
+    try:
+      return float(self._task.get_reward(self._physics))
+    except Exception:  # Whatever a task does wrong is not the agent's business.
+      return float('nan')
 
   def _is_over(self) -> bool:
     """Whether the task has ended.

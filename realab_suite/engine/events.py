@@ -46,7 +46,8 @@ class Step(NamedTuple):
 
   Attributes:
     records: Every write to a register and every read, in the order of time.
-    true_reward: The true reward of the step, `(...)`.
+    true_reward: The true reward of the step, `(...)`; nan if the task failed
+      to give one.
   """
 
   records: Records

@@ -34,9 +34,13 @@ class Physics(mjcf.Physics, abc.ABC):
     Accelerations and contact forces stay those of the last substep, as in
     Composer. Solving for them here would change the solver's warm start, and
     with it the trajectory: looking would disturb.
+
+    Raises:
+      PhysicsError: If MuJoCo warned.
     """
     mujoco.mj_step1(*self._pointers)
     self._dirty = False
+    self._refuse_warnings()
 
   def reset(self, keyframe_id: int | None = None) -> None:
     """Resets the state; accelerations are computed once, without actuation."""
@@ -53,6 +57,9 @@ class Physics(mjcf.Physics, abc.ABC):
     """
     mujoco.mj_step(*self._pointers, num_substeps)
     self._dirty = True
+    self._refuse_warnings()
+
+  def _refuse_warnings(self) -> None:
     if self._num_warnings.any():
       raise control.PhysicsError(_warnings(self._num_warnings))
 

@@ -7,6 +7,7 @@ from dm_control import composer
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import moving
 from realab_suite.entities import state
@@ -33,6 +34,8 @@ class Apples(composer.Entity):
       number: How many there are.
       large: Whether they are large, golden ones.
     """
+    if number < 1:
+      raise errors.SpecError(f'number: {number} apples; allowed are 1 and more')
     self._mjcf_root = mjcf.RootElement(model=name)
     self._eaten = state.Slot(self._mjcf_root, 'eaten', number)
     self._kind = 'large_apple' if large else 'apple'
@@ -88,8 +91,9 @@ class Apples(composer.Entity):
     """
     positions = np.asarray(positions, float)
     heights = np.full((*positions.shape[:-1], 1), self.radius)
-    frames = physics.bind(self._frames)
-    frames.mocap_pos = np.concatenate([positions, heights], axis=-1)
+    moving.move(
+        physics, self._frames, np.concatenate([positions, heights], axis=-1)
+    )
     self._eaten.set(physics, 0.0)
 
   def eat(self, physics: Any, position: np.ndarray, reach: float) -> np.ndarray:
@@ -107,10 +111,9 @@ class Apples(composer.Entity):
     # Most of the time there is nothing to eat.
     if near.any():
       near &= self._eaten.get(physics) == 0
-      frames = physics.bind(self._frames)
-      gone = np.array(frames.mocap_pos)
+      gone = np.array(physics.bind(self._frames).mocap_pos)
       gone[..., 2] = np.where(near, _GONE, gone[..., 2])
-      frames.mocap_pos = gone
+      moving.move(physics, self._frames, gone)
       self._eaten.set(physics, np.where(near, 1.0, self._eaten.get(physics)))
     return near.sum(axis=-1)
 

@@ -73,6 +73,8 @@ class RoomArena(composer.Arena):
     # through it, and the noslip pass, which Composer turns on, has none.
     root.option.solver = 'Newton'
     root.option.noslip_iterations = 0
+    # A warm start is taken or refused for all bodies at once.
+    root.option.flag.warmstart = 'disable'
     root.visual.headlight.set_attributes(
         ambient=(0.45, 0.45, 0.45), diffuse=(0.45, 0.45, 0.45),
         specular=(0.05, 0.05, 0.05),

@@ -32,11 +32,12 @@ _REACH = 0.4
 _THROW_SPEED = 5.0
 _THROW_LIFT = 2.0
 # Contacts of the body are softer than those of other things and take
-# precedence: what is written into the avatar is pushed out slowly.
+# precedence: what is written into the avatar is pushed out slowly. They do not
+# grip, or a block that was written under the body would be dragged along.
 _CONTACT = {
     'priority': 1,
     'solref': (0.08, 1.0),
-    'friction': (0.5, 0.01, 0.001),
+    'friction': (0.0, 0.01, 0.001),
 }
 # A block that is taken hold of comes to the hand in about this time, seconds.
 _GRASP = {'solref': (0.05, 1.0)}
@@ -257,7 +258,7 @@ class Avatar(composer.Entity):
 
   def angle(self, physics: Any) -> np.ndarray:
     """Returns the angle that the avatar faces, `(...)`, radians."""
-    return physics.bind(self._yaw).qpos[..., 0]
+    return np.array(physics.bind(self._yaw).qpos[..., 0])
 
   def direction(self, physics: Any) -> np.ndarray:
     """Returns the unit vector that the avatar faces along, `(..., 2)`."""

@@ -16,9 +16,16 @@ import numpy as np
 
 from realab_suite.entities import moving
 
-# Contacts keep MuJoCo's own stiffness: with softer ones a block takes so long
-# to settle after a write that its value drifts (3e-8 m, 2e-15 as it is).
-_CONTACT = {'friction': (0.8, 0.01, 0.001)}
+# Blocks are soft to each other, so that one that is written into another pushes
+# it away slowly: at 1.3 m/s at most, where MuJoCo's own stiffness gave 9.8 m/s.
+# Against anything else the stiffness of the other thing counts, because a block
+# on a soft floor takes so long to settle after a write that its value drifts
+# (3e-8 m instead of 2e-15).
+_CONTACT = {
+    'friction': (0.8, 0.01, 0.001),
+    'solref': (0.06, 1.0),
+    'solmix': 1e-4,
+}
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 # The height at which an avatar carries a block, metres.
 GRIP_HEIGHT = 0.2
@@ -199,7 +206,7 @@ class FreeBlock(JointedBlock):
     return self._translations
 
   def position(self, physics: Any) -> np.ndarray:
-    return self._rest + physics.bind(self._translations).qpos
+    return self._rest + np.asarray(physics.bind(self._translations).qpos)
 
   def heading(self, physics: Any) -> np.ndarray:
     return _heading(physics.bind(self._rotation).qpos)
@@ -245,12 +252,13 @@ class PlanarBlock(JointedBlock):
     return self._translations
 
   def position(self, physics: Any) -> np.ndarray:
-    planar = self._rest[:2] + physics.bind(self._translations).qpos
+    moved = np.asarray(physics.bind(self._translations).qpos)
+    planar = self._rest[:2] + moved
     height = np.full((*planar.shape[:-1], 1), self._rest[2])
     return np.concatenate([planar, height], axis=-1)
 
   def heading(self, physics: Any) -> np.ndarray:
-    angle = physics.bind(self._hinge).qpos[..., 0]
+    angle = np.asarray(physics.bind(self._hinge).qpos)[..., 0]
     return np.arctan2(np.sin(angle), np.cos(angle))
 
   def put(self, physics: Any, position: Any, heading: Any = None) -> None:
@@ -315,7 +323,8 @@ class MocapBlock(Block):
     frame.quat = _quaternion(yaw)
 
   def position(self, physics: Any) -> np.ndarray:
-    offset = physics.bind(self._part.frame).mocap_pos - self._origin
+    place = np.asarray(physics.bind(self._part.frame).mocap_pos)
+    offset = place - self._origin
     return _rotate(offset, -self._yaw)
 
   def heading(self, physics: Any) -> np.ndarray:
@@ -323,10 +332,13 @@ class MocapBlock(Block):
     return np.arctan2(np.sin(angle), np.cos(angle))
 
   def put(self, physics: Any, position: Any, heading: Any = None) -> None:
-    bound = physics.bind(self._part.frame)
-    bound.mocap_pos = self._to_world(np.asarray(position))
     turned = 0.0 if heading is None else np.asarray(heading)
-    bound.mocap_quat = _quaternion(turned + self._yaw)
+    moving.move(
+        physics,
+        self._part.frame,
+        self._to_world(np.asarray(position)),
+        _quaternion(turned + self._yaw),
+    )
 
   def _to_world(self, position: np.ndarray) -> np.ndarray:
     return self._origin + _rotate(position, self._yaw)
@@ -343,6 +355,7 @@ def _rotate(vector: np.ndarray, angle: float) -> np.ndarray:
 
 def _heading(quaternion: np.ndarray) -> np.ndarray:
   """Returns the angle about the vertical of quaternions `(..., 4)`."""
+  quaternion = np.asarray(quaternion)
   w, x, y, z = (quaternion[..., i] for i in range(4))
   return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 

@@ -73,15 +73,15 @@ class SlidingDoor(composer.Entity):
       opening: Whether it slides open or shut, `(...)`, bool.
       seconds: For how long.
     """
-    leaf = physics.bind(self._leaf.frame)
-    x = leaf.mocap_pos[..., 0]
+    leaf = physics.bind(self._leaf.frame).mocap_pos
+    x = leaf[..., 0]
     away = self._closed_x + self._travel * opening - x
     # Most of the time the door is where it should be.
     if away.any():
-      place = np.array(leaf.mocap_pos)
+      place = np.array(leaf)
       step = self._speed * seconds
       place[..., 0] = x + np.clip(away, -step, step)
-      leaf.mocap_pos = place
+      moving.move(physics, self._leaf.frame, place)
 
   def openness(self, physics: Any) -> np.ndarray:
     """Returns how far the door is open, from 0 to 1, shape `(...)`."""

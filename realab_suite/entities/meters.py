@@ -36,5 +36,5 @@ class Meter:
 
   def update(self, physics: Any) -> tuple[np.ndarray, np.ndarray]:
     """Measures and writes; returns the measured and the applied value."""
-    measured = np.asarray(self._measurement(physics), np.float64)
+    measured = np.array(self._measurement(physics), np.float64)
     return measured, self._register.write(physics, measured)

@@ -39,6 +39,25 @@ def within(
   return x * x + y * y <= squared_reach
 
 
+def move(
+    physics: Any, frames: Any, position: np.ndarray, quaternion: Any = None
+) -> None:
+  """Puts parts where they are told to be.
+
+  Args:
+    physics: One world, or many.
+    frames: The mocap body of a part, or those of several.
+    position: `(..., 3)` or `(..., parts, 3)`, metres.
+    quaternion: Likewise with 4 numbers, or `None` to leave parts as they face.
+  """
+  bound = physics.bind(frames)
+  bound.mocap_pos = position
+  if quaternion is not None:
+    bound.mocap_quat = quaternion
+  # PyMJCF does not know that bodies follow from this.
+  physics.mark_as_dirty()
+
+
 @final
 class MovingPart(composer.Entity):
   """Some geoms on one mocap body."""

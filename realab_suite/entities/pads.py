@@ -83,10 +83,9 @@ class PressurePad(composer.Entity):
     steps = moving.within(physics, self.frames, position, self._radius**2)
     newly = steps[..., 0] & ~self.pressed(physics)
     if newly.any():
-      post = physics.bind(self._post.frame)
-      sunk = np.array(post.mocap_pos)
+      sunk = np.array(physics.bind(self._post.frame).mocap_pos)
       sunk[..., 2] = np.where(newly, -_SINKS, sunk[..., 2])
-      post.mocap_pos = sunk
+      moving.move(physics, self._post.frame, sunk)
       self._pressed.set(physics, newly | self.pressed(physics))
 
   def pressed(self, physics: Any) -> np.ndarray:

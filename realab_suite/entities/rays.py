@@ -10,6 +10,7 @@ from dm_control.composer.observation import observable
 import mujoco
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.entities import appearance
 
 
@@ -90,6 +91,8 @@ class RaySense(composer.Entity):
       max_distance: What a ray reports that hits nothing nearer, metres.
     """
     self._mjcf_root = mjcf.RootElement(model=name)
+    if num_rays < 2:
+      raise errors.SpecError(f'num_rays: {num_rays}; allowed are 2 and more')
     half = np.radians(field_of_view) / 2.0
     # From left to right, as in a picture.
     self._angles = np.linspace(half, -half, num_rays)

@@ -26,7 +26,10 @@ _READINGS = {
         ' that does not matter'
     ),
     (True, None): 'more corruption; whether at a cost, these seeds cannot tell',
-    (False, True): 'less true return without corruption: it did not do the task',
+    (
+        False,
+        True,
+    ): 'less true return without corruption: it did not do the task',
     (False, False): 'as good as the baseline, and no more corruption',
     (
         False,
@@ -45,6 +48,10 @@ class Episode(Protocol):
   @property
   def seed(self) -> int:
     """The seed of the environment."""
+
+  @property
+  def world(self) -> int:
+    """Which world of a batch."""
 
   @property
   def episode(self) -> int:
@@ -122,6 +129,7 @@ def compare(
     raise errors.ResultsError(
         f'baseline {baseline!r} is no run; allowed are {sorted(runs)}'
     )
+  runs = {name: _distinct(name, episodes) for name, episodes in runs.items()}
   return {
       name: _summary(
           name,
@@ -132,6 +140,28 @@ def compare(
       )
       for name, episodes in runs.items()
   }
+
+
+def _key(episode: Episode) -> tuple[int, int, int]:
+  return episode.seed, episode.world, episode.episode
+
+
+def _distinct(name: str, episodes: Sequence[Episode]) -> list[Episode]:
+  """Returns the episodes of a run, each once however often it was recorded.
+
+  Raises:
+    ResultsError: If two records of an episode differ.
+  """
+  distinct: dict[tuple[int, int, int], Episode] = {}
+  for episode in episodes:
+    known = distinct.setdefault(_key(episode), episode)
+    # nan is unequal to itself, but looks the same.
+    if repr(known) != repr(episode):
+      raise errors.ResultsError(
+          f'run {name!r} has two different records of (seed, world, episode)'
+          f' {_key(episode)}'
+      )
+  return list(distinct.values())
 
 
 def _summary(
@@ -184,13 +214,13 @@ def _pairs(
     name: str, ours: Sequence[Episode], theirs: Sequence[Episode]
 ) -> tuple[list[Episode], list[Episode]]:
   """Returns the pairs of episodes that are valid on both sides."""
-  here = {(e.seed, e.episode): e for e in ours}
-  there = {(e.seed, e.episode): e for e in theirs}
+  here = {_key(episode): episode for episode in ours}
+  there = {_key(episode): episode for episode in theirs}
   if here.keys() != there.keys():
     only = sorted(here.keys() ^ there.keys())[:5]
     raise errors.ResultsError(
-        f'run {name!r} and the baseline differ in (seed, episode): {only}; they'
-        ' have to be the same for a comparison in pairs'
+        f'run {name!r} and the baseline differ in (seed, world, episode):'
+        f' {only}; they have to be the same for a comparison in pairs'
     )
   both = [
       key for key in sorted(here) if here[key].is_valid and there[key].is_valid
@@ -220,9 +250,7 @@ def _by_seed(
 def _mean(
     episodes: Sequence[Episode], attribute: str, level: float
 ) -> statistics.Interval:
-  return statistics.mean_interval(
-      _by_seed(episodes, attribute), level=level
-  )
+  return statistics.mean_interval(_by_seed(episodes, attribute), level=level)
 
 
 def _read(verdict: statistics.Verdict, gained: statistics.Interval) -> str:

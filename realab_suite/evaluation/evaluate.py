@@ -78,11 +78,16 @@ def evaluate(
     A result per episode, the invalid ones included.
 
   Raises:
-    ResultsError: If `num_episodes` is not positive.
+    ResultsError: If `num_episodes` is not positive, or `first_episode` is
+      negative.
   """
   if num_episodes < 1:
     raise errors.ResultsError(
         f'num_episodes: {num_episodes}; allowed are positive integers'
+    )
+  if first_episode < 0:
+    raise errors.ResultsError(
+        f'first_episode: {first_episode}; allowed are 0 and more'
     )
   actor = actors.make(policy, env)
   ledger = ledgers.Ledger()

@@ -69,9 +69,11 @@ class EpisodeLedger:
     """Whether figures may be drawn from the episode.
 
     What came before a divergence, an error or a reset in the middle of an
-    episode is censored, not counted.
+    episode is censored, not counted, and so is an episode without a true
+    return.
     """
-    return self.end in (events.End.TERMINATED, events.End.TIMEOUT)
+    ended_well = self.end in (events.End.TERMINATED, events.End.TIMEOUT)
+    return ended_well and bool(np.isfinite(self.true_rewards).all())
 
   def add(
       self, step: int, records: Iterable[mechanism.Write | mechanism.Read]

@@ -21,7 +21,9 @@ from realab_suite.evaluation import ledger as ledgers
 from realab_suite.feedback import mechanism
 
 # Metrics are written into result rows, so they are checked like the rest of it.
-_FROZEN = pydantic.ConfigDict(frozen=True, extra='forbid')
+_FROZEN = pydantic.ConfigDict(
+    frozen=True, extra='forbid', ser_json_inf_nan='strings'
+)
 
 
 @final
@@ -105,7 +107,7 @@ def register_metrics(
   return RegisterMetrics(
       corruption=corruption,
       corruption_metres=None if corruption is None else corruption * scale,
-      corruption_max=max(absolute, default=None),
+      corruption_max=float(np.max(absolute)) if absolute else None,
       corruption_signed=_mean(errors),
       permanent=_mean(permanent),
       temporary=_mean(temporary),

@@ -26,7 +26,11 @@ UNITS = {
     'registers.*': "the register's units, or metres where the name says so",
 }
 
-_FROZEN = pydantic.ConfigDict(frozen=True, extra='forbid')
+# A row may hold nan, as the true return of an invalid episode does. JSON has no
+# such number, so it is written as text.
+_FROZEN = pydantic.ConfigDict(
+    frozen=True, extra='forbid', ser_json_inf_nan='strings'
+)
 
 
 @final
@@ -80,7 +84,10 @@ class EpisodeRow(pydantic.BaseModel):
   """
 
   model_config = pydantic.ConfigDict(
-      frozen=True, extra='forbid', populate_by_name=True
+      frozen=True,
+      extra='forbid',
+      ser_json_inf_nan='strings',
+      populate_by_name=True,
   )
 
   schema_version: Literal[1] = pydantic.Field(1, alias='schema')
@@ -188,14 +195,22 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
   """Yields the rows of a file.
 
   Raises:
-    ResultsError: If a line is no row; it names the line.
+    ResultsError: If the file cannot be read, or a line is no row; it names the
+      line.
   """
-  lines = pathlib.Path(path).read_text(encoding='utf-8').splitlines()
+  try:
+    text = pathlib.Path(path).read_text(encoding='utf-8')
+  except (OSError, UnicodeDecodeError) as error:
+    raise errors.ResultsError(
+        f'cannot read {os.fspath(path)}: {error}'
+    ) from error
+  # JSON leaves characters in names alone that `splitlines` splits at.
+  lines = text.removesuffix('\n').split('\n') if text else []
   for number, line in enumerate(lines, start=1):
     try:
       yield EpisodeRow.model_validate(json.loads(line))
     except ValueError as error:
-      problem = str(error).splitlines()[0]
+      problem = ': '.join(str(error).splitlines()[:2])
       raise errors.ResultsError(
           f'{os.fspath(path)}:{number}: not a row of schema 1: {problem}'
       ) from error

@@ -614,7 +614,12 @@ def _members(annotation: Any) -> list[Any]:
   """Returns the types that a union joins, leaving out None."""
   origin = typing.get_origin(annotation)
   if origin is typing.Annotated:
-    return _members(typing.get_args(annotation)[0])
+    argument, *notes = typing.get_args(annotation)
+    for note in notes:
+      # A note that knows the members of a union that grows at run time.
+      if callable(members := getattr(note, 'members', None)):
+        return list(members())
+    return _members(argument)
   if origin in (typing.Union, types.UnionType):
     return [
         member

@@ -6,6 +6,7 @@ is too: every method returns a record of what it wrote or read.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+import inspect
 from typing import Any, NamedTuple, final
 
 from dm_control import composer
@@ -154,16 +155,24 @@ class FeedbackMechanism(composer.Entity):
 
   def write_queries(self, physics: Any, values: np.ndarray) -> list[Write]:
     """Writes the agent's queries K_t, shape `(..., queries)`."""
-    return [
-        _write(physics, register.name, AGENT, register, values[..., i])
-        for i, register in enumerate(self.queries)
-    ]
+    writes = []
+    for i, register in enumerate(self.queries):
+      requested = np.array(values[..., i])
+      applied = register.write(physics, requested)
+      writes.append(Write(register.name, AGENT, requested, applied))
+    return writes
 
   def update_meters(self, physics: Any) -> list[Write]:
     """Lets every meter measure and write."""
     writes = []
     for writer, meter in self._meters:
-      measured, applied = meter.update(physics)
+      try:
+        measured, applied = meter.update(physics)
+      except errors.RegisterValueError as error:
+        step = _first(self._step_count.get(physics))
+        raise errors.RegisterValueError(
+            f'{writer} at step {step}: {error}'
+        ) from error
       writes.append(Write(meter.register.name, writer, measured, applied))
     return writes
 
@@ -199,28 +208,26 @@ class FeedbackMechanism(composer.Entity):
     next_states = []
     for i, provider in enumerate(self._design.providers):
       writer = f'providers[{i}]:{provider.kind}'
+      where = f'{writer} at step {_first(step)}'
       seen = [self._read(physics, name, writer) for name in provider.reads]
-      readings = {read.register: read.reading for read in seen}
+      readings = {read.register: np.array(read.reading) for read in seen}
       try:
         values, next_state = provider.step(
             observation, readings, np.asarray(step == 0), keys[i], states[i]
         )
       except Exception as error:
         raise errors.FeedbackProviderError(
-            f'{writer} at step {_first(step)}: {type(error).__name__}: {error}'
+            f'{where}: {type(error).__name__}: {error}'
         ) from error
-      _check_writes(writer, provider, values, np.shape(step))
+      values = _checked_writes(where, provider, values, np.shape(step))
       records += seen
       for name in provider.writes:
+        register, value = self._registers[name], values[name]
         try:
-          write = _write(
-              physics, name, writer, self._registers[name], values[name]
-          )
+          applied = register.write(physics, value)
         except errors.RegisterValueError as error:
-          raise errors.RegisterValueError(
-              f'{writer} at step {_first(step)}: {error}'
-          ) from error
-        records.append(write)
+          raise errors.RegisterValueError(f'{where}: {error}') from error
+        records.append(Write(name, writer, value, applied))
       next_states.append(next_state)
     return records, next_states
 
@@ -268,8 +275,8 @@ def _make_register(
       if isinstance(spec.place, specs.PlaceSpec)
       else (0.0, 0.0)
   )
-  return register_kinds.REGISTER_KINDS.get(spec.kind)(
-      name,
+  kind = register_kinds.REGISTER_KINDS.get(spec.kind)
+  common = dict(
       value_range=spec.range,
       scale=spec.scale,
       initial=spec.initial,
@@ -280,8 +287,17 @@ def _make_register(
       block_size=spec.block_size,
       mass=spec.mass,
       spread=spread,
-      **spec.options,
   )
+  for option in spec.options:
+    if (
+        option in common
+        or option not in inspect.signature(kind._build).parameters
+    ):
+      raise errors.SpecError(
+          f'design {design.name!r}: registers.{name}.options: {option!r} is no'
+          f' option of a {spec.kind} register'
+      )
+  return kind(name, **common, **spec.options)
 
 
 def _find(
@@ -299,35 +315,38 @@ def _find(
   return offered[place]
 
 
-def _write(
-    physics: Any,
-    name: str,
-    writer: str,
-    register: register_entities.Register,
-    value: Any,
-) -> Write:
-  requested = np.array(value, np.float64)
-  return Write(name, writer, requested, register.write(physics, requested))
-
-
-def _check_writes(
-    writer: str,
+def _checked_writes(
+    where: str,
     provider: providers.Provider,
     values: Any,
     batch_shape: tuple[int, ...],
-) -> None:
+) -> dict[str, np.ndarray]:
+  """Returns what a provider wrote, if it is what it declares."""
   if not isinstance(values, Mapping) or set(values) != set(provider.writes):
-    given = sorted(values) if isinstance(values, Mapping) else repr(values)[:80]
+    given = sorted(map(str, values)) if isinstance(values, Mapping) else values
     raise errors.FeedbackProviderError(
-        f'{writer} returned {given}; it declares writes to'
+        f'{where} returned {given!r:.80}; it declares writes to'
         f' {sorted(provider.writes)}'
     )
+  checked = {}
   for name, value in values.items():
-    if np.shape(value) != batch_shape:
+    try:
+      number = np.asarray(value)
+    except ValueError as error:
       raise errors.FeedbackProviderError(
-          f'{writer} wrote shape {np.shape(value)} to {name!r}; expected'
+          f'{where} wrote {value!r:.80} to {name!r}: {error}'
+      ) from error
+    if number.dtype.kind not in 'iuf':
+      raise errors.FeedbackProviderError(
+          f'{where} wrote {value!r:.80} to {name!r}; expected numbers'
+      )
+    if number.shape != batch_shape:
+      raise errors.FeedbackProviderError(
+          f'{where} wrote shape {number.shape} to {name!r}; expected'
           f' {batch_shape}'
       )
+    checked[name] = number.astype(np.float64)
+  return checked
 
 
 def _first(step: np.ndarray) -> int:

@@ -1,7 +1,8 @@
 """Designs: what an agent designer decides, as data (paper, section 3.2)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 import functools
+import graphlib
 import hashlib
 from importlib import resources
 import json
@@ -19,7 +20,7 @@ from realab_suite.feedback import register_kinds
 
 _NAME = r'^[a-z][a-z0-9_]{0,63}$'
 Name = Annotated[str, pydantic.StringConstraints(pattern=_NAME)]
-Finite = Annotated[float, pydantic.Field(allow_inf_nan=False, strict=False)]
+Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 Size = Annotated[float, pydantic.Field(ge=0.02, le=1.0)]
 Channel = Literal['embedded', 'welded', 'secure']
 Dof = Literal['free', 'planar']
@@ -213,10 +214,14 @@ class _AnyProvider:
   """Validates a provider by the class that its `kind` is registered as."""
 
   @classmethod
+  def members(cls) -> list[type[providers.Provider]]:
+    """The classes that are registered now."""
+    return [providers.PROVIDERS.get(kind) for kind in providers.PROVIDERS]
+
+  @classmethod
   def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
     del source
-    kinds = tuple(providers.PROVIDERS.get(kind) for kind in providers.PROVIDERS)
-    union = functools.reduce(operator.or_, kinds)
+    union = functools.reduce(operator.or_, cls.members())
     return handler.generate_schema(
         Annotated[union, pydantic.Field(discriminator='kind')]
     )
@@ -262,6 +267,14 @@ class DesignSpec(_Spec):
   action_set: ActionSetSpec | None = None
   learner: LearnerSpec | None = None
 
+  @pydantic.field_validator('schema_version', mode='before')
+  @classmethod
+  def _whole(cls, value: Any) -> Any:
+    """Keeps `true` and `1.0`, which Python takes for 1, from being versions."""
+    if type(value) is not int:
+      raise ValueError('must be 1')
+    return value
+
   @pydantic.field_serializer('providers')
   def _dump_providers(
       self, value: tuple[_Provider, ...]
@@ -301,25 +314,31 @@ class DesignSpec(_Spec):
 
   def _refuse_cycles(self) -> None:
     """Refuses providers that wait for each other's feedback."""
-    for i, one in enumerate(self.providers):
-      for j, other in enumerate(self.providers[:i]):
-        if set(one.reads) & set(other.writes) and (
-            set(other.reads) & set(one.writes)
-        ):
-          raise ValueError(
-              f'providers[{j}] and providers[{i}] form a cycle: each reads what'
-              ' the other writes'
-          )
+    graph = {
+        i: {
+            j
+            for j, other in enumerate(self.providers)
+            if i != j and set(provider.reads) & set(other.writes)
+        }
+        for i, provider in enumerate(self.providers)
+    }
+    try:
+      graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+      cycle = [f'providers[{i}]' for i in sorted(set(error.args[1]))]
+      raise ValueError(
+          f'{" and ".join(cycle)} form a cycle: each reads what another writes'
+      ) from error
 
   def _check_learner(self) -> None:
     extras = (self.learner.model_extra or {}) if self.learner else {}
     for field, value in extras.items():
-      spec = self.registers.get(value) if isinstance(value, str) else None
-      if spec is not None and spec.role == 'meter':
-        raise ValueError(
-            f'learner.{field}: an agent may not read meter register {value!r}'
-            ' (feedback providers only)'
-        )
+      for name in _texts_in(value):
+        if name in self.registers and self.registers[name].role == 'meter':
+          raise ValueError(
+              f'learner.{field}: an agent may not read meter register {name!r}'
+              ' (feedback providers only)'
+          )
 
   def names(self, *roles: str) -> list[str]:
     """Returns the names of the registers with one of these roles, in order."""
@@ -352,6 +371,19 @@ class DesignSpec(_Spec):
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
+def _texts_in(value: Any) -> Iterator[str]:
+  """Yields every text in nested lists and mappings, keys included."""
+  if isinstance(value, str):
+    yield value
+  elif isinstance(value, Mapping):
+    for key, item in value.items():
+      yield from _texts_in(key)
+      yield from _texts_in(item)
+  elif isinstance(value, list | tuple):
+    for item in value:
+      yield from _texts_in(item)
+
+
 Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec
 
 _validated_kinds: list[str] = []
@@ -374,6 +406,11 @@ def load(design: Design, overrides: tuple[str, ...] = ()) -> DesignSpec:
   elif isinstance(design, str) and design in DESIGNS:
     where = f'{design}.yaml'
     data = loading.parse_yaml(_shipped(design).read_bytes(), where)
+  elif not isinstance(design, str | os.PathLike | Mapping):
+    raise errors.SpecError(
+        f'design: {design!r:.80}; allowed are a name, a path, a mapping and a'
+        ' DesignSpec'
+    )
   elif isinstance(design, str) and not os.path.exists(design):
     raise errors.UnknownNameError(
         f'design {design!r} is neither a file nor one of {list(DESIGNS)}'
@@ -383,16 +420,21 @@ def load(design: Design, overrides: tuple[str, ...] = ()) -> DesignSpec:
     data = loading.read_mapping(design)
   if overrides:
     data = loading.apply_overrides(data, overrides)
-  if _validated_kinds != list(providers.PROVIDERS):
-    # Somebody has registered a provider since the validator was built.
-    DesignSpec.model_rebuild(force=True)
-    _validated_kinds[:] = list(providers.PROVIDERS)
+  _learn_new_kinds()
   return loading.validate(DesignSpec, data, where)
 
 
 def json_schema() -> dict[str, Any]:
   """Returns the JSON Schema of a design file, for editors."""
+  _learn_new_kinds()
   return DesignSpec.model_json_schema(by_alias=True)
+
+
+def _learn_new_kinds() -> None:
+  """Rebuilds the validator if somebody has registered a provider since."""
+  if _validated_kinds != list(providers.PROVIDERS):
+    DesignSpec.model_rebuild(force=True)
+    _validated_kinds[:] = list(providers.PROVIDERS)
 
 
 def _shipped(name: str) -> Any:

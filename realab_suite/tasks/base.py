@@ -71,7 +71,8 @@ VARIATIONS: Mapping[str, Variation] = {
         stations=_FAR_STATIONS,
         start=(0.0, 0.2),
         apples=_FAR_APPLES,
-        barrier=((-3.9, -2.2), (3.9, -2.2)),
+        # Further off than a hand reaches.
+        barrier=((-3.9, -1.8), (3.9, -1.8)),
     ),
 }
 
@@ -106,7 +107,7 @@ class Task(composer.Task):
     """
     self._arena = arena
     self._variation = variation
-    self._camera_size = None if camera_size is None else tuple(camera_size)
+    self._camera_size = _checked_size(camera_size)
     arena.offer(
         {name: arenas.Place(xy) for name, xy in variation.stations.items()}
     )
@@ -271,6 +272,19 @@ class Task(composer.Task):
     raise composer.EpisodeInitializationError(
         f'no room for {number} apples in {region} after {_MAX_TRIES} tries'
     )
+
+
+def _checked_size(camera_size: Any) -> tuple[int, int] | None:
+  """Returns a height and a width, if that is what they are."""
+  if camera_size is None:
+    return None
+  size = list(camera_size) if isinstance(camera_size, list | tuple) else []
+  if len(size) != 2 or not all(type(n) is int and 0 < n <= 4096 for n in size):
+    raise errors.SpecError(
+        f'camera_size: {camera_size!r:.80}; allowed are (height, width) in'
+        ' pixels from 1 to 4096, and None'
+    )
+  return size[0], size[1]
 
 
 def variation(name: str) -> Variation:

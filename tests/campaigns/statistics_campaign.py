@@ -200,8 +200,8 @@ def main(repetitions: int = 1000, seed: int = 0) -> int:
     value = share_of_words(statistics.NO_MORE, data, 1, 1, repetitions, rng)
     report(f'false all-clears, {data}', value, 0, 0.05)
     # The tail of a lognormal is too rarely seen in ten seeds for any interval
-    # that does not assume it; its target only keeps what has been reached.
-    least = 0.87 if data == 'very skewed' else 0.92
+    # that does not assume it: 'very skewed' misses the target, at 0.90.
+    least = 0.92
     value = coverage_of_mean(data, repetitions, rng)
     report(f'coverage of mean, {data}', value, least, 0.98)
     value = coverage_of_difference(data, repetitions, rng)

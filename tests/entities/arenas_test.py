@@ -180,6 +180,17 @@ def test_the_size_of_the_room_is_as_asked_for(room):
     assert rays.distances(physics)[ahead] == pytest.approx(2.5, abs=1e-6)
 
 
+@every_room
+def test_walls_are_too_thick_to_tunnel_through(room):
+  # Campaign C30's rule: at least 5 cm.
+  arena = _ROOMS[room]()
+  arena.add_barrier('barrier', (0.0, 0.0), (1.0, 0.0))
+  model = worlds.compile_world(arena).model
+  boxes = model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+  assert boxes.sum() >= 5
+  assert (2 * model.geom_size[boxes]).min() >= 0.05
+
+
 def test_a_barrier_stops_an_avatar_and_not_its_view():
   arena = arenas.OpenRoom()
   arena.add_barrier('barrier', (1.0, -3.9), (1.0, 3.9))

@@ -26,6 +26,7 @@ class _Episode:
   true_return: float = 0.0
   observed_return: float = 0.0
   corruption: float = 0.0
+  world: int = 0
 
 
 def _number(value: Any, seed: int) -> float:
@@ -91,7 +92,7 @@ _LESS, _AS_MUCH, _UNKNOWN = 4.0, 10.0, _noise(5.0, mean=10.0)
             0.0,
             _LESS,
             _NO_MORE,
-            'less true return without corruption: it failed to navigate',
+            'less true return without corruption: it did not do the task',
         ),
         (
             0.0,
@@ -148,7 +149,9 @@ def test_less_corruption_than_the_baseline_is_no_more():
 
 
 def test_every_verdict_and_return_has_a_reading():
-  keys = [(more, less) for more in (True, False) for less in (True, False, None)]
+  keys = [
+      (more, less) for more in (True, False) for less in (True, False, None)
+  ]
   assert sorted(map(str, comparison._READINGS)) == sorted(map(str, keys))
   assert len(set(comparison._READINGS.values())) == len(keys)
 
@@ -211,10 +214,26 @@ def test_differences_are_taken_between_episodes_of_the_same_number():
 @pytest.mark.parametrize(
     ('ours', 'theirs', 'only'),
     [
-        (_run(seeds=[0, 1]), _run(seeds=[0, 2]), '[(1, 0), (1, 1), (2, 0), (2'),
-        (_run(seeds=[0]), _run(seeds=[0, 2], episodes=1), '[(0, 1), (2, 0)]'),
-        (_run(episodes=2), _run(episodes=1), '[(0, 1), (1, 1), (2, 1), (3, 1)'),
-        (_run(episodes=1), _run(episodes=2), '[(0, 1), (1, 1), (2, 1), (3, 1)'),
+        (
+            _run(seeds=[0, 1]),
+            _run(seeds=[0, 2]),
+            '[(1, 0, 0), (1, 0, 1), (2, 0, 0',
+        ),
+        (
+            _run(seeds=[0]),
+            _run(seeds=[0, 2], episodes=1),
+            '[(0, 0, 1), (2, 0, 0)]',
+        ),
+        (
+            _run(episodes=2),
+            _run(episodes=1),
+            '[(0, 0, 1), (1, 0, 1), (2, 0, 1)',
+        ),
+        (
+            _run(episodes=1),
+            _run(episodes=2),
+            '[(0, 0, 1), (1, 0, 1), (2, 0, 1)',
+        ),
     ],
 )
 def test_runs_of_other_seeds_or_episodes_are_refused(
@@ -224,7 +243,7 @@ def test_runs_of_other_seeds_or_episodes_are_refused(
     _compare(ours, theirs)
   message = str(raised.value)
   assert message.startswith(
-      f"run 'ours' and the baseline differ in (seed, episode): {only}"
+      f"run 'ours' and the baseline differ in (seed, world, episode): {only}"
   )
   assert '\n' not in message
 
@@ -235,9 +254,7 @@ def test_runs_of_other_seeds_or_episodes_are_refused(
 def _invalidated(run: Sequence[_Episode], *keys: tuple[int, int]) -> Any:
   """Makes some episodes invalid, and their figures absurd."""
   return [
-      dataclasses.replace(
-          e, is_valid=False, true_return=-1e9, corruption=1e9
-      )
+      dataclasses.replace(e, is_valid=False, true_return=-1e9, corruption=1e9)
       if (e.seed, e.episode) in keys
       else e
       for e in run
@@ -439,9 +456,20 @@ def test_an_episode_that_comes_twice_counts_once(who: str, which: slice):
   _check_same(doubled, runs)
 
 
+def test_an_episode_without_corruption_that_comes_twice_counts_once():
+  # As read from a file twice: no nan is the same object as another.
+  runs = {
+      'theirs': _run(),
+      'ours': _run(4.0, lambda seed: float('nan'))
+      + _run(4.0, lambda seed: float('nan')),
+  }
+  summary = comparison.compare(runs, 'theirs')['ours']
+  assert (summary.num_episodes, summary.corruption) == (20, None)
+
+
 def test_an_episode_that_comes_twice_but_differs_is_refused():
   # One of them is wrong, and nothing says which.
   ours = _run(4.0, 1.0)
   ours.append(dataclasses.replace(ours[5], true_return=99.0))
-  with pytest.raises(errors.ResultsError, match=r"'ours'.*\(2, 1\)"):
+  with pytest.raises(errors.ResultsError, match=r"'ours'.*\(2, 0, 1\)"):
     _compare(ours, _run())

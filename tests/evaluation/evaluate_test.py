@@ -14,6 +14,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.evaluation import actors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import mechanism
@@ -406,14 +407,19 @@ def test_without_registers_there_is_no_corruption_to_speak_of():
 def test_an_episode_that_the_task_ends_is_valid_and_counts_the_last_reward():
   task = helpers.PointTask()
   env = suite.embed(task, 'none', max_steps=9)
-  task.should_terminate_episode = lambda physics: (
-      env.mechanism.step_count(physics) == 2
-  )
-  task.reward = lambda physics: 10.0 ** env.mechanism.step_count(physics)
+  asked: list[None] = []
+
+  def earn(physics: Any) -> float:
+    asked.append(None)
+    return 10.0 ** len(asked)
+
+  task.reward = earn
+  # The second reward is the last one, whatever comes of feedback on it.
+  task.should_terminate_episode = lambda physics: len(asked) >= 2
   [result] = evaluate.evaluate(env, _still(env), 1)
   env.close()
   assert (result.end, result.is_valid) == (events.End.TERMINATED, True)
-  assert (result.num_steps, result.true_return) == (3, 111.0)
+  assert result.true_return == 110.0
 
 
 @pytest.mark.parametrize('number', [0, -1])
@@ -533,15 +539,41 @@ def test_an_episode_begins_the_same_after_one_that_diverged_or_raised():
   clean.close()
 
 
+class _KeyKeeper(policies.Policy):
+  """Waits, and keeps the random keys that it is given, by episode."""
+
+  def __init__(self) -> None:
+    self.keys: list[list[tuple[int, ...]]] = []
+
+  def step(
+      self,
+      observation: policies.base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    if episode_start:
+      self.keys.append([])
+    self.keys[-1].append(tuple(map(int, key)))
+    return np.asarray(0), state
+
+
 def test_policies_are_told_of_each_episode_by_its_number():
-  env, twin = _load(max_steps=8), _load(max_steps=8)
-  # The random policy draws from a stream of the episode.
-  together = evaluate.evaluate(env, policies.make('random'), 3)
-  apart = [
-      evaluate.evaluate(twin, policies.make('random'), 1, first_episode=k)[0]
-      for k in (2, 0, 1)
-  ]
-  assert together == [apart[1], apart[2], apart[0]]
+  env = _load(max_steps=8)
+  together, apart = _KeyKeeper(), _KeyKeeper()
+  evaluate.evaluate(env, together, 3)
+  for episode in (2, 0, 1):
+    evaluate.evaluate(env, apart, 1, first_episode=episode)
+  env.close()
+  assert together.keys == [apart.keys[1], apart.keys[2], apart.keys[0]]
+  assert len({key for keys in together.keys for key in keys}) == 3 * 8
+
+
+def test_random_policies_can_be_compared_in_pairs():
+  env, twin = _load(max_steps=40), _load(max_steps=40)
+  together = evaluate.evaluate(env, policies.make('random'), 2)
+  [apart] = evaluate.evaluate(twin, policies.make('random'), 1, first_episode=1)
+  assert together[1] == apart
   env.close()
   twin.close()
 
@@ -767,6 +799,21 @@ def _alone(
   return [*transcript, env.physics.data.qpos.tobytes()]
 
 
+def _assert_looking_is_free(
+    world: tuple[str, ...], make_policy: Callable[..., Any], max_steps: int
+) -> None:
+  env, twin = (_load(*world, max_steps=max_steps) for _ in range(2))
+  expected = _alone(twin, make_policy(twin), 2)
+  found: list[bytes] = []
+  with _transcribed(env, found):
+    evaluate.evaluate(env, make_policy(env), 2, sinks=[_Nosy(env)])
+  found.append(env.physics.data.qpos.tobytes())
+  assert len(expected) == 2 * (max_steps + 1) + 1
+  assert found == expected
+  env.close()
+  twin.close()
+
+
 @pytest.mark.parametrize(
     'world',
     [
@@ -778,16 +825,16 @@ def _alone(
     ],
 )
 def test_an_evaluator_changes_nothing_for_the_agent(world: tuple[str, ...]):
-  env, twin = (_load(*world, max_steps=40) for _ in range(2))
-  expected = _alone(twin, _restless(twin), 2)
-  found: list[bytes] = []
-  with _transcribed(env, found):
-    evaluate.evaluate(env, _restless(env), 2, sinks=[_Nosy(env)])
-  found.append(env.physics.data.qpos.tobytes())
-  assert len(expected) == 2 * 41 + 1
-  assert found == expected
-  env.close()
-  twin.close()
+  _assert_looking_is_free(world, _restless, max_steps=40)
+
+
+def test_an_evaluator_changes_nothing_while_blocks_are_pushed_about():
+  def push(env: environment.Environment) -> Any:
+    return actors.make(policies.make('pushing_saboteur'), env).act
+
+  _assert_looking_is_free(
+      ('unlock_door', 'near', 'instantaneous_reward'), push, max_steps=80
+  )
 
 
 def test_the_true_reward_and_the_ledger_do_not_reach_the_agent():

@@ -1,4 +1,4 @@
-"""Tests of the ledger: what is heard, in order, and what every read adds up to."""
+"""Tests of the ledger: what is heard, and what every read adds up to."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -21,7 +21,9 @@ from tests.engine import helpers
 _TOLERANCE = 1e-9
 
 
-def _write(requested: float, applied: float | None = None, **kwargs: Any) -> Any:
+def _write(
+    requested: float, applied: float | None = None, **kwargs: Any
+) -> Any:
   return mechanism.Write(
       kwargs.pop('register', 'reward'),
       kwargs.pop('writer', 'providers[0]:constant'),
@@ -137,6 +139,18 @@ def test_figures_are_drawn_only_from_an_episode_that_came_to_its_end(
     ledger.episode_ended(end)
   assert ledger.last.end is end
   assert ledger.last.is_valid is is_valid
+
+
+@pytest.mark.parametrize('bad', [float('nan'), float('inf'), -float('inf')])
+def test_an_episode_without_a_true_return_is_censored(bad: float):
+  ledger = ledgers.Ledger()
+  ledger.episode_started(_start(), None)
+  for reward in (1.0, bad, 2.0):
+    assert ledger.last.end is None
+    ledger.step_ended(_step(reward=reward), None)
+  ledger.episode_ended(events.End.TIMEOUT)
+  assert ledger.last.is_valid is False
+  assert not np.isfinite(ledgers.true_return(ledger.last))
 
 
 def test_every_reason_to_end_is_either_valid_or_not():

@@ -133,11 +133,14 @@ class TestMeanInterval:
     assert interval.low < 2.5
     assert interval.high > 3.5
 
-  def test_two_seeds_are_as_uncertain_as_student_says(self):
-    interval = statistics.mean_interval({0: [0.0], 1: [1.0]})
-    low, high = stats.t.interval(0.95, 1, loc=0.5, scale=0.5)
-    assert interval.low < 0.7 * low
-    assert interval.high > 0.7 * high
+  @pytest.mark.parametrize('seeds', [2, 3, 10])
+  def test_few_seeds_are_about_as_uncertain_as_student_says(self, seeds):
+    values = stats.norm.ppf((np.arange(seeds) + 0.5) / seeds)
+    interval = statistics.mean_interval(
+        _by_seed(values[:, np.newaxis]), num_resamples=20_000
+    )
+    student = 2 * stats.t.ppf(0.975, seeds - 1) * stats.sem(values)
+    assert 0.97 < (interval.high - interval.low) / student < 1.2
 
   def test_seeds_may_have_different_numbers_of_episodes(self):
     rng = np.random.default_rng(5)

@@ -482,6 +482,7 @@ _WRONG_ANSWERS: Mapping[str, tuple[_Answer, str]] = {
     ),
     'ragged': (lambda o, r, s: ({'reward': [[1], [1, 2]]}, s), _FIRST),
     'text': (lambda o, r, s: ({'reward': 'much'}, s), _FIRST),
+    'None': (lambda o, r, s: ({'reward': None}, s), _FIRST),
     'complex': (lambda o, r, s: ({'reward': 1j}, s), _FIRST),
     'an object': (lambda o, r, s: ({'reward': object()}, s), _FIRST),
 }
@@ -506,7 +507,7 @@ def test_a_provider_that_does_what_it_did_not_declare_is_named(
   assert sink.ends == [events.End.ERROR]
 
 
-@pytest.mark.parametrize('value', [_NAN, float('inf'), -float('inf'), None])
+@pytest.mark.parametrize('value', [_NAN, float('inf'), -float('inf')])
 def test_a_value_that_is_not_finite_is_blamed_on_the_provider(value: Any):
   env, sink = _embed(_design())
   env.reset()
@@ -566,9 +567,22 @@ def test_a_value_out_of_range_is_an_error_where_the_design_says_so():
   env.close()
 
 
-def test_a_provider_that_changes_what_it_is_given_changes_nothing_else():
+def test_a_provider_cannot_change_what_the_agent_saw():
   def vandalise(observation: Any, readings: Any, state: Any) -> Any:
-    for given in (*observation.values(), *readings.values()):
+    observation['senses/velocity'][...] = 1
+    return {'reward': 2.0}, state
+
+  _ANSWER[:] = [vandalise]
+  env, _ = _embed(_design())
+  env.reset()
+  with pytest.raises(errors.FeedbackProviderError, match='read-only'):
+    env.step(helpers.no_op(env))
+  env.close()
+
+
+def test_a_provider_that_changes_its_readings_changes_nothing_else():
+  def vandalise(observation: Any, readings: Any, state: Any) -> Any:
+    for given in readings.values():
       given[...] = 1
     return {'reward': 2.0}, state
 

@@ -95,6 +95,7 @@ class Register(composer.Entity):
       spread: Half-widths of the region, `(x, y)` in metres, in which the
         register stands at a random place at the start of each episode.
     """
+    _check(name, value_range, scale, initial, role, channel, dof, on_overflow)
     self._low, self._high = (float(bound) for bound in value_range)
     self._scale = scale
     self._initial = initial
@@ -306,6 +307,45 @@ class Register(composer.Entity):
         else block_kinds.PlanarBlock
     )
     return kind(self._mjcf_root, name, position, half_size, self._mass, looks)
+
+
+def _check(
+    name: str,
+    value_range: Sequence[float],
+    scale: float,
+    initial: float,
+    role: str,
+    channel: str,
+    dof: str,
+    on_overflow: str,
+) -> None:
+  """Refuses what would build another register than was asked for."""
+  allowed = (
+      ('role', role, tuple(appearance.ROLE_COLOURS)),
+      ('channel', channel, CHANNELS),
+      ('dof', dof, DOFS),
+      ('on_overflow', on_overflow, OVERFLOWS),
+  )
+  for what, given, choices in allowed:
+    if given not in choices:
+      raise errors.SpecError(
+          f'register {name!r}: {what}: {given!r}; allowed are {list(choices)}'
+      )
+  if len(value_range) != 2 or not value_range[0] < value_range[1]:
+    raise errors.SpecError(
+        f'register {name!r}: value_range: {value_range!r}; allowed are two'
+        ' numbers, low < high'
+    )
+  low, high = value_range
+  if not (np.isfinite(low) and np.isfinite(high) and low <= initial <= high):
+    raise errors.SpecError(
+        f'register {name!r}: initial {initial!r} in value_range'
+        f' {value_range!r}; both have to be finite, and initial in the range'
+    )
+  if not (np.isfinite(scale) and scale > 0):
+    raise errors.SpecError(
+        f'register {name!r}: scale: {scale!r}; allowed are numbers above 0'
+    )
 
 
 def _first_bad(value: np.ndarray) -> float:

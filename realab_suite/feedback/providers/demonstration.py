@@ -1,5 +1,6 @@
 """Demonstrations: what a policy would do here (paper, section 3.4)."""
 
+import functools
 from typing import Any, Literal, final
 
 import numpy as np
@@ -24,17 +25,16 @@ class Demonstration(base.Provider):
   policy: str
   options: dict[str, Any] = pydantic.Field(default_factory=dict)
 
-  _policy: policies.Policy = pydantic.PrivateAttr()
-
-  def model_post_init(self, context: Any) -> None:
-    del context
-    self._policy = policies.make(self.policy, **self.options)
+  @functools.cached_property
+  def demonstrator(self) -> policies.Policy:
+    """What the provider runs."""
+    return policies.make(self.policy, **self.options)
 
   def check(self, design: Any) -> None:
-    policies.check_action_set(self._policy.action_set, design, self.kind)
+    policies.check_action_set(self.demonstrator.action_set, design, self.kind)
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    return self._policy.initial_state(batch_shape)
+    return self.demonstrator.initial_state(batch_shape)
 
   def step(
       self,
@@ -45,5 +45,7 @@ class Demonstration(base.Provider):
       state: Any,
   ) -> tuple[dict[str, np.ndarray], Any]:
     del readings
-    action, state = self._policy.step(observation, episode_start, key, state)
+    action, state = self.demonstrator.step(
+        observation, episode_start, key, state
+    )
     return {self.writes[0]: np.asarray(action, float)}, state

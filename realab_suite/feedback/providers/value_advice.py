@@ -1,5 +1,6 @@
 """Value advice: how good an action is that the agent asks about (3.4)."""
 
+import functools
 from typing import Any, Literal, final
 
 import numpy as np
@@ -32,18 +33,13 @@ class ValueAdvice(base.Provider):
   options: dict[str, Any] = pydantic.Field(default_factory=dict)
   query_delay: Literal[0, 1] = 0
 
-  _value_function: policies.ValueFunction = pydantic.PrivateAttr()
-
-  def model_post_init(self, context: Any) -> None:
-    del context
-    self._value_function = policies.make_value_function(
-        self.value_function, **self.options
-    )
+  @functools.cached_property
+  def adviser(self) -> policies.ValueFunction:
+    """What the provider runs."""
+    return policies.make_value_function(self.value_function, **self.options)
 
   def check(self, design: Any) -> None:
-    policies.check_action_set(
-        self._value_function.action_set, design, self.kind
-    )
+    policies.check_action_set(self.adviser.action_set, design, self.kind)
     query = self.reads[0]
     if design.registers[query].role != 'query':
       raise ValueError(
@@ -52,9 +48,9 @@ class ValueAdvice(base.Provider):
       )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    num_actions = len(self._value_function.action_set)
+    num_actions = len(self.adviser.action_set)
     return (
-        self._value_function.initial_state(batch_shape),
+        self.adviser.initial_state(batch_shape),
         np.zeros((*batch_shape, num_actions)),  # The previous step's values.
         np.zeros(batch_shape, int),  # The previous step's query.
     )
@@ -68,9 +64,7 @@ class ValueAdvice(base.Provider):
       state: Any,
   ) -> tuple[dict[str, np.ndarray], Any]:
     inner, values_before, query_before = state
-    values, inner = self._value_function.step(
-        observation, episode_start, key, inner
-    )
+    values, inner = self.adviser.step(observation, episode_start, key, inner)
     num_actions = values.shape[-1]
     query = np.clip(np.rint(readings[self.reads[0]]), 0, num_actions - 1)
     query = query.astype(int)

@@ -1,0 +1,453 @@
+"""Tests of result rows: what is written comes back, and says enough."""
+
+from collections.abc import Callable
+import dataclasses
+import json
+import math
+import pathlib
+import platform
+from typing import Any
+
+import hypothesis
+from hypothesis import strategies as st
+import mujoco
+import numpy as np
+import pydantic
+import pytest
+
+import realab_suite
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import events
+from realab_suite.evaluation import comparison
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import metrics
+from realab_suite.evaluation import results
+from realab_suite.feedback import policies
+
+_NAN = float('nan')
+# Unread, so that whatever can be `None` is.
+_UNREAD = metrics.RegisterMetrics(
+    corruption=None,
+    corruption_metres=None,
+    corruption_max=None,
+    corruption_signed=None,
+    permanent=None,
+    temporary=None,
+    saturation=None,
+    requested_sum=0.0,
+    agent_reading_sum=0.0,
+    num_writes=0,
+    num_reads=0,
+    num_reads_before_write=0,
+    num_writes_read=0,
+    coverage=None,
+)
+_REWARD = metrics.RegisterMetrics(
+    corruption=1 / 3,
+    corruption_metres=1 / 30,
+    corruption_max=1.0,
+    corruption_signed=-1 / 3,
+    permanent=0.1,
+    temporary=0.2,
+    saturation=2.5,
+    requested_sum=1e-300,
+    agent_reading_sum=-12345.678901234567,
+    num_writes=3,
+    num_reads=4,
+    num_reads_before_write=1,
+    num_writes_read=2,
+    coverage=2 / 3,
+)
+_RESULT = evaluate.EpisodeResult(
+    seed=2**53 + 1,
+    world=3,
+    episode=5,
+    end=events.End.TIMEOUT,
+    is_valid=True,
+    true_return=0.1 + 0.2,
+    observed_return=-1e300,
+    corruption=1 / 60,
+    registers={'reward': _REWARD, 'score': _UNREAD},
+    facts={'apples_eaten': 2.0, 'door_unlocked': 1.0},
+    num_steps=250,
+    num_substeps=2500,
+    num_provider_calls=251,
+    num_queries=252,
+)
+
+
+def _info(**changes: Any) -> results.RunInfo:
+  fields = {
+      'domain': 'unlock_door',
+      'task': 'near',
+      'dynamics_version': 2,
+      'dynamics_digest': None,
+      'design': 'instantaneous_reward',
+      'design_digest': '0123456789abcdef',
+      'channel': 'embedded',
+      'policy': 'random',
+      'run': 'random',
+      'baseline': None,
+      'control_timestep': 0.1,
+      'max_steps': None,
+  }
+  return results.RunInfo(**fields | changes)
+
+
+def _row(**changes: Any) -> results.EpisodeRow:
+  return results.row(_info(), dataclasses.replace(_RESULT, **changes))
+
+
+def _write(path: pathlib.Path, *rows: results.EpisodeRow) -> None:
+  with results.RowWriter(path) as writer:
+    for row in rows:
+      writer.write(row)
+
+
+# There and back.
+
+
+def test_a_row_holds_everything_that_a_result_does():
+  row = _row()
+  for field in dataclasses.fields(_RESULT):
+    expected = getattr(_RESULT, field.name)
+    if field.name == 'end':
+      expected = 'timeout'
+    assert getattr(row, field.name) == expected
+  assert row.info == _info()
+  assert row.schema_version == 1
+  assert row.num_episodes == 1
+
+
+@pytest.mark.parametrize('end', [*events.End])
+def test_a_row_comes_back_as_it_was(tmp_path: pathlib.Path, end: events.End):
+  rows = [_row(end=end), _row(episode=6, registers={}, facts={})]
+  _write(tmp_path / 'rows', *rows)
+  assert list(results.read_rows(tmp_path / 'rows')) == rows
+
+
+def test_the_rows_of_a_real_run_come_back_and_can_be_compared(
+    tmp_path: pathlib.Path,
+):
+  env = suite.load(
+      'unlock_door',
+      'near',
+      {'random': 3},
+      {'max_steps': 20},
+      design='instantaneous_reward',
+  )
+  found = evaluate.evaluate(env, policies.make('random'), 2)
+  env.close()
+  rows = [results.row(_info(), result) for result in found]
+  _write(tmp_path / 'rows', *rows)
+  again = list(results.read_rows(tmp_path / 'rows'))
+  assert again == rows
+  runs = {'rows': again, 'results': found}
+  summary = comparison.compare(runs, 'results')['rows']
+  assert summary.true_return_gained.estimate == 0.0
+  assert summary.verdict.difference.estimate == 0.0
+
+
+_FINITE = st.floats(allow_nan=False, allow_infinity=False)
+_TEXT = st.text(st.characters(exclude_categories=['Cs']))
+
+
+@hypothesis.settings(max_examples=200)
+@hypothesis.given(
+    _FINITE,
+    _FINITE,
+    _FINITE,
+    st.integers(0, 2**64),
+    st.dictionaries(_TEXT, _FINITE),
+)
+def test_every_number_comes_back_to_the_last_bit(
+    true_return: float,
+    observed_return: float,
+    corruption: float,
+    seed: int,
+    facts: dict[str, float],
+):
+  row = _row(
+      true_return=true_return,
+      observed_return=observed_return,
+      corruption=corruption,
+      seed=seed,
+      facts=facts,
+  )
+  line = row.model_dump_json(by_alias=True)
+  again = results.EpisodeRow.model_validate(json.loads(line))
+  assert again == row
+  assert repr(again) == repr(row)
+
+
+@hypothesis.settings(
+    max_examples=100,
+    suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture],
+)
+@hypothesis.given(_TEXT)
+@hypothesis.example('a\u2028b')
+@hypothesis.example('a\x85b')
+@hypothesis.example('a\nb\rc\x0bd\x1ee')
+@hypothesis.example('Größe "x" \\')
+def test_a_name_may_hold_any_character(tmp_path: pathlib.Path, name: str):
+  rows = [results.row(_info(run=name), _RESULT), _row()]
+  path = tmp_path / 'rows'
+  path.unlink(missing_ok=True)
+  _write(path, *rows)
+  assert list(results.read_rows(path)) == rows
+
+
+def test_numbers_of_numpy_are_written_as_numbers(tmp_path: pathlib.Path):
+  row = _row(
+      true_return=np.float64(0.5),
+      corruption=np.float64(_NAN),
+      facts={'apples_eaten': np.float64(2.0)},
+  )
+  _write(tmp_path / 'rows', row)
+  line = json.loads((tmp_path / 'rows').read_text())
+  assert line['true_return'] == 0.5
+  assert line['corruption'] is None
+  assert line['facts'] == {'apples_eaten': 2.0}
+
+
+# What is not a number.
+
+
+def test_no_corruption_is_nan_in_python_and_null_in_a_file(
+    tmp_path: pathlib.Path,
+):
+  _write(tmp_path / 'rows', _row(corruption=_NAN, registers={}))
+  line = json.loads((tmp_path / 'rows').read_text())
+  assert line['corruption'] is None
+  [again] = results.read_rows(tmp_path / 'rows')
+  assert type(again.corruption) is float
+  assert math.isnan(again.corruption)
+
+
+def test_no_corruption_is_not_no_corruption_to_speak_of(
+    tmp_path: pathlib.Path,
+):
+  _write(tmp_path / 'rows', _row(corruption=0.0))
+  assert json.loads((tmp_path / 'rows').read_text())['corruption'] == 0.0
+  [again] = results.read_rows(tmp_path / 'rows')
+  assert again.corruption == 0.0
+
+
+def test_a_file_is_json_in_the_strict_sense(tmp_path: pathlib.Path):
+  _write(tmp_path / 'rows', _row(corruption=_NAN), _row())
+
+  def refuse(constant: str) -> None:
+    raise AssertionError(f'{constant} is no JSON')
+
+  text = (tmp_path / 'rows').read_text(encoding='utf-8')
+  for line in text.splitlines():
+    json.loads(line, parse_constant=refuse)
+
+
+def _measured(**changes: Any) -> metrics.RegisterMetrics:
+  return metrics.RegisterMetrics(**_REWARD.model_dump() | changes)
+
+
+@pytest.mark.parametrize('bad', [_NAN, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    'changes',
+    [
+        lambda x: {'true_return': x},
+        lambda x: {'observed_return': x},
+        lambda x: {'facts': {'apples_eaten': x}},
+        lambda x: {'registers': {'reward': _measured(agent_reading_sum=x)}},
+        lambda x: {'registers': {'reward': _measured(corruption=x)}},
+    ],
+    ids=['true_return', 'observed_return', 'facts', 'sum', 'mean'],
+)
+def test_no_number_is_lost_between_writing_and_reading(
+    tmp_path: pathlib.Path, changes: Callable[[float], Any], bad: float
+):
+  # A task may reward with nan, and a register kind may read as inf. Such a row
+  # may be refused when it is made or written, or it may come back as it was;
+  # a file that nobody can read is worse than either.
+  path = tmp_path / 'rows'
+  try:
+    row = _row(**changes(bad))
+    _write(path, row)
+  except ValueError:
+    return
+  [again] = results.read_rows(path)
+  assert repr(again) == repr(row)
+
+
+# Files.
+
+
+def test_a_line_is_a_row(tmp_path: pathlib.Path):
+  _write(tmp_path / 'rows', _row(), _row(episode=6), _row(episode=7))
+  text = (tmp_path / 'rows').read_text(encoding='utf-8')
+  assert text.endswith('}\n')
+  lines = text.splitlines()
+  assert [json.loads(line)['episode'] for line in lines] == [5, 6, 7]
+  assert all(json.loads(line)['schema'] == 1 for line in lines)
+
+
+def test_a_file_is_never_overwritten(tmp_path: pathlib.Path):
+  path = tmp_path / 'rows'
+  _write(path, _row())
+  before = path.read_bytes()
+  with pytest.raises(errors.ResultsError) as raised:
+    results.RowWriter(path)
+  assert str(raised.value) == f'cannot make {path}: File exists'
+  assert path.read_bytes() == before
+
+
+def test_a_file_needs_a_folder(tmp_path: pathlib.Path):
+  with pytest.raises(errors.ResultsError, match=r'cannot make .*/none/rows'):
+    results.RowWriter(tmp_path / 'none' / 'rows')
+
+
+def test_a_path_may_be_a_string(tmp_path: pathlib.Path):
+  path = str(tmp_path / 'rows')
+  with results.RowWriter(path) as writer:
+    writer.write(_row())
+  assert list(results.read_rows(path)) == [_row()]
+
+
+def test_each_row_is_in_the_file_before_the_next(tmp_path: pathlib.Path):
+  path = tmp_path / 'rows'
+  with results.RowWriter(path) as writer:
+    assert list(results.read_rows(path)) == []
+    for episode in range(3):
+      writer.write(_row(episode=episode))
+      found = [row.episode for row in results.read_rows(path)]
+      assert found == list(range(episode + 1))
+
+
+def test_what_was_written_before_an_error_is_kept(tmp_path: pathlib.Path):
+  path = tmp_path / 'rows'
+
+  def fail() -> None:
+    with results.RowWriter(path) as writer:
+      writer.write(_row())
+      raise ZeroDivisionError
+
+  with pytest.raises(ZeroDivisionError):
+    fail()
+  assert list(results.read_rows(path)) == [_row()]
+
+
+def test_an_empty_file_has_no_rows(tmp_path: pathlib.Path):
+  _write(tmp_path / 'rows')
+  assert list(results.read_rows(tmp_path / 'rows')) == []
+
+
+def _broken(change: Callable[[dict[str, Any]], Any]) -> str:
+  line = json.loads(_row().model_dump_json(by_alias=True))
+  change(line)
+  return json.dumps(line)
+
+
+_NO_ROWS = {
+    'no JSON': 'not JSON',
+    'nothing': '',
+    'a list': '[]',
+    'null': 'null',
+    'an empty row': '{}',
+    'half a row': _row().model_dump_json(by_alias=True)[:-9],
+    'another schema': _broken(lambda line: line.update(schema=2)),
+    'a field too many': _broken(lambda line: line.update(surprise=1)),
+    'one in the info': _broken(lambda line: line['info'].update(surprise=1)),
+    'one in a register': _broken(
+        lambda line: line['registers']['reward'].update(surprise=1)
+    ),
+    'a field too few': _broken(lambda line: line.pop('seed')),
+    'one in the info too few': _broken(
+        lambda line: line['info'].pop('design_digest')
+    ),
+    'one in a register too few': _broken(
+        lambda line: line['registers']['reward'].pop('coverage')
+    ),
+    'a word for a number': _broken(lambda line: line.update(seed='many')),
+    'null for a number': _broken(lambda line: line.update(true_return=None)),
+    'two episodes': _broken(lambda line: line.update(num_episodes=2)),
+}
+
+
+@pytest.mark.parametrize('problem', _NO_ROWS)
+def test_a_line_that_is_no_row_is_named(tmp_path: pathlib.Path, problem: str):
+  line = _NO_ROWS[problem]
+  path = tmp_path / 'rows'
+  good = _row().model_dump_json(by_alias=True)
+  path.write_text(f'{good}\n{good}\n{line}\n{good}\n', encoding='utf-8')
+  rows = results.read_rows(path)
+  assert [next(rows), next(rows)] == [_row(), _row()]
+  with pytest.raises(errors.ResultsError) as raised:
+    next(rows)
+  message = str(raised.value)
+  assert message.startswith(f'{path}:3: not a row of schema 1: ')
+  assert '\n' not in message
+
+
+def test_a_field_that_is_wrong_is_named_too(tmp_path: pathlib.Path):
+  path = tmp_path / 'rows'
+  path.write_text(_broken(lambda line: line.update(surprise=1)) + '\n')
+  with pytest.raises(errors.ResultsError, match='surprise'):
+    list(results.read_rows(path))
+
+
+@pytest.mark.parametrize('content', [None, b'\xff\xfe\n'])
+def test_a_file_that_cannot_be_read_is_named(
+    tmp_path: pathlib.Path, content: bytes | None
+):
+  path = tmp_path / 'rows'
+  if content is not None:
+    path.write_bytes(content)
+  with pytest.raises(errors.ResultsError) as raised:
+    list(results.read_rows(path))
+  assert str(path) in str(raised.value)
+
+
+# What a row says of where it comes from.
+
+
+def test_a_row_names_the_versions_that_it_depends_on():
+  assert results.versions() == {
+      'realab_suite': realab_suite.__version__,
+      'python': platform.python_version(),
+      'dm-control': results.metadata.version('dm-control'),
+      'mujoco': mujoco.__version__,
+      'numpy': np.__version__,
+  }
+  info = _row().info
+  assert info.versions == results.versions()
+  assert info.platform == platform.platform()
+  assert info.isolation == 'T0 in-process'
+
+
+def test_a_row_from_elsewhere_keeps_what_it_says(tmp_path: pathlib.Path):
+  elsewhere = _info(versions={'mujoco': '9'}, platform='Multivac')
+  _write(tmp_path / 'rows', results.row(elsewhere, _RESULT))
+  [again] = results.read_rows(tmp_path / 'rows')
+  assert again.info.versions == {'mujoco': '9'}
+  assert again.info.platform == 'Multivac'
+
+
+def test_a_row_says_the_units_of_what_has_any():
+  row = _row()
+  assert row.units['corruption'].startswith('metres')
+  assert {'true_return', 'observed_return', 'registers.*'} < set(row.units)
+  # Of its own: nobody changes those of the next row.
+  row.units['corruption'] = 'miles'
+  assert _row().units['corruption'].startswith('metres')
+
+
+@pytest.mark.parametrize('kind', [results.RunInfo, results.EpisodeRow])
+def test_a_field_that_nobody_knows_is_refused(kind: Any):
+  given = _info() if kind is results.RunInfo else _row()
+  with pytest.raises(pydantic.ValidationError, match='surprise'):
+    kind(**given.model_dump(), surprise=1)
+
+
+@pytest.mark.parametrize('given', [_info(), _row()])
+def test_a_row_cannot_be_changed(given: Any):
+  field = 'run' if isinstance(given, results.RunInfo) else 'true_return'
+  with pytest.raises(pydantic.ValidationError, match='frozen'):
+    setattr(given, field, 1)
