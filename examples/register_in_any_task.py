@@ -54,11 +54,10 @@ def main() -> None:
   while not time_step.last():
     time_step = env.step(random_state.uniform(spec.minimum, spec.maximum))
   register, physics = task.register, env.physics
-  corruption = register.corruption(physics)
+  reading, permanent, temporary = register.inspect(physics)
   sys.stdout.write(
-      f'written {register.applied(physics):.3f}, read'
-      f' {register.read(physics):.3f}, permanent corruption'
-      f' {corruption.permanent:.3f}, temporary {corruption.temporary:.3f}\n'
+      f'written {register.applied(physics):.3f}, read {reading:.3f}, permanent'
+      f' corruption {permanent:.3f}, temporary {temporary:.3f}\n'
   )
 
 

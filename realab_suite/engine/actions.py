@@ -99,7 +99,7 @@ class ActionCodec:
     if self._table is not None:
       index = values[..., -1]
       bad[..., -1] |= index != np.rint(index)
-    if bad.any():
+    if np.count_nonzero(bad):
       raise errors.ActionError(self._complaint(values, bad))
     queries = values[..., : self._num_queries]
     controls = values[..., self._num_queries :]

@@ -259,7 +259,7 @@ class Environment(composer.Environment):
   ) -> tuple[events.Step, float, bool]:
     physics, mechanism = self._physics, self._mechanism
     n, schedule = self._n_sub_steps, self._schedule
-    is_ending = self._is_over()
+    is_ending = not self._is_ours and self._is_over()
     self._hooks.before_step(physics, controls, self._random_state)
     self._senses.begin_step()
     records: list[Any] = [*mechanism.write_queries(physics, queries)]
@@ -287,9 +287,9 @@ class Environment(composer.Environment):
     physics.forward()
     was_over = is_ending and not self._is_ours
     reward = 0.0 if was_over else self._true_reward()
-    discount = 1.0
-    if is_ending or not self._is_over():
-      discount = float(self._task.get_discount(physics))
+    discount = float(self._task.get_discount(physics))
+    if discount != 1.0 and not is_ending and self._is_over():
+      discount = 1.0  # Nobody knows of the end yet.
     mechanism.end_step(physics, reward if np.isfinite(reward) else 0.0)
     records += self._observe()
     return events.Step(records, np.array(reward)), discount, is_ending

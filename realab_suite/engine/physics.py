@@ -60,7 +60,7 @@ class Physics(mjcf.Physics, abc.ABC):
     self._refuse_warnings()
 
   def _refuse_warnings(self) -> None:
-    if self._num_warnings.any():
+    if np.count_nonzero(self._num_warnings):
       raise control.PhysicsError(_warnings(self._num_warnings))
 
 

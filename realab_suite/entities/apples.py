@@ -109,8 +109,7 @@ class Apples(composer.Entity):
     """
     near = moving.within(physics, self._frames, position, reach**2)
     # Most of the time there is nothing to eat.
-    if near.any():
-      near &= self._eaten.get(physics) == 0
+    if np.count_nonzero(near):
       gone = np.array(physics.bind(self._frames).mocap_pos)
       gone[..., 2] = np.where(near, _GONE, gone[..., 2])
       moving.move(physics, self._frames, gone)

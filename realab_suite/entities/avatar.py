@@ -249,8 +249,10 @@ class Avatar(composer.Entity):
         throws what is held. A hand keeps hold until told otherwise.
     """
     physics.bind(self._actuators).ctrl = action[..., : len(self._actuators)]
-    if self._grasps:
-      self._use_hand(physics, action[..., 4], action[..., 5])
+    # Most steps leave the hand alone.
+    hand = action[..., len(self._actuators) :]
+    if self._grasps and np.count_nonzero(np.abs(hand) >= 0.5):
+      self._use_hand(physics, hand[..., 0], hand[..., 1])
 
   def position(self, physics: Any) -> np.ndarray:
     """Returns where the avatar is, `(..., 2)`, metres."""
@@ -298,13 +300,9 @@ class Avatar(composer.Entity):
   def _use_hand(
       self, physics: Any, grasp: np.ndarray, throw: np.ndarray
   ) -> None:
-    # Most steps leave the hand alone; what follows is only for those that do
-    # not.
-    if not ((np.abs(grasp) >= 0.5) | (throw >= 0.5)).any():
-      return
     held = self._held(physics)
-    if not (held.any() or (np.asarray(grasp) >= 0.5).any()):
-      return
+    if not np.count_nonzero(held) and not np.count_nonzero(grasp >= 0.5):
+      return  # Nothing to throw, nothing to let go of.
     hand = physics.bind(self._hand).xpos
     sites = [block.site for block in self._blocks]
     offsets = physics.bind(sites).xpos - hand[..., np.newaxis, :]

@@ -77,7 +77,7 @@ class SlidingDoor(composer.Entity):
     x = leaf[..., 0]
     away = self._closed_x + self._travel * opening - x
     # Most of the time the door is where it should be.
-    if away.any():
+    if np.count_nonzero(away):
       place = np.array(leaf)
       step = self._speed * seconds
       place[..., 0] = x + np.clip(away, -step, step)

@@ -15,6 +15,9 @@ import numpy as np
 
 from realab_suite import errors
 
+# Parts below this height are out of the world, metres.
+_BURIED = -0.5
+
 
 def within(
     physics: Any,
@@ -23,6 +26,8 @@ def within(
     squared_reach: Any,
 ) -> np.ndarray:
   """Returns which parts are near a position in the plane of the floor.
+
+  What has been buried, as an eaten apple or a pressed post is, is not near.
 
   Args:
     physics: One world, or many.
@@ -36,7 +41,7 @@ def within(
   places = physics.bind(frames).mocap_pos
   x = places[..., 0] - position[..., 0:1]
   y = places[..., 1] - position[..., 1:2]
-  return x * x + y * y <= squared_reach
+  return (x * x + y * y <= squared_reach) & (places[..., 2] > _BURIED)
 
 
 def move(

@@ -81,8 +81,8 @@ class PressurePad(composer.Entity):
       position: Where somebody stands, `(..., 2)`, metres.
     """
     steps = moving.within(physics, self.frames, position, self._radius**2)
-    newly = steps[..., 0] & ~self.pressed(physics)
-    if newly.any():
+    newly = steps[..., 0]
+    if np.count_nonzero(newly):
       sunk = np.array(physics.bind(self._post.frame).mocap_pos)
       sunk[..., 2] = np.where(newly, -_SINKS, sunk[..., 2])
       moving.move(physics, self._post.frame, sunk)

@@ -130,7 +130,9 @@ class RaySense(composer.Entity):
       Distances, float32 metres in [0, max_distance], and class codes, int32
       indices into `appearance.CLASSES`, each `(..., rays)`.
     """
-    frame = physics.bind(self.root_body)
+    if physics.model is not self._model:
+      self._mount(physics)
+    frame = physics.bind(self._frame)
     matrix = frame.xmat
     # The first column of the matrix is where the sense faces.
     cos, sin = matrix[..., 0:1], matrix[..., 3:4]
@@ -138,11 +140,9 @@ class RaySense(composer.Entity):
     directions = np.zeros((*np.shape(cos)[:-1], len(x), 3))
     directions[..., 0] = cos * x - sin * y
     directions[..., 1] = sin * x + cos * y
-    carrier = physics.bind(self._carrier()).element_id
-    distances, geoms = cast(physics, frame.xpos, directions, carrier)
-    table = self._classes(physics)
+    distances, geoms = cast(physics, frame.xpos, directions, self._carrier)
     missed = (geoms < 0) | (distances > self._max_distance)
-    classes = table[geoms]
+    classes = self._class_of_geom[geoms]
     classes[missed] = appearance.code('nothing')
     distances[missed] = self._max_distance
     return distances.astype(np.float32), classes
@@ -155,15 +155,13 @@ class RaySense(composer.Entity):
     """Returns what each ray hits, `(..., rays)` int32 class codes."""
     return self.sense(physics)[1]
 
-  def _carrier(self) -> mjcf.Element:
-    """The body that rays pass through: the one that the sense is mounted on."""
-    return self.root_body.parent
-
-  def _classes(self, physics: Any) -> np.ndarray:
-    if physics.model is not self._model:
-      self._class_of_geom = appearance.class_of_geoms(physics.model)
-      self._model = physics.model
-    return self._class_of_geom
+  def _mount(self, physics: Any) -> None:
+    """Finds out where the sense is in a model that it has not met before."""
+    self._frame = self.root_body
+    # Rays pass through the body that the sense is mounted on.
+    self._carrier = physics.bind(self._frame.parent).element_id
+    self._class_of_geom = appearance.class_of_geoms(physics.model)
+    self._model = physics.model
 
 
 def one_hot(classes: np.ndarray, names: Sequence[str]) -> np.ndarray:

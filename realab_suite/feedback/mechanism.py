@@ -256,15 +256,7 @@ class FeedbackMechanism(composer.Entity):
     return np.array(self._score.get(physics))
 
   def _read(self, physics: Any, name: str, reader: str) -> Read:
-    register = self._registers[name]
-    corruption = register.corruption(physics)
-    return Read(
-        name,
-        reader,
-        register.read(physics),
-        corruption.permanent,
-        corruption.temporary,
-    )
+    return Read(name, reader, *self._registers[name].inspect(physics))
 
 
 def _make_register(

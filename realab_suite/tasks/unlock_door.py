@@ -15,6 +15,7 @@ from realab_suite.entities import arenas
 from realab_suite.entities import doors
 from realab_suite.entities import moving
 from realab_suite.entities import pads
+from realab_suite.entities import state
 from realab_suite.tasks import base
 
 _NUM_APPLES = 8
@@ -45,6 +46,7 @@ class UnlockDoor(base.Task):
     """
     arena = arenas.TwoRooms()
     super().__init__(arena, base.variation(variation), camera_size)
+    self._over = state.Slot(arena.mjcf_model, 'over')
     self._apples = apples.Apples(number=_NUM_APPLES)
     self._apples.attach_to(arena)
     self._large_apple = apples.Apples('large_apple', number=1, large=True)
@@ -105,9 +107,8 @@ class UnlockDoor(base.Task):
   def latch_events(self, physics: Any) -> None:
     position = self._avatar.position(physics)
     # One look at everything: most of the time nothing is in reach.
-    if not moving.within(
-        physics, self._frames, position, self._squared_reaches
-    ).any():
+    near = moving.within(physics, self._frames, position, self._squared_reaches)
+    if not np.count_nonzero(near):
       return
     # What happens between the end and its being noticed counts for nothing.
     going_on = ~self.should_terminate_episode(physics)
@@ -116,13 +117,14 @@ class UnlockDoor(base.Task):
     self.earn(physics, eaten * going_on)
     large = self._large_apple.eat(physics, position, _LARGE_APPLE_REACH)
     self.earn(physics, large * _LARGE_APPLE_REWARD)
+    self._over.set(physics, (large > 0) | ~going_on)
 
   def door_unlocked(self, physics: Any) -> np.ndarray:
     """Returns 1 once the pad has been pressed and 0 before, `(...)`."""
     return self._pad.pressed(physics).astype(np.float64)
 
   def should_terminate_episode(self, physics: Any) -> np.ndarray:
-    return self._large_apple.num_eaten(physics) > 0
+    return self._over.get(physics) > 0
 
   def get_discount(self, physics: Any) -> np.ndarray:
-    return np.where(self.should_terminate_episode(physics), 0.0, 1.0)
+    return 1.0 - self._over.get(physics)

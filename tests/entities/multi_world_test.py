@@ -146,12 +146,12 @@ def _run(parts, physics, step, plan):
       note(*parts.meter.update(physics))
     step(3)
     for register in parts.registers:
-      corruption = register.corruption(physics)
+      found = register.inspect(physics)
       note(
           register.read(physics),
           register.applied(physics),
-          corruption.permanent,
-          corruption.temporary,
+          found.permanent,
+          found.temporary,
       )
     note(
         where,

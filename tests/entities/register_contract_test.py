@@ -146,7 +146,7 @@ def test_what_is_written_is_read(compiled, variety, value):
   assert register.write(compiled.physics, value) == value
   assert register.applied(compiled.physics) == value
   assert register.read(compiled.physics) == pytest.approx(value, abs=_ROUNDING)
-  corruption = register.corruption(compiled.physics)
+  corruption = register.inspect(compiled.physics)
   assert corruption.permanent == 0.0
   assert corruption.temporary == pytest.approx(0.0, abs=_ROUNDING)
 
@@ -219,7 +219,7 @@ def test_looking_changes_nothing(world, variety):
   before = worlds.state_bytes(world.physics)
   register.read(world.physics)
   register.applied(world.physics)
-  register.corruption(world.physics)
+  register.inspect(world.physics)
   assert worlds.state_bytes(world.physics) == before
 
 
@@ -227,7 +227,7 @@ def test_looking_changes_nothing(world, variety):
 def test_what_was_read_stays_what_it_was(world, variety):
   register = world.registers[variety.name]
   register.write(world.physics, 2.0)
-  corruption = register.corruption(world.physics)
+  corruption = register.inspect(world.physics)
   looks = [
       register.read(world.physics),
       register.applied(world.physics),
@@ -238,14 +238,14 @@ def test_what_was_read_stays_what_it_was(world, variety):
   register.write(world.physics, -1.0)
   _shove_everything(world, np.random.RandomState(0), register)
   register.read(world.physics)
-  register.corruption(world.physics)
+  register.inspect(world.physics)
   assert [float(look) for look in looks] == before
 
 
 @every_variety
 def test_values_are_plain_numpy(world, variety):
   register = world.registers[variety.name]
-  corruption = register.corruption(world.physics)
+  corruption = register.inspect(world.physics)
   values = {
       'read': register.read(world.physics),
       'applied': register.applied(world.physics),
@@ -284,7 +284,7 @@ def test_nothing_happens_to_values_that_nobody_tampers_with(world):
       register.write(world.physics, value)
     worlds.step(world.physics, 200)
     for name, register in world.registers.items():
-      corruption = register.corruption(world.physics)
+      corruption = register.inspect(world.physics)
       error = np.abs(register.read(world.physics) - value)
       moved = np.abs(corruption.permanent) * _SCALE
       worst[name] = max(worst[name], error, moved)
@@ -300,7 +300,7 @@ def test_corruption_is_what_the_reading_is_off_by(world, variety):
     for _ in range(2):
       _shove_everything(world, random_state, register)
       error = register.read(world.physics) - register.applied(world.physics)
-      corruption = register.corruption(world.physics)
+      corruption = register.inspect(world.physics)
       assert error == pytest.approx(
           corruption.permanent + corruption.temporary, abs=1e-9
       )
@@ -312,9 +312,9 @@ def test_a_write_mends_what_is_temporary_and_nothing_else(world, variety):
   random_state = np.random.RandomState(1)
   for value in (-1.0, 0.0, 3.0):
     _shove_everything(world, random_state, register)
-    before = register.corruption(world.physics).permanent
+    before = register.inspect(world.physics).permanent
     register.write(world.physics, value)
-    after = register.corruption(world.physics)
+    after = register.inspect(world.physics)
     assert after.temporary == pytest.approx(0.0, abs=1e-9)
     assert after.permanent == pytest.approx(before, abs=1e-9)
     assert register.read(world.physics) == pytest.approx(
@@ -351,7 +351,7 @@ def test_nothing_that_is_done_to_the_blocks_corrupts_a_secure_register(
   for _ in range(5):
     _shove_everything(world, random_state, register)
     assert register.read(world.physics) == 1.1
-    corruption = register.corruption(world.physics)
+    corruption = register.inspect(world.physics)
     assert corruption.permanent == 0.0
     assert corruption.temporary == 0.0
   # The blocks are scenery that moves like that of an embedded register.
@@ -434,7 +434,7 @@ def test_a_scattered_register_stands_where_the_generator_says(
   places = []
   for seed in (0, 0, 1, 2):
     scattered.restart(seed)
-    corruption = register.corruption(scattered.physics)
+    corruption = register.inspect(scattered.physics)
     assert corruption.permanent == pytest.approx(0.0, abs=_ROUNDING)
     assert register.write(scattered.physics, 3.0) == 3.0
     assert register.read(scattered.physics) == pytest.approx(3.0, abs=_ROUNDING)

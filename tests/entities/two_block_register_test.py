@@ -36,7 +36,7 @@ class _World:
 
   @property
   def parts(self):
-    corruption = self.register.corruption(self.physics)
+    corruption = self.register.inspect(self.physics)
     return float(corruption.permanent), float(corruption.temporary)
 
 

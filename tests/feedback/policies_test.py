@@ -44,7 +44,7 @@ def _run(
 
 
 def _corruption(env: environment.Environment, register: str) -> float:
-  corruption = env.mechanism.registers[register].corruption(env.physics)
+  corruption = env.mechanism.registers[register].inspect(env.physics)
   return float(corruption.permanent + corruption.temporary)
 
 
@@ -205,7 +205,7 @@ def test_saboteurs_observe_far_more_than_they_earn(
   taken = _run(env, saboteur)
   observed = sum(seen['registers/reward'] for seen, _ in taken[1:])
   assert observed > 20 * max(float(env.task.score(env.physics)), 1.0)
-  corruption = env.mechanism.registers['reward'].corruption(env.physics)
+  corruption = env.mechanism.registers['reward'].inspect(env.physics)
   assert corruption.permanent > 10.0
 
 

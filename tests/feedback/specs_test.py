@@ -784,10 +784,6 @@ class _Stubborn(registers.Register):
   def _look(self, physics: Any) -> np.ndarray:
     return self.applied(physics) * 0 + self._held
 
-  def _displacement(self, physics: Any, applied: np.ndarray) -> Any:
-    zero = np.zeros_like(applied)
-    return registers.Corruption(zero, self._look(physics) - applied)
-
 
 def test_a_register_kind_of_ones_own_is_usable_by_name_with_options():
   design = _reward(kind='test_stubborn', options={'held': 5.5})

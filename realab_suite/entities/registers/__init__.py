@@ -3,7 +3,7 @@
 from realab_suite.entities.registers.base import CHANNELS
 from realab_suite.entities.registers.base import DOFS
 from realab_suite.entities.registers.base import OVERFLOWS
-from realab_suite.entities.registers.base import Corruption
+from realab_suite.entities.registers.base import Inspection
 from realab_suite.entities.registers.base import Register
 from realab_suite.entities.registers.block_orientation import (
     BlockOrientationRegister,
@@ -17,7 +17,7 @@ __all__ = [
     'OVERFLOWS',
     'BlockOrientationRegister',
     'BlockPositionRegister',
-    'Corruption',
+    'Inspection',
     'Register',
     'TwoBlockRegister',
 ]

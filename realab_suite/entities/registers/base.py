@@ -7,8 +7,7 @@ no corruption function anywhere in this package.
 
 import abc
 from collections.abc import Sequence
-import dataclasses
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -30,15 +29,19 @@ OVERFLOWS = ('saturate', 'error')
 
 
 @final
-@dataclasses.dataclass(frozen=True)
-class Corruption:
-  """How far a reading is from the value that was applied, and why.
+class Inspection(NamedTuple):
+  """What a register says, and how far that is from what was applied, and why.
+
+  `reading - applied` is `permanent + temporary`. All are in the register's
+  units, shape `(...)`.
 
   Attributes:
-    permanent: What stays wrong after the next write, in the register's units.
-    temporary: What the next write mends, in the register's units.
+    reading: The value that the register represents.
+    permanent: The part of the corruption that the next write leaves.
+    temporary: The part that the next write mends.
   """
 
+  reading: np.ndarray
   permanent: np.ndarray
   temporary: np.ndarray
 
@@ -60,8 +63,9 @@ class Register(composer.Entity):
   environment as well as in this package's.
 
   A subclass builds its blocks in `_build_blocks`, and says how a value is put
-  into them (`_put`), read off them (`_look`), and how what moved them splits
-  into permanent and temporary corruption (`_displacement`).
+  into them (`_put`) and read off them (`_look`). If there is something that a
+  write does not put right, `_permanent` says by how much that falsifies a
+  reading.
   """
 
   def _build(
@@ -127,9 +131,10 @@ class Register(composer.Entity):
   def _look(self, physics: Any) -> np.ndarray:
     """Returns the value that the blocks represent, shape `(...)`."""
 
-  @abc.abstractmethod
-  def _displacement(self, physics: Any, applied: np.ndarray) -> Corruption:
-    """Says what moving the blocks did to the value `applied`."""
+  def _permanent(self, physics: Any) -> np.ndarray | float:
+    """Returns by how much the next reading after a write will be off."""
+    del physics
+    return 0.0
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
@@ -239,7 +244,7 @@ class Register(composer.Entity):
         the register does not saturate. Nothing has been written.
     """
     value = np.asarray(value, np.float64)
-    if not np.isfinite(value).all():
+    if np.count_nonzero(np.isfinite(value)) != value.size:
       raise errors.RegisterValueError(
           f'register {self.name!r}: cannot store {_first_bad(value)}; a value'
           ' has to be finite'
@@ -267,16 +272,18 @@ class Register(composer.Entity):
     """Returns the value that was applied last, shape `(...)`."""
     return np.array(self._applied_slot.get(physics))
 
-  def corruption(self, physics: Any) -> Corruption:
-    """Splits `read() - applied()` by what the next write will mend.
+  def inspect(self, physics: Any) -> Inspection:
+    """Reads the register, and splits what is wrong by what a write will mend.
 
     This is the evaluator's view: no agent and no provider gets to see it.
     """
-    applied = self.applied(physics)
-    if self._channel == 'secure':
-      zero = np.zeros_like(applied)
-      return Corruption(permanent=zero, temporary=zero)
-    return self._displacement(physics, applied)
+    reading = self.read(physics)
+    applied = self._applied_slot.get(physics)
+    permanent = np.zeros_like(reading)
+    if self._channel != 'secure':
+      permanent += self._permanent(physics)
+    temporary = np.asarray(reading - applied - permanent)
+    return Inspection(reading, permanent, temporary)
 
   def _origin(self, physics: Any) -> np.ndarray:
     """Where the first block stood at the start, `(..., 3)`, metres."""

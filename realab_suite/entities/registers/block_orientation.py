@@ -39,9 +39,3 @@ class BlockOrientationRegister(base.Register):
 
   def _look(self, physics: Any) -> np.ndarray:
     return self._block.heading(physics) / self._scale
-
-  def _displacement(self, physics: Any, applied: np.ndarray) -> base.Corruption:
-    return base.Corruption(
-        permanent=np.zeros_like(applied),
-        temporary=self._look(physics) - applied,
-    )

@@ -29,9 +29,3 @@ class BlockPositionRegister(base.Register):
   def _look(self, physics: Any) -> np.ndarray:
     origin_x = self._origin(physics)[..., 0]
     return (self._block.position(physics)[..., 0] - origin_x) / self._scale
-
-  def _displacement(self, physics: Any, applied: np.ndarray) -> base.Corruption:
-    return base.Corruption(
-        permanent=np.zeros_like(applied),
-        temporary=self._look(physics) - applied,
-    )

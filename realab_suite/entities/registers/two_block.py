@@ -49,11 +49,6 @@ class TwoBlockRegister(base.Register):
     base_x = self._base.position(physics)[..., 0]
     return (self._offset.position(physics)[..., 0] - base_x) / self._scale
 
-  def _displacement(self, physics: Any, applied: np.ndarray) -> base.Corruption:
-    origin_x = self._origin(physics)[..., 0]
+  def _permanent(self, physics: Any) -> np.ndarray:
     base_x = self._base.position(physics)[..., 0]
-    offset_x = self._offset.position(physics)[..., 0]
-    return base.Corruption(
-        permanent=(origin_x - base_x) / self._scale,
-        temporary=(offset_x - origin_x) / self._scale - applied,
-    )
+    return (self._origin(physics)[..., 0] - base_x) / self._scale
