@@ -1,6 +1,7 @@
 """Result rows: a line of JSON per episode, enough to publish and to repeat."""
 
 from collections.abc import Iterator
+import dataclasses
 from importlib import metadata
 import json
 import math
@@ -133,23 +134,11 @@ def versions() -> dict[str, str]:
 
 def row(info: RunInfo, result: evaluate.EpisodeResult) -> EpisodeRow:
   """Returns the row of an episode."""
-  return EpisodeRow(
-      info=info,
-      seed=result.seed,
-      world=result.world,
-      episode=result.episode,
-      end=result.end.value,
-      is_valid=result.is_valid,
-      true_return=result.true_return,
-      observed_return=result.observed_return,
-      corruption=result.corruption,
-      registers=result.registers,
-      facts=result.facts,
-      num_steps=result.num_steps,
-      num_substeps=result.num_substeps,
-      num_provider_calls=result.num_provider_calls,
-      num_queries=result.num_queries,
-  )
+  fields = {
+      field.name: getattr(result, field.name)
+      for field in dataclasses.fields(result)
+  }
+  return EpisodeRow(info=info, **{**fields, 'end': result.end.value})
 
 
 @final

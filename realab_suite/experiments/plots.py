@@ -79,7 +79,8 @@ def draw_trajectories(
       clock, ax=axes, label='time (s)', aspect=40, pad=0.01, shrink=0.8
   )
   _add_legend(canvas, _world_legend(first))
-  canvas.savefig(path)
+  # Tight, or the topmost title loses its head when panels are many.
+  canvas.savefig(path, bbox_inches='tight', pad_inches=0.1)
 
 
 def draw_time_line(

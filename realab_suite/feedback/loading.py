@@ -15,21 +15,17 @@ that takes any text would not notice.
 
 from collections.abc import Iterator, Mapping, Sequence
 import dataclasses
-import difflib
-import itertools
 import math
 import os
 import re
-import types
 import typing
-from typing import Any, TypeVar
+from typing import Any
 import unicodedata
 
-import pydantic
-from pydantic import fields
 import yaml
 
 from realab_suite import errors
+from realab_suite.feedback import messages
 
 _MAX_BYTES = 2**20
 _MAX_DEPTH = 32
@@ -38,7 +34,6 @@ _MAX_ENTRIES = 1000
 _MAX_VALUES = 100_000
 # Integers beyond this are not exact as the floats that they may become.
 _MAX_INT = 2**53
-_MAX_QUOTE = 80
 
 # Control, format (which includes the bidirectional ones and the byte order
 # mark), surrogate, line separator and paragraph separator.
@@ -57,8 +52,6 @@ _NOT_FINITE = re.compile(r'[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)')
 _AMBIGUOUS = re.compile(r'(?i:yes|no|on|off)|[-+]?0[oO][0-7]+')
 _YAML_1_1 = yaml.resolver.Resolver()
 _TEXT_TAG = 'tag:yaml.org,2002:str'
-
-_Model = TypeVar('_Model', bound=pydantic.BaseModel)
 
 
 def read_mapping(
@@ -80,14 +73,14 @@ def read_mapping(
       such a file.
   """
   if isinstance(source, Mapping):
-    return _copy_mapping(source, _Place(where or '<mapping>'))
+    return _copy_mapping(source, messages.Place(where or '<mapping>'))
   if not isinstance(source, (str, os.PathLike)):
-    raise _Place(where or '<mapping>').error(
-        f'expected a path or a mapping, got {_quote(source)}'
+    raise messages.Place(where or '<mapping>').error(
+        f'expected a path or a mapping, got {messages.quote(source)}'
     )
   path = os.fsdecode(source)
   where = where or path
-  return parse_yaml(_read_file(path, _Place(where)), where)
+  return parse_yaml(_read_file(path, messages.Place(where)), where)
 
 
 def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
@@ -103,37 +96,14 @@ def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
   """
   documents = _documents(text, where)
   if len(documents) != 1:
-    raise _Place(where).error(
+    raise messages.Place(where).error(
         f'expected a mapping at top level, got {len(documents)} documents'
     )
   if not isinstance(documents[0], dict):
-    raise _Place(where).error(
-        f'expected a mapping at top level, got {_quote(documents[0])}'
+    raise messages.Place(where).error(
+        f'expected a mapping at top level, got {messages.quote(documents[0])}'
     )
   return documents[0]
-
-
-def validate(
-    model_class: type[_Model], data: Mapping[str, Any], where: str
-) -> _Model:
-  """Returns the model that the data describes.
-
-  Args:
-    model_class: What the data has to be. Its own configuration decides how
-      strict that is.
-    data: What `read_mapping` returned.
-    where: What error messages call the data.
-
-  Raises:
-    SpecError: If the data does not fit. The message lists every problem.
-  """
-  try:
-    return model_class.model_validate(data)
-  except pydantic.ValidationError as error:
-    problems = error.errors(include_url=False)
-  # A union can report the same problem once for each of its members.
-  unique = dict.fromkeys(_problem(p, model_class, data) for p in problems)
-  raise _Place(where).error('; '.join(unique))
 
 
 def apply_overrides(
@@ -151,9 +121,9 @@ def apply_overrides(
     SpecError: If an override is malformed or leads through something that is
       neither a mapping nor a list.
   """
-  result = _copy_mapping(data, _Place('<mapping>'))
+  result = _copy_mapping(data, messages.Place('<mapping>'))
   for override in overrides:
-    place = _Place(f'override {_quote(override)}')
+    place = messages.Place(f'override {messages.quote(override)}')
     key, equals, text = override.partition('=')
     if not equals:
       raise place.error('expected key=value')
@@ -173,35 +143,12 @@ def apply_overrides(
 
 
 @typing.final
-@dataclasses.dataclass(frozen=True)
-class _Place:
-  """Where a value stands, as error messages name it."""
-
-  where: str
-  path: tuple[str | int, ...] = ()
-  line: int | None = None
-
-  def child(self, key: str | int) -> '_Place':
-    return _Place(self.where, (*self.path, key), self.line)
-
-  def error(self, problem: str) -> errors.SpecError:
-    where = self.where if self.line is None else f'{self.where}:{self.line}'
-    parts = (where, _format_path(self.path), problem)
-    message = ': '.join(part for part in parts if part)
-    # File names, keys and messages of validators may hold anything; an error
-    # is one line that a terminal shows as it is.
-    return errors.SpecError(
-        ''.join(c if c.isprintable() else repr(c)[1:-1] for c in message)
-    )
-
-
-@typing.final
 @dataclasses.dataclass
 class _Frame:
   """A mapping or list that is being built."""
 
   container: dict[str, Any] | list[Any]
-  place: _Place
+  place: messages.Place
   # The key that waits for its value, and the lines of all keys so far.
   key: str | None = None
   key_lines: dict[str, int] = dataclasses.field(default_factory=dict)
@@ -210,19 +157,19 @@ class _Frame:
   def expects_key(self) -> bool:
     return isinstance(self.container, dict) and self.key is None
 
-  def next_place(self, line: int) -> _Place:
-    place = _Place(self.place.where, self.place.path, line)
+  def next_place(self, line: int) -> messages.Place:
+    place = messages.Place(self.place.where, self.place.path, line)
     if isinstance(self.container, list):
       return place.child(len(self.container))
     return place if self.key is None else place.child(self.key)
 
-  def add_key(self, key: Any, place: _Place) -> None:
+  def add_key(self, key: Any, place: messages.Place) -> None:
     key = _checked_key(key, place)
     line = place.line or 0
     if key in self.key_lines:
       raise place.error(
-          f'duplicate key {_quote(key)} (lines {self.key_lines[key]} and'
-          f' {line})'
+          f'duplicate key {messages.quote(key)} (lines'
+          f' {self.key_lines[key]} and {line})'
       )
     self.key = key
     self.key_lines[key] = line
@@ -242,8 +189,8 @@ def _documents(text: str | bytes, where: str) -> list[Any]:
   # A stack of our own, because depth must not depend on Python's.
   stack: list[_Frame] = []
   budget = iter(range(_MAX_VALUES))
-  for event, line in _events(_decode(text, _Place(where)), where):
-    place = _Place(where, line=line)
+  for event, line in _events(_decode(text, messages.Place(where)), where):
+    place = messages.Place(where, line=line)
     if stack:
       place = stack[-1].next_place(line)
     if isinstance(event, yaml.DocumentStartEvent):
@@ -266,12 +213,12 @@ def _documents(text: str | bytes, where: str) -> list[Any]:
   return documents
 
 
-def _node_value(event: Any, place: _Place) -> Any:
+def _node_value(event: Any, place: messages.Place) -> Any:
   """Returns the scalar, or the still empty collection, that an event is."""
   if event.anchor is not None:
     raise place.error('anchors and aliases are not allowed')
   if event.tag is not None:
-    raise place.error(f'tag {_quote(event.tag)} not allowed')
+    raise place.error(f'tag {messages.quote(event.tag)} not allowed')
   if isinstance(event, yaml.SequenceStartEvent):
     return []
   if isinstance(event, yaml.MappingStartEvent):
@@ -290,11 +237,13 @@ def _events(text: str, where: str) -> Iterator[tuple[Any, int]]:
         event = loader.get_event()
       except yaml.MarkedYAMLError as error:
         line = _line(error.problem_mark)
-        raise _Place(where, line=line).error(f'{error.problem}') from None
+        raise messages.Place(where, line=line).error(
+            f'{error.problem}'
+        ) from None
       # A tag that escapes bytes which are no text is a UnicodeDecodeError.
       except (yaml.YAMLError, UnicodeError) as error:
         problem = ' '.join(str(error).split())
-        raise _Place(where).error(f'not YAML: {problem}') from None
+        raise messages.Place(where).error(f'not YAML: {problem}') from None
       if event is None:
         return
       yield event, _line(event.start_mark) or 1
@@ -306,7 +255,7 @@ def _line(mark: Any) -> int | None:
   return None if mark is None else mark.line + 1
 
 
-def _decode(text: str | bytes, place: _Place) -> str:
+def _decode(text: str | bytes, place: messages.Place) -> str:
   """Returns the text with plain newlines, checked as a whole."""
   # A lone surrogate is reported as a character, with its line.
   content = (
@@ -328,7 +277,7 @@ def _decode(text: str | bytes, place: _Place) -> str:
   return text
 
 
-def _read_file(path: str, place: _Place) -> bytes:
+def _read_file(path: str, place: messages.Place) -> bytes:
   # Opening a named pipe would wait for ever, so the kind is checked first.
   if not os.path.isfile(path):
     exists = os.path.exists(path)
@@ -344,7 +293,9 @@ def _read_file(path: str, place: _Place) -> bytes:
   return content
 
 
-def _resolve(text: str, place: _Place) -> bool | int | float | str | None:
+def _resolve(
+    text: str, place: messages.Place
+) -> bool | int | float | str | None:
   """Returns what an unquoted scalar means."""
   if _NULL.fullmatch(text):
     return None
@@ -355,26 +306,28 @@ def _resolve(text: str, place: _Place) -> bool | int | float | str | None:
   if _INT.fullmatch(text):
     # Python refuses to convert thousands of digits.
     if len(text.lstrip('+-')) > len(str(_MAX_INT)):
-      raise place.error(f'integer {_quote(text)} is out of range')
+      raise place.error(f'integer {messages.quote(text)} is out of range')
     return int(text)
   if match := _FLOAT.fullmatch(text):
     value = float(text)
     vanished = value == 0 and re.search('[1-9]', match['mantissa'])
     if math.isinf(value) or vanished:
-      raise place.error(f'number {_quote(text)} is out of range')
+      raise place.error(f'number {messages.quote(text)} is out of range')
     return value
   if _NOT_FINITE.fullmatch(text):
     raise place.error(f'must be finite, got {text}')
   tag = _YAML_1_1.resolve(yaml.ScalarNode, text, (True, False))
   if tag != _TEXT_TAG or _AMBIGUOUS.fullmatch(text):
     raise place.error(
-        f'{_quote(text)} is ambiguous: quote it if it is text, or write true,'
-        ' false or a plain decimal number'
+        f'{messages.quote(text)} is ambiguous: quote it if it is text, or write'
+        ' true, false or a plain decimal number'
     )
   return text
 
 
-def _copy_mapping(data: Mapping[str, Any], place: _Place) -> dict[str, Any]:
+def _copy_mapping(
+    data: Mapping[str, Any], place: messages.Place
+) -> dict[str, Any]:
   budget = iter(range(_MAX_VALUES))
   return {
       key: _copy(value, place.child(key), 2, budget)
@@ -382,7 +335,9 @@ def _copy_mapping(data: Mapping[str, Any], place: _Place) -> dict[str, Any]:
   }
 
 
-def _copy(value: Any, place: _Place, depth: int, budget: Iterator[int]) -> Any:
+def _copy(
+    value: Any, place: messages.Place, depth: int, budget: Iterator[int]
+) -> Any:
   """Returns a copy of a value, which stands `depth - 1` collections deep."""
   _spend(budget, place)
   if isinstance(value, Mapping):
@@ -402,30 +357,32 @@ def _copy(value: Any, place: _Place, depth: int, budget: Iterator[int]) -> Any:
 
 
 def _checked_items(
-    data: Mapping[Any, Any], place: _Place
+    data: Mapping[Any, Any], place: messages.Place
 ) -> Iterator[tuple[str, Any]]:
   _check_entries(len(data), place)
   for key, value in data.items():
     yield _checked_key(key, place), value
 
 
-def _checked_key(key: Any, place: _Place) -> str:
+def _checked_key(key: Any, place: messages.Place) -> str:
   if not isinstance(key, str):
-    raise place.error(f'keys must be strings, got {_quote(key)} (quote it)')
+    raise place.error(
+        f'keys must be strings, got {messages.quote(key)} (quote it)'
+    )
   if '\n' in key:
-    raise place.error(f'keys must be one line, got {_quote(key)}')
+    raise place.error(f'keys must be one line, got {messages.quote(key)}')
   return typing.cast(str, _checked_scalar(key, place))
 
 
 def _checked_scalar(
-    value: Any, place: _Place
+    value: Any, place: messages.Place
 ) -> bool | int | float | str | None:
   """Returns a value as exactly one of the plain types."""
   if value is None or isinstance(value, bool):
     return value
   if isinstance(value, int):
     if abs(value) > _MAX_INT:
-      raise place.error(f'integer {_quote(value)} is out of range')
+      raise place.error(f'integer {messages.quote(value)} is out of range')
     return int(value)
   if isinstance(value, float):
     if not math.isfinite(value):
@@ -440,7 +397,7 @@ def _checked_scalar(
     return str.__str__(value)
   raise place.error(
       'expected a mapping, list, string, number, boolean or null, got'
-      f' {_quote(value)}'
+      f' {messages.quote(value)}'
   )
 
 
@@ -454,35 +411,35 @@ def _forbidden_character(text: str) -> str | None:
   return min(found, key=text.index, default=None)
 
 
-def _character_error(character: str, place: _Place) -> errors.SpecError:
+def _character_error(character: str, place: messages.Place) -> errors.SpecError:
   if character == '\t':
     return place.error('tab is not allowed (use spaces)')
   return place.error(f'character U+{ord(character):04X} is not allowed')
 
 
-def _check_size(size: int, place: _Place) -> None:
+def _check_size(size: int, place: messages.Place) -> None:
   if size > _MAX_BYTES:
     tenths = math.ceil(10 * size / _MAX_BYTES)
     raise place.error(f'file is {tenths / 10} MiB, limit 1 MiB')
 
 
-def _check_depth(depth: int, place: _Place) -> None:
+def _check_depth(depth: int, place: messages.Place) -> None:
   if depth > _MAX_DEPTH:
     raise place.error(f'nested deeper than {_MAX_DEPTH}')
 
 
-def _spend(budget: Iterator[int], place: _Place) -> None:
+def _spend(budget: Iterator[int], place: messages.Place) -> None:
   if next(budget, None) is None:
     raise place.error(f'more than {_MAX_VALUES} values in all')
 
 
-def _check_entries(count: int, place: _Place) -> None:
+def _check_entries(count: int, place: messages.Place) -> None:
   if count > _MAX_ENTRIES:
     raise place.error(f'more than {_MAX_ENTRIES} entries')
 
 
 def _assign(
-    data: dict[str, Any], keys: Sequence[str], value: Any, place: _Place
+    data: dict[str, Any], keys: Sequence[str], value: Any, place: messages.Place
 ) -> None:
   """Sets the value at the end of the keys, within a mapping of our own."""
   node: Any = data
@@ -493,14 +450,14 @@ def _assign(
       # Compared as text, since a long key is no integer that Python accepts.
       if key not in map(str, range(len(node))):
         raise place.error(
-            f'index {_quote(key)} is not one of the {len(node)} entries of'
-            f' {_quote(".".join(keys[:depth]))}'
+            f'index {messages.quote(key)} is not one of the {len(node)}'
+            f' entries of {messages.quote(".".join(keys[:depth]))}'
         )
       position = int(key)
     elif not isinstance(node, dict):
       raise place.error(
-          f'{_quote(".".join(keys[:depth]))} is {_quote(node)}, not a mapping'
-          ' or list'
+          f'{messages.quote(".".join(keys[:depth]))} is'
+          f' {messages.quote(node)}, not a mapping or list'
       )
     if is_last:
       node[position] = value
@@ -508,172 +465,3 @@ def _assign(
       node = node.setdefault(key, {})
     else:
       node = node[position]
-
-
-def _problem(
-    details: Any, model_class: type[pydantic.BaseModel], data: Any
-) -> str:
-  """Returns what one entry of a `pydantic.ValidationError` means."""
-  kind = details['type']
-  location = list(details['loc'])
-  if kind == 'extra_forbidden':
-    key = str(location.pop())
-    path, members = _locate(location, model_class, data)
-    text = _describe_unknown_key(key, members)
-  else:
-    path, _ = _locate(location, model_class, data)
-    if kind in ('union_tag_invalid', 'union_tag_not_found'):
-      path = (*path, details['ctx']['discriminator'].strip("'"))
-    text = _describe(details)
-  # The message of a validator may have several lines.
-  text = ' '.join(text.split())
-  return ': '.join(part for part in (_format_path(path), text) if part)
-
-
-def _describe_unknown_key(key: str, members: Sequence[Any]) -> str:
-  allowed = [k for m in members if _is_model(m) for k in _fields(m)]
-  text = f'unknown key {_quote(key)}'
-  for match in difflib.get_close_matches(key, allowed, n=1):
-    text += f"; did you mean '{match}'?"
-  return f'{text} (allowed: {", ".join(allowed)})' if allowed else text
-
-
-def _describe(details: Any) -> str:
-  """Returns what is wrong with a value, and the value."""
-  kind = details['type']
-  context = details.get('ctx', {})
-  given = _quote(details['input'])
-  if kind in ('missing', 'union_tag_not_found'):
-    return 'required key is missing'
-  if kind == 'union_tag_invalid':
-    tag = _quote(context['tag'])
-    return f'must be one of {context["expected_tags"]}, got {tag}'
-  if kind in ('model_type', 'model_attributes_type', 'dict_type'):
-    return f'must be a mapping, got {given}'
-  if 'error' in context:
-    return f'{context["error"]}, got {given}'
-  rule = re.sub(r'^\w+ should ', 'must ', details['msg'])
-  return f'{rule}, got {given}'
-
-
-def _locate(
-    location: Sequence[str | int],
-    model_class: type[pydantic.BaseModel],
-    data: Any,
-) -> tuple[tuple[str | int, ...], list[Any]]:
-  """Follows a location of pydantic through the types and through the data.
-
-  Pydantic's locations also name the member that it chose from a union, which
-  is nothing that a user wrote.
-
-  Returns:
-    The keys and indices that lead to the place in the data, and the types that
-    are allowed there, as far as they can be found.
-  """
-  path: list[str | int] = []
-  members: list[Any] = [model_class]
-  components = list(location)
-  while components:
-    component = components.pop(0)
-    if len(members) > 1:
-      members = [m for m in members if _answers_to(m, component)]
-      continue
-    is_present = (
-        component in data
-        if isinstance(data, Mapping)
-        else isinstance(data, (list, tuple)) and component in range(len(data))
-    )
-    # Without a type to follow, the data tells keys from names of members; only
-    # the last key may be missing there. '[key]' says that a key is wrong.
-    if component == '[key]' or not (members or is_present or not components):
-      continue
-    path.append(component)
-    data = data[component] if is_present else None
-    members = list(
-        itertools.chain.from_iterable(_children(m, component) for m in members)
-    )
-  return tuple(path), members
-
-
-def _children(annotation: Any, component: str | int) -> list[Any]:
-  """Returns the types that a key or index of a type allows."""
-  if _is_model(annotation):
-    field = _fields(annotation).get(str(component))
-    return [] if field is None else _members(field.annotation)
-  arguments = typing.get_args(annotation)
-  if not arguments:
-    return []
-  if len(arguments) > 1 and isinstance(component, str):
-    return _members(arguments[1])
-  if isinstance(component, int) and Ellipsis not in arguments:
-    return _members(arguments[min(component, len(arguments) - 1)])
-  return _members(arguments[0])
-
-
-def _members(annotation: Any) -> list[Any]:
-  """Returns the types that a union joins, leaving out None."""
-  origin = typing.get_origin(annotation)
-  if origin is typing.Annotated:
-    argument, *notes = typing.get_args(annotation)
-    for note in notes:
-      # A note that knows the members of a union that grows at run time.
-      if callable(members := getattr(note, 'members', None)):
-        return list(members())
-    return _members(argument)
-  if origin in (typing.Union, types.UnionType):
-    return [
-        member
-        for argument in typing.get_args(annotation)
-        for member in _members(argument)
-        if member is not types.NoneType
-    ]
-  return [annotation]
-
-
-def _answers_to(annotation: Any, label: str | int) -> bool:
-  """Whether pydantic's name for a member of a union means this type."""
-  return _is_model(annotation) and (
-      annotation.__name__ == label
-      or any(
-          typing.get_origin(field.annotation) is typing.Literal
-          and label in typing.get_args(field.annotation)
-          for field in annotation.model_fields.values()
-      )
-  )
-
-
-def _is_model(annotation: Any) -> bool:
-  return isinstance(annotation, type) and issubclass(
-      annotation, pydantic.BaseModel
-  )
-
-
-def _fields(
-    model_class: type[pydantic.BaseModel],
-) -> dict[str, fields.FieldInfo]:
-  """Returns the fields of a model by the keys that a user writes."""
-  return {
-      alias if isinstance(alias := field.validation_alias, str) else name: field
-      for name, field in model_class.model_fields.items()
-  }
-
-
-def _format_path(path: Sequence[str | int]) -> str:
-  text = ''
-  for part in path:
-    if isinstance(part, int):
-      text += f'[{part}]'
-    elif re.fullmatch(r'[\w-]+', part):
-      text += f'.{part}' if text else part
-    else:
-      text += f'[{_quote(part)}]'
-  return text
-
-
-def _quote(value: object) -> str:
-  """Returns the repr of a value, cut to a length that an error can hold."""
-  try:
-    text = ' '.join(repr(value).split())
-  except Exception:  # For instance an integer too long for Python to print.
-    text = f'<{type(value).__name__}>'
-  return text if len(text) <= _MAX_QUOTE else f'{text[: _MAX_QUOTE - 3]}...'

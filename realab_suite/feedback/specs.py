@@ -17,6 +17,7 @@ from realab_suite.feedback import action_sets
 from realab_suite.feedback import loading
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
+from realab_suite.feedback import validation
 
 _NAME = r'^[a-z][a-z0-9_]{0,63}$'
 Name = Annotated[str, pydantic.StringConstraints(pattern=_NAME)]
@@ -421,7 +422,7 @@ def load(design: Design, overrides: tuple[str, ...] = ()) -> DesignSpec:
   if overrides:
     data = loading.apply_overrides(data, overrides)
   _learn_new_kinds()
-  return loading.validate(DesignSpec, data, where)
+  return validation.validate(DesignSpec, data, where)
 
 
 def json_schema() -> dict[str, Any]:

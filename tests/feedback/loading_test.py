@@ -16,6 +16,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.feedback import loading
+from realab_suite.feedback import validation
 
 _VALID = """\
 spec_version: 1
@@ -205,7 +206,7 @@ def _message(text: str | bytes) -> str:
 
 def _refusal(data: dict[str, Any]) -> str:
   with pytest.raises(errors.SpecError) as info:
-    loading.validate(_Design, data, 'd.yaml')
+    validation.validate(_Design, data, 'd.yaml')
   return str(info.value)
 
 
@@ -506,7 +507,7 @@ def test_a_mapping_that_repeats_one_list_without_end_is_refused():
 
 
 def test_valid_data_gives_the_model():
-  design = loading.validate(
+  design = validation.validate(
       _Design,
       {**_register(scale=2), 'providers': [{'kind': 'scaled', 'scale': 1.0}]},
       'd.yaml',
@@ -671,7 +672,7 @@ def test_a_value_that_python_cannot_print_is_named_by_its_type():
 
 def test_the_causes_of_pydantic_are_not_shown():
   with pytest.raises(errors.SpecError) as info:
-    loading.validate(_Design, {'spare': 1}, 'd.yaml')
+    validation.validate(_Design, {'spare': 1}, 'd.yaml')
   assert info.value.__cause__ is None
   assert info.value.__context__ is None
 
@@ -968,7 +969,7 @@ def test_random_overrides_are_applied_or_refused(data, pieces):
 def test_random_descriptions_are_validated_or_refused(data):
   before = copy.deepcopy(data)
   with pytest.raises(errors.SpecError) as info:
-    loading.validate(_Design, {'providers': 0, **data}, 'd.yaml')
+    validation.validate(_Design, {'providers': 0, **data}, 'd.yaml')
   assert str(info.value).isprintable()
   assert data == before
 

@@ -1,0 +1,55 @@
+"""How messages show places in a description, and what stands there."""
+
+from collections.abc import Sequence
+import dataclasses
+import re
+from typing import final
+
+from realab_suite import errors
+
+_MAX_LENGTH = 80
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Place:
+  """Where a value stands, as error messages name it."""
+
+  where: str
+  path: tuple[str | int, ...] = ()
+  line: int | None = None
+
+  def child(self, key: str | int) -> 'Place':
+    return Place(self.where, (*self.path, key), self.line)
+
+  def error(self, problem: str) -> errors.SpecError:
+    where = self.where if self.line is None else f'{self.where}:{self.line}'
+    parts = (where, format_path(self.path), problem)
+    message = ': '.join(part for part in parts if part)
+    # File names, keys and messages of validators may hold anything; an error
+    # is one line that a terminal shows as it is.
+    return errors.SpecError(
+        ''.join(c if c.isprintable() else repr(c)[1:-1] for c in message)
+    )
+
+
+def format_path(path: Sequence[str | int]) -> str:
+  """Returns a path as users write it: `registers.reward.range[1]`."""
+  text = ''
+  for part in path:
+    if isinstance(part, int):
+      text += f'[{part}]'
+    elif re.fullmatch(r'[\w-]+', part):
+      text += f'.{part}' if text else part
+    else:
+      text += f'[{quote(part)}]'
+  return text
+
+
+def quote(value: object) -> str:
+  """Returns the repr of a value, cut to a length that an error can hold."""
+  try:
+    text = ' '.join(repr(value).split())
+  except Exception:  # For instance an integer too long for Python to print.
+    text = f'<{type(value).__name__}>'
+  return text if len(text) <= _MAX_LENGTH else f'{text[: _MAX_LENGTH - 3]}...'

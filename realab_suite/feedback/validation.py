@@ -1,0 +1,187 @@
+"""Validates data by a pydantic model, and says in one line what is wrong."""
+
+from collections.abc import Mapping, Sequence
+import difflib
+import itertools
+import re
+import types
+import typing
+from typing import Any, TypeVar
+
+import pydantic
+from pydantic import fields
+
+from realab_suite.feedback import messages
+
+_Model = TypeVar('_Model', bound=pydantic.BaseModel)
+
+
+def validate(
+    model_class: type[_Model], data: Mapping[str, Any], where: str
+) -> _Model:
+  """Returns the model that the data describes.
+
+  Args:
+    model_class: What the data has to be. Its own configuration decides how
+      strict that is.
+    data: What `read_mapping` returned.
+    where: What error messages call the data.
+
+  Raises:
+    SpecError: If the data does not fit. The message lists every problem.
+  """
+  try:
+    return model_class.model_validate(data)
+  except pydantic.ValidationError as error:
+    problems = error.errors(include_url=False)
+  # A union can report the same problem once for each of its members.
+  unique = dict.fromkeys(_problem(p, model_class, data) for p in problems)
+  raise messages.Place(where).error('; '.join(unique))
+
+
+def _problem(
+    details: Any, model_class: type[pydantic.BaseModel], data: Any
+) -> str:
+  """Returns what one entry of a `pydantic.ValidationError` means."""
+  kind = details['type']
+  location = list(details['loc'])
+  if kind == 'extra_forbidden':
+    key = str(location.pop())
+    path, members = _locate(location, model_class, data)
+    text = _describe_unknown_key(key, members)
+  else:
+    path, _ = _locate(location, model_class, data)
+    if kind in ('union_tag_invalid', 'union_tag_not_found'):
+      path = (*path, details['ctx']['discriminator'].strip("'"))
+    text = _describe(details)
+  # The message of a validator may have several lines.
+  text = ' '.join(text.split())
+  return ': '.join(part for part in (messages.format_path(path), text) if part)
+
+
+def _describe_unknown_key(key: str, members: Sequence[Any]) -> str:
+  allowed = [k for m in members if _is_model(m) for k in _fields(m)]
+  text = f'unknown key {messages.quote(key)}'
+  for match in difflib.get_close_matches(key, allowed, n=1):
+    text += f"; did you mean '{match}'?"
+  return f'{text} (allowed: {", ".join(allowed)})' if allowed else text
+
+
+def _describe(details: Any) -> str:
+  """Returns what is wrong with a value, and the value."""
+  kind = details['type']
+  context = details.get('ctx', {})
+  given = messages.quote(details['input'])
+  if kind in ('missing', 'union_tag_not_found'):
+    return 'required key is missing'
+  if kind == 'union_tag_invalid':
+    tag = messages.quote(context['tag'])
+    return f'must be one of {context["expected_tags"]}, got {tag}'
+  if kind in ('model_type', 'model_attributes_type', 'dict_type'):
+    return f'must be a mapping, got {given}'
+  if 'error' in context:
+    return f'{context["error"]}, got {given}'
+  rule = re.sub(r'^\w+ should ', 'must ', details['msg'])
+  return f'{rule}, got {given}'
+
+
+def _locate(
+    location: Sequence[str | int],
+    model_class: type[pydantic.BaseModel],
+    data: Any,
+) -> tuple[tuple[str | int, ...], list[Any]]:
+  """Follows a location of pydantic through the types and through the data.
+
+  Pydantic's locations also name the member that it chose from a union, which
+  is nothing that a user wrote.
+
+  Returns:
+    The keys and indices that lead to the place in the data, and the types that
+    are allowed there, as far as they can be found.
+  """
+  path: list[str | int] = []
+  members: list[Any] = [model_class]
+  components = list(location)
+  while components:
+    component = components.pop(0)
+    if len(members) > 1:
+      members = [m for m in members if _answers_to(m, component)]
+      continue
+    is_present = (
+        component in data
+        if isinstance(data, Mapping)
+        else isinstance(data, (list, tuple)) and component in range(len(data))
+    )
+    # Without a type to follow, the data tells keys from names of members; only
+    # the last key may be missing there. '[key]' says that a key is wrong.
+    if component == '[key]' or not (members or is_present or not components):
+      continue
+    path.append(component)
+    data = data[component] if is_present else None
+    members = list(
+        itertools.chain.from_iterable(_children(m, component) for m in members)
+    )
+  return tuple(path), members
+
+
+def _children(annotation: Any, component: str | int) -> list[Any]:
+  """Returns the types that a key or index of a type allows."""
+  if _is_model(annotation):
+    field = _fields(annotation).get(str(component))
+    return [] if field is None else _members(field.annotation)
+  arguments = typing.get_args(annotation)
+  if not arguments:
+    return []
+  if len(arguments) > 1 and isinstance(component, str):
+    return _members(arguments[1])
+  if isinstance(component, int) and Ellipsis not in arguments:
+    return _members(arguments[min(component, len(arguments) - 1)])
+  return _members(arguments[0])
+
+
+def _members(annotation: Any) -> list[Any]:
+  """Returns the types that a union joins, leaving out None."""
+  origin = typing.get_origin(annotation)
+  if origin is typing.Annotated:
+    argument, *notes = typing.get_args(annotation)
+    for note in notes:
+      # A note that knows the members of a union that grows at run time.
+      if callable(members := getattr(note, 'members', None)):
+        return list(members())
+    return _members(argument)
+  if origin in (typing.Union, types.UnionType):
+    return [
+        member
+        for argument in typing.get_args(annotation)
+        for member in _members(argument)
+        if member is not types.NoneType
+    ]
+  return [annotation]
+
+
+def _answers_to(annotation: Any, label: str | int) -> bool:
+  """Whether pydantic's name for a member of a union means this type."""
+  return _is_model(annotation) and (
+      annotation.__name__ == label
+      or any(
+          typing.get_origin(field.annotation) is typing.Literal
+          and label in typing.get_args(field.annotation)
+          for field in annotation.model_fields.values()
+      )
+  )
+
+
+def _is_model(annotation: Any) -> bool:
+  return isinstance(annotation, type) and issubclass(
+      annotation, pydantic.BaseModel
+  )
+
+
+def _fields(
+    model_class: type[pydantic.BaseModel],
+) -> dict[str, fields.FieldInfo]:
+  """Returns the fields of a model by the keys that a user writes."""
+  return {
+      alias if isinstance(alias := field.validation_alias, str) else name: field
+      for name, field in model_class.model_fields.items()
+  }
