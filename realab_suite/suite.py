@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
@@ -140,7 +141,8 @@ def load(
     task_name: The variation of it, as in `'standard'`.
     task_kwargs: `random`, a seed, and whatever the world takes, as in
       `camera_size`.
-    environment_kwargs: `max_steps`, the length of an episode.
+    environment_kwargs: `max_steps`, the length of an episode, and `world`, the
+      number of a world of a batch, to have that one alone.
     visualize_reward: Has to be `False`: it would paint the true reward into the
       agent's view.
     design: The name of a design that ships with the package, a path, a mapping
@@ -171,9 +173,10 @@ def load(
         f'task_kwargs of {domain_name}.{task_name}: {error}'
     ) from error
   options = {'max_steps': MAX_STEPS, **(environment_kwargs or {})}
-  if unknown := set(options) - {'max_steps'}:
+  if unknown := set(options) - {'max_steps', 'world'}:
     raise errors.SpecError(
-        f'environment_kwargs: unknown {sorted(unknown)}; allowed is max_steps'
+        f'environment_kwargs: unknown {sorted(unknown)}; allowed are max_steps and'
+        ' world'
     )
   return embed(
       task,
@@ -184,12 +187,55 @@ def load(
   )
 
 
+def load_batch(
+    domain_name: str,
+    task_name: str,
+    task_kwargs: Mapping[str, Any] | None = None,
+    environment_kwargs: Mapping[str, Any] | None = None,
+    *,
+    num_envs: int,
+    num_threads: int = 0,
+    design: specs.Design | None = None,
+    overrides: Sequence[str] = (),
+) -> batch_environment.BatchEnvironment:
+  """Loads many worlds of a task, which are stepped together.
+
+  World i is, bit for bit, what `load` gives with `environment_kwargs` of
+  `{'world': i}`.
+
+  Args:
+    domain_name: As in `load`.
+    task_name: As in `load`.
+    task_kwargs: As in `load`; agents of a batch sense by rays alone so far.
+    environment_kwargs: As in `load`.
+    num_envs: How many worlds.
+    num_threads: How many threads step them; 0 for all processors.
+    design: As in `load`.
+    overrides: As in `load`.
+
+  Raises:
+    SpecError: If a name, an argument or the design is wrong.
+  """
+  if (task_kwargs or {}).get('camera_size') is not None:
+    raise errors.SpecError('camera_size: a batch has no cameras; allowed is None')
+  single = load(
+      domain_name,
+      task_name,
+      task_kwargs,
+      environment_kwargs,
+      design=design,
+      overrides=overrides,
+  )
+  return batch_environment.BatchEnvironment(single, num_envs, num_threads)
+
+
 def embed(
     task: composer.Task,
     design: specs.Design,
     *,
     random: int | np.random.RandomState | None = None,
     max_steps: int | None = None,
+    world: int = 0,
     measurements: Mapping[str, Callable[[Any], Any]] | None = None,
     overrides: Sequence[str] = (),
 ) -> environment.Environment:
@@ -203,6 +249,7 @@ def embed(
     design: As in `load`.
     random: A seed.
     max_steps: After how many control steps an episode ends, or `None`.
+    world: Which world of a batch this is; the random streams of each differ.
     measurements: What meters can measure besides `score`, the true return so
       far: functions of the physics, by name.
     overrides: Dotted overrides of the design.
@@ -234,6 +281,6 @@ def embed(
     task.avatar.make_graspable(
         [b for r in mechanism.registers.values() for b in r.blocks]
     )
-  env = environment.Environment(task, mechanism, seed=seed, max_steps=max_steps)
+  env = environment.Environment(task, mechanism, seed=seed, world=world, max_steps=max_steps)
   placement.check(env.physics, task.root_entity, mechanism)
   return env

@@ -20,9 +20,11 @@ from realab_suite.engine import seeding
 from realab_suite.engine import senses as sense_kinds
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import specs as specs_lib
 from realab_suite.tasks import base
 
-_MAX_RESET_ATTEMPTS = 10
+# How often the beginning of an episode is tried, with another draw each time.
+MAX_RESET_ATTEMPTS = 10
 _TIME_LEFT = 'senses/time_left'
 
 
@@ -66,7 +68,7 @@ class Environment(composer.Environment):
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
-        max_reset_attempts=_MAX_RESET_ATTEMPTS,
+        max_reset_attempts=MAX_RESET_ATTEMPTS,
         recompile_mjcf_every_episode=not self._is_ours,
         legacy_step=False,
     )
@@ -116,6 +118,29 @@ class Environment(composer.Environment):
   def num_substeps(self) -> int:
     """How many substeps of the physics make a control step."""
     return self._n_sub_steps
+
+  @property
+  def codec(self) -> actions.ActionCodec:
+    """What takes actions apart."""
+    return self._codec
+
+  @property
+  def schedule(self) -> specs_lib.ScheduleSpec:
+    """When meters and providers act."""
+    return self._schedule
+
+  @property
+  def thin_physics(self) -> engine_physics.ThinPhysics:
+    """The physics itself, which is compiled once.
+
+    Raises:
+      SpecError: If the world is somebody else's.
+    """
+    if not isinstance(self._physics, engine_physics.ThinPhysics):
+      raise errors.SpecError(
+          f'{type(self._task).__name__} is stepped as Composer would step it'
+      )
+    return self._physics
 
   def add_sink(self, sink: events.EventSink) -> None:
     """Lets an evaluator hear of everything, from the next episode on."""
@@ -171,14 +196,14 @@ class Environment(composer.Environment):
     # Whatever goes wrong from here on, the next step starts with a reset.
     self._reset_next_step = True
     self._episode += 1
-    for attempt in range(_MAX_RESET_ATTEMPTS):
+    for attempt in range(MAX_RESET_ATTEMPTS):
       stream = f'reset/{attempt}'
       self._random_state = self._stream(stream)
       try:
         self._initialize_episode()
         break
       except composer.EpisodeInitializationError:
-        if attempt == _MAX_RESET_ATTEMPTS - 1:
+        if attempt == MAX_RESET_ATTEMPTS - 1:
           raise
     providers = self._mechanism.design.providers
     self._provider_keys = [

@@ -60,6 +60,16 @@ def episode_key(seed: int, world: int, episode: int, stream: str) -> np.ndarray:
   return sequence(seed, world, episode, stream).generate_state(2, np.uint64)
 
 
-def step_key(key: np.ndarray, step: int) -> np.ndarray:
-  """Returns the key of one control step, `(2,)` uint64."""
-  return key + np.array([0, step], np.uint64)
+def step_key(key: np.ndarray, step: int | np.ndarray) -> np.ndarray:
+  """Returns the key of one control step.
+
+  Args:
+    key: Of the episode, `(..., 2)`, uint64.
+    step: The number of the control step, `(...)`.
+
+  Returns:
+    `(..., 2)`, uint64.
+  """
+  stepped = np.array(key)
+  stepped[..., 1] += np.asarray(step).astype(np.uint64)
+  return stepped

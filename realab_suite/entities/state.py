@@ -44,6 +44,8 @@ class Slot:
         'numeric', name=_PREFIX + name, size=size or 1
     )
     self._size = size
+    self._model: Any = None
+    self._index: int | slice = 0
     self._data: Any = None
     self._view = np.zeros(0)
 
@@ -63,15 +65,19 @@ class Slot:
     self._view[...] = value
 
   def _resolve(self, physics: Any) -> None:
-    """Finds the slot in the state of a world that it has not met before."""
-    start = layout(physics.model).get(self._numeric.full_identifier)
-    if start is None:
-      raise errors.StateLayoutError(
-          f'{self._numeric.full_identifier}: not in the compiled model;'
-          ' attach the entity before the physics is compiled'
-      )
-    index = start if self._size is None else slice(start, start + self._size)
-    self._view = physics.data.userdata[..., index]
+    """Finds the slot in the state of a world other than the last one."""
+    model = physics.model
+    if model is not self._model:
+      start = layout(model).get(self._numeric.full_identifier)
+      if start is None:
+        raise errors.StateLayoutError(
+            f'{self._numeric.full_identifier}: not in the compiled model;'
+            ' attach the entity before the physics is compiled'
+        )
+      end = start + (self._size or 1)
+      self._index = start if self._size is None else slice(start, end)
+      self._model = model
+    self._view = physics.data.userdata[..., self._index]
     self._data = physics.data
 
 
