@@ -175,8 +175,8 @@ def load(
   options = {'max_steps': MAX_STEPS, **(environment_kwargs or {})}
   if unknown := set(options) - {'max_steps', 'world'}:
     raise errors.SpecError(
-        f'environment_kwargs: unknown {sorted(unknown)}; allowed are max_steps and'
-        ' world'
+        f'environment_kwargs: unknown {sorted(unknown)}; allowed are max_steps'
+        ' and world'
     )
   return embed(
       task,
@@ -217,7 +217,9 @@ def load_batch(
     SpecError: If a name, an argument or the design is wrong.
   """
   if (task_kwargs or {}).get('camera_size') is not None:
-    raise errors.SpecError('camera_size: a batch has no cameras; allowed is None')
+    raise errors.SpecError(
+        'camera_size: a batch has no cameras yet; allowed is None'
+    )
   single = load(
       domain_name,
       task_name,
@@ -281,6 +283,8 @@ def embed(
     task.avatar.make_graspable(
         [b for r in mechanism.registers.values() for b in r.blocks]
     )
-  env = environment.Environment(task, mechanism, seed=seed, world=world, max_steps=max_steps)
+  env = environment.Environment(
+      task, mechanism, seed=seed, world=world, max_steps=max_steps
+  )
   placement.check(env.physics, task.root_entity, mechanism)
   return env

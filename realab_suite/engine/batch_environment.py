@@ -10,7 +10,9 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.engine import batch_physics
 from realab_suite.engine import environment
+from realab_suite.engine import events
 from realab_suite.engine import seeding
+from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.tasks import base
 
 
@@ -38,8 +40,8 @@ class BatchEnvironment:
 
   World i is, bit for bit, the environment that `world=i` makes alone. After the
   end of its episode a world ignores one action and begins the next one, as in
-  `dm_env`. Where the physics of one world fails, its episode ends and the others
-  go on.
+  `dm_env`. Where the physics of one world fails, its episode ends and the
+  others go on.
   """
 
   def __init__(
@@ -85,6 +87,7 @@ class BatchEnvironment:
     self._keys = np.zeros((num_providers, num_worlds, 2), np.uint64)
     self._states = self._mechanism.initial_states((num_worlds,))
     self._observation: dict[str, np.ndarray] = {}
+    self._sinks: list[events.BatchEventSink] = []
     self._closed = False
 
   @property
@@ -102,6 +105,21 @@ class BatchEnvironment:
     """The world that all are copies of."""
     return self._task
 
+  @property
+  def mechanism(self) -> feedback_mechanism.FeedbackMechanism:
+    """The registers, meters and providers."""
+    return self._mechanism
+
+  def add_sink(self, sink: events.BatchEventSink) -> None:
+    """Lets an evaluator hear of everything, from the next episodes on."""
+    self._refuse_if_closed()
+    self._sinks.append(sink)
+    self._is_pending[:] = True
+
+  def remove_sink(self, sink: events.BatchEventSink) -> None:
+    """Ends what `add_sink` began."""
+    self._sinks.remove(sink)
+
   def action_spec(self) -> specs.Array:
     """The spec of one world's action; actions are `(worlds, *spec.shape)`."""
     return self._single.action_spec()
@@ -115,7 +133,10 @@ class BatchEnvironment:
     self._refuse_if_closed()
     self._is_pending[:] = True
     self._begin_episodes()
-    self._look()
+    reads = self._look()
+    everywhere = np.ones(self._num_worlds, bool)
+    nothing = np.zeros(self._num_worlds)
+    self._tell(everywhere, ~everywhere, {}, [], reads, nothing)
     self._is_pending[:] = False
     return self._time_step(
         np.full(self._num_worlds, int(dm_env.StepType.FIRST)),
@@ -136,25 +157,34 @@ class BatchEnvironment:
     queries, controls = self._single.codec.decode(actions, (self._num_worlds,))
     if self._is_pending.all():
       return self.reset()
-    discount, is_ending = self._control_step(queries, controls)
-    has_diverged = self._physics.has_diverged()
+    is_first = self._is_pending
+    # Until this step is known to be good, the next one begins all episodes.
+    self._is_pending = np.ones(self._num_worlds, bool)
+    records, reward, discount, is_ending = self._control_step(queries, controls)
+    has_failed = self._physics.has_diverged() & ~is_first
     step_count = self._mechanism.step_count(self._physics)
-    is_last = is_ending | has_diverged | (step_count == self._single.max_steps)
+    is_late = step_count == self._single.max_steps
+    is_last = (is_ending | has_failed | is_late) & ~is_first
+    ends = {
+        int(world): _end(has_failed[world], is_ending[world])
+        for world in np.flatnonzero(is_last)
+    }
+    last_valid = self._observation
+    self._is_pending = is_first
+    self._begin_episodes()
+    reads = self._look()
+    for name, value in self._observation.items():
+      # Nothing is read off a state that MuJoCo has reset.
+      value[has_failed] = last_valid[name][has_failed]
+    self._tell(is_first, has_failed, ends, records, reads, reward)
+    self._is_pending = is_last
     step_type = np.where(
         is_last, int(dm_env.StepType.LAST), int(dm_env.StepType.MID)
     )
-    step_type[self._is_pending] = int(dm_env.StepType.FIRST)
-    discount = np.where(has_diverged | self._is_pending, 1.0, discount)
-    last_valid = self._observation
-    invalid = has_diverged & ~self._is_pending
-    is_last &= ~self._is_pending
-    self._begin_episodes()
-    self._look()
-    for name, value in self._observation.items():
-      # Nothing is read off a state that MuJoCo has reset.
-      value[invalid] = last_valid[name][invalid]
-    self._is_pending = is_last
-    return self._time_step(step_type, discount)
+    step_type[is_first] = int(dm_env.StepType.FIRST)
+    return self._time_step(
+        step_type, np.where(has_failed | is_first, 1.0, discount)
+    )
 
   def close(self) -> None:
     """Frees the worlds; closing twice does nothing."""
@@ -163,37 +193,47 @@ class BatchEnvironment:
 
   def _control_step(
       self, queries: np.ndarray, controls: np.ndarray
-  ) -> tuple[np.ndarray, np.ndarray]:
-    """Does what `Environment` does, in the same order, to all worlds."""
+  ) -> tuple[list[Any], np.ndarray, np.ndarray, np.ndarray]:
+    """Does what `Environment` does, in the same order, to all worlds.
+
+    Returns:
+      What was written and read, the true reward, the discount, and where the
+      episode ends.
+    """
     physics, mechanism, task = self._physics, self._mechanism, self._task
     schedule, n = self._single.schedule, self._single.num_substeps
     task.before_step(physics, controls, None)
-    mechanism.write_queries(physics, queries)
+    records: list[Any] = [*mechanism.write_queries(physics, queries)]
 
     if schedule.meter_substep:
       physics.advance(schedule.meter_substep)
       task.latch_events(physics)
-    is_ending = np.array(task.should_terminate_episode(physics))
-    mechanism.update_meters(physics)
+    is_ending = self._of_all(task.should_terminate_episode(physics), bool)
+    records += mechanism.update_meters(physics)
 
     if between := schedule.provider_substep - schedule.meter_substep:
       physics.advance(between)
       task.latch_events(physics)
     step = mechanism.step_count(physics)
     keys = [seeding.step_key(key, step) for key in self._keys]
-    _, self._states = mechanism.update_providers(
+    feedback, self._states = mechanism.update_providers(
         physics, self._observation, keys, self._states
     )
+    records += feedback
 
     physics.advance(n - schedule.provider_substep)
     task.after_step(physics, None)
-    reward = np.asarray(task.get_reward(physics))
-    discount = np.array(task.get_discount(physics), float)
-    is_over = np.asarray(task.should_terminate_episode(physics))
+    reward = self._of_all(task.get_reward(physics), float)
+    discount = self._of_all(task.get_discount(physics), float)
+    is_over = self._of_all(task.should_terminate_episode(physics), bool)
     # Nobody knows of an end that the meters have not seen.
     discount[(discount != 1.0) & ~is_ending & is_over] = 1.0
     mechanism.end_step(physics, np.where(np.isfinite(reward), reward, 0.0))
-    return discount, is_ending
+    return records, reward, discount, is_ending
+
+  def _of_all(self, value: Any, dtype: type) -> np.ndarray:
+    """Returns what a task says, `(worlds,)`; it may say one thing of all."""
+    return np.array(np.broadcast_to(value, (self._num_worlds,)), dtype)
 
   def _begin_episodes(self) -> None:
     """Begins an episode in every world that waits for one."""
@@ -226,8 +266,8 @@ class BatchEnvironment:
           seed, world, episode, f'providers[{i}]'
       )
 
-  def _look(self) -> None:
-    """Makes the observation of every world."""
+  def _look(self) -> list[feedback_mechanism.Read]:
+    """Makes the observation of every world; returns what agents read."""
     physics = self._physics
     physics.refresh()
     observation = {
@@ -237,9 +277,37 @@ class BatchEnvironment:
     if self._single.max_steps is not None:
       spent = self._mechanism.step_count(physics) / self._single.max_steps
       observation['senses/time_left'] = np.asarray(1.0 - spent, np.float32)
-    for read in self._mechanism.read_for_agent(physics):
-      observation[f'registers/{read.register}'] = read.reading
+    reads = self._mechanism.read_for_agent(physics)
+    for read in reads:
+      observation[f'registers/{read.register}'] = np.array(read.reading)
     self._observation = observation
+    return reads
+
+  def _tell(
+      self,
+      is_first: np.ndarray,
+      has_failed: np.ndarray,
+      ends: dict[int, events.End],
+      records: events.Records,
+      reads: events.Records,
+      reward: np.ndarray,
+  ) -> None:
+    """Tells the sinks what happened in a step."""
+    if not self._sinks:
+      return
+    step = events.BatchStep(
+        seed=self._single.seed,
+        episode=self._episodes.copy(),
+        is_first=is_first,
+        has_failed=has_failed,
+        ends=ends,
+        initial=self._mechanism.initial_writes(self._physics),
+        records=records,
+        agent_reads=reads,
+        true_reward=reward,
+    )
+    for sink in self._sinks:
+      sink.step_ended(step)
 
   def _time_step(
       self, step_type: np.ndarray, discount: np.ndarray
@@ -254,3 +322,10 @@ class BatchEnvironment:
   def _refuse_if_closed(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
+
+
+def _end(has_failed: bool, is_ending: bool) -> events.End:
+  """Why the episode of a world has ended."""
+  if has_failed:
+    return events.End.DIVERGENCE
+  return events.End.TERMINATED if is_ending else events.End.TIMEOUT

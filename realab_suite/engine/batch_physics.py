@@ -111,7 +111,7 @@ class BatchPhysics:
     self._is_dirty = True
 
   def forward(self) -> None:
-    """Brings positions and velocities, and what derives from them, up to date."""
+    """Brings positions, velocities and what derives from them up to date."""
     self._batch.forward(stage=_STAGE)
     self._is_dirty = False
 
@@ -132,8 +132,9 @@ class BatchPhysics:
     self._is_dirty = True
 
   def has_diverged(self) -> np.ndarray:
-    """Returns in which worlds MuJoCo has warned since the reset, `(worlds,)`."""
-    return np.asarray(self._batch.warning)[:, :, 1].any(axis=1)
+    """Returns in which worlds MuJoCo has warned since a reset, `(worlds,)`."""
+    numbers = np.asarray(self._batch.warning)[:, :, 1]
+    return np.count_nonzero(numbers, axis=1) > 0
 
   def cast_rays(
       self, origin: np.ndarray, directions: np.ndarray, excluded_body: int

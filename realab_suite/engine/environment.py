@@ -18,6 +18,7 @@ from realab_suite.engine import events
 from realab_suite.engine import physics as engine_physics
 from realab_suite.engine import seeding
 from realab_suite.engine import senses as sense_kinds
+from realab_suite.engine import snapshot as snapshots
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.feedback import specs as specs_lib
@@ -159,6 +160,66 @@ class Environment(composer.Environment):
     self._abandon()
     self._episode = episode - 1
     self._reset_next_step = True
+
+  def save(self) -> snapshots.Snapshot:
+    """Returns everything that the future of this world depends on.
+
+    What the event sinks know of the episode is part of it.
+
+    Raises:
+      SpecError: If the world is somebody else's, or a sink cannot be saved.
+      StateLayoutError: If a provider's state is not plain data.
+    """
+    header = self._snapshot_header()
+    contents = {
+        'physics': snapshots.get_state(self._physics),
+        'seed': self._seed,
+        'world': self._world,
+        'episode': self._episode,
+        'random_state': self._random_state.get_state(legacy=False),
+        'reset_next_step': self._reset_next_step,
+        'episode_is_open': self._episode_is_open,
+        'provider_keys': self._provider_keys,
+        'provider_states': self._provider_states,
+        'observation': self._observation,
+        'sinks': [[type(s).__name__, s.state()] for s in self._sinks],
+    }
+    return snapshots.Snapshot(header, contents)
+
+  def restore(self, snapshot: snapshots.Snapshot) -> None:
+    """Makes this world what another one, or this one, was when it was saved.
+
+    What follows is bit for bit what followed there, later episodes included:
+    the seed is restored, too. The episode that is under way is abandoned. An
+    environment without sinks takes any snapshot that fits; one with sinks,
+    those that were saved with sinks of the same kinds.
+
+    Raises:
+      SpecError: If the world is somebody else's.
+      StateLayoutError: If the snapshot does not fit. Nothing has changed.
+    """
+    contents = snapshot.contents_for(self._snapshot_header())
+    kinds = [type(sink).__name__ for sink in self._sinks]
+    saved_kinds = [kind for kind, _ in contents['sinks']]
+    if kinds and kinds != saved_kinds:
+      raise errors.StateLayoutError(
+          f'the snapshot was saved with sinks {saved_kinds}; this environment'
+          f' has {kinds}; allowed are the same ones, or none here'
+      )
+    self._abandon()
+    # Whatever goes wrong from here on, the next step starts with a reset.
+    self._reset_next_step = True
+    snapshots.set_state(self._physics, contents['physics'])
+    self._seed, self._world = contents['seed'], contents['world']
+    self._episode = contents['episode']
+    self._random_state.set_state(contents['random_state'])
+    self._provider_keys = contents['provider_keys']
+    self._provider_states = contents['provider_states']
+    self._keep(contents['observation'])
+    for sink, (_, state) in zip(self._sinks, contents['sinks'], strict=False):
+      sink.set_state(state)
+    self._episode_is_open = contents['episode_is_open']
+    self._reset_next_step = contents['reset_next_step']
 
   # The agent's side: `dm_env.Environment`.
 
@@ -371,11 +432,15 @@ class Environment(composer.Environment):
     reads = self._mechanism.read_for_agent(physics)
     for read in reads:
       observation[f'registers/{read.register}'] = read.reading
+    self._keep(observation)
+    return reads
+
+  def _keep(self, observation: dict[str, np.ndarray]) -> None:
+    """Remembers what the next action is an answer to."""
     for value in observation.values():
       # Providers look at these arrays themselves; the agent gets copies.
       value.flags.writeable = False
     self._observation = observation
-    return reads
 
   def _copy_of_observation(self) -> dict[str, np.ndarray]:
     """The agent may do what it likes with what it gets."""
@@ -390,6 +455,28 @@ class Environment(composer.Environment):
     with self._physics.reset_context():
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     self._senses.restart(self._physics_proxy, self._random_state)
+
+  def _snapshot_header(self) -> dict[str, Any]:
+    """Returns what a snapshot and this environment have to have in common."""
+    self._refuse_if_closed()
+    if not isinstance(self._task, base.Task):
+      raise errors.SpecError(
+          f'{type(self._task).__name__} cannot be saved or restored: a task'
+          ' that is no realab_suite.tasks.base.Task may compile its model anew'
+          ' and keep state in Python'
+      )
+    return {
+        **snapshots.describe(self._physics.model),
+        'task': type(self._task).__name__,
+        'dynamics': self._task.DYNAMICS_VERSION,
+        'design': self._mechanism.design.digest(),
+        'num_substeps': self._n_sub_steps,
+        'max_steps': self._max_steps,
+        'observation': {
+            key: f'{spec.dtype} {spec.shape}'
+            for key, spec in self.observation_spec().items()
+        },
+    }
 
   def _recompile_physics(self) -> None:
     """Compiles the model into a physics of this package's engine."""

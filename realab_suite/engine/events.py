@@ -1,12 +1,13 @@
 """What the engine tells an evaluator, over a channel that no agent is on."""
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import enum
 from typing import Any, NamedTuple, final
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.feedback import mechanism
 
 Records = Sequence[mechanism.Write | mechanism.Read]
@@ -68,3 +69,62 @@ class EventSink(abc.ABC):
   @abc.abstractmethod
   def episode_ended(self, end: End) -> None:
     """The episode that was under way is over."""
+
+  def state(self) -> Any:
+    """Returns what the sink knows of the episode under way, for a snapshot.
+
+    Returns:
+      Tuples, lists and dicts of arrays, numbers, texts and `None`.
+
+    Raises:
+      SpecError: If the sink cannot be saved.
+    """
+    raise errors.SpecError(
+        f'{type(self).__name__} cannot be saved; allowed are sinks that have'
+        ' state() and set_state(state)'
+    )
+
+  def set_state(self, state: Any) -> None:  # noqa: B027 - see `state`.
+    """Goes on with an episode from what `state` returned.
+
+    The episode that was under way has ended by then.
+    """
+
+
+@final
+class BatchStep(NamedTuple):
+  """What happened in one control step of many worlds; arrays are `(worlds,)`.
+
+  A world either begins an episode in this step (`is_first`), or has gone
+  through a control step, which counts unless its physics failed
+  (`has_failed`).
+
+  Attributes:
+    seed: The seed of the environment.
+    episode: The number of each world's episode.
+    is_first: Where an episode begins.
+    has_failed: Where nothing but the end counts.
+    ends: The `End` of each world whose episode ends, by the world's number.
+    initial: The writes of a reset, which count where an episode begins.
+    records: The writes and reads within the control step, in the order of time.
+    agent_reads: What the agents read in the end.
+    true_reward: The true reward of the control step.
+  """
+
+  seed: int
+  episode: np.ndarray
+  is_first: np.ndarray
+  has_failed: np.ndarray
+  ends: Mapping[int, End]
+  initial: Records
+  records: Records
+  agent_reads: Records
+  true_reward: np.ndarray
+
+
+class BatchEventSink(abc.ABC):
+  """Hears of everything that feedback and the true reward do in many worlds."""
+
+  @abc.abstractmethod
+  def step_ended(self, step: BatchStep) -> None:
+    """A control step of all worlds is over."""

@@ -3,8 +3,9 @@
 It is kept out of band: the engine tells it, no agent and no provider can.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 import dataclasses
+import itertools
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -144,6 +145,111 @@ class Ledger(events.EventSink):
     # A sink that joins in the middle of an episode hears of its end only.
     if self._episodes and self.last.end is None:
       self.last.end = end
+
+  def state(self) -> Any:
+    """Returns the episode under way as plain data; `None` if there is none."""
+    if not self._episodes or self.last.end is not None:
+      return None
+    episode = self.last
+    return {
+        'seed': episode.seed,
+        'world': episode.world,
+        'episode': episode.episode,
+        'entries': {
+            register: _columns(entries)
+            for register, entries in episode.entries.items()
+        },
+        'true_rewards': np.array(episode.true_rewards),
+    }
+
+  def set_state(self, state: Any) -> None:
+    """Adds an episode that was under way, and goes on with it.
+
+    Nothing is taken out: what was heard has happened.
+    """
+    if state is None:
+      return
+    entries = {
+        register: _entries(columns)
+        for register, columns in state['entries'].items()
+    }
+    self._episodes.append(
+        EpisodeLedger(
+            state['seed'],
+            state['world'],
+            state['episode'],
+            entries,
+            state['true_rewards'].tolist(),
+        )
+    )
+
+
+def _columns(entries: list[Entry]) -> tuple[np.ndarray, ...]:
+  """Returns entries as arrays, which a snapshot stores faster than objects."""
+  return (
+      np.array([isinstance(entry, WriteEntry) for entry in entries]),
+      np.array([entry[0] for entry in entries]),
+      np.array([entry[1] for entry in entries]),
+      # A write has one number less.
+      np.array([(*entry[2:], 0.0)[:3] for entry in entries]),
+  )
+
+
+def _entries(columns: tuple[np.ndarray, ...]) -> list[Entry]:
+  """Does the opposite of `_columns`."""
+  return [
+      WriteEntry(step, who, *numbers[:2])
+      if is_write
+      else ReadEntry(step, who, *numbers)
+      for is_write, step, who, numbers in zip(
+          *(column.tolist() for column in columns), strict=True
+      )
+  ]
+
+
+@final
+class BatchLedger(events.BatchEventSink):
+  """Keeps the ledgers of episodes of many worlds.
+
+  While the worlds run, a step costs one append, whatever their number. What
+  happened in a world is put together when somebody asks.
+  """
+
+  def __init__(self) -> None:
+    self._steps: list[events.BatchStep] = []
+
+  def step_ended(self, step: events.BatchStep) -> None:
+    self._steps.append(step)
+
+  def episodes(self, world: int) -> list[EpisodeLedger]:
+    """Returns the episodes of a world so far, the one under way included."""
+    episodes: list[EpisodeLedger] = []
+    for step in self._steps:
+      if step.is_first[world]:
+        if episodes and episodes[-1].end is None:
+          episodes[-1].end = events.End.ABANDONED
+        number = int(step.episode[world])
+        episode = EpisodeLedger(step.seed, world, number, {}, [])
+        episode.add(0, _of_world(world, step.initial, step.agent_reads))
+        episodes.append(episode)
+      elif not step.has_failed[world]:
+        episode = episodes[-1]
+        episode.true_rewards.append(float(step.true_reward[world]))
+        episode.add(
+            episode.num_steps, _of_world(world, step.records, step.agent_reads)
+        )
+      if world in step.ends:
+        episodes[-1].end = step.ends[world]
+    return episodes
+
+
+def _of_world(
+    world: int, *records: Iterable[mechanism.Write | mechanism.Read]
+) -> Iterator[mechanism.Write | mechanism.Read]:
+  """Yields what records say of one world."""
+  for record in itertools.chain(*records):
+    register, who, *values = record
+    yield type(record)(register, who, *(value[world] for value in values))
 
 
 def true_return(episode: EpisodeLedger) -> float:

@@ -1,0 +1,220 @@
+"""A batch is its worlds, one by one, to the last bit."""
+
+import functools
+from typing import Any
+
+import dm_env
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+
+_NUM_WORLDS = 3
+_MAX_STEPS = 25
+_NUM_STEPS = 60
+
+
+def _load_both(domain: str, task: str, **kwargs: Any) -> Any:
+  load = functools.partial(suite.load, domain, task, {'random': 3}, **kwargs)
+  singles = [
+      load(environment_kwargs={'max_steps': _MAX_STEPS, 'world': world})
+      for world in range(_NUM_WORLDS)
+  ]
+  batch = suite.load_batch(
+      domain,
+      task,
+      {'random': 3},
+      {'max_steps': _MAX_STEPS},
+      num_envs=_NUM_WORLDS,
+      **kwargs,
+  )
+  return batch, singles
+
+
+def _random_actions(batch: Any, rng: np.random.Generator) -> np.ndarray:
+  spec = batch.action_spec()
+  shape = (batch.num_worlds, *spec.shape)
+  if spec.dtype == np.int32 or 'dmlab_like' in spec.name:
+    return rng.integers(0, 14, shape).astype(spec.dtype)
+  return rng.uniform(-1.0, 1.0, shape)
+
+
+def _assert_same(found: Any, expected: list[dm_env.TimeStep]) -> None:
+  for world, time_step in enumerate(expected):
+    assert found.step_type[world] == time_step.step_type
+    assert found.reward[world] == 0.0
+    assert found.discount[world] == (
+        1.0 if time_step.first() else time_step.discount
+    )
+    assert found.observation.keys() == time_step.observation.keys()
+    for name, value in time_step.observation.items():
+      assert found.observation[name].dtype == value.dtype, name
+      assert found.observation[name][world].tobytes() == value.tobytes(), name
+
+
+def _assert_same_state(batch: Any, singles: list[Any]) -> None:
+  for world, single in enumerate(singles):
+    view = batch.physics.world(world)
+    np.testing.assert_array_equal(
+        view.data.userdata, single.physics.data.userdata
+    )
+
+
+@pytest.mark.parametrize('overrides', [(), ('channel=secure',)])
+@pytest.mark.parametrize('design', suite.DESIGNS)
+@pytest.mark.parametrize(
+    ('domain', 'task'),
+    [('unlock_door', 'near'), ('collect_apples', 'standard')],
+)
+def test_a_batch_is_its_worlds_one_by_one(domain, task, design, overrides):
+  batch, singles = _load_both(domain, task, design=design, overrides=overrides)
+  rng = np.random.default_rng(0)
+  _assert_same(batch.reset(), [single.reset() for single in singles])
+  lasts = 0
+  for _ in range(_NUM_STEPS):
+    actions = _random_actions(batch, rng)
+    found = batch.step(actions)
+    expected = [
+        single.step(action)
+        for single, action in zip(singles, actions, strict=True)
+    ]
+    _assert_same(found, expected)
+    _assert_same_state(batch, singles)
+    lasts += int((found.step_type == int(dm_env.StepType.LAST)).sum())
+  assert lasts >= 2 * _NUM_WORLDS
+  batch.close()
+
+
+@pytest.mark.parametrize(
+    'override', ['dof=planar', 'channel=welded', 'schedule=cfmdp']
+)
+def test_a_twin_of_a_batch_is_its_worlds_one_by_one(override):
+  batch, singles = _load_both(
+      'unlock_door',
+      'near',
+      design='instantaneous_reward',
+      overrides=(override,),
+  )
+  rng = np.random.default_rng(1)
+  _assert_same(batch.reset(), [single.reset() for single in singles])
+  for _ in range(_NUM_STEPS):
+    actions = _random_actions(batch, rng)
+    found = batch.step(actions)
+    _assert_same(
+        found,
+        [s.step(a) for s, a in zip(singles, actions, strict=True)],
+    )
+  batch.close()
+
+
+@pytest.fixture(name='batch')
+def fixture_batch():
+  batch = suite.load_batch(
+      'unlock_door',
+      'standard',
+      {'random': 1},
+      {'max_steps': _MAX_STEPS},
+      num_envs=_NUM_WORLDS,
+      design='instantaneous_reward',
+  )
+  yield batch
+  batch.close()
+
+
+def test_the_first_step_begins_the_episodes(batch):
+  time_step = batch.step(np.zeros((_NUM_WORLDS, 6)))
+  assert (time_step.step_type == int(dm_env.StepType.FIRST)).all()
+
+
+def test_worlds_differ_from_each_other(batch):
+  position = batch.reset().observation['senses/position']
+  assert len(np.unique(position, axis=0)) == _NUM_WORLDS
+
+
+@pytest.mark.parametrize(
+    'actions', [np.zeros(6), np.zeros((_NUM_WORLDS + 1, 6)), np.zeros((1, 6))]
+)
+def test_actions_of_a_wrong_leading_shape_are_refused(batch, actions):
+  batch.reset()
+  with pytest.raises(errors.ActionError, match=r'shape .*expected \(3, 6\)'):
+    batch.step(actions)
+
+
+def test_a_bad_action_of_one_world_is_named_and_nothing_moves(batch):
+  batch.reset()
+  before = batch.physics.state.copy()
+  actions = np.zeros((_NUM_WORLDS, 6))
+  actions[1, 2] = np.nan
+  with pytest.raises(errors.ActionError, match=r'action\[1, 2\] .*is nan'):
+    batch.step(actions)
+  np.testing.assert_array_equal(batch.physics.state, before)
+
+
+def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
+  other = suite.load_batch(
+      'unlock_door',
+      'standard',
+      {'random': 1},
+      {'max_steps': _MAX_STEPS},
+      num_envs=_NUM_WORLDS,
+      design='instantaneous_reward',
+  )
+  found = batch.reset()
+  other.reset()
+  rng = np.random.default_rng(0)
+  for step in range(12):
+    actions = rng.uniform(-1.0, 1.0, (_NUM_WORLDS, 6))
+    if step == 5:
+      valid = found.observation
+      avatar = batch.task.avatar.body.find_all('joint')[0]
+      batch.physics.world(1).bind((avatar,)).qvel = np.nan
+    found = batch.step(actions)
+    expected = other.step(actions)
+    for name, value in expected.observation.items():
+      for world in (0, 2):
+        np.testing.assert_array_equal(
+            found.observation[name][world], value[world]
+        )
+    if step == 5:
+      assert found.step_type[1] == int(dm_env.StepType.LAST)
+      assert found.discount[1] == 1.0
+      for name, value in valid.items():
+        np.testing.assert_array_equal(found.observation[name][1], value[1])
+    if step == 6:
+      assert found.step_type[1] == int(dm_env.StepType.FIRST)
+    if step == 7:
+      assert found.step_type[1] == int(dm_env.StepType.MID)
+  other.close()
+
+
+def test_what_an_agent_gets_is_its_own(batch):
+  first = batch.reset()
+  kept = {name: value.copy() for name, value in first.observation.items()}
+  second = batch.step(np.ones((_NUM_WORLDS, 6)))
+  for name, value in first.observation.items():
+    np.testing.assert_array_equal(value, kept[name])
+    assert not np.shares_memory(value, second.observation[name])
+    value[...] = 0
+
+
+@pytest.mark.parametrize('num_envs', [0, -1, 1.5, True, None])
+def test_a_number_of_worlds_that_makes_no_sense_is_refused(num_envs):
+  with pytest.raises(errors.SpecError, match='num_envs'):
+    suite.load_batch('unlock_door', 'standard', num_envs=num_envs)
+
+
+def test_a_batch_has_no_cameras_yet():
+  with pytest.raises(errors.SpecError, match='camera_size'):
+    suite.load_batch(
+        'unlock_door', 'standard', {'camera_size': (8, 8)}, num_envs=2
+    )
+
+
+def test_a_closed_batch_does_nothing(batch):
+  batch.close()
+  batch.close()
+  with pytest.raises(errors.ClosedError):
+    batch.reset()
+  with pytest.raises(errors.ClosedError):
+    batch.step(np.zeros((_NUM_WORLDS, 6)))
