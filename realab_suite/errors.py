@@ -35,6 +35,16 @@ class ClosedError(RealabError, RuntimeError):
   """An environment was used after `close()`."""
 
 
+@final
+class RenderingError(RealabError, RuntimeError):
+  """A frame cannot be drawn here; the message names what to set."""
+
+
+@final
+class ForkError(RealabError, RuntimeError):
+  """A process that was forked asked for what only its parent has."""
+
+
 class ResultsError(RealabError, ValueError):
   """Results cannot be written, read or compared as asked."""
 

@@ -12,6 +12,7 @@ from typing import Any
 from absl import flags
 import dm_env
 
+from realab_suite import _display
 from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
@@ -29,7 +30,7 @@ _VIDEO = flags.DEFINE_string(
 def main(argv: Sequence[str]) -> None:
   """Opens a window, or writes a film."""
   del argv
-  if _VIDEO.value is None and headless.has_display():
+  if _VIDEO.value is None and _display.has_display():
     _open_window()
   else:
     _write_film()

@@ -216,9 +216,10 @@ def load_batch(
   Raises:
     SpecError: If a name, an argument or the design is wrong.
   """
-  if (task_kwargs or {}).get('camera_size') is not None:
+  if 'world' in (environment_kwargs or {}):
     raise errors.SpecError(
-        'camera_size: a batch has no cameras yet; allowed is None'
+        'environment_kwargs: a batch has all worlds from 0 on; allowed is'
+        ' max_steps'
     )
   single = load(
       domain_name,
@@ -228,6 +229,10 @@ def load_batch(
       design=design,
       overrides=overrides,
   )
+  if isinstance(single.task, base.Task) and single.task.camera_size is not None:
+    raise errors.SpecError(
+        'camera_size: a batch has no cameras yet; allowed is None'
+    )
   return batch_environment.BatchEnvironment(single, num_envs, num_threads)
 
 
@@ -236,7 +241,7 @@ def embed(
     design: specs.Design,
     *,
     random: int | np.random.RandomState | None = None,
-    max_steps: int | None = None,
+    max_steps: int | None = 1000,
     world: int = 0,
     measurements: Mapping[str, Callable[[Any], Any]] | None = None,
     overrides: Sequence[str] = (),
@@ -250,7 +255,8 @@ def embed(
     task: The task; registers are attached to its root entity.
     design: As in `load`.
     random: A seed.
-    max_steps: After how many control steps an episode ends, or `None`.
+    max_steps: After how many control steps an episode ends; `None` if only the
+      task ends it.
     world: Which world of a batch this is; the random streams of each differ.
     measurements: What meters can measure besides `score`, the true return so
       far: functions of the physics, by name.
@@ -259,6 +265,19 @@ def embed(
   Raises:
     SpecError: If the design is wrong or does not fit the task.
   """
+  if not isinstance(task, composer.Task):
+    raise errors.SpecError(
+        f'task: {type(task).__name__}; allowed are Composer tasks'
+    )
+  if type(world) is not int or world < 0:
+    raise errors.SpecError(f'world: {world!r}; allowed are integers from 0 on')
+  if isinstance(overrides, str) or not all(
+      isinstance(override, str) for override in overrides
+  ):
+    raise errors.SpecError(
+        f'overrides: {overrides!r:.80}; allowed is a list of texts, as in'
+        " ['channel=secure']"
+    )
   seed = seeding.as_seed(random)
   if max_steps is not None and (
       isinstance(max_steps, bool)

@@ -1,10 +1,12 @@
 """Benchmarks run and report; how fast things are is not tested here."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
+from benchmarks import batch
 from benchmarks import reset
 from benchmarks import step
 from benchmarks import timing
@@ -37,6 +39,62 @@ def test_each_benchmark_prints_a_line_per_figure(
     assert f' {target} ' in line
     judged = {'met', 'missed'} & set(line.split())
     assert bool(judged) == (target != '-')
+
+
+_FEW_WORLDS = {
+    '_WORLDS': 2,
+    '_STEPS': 2,
+    '_STOCK_STEPS': 2,
+    '_SIZES': {1: 1, 2: 1},
+    '_REGISTERS': (1, 2),
+    '_REGISTER_STEPS': 1,
+    '_MEMORY_WORLDS': 2,
+}
+
+
+@pytest.fixture(name='few_worlds')
+def few_worlds_fixture(monkeypatch: pytest.MonkeyPatch) -> None:
+  for name, value in _FEW_WORLDS.items():
+    monkeypatch.setattr(batch, name, value)
+
+
+@pytest.mark.usefixtures('few_worlds')
+def test_the_benchmark_of_many_worlds_prints_a_line_per_figure(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+  batch.main(['--rounds=1'])
+  lines = capsys.readouterr().out.splitlines()
+  for name, target in {
+      'throughput lost to raw engine': '<= 15 %',
+      "a world's step, of a stock step": '<= 6.67 %',
+      "a world's reset": '<= 0.2 ms',
+      'memory of one of 2 worlds': '<= 1 MiB',
+      'steps of 2 worlds': '-',
+      'step, registers: 2 planar': '-',
+      '2 registers to 1, free': '<= 2 x',
+  }.items():
+    (line,) = (line for line in lines if line.startswith(f'{name}  '))
+    assert f' {target} ' in line
+    judged = {'met', 'missed'} & set(line.split())
+    assert bool(judged) == (target != '-')
+
+
+@pytest.mark.usefixtures('few_worlds')
+def test_a_raw_batch_that_does_something_else_is_noticed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+  record = batch._record
+
+  def record_carelessly(env: Any, actions: np.ndarray) -> batch.RawSteps:
+    raw = record(env, actions)
+    writes, _ = raw.steps[-1][1]
+    writes[0][1][:] += 1e-12
+    return raw
+
+  monkeypatch.setattr(batch, '_record', record_carelessly)
+  monkeypatch.setattr(batch, '_measure_memory', list)
+  with pytest.raises(RuntimeError, match='another state'):
+    batch.main(['--rounds=1'])
 
 
 def test_a_raw_engine_that_does_something_else_is_noticed(

@@ -20,11 +20,12 @@ _PACKAGE = 'realab_suite'
 
 # What each layer may import besides itself and `_FOUNDATION`. An entry that
 # names a module admits that module alone.
-_FOUNDATION = ('errors', '_versions')
+_FOUNDATION = ('errors', '_display', '_versions')
 _BELOW_SUITE = ('entities', 'feedback', 'tasks', 'engine', 'evaluation')
 _MAY_IMPORT = {
     '__init__': (),
     'errors': (),
+    '_display': (),
     '_versions': (),
     'configs': (),
     'entities': (),

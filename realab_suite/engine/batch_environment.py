@@ -61,19 +61,20 @@ class BatchEnvironment:
     Raises:
       SpecError: If there cannot be many of this environment.
     """
-    if (
-        isinstance(num_worlds, bool)
-        or not isinstance(num_worlds, int)
-        or num_worlds < 1
-    ):
+    if type(num_worlds) is not int or num_worlds < 1:
       raise errors.SpecError(
           f'num_envs: {num_worlds!r}; allowed are positive integers'
+      )
+    if type(num_threads) is not int or num_threads < 0:
+      raise errors.SpecError(
+          f'num_threads: {num_threads!r}; allowed are integers from 0 on'
       )
     if not isinstance(single.task, base.Task):
       raise errors.SpecError(
           f'{type(single.task).__name__} compiles anew in each episode; a batch'
           ' takes worlds of this package'
       )
+    _refuse_step_hooks(single.task)
     self._single = single
     self._task: base.Task = single.task
     self._mechanism = single.mechanism
@@ -160,7 +161,13 @@ class BatchEnvironment:
     is_first = self._is_pending
     # Until this step is known to be good, the next one begins all episodes.
     self._is_pending = np.ones(self._num_worlds, bool)
-    records, reward, discount, is_ending = self._control_step(queries, controls)
+    try:
+      records, reward, discount, is_ending = self._control_step(
+          queries, controls, is_first
+      )
+    except Exception:
+      self._tell_of_end(~is_first, events.End.ERROR)
+      raise
     has_failed = self._physics.has_diverged() & ~is_first
     step_count = self._mechanism.step_count(self._physics)
     is_late = step_count == self._single.max_steps
@@ -176,6 +183,7 @@ class BatchEnvironment:
     for name, value in self._observation.items():
       # Nothing is read off a state that MuJoCo has reset.
       value[has_failed] = last_valid[name][has_failed]
+      value.flags.writeable = False
     self._tell(is_first, has_failed, ends, records, reads, reward)
     self._is_pending = is_last
     step_type = np.where(
@@ -188,13 +196,18 @@ class BatchEnvironment:
 
   def close(self) -> None:
     """Frees the worlds; closing twice does nothing."""
+    if not self._closed:
+      self._tell_of_end(~self._is_pending, events.End.ABANDONED)
     self._closed = True
     self._single.close()
 
   def _control_step(
-      self, queries: np.ndarray, controls: np.ndarray
+      self, queries: np.ndarray, controls: np.ndarray, is_first: np.ndarray
   ) -> tuple[list[Any], np.ndarray, np.ndarray, np.ndarray]:
     """Does what `Environment` does, in the same order, to all worlds.
+
+    Worlds that begin an episode next (`is_first`) go along, for nothing that
+    happens in them counts; nor may it do harm.
 
     Returns:
       What was written and read, the true reward, the discount, and where the
@@ -202,6 +215,7 @@ class BatchEnvironment:
     """
     physics, mechanism, task = self._physics, self._mechanism, self._task
     schedule, n = self._single.schedule, self._single.num_substeps
+    was_over = self._of_all(task.should_terminate_episode(physics), bool)
     task.before_step(physics, controls, None)
     records: list[Any] = [*mechanism.write_queries(physics, queries)]
 
@@ -209,7 +223,8 @@ class BatchEnvironment:
       physics.advance(schedule.meter_substep)
       task.latch_events(physics)
     is_ending = self._of_all(task.should_terminate_episode(physics), bool)
-    records += mechanism.update_meters(physics)
+    idle = is_first | physics.has_diverged()
+    records += mechanism.update_meters(physics, idle)
 
     if between := schedule.provider_substep - schedule.meter_substep:
       physics.advance(between)
@@ -217,19 +232,31 @@ class BatchEnvironment:
     step = mechanism.step_count(physics)
     keys = [seeding.step_key(key, step) for key in self._keys]
     feedback, self._states = mechanism.update_providers(
-        physics, self._observation, keys, self._states
+        physics,
+        self._observation,
+        keys,
+        self._states,
+        is_first | physics.has_diverged(),
     )
     records += feedback
 
     physics.advance(n - schedule.provider_substep)
     task.after_step(physics, None)
-    reward = self._of_all(task.get_reward(physics), float)
+    reward = self._true_reward()
+    reward[was_over] = 0.0
     discount = self._of_all(task.get_discount(physics), float)
     is_over = self._of_all(task.should_terminate_episode(physics), bool)
     # Nobody knows of an end that the meters have not seen.
     discount[(discount != 1.0) & ~is_ending & is_over] = 1.0
     mechanism.end_step(physics, np.where(np.isfinite(reward), reward, 0.0))
     return records, reward, discount, is_ending
+
+  def _true_reward(self) -> np.ndarray:
+    """Returns the true reward, or nan where the task fails to give one."""
+    try:
+      return self._of_all(self._task.get_reward(self._physics), float)
+    except Exception:  # Whatever a task does wrong is not the agent's business.
+      return np.full(self._num_worlds, np.nan)
 
   def _of_all(self, value: Any, dtype: type) -> np.ndarray:
     """Returns what a task says, `(worlds,)`; it may say one thing of all."""
@@ -241,6 +268,11 @@ class BatchEnvironment:
     if not len(worlds):
       return
     self._physics.reset(worlds)
+    fresh = self._mechanism.initial_states((self._num_worlds,))
+    self._states = [
+        _begin_anew(state, initial, worlds)
+        for state, initial in zip(self._states, fresh, strict=True)
+    ]
     for world in worlds:
       self._episodes[world] += 1
       self._initialize(int(world), int(self._episodes[world]))
@@ -309,6 +341,23 @@ class BatchEnvironment:
     for sink in self._sinks:
       sink.step_ended(step)
 
+  def _tell_of_end(self, worlds: np.ndarray, end: events.End) -> None:
+    """Tells the sinks that episodes are over, between two steps."""
+    nowhere = np.zeros(self._num_worlds, bool)
+    step = events.BatchStep(
+        seed=self._single.seed,
+        episode=self._episodes.copy(),
+        is_first=nowhere,
+        has_failed=~nowhere,
+        ends={int(world): end for world in np.flatnonzero(worlds)},
+        initial=[],
+        records=[],
+        agent_reads=[],
+        true_reward=np.zeros(self._num_worlds),
+    )
+    for sink in self._sinks:
+      sink.step_ended(step)
+
   def _time_step(
       self, step_type: np.ndarray, discount: np.ndarray
   ) -> BatchTimeStep:
@@ -322,6 +371,34 @@ class BatchEnvironment:
   def _refuse_if_closed(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
+
+
+def _begin_anew(state: Any, initial: Any, worlds: np.ndarray) -> Any:
+  """Returns a provider's state, with the initial one in some worlds."""
+  if isinstance(state, dict):
+    return {
+        key: _begin_anew(part, initial[key], worlds)
+        for key, part in state.items()
+    }
+  if isinstance(state, tuple | list):
+    return type(state)(
+        _begin_anew(part, first, worlds)
+        for part, first in zip(state, initial, strict=True)
+    )
+  begun = np.array(state)
+  begun[worlds] = np.asarray(initial)[worlds]
+  return begun
+
+
+def _refuse_step_hooks(task: base.Task) -> None:
+  """Refuses entities that want to be called in each step: nobody would."""
+  for entity in task.root_entity.iter_entities():
+    for hook in ('before_step', 'after_step'):
+      if getattr(type(entity), hook) is not getattr(composer.Entity, hook):
+        raise errors.SpecError(
+            f'{type(entity).__name__}.{hook}: a batch calls the hooks of the'
+            ' task only'
+        )
 
 
 def _end(has_failed: bool, is_ending: bool) -> events.End:

@@ -66,6 +66,8 @@ class Environment(composer.Environment):
     # A world of ours has no hooks in substeps and compiles once. Somebody
     # else's is treated as Composer would.
     self._is_ours = isinstance(task, base.Task)
+    if isinstance(task, base.Task):
+      _refuse_substep_hooks(task)
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
@@ -109,6 +111,11 @@ class Environment(composer.Environment):
   def seed(self) -> int:
     """From which every random stream follows."""
     return self._seed
+
+  @property
+  def world(self) -> int:
+    """Which world of a batch this is; 0 for one alone."""
+    return self._world
 
   @property
   def max_steps(self) -> int | None:
@@ -157,6 +164,8 @@ class Environment(composer.Environment):
   def rewind(self, episode: int = 0) -> None:
     """Makes `episode` the next one; paired comparisons start from the same."""
     self._refuse_if_closed()
+    if episode < 0:
+      raise errors.SpecError(f'episode: {episode}; allowed are 0 and more')
     self._abandon()
     self._episode = episode - 1
     self._reset_next_step = True
@@ -345,7 +354,7 @@ class Environment(composer.Environment):
   ) -> tuple[events.Step, float, bool]:
     physics, mechanism = self._physics, self._mechanism
     n, schedule = self._n_sub_steps, self._schedule
-    is_ending = not self._is_ours and self._is_over()
+    was_over = is_ending = self._is_over()
     self._hooks.before_step(physics, controls, self._random_state)
     self._senses.begin_step()
     records: list[Any] = [*mechanism.write_queries(physics, queries)]
@@ -371,7 +380,6 @@ class Environment(composer.Environment):
     self._advance(n - schedule.provider_substep, controls)
     self._hooks.after_step(physics, self._random_state)
     physics.forward()
-    was_over = is_ending and not self._is_ours
     reward = 0.0 if was_over else self._true_reward()
     discount = float(self._task.get_discount(physics))
     if discount != 1.0 and not is_ending and self._is_over():
@@ -505,3 +513,16 @@ class Environment(composer.Environment):
   def _refuse_if_closed(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
+
+
+def _refuse_substep_hooks(task: base.Task) -> None:
+  """Refuses hooks that nobody would call: there is no Python in a substep."""
+  parts = [(task, composer.Task)]
+  parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
+  for part, kind in parts:
+    for hook in ('before_substep', 'after_substep'):
+      if getattr(type(part), hook) is not getattr(kind, hook):
+        raise errors.SpecError(
+            f'{type(part).__name__}.{hook}: worlds of this package have no hooks'
+            ' in substeps; use latch_events'
+        )

@@ -9,6 +9,9 @@ from dm_control.rl import control
 import mujoco
 import numpy as np
 
+from realab_suite.engine import camera as engine_camera
+from realab_suite.entities import cameras
+
 # Attributes of bound elements that are state.
 _STATE = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
 
@@ -81,6 +84,14 @@ class ThinPhysics(Physics):
   def _reload_from_data(self, data: Any) -> None:
     super()._reload_from_data(data)
     self._thin: dict[Any, _ThinBinding] = {}
+    # For each size of frames.
+    self._renderers: dict[Any, engine_camera.FrameRenderer] = {}
+
+  def free(self) -> None:
+    """Frees the world; it must not be used afterwards."""
+    for renderer in self._renderers.values():
+      renderer.free()
+    super().free()
 
   def bind(self, mjcf_elements: Any) -> Any:
     """Returns the binding of an element, or of a tuple or list of elements."""
@@ -95,6 +106,29 @@ class ThinPhysics(Physics):
       binding = _ThinBinding(self, namespace, names)
       self._thin[key] = binding
     return binding
+
+  def draw(self, camera: mjcf.Element, height: int, width: int) -> np.ndarray:
+    """Draws what a camera sees, for an agent; `render` is for people.
+
+    Raises:
+      RenderingError: If nothing renders here.
+    """
+    if self._dirty:
+      self.forward()
+    size = height, width
+    if size not in self._renderers:
+      self._renderers[size] = engine_camera.FrameRenderer(
+          self.model.ptr, height, width
+      )
+    camera_id = self.bind(camera).element_id
+    return self._renderers[size].draw(self.data.ptr, camera_id)
+
+
+@cameras.look.register
+def _look(
+    physics: ThinPhysics, camera: mjcf.Element, height: int, width: int
+) -> np.ndarray:
+  return physics.draw(camera, height, width)
 
 
 def _view(array: np.ndarray, index: Any) -> np.ndarray | None:

@@ -115,7 +115,9 @@ def _obstacles(model: mujoco.MjModel) -> list[int]:
   """The solid geoms that nothing can push, the ground apart."""
   ground = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
   solid = (model.geom_contype | model.geom_conaffinity) != 0
-  fixed = model.body_weldid[model.geom_bodyid] == 0
+  bodies = model.geom_bodyid
+  # Doors and posts are moved, but not by being pushed.
+  fixed = (model.body_weldid[bodies] == 0) | (model.body_mocapid[bodies] >= 0)
   flat = np.isin(model.geom_type, ground)
   return list(np.flatnonzero(solid & fixed & ~flat))
 

@@ -112,8 +112,8 @@ class Snapshot:
     payload = data[start:]
     if data[:start] != _MAGIC + hashlib.sha256(payload).digest():
       raise errors.StateLayoutError(
-          f'{len(data)} bytes are no snapshot, or a damaged one; allowed is what'
-          ' Snapshot.to_bytes returned'
+          f'{len(data)} bytes are no snapshot, or a damaged one; allowed is'
+          ' what Snapshot.to_bytes returned'
       )
     try:
       header, contents = _read(payload)
@@ -205,7 +205,7 @@ def _decode(node: Any, arrays: list[np.ndarray]) -> Any:
   if kind == 'tuple':
     return tuple(_decode(item, arrays) for item in inside)
   if kind == 'array':
-    return arrays[inside].copy()
+    return np.array(arrays[inside])  # In the same order in memory.
   if kind == 'scalar':
     return arrays[inside][()]
   raise ValueError(f'{kind!r:.40} is no kind of node')

@@ -34,7 +34,16 @@ class Meter:
   def register(self) -> registers.Register:
     return self._register
 
-  def update(self, physics: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Measures and writes; returns the measured and the applied value."""
+  def update(
+      self, physics: Any, idle: np.ndarray | None = None
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Measures and writes; returns the measured and the applied value.
+
+    Args:
+      physics: One world, or many.
+      idle: In which worlds the register keeps its value, `(...)`, bool.
+    """
     measured = np.array(self._measurement(physics), np.float64)
+    if idle is not None:
+      measured = np.where(idle, self._register.applied(physics), measured)
     return measured, self._register.write(physics, measured)

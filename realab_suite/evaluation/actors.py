@@ -64,7 +64,7 @@ class PolicyActor:
       SpecError: If the environment's actions are not those of the policy.
     """
     self._policy = policy
-    self._seed = env.seed
+    self._seed, self._world = env.seed, env.world
     design = env.mechanism.design
     self._queries = [register.value_spec for register in env.mechanism.queries]
     self._query_policy = TAKEN_ACTION
@@ -95,8 +95,10 @@ class PolicyActor:
 
   def begin(self, episode: int) -> None:
     """Forgets, and takes up the random stream of an episode."""
-    self._key = seeding.episode_key(self._seed, 0, episode, 'policy')
-    self._query_key = seeding.episode_key(self._seed, 0, episode, 'query')
+    self._key = seeding.episode_key(self._seed, self._world, episode, 'policy')
+    self._query_key = seeding.episode_key(
+        self._seed, self._world, episode, 'query'
+    )
     self._state = self._policy.initial_state(())
     self._step = 0
 
@@ -129,7 +131,16 @@ class PolicyActor:
 def make(
     policy: policies.Policy | PlainPolicy, env: environment.Environment
 ) -> Actor:
-  """Returns an actor for a policy of either kind."""
+  """Returns an actor for a policy of either kind.
+
+  Raises:
+    SpecError: If it is no policy, or its actions are not the environment's.
+  """
   if isinstance(policy, policies.Policy):
     return PolicyActor(policy, env)
+  if not callable(policy):
+    raise errors.SpecError(
+        f'policy: {policy!r:.80}; allowed are a policy, as policies.make returns'
+        ' it, and a function from a time step to an action'
+    )
   return PlainActor(policy)

@@ -78,10 +78,16 @@ def evaluate(
     A result per episode, the invalid ones included.
 
   Raises:
-    ResultsError: If `num_episodes` is not positive, or `first_episode` is
+    ResultsError: If `env` is none of this package's, `num_episodes` is not
+      positive, or `first_episode` is
       negative.
   """
-  if num_episodes < 1:
+  if not isinstance(env, environment.Environment):
+    raise errors.ResultsError(
+        f'env: {type(env).__name__}; allowed is one Environment, as suite.load'
+        ' returns it'
+    )
+  if not isinstance(num_episodes, int) or num_episodes < 1:
     raise errors.ResultsError(
         f'num_episodes: {num_episodes}; allowed are positive integers'
     )

@@ -238,7 +238,7 @@ class BatchLedger(events.BatchEventSink):
         episode.add(
             episode.num_steps, _of_world(world, step.records, step.agent_reads)
         )
-      if world in step.ends:
+      if world in step.ends and episodes[-1].end is None:
         episodes[-1].end = step.ends[world]
     return episodes
 

@@ -8,6 +8,8 @@ import os
 import subprocess
 import sys
 
+from realab_suite import _display
+
 _PATIENCE_SECONDS = 60
 # In a process of its own: where libraries are missing, imports fail half way.
 _RENDERS_SOMETHING = """
@@ -15,13 +17,6 @@ from dm_control import mujoco
 xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
 mujoco.Physics.from_xml_string(xml).render(8, 8)
 """
-
-
-def has_display() -> bool:
-  """Returns whether windows can be opened, as far as the environment says."""
-  if sys.platform != 'linux':
-    return True
-  return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
 
 
 def choose_renderer() -> str | None:
@@ -45,7 +40,7 @@ def choose_renderer() -> str | None:
 
 def render_nothing() -> None:
   """Sets `MUJOCO_GL` to `disable`, unless the user has named a renderer."""
-  if not os.environ.get('MUJOCO_GL'):
+  if not _display.CHOSEN_BY_USER:
     os.environ['MUJOCO_GL'] = 'disable'
 
 
@@ -66,7 +61,7 @@ def _candidates() -> list[str]:
     return [named]
   if sys.platform != 'linux':
     return ['glfw']
-  return ['glfw', 'egl'] if has_display() else ['egl']
+  return ['glfw', 'egl'] if _display.has_display() else ['egl']
 
 
 def _problem(renderer: str) -> str | None:

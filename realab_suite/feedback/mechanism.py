@@ -162,16 +162,26 @@ class FeedbackMechanism(composer.Entity):
       writes.append(Write(register.name, AGENT, requested, applied))
     return writes
 
-  def update_meters(self, physics: Any) -> list[Write]:
-    """Lets every meter measure and write."""
+  def update_meters(
+      self, physics: Any, idle: np.ndarray | None = None
+  ) -> list[Write]:
+    """Lets every meter measure and write.
+
+    Args:
+      physics: One world, or many.
+      idle: In which worlds there is nothing to measure, `(...)`, bool: their
+        registers keep their values.
+    """
     writes = []
     for writer, meter in self._meters:
       try:
-        measured, applied = meter.update(physics)
+        measured, applied = meter.update(physics, idle)
       except errors.RegisterValueError as error:
         step = _first(self._step_count.get(physics))
+        # The message may reach an agent, which is not to learn what is true.
         raise errors.RegisterValueError(
-            f'{writer} at step {step}: {error}'
+            f'{writer} at step {step}: register {meter.register.name!r} cannot'
+            ' store what was measured'
         ) from error
       writes.append(Write(meter.register.name, writer, measured, applied))
     return writes
@@ -186,6 +196,7 @@ class FeedbackMechanism(composer.Entity):
       observation: providers.Observation,
       keys: Sequence[np.ndarray],
       states: Sequence[Any],
+      idle: np.ndarray | None = None,
   ) -> tuple[list[Write | Read], list[Any]]:
     """Lets every provider read, think and write, in the design's order.
 
@@ -194,6 +205,7 @@ class FeedbackMechanism(composer.Entity):
       observation: What the agent saw when it chose its action.
       keys: A random key per provider, each `(..., 2)`, uint64.
       states: The state of each provider.
+      idle: In which worlds what providers say does not count, `(...)`, bool.
 
     Returns:
       What was read and written, in order, and the next states.
@@ -223,6 +235,8 @@ class FeedbackMechanism(composer.Entity):
       records += seen
       for name in provider.writes:
         register, value = self._registers[name], values[name]
+        if idle is not None:
+          value = np.where(idle, register.applied(physics), value)
         try:
           applied = register.write(physics, value)
         except errors.RegisterValueError as error:
@@ -273,7 +287,7 @@ def _make_register(
       scale=spec.scale,
       initial=spec.initial,
       role=spec.role,
-      channel=spec.channel or design.channel,
+      channel=design.channel_of(name),
       dof=spec.dof or design.dof,
       on_overflow=spec.on_overflow,
       block_size=spec.block_size,

@@ -74,7 +74,8 @@ class RegisterSpec(_Spec):
     scale: Metres (radians for an orientation) per unit.
     initial: The value at the start of an episode.
     on_overflow: What happens to a value out of range.
-    channel: What can influence the value; `None` takes the design's.
+    channel: What can influence the value, unless the design as a whole is
+      welded or secure; `None` for embedded.
     dof: How a block can move; `None` takes the design's.
     block_size: The length of an edge of a block, metres.
     mass: Of a block, kilograms.
@@ -240,7 +241,8 @@ class DesignSpec(_Spec):
     schema_version: The version of this format; `schema` in a file.
     name: The name of the design.
     description: What it is, in a sentence.
-    channel: Of every register that does not say otherwise.
+    channel: `welded` and `secure` go for every register; `embedded` for those
+      that do not say otherwise.
     dof: Of every register that does not say otherwise.
     registers: The registers, by name.
     meters: What is measured into which meter register.
@@ -344,6 +346,16 @@ class DesignSpec(_Spec):
   def names(self, *roles: str) -> list[str]:
     """Returns the names of the registers with one of these roles, in order."""
     return [n for n, spec in self.registers.items() if spec.role in roles]
+
+  def channel_of(self, name: str) -> Channel:
+    """Returns the channel of a register.
+
+    A design that is welded or secure is so as a whole, whatever its registers
+    say: it is the twin of another one.
+    """
+    if self.channel != 'embedded':
+      return self.channel
+    return self.registers[name].channel or 'embedded'
 
   def schedule_for(self, num_substeps: int) -> ScheduleSpec:
     """Returns the schedule for control steps of `num_substeps` substeps.

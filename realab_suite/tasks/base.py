@@ -12,6 +12,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import cameras
 from realab_suite.entities import state
 
 CONTROL_TIMESTEP = 0.1
@@ -131,6 +132,11 @@ class Task(composer.Task):
     return self._avatar
 
   @property
+  def camera_size(self) -> tuple[int, int] | None:
+    """Height and width of the agent's view, or `None` for none."""
+    return self._camera_size
+
+  @property
   def measurements(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
     """What a meter of this world can measure, by name (paper, section 3.1)."""
     return {'score': self.score}
@@ -221,9 +227,7 @@ class Task(composer.Task):
     }
     if self._camera_size is not None:
       height, width = self._camera_size
-      senses['camera'] = physics.render(
-          height, width, camera_id=avatar.camera.full_identifier
-      )
+      senses['camera'] = cameras.look(physics, avatar.camera, height, width)
     return senses
 
   def _place_avatar(self, physics: Any, random_state: Any) -> None:

@@ -8,6 +8,7 @@ from absl import flags
 from absl.testing import flagsaver
 import pytest
 
+from realab_suite import _display
 from realab_suite import explore
 from realab_suite.experiments import headless
 from realab_suite.experiments import run
@@ -134,7 +135,7 @@ def test_a_renderer_that_does_not_work_is_refused_in_one_line(monkeypatch):
 
 def test_a_renderer_that_works_is_chosen(monkeypatch):
   monkeypatch.setenv('MUJOCO_GL', '')
-  monkeypatch.setattr(headless, 'has_display', lambda: True)
+  monkeypatch.setattr(_display, 'has_display', lambda: True)
   tried = []
 
   def ran(command, env, **unused):

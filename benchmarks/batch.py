@@ -1,0 +1,560 @@
+"""Many worlds together, against the raw batch engine doing the same.
+
+`python -m benchmarks.batch` steps 256 worlds of Unlock Door with two free
+two-block registers, rays, a ledger and random actions that use the hand, on all
+processors. MuJoCo's own `Batch` replays it from a copy of the state: the same
+substeps, the same writes as assignments to whole arrays, one update of derived
+quantities, the same rays cast by a second `Batch`. Both have to end in the same
+state, bit for bit, in every round.
+
+The stock contestant is one `composer.Environment` as dm_control makes it, with
+the same world and registers: the model is compiled again in each episode, what
+the avatar senses are observables, and the task writes both registers after each
+step. It keeps no ledger.
+"""
+
+from collections.abc import Mapping, Sequence
+import contextlib
+import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from typing import Any, final
+from unittest import mock
+
+from dm_control import composer
+import mujoco
+from mujoco import batch as mujoco_batch
+import numpy as np
+
+from benchmarks import timing
+from realab_suite import suite
+from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_physics
+from realab_suite.engine import seeding
+from realab_suite.evaluation import ledger
+from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import specs
+from realab_suite.tasks import unlock_door
+
+_WORLDS = 256
+_STEPS = 20
+_STOCK_STEPS = 100
+_ROUNDS = 8
+_SEED = 0
+# How many steps of how many worlds show how throughput grows.
+_SIZES = {1: 64, 16: 16, 64: 8, 256: 4, 1024: 4}
+_REGISTERS = (1, 2, 4)
+_REGISTER_STEPS = 4
+_MEMORY_WORLDS = 1024
+
+# At least 0.85 of the throughput of the raw engine.
+_MOST_LOST = 15.0
+# At least 15 times the throughput of stock Composer.
+_MOST_OF_STOCK = 100 / 15
+_RESET_TARGET_MS = 0.2
+_MEMORY_TARGET_MIB = 1.0
+
+# What a world may set between substeps besides blocks and controls: the door,
+# eaten apples, the grip of the hand, what it throws.
+_OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')
+_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
+
+Phase = tuple[list[tuple[np.ndarray, np.ndarray]], int]
+"""What is written, each a view and its new value, and substeps after it."""
+
+Rays = tuple[np.ndarray, np.ndarray, int]
+"""Origins, directions and the body that rays pass through."""
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class RawSteps:
+  """Steps of a batch, for the raw engine to replay.
+
+  Attributes:
+    batch: Steps the worlds; the views of `steps` point into it.
+    ray_batch: Casts the rays.
+    start: The state before the first step.
+    steps: What happens in each control step.
+    rays: What is cast at the end of each control step.
+  """
+
+  batch: mujoco_batch.Batch
+  ray_batch: mujoco_batch.Batch
+  start: np.ndarray
+  steps: list[list[Phase]]
+  rays: list[Rays]
+
+  def replay(self) -> float:
+    """Runs the steps and returns the seconds that a control step took."""
+    batch, ray_batch = self.batch, self.ray_batch
+    batch.state[:] = self.start
+    began = time.perf_counter()
+    for phases, (origins, directions, carrier) in zip(
+        self.steps, self.rays, strict=True
+    ):
+      for writes, num_substeps in phases:
+        for view, value in writes:
+          view[:] = value
+        batch.step(nstep=num_substeps)
+      batch.forward(stage=_STAGE)
+      ray_batch.state[:] = batch.state
+      ray_batch.ray(origins, directions, bodyexclude=carrier)
+    return (time.perf_counter() - began) / len(self.steps)
+
+
+@final
+class StockTask(composer.Task):
+  """Unlock Door with two registers, as a task of stock Composer's."""
+
+  def __init__(self) -> None:
+    self._world = unlock_door.UnlockDoor()
+    mechanism = feedback_mechanism.FeedbackMechanism(
+        specs.load('instantaneous_reward')
+    )
+    mechanism.attach_to(self._world.root_entity)
+    self._registers = mechanism.registers
+    avatar = self._world.avatar
+    avatar.make_graspable(
+        [b for register in self._registers.values() for b in register.blocks]
+    )
+    for part in (
+        *avatar.observables.proprioception,
+        avatar.rays.observables.distances,
+        avatar.rays.observables.classes,
+        self._registers['reward'].observables.reading,
+    ):
+      part.enabled = True
+    self.control_timestep = self._world.control_timestep
+
+  @property
+  def root_entity(self) -> composer.Entity:
+    return self._world.root_entity
+
+  def action_spec(self, physics: Any) -> Any:
+    return self._world.action_spec(physics)
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    self._world.initialize_episode(physics, random_state)
+
+  def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+    self._world.before_step(physics, action, random_state)
+
+  def after_step(self, physics: Any, random_state: Any) -> None:
+    self._world.after_step(physics, random_state)
+    self._registers['score'].write(physics, self._world.score(physics))
+    self._registers['reward'].write(physics, self._world.get_reward(physics))
+
+  def get_reward(self, physics: Any) -> Any:
+    return self._world.get_reward(physics)
+
+  def should_terminate_episode(self, physics: Any) -> bool:
+    return bool(self._world.should_terminate_episode(physics))
+
+
+@final
+class _Stock:
+  """One world of stock Composer's, and how long it takes."""
+
+  def __init__(self) -> None:
+    self._env = composer.Environment(StockTask(), random_state=_SEED)
+    spec = self._env.action_spec()
+    self._actions = np.random.default_rng(_SEED).uniform(
+        spec.minimum, spec.maximum, (_STOCK_STEPS, *spec.shape)
+    )
+
+  def reset(self) -> float:
+    """Begins an episode and returns the seconds that it took."""
+    began = time.perf_counter()
+    self._env.reset()
+    return time.perf_counter() - began
+
+  def step(self) -> float:
+    """Plays after a reset and returns the seconds that a step took."""
+    began = time.perf_counter()
+    for action in self._actions:
+      self._env.step(action)
+    return (time.perf_counter() - began) / len(self._actions)
+
+
+def _load(
+    num_worlds: int, design: str | Mapping[str, Any] = 'instantaneous_reward'
+) -> batch_environment.BatchEnvironment:
+  """Loads worlds that an evaluator listens to."""
+  env = suite.load_batch(
+      'unlock_door',
+      'standard',
+      {'random': _SEED},
+      num_envs=num_worlds,
+      design=design,
+  )
+  env.add_sink(ledger.BatchLedger())
+  return env
+
+
+def _draw(
+    env: batch_environment.BatchEnvironment, num_steps: int
+) -> np.ndarray:
+  spec = env.action_spec()
+  return np.random.default_rng(_SEED).uniform(
+      spec.minimum, spec.maximum, (num_steps, env.num_worlds, *spec.shape)
+  )
+
+
+def _play(
+    env: batch_environment.BatchEnvironment, actions: np.ndarray
+) -> float:
+  """Plays the first episodes and returns the seconds that a step took."""
+  # Only the environment of one world can be rewound so far.
+  env._episodes[:] = -1
+  env.reset()
+  began = time.perf_counter()
+  for action in actions:
+    env.step(action)
+  return (time.perf_counter() - began) / len(actions)
+
+
+def _reset(env: batch_environment.BatchEnvironment) -> float:
+  """Begins other episodes and returns the seconds that it took."""
+  began = time.perf_counter()
+  env.reset()
+  return time.perf_counter() - began
+
+
+def _record(
+    env: batch_environment.BatchEnvironment, actions: np.ndarray
+) -> RawSteps:
+  """Plays the first episodes, with the raw engine in step."""
+  env._episodes[:] = -1
+  env.reset()
+  physics = env.physics
+  model, true = physics.model.ptr, physics._batch
+  raw, ray_batch = (
+      mujoco_batch.Batch(model, env.num_worlds, true.nthread) for _ in range(2)
+  )
+  start = true.state.copy()
+  raw.state[:] = start
+  # The meter and the provider write the blocks that carry the values.
+  meter, provider = (env.mechanism.registers[n] for n in ('score', 'reward'))
+  routine = [
+      [(raw.bind('ctrl'), true.bind('ctrl'))],
+      _pose_views(physics, meter, raw, true),
+      _pose_views(physics, provider, raw, true),
+  ]
+  phases: list[Phase] = []
+  rays: list[Rays] = []
+  advance, cast = physics.advance, physics.cast_rays
+
+  def advance_both(num_substeps: int) -> None:
+    writes = [(view, value.copy()) for view, value in routine[len(phases)]]
+    for view, value in writes:
+      view[:] = value
+    for name in _OCCASIONAL:
+      view, value = raw.bind(name), true.bind(name)
+      if not np.array_equal(view, value):
+        writes.append((view, value.copy()))
+        view[:] = value
+    phases.append((writes, num_substeps))
+    raw.step(nstep=num_substeps)
+    advance(num_substeps)
+
+  def cast_both(origins: Any, directions: Any, carrier: int) -> Any:
+    rays.append((origins[:, np.newaxis, :].copy(), directions.copy(), carrier))
+    return cast(origins, directions, carrier)
+
+  steps = []
+  with (
+      mock.patch.object(physics, 'advance', advance_both),
+      mock.patch.object(physics, 'cast_rays', cast_both),
+  ):
+    for action in actions:
+      env.step(action)
+      steps.append(phases.copy())
+      phases.clear()
+  return RawSteps(raw, ray_batch, start, steps, rays)
+
+
+def _pose_views(
+    physics: batch_physics.BatchPhysics,
+    register: Any,
+    raw: mujoco_batch.Batch,
+    true: mujoco_batch.Batch,
+) -> list[tuple[np.ndarray, np.ndarray]]:
+  """Returns views of the pose of a two-block register's offset block."""
+  model = physics.model
+  joints = physics.bind(register.blocks[1].body.joint).element_id
+  first, last = min(joints), max(joints)
+  views = []
+  for name, starts, size in (
+      ('qpos', model.jnt_qposadr, 4),
+      ('qvel', model.jnt_dofadr, 3),
+  ):
+    part = slice(starts[first], starts[last] + size)  # The last one is a ball.
+    views.append((raw.bind(name)[:, part], true.bind(name)[:, part]))
+  return views
+
+
+def _check_same(env: batch_environment.BatchEnvironment, raw: RawSteps) -> None:
+  """Raises an error if the raw engine has not done the same."""
+  for name in ('qpos', 'qvel', 'time', 'qacc_warmstart'):
+    true, other = env.physics._batch.bind(name), raw.batch.bind(name)
+    if true.tobytes() != other.tobytes():
+      raise RuntimeError(
+          f'the raw engine ended in another state than the environment ({name}),'
+          ' so their times cannot be compared'
+      )
+
+
+def _break_down_step(
+    env: batch_environment.BatchEnvironment,
+    actions: np.ndarray,
+    raw_us: float,
+) -> list[timing.Figure]:
+  """Says where the time of a step goes, timers included."""
+  task, mechanism, physics = env.task, env.mechanism, env.physics
+  parts = (
+      ('substeps', physics, 'advance'),
+      ('derived quantities', physics, 'forward'),
+      ('motors and hand', task.avatar, 'apply_action'),
+      ('events of the world', task, 'latch_events'),
+      ('meters', mechanism, 'update_meters'),
+      ('providers', mechanism, 'update_providers'),
+      ("agent's reads", mechanism, 'read_for_agent'),
+      ('casting rays', physics, 'cast_rays'),
+      ('the rest of rays', task.avatar.rays, 'sense'),
+      ('other senses', task, 'senses'),
+      ('ledger', env, '_tell'),
+      ('the rest', env, 'step'),
+  )
+  env._episodes[:] = -1
+  env.reset()
+
+  def play() -> None:
+    for action in actions:
+      env.step(action)
+
+  split = _split(parts, play)
+  unit = len(actions) * env.num_worlds
+  return [
+      timing.Figure(
+          f'  {label}, {calls / len(actions):g} a step',
+          np.array([1e6 * seconds / unit]),
+          'us',
+          ratios=np.array([1e6 * seconds / unit / raw_us]),
+      )
+      for label, (seconds, calls) in split.items()
+  ]
+
+
+def _break_down_reset(
+    env: batch_environment.BatchEnvironment,
+) -> list[timing.Figure]:
+  """Says where the time of a reset goes, timers included."""
+  task = env.task
+  parts = (
+      ('resetting the state', env.physics, 'reset'),
+      ('random states', seeding, 'random_state'),
+      ('keys of providers', seeding, 'episode_key'),
+      ('where apples lie', task, '_scatter'),
+      ('placing the avatar', task, '_place_avatar'),
+      ('the rest of the world', task, 'initialize_episode'),
+      ('registers', env, '_initialize'),
+      ('looking', env, '_look'),
+      ('the rest', env, 'reset'),
+  )
+  split = _split(parts, env.reset)
+  return [
+      timing.Figure(
+          f'  {label}', np.array([1e3 * seconds / env.num_worlds]), 'ms'
+      )
+      for label, (seconds, _) in split.items()
+  ]
+
+
+def _split(
+    parts: Sequence[tuple[str, Any, str]], work: Any
+) -> dict[str, tuple[float, int]]:
+  """Returns the seconds and the calls of each of some methods in some work."""
+  watch = timing.Stopwatch()
+  with contextlib.ExitStack() as stack:
+    for label, owner, name in parts:
+      timed = watch.watch(label, getattr(owner, name))
+      stack.enter_context(mock.patch.object(owner, name, timed))
+    work()
+  return {label: (s, watch.calls[label]) for label, s in watch.seconds.items()}
+
+
+def _grow_worlds(rounds: int) -> list[timing.Figure]:
+  """Says how throughput grows with the number of worlds."""
+  contestants = {}
+  for number, num_steps in _SIZES.items():
+    env = _load(number)
+    contestants[number] = (env, _draw(env, num_steps))
+  seconds = timing.time_rounds(
+      {
+          str(number): lambda playing=playing: _play(*playing)
+          for number, playing in contestants.items()
+      },
+      rounds,
+  )
+  for env, _ in contestants.values():
+    env.close()
+  return [
+      timing.Figure(
+          f'steps of {number} worlds', number / seconds[str(number)], '/s'
+      )
+      for number in _SIZES
+  ]
+
+
+def _design(dof: str, number: int) -> dict[str, Any]:
+  """Returns a design of registers that are written in each step."""
+  names = [f'register_{i}' for i in range(1, number + 1)]
+  return {
+      'schema': 1,
+      'name': f'{dof}_{number}',
+      'dof': dof,
+      'registers': {
+          name: {
+              'kind': 'two_block',
+              'role': 'meter',
+              'place': f'station_{i}',
+              'range': [0, 20],
+              'scale': 0.1,
+          }
+          for i, name in enumerate(names, start=1)
+      },
+      'meters': [{'measures': 'score', 'writes': name} for name in names],
+  }
+
+
+def _grow_registers(rounds: int) -> list[timing.Figure]:
+  """Says what registers cost; twice as many may cost twice as much."""
+  playing = {}
+  for dof in ('free', 'planar'):
+    for number in _REGISTERS:
+      env = _load(_WORLDS, _design(dof, number))
+      playing[f'{number} {dof}'] = (env, _draw(env, _REGISTER_STEPS))
+  seconds = timing.time_rounds(
+      {name: lambda p=p: _play(*p) for name, p in playing.items()}, rounds
+  )
+  for env, _ in playing.values():
+    env.close()
+  us = {name: 1e6 * taken / _WORLDS for name, taken in seconds.items()}
+  figures = [
+      timing.Figure(f'step, registers: {name}', taken, 'us')
+      for name, taken in us.items()
+  ]
+  most, half = _REGISTERS[-1], _REGISTERS[-2]
+  for dof in ('free', 'planar'):
+    growth = us[f'{most} {dof}'] / us[f'{half} {dof}']
+    figures.append(
+        timing.Figure(
+            f'{most} registers to {half}, {dof}', growth, 'x', most / half
+        )
+    )
+  return figures
+
+
+def _resident_mib() -> float:
+  """Returns how much memory this process has, as Linux counts it."""
+  pages = int(pathlib.Path('/proc/self/statm').read_text().split()[1])
+  return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
+
+
+def measure_memory(num_worlds: int) -> None:
+  """Prints the MiB before worlds are made, with one, and with many."""
+  single = suite.load(
+      'unlock_door', 'standard', {'random': _SEED},
+      design='instantaneous_reward',
+  )  # fmt: skip
+  before = _resident_mib()
+  single.close()
+  readings = [before]
+  for number in (1, num_worlds):
+    env = _load(number)
+    env.reset()
+    env.step(_draw(env, 1)[0])
+    readings.append(_resident_mib())
+  print(*readings)
+
+
+def _measure_memory() -> list[timing.Figure]:
+  """Returns the memory of worlds, measured in a process of their own."""
+  code = (
+      'from benchmarks import batch;' f' batch.measure_memory({_MEMORY_WORLDS})'
+  )
+  done = subprocess.run(
+      [sys.executable, '-c', code], capture_output=True, text=True, check=True
+  )
+  before, one, many = map(float, done.stdout.split())
+  return [
+      timing.Figure(
+          f'memory of one of {_MEMORY_WORLDS} worlds',
+          np.array([(many - one) / _MEMORY_WORLDS]),
+          'MiB',
+          _MEMORY_TARGET_MIB,
+      ),
+      timing.Figure(
+          'memory of model and threads', np.array([one - before]), 'MiB'
+      ),
+  ]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+  """Runs the benchmark."""
+  rounds = timing.parse_rounds(__doc__, arguments, _ROUNDS)
+  memory = _measure_memory()
+  env, stock = _load(_WORLDS), _Stock()
+  actions = _draw(env, _STEPS)
+  raw = _record(env, actions)
+
+  def replay() -> float:
+    seconds = raw.replay()
+    _check_same(env, raw)
+    return seconds
+
+  seconds = timing.time_rounds(
+      {
+          'batch': lambda: _play(env, actions),
+          'raw': replay,
+          'reset': lambda: _reset(env),
+          'stock reset': stock.reset,
+          'stock': stock.step,
+      },
+      rounds,
+  )
+  us, raw_us, reset_us = (
+      1e6 * seconds[name] / _WORLDS for name in ('batch', 'raw', 'reset')
+  )
+  stock_us = 1e6 * seconds['stock']
+  timing.report([
+      timing.Figure(
+          'throughput lost to raw engine', 100 * (1 - raw_us / us), '%',
+          _MOST_LOST, ratios=us / raw_us,
+      ),
+      timing.Figure(
+          "a world's step, of a stock step", 100 * us / stock_us, '%',
+          round(_MOST_OF_STOCK, 2),
+      ),
+      timing.Figure('steps to one of stock', stock_us / us, 'x'),
+      timing.Figure("a world's step", us, 'us', ratios=us / raw_us),
+      timing.Figure('raw step', raw_us, 'us'),
+      timing.Figure('stock step', stock_us, 'us'),
+      timing.Figure('steps', 1e6 / us, '/s'),
+      timing.Figure("a world's reset", reset_us / 1e3, 'ms', _RESET_TARGET_MS),
+      timing.Figure('stock reset', 1e3 * seconds['stock reset'], 'ms'),
+      *_break_down_step(env, actions, float(np.median(raw_us))),
+      *_break_down_reset(env),
+      *memory,
+      *_grow_worlds(max(1, rounds // 3)),
+      *_grow_registers(max(1, rounds // 3)),
+  ])  # fmt: skip
+  env.close()
+
+
+if __name__ == '__main__':
+  main()

@@ -1,0 +1,234 @@
+"""Tests for frames for agents: what is drawn, by whom, and until when."""
+
+import gc
+import os
+import subprocess
+import sys
+import threading
+
+import mujoco
+import numpy as np
+import pytest
+
+from realab_suite import _display
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import camera as engine_camera
+from realab_suite.engine import physics as engine_physics
+from realab_suite.entities import apples as apples_entity
+from realab_suite.entities import arenas
+from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import cameras
+from tests import worlds
+
+_FORKS = """
+import os
+import numpy as np
+from realab_suite import errors
+from realab_suite import suite
+env = suite.load('collect_apples', 'standard', {'random': 0,
+                                               'camera_size': (16, 16)})
+env.reset()
+child = os.fork()
+if not child:
+  try:
+    env.step(np.zeros(env.action_spec().shape))
+  except errors.ForkError:
+    env.close()
+    raise SystemExit(7)
+_, status = os.waitpid(child, 0)
+raise SystemExit(os.waitstatus_to_exitcode(status))
+"""
+
+
+def _load(size=(64, 64), seed=0, name='unlock_door'):
+  return suite.load(name, 'standard', {'random': seed, 'camera_size': size})
+
+
+def _frame(time_step):
+  return time_step.observation['senses/camera']
+
+
+def _apple_world():
+  arena = arenas.OpenRoom()
+  apples = apples_entity.Apples(number=1)
+  apples.attach_to(arena, (2.0, 0.8))
+  avatar = avatar_entity.Avatar()
+  arena.attach(avatar)
+  physics = worlds.compile_world(arena, engine_physics.ThinPhysics)
+  worlds.start_episode(physics, avatar)
+  return physics, avatar.camera
+
+
+@pytest.mark.camera
+def test_a_frame_is_of_its_size_and_the_callers_own():
+  physics, camera = _apple_world()
+  first = cameras.look(physics, camera, 48, 80)
+  again = cameras.look(physics, camera, 48, 80)
+  assert first.shape == (48, 80, 3)
+  assert first.dtype == np.uint8
+  assert first.flags.owndata
+  assert first.flags.c_contiguous
+  assert not np.shares_memory(first, again)
+  assert first.tobytes() == again.tobytes()
+
+
+@pytest.mark.camera
+def test_an_apple_on_the_left_is_red_on_the_left_and_below_the_horizon():
+  physics, camera = _apple_world()
+  frame = cameras.look(physics, camera, 64, 64).astype(int)
+  red = frame[..., 0] > 2 * frame[..., 1:].max(axis=-1)
+  assert red[32:, :32].sum() > 15
+  assert red[:, 32:].sum() == 0
+  assert red[:32].sum() == 0
+
+
+@pytest.mark.camera
+def test_an_agent_sees_what_people_see_but_for_edges():
+  env = _load()
+  frame = _frame(env.reset()).astype(int)
+  camera = env.task.avatar.camera.full_identifier
+  film = env.physics.render(64, 64, camera_id=camera).astype(int)
+  difference = np.abs(frame - film).max(axis=-1)
+  assert np.median(difference) <= 2
+  assert (difference > 24).mean() < 0.08
+  # Drawing by turns disturbs neither.
+  again = cameras.look(env.physics, env.task.avatar.camera, 64, 64)
+  np.testing.assert_array_equal(again, frame)
+  quality = env.physics.model.ptr.vis.quality
+  assert quality.offsamples == 4
+  env.close()
+
+
+@pytest.mark.camera
+def test_what_moves_is_drawn_where_it_is_now():
+  env = _load()
+  before = _frame(env.reset())
+  action = np.zeros(env.action_spec().shape)
+  action[2] = 1.0  # Turn.
+  assert np.abs(_frame(env.step(action)).astype(int) - before).max() > 20
+  env.close()
+
+
+@pytest.mark.camera
+def test_environments_of_different_sizes_draw_by_turns():
+  sizes = [(64, 64), (32, 96)]
+  alone = []
+  for size in sizes:
+    env = _load(size)
+    alone.append([_frame(env.reset()) for _ in range(3)])
+    env.close()
+  envs = [_load(size) for size in sizes]
+  for i in range(3):
+    for env, frames in zip(envs, alone, strict=True):
+      np.testing.assert_array_equal(_frame(env.reset()), frames[i])
+  assert envs[0].observation_spec()['senses/camera'].shape == (64, 64, 3)
+  # One that closes, or is forgotten, takes nothing from the other.
+  envs.pop().close()
+  _load((16, 16)).reset()
+  gc.collect()
+  envs[0].rewind()
+  np.testing.assert_array_equal(_frame(envs[0].reset()), alone[0][0])
+  envs[0].close()
+
+
+@pytest.mark.camera
+def test_there_is_one_renderer_from_the_first_frame_until_close(monkeypatch):
+  made, freed = [], []
+
+  class Context(mujoco.MjrContext):
+
+    def __init__(self, *args):
+      super().__init__(*args)
+      made.append((self.offHeight, self.offWidth, self.offSamples))
+
+    def free(self):
+      freed.append(self)
+      super().free()
+
+  monkeypatch.setattr(mujoco, 'MjrContext', Context)
+  env = _load((40, 24))
+  assert not made
+  for _ in range(3):
+    env.reset()
+  assert made == [(40, 24, 0)]
+  assert not freed
+  env.close()
+  assert len(freed) == 1
+
+
+@pytest.mark.camera
+def test_another_thread_is_refused_and_may_have_its_own():
+  env = _load((16, 16))
+  expected = _frame(env.reset())
+  found = []
+
+  def work():
+    try:
+      env.reset()
+    except errors.RenderingError as error:
+      found.append(str(error))
+    own = _load((16, 16))
+    found.append(_frame(own.reset()))
+    own.close()
+
+  thread = threading.Thread(target=work)
+  thread.start()
+  thread.join()
+  assert 'allowed is the thread' in found[0]
+  np.testing.assert_array_equal(found[1], expected)
+  env.close()
+
+
+@pytest.mark.camera
+def test_a_forked_child_is_refused_and_ends():
+  ran = subprocess.run(
+      [sys.executable, '-c', _FORKS],
+      capture_output=True,
+      text=True,
+      timeout=60,
+      check=False,
+  )
+  assert (ran.returncode, ran.stderr) == (7, '')
+
+
+@pytest.mark.skipif(
+    os.environ['MUJOCO_GL'] != 'disable', reason='something renders'
+)
+def test_where_nothing_renders_the_error_says_what_to_set():
+  env = _load()
+  with pytest.raises(errors.RenderingError, match='set MUJOCO_GL to egl'):
+    env.reset()
+  env.close()
+
+
+def test_agents_frames_are_drawn_from_a_plain_copy_of_the_model():
+  physics, _ = _apple_world()
+  model = physics.model.ptr
+  plain = engine_camera._plain(model, 20, 30)
+  assert (plain.vis.global_.offheight, plain.vis.global_.offwidth) == (20, 30)
+  assert plain.vis.quality.shadowsize == 0
+  assert model.vis.quality.shadowsize > 0
+  # Of all shapes, the floor's alone differs: in the size of its tiles.
+  changed = np.argwhere(model.geom_size != plain.geom_size)
+  np.testing.assert_array_equal(changed, [[model.geom('floor').id, 2]])
+
+
+@pytest.mark.parametrize(
+    ('chosen', 'display', 'devices', 'expected'),
+    [
+        (False, False, 1, 'egl'),
+        (False, False, 0, ''),
+        (False, True, 1, ''),
+        (True, False, 1, ''),
+    ],
+)
+def test_egl_is_the_default_where_it_is_and_no_display_is(
+    monkeypatch, chosen, display, devices, expected
+):
+  monkeypatch.setenv('MUJOCO_GL', '')
+  monkeypatch.setattr(_display, 'CHOSEN_BY_USER', chosen)
+  monkeypatch.setattr(_display, 'has_display', lambda: display)
+  monkeypatch.setattr(_display, '_num_egl_devices', lambda: devices)
+  _display.prefer_egl()
+  assert os.environ['MUJOCO_GL'] == expected

@@ -1,0 +1,508 @@
+"""Tests of snapshots: what is restored goes on bit for bit, or is refused."""
+
+import hashlib
+import io
+import json
+import pathlib
+import subprocess
+import sys
+from typing import Any
+
+from dm_control.rl import control
+import hypothesis
+from hypothesis import strategies as st
+import mujoco
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.engine import events
+from realab_suite.engine import snapshot as snapshots
+from realab_suite.evaluation import ledger as ledgers
+from tests import worlds
+from tests.campaigns import snapshot_campaign as campaign
+from tests.engine import helpers
+
+_ROOT = pathlib.Path(__file__).parents[2]
+_STEPS = 60
+_REWARD = campaign.Case('unlock_door', 'instantaneous_reward', (), 7)
+_ADVICE = campaign.Case('collect_apples', 'value_advice', (), 7)
+# Advice on the query before: values and queries are in the provider's state.
+_LATE = _ADVICE._replace(overrides=('providers.0.query_delay=1',))
+# Derived quantities are read before the physics has moved.
+_AT_ONCE = _REWARD._replace(overrides=('schedule=cfmdp',))
+
+
+def _header(**changes: Any) -> dict[str, Any]:
+  return {'model': 'm', 'slots': {'a': 0, 'b': 1}, **changes}
+
+
+def _signed(payload: bytes) -> bytes:
+  """Returns bytes whose checksum is right, whatever is in them."""
+  return snapshots._MAGIC + hashlib.sha256(payload).digest() + payload
+
+
+def _through_bytes(contents: Any) -> Any:
+  data = snapshots.Snapshot(_header(), contents).to_bytes()
+  return snapshots.Snapshot.from_bytes(data).contents_for(_header())
+
+
+# What is restored goes on bit for bit.
+
+
+@pytest.mark.parametrize(
+    'case',
+    [*campaign.CASES, _LATE, _AT_ONCE],
+    ids=lambda case: '-'.join((case.domain, case.design, *case.overrides)),
+)
+def test_what_is_restored_goes_on_bit_for_bit_here_and_elsewhere(case):
+  point = int(np.random.default_rng(len(str(case))).integers(88))
+  assert campaign.num_differences(case, point, _STEPS) == 0
+
+
+@hypothesis.settings(max_examples=10)
+@hypothesis.given(point=st.integers(0, 100), seed=st.integers(0, 2**32))
+def test_any_step_of_any_seed_can_be_saved(point: int, seed: int):
+  case = _REWARD._replace(seed=seed)
+  assert campaign.num_differences(case, point, _STEPS) == 0
+
+
+def test_another_process_goes_on_bit_for_bit(tmp_path):
+  env, snapshot = campaign.saved(_LATE, 30)
+  (tmp_path / 'snapshot').write_bytes(snapshot.to_bytes())
+  code = f"""
+import pathlib
+from realab_suite.engine import snapshot as snapshots
+from tests.campaigns import snapshot_campaign as campaign
+folder = pathlib.Path({str(tmp_path)!r})
+env = campaign.Case{tuple(_LATE)!r}.load()
+data = (folder / 'snapshot').read_bytes()
+env.restore(snapshots.Snapshot.from_bytes(data))
+transcript = campaign.play(env, {_STEPS}, seed=2)
+(folder / 'transcript').write_bytes(b'|'.join(transcript))
+"""
+  subprocess.run([sys.executable, '-c', code], cwd=_ROOT, check=True)
+  expected = b'|'.join(campaign.play(env, _STEPS, seed=2))
+  assert (tmp_path / 'transcript').read_bytes() == expected
+
+
+def test_transcripts_tell_runs_apart():
+  env, snapshot = campaign.saved(_REWARD, 20)
+  first = campaign.play(env, 5, seed=2)
+  env.restore(snapshot)
+  second = campaign.play(env, 5, seed=3)
+  assert all(a != b for a, b in zip(first[:-1], second[:-1], strict=True))
+
+
+def test_what_is_saved_in_these_tests_is_no_world_at_rest():
+  env, _ = campaign.saved(_REWARD, 20)
+  reads = campaign.ledger_of(env).last.entries['score']
+  assert abs(reads[-1].permanent) > 0.01
+
+
+def test_a_snapshot_can_be_restored_again_and_again():
+  env, snapshot = campaign.saved(_ADVICE, 25)
+  before = snapshot.to_bytes()
+  runs = []
+  for _ in range(3):
+    env.restore(snapshot)
+    runs.append(campaign.play(env, 20, seed=2))
+  assert runs[0] == runs[1] == runs[2]
+  assert snapshot.to_bytes() == before
+
+
+def test_saving_disturbs_nothing():
+  runs = []
+  for saves in (False, True):
+    env = _REWARD.load()
+    env.reset()
+    run = []
+    for i in range(30):
+      if saves:
+        env.save()
+      run += campaign.play(env, 1, seed=i)
+    runs.append(run)
+  assert runs[0] == runs[1]
+
+
+def test_what_derives_from_the_state_is_there_at_once():
+  env, snapshot = campaign.saved(_REWARD, 40)
+  names = ('xpos', 'xmat', 'geom_xpos', 'site_xpos', 'subtree_com', 'cvel')
+  expected = {n: np.array(getattr(env.physics.data, n)) for n in names}
+  senses = env.task.senses(env.physics)
+  other = _REWARD.load(seed=8)
+  other.reset()
+  campaign.play(other, 11, seed=5)
+  other.restore(snapshot)
+  # Past the views of this package, which would bring it up to date.
+  for name in names:
+    np.testing.assert_array_equal(
+        getattr(other.physics.data, name), expected[name], err_msg=name
+    )
+  for name, value in other.task.senses(other.physics).items():
+    np.testing.assert_array_equal(value, senses[name], err_msg=name)
+
+
+def test_a_world_that_was_never_reset_can_be_saved():
+  env, snapshot = _REWARD.load(), _REWARD.load().save()
+  expected = campaign.play(env, 10, seed=2)
+  other = _REWARD.load(seed=8)
+  campaign.play(other, 10, seed=3)
+  other.restore(snapshot)
+  assert campaign.play(other, 10, seed=2) == expected
+
+
+def test_after_the_last_step_the_next_one_starts_an_episode():
+  env, _ = campaign.saved(_REWARD, 0)
+  while not env.step(helpers.no_op(env)).last():
+    pass
+  snapshot = env.save()
+  expected = campaign.play(env, 10, seed=2)
+  other = _REWARD.load(seed=8)
+  other.reset()
+  other.restore(snapshot)
+  first = other.step(helpers.no_op(other))
+  assert first.first()
+  other.restore(snapshot)
+  assert campaign.play(other, 10, seed=2) == expected
+
+
+def test_the_seed_and_the_generator_are_restored():
+  env, snapshot = campaign.saved(_REWARD, 5)
+  expected = env.random_state.uniform(size=3)
+  other = _REWARD.load(seed=8)
+  other.restore(snapshot)
+  assert other.seed == 7
+  np.testing.assert_array_equal(other.random_state.uniform(size=3), expected)
+
+
+def test_a_world_that_diverged_can_be_restored():
+  env, snapshot = campaign.saved(_REWARD, 20)
+  expected = campaign.play(env, 10, seed=2)
+  env.restore(snapshot)
+  env.physics.data.qvel[:] = 1e12
+  env.step(helpers.no_op(env))
+  assert campaign.ledger_of(env).last.end is events.End.DIVERGENCE
+  env.restore(snapshot)
+  assert campaign.play(env, 10, seed=2) == expected
+
+
+def test_after_a_failed_restore_the_next_step_starts_an_episode(monkeypatch):
+  env, snapshot = campaign.saved(_REWARD, 20)
+
+  def fail(*_: Any) -> None:
+    raise control.PhysicsError('planted')
+
+  monkeypatch.setattr(snapshots, 'set_state', fail)
+  with pytest.raises(control.PhysicsError):
+    env.restore(snapshot)
+  assert env.step(helpers.no_op(env)).first()
+
+
+def test_the_agent_cannot_reach_what_is_restored():
+  env, snapshot = campaign.saved(_ADVICE, 5)
+  env.restore(snapshot)
+  assert not any(v.flags.writeable for v in env._observation.values())
+
+
+# What the ledger knows.
+
+
+def test_the_ledger_keeps_what_has_happened_and_goes_on_with_the_episode():
+  env, snapshot = campaign.saved(_REWARD, 20)
+  ledger = campaign.ledger_of(env)
+  at_save = repr(ledger.last)
+  campaign.play(env, 5, seed=2)
+  env.restore(snapshot)
+  abandoned, restored = ledger.episodes
+  assert abandoned.end is events.End.ABANDONED
+  assert abandoned.num_steps == 25
+  assert repr(restored) == at_save
+  assert restored.num_steps == 20
+
+
+def test_a_restored_episode_is_the_ledgers_own():
+  env, snapshot = campaign.saved(_REWARD, 20)
+  ledger = campaign.ledger_of(env)
+  env.restore(snapshot)
+  env.restore(snapshot)
+  first, second = ledger.episodes[1:]
+  campaign.play(env, 3, seed=2)
+  assert (first.num_steps, second.num_steps) == (20, 23)
+  types = {type(entry) for entry in second.entries['reward']}
+  assert types == {ledgers.WriteEntry, ledgers.ReadEntry}
+
+
+def test_a_ledger_without_an_open_episode_says_nothing():
+  ledger = ledgers.Ledger()
+  assert ledger.state() is None
+  ledger.set_state(None)
+  assert not ledger.episodes
+
+
+def test_a_world_that_nobody_listens_to_takes_any_snapshot():
+  env, snapshot = campaign.saved(_REWARD, 10)
+  other = _REWARD.load()
+  other.remove_sink(campaign.ledger_of(other))
+  other.restore(snapshot)
+  actions = helpers.random_actions(env, 10)
+  for action in actions:
+    expected = helpers.to_bytes(env.step(action))
+    assert helpers.to_bytes(other.step(action)) == expected
+
+
+def test_a_ledger_that_would_miss_a_beginning_refuses():
+  env, _ = campaign.saved(_REWARD, 10)
+  env.remove_sink(campaign.ledger_of(env))
+  snapshot = env.save()
+  other = _REWARD.load()
+  with pytest.raises(
+      errors.StateLayoutError, match=r"with sinks \[\]; .* has \['Ledger'\]"
+  ):
+    other.restore(snapshot)
+
+
+def test_a_sink_that_cannot_be_saved_refuses():
+  env = _REWARD.load()
+  env.add_sink(helpers.RecordingSink())
+  with pytest.raises(errors.SpecError, match='RecordingSink cannot be saved'):
+    env.save()
+
+
+# Where a snapshot does not fit.
+
+
+def _other_world() -> environment.Environment:
+  return _REWARD._replace(domain='collect_apples').load()
+
+
+def _other_design() -> environment.Environment:
+  return _REWARD._replace(overrides=('registers.reward.initial=1',)).load()
+
+
+def _other_length() -> environment.Environment:
+  kwargs: Any = dict(design=_REWARD.design)
+  return suite.load('unlock_door', 'standard', None, {'max_steps': 9}, **kwargs)
+
+
+def _other_friction() -> environment.Environment:
+  env = _REWARD.load()
+  env.physics.model.geom_friction[0, 0] *= 1.001
+  return env
+
+
+@pytest.mark.parametrize(
+    ('load', 'named'),
+    [
+        (_other_world, r"task is 'UnlockDoor' in .*, 'CollectApples' here"),
+        (_other_world, r'slots: apples/userdata\.eaten \(3 in .*, 2 here\), '),
+        (_other_design, "design is '"),
+        (_other_length, 'environment: max_steps is 90 in the snapshot, 9 here'),
+        (_other_friction, "environment: model is '"),
+    ],
+)
+def test_a_world_that_is_another_refuses_and_does_not_change(load, named):
+  _, snapshot = campaign.saved(_REWARD, 3)
+  other = load()
+  other.reset()
+  other.step(helpers.no_op(other))
+  before = other.save().to_bytes() if other._sinks else None
+  state = worlds.state_bytes(other.physics)
+  with pytest.raises(errors.StateLayoutError, match=named):
+    other.restore(snapshot)
+  assert worlds.state_bytes(other.physics) == state
+  assert not other._sinks or other.save().to_bytes() == before
+
+
+def test_another_version_of_mujoco_refuses(monkeypatch):
+  env, snapshot = campaign.saved(_REWARD, 3)
+  monkeypatch.setattr(mujoco, '__version__', '3.99.0')
+  with pytest.raises(
+      errors.StateLayoutError,
+      match=r"environment: mujoco is '3\.17\.\d+' in the snapshot, '3\.99\.0'",
+  ):
+    env.restore(snapshot)
+
+
+def test_other_slots_are_named():
+  snapshot = snapshots.Snapshot(_header(), ())
+  with pytest.raises(
+      errors.StateLayoutError,
+      match=r'slots: b \(1 in the snapshot, 2 here\), c \(None .*, 3 here\)$',
+  ):
+    snapshot.contents_for(_header(slots={'a': 0, 'b': 2, 'c': 3}))
+
+
+def test_somebody_elses_task_is_neither_saved_nor_restored():
+  env = suite.embed(helpers.PointTask(), 'none', random=7)
+  env.reset()
+  with pytest.raises(errors.SpecError, match='PointTask cannot be saved or'):
+    env.save()
+  _, snapshot = campaign.saved(_REWARD, 0)
+  with pytest.raises(errors.SpecError, match='may compile its model anew'):
+    env.restore(snapshot)
+  env.close()
+
+
+def test_a_world_that_sleeps_is_not_saved():
+  env = _REWARD.load()
+  env.physics.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+  with pytest.raises(errors.SpecError, match='fall asleep cannot be saved'):
+    env.save()
+
+
+def test_a_closed_world_is_neither_saved_nor_restored():
+  env, snapshot = campaign.saved(_REWARD, 0)
+  env.close()
+  with pytest.raises(errors.ClosedError):
+    env.save()
+  with pytest.raises(errors.ClosedError):
+    env.restore(snapshot)
+
+
+# To bytes and back.
+
+
+def _same(a: Any, b: Any) -> bool:
+  """Whether two trees are of the same types and, bit for bit, values."""
+  if type(a) is not type(b):
+    return False
+  if isinstance(a, tuple | list):
+    return len(a) == len(b) and all(map(_same, a, b))
+  if isinstance(a, dict):
+    return list(a) == list(b) and all(_same(a[k], b[k]) for k in a)
+  if isinstance(a, np.ndarray | np.generic):
+    like = a.dtype == b.dtype and a.shape == b.shape
+    return like and a.tobytes() == b.tobytes()
+  return repr(a) == repr(b)
+
+
+_ARRAYS = st.sampled_from([
+    np.zeros(()), np.zeros((0, 3), bool), np.array([np.nan, -0.0, np.inf]),
+    np.arange(6, dtype='>i2').reshape(2, 3), np.array(['a', 'bc']),
+    np.arange(12.0).reshape(3, 4).T[::2], np.float32(0.1), np.uint64(2**63),
+    np.bool_(True), np.array(1 + 2j),
+])  # fmt: skip
+_TREES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text()
+    | _ARRAYS,
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.lists(inner, max_size=3).map(tuple)
+        | st.dictionaries(st.text(), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@hypothesis.given(contents=_TREES)
+def test_plain_data_goes_through_bytes_and_back(contents: Any):
+  data = snapshots.Snapshot(_header(), contents).to_bytes()
+  copy = snapshots.Snapshot.from_bytes(data)
+  assert _same(copy.contents_for(_header()), contents)
+  assert copy.to_bytes() == data
+
+
+def test_a_snapshot_shares_nothing_with_what_was_saved_or_is_returned():
+  array = np.zeros(3)
+  snapshot = snapshots.Snapshot(_header(), [array])
+  array[:] = 1.0
+  snapshot.contents_for(_header())[0][:] = 2.0
+  np.testing.assert_array_equal(snapshot.contents_for(_header())[0], 0.0)
+
+
+@pytest.mark.parametrize(
+    ('contents', 'where'),
+    [
+        ({'a': [object()]}, r"snapshot\['a'\]\[0\] is a object"),
+        ((1, {2: 3}), r'snapshot\[1\] is a dict'),
+        (np.array([None]), 'snapshot is a ndarray'),
+        (np.ma.zeros(2), 'snapshot is a MaskedArray'),
+        (events.End.ERROR, 'snapshot is a End'),
+    ],
+)
+def test_what_is_no_plain_data_is_refused_and_found(contents, where):
+  with pytest.raises(errors.StateLayoutError, match=where):
+    snapshots.Snapshot(_header(), contents)
+
+
+_BYTES = snapshots.Snapshot(_header(), [np.arange(9.0), 'x']).to_bytes()
+
+
+@hypothesis.given(end=st.integers(0, len(_BYTES) - 1))
+def test_truncated_bytes_are_refused(end: int):
+  with pytest.raises(errors.StateLayoutError, match='no snapshot, or a damag'):
+    snapshots.Snapshot.from_bytes(_BYTES[:end])
+
+
+@hypothesis.given(bit=st.integers(0, 8 * len(_BYTES) - 1))
+def test_a_flipped_bit_is_found(bit: int):
+  damaged = bytearray(_BYTES)
+  damaged[bit // 8] ^= 1 << bit % 8
+  with pytest.raises(errors.StateLayoutError, match='no snapshot, or a damag'):
+    snapshots.Snapshot.from_bytes(bytes(damaged))
+
+
+@hypothesis.given(data=st.binary())
+def test_random_bytes_are_refused(data: bytes):
+  with pytest.raises(errors.StateLayoutError, match='no snapshot, or a damag'):
+    snapshots.Snapshot.from_bytes(data)
+
+
+@hypothesis.given(at=st.integers(0, 2**20), byte=st.integers(1, 255))
+def test_a_forged_checksum_gives_an_error_or_a_snapshot(at: int, byte: int):
+  payload = bytearray(_BYTES[len(snapshots._MAGIC) + 32 :])
+  payload[at % len(payload)] ^= byte
+  try:
+    snapshots.Snapshot.from_bytes(_signed(bytes(payload)))
+  except errors.StateLayoutError as error:
+    assert '\n' not in str(error)  # noqa: PT017 - either is fine.
+
+
+def _archive(structure: Any, **arrays: Any) -> bytes:
+  file = io.BytesIO()
+  text = json.dumps(structure).encode()
+  np.savez(file, structure=np.frombuffer(text, np.uint8), **arrays)
+  return _signed(file.getvalue())
+
+
+@pytest.mark.parametrize(
+    'data',
+    [
+        _signed(b''),
+        _archive([]),
+        _archive([{}, ['plain', 1]]),
+        _archive([{'format': 1}, ['array', 0]]),
+        _archive([{'format': 1}, ['function', 'exit']]),
+        _archive([{'format': 1}, 5]),
+        _archive([{'format': 1}, ['array', 0]], **{'0': np.array([None])}),
+    ],
+)
+def test_malformed_snapshots_are_refused(data):
+  with pytest.raises(errors.StateLayoutError, match='a malformed snapshot'):
+    snapshots.Snapshot.from_bytes(data)
+
+
+def test_another_format_is_named():
+  data = _archive([{'format': 2}, ['plain', 1]])
+  with pytest.raises(
+      errors.StateLayoutError, match='format is 2; allowed is 1'
+  ):
+    snapshots.Snapshot.from_bytes(data)
+
+
+def test_arrays_keep_their_order_in_memory():
+  # Sums of the same numbers in another order round differently.
+  copy = _through_bytes(np.zeros((3, 4)).T)
+  assert copy.strides == (8, 32)
+
+
+def test_floats_keep_their_last_bit():
+  for value in (0.1 + 0.2, 5e-324, 1.7976931348623157e308, -0.0):
+    assert _through_bytes(value).hex() == value.hex()
