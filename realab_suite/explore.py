@@ -7,6 +7,8 @@ For example, an agent that tampers with the reward of Unlock Door:
 
 from collections.abc import Callable, Sequence
 import contextlib
+import itertools
+import os
 from typing import Any
 
 from absl import flags
@@ -57,7 +59,7 @@ def _write_film() -> None:
 
   env, policy = _load()
   world = f'{cli.DOMAIN.value}_{cli.TASK.value}'
-  path = _VIDEO.value or f'{world}_{_POLICY.value}_{_SEED.value}.mp4'
+  path = _VIDEO.value or _unused(f'{world}_{_POLICY.value}_{_SEED.value}')
   with (
       contextlib.closing(env),
       videos.Film(env, path, _POLICY.value, tuple(videos.WIDTHS)) as film,
@@ -65,6 +67,16 @@ def _write_film() -> None:
     recorder = recording.Recorder(env, film.add)
     evaluate.evaluate(env, policy, 1, sinks=[recorder])
   cli.say(f'The film is {path}')
+
+
+def _unused(stem: str) -> str:
+  """Returns the name of a film that is not there yet."""
+  path = f'{stem}.mp4'
+  for number in itertools.count(2):
+    if not os.path.exists(path):
+      break
+    path = f'{stem}_{number}.mp4'
+  return path
 
 
 def _load() -> tuple[Any, Any]:

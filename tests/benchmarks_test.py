@@ -93,7 +93,7 @@ def test_a_raw_batch_that_does_something_else_is_noticed(
 
   monkeypatch.setattr(batch, '_record', record_carelessly)
   monkeypatch.setattr(batch, '_measure_memory', list)
-  with pytest.raises(RuntimeError, match='another state'):
+  with pytest.raises(RuntimeError, match='another qpos'):
     batch.main(['--rounds=1'])
 
 

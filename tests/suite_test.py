@@ -354,7 +354,10 @@ _LOAD = functools.partial(suite.load, 'collect_apples', 'standard')
         ({'task_kwargs': {'random': True}}, 'random: True; allowed are'),
         ({'task_kwargs': {'random': 'x'}}, "random: 'x'; allowed are"),
         ({'task_kwargs': 3}, 'task_kwargs'),
-        ({'environment_kwargs': {'steps': 1}}, "unknown ['steps']; allowed is"),
+        (
+            {'environment_kwargs': {'steps': 1}},
+            "unknown ['steps']; allowed are",
+        ),
         ({'environment_kwargs': {'max_steps': 0}}, 'max_steps: 0; allowed'),
         ({'environment_kwargs': {'max_steps': -5}}, 'max_steps: -5; allowed'),
         ({'environment_kwargs': {'max_steps': 2.0}}, 'max_steps: 2.0; allo'),

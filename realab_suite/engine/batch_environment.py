@@ -82,6 +82,13 @@ class BatchEnvironment:
         single.thin_physics, num_worlds, num_threads
     )
     self._num_worlds = num_worlds
+    self._entities = [
+        entity
+        for entity in self._task.root_entity.iter_entities()
+        if type(entity).initialize_episode
+        is not composer.Entity.initialize_episode
+    ]
+    self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
     self._episodes = np.full(num_worlds, -1)
     self._is_pending = np.ones(num_worlds, bool)
     num_providers = len(self._mechanism.design.providers)
@@ -279,15 +286,14 @@ class BatchEnvironment:
 
   def _initialize(self, world: int, episode: int) -> None:
     seed, view = self._single.seed, self._physics.world(world)
-    entities = list(self._task.root_entity.iter_entities())
     for attempt in range(environment.MAX_RESET_ATTEMPTS):
-      random_state = seeding.random_state(
-          seed, world, episode, f'reset/{attempt}'
+      seeding.reseed(
+          self._random_state, seed, world, episode, f'reset/{attempt}'
       )
       try:
-        self._task.initialize_episode(view, random_state)
-        for entity in entities:
-          entity.initialize_episode(view, random_state)
+        self._task.initialize_episode(view, self._random_state)
+        for entity in self._entities:
+          entity.initialize_episode(view, self._random_state)
         break
       except composer.EpisodeInitializationError:
         if attempt == environment.MAX_RESET_ATTEMPTS - 1:

@@ -267,8 +267,13 @@ class Environment(composer.Environment):
     self._reset_next_step = True
     self._episode += 1
     for attempt in range(MAX_RESET_ATTEMPTS):
-      stream = f'reset/{attempt}'
-      self._random_state = self._stream(stream)
+      seeding.reseed(
+          self._random_state,
+          self._seed,
+          self._world,
+          self._episode,
+          f'reset/{attempt}',
+      )
       try:
         self._initialize_episode()
         break
@@ -498,9 +503,6 @@ class Environment(composer.Environment):
     self._physics = kind.from_mjcf_model(self._task.root_entity.mjcf_model)
     self._physics.legacy_step = False
 
-  def _stream(self, name: str) -> np.random.RandomState:
-    return seeding.random_state(self._seed, self._world, self._episode, name)
-
   def _abandon(self) -> None:
     if self._episode_is_open:
       self._end(events.End.ABANDONED)
@@ -523,6 +525,6 @@ def _refuse_substep_hooks(task: base.Task) -> None:
     for hook in ('before_substep', 'after_substep'):
       if getattr(type(part), hook) is not getattr(kind, hook):
         raise errors.SpecError(
-            f'{type(part).__name__}.{hook}: worlds of this package have no hooks'
-            ' in substeps; use latch_events'
+            f'{type(part).__name__}.{hook}: worlds of this package have no'
+            ' hooks in substeps; use latch_events'
         )

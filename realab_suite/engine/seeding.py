@@ -50,9 +50,25 @@ def random_state(
     seed: int, world: int, episode: int, stream: str
 ) -> np.random.RandomState:
   """Returns the stream as what Composer's hooks take."""
-  return np.random.RandomState(
-      np.random.MT19937(sequence(seed, world, episode, stream))
-  )
+  made = np.random.RandomState(0)
+  reseed(made, seed, world, episode, stream)
+  return made
+
+
+def reseed(
+    random_state: np.random.RandomState,
+    seed: int,
+    world: int,
+    episode: int,
+    stream: str,
+) -> None:
+  """Makes a `RandomState` go on as another stream.
+
+  To make a new one for every episode takes longer than all the rest of a reset
+  of one world among many.
+  """
+  words = sequence(seed, world, episode, stream).generate_state(8)
+  random_state.seed(words)
 
 
 def episode_key(seed: int, world: int, episode: int, stream: str) -> np.ndarray:

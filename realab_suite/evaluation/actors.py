@@ -140,7 +140,7 @@ def make(
     return PolicyActor(policy, env)
   if not callable(policy):
     raise errors.SpecError(
-        f'policy: {policy!r:.80}; allowed are a policy, as policies.make returns'
-        ' it, and a function from a time step to an action'
+        f'policy: {policy!r:.80}; allowed are a policy, as policies.make'
+        ' returns it, and a function from a time step to an action'
     )
   return PlainActor(policy)

@@ -1,14 +1,21 @@
 """A batch is its worlds, one by one, to the last bit."""
 
 import functools
-from typing import Any
+from typing import Any, Literal
 
+from dm_control import composer
+from dm_control import mjcf
 import dm_env
 import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.engine import batch_environment
+from realab_suite.evaluation import ledger
+from realab_suite.feedback import providers
+from realab_suite.tasks import collect_apples
+from tests.engine import helpers
 
 _NUM_WORLDS = 3
 _MAX_STEPS = 25
@@ -218,3 +225,112 @@ def test_a_closed_batch_does_nothing(batch):
     batch.reset()
   with pytest.raises(errors.ClosedError):
     batch.step(np.zeros((_NUM_WORLDS, 6)))
+
+
+class _Counting(providers.Provider):
+  """Counts its own steps, and trusts its initial state to be the first."""
+
+  kind: Literal['counting_in_a_test'] = 'counting_in_a_test'
+
+  def initial_state(self, batch_shape):
+    return {'count': (np.zeros(batch_shape),)}
+
+  def step(self, observation, readings, episode_start, key, state):
+    (count,) = state['count']
+    return {self.writes[0]: count}, {'count': (count + 1,)}
+
+
+def test_providers_begin_every_episode_anew():
+  with helpers.registered(providers.PROVIDERS, 'counting_in_a_test', _Counting):
+    batch, singles = _load_both(
+        'collect_apples',
+        'standard',
+        design={
+            'schema': 1,
+            'name': 'counting',
+            'channel': 'secure',
+            'registers': {
+                'count': {
+                    'kind': 'two_block',
+                    'role': 'feedback',
+                    'place': 'station_1',
+                    'range': [0, 20],
+                }
+            },
+            'providers': [{'kind': 'counting_in_a_test', 'writes': ['count']}],
+        },
+    )
+  actions = np.zeros((_NUM_WORLDS, 6))
+  counts = []
+  for _ in range(_NUM_STEPS):
+    found = batch.step(actions)
+    _assert_same(found, [single.step(actions[0]) for single in singles])
+    counts.append(float(found.observation['registers/count'][0]))
+  assert counts.count(3.0) == 3
+  batch.close()
+
+
+class _Overflowing(collect_apples.CollectApples):
+  """Goes on earning after it is over, beyond what its meter can hold."""
+
+  def latch_events(self, physics):
+    """Nothing happens within a step."""
+
+  def after_step(self, physics, random_state):
+    self.earn(physics, np.ones(np.shape(self.score(physics))))
+
+  def should_terminate_episode(self, physics):
+    length = 3.0 + (self.avatar.position(physics)[..., 0] > 0.0)
+    return self.score(physics) >= length
+
+
+def test_a_world_that_is_over_does_no_harm_to_the_others():
+  design = {
+      'schema': 1,
+      'name': 'narrow',
+      'registers': {
+          'score': {
+              'kind': 'two_block',
+              'role': 'meter',
+              'place': 'station_1',
+              'range': [0, 4],
+              'on_overflow': 'error',
+          }
+      },
+      'meters': [{'measures': 'score', 'writes': 'score'}],
+  }
+  single = suite.embed(_Overflowing(), design, random=1, max_steps=50)
+  batch = batch_environment.BatchEnvironment(single, 8)
+  batch_ledger = ledger.BatchLedger()
+  batch.add_sink(batch_ledger)
+  step_types = np.stack(
+      [batch.step(np.zeros((8, 6))).step_type for _ in range(20)]
+  )
+  assert len(np.unique((step_types == 2).argmax(axis=0))) > 1
+  for world in range(8):
+    first = batch_ledger.episodes(world)[0]
+    # What is earned after the end counts for nothing.
+    assert ledger.true_return(first) in (3.0, 4.0)
+  batch.close()
+
+
+def test_a_batch_of_a_world_whose_parts_want_every_step_is_refused():
+  task = collect_apples.CollectApples()
+  task.root_entity.attach(_Restless())
+  single = suite.embed(task, 'none', random=1)
+  with pytest.raises(errors.SpecError, match=r'_Restless\.after_step'):
+    batch_environment.BatchEnvironment(single, 2)
+  single.close()
+
+
+class _Restless(composer.Entity):
+
+  def _build(self):
+    self._model = mjcf.RootElement(model='restless')
+
+  @property
+  def mjcf_model(self):
+    return self._model
+
+  def after_step(self, physics, random_state):
+    raise NotImplementedError

@@ -917,7 +917,7 @@ def test_a_sense_that_is_called_like_one_of_ours_is_refused():
 
   with pytest.raises(errors.RealabError, match='time_left'):
     _embed(Clashing(), max_steps=5)
-  env, _ = _embed(Clashing())  # Without a time limit nothing clashes.
+  env, _ = _embed(Clashing(), max_steps=None)  # Nothing clashes.
   env.close()
 
 

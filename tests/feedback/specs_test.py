@@ -692,13 +692,21 @@ def test_a_design_has_a_twin_for_each_channel_and_dof(channel: str, dof: str):
   original.close()
 
 
-def test_what_a_register_says_wins_over_what_the_design_says():
-  design = _design(channel='secure', dof='planar')
-  design['registers']['reward'] = {**_REWARD, 'channel': 'embedded'}
+@pytest.mark.parametrize(
+    ('whole', 'found'),
+    [
+        ('embedded', {'reward': 'secure', 'score': 'embedded'}),
+        ('welded', {'reward': 'welded', 'score': 'welded'}),
+        ('secure', {'reward': 'secure', 'score': 'secure'}),
+    ],
+)
+def test_a_twin_is_one_as_a_whole_whatever_its_registers_say(whole, found):
+  design = _design(channel=whole, dof='planar')
+  design['registers']['reward'] = {**_REWARD, 'channel': 'secure'}
   env = suite.load(*_ON_TWO, design=design)
-  found = {n: r.channel for n, r in env.mechanism.registers.items()}
+  channels = {n: r.channel for n, r in env.mechanism.registers.items()}
   env.close()
-  assert found == {'reward': 'embedded', 'score': 'secure'}
+  assert channels == found
 
 
 # The JSON Schema, and kinds of one's own.
