@@ -4,6 +4,7 @@ This file alone touches private parts of `composer.Environment`; they are those
 of dm_control 1.0.50, and a test says so when they change.
 """
 
+import math
 from typing import Any, final
 
 from dm_control import composer
@@ -389,7 +390,7 @@ class Environment(composer.Environment):
     discount = float(self._task.get_discount(physics))
     if discount != 1.0 and not is_ending and self._is_over():
       discount = 1.0  # Nobody knows of the end yet.
-    mechanism.end_step(physics, reward if np.isfinite(reward) else 0.0)
+    mechanism.end_step(physics, reward if math.isfinite(reward) else 0.0)
     records += self._observe()
     return events.Step(records, np.array(reward)), discount, is_ending
 
@@ -452,12 +453,12 @@ class Environment(composer.Environment):
     """Remembers what the next action is an answer to."""
     for value in observation.values():
       # Providers look at these arrays themselves; the agent gets copies.
-      value.flags.writeable = False
+      value.setflags(write=False)
     self._observation = observation
 
   def _copy_of_observation(self) -> dict[str, np.ndarray]:
     """The agent may do what it likes with what it gets."""
-    return {key: np.array(value) for key, value in self._observation.items()}
+    return {key: value.copy() for key, value in self._observation.items()}
 
   # Episodes.
 

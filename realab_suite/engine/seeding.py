@@ -87,5 +87,5 @@ def step_key(key: np.ndarray, step: int | np.ndarray) -> np.ndarray:
     `(..., 2)`, uint64.
   """
   stepped = np.array(key)
-  stepped[..., 1] += np.asarray(step).astype(np.uint64)
+  stepped[..., 1] += np.uint64(step)
   return stepped

@@ -177,10 +177,10 @@ class FeedbackMechanism(composer.Entity):
       try:
         measured, applied = meter.update(physics, idle)
       except errors.RegisterValueError as error:
-        step = _first(self._step_count.get(physics))
+        step = self._step_count.get(physics)
         # The message may reach an agent, which is not to learn what is true.
         raise errors.RegisterValueError(
-            f'{writer} at step {step}: register {meter.register.name!r} cannot'
+            f'{_where(writer, step)}: register {meter.register.name!r} cannot'
             ' store what was measured'
         ) from error
       writes.append(Write(meter.register.name, writer, measured, applied))
@@ -220,7 +220,6 @@ class FeedbackMechanism(composer.Entity):
     next_states = []
     for i, provider in enumerate(self._design.providers):
       writer = f'providers[{i}]:{provider.kind}'
-      where = f'{writer} at step {_first(step)}'
       seen = [self._read(physics, name, writer) for name in provider.reads]
       readings = {read.register: np.array(read.reading) for read in seen}
       try:
@@ -229,9 +228,9 @@ class FeedbackMechanism(composer.Entity):
         )
       except Exception as error:
         raise errors.FeedbackProviderError(
-            f'{where}: {type(error).__name__}: {error}'
+            f'{_where(writer, step)}: {type(error).__name__}: {error}'
         ) from error
-      values = _checked_writes(where, provider, values, np.shape(step))
+      values = _checked_writes(writer, step, provider, values)
       records += seen
       for name in provider.writes:
         register, value = self._registers[name], values[name]
@@ -240,7 +239,9 @@ class FeedbackMechanism(composer.Entity):
         try:
           applied = register.write(physics, value)
         except errors.RegisterValueError as error:
-          raise errors.RegisterValueError(f'{where}: {error}') from error
+          raise errors.RegisterValueError(
+              f'{_where(writer, step)}: {error}'
+          ) from error
         records.append(Write(name, writer, value, applied))
       next_states.append(next_state)
     return records, next_states
@@ -322,16 +323,13 @@ def _find(
 
 
 def _checked_writes(
-    where: str,
-    provider: providers.Provider,
-    values: Any,
-    batch_shape: tuple[int, ...],
+    writer: str, step: np.ndarray, provider: providers.Provider, values: Any
 ) -> dict[str, np.ndarray]:
   """Returns what a provider wrote, if it is what it declares."""
   if not isinstance(values, Mapping) or set(values) != set(provider.writes):
     given = sorted(map(str, values)) if isinstance(values, Mapping) else values
     raise errors.FeedbackProviderError(
-        f'{where} returned {given!r:.80}; it declares writes to'
+        f'{_where(writer, step)} returned {given!r:.80}; it declares writes to'
         f' {sorted(provider.writes)}'
     )
   checked = {}
@@ -340,20 +338,22 @@ def _checked_writes(
       number = np.asarray(value)
     except ValueError as error:
       raise errors.FeedbackProviderError(
-          f'{where} wrote {value!r:.80} to {name!r}: {error}'
+          f'{_where(writer, step)} wrote {value!r:.80} to {name!r}: {error}'
       ) from error
     if number.dtype.kind not in 'iuf':
       raise errors.FeedbackProviderError(
-          f'{where} wrote {value!r:.80} to {name!r}; expected numbers'
+          f'{_where(writer, step)} wrote {value!r:.80} to {name!r}; expected'
+          ' numbers'
       )
-    if number.shape != batch_shape:
+    if number.shape != np.shape(step):
       raise errors.FeedbackProviderError(
-          f'{where} wrote shape {number.shape} to {name!r}; expected'
-          f' {batch_shape}'
+          f'{_where(writer, step)} wrote shape {number.shape} to {name!r};'
+          f' expected {np.shape(step)}'
       )
     checked[name] = number.astype(np.float64)
   return checked
 
 
-def _first(step: np.ndarray) -> int:
-  return int(np.ravel(step)[0])
+def _where(writer: str, step: np.ndarray) -> str:
+  """Names a writer and the control step that it failed in, of world 0."""
+  return f'{writer} at step {int(np.ravel(step)[0])}'
