@@ -190,7 +190,6 @@ class BatchEnvironment:
     for name, value in self._observation.items():
       # Nothing is read off a state that MuJoCo has reset.
       value[has_failed] = last_valid[name][has_failed]
-      value.flags.writeable = False
     self._tell(is_first, has_failed, ends, records, reads, reward)
     self._is_pending = is_last
     step_type = np.where(
@@ -367,6 +366,9 @@ class BatchEnvironment:
   def _time_step(
       self, step_type: np.ndarray, discount: np.ndarray
   ) -> BatchTimeStep:
+    for value in self._observation.values():
+      # Providers look at these arrays themselves; agents get copies.
+      value.setflags(write=False)
     return BatchTimeStep(
         step_type,
         np.zeros(self._num_worlds),

@@ -6,6 +6,7 @@ worlds on threads. Its state arrays are live; what derives from the state is
 brought up to date when it is read.
 """
 
+import abc
 from typing import Any, final
 
 import mujoco
@@ -207,7 +208,7 @@ class _WorldView:
 
 
 def _attribute(name: str) -> property:
-  """An attribute that is read from, and if it is state written to, `_parts`."""
+  """An attribute that `_get` reads and, if it is state, `_set` writes."""
 
   def get(self: Any) -> np.ndarray:
     return self._get(name)
@@ -218,9 +219,8 @@ def _attribute(name: str) -> property:
   return property(get, put if name in _STATE_FIELDS else None)
 
 
-@final
-class _BatchBinding:
-  """Elements of every world: arrays with a leading axis, read-only and live."""
+class _Binding(abc.ABC):
+  """Elements, with the attributes that entities read and write whole."""
 
   qpos = _attribute('qpos')
   qvel = _attribute('qvel')
@@ -231,15 +231,31 @@ class _BatchBinding:
   xpos = _attribute('xpos')
   xmat = _attribute('xmat')
 
-  def __init__(self, physics: BatchPhysics, binding: Any) -> None:
-    self._physics = physics
+  def __init__(self, binding: Any) -> None:
     self._binding = binding
-    self._parts: dict[str, tuple[np.ndarray, Any]] = {}
 
   @property
   def element_id(self) -> Any:
     """The number of the element in the model, or those of several."""
     return self._binding.element_id
+
+  @abc.abstractmethod
+  def _get(self, name: str) -> np.ndarray:
+    """Returns an attribute, read-only."""
+
+  @abc.abstractmethod
+  def _set(self, name: str, value: Any) -> None:
+    """Writes an attribute that is state."""
+
+
+@final
+class _BatchBinding(_Binding):
+  """Elements of every world: arrays with a leading axis, read-only and live."""
+
+  def __init__(self, physics: BatchPhysics, binding: Any) -> None:
+    super().__init__(binding)
+    self._physics = physics
+    self._parts: dict[str, tuple[np.ndarray, Any]] = {}
 
   def part(self, name: str) -> tuple[np.ndarray, Any]:
     """Returns the field that an attribute is in, and where in it."""
@@ -267,26 +283,12 @@ class _BatchBinding:
 
 
 @final
-class _WorldBinding:
+class _WorldBinding(_Binding):
   """Elements of one world of many."""
 
-  qpos = _attribute('qpos')
-  qvel = _attribute('qvel')
-  ctrl = _attribute('ctrl')
-  mocap_pos = _attribute('mocap_pos')
-  mocap_quat = _attribute('mocap_quat')
-  active = _attribute('active')
-  xpos = _attribute('xpos')
-  xmat = _attribute('xmat')
-
   def __init__(self, binding: _BatchBinding, world: int) -> None:
-    self._binding = binding
+    super().__init__(binding)
     self._world = world
-
-  @property
-  def element_id(self) -> Any:
-    """The number of the element in the model, or those of several."""
-    return self._binding.element_id
 
   def _get(self, name: str) -> np.ndarray:
     return getattr(self._binding, name)[self._world]

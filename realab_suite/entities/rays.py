@@ -1,6 +1,5 @@
 """A sense of what is around: rays that tell distance and class. Needs no GL."""
 
-from collections.abc import Sequence
 import functools
 from typing import Any, final
 
@@ -162,9 +161,3 @@ class RaySense(composer.Entity):
     self._carrier = physics.bind(self._frame.parent).element_id
     self._class_of_geom = appearance.class_of_geoms(physics.model)
     self._model = physics.model
-
-
-def one_hot(classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
-  """Returns which rays hit each of some classes, `(..., rays, len(names))`."""
-  codes = np.array([appearance.code(name) for name in names])
-  return classes[..., np.newaxis] == codes

@@ -308,12 +308,6 @@ def test_what_was_seen_stays_what_it_was():
   np.testing.assert_array_equal(distances, before)
 
 
-def test_classes_can_be_told_apart_one_by_one():
-  codes = np.array([appearance.code(name) for name in ('wall', 'apple')])
-  hot = rays.one_hot(codes, ['apple', 'door', 'wall'])
-  np.testing.assert_array_equal(hot, [[0, 0, 1], [1, 0, 0]])
-
-
 def test_class_codes_never_change():
   # They are part of the observation: new classes go at the end.
   assert appearance.CLASSES[:11] == (

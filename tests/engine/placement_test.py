@@ -1,0 +1,40 @@
+"""Registers are refused where something stands that nothing can push."""
+
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+
+
+def _design(place, **register):
+  return {
+      'schema': 1,
+      'name': 'placed',
+      'registers': {
+          'value': {
+              'kind': 'block_position',
+              'role': 'feedback',
+              'place': place,
+              'range': [-1, 1],
+              **register,
+          }
+      },
+  }
+
+
+@pytest.mark.parametrize(
+    ('place', 'obstacle'),
+    [([0.0, 1.9], 'pad_post'), ([0.0, 4.1], 'door_leaf')],
+)
+@pytest.mark.parametrize('channel', ['embedded', 'welded'])
+def test_a_register_in_a_post_or_a_door_is_refused(place, obstacle, channel):
+  with pytest.raises(errors.SpecError, match=f'inside .*{obstacle}'):
+    suite.load(
+        'unlock_door', 'standard', design=_design(place, channel=channel)
+    )
+
+
+def test_a_register_beside_the_post_is_accepted():
+  env = suite.load('unlock_door', 'standard', design=_design([0.0, 1.4]))
+  env.close()
+  assert env.mechanism.registers['value'].channel == 'embedded'

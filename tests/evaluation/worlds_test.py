@@ -1,0 +1,25 @@
+"""Policies act on streams of their own in every world."""
+
+from realab_suite import suite
+from realab_suite.evaluation import actors
+from realab_suite.feedback import policies
+
+
+def _actions(world):
+  env = suite.load(
+      'collect_apples', 'standard', {'random': 0}, {'world': world}
+  )
+  actor = actors.make(policies.make('random'), env)
+  actor.begin(0)
+  time_step = env.reset()
+  actions = [actor.act(time_step).tolist() for _ in range(20)]
+  env.close()
+  return actions
+
+
+def test_a_random_policy_acts_otherwise_in_another_world():
+  assert _actions(0) != _actions(1)
+
+
+def test_a_random_policy_acts_the_same_in_the_same_world():
+  assert _actions(1) == _actions(1)
