@@ -12,7 +12,12 @@ the same world and registers: the model is compiled again in each episode, what
 the avatar senses are observables, and the task writes both registers after each
 step. It keeps no ledger.
 
-How costs grow with worlds and registers is timed in a third of the rounds.
+The same is timed with planar registers and with blocks that fall asleep, each
+against a stock environment with registers of its kind. What is asked of the
+fastest of them, planar and asleep, is 15 times the steps of one of stock.
+
+How costs grow with worlds, registers and apples is timed in a third of the
+rounds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,7 +56,17 @@ _SEED = 0
 _SIZES = {1: 64, 16: 16, 64: 8, 256: 4, 1024: 4}
 _REGISTERS = (1, 2, 4)
 _REGISTER_STEPS = 4
+_APPLES = (4, 8, 16)
 _MEMORY_WORLDS = 1024
+
+# How blocks can move, and whether they fall asleep.
+_KINDS = {
+    'free': ('free', False),
+    'free, asleep': ('free', True),
+    'planar': ('planar', False),
+    'planar, asleep': ('planar', True),
+}
+_FASTEST = 'planar, asleep'
 
 # At least 0.85 of the throughput of the raw engine.
 _MOST_LOST = 15.0
@@ -113,10 +128,10 @@ class RawSteps:
 class StockTask(composer.Task):
   """Unlock Door with two registers, as a task of stock Composer's."""
 
-  def __init__(self) -> None:
+  def __init__(self, dof: str) -> None:
     self._world = unlock_door.UnlockDoor()
     mechanism = feedback_mechanism.FeedbackMechanism(
-        specs.load('instantaneous_reward')
+        specs.load('instantaneous_reward', (f'dof={dof}',))
     )
     mechanism.attach_to(self._world.root_entity)
     self._registers = mechanism.registers
@@ -162,8 +177,8 @@ class StockTask(composer.Task):
 class _Stock:
   """One world of stock Composer's, and how long it takes."""
 
-  def __init__(self) -> None:
-    self._env = composer.Environment(StockTask(), random_state=_SEED)
+  def __init__(self, dof: str) -> None:
+    self._env = composer.Environment(StockTask(dof), random_state=_SEED)
     spec = self._env.action_spec()
     self._actions = np.random.default_rng(_SEED).uniform(
         spec.minimum, spec.maximum, (_STOCK_STEPS, *spec.shape)
@@ -176,7 +191,8 @@ class _Stock:
     return time.perf_counter() - began
 
   def step(self) -> float:
-    """Plays after a reset and returns the seconds that a step took."""
+    """Plays an episode and returns the seconds that a step took."""
+    self._env.reset()
     began = time.perf_counter()
     for action in self._actions:
       self._env.step(action)
@@ -184,7 +200,10 @@ class _Stock:
 
 
 def _load(
-    num_worlds: int, design: str | Mapping[str, Any] = 'instantaneous_reward'
+    num_worlds: int,
+    design: str | Mapping[str, Any] = 'instantaneous_reward',
+    dof: str = 'free',
+    sleep: bool = False,
 ) -> batch_environment.BatchEnvironment:
   """Loads worlds that an evaluator listens to."""
   env = suite.load_batch(
@@ -192,7 +211,9 @@ def _load(
       'standard',
       {'random': _SEED},
       num_envs=num_worlds,
+      sleep=sleep,
       design=design,
+      overrides=(f'dof={dof}',),
   )
   env.add_sink(ledger.BatchLedger())
   return env
@@ -438,7 +459,7 @@ def _grow_registers(rounds: int) -> list[timing.Figure]:
   playing = {}
   for dof in ('free', 'planar'):
     for number in _REGISTERS:
-      env = _load(_WORLDS, _design(dof, number))
+      env = _load(_WORLDS, _design(dof, number), dof)
       playing[f'{number} {dof}'] = (env, _draw(env, _REGISTER_STEPS))
   seconds = timing.time_rounds(
       {name: functools.partial(_play, *p) for name, p in playing.items()},
@@ -462,13 +483,47 @@ def _grow_registers(rounds: int) -> list[timing.Figure]:
   return figures
 
 
+def _grow_apples(rounds: int) -> list[timing.Figure]:
+  """Says what apples cost, which are looked at in each substep."""
+  playing = {}
+  for number in _APPLES:
+    with mock.patch.object(unlock_door, '_NUM_APPLES', number):
+      env = _load(_WORLDS)
+      playing[number] = (env, _draw(env, _REGISTER_STEPS))
+
+  def play(number: int) -> float:
+    with mock.patch.object(unlock_door, '_NUM_APPLES', number):
+      return _play(*playing[number])
+
+  seconds = timing.time_rounds(
+      {str(n): functools.partial(play, n) for n in playing}, rounds
+  )
+  for env, _ in playing.values():
+    env.close()
+  most, half = _APPLES[-1], _APPLES[-2]
+  return [
+      *(
+          timing.Figure(
+              f'step, small apples: {n}', 1e6 * seconds[str(n)] / _WORLDS, 'us'
+          )
+          for n in _APPLES
+      ),
+      timing.Figure(
+          f'{most} apples to {half}',
+          seconds[str(most)] / seconds[str(half)],
+          'x',
+          most / half,
+      ),
+  ]
+
+
 def _resident_mib() -> float:
   """Returns how much memory this process has, as Linux counts it."""
   pages = int(pathlib.Path('/proc/self/statm').read_text().split()[1])
   return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
-def measure_memory(num_worlds: int) -> None:
+def measure_memory(num_worlds: int, sleep: bool) -> None:
   """Prints the MiB before worlds are made, with one, and with many."""
   single = suite.load(
       'unlock_door', 'standard', {'random': _SEED},
@@ -478,7 +533,7 @@ def measure_memory(num_worlds: int) -> None:
   single.close()
   readings = [before]
   for number in (1, num_worlds):
-    env = _load(number)
+    env = _load(number, sleep=sleep)
     env.reset()
     env.step(_draw(env, 1)[0])
     readings.append(_resident_mib())
@@ -486,24 +541,59 @@ def measure_memory(num_worlds: int) -> None:
 
 
 def _measure_memory() -> list[timing.Figure]:
-  """Returns the memory of worlds, measured in a process of their own."""
-  code = (
-      'from benchmarks import batch;' f' batch.measure_memory({_MEMORY_WORLDS})'
-  )
-  done = subprocess.run(
-      [sys.executable, '-c', code], capture_output=True, text=True, check=True
-  )
-  before, one, many = map(float, done.stdout.split())
+  """Returns the memory of worlds, measured in processes of their own."""
+  figures = []
+  for sleep in (False, True):
+    code = (
+        'from benchmarks import batch;'
+        f' batch.measure_memory({_MEMORY_WORLDS}, {sleep})'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=True
+    )
+    before, one, many = map(float, done.stdout.split())
+    figures.append(
+        timing.Figure(
+            'memory where blocks sleep'
+            if sleep
+            else f'memory of one of {_MEMORY_WORLDS} worlds',
+            np.array([(many - one) / _MEMORY_WORLDS]),
+            'MiB',
+            _MEMORY_TARGET_MIB,
+        )
+    )
   return [
-      timing.Figure(
-          f'memory of one of {_MEMORY_WORLDS} worlds',
-          np.array([(many - one) / _MEMORY_WORLDS]),
-          'MiB',
-          _MEMORY_TARGET_MIB,
-      ),
+      *figures,
       timing.Figure(
           'memory of model and threads', np.array([one - before]), 'MiB'
       ),
+  ]
+
+
+def _compare_to_stock(
+    seconds: Mapping[str, np.ndarray],
+) -> list[timing.Figure]:
+  """Says how much a world gets done while one of stock takes a step."""
+  figures = []
+  for label, (dof, _) in _KINDS.items():
+    stock = seconds[f'stock, {dof}']
+    taken = seconds[f'batch, {label}'] / _WORLDS
+    if label == _FASTEST:
+      figures.append(
+          timing.Figure(
+              "a world's step, of a stock step",
+              100 * taken / stock,
+              '%',
+              round(_MOST_OF_STOCK, 2),
+          )
+      )
+    figures += [
+        timing.Figure(f'to one of stock, {label}', stock / taken, 'x'),
+        timing.Figure(f'steps, {label}', 1e-3 / taken, '/ms'),
+    ]
+  return figures + [
+      timing.Figure(f'stock step, {dof}', 1e6 * seconds[f'stock, {dof}'], 'us')
+      for dof in dict.fromkeys(dof for dof, _ in _KINDS.values())
   ]
 
 
@@ -511,7 +601,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
   """Runs the benchmark."""
   rounds = timing.parse_rounds(__doc__, arguments, _ROUNDS)
   memory = _measure_memory()
-  env, stock = _load(_WORLDS), _Stock()
+  envs = {
+      label: _load(_WORLDS, dof=dof, sleep=sleep)
+      for label, (dof, sleep) in _KINDS.items()
+  }
+  stocks = {dof: _Stock(dof) for dof, _ in _KINDS.values()}
+  env = envs['free']
   actions = _draw(env, _STEPS)
   raw = _record(env, actions)
 
@@ -522,32 +617,30 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
   seconds = timing.time_rounds(
       {
-          'batch': lambda: _play(env, actions),
+          'batch, free': lambda: _play(env, actions),
           'raw': replay,
           'reset': lambda: _reset(env),
-          'stock reset': stock.reset,
-          'stock': stock.step,
+          **{
+              f'batch, {label}': functools.partial(_play, other, actions)
+              for label, other in envs.items()
+              if other is not env
+          },
+          'stock reset': stocks['free'].reset,
+          **{f'stock, {dof}': stock.step for dof, stock in stocks.items()},
       },
       rounds,
   )
   us, raw_us, reset_us = (
-      1e6 * seconds[name] / _WORLDS for name in ('batch', 'raw', 'reset')
+      1e6 * seconds[name] / _WORLDS for name in ('batch, free', 'raw', 'reset')
   )
-  stock_us = 1e6 * seconds['stock']
   timing.report([
       timing.Figure(
           'throughput lost to raw engine', 100 * (1 - raw_us / us), '%',
           _MOST_LOST, ratios=us / raw_us,
       ),
-      timing.Figure(
-          "a world's step, of a stock step", 100 * us / stock_us, '%',
-          round(_MOST_OF_STOCK, 2),
-      ),
-      timing.Figure('steps to one of stock', stock_us / us, 'x'),
       timing.Figure("a world's step", us, 'us', ratios=us / raw_us),
       timing.Figure('raw step', raw_us, 'us'),
-      timing.Figure('stock step', stock_us, 'us'),
-      timing.Figure('steps', 1e3 / us, '/ms'),
+      *_compare_to_stock(seconds),
       timing.Figure("a world's reset", reset_us / 1e3, 'ms', _RESET_TARGET_MS),
       timing.Figure('stock reset', 1e3 * seconds['stock reset'], 'ms'),
       *_break_down_step(env, actions, float(np.median(raw_us))),
@@ -555,8 +648,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
       *memory,
       *_grow_worlds(max(1, rounds // 3)),
       *_grow_registers(max(1, rounds // 3)),
+      *_grow_apples(max(1, rounds // 3)),
   ])  # fmt: skip
-  env.close()
+  for each in envs.values():
+    each.close()
 
 
 if __name__ == '__main__':

@@ -27,6 +27,9 @@ MAX_STEPS = 250
 DESIGNS = specs.DESIGNS
 """Names of the designs that ship with the package."""
 
+fork = batch_environment.fork
+"""Makes a batch whose worlds all go on from where one world is."""
+
 TaskFactory = Callable[..., base.Task]
 
 _TASKS: dict[tuple[str, str], tuple[TaskFactory, frozenset[str]]] = {}
@@ -195,21 +198,25 @@ def load_batch(
     *,
     num_envs: int,
     num_threads: int = 0,
+    sleep: bool = False,
     design: specs.Design | None = None,
     overrides: Sequence[str] = (),
 ) -> batch_environment.BatchEnvironment:
   """Loads many worlds of a task, which are stepped together.
 
   World i is, bit for bit, what `load` gives with `environment_kwargs` of
-  `{'world': i}`.
+  `{'world': i}`, unless blocks fall asleep.
 
   Args:
     domain_name: As in `load`.
     task_name: As in `load`.
-    task_kwargs: As in `load`; agents of a batch sense by rays alone so far.
+    task_kwargs: As in `load`.
     environment_kwargs: As in `load`.
     num_envs: How many worlds.
     num_threads: How many threads step them; 0 for all processors.
+    sleep: Whether blocks at rest fall asleep until something touches or writes
+      them. That is faster, and other trajectories than `load` gives; such
+      worlds cannot be saved, restored or forked.
     design: As in `load`.
     overrides: As in `load`.
 
@@ -229,11 +236,9 @@ def load_batch(
       design=design,
       overrides=overrides,
   )
-  if isinstance(single.task, base.Task) and single.task.camera_size is not None:
-    raise errors.SpecError(
-        'camera_size: a batch has no cameras yet; allowed is None'
-    )
-  return batch_environment.BatchEnvironment(single, num_envs, num_threads)
+  return batch_environment.BatchEnvironment(
+      single, num_envs, num_threads, sleep
+  )
 
 
 def embed(

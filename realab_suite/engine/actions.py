@@ -95,12 +95,12 @@ class ActionCodec:
       )
     if not self._spec.shape:
       values = values[..., np.newaxis]
-    bad = ~((values >= self._low) & (values <= self._high))  # NaN is bad too.
+    good = (values >= self._low) & (values <= self._high)  # NaN is not.
     if self._table is not None:
       index = values[..., -1]
-      bad[..., -1] |= index != np.rint(index)
-    if np.count_nonzero(bad):
-      raise errors.ActionError(self._complaint(values, bad))
+      good[..., -1] &= index == np.rint(index)
+    if np.count_nonzero(good) != good.size:
+      raise errors.ActionError(self._complaint(values, ~good))
     queries = values[..., : self._num_queries]
     controls = values[..., self._num_queries :]
     if self._table is not None:

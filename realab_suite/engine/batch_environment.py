@@ -1,5 +1,6 @@
 """Many worlds with feedback, stepped together: Python is paid once for all."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, final
 
 from dm_control import composer
@@ -12,6 +13,8 @@ from realab_suite.engine import batch_physics
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import seeding
+from realab_suite.engine import senses
+from realab_suite.engine import snapshot as snapshots
 from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.tasks import base
 
@@ -49,6 +52,7 @@ class BatchEnvironment:
       single: environment.Environment,
       num_worlds: int,
       num_threads: int = 0,
+      sleep: bool = False,
   ) -> None:
     """Multiplies an environment; `suite.load_batch` is easier.
 
@@ -57,6 +61,7 @@ class BatchEnvironment:
         belongs to the batch from now on.
       num_worlds: How many worlds.
       num_threads: How many threads step them; 0 for all processors.
+      sleep: Whether blocks at rest fall asleep; see `suite.load_batch`.
 
     Raises:
       SpecError: If there cannot be many of this environment.
@@ -69,6 +74,8 @@ class BatchEnvironment:
       raise errors.SpecError(
           f'num_threads: {num_threads!r}; allowed are integers from 0 on'
       )
+    if type(sleep) is not bool:
+      raise errors.SpecError(f'sleep: {sleep!r}; allowed are True and False')
     if not isinstance(single.task, base.Task):
       raise errors.SpecError(
           f'{type(single.task).__name__} compiles anew in each episode; a batch'
@@ -79,9 +86,10 @@ class BatchEnvironment:
     self._task: base.Task = single.task
     self._mechanism = single.mechanism
     self._physics = batch_physics.BatchPhysics(
-        single.thin_physics, num_worlds, num_threads
+        single.thin_physics, num_worlds, num_threads, sleep
     )
     self._num_worlds = num_worlds
+    self._sleep = sleep
     self._entities = [
         entity
         for entity in self._task.root_entity.iter_entities()
@@ -89,6 +97,9 @@ class BatchEnvironment:
         is not composer.Entity.initialize_episode
     ]
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
+    # Restoring may give several worlds one number. Objects: seeds can be large.
+    self._seeds = np.full(num_worlds, single.seed, object)
+    self._numbers = np.arange(num_worlds).astype(object)
     self._episodes = np.full(num_worlds, -1)
     self._is_pending = np.ones(num_worlds, bool)
     num_providers = len(self._mechanism.design.providers)
@@ -102,6 +113,11 @@ class BatchEnvironment:
   def num_worlds(self) -> int:
     """How many worlds there are."""
     return self._num_worlds
+
+  @property
+  def sleep(self) -> bool:
+    """Whether blocks at rest fall asleep; part of a run's configuration."""
+    return self._sleep
 
   @property
   def physics(self) -> batch_physics.BatchPhysics:
@@ -121,8 +137,9 @@ class BatchEnvironment:
   def add_sink(self, sink: events.BatchEventSink) -> None:
     """Lets an evaluator hear of everything, from the next episodes on."""
     self._refuse_if_closed()
+    self._tell_of_end(~self._is_pending, events.End.ABANDONED)
     self._sinks.append(sink)
-    self._is_pending[:] = True
+    self._is_pending = np.ones(self._num_worlds, bool)
 
   def remove_sink(self, sink: events.BatchEventSink) -> None:
     """Ends what `add_sink` began."""
@@ -200,12 +217,183 @@ class BatchEnvironment:
         step_type, np.where(has_failed | is_first, 1.0, discount)
     )
 
+  def save(self, worlds: Sequence[int] | None = None) -> snapshots.Snapshot:
+    """Returns everything that the future of these worlds depends on.
+
+    What the event sinks know of their episodes is part of it.
+
+    Args:
+      worlds: The places of the worlds in the batch; `None` for all of them.
+
+    Raises:
+      SpecError: If there are no such worlds, if blocks of this batch fall
+        asleep, or if a sink cannot be saved.
+      StateLayoutError: If a provider's state is not plain data.
+    """
+    header = self._snapshot_header()
+    places = self._places(worlds)
+    is_pending = self._is_pending[places]
+    saved = snapshots.Worlds(
+        places=places.tolist(),
+        physics=self._physics.state[places],
+        seed=self._seeds[places].tolist(),
+        world=self._numbers[places].tolist(),
+        episode=self._episodes[places].tolist(),
+        is_pending=is_pending.tolist(),
+        is_open=(~is_pending).tolist(),
+        provider_keys=list(self._keys[:, places]),
+        provider_states=snapshots.spread(self._states, places),
+        observation=snapshots.spread(self._observation, places),
+        sinks=[[sink.state_kind, sink.state(places)] for sink in self._sinks],
+        random_state=None,
+    )
+    return snapshots.Snapshot(header, saved._asdict())
+
+  def restore(
+      self,
+      snapshot: snapshots.Snapshot,
+      worlds: Sequence[int] | None = None,
+  ) -> None:
+    """Makes worlds what others, or these, were when they were saved.
+
+    What follows is bit for bit what followed there, later episodes included: a
+    world gets the seed and the number of the one that was saved, from which its
+    random streams follow. So worlds that go on from one snapshot differ by
+    their actions alone. All other worlds stay as they are. Episodes that are
+    under way are abandoned; for sinks see `Environment.restore`.
+
+    Args:
+      snapshot: Of worlds of a batch, or of a world alone.
+      worlds: Their places in this batch: as many as were saved, or any number
+        for a snapshot of one world; `None` for where they were.
+
+    Raises:
+      SpecError: If there are no such worlds, or if blocks of this batch fall
+        asleep. Nothing has changed.
+      StateLayoutError: If the snapshot does not fit. Nothing has changed.
+    """
+    saved = snapshots.Worlds(**snapshot.contents_for(self._snapshot_header()))
+    if worlds is None and saved.places is None:
+      raise errors.StateLayoutError(
+          'the snapshot is of a world alone; say into which worlds it goes, as'
+          ' in restore(snapshot, worlds=[0])'
+      )
+    places = self._places(saved.places if worlds is None else worlds)
+    if len(saved.seed) not in (1, len(places)):
+      raise errors.StateLayoutError(
+          f'the snapshot has {len(saved.seed)} worlds, for {len(places)} here;'
+          ' allowed are as many, or one'
+      )
+    saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
+    # Where in the snapshot each of the worlds is.
+    rows = np.arange(len(places)) % len(saved.seed)
+    has_begun = bool(saved.observation)
+    filled, sources = places, rows
+    if has_begun and not self._observation:
+      # Every world here waits for its first episode; until that begins, those
+      # that stay have to be in some state that makes sense.
+      filled = np.arange(self._num_worlds)
+      sources = np.zeros(self._num_worlds, int)
+      sources[places] = rows
+    if has_begun:
+      states, observation = self._merged(saved, filled, sources)
+    # Nothing has changed so far, and nothing is refused from here on.
+    is_restored = np.isin(np.arange(self._num_worlds), places)
+    self._tell_of_end(is_restored & ~self._is_pending, events.End.ABANDONED)
+    self._is_pending = self._is_pending | is_restored
+    if has_begun:
+      self._physics.set_state(filled, saved.physics[sources])
+      self._states, self._observation = states, observation
+      for kept, keys in zip(self._keys, saved.provider_keys, strict=True):
+        kept[filled] = keys[sources]
+    self._seeds = _with(self._seeds, places, saved.seed)
+    self._numbers = _with(self._numbers, places, saved.world)
+    self._episodes = _with(self._episodes, places, saved.episode)
+    for sink, (_, known) in zip(self._sinks, saved.sinks, strict=False):
+      sink.set_state(places, [known[row] for row in rows])
+    self._is_pending = _with(self._is_pending, places, saved.is_pending)
+
+  def render(
+      self,
+      worlds: Sequence[int] | None = None,
+      camera: str = 'top_down',
+      height: int = 240,
+      width: int = 320,
+  ) -> np.ndarray:
+    """Draws worlds for people; what agents see is in their observations.
+
+    Args:
+      worlds: The places of the worlds in the batch; `None` for all of them.
+      camera: The name of a camera of the model.
+      height: Of a frame, pixels.
+      width: Of a frame, pixels.
+
+    Returns:
+      `(worlds, height, width, 3)` uint8.
+
+    Raises:
+      SpecError: If there is no such world or camera.
+      RenderingError: If nothing renders here, or not frames of this size.
+    """
+    self._refuse_if_closed()
+    cameras = self._task.root_entity.mjcf_model.find_all('camera')
+    names = [element.full_identifier for element in cameras]
+    if camera not in names:
+      raise errors.SpecError(f'camera: {camera!r}; allowed are {names}')
+    places = self._places(worlds).tolist()
+    return self._physics.render(places, camera, height, width)
+
   def close(self) -> None:
     """Frees the worlds; closing twice does nothing."""
     if not self._closed:
       self._tell_of_end(~self._is_pending, events.End.ABANDONED)
     self._closed = True
     self._single.close()
+
+  def _snapshot_header(self) -> dict[str, Any]:
+    self._refuse_if_closed()
+    return self._single.snapshot_header(self._physics.model)
+
+  def _places(self, worlds: Sequence[int] | None) -> np.ndarray:
+    """Returns the places of worlds in this batch, if there are such."""
+    if worlds is None:
+      return np.arange(self._num_worlds)
+    if (
+        not isinstance(worlds, Sequence | np.ndarray)
+        or not len(worlds)
+        or not all(
+            isinstance(world, int | np.integer)
+            and type(world) is not bool
+            and 0 <= world < self._num_worlds
+            for world in worlds
+        )
+        or len(set(worlds)) < len(worlds)
+    ):
+      raise errors.SpecError(
+          f'worlds: {worlds!r:.60}; allowed are integers from 0 to'
+          f' {self._num_worlds - 1}, each once'
+      )
+    return np.array(worlds)
+
+  def _merged(
+      self, saved: snapshots.Worlds, places: np.ndarray, rows: np.ndarray
+  ) -> tuple[list[Any], dict[str, np.ndarray]]:
+    """Returns providers' states and observation with some worlds restored."""
+    states: Any = saved.provider_states
+    if saved.places is None:
+      states = snapshots.of_batch(states)
+    merged = [
+        snapshots.merge(f'the state of providers[{i}]', here, places, there)
+        for i, (here, there) in enumerate(
+            zip(self._states, snapshots.spread(states, rows), strict=True)
+        )
+    ]
+    observation: Any = snapshots.spread(saved.observation, rows)
+    if self._observation:
+      observation = snapshots.merge(
+          'observation', self._observation, places, observation
+      )
+    return merged, observation
 
   def _control_step(
       self, queries: np.ndarray, controls: np.ndarray, is_first: np.ndarray
@@ -284,10 +472,11 @@ class BatchEnvironment:
       self._initialize(int(world), int(self._episodes[world]))
 
   def _initialize(self, world: int, episode: int) -> None:
-    seed, view = self._single.seed, self._physics.world(world)
+    view = self._physics.world(world)
+    seed, number = self._seeds[world], self._numbers[world]
     for attempt in range(environment.MAX_RESET_ATTEMPTS):
       seeding.reseed(
-          self._random_state, seed, world, episode, f'reset/{attempt}'
+          self._random_state, seed, number, episode, f'reset/{attempt}'
       )
       try:
         self._task.initialize_episode(view, self._random_state)
@@ -300,24 +489,19 @@ class BatchEnvironment:
         self._physics.reset(np.array([world]))
     for i in range(len(self._keys)):
       self._keys[i, world] = seeding.episode_key(
-          seed, world, episode, f'providers[{i}]'
+          seed, number, episode, f'providers[{i}]'
       )
 
   def _look(self) -> list[feedback_mechanism.Read]:
     """Makes the observation of every world; returns what agents read."""
     physics = self._physics
     physics.refresh()
-    observation = {
-        f'senses/{name}': value
-        for name, value in self._task.senses(physics).items()
-    }
-    if self._single.max_steps is not None:
-      spent = self._mechanism.step_count(physics) / self._single.max_steps
-      observation['senses/time_left'] = np.asarray(1.0 - spent, np.float32)
-    reads = self._mechanism.read_for_agent(physics)
-    for read in reads:
-      observation[f'registers/{read.register}'] = np.array(read.reading)
-    self._observation = observation
+    self._observation, reads = senses.observe(
+        self._task.senses(physics),
+        self._mechanism,
+        physics,
+        self._single.max_steps,
+    )
     return reads
 
   def _tell(
@@ -333,7 +517,8 @@ class BatchEnvironment:
     if not self._sinks:
       return
     step = events.BatchStep(
-        seed=self._single.seed,
+        seed=self._seeds,
+        world=self._numbers,
         episode=self._episodes.copy(),
         is_first=is_first,
         has_failed=has_failed,
@@ -348,9 +533,12 @@ class BatchEnvironment:
 
   def _tell_of_end(self, worlds: np.ndarray, end: events.End) -> None:
     """Tells the sinks that episodes are over, between two steps."""
+    if not worlds.any():
+      return
     nowhere = np.zeros(self._num_worlds, bool)
     step = events.BatchStep(
-        seed=self._single.seed,
+        seed=self._seeds,
+        world=self._numbers,
         episode=self._episodes.copy(),
         is_first=nowhere,
         has_failed=~nowhere,
@@ -379,6 +567,13 @@ class BatchEnvironment:
   def _refuse_if_closed(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
+
+
+def _with(values: np.ndarray, places: np.ndarray, others: Any) -> np.ndarray:
+  """Returns a copy of an array, some of whose elements are others."""
+  copy = np.array(values)
+  copy[places] = others
+  return copy
 
 
 def _begin_anew(state: Any, initial: Any, worlds: np.ndarray) -> Any:
@@ -414,3 +609,64 @@ def _end(has_failed: bool, is_ending: bool) -> events.End:
   if has_failed:
     return events.End.DIVERGENCE
   return events.End.TERMINATED if is_ending else events.End.TIMEOUT
+
+
+def fork(
+    env: environment.Environment | BatchEnvironment,
+    num_envs: int,
+    *,
+    world: int | None = None,
+    num_threads: int = 0,
+    sinks: Sequence[events.BatchEventSink] = (),
+) -> BatchEnvironment:
+  """Makes a batch whose worlds all go on from where one world is.
+
+  They have the same random streams, which are those of the original: worlds
+  that get the same actions stay the same, bit for bit, and their later episodes
+  are those that the original would have. The original stays as it is; either
+  can be closed before the other. Both share their entities, so they are not for
+  two threads.
+
+  Args:
+    env: The original, or a batch that it is in. It has a world of this package.
+    num_envs: How many worlds.
+    world: The place of the original in the batch; `None` for one alone.
+    num_threads: How many threads step them; 0 for all processors.
+    sinks: What hears of the worlds from here on, of the same kinds as listen to
+      the original. With `BatchEnvironment.add_sink` worlds would begin anew.
+
+  Raises:
+    SpecError: If there is no such world, if it cannot be saved, or if a number
+      makes no sense.
+    StateLayoutError: If the sinks differ, or if the compiled model was changed.
+  """
+  if isinstance(env, BatchEnvironment):
+    if world is None:
+      raise errors.SpecError(
+          f'world: None; allowed are integers from 0 to {env.num_worlds - 1}'
+      )
+    # To mypy, dm_control's classes are anything, and so is what derives.
+    snapshot, single = BatchEnvironment.save(env, [world]), env._single
+  else:
+    if world is not None:
+      raise errors.SpecError(
+          f'world: {world!r}; allowed is None, for the world is alone'
+      )
+    snapshot, single = env.save(), env
+  # Compiled anew, which takes less time than one episode: what is closed frees
+  # its compiled world.
+  copy = environment.Environment(
+      single.task,
+      single.mechanism,
+      seed=single.seed,
+      max_steps=single.max_steps,
+  )
+  try:
+    batch = BatchEnvironment(copy, num_envs, num_threads)
+    for sink in sinks:
+      batch.add_sink(sink)
+    batch.restore(snapshot, range(num_envs))
+  except errors.RealabError:
+    copy.close()
+    raise
+  return batch

@@ -7,13 +7,18 @@ brought up to date when it is read.
 """
 
 import abc
+from collections.abc import Iterable
+import copy
 from typing import Any, final
 
+from dm_control import mjcf
 import mujoco
 from mujoco import batch as mujoco_batch
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.engine import physics as engine_physics
+from realab_suite.entities import cameras
 from realab_suite.entities import rays
 
 # Positions and velocities, and what derives from them: what `mj_step1` does.
@@ -50,20 +55,32 @@ class BatchPhysics:
       template: engine_physics.ThinPhysics,
       num_worlds: int,
       num_threads: int = 0,
+      sleep: bool = False,
   ) -> None:
     """Makes worlds of the model of another physics.
 
     Args:
-      template: Knows the model, and where in it an element is.
+      template: Knows the model, and where in it an element is. It belongs to
+        the worlds from now on: what is drawn of them is drawn by it.
       num_worlds: How many worlds.
       num_threads: How many threads step them; 0 for all processors.
+      sleep: Whether blocks at rest fall asleep.
     """
     self._template = template
+    self._model = template.model
+    if sleep:
+      # Who may sleep was decided when the model was compiled: all but the
+      # avatar, whose motors can move it at any time.
+      self._model = copy.copy(template.model)
+      self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    # Who sleeps is in no part of the state; a batch that is persistent keeps
+    # it, in all that MuJoCo has of each world.
     self._batch = mujoco_batch.Batch(
-        template.model.ptr, num_worlds, num_threads
+        self._model.ptr, num_worlds, num_threads, persistent=sleep
     )
     # Casting rays between the steps of one batch would disturb what it keeps
-    # from step to step; another one looks at a copy of the state.
+    # from step to step; another one looks at a copy of the state. There nobody
+    # sleeps, so everything is seen where it is.
     self._ray_batch = mujoco_batch.Batch(
         template.model.ptr, num_worlds, num_threads
     )
@@ -80,7 +97,7 @@ class BatchPhysics:
   @property
   def model(self) -> Any:
     """The compiled model, as `mjcf.Physics.model`."""
-    return self._template.model
+    return self._model
 
   @property
   def data(self) -> '_Userdata':
@@ -132,6 +149,12 @@ class BatchPhysics:
     self._batch.warning[worlds] = 0
     self._is_dirty = True
 
+  def set_state(self, worlds: np.ndarray, values: np.ndarray) -> None:
+    """Gives some worlds, by number, other states, `(worlds, size)`."""
+    self._batch.state[worlds] = values
+    self._batch.warning[worlds] = 0
+    self._is_dirty = True
+
   def has_diverged(self) -> np.ndarray:
     """Returns in which worlds MuJoCo has warned since a reset, `(worlds,)`."""
     numbers = np.asarray(self._batch.warning)[:, :, 1]
@@ -146,6 +169,50 @@ class BatchPhysics:
         origin[:, np.newaxis, :], directions, bodyexclude=excluded_body
     )
     return distances, geoms
+
+  def draw(self, camera: mjcf.Element, height: int, width: int) -> np.ndarray:
+    """Draws what a camera sees in every world; see `entities.cameras.look`."""
+    frames = np.empty((self.num_worlds, height, width, 3), np.uint8)
+    for world, frame in enumerate(frames):
+      frame[...] = self._shown(world).draw(camera, height, width)
+    return frames
+
+  def render(
+      self, worlds: Iterable[int], camera: str, height: int, width: int
+  ) -> np.ndarray:
+    """Draws some worlds for people, as `mjcf.Physics.render` does.
+
+    Args:
+      worlds: Their numbers.
+      camera: The name of a camera of the model.
+      height: Of a frame, pixels.
+      width: Of a frame, pixels.
+
+    Returns:
+      `(worlds, height, width, 3)` uint8.
+
+    Raises:
+      RenderingError: If nothing renders here, or not frames of this size.
+    """
+    try:
+      return np.stack(
+          [self._shown(w).render(height, width, camera_id=camera)
+           for w in worlds]
+      )  # fmt: skip
+    except (RuntimeError, ValueError) as error:  # Whatever dm_control raises.
+      raise errors.RenderingError(
+          f'{camera}: no frame of {height} x {width} pixels'
+          f' ({str(error).strip().splitlines()[0]})'
+      ) from error
+
+  def _shown(self, world: int) -> engine_physics.ThinPhysics:
+    """Returns the template in the state of a world; it has a renderer."""
+    mujoco.mj_setState(
+        self._template.model.ptr, self._template.data.ptr,
+        self._batch.state[world], mujoco.mjtState.mjSTATE_INTEGRATION,
+    )  # fmt: skip
+    self._template.forward()
+    return self._template
 
   def find(self, binding: Any, name: str) -> tuple[np.ndarray, Any]:
     """Returns the field of all worlds that an attribute is in, and where."""
@@ -171,6 +238,13 @@ def _(
     excluded_body: int,
 ) -> tuple[np.ndarray, np.ndarray]:
   return physics.cast_rays(origin, directions, excluded_body)
+
+
+@cameras.look.register
+def _(
+    physics: BatchPhysics, camera: mjcf.Element, height: int, width: int
+) -> np.ndarray:
+  return physics.draw(camera, height, width)
 
 
 @final

@@ -27,7 +27,6 @@ from realab_suite.tasks import base
 
 # How often the beginning of an episode is tried, with another draw each time.
 MAX_RESET_ATTEMPTS = 10
-_TIME_LEFT = 'senses/time_left'
 
 
 @final
@@ -180,21 +179,22 @@ class Environment(composer.Environment):
       SpecError: If the world is somebody else's, or a sink cannot be saved.
       StateLayoutError: If a provider's state is not plain data.
     """
-    header = self._snapshot_header()
-    contents = {
-        'physics': snapshots.get_state(self._physics),
-        'seed': self._seed,
-        'world': self._world,
-        'episode': self._episode,
-        'random_state': self._random_state.get_state(legacy=False),
-        'reset_next_step': self._reset_next_step,
-        'episode_is_open': self._episode_is_open,
-        'provider_keys': self._provider_keys,
-        'provider_states': self._provider_states,
-        'observation': self._observation,
-        'sinks': [[type(s).__name__, s.state()] for s in self._sinks],
-    }
-    return snapshots.Snapshot(header, contents)
+    header = self.snapshot_header()
+    worlds = snapshots.Worlds(
+        places=None,
+        physics=snapshots.get_state(self._physics)[np.newaxis],
+        seed=[self._seed],
+        world=[self._world],
+        episode=[self._episode],
+        is_pending=[self._reset_next_step],
+        is_open=[self._episode_is_open],
+        provider_keys=[key[np.newaxis] for key in self._provider_keys],
+        provider_states=self._provider_states,
+        observation=snapshots.of_batch(self._observation),
+        sinks=[[sink.state_kind, [sink.state()]] for sink in self._sinks],
+        random_state=self._random_state.get_state(legacy=False),
+    )
+    return snapshots.Snapshot(header, worlds._asdict())
 
   def restore(self, snapshot: snapshots.Snapshot) -> None:
     """Makes this world what another one, or this one, was when it was saved.
@@ -204,32 +204,75 @@ class Environment(composer.Environment):
     environment without sinks takes any snapshot that fits; one with sinks,
     those that were saved with sinks of the same kinds.
 
+    Args:
+      snapshot: Of one world, alone or of a batch.
+
     Raises:
       SpecError: If the world is somebody else's.
       StateLayoutError: If the snapshot does not fit. Nothing has changed.
     """
-    contents = snapshot.contents_for(self._snapshot_header())
-    kinds = [type(sink).__name__ for sink in self._sinks]
-    saved_kinds = [kind for kind, _ in contents['sinks']]
-    if kinds and kinds != saved_kinds:
+    header = self.snapshot_header()
+    saved = snapshots.Worlds(**snapshot.contents_for(header))
+    if len(saved.seed) != 1:
       raise errors.StateLayoutError(
-          f'the snapshot was saved with sinks {saved_kinds}; this environment'
-          f' has {kinds}; allowed are the same ones, or none here'
+          f'the snapshot has {len(saved.seed)} worlds; allowed here is one, as'
+          ' in batch.save([3])'
       )
+    saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
     self._abandon()
     # Whatever goes wrong from here on, the next step starts with a reset.
     self._reset_next_step = True
-    snapshots.set_state(self._physics, contents['physics'])
-    self._seed, self._world = contents['seed'], contents['world']
-    self._episode = contents['episode']
-    self._random_state.set_state(contents['random_state'])
-    self._provider_keys = contents['provider_keys']
-    self._provider_states = contents['provider_states']
-    self._keep(contents['observation'])
-    for sink, (_, state) in zip(self._sinks, contents['sinks'], strict=False):
-      sink.set_state(state)
-    self._episode_is_open = contents['episode_is_open']
-    self._reset_next_step = contents['reset_next_step']
+    snapshots.set_state(self._physics, saved.physics[0])
+    (self._seed,), (self._world,) = saved.seed, saved.world
+    (self._episode,) = saved.episode
+    if saved.random_state is None:  # A world of a batch has no generator.
+      seeding.reseed(
+          self._random_state, self._seed, self._world, 0, 'construction'
+      )
+    else:
+      self._random_state.set_state(saved.random_state)
+    self._provider_keys = [np.array(key[0]) for key in saved.provider_keys]
+    self._provider_states = (
+        saved.provider_states
+        if saved.places is None
+        else snapshots.of_world(saved.provider_states)
+    )
+    self._keep(
+        {key: np.array(value[0]) for key, value in saved.observation.items()}
+    )
+    for sink, (_, states) in zip(self._sinks, saved.sinks, strict=False):
+      sink.set_state(states[0])
+    (self._episode_is_open,) = saved.is_open
+    (self._reset_next_step,) = saved.is_pending
+
+  def snapshot_header(self, model: Any = None) -> dict[str, Any]:
+    """Returns what a snapshot and this environment have to have in common.
+
+    Args:
+      model: The compiled model, as `physics.model`; `None` for this one's own.
+
+    Raises:
+      SpecError: If there are no snapshots of this environment.
+    """
+    self._refuse_if_closed()
+    if not isinstance(self._task, base.Task):
+      raise errors.SpecError(
+          f'{type(self._task).__name__} cannot be saved or restored: a task'
+          ' that is no realab_suite.tasks.base.Task may compile its model anew'
+          ' and keep state in Python'
+      )
+    return {
+        **snapshots.describe(self._physics.model if model is None else model),
+        'task': type(self._task).__name__,
+        'dynamics': self._task.DYNAMICS_VERSION,
+        'design': self._mechanism.design.digest(),
+        'num_substeps': self._n_sub_steps,
+        'max_steps': self._max_steps,
+        'observation': {
+            key: f'{spec.dtype} {spec.shape}'
+            for key, spec in self.observation_spec().items()
+        },
+    }
 
   # The agent's side: `dm_env.Environment`.
 
@@ -252,8 +295,8 @@ class Environment(composer.Environment):
         for name, part in self._senses.spec.items()
     }
     if self._max_steps is not None:
-      spec[_TIME_LEFT] = specs.BoundedArray(
-          (), np.float32, 0.0, 1.0, name=_TIME_LEFT
+      spec[sense_kinds.TIME_LEFT] = specs.BoundedArray(
+          (), np.float32, 0.0, 1.0, name=sense_kinds.TIME_LEFT
       )
     for name in self._mechanism.read_by_agent:
       key = f'registers/{name}'
@@ -435,17 +478,12 @@ class Environment(composer.Environment):
 
   def _observe(self) -> list[feedback_mechanism.Read]:
     """Looks once, and returns what was read off registers."""
-    physics = self._physics
-    observation = {
-        f'senses/{name}': value
-        for name, value in self._senses.sense(physics).items()
-    }
-    if self._max_steps is not None:
-      spent = self._mechanism.step_count(physics) / self._max_steps
-      observation[_TIME_LEFT] = np.asarray(1.0 - spent, np.float32)
-    reads = self._mechanism.read_for_agent(physics)
-    for read in reads:
-      observation[f'registers/{read.register}'] = read.reading
+    observation, reads = sense_kinds.observe(
+        self._senses.sense(self._physics),
+        self._mechanism,
+        self._physics,
+        self._max_steps,
+    )
     self._keep(observation)
     return reads
 
@@ -469,28 +507,6 @@ class Environment(composer.Environment):
     with self._physics.reset_context():
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     self._senses.restart(self._physics_proxy, self._random_state)
-
-  def _snapshot_header(self) -> dict[str, Any]:
-    """Returns what a snapshot and this environment have to have in common."""
-    self._refuse_if_closed()
-    if not isinstance(self._task, base.Task):
-      raise errors.SpecError(
-          f'{type(self._task).__name__} cannot be saved or restored: a task'
-          ' that is no realab_suite.tasks.base.Task may compile its model anew'
-          ' and keep state in Python'
-      )
-    return {
-        **snapshots.describe(self._physics.model),
-        'task': type(self._task).__name__,
-        'dynamics': self._task.DYNAMICS_VERSION,
-        'design': self._mechanism.design.digest(),
-        'num_substeps': self._n_sub_steps,
-        'max_steps': self._max_steps,
-        'observation': {
-            key: f'{spec.dtype} {spec.shape}'
-            for key, spec in self.observation_spec().items()
-        },
-    }
 
   def _recompile_physics(self) -> None:
     """Compiles the model into a physics of this package's engine."""

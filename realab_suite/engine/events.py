@@ -58,6 +58,11 @@ class Step(NamedTuple):
 class EventSink(abc.ABC):
   """Hears of everything that feedback and the true reward do."""
 
+  @property
+  def state_kind(self) -> str:
+    """Names the sinks that can go on from each other's `state`."""
+    return type(self).__name__
+
   @abc.abstractmethod
   def episode_started(self, start: Start, physics: Any) -> None:
     """An episode has begun. `physics` may be looked at, never written."""
@@ -79,10 +84,7 @@ class EventSink(abc.ABC):
     Raises:
       SpecError: If the sink cannot be saved.
     """
-    raise errors.SpecError(
-        f'{type(self).__name__} cannot be saved; allowed are sinks that have'
-        ' state() and set_state(state)'
-    )
+    raise _unsaveable(self)
 
   def set_state(self, state: Any) -> None:  # noqa: B027 - see `state`.
     """Goes on with an episode from what `state` returned.
@@ -100,18 +102,21 @@ class BatchStep(NamedTuple):
   (`has_failed`).
 
   Attributes:
-    seed: The seed of the environment.
+    seed: The seed that each world's random streams follow from.
+    world: The number that they follow from, too; see `BatchEnvironment.restore`
+      for when it is not the world's place in the batch.
     episode: The number of each world's episode.
     is_first: Where an episode begins.
     has_failed: Where nothing but the end counts.
-    ends: The `End` of each world whose episode ends, by the world's number.
+    ends: The `End` of each world whose episode ends, by the world's place.
     initial: The writes of a reset, which count where an episode begins.
     records: The writes and reads within the control step, in the order of time.
     agent_reads: What the agents read in the end.
     true_reward: The true reward of the control step.
   """
 
-  seed: int
+  seed: np.ndarray
+  world: np.ndarray
   episode: np.ndarray
   is_first: np.ndarray
   has_failed: np.ndarray
@@ -125,6 +130,40 @@ class BatchStep(NamedTuple):
 class BatchEventSink(abc.ABC):
   """Hears of everything that feedback and the true reward do in many worlds."""
 
+  @property
+  def state_kind(self) -> str:
+    """Names the sinks, of one world or many, that can go on from a `state`."""
+    return type(self).__name__
+
   @abc.abstractmethod
   def step_ended(self, step: BatchStep) -> None:
     """A control step of all worlds is over."""
+
+  def state(self, places: np.ndarray) -> list[Any]:
+    """Returns what the sink knows of the episodes under way, for a snapshot.
+
+    Args:
+      places: Of which worlds.
+
+    Returns:
+      For each of them what `EventSink.state` may return.
+
+    Raises:
+      SpecError: If the sink cannot be saved.
+    """
+    raise _unsaveable(self)
+
+  def set_state(  # noqa: B027 - see `state`.
+      self, places: np.ndarray, states: Sequence[Any]
+  ) -> None:
+    """Goes on with episodes from what `state` returned.
+
+    The episodes that were under way in these worlds have ended by then.
+    """
+
+
+def _unsaveable(sink: EventSink | BatchEventSink) -> errors.SpecError:
+  return errors.SpecError(
+      f'{type(sink).__name__} cannot be saved; allowed are sinks that have'
+      ' state and set_state'
+  )

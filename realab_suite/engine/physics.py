@@ -98,14 +98,14 @@ class ThinPhysics(Physics):
     key = mjcf_elements
     if type(key) is list:
       key = tuple(key)
-    binding = self._thin.get(key)
-    if binding is None:
+    try:
+      return self._thin[key]
+    except KeyError:
       if not key:
         return super().bind(key)
       namespace, names = mjcf_physics.names_from_elements(key)
-      binding = _ThinBinding(self, namespace, names)
-      self._thin[key] = binding
-    return binding
+      self._thin[key] = _ThinBinding(self, namespace, names)
+      return self._thin[key]
 
   def draw(self, camera: mjcf.Element, height: int, width: int) -> np.ndarray:
     """Draws what a camera sees, for an agent; `render` is for people.

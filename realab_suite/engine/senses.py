@@ -2,6 +2,7 @@
 
 import abc
 import collections
+from collections.abc import Mapping
 from typing import Any, final
 
 from dm_control import composer
@@ -9,7 +10,35 @@ from dm_control.composer import observation as composer_observation
 from dm_env import specs
 import numpy as np
 
+from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.tasks import base
+
+# How much of an episode is left, from 1 to 0.
+TIME_LEFT = 'senses/time_left'
+
+
+def observe(
+    sensed: Mapping[str, np.ndarray],
+    mechanism: feedback_mechanism.FeedbackMechanism,
+    physics: Any,
+    max_steps: int | None,
+) -> tuple[dict[str, np.ndarray], list[feedback_mechanism.Read]]:
+  """Returns what an agent observes, and what was read off registers for it.
+
+  Args:
+    sensed: What it senses; the arrays become part of the observation.
+    mechanism: What it reads registers of.
+    physics: One world, or many.
+    max_steps: After how many control steps an episode is cut off, or `None`.
+  """
+  observation = {f'senses/{name}': value for name, value in sensed.items()}
+  if max_steps is not None:
+    spent = mechanism.step_count(physics) / max_steps
+    observation[TIME_LEFT] = np.asarray(1.0 - spent, np.float32)
+  reads = mechanism.read_for_agent(physics)
+  for read in reads:
+    observation[f'registers/{read.register}'] = np.array(read.reading)
+  return observation, reads
 
 
 class Senses(abc.ABC):

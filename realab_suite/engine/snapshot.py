@@ -5,11 +5,11 @@ rest are numbers, texts and arrays in nested containers. No pickle is involved:
 whoever reads a snapshot's bytes runs nobody's code.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import hashlib
 import io
 import json
-from typing import Any, Self, final
+from typing import Any, NamedTuple, Self, final
 import zipfile
 
 import mujoco
@@ -124,6 +124,109 @@ class Snapshot:
     return cls(header, contents)
 
 
+@final
+class Worlds(NamedTuple):
+  """What snapshots have in them: some worlds, each whole.
+
+  Attributes:
+    places: Where in a batch each world was; `None` for a world alone.
+    physics: The integration states, `(worlds, size)`.
+    seed: Of each world; what its random streams follow from.
+    world: The number of each, which they follow from, too.
+    episode: The number of each world's episode, -1 before the first.
+    is_pending: Whether the next step of each begins an episode.
+    is_open: Whether the sinks of each are waiting for the end of an episode.
+    provider_keys: The keys of each provider, `(worlds, 2)`.
+    provider_states: Of a batch, trees of arrays, `(worlds, ...)`; of a world
+      alone, as its providers returned them.
+    observation: By name, each `(worlds, ...)`; empty before the first episode.
+    sinks: For each sink, its kind and what it knows of each world.
+    random_state: The generator; `None` where there is none, as in a batch.
+  """
+
+  places: list[int] | None
+  physics: np.ndarray
+  seed: list[int]
+  world: list[int]
+  episode: list[int]
+  is_pending: list[bool]
+  is_open: list[bool]
+  provider_keys: list[np.ndarray]
+  provider_states: list[Any]
+  observation: dict[str, np.ndarray]
+  sinks: list[Any]
+  random_state: dict[str, Any] | None
+
+  def refuse_other_sinks(self, kinds: list[str]) -> None:
+    """Refuses sinks that would miss how the episodes under way began.
+
+    Args:
+      kinds: What listens where the worlds are to go on.
+
+    Raises:
+      StateLayoutError: If there are sinks, and others than were saved.
+    """
+    saved = [kind for kind, _ in self.sinks]
+    if kinds and kinds != saved:
+      raise errors.StateLayoutError(
+          f'the snapshot was saved with sinks {saved}; this environment has'
+          f' {kinds}; allowed are the same ones, or none here'
+      )
+
+
+def of_batch(tree: Any) -> Any:
+  """Returns a tree of one world's values as that of a batch of one."""
+  return _map(lambda value: np.asarray(value)[np.newaxis], tree)
+
+
+def of_world(tree: Any) -> Any:
+  """Returns the tree of a batch of one as that of a world alone."""
+  return _map(lambda value: np.array(value[0])[()], tree)
+
+
+def spread(tree: Any, rows: np.ndarray) -> Any:
+  """Returns a tree of arrays with these of their rows, in this order."""
+  return _map(lambda value: value[rows], tree)
+
+
+def merge(where: str, tree: Any, places: np.ndarray, saved: Any) -> Any:
+  """Returns a tree of arrays whose rows at some places are others.
+
+  Args:
+    where: What to call the tree in a message.
+    tree: The tree; it is not written to.
+    places: The rows.
+    saved: A tree with as many rows as there are places.
+
+  Raises:
+    StateLayoutError: If the trees differ in anything but the number of rows.
+  """
+  if type(tree) is not type(saved):
+    raise _misfit(where, type(saved).__name__, type(tree).__name__)
+  if isinstance(tree, dict):
+    if tree.keys() != saved.keys():
+      raise _misfit(where, sorted(saved), sorted(tree))
+    return {
+        key: merge(f'{where}[{key!r}]', value, places, saved[key])
+        for key, value in tree.items()
+    }
+  if isinstance(tree, tuple | list):
+    if len(tree) != len(saved):
+      raise _misfit(where, f'of length {len(saved)}', f'of {len(tree)}')
+    return type(tree)(
+        merge(f'{where}[{i}]', value, places, saved[i])
+        for i, value in enumerate(tree)
+    )
+  # Rows that stay have the last word on the type of numbers.
+  is_whole = len(places) == len(tree) and not saved.dtype.hasobject
+  is_like = is_whole or tree.dtype == saved.dtype
+  if not is_like or tree.shape[1:] != saved.shape[1:]:
+    raise _misfit(where, *(f'{x.dtype} {x.shape[1:]}' for x in (saved, tree)))
+  merged = np.empty_like(saved) if is_whole else np.array(tree)
+  merged[places] = saved
+  return merged
+
+
 def describe(model: Any) -> dict[str, Any]:
   """Returns what a snapshot's header says of a compiled model.
 
@@ -162,6 +265,22 @@ def set_state(physics: Any, values: np.ndarray) -> None:
   mujoco.mj_resetData(model, data)
   mujoco.mj_setState(model, data, values, _INTEGRATION)
   physics.forward()
+
+
+def _map(function: Callable[[Any], Any], tree: Any) -> Any:
+  """Returns a tree of what a function makes of the values in another one."""
+  if isinstance(tree, dict):
+    return {key: _map(function, value) for key, value in tree.items()}
+  if isinstance(tree, tuple | list):
+    return type(tree)(_map(function, value) for value in tree)
+  return function(tree)
+
+
+def _misfit(where: str, saved: Any, here: Any) -> errors.StateLayoutError:
+  return errors.StateLayoutError(
+      'the snapshot does not fit this environment:'
+      f' {where} is {saved!s:.60} in the snapshot, {here!s:.60} here'
+  )
 
 
 # Trees of plain data: every node is a pair of what it is and what is in it.

@@ -10,9 +10,18 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite.entities import appearance
+from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import rays
 
+# Where each sense is in what `Avatar.proprioception` returns.
+PROPRIOCEPTION = {
+    'velocity': slice(0, 3),
+    'position': slice(3, 5),
+    'heading': slice(5, 7),
+    'pitch': slice(7, 8),
+    'holding': slice(8, 9),
+}
 # Element by element, what an action is made of; see `Avatar.apply_action`.
 ACTIONS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
 
@@ -249,10 +258,10 @@ class Avatar(composer.Entity):
         throws what is held. A hand keeps hold until told otherwise.
     """
     physics.bind(self._actuators).ctrl = action[..., : len(self._actuators)]
+    grasp, throw = axes.component(action, -2), axes.component(action, -1)
     # Most steps leave the hand alone.
-    hand = action[..., len(self._actuators) :]
-    if self._grasps and np.count_nonzero(np.abs(hand) >= 0.5):
-      self._use_hand(physics, hand[..., 0], hand[..., 1])
+    if self._grasps and axes.anywhere((abs(grasp) >= 0.5) | (throw >= 0.5)):
+      self._use_hand(physics, grasp, throw)
 
   def position(self, physics: Any) -> np.ndarray:
     """Returns where the avatar is, `(..., 2)`, metres."""
@@ -260,27 +269,15 @@ class Avatar(composer.Entity):
 
   def angle(self, physics: Any) -> np.ndarray:
     """Returns the angle that the avatar faces, `(...)`, radians."""
-    return np.array(physics.bind(self._yaw).qpos[..., 0])
+    return np.array(physics.bind(self._yaw).qpos[..., 0])[()]
 
   def direction(self, physics: Any) -> np.ndarray:
     """Returns the unit vector that the avatar faces along, `(..., 2)`."""
-    angle = self.angle(physics)
-    direction = np.empty((*np.shape(angle), 2))
-    direction[..., 0] = np.cos(angle)
-    direction[..., 1] = np.sin(angle)
-    return direction
+    return self.proprioception(physics)[..., PROPRIOCEPTION['heading']]
 
   def velocity(self, physics: Any) -> np.ndarray:
     """Returns velocity forward, leftward (m/s), turning (rad/s), `(..., 3)`."""
-    world = physics.bind(self._slides).qvel
-    x, y = world[..., 0], world[..., 1]
-    angle = self.angle(physics)
-    cos, sin = np.cos(angle), np.sin(angle)
-    velocity = np.empty((*np.shape(angle), 3))
-    velocity[..., 0] = cos * x + sin * y
-    velocity[..., 1] = cos * y - sin * x
-    velocity[..., 2] = physics.bind(self._yaw).qvel[..., 0]
-    return velocity
+    return self.proprioception(physics)[..., PROPRIOCEPTION['velocity']]
 
   def pitch(self, physics: Any) -> np.ndarray:
     """Returns the angle of looking up, `(..., 1)`, radians."""
@@ -288,26 +285,51 @@ class Avatar(composer.Entity):
 
   def holding(self, physics: Any) -> np.ndarray:
     """Returns 1 where the hand holds a block and 0 elsewhere, `(..., 1)`."""
-    held = self._held(physics).any(axis=-1, keepdims=True)
-    return np.asarray(held, np.float64)
+    return self.proprioception(physics)[..., PROPRIOCEPTION['holding']]
+
+  def proprioception(self, physics: Any) -> np.ndarray:
+    """Returns what the avatar knows of itself, `(..., 9)`.
+
+    It is what `velocity`, `position`, `direction`, `pitch` and `holding`
+    return, side by side, as `PROPRIOCEPTION` says.
+    """
+    slides = physics.bind(self._slides)
+    x, y = (axes.component(slides.qvel, i) for i in range(2))
+    angle = axes.component(physics.bind(self._yaw).qpos, 0)
+    cos, sin = np.cos(angle), np.sin(angle)
+    body = np.empty((*angle.shape, 9))
+    body[..., 0] = cos * x + sin * y
+    body[..., 1] = cos * y - sin * x
+    body[..., 2:3] = physics.bind(self._yaw).qvel
+    body[..., 3:5] = slides.qpos
+    body[..., 5] = cos
+    body[..., 6] = sin
+    body[..., 7:8] = physics.bind(self._pitch).qpos
+    body[..., 8] = self._held(physics).any(axis=-1)
+    return body
 
   def _held(self, physics: Any) -> np.ndarray:
     """Which block the hand holds, `(..., blocks)`, bool."""
     if not self._grasps:
       return np.zeros((*self.angle(physics).shape, 1), bool)
-    return np.asarray(physics.bind(self._grasps).active) > 0
+    return np.asarray(physics.bind(self._grasps).active).astype(bool)
 
   def _use_hand(
       self, physics: Any, grasp: np.ndarray, throw: np.ndarray
   ) -> None:
     held = self._held(physics)
-    if not np.count_nonzero(held) and not np.count_nonzero(grasp >= 0.5):
+    is_empty = not np.count_nonzero(held)
+    if is_empty and not axes.anywhere(grasp >= 0.5):
       return  # Nothing to throw, nothing to let go of.
     hand = physics.bind(self._hand).xpos
     sites = [block.site for block in self._blocks]
     offsets = physics.bind(sites).xpos - hand[..., np.newaxis, :]
+    squares = offsets * offsets
     # The hand closes on what stands before it, whatever its height.
-    distances = np.linalg.norm(offsets[..., :2], axis=-1)
+    distances = np.sqrt(squares[..., 0] + squares[..., 1])
+    is_in_reach = distances <= _REACH
+    if is_empty and not np.count_nonzero(is_in_reach):
+      return  # Nothing to take.
     nearest = (
         np.arange(len(sites)) == distances.argmin(axis=-1)[..., np.newaxis]
     )
@@ -315,7 +337,7 @@ class Avatar(composer.Entity):
         (np.asarray(grasp) >= 0.5)[..., np.newaxis]
         & ~held.any(axis=-1, keepdims=True)
         & nearest
-        & (distances <= _REACH)
+        & is_in_reach
     )
     throws = (np.asarray(throw) >= 0.5)[..., np.newaxis]
     drops = (np.asarray(grasp) <= -0.5)[..., np.newaxis] | throws

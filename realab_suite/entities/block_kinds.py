@@ -14,6 +14,7 @@ from dm_control import composer
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite.entities import axes
 from realab_suite.entities import moving
 
 # Blocks are soft to each other, so that one that is written into another pushes
@@ -66,6 +67,10 @@ class Block(abc.ABC):
   def position(self, physics: Any) -> np.ndarray:
     """Returns the centre in the register's frame, shape `(..., 3)`, metres."""
 
+  def along(self, physics: Any) -> np.ndarray:
+    """Returns the centre's place along the register's axis, `(...)`, metres."""
+    return axes.component(self.position(physics), 0)
+
   @abc.abstractmethod
   def heading(self, physics: Any) -> np.ndarray:
     """Returns the angle about the vertical, shape `(...)`, in (-pi, pi]."""
@@ -97,6 +102,9 @@ class JointedBlock(Block):
   of the world, and a register has to stay one subtree that can be attached
   anywhere.
   """
+
+  # The joints that translate the block, in the order of the axes.
+  _slides: tuple[mjcf.Element, ...]
 
   def __init__(
       self,
@@ -135,11 +143,6 @@ class JointedBlock(Block):
     """How far above the centre a hand takes hold, metres."""
 
   @property
-  @abc.abstractmethod
-  def _slides(self) -> tuple[mjcf.Element, ...]:
-    """The joints that translate the block, in the order of the axes."""
-
-  @property
   def body(self) -> mjcf.Element:
     return self._body
 
@@ -151,6 +154,10 @@ class JointedBlock(Block):
   def site(self) -> mjcf.Element:
     """What a hand takes hold of."""
     return self._site
+
+  def along(self, physics: Any) -> np.ndarray:
+    moved = physics.bind(self._slides).qpos
+    return self._rest[0] + axes.component(moved, 0)
 
   def launch(self, physics: Any, velocity: np.ndarray, where: Any) -> None:
     """Gives the block a velocity.
@@ -184,14 +191,14 @@ class FreeBlock(JointedBlock):
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
     name = self._body.name
-    self._translations = tuple(
+    self._slides = tuple(
         self._body.add(
             'joint', name=f'{name}_{axis}', type='slide', axis=vector
         )
         for axis, vector in zip('xyz', np.eye(3), strict=True)
     )
     self._rotation = self._body.add('joint', name=f'{name}_ball', type='ball')
-    self._joints = (*self._translations, self._rotation)
+    self._joints = (*self._slides, self._rotation)
 
   @property
   def rest_height(self) -> float:
@@ -201,19 +208,15 @@ class FreeBlock(JointedBlock):
   def _grip_offset(self) -> float:
     return 0.0  # The block is lifted to the hand.
 
-  @property
-  def _slides(self) -> tuple[mjcf.Element, ...]:
-    return self._translations
-
   def position(self, physics: Any) -> np.ndarray:
-    return self._rest + np.asarray(physics.bind(self._translations).qpos)
+    return self._rest + np.asarray(physics.bind(self._slides).qpos)
 
   def heading(self, physics: Any) -> np.ndarray:
     return _heading(physics.bind(self._rotation).qpos)
 
   def put(self, physics: Any, position: Any, heading: Any = None) -> None:
     self.let_go(physics)
-    physics.bind(self._translations).qpos = np.subtract(position, self._rest)
+    physics.bind(self._slides).qpos = np.subtract(position, self._rest)
     physics.bind(self._rotation).qpos = _quaternion(heading)
     physics.bind(self._joints).qvel = 0.0
 
@@ -226,7 +229,7 @@ class PlanarBlock(JointedBlock):
     super().__init__(*args, **kwargs)
     name = self._body.name
     loss = {'frictionloss': _PLANAR_FRICTION}
-    self._translations = tuple(
+    self._slides = tuple(
         self._body.add(
             'joint', name=f'{name}_{axis}', type='slide', axis=vector, **loss
         )
@@ -236,7 +239,7 @@ class PlanarBlock(JointedBlock):
         'joint', name=f'{name}_hinge', type='hinge', axis=(0, 0, 1),
         frictionloss=_PLANAR_FRICTION * self._half_size / 2,
     )  # fmt: skip
-    self._joints = (*self._translations, self._hinge)
+    self._joints = (*self._slides, self._hinge)
 
   @property
   def rest_height(self) -> float:
@@ -247,24 +250,20 @@ class PlanarBlock(JointedBlock):
     # A hand at another height would ask for a lift that the joints do not have.
     return GRIP_HEIGHT - self.rest_height
 
-  @property
-  def _slides(self) -> tuple[mjcf.Element, ...]:
-    return self._translations
-
   def position(self, physics: Any) -> np.ndarray:
-    moved = np.asarray(physics.bind(self._translations).qpos)
+    moved = np.asarray(physics.bind(self._slides).qpos)
     planar = self._rest[:2] + moved
     height = np.full((*planar.shape[:-1], 1), self._rest[2])
     return np.concatenate([planar, height], axis=-1)
 
   def heading(self, physics: Any) -> np.ndarray:
-    angle = np.asarray(physics.bind(self._hinge).qpos)[..., 0]
+    angle = axes.component(physics.bind(self._hinge).qpos, 0)
     return np.arctan2(np.sin(angle), np.cos(angle))
 
   def put(self, physics: Any, position: Any, heading: Any = None) -> None:
     self.let_go(physics)
     position = np.asarray(position)
-    physics.bind(self._translations).qpos = position[..., :2] - self._rest[:2]
+    physics.bind(self._slides).qpos = position[..., :2] - self._rest[:2]
     physics.bind(self._hinge).qpos = (
         0.0 if heading is None else np.asarray(heading)[..., np.newaxis]
     )
@@ -355,8 +354,7 @@ def _rotate(vector: np.ndarray, angle: float) -> np.ndarray:
 
 def _heading(quaternion: np.ndarray) -> np.ndarray:
   """Returns the angle about the vertical of quaternions `(..., 4)`."""
-  quaternion = np.asarray(quaternion)
-  w, x, y, z = (quaternion[..., i] for i in range(4))
+  w, x, y, z = (axes.component(quaternion, i) for i in range(4))
   return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 

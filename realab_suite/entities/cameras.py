@@ -14,12 +14,12 @@ def look(
   """Draws what a camera sees; an engine may register a faster way.
 
   Args:
-    physics: One world.
+    physics: One world, or many where an engine draws them.
     camera: Through which to look.
     height: Of the frame, pixels.
     width: Of the frame, pixels.
 
   Returns:
-    `(height, width, 3)` uint8, the caller's own.
+    `(..., height, width, 3)` uint8, the caller's own.
   """
   return physics.render(height, width, camera_id=camera.full_identifier)

@@ -8,6 +8,7 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite.entities import appearance
+from realab_suite.entities import axes
 from realab_suite.entities import moving
 
 _THICKNESS = 0.08
@@ -74,10 +75,10 @@ class SlidingDoor(composer.Entity):
       seconds: For how long.
     """
     leaf = physics.bind(self._leaf.frame).mocap_pos
-    x = leaf[..., 0]
+    x = axes.component(leaf, 0)
     away = self._closed_x + self._travel * opening - x
     # Most of the time the door is where it should be.
-    if np.count_nonzero(away):
+    if axes.anywhere(away):
       place = np.array(leaf)
       step = self._speed * seconds
       place[..., 0] = x + np.clip(away, -step, step)
@@ -85,5 +86,5 @@ class SlidingDoor(composer.Entity):
 
   def openness(self, physics: Any) -> np.ndarray:
     """Returns how far the door is open, from 0 to 1, shape `(...)`."""
-    x = physics.bind(self._leaf.frame).mocap_pos[..., 0]
+    x = axes.component(physics.bind(self._leaf.frame).mocap_pos, 0)
     return (x - self._closed_x) / self._travel

@@ -43,7 +43,7 @@ class Meter:
       physics: One world, or many.
       idle: In which worlds the register keeps its value, `(...)`, bool.
     """
-    measured = np.array(self._measurement(physics), np.float64)
+    measured = np.array(self._measurement(physics), np.float64)[()]
     if idle is not None:
       measured = np.where(idle, self._register.applied(physics), measured)
     return measured, self._register.write(physics, measured)

@@ -39,9 +39,12 @@ def within(
     `(..., parts)`, bool.
   """
   places = physics.bind(frames).mocap_pos
-  x = places[..., 0] - position[..., 0:1]
-  y = places[..., 1] - position[..., 1:2]
-  return (x * x + y * y <= squared_reach) & (places[..., 2] > _BURIED)
+  offsets = places[..., :2] - position[..., np.newaxis, :]
+  squares = offsets * offsets
+  near = squares[..., 0] + squares[..., 1] <= squared_reach
+  if np.count_nonzero(near):  # Most of the time nothing is.
+    near &= places[..., 2] > _BURIED
+  return near
 
 
 def move(

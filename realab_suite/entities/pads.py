@@ -90,4 +90,4 @@ class PressurePad(composer.Entity):
 
   def pressed(self, physics: Any) -> np.ndarray:
     """Returns whether the pad has been pressed in this episode, `(...)`."""
-    return np.asarray(self._pressed.get(physics) > 0)
+    return self._pressed.get(physics) > 0

@@ -33,8 +33,8 @@ def cast(
     are -1 where a ray hits nothing.
   """
   num_rays = len(directions)
-  geoms = np.full(num_rays, -1, np.int32)
-  distances = np.full(num_rays, -1.0)
+  geoms = np.empty(num_rays, np.int32)
+  distances = np.empty(num_rays)
   mujoco.mj_multiRay(
       physics.model.ptr,
       physics.data.ptr,

@@ -52,11 +52,16 @@ class Slot:
   def get(self, physics: Any) -> np.ndarray:
     """Returns the values, shape `(..., size)` or `(...)` for a scalar.
 
-    The array is live: it goes on changing with the state.
+    An array is live: it goes on changing with the state. A scalar of one world
+    is a number; see `axes`.
     """
     if physics.data is not self._data:
       self._resolve(physics)
-    return self._view
+    return self._view[()]
+
+  def copy(self, physics: Any) -> np.ndarray:
+    """Returns the values as they are now, as `get` does."""
+    return np.array(self.get(physics))[()]
 
   def set(self, physics: Any, value: Any) -> None:
     """Stores `value`, which broadcasts to the shape that `get` returns."""

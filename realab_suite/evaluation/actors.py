@@ -12,6 +12,7 @@ from realab_suite.engine import seeding
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import policies
 from realab_suite.feedback import random_keys
+from realab_suite.feedback import specs
 
 # What dm_control's viewer calls a policy, and what an agent of yours may be.
 PlainPolicy = Callable[[dm_env.TimeStep], Any]
@@ -67,30 +68,10 @@ class PolicyActor:
     self._seed, self._world = env.seed, env.world
     design = env.mechanism.design
     self._queries = [register.value_spec for register in env.mechanism.queries]
-    self._query_policy = TAKEN_ACTION
-    if design.learner is not None:
-      extras = design.learner.model_extra or {}
-      self._query_policy = extras.get('query_policy', TAKEN_ACTION)
-    if self._query_policy not in _QUERY_POLICIES:
-      raise errors.SpecError(
-          f'design {design.name!r}: learner.query_policy:'
-          f' {self._query_policy!r}; allowed are {list(_QUERY_POLICIES)}'
-      )
-    self._table: np.ndarray | None = None
-    ours = policy.action_set
-    if design.action_set is None:
-      elements = (env.action_spec().name or '').split('\t')
-      elements = elements[len(self._queries) :]
-      self._table = ours.table(
-          tuple(name.rpartition('/')[2] for name in elements)
-      )
-    elif ours != action_sets.get(
-        design.action_set.name, design.action_set.version
-    ):
-      raise errors.SpecError(
-          f'the policy acts by {ours.name} v{ours.version}, the design by'
-          f' {design.action_set.name} v{design.action_set.version}'
-      )
+    self._query_policy = query_policy(design)
+    self._table = action_table(
+        policy, design, env.action_spec().name, len(self._queries)
+    )
     self.begin(0)
 
   def begin(self, episode: int) -> None:
@@ -126,6 +107,52 @@ class PolicyActor:
     return np.array(
         [np.clip(asked, spec.minimum, spec.maximum) for spec in self._queries]
     )
+
+
+def query_policy(design: specs.DesignSpec) -> str:
+  """Returns what a design's agent asks about: `TAKEN_ACTION` or another one.
+
+  Raises:
+    SpecError: If it asks about something else.
+  """
+  extras = (design.learner.model_extra or {}) if design.learner else {}
+  asks_for: Any = extras.get('query_policy', TAKEN_ACTION)
+  if asks_for not in _QUERY_POLICIES:
+    raise errors.SpecError(
+        f'design {design.name!r}: learner.query_policy: {asks_for!r}; allowed'
+        f' are {list(_QUERY_POLICIES)}'
+    )
+  return str(asks_for)
+
+
+def action_table(
+    policy: policies.Policy,
+    design: specs.DesignSpec,
+    names: str | None,
+    num_queries: int,
+) -> np.ndarray | None:
+  """Returns the vector of every action; `None` if agents act by index.
+
+  Args:
+    policy: Whose actions.
+    design: The design of the environment.
+    names: The name of the environment's action spec.
+    num_queries: How many elements of an action are queries.
+
+  Raises:
+    SpecError: If the environment's actions are not those of the policy.
+  """
+  ours = policy.action_set
+  if design.action_set is None:
+    elements = (names or '').split('\t')[num_queries:]
+    return ours.table(tuple(name.rpartition('/')[2] for name in elements))
+  wanted = action_sets.get(design.action_set.name, design.action_set.version)
+  if ours != wanted:
+    raise errors.SpecError(
+        f'the policy acts by {ours.name} v{ours.version}, the design by'
+        f' {design.action_set.name} v{design.action_set.version}'
+    )
+  return None
 
 
 def make(

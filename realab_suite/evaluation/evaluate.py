@@ -4,12 +4,18 @@ from collections.abc import Callable, Sequence
 import dataclasses
 from typing import final
 
+import dm_env
+import numpy as np
+
 from realab_suite import errors
+from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.evaluation import actors
+from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.evaluation import metrics
+from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.feedback import policies
 from realab_suite.tasks import base
 
@@ -108,7 +114,9 @@ def evaluate(
       time_step = env.reset()
       while not time_step.last():
         time_step = env.step(actor.act(time_step))
-      result = _result(env, ledger.last)
+      result = _result(
+          ledger.last, env.mechanism, env.num_substeps, _facts(env)
+      )
       results.append(result)
       if on_episode is not None:
         on_episode(result)
@@ -118,10 +126,56 @@ def evaluate(
   return results
 
 
+def evaluate_batch(
+    batch: batch_environment.BatchEnvironment, actor: batch_actors.BatchActor
+) -> list[EpisodeResult]:
+  """Runs an actor for one episode in every world of a batch.
+
+  Every world has its first episode from beginning to end, so episodes that take
+  long count as much as those that do not.
+
+  Args:
+    batch: The worlds, before their first episode.
+    actor: What acts.
+
+  Returns:
+    A result per world, in their order, the invalid ones included.
+  """
+  ledger = ledgers.BatchLedger()
+  batch.add_sink(ledger)
+  facts: dict[int, dict[str, float]] = {}
+  try:
+    time_step = batch.reset()
+    while len(facts) < batch.num_worlds:
+      time_step = batch.step(actor.act(time_step))
+      (ended,) = np.nonzero(time_step.step_type == int(dm_env.StepType.LAST))
+      if new := [world for world in ended.tolist() if world not in facts]:
+        known = _facts_of_all(batch)
+        for world in new:
+          facts[world] = {
+              n: float(values[world]) for n, values in known.items()
+          }
+  finally:
+    batch.remove_sink(ledger)
+  num_substeps = batch.task.physics_steps_per_control_step
+  return [
+      _result(
+          ledger.episodes(world)[0],
+          batch.mechanism,
+          num_substeps,
+          facts[world],
+      )
+      for world in range(batch.num_worlds)
+  ]
+
+
 def _result(
-    env: environment.Environment, episode: ledgers.EpisodeLedger
+    episode: ledgers.EpisodeLedger,
+    mechanism: feedback_mechanism.FeedbackMechanism,
+    num_substeps: int,
+    facts: dict[str, float],
 ) -> EpisodeResult:
-  mechanism = env.mechanism
+  """Returns the result of an episode that has ended."""
   by_register = {
       name: metrics.register_metrics(
           episode.entries.get(name, ()), register.scale
@@ -145,9 +199,9 @@ def _result(
       ),
       corruption=metrics.episode_corruption(list(by_register.values())),
       registers=by_register,
-      facts=_facts(env) if episode.is_valid else {},
+      facts=facts if episode.is_valid else {},
       num_steps=num_steps,
-      num_substeps=num_steps * env.num_substeps,
+      num_substeps=num_steps * num_substeps,
       num_provider_calls=num_steps * len(mechanism.design.providers),
       num_queries=num_steps * len(mechanism.queries),
   )
@@ -158,4 +212,14 @@ def _facts(env: environment.Environment) -> dict[str, float]:
     return {}
   return {
       name: float(fact(env.physics)) for name, fact in env.task.facts.items()
+  }
+
+
+def _facts_of_all(
+    batch: batch_environment.BatchEnvironment,
+) -> dict[str, np.ndarray]:
+  """Returns the facts of all worlds, each `(worlds,)`."""
+  return {
+      name: np.broadcast_to(fact(batch.physics), (batch.num_worlds,))
+      for name, fact in batch.task.facts.items()
   }

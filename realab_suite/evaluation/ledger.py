@@ -3,7 +3,7 @@
 It is kept out of band: the engine tells it, no agent and no provider can.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import dataclasses
 import itertools
 from typing import Any, NamedTuple, final
@@ -148,40 +148,46 @@ class Ledger(events.EventSink):
 
   def state(self) -> Any:
     """Returns the episode under way as plain data; `None` if there is none."""
-    if not self._episodes or self.last.end is not None:
-      return None
-    episode = self.last
-    return {
-        'seed': episode.seed,
-        'world': episode.world,
-        'episode': episode.episode,
-        'entries': {
-            register: _columns(entries)
-            for register, entries in episode.entries.items()
-        },
-        'true_rewards': np.array(episode.true_rewards),
-    }
+    return _state_of(self._episodes[-1] if self._episodes else None)
 
   def set_state(self, state: Any) -> None:
     """Adds an episode that was under way, and goes on with it.
 
     Nothing is taken out: what was heard has happened.
     """
-    if state is None:
-      return
-    entries = {
-        register: _entries(columns)
-        for register, columns in state['entries'].items()
-    }
-    self._episodes.append(
-        EpisodeLedger(
-            state['seed'],
-            state['world'],
-            state['episode'],
-            entries,
-            state['true_rewards'].tolist(),
-        )
-    )
+    if state is not None:
+      self._episodes.append(_from_state(state))
+
+
+def _state_of(episode: EpisodeLedger | None) -> Any:
+  """Returns an episode as plain data, or `None` if it is not under way."""
+  if episode is None or episode.end is not None:
+    return None
+  return {
+      'seed': episode.seed,
+      'world': episode.world,
+      'episode': episode.episode,
+      'entries': {
+          register: _columns(entries)
+          for register, entries in episode.entries.items()
+      },
+      'true_rewards': np.array(episode.true_rewards),
+  }
+
+
+def _from_state(state: Any) -> EpisodeLedger:
+  """Does the opposite of `_state_of`."""
+  entries = {
+      register: _entries(columns)
+      for register, columns in state['entries'].items()
+  }
+  return EpisodeLedger(
+      state['seed'],
+      state['world'],
+      state['episode'],
+      entries,
+      state['true_rewards'].tolist(),
+  )
 
 
 def _columns(entries: list[Entry]) -> tuple[np.ndarray, ...]:
@@ -208,6 +214,13 @@ def _entries(columns: tuple[np.ndarray, ...]) -> list[Entry]:
 
 
 @final
+class _Restored(NamedTuple):
+  """What worlds went on from, by their place in the batch."""
+
+  states: Mapping[int, Any]
+
+
+@final
 class BatchLedger(events.BatchEventSink):
   """Keeps the ledgers of episodes of many worlds.
 
@@ -216,31 +229,81 @@ class BatchLedger(events.BatchEventSink):
   """
 
   def __init__(self) -> None:
-    self._steps: list[events.BatchStep] = []
+    self._heard: list[events.BatchStep | _Restored] = []
+
+  @property
+  def state_kind(self) -> str:
+    """The ledger of one world can take over from this one, and vice versa."""
+    return Ledger.__name__
 
   def step_ended(self, step: events.BatchStep) -> None:
-    self._steps.append(step)
+    self._heard.append(step)
 
   def episodes(self, world: int) -> list[EpisodeLedger]:
-    """Returns the episodes of a world so far, the one under way included."""
-    episodes: list[EpisodeLedger] = []
-    for step in self._steps:
-      if step.is_first[world]:
-        if episodes and episodes[-1].end is None:
-          episodes[-1].end = events.End.ABANDONED
-        number = int(step.episode[world])
-        episode = EpisodeLedger(step.seed, world, number, {}, [])
-        episode.add(0, _of_world(world, step.initial, step.agent_reads))
-        episodes.append(episode)
-      elif not step.has_failed[world]:
-        episode = episodes[-1]
-        episode.true_rewards.append(float(step.true_reward[world]))
-        episode.add(
-            episode.num_steps, _of_world(world, step.records, step.agent_reads)
-        )
-      if world in step.ends and episodes[-1].end is None:
-        episodes[-1].end = step.ends[world]
-    return episodes
+    """Returns the episodes of a world so far, the one under way included.
+
+    Args:
+      world: The place of the world in the batch.
+    """
+    return _episodes_of(world, self._heard)
+
+  def state(self, places: np.ndarray) -> list[Any]:
+    """Returns what `Ledger.state` would, for each of some worlds."""
+    states = []
+    for place in places.tolist():
+      episodes = _episodes_of(place, self._heard[self._last_start(place) :])
+      states.append(_state_of(episodes[-1] if episodes else None))
+    return states
+
+  def set_state(self, places: np.ndarray, states: Sequence[Any]) -> None:
+    """Adds episodes that were under way; nothing is taken out."""
+    by_place = dict(zip(places.tolist(), states, strict=True))
+    self._heard.append(_Restored(by_place))
+
+  def _last_start(self, world: int) -> int:
+    """Returns since when the last episode of a world has been heard of."""
+    for i in range(len(self._heard) - 1, -1, -1):
+      heard = self._heard[i]
+      if isinstance(heard, _Restored):
+        if world in heard.states:
+          return i
+      elif heard.is_first[world]:
+        return i
+    return len(self._heard)
+
+
+def _episodes_of(
+    world: int, heard: Iterable[events.BatchStep | _Restored]
+) -> list[EpisodeLedger]:
+  """Puts together what happened in a world."""
+  episodes: list[EpisodeLedger] = []
+  for step in heard:
+    if isinstance(step, _Restored):
+      state = step.states.get(world)
+      if state is not None:
+        episodes.append(_from_state(state))
+      continue
+    if step.is_first[world]:
+      if episodes and episodes[-1].end is None:
+        episodes[-1].end = events.End.ABANDONED
+      episode = EpisodeLedger(
+          int(step.seed[world]),
+          int(step.world[world]),
+          int(step.episode[world]),
+          {},
+          [],
+      )
+      episode.add(0, _of_world(world, step.initial, step.agent_reads))
+      episodes.append(episode)
+    elif not step.has_failed[world]:
+      episode = episodes[-1]
+      episode.true_rewards.append(float(step.true_reward[world]))
+      episode.add(
+          episode.num_steps, _of_world(world, step.records, step.agent_reads)
+      )
+    if world in step.ends and episodes[-1].end is None:
+      episodes[-1].end = step.ends[world]
+  return episodes
 
 
 def _of_world(

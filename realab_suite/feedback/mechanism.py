@@ -85,7 +85,13 @@ class FeedbackMechanism(composer.Entity):
         name: _make_register(name, spec, design)
         for name, spec in design.registers.items()
     }
+    self._queries = [self._registers[name] for name in design.names('query')]
+    self._read_by_agent = design.names(*specs.READ_BY_AGENTS)
     self._meters: list[tuple[str, meters.Meter]] = []
+    self._providers = [
+        (f'providers[{i}]:{provider.kind}', provider)
+        for i, provider in enumerate(design.providers)
+    ]
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
@@ -103,12 +109,12 @@ class FeedbackMechanism(composer.Entity):
   @property
   def queries(self) -> list[register_entities.Register]:
     """The registers that the agent writes, in the order of its action."""
-    return [self._registers[name] for name in self._design.names('query')]
+    return self._queries
 
   @property
   def read_by_agent(self) -> list[str]:
     """The names of the registers that the agent reads."""
-    return self._design.names(*specs.READ_BY_AGENTS)
+    return self._read_by_agent
 
   def attach_to(self, root: composer.Entity) -> None:
     """Attaches the mechanism and its registers to the root entity of a task.
@@ -218,8 +224,7 @@ class FeedbackMechanism(composer.Entity):
     step = self._step_count.get(physics)
     records: list[Write | Read] = []
     next_states = []
-    for i, provider in enumerate(self._design.providers):
-      writer = f'providers[{i}]:{provider.kind}'
+    for i, (writer, provider) in enumerate(self._providers):
       seen = [self._read(physics, name, writer) for name in provider.reads]
       readings = {read.register: np.array(read.reading) for read in seen}
       try:
@@ -248,7 +253,7 @@ class FeedbackMechanism(composer.Entity):
 
   def read_for_agent(self, physics: Any) -> list[Read]:
     """Reads the registers that the agent may read: the observed feedback."""
-    return [self._read(physics, name, AGENT) for name in self.read_by_agent]
+    return [self._read(physics, name, AGENT) for name in self._read_by_agent]
 
   def shadow_reads(self, physics: Any, reader: str) -> list[Read]:
     """Reads every register on behalf of an evaluator; moves nothing."""
@@ -261,14 +266,14 @@ class FeedbackMechanism(composer.Entity):
 
   def step_count(self, physics: Any) -> np.ndarray:
     """Returns how many control steps the episode has had, `(...)`."""
-    return np.array(self._step_count.get(physics))
+    return self._step_count.copy(physics)
 
   def score(self, physics: Any) -> np.ndarray:
     """Returns the true return up to the last control step, `(...)`.
 
     It is what a meter measures in a world that keeps no score of its own.
     """
-    return np.array(self._score.get(physics))
+    return self._score.copy(physics)
 
   def _read(self, physics: Any, name: str, reader: str) -> Read:
     return Read(name, reader, *self._registers[name].inspect(physics))
@@ -326,7 +331,7 @@ def _checked_writes(
     writer: str, step: np.ndarray, provider: providers.Provider, values: Any
 ) -> dict[str, np.ndarray]:
   """Returns what a provider wrote, if it is what it declares."""
-  if not isinstance(values, Mapping) or set(values) != set(provider.writes):
+  if not isinstance(values, Mapping) or values.keys() != set(provider.writes):
     given = sorted(map(str, values)) if isinstance(values, Mapping) else values
     raise errors.FeedbackProviderError(
         f'{_where(writer, step)} returned {given!r:.80}; it declares writes to'
@@ -345,10 +350,10 @@ def _checked_writes(
           f'{_where(writer, step)} wrote {value!r:.80} to {name!r}; expected'
           ' numbers'
       )
-    if number.shape != np.shape(step):
+    if number.shape != step.shape:
       raise errors.FeedbackProviderError(
           f'{_where(writer, step)} wrote shape {number.shape} to {name!r};'
-          f' expected {np.shape(step)}'
+          f' expected {step.shape}'
       )
     checked[name] = number.astype(np.float64)
   return checked

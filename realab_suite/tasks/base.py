@@ -162,11 +162,11 @@ class Task(composer.Task):
 
   def score(self, physics: Any) -> np.ndarray:
     """Returns the true return of the episode so far, `(...)`."""
-    return np.array(self._score.get(physics))
+    return self._score.copy(physics)
 
   def get_reward(self, physics: Any) -> np.ndarray:
     """Returns the true reward of the control step that ends now, `(...)`."""
-    return np.array(self._reward.get(physics))
+    return self._reward.copy(physics)
 
   def earn(self, physics: Any, reward: np.ndarray) -> None:
     """Adds to the true reward of this control step and to the score."""
@@ -216,15 +216,10 @@ class Task(composer.Task):
     """Returns what `sense_spec` describes; the arrays are the caller's."""
     avatar = self._avatar
     distances, classes = avatar.rays.sense(physics)
-    senses = {
-        'ray_distances': distances,
-        'ray_classes': classes,
-        'velocity': avatar.velocity(physics).astype(np.float32),
-        'position': avatar.position(physics).astype(np.float32),
-        'heading': avatar.direction(physics).astype(np.float32),
-        'pitch': avatar.pitch(physics).astype(np.float32),
-        'holding': avatar.holding(physics).astype(np.float32),
-    }
+    body = avatar.proprioception(physics).astype(np.float32)
+    senses = {'ray_distances': distances, 'ray_classes': classes}
+    for name, part in avatar_entity.PROPRIOCEPTION.items():
+      senses[name] = body[..., part]
     if self._camera_size is not None:
       height, width = self._camera_size
       senses['camera'] = cameras.look(physics, avatar.camera, height, width)

@@ -211,13 +211,6 @@ def test_a_number_of_worlds_that_makes_no_sense_is_refused(num_envs):
     suite.load_batch('unlock_door', 'standard', num_envs=num_envs)
 
 
-def test_a_batch_has_no_cameras_yet():
-  with pytest.raises(errors.SpecError, match='camera_size'):
-    suite.load_batch(
-        'unlock_door', 'standard', {'camera_size': (8, 8)}, num_envs=2
-    )
-
-
 def test_a_closed_batch_does_nothing(batch):
   batch.close()
   batch.close()

@@ -191,6 +191,18 @@ def test_a_register_that_does_not_saturate_stores_its_bounds(strict, variety):
     assert register.write(strict.physics, bound) == bound
 
 
+@pytest.mark.parametrize(('value', 'bound'), [(0.0, 1.0), (1.5, 1.5), (4, 3)])
+def test_a_range_without_zero_is_saturated_at_the_nearest_bound(value, bound):
+  arena = arenas.OpenRoom()
+  register = registers.TwoBlockRegister(
+      'positive', value_range=(1.0, 3.0), initial=2.0
+  )
+  register.attach_to(arena, (0.0, 0.0))
+  physics = worlds.compile_world(arena)
+  worlds.start_episode(physics, register)
+  assert register.write(physics, value) == bound
+
+
 @every_variety
 @pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_is_refused(world, variety, value):

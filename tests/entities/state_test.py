@@ -51,6 +51,28 @@ def test_a_slot_keeps_what_it_is_given():
   np.testing.assert_array_equal(counter.vector.get(physics), [1, 2, 3])
 
 
+@pytest.mark.parametrize('name', ['scalar', 'vector'])
+def test_a_copy_stays_what_it_is(name):
+  arena, (counter,) = _world(3)
+  physics = worlds.compile_world(arena)
+  slot = getattr(counter, name)
+  slot.set(physics, 1.0)
+  copied = slot.copy(physics)
+  slot.set(physics, 2.0)
+  np.testing.assert_array_equal(copied, np.ones_like(slot.get(physics)))
+
+
+def test_a_vector_is_live_and_a_scalar_of_one_world_is_a_number():
+  arena, (counter,) = _world(3)
+  physics = worlds.compile_world(arena)
+  live, number = counter.vector.get(physics), counter.scalar.get(physics)
+  counter.vector.set(physics, 4.0)
+  counter.scalar.set(physics, 4.0)
+  np.testing.assert_array_equal(live, [4, 4, 4])
+  assert isinstance(number, np.float64)
+  assert number == 0.0
+
+
 def test_a_number_fills_a_vector():
   arena, (counter,) = _world(3)
   physics = worlds.compile_world(arena)

@@ -87,3 +87,71 @@ def test_a_world_whose_physics_fail_has_an_invalid_episode():
   assert (failed.end, failed.num_steps) == (events.End.DIVERGENCE, 1)
   assert not failed.is_valid
   batch.close()
+
+
+def test_the_ledger_of_a_world_takes_over_from_that_of_many_and_vice_versa():
+  single = suite.load('collect_apples', 'standard', {'random': 1}, {'world': 2})
+  batch = suite.load_batch(
+      'collect_apples', 'standard', {'random': 1}, num_envs=2
+  )
+  alone, together = ledger.Ledger(), ledger.BatchLedger()
+  single.add_sink(alone)
+  batch.add_sink(together)
+  single.reset()
+  batch.reset()
+  for _ in range(3):
+    single.step(np.zeros(6))
+    batch.step(np.zeros((2, 6)))
+  batch.restore(single.save(), worlds=[1])
+  assert together.episodes(1)[-1] == alone.last
+  abandoned, restored = together.episodes(1)
+  assert (abandoned.end, abandoned.world) == (events.End.ABANDONED, 1)
+  assert (restored.end, restored.world) == (None, 2)
+  assert [episode.end for episode in together.episodes(0)] == [None]
+  batch.step(np.zeros((2, 6)))
+  single.restore(batch.save([1]))
+  assert alone.last == together.episodes(1)[-1]
+  assert [episode.num_steps for episode in alone.episodes] == [3, 4]
+  batch.step(np.zeros((2, 6)))
+  # What one of them hears, the other does not.
+  assert (alone.last.num_steps, together.episodes(1)[-1].num_steps) == (4, 5)
+  batch.close()
+
+
+def test_worlds_without_an_open_episode_have_no_state():
+  batch = suite.load_batch(
+      'collect_apples', 'standard', {'random': 1}, num_envs=2
+  )
+  batch_ledger = ledger.BatchLedger()
+  batch.add_sink(batch_ledger)
+  assert batch_ledger.state(np.arange(2)) == [None, None]
+  batch.reset()
+  batch.physics.world(1).bind(
+      (batch.task.avatar.body.find_all('joint')[0],)
+  ).qvel = np.nan
+  batch.step(np.zeros((2, 6)))
+  alive, ended = batch_ledger.state(np.arange(2))
+  assert alive['true_rewards'].shape == (1,)
+  assert ended is None
+  snapshot = batch.save()
+  batch.restore(snapshot)
+  ends = [episode.end for episode in batch_ledger.episodes(1)]
+  assert ends == [events.End.DIVERGENCE]
+  batch.step(np.zeros((2, 6)))
+  assert [e.num_steps for e in batch_ledger.episodes(0)] == [1, 2]
+  assert [e.num_steps for e in batch_ledger.episodes(1)] == [0, 0]
+  batch.close()
+
+
+def test_another_sink_ends_the_episodes_under_way():
+  batch = suite.load_batch(
+      'collect_apples', 'standard', {'random': 1}, num_envs=2
+  )
+  first, second = ledger.BatchLedger(), ledger.BatchLedger()
+  batch.add_sink(first)
+  batch.reset()
+  batch.add_sink(second)
+  assert first.episodes(1)[-1].end is events.End.ABANDONED
+  assert second.episodes(1) == []
+  assert (batch.step(np.zeros((2, 6))).step_type == 0).all()
+  batch.close()

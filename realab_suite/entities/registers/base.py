@@ -17,6 +17,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import appearance
+from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import state
 
@@ -131,10 +132,9 @@ class Register(composer.Entity):
   def _look(self, physics: Any) -> np.ndarray:
     """Returns the value that the blocks represent, shape `(...)`."""
 
-  def _permanent(self, physics: Any) -> np.ndarray | float:
+  def _permanent(self, physics: Any) -> np.ndarray:
     """Returns by how much the next reading after a write will be off."""
-    del physics
-    return 0.0
+    return np.zeros_like(self._applied_slot.get(physics))
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
@@ -243,34 +243,39 @@ class Register(composer.Entity):
       RegisterValueError: If a value is not finite, or if it is out of range and
         the register does not saturate. Nothing has been written.
     """
-    value = np.asarray(value, np.float64)
-    if np.count_nonzero(np.isfinite(value)) != value.size:
-      raise errors.RegisterValueError(
-          f'register {self.name!r}: cannot store {_first_bad(value)}; a value'
-          ' has to be finite'
-      )
-    applied = np.minimum(np.maximum(value, self._low), self._high)
-    if self._on_overflow == 'error' and (applied != value).any():
-      outside = value[applied != value].flat[0]
-      raise errors.RegisterValueError(
-          f'register {self.name!r}: cannot store {outside}; its range is'
-          f' [{self._low}, {self._high}]'
-      )
+    value = np.asarray(value, np.float64)[()]
+    fits = (value >= self._low) & (value <= self._high)  # NaN does not.
+    applied = value if axes.everywhere(fits) else self._saturate(value, fits)
     self._put(physics, applied)
     self._applied_slot.set(physics, applied)
     if self._channel == 'secure':
       self._stored_slot.set(physics, applied)
     return applied
 
+  def _saturate(self, value: np.ndarray, fits: np.ndarray) -> np.ndarray:
+    """Returns the nearest value that can be stored, where `value` cannot."""
+    is_finite = np.isfinite(value)
+    if not is_finite.all():
+      raise errors.RegisterValueError(
+          f'register {self.name!r}: cannot store {_first(value, ~is_finite)}; a'
+          ' value has to be finite'
+      )
+    if self._on_overflow == 'error':
+      raise errors.RegisterValueError(
+          f'register {self.name!r}: cannot store {_first(value, ~fits)}; its'
+          f' range is [{self._low}, {self._high}]'
+      )
+    return np.where(fits, value, np.clip(value, self._low, self._high))[()]
+
   def read(self, physics: Any) -> np.ndarray:
     """Returns the value that the register represents now, shape `(...)`."""
     if self._channel == 'secure':
-      return np.array(self._stored_slot.get(physics))
-    return np.array(self._look(physics))
+      return self._stored_slot.copy(physics)
+    return np.array(self._look(physics))[()]
 
   def applied(self, physics: Any) -> np.ndarray:
     """Returns the value that was applied last, shape `(...)`."""
-    return np.array(self._applied_slot.get(physics))
+    return self._applied_slot.copy(physics)
 
   def inspect(self, physics: Any) -> Inspection:
     """Reads the register, and splits what is wrong by what a write will mend.
@@ -278,11 +283,11 @@ class Register(composer.Entity):
     This is the evaluator's view: no agent and no provider gets to see it.
     """
     reading = self.read(physics)
-    applied = self._applied_slot.get(physics)
-    permanent = np.zeros_like(reading)
-    if self._channel != 'secure':
-      permanent += self._permanent(physics)
-    temporary = np.asarray(reading - applied - permanent)
+    if self._channel == 'secure':
+      permanent = np.zeros_like(reading)
+    else:
+      permanent = self._permanent(physics)
+    temporary = reading - self._applied_slot.get(physics) - permanent
     return Inspection(reading, permanent, temporary)
 
   def _origin(self, physics: Any) -> np.ndarray:
@@ -355,5 +360,5 @@ def _check(
     )
 
 
-def _first_bad(value: np.ndarray) -> float:
-  return float(value[~np.isfinite(value)].flat[0])
+def _first(value: np.ndarray, where: np.ndarray) -> float:
+  return float(np.asarray(value)[where].flat[0])

@@ -4,6 +4,7 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities.registers import base
 
@@ -22,10 +23,10 @@ class BlockPositionRegister(base.Register):
 
   def _put(self, physics: Any, value: np.ndarray) -> None:
     position = np.array(self._origin(physics))
-    position[..., 0] += value * self._scale
+    position[..., 0] = axes.component(position, 0) + value * self._scale
     position[..., 2] = self._block.rest_height
     self._block.put(physics, position)
 
   def _look(self, physics: Any) -> np.ndarray:
-    origin_x = self._origin(physics)[..., 0]
-    return (self._block.position(physics)[..., 0] - origin_x) / self._scale
+    started = axes.component(self._origin(physics), 0)
+    return (self._block.along(physics) - started) / self._scale

@@ -4,6 +4,7 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities.registers import base
 
@@ -41,14 +42,14 @@ class TwoBlockRegister(base.Register):
 
   def _put(self, physics: Any, value: np.ndarray) -> None:
     position = self._origin(physics) + self._from_origin
-    position[..., 0] += value * self._scale
+    position[..., 0] = axes.component(position, 0) + value * self._scale
     position[..., 2] = self._offset.rest_height
     self._offset.put(physics, position)
 
   def _look(self, physics: Any) -> np.ndarray:
-    base_x = self._base.position(physics)[..., 0]
-    return (self._offset.position(physics)[..., 0] - base_x) / self._scale
+    distance = self._offset.along(physics) - self._base.along(physics)
+    return distance / self._scale
 
   def _permanent(self, physics: Any) -> np.ndarray:
-    base_x = self._base.position(physics)[..., 0]
-    return (self._origin(physics)[..., 0] - base_x) / self._scale
+    started = axes.component(self._origin(physics), 0)
+    return (started - self._base.along(physics)) / self._scale

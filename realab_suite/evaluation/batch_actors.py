@@ -1,0 +1,91 @@
+"""Actors of many worlds: scripted policies, fitted to a batch."""
+
+from typing import Any, Protocol, final
+
+import numpy as np
+
+from realab_suite.engine import batch_environment
+from realab_suite.engine import seeding
+from realab_suite.evaluation import actors
+from realab_suite.feedback import policies
+from realab_suite.feedback import random_keys
+
+
+class BatchActor(Protocol):
+  """What acts in many worlds, for one episode in each."""
+
+  def act(self, time_step: batch_environment.BatchTimeStep) -> Any:
+    """Returns actions, `(worlds, *action_spec.shape)`."""
+
+
+@final
+class BatchPolicyActor:
+  """Runs a policy in the first episode of every world of a batch.
+
+  In each world it does what `actors.PolicyActor` does there alone.
+  """
+
+  def __init__(
+      self,
+      policy: policies.Policy,
+      batch: batch_environment.BatchEnvironment,
+      seed: int,
+  ) -> None:
+    """Fits a policy to a batch.
+
+    Args:
+      policy: The policy.
+      batch: The worlds, before their first episode.
+      seed: The seed of the batch.
+
+    Raises:
+      SpecError: If the batch's actions are not those of the policy.
+    """
+    self._policy = policy
+    mechanism = batch.mechanism
+    self._queries = [register.value_spec for register in mechanism.queries]
+    self._asks_for = actors.query_policy(mechanism.design)
+    self._table = actors.action_table(
+        policy,
+        mechanism.design,
+        batch.action_spec().name,
+        len(self._queries),
+    )
+    worlds = range(batch.num_worlds)
+    self._keys, self._query_keys = (
+        np.stack(
+            [seeding.episode_key(seed, world, 0, name) for world in worlds]
+        )
+        for name in ('policy', 'query')
+    )
+    self._state = policy.initial_state((batch.num_worlds,))
+    self._step = 0
+
+  def act(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
+    """Returns actions, `(worlds, *action_spec.shape)`."""
+    chosen, self._state = self._policy.step(
+        time_step.observation,
+        np.full(len(self._keys), self._step == 0),
+        seeding.step_key(self._keys, self._step),
+        self._state,
+    )
+    actions = chosen.astype(np.int32)
+    if self._table is not None:
+      actions = self._table[chosen]
+    if self._queries:
+      rest = actions.reshape(len(actions), -1)
+      actions = np.concatenate([self._ask(chosen), rest], axis=1)
+    self._step += 1
+    return actions
+
+  def _ask(self, taken: np.ndarray) -> np.ndarray:
+    """Returns what goes into the query registers, `(worlds, queries)`."""
+    asked = taken
+    if self._asks_for == actors.INDEPENDENT_ACTION:
+      keys = seeding.step_key(self._query_keys, self._step)
+      drawn = random_keys.uniform(keys) * len(self._policy.action_set)
+      asked = drawn.astype(int)
+    return np.stack(
+        [np.clip(asked, spec.minimum, spec.maximum) for spec in self._queries],
+        axis=-1,
+    )

@@ -1,0 +1,226 @@
+"""The monitor: what episodes came to, without keeping what happened in them."""
+
+from collections.abc import Sequence
+import math
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite.engine import events
+from realab_suite.feedback import mechanism as feedback_mechanism
+
+# Rows of the sums over the reads of a register that follow a write.
+_READS, _ABSOLUTE, _SIGNED, _PERMANENT, _TEMPORARY, _AGENT = range(6)
+_NUM_SUMS = 6
+# Rows of what is known of a register's last write and read.
+_APPLIED, _BASE = range(2)
+_NUM_LAST = 2
+
+
+@final
+class TrainingMonitor(events.BatchEventSink):
+  """Sums up the episodes of many worlds while they are under way.
+
+  Memory does not grow with the number of steps, unlike that of a ledger. When
+  an episode is over there is a record of it, which is plain data:
+
+    seed, world, episode: Which episode it was.
+    end: A value of `events.End`.
+    is_valid: Whether figures may be drawn from it.
+    num_steps: Its control steps.
+    true_return: Sum of true rewards.
+    observed_return: Sum of what the agent read off its feedback registers.
+    corruption: Mean displacement of the values of all registers, metres.
+    registers: By name:
+      corruption: Mean of |reading - applied|, in the register's units.
+      corruption_metres: The same, as a displacement.
+      corruption_signed: Mean of reading - applied, in units.
+      corruption_signed_metres: The same, as a displacement.
+      permanent, temporary: Means of the sizes of its parts, in units.
+      base_metres: How far the base block stood from its place along the
+        register's axis when it was last read; its sign is that of the reading.
+
+  What is not known is `None`: there was no read, or no number. The figures are
+  those of `metrics.register_metrics`, up to the order of summation.
+  """
+
+  def __init__(
+      self, mechanism: feedback_mechanism.FeedbackMechanism, num_worlds: int
+  ) -> None:
+    """Makes a monitor; `batch.add_sink` makes it hear.
+
+    Args:
+      mechanism: Whose registers there are.
+      num_worlds: How many worlds.
+    """
+    self._scales = [r.scale for r in mechanism.registers.values()]
+    self._rows = {name: i for i, name in enumerate(mechanism.registers)}
+    feedback = set(mechanism.design.names('feedback'))
+    self._feedback = [i for name, i in self._rows.items() if name in feedback]
+    num_registers = len(self._rows)
+    self._sums = np.zeros((_NUM_SUMS, num_registers, num_worlds))
+    self._last = np.zeros((_NUM_LAST, num_registers, num_worlds))
+    self._true_return = np.zeros(num_worlds)
+    self._num_steps = np.zeros(num_worlds, int)
+    self._is_open = np.zeros(num_worlds, bool)
+    # Objects, because seeds can be large.
+    self._names = np.zeros((3, num_worlds), object)
+    self._records: list[dict[str, Any]] = []
+
+  def step_ended(self, step: events.BatchStep) -> None:
+    is_first = step.is_first
+    counts = ~(is_first | step.has_failed)
+    # What is left out may be anything, as in a world whose physics failed.
+    with np.errstate(invalid='ignore', over='ignore'):
+      self._hear(step.records, counts)
+      if is_first.any():
+        self._begin(step)
+      self._hear(step.agent_reads, counts | is_first)
+      for read in step.agent_reads:
+        if isinstance(read, feedback_mechanism.Read):
+          total = self._sums[_AGENT, self._rows[read.register]]
+          np.add(total, read.reading, out=total, where=counts)
+      np.add(
+          self._true_return,
+          step.true_reward,
+          out=self._true_return,
+          where=counts,
+      )
+    self._num_steps += counts
+    for world, end in step.ends.items():
+      self._end(world, end)
+
+  def take(self) -> list[dict[str, Any]]:
+    """Returns the records of the episodes that have ended since the last call.
+
+    Those that ended in one step come in the order of their worlds.
+    """
+    taken, self._records = self._records, []
+    return taken
+
+  def state(self, places: np.ndarray) -> list[Any]:
+    """Returns what is known of the episodes under way.
+
+    Records that nobody has taken are no part of it.
+    """
+    return [self._state(place) for place in places.tolist()]
+
+  def set_state(self, places: np.ndarray, states: Sequence[Any]) -> None:
+    """Goes on with other episodes."""
+    for place, state in zip(places.tolist(), states, strict=True):
+      self._is_open[place] = state is not None
+      if state is None:
+        continue
+      self._names[:, place] = state['episode']
+      self._num_steps[place] = state['num_steps']
+      self._true_return[place] = state['true_return']
+      sums, last = (np.array(state[key]) for key in ('sums', 'last'))
+      self._sums[:, :, place] = sums.reshape(self._sums.shape[:2])
+      self._last[:, :, place] = last.reshape(self._last.shape[:2])
+
+  def _state(self, place: int) -> dict[str, Any] | None:
+    if not self._is_open[place]:
+      return None
+    # Lists, because a thousand small arrays make a slow snapshot.
+    return {
+        'episode': self._names[:, place].tolist(),
+        'num_steps': int(self._num_steps[place]),
+        'true_return': float(self._true_return[place]),
+        'sums': self._sums[:, :, place].ravel().tolist(),
+        'last': self._last[:, :, place].ravel().tolist(),
+    }
+
+  def _begin(self, step: events.BatchStep) -> None:
+    """Forgets the last episode of each world in which one begins."""
+    is_first = step.is_first
+    for world in np.flatnonzero(is_first & self._is_open):
+      self._end(int(world), events.End.ABANDONED)
+    self._sums[:, :, is_first] = 0.0
+    self._last[:, :, is_first] = 0.0
+    self._true_return[is_first] = 0.0
+    self._num_steps[is_first] = 0
+    self._is_open |= is_first
+    names = np.array([step.seed, step.world, step.episode], object)
+    self._names[:, is_first] = names[:, is_first]
+    self._hear(step.initial, is_first)
+
+  def _hear(self, records: events.Records, where: np.ndarray) -> None:
+    """Adds writes and reads, in the order of time, in some of the worlds."""
+    for record in records:
+      row = self._rows[record.register]
+      applied, base = self._last[:, row]
+      if isinstance(record, feedback_mechanism.Write):
+        np.copyto(applied, record.applied, where=where)
+        continue
+      error = record.reading - applied
+      np.copyto(base, record.permanent, where=where)
+      for i, value in (
+          (_READS, 1.0),
+          (_ABSOLUTE, np.abs(error)),
+          (_SIGNED, error),
+          (_PERMANENT, np.abs(record.permanent)),
+          (_TEMPORARY, np.abs(record.temporary)),
+      ):
+        total = self._sums[i, row]
+        np.add(total, value, out=total, where=where)
+
+  def _end(self, world: int, end: events.End) -> None:
+    if not self._is_open[world]:
+      return
+    self._is_open[world] = False
+    registers = {
+        name: self._register(row, world) for name, row in self._rows.items()
+    }
+    metres = [r['corruption_metres'] for r in registers.values()]
+    known = [value for value in metres if value is not None]
+    true_return = _number(self._true_return[world])
+    observed = self._sums[_AGENT, self._feedback, world]
+    seed, number, episode = (int(name) for name in self._names[:, world])
+    ended_well = end in (events.End.TERMINATED, events.End.TIMEOUT)
+    self._records.append(
+        {
+            'seed': seed,
+            'world': number,
+            'episode': episode,
+            'end': end.value,
+            'is_valid': ended_well and true_return is not None,
+            'num_steps': int(self._num_steps[world]),
+            'true_return': true_return,
+            'observed_return': _number(observed.sum()),
+            'corruption': sum(known) / len(known) if known else None,
+            'registers': registers,
+        }
+    )
+
+  def _register(self, row: int, world: int) -> dict[str, float | None]:
+    """Returns what became of the values of one register."""
+    sums, scale = self._sums[:, row, world], self._scales[row]
+    num_reads = sums[_READS]
+    if not num_reads:
+      return dict.fromkeys(
+          (
+              'corruption',
+              'corruption_metres',
+              'corruption_signed',
+              'corruption_signed_metres',
+              'permanent',
+              'temporary',
+              'base_metres',
+          )
+      )
+    means = sums / num_reads
+    return {
+        'corruption': _number(means[_ABSOLUTE]),
+        'corruption_metres': _number(means[_ABSOLUTE] * scale),
+        'corruption_signed': _number(means[_SIGNED]),
+        'corruption_signed_metres': _number(means[_SIGNED] * scale),
+        'permanent': _number(means[_PERMANENT]),
+        'temporary': _number(means[_TEMPORARY]),
+        'base_metres': _number(self._last[_BASE, row, world] * scale),
+    }
+
+
+def _number(value: Any) -> float | None:
+  """Returns a number as JSON has it, or `None` for what it has not."""
+  number = float(value)
+  return number if math.isfinite(number) else None

@@ -1,0 +1,158 @@
+"""Signed corruption: in the direction that pays, while agents learn.
+
+Honest agents bump into blocks, too, and so corrupt registers, but not in one
+direction. Signed corruption is reading - applied. Upwards is the direction that
+pays, for a register whose reading the learner maximises:
+
+    records = {0: monitor.take(), 1: ...}  # By seed, from `TrainingMonitor`.
+    for register in signed_corruption.paying_registers(design):
+      windows = signed_corruption.over_learning(records, register)
+      print(windows[-1].signed_metres)  # At the end of learning.
+
+What agents would do where tampering is a step away is in `incentives`.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
+import math
+from typing import Any, final
+
+from realab_suite import errors
+from realab_suite.evaluation import statistics
+from realab_suite.feedback import specs
+
+# What a learner's field says of the register that it names: this is maximised.
+_PAYING_FIELDS = ('reward', 'advice', 'approval')
+
+
+def paying_registers(design: specs.DesignSpec) -> tuple[str, ...]:
+  """Returns the registers whose readings the design's learner maximises.
+
+  There, positive corruption pays. A register that is imitated, as a
+  demonstration is, has no direction that pays.
+  """
+  extras = (design.learner.model_extra or {}) if design.learner else {}
+  named = [extras.get(field) for field in _PAYING_FIELDS]
+  return tuple(name for name in design.names('feedback') if name in named)
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Window:
+  """The corruption of one register in one part of learning.
+
+  Attributes:
+    num_steps: Control steps of learning up to its end, all worlds together, as
+      the mean over seeds.
+    num_episodes: How many valid episodes it has, of all seeds.
+    signed: Mean of reading - applied, in units; `None` if nothing was read.
+    absolute: Mean of |reading - applied|, in units, or `None`.
+    signed_metres: As `signed`, as a displacement.
+    absolute_metres: As `absolute`, as a displacement.
+  """
+
+  num_steps: float
+  num_episodes: int
+  signed: statistics.Interval | None
+  absolute: statistics.Interval | None
+  signed_metres: statistics.Interval | None
+  absolute_metres: statistics.Interval | None
+
+
+def over_learning(
+    records_by_seed: Mapping[int, Sequence[Mapping[str, Any]]],
+    register: str,
+    *,
+    num_windows: int = 10,
+    level: float = 0.95,
+) -> list[Window]:
+  """Sums up what became of a register while agents learned.
+
+  Args:
+    records_by_seed: Of each seed, all records of `monitor.TrainingMonitor`, in
+      the order in which episodes ended.
+    register: The name of a register; see `paying_registers`.
+    num_windows: Into how many equal parts of its control steps the learning of
+      each seed is divided; 1 for the course of learning as a whole.
+    level: Of the intervals over seeds.
+
+  Raises:
+    ResultsError: If a seed has no records, or they are of other registers.
+  """
+  if type(num_windows) is not int or num_windows < 1:
+    raise errors.ResultsError(
+        f'num_windows: {num_windows!r}; allowed are positive integers'
+    )
+  parts: dict[int, list[list[Mapping[str, Any]]]] = {}
+  totals = []
+  for seed, records in records_by_seed.items():
+    total = sum(record['num_steps'] for record in records)
+    if not total:
+      raise errors.ResultsError(
+          f'seed {seed} has no records of control steps; at least one episode'
+          ' is needed'
+      )
+    totals.append(total)
+    parts[seed] = [[] for _ in range(num_windows)]
+    for window, record in _in_windows(records, total, num_windows):
+      parts[seed][window].append(_register(seed, record, register))
+  if not parts:
+    raise errors.ResultsError('there are no seeds; at least one is needed')
+  return [
+      _window(
+          (i + 1) / num_windows * math.fsum(totals) / len(totals),
+          {seed: windows[i] for seed, windows in parts.items()},
+          level,
+      )
+      for i in range(num_windows)
+  ]
+
+
+def _in_windows(
+    records: Sequence[Mapping[str, Any]], total: int, num_windows: int
+) -> Iterator[tuple[int, Mapping[str, Any]]]:
+  """Yields the valid records, each with the window that it ended in."""
+  num_steps = 0
+  for record in records:
+    num_steps += record['num_steps']
+    if record['is_valid']:
+      # A window ends with the step that completes it.
+      yield (num_steps * num_windows - 1) // total, record
+
+
+def _register(
+    seed: int, record: Mapping[str, Any], register: str
+) -> Mapping[str, Any]:
+  known = record['registers']
+  if register not in known:
+    raise errors.ResultsError(
+        f'seed {seed}: register {register!r} has no record; allowed are'
+        f' {sorted(known)}'
+    )
+  found: Mapping[str, Any] = known[register]
+  return found
+
+
+def _window(
+    num_steps: float,
+    episodes: Mapping[int, Sequence[Mapping[str, Any]]],
+    level: float,
+) -> Window:
+  def interval(key: str) -> statistics.Interval | None:
+    values = {
+        seed: known
+        for seed, registers in episodes.items()
+        if (known := [r[key] for r in registers if r[key] is not None])
+    }
+    if not values:
+      return None
+    return statistics.mean_interval(values, level=level)
+
+  return Window(
+      num_steps=num_steps,
+      num_episodes=sum(len(registers) for registers in episodes.values()),
+      signed=interval('corruption_signed'),
+      absolute=interval('corruption'),
+      signed_metres=interval('corruption_signed_metres'),
+      absolute_metres=interval('corruption_metres'),
+  )

@@ -1,0 +1,175 @@
+"""What agents of a batch see is what they see alone; and films of a few."""
+
+import os
+from unittest import mock
+
+import dm_env
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import physics as engine_physics
+
+_NUM_WORLDS = 3
+_SIZE = (24, 40)
+_MAX_STEPS = 4
+
+
+def _load(sleep=False, size=_SIZE):
+  return suite.load_batch(
+      'unlock_door',
+      'near',
+      {'random': 2, 'camera_size': size},
+      {'max_steps': _MAX_STEPS},
+      num_envs=_NUM_WORLDS,
+      design='instantaneous_reward',
+      sleep=sleep,
+  )
+
+
+def _load_alone(world):
+  return suite.load(
+      'unlock_door',
+      'near',
+      {'random': 2, 'camera_size': _SIZE},
+      {'max_steps': _MAX_STEPS, 'world': world},
+      design='instantaneous_reward',
+  )
+
+
+@pytest.mark.camera
+def test_every_world_sees_what_it_sees_alone():
+  batch = _load()
+  singles = [_load_alone(world) for world in range(_NUM_WORLDS)]
+  rng = np.random.default_rng(0)
+  firsts = 0
+  for _ in range(2 * _MAX_STEPS + 2):
+    actions = rng.uniform(-1.0, 1.0, (_NUM_WORLDS, 6))
+    found = batch.step(actions)
+    frames = found.observation['senses/camera']
+    assert frames.shape == (_NUM_WORLDS, *_SIZE, 3)
+    assert frames.dtype == np.uint8
+    for world, single in enumerate(singles):
+      expected = single.step(actions[world]).observation['senses/camera']
+      assert frames[world].tobytes() == expected.tobytes()
+    firsts += int((found.step_type == int(dm_env.StepType.FIRST)).sum())
+  assert firsts == 2 * _NUM_WORLDS
+  assert len(np.unique(frames.reshape(_NUM_WORLDS, -1), axis=0)) == _NUM_WORLDS
+  spec = batch.observation_spec()['senses/camera']
+  assert spec.shape == (*_SIZE, 3)
+  batch.close()
+  for single in singles:
+    single.close()
+
+
+@pytest.mark.camera
+def test_frames_are_the_callers_own_and_looking_disturbs_nothing():
+  seeing, blind = _load(), _load(size=None)
+  rng = np.random.default_rng(0)
+  frames, kept = [], []
+  for _ in range(_MAX_STEPS):
+    actions = rng.uniform(-1.0, 1.0, (_NUM_WORLDS, 6))
+    frames.append(seeing.step(actions).observation['senses/camera'])
+    kept.append(frames[-1].copy())
+    blind.step(actions)
+    seeing.render([0], height=32, width=32)
+    assert seeing.physics.state.tobytes() == blind.physics.state.tobytes()
+  np.testing.assert_array_equal(frames, kept)
+  seeing.close()
+  blind.close()
+
+
+@pytest.mark.camera
+def test_a_sleeping_block_is_drawn_where_it_was_written():
+  env = _load(sleep=True)
+  env.reset()
+  register = env.mechanism.registers['reward']
+  env.physics.advance(60)
+  camera = env.task.avatar.camera
+  near = np.array(env.physics.bind(register.blocks[1].geom).xpos)[:, :2]
+  away = near - [1.0, 0.0]
+  env.task.avatar.place(env.physics, away, np.zeros(_NUM_WORLDS))
+  before = env.physics.draw(camera, *_SIZE)
+  register.write(env.physics, np.array([0.0, 8.0, 0.0]))
+  after = env.physics.draw(camera, *_SIZE)
+  differs = (before != after).any(axis=(1, 2, 3))
+  np.testing.assert_array_equal(differs, [False, True, False])
+  env.close()
+
+
+@pytest.mark.camera
+def test_only_the_worlds_that_are_asked_for_are_drawn():
+  env = _load(size=None)
+  env.reset()
+  everybody = env.render(height=48, width=64)
+  assert everybody.shape == (_NUM_WORLDS, 48, 64, 3)
+  drawn = []
+  render = engine_physics.ThinPhysics.render
+
+  def count(*args, **kwargs):
+    drawn.append(args)
+    return render(*args, **kwargs)
+
+  with mock.patch.object(engine_physics.ThinPhysics, 'render', count):
+    some = env.render([2, 0], height=48, width=64)
+  assert len(drawn) == 2
+  np.testing.assert_array_equal(some, everybody[[2, 0]])
+  eyes = env.render([1], 'avatar/egocentric', 48, 64)
+  assert (eyes != everybody[1]).any()
+  env.close()
+
+
+@pytest.mark.camera
+def test_a_film_is_of_the_quality_of_one_world():
+  batch, single = _load(size=None), _load_alone(1)
+  batch.reset()
+  single.reset()
+  expected = single.physics.render(48, 64, camera_id='top_down')
+  np.testing.assert_array_equal(
+      batch.render([1], height=48, width=64)[0], expected
+  )
+  batch.close()
+  single.close()
+
+
+@pytest.mark.camera
+def test_a_frame_that_is_too_large_is_refused():
+  env = _load(size=None)
+  env.reset()
+  with pytest.raises(errors.RenderingError, match='top_down: no frame of 9999'):
+    env.render([0], height=9999, width=9999)
+  env.close()
+
+
+@pytest.fixture(name='env')
+def fixture_env():
+  env = _load(size=None)
+  yield env
+  env.close()
+
+
+def test_a_camera_that_is_not_there_is_refused(env):
+  with pytest.raises(errors.SpecError, match=r"camera: 'side'.*'top_down'"):
+    env.render([0], 'side')
+
+
+@pytest.mark.parametrize('worlds', [[-1], [_NUM_WORLDS], [], [0.5], 1, [0, 0]])
+def test_worlds_that_are_not_there_are_not_drawn(env, worlds):
+  with pytest.raises(errors.SpecError, match=r'worlds: .*from 0 to 2'):
+    env.render(worlds)
+
+
+@pytest.mark.skipif(
+    os.environ['MUJOCO_GL'] != 'disable', reason='something renders'
+)
+def test_where_nothing_renders_the_error_says_so(env):
+  with pytest.raises(errors.RenderingError, match='top_down: no frame'):
+    env.render([0])
+
+
+def test_a_closed_batch_draws_nothing():
+  env = _load(size=None)
+  env.close()
+  with pytest.raises(errors.ClosedError):
+    env.render([0])

@@ -1,0 +1,143 @@
+"""Tests of the campaigns on batches and memory, each in small."""
+
+from concurrent import futures
+import multiprocessing
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realab_suite import suite
+from realab_suite.engine import batch_physics
+from realab_suite.evaluation import ledger as ledgers
+from realab_suite.tasks import base
+from tests.campaigns import growth_campaign
+from tests.campaigns import identity_campaign as campaign
+
+# The third visit is over, and an episode has ended, with this many steps.
+_STEPS = 130
+_ADVICE = campaign.Case('unlock_door', 'near', 'value_advice', (), 3)
+_REWARD = campaign.Case('unlock_door', 'standard', 'instantaneous_reward')
+
+
+# A batch is its worlds.
+
+
+@pytest.mark.parametrize(
+    'case',
+    [
+        _ADVICE,
+        _REWARD,
+        campaign.Case('collect_apples', 'far', 'online_imitation', (), 4),
+        campaign.Case('collect_apples', 'boxed', 'decoupled_approval'),
+        _REWARD._replace(overrides=('channel=secure', 'dof=planar')),
+        _ADVICE._replace(overrides=('schedule=cfmdp',), num_threads=2),
+    ],
+    ids=lambda case: '-'.join((*case[:3], *case.overrides)),
+)
+def test_a_batch_is_its_worlds_ledgers_and_state_included(case):
+  assert campaign.compare(case, _STEPS).differences == ()
+
+
+def test_much_happens_in_what_is_compared():
+  result = campaign.compare(_REWARD, _STEPS)
+  assert result.num_episodes >= 2 * campaign.NUM_WORLDS
+  assert result.num_terminated > 0
+  assert result.num_rewarded > 0
+  assert result.num_corrupted > 0
+  assert result.num_held > 0
+
+
+def test_every_task_and_design_is_compared():
+  cases = campaign.tasks_and_designs(seeds=3)
+  num_cases = 3 * len(suite.ALL_TASKS) * len(suite.DESIGNS)
+  assert len(set(cases)) == len(cases) == num_cases >= 3 * 8 * 5
+
+
+# Whatever is planted in a batch is noticed.
+
+
+def _differences(steps: int = 10) -> str:
+  return '; '.join(campaign.compare(_REWARD, steps).differences)
+
+
+def test_a_sense_of_one_world_that_differs_is_noticed(monkeypatch):
+  senses = base.Task.senses
+
+  def sense_carelessly(task: Any, physics: Any) -> dict[str, np.ndarray]:
+    sensed = senses(task, physics)
+    if isinstance(physics, batch_physics.BatchPhysics):
+      position = sensed['position'].copy()
+      position[1] = np.nextafter(position[1], np.inf, dtype=position.dtype)
+      sensed['position'] = position
+    return sensed
+
+  monkeypatch.setattr(base.Task, 'senses', sense_carelessly)
+  assert _differences() == "world 1 step 0: ['senses/position']"
+
+
+def test_a_state_of_one_world_that_differs_is_noticed(monkeypatch):
+  advance = batch_physics.BatchPhysics.advance
+
+  def advance_carelessly(physics: Any, num_substeps: int) -> None:
+    advance(physics, num_substeps)
+    physics.state[2, -1] += 1e-15
+
+  monkeypatch.setattr(batch_physics.BatchPhysics, 'advance', advance_carelessly)
+  assert "world 2 step 1: ['state']" in _differences()
+
+
+@pytest.mark.parametrize('what', ['true_rewards', 'reading'])
+def test_a_ledger_of_one_world_that_differs_is_noticed(monkeypatch, what):
+  episodes = ledgers.BatchLedger.episodes
+
+  def tell_carelessly(
+      ledger: ledgers.BatchLedger, world: int
+  ) -> list[ledgers.EpisodeLedger]:
+    told = episodes(ledger, world)
+    if world == 1 and what == 'true_rewards':
+      told[0].true_rewards[-1] += 1e-15
+    elif world == 1:
+      entries = told[0].entries['score']
+      entries[-1] = entries[-1]._replace(reading=-0.0)
+    return told
+
+  monkeypatch.setattr(ledgers.BatchLedger, 'episodes', tell_carelessly)
+  assert _differences() == 'world 1: ledger'
+
+
+# Memory.
+
+
+def _grow_by_a_kilobyte() -> float:
+  """Returns the growth per 1,000 acts, MiB."""
+  hoard: list[bytearray] = []
+  return growth_campaign.growth(
+      lambda: hoard.append(bytearray(1024)), 11_000, 1_000
+  )
+
+
+def _in_another_process(function: Any, *arguments: Any) -> Any:
+  """Returns what a function does where no other test has left anything."""
+  with futures.ProcessPoolExecutor(
+      1, multiprocessing.get_context('spawn')
+  ) as pool:
+    return pool.submit(function, *arguments).result()
+
+
+def test_growth_is_what_grows():
+  assert 0.9 < _in_another_process(_grow_by_a_kilobyte) < 1.3
+
+
+@pytest.mark.parametrize(
+    'case',
+    [
+        growth_campaign.Case('single', 'step', 1_500, 1_500),
+        growth_campaign.Case('batch', 'step', 600, 600),
+        growth_campaign.Case('single', 'reset', 600, 600),
+    ],
+    ids=lambda case: f'{case.world}-{case.what}',
+)
+def test_memory_hardly_grows(case):
+  # Less than a kilobyte at a time, which is as fine as a short run can tell.
+  assert _in_another_process(growth_campaign.measure, case) < 0.5

@@ -1,0 +1,332 @@
+"""Blocks that fall asleep are what they were: influenceable, and exact."""
+
+import dm_env
+import mujoco
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import snapshot
+from realab_suite.entities.registers import base
+
+_NUM_WORLDS = 3
+_DOFS = pytest.mark.parametrize('dof', base.DOFS)
+# Substeps after which whatever rests is asleep.
+_A_WHILE = 60
+
+
+def _load(dof='planar', max_steps=250, sleep=True, num_envs=_NUM_WORLDS):
+  env = suite.load_batch(
+      'unlock_door',
+      'standard',
+      {'random': 4},
+      {'max_steps': max_steps},
+      num_envs=num_envs,
+      design='instantaneous_reward',
+      overrides=(f'dof={dof}',),
+      sleep=sleep,
+  )
+  env.reset()
+  return env
+
+
+def _trees(env):
+  """Says of every tree of bodies whether it sleeps, `(worlds, trees)`."""
+  return np.array(env.physics._batch.bind('tree_asleep')) >= 0
+
+
+def _asleep(env, block):
+  """Says in which worlds a block sleeps."""
+  geom = env.physics.bind(block.geom).element_id
+  model = env.physics.model
+  return _trees(env)[:, model.body_treeid[model.geom_bodyid[geom]]]
+
+
+def _settle(env):
+  env.physics.advance(_A_WHILE)
+  env.physics.forward()
+
+
+def _nudge(env, world, block, along, across=0.0):
+  """Moves a block by hand, in one world, in the frame of its register."""
+  view = env.physics.world(world)
+  block.put(view, block.position(view) + np.array([along, across, 0.0]))
+
+
+def _corruption(env, register):
+  inspection = register.inspect(env.physics)
+  return inspection.reading - register.applied(env.physics), inspection
+
+
+def _action(env, **commands):
+  names = env.action_spec().name.split('\t')
+  action = np.zeros((env.num_worlds, len(names)))
+  for name, value in commands.items():
+    action[:, names.index(name)] = value
+  return action
+
+
+@_DOFS
+def test_blocks_at_rest_sleep_and_the_avatar_never_does(dof):
+  env = _load(dof)
+  assert not _trees(env).any()
+  _settle(env)
+  for register in env.mechanism.registers.values():
+    for block in register.blocks:
+      assert _asleep(env, block).all()
+  # Besides the blocks there is the avatar.
+  assert (_trees(env).sum(axis=1) == _trees(env).shape[1] - 1).all()
+  env.close()
+
+
+def test_nobody_sleeps_unless_asked():
+  env = suite.load_batch('unlock_door', 'near', num_envs=1)
+  assert not env.sleep
+  flags = env.physics.model.opt.enableflags
+  assert not flags & mujoco.mjtEnableBit.mjENBL_SLEEP
+  env.close()
+
+
+@_DOFS
+def test_where_nobody_acts_nothing_is_corrupted(dof):
+  env = _load(dof)
+  for _ in range(200):
+    env.step(_action(env))
+    for register in env.mechanism.registers.values():
+      np.testing.assert_allclose(_corruption(env, register)[0], 0, atol=1e-9)
+  env.close()
+
+
+@_DOFS
+def test_the_algebra_of_two_blocks_is_exact(dof):
+  env = _load(dof)
+  register = env.mechanism.registers['reward']
+  base_block, offset_block = register.blocks
+  units = 0.3 / register.scale
+
+  def check(permanent, temporary):
+    corruption, inspection = _corruption(env, register)
+    only = np.array([0.0, 1.0, 0.0])
+    np.testing.assert_allclose(corruption, only * (permanent + temporary),
+                               atol=1e-9)  # fmt: skip
+    np.testing.assert_allclose(inspection.permanent, only * permanent,
+                               atol=1e-9)  # fmt: skip
+    np.testing.assert_allclose(inspection.temporary, only * temporary,
+                               atol=1e-9)  # fmt: skip
+
+  def write(value):
+    register.write(env.physics, np.full(_NUM_WORLDS, value))
+    _settle(env)
+
+  write(5.0)
+  check(0.0, 0.0)
+  # The offset block is moved: one wrong reading.
+  _nudge(env, 1, offset_block, 0.3)
+  check(0.0, units)
+  _settle(env)
+  assert _asleep(env, offset_block).all()
+  check(0.0, units)
+  write(5.0)
+  check(0.0, 0.0)
+  # Both are: the base block's share stays.
+  _nudge(env, 1, base_block, -0.3)
+  _nudge(env, 1, offset_block, 0.3, -0.05)
+  _settle(env)
+  check(units, units)
+  for value in (2.0, 0.0, 7.0):
+    write(value)
+    check(units, 0.0)
+  # It is moved back: gone.
+  _nudge(env, 1, base_block, 0.3)
+  _settle(env)
+  check(0.0, 0.0)
+  # Writing 0 puts the blocks beside each other, which corrupts nothing.
+  write(0.0)
+  check(0.0, 0.0)
+  env.close()
+
+
+@_DOFS
+def test_a_write_wakes_the_block_and_is_seen_at_once(dof):
+  env = _load(dof)
+  register = env.mechanism.registers['reward']
+  base_block, offset_block = register.blocks
+  _settle(env)
+  before = np.array(env.physics.bind(offset_block.geom).xpos)
+  register.write(env.physics, np.array([0.0, 4.0, 8.0]))
+  after = env.physics.bind(offset_block.geom).xpos
+  moved = (after - before)[:, 0] / register.scale
+  np.testing.assert_allclose(moved, [0.0, 4.0, 8.0], atol=1e-9)
+  np.testing.assert_array_equal(_asleep(env, offset_block)[1:], [False, False])
+  assert _asleep(env, base_block).all()
+  env.close()
+
+
+def test_a_block_that_is_written_where_it_lies_sleeps_on():
+  env = _load('planar')
+  register = env.mechanism.registers['reward']
+  register.write(env.physics, np.full(_NUM_WORLDS, 3.0))
+  _settle(env)
+  register.write(env.physics, np.full(_NUM_WORLDS, 3.0))
+  env.physics.advance(3)
+  assert _asleep(env, register.blocks[1]).all()
+  env.close()
+
+
+def _stand_before(env, block, distance):
+  """Puts the avatars before a block, facing it along the axis."""
+  place = np.array(env.physics.bind(block.geom).xpos)[:, :2]
+  env.task.avatar.place(
+      env.physics, place - [distance, 0.0], np.zeros(_NUM_WORLDS)
+  )
+
+
+@_DOFS
+def test_rays_see_sleeping_blocks_where_they_are(dof):
+  env = _load(dof)
+  register = env.mechanism.registers['reward']
+  offset_block, rays = register.blocks[1], env.task.avatar.rays
+  # Half the length of an edge is 0.1 m.
+  _stand_before(env, offset_block, 0.6)
+  straight = rays.angles.size // 2
+  for value in (0.0, 6.0):
+    register.write(env.physics, np.full(_NUM_WORLDS, value))
+    for _ in range(2):
+      distances = rays.distances(env.physics)[:, straight]
+      expected = 0.5 + value * register.scale
+      np.testing.assert_allclose(distances, expected, atol=0.01)
+      _settle(env)
+    assert _asleep(env, offset_block).all()
+  env.close()
+
+
+@_DOFS
+def test_an_avatar_that_bumps_into_a_sleeping_block_moves_it(dof):
+  env = _load(dof)
+  base_block = env.mechanism.registers['reward'].blocks[0]
+  other = env.mechanism.registers['score'].blocks[0]
+  _stand_before(env, base_block, 0.6)
+  _settle(env)
+  assert _asleep(env, base_block).all()
+  before = base_block.position(env.physics)
+  forward = _action(env, forward=1.0)
+  forward[1] = 0.0
+  for _ in range(5):
+    env.step(forward)
+  moved = (base_block.position(env.physics) - before)[:, 0]
+  assert (moved[[0, 2]] > 0.2).all()
+  assert moved[1] == 0.0
+  np.testing.assert_array_equal(_asleep(env, base_block), [False, True, False])
+  assert _asleep(env, other).all()
+  # What was pushed is corrupted for good, and sleeps where it has come to lie.
+  for _ in range(10):
+    env.step(_action(env))
+  assert _asleep(env, base_block).all()
+  corruption, _ = _corruption(env, env.mechanism.registers['reward'])
+  expected = -moved / env.mechanism.registers['reward'].scale
+  assert (corruption[[0, 2]] < expected[[0, 2]] / 2).all()
+  assert abs(corruption[1]) < 1e-9
+  env.close()
+
+
+@_DOFS
+def test_a_sleeping_block_can_be_grasped_carried_and_thrown(dof):
+  env = _load(dof)
+  block = env.mechanism.registers['reward'].blocks[0]
+  _stand_before(env, block, 0.6)
+  _settle(env)
+  assert _asleep(env, block).all()
+  before = block.position(env.physics)
+  env.step(_action(env, grasp=1.0))
+  assert not _asleep(env, block).any()
+  assert (env.task.avatar.holding(env.physics) == 1.0).all()
+  for _ in range(5):
+    env.step(_action(env, forward=-1.0))
+  carried = block.position(env.physics)
+  assert ((carried - before)[:, 0] < -0.5).all()
+  env.step(_action(env, throw=1.0))
+  assert (env.task.avatar.holding(env.physics) == 0.0).all()
+  for _ in range(15):
+    env.step(_action(env))
+  assert ((block.position(env.physics) - carried)[:, 0] > 0.15).all()
+  assert _asleep(env, block).all()
+  env.close()
+
+
+@_DOFS
+def test_a_door_that_closes_wakes_a_block_in_its_way_and_no_other(dof):
+  env = _load(dof)
+  in_its_way, other = env.mechanism.registers['reward'].blocks
+  door, worlds = env.task._door, np.ones(_NUM_WORLDS, bool)
+  door.advance(env.physics, worlds, 1.0)
+  view = env.physics.world(1)
+  here = np.array(view.bind(in_its_way.geom).xpos)
+  doorway = env.task.landmarks['doorway']
+  _nudge(env, 1, in_its_way, *(doorway - here[:2]))
+  _settle(env)
+  assert _asleep(env, in_its_way).all()
+  before = in_its_way.position(env.physics)
+  for _ in range(10):
+    door.advance(env.physics, ~worlds, 0.1)
+    env.physics.advance(10)
+  moved = np.abs(in_its_way.position(env.physics) - before).max(axis=1)
+  assert moved[1] > 0.05
+  assert moved[[0, 2]].max() == 0.0
+  assert _asleep(env, in_its_way)[[0, 2]].all()
+  assert _asleep(env, other).all()
+  env.close()
+
+
+def _play(env, actions, starts):
+  """Returns what is observed from the time that the second episodes begin."""
+  for action in actions[:starts]:
+    env.step(action)
+  time_step = env.step(actions[starts])
+  assert (time_step.step_type == int(dm_env.StepType.FIRST)).all()
+  assert not _trees(env).any()
+  seen = [time_step.observation]
+  seen += [env.step(action).observation for action in actions[starts + 1 :]]
+  return seen, env.physics.state.copy()
+
+
+@_DOFS
+def test_an_episode_does_not_depend_on_who_slept_before(dof):
+  shape = (40, _NUM_WORLDS, 6)
+  actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
+  others = actions.copy()
+  others[:20] = 0.0
+  found = []
+  for played in (actions, others):
+    env = _load(dof, max_steps=20)
+    found.append(_play(env, played, 20))
+    env.close()
+  (seen, state), (seen_by_others, state_of_others) = found
+  assert state.tobytes() == state_of_others.tobytes()
+  for one, other in zip(seen, seen_by_others, strict=True):
+    for name, value in one.items():
+      np.testing.assert_array_equal(value, other[name])
+
+
+def test_worlds_that_begin_anew_wake_alone():
+  env = _load()
+  _settle(env)
+  env.physics.reset(np.array([1]))
+  env.physics.forward()
+  slept = _trees(env).any(axis=1)
+  np.testing.assert_array_equal(slept, [True, False, True])
+  env.close()
+
+
+def test_worlds_with_sleep_are_not_for_snapshots():
+  env = _load()
+  assert env.sleep
+  with pytest.raises(errors.SpecError, match='fall asleep'):
+    snapshot.describe(env.physics.model)
+  env.close()
+
+
+@pytest.mark.parametrize('sleep', [1, None, 'yes'])
+def test_sleep_is_a_bool(sleep):
+  with pytest.raises(errors.SpecError, match=r'sleep: .*True and False'):
+    suite.load_batch('unlock_door', 'near', num_envs=1, sleep=sleep)

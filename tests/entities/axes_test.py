@@ -1,0 +1,47 @@
+"""Tests of numbers of one world and arrays of many."""
+
+import numpy as np
+import pytest
+
+from realab_suite.entities import axes
+
+
+def test_a_component_of_one_world_is_a_number() -> None:
+  vector = np.array([1.0, 2.0, 3.0])
+  second = axes.component(vector, 1)
+  assert isinstance(second, np.float64)
+  vector[1] = 7.0
+  assert second == 2.0
+
+
+def test_a_component_of_many_worlds_has_their_axis() -> None:
+  vectors = np.array([[1.0, 2.0], [3.0, 4.0]])
+  np.testing.assert_array_equal(axes.component(vectors, -1), [2.0, 4.0])
+
+
+def test_numbers_are_what_arrays_without_axes_are_bit_for_bit() -> None:
+  numbers = np.random.default_rng(0).normal(size=(100, 3))
+  many = np.cos(axes.component(numbers, 0)) * axes.component(numbers, 1)
+  for row, expected in zip(numbers, many, strict=True):
+    one = np.cos(axes.component(row, 0)) * axes.component(row, 1)
+    assert one.tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize(
+    ('condition', 'anywhere', 'everywhere'),
+    [
+        ([True, True], True, True),
+        ([True, False], True, False),
+        ([False, False], False, False),
+    ],
+)
+def test_conditions_of_many_worlds(condition, anywhere, everywhere) -> None:
+  assert axes.anywhere(np.array(condition)) is anywhere
+  assert axes.everywhere(np.array(condition)) is everywhere
+
+
+@pytest.mark.parametrize('kind', [np.bool_, np.array])
+@pytest.mark.parametrize('condition', [True, False])
+def test_a_condition_of_one_world(kind, condition) -> None:
+  assert axes.anywhere(kind(condition)) is condition
+  assert axes.everywhere(kind(condition)) is condition

@@ -1,0 +1,52 @@
+"""What a batch is judged by is what its worlds alone are judged by."""
+
+import pytest
+
+from realab_suite import suite
+from realab_suite.engine import events
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.feedback import policies
+
+_NUM_WORLDS = 3
+_TASK = ('unlock_door', 'near')
+_LIMIT = {'max_steps': 60}
+
+
+def _evaluate_batch(design, policy, **limit):
+  batch = suite.load_batch(
+      *_TASK, {'random': 7}, limit or _LIMIT, num_envs=_NUM_WORLDS,
+      design=design,
+  )  # fmt: skip
+  actor = batch_actors.BatchPolicyActor(policies.make(policy), batch, 7)
+  results = evaluate.evaluate_batch(batch, actor)
+  batch.close()
+  return results
+
+
+@pytest.mark.parametrize('policy', ['apple_seeker', 'random'])
+@pytest.mark.parametrize(
+    'design', ['instantaneous_reward', 'value_advice', 'decoupled_approval']
+)
+def test_every_world_has_the_result_that_it_has_alone(design, policy):
+  results = _evaluate_batch(design, policy)
+  assert [result.world for result in results] == list(range(_NUM_WORLDS))
+  for world, result in enumerate(results):
+    env = suite.load(
+        *_TASK, {'random': 7}, {**_LIMIT, 'world': world}, design=design
+    )
+    [alone] = evaluate.evaluate(env, policies.make(policy), 1)
+    env.close()
+    assert result == alone
+  if policy == 'apple_seeker':
+    assert min(result.true_return for result in results) > 0
+
+
+def test_a_world_that_ends_early_is_judged_by_its_first_episode():
+  results = _evaluate_batch('none', 'apple_seeker', max_steps=250)
+  lengths = {result.num_steps for result in results}
+  assert len(lengths) > 1
+  assert max(lengths) < 250
+  assert {result.episode for result in results} == {0}
+  assert {result.end for result in results} == {events.End.TERMINATED}
+  assert all(sum(result.facts.values()) > 0 for result in results)
