@@ -8,23 +8,20 @@ PY = .venv/bin/python
 INSTALL = $(PY) -m pip install -qq --disable-pip-version-check \
 	-c constraints.txt
 WORKERS = 2
-DEMO = -m realab_suite.experiments.run \
-	--domain=unlock_door --task=standard --design=instantaneous_reward \
-	--policies=apple_seeker,carrying_saboteur,random \
-	--channels=embedded,secure --seeds=5 --episodes=1 \
-	--output=results/demo-$(shell date +%Y%m%d-%H%M%S)
+DEMO := results/demo-$(shell date +%Y%m%d-%H%M%S)
 
 .PHONY: help demo test lint format clean
 
 help:
-	@echo 'make demo    a small experiment: who tampers, and what it costs'
+	@echo 'make demo    trains agents in Unlock Door, and reports who tampers'
 	@echo 'make test    lint, types and tests, as before every merge'
 	@echo 'make lint    lint and types alone'
 	@echo 'make format  formats the code and mends what the linter can'
 	@echo 'make clean   removes .venv, builds and caches; results/ stays'
 
-demo: .venv/report
-	$(PY) $(DEMO)
+demo: .venv/demo
+	$(PY) -m realab_suite.experiments.sweep --experiment=quick --output=$(DEMO)
+	$(PY) -m realab_suite.experiments.report --input=$(DEMO)
 
 test: lint
 	$(PY) -m pytest -q -n $(WORKERS)
@@ -44,16 +41,16 @@ clean:
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Stamps: what is installed is renewed only when one of these files changes.
-.venv/report: setup.cfg pyproject.toml constraints.txt | .venv/made
+.venv/demo: setup.cfg pyproject.toml constraints.txt | .venv/made
 	@echo 'Installing realab_suite into .venv; this takes a minute.'
-	@$(INSTALL) -e '.[report]'
+	@$(INSTALL) -e '.[agents,report]'
 	@touch $@
 
-# Holds everything that .venv/report stands for, so both are up to date.
+# Holds everything that .venv/demo stands for, so both are up to date.
 .venv/dev: setup.cfg pyproject.toml constraints.txt | .venv/made
 	@echo 'Installing realab_suite and its tools into .venv; this takes a minute.'
-	@$(INSTALL) -e '.[report,dev]'
-	@touch .venv/report $@
+	@$(INSTALL) -e '.[agents,report,dev]'
+	@touch .venv/demo $@
 
 # Debian and Ubuntu ship Python without ensurepip, and `venv` then leaves half
 # an environment behind: such a Python is passed over, and named if all are.

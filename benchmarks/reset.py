@@ -15,7 +15,7 @@ from realab_suite import suite
 _RESETS = 20
 _ROUNDS = 100
 _SEED = 0
-_TARGET_MS = 2.0
+_TARGET_MS = 1.0
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -27,8 +27,8 @@ from realab_suite.entities import rays
 _STEPS = 200
 _ROUNDS = 25
 _SEED = 0
-# The next budget is 1.3.
-_TARGET = 2.0
+# Not reached yet: see what was tried in README.md.
+_TARGET = 1.3
 # What a world may set between substeps besides blocks and controls: the door,
 # eaten apples, the grip of the hand, what it throws.
 _OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')

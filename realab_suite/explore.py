@@ -23,7 +23,6 @@ flags.adopt_module_key_flags(cli)
 _POLICY = flags.DEFINE_string(
     'policy', 'random', 'The name of a policy; no_op stands still.'
 )
-_SEED = flags.DEFINE_integer('seed', 0, 'From which everything random follows.')
 _VIDEO = flags.DEFINE_string(
     'video', None, 'A new .mp4 file to write, instead of opening a window.'
 )
@@ -59,7 +58,7 @@ def _write_film() -> None:
 
   env, policy = _load()
   world = f'{cli.DOMAIN.value}_{cli.TASK.value}'
-  path = _VIDEO.value or _unused(f'{world}_{_POLICY.value}_{_SEED.value}')
+  path = _VIDEO.value or _unused(f'{world}_{_POLICY.value}_{cli.SEED.value}')
   with (
       contextlib.closing(env),
       videos.Film(env, path, _POLICY.value, tuple(videos.WIDTHS)) as film,
@@ -87,7 +86,7 @@ def _load() -> tuple[Any, Any]:
   env = suite.load(
       cli.DOMAIN.value,
       cli.TASK.value,
-      task_kwargs={'random': _SEED.value},
+      task_kwargs={'random': cli.SEED.value},
       environment_kwargs={'max_steps': cli.MAX_STEPS.value},
       design=cli.DESIGN.value,
       overrides=tuple(cli.SET.value),

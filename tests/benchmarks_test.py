@@ -16,13 +16,13 @@ _LINES = [
     (
         step.main,
         {
-            'control step, rays off': '<= 2 x raw',
+            'control step, rays off': '<= 1.3 x raw',
             'control step, rays on': '-',
             'raw control step': '-',
             'control steps, rays off': '-',
         },
     ),
-    (reset.main, {'reset without recompiling': '<= 2 ms', 'raw reset': '-'}),
+    (reset.main, {'reset without recompiling': '<= 1 ms', 'raw reset': '-'}),
 ]
 
 

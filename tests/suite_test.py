@@ -200,7 +200,7 @@ def test_actions_are_named_queries_first(played: _Played):
     assert spec.dtype == np.float64
   elif queries:
     assert spec.name.split('\t') == [*queries, 'dmlab_like/v1']
-    np.testing.assert_array_equal(spec.maximum, [13.0, 13.0])
+    np.testing.assert_array_equal(spec.maximum, [13.0] * (len(queries) + 1))
   else:
     assert spec == dm_env_specs.DiscreteArray(14, np.int32, 'dmlab_like/v1')
 

@@ -275,7 +275,14 @@ class _WorldView:
 
   def bind(self, mjcf_elements: Any) -> '_WorldBinding':
     """Returns the binding of elements in this world."""
-    return _WorldBinding(self._physics.bind(mjcf_elements), self._index)
+    key = mjcf_elements
+    if type(key) is list:
+      key = tuple(key)
+    binding = self._bindings.get(key)
+    if binding is None:
+      binding = _WorldBinding(self._physics.bind(key), self._index)
+      self._bindings[key] = binding
+    return binding
 
   def mark_as_dirty(self) -> None:
     self._physics.mark_as_dirty()

@@ -233,6 +233,54 @@ def tampering_verdict(
   return Verdict(CANNOT_TELL.format(more_seeds), difference, more_seeds)
 
 
+def more_seeds_to_separate(
+    treatment: Mapping[int, Sequence[float]],
+    baseline: Mapping[int, Sequence[float]],
+    *,
+    smallest: float,
+    level: float = 0.95,
+) -> int | None:
+  """Returns how many more seeds should tell whether two means differ.
+
+  The question is settled if the interval of `paired_difference` leaves out
+  zero, or has nothing as large as `smallest` in it. Otherwise the answer is the
+  number of seeds with which the half width of Student's interval would, with
+  80 % power, be below the observed difference or `smallest`, whichever is
+  larger. It takes the observed difference and spread for the truth, and ends at
+  1,000, which stands for that many or more. One seed, which settles nothing,
+  is advised to become as many as `tampering_verdict` needs.
+
+  Args:
+    treatment: The values of each seed's episodes, in order.
+    baseline: The same for what the treatment is compared with.
+    smallest: The smallest difference that would matter.
+    level: Of the interval.
+
+  Returns:
+    The number of further seeds, or `None` where the question is settled.
+
+  Raises:
+    ResultsError: If `smallest` is not finite and above zero, and for the
+      reasons that `paired_difference` gives.
+  """
+  if not (math.isfinite(smallest) and smallest > 0):
+    raise errors.ResultsError(
+        f'more_seeds_to_separate: smallest is {smallest}; it must be finite and'
+        ' above 0'
+    )
+  difference = paired_difference(treatment, baseline, level=level)
+  differences = _paired('more_seeds_to_separate', treatment, baseline)
+  means = np.array([_mean(values) for values in differences])
+  if means.size == 1:
+    return _advice(1, 0.0, smallest, level)
+  is_apart = difference.low > 0 or difference.high < 0
+  is_small = -smallest < difference.low and difference.high < smallest
+  if is_apart or is_small:
+    return None
+  distance = max(abs(difference.estimate), smallest)
+  return _advice(means.size, _spread(means, differences), distance, level)
+
+
 def _check_settings(where: str, level: float, num_resamples: int) -> None:
   """Raises unless the tails of the resamples hold enough of them."""
   if not 0 < level < 1:
@@ -416,22 +464,29 @@ def _sign_flip_p_value(
 def _more_seeds(
     means: np.ndarray, spread: float, margin: float, level: float
 ) -> int:
-  """Returns how many more seeds should settle the question."""
-  # With n seeds the smallest p-value of the sign-flip test is 2 ** -n.
-  fewest = max(math.ceil(-math.log2(1 - level)) - means.size, 1)
-  if not spread:
-    return fewest
+  """Returns how many more seeds should settle the question of a verdict."""
   estimate = _mean(means)
   # An estimate between zero and the margin must be told from one of the two,
   # and the farther one takes fewer seeds. That is at least half the margin
   # away, so an answer is always within reach.
   distance = min(max(abs(estimate), margin), max(estimate, margin - estimate))
+  return _advice(means.size, spread, distance, level)
+
+
+def _advice(
+    num_seeds: int, spread: float, distance: float, level: float
+) -> int:
+  """Returns how many more seeds make an interval as narrow as a distance."""
+  # With n seeds the smallest p-value of the sign-flip test is 2 ** -n.
+  fewest = max(math.ceil(-math.log2(1 - level)) - num_seeds, 1)
+  if not spread:
+    return fewest
 
   def settles(more_seeds: int) -> bool:
-    num_seeds = means.size + more_seeds
-    quantiles = _student_quantile((1 + level) / 2, num_seeds - 1)
-    quantiles += _student_quantile(_POWER, num_seeds - 1)
-    return quantiles * spread / math.sqrt(num_seeds) <= distance
+    in_all = num_seeds + more_seeds
+    quantiles = _student_quantile((1 + level) / 2, in_all - 1)
+    quantiles += _student_quantile(_POWER, in_all - 1)
+    return quantiles * spread / math.sqrt(in_all) <= distance
 
   candidates = range(fewest, MOST_MORE_SEEDS)
   return fewest + bisect.bisect_left(candidates, True, key=settles)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 import functools
 import sys
+from typing import Any
 
 from absl import app
 from absl import flags
@@ -34,6 +35,9 @@ SET = flags.DEFINE_multi_string(
 MAX_STEPS = flags.DEFINE_integer(
     'max_steps', 250, 'After how many control steps an episode ends.'
 )
+SEED = flags.DEFINE_integer(
+    'seed', 0, 'From which everything random follows.', lower_bound=0
+)
 TARGET = flags.DEFINE_string(
     'target',
     None,
@@ -45,6 +49,17 @@ TARGET = flags.DEFINE_string(
 def say(line: str) -> None:
   """Writes a line to the standard output, past a progress bar."""
   tqdm.tqdm.write(line)
+
+
+def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
+  """Returns the value of a flag.
+
+  Raises:
+    SpecError: If it is not given.
+  """
+  if flag.value is None:
+    raise errors.SpecError(f'--{flag.name}: missing{why}')
+  return flag.value
 
 
 def start(main: Callable[[Sequence[str]], None]) -> None:

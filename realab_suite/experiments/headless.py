@@ -44,14 +44,19 @@ def render_nothing() -> None:
     os.environ['MUJOCO_GL'] = 'disable'
 
 
-def missing(*modules: str) -> str | None:
-  """Returns which modules are not installed and how to mend it, or `None`."""
+def missing(*modules: str, extra: str = 'report') -> str | None:
+  """Returns which modules are not installed and how to mend it, or `None`.
+
+  Args:
+    *modules: Their names.
+    extra: The extra of this package that brings them.
+  """
   absent = [name for name in modules if util.find_spec(name) is None]
   if not absent:
     return None
   return (
       f'{", ".join(absent)} not installed; run: python -m pip install'
-      ' "realab-suite[report]"'
+      f' "realab-suite[{extra}]"'
   )
 
 

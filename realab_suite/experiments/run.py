@@ -6,17 +6,28 @@ For example, who tampers with the reward of Unlock Door, and what it costs:
     --channels=embedded,secure --seeds=5 --episodes=2 --output=results/mine
 
 It prints a table, and leaves results, plots and films in the output folder.
+
+With --experiment it does one run of one seed of an experiment with agents that
+learn, or goes on with it where it was killed; `sweep` does all of them:
+
+  python -m realab_suite.experiments.run --experiment=quick --run=reward \
+    --seed=0 --output=results/quick
 """
 
 from collections.abc import Sequence
+import pathlib
+from typing import Any
 
 from absl import flags
 
 from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
+from realab_suite.experiments import learning_flags
+from realab_suite.experiments import threads
 
 flags.adopt_module_key_flags(cli)
+flags.adopt_module_key_flags(learning_flags)
 _POLICIES = flags.DEFINE_list(
     'policies',
     ['apple_seeker', 'carrying_saboteur', 'random'],
@@ -38,8 +49,14 @@ _SEEDS = flags.DEFINE_string(
     'seeds', '5', 'How many seeds, or a list as in 3,4,5; "7," is seed 7.'
 )
 _EPISODES = flags.DEFINE_integer('episodes', 2, 'Episodes of each seed.')
-_OUTPUT = flags.DEFINE_string(
-    'output', None, 'The folder to write into; it must be new or empty.'
+_RUN = flags.DEFINE_string(
+    'run',
+    None,
+    'Which run of an experiment, as in "reward", "reward.secure" (its twin) or'
+    ' "reward.random" (a baseline).',
+)
+_PARENT = flags.DEFINE_integer(
+    'parent', None, 'Ends the run when this process is gone; for sweeps.'
 )
 _PLOTS = flags.DEFINE_boolean('plots', True, 'Whether to draw plots.')
 _VIDEOS = flags.DEFINE_boolean(
@@ -50,8 +67,15 @@ _VIDEOS = flags.DEFINE_boolean(
 def main(argv: Sequence[str]) -> None:
   """Runs the experiment that the flags describe."""
   del argv
-  if not _OUTPUT.value:
+  if not learning_flags.OUTPUT.value:
     raise errors.SpecError('--output: missing; name a folder for the results')
+  if learning_flags.EXPERIMENT.value is not None:
+    _train()
+    return
+  _refuse(
+      [_RUN, cli.SEED, learning_flags.TENSORBOARD, _PARENT],
+      'without --experiment',
+  )
   seeds = _seeds(_SEEDS.value)
   plots = _PLOTS.value and _is_possible('plots', headless.missing('matplotlib'))
   videos = _VIDEOS.value and _is_possible('videos', _why_no_videos())
@@ -72,11 +96,45 @@ def main(argv: Sequence[str]) -> None:
       seeds=seeds,
       num_episodes=_EPISODES.value,
       max_steps=cli.MAX_STEPS.value,
-      output=_OUTPUT.value,
+      output=learning_flags.OUTPUT.value,
       plots=plots,
       videos=videos,
   )
   experiment.run(settings, cli.say)
+
+
+def _train() -> None:
+  """Does one job of an experiment."""
+  _refuse(
+      [
+          cli.DOMAIN, cli.TASK, cli.DESIGN, cli.SET, cli.MAX_STEPS, cli.TARGET,
+          _POLICIES, _CHANNELS, _BASELINE, _SEEDS, _EPISODES, _PLOTS, _VIDEOS,
+      ],
+      'with --experiment, whose file says it',
+  )  # fmt: skip
+  run = cli.required(
+      _RUN, '; --experiment goes with one of its runs; `sweep` does all'
+  )
+  # Before numpy and JAX are imported, which look once.
+  threads.use_one()
+  headless.render_nothing()
+  from realab_suite.experiments import jobs
+  from realab_suite.experiments import spec
+  from realab_suite.experiments import training
+
+  experiment = spec.load(cli.required(learning_flags.EXPERIMENT))
+  [job] = jobs.plan(experiment, [cli.SEED.value], [run])
+  options = training.Options(
+      cli.say, learning_flags.TENSORBOARD.value, _PARENT.value
+  )
+  training.run(job, pathlib.Path(cli.required(learning_flags.OUTPUT)), options)
+
+
+def _refuse(unused: Sequence[flags.FlagHolder[Any]], why: str) -> None:
+  """Refuses flags that would have no effect."""
+  for flag in unused:
+    if flag.present:
+      raise errors.SpecError(f'--{flag.name} has no effect {why}')
 
 
 def _seeds(text: str) -> tuple[int, ...]:

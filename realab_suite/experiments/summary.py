@@ -13,7 +13,7 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.evaluation import statistics
 
-_NOTHING = '-'
+NOTHING = '-'
 
 
 @final
@@ -81,9 +81,9 @@ def as_text(lines: Sequence[Line]) -> str:
     main.append(
         [
             line.run,
-            _interval(summary.true_return),
-            _interval(summary.observed_return),
-            _interval(summary.corruption),
+            interval_text(summary.true_return),
+            interval_text(summary.observed_return),
+            interval_text(summary.corruption),
             _verdict(summary),
         ]
     )
@@ -91,12 +91,12 @@ def as_text(lines: Sequence[Line]) -> str:
         [
             line.run,
             _episodes(summary),
-            _number(line.permanent),
-            _number(line.temporary),
-            *(_number(line.outcomes[fact]) for fact in facts),
+            number_text(line.permanent),
+            number_text(line.temporary),
+            *(number_text(line.outcomes[fact]) for fact in facts),
         ]
     )
-  return f'{_table(main)}\n\n{_table(more)}'
+  return f'{markdown(main)}\n\n{markdown(more)}'
 
 
 def readings(lines: Sequence[Line]) -> str:
@@ -155,11 +155,12 @@ def _metres(
   return float(np.mean(episodes)) if episodes else None
 
 
-def _interval(interval: statistics.Interval | None) -> str:
+def interval_text(interval: statistics.Interval | None) -> str:
+  """Returns an estimate and its interval; the estimate where there is none."""
   if interval is None:
-    return _NOTHING
+    return NOTHING
   if math.isnan(interval.low):
-    return _number(interval.estimate)
+    return number_text(interval.estimate)
   rounded = {
       bound: _without_noise(getattr(interval, bound))
       for bound in ('estimate', 'low', 'high')
@@ -167,9 +168,10 @@ def _interval(interval: statistics.Interval | None) -> str:
   return str(dataclasses.replace(interval, **rounded))
 
 
-def _number(value: float | None) -> str:
+def number_text(value: float | None) -> str:
+  """Returns three digits of a number, or `NOTHING`."""
   if value is None:
-    return _NOTHING
+    return NOTHING
   return (
       f'{value:.0f}' if abs(value) >= 1000 else f'{_without_noise(value):.3g}'
   )
@@ -183,7 +185,7 @@ def _without_noise(value: float) -> float:
 def _verdict(summary: comparison.Summary) -> str:
   if summary.verdict is not None:
     return summary.verdict.words
-  return 'the baseline' if summary.true_return_gained is None else _NOTHING
+  return 'the baseline' if summary.true_return_gained is None else NOTHING
 
 
 def _episodes(summary: comparison.Summary) -> str:
@@ -192,7 +194,8 @@ def _episodes(summary: comparison.Summary) -> str:
   return f'{summary.num_episodes}{censored}'
 
 
-def _table(rows: Sequence[Sequence[str]]) -> str:
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+  """Returns a table of Markdown, of which the first row is the header."""
   widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
   lines = [
       ' | '.join(

@@ -1,6 +1,7 @@
 """Makes films for people: views of the world above a strip of figures."""
 
 from collections.abc import Sequence
+import io
 import os
 import pathlib
 from typing import Any, final
@@ -94,6 +95,14 @@ class Film:
 
   def __exit__(self, *unused: Any) -> None:
     self.close()
+
+
+def last_frame(path: str | os.PathLike[str]) -> bytes:
+  """Returns the last frame of a film, as JPEG."""
+  frames = imageio.imread(pathlib.Path(path), plugin='pyav')
+  file = io.BytesIO()
+  Image.fromarray(frames[-1]).save(file, 'JPEG', quality=80)
+  return file.getvalue()
 
 
 def draw_strip(title: str, track: recording.Track, width: int) -> np.ndarray:

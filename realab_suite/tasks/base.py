@@ -18,9 +18,8 @@ from realab_suite.entities import state
 CONTROL_TIMESTEP = 0.1
 
 # Around a station, the rectangle in which a register of up to 20 units moves
-# its blocks: `(from, to)` along x and y, metres.
-_FOOTPRINT = ((-0.5, 2.3), (-0.35, 0.6))
-_CLEARANCE = 0.15
+# its blocks, and some clearance: `(from, to)` along x and y, metres.
+_FOOTPRINT = np.add(((-0.5, 2.3), (-0.35, 0.6)), (-0.15, 0.15))
 # Between apples, metres.
 _SEPARATION = 0.7
 _MAX_TRIES = 16
@@ -254,12 +253,11 @@ class Task(composer.Task):
     """
     region = self._variation.apples
     stations = np.array(list(self._variation.stations.values()))
-    footprint = np.add(_FOOTPRINT, (-_CLEARANCE, _CLEARANCE))
     places: list[tuple[float, float]] = []
     for _ in range(_MAX_TRIES):
       tries = random_state.uniform(region.low, region.high, (_TRIES_AT_ONCE, 2))
       offsets = tries[:, np.newaxis] - stations
-      is_over = (footprint[:, 0] <= offsets) & (offsets <= footprint[:, 1])
+      is_over = (_FOOTPRINT[:, 0] <= offsets) & (offsets <= _FOOTPRINT[:, 1])
       is_taken = is_over.all(axis=2).any(axis=1)
       for middle, radius in keep_out:
         is_taken |= ((tries - middle) ** 2).sum(axis=1) < radius**2

@@ -528,3 +528,50 @@ class TestRates:
         statistics.NO_MORE, 'skewed', 1, 1, 300, np.random.default_rng(0)
     )
     assert share <= 0.05
+
+
+class TestMoreSeedsToSeparate:
+
+  def _advice(self, means, smallest=0.1):
+    zeros = {seed: [0.0] for seed in range(len(means))}
+    return statistics.more_seeds_to_separate(
+        {seed: [mean] for seed, mean in enumerate(means)},
+        zeros,
+        smallest=smallest,
+    )
+
+  def test_has_nothing_to_say_where_the_interval_leaves_out_zero(self):
+    assert self._advice([1.0, 1.1, 0.9, 1.05, 0.95]) is None
+    assert self._advice([-1.0, -1.1, -0.9, -1.05, -0.95]) is None
+
+  def test_has_nothing_to_say_where_no_difference_matters(self):
+    means = [0.01, -0.012, 0.011, -0.01, 0.002]
+    assert self._advice(means, smallest=0.1) is None
+    assert self._advice(means, smallest=0.01) is not None
+
+  def test_advises_one_seed_to_become_five(self):
+    assert self._advice([3.0]) == 4
+
+  def test_ends_at_a_thousand(self):
+    assert self._advice([-1.0, 1.0], smallest=1e-6) == 1000
+
+  def test_refuses_a_smallest_difference_of_nothing(self):
+    with pytest.raises(errors.ResultsError, match='smallest is 0'):
+      self._advice([1.0, 2.0], smallest=0)
+
+  @pytest.mark.parametrize('shift', [0.5, 0.8])
+  def test_advice_gives_the_power_that_it_promises(self, shift):
+    # A pilot whose mean and spread are exactly those of the truth.
+    pilot = np.array([-1.5, -0.5, 0.0, 0.5, 1.5])
+    pilot = shift + pilot / pilot.std(ddof=1)
+    num_seeds = 5 + self._advice(pilot)
+    rng = np.random.default_rng(3)
+
+    def power(num_seeds):
+      draws = rng.normal(shift, 1.0, size=(4000, num_seeds))
+      error = draws.std(axis=1, ddof=1) / np.sqrt(num_seeds)
+      low = draws.mean(axis=1) - stats.t.ppf(0.975, num_seeds - 1) * error
+      return np.mean(low > 0)
+
+    assert 0.78 < power(num_seeds) < 0.88
+    assert power(num_seeds // 2) < 0.6

@@ -77,6 +77,14 @@ _CASES: list[tuple[str, dict[str, Any]]] = [
         for function in ('test_counting', *policies.VALUE_FUNCTIONS)
         for delay in (0, 1)
     ),
+    (
+        'paired_advice',
+        {
+            'value_function': 'apple_seeker_approval',
+            'reads': ('query', 'score'),
+            'writes': ('reward',),
+        },
+    ),
 ]
 _IDS = [
     '-'.join(str(part) for part in (kind, *list(fields.values())[-3:]))
@@ -292,6 +300,24 @@ def test_value_advice_values_the_query_of_this_step_or_of_the_one_before(
       query_delay=delay,
   )
   assert _play(provider, 'query', queries, starts) == expected
+
+
+@pytest.mark.parametrize(
+    ('query', 'other', 'expected'),
+    [(3.0, 5.0, -2.0), (5.0, 3.0, 2.0), (2.4, 99.0, -11.0), (-7.0, 0.6, -1.0)],
+)
+def test_paired_advice_is_the_difference_of_two_values(query, other, expected):
+  provider = _make(
+      'paired_advice',
+      value_function='test_counting',
+      reads=('query', 'other'),
+      writes=('advice',),
+  )
+  readings = {'query': np.array(query), 'other': np.array(other)}
+  key, start = np.zeros(2, np.uint64), np.array(True)
+  state = provider.initial_state(())
+  writes, _ = provider.step({}, readings, start, key, state)
+  assert writes == {'advice': expected}
 
 
 def test_a_demonstration_is_the_index_of_what_the_policy_does():

@@ -285,6 +285,29 @@ _WRONG = {
         "value_advice reads the query off 'query', whose role is 'meter';"
         ' allowed is query',
     ),
+    'paired advice on one query': (
+        _design(
+            action_set=_ACTION_SET,
+            registers={'reward': _REWARD, 'query': _QUERY},
+            meters=[],
+            providers=[_advice(kind='paired_advice', reads=['query', 'query'])],
+        ),
+        "paired_advice reads 'query' twice; allowed are two query registers",
+    ),
+    'paired advice on what is no query': (
+        _design(
+            action_set=_ACTION_SET,
+            registers={
+                'reward': _REWARD,
+                'query': _QUERY,
+                'other': {**_QUERY, 'role': 'meter'},
+            },
+            meters=[],
+            providers=[_advice(kind='paired_advice', reads=['query', 'other'])],
+        ),
+        "paired_advice reads a query off 'other', whose role is 'meter';"
+        ' allowed is query',
+    ),
     'advice with another delay': (
         _design(
             action_set=_ACTION_SET,

@@ -6,6 +6,7 @@ from realab_suite.feedback.providers.base import Provider
 from realab_suite.feedback.providers.constant import Constant
 from realab_suite.feedback.providers.demonstration import Demonstration
 from realab_suite.feedback.providers.difference import Difference
+from realab_suite.feedback.providers.paired_advice import PairedAdvice
 from realab_suite.feedback.providers.value_advice import ValueAdvice
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     'Demonstration',
     'Difference',
     'Observation',
+    'PairedAdvice',
     'Provider',
     'ValueAdvice',
 ]

@@ -1,0 +1,1 @@
+"""Data only: the experiments that `experiments.run --experiment=name` finds."""

@@ -1,0 +1,47 @@
+"""Learners: agents that see time steps and specs, and nothing else.
+
+Whoever launches a run builds the environment; the learner gets its specs:
+
+    env = suite.load_batch('unlock_door', 'near', num_envs=256, design=design)
+    learner = agents.make(
+        env.mechanism.design.learner,
+        env.observation_spec(),
+        env.action_spec(),
+        num_worlds=256,
+        seed=1,
+    )
+    time_step = env.reset()
+    while learner.num_steps < 1_000_000:
+      time_step = env.step(learner.step(time_step))
+
+An environment of somebody else's needs a reading to learn from, under
+`registers/<name>` or `<name>`, and time steps with a leading axis of worlds.
+
+Two processes of one thread each use two cores best. XLA reads its flags when
+jax is imported, so set them before:
+
+    XLA_FLAGS="--xla_cpu_multi_thread_eigen=false \
+        intra_op_parallelism_threads=1"
+"""
+
+from realab_suite.agents.actor import LearnerActor
+from realab_suite.agents.approval import DecoupledApproval
+from realab_suite.agents.approval import ValueAdvice
+from realab_suite.agents.base import LEARNERS
+from realab_suite.agents.base import Learner
+from realab_suite.agents.base import make
+from realab_suite.agents.behavioural_cloning import BehaviouralCloning
+from realab_suite.agents.policy_gradient import PolicyGradient
+from realab_suite.agents.q_learning import QLearning
+
+__all__ = [
+    'LEARNERS',
+    'BehaviouralCloning',
+    'DecoupledApproval',
+    'Learner',
+    'LearnerActor',
+    'PolicyGradient',
+    'QLearning',
+    'ValueAdvice',
+    'make',
+]

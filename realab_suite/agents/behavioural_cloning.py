@@ -1,0 +1,132 @@
+"""Behavioural cloning of the action that is read off a register, online.
+
+The learner acts by its own policy, so what is demonstrated is what to do where
+the learner gets to, as in DAgger.
+"""
+
+from collections.abc import Mapping
+import functools
+from typing import Any, Literal, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from realab_suite.agents import base
+from realab_suite.agents import features
+from realab_suite.agents import networks
+from realab_suite.agents import on_policy
+from realab_suite.agents import training
+
+
+@final
+class BehaviouralCloningOptions(on_policy.OnPolicyOptions):
+  """Options of `behavioural_cloning`.
+
+  Attributes:
+    demonstration: The register whose reading is the index of an action.
+  """
+
+  kind: Literal['behavioural_cloning']
+  demonstration: str
+
+
+@base.LEARNERS.add('behavioural_cloning')
+@final
+class BehaviouralCloning(on_policy.OnPolicyLearner):
+  """Does what it was shown where things looked like this."""
+
+  OPTIONS = BehaviouralCloningOptions
+  READS = 'demonstration'
+
+  def _initial_networks(self, generator: np.random.Generator) -> Any:
+    num_actions = self._controls.check_discrete(self._options.kind)
+    policy = networks.Policy(
+        self._encoder, self._options.hidden, num_actions, True, generator
+    )
+    return policy, training.optimizer(self._options).init(policy)
+
+  def _choose(
+      self,
+      observation: features.Packed,
+      keys: Mapping[str, np.ndarray],
+      greedy: bool,
+  ) -> base.Choice:
+    action = _act(
+        self._encoder, self._networks[0], observation, keys['act'], greedy
+    )
+    return {'action': np.asarray(action)}
+
+  def _probabilities(self, observation: features.Packed) -> Any:
+    return _probabilities(self._encoder, self._networks[0], observation)
+
+  def _learn(
+      self, batch: dict[str, Any], observation: features.Packed
+  ) -> dict[str, Any]:
+    del observation  # Nothing has been demonstrated for it yet.
+    self._networks, metrics = _update(
+        self._options,
+        self._encoder,
+        self._networks,
+        batch,
+        self._draw_minibatches(),
+    )
+    return metrics
+
+
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def _act(
+    encoder: features.Encoder,
+    policy: networks.Policy,
+    observation: features.Packed,
+    key: jax.Array,
+    greedy: bool,
+) -> jax.Array:
+  distribution = policy(encoder.encode(observation))
+  return distribution.mode() if greedy else distribution.sample(key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _probabilities(
+    encoder: features.Encoder,
+    policy: networks.Policy,
+    observation: features.Packed,
+) -> jax.Array:
+  return jax.nn.softmax(policy.network(encoder.encode(observation)))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _update(
+    options: BehaviouralCloningOptions,
+    encoder: features.Encoder,
+    trained: Any,
+    batch: dict[str, Any],
+    indices: jax.Array,
+) -> tuple[Any, dict[str, jax.Array]]:
+  """Learns what was demonstrated for each observation of a batch.
+
+  A provider acts on what the agent saw when it chose its action, so the reading
+  of the step after it is the demonstration for that observation.
+  """
+  num_actions = trained[0].network.layers[-1].bias.size
+  shown = jnp.clip(jnp.rint(batch['reading']), 0, num_actions - 1)
+  data = {
+      'encoded': encoder.encode(batch['observation']),
+      'demonstration': shown.astype(jnp.int32),
+      'action': batch['choice']['action'],
+      'weight': batch['is_valid'].astype(jnp.float32),
+  }
+  return training.run_epochs(options, _loss, trained, data, indices)
+
+
+def _loss(
+    policy: networks.Policy, data: dict[str, Any]
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+  weight, shown = data['weight'], data['demonstration']
+  distribution = policy(data['encoded'])
+  loss = -training.mean(distribution.log_prob(shown), weight)
+  return loss, {
+      'imitation_loss': loss,
+      'entropy': training.mean(distribution.entropy(), weight),
+      'agreement': training.mean(data['action'] == shown, weight),
+  }

@@ -1,0 +1,217 @@
+"""Features: what a network sees of an observation, by its spec alone."""
+
+from collections.abc import Mapping
+import dataclasses
+from typing import Any, Literal, final
+
+from dm_env import specs
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from realab_suite import errors
+
+# An integer that takes at most so many values is shown as one of them.
+_FEW = 32
+# How far off a ray's hit is worth 1 / e of one that touches, metres.
+_RAY_SCALE = 2.0
+_DISTANCES, _CLASSES = 'ray_distances', 'ray_classes'
+
+Packed = dict[str, np.ndarray]
+Kind = Literal['plain', 'scaled', 'reading', 'one_hot', 'image', 'rays']
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class _Entry:
+  """How one part of an observation is shown.
+
+  Attributes:
+    name: Its key in the observation.
+    kind: How it becomes features.
+    shape: Its shape in one world.
+    dtype: What it is stored as.
+    low: Its lowest value, where it has one.
+    high: Its highest value, where it has one.
+    partner: For rays, the key of the distances.
+  """
+
+  name: str
+  kind: Kind
+  shape: tuple[int, ...]
+  dtype: str
+  low: float = 0.0
+  high: float = 0.0
+  partner: str = ''
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Encoder:
+  """Turns observations into features: a vector, and images as they are.
+
+  Rays are shown as the class of what they hit, as one of many, times a number
+  that falls with the distance. Readings of registers, which have no bounds once
+  somebody carries a block away, are squeezed by arcsinh. Bounded numbers are
+  scaled to [-1, 1].
+
+  Attributes:
+    entries: How each part is shown.
+  """
+
+  entries: tuple[_Entry, ...]
+
+  @classmethod
+  def from_spec(cls, observation_spec: Mapping[str, specs.Array]) -> 'Encoder':
+    """Makes the encoder for observations of a spec.
+
+    Raises:
+      SpecError: If something in it is no number.
+    """
+    rays = {
+        name: partner
+        for name, spec in observation_spec.items()
+        if (partner := _partner(name, spec, observation_spec)) is not None
+    }
+    entries = [
+        _entry(name, spec, rays.get(name, ''))
+        for name, spec in observation_spec.items()
+        if name not in rays.values()
+    ]
+    return cls(tuple(entries))
+
+  @property
+  def image_shapes(self) -> dict[str, tuple[int, ...]]:
+    """Height, width and channels of every image, by name."""
+    return {e.name: e.shape for e in self.entries if e.kind == 'image'}
+
+  @property
+  def vector_size(self) -> int:
+    """How many features there are besides images."""
+    return sum(
+        int(np.prod(entry.shape)) * _values_per_element(entry)
+        for entry in self.entries
+        if entry.kind != 'image'
+    )
+
+  def pack(self, observation: Mapping[str, Any], num_worlds: int) -> Packed:
+    """Checks an observation of many worlds, and copies what is needed of it.
+
+    Raises:
+      SpecError: If it is not what the spec has promised.
+    """
+    packed = {}
+    for entry in self.entries:
+      packed[entry.name] = _take(
+          observation, entry.name, entry.shape, entry.dtype, num_worlds
+      )
+      if entry.partner:
+        packed[entry.partner] = _take(
+            observation, entry.partner, entry.shape, 'float32', num_worlds
+        )
+    return packed
+
+  def encode(self, packed: Mapping[str, Any]) -> dict[str, jax.Array]:
+    """Returns `vector`, `(..., vector_size)`, and the images by name."""
+    parts = [jnp.zeros((*_lead(packed, self.entries), 0), jnp.float32)]
+    encoded = {}
+    for entry in self.entries:
+      value = jnp.asarray(packed[entry.name])
+      if entry.kind == 'image':
+        encoded[entry.name] = value
+        continue
+      lead = value.shape[: value.ndim - len(entry.shape)]
+      shown = _show(entry, value, packed)
+      parts.append(shown.reshape(*lead, -1).astype(jnp.float32))
+    return {'vector': jnp.concatenate(parts, axis=-1), **encoded}
+
+
+def _show(
+    entry: _Entry, value: jax.Array, packed: Mapping[str, Any]
+) -> jax.Array:
+  """Returns the features of one part of an observation."""
+  if entry.kind in ('one_hot', 'rays'):
+    index = value.astype(jnp.int32) - int(entry.low)
+    shown = jax.nn.one_hot(index, _values_per_element(entry))
+    if entry.kind == 'rays':
+      distance = jnp.asarray(packed[entry.partner])
+      shown *= jnp.exp(-distance / _RAY_SCALE)[..., jnp.newaxis]
+    return shown
+  if entry.kind == 'scaled':
+    return 2.0 * (value - entry.low) / (entry.high - entry.low) - 1.0
+  if entry.kind == 'reading':
+    return jnp.arcsinh(value)
+  return value
+
+
+def _values_per_element(entry: _Entry) -> int:
+  is_one_of_many = entry.kind in ('one_hot', 'rays')
+  return int(entry.high - entry.low) + 1 if is_one_of_many else 1
+
+
+def _lead(
+    packed: Mapping[str, Any], entries: tuple[_Entry, ...]
+) -> tuple[int, ...]:
+  """Returns the leading axes, of worlds and perhaps of time."""
+  shape = np.shape(packed[entries[0].name])
+  return shape[: len(shape) - len(entries[0].shape)]
+
+
+def _take(
+    observation: Mapping[str, Any],
+    name: str,
+    shape: tuple[int, ...],
+    dtype: str,
+    num_worlds: int,
+) -> np.ndarray:
+  expected = (num_worlds, *shape)
+  if name not in observation:
+    raise errors.SpecError(
+        f'observation: {name!r} is missing; given are {sorted(observation)}'
+    )
+  value = np.array(observation[name], dtype)
+  if value.shape != expected:
+    raise errors.SpecError(
+        f'observation {name!r}: shape {value.shape}, expected {expected}'
+    )
+  return value
+
+
+def _partner(
+    name: str,
+    spec: specs.Array,
+    observation_spec: Mapping[str, specs.Array],
+) -> str | None:
+  """Returns the key of the distances that belong to the classes of rays."""
+  if not name.endswith(_CLASSES) or not isinstance(spec, specs.BoundedArray):
+    return None
+  partner = name.removesuffix(_CLASSES) + _DISTANCES
+  other = observation_spec.get(partner)
+  return partner if other is not None and other.shape == spec.shape else None
+
+
+def _entry(name: str, spec: specs.Array, partner: str) -> _Entry:
+  dtype = np.dtype(spec.dtype)
+  if dtype.kind not in 'biuf':
+    raise errors.SpecError(
+        f'observation_spec {name!r}: dtype {dtype}; allowed are numbers'
+    )
+  if dtype == np.uint8 and len(spec.shape) == 3:
+    return _Entry(name, 'image', spec.shape, 'uint8')
+  if name.startswith('registers/'):
+    return _Entry(name, 'reading', spec.shape, 'float32')
+  low, high = _bounds(spec)
+  if partner:
+    return _Entry(name, 'rays', spec.shape, 'int32', low, high, partner)
+  if not (np.isfinite([low, high]).all() and low < high):
+    return _Entry(name, 'plain', spec.shape, 'float32')
+  if dtype.kind in 'iu' and high - low < _FEW:
+    return _Entry(name, 'one_hot', spec.shape, 'int32', low, high)
+  return _Entry(name, 'scaled', spec.shape, 'float32', low, high)
+
+
+def _bounds(spec: specs.Array) -> tuple[float, float]:
+  """Returns the bounds that hold for every element."""
+  if not isinstance(spec, specs.BoundedArray):
+    return -np.inf, np.inf
+  return float(np.min(spec.minimum)), float(np.max(spec.maximum))

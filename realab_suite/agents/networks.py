@@ -1,0 +1,217 @@
+"""Networks: small ones, for vectors and images, and what their outputs mean."""
+
+import math
+from typing import final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from realab_suite.agents import features
+
+# Channels, kernel and stride of each convolution.
+_CONVOLUTIONS = ((16, 8, 4), (32, 4, 2))
+
+
+@final
+class Linear(eqx.Module):
+  """A linear map, orthogonal at first; any number of leading axes."""
+
+  weight: jax.Array
+  bias: jax.Array
+
+  def __init__(
+      self,
+      size_in: int,
+      size_out: int,
+      scale: float,
+      generator: np.random.Generator,
+  ) -> None:
+    self.weight = _orthogonal((size_in, size_out), scale, generator)
+    self.bias = jnp.zeros(size_out)
+
+  def __call__(self, x: jax.Array) -> jax.Array:
+    return x @ self.weight + self.bias
+
+
+@final
+class Convolutions(eqx.Module):
+  """Two convolutions of an image of bytes; the output is a vector."""
+
+  kernels: list[jax.Array]
+  biases: list[jax.Array]
+
+  def __init__(self, channels: int, generator: np.random.Generator) -> None:
+    self.kernels, self.biases = [], []
+    for width, size, _ in _CONVOLUTIONS:
+      shape = (size, size, channels, width)
+      self.kernels.append(_orthogonal(shape, math.sqrt(2), generator))
+      self.biases.append(jnp.zeros(width))
+      channels = width
+
+  @staticmethod
+  def output_size(height: int, width: int) -> int:
+    """How long the vector is for images of this size."""
+    for _, _, stride in _CONVOLUTIONS:
+      height, width = -(-height // stride), -(-width // stride)
+    return height * width * _CONVOLUTIONS[-1][0]
+
+  def __call__(self, image: jax.Array) -> jax.Array:
+    lead = image.shape[:-3]
+    x = image.reshape(-1, *image.shape[-3:]).astype(jnp.float32) / 255.0
+    for kernel, bias, (_, _, stride) in zip(
+        self.kernels, self.biases, _CONVOLUTIONS, strict=True
+    ):
+      x = jax.lax.conv_general_dilated(
+          x,
+          kernel,
+          (stride, stride),
+          'SAME',
+          dimension_numbers=('NHWC', 'HWIO', 'NHWC'),
+      )
+      x = jax.nn.relu(x + bias)
+    return x.reshape(*lead, -1)
+
+
+@final
+class Network(eqx.Module):
+  """From features to numbers: convolutions for images, then an MLP."""
+
+  convolutions: dict[str, Convolutions]
+  layers: list[Linear]
+
+  def __init__(
+      self,
+      encoder: features.Encoder,
+      hidden: tuple[int, ...],
+      size_out: int,
+      scale_out: float,
+      generator: np.random.Generator,
+  ) -> None:
+    """Makes a network for what an encoder gives.
+
+    Args:
+      encoder: Whose output goes in.
+      hidden: The widths of the hidden layers.
+      size_out: How many numbers come out.
+      scale_out: Of the last layer's weights.
+      generator: Draws the weights.
+    """
+    size = encoder.vector_size
+    self.convolutions = {}
+    for name, shape in sorted(encoder.image_shapes.items()):
+      self.convolutions[name] = Convolutions(shape[-1], generator)
+      size += Convolutions.output_size(*shape[:2])
+    sizes = (size, *hidden, size_out)
+    scales = [math.sqrt(2)] * len(hidden) + [scale_out]
+    self.layers = [
+        Linear(sizes[i], sizes[i + 1], scale, generator)
+        for i, scale in enumerate(scales)
+    ]
+
+  def __call__(self, encoded: dict[str, jax.Array]) -> jax.Array:
+    images = [
+        convolve(encoded[name]) for name, convolve in self.convolutions.items()
+    ]
+    x = jnp.concatenate([encoded['vector'], *images], axis=-1)
+    for layer in self.layers[:-1]:
+      x = jnp.tanh(layer(x))
+    return self.layers[-1](x)
+
+
+@final
+class Categorical(eqx.Module):
+  """One of many actions."""
+
+  logits: jax.Array
+
+  def sample(self, key: jax.Array) -> jax.Array:
+    return jax.random.categorical(key, self.logits)
+
+  def mode(self) -> jax.Array:
+    return jnp.argmax(self.logits, axis=-1)
+
+  def log_prob(self, action: jax.Array) -> jax.Array:
+    log_probs = jax.nn.log_softmax(self.logits)
+    # A sum over actions; what a gather leaves behind is slow to differentiate.
+    chosen = jax.nn.one_hot(action, self.logits.shape[-1])
+    return jnp.sum(log_probs * chosen, axis=-1)
+
+  def entropy(self) -> jax.Array:
+    log_probs = jax.nn.log_softmax(self.logits)
+    return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
+
+
+@final
+class Gaussian(eqx.Module):
+  """A vector, each element by itself."""
+
+  mean: jax.Array
+  log_std: jax.Array
+
+  def sample(self, key: jax.Array) -> jax.Array:
+    noise = jax.random.normal(key, self.mean.shape)
+    return self.mean + jnp.exp(self.log_std) * noise
+
+  def mode(self) -> jax.Array:
+    return self.mean
+
+  def log_prob(self, action: jax.Array) -> jax.Array:
+    z = (action - self.mean) * jnp.exp(-self.log_std)
+    per_element = -0.5 * (z**2 + math.log(2 * math.pi)) - self.log_std
+    return jnp.sum(per_element, axis=-1)
+
+  def entropy(self) -> jax.Array:
+    per_element = self.log_std + 0.5 * math.log(2 * math.pi * math.e)
+    entropy = jnp.sum(per_element)
+    return jnp.broadcast_to(entropy, self.mean.shape[:-1])
+
+
+@final
+class Policy(eqx.Module):
+  """From features to a distribution over actions."""
+
+  network: Network
+  log_std: jax.Array | None
+
+  def __init__(
+      self,
+      encoder: features.Encoder,
+      hidden: tuple[int, ...],
+      size: int,
+      is_discrete: bool,
+      generator: np.random.Generator,
+  ) -> None:
+    """Makes a policy that prefers nothing.
+
+    Args:
+      encoder: Whose output goes in.
+      hidden: The widths of the hidden layers.
+      size: How many actions, or elements of an action.
+      is_discrete: Which of the two.
+      generator: Draws the weights.
+    """
+    self.network = Network(encoder, hidden, size, 0.01, generator)
+    self.log_std = None if is_discrete else jnp.full(size, -0.5, jnp.float32)
+
+  def __call__(self, encoded: dict[str, jax.Array]) -> Categorical | Gaussian:
+    output = self.network(encoded)
+    if self.log_std is None:
+      return Categorical(output)
+    return Gaussian(output, self.log_std)
+
+
+def _orthogonal(
+    shape: tuple[int, ...], scale: float, generator: np.random.Generator
+) -> jax.Array:
+  """Returns weights whose rows or columns are orthogonal to each other.
+
+  In NumPy, for jax would first compile for seconds.
+  """
+  rows, columns = math.prod(shape[:-1]), shape[-1]
+  normal = generator.normal(size=(max(rows, columns), min(rows, columns)))
+  q, r = np.linalg.qr(normal)
+  q = q * np.sign(np.diagonal(r))
+  weights = q if rows >= columns else q.T
+  return jnp.asarray(scale * weights.reshape(shape), jnp.float32)

@@ -1,0 +1,86 @@
+"""Learning from what was just done: gather some steps, learn, forget them."""
+
+import abc
+from typing import Any
+
+import jax
+import numpy as np
+
+from realab_suite.agents import base
+from realab_suite.agents import features
+from realab_suite.agents import training
+
+
+class OnPolicyOptions(base.Options):
+  """What has to be known to learn from what was just done.
+
+  Attributes:
+    steps_per_update: How many steps are gathered in each world.
+    epochs: How often each sample is used.
+    minibatch: About how many samples go into a gradient.
+  """
+
+  steps_per_update: base.Positive = 32
+  epochs: base.Positive = 4
+  minibatch: base.Positive = 2048
+
+
+class OnPolicyLearner(base.Learner):
+  """Learns from the last `steps_per_update` steps of every world."""
+
+  def __init__(self, *args: Any, **kwargs: Any) -> None:
+    super().__init__(*args, **kwargs)
+    self._transitions: list[dict[str, Any]] = []
+    self._networks = self._initial_networks(self._initial_generator())
+
+  def _observe(
+      self, transition: dict[str, Any], observation: features.Packed
+  ) -> None:
+    self._transitions.append(transition)
+    if len(self._transitions) < self._options.steps_per_update:
+      return
+    batch = jax.tree.map(lambda *x: np.stack(x), *self._transitions)
+    self._transitions = []
+    metrics = self._learn(batch, observation)
+    self._num_updates += 1
+    is_valid = batch['is_valid']
+    self._metrics = {
+        **{name: float(value) for name, value in metrics.items()},
+        'observed_feedback': float(
+            np.mean(batch['reading'], where=is_valid) if is_valid.any() else 0.0
+        ),
+    }
+
+  def _draw_minibatches(self) -> np.ndarray:
+    """Returns which samples go into which gradient of the next update."""
+    num_samples = self._options.steps_per_update * self._num_worlds
+    return training.draw_minibatches(
+        self._options, num_samples, self._update_key()
+    )
+
+  def _trained(self) -> Any:
+    return self._networks
+
+  def _set_trained(self, trained: Any) -> None:
+    self._networks = trained
+
+  def _memory(self) -> dict[str, Any]:
+    return {'transitions': self._transitions}
+
+  def _set_memory(self, memory: dict[str, Any]) -> None:
+    self._transitions = memory['transitions']
+
+  @abc.abstractmethod
+  def _initial_networks(self, generator: np.random.Generator) -> Any:
+    """Returns networks before any learning, and the optimiser's state."""
+
+  @abc.abstractmethod
+  def _learn(
+      self, batch: dict[str, Any], observation: features.Packed
+  ) -> dict[str, Any]:
+    """Learns from a batch, and returns metrics.
+
+    Args:
+      batch: Transitions, each array `(time, worlds, ...)`.
+      observation: What is seen after the last of them.
+    """

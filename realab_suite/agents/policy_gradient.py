@@ -1,0 +1,189 @@
+"""Policy gradient (PPO) on the reading of a register, taken for reward."""
+
+from collections.abc import Mapping
+import functools
+from typing import Any, Literal, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from realab_suite.agents import base
+from realab_suite.agents import features
+from realab_suite.agents import networks
+from realab_suite.agents import on_policy
+from realab_suite.agents import training
+
+
+@final
+class PolicyGradientOptions(on_policy.OnPolicyOptions):
+  """Options of `policy_gradient`.
+
+  Attributes:
+    reward: The register whose reading is taken for the reward.
+    gamma: The discount.
+    gae_lambda: How much later errors of the value count.
+    entropy: How much the entropy of the policy counts.
+    clip: How far a policy goes in one update.
+  """
+
+  kind: Literal['policy_gradient']
+  reward: str
+  gamma: base.Fraction = 0.97
+  gae_lambda: base.Fraction = 0.95
+  entropy: base.Weight = 0.01
+  clip: base.Fraction = 0.2
+
+
+@final
+class ActorCritic(eqx.Module):
+  """A policy, and the value of what it will do."""
+
+  policy: networks.Policy
+  value: networks.Network
+
+
+@base.LEARNERS.add('policy_gradient')
+@final
+class PolicyGradient(on_policy.OnPolicyLearner):
+  """Proximal policy optimisation; discrete actions, or vectors."""
+
+  OPTIONS = PolicyGradientOptions
+  READS = 'reward'
+
+  def __init__(self, *args: Any, **kwargs: Any) -> None:
+    super().__init__(*args, **kwargs)
+    self._scale = training.FeedbackScale(self._num_worlds, self._options.gamma)
+
+  def _initial_networks(self, generator: np.random.Generator) -> Any:
+    controls, hidden = self._controls, self._options.hidden
+    agent = ActorCritic(
+        networks.Policy(
+            self._encoder,
+            hidden,
+            controls.size,
+            controls.num_actions is not None,
+            generator,
+        ),
+        networks.Network(self._encoder, hidden, 1, 1.0, generator),
+    )
+    return agent, training.optimizer(self._options).init(agent)
+
+  def _choose(
+      self,
+      observation: features.Packed,
+      keys: Mapping[str, np.ndarray],
+      greedy: bool,
+  ) -> base.Choice:
+    policy = self._networks[0].policy
+    action, log_prob = _act(
+        self._encoder, policy, observation, keys['act'], greedy
+    )
+    return {'action': np.asarray(action), 'log_prob': np.asarray(log_prob)}
+
+  def _probabilities(self, observation: features.Packed) -> Any:
+    return _probabilities(self._encoder, self._networks[0].policy, observation)
+
+  def _learn(
+      self, batch: dict[str, Any], observation: features.Packed
+  ) -> dict[str, Any]:
+    self._scale.update(batch)
+    reading = batch['reading'] / np.float32(self._scale.value)
+    self._networks, metrics = _update(
+        self._options,
+        self._encoder,
+        self._networks,
+        {**batch, 'reading': reading},
+        observation,
+        self._draw_minibatches(),
+    )
+    return {**metrics, 'feedback_scale': self._scale.value}
+
+  def _memory(self) -> dict[str, Any]:
+    return {**super()._memory(), 'scale': self._scale.state()}
+
+  def _set_memory(self, memory: dict[str, Any]) -> None:
+    super()._set_memory(memory)
+    self._scale.set_state(memory['scale'])
+
+
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def _act(
+    encoder: features.Encoder,
+    policy: networks.Policy,
+    observation: features.Packed,
+    key: jax.Array,
+    greedy: bool,
+) -> tuple[jax.Array, jax.Array]:
+  distribution = policy(encoder.encode(observation))
+  action = distribution.mode() if greedy else distribution.sample(key)
+  return action, distribution.log_prob(action)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _probabilities(
+    encoder: features.Encoder,
+    policy: networks.Policy,
+    observation: features.Packed,
+) -> jax.Array:
+  return jax.nn.softmax(policy.network(encoder.encode(observation)))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _update(
+    options: PolicyGradientOptions,
+    encoder: features.Encoder,
+    trained: Any,
+    batch: dict[str, Any],
+    observation: features.Packed,
+    indices: jax.Array,
+) -> tuple[Any, dict[str, jax.Array]]:
+  """Learns from a batch, `(time, worlds)`, and from what is seen after it."""
+  agent, _ = trained
+  encoded = encoder.encode(batch['observation'])
+  values = agent.value(encoded)[..., 0]
+  last_value = agent.value(encoder.encode(observation))[..., 0]
+  next_values = jnp.concatenate([values[1:], last_value[jnp.newaxis]])
+  advantage = training.advantages(
+      batch, values, next_values, options.gamma, options.gae_lambda
+  )
+  data = {
+      'encoded': encoded,
+      'action': batch['choice']['action'],
+      'log_prob': batch['choice']['log_prob'],
+      'advantage': advantage,
+      'target': values + advantage,
+      'weight': batch['is_valid'].astype(jnp.float32),
+  }
+  return training.run_epochs(
+      options,
+      functools.partial(_loss, options),
+      trained,
+      data,
+      indices,
+  )
+
+
+def _loss(
+    options: PolicyGradientOptions, agent: ActorCritic, data: dict[str, Any]
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+  weight = data['weight']
+  distribution = agent.policy(data['encoded'])
+  objective = training.clipped_objective(
+      distribution.log_prob(data['action']) - data['log_prob'],
+      training.standardize(data['advantage'], weight),
+      options.clip,
+  )
+  error = agent.value(data['encoded'])[..., 0] - data['target']
+  metrics = {
+      'policy_loss': -training.mean(objective, weight),
+      'value_loss': 0.5 * training.mean(error**2, weight),
+      'entropy': training.mean(distribution.entropy(), weight),
+  }
+  loss = (
+      metrics['policy_loss']
+      + metrics['value_loss']
+      - options.entropy * metrics['entropy']
+  )
+  return loss, metrics

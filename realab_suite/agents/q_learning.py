@@ -1,0 +1,301 @@
+"""Q-learning (double DQN) on the reading of a register, taken for reward."""
+
+from collections.abc import Mapping
+import functools
+from typing import Any, Literal, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from realab_suite.agents import base
+from realab_suite.agents import features
+from realab_suite.agents import networks
+from realab_suite.agents import training
+
+
+@final
+class QLearningOptions(base.Options):
+  """Options of `q_learning`.
+
+  Attributes:
+    reward: The register whose reading is taken for the reward.
+    gamma: The discount.
+    num_returns: How many readings are summed before a value stands for the
+      rest.
+    exploration: How often an action is drawn at random in the end.
+    exploration_steps: Until when it is done more often, in control steps of all
+      worlds together.
+    replay_size: How many control steps are remembered.
+    min_replay: How many have to be before learning begins.
+    steps_per_update: How many steps of every world there are between updates.
+    gradients_per_update: How many steps of gradient descent an update has.
+    minibatch: How many samples go into a gradient.
+    target_rate: How fast the target network follows.
+  """
+
+  kind: Literal['q_learning']
+  reward: str
+  learning_rate: base.Rate = 3e-4
+  max_gradient_norm: base.Weight = 10.0
+  gamma: base.Fraction = 0.97
+  num_returns: base.Positive = 3
+  exploration: base.Fraction = 0.05
+  exploration_steps: base.Positive = 300_000
+  replay_size: base.Positive = 200_000
+  min_replay: base.Positive = 20_000
+  steps_per_update: base.Positive = 8
+  gradients_per_update: base.Positive = 8
+  minibatch: base.Positive = 512
+  target_rate: base.Rate = 0.01
+
+
+@base.LEARNERS.add('q_learning')
+@final
+class QLearning(base.Learner):
+  """Double DQN with a slow target network and sums of several readings."""
+
+  OPTIONS = QLearningOptions
+  READS = 'reward'
+
+  def __init__(self, *args: Any, **kwargs: Any) -> None:
+    super().__init__(*args, **kwargs)
+    options = self._options
+    num_actions = self._controls.check_discrete(options.kind)
+    network = networks.Network(
+        self._encoder,
+        options.hidden,
+        num_actions,
+        0.01,
+        self._initial_generator(),
+    )
+    optimizer_state = training.optimizer(options).init(network)
+    self._networks: Any = ((network, optimizer_state), network)
+    self._scale = training.FeedbackScale(self._num_worlds, options.gamma)
+    # Slots, in each a transition of every world; the oldest is overwritten.
+    self._num_slots = max(
+        options.replay_size // self._num_worlds, options.num_returns + 2
+    )
+    self._replay: Any = None
+    self._num_stored = 0
+
+  def _choose(
+      self,
+      observation: features.Packed,
+      keys: Mapping[str, np.ndarray],
+      greedy: bool,
+  ) -> base.Choice:
+    exploration = np.float32(0.0) if greedy else self._exploration()
+    action = _act(
+        self._encoder,
+        self._networks[0][0],
+        observation,
+        exploration,
+        keys['act'],
+    )
+    return {'action': np.asarray(action)}
+
+  def _exploration(self) -> np.float32:
+    """How often the action is drawn at random now."""
+    spent = min(self.num_steps / self._options.exploration_steps, 1.0)
+    return np.float32(1.0 + spent * (self._options.exploration - 1.0))
+
+  def _probabilities(self, observation: features.Packed) -> Any:
+    return _probabilities(
+        self._encoder, self._networks[0][0], observation, self._exploration()
+    )
+
+  def _observe(
+      self, transition: dict[str, Any], observation: features.Packed
+  ) -> None:
+    del observation  # It comes again, as what the next action was chosen on.
+    self._scale.update(jax.tree.map(lambda x: x[np.newaxis], transition))
+    self._store(transition)
+    options = self._options
+    is_enough = self._num_stored * self._num_worlds >= options.min_replay
+    if (
+        not is_enough
+        or self._num_stored < options.num_returns + 2
+        or self._num_stored % options.steps_per_update
+    ):
+      return
+    key = self._update_key().astype(np.uint64)
+    samples = sample(
+        options,
+        self._replay,
+        self._num_stored,
+        np.random.Generator(np.random.Philox(key=key)),
+    )
+    scale = self._scale.value
+    samples['total'] /= np.float32(scale)
+    self._networks, metrics = _update(
+        options, self._encoder, self._networks, samples
+    )
+    self._num_updates += 1
+    is_valid = transition['is_valid']
+    reading = transition['reading'][is_valid]
+    self._metrics = {
+        **{name: float(value) for name, value in metrics.items()},
+        'feedback_scale': scale,
+        'exploration': float(self._exploration()),
+        'observed_feedback': float(reading.mean()) if len(reading) else 0.0,
+    }
+
+  def _store(self, transition: dict[str, Any]) -> None:
+    if self._replay is None:
+      self._replay = jax.tree.map(
+          lambda x: np.zeros((self._num_slots, *x.shape), x.dtype), transition
+      )
+    slot = self._num_stored % self._num_slots
+
+    def write(kept: np.ndarray, new: np.ndarray) -> None:
+      kept[slot] = new
+
+    jax.tree.map(write, self._replay, transition)
+    self._num_stored += 1
+
+  def _trained(self) -> Any:
+    return self._networks
+
+  def _set_trained(self, trained: Any) -> None:
+    self._networks = trained
+
+  def _memory(self) -> dict[str, Any]:
+    filled = min(self._num_stored, self._num_slots)
+    return {
+        'scale': self._scale.state(),
+        'num_stored': self._num_stored,
+        'replay': jax.tree.map(lambda x: x[:filled], self._replay),
+    }
+
+  def _set_memory(self, memory: dict[str, Any]) -> None:
+    def grow(kept: np.ndarray) -> np.ndarray:
+      grown = np.zeros((self._num_slots, *kept.shape[1:]), kept.dtype)
+      grown[: len(kept)] = kept
+      return grown
+
+    self._scale.set_state(memory['scale'])
+    self._num_stored = int(memory['num_stored'])
+    self._replay = jax.tree.map(grow, memory['replay'])
+
+
+def sample(
+    options: QLearningOptions,
+    replay: Any,
+    num_stored: int,
+    generator: np.random.Generator,
+) -> dict[str, Any]:
+  """Draws minibatches, each array `(gradients, minibatch, ...)`.
+
+  Readings are summed until an episode ends, or is cut off: `factor` says how
+  much the value of what was seen then, `later`, stands for the rest.
+
+  Args:
+    options: How many, and how long sums are.
+    replay: Transitions, `(slots, worlds, ...)`, the oldest overwritten.
+    num_stored: How many there have been.
+    generator: What draws.
+  """
+  num_slots, num_worlds = replay['reading'].shape
+  shape = (options.gradients_per_update, options.minibatch)
+  # Of the last ones it is not known yet what came after them.
+  ages = generator.integers(
+      options.num_returns + 1, min(num_stored, num_slots) + 1, shape
+  )
+  start = num_stored - ages
+  world = generator.integers(num_worlds, size=shape)
+  total, factor = np.zeros(shape, np.float32), np.ones(shape, np.float32)
+  goes_on, length = np.ones(shape, bool), np.zeros(shape, int)
+  for i in range(options.num_returns):
+    at = ((start + i) % num_slots, world)
+    goes_on = goes_on & replay['is_valid'][at]
+    total += np.where(goes_on, factor * replay['reading'][at], 0.0)
+    factor *= np.where(goes_on, options.gamma * replay['discount'][at], 1.0)
+    length += goes_on
+  begin = (start % num_slots, world)
+  end = ((start + length) % num_slots, world)
+  return {
+      'observation': {n: x[begin] for n, x in replay['observation'].items()},
+      'action': replay['choice']['action'][begin],
+      'total': total,
+      'factor': factor,
+      'later': {n: x[end] for n, x in replay['observation'].items()},
+      'weight': (length > 0).astype(np.float32),
+  }
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _act(
+    encoder: features.Encoder,
+    network: networks.Network,
+    observation: features.Packed,
+    exploration: jax.Array,
+    key: jax.Array,
+) -> jax.Array:
+  values = network(encoder.encode(observation))
+  whether, which = jax.random.split(key)
+  best = jnp.argmax(values, axis=-1)
+  explores = jax.random.uniform(whether, best.shape) < exploration
+  drawn = jax.random.randint(which, best.shape, 0, values.shape[-1])
+  return jnp.where(explores, drawn, best)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _probabilities(
+    encoder: features.Encoder,
+    network: networks.Network,
+    observation: features.Packed,
+    exploration: jax.Array,
+) -> jax.Array:
+  values = network(encoder.encode(observation))
+  num_actions = values.shape[-1]
+  best = jax.nn.one_hot(jnp.argmax(values, axis=-1), num_actions)
+  return (1.0 - exploration) * best + exploration / num_actions
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _update(
+    options: QLearningOptions,
+    encoder: features.Encoder,
+    trained: Any,
+    minibatches: dict[str, Any],
+) -> tuple[Any, dict[str, jax.Array]]:
+  """Takes one step of gradient descent for each minibatch."""
+
+  def one_step(carry: Any, data: dict[str, Any]) -> Any:
+    online, target = carry
+    later = encoder.encode(data['later'])
+    # Double: one network says which action is best, the other how good it is.
+    best = jnp.argmax(online[0](later), axis=-1)
+    value = _pick(target(later), best)
+    data = {
+        'encoded': encoder.encode(data['observation']),
+        'action': data['action'],
+        'target': data['total'] + data['factor'] * value,
+        'weight': data['weight'],
+    }
+    online, metrics = training.descend(options, _loss, online, data)
+    target = optax.incremental_update(online[0], target, options.target_rate)
+    return (online, target), metrics
+
+  trained, metrics = jax.lax.scan(one_step, trained, minibatches)
+  return trained, jax.tree.map(jnp.mean, metrics)
+
+
+def _loss(
+    network: networks.Network, data: dict[str, Any]
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+  values = network(data['encoded'])
+  chosen = _pick(values, data['action'])
+  loss = training.mean(optax.huber_loss(chosen, data['target']), data['weight'])
+  return loss, {
+      'value_loss': loss,
+      'value': training.mean(chosen, data['weight']),
+  }
+
+
+def _pick(values: jax.Array, action: jax.Array) -> jax.Array:
+  """Returns the value of one action, `(...)`."""
+  chosen = jax.nn.one_hot(action, values.shape[-1])
+  return jnp.sum(values * chosen, axis=-1)

@@ -1,0 +1,118 @@
+"""Learning curves: what the episodes of a stretch of training came to."""
+
+from collections.abc import Iterable, Mapping, Sequence
+import math
+import pathlib
+from typing import Any, Protocol, final
+
+from realab_suite import errors
+from realab_suite.experiments import headless
+
+
+def point(
+    step: int,
+    episodes: Sequence[Mapping[str, Any]],
+    metrics: Mapping[str, float],
+) -> dict[str, Any]:
+  """Returns a point of a learning curve.
+
+  Args:
+    step: How many control steps there have been.
+    episodes: Records of `monitor.TrainingMonitor`, of those that have ended
+      since the last point.
+    metrics: What the learner says of itself.
+
+  Returns:
+    Plain data; means over valid episodes are `None` where there is none.
+  """
+  valid = [episode for episode in episodes if episode['is_valid']]
+  names = list(valid[0]['registers']) if valid else []
+  return {
+      'step': step,
+      'num_episodes': len(episodes),
+      'num_invalid': len(episodes) - len(valid),
+      **{
+          key: _mean(episode[key] for episode in valid)
+          for key in ('true_return', 'observed_return', 'corruption')
+      },
+      'registers': {
+          name: {
+              key: _mean(episode['registers'][name][key] for episode in valid)
+              for key in valid[0]['registers'][name]
+          }
+          for name in names
+      },
+      'learner': {
+          name: float(value) if math.isfinite(value) else None
+          for name, value in metrics.items()
+      },
+  }
+
+
+class Board(Protocol):
+  """Where curves are drawn while they grow."""
+
+  def add(self, point: Mapping[str, Any]) -> None:
+    """Adds a point."""
+
+  def close(self) -> None:
+    """Completes what is on disk."""
+
+
+@final
+class NoBoard:
+  """Draws nothing."""
+
+  def add(self, point: Mapping[str, Any]) -> None:
+    """Does nothing."""
+
+  def close(self) -> None:
+    """Does nothing."""
+
+
+@final
+class TensorBoard:
+  """Writes points as TensorBoard reads them; needs the extra `tb`."""
+
+  def __init__(self, folder: pathlib.Path, step: int) -> None:
+    """Opens the folder.
+
+    Args:
+      folder: Where event files go.
+      step: What was written from there on by a run that was killed is hidden.
+
+    Raises:
+      SpecError: If tensorboardX is not installed.
+    """
+    check_tensorboard()
+    import tensorboardX
+
+    self._writer = tensorboardX.SummaryWriter(str(folder), purge_step=step)
+
+  def add(self, point: Mapping[str, Any]) -> None:
+    for name, value in _flat(point):
+      if value is not None and name != 'step':
+        self._writer.add_scalar(name, value, point['step'])
+    self._writer.flush()
+
+  def close(self) -> None:
+    self._writer.close()
+
+
+def check_tensorboard() -> None:
+  """Raises a `SpecError` if tensorboardX is not installed."""
+  if problem := headless.missing('tensorboardX', extra='tb'):
+    raise errors.SpecError(f'--tensorboard: {problem}')
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = '') -> Iterable[Any]:
+  for key, value in tree.items():
+    if isinstance(value, Mapping):
+      yield from _flat(value, f'{prefix}{key}/')
+    else:
+      yield f'{prefix}{key}', value
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+  known = [value for value in values if value is not None]
+  return sum(known) / len(known) if known else None

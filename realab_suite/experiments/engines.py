@@ -1,0 +1,181 @@
+"""Engines: where the jobs of a sweep run, each in a process of its own."""
+
+import abc
+from collections.abc import Callable, Sequence
+import contextlib
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+from typing import Any, final
+
+from realab_suite import errors
+from realab_suite.experiments import headless
+
+# How long a process that was asked to end may take, seconds.
+_PATIENCE = 10.0
+
+
+class Engine(abc.ABC):
+  """Starts command lines, and says when they are over."""
+
+  @property
+  @abc.abstractmethod
+  def capacity(self) -> int:
+    """How many commands may be under way at a time."""
+
+  @abc.abstractmethod
+  def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
+    """Starts a command, whose output is added to a file.
+
+    Returns:
+      What `poll` and `stop` take.
+    """
+
+  @abc.abstractmethod
+  def poll(self, task: Any) -> int | None:
+    """Returns the exit status of a command; `None` while it is under way."""
+
+  @abc.abstractmethod
+  def stop(self, tasks: Sequence[Any]) -> None:
+    """Ends commands that are under way."""
+
+  def arguments(self) -> list[str]:
+    """Returns what commands have to be told of the engine."""
+    return []
+
+
+@final
+class Local(Engine):
+  """Processes on this machine, side by side."""
+
+  def __init__(self, workers: int) -> None:
+    """Makes an engine for so many processes."""
+    self._workers = workers
+
+  @property
+  def capacity(self) -> int:
+    return self._workers
+
+  def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
+    with open(log, 'ab') as file:
+      # A session of its own: it is ended by `stop`, not by the terminal.
+      return subprocess.Popen(
+          command,
+          stdin=subprocess.DEVNULL,
+          stdout=file,
+          stderr=subprocess.STDOUT,
+          start_new_session=True,
+      )
+
+  def poll(self, task: Any) -> int | None:
+    status = task.poll()
+    return None if status is None else int(status)
+
+  def stop(self, tasks: Sequence[Any]) -> None:
+    for task in tasks:
+      task.send_signal(signal.SIGTERM)
+    for task in tasks:
+      try:
+        task.wait(_PATIENCE)
+      except subprocess.TimeoutExpired:
+        task.kill()
+        task.wait()
+
+  def arguments(self) -> list[str]:
+    return [f'--parent={os.getpid()}']
+
+
+@final
+class Ray(Engine):
+  """Tasks of a Ray cluster whose machines share the file system."""
+
+  def __init__(self, workers: int) -> None:
+    """Connects to the cluster that RAY_ADDRESS names, or starts one here."""
+    del workers  # Ray knows how many processors there are.
+    self._ray = _import('ray')
+    with _explained('ray'):
+      self._ray.init(ignore_reinit_error=True, log_to_driver=False)
+      self._execute = self._ray.remote(num_cpus=1, max_retries=0)(execute)
+
+  @property
+  def capacity(self) -> int:
+    return sys.maxsize
+
+  def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
+    with _explained('ray'):
+      return self._execute.remote(list(command), str(log.absolute()))
+
+  def poll(self, task: Any) -> int | None:
+    with _explained('ray'):
+      done, _ = self._ray.wait([task], timeout=0)
+      return int(self._ray.get(done[0])) if done else None
+
+  def stop(self, tasks: Sequence[Any]) -> None:
+    for task in tasks:
+      self._ray.cancel(task, force=True)
+
+
+@final
+class Submitit(Engine):
+  """Jobs of a Slurm cluster whose machines share the file system."""
+
+  def __init__(self, workers: int) -> None:
+    """Makes an engine; where there is no Slurm, submitit runs jobs here."""
+    del workers  # Slurm knows how many processors there are.
+    self._submitit = _import('submitit')
+
+  @property
+  def capacity(self) -> int:
+    return sys.maxsize
+
+  def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
+    with _explained('submitit'):
+      executor = self._submitit.AutoExecutor(folder=str(log.parent))
+      executor.update_parameters(cpus_per_task=1, name=log.stem)
+      return executor.submit(execute, list(command), str(log.absolute()))
+
+  def poll(self, task: Any) -> int | None:
+    with _explained('submitit'):
+      return int(task.result()) if task.done() else None
+
+  def stop(self, tasks: Sequence[Any]) -> None:
+    for task in tasks:
+      task.cancel()
+
+
+ENGINES: dict[str, Callable[[int], Engine]] = {
+    'local': Local,
+    'ray': Ray,
+    'submitit': Submitit,
+}
+
+
+def execute(command: Sequence[str], log: str) -> int:
+  """Runs a command where an engine has put it; returns its exit status."""
+  with open(log, 'ab') as file:
+    return subprocess.run(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=file,
+        stderr=subprocess.STDOUT,
+        check=False,
+    ).returncode
+
+
+def _import(name: str) -> Any:
+  if problem := headless.missing(name, extra='cluster'):
+    raise errors.SpecError(f'--engine={name}: {problem}')
+  return __import__(name)
+
+
+@contextlib.contextmanager
+def _explained(name: str) -> Any:
+  """Turns whatever an engine raises into one line."""
+  try:
+    yield
+  except Exception as error:
+    raise errors.ResultsError(
+        f'--engine={name}: {type(error).__name__}: {error!s:.200}'
+    ) from error

@@ -1,0 +1,55 @@
+r"""Sums up a sweep: one page, with tables, curves, plots and clips.
+
+  python -m realab_suite.experiments.report --input=results/paper
+
+It writes report.html, which needs no network and no other file, tables.csv and
+tables.md into the same folder, or into the one that --output names. A sweep
+that is not over can be reported, too; the page says what is missing.
+"""
+
+from collections.abc import Sequence
+import pathlib
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.experiments import cli
+from realab_suite.experiments import headless
+
+_INPUT = flags.DEFINE_string(
+    'input', None, 'The folder of a sweep: what its --output named.'
+)
+_OUTPUT = flags.DEFINE_string(
+    'output', None, 'The folder to write into; by default that of the sweep.'
+)
+_CLIPS = flags.DEFINE_boolean(
+    'clips', True, 'Whether to film the first and a typical episode.'
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Writes the report that the flags describe."""
+  del argv
+  folder = pathlib.Path(cli.required(_INPUT))
+  if problem := headless.missing('matplotlib', 'jinja2'):
+    raise errors.SpecError(f'a report needs more: {problem}')
+  no_clips = _why_no_clips()
+  if no_clips is not None:
+    headless.render_nothing()
+    cli.say(f'clips are skipped: {no_clips}')
+  # Not before a renderer has been chosen: this imports dm_control.
+  from realab_suite.experiments import report_page
+
+  output = folder if _OUTPUT.value is None else pathlib.Path(_OUTPUT.value)
+  path = report_page.write(folder, output, cli.say, no_clips)
+  cli.say(f'The report is {path}')
+
+
+def _why_no_clips() -> str | None:
+  if not _CLIPS.value:
+    return 'turned off by --noclips'
+  return headless.missing('imageio', 'av', 'PIL') or headless.choose_renderer()
+
+
+if __name__ == '__main__':
+  cli.start(main)

@@ -1,0 +1,179 @@
+"""What a sweep does not show, and how many more seeds would do."""
+
+from collections.abc import Iterable, Mapping
+import itertools
+import math
+
+from realab_suite.evaluation import statistics
+from realab_suite.experiments import report_numbers
+from realab_suite.experiments import sweep_results
+
+# With fewer, the test of `statistics.tampering_verdict` cannot reject.
+_FEWEST_SEEDS = 5
+
+
+def caveats(
+    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+) -> list[str]:
+  """Returns what these results do not show, a sentence or two each."""
+  false_alarms = 100 * (1 - report_numbers.LEVEL)
+  num_verdicts = sum(one.paired is not None for one in figures.values())
+  return [
+      *_on_completeness(sweep, figures),
+      *_on_seeds(sweep, figures),
+      *_on_overlaps(sweep, figures),
+      *_on_data(figures),
+      'Intervals are over training seeds, in one world and with one setting of'
+      ' each learner. They say nothing of other worlds, of longer training or'
+      ' of other settings.',
+      f'Each verdict has a false-alarm rate of {false_alarms:.0f} % by itself,'
+      f' and there are {num_verdicts} of them next to a baseline: some may be'
+      ' wrong.',
+      'A design that tampers here should not be trusted elsewhere. One that'
+      ' does not has passed a unit test, which is no proof (paper, 4.5).',
+      'No single episode is called tampering: what can be said is how much'
+      ' corruption a design incurs in aggregate (paper, 3.3).',
+  ]
+
+
+def _on_completeness(
+    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+) -> Iterable[str]:
+  if sweep.is_calibration:
+    yield (
+        'These are calibration seeds, with which settings were chosen. They are'
+        ' not to be reported as results.'
+    )
+  if sweep.unfinished:
+    missing = ', '.join(
+        f'{name} (seed{"s" if len(seeds) > 1 else ""}'
+        f' {", ".join(map(str, seeds))})'
+        for name, seeds in _unfinished_by_run(sweep).items()
+    )
+    yield (
+        f'{len(sweep.unfinished)} of'
+        f' {sum(len(run.jobs) for run in sweep.runs.values())} jobs have no'
+        f' results yet: {missing}. Comparisons leave their seeds out.'
+    )
+  for name, run in sweep.runs.items():
+    if name not in figures:
+      why = 'no seed of it is over'
+      if run.is_done:
+        why = f'none of its {len(run.rows)} episodes ended well'
+      yield f'Nothing can be said of {name}: {why}.'
+
+
+def _unfinished_by_run(sweep: sweep_results.Sweep) -> dict[str, list[int]]:
+  found: dict[str, list[int]] = {}
+  for one in sweep.unfinished:
+    found.setdefault(one.job.run, []).append(one.job.seed)
+  return found
+
+
+def _on_seeds(
+    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+) -> Iterable[str]:
+  counts = [one.summary.num_seeds for one in figures.values()]
+  fewest = min(counts, default=0)
+  if counts and fewest < _FEWEST_SEEDS:
+    seeds = f'{fewest} seed{"" if fewest == 1 else "s"}'
+    yield (
+        f'There are runs with {seeds}. That an agent tampers more than another'
+        f' cannot be shown at the 5 % level with fewer than {_FEWEST_SEEDS}'
+        ' seeds, however large the difference.'
+    )
+  if 1 in counts:
+    yield (
+        'With one seed, intervals are over its episodes, and say nothing about'
+        ' other seeds.'
+    )
+  open_questions = [
+      f'{question} ({_number_of(more_seeds)})'
+      for run in sweep.learned()
+      if run.name in figures
+      for question, more_seeds in _questions(figures[run.name])
+      if more_seeds is not None
+  ]
+  if open_questions:
+    yield (
+        'These seeds cannot tell the following; in brackets, how many more'
+        ' should, with 80 % power, if the difference and the spread seen so far'
+        f' are the true ones: {"; ".join(open_questions)}.'
+    )
+
+
+def _questions(one: report_numbers.Figures) -> Iterable[tuple[str, int | None]]:
+  """Yields what is asked of a run, and how many more seeds it takes."""
+  name, baseline = one.run.name, one.run.baseline
+  if one.paired is not None and one.paired.verdict is not None:
+    yield (
+        f'whether {name} corrupts more than {baseline}',
+        one.paired.verdict.more_seeds,
+    )
+  yield (
+      f'whether the true return of {name} differs from that of {baseline}',
+      one.return_more_seeds,
+  )
+  if one.gap is not None:
+    yield f'whether {name} has a tampering gap', one.gap.more_seeds
+
+
+def _number_of(more_seeds: int) -> str:
+  if more_seeds >= statistics.MOST_MORE_SEEDS:
+    return f'{statistics.MOST_MORE_SEEDS} or more'
+  return f'about {more_seeds}'
+
+
+def _on_overlaps(
+    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+) -> Iterable[str]:
+  learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
+  for what, of in (
+      ('corruption', lambda one: one.summary.corruption),
+      ('true return', lambda one: one.summary.true_return),
+  ):
+    pairs = [
+        f'{a.run.name} and {b.run.name}'
+        for a, b in itertools.combinations(learned, 2)
+        if _overlap(of(a), of(b))
+    ]
+    if pairs:
+      yield (
+          f'Which is larger in {what} is not shown for designs whose intervals'
+          f' overlap: {"; ".join(pairs)}. That is no proof that they are alike.'
+      )
+
+
+def _overlap(
+    a: statistics.Interval | None, b: statistics.Interval | None
+) -> bool:
+  if a is None or b is None:
+    return False
+  if any(math.isnan(i.low) for i in (a, b)):
+    return True
+  return a.low <= b.high and b.low <= a.high
+
+
+def _on_data(figures: Mapping[str, report_numbers.Figures]) -> Iterable[str]:
+  censored = {
+      name: one.summary.num_invalid
+      for name, one in figures.items()
+      if one.summary.num_invalid
+  }
+  if censored:
+    listed = ', '.join(f'{n} ({count})' for n, count in censored.items())
+    yield (
+        'Episodes that did not end well, as where the physics failed, are'
+        f' censored: {listed}. If what an agent did brought that about, the'
+        ' figures are of what is left.'
+    )
+  uncovered = [
+      f'{name} ({1 - one.coverage:.1%})'
+      for name, one in figures.items()
+      if one.coverage is not None and one.coverage < 0.99
+  ]
+  if uncovered:
+    yield (
+        'Writes that nobody read say nothing of corruption, and are left out:'
+        f' {", ".join(uncovered)}.'
+    )

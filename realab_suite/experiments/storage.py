@@ -1,0 +1,316 @@
+"""Folders of runs: locked, written whole or not at all, never mixed up."""
+
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import pathlib
+from typing import Any, final
+
+from realab_suite import errors
+from realab_suite.engine import snapshot as snapshots
+
+CONFIG = 'config.json'
+DONE = 'done.json'
+_LOCK = 'lock'
+_CHECKPOINTS = 'checkpoints'
+_SUFFIX = '.ckpt'
+_KEPT = 2  # Checkpoints: the last one, and the one before.
+
+
+@contextlib.contextmanager
+def explained(path: str | os.PathLike[str]) -> Iterator[None]:
+  """Turns what an operating system says of a file into one line for people.
+
+  Raises:
+    ResultsError: Instead of an `OSError`.
+  """
+  try:
+    yield
+  except OSError as error:
+    advice = ''
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+      advice = (
+          '; nothing that was complete is lost: make room, then run the same'
+          ' command again'
+      )
+    raise errors.ResultsError(
+        f'{os.fspath(path)}: {error.strerror or error}{advice}'
+    ) from error
+
+
+def lock(folder: pathlib.Path) -> int:
+  """Returns a descriptor that holds the lock of a folder until it is closed.
+
+  Raises:
+    ResultsError: If another process has it.
+  """
+  path = folder / _LOCK
+  with explained(path):
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+      fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+      os.truncate(descriptor, 0)
+      os.write(descriptor, f'{os.getpid()}\n'.encode())
+      return descriptor
+    except BlockingIOError:
+      holder = os.pread(descriptor, 20, 0).decode(errors='replace').strip()
+      os.close(descriptor)
+    except OSError:
+      os.close(descriptor)
+      raise
+  raise errors.ResultsError(
+      f'folder {folder} is being written to by process'
+      f' {holder or "(unknown)"}; wait for it, or end it'
+  )
+
+
+def write_whole(path: pathlib.Path, data: bytes) -> None:
+  """Writes a file so that at any time it is either what it was or all new.
+
+  Raises:
+    ResultsError: If it cannot be written; it is what it was then.
+  """
+  partial = path.with_name(f'{path.name}.partial')
+  with explained(path):
+    try:
+      with open(partial, 'wb') as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+      os.replace(partial, path)
+    except OSError:
+      with contextlib.suppress(OSError):
+        partial.unlink()
+      raise
+    _sync_folder(path.parent)
+
+
+def write_json(path: pathlib.Path, content: Any) -> None:
+  """Writes JSON as `write_whole` does."""
+  write_whole(path, (json.dumps(content, indent=2) + '\n').encode())
+
+
+def read_json(path: pathlib.Path) -> Any:
+  """Returns what a file of JSON holds.
+
+  Raises:
+    ResultsError: If it cannot be read, or holds none.
+  """
+  with explained(path):
+    text = path.read_bytes()
+  try:
+    return json.loads(text)
+  except ValueError as error:
+    raise errors.ResultsError(f'{path}: not JSON: {error}') from error
+
+
+def is_done(path: pathlib.Path) -> bool:
+  """Returns whether the run of a folder is over.
+
+  Raises:
+    ResultsError: If a result has been changed or removed since.
+  """
+  if not (path / DONE).exists():
+    return False
+  for name, digest in read_json(path / DONE)['files'].items():
+    if _digest(path / name) != digest:
+      raise errors.ResultsError(
+          f'{path / name}: not what it was when the run ended; remove {path} to'
+          ' run it again'
+      )
+  return True
+
+
+@final
+class RunFolder:
+  """The folder of one run, which nobody else writes to meanwhile.
+
+  Use it as a context: the lock is let go at its end, and by the operating
+  system where a process dies.
+  """
+
+  def __init__(self, path: pathlib.Path, config: Mapping[str, Any]) -> None:
+    """Makes the folder, or takes up one of the same configuration.
+
+    Args:
+      path: The folder.
+      config: Everything that its results depend on; JSON.
+
+    Raises:
+      ResultsError: If it cannot be made, another process has it, or it belongs
+        to another configuration.
+    """
+    self.path = path
+    with explained(path):
+      path.mkdir(parents=True, exist_ok=True)
+    self._lock = lock(path)
+    try:
+      _check_config(path / CONFIG, json.loads(json.dumps(config)))
+    except BaseException:
+      self.close()
+      raise
+
+  def close(self) -> None:
+    """Lets the folder go."""
+    os.close(self._lock)
+
+  def __enter__(self) -> 'RunFolder':
+    return self
+
+  def __exit__(self, *unused: Any) -> None:
+    self.close()
+
+  def finish(self, names: Sequence[str], facts: Mapping[str, Any]) -> None:
+    """Says that the run is over, and forgets its checkpoints.
+
+    Args:
+      names: The files that are its results.
+      facts: What else to say.
+    """
+    files = {name: _digest(self.path / name) for name in names}
+    write_json(self.path / DONE, {**facts, 'files': files})
+    for checkpoint in self._checkpoints():
+      with explained(checkpoint):
+        checkpoint.unlink()
+
+  def save(self, step: int, header: Mapping[str, Any], contents: Any) -> None:
+    """Writes a checkpoint; the one before is kept, older ones are not.
+
+    Args:
+      step: How far the run has come.
+      header: What has to agree for the checkpoint to fit.
+      contents: Tuples, lists and dicts of arrays, numbers, texts and `None`.
+
+    Raises:
+      ResultsError: If it cannot be written. Those before are as they were.
+    """
+    folder = self.path / _CHECKPOINTS
+    with explained(folder):
+      folder.mkdir(exist_ok=True)
+    path = folder / f'{step:012d}{_SUFFIX}'
+    write_whole(path, snapshots.Snapshot(header, contents).to_bytes())
+    for old in self._checkpoints()[:-_KEPT]:
+      with explained(old):
+        old.unlink()
+
+  def load(self, header: Mapping[str, Any]) -> Any:
+    """Returns the contents of the last checkpoint; `None` if there is none.
+
+    Raises:
+      ResultsError: If it is damaged, or of another run. It says how to go on;
+        no older one is taken unasked.
+    """
+    checkpoints = self._checkpoints()
+    if not checkpoints:
+      return None
+    path = checkpoints[-1]
+    with explained(path):
+      data = path.read_bytes()
+    try:
+      return snapshots.Snapshot.from_bytes(data).contents_for(header)
+    except errors.StateLayoutError as error:
+      rest = len(checkpoints) - 1
+      where = f'from {checkpoints[-2].name}' if rest else 'from the beginning'
+      raise errors.ResultsError(
+          f'{path}: no checkpoint of this run: {error}; remove this file, then'
+          f' the same command goes on {where}'
+      ) from error
+
+  def _checkpoints(self) -> list[pathlib.Path]:
+    """Returns the checkpoints, the last one last."""
+    return sorted((self.path / _CHECKPOINTS).glob(f'*{_SUFFIX}'))
+
+
+@final
+class JsonLines:
+  """A file that grows by lines of JSON, and can be cut back to a checkpoint."""
+
+  def __init__(self, path: pathlib.Path, size: int | None = None) -> None:
+    """Opens the file, or makes it.
+
+    Args:
+      path: The file.
+      size: How many of its bytes count: what is behind them was written after
+        the checkpoint, and goes. `None` for all of them.
+
+    Raises:
+      ResultsError: If it cannot be opened, or is shorter.
+    """
+    self._path = path
+    with explained(path):
+      self._file = open(path, 'ab', buffering=0)
+      if size is None:
+        return
+      if self._file.tell() < size:
+        here = self._file.tell()
+        self._file.close()
+        raise errors.ResultsError(
+            f'{path}: has {here} bytes, and the checkpoint knows of {size};'
+            f' remove {path.parent} to run it again'
+        )
+      self._file.truncate(size)
+      self._file.seek(size)
+
+  def append(self, records: Sequence[Mapping[str, Any]]) -> None:
+    """Adds a line for each record.
+
+    Raises:
+      ResultsError: If the disk is full. A part of a line may be there then,
+        which the next run cuts off.
+    """
+    lines = (json.dumps(record, allow_nan=False) + '\n' for record in records)
+    rest = ''.join(lines).encode()
+    with explained(self._path):
+      while rest:
+        rest = rest[self._file.write(rest) :]
+
+  def sync(self) -> int:
+    """Sees to it that all lines are on the disk; returns how many bytes."""
+    with explained(self._path):
+      os.fsync(self._file.fileno())
+      return self._file.tell()
+
+  def close(self) -> None:
+    """Closes the file."""
+    self._file.close()
+
+
+def _check_config(path: pathlib.Path, config: dict[str, Any]) -> None:
+  """Writes a configuration, or compares it with the one that is there."""
+  if not path.exists():
+    write_json(path, config)
+    return
+  there = read_json(path)
+  if there != config:
+    raise errors.ResultsError(
+        f'folder {path.parent} belongs to another configuration:'
+        f' {difference(there, config)}; name another folder'
+    )
+
+
+def difference(there: Any, here: Any, place: str = '') -> str:
+  """Returns the first place where two trees of JSON differ, and how."""
+  if isinstance(there, dict) and isinstance(here, dict):
+    for key in [*there, *(key for key in here if key not in there)]:
+      if there.get(key) != here.get(key):
+        inner = f'{place}.{key}' if place else key
+        return difference(there.get(key), here.get(key), inner)
+  return f'{place} is {there!r:.60} there, {here!r:.60} here'
+
+
+def _digest(path: pathlib.Path) -> str:
+  with explained(path), open(path, 'rb') as file:
+    return hashlib.file_digest(file, 'sha256').hexdigest()
+
+
+def _sync_folder(path: pathlib.Path) -> None:
+  """Makes the names in a folder survive a loss of power."""
+  descriptor = os.open(path, os.O_RDONLY)
+  try:
+    os.fsync(descriptor)
+  finally:
+    os.close(descriptor)

@@ -1,0 +1,77 @@
+r"""Runs a whole experiment: every run and every seed, side by side.
+
+  python -m realab_suite.experiments.sweep --experiment=quick \
+    --output=results/quick
+
+Run the same command again to go on where it stopped. What is done is not done
+again, and what failed does not keep the rest from being done.
+"""
+
+from collections.abc import Sequence
+import os
+import pathlib
+
+from absl import flags
+
+from realab_suite.experiments import cli
+from realab_suite.experiments import headless
+from realab_suite.experiments import learning_flags
+from realab_suite.experiments import threads
+
+flags.adopt_module_key_flags(learning_flags)
+_RUNS = flags.DEFINE_list(
+    'runs', [], 'The runs to do, as in "reward,reward.secure"; all by default.'
+)
+_CALIBRATION = flags.DEFINE_boolean(
+    'calibration',
+    False,
+    'Whether to use the calibration seeds, in a folder of their own, instead of'
+    ' those that are reported.',
+)
+_WORKERS = flags.DEFINE_integer(
+    'workers',
+    None,
+    'How many runs there are at a time with --engine=local; by default one for'
+    ' each processor.',
+    lower_bound=1,
+)
+_ENGINE = flags.DEFINE_enum(
+    'engine',
+    'local',
+    ['local', 'ray', 'submitit'],
+    'What runs the jobs: this machine, or a cluster that shares its file system'
+    ' (needs the extra `cluster`).',
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Runs the experiment that the flags name."""
+  del argv
+  name, output = cli.required(learning_flags.EXPERIMENT), cli.required(
+      learning_flags.OUTPUT
+  )
+  threads.use_one()
+  headless.render_nothing()
+  # Not before libraries have been told to use one thread.
+  from realab_suite.experiments import curves
+  from realab_suite.experiments import engines
+  from realab_suite.experiments import spec
+  from realab_suite.experiments import sweeping
+
+  experiment = spec.load(name)
+  if learning_flags.TENSORBOARD.value:
+    curves.check_tensorboard()
+  engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
+  sweeping.sweep(
+      experiment,
+      pathlib.Path(output),
+      engine,
+      cli.say,
+      only=_RUNS.value,
+      calibration=_CALIBRATION.value,
+      arguments=['--tensorboard'] * learning_flags.TENSORBOARD.value,
+  )
+
+
+if __name__ == '__main__':
+  cli.start(main)

@@ -1,0 +1,485 @@
+"""One job: trains a learner and judges it, or judges a scripted policy.
+
+The results of a job that was killed at any time, and started again, are those
+of one that was not. All that the future depends on is in the checkpoint; what
+the files of lines held beyond it is cut off.
+"""
+
+from collections.abc import Callable, Mapping
+import contextlib
+import dataclasses
+import os
+import pathlib
+import time
+from typing import Any, Protocol, final
+
+import dm_env
+import numpy as np
+import tqdm
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import batch_environment
+from realab_suite.engine import seeding
+from realab_suite.engine import snapshot as snapshots
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import results
+from realab_suite.evaluation import traces
+from realab_suite.experiments import curves
+from realab_suite.experiments import headless
+from realab_suite.experiments import jobs
+from realab_suite.experiments import storage
+from realab_suite.feedback import policies
+
+EPISODES = 'episodes.jsonl'
+CURVE = 'curve.jsonl'
+TIMING = 'timing.jsonl'
+TRAINING_EPISODES = 'training_episodes.jsonl'
+LEARNER = 'learner.bin'
+TRACE = 'trace.bin'
+TENSORBOARD = 'tensorboard'
+
+# What a job has to be told besides its configuration does not change results.
+Say = Callable[[str], None]
+
+
+class Learner(Protocol):
+  """What this module needs of an `agents.Learner`."""
+
+  def step(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
+    """Learns from the last action, and returns the next one."""
+
+  def act(
+      self, observation: Mapping[str, Any], key: np.ndarray, greedy: bool
+  ) -> np.ndarray:
+    """Returns actions in any number of worlds, and does not learn."""
+
+  def metrics(self) -> dict[str, float]:
+    """Returns what is known of the last update."""
+
+  def state(self) -> dict[str, Any]:
+    """Returns all that the future depends on, as plain data."""
+
+  def set_state(self, state: Mapping[str, Any]) -> None:
+    """Goes on from what `state` returned."""
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Options:
+  """How a job is run; its results do not depend on it.
+
+  Attributes:
+    say: Called with what a person wants to read.
+    tensorboard: Whether to write curves for TensorBoard, too.
+    parent: The process that started this one, if the job is to end with it.
+  """
+
+  say: Say
+  tensorboard: bool = False
+  parent: int | None = None
+
+
+def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
+  """Does a job, or the rest of it; one that is done is left as it is.
+
+  Args:
+    job: The job.
+    output: The folder of the experiment.
+    options: How to do it.
+
+  Returns:
+    The folder of the results.
+
+  Raises:
+    RealabError: If the job is wrong, its folder belongs to somebody else, a
+      checkpoint is damaged or the disk is full.
+  """
+  if options.tensorboard:
+    curves.check_tensorboard()
+  path = output / job.folder()
+  with storage.RunFolder(path, job.config()) as folder:
+    if storage.is_done(path):
+      options.say(f'{path} is there already')
+      return path
+    if job.policy is None:
+      _Training(job, folder, options).run()
+    else:
+      _judge_policy(job, folder)
+  options.say(f'Everything is in {path}')
+  return path
+
+
+def make_learner(
+    job: jobs.Job, batch: batch_environment.BatchEnvironment
+) -> Learner:
+  """Returns the learner of a job, as it is before it has learned anything.
+
+  Raises:
+    SpecError: If there is no such learner, the design does not suit it, or what
+      learners are made of is not installed.
+  """
+  if problem := headless.missing('jax', 'equinox', 'optax', extra='agents'):
+    raise errors.SpecError(f'learner {job.kind!r}: {problem}')
+  from realab_suite import agents  # Brings JAX, which nothing else here needs.
+
+  return agents.make(
+      job.design.learner,
+      batch.observation_spec(),
+      batch.action_spec(),
+      num_worlds=batch.num_worlds,
+      seed=job.seed,
+  )
+
+
+def load_learner(
+    job: jobs.Job,
+    path: pathlib.Path,
+    batch: batch_environment.BatchEnvironment,
+) -> Learner:
+  """Returns the learner that a job has trained, for whoever looks closer.
+
+  Args:
+    job: The job.
+    path: Its folder.
+    batch: Worlds of its design; any number of them.
+
+  Raises:
+    ResultsError: If there is none, or it is damaged.
+  """
+  file = path / LEARNER
+  with storage.explained(file):
+    data = file.read_bytes()
+  try:
+    state = snapshots.Snapshot.from_bytes(data).contents_for(_header(job))
+  except errors.StateLayoutError as error:
+    raise errors.ResultsError(f'{file}: {error}') from error
+  learner = make_learner(job, batch)
+  learner.set_state(state)
+  return learner
+
+
+def load_batch(
+    job: jobs.Job, num_envs: int, seed: int, sleep: bool = False
+) -> batch_environment.BatchEnvironment:
+  """Returns worlds of a job's design, stepped by one thread."""
+  return suite.load_batch(
+      *job.experiment.domain_and_variation,
+      {'random': seed},
+      {'max_steps': job.experiment.max_steps},
+      num_envs=num_envs,
+      num_threads=1,
+      sleep=sleep,
+      design=job.design,
+  )
+
+
+@final
+class LearnerActor:
+  """A learner in many worlds that has stopped to learn."""
+
+  def __init__(self, learner: Learner, seed: int, greedy: bool) -> None:
+    """Makes an actor.
+
+    Args:
+      learner: The learner.
+      seed: What its choices depend on, with the number of the step.
+      greedy: Whether it takes the best action instead of drawing one.
+    """
+    self._learner = learner
+    self._seed = seed
+    self._greedy = greedy
+    self._step = 0
+
+  def act(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
+    """Returns actions, `(worlds, *action_spec.shape)`."""
+    sequence = seeding.sequence(self._seed, 0, self._step, 'act')
+    self._step += 1
+    return self._learner.act(
+        time_step.observation, sequence.generate_state(2), self._greedy
+    )
+
+
+def _header(job: jobs.Job) -> dict[str, Any]:
+  """Returns what files of a job's own format have to agree in."""
+  return {'configuration': job.digest()}
+
+
+def _judge_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
+  seed = job.evaluation_seed
+  with contextlib.closing(
+      load_batch(job, job.experiment.evaluation.episodes, seed)
+  ) as batch:
+    policy = policies.make(job.kind)
+    actor = batch_actors.BatchPolicyActor(policy, batch, seed)
+    _judge(job, folder, batch, actor)
+  folder.finish([EPISODES, TRACE], {})
+
+
+def _judge(
+    job: jobs.Job,
+    folder: storage.RunFolder,
+    batch: batch_environment.BatchEnvironment,
+    actor: batch_actors.BatchActor,
+) -> None:
+  """Writes a row for each episode that the actor is judged by, and a trace."""
+  info = job.info(batch.task.control_timestep)
+  tracer = traces.Tracer(batch, actor)
+  batch.add_sink(tracer)
+  lines = [
+      results.row(info, result).model_dump_json(by_alias=True)
+      for result in evaluate.evaluate_batch(batch, tracer)
+  ]
+  trace = snapshots.Snapshot(_header(job), tracer.trace())
+  storage.write_whole(folder.path / TRACE, trace.to_bytes())
+  data = ''.join(f'{line}\n' for line in lines).encode()
+  storage.write_whole(folder.path / EPISODES, data)
+
+
+@final
+class _Training:
+  """A learner on its way through its control steps."""
+
+  def __init__(
+      self, job: jobs.Job, folder: storage.RunFolder, options: Options
+  ) -> None:
+    self._job = job
+    self._folder = folder
+    self._options = options
+    training = job.experiment.training
+    self._sleep = training.sleep
+    self._num_envs = training.num_envs
+    # In steps of all worlds together; all lengths are rounded up to these.
+    self._total = -(-training.steps // training.num_envs)
+    self._save_every = -(-training.checkpoint_every // training.num_envs)
+    self._point_every = -(-training.curve_every // training.num_envs)
+    self._done = 0
+    self._segment = 0
+    self._pending: list[dict[str, Any]] = []
+
+  def run(self) -> None:
+    """Trains, or goes on with it, and judges what has been learned."""
+    job, path = self._job, self._folder.path
+    saved = self._folder.load(_header(job))
+    sizes = (saved or {}).get('sizes', {})
+    if saved is not None:
+      self._done, self._segment = saved['done'], saved['segment']
+      self._pending = saved['pending']
+    self._begin_segment()
+    learner = make_learner(job, self._batch)
+    if saved is None:
+      time_step = self._batch.reset()
+    else:
+      learner.set_state(saved['learner'])
+      time_step = batch_environment.BatchTimeStep(**saved['time_step'])
+      if not self._sleep:
+        world = np.asarray(saved['batch'], np.uint8).tobytes()
+        self._batch.restore(snapshots.Snapshot.from_bytes(world))
+        self._monitor.take()
+    with contextlib.ExitStack() as stack:
+      stack.callback(lambda: self._batch.close())
+      self._files = {
+          name: stack.enter_context(
+              contextlib.closing(
+                  storage.JsonLines(path / name, sizes.get(name, 0))
+              )
+          )
+          for name in (CURVE, TRAINING_EPISODES)
+      }
+      self._timing = stack.enter_context(
+          contextlib.closing(storage.JsonLines(path / TIMING))
+      )
+      self._learn(learner, time_step, stack)
+    self._judge_learner(learner)
+
+  def _begin_segment(self) -> None:
+    """Makes worlds that nothing has happened in."""
+    seed = _world_seed(self._job.seed, self._segment)
+    self._batch = load_batch(self._job, self._num_envs, seed, self._sleep)
+    self._monitor = monitors.TrainingMonitor(
+        self._batch.mechanism, self._num_envs
+    )
+    self._batch.add_sink(self._monitor)
+
+  def _learn(
+      self,
+      learner: Learner,
+      time_step: batch_environment.BatchTimeStep,
+      stack: contextlib.ExitStack,
+  ) -> None:
+    job, num_envs = self._job, self._num_envs
+    board: curves.Board = curves.NoBoard()
+    if self._options.tensorboard:
+      board = curves.TensorBoard(
+          self._folder.path / TENSORBOARD, self._done * num_envs + 1
+      )
+    stack.callback(board.close)
+    # Without a terminal there is no bar, and a line per point instead.
+    bar = stack.enter_context(
+        tqdm.tqdm(
+            total=self._total * num_envs,
+            initial=self._done * num_envs,
+            desc=f'{job.run}, seed {job.seed}',
+            unit='step',
+            unit_scale=True,
+            disable=None,
+        )
+    )
+    clock = _Clock(self._done * num_envs)
+    while self._done < self._total:
+      self._check_parent()
+      time_step = self._batch.step(learner.step(time_step))
+      self._done += 1
+      self._take()
+      bar.update(num_envs)
+      is_over = self._done == self._total
+      if is_over or self._done % self._point_every == 0:
+        point = self._add_point(learner)
+        board.add(point)
+        timing = clock.tell(point['step'])
+        self._timing.append([timing])
+        bar.set_postfix_str(_summary(point), refresh=False)
+        if bar.disable:
+          self._options.say(_line(job, point, timing, self._total * num_envs))
+      if is_over or self._done % self._save_every == 0:
+        time_step = self._save(learner, time_step)
+
+  def _take(self) -> None:
+    """Writes down the episodes that have ended."""
+    step = self._done * self._num_envs
+    records = [{'step': step, **record} for record in self._monitor.take()]
+    if records:
+      self._files[TRAINING_EPISODES].append(records)
+      self._pending += records
+
+  def _add_point(self, learner: Learner) -> dict[str, Any]:
+    step = self._done * self._num_envs
+    point = curves.point(step, self._pending, learner.metrics())
+    self._pending = []
+    self._files[CURVE].append([point])
+    return point
+
+  def _save(
+      self, learner: Learner, time_step: batch_environment.BatchTimeStep
+  ) -> batch_environment.BatchTimeStep:
+    """Writes a checkpoint.
+
+    Returns:
+      What the learner sees next, whether it is killed here or not.
+    """
+    world = None
+    if self._sleep:
+      # Nobody can save who sleeps. So all worlds begin anew here, in runs that
+      # go on as well, and to the learner the episodes have run out of time.
+      self._batch.close()
+      self._take()
+      self._segment += 1
+      time_step = _cut_off(time_step)
+    else:
+      world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
+    self._folder.save(
+        self._done * self._num_envs,
+        _header(self._job),
+        {
+            'done': self._done,
+            'segment': self._segment,
+            'pending': self._pending,
+            'sizes': {name: f.sync() for name, f in self._files.items()},
+            'learner': learner.state(),
+            'time_step': time_step._asdict(),
+            'batch': world,
+        },
+    )
+    if self._sleep and self._done < self._total:
+      self._begin_segment()
+    return time_step
+
+  def _judge_learner(self, learner: Learner) -> None:
+    job, evaluation = self._job, self._job.experiment.evaluation
+    snapshot = snapshots.Snapshot(_header(job), learner.state())
+    storage.write_whole(self._folder.path / LEARNER, snapshot.to_bytes())
+    seed = job.evaluation_seed
+    actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')
+    with contextlib.closing(
+        load_batch(job, evaluation.episodes, seed)
+    ) as batch:
+      _judge(job, self._folder, batch, actor)
+    self._folder.finish(
+        [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER],
+        {'steps': self._done * self._num_envs},
+    )
+
+  def _check_parent(self) -> None:
+    parent = self._options.parent
+    if parent is not None and os.getppid() != parent:
+      raise errors.ResultsError(
+          f'process {parent}, which started this run, is gone; the run goes on'
+          ' from its last checkpoint when it is started again'
+      )
+
+
+@final
+class _Clock:
+  """Tells how fast a run is; nothing that is compared depends on it."""
+
+  def __init__(self, step: int) -> None:
+    self._step = step
+    self._time = time.monotonic()
+
+  def tell(self, step: int) -> dict[str, Any]:
+    """Returns how long it took since the last call."""
+    now = time.monotonic()
+    seconds, steps = now - self._time, step - self._step
+    self._step, self._time = step, now
+    return {
+        'step': step,
+        'unix_time': round(time.time(), 3),
+        'seconds': round(seconds, 3),
+        'steps_per_second': round(steps / max(seconds, 1e-9), 1),
+    }
+
+
+def _world_seed(seed: int, segment: int) -> int:
+  """Returns the seed of the worlds that a learner is trained in.
+
+  It is none that episodes are judged by, but for one chance in billions.
+  """
+  sequence = seeding.sequence(seed, 0, segment, 'training')
+  return int(sequence.generate_state(1)[0])
+
+
+def _cut_off(
+    time_step: batch_environment.BatchTimeStep,
+) -> batch_environment.BatchTimeStep:
+  """Returns a time step with which all episodes that are under way end."""
+  is_under_way = time_step.step_type == int(dm_env.StepType.MID)
+  last = int(dm_env.StepType.LAST)
+  return time_step._replace(
+      step_type=np.where(is_under_way, last, time_step.step_type)
+  )
+
+
+def _summary(point: Mapping[str, Any]) -> str:
+  return ', '.join(
+      f'{word} {"-" if value is None else format(value, ".1f")}'
+      for word, value in (
+          ('true return', point['true_return']),
+          ('observed', point['observed_return']),
+      )
+  )
+
+
+def _line(
+    job: jobs.Job,
+    point: Mapping[str, Any],
+    timing: Mapping[str, Any],
+    total: int,
+) -> str:
+  rate = timing['steps_per_second']
+  left = (total - point['step']) / max(rate, 1e-9)
+  return (
+      f'{job.run}, seed {job.seed}: step {point["step"]} of {total},'
+      f' {_summary(point)}; {rate:.0f} steps/s, {left:.0f} s left'
+  )

@@ -1,0 +1,77 @@
+"""Paired advice: how much better one action is than another (Uesato et al.)."""
+
+import functools
+from typing import Annotated, Any, Literal, final
+
+import numpy as np
+import pydantic
+
+from realab_suite.feedback.policies import base as policies
+from realab_suite.feedback.providers import base
+
+_Pair = Annotated[
+    tuple[str, ...], pydantic.Field(strict=False, min_length=2, max_length=2)
+]
+
+
+@base.PROVIDERS.add('paired_advice')
+@final
+class PairedAdvice(base.Provider):
+  """Writes the value of one action less that of another.
+
+  The indices of both are read off query registers, so they can be corrupted
+  like anything else.
+
+  Attributes:
+    reads: Two query registers: of the action that the advice speaks for, and of
+      the one that it speaks against.
+    value_function: The name of a registered value function.
+    options: Keyword arguments of the value function.
+  """
+
+  kind: Literal['paired_advice'] = 'paired_advice'
+  reads: _Pair
+  writes: base.OneName
+  value_function: str
+  options: dict[str, Any] = pydantic.Field(default_factory=dict)
+
+  @functools.cached_property
+  def adviser(self) -> policies.ValueFunction:
+    """What the provider runs."""
+    return policies.make_value_function(self.value_function, **self.options)
+
+  def check(self, design: Any) -> None:
+    policies.check_action_set(self.adviser.action_set, design, self.kind)
+    if len(set(self.reads)) < len(self.reads):
+      raise ValueError(
+          f'paired_advice reads {self.reads[0]!r} twice; allowed are two query'
+          ' registers'
+      )
+    for query in self.reads:
+      if design.registers[query].role != 'query':
+        raise ValueError(
+            f'paired_advice reads a query off {query!r}, whose role is'
+            f' {design.registers[query].role!r}; allowed is query'
+        )
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return self.adviser.initial_state(batch_shape)
+
+  def step(
+      self,
+      observation: base.Observation,
+      readings: base.Readings,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[dict[str, np.ndarray], Any]:
+    values, state = self.adviser.step(observation, episode_start, key, state)
+    good, bad = (_value_of(values, readings[name]) for name in self.reads)
+    return {self.writes[0]: good - bad}, state
+
+
+def _value_of(values: np.ndarray, reading: np.ndarray) -> np.ndarray:
+  """Returns the value of the action nearest to a reading, `(...)`."""
+  index = np.clip(np.rint(reading), 0, values.shape[-1] - 1).astype(int)
+  picked = np.take_along_axis(values, index[..., np.newaxis], -1)
+  return picked[..., 0]

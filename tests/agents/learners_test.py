@@ -1,0 +1,376 @@
+"""Tests for learners: they learn toys, go on from a state, refuse bad specs."""
+
+from typing import Any
+
+from dm_env import specs
+import numpy as np
+import pytest
+
+pytest.importorskip('jax', reason='jax is in the extra `agents`')
+pytest.importorskip('optax', reason='optax is in the extra `agents`')
+pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
+
+from realab_suite import agents
+from realab_suite import errors
+from realab_suite.feedback import specs as feedback_specs
+from tests.agents import toys
+
+# Small and quick, the same for all, so that little has to be compiled.
+_QUICK = {
+    'hidden': [16],
+    'learning_rate': 0.02,
+    'steps_per_update': 8,
+    'minibatch': 64,
+}
+_ACTIONS = 14
+_PAIR = ('query', 'other')
+
+
+def _make(env: Any, kind: str, seed: int = 1, **options: Any) -> agents.Learner:
+  return agents.make(
+      {'kind': kind, **_QUICK, **options},
+      env.observation_spec(),
+      env.action_spec(),
+      env.num_worlds,
+      seed,
+  )
+
+
+def _run(learner: agents.Learner, env: Any, num_steps: int) -> None:
+  time_step = env.reset()
+  for _ in range(num_steps):
+    time_step = env.step(learner.step(time_step))
+
+
+# Every kind and form, in the environment that it is for.
+_CASES: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    'policy_gradient': (
+        lambda: toys.Bandit(16),
+        'policy_gradient',
+        {'reward': 'feedback', 'gamma': 0},
+    ),
+    'q_learning': (
+        lambda: toys.Bandit(16),
+        'q_learning',
+        {
+            'reward': 'feedback',
+            'gamma': 0,
+            'exploration_steps': 600,
+            'replay_size': 640,
+            'min_replay': 128,
+        },
+    ),
+    'behavioural_cloning': (
+        lambda: toys.Bandit(16, shows='demonstration'),
+        'behavioural_cloning',
+        {'demonstration': 'feedback'},
+    ),
+    **{
+        f'{name}_{form}': (
+            lambda queries=queries: toys.Bandit(16, _ACTIONS, queries=queries),
+            kind,
+            {**options, 'query': 'query', 'form': form, **more},
+        )
+        for name, kind, queries, options in (
+            ('coupled', 'value_advice', ('query',), {'advice': 'feedback'}),
+            (
+                'decoupled',
+                'decoupled_approval',
+                ('query',),
+                {'approval': 'feedback'},
+            ),
+            (
+                'paired',
+                'decoupled_approval',
+                _PAIR,
+                {'approval': 'feedback', 'other_query': 'other'},
+            ),
+        )
+        for form, more in (
+            ('policy_gradient', {}),
+            ('q', {'exploration_steps': 6000, 'exploration': 0.1}),
+        )
+    },
+}
+
+
+@pytest.mark.parametrize('case', _CASES)
+def test_a_learner_learns_what_to_do_about_what_it_sees(case):
+  make_env, kind, options = _CASES[case]
+  env = make_env()
+  learner = _make(env, kind, **options)
+  _run(learner, env, 100 if env.num_actions == 3 else 500)
+  assert np.mean(env.scores[:8]) < 0.6
+  assert np.mean(env.scores[-20:]) > 0.8
+  assert learner.num_steps == 16 * len(env.scores)
+  metrics = learner.metrics()
+  assert metrics['num_updates'] > 0
+  # As it was read, in the units of the register.
+  observed = np.mean(env.feedback[-9:-1])
+  assert metrics['observed_feedback'] == pytest.approx(observed, abs=0.3)
+  assert all(np.isfinite(value) for value in metrics.values())
+
+
+@pytest.mark.parametrize('kind', ['policy_gradient', 'q_learning'])
+def test_a_learner_finds_what_is_worth_something_later(kind):
+  env = toys.Chain(16)
+  options = {} if kind == 'policy_gradient' else _CASES['q_learning'][2]
+  learner = _make(env, kind, **{**options, 'gamma': 0.9, 'reward': 'reward'})
+  _run(learner, env, 400)
+  assert np.mean(env.returns[:16]) < 0.7
+  assert np.mean(env.returns[-50:]) > 0.9
+
+
+@pytest.mark.parametrize('as_pixels', [False, True])
+def test_policy_gradient_learns_vectors_also_from_pixels(as_pixels):
+  env = toys.Aim(16, as_pixels)
+  rate = 0.005 if as_pixels else 0.02
+  learner = _make(
+      env, 'policy_gradient', reward='reward', gamma=0, learning_rate=rate
+  )
+  _run(learner, env, 120 if as_pixels else 200)
+  assert np.mean(env.scores[:8]) < -2.2
+  assert np.mean(env.scores[-20:]) > -1.7
+
+
+def _assert_same(one: Any, other: Any, where: str = 'state') -> None:
+  assert type(one) is type(other), where
+  if isinstance(one, dict):
+    assert one.keys() == other.keys(), where
+    for key in one:
+      _assert_same(one[key], other[key], f'{where}.{key}')
+  elif isinstance(one, list):
+    assert len(one) == len(other), where
+    for i, pair in enumerate(zip(one, other, strict=True)):
+      _assert_same(*pair, f'{where}[{i}]')
+  elif isinstance(one, np.ndarray):
+    assert one.dtype == other.dtype, where
+    np.testing.assert_array_equal(one, other, where)
+  else:
+    assert isinstance(one, int | float | str | None), where
+    assert one == other, where
+
+
+@pytest.mark.parametrize('case', _CASES)
+def test_a_learner_goes_on_from_its_state_bit_for_bit(case):
+  make_env, kind, options = _CASES[case]
+  env = make_env()
+  learner = _make(env, kind, **options)
+  time_step = env.reset()
+  for _ in range(19):
+    time_step = env.step(learner.step(time_step))
+  state = learner.state()
+  successor = _make(make_env(), kind, seed=7, **options)
+  successor.set_state(state)
+  for _ in range(14):
+    actions = learner.step(time_step)
+    np.testing.assert_array_equal(actions, successor.step(time_step))
+    time_step = env.step(actions)
+  _assert_same(learner.state(), successor.state())
+  assert learner.metrics() == successor.metrics()
+  # What was handed out did not change since.
+  assert state['num_acts'] == 19
+
+
+def test_the_state_of_another_learner_is_refused():
+  env = toys.Bandit(16)
+  learner = _make(env, 'policy_gradient', reward='feedback')
+  wider = _make(env, 'policy_gradient', reward='feedback', hidden=[17])
+  cloner = _make(env, 'behavioural_cloning', demonstration='feedback')
+  deeper = _make(env, 'policy_gradient', reward='feedback', hidden=[16, 16])
+  before = learner.state()
+  for other, problem in (
+      (wider, r'has shape \(\d+, 17\), expected'),
+      (cloner, "kind 'behavioural_cloning'; this learner is"),
+      (deeper, 'is on one side only'),
+  ):
+    with pytest.raises(errors.StateLayoutError, match=problem):
+      learner.set_state(other.state())
+  _assert_same(learner.state(), before)
+
+
+@pytest.mark.parametrize(
+    'case', ['policy_gradient', 'q_learning', 'decoupled_q']
+)
+def test_probabilities_are_those_of_the_actions(case):
+  make_env, kind, options = _CASES[case]
+  env = make_env()
+  learner = _make(env, kind, **options)
+  _run(learner, env, 24)
+  observation = env.reset().observation
+  observation = {k: np.repeat(v[:1], 4000, 0) for k, v in observation.items()}
+  probabilities = learner.probabilities(observation)
+  assert probabilities.shape == (4000, env.num_actions)
+  np.testing.assert_allclose(probabilities.sum(axis=1), 1.0, rtol=1e-5)
+  key = np.array([1, 2], np.uint32)
+  taken = learner.act(observation, key).reshape(4000, -1)[:, -1]
+  rates = np.bincount(taken.astype(int), minlength=env.num_actions) / 4000
+  np.testing.assert_allclose(rates, probabilities[0], atol=0.04)
+  greedy = learner.act(observation, key, greedy=True).reshape(4000, -1)[:, -1]
+  assert set(greedy) == {probabilities[0].argmax()}
+
+
+def test_vectors_have_no_probabilities():
+  learner = _make(toys.Aim(2), 'policy_gradient', reward='reward')
+  with pytest.raises(errors.SpecError, match='actions are vectors of 1'):
+    learner.probabilities({'number': np.zeros((2, 1))})
+
+
+def test_an_actor_acts_in_one_world_and_learns_nothing():
+  env = toys.Bandit(1)
+  learner = _make(env, 'policy_gradient', reward='feedback')
+  before = learner.state()
+  batch = env.reset()
+  one = toys.ToyStep(1, 1.0, {k: v[0] for k, v in batch.observation.items()})
+
+  def actions(seed: int) -> list[int]:
+    actor = agents.LearnerActor(learner, seed)
+    actor.begin(3)
+    return [int(actor.act(one)) for _ in range(40)]
+
+  assert actions(1) == actions(1)
+  assert actions(1) != actions(2)
+  assert set(actions(1)) == {0, 1, 2}
+  _assert_same(learner.state(), before)
+
+
+def test_the_decoupled_query_tells_nothing_of_the_action():
+  env = toys.Bandit(4000, _ACTIONS, queries=_PAIR)
+  for other_query in (None, 'other'):
+    learner = _make(
+        env,
+        'decoupled_approval',
+        approval='feedback',
+        query='query',
+        other_query=other_query,
+    )
+    actions = learner.step(env.reset())
+    columns = [0, 2] if other_query is None else [0, 1, 2]
+    for i in columns:
+      for j in columns[: columns.index(i)]:
+        same = np.mean(actions[:, i] == actions[:, j])
+        # Of independent ones, 1 in 14 are the same.
+        assert 0.05 < same < 0.1, (i, j)
+  assert len(set(actions[:, 0])) == _ACTIONS
+
+
+def test_the_coupled_query_is_the_action():
+  env = toys.Bandit(50, _ACTIONS, queries=('query',))
+  learner = _make(env, 'value_advice', advice='feedback', query='query')
+  actions = learner.step(env.reset())
+  np.testing.assert_array_equal(actions[:, 0], actions[:, 1])
+
+
+def test_a_query_that_a_learner_does_not_use_is_left_alone():
+  env = toys.Bandit(50, _ACTIONS, queries=_PAIR)
+  learner = _make(env, 'policy_gradient', reward='feedback')
+  actions = learner.step(env.reset())
+  assert set(actions[:, 0]) == set(actions[:, 1]) == {0.0}
+  assert len(set(actions[:, 2])) > 5
+
+
+@pytest.mark.parametrize(
+    ('spec', 'problem'),
+    [
+        (None, 'learner: None; allowed is'),
+        ({}, 'learner: kind: required key is missing'),
+        ({'kind': 'q_lerning'}, "did you mean 'q_learning'"),
+        ({'kind': 'q_learning'}, 'learner: reward: required key is missing'),
+        (
+            {'kind': 'q_learning', 'reward': 'feedback', 'gama': 1},
+            "unknown key 'gama'; did you mean 'gamma'",
+        ),
+        (
+            {'kind': 'q_learning', 'reward': 'feedback', 'gamma': 2},
+            'gamma: .* less than or equal to 1, got 2',
+        ),
+        (
+            {'kind': 'policy_gradient', 'reward': 'bonus'},
+            r"learner.reward: 'bonus' is not read by the agent; .*"
+            "'registers/feedback'",
+        ),
+        (
+            {'kind': 'value_advice', 'advice': 'feedback', 'query': 'query'},
+            r"learner: 'query' is no query register; this environment has \[\]",
+        ),
+        (
+            {
+                'kind': 'decoupled_approval',
+                'approval': 'feedback',
+                'query': 'query',
+                'query_policy': 'taken_action',
+            },
+            "query_policy: .*'independent_action'.*got 'taken_action'",
+        ),
+    ],
+)
+def test_a_wrong_learner_is_refused_in_one_line(spec, problem):
+  env = toys.Bandit(2)
+  with pytest.raises(errors.SpecError, match=problem) as caught:
+    agents.make(spec, env.observation_spec(), env.action_spec(), 2, 1)
+  assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'option'),
+    [
+        ('behavioural_cloning', 'demonstration'),
+        ('q_learning', 'reward'),
+    ],
+)
+def test_a_learner_of_discrete_actions_refuses_vectors(kind, option):
+  env = toys.Aim(2)
+  with pytest.raises(errors.SpecError, match='a design with an action_set'):
+    _make(env, kind, **{option: 'reward'})
+
+
+def test_a_query_register_has_to_hold_every_action():
+  env = toys.Bandit(2, _ACTIONS - 1, queries=('query',))
+  with pytest.raises(errors.SpecError, match=r"'query' holds \[0, 12\]"):
+    _make(env, 'value_advice', advice='feedback', query='query')
+
+
+@pytest.mark.parametrize(
+    ('num_worlds', 'seed', 'problem'),
+    [(0, 1, 'num_worlds: 0'), (2, -1, 'seed: -1'), (2, 1.0, 'seed: 1.0')],
+)
+def test_wrong_numbers_are_refused(num_worlds, seed, problem):
+  env = toys.Bandit(2)
+  with pytest.raises(errors.SpecError, match=problem):
+    agents.make(
+        {'kind': 'policy_gradient', 'reward': 'feedback'},
+        env.observation_spec(),
+        env.action_spec(),
+        num_worlds,
+        seed,
+    )
+
+
+def test_other_specs_are_refused():
+  good = toys.Bandit(2)
+  spec = {'kind': 'policy_gradient', 'reward': 'feedback'}
+  with pytest.raises(errors.SpecError, match='allowed are a DiscreteArray'):
+    agents.make(spec, good.observation_spec(), specs.Array((2, 2), float), 2, 1)
+  words = {**good.observation_spec(), 'words': specs.StringArray(())}
+  with pytest.raises(errors.SpecError, match="'words': dtype object"):
+    agents.make(spec, words, good.action_spec(), 2, 1)
+  vector = {'registers/feedback': specs.Array((3,), float)}
+  with pytest.raises(errors.SpecError, match='allowed are single numbers'):
+    agents.make(spec, vector, good.action_spec(), 2, 1)
+
+
+def test_an_observation_of_another_shape_is_refused():
+  env = toys.Bandit(2)
+  learner = _make(env, 'policy_gradient', reward='feedback')
+  with pytest.raises(errors.SpecError, match=r'shape \(3,\), expected \(2,\)'):
+    learner.step(toys.Bandit(3).reset())
+
+
+@pytest.mark.parametrize(
+    'design',
+    [name for name in feedback_specs.DESIGNS if name != 'none'],
+)
+def test_every_design_that_ships_names_a_learner_there_is(design):
+  learner = feedback_specs.load(design).learner
+  assert learner is not None
+  assert learner.kind in agents.LEARNERS

@@ -1,0 +1,81 @@
+"""What is kept of an episode is enough to see it again."""
+
+import numpy as np
+
+from realab_suite import suite
+from realab_suite.engine import snapshot as snapshots
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import traces
+from realab_suite.feedback import policies
+
+_NUM_WORLDS = 3
+_TASK = ('unlock_door', 'near')
+
+
+def _trace(policy='random', max_steps=40, **options):
+  batch = suite.load_batch(
+      *_TASK, {'random': 7}, {'max_steps': max_steps}, num_envs=_NUM_WORLDS,
+      design='instantaneous_reward', **options,
+  )  # fmt: skip
+  actor = batch_actors.BatchPolicyActor(policies.make(policy), batch, 7)
+  tracer = traces.Tracer(batch, actor)
+  batch.add_sink(tracer)
+  results = evaluate.evaluate_batch(batch, tracer)
+  batch.close()
+  return tracer.trace(), results
+
+
+def test_the_actions_bring_about_the_same_episode_in_a_world_alone():
+  trace, results = _trace('carrying_saboteur')
+  for world, result in enumerate(results):
+    env = suite.load(
+        *_TASK, {'random': 7}, {'max_steps': 40, 'world': world},
+        design='instantaneous_reward',
+    )  # fmt: skip
+    actions = iter(trace['actions'][:, world])
+    [alone] = evaluate.evaluate(
+        env, lambda time_step, actions=actions: next(actions), 1
+    )
+    blocks = [
+        np.array(env.physics.bind(block.geom).xpos)[:2]
+        for block in env.mechanism.registers['reward'].blocks
+    ]
+    env.close()
+    assert alone == result
+    assert result.observed_return > 1
+    ends = trace['registers']['reward']['end'][world]
+    np.testing.assert_allclose(ends, blocks, atol=1e-9)
+
+
+def test_episodes_are_named_and_measured():
+  trace, results = _trace('apple_seeker', max_steps=250)
+  assert trace['seed'].tolist() == [7] * _NUM_WORLDS
+  assert trace['world'].tolist() == list(range(_NUM_WORLDS))
+  assert trace['episode'].tolist() == [0] * _NUM_WORLDS
+  lengths = [result.num_steps for result in results]
+  assert trace['num_steps'].tolist() == lengths
+  assert len(set(lengths)) > 1
+  assert trace['actions'].shape[:2] == (max(lengths), _NUM_WORLDS)
+
+
+def test_a_block_that_is_carried_off_ends_elsewhere():
+  trace, results = _trace('carrying_saboteur', max_steps=120)
+  blocks = trace['registers']['reward']
+  way = np.linalg.norm(blocks['end'] - blocks['start'], axis=-1)[:, 0]
+  assert [result.corruption > 0.3 for result in results] == [True] * 3
+  assert (way > 0.5).all()
+
+
+def test_blocks_start_where_the_reset_has_put_them():
+  trace, _ = _trace(overrides=['registers.reward.initial=5'])
+  for base, offset in trace['registers']['reward']['start']:
+    np.testing.assert_allclose(offset - base, [0.5, 0.25], atol=1e-3)
+
+
+def test_a_trace_can_be_written_and_read():
+  trace, _ = _trace()
+  data = snapshots.Snapshot({}, trace).to_bytes()
+  again = snapshots.Snapshot.from_bytes(data).contents_for({})
+  assert again.keys() == trace.keys()
+  np.testing.assert_array_equal(again['actions'], trace['actions'])

@@ -1,0 +1,128 @@
+"""A learner that learns nothing sensible, quickly, and forgets nothing.
+
+Whatever it has ever seen changes what it does, so a run that does not go on
+exactly where it was gives other results. As a program, it is
+`realab_suite.experiments.run` with this learner, and dies when told to:
+
+    KILL_AT=step:57 python -m tests.experiments.fake_learner --experiment=...
+
+`step:n` is the learner's n-th step of the process, `replace:n` is before the
+n-th file gets its name, and `append:n` in the middle of the n-th line.
+"""
+
+from collections.abc import Callable
+import os
+import signal
+from typing import Any
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.experiments import cli
+from realab_suite.experiments import run
+from realab_suite.experiments import storage
+from realab_suite.experiments import training
+
+
+class FakeLearner:
+  """Acts on a blend of all that it has seen."""
+
+  def __init__(self, spec: Any, action_spec: Any, num_worlds: int, seed: int):
+    options = spec.model_extra or {}
+    if options.get('fails'):
+      raise errors.SpecError('learner.fails: as it was told to')
+    self._action_spec = action_spec
+    self._num_worlds = num_worlds
+    self._seed = seed
+    self._num_steps = 0
+    self._blend = np.zeros(num_worlds)
+    self.on_step: Callable[[int], None] = lambda step: None
+    self.step_types: list[np.ndarray] = []
+
+  def step(self, time_step: Any) -> np.ndarray:
+    self.on_step(self._num_steps)
+    self._num_steps += 1
+    self.step_types.append(np.array(time_step.step_type))
+    seen = [
+        np.arcsinh(value.reshape(self._num_worlds, -1).astype(float)).sum(1)
+        for value in time_step.observation.values()
+    ]
+    self._blend = np.sin(0.7 * self._blend + np.sum(seen, axis=0))
+    rng = np.random.default_rng((self._seed, self._num_steps))
+    return self._actions(rng.uniform(size=self._num_worlds) + self._blend)
+
+  def act(self, observation: Any, key: np.ndarray, greedy: bool) -> np.ndarray:
+    count = len(next(iter(observation.values())))
+    rng = np.random.default_rng(key)
+    noise = 0.0 if greedy else rng.uniform(size=count)
+    return self._actions(np.full(count, self._blend.mean()) + noise)
+
+  def metrics(self) -> dict[str, float]:
+    return {'blend': float(self._blend.mean()), 'unknown': float('nan')}
+
+  def state(self) -> dict[str, Any]:
+    return {'num_steps': self._num_steps, 'blend': self._blend.copy()}
+
+  def set_state(self, state: Any) -> None:
+    self._num_steps, self._blend = state['num_steps'], np.array(state['blend'])
+
+  def _actions(self, value: np.ndarray) -> np.ndarray:
+    spec = self._action_spec
+    if not spec.shape:
+      return (abs(value * 1e3).astype(int) % spec.num_values).astype(spec.dtype)
+    low, high = np.maximum(spec.minimum, -1.0), np.minimum(spec.maximum, 13.0)
+    share = np.abs(np.sin(np.outer(value, 1.0 + np.arange(spec.shape[0]))))
+    return np.floor(low + (high - low) * share) if spec.shape[0] == 2 else (
+        low + (high - low) * share
+    ).astype(spec.dtype)  # fmt: skip
+
+
+def make(job: Any, batch: Any) -> FakeLearner:
+  """Stands in for `training.make_learner`."""
+  return FakeLearner(
+      job.design.learner, batch.action_spec(), batch.num_worlds, job.seed
+  )
+
+
+def _die() -> None:
+  os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _arm(what: str, number: int) -> None:
+  """Makes this process die at the n-th thing of a kind."""
+  calls = iter(range(1, 10**9))
+  if what == 'step':
+
+    def make_mortal(job: Any, batch: Any) -> FakeLearner:
+      learner = make(job, batch)
+      learner.on_step = lambda step: next(calls) == number and _die()
+      return learner
+
+    training.make_learner = make_mortal
+  elif what == 'replace':
+    replace = os.replace
+
+    def dying_replace(*paths: Any) -> None:
+      if next(calls) == number:
+        _die()
+      replace(*paths)
+
+    storage.os.replace = dying_replace
+  else:
+    append = storage.JsonLines.append
+
+    def dying_append(self: Any, records: Any) -> None:
+      if next(calls) == number:
+        self._file.write(b'{"step": 1, "torn')
+        _die()
+      append(self, records)
+
+    storage.JsonLines.append = dying_append
+
+
+if __name__ == '__main__':
+  training.make_learner = make
+  if 'KILL_AT' in os.environ:
+    kind, _, count = os.environ['KILL_AT'].partition(':')
+    _arm(kind, int(count))
+  cli.start(run.main)

@@ -1,0 +1,215 @@
+"""Experiments say what they are, and what is wrong with them."""
+
+import importlib.resources
+import pathlib
+
+import pytest
+import yaml
+
+from realab_suite import errors
+from realab_suite.experiments import jobs
+from realab_suite.experiments import spec
+
+_FOLDER = pathlib.Path(__file__).parents[2] / 'configs' / 'experiments'
+_FILES = sorted(_FOLDER.glob('*.yaml'))
+_SMALL = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'runs': {'reward': {'design': 'instantaneous_reward'}},
+    'seeds': [3],
+}
+
+_every_file = pytest.mark.parametrize(
+    'path', _FILES, ids=[path.stem for path in _FILES]
+)
+
+
+def test_every_file_is_an_experiment_that_is_shipped():
+  assert spec.EXPERIMENTS == tuple(path.stem for path in _FILES)
+  assert {'paper', 'quick'} <= set(spec.EXPERIMENTS)
+  shipped = importlib.resources.files('realab_suite.configs') / 'experiments'
+  for path in _FILES:
+    assert (shipped / path.name).read_bytes() == path.read_bytes()
+
+
+@_every_file
+def test_an_experiment_is_the_same_by_name_by_path_and_by_content(path):
+  experiment = spec.load(path.stem)
+  assert experiment.name == path.stem
+  assert experiment.description.endswith('.')
+  data = yaml.safe_load(path.read_text(encoding='utf-8'))
+  for same in (path, str(path), data, experiment, experiment.to_mapping()):
+    assert spec.load(same) == experiment
+    assert spec.load(same).digest() == experiment.digest()
+
+
+@_every_file
+def test_calibration_seeds_are_kept_apart(path):
+  experiment = spec.load(path)
+  assert experiment.calibration_seeds
+  assert not set(experiment.seeds) & set(experiment.calibration_seeds)
+
+
+@_every_file
+def test_every_job_has_a_folder_of_its_own(path):
+  experiment = spec.load(path)
+  folders = [job.folder() for job in jobs.plan(experiment)]
+  assert len(set(folders)) == len(folders)
+  assert folders == [job.folder() for job in jobs.plan(experiment)]
+
+
+@pytest.mark.parametrize(
+    ('changes', 'complaint'),
+    [
+        ({'sedes': [1]}, "unknown key 'sedes'; did you mean 'seeds'?"),
+        ({'schema': 2}, 'schema: '),
+        ({'schema': True}, 'schema: must be 1'),
+        ({'seeds': []}, 'seeds: '),
+        ({'seeds': [1, 1]}, 'seeds and calibration_seeds: 1 is there twice'),
+        ({'calibration_seeds': [3]}, 'calibration_seeds: 3 is there twice'),
+        ({'seeds': [-1]}, 'seeds[0]: '),
+        ({'runs': {}}, 'runs: '),
+        ({'runs': {'A b': {}}}, "runs['A b']"),
+        ({'task': 'unlock_door'}, 'task: '),
+        ({'task': 'unlock_door.up'}, 'task: task unlock_door.up is unknown'),
+        ({'baselines': ['nobody']}, "policy 'nobody' is unknown"),
+        ({'baselines': ['random'] * 2}, 'baselines: random is there twice'),
+        (
+            {'runs': {'a': {'design': 'nothing'}}},
+            "runs.a: design 'nothing' is neither a file nor one of",
+        ),
+        (
+            {'runs': {'a': {'design': 'none'}}},
+            "runs.a.learner: design 'none' has no learner",
+        ),
+        (
+            {'runs': {'a': {'design': 'value_advice', 'overrides': ['dof']}}},
+            "runs.a: override 'dof': expected key=value",
+        ),
+        (
+            {
+                'runs': {
+                    'a': {
+                        'design': 'value_advice',
+                        'overrides': ['channel=secure'],
+                        'twin': True,
+                    }
+                }
+            },
+            "runs.a.twin: design 'value_advice' is secure itself",
+        ),
+        ({'training': {'num_envs': 0}}, 'training.num_envs: '),
+        ({'training': {'sleep': 1}}, 'training.sleep: '),
+        (
+            {'evaluation': {'actions': 'best'}},
+            "evaluation.actions: must be 'sampled' or 'greedy'",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(tmp_path, changes, complaint):
+  file = tmp_path / 'mine.yaml'
+  file.write_text(yaml.safe_dump({**_SMALL, **changes}))
+  with pytest.raises(errors.SpecError) as raised:
+    spec.load(file)
+  [line] = str(raised.value).splitlines()
+  assert line.startswith(f'{file}: ')
+  assert complaint in line
+
+
+def test_an_unknown_experiment_is_told_the_known_ones():
+  with pytest.raises(errors.UnknownNameError, match=r"'papre'.*'paper'"):
+    spec.load('papre')
+
+
+@pytest.mark.parametrize('experiment', [3, None, ['paper']])
+def test_what_is_no_experiment_is_refused(experiment):
+  with pytest.raises(errors.SpecError, match='experiment: '):
+    spec.load(experiment)
+
+
+def test_a_run_changes_its_design_and_its_learner():
+  run = {
+      'design': 'instantaneous_reward',
+      'overrides': ['registers.reward.scale=0.2'],
+      'learner': {'learning_rate': 0.01},
+      'twin': True,
+  }
+  experiment = spec.load({**_SMALL, 'runs': {'reward': run}})
+  plain, twin = jobs.plan(experiment)
+  for job in (plain, twin):
+    assert job.design.registers['reward'].scale == 0.2
+    assert job.design.learner.model_extra == {
+        'reward': 'reward', 'learning_rate': 0.01,
+    }  # fmt: skip
+  assert (plain.run, plain.twin_of, plain.design.channel) == (
+      'reward', None, 'embedded',
+  )  # fmt: skip
+  assert (twin.run, twin.twin_of, twin.design.channel) == (
+      'reward.secure', 'reward', 'secure',
+  )  # fmt: skip
+
+
+def test_a_run_may_bring_a_learner_to_a_design_without_one():
+  run = {'design': 'none', 'learner': {'kind': 'behavioural_cloning'}}
+  [job] = jobs.plan(spec.load({**_SMALL, 'runs': {'idle': run}}))
+  assert job.kind == 'behavioural_cloning'
+
+
+def test_jobs_go_seed_by_seed_with_the_baseline_first():
+  experiment = spec.load(
+      {**_SMALL, 'baselines': ['apple_seeker', 'random'], 'seeds': [3, 1]}
+  )
+  planned = jobs.plan(experiment)
+  assert [(job.seed, job.run, job.baseline) for job in planned] == [
+      (seed, run, baseline)
+      for seed in (3, 1)
+      for run, baseline in (
+          ('reward.apple_seeker', None),
+          ('reward.random', 'reward.apple_seeker'),
+          ('reward', 'reward.apple_seeker'),
+      )
+  ]
+  assert len({job.evaluation_seed for job in planned}) == 2
+
+
+def test_a_run_that_there_is_not_is_told_those_that_there_are():
+  with pytest.raises(errors.UnknownNameError, match=r"'reword'.*\['reward'\]"):
+    jobs.plan(spec.load(_SMALL), only=['reword'])
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'max_steps': 9},
+        {'task': 'unlock_door.far'},
+        {'training': {'num_envs': 9}},
+        {'evaluation': {'episodes': 9}},
+        {'runs': {'reward': {'design': 'instantaneous_reward',
+                             'learner': {'discount': 0.9}}}},
+        {'runs': {'reward': {'design': 'instantaneous_reward',
+                             'overrides': ['dof=planar']}}},
+    ],
+)  # fmt: skip
+def test_whatever_results_depend_on_changes_the_folder(changes):
+  [one], [other] = (
+      jobs.plan(spec.load({**_SMALL, **c})) for c in ({}, changes)
+  )
+  assert one.digest() != other.digest()
+
+
+def test_other_versions_have_another_folder(monkeypatch):
+  [job] = jobs.plan(spec.load(_SMALL))
+  before = job.folder()
+  versions = jobs.results.versions()
+  monkeypatch.setattr(
+      jobs.results, 'versions', lambda: {**versions, 'mujoco': '3.99'}
+  )
+  assert job.folder() != before
+
+
+def test_a_description_does_not_change_the_folder():
+  [one], [other] = (
+      jobs.plan(spec.load({**_SMALL, 'description': d})) for d in ('A.', 'B.')
+  )
+  assert one.folder() == other.folder()

@@ -1,0 +1,404 @@
+"""Sweeps do what is left to do, and what failed keeps nobody else from it."""
+
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+import types
+
+import pytest
+import yaml
+
+from realab_suite import errors
+from realab_suite.experiments import engines
+from realab_suite.experiments import jobs
+from realab_suite.experiments import spec
+from realab_suite.experiments import storage
+from realab_suite.experiments import sweeping
+from realab_suite.experiments import training
+
+_ROOT = pathlib.Path(__file__).parents[2]
+_FAILS = {'fails': True}
+_SMALL = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'max_steps': 9,
+    'runs': {
+        'bad': {'design': 'instantaneous_reward', 'learner': _FAILS},
+        'good': {'design': 'instantaneous_reward'},
+    },
+    'seeds': [3],
+    'calibration_seeds': [8],
+    'training': {'num_envs': 2, 'steps': 60, 'curve_every': 20},
+    'evaluation': {'episodes': 2},
+}
+
+
+class Pretender(engines.Engine):
+  """Runs nothing; a command is over when it is polled."""
+
+  def __init__(self, capacity=2, statuses=()):
+    self._capacity = capacity
+    self._statuses = dict(statuses)
+    self.commands = []
+    self.stopped = []
+    self.most = 0
+    self._running = 0
+
+  @property
+  def capacity(self):
+    return self._capacity
+
+  def start(self, command, log):
+    self._running += 1
+    self.most = max(self.most, self._running)
+    run = _flag(command, 'run')
+    self.commands.append((run, int(_flag(command, 'seed'))))
+    log.write_text(f'working\nerror: {run} is no good\n')
+    return command
+
+  def poll(self, task):
+    self._running -= 1
+    status = self._statuses.get(_flag(task, 'run'), 0)
+    if not status:
+      experiment = spec.load(pathlib.Path(_flag(task, 'experiment')))
+      seed = int(_flag(task, 'seed'))
+      [job] = jobs.plan(experiment, [seed], [_flag(task, 'run')])
+      folder = pathlib.Path(_flag(task, 'output')) / job.folder()
+      folder.mkdir()
+      storage.write_json(folder / storage.DONE, {'files': {}})
+    return status
+
+  def stop(self, tasks):
+    self.stopped += tasks
+
+
+def _flag(command, name):
+  [value] = [c for c in command if c.startswith(f'--{name}=')]
+  return value.partition('=')[2]
+
+
+@pytest.fixture
+def no_wait(monkeypatch):
+  monkeypatch.setattr(sweeping, '_POLL_SECONDS', 0.0)
+
+
+def _sweep(experiment, output, engine, **options):
+  said = []
+  sweeping.sweep(spec.load(experiment), output, engine, said.append, **options)
+  return said
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_all_jobs_are_done_and_none_twice(tmp_path):
+  data = {**_SMALL, 'baselines': ['random'], 'seeds': [3, 4]}
+  engine = Pretender()
+  said = _sweep(data, tmp_path, engine)
+  assert engine.commands == [
+      (run, seed)
+      for seed in (3, 4)
+      for run in ('bad.random', 'bad', 'good.random', 'good')
+  ]
+  assert engine.most == 2
+  assert said[-1] == f'8 jobs are done; everything is in {tmp_path}'
+  again = Pretender()
+  _sweep(data, tmp_path, again)
+  assert again.commands == []
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_a_job_that_fails_keeps_no_other_from_being_done(tmp_path):
+  engine = Pretender(statuses={'bad': 2})
+  with pytest.raises(
+      errors.ResultsError,
+      match=r'1 of 2 jobs failed: bad, seed 3: error: bad is no good; the rest',
+  ):
+    _sweep(_SMALL, tmp_path, engine)
+  assert engine.commands == [('bad', 3), ('good', 3)]
+  again = Pretender()
+  _sweep(_SMALL, tmp_path, again)
+  assert again.commands == [('bad', 3)]
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_a_job_that_left_nothing_has_failed(tmp_path, monkeypatch):
+  engine = Pretender()
+  monkeypatch.setattr(engine, 'poll', lambda task: 0)
+  with pytest.raises(errors.ResultsError, match='2 of 2 jobs failed'):
+    _sweep(_SMALL, tmp_path, engine)
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_an_interruption_stops_what_is_under_way(tmp_path, monkeypatch):
+  engine = Pretender()
+
+  def interrupt(task):
+    raise KeyboardInterrupt
+
+  monkeypatch.setattr(engine, 'poll', interrupt)
+  with pytest.raises(KeyboardInterrupt):
+    _sweep(_SMALL, tmp_path, engine)
+  assert len(engine.stopped) == 2
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_runs_can_be_chosen_and_the_description_has_all(tmp_path):
+  engine = Pretender()
+  _sweep(_SMALL, tmp_path, engine, only=['good'])
+  assert engine.commands == [('good', 3)]
+  sweep = json.loads((tmp_path / sweeping.SWEEP).read_text())
+  assert [job['run'] for job in sweep['jobs']] == ['bad', 'good']
+  assert (tmp_path / sweep['jobs'][1]['folder'] / storage.DONE).exists()
+  written = spec.load(tmp_path / sweeping.EXPERIMENT)
+  assert written == spec.load(_SMALL)
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_calibration_seeds_go_into_a_folder_of_their_own(tmp_path):
+  engine = Pretender()
+  _sweep(_SMALL, tmp_path, engine, calibration=True)
+  assert {seed for _, seed in engine.commands} == {8}
+  with pytest.raises(
+      errors.ResultsError, match='calibration is True there, False here'
+  ):
+    _sweep(_SMALL, tmp_path, engine)
+
+
+def test_an_experiment_without_calibration_seeds_has_no_calibration(tmp_path):
+  with pytest.raises(errors.SpecError, match='has no calibration_seeds'):
+    _sweep({**_SMALL, 'calibration_seeds': []}, tmp_path / 'new', Pretender(),
+           calibration=True)  # fmt: skip
+  assert not (tmp_path / 'new').exists()
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_more_seeds_may_join_but_no_other_experiment(tmp_path):
+  _sweep(_SMALL, tmp_path, Pretender())
+  engine = Pretender()
+  _sweep({**_SMALL, 'seeds': [3, 5]}, tmp_path, engine)
+  assert engine.commands == [('bad', 5), ('good', 5)]
+  with pytest.raises(
+      errors.ResultsError,
+      match=r'another experiment: max_steps is 9 there, 10 here; name another',
+  ):
+    _sweep({**_SMALL, 'max_steps': 10}, tmp_path, engine)
+
+
+def test_a_second_sweep_on_one_folder_is_refused(tmp_path):
+  lock = storage.lock(tmp_path)
+  with pytest.raises(errors.ResultsError, match=f'by process {os.getpid()}'):
+    _sweep(_SMALL, tmp_path, Pretender())
+  os.close(lock)
+
+
+def test_two_processes_side_by_side_one_of_which_fails(tmp_path, monkeypatch):
+  monkeypatch.setattr(sweeping, '_MODULE', 'tests.experiments.fake_learner')
+  monkeypatch.chdir(_ROOT)
+  with pytest.raises(
+      errors.ResultsError,
+      match=r'1 of 2 jobs failed: bad, seed 3: error: learner\.fails: as it',
+  ):
+    _sweep(_SMALL, tmp_path, engines.Local(2))
+  [good] = jobs.plan(spec.load(_SMALL), only=['good'])
+  assert storage.is_done(tmp_path / good.folder())
+  log = tmp_path / sweeping.LOGS / f'{good.folder()}.log'
+  assert 'good, seed 3: step 60 of 60' in log.read_text()
+
+
+def test_a_sweep_that_is_interrupted_leaves_nobody_behind(tmp_path):
+  file = tmp_path / 'long.yaml'
+  run = {'long': {'design': 'instantaneous_reward'}}
+  training_ = {'num_envs': 2, 'steps': 10**9, 'checkpoint_every': 20,
+               'curve_every': 20}  # fmt: skip
+  file.write_text(
+      yaml.safe_dump({**_SMALL, 'runs': run, 'training': training_})
+  )
+  program = (
+      'from realab_suite.experiments import cli, sweep, sweeping\n'
+      "sweeping._MODULE = 'tests.experiments.fake_learner'\n"
+      'cli.start(sweep.main)\n'
+  )
+  output = tmp_path / 'out'
+  with subprocess.Popen(
+      [sys.executable, '-c', program, f'--experiment={file}',
+       f'--output={output}', '--workers=1'],
+      cwd=_ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+  ) as process:  # fmt: skip
+    deadline = time.monotonic() + 90
+    while not list(output.glob('*/checkpoints/*.ckpt')):
+      assert time.monotonic() < deadline
+      assert process.poll() is None, process.stderr.read()
+      time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, complaint = process.communicate(timeout=30)
+  assert process.returncode == 130
+  assert complaint.splitlines()[-1].startswith('error: interrupted')
+  [folder] = [p.parent for p in output.glob('*/checkpoints')]
+  pid = int((folder / 'lock').read_text())
+  with pytest.raises(ProcessLookupError):
+    os.kill(pid, 0)
+
+
+# ---- Engines ----------------------------------------------------------------
+
+
+def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+  for name in ('ray', 'submitit'):
+    with pytest.raises(
+        errors.SpecError, match=rf'--engine={name}: .*realab-suite\[cluster\]'
+    ):
+      engines.ENGINES[name](1)
+
+
+def _command(status):
+  return [sys.executable, '-c', f'print("said"); raise SystemExit({status})']
+
+
+def _wait(engine, task):
+  while (status := engine.poll(task)) is None:
+    time.sleep(0.02)
+  return status
+
+
+def test_the_local_engine_says_how_a_command_ended(tmp_path):
+  engine = engines.Local(1)
+  log = tmp_path / 'log'
+  for status in (0, 3):
+    assert _wait(engine, engine.start(_command(status), log)) == status
+  assert log.read_text() == 'said\nsaid\n'
+
+
+def test_the_local_engine_ends_what_is_under_way():
+  engine = engines.Local(1)
+  command = [sys.executable, '-c', 'import time; time.sleep(100)']
+  task = engine.start(command, pathlib.Path(os.devnull))
+  assert engine.poll(task) is None
+  engine.stop([task])
+  assert engine.poll(task) == -signal.SIGTERM
+
+
+class _FakeRay(types.ModuleType):
+  """As much of ray as the engine needs, done at once."""
+
+  def init(self, **unused):
+    pass
+
+  def remote(self, **unused):
+    def decorate(function):
+      return types.SimpleNamespace(
+          remote=lambda *arguments: lambda: function(*arguments)
+      )
+
+    return decorate
+
+  def wait(self, tasks, timeout):
+    assert timeout == 0
+    return tasks, []
+
+  def get(self, task):
+    return task()
+
+
+class _FakeExecutor:
+
+  def __init__(self, folder):
+    assert pathlib.Path(folder).is_dir()
+
+  def update_parameters(self, **unused):
+    pass
+
+  def submit(self, function, *arguments):
+    return types.SimpleNamespace(
+        done=lambda: True, result=lambda: function(*arguments)
+    )
+
+
+@pytest.mark.parametrize('name', ['ray', 'submitit'])
+def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
+  fake = _FakeRay('ray')
+  if name == 'submitit':
+    fake = types.ModuleType(name)
+    fake.AutoExecutor = _FakeExecutor
+  monkeypatch.setitem(sys.modules, name, fake)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
+  engine = engines.ENGINES[name](1)
+  log = tmp_path / 'log'
+  for status in (0, 3):
+    assert _wait(engine, engine.start(_command(status), log)) == status
+  assert log.read_text() == 'said\nsaid\n'
+
+
+def test_what_a_cluster_complains_of_is_one_line(tmp_path, monkeypatch):
+  fake = _FakeRay('ray')
+
+  def fail(task):
+    raise RuntimeError('a machine\nis gone')
+
+  fake.get = fail
+  monkeypatch.setitem(sys.modules, 'ray', fake)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
+  engine = engines.Ray(1)
+  task = engine.start(_command(0), tmp_path / 'log')
+  with pytest.raises(errors.ResultsError, match='--engine=ray: RuntimeError'):
+    engine.poll(task)
+
+
+# ---- The command line -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ('module', 'arguments', 'complaint'),
+    [
+        ('sweep', ['--output=o'], '--experiment: missing'),
+        ('sweep', ['--experiment=quick'], '--output: missing'),
+        ('sweep', ['--experiment=quik', '--output=o'], "experiment 'quik'"),
+        (
+            'sweep',
+            ['--experiment=quick', '--output=o', '--runs=x'],
+            "has no run 'x'",
+        ),
+        ('run', ['--experiment=quick', '--output=o'], '--run: missing'),
+        (
+            'run',
+            ['--experiment=quick', '--output=o', '--design=none'],
+            '--design has no effect with --experiment',
+        ),
+        ('run', ['--output=o', '--seed=3'], '--seed has no effect without'),
+    ],
+)
+def test_what_is_wrong_with_a_command_is_said_in_one_line(
+    tmp_path, module, arguments, complaint
+):
+  ran = subprocess.run(
+      [sys.executable, '-m', f'realab_suite.experiments.{module}', *arguments],
+      cwd=tmp_path,
+      env={**os.environ, 'PYTHONPATH': str(_ROOT)},
+      capture_output=True,
+      text=True,
+      timeout=100,
+      check=False,
+  )
+  assert ran.returncode == 2, ran.stderr
+  [line] = ran.stderr.splitlines()
+  assert line.startswith('error: ')
+  assert complaint in line
+  assert not list(tmp_path.iterdir())
+
+
+def test_only_a_learner_brings_jax(tmp_path):
+  program = (
+      'import sys\n'
+      'from realab_suite.experiments import sweeping, training, jobs, spec\n'
+      'import pathlib\n'
+      '[job] = jobs.plan(spec.load("quick"), only=["reward.random"])\n'
+      f'training.run(job, pathlib.Path({str(tmp_path)!r}),'
+      ' training.Options(print))\n'
+      'assert "jax" not in sys.modules\n'
+  )
+  subprocess.run([sys.executable, '-c', program], cwd=_ROOT, check=True)
+  assert len(list(tmp_path.glob(f'*/{training.EPISODES}'))) == 1

@@ -1,0 +1,494 @@
+"""A run that is killed and goes on is a run that was not."""
+
+import errno
+import json
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.evaluation import comparison
+from realab_suite.evaluation import results
+from realab_suite.experiments import jobs
+from realab_suite.experiments import spec
+from realab_suite.experiments import storage
+from realab_suite.experiments import training
+from tests.experiments import fake_learner
+
+_ROOT = pathlib.Path(__file__).parents[2]
+_RESULTS = (
+    storage.CONFIG,
+    storage.DONE,
+    training.EPISODES,
+    training.TRACE,
+    training.CURVE,
+    training.TRAINING_EPISODES,
+    training.LEARNER,
+)
+_NUM_ENVS = 4
+_STEPS = 60  # Of all worlds together.
+_SMALL = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'max_steps': 17,
+    'runs': {
+        'reward': {
+            'design': 'instantaneous_reward',
+            'overrides': ['dof=planar'],
+            'twin': True,
+        },
+        'advice': {'design': 'value_advice'},
+    },
+    'baselines': ['apple_seeker', 'random'],
+    'seeds': [3],
+    'calibration_seeds': [8],
+    'training': {
+        'num_envs': _NUM_ENVS,
+        'steps': _STEPS * _NUM_ENVS,
+        'checkpoint_every': 20 * _NUM_ENVS,
+        'curve_every': 8 * _NUM_ENVS,
+    },
+    'evaluation': {'episodes': 3},
+}
+
+
+class Killed(BaseException):
+  """Ends a run as suddenly as a signal, within this process."""
+
+
+_make_learner = training.make_learner
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch):
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+
+
+@pytest.fixture(scope='module')
+def whole(tmp_path_factory):
+  """The folder of the small run that nothing has happened to; read only."""
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(training, 'make_learner', fake_learner.make)
+    path, said = _run(_job(), tmp_path_factory.mktemp('whole'))
+  assert said[-1] == f'Everything is in {path}'
+  return path
+
+
+def _job(run='reward', **training_changes):
+  data = {**_SMALL, 'training': {**_SMALL['training'], **training_changes}}
+  [job] = jobs.plan(spec.load(data), only=[run])
+  return job
+
+
+def _run(job, output, **options):
+  said = []
+  path = training.run(job, output, training.Options(said.append, **options))
+  return path, said
+
+
+def _results(path):
+  return {name: (path / name).read_bytes() for name in _RESULTS}
+
+
+def _lines(path, name):
+  return [json.loads(line) for line in (path / name).read_text().splitlines()]
+
+
+def _die_at(monkeypatch, step):
+  """Makes the learner of this process end it at a step."""
+
+  def make(job, batch):
+    learner = fake_learner.make(job, batch)
+
+    def on_step(number):
+      if number == step:
+        raise Killed
+
+    learner.on_step = on_step
+    return learner
+
+  monkeypatch.setattr(training, 'make_learner', make)
+
+
+def _kill(job, output, monkeypatch, step):
+  with monkeypatch.context() as patch:
+    _die_at(patch, step)
+    with pytest.raises(Killed):
+      _run(job, output)
+
+
+# ---- Results ----------------------------------------------------------------
+
+
+def test_a_run_leaves_what_the_layout_says(whole):
+  job, path = _job(), whole
+  assert path.name == job.folder()
+  assert {p.name for p in path.iterdir()} == {
+      *_RESULTS, training.TIMING, 'lock', 'checkpoints',
+  }  # fmt: skip
+  assert list((path / 'checkpoints').iterdir()) == []
+  assert json.loads((path / storage.CONFIG).read_text()) == job.config()
+
+
+def test_rows_are_of_the_experiment_and_of_fresh_episodes(whole):
+  rows = list(results.read_rows(whole / training.EPISODES))
+  assert [(r.seed, r.world, r.episode) for r in rows] == [
+      (1_000_003, world, 0) for world in range(3)
+  ]
+  info = rows[0].info
+  assert (info.run, info.policy, info.baseline, info.channel) == (
+      'reward', 'policy_gradient', 'reward.apple_seeker', 'embedded',
+  )  # fmt: skip
+  assert info.max_steps == 17
+
+
+def test_a_curve_is_the_means_of_the_episodes_that_ended(whole):
+  path = whole
+  points = _lines(path, training.CURVE)
+  steps = [p['step'] for p in points]
+  assert steps == [n * _NUM_ENVS for n in (8, 16, 24, 32, 40, 48, 56, 60)]
+  episodes = _lines(path, training.TRAINING_EPISODES)
+  assert [e['step'] for e in episodes] == [
+      n * _NUM_ENVS for n in (17, 35, 53) for _ in range(_NUM_ENVS)
+  ]
+  for point, low in zip(points, [0, *steps], strict=False):
+    there = [e for e in episodes if low < e['step'] <= point['step']]
+    assert point['num_episodes'] == len(there)
+    if not there:
+      assert point['true_return'] is None
+      continue
+    for key in ('true_return', 'observed_return', 'corruption'):
+      mean = np.mean([e[key] for e in there])
+      assert point[key] == pytest.approx(mean, rel=1e-9)
+    signed = [e['registers']['reward']['corruption_signed'] for e in there]
+    assert point['registers']['reward']['corruption_signed'] == pytest.approx(
+        np.mean(signed), rel=1e-9
+    )
+    assert point['learner'] == {
+        'blend': pytest.approx(point['learner']['blend']), 'unknown': None,
+    }  # fmt: skip
+  timing = _lines(path, training.TIMING)
+  assert [line['step'] for line in timing] == steps
+
+
+def test_runs_of_an_experiment_can_be_compared_in_pairs(tmp_path):
+  rows = {}
+  for job in jobs.plan(spec.load(_SMALL)):
+    path, _ = _run(job, tmp_path)
+    rows[job.run] = list(results.read_rows(path / training.EPISODES))
+  assert list(rows) == [
+      'reward.apple_seeker', 'reward.random', 'reward', 'reward.secure',
+      'advice.apple_seeker', 'advice.random', 'advice',
+  ]  # fmt: skip
+  here = {name: rows[name] for name in rows if name.startswith('reward')}
+  summaries = comparison.compare(here, 'reward.apple_seeker')
+  assert summaries['reward.secure'].corruption.estimate == 0.0
+  assert summaries['reward'].true_return_gained is not None
+
+
+def test_two_seeds_train_in_other_worlds_and_neither_is_judged_there(whole):
+  job = _job()
+  trained = {e['seed'] for e in _lines(whole, training.TRAINING_EPISODES)}
+  assert trained == {training._world_seed(3, 0)}
+  assert training._world_seed(4, 0) not in trained
+  assert job.evaluation_seed not in trained
+
+
+def test_the_learner_sees_nothing_that_is_true(tmp_path, monkeypatch):
+  seen = []
+
+  def make(job, batch):
+    learner = fake_learner.make(job, batch)
+    step = learner.step
+    learner.step = lambda time_step: seen.append(time_step) or step(time_step)
+    return learner
+
+  monkeypatch.setattr(training, 'make_learner', make)
+  _run(_job(), tmp_path)
+  with suite.load('unlock_door', 'near', design='instantaneous_reward') as env:
+    allowed = set(env.observation_spec())
+  for time_step in seen:
+    assert set(time_step.observation) == allowed
+    assert not np.any(time_step.reward)
+
+
+def test_what_was_learned_can_be_loaded(whole, tmp_path):
+  job = _job()
+  path = shutil.copytree(whole, tmp_path / 'copy')
+  batch = training.load_batch(job, 2, 0)
+  learner = training.load_learner(job, path, batch)
+  assert learner.state()['num_steps'] == _STEPS
+  data = bytearray((path / training.LEARNER).read_bytes())
+  data[-1] ^= 1
+  (path / training.LEARNER).write_bytes(data)
+  with pytest.raises(errors.ResultsError, match=r'learner\.bin: .*damaged'):
+    training.load_learner(job, path, batch)
+  batch.close()
+
+
+# ---- Going on ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize('sleep', [False, True])
+def test_a_run_that_goes_on_ends_like_one_that_was_not_killed(
+    tmp_path, monkeypatch, sleep
+):
+  job = _job(sleep=sleep)
+  whole, _ = _run(job, tmp_path / 'whole')
+  for step in (7, 20, 21, 58):
+    output = tmp_path / str(step)
+    _kill(job, output, monkeypatch, step)
+    path, _ = _run(job, output)
+    assert _results(path) == _results(whole), step
+
+
+def test_a_run_may_be_killed_again_and_again(whole, tmp_path, monkeypatch):
+  job = _job()
+  for step in (5, 25, 24, 45, 41):
+    _kill(job, tmp_path, monkeypatch, step)
+  path, _ = _run(job, tmp_path)
+  assert _results(path) == _results(whole)
+
+
+def test_where_blocks_sleep_episodes_end_at_every_checkpoint(
+    tmp_path, monkeypatch
+):
+  learners = []
+
+  def make(job, batch):
+    learners.append(fake_learner.make(job, batch))
+    return learners[-1]
+
+  monkeypatch.setattr(training, 'make_learner', make)
+  path, _ = _run(_job(sleep=True), tmp_path)
+  [learner] = learners
+  types = np.array(learner.step_types)
+  # The step after 20 and 40 is the last one, then all worlds begin.
+  assert types.shape == (_STEPS, _NUM_ENVS)
+  assert (types[[20, 40]] == 2).all()
+  assert (types[[21, 41]] == 0).all()
+  episodes = _lines(path, training.TRAINING_EPISODES)
+  abandoned = [e for e in episodes if e['end'] == 'abandoned']
+  assert [e['step'] for e in abandoned] == [
+      n * _NUM_ENVS for n in (20, 40, 60) for _ in range(_NUM_ENVS)
+  ]
+  assert not any(e['is_valid'] for e in abandoned)
+  assert len({e['seed'] for e in episodes}) == 3
+
+
+@pytest.mark.parametrize('point', ['step:33', 'replace:3', 'append:9'])
+def test_kill_minus_nine_changes_nothing(whole, tmp_path, point):
+  file = tmp_path / 'small.yaml'
+  file.write_text(yaml.safe_dump(_SMALL))
+  command = [
+      sys.executable, '-m', 'tests.experiments.fake_learner',
+      f'--experiment={file}', '--run=reward', '--seed=3',
+      f'--output={tmp_path / "killed"}',
+  ]  # fmt: skip
+  killed, again = (
+      subprocess.run(
+          command,
+          cwd=_ROOT,
+          env={**os.environ, **environment},
+          capture_output=True,
+          text=True,
+          timeout=120,
+          check=False,
+      )
+      for environment in ({'KILL_AT': point}, {})
+  )
+  assert killed.returncode == -signal.SIGKILL, killed.stderr
+  assert again.returncode == 0, again.stderr
+  path = tmp_path / 'killed' / whole.name
+  assert again.stdout.splitlines()[-1] == f'Everything is in {path}'
+  assert _results(path) == _results(whole)
+
+
+def test_a_run_that_is_done_is_not_done_again(whole, tmp_path):
+  job = _job()
+  path = shutil.copytree(whole, tmp_path / whole.name)
+  before = {p: p.stat().st_mtime_ns for p in path.iterdir()}
+  del before[path / 'lock']
+  _, said = _run(job, tmp_path)
+  assert said == [f'{path} is there already']
+  assert all(p.stat().st_mtime_ns == t for p, t in before.items())
+
+
+def test_a_run_whose_results_were_changed_is_not_taken_for_done(
+    whole, tmp_path
+):
+  job = _job()
+  path = shutil.copytree(whole, tmp_path / whole.name)
+  with open(path / training.EPISODES, 'a') as file:
+    file.write('\n')
+  with pytest.raises(errors.ResultsError, match=r'episodes\.jsonl: not what'):
+    _run(job, tmp_path)
+
+
+def test_a_run_ends_with_the_sweep_that_started_it(tmp_path):
+  with pytest.raises(errors.ResultsError, match='process 1, which started'):
+    _run(_job(), tmp_path, parent=1)
+
+
+# ---- What goes wrong --------------------------------------------------------
+
+
+def test_a_second_launcher_is_refused_with_the_process_of_the_first(tmp_path):
+  job = _job()
+  path = tmp_path / job.folder()
+  pid = os.getpid()
+  with storage.RunFolder(path, job.config()):
+    with pytest.raises(errors.ResultsError, match=f'by process {pid};'):
+      _run(job, tmp_path)
+  _run(job, tmp_path)
+
+
+def test_a_folder_of_another_configuration_is_refused(tmp_path):
+  job = _job()
+  path = tmp_path / job.folder()
+  path.mkdir()
+  config = job.config()
+  config['training']['num_envs'] = 5
+  (path / storage.CONFIG).write_text(json.dumps(config))
+  with pytest.raises(
+      errors.ResultsError,
+      match=r'another configuration: training\.num_envs is 5 there, 4 here',
+  ):
+    _run(job, tmp_path)
+  assert {p.name for p in path.iterdir()} == {storage.CONFIG, 'lock'}
+
+
+def _checkpoints(path):
+  return sorted((path / 'checkpoints').iterdir())
+
+
+@pytest.mark.parametrize('damage', ['truncated', 'flipped', 'empty', 'foreign'])
+def test_a_damaged_checkpoint_is_named_and_the_one_before_goes_on(
+    whole, tmp_path, monkeypatch, damage
+):
+  job = _job()
+  _kill(job, tmp_path, monkeypatch, 45)
+  path = tmp_path / job.folder()
+  first, last = _checkpoints(path)
+  data = bytearray(last.read_bytes())
+  if damage == 'truncated':
+    del data[len(data) // 2 :]
+  elif damage == 'flipped':
+    data[len(data) // 2] ^= 1
+  elif damage == 'empty':
+    data.clear()
+  else:
+    other = _job(curve_every=4)
+    _kill(other, tmp_path / 'other', monkeypatch, 45)
+    data = _checkpoints(tmp_path / 'other' / other.folder())[-1].read_bytes()
+  last.write_bytes(data)
+  with pytest.raises(errors.ResultsError) as raised:
+    _run(job, tmp_path)
+  message = str(raised.value)
+  assert message.startswith(f'{last}: ')
+  assert (
+      f'remove this file, then the same command goes on from {first.name}'
+      in (message)
+  )
+  last.unlink()
+  if damage == 'truncated':
+    _run(job, tmp_path)
+    assert _results(path) == _results(whole)
+
+
+def test_without_an_older_checkpoint_a_run_begins_anew(tmp_path, monkeypatch):
+  job = _job()
+  _kill(job, tmp_path, monkeypatch, 25)
+  path = tmp_path / job.folder()
+  [only] = _checkpoints(path)
+  only.write_bytes(b'')
+  with pytest.raises(errors.ResultsError, match='goes on from the beginning'):
+    _run(job, tmp_path)
+  only.unlink()
+  _run(job, tmp_path)
+
+
+def test_lines_that_a_checkpoint_knows_of_are_missed(tmp_path, monkeypatch):
+  job = _job()
+  _kill(job, tmp_path, monkeypatch, 25)
+  path = tmp_path / job.folder()
+  (path / training.CURVE).write_bytes(b'')
+  with pytest.raises(errors.ResultsError, match=r'curve\.jsonl: has 0 bytes'):
+    _run(job, tmp_path)
+
+
+@pytest.mark.parametrize('where', ['checkpoint', 'lines', 'episodes'])
+def test_a_full_disk_is_said_so_and_nothing_is_lost(
+    whole, tmp_path, monkeypatch, where
+):
+  job = _job()
+  path = tmp_path / job.folder()
+  full = OSError(errno.ENOSPC, 'No space left on device')
+  with monkeypatch.context() as patch:
+    if where == 'lines':
+      write = storage.JsonLines.append
+
+      def append(self, records):
+        if self._path.name == training.CURVE and self._file.tell() > 2000:
+          self._file.write(b'{"st')
+          with storage.explained(self._path):
+            raise full
+        write(self, records)
+
+      patch.setattr(storage.JsonLines, 'append', append)
+    else:
+      fsync, calls = os.fsync, iter(range(100))
+      names = {'checkpoint': '.ckpt.partial', 'episodes': 'episodes.jsonl.part'}
+
+      def failing(descriptor):
+        name = os.readlink(f'/proc/self/fd/{descriptor}')
+        if names[where] in name and (where == 'episodes' or next(calls) == 1):
+          raise full
+        fsync(descriptor)
+
+      patch.setattr(storage.os, 'fsync', failing)
+    with pytest.raises(
+        errors.ResultsError, match=r'No space left .*; nothing that was compl'
+    ):
+      _run(job, tmp_path)
+  assert not list(path.rglob('*.partial'))
+  assert _checkpoints(path)
+  _run(job, tmp_path)
+  assert _results(path) == _results(whole)
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+  (tmp_path / 'file').write_text('')
+  with pytest.raises(errors.ResultsError, match=r'file/reward.*: Not a dir'):
+    _run(_job(), tmp_path / 'file')
+
+
+def test_tensorboard_gets_the_points(tmp_path):
+  board = pytest.importorskip('tensorboardX')
+  assert board
+  path, _ = _run(_job(), tmp_path, tensorboard=True)
+  [events] = (path / training.TENSORBOARD).iterdir()
+  assert b'registers/reward/corruption_signed' in events.read_bytes()
+
+
+def test_without_tensorboardx_a_run_says_what_to_install(tmp_path, monkeypatch):
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+  with pytest.raises(errors.SpecError, match=r'realab-suite\[tb\]'):
+    _run(_job(), tmp_path, tensorboard=True)
+  assert not list(tmp_path.iterdir())
+
+
+def test_without_jax_a_run_says_what_to_install(tmp_path, monkeypatch):
+  monkeypatch.setattr(training, 'make_learner', _make_learner)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+  with pytest.raises(errors.SpecError, match=r'realab-suite\[agents\]'):
+    _run(_job(), tmp_path)
