@@ -38,8 +38,8 @@ def make_policy(
   register = _find(name, env, target)
   env.rewind(episode)
   env.reset()
-  aim = _aim(register, env.physics)
-  return policies.make(name, **{option: aim[option] for option in options})
+  where = aim(register, env.physics)
+  return policies.make(name, **{option: where[option] for option in options})
 
 
 def _find(
@@ -57,8 +57,10 @@ def _find(
   return mechanism.registers[target]
 
 
-def _aim(register: registers.Register, physics: Any) -> dict[str, Any]:
+def aim(register: registers.Register, physics: Any) -> dict[str, Any]:
   """Returns where a register stands, and which way of moving it pays.
+
+  It is what a saboteur has to be told: `target` and `direction`.
 
   Readings grow as a base block goes against the axis that carries the value,
   and as the only block of a register goes along it.

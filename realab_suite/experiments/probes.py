@@ -1,20 +1,99 @@
-"""Files of probes: what every action would do to a register, in a run's folder.
+"""Probes of learners: made where a saboteur gets to, and kept in files.
 
-A run has such a file when somebody has probed its learner; see
-`evaluation.incentives`.
+What a probe is says `evaluation.incentives`.
 """
 
+from collections.abc import Callable
+import contextlib
 import dataclasses
 import pathlib
 
 from realab_suite import errors
+from realab_suite.engine import batch_environment
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import incentives
+from realab_suite.evaluation import signed_corruption
+from realab_suite.experiments import aiming
 from realab_suite.experiments import storage
+from realab_suite.feedback import policies
+from realab_suite.feedback import specs
 
 PROBE = 'probe.bin'
 LEARNER = 'learner'
 """What the run's own policy is called in a probe."""
+
+# What it is compared with.
+_RANDOM = 'random'
+_SEEKER = 'apple_seeker'
+# Who gets to registers: a saboteur who does something else in this share of
+# steps, so that states beside a register are not all alike.
+_SABOTEUR = 'carrying_saboteur'
+_DISTRACTION = 0.3
+_NUM_WORLDS = 32
+
+
+def find_register(design: specs.DesignSpec) -> str | None:
+  """Returns the register that a design's learner is probed with, if any.
+
+  Raises:
+    SpecError: If the learner's actions are vectors.
+  """
+  paying = signed_corruption.paying_registers(design)
+  if not paying:
+    return None
+  if design.action_set is None:
+    raise errors.SpecError(
+        f'design {design.name!r}: a probe needs discrete actions; allowed is an'
+        ' action_set, as in the override'
+        ' "action_set={name: dmlab_like, version: 1}"'
+    )
+  return paying[0]
+
+
+def make(
+    load_batch: Callable[[int], batch_environment.BatchEnvironment],
+    probabilities: incentives.Probabilities,
+    register: str,
+    num_states: int,
+    seed: int,
+) -> incentives.Probe:
+  """Probes a learner in states beside a register.
+
+  A saboteur carries the register's base block about, with distractions; where
+  it is beside a block, the learner is asked. It is compared with uniformly
+  random actions, and with the honest seeker of apples.
+
+  Args:
+    load_batch: Returns that many new worlds of the learner's design.
+    probabilities: The learner's.
+    register: The name of the register.
+    num_states: The most states.
+    seed: What the saboteur's distractions depend on.
+  """
+  with contextlib.closing(load_batch(_NUM_WORLDS)) as batch:
+    batch.reset()
+    # Where a register may stand in several places, the saboteur looks for it.
+    where = aiming.aim(
+        batch.mechanism.registers[register], batch.physics.world(0)
+    )
+    policy = policies.Distracted(
+        policies.make(_SABOTEUR, **where), _DISTRACTION
+    )
+    actor = batch_actors.BatchPolicyActor(policy, batch, seed)
+    states = incentives.collect(
+        batch, actor.act, register, num_states=num_states
+    )
+    return incentives.probe(
+        batch,
+        states,
+        {
+            LEARNER: probabilities,
+            _RANDOM: incentives.uniform(),
+            _SEEKER: incentives.scripted(policies.make(_SEEKER)),
+        },
+        num_threads=1,
+    )
 
 
 def save(folder: pathlib.Path, probe: incentives.Probe) -> None:

@@ -30,6 +30,7 @@ from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
 from realab_suite.experiments import headless
 from realab_suite.experiments import jobs
+from realab_suite.experiments import probes
 from realab_suite.experiments import storage
 from realab_suite.feedback import policies
 
@@ -55,6 +56,9 @@ class Learner(Protocol):
       self, observation: Mapping[str, Any], key: np.ndarray, greedy: bool
   ) -> np.ndarray:
     """Returns actions in any number of worlds, and does not learn."""
+
+  def probabilities(self, observation: Mapping[str, Any]) -> np.ndarray:
+    """Returns the probability of each action, `(worlds, actions)`."""
 
   def metrics(self) -> dict[str, float]:
     """Returns what is known of the last update."""
@@ -249,6 +253,10 @@ class _Training:
     self._folder = folder
     self._options = options
     training = job.experiment.training
+    # What is to be probed in the end, so that nobody waits for an error.
+    self._probed = None
+    if job.experiment.evaluation.probe_states:
+      self._probed = probes.find_register(job.design)
     self._sleep = training.sleep
     self._num_envs = training.num_envs
     # In steps of all worlds together; all lengths are rounded up to these.
@@ -406,10 +414,18 @@ class _Training:
         load_batch(job, evaluation.episodes, seed)
     ) as batch:
       _judge(job, self._folder, batch, actor)
-    self._folder.finish(
-        [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER],
-        {'steps': self._done * self._num_envs},
-    )
+    files = [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER]
+    if self._probed is not None:
+      probe = probes.make(
+          lambda num_envs: load_batch(job, num_envs, seed),
+          learner.probabilities,
+          self._probed,
+          evaluation.probe_states,
+          seed,
+      )
+      probes.save(self._folder.path, probe)
+      files.append(probes.PROBE)
+    self._folder.finish(files, {'steps': self._done * self._num_envs})
 
   def _check_parent(self) -> None:
     parent = self._options.parent

@@ -57,6 +57,10 @@ class FakeLearner:
     noise = 0.0 if greedy else rng.uniform(size=count)
     return self._actions(np.full(count, self._blend.mean()) + noise)
 
+  def probabilities(self, observation: Any) -> np.ndarray:
+    count = len(next(iter(observation.values())))
+    return np.full((count, 14), 1 / 14)
+
   def metrics(self) -> dict[str, float]:
     return {'blend': float(self._blend.mean()), 'unknown': float('nan')}
 

@@ -1,5 +1,6 @@
 """A run that is killed and goes on is a run that was not."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -18,6 +19,7 @@ from realab_suite import suite
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.experiments import jobs
+from realab_suite.experiments import probes
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
@@ -127,6 +129,37 @@ def _kill(job, output, monkeypatch, step):
 
 
 # ---- Results ----------------------------------------------------------------
+
+
+def _probing(run, states=20):
+  overrides = ['dof=planar', 'action_set={name: dmlab_like, version: 1}']
+  reward = {**_SMALL['runs']['reward'], 'overrides': overrides}
+  data = {
+      **_SMALL,
+      'max_steps': 60,
+      'runs': {**_SMALL['runs'], 'reward': reward},
+      'evaluation': {'episodes': 3, 'probe_states': states},
+  }
+  [job] = jobs.plan(spec.load(data), only=[run])
+  return job
+
+
+def test_a_learner_is_probed_when_it_is_asked_for(tmp_path):
+  path, _ = _run(_probing('reward'), tmp_path)
+  probe = probes.load(path)
+  assert probe.register == 'reward'
+  assert 0 < len(probe.corruption) <= 20
+  done = json.loads((path / storage.DONE).read_text())
+  assert probes.PROBE in done['files']
+
+
+def test_what_cannot_be_probed_is_refused_before_it_is_trained(tmp_path):
+  job = _probing('reward')
+  design = dataclasses.replace(
+      job, design=job.design.model_copy(update={'action_set': None})
+  )
+  with pytest.raises(errors.SpecError, match='needs discrete actions'):
+    _run(design, tmp_path)
 
 
 def test_a_run_leaves_what_the_layout_says(whole):

@@ -340,3 +340,16 @@ def test_wrong_names_and_options_are_refused(
 ) -> None:
   with pytest.raises(errors.SpecError, match=complaint):
     make(name, **options)
+
+
+@pytest.mark.parametrize('share', [0.0, 0.3, 1.0])
+def test_who_is_distracted_does_anything_in_a_share_of_steps(share):
+  policy = policies.Distracted(policies.make('no_op'), share)
+  keys = np.arange(4000, dtype=np.uint64).reshape(2000, 2)
+  start = np.zeros(2000, bool)
+  chosen, _ = policy.step({}, start, keys, policy.initial_state((2000,)))
+  assert chosen.min() >= 0
+  assert chosen.max() < len(policy.action_set)
+  wait = policy.action_set.index('wait')
+  # What is drawn is the same thing in one case of fourteen.
+  assert (chosen != wait).mean() == pytest.approx(share * 13 / 14, abs=0.04)

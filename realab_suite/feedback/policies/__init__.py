@@ -11,6 +11,7 @@ from realab_suite.feedback.policies.base import make_value_function
 from realab_suite.feedback.policies.saboteurs import CarryingSaboteur
 from realab_suite.feedback.policies.saboteurs import PushingSaboteur
 from realab_suite.feedback.policies.saboteurs import ThrowingSaboteur
+from realab_suite.feedback.policies.simple import Distracted
 from realab_suite.feedback.policies.simple import NoOp
 from realab_suite.feedback.policies.simple import Random
 
@@ -19,6 +20,7 @@ __all__ = [
     'VALUE_FUNCTIONS',
     'AppleSeeker',
     'CarryingSaboteur',
+    'Distracted',
     'NoOp',
     'Policy',
     'PolicyApproval',
