@@ -229,7 +229,11 @@ class _Sweep:
 
   def _progress(self) -> str:
     failed = f', {len(self._failures)} failed' if self._failures else ''
-    return f'{self._num_over} of {len(self._jobs)} jobs{failed}'
+    parts = [f'{self._num_over} of {len(self._jobs)} jobs{failed}']
+    for running in self._running:
+      if returns := _last_returns(running.folder):
+        parts.append(f'{running.job.run}: {returns}')
+    return '; '.join(parts)
 
 
 def _last_step(folder: pathlib.Path) -> int:
@@ -238,6 +242,14 @@ def _last_step(folder: pathlib.Path) -> int:
     return int(json.loads(_last_line(folder / training.TIMING))['step'])
   except ValueError:  # Nothing yet, or half a line.
     return 0
+
+
+def _last_returns(folder: pathlib.Path) -> str:
+  """Says what a run's last episodes have brought, as far as it has said."""
+  try:
+    return training.summary(json.loads(_last_line(folder / training.CURVE)))
+  except (ValueError, KeyError):  # Nothing yet, or half a line.
+    return ''
 
 
 def _last_line(path: pathlib.Path) -> str:

@@ -348,7 +348,7 @@ class _Training:
         board.add(point)
         timing = clock.tell(point['step'])
         self._timing.append([timing])
-        bar.set_postfix_str(_summary(point), refresh=False)
+        bar.set_postfix_str(summary(point), refresh=False)
         if bar.disable:
           self._options.say(_line(job, point, timing, self._total * num_envs))
       if is_over or self._done % self._save_every == 0:
@@ -477,7 +477,8 @@ def _cut_off(
   )
 
 
-def _summary(point: Mapping[str, Any]) -> str:
+def summary(point: Mapping[str, Any]) -> str:
+  """Returns a point's true and observed return, in words."""
   return ', '.join(
       f'{word} {"-" if value is None else format(value, ".1f")}'
       for word, value in (
@@ -497,5 +498,5 @@ def _line(
   left = (total - point['step']) / max(rate, 1e-9)
   return (
       f'{job.run}, seed {job.seed}: step {point["step"]} of {total},'
-      f' {_summary(point)}; {rate:.0f} steps/s, {left:.0f} s left'
+      f' {summary(point)}; {rate:.0f} steps/s, {left:.0f} s left'
   )

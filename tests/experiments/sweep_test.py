@@ -218,6 +218,9 @@ def test_a_sweep_that_is_interrupted_leaves_nobody_behind(tmp_path):
       yaml.safe_dump({**_SMALL, 'runs': run, 'training': training_})
   )
   program = (
+      # Whoever runs tests in the background may have SIGINT ignored.
+      'import signal\n'
+      'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
       'from realab_suite.experiments import cli, sweep, sweeping\n'
       "sweeping._MODULE = 'tests.experiments.fake_learner'\n"
       'cli.start(sweep.main)\n'
@@ -234,7 +237,10 @@ def test_a_sweep_that_is_interrupted_leaves_nobody_behind(tmp_path):
       assert process.poll() is None, process.stderr.read()
       time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    _, complaint = process.communicate(timeout=30)
+    try:
+      _, complaint = process.communicate(timeout=30)
+    finally:
+      process.kill()
   assert process.returncode == 130
   assert complaint.splitlines()[-1].startswith('error: interrupted')
   [folder] = [p.parent for p in output.glob('*/checkpoints')]
@@ -402,3 +408,20 @@ def test_only_a_learner_brings_jax(tmp_path):
   )
   subprocess.run([sys.executable, '-c', program], cwd=_ROOT, check=True)
   assert len(list(tmp_path.glob(f'*/{training.EPISODES}'))) == 1
+
+
+@pytest.mark.parametrize(
+    ('written', 'said'),
+    [
+        (
+            '{"true_return": 1.25, "observed_return": null}\n',
+            'true return 1.2, observed -',
+        ),
+        ('{"true_return": 1.25, "obs', ''),
+        ('{}', ''),
+        ('', ''),
+    ],
+)
+def test_a_sweep_shows_returns_as_far_as_there_are_any(tmp_path, written, said):
+  (tmp_path / training.CURVE).write_text(written)
+  assert sweeping._last_returns(tmp_path) == said

@@ -1,0 +1,59 @@
+r"""Trains the networks that supervisors run, and writes them into files.
+
+  python -m realab_suite.experiments.make_networks --output=configs/networks
+
+Each learns from the reading of a reward register that nothing can tamper with,
+so from the true reward, and sees the senses of an agent but no register. What
+it reaches is measured afterwards, in NumPy, in other episodes than it has
+learned in. The same versions on the same kind of machine make the same files.
+"""
+
+from collections.abc import Sequence
+import pathlib
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.experiments import cli
+from realab_suite.experiments import headless
+from realab_suite.experiments import threads
+
+_OUTPUT = flags.DEFINE_string('output', None, 'The folder to write into.')
+_NETWORKS = flags.DEFINE_list(
+    'networks', [], 'Which networks to make; all by default.'
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Makes the networks that the flags name."""
+  del argv
+  output = pathlib.Path(cli.required(_OUTPUT))
+  if problem := headless.missing('jax', 'equinox', 'optax', extra='agents'):
+    raise errors.SpecError(f'making networks needs more: {problem}')
+  threads.use_one()
+  headless.render_nothing()
+  # Not before libraries have been told to use one thread.
+  from realab_suite.experiments import network_making
+  from realab_suite.experiments import storage
+
+  recipes = network_making.RECIPES
+  names = _NETWORKS.value or list(recipes)
+  if unknown := sorted(set(names) - set(recipes)):
+    raise errors.UnknownNameError(
+        f'--networks: {unknown[0]!r} is unknown; known are {list(recipes)}'
+    )
+  for name in names:
+    network = network_making.make(recipes[name])
+    for reached in network.header.reached:
+      cli.say(
+          f'{name}: true return {reached.mean:.2f} [{reached.low:.2f},'
+          f' {reached.high:.2f}] in {reached.task}'
+      )
+    with storage.explained(output):
+      output.mkdir(parents=True, exist_ok=True)
+    storage.write_whole(output / f'{name}.npz', network.to_bytes())
+    cli.say(f'{output / name}.npz has been written')
+
+
+if __name__ == '__main__':
+  cli.start(main)
