@@ -45,7 +45,13 @@ class Stopwatch:
     calls: How often each function was called, by label.
   """
 
-  def __init__(self) -> None:
+  def __init__(self, clock: Callable[[], float] | None = None) -> None:
+    """Makes a stopwatch.
+
+    Args:
+      clock: Tells the time, seconds; `None` for the clock on the wall.
+    """
+    self._clock = clock or time.perf_counter
     self.seconds: dict[str, float] = {}
     self.calls: dict[str, int] = {}
     self._running: list[str] = []
@@ -71,7 +77,7 @@ class Stopwatch:
 
   def _book(self) -> None:
     """Gives the time since the last call to whoever ran."""
-    now = time.perf_counter()
+    now = self._clock()
     if self._running:
       self.seconds[self._running[-1]] += now - self._since
     self._since = now
@@ -86,7 +92,8 @@ class Figure:
     name: What was measured.
     samples: One figure per round, or one alone.
     unit: Of the figure.
-    target: The most that is allowed, or `None` for what is not judged.
+    target: The most that is allowed, of a rate the least, or `None` for what is
+      not judged.
     target_is_ratio: Whether `target` is about `ratios` and not the figure.
     ratios: To what the raw engine took in the same round, or `None`.
   """
@@ -104,13 +111,18 @@ class Figure:
     if self.target is None:
       return '-'
     judged = self.ratios if self.target_is_ratio else self.samples
-    return 'met' if np.median(judged) <= self.target else 'missed'
+    median = np.median(judged)
+    is_met = (
+        median >= self.target if self._is_at_least else median <= self.target
+    )
+    return 'met' if is_met else 'missed'
 
   def __str__(self) -> str:
     target = '-'
     if self.target is not None:
       unit = 'x raw' if self.target_is_ratio else self.unit
-      target = f'<= {self.target:g} {unit}'
+      sign = '>=' if self._is_at_least else '<='
+      target = f'{sign} {self.target:g} {unit}'
     ratio = '-' if self.ratios is None else f'{np.median(self.ratios):.2f} x'
     return _columns(
         self.name,
@@ -126,8 +138,15 @@ class Figure:
   @property
   def _best(self) -> float:
     """The figure of the round that was disturbed the least."""
-    is_rate = self.unit.startswith('/')
-    return float(self.samples.max() if is_rate else self.samples.min())
+    return float(self.samples.max() if self._is_rate else self.samples.min())
+
+  @property
+  def _is_rate(self) -> bool:
+    return self.unit.startswith('/')
+
+  @property
+  def _is_at_least(self) -> bool:
+    return self._is_rate and not self.target_is_ratio
 
   def _quiet_ratio(self) -> tuple[str, str]:
     """Returns the ratio of the best figures, and the quartiles of ratios."""

@@ -10,7 +10,9 @@ from benchmarks import batch
 from benchmarks import reset
 from benchmarks import step
 from benchmarks import timing
+from benchmarks import train
 from realab_suite import suite
+from realab_suite.experiments import headless
 
 _LINES = [
     (
@@ -77,6 +79,47 @@ def test_the_benchmark_of_many_worlds_prints_a_line_per_figure(
     assert f' {target} ' in line
     judged = {'met', 'missed'} & set(line.split())
     assert bool(judged) == (target != '-')
+
+
+def test_the_benchmark_of_training_prints_a_line_per_figure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  for module in ('jax', 'optax', 'equinox'):
+    pytest.importorskip(module, reason=f'{module} is in the extra `agents`')
+  monkeypatch.setattr(train, '_WORLDS', 2)
+  monkeypatch.setattr(train, '_STEPS', 33)  # One update.
+  kinds = {'planar, asleep': ('planar', True), 'free': ('free', False)}
+  monkeypatch.setattr(train, '_KINDS', kinds)
+  train.main(['--rounds=1'])
+  figures = {}
+  for line in capsys.readouterr().out.splitlines()[2:]:
+    figures[line[:34].rstrip()] = line[34:].split()
+  assert figures['control steps, planar, asleep'][2:5] == ['>=', '15', '/ms']
+  assert figures['control steps, planar, asleep'][6] in ('met', 'missed')
+  assert figures['control steps, free'][2] == '-'
+  for kind in kinds:
+    for part in ('physics', 'rays', 'network', 'update', 'the rest'):
+      assert float(figures[f'  {part}, {kind}'][0]) > 0
+    whole = float(figures[f'processor time, {kind}'][0])
+    assert whole > float(figures[f'  physics, {kind}'][0])
+
+
+def test_the_benchmark_of_training_says_in_one_line_what_is_not_installed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  monkeypatch.setattr(headless, 'missing', lambda *_, **__: 'jax is missing')
+  with pytest.raises(SystemExit) as raised:
+    train.main([])
+  assert raised.value.code == 2
+  assert capsys.readouterr().err == 'error: jax is missing\n'
+
+
+def test_a_worker_that_fails_ends_the_benchmark(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+  monkeypatch.setattr(train, '_KINDS', {'wrong': ('sideways', True)})
+  with pytest.raises(EOFError):
+    train.main(['--rounds=1'])
 
 
 @pytest.mark.usefixtures('few_worlds')
@@ -146,6 +189,17 @@ def test_the_median_of_what_has_the_target_is_judged(
       'it', np.array(samples), 'us', 2.0, target_is_ratio, np.array(ratios)
   )
   assert figure.verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ('samples', 'verdict'), [([3.0, 2.0, 1.0], 'met'), ([9, 1, 1], 'missed')]
+)
+def test_of_a_rate_the_target_is_the_least(
+    samples: list[float], verdict: str
+) -> None:
+  figure = timing.Figure('it', np.array(samples), '/s', 2.0)
+  assert figure.verdict == verdict
+  assert ' >= 2 /s ' in str(figure)
 
 
 def test_a_stopwatch_gives_time_to_whoever_spends_it(
