@@ -2,10 +2,11 @@ r"""Trains the networks that supervisors run, and writes them into files.
 
   python -m realab_suite.experiments.make_networks --output=configs/networks
 
-Each learns from the reading of a reward register that nothing can tamper with,
-so from the true reward, and sees the senses of an agent but no register. What
-it reaches is measured afterwards, in NumPy, in other episodes than it has
-learned in. The same versions on the same kind of machine make the same files.
+Each learns for some minutes from the reading of a reward register that nothing
+can tamper with, so from the true reward, and sees the senses of an agent but no
+register. What it reaches is measured afterwards, in NumPy, in other episodes
+than it has learned in. The same versions on the same kind of machine make the
+same files.
 """
 
 from collections.abc import Sequence
@@ -19,9 +20,6 @@ from realab_suite.experiments import headless
 from realab_suite.experiments import threads
 
 _OUTPUT = flags.DEFINE_string('output', None, 'The folder to write into.')
-_NETWORKS = flags.DEFINE_list(
-    'networks', [], 'Which networks to make; all by default.'
-)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -36,14 +34,8 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.experiments import network_making
   from realab_suite.experiments import storage
 
-  recipes = network_making.RECIPES
-  names = _NETWORKS.value or list(recipes)
-  if unknown := sorted(set(names) - set(recipes)):
-    raise errors.UnknownNameError(
-        f'--networks: {unknown[0]!r} is unknown; known are {list(recipes)}'
-    )
-  for name in names:
-    network = network_making.make(recipes[name])
+  for name, recipe in network_making.RECIPES.items():
+    network = network_making.make(recipe)
     for reached in network.header.reached:
       cli.say(
           f'{name}: true return {reached.mean:.2f} [{reached.low:.2f},'

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 import contextlib
 import dataclasses
 from importlib import metadata
-from typing import Any, Literal, final
+from typing import Any, final
 
 import numpy as np
 import tqdm
@@ -45,25 +45,22 @@ class Recipe:
   """How a network is made.
 
   Attributes:
-    outputs: What its outputs are.
     description: What it does, in a sentence.
     learner: The options of the learner.
     part: Where its layers are in what the learner has learned.
     steps: For how many control steps it learns, all worlds together.
   """
 
-  outputs: Literal['log_probabilities', 'action_values']
   description: str
   learner: Mapping[str, Any]
   part: str
   steps: int
 
 
-# With a discount of 0.99 a learner leaves five of eight small apples for the
-# sake of being sooner at the large one.
+# With a discount of 0.99 it leaves five of eight small apples for the sake of
+# being sooner at the large one.
 RECIPES: Mapping[str, Recipe] = {
     'demonstrator_v1': Recipe(
-        'log_probabilities',
         'Gathers the small apples, steps on the pad, takes the large apple.',
         {
             'kind': 'policy_gradient',
@@ -73,18 +70,6 @@ RECIPES: Mapping[str, Recipe] = {
         },
         '[0].policy.network',
         2_000_000,
-    ),
-    'values_v1': Recipe(
-        'action_values',
-        'Discounted true return of each action and the best ones after it.',
-        {
-            'kind': 'q_learning',
-            'reward': 'reward',
-            'gamma': 0.998,
-            'hidden': [64, 64],
-        },
-        '[0][0]',
-        1_500_000,
     ),
 }
 
@@ -116,7 +101,7 @@ def make(
   design = specs.load(_DESIGN, _OVERRIDES)
   actions = action_sets.DMLAB_LIKE
   header = network_files.Header(
-      outputs=recipe.outputs,
+      outputs='log_probabilities',
       description=recipe.description,
       action_set=actions.name,
       action_set_version=actions.version,
@@ -169,7 +154,7 @@ def _train(
     encoder = features.Encoder.from_spec(senses)
     learner = learner_class(
         options,
-        f'registers/{options.reward}',
+        f'registers/{getattr(options, learner_class.READS)}',
         encoder,
         controls.Controls.from_spec(batch.action_spec()),
         num_envs,
@@ -182,8 +167,9 @@ def _train(
       while learner.num_steps < recipe.steps:
         time_step = batch.step(learner.step(time_step))
         bar.update(num_envs)
+  names = network_files.Feature.model_fields
   seen = tuple(
-      network_files.Feature(**dataclasses.asdict(part))
+      network_files.Feature(**{name: getattr(part, name) for name in names})
       for part in encoder.entries
   )
   return seen, learner.state()['trained']
@@ -226,13 +212,9 @@ def judge(
 def _reached(
     network: network_files.Network, variation: str, num_episodes: int
 ) -> network_files.Reached:
-  """Returns what comes of taking the action of the highest output."""
-  returns = judge(
-      networks.NetworkDemonstrator(network),
-      variation,
-      num_episodes,
-      _JUDGED_SEED,
-  )
+  """Returns what comes of taking the best action in every step."""
+  policy = networks.NetworkDemonstrator(network)
+  returns = judge(policy, variation, num_episodes, _JUDGED_SEED)
   interval = statistics.mean_interval({_JUDGED_SEED: returns})
   return network_files.Reached(
       task=f'{_DOMAIN}.{variation}',

@@ -8,6 +8,8 @@ from realab_suite.feedback.policies.base import Policy
 from realab_suite.feedback.policies.base import ValueFunction
 from realab_suite.feedback.policies.base import make
 from realab_suite.feedback.policies.base import make_value_function
+from realab_suite.feedback.policies.network import NetworkDemonstrator
+from realab_suite.feedback.policies.network import NetworkValues
 from realab_suite.feedback.policies.saboteurs import CarryingSaboteur
 from realab_suite.feedback.policies.saboteurs import PushingSaboteur
 from realab_suite.feedback.policies.saboteurs import ThrowingSaboteur
@@ -21,6 +23,8 @@ __all__ = [
     'AppleSeeker',
     'CarryingSaboteur',
     'Distracted',
+    'NetworkDemonstrator',
+    'NetworkValues',
     'NoOp',
     'Policy',
     'PolicyApproval',

@@ -1,0 +1,1 @@
+"""Data only: the networks that supervisors run, made by `make_networks`."""

@@ -1,0 +1,71 @@
+"""Tests for the command that makes the networks of supervisors."""
+
+import dataclasses
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+from realab_suite.feedback.policies import network_files
+
+pytest.importorskip('optax')
+
+from realab_suite.experiments import network_making
+
+_ROOT = pathlib.Path(__file__).parents[2]
+
+
+def test_every_shipped_network_is_what_its_recipe_makes():
+  assert tuple(network_making.RECIPES) == network_files.NETWORKS
+  for name, recipe in network_making.RECIPES.items():
+    header = network_files.load(name).header
+    assert header.description == recipe.description
+    assert header.made.learner == recipe.learner
+    assert header.made.steps == recipe.steps
+    assert list(header.hidden) == recipe.learner['hidden']
+
+
+def test_what_is_made_is_what_was_learned_and_can_be_loaded():
+  recipe = network_making.RECIPES['demonstrator_v1']
+  recipe = dataclasses.replace(
+      recipe,
+      learner={**recipe.learner, 'hidden': [8], 'steps_per_update': 4},
+      steps=16,
+  )
+  made = network_making.make(recipe, num_envs=2, num_episodes=2)
+  net = network_files.from_bytes(made.to_bytes(), 'small.npz')
+  assert net.digest() == made.digest()
+  assert net.header.hidden == (8,)
+  assert (net.header.made.steps, net.header.made.num_envs) == (16, 2)
+  assert [reached.episodes for reached in net.header.reached] == [2, 2, 2]
+  seen = {feature.name for feature in net.header.features}
+  assert {'senses/ray_classes', 'senses/velocity'} <= seen
+  assert not any(name.startswith('registers/') for name in seen)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'complaint'),
+    [
+        ([], 'error: --output: missing'),
+        (['--output=new', 'demonstrator_v1'], 'are no flags'),
+    ],
+)
+def test_what_the_command_line_gets_wrong_is_told_in_a_line(
+    tmp_path, arguments, complaint
+):
+  module = 'realab_suite.experiments.make_networks'
+  ran = subprocess.run(
+      [sys.executable, '-m', module, *arguments],
+      cwd=tmp_path,
+      env={**os.environ, 'PYTHONPATH': str(_ROOT)},
+      capture_output=True,
+      text=True,
+      timeout=100,
+      check=False,
+  )
+  assert ran.returncode == 2
+  assert complaint in ran.stderr
+  assert len(ran.stderr.splitlines()) == 1
+  assert not list(tmp_path.iterdir())
