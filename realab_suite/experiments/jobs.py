@@ -15,6 +15,7 @@ from realab_suite import suite
 from realab_suite.evaluation import results
 from realab_suite.experiments import spec as experiment_spec
 from realab_suite.feedback import specs
+from realab_suite.feedback import validation
 
 _SCHEMA = 1
 # What learners are made of; results depend on it where it is installed.
@@ -89,7 +90,7 @@ class Job:
 
   def digest(self) -> str:
     """Returns a hash of the configuration."""
-    return experiment_spec.digest_of(self.config())[:_NUM_DIGITS]
+    return validation.digest_of(self.config())[:_NUM_DIGITS]
 
   def folder(self) -> str:
     """Returns the name of the folder of the results."""

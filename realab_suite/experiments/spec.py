@@ -1,9 +1,7 @@
 """Experiments as data: which agents are trained, and how they are judged."""
 
 from collections.abc import Iterator, Mapping
-import hashlib
 from importlib import resources
-import json
 import os
 from typing import Annotated, Any, Literal, final
 
@@ -25,16 +23,8 @@ TWIN = 'secure'
 """What the secure twin of a run is called, and its channel."""
 
 
-class _Spec(pydantic.BaseModel):
-  """Frozen; unknown keys and lossy conversions are errors."""
-
-  model_config = pydantic.ConfigDict(
-      frozen=True, extra='forbid', strict=True, populate_by_name=True
-  )
-
-
 @final
-class RunSpec(_Spec):
+class RunSpec(validation.Spec):
   """An agent to train.
 
   Attributes:
@@ -46,7 +36,7 @@ class RunSpec(_Spec):
 
   design: str
   overrides: Annotated[tuple[str, ...], pydantic.Field(strict=False)] = ()
-  learner: dict[str, Any] = {}
+  learner: dict[str, Any] = pydantic.Field(default_factory=dict)
   twin: bool = False
 
   def load(self, channel: str | None = None) -> specs.DesignSpec:
@@ -69,7 +59,7 @@ class RunSpec(_Spec):
 
 
 @final
-class TrainingSpec(_Spec):
+class TrainingSpec(validation.Spec):
   """How long agents are trained; lengths are control steps of all worlds.
 
   Attributes:
@@ -89,7 +79,7 @@ class TrainingSpec(_Spec):
 
 
 @final
-class EvaluationSpec(_Spec):
+class EvaluationSpec(validation.Spec):
   """How a policy is judged, once it has stopped to learn.
 
   Attributes:
@@ -108,7 +98,7 @@ class EvaluationSpec(_Spec):
 
 
 @final
-class ExperimentSpec(_Spec):
+class ExperimentSpec(validation.Spec):
   """Runs on one task, and what they are compared with.
 
   Attributes:
@@ -177,20 +167,6 @@ class ExperimentSpec(_Spec):
     """The two names that `suite.load` takes."""
     domain, _, variation = self.task.partition('.')
     return domain, variation
-
-  def to_mapping(self) -> dict[str, Any]:
-    """Returns the experiment as plain data, defaults filled in."""
-    return self.model_dump(mode='json', by_alias=True)
-
-  def digest(self) -> str:
-    """Returns a hash of the experiment."""
-    return digest_of(self.to_mapping())
-
-
-def digest_of(data: Mapping[str, Any]) -> str:
-  """Returns a hash of plain data, whatever the order of its keys."""
-  canonical = json.dumps(data, sort_keys=True, separators=(',', ':'))
-  return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
 Experiment = str | os.PathLike[str] | Mapping[str, Any] | ExperimentSpec

@@ -3,9 +3,7 @@
 from collections.abc import Iterator, Mapping
 import functools
 import graphlib
-import hashlib
 from importlib import resources
-import json
 import operator
 import os
 from typing import Annotated, Any, Literal, final
@@ -31,16 +29,8 @@ Role = Literal['feedback', 'meter', 'query', 'signal']
 READ_BY_AGENTS = ('feedback', 'signal')
 
 
-class _Spec(pydantic.BaseModel):
-  """Frozen; unknown keys and lossy conversions are errors."""
-
-  model_config = pydantic.ConfigDict(
-      frozen=True, extra='forbid', strict=True, populate_by_name=True
-  )
-
-
 @final
-class PlaceSpec(_Spec):
+class PlaceSpec(validation.Spec):
   """Coordinates, or a region around them.
 
   Attributes:
@@ -62,7 +52,7 @@ class PlaceSpec(_Spec):
 
 
 @final
-class RegisterSpec(_Spec):
+class RegisterSpec(validation.Spec):
   """A register: what it is, what it is for, and where it stands.
 
   Attributes:
@@ -93,7 +83,7 @@ class RegisterSpec(_Spec):
   dof: Dof | None = None
   block_size: Size = 0.2
   mass: Annotated[float, pydantic.Field(ge=0.01, le=100)] = 1.0
-  options: dict[str, Any] = {}
+  options: dict[str, Any] = pydantic.Field(default_factory=dict)
 
   @pydantic.field_validator('kind')
   @classmethod
@@ -125,7 +115,7 @@ class RegisterSpec(_Spec):
 
 
 @final
-class MeterSpec(_Spec):
+class MeterSpec(validation.Spec):
   """A meter.
 
   Attributes:
@@ -138,7 +128,7 @@ class MeterSpec(_Spec):
 
 
 @final
-class ScheduleSpec(_Spec):
+class ScheduleSpec(validation.Spec):
   """After which substeps of a control step meters and providers act.
 
   Attributes:
@@ -173,7 +163,7 @@ class ScheduleSpec(_Spec):
 
 
 @final
-class ActionSetSpec(_Spec):
+class ActionSetSpec(validation.Spec):
   """Which discrete action set the agent acts by.
 
   Attributes:
@@ -194,7 +184,7 @@ class ActionSetSpec(_Spec):
 
 
 @final
-class LearnerSpec(_Spec):
+class LearnerSpec(validation.Spec):
   """The learning algorithm, for whoever trains an agent of this design.
 
   Fields besides `kind` are the learner's own. Where one names a register, it
@@ -234,7 +224,7 @@ _Provider = providers.Provider
 
 
 @final
-class DesignSpec(_Spec):
+class DesignSpec(validation.Spec):
   """An agent design: a feedback function and a learner (section 3.2).
 
   Attributes:
@@ -260,7 +250,7 @@ class DesignSpec(_Spec):
   description: str = ''
   channel: Channel = 'embedded'
   dof: Dof = 'free'
-  registers: dict[Name, RegisterSpec] = {}
+  registers: dict[Name, RegisterSpec] = pydantic.Field(default_factory=dict)
   meters: Annotated[tuple[MeterSpec, ...], pydantic.Field(strict=False)] = ()
   providers: Annotated[
       tuple[Annotated[_Provider, _AnyProvider], ...],
@@ -371,17 +361,6 @@ class DesignSpec(_Spec):
     if self.schedule == 'cfmdp':
       return ScheduleSpec(meter_substep=0, provider_substep=0)
     return self.schedule.check(num_substeps)
-
-  def to_mapping(self) -> dict[str, Any]:
-    """Returns the design as plain data, defaults filled in."""
-    return self.model_dump(mode='json', by_alias=True)
-
-  def digest(self) -> str:
-    """Returns a hash of the design, by which results are told apart."""
-    canonical = json.dumps(
-        self.to_mapping(), sort_keys=True, separators=(',', ':')
-    )
-    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
 def _texts_in(value: Any) -> Iterator[str]:

@@ -1,8 +1,11 @@
-"""Validates data by a pydantic model, and says in one line what is wrong."""
+"""Specs, as pydantic models: strict, hashed, and wrong in one line at most."""
 
+import abc
 from collections.abc import Mapping, Sequence
 import difflib
+import hashlib
 import itertools
+import json
 import re
 import types
 import typing
@@ -14,6 +17,28 @@ from pydantic import fields
 from realab_suite.feedback import messages
 
 _Model = TypeVar('_Model', bound=pydantic.BaseModel)
+
+
+class Spec(pydantic.BaseModel, abc.ABC):
+  """Frozen; unknown keys and lossy conversions are errors."""
+
+  model_config = pydantic.ConfigDict(
+      frozen=True, extra='forbid', strict=True, populate_by_name=True
+  )
+
+  def to_mapping(self) -> dict[str, Any]:
+    """Returns this as plain data, defaults filled in."""
+    return self.model_dump(mode='json', by_alias=True)
+
+  def digest(self) -> str:
+    """Returns a hash of all this, by which results are told apart."""
+    return digest_of(self.to_mapping())
+
+
+def digest_of(data: Mapping[str, Any]) -> str:
+  """Returns a hash of plain data, whatever the order of its keys."""
+  canonical = json.dumps(data, sort_keys=True, separators=(',', ':'))
+  return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
 def validate(
