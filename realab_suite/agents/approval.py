@@ -124,7 +124,7 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
         self._encoder,
         self._networks[0],
         observation,
-        self._exploration(),
+        training.exploration(self._options, self.num_steps),
         keys['act'],
         self._query_keys(keys),
         greedy,
@@ -143,14 +143,12 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
     asked = choice['asked']
     return {name: asked[:, i] for i, name in enumerate(self._options.queries)}
 
-  def _exploration(self) -> np.float32:
-    """How often the action is drawn at random now."""
-    spent = min(self.num_steps / self._options.exploration_steps, 1.0)
-    return np.float32(1.0 + spent * (self._options.exploration - 1.0))
-
   def _probabilities(self, observation: features.Packed) -> Any:
     return _probabilities(
-        self._encoder, self._networks[0], observation, self._exploration()
+        self._encoder,
+        self._networks[0],
+        observation,
+        training.exploration(self._options, self.num_steps),
     )
 
   def _learn(

@@ -52,13 +52,13 @@ class BehaviouralCloning(on_policy.OnPolicyLearner):
       keys: Mapping[str, np.ndarray],
       greedy: bool,
   ) -> base.Choice:
-    action = _act(
+    action, _ = networks.act(
         self._encoder, self._networks[0], observation, keys['act'], greedy
     )
     return {'action': np.asarray(action)}
 
   def _probabilities(self, observation: features.Packed) -> Any:
-    return _probabilities(self._encoder, self._networks[0], observation)
+    return networks.probabilities(self._encoder, self._networks[0], observation)
 
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
@@ -72,27 +72,6 @@ class BehaviouralCloning(on_policy.OnPolicyLearner):
         self._draw_minibatches(),
     )
     return metrics
-
-
-@functools.partial(jax.jit, static_argnums=(0, 4))
-def _act(
-    encoder: features.Encoder,
-    policy: networks.Policy,
-    observation: features.Packed,
-    key: jax.Array,
-    greedy: bool,
-) -> jax.Array:
-  distribution = policy(encoder.encode(observation))
-  return distribution.mode() if greedy else distribution.sample(key)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _probabilities(
-    encoder: features.Encoder,
-    policy: networks.Policy,
-    observation: features.Packed,
-) -> jax.Array:
-  return jax.nn.softmax(policy.network(encoder.encode(observation)))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

@@ -1,5 +1,6 @@
 """Networks: small ones, for vectors and images, and what their outputs mean."""
 
+import functools
 import math
 from typing import final
 
@@ -200,6 +201,28 @@ class Policy(eqx.Module):
     if self.log_std is None:
       return Categorical(output)
     return Gaussian(output, self.log_std)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def act(
+    encoder: features.Encoder,
+    policy: Policy,
+    observation: features.Packed,
+    key: jax.Array,
+    greedy: bool,
+) -> tuple[jax.Array, jax.Array]:
+  """Returns what a policy does, and the logarithm of its probability."""
+  distribution = policy(encoder.encode(observation))
+  action = distribution.mode() if greedy else distribution.sample(key)
+  return action, distribution.log_prob(action)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def probabilities(
+    encoder: features.Encoder, policy: Policy, observation: features.Packed
+) -> jax.Array:
+  """Returns the probability of each discrete action, `(worlds, actions)`."""
+  return jax.nn.softmax(policy.network(encoder.encode(observation)))
 
 
 def _orthogonal(

@@ -77,13 +77,15 @@ class PolicyGradient(on_policy.OnPolicyLearner):
       greedy: bool,
   ) -> base.Choice:
     policy = self._networks[0].policy
-    action, log_prob = _act(
+    action, log_prob = networks.act(
         self._encoder, policy, observation, keys['act'], greedy
     )
     return {'action': np.asarray(action), 'log_prob': np.asarray(log_prob)}
 
   def _probabilities(self, observation: features.Packed) -> Any:
-    return _probabilities(self._encoder, self._networks[0].policy, observation)
+    return networks.probabilities(
+        self._encoder, self._networks[0].policy, observation
+    )
 
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
@@ -106,28 +108,6 @@ class PolicyGradient(on_policy.OnPolicyLearner):
   def _set_memory(self, memory: dict[str, Any]) -> None:
     super()._set_memory(memory)
     self._scale.set_state(memory['scale'])
-
-
-@functools.partial(jax.jit, static_argnums=(0, 4))
-def _act(
-    encoder: features.Encoder,
-    policy: networks.Policy,
-    observation: features.Packed,
-    key: jax.Array,
-    greedy: bool,
-) -> tuple[jax.Array, jax.Array]:
-  distribution = policy(encoder.encode(observation))
-  action = distribution.mode() if greedy else distribution.sample(key)
-  return action, distribution.log_prob(action)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _probabilities(
-    encoder: features.Encoder,
-    policy: networks.Policy,
-    observation: features.Packed,
-) -> jax.Array:
-  return jax.nn.softmax(policy.network(encoder.encode(observation)))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

@@ -86,7 +86,11 @@ class QLearning(base.Learner):
       keys: Mapping[str, np.ndarray],
       greedy: bool,
   ) -> base.Choice:
-    exploration = np.float32(0.0) if greedy else self._exploration()
+    exploration = (
+        np.float32(0.0)
+        if greedy
+        else training.exploration(self._options, self.num_steps)
+    )
     action = _act(
         self._encoder,
         self._networks[0][0],
@@ -96,14 +100,12 @@ class QLearning(base.Learner):
     )
     return {'action': np.asarray(action)}
 
-  def _exploration(self) -> np.float32:
-    """How often the action is drawn at random now."""
-    spent = min(self.num_steps / self._options.exploration_steps, 1.0)
-    return np.float32(1.0 + spent * (self._options.exploration - 1.0))
-
   def _probabilities(self, observation: features.Packed) -> Any:
     return _probabilities(
-        self._encoder, self._networks[0][0], observation, self._exploration()
+        self._encoder,
+        self._networks[0][0],
+        observation,
+        training.exploration(self._options, self.num_steps),
     )
 
   def _observe(
@@ -138,7 +140,9 @@ class QLearning(base.Learner):
     self._metrics = {
         **{name: float(value) for name, value in metrics.items()},
         'feedback_scale': scale,
-        'exploration': float(self._exploration()),
+        'exploration': float(
+            training.exploration(self._options, self.num_steps)
+        ),
         'observed_feedback': float(reading.mean()) if len(reading) else 0.0,
     }
 

@@ -33,6 +33,17 @@ def descend(
   return (optax.apply_updates(network, updates), optimizer_state), metrics
 
 
+def exploration(options: Any, num_steps: int) -> np.float32:
+  """Returns how often an action is drawn at random now.
+
+  Args:
+    options: Options with `exploration` and `exploration_steps`.
+    num_steps: How many control steps there have been, of all worlds together.
+  """
+  spent = min(num_steps / options.exploration_steps, 1.0)
+  return np.float32(1.0 + spent * (options.exploration - 1.0))
+
+
 def draw_minibatches(
     options: Any, num_samples: int, key: np.ndarray
 ) -> np.ndarray:

@@ -3,6 +3,7 @@
 import abc
 from collections.abc import Callable, Sequence
 import contextlib
+import importlib
 import os
 import pathlib
 import signal
@@ -167,7 +168,7 @@ def execute(command: Sequence[str], log: str) -> int:
 def _import(name: str) -> Any:
   if problem := headless.missing(name, extra='cluster'):
     raise errors.SpecError(f'--engine={name}: {problem}')
-  return __import__(name)
+  return importlib.import_module(name)
 
 
 @contextlib.contextmanager

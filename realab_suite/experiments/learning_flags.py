@@ -8,7 +8,6 @@ EXPERIMENT = flags.DEFINE_string(
     'An experiment with agents that learn: the name of one that ships, or the'
     ' path of a YAML file.',
 )
-OUTPUT = flags.DEFINE_string('output', None, 'The folder to write into.')
 TENSORBOARD = flags.DEFINE_boolean(
     'tensorboard', False, 'Whether to write curves for TensorBoard, too.'
 )

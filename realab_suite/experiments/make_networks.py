@@ -17,15 +17,16 @@ from absl import flags
 from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
+from realab_suite.experiments import output_flag
 from realab_suite.experiments import threads
 
-_OUTPUT = flags.DEFINE_string('output', None, 'The folder to write into.')
+flags.adopt_module_key_flags(output_flag)
 
 
 def main(argv: Sequence[str]) -> None:
   """Makes the networks that the flags name."""
   del argv
-  output = pathlib.Path(cli.required(_OUTPUT))
+  output = pathlib.Path(cli.required(output_flag.OUTPUT))
   if problem := headless.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'making networks needs more: {problem}')
   threads.use_one()

@@ -15,12 +15,11 @@ from absl import flags
 from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
+from realab_suite.experiments import output_flag
 
+flags.adopt_module_key_flags(output_flag)
 _INPUT = flags.DEFINE_string(
     'input', None, 'The folder of a sweep: what its --output named.'
-)
-_OUTPUT = flags.DEFINE_string(
-    'output', None, 'The folder to write into; by default that of the sweep.'
 )
 _CLIPS = flags.DEFINE_boolean(
     'clips', True, 'Whether to film the first and a typical episode.'
@@ -40,7 +39,8 @@ def main(argv: Sequence[str]) -> None:
   # Not before a renderer has been chosen: this imports dm_control.
   from realab_suite.experiments import report_page
 
-  output = folder if _OUTPUT.value is None else pathlib.Path(_OUTPUT.value)
+  chosen = output_flag.OUTPUT.value
+  output = folder if chosen is None else pathlib.Path(chosen)
   path = report_page.write(folder, output, cli.say, no_clips)
   cli.say(f'The report is {path}')
 

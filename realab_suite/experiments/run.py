@@ -24,10 +24,12 @@ from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
 from realab_suite.experiments import learning_flags
+from realab_suite.experiments import output_flag
 from realab_suite.experiments import threads
 
 flags.adopt_module_key_flags(cli)
 flags.adopt_module_key_flags(learning_flags)
+flags.adopt_module_key_flags(output_flag)
 _POLICIES = flags.DEFINE_list(
     'policies',
     ['apple_seeker', 'carrying_saboteur', 'random'],
@@ -67,7 +69,7 @@ _VIDEOS = flags.DEFINE_boolean(
 def main(argv: Sequence[str]) -> None:
   """Runs the experiment that the flags describe."""
   del argv
-  if not learning_flags.OUTPUT.value:
+  if not output_flag.OUTPUT.value:
     raise errors.SpecError('--output: missing; name a folder for the results')
   if learning_flags.EXPERIMENT.value is not None:
     _train()
@@ -96,7 +98,7 @@ def main(argv: Sequence[str]) -> None:
       seeds=seeds,
       num_episodes=_EPISODES.value,
       max_steps=cli.MAX_STEPS.value,
-      output=learning_flags.OUTPUT.value,
+      output=output_flag.OUTPUT.value,
       plots=plots,
       videos=videos,
   )
@@ -127,7 +129,7 @@ def _train() -> None:
   options = training.Options(
       cli.say, learning_flags.TENSORBOARD.value, _PARENT.value
   )
-  training.run(job, pathlib.Path(cli.required(learning_flags.OUTPUT)), options)
+  training.run(job, pathlib.Path(cli.required(output_flag.OUTPUT)), options)
 
 
 def _refuse(unused: Sequence[flags.FlagHolder[Any]], why: str) -> None:

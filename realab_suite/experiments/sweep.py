@@ -16,9 +16,11 @@ from absl import flags
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
 from realab_suite.experiments import learning_flags
+from realab_suite.experiments import output_flag
 from realab_suite.experiments import threads
 
 flags.adopt_module_key_flags(learning_flags)
+flags.adopt_module_key_flags(output_flag)
 _RUNS = flags.DEFINE_list(
     'runs', [], 'The runs to do, as in "reward,reward.secure"; all by default.'
 )
@@ -48,7 +50,7 @@ def main(argv: Sequence[str]) -> None:
   """Runs the experiment that the flags name."""
   del argv
   name, output = cli.required(learning_flags.EXPERIMENT), cli.required(
-      learning_flags.OUTPUT
+      output_flag.OUTPUT
   )
   threads.use_one()
   headless.render_nothing()

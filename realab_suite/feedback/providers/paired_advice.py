@@ -8,6 +8,7 @@ import pydantic
 
 from realab_suite.feedback.policies import base as policies
 from realab_suite.feedback.providers import base
+from realab_suite.feedback.providers import queries
 
 _Pair = Annotated[
     tuple[str, ...], pydantic.Field(strict=False, min_length=2, max_length=2)
@@ -66,12 +67,8 @@ class PairedAdvice(base.Provider):
       state: Any,
   ) -> tuple[dict[str, np.ndarray], Any]:
     values, state = self.adviser.step(observation, episode_start, key, state)
-    good, bad = (_value_of(values, readings[name]) for name in self.reads)
+    good, bad = (
+        queries.pick(values, queries.index(readings[name], values.shape[-1]))
+        for name in self.reads
+    )
     return {self.writes[0]: good - bad}, state
-
-
-def _value_of(values: np.ndarray, reading: np.ndarray) -> np.ndarray:
-  """Returns the value of the action nearest to a reading, `(...)`."""
-  index = np.clip(np.rint(reading), 0, values.shape[-1] - 1).astype(int)
-  picked = np.take_along_axis(values, index[..., np.newaxis], -1)
-  return picked[..., 0]

@@ -8,6 +8,7 @@ import pydantic
 
 from realab_suite.feedback.policies import base as policies
 from realab_suite.feedback.providers import base
+from realab_suite.feedback.providers import queries
 
 
 @base.PROVIDERS.add('value_advice')
@@ -65,18 +66,12 @@ class ValueAdvice(base.Provider):
   ) -> tuple[dict[str, np.ndarray], Any]:
     inner, values_before, query_before = state
     values, inner = self.adviser.step(observation, episode_start, key, inner)
-    num_actions = values.shape[-1]
-    query = np.clip(np.rint(readings[self.reads[0]]), 0, num_actions - 1)
-    query = query.astype(int)
+    query = queries.index(readings[self.reads[0]], values.shape[-1])
     if self.query_delay:
       # There is no previous step to value in the first one.
-      advice = np.where(episode_start, 0.0, _pick(values_before, query_before))
+      advice = np.where(
+          episode_start, 0.0, queries.pick(values_before, query_before)
+      )
     else:
-      advice = _pick(values, query)
+      advice = queries.pick(values, query)
     return {self.writes[0]: advice}, (inner, values, query)
-
-
-def _pick(values: np.ndarray, index: np.ndarray) -> np.ndarray:
-  """Returns `values[..., index]`, world by world."""
-  picked = np.take_along_axis(values, np.asarray(index)[..., np.newaxis], -1)
-  return picked[..., 0]
