@@ -59,6 +59,16 @@ class Job:
     return self.design.learner.kind
 
   @property
+  def training(self) -> experiment_spec.TrainingSpec:
+    """How long it is trained, if it learns."""
+    name, _, _ = self.run.partition('.')
+    training = self.experiment.training
+    steps = self.experiment.runs[name].steps
+    if steps is None:
+      return training
+    return training.model_copy(update={'steps': steps})
+
+  @property
   def evaluation_seed(self) -> int:
     """The seed of the episodes that the policy is judged by."""
     return self.seed + self.experiment.evaluation.seed_offset
@@ -84,7 +94,7 @@ class Job:
         'versions': depends_on,
     }
     if self.policy is None:
-      config['training'] = experiment.training.model_dump()
+      config['training'] = self.training.model_dump()
       depends_on.update(_installed(_LEARNERS_DEPEND_ON))
     return config
 

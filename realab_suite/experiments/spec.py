@@ -32,12 +32,14 @@ class RunSpec(validation.Spec):
     overrides: Dotted overrides of it.
     learner: Fields of the design's learner that differ from the design.
     twin: Whether to train it on the design's secure twin as well.
+    steps: For how many control steps; `None` takes the experiment's.
   """
 
   design: str
   overrides: Annotated[tuple[str, ...], pydantic.Field(strict=False)] = ()
   learner: dict[str, Any] = pydantic.Field(default_factory=dict)
   twin: bool = False
+  steps: _Count | None = None
 
   def load(self, channel: str | None = None) -> specs.DesignSpec:
     """Returns the design, with what the run changes.

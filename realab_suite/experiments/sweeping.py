@@ -153,7 +153,7 @@ class _Sweep:
     """Does all jobs; see `sweep`."""
     waiting = list(self._jobs)
     lengths = [
-        job.experiment.training.steps for job in waiting if job.policy is None
+        job.training.steps for job in waiting if job.policy is None
     ]
     total = sum(lengths)
     bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
@@ -219,7 +219,7 @@ class _Sweep:
     self._num_over += 1
     name = f'{job.run}, seed {job.seed}'
     if job.policy is None and problem is None:
-      self._steps[folder.name] = job.experiment.training.steps
+      self._steps[folder.name] = job.training.steps
     if problem is not None:
       self._failures.append(f'{name}: {problem}')
     self._say(

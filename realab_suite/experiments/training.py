@@ -252,7 +252,7 @@ class _Training:
     self._job = job
     self._folder = folder
     self._options = options
-    training = job.experiment.training
+    training = job.training
     # What is to be probed in the end, so that nobody waits for an error.
     self._probed = None
     if job.experiment.evaluation.probe_states:

@@ -102,6 +102,10 @@ def test_every_job_has_a_folder_of_its_own(path):
         ({'training': {'num_envs': 0}}, 'training.num_envs: '),
         ({'training': {'sleep': 1}}, 'training.sleep: '),
         (
+            {'runs': {'a': {'design': 'value_advice', 'steps': 0}}},
+            'runs.a.steps: ',
+        ),
+        (
             {'evaluation': {'actions': 'best'}},
             "evaluation.actions: must be 'sampled' or 'greedy'",
         ),
@@ -154,6 +158,23 @@ def test_a_run_may_bring_a_learner_to_a_design_without_one():
   run = {'design': 'none', 'learner': {'kind': 'behavioural_cloning'}}
   [job] = jobs.plan(spec.load({**_SMALL, 'runs': {'idle': run}}))
   assert job.kind == 'behavioural_cloning'
+
+
+def test_a_run_may_be_trained_for_longer_than_the_others():
+  design = {'design': 'instantaneous_reward'}
+  runs = {
+      'longer': {**design, 'steps': 900, 'twin': True},
+      'as_all': design,
+  }
+  experiment = spec.load(
+      {**_SMALL, 'runs': runs, 'training': {'steps': 500, 'num_envs': 9}}
+  )
+  planned = {job.run: job for job in jobs.plan(experiment)}
+  assert {run: job.training.steps for run, job in planned.items()} == {
+      'longer': 900, 'longer.secure': 900, 'as_all': 500,
+  }  # fmt: skip
+  assert planned['longer'].training.num_envs == 9
+  assert planned['longer'].config()['training']['steps'] == 900
 
 
 def test_jobs_go_seed_by_seed_with_the_baseline_first():
