@@ -37,11 +37,11 @@ def main(argv: Sequence[str]) -> None:
     headless.render_nothing()
     cli.say(f'clips are skipped: {no_clips}')
   # Not before a renderer has been chosen: this imports dm_control.
-  from realab_suite.experiments import report_page
+  from realab_suite.experiments.reporting import page
 
   chosen = output_flag.OUTPUT.value
   output = folder if chosen is None else pathlib.Path(chosen)
-  path = report_page.write(folder, output, cli.say, no_clips)
+  path = page.write(folder, output, cli.say, no_clips)
   cli.say(f'The report is {path}')
 
 

@@ -152,9 +152,7 @@ class _Sweep:
   def run(self) -> None:
     """Does all jobs; see `sweep`."""
     waiting = list(self._jobs)
-    lengths = [
-        job.training.steps for job in waiting if job.policy is None
-    ]
+    lengths = [job.training.steps for job in waiting if job.policy is None]
     total = sum(lengths)
     bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
     with bar:

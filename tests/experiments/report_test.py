@@ -18,17 +18,17 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import jobs
-from realab_suite.experiments import replays
-from realab_suite.experiments import report_caveats
-from realab_suite.experiments import report_numbers
-from realab_suite.experiments import report_page
-from realab_suite.experiments import report_plots
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import summary
-from realab_suite.experiments import sweep_results
 from realab_suite.experiments import sweeping
 from realab_suite.experiments import training
+from realab_suite.experiments.reporting import caveats
+from realab_suite.experiments.reporting import charts
+from realab_suite.experiments.reporting import numbers
+from realab_suite.experiments.reporting import page as pages
+from realab_suite.experiments.reporting import replays
+from realab_suite.experiments.reporting import sweep_results
 from tests.experiments import fake_learner
 from tests.experiments import fake_sweep
 
@@ -41,7 +41,7 @@ def _quiet(line):
 
 
 def _write(folder, output, no_clips=_NO_CLIPS):
-  path = report_page.write(folder, output, _quiet, no_clips)
+  path = pages.write(folder, output, _quiet, no_clips)
   return path.read_text(encoding='utf-8')
 
 
@@ -60,7 +60,7 @@ def output(folder, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def page(output):
-  return (output / report_page.PAGE).read_text(encoding='utf-8')
+  return (output / pages.PAGE).read_text(encoding='utf-8')
 
 
 @pytest.fixture
@@ -152,7 +152,7 @@ def test_the_tampering_gap_is_what_the_twin_gets_more(folder, page, output):
   assert cells[2] == summary.interval_text(gap)
   # Three seeds are too few for the test, however large the difference.
   assert cells[4] == 'cannot tell: 2 more seeds'
-  with open(output / report_page.CSV, newline='') as file:
+  with open(output / pages.CSV, newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   assert float(records['reward']['tampering_gap']) == gap.estimate
   assert records['decoupled']['tampering_gap'] == ''
@@ -174,7 +174,7 @@ def test_parts_of_corruption_are_in_metres(folder, page):
 
 
 def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
-  markdown = (output / report_page.MARKDOWN).read_text(encoding='utf-8')
+  markdown = (output / pages.MARKDOWN).read_text(encoding='utf-8')
   for title in (
       'In short', 'Returns and corruption', 'Outcomes', 'Next to the baseline',
       'Incentive to tamper', 'How far registers were moved',
@@ -227,11 +227,11 @@ def test_the_same_results_give_the_same_bytes_in_another_process(
   assert ran.returncode == 0, ran.stderr
   said = ran.stdout.splitlines()
   assert said[0] == 'clips are skipped: turned off by --noclips'
-  assert said[-1] == f'The report is {tmp_path / report_page.PAGE}'
-  here = (output / report_page.PAGE).read_text()
-  there = (tmp_path / report_page.PAGE).read_text()
+  assert said[-1] == f'The report is {tmp_path / pages.PAGE}'
+  here = (output / pages.PAGE).read_text()
+  there = (tmp_path / pages.PAGE).read_text()
   assert there == here.replace(_NO_CLIPS, 'turned off by --noclips')
-  for name in (report_page.CSV, report_page.MARKDOWN):
+  for name in (pages.CSV, pages.MARKDOWN):
     assert (tmp_path / name).read_bytes() == (output / name).read_bytes()
 
 
@@ -249,13 +249,13 @@ def test_hostile_names_are_shown_not_obeyed(tmp_path):
   assert hostile in _text(page)
   assert '<script>alert(2)</script>' in _text(page)
   assert _cells(page, 'Returns and corruption', hostile)[2] == '2'
-  markdown = (tmp_path / 'out' / report_page.MARKDOWN).read_text()
+  markdown = (tmp_path / 'out' / pages.MARKDOWN).read_text()
   assert r'\<b onclick=alert(1)\>$x$ "&\|\`' in markdown
 
 
 def test_the_template_is_shipped():
   cfg = (_ROOT / 'setup.cfg').read_text()
-  assert 'realab_suite.experiments = templates/*.j2' in cfg
+  assert 'realab_suite.experiments.reporting = templates/*.j2' in cfg
 
 
 # ---- What is not there -------------------------------------------------------
@@ -385,13 +385,13 @@ def test_a_damaged_trace_is_named(own_folder):
 
 def test_few_seeds_are_said_to_be_few(folder):
   sweep = sweep_results.load(folder)
-  figures = report_numbers.compute(sweep)
-  caveats = report_caveats.caveats(sweep, figures)
+  figures = numbers.compute(sweep)
+  cautions = caveats.caveats(sweep, figures)
   assert any(
-      'with fewer than 5 seeds, however large' in caveat for caveat in caveats
+      'with fewer than 5 seeds, however large' in caveat for caveat in cautions
   )
   more = figures['reward'].paired.verdict.more_seeds
-  said = ' '.join(caveats)
+  said = ' '.join(cautions)
   assert 'whether reward corrupts more than reward.apple_seeker (about' in said
   assert f'reward.apple_seeker (about {more});' in said
   gap = figures['reward'].gap
@@ -401,11 +401,11 @@ def test_few_seeds_are_said_to_be_few(folder):
 
 def test_overlapping_intervals_are_said_to_show_nothing(folder):
   sweep = sweep_results.load(folder)
-  figures = report_numbers.compute(sweep)
-  said = ' '.join(report_caveats.caveats(sweep, figures))
+  figures = numbers.compute(sweep)
+  said = ' '.join(caveats.caveats(sweep, figures))
   assert 'Which is larger in' not in said
   figures['decoupled'] = figures['reward']
-  said = ' '.join(report_caveats.caveats(sweep, figures))
+  said = ' '.join(caveats.caveats(sweep, figures))
   assert 'Which is larger in corruption is not shown' in said
 
 
@@ -415,8 +415,8 @@ def test_overlapping_intervals_are_said_to_show_nothing(folder):
 def _learning(observed):
   steps = {0: {100: 1.0, 200: 5.0}, 1: {100: 2.0, 200: 6.0}}
   seen = {s: {n: x * observed for n, x in c.items()} for s, c in steps.items()}
-  bands = [{'run': report_plots.band(c)} for c in (steps, seen, steps)]
-  return report_plots.Learning('one', *bands, baseline=4.0)
+  bands = [{'run': charts.band(c)} for c in (steps, seen, steps)]
+  return charts.Learning('one', *bands, baseline=4.0)
 
 
 @pytest.mark.parametrize(
@@ -425,13 +425,13 @@ def _learning(observed):
 def test_an_axis_is_symlog_where_observed_returns_dwarf_true_ones(
     observed, is_symlog
 ):
-  look = report_plots.looks(['one'])
-  svg = report_plots.draw_learning([_learning(observed)], look).decode()
+  look = charts.looks(['one'])
+  svg = charts.draw_learning([_learning(observed)], look).decode()
   assert ('observed return (units), symlog' in svg) == is_symlog
 
 
 def test_a_band_is_the_interval_over_seeds():
-  one = report_plots.band({0: {100: 1.0, 200: 5.0}, 1: {100: 2.0}})
+  one = charts.band({0: {100: 1.0, 200: 5.0}, 1: {100: 2.0}})
   assert one.steps.tolist() == [100, 200]
   assert one.mean.tolist() == [1.5, 5.0]
   assert one.low[0] < 1.0 < 2.0 < one.high[0]
@@ -439,7 +439,7 @@ def test_a_band_is_the_interval_over_seeds():
 
 def test_designs_look_different_however_many_there_are():
   names = [f'design {i}' for i in range(30)]
-  looks = report_plots.looks(names)
+  looks = charts.looks(names)
   assert len(set(looks.values())) == 30
 
 

@@ -12,7 +12,7 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import signed_corruption
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import probes
-from realab_suite.experiments import sweep_results
+from realab_suite.experiments.reporting import sweep_results
 
 _Rows = Sequence[results.EpisodeRow]
 

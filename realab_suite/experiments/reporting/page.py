@@ -19,14 +19,14 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import signed_corruption
 from realab_suite.experiments import plots
 from realab_suite.experiments import recording
-from realab_suite.experiments import replays
-from realab_suite.experiments import report_caveats
-from realab_suite.experiments import report_numbers
-from realab_suite.experiments import report_plots
-from realab_suite.experiments import report_tables
 from realab_suite.experiments import storage
 from realab_suite.experiments import summary as texts
-from realab_suite.experiments import sweep_results
+from realab_suite.experiments.reporting import caveats
+from realab_suite.experiments.reporting import charts
+from realab_suite.experiments.reporting import numbers
+from realab_suite.experiments.reporting import replays
+from realab_suite.experiments.reporting import sweep_results
+from realab_suite.experiments.reporting import tables
 
 PAGE = 'report.html'
 CSV = 'tables.csv'
@@ -94,37 +94,38 @@ def write(
       nothing can be written.
   """
   sweep = sweep_results.load(folder)
-  figures = report_numbers.compute(sweep, say)
+  figures = numbers.compute(sweep, say)
   incentive = {}
   for name, one in figures.items():
     if not one.run.is_scripted:
       say(f'{name}: incentive to tamper')
-      incentive[name] = report_numbers.incentives_of(one.run)
-  page = render(sweep, figures, incentive, say, no_clips)
-  caveats = report_caveats.caveats(sweep, figures)
-  tables = [
-      report_tables.overview(sweep, figures),
-      *report_tables.tables(sweep, figures, incentive),
-  ]
+      incentive[name] = numbers.incentives_of(one.run)
+  overview = tables.overview(sweep, figures)
+  details = tables.tables(sweep, figures, incentive)
+  cautions = caveats.caveats(sweep, figures)
+  whole = _render(sweep, figures, overview, details, cautions, say, no_clips)
   with storage.explained(output):
     output.mkdir(parents=True, exist_ok=True)
-  text = f'# {_title(sweep)}\n\n{report_tables.markdown(tables, caveats)}'
+  text = tables.markdown([overview, *details], cautions)
+  text = f'# {_title(sweep)}\n\n{text}'
   storage.write_whole(output / MARKDOWN, text.encode())
-  csv = report_tables.csv_text(figures, incentive)
+  csv = tables.csv_text(figures, incentive)
   storage.write_whole(output / CSV, csv.encode())
-  storage.write_whole(output / PAGE, page.encode())
+  storage.write_whole(output / PAGE, whole.encode())
   return output / PAGE
 
 
-def render(
+def _render(
     sweep: sweep_results.Sweep,
-    figures: Mapping[str, report_numbers.Figures],
-    incentive: Mapping[str, Sequence[report_numbers.Incentive]],
+    figures: Mapping[str, numbers.Figures],
+    overview: tables.Table,
+    details: Sequence[tables.Table],
+    cautions: Sequence[str],
     say: _Say,
     no_clips: str | None,
 ) -> str:
   """Returns the page; the same inputs give the same text."""
-  looks = report_plots.looks([run.name for run in sweep.learned()])
+  looks = charts.looks([run.name for run in sweep.learned()])
   learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
   pictures: dict[str, Picture | None] = {
       'learning': _learning(sweep, figures, looks),
@@ -136,7 +137,6 @@ def render(
   clips: list[Clip] = []
   if no_clips is None:
     clips, no_clips = _clips(learned, say)
-  overview = report_tables.overview(sweep, figures)
   return _environment().get_template(_TEMPLATE).render(
       title=_title(sweep),
       description=str(sweep.experiment.get('description', '')),
@@ -145,12 +145,12 @@ def render(
       unfinished=[_unfinished(one, sweep) for one in sweep.unfinished],
       overview=overview if overview.rows else None,
       has_one_seed=any(one.summary.num_seeds == 1 for one in learned),
-      tables=report_tables.tables(sweep, figures, incentive),
+      tables=details,
       pictures=pictures,
       no_paths=no_paths,
       clips=clips,
       no_clips=no_clips,
-      caveats=report_caveats.caveats(sweep, figures),
+      caveats=cautions,
       made_with=_made_with(sweep),
       speeds=_speeds(sweep),
       experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
@@ -160,7 +160,7 @@ def render(
 
 
 def _environment() -> jinja2.Environment:
-  folder = resources.files('realab_suite.experiments') / 'templates'
+  folder = resources.files('realab_suite.experiments.reporting') / 'templates'
 
   def load(name: str) -> str:
     return (folder / name).read_text(encoding='utf-8')
@@ -216,8 +216,8 @@ def _unfinished(
 
 def _learning(
     sweep: sweep_results.Sweep,
-    figures: Mapping[str, report_numbers.Figures],
-    looks: Mapping[str, report_plots.Look],
+    figures: Mapping[str, numbers.Figures],
+    looks: Mapping[str, charts.Look],
 ) -> Picture | None:
   designs = []
   for run in sweep.learned():
@@ -228,7 +228,7 @@ def _learning(
       continue
     baseline = figures.get(run.baseline or '')
     designs.append(
-        report_plots.Learning(
+        charts.Learning(
             run.name,
             _bands(done, lambda run, point: point['true_return']),
             _bands(done, lambda run, point: point['observed_return']),
@@ -245,16 +245,16 @@ def _learning(
       ' maximises, where above zero is the direction that pays, or of all its'
       ' feedback registers if it maximises none. Observed returns are in each'
       " register's own units.",
-      _svg(report_plots.draw_learning(designs, looks)),
+      _svg(charts.draw_learning(designs, looks)),
   )
 
 
 def _bands(
     runs: Mapping[str, sweep_results.Run],
     figure: Callable[[sweep_results.Run, Mapping[str, Any]], float | None],
-) -> dict[str, report_plots.Band]:
+) -> dict[str, charts.Band]:
   return {
-      whose: report_plots.band(
+      whose: charts.band(
           {
               seed: {
                   point['step']: value
@@ -284,8 +284,8 @@ def _signed_metres(
 
 def _plane(
     sweep: sweep_results.Sweep,
-    figures: Mapping[str, report_numbers.Figures],
-    looks: Mapping[str, report_plots.Look],
+    figures: Mapping[str, numbers.Figures],
+    looks: Mapping[str, charts.Look],
 ) -> Picture | None:
   points = []
   for name, one in figures.items():
@@ -297,7 +297,7 @@ def _plane(
       continue
     kind = 'baseline' if is_baseline else 'twin' if one.run.twin_of else 'run'
     points.append(
-        report_plots.Point(
+        charts.Point(
             name,
             family,
             kind,
@@ -314,7 +314,7 @@ def _plane(
       ' right and low: it tampers. To the left and low: it did not do the task.'
       ' To the left and high is where a design should be. In the grey strip,'
       ' corruption is too small to matter.',
-      _svg(report_plots.draw_plane(points, looks)),
+      _svg(charts.draw_plane(points, looks)),
   )
 
 
@@ -332,8 +332,8 @@ def _by_seed(
 
 def _maps(
     sweep: sweep_results.Sweep,
-    figures: Mapping[str, report_numbers.Figures],
-    looks: Mapping[str, report_plots.Look],
+    figures: Mapping[str, numbers.Figures],
+    looks: Mapping[str, charts.Look],
 ) -> Picture | None:
   maps = []
   for name, one in figures.items():
@@ -342,7 +342,7 @@ def _maps(
       continue
     sizes = [r.block_size for r in run.design.registers.values()]
     maps.append(
-        report_plots.Map(
+        charts.Map(
             name,
             sweep.family(run),
             run.twin_of is not None,
@@ -357,7 +357,7 @@ def _maps(
       'Where registers were moved to',
       'The room from above. A mark is where the base block of a register stood'
       ' at the end of an episode, of all seeds.',
-      _svg(report_plots.draw_maps(maps, replays.shapes(first), looks)),
+      _svg(charts.draw_maps(maps, replays.shapes(first), looks)),
   )
 
 
@@ -376,7 +376,7 @@ def _ways(
 
 
 def _paths(
-    learned: Sequence[report_numbers.Figures],
+    learned: Sequence[numbers.Figures],
 ) -> tuple[Picture | None, str | None]:
   """Returns a picture of typical episodes, or why there is none."""
   tracks: dict[str, recording.Track] = {}
@@ -405,7 +405,7 @@ def _paths(
 
 
 def _clips(
-    learned: Sequence[report_numbers.Figures], say: _Say
+    learned: Sequence[numbers.Figures], say: _Say
 ) -> tuple[list[Clip], str | None]:
   """Returns films, and why there are no more of them, or `None`."""
   clips = []

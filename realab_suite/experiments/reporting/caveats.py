@@ -5,18 +5,18 @@ import itertools
 import math
 
 from realab_suite.evaluation import statistics
-from realab_suite.experiments import report_numbers
-from realab_suite.experiments import sweep_results
+from realab_suite.experiments.reporting import numbers
+from realab_suite.experiments.reporting import sweep_results
 
 # With fewer, the test of `statistics.tampering_verdict` cannot reject.
 _FEWEST_SEEDS = 5
 
 
 def caveats(
-    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> list[str]:
   """Returns what these results do not show, a sentence or two each."""
-  false_alarms = 100 * (1 - report_numbers.LEVEL)
+  false_alarms = 100 * (1 - numbers.LEVEL)
   num_verdicts = sum(one.paired is not None for one in figures.values())
   return [
       *_on_completeness(sweep, figures),
@@ -37,7 +37,7 @@ def caveats(
 
 
 def _on_completeness(
-    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> Iterable[str]:
   if sweep.is_calibration:
     yield (
@@ -71,7 +71,7 @@ def _unfinished_by_run(sweep: sweep_results.Sweep) -> dict[str, list[int]]:
 
 
 def _on_seeds(
-    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> Iterable[str]:
   counts = [one.summary.num_seeds for one in figures.values()]
   fewest = min(counts, default=0)
@@ -102,7 +102,7 @@ def _on_seeds(
     )
 
 
-def _questions(one: report_numbers.Figures) -> Iterable[tuple[str, int | None]]:
+def _questions(one: numbers.Figures) -> Iterable[tuple[str, int | None]]:
   """Yields what is asked of a run, and how many more seeds it takes."""
   name, baseline = one.run.name, one.run.baseline
   if one.paired is not None and one.paired.verdict is not None:
@@ -125,7 +125,7 @@ def _number_of(more_seeds: int) -> str:
 
 
 def _on_overlaps(
-    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> Iterable[str]:
   learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
   for what, of in (
@@ -154,7 +154,7 @@ def _overlap(
   return a.low <= b.high and b.low <= a.high
 
 
-def _on_data(figures: Mapping[str, report_numbers.Figures]) -> Iterable[str]:
+def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
   censored = {
       name: one.summary.num_invalid
       for name, one in figures.items()

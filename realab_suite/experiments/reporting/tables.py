@@ -8,9 +8,9 @@ from typing import Any, final
 
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import statistics
-from realab_suite.experiments import report_numbers
 from realab_suite.experiments import summary as texts
-from realab_suite.experiments import sweep_results
+from realab_suite.experiments.reporting import numbers
+from realab_suite.experiments.reporting import sweep_results
 
 
 @final
@@ -36,7 +36,7 @@ class Table:
 
 
 def overview(
-    sweep: sweep_results.Sweep, figures: Mapping[str, report_numbers.Figures]
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> Table:
   """Returns what a reader wants to know first, a row per learned design."""
   rows, families = [], []
@@ -71,8 +71,8 @@ def overview(
 
 def tables(
     sweep: sweep_results.Sweep,
-    figures: Mapping[str, report_numbers.Figures],
-    incentive: Mapping[str, Sequence[report_numbers.Incentive]],
+    figures: Mapping[str, numbers.Figures],
+    incentive: Mapping[str, Sequence[numbers.Incentive]],
 ) -> list[Table]:
   """Returns the tables of a report, but for the one at its top."""
   families = [sweep.family(one.run) for one in figures.values()]
@@ -89,7 +89,7 @@ def tables(
 
 
 def _returns_table(
-    figures: Sequence[report_numbers.Figures], families: Sequence[str]
+    figures: Sequence[numbers.Figures], families: Sequence[str]
 ) -> Table:
   rows = []
   for one in figures:
@@ -125,7 +125,7 @@ def _returns_table(
 
 
 def _outcomes_table(
-    figures: Sequence[report_numbers.Figures], families: Sequence[str]
+    figures: Sequence[numbers.Figures], families: Sequence[str]
 ) -> Table:
   facts = list(dict.fromkeys(f for one in figures for f in one.outcomes))
   rows = [
@@ -146,7 +146,7 @@ def _outcomes_table(
 
 
 def _baseline_table(
-    sweep: sweep_results.Sweep, figures: Sequence[report_numbers.Figures]
+    sweep: sweep_results.Sweep, figures: Sequence[numbers.Figures]
 ) -> Table:
   rows, families = [], []
   for one in figures:
@@ -178,7 +178,7 @@ def _baseline_table(
   )  # fmt: skip
 
 
-def _gap_table(figures: Sequence[report_numbers.Figures]) -> Table:
+def _gap_table(figures: Sequence[numbers.Figures]) -> Table:
   rows, families = [], []
   for one in figures:
     gap = one.gap
@@ -215,7 +215,7 @@ def _next_to_twin(verdict: statistics.Verdict | None) -> str:
 
 def _incentive_table(
     sweep: sweep_results.Sweep,
-    incentive: Mapping[str, Sequence[report_numbers.Incentive]],
+    incentive: Mapping[str, Sequence[numbers.Incentive]],
 ) -> Table:
   others = sorted(
       {o for ones in incentive.values() for i in ones for o in i.probe}
@@ -256,7 +256,7 @@ def _incentive_table(
 
 
 def _moved_table(
-    sweep: sweep_results.Sweep, figures: Sequence[report_numbers.Figures]
+    sweep: sweep_results.Sweep, figures: Sequence[numbers.Figures]
 ) -> Table:
   rows, families = [], []
   for one in figures:
@@ -274,7 +274,7 @@ def _moved_table(
       'How far registers were moved',
       'How far from its place the first block of a register stood when an'
       ' episode ended, and in which share of them that was over'
-      f' {report_numbers.UNMOVED} m. The blocks of a secure twin can be moved,'
+      f' {numbers.UNMOVED} m. The blocks of a secure twin can be moved,'
       ' too; they hold no value.',
       ['run', 'register', 'moved (m)', 'share of episodes'],
       rows,
@@ -297,8 +297,8 @@ def markdown(tables_: Sequence[Table], caveats_: Sequence[str]) -> str:
 
 
 def csv_text(
-    figures: Mapping[str, report_numbers.Figures],
-    incentive: Mapping[str, Sequence[report_numbers.Incentive]],
+    figures: Mapping[str, numbers.Figures],
+    incentive: Mapping[str, Sequence[numbers.Incentive]],
 ) -> str:
   """Returns everything as numbers, a line per run."""
   records = [
@@ -313,7 +313,7 @@ def csv_text(
 
 
 def _record(
-    one: report_numbers.Figures, incentive: Sequence[report_numbers.Incentive]
+    one: numbers.Figures, incentive: Sequence[numbers.Incentive]
 ) -> dict[str, Any]:
   run, summary, paired, gap = one.run, one.summary, one.paired, one.gap
   job = run.jobs[0]

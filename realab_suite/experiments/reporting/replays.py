@@ -17,7 +17,7 @@ from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import recording
-from realab_suite.experiments import sweep_results
+from realab_suite.experiments.reporting import sweep_results
 
 # Makes what is called at every control step of an episode.
 OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]
