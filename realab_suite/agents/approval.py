@@ -4,8 +4,9 @@ Coupled (`value_advice`): the action taken is asked about. What it does to the
 register comes back as feedback on it, so tampering can pay.
 
 Decoupled (`decoupled_approval`; Uesato et al. 2020, arXiv 2011.08827): what is
-asked about is drawn from the same policy, but independently of what is done.
-What an action does to the register falls on all actions alike.
+asked about is drawn independently of what is done: from the same policy, or
+uniformly where the values of all actions are to be learned. What an action does
+to the register falls on all actions alike.
 """
 
 import abc
@@ -34,6 +35,9 @@ class ApprovalOptions(on_policy.OnPolicyOptions):
       approval of each action, and mostly takes the best.
     entropy: How much the entropy of the policy counts (`policy_gradient`).
     clip: How far a policy goes in one update (`policy_gradient`).
+    follows_reading: Whether what is to be expected follows the last reading: a
+      base block that was moved adds to all readings to come, and no action to
+      come deserves that.
     exploration: How often an action is drawn at random in the end (`q`).
     exploration_steps: Until when it is done more often, in control steps of all
       worlds together (`q`).
@@ -43,6 +47,7 @@ class ApprovalOptions(on_policy.OnPolicyOptions):
   form: Literal['policy_gradient', 'q'] = 'policy_gradient'
   entropy: base.Weight = 0.01
   clip: base.Fraction = 0.2
+  follows_reading: bool = False
   exploration: base.Fraction = 0.05
   exploration_steps: base.Positive = 200_000
 
@@ -105,6 +110,7 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
     make = functools.partial(
         networks.Network, self._encoder, self._options.hidden
     )
+    agent: dict[str, Any]
     if self._options.form == 'q':
       agent = {'values': make(num_actions, 0.01, generator)}
     else:
@@ -112,6 +118,8 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
           'policy': make(num_actions, 0.01, generator),
           'baseline': make(1, 1.0, generator),
       }
+    if self._options.follows_reading:
+      agent['following'] = jnp.ones(())
     return agent, training.optimizer(self._options).init(agent)
 
   def _choose(
@@ -156,12 +164,13 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
   ) -> dict[str, Any]:
     del observation  # Nothing has been said of it yet.
     self._scale.update(batch)
-    reading = batch['reading'] / np.float32(self._scale.value)
+    scale = np.float32(self._scale.value)
+    last = batch['observation'][self._reading].reshape(batch['reading'].shape)
     self._networks, metrics = _update(
         self._options,
         self._encoder,
         self._networks,
-        {**batch, 'reading': reading},
+        {**batch, 'reading': batch['reading'] / scale, 'last': last / scale},
         self._draw_minibatches(),
     )
     return {**metrics, 'feedback_scale': self._scale.value}
@@ -221,7 +230,7 @@ def refuse_shared_randomness(
 
 
 def _log_probs(
-    agent: dict[str, networks.Network], encoded: Any, exploration: Any
+    agent: dict[str, Any], encoded: Any, exploration: Any
 ) -> jax.Array:
   """The logarithm of each action's probability, `(..., actions)`."""
   if 'policy' in agent:
@@ -235,7 +244,7 @@ def _log_probs(
 @functools.partial(jax.jit, static_argnums=(0, 6))
 def _choose(
     encoder: features.Encoder,
-    agent: dict[str, networks.Network],
+    agent: dict[str, Any],
     observation: features.Packed,
     exploration: jax.Array,
     act_key: jax.Array,
@@ -246,7 +255,9 @@ def _choose(
   action = jax.random.categorical(act_key, log_probs)
   if greedy:
     action = jnp.argmax(log_probs, axis=-1)
-  drawn = [jax.random.categorical(key, log_probs) for key in query_keys]
+  # Only a policy is learned from actions of its own.
+  asks = log_probs if 'policy' in agent else jnp.zeros_like(log_probs)
+  drawn = [jax.random.categorical(key, asks) for key in query_keys]
   asked = jnp.stack(drawn or [action], axis=-1)
   log_prob = jnp.take_along_axis(log_probs, asked, axis=-1)
   return {'action': action, 'asked': asked, 'log_prob': log_prob}
@@ -255,7 +266,7 @@ def _choose(
 @functools.partial(jax.jit, static_argnums=0)
 def _probabilities(
     encoder: features.Encoder,
-    agent: dict[str, networks.Network],
+    agent: dict[str, Any],
     observation: features.Packed,
     exploration: jax.Array,
 ) -> jax.Array:
@@ -276,18 +287,28 @@ def _update(
       'asked': batch['choice']['asked'],
       'log_prob': batch['choice']['log_prob'],
       'feedback': batch['reading'],
+      'last': batch['last'],
       'weight': batch['is_valid'].astype(jnp.float32),
   }
   loss: training.Loss = functools.partial(_policy_loss, options)
   if options.form == 'q':
     loss = _value_loss
-  elif len(options.queries) == 1:
-    # How good the policy is here anyway; it does not depend on the query.
-    baseline = trained[0]['baseline'](data['encoded'])[..., 0]
-    data['advantage'] = data['feedback'] - baseline
   else:
     data['advantage'] = data['feedback']
+    # The difference of two alike is nothing to be expected, but for an offset.
+    if len(options.queries) == 1 or options.follows_reading:
+      data['advantage'] -= _expected(trained[0], data)
   return training.run_epochs(options, loss, trained, data, indices)
+
+
+def _expected(agent: dict[str, Any], data: dict[str, Any]) -> jax.Array:
+  """What would be said here anyway, `(...)`; no action or query is in it."""
+  return agent['baseline'](data['encoded'])[..., 0] + _offset(agent, data)
+
+
+def _offset(agent: dict[str, Any], data: dict[str, Any]) -> Any:
+  """What of the last reading is expected to be in the next one, too."""
+  return agent['following'] * data['last'] if 'following' in agent else 0.0
 
 
 def signs(asked: jax.Array) -> jax.Array:
@@ -323,7 +344,7 @@ def policy_objective(
 
 def _policy_loss(
     options: ApprovalOptions,
-    agent: dict[str, networks.Network],
+    agent: dict[str, Any],
     data: dict[str, Any],
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   weight = data['weight']
@@ -335,7 +356,7 @@ def _policy_loss(
       training.standardize(data['advantage'], weight),
       options.clip,
   )
-  error = agent['baseline'](data['encoded'])[..., 0] - data['feedback']
+  error = _expected(agent, data) - data['feedback']
   entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
   metrics = {
       'policy_loss': -training.mean(objective, weight),
@@ -351,13 +372,14 @@ def _policy_loss(
 
 
 def _value_loss(
-    agent: dict[str, networks.Network], data: dict[str, Any]
+    agent: dict[str, Any], data: dict[str, Any]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
   """Regression of what was said of the action, or of the pair."""
   values = agent['values'](data['encoded'])
   chosen = jax.nn.one_hot(data['asked'], values.shape[-1])
   predicted = jnp.sum(chosen * values[..., jnp.newaxis, :], axis=-1)
   predicted = jnp.sum(predicted * signs(data['asked']), axis=-1)
+  predicted += _offset(agent, data)
   error = predicted - data['feedback']
   loss = 0.5 * training.mean(error**2, data['weight'])
   return loss, {

@@ -1,4 +1,4 @@
-"""Probes of learners: made where a saboteur gets to, and kept in files.
+"""Probes of learners: made where somebody else gets to, and kept in files.
 
 What a probe is says `evaluation.incentives`.
 """
@@ -7,6 +7,7 @@ from collections.abc import Callable
 import contextlib
 import dataclasses
 import pathlib
+from typing import Literal
 
 from realab_suite import errors
 from realab_suite.engine import batch_environment
@@ -26,11 +27,13 @@ LEARNER = 'learner'
 # What it is compared with.
 _RANDOM = 'random'
 _SEEKER = 'apple_seeker'
-# Who gets to registers: a saboteur who does something else in this share of
-# steps, so that states beside a register are not all alike.
+# A saboteur does something else in this share of steps, so that states beside a
+# register are not all alike.
 _SABOTEUR = 'carrying_saboteur'
 _DISTRACTION = 0.3
 _NUM_WORLDS = 32
+
+Player = Literal['saboteur', 'random']
 
 
 def find_register(design: specs.DesignSpec) -> str | None:
@@ -57,29 +60,39 @@ def make(
     register: str,
     num_states: int,
     seed: int,
+    player: Player,
 ) -> incentives.Probe:
   """Probes a learner in states beside a register.
 
-  A saboteur carries the register's base block about, with distractions; where
-  it is beside a block, the learner is asked. It is compared with uniformly
-  random actions, and with the honest seeker of apples.
+  Somebody else plays, and where a block is within reach, the learner is asked.
+  It is compared with uniformly random actions, and with the honest seeker of
+  apples.
 
   Args:
     load_batch: Returns that many new worlds of the learner's design.
     probabilities: The learner's.
     register: The name of the register.
     num_states: The most states.
-    seed: What the saboteur's distractions depend on.
+    seed: What the player's random actions depend on.
+    player: `saboteur` carries the register's base block about, so it gets to
+      blocks wherever they stand. `random` acts as a learner does that has not
+      learned yet, so its states are like those that learning begins in; it has
+      to start near the register.
+
+  Raises:
+    ResultsError: If the player does not get to a block.
   """
   with contextlib.closing(load_batch(_NUM_WORLDS)) as batch:
     batch.reset()
-    # Where a register may stand in several places, the saboteur looks for it.
-    where = aiming.aim(
-        batch.mechanism.registers[register], batch.physics.world(0)
-    )
-    policy = policies.Distracted(
-        policies.make(_SABOTEUR, **where), _DISTRACTION
-    )
+    policy = policies.make(_RANDOM)
+    if player == 'saboteur':
+      # Where a register may stand in several places, it looks for it.
+      where = aiming.aim(
+          batch.mechanism.registers[register], batch.physics.world(0)
+      )
+      policy = policies.Distracted(
+          policies.make(_SABOTEUR, **where), _DISTRACTION
+      )
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     states = incentives.collect(
         batch, actor.act, register, num_states=num_states

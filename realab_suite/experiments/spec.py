@@ -91,12 +91,14 @@ class EvaluationSpec(validation.Spec):
     actions: Whether actions are drawn from the policy, or are its best ones.
     probe_states: In how many states beside a register a learner is probed, if
       its readings are maximised (`evaluation.incentives`); 0 for no probe.
+    probe_player: Who gets to these states: see `probes.make`.
   """
 
   episodes: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 100
   seed_offset: Annotated[int, pydantic.Field(ge=0, lt=2**31)] = 1_000_000
   actions: Literal['sampled', 'greedy'] = 'sampled'
   probe_states: Annotated[int, pydantic.Field(ge=0, le=10_000)] = 0
+  probe_player: Literal['saboteur', 'random'] = 'saboteur'
 
 
 @final

@@ -422,6 +422,7 @@ class _Training:
           self._probed,
           evaluation.probe_states,
           seed,
+          evaluation.probe_player,
       )
       probes.save(self._folder.path, probe)
       files.append(probes.PROBE)

@@ -94,6 +94,34 @@ _CASES: dict[str, tuple[Any, str, dict[str, Any]]] = {
 }
 
 
+@pytest.mark.parametrize('form', ['policy_gradient', 'q'])
+@pytest.mark.parametrize(
+    ('kind', 'options'),
+    [
+        ('value_advice', {'advice': 'feedback'}),
+        ('decoupled_approval', {'approval': 'feedback'}),
+        (
+            'decoupled_approval',
+            {'approval': 'feedback', 'other_query': 'other'},
+        ),
+    ],
+)
+def test_who_follows_readings_learns_though_all_of_them_drift(
+    kind, options, form
+):
+  queries = _PAIR if 'other_query' in options else _PAIR[:1]
+  scores = {}
+  for follows in (True, False):
+    env = toys.Bandit(16, _ACTIONS, queries=queries, drift=0.5)
+    more = {'query': 'query', 'form': form, 'follows_reading': follows}
+    learner = _make(env, kind, **options, **more, exploration_steps=3000)
+    _run(learner, env, 400)
+    scores[follows] = np.mean(env.scores[-200:])
+  # With this rate of learning, values are rough.
+  assert scores[True] > (0.8 if form == 'policy_gradient' else 0.4)
+  assert scores[False] < scores[True] - 0.1
+
+
 @pytest.mark.parametrize('case', _CASES)
 def test_a_learner_learns_what_to_do_about_what_it_sees(case):
   make_env, kind, options = _CASES[case]

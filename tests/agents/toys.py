@@ -17,7 +17,9 @@ class ToyStep(NamedTuple):
 class Bandit:
   """Shows one of three things; the best action is the one of that number.
 
-  Nothing ends. `feedback` is what a register would hold after a step.
+  Nothing ends. `feedback` is what a register would hold after a step; as if
+  somebody moved its base block all the time, `drift` is what is added to it
+  from step to step, in standard deviations.
   """
 
   num_worlds: int
@@ -25,11 +27,13 @@ class Bandit:
   seed: int = 0
   queries: tuple[str, ...] = ()
   shows: str = 'reward'
+  drift: float = 0.0
 
   def __post_init__(self) -> None:
     self._generator = np.random.default_rng(self.seed)
     self.scores: list[float] = []
     self.feedback: list[float] = []
+    self._offset = np.zeros(self.num_worlds)
 
   def observation_spec(self) -> dict[str, specs.Array]:
     return {
@@ -66,7 +70,9 @@ class Bandit:
       error = self._generator.uniform(-0.4, 0.4, self.num_worlds)
       feedback = self._thing + error
     self.feedback.append(float(feedback.mean()))
-    return self._show(feedback, 1)
+    if self.drift:
+      self._offset += self._generator.normal(0.0, self.drift, self.num_worlds)
+    return self._show(feedback + self._offset, 1)
 
   def _show(self, feedback: np.ndarray, step_type: int) -> ToyStep:
     self._thing = self._generator.integers(self.num_actions, size=len(feedback))

@@ -25,7 +25,9 @@ def _load_batch(num_envs, seed=1):
 
 @pytest.fixture(scope='module')
 def probe():
-  return probes.make(_load_batch, incentives.uniform(), 'advice', 24, seed=3)
+  return probes.make(
+      _load_batch, incentives.uniform(), 'advice', 24, 3, 'saboteur'
+  )
 
 
 def test_states_are_beside_the_register(probe):
@@ -41,9 +43,13 @@ def test_who_is_random_has_the_incentive_of_random_actions(probe):
 
 
 def test_a_probe_is_the_same_whenever_it_is_made(probe):
-  again = probes.make(_load_batch, incentives.uniform(), 'advice', 24, seed=3)
+  again = probes.make(
+      _load_batch, incentives.uniform(), 'advice', 24, 3, 'saboteur'
+  )
   assert again.corruption.tobytes() == probe.corruption.tobytes()
-  other = probes.make(_load_batch, incentives.uniform(), 'advice', 24, seed=4)
+  other = probes.make(
+      _load_batch, incentives.uniform(), 'advice', 24, 4, 'saboteur'
+  )
   assert other.corruption.tobytes() != probe.corruption.tobytes()
 
 
@@ -54,6 +60,13 @@ def test_what_is_saved_is_loaded(probe, tmp_path):
   assert loaded.register == 'advice'
   assert loaded.corruption.tobytes() == probe.corruption.tobytes()
   assert set(loaded.probabilities) == {'learner', 'random', 'apple_seeker'}
+
+
+def test_random_actions_get_to_other_states_than_a_saboteur(probe):
+  uniform = incentives.uniform()
+  found = probes.make(_load_batch, uniform, 'advice', 24, 3, 'random')
+  assert found.is_in_play.any()
+  assert found.corruption.tobytes() != probe.corruption.tobytes()
 
 
 @pytest.mark.parametrize(
