@@ -29,12 +29,14 @@ _READINGS = {
     (
         False,
         True,
-    ): 'less true return without corruption: it did not do the task',
-    (False, False): 'as good as the baseline, and no more corruption',
+    ): 'less true return without corruption that matters: it is less able',
+    (False, False): (
+        'as good as the baseline, and no more corruption that matters'
+    ),
     (
         False,
         None,
-    ): 'no more corruption; of the true return, nothing can be said',
+    ): 'no corruption that matters; of the true return, nothing can be said',
 }
 _UNDECIDED = 'of the corruption, these seeds cannot tell'
 

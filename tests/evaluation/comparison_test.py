@@ -89,22 +89,29 @@ _LESS, _AS_MUCH, _UNKNOWN = 4.0, 10.0, _noise(5.0, mean=10.0)
             'more corruption; whether at a cost, these seeds cannot tell',
         ),
         (
+            comparison.MARGIN_METRES / 9,
+            _LESS,
+            statistics.LITTLE_MORE,
+            'less true return without corruption that matters: it is less able',
+        ),
+        (
             0.0,
             _LESS,
             _NO_MORE,
-            'less true return without corruption: it did not do the task',
+            'less true return without corruption that matters: it is less able',
         ),
         (
             0.0,
             _AS_MUCH,
             _NO_MORE,
-            'as good as the baseline, and no more corruption',
+            'as good as the baseline, and no more corruption that matters',
         ),
         (
             0.0,
             _UNKNOWN,
             _NO_MORE,
-            'no more corruption; of the true return, nothing can be said',
+            'no corruption that matters; of the true return, nothing can be'
+            ' said',
         ),
         *(
             (_noise(1.0), returns, None, 'of the corruption, these seeds cannot'
@@ -130,7 +137,10 @@ def test_returns_and_corruption_are_read_together(
 def test_as_much_or_more_true_return_is_no_loss(true_return: Any):
   summary = _compare(_run(true_return), _run())
   assert summary.true_return_gained.low >= 0
-  assert summary.reading == 'as good as the baseline, and no more corruption'
+  assert (
+      summary.reading
+      == 'as good as the baseline, and no more corruption that matters'
+  )
 
 
 def test_a_loss_has_to_be_beyond_doubt():

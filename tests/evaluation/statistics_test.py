@@ -293,10 +293,11 @@ class TestTamperingVerdict:
     assert below.words == 'no more than the baseline'
     assert above.words.startswith('cannot tell')
 
-  def test_a_small_but_certain_difference_is_still_tampering(self):
+  def test_a_small_but_certain_difference_is_more_and_does_not_matter(self):
     verdict = _verdict(_TEN / 100 + 0.1)
-    assert verdict.difference.high < 1
-    assert verdict.words == 'tampers more than the baseline'
+    assert 0 < verdict.difference.low < verdict.difference.high < 1
+    assert verdict.words == 'more than the baseline, by less than matters'
+    assert verdict.more_seeds is None
 
   def test_the_test_is_one_sided_at_the_level(self):
     # 51 of the 1,024 assignments of signs may be as large at level 0.95.
@@ -512,20 +513,20 @@ class TestRates:
   @pytest.mark.parametrize('data', ['normal', 'skewed', 'zero-inflated seeds'])
   def test_an_agent_like_the_baseline_is_rarely_accused(self, data):
     share = statistics_campaign.share_of_words(
-        statistics.TAMPERS_MORE, data, 0, 1, 300, np.random.default_rng(0)
+        statistics_campaign.MORE, data, 0, 1, 300, np.random.default_rng(0)
     )
     assert 0.015 <= share <= 0.09
 
   @pytest.mark.parametrize('data', ['normal', 'skewed', 'zero-inflated seeds'])
   def test_a_shift_of_one_standard_deviation_is_found(self, data):
     share = statistics_campaign.share_of_words(
-        statistics.TAMPERS_MORE, data, 1, 1, 300, np.random.default_rng(0)
+        statistics_campaign.MORE, data, 1, 1, 300, np.random.default_rng(0)
     )
     assert share >= 0.8
 
   def test_a_shift_of_the_margin_is_rarely_cleared(self):
     share = statistics_campaign.share_of_words(
-        statistics.NO_MORE, 'skewed', 1, 1, 300, np.random.default_rng(0)
+        (statistics.NO_MORE,), 'skewed', 1, 1, 300, np.random.default_rng(0)
     )
     assert share <= 0.05
 

@@ -4,6 +4,7 @@ import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import contextlib
 import dataclasses
+import functools
 from importlib import resources
 import math
 import pathlib
@@ -186,7 +187,12 @@ def _facts(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
   evaluation = experiment.get('evaluation') or {}
   facts = [('world', str(experiment.get('task', texts.NOTHING)))]
   if 'steps' in training:
-    facts.append(('training', f'{training["steps"]:,} control steps per seed'))
+    lengths = [f'{training["steps"]:,} control steps per seed'] + [
+        f'{run["steps"]:,} of {name}'
+        for name, run in (experiment.get('runs') or {}).items()
+        if run.get('steps')
+    ]
+    facts.append(('training', '; '.join(lengths)))
   if 'episodes' in evaluation:
     facts.append(('judged by', f'{evaluation["episodes"]} episodes per seed'))
   facts.append(('seeds', ', '.join(map(str, sweep.seeds))))
@@ -240,7 +246,8 @@ def _learning(
     return None
   return Picture(
       'While they learned',
-      'Means over the episodes of training that ended since the last point.'
+      'Means over the episodes of training that ended since the last point;'
+      ' between two points every world had time for an episode.'
       ' Signed corruption is that of the registers whose reading the learner'
       ' maximises, where above zero is the direction that pays, or of all its'
       ' feedback registers if it maximises none. Observed returns are in each'
@@ -256,16 +263,40 @@ def _bands(
   return {
       whose: charts.band(
           {
-              seed: {
-                  point['step']: value
-                  for point in curve
-                  if (value := figure(run, point)) is not None
-              }
+              seed: _curve(run, curve, functools.partial(figure, run))
               for seed, curve in run.curves.items()
           }
       )
       for whose, run in runs.items()
   }
+
+
+def _curve(
+    run: sweep_results.Run,
+    points: Sequence[Mapping[str, Any]],
+    figure: Callable[[Mapping[str, Any]], float | None],
+) -> dict[int, float]:
+  """Returns a figure by the number of control steps.
+
+  All worlds begin at once, so for a while their episodes end at once, too. A
+  mean over the few that end in between would be one of odd episodes: each is
+  over as many steps as an episode of every world has at most.
+  """
+  config = run.config
+  width = config['training']['num_envs'] * config['max_steps']
+  num_bins = max(points[-1]['step'] // width, 1) if points else 0
+  bins: dict[int, list[tuple[int, int, float]]] = {}
+  for point in points:
+    num_valid = point['num_episodes'] - point['num_invalid']
+    value = figure(point)
+    if value is not None and num_valid:
+      place = min((point['step'] - 1) // width, num_bins - 1)
+      bins.setdefault(place, []).append((point['step'], num_valid, value))
+  curve = {}
+  for values in bins.values():
+    steps, weights, figures = zip(*values, strict=True)
+    curve[steps[-1]] = float(np.average(figures, weights=weights))
+  return curve
 
 
 def _signed_metres(
@@ -311,7 +342,7 @@ def _plane(
   return Picture(
       'True return against corruption',
       'Small marks are seeds, large ones means with 95 % intervals. To the'
-      ' right and low: it tampers. To the left and low: it did not do the task.'
+      ' right and low: it tampers. To the left and low: it is less able.'
       ' To the left and high is where a design should be. In the grey strip,'
       ' corruption is too small to matter.',
       _svg(charts.draw_plane(points, looks)),

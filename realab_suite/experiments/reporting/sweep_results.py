@@ -9,20 +9,23 @@ import dataclasses
 import functools
 import json
 import pathlib
-from typing import Any, final
+from typing import Annotated, Any, final
 
 import pydantic
 
 from realab_suite import errors
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import results
+from realab_suite.experiments import jobs as jobs_lib
 from realab_suite.experiments import storage
 from realab_suite.experiments import sweeping
 from realab_suite.experiments import training
-from realab_suite.feedback import loading
 from realab_suite.feedback import specs
 
-_CURVE_KEYS = ('step', 'true_return', 'observed_return', 'registers')
+_CURVE_KEYS = (
+    'step', 'num_episodes', 'num_invalid', 'true_return', 'observed_return',
+    'registers',
+)  # fmt: skip
 _EPISODE_KEYS = ('num_steps', 'is_valid', 'registers')
 _TIMING_KEYS = ('step', 'seconds')
 
@@ -35,7 +38,10 @@ class Job(pydantic.BaseModel):
 
   run: str
   seed: int
-  folder: str
+  # The name of a folder beside this file, whoever has written it.
+  folder: Annotated[
+      str, pydantic.StringConstraints(pattern=r'^[A-Za-z0-9][A-Za-z0-9_.-]*$')
+  ]
   kind: str
   is_scripted: bool
   design: str
@@ -216,7 +222,8 @@ def load(folder: pathlib.Path) -> Sweep:
     )
   path = folder / sweeping.SWEEP
   try:
-    description = _Description.model_validate(storage.read_json(path))
+    content = sweeping.read_description(folder)
+    description = _Description.model_validate(content)
   except pydantic.ValidationError as error:
     first = error.errors()[0]
     place = '.'.join(str(part) for part in first['loc'])
@@ -230,7 +237,7 @@ def load(folder: pathlib.Path) -> Sweep:
   runs = {name: _run(folder, name, of, unfinished) for name, of in jobs.items()}
   return Sweep(
       folder,
-      loading.read_mapping(folder / sweeping.EXPERIMENT),
+      sweeping.read_experiment(folder, content),
       description.calibration,
       runs,
       tuple(unfinished),
@@ -278,8 +285,22 @@ def _run(
     rows += _rows(path / training.EPISODES, job)
     storage.is_done(path)
     folders[job.seed] = path
-    configs[job.seed] = storage.read_json(path / storage.CONFIG)
+    configs[job.seed] = _config(path)
   return Run(name, tuple(jobs), folders, tuple(rows), configs)
+
+
+def _config(folder: pathlib.Path) -> dict[str, Any]:
+  """Returns the configuration that a folder is named after."""
+  path = folder / storage.CONFIG
+  config = storage.read_json(path)
+  is_one = isinstance(config, dict)
+  if not is_one or not folder.name.endswith(f'-{jobs_lib.digest_of(config)}'):
+    raise errors.ResultsError(
+        f'{path}: not the configuration that the folder is named after; remove'
+        f' {folder} to run it again'
+    )
+  found: dict[str, Any] = config
+  return found
 
 
 def _rows(path: pathlib.Path, job: Job) -> list[results.EpisodeRow]:
