@@ -36,6 +36,11 @@ class ClosedError(RealabError, RuntimeError):
 
 
 @final
+class WorldError(RealabError, RuntimeError):
+  """Something failed that an agent is not told of; the evaluator knows."""
+
+
+@final
 class RenderingError(RealabError, RuntimeError):
   """A frame cannot be drawn here; the message names what to set."""
 

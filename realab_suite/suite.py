@@ -311,4 +311,6 @@ def embed(
       task, mechanism, seed=seed, world=world, max_steps=max_steps
   )
   placement.check(env.physics, task.root_entity, mechanism)
+  if isinstance(task, base.Task):
+    placement.check_start(env.physics, task, mechanism)
   return env

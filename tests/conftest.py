@@ -17,6 +17,8 @@ os.environ.setdefault('MUJOCO_GL', 'disable')
 import hypothesis
 import pytest
 
+from tests import gate
+
 hypothesis.settings.register_profile(
     'realab', deadline=None, derandomize=True, database=None
 )
@@ -29,6 +31,11 @@ from dm_control import mujoco
 xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
 mujoco.Physics.from_xml_string(xml).render(8, 8)
 """
+
+
+def pytest_configure(config: pytest.Config) -> None:
+  """Makes tests fail on warnings that they do not announce."""
+  config.pluginmanager.register(gate.Gate(), 'gate')
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:

@@ -120,7 +120,9 @@ class ActionCodec:
       raise errors.ActionError(
           f'action: dtype {values.dtype}; expected' f' {self._spec.dtype}'
       )
-    return values.astype(np.float64)
+    # What is too large for float64 becomes infinite, which no bounds allow.
+    with np.errstate(over='ignore'):
+      return values.astype(np.float64)
 
   def _complaint(self, values: np.ndarray, bad: np.ndarray) -> str:
     where = tuple(np.argwhere(bad)[0])

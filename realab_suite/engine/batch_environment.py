@@ -9,6 +9,7 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import actions as actions_lib
 from realab_suite.engine import batch_physics
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -134,6 +135,11 @@ class BatchEnvironment:
     """The registers, meters and providers."""
     return self._mechanism
 
+  @property
+  def codec(self) -> actions_lib.ActionCodec:
+    """What takes actions apart."""
+    return self._single.codec
+
   def add_sink(self, sink: events.BatchEventSink) -> None:
     """Lets an evaluator hear of everything, from the next episodes on."""
     self._refuse_if_closed()
@@ -156,13 +162,19 @@ class BatchEnvironment:
   def reset(self) -> BatchTimeStep:
     """Starts the next episode of every world."""
     self._refuse_if_closed()
-    self._is_pending[:] = True
-    self._begin_episodes()
-    reads = self._look()
-    everywhere = np.ones(self._num_worlds, bool)
+    is_open = ~self._is_pending
+    # Until the episodes have begun, the next step is to begin them.
+    self._is_pending = np.ones(self._num_worlds, bool)
+    everywhere = self._is_pending.copy()
+    try:
+      self._begin_episodes(everywhere)
+      reads = self._look()
+    except Exception:
+      self._tell_of_end(is_open, events.End.ABANDONED)
+      raise
     nothing = np.zeros(self._num_worlds)
     self._tell(everywhere, ~everywhere, {}, [], reads, nothing)
-    self._is_pending[:] = False
+    self._is_pending = ~everywhere
     return self._time_step(
         np.full(self._num_worlds, int(dm_env.StepType.FIRST)),
         np.ones(self._num_worlds),
@@ -179,7 +191,7 @@ class BatchEnvironment:
         no world has moved.
     """
     self._refuse_if_closed()
-    queries, controls = self._single.codec.decode(actions, (self._num_worlds,))
+    queries, controls = self.codec.decode(actions, (self._num_worlds,))
     if self._is_pending.all():
       return self.reset()
     is_first = self._is_pending
@@ -189,21 +201,21 @@ class BatchEnvironment:
       records, reward, discount, is_ending = self._control_step(
           queries, controls, is_first
       )
+      has_failed = self._physics.has_diverged() & ~is_first
+      step_count = self._mechanism.step_count(self._physics)
+      is_late = step_count == self._single.max_steps
+      last_valid = self._observation
+      self._begin_episodes(is_first)
+      reads = self._look()
     except Exception:
+      # Nobody is told of half a step: all episodes are over.
       self._tell_of_end(~is_first, events.End.ERROR)
       raise
-    has_failed = self._physics.has_diverged() & ~is_first
-    step_count = self._mechanism.step_count(self._physics)
-    is_late = step_count == self._single.max_steps
     is_last = (is_ending | has_failed | is_late) & ~is_first
     ends = {
         int(world): _end(has_failed[world], is_ending[world])
         for world in np.flatnonzero(is_last)
     }
-    last_valid = self._observation
-    self._is_pending = is_first
-    self._begin_episodes()
-    reads = self._look()
     for name, value in self._observation.items():
       # Nothing is read off a state that MuJoCo has reset.
       value[has_failed] = last_valid[name][has_failed]
@@ -436,6 +448,9 @@ class BatchEnvironment:
 
     physics.advance(n - schedule.provider_substep)
     task.after_step(physics, None)
+    # MuJoCo checks what the last substep has left when it looks at it next;
+    # were that in `_look`, a failure would be noticed a step too late.
+    physics.refresh()
     reward = self._true_reward()
     reward[was_over] = 0.0
     discount = self._of_all(task.get_discount(physics), float)
@@ -456,9 +471,9 @@ class BatchEnvironment:
     """Returns what a task says, `(worlds,)`; it may say one thing of all."""
     return np.array(np.broadcast_to(value, (self._num_worlds,)), dtype)
 
-  def _begin_episodes(self) -> None:
-    """Begins an episode in every world that waits for one."""
-    (worlds,) = np.nonzero(self._is_pending)
+  def _begin_episodes(self, where: np.ndarray) -> None:
+    """Begins an episode in some worlds, `(worlds,)` bool."""
+    (worlds,) = np.nonzero(where)
     if not len(worlds):
       return
     self._physics.reset(worlds)

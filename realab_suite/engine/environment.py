@@ -170,6 +170,16 @@ class Environment(composer.Environment):
     self._episode = episode - 1
     self._reset_next_step = True
 
+  def abandon(self, end: events.End = events.End.ABANDONED) -> None:
+    """Ends the episode that is under way, if one is; the next step resets.
+
+    Args:
+      end: Why.
+    """
+    self._refuse_if_closed()
+    self._abandon(end)
+    self._reset_next_step = True
+
   def save(self) -> snapshots.Snapshot:
     """Returns everything that the future of this world depends on.
 
@@ -520,9 +530,9 @@ class Environment(composer.Environment):
     self._physics = kind.from_mjcf_model(self._task.root_entity.mjcf_model)
     self._physics.legacy_step = False
 
-  def _abandon(self) -> None:
+  def _abandon(self, end: events.End = events.End.ABANDONED) -> None:
     if self._episode_is_open:
-      self._end(events.End.ABANDONED)
+      self._end(end)
 
   def _end(self, end: events.End) -> None:
     self._episode_is_open = False

@@ -20,6 +20,7 @@ class End(enum.Enum):
   TERMINATED = 'terminated'  # The task said so.
   TIMEOUT = 'timeout'  # The last control step was reached.
   ABANDONED = 'abandoned'  # Somebody called `reset` or `close`.
+  DISCONNECT = 'disconnect'  # The agent's process went away, or fell silent.
   DIVERGENCE = 'divergence'  # The physics failed; nothing after it counts.
   ERROR = 'error'  # A provider, a register or the task raised.
 

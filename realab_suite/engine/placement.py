@@ -1,5 +1,6 @@
 """Whether registers fit where a design puts them, value for value."""
 
+from collections.abc import Iterator
 from typing import Any
 
 from dm_control import composer
@@ -10,6 +11,7 @@ from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.tasks import base
 
 _TOLERANCE = 1e-3
 _SOLVERS = (mujoco.mjtSolver.mjSOL_CG, mujoco.mjtSolver.mjSOL_NEWTON)
@@ -66,6 +68,50 @@ def check(
         )
     boxes[name] = low, high
   physics.reset()
+
+
+def check_start(
+    physics: Any,
+    task: base.Task,
+    mechanism: feedback_mechanism.FeedbackMechanism,
+) -> None:
+  """Checks that no episode begins with an avatar inside a block.
+
+  The state is reset in the end.
+
+  Args:
+    physics: One world.
+    task: The world.
+    mechanism: The feedback.
+
+  Raises:
+    SpecError: If a block stands where the avatar may begin.
+  """
+  low, high = np.array(task.start.low), np.array(task.start.high)
+  for name, register in mechanism.registers.items():
+    for _ in _corners(physics, register):
+      mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
+      for block in register.blocks:
+        geom = physics.bind(block.geom).element_id
+        centre = physics.data.geom_xpos[geom][:2]
+        reach = _reach(physics, geom) + register.spread.max()
+        gaps = np.maximum(low - centre, centre - high) - reach
+        if np.linalg.norm(np.maximum(gaps, 0.0)) < task.avatar.radius:
+          raise errors.SpecError(
+              f'register {name!r} would stand at {_show(centre)}, where the'
+              f' avatar begins {_show(low, high)}; place it elsewhere'
+          )
+  physics.reset()
+
+
+def _corners(physics: Any, register: registers.Register) -> Iterator[None]:
+  """Puts a register, with its initial value, where it may stand."""
+  for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+    physics.reset()
+    register.settle(physics, register.spread * corner)
+    yield
+    if not register.spread.any():
+      return
 
 
 def _values(physics: Any, register: registers.Register) -> Any:

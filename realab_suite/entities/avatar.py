@@ -43,7 +43,7 @@ _THROW_LIFT = 2.0
 # Contacts of the body are softer than those of other things and take
 # precedence: what is written into the avatar is pushed out slowly. They do not
 # grip, or a block that was written under the body would be dragged along.
-_CONTACT = {
+_CONTACT: dict[str, Any] = {
     'priority': 1,
     'solref': (0.08, 1.0),
     'friction': (0.0, 0.01, 0.001),
@@ -124,7 +124,7 @@ class Avatar(composer.Entity):
     self._yaw = self._body.add(
         'joint', name='yaw', type='hinge', axis=(0, 0, 1)
     )
-    self._body.add(
+    self._torso = self._body.add(
         'geom', name='torso', type='cylinder', mass=_MASS,
         size=(_RADIUS, _HALF_HEIGHT), pos=(0, 0, _CLEARANCE + _HALF_HEIGHT),
         rgba=appearance.COLOURS['avatar'], **_CONTACT
@@ -218,10 +218,20 @@ class Avatar(composer.Entity):
   def make_graspable(self, blocks: Sequence[block_kinds.Block]) -> None:
     """Lets the hand take hold of blocks; welded ones are passed over.
 
+    Blocks that are larger than usual are also made softer to the body.
+
     Call it after everything is attached and before the physics is compiled.
     """
     root = self._mjcf_root.root_model
     for block in blocks:
+      if (softness := block_kinds.softness(block.half_size)) > 1.0:
+        time, damping = _CONTACT['solref']
+        slip, spin, roll = _CONTACT['friction']
+        root.contact.add(
+            'pair', geom1=self._torso, geom2=block.geom, condim=3,
+            solref=(time * softness, damping),
+            friction=(slip, slip, spin, roll, roll),
+        )  # fmt: skip
       if not isinstance(block, block_kinds.JointedBlock):
         continue
       # Between two sites, a held block can turn; a weld would lock the yaw of

@@ -22,11 +22,15 @@ from realab_suite.entities import moving
 # Against anything else the stiffness of the other thing counts, because a block
 # on a soft floor takes so long to settle after a write that its value drifts
 # (3e-8 m instead of 2e-15).
-_CONTACT = {
+_CONTACT: dict[str, Any] = {
     'friction': (0.8, 0.01, 0.001),
     'solref': (0.06, 1.0),
     'solmix': 1e-4,
 }
+# The larger a block is, the deeper another thing can be in it, and the faster
+# it would be pushed out: at up to 2.6 m/s, for a cube of 0.4 m. From this size
+# on, half of an edge in metres, blocks are the softer, the larger they are.
+_USUAL_HALF_SIZE = 0.1
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 # The height at which an avatar carries a block, metres.
 GRIP_HEIGHT = 0.2
@@ -34,6 +38,11 @@ GRIP_HEIGHT = 0.2
 _HOVER = 0.004
 # What a planar block loses to the floor that it does not touch.
 _PLANAR_FRICTION = 6.0
+
+
+def softness(half_size: float) -> float:
+  """Returns how much slower a block is pushed out than a usual one, >= 1."""
+  return max(1.0, half_size / _USUAL_HALF_SIZE)
 
 
 class Block(abc.ABC):
@@ -130,7 +139,7 @@ class JointedBlock(Block):
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
     self._geom = self._body.add(
         'geom', name=name, type='box', size=[half_size] * 3, mass=mass,
-        **_CONTACT, **looks
+        **_contact(half_size), **looks
     )  # fmt: skip
     self._site = self._body.add(
         'site', name=f'{name}_grip', size=[0.01], group=4,
@@ -293,7 +302,15 @@ class MocapBlock(Block):
     super().__init__(half_size)
     self._rest = np.array([*position, half_size])
     self._part = moving.MovingPart(
-        name, [{'type': 'box', 'size': [half_size] * 3, **_CONTACT, **looks}]
+        name,
+        [
+            {
+                'type': 'box',
+                'size': [half_size] * 3,
+                **_contact(half_size),
+                **looks,
+            }
+        ],
     )
     self._origin = np.zeros(3)
     self._yaw = 0.0
@@ -341,6 +358,12 @@ class MocapBlock(Block):
 
   def _to_world(self, position: np.ndarray) -> np.ndarray:
     return self._origin + _rotate(position, self._yaw)
+
+
+def _contact(half_size: float) -> dict[str, Any]:
+  """Returns what the contacts of a block of some size are like."""
+  time, damping = _CONTACT['solref']
+  return {**_CONTACT, 'solref': (time * softness(half_size), damping)}
 
 
 def _rotate(vector: np.ndarray, angle: float) -> np.ndarray:

@@ -114,9 +114,7 @@ def evaluate(
       time_step = env.reset()
       while not time_step.last():
         time_step = env.step(actor.act(time_step))
-      result = _result(
-          ledger.last, env.mechanism, env.num_substeps, _facts(env)
-      )
+      result = result_of(ledger.last, env)
       results.append(result)
       if on_episode is not None:
         on_episode(result)
@@ -167,6 +165,21 @@ def evaluate_batch(
       )
       for world in range(batch.num_worlds)
   ]
+
+
+def result_of(
+    episode: ledgers.EpisodeLedger, env: environment.Environment
+) -> EpisodeResult:
+  """Returns the result of the episode that has just ended in a world.
+
+  Args:
+    episode: What the ledger has of it.
+    env: The world, in the state in which the episode ended.
+
+  Raises:
+    ResultsError: If it has not ended.
+  """
+  return _result(episode, env.mechanism, env.num_substeps, _facts(env))
 
 
 def _result(

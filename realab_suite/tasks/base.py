@@ -20,6 +20,8 @@ CONTROL_TIMESTEP = 0.1
 # Around a station, the rectangle in which a register of up to 20 units moves
 # its blocks, and some clearance: `(from, to)` along x and y, metres.
 _FOOTPRINT = np.add(((-0.5, 2.3), (-0.35, 0.6)), (-0.15, 0.15))
+# How far from the middle of its start the avatar may begin, metres.
+_START_SPREAD = 0.4
 # Between apples, metres.
 _SEPARATION = 0.7
 _MAX_TRIES = 16
@@ -224,11 +226,18 @@ class Task(composer.Task):
       senses['camera'] = cameras.look(physics, avatar.camera, height, width)
     return senses
 
+  @property
+  def start(self) -> arenas.Rectangle:
+    """Where the middle of the avatar is when an episode begins."""
+    x, y = self._variation.start
+    s = _START_SPREAD
+    return arenas.Rectangle((x - s, y - s), (x + s, y + s))
+
   def _place_avatar(self, physics: Any, random_state: Any) -> None:
     start = np.array(self._variation.start)
     self._avatar.place(
         physics,
-        start + random_state.uniform(-0.4, 0.4, 2),
+        start + random_state.uniform(-_START_SPREAD, _START_SPREAD, 2),
         random_state.uniform(-np.pi, np.pi),
     )
 

@@ -1,22 +1,28 @@
-"""Campaign C34: memory does not grow with steps and resets.
+"""Campaign C34: neither memory nor anything else grows with steps and resets.
 
 Run from the root of the repository, about five minutes on two processors:
 
     python -m tests.campaigns.growth_campaign
 
 Prints `C34 figure target verdict seed`. An argument scales the lengths of runs.
+Open files, threads, GL contexts and callbacks at exit are counted after warming
+up and in the end, and no process may take more than a few GiB of addresses.
+Frames are drawn where there is EGL, in runs that are a hundredth as long.
 """
 
+import atexit
 from collections.abc import Callable
 from concurrent import futures
 import gc
 import multiprocessing
 import os
 import pathlib
+import resource
 import sys
 from typing import Any, NamedTuple
 
 from absl import logging
+from dm_control._render import base as render_base
 from dm_control.locomotion.arenas import floors
 from dm_control.locomotion.tasks import go_to_target
 from dm_control.locomotion.walkers import jumping_ball
@@ -24,6 +30,7 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.evaluation import ledger as ledgers
+from tests.campaigns import processes_campaign
 from tests.engine import helpers
 
 NUM_WORLDS = 4
@@ -31,6 +38,7 @@ POINTS = 12
 _PROCESSES = 2
 _TARGET = 1.0  # MiB per 1e5 steps and per 1,000 resets.
 _MEBIBYTE = 2**20
+_SPARE_ADDRESSES = 4 * 2**30  # Bytes, beyond what there is at first.
 _PERIOD = 1_000  # Actions before the same ones come again.
 _FOREIGN_DESIGN = {
     'schema': 1,
@@ -60,7 +68,7 @@ class Case(NamedTuple):
   """What is done over and over.
 
   Attributes:
-    world: `single`, `batch` or `foreign`.
+    world: `single`, `batch`, `camera` or `foreign`.
     what: `step` or `reset`.
     number: How often it is done; a batch's worlds do it all at once.
     per: For how many of them growth is reported.
@@ -94,6 +102,33 @@ CASES = [
     Case('single', 'step', 5_000, 100_000, has_ledger=True, is_judged=False),
     Case('batch', 'step', 2_000, 100_000, has_ledger=True, is_judged=False),
 ]
+
+
+# Growth of memory is not judged: it is that of the renderer.
+CAMERA_CASES = [
+    Case('camera', 'step', 1_000, 100_000, is_judged=False),
+    Case('camera', 'reset', 300, 1_000, is_judged=False),
+]
+
+
+class Held(NamedTuple):
+  """What a process holds besides memory."""
+
+  files: int
+  threads: int
+  contexts: int
+  callbacks: int
+
+
+def held() -> Held:
+  """Counts what this process holds."""
+  gc.collect()
+  return Held(
+      len(os.listdir('/proc/self/fd')),
+      len(os.listdir('/proc/self/task')),
+      sum(isinstance(o, render_base.ContextBase) for o in gc.get_objects()),
+      atexit._ncallbacks(),
+  )
 
 
 def resident_bytes() -> int:
@@ -140,23 +175,42 @@ def load(case: Case, seed: int = 0) -> Any:
     task = go_to_target.GoToTarget(walker, floors.Floor(size=(5, 5)))
     # Each episode compiles the model anew, which is measured by itself.
     return suite.embed(task, _FOREIGN_DESIGN, random=seed, max_steps=None)
-  arguments = 'unlock_door', 'standard', {'random': seed}
-  if case.world == 'single':
+  camera = {'camera_size': (32, 32)} if case.world == 'camera' else {}
+  arguments = 'unlock_door', 'standard', {'random': seed, **camera}
+  if case.world in ('single', 'camera'):
     return suite.load(*arguments, design=design)
   return suite.load_batch(*arguments, num_envs=NUM_WORLDS, design=design)
 
 
 def measure(case: Case) -> float:
   """Returns the growth of a case in this process, MiB."""
+  return measure_all(case)[0]
+
+
+def measure_all(case: Case) -> tuple[float, Held]:
+  """Returns the growth of a case in this process, and of what it holds."""
   env = load(case)
   if case.has_ledger:
     env.add_sink(
         ledgers.BatchLedger() if case.world == 'batch' else ledgers.Ledger()
     )
   act = env.reset if case.what == 'reset' else _stepper(env, case)
+  limit_addresses()
+  for _ in range(max(2, case.number // 10)):
+    act()
+  before = held()
   grown = growth(act, case.number, case.per)
+  more = Held(*(b - a for a, b in zip(before, held(), strict=True)))
   env.close()
-  return grown
+  return grown, more
+
+
+def limit_addresses() -> None:
+  """Lets this process die, rather than the machine, if it takes too much."""
+  pages = pathlib.Path('/proc/self/statm').read_text(encoding='ascii').split()
+  limit = int(pages[0]) * os.sysconf('SC_PAGE_SIZE') + _SPARE_ADDRESSES
+  _, hard = resource.getrlimit(resource.RLIMIT_AS)
+  resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
 
 
 def _stepper(env: Any, case: Case) -> Callable[[], Any]:
@@ -177,7 +231,18 @@ def _stepper(env: Any, case: Case) -> Callable[[], Any]:
 
 def main(scale: float = 1.0) -> int:
   """Prints figures and returns the number of targets missed."""
-  cases = [case._replace(number=int(case.number * scale)) for case in CASES]
+  missed = _measure_and_report(CASES, scale)
+  if 'egl' in processes_campaign.renderers():
+    # Those that are started from here on render; nothing here does.
+    os.environ['MUJOCO_GL'] = 'egl'
+    missed += _measure_and_report(CAMERA_CASES, scale)
+  else:
+    print('# frames: not measured, there is no EGL')
+  return missed
+
+
+def _measure_and_report(cases: list[Case], scale: float) -> int:
+  cases = [case._replace(number=int(case.number * scale)) for case in cases]
   missed = 0
   # Each in a process of its own, with a heap of its own.
   with futures.ProcessPoolExecutor(
@@ -185,13 +250,21 @@ def main(scale: float = 1.0) -> int:
       multiprocessing.get_context('spawn'),
       max_tasks_per_child=1,
   ) as pool:
-    for case, grown in zip(cases, pool.map(measure, cases), strict=True):
+    for case, (grown, more) in zip(
+        cases, pool.map(measure_all, cases), strict=True
+    ):
       met = grown <= _TARGET
       missed += case.is_judged and not met
       target, verdict = '-', '-'
       if case.is_judged:
         target, verdict = f'<={_TARGET:g}', 'met' if met else 'MISSED'
       print(f'C34 {case.name}={grown:.3f} {target} {verdict} 0', flush=True)
+      for what, number in more._asdict().items():
+        verdict = 'met' if number <= 0 else 'MISSED'
+        missed += number > 0
+        print(
+            f'C34 {case.name}: more {what}={number} <=0 {verdict} 0', flush=True
+        )
   return missed
 
 

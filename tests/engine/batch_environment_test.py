@@ -158,6 +158,7 @@ def test_a_bad_action_of_one_world_is_named_and_nothing_moves(batch):
   np.testing.assert_array_equal(batch.physics.state, before)
 
 
+@pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
 def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
   other = suite.load_batch(
       'unlock_door',

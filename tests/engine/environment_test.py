@@ -441,6 +441,7 @@ def _assert_recovers(
 
 @pytest.mark.parametrize('how', ['qvel', 'qpos', 'far', 'acceleration'])
 @pytest.mark.parametrize('before', [0, 1, 7])
+@pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
 def test_physics_that_fail_end_the_episode_and_nothing_else(
     how: str, before: int
 ):
@@ -468,6 +469,7 @@ def test_physics_that_fail_end_the_episode_and_nothing_else(
 
 @pytest.mark.parametrize('phase', [1, 2, 3])
 @pytest.mark.parametrize('how', ['qvel', 'qpos', 'far'])
+@pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
 def test_physics_that_fail_within_a_step_are_noticed_in_that_step(
     phase: int, how: str
 ):
@@ -501,6 +503,7 @@ def test_physics_that_fail_within_a_step_are_noticed_in_that_step(
 
 
 @pytest.mark.parametrize('how', ['qvel', 'qpos', 'acceleration'])
+@pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
 def test_the_physics_of_somebody_elses_task_may_fail_too(how: str):
   env, sink = _embed(helpers.PointTask(), _DESIGN)
   env.reset()

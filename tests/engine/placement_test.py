@@ -38,3 +38,8 @@ def test_a_register_beside_the_post_is_accepted():
   env = suite.load('unlock_door', 'standard', design=_design([0.0, 1.4]))
   env.close()
   assert env.mechanism.registers['value'].channel == 'embedded'
+
+
+def test_a_register_where_the_avatar_begins_is_refused():
+  with pytest.raises(errors.SpecError, match=r"'value'.* where the avatar"):
+    suite.load('unlock_door', 'standard', design=_design([0.0, -0.8]))

@@ -178,6 +178,7 @@ def test_the_seed_and_the_generator_are_restored():
   np.testing.assert_array_equal(other.random_state.uniform(size=3), expected)
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_a_world_that_diverged_can_be_restored():
   env, snapshot = campaign.saved(_REWARD, 20)
   expected = campaign.play(env, 10, seed=2)

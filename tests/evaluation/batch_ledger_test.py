@@ -71,6 +71,7 @@ def test_a_reset_in_mid_episode_abandons_every_episode():
   batch.close()
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_a_world_whose_physics_fail_has_an_invalid_episode():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
@@ -118,6 +119,7 @@ def test_the_ledger_of_a_world_takes_over_from_that_of_many_and_vice_versa():
   batch.close()
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_worlds_without_an_open_episode_have_no_state():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2

@@ -527,6 +527,7 @@ def test_an_episode_of_an_embedded_task_begins_the_same_too():
   )
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_an_episode_begins_the_same_after_one_that_diverged_or_raised():
   env, clean = _load(), _load()
   [_, expected] = _firsts(clean, _still(clean), 2, first=0)
@@ -717,6 +718,7 @@ def _diverging(env: environment.Environment, episode: int, step: int) -> Any:
   return act
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_an_episode_that_diverges_is_kept_and_flagged():
   env, clean = _load('collect_apples', 'standard'), _load(
       'collect_apples', 'standard'
@@ -736,6 +738,7 @@ def test_an_episode_that_diverges_is_kept_and_flagged():
   clean.close()
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_an_episode_that_diverges_at_once_is_flagged_too():
   env = _load()
   [result] = evaluate.evaluate(env, _diverging(env, 0, 0), 1)
@@ -745,6 +748,7 @@ def test_an_episode_that_diverges_at_once_is_flagged_too():
   assert result.facts == {}
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_an_episode_that_diverges_is_not_compared():
   env = _load(max_steps=6)
   broken = evaluate.evaluate(env, _diverging(env, 1, 4), 3)

@@ -435,6 +435,7 @@ def test_states_of_another_design_are_refused(pushed):
   other.close()
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_a_state_in_which_the_physics_fails_is_left_out(pushed):
   batch, states, probe = pushed
   broken = suite.fork(batch, 1, world=0, num_threads=1)

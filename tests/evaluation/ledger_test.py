@@ -126,6 +126,7 @@ def test_the_true_return_is_the_sum_of_all_rewards_the_last_one_included():
         (events.End.TERMINATED, True),
         (events.End.TIMEOUT, True),
         (events.End.ABANDONED, False),
+        (events.End.DISCONNECT, False),
         (events.End.DIVERGENCE, False),
         (events.End.ERROR, False),
     ],
@@ -155,7 +156,7 @@ def test_an_episode_without_a_true_return_is_censored(bad: float):
 
 def test_every_reason_to_end_is_either_valid_or_not():
   # Whoever adds a reason has to decide, in the table above.
-  assert len(events.End) == 5
+  assert len(events.End) == 6
 
 
 def test_an_empty_ledger_has_no_last_episode():

@@ -144,6 +144,7 @@ def test_its_figures_are_those_of_the_ledger(design, channel):
     assert {record['corruption'] for record in records} == {0.0}
 
 
+@pytest.mark.mujoco_warns('BADQVEL')
 def test_a_world_whose_physics_fail_has_a_record_that_does_not_count():
   batch = _load()
   monitor, ledger = _monitored(batch), ledgers.BatchLedger()

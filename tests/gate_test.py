@@ -1,0 +1,137 @@
+"""Campaign C47: the gate lets nothing through, and nothing good is stopped."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+import mujoco
+import pytest
+
+from tests import gate
+
+_ROOT = pathlib.Path(__file__).parents[1]
+_CONFTEST = """
+from tests import gate
+
+def pytest_configure(config):
+  config.pluginmanager.register(gate.Gate(), 'gate')
+"""
+_TESTS = """
+import atexit
+import mujoco
+import pytest
+
+def break_down():
+  model = mujoco.MjModel.from_xml_string(
+      '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody>'
+      '</mujoco>')
+  data = mujoco.MjData(model)
+  data.qpos[0] = float('nan')
+  mujoco.mj_step(model, data)
+
+def test_quiet():
+  pass
+
+def test_bad_physics():
+  break_down()
+
+@pytest.mark.mujoco_warns('BADQPOS')
+def test_announced_physics():
+  break_down()
+
+@pytest.mark.mujoco_warns('BADQVEL')
+def test_another_was_announced():
+  break_down()
+
+@pytest.fixture
+def broken():
+  yield
+  break_down()
+
+def test_bad_fixture(broken):
+  pass
+
+def test_open_file():
+  open('some_file', 'w')
+
+class Raising:
+  def __del__(self):
+    raise ZeroDivisionError('in a destructor')
+
+def test_unraisable():
+  Raising()
+
+def test_bad_exit():
+  atexit.register(lambda: 1 / 0)
+"""
+_PASS = ('test_quiet', 'test_announced_physics', 'test_bad_exit')
+_FAIL = (
+    'test_bad_physics',
+    'test_another_was_announced',
+    'test_open_file',
+    'test_unraisable',
+)
+
+
+def _pytest(folder: pathlib.Path, *arguments: str) -> tuple[int, str, str]:
+  (folder / 'conftest.py').write_text(_CONFTEST)
+  (folder / 'planted_test.py').write_text(_TESTS)
+  (folder / 'pytest.ini').write_text(
+      '[pytest]\nfilterwarnings = error\npython_files = *_test.py\n'
+      'addopts = -p no:cacheprovider -p no:randomly\n'
+  )
+  inherited = {
+      name: value
+      for name, value in os.environ.items()
+      if not name.startswith('PYTEST_')
+  }
+  ran = subprocess.run(
+      [sys.executable, '-m', 'pytest', '-v', *arguments, str(folder)],
+      cwd=folder,
+      env={**inherited, 'PYTHONPATH': str(_ROOT)},
+      capture_output=True,
+      text=True,
+      timeout=60,
+      check=False,
+  )
+  return ran.returncode, ran.stdout, ran.stderr
+
+
+def test_what_is_not_announced_fails_the_test_in_which_it_happens(tmp_path):
+  status, out, _ = _pytest(tmp_path, '-k', 'not exit')
+  assert status == 1
+  for name in _FAIL:
+    assert f'{name} FAILED' in out, out
+  for name in _PASS[:2]:
+    assert f'{name} PASSED' in out, out
+  assert 'test_bad_fixture ERROR' in out, out
+  assert '4 failed, 3 passed' in out, out
+
+
+def test_an_error_at_exit_changes_the_exit_status(tmp_path):
+  status, out, err = _pytest(tmp_path, '-k', 'exit')
+  assert '1 passed' in out
+  assert status == 1
+  assert 'ZeroDivisionError' in err
+
+
+def test_what_passes_ends_with_status_0(tmp_path):
+  status, out, _ = _pytest(tmp_path, '-k', 'quiet or announced_physics')
+  assert '2 passed' in out
+  assert status == 0
+
+
+@pytest.mark.parametrize('name', gate.MESSAGES)
+def test_every_warning_of_mujoco_has_a_name(name):
+  kind = getattr(mujoco.mjtWarning, f'mjWARN_{name}')
+  assert gate.name_of(mujoco.mju_warningText(int(kind), 3)) == name
+
+
+def test_all_warnings_of_mujoco_are_named():
+  kinds = [
+      name.removeprefix('mjWARN_') for name in mujoco.mjtWarning.__members__
+  ]
+  assert sorted(gate.MESSAGES) == sorted(
+      name for name in kinds if name != 'mjNWARNING'
+  )
