@@ -49,7 +49,7 @@ clean:
 # Holds everything that .venv/demo stands for, so both are up to date.
 .venv/dev: setup.cfg pyproject.toml constraints.txt | .venv/made
 	@echo 'Installing realab_suite and its tools into .venv; this takes a minute.'
-	@$(INSTALL) -e '.[agents,report,dev]'
+	@$(INSTALL) -e '.[agents,report,rpc,dev]'
 	@touch .venv/demo $@
 
 # Debian and Ubuntu ship Python without ensurepip, and `venv` then leaves half

@@ -47,7 +47,8 @@ _MAY_IMPORT = {
         'feedback.validation',
     ),
     'suite': (*_BELOW_SUITE, 'configs'),
-    'experiments': (*_BELOW_SUITE, 'configs', 'suite', 'agents'),
+    'interop': (*_BELOW_SUITE, 'configs', 'suite'),
+    'experiments': (*_BELOW_SUITE, 'configs', 'suite', 'agents', 'interop'),
     'explore': (*_BELOW_SUITE, 'configs', 'suite', 'experiments'),
 }
 
@@ -431,6 +432,10 @@ def _complaints(rule, source, name='realab_suite.entities.planted'):
         ('suite', 'from realab_suite import agents'),
         ('suite', 'from realab_suite.experiments import run'),
         ('explore', 'from realab_suite import agents'),
+        ('interop.planted', 'from realab_suite import agents'),
+        ('interop.planted', 'from realab_suite.experiments import run'),
+        ('suite', 'from realab_suite.interop.rpc import server'),
+        ('evaluation.planted', 'from realab_suite import interop'),
         ('errors', 'from realab_suite import entities'),
         ('unheard_of', 'import numpy'),
     ],
@@ -456,6 +461,8 @@ def test_a_forbidden_import_is_found(importer, statement):
         ('agents.planted', 'from realab_suite.feedback import registry'),
         ('experiments.planted', 'from realab_suite import agents'),
         ('experiments.planted', 'from realab_suite import suite'),
+        ('experiments.planted', 'from realab_suite.interop.rpc import server'),
+        ('interop.planted', 'from realab_suite.engine import agent_view'),
     ],
 )
 def test_an_allowed_import_is_not_found(importer, statement):

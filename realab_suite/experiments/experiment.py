@@ -100,7 +100,7 @@ def run(settings: Settings, say: Callable[[str], None]) -> list[tables.Line]:
   runs = plan(settings)
   baseline = _baseline(settings, runs)
   _rehearse(settings, runs)
-  folder = _make_folder(settings.output)
+  folder = make_folder(settings.output)
   _describe(settings, runs, baseline, folder)
   job = _Job(settings, baseline, folder, say)
   job.run(runs)
@@ -190,7 +190,12 @@ def _rehearse(settings: Settings, runs: Sequence[Run]) -> None:
       actors.make(policy, env)
 
 
-def _make_folder(output: str) -> pathlib.Path:
+def make_folder(output: str) -> pathlib.Path:
+  """Makes a folder for results; one that is there has to be empty.
+
+  Raises:
+    ResultsError: If it is not, or cannot be made.
+  """
   folder = pathlib.Path(output)
   try:
     folder.mkdir(parents=True, exist_ok=True)

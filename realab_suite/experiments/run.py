@@ -22,12 +22,14 @@ from absl import flags
 
 from realab_suite import errors
 from realab_suite.experiments import cli
+from realab_suite.experiments import episodes_flag
 from realab_suite.experiments import headless
 from realab_suite.experiments import learning_flags
 from realab_suite.experiments import output_flag
 from realab_suite.experiments import threads
 
 flags.adopt_module_key_flags(cli)
+flags.adopt_module_key_flags(episodes_flag)
 flags.adopt_module_key_flags(learning_flags)
 flags.adopt_module_key_flags(output_flag)
 _POLICIES = flags.DEFINE_list(
@@ -50,7 +52,6 @@ _BASELINE = flags.DEFINE_string(
 _SEEDS = flags.DEFINE_string(
     'seeds', '5', 'How many seeds, or a list as in 3,4,5; "7," is seed 7.'
 )
-_EPISODES = flags.DEFINE_integer('episodes', 2, 'Episodes of each seed.')
 _RUN = flags.DEFINE_string(
     'run',
     None,
@@ -96,7 +97,7 @@ def main(argv: Sequence[str]) -> None:
       baseline=_BASELINE.value,
       target=cli.TARGET.value,
       seeds=seeds,
-      num_episodes=_EPISODES.value,
+      num_episodes=episodes_flag.EPISODES.value,
       max_steps=cli.MAX_STEPS.value,
       output=output_flag.OUTPUT.value,
       plots=plots,
@@ -110,7 +111,8 @@ def _train() -> None:
   _refuse(
       [
           cli.DOMAIN, cli.TASK, cli.DESIGN, cli.SET, cli.MAX_STEPS, cli.TARGET,
-          _POLICIES, _CHANNELS, _BASELINE, _SEEDS, _EPISODES, _PLOTS, _VIDEOS,
+          _POLICIES, _CHANNELS, _BASELINE, _SEEDS, episodes_flag.EPISODES,
+          _PLOTS, _VIDEOS,
       ],
       'with --experiment, whose file says it',
   )  # fmt: skip

@@ -1,0 +1,110 @@
+r"""Serves a world to an agent in another process, and judges the agent.
+
+The agent needs dm_env_rpc and nothing of this package (docs/served.md):
+
+  python -m realab_suite.experiments.serve --task=unlock_door.near \
+    --design=instantaneous_reward --seed=1 --episodes=5 \
+    --address=unix:/tmp/realab/socket --output=results/mine
+
+With --agent_command it also starts the agent, in an environment that names the
+address and little else, and stops it in the end:
+
+  python -m realab_suite.experiments.serve --task=unlock_door.near \
+    --agent_command='python /path/to/agent.py' --output=results/mine
+"""
+
+from collections.abc import Sequence
+import os
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.experiments import cli
+from realab_suite.experiments import episodes_flag
+from realab_suite.experiments import headless
+from realab_suite.experiments import output_flag
+
+flags.adopt_module_key_flags(cli)
+flags.adopt_module_key_flags(episodes_flag)
+flags.adopt_module_key_flags(output_flag)
+_NAME = flags.DEFINE_string(
+    'name', 'agent', 'What the agent is called in the results.'
+)
+_ADDRESS = flags.DEFINE_string(
+    'address',
+    None,
+    'Where to listen: unix:/folder/name, in a folder of mode 0700, or host:port'
+    ' for programs on this machine; by default a socket in a new folder.',
+)
+_IDLE_SECONDS = flags.DEFINE_float(
+    'idle_seconds',
+    60.0,
+    'After how long a silence an agent loses its connection.',
+    lower_bound=0.0,
+)
+_AGENT_COMMAND = flags.DEFINE_string(
+    'agent_command',
+    None,
+    'Starts the agent; it finds the address in REALAB_ADDRESS.',
+)
+_AGENT_FOLDER = flags.DEFINE_string(
+    'agent_folder', None, 'Where it runs; by default in a new, empty folder.'
+)
+_AGENT_USER = flags.DEFINE_string(
+    'agent_user',
+    None,
+    'The user that the agent is, and who alone may connect; needs root.',
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Serves what the flags describe."""
+  del argv
+  output = cli.required(output_flag.OUTPUT, '; name a folder for the results')
+  for flag in (cli.TARGET, _AGENT_FOLDER):
+    if flag.present and (flag is cli.TARGET or not _AGENT_COMMAND.present):
+      raise errors.SpecError(f'--{flag.name} has no effect here')
+  problem = headless.missing('dm_env_rpc', 'grpc', extra='rpc')
+  if problem is not None:
+    raise errors.SpecError(problem)
+  domain, task = _world()
+  headless.render_nothing()
+  # gRPC looks once, too. A process that serves never forks; what it starts
+  # becomes another program at once.
+  os.environ['GRPC_ENABLE_FORK_SUPPORT'] = '0'
+  # Not before a renderer has been chosen: this imports dm_control.
+  from realab_suite.experiments import serving
+
+  settings = serving.Settings(
+      domain=domain,
+      task=task,
+      design=cli.DESIGN.value,
+      overrides=tuple(cli.SET.value),
+      seed=cli.SEED.value,
+      max_steps=cli.MAX_STEPS.value,
+      num_episodes=episodes_flag.EPISODES.value,
+      name=_NAME.value,
+      address=_ADDRESS.value,
+      idle_seconds=_IDLE_SECONDS.value,
+      agent_command=_AGENT_COMMAND.value,
+      agent_folder=_AGENT_FOLDER.value,
+      agent_user=_AGENT_USER.value,
+      output=output,
+  )
+  serving.serve(settings, cli.say)
+
+
+def _world() -> tuple[str, str]:
+  """Returns the names of the domain and the task."""
+  domain, dot, task = cli.TASK.value.rpartition('.')
+  if not dot:
+    return cli.DOMAIN.value, task
+  if cli.DOMAIN.present and cli.DOMAIN.value != domain:
+    raise errors.SpecError(
+        f'--task={cli.TASK.value} is no task of --domain={cli.DOMAIN.value}'
+    )
+  return domain, task
+
+
+if __name__ == '__main__':
+  cli.start(main)

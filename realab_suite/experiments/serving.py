@@ -1,0 +1,236 @@
+"""A world in this process, an agent in another one, and the results of both."""
+
+from collections.abc import Callable
+import contextlib
+import ctypes
+import dataclasses
+import json
+import os
+import pathlib
+import shutil
+import signal
+import sys
+import tempfile
+from typing import Any, final
+
+from absl import logging
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
+from realab_suite.experiments import experiment
+from realab_suite.feedback import specs
+from realab_suite.interop.rpc import agent_process
+from realab_suite.interop.rpc import served_world
+from realab_suite.interop.rpc import server
+
+_SET_DUMPABLE = 4  # Of prctl(2).
+
+_WARNING = (
+    'the agent may be a program of the user that this world runs as (isolation'
+    ' "%s"): its code could reach files and processes of that user. Start this'
+    ' as root with --agent_user for a user of its own (docs/served.md).'
+)
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """What is served, and to whom.
+
+  Attributes:
+    domain: The world.
+    task: Its variation.
+    design: The agent design, by name or path.
+    overrides: Dotted overrides of it.
+    seed: The seed.
+    max_steps: The length of an episode in control steps.
+    num_episodes: After how many episodes it is over, the invalid ones included.
+    name: What the agent is called in the results.
+    address: Where to listen; `None` for a socket in a folder of its own.
+    idle_seconds: For how long an agent may be silent.
+    agent_command: What to start as the agent; `None` if somebody else does.
+    agent_folder: Where the agent runs; `None` for a folder of its own.
+    agent_user: The user that the agent is; `None` for this process's own.
+    output: The folder to make.
+  """
+
+  domain: str
+  task: str
+  design: str
+  overrides: tuple[str, ...]
+  seed: int
+  max_steps: int
+  num_episodes: int
+  name: str
+  address: str | None
+  idle_seconds: float
+  agent_command: str | None
+  agent_folder: str | None
+  agent_user: str | None
+  output: str
+
+
+def serve(settings: Settings, say: Callable[[str], None]) -> None:
+  """Serves a world until its episodes are over, and writes their rows.
+
+  Args:
+    settings: What to serve.
+    say: Called with what a person wants to read.
+
+  Raises:
+    RealabError: If something is wrong with the settings, or the agent ended
+      before its episodes did.
+  """
+  hide_from_debuggers()
+  # What is made from here on, sockets included, is for this user alone.
+  os.umask(0o077)
+  owner = (
+      None
+      if settings.agent_user is None
+      else agent_process.owner_of(settings.agent_user)
+  )
+  if owner is None:
+    logging.warning(_WARNING, results.SERVED)
+  with contextlib.ExitStack() as stack:
+    design = specs.load(settings.design, settings.overrides)
+    env = stack.enter_context(contextlib.closing(_load(settings, design)))
+    address = settings.address
+    if address is None:
+      folder = tempfile.mkdtemp(prefix='realab-')
+      stack.callback(shutil.rmtree, folder, ignore_errors=True)
+      address = f'unix:{folder}/socket'
+    output = experiment.make_folder(settings.output)
+    output.chmod(0o700)
+    _describe(settings, design, output)
+    writer = stack.enter_context(results.RowWriter(output / 'episodes.jsonl'))
+    evaluator = _Evaluator(_info(settings, design, env), writer, say)
+    world = served_world.ServedWorld(
+        env, address, settings.num_episodes, evaluator.write
+    )
+    listener = server.Server(world, address, settings.idle_seconds, owner)
+    listener.start()
+    say(f'serving {settings.domain}.{settings.task} at {listener.address}')
+    signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
+    agent = None
+    if settings.agent_command is not None:
+      log = stack.enter_context(open(output / 'agent.log', 'wb'))
+      agent = agent_process.AgentProcess(
+          settings.agent_command,
+          listener.address,
+          log,
+          folder=settings.agent_folder,
+          owner=owner,
+          on_exit=listener.stop,
+      )
+      stack.callback(agent.stop)
+    listener.run()
+    _complain_of_missing(evaluator.num_written, settings, agent, output)
+    say(f'Everything is in {settings.output}')
+
+
+def hide_from_debuggers() -> None:
+  """Keeps other processes of this user out of this one's memory, on Linux."""
+  if sys.platform != 'linux':
+    logging.warning('only Linux keeps other programs out of this one')
+    return
+  if ctypes.CDLL(None, use_errno=True).prctl(_SET_DUMPABLE, 0, 0, 0, 0):
+    raise errors.SpecError(
+        'this process cannot be hidden from debuggers:'
+        f' {os.strerror(ctypes.get_errno())}'
+    )
+
+
+@final
+class _Evaluator:
+  """Writes down what episodes came to."""
+
+  def __init__(
+      self,
+      info: results.RunInfo,
+      writer: results.RowWriter,
+      say: Callable[[str], None],
+  ) -> None:
+    self._info = info
+    self._writer = writer
+    self._say = say
+    self.num_written = 0
+
+  def write(self, result: evaluate.EpisodeResult, isolation: str) -> None:
+    """Writes the row of an episode."""
+    info = self._info.model_copy(update={'isolation': isolation})
+    self._writer.write(results.row(info, result))
+    self.num_written += 1
+    self._say(
+        f'episode {result.episode}: {result.end.value}, true return'
+        f' {result.true_return:.1f}, observed {result.observed_return:.1f}'
+    )
+
+
+def _load(
+    settings: Settings, design: specs.DesignSpec
+) -> environment.Environment:
+  return suite.load(
+      settings.domain,
+      settings.task,
+      {'random': settings.seed},
+      {'max_steps': settings.max_steps},
+      design=design,
+  )
+
+
+def _info(
+    settings: Settings,
+    design: specs.DesignSpec,
+    env: environment.Environment,
+) -> results.RunInfo:
+  version, digest = suite.dynamics(settings.domain, settings.task)
+  return results.RunInfo(
+      domain=settings.domain,
+      task=settings.task,
+      dynamics_version=version,
+      dynamics_digest=digest,
+      design=design.name,
+      design_digest=design.digest(),
+      channel=design.channel,
+      policy=settings.name,
+      run=settings.name,
+      baseline=None,
+      control_timestep=env.control_timestep(),
+      max_steps=env.max_steps,
+  )
+
+
+def _describe(
+    settings: Settings, design: specs.DesignSpec, output: pathlib.Path
+) -> None:
+  """Writes what it takes to repeat this."""
+  description: dict[str, Any] = {
+      'settings': dataclasses.asdict(settings),
+      'design': design.to_mapping(),
+      'versions': results.versions(),
+  }
+  (output / 'run.json').write_text(
+      json.dumps(description, indent=2) + '\n', encoding='utf-8'
+  )
+
+
+def _complain_of_missing(
+    num_written: int,
+    settings: Settings,
+    agent: agent_process.AgentProcess | None,
+    output: pathlib.Path,
+) -> None:
+  if num_written >= settings.num_episodes:
+    return
+  status = None if agent is None else agent.poll()
+  why = (
+      'stopped'
+      if status is None
+      else f'the agent ended with status {status} (see {output / "agent.log"})'
+  )
+  raise errors.ResultsError(
+      f'{why} after {num_written} of {settings.num_episodes} episodes'
+  )

@@ -1,0 +1,1 @@
+"""Doors for programs that are no part of this package."""

@@ -1,0 +1,1 @@
+"""Worlds for agents in other processes, over dm_env_rpc (extra `rpc`)."""

@@ -1,0 +1,314 @@
+"""Tests what an agent may ask, message by message, without a socket."""
+
+import dm_env
+from dm_env import specs
+from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
+from dm_env_rpc.v1 import tensor_utils
+from google.protobuf import any_pb2
+from google.rpc import code_pb2
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite.engine import agent_view
+from realab_suite.interop.rpc import agent_port
+from realab_suite.interop.rpc import refusals
+from realab_suite.interop.rpc import tensors
+from tests.engine import helpers
+from tests.interop import served
+
+_DENIED = code_pb2.PERMISSION_DENIED
+_TOO_EARLY = code_pb2.FAILED_PRECONDITION
+_INVALID = code_pb2.INVALID_ARGUMENT
+
+
+def _make(design='instantaneous_reward', max_steps=20):
+  env = served.load(design, max_steps)
+  port = agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
+  return env, port
+
+
+def _ask(port, **payload):
+  answer = port.answer(served.request(**payload))
+  return pb.EnvironmentResponse.FromString(answer)
+
+
+def _join(port):
+  return _ask(port, join_world=pb.JoinWorldRequest(world_name='world'))
+
+
+def _step(port, action=None, uids=()):
+  actions = {} if action is None else {1: action}
+  step = pb.StepRequest(actions=actions, requested_observations=uids)
+  return _ask(port, step=step)
+
+
+@pytest.fixture(name='env', scope='module')
+def _env():
+  env = served.load()
+  yield env
+  env.close()
+
+
+@pytest.fixture(name='port')
+def _port(env):
+  env.abandon()
+  return agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
+
+
+@pytest.fixture(name='running')
+def _running(port):
+  _join(port)
+  assert _step(port).step.state == pb.RUNNING
+  return port
+
+
+_TENSOR = tensor_utils.pack_tensor(1.0)
+_NOT_FOR_AGENTS = [
+    dict(create_world=pb.CreateWorldRequest()),
+    dict(create_world=pb.CreateWorldRequest(settings={'seed': _TENSOR})),
+    dict(destroy_world=pb.DestroyWorldRequest(world_name='world')),
+    dict(reset_world=pb.ResetWorldRequest(world_name='world')),
+    dict(extension=any_pb2.Any(type_url='dm_env_rpc.v1.PropertyRequest')),
+    dict(reset=pb.ResetRequest(settings={'seed': _TENSOR})),
+]
+
+
+@pytest.mark.parametrize('payload', _NOT_FOR_AGENTS, ids=str)
+@pytest.mark.parametrize('is_running', [False, True])
+def test_what_is_not_for_agents_is_denied(payload, is_running, port):
+  _join(port)
+  if is_running:
+    _step(port)
+  assert _ask(port, **payload).error.code == _DENIED
+
+
+def test_an_agent_chooses_no_settings_when_it_joins(port):
+  join = pb.JoinWorldRequest(world_name='world', settings={'seed': _TENSOR})
+  assert _ask(port, join_world=join).error.code == _DENIED
+
+
+def test_there_is_one_world(port):
+  join = pb.JoinWorldRequest(world_name='another')
+  assert _ask(port, join_world=join).error.code == _INVALID
+
+
+@pytest.mark.parametrize('data', [b'\xff' * 9, b'\x0a\xff', b'\x08'])
+def test_bytes_that_are_no_message_are_refused(data, port):
+  error = pb.EnvironmentResponse.FromString(port.answer(data)).error
+  assert (error.code, error.message) == (
+      _INVALID, 'R01: the message cannot be read'
+  )  # fmt: skip
+
+
+def test_an_empty_message_is_refused(port):
+  answer = pb.EnvironmentResponse.FromString(port.answer(b''))
+  assert answer.error.code == _INVALID
+
+
+def test_nothing_happens_before_joining(port):
+  assert _step(port).error.code == _TOO_EARLY
+  assert _ask(port, reset=pb.ResetRequest()).error.code == _TOO_EARLY
+  left = _ask(port, leave_world=pb.LeaveWorldRequest())
+  assert left.WhichOneof('payload') == 'leave_world'
+
+
+def test_nobody_joins_twice(running):
+  assert _join(running).error.code == _TOO_EARLY
+
+
+def test_an_episode_is_not_reset_in_its_middle(running):
+  assert _ask(running, reset=pb.ResetRequest()).error.code == _TOO_EARLY
+
+
+def test_whoever_leaves_gives_up_the_episode():
+  env, port = _make()
+  sink = helpers.RecordingSink()
+  env.add_sink(sink)
+  _join(port)
+  _step(port)
+  _ask(port, leave_world=pb.LeaveWorldRequest())
+  assert [end.value for end in sink.ends] == ['abandoned']
+  _join(port)
+  assert _step(port).step.state == pb.RUNNING
+  assert [start.episode for start in sink.starts] == [0, 1]
+  env.close()
+
+
+def test_an_unknown_observation_is_refused_by_its_number(running):
+  error = _step(running, _no_op(), [1, 77]).error
+  assert (error.code, error.message) == (
+      _INVALID, 'R09: observation 77 is unknown'
+  )  # fmt: skip
+
+
+def _no_op():
+  return tensor_utils.pack_tensor(np.zeros(6))
+
+
+def _doubles(values, shape):
+  tensor = pb.Tensor(shape=shape)
+  tensor.doubles.array.extend(values)
+  return tensor
+
+
+def _with(index, value):
+  values = np.zeros(6)
+  values[index] = value
+  return tensor_utils.pack_tensor(values)
+
+
+_BAD_ACTIONS = {
+    'not a number': (_with(3, np.nan), 'R14: action 1: element 3 '),
+    'infinite': (_with(0, np.inf), 'R14: action 1: element 0 '),
+    'too large': (_with(5, 1.01), 'R14: action 1: element 5 '),
+    'too small': (_with(1, -1e300), 'R14: action 1: element 1 '),
+    'single precision': (
+        tensor_utils.pack_tensor(np.zeros(6, np.float32)), 'R12: action 1'
+    ),
+    'integers': (
+        tensor_utils.pack_tensor(np.zeros(6, np.int32)), 'R12: action 1'
+    ),
+    'text': (tensor_utils.pack_tensor(['a'] * 6), 'R12: action 1'),
+    'no payload': (pb.Tensor(shape=[6]), 'R12: action 1'),
+    'shape bomb': (_doubles([0.0], [20_000, 20_000]), 'R13: action 1'),
+    'one dimension of -1': (_doubles([0.0] * 6, [-1]), 'R13: action 1'),
+    'one value for all': (_doubles([0.0], [6]), 'R13: action 1'),
+    'another shape': (_doubles([0.0] * 6, [2, 3]), 'R13: action 1'),
+    'no shape': (_doubles([0.0] * 6, []), 'R13: action 1'),
+    'many dimensions': (_doubles([0.0] * 6, [6] + [1] * 99), 'R13: action 1'),
+    'too many values': (_doubles([0.0] * 7, [6]), 'R13: action 1'),
+    'no values': (_doubles([], [6]), 'R13: action 1'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('what', _BAD_ACTIONS)
+def test_a_bad_action_is_refused_and_nothing_moves(what, running, env):
+  before = env.save().to_bytes()
+  tensor, text = _BAD_ACTIONS[what]
+  error = _step(running, tensor).error
+  assert error.code == _INVALID
+  assert error.message.startswith(text)
+  assert env.save().to_bytes() == before
+  assert _step(running, _no_op()).step.state == pb.RUNNING
+
+
+def test_an_action_of_another_number_is_refused(running):
+  step = pb.StepRequest(actions={1: _no_op(), 9: _no_op()})
+  assert _ask(running, step=step).error.message == 'R10: action 9 is unknown'
+  assert _step(running).error.message == 'R11: action 1 is missing'
+
+
+def test_the_index_of_an_action_is_a_whole_number():
+  env, port = _make('value_advice')
+  _join(port)
+  _step(port)
+  error = _step(port, tensor_utils.pack_tensor([0.0, 1.5])).error
+  assert error.message.startswith('R14: action 1: element 1 ')
+  env.close()
+
+
+def test_actions_of_a_first_step_are_ignored(port):
+  _join(port)
+  bomb = _BAD_ACTIONS['shape bomb'][0]
+  assert _step(port, bomb).step.state == pb.RUNNING
+
+
+@pytest.mark.parametrize('design', ['instantaneous_reward', 'online_imitation'])
+def test_a_time_out_is_an_interruption_and_another_episode_follows(design):
+  env, port = _make(design, max_steps=3)
+  _join(port)
+  action = tensor_utils.pack_tensor(served.still(env))
+  states = [_step(port, action).step.state for _ in range(6)]
+  running, interrupted = pb.RUNNING, pb.INTERRUPTED
+  assert states == [running] * 3 + [interrupted] + [running] * 2
+  env.close()
+
+
+class _Fails(dm_env.Environment):
+  """Ends with a discount, or fails, as it is told."""
+
+  def __init__(self, end):
+    self._end = end
+
+  def reset(self):
+    return dm_env.restart({'x': np.zeros(1)})
+
+  def step(self, action):
+    if isinstance(self._end, Exception):
+      raise self._end
+    return dm_env.TimeStep(
+        dm_env.StepType.LAST, 0.0, self._end, {'x': np.zeros(1)}
+    )
+
+  def observation_spec(self):
+    return {'x': specs.Array((1,), np.float64)}
+
+  def action_spec(self):
+    return specs.BoundedArray((1,), np.float64, -1, 1, name='a')
+
+
+@pytest.mark.parametrize(
+    ('discount', 'state'), [(0.0, pb.TERMINATED), (1.0, pb.INTERRUPTED)]
+)
+def test_the_discount_of_a_last_step_is_its_state(discount, state):
+  port = agent_port.AgentPort(_Fails(discount), lambda: None)
+  _join(port)
+  _step(port)
+  assert _step(port, tensor_utils.pack_tensor([0.0])).step.state == state
+
+
+def test_a_failure_says_nothing_and_another_episode_follows():
+  secret = RuntimeError('/home/me: the true reward is 173.25')
+  port = agent_port.AgentPort(_Fails(secret), lambda: None)
+  _join(port)
+  _step(port)
+  error = _step(port, tensor_utils.pack_tensor([0.0])).error
+  assert error.code == code_pb2.INTERNAL
+  assert error.message == (
+      'R15: the episode has failed; the next step begins another one'
+  )
+  assert not error.details
+  assert _step(port).step.state == pb.RUNNING
+
+
+def test_no_episode_begins_when_there_are_no_more(port):
+  _join(port)
+  port.finish()
+  assert _step(port).error.code == _TOO_EARLY
+
+
+def test_every_refusal_has_an_id_of_its_own():
+  ids = [reason.value[0] for reason in refusals.Reason]
+  assert len(set(ids)) == len(ids)
+
+
+@pytest.mark.parametrize('design', ['instantaneous_reward', 'value_advice'])
+def test_replies_to_steps_have_one_size(design):
+  env, port = _make(design, max_steps=15)
+  specs_ = _join(port).join_world.specs
+  uids = list(specs_.observations)
+  sizes = set()
+  for action in helpers.random_actions(env, 40):
+    step = pb.StepRequest(
+        actions={1: tensor_utils.pack_tensor(action)},
+        requested_observations=uids,
+    )
+    sizes.add(len(port.answer(served.request(step=step))))
+  env.close()
+  assert len(sizes) == 1
+
+
+def test_integers_whose_size_would_tell_their_value_are_refused():
+  spec = {'count': specs.BoundedArray((2,), np.int64, 0, 1000)}
+  with pytest.raises(errors.SpecError, match='observation count: int64'):
+    tensors.Observations(spec)
+  tensors.Observations({'x': specs.BoundedArray((2,), np.int64, 0, 127)})
+  tensors.Observations({'x': specs.Array((2,), np.uint8)})
+
+
+def test_specs_arrive_as_they_are(port, env):
+  found = _join(port).join_world.specs
+  names = {uid: spec.name for uid, spec in found.observations.items()}
+  assert names == dict(enumerate(env.observation_spec(), start=1))
+  assert found.actions[1].name == env.action_spec().name

@@ -1,0 +1,241 @@
+"""What tests and campaigns of served worlds share: servers, and clients."""
+
+from collections.abc import Callable, Iterator
+import contextlib
+import pathlib
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from typing import Any, NamedTuple
+
+from dm_env_rpc.v1 import connection as rpc_connection
+from dm_env_rpc.v1 import dm_env_adaptor
+from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
+from dm_env_rpc.v1 import tensor_utils
+import grpc
+import numpy as np
+
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.evaluation import evaluate
+from realab_suite.interop.rpc import served_world
+from realab_suite.interop.rpc import server as rpc_server
+from tests.engine import helpers
+
+ROOT = pathlib.Path(__file__).parents[2]
+_PATIENCE_SECONDS = 60
+
+STEP = '/dm_env_rpc.v1.Environment/Process'
+
+
+def load(
+    design: str = 'instantaneous_reward', max_steps: int = 20, seed: int = 0
+) -> environment.Environment:
+  """Returns the world that these tests serve."""
+  return suite.load(
+      'unlock_door',
+      'near',
+      {'random': seed},
+      {'max_steps': max_steps},
+      design=design,
+  )
+
+
+class Served(NamedTuple):
+  """A server in a thread of this process."""
+
+  address: str
+  server: rpc_server.Server
+  thread: threading.Thread
+  results: list[tuple[evaluate.EpisodeResult, str]]
+
+  def ends(self) -> list[str]:
+    return [result.end.value for result, _ in self.results]
+
+
+@contextlib.contextmanager
+def in_thread(
+    make_env: Callable[[], environment.Environment] = load,
+    *,
+    num_episodes: int = 1_000_000,
+    idle_seconds: float = 60.0,
+    alter: Callable[[Any], None] = lambda world: None,
+) -> Iterator[Served]:
+  """Serves a world from a thread, which makes it, too."""
+  results: list[Any] = []
+  ready = threading.Event()
+  made: list[Any] = []
+  with tempfile.TemporaryDirectory(prefix='realab-') as folder:
+    address = f'unix:{folder}/socket'
+
+    def serve() -> None:
+      try:
+        with contextlib.closing(make_env()) as env:
+          world = served_world.ServedWorld(
+              env,
+              address,
+              num_episodes,
+              lambda result, tier: results.append((result, tier)),
+          )
+          alter(world)
+          server = rpc_server.Server(world, address, idle_seconds)
+          server.start()
+          made.append(server)
+          ready.set()
+          server.run()
+      finally:
+        ready.set()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    ready.wait(_PATIENCE_SECONDS)
+    try:
+      yield Served(address, made[0], thread, results)
+    finally:
+      if made:
+        made[0].stop()
+      thread.join(_PATIENCE_SECONDS)
+
+
+class Program(NamedTuple):
+  """A server as a program of its own."""
+
+  address: str
+  process: subprocess.Popen[str]
+  output: pathlib.Path
+
+
+@contextlib.contextmanager
+def in_process(
+    output: pathlib.Path,
+    *flags: str,
+    module: str = 'realab_suite.experiments.serve',
+    stdin: str = '',
+) -> Iterator[Any]:
+  """Serves a world from a process, as people would."""
+  process = subprocess.Popen(
+      [
+          sys.executable, '-m', module,
+          '--task=unlock_door.near', f'--output={output}', *flags,
+      ],
+      cwd=ROOT,
+      stdin=subprocess.PIPE,
+      stdout=subprocess.PIPE,
+      stderr=subprocess.PIPE,
+      text=True,
+  )  # fmt: skip
+  try:
+    process.stdin.write(stdin)
+    process.stdin.flush()
+    line = process.stdout.readline()
+    if ' at ' not in line:
+      raise RuntimeError(line + process.stderr.read())
+    yield Program(line.split(' at ')[1].strip(), process, output)
+  finally:
+    process.terminate()
+    process.communicate(timeout=_PATIENCE_SECONDS)
+
+
+class Client:
+  """A client that says what it likes, and hears what there is to hear."""
+
+  def __init__(self, address: str) -> None:
+    self.channel = grpc.insecure_channel(
+        address,
+        options=[
+            ('grpc.max_send_message_length', -1),
+            # Otherwise a second channel shares the first one's connection.
+            ('grpc.use_local_subchannel_pool', 1),
+        ],
+    )
+    self.connection = rpc_connection.Connection(self.channel)
+
+  def send(self, request: Any) -> Any:
+    return self.connection.send(request)
+
+  def join(self) -> Any:
+    return self.send(pb.JoinWorldRequest(world_name='world')).specs
+
+  def step(self, action: Any = None, uids: Any = ()) -> Any:
+    actions = {} if action is None else {1: tensor_utils.pack_tensor(action)}
+    return self.send(
+        pb.StepRequest(actions=actions, requested_observations=uids)
+    )
+
+  def env(self) -> dm_env_adaptor.DmEnvAdaptor:
+    return dm_env_adaptor.join_world(self.connection, 'world', {})
+
+  def close(self) -> None:
+    self.connection.close()
+    self.channel.close()
+
+  def __enter__(self) -> 'Client':
+    return self
+
+  def __exit__(self, *unused: Any) -> None:
+    self.close()
+
+
+def join_eventually(address: str, seconds: float = 5.0) -> Client:
+  """Returns a client that has joined, once whoever came before has gone."""
+  deadline = time.monotonic() + seconds
+  while True:
+    client = Client(address)
+    try:
+      client.join()
+      return client
+    except grpc.RpcError:
+      client.close()
+      if time.monotonic() > deadline:
+        raise
+      time.sleep(0.01)
+
+
+class RawStream:
+  """A stream of bytes, for requests that no honest client would send."""
+
+  def __init__(self, address: str) -> None:
+    self.channel = grpc.insecure_channel(
+        address,
+        options=[
+            ('grpc.max_send_message_length', -1),
+            ('grpc.use_local_subchannel_pool', 1),
+        ],
+    )
+    call = self.channel.stream_stream(STEP)
+    self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+    self._answers = call(iter(self._requests.get, None))
+
+  def ask(self, request: bytes) -> bytes:
+    self._requests.put(request)
+    return next(self._answers)
+
+  def tell(self, request: bytes) -> None:
+    self._requests.put(request)
+
+  def cancel(self) -> None:
+    self._answers.cancel()
+
+  def close(self) -> None:
+    self._requests.put(None)
+    self.cancel()
+    self.channel.close()
+
+
+def to_bytes(time_step: Any) -> bytes:
+  """Returns a time step canonically; a map on the wire has no order."""
+  ordered = dict(sorted(time_step.observation.items()))
+  return helpers.to_bytes(time_step._replace(observation=ordered))
+
+
+def request(**payload: Any) -> bytes:
+  """Returns a request as bytes."""
+  return pb.EnvironmentRequest(**payload).SerializeToString()
+
+
+def still(env: Any) -> np.ndarray:
+  """Returns an action that does nothing."""
+  return np.zeros(env.action_spec().shape, env.action_spec().dtype)
