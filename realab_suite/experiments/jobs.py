@@ -5,7 +5,7 @@ scripted policy that is judged alike. Its configuration says everything that its
 results depend on, and its folder is named after a hash of it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import dataclasses
 from importlib import metadata
 from typing import Any, final
@@ -100,7 +100,7 @@ class Job:
 
   def digest(self) -> str:
     """Returns a hash of the configuration."""
-    return validation.digest_of(self.config())[:_NUM_DIGITS]
+    return digest_of(self.config())
 
   def folder(self) -> str:
     """Returns the name of the folder of the results."""
@@ -124,6 +124,11 @@ class Job:
         control_timestep=control_timestep,
         max_steps=self.experiment.max_steps,
     )
+
+
+def digest_of(config: Mapping[str, Any]) -> str:
+  """Returns the hash of a configuration that ends the name of a folder."""
+  return validation.digest_of(config)[:_NUM_DIGITS]
 
 
 def plan(

@@ -41,16 +41,20 @@ class RunSpec(validation.Spec):
   twin: bool = False
   steps: _Count | None = None
 
-  def load(self, channel: str | None = None) -> specs.DesignSpec:
+  def load(
+      self, channel: str | None = None, *, is_confined: bool = False
+  ) -> specs.DesignSpec:
     """Returns the design, with what the run changes.
 
     Args:
       channel: The channel of the design, or `None` for its own.
+      is_confined: Whether the design, and files that it names, have to be
+        within the working directory.
 
     Raises:
       SpecError: If that is no design.
     """
-    design = specs.load(self.design, self.overrides)
+    design = specs.load(self.design, self.overrides, is_confined=is_confined)
     changes: dict[str, Any] = {}
     if self.learner:
       own = {} if design.learner is None else design.learner.model_dump()
@@ -179,6 +183,8 @@ Experiment = str | os.PathLike[str] | Mapping[str, Any] | ExperimentSpec
 def load(experiment: Experiment) -> ExperimentSpec:
   """Loads and validates an experiment, and the designs that it names.
 
+  Designs that a file names have to be within the working directory.
+
   Args:
     experiment: The name of an experiment that ships with the package, a path to
       a YAML file, a mapping, or a spec.
@@ -208,14 +214,15 @@ def load(experiment: Experiment) -> ExperimentSpec:
         else os.fspath(experiment)
     )
     data = loading.read_mapping(experiment)
+  is_file = not isinstance(experiment, Mapping)
   spec = validation.validate(ExperimentSpec, data, where)
-  for place, problem in _problems(spec):
+  for place, problem in _problems(spec, is_confined=is_file):
     raise messages.Place(where, place).error(problem)
   return spec
 
 
 def _problems(
-    spec: ExperimentSpec,
+    spec: ExperimentSpec, is_confined: bool
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
   """Yields where an experiment names what there is not, and what is wrong."""
   try:
@@ -224,7 +231,7 @@ def _problems(
     yield ('task',), str(error)
   for name, run in spec.runs.items():
     try:
-      design = run.load()
+      design = run.load(is_confined=is_confined)
     except errors.SpecError as error:
       yield ('runs', name), str(error)
       continue

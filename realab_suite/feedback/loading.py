@@ -18,6 +18,7 @@ import dataclasses
 import math
 import os
 import re
+import sys
 import typing
 from typing import Any
 import unicodedata
@@ -104,6 +105,19 @@ def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
         f'expected a mapping at top level, got {messages.quote(documents[0])}'
     )
   return documents[0]
+
+
+def is_inside(path: str) -> bool:
+  """Whether a path is within the working directory, links followed.
+
+  What a file names is looked for there alone: whoever wrote the file is not
+  whoever reads it.
+  """
+  root = os.path.realpath(os.curdir)
+  try:
+    return os.path.commonpath([root, os.path.realpath(path)]) == root
+  except ValueError:  # Not a path at all.
+    return False
 
 
 def apply_overrides(
@@ -387,6 +401,9 @@ def _checked_scalar(
   if isinstance(value, float):
     if not math.isfinite(value):
       raise place.error(f'must be finite, got {value}')
+    # MuJoCo's reader of numbers takes one that has lost digits for too large.
+    if 0 < abs(value) < sys.float_info.min:
+      raise place.error(f'number {value} is out of range')
     # Equal descriptions must print alike, and -0.0 equals 0.0.
     return float(value) + 0.0
   if isinstance(value, str):

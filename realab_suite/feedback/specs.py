@@ -13,6 +13,7 @@ import pydantic
 from realab_suite import errors
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import loading
+from realab_suite.feedback import messages
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import validation
@@ -20,6 +21,9 @@ from realab_suite.feedback import validation
 _NAME = r'^[a-z][a-z0-9_]{0,63}$'
 Name = Annotated[str, pydantic.StringConstraints(pattern=_NAME)]
 Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
+# Larger ones make the arithmetic of a step overflow.
+Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
+Value = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
 Size = Annotated[float, pydantic.Field(ge=0.02, le=1.0)]
 Channel = Literal['embedded', 'welded', 'secure']
 Dof = Literal['free', 'planar']
@@ -40,7 +44,9 @@ class PlaceSpec(validation.Spec):
       random in each episode.
   """
 
-  position: Annotated[tuple[Finite, Finite], pydantic.Field(strict=False)]
+  position: Annotated[
+      tuple[Coordinate, Coordinate], pydantic.Field(strict=False)
+  ]
   yaw: Finite = 0.0
   spread: Annotated[
       tuple[
@@ -75,9 +81,10 @@ class RegisterSpec(validation.Spec):
   kind: str
   role: Role
   place: Name | PlaceSpec
-  range: Annotated[tuple[Finite, Finite], pydantic.Field(strict=False)]
-  scale: Annotated[float, pydantic.Field(gt=0, le=10)] = 0.1
-  initial: Finite = 0.0
+  range: Annotated[tuple[Value, Value], pydantic.Field(strict=False)]
+  # Below it, what is left of a reading is the noise of positions.
+  scale: Annotated[float, pydantic.Field(ge=1e-6, le=10)] = 0.1
+  initial: Value = 0.0
   on_overflow: Literal['saturate', 'error'] = 'saturate'
   channel: Channel | None = None
   dof: Dof | None = None
@@ -381,14 +388,23 @@ Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec
 _validated_kinds: list[str] = []
 
 
-def load(design: Design, overrides: tuple[str, ...] = ()) -> DesignSpec:
+def load(
+    design: Design,
+    overrides: tuple[str, ...] = (),
+    *,
+    is_confined: bool = False,
+) -> DesignSpec:
   """Loads and validates a design.
+
+  Files that the file of a design names have to be within the working directory.
 
   Args:
     design: The name of a design that ships with the package, a path to a YAML
       file, a mapping, or a spec.
     overrides: Dotted overrides, as in `registers.reward.scale=0.2`; the secure
       twin of a design is `channel=secure`.
+    is_confined: Whether that goes for files that `overrides` name, too, and for
+      the design itself.
 
   Raises:
     SpecError: Where the file, key path or override is wrong, in one line.
@@ -407,13 +423,37 @@ def load(design: Design, overrides: tuple[str, ...] = ()) -> DesignSpec:
     raise errors.UnknownNameError(
         f'design {design!r} is neither a file nor one of {list(DESIGNS)}'
     )
+  elif isinstance(design, Mapping):
+    where, data = 'design', loading.read_mapping(design)
   else:
-    where = 'design' if isinstance(design, Mapping) else os.fspath(design)
+    where = os.fspath(design)
+    if is_confined and not loading.is_inside(where):
+      raise errors.SpecError(
+          f'design {messages.quote(where)} is outside the working directory;'
+          f' allowed in a file are paths within it and {list(DESIGNS)}'
+      )
     data = loading.read_mapping(design)
+    _refuse_files_elsewhere(data, where)
   if overrides:
     data = loading.apply_overrides(data, overrides)
+    if is_confined:
+      _refuse_files_elsewhere(data, where)
   _learn_new_kinds()
   return validation.validate(DesignSpec, data, where)
+
+
+def _refuse_files_elsewhere(data: Mapping[str, Any], where: str) -> None:
+  """Refuses weights that a file names and that are somewhere else."""
+  given = data.get('providers')
+  for i, provider in enumerate(given if isinstance(given, list) else []):
+    options = provider.get('options') if isinstance(provider, dict) else None
+    weights = options.get('weights') if isinstance(options, dict) else None
+    if isinstance(weights, str) and not loading.is_inside(weights):
+      place = messages.Place(where, ('providers', i, 'options', 'weights'))
+      raise place.error(
+          f'{messages.quote(weights)} is outside the working directory; allowed'
+          ' in a file are names, and paths within it'
+      )
 
 
 def json_schema() -> dict[str, Any]:

@@ -16,6 +16,9 @@ from pydantic import fields
 
 from realab_suite.feedback import messages
 
+# A line that goes on for ever tells less, not more.
+_MAX_TOLD = 10
+
 _Model = TypeVar('_Model', bound=pydantic.BaseModel)
 
 
@@ -53,15 +56,18 @@ def validate(
     where: What error messages call the data.
 
   Raises:
-    SpecError: If the data does not fit. The message lists every problem.
+    SpecError: If the data does not fit. The message lists the problems.
   """
   try:
     return model_class.model_validate(data)
   except pydantic.ValidationError as error:
     problems = error.errors(include_url=False)
   # A union can report the same problem once for each of its members.
-  unique = dict.fromkeys(_problem(p, model_class, data) for p in problems)
-  raise messages.Place(where).error('; '.join(unique))
+  unique = list(dict.fromkeys(_problem(p, model_class, data) for p in problems))
+  told = unique[:_MAX_TOLD]
+  if len(unique) > len(told):
+    told.append(f'and {len(unique) - len(told)} more')
+  raise messages.Place(where).error('; '.join(told))
 
 
 def _problem(

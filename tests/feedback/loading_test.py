@@ -85,6 +85,7 @@ _HAZARDS = {
     'infinity': ('a: -.inf', 'a: must be finite, got -.inf'),
     'float that overflows': ('a: 1e999', "'1e999' is out of range"),
     'float that vanishes': ('a: -0.1e-999', "'-0.1e-999' is out of range"),
+    'float without digits': ('a: 5e-324', 'a: number 5e-324 is out of range'),
     '400 digits': ('a: ' + '1' * 400, 'is out of range'),
     '5000 digits': ('a: -' + '1' * 5000, 'is out of range'),
     'just inexact': ('a: 9007199254740993', 'is out of range'),
@@ -843,7 +844,7 @@ _SCALARS = (
     st.none()
     | st.booleans()
     | st.integers(-(2**53), 2**53)
-    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)
     | st.text(st.characters(exclude_categories=['C', 'Z']))
 )
 _KEYS = st.text(st.characters(exclude_categories=['C', 'Z']), max_size=5)

@@ -148,6 +148,15 @@ _WRONG = {
     'block without size': (_reward(block_size=0), 'block_size: must be gre'),
     'huge block': (_reward(block_size=5), 'block_size: must be less than'),
     'scale of zero': (_reward(scale=0), 'registers.reward.scale: must be gre'),
+    'scale that leaves noise': (_reward(scale=1e-7), 'scale: must be gre'),
+    'range beyond arithmetic': (
+        _reward(range=[-1e308, 1e308]),
+        'registers.reward.range[0]: must be greater than or equal to -100000',
+    ),
+    'place beyond arithmetic': (
+        _reward(place=[1e300, 0]),
+        'registers.reward.place.position[0]: must be less than or equal to 100',
+    ),
     'unknown register kind': (
         _reward(kind='tow_block'),
         "register kind 'tow_block' is unknown; did you mean 'two_block'?",
@@ -860,7 +869,7 @@ def test_no_name_of_a_register_is_mixed_up_with_a_part_of_the_world():
   design = _design(
       channel='welded',
       registers={
-          name: {**_REWARD, 'place': [0.0, i * 0.9 - 2], 'range': [0, 1]}
+          name: {**_REWARD, 'place': [1.5, i * 0.9 - 2], 'range': [0, 1]}
           for i, name in enumerate(('reward', *taken))
       },
       meters=[],

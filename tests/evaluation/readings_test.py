@@ -1,0 +1,45 @@
+"""Campaign C40, and that it can fail."""
+
+from typing import Any
+
+import pytest
+
+from realab_suite.entities.registers import two_block
+from realab_suite.feedback import mechanism
+from tests.campaigns import readings_campaign as campaign
+
+
+def test_every_reading_is_what_was_asked_for_plus_what_became_of_it():
+  found = campaign.play(campaign.NUM_READS, seed=1)
+  assert found.num_reads >= campaign.NUM_READS
+  assert found.excess <= campaign.TOLERANCE
+  # What registers say of themselves is what the blocks in the world say.
+  assert found.permanent <= campaign.TOLERANCE
+  assert found.temporary <= campaign.TOLERANCE
+  assert min(found.sizes) > 0.5
+
+
+def test_corruption_of_the_wrong_part_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+):
+  monkeypatch.setattr(
+      two_block.TwoBlockRegister,
+      '_permanent',
+      lambda self, physics: 0.0 * self._base.along(physics),
+  )
+  found = campaign.play(2_000, seed=1)
+  assert found.excess <= campaign.TOLERANCE
+  assert min(found.permanent, found.temporary) > 0.5
+
+
+def test_a_write_that_is_logged_as_something_else_is_found(
+    monkeypatch: pytest.MonkeyPatch,
+):
+  read = mechanism.FeedbackMechanism._read
+
+  def planted(self: Any, physics: Any, name: str, reader: str) -> Any:
+    found = read(self, physics, name, reader)
+    return found._replace(temporary=found.temporary * (1.0 + 1e-6))
+
+  monkeypatch.setattr(mechanism.FeedbackMechanism, '_read', planted)
+  assert campaign.play(2_000, seed=1).excess > campaign.TOLERANCE

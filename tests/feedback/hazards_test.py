@@ -1,0 +1,69 @@
+"""Campaign C21: crafted files are refused soon, clearly and without memory."""
+
+import pathlib
+import resource
+import time
+from typing import Any
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.experiments import spec as experiments
+from realab_suite.feedback import specs
+from tests.feedback import loading_test
+
+_MAX_SECONDS = 1.0
+_MAX_GROWTH = 100 * 2**20
+# Files whose parts are all allowed, but not as a design.
+_LARGE: dict[str, Any] = {
+    'wide': 'a: [' + ','.join(['x' * 900] * 999) + ']',
+    'many registers': 'schema: 1\nname: a\nregisters:\n'
+    + '\n'.join(f'  r{i}: {{}}' for i in range(1000)),
+    'many problems': 'schema: 1\nname: a\nproviders: ['
+    + ','.join(['{kind: x}'] * 1000)
+    + ']',
+    'long text': 'schema: 1\nname: ' + 'a' * 10**6,
+    'long key': 'a' * 10**6 + ': 1',
+    'deep and wide': 'a: ' + '[' * 31 + '1' + ']' * 31,
+    'quotes': 'a: "' + '\\"' * 400_000 + '"',
+    'escapes': 'a: "' + '\\u0041' * 150_000 + '"',
+    'comments': 'a: 1\n' + '#\n' * 400_000,
+    'blank lines': '\n' * 1_000_000,
+    'folded': 'a: >\n' + ' x\n' * 300_000,
+}
+_HAZARDS = {
+    **{name: text for name, (text, _) in loading_test._HAZARDS.items()},
+    **_LARGE,
+}
+
+
+def _bytes(text: Any) -> bytes:
+  if isinstance(text, bytes):
+    return text
+  return bytes(text.encode('utf-8', 'surrogatepass'))
+
+
+def _peak() -> int:
+  return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def test_there_are_at_least_thirty_crafted_files():
+  assert len(_HAZARDS) >= 30
+
+
+@pytest.mark.parametrize('load', [specs.load, experiments.load])
+def test_crafted_files_are_refused_soon_and_in_little_memory(
+    tmp_path: pathlib.Path, load: Any
+):
+  path = tmp_path / 'crafted.yaml'
+  for name, text in _HAZARDS.items():
+    path.write_bytes(_bytes(text))
+    begin, before = time.process_time(), _peak()
+    with pytest.raises(errors.SpecError) as caught:
+      load(path)
+    assert time.process_time() - begin <= _MAX_SECONDS, name
+    assert _peak() - before <= _MAX_GROWTH, name
+    message = str(caught.value)
+    assert str(path) in message, name
+    assert message.isprintable(), name
+    assert len(message) <= 4_000, name

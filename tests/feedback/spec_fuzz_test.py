@@ -1,0 +1,79 @@
+"""Campaign C20 in small, and that it can fail."""
+
+import contextlib
+import os
+import pathlib
+import time
+from typing import Any
+
+from realab_suite import errors
+from realab_suite.feedback import specs
+from tests.campaigns import spec_fuzz_campaign as campaign
+
+
+def test_whatever_a_design_or_an_experiment_says_it_runs_or_is_refused():
+  judged = list(campaign.campaign(500, 50, 10, seed=1, num_workers=1))
+  assert not [(o.problem, case) for case, o in judged if o.problem]
+  outcomes = [outcome for _, outcome in judged]
+  assert max(outcome.seconds for outcome in outcomes) <= campaign.MAX_SECONDS
+  assert max(outcome.grown for outcome in outcomes) <= campaign.MAX_BYTES
+  for stage, number in (('validate', 500), ('compile', 50), ('step', 10)):
+    of_stage = [o for o in outcomes if o.stage == stage]
+    assert len(of_stage) == number
+    assert any(not o.refusal for o in of_stage)
+    assert stage == 'step' or any(o.refusal for o in of_stage)
+  kinds = {(case.kind, isinstance(case.source, bytes)) for case, _ in judged}
+  assert len(kinds) == 4
+
+
+def _answer(connection: Any) -> None:
+  """Does to a child what the seed of its case says."""
+  while (job := connection.recv()) is not None:
+    case, stage = job
+    if case.seed == 1:
+      os._exit(11)
+    if case.seed == 2:
+      time.sleep(60)
+    connection.send(campaign.Outcome(stage, '', ''))
+
+
+def test_a_child_that_dies_or_hangs_is_a_bad_outcome_and_is_replaced():
+  case = campaign.Case('design', {}, ('unlock_door', 'near'), 0)
+  with contextlib.closing(campaign.Child(_answer, patience=20.0)) as child:
+    assert not child.judge(case, 'compile').problem
+    found = child.judge(case._replace(seed=1), 'compile')
+    assert found.problem == 'the process died'
+    assert not child.judge(case, 'compile').problem
+    child._patience = 0.5
+    assert 'no answer' in child.judge(case._replace(seed=2), 'compile').problem
+
+
+def _judged(error: Exception, monkeypatch: Any, folder: pathlib.Path) -> str:
+  def load(*unused: Any) -> Any:
+    raise error
+
+  monkeypatch.setattr(specs, 'load', load)
+  case = campaign.Case('design', b'a: 1', ('unlock_door', 'near'), 0)
+  return campaign.judge(case, 'validate', folder).problem
+
+
+def test_other_errors_and_unclear_ones_are_bad_outcomes(tmp_path, monkeypatch):
+  for error, problem in (
+      (OverflowError('x'), 'OverflowError: x'),
+      (MemoryError(), 'MemoryError: '),
+      (errors.SpecError('two\nlines'), 'not one line'),
+      (errors.SpecError('bad'), 'names no file'),
+      (errors.SpecError('given.yaml: it is bad'), 'names no place'),
+      (errors.SpecError('given.yaml: range: must be finite'), ''),
+  ):
+    found = _judged(error, monkeypatch, tmp_path)
+    assert found.startswith(problem) if problem else not found
+
+
+def test_memory_that_a_case_takes_is_measured(tmp_path, monkeypatch):
+  def load(*unused: Any) -> Any:
+    return bytearray(700 * 2**20)
+
+  monkeypatch.setattr(specs, 'load', load)
+  case = campaign.Case('design', {}, ('unlock_door', 'near'), 0)
+  assert campaign.judge(case, 'validate', tmp_path).grown > 0
