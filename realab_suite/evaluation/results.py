@@ -1,7 +1,12 @@
-"""Result rows: a line of JSON per episode, enough to publish and to repeat."""
+"""Result rows: a line of JSON per episode, enough to publish and to repeat.
+
+Each line ends with a checksum of itself, so that a row which has been damaged
+is never taken for one that has not.
+"""
 
 from collections.abc import Iterator
 import dataclasses
+import hashlib
 from importlib import metadata
 import json
 import math
@@ -9,6 +14,7 @@ import os
 import pathlib
 import platform
 from typing import Any, Literal, final
+import warnings
 
 import pydantic
 
@@ -19,6 +25,9 @@ from realab_suite.evaluation import metrics
 
 # Everything in one process: honest agents only (docs/architecture.md).
 IN_PROCESS = 'T0 in-process'
+# Over a socket (docs/served.md): what the agent's code may be, see there.
+SERVED = 'T1 served to another process of the same user'
+SERVED_TO_ANOTHER_USER = 'T2 served to another user'
 
 UNITS = {
     'true_return': 'true reward',
@@ -141,6 +150,20 @@ def row(info: RunInfo, result: evaluate.EpisodeResult) -> EpisodeRow:
   return EpisodeRow(info=info, **{**fields, 'end': result.end.value})
 
 
+_CHECKSUM = b',"checksum":"'
+_NUM_DIGITS = 16
+
+
+def line(one: EpisodeRow) -> bytes:
+  """Returns a row as the line of a file, newline included."""
+  return sealed(one.model_dump_json(by_alias=True).encode())
+
+
+def sealed(text: bytes) -> bytes:
+  """Returns a JSON object as a line whose last member is its checksum."""
+  return text[:-1] + _CHECKSUM + _checksum(text) + b'"}\n'
+
+
 @final
 class RowWriter:
   """Appends rows to a new file; each is on disk before the next is written."""
@@ -152,7 +175,7 @@ class RowWriter:
       ResultsError: If there is one already, or it cannot be made.
     """
     try:
-      self._file = open(path, 'x', encoding='utf-8')
+      self._file = open(path, 'xb')
     except OSError as error:
       raise errors.ResultsError(
           f'cannot make {os.fspath(path)}: {error.strerror}'
@@ -160,10 +183,10 @@ class RowWriter:
 
   def write(self, one: EpisodeRow) -> None:
     """Appends a row."""
-    line = one.model_dump_json(by_alias=True)
     try:
-      self._file.write(line + '\n')
+      self._file.write(line(one))
       self._file.flush()
+      os.fsync(self._file.fileno())
     except OSError as error:
       raise errors.ResultsError(
           f'cannot write {self._file.name}: {error.strerror}'
@@ -183,23 +206,53 @@ class RowWriter:
 def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
   """Yields the rows of a file.
 
+  A process that was killed, or a disk that was full, may leave a part of a row
+  behind the last newline. It is left out, with one warning that says so.
+
   Raises:
-    ResultsError: If the file cannot be read, or a line is no row; it names the
-      line.
+    ResultsError: If the file cannot be read, or any other line is no row, or
+      not the row that was written; it names the line.
   """
+  where = os.fspath(path)
   try:
-    text = pathlib.Path(path).read_text(encoding='utf-8')
-  except (OSError, UnicodeDecodeError) as error:
-    raise errors.ResultsError(
-        f'cannot read {os.fspath(path)}: {error}'
-    ) from error
-  # JSON leaves characters in names alone that `splitlines` splits at.
-  lines = text.removesuffix('\n').split('\n') if text else []
-  for number, line in enumerate(lines, start=1):
+    data = pathlib.Path(path).read_bytes()
+  except OSError as error:
+    raise errors.ResultsError(f'cannot read {where}: {error}') from error
+  *whole, tail = data.split(b'\n')
+  for number, text in enumerate(whole, start=1):
     try:
-      yield EpisodeRow.model_validate(json.loads(line))
+      yield _parse(text)
     except ValueError as error:
       problem = ': '.join(str(error).splitlines()[:2])
       raise errors.ResultsError(
-          f'{os.fspath(path)}:{number}: not a row of schema 1: {problem}'
+          f'{where}:{number}: not a row of schema 1: {problem}'
       ) from error
+  if not tail:
+    return
+  try:
+    last = _parse(tail)
+  except ValueError:
+    warnings.warn(
+        f'{where}:{len(whole) + 1}: the last {len(tail)} bytes are a part of a'
+        f' row and are left out; {len(whole)} rows before them are whole',
+        stacklevel=2,
+    )
+  else:
+    yield last  # All of it but the newline.
+
+
+def _parse(text: bytes) -> EpisodeRow:
+  """Returns the row of a line without its newline.
+
+  Raises:
+    ValueError: If it is none.
+  """
+  content, found, rest = text.rpartition(_CHECKSUM)
+  content += b'}'
+  if not found or rest != _checksum(content) + b'"}':
+    raise ValueError('its checksum does not agree: it is not what was written')
+  return EpisodeRow.model_validate(json.loads(content))
+
+
+def _checksum(text: bytes) -> bytes:
+  return hashlib.sha256(text).hexdigest()[:_NUM_DIGITS].encode()

@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import pathlib
+import re
 from typing import Any, final
 
 from realab_suite import errors
@@ -19,6 +20,7 @@ _LOCK = 'lock'
 _CHECKPOINTS = 'checkpoints'
 _SUFFIX = '.ckpt'
 _KEPT = 2  # Checkpoints: the last one, and the one before.
+_CHUNK = 1 << 20
 
 
 @contextlib.contextmanager
@@ -116,13 +118,66 @@ def is_done(path: pathlib.Path) -> bool:
   """
   if not (path / DONE).exists():
     return False
-  for name, digest in read_json(path / DONE)['files'].items():
+  for name, digest in _read_done(path / DONE).items():
     if _digest(path / name) != digest:
       raise errors.ResultsError(
           f'{path / name}: not what it was when the run ended; remove {path} to'
           ' run it again'
       )
   return True
+
+
+def write_done(path: pathlib.Path, content: Mapping[str, Any]) -> None:
+  """Says that the run of a folder is over.
+
+  Args:
+    path: The folder.
+    content: What to say; `files` are the results, with their SHA-256.
+  """
+  write_sealed(path / DONE, content)
+
+
+def write_sealed(path: pathlib.Path, content: Mapping[str, Any]) -> None:
+  """Writes JSON with a checksum, as `write_whole` does."""
+  write_json(path, {**content, 'checksum': _checksum(content)})
+
+
+def read_sealed(path: pathlib.Path, advice: str) -> dict[str, Any]:
+  """Returns what `write_sealed` wrote.
+
+  Args:
+    path: The file.
+    advice: What to do if it is damaged.
+
+  Raises:
+    ResultsError: If it cannot be read, or is not what was written.
+  """
+  content = read_json(path)
+  checksum = content.pop('checksum', '') if isinstance(content, dict) else ''
+  if checksum != _checksum(content):
+    raise errors.ResultsError(
+        f'{path}: damaged: its checksum does not agree; {advice}'
+    )
+  sealed: dict[str, Any] = content
+  return sealed
+
+
+def _read_done(path: pathlib.Path) -> dict[str, str]:
+  """Returns the SHA-256 of each result, by the name of its file."""
+  advice = f'remove {path.parent} to run it again'
+  files: dict[str, str] = read_sealed(path, advice).get('files', {})
+  for name in files:
+    # A checksum is no signature: whoever made the folder has made it, too.
+    if not re.fullmatch(r'\w[\w.-]*', name):
+      raise errors.ResultsError(
+          f'{path}: {name!r:.80} is no file of a run; {advice}'
+      )
+  return files
+
+
+def _checksum(content: Any) -> str:
+  text = json.dumps(content, sort_keys=True)
+  return hashlib.sha256(text.encode()).hexdigest()
 
 
 @final
@@ -172,7 +227,7 @@ class RunFolder:
       facts: What else to say.
     """
     files = {name: _digest(self.path / name) for name in names}
-    write_json(self.path / DONE, {**facts, 'files': files})
+    write_done(self.path, {**facts, 'files': files})
     for checkpoint in self._checkpoints():
       with explained(checkpoint):
         checkpoint.unlink()
@@ -225,35 +280,51 @@ class RunFolder:
     return sorted((self.path / _CHECKPOINTS).glob(f'*{_SUFFIX}'))
 
 
+# How many bytes of a file of lines count, and their SHA-256.
+Mark = Mapping[str, Any]
+NOTHING: Mark = {'size': 0, 'sha256': hashlib.sha256().hexdigest()}
+
+
 @final
 class JsonLines:
   """A file that grows by lines of JSON, and can be cut back to a checkpoint."""
 
-  def __init__(self, path: pathlib.Path, size: int | None = None) -> None:
+  def __init__(self, path: pathlib.Path, mark: Mark | None = None) -> None:
     """Opens the file, or makes it.
 
     Args:
       path: The file.
-      size: How many of its bytes count: what is behind them was written after
-        the checkpoint, and goes. `None` for all of them.
+      mark: How far it counts: what is behind that was written after the
+        checkpoint, and goes. `None` for all of it, whatever it is.
 
     Raises:
-      ResultsError: If it cannot be opened, or is shorter.
+      ResultsError: If it cannot be opened, is shorter, or is not what it was.
     """
     self._path = path
+    self._hash = hashlib.sha256()
     with explained(path):
-      self._file = open(path, 'ab', buffering=0)
-      if size is None:
+      self._file = open(path, 'a+b', buffering=0)
+      if mark is None:
         return
-      if self._file.tell() < size:
-        here = self._file.tell()
+      size = mark['size']
+      self._file.seek(0)
+      while rest := size - self._file.tell():
+        data = self._file.read(min(rest, _CHUNK))
+        if not data:
+          break
+        self._hash.update(data)
+      here = self._file.tell()
+      problem = ''
+      if here < size:
+        problem = f'has {here} bytes, and the checkpoint knows of {size}'
+      elif self._hash.hexdigest() != mark['sha256']:
+        problem = 'not what it was when the checkpoint was written'
+      if problem:
         self._file.close()
         raise errors.ResultsError(
-            f'{path}: has {here} bytes, and the checkpoint knows of {size};'
-            f' remove {path.parent} to run it again'
+            f'{path}: {problem}; remove {path.parent} to run it again'
         )
       self._file.truncate(size)
-      self._file.seek(size)
 
   def append(self, records: Sequence[Mapping[str, Any]]) -> None:
     """Adds a line for each record.
@@ -264,15 +335,20 @@ class JsonLines:
     """
     lines = (json.dumps(record, allow_nan=False) + '\n' for record in records)
     rest = ''.join(lines).encode()
+    self._hash.update(rest)
     with explained(self._path):
       while rest:
         rest = rest[self._file.write(rest) :]
 
-  def sync(self) -> int:
-    """Sees to it that all lines are on the disk; returns how many bytes."""
+  def sync(self) -> dict[str, Any]:
+    """Sees to it that all lines are on the disk; returns the mark of the end.
+
+    It counts for a file that was opened with a mark.
+    """
     with explained(self._path):
       os.fsync(self._file.fileno())
-      return self._file.tell()
+      size = self._file.tell()
+    return {'size': size, 'sha256': self._hash.hexdigest()}
 
   def close(self) -> None:
     """Closes the file."""

@@ -1,6 +1,7 @@
 """Sweeps: all jobs of an experiment, as many at a time as an engine takes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+import hashlib
 import json
 import os
 import pathlib
@@ -81,7 +82,7 @@ def _describe(
   if (output / EXPERIMENT).exists():
     there = {
         **loading.read_mapping(output / EXPERIMENT),
-        'calibration': storage.read_json(output / SWEEP)['calibration'],
+        'calibration': read_description(output)['calibration'],
     }
     fixed = [
         {key: value for key, value in one.items() if key not in _FREE}
@@ -93,8 +94,10 @@ def _describe(
           f'folder {output} belongs to another experiment: {differing}; name'
           ' another folder'
       )
+  text = yaml.safe_dump(experiment.to_mapping(), sort_keys=False)
   description = {
       'schema': 1,
+      'sha256': _sha256(text.encode()),
       'experiment': experiment.name,
       'calibration': calibration,
       'jobs': [
@@ -112,9 +115,43 @@ def _describe(
           for job in planned
       ],
   }
-  storage.write_json(output / SWEEP, description)
-  text = yaml.safe_dump(experiment.to_mapping(), sort_keys=False)
+  storage.write_sealed(output / SWEEP, description)
   storage.write_whole(output / EXPERIMENT, text.encode())
+
+
+def read_description(folder: pathlib.Path) -> dict[str, Any]:
+  """Returns what a sweep has written of itself.
+
+  Raises:
+    ResultsError: If it is damaged.
+  """
+  return storage.read_sealed(folder / SWEEP, _advice(folder))
+
+
+def read_experiment(
+    folder: pathlib.Path, description: Mapping[str, Any]
+) -> dict[str, Any]:
+  """Returns the experiment of a sweep, as its file has it.
+
+  Raises:
+    ResultsError: If it is not what the description is of.
+  """
+  path = folder / EXPERIMENT
+  with storage.explained(path):
+    text = path.read_bytes()
+  if _sha256(text) != description.get('sha256'):
+    raise errors.ResultsError(
+        f'{path}: not what it was when the sweep began; {_advice(folder)}'
+    )
+  return loading.parse_yaml(text, os.fspath(path))
+
+
+def _advice(folder: pathlib.Path) -> str:
+  return f'remove {folder / EXPERIMENT}, then run the same sweep again'
+
+
+def _sha256(text: bytes) -> str:
+  return hashlib.sha256(text).hexdigest()
 
 
 @final

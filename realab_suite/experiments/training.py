@@ -41,6 +41,7 @@ TRAINING_EPISODES = 'training_episodes.jsonl'
 LEARNER = 'learner.bin'
 TRACE = 'trace.bin'
 TENSORBOARD = 'tensorboard'
+_CHECKPOINT = 'checkpoint'
 
 # What a job has to be told besides its configuration does not change results.
 Say = Callable[[str], None]
@@ -157,7 +158,9 @@ def load_learner(
   with storage.explained(file):
     data = file.read_bytes()
   try:
-    state = snapshots.Snapshot.from_bytes(data).contents_for(_header(job))
+    state = snapshots.Snapshot.from_bytes(data).contents_for(
+        _header(job, LEARNER)
+    )
   except errors.StateLayoutError as error:
     raise errors.ResultsError(f'{file}: {error}') from error
   learner = make_learner(job, batch)
@@ -206,9 +209,9 @@ class LearnerActor:
     )
 
 
-def _header(job: jobs.Job) -> dict[str, Any]:
+def _header(job: jobs.Job, what: str) -> dict[str, Any]:
   """Returns what files of a job's own format have to agree in."""
-  return {'configuration': job.digest()}
+  return {'configuration': job.digest(), 'what': what}
 
 
 def _judge_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
@@ -233,13 +236,12 @@ def _judge(
   tracer = traces.Tracer(batch, actor)
   batch.add_sink(tracer)
   lines = [
-      results.row(info, result).model_dump_json(by_alias=True)
+      results.line(results.row(info, result))
       for result in evaluate.evaluate_batch(batch, tracer)
   ]
-  trace = snapshots.Snapshot(_header(job), tracer.trace())
+  trace = snapshots.Snapshot(_header(job, TRACE), tracer.trace())
   storage.write_whole(folder.path / TRACE, trace.to_bytes())
-  data = ''.join(f'{line}\n' for line in lines).encode()
-  storage.write_whole(folder.path / EPISODES, data)
+  storage.write_whole(folder.path / EPISODES, b''.join(lines))
 
 
 @final
@@ -270,8 +272,8 @@ class _Training:
   def run(self) -> None:
     """Trains, or goes on with it, and judges what has been learned."""
     job, path = self._job, self._folder.path
-    saved = self._folder.load(_header(job))
-    sizes = (saved or {}).get('sizes', {})
+    saved = self._folder.load(_header(job, _CHECKPOINT))
+    marks = (saved or {}).get('marks', {})
     if saved is not None:
       self._done, self._segment = saved['done'], saved['segment']
       self._pending = saved['pending']
@@ -291,7 +293,9 @@ class _Training:
       self._files = {
           name: stack.enter_context(
               contextlib.closing(
-                  storage.JsonLines(path / name, sizes.get(name, 0))
+                  storage.JsonLines(
+                      path / name, marks.get(name, storage.NOTHING)
+                  )
               )
           )
           for name in (CURVE, TRAINING_EPISODES)
@@ -389,12 +393,12 @@ class _Training:
       world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
     self._folder.save(
         self._done * self._num_envs,
-        _header(self._job),
+        _header(self._job, _CHECKPOINT),
         {
             'done': self._done,
             'segment': self._segment,
             'pending': self._pending,
-            'sizes': {name: f.sync() for name, f in self._files.items()},
+            'marks': {name: f.sync() for name, f in self._files.items()},
             'learner': learner.state(),
             'time_step': time_step._asdict(),
             'batch': world,
@@ -406,7 +410,7 @@ class _Training:
 
   def _judge_learner(self, learner: Learner) -> None:
     job, evaluation = self._job, self._job.experiment.evaluation
-    snapshot = snapshots.Snapshot(_header(job), learner.state())
+    snapshot = snapshots.Snapshot(_header(job, LEARNER), learner.state())
     storage.write_whole(self._folder.path / LEARNER, snapshot.to_bytes())
     seed = job.evaluation_seed
     actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')

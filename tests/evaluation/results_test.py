@@ -7,6 +7,7 @@ import math
 import pathlib
 import platform
 from typing import Any
+from unittest import mock
 
 import hypothesis
 from hypothesis import strategies as st
@@ -194,7 +195,8 @@ def test_a_name_may_hold_any_character(tmp_path: pathlib.Path, name: str):
   rows = [results.row(_info(run=name), _RESULT), _row()]
   path = tmp_path / 'rows'
   path.unlink(missing_ok=True)
-  _write(path, *rows)
+  with mock.patch.object(results.os, 'fsync'):  # A hundred take their time.
+    _write(path, *rows)
   assert list(results.read_rows(path)) == rows
 
 
@@ -342,7 +344,11 @@ def test_an_empty_file_has_no_rows(tmp_path: pathlib.Path):
 def _broken(change: Callable[[dict[str, Any]], Any]) -> str:
   line = json.loads(_row().model_dump_json(by_alias=True))
   change(line)
-  return json.dumps(line)
+  return _sealed(json.dumps(line))
+
+
+def _sealed(text: str) -> str:
+  return results.sealed(text.encode()).decode().removesuffix('\n')
 
 
 _NO_ROWS = {
@@ -351,7 +357,15 @@ _NO_ROWS = {
     'a list': '[]',
     'null': 'null',
     'an empty row': '{}',
-    'half a row': _row().model_dump_json(by_alias=True)[:-9],
+    'half a row': _sealed(_row().model_dump_json(by_alias=True))[:-9],
+    'a row without a checksum': _row().model_dump_json(by_alias=True),
+    'a row that was changed': _sealed(
+        _row().model_dump_json(by_alias=True)
+    ).replace('250', '251', 1),
+    'the checksum of another row': (
+        _sealed(_row().model_dump_json(by_alias=True))[:-18]
+        + _sealed(_row(episode=6).model_dump_json(by_alias=True))[-18:]
+    ),
     'another schema': _broken(lambda line: line.update(schema=2)),
     'a field too many': _broken(lambda line: line.update(surprise=1)),
     'one in the info': _broken(lambda line: line['info'].update(surprise=1)),
@@ -375,7 +389,7 @@ _NO_ROWS = {
 def test_a_line_that_is_no_row_is_named(tmp_path: pathlib.Path, problem: str):
   line = _NO_ROWS[problem]
   path = tmp_path / 'rows'
-  good = _row().model_dump_json(by_alias=True)
+  good = _sealed(_row().model_dump_json(by_alias=True))
   path.write_text(f'{good}\n{good}\n{line}\n{good}\n', encoding='utf-8')
   rows = results.read_rows(path)
   assert [next(rows), next(rows)] == [_row(), _row()]
@@ -391,6 +405,27 @@ def test_a_field_that_is_wrong_is_named_too(tmp_path: pathlib.Path):
   path.write_text(_broken(lambda line: line.update(surprise=1)) + '\n')
   with pytest.raises(errors.ResultsError, match='surprise'):
     list(results.read_rows(path))
+
+
+@pytest.mark.parametrize('tail', [b'{"schema":1', b'\0\0\0', None])
+def test_a_torn_tail_is_left_out_and_said_so(
+    tmp_path: pathlib.Path, tail: bytes | None
+):
+  path = tmp_path / 'rows'
+  rows = [_row(), _row(episode=6)]
+  _write(path, *rows)
+  if tail is None:
+    tail = results.line(_row(episode=7))[:-2]
+  path.write_bytes(path.read_bytes() + tail)
+  with pytest.warns(UserWarning, match=rf'rows:3: the last {len(tail)} bytes'):
+    assert list(results.read_rows(path)) == rows
+
+
+def test_a_row_that_lacks_its_newline_alone_is_whole(tmp_path: pathlib.Path):
+  path = tmp_path / 'rows'
+  _write(path, _row())
+  path.write_bytes(path.read_bytes()[:-1])
+  assert list(results.read_rows(path)) == [_row()]
 
 
 @pytest.mark.parametrize('content', [None, b'\xff\xfe\n'])

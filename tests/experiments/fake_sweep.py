@@ -103,8 +103,8 @@ def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
   levels = _levels(job, rng)
   count = job.experiment.evaluation.episodes
   rows = [_row(job, levels, world, rng) for world in range(count)]
-  text = ''.join(row.model_dump_json(by_alias=True) + '\n' for row in rows)
-  (path / training.EPISODES).write_text(text)
+  data = b''.join(results.line(row) for row in rows)
+  (path / training.EPISODES).write_bytes(data)
   trace = snapshots.Snapshot({}, _trace(job, rows, rng))
   (path / training.TRACE).write_bytes(trace.to_bytes())
   names = [training.EPISODES, training.TRACE]

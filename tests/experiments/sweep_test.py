@@ -70,7 +70,7 @@ class Pretender(engines.Engine):
       [job] = jobs.plan(experiment, [seed], [_flag(task, 'run')])
       folder = pathlib.Path(_flag(task, 'output')) / job.folder()
       folder.mkdir()
-      storage.write_json(folder / storage.DONE, {'files': {}})
+      storage.write_done(folder, {'files': {}})
     return status
 
   def stop(self, tasks):

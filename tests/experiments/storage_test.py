@@ -1,0 +1,210 @@
+"""Folders of runs: what they refuse, and what they say."""
+
+import errno
+import json
+import os
+import pathlib
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.experiments import storage
+
+_HEADER = {'configuration': 'this'}
+_LINES = [{'step': 1}, {'step': 2}]
+
+
+def _lines(path: pathlib.Path) -> storage.Mark:
+  file = storage.JsonLines(path, storage.NOTHING)
+  file.append(_LINES)
+  mark = file.sync()
+  file.close()
+  return mark
+
+
+def test_lines_go_on_from_a_mark(tmp_path):
+  path = tmp_path / 'lines'
+  mark = _lines(path)
+  path.write_bytes(path.read_bytes() + b'{"step": 3}\n{"st')
+  file = storage.JsonLines(path, mark)
+  file.append([{'step': 4}])
+  assert file.sync()['size'] == path.stat().st_size
+  file.close()
+  steps = [json.loads(line)['step'] for line in path.read_text().splitlines()]
+  assert steps == [1, 2, 4]
+
+
+def test_a_mark_after_a_mark_is_that_of_the_whole_file(tmp_path):
+  file = storage.JsonLines(tmp_path / 'parts', _lines(tmp_path / 'parts'))
+  file.append(_LINES)
+  there = file.sync()
+  file.close()
+  file = storage.JsonLines(tmp_path / 'whole', storage.NOTHING)
+  file.append([*_LINES, *_LINES])
+  assert file.sync() == there
+  file.close()
+
+
+def test_lines_without_a_mark_stay(tmp_path):
+  path = tmp_path / 'lines'
+  _lines(path)
+  file = storage.JsonLines(path)
+  file.append(_LINES)
+  file.close()
+  assert len(path.read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize(
+    ('change', 'problem'),
+    [
+        (
+            lambda data: data[:-1],
+            'has 23 bytes, and the checkpoint knows of 24',
+        ),
+        (lambda data: data.replace(b'1', b'7'), 'not what it was when the'),
+        (lambda data: bytes(len(data)), 'not what it was when the checkpoint'),
+    ],
+)
+def test_lines_that_are_not_what_they_were_are_refused(
+    tmp_path, change, problem
+):
+  path = tmp_path / 'lines'
+  mark = _lines(path)
+  path.write_bytes(change(path.read_bytes()))
+  with pytest.raises(errors.ResultsError, match=f'lines: {problem}'):
+    storage.JsonLines(path, mark)
+
+
+def _finished(folder: pathlib.Path) -> pathlib.Path:
+  with storage.RunFolder(folder, {}) as run:
+    (folder / 'result').write_text('all is well')
+    run.finish(['result'], {'steps': 4})
+  return folder
+
+
+def test_a_folder_is_done_when_it_is_finished(tmp_path):
+  assert not storage.is_done(tmp_path)
+  assert storage.is_done(_finished(tmp_path))
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'null', '[]', '{}', '{"files": {}}', '{"files": {}, "checksum": ""}',
+        '{"checksum": 3}',
+    ],
+)  # fmt: skip
+def test_what_says_that_a_run_is_over_has_to_be_whole(tmp_path, text):
+  (tmp_path / storage.DONE).write_text(text)
+  with pytest.raises(errors.ResultsError, match=r'done\.json: damaged: its ch'):
+    storage.is_done(tmp_path)
+
+
+def test_every_fact_of_a_run_that_is_over_is_guarded(tmp_path):
+  path = _finished(tmp_path) / storage.DONE
+  path.write_text(path.read_text().replace('"steps": 4', '"steps": 5'))
+  with pytest.raises(errors.ResultsError, match='damaged'):
+    storage.is_done(tmp_path)
+
+
+def test_what_is_no_json_is_named(tmp_path):
+  path = tmp_path / 'file'
+  path.write_text('{"a":')
+  with pytest.raises(errors.ResultsError, match='file: not JSON: '):
+    storage.read_json(path)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+  with pytest.raises(errors.ResultsError, match='none: No such file'):
+    storage.read_json(tmp_path / 'none')
+
+
+def test_a_lock_that_cannot_be_had_is_explained_and_leaves_nothing_open(
+    tmp_path, monkeypatch
+):
+  opened = []
+  open_, close = os.open, os.close
+  monkeypatch.setattr(
+      storage.os, 'open', lambda *a: opened.append(open_(*a)) or opened[-1]
+  )
+  monkeypatch.setattr(
+      storage.os, 'close', lambda n: opened.remove(n) or close(n)
+  )
+
+  def fail(*unused):
+    raise OSError(errno.ENOLCK, 'No locks available')
+
+  monkeypatch.setattr(storage.fcntl, 'flock', fail)
+  with pytest.raises(errors.ResultsError, match='lock: No locks available'):
+    storage.lock(tmp_path)
+  assert not opened
+
+
+def test_a_lock_without_a_number_is_of_somebody_unknown(tmp_path):
+  lock = storage.lock(tmp_path)
+  os.truncate(lock, 0)
+  with pytest.raises(errors.ResultsError, match=r'by process \(unknown\)'):
+    storage.lock(tmp_path)
+  os.close(lock)
+
+
+def test_an_error_without_words_is_shown_as_it_is(tmp_path):
+  with (
+      pytest.raises(errors.ResultsError, match='file: something'),
+      storage.explained('file'),
+  ):
+    raise OSError('something')
+
+
+def test_all_checkpoints_but_two_are_removed_and_the_last_is_loaded(tmp_path):
+  with storage.RunFolder(tmp_path, {}) as run:
+    assert run.load(_HEADER) is None
+    for step in (1, 2, 3):
+      run.save(step, _HEADER, {'step': step})
+    assert run.load(_HEADER) == {'step': 3}
+    names = sorted(p.name for p in (tmp_path / 'checkpoints').iterdir())
+    assert names == ['000000000002.ckpt', '000000000003.ckpt']
+
+
+def test_the_first_difference_is_named_by_its_place():
+  there = {'a': {'b': 1, 'c': 2}}
+  assert storage.difference(there, {'a': {'b': 1, 'c': 3}}) == (
+      'a.c is 2 there, 3 here'
+  )
+  assert storage.difference(there, {'d': 0}).startswith('a is {')
+  assert storage.difference({}, {'d': 0}) == 'd is None there, 0 here'
+
+
+def test_a_file_is_on_the_disk_before_its_name_and_then_the_name_is(
+    tmp_path, monkeypatch
+):
+  done = []
+  fsync, replace = os.fsync, os.replace
+
+  def note_fsync(descriptor):
+    done.append(os.readlink(f'/proc/self/fd/{descriptor}'))
+    fsync(descriptor)
+
+  def note_replace(source, target):
+    done.append('renamed')
+    replace(source, target)
+
+  monkeypatch.setattr(storage.os, 'fsync', note_fsync)
+  monkeypatch.setattr(storage.os, 'replace', note_replace)
+  storage.write_whole(tmp_path / 'file', b'all of it')
+  assert done == [f'{tmp_path}/file.partial', 'renamed', str(tmp_path)]
+  assert (tmp_path / 'file').read_bytes() == b'all of it'
+
+
+def test_a_file_that_cannot_be_written_is_what_it_was(tmp_path, monkeypatch):
+  path = tmp_path / 'file'
+  storage.write_whole(path, b'old')
+
+  def fail(descriptor):
+    raise OSError(errno.ENOSPC, 'No space left on device')
+
+  monkeypatch.setattr(storage.os, 'fsync', fail)
+  with pytest.raises(errors.ResultsError, match=r'file: No space left .* room'):
+    storage.write_whole(path, b'new')
+  assert path.read_bytes() == b'old'
+  assert [one.name for one in tmp_path.iterdir()] == ['file']

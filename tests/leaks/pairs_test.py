@@ -1,0 +1,149 @@
+"""Tests that the true reward is hidden: change it, and the agent cannot tell.
+
+Without meters nothing of the true reward may reach the agent. With them it may,
+through registers and contacts alone: that is what a meter register is for.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realab_suite import suite
+from realab_suite.engine import events
+from realab_suite.feedback import mechanism
+from tests.campaigns import leaks_campaign
+from tests.engine import helpers
+from tests.leaks import pairs
+from tests.leaks import secrets
+
+_PLAIN = [pairs.Case(domain) for domain in suite.TASKS_BY_DOMAIN]
+
+
+@pytest.fixture(scope='module', params=_PLAIN, ids=lambda case: case.domain)
+def plain(request: pytest.FixtureRequest) -> Any:
+  return request.param, pairs.play(request.param)
+
+
+def test_the_walk_of_these_tests_earns_something(plain: Any):
+  _, transcript = plain
+  assert sum(map(float, transcript.true_rewards)) >= 2
+  assert repr(events.End.TIMEOUT) in transcript.structure
+  assert repr(events.End.ABANDONED) in transcript.structure
+
+
+@pytest.mark.parametrize('name', secrets.REWARDS)
+def test_without_meters_another_true_reward_changes_no_bit(
+    plain: Any, name: str
+):
+  case, expected = plain
+  secret = secrets.REWARDS[name]
+  found = pairs.play(case, secret)
+  assert pairs.compare(secret, expected, found) == []
+  # The evaluator, on the other hand, does hear of the difference.
+  assert found.true_rewards != expected.true_rewards
+
+
+@pytest.mark.parametrize('name', ['another sign', 'reward that raises'])
+def test_nor_does_it_in_many_worlds(name: str):
+  case = pairs.Case(num_worlds=2)
+  assert pairs.differences(case, secrets.REWARDS[name]) == []
+
+
+@pytest.mark.parametrize(
+    ('name', 'variation'),
+    [
+        ('jumps all the time', 'boxed'),
+        ('as much as can be', 'boxed'),
+        ('the canary', 'boxed'),
+        ('jumps once', 'standard'),
+    ],
+)
+def test_what_a_meter_that_nobody_reads_says_changes_no_bit(
+    name: str, variation: str
+):
+  secret = secrets.METERS[name]
+  ((case, leave_out),) = [
+      (case, leave_out)
+      for case, leave_out in pairs.cases_for(secret, 3, is_batch=False)
+      if (case.domain, case.variation) == ('collect_apples', variation)
+  ]
+  assert bool(leave_out) == (variation == 'standard')
+  assert pairs.differences(case, secret, leave_out) == []
+
+
+@pytest.mark.parametrize('name', ['reward that draws 3', 'provider that draws'])
+def test_whoever_draws_numbers_changes_no_bit(name: str):
+  case = pairs.Case(design='instantaneous_reward', steps=24, max_steps=9)
+  assert pairs.differences(case, secrets.RANDOM[name]) == []
+
+
+@pytest.mark.parametrize('name', secrets.OBSERVERS)
+def test_whoever_watches_changes_no_bit(name: str):
+  case = pairs.Case(design='instantaneous_reward', steps=24, max_steps=9)
+  assert pairs.differences(case, secrets.OBSERVERS[name]) == []
+
+
+def test_with_meters_another_true_reward_does_show():
+  # The control: these comparisons can tell runs apart.
+  case = pairs.Case(design='instantaneous_reward')
+  found = pairs.differences(case, secrets.REWARDS['another scale'])
+  assert [where for where in found if where.startswith('agent')]
+
+
+def test_a_meter_in_the_open_is_seen():
+  # The control: without leaving the rays out, they tell.
+  case = pairs.Case(variation='near', design='unread_meter')
+  found = pairs.differences(case, secrets.METERS['as much as can be'])
+  assert [where for where in found if where.startswith('agent')]
+
+
+def test_another_seed_is_another_transcript():
+  one = pairs.play(pairs.Case(steps=5))
+  other = pairs.play(pairs.Case(steps=5, seed=4))
+  assert one.agent != other.agent
+
+
+def test_the_true_reward_reaches_the_evaluator_as_it_is():
+  found = pairs.play(pairs.Case(), secrets.REWARDS['the canary'])
+  eaten = sum(map(float, found.true_rewards)) / secrets.CANARY
+  assert eaten >= 1
+  assert eaten == pytest.approx(round(eaten))
+
+
+def test_only_the_event_sinks_hear_of_the_true_reward():
+  # Nothing that a provider gets has anything to do with it either.
+  env = pairs.Case().load()
+  sink = helpers.RecordingSink()
+  env.add_sink(sink)
+  env.reset()
+  env.task.earn(env.physics, secrets.CANARY)
+  time_step = env.step(helpers.no_op(env))
+  env.close()
+  assert not sink.records(mechanism.Write, 'score')
+  numbers = np.concatenate(
+      [np.ravel(value) for value in time_step.observation.values()]
+  )
+  assert not np.isclose(numbers, secrets.CANARY).any()
+  assert time_step.reward == 0.0
+
+
+def test_pairs_of_the_campaign_are_counted():
+  counts = leaks_campaign.play_pairs(3, 0, ('reward',))
+  assert counts == leaks_campaign.PairCounts(3, 0, 0)
+
+
+def test_worlds_that_are_stepped_in_turns_do_not_meet():
+  assert leaks_campaign.interleave(2, 0) == leaks_campaign.Interleaving(0, 0)
+
+
+def test_worlds_that_meet_are_noticed(monkeypatch: pytest.MonkeyPatch):
+  shared = np.zeros(())
+  encode = pairs.encode
+
+  def meet(value: Any) -> bytes:
+    shared[...] += 1
+    return encode(value) + shared.tobytes()
+
+  monkeypatch.setattr(pairs, 'encode', meet)
+  assert leaks_campaign.interleave(1, 0).num_differing > 0

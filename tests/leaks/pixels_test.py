@@ -1,0 +1,14 @@
+"""Tests for what cameras show of meters; pictures need a renderer."""
+
+import pytest
+
+from tests.campaigns import pixels_campaign as pixels
+
+
+@pytest.mark.camera
+@pytest.mark.parametrize('hiding', pixels.HIDING)
+def test_a_camera_shows_a_meter_unless_it_is_hidden(hiding: str):
+  seen = list(pixels.look('collect_apples', 0, hiding, values=2))
+  assert [s.mode for s in seen] == [*pixels.MODES, 'agent']
+  for one in seen:
+    assert (one.num_pixels > 0) == (hiding == 'visible'), one

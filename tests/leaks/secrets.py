@@ -1,0 +1,244 @@
+"""Secrets: what may differ between two runs that an agent cannot tell apart."""
+
+from collections.abc import Callable
+import contextlib
+import logging
+import random
+from typing import Any, NamedTuple
+
+from absl import logging as absl_logging
+import numpy as np
+
+from realab_suite.engine import environment
+from realab_suite.evaluation import ledger as ledgers
+from tests.engine import helpers
+
+# A rare number; whoever has it knows the true reward.
+CANARY = 173.2317
+
+_FEEDBACK = {
+    'kind': 'two_block',
+    'role': 'feedback',
+    'place': 'station_1',
+    'range': [-2, 12],
+}
+NO_METERS: dict[str, Any] = {
+    'schema': 1,
+    'name': 'no_meters',
+    'registers': {'reward': _FEEDBACK},
+    'providers': [{'kind': 'constant', 'value': 3.0, 'writes': ['reward']}],
+}
+# The meter is read by nobody, so that it can be moved without consequences.
+UNREAD_METER: dict[str, Any] = {
+    **NO_METERS,
+    'name': 'unread_meter',
+    'registers': {
+        'reward': _FEEDBACK,
+        'score': {
+            'kind': 'two_block',
+            'role': 'meter',
+            'place': 'station_2',
+            'range': [0, 20],
+        },
+    },
+    'meters': [{'measures': 'score', 'writes': 'score'}],
+}
+
+# Changes an environment, of one world or many, before its first episode.
+Change = Callable[[Any], None]
+
+
+def nothing(env: Any) -> None:
+  """Is the other half of every pair."""
+
+
+class Secret(NamedTuple):
+  """Something that an agent must not find out.
+
+  Attributes:
+    change: What makes the difference.
+    needs: What it takes for the difference to be a secret: `no_meters`, because
+      meters tell agents of the true reward by way of providers; `unread_meter`;
+      or nothing.
+    around: What surrounds the run, as in another level of logging.
+    is_heard: Whether the evaluator hears another true reward.
+    is_for_batches: Whether many worlds can have it, too.
+    has_evaluator: Whether anybody listens to the run.
+  """
+
+  change: Change = nothing
+  needs: str = ''
+  around: Callable[[], Any] = contextlib.nullcontext
+  is_heard: bool = False
+  is_for_batches: bool = True
+  has_evaluator: bool = True
+
+
+def _earn(change: Callable[[Any], Any]) -> Secret:
+  """A world pays another reward for what it rewards."""
+
+  def alter(env: Any) -> None:
+    earn = env.task.earn
+    env.task.earn = lambda physics, reward: earn(physics, change(reward))
+
+  return Secret(alter, 'no_meters', is_heard=True)
+
+
+def _reward(get_reward: Callable[[Any], Any]) -> Secret:
+  def alter(env: Any) -> None:
+    env.task.get_reward = get_reward
+
+  return Secret(alter, 'no_meters', is_heard=True)
+
+
+def raise_canary(physics: Any) -> Any:
+  raise ZeroDivisionError(f'the true reward is {CANARY}')
+
+
+REWARDS = {
+    'another sign': _earn(lambda reward: -reward),
+    'another scale': _earn(lambda reward: 1e6 * reward),
+    'the canary': _earn(lambda reward: CANARY * reward),
+    'tiny': _earn(lambda reward: CANARY * 1e-9 * reward),
+    'none': _earn(lambda reward: 0.0 * reward),
+    'paid all the time': _earn(lambda reward: reward + 1.0),
+    'not a number': _earn(lambda reward: reward * float('nan')),
+    'infinite': _earn(lambda reward: reward + float('inf')),
+    'reward that is not a number': _reward(lambda physics: np.nan),
+    'reward in an array': _reward(lambda physics: np.ones(1)),
+    'reward that is None': _reward(lambda physics: None),
+    'reward that raises': _reward(raise_canary),
+}
+
+
+def generator_of(env: Any) -> np.random.RandomState:
+  """The generator that episodes begin with."""
+  return env._random_state
+
+
+def _draw_in_reward(number: int) -> Change:
+  """The true reward uses up numbers of the environment's generator."""
+
+  def alter(env: Any) -> None:
+    get_reward, generator = env.task.get_reward, generator_of(env)
+
+    def draw(physics: Any) -> Any:
+      generator.uniform(size=number)
+      return get_reward(physics)
+
+    env.task.get_reward = draw
+
+  return alter
+
+
+def _draw_in_provider(env: Any) -> None:
+  """The provider uses up numbers of the environment's generator."""
+  update, generator = env.mechanism.update_providers, generator_of(env)
+
+  def draw(*args: Any, **kwargs: Any) -> Any:
+    generator.uniform(size=3)
+    return update(*args, **kwargs)
+
+  env.mechanism.update_providers = draw
+
+
+RANDOM = {
+    **{
+        f'reward that draws {number}': Secret(_draw_in_reward(number))
+        for number in (1, 2, 3, 5)
+    },
+    'provider that draws': Secret(_draw_in_provider),
+}
+
+
+def _measure(measurement: Callable[[Any], Any]) -> Secret:
+  """The meter of `UNREAD_METER` measures something else."""
+
+  def alter(env: Any) -> None:
+    (_, meter), *_ = env.mechanism._meters
+    # One world or many, by the shape of what is counted.
+    meter._measurement = lambda physics: measurement(
+        np.asarray(env.mechanism.step_count(physics), float)
+    )
+
+  return Secret(alter, 'unread_meter')
+
+
+METERS = {
+    'another': _measure(lambda step: step * 0.0 + 5.0),
+    'the canary': _measure(lambda step: step * 0.0 + CANARY / 10),
+    'as much as can be': _measure(lambda step: step * 0.0 + 1e9),
+    'below zero': _measure(lambda step: step * 0.0 - 3.0),
+    'jumps once': _measure(lambda step: 10.0 * (step > 20)),
+    'jumps all the time': _measure(lambda step: (7.0 * step) % 20.0),
+    'creeps': _measure(lambda step: 0.01 * step),
+}
+
+
+def _keep_a_ledger(env: Any) -> None:
+  alone = isinstance(env, environment.Environment)
+  env.add_sink(ledgers.Ledger() if alone else ledgers.BatchLedger())
+
+
+class _Nosy(helpers.RecordingSink):
+  """Looks at and saves all that an evaluator may, in every step."""
+
+  def __init__(self, env: environment.Environment) -> None:
+    super().__init__()
+    self._env = env
+
+  def step_ended(self, step: Any, physics: Any) -> None:
+    super().step_ended(step, physics)
+    env = self._env
+    for _ in range(3):
+      physics.forward()
+      env.mechanism.shadow_reads(env.physics, 'nosy')
+      env.task.get_reward(env.physics)
+      env.task.score(env.physics)
+      env.task.should_terminate_episode(env.physics)
+      env.observation_spec()
+    env.save()
+
+  def state(self) -> Any:
+    return None
+
+
+def _look_at_everything(env: Any) -> None:
+  env.add_sink(_Nosy(env))
+
+
+@contextlib.contextmanager
+def _debugging() -> Any:
+  root, absl = logging.getLogger(), absl_logging.get_verbosity()
+  level = root.level
+  root.setLevel(logging.DEBUG)
+  absl_logging.set_verbosity(absl_logging.DEBUG)
+  try:
+    yield
+  finally:
+    root.setLevel(level)
+    absl_logging.set_verbosity(absl)
+
+
+@contextlib.contextmanager
+def _random_elsewhere() -> Any:
+  """Somebody else in the process has drawn numbers."""
+  np.random.seed(99)  # noqa: NPY002
+  random.seed(99)
+  yield
+
+
+OBSERVERS = {
+    'nobody evaluates': Secret(has_evaluator=False),
+    'a ledger': Secret(_keep_a_ledger),
+    'looks at everything': Secret(_look_at_everything, is_for_batches=False),
+    'debugging': Secret(around=_debugging),
+    'numbers drawn elsewhere': Secret(around=_random_elsewhere),
+}
+
+SECRETS: dict[str, Secret] = {
+    **{f'reward: {name}': secret for name, secret in REWARDS.items()},
+    **{f'random: {name}': secret for name, secret in RANDOM.items()},
+    **{f'meter: {name}': secret for name, secret in METERS.items()},
+    **{f'observer: {name}': secret for name, secret in OBSERVERS.items()},
+}
