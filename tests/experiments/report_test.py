@@ -444,6 +444,22 @@ def test_an_axis_is_symlog_where_observed_returns_dwarf_true_ones(
   assert ('observed return (units), symlog' in svg) == is_symlog
 
 
+def test_a_curve_has_a_point_for_as_many_steps_as_episodes_take():
+  # In twelve steps every world ends an episode; those that end sooner are odd.
+  points = [
+      (5, 1, 10.0),
+      (10, 0, None),
+      (15, 3, 2.0),
+      (20, 2, 4.0),
+      (25, 2, 6.0),
+  ]
+  assert charts.curve(points, 12) == {15: 4.0, 25: 5.0}
+  # What is left in the end goes with what was before.
+  assert charts.curve([*points, (30, 4, 5.0)], 12) == {15: 4.0, 30: 5.0}
+  assert charts.curve(points[:2], 12) == {5: 10.0}
+  assert charts.curve([], 12) == {}
+
+
 def test_a_band_is_the_interval_over_seeds():
   one = charts.band({0: {100: 1.0, 200: 5.0}, 1: {100: 2.0}})
   assert one.steps.tolist() == [100, 200]

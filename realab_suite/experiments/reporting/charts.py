@@ -89,6 +89,41 @@ class Band:
   high: np.ndarray
 
 
+def curve(
+    points: Iterable[tuple[int, int, float | None]], width: int
+) -> dict[int, float]:
+  """Returns the mean over at least so many steps, by where they end.
+
+  Args:
+    points: Up to which step, the number of episodes that ended since the point
+      before, and their mean, where there is one.
+    width: How many steps to take together. A point that reaches into the next
+      ones goes with those that it begins in; what is left in the end goes with
+      those before.
+  """
+  parts: list[list[tuple[int, int, float]]] = []
+  begin, done = 0, 0
+  values: list[tuple[int, int, float]] = []
+  for step, number, value in points:
+    if begin - done >= width:
+      parts.append(values)
+      values, done = [], begin - begin % width
+    if value is not None and number:
+      values.append((step, number, value))
+    begin = step
+  if begin - done >= width or not parts:
+    parts.append(values)
+  else:
+    parts[-1] += values
+  return {
+      part[-1][0]: float(
+          np.average([p[2] for p in part], weights=[p[1] for p in part])
+      )
+      for part in parts
+      if part
+  }
+
+
 def band(curves: Mapping[int, Mapping[int, float]]) -> Band:
   """Returns the mean over seeds and its interval at each step.
 

@@ -4,7 +4,6 @@ import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import contextlib
 import dataclasses
-import functools
 from importlib import resources
 import math
 import pathlib
@@ -263,7 +262,7 @@ def _bands(
   return {
       whose: charts.band(
           {
-              seed: _curve(run, curve, functools.partial(figure, run))
+              seed: _curve(run, curve, figure)
               for seed, curve in run.curves.items()
           }
       )
@@ -274,29 +273,19 @@ def _bands(
 def _curve(
     run: sweep_results.Run,
     points: Sequence[Mapping[str, Any]],
-    figure: Callable[[Mapping[str, Any]], float | None],
+    figure: Callable[[sweep_results.Run, Mapping[str, Any]], float | None],
 ) -> dict[int, float]:
-  """Returns a figure by the number of control steps.
-
-  All worlds begin at once, so for a while their episodes end at once, too. A
-  mean over the few that end in between would be one of odd episodes: each is
-  over as many steps as an episode of every world has at most.
-  """
-  config = run.config
-  width = config['training']['num_envs'] * config['max_steps']
-  num_bins = max(points[-1]['step'] // width, 1) if points else 0
-  bins: dict[int, list[tuple[int, int, float]]] = {}
-  for point in points:
-    num_valid = point['num_episodes'] - point['num_invalid']
-    value = figure(point)
-    if value is not None and num_valid:
-      place = min((point['step'] - 1) // width, num_bins - 1)
-      bins.setdefault(place, []).append((point['step'], num_valid, value))
-  curve = {}
-  for values in bins.values():
-    steps, weights, figures = zip(*values, strict=True)
-    curve[steps[-1]] = float(np.average(figures, weights=weights))
-  return curve
+  """Returns a figure by the number of control steps."""
+  # All worlds begin at once, so for a while their episodes end at once, too,
+  # and those few that end in between are odd ones.
+  width = run.config['training']['num_envs'] * run.config['max_steps']
+  return charts.curve(
+      [
+          (p['step'], p['num_episodes'] - p['num_invalid'], figure(run, p))
+          for p in points
+      ],
+      width,
+  )
 
 
 def _signed_metres(
