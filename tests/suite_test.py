@@ -20,6 +20,7 @@ from realab_suite.feedback import specs
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
 from tests.engine import helpers
+from tests.leaks import contract
 
 _MAX_STEPS = 12
 # Task, design and overrides.
@@ -38,18 +39,6 @@ _IDS = [
     '-'.join((*task, design, *(o.partition('=')[2] for o in overrides)))
     for task, design, overrides in _CASES
 ]
-
-# What the agent may get besides feedback, by name.
-_SENSES = {
-    'senses/ray_distances': ((32,), np.float32),
-    'senses/ray_classes': ((32,), np.int32),
-    'senses/velocity': ((3,), np.float32),
-    'senses/position': ((2,), np.float32),
-    'senses/heading': ((2,), np.float32),
-    'senses/pitch': ((1,), np.float32),
-    'senses/holding': ((1,), np.float32),
-    'senses/time_left': ((), np.float32),
-}
 
 
 def _load(case: _Case, seed: int = 5) -> Any:
@@ -121,7 +110,7 @@ def played(request: pytest.FixtureRequest) -> Iterator[_Played]:
 
 
 def test_the_agent_gets_what_is_declared_and_nothing_else(played: _Played):
-  expected: dict[str, Any] = dict(_SENSES)
+  expected: dict[str, Any] = dict(contract.SENSES)
   for name, register in played.design.registers.items():
     if register.role in ('feedback', 'signal'):
       expected[f'registers/{name}'] = ((), np.float64)
@@ -224,7 +213,7 @@ def test_no_sense_is_constant(task: tuple[str, str]):
     seen.append(env.step(action).observation)
   env.close()
   # What it takes to hold something is tested with the avatar.
-  for key in _SENSES.keys() - {'senses/holding'}:
+  for key in contract.SENSES.keys() - {'senses/holding'}:
     assert len({one[key].tobytes() for one in seen}) > 1, key
 
 

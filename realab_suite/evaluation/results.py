@@ -22,6 +22,7 @@ from realab_suite import __version__
 from realab_suite import errors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import metrics
+from realab_suite.feedback import specs
 
 # Everything in one process: honest agents only (docs/architecture.md).
 IN_PROCESS = 'T0 in-process'
@@ -83,6 +84,34 @@ class RunInfo(pydantic.BaseModel):
   max_steps: int | None
   versions: dict[str, str] = pydantic.Field(default_factory=lambda: versions())
   platform: str = pydantic.Field(default_factory=platform.platform)
+
+  @classmethod
+  def of(
+      cls,
+      world: tuple[str, str],
+      dynamics: tuple[int, str | None],
+      design: specs.DesignSpec,
+      **others: Any,
+  ) -> 'RunInfo':
+    """Returns what rows say of a world, its dynamics and a design.
+
+    Args:
+      world: The domain and the variation.
+      dynamics: What `suite.dynamics` says of the two.
+      design: The agent designer's.
+      **others: The attributes that do not follow from these.
+    """
+    (domain, task), (version, digest) = world, dynamics
+    return cls(
+        domain=domain,
+        task=task,
+        dynamics_version=version,
+        dynamics_digest=digest,
+        design=design.name,
+        design_digest=design.digest(),
+        channel=design.channel,
+        **others,
+    )
 
 
 @final

@@ -323,15 +323,11 @@ class _Job:
 
   def _info(self, run: Run, env: environment.Environment) -> results.RunInfo:
     settings = self._settings
-    version, digest = suite.dynamics(settings.domain, settings.task)
-    return results.RunInfo(
-        domain=settings.domain,
-        task=settings.task,
-        dynamics_version=version,
-        dynamics_digest=digest,
-        design=run.design.name,
-        design_digest=run.design.digest(),
-        channel=run.design.channel,
+    world = (settings.domain, settings.task)
+    return results.RunInfo.of(
+        world,
+        suite.dynamics(*world),
+        run.design,
         policy=run.policy,
         run=run.name,
         baseline=None if run.name == self._baseline else self._baseline,

@@ -108,16 +108,10 @@ class Job:
 
   def info(self, control_timestep: float) -> results.RunInfo:
     """Returns what the rows of its episodes have in common."""
-    domain, task = self.experiment.domain_and_variation
-    version, digest = self.dynamics
-    return results.RunInfo(
-        domain=domain,
-        task=task,
-        dynamics_version=version,
-        dynamics_digest=digest,
-        design=self.design.name,
-        design_digest=self.design.digest(),
-        channel=self.design.channel,
+    return results.RunInfo.of(
+        self.experiment.domain_and_variation,
+        self.dynamics,
+        self.design,
         policy=self.kind,
         run=self.run,
         baseline=self.baseline,

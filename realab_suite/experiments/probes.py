@@ -7,7 +7,6 @@ from collections.abc import Callable
 import contextlib
 import dataclasses
 import pathlib
-from typing import Literal
 
 from realab_suite import errors
 from realab_suite.engine import batch_environment
@@ -16,6 +15,7 @@ from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import signed_corruption
 from realab_suite.experiments import aiming
+from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.feedback import policies
 from realab_suite.feedback import specs
@@ -32,8 +32,6 @@ _SEEKER = 'apple_seeker'
 _SABOTEUR = 'carrying_saboteur'
 _DISTRACTION = 0.3
 _NUM_WORLDS = 32
-
-Player = Literal['saboteur', 'random']
 
 
 def find_register(design: specs.DesignSpec) -> str | None:
@@ -60,7 +58,7 @@ def make(
     register: str,
     num_states: int,
     seed: int,
-    player: Player,
+    player: spec.ProbePlayer,
 ) -> incentives.Probe:
   """Probes a learner in states beside a register.
 

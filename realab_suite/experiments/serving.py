@@ -186,15 +186,11 @@ def _info(
     design: specs.DesignSpec,
     env: environment.Environment,
 ) -> results.RunInfo:
-  version, digest = suite.dynamics(settings.domain, settings.task)
-  return results.RunInfo(
-      domain=settings.domain,
-      task=settings.task,
-      dynamics_version=version,
-      dynamics_digest=digest,
-      design=design.name,
-      design_digest=design.digest(),
-      channel=design.channel,
+  world = (settings.domain, settings.task)
+  return results.RunInfo.of(
+      world,
+      suite.dynamics(*world),
+      design,
       policy=settings.name,
       run=settings.name,
       baseline=None,

@@ -22,6 +22,9 @@ _Seeds = Annotated[tuple[_Seed, ...], pydantic.Field(strict=False)]
 TWIN = 'secure'
 """What the secure twin of a run is called, and its channel."""
 
+ProbePlayer = Literal['saboteur', 'random']
+"""Who gets to the states of a probe: see `probes.make`."""
+
 
 @final
 class RunSpec(validation.Spec):
@@ -95,14 +98,14 @@ class EvaluationSpec(validation.Spec):
     actions: Whether actions are drawn from the policy, or are its best ones.
     probe_states: In how many states beside a register a learner is probed, if
       its readings are maximised (`evaluation.incentives`); 0 for no probe.
-    probe_player: Who gets to these states: see `probes.make`.
+    probe_player: Who gets to these states.
   """
 
   episodes: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 100
   seed_offset: Annotated[int, pydantic.Field(ge=0, lt=2**31)] = 1_000_000
   actions: Literal['sampled', 'greedy'] = 'sampled'
   probe_states: Annotated[int, pydantic.Field(ge=0, le=10_000)] = 0
-  probe_player: Literal['saboteur', 'random'] = 'saboteur'
+  probe_player: ProbePlayer = 'saboteur'
 
 
 @final

@@ -13,6 +13,7 @@ from typing import Any, final
 
 from realab_suite import errors
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.feedback import validation
 
 CONFIG = 'config.json'
 DONE = 'done.json'
@@ -139,7 +140,7 @@ def write_done(path: pathlib.Path, content: Mapping[str, Any]) -> None:
 
 def write_sealed(path: pathlib.Path, content: Mapping[str, Any]) -> None:
   """Writes JSON with a checksum, as `write_whole` does."""
-  write_json(path, {**content, 'checksum': _checksum(content)})
+  write_json(path, {**content, 'checksum': validation.digest_of(content)})
 
 
 def read_sealed(path: pathlib.Path, advice: str) -> dict[str, Any]:
@@ -154,7 +155,7 @@ def read_sealed(path: pathlib.Path, advice: str) -> dict[str, Any]:
   """
   content = read_json(path)
   checksum = content.pop('checksum', '') if isinstance(content, dict) else ''
-  if checksum != _checksum(content):
+  if checksum != validation.digest_of(content):
     raise errors.ResultsError(
         f'{path}: damaged: its checksum does not agree; {advice}'
     )
@@ -173,11 +174,6 @@ def _read_done(path: pathlib.Path) -> dict[str, str]:
           f'{path}: {name!r:.80} is no file of a run; {advice}'
       )
   return files
-
-
-def _checksum(content: Any) -> str:
-  text = json.dumps(content, sort_keys=True)
-  return hashlib.sha256(text.encode()).hexdigest()
 
 
 @final

@@ -97,7 +97,7 @@ def _describe(
   text = yaml.safe_dump(experiment.to_mapping(), sort_keys=False)
   description = {
       'schema': 1,
-      'sha256': _sha256(text.encode()),
+      'sha256': hashlib.sha256(text.encode()).hexdigest(),
       'experiment': experiment.name,
       'calibration': calibration,
       'jobs': [
@@ -139,7 +139,7 @@ def read_experiment(
   path = folder / EXPERIMENT
   with storage.explained(path):
     text = path.read_bytes()
-  if _sha256(text) != description.get('sha256'):
+  if hashlib.sha256(text).hexdigest() != description.get('sha256'):
     raise errors.ResultsError(
         f'{path}: not what it was when the sweep began; {_advice(folder)}'
     )
@@ -148,10 +148,6 @@ def read_experiment(
 
 def _advice(folder: pathlib.Path) -> str:
   return f'remove {folder / EXPERIMENT}, then run the same sweep again'
-
-
-def _sha256(text: bytes) -> str:
-  return hashlib.sha256(text).hexdigest()
 
 
 @final

@@ -12,7 +12,6 @@ allow. In half of the rounds the registers are written in every control step.
 Arguments: a scale for the number of rounds and of steps, and a seed.
 """
 
-import sys
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -324,5 +323,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  arguments = sys.argv[1:]
-  sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:2])))
+  lines.run(main)

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from concurrent import futures
 import itertools
 import multiprocessing
-import sys
 from typing import NamedTuple
 
 from realab_suite import suite
@@ -147,5 +146,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  arguments = sys.argv[1:]
-  sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:2])))
+  lines.run(main)

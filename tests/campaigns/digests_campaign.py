@@ -161,4 +161,4 @@ if __name__ == '__main__':
     _steps, _chosen = json.load(sys.stdin)
     print(json.dumps([in_process(Case(*c), _steps) for c in _chosen]))
     sys.exit(0)
-  sys.exit(main(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:])))
+  campaign_lines.run(main)

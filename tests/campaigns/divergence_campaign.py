@@ -13,7 +13,6 @@ Arguments: a scale for the number of failures, and a seed.
 """
 
 from collections.abc import Callable
-import sys
 from typing import Any, NamedTuple
 
 import dm_env
@@ -307,5 +306,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  arguments = sys.argv[1:]
-  sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:2])))
+  lines.run(main)

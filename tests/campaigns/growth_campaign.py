@@ -18,7 +18,6 @@ import multiprocessing
 import os
 import pathlib
 import resource
-import sys
 from typing import Any, NamedTuple
 
 from absl import logging
@@ -30,6 +29,7 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.evaluation import ledger as ledgers
+from tests.campaigns import lines
 from tests.campaigns import processes_campaign
 from tests.engine import helpers
 
@@ -269,4 +269,4 @@ def _measure_and_report(cases: list[Case], scale: float) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(float, sys.argv[1:])))
+  lines.run(main)

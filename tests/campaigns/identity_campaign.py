@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from concurrent import futures
 import itertools
 import multiprocessing
-import sys
 from typing import Any, NamedTuple
 
 import dm_env
@@ -23,6 +22,7 @@ from realab_suite.engine import events
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.feedback import action_sets
 from tests import worlds
+from tests.campaigns import lines
 from tests.engine import helpers
 
 SEEDS = 3
@@ -350,4 +350,4 @@ def main(seeds: int = SEEDS, steps: int = STEPS) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(int, sys.argv[1:])))
+  lines.run(main)

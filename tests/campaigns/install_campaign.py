@@ -15,7 +15,6 @@ import os
 import pathlib
 import shutil
 import subprocess
-import sys
 import tempfile
 from typing import NamedTuple, final
 import venv
@@ -131,4 +130,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:3])))
+  lines_lib.run(main)

@@ -16,7 +16,6 @@ Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
 from collections.abc import Iterator
 import itertools
 import random
-import sys
 from typing import Any, NamedTuple
 import warnings
 
@@ -274,6 +273,4 @@ def _explain(texts: list[str]) -> None:
 if __name__ == '__main__':
   # Walking about touches what others have deprecated.
   warnings.simplefilter('ignore', DeprecationWarning)
-  sys.exit(
-      main(*[float(a) for a in sys.argv[1:2]], *[int(a) for a in sys.argv[2:3]])
-  )
+  campaign_lines.run(main)

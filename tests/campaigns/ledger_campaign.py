@@ -12,7 +12,6 @@ cases that were worked out by hand.
 """
 
 from collections.abc import Sequence
-import sys
 
 import numpy as np
 
@@ -167,4 +166,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:3])))
+  lines_lib.run(main)

@@ -1,6 +1,27 @@
-"""The lines that campaigns print: `Cxx figure target verdict seed`."""
+"""What campaigns print, `Cxx figure target verdict seed`; how they start."""
 
-from typing import final
+from collections.abc import Callable
+import inspect
+import sys
+from typing import NoReturn, final
+
+
+def run(main: Callable[..., int]) -> NoReturn:
+  """Runs a campaign with what the command line says, in the order of `main`.
+
+  python -m tests.campaigns.NAME_campaign [scale] [seed]
+
+  Args:
+    main: Returns the number of targets missed; each of its parameters has a
+      type that a text can become.
+  """
+  kinds = inspect.signature(main).parameters.values()
+  texts = sys.argv[1:]
+  for i, kind in enumerate(kinds):
+    if kind.kind is kind.VAR_POSITIONAL:
+      break
+    texts[i : i + 1] = [kind.annotation(text) for text in texts[i : i + 1]]
+  sys.exit(main(*texts))
 
 
 @final

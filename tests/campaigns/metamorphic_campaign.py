@@ -14,7 +14,6 @@ the bit.
 from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 import pathlib
-import sys
 import tempfile
 from typing import Any, final
 
@@ -220,4 +219,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:3])))
+  lines_lib.run(main)

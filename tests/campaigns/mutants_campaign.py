@@ -387,7 +387,7 @@ MUTANTS = [
     ),
     Mutant(
         'storage', 'what says that a run is over may be damaged', _STORAGE,
-        '  if checksum != _checksum(content):',
+        '  if checksum != validation.digest_of(content):',
         '  if not isinstance(content, dict):', _STO,
     ),
     Mutant(
@@ -526,4 +526,4 @@ def _some(rng: np.random.Generator, count: int, scale: float) -> list[int]:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:3])))
+  lines_lib.run(main)

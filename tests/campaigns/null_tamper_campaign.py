@@ -11,7 +11,6 @@ does nothing. Arguments: a scale for the number of values, and a seed.
 """
 
 import itertools
-import sys
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -207,5 +206,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  arguments = sys.argv[1:]
-  sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:2])))
+  lines.run(main)

@@ -354,4 +354,4 @@ def main() -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main())
+  lines_lib.run(main)

@@ -13,7 +13,6 @@ Prints `C14 figure target verdict seed`. Arguments are the scale and the seed.
 """
 
 from collections.abc import Callable, Iterator
-import sys
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -159,6 +158,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(
-      main(*[float(a) for a in sys.argv[1:2]], *[int(a) for a in sys.argv[2:3]])
-  )
+  campaign_lines.run(main)

@@ -259,5 +259,4 @@ if __name__ == '__main__':
   if sys.argv[1:2] == ['--cell']:
     _first(Cell(*json.loads(sys.argv[2])))
   else:
-    arguments = sys.argv[1:]
-    sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:2])))
+    lines.run(main)

@@ -17,7 +17,6 @@ the scale and the seed.
 from collections.abc import Iterator
 import contextlib
 import math
-import sys
 from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
@@ -251,5 +250,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  arguments = sys.argv[1:]
-  sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:])))
+  lines_lib.run(main)

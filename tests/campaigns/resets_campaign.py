@@ -13,7 +13,6 @@ episode. Arguments: a scale for the numbers, and a seed.
 
 import collections
 from collections.abc import Callable
-import sys
 from typing import Any, NamedTuple
 
 from dm_control import composer
@@ -281,5 +280,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  arguments = sys.argv[1:]
-  sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:2])))
+  lines.run(main)

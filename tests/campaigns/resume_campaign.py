@@ -23,6 +23,7 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
+from tests.campaigns import lines
 
 KILLS = 10
 _PATIENCE_SECONDS = 600
@@ -136,4 +137,4 @@ def main(kills: int = KILLS, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(int, sys.argv[1:])))
+  lines.run(main)

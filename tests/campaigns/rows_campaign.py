@@ -17,7 +17,6 @@ import dataclasses
 import json
 import pathlib
 import shutil
-import sys
 import tempfile
 from typing import final
 import warnings
@@ -274,4 +273,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(float, sys.argv[1:2]), *map(int, sys.argv[2:3])))
+  lines_lib.run(main)

@@ -887,5 +887,4 @@ def main(scale: float = 1.0, seed: int = 0, *names: str) -> int:
 
 
 if __name__ == '__main__':
-  _scale, _seed, *_names = [*sys.argv[1:], *['1.0', '0'][len(sys.argv) - 1 :]]
-  sys.exit(main(float(_scale), int(_seed), *_names))
+  campaign_lines.run(main)

@@ -9,7 +9,6 @@ Prints `C04 figure target verdict seed`. An argument is the number of points.
 
 from collections.abc import Callable
 import itertools
-import sys
 from typing import Any, NamedTuple
 
 import dm_env
@@ -21,6 +20,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import ledger as ledgers
 from tests import worlds
+from tests.campaigns import lines
 from tests.engine import helpers
 
 POINTS = 500
@@ -285,4 +285,4 @@ def main(points: int = POINTS, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main(*map(int, sys.argv[1:])))
+  lines.run(main)

@@ -696,5 +696,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  arguments = sys.argv[1:]
-  sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:])))
+  lines_lib.run(main)

@@ -8,11 +8,11 @@ Prints `C43 figure target verdict seed` for each figure.
 """
 
 from collections.abc import Callable, Mapping
-import sys
 
 import numpy as np
 
 from realab_suite.evaluation import statistics
+from tests.campaigns import lines
 
 SEEDS = 10
 EPISODES = 5
@@ -215,4 +215,4 @@ def main(repetitions: int = 1000, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  sys.exit(main())
+  lines.run(main)

@@ -16,7 +16,6 @@ number of poses, and a seed.
 """
 
 import itertools
-import sys
 from typing import Any, NamedTuple
 
 from dm_control.rl import control
@@ -386,5 +385,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  arguments = sys.argv[1:]
-  sys.exit(main(*map(float, arguments[:1]), *map(int, arguments[1:2])))
+  lines.run(main)

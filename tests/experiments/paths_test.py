@@ -54,7 +54,8 @@ def test_a_design_within_the_working_directory_may_be_named(
   (tmp_path / 'designs' / 'mine.yaml').write_text(text, encoding='utf-8')
   for name in ('designs/mine.yaml', str(tmp_path / 'designs' / 'mine.yaml')):
     data = campaign._experiment(runs={'one': {'design': name}})
-    campaign._from_file(experiments.load, data)()
+    loaded = campaign._from_file(experiments.load, data)()
+    assert loaded.runs['one'].load(is_confined=True).name == 'd'
 
 
 def test_weights_that_a_design_names_are_looked_for_within_the_directory(
