@@ -6,6 +6,7 @@ frames: no multisampling, no shadows, a buffer of the size of the frame, and
 coarse meshes. What there is to see, and its colours, stay the same.
 """
 
+import atexit
 import copy
 import os
 import threading
@@ -146,7 +147,12 @@ def _start() -> Any:
   """Returns the GL context of this thread, which is made once."""
   if _threads.gl is None or _threads.gl.terminated:
     _threads.gl = _render.Renderer(max_width=1, max_height=1)
-    _started.append(weakref.ref(_threads.gl))
+    reference = weakref.ref(_threads.gl)
+    _started.append(reference)
+    if threading.current_thread() is not threading.main_thread():
+      # At exit the main thread would free what belongs to this one, and fail.
+      # Exit handlers run last first, so this one comes before dm_control's.
+      atexit.register(_leave, reference)
   return _threads.gl
 
 
@@ -168,6 +174,12 @@ def _free(
       _disown(gl)
 
 
+def _leave(reference: weakref.ref[Any]) -> None:
+  """Leaves a GL context to the operating system."""
+  if (gl := reference()) is not None:
+    _disown(gl)
+
+
 def _disown(gl: Any) -> None:
   """Lets dm_control believe that a GL context has been freed."""
   gl._render_executor._terminated = True
@@ -186,8 +198,7 @@ def _note_fork() -> None:
   if _started and not _forked_from:
     _forked_from.append(os.getppid())
     for reference in _started:
-      if (gl := reference()) is not None:
-        _disown(gl)
+      _leave(reference)
 
 
 os.register_at_fork(after_in_child=_note_fork)
