@@ -42,6 +42,12 @@ _IDLE_SECONDS = flags.DEFINE_float(
     'After how long a silence an agent loses its connection.',
     lower_bound=0.0,
 )
+_PROVIDER_SECONDS = flags.DEFINE_float(
+    'provider_seconds',
+    60.0,
+    'After how long a provider that has not answered fails, with the episode.',
+    lower_bound=0.001,
+)
 _AGENT_COMMAND = flags.DEFINE_string(
     'agent_command',
     None,
@@ -86,6 +92,7 @@ def main(argv: Sequence[str]) -> None:
       name=_NAME.value,
       address=_ADDRESS.value,
       idle_seconds=_IDLE_SECONDS.value,
+      provider_seconds=_PROVIDER_SECONDS.value,
       agent_command=_AGENT_COMMAND.value,
       agent_folder=_AGENT_FOLDER.value,
       agent_user=_AGENT_USER.value,

@@ -1,6 +1,6 @@
 """A world in this process, an agent in another one, and the results of both."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import contextlib
 import ctypes
 import dataclasses
@@ -11,7 +11,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from typing import Any, final
+from typing import Any, NoReturn, final
 
 from absl import logging
 
@@ -51,6 +51,7 @@ class Settings:
     name: What the agent is called in the results.
     address: Where to listen; `None` for a socket in a folder of its own.
     idle_seconds: For how long an agent may be silent.
+    provider_seconds: For how long a provider may think about a step.
     agent_command: What to start as the agent; `None` if somebody else does.
     agent_folder: Where the agent runs; `None` for a folder of its own.
     agent_user: The user that the agent is; `None` for this process's own.
@@ -67,6 +68,7 @@ class Settings:
   name: str
   address: str | None
   idle_seconds: float
+  provider_seconds: float
   agent_command: str | None
   agent_folder: str | None
   agent_user: str | None
@@ -97,6 +99,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
   with contextlib.ExitStack() as stack:
     design = specs.load(settings.design, settings.overrides)
     env = stack.enter_context(contextlib.closing(_load(settings, design)))
+    env.mechanism.guard_providers(lambda: deadline(settings.provider_seconds))
     address = settings.address
     if address is None:
       folder = tempfile.mkdtemp(prefix='realab-')
@@ -141,6 +144,29 @@ def hide_from_debuggers() -> None:
         'this process cannot be hidden from debuggers:'
         f' {os.strerror(ctypes.get_errno())}'
     )
+
+
+@contextlib.contextmanager
+def deadline(seconds: float) -> Iterator[None]:
+  """Ends what takes too long; for the main thread, which alone gets signals.
+
+  Code that waits outside Python is not interrupted before it comes back.
+
+  Raises:
+    TimeoutError: If it does.
+  """
+
+  def ring(*unused: Any) -> NoReturn:
+    raise TimeoutError(f'no answer within {seconds:g} s')
+
+  before = signal.signal(signal.SIGALRM, ring)
+  # Again and again: somebody may have caught the first one.
+  signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
+  try:
+    yield
+  finally:
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, before)
 
 
 @final

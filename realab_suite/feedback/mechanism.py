@@ -6,6 +6,7 @@ is too: every method returns a record of what it wrote or read.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+import contextlib
 import inspect
 from typing import Any, NamedTuple, final
 
@@ -25,6 +26,8 @@ from realab_suite.feedback import specs
 # Who writes and reads, where it is not a provider.
 AGENT = 'agent'
 INITIAL = 'initial'
+
+Guard = Callable[[], contextlib.AbstractContextManager[None]]
 
 
 @final
@@ -92,6 +95,7 @@ class FeedbackMechanism(composer.Entity):
         (f'providers[{i}]:{provider.kind}', provider)
         for i, provider in enumerate(design.providers)
     ]
+    self._guard: Guard = contextlib.nullcontext
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
@@ -150,6 +154,14 @@ class FeedbackMechanism(composer.Entity):
           measurements[spec.measures], self._registers[spec.writes]
       )
       self._meters.append((f'meter:{spec.measures}', meter))
+
+  def guard_providers(self, guard: Guard) -> None:
+    """Has every step of a provider run within a context of its own.
+
+    Args:
+      guard: Makes one; what it raises counts as raised by the provider.
+    """
+    self._guard = guard
 
   def initial_writes(self, physics: Any) -> list[Write]:
     """Returns what registers wrote themselves when the episode began."""
@@ -217,8 +229,8 @@ class FeedbackMechanism(composer.Entity):
       What was read and written, in order, and the next states.
 
     Raises:
-      FeedbackProviderError: If a provider raises, or writes something else than
-        it declared, or something of another shape.
+      FeedbackProviderError: If a provider or its guard raises, or a provider
+        writes something else than it declared, or something of another shape.
       RegisterValueError: If a register cannot store what a provider wrote.
     """
     step = self._step_count.get(physics)
@@ -228,9 +240,10 @@ class FeedbackMechanism(composer.Entity):
       seen = [self._read(physics, name, writer) for name in provider.reads]
       readings = {read.register: np.array(read.reading) for read in seen}
       try:
-        values, next_state = provider.step(
-            observation, readings, np.asarray(step == 0), keys[i], states[i]
-        )
+        with self._guard():
+          values, next_state = provider.step(
+              observation, readings, np.asarray(step == 0), keys[i], states[i]
+          )
       except Exception as error:
         raise errors.FeedbackProviderError(
             f'{_where(writer, step)}: {type(error).__name__}: {error}'

@@ -1,5 +1,6 @@
 """Tests served worlds over a socket: who is let in, and how they leave."""
 
+import contextlib
 import json
 import os
 import pathlib
@@ -20,6 +21,8 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.evaluation import results
+from realab_suite.experiments import serving as serving_lib
+from realab_suite.feedback.providers import difference
 from realab_suite.interop.rpc import server as rpc_server
 from realab_suite.interop.rpc import sockets
 from tests.engine import helpers
@@ -215,6 +218,35 @@ def test_a_failing_provider_ends_the_episode_and_says_nothing(caplog):
     _wait_for(lambda: len(serving.results) == 2)
     assert serving.ends()[0] == 'error'
   assert '173.25' in caplog.text  # The evaluator is told.
+
+
+def test_a_provider_that_does_not_answer_fails(monkeypatch):
+  ended = []
+
+  def wait(self, *args):
+    try:
+      time.sleep(20)
+    except TimeoutError:
+      ended.append(1)
+      time.sleep(20)  # Whoever catches the first one hears of a second.
+
+  with contextlib.closing(served.load()) as env:
+    env.reset()
+    env.mechanism.guard_providers(lambda: serving_lib.deadline(0.05))
+    env.step(np.zeros(6))
+    monkeypatch.setattr(difference.Difference, 'step', wait)
+    handler = signal.getsignal(signal.SIGALRM)
+    with pytest.raises(
+        errors.FeedbackProviderError,
+        match=r'providers\[0\]:difference.*no answer within 0.05 s',
+    ):
+      env.step(np.zeros(6))
+    assert ended
+    monkeypatch.undo()
+    assert env.reset().first()
+    time.sleep(0.06)  # Nothing rings outside providers.
+    assert not env.step(np.zeros(6)).first()
+    assert signal.getsignal(signal.SIGALRM) is handler
 
 
 # Where a server listens.
