@@ -191,7 +191,7 @@ def drill_single(drill: Drill, seed: int, env: Any, clean: Any) -> Result:
       value.tobytes() == last.observation[name].tobytes()
       for name, value in found.observation.items()
   )
-  censored = not ledger.last.is_valid
+  censored = flagged and not ledger.last.is_valid
   clean.rewind(1)
   afterwards, expected = [], []
   for action in actions[-_STEPS_AFTER:]:
@@ -244,7 +244,7 @@ def drill_batch(
       value[world].tobytes() == last.observation[name][world].tobytes()
       for name, value in found.observation.items()
   )
-  censored = not episode.is_valid
+  censored = flagged and not episode.is_valid
   others = [i for i in range(NUM_WORLDS) if i != world]
   harmed = _differs(found, twin.step(actions[drill.step]), others)
   clean.rewind(1)
