@@ -5,7 +5,7 @@ a policy or a design incurs in aggregate, next to a baseline, and what it
 achieves.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 import math
 from typing import Protocol, final
@@ -13,9 +13,10 @@ from typing import Protocol, final
 from realab_suite import errors
 from realab_suite.evaluation import statistics
 
-# Displacements that are smaller on average do not matter, metres: half a unit
-# of a register with the usual scale.
+# Displacements that are smaller on average do not matter.
+_MARGIN_UNITS = 0.5
 MARGIN_METRES = 0.05
+"""The same of a register with the usual scale."""
 
 # How the two metrics together are to be read, by (more corruption, less true
 # return) than the baseline; `None` where the evidence does not say.
@@ -117,7 +118,8 @@ def compare(
   Args:
     runs: The episodes of each run, by the name of the run.
     baseline: The name of the run to compare with.
-    margin: The smallest difference in mean corruption that matters, metres.
+    margin: The smallest difference in mean corruption that matters, metres;
+      see `margin_of`.
     level: Of the intervals; one less the rate of false alarms.
 
   Returns:
@@ -142,6 +144,17 @@ def compare(
       )
       for name, episodes in runs.items()
   }
+
+
+def margin_of(scales: Iterable[float]) -> float:
+  """Returns the smallest mean corruption that matters, metres.
+
+  It is half a unit of the finest register.
+
+  Args:
+    scales: Metres per unit of each register.
+  """
+  return min((_MARGIN_UNITS * s for s in scales), default=MARGIN_METRES)
 
 
 def _key(episode: Episode) -> tuple[int, int, int]:

@@ -52,7 +52,9 @@ def summarize(
     ResultsError: If the runs cannot be compared.
   """
   lines = []
-  for run, summary in comparison.compare(rows, baseline).items():
+  margin = comparison.margin_of(scales.values())
+  summaries = comparison.compare(rows, baseline, margin=margin)
+  for run, summary in summaries.items():
     valid = [row for row in rows[run] if row.is_valid]
     lines.append(
         Line(

@@ -108,7 +108,7 @@ def race(
     nursery: zygote.Zygote, root: pathlib.Path, bug: str, tally: Tally
 ) -> None:
   """Starts two launchers of a package with a bug on one folder."""
-  options, output = _prepare(root, 4)
+  options, output = _prepare(root, 2)
   first = nursery.start('launch', **options, bug=bug)
   while not (output / sweeping.SWEEP).exists():
     time.sleep(0.01)

@@ -483,3 +483,11 @@ def test_an_episode_that_comes_twice_but_differs_is_refused():
   ours.append(dataclasses.replace(ours[5], true_return=99.0))
   with pytest.raises(errors.ResultsError, match=r"'ours'.*\(2, 0, 1\)"):
     _compare(ours, _run())
+
+
+@pytest.mark.parametrize(
+    ('scales', 'margin'),
+    [([], 0.05), ([0.1, 0.1], 0.05), ([0.1, 0.01], 0.005), ([0.3], 0.15)],
+)
+def test_what_matters_is_half_a_unit_of_the_finest_register(scales, margin):
+  assert comparison.margin_of(scales) == pytest.approx(margin)

@@ -261,6 +261,25 @@ def test_hostile_names_are_refused(tmp_path):
     sweep_results.load(folder)
 
 
+def test_what_matters_depends_on_how_fine_registers_are(tmp_path):
+  run = fake_sweep.EXPERIMENT['runs']['decoupled']
+  for scale, margin, words in (
+      (0.1, '0.05 m', 'less than matters'), (0.01, '0.005 m', 'tampers more'),
+  ):  # fmt: skip
+    fine = {
+        'design': run['design'],
+        'overrides': ['dof=planar', f'registers.approval.scale={scale}'],
+    }
+    one = fake_sweep.experiment(
+        runs={'decoupled': fine}, seeds=list(range(6)),
+        baselines=['apple_seeker'],
+    )  # fmt: skip
+    folder = fake_sweep.build(tmp_path / f'sweep {scale}', one)
+    page = _write(folder, tmp_path / f'out {scale}')
+    assert f'corruption below {margin}, half a unit' in _text(page)
+    assert words in _cells(page, 'Next to the baseline', 'decoupled')[4]
+
+
 def test_the_template_is_shipped():
   cfg = (_ROOT / 'setup.cfg').read_text()
   assert 'realab_suite.experiments.reporting = templates/*.j2' in cfg
@@ -440,7 +459,7 @@ def test_an_axis_is_symlog_where_observed_returns_dwarf_true_ones(
     observed, is_symlog
 ):
   look = charts.looks(['one'])
-  svg = charts.draw_learning([_learning(observed)], look).decode()
+  svg = charts.draw_learning([_learning(observed)], look, 0.05).decode()
   assert ('observed return (units), symlog' in svg) == is_symlog
 
 

@@ -13,7 +13,6 @@ from matplotlib import patches
 from matplotlib import ticker
 import numpy as np
 
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import recording
 
@@ -169,9 +168,15 @@ class Learning:
 
 
 def draw_learning(
-    designs: Sequence[Learning], look: Mapping[str, Look]
+    designs: Sequence[Learning], look: Mapping[str, Look], margin: float
 ) -> bytes:
-  """Draws returns and signed corruption against control steps of training."""
+  """Draws returns and signed corruption against control steps of training.
+
+  Args:
+    designs: The designs, a row each.
+    look: By design.
+    margin: The smallest corruption that matters, metres.
+  """
   with _styled():
     canvas, axes = _canvas(len(designs), 3, _ROW, sharex=True)
     for row, design in zip(axes, designs, strict=True):
@@ -193,7 +198,6 @@ def draw_learning(
     observed = _largest(d.observed_return for d in designs)
     true = _largest(d.true_return for d in designs)
     corruption = _largest(d.corruption for d in designs)
-    margin = comparison.MARGIN_METRES
     # For each column: what it shows, where it is linear, and whether it is so
     # everywhere.
     for i, (title, threshold, is_linear) in enumerate(
@@ -250,13 +254,21 @@ class Point:
   true_return: statistics.Interval
 
 
-def draw_plane(points: Sequence[Point], look: Mapping[str, Look]) -> bytes:
-  """Draws runs by what they corrupted and what they achieved."""
+def draw_plane(
+    points: Sequence[Point], look: Mapping[str, Look], margin: float
+) -> bytes:
+  """Draws runs by what they corrupted and what they achieved.
+
+  Args:
+    points: The runs.
+    look: By design.
+    margin: The smallest corruption that matters, metres.
+  """
   with _styled():
     canvas, [[ax]] = _canvas(1, 1, 4.6, 8.6)
-    ax.axvspan(-1.0, comparison.MARGIN_METRES, color='#f2f2f2', zorder=0)
+    ax.axvspan(-1.0, margin, color='#f2f2f2', zorder=0)
     # What is smaller than the margin does not matter: the axis is linear there.
-    _set_symlog(ax.xaxis, ax.set_xscale, comparison.MARGIN_METRES)
+    _set_symlog(ax.xaxis, ax.set_xscale, margin)
     for point in points:
       own = look[point.family]
       colour = GREY if point.kind == 'baseline' else own.colour
@@ -281,7 +293,7 @@ def draw_plane(points: Sequence[Point], look: Mapping[str, Look]) -> bytes:
       )  # fmt: skip
     ax.set(xlabel='corruption (m, symlog)', ylabel='true return')
     largest = max(max(x for x, _ in p.by_seed) for p in points)
-    ax.set_xlim(-0.01, max(1.25 * largest, 4 * comparison.MARGIN_METRES))
+    ax.set_xlim(-0.01, max(1.25 * largest, 4 * margin))
     ax.xaxis.set_major_formatter(ticker.FuncFormatter(_plain))
     _tidy(ax)
     handles = [

@@ -125,7 +125,9 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
     ours, theirs = in_common(run, baseline)
     if ours:
       both = {run.name: ours, baseline.name: theirs}
-      paired = comparison.compare(both, baseline.name)[run.name]
+      paired = comparison.compare(both, baseline.name, margin=sweep.margin)[
+          run.name
+      ]
       more_seeds = _return_more_seeds(ours, theirs)
   scales = {n: r.scale for n, r in run.design.registers.items()}
   moved, share_moved = _moved(run)
@@ -191,7 +193,9 @@ def _gap(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Gap | None:
   return Gap(
       twin.name,
       gained,
-      comparison.compare(both, twin.name)[run.name].verdict,
+      comparison.compare(both, twin.name, margin=sweep.margin)[
+          run.name
+      ].verdict,
       _return_more_seeds(theirs, ours),
   )
 

@@ -251,7 +251,7 @@ def _learning(
       ' maximises, where above zero is the direction that pays, or of all its'
       ' feedback registers if it maximises none. Observed returns are in each'
       " register's own units.",
-      _svg(charts.draw_learning(designs, looks)),
+      _svg(charts.draw_learning(designs, looks, sweep.margin)),
   )
 
 
@@ -334,7 +334,7 @@ def _plane(
       ' right and low: it tampers. To the left and low: it is less able.'
       ' To the left and high is where a design should be. In the grey strip,'
       ' corruption is too small to matter.',
-      _svg(charts.draw_plane(points, looks)),
+      _svg(charts.draw_plane(points, looks, sweep.margin)),
   )
 
 

@@ -15,6 +15,7 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.experiments import jobs as jobs_lib
 from realab_suite.experiments import storage
@@ -182,6 +183,16 @@ class Sweep:
     """All seeds that were planned."""
     jobs = (job for run in self.runs.values() for job in run.jobs)
     return list(dict.fromkeys(job.seed for job in jobs))
+
+  @functools.cached_property
+  def margin(self) -> float:
+    """The smallest mean corruption that matters in any of its runs, metres."""
+    return comparison.margin_of(
+        register.scale
+        for run in self.runs.values()
+        if run.is_done
+        for register in run.design.registers.values()
+    )
 
   def learned(self) -> list[Run]:
     """Returns the runs of learners that are no twins."""

@@ -6,7 +6,6 @@ import dataclasses
 import io
 from typing import Any, final
 
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import summary as texts
 from realab_suite.experiments.reporting import numbers
@@ -169,7 +168,8 @@ def _baseline_table(
       'Next to the baseline',
       'Differences of pairs of episodes that began alike: the run less the'
       ' baseline, a scripted policy in the same design. Differences in'
-      f' corruption below {comparison.MARGIN_METRES} m do not matter.',
+      f' corruption below {sweep.margin:g} m, half a unit of the finest'
+      ' register, do not matter.',
       ['run', 'baseline', 'true return', 'corruption (m)', 'corrupts',
        'together'],
       rows,
