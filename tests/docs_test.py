@@ -5,8 +5,11 @@ import re
 import runpy
 
 import pytest
+import yaml
 
 from realab_suite import suite
+from realab_suite.experiments import probes
+from realab_suite.experiments import spec
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 
@@ -50,6 +53,16 @@ def test_ones_own_register_provider_and_task_take_under_thirty_lines():
   assert len(blocks) >= 5
   for block in blocks:
     assert len(block.splitlines()) < _MAX_LINES, block
+
+
+def test_the_experiment_of_the_page_is_one_that_can_be_run():
+  page = (_ROOT / 'docs/experiments.md').read_text()
+  [text] = re.findall(r'```yaml\n(schema: 1\n.*?)```', page, re.DOTALL)
+  experiment = spec.load(yaml.safe_load(text))
+  for run in experiment.runs.values():
+    for channel in (None, spec.TWIN):
+      # A probe needs discrete actions.
+      assert probes.find_register(run.load(channel)) == 'reward'
 
 
 def test_the_example_in_a_task_of_dm_control_runs(capsys):

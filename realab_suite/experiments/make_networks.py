@@ -1,6 +1,6 @@
 r"""Trains the networks that supervisors run, and writes them into files.
 
-  python -m realab_suite.experiments.make_networks --output=configs/networks
+  python -m realab_suite.experiments.make_networks --output=results/networks
 
 Each learns for some minutes from the reading of a reward register that nothing
 can tamper with, so from the true reward, and sees the senses of an agent but no
@@ -35,6 +35,11 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.experiments import network_making
   from realab_suite.experiments import storage
 
+  paths = {name: output / f'{name}.npz' for name in network_making.RECIPES}
+  for path in paths.values():
+    if path.exists():
+      # Designs name networks, and would not notice that one has changed.
+      raise errors.SpecError(f'{path} is there already; name another folder')
   for name, recipe in network_making.RECIPES.items():
     network = network_making.make(recipe)
     for reached in network.header.reached:
@@ -44,8 +49,8 @@ def main(argv: Sequence[str]) -> None:
       )
     with storage.explained(output):
       output.mkdir(parents=True, exist_ok=True)
-    storage.write_whole(output / f'{name}.npz', network.to_bytes())
-    cli.say(f'{output / name}.npz has been written')
+    storage.write_whole(paths[name], network.to_bytes())
+    cli.say(f'{paths[name]} has been written')
 
 
 if __name__ == '__main__':

@@ -15,8 +15,10 @@ from absl import flags
 from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
+from realab_suite.experiments import imports_flag
 from realab_suite.experiments import output_flag
 
+flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(output_flag)
 _INPUT = flags.DEFINE_string(
     'input', None, 'The folder of a sweep: what its --output named.'
@@ -39,6 +41,7 @@ def main(argv: Sequence[str]) -> None:
   # Not before a renderer has been chosen: this imports dm_control.
   from realab_suite.experiments.reporting import page
 
+  imports_flag.load()
   chosen = output_flag.OUTPUT.value
   output = folder if chosen is None else pathlib.Path(chosen)
   path = page.write(folder, output, cli.say, no_clips)

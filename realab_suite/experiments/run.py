@@ -24,12 +24,14 @@ from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import episodes_flag
 from realab_suite.experiments import headless
+from realab_suite.experiments import imports_flag
 from realab_suite.experiments import learning_flags
 from realab_suite.experiments import output_flag
 from realab_suite.experiments import threads
 
 flags.adopt_module_key_flags(cli)
 flags.adopt_module_key_flags(episodes_flag)
+flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(learning_flags)
 flags.adopt_module_key_flags(output_flag)
 _POLICIES = flags.DEFINE_list(
@@ -87,6 +89,7 @@ def main(argv: Sequence[str]) -> None:
   # Not before a renderer has been chosen: this imports dm_control.
   from realab_suite.experiments import experiment
 
+  imports_flag.load()
   settings = experiment.Settings(
       domain=cli.DOMAIN.value,
       task=cli.TASK.value,
@@ -126,6 +129,7 @@ def _train() -> None:
   from realab_suite.experiments import spec
   from realab_suite.experiments import training
 
+  imports_flag.load()
   experiment = spec.load(cli.required(learning_flags.EXPERIMENT))
   [job] = jobs.plan(experiment, [cli.SEED.value], [run])
   options = training.Options(

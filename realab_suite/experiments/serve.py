@@ -22,10 +22,12 @@ from realab_suite import errors
 from realab_suite.experiments import cli
 from realab_suite.experiments import episodes_flag
 from realab_suite.experiments import headless
+from realab_suite.experiments import imports_flag
 from realab_suite.experiments import output_flag
 
 flags.adopt_module_key_flags(cli)
 flags.adopt_module_key_flags(episodes_flag)
+flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(output_flag)
 _NAME = flags.DEFINE_string(
     'name', 'agent', 'What the agent is called in the results.'
@@ -81,6 +83,7 @@ def main(argv: Sequence[str]) -> None:
   # Not before a renderer has been chosen: this imports dm_control.
   from realab_suite.experiments import serving
 
+  imports_flag.load()
   settings = serving.Settings(
       domain=domain,
       task=task,

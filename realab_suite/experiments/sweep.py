@@ -15,10 +15,12 @@ from absl import flags
 
 from realab_suite.experiments import cli
 from realab_suite.experiments import headless
+from realab_suite.experiments import imports_flag
 from realab_suite.experiments import learning_flags
 from realab_suite.experiments import output_flag
 from realab_suite.experiments import threads
 
+flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(learning_flags)
 flags.adopt_module_key_flags(output_flag)
 _RUNS = flags.DEFINE_list(
@@ -60,9 +62,12 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.experiments import spec
   from realab_suite.experiments import sweeping
 
+  imports_flag.load()
   experiment = spec.load(name)
   if learning_flags.TENSORBOARD.value:
     curves.check_tensorboard()
+  arguments = imports_flag.arguments()
+  arguments += ['--tensorboard'] * learning_flags.TENSORBOARD.value
   engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
   sweeping.sweep(
       experiment,
@@ -71,7 +76,7 @@ def main(argv: Sequence[str]) -> None:
       cli.say,
       only=_RUNS.value,
       calibration=_CALIBRATION.value,
-      arguments=['--tensorboard'] * learning_flags.TENSORBOARD.value,
+      arguments=arguments,
   )
 
 

@@ -1,5 +1,8 @@
+import ast
+import importlib
 import os
 import pathlib
+import re
 import subprocess
 import sys
 import types
@@ -7,10 +10,13 @@ import types
 from absl import flags
 from absl.testing import flagsaver
 import pytest
+import yaml
 
 from realab_suite import _display
+from realab_suite import errors
 from realab_suite import explore
 from realab_suite.experiments import headless
+from realab_suite.experiments import imports_flag
 from realab_suite.experiments import run
 from tests.experiments import small
 
@@ -79,6 +85,46 @@ def test_what_is_wrong_with_a_command_is_said_in_one_line(arguments, complaint):
 )
 def test_seeds_are_a_count_or_a_list(text, seeds):
   assert run._seeds(text) == seeds
+
+
+def test_ones_own_module_is_imported_by_every_launcher(tmp_path):
+  # The register, the provider, the task and the design of the page.
+  page = (_ROOT / 'docs' / 'your_own.md').read_text()
+  blocks = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+  [design] = re.findall(
+      r'^design = (\{\n.*?^\})', page, re.DOTALL | re.MULTILINE
+  )
+  (tmp_path / 'mine.py').write_text(
+      '\n'.join(b for b in blocks if 'class ' in b)
+  )
+  (tmp_path / 'watched.yaml').write_text(
+      yaml.safe_dump(ast.literal_eval(design))
+  )
+  arguments = [
+      '--domain=stay', '--policies=no_op', '--seeds=1', '--episodes=1',
+      '--max_steps=3', '--noplots', '--novideos', '--import=mine',
+      f'--design={tmp_path / "watched.yaml"}', f'--output={tmp_path / "out"}',
+  ]  # fmt: skip
+  ran = _run(*arguments, PYTHONPATH=str(tmp_path))
+  assert (ran.returncode, ran.stderr) == (0, '')
+  [row] = small.rows(tmp_path / 'out')
+  assert row.info.domain == 'stay'
+  for module in ('run', 'sweep', 'report', 'serve'):
+    importlib.import_module(f'realab_suite.experiments.{module}')
+    assert 'import' in {
+        flag.name
+        for flag in flags.FLAGS.get_key_flags_for_module(
+            f'realab_suite.experiments.{module}'
+        )
+    }
+
+
+def test_a_sweep_tells_its_runs_what_to_import():
+  with flagsaver.flagsaver():
+    flags.FLAGS(['program', '--import=one', '--import=two'])
+    assert imports_flag.arguments() == ['--import=one', '--import=two']
+    with pytest.raises(errors.SpecError, match='--import=one: No module named'):
+      imports_flag.load()
 
 
 def test_where_nothing_renders_exploring_ends_with_one_line(tmp_path):

@@ -53,6 +53,9 @@ class Incentive:
     register: The register.
     course: Signed and absolute corruption over the course of learning.
     end: The same in its last tenth.
+    judged: The signed corruption of the policy that was learned, in the
+      episodes that it was judged by, units.
+    judged_metres: The same, metres.
     probe: By what it is compared with, what the policy would do where
       tampering is at hand.
   """
@@ -60,6 +63,8 @@ class Incentive:
   register: str
   course: signed_corruption.Window | None
   end: signed_corruption.Window | None
+  judged: statistics.Interval | None
+  judged_metres: statistics.Interval | None
   probe: Mapping[str, incentives.Summary]
 
 
@@ -283,12 +288,13 @@ def incentives_of(run: sweep_results.Run) -> list[Incentive]:
       if (probe := probes.load(path)) is not None
   }
   return [
-      _incentive(register, records, found)
+      _incentive(run, register, records, found)
       for register in signed_corruption.paying_registers(run.design)
   ]
 
 
 def _incentive(
+    run: sweep_results.Run,
     register: str,
     records: Mapping[int, Sequence[Mapping[str, Any]]],
     found: Mapping[int, incentives.Probe],
@@ -308,8 +314,22 @@ def _incentive(
       register,
       course[0],
       windows[-1],
+      _judged(run, register, 1.0),
+      _judged(run, register, run.design.registers[register].scale),
       {
           other: incentives.combine(own, probes.LEARNER, other)
           for other in sorted(others)
       },
   )
+
+
+def _judged(
+    run: sweep_results.Run, register: str, scale: float
+) -> statistics.Interval | None:
+  """Returns the mean signed corruption in the episodes of judgement."""
+
+  def signed(row: results.EpisodeRow) -> float | None:
+    units = row.registers[register].corruption_signed
+    return None if units is None else scale * units
+
+  return _interval([row for row in run.rows if row.is_valid], signed)

@@ -229,6 +229,10 @@ def _incentive_table(
             texts.interval_text(window and window.signed_metres),
             texts.interval_text(window and window.signed),
         ]
+      cells += [
+          texts.interval_text(one.judged_metres),
+          texts.interval_text(one.judged),
+      ]
       for other in others:
         summary = one.probe.get(other)
         cells.append(texts.interval_text(summary and summary.signed_metres))
@@ -248,6 +252,7 @@ def _incentive_table(
       f' Honest agents bump into blocks, but in no direction.{probed}',
       ['run', 'register', 'signed, while learning (m)', '(units)',
        'signed, at its end (m)', '(units)',
+       'signed, when judged (m)', '(units)',
        *(f'probe, next to {other} (m)' for other in others)],
       rows,
       families,
@@ -352,6 +357,8 @@ def _record(
       prefix = f'{i.register}_signed_{when}'
       intervals[f'{prefix}_metres'] = window and window.signed_metres
       intervals[prefix] = window and window.signed
+    intervals[f'{i.register}_signed_judged_metres'] = i.judged_metres
+    intervals[f'{i.register}_signed_judged'] = i.judged
     for other, probed in i.probe.items():
       prefix = f'{i.register}_probe_{other}'
       intervals[f'{prefix}_signed_metres'] = probed.signed_metres
