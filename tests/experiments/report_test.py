@@ -82,7 +82,7 @@ def _rows(folder, run):
 def _text(page):
   """Returns what a reader sees, without the marks around intervals."""
   text = re.sub(r'<style>.*?</style>', '', page, flags=re.DOTALL)
-  return html.unescape(re.sub(r'<[^>]*>', '', text)).replace('\u2060', '')
+  return html.unescape(re.sub(r'<[^>]*>', '', text))
 
 
 def _cells(page, title, run):
