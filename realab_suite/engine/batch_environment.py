@@ -454,9 +454,7 @@ class BatchEnvironment:
     reward = self._true_reward()
     reward[was_over] = 0.0
     discount = self._of_all(task.get_discount(physics), float)
-    is_over = self._of_all(task.should_terminate_episode(physics), bool)
-    # Nobody knows of an end that the meters have not seen.
-    discount[(discount != 1.0) & ~is_ending & is_over] = 1.0
+    discount[~is_ending] = 1.0
     mechanism.end_step(physics, np.where(np.isfinite(reward), reward, 0.0))
     return records, reward, discount, is_ending
 

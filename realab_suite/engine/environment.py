@@ -344,11 +344,12 @@ class Environment(composer.Environment):
     self._provider_states = self._mechanism.initial_states(())
     records: list[Any] = [*self._mechanism.initial_writes(self._physics)]
     records += self._observe()
-    self._reset_next_step = False
-    self._episode_is_open = True
     start = events.Start(self._seed, self._world, self._episode, records)
     for sink in self._sinks:
       sink.episode_started(start, self._physics_proxy)
+    # Unless all have heard of its beginning, there is no episode.
+    self._reset_next_step = False
+    self._episode_is_open = True
     return dm_env.restart(self._copy_of_observation())
 
   def step(self, action: Any) -> dm_env.TimeStep:
@@ -441,8 +442,8 @@ class Environment(composer.Environment):
     physics.forward()
     reward = 0.0 if was_over else self._true_reward()
     discount = float(self._task.get_discount(physics))
-    if discount != 1.0 and not is_ending and self._is_over():
-      discount = 1.0  # Nobody knows of the end yet.
+    if not is_ending:
+      discount = 1.0  # Of an end that the meters have not seen, nobody knows.
     mechanism.end_step(physics, reward if math.isfinite(reward) else 0.0)
     records += self._observe()
     return events.Step(records, np.array(reward)), discount, is_ending

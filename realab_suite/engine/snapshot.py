@@ -9,8 +9,10 @@ from collections.abc import Callable, Mapping
 import hashlib
 import io
 import json
+import math
 from typing import Any, NamedTuple, Self, final
 import zipfile
+import zlib
 
 import mujoco
 import numpy as np
@@ -30,12 +32,14 @@ _MALFORMED = (
     AttributeError,
     EOFError,
     LookupError,
+    MemoryError,
     NotImplementedError,
     OSError,
     RecursionError,
     TypeError,
     ValueError,
     zipfile.BadZipFile,
+    zlib.error,
 )
 
 
@@ -332,6 +336,9 @@ def _decode(node: Any, arrays: list[np.ndarray]) -> Any:
 
 def _read(payload: bytes) -> tuple[dict[str, Any], Any]:
   """Returns the header and the contents that are in a snapshot's bytes."""
+  with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+    for member in archive.infolist():
+      _check_size(archive, member)
   with np.load(io.BytesIO(payload), allow_pickle=False) as file:
     header, tree = json.loads(file[_STRUCTURE].tobytes())
     if header['format'] != _FORMAT:
@@ -340,6 +347,27 @@ def _read(payload: bytes) -> tuple[dict[str, Any], Any]:
       )
     arrays = [file[str(i)] for i in range(len(file.files) - 1)]
   return header, _decode(tree, arrays)
+
+
+def _check_size(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
+  """Checks that an array is as large as it says, before room is made for it.
+
+  Raises:
+    ValueError: If it is not.
+  """
+  if member.compress_type != zipfile.ZIP_STORED:
+    raise ValueError(f'{member.filename!r:.40} is compressed')
+  with archive.open(member) as file:
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+      raise ValueError(f'{member.filename!r:.40} is of version {version}')
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    size = math.prod(shape) * dtype.itemsize
+    if size != member.file_size - file.tell():
+      raise ValueError(
+          f'{member.filename!r:.40} says that it has {size} bytes; there are'
+          f' {member.file_size - file.tell()}'
+      )
 
 
 def _difference(key: str, saved: Any, here: Any) -> str:

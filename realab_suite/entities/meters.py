@@ -45,5 +45,5 @@ class Meter:
     """
     measured = np.array(self._measurement(physics), np.float64)[()]
     if idle is not None:
-      measured = np.where(idle, self._register.applied(physics), measured)
+      measured = np.where(idle, self._register.keep(physics), measured)
     return measured, self._register.write(physics, measured)

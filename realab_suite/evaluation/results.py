@@ -204,7 +204,8 @@ class RowWriter:
       ResultsError: If there is one already, or it cannot be made.
     """
     try:
-      self._file = open(path, 'xb')
+      # What could not be written is not tried again when the file is closed.
+      self._file = open(path, 'xb', buffering=0)
     except OSError as error:
       raise errors.ResultsError(
           f'cannot make {os.fspath(path)}: {error.strerror}'
@@ -212,9 +213,10 @@ class RowWriter:
 
   def write(self, one: EpisodeRow) -> None:
     """Appends a row."""
+    rest = line(one)
     try:
-      self._file.write(line(one))
-      self._file.flush()
+      while rest:
+        rest = rest[self._file.write(rest) :]
       os.fsync(self._file.fileno())
     except OSError as error:
       raise errors.ResultsError(
@@ -280,7 +282,10 @@ def _parse(text: bytes) -> EpisodeRow:
   content += b'}'
   if not found or rest != _checksum(content) + b'"}':
     raise ValueError('its checksum does not agree: it is not what was written')
-  return EpisodeRow.model_validate(json.loads(content))
+  try:
+    return EpisodeRow.model_validate(json.loads(content))
+  except RecursionError as error:
+    raise ValueError('it is nested too deeply') from error
 
 
 def _checksum(text: bytes) -> bytes:

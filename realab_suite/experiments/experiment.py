@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
-import json
 import pathlib
 from typing import Any, NamedTuple, final
 
@@ -19,6 +18,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import aiming
 from realab_suite.experiments import recording
+from realab_suite.experiments import storage
 from realab_suite.experiments import summary as tables
 from realab_suite.feedback import policies
 from realab_suite.feedback import specs
@@ -109,11 +109,10 @@ def run(settings: Settings, say: Callable[[str], None]) -> list[tables.Line]:
   scales = {n: r.scale for n, r in runs[0].design.registers.items()}
   lines = tables.summarize(job.rows, baseline, scales)
   text = tables.as_text(lines)
-  (folder / 'summary.md').write_text(
-      f'{_title(settings)}\n\n{text}\n\n{tables.readings(lines)}\n',
-      encoding='utf-8',
-  )
-  tables.write_csv(lines, folder / 'summary.csv')
+  summary = f'{_title(settings)}\n\n{text}\n\n{tables.readings(lines)}\n'
+  storage.write_whole(folder / 'summary.md', summary.encode())
+  with storage.explained(folder):
+    tables.write_csv(lines, folder / 'summary.csv')
   say(f'\n{text}\n\nEverything is in {folder}')
   return lines
 
@@ -217,9 +216,9 @@ def _describe(
 ) -> None:
   """Writes what it takes to repeat the experiment."""
   for design in {run.design.channel: run.design for run in runs}.values():
-    (folder / f'design_{design.channel}.yaml').write_text(
-        yaml.safe_dump(design.to_mapping(), sort_keys=False), encoding='utf-8'
-    )
+    text = yaml.safe_dump(design.to_mapping(), sort_keys=False)
+    path = folder / f'design_{design.channel}.yaml'
+    storage.write_whole(path, text.encode())
   version, digest = suite.dynamics(settings.domain, settings.task)
   description = {
       'settings': dataclasses.asdict(settings),
@@ -228,9 +227,7 @@ def _describe(
       'dynamics': {'version': version, 'digest': digest},
       'versions': results.versions(),
   }
-  (folder / 'run.json').write_text(
-      json.dumps(description, indent=2) + '\n', encoding='utf-8'
-  )
+  storage.write_json(folder / 'run.json', description)
 
 
 @final

@@ -29,6 +29,7 @@ flags.adopt_module_key_flags(cli)
 flags.adopt_module_key_flags(episodes_flag)
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(output_flag)
+_MOST_SECONDS = 1e6
 _NAME = flags.DEFINE_string(
     'name', 'agent', 'What the agent is called in the results.'
 )
@@ -42,13 +43,11 @@ _IDLE_SECONDS = flags.DEFINE_float(
     'idle_seconds',
     60.0,
     'After how long a silence an agent loses its connection.',
-    lower_bound=0.0,
 )
 _PROVIDER_SECONDS = flags.DEFINE_float(
     'provider_seconds',
     60.0,
     'After how long a provider that has not answered fails, with the episode.',
-    lower_bound=0.001,
 )
 _AGENT_COMMAND = flags.DEFINE_string(
     'agent_command',
@@ -75,6 +74,12 @@ def main(argv: Sequence[str]) -> None:
   problem = headless.missing('dm_env_rpc', 'grpc', extra='rpc')
   if problem is not None:
     raise errors.SpecError(problem)
+  for seconds in (_IDLE_SECONDS, _PROVIDER_SECONDS):
+    if not 0 < seconds.value <= _MOST_SECONDS:  # Nor is nan.
+      raise errors.SpecError(
+          f'--{seconds.name}={seconds.value:g}; allowed is more than 0, and at'
+          f' most {_MOST_SECONDS:g}'
+      )
   domain, task = _world()
   headless.render_nothing()
   # gRPC looks once, too. A process that serves never forks; what it starts

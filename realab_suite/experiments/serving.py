@@ -4,14 +4,13 @@ from collections.abc import Callable, Iterator
 import contextlib
 import ctypes
 import dataclasses
-import json
 import os
 import pathlib
 import shutil
 import signal
 import sys
 import tempfile
-from typing import Any, NoReturn, final
+from typing import Any, final
 
 from absl import logging
 
@@ -21,6 +20,7 @@ from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment
+from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import served_world
@@ -106,7 +106,8 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
       stack.callback(shutil.rmtree, folder, ignore_errors=True)
       address = f'unix:{folder}/socket'
     output = experiment.make_folder(settings.output)
-    output.chmod(0o700)
+    with storage.explained(output):
+      output.chmod(0o700)
     _describe(settings, design, output)
     writer = stack.enter_context(results.RowWriter(output / 'episodes.jsonl'))
     evaluator = _Evaluator(_info(settings, design, env), writer, say)
@@ -114,21 +115,24 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
         env, address, settings.num_episodes, evaluator.write
     )
     listener = server.Server(world, address, settings.idle_seconds, owner)
-    listener.start()
+    agent = None
+    with _removed_if_refused(output):
+      listener.start()
+      stack.callback(listener.close)
+      if settings.agent_command is not None:
+        with storage.explained(output):
+          log = stack.enter_context(open(output / 'agent.log', 'wb'))
+        agent = agent_process.AgentProcess(
+            settings.agent_command,
+            listener.address,
+            log,
+            folder=settings.agent_folder,
+            owner=owner,
+            on_exit=listener.stop,
+        )
+        stack.callback(agent.stop)
     say(f'serving {settings.domain}.{settings.task} at {listener.address}')
     signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
-    agent = None
-    if settings.agent_command is not None:
-      log = stack.enter_context(open(output / 'agent.log', 'wb'))
-      agent = agent_process.AgentProcess(
-          settings.agent_command,
-          listener.address,
-          log,
-          folder=settings.agent_folder,
-          owner=owner,
-          on_exit=listener.stop,
-      )
-      stack.callback(agent.stop)
     listener.run()
     _complain_of_missing(evaluator.num_written, settings, agent, output)
     say(f'Everything is in {settings.output}')
@@ -147,6 +151,16 @@ def hide_from_debuggers() -> None:
 
 
 @contextlib.contextmanager
+def _removed_if_refused(folder: pathlib.Path) -> Iterator[None]:
+  """Lets nothing be in the way of the same command, mended."""
+  try:
+    yield
+  except errors.SpecError:
+    shutil.rmtree(folder, ignore_errors=True)
+    raise
+
+
+@contextlib.contextmanager
 def deadline(seconds: float) -> Iterator[None]:
   """Ends what takes too long; for the main thread, which alone gets signals.
 
@@ -155,9 +169,11 @@ def deadline(seconds: float) -> Iterator[None]:
   Raises:
     TimeoutError: If it does.
   """
+  is_over = False
 
-  def ring(*unused: Any) -> NoReturn:
-    raise TimeoutError(f'no answer within {seconds:g} s')
+  def ring(*unused: Any) -> None:
+    if not is_over:
+      raise TimeoutError(f'no answer within {seconds:g} s')
 
   before = signal.signal(signal.SIGALRM, ring)
   # Again and again: somebody may have caught the first one.
@@ -165,6 +181,7 @@ def deadline(seconds: float) -> Iterator[None]:
   try:
     yield
   finally:
+    is_over = True
     signal.setitimer(signal.ITIMER_REAL, 0)
     signal.signal(signal.SIGALRM, before)
 
@@ -234,9 +251,7 @@ def _describe(
       'design': design.to_mapping(),
       'versions': results.versions(),
   }
-  (output / 'run.json').write_text(
-      json.dumps(description, indent=2) + '\n', encoding='utf-8'
-  )
+  storage.write_json(output / 'run.json', description)
 
 
 def _complain_of_missing(

@@ -107,7 +107,7 @@ def read_json(path: pathlib.Path) -> Any:
     text = path.read_bytes()
   try:
     return json.loads(text)
-  except ValueError as error:
+  except (ValueError, RecursionError) as error:
     raise errors.ResultsError(f'{path}: not JSON: {error}') from error
 
 
@@ -291,7 +291,7 @@ class JsonLines:
     Args:
       path: The file.
       mark: How far it counts: what is behind that was written after the
-        checkpoint, and goes. `None` for all of it, whatever it is.
+        checkpoint, and goes. `None` for all whole lines, whatever they are.
 
     Raises:
       ResultsError: If it cannot be opened, is shorter, or is not what it was.
@@ -301,6 +301,9 @@ class JsonLines:
     with explained(path):
       self._file = open(path, 'a+b', buffering=0)
       if mark is None:
+        self._file.seek(0)
+        whole = self._file.read().rfind(b'\n') + 1
+        self._file.truncate(whole)
         return
       size = mark['size']
       self._file.seek(0)

@@ -156,7 +156,7 @@ class FeedbackMechanism(composer.Entity):
       self._meters.append((f'meter:{spec.measures}', meter))
 
   def guard_providers(self, guard: Guard) -> None:
-    """Has every step of a provider run within a context of its own.
+    """Has whatever a provider does run within a context of its own.
 
     Args:
       guard: Makes one; what it raises counts as raised by the provider.
@@ -205,8 +205,21 @@ class FeedbackMechanism(composer.Entity):
     return writes
 
   def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
-    """Returns the states of the providers before an episode."""
-    return [p.initial_state(batch_shape) for p in self._design.providers]
+    """Returns the states of the providers before an episode.
+
+    Raises:
+      FeedbackProviderError: If a provider or its guard raises.
+    """
+    states = []
+    for writer, provider in self._providers:
+      try:
+        with self._guard():
+          states.append(provider.initial_state(batch_shape))
+      except Exception as error:
+        raise errors.FeedbackProviderError(
+            f'{writer}, before the first step: {type(error).__name__}: {error}'
+        ) from error
+    return states
 
   def update_providers(
       self,
@@ -253,7 +266,7 @@ class FeedbackMechanism(composer.Entity):
       for name in provider.writes:
         register, value = self._registers[name], values[name]
         if idle is not None:
-          value = np.where(idle, register.applied(physics), value)
+          value = np.where(idle, register.keep(physics), value)
         try:
           applied = register.write(physics, value)
         except errors.RegisterValueError as error:
@@ -354,7 +367,7 @@ def _checked_writes(
   for name, value in values.items():
     try:
       number = np.asarray(value)
-    except ValueError as error:
+    except Exception as error:  # It may be of any class, or none.
       raise errors.FeedbackProviderError(
           f'{_where(writer, step)} wrote {value!r:.80} to {name!r}: {error}'
       ) from error

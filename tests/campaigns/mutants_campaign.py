@@ -423,9 +423,7 @@ MUTANTS = [
     ),
     Mutant(
         'storage', 'rows wait in memory', _RESULTS,
-        '''      self._file.flush()
-      os.fsync(self._file.fileno())
-''', '', _RES,
+        "open(path, 'xb', buffering=0)", "open(path, 'xb')", _RES,
     ),
 ]  # fmt: skip
 

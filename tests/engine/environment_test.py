@@ -20,6 +20,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.evaluation import ledger as ledgers
 from realab_suite.feedback import mechanism
 from tests import worlds
 from tests.engine import helpers
@@ -972,3 +973,41 @@ def test_no_other_private_parts_of_dm_control_are_used():
   inherited -= {name for name in private if name.startswith('_abc')}
   assert inherited == _PRIVATE_OF_DM_CONTROL_1_0_50
   assert private - set(vars(ours)) - assigned <= _PRIVATE_OF_DM_CONTROL_1_0_50
+
+
+def test_a_sink_that_fails_at_the_beginning_of_an_episode_leaves_none():
+  class Failing:
+    """Fails at the second beginning."""
+
+    def __init__(self):
+      self.count = 0
+
+    def episode_started(self, start, physics):
+      self.count += 1
+      if self.count == 2:
+        raise OSError('no room for a film')
+
+    def step_ended(self, step, physics):
+      """Films."""
+
+    def episode_ended(self, end):
+      """Closes the film."""
+
+  env = suite.load(
+      'collect_apples', 'near', {'random': 0}, {'max_steps': 3},
+      design='instantaneous_reward',
+  )  # fmt: skip
+  ledger = ledgers.Ledger()
+  env.add_sink(Failing())
+  env.add_sink(ledger)
+  action = helpers.no_op(env)
+  env.reset()
+  for _ in range(3):
+    env.step(action)
+  rewards = list(ledger.last.true_rewards)
+  with pytest.raises(OSError, match='no room'):
+    env.reset()
+  assert env.step(action).first()
+  assert [e.end for e in ledger.episodes] == [events.End.TIMEOUT, None]
+  assert ledger.episodes[0].true_rewards == rewards
+  env.close()

@@ -7,6 +7,7 @@ import pathlib
 import subprocess
 import sys
 from typing import Any
+import zipfile
 
 from dm_control.rl import control
 import hypothesis
@@ -507,3 +508,24 @@ def test_arrays_keep_their_order_in_memory():
 def test_floats_keep_their_last_bit():
   for value in (0.1 + 0.2, 5e-324, 1.7976931348623157e308, -0.0):
     assert _through_bytes(value).hex() == value.hex()
+
+
+@pytest.mark.parametrize('shape', [(10**15,), (2, 10**9), (3,)])
+def test_an_array_that_says_it_is_larger_than_it_is_is_refused(shape):
+  whole = snapshots.Snapshot({}, np.arange(4.0)).to_bytes()
+  start = len(snapshots._MAGIC) + 32
+  with zipfile.ZipFile(io.BytesIO(whole[start:])) as archive:
+    members = {name: archive.read(name) for name in archive.namelist()}
+  header = io.BytesIO()
+  np.lib.format.write_array_header_1_0(
+      header, {'descr': '<f8', 'fortran_order': False, 'shape': shape}
+  )
+  members['0.npy'] = header.getvalue() + members['0.npy'][-32:]
+  forged = io.BytesIO()
+  with zipfile.ZipFile(forged, 'w') as archive:
+    for name, data in members.items():
+      archive.writestr(name, data)
+  payload = forged.getvalue()
+  data = snapshots._MAGIC + hashlib.sha256(payload).digest() + payload
+  with pytest.raises(errors.StateLayoutError, match='says that it has'):
+    snapshots.Snapshot.from_bytes(data)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import meters
 from realab_suite.entities import registers
@@ -13,11 +14,15 @@ from tests import worlds
 class _World:
   """A score, a meter of it, and the register that the meter writes."""
 
-  def __init__(self, channel='embedded', **options):
+  def __init__(self, channel='embedded', value_range=(0, 10), **options):
     arena = arenas.OpenRoom()
     self.score = state.Slot(arena.mjcf_model, 'score')
     self.register = registers.TwoBlockRegister(
-        'score', value_range=(0, 10), role='meter', channel=channel, **options
+        'score',
+        value_range=value_range,
+        role='meter',
+        channel=channel,
+        **options,
     )
     self.register.attach_to(arena, (0.0, 0.0))
     self.meter = meters.Meter(self.score.get, self.register)
@@ -58,6 +63,16 @@ def test_what_was_measured_is_told_beside_what_could_be_stored(world):
   assert measured == 12.0
   assert applied == 10.0
   assert world.read() == pytest.approx(10.0, abs=1e-12)
+
+
+def test_a_meter_that_is_idle_keeps_what_fits_whatever_is_left_of_it():
+  world = _World(initial=2.0, on_overflow='error', value_range=(1, 10))
+  assert world.meter.update(world.physics, np.array(True)) == (2.0, 2.0)
+  # As MuJoCo leaves it when the physics have failed.
+  world.physics.data.userdata[:] = 0.0
+  assert world.meter.update(world.physics, np.array(True)) == (1.0, 1.0)
+  with pytest.raises(errors.RegisterValueError):
+    world.meter.update(world.physics, np.array(False))
 
 
 def test_what_was_measured_stays_what_it_was(world):

@@ -6,6 +6,7 @@ import json
 import math
 import pathlib
 import platform
+import resource
 from typing import Any
 from unittest import mock
 
@@ -486,3 +487,28 @@ def test_a_row_cannot_be_changed(given: Any):
   field = 'run' if isinstance(given, results.RunInfo) else 'true_return'
   with pytest.raises(pydantic.ValidationError, match='frozen'):
     setattr(given, field, 1)
+
+
+def test_a_row_that_did_not_fit_is_not_tried_again(tmp_path: pathlib.Path):
+  path = tmp_path / 'rows.jsonl'
+  writer = results.RowWriter(path)
+  writer.write(_row())
+  size = path.stat().st_size
+  soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+  resource.setrlimit(resource.RLIMIT_FSIZE, (size + 50, hard))
+  try:
+    with pytest.raises(errors.ResultsError, match='File too large'):
+      writer.write(_row())
+  finally:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+  writer.close()
+  assert path.stat().st_size == size + 50
+  with pytest.warns(UserWarning, match='the last 50 bytes'):
+    assert len(list(results.read_rows(path))) == 1
+
+
+def test_a_row_that_is_nested_without_end_is_none(tmp_path: pathlib.Path):
+  path = tmp_path / 'rows.jsonl'
+  path.write_bytes(results.sealed(b'{"a":' + b'[' * 100_000 + b'}'))
+  with pytest.raises(errors.ResultsError, match='nested too deeply'):
+    list(results.read_rows(path))

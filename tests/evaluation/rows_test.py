@@ -5,6 +5,7 @@ import pytest
 
 from realab_suite.evaluation import results
 from realab_suite.experiments import storage
+from realab_suite.feedback import validation
 from tests.campaigns import rows_campaign
 
 
@@ -34,9 +35,13 @@ def test_rows_that_are_not_read_are_counted_as_lost(monkeypatch):
   assert tally.unnoticed > 0
 
 
-@pytest.mark.parametrize('name', ['_checksum', '_digest'])
-def test_other_files_without_checksums_are_taken_for_whole(monkeypatch, name):
-  monkeypatch.setattr(storage, name, lambda content: '')
+@pytest.mark.parametrize(
+    ('module', 'name'), [(validation, 'digest_of'), (storage, '_digest')]
+)
+def test_other_files_without_checksums_are_taken_for_whole(
+    monkeypatch, module, name
+):
+  monkeypatch.setattr(module, name, lambda content: '')
   monkeypatch.setattr(storage, '_read_done', lambda path: {})
   _, others, taken = _damage(monkeypatch, 400)
   assert others == 40

@@ -208,3 +208,20 @@ def test_a_file_that_cannot_be_written_is_what_it_was(tmp_path, monkeypatch):
     storage.write_whole(path, b'new')
   assert path.read_bytes() == b'old'
   assert [one.name for one in tmp_path.iterdir()] == ['file']
+
+
+def test_half_a_line_goes_when_a_file_without_a_mark_is_opened_again(tmp_path):
+  path = tmp_path / 'timing.jsonl'
+  path.write_bytes(b'{"step": 1}\n{"st')
+  for step in (2, 3):
+    lines = storage.JsonLines(path)
+    lines.append([{'step': step}])
+    lines.close()
+  assert path.read_text() == '{"step": 1}\n{"step": 2}\n{"step": 3}\n'
+
+
+def test_json_without_an_end_is_refused(tmp_path):
+  path = tmp_path / 'deep.json'
+  path.write_text('[' * 100_000)
+  with pytest.raises(errors.ResultsError, match=r'deep\.json: not JSON'):
+    storage.read_json(path)

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Callable, Iterator, Mapping
+import contextlib
 import copy
 from typing import Any, Literal, final
 
@@ -448,6 +449,13 @@ _FIRST = r'providers\[0\]:test_scripted'
 _NAN = float('nan')
 
 
+class _NoArray:
+  """Raises what conversions are not known for."""
+
+  def __array__(self, *unused: Any, **unused_too: Any) -> Any:
+    raise RuntimeError('not an array')
+
+
 def _raise(observation: Any, readings: Any, state: Any) -> Any:
   raise KeyError('senses/nose')
 
@@ -485,6 +493,7 @@ _WRONG_ANSWERS: Mapping[str, tuple[_Answer, str]] = {
     'None': (lambda o, r, s: ({'reward': None}, s), _FIRST),
     'complex': (lambda o, r, s: ({'reward': 1j}, s), _FIRST),
     'an object': (lambda o, r, s: ({'reward': object()}, s), _FIRST),
+    'what is no array': (lambda o, r, s: ({'reward': _NoArray()}, s), _FIRST),
 }
 
 
@@ -505,6 +514,34 @@ def test_a_provider_that_does_what_it_did_not_declare_is_named(
   assert 'at step 2' in str(caught.value)
   assert '\n' not in str(caught.value)
   assert sink.ends == [events.End.ERROR]
+
+
+def test_a_provider_that_fails_before_the_first_step_is_named(monkeypatch):
+  entered = []
+
+  @contextlib.contextmanager
+  def guard():
+    entered.append(1)
+    yield
+
+  env, _ = _embed(_design())
+  env.mechanism.guard_providers(guard)
+  env.reset()
+  assert len(entered) == 1
+  env.step(helpers.no_op(env))
+  assert len(entered) == 2
+
+  def fail(self: Any, batch_shape: Any) -> Any:
+    raise OSError('no such file')
+
+  monkeypatch.setattr(_Scripted, 'initial_state', fail)
+  with pytest.raises(
+      errors.FeedbackProviderError, match=r'before the first step: OSError: no'
+  ):
+    env.reset()
+  monkeypatch.undo()
+  assert env.step(helpers.no_op(env)).first()
+  env.close()
 
 
 @pytest.mark.parametrize('value', [_NAN, float('inf'), -float('inf')])

@@ -23,12 +23,15 @@ from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.experiments import serving as serving_lib
 from realab_suite.feedback.providers import difference
+from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import server as rpc_server
 from realab_suite.interop.rpc import sockets
 from tests.engine import helpers
 from tests.interop import served
 
 _PYTHON = sys.executable
+_NOBODY = 65534
+_SETSID = 'setsid'
 _is_root = pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
 _is_linux = pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
 
@@ -283,6 +286,48 @@ def test_a_folder_that_others_may_enter_is_refused(tmp_path):
     rpc_server.Server(_Nothing(), f'unix:{tmp_path}/socket').start()
 
 
+def test_a_link_to_a_folder_is_refused(tmp_path):
+  (tmp_path / 'own').mkdir(mode=0o700)
+  (tmp_path / 'link').symlink_to(tmp_path / 'own')
+  with pytest.raises(errors.SpecError, match='is no folder of user'):
+    rpc_server.Server(_Nothing(), f'unix:{tmp_path}/link/socket').start()
+
+
+@_is_root
+def test_a_folder_of_somebody_else_is_refused(tmp_path):
+  (tmp_path / 'theirs').mkdir(mode=0o700)
+  os.chown(tmp_path / 'theirs', _NOBODY, _NOBODY)
+  address = f'unix:{tmp_path}/theirs/socket'
+  for owner in (None, (_NOBODY, _NOBODY)):
+    with pytest.raises(errors.SpecError, match='is no folder of user 0'):
+      rpc_server.Server(_Nothing(), address, owner=owner).start()
+
+
+@_is_root
+def test_a_folder_is_for_the_group_of_whoever_connects_now(tmp_path):
+  folder = tmp_path / 'own'
+  for group in (_NOBODY, _NOBODY - 1):
+    with sockets.prepared(f'unix:{folder}/socket', (_NOBODY, group)):
+      (folder / 'socket').touch()
+    status = folder.stat()
+    assert (status.st_mode & 0o777, status.st_gid) == (0o710, group)
+    (folder / 'socket').unlink()
+  with pytest.raises(errors.SpecError, match='cannot make folder'):
+    with sockets.prepared(f'unix:{tmp_path}/a/b/s', (_NOBODY, _NOBODY)):
+      pass
+
+
+def test_a_port_is_not_for_one_user_alone():
+  with pytest.raises(errors.SpecError, match='anybody could connect'):
+    rpc_server.Server(_Nothing(), 'localhost:0', owner=(1, 1)).start()
+
+
+@_is_root
+def test_nothing_can_be_kept_from_root():
+  with pytest.raises(errors.SpecError, match='is root'):
+    agent_process.owner_of('root')
+
+
 def test_a_socket_is_its_users_alone(serving):
   path = sockets.path_of(serving.address)
   assert path.parent.stat().st_mode & 0o777 == 0o700
@@ -318,6 +363,32 @@ def test_a_port_of_this_machine_can_be_served():
   stream.close()
   server.stop()
   thread.join()
+
+
+def test_what_breaks_off_an_answer_leaves_nobody_waiting(tmp_path):
+  # Python waits for the threads of pools when it ends.
+  program = f"""
+import threading
+from realab_suite.interop.rpc import server
+from tests.interop import served, served_test
+def interrupt(request):
+  raise KeyboardInterrupt
+world = served_test._Nothing()
+world.answer = interrupt
+made = server.Server(world, 'unix:{tmp_path}/s/socket')
+made.start()
+stream = served.RawStream(made.address)
+threading.Thread(target=stream.ask, args=(b'x',), daemon=True).start()
+try:
+  made.run()
+except KeyboardInterrupt:
+  raise SystemExit(7)
+"""
+  ran = subprocess.run(
+      [_PYTHON, '-c', program], cwd=served.ROOT, timeout=20, check=False,
+      stderr=subprocess.DEVNULL,
+  )  # fmt: skip
+  assert ran.returncode == 7
 
 
 def test_a_server_does_not_survive_a_fork(tmp_path):
@@ -423,6 +494,9 @@ def test_an_agent_that_ends_too_early_is_told_of_in_one_line(tmp_path):
         (['--output=x', '--target=y'], '--target'),
         (['--output=x', '--agent_user=nobody_of_that_name'], 'agent_user'),
         (['--output=/proc/x'], '/proc/x'),
+        (['--output=x', '--provider_seconds=inf'], '--provider_seconds=inf'),
+        (['--output=x', '--idle_seconds=nan'], '--idle_seconds=nan'),
+        (['--output=x', '--idle_seconds=0'], '--idle_seconds=0'),
     ],
 )
 def test_what_is_wrong_with_a_command_is_said_in_one_line(flags, complaint):
@@ -435,6 +509,47 @@ def test_a_command_that_cannot_start_is_told_of(tmp_path):
   ran = _serve(f'--output={tmp_path / "r"}', '--agent_command=/no/such/agent')
   assert ran.returncode == 2
   assert 'cannot start' in ran.stderr.splitlines()[-1]
+  # The same command, mended, is not told that the folder is not empty.
+  assert not (tmp_path / 'r').exists()
+
+
+def _start_agent(command, log):
+  ended = threading.Event()
+  agent = agent_process.AgentProcess(command, 'unix:/x', log, on_exit=ended.set)
+  return agent, ended
+
+
+def test_an_agent_has_ended_though_its_children_say_something(tmp_path):
+  with open(tmp_path / 'log', 'wb') as log:
+    # A session of its own outlives the agent's group.
+    agent, ended = _start_agent(
+        f'sh -c "{_SETSID} sleep 20 & echo gone; exit 3"', log
+    )
+    assert ended.wait(5)
+    assert agent.poll() == 3
+    agent.stop()
+  assert (tmp_path / 'log').read_bytes() == b'gone\n'
+
+
+def test_the_log_of_an_agent_has_an_end(tmp_path, monkeypatch):
+  monkeypatch.setattr(agent_process, 'MAX_LOG_BYTES', 1000)
+  program = "for i in range(9): print('x' * 100_000, flush=True)"
+  with open(tmp_path / 'log', 'wb') as log:
+    agent, ended = _start_agent(f'{_PYTHON} -c "{program}"', log)
+    assert ended.wait(20)
+    assert agent.poll() == 0
+    agent.stop()
+  said = (tmp_path / 'log').read_bytes()
+  assert said.endswith(b'which has not been kept\n')
+  assert len(said) < 1000 + 2 * 65536
+
+
+def test_a_log_that_cannot_be_written_does_not_stop_an_agent(caplog):
+  with open('/dev/full', 'wb', buffering=0) as log:
+    agent, ended = _start_agent(f'{_PYTHON} -c "print(5 * 10**5 * \'x\')"', log)
+    assert ended.wait(20)
+    agent.stop()
+  assert 'the log of the agent ends here' in caplog.text
 
 
 def test_an_agent_that_does_not_want_to_end_is_ended(tmp_path):

@@ -277,6 +277,13 @@ class Register(composer.Entity):
     """Returns the value that was applied last, shape `(...)`."""
     return self._applied_slot.copy(physics)
 
+  def keep(self, physics: Any) -> np.ndarray:
+    """Returns what to write so that the register keeps its value, `(...)`.
+
+    What physics that have failed left of the value may be out of range.
+    """
+    return np.clip(self.applied(physics), self._low, self._high)[()]
+
   def inspect(self, physics: Any) -> Inspection:
     """Reads the register, and splits what is wrong by what a write will mend.
 

@@ -262,7 +262,7 @@ def from_bytes(data: bytes, where: str) -> Network:
   text = arrays.pop(_HEADER, np.zeros(0)).tobytes()
   try:
     content = json.loads(text)
-  except ValueError as error:
+  except (ValueError, RecursionError) as error:
     raise place.error(f'not a network: header: {error}') from error
   if not isinstance(content, dict):
     raise place.error('not a network: header: must be a mapping')

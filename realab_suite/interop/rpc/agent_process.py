@@ -9,7 +9,9 @@ import signal
 import subprocess
 import tempfile
 import threading
-from typing import IO, final
+from typing import IO, Any, final
+
+from absl import logging
 
 from realab_suite import errors
 
@@ -19,13 +21,18 @@ ADDRESS_VARIABLE = 'REALAB_ADDRESS'
 # All that an agent's environment has of the evaluator's.
 _ALLOWED_VARIABLES = ('PATH', 'LANG', 'LC_ALL', 'LC_CTYPE', 'TZ')
 _PATIENCE_SECONDS = 2.0
+_CHUNK = 1 << 16
+MAX_LOG_BYTES = 64 << 20
+"""So much of what an agent says is written down."""
+_CUT = b'\n... the agent said more, which has not been kept\n'
 
 
 def owner_of(user: str) -> tuple[int, int]:
   """Returns the ids of a user and of the user's group.
 
   Raises:
-    SpecError: If there is no such user, or this process may not be another one.
+    SpecError: If there is no such user, it is root, or this process may not be
+      another one.
   """
   if os.geteuid() != 0:
     raise errors.SpecError(
@@ -35,6 +42,11 @@ def owner_of(user: str) -> tuple[int, int]:
     entry = pwd.getpwnam(user)
   except KeyError as error:
     raise errors.SpecError(f'agent_user: {user!r:.80} is unknown') from error
+  if entry.pw_uid == 0:
+    raise errors.SpecError(
+        f'agent_user: {user!r:.80} is root, from whom nothing can be kept;'
+        ' allowed is any other user'
+    )
   return entry.pw_uid, entry.pw_gid
 
 
@@ -90,7 +102,7 @@ class AgentProcess:
       SpecError: If there is no such command.
     """
     self._temporary = None if folder else tempfile.mkdtemp(prefix='realab-')
-    self._log = log
+    self._log: IO[bytes] | None = log
     self._on_exit = on_exit
     home = os.path.abspath(self._temporary or str(folder))
     if self._temporary and owner is not None:
@@ -115,8 +127,13 @@ class AgentProcess:
       raise errors.SpecError(
           f'agent_command: cannot start {command!r:.80}: {error}'
       ) from error
-    self._listener = threading.Thread(target=self._listen, daemon=True)
+    self._log_lock = threading.Lock()
+    self._listener = threading.Thread(
+        target=self._listen, args=(self._process.stdout,), daemon=True
+    )
     self._listener.start()
+    # What the agent has started may hold its streams open, and outlive it.
+    threading.Thread(target=self._wait, daemon=True).start()
 
   @property
   def pid(self) -> int:
@@ -141,15 +158,31 @@ class AgentProcess:
         continue
     self._process.wait()
     self._listener.join(_PATIENCE_SECONDS)
+    with self._log_lock:
+      self._log = None
     self._clean_up()
 
-  def _listen(self) -> None:
-    if self._process.stdout is not None:
-      shutil.copyfileobj(self._process.stdout, self._log)
-      self._process.stdout.close()
-    self._log.flush()
+  def _wait(self) -> None:
     self._process.wait()
     self._on_exit()
+
+  def _listen(self, said: Any) -> None:
+    """Writes down what the agent says, and never lets it wait."""
+    left = MAX_LOG_BYTES
+    with said:
+      while data := os.read(said.fileno(), _CHUNK):
+        with self._log_lock:
+          if self._log is None:
+            return
+          if left <= 0:
+            continue
+          left -= len(data)
+          try:
+            self._log.write(data if left > 0 else data + _CUT)
+            self._log.flush()
+          except OSError as error:
+            logging.error('the log of the agent ends here: %s', error)
+            left = 0
 
   def _clean_up(self) -> None:
     if self._temporary:

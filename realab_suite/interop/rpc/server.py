@@ -207,7 +207,7 @@ class Server:
       if self._session is not None:
         self._part()
     finally:
-      self._close()
+      self.close()
 
   def stop(self) -> None:
     """Makes `run` return; any thread may call."""
@@ -229,7 +229,13 @@ class Server:
     if isinstance(event, _Gone):
       self._part()
       return
-    event.answer.set_result(self._world.answer(event.request))
+    try:
+      answer = self._world.answer(event.request)
+    except BaseException:
+      # A thread of gRPC's waits for it, and the process for that thread.
+      event.answer.cancel()
+      raise
+    event.answer.set_result(answer)
     self._settle()
     self._stay()
 
@@ -267,9 +273,11 @@ class Server:
     finally:
       self._is_taken.release()
 
-  def _close(self) -> None:
-    """Lets nobody in any more, and leaves nobody waiting."""
+  def close(self) -> None:
+    """Lets nobody in any more, and nobody wait; `run` ends with it."""
     with self._door:
+      if self._is_closed:
+        return
       self._is_closed = True
     stopped = self._server.stop(grace=None)
     while not self._events.empty():

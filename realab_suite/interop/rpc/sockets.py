@@ -45,6 +45,11 @@ def prepared(
           f'address: {address!r:.80}; allowed are unix:/folder/name and'
           ' host:port'
       )
+    if owner is not None:
+      raise errors.SpecError(
+          f'address: {address!r:.80}; allowed with a user for the agent is'
+          ' unix:/folder/name alone, because anybody could connect to a port'
+      )
     yield grpc.LocalConnectionType.LOCAL_TCP
     return
   if len(os.fsencode(path)) > _MAX_PATH or not path.is_absolute():
@@ -60,7 +65,7 @@ def prepared(
   yield grpc.LocalConnectionType.UDS
   path.chmod(0o600)
   if owner is not None:
-    os.chown(path, *owner)
+    os.chown(path, *owner, follow_symlinks=False)
 
 
 def remove(address: str) -> None:
@@ -102,17 +107,23 @@ def users_connected_to(address: str) -> set[int]:
 def _make_private(folder: pathlib.Path, owner: tuple[int, int] | None) -> None:
   """Makes a folder that its user alone can enter; the owner's group may pass.
 
-  The folder stays this user's, so that nobody else can put another socket
-  there.
+  The folder is this user's and stays so, because whoever has it can put another
+  socket there.
   """
   allowed = 0o700 if owner is None else 0o710
   try:
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    mode = stat.S_IMODE(folder.stat().st_mode)
-    if owner is not None and mode == 0o700:
+    # Folders that are made on the way would not let the owner pass.
+    folder.mkdir(mode=0o700, parents=owner is None, exist_ok=True)
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
+      raise errors.SpecError(
+          f'address: {folder} is no folder of user {os.geteuid()}; allowed is'
+          ' one that nobody else could put a socket into'
+      )
+    mode = stat.S_IMODE(status.st_mode)
+    if owner is not None and not mode & ~allowed:
       os.chown(folder, -1, owner[1])
       folder.chmod(allowed)
-      mode = allowed
   except OSError as error:
     raise errors.SpecError(
         f'address: cannot make folder {folder}: {error.strerror}'
