@@ -22,6 +22,7 @@ import numpy as np
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.evaluation import ledger as ledgers
+from tests import worlds
 from tests.campaigns import lines
 from tests.engine import helpers
 
@@ -193,13 +194,14 @@ def drill_single(drill: Drill, seed: int, env: Any, clean: Any) -> Result:
   )
   censored = flagged and not ledger.last.is_valid
   clean.rewind(1)
-  afterwards, expected = [], []
+  afterwards, is_clean = [], True
   for action in actions[-_STEPS_AFTER:]:
     afterwards.append(env.step(action))
-    expected.append(clean.step(action))
-  is_clean = [helpers.to_bytes(t) for t in afterwards] == [
-      helpers.to_bytes(t) for t in expected
-  ]
+    expected = clean.step(action)
+    is_clean &= helpers.to_bytes(afterwards[-1]) == helpers.to_bytes(expected)
+    is_clean &= worlds.state_bytes(env.physics) == worlds.state_bytes(
+        clean.physics
+    )
   env.remove_sink(ledger)
   return Result(
       1, flagged, censored, stale, not afterwards[0].first(), is_clean
@@ -256,16 +258,20 @@ def drill_batch(
         value.tobytes() == found.observation[name][world].tobytes()
         for name, value in expected.observation.items()
     )
+    is_clean &= physics.state[world].tobytes() == worlds.state_bytes(
+        clean.physics
+    )
     harmed |= _differs(found, twin.step(action), others)
+    harmed |= bool((physics.state[others] != twin.physics.state[others]).any())
   batch.remove_sink(ledger)
   return Result(1, flagged, censored, stale, is_mid, is_clean, harmed)
 
 
-def _differs(found: Any, expected: Any, worlds: list[int]) -> bool:
+def _differs(found: Any, expected: Any, places: list[int]) -> bool:
   return any(
-      value[worlds].tobytes() != found.observation[name][worlds].tobytes()
+      value[places].tobytes() != found.observation[name][places].tobytes()
       for name, value in expected.observation.items()
-  )
+  ) or bool((found.step_type[places] != expected.step_type[places]).any())
 
 
 def run(kind: str, number: int, seed: int, *, in_batch: bool) -> Result:

@@ -149,18 +149,21 @@ def build(folder: pathlib.Path) -> list[Kind]:
   def load_sweep() -> Any:
     loaded = sweep_results.load(sweep)
     return loaded.experiment, [
-        (run.name, run.jobs, len(run.rows), run.configs)
+        (run.name, run.jobs, [*map(results.line, run.rows)], run.configs)
         for run in loaded.runs.values()
     ]
 
   def load_done() -> Any:
     return storage.is_done(run), load_sweep()
 
+  def of_done(name: str) -> Any:
+    return load_done(), (run / name).read_bytes()
+
   return [
       Kind('checkpoint', checkpoint, load_checkpoint),
       Kind('learner.bin', learner, lambda: _of_snapshot(learner, header)),
       Kind('snapshot', world, lambda: _of_snapshot(world, world_header)),
-      Kind('trace.bin', run / training.TRACE, load_done),
+      Kind('trace.bin', run / training.TRACE, lambda: of_done(training.TRACE)),
       Kind('network', network, load_network),
       Kind('probe.bin', folder / probes.PROBE, load_probe),
       Kind('sweep.json', sweep / sweeping.SWEEP, load_sweep),
@@ -172,7 +175,9 @@ def build(folder: pathlib.Path) -> list[Kind]:
           run / training.EPISODES,
           lambda: _of_rows(run / training.EPISODES),
       ),
-      Kind('curve.jsonl', run / training.CURVE, load_done),
+      Kind(
+          'curve.jsonl', run / training.CURVE, lambda: of_done(training.CURVE)
+      ),
   ]
 
 

@@ -84,7 +84,8 @@ def sweep(
     _wait_for_lock(output, first)
     _try_another(nursery, options, first, tally)
     # Evenly from first to last, and at any moment of a job.
-    while _num_done(output) < goal:
+    deadline = time.monotonic() + _PATIENCE_SECONDS * len(planned)
+    while _num_done(output) < goal and time.monotonic() < deadline:
       time.sleep(0.01)
     time.sleep(rng.uniform(0.0, 0.3))
     os.kill(first, signal.SIGKILL)

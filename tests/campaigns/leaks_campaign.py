@@ -15,7 +15,6 @@ Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
 
 from collections.abc import Iterator
 import itertools
-import random
 from typing import Any, NamedTuple
 import warnings
 
@@ -141,7 +140,7 @@ def interleave(schedules: int, seed: int) -> Interleaving:
     return told
 
   turns = [i for i in range(_INTERLEAVED) for _ in range(_STEPS_INTERLEAVED)]
-  before = _global_generators()
+  before = pairs._global_generators()
   alone = run(turns)
   generator = np.random.default_rng(seed)
   num_differing = num_changes = 0
@@ -150,17 +149,12 @@ def interleave(schedules: int, seed: int) -> Interleaving:
     num_differing += sum(
         one != other for one, other in zip(alone, told, strict=True)
     )
-    after = _global_generators()
+    after = pairs._global_generators()
     num_changes += before != after
     before = after
   for env in envs:
     env.close()
   return Interleaving(num_differing, num_changes)
-
-
-def _global_generators() -> str:
-  legacy: Any = np.random.mtrand._rand
-  return repr((legacy.get_state()[1].tobytes(), random.getstate()))
 
 
 def uncaught(chosen: list[mutants.Mutant]) -> list[str]:
@@ -245,13 +239,9 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
     public = walk.find(case)
     _explain(public)
     c12.at_most(f'secrets by public names, view {num_worlds}', len(public), 0)
-    private = walk.secrets_reached(case)
     # No promise: within one process private names are a courtesy.
-    c12.at_least(
-        f'of {walk.NUM_SECRETS} by private names, view {num_worlds}',
-        len(private),
-        0,
-    )
+    private = len(walk.secrets_reached(case))
+    print(f'# C12 {private} of {walk.NUM_SECRETS} by private names')
 
   scanned = failures.scan(max(1, round(scale * 2)), seed)
   _explain(scanned.found)

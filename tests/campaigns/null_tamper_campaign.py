@@ -129,8 +129,9 @@ def write_and_wait(
         corruption = register.inspect(physics)
         error = np.abs(register.read(physics) - value)
         parts = np.abs([corruption.permanent, corruption.temporary])
-        worst = max(worst, float(error), float(parts.max()))
-      farthest = max(farthest, float(np.abs(_places(world) - before).max()))
+        worst = float(np.max([worst, error, *parts]))  # Of nan, too.
+      moved = np.abs(_places(world) - before).max()
+      farthest = float(np.maximum(farthest, moved))
   return Result(len(written) * len(world.registers), worst, farthest)
 
 

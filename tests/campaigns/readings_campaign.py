@@ -154,8 +154,10 @@ class Witness(events.EventSink):
       applied = register.applied(physics)
       permanent = -moved[0] if len(moved) > 1 else 0.0
       temporary = moved[-1] - applied
-      self.permanent = max(self.permanent, abs(read.permanent - permanent))
-      self.temporary = max(self.temporary, abs(read.temporary - temporary))
+      # Of nan, the maximum is nan.
+      errors = np.abs([read.permanent - permanent, read.temporary - temporary])
+      self.permanent = float(np.maximum(self.permanent, errors[0]))
+      self.temporary = float(np.maximum(self.temporary, errors[1]))
 
 
 def pairs(

@@ -108,7 +108,7 @@ def begin_many(
     spoil: Is called after each reset, for a control.
   """
   rng = np.random.default_rng(seed)
-  legal = refused = failed = penetrating = 0
+  legal = refused = begun = failed = penetrating = 0
   deepest, worst = 0.0, []
   while legal < specs:
     domain, task = suite.ALL_TASKS[rng.integers(len(suite.ALL_TASKS))]
@@ -120,6 +120,7 @@ def begin_many(
       continue
     legal += 1
     for _ in range(resets):
+      begun += 1
       try:
         env.reset()
       except composer.EpisodeInitializationError:
@@ -133,7 +134,7 @@ def begin_many(
         worst.append(f'{domain}.{task}: {what}, {deep:.3g} m')
     env.close()
   return Found(
-      legal, refused, specs * resets, failed, penetrating, deepest, tuple(worst)
+      legal, refused, begun, failed, penetrating, deepest, tuple(worst)
   )
 
 

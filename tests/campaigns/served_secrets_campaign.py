@@ -136,7 +136,8 @@ def run_c08(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
   plain: dict[Any, list[bytes]] = {}
   for i in range(number):
     secret = SECRETS[list(SECRETS)[i % len(SECRETS)]]
-    key = _DESIGNS[i % len(_DESIGNS)], int(generator.integers(5))
+    design = _DESIGNS[i // len(SECRETS) % len(_DESIGNS)]
+    key = design, int(generator.integers(5))
     if key not in plain:
       plain[key] = wire(lambda env: None, *key)
     found = wire(secret, *key)
@@ -312,6 +313,8 @@ def timing(
   """
   generator = np.random.default_rng(seed)
   rewards = (one, other)
+  # A task that fails has no reward, and that of two failures is the same.
+  assert all(math.isfinite(reward()) for reward in rewards)
   chosen = 0
 
   def make_env() -> environment.Environment:
@@ -341,7 +344,7 @@ def timing(
 
 def run_c18(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
   steps = max(200, int(TIMED_STEPS * scale))
-  effect, p = timing(SECRETS['a number'], SECRETS['a tiny number'], steps, seed)
+  effect, p = timing(lambda: 173.2317, lambda: 1e-300, steps, seed)
   print(f'C18 advisory: effect {effect:.4f} of the median, p={p:.3f}')
   lines.at_least('small or chance', int(effect < 0.01 or p > 0.01), 1)
 

@@ -39,6 +39,7 @@ SPEED_LIMIT = 2.0  # Metres per second.
 DEPTH_LIMIT = 1e-6  # Metres, beyond what geometry says.
 # MuJoCo finds how deep a round body is step by step, and stops short.
 ROUND_DEPTH_LIMIT = 1e-3
+DEEP = 1e-3  # Metres; what is deeper has to have a contact.
 _SUBSTEPS = 200
 _SIZES = (0.1, 0.2, 0.4, 1.0)
 _LARGEST_AT_WALL = 0.4
@@ -59,6 +60,7 @@ class Result(NamedTuple):
     excess: By how much a contact is deeper than geometry says, metres.
     num_refused: Designs that were refused, of those that had to be.
     num_taken: Designs that were not refused.
+    num_missing: Things that were deep in the written block, without a contact.
   """
 
   num_writes: int = 0
@@ -69,6 +71,7 @@ class Result(NamedTuple):
   excess: float = -np.inf
   num_refused: int = 0
   num_taken: int = 0
+  num_missing: int = 0
 
   def plus(self, other: 'Result') -> 'Result':
     """Returns both together."""
@@ -81,6 +84,7 @@ class Result(NamedTuple):
         max(self.excess, other.excess),
         self.num_refused + other.num_refused,
         self.num_taken + other.num_taken,
+        self.num_missing + other.num_missing,
     )
 
 
@@ -165,29 +169,32 @@ def _write(world: World, into: str) -> Result:
   try:
     world.written.write(physics, _VALUE)
     mujoco.mj_forward(physics.model.ptr, physics.data.ptr)
-    contacts, overlaps, excess = _compare_contacts(world, into)
+    contacts, overlaps, excess, missing = _compare_contacts(world, into)
     speed = 0.0
     for _ in range(_SUBSTEPS):
       physics.advance(1)
-      speed = max(speed, _speed(world))
+      speed = float(np.maximum(speed, _speed(world)))  # Of nan, too.
   except control.PhysicsError:
     return Result(num_writes=1, num_errors=1)
-  return Result(1, overlaps, contacts, speed, 0, excess)
+  return Result(1, overlaps, contacts, speed, 0, excess, num_missing=missing)
 
 
 def _speed(world: World) -> float:
   """The greatest speed of blocks and the avatar, metres per second."""
   parts = [*world.written.blocks, *world.other.blocks]
   moving = [part._slides for part in parts] + [world.avatar._slides]
-  return max(float(np.linalg.norm(world.physics.bind(s).qvel)) for s in moving)
+  return float(
+      np.max([np.linalg.norm(world.physics.bind(s).qvel) for s in moving])
+  )
 
 
-def _compare_contacts(world: World, into: str) -> tuple[int, int, float]:
+def _compare_contacts(world: World, into: str) -> tuple[int, int, float, int]:
   """Compares contacts of the written block with what geometry says.
 
   Returns:
-    How many there are, whether anything overlaps, and by how much the deepest
-    contact is deeper than the two things are in each other.
+    How many there are, whether anything overlaps, by how much the deepest
+    contact is deeper than the two things are in each other, and how many things
+    are deep in the block without any.
   """
   physics = world.physics
   model, data = physics.model.ptr, physics.data.ptr
@@ -200,11 +207,13 @@ def _compare_contacts(world: World, into: str) -> tuple[int, int, float]:
       _geom_of(world.avatar, physics): cylinder_depth(boxes[0], torso),
   }
   excess, number = -np.inf, 0
+  touching = set()
   for contact in data.contact[: data.ncon]:
     pair = {int(contact.geom[0]), int(contact.geom[1])}
     if mine not in pair:
       continue
     (thing,) = pair - {mine}
+    touching.add(thing)
     is_floor = model.geom_type[thing] == mujoco.mjtGeom.mjGEOM_PLANE
     if is_floor:
       depth = -_lowest(boxes[0])
@@ -215,7 +224,8 @@ def _compare_contacts(world: World, into: str) -> tuple[int, int, float]:
     number += 1
     excess = max(excess, -float(contact.dist) - depth)
   is_over = max(depths.values()) > 0 or into == 'apple'
-  return number, int(is_over), excess
+  deep = {thing for thing, depth in depths.items() if depth > DEEP}
+  return number, int(is_over), excess, len(deep - touching)
 
 
 class Box(NamedTuple):
@@ -372,6 +382,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
     report.at_least(f'{into}: writes', result.num_writes, 154 * poses)
     report.at_least(f'{into}: overlaps', result.num_overlaps, 77 * poses)
     report.at_least(f'{into}: contacts', result.num_contacts, 154)
+    report.at_most(f'{into}: deep without a contact', result.num_missing, 0)
     report.at_most(f'{into}: speed (m/s)', result.speed, SPEED_LIMIT)
     report.at_most(f'{into}: PhysicsErrors', result.num_errors, 0)
     report.at_most(

@@ -28,6 +28,8 @@ from tests.engine import helpers
 ROOT = pathlib.Path(__file__).parents[2]
 _PATIENCE_SECONDS = 60
 
+# Nobody waits longer for an answer that does not come.
+_MOST_SECONDS = 1800.0
 STEP = '/dm_env_rpc.v1.Environment/Process'
 
 
@@ -207,7 +209,7 @@ class RawStream:
     )
     call = self.channel.stream_stream(STEP)
     self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-    self._answers = call(iter(self._requests.get, None))
+    self._answers = call(iter(self._requests.get, None), timeout=_MOST_SECONDS)
 
   def ask(self, request: bytes) -> bytes:
     self._requests.put(request)

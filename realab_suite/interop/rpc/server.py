@@ -31,7 +31,7 @@ _LINGER_SECONDS = 5.0
 # main thread wakes up, which may be the one that waits.
 _PULSE_SECONDS = 0.25
 _MAX_STREAMS = 16
-_HANDSHAKE_MS = 5_000
+_HANDSHAKE_MS = 800
 _MAX_HEADER_BYTES = 8 << 10
 _OPTIONS = (
     ('grpc.max_receive_message_length', MAX_REQUEST_BYTES),
