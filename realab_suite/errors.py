@@ -55,6 +55,11 @@ class ResultsError(RealabError, ValueError):
 
 
 @final
+class OutOfReachError(ResultsError):
+  """Nobody got to a register, so there is nothing to probe."""
+
+
+@final
 class UnknownNameError(SpecError, KeyError):
   """A name is not in a registry; the message lists what is."""
 

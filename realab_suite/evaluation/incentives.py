@@ -103,7 +103,8 @@ def collect(
 
   Raises:
     UnknownNameError: If there is no such register.
-    ResultsError: If no block came within reach, or a number makes no sense.
+    OutOfReachError: If no block came within reach.
+    ResultsError: If a number makes no sense.
     SpecError: If the worlds cannot be saved; see `BatchEnvironment.save`.
   """
   _check_positive(num_states=num_states, spacing=spacing, max_steps=max_steps)
@@ -126,7 +127,7 @@ def collect(
     waits -= 1
     time_step = batch.step(act(time_step))
   if not saved:
-    raise errors.ResultsError(
+    raise errors.OutOfReachError(
         f'no block of register {register!r} came within {reach} m of the avatar'
         f' in {max_steps} control steps of {batch.num_worlds} worlds; let'
         ' somebody play who goes there'

@@ -29,6 +29,8 @@ _POWER = 0.8
 
 # Up to this many seeds every assignment of signs is tried, none is sampled.
 _ENUMERATED_SEEDS = 12
+# How many episodes are drawn at a time, which bounds memory.
+_MOST_DRAWN = 1_000_000
 
 
 @final
@@ -281,7 +283,10 @@ def more_seeds_to_separate(
   is_small = -smallest < difference.low and difference.high < smallest
   if is_apart or is_small:
     return None
-  distance = max(abs(difference.estimate), smallest)
+  # From where it seems to be, to 0 or to what would matter: to the farther one,
+  # as either settles the question.
+  size = abs(difference.estimate)
+  distance = max(size, smallest - size)
   return _advice(means.size, _spread(means, differences), distance, level)
 
 
@@ -435,15 +440,18 @@ def _resampled_means(
   for row, values in zip(table, units, strict=True):
     row[: values.size] = values
   means = np.empty((num_resamples, len(units)))
-  # One seed at a time, which bounds the memory that large evaluations take.
+  # Some resamples of one seed at a time: learners play many episodes.
+  num_rows = max(1, _MOST_DRAWN // table.shape[1])
   for column in means.T:
     seeds = rng.integers(len(units), size=num_resamples)
-    sizes = counts[seeds]
-    uniform = rng.random((num_resamples, table.shape[1]))
-    episodes = (uniform * sizes[:, np.newaxis]).astype(int)
-    drawn = table[seeds[:, np.newaxis], episodes]
-    drawn[np.arange(table.shape[1]) >= sizes[:, np.newaxis]] = 0
-    column[:] = drawn.sum(axis=1) / sizes
+    sizes = counts[seeds][:, np.newaxis]
+    for first in range(0, num_resamples, num_rows):
+      some = slice(first, first + num_rows)
+      uniform = rng.random((len(seeds[some]), table.shape[1]))
+      episodes = (uniform * sizes[some]).astype(int)
+      drawn = table[seeds[some][:, np.newaxis], episodes]
+      drawn[np.arange(table.shape[1]) >= sizes[some]] = 0
+      column[some] = drawn.sum(axis=1) / sizes[some, 0]
   return means
 
 

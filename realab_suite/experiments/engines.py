@@ -16,6 +16,8 @@ from realab_suite.experiments import headless
 
 # How long a process that was asked to end may take, seconds.
 _PATIENCE = 10.0
+# Of a job of Slurm's; left alone, submitit ends it after five.
+_MOST_MINUTES = 24 * 60
 
 
 class Engine(abc.ABC):
@@ -106,7 +108,9 @@ class Ray(Engine):
 
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
     with _explained('ray'):
-      return self._execute.remote(list(command), str(log.absolute()))
+      return self._execute.remote(
+          list(command), str(log.absolute()), os.getcwd()
+      )
 
   def poll(self, task: Any) -> int | None:
     with _explained('ray'):
@@ -134,8 +138,12 @@ class Submitit(Engine):
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
     with _explained('submitit'):
       executor = self._submitit.AutoExecutor(folder=str(log.parent))
-      executor.update_parameters(cpus_per_task=1, name=log.stem)
-      return executor.submit(execute, list(command), str(log.absolute()))
+      executor.update_parameters(
+          cpus_per_task=1, name=log.stem, timeout_min=_MOST_MINUTES
+      )
+      return executor.submit(
+          execute, list(command), str(log.absolute()), os.getcwd()
+      )
 
   def poll(self, task: Any) -> int | None:
     with _explained('submitit'):
@@ -153,11 +161,12 @@ ENGINES: dict[str, Callable[[int], Engine]] = {
 }
 
 
-def execute(command: Sequence[str], log: str) -> int:
-  """Runs a command where an engine has put it; returns its exit status."""
+def execute(command: Sequence[str], log: str, folder: str) -> int:
+  """Runs a command in a folder of an engine's; returns its exit status."""
   with open(log, 'ab') as file:
     return subprocess.run(
         command,
+        cwd=folder,
         stdin=subprocess.DEVNULL,
         stdout=file,
         stderr=subprocess.STDOUT,

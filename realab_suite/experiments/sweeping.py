@@ -233,7 +233,12 @@ class _Sweep:
 
   def _poll(self) -> None:
     for running in list(self._running):
-      status = self._engine.poll(running.task)
+      lost = None
+      try:
+        status = self._engine.poll(running.task)
+      except errors.ResultsError as error:
+        # A machine of a cluster may be gone; the other jobs are not.
+        status, lost = -1, str(error)
       if running.job.policy is None:
         self._steps[running.folder.name] = _last_step(running.folder)
       if status is None:
@@ -241,7 +246,7 @@ class _Sweep:
       self._running.remove(running)
       problem = None
       if status or not (running.folder / storage.DONE).exists():
-        problem = _last_line(running.log) or f'exit status {status}'
+        problem = lost or _last_line(running.log) or f'exit status {status}'
       self._finish(running.job, running.folder, problem)
 
   def _finish(

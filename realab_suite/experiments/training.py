@@ -420,16 +420,21 @@ class _Training:
       _judge(job, self._folder, batch, actor)
     files = [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER]
     if self._probed is not None:
-      probe = probes.make(
-          lambda num_envs: load_batch(job, num_envs, seed),
-          learner.probabilities,
-          self._probed,
-          evaluation.probe_states,
-          seed,
-          evaluation.probe_player,
-      )
-      probes.save(self._folder.path, probe)
-      files.append(probes.PROBE)
+      try:
+        probe = probes.make(
+            lambda num_envs: load_batch(job, num_envs, seed),
+            learner.probabilities,
+            self._probed,
+            evaluation.probe_states,
+            seed,
+            evaluation.probe_player,
+        )
+      except errors.OutOfReachError as error:
+        # Behind a barrier, say: that is a result, and no reason to learn again.
+        self._options.say(f'{job.run}, seed {job.seed}: no probe: {error}')
+      else:
+        probes.save(self._folder.path, probe)
+        files.append(probes.PROBE)
     self._folder.finish(files, {'steps': self._done * self._num_envs})
 
   def _check_parent(self) -> None:

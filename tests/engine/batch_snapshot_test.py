@@ -25,7 +25,7 @@ _REWARD = campaign.Case('unlock_door', 'instantaneous_reward', (), 7)
 _ADVICE = campaign.Case('collect_apples', 'value_advice', (), 7)
 _CASES = [
     _REWARD,
-    _ADVICE._replace(overrides=('providers.0.query_delay=1',)),
+    _ADVICE._replace(overrides=('learner=null', 'providers.0.query_delay=1')),
     campaign.Case('collect_apples', 'online_imitation', (), 7),
     campaign.CASES[-1]._replace(seed=7),
     campaign.Case('unlock_door', 'decoupled_approval', ('dof=planar',), 7),

@@ -31,7 +31,9 @@ _STEPS = 60
 _REWARD = campaign.Case('unlock_door', 'instantaneous_reward', (), 7)
 _ADVICE = campaign.Case('collect_apples', 'value_advice', (), 7)
 # Advice on the query before: values and queries are in the provider's state.
-_LATE = _ADVICE._replace(overrides=('providers.0.query_delay=1',))
+_LATE = _ADVICE._replace(
+    overrides=('learner=null', 'providers.0.query_delay=1')
+)
 # Derived quantities are read before the physics has moved.
 _AT_ONCE = _REWARD._replace(overrides=('schedule=cfmdp',))
 

@@ -550,6 +550,15 @@ class TestMoreSeedsToSeparate:
     assert self._advice(means, smallest=0.1) is None
     assert self._advice(means, smallest=0.01) is not None
 
+  def test_a_small_difference_needs_more_seeds_than_none_or_a_large_one(self):
+    # Either bound settles it; from the middle, both are far to see.
+    spread = np.array([-1.5, -0.5, 0.0, 0.5, 1.5])
+    none, small, large = (
+        self._advice(shift + spread, smallest=1.0) for shift in (0.0, 0.5, 1.0)
+    )
+    assert none == large
+    assert 2 * none < small < 6 * none
+
   def test_advises_one_seed_to_become_five(self):
     assert self._advice([3.0]) == 4
 
@@ -576,3 +585,10 @@ class TestMoreSeedsToSeparate:
 
     assert 0.78 < power(num_seeds) < 0.88
     assert power(num_seeds // 2) < 0.6
+
+
+def test_resamples_are_the_same_however_many_are_drawn_at_a_time(monkeypatch):
+  values = {0: [1.0, 2.0, 5.0], 1: [0.0], 2: [3.0, 4.0]}
+  whole = statistics.mean_interval(values)
+  monkeypatch.setattr(statistics, '_MOST_DRAWN', 7)
+  assert statistics.mean_interval(values) == whole

@@ -472,11 +472,24 @@ def test_a_curve_has_a_point_for_as_many_steps_as_episodes_take():
       (20, 2, 4.0),
       (25, 2, 6.0),
   ]
-  assert charts.curve(points, 12) == {15: 4.0, 25: 5.0}
+  assert charts.curve(points, 12) == {25: 4.5}
+  assert charts.curve(points, 10) == {10: 10.0, 25: pytest.approx(26 / 7)}
   # What is left in the end goes with what was before.
-  assert charts.curve([*points, (30, 4, 5.0)], 12) == {15: 4.0, 30: 5.0}
-  assert charts.curve(points[:2], 12) == {5: 10.0}
+  assert charts.curve(points[:3], 12) == {15: 4.0}
+  assert charts.curve(points[:2], 12) == {10: 10.0}
   assert charts.curve([], 12) == {}
+  # Windows end where they do whatever happened in them.
+  odd = [(5, 0, None), (10, 1, 90.0), (15, 0, None), (20, 9, 2.0), (30, 9, 4.0)]
+  assert charts.curve(odd, 12) == {15: 90.0, 30: 3.0}
+  assert charts.curve(odd, 12, fewest=2) == {30: 3.0}
+
+
+def test_a_band_has_the_steps_at_which_all_seeds_that_got_there_are_known():
+  one = charts.band(
+      {0: {1: 1.0, 2: 9.0, 3: 3.0}, 1: {1: 3.0, 3: 5.0}, 2: {1: 2.0}, 3: {}}
+  )
+  assert one.steps.tolist() == [1, 3]
+  assert one.mean.tolist() == [2.0, 4.0]
 
 
 def test_a_band_is_the_interval_over_seeds():

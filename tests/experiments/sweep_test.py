@@ -64,6 +64,8 @@ class Pretender(engines.Engine):
   def poll(self, task):
     self._running -= 1
     status = self._statuses.get(_flag(task, 'run'), 0)
+    if callable(status):
+      status()
     if not status:
       experiment = spec.load(pathlib.Path(_flag(task, 'experiment')))
       seed = int(_flag(task, 'seed'))
@@ -122,6 +124,19 @@ def test_a_job_that_fails_keeps_no_other_from_being_done(tmp_path):
   again = Pretender()
   _sweep(_SMALL, tmp_path, again)
   assert again.commands == [('bad', 3)]
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_a_job_that_a_cluster_has_lost_keeps_no_other_from_being_done(tmp_path):
+  def lose():
+    raise errors.ResultsError('--engine=ray: a machine is gone')
+
+  engine = Pretender(statuses={'bad': lose})
+  with pytest.raises(
+      errors.ResultsError, match='1 of 2 jobs failed: bad, seed 3: --engine=ray'
+  ):
+    _sweep(_SMALL, tmp_path, engine)
+  assert engine.commands == [('bad', 3), ('good', 3)]
 
 
 @pytest.mark.usefixtures('no_wait')
@@ -315,8 +330,8 @@ class _FakeExecutor:
   def __init__(self, folder):
     assert pathlib.Path(folder).is_dir()
 
-  def update_parameters(self, **unused):
-    pass
+  def update_parameters(self, *, timeout_min, **unused):
+    assert timeout_min >= 60  # Left alone, it is five.
 
   def submit(self, function, *arguments):
     return types.SimpleNamespace(
@@ -337,6 +352,14 @@ def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
   for status in (0, 3):
     assert _wait(engine, engine.start(_command(status), log)) == status
   assert log.read_text() == 'said\nsaid\n'
+
+
+def test_a_worker_works_where_the_sweep_does(tmp_path):
+  show = 'import os; print(os.getcwd())'
+  log = tmp_path / 'log'
+  command = [sys.executable, '-c', show]
+  assert not engines.execute(command, str(log), str(tmp_path))
+  assert log.read_text().strip() == str(tmp_path)
 
 
 def test_what_a_cluster_complains_of_is_one_line(tmp_path, monkeypatch):

@@ -153,6 +153,15 @@ def test_a_learner_is_probed_when_it_is_asked_for(tmp_path):
   assert probes.PROBE in done['files']
 
 
+def test_a_register_that_nobody_gets_to_is_no_reason_to_learn_again(tmp_path):
+  job = _probing('reward')
+  boxed = job.experiment.model_copy(update={'task': 'unlock_door.boxed'})
+  path, said = _run(dataclasses.replace(job, experiment=boxed), tmp_path)
+  assert storage.is_done(path)
+  assert probes.load(path) is None
+  assert any('no probe: no block of register' in line for line in said)
+
+
 def test_what_cannot_be_probed_is_refused_before_it_is_trained(tmp_path):
   job = _probing('reward')
   design = dataclasses.replace(

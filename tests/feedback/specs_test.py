@@ -326,6 +326,21 @@ _WRONG = {
         ),
         'query_delay: must be 0 or 1, got 2',
     ),
+    'advice that its learner takes for that of another action': (
+        _design(
+            action_set=_ACTION_SET,
+            registers={'reward': _REWARD, 'query': _QUERY},
+            meters=[],
+            providers=[_advice(query_delay=1)],
+            learner={
+                'kind': 'value_advice',
+                'advice': 'reward',
+                'query': 'query',
+            },
+        ),
+        'query_delay: 1 values the query of the step before, and the learner'
+        ' value_advice takes what it reads',
+    ),
     'unknown value function': (
         _design(
             action_set=_ACTION_SET,

@@ -89,50 +89,60 @@ class Band:
 
 
 def curve(
-    points: Iterable[tuple[int, int, float | None]], width: int
+    points: Iterable[tuple[int, int, float | None]], width: int, fewest: int = 1
 ) -> dict[int, float]:
   """Returns the mean over at least so many steps, by where they end.
 
   Args:
     points: Up to which step, the number of episodes that ended since the point
       before, and their mean, where there is one.
-    width: How many steps to take together. A point that reaches into the next
-      ones goes with those that it begins in; what is left in the end goes with
+    width: How many steps to take together. What is left in the end goes with
       those before.
+    fewest: Steps in which fewer episodes ended are left out: in learning that
+      begins in all worlds at once, those that end in between are odd ones.
   """
-  parts: list[list[tuple[int, int, float]]] = []
-  begin, done = 0, 0
-  values: list[tuple[int, int, float]] = []
+  parts: list[list[tuple[int, float]]] = [[]]
+  ends, done, last = [0], 0, 0
   for step, number, value in points:
-    if begin - done >= width:
-      parts.append(values)
-      values, done = [], begin - begin % width
     if value is not None and number:
-      values.append((step, number, value))
-    begin = step
-  if begin - done >= width or not parts:
-    parts.append(values)
-  else:
-    parts[-1] += values
+      parts[-1].append((number, value))
+    last = step
+    if step - done >= width:
+      ends[-1] = done = step
+      parts.append([])
+      ends.append(step)
+  rest = parts.pop()
+  ends.pop()
+  if rest and parts:
+    parts[-1] += rest
+    ends[-1] = last
+  elif rest:
+    parts, ends = [rest], [last]
   return {
-      part[-1][0]: float(
-          np.average([p[2] for p in part], weights=[p[1] for p in part])
-      )
-      for part in parts
-      if part
+      end: float(np.average([p[1] for p in part], weights=[p[0] for p in part]))
+      for end, part in zip(ends, parts, strict=True)
+      if sum(p[0] for p in part) >= fewest
   }
 
 
 def band(curves: Mapping[int, Mapping[int, float]]) -> Band:
   """Returns the mean over seeds and its interval at each step.
 
+  A step counts if every seed that has got so far has a figure there: others
+  would show another selection of seeds at each step.
+
   Args:
     curves: Of each seed, a figure by the number of control steps.
   """
-  steps = sorted({step for curve in curves.values() for step in curve})
+  known = {seed: c for seed, c in curves.items() if c}
+  steps = [
+      step
+      for step in sorted({step for c in known.values() for step in c})
+      if all(step in c or max(c) < step for c in known.values())
+  ]
   intervals = [
       statistics.mean_interval(
-          {seed: [c[step]] for seed, c in curves.items() if step in c},
+          {seed: [c[step]] for seed, c in known.items() if step in c},
           num_resamples=1000,
       )
       for step in steps

@@ -203,6 +203,9 @@ def _unfinished(
     one: sweep_results.Unfinished, sweep: sweep_results.Sweep
 ) -> dict[str, str]:
   total = (sweep.experiment.get('training') or {}).get('steps')
+  runs = sweep.experiment.get('runs') or {}
+  own = (runs.get(one.job.twin_of or one.job.run) or {}).get('steps')
+  total = own or total
   how_far = 'not begun'
   if one.has_begun:
     how_far = 'begun, and not over'
@@ -250,7 +253,8 @@ def _learning(
       ' Signed corruption is that of the registers whose reading the learner'
       ' maximises, where above zero is the direction that pays, or of all its'
       ' feedback registers if it maximises none. Observed returns are in each'
-      " register's own units.",
+      " register's own units. Steps in which less than half of the worlds"
+      ' ended an episode are left out.',
       _svg(charts.draw_learning(designs, looks, sweep.margin)),
   )
 
@@ -276,15 +280,16 @@ def _curve(
     figure: Callable[[sweep_results.Run, Mapping[str, Any]], float | None],
 ) -> dict[int, float]:
   """Returns a figure by the number of control steps."""
-  # All worlds begin at once, so for a while their episodes end at once, too,
-  # and those few that end in between are odd ones.
-  width = run.config['training']['num_envs'] * run.config['max_steps']
+  # All worlds begin at once, so for a while their episodes end at once, too. A
+  # step goes by before the next ones begin.
+  num_envs = run.config['training']['num_envs']
   return charts.curve(
       [
           (p['step'], p['num_episodes'] - p['num_invalid'], figure(run, p))
           for p in points
       ],
-      width,
+      width=num_envs * (run.config['max_steps'] + 1),
+      fewest=-(-num_envs // 2),
   )
 
 
@@ -428,7 +433,7 @@ def _clips(
     learned: Sequence[numbers.Figures], say: _Say
 ) -> tuple[list[Clip], str | None]:
   """Returns films, and why there are no more of them, or `None`."""
-  clips = []
+  clips, problem = [], None
   for one in learned:
     chosen = {'first episode': replays.first_row(one.run)}
     typical = replays.typical_row(one.run)
@@ -439,8 +444,8 @@ def _clips(
       try:
         clips.append(_clip(one.run, row, what))
       except errors.RealabError as error:
-        return clips, f'{one.run.name}: {error}'
-  return clips, None
+        problem = f'{one.run.name}: {error}'
+  return clips, problem
 
 
 def _clip(run: sweep_results.Run, row: results.EpisodeRow, what: str) -> Clip:

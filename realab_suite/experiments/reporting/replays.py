@@ -24,8 +24,8 @@ OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]
 
 
 def first_row(run: sweep_results.Run) -> results.EpisodeRow:
-  """Returns the first episode that a run was judged by."""
-  return min(run.rows, key=_key)
+  """Returns the first valid episode that a run was judged by."""
+  return min((row for row in run.rows if row.is_valid), key=_key)
 
 
 def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:

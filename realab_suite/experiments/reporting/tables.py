@@ -210,7 +210,9 @@ def _gap_table(figures: Sequence[numbers.Figures]) -> Table:
 def _next_to_twin(verdict: statistics.Verdict | None) -> str:
   if verdict is None:
     return texts.NOTHING
-  return verdict.words.replace('the baseline', 'its twin')
+  # The twin cannot be corrupted, so more than it is not yet tampering (3.3).
+  words = verdict.words.replace('the baseline', 'its twin')
+  return words.replace('tampers more', 'more')
 
 
 def _incentive_table(

@@ -10,6 +10,9 @@ from realab_suite.feedback.policies import base as policies
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
 
+# What they read in a step, they credit to the query of that step.
+_LEARN_OF_THIS_STEP = ('value_advice', 'decoupled_approval')
+
 
 @base.PROVIDERS.add('value_advice')
 @final
@@ -46,6 +49,13 @@ class ValueAdvice(base.Provider):
       raise ValueError(
           f'value_advice reads the query off {query!r}, whose role is'
           f' {design.registers[query].role!r}; allowed is query'
+      )
+    learner = None if design.learner is None else design.learner.kind
+    if self.query_delay and learner in _LEARN_OF_THIS_STEP:
+      raise ValueError(
+          'query_delay: 1 values the query of the step before, and the learner'
+          f' {learner} takes what it reads for the value of this one; allowed'
+          ' is 0, or another learner'
       )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
