@@ -15,6 +15,7 @@ target verdict seed`.
 
 from collections.abc import Callable, Iterator
 import contextlib
+import hashlib
 import os
 import pathlib
 import shutil
@@ -48,6 +49,7 @@ _REGISTER = {
     'kind': 'two_block', 'role': 'feedback', 'place': 'station_1',
     'range': [0, 13],
 }  # fmt: skip
+_LINK = 'link.yaml'
 
 
 class Case(NamedTuple):
@@ -131,6 +133,8 @@ def _from_file(load: Callable[[str], Any], data: Any) -> Callable[[], Any]:
 
 def _sweep(folder: str) -> Any:
   pathlib.Path('sweep').mkdir(exist_ok=True)
+  if folder == _LINK and not os.path.lexists(f'sweep/{_LINK}'):
+    os.symlink(os.path.abspath('linked'), f'sweep/{_LINK}')
   text = yaml.safe_dump(_experiment())
   pathlib.Path('sweep', sweeping.EXPERIMENT).write_text(text, encoding='utf-8')
   job = {
@@ -143,7 +147,7 @@ def _sweep(folder: str) -> Any:
       pathlib.Path('sweep', sweeping.SWEEP),
       {
           'experiment': 'e', 'calibration': False, 'jobs': [job],
-          'sha256': sweeping._sha256(text.encode()),
+          'sha256': hashlib.sha256(text.encode()).hexdigest(),
       },
   )  # fmt: skip
   return sweep_results.load(pathlib.Path('sweep'))
@@ -158,7 +162,7 @@ def _done(name: str) -> Any:
 
 def paths(outside: pathlib.Path) -> dict[str, str]:
   """Returns paths that lead out of the working directory, by what they are."""
-  os.symlink(outside / 'secret.yaml', 'link.yaml')
+  os.symlink(outside / 'secret.yaml', _LINK)
   os.symlink(outside, 'linked')
   os.symlink('linked', 'twice')
   up = os.path.relpath(outside, '.')
@@ -167,7 +171,7 @@ def paths(outside: pathlib.Path) -> dict[str, str]:
       'two slashes': f'/{outside}/secret.yaml',
       'up': f'{up}/secret.yaml',
       'up and down': f'sub/../{up}/secret.yaml',
-      'link': 'link.yaml',
+      'link': _LINK,
       'link to a folder': 'linked/secret.yaml',
       'link to a link': 'twice/secret.yaml',
       'link and up': f'linked/../{outside.name}/secret.yaml',

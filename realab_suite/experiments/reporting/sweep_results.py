@@ -267,7 +267,7 @@ def read_lines(path: pathlib.Path, keys: Sequence[str]) -> list[dict[str, Any]]:
   for number, line in enumerate(text.splitlines(), start=1):
     try:
       record = json.loads(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
       raise errors.ResultsError(
           f'{path}:{number}: not JSON: {error}'
       ) from error
@@ -289,6 +289,10 @@ def _run(
   folders, rows, configs = {}, [], {}
   for job in jobs:
     path = folder / job.folder
+    if path.is_symlink():
+      raise errors.ResultsError(
+          f'{path}: a link; allowed are folders within that of the sweep'
+      )
     if not (path / storage.DONE).exists():
       unfinished.append(_unfinished(job, path))
       continue
