@@ -36,6 +36,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.experiments import spec as experiments
 from realab_suite.feedback import specs
+from tests import memory
 from tests.campaigns import lines as lines_lib
 from tests.engine import helpers
 
@@ -535,7 +536,7 @@ def run(env: Any, steps: int, seed: int) -> str:
 def judge(case: Case, last_stage: str, folder: pathlib.Path) -> Outcome:
   """Takes a case as far as it is to go."""
   stage = 'validate'
-  begin, before = time.perf_counter(), _peak()
+  begin, before = time.perf_counter(), memory.forget_peak()
   problem = refusal = ''
   try:
     spec = validate(case, folder)
@@ -561,11 +562,7 @@ def judge(case: Case, last_stage: str, folder: pathlib.Path) -> Outcome:
   except BaseException as error:
     problem = f'{type(error).__name__}: {error!s:.200}'
   seconds = time.perf_counter() - begin
-  return Outcome(stage, problem, refusal, seconds, _peak() - before)
-
-
-def _peak() -> int:
-  return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+  return Outcome(stage, problem, refusal, seconds, memory.peak() - before)
 
 
 def _serve(connection: Any) -> None:

@@ -1,7 +1,6 @@
 """Campaign C21: crafted files are refused soon, clearly and without memory."""
 
 import pathlib
-import re
 import sys
 import time
 from typing import Any
@@ -11,6 +10,7 @@ import pytest
 from realab_suite import errors
 from realab_suite.experiments import spec as experiments
 from realab_suite.feedback import specs
+from tests import memory
 from tests.feedback import loading_test
 
 _MAX_SECONDS = 1.0
@@ -45,17 +45,6 @@ def _bytes(text: Any) -> bytes:
   return bytes(text.encode('utf-8', 'surrogatepass'))
 
 
-def _forget_peak() -> int:
-  """Returns the memory that is in use, bytes; `_peak` counts from here."""
-  pathlib.Path('/proc/self/clear_refs').write_text('5', encoding='ascii')
-  return _peak()
-
-
-def _peak() -> int:
-  status = pathlib.Path('/proc/self/status').read_text(encoding='ascii')
-  return int(re.findall(r'VmHWM:\s+(\d+) kB', status)[0]) * 1024
-
-
 def test_there_are_at_least_thirty_crafted_files():
   assert len(_HAZARDS) >= 30
 
@@ -63,9 +52,9 @@ def test_there_are_at_least_thirty_crafted_files():
 @_is_linux
 def test_memory_that_was_taken_and_given_back_is_seen():
   for _ in range(2):  # The second time it is no more than the first.
-    before = _forget_peak()
+    before = memory.forget_peak()
     len(b'x' * 2 * _MAX_GROWTH)
-    assert _peak() - before > _MAX_GROWTH
+    assert memory.peak() - before > _MAX_GROWTH
 
 
 @_is_linux
@@ -76,11 +65,11 @@ def test_crafted_files_are_refused_soon_and_in_little_memory(
   path = tmp_path / 'crafted.yaml'
   for name, text in _HAZARDS.items():
     path.write_bytes(_bytes(text))
-    begin, before = time.process_time(), _forget_peak()
+    begin, before = time.process_time(), memory.forget_peak()
     with pytest.raises(errors.SpecError) as caught:
       load(path)
     assert time.process_time() - begin <= _MAX_SECONDS, name
-    assert _peak() - before <= _MAX_GROWTH, name
+    assert memory.peak() - before <= _MAX_GROWTH, name
     message = str(caught.value)
     assert str(path) in message, name
     assert message.isprintable(), name
