@@ -244,9 +244,7 @@ class RunFolder:
       folder.mkdir(exist_ok=True)
     path = folder / f'{step:012d}{_SUFFIX}'
     write_whole(path, snapshots.Snapshot(header, contents).to_bytes())
-    for old in self._checkpoints()[:-_KEPT]:
-      with explained(old):
-        old.unlink()
+    self._forget_old()
 
   def load(self, header: Mapping[str, Any]) -> Any:
     """Returns the contents of the last checkpoint; `None` if there is none.
@@ -262,7 +260,7 @@ class RunFolder:
     with explained(path):
       data = path.read_bytes()
     try:
-      return snapshots.Snapshot.from_bytes(data).contents_for(header)
+      contents = snapshots.Snapshot.from_bytes(data).contents_for(header)
     except errors.StateLayoutError as error:
       rest = len(checkpoints) - 1
       where = f'from {checkpoints[-2].name}' if rest else 'from the beginning'
@@ -270,6 +268,14 @@ class RunFolder:
           f'{path}: no checkpoint of this run: {error}; remove this file, then'
           f' the same command goes on {where}'
       ) from error
+    # Whoever wrote the last one may have been killed before doing this.
+    self._forget_old()
+    return contents
+
+  def _forget_old(self) -> None:
+    for old in self._checkpoints()[:-_KEPT]:
+      with explained(old):
+        old.unlink()
 
   def _checkpoints(self) -> list[pathlib.Path]:
     """Returns the checkpoints, the last one last."""
