@@ -1,6 +1,6 @@
 """What campaigns print, `Cxx figure target verdict seed`; how they start."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 import inspect
 import sys
 from typing import NoReturn, final
@@ -56,3 +56,25 @@ class Lines:
         f'{self._campaign} {figure}={value:.6g} {target} {words} {self._seed}',
         flush=True,
     )
+
+
+def print_all(
+    runs: Mapping[str, Callable[[Lines, float, int], None]],
+    scale: float,
+    seed: int,
+    names: Sequence[str],
+) -> int:
+  """Runs several campaigns; returns the number of targets missed.
+
+  Args:
+    runs: By name, what prints the lines of one of them.
+    scale: Of each.
+    seed: Of each.
+    names: Which ones; all if there is none.
+  """
+  missed = 0
+  for name in names or runs:
+    lines = Lines(name, seed)
+    runs[name](lines, scale, seed)
+    missed += lines.num_missed
+  return missed

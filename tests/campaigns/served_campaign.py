@@ -890,12 +890,7 @@ _RUNS = {'C16': run_c16, 'C24': run_c24, 'C25': run_c25, 'C26': run_c26}
 
 def main(scale: float = 1.0, seed: int = 0, *names: str) -> int:
   """Prints the figures and returns the number of targets missed."""
-  missed = 0
-  for name in names or _RUNS:
-    lines = campaign_lines.Lines(name, seed)
-    _RUNS[name](lines, scale, seed)
-    missed += lines.num_missed
-  return missed
+  return campaign_lines.print_all(_RUNS, scale, seed, names)
 
 
 if __name__ == '__main__':

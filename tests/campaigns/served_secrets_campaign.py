@@ -602,12 +602,7 @@ _RUNS = {
 
 def main(scale: float = 1.0, seed: int = 0, *names: str) -> int:
   """Prints the figures and returns the number of targets missed."""
-  missed = 0
-  for name in names or _RUNS:
-    lines = campaign_lines.Lines(name, seed)
-    _RUNS[name](lines, scale, seed)
-    missed += lines.num_missed
-  return missed
+  return campaign_lines.print_all(_RUNS, scale, seed, names)
 
 
 if __name__ == '__main__':

@@ -120,6 +120,7 @@ def test_writes_into_what_is_in_the_way_stay_slow_and_shallow():
     found = teleports_campaign.write_into(world, into, 0.5, 0.3, 0.2)
     assert (found.num_overlaps, found.num_errors) == (1, 0)
     assert 0 < found.num_contacts
+    assert found.num_missing == 0
     assert found.speed <= teleports_campaign.SPEED_LIMIT
     assert found.excess <= teleports_campaign.ROUND_DEPTH_LIMIT
   assert teleports_campaign.load_into_a_wall(0.5, 1).num_refused == 1
