@@ -89,18 +89,22 @@ def check_start(
   """
   low, high = np.array(task.start.low), np.array(task.start.high)
   for name, register in mechanism.registers.items():
+    geoms = [physics.bind(block.geom).element_id for block in register.blocks]
+    # Where each block may be: whatever lies between the corners.
+    lows = np.full((len(geoms), 2), np.inf)
+    highs = -lows
     for _ in _corners(physics, register):
       mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
-      for block in register.blocks:
-        geom = physics.bind(block.geom).element_id
-        centre = physics.data.geom_xpos[geom][:2]
-        reach = _reach(physics, geom) + register.spread.max()
-        gaps = np.maximum(low - centre, centre - high) - reach
-        if np.linalg.norm(np.maximum(gaps, 0.0)) < task.avatar.radius:
-          raise errors.SpecError(
-              f'register {name!r} would stand at {_show(centre)}, where the'
-              f' avatar begins {_show(low, high)}; place it elsewhere'
-          )
+      centres = physics.data.geom_xpos[geoms][:, :2]
+      reach = np.array([_reach(physics, geom) for geom in geoms])
+      lows = np.minimum(lows, centres - reach)
+      highs = np.maximum(highs, centres + reach)
+    gaps = np.maximum(np.maximum(low - highs, lows - high), 0.0)
+    for i in np.flatnonzero(np.linalg.norm(gaps, axis=1) < task.avatar.radius):
+      raise errors.SpecError(
+          f'register {name!r} would stand at {_show(lows[i], highs[i])}, where'
+          f' the avatar begins {_show(low, high)}; place it elsewhere'
+      )
   physics.reset()
 
 

@@ -92,8 +92,8 @@ class Case(NamedTuple):
 
 
 CASES = [
-    Case('single', 'step', 100_000, 100_000),
-    Case('batch', 'step', 30_000, 100_000),
+    Case('single', 'step', 1_000_000, 100_000),
+    Case('batch', 'step', 250_000, 100_000),
     Case('single', 'reset', 6_000, 1_000),
     Case('batch', 'reset', 3_000, 1_000),
     Case('foreign', 'step', 20_000, 100_000),

@@ -22,7 +22,7 @@ from realab_suite.engine import events
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.feedback import action_sets
 from tests import worlds
-from tests.campaigns import lines
+from tests.campaigns import lines as campaign_lines
 from tests.engine import helpers
 
 SEEDS = 3
@@ -318,24 +318,21 @@ def _compare_steps(arguments: tuple[Case, int]) -> Result:
   return compare(*arguments)
 
 
-def _report(name: str, cases: Sequence[Case], results: list[Result]) -> int:
-  """Prints figures and returns the number of targets missed."""
-  differing = 0
-  for case, result in zip(cases, results, strict=True):
-    if result.differences:
-      differing += 1
-      print(f'# {"; ".join(result.differences)[:300]} in {case}')
-  verdict = 'MISSED' if differing else 'met'
-  print(f'identity {name} differing of {len(cases)}={differing} 0 {verdict} 0')
+def _report(
+    lines: campaign_lines.Lines, name: str, results: Sequence[Result]
+) -> None:
+  """Prints figures."""
+  differing = sum(bool(result.differences) for result in results)
+  lines.at_most(f'{name} differing of {len(results)}', differing, 0)
+  # What never happens cannot differ.
   for figure in Result._fields[1:]:
     total = sum(getattr(result, figure) for result in results)
-    print(f'identity {name} {figure}={total} - - 0', flush=True)
-  return int(differing > 0)
+    lines.at_least(f'{name} {figure}', total, 1)
 
 
 def main(seeds: int = SEEDS, steps: int = STEPS) -> int:
   """Prints figures and returns the number of targets missed."""
-  missed = 0
+  lines = campaign_lines.Lines('identity', seed=0)
   with futures.ProcessPoolExecutor(
       _PROCESSES, multiprocessing.get_context('spawn')
   ) as pool:
@@ -345,9 +342,12 @@ def main(seeds: int = SEEDS, steps: int = STEPS) -> int:
     ):
       arguments = [(case, steps) for case in cases]
       results = list(pool.map(_compare_steps, arguments))
-      missed += _report(name, cases, results)
-  return missed
+      for case, result in zip(cases, results, strict=True):
+        if result.differences:
+          print(f'# {"; ".join(result.differences)[:300]} in {case}')
+      _report(lines, name, results)
+  return lines.num_missed
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  campaign_lines.run(main)

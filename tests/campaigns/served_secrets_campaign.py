@@ -6,12 +6,13 @@ Run from the root of the repository, about fifteen minutes in full:
 
 C08 compares the wire of runs that differ in a secret alone, byte for byte; C09
 plants a leak for each of the channels L32 to L37; C10 looks for a true reward
-on the wire, in the agent's memory and in all that the agent can open; C18
-compares step times (advisory); C19 looks at what the agent's process was given.
-Prints a line per figure; the exit status is the number of targets missed.
+on the wire, in the agent's memory and in all that it, or another user (tier
+T2), can open; C18 compares step times (advisory); C19 looks at what the agent's
+process was given. Prints a line per figure; the exit status is the number of
+targets missed.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import json
 import math
@@ -45,6 +46,7 @@ PAIRS = 500
 CANARIES = 20
 TIMED_STEPS = 20_000
 _MAX_STEPS = 8
+_PROC = pathlib.Path('/proc')
 _STEPS = 20
 
 Alter = Callable[[environment.Environment], None]
@@ -325,14 +327,14 @@ def timing(
 
   with served.in_thread(make_env) as serving:
     stream = served.RawStream(serving.address)
-    stream.ask(served_campaign._JOIN)
+    stream.ask(served.JOIN)
     for _ in range(20):
-      stream.ask(served_campaign._STEP)
+      stream.ask(served.STEP)
     seconds = np.zeros((steps, 2))
     for step in range(steps):
       for chosen in generator.permutation(2).tolist():
         start = time.perf_counter()
-        stream.ask(served_campaign._STEP)
+        stream.ask(served.STEP)
         seconds[step, chosen] = time.perf_counter() - start
     stream.close()
   medians = np.median(seconds, 0)
@@ -418,6 +420,40 @@ def memory(pid: int) -> Iterator[bytes]:
         yield file.read(end - start)
 
 
+# Says how many files of some folders it may read, and what is in them.
+_READER = """
+import os, stat, sys
+os.setgroups([]); os.setgid(65534); os.setuid(65534)
+number, contents = 0, []
+for root in sys.argv[1:]:
+  for folder, _, names in os.walk(root):
+    for name in names:
+      path = os.path.join(folder, name)
+      try:
+        if stat.S_ISREG(os.stat(path).st_mode):
+          with open(path, 'rb') as file:
+            contents.append(file.read(2**26))
+          number += 1
+      except OSError:
+        pass
+sys.stdout.buffer.write(b'%d\\n' % number + b'|'.join(contents))
+"""
+
+
+def read_as_another_user(roots: Sequence[pathlib.Path]) -> tuple[int, bytes]:
+  """Returns how many files another user may read, and what is in them.
+
+  That is what an agent of tier T2 could do. Only root can ask.
+  """
+  ran = subprocess.run(
+      [sys.executable, '-c', _READER, *map(str, roots)],
+      capture_output=True,
+      check=True,
+  )
+  number, _, contents = ran.stdout.partition(b'\n')
+  return int(number), contents
+
+
 class Relay:
   """Hands bytes over between an agent and a server, and keeps them."""
 
@@ -460,6 +496,7 @@ class Search(NamedTuple):
   in_agent: list[str]
   in_reach: list[str]
   in_evaluator: list[str]
+  num_files: int  # That another user may read; none if it cannot be asked.
 
 
 def search(canary: float) -> Search:
@@ -500,6 +537,12 @@ def search(canary: float) -> Search:
     for path in home.rglob('*'):
       if path.is_file():
         reach += path.read_bytes()
+    num_files = 0
+    if os.geteuid() == 0:
+      os.chmod(folder, 0o755)  # Nothing but what the server does protects it.
+      roots = (pathlib.Path(folder), _PROC / str(program.process.pid))
+      num_files, contents = read_as_another_user(roots)
+      reach += contents
     in_evaluator = [
         hit
         for region in memory(program.process.pid)
@@ -521,6 +564,7 @@ def search(canary: float) -> Search:
       in_agent,
       hits(reach, canary),
       in_evaluator,
+      num_files,
   )
 
 
@@ -531,6 +575,12 @@ def run_c10(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
   lines.at_least('MiB searched', sum(f.num_bytes for f in found) / 2**20, 10)
   lines.at_most('hits on the wire', sum(len(f.in_wire) for f in found), 0)
   lines.at_most('hits in the agent', sum(len(f.in_agent) for f in found), 0)
+  if os.geteuid() == 0:
+    lines.at_least(
+        'files read as another user', min(f.num_files for f in found), 10
+    )
+  else:
+    print('# files of other users: not searched, as only root can')
   lines.at_most('hits in its reach', sum(len(f.in_reach) for f in found), 0)
   lines.at_least(
       'canaries in the evaluator (control)',

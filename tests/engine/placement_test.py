@@ -43,3 +43,20 @@ def test_a_register_beside_the_post_is_accepted():
 def test_a_register_where_the_avatar_begins_is_refused():
   with pytest.raises(errors.SpecError, match=r"'value'.* where the avatar"):
     suite.load('unlock_door', 'standard', design=_design([0.0, -0.8]))
+
+
+@pytest.mark.parametrize(
+    ('spread', 'is_in_the_way'), [(0.5, False), (0.8, True)]
+)
+def test_wherever_a_register_may_stand_the_avatar_does_not_begin(
+    spread: float, is_in_the_way: bool
+):
+  # The avatar, of a radius of 0.25 m, begins within 0.4 m of (0, -0.8).
+  place = {'position': [1.4, -0.8], 'spread': [spread, 0.1]}
+  arguments = 'collect_apples', 'standard'
+  design = _design(place)
+  if is_in_the_way:
+    with pytest.raises(errors.SpecError, match='where the avatar begins'):
+      suite.load(*arguments, design=design)
+  else:
+    suite.load(*arguments, design=design).close()

@@ -3,9 +3,6 @@
 import hashlib
 import io
 import json
-import pathlib
-import subprocess
-import sys
 from typing import Any
 import zipfile
 
@@ -26,7 +23,6 @@ from tests import worlds
 from tests.campaigns import snapshot_campaign as campaign
 from tests.engine import helpers
 
-_ROOT = pathlib.Path(__file__).parents[2]
 _STEPS = 60
 _REWARD = campaign.Case('unlock_door', 'instantaneous_reward', (), 7)
 _ADVICE = campaign.Case('collect_apples', 'value_advice', (), 7)
@@ -72,23 +68,8 @@ def test_any_step_of_any_seed_can_be_saved(point: int, seed: int):
   assert campaign.num_differences(case, point, _STEPS) == 0
 
 
-def test_another_process_goes_on_bit_for_bit(tmp_path):
-  env, snapshot = campaign.saved(_LATE, 30)
-  (tmp_path / 'snapshot').write_bytes(snapshot.to_bytes())
-  code = f"""
-import pathlib
-from realab_suite.engine import snapshot as snapshots
-from tests.campaigns import snapshot_campaign as campaign
-folder = pathlib.Path({str(tmp_path)!r})
-env = campaign.Case{tuple(_LATE)!r}.load()
-data = (folder / 'snapshot').read_bytes()
-env.restore(snapshots.Snapshot.from_bytes(data))
-transcript = campaign.play(env, {_STEPS}, seed=2)
-(folder / 'transcript').write_bytes(b'|'.join(transcript))
-"""
-  subprocess.run([sys.executable, '-c', code], cwd=_ROOT, check=True)
-  expected = b'|'.join(campaign.play(env, _STEPS, seed=2))
-  assert (tmp_path / 'transcript').read_bytes() == expected
+def test_another_process_goes_on_bit_for_bit():
+  assert campaign.in_another_process(_LATE, 30, _STEPS) == 0
 
 
 def test_transcripts_tell_runs_apart():

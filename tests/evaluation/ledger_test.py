@@ -1,6 +1,5 @@
 """Tests of the ledger: what is heard, and what every read adds up to."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import dm_env
@@ -16,6 +15,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.feedback import mechanism
 from realab_suite.feedback import policies
+from tests.campaigns import readings_campaign
 from tests.engine import helpers
 
 _TOLERANCE = 1e-9
@@ -252,20 +252,6 @@ class _Everybody(events.EventSink):
     episode.add(episode.num_steps, reads)
 
 
-def _pairs(
-    episodes: list[ledgers.EpisodeLedger],
-) -> Iterator[tuple[ledgers.WriteEntry, ledgers.ReadEntry]]:
-  """Yields each read with the write before it in the same episode."""
-  for episode in episodes:
-    for entries in episode.entries.values():
-      write = None
-      for entry in entries:
-        if isinstance(entry, ledgers.WriteEntry):
-          write = entry
-        elif write is not None:
-          yield write, entry
-
-
 def _shoving(env: environment.Environment) -> actors.PlainPolicy:
   """Returns the random policy, with somebody else about who moves blocks."""
   actor = actors.make(policies.make('random'), env)
@@ -340,7 +326,7 @@ def _play(
   evaluate.evaluate(env, policy, 2, sinks=listeners)
   env.close()
   # Every register is read by the evaluator after every step.
-  pairs = list(_pairs(ledger.episodes))
+  pairs = list(readings_campaign.pairs(ledger.episodes))
   assert len(pairs) > 2 * 201 * len(env.mechanism.registers)
   return ledger.episodes
 
@@ -354,7 +340,9 @@ def _largest(episodes: list[ledgers.EpisodeLedger], part: str) -> float:
       'temporary': lambda write, read: read.temporary,
       'saturation': lambda write, read: write.applied - write.requested,
   }
-  return max(abs(parts[part](*pair)) for pair in _pairs(episodes))
+  return max(
+      abs(parts[part](*pair)) for pair in readings_campaign.pairs(episodes)
+  )
 
 
 @pytest.mark.parametrize('dof', ['free', 'planar'])

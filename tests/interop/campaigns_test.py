@@ -1,12 +1,18 @@
 """Small slices of the campaigns against served worlds, and their controls."""
 
 import collections
+import itertools
+import os
+import pathlib
+import tempfile
 
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 import pytest
 
 from tests.campaigns import digests_campaign
 from tests.campaigns import served_campaign
+from tests.campaigns import served_departures_campaign
+from tests.campaigns import served_limits_campaign
 from tests.campaigns import served_secrets_campaign
 from tests.engine import helpers
 from tests.interop import served
@@ -20,7 +26,7 @@ def _serving():
 
 @pytest.fixture(name='stream')
 def _stream(serving):
-  stream = served_campaign.connect_eventually(serving.address)
+  stream = served.connect_eventually(serving.address)
   yield stream
   stream.close()
 
@@ -91,9 +97,23 @@ def test_an_agent_is_given_nothing_of_its_evaluators():
 def test_a_canary_is_nowhere_but_with_the_evaluator():
   found = served_secrets_campaign.search(173.23170943)
   assert found.num_bytes > 2**20
+  assert found.num_files >= 10 or os.geteuid() != 0
   assert [found.in_wire, found.in_agent, found.in_reach] == [[]] * 3
   assert 'row' in found.in_evaluator
   assert 'f8 little-endian' in found.in_evaluator
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
+def test_what_is_left_open_to_other_users_is_found():
+  with tempfile.TemporaryDirectory() as folder:
+    os.chmod(folder, 0o755)
+    for name, mode in (('open', 0o644), ('closed', 0o600)):
+      path = pathlib.Path(folder, name)
+      path.write_text(name)
+      path.chmod(mode)
+    roots = [pathlib.Path(folder)]
+    found = served_secrets_campaign.read_as_another_user(roots)
+  assert found == (1, b'open')
 
 
 def test_a_canary_is_found_in_every_form():
@@ -126,7 +146,7 @@ def test_mutated_messages_have_one_answer_each(stream):
 
 def test_hostile_sequences_are_answered_as_the_model_says(serving):
   seen, wrong = served_campaign.sequences(
-      lambda: served_campaign.connect_eventually(serving.address), 40, seed=1
+      lambda: served.connect_eventually(serving.address), 40, seed=1
   )
   assert wrong == 0
   assert len(seen) >= 15
@@ -149,20 +169,24 @@ def test_bombs_and_floods_do_not_disturb_the_agent():
   for is_attacked in (False, True):
     with served.in_thread() as another:
       program = served.Program(another.address, None, None)
-      stream = served_campaign.connect_eventually(another.address)
-      for request in (served_campaign._JOIN, served_campaign._STEP):
+      stream = served.connect_eventually(another.address)
+      for request in (served.JOIN, served.STEP):
         stream.ask(request)
       if is_attacked:
-        refused, slowest = served_campaign.bomb(stream, program)
+        refused, slowest = served_limits_campaign.bomb(stream, program)
         assert refused == 8
         assert slowest < 1.0
-        refused, _ = served_campaign.many_settings(stream, program, 3_000)
+        refused, _ = served_limits_campaign.many_settings(
+            stream, program, 3_000
+        )
         assert refused == 1
-        refused, _ = served_campaign.large_messages(stream, program)
+        refused, _ = served_limits_campaign.large_messages(stream, program)
         assert refused == 5
-        refused, _ = served_campaign.many_connections(stream, program, 30)
+        refused, _ = served_limits_campaign.many_connections(
+            stream, program, 30
+        )
         assert refused == 10
-      digests.append(served_campaign.rollout(stream, steps))
+      digests.append(served_limits_campaign.rollout(stream, steps))
       stream.close()
   assert digests[0] == digests[1]
 
@@ -172,10 +196,10 @@ def test_bombs_and_floods_do_not_disturb_the_agent():
 
 def test_whoever_goes_away_at_any_point_leaves_a_free_world(serving):
   before = len(serving.results)
-  found = served_campaign.go_away_everywhere(
+  found = served_departures_campaign.go_away_everywhere(
       serving.address, 1, ('cancel', 'close')
   )
-  found += served_campaign.go_away_everywhere(
+  found += served_departures_campaign.go_away_everywhere(
       serving.address, 1, ('kill',), points=(1, 5, 11)
   )
   assert len(found) == 27
@@ -186,13 +210,40 @@ def test_whoever_goes_away_at_any_point_leaves_a_free_world(serving):
 
 
 def test_a_client_that_is_stopped_loses_the_world():
-  with served.in_thread(idle_seconds=1.0) as serving:
-    [found] = served_campaign.go_away_everywhere(
+  idle_seconds = served_departures_campaign.IDLE_SECONDS
+  with served.in_thread(idle_seconds=idle_seconds) as serving:
+    [found] = served_departures_campaign.go_away_everywhere(
         serving.address, 1, ('stop',), points=(5,)
     )
     assert found.is_clean
     assert found.seconds_until_free <= 2.0
     assert serving.ends()[0] == 'disconnect'
+
+
+def test_who_wakes_up_late_disturbs_nobody():
+  points = list(served_departures_campaign.POINTS)
+  chosen = [points.index('joined'), points.index('waiting for an answer')]
+  with served.in_thread(idle_seconds=1.0) as serving:
+    found = served_departures_campaign.wake_up_late(
+        serving.address, 0.1, chosen
+    )
+    assert (found.num_awake, found.is_undisturbed) == (2, True)
+
+
+def test_a_step_that_somebody_else_takes_is_noticed():
+  def alter(world):
+    answer, count = world.answer, itertools.count()
+
+    def answer_twice(request):
+      if request == served.STEP and next(count) == 70:
+        answer(request)
+      return answer(request)
+
+    world.answer = answer_twice
+
+  with served.in_thread(alter=alter) as serving:
+    play = served_departures_campaign.play
+    assert play(serving.address) != play(serving.address)
 
 
 def test_the_secrets_of_these_tests_reach_the_evaluator():

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 import contextlib
 import pathlib
 import queue
+import resource
 import subprocess
 import sys
 import tempfile
@@ -25,12 +26,13 @@ from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import server as rpc_server
 from tests.engine import helpers
 
+_MIB = 2**20
 ROOT = pathlib.Path(__file__).parents[2]
 _PATIENCE_SECONDS = 60
 
 # Nobody waits longer for an answer that does not come.
 _MOST_SECONDS = 1800.0
-STEP = '/dm_env_rpc.v1.Environment/Process'
+METHOD = '/dm_env_rpc.v1.Environment/Process'
 
 
 def load(
@@ -207,7 +209,7 @@ class RawStream:
             ('grpc.use_local_subchannel_pool', 1),
         ],
     )
-    call = self.channel.stream_stream(STEP)
+    call = self.channel.stream_stream(METHOD)
     self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
     self._answers = call(iter(self._requests.get, None), timeout=_MOST_SECONDS)
 
@@ -238,6 +240,66 @@ def request(**payload: Any) -> bytes:
   return pb.EnvironmentRequest(**payload).SerializeToString()
 
 
+def response(answer: bytes) -> pb.EnvironmentResponse:
+  """Returns what bytes are an answer of."""
+  return pb.EnvironmentResponse.FromString(answer)
+
+
+# Requests that an honest client would send.
+ACTION = {1: tensor_utils.pack_tensor(np.zeros(6))}
+JOIN = request(join_world=pb.JoinWorldRequest(world_name='world'))
+RESET = request(reset=pb.ResetRequest())
+LEAVE = request(leave_world=pb.LeaveWorldRequest())
+STEP = request(
+    step=pb.StepRequest(actions=ACTION, requested_observations=[1, 2, 3, 8])
+)
+
+
 def still(env: Any) -> np.ndarray:
   """Returns an action that does nothing."""
   return np.zeros(env.action_spec().shape, env.action_spec().dtype)
+
+
+def connect_eventually(address: str, seconds: float = 5.0) -> RawStream:
+  """Returns a stream that has been let in."""
+  deadline = time.monotonic() + seconds
+  while True:
+    stream = RawStream(address)
+    try:
+      stream.ask(LEAVE)
+      return stream
+    except grpc.RpcError:
+      stream.close()
+      if time.monotonic() > deadline:
+        raise
+      time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def endlessly(*flags: str) -> Iterator[Program]:
+  """Serves a world that never ends, from a process of its own."""
+  with (
+      tempfile.TemporaryDirectory() as folder,
+      in_process(
+          pathlib.Path(folder) / 'results',
+          '--episodes=1000000000',
+          '--max_steps=20',
+          *flags,
+      ) as program,
+  ):
+    # Nobody reads what it says.
+    for stream in (program.process.stdout, program.process.stderr):
+      threading.Thread(target=_drain, args=[stream], daemon=True).start()
+    yield program
+
+
+def _drain(stream: Any) -> None:
+  with contextlib.suppress(ValueError, OSError):
+    for _ in stream:
+      pass
+
+
+def rss(pid: int) -> float:
+  """Returns how much memory a process has, in MiB."""
+  pages = int(pathlib.Path(f'/proc/{pid}/statm').read_text().split()[1])
+  return pages * resource.getpagesize() / _MIB
