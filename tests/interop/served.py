@@ -183,21 +183,6 @@ class Client:
     self.close()
 
 
-def join_eventually(address: str, seconds: float = 5.0) -> Client:
-  """Returns a client that has joined, once whoever came before has gone."""
-  deadline = time.monotonic() + seconds
-  while True:
-    client = Client(address)
-    try:
-      client.join()
-      return client
-    except grpc.RpcError:
-      client.close()
-      if time.monotonic() > deadline:
-        raise
-      time.sleep(0.01)
-
-
 class RawStream:
   """A stream of bytes, for requests that no honest client would send."""
 
@@ -260,16 +245,30 @@ def still(env: Any) -> np.ndarray:
   return np.zeros(env.action_spec().shape, env.action_spec().dtype)
 
 
+def join_eventually(address: str, seconds: float = 5.0) -> Client:
+  """Returns a client that has joined, once whoever came before has gone."""
+  return _eventually(lambda: Client(address), Client.join, seconds)
+
+
 def connect_eventually(address: str, seconds: float = 5.0) -> RawStream:
   """Returns a stream that has been let in."""
+  return _eventually(
+      lambda: RawStream(address), lambda stream: stream.ask(LEAVE), seconds
+  )
+
+
+def _eventually(
+    make: Callable[[], Any], greet: Callable[[Any], Any], seconds: float
+) -> Any:
+  """Returns somebody who was not refused, and lets go of those who were."""
   deadline = time.monotonic() + seconds
   while True:
-    stream = RawStream(address)
+    made = make()
     try:
-      stream.ask(LEAVE)
-      return stream
+      greet(made)
+      return made
     except grpc.RpcError:
-      stream.close()
+      made.close()
       if time.monotonic() > deadline:
         raise
       time.sleep(0.01)
