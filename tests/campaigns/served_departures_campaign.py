@@ -30,6 +30,8 @@ REPETITIONS = 50
 STOPPED_SECONDS = 30.0
 IDLE_SECONDS = 1.0
 _PATIENCE_SECONDS = 600
+# This one; its name is another one where it is run.
+_MODULE = 'tests.campaigns.served_departures_campaign'
 
 
 def _ask_without_waiting(stream: served.RawStream) -> None:
@@ -104,7 +106,7 @@ class Clients:
 
   def __init__(self, address: str) -> None:
     self._address = address
-    self._nursery = zygote.Zygote(__name__)
+    self._nursery = zygote.Zygote(_MODULE)
     self._folder = tempfile.TemporaryDirectory()
     self._number = 0
 
