@@ -54,7 +54,6 @@ class Mutant(NamedTuple):
 
 _ENVIRONMENT = 'engine/environment.py'
 _ENV = ('tests/engine/environment_test.py',)
-_SUITE = ('tests/suite_test.py',)
 _ACTIONS = 'engine/actions.py'
 _MECHANISM = 'feedback/mechanism.py'
 _MECH = ('tests/feedback/mechanism_test.py',)
@@ -130,7 +129,7 @@ MUTANTS = [
         'contract', 'finding 6: discounts may be anything', _ENVIRONMENT,
         'discount = float(self._task.get_discount(physics))',
         "discount = float(self._task.get_discount(physics)) * float('nan')",
-        _SUITE,
+        _ENV,
     ),
     Mutant(
         'contract', 'finding 6: an observation is aliased', _ENVIRONMENT,
@@ -247,7 +246,7 @@ MUTANTS = [
     Mutant(
         'contract', 'solvers that couple are accepted', 'engine/placement.py',
         '  _check_solver(physics, mechanism)\n', '',
-        ('tests/engine/placement_test.py',),
+        ('tests/feedback/specs_test.py',),
     ),
     # ---- Metrics -------------------------------------------------------------
     Mutant(
