@@ -7,7 +7,7 @@ Run from the root of the repository, about fifteen minutes on two processors:
 50 scripted pushers at full force shove blocks at walls and into corners and
 doorways, carry and throw them, and stack them, for 2,000 control steps each;
 ten times over, with other seeds, which is 1e6 control steps of 10 substeps. The
-blocks weigh from 10 g to 100 kg and measure from 2 cm to 1 m, as far as designs
+blocks weigh from 10 g to 100 kg and measure from 6 cm to 1 m, as far as designs
 allow. In half of the rounds the registers are written in every control step.
 Arguments: a scale for the number of rounds and of steps, and a seed.
 """
@@ -52,9 +52,9 @@ DESIGN = {
             [-2.9, -2.9], kind='block_position', block_size=1.0, mass=100.0
         ),
         'small': _register([-2.8, 0.4], block_size=0.1, mass=0.2),
-        'tiny': _register([1.8, -2.0], block_size=0.02, mass=0.01),
+        'tiny': _register([1.8, -2.0], block_size=0.06, mass=0.01),
         'tiny_planar': _register(
-            [1.8, -2.6], block_size=0.02, mass=0.01, dof='planar'
+            [1.8, -2.6], block_size=0.06, mass=0.01, dof='planar'
         ),
         'dense': _register([1.8, 3.0], block_size=0.1, mass=100.0),
         'turned': _register(

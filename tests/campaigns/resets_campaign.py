@@ -73,7 +73,7 @@ def draw_design(rng: np.random.Generator) -> dict[str, Any]:
         'range': [float(low), float(high)],
         'scale': float(rng.uniform(0.01, 0.3)),
         'initial': float(rng.uniform(low, high)),
-        'block_size': float(np.exp(rng.uniform(np.log(0.02), 0.0))),
+        'block_size': float(np.exp(rng.uniform(np.log(0.06), 0.0))),
         'mass': float(np.exp(rng.uniform(np.log(0.01), np.log(100.0)))),
         'channel': str(rng.choice(['embedded', 'welded', 'secure'])),
         'dof': str(rng.choice(['free', 'planar'])),

@@ -208,7 +208,7 @@ def _register(name: str) -> st.SearchStrategy[Any]:
           'on_overflow': st.sampled_from(['saturate', 'error']),
           'channel': st.sampled_from(['embedded', 'welded', 'secure']),
           'dof': st.sampled_from(['free', 'planar']),
-          'block_size': st.floats(0.02, 0.6),
+          'block_size': st.floats(0.06, 0.6),
           'mass': st.sampled_from([0.01, 0.5, 1, 30, 100]),
           'options': st.sampled_from([{}, {'colour': 1}, {'scale': 2}]),
       },

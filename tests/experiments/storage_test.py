@@ -107,6 +107,13 @@ def test_every_fact_of_a_run_that_is_over_is_guarded(tmp_path):
     storage.is_done(tmp_path)
 
 
+@pytest.mark.parametrize('name', ['../x', '/x', '.x', ''])
+def test_a_run_that_is_over_names_files_of_its_own_folder(tmp_path, name):
+  storage.write_done(tmp_path, {'files': {name: '0' * 64}})
+  with pytest.raises(errors.ResultsError, match='is no file of a run; remove'):
+    storage.is_done(tmp_path)
+
+
 def test_what_is_no_json_is_named(tmp_path):
   path = tmp_path / 'file'
   path.write_text('{"a":')
@@ -173,6 +180,10 @@ def test_the_first_difference_is_named_by_its_place():
   )
   assert storage.difference(there, {'d': 0}).startswith('a is {')
   assert storage.difference({}, {'d': 0}) == 'd is None there, 0 here'
+  # One has the key, and says nothing by it.
+  assert storage.difference({'a': {'b': None}}, {'a': {}}) == (
+      "a is {'b': None} there, {} here"
+  )
 
 
 def test_a_file_is_on_the_disk_before_its_name_and_then_the_name_is(

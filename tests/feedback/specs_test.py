@@ -146,6 +146,10 @@ _WRONG = {
     'absurd mass': (_reward(mass=1e300), 'mass: must be less than'),
     'mass as a boolean': (_reward(mass=True), 'mass: must be a valid number'),
     'block without size': (_reward(block_size=0), 'block_size: must be gre'),
+    'block that would land under the floor': (
+        _reward(block_size=0.05),
+        'block_size: must be greater than or equal to 0.06, got 0.05',
+    ),
     'huge block': (_reward(block_size=5), 'block_size: must be less than'),
     'scale of zero': (_reward(scale=0), 'registers.reward.scale: must be gre'),
     'scale that leaves noise': (_reward(scale=1e-7), 'scale: must be gre'),
