@@ -25,7 +25,7 @@ Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 Value = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
 # What an avatar throws lands at up to 2.8 m/s, 28 mm in a substep of 10 ms: the
-# middle of a block of less than twice that would be under the floor for a while.
+# middle of a block of less than twice that would be under the floor at first.
 Size = Annotated[float, pydantic.Field(ge=0.06, le=1.0)]
 Channel = Literal['embedded', 'welded', 'secure']
 Dof = Literal['free', 'planar']
