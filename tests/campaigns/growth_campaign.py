@@ -1,6 +1,6 @@
 """Campaign C34: neither memory nor anything else grows with steps and resets.
 
-Run from the root of the repository, about a quarter of an hour on two processors:
+Run from the root of the repository, a quarter of an hour on two processors:
 
     python -m tests.campaigns.growth_campaign
 
