@@ -1,6 +1,6 @@
 """Campaign C45: how much of what must not be wrong the tests go through.
 
-Run from the root of the repository, about five minutes:
+Run from the root of the repository, about eight minutes:
 
     python -m tests.campaigns.coverage_campaign [scale] [seed]
 

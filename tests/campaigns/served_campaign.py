@@ -1,6 +1,6 @@
 """Campaigns C16 and C24: messages to a served world that mean ill.
 
-Run from the root of the repository, about half an hour in full:
+Run from the root of the repository, about two minutes in full:
 
     python -m tests.campaigns.served_campaign [scale] [seed] [C24 ...]
 

@@ -1,6 +1,6 @@
 """Campaign C25: clients that try to use a served world up.
 
-Run from the root of the repository, about five minutes in full:
+Run from the root of the repository, about half a minute in full:
 
     python -m tests.campaigns.served_limits_campaign
 
@@ -16,7 +16,7 @@ import hashlib
 import socket
 import threading
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
@@ -34,6 +34,7 @@ SETTINGS_KEYS = 100_000
 _MIB = 2**20
 
 
+@final
 class PeakMemory:
   """Watches the memory of a process."""
 
@@ -85,6 +86,7 @@ def expected_rollout(steps: int) -> str:
   return digest
 
 
+@final
 class Attack(NamedTuple):
   """What came of an attack on a server whose agent plays on."""
 

@@ -1,6 +1,6 @@
 """Campaigns C08, C09, C10, C18 and C19, served: what an agent could find out.
 
-Run from the root of the repository, about fifteen minutes in full:
+Run from the root of the repository, about five minutes in full:
 
     python -m tests.campaigns.served_secrets_campaign [scale] [seed] [C10 ...]
 
@@ -46,7 +46,6 @@ PAIRS = 500
 CANARIES = 20
 TIMED_STEPS = 20_000
 _MAX_STEPS = 8
-_PROC = pathlib.Path('/proc')
 _STEPS = 20
 
 Alter = Callable[[environment.Environment], None]
@@ -496,7 +495,7 @@ class Search(NamedTuple):
   in_agent: list[str]
   in_reach: list[str]
   in_evaluator: list[str]
-  num_files: int  # That another user may read; none if it cannot be asked.
+  num_files: int  # That another user may read; 0 where only root can ask.
 
 
 def search(canary: float) -> Search:
@@ -540,7 +539,8 @@ def search(canary: float) -> Search:
     num_files = 0
     if os.geteuid() == 0:
       os.chmod(folder, 0o755)  # Nothing but what the server does protects it.
-      roots = (pathlib.Path(folder), _PROC / str(program.process.pid))
+      world = pathlib.Path(f'/proc/{program.process.pid}')
+      roots = (pathlib.Path(folder), world)
       num_files, contents = read_as_another_user(roots)
       reach += contents
     in_evaluator = [

@@ -662,7 +662,10 @@ def test_closing_twice_does_nothing_and_a_closed_environment_does_nothing():
 
 
 def test_an_environment_that_was_never_used_can_be_closed():
-  _load().close()
+  env = _load()
+  env.close()
+  with pytest.raises(errors.ClosedError):
+    env.reset()
 
 
 @pytest.mark.parametrize(

@@ -244,8 +244,9 @@ def test_a_file_is_json_in_the_strict_sense(tmp_path: pathlib.Path):
     raise AssertionError(f'{constant} is no JSON')
 
   text = (tmp_path / 'rows').read_text(encoding='utf-8')
-  for line in text.splitlines():
-    json.loads(line, parse_constant=refuse)
+  lines = text.splitlines()
+  read = [json.loads(line, parse_constant=refuse) for line in lines]
+  assert [row['num_steps'] for row in read] == [_row().num_steps] * 2
 
 
 def _measured(**changes: Any) -> metrics.RegisterMetrics:

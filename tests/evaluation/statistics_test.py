@@ -243,7 +243,8 @@ class TestErrors:
       statistics.tampering_verdict({1: [0.0]}, {1: [0.0]}, margin=margin)
 
   def test_as_many_resamples_as_the_message_asks_for_are_enough(self):
-    statistics.mean_interval({1: [0.0]}, level=0.9, num_resamples=100)
+    found = statistics.mean_interval({1: [0.0]}, level=0.9, num_resamples=100)
+    assert found.level == 0.9
 
   def test_messages_are_one_line_and_name_the_function(self):
     with pytest.raises(errors.ResultsError, match=r'\Atampering_verdict: .*\Z'):

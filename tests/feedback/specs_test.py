@@ -452,7 +452,9 @@ def test_a_design_that_does_not_fit_a_world_is_refused_in_one_line(
 
 
 def test_the_design_of_the_tables_is_itself_all_right():
-  suite.load(*_ON_TWO, design=_DESIGN).close()
+  env = suite.load(*_ON_TWO, design=_DESIGN)
+  env.close()
+  assert set(env.mechanism.registers) == set(_DESIGN['registers'])
 
 
 def test_messages_name_the_file(tmp_path: pathlib.Path):

@@ -200,8 +200,9 @@ def test_a_task_is_an_ordinary_composer_task():
     env = composer.Environment(world(), random_state=1)
     env.reset()
     env.physics.forward()
-    env.step(np.zeros(env.action_spec().shape))
+    time_step = env.step(np.zeros(env.action_spec().shape))
     env.close()
+    assert time_step.mid()
 
 
 def test_a_world_without_room_for_its_apples_says_so():
