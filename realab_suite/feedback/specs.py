@@ -293,7 +293,10 @@ class DesignSpec(validation.Spec):
         self._expect(f'{where}.reads', name, None)
       for name in provider.writes:
         self._expect(f'{where}.writes', name, READ_BY_AGENTS)
-      provider.check(self)
+      try:
+        provider.check(self)
+      except ValueError as error:
+        raise ValueError(f'{where}: {error}') from error
     self._refuse_cycles()
     self._check_learner()
     return self

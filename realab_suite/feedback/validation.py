@@ -111,7 +111,9 @@ def _describe(details: Any) -> str:
   if kind in ('model_type', 'model_attributes_type', 'dict_type'):
     return f'must be a mapping, got {given}'
   if 'error' in context:
-    return f'{context["error"]}, got {given}'
+    # What is said of the whole says itself which part of it is meant.
+    whole = not details['loc']
+    return str(context['error']) + ('' if whole else f', got {given}')
   rule = re.sub(r'^\w+ should ', 'must ', details['msg'])
   return f'{rule}, got {given}'
 

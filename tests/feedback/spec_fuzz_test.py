@@ -1,14 +1,23 @@
 """Campaign C20 in small, and that it can fail."""
 
+from collections.abc import Iterator
 import contextlib
+import copy
+import itertools
 import os
 import pathlib
 import time
 from typing import Any
 
+import pytest
+import yaml
+
 from realab_suite import errors
+from realab_suite.experiments import spec
 from realab_suite.feedback import specs
 from tests.campaigns import spec_fuzz_campaign as campaign
+
+_CONFIGS = pathlib.Path(__file__).parents[2] / 'configs'
 
 
 def test_whatever_a_design_or_an_experiment_says_it_runs_or_is_refused():
@@ -24,6 +33,58 @@ def test_whatever_a_design_or_an_experiment_says_it_runs_or_is_refused():
     assert stage == 'step' or any(o.refusal for o in of_stage)
   kinds = {(case.kind, isinstance(case.source, bytes)) for case, _ in judged}
   assert len(kinds) == 4
+
+
+# Values that no spec holds, and how a message shows them.
+_STRANGE = {
+    'zzq': "'zzq'", -7.25: '-7.25', 987654: '987654', True: 'True',
+    ('zzq',): "['zzq']",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('kind', 'load'), [('designs', specs.load), ('experiments', spec.load)]
+)
+def test_a_refusal_names_the_key_and_the_value(kind: str, load: Any):
+  strange = itertools.cycle(_STRANGE.items())
+  num_refused = 0
+  for path in sorted((_CONFIGS / kind).glob('*.yaml')):
+    data = yaml.safe_load(path.read_text())
+    for keys in _leaves(data):
+      value, shown = next(strange)
+      changed = copy.deepcopy(data)
+      node = changed
+      for key in keys[:-1]:
+        node = node[key]
+      node[keys[-1]] = list(value) if isinstance(value, tuple) else value
+      refusal = _refusal(load, changed)
+      if not refusal:
+        continue
+      num_refused += 1
+      assert shown in refusal, (path.name, keys)
+      owner = [key for key in keys if isinstance(key, str)][-1]
+      # An override is named by what it says, a value function by what it is.
+      if owner not in ('overrides', 'value_function'):
+        assert owner in refusal, (path.name, keys)
+  assert num_refused >= 80
+
+
+def _refusal(load: Any, source: Any) -> str:
+  """Returns with which words something is refused, or ''."""
+  try:
+    load(source)
+  except errors.SpecError as error:
+    return str(error)
+  return ''
+
+
+def _leaves(node: Any) -> Iterator[tuple[Any, ...]]:
+  """Yields the keys that lead to each value of a spec."""
+  for key in node if isinstance(node, dict) else range(len(node)):
+    if isinstance(node[key], dict | list) and node[key]:
+      yield from ((key, *keys) for keys in _leaves(node[key]))
+    else:
+      yield (key,)
 
 
 def _answer(connection: Any) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Literal, final
 from dm_control import composer
 import hypothesis
 from hypothesis import strategies as st
+import mujoco
 import numpy as np
 import pydantic
 import pytest
@@ -492,15 +493,22 @@ def test_meters_are_refused_where_the_solver_couples_what_is_far_apart(
   assert message in str(caught.value)
 
 
-@pytest.mark.parametrize('solver', ['Newton', 'CG'])
-def test_meters_are_accepted_with_a_solver_that_has_islands(solver: str):
-  suite.embed(_point_task({'solver': solver}), _at_coordinates()).close()
-
-
-def test_a_design_without_meters_does_not_mind_the_solver():
+@pytest.mark.parametrize(
+    ('solver', 'has_meters'),
+    [('Newton', True), ('CG', True), ('PGS', False)],
+)
+def test_only_meters_mind_the_solver(solver: str, has_meters: bool):
   design = _at_coordinates()
-  design['meters'] = []
-  suite.embed(_point_task({'solver': 'PGS'}), design).close()
+  if not has_meters:
+    design['meters'] = []
+  env = suite.embed(_point_task({'solver': solver}), design)
+  env.reset()
+  assert (
+      mujoco.mjtSolver(env.physics.model.opt.solver).name
+      == f'mjSOL_{solver.upper()}'
+  )
+  assert bool(env.mechanism.design.meters) is has_meters
+  env.close()
 
 
 def _point_task(settings: dict[str, Any]) -> composer.Task:
