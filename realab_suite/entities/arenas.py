@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, final
 
 from dm_control import composer
+from dm_control import mjcf
 import numpy as np
 
 from realab_suite import errors
@@ -14,6 +15,13 @@ from realab_suite.entities import appearance
 _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
 _BARRIER_HEIGHT = 0.5
+# What is hit by something heavy flies off at twice its speed, and over any wall
+# that cameras can look across.
+_LID_HEIGHT = 3.0
+_UNSEEN = {'rgba': (0, 0, 0, 0), 'user': [appearance.code('nothing')]}
+# Walls go on below the floor: a small block that is forced into one would leave
+# by the shortest way otherwise, which is down.
+_DEPTH = 0.5
 _CAMERA_HEIGHT = 30.0
 
 
@@ -100,7 +108,9 @@ class RoomArena(composer.Arena):
         'light', name='sun', pos=(0, 0, 12), dir=(0.2, 0.3, -1),
         directional='true', castshadow='false', diffuse=(0.4, 0.4, 0.4),
     )  # fmt: skip
+    self._walls: list[mjcf.Element] = []
     self._build_walls()
+    self._build_guards()
     low, high = np.array(self.extent.low), np.array(self.extent.high)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.5
     root.worldbody.add(
@@ -111,7 +121,25 @@ class RoomArena(composer.Arena):
 
   @abc.abstractmethod
   def _build_walls(self) -> None:
-    """Adds the walls, by `_add_wall`."""
+    """Adds the walls, by `_add_wall`; guards above them follow."""
+
+  def _build_guards(self) -> None:
+    """Closes the space above the walls, out of sight of cameras and rays.
+
+    MuJoCo draws nothing that is transparent, and its rays pass through it.
+    """
+    world = self._mjcf_root.worldbody
+    height = (_LID_HEIGHT - _WALL_HEIGHT) / 2
+    for wall in self._walls:
+      world.add(
+          'geom', name=f'{wall.name}_guard', type='box',
+          size=(*wall.size[:2], height),
+          pos=(*wall.pos[:2], _WALL_HEIGHT + height), **_UNSEEN,
+      )  # fmt: skip
+    world.add(
+        'geom', name='lid', type='plane', size=(20, 20, 0.1),
+        pos=(0, 0, _LID_HEIGHT), zaxis=(0, 0, -1), **_UNSEEN,
+    )  # fmt: skip
 
   @property
   @abc.abstractmethod
@@ -152,7 +180,7 @@ class RoomArena(composer.Arena):
       self, name: str, start: Sequence[float], end: Sequence[float]
   ) -> None:
     """Adds a wall whose middle line runs from `start` to `end`, metres."""
-    self._add_box(name, 'wall', start, end, _WALL_HEIGHT)
+    self._walls.append(self._add_box(name, 'wall', start, end, _WALL_HEIGHT))
 
   def _add_box(
       self,
@@ -161,12 +189,13 @@ class RoomArena(composer.Arena):
       start: Sequence[float],
       end: Sequence[float],
       height: float,
-  ) -> None:
+  ) -> mjcf.Element:
     line = np.array([start, end], float)
     half = np.ptp(line, axis=0) / 2 + _WALL_THICKNESS / 2
-    self._mjcf_root.worldbody.add(
-        'geom', name=name, type='box', size=(*half, height / 2),
-        pos=(*line.mean(axis=0), height / 2), **appearance.looks(kind)
+    return self._mjcf_root.worldbody.add(
+        'geom', name=name, type='box', size=(*half, (height + _DEPTH) / 2),
+        pos=(*line.mean(axis=0), (height - _DEPTH) / 2),
+        **appearance.looks(kind),
     )  # fmt: skip
 
   def _add_room(

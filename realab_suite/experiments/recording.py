@@ -214,7 +214,7 @@ class Recorder(events.EventSink):
       self._on_step(physics, track)
 
   def _shapes(self, physics: Any) -> list[Shape]:
-    """Returns everything but the floor, the avatar and the registers."""
+    """Returns all that is seen but the floor, the avatar and registers."""
     moving = [
         *self._avatar.mjcf_model.find_all('geom'),
         *(b.geom for r in self._registers.values() for b in r.blocks),
@@ -234,7 +234,9 @@ class Recorder(events.EventSink):
             ),
         )
         for i in np.argsort(data.geom_xpos[:, 2], kind='stable')
-        if i not in left_out and model.geom_type[i] != _PLANE
+        if i not in left_out
+        and model.geom_type[i] != _PLANE
+        and model.geom_rgba[i, 3] > 0
     ]
 
 

@@ -8,7 +8,9 @@ from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import registers
 from tests import worlds
+from tests.campaigns import bulldozers_campaign
 
 _ROOMS = {'open_room': arenas.OpenRoom, 'two_rooms': arenas.TwoRooms}
 every_room = pytest.mark.parametrize('room', _ROOMS)
@@ -138,6 +140,77 @@ def test_an_avatar_that_runs_about_in_the_small_room_stays_inside():
 
 
 @every_room
+@pytest.mark.parametrize(
+    ('size', 'mass'), [(0.06, 0.01), (0.2, 1.0), (1.0, 100.0)]
+)
+@pytest.mark.parametrize('is_guarded', [True, False])
+def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
+  arena = _ROOMS[room]()
+  register = registers.BlockPositionRegister(
+      'r', value_range=(0, 1), block_size=size, mass=mass
+  )
+  register.attach_to(arena, (0.0, 0.0))
+  if not is_guarded:
+    for geom in arena.mjcf_model.find_all('geom'):
+      if geom.name == 'lid' or (geom.name or '').endswith('_guard'):
+        geom.remove()
+  physics = worlds.compile_world(arena)
+  (block,) = register.blocks
+  starts = [(0.0, 0.0), (2.5, -2.5)]
+  if 'side_room' in arena.places:
+    starts.append(arena.places['side_room'].position)
+  rng = np.random.default_rng(0)
+  highest, num_outside = 0.0, 0
+  for start in starts * 8:
+    with physics.reset_context():
+      block.put(physics, np.array([*start, 0.6]), rng.uniform(0, np.pi))
+    up, along = rng.uniform(3.0, 10.0, 2)
+    angle = rng.uniform(0, 2 * np.pi)
+    velocity = np.array([along * np.cos(angle), along * np.sin(angle), up])
+    block.launch(physics, velocity, True)
+    for _ in range(150):
+      worlds.step(physics)
+      position = worlds.world_position(physics, block)
+      highest = max(highest, position[2])
+      is_outside = bulldozers_campaign.is_outside(arena, position[:2])
+      num_outside += int(is_outside)
+  assert highest > 1.0 + size
+  assert (num_outside == 0) is is_guarded
+
+
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+def test_a_small_block_that_is_forced_into_a_wall_comes_back(dof):
+  arena = arenas.OpenRoom()
+  register = registers.BlockPositionRegister(
+      'r', value_range=(0, 1), block_size=0.06, mass=0.01, dof=dof
+  )
+  register.attach_to(arena, (0.0, 0.0))
+  physics = worlds.compile_world(arena)
+  (block,) = register.blocks
+  # As deep as the wall is half.
+  block.put(physics, np.array([4.09, 0.0, block.rest_height]))
+  for _ in range(100):
+    worlds.step(physics)
+    assert worlds.world_position(physics, block)[2] > 0.02
+  assert worlds.world_position(physics, block)[0] < 4.0
+
+
+def test_a_room_has_a_lid():
+  arena = arenas.OpenRoom()
+  register = registers.BlockPositionRegister('r', value_range=(0, 1))
+  register.attach_to(arena, (0.0, 0.0))
+  physics = worlds.compile_world(arena)
+  (block,) = register.blocks
+  heights = []
+  block.launch(physics, np.array([0.0, 0.0, 30.0]), True)
+  for _ in range(50):
+    worlds.step(physics)
+    heights.append(worlds.world_position(physics, block)[2])
+  assert 2.5 < max(heights) < 3.2
+  assert heights[-1] < 2.5
+
+
+@every_room
 def test_no_ray_leaves_the_room(room):
   arena = _ROOMS[room]()
   physics, avatar = _with_avatar(arena)
@@ -200,8 +273,9 @@ def test_a_barrier_stops_an_avatar_and_not_its_view():
   avatar.place(physics, (0.0, 0.0), 0.0)
   seen = avatar.rays.classes(physics)[np.abs(avatar.rays.angles).argmin()]
   assert seen == appearance.code('barrier')
-  top = physics.model.geom_size[physics.model.name2id('barrier', 'geom'), 2] * 2
   physics.forward()
+  barrier = physics.bind(arena.mjcf_model.find('geom', 'barrier'))
+  top = barrier.xpos[2] + barrier.size[2]
   assert physics.bind(avatar.camera).xpos[2] > top
 
 

@@ -22,8 +22,12 @@ every_dof = pytest.mark.parametrize('dof', registers.DOFS)
 class _World:
   """An avatar at the origin and, one metre ahead, blocks."""
 
-  def __init__(self, kind=registers.BlockPositionRegister, **options):
+  def __init__(
+      self, kind=registers.BlockPositionRegister, barrier=None, **options
+  ):
     self.arena = arenas.OpenRoom()
+    if barrier is not None:
+      self.arena.add_barrier('barrier', *barrier)
     self.register = kind(
         'register', value_range=(-30, 30), scale=0.1, **options
     )
@@ -366,6 +370,24 @@ def test_a_hand_keeps_hold_until_it_is_told_otherwise(dof, command):
   world.grasp()
   world.act(50, grasp=command)
   assert world.holding
+
+
+@every_dof
+@pytest.mark.parametrize(
+    ('size', 'mass', 'keeps_hold'), [(0.06, 0.01, False), (0.2, 1.0, True)]
+)
+def test_a_block_that_is_stuck_stays_behind(dof, size, mass, keeps_hold):
+  # The avatar can pass the end of the barrier, the block cannot.
+  world = _World(
+      barrier=[(0.8, 0.5), (2.5, 0.5)], dof=dof, block_size=size, mass=mass
+  )
+  world.grasp()
+  for _ in range(10):
+    world.act(10, strafe=1.0)
+    assert world.block[1] < 0.4 - size / 2 + 0.03
+  assert world.avatar.position(world.physics)[1] > 0.7
+  # It swings round a usual block, and loses a light one.
+  assert world.holding is keeps_hold
 
 
 @every_dof
