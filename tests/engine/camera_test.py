@@ -229,9 +229,10 @@ def test_agents_frames_are_drawn_from_a_plain_copy_of_the_model():
   assert (plain.vis.global_.offheight, plain.vis.global_.offwidth) == (20, 30)
   assert plain.vis.quality.shadowsize == 0
   assert model.vis.quality.shadowsize > 0
-  # Of all shapes, the floor's alone differs: in the size of its tiles.
+  # Of all shapes, those of planes alone differ: in the size of their tiles.
   changed = np.argwhere(model.geom_size != plain.geom_size)
-  np.testing.assert_array_equal(changed, [[model.geom('floor').id, 2]])
+  planes = [model.geom(name).id for name in ('floor', 'lid')]
+  np.testing.assert_array_equal(changed, [[plane, 2] for plane in planes])
 
 
 @pytest.mark.parametrize(
