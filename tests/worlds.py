@@ -45,6 +45,15 @@ def state_bytes(physics: mjcf.Physics) -> bytes:
   return state.tobytes()
 
 
+def guards(arena: composer.Arena) -> list[mjcf.Element]:
+  """Returns what keeps blocks from flying out of a room, and nobody sees."""
+  return [
+      geom
+      for geom in arena.mjcf_model.find_all('geom')
+      if geom.name == 'lid' or geom.name.endswith('_guard')
+  ]
+
+
 def body_of(physics: mjcf.Physics, block: Any) -> int:
   """Returns the id of the body that a block's cube belongs to."""
   return physics.model.geom_bodyid[physics.bind(block.geom).element_id]

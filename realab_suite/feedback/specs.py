@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, final
 import pydantic
 
 from realab_suite import errors
+from realab_suite.entities import block_kinds
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import loading
 from realab_suite.feedback import messages
@@ -24,9 +25,7 @@ Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 # Larger ones make the arithmetic of a step overflow.
 Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 Value = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
-# What an avatar throws lands at up to 2.8 m/s, 28 mm in a substep of 10 ms: the
-# middle of a block of less than twice that would be under the floor at first.
-Size = Annotated[float, pydantic.Field(ge=0.06, le=1.0)]
+Size = Annotated[float, pydantic.Field(ge=block_kinds.LEAST_SIZE, le=1.0)]
 Channel = Literal['embedded', 'welded', 'secure']
 Dof = Literal['free', 'planar']
 Role = Literal['feedback', 'meter', 'query', 'signal']

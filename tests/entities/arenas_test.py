@@ -149,11 +149,10 @@ def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
   register = registers.BlockPositionRegister(
       'r', value_range=(0, 1), block_size=size, mass=mass
   )
-  register.attach_to(arena, (0.0, 0.0))
   if not is_guarded:
-    for geom in arena.mjcf_model.find_all('geom'):
-      if geom.name == 'lid' or (geom.name or '').endswith('_guard'):
-        geom.remove()
+    for guard in worlds.guards(arena):
+      guard.remove()
+  register.attach_to(arena, (0.0, 0.0))
   physics = worlds.compile_world(arena)
   (block,) = register.blocks
   starts = [(0.0, 0.0), (2.5, -2.5)]

@@ -93,11 +93,8 @@ def test_the_camera_above_sees_the_whole_of_the_rooms():
   )[..., 0]  # fmt: skip
   floor = physics.model.name2id('floor', 'geom')
   names = {physics.model.id2name(geom, 'geom') for geom in seen.ravel()}
-  # All but what keeps blocks from flying over the walls.
-  assert names == {
-      geom.name for geom in arena.mjcf_model.find_all('geom')
-      if geom.name != 'lid' and not geom.name.endswith('_guard')
-  }  # fmt: skip
+  everything = {geom.name for geom in arena.mjcf_model.find_all('geom')}
+  assert names == everything - {guard.name for guard in worlds.guards(arena)}
   # Nothing is cut off: beyond the walls is the floor.
   border = np.ones(seen.shape, bool)
   border[1:-1, 1:-1] = False
