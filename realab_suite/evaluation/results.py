@@ -137,6 +137,7 @@ class EpisodeRow(pydantic.BaseModel):
   episode: int
   end: str
   is_valid: bool
+  failure: str | None = None
   true_return: float
   observed_return: float
   corruption: float

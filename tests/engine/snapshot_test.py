@@ -18,6 +18,7 @@ from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.entities import registers
 from realab_suite.evaluation import ledger as ledgers
 from tests import worlds
 from tests.campaigns import snapshot_campaign as campaign
@@ -217,7 +218,7 @@ def test_a_restored_episode_is_the_ledgers_own():
   campaign.play(env, 3, seed=2)
   assert (first.num_steps, second.num_steps) == (20, 23)
   types = {type(entry) for entry in second.entries['reward']}
-  assert types == {ledgers.WriteEntry, ledgers.ReadEntry}
+  assert types == {registers.Write, registers.Read}
 
 
 def test_a_ledger_without_an_open_episode_says_nothing():
