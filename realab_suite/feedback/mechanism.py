@@ -21,7 +21,7 @@ from realab_suite.entities import meters
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import records
-from realab_suite.feedback import messages
+from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
@@ -215,7 +215,7 @@ class FeedbackMechanism(composer.Entity):
             f'{where}: {type(error).__name__}: {error}'
         ) from error
       if batch_shape:
-        _check_state(where, state, batch_shape)
+        provider_results.check_state(where, state, batch_shape)
       states.append(state)
     return states
 
@@ -263,7 +263,14 @@ class FeedbackMechanism(composer.Entity):
         raise errors.FeedbackProviderError(
             f'{_where(writer, step)}: {type(error).__name__}: {error}'
         ) from error
-      values, next_state = _checked_return(writer, step, provider, returned)
+      try:
+        values, next_state = provider_results.checked(
+            provider, returned, np.shape(step)
+        )
+      except errors.FeedbackProviderError as error:
+        raise errors.FeedbackProviderError(
+            f'{_where(writer, step)} {error}'
+        ) from error
       log += reads
       for name in provider.writes:
         register, value = self._registers[name], values[name]
@@ -294,7 +301,7 @@ class FeedbackMechanism(composer.Entity):
         initial one.
     """
     return [
-        _restarted(f'state of {writer}', state, initial, worlds)
+        provider_results.restarted(f'state of {writer}', state, initial, worlds)
         for (writer, _), state, initial in zip(
             self._providers,
             states,
@@ -382,96 +389,6 @@ def _find(
         f' are {sorted(offered) or "coordinates"}'
     )
   return offered[place]
-
-
-def _checked_return(
-    writer: str, step: Any, provider: providers.Provider, returned: Any
-) -> tuple[dict[str, np.ndarray], Any]:
-  """Returns the writes and the next state that a provider returned.
-
-  Raises:
-    FeedbackProviderError: If they are not what it declares.
-  """
-  where = _where(writer, step)
-  if not isinstance(returned, tuple) or len(returned) != 2:
-    raise errors.FeedbackProviderError(
-        f'{where} returned {messages.quote(returned)}; allowed is (writes,'
-        ' state)'
-    )
-  values, state = returned
-  if not isinstance(values, Mapping) or values.keys() != set(provider.writes):
-    given = sorted(map(str, values)) if isinstance(values, Mapping) else values
-    raise errors.FeedbackProviderError(
-        f'{where} returned writes {messages.quote(given)}; it declares writes'
-        f' to {sorted(provider.writes)}'
-    )
-  return {
-      name: _checked_value(where, name, value, np.shape(step))
-      for name, value in values.items()
-  }, state
-
-
-def _checked_value(
-    where: str, name: str, value: Any, shape: tuple[int, ...]
-) -> np.ndarray:
-  """Returns a value to write as float64, if it is one per world."""
-  given = f'{where} wrote {messages.quote(value)} to {name!r}'
-  try:
-    number = np.asarray(value)
-  except Exception as error:  # An object may raise anything.
-    raise errors.FeedbackProviderError(
-        f'{given}: {type(error).__name__}: {error}'
-    ) from error
-  if number.dtype.kind not in 'iuf' or np.ma.isMaskedArray(value):
-    raise errors.FeedbackProviderError(f'{given}; allowed are plain numbers')
-  if number.shape != shape:
-    raise errors.FeedbackProviderError(
-        f'{where} wrote shape {number.shape} to {name!r}; allowed is {shape}'
-    )
-  return number.astype(np.float64)[()]
-
-
-def _check_state(where: str, state: Any, batch_shape: tuple[int, ...]) -> None:
-  """Checks that a provider's state has an axis of worlds throughout."""
-  if isinstance(state, dict):
-    for part in state.values():
-      _check_state(where, part, batch_shape)
-  elif isinstance(state, tuple | list):
-    for part in state:
-      _check_state(where, part, batch_shape)
-  elif (
-      not isinstance(state, np.ndarray)
-      or state.dtype.hasobject
-      or state.shape[:1] != batch_shape
-  ):
-    raise errors.FeedbackProviderError(
-        f'{where}: its state holds {messages.quote(state)}; allowed in a batch'
-        ' are tuples, lists and dicts of arrays whose first axis has length'
-        f' {batch_shape[0]}'
-    )
-
-
-def _restarted(where: str, state: Any, initial: Any, worlds: np.ndarray) -> Any:
-  """Returns a provider's state, with the initial one in some worlds."""
-  is_like = type(state) is type(initial)
-  if is_like and isinstance(state, dict) and state.keys() == initial.keys():
-    return {
-        key: _restarted(f'{where}[{key!r}]', part, initial[key], worlds)
-        for key, part in state.items()
-    }
-  if is_like and isinstance(state, tuple | list) and len(state) == len(initial):
-    return type(state)(
-        _restarted(f'{where}[{i}]', part, initial[i], worlds)
-        for i, part in enumerate(state)
-    )
-  if np.shape(state) == np.shape(initial) and isinstance(initial, np.ndarray):
-    begun = np.array(state)
-    begun[worlds] = initial[worlds]
-    return begun
-  raise errors.FeedbackProviderError(
-      f'{where}: {messages.quote(state)}; allowed is the structure of the'
-      f' initial state, {messages.quote(initial)}'
-  )
 
 
 def _where(writer: str, step: Any, world: int | None = None) -> str:
