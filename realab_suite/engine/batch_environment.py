@@ -107,8 +107,9 @@ class BatchEnvironment:
         self._host, self._mechanism, single.max_steps
     )
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
-    # Restoring may give several worlds one number. Objects: seeds can be large.
-    self._seeds = np.full(num_worlds, single.seed, object)
+    # Restoring may give several worlds one number. Objects: seeds can be large,
+    # or salted; `np.full` would drop the salt.
+    self._seeds = np.array([single.seed] * num_worlds, object)
     self._numbers = np.arange(num_worlds).astype(object)
     self._episodes = np.full(num_worlds, -1)
     self._is_pending = np.ones(num_worlds, bool)
