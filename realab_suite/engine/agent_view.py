@@ -114,7 +114,7 @@ class _View(abc.ABC):
 
   def __reduce_ex__(self, protocol: Any) -> Any:
     """Refuses `copy` and `pickle`, which would hand over the environment."""
-    raise TypeError('views cannot be copied or pickled')
+    raise TypeError('views cannot be pickled or copied')
 
   def __reduce__(self) -> Any:
     return self.__reduce_ex__(0)

@@ -34,8 +34,8 @@ from dm_env_rpc.v1 import tensor_utils
 import numpy as np
 
 from realab_suite.engine import environment
+from realab_suite.entities import registers
 from realab_suite.evaluation import results
-from realab_suite.feedback import mechanism as mechanisms
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import sockets
 from tests.campaigns import lines as campaign_lines
@@ -253,11 +253,11 @@ def catch_l37() -> bool:
       if next(steps) % 2:
         return (
             (
-                [r for r in result[0] if not isinstance(r, mechanisms.Write)],
+                [r for r in result[0] if not isinstance(r, registers.Write)],
                 *result[1:],
             )
             if isinstance(result, tuple)
-            else [r for r in result if not isinstance(r, mechanisms.Write)]
+            else [r for r in result if not isinstance(r, registers.Write)]
         )
       return result
 
@@ -278,7 +278,7 @@ def writes_per_step(alter: Alter) -> set[int]:
     env.step(action)
   env.close()
   return {
-      sum(isinstance(record, mechanisms.Write) for record in step.records)
+      sum(isinstance(record, registers.Write) for record in step.records)
       for step in sink.steps
   }
 

@@ -232,6 +232,6 @@ def test_a_view_cannot_be_copied(steal: Any, is_batch: bool):
   else:
     env = suite.load('collect_apples', 'near')
     view = agent_view.AgentView(env)
-  with pytest.raises(TypeError, match='cannot be copied or pickled'):
+  with pytest.raises(TypeError, match='cannot be pickled or copied'):
     steal(view)
   env.close()

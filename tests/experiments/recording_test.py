@@ -64,11 +64,11 @@ def test_a_reading_stands_beside_the_write_that_came_before_it():
   track = recording.RegisterTrack('feedback', 0.1)
   write, read = registers.Write, registers.Read
   nowhere = np.zeros((2, 2))
-  track.add([write('r', 'a', np.array(9.0), np.array(5.0))], nowhere)
+  track.add([write('r', 'a', 1, np.array(9.0), np.array(5.0))], nowhere)
   track.add(
       [
-          read('r', 'b', np.array(6.0), np.array(0.75), np.array(0.25)),
-          write('r', 'a', np.array(1.0), np.array(1.0)),
+          read('r', 'b', 1, np.array(6.0), np.array(0.75), np.array(0.25)),
+          write('r', 'a', 1, np.array(1.0), np.array(1.0)),
       ],
       nowhere,
   )
