@@ -207,7 +207,7 @@ def load(experiment: Experiment) -> ExperimentSpec:
     )
   elif isinstance(experiment, str) and not os.path.exists(experiment):
     raise errors.UnknownNameError(
-        f'experiment {experiment!r} is neither a file nor one of'
+        f'experiment {messages.quote(experiment)} is neither a file nor one of'
         f' {list(EXPERIMENTS)}'
     )
   else:

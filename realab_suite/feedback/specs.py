@@ -306,8 +306,8 @@ class DesignSpec(validation.Spec):
     """Checks that a register is declared and has one of some roles."""
     if name not in self.registers:
       raise ValueError(
-          f'{where}: register {name!r} is not declared; declared are'
-          f' {sorted(self.registers)}'
+          f'{where}: register {messages.quote(name)} is not declared; declared'
+          f' are {sorted(self.registers)}'
       )
     role = self.registers[name].role
     if roles is not None and role not in roles:
@@ -339,8 +339,9 @@ class DesignSpec(validation.Spec):
     for field, value in extras.items():
       for name in _texts_in(value):
         if name in self.registers and self.registers[name].role == 'meter':
+          where = messages.format_path(('learner', field))
           raise ValueError(
-              f'learner.{field}: an agent may not read meter register {name!r}'
+              f'{where}: an agent may not read meter register {name!r}'
               ' (feedback providers only)'
           )
 
@@ -438,7 +439,8 @@ def load(
     )
   elif isinstance(design, str) and not os.path.exists(design):
     raise errors.UnknownNameError(
-        f'design {design!r} is neither a file nor one of {list(DESIGNS)}'
+        f'design {messages.quote(design)} is neither a file nor one of'
+        f' {list(DESIGNS)}'
     )
   elif isinstance(design, Mapping):
     where, data = 'design', loading.read_mapping(design)

@@ -471,6 +471,27 @@ def test_what_is_no_design_at_all_is_refused(design: Any):
     specs.load(design)
 
 
+@pytest.mark.parametrize(
+    'given',
+    [
+        lambda long: long,
+        lambda long: _design(**{long: 1}),
+        lambda long: _design(registers={long: _REWARD}),
+        lambda long: _reward(kind=long),
+        lambda long: _reward(**{long: 1}),
+        lambda long: _design(learner={'kind': 'x', long: 'score'}),
+        lambda long: _design(
+            providers=[{**_DESIGN['providers'][0], 'reads': [long]}]
+        ),
+    ],
+)
+def test_a_long_name_or_key_is_cut_in_a_message(given: Any):
+  with pytest.raises(errors.SpecError) as caught:
+    specs.load(given('k' * 100_000))
+  assert 'kkkkk' in str(caught.value)
+  assert len(str(caught.value)) < 600
+
+
 def test_an_unknown_design_is_refused_with_the_known_ones():
   with pytest.raises(errors.UnknownNameError, match='instantaneous_reward'):
     specs.load('instantaneous_rewards')
