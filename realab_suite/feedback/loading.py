@@ -138,6 +138,8 @@ def apply_overrides(
   result = _copy_mapping(data, messages.Place('<mapping>'))
   for override in overrides:
     place = messages.Place(f'override {messages.quote(override)}')
+    if not isinstance(override, str):
+      raise place.error('expected key=value, as a text')
     key, equals, text = override.partition('=')
     if not equals:
       raise place.error('expected key=value')

@@ -1,6 +1,6 @@
 """Designs: what an agent designer decides, as data (paper, section 3.2)."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 import functools
 import graphlib
 from importlib import resources
@@ -408,7 +408,7 @@ _validated_kinds: list[str] = []
 
 def load(
     design: Design,
-    overrides: tuple[str, ...] = (),
+    overrides: Sequence[str] = (),
     *,
     is_confined: bool = False,
 ) -> DesignSpec:
@@ -427,6 +427,11 @@ def load(
   Raises:
     SpecError: Where the file, key path or override is wrong, in one line.
   """
+  if isinstance(overrides, str) or not isinstance(overrides, Sequence):
+    raise errors.SpecError(
+        f'overrides: {messages.quote(overrides)}; allowed is a list of texts,'
+        " as in ['channel=secure']"
+    )
   if isinstance(design, DesignSpec):
     where, data = f'design {design.name!r}', design.to_mapping()
   elif isinstance(design, str) and design in DESIGNS:
@@ -453,12 +458,11 @@ def load(
       )
     data = loading.read_mapping(design)
     _refuse_files_elsewhere(data, where)
-  if overrides:
-    data = loading.apply_overrides(data, overrides)
-    if is_confined:
-      _refuse_files_elsewhere(data, where)
+  if is_confined:
+    changed = loading.apply_overrides(data, overrides)
+    _refuse_files_elsewhere(changed, where)
   _learn_new_kinds()
-  return validation.validate(DesignSpec, data, where)
+  return validation.validate(DesignSpec, data, where, overrides)
 
 
 def _refuse_files_elsewhere(data: Mapping[str, Any], where: str) -> None:

@@ -1,8 +1,10 @@
-"""Specs, as pydantic models: strict, hashed, and wrong in one line at most."""
+"""Base class for specs: strict, frozen, hashable, with one-line errors."""
 
 import abc
-from collections.abc import Mapping, Sequence
+import bisect
+from collections.abc import Callable, Mapping, Sequence
 import difflib
+import functools
 import hashlib
 import itertools
 import json
@@ -14,6 +16,8 @@ from typing import Any, TypeVar
 import pydantic
 from pydantic import fields
 
+from realab_suite import errors
+from realab_suite.feedback import loading
 from realab_suite.feedback import messages
 
 # A line that goes on for ever tells less, not more.
@@ -45,7 +49,10 @@ def digest_of(data: Mapping[str, Any]) -> str:
 
 
 def validate(
-    model_class: type[_Model], data: Mapping[str, Any], where: str
+    model_class: type[_Model],
+    data: Mapping[str, Any],
+    where: str,
+    overrides: Sequence[str] = (),
 ) -> _Model:
   """Returns the model that the data describes.
 
@@ -54,20 +61,76 @@ def validate(
       strict that is.
     data: What `read_mapping` returned.
     where: What error messages call the data.
+    overrides: Overrides of the data; see `loading.apply_overrides`. Messages
+      call a problem theirs if the data do not have it without them.
 
   Raises:
     SpecError: If the data does not fit. The message lists the problems.
   """
+
+  @functools.cache
+  def judged(count: int) -> tuple[_Model | None, list[str]]:
+    """Returns the model with the first `count` overrides, or its problems."""
+    used = overrides[:count]
+    changed = loading.apply_overrides(data, used) if used else data
+    return _judged(model_class, changed)
+
+  model, problems = judged(len(overrides))
+  if model is not None:
+    return model
+  # By where they come from: 0 for the data, 1 for the first override.
+  told: dict[int, list[str]] = {}
+  for problem in problems[:_MAX_TOLD]:
+    origin = _origin(problem, len(overrides), lambda count: judged(count)[1])
+    told.setdefault(origin, []).append(problem)
+  if len(problems) > _MAX_TOLD:
+    told[max(told)].append(f'and {len(problems) - _MAX_TOLD} more')
+  names = [where, *(f'override {messages.quote(o)}' for o in overrides)]
+  raise errors.SpecError(
+      '; '.join(
+          str(messages.Place(names[origin]).error('; '.join(found)))
+          for origin, found in sorted(told.items())
+      )
+  )
+
+
+def _judged(
+    model_class: type[_Model], data: Mapping[str, Any]
+) -> tuple[_Model | None, list[str]]:
+  """Returns the model that the data describes, or its problems."""
   try:
-    return model_class.model_validate(data)
+    return model_class.model_validate(data), []
   except pydantic.ValidationError as error:
     problems = error.errors(include_url=False)
   # A union can report the same problem once for each of its members.
-  unique = list(dict.fromkeys(_problem(p, model_class, data) for p in problems))
-  told = unique[:_MAX_TOLD]
-  if len(unique) > len(told):
-    told.append(f'and {len(unique) - len(told)} more')
-  raise messages.Place(where).error('; '.join(told))
+  return None, list(
+      dict.fromkeys(_problem(p, model_class, data) for p in problems)
+  )
+
+
+def _origin(
+    problem: str, count: int, problems_of: Callable[[int], Sequence[str]]
+) -> int:
+  """Returns with how many overrides a problem appears: 0 without any.
+
+  Args:
+    problem: A problem that there is with all overrides.
+    count: The number of overrides.
+    problems_of: Returns the problems that there are with the first overrides.
+  """
+
+  def is_there(used: int) -> bool:
+    return _gist(problem) in map(_gist, problems_of(used))
+
+  if is_there(0):
+    return 0
+  # Wherever the search ends, the problem is there, and one before it is not.
+  return bisect.bisect_left(range(count), True, lo=1, key=is_there)
+
+
+def _gist(problem: str) -> str:
+  """Returns a problem without the list of what is allowed, which may change."""
+  return problem.partition(';')[0]
 
 
 def _problem(
@@ -111,9 +174,11 @@ def _describe(details: Any) -> str:
   if kind in ('model_type', 'model_attributes_type', 'dict_type'):
     return f'must be a mapping, got {given}'
   if 'error' in context:
-    # What is said of the whole says itself which part of it is meant.
-    whole = not details['loc']
-    return str(context['error']) + ('' if whole else f', got {given}')
+    text = str(context['error'])
+    # A text about a mapping names the part of it that is wrong.
+    if isinstance(details['input'], Mapping) or given in text:
+      return text
+    return f'{text}, got {given}'
   rule = re.sub(r'^\w+ should ', 'must ', details['msg'])
   return f'{rule}, got {given}'
 
