@@ -11,6 +11,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.feedback import loading
 from realab_suite.feedback import messages
+from realab_suite.feedback import option_types
 from realab_suite.feedback import policies
 from realab_suite.feedback import specs
 from realab_suite.feedback import validation
@@ -38,7 +39,7 @@ class RunSpec(validation.Spec):
     steps: For how many control steps; `None` takes the experiment's.
   """
 
-  design: str
+  design: option_types.FilePath
   overrides: Annotated[tuple[str, ...], pydantic.Field(strict=False)] = ()
   learner: dict[str, Any] = pydantic.Field(default_factory=dict)
   twin: bool = False
@@ -218,7 +219,7 @@ def load(experiment: Experiment) -> ExperimentSpec:
     )
     data = loading.read_mapping(experiment)
   is_file = not isinstance(experiment, Mapping)
-  spec = validation.validate(ExperimentSpec, data, where)
+  spec = validation.validate(ExperimentSpec, data, where, is_confined=is_file)
   for place, problem in _problems(spec, is_confined=is_file):
     raise messages.Place(where, place).error(problem)
   return spec

@@ -12,9 +12,11 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.entities import block_kinds
+from realab_suite.entities import registers
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import loading
 from realab_suite.feedback import messages
+from realab_suite.feedback import option_types
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import validation
@@ -79,7 +81,7 @@ class RegisterSpec(validation.Spec):
     options: Further keyword arguments of a register kind of your own.
   """
 
-  kind: str
+  kind: Annotated[str, option_types.NameIn(register_kinds.REGISTER_KINDS)]
   role: Role
   place: Name | PlaceSpec
   range: Annotated[tuple[Value, Value], pydantic.Field(strict=False)]
@@ -91,16 +93,15 @@ class RegisterSpec(validation.Spec):
   dof: Dof | None = None
   block_size: Size = 0.2
   mass: Annotated[float, pydantic.Field(ge=0.01, le=100)] = 1.0
-  options: dict[str, Any] = pydantic.Field(default_factory=dict)
-
-  @pydantic.field_validator('kind')
-  @classmethod
-  def _known(cls, kind: str) -> str:
-    try:
-      register_kinds.REGISTER_KINDS.get(kind)
-    except errors.UnknownNameError as error:
-      raise ValueError(str(error)) from error
-    return kind
+  options: Annotated[
+      dict[str, Any],
+      option_types.OptionsOf(
+          register_kinds.REGISTER_KINDS,
+          'kind',
+          method='_build',
+          reserved=registers.Register._build,
+      ),
+  ] = pydantic.Field(default_factory=dict)
 
   @pydantic.field_validator('place', mode='before')
   @classmethod
@@ -214,8 +215,11 @@ class _AnyProvider:
   """Validates a provider by the class that its `kind` is registered as."""
 
   @classmethod
-  def members(cls) -> list[type[providers.Provider]]:
+  def members(
+      cls, siblings: Mapping[str, Any] | None = None
+  ) -> list[type[providers.Provider]]:
     """The classes that are registered now."""
+    del siblings
     return [providers.PROVIDERS.get(kind) for kind in providers.PROVIDERS]
 
   @classmethod
@@ -403,7 +407,7 @@ def _texts_in(value: Any) -> Iterator[str]:
 
 Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec
 
-_validated_kinds: list[str] = []
+_validated_kinds: list[type[_Provider]] = []
 
 
 def load(
@@ -432,6 +436,7 @@ def load(
         f'overrides: {messages.quote(overrides)}; allowed is a list of texts,'
         " as in ['channel=secure']"
     )
+  is_file = False
   if isinstance(design, DesignSpec):
     where, data = f'design {design.name!r}', design.to_mapping()
   elif isinstance(design, str) and design in DESIGNS:
@@ -456,27 +461,16 @@ def load(
           f'design {messages.quote(where)} is outside the working directory;'
           f' allowed in a file are paths within it and {list(DESIGNS)}'
       )
-    data = loading.read_mapping(design)
-    _refuse_files_elsewhere(data, where)
-  if is_confined:
-    changed = loading.apply_overrides(data, overrides)
-    _refuse_files_elsewhere(changed, where)
+    data, is_file = loading.read_mapping(design), True
   _learn_new_kinds()
-  return validation.validate(DesignSpec, data, where, overrides)
-
-
-def _refuse_files_elsewhere(data: Mapping[str, Any], where: str) -> None:
-  """Refuses weights that a file names and that are somewhere else."""
-  given = data.get('providers')
-  for i, provider in enumerate(given if isinstance(given, list) else []):
-    options = provider.get('options') if isinstance(provider, dict) else None
-    weights = options.get('weights') if isinstance(options, dict) else None
-    if isinstance(weights, str) and not loading.is_inside(weights):
-      place = messages.Place(where, ('providers', i, 'options', 'weights'))
-      raise place.error(
-          f'{messages.quote(weights)} is outside the working directory; allowed'
-          ' in a file are names, and paths within it'
-      )
+  return validation.validate(
+      DesignSpec,
+      data,
+      where,
+      overrides,
+      is_confined=is_file or is_confined,
+      are_overrides_free=not is_confined,
+  )
 
 
 def json_schema() -> dict[str, Any]:
@@ -486,10 +480,11 @@ def json_schema() -> dict[str, Any]:
 
 
 def _learn_new_kinds() -> None:
-  """Rebuilds the validator if somebody has registered a provider since."""
-  if _validated_kinds != list(providers.PROVIDERS):
+  """Rebuilds the validator if other providers are registered than before."""
+  kinds = _AnyProvider.members()
+  if _validated_kinds != kinds:
     DesignSpec.model_rebuild(force=True)
-    _validated_kinds[:] = list(providers.PROVIDERS)
+    _validated_kinds[:] = kinds
 
 
 def _shipped(name: str) -> Any:

@@ -50,6 +50,9 @@ _WRONG = {
     # Not in the file.
     'registers.reward.mass=-1': 'registers.reward.mass: must be greater than',
     'registers.query.mass=0': 'registers.query.mass: must be greater than',
+    'registers.reward.options.speed=1': (
+        "registers.reward.options: unknown key 'speed' (allowed: none)"
+    ),
     'metres=[]': "unknown key 'metres'; did you mean 'meters'?",
     'learner.reward=reward': 'learner.kind: required key is missing',
     'schedule.meter_substep=3': (
@@ -57,7 +60,14 @@ _WRONG = {
     ),
     'name=[]': 'name: must be a valid string, got []',
     'providers.0.query_delay=2': 'providers[0].query_delay: must be 0 or 1',
+    'providers.0.options.options.speed=1': (
+        "providers[0].options.options: unknown key 'speed'"
+    ),
+    'providers.0.value_function=oracle': (
+        "providers[0].value_function: value function 'oracle' is unknown"
+    ),
 }
+_APART = [override for override in _WRONG if 'oracle' not in override]
 _RIGHT = (
     'dof=planar',
     'description=x',
@@ -220,6 +230,8 @@ def test_a_long_override_is_cut():
       f'learner.{long}=1',
       f'providers.0.reads=[{long}]',
       f'providers.0.value_function={long}',
+      f'providers.0.options.policy={long}',
+      f'providers.0.options.{long}=1',
       f'learner={{kind: x, {long}: score}}',
   ):
     overrides = [override]
@@ -268,8 +280,9 @@ def test_worlds_and_experiments_name_the_override(tmp_path: pathlib.Path):
 
 @hypothesis.settings(max_examples=60, deadline=None)
 @hypothesis.given(
+    # Without the one that keeps options from being checked.
     wrong=st.lists(
-        st.sampled_from(list(_WRONG)), min_size=1, max_size=9, unique=True
+        st.sampled_from(_APART), min_size=1, max_size=9, unique=True
     ),
     right=st.lists(st.sampled_from(_RIGHT), max_size=3),
     order=st.randoms(use_true_random=False),
