@@ -1,8 +1,7 @@
 """Designs: what an agent designer decides, as data (paper, section 3.2)."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import functools
-import graphlib
 from importlib import resources
 import operator
 import os
@@ -14,6 +13,7 @@ from realab_suite import errors
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from realab_suite.feedback import action_sets
+from realab_suite.feedback import consistency
 from realab_suite.feedback import loading
 from realab_suite.feedback import messages
 from realab_suite.feedback import option_types
@@ -288,66 +288,8 @@ class DesignSpec(validation.Spec):
 
   @pydantic.model_validator(mode='after')
   def _consistent(self) -> 'DesignSpec':
-    for i, meter in enumerate(self.meters):
-      self._expect(f'meters[{i}].writes', meter.writes, ('meter',))
-    for i, provider in enumerate(self.providers):
-      where = f'providers[{i}]'
-      for name in provider.reads:
-        self._expect(f'{where}.reads', name, None)
-      for name in provider.writes:
-        self._expect(f'{where}.writes', name, READ_BY_AGENTS)
-      try:
-        provider.check(self)
-      except ValueError as error:
-        raise ValueError(f'{where}: {error}') from error
-    self._refuse_cycles()
-    self._check_learner()
+    consistency.check(self, READ_BY_AGENTS)
     return self
-
-  def _expect(
-      self, where: str, name: str, roles: tuple[str, ...] | None
-  ) -> None:
-    """Checks that a register is declared and has one of some roles."""
-    if name not in self.registers:
-      raise ValueError(
-          f'{where}: register {messages.quote(name)} is not declared; declared'
-          f' are {sorted(self.registers)}'
-      )
-    role = self.registers[name].role
-    if roles is not None and role not in roles:
-      raise ValueError(
-          f'{where}: register {name!r} has role {role!r}; allowed are'
-          f' {list(roles)}'
-      )
-
-  def _refuse_cycles(self) -> None:
-    """Refuses providers that wait for each other's feedback."""
-    graph = {
-        i: {
-            j
-            for j, other in enumerate(self.providers)
-            if i != j and set(provider.reads) & set(other.writes)
-        }
-        for i, provider in enumerate(self.providers)
-    }
-    try:
-      graphlib.TopologicalSorter(graph).prepare()
-    except graphlib.CycleError as error:
-      cycle = [f'providers[{i}]' for i in sorted(set(error.args[1]))]
-      raise ValueError(
-          f'{" and ".join(cycle)} form a cycle: each reads what another writes'
-      ) from error
-
-  def _check_learner(self) -> None:
-    extras = (self.learner.model_extra or {}) if self.learner else {}
-    for field, value in extras.items():
-      for name in _texts_in(value):
-        if name in self.registers and self.registers[name].role == 'meter':
-          where = messages.format_path(('learner', field))
-          raise ValueError(
-              f'{where}: an agent may not read meter register {name!r}'
-              ' (feedback providers only)'
-          )
 
   def names(self, *roles: str) -> list[str]:
     """Returns the names of the registers with one of these roles, in order."""
@@ -390,19 +332,6 @@ class DesignSpec(validation.Spec):
     if self.schedule == 'cfmdp':
       return ScheduleSpec(meter_substep=0, provider_substep=0)
     return self.schedule.check(num_substeps)
-
-
-def _texts_in(value: Any) -> Iterator[str]:
-  """Yields every text in nested lists and mappings, keys included."""
-  if isinstance(value, str):
-    yield value
-  elif isinstance(value, Mapping):
-    for key, item in value.items():
-      yield from _texts_in(key)
-      yield from _texts_in(item)
-  elif isinstance(value, list | tuple):
-    for item in value:
-      yield from _texts_in(item)
 
 
 Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec

@@ -87,6 +87,9 @@ _CROSS = {
         "providers[0]: value_advice reads the query off 'query', whose role is"
         " 'meter'"
     ),
+    'registers.query.range=[0, 5]': (
+        'registers.query.range: [0.0, 5.0] leaves out actions of dmlab_like v1'
+    ),
     'registers.reward.role=meter': (
         "providers[0].writes: register 'reward' has role 'meter'"
     ),

@@ -306,7 +306,7 @@ _WRONG = {
             meters=[],
             providers=[_advice(kind='paired_advice', reads=['query', 'query'])],
         ),
-        "paired_advice reads 'query' twice; allowed are two query registers",
+        "providers[0].reads: register 'query' is there twice",
     ),
     'paired advice on what is no query': (
         _design(

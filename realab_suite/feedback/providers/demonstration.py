@@ -28,6 +28,10 @@ class Demonstration(base.Provider):
       dict[str, Any], option_types.OptionsOf(policies.POLICIES, 'policy')
   ] = pydantic.Field(default_factory=dict)
 
+  @property
+  def action_writes(self) -> tuple[str, ...]:
+    return self.writes
+
   @functools.cached_property
   def demonstrator(self) -> policies.Policy:
     """What the provider runs."""

@@ -51,11 +51,6 @@ class PairedAdvice(base.Provider):
 
   def check(self, design: Any) -> None:
     policies.check_action_set(self.adviser.action_set, design, self.kind)
-    if len(set(self.reads)) < len(self.reads):
-      raise ValueError(
-          f'paired_advice reads {self.reads[0]!r} twice; allowed are two query'
-          ' registers'
-      )
     for query in self.reads:
       if design.registers[query].role != 'query':
         raise ValueError(
