@@ -276,13 +276,6 @@ def embed(
     )
   if type(world) is not int or world < 0:
     raise errors.SpecError(f'world: {world!r}; allowed are integers from 0 on')
-  if isinstance(overrides, str) or not all(
-      isinstance(override, str) for override in overrides
-  ):
-    raise errors.SpecError(
-        f'overrides: {overrides!r:.80}; allowed is a list of texts, as in'
-        " ['channel=secure']"
-    )
   seed = seeding.as_seed(random)
   if max_steps is not None and (
       isinstance(max_steps, bool)
@@ -293,7 +286,7 @@ def embed(
         f'max_steps: {max_steps!r}; allowed are positive integers and None'
     )
   mechanism = feedback_mechanism.FeedbackMechanism(
-      specs.load(design, tuple(overrides))
+      specs.load(design, overrides)
   )
   mechanism.attach_to(task.root_entity)
   try:

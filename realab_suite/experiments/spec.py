@@ -11,6 +11,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.feedback import loading
 from realab_suite.feedback import messages
+from realab_suite.feedback import option_types
 from realab_suite.feedback import policies
 from realab_suite.feedback import specs
 from realab_suite.feedback import validation
@@ -38,7 +39,7 @@ class RunSpec(validation.Spec):
     steps: For how many control steps; `None` takes the experiment's.
   """
 
-  design: str
+  design: option_types.FilePath
   overrides: Annotated[tuple[str, ...], pydantic.Field(strict=False)] = ()
   learner: dict[str, Any] = pydantic.Field(default_factory=dict)
   twin: bool = False
@@ -64,7 +65,9 @@ class RunSpec(validation.Spec):
       changes['learner'] = {**own, **self.learner}
     if channel is not None:
       changes['channel'] = channel
-    return specs.load({**design.to_mapping(), **changes})
+    # A problem now is one of the run, and the design's file has no part in it.
+    changed = loading.read_mapping({**design.to_mapping(), **changes})
+    return validation.validate(specs.DesignSpec, changed, '')
 
 
 @final
@@ -207,7 +210,7 @@ def load(experiment: Experiment) -> ExperimentSpec:
     )
   elif isinstance(experiment, str) and not os.path.exists(experiment):
     raise errors.UnknownNameError(
-        f'experiment {experiment!r} is neither a file nor one of'
+        f'experiment {messages.quote(experiment)} is neither a file nor one of'
         f' {list(EXPERIMENTS)}'
     )
   else:
@@ -218,7 +221,7 @@ def load(experiment: Experiment) -> ExperimentSpec:
     )
     data = loading.read_mapping(experiment)
   is_file = not isinstance(experiment, Mapping)
-  spec = validation.validate(ExperimentSpec, data, where)
+  spec = validation.validate(ExperimentSpec, data, where, is_confined=is_file)
   for place, problem in _problems(spec, is_confined=is_file):
     raise messages.Place(where, place).error(problem)
   return spec

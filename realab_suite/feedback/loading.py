@@ -51,6 +51,10 @@ _FLOAT = re.compile(
 _NOT_FINITE = re.compile(r'[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)')
 # Words that a person may mean as a boolean, and octal as YAML 1.2 spells it.
 _AMBIGUOUS = re.compile(r'(?i:yes|no|on|off)|[-+]?0[oO][0-7]+')
+# Paths that other programs or other systems take out of a directory.
+_LEADS_ELSEWHERE = re.compile(
+    r'~|[A-Za-z]:|[A-Za-z][\w+.-]*://|.*\\', re.DOTALL
+)
 _YAML_1_1 = yaml.resolver.Resolver()
 _TEXT_TAG = 'tag:yaml.org,2002:str'
 
@@ -108,11 +112,13 @@ def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
 
 
 def is_inside(path: str) -> bool:
-  """Whether a path is within the working directory, links followed.
+  """Returns True if a path is within the working directory, links followed.
 
-  What a file names is looked for there alone: whoever wrote the file is not
-  whoever reads it.
+  A file may name such paths only: its author need not be its reader. URLs and
+  paths with a leading `~`, a drive or a backslash count as outside everywhere.
   """
+  if _LEADS_ELSEWHERE.match(path):
+    return False
   root = os.path.realpath(os.curdir)
   try:
     return os.path.commonpath([root, os.path.realpath(path)]) == root
@@ -138,10 +144,12 @@ def apply_overrides(
   result = _copy_mapping(data, messages.Place('<mapping>'))
   for override in overrides:
     place = messages.Place(f'override {messages.quote(override)}')
-    key, equals, text = override.partition('=')
+    if not isinstance(override, str):
+      raise place.error('expected key=value, as a text')
+    _, equals, text = override.partition('=')
     if not equals:
       raise place.error('expected key=value')
-    keys = key.split('.')
+    keys = keys_of(override)
     if not all(k.strip() for k in keys):
       raise place.error('empty key')
     documents = _documents(text, place.where)
@@ -154,6 +162,11 @@ def apply_overrides(
     # The new value may be too deep or one too many where it stands now.
     result = _copy_mapping(result, place)
   return result
+
+
+def keys_of(override: str) -> list[str]:
+  """Returns the keys that lead to what an override sets."""
+  return override.partition('=')[0].split('.')
 
 
 @typing.final

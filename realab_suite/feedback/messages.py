@@ -39,7 +39,7 @@ def format_path(path: Sequence[str | int]) -> str:
   for part in path:
     if isinstance(part, int):
       text += f'[{part}]'
-    elif re.fullmatch(r'[\w-]+', part):
+    elif re.fullmatch(rf'[\w-]{{1,{_MAX_LENGTH}}}', part):
       text += f'.{part}' if text else part
     else:
       text += f'[{quote(part)}]'

@@ -5,6 +5,7 @@ import difflib
 from typing import Generic, TypeVar, final
 
 from realab_suite import errors
+from realab_suite.feedback import messages
 
 T = TypeVar('T')
 
@@ -47,7 +48,8 @@ class Registry(Generic[T]):
       close = difflib.get_close_matches(name, self._entries, n=1)
       hint = f'; did you mean {close[0]!r}?' if close else ''
       raise errors.UnknownNameError(
-          f'{self._what} {name!r} is unknown{hint}; known are {sorted(self)}'
+          f'{self._what} {messages.quote(name)} is unknown{hint}; known are'
+          f' {sorted(self)}'
       )
     return self._entries[name]
 

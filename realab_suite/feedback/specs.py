@@ -1,8 +1,7 @@
 """Designs: what an agent designer decides, as data (paper, section 3.2)."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 import functools
-import graphlib
 from importlib import resources
 import operator
 import os
@@ -12,9 +11,12 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.entities import block_kinds
+from realab_suite.entities import registers
 from realab_suite.feedback import action_sets
+from realab_suite.feedback import consistency
 from realab_suite.feedback import loading
 from realab_suite.feedback import messages
+from realab_suite.feedback import option_types
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import validation
@@ -79,7 +81,7 @@ class RegisterSpec(validation.Spec):
     options: Further keyword arguments of a register kind of your own.
   """
 
-  kind: str
+  kind: Annotated[str, option_types.NameIn(register_kinds.REGISTER_KINDS)]
   role: Role
   place: Name | PlaceSpec
   range: Annotated[tuple[Value, Value], pydantic.Field(strict=False)]
@@ -91,16 +93,15 @@ class RegisterSpec(validation.Spec):
   dof: Dof | None = None
   block_size: Size = 0.2
   mass: Annotated[float, pydantic.Field(ge=0.01, le=100)] = 1.0
-  options: dict[str, Any] = pydantic.Field(default_factory=dict)
-
-  @pydantic.field_validator('kind')
-  @classmethod
-  def _known(cls, kind: str) -> str:
-    try:
-      register_kinds.REGISTER_KINDS.get(kind)
-    except errors.UnknownNameError as error:
-      raise ValueError(str(error)) from error
-    return kind
+  options: Annotated[
+      dict[str, Any],
+      option_types.OptionsOf(
+          register_kinds.REGISTER_KINDS,
+          'kind',
+          method='_build',
+          reserved=registers.Register._build,
+      ),
+  ] = pydantic.Field(default_factory=dict)
 
   @pydantic.field_validator('place', mode='before')
   @classmethod
@@ -214,8 +215,11 @@ class _AnyProvider:
   """Validates a provider by the class that its `kind` is registered as."""
 
   @classmethod
-  def members(cls) -> list[type[providers.Provider]]:
+  def members(
+      cls, siblings: Mapping[str, Any] | None = None
+  ) -> list[type[providers.Provider]]:
     """The classes that are registered now."""
+    del siblings
     return [providers.PROVIDERS.get(kind) for kind in providers.PROVIDERS]
 
   @classmethod
@@ -284,65 +288,8 @@ class DesignSpec(validation.Spec):
 
   @pydantic.model_validator(mode='after')
   def _consistent(self) -> 'DesignSpec':
-    for i, meter in enumerate(self.meters):
-      self._expect(f'meters[{i}].writes', meter.writes, ('meter',))
-    for i, provider in enumerate(self.providers):
-      where = f'providers[{i}]'
-      for name in provider.reads:
-        self._expect(f'{where}.reads', name, None)
-      for name in provider.writes:
-        self._expect(f'{where}.writes', name, READ_BY_AGENTS)
-      try:
-        provider.check(self)
-      except ValueError as error:
-        raise ValueError(f'{where}: {error}') from error
-    self._refuse_cycles()
-    self._check_learner()
+    consistency.check(self, READ_BY_AGENTS)
     return self
-
-  def _expect(
-      self, where: str, name: str, roles: tuple[str, ...] | None
-  ) -> None:
-    """Checks that a register is declared and has one of some roles."""
-    if name not in self.registers:
-      raise ValueError(
-          f'{where}: register {name!r} is not declared; declared are'
-          f' {sorted(self.registers)}'
-      )
-    role = self.registers[name].role
-    if roles is not None and role not in roles:
-      raise ValueError(
-          f'{where}: register {name!r} has role {role!r}; allowed are'
-          f' {list(roles)}'
-      )
-
-  def _refuse_cycles(self) -> None:
-    """Refuses providers that wait for each other's feedback."""
-    graph = {
-        i: {
-            j
-            for j, other in enumerate(self.providers)
-            if i != j and set(provider.reads) & set(other.writes)
-        }
-        for i, provider in enumerate(self.providers)
-    }
-    try:
-      graphlib.TopologicalSorter(graph).prepare()
-    except graphlib.CycleError as error:
-      cycle = [f'providers[{i}]' for i in sorted(set(error.args[1]))]
-      raise ValueError(
-          f'{" and ".join(cycle)} form a cycle: each reads what another writes'
-      ) from error
-
-  def _check_learner(self) -> None:
-    extras = (self.learner.model_extra or {}) if self.learner else {}
-    for field, value in extras.items():
-      for name in _texts_in(value):
-        if name in self.registers and self.registers[name].role == 'meter':
-          raise ValueError(
-              f'learner.{field}: an agent may not read meter register {name!r}'
-              ' (feedback providers only)'
-          )
 
   def names(self, *roles: str) -> list[str]:
     """Returns the names of the registers with one of these roles, in order."""
@@ -387,27 +334,14 @@ class DesignSpec(validation.Spec):
     return self.schedule.check(num_substeps)
 
 
-def _texts_in(value: Any) -> Iterator[str]:
-  """Yields every text in nested lists and mappings, keys included."""
-  if isinstance(value, str):
-    yield value
-  elif isinstance(value, Mapping):
-    for key, item in value.items():
-      yield from _texts_in(key)
-      yield from _texts_in(item)
-  elif isinstance(value, list | tuple):
-    for item in value:
-      yield from _texts_in(item)
-
-
 Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec
 
-_validated_kinds: list[str] = []
+_validated_kinds: list[type[_Provider]] = []
 
 
 def load(
     design: Design,
-    overrides: tuple[str, ...] = (),
+    overrides: Sequence[str] = (),
     *,
     is_confined: bool = False,
 ) -> DesignSpec:
@@ -426,6 +360,12 @@ def load(
   Raises:
     SpecError: Where the file, key path or override is wrong, in one line.
   """
+  if isinstance(overrides, str) or not isinstance(overrides, Sequence):
+    raise errors.SpecError(
+        f'overrides: {messages.quote(overrides)}; allowed is a list of texts,'
+        " as in ['channel=secure']"
+    )
+  is_file = False
   if isinstance(design, DesignSpec):
     where, data = f'design {design.name!r}', design.to_mapping()
   elif isinstance(design, str) and design in DESIGNS:
@@ -438,7 +378,8 @@ def load(
     )
   elif isinstance(design, str) and not os.path.exists(design):
     raise errors.UnknownNameError(
-        f'design {design!r} is neither a file nor one of {list(DESIGNS)}'
+        f'design {messages.quote(design)} is neither a file nor one of'
+        f' {list(DESIGNS)}'
     )
   elif isinstance(design, Mapping):
     where, data = 'design', loading.read_mapping(design)
@@ -449,28 +390,16 @@ def load(
           f'design {messages.quote(where)} is outside the working directory;'
           f' allowed in a file are paths within it and {list(DESIGNS)}'
       )
-    data = loading.read_mapping(design)
-    _refuse_files_elsewhere(data, where)
-  if overrides:
-    data = loading.apply_overrides(data, overrides)
-    if is_confined:
-      _refuse_files_elsewhere(data, where)
+    data, is_file = loading.read_mapping(design), True
   _learn_new_kinds()
-  return validation.validate(DesignSpec, data, where)
-
-
-def _refuse_files_elsewhere(data: Mapping[str, Any], where: str) -> None:
-  """Refuses weights that a file names and that are somewhere else."""
-  given = data.get('providers')
-  for i, provider in enumerate(given if isinstance(given, list) else []):
-    options = provider.get('options') if isinstance(provider, dict) else None
-    weights = options.get('weights') if isinstance(options, dict) else None
-    if isinstance(weights, str) and not loading.is_inside(weights):
-      place = messages.Place(where, ('providers', i, 'options', 'weights'))
-      raise place.error(
-          f'{messages.quote(weights)} is outside the working directory; allowed'
-          ' in a file are names, and paths within it'
-      )
+  return validation.validate(
+      DesignSpec,
+      data,
+      where,
+      overrides,
+      is_confined=is_file or is_confined,
+      are_overrides_free=not is_confined,
+  )
 
 
 def json_schema() -> dict[str, Any]:
@@ -480,10 +409,11 @@ def json_schema() -> dict[str, Any]:
 
 
 def _learn_new_kinds() -> None:
-  """Rebuilds the validator if somebody has registered a provider since."""
-  if _validated_kinds != list(providers.PROVIDERS):
+  """Rebuilds the validator if other providers are registered than before."""
+  kinds = _AnyProvider.members()
+  if _validated_kinds != kinds:
     DesignSpec.model_rebuild(force=True)
-    _validated_kinds[:] = list(providers.PROVIDERS)
+    _validated_kinds[:] = kinds
 
 
 def _shipped(name: str) -> Any:

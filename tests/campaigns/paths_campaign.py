@@ -16,6 +16,7 @@ target verdict seed`.
 from collections.abc import Callable, Iterator
 import contextlib
 import hashlib
+import json
 import os
 import pathlib
 import shutil
@@ -40,6 +41,7 @@ from realab_suite.feedback import specs
 from realab_suite.feedback.policies import network_files
 from tests.campaigns import lines as lines_lib
 from tests.experiments import small
+from tests.feedback import file_readers
 
 OFF_LIMITS = 'off_limits'
 """The name of the folder that nothing may be opened in."""
@@ -118,17 +120,55 @@ def _experiment(**changes: Any) -> dict[str, Any]:
 
 
 def _with_weights(path: str) -> dict[str, Any]:
+  return _demonstrated('network_demonstrator', {'weights': path})
+
+
+def _demonstrated(policy: str, options: Any) -> dict[str, Any]:
   (provider,) = _design()['providers']
-  return _design(providers=[{**provider, 'options': {'weights': path}}])
+  return _design(providers=[{**provider, 'policy': policy, 'options': options}])
+
+
+def _wrapped(depth: int, path: str) -> dict[str, Any]:
+  """Weights in the options of so many policies around each other."""
+  policy, options = 'network_demonstrator', {'weights': path}
+  for _ in range(depth):
+    options = {'inner': policy, 'inner_options': options}
+    policy = 'test_wrapping'
+  return _demonstrated(policy, options)
+
+
+def _advised(function: str, options: Any) -> dict[str, Any]:
+  return _design(
+      registers={
+          'reward': _REGISTER,
+          'query': {**_REGISTER, 'role': 'query', 'place': 'station_2'},
+      },
+      providers=[
+          {
+              'kind': 'value_advice',
+              'value_function': function,
+              'options': options,
+              'reads': ['query'],
+              'writes': ['reward'],
+          }
+      ],
+  )
+
+
+def _overridden(design: Any, *overrides: str) -> Callable[[], Any]:
+  """A file of a design, with overrides of the user's."""
+  return _from_file(lambda name: specs.load(name, overrides), design)
 
 
 def _from_file(load: Callable[[str], Any], data: Any) -> Callable[[], Any]:
-  def use() -> Any:
-    text = yaml.safe_dump(data, allow_unicode=True)
-    pathlib.Path('given.yaml').write_text(text, encoding='utf-8')
-    return load('given.yaml')
+  return lambda: load(_file(data))
 
-  return use
+
+def _file(data: Any) -> str:
+  """Writes a file, without anchors, and returns its name."""
+  text = json.dumps(data)
+  pathlib.Path('given.yaml').write_text(text, encoding='utf-8')
+  return 'given.yaml'
 
 
 def _sweep(folder: str) -> Any:
@@ -184,6 +224,13 @@ def paths(outside: pathlib.Path) -> dict[str, str]:
       'format': '%s%n',
       'newline': 'a\n../b',
       'dots': '..',
+      'home folder': '~',
+      'home of another user': '~root/x.npz',
+      'drive': 'C:\\x.npz',
+      'drive without a folder': 'C:x.npz',
+      'share': '\\\\server\\share\\x.npz',
+      'up, with backslashes': f'..\\{outside.name}\\secret.npz',
+      'NUL': 'a\0b',
   }
 
 
@@ -213,6 +260,65 @@ def cases(outside: pathlib.Path) -> list[Case]:
             ),
         ),
         'weights of a design': _from_file(specs.load, _with_weights(path)),
+        'weights of a value function': _from_file(
+            specs.load, _advised('network_values', {'weights': path})
+        ),
+        'weights of the policy of a value function': _from_file(
+            specs.load,
+            _advised(
+                'apple_seeker_approval',
+                {
+                    'policy': 'network_demonstrator',
+                    'options': {'weights': path},
+                },
+            ),
+        ),
+        **{
+            f'weights, {depth} policies deep': _from_file(
+                specs.load, _wrapped(depth, path)
+            )
+            for depth in (1, 3, 20)
+        },
+        'deep weights in an override': _from_file(
+            experiments.load,
+            _experiment(
+                runs={
+                    'one': {
+                        'design': 'value_advice',
+                        'overrides': [
+                            'providers.0.options.policy=network_demonstrator',
+                            f'providers.0.options.options.weights={path!r}',
+                        ],
+                    }
+                }
+            ),
+        ),
+        'weights that an override makes a path': _overridden(
+            _demonstrated('test_any_option', {'weights': path}),
+            'providers.0.policy=network_demonstrator',
+        ),
+        'weights beside an override': _overridden(
+            _wrapped(1, path), 'providers.0.options.inner_options.x=1'
+        ),
+        'file of a provider': _from_file(
+            specs.load,
+            _design(
+                providers=[
+                    {'kind': 'test_reading', 'writes': [], 'file': path}
+                ]
+            ),
+        ),
+        'files of a policy': _from_file(
+            specs.load, _demonstrated('test_reader', {'table': {'a': [path]}})
+        ),
+        'file of a register': lambda register=register: _load_world(
+            _file(
+                _design(
+                    registers={'reward': {**register, 'kind': 'test_reading'}},
+                    providers=[],
+                )
+            )
+        ),
         'name of an experiment': _from_file(
             experiments.load, _experiment(name=path)
         ),
@@ -243,6 +349,9 @@ def cases(outside: pathlib.Path) -> list[Case]:
         'model in a design': _from_file(specs.load, _design(model=path)),
         'folder of a job': lambda path=path: _sweep(path),
         'result of a run': lambda path=path: _done(path),
+        'design of a run that is over': lambda path=path: sweep_results.Run(
+            'one', (), {}, (), {0: {'design': _with_weights(path)}}
+        ).design,
         '--run': lambda path=path: jobs.plan(experiment, [0], [path]),
         '--policies': lambda path=path: scripted.plan(
             small.settings(here, policies=(path,))
@@ -302,7 +411,7 @@ def run(watch: Watch, every: int = 1) -> Figures:
   installed = [sys.prefix, sys.base_prefix, sysconfig.get_path('stdlib')]
   package = pathlib.Path(realab_suite.__file__).parents[1]
   accepted, other_errors, opened = [], [], []
-  with workplace() as outside:
+  with workplace() as outside, file_readers.registered():
     given = cases(outside)[::every]
     for case in given:
       with watch.only(os.getcwd(), str(package), *installed):

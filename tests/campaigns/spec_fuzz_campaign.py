@@ -219,15 +219,16 @@ _POLICIES = st.sampled_from(
     ['apple_seeker', 'no_op', 'random', 'carrying_saboteur', 'oracle',
      'network_demonstrator']
 )  # fmt: skip
+_OPTION = {
+    'weights': st.sampled_from(
+        ['demonstrator_v1', '/etc/passwd', '../x.npz', 'a\0b']
+    ),
+    'half_width': _NUMBER,
+    'target': st.tuples(_NUMBER, _NUMBER).map(list),
+    'direction': st.tuples(_NUMBER, _NUMBER).map(list),
+}
 _OPTIONS = _mapping(
-    {},
-    {
-        'weights': st.sampled_from(
-            ['demonstrator_v1', '/etc/passwd', '../x.npz', 'a\0b']
-        ),
-        'target': st.tuples(_NUMBER, _NUMBER).map(list),
-        'direction': st.tuples(_NUMBER, _NUMBER).map(list),
-    },
+    {}, {**_OPTION, 'policy': _POLICIES, 'options': _mapping({}, _OPTION)}
 )
 _PROVIDERS = st.one_of(
     st.fixed_dictionaries(

@@ -1,7 +1,9 @@
 """Campaign C22 in small, and that it can fail."""
 
+from collections.abc import Iterator
 import pathlib
 import re
+from typing import Any
 
 import pytest
 
@@ -9,15 +11,17 @@ import realab_suite
 from realab_suite import errors
 from realab_suite.experiments import spec as experiments
 from realab_suite.experiments import storage
+from realab_suite.feedback import annotations
 from realab_suite.feedback import loading
 from realab_suite.feedback import specs
 from tests.campaigns import paths_campaign as campaign
+from tests.feedback import file_readers
 
 _WATCH = campaign.Watch()
 
 
 def test_what_leads_elsewhere_is_refused_and_nothing_there_is_opened():
-  found = campaign.run(_WATCH, every=3)
+  found = campaign.run(_WATCH, every=5)
   assert found.tried >= 40
   assert not found.accepted
   assert not found.other_errors
@@ -43,6 +47,29 @@ def test_without_the_check_files_elsewhere_are_opened(
     )
     use()
     assert any(campaign.OFF_LIMITS in path for path in _WATCH.opened)
+
+
+def test_paths_that_are_looked_for_in_one_place_only_are_missed(
+    monkeypatch: pytest.MonkeyPatch,
+):
+  # What the check was once: options of providers, and nothing within them.
+  found = annotations.paths_in
+
+  def shallow(*arguments: Any) -> Iterator[Any]:
+    return (
+        (path, text)
+        for path, text in found(*arguments)
+        if path[2:] == ('options', 'weights')
+    )
+
+  monkeypatch.setattr(annotations, 'paths_in', shallow)
+  with campaign.workplace() as outside, file_readers.registered():
+    for depth in (1, 3):
+      with _WATCH.only('.'):
+        campaign._from_file(
+            specs.load, campaign._wrapped(depth, f'{outside}/secret.npz')
+        )()
+        assert any(campaign.OFF_LIMITS in path for path in _WATCH.opened)
 
 
 def test_a_design_within_the_working_directory_may_be_named(

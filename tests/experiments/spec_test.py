@@ -91,6 +91,39 @@ def test_every_job_has_a_folder_of_its_own(path):
             {
                 'runs': {
                     'a': {
+                        'design': 'instantaneous_reward',
+                        'overrides': ['registers.reward.scale=-1'],
+                    }
+                }
+            },
+            "runs.a: override 'registers.reward.scale=-1': registers.reward.sc",
+        ),
+        (
+            {
+                'runs': {
+                    'a': {
+                        'design': 'instantaneous_reward',
+                        'learner': {'kind': 3},
+                    }
+                }
+            },
+            'runs.a: learner.kind: must be a valid string, got 3',
+        ),
+        (
+            {
+                'runs': {
+                    'a': {
+                        'design': 'instantaneous_reward',
+                        'learner': {'reward': 'score'},
+                    }
+                }
+            },
+            "runs.a: learner.reward: an agent may not read meter register 'sco",
+        ),
+        (
+            {
+                'runs': {
+                    'a': {
                         'design': 'value_advice',
                         'overrides': ['channel=secure'],
                         'twin': True,

@@ -240,24 +240,36 @@ def test_the_query_is_in_its_register_before_the_world_ticks():
 def test_providers_act_in_the_order_of_the_design():
   design = _design(
       providers=[
-          {'kind': 'constant', 'value': 5.0, 'writes': ['reward']},
+          {'kind': 'constant', 'value': 5.0, 'writes': ['early']},
           {
               'kind': 'test_scripted',
-              'reads': ['reward'],
+              'reads': ['early', 'late'],
               'writes': ['reward'],
           },
-          {'kind': 'constant', 'value': 3.0, 'writes': ['reward']},
+          {'kind': 'constant', 'value': 3.0, 'writes': ['late']},
       ]
   )
+  design['registers']['early'] = _register('feedback', 'centre', 0, 6)
+  design['registers']['late'] = _register('feedback', 'north_wall', 0, 6)
   env, sink = _embed(design)
   env.reset()
   time_step = env.step(helpers.no_op(env))
   env.close()
-  assert sink.requested('reward') == [5.0, 2.0, 3.0]
-  np.testing.assert_allclose(_SEEN[0][1]['reward'], 5.0, atol=1e-12)
-  np.testing.assert_allclose(
-      time_step.observation['registers/reward'], 3.0, atol=1e-9
-  )
+  (step,) = sink.steps
+  writes = [
+      record for record in step.records if isinstance(record, registers.Write)
+  ]
+  assert [(write.register, write.writer) for write in writes[-3:]] == [
+      ('early', 'providers[0]:constant'),
+      ('reward', 'providers[1]:test_scripted'),
+      ('late', 'providers[2]:constant'),
+  ]
+  np.testing.assert_allclose(_SEEN[0][1]['early'], 5.0, atol=1e-12)
+  np.testing.assert_allclose(_SEEN[0][1]['late'], 0.0, atol=1e-12)
+  for name, value in (('early', 5.0), ('reward', 2.0), ('late', 3.0)):
+    np.testing.assert_allclose(
+        time_step.observation[f'registers/{name}'], value, atol=1e-9
+    )
 
 
 def test_an_episode_begins_with_initial_writes_that_are_logged():
@@ -311,7 +323,8 @@ def test_providers_know_when_an_episode_starts_and_get_their_state_back():
 
 
 def test_every_provider_gets_another_key_in_every_step_and_episode():
-  scripted = _design()['providers'][0]
+  _ANSWER[:] = [lambda observation, readings, state: ({}, state)]
+  scripted = {**_design()['providers'][0], 'writes': []}
   env, _ = _embed(_design(providers=[scripted, scripted]), max_steps=5)
   for _ in range(2 * 6):
     env.step(helpers.no_op(env))

@@ -287,7 +287,7 @@ _WRONG = {
                 }
             ],
         ),
-        "policy 'no_op' with options {'speed': 1}",
+        "providers[0].options: unknown key 'speed' (allowed: none)",
     ),
     'advice on what is no query': (
         _design(
@@ -306,7 +306,7 @@ _WRONG = {
             meters=[],
             providers=[_advice(kind='paired_advice', reads=['query', 'query'])],
         ),
-        "paired_advice reads 'query' twice; allowed are two query registers",
+        "providers[0].reads: register 'query' is there twice",
     ),
     'paired advice on what is no query': (
         _design(
@@ -419,11 +419,11 @@ _DOES_NOT_FIT = {
     ),
     'option that a register does not take': (
         _reward(options={'colour': 'red'}),
-        "registers.reward.options: 'colour'",
+        "registers.reward.options: unknown key 'colour' (allowed: none)",
     ),
     'option that is a key of its own': (
         _reward(options={'scale': 0.2}),
-        "registers.reward.options: 'scale'",
+        "registers.reward.options: unknown key 'scale' (allowed: none)",
     ),
 }
 
@@ -469,6 +469,27 @@ def test_messages_name_the_file(tmp_path: pathlib.Path):
 def test_what_is_no_design_at_all_is_refused(design: Any):
   with pytest.raises(errors.SpecError):
     specs.load(design)
+
+
+@pytest.mark.parametrize(
+    'given',
+    [
+        lambda long: long,
+        lambda long: _design(**{long: 1}),
+        lambda long: _design(registers={long: _REWARD}),
+        lambda long: _reward(kind=long),
+        lambda long: _reward(**{long: 1}),
+        lambda long: _design(learner={'kind': 'x', long: 'score'}),
+        lambda long: _design(
+            providers=[{**_DESIGN['providers'][0], 'reads': [long]}]
+        ),
+    ],
+)
+def test_a_long_name_or_key_is_cut_in_a_message(given: Any):
+  with pytest.raises(errors.SpecError) as caught:
+    specs.load(given('k' * 100_000))
+  assert 'kkkkk' in str(caught.value)
+  assert len(str(caught.value)) < 600
 
 
 def test_an_unknown_design_is_refused_with_the_known_ones():
@@ -612,7 +633,10 @@ _CHANGES = {
     'registers.dof': _reward(dof='planar'),
     'registers.block_size': _reward(block_size=0.3),
     'registers.mass': _reward(mass=2),
-    'registers.options': _reward(options={'a': 1}),
+    'registers.options': _reward(kind='test_stubborn'),
+    'registers.options.held': _reward(
+        kind='test_stubborn', options={'held': 1.0}
+    ),
     'meters': _design(meters=[]),
     'meters.measures': _design(
         meters=[{'measures': 'door_unlocked', 'writes': 'score'}]
@@ -637,7 +661,9 @@ _CHANGES = {
 
 def test_the_digest_changes_with_every_field():
   designs = {'unchanged': _DESIGN, **_CHANGES}
-  digests = {name: specs.load(d).digest() for name, d in designs.items()}
+  kinds = register_kinds.REGISTER_KINDS
+  with helpers.registered(kinds, 'test_stubborn', _Stubborn):
+    digests = {name: specs.load(d).digest() for name, d in designs.items()}
   assert len(set(digests.values())) == len(digests), digests
 
 

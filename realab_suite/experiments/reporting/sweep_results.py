@@ -123,7 +123,7 @@ class Run:
   @functools.cached_property
   def design(self) -> specs.DesignSpec:
     """The design that the run was made with."""
-    return specs.load(self.config['design'])
+    return specs.load(self.config['design'], is_confined=True)
 
   @functools.cached_property
   def curves(self) -> dict[int, list[dict[str, Any]]]:

@@ -1,8 +1,9 @@
 """An honest agent: it does what the environment designer intends."""
 
-from typing import Any, final
+from typing import Annotated, Any, final
 
 import numpy as np
+import pydantic
 
 from realab_suite.feedback.policies import base
 from realab_suite.feedback.policies import navigation
@@ -38,7 +39,10 @@ class AppleSeeker(base.Policy):
   are, and how long nothing has come of what it does.
   """
 
-  def __init__(self, half_width: float = 3.6) -> None:
+  def __init__(
+      self,
+      half_width: Annotated[float, pydantic.Field(gt=0, le=100)] = 3.6,
+  ) -> None:
     """Makes the policy.
 
     Args:

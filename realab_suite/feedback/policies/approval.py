@@ -1,12 +1,13 @@
 """Approval: how near an action is to what some policy would do here."""
 
 from collections.abc import Mapping
-from typing import Any, final
+from typing import Annotated, Any, final
 
 import numpy as np
 
 from realab_suite.entities import avatar
 from realab_suite.feedback import action_sets
+from realab_suite.feedback import option_types
 from realab_suite.feedback.policies import base
 
 
@@ -21,8 +22,13 @@ class PolicyApproval(base.ValueFunction):
 
   def __init__(
       self,
-      policy: str = 'apple_seeker',
-      options: Mapping[str, Any] | None = None,
+      policy: Annotated[
+          str, option_types.NameIn(base.POLICIES)
+      ] = 'apple_seeker',
+      options: Annotated[
+          Mapping[str, Any] | None,
+          option_types.OptionsOf(base.POLICIES, 'policy'),
+      ] = None,
   ) -> None:
     """Makes the value function.
 

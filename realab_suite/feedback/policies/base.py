@@ -12,6 +12,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.feedback import action_sets
+from realab_suite.feedback import messages
 from realab_suite.feedback import registry
 
 Observation = Mapping[str, np.ndarray]
@@ -109,9 +110,12 @@ def _make(
   factory = names.get(name)
   try:
     return factory(**options)
-  except TypeError as error:
+  except errors.RealabError:
+    raise
+  except Exception as error:  # It may be of any class.
     raise errors.SpecError(
-        f'{what} {name!r} with options {dict(options)!r}: {error}'
+        f'{what} {name!r} with options {messages.quote(dict(options))}:'
+        f' {type(error).__name__}: {error}'
     ) from error
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.feedback import action_sets
+from realab_suite.feedback import option_types
 from realab_suite.feedback.policies import base
 from realab_suite.feedback.policies import network_files
 
@@ -28,7 +29,10 @@ class NetworkDemonstrator(base.Policy):
   """
 
   def __init__(
-      self, weights: network_files.Weights = 'demonstrator_v1'
+      self,
+      weights: (
+          option_types.FilePath | network_files.Network
+      ) = 'demonstrator_v1',
   ) -> None:
     """Makes the policy.
 
@@ -70,7 +74,10 @@ class NetworkValues(base.ValueFunction):
   """
 
   def __init__(
-      self, weights: network_files.Weights = 'demonstrator_v1'
+      self,
+      weights: (
+          option_types.FilePath | network_files.Network
+      ) = 'demonstrator_v1',
   ) -> None:
     """Makes the value function; arguments are those of the demonstrator."""
     self._network = network_files.load(weights)

@@ -1,10 +1,10 @@
 """Agents that tamper: they move the base block of a register where it pays."""
 
 import abc
-from collections.abc import Sequence
-from typing import Any, final
+from typing import Annotated, Any, final
 
 import numpy as np
+import pydantic
 
 from realab_suite import errors
 from realab_suite.feedback.policies import base
@@ -37,6 +37,10 @@ _ASIDE = 0.22
 # How well it has to face along the direction to have arrived, radians.
 _ALIGNED = 0.5
 
+# Larger ones make the arithmetic of a step overflow.
+_Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
+_Vector = tuple[_Coordinate, _Coordinate]
+
 
 class Saboteur(base.Policy, abc.ABC):
   """Moves the base block of a register, and ignores everything else.
@@ -46,8 +50,8 @@ class Saboteur(base.Policy, abc.ABC):
 
   def __init__(
       self,
-      target: Sequence[float] = (1.4, -2.2),
-      direction: Sequence[float] = (-1.0, 0.0),
+      target: _Vector = (1.4, -2.2),
+      direction: _Vector = (-1.0, 0.0),
   ) -> None:
     """Makes the policy.
 

@@ -46,6 +46,14 @@ class Provider(pydantic.BaseModel, abc.ABC):
     """
     return ()
 
+  @property
+  def action_writes(self) -> tuple[str, ...]:
+    """Names in `writes` that are given the index of an action.
+
+    A subclass that writes such an index overrides it.
+    """
+    return ()
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step: arrays, tuples or dicts of them.
 

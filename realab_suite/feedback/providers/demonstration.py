@@ -1,11 +1,12 @@
 """Demonstrations: what a policy would do here (paper, section 3.4)."""
 
 import functools
-from typing import Any, Literal, final
+from typing import Annotated, Any, Literal, final
 
 import numpy as np
 import pydantic
 
+from realab_suite.feedback import option_types
 from realab_suite.feedback.policies import base as policies
 from realab_suite.feedback.providers import base
 
@@ -22,8 +23,14 @@ class Demonstration(base.Provider):
 
   kind: Literal['demonstration'] = 'demonstration'
   writes: base.OneName
-  policy: str
-  options: dict[str, Any] = pydantic.Field(default_factory=dict)
+  policy: Annotated[str, option_types.NameIn(policies.POLICIES)]
+  options: Annotated[
+      dict[str, Any], option_types.OptionsOf(policies.POLICIES, 'policy')
+  ] = pydantic.Field(default_factory=dict)
+
+  @property
+  def action_writes(self) -> tuple[str, ...]:
+    return self.writes
 
   @functools.cached_property
   def demonstrator(self) -> policies.Policy:

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 import pydantic
 
+from realab_suite.feedback import option_types
 from realab_suite.feedback.policies import base as policies
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
@@ -33,8 +34,11 @@ class PairedAdvice(base.Provider):
   kind: Literal['paired_advice'] = 'paired_advice'
   reads: _Pair
   writes: base.OneName
-  value_function: str
-  options: dict[str, Any] = pydantic.Field(default_factory=dict)
+  value_function: Annotated[str, option_types.NameIn(policies.VALUE_FUNCTIONS)]
+  options: Annotated[
+      dict[str, Any],
+      option_types.OptionsOf(policies.VALUE_FUNCTIONS, 'value_function'),
+  ] = pydantic.Field(default_factory=dict)
 
   @property
   def action_queries(self) -> tuple[str, ...]:
@@ -47,11 +51,6 @@ class PairedAdvice(base.Provider):
 
   def check(self, design: Any) -> None:
     policies.check_action_set(self.adviser.action_set, design, self.kind)
-    if len(set(self.reads)) < len(self.reads):
-      raise ValueError(
-          f'paired_advice reads {self.reads[0]!r} twice; allowed are two query'
-          ' registers'
-      )
     for query in self.reads:
       if design.registers[query].role != 'query':
         raise ValueError(

@@ -1,11 +1,12 @@
 """Value advice: how good an action is that the agent asks about (3.4)."""
 
 import functools
-from typing import Any, Literal, final
+from typing import Annotated, Any, Literal, final
 
 import numpy as np
 import pydantic
 
+from realab_suite.feedback import option_types
 from realab_suite.feedback.policies import base as policies
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
@@ -33,8 +34,11 @@ class ValueAdvice(base.Provider):
   kind: Literal['value_advice'] = 'value_advice'
   reads: base.OneName
   writes: base.OneName
-  value_function: str
-  options: dict[str, Any] = pydantic.Field(default_factory=dict)
+  value_function: Annotated[str, option_types.NameIn(policies.VALUE_FUNCTIONS)]
+  options: Annotated[
+      dict[str, Any],
+      option_types.OptionsOf(policies.VALUE_FUNCTIONS, 'value_function'),
+  ] = pydantic.Field(default_factory=dict)
   query_delay: Literal[0, 1] = 0
 
   @property

@@ -1,0 +1,150 @@
+"""Checks that the parts of a design fit each other.
+
+The type of each part checks the part alone; the mechanism and
+`engine/placement.py` check a design against its world.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+import graphlib
+from typing import Any
+
+from realab_suite.feedback import action_sets
+from realab_suite.feedback import messages
+
+
+def check(design: Any, read_by_agents: Sequence[str]) -> None:
+  """Checks a design.
+
+  Args:
+    design: A `specs.DesignSpec` whose fields are valid.
+    read_by_agents: The roles of registers that providers may write.
+
+  Raises:
+    ValueError: If registers, meters, providers and learner do not fit.
+  """
+  for i, meter in enumerate(design.meters):
+    _expect_role(design, f'meters[{i}].writes', meter.writes, ('meter',))
+  for i, provider in enumerate(design.providers):
+    where = f'providers[{i}]'
+    for name in provider.reads:
+      _expect_role(design, f'{where}.reads', name, None)
+    for name in provider.writes:
+      _expect_role(design, f'{where}.writes', name, read_by_agents)
+    _refuse_twice(f'{where}.reads', provider.reads)
+    _refuse_twice(f'{where}.writes', provider.writes)
+    try:
+      provider.check(design)
+    except ValueError as error:
+      raise ValueError(f'{where}: {error}') from error
+    except Exception as error:  # It may be of any class.
+      raise ValueError(f'{where}: {type(error).__name__}: {error}') from error
+    for name in (*provider.action_queries, *provider.action_writes):
+      _expect_actions(design, where, name)
+  _refuse_second_writers(design)
+  _refuse_cycles(design)
+  _check_learner(design)
+
+
+def _expect_role(
+    design: Any, where: str, name: str, roles: Sequence[str] | None
+) -> None:
+  """Checks that a register is declared and has one of some roles."""
+  if name not in design.registers:
+    raise ValueError(
+        f'{where}: register {messages.quote(name)} is not declared; declared'
+        f' are {sorted(design.registers)}'
+    )
+  role = design.registers[name].role
+  if roles is not None and role not in roles:
+    raise ValueError(
+        f'{where}: register {name!r} has role {role!r}; allowed are'
+        f' {list(roles)}'
+    )
+
+
+def _refuse_twice(where: str, names: Sequence[str]) -> None:
+  """Refuses a list that names a register twice."""
+  seen: set[str] = set()
+  for name in names:
+    if name in seen:
+      raise ValueError(
+          f'{where}: register {name!r} is there twice; allowed is once'
+      )
+    seen.add(name)
+
+
+def _refuse_second_writers(design: Any) -> None:
+  """Refuses registers with two writers: the second replaces the first value."""
+  writers: dict[str, str] = {}
+  for where, names in (
+      *((f'meters[{i}]', (m.writes,)) for i, m in enumerate(design.meters)),
+      *((f'providers[{i}]', p.writes) for i, p in enumerate(design.providers)),
+  ):
+    for name in names:
+      if name in writers:
+        raise ValueError(
+            f'{where}.writes: register {name!r} is written by {writers[name]}'
+            ' already; allowed is one writer'
+        )
+      writers[name] = where
+
+
+def _expect_actions(design: Any, where: str, name: str) -> None:
+  """Checks that a register can hold the index of every action."""
+  if design.action_set is None:
+    return
+  known = action_sets.get(design.action_set.name, design.action_set.version)
+  last = len(known) - 1
+  low, high = design.registers[name].range
+  if not low <= 0 <= last <= high:
+    raise ValueError(
+        f'registers.{name}.range: {[low, high]} leaves out actions of'
+        f' {known.name} v{known.version}, whose indices {where} uses; allowed'
+        f' are ranges that contain [0, {last}]'
+    )
+
+
+def _refuse_cycles(design: Any) -> None:
+  """Refuses providers that wait for each other's feedback."""
+  writers = {
+      name: i
+      for i, provider in enumerate(design.providers)
+      for name in provider.writes
+  }
+  graph = {
+      i: {writers[name] for name in provider.reads if name in writers} - {i}
+      for i, provider in enumerate(design.providers)
+  }
+  try:
+    graphlib.TopologicalSorter(graph).prepare()
+  except graphlib.CycleError as error:
+    cycle = [f'providers[{i}]' for i in sorted(set(error.args[1]))]
+    raise ValueError(
+        f'{" and ".join(cycle)} form a cycle: each reads what another writes'
+    ) from error
+
+
+def _check_learner(design: Any) -> None:
+  """Refuses a learner that names a meter register."""
+  extras = (design.learner.model_extra or {}) if design.learner else {}
+  for field, value in extras.items():
+    for name in _texts_in(value):
+      if name in design.registers and design.registers[name].role == 'meter':
+        where = messages.format_path(('learner', field))
+        raise ValueError(
+            f'{where}: an agent may not read meter register {name!r} (feedback'
+            ' providers only)'
+        )
+
+
+def _texts_in(value: Any) -> Iterator[str]:
+  """Yields every text in nested lists and mappings, keys included."""
+  if isinstance(value, str):
+    yield value
+  elif isinstance(value, Mapping):
+    for key, item in value.items():
+      yield from _texts_in(key)
+      yield from _texts_in(item)
+  elif isinstance(value, list | tuple):
+    for item in value:
+      yield from _texts_in(item)
