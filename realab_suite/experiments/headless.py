@@ -1,6 +1,6 @@
-"""Finds a way to render before dm_control is imported, which fixes the choice.
+"""Finds a renderer that works before dm_control and MuJoCo are imported.
 
-Nothing here imports dm_control or MuJoCo: both look at `MUJOCO_GL` once.
+Nothing here imports either: each looks at `MUJOCO_GL` once.
 """
 
 from importlib import util
@@ -40,7 +40,7 @@ def choose_renderer() -> str | None:
 
 def render_nothing() -> None:
   """Sets `MUJOCO_GL` to `disable`, unless the user has named a renderer."""
-  if not _display.CHOSEN_BY_USER:
+  if not os.environ.get('MUJOCO_GL'):
     os.environ['MUJOCO_GL'] = 'disable'
 
 
