@@ -21,7 +21,11 @@ from tests import gate
 from tests import patience
 
 hypothesis.settings.register_profile(
-    'realab', deadline=None, derandomize=True, database=None
+    'realab',
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile('realab')
 
