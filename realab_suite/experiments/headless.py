@@ -10,7 +10,8 @@ import sys
 
 from realab_suite import _display
 
-_PATIENCE_SECONDS = 60
+# More than a slow machine under load needs to import dm_control and draw.
+_PATIENCE_SECONDS = 300
 # In a process of its own: where libraries are missing, imports fail half way.
 _RENDERS_SOMETHING = """
 from dm_control import mujoco
