@@ -736,7 +736,7 @@ def clone(seed: int) -> Attack:
         with served.Client(program.address) as client:
           episodes = clones.play(client.env())
         blind = clones.predict(clones.make(int(arguments['seed'])), episodes)
-      program.process.wait(60)
+      program.process.wait(patience.SECONDS)
     rows = list(results.read_rows(output / 'episodes.jsonl'))
     seeing = clones.predict(clones.make(clones.seed_in(output)), episodes)
   return Attack(
