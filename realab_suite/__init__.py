@@ -7,4 +7,4 @@ __version__ = '0.1.0'
 
 _versions.check()
 # Before dm_control is imported, which looks once.
-_display.prefer_egl()
+_display.postpone_choice()

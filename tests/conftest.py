@@ -18,14 +18,18 @@ import hypothesis
 import pytest
 
 from tests import gate
+from tests import patience
 
 hypothesis.settings.register_profile(
-    'realab', deadline=None, derandomize=True, database=None
+    'realab',
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile('realab')
 
 _ROOT = pathlib.Path(__file__).parents[1]
-_PATIENCE_SECONDS = 120
 _RENDERS_SOMETHING = """
 from dm_control import mujoco
 xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
@@ -43,14 +47,24 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
   marked = pyfuncitem.get_closest_marker('camera') is not None
   if not marked or os.environ['MUJOCO_GL'] == 'egl':
     return None
-  if complaint := _why_egl_does_not_work():
-    pytest.skip(f'no EGL: {complaint}')
+  _skip_without_egl()
   ran = _python_with_egl(
       '-m', 'pytest', '-q', '-p', 'no:cacheprovider', pyfuncitem.nodeid
   )
   if ran.returncode:
     pytest.fail(ran.stdout + ran.stderr, pytrace=False)
   return True
+
+
+@pytest.fixture
+def egl() -> None:
+  """Skips a test of other processes, which render, where there is no EGL."""
+  _skip_without_egl()
+
+
+def _skip_without_egl() -> None:
+  if complaint := _why_egl_does_not_work():
+    pytest.skip(f'no EGL: {complaint}')
 
 
 @functools.cache
@@ -75,6 +89,6 @@ def _python_with_egl(*arguments: str) -> subprocess.CompletedProcess[str]:
       env={**inherited, 'MUJOCO_GL': 'egl'},
       capture_output=True,
       text=True,
-      timeout=_PATIENCE_SECONDS,
+      timeout=patience.SECONDS,
       check=False,
   )

@@ -9,6 +9,7 @@ import mujoco
 import pytest
 
 from tests import gate
+from tests import patience
 
 _ROOT = pathlib.Path(__file__).parents[1]
 _CONFTEST = """
@@ -92,7 +93,7 @@ def _pytest(folder: pathlib.Path, *arguments: str) -> tuple[int, str, str]:
       env={**inherited, 'PYTHONPATH': str(_ROOT)},
       capture_output=True,
       text=True,
-      timeout=60,
+      timeout=patience.SECONDS,
       check=False,
   )
   return ran.returncode, ran.stdout, ran.stderr

@@ -17,6 +17,7 @@ from dm_control import _render
 import mujoco
 import numpy as np
 
+from realab_suite import _display
 from realab_suite import errors
 
 # Corners around, and rings along, what is round.
@@ -80,9 +81,7 @@ class FrameRenderer:
     except Exception as error:  # Each renderer fails by errors of its own.
       raise errors.RenderingError(
           f'camera: no frame of {height} x {width} pixels with'
-          f' MUJOCO_GL={_render.BACKEND or "disable"} ({_first_line(error)});'
-          ' set MUJOCO_GL to egl (headless), glfw (with a display) or osmesa'
-          ' before Python starts, or camera_size to None'
+          f' {what_to_set(error)}, or camera_size to None'
       ) from error
     self._gl.increment_refcount()
     # What is dropped is freed as well; at exit, GL ends before Python does.
@@ -129,6 +128,15 @@ class FrameRenderer:
     self._finalizer()
 
 
+def what_to_set(error: Exception) -> str:
+  """Returns the renderer that failed, why, and which ones there are."""
+  return (
+      f'MUJOCO_GL={_render.BACKEND or "disable"} ({_first_line(error)});'
+      ' set MUJOCO_GL to egl (headless), glfw (with a display) or osmesa'
+      ' before Python starts'
+  )
+
+
 def _plain(model: mujoco.MjModel, height: int, width: int) -> mujoco.MjModel:
   """Returns a copy of a model that is drawn fast."""
   plain = copy.copy(model)
@@ -146,6 +154,7 @@ def _plain(model: mujoco.MjModel, height: int, width: int) -> mujoco.MjModel:
 def _start() -> Any:
   """Returns the GL context of this thread, which is made once."""
   if _threads.gl is None or _threads.gl.terminated:
+    _display.load_llvm()
     _threads.gl = _render.Renderer(max_width=1, max_height=1)
     reference = weakref.ref(_threads.gl)
     _started.append(reference)

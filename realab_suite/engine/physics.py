@@ -8,6 +8,8 @@ from dm_control.rl import control
 import mujoco
 import numpy as np
 
+from realab_suite import _display
+from realab_suite import errors
 from realab_suite.engine import camera as engine_camera
 from realab_suite.entities import cameras
 
@@ -74,6 +76,20 @@ class ThinPhysics(mjcf.Physics):
     mujoco.mj_step(*self._pointers, num_substeps)
     self._dirty = True
     self._refuse_warnings()
+
+  def _make_rendering_contexts(self) -> None:
+    """Prepares to draw for people.
+
+    Raises:
+      RenderingError: If nothing renders here.
+    """
+    _display.load_llvm()
+    try:
+      super()._make_rendering_contexts()
+    except Exception as error:  # Each renderer fails by errors of its own.
+      raise errors.RenderingError(
+          f'physics: no picture with {engine_camera.what_to_set(error)}'
+      ) from error
 
   def _refuse_warnings(self) -> None:
     if np.count_nonzero(self._num_warnings):

@@ -1,6 +1,6 @@
-"""Finds a way to render before dm_control is imported, which fixes the choice.
+"""Finds a renderer that works before dm_control and MuJoCo are imported.
 
-Nothing here imports dm_control or MuJoCo: both look at `MUJOCO_GL` once.
+Nothing here imports either: each looks at `MUJOCO_GL` once.
 """
 
 from importlib import util
@@ -10,7 +10,8 @@ import sys
 
 from realab_suite import _display
 
-_PATIENCE_SECONDS = 60
+# More than a slow machine under load needs to import dm_control and draw.
+_PATIENCE_SECONDS = 300
 # In a process of its own: where libraries are missing, imports fail half way.
 _RENDERS_SOMETHING = """
 from dm_control import mujoco
@@ -40,7 +41,7 @@ def choose_renderer() -> str | None:
 
 def render_nothing() -> None:
   """Sets `MUJOCO_GL` to `disable`, unless the user has named a renderer."""
-  if not _display.CHOSEN_BY_USER:
+  if not os.environ.get('MUJOCO_GL'):
     os.environ['MUJOCO_GL'] = 'disable'
 
 

@@ -13,6 +13,7 @@ from realab_suite.feedback.policies import network_files
 pytest.importorskip('optax')
 
 from realab_suite.experiments import network_making
+from tests import patience
 
 _ROOT = pathlib.Path(__file__).parents[2]
 
@@ -62,7 +63,7 @@ def test_what_the_command_line_gets_wrong_is_told_in_a_line(
       env={**os.environ, 'PYTHONPATH': str(_ROOT)},
       capture_output=True,
       text=True,
-      timeout=100,
+      timeout=patience.SECONDS,
       check=False,
   )
   assert ran.returncode == 2

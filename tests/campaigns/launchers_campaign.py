@@ -27,6 +27,7 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import sweeping
+from tests import patience
 from tests.campaigns import lines as lines_lib
 from tests.campaigns import victims
 from tests.campaigns import zygote
@@ -34,8 +35,6 @@ from tests.campaigns import zygote
 JOBS = 200
 KILLS = 20
 _WORKERS = 2
-_MOST_STARTS = 10
-_PATIENCE_SECONDS = 60
 
 
 @final
@@ -74,28 +73,29 @@ def sweep(
     kills: int,
     rng: np.random.Generator,
 ) -> Tally:
-  """Does a sweep that is killed so many times, and says what became of it."""
+  """Does a sweep that is killed so many times, and says what became of it.
+
+  Its last job does not end before the last kill, so each kill finds a launcher
+  that is under way.
+  """
   tally = Tally()
   options, output = _prepare(root, num_jobs)
   planned = jobs.plan(spec.load(experiment(num_jobs)))
+  release = root / 'release'
+  options |= {'held': planned[-1].folder(), 'release': str(release)}
   while tally.kills < kills:
     goal = round(len(planned) * tally.kills / kills)
     first = nursery.start('launch', **options)
     _wait_for_lock(output, first)
     _try_another(nursery, options, first, tally)
     # Evenly from first to last, and at any moment of a job.
-    deadline = time.monotonic() + _PATIENCE_SECONDS * len(planned)
-    while _num_done(output) < goal and time.monotonic() < deadline:
-      time.sleep(0.01)
+    patience.until(lambda goal=goal: _num_done(output) >= goal)
     time.sleep(rng.uniform(0.0, 0.3))
     os.kill(first, signal.SIGKILL)
-    if nursery.wait(first).status != -signal.SIGKILL:
-      break  # It was faster than the killer.
-    tally.kills += 1
-  for _ in range(_MOST_STARTS):
-    # Jobs of the last launcher, which end by themselves, may still be there.
-    if not nursery.call('launch', **options).status:
-      break
+    tally.kills += nursery.wait(first).status == -signal.SIGKILL
+  release.touch()
+  # Jobs of the last launcher, which end by themselves, may still be there.
+  patience.until(lambda: not nursery.call('launch', **options).status)
   finished = (root / 'finished').read_text().split()
   for job in planned:
     if not storage.is_done(output / job.folder()):
@@ -111,8 +111,7 @@ def race(
   """Starts two launchers of a package with a bug on one folder."""
   options, output = _prepare(root, 2)
   first = nursery.start('launch', **options, bug=bug)
-  while not (output / sweeping.SWEEP).exists():
-    time.sleep(0.01)
+  patience.until((output / sweeping.SWEEP).exists)
   _try_another(nursery, {**options, 'bug': bug}, first, tally)
   nursery.wait(first)
 
@@ -137,12 +136,8 @@ def _num_done(output: pathlib.Path) -> int:
 
 
 def _wait_for_lock(output: pathlib.Path, pid: int) -> None:
-  deadline = time.monotonic() + _PATIENCE_SECONDS
   lock = output / 'lock'
-  while not lock.exists() or lock.read_text().strip() != str(pid):
-    if time.monotonic() > deadline:
-      raise RuntimeError(f'launcher {pid} has not begun')
-    time.sleep(0.01)
+  patience.until(lambda: lock.exists() and lock.read_text().strip() == str(pid))
 
 
 def _try_another(

@@ -29,12 +29,12 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import suite
+from tests import patience
 from tests.campaigns import lines
 
 METHODS = ('spawn', 'forkserver', 'fork')
 THREADS = ('owner', 'other')
 EXITS = ('exit', 'exception')
-PATIENCE = 30.0  # Seconds.
 _ROOT = pathlib.Path(__file__).parents[2]
 _RENDERS = """
 from dm_control import mujoco
@@ -101,7 +101,7 @@ def _works(gl: str) -> bool:
       [sys.executable, '-c', _RENDERS],
       env={**os.environ, 'MUJOCO_GL': gl},
       capture_output=True,
-      timeout=2 * PATIENCE,
+      timeout=patience.SECONDS,
       check=False,
   )
   return ran.returncode == 0
@@ -129,8 +129,8 @@ def run(cell: Cell) -> Result:
       start_new_session=True,
   )
   try:
-    # The first process waits for the second one as long.
-    out, err = process.communicate(timeout=3 * PATIENCE)
+    # The first process waits for the second one, too.
+    out, err = process.communicate(timeout=2 * patience.SECONDS)
   except subprocess.TimeoutExpired:
     process.kill()
     out, err = process.communicate()
@@ -171,7 +171,7 @@ def _first(cell: Cell) -> None:
   context = multiprocessing.get_context(cell.method)
   child = context.Process(target=_second, args=(cell,))
   child.start()
-  child.join(PATIENCE)
+  child.join(patience.SECONDS)
   if child.exitcode is None:
     _say(hangs=True)
     child.kill()

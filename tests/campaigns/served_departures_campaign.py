@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, final
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 import grpc
 
+from tests import patience
 from tests.campaigns import lines as campaign_lines
 from tests.campaigns import served_campaign
 from tests.campaigns import zygote
@@ -29,7 +30,6 @@ from tests.interop import served
 REPETITIONS = 50
 STOPPED_SECONDS = 30.0
 IDLE_SECONDS = 1.0
-_PATIENCE_SECONDS = 600
 # This one; its name is another one where it is run.
 _MODULE = 'tests.campaigns.served_departures_campaign'
 
@@ -94,7 +94,7 @@ def go_and_stay(address: str, point: int, sign: str) -> None:
   signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCONT])
   stream = go_to(address, point)
   pathlib.Path(sign).touch()
-  if signal.sigtimedwait([signal.SIGCONT], _PATIENCE_SECONDS) is not None:
+  if signal.sigtimedwait([signal.SIGCONT], patience.SECONDS) is not None:
     for request in (served.STEP, served.JOIN, served.STEP):
       stream.tell(request)
     time.sleep(0.5)
@@ -126,11 +126,7 @@ class Clients:
     pid = self._nursery.start(
         'go_and_stay', address=self._address, point=point, sign=str(sign)
     )
-    deadline = time.monotonic() + 30.0
-    while not sign.exists():
-      if time.monotonic() > deadline:
-        raise RuntimeError(f'client {pid} did not get to point {point}')
-      time.sleep(0.002)
+    patience.until(sign.exists)
     return pid
 
   def wait(self, pid: int) -> zygote.Ended:
@@ -147,8 +143,23 @@ class Leaving(NamedTuple):
   seconds_until_refused: float
 
 
-def go_away(address: str, point: int, way: str, clients: Clients) -> Leaving:
-  """Goes to a point, then away; returns how it was for the next one."""
+def go_away(
+    address: str,
+    point: int,
+    way: str,
+    clients: Clients,
+    let_idle: Callable[[], None] = lambda: None,
+) -> Leaving:
+  """Goes to a point, then away; returns how it was for the next one.
+
+  Args:
+    address: Of the server.
+    point: Of `POINTS`.
+    way: Of `WAYS`.
+    clients: Start clients that can be killed and stopped.
+    let_idle: Called until a client that was stopped has lost the world; moves
+      on the server's clock, where that is not the real one.
+  """
   stream = pid = None
   if way in ('kill', 'stop'):
     pid = clients.start(point)
@@ -165,7 +176,9 @@ def go_away(address: str, point: int, way: str, clients: Clients) -> Leaving:
     stream.cancel()
   else:
     stream.channel.close()
-  following = served.connect_eventually(address, 10.0)
+  following = served.connect_eventually(
+      address, let_idle if way == 'stop' else lambda: None
+  )
   free_after = time.monotonic() - start
   is_clean = _begins_clean(following, address)
   if way == 'stop':
@@ -195,7 +208,7 @@ def _begins_clean(following: served.RawStream, address: str) -> bool:
         raise
       print('# C26: this machine stood still for a second', flush=True)
       following.close()
-      following = served.connect_eventually(address, 10.0)
+      following = served.connect_eventually(address)
       continue
     break
   following.close()
@@ -204,7 +217,7 @@ def _begins_clean(following: served.RawStream, address: str) -> bool:
 
 def _time_of_refusal(address: str) -> float:
   with served.Client(address) as second:
-    grpc.channel_ready_future(second.channel).result(5)
+    grpc.channel_ready_future(second.channel).result(patience.SECONDS)
     start = time.monotonic()
     try:
       second.join()
@@ -219,11 +232,12 @@ def go_away_everywhere(
     repetitions: int,
     ways: Sequence[str] = WAYS,
     points: Sequence[int] = range(len(POINTS)),
+    let_idle: Callable[[], None] = lambda: None,
 ) -> list[Leaving]:
-  """Goes away from every point in every way."""
+  """Goes away from every point in every way; see `go_away`."""
   with Clients(address) as clients:
     return [
-        go_away(address, point, way, clients)
+        go_away(address, point, way, clients, let_idle)
         for _ in range(repetitions)
         for way in ways
         for point in points
@@ -246,9 +260,19 @@ class Waking(NamedTuple):
 
 
 def wake_up_late(
-    address: str, seconds: float, points: Sequence[int] = range(len(POINTS))
+    address: str,
+    seconds: float,
+    points: Sequence[int] = range(len(POINTS)),
+    let_idle: Callable[[], None] = lambda: None,
 ) -> Waking:
-  """Stops clients at points, and lets them go on while somebody plays."""
+  """Stops clients at points, and lets them go on while somebody plays.
+
+  Args:
+    address: Of the server.
+    seconds: For how long all of them are stopped.
+    points: Where, of `POINTS`.
+    let_idle: As in `go_away`.
+  """
   expected = play(address)
   with Clients(address) as clients:
     pids = []
@@ -256,7 +280,7 @@ def wake_up_late(
       pids.append(clients.start(point))
       os.kill(pids[-1], signal.SIGSTOP)
       # Once it has been idle for long enough.
-      served.connect_eventually(address, 10.0).close()
+      served.connect_eventually(address, let_idle).close()
     start = time.monotonic()
     time.sleep(seconds)
 
@@ -285,7 +309,7 @@ def play(
     State and number of observations of each answer, which somebody else's step
     or reset would shift.
   """
-  stream = served.connect_eventually(address, 10.0)
+  stream = served.connect_eventually(address)
   stream.ask(served.JOIN)
   found = []
   for i in range(50):

@@ -25,6 +25,7 @@ import grpc
 import numpy as np
 
 from realab_suite.interop.rpc import sockets
+from tests import patience
 from tests.campaigns import lines as campaign_lines
 from tests.interop import served
 
@@ -179,7 +180,7 @@ def many_connections(
   with contextlib.ExitStack() as stack:
     for _ in range(number):
       silent = stack.enter_context(socket.socket(socket.AF_UNIX))
-      silent.settimeout(5.0)
+      silent.settimeout(patience.SECONDS)
       silent.connect(path)
     refused, slowest = 0, 0.0
     for _ in range(10):

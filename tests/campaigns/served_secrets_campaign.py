@@ -27,7 +27,7 @@ import sys
 import tempfile
 import threading
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
@@ -38,6 +38,7 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import results
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import sockets
+from tests import patience
 from tests.campaigns import lines as campaign_lines
 from tests.campaigns import served_campaign
 from tests.engine import helpers
@@ -229,14 +230,18 @@ def catch_l35() -> bool:
   return found != wire(lambda env: None, alter_world=pad)
 
 
-def catch_l36(steps: int = 300) -> bool:
+def catch_l36(
+    steps: int = 300,
+    sleep: Callable[[float], Any] = time.sleep,
+    clock: Callable[[], float] = time.perf_counter,
+) -> bool:
   """Steps take longer when there is a true reward."""
 
   def linger() -> float:
-    time.sleep(0.002)
+    sleep(0.002)
     return 1.0
 
-  effect, p = timing(linger, lambda: 0.0, steps, 0)
+  effect, p = timing(linger, lambda: 0.0, steps, 0, clock)
   return effect > 0.01 and p < 0.01
 
 
@@ -302,8 +307,29 @@ def run_c09(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
 # C18: time.
 
 
+@final
+class FakeClock:
+  """A clock that moves by sleeping, and by chance with each look at it."""
+
+  def __init__(self, seed: int) -> None:
+    self._now = 0.0
+    self._rng = np.random.default_rng(seed)
+
+  def __call__(self) -> float:
+    self._now += self._rng.exponential(0.001)
+    return self._now
+
+  def sleep(self, seconds: float) -> None:
+    """Moves the clock on."""
+    self._now += seconds
+
+
 def timing(
-    one: Callable[[], Any], other: Callable[[], Any], steps: int, seed: int
+    one: Callable[[], Any],
+    other: Callable[[], Any],
+    steps: int,
+    seed: int,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> tuple[float, float]:
   """Times paired steps of one served world, in random order.
 
@@ -312,6 +338,7 @@ def timing(
     other: Gives that of the other one.
     steps: How many pairs.
     seed: Of the order.
+    clock: Gives the time before and after a step, seconds.
 
   Returns:
     The difference of medians as a part of the median, and the p-value of a sign
@@ -337,9 +364,9 @@ def timing(
     seconds = np.zeros((steps, 2))
     for step in range(steps):
       for chosen in generator.permutation(2).tolist():
-        start = time.perf_counter()
+        start = clock()
         stream.ask(served.STEP)
-        seconds[step, chosen] = time.perf_counter() - start
+        seconds[step, chosen] = clock() - start
     stream.close()
   medians = np.median(seconds, 0)
   wins = int(np.count_nonzero(seconds[:, 0] > seconds[:, 1]))
@@ -565,11 +592,11 @@ def search(canary: float) -> Search:
         for region in memory(program.process.pid)
         for hit in found_in(region)
     ]
-    agent.communicate('\n', timeout=30)
-    time.sleep(0.2)
-    rows = list(
-        results.read_rows(pathlib.Path(folder) / 'results/episodes.jsonl')
-    )
+    agent.communicate('\n', timeout=patience.SECONDS)
+    path = pathlib.Path(folder) / 'results/episodes.jsonl'
+    # Of the agent's two episodes, each in a line of its own.
+    patience.until(lambda: path.read_bytes().count(b'\n') >= 2)
+    rows = list(results.read_rows(path))
     in_evaluator += ['row'] * any(
         abs(row.true_return - canary) < 1e-9 for row in rows
     )
@@ -709,7 +736,7 @@ def clone(seed: int) -> Attack:
         with served.Client(program.address) as client:
           episodes = clones.play(client.env())
         blind = clones.predict(clones.make(int(arguments['seed'])), episodes)
-      program.process.wait(60)
+      program.process.wait(patience.SECONDS)
     rows = list(results.read_rows(output / 'episodes.jsonl'))
     seeing = clones.predict(clones.make(clones.seed_in(output)), episodes)
   return Attack(

@@ -27,6 +27,7 @@ from realab_suite.experiments import run
 from realab_suite.experiments import storage
 from realab_suite.experiments import sweep
 from realab_suite.experiments import training
+from tests import patience
 from tests.experiments import fake_learner
 
 _RUN = 'reward'
@@ -139,6 +140,8 @@ def launch(
     workers: int,
     finished: str,
     bug: str | None = None,
+    held: str | None = None,
+    release: str | None = None,
 ) -> None:
   """Does the whole sweep, as its command line does, and never returns.
 
@@ -148,10 +151,14 @@ def launch(
     workers: How many jobs there are at a time.
     finished: The file to add the name of each job to that is over.
     bug: What is planted, a key of `BUGS`.
+    held: The folder of a job that ends when there is the file `release`.
+    release: The file.
   """
   if bug is not None:
     BUGS[bug]()
   _tell_of_the_finished(finished)
+  if held is not None:
+    _hold(held, str(release))
   engines.ENGINES['local'] = _Forks
   sys.argv = ['sweep', f'--experiment={experiment}', f'--output={output}',
               f'--workers={workers}']  # fmt: skip
@@ -262,6 +269,23 @@ def _obey_permissions() -> None:
   nothing = (ctypes.c_uint32 * 6)()
   if ctypes.CDLL(None).capset(header, nothing):
     raise OSError('capset')
+
+
+def _hold(folder: str, release: str) -> None:
+  """Lets one job not end before there is a file, or its launcher is killed."""
+  finish = storage.RunFolder.finish
+  launcher = os.getpid()
+
+  def wait_and_finish(self: Any, *arguments: Any) -> None:
+    if self.path.name == folder:
+      patience.until(
+          lambda: os.path.exists(release) or os.getppid() != launcher
+      )
+      if not os.path.exists(release):
+        os._exit(1)
+    finish(self, *arguments)
+
+  storage.RunFolder.finish = wait_and_finish
 
 
 def _tell_of_the_finished(path: str) -> None:

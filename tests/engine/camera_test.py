@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from realab_suite import _display
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import camera as engine_camera
@@ -19,6 +18,7 @@ from realab_suite.entities import apples as apples_entity
 from realab_suite.entities import arenas
 from realab_suite.entities import avatar as avatar_entity
 from realab_suite.entities import cameras
+from tests import patience
 from tests import worlds
 
 # Python 3.12 warns of forks from threads; here the fork is what is tested.
@@ -206,7 +206,7 @@ def test_processes_end_in_silence(script, status):
       [sys.executable, '-c', script],
       capture_output=True,
       text=True,
-      timeout=60,
+      timeout=patience.SECONDS,
       check=False,
   )
   assert (ran.returncode, ran.stderr) == (status, '')
@@ -233,23 +233,3 @@ def test_agents_frames_are_drawn_from_a_plain_copy_of_the_model():
   changed = np.argwhere(model.geom_size != plain.geom_size)
   planes = [model.geom(name).id for name in ('floor', 'lid')]
   np.testing.assert_array_equal(changed, [[plane, 2] for plane in planes])
-
-
-@pytest.mark.parametrize(
-    ('chosen', 'display', 'devices', 'expected'),
-    [
-        (False, False, 1, 'egl'),
-        (False, False, 0, ''),
-        (False, True, 1, ''),
-        (True, False, 1, ''),
-    ],
-)
-def test_egl_is_the_default_where_it_is_and_no_display_is(
-    monkeypatch, chosen, display, devices, expected
-):
-  monkeypatch.setenv('MUJOCO_GL', '')
-  monkeypatch.setattr(_display, 'CHOSEN_BY_USER', chosen)
-  monkeypatch.setattr(_display, 'has_display', lambda: display)
-  monkeypatch.setattr(_display, '_num_egl_devices', lambda: devices)
-  _display.prefer_egl()
-  assert os.environ['MUJOCO_GL'] == expected

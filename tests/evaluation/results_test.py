@@ -186,7 +186,10 @@ def test_every_number_comes_back_to_the_last_bit(
 
 @hypothesis.settings(
     max_examples=100,
-    suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture],
+    suppress_health_check=[
+        hypothesis.HealthCheck.function_scoped_fixture,
+        hypothesis.HealthCheck.too_slow,
+    ],
 )
 @hypothesis.given(_TEXT)
 @hypothesis.example('a\u2028b')

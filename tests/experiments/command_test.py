@@ -18,6 +18,7 @@ from realab_suite import explore
 from realab_suite.experiments import headless
 from realab_suite.experiments import imports_flag
 from realab_suite.experiments import run
+from tests import patience
 from tests.experiments import small
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -30,7 +31,7 @@ def _run(*arguments, module='realab_suite.experiments.run', **environment):
       env={**os.environ, **environment},
       capture_output=True,
       text=True,
-      timeout=100,
+      timeout=patience.SECONDS,
       check=False,
   )
 

@@ -106,7 +106,6 @@ def test_a_sweep_that_is_killed_lacks_nothing_and_does_nothing_twice(
     nursery, tmp_path
 ):
   rng = np.random.default_rng(0)
-  # Enough jobs that on a slow machine, too, the killer comes in time.
   tally = launchers_campaign.sweep(nursery, tmp_path, 8, 1, rng)
   assert tally == launchers_campaign.Tally(kills=1, second=1)
 

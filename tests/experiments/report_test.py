@@ -29,6 +29,7 @@ from realab_suite.experiments.reporting import numbers
 from realab_suite.experiments.reporting import page as pages
 from realab_suite.experiments.reporting import replays
 from realab_suite.experiments.reporting import sweep_results
+from tests import patience
 from tests.experiments import fake_learner
 from tests.experiments import fake_sweep
 
@@ -228,7 +229,7 @@ def test_the_same_results_give_the_same_bytes_in_another_process(
           f'--output={tmp_path}', '--noclips',
       ],
       cwd=_ROOT, env={**os.environ, 'PYTHONHASHSEED': '77'}, text=True,
-      capture_output=True, timeout=100, check=False,
+      capture_output=True, timeout=patience.SECONDS, check=False,
   )  # fmt: skip
   assert ran.returncode == 0, ran.stderr
   said = ran.stdout.splitlines()

@@ -6,7 +6,6 @@ import pathlib
 import signal
 import subprocess
 import sys
-import time
 import types
 
 import pytest
@@ -19,6 +18,7 @@ from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import sweeping
 from realab_suite.experiments import training
+from tests import patience
 
 _ROOT = pathlib.Path(__file__).parents[2]
 _FAILS = {'fails': True}
@@ -246,14 +246,14 @@ def test_a_sweep_that_is_interrupted_leaves_nobody_behind(tmp_path):
        f'--output={output}', '--workers=1'],
       cwd=_ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
   ) as process:  # fmt: skip
-    deadline = time.monotonic() + 90
-    while not list(output.glob('*/checkpoints/*.ckpt')):
-      assert time.monotonic() < deadline
-      assert process.poll() is None, process.stderr.read()
-      time.sleep(0.05)
+    patience.until(
+        lambda: list(output.glob('*/checkpoints/*.ckpt'))
+        or process.poll() is not None
+    )
+    assert process.poll() is None, process.stderr.read()
     process.send_signal(signal.SIGINT)
     try:
-      _, complaint = process.communicate(timeout=30)
+      _, complaint = process.communicate(timeout=patience.SECONDS)
     finally:
       process.kill()
   assert process.returncode == 130
@@ -281,9 +281,14 @@ def _command(status):
 
 
 def _wait(engine, task):
-  while (status := engine.poll(task)) is None:
-    time.sleep(0.02)
-  return status
+  statuses = []
+
+  def has_ended():
+    statuses.append(engine.poll(task))
+    return statuses[-1] is not None
+
+  patience.until(has_ended)
+  return statuses[-1]
 
 
 def test_the_local_engine_says_how_a_command_ended(tmp_path):
@@ -294,9 +299,10 @@ def test_the_local_engine_says_how_a_command_ended(tmp_path):
   assert log.read_text() == 'said\nsaid\n'
 
 
-def test_the_local_engine_ends_what_is_under_way():
+def test_the_local_engine_ends_what_is_under_way(monkeypatch):
+  monkeypatch.setattr(engines, '_PATIENCE', patience.SECONDS)
   engine = engines.Local(1)
-  command = [sys.executable, '-c', 'import time; time.sleep(100)']
+  command = [sys.executable, '-c', 'import time; time.sleep(1e6)']
   task = engine.start(command, pathlib.Path(os.devnull))
   assert engine.poll(task) is None
   engine.stop([task])
@@ -409,7 +415,7 @@ def test_what_is_wrong_with_a_command_is_said_in_one_line(
       env={**os.environ, 'PYTHONPATH': str(_ROOT)},
       capture_output=True,
       text=True,
-      timeout=100,
+      timeout=patience.SECONDS,
       check=False,
   )
   assert ran.returncode == 2, ran.stderr

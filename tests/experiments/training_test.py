@@ -23,6 +23,7 @@ from realab_suite.experiments import probes
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
+from tests import patience
 from tests.experiments import fake_learner
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -343,7 +344,7 @@ def test_kill_minus_nine_changes_nothing(whole, tmp_path, point):
           env={**os.environ, **environment},
           capture_output=True,
           text=True,
-          timeout=120,
+          timeout=patience.SECONDS,
           check=False,
       )
       for environment in ({'KILL_AT': point}, {})

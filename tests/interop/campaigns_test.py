@@ -5,6 +5,7 @@ import itertools
 import os
 import pathlib
 import tempfile
+import tracemalloc
 
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 import pytest
@@ -82,7 +83,13 @@ def test_a_planted_leak_is_caught(channel):
 
 
 def test_a_planted_leak_by_time_is_caught():
-  assert served_secrets_campaign.catch_l36(steps=100)
+  clock = served_secrets_campaign.FakeClock(seed=0)
+  assert served_secrets_campaign.catch_l36(100, clock.sleep, clock)
+
+
+def test_what_takes_no_longer_is_no_leak():
+  clock = served_secrets_campaign.FakeClock(seed=0)
+  assert not served_secrets_campaign.catch_l36(100, lambda _: None, clock)
 
 
 def test_an_agent_is_given_nothing_of_its_evaluators():
@@ -183,9 +190,13 @@ def test_bombs_and_floods_do_not_disturb_the_agent():
       for request in (served.JOIN, served.STEP):
         stream.ask(request)
       if is_attacked:
-        refused, slowest = served_limits_campaign.bomb(stream, program)
+        tracemalloc.start()
+        refused, _ = served_limits_campaign.bomb(stream, program)
+        _, largest = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
         assert refused == 8
-        assert slowest < 1.0
+        # A shape that was believed would take at least 3 GiB.
+        assert largest < 16 * 2**20
         refused, _ = served_limits_campaign.many_settings(
             stream, program, 3_000
         )
@@ -214,28 +225,30 @@ def test_whoever_goes_away_at_any_point_leaves_a_free_world(serving):
   )
   assert len(found) == 27
   assert all(one.is_clean for one in found)
-  assert max(one.seconds_until_free for one in found) <= 2.0
+  # All found the world free, though the clock of the server stood still.
   ends = [end for end in serving.ends()[before:] if end == 'disconnect']
   assert len(ends) == 5 * 2 + 2
 
 
 def test_a_client_that_is_stopped_loses_the_world():
-  idle_seconds = served_departures_campaign.IDLE_SECONDS
-  with served.in_thread(idle_seconds=idle_seconds) as serving:
+  with served.in_thread() as serving:
     [found] = served_departures_campaign.go_away_everywhere(
-        serving.address, 1, ('stop',), points=(5,)
+        serving.address,
+        1,
+        ('stop',),
+        points=(5,),
+        let_idle=serving.clock.advance,
     )
     assert found.is_clean
-    assert found.seconds_until_free <= 2.0
     assert serving.ends()[0] == 'disconnect'
 
 
 def test_who_wakes_up_late_disturbs_nobody():
   points = list(served_departures_campaign.POINTS)
   chosen = [points.index('joined'), points.index('waiting for an answer')]
-  with served.in_thread(idle_seconds=1.0) as serving:
+  with served.in_thread() as serving:
     found = served_departures_campaign.wake_up_late(
-        serving.address, 0.1, chosen
+        serving.address, 0.1, chosen, serving.clock.advance
     )
     assert (found.num_awake, found.is_undisturbed) == (2, True)
 

@@ -19,6 +19,7 @@ from realab_suite.experiments import serving
 from realab_suite.experiments import storage
 from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import sockets
+from tests import patience
 from tests.experiments import small
 from tests.interop import clones
 from tests.interop import served
@@ -60,7 +61,7 @@ def _serve(output, *flags):
   with served.in_process(output, *flags) as program:
     with served.Client(program.address) as client:
       episodes = clones.play(client.env())
-    assert program.process.wait(20) == 0
+    assert program.process.wait(patience.SECONDS) == 0
   return episodes
 
 
@@ -71,7 +72,7 @@ def test_a_clone_predicts_no_observation_of_any_episode(tmp_path):
     arguments = clones.arguments_of(program.process.pid)
     with served.Client(program.address) as client:
       episodes = clones.play(client.env())
-    assert program.process.wait(20) == 0
+    assert program.process.wait(patience.SECONDS) == 0
   assert arguments['seed'] == str(_SEED)
   clone = clones.make(int(arguments['seed']))
   assert _num_right(clones.predict(clone, episodes)) == [0, 0, 0]
@@ -86,7 +87,7 @@ def test_a_program_of_another_user_predicts_nothing():
     output = pathlib.Path(folder, 'results')
     with served.in_process(output, *_FLAGS, '--agent_user=nobody') as program:
       report = clones.attack(program, _NOBODY)
-      assert program.process.wait(20) == 0
+      assert program.process.wait(patience.SECONDS) == 0
     isolation = {row.info.isolation for row in _rows(output)}
     assert isolation == {results.SERVED_TO_ANOTHER_USER}
     assert report.arguments['seed'] == str(_SEED)
@@ -204,7 +205,7 @@ def test_a_run_is_repeated_by_its_record(tmp_path):
   ) as program:
     with served.Client(program.address) as client:
       assert clones.play(client.env()) == episodes
-    assert program.process.wait(20) == 0
+    assert program.process.wait(patience.SECONDS) == 0
   rows = [[r.model_dump_json() for r in _rows(o)] for o in (first, second)]
   assert rows[0] == rows[1]
   assert clones.seed_in(second).salt == clones.seed_in(first).salt
@@ -215,7 +216,8 @@ def _settings(record):
   return serving.Settings(
       domain='collect_apples', task='standard', design='none', overrides=(),
       seed=0, max_steps=250, repeat=str(record), num_episodes=2, name='agent',
-      address=None, idle_seconds=1.0, provider_seconds=1.0, agent_command=None,
+      address=None, idle_seconds=patience.SECONDS,
+      provider_seconds=patience.SECONDS, agent_command=None,
       agent_folder=None, agent_user=None, output='results',
   )  # fmt: skip
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from typing import Any, NamedTuple
 
 from dm_env_rpc.v1 import connection as rpc_connection
@@ -24,14 +23,12 @@ from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
 from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import server as rpc_server
+from tests import patience
 from tests.engine import helpers
 
 _MIB = 2**20
 ROOT = pathlib.Path(__file__).parents[2]
-_PATIENCE_SECONDS = 60
-
-# Nobody waits longer for an answer that does not come.
-_MOST_SECONDS = 1800.0
+IDLE_SECONDS = 60.0
 METHOD = '/dm_env_rpc.v1.Environment/Process'
 
 
@@ -48,13 +45,36 @@ def load(
   )
 
 
+class Clock:
+  """A clock that stands still until a test moves it on."""
+
+  def __init__(self) -> None:
+    self._now = 0.0
+
+  def __call__(self) -> float:
+    return self._now
+
+  def advance(self, seconds: float = IDLE_SECONDS) -> None:
+    """Moves the clock on; by default, until a silent agent loses its world."""
+    self._now += seconds
+
+
 class Served(NamedTuple):
-  """A server in a thread of this process."""
+  """A server in a thread of this process.
+
+  Attributes:
+    address: Where it listens.
+    server: The server.
+    thread: The thread that runs the world.
+    results: The results of episodes, with their tiers of isolation.
+    clock: The clock by which agents are silent.
+  """
 
   address: str
   server: rpc_server.Server
   thread: threading.Thread
   results: list[tuple[evaluate.EpisodeResult, str]]
+  clock: Clock
 
   def ends(self) -> list[str]:
     return [result.end.value for result, _ in self.results]
@@ -65,11 +85,11 @@ def in_thread(
     make_env: Callable[[], environment.Environment] = load,
     *,
     num_episodes: int = 1_000_000,
-    idle_seconds: float = 60.0,
     alter: Callable[[Any], None] = lambda world: None,
 ) -> Iterator[Served]:
   """Serves a world from a thread, which makes it, too."""
   results: list[Any] = []
+  clock = Clock()
   ready = threading.Event()
   made: list[Any] = []
   with tempfile.TemporaryDirectory(prefix='realab-') as folder:
@@ -85,7 +105,7 @@ def in_thread(
               lambda result, tier: results.append((result, tier)),
           )
           alter(world)
-          server = rpc_server.Server(world, address, idle_seconds)
+          server = rpc_server.Server(world, address, IDLE_SECONDS, clock=clock)
           server.start()
           made.append(server)
           ready.set()
@@ -95,13 +115,13 @@ def in_thread(
 
     thread = threading.Thread(target=serve)
     thread.start()
-    ready.wait(_PATIENCE_SECONDS)
+    ready.wait(patience.SECONDS)
     try:
-      yield Served(address, made[0], thread, results)
+      yield Served(address, made[0], thread, results, clock)
     finally:
       if made:
         made[0].stop()
-      thread.join(_PATIENCE_SECONDS)
+      thread.join(patience.SECONDS)
 
 
 class Program(NamedTuple):
@@ -140,7 +160,7 @@ def in_process(
     yield Program(line.split(' at ')[1].strip(), process, output)
   finally:
     process.terminate()
-    process.communicate(timeout=_PATIENCE_SECONDS)
+    process.communicate(timeout=patience.SECONDS)
 
 
 class Client:
@@ -196,7 +216,9 @@ class RawStream:
     )
     call = self.channel.stream_stream(METHOD)
     self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-    self._answers = call(iter(self._requests.get, None), timeout=_MOST_SECONDS)
+    self._answers = call(
+        iter(self._requests.get, None), timeout=patience.SECONDS
+    )
 
   def ask(self, request: bytes) -> bytes:
     self._requests.put(request)
@@ -245,33 +267,48 @@ def still(env: Any) -> np.ndarray:
   return np.zeros(env.action_spec().shape, env.action_spec().dtype)
 
 
-def join_eventually(address: str, seconds: float = 5.0) -> Client:
-  """Returns a client that has joined, once whoever came before has gone."""
-  return _eventually(lambda: Client(address), Client.join, seconds)
+def join_eventually(
+    address: str, meanwhile: Callable[[], None] = lambda: None
+) -> Client:
+  """Returns a client that has joined, after earlier ones have left.
+
+  Args:
+    address: Of the server.
+    meanwhile: Called after each refusal.
+  """
+  return _eventually(lambda: Client(address), Client.join, meanwhile)
 
 
-def connect_eventually(address: str, seconds: float = 5.0) -> RawStream:
-  """Returns a stream that has been let in."""
+def connect_eventually(
+    address: str, meanwhile: Callable[[], None] = lambda: None
+) -> RawStream:
+  """Returns a stream that has been admitted; see `join_eventually`."""
   return _eventually(
-      lambda: RawStream(address), lambda stream: stream.ask(LEAVE), seconds
+      lambda: RawStream(address), lambda stream: stream.ask(LEAVE), meanwhile
   )
 
 
 def _eventually(
-    make: Callable[[], Any], greet: Callable[[Any], Any], seconds: float
+    make: Callable[[], Any],
+    greet: Callable[[Any], Any],
+    meanwhile: Callable[[], None],
 ) -> Any:
-  """Returns somebody who was not refused, and lets go of those who were."""
-  deadline = time.monotonic() + seconds
-  while True:
+  """Returns the first that is not refused, and closes those that are."""
+  admitted = []
+
+  def attempt() -> bool:
     made = make()
     try:
       greet(made)
-      return made
     except grpc.RpcError:
       made.close()
-      if time.monotonic() > deadline:
-        raise
-      time.sleep(0.01)
+      meanwhile()
+      return False
+    admitted.append(made)
+    return True
+
+  patience.until(attempt)
+  return admitted[0]
 
 
 @contextlib.contextmanager

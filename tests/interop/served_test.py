@@ -1,5 +1,6 @@
 """Tests served worlds over a socket: who is let in, and how they leave."""
 
+from concurrent import futures
 import contextlib
 import json
 import os
@@ -11,7 +12,6 @@ import subprocess
 import sys
 import textwrap
 import threading
-import time
 
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import error
@@ -26,6 +26,7 @@ from realab_suite.feedback.providers import difference
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import server as rpc_server
 from realab_suite.interop.rpc import sockets
+from tests import patience
 from tests.engine import helpers
 from tests.interop import served
 
@@ -50,13 +51,6 @@ def _play(env, actions):
   return [served.to_bytes(time_step) for time_step in time_steps]
 
 
-def _wait_for(condition, seconds=10.0):
-  deadline = time.monotonic() + seconds
-  while not condition() and time.monotonic() < deadline:
-    time.sleep(0.005)
-  assert condition()
-
-
 def test_a_stock_client_gets_what_an_agent_in_the_process_gets(serving):
   env = served.load()
   actions = helpers.random_actions(env, 45)
@@ -70,15 +64,33 @@ def test_a_stock_client_gets_what_an_agent_in_the_process_gets(serving):
   assert serving.ends()[:2] == ['timeout', 'timeout']
 
 
-def test_a_second_client_is_turned_away_at_once(serving):
-  with served.Client(serving.address) as first:
-    first.join()
+def test_a_second_client_is_turned_away_at_once():
+  is_asked, may_answer = threading.Event(), threading.Event()
+
+  def hold(world):
+    answer = world.answer
+
+    def answer_later(request):
+      is_asked.set()
+      may_answer.wait(patience.SECONDS)
+      return answer(request)
+
+    world.answer = answer_later
+
+  with (
+      served.in_thread(alter=hold) as serving,
+      served.Client(serving.address) as first,
+      futures.ThreadPoolExecutor(1) as pool,
+  ):
+    joined = pool.submit(first.join)
+    is_asked.wait(patience.SECONDS)
+    # While the world is busy with the first one's request.
     with served.Client(serving.address) as second:
-      grpc.channel_ready_future(second.channel).result(5)
-      start = time.monotonic()
       with pytest.raises(grpc.RpcError) as caught:
         second.join()
-      assert time.monotonic() - start <= 0.1
+    assert not joined.done()
+    may_answer.set()
+    joined.result()
     assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
     assert caught.value.details() == 'R17: another agent is connected'
     assert first.step().state == pb.RUNNING
@@ -90,10 +102,10 @@ def test_a_client_that_goes_leaves_an_invalid_episode_and_a_free_world(serving):
   first.step()
   first.step(np.zeros(6))
   first.close()
-  second = served.join_eventually(serving.address, 2.0)
+  second = served.join_eventually(serving.address)
   assert second.step().state == pb.RUNNING
   second.close()
-  _wait_for(lambda: len(serving.results) == 2)
+  patience.until(lambda: len(serving.results) == 2)
   assert serving.ends() == ['disconnect'] * 2
   assert [result.num_steps for result, _ in serving.results] == [1, 0]
   assert not any(result.is_valid for result, _ in serving.results)
@@ -106,24 +118,26 @@ def test_a_client_that_goes_between_episodes_leaves_nothing(serving):
 
 
 def test_a_silent_client_loses_the_world():
-  with served.in_thread(idle_seconds=0.3) as serving:
+  with served.in_thread() as serving:
     with served.Client(serving.address) as silent:
       silent.join()
       silent.step()
-      with served.join_eventually(serving.address, 3.0) as next_one:
+      with served.join_eventually(
+          serving.address, serving.clock.advance
+      ) as next_one:
         assert next_one.step().state == pb.RUNNING
         with pytest.raises(grpc.RpcError):
           silent.step(np.zeros(6))
         assert next_one.step(np.zeros(6)).state == pb.RUNNING
-    _wait_for(lambda: serving.ends() == ['disconnect'] * 2)
+    patience.until(lambda: serving.ends() == ['disconnect'] * 2)
 
 
 def test_a_client_that_says_something_now_and_then_stays():
-  with served.in_thread(idle_seconds=0.5) as serving:
+  with served.in_thread() as serving:
     with served.Client(serving.address) as client:
       client.join()
       for i in range(5):
-        time.sleep(0.2)
+        serving.clock.advance(0.9 * served.IDLE_SECONDS)
         client.step(np.zeros(6) if i else None)
       assert serving.ends() == []
 
@@ -146,7 +160,7 @@ def test_one_thread_alone_runs_the_world():
       with served.join_eventually(serving.address) as client:
         client.step()
         client.step(np.zeros(6))
-    _wait_for(lambda: len(serving.results) == 3)
+    patience.until(lambda: len(serving.results) == 3)
     assert threads == {serving.thread.ident}
 
 
@@ -157,7 +171,7 @@ def test_a_large_message_ends_the_stream_and_the_world_is_free(serving):
     with pytest.raises(grpc.RpcError) as caught:
       client.send(pb.ResetRequest(settings=settings))
     assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-  served.join_eventually(serving.address, 2.0).close()
+  served.join_eventually(serving.address).close()
 
 
 def test_what_is_compressed_is_not_unpacked(serving):
@@ -189,7 +203,7 @@ def test_after_the_last_episode_the_server_ends():
           error.DmEnvRpcError, match='R16: there are no more episodes'
       ):
         client.step()
-    serving.thread.join(5)
+    serving.thread.join(patience.SECONDS)
     assert not serving.thread.is_alive()
     assert serving.ends() == ['timeout']
 
@@ -218,7 +232,7 @@ def test_a_failing_provider_ends_the_episode_and_says_nothing(caplog):
         client.step(np.zeros(6))
       assert '173' not in str(caught.value)
       assert client.step().state == pb.RUNNING
-    _wait_for(lambda: len(serving.results) == 2)
+    patience.until(lambda: len(serving.results) == 2)
     assert serving.ends()[0] == 'error'
   assert '173.25' in caplog.text  # The evaluator is told.
 
@@ -228,15 +242,18 @@ def test_a_provider_that_does_not_answer_fails(monkeypatch):
 
   def wait(self, *args):
     try:
-      time.sleep(20)
+      threading.Event().wait()
     except TimeoutError:
       ended.append(1)
-      time.sleep(20)  # Whoever catches the first one hears of a second.
+      # A provider that catches the first error gets a second one.
+      threading.Event().wait()
 
   with contextlib.closing(served.load()) as env:
     env.reset()
-    env.mechanism.guard_providers(lambda: serving_lib.deadline(0.05))
+    seconds = patience.SECONDS
+    env.mechanism.guard_providers(lambda: serving_lib.deadline(seconds))
     env.step(np.zeros(6))
+    seconds = 0.05
     monkeypatch.setattr(difference.Difference, 'step', wait)
     handler = signal.getsignal(signal.SIGALRM)
     with pytest.raises(
@@ -246,8 +263,10 @@ def test_a_provider_that_does_not_answer_fails(monkeypatch):
       env.step(np.zeros(6))
     assert ended
     monkeypatch.undo()
+    seconds = patience.SECONDS
+    # Nothing rings outside providers.
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
     assert env.reset().first()
-    time.sleep(0.06)  # Nothing rings outside providers.
     assert not env.step(np.zeros(6)).first()
     assert signal.getsignal(signal.SIGALRM) is handler
 
@@ -385,8 +404,8 @@ except KeyboardInterrupt:
   raise SystemExit(7)
 """
   ran = subprocess.run(
-      [_PYTHON, '-c', program], cwd=served.ROOT, timeout=20, check=False,
-      stderr=subprocess.DEVNULL,
+      [_PYTHON, '-c', program], cwd=served.ROOT, timeout=patience.SECONDS,
+      check=False, stderr=subprocess.DEVNULL,
   )  # fmt: skip
   assert ran.returncode == 7
 
@@ -408,7 +427,10 @@ if not child:
 os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
   ran = subprocess.run(
-      [_PYTHON, '-c', program], cwd=served.ROOT, timeout=60, check=False
+      [_PYTHON, '-c', program],
+      cwd=served.ROOT,
+      timeout=patience.SECONDS,
+      check=False,
   )
   assert ran.returncode == 7
 
@@ -441,7 +463,8 @@ def test_the_agent_of_the_page_needs_nothing_of_this_package(tmp_path):
           '--task=unlock_door.near', '--max_steps=5', '--episodes=2',
           f'--agent_command={_PYTHON} {agent}', f'--output={output}',
       ],
-      cwd=served.ROOT, capture_output=True, text=True, timeout=100, check=False,
+      cwd=served.ROOT, capture_output=True, text=True, check=False,
+      timeout=patience.SECONDS,
   )  # fmt: skip
   assert ran.returncode == 0, ran.stderr
   rows = list(results.read_rows(output / 'episodes.jsonl'))
@@ -470,7 +493,8 @@ def test_an_import_of_this_package_is_made_impossible_above():
 def _serve(*flags):
   return subprocess.run(
       [_PYTHON, '-m', 'realab_suite.experiments.serve', *flags],
-      cwd=served.ROOT, capture_output=True, text=True, timeout=100, check=False,
+      cwd=served.ROOT, capture_output=True, text=True, check=False,
+      timeout=patience.SECONDS,
   )  # fmt: skip
 
 
@@ -525,20 +549,23 @@ def test_an_agent_has_ended_though_its_children_say_something(tmp_path):
   with open(tmp_path / 'log', 'wb') as log:
     # A session of its own outlives the agent's group.
     agent, ended = _start_agent(
-        f'sh -c "{_SETSID} sleep 20 & echo gone; exit 3"', log
+        f'sh -c "{_SETSID} sleep 1000000 & echo $!; exit 3"', log
     )
-    assert ended.wait(5)
+    assert ended.wait(patience.SECONDS)
     assert agent.poll() == 3
+    patience.until((tmp_path / 'log').read_bytes)
     agent.stop()
-  assert (tmp_path / 'log').read_bytes() == b'gone\n'
+  child = int((tmp_path / 'log').read_bytes())
+  os.kill(child, signal.SIGKILL)  # It is still there.
 
 
 def test_the_log_of_an_agent_has_an_end(tmp_path, monkeypatch):
   monkeypatch.setattr(agent_process, 'MAX_LOG_BYTES', 1000)
+  monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
   program = "for i in range(9): print('x' * 100_000, flush=True)"
   with open(tmp_path / 'log', 'wb') as log:
     agent, ended = _start_agent(f'{_PYTHON} -c "{program}"', log)
-    assert ended.wait(20)
+    assert ended.wait(patience.SECONDS)
     assert agent.poll() == 0
     agent.stop()
   said = (tmp_path / 'log').read_bytes()
@@ -546,10 +573,13 @@ def test_the_log_of_an_agent_has_an_end(tmp_path, monkeypatch):
   assert len(said) < 1000 + 2 * 65536
 
 
-def test_a_log_that_cannot_be_written_does_not_stop_an_agent(caplog):
+def test_a_log_that_cannot_be_written_does_not_stop_an_agent(
+    caplog, monkeypatch
+):
+  monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
   with open('/dev/full', 'wb', buffering=0) as log:
     agent, ended = _start_agent(f'{_PYTHON} -c "print(5 * 10**5 * \'x\')"', log)
-    assert ended.wait(20)
+    assert ended.wait(patience.SECONDS)
     agent.stop()
   assert 'the log of the agent ends here' in caplog.text
 
@@ -560,7 +590,7 @@ def test_an_agent_that_does_not_want_to_end_is_ended(tmp_path):
       'import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n'
   )
   agent.write_text(
-      stubborn + _example() + 'print("stays", flush=True)\ntime.sleep(600)\n'
+      f'{stubborn}print("stays", flush=True)\n{_example()}time.sleep(1e6)\n'
   )
   output = tmp_path / 'results'
   ran = _serve(
@@ -577,7 +607,7 @@ def test_a_server_that_is_asked_to_end_writes_down_what_there_is(tmp_path):
       client.join()
       client.step()
       program.process.send_signal(signal.SIGTERM)
-      assert program.process.wait(20) == 2
+      assert program.process.wait(patience.SECONDS) == 2
   [row] = results.read_rows(tmp_path / 'results' / 'episodes.jsonl')
   assert row.end == 'disconnect'
   assert not pathlib.Path(sockets.path_of(program.address)).exists()
@@ -606,10 +636,10 @@ def test_a_client_of_another_user_makes_tier_t2(tmp_path):
     ran = subprocess.run(
         [_PYTHON, '-c', agent],
         env={**os.environ, 'REALAB_ADDRESS': program.address},
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=patience.SECONDS, check=False,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
-    assert program.process.wait(20) == 0
+    assert program.process.wait(patience.SECONDS) == 0
   rows = list(results.read_rows(tmp_path / 'results' / 'episodes.jsonl'))
   assert [row.info.isolation for row in rows] == [
       results.SERVED_TO_ANOTHER_USER
@@ -642,6 +672,6 @@ os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 def test_the_memory_of_a_world_is_not_for_others_of_the_same_user(how, status):
   ran = subprocess.run(
       [_PYTHON, '-W', 'ignore', '-c', _READ_MEMORY, how],
-      cwd=served.ROOT, timeout=60, check=False,
+      cwd=served.ROOT, timeout=patience.SECONDS, check=False,
   )  # fmt: skip
   assert ran.returncode == status

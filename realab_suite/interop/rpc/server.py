@@ -5,7 +5,7 @@ gRPC hand requests over, and wait.
 """
 
 import abc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent import futures
 import os
 import queue
@@ -121,6 +121,7 @@ class Server:
       address: str,
       idle_seconds: float = IDLE_SECONDS,
       owner: tuple[int, int] | None = None,
+      clock: Callable[[], float] = time.monotonic,
   ) -> None:
     """Makes the server.
 
@@ -129,11 +130,13 @@ class Server:
       address: `unix:/folder/name` or `host:port`; port 0 for any that is free.
       idle_seconds: For how long an agent may be silent.
       owner: The user and the group of the agent; `None` for this user's own.
+      clock: Time by which an agent is silent, seconds.
     """
     self._world = world
     self._owner = owner
     self._given_address = address
     self._idle_seconds = idle_seconds
+    self._clock = clock
     self._events: queue.SimpleQueue[_Event] = queue.SimpleQueue()
     self._is_taken = threading.Lock()
     # While it is held, nobody is let in or turned away for good.
@@ -242,17 +245,17 @@ class Server:
   def _settle(self) -> None:
     if not self._is_ending and not self._world.settle():
       self._is_ending = True
-      self._deadline = time.monotonic() + _LINGER_SECONDS
+      self._deadline = self._clock() + _LINGER_SECONDS
 
   def _stay(self) -> None:
     if not self._is_ending:
-      self._deadline = time.monotonic() + self._idle_seconds
+      self._deadline = self._clock() + self._idle_seconds
 
   def _patience(self) -> float:
     """Returns for how much longer the agent may be silent, seconds."""
     if self._session is None:
       return _PULSE_SECONDS
-    return max(0.0, self._deadline - time.monotonic())
+    return max(0.0, self._deadline - self._clock())
 
   def _expire(self) -> None:
     """Frees the world of an agent that has been silent for too long."""

@@ -1,0 +1,279 @@
+"""Tests for when GL is loaded: with the first frame, and not before."""
+
+from importlib import util
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+
+import numpy as np
+import pytest
+
+from tests import patience
+
+# Names of what GL maps into a process; X11 and GLFW are no part of it.
+_MAPPED = """
+import pathlib
+import re
+
+def mapped():
+  maps = pathlib.Path('/proc/self/maps').read_text()
+  return sorted(set(re.findall(
+      r'lib\\w*GL\\w*|libLLVM|libgallium|swrast_dri|OSMesa|libtriton', maps)))
+"""
+_STEPS = """
+import numpy as np
+from realab_suite import suite
+
+env = suite.load('unlock_door', 'near', {'random': 0},
+                 design='instantaneous_reward')
+batch = suite.load_batch('collect_apples', 'standard', {'random': 0},
+                         num_envs=2, design='value_advice')
+for world in (env, batch):
+  world.reset()
+  spec = world.action_spec()
+  shape = spec.shape if world is env else (2, *spec.shape)
+  world.step(np.zeros(shape, spec.dtype))
+"""
+_FRAME = """
+from realab_suite import suite
+eye = suite.load('collect_apples', 'standard',
+                 {'random': 0, 'camera_size': (16, 16)})
+frame = eye.reset().observation['senses/camera']
+assert frame.std() > 1, frame
+"""
+_PICTURE = """
+from realab_suite import suite
+scene = suite.load('collect_apples', 'standard', {'random': 0})
+scene.reset()
+assert scene.physics.render(16, 16, camera_id='top_down').std() > 1
+"""
+_FOREIGN = """
+import realab_suite
+from dm_control import mujoco
+xml = '<mujoco><worldbody><light/><geom size="1"/></worldbody></mujoco>'
+assert mujoco.Physics.from_xml_string(xml).render(16, 16).std() > 1
+"""
+# What draws first, and what the user has named.
+_DRAWN = [
+    (_FRAME, None),
+    (_FRAME, 'egl'),
+    (_PICTURE, None),
+    (_PICTURE, ''),
+    (_FOREIGN, None),
+]
+_IMPORT_TORCH = """
+import torch
+"""
+_IMPORT_DYNAMO = """
+import torch._dynamo
+"""
+
+pytestmark = pytest.mark.skipif(
+    sys.platform != 'linux', reason='elsewhere nothing is postponed'
+)
+renders = pytest.mark.usefixtures('egl')
+needs_torch = pytest.mark.skipif(
+    util.find_spec('torch') is None, reason='torch is not installed'
+)
+
+
+def _run(*parts, named=None, **variables):
+  """Runs a script in a process without a display.
+
+  Args:
+    *parts: Of the script.
+    named: The value of `MUJOCO_GL`, which is not set if it is `None`.
+    **variables: More of the environment.
+
+  Returns:
+    What it prints.
+  """
+  if named is not None:
+    variables['MUJOCO_GL'] = named
+  taken = ('MUJOCO_GL', 'DISPLAY', 'WAYLAND_DISPLAY', 'PYOPENGL_PLATFORM')
+  inherited = {k: v for k, v in os.environ.items() if k not in taken}
+  ran = subprocess.run(
+      [sys.executable, '-c', ''.join(parts)],
+      env={**inherited, **variables},
+      capture_output=True,
+      text=True,
+      timeout=patience.SECONDS,
+      check=False,
+  )
+  assert ran.returncode == 0, (ran.returncode, ran.stderr[-2_000:])
+  return ran.stdout
+
+
+@pytest.mark.parametrize('named', [None, '', 'egl', 'disable'])
+def test_worlds_without_a_camera_load_no_gl(named):
+  # What MuJoCo alone maps for a renderer that the user named is not ours.
+  printed = _run(
+      _MAPPED,
+      'import mujoco\nbefore = mapped()\n',
+      _STEPS,
+      'print(set(mapped()) - set(before), "libLLVM" in mapped())\n',
+      named=named,
+  )
+  assert printed == 'set() False\n'
+
+
+def test_importing_the_package_imports_no_numpy_and_sets_nothing():
+  # Threads of numpy and of JAX are limited before either is imported.
+  printed = _run(
+      'import os, sys\nbefore = dict(os.environ)\nimport realab_suite\n'
+      'print("numpy" in sys.modules, dict(os.environ) == before)\n'
+  )
+  assert printed == 'False True\n'
+
+
+@pytest.mark.parametrize(
+    ('variables', 'postponed'),
+    [
+        ({}, True),
+        ({'MUJOCO_GL': 'osmesa'}, True),
+        ({'MUJOCO_GL': 'osmesa', 'DISPLAY': ':0'}, True),
+        ({'DISPLAY': ':0'}, False),
+        ({'WAYLAND_DISPLAY': 'wayland-0'}, False),
+        ({'MUJOCO_GL': 'glfw'}, False),
+        ({'MUJOCO_GL': 'off'}, False),
+    ],
+)
+def test_what_starts_no_driver_is_left_to_dm_control(variables, postponed):
+  # The viewer needs GLFW to be chosen before its window is opened.
+  printed = _run(
+      'import sys\nimport realab_suite\n'
+      'print("dm_control._render" in sys.modules)\n',
+      **variables,
+  )
+  assert printed == f'{postponed}\n'
+
+
+@renders
+@pytest.mark.parametrize(('draw', 'named'), _DRAWN)
+def test_the_first_frame_chooses_egl_where_there_is_no_display(draw, named):
+  printed = _run(
+      'import os\nbefore = os.environ.get("MUJOCO_GL")\n',
+      draw,
+      'from dm_control import _render\n'
+      'print(_render.BACKEND, os.environ.get("MUJOCO_GL") == before)\n',
+      named=named,
+  )
+  assert printed == 'egl True\n'
+
+
+@renders
+def test_threads_that_draw_first_choose_once():
+  printed = _run(
+      'import threading\n',
+      _STEPS,
+      """
+from dm_control import _render
+barrier = threading.Barrier(4)
+kinds = []
+def draw():
+  eye = suite.load('collect_apples', 'standard',
+                   {'random': 0, 'camera_size': (16, 16)})
+  barrier.wait()
+  frame = eye.reset().observation['senses/camera']
+  kinds.append((_render.Renderer, frame.tobytes()))
+  eye.close()
+threads = [threading.Thread(target=draw) for _ in range(4)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print(len(kinds), len(set(kinds)))
+""",
+  )
+  assert printed == '4 1\n'
+
+
+@renders
+def test_a_choice_that_dm_control_has_made_stays():
+  printed = _run(
+      'from dm_control import _render\nrenderer = _render.Renderer\n',
+      _FRAME,
+      'print(_render.Renderer is renderer, _render.BACKEND)\n',
+      named='egl',
+  )
+  assert printed == 'True egl\n'
+
+
+@pytest.mark.parametrize('draw', [_FRAME, _PICTURE])
+def test_where_nothing_renders_a_picture_names_what_to_set(draw):
+  printed = _run(
+      'from realab_suite import errors\ntry:\n',
+      ''.join(f'  {line}\n' for line in draw.splitlines()),
+      'except errors.RenderingError as error:\n  print(error)\n',
+      # EGL finds no driver here.
+      __EGL_VENDOR_LIBRARY_DIRS='/nonexistent',
+  )
+  assert 'MUJOCO_GL=egl (' in printed
+  assert 'set MUJOCO_GL to egl (headless), glfw' in printed
+  assert len(printed.splitlines()) == 1
+
+
+@renders
+@pytest.mark.parametrize('draw', [_FRAME, _PICTURE, _FOREIGN])
+def test_a_library_with_an_llvm_of_its_own_is_loaded_before_gl(draw, tmp_path):
+  # Any library will do: what counts is when it is loaded.
+  suffix = sysconfig.get_config_var('EXT_SUFFIX')
+  core = np._core._multiarray_umath.__file__
+  assert core.endswith(suffix)
+  folder = tmp_path / 'triton'
+  (folder / '_C').mkdir(parents=True)
+  (folder / '__init__.py').write_text('raise SystemExit("imported")\n')
+  shutil.copy(core, folder / '_C' / f'libtriton{suffix}')
+  printed = _run(
+      _MAPPED,
+      _STEPS,
+      'print("libtriton" in mapped())\n',
+      draw,
+      'print("libtriton" in mapped(), "triton" in __import__("sys").modules)\n',
+      PYTHONPATH=os.pathsep.join([str(tmp_path), *sys.path]),
+  )
+  assert printed == 'False\nTrue False\n'
+
+
+@renders
+def test_after_gl_a_library_with_an_llvm_is_left_alone(tmp_path):
+  folder = tmp_path / 'triton' / '_C'
+  folder.mkdir(parents=True)
+  shutil.copy(np._core._multiarray_umath.__file__, folder / 'libtriton.so')
+  printed = _run(
+      _MAPPED,
+      'from dm_control import _render\n',
+      _FRAME,
+      'print("libLLVM" in mapped(), "libtriton" in mapped())\n',
+      named='egl',
+      PYTHONPATH=os.pathsep.join([str(tmp_path), *sys.path]),
+  )
+  assert printed in ('True False\n', 'False True\n')  # Without Mesa, loaded.
+
+
+_ORDERS = {
+    'package, torch': (_STEPS, _IMPORT_TORCH),
+    'torch, package': (_IMPORT_TORCH, _STEPS),
+}
+
+
+@needs_torch
+@pytest.mark.parametrize('named', [None, 'egl'])
+@pytest.mark.parametrize('order', _ORDERS)
+def test_torch_and_worlds_go_together(order, named):
+  _run(*_ORDERS[order], _IMPORT_DYNAMO, named=named)
+
+
+@renders
+@needs_torch
+@pytest.mark.parametrize(('draw', 'named'), _DRAWN)
+@pytest.mark.parametrize('order', _ORDERS)
+def test_torch_and_frames_go_together(order, draw, named):
+  _run(*_ORDERS[order], draw, _IMPORT_DYNAMO, named=named)
+
+
+@renders
+@needs_torch
+@pytest.mark.parametrize('draw', [_FRAME, _PICTURE, _FOREIGN])
+def test_torch_may_be_imported_after_a_frame(draw):
+  _run(draw, _IMPORT_TORCH, _IMPORT_DYNAMO, 'import torch._inductor\n')

@@ -1,0 +1,79 @@
+"""No test asserts a duration or races a process.
+
+Work is counted by `tests/work.py`, and `tests/patience.py` waits for what is to
+happen. So no test reads a clock or gives up after a time of its own.
+"""
+
+import ast
+import pathlib
+import re
+
+import pytest
+
+_ROOT = pathlib.Path(__file__).parent
+_CLOCKS = ('time', 'timeit')
+_WAITS = ('wait', 'join', 'result', 'settimeout', 'communicate', 'poll')
+_TIMEOUTS = re.compile(r'timeout|.*_(seconds|ms)')
+
+
+def _violations(source: str) -> list[str]:
+  """Returns what in the source of a test depends on the speed of a machine."""
+  found = []
+  for node in ast.walk(ast.parse(source)):
+    if isinstance(node, ast.Import):
+      names = {alias.name for alias in node.names}
+      found += [f'{node.lineno}: {name}' for name in names & set(_CLOCKS)]
+    elif isinstance(node, ast.ImportFrom) and node.module in _CLOCKS:
+      found.append(f'{node.lineno}: {node.module}')
+    elif isinstance(node, ast.Call):
+      given = [k.value for k in node.keywords if _is_timeout(k.arg)]
+      if isinstance(node.func, ast.Attribute) and node.func.attr in _WAITS:
+        given += node.args
+      if any(_is_number(value) for value in given):
+        found.append(f'{node.lineno}: {ast.unparse(node)[:60]}')
+  return found
+
+
+def _is_timeout(name: str | None) -> bool:
+  return name is not None and bool(_TIMEOUTS.fullmatch(name))
+
+
+def _is_number(node: ast.expr) -> bool:
+  return isinstance(node, ast.Constant) and isinstance(node.value, int | float)
+
+
+@pytest.mark.parametrize(
+    'path', sorted(_ROOT.rglob('*_test.py')), ids=lambda path: path.name
+)
+def test_no_test_depends_on_the_speed_of_the_machine(path: pathlib.Path):
+  assert not _violations(path.read_text(encoding='utf-8'))
+
+
+@pytest.mark.parametrize(
+    'planted',
+    [
+        'import time',
+        'from time import monotonic',
+        'subprocess.run(command, timeout=60)',
+        'process.wait(20)',
+        'ended.wait(timeout=5.0)',
+        'thread.join(5)',
+        'future.result(5)',
+        'in_thread(idle_seconds=0.3)',
+    ],
+)
+def test_what_is_not_allowed_is_found(planted: str):
+  assert _violations(planted)
+
+
+@pytest.mark.parametrize(
+    'allowed',
+    [
+        'process.wait(patience.SECONDS)',
+        'patience.until(lambda: thread.is_alive())',
+        "', '.join(parts)",
+        'work.num_calls(function) <= 5',
+    ],
+)
+def test_what_is_allowed_is_not_found(allowed: str):
+  assert not _violations(allowed)
