@@ -106,12 +106,10 @@ def _actions(
 ) -> list[np.ndarray]:
   """Returns the actions of an episode."""
   for trace in run.traces.values():
-    is_it = (
-        (trace['seed'] == row.seed)
-        & (trace['world'] == row.world)
-        & (trace['episode'] == row.episode)
-    )
-    for place in np.flatnonzero(is_it):
+    keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
+    for place, key in enumerate(keys):
+      if key != _key(row):
+        continue
       actions = trace['actions'][: trace['num_steps'][place], place]
       if len(actions) == row.num_steps:
         return list(actions)
