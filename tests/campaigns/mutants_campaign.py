@@ -63,7 +63,7 @@ _REG = ('tests/entities/register_contract_test.py',)
 _TWO = ('tests/entities/two_block_register_test.py',)
 _METRICS = 'evaluation/metrics.py'
 _MET = ('tests/evaluation/metrics_test.py',)
-_LEDGER = 'evaluation/ledger.py'
+_ENDINGS = 'evaluation/endings.py'
 _LED = ('tests/evaluation/ledger_test.py', 'tests/evaluation/metrics_test.py')
 _COMPARISON = 'evaluation/comparison.py'
 _COM = ('tests/evaluation/comparison_test.py',)
@@ -310,14 +310,19 @@ MUTANTS = [
 ''', _MET,
     ),
     Mutant(
-        'metric', 'a diverged episode is valid', _LEDGER,
-        'ended_well = self.end in (events.End.TERMINATED, events.End.TIMEOUT)',
-        'ended_well = self.end is not None', _LED,
+        'metric', 'a diverged episode is valid', _ENDINGS,
+        'return end in _BY_THE_TASK and math.isfinite(true_return)',
+        'return end is not None and math.isfinite(true_return)', _LED,
     ),
     Mutant(
-        'metric', 'an episode without a true return is valid', _LEDGER,
-        'return ended_well and bool(np.isfinite(self.true_rewards).all())',
-        'return ended_well', _LED,
+        'metric', 'an episode without a true return is valid', _ENDINGS,
+        'return end in _BY_THE_TASK and math.isfinite(true_return)',
+        'return end in _BY_THE_TASK', _LED,
+    ),
+    Mutant(
+        'metric', 'an episode that the agent gives up is left out', _ENDINGS,
+        'return end in _BY_THE_AGENT and math.isfinite(true_return)',
+        'return False', ('tests/evaluation/endings_test.py',),
     ),
     Mutant(
         'metric', 'an episode that comes twice counts twice', _COMPARISON,
