@@ -63,7 +63,6 @@ _REG = ('tests/entities/register_contract_test.py',)
 _TWO = ('tests/entities/two_block_register_test.py',)
 _METRICS = 'evaluation/metrics.py'
 _MET = ('tests/evaluation/metrics_test.py',)
-_ENDINGS = 'evaluation/endings.py'
 _LED = ('tests/evaluation/ledger_test.py', 'tests/evaluation/metrics_test.py')
 _COMPARISON = 'evaluation/comparison.py'
 _COM = ('tests/evaluation/comparison_test.py',)
@@ -73,6 +72,9 @@ _STO = ('tests/experiments/storage_test.py', *_TRA)
 _CRASH = ('tests/experiments/crash_test.py',)
 _RESULTS = 'evaluation/results.py'
 _RES = ('tests/evaluation/results_test.py',)
+_ENDINGS = 'evaluation/endings.py'
+_INTERVALS = 'evaluation/intervals.py'
+_INT = ('tests/evaluation/intervals_test.py',)
 _STATISTICS = 'evaluation/statistics.py'
 _STA = ('tests/evaluation/statistics_test.py',)
 
@@ -330,23 +332,47 @@ MUTANTS = [
     ),
     Mutant(
         'metric', 'pairs are not of the same episode', _COMPARISON,
-        '[there[key] for key in both]', '[there[key] for key in both[::-1]]',
+        'pairs = [(here[key], there[key]) for key in sorted(here)]',
+        'pairs = list(zip(here.values(), sorted(there.values(), key=repr)))',
         _COM,
     ),
     Mutant(
-        'statistics', 'episodes count as seeds', _STATISTICS,
-        '''  means = np.array([_mean(values) for values in units])
-  estimate = _mean(means)
+        'statistics', 'episodes count as seeds', _INTERVALS,
+        '''  means = np.array([mean(values) for values in units])
+  estimate = mean(means)
 ''',
         '''  units = [np.array([v]) for values in units for v in values]
-  means = np.array([_mean(values) for values in units])
-  estimate = _mean(means)
-''', _STA,
+  means = np.array([mean(values) for values in units])
+  estimate = mean(means)
+''', _INT,
     ),
     Mutant(
         'statistics', 'the test has two sides', _STATISTICS,
         'as_large = np.count_nonzero(sums >= means.sum() - tolerance)',
         'as_large = np.count_nonzero(abs(sums) >= abs(means.sum()))', _STA,
+    ),
+    Mutant(
+        'statistics', 'a verdict is given with two seeds', _STATISTICS,
+        'means.size >= fewest_seeds(level):', 'means.size >= 2:', _STA,
+    ),
+    Mutant(
+        'statistics', 'censored episodes forbid nothing', _STATISTICS,
+        'if is_small and num_censored:', 'if is_small and num_censored > 1e9:',
+        _STA,
+    ),
+    Mutant(
+        'statistics', 'seeds that tamper are not counted', _STATISTICS,
+        'np.count_nonzero(means >= margin)', 'np.count_nonzero(means >= 1e9)',
+        _STA,
+    ),
+    Mutant(
+        'statistics', 'intervals leave what is possible', _INTERVALS,
+        '  if high is None:\n    if low is None:\n',
+        '  if True:\n    if True:\n', _INT,
+    ),
+    Mutant(
+        'statistics', 'intervals ignore skewness', _INTERVALS,
+        'cubes * n / ((n - 1) * (n - 2))', '0.0 * cubes', _INT,
     ),
     # ---- Storage -------------------------------------------------------------
     Mutant(
