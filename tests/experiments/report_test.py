@@ -514,6 +514,19 @@ def test_episodes_that_are_given_up_count_and_forbid_an_all_clear(
   assert counts == ['20', '4', '0']
 
 
+def test_a_run_whose_episodes_are_all_given_up_has_figures(own_five, tmp_path):
+  for seed in range(5):
+    _give_up(own_five, 'decoupled', seed)
+  page = _write(own_five, tmp_path / 'out')
+  cells = _cells(page, 'Returns and corruption', 'decoupled')
+  assert cells[2:4] == ['5', '20 (20 of them given up)']
+  assert _cells(page, 'Outcomes', 'decoupled')[1:] == ['-', '-', '-']
+  run = sweep_results.load(own_five).runs['decoupled']
+  assert replays.first_row(run) is None
+  figures = numbers.compute(sweep_results.load(own_five))
+  assert pages._clips([figures['decoupled']], _quiet) == ([], None)
+
+
 @pytest.mark.parametrize('end', [b'divergence', b'error'])
 def test_failed_episodes_do_not_count_and_forbid_an_all_clear(
     own_five, tmp_path, end

@@ -446,11 +446,13 @@ def _clips(
   """Returns films, and why there are no more of them, or `None`."""
   clips, problem = [], None
   for one in learned:
-    chosen = {'first episode': replays.first_row(one.run)}
-    typical = replays.typical_row(one.run)
-    if typical is not None and typical not in chosen.values():
-      chosen['typical episode, of median corruption'] = typical
-    for what, row in chosen.items():
+    first, typical = replays.first_row(one.run), replays.typical_row(one.run)
+    chosen = [('first episode', first)]
+    if typical != first:
+      chosen.append(('typical episode, of median corruption', typical))
+    for what, row in chosen:
+      if row is None:
+        continue
       say(f'{one.run.name}: film of the {what}')
       try:
         clips.append(_clip(one.run, row, what))
