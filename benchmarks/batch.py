@@ -386,7 +386,7 @@ def _break_down_reset(
       ('placing the avatar', task, '_place_avatar'),
       ('the rest of the world', task, 'initialize_episode'),
       ('registers', env, '_initialize'),
-      ('looking', env, '_look'),
+      ('looking', env, '_observe'),
       ('the rest', env, 'reset'),
   )
   split = _split(parts, env.reset)

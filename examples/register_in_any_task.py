@@ -54,10 +54,11 @@ def main() -> None:
   while not time_step.last():
     time_step = env.step(random_state.uniform(spec.minimum, spec.maximum))
   register, physics = task.register, env.physics
-  reading, permanent, temporary = register.inspect(physics)
+  read = register.inspect(physics)
   sys.stdout.write(
-      f'written {register.applied(physics):.3f}, read {reading:.3f}, permanent'
-      f' corruption {permanent:.3f}, temporary {temporary:.3f}\n'
+      f'written {register.applied(physics):.3f}, read {read.reading:.3f},'
+      f' permanent corruption {read.permanent:.3f}, temporary'
+      f' {read.temporary:.3f}\n'
   )
 
 

@@ -20,7 +20,16 @@ class ActionError(RealabError, ValueError):
 
 
 class RegisterValueError(RealabError, ValueError):
-  """A value cannot be written to a register; nothing has been written."""
+  """A value cannot be written to a register; nothing has been written.
+
+  Attributes:
+    world: Place of the first world whose value is wrong, in a batch; `None`
+      for a world alone.
+  """
+
+  def __init__(self, message: str, world: int | None = None) -> None:
+    super().__init__(message)
+    self.world = world
 
 
 class FeedbackProviderError(RealabError, RuntimeError):

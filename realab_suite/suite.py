@@ -296,6 +296,25 @@ def embed(
       specs.load(design, tuple(overrides))
   )
   mechanism.attach_to(task.root_entity)
+  try:
+    return _connected(task, mechanism, seed, world, max_steps, measurements)
+  except BaseException:
+    # A corrected design can be embedded in the same task.
+    if isinstance(task, base.Task):
+      task.avatar.forget(_blocks(mechanism))
+    mechanism.detach_from_root()
+    raise
+
+
+def _connected(
+    task: composer.Task,
+    mechanism: feedback_mechanism.FeedbackMechanism,
+    seed: int,
+    world: int,
+    max_steps: int | None,
+    measurements: Mapping[str, Callable[[Any], Any]] | None,
+) -> environment.Environment:
+  """Returns the environment of a task that has a mechanism attached."""
   mechanism.connect(
       {
           'score': mechanism.score,
@@ -304,13 +323,19 @@ def embed(
       }
   )
   if isinstance(task, base.Task):
-    task.avatar.make_graspable(
-        [b for r in mechanism.registers.values() for b in r.blocks]
-    )
+    task.avatar.make_graspable(_blocks(mechanism))
   env = environment.Environment(
       task, mechanism, seed=seed, world=world, max_steps=max_steps
   )
-  placement.check(env.physics, task.root_entity, mechanism)
-  if isinstance(task, base.Task):
-    placement.check_start(env.physics, task, mechanism)
+  try:
+    placement.check(env.physics, task.root_entity, mechanism)
+    if isinstance(task, base.Task):
+      placement.check_start(env.physics, task, mechanism)
+  except BaseException:
+    env.close()
+    raise
   return env
+
+
+def _blocks(mechanism: feedback_mechanism.FeedbackMechanism) -> list[Any]:
+  return [b for r in mechanism.registers.values() for b in r.blocks]

@@ -19,7 +19,7 @@ def compile_world(
 
 def step(physics: mjcf.Physics, steps: int = 1) -> None:
   """Steps a world from the state as it is."""
-  if isinstance(physics, engine_physics.Physics):
+  if isinstance(physics, engine_physics.ThinPhysics):
     physics.advance(steps)
     return
   # Composer's steps begin in the middle of the engine's, with what was derived
@@ -34,6 +34,11 @@ def start_episode(physics: Any, *entities: Any, seed: int = 0) -> None:
     random_state = np.random.RandomState(seed)
     for entity in entities:
       entity.initialize_episode(physics, random_state)
+
+
+def shadow_reads(mechanism: Any, physics: Any, reader: str) -> list[Any]:
+  """Reads every register on behalf of an evaluator; moves nothing."""
+  return [r.inspect(physics, reader) for r in mechanism.registers.values()]
 
 
 def state_bytes(physics: mjcf.Physics) -> bytes:

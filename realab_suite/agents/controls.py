@@ -46,10 +46,10 @@ class Controls:
     if isinstance(spec, specs.DiscreteArray):
       bounds = np.zeros(()), np.array(spec.num_values - 1.0)
       return cls((), spec.dtype, (), spec.num_values, *bounds)
-    if spec.shape[1:] or not spec.shape or spec.dtype.kind != 'f':
+    if spec.shape[1:] or not spec.shape or spec.dtype.kind not in 'if':
       raise errors.SpecError(
           f'action_spec: {spec!r:.120}; allowed are a DiscreteArray and one'
-          ' axis of floats'
+          ' axis of numbers'
       )
     names = (spec.name or '').split('\t')
     queries = tuple(

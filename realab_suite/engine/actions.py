@@ -1,6 +1,7 @@
-"""Actions: what the agent may send, and how it reaches motors and queries."""
+"""Actions: their spec, and how they are split into queries and controls."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+import math
 from typing import Any, final
 
 from dm_env import specs
@@ -12,11 +13,16 @@ from realab_suite.feedback import action_sets
 
 @final
 class ActionCodec:
-  """Checks actions and takes them apart into queries and controls.
+  """Checks actions and splits them into queries and controls.
 
-  Without a discrete action set, an action is one vector: the query elements,
-  then the world's control elements. With one and no queries, it is the index of
-  an action; with queries, a vector that ends in the index.
+  Every action that satisfies `spec` is accepted:
+
+  - Without a discrete action set, an action is one float64 vector: the query
+    elements, then the task's control elements.
+  - With an action set and no queries, it is the int32 index of an action.
+  - With an action set and queries, it is a vector that ends in the index: int32
+    if all queries are indices of actions too, and float64 if one is a real
+    number. In a float64 vector the index is rounded to the nearest one.
   """
 
   def __init__(
@@ -24,47 +30,58 @@ class ActionCodec:
       control_spec: specs.BoundedArray,
       query_specs: Sequence[specs.BoundedArray],
       action_set: action_sets.ActionSet | None,
+      integer_queries: Collection[str] = (),
   ) -> None:
     """Makes the codec.
 
     Args:
-      control_spec: What the world takes; element names are tab-separated.
-      query_specs: What each query register stores.
+      control_spec: Action spec of the task; element names are tab-separated.
+      query_specs: Value spec of each query register.
       action_set: The discrete actions, or `None` for continuous ones.
+      integer_queries: Names of the query registers that hold the index of an
+        action.
+
+    Raises:
+      SpecError: If the task's action spec is not a bounded vector of numbers.
     """
+    elements = _element_names(control_spec)
     self._num_queries = len(query_specs)
     self._table: np.ndarray | None = None
     names = [f'query/{spec.name}' for spec in query_specs]
     low = [float(spec.minimum) for spec in query_specs]
     high = [float(spec.maximum) for spec in query_specs]
-    shape: tuple[int, ...] = (self._num_queries + control_spec.shape[0],)
-    dtype: np.dtype[Any] = np.dtype(np.float64)
+    is_integer = False
     if action_set is None:
-      names += (control_spec.name or '').split('\t')
+      names += elements
       low += list(np.broadcast_to(control_spec.minimum, control_spec.shape))
       high += list(np.broadcast_to(control_spec.maximum, control_spec.shape))
     else:
-      elements = (control_spec.name or '').split('\t')
       self._table = action_set.table(
           tuple(name.rpartition('/')[2] for name in elements)
       )
       names.append(f'{action_set.name}/v{action_set.version}')
       low.append(0.0)
       high.append(len(action_set) - 1.0)
-      shape = (self._num_queries + 1,)
-      if not query_specs:
-        shape, dtype = (), np.dtype(np.int32)
+      is_integer = all(spec.name in integer_queries for spec in query_specs)
+    if is_integer:
+      low, high = [math.ceil(x) for x in low], [math.floor(x) for x in high]
     self._names = names
-    self._low, self._high = np.array(low), np.array(high)
-    self._spec = self._make_spec(shape, dtype)
+    self._low, self._high = np.array(low, float), np.array(high, float)
+    # An unbounded element takes any number, which infinity is not.
+    self._is_bounded = bool(np.isfinite([self._low, self._high]).all())
+    self._spec = self._make_spec(np.dtype(np.int32 if is_integer else float))
 
-  def _make_spec(self, shape: tuple[int, ...], dtype: np.dtype) -> specs.Array:
-    if not shape:
+  def _make_spec(self, dtype: np.dtype) -> specs.Array:
+    if self._table is not None and not self._num_queries:
       return specs.DiscreteArray(
-          int(self._high[0]) + 1, dtype=dtype, name=self._names[0]
+          len(self._table), dtype=dtype, name=self._names[0]
       )
     return specs.BoundedArray(
-        shape, dtype, self._low, self._high, name='\t'.join(self._names)
+        self._low.shape,
+        dtype,
+        self._low.astype(dtype),
+        self._high.astype(dtype),
+        name='\t'.join(self._names),
     )
 
   @property
@@ -75,14 +92,15 @@ class ActionCodec:
   def decode(
       self, action: Any, batch_shape: tuple[int, ...] = ()
   ) -> tuple[np.ndarray, np.ndarray]:
-    """Checks an action and takes it apart.
+    """Checks an action and splits it.
 
     Args:
-      action: Shape `(*batch_shape, *spec.shape)`, of a safe numeric dtype.
+      action: Shape `(*batch_shape, *spec.shape)`: integers, or where the spec
+        is of floats, numbers.
       batch_shape: `()` for one world, `(worlds,)` for many.
 
     Returns:
-      Query values, `(..., queries)`, and controls, `(..., controls)`.
+      Query values, `(..., queries)`, and controls, `(..., controls)`, float64.
 
     Raises:
       ActionError: If dtype, shape or any element is wrong.
@@ -96,15 +114,14 @@ class ActionCodec:
     if not self._spec.shape:
       values = values[..., np.newaxis]
     good = (values >= self._low) & (values <= self._high)  # NaN is not.
-    if self._table is not None:
-      index = values[..., -1]
-      good[..., -1] &= index == np.rint(index)
+    if not self._is_bounded:
+      good &= np.isfinite(values)
     if np.count_nonzero(good) != good.size:
       raise errors.ActionError(self._complaint(values, ~good))
     queries = values[..., : self._num_queries]
     controls = values[..., self._num_queries :]
     if self._table is not None:
-      controls = self._table[controls[..., 0].astype(int)]
+      controls = self._table[np.rint(controls[..., 0]).astype(int)]
     return queries, controls
 
   def _cast(self, action: Any) -> np.ndarray:
@@ -114,12 +131,14 @@ class ActionCodec:
       raise errors.ActionError(
           f'action: {type(action).__name__} is no array of numbers'
       ) from error
-    # A discrete action is an integer; half a step to the left is not one.
-    kinds = 'iuf' if self._spec.shape else 'iu'
+    # Half a step to the left is not an action.
+    kinds = 'iuf' if self._spec.dtype.kind == 'f' else 'iu'
     if values.dtype.kind not in kinds:
       raise errors.ActionError(
-          f'action: dtype {values.dtype}; expected' f' {self._spec.dtype}'
+          f'action: dtype {values.dtype}; expected {self._spec.dtype}'
       )
+    if np.ma.isMaskedArray(action):
+      raise errors.ActionError('action: a masked array; expected plain numbers')
     # What is too large for float64 becomes infinite, which no bounds allow.
     with np.errstate(over='ignore'):
       return values.astype(np.float64)
@@ -131,6 +150,25 @@ class ActionCodec:
     if np.isnan(value):
       return f'{label} ({self._names[i]}) is nan'
     low, high = self._low[i], self._high[i]
-    if low <= value <= high:
-      return f'{label} ({self._names[i]}) = {value} is not a whole number'
     return f'{label} ({self._names[i]}) = {value} outside [{low:g}, {high:g}]'
+
+
+def _element_names(control_spec: Any) -> list[str]:
+  """Returns a name for each control element.
+
+  Raises:
+    SpecError: If the spec is not a bounded vector of numbers.
+  """
+  is_vector = isinstance(control_spec, specs.BoundedArray) and (
+      len(control_spec.shape) == 1 and control_spec.dtype.kind in 'iuf'
+  )
+  if not is_vector:
+    raise errors.SpecError(
+        f'action_spec of the task: {control_spec!r:.160}; allowed is a'
+        ' BoundedArray of numbers with one axis'
+    )
+  names = (control_spec.name or '').split('\t')
+  (num_elements,) = control_spec.shape
+  if len(names) != num_elements:
+    return [f'element_{i}' for i in range(num_elements)]
+  return names

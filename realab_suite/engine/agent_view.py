@@ -112,9 +112,19 @@ class _View(abc.ABC):
     """
     self.__is_closed = True
 
+  def __reduce_ex__(self, protocol: Any) -> Any:
+    """Refuses `copy` and `pickle`, which would hand over the environment."""
+    raise TypeError('views cannot be pickled or copied')
+
+  def __reduce__(self) -> Any:
+    return self.__reduce_ex__(0)
+
+  def __getstate__(self) -> Any:
+    return self.__reduce_ex__(0)
+
   @abc.abstractmethod
   def _restate(self, time_step: Any) -> Any:
-    """Returns what of a time step is the agent's."""
+    """Returns the part of a time step that the agent may see."""
 
   def _filtered(self, observation: Any) -> dict[str, np.ndarray]:
     """Returns the agent's own copies of what it may observe."""
@@ -132,7 +142,8 @@ class _View(abc.ABC):
     """
     problem: errors.ActionError
     try:
-      given = np.array(action)
+      # A masked array stays one, and is refused for it.
+      given = np.array(action, subok=np.ma.isMaskedArray(action))
       self.__env.codec.decode(given, self.__actions_shape)
       return given
     except errors.ActionError as error:

@@ -1,6 +1,7 @@
 """Many worlds with feedback, stepped together: Python is paid once for all."""
 
 from collections.abc import Sequence
+import functools
 from typing import Any, NamedTuple, final
 
 from dm_control import composer
@@ -11,11 +12,15 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.engine import actions as actions_lib
 from realab_suite.engine import batch_physics
+from realab_suite.engine import control_step
 from realab_suite.engine import environment
+from realab_suite.engine import episodes
 from realab_suite.engine import events
+from realab_suite.engine import hosts
+from realab_suite.engine import observing
 from realab_suite.engine import seeding
-from realab_suite.engine import senses
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.entities import registers
 from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.tasks import base
 
@@ -82,7 +87,7 @@ class BatchEnvironment:
           f'{type(single.task).__name__} compiles anew in each episode; a batch'
           ' takes worlds of this package'
       )
-    _refuse_step_hooks(single.task)
+    _refuse_step_hooks(single)
     self._single = single
     self._task: base.Task = single.task
     self._mechanism = single.mechanism
@@ -97,9 +102,14 @@ class BatchEnvironment:
         if type(entity).initialize_episode
         is not composer.Entity.initialize_episode
     ]
+    self._host = hosts.WorldHost(self._task, self._task, None, (num_worlds,))
+    self._observer = observing.Observer(
+        self._host, self._mechanism, single.max_steps
+    )
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
-    # Restoring may give several worlds one number. Objects: seeds can be large.
-    self._seeds = np.full(num_worlds, single.seed, object)
+    # Restoring may give several worlds one number. Objects: seeds can be large,
+    # or salted; `np.full` would drop the salt.
+    self._seeds = np.array([single.seed] * num_worlds, object)
     self._numbers = np.arange(num_worlds).astype(object)
     self._episodes = np.full(num_worlds, -1)
     self._is_pending = np.ones(num_worlds, bool)
@@ -162,18 +172,14 @@ class BatchEnvironment:
   def reset(self) -> BatchTimeStep:
     """Starts the next episode of every world."""
     self._refuse_if_closed()
-    is_open = ~self._is_pending
+    self._tell_of_end(~self._is_pending, events.End.ABANDONED)
     # Until the episodes have begun, the next step is to begin them.
     self._is_pending = np.ones(self._num_worlds, bool)
     everywhere = self._is_pending.copy()
-    try:
-      self._begin_episodes(everywhere)
-      reads = self._look()
-    except Exception:
-      self._tell_of_end(is_open, events.End.ABANDONED)
-      raise
+    self._begin_episodes(everywhere)
+    reads = self._observe()
     nothing = np.zeros(self._num_worlds)
-    self._tell(everywhere, ~everywhere, {}, [], reads, nothing)
+    self._tell(everywhere, ~everywhere, {}, [], reads, nothing, None)
     self._is_pending = ~everywhere
     return self._time_step(
         np.full(self._num_worlds, int(dm_env.StepType.FIRST)),
@@ -197,36 +203,54 @@ class BatchEnvironment:
     is_first = self._is_pending
     # Until this step is known to be good, the next one begins all episodes.
     self._is_pending = np.ones(self._num_worlds, bool)
+    last_valid = self._observation
     try:
-      records, reward, discount, is_ending = self._control_step(
-          queries, controls, is_first
+      records, ending, self._states = control_step.run(
+          self._physics,
+          self._host,
+          self._mechanism,
+          self._single.schedule,
+          self._single.num_substeps,
+          queries=queries,
+          controls=controls,
+          observation=self._observation,
+          provider_keys=self._keys,
+          provider_states=self._states,
+          is_first=is_first,
       )
       has_failed = self._physics.has_diverged() & ~is_first
       step_count = self._mechanism.step_count(self._physics)
       is_late = step_count == self._single.max_steps
-      last_valid = self._observation
       self._begin_episodes(is_first)
-      reads = self._look()
+      reads = self._observe()
     except Exception:
-      # Nobody is told of half a step: all episodes are over.
+      # No sink gets half a step: all episodes are over.
       self._tell_of_end(~is_first, events.End.ERROR)
       raise
-    is_last = (is_ending | has_failed | is_late) & ~is_first
+    is_last = (ending.is_ending | has_failed | is_late) & ~is_first
     ends = {
-        int(world): _end(has_failed[world], is_ending[world])
+        int(world): _end(has_failed[world], ending.is_ending[world])
         for world in np.flatnonzero(is_last)
     }
     for name, value in self._observation.items():
-      # Nothing is read off a state that MuJoCo has reset.
+      # Nothing is read from a state that MuJoCo has reset.
       value[has_failed] = last_valid[name][has_failed]
-    self._tell(is_first, has_failed, ends, records, reads, reward)
+    self._tell(
+        is_first,
+        has_failed,
+        ends,
+        records,
+        reads,
+        ending.true_reward,
+        ending.failure,
+    )
     self._is_pending = is_last
     step_type = np.where(
         is_last, int(dm_env.StepType.LAST), int(dm_env.StepType.MID)
     )
     step_type[is_first] = int(dm_env.StepType.FIRST)
     return self._time_step(
-        step_type, np.where(has_failed | is_first, 1.0, discount)
+        step_type, np.where(has_failed | is_first, 1.0, ending.discount)
     )
 
   def save(self, worlds: Sequence[int] | None = None) -> snapshots.Snapshot:
@@ -407,115 +431,43 @@ class BatchEnvironment:
       )
     return merged, observation
 
-  def _control_step(
-      self, queries: np.ndarray, controls: np.ndarray, is_first: np.ndarray
-  ) -> tuple[list[Any], np.ndarray, np.ndarray, np.ndarray]:
-    """Does what `Environment` does, in the same order, to all worlds.
-
-    Worlds that begin an episode next (`is_first`) go along, for nothing that
-    happens in them counts; nor may it do harm.
-
-    Returns:
-      What was written and read, the true reward, the discount, and where the
-      episode ends.
-    """
-    physics, mechanism, task = self._physics, self._mechanism, self._task
-    schedule, n = self._single.schedule, self._single.num_substeps
-    was_over = self._of_all(task.should_terminate_episode(physics), bool)
-    task.before_step(physics, controls, None)
-    records: list[Any] = [*mechanism.write_queries(physics, queries)]
-
-    if schedule.meter_substep:
-      physics.advance(schedule.meter_substep)
-      task.latch_events(physics)
-    is_ending = self._of_all(task.should_terminate_episode(physics), bool)
-    idle = is_first | physics.has_diverged()
-    records += mechanism.update_meters(physics, idle)
-
-    if between := schedule.provider_substep - schedule.meter_substep:
-      physics.advance(between)
-      task.latch_events(physics)
-    step = mechanism.step_count(physics)
-    keys = [seeding.step_key(key, step) for key in self._keys]
-    feedback, self._states = mechanism.update_providers(
-        physics,
-        self._observation,
-        keys,
-        self._states,
-        is_first | physics.has_diverged(),
-    )
-    records += feedback
-
-    physics.advance(n - schedule.provider_substep)
-    task.after_step(physics, None)
-    # MuJoCo checks what the last substep has left when it looks at it next;
-    # were that in `_look`, a failure would be noticed a step too late.
-    physics.refresh()
-    reward = self._true_reward()
-    reward[was_over] = 0.0
-    discount = self._of_all(task.get_discount(physics), float)
-    discount[~is_ending] = 1.0
-    mechanism.end_step(physics, np.where(np.isfinite(reward), reward, 0.0))
-    return records, reward, discount, is_ending
-
-  def _true_reward(self) -> np.ndarray:
-    """Returns the true reward, or nan where the task fails to give one."""
-    try:
-      return self._of_all(self._task.get_reward(self._physics), float)
-    except Exception:  # Whatever a task does wrong is not the agent's business.
-      return np.full(self._num_worlds, np.nan)
-
-  def _of_all(self, value: Any, dtype: type) -> np.ndarray:
-    """Returns what a task says, `(worlds,)`; it may say one thing of all."""
-    return np.array(np.broadcast_to(value, (self._num_worlds,)), dtype)
-
   def _begin_episodes(self, where: np.ndarray) -> None:
     """Begins an episode in some worlds, `(worlds,)` bool."""
     (worlds,) = np.nonzero(where)
     if not len(worlds):
       return
-    self._physics.reset(worlds)
-    fresh = self._mechanism.initial_states((self._num_worlds,))
-    self._states = [
-        _begin_anew(state, initial, worlds)
-        for state, initial in zip(self._states, fresh, strict=True)
-    ]
-    for world in worlds:
-      self._episodes[world] += 1
-      self._initialize(int(world), int(self._episodes[world]))
-
-  def _initialize(self, world: int, episode: int) -> None:
-    view = self._physics.world(world)
-    seed, number = self._seeds[world], self._numbers[world]
-    for attempt in range(environment.MAX_RESET_ATTEMPTS):
-      seeding.reseed(
-          self._random_state, seed, number, episode, f'reset/{attempt}'
-      )
-      try:
-        self._task.initialize_episode(view, self._random_state)
-        for entity in self._entities:
-          entity.initialize_episode(view, self._random_state)
-        break
-      except composer.EpisodeInitializationError:
-        if attempt == environment.MAX_RESET_ATTEMPTS - 1:
-          raise
-        self._physics.reset(np.array([world]))
-    for i in range(len(self._keys)):
-      self._keys[i, world] = seeding.episode_key(
-          seed, number, episode, f'providers[{i}]'
-      )
-
-  def _look(self) -> list[feedback_mechanism.Read]:
-    """Makes the observation of every world; returns what agents read."""
-    physics = self._physics
-    physics.refresh()
-    self._observation, reads = senses.observe(
-        self._task.senses(physics),
-        self._mechanism,
-        physics,
-        self._single.max_steps,
+    self._states = self._mechanism.restart_states(
+        self._states, worlds, self._num_worlds
     )
-    return reads
+    self._physics.reset(worlds)
+    for world in worlds.tolist():
+      self._episodes[world] += 1
+      stream = (
+          self._seeds[world],
+          self._numbers[world],
+          int(self._episodes[world]),
+      )
+      episodes.begin(
+          self._random_state,
+          *stream,
+          functools.partial(self._initialize, world),
+      )
+      self._keys[:, world] = episodes.provider_keys(*stream, len(self._keys))
+
+  def _initialize(self, world: int, attempt: int) -> None:
+    """Initializes the task and its entities in a world that has been reset."""
+    if attempt:
+      self._physics.reset(np.array([world]))
+    view = self._physics.world(world)
+    self._task.initialize_episode(view, self._random_state)
+    for entity in self._entities:
+      entity.initialize_episode(view, self._random_state)
+
+  def _observe(self) -> list[Any]:
+    """Makes the observation of every world; returns the agents' reads."""
+    self._physics.refresh()
+    self._observation, reads = self._observer.observe(self._physics)
+    return list(reads)
 
   def _tell(
       self,
@@ -523,10 +475,11 @@ class BatchEnvironment:
       has_failed: np.ndarray,
       ends: dict[int, events.End],
       records: events.Records,
-      reads: events.Records,
+      reads: Sequence[registers.Read],
       reward: np.ndarray,
+      failure: str | None,
   ) -> None:
-    """Tells the sinks what happened in a step."""
+    """Notifies the sinks of a step."""
     if not self._sinks:
       return
     step = events.BatchStep(
@@ -540,6 +493,7 @@ class BatchEnvironment:
         records=records,
         agent_reads=reads,
         true_reward=reward,
+        failure=failure,
     )
     for sink in self._sinks:
       sink.step_ended(step)
@@ -567,14 +521,11 @@ class BatchEnvironment:
   def _time_step(
       self, step_type: np.ndarray, discount: np.ndarray
   ) -> BatchTimeStep:
-    for value in self._observation.values():
-      # Providers look at these arrays themselves; agents get copies.
-      value.setflags(write=False)
     return BatchTimeStep(
         step_type,
         np.zeros(self._num_worlds),
         discount,
-        {name: np.array(value) for name, value in self._observation.items()},
+        observing.copied(observing.frozen(self._observation)),
     )
 
   def _refuse_if_closed(self) -> None:
@@ -589,26 +540,14 @@ def _with(values: np.ndarray, places: np.ndarray, others: Any) -> np.ndarray:
   return copy
 
 
-def _begin_anew(state: Any, initial: Any, worlds: np.ndarray) -> Any:
-  """Returns a provider's state, with the initial one in some worlds."""
-  if isinstance(state, dict):
-    return {
-        key: _begin_anew(part, initial[key], worlds)
-        for key, part in state.items()
-    }
-  if isinstance(state, tuple | list):
-    return type(state)(
-        _begin_anew(part, first, worlds)
-        for part, first in zip(state, initial, strict=True)
+def _refuse_step_hooks(single: environment.Environment) -> None:
+  """Refuses hooks that a batch never calls."""
+  if single.has_extra_hooks:
+    raise errors.SpecError(
+        'add_extra_hook: a batch never calls extra hooks; allowed is an'
+        ' environment without them'
     )
-  begun = np.array(state)
-  begun[worlds] = np.asarray(initial)[worlds]
-  return begun
-
-
-def _refuse_step_hooks(task: base.Task) -> None:
-  """Refuses entities that want to be called in each step: nobody would."""
-  for entity in task.root_entity.iter_entities():
+  for entity in single.task.root_entity.iter_entities():
     for hook in ('before_step', 'after_step'):
       if getattr(type(entity), hook) is not getattr(composer.Entity, hook):
         raise errors.SpecError(
@@ -666,6 +605,7 @@ def fork(
           f'world: {world!r}; allowed is None, for the world is alone'
       )
     snapshot, single = env.save(), env
+  _refuse_step_hooks(single)
   # Compiled anew, which takes less time than one episode: what is closed frees
   # its compiled world.
   copy = environment.Environment(

@@ -1,13 +1,14 @@
 """One world with feedback, as a `dm_env` environment without a reward channel.
 
-This file alone touches private parts of `composer.Environment`; they are those
-of dm_control 1.0.50, and a test says so when they change.
+This module and `foreign` alone use private parts of `composer.Environment`;
+they are those of dm_control 1.0.50, and a test fails when they change.
 """
 
-import math
+import contextlib
 from typing import Any, final
 
 from dm_control import composer
+from dm_control.composer import environment as composer_environment
 from dm_control.rl import control
 import dm_env
 from dm_env import specs
@@ -15,23 +16,32 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import actions
+from realab_suite.engine import control_step
+from realab_suite.engine import episodes
 from realab_suite.engine import events
+from realab_suite.engine import foreign
+from realab_suite.engine import hosts
+from realab_suite.engine import observing
 from realab_suite.engine import physics as engine_physics
 from realab_suite.engine import seeding
-from realab_suite.engine import senses as sense_kinds
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.feedback import specs as specs_lib
 from realab_suite.tasks import base
 
-# How often the beginning of an episode is tried, with another draw each time.
-MAX_RESET_ATTEMPTS = 10
+# Hooks that Composer would call and that a world of this package never does.
+_UNUSED_HOOKS = (
+    'initialize_episode_mjcf',
+    'after_compile',
+    'before_substep',
+    'after_substep',
+)
 
 
 @final
 class Environment(composer.Environment):
-  """A world, a feedback mechanism, and what passes between them and an agent.
+  """A world, a feedback mechanism, and the data channel of an agent.
 
   `reward` is the constant 0.0; feedback comes as observations
   `registers/<name>`. The true reward goes to the event sinks only.
@@ -53,54 +63,56 @@ class Environment(composer.Environment):
     Args:
       task: The world, with `mechanism` attached to its root entity.
       mechanism: The feedback.
-      seed: From which, with `world`, every random stream follows.
-      world: Which world of a batch this is.
-      max_steps: After how many control steps an episode is cut off, or `None`.
+      seed: Seed of every random stream, together with `world`.
+      world: Number of the world in a batch.
+      max_steps: Length of an episode in control steps, or `None`.
     """
-    self._physics: engine_physics.Physics
+    self._physics: Any
     self._mechanism = mechanism
     self._seed, self._world, self._episode = seed, world, -1
     self._max_steps = max_steps
     self._sinks: list[events.EventSink] = []
     self._closed = False
-    # A world of ours has no hooks in substeps and compiles once. Somebody
-    # else's is treated as Composer would.
+    self._has_extra_hooks = False
+    # Worlds of this package compile once and have no hooks in substeps. Other
+    # tasks are treated as Composer does.
     self._is_ours = isinstance(task, base.Task)
     if isinstance(task, base.Task):
       _refuse_substep_hooks(task)
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
-        max_reset_attempts=MAX_RESET_ATTEMPTS,
         recompile_mjcf_every_episode=not self._is_ours,
-        legacy_step=False,
+        strip_singleton_obs_buffer_dim=True,
     )
-    self._senses: sense_kinds.Senses
+    self._host: hosts.Host
     if isinstance(task, base.Task):
-      self._senses = sense_kinds.WorldSenses(task)
+      self._host = hosts.WorldHost(task, self._hooks, self._random_state, ())
     else:
-      self._senses = sense_kinds.ObservableSenses(task)
-      self._senses.restart(self._physics, self._random_state)
-    if max_steps is not None and 'time_left' in self._senses.spec:
-      raise errors.SpecError(
-          "the task has an observable 'time_left' of its own; allowed names are"
-          ' all others, or max_steps=None'
+      self._host = foreign.ForeignHost(
+          task,
+          self._hooks,
+          self._random_state,
+          lambda: self._observation_updater,
+          has_registers=bool(mechanism.registers),
       )
+    self._observer = observing.Observer(self._host, mechanism, max_steps)
     self._schedule = mechanism.design.schedule_for(self._n_sub_steps)
     chosen = mechanism.design.action_set
     self._codec = actions.ActionCodec(
-        task.action_spec(self._physics),
+        task.action_spec(self._physics_proxy),
         [register.value_spec for register in mechanism.queries],
         None
         if chosen is None
         else action_sets.get(chosen.name, chosen.version),
+        mechanism.design.integer_queries(),
     )
     self._observation: dict[str, np.ndarray] = {}
-    self._provider_keys: list[np.ndarray] = []
+    self._provider_keys = self._new_provider_keys()
     self._provider_states: list[Any] = []
     self._episode_is_open = False
 
-  # What the evaluator and the launcher use; no agent is handed this object.
+  # The evaluator's and the launchers' side; no agent gets this object.
 
   @property
   def mechanism(self) -> feedback_mechanism.FeedbackMechanism:
@@ -109,40 +121,45 @@ class Environment(composer.Environment):
 
   @property
   def seed(self) -> int:
-    """From which every random stream follows."""
+    """Seed of every random stream."""
     return self._seed
 
   @property
   def world(self) -> int:
-    """Which world of a batch this is; 0 for one alone."""
+    """Number of the world in a batch; 0 for one alone."""
     return self._world
 
   @property
   def max_steps(self) -> int | None:
-    """After how many control steps an episode is cut off."""
+    """Length of an episode in control steps, or `None`."""
     return self._max_steps
 
   @property
   def num_substeps(self) -> int:
-    """How many substeps of the physics make a control step."""
+    """Number of physics substeps in a control step."""
     return self._n_sub_steps
 
   @property
   def codec(self) -> actions.ActionCodec:
-    """What takes actions apart."""
+    """Checks and splits actions."""
     return self._codec
 
   @property
   def schedule(self) -> specs_lib.ScheduleSpec:
-    """When meters and providers act."""
+    """Substeps after which meters and providers act."""
     return self._schedule
+
+  @property
+  def has_extra_hooks(self) -> bool:
+    """Whether `add_extra_hook` was called."""
+    return self._has_extra_hooks
 
   @property
   def thin_physics(self) -> engine_physics.ThinPhysics:
     """The physics itself, which is compiled once.
 
     Raises:
-      SpecError: If the world is somebody else's.
+      SpecError: If the task is not one of this package's worlds.
     """
     if not isinstance(self._physics, engine_physics.ThinPhysics):
       raise errors.SpecError(
@@ -150,15 +167,40 @@ class Environment(composer.Environment):
       )
     return self._physics
 
+  def add_extra_hook(self, hook_name: str, hook_callable: Any) -> None:
+    """Adds a hook, as in `composer.Environment`.
+
+    Args:
+      hook_name: One of `composer.HOOK_NAMES`.
+      hook_callable: Function with the arguments of the task's own hook.
+
+    Raises:
+      SpecError: If this environment never calls such a hook.
+    """
+    self._refuse_if_closed()
+    if self._is_ours and hook_name in _UNUSED_HOOKS:
+      allowed = [
+          name
+          for name in composer_environment.HOOK_NAMES
+          if name not in _UNUSED_HOOKS
+      ]
+      raise errors.SpecError(
+          f'add_extra_hook: {hook_name!r} is never called in'
+          f' {type(self._task).__name__}, which compiles once and has no Python'
+          f' in substeps; allowed are {allowed}'
+      )
+    super().add_extra_hook(hook_name, hook_callable)
+    self._has_extra_hooks = True
+
   def add_sink(self, sink: events.EventSink) -> None:
-    """Lets an evaluator hear of everything, from the next episode on."""
+    """Notifies a sink of all events, from the next episode on."""
     self._refuse_if_closed()
     self._abandon()
     self._sinks.append(sink)
     self._reset_next_step = True
 
   def remove_sink(self, sink: events.EventSink) -> None:
-    """Ends what `add_sink` began."""
+    """Undoes `add_sink`."""
     self._sinks.remove(sink)
 
   def rewind(self, episode: int = 0) -> None:
@@ -183,7 +225,7 @@ class Environment(composer.Environment):
   def save(self) -> snapshots.Snapshot:
     """Returns everything that the future of this world depends on.
 
-    What the event sinks know of the episode is part of it.
+    The event sinks' records of the episode are part of it.
 
     Raises:
       SpecError: If the world is somebody else's, or a sink cannot be saved.
@@ -241,13 +283,16 @@ class Environment(composer.Environment):
       )
     else:
       self._random_state.set_state(saved.random_state)
-    self._provider_keys = [np.array(key[0]) for key in saved.provider_keys]
+    for here, there in zip(
+        self._provider_keys, saved.provider_keys, strict=True
+    ):
+      here[:] = there[0]
     self._provider_states = (
         saved.provider_states
         if saved.places is None
         else snapshots.of_world(saved.provider_states)
     )
-    self._keep(
+    self._observation = observing.frozen(
         {key: np.array(value[0]) for key, value in saved.observation.items()}
     )
     for sink, (_, states) in zip(self._sinks, saved.sinks, strict=False):
@@ -300,18 +345,7 @@ class Environment(composer.Environment):
 
   def observation_spec(self) -> dict[str, specs.Array]:
     self._refuse_if_closed()
-    spec = {
-        f'senses/{name}': part.replace(name=f'senses/{name}')
-        for name, part in self._senses.spec.items()
-    }
-    if self._max_steps is not None:
-      spec[sense_kinds.TIME_LEFT] = specs.BoundedArray(
-          (), np.float32, 0.0, 1.0, name=sense_kinds.TIME_LEFT
-      )
-    for name in self._mechanism.read_by_agent:
-      key = f'registers/{name}'
-      spec[key] = specs.Array((), np.float64, name=key)
-    return spec
+    return self._observer.spec()
 
   def reset(self) -> dm_env.TimeStep:
     """Starts the next episode and returns its FIRST time step."""
@@ -320,37 +354,25 @@ class Environment(composer.Environment):
     # Whatever goes wrong from here on, the next step starts with a reset.
     self._reset_next_step = True
     self._episode += 1
-    for attempt in range(MAX_RESET_ATTEMPTS):
-      seeding.reseed(
-          self._random_state,
-          self._seed,
-          self._world,
-          self._episode,
-          f'reset/{attempt}',
-      )
-      try:
-        self._initialize_episode()
-        break
-      except composer.EpisodeInitializationError:
-        if attempt == MAX_RESET_ATTEMPTS - 1:
-          raise
-    providers = self._mechanism.design.providers
-    self._provider_keys = [
-        seeding.episode_key(
-            self._seed, self._world, self._episode, f'providers[{i}]'
-        )
-        for i in range(len(providers))
-    ]
+    episodes.begin(
+        self._random_state,
+        self._seed,
+        self._world,
+        self._episode,
+        self._initialize_episode,
+    )
+    self._provider_keys = self._new_provider_keys()
     self._provider_states = self._mechanism.initial_states(())
     records: list[Any] = [*self._mechanism.initial_writes(self._physics)]
     records += self._observe()
     start = events.Start(self._seed, self._world, self._episode, records)
-    for sink in self._sinks:
-      sink.episode_started(start, self._physics_proxy)
-    # Unless all have heard of its beginning, there is no episode.
+    with self._undisturbed():
+      for sink in self._sinks:
+        sink.episode_started(start, self._physics_proxy)
+    # Unless every sink took its beginning, there is no episode.
     self._reset_next_step = False
     self._episode_is_open = True
-    return dm_env.restart(self._copy_of_observation())
+    return dm_env.restart(observing.copied(self._observation))
 
   def step(self, action: Any) -> dm_env.TimeStep:
     """Runs one control step and returns its time step.
@@ -368,27 +390,33 @@ class Environment(composer.Environment):
     # Until this step is known to be good, the next one starts with a reset.
     self._reset_next_step = True
     try:
-      step, discount, terminated = self._control_step(queries, controls)
+      outcome = self._control_step(queries, controls)
+      records = outcome.records + self._observe()
     except control.PhysicsError:
       self._end(events.End.DIVERGENCE)
       # The agent learns that time is up and nothing else: no register is read
-      # off a state that MuJoCo has reset.
-      return dm_env.truncation(0.0, self._copy_of_observation(), 1.0)
+      # from a state that MuJoCo has reset.
+      return dm_env.truncation(0.0, observing.copied(self._observation), 1.0)
     except Exception:
       self._end(events.End.ERROR)
       raise
-    for sink in self._sinks:
-      sink.step_ended(step, self._physics_proxy)
-    if terminated:
+    ending = outcome.ending
+    self._provider_states = outcome.provider_states
+    with self._undisturbed():
+      step = events.Step(records, np.array(ending.true_reward), ending.failure)
+      for sink in self._sinks:
+        sink.step_ended(step, self._physics_proxy)
+    observation = observing.copied(self._observation)
+    if ending.is_ending:
       self._end(events.End.TERMINATED)
       return dm_env.TimeStep(
-          dm_env.StepType.LAST, 0.0, discount, self._copy_of_observation()
+          dm_env.StepType.LAST, 0.0, float(ending.discount), observation
       )
     if self._mechanism.step_count(self._physics) == self._max_steps:
       self._end(events.End.TIMEOUT)
-      return dm_env.truncation(0.0, self._copy_of_observation(), discount)
+      return dm_env.truncation(0.0, observation, 1.0)
     self._reset_next_step = False
-    return dm_env.transition(0.0, self._copy_of_observation(), discount)
+    return dm_env.transition(0.0, observation, float(ending.discount))
 
   def close(self) -> None:
     """Frees the world; closing twice does nothing."""
@@ -407,129 +435,65 @@ class Environment(composer.Environment):
   def __deepcopy__(self, memo: Any) -> Any:
     return self.__reduce__()
 
-  # One control step, in order.
-
   def _control_step(
       self, queries: np.ndarray, controls: np.ndarray
-  ) -> tuple[events.Step, float, bool]:
-    physics, mechanism = self._physics, self._mechanism
-    n, schedule = self._n_sub_steps, self._schedule
-    was_over = is_ending = self._is_over()
-    self._hooks.before_step(physics, controls, self._random_state)
-    self._senses.begin_step()
-    records: list[Any] = [*mechanism.write_queries(physics, queries)]
-
-    self._advance(schedule.meter_substep, controls)
-    self._latch(schedule.meter_substep)
-    if self._is_ours:
-      is_ending = self._is_over()
-    records += mechanism.update_meters(physics)
-
-    between = schedule.provider_substep - schedule.meter_substep
-    self._advance(between, controls)
-    self._latch(between)
-    step = int(mechanism.step_count(physics))
-    feedback, self._provider_states = mechanism.update_providers(
-        physics,
-        self._observation,
-        [seeding.step_key(key, step) for key in self._provider_keys],
-        self._provider_states,
-    )
-    records += feedback
-
-    self._advance(n - schedule.provider_substep, controls)
-    self._hooks.after_step(physics, self._random_state)
-    physics.forward()
-    reward = 0.0 if was_over else self._true_reward()
-    discount = float(self._task.get_discount(physics))
-    if not is_ending:
-      discount = 1.0  # Of an end that the meters have not seen, nobody knows.
-    mechanism.end_step(physics, reward if math.isfinite(reward) else 0.0)
-    records += self._observe()
-    return events.Step(records, np.array(reward)), discount, is_ending
-
-  def _true_reward(self) -> float:
-    """Returns the true reward, or nan where the task fails to give one.
-
-    An exception would reach the agent, and tell it something: only the
-    evaluator hears that there is no reward, and that the episode is not valid.
-    """
-    try:
-      return float(self._task.get_reward(self._physics))
-    except Exception:  # Whatever a task does wrong is not the agent's business.
-      return float('nan')
-
-  def _is_over(self) -> bool:
-    """Whether the task has ended.
-
-    The episode does so with the control step whose meters can know of it: what
-    ends an episode is often what matters most, and feedback on it would never
-    reach the agent otherwise.
-    """
-    return bool(self._task.should_terminate_episode(self._physics))
-
-  def _latch(self, num_substeps: int) -> None:
-    """Records what has happened, in the worlds that keep such a record."""
-    if num_substeps and self._is_ours:
-      self._task.latch_events(self._physics)
-
-  def _advance(self, num_substeps: int, controls: np.ndarray) -> None:
-    """Steps the physics."""
-    if self._is_ours:
-      if num_substeps:
-        self._physics.advance(num_substeps)
-      return
-    physics = self._physics_proxy
-    for _ in range(num_substeps):
-      self._hooks.before_substep(physics, controls, self._random_state)
-      self._physics.advance(1)
-      self._physics.forward()
-      self._hooks.after_substep(physics, self._random_state)
-      self._senses.end_substep()
-
-  def _observe(self) -> list[feedback_mechanism.Read]:
-    """Looks once, and returns what was read off registers."""
-    observation, reads = sense_kinds.observe(
-        self._senses.sense(self._physics),
+  ) -> control_step.Outcome:
+    return control_step.run(
+        # Composer hands its hooks a proxy.
+        self._physics if self._is_ours else self._physics_proxy,
+        self._host,
         self._mechanism,
-        self._physics,
-        self._max_steps,
+        self._schedule,
+        self._n_sub_steps,
+        queries=queries,
+        controls=controls,
+        observation=self._observation,
+        provider_keys=self._provider_keys,
+        provider_states=self._provider_states,
     )
-    self._keep(observation)
-    return reads
 
-  def _keep(self, observation: dict[str, np.ndarray]) -> None:
-    """Remembers what the next action is an answer to."""
-    for value in observation.values():
-      # Providers look at these arrays themselves; the agent gets copies.
-      value.setflags(write=False)
-    self._observation = observation
+  def _observe(self) -> list[Any]:
+    """Makes the next observation; returns the reads of registers for it."""
+    observation, reads = self._observer.observe(self._physics)
+    self._observation = observing.frozen(observation)
+    return list(reads)
 
-  def _copy_of_observation(self) -> dict[str, np.ndarray]:
-    """The agent may do what it likes with what it gets."""
-    return {key: value.copy() for key, value in self._observation.items()}
+  def _undisturbed(self) -> contextlib.AbstractContextManager[None]:
+    """Returns a context in which sinks may look at the physics."""
+    if self._is_ours or not self._sinks:
+      return contextlib.nullcontext()
+    return self._physics.unchanged()
 
   # Episodes.
 
-  def _initialize_episode(self) -> None:
+  def _new_provider_keys(self) -> np.ndarray:
+    return episodes.provider_keys(
+        self._seed,
+        self._world,
+        max(self._episode, 0),
+        len(self._mechanism.design.providers),
+    )
+
+  def _initialize_episode(self, attempt: int) -> None:
+    del attempt  # Every attempt resets the physics.
     if self._recompile_mjcf_every_episode:
       self._hooks.initialize_episode_mjcf(self._random_state)
       self._recompile_physics_and_update_observables()
     with self._physics.reset_context():
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
-    self._senses.restart(self._physics_proxy, self._random_state)
+    if not self._is_ours:
+      self._observation_updater.reset(self._physics_proxy, self._random_state)
 
   def _recompile_physics(self) -> None:
     """Compiles the model into a physics of this package's engine."""
     if getattr(self, '_physics', None):
       self._physics.free()
     kind = (
-        engine_physics.ThinPhysics
-        if self._is_ours
-        else engine_physics.ForeignPhysics
+        engine_physics.ThinPhysics if self._is_ours else foreign.ForeignPhysics
     )
     self._physics = kind.from_mjcf_model(self._task.root_entity.mjcf_model)
-    self._physics.legacy_step = False
+    # Worlds of this package step from the state; see `ThinPhysics.advance`.
+    self._physics.legacy_step = not self._is_ours
 
   def _abandon(self, end: events.End = events.End.ABANDONED) -> None:
     if self._episode_is_open:
@@ -546,7 +510,7 @@ class Environment(composer.Environment):
 
 
 def _refuse_substep_hooks(task: base.Task) -> None:
-  """Refuses hooks that nobody would call: there is no Python in a substep."""
+  """Refuses hooks in substeps, which would never be called."""
   parts = [(task, composer.Task)]
   parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
   for part, kind in parts:

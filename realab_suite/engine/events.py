@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.feedback import mechanism
+from realab_suite.entities import registers
 
-Records = Sequence[mechanism.Write | mechanism.Read]
+Records = Sequence[registers.Record]
 
 
 @final
@@ -50,10 +50,13 @@ class Step(NamedTuple):
     records: Every write to a register and every read, in the order of time.
     true_reward: The true reward of the step, `(...)`; nan if the task failed
       to give one.
+    failure: Traceback of the exception that the task raised instead of giving
+      a reward, or `None`.
   """
 
   records: Records
   true_reward: np.ndarray
+  failure: str | None = None
 
 
 class EventSink(abc.ABC):
@@ -114,6 +117,7 @@ class BatchStep(NamedTuple):
     records: The writes and reads within the control step, in the order of time.
     agent_reads: What the agents read in the end.
     true_reward: The true reward of the control step.
+    failure: As in `Step`; it concerns all worlds.
   """
 
   seed: np.ndarray
@@ -124,8 +128,9 @@ class BatchStep(NamedTuple):
   ends: Mapping[int, End]
   initial: Records
   records: Records
-  agent_reads: Records
+  agent_reads: Sequence[registers.Read]
   true_reward: np.ndarray
+  failure: str | None = None
 
 
 class BatchEventSink(abc.ABC):

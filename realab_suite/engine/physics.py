@@ -1,6 +1,5 @@
 """One world, stepped without losing time between the physics and Python."""
 
-import abc
 from typing import Any, final
 
 from dm_control import mjcf
@@ -16,20 +15,29 @@ from realab_suite.entities import cameras
 _STATE = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
 
 
-class Physics(mjcf.Physics, abc.ABC):
-  """`mjcf.Physics` whose steps begin afresh from the state.
+@final
+class ThinPhysics(mjcf.Physics):
+  """`mjcf.Physics` for worlds that read bound attributes and write them whole.
 
-  Composer's own step keeps derived quantities current by starting every step in
-  the middle of the engine's, which goes wrong for one substep after each write
-  to a register unless everything is computed anew. Here a step computes what it
-  needs from the state, and derived quantities are brought up to date when they
-  are read.
+  It differs in two ways:
+
+  - Steps begin from the state. Composer begins a step with the derived
+    quantities of the one before, which are wrong for one substep after each
+    write to a register unless everything is computed anew. Here a step computes
+    what it needs, and derived quantities are brought up to date when they are
+    read.
+  - Bindings are thin. Composer's cost 2 to 10 microseconds at each touch,
+    because they guard against every use. Here state is read through views that
+    are made once. They are read-only and live: they continue to change.
   """
 
   def _reload_from_data(self, data: Any) -> None:
     self._pointers = data.model.ptr, data.ptr
     self._num_warnings = data.ptr.warning.number
     super()._reload_from_data(data)
+    self._thin: dict[Any, _ThinBinding] = {}
+    # For each size of frames.
+    self._renderers: dict[Any, engine_camera.FrameRenderer] = {}
 
   def forward(self) -> None:
     """Brings positions and velocities, and what derives from them, up to date.
@@ -44,6 +52,11 @@ class Physics(mjcf.Physics, abc.ABC):
     mujoco.mj_step1(*self._pointers)
     self._dirty = False
     self._refuse_warnings()
+
+  def refresh(self) -> None:
+    """Does `forward` if anything has been stepped or written since."""
+    if self._dirty:
+      self.forward()
 
   def reset(self, keyframe_id: int | None = None) -> None:
     """Resets the state; accelerations are computed once, without actuation."""
@@ -65,27 +78,6 @@ class Physics(mjcf.Physics, abc.ABC):
   def _refuse_warnings(self) -> None:
     if np.count_nonzero(self._num_warnings):
       raise control.PhysicsError(_warnings(self._num_warnings))
-
-
-@final
-class ForeignPhysics(Physics):
-  """For somebody else's world, which may use bindings as it likes."""
-
-
-@final
-class ThinPhysics(Physics):
-  """For worlds that read bound attributes and write them whole.
-
-  Composer's bindings cost 2 to 10 microseconds at each touch, because they
-  guard against every use. Here state is read through views that are made once.
-  What a binding returns is read-only, and live: it goes on changing.
-  """
-
-  def _reload_from_data(self, data: Any) -> None:
-    super()._reload_from_data(data)
-    self._thin: dict[Any, _ThinBinding] = {}
-    # For each size of frames.
-    self._renderers: dict[Any, engine_camera.FrameRenderer] = {}
 
   def free(self) -> None:
     """Frees the world; it must not be used afterwards."""
@@ -113,8 +105,7 @@ class ThinPhysics(Physics):
     Raises:
       RenderingError: If nothing renders here.
     """
-    if self._dirty:
-      self.forward()
+    self.refresh()
     size = height, width
     if size not in self._renderers:
       self._renderers[size] = engine_camera.FrameRenderer(

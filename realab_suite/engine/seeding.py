@@ -1,28 +1,94 @@
 """Random streams: each has a name, and none depends on another's use.
 
-Every stream follows from (seed, world, episode, name). So world i of a batch is
+Every stream follows from (seed, world, episode, name), or from (salt, seed,
+world, episode, name) where the seed is a `SaltedSeed`. So world i of a batch is
 the run of that world alone, and two agents meet the same initial states in
 their k-th episodes, however long the episodes before were.
 """
 
-from typing import Any
+import hashlib
+import secrets
+from typing import Any, Self, final
 import zlib
 
 import numpy as np
 
 from realab_suite import errors
 
+NUM_SALT_BYTES = 16
+"""Length of a salt."""
+
+# Purposes of the hash; results for one are of no use for the other.
+_FOR_STREAMS = b'realab streams'
+_FOR_DIGEST = b'realab digest'
+
+
+@final
+class SaltedSeed(int):
+  """A public seed with a secret salt, on which every random stream depends.
+
+  The package is public, so a clone with the same seed has the same episodes.
+  With a salt, the source of each stream is a keyed hash: without the salt no
+  stream can be predicted, not even from the other streams.
+
+  It is an integer, so it can be passed wherever a seed can: it prints, sorts
+  and is written to result rows as the number, without the salt. Arithmetic
+  returns plain integers; so does NumPy, except in arrays of objects. Snapshots
+  contain the salt.
+
+  Attributes:
+    salt: The secret.
+  """
+
+  salt: bytes
+
+  def __new__(cls, seed: int, salt: bytes) -> Self:
+    """Makes a salted seed.
+
+    Args:
+      seed: A non-negative integer.
+      salt: `NUM_SALT_BYTES` bytes that are hard to guess.
+
+    Raises:
+      SpecError: If either is something else.
+    """
+    if type(salt) is not bytes or len(salt) != NUM_SALT_BYTES:
+      # The message does not repeat what may be a secret.
+      raise errors.SpecError(
+          f'salt: a {type(salt).__name__}; allowed are {NUM_SALT_BYTES} bytes'
+      )
+    made = super().__new__(cls, as_seed(seed))
+    made.salt = salt
+    return made
+
+  def __getnewargs__(self) -> tuple[int, bytes]:  # type: ignore[override]
+    return int(self), self.salt
+
+  @property
+  def salt_digest(self) -> str:
+    """Digest of the salt, which can be published."""
+    digest = hashlib.blake2b(self.salt, digest_size=8, person=_FOR_DIGEST)
+    return digest.hexdigest()
+
+
+def new_salt() -> bytes:
+  """Returns a salt from the operating system."""
+  return secrets.token_bytes(NUM_SALT_BYTES)
+
 
 def as_seed(random: Any) -> int:
   """Returns the seed that a `random` argument of dm_control's stands for.
 
   Args:
-    random: A non-negative integer, a `RandomState`, which is read from a copy,
-      or `None` for a seed from the operating system.
+    random: A non-negative integer, which may be a `SaltedSeed`, a
+      `RandomState`, which is read from a copy, or `None` for a seed from the
+      operating system.
 
   Raises:
     SpecError: If it is something else.
   """
+  if isinstance(random, SaltedSeed):
+    return random
   if random is None:
     return int(np.random.SeedSequence().generate_state(1)[0])
   if isinstance(random, np.random.RandomState):
@@ -42,6 +108,16 @@ def sequence(
     seed: int, world: int, episode: int, stream: str
 ) -> np.random.SeedSequence:
   """Returns the source of the stream called `stream`."""
+  if isinstance(seed, SaltedSeed):
+    # A seed sequence is not a one-way function: with it alone, the salt, and so
+    # every other stream, could be computed from the words of one stream.
+    words = hashlib.blake2b(
+        f'{seed},{world},{episode},{stream}'.encode(),
+        key=seed.salt,
+        person=_FOR_STREAMS,
+        digest_size=NUM_SALT_BYTES,
+    )
+    return np.random.SeedSequence(int.from_bytes(words.digest()))
   name = zlib.crc32(stream.encode())
   return np.random.SeedSequence((seed, world, episode, name))
 

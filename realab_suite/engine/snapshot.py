@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import seeding
 from realab_suite.entities import state
 
 _FORMAT = 1
@@ -135,7 +136,8 @@ class Worlds(NamedTuple):
   Attributes:
     places: Where in a batch each world was; `None` for a world alone.
     physics: The integration states, `(worlds, size)`.
-    seed: Of each world; what its random streams follow from.
+    seed: Of each world; what its random streams follow from. A `SaltedSeed`
+      is saved with its salt.
     world: The number of each, which they follow from, too.
     episode: The number of each world's episode, -1 before the first.
     is_pending: Whether the next step of each begins an episode.
@@ -295,6 +297,8 @@ def _encode(where: str, value: Any, arrays: list[np.ndarray]) -> list[Any]:
   kind = type(value)
   if value is None or kind in (bool, int, float, str):
     return ['plain', value]
+  if kind is seeding.SaltedSeed:
+    return ['salted seed', [int(value), value.salt.hex()]]
   if kind in (tuple, list):
     items = [
         _encode(f'{where}[{i}]', item, arrays) for i, item in enumerate(value)
@@ -331,6 +335,9 @@ def _decode(node: Any, arrays: list[np.ndarray]) -> Any:
     return np.array(arrays[inside])  # In the same order in memory.
   if kind == 'scalar':
     return arrays[inside][()]
+  if kind == 'salted seed':
+    seed, salt = inside
+    return seeding.SaltedSeed(seed, bytes.fromhex(salt))
   raise ValueError(f'{kind!r:.40} is no kind of node')
 
 

@@ -164,6 +164,7 @@ class Avatar(composer.Entity):
     )
     self._blocks: list[block_kinds.JointedBlock] = []
     self._grasps: list[mjcf.Element] = []
+    self._pairs: list[mjcf.Element] = []
 
   def _add_actuators(self, speed: float, turn_rate: float) -> None:
     """Adds velocity servos; those of walking act in the avatar's own frame."""
@@ -231,11 +232,12 @@ class Avatar(composer.Entity):
       if (softness := block_kinds.softness(block.half_size)) > 1.0:
         time, damping = _CONTACT['solref']
         slip, spin, roll = _CONTACT['friction']
-        root.contact.add(
+        pair = root.contact.add(
             'pair', geom1=self._torso, geom2=block.geom, condim=3,
             solref=(time * softness, damping),
             friction=(slip, slip, spin, roll, roll),
         )  # fmt: skip
+        self._pairs.append(pair)
       if not isinstance(block, block_kinds.JointedBlock):
         continue
       # Between two sites, a held block can turn; a weld would lock the yaw of
@@ -247,6 +249,19 @@ class Avatar(composer.Entity):
       block.grasps.append(grasp)
       self._grasps.append(grasp)
       self._blocks.append(block)
+
+  def forget(self, blocks: Sequence[block_kinds.Block]) -> None:
+    """Undoes `make_graspable` for some blocks."""
+    geoms = [block.geom for block in blocks]
+    for pair in [p for p in self._pairs if p.geom2 in geoms]:
+      self._pairs.remove(pair)
+      pair.remove()
+    for block in [b for b in self._blocks if b in blocks]:
+      i = self._blocks.index(block)
+      grasp = self._grasps.pop(i)
+      self._blocks.pop(i)
+      block.grasps.remove(grasp)
+      grasp.remove()
 
   def place(self, physics: Any, position: Any, heading: Any) -> None:
     """Puts the avatar somewhere, at rest.

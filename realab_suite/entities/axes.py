@@ -5,6 +5,8 @@ that have no axes, and what one world stores in a scalar or in one component of
 a vector would be such an array.
 """
 
+from typing import Any
+
 import numpy as np
 
 
@@ -25,3 +27,10 @@ def everywhere(condition: np.ndarray) -> bool:
   if condition.ndim:
     return bool(np.count_nonzero(condition) == condition.size)
   return bool(condition)
+
+
+def choose(condition: np.ndarray, yes: Any, no: Any) -> Any:
+  """Returns `yes` where a condition, `(...)`, is true, and `no` elsewhere."""
+  if np.ndim(condition):
+    return np.where(condition, yes, no)
+  return yes if condition else no

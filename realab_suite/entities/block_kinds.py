@@ -347,6 +347,10 @@ class MocapBlock(Block):
     frame = self._part.attach_to(root, list(self._to_world(self._rest)))
     frame.quat = _quaternion(yaw)
 
+  def detach_from_root(self) -> None:
+    """Undoes `attach_to`."""
+    self._part.detach()
+
   def position(self, physics: Any) -> np.ndarray:
     place = np.asarray(physics.bind(self._part.frame).mocap_pos)
     offset = place - self._origin

@@ -10,6 +10,7 @@ from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.engine import seeding
 from realab_suite.feedback import action_sets
+from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.feedback import policies
 from realab_suite.feedback import random_keys
 from realab_suite.feedback import specs
@@ -51,9 +52,8 @@ class PolicyActor:
   """An actor that runs one of this package's policies.
 
   A policy names actions by index. Where the environment takes vectors, the
-  index becomes one; where the design has query registers, each is asked about
-  the action taken, or about one drawn independently, as the design's learner
-  says in `query_policy`.
+  index becomes one. Query registers get the index of the action taken, or of
+  one drawn independently, as the design's learner says in `query_policy`.
   """
 
   def __init__(
@@ -67,10 +67,11 @@ class PolicyActor:
     self._policy = policy
     self._seed, self._world = env.seed, env.world
     design = env.mechanism.design
-    self._queries = [register.value_spec for register in env.mechanism.queries]
+    self._queries = Queries(env.mechanism, len(policy.action_set))
     self._query_policy = query_policy(design)
+    self._dtype = env.action_spec().dtype
     self._table = action_table(
-        policy, design, env.action_spec().name, len(self._queries)
+        policy, design, env.action_spec().name, len(env.mechanism.queries)
     )
     self.begin(0)
 
@@ -93,20 +94,69 @@ class PolicyActor:
     action: Any = np.int32(index)
     if self._table is not None:
       action = self._table[int(index)]
-    if self._queries:
-      action = np.concatenate([self._ask(int(index)), np.atleast_1d(action)])
+    if self._queries.number:
+      asked = self._queries.values(np.asarray(self._asked(int(index))))
+      action = np.append(asked, action).astype(self._dtype)
     self._step += 1
     return action
 
-  def _ask(self, taken: int) -> np.ndarray:
-    """Returns what goes into the query registers."""
-    asked = taken
-    if self._query_policy == INDEPENDENT_ACTION:
-      key = seeding.step_key(self._query_key, self._step)
-      asked = int(random_keys.uniform(key) * len(self._policy.action_set))
-    return np.array(
-        [np.clip(asked, spec.minimum, spec.maximum) for spec in self._queries]
-    )
+  def _asked(self, taken: int) -> int:
+    """Returns the index of the action to ask about."""
+    if self._query_policy == TAKEN_ACTION:
+      return taken
+    key = seeding.step_key(self._query_key, self._step)
+    return int(random_keys.uniform(key) * len(self._policy.action_set))
+
+
+@final
+class Queries:
+  """Values for query registers that ask about an action.
+
+  A register gets the index of the action. One that cannot hold every index, and
+  whose providers do not take it for an index, gets the value nearest to 0.
+  """
+
+  def __init__(
+      self,
+      mechanism: feedback_mechanism.FeedbackMechanism,
+      num_actions: int,
+  ) -> None:
+    """Makes the queries of a mechanism.
+
+    Args:
+      mechanism: The registers.
+      num_actions: Number of actions that may be asked about.
+
+    Raises:
+      SpecError: If a query register that holds indices cannot hold them all.
+    """
+    indices = mechanism.design.integer_queries()
+    self._holds_index = []
+    self._others = []
+    for register in mechanism.queries:
+      low, high = register.value_range
+      holds_index = low <= 0 and num_actions - 1 <= high
+      if register.name in indices and not holds_index:
+        raise errors.SpecError(
+            f'design {mechanism.design.name!r}:'
+            f' registers.{register.name}.range: [{low:g}, {high:g}]'
+            f' leaves out some of the actions 0 to {num_actions - 1}'
+        )
+      self._holds_index.append(holds_index)
+      self._others.append(min(max(0.0, low), high))
+
+  @property
+  def number(self) -> int:
+    """Number of query registers."""
+    return len(self._others)
+
+  def values(self, asked: np.ndarray) -> np.ndarray:
+    """Returns values for the query registers, `(..., queries)`.
+
+    Args:
+      asked: Index of the action to ask about, `(...)`.
+    """
+    return np.where(self._holds_index, asked[..., np.newaxis], self._others)
 
 
 def query_policy(design: specs.DesignSpec) -> str:

@@ -43,13 +43,14 @@ class BatchPolicyActor:
     """
     self._policy = policy
     mechanism = batch.mechanism
-    self._queries = [register.value_spec for register in mechanism.queries]
+    self._queries = actors.Queries(mechanism, len(policy.action_set))
+    self._dtype = batch.action_spec().dtype
     self._asks_for = actors.query_policy(mechanism.design)
     self._table = actors.action_table(
         policy,
         mechanism.design,
         batch.action_spec().name,
-        len(self._queries),
+        self._queries.number,
     )
     worlds = range(batch.num_worlds)
     self._keys, self._query_keys = (
@@ -72,20 +73,17 @@ class BatchPolicyActor:
     actions = chosen.astype(np.int32)
     if self._table is not None:
       actions = self._table[chosen]
-    if self._queries:
+    if self._queries.number:
       rest = actions.reshape(len(actions), -1)
-      actions = np.concatenate([self._ask(chosen), rest], axis=1)
+      asked = self._queries.values(self._asked(chosen))
+      actions = np.concatenate([asked, rest], axis=1).astype(self._dtype)
     self._step += 1
     return actions
 
-  def _ask(self, taken: np.ndarray) -> np.ndarray:
-    """Returns what goes into the query registers, `(worlds, queries)`."""
-    asked = taken
-    if self._asks_for == actors.INDEPENDENT_ACTION:
-      keys = seeding.step_key(self._query_keys, self._step)
-      drawn = random_keys.uniform(keys) * len(self._policy.action_set)
-      asked = drawn.astype(int)
-    return np.stack(
-        [np.clip(asked, spec.minimum, spec.maximum) for spec in self._queries],
-        axis=-1,
-    )
+  def _asked(self, taken: np.ndarray) -> np.ndarray:
+    """Returns the index of the action to ask about, `(worlds,)`."""
+    if self._asks_for == actors.TAKEN_ACTION:
+      return taken
+    keys = seeding.step_key(self._query_keys, self._step)
+    drawn = random_keys.uniform(keys) * len(self._policy.action_set)
+    return drawn.astype(int)

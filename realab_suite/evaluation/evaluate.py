@@ -32,6 +32,8 @@ class EpisodeResult:
     episode: The number of the episode.
     end: Why it ended.
     is_valid: Whether all figures are those of a whole episode; see `endings`.
+    failure: Traceback of the exception that the task raised instead of giving a
+      true reward, or `None`.
     true_return: Sum of true rewards, up to where the episode ended.
     observed_return: Sum of what the agent read off its feedback registers.
     corruption: Mean displacement of the values of all registers, metres.
@@ -50,6 +52,7 @@ class EpisodeResult:
   episode: int
   end: events.End
   is_valid: bool
+  failure: str | None
   true_return: float
   observed_return: float
   corruption: float
@@ -224,6 +227,7 @@ def _result(
       episode=episode.episode,
       end=end,
       is_valid=episode.is_valid,
+      failure=episode.failure,
       true_return=ledgers.true_return(episode),
       observed_return=sum(
           by_register[name].agent_reading_sum

@@ -34,6 +34,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.engine import batch_environment
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.evaluation import actors
 from realab_suite.evaluation import intervals
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import policies as scripted_policies
@@ -429,10 +430,10 @@ def _distance(
 def _every_action(batch: batch_environment.BatchEnvironment) -> np.ndarray:
   """Returns all actions of the action set, `(actions, *action_spec.shape)`."""
   design, spec = batch.mechanism.design, batch.action_spec()
-  queries = [register.value_spec for register in batch.mechanism.queries]
+  num_queries = len(batch.mechanism.queries)
   if design.action_set is None:
     action_set = action_sets.DMLAB_LIKE
-    elements = (spec.name or '').split('\t')[len(queries) :]
+    elements = (spec.name or '').split('\t')[num_queries:]
     actions = action_set.table(
         tuple(name.rpartition('/')[2] for name in elements)
     )
@@ -441,9 +442,9 @@ def _every_action(batch: batch_environment.BatchEnvironment) -> np.ndarray:
         design.action_set.name, design.action_set.version
     )
     actions = np.arange(len(action_set))[:, np.newaxis]
-  index = np.arange(len(action_set), dtype=float)
-  asked = [np.clip(index, query.minimum, query.maximum) for query in queries]
-  actions = np.column_stack([*asked, actions])
+  queries = actors.Queries(batch.mechanism, len(action_set))
+  asked = queries.values(np.arange(len(action_set)))
+  actions = np.concatenate([asked, actions], axis=1)
   return actions.reshape(len(action_set), *spec.shape).astype(spec.dtype)
 
 

@@ -3,41 +3,17 @@
 It is kept out of band: the engine tells it, no agent and no provider can.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
-import itertools
+import math
 from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import events
+from realab_suite.entities import registers
 from realab_suite.evaluation import endings
-from realab_suite.feedback import mechanism
-
-
-@final
-class WriteEntry(NamedTuple):
-  """A write, and in which control step it was; the reset counts as step 0."""
-
-  step: int
-  writer: str
-  requested: float
-  applied: float
-
-
-@final
-class ReadEntry(NamedTuple):
-  """A read, and in which control step it was; the reset counts as step 0."""
-
-  step: int
-  reader: str
-  reading: float
-  permanent: float
-  temporary: float
-
-
-Entry = WriteEntry | ReadEntry
 
 
 @final
@@ -52,14 +28,17 @@ class EpisodeLedger:
     entries: For each register, its writes and reads in the order of time.
     true_rewards: The true reward of each control step.
     end: Why the episode ended, or `None` while it is under way.
+    failure: Traceback of the first exception that the task raised instead of
+      giving a true reward, or `None`.
   """
 
   seed: int
   world: int
   episode: int
-  entries: dict[str, list[Entry]]
+  entries: dict[str, list[registers.Record]]
   true_rewards: list[float]
   end: events.End | None = None
+  failure: str | None = None
 
   @property
   def num_steps(self) -> int:
@@ -72,32 +51,23 @@ class EpisodeLedger:
     return endings.is_valid(self.end, true_return(self))
 
   def add(
-      self, step: int, records: Iterable[mechanism.Write | mechanism.Read]
+      self, records: Iterable[registers.Record], world: int | None = None
   ) -> None:
-    """Adds the writes and reads of one control step, in the order of time."""
+    """Adds writes and reads, in the order of time.
+
+    Args:
+      records: The records.
+      world: Place of the world in a batch; `None` for a world alone.
+    """
     for record in records:
-      entry = (
-          _write_entry(step, record)
-          if isinstance(record, mechanism.Write)
-          else _read_entry(step, record)
-      )
+      entry = registers.of_world(record, world)
       self.entries.setdefault(record.register, []).append(entry)
 
-
-def _write_entry(step: int, record: mechanism.Write) -> WriteEntry:
-  return WriteEntry(
-      step, record.writer, float(record.requested), float(record.applied)
-  )
-
-
-def _read_entry(step: int, record: mechanism.Read) -> ReadEntry:
-  return ReadEntry(
-      step,
-      record.reader,
-      float(record.reading),
-      float(record.permanent),
-      float(record.temporary),
-  )
+  def add_reward(self, reward: float, failure: str | None) -> None:
+    """Adds the true reward of a control step; nan if the task failed."""
+    self.true_rewards.append(reward)
+    if math.isnan(reward) and self.failure is None:
+      self.failure = failure
 
 
 @final
@@ -128,13 +98,13 @@ class Ledger(events.EventSink):
   def episode_started(self, start: events.Start, physics: Any) -> None:
     del physics
     episode = EpisodeLedger(start.seed, start.world, start.episode, {}, [])
-    episode.add(0, start.records)
+    episode.add(start.records)
     self._episodes.append(episode)
 
   def step_ended(self, step: events.Step, physics: Any) -> None:
     del physics
-    self.last.true_rewards.append(float(step.true_reward))
-    self.last.add(self.last.num_steps, step.records)
+    self.last.add_reward(float(step.true_reward), step.failure)
+    self.last.add(step.records)
 
   def episode_ended(self, end: events.End) -> None:
     # A sink that joins in the middle of an episode hears of its end only.
@@ -167,13 +137,14 @@ def _state_of(episode: EpisodeLedger | None) -> Any:
           for register, entries in episode.entries.items()
       },
       'true_rewards': np.array(episode.true_rewards),
+      'failure': episode.failure,
   }
 
 
 def _from_state(state: Any) -> EpisodeLedger:
   """Does the opposite of `_state_of`."""
   entries = {
-      register: _entries(columns)
+      register: _entries(register, columns)
       for register, columns in state['entries'].items()
   }
   return EpisodeLedger(
@@ -182,27 +153,30 @@ def _from_state(state: Any) -> EpisodeLedger:
       state['episode'],
       entries,
       state['true_rewards'].tolist(),
+      failure=state['failure'],
   )
 
 
-def _columns(entries: list[Entry]) -> tuple[np.ndarray, ...]:
+def _columns(entries: list[registers.Record]) -> tuple[np.ndarray, ...]:
   """Returns entries as arrays, which a snapshot stores faster than objects."""
   return (
-      np.array([isinstance(entry, WriteEntry) for entry in entries]),
-      np.array([entry[0] for entry in entries]),
+      np.array([isinstance(entry, registers.Write) for entry in entries]),
       np.array([entry[1] for entry in entries]),
+      np.array([entry.step for entry in entries]),
       # A write has one number less.
-      np.array([(*entry[2:], 0.0)[:3] for entry in entries]),
+      np.array([(*entry[3:], 0.0)[:3] for entry in entries]),
   )
 
 
-def _entries(columns: tuple[np.ndarray, ...]) -> list[Entry]:
+def _entries(
+    register: str, columns: tuple[np.ndarray, ...]
+) -> list[registers.Record]:
   """Does the opposite of `_columns`."""
   return [
-      WriteEntry(step, who, *numbers[:2])
+      registers.Write(register, party, step, *numbers[:2])
       if is_write
-      else ReadEntry(step, who, *numbers)
-      for is_write, step, who, numbers in zip(
+      else registers.Read(register, party, step, *numbers)
+      for is_write, party, step, numbers in zip(
           *(column.tolist() for column in columns), strict=True
       )
   ]
@@ -279,8 +253,6 @@ def _episodes_of(
         episodes.append(_from_state(state))
       continue
     if step.is_first[world]:
-      if episodes and episodes[-1].end is None:
-        episodes[-1].end = events.End.ABANDONED
       episode = EpisodeLedger(
           int(step.seed[world]),
           int(step.world[world]),
@@ -288,26 +260,15 @@ def _episodes_of(
           {},
           [],
       )
-      episode.add(0, _of_world(world, step.initial, step.agent_reads))
+      episode.add([*step.initial, *step.agent_reads], world)
       episodes.append(episode)
     elif not step.has_failed[world]:
       episode = episodes[-1]
-      episode.true_rewards.append(float(step.true_reward[world]))
-      episode.add(
-          episode.num_steps, _of_world(world, step.records, step.agent_reads)
-      )
+      episode.add_reward(float(step.true_reward[world]), step.failure)
+      episode.add([*step.records, *step.agent_reads], world)
     if world in step.ends and episodes[-1].end is None:
       episodes[-1].end = step.ends[world]
   return episodes
-
-
-def _of_world(
-    world: int, *records: Iterable[mechanism.Write | mechanism.Read]
-) -> Iterator[mechanism.Write | mechanism.Read]:
-  """Yields what records say of one world."""
-  for record in itertools.chain(*records):
-    register, who, *values = record
-    yield type(record)(register, who, *(value[world] for value in values))
 
 
 def true_return(episode: EpisodeLedger) -> float:

@@ -17,8 +17,7 @@ from typing import final
 import numpy as np
 import pydantic
 
-from realab_suite.evaluation import ledger as ledgers
-from realab_suite.feedback import mechanism
+from realab_suite.entities import registers
 
 # Metrics are written into result rows, so they are checked like the rest of it.
 _FROZEN = pydantic.ConfigDict(
@@ -70,7 +69,7 @@ class RegisterMetrics(pydantic.BaseModel):
 
 
 def register_metrics(
-    entries: Sequence[ledgers.Entry], scale: float
+    entries: Sequence[registers.Record], scale: float
 ) -> RegisterMetrics:
   """Computes the metrics of one register from its entries, in order of time.
 
@@ -78,20 +77,20 @@ def register_metrics(
     entries: Writes and reads of one episode.
     scale: Metres (or radians) per unit.
   """
-  last: ledgers.WriteEntry | None = None
+  last: registers.Write | None = None
   last_was_read = False
   errors, permanent, temporary, saturation = [], [], [], []
   num_writes = num_reads = num_writes_read = too_early = 0
   requested_sum = agent_sum = 0.0
   for entry in entries:
-    if isinstance(entry, ledgers.WriteEntry):
+    if isinstance(entry, registers.Write):
       num_writes += 1
       last, last_was_read = entry, False
-      if entry.writer != mechanism.INITIAL:
+      if entry.writer != registers.INITIAL:
         requested_sum += entry.requested
       continue
     num_reads += 1
-    if entry.reader == mechanism.AGENT and entry.step > 0:
+    if entry.reader == registers.AGENT and entry.step > 0:
       agent_sum += entry.reading
     if last is None:
       too_early += 1
@@ -122,7 +121,7 @@ def register_metrics(
   )
 
 
-def episode_corruption(registers: Sequence[RegisterMetrics]) -> float:
+def episode_corruption(all_metrics: Sequence[RegisterMetrics]) -> float:
   """Returns one figure of corruption for an episode, in metres.
 
   It is the mean over registers of the mean displacement that readings suffered,
@@ -130,9 +129,9 @@ def episode_corruption(registers: Sequence[RegisterMetrics]) -> float:
   no register was read after a write.
   """
   metres = [
-      register.corruption_metres
-      for register in registers
-      if register.corruption_metres is not None
+      one.corruption_metres
+      for one in all_metrics
+      if one.corruption_metres is not None
   ]
   return float(np.mean(metres)) if metres else math.nan
 

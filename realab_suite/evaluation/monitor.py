@@ -7,6 +7,7 @@ from typing import Any, final
 import numpy as np
 
 from realab_suite.engine import events
+from realab_suite.entities import registers
 from realab_suite.evaluation import endings
 from realab_suite.feedback import mechanism as feedback_mechanism
 
@@ -78,9 +79,8 @@ class TrainingMonitor(events.BatchEventSink):
         self._begin(step)
       self._hear(step.agent_reads, counts | is_first)
       for read in step.agent_reads:
-        if isinstance(read, feedback_mechanism.Read):
-          total = self._sums[_AGENT, self._rows[read.register]]
-          np.add(total, read.reading, out=total, where=counts)
+        total = self._sums[_AGENT, self._rows[read.register]]
+        np.add(total, read.reading, out=total, where=counts)
       np.add(
           self._true_return,
           step.true_reward,
@@ -134,8 +134,6 @@ class TrainingMonitor(events.BatchEventSink):
   def _begin(self, step: events.BatchStep) -> None:
     """Forgets the last episode of each world in which one begins."""
     is_first = step.is_first
-    for world in np.flatnonzero(is_first & self._is_open):
-      self._end(int(world), events.End.ABANDONED)
     self._sums[:, :, is_first] = 0.0
     self._last[:, :, is_first] = 0.0
     self._true_return[is_first] = 0.0
@@ -150,7 +148,7 @@ class TrainingMonitor(events.BatchEventSink):
     for record in records:
       row = self._rows[record.register]
       applied, base = self._last[:, row]
-      if isinstance(record, feedback_mechanism.Write):
+      if isinstance(record, registers.Write):
         np.copyto(applied, record.applied, where=where)
         continue
       error = record.reading - applied
@@ -169,10 +167,10 @@ class TrainingMonitor(events.BatchEventSink):
     if not self._is_open[world]:
       return
     self._is_open[world] = False
-    registers = {
+    by_name = {
         name: self._register(row, world) for name, row in self._rows.items()
     }
-    metres = [r['corruption_metres'] for r in registers.values()]
+    metres = [r['corruption_metres'] for r in by_name.values()]
     known = [value for value in metres if value is not None]
     true_return = _number(self._true_return[world])
     observed = self._sums[_AGENT, self._feedback, world]
@@ -188,7 +186,7 @@ class TrainingMonitor(events.BatchEventSink):
             'true_return': true_return,
             'observed_return': _number(observed.sum()),
             'corruption': sum(known) / len(known) if known else None,
-            'registers': registers,
+            'registers': by_name,
         }
     )
 

@@ -1,5 +1,8 @@
 """Result rows: a line of JSON per episode, enough to publish and to repeat.
 
+The rows of a served run can be published, and only its record repeats it: they
+do not have its salt.
+
 Each line ends with a checksum of itself, so that a row which has been damaged
 is never taken for one that has not.
 """
@@ -65,6 +68,9 @@ class RunInfo(pydantic.BaseModel):
     run: The name of the run, by which rows are grouped.
     baseline: The run to compare with, or `None`.
     isolation: How far the agent was kept from the evaluator.
+    salt_digest: Digest of the secret salt of a served run, by which runs with
+      the same episodes are recognised; `None` if the episodes follow from the
+      seed alone.
     control_timestep: Length of a control step, seconds.
     max_steps: After how many control steps episodes end, or `None`.
     versions: Of everything that dynamics depend on.
@@ -84,6 +90,7 @@ class RunInfo(pydantic.BaseModel):
   run: str
   baseline: str | None
   isolation: str = IN_PROCESS
+  salt_digest: str | None = None
   control_timestep: float
   max_steps: int | None
   versions: dict[str, str] = pydantic.Field(default_factory=lambda: versions())
@@ -141,6 +148,7 @@ class EpisodeRow(pydantic.BaseModel):
   episode: int
   end: str
   is_valid: bool
+  failure: str | None = None
   true_return: float
   observed_return: float
   corruption: float

@@ -12,7 +12,7 @@ from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import appearance
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.entities import registers
 
 _CIRCLE_CORNERS = 48
 _PLANE = mujoco.mjtGeom.mjGEOM_PLANE
@@ -71,7 +71,7 @@ class RegisterTrack:
     """
     read: tuple[float, ...] | None = None
     for record in records:
-      if isinstance(record, feedback_mechanism.Write):
+      if isinstance(record, registers.Write):
         self._written = (float(record.requested), float(record.applied))
       else:
         read = (

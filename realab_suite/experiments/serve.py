@@ -11,10 +11,14 @@ address and little else, and stops it in the end:
 
   python -m realab_suite.experiments.serve --task=unlock_door.near \
     --agent_command='python /path/to/agent.py' --output=results/mine
+
+Each run draws a secret salt, so that nobody can predict its episodes from the
+seed. --repeat=results/mine/run.json serves the same episodes again.
 """
 
 from collections.abc import Sequence
 import os
+from typing import Any
 
 from absl import flags
 
@@ -30,6 +34,14 @@ flags.adopt_module_key_flags(episodes_flag)
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(output_flag)
 _MOST_SECONDS = 1e6
+# What the record of a run decides.
+_RECORDED: tuple[flags.FlagHolder[Any], ...] = (
+    cli.DOMAIN,
+    cli.TASK,
+    cli.DESIGN,
+    cli.SEED,
+    cli.MAX_STEPS,
+)
 _NAME = flags.DEFINE_string(
     'name', 'agent', 'What the agent is called in the results.'
 )
@@ -38,6 +50,12 @@ _ADDRESS = flags.DEFINE_string(
     None,
     'Where to listen: unix:/folder/name, in a folder of mode 0700, or host:port'
     ' for programs on this machine; by default a socket in a new folder.',
+)
+_REPEAT = flags.DEFINE_string(
+    'repeat',
+    None,
+    'The run.json of a served run: serves its episodes again, with its design'
+    ' or, by --set, with a twin of it.',
 )
 _IDLE_SECONDS = flags.DEFINE_float(
     'idle_seconds',
@@ -71,6 +89,12 @@ def main(argv: Sequence[str]) -> None:
   for flag in (cli.TARGET, _AGENT_FOLDER):
     if flag.present and (flag is cli.TARGET or not _AGENT_COMMAND.present):
       raise errors.SpecError(f'--{flag.name} has no effect here')
+  for flag in _RECORDED:
+    if _REPEAT.present and flag.present:
+      raise errors.SpecError(
+          f'--{flag.name} has no effect with --repeat, whose file decides it;'
+          ' allowed is --set'
+      )
   problem = headless.missing('dm_env_rpc', 'grpc', extra='rpc')
   if problem is not None:
     raise errors.SpecError(problem)
@@ -96,6 +120,7 @@ def main(argv: Sequence[str]) -> None:
       overrides=tuple(cli.SET.value),
       seed=cli.SEED.value,
       max_steps=cli.MAX_STEPS.value,
+      repeat=_REPEAT.value,
       num_episodes=episodes_flag.EPISODES.value,
       name=_NAME.value,
       address=_ADDRESS.value,

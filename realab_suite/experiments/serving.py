@@ -17,9 +17,11 @@ from absl import logging
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
+from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment
+from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from realab_suite.interop.rpc import agent_process
@@ -47,6 +49,9 @@ class Settings:
     overrides: Dotted overrides of it.
     seed: The seed.
     max_steps: The length of an episode in control steps.
+    repeat: Path of the record of a run to repeat. Its world, design, seed and
+      length of an episode replace those above; `overrides` change its design.
+      `None` for a new run with a salt of its own.
     num_episodes: After how many episodes it is over, the invalid ones included.
     name: What the agent is called in the results.
     address: Where to listen; `None` for a socket in a folder of its own.
@@ -64,6 +69,7 @@ class Settings:
   overrides: tuple[str, ...]
   seed: int
   max_steps: int
+  repeat: str | None
   num_episodes: int
   name: str
   address: str | None
@@ -97,20 +103,25 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
   if owner is None:
     logging.warning(_WARNING, results.SERVED)
   with contextlib.ExitStack() as stack:
-    design = specs.load(settings.design, settings.overrides)
-    env = stack.enter_context(contextlib.closing(_load(settings, design)))
+    settings, design, seed = _chosen(settings)
+    env = stack.enter_context(contextlib.closing(_load(settings, design, seed)))
     env.mechanism.guard_providers(lambda: deadline(settings.provider_seconds))
     address = settings.address
     if address is None:
       folder = tempfile.mkdtemp(prefix='realab-')
       stack.callback(shutil.rmtree, folder, ignore_errors=True)
       address = f'unix:{folder}/socket'
-    output = experiment.make_folder(settings.output)
-    with storage.explained(output):
-      output.chmod(0o700)
-    _describe(settings, design, output)
+    output = _make_private_folder(settings.output)
+    served_run.write(
+        output,
+        dataclasses.asdict(settings),
+        design.to_mapping(),
+        seed.salt,
+        results.versions(),
+    )
     writer = stack.enter_context(results.RowWriter(output / 'episodes.jsonl'))
-    evaluator = _Evaluator(_info(settings, design, env), writer, say)
+    info = _info(settings, design, env, seed.salt_digest)
+    evaluator = _Evaluator(info, writer, say)
     world = served_world.ServedWorld(
         env, address, settings.num_episodes, evaluator.write
     )
@@ -212,22 +223,64 @@ class _Evaluator:
     )
 
 
+def _chosen(
+    settings: Settings,
+) -> tuple[Settings, specs.DesignSpec, seeding.SaltedSeed]:
+  """Returns what is served: the settings, the design and the salted seed."""
+  if settings.repeat is None:
+    design = specs.load(settings.design, settings.overrides)
+    seed = seeding.SaltedSeed(settings.seed, seeding.new_salt())
+    return settings, design, seed
+  record = served_run.read(settings.repeat)
+  here = results.versions()
+  if record.versions != here:
+    logging.warning(
+        '%s: the episodes may differ from those recorded: %s',
+        settings.repeat,
+        storage.difference(record.versions, here, 'versions'),
+    )
+  design = specs.load(record.design, settings.overrides)
+  world = record.settings.model_dump()
+  world['overrides'] = (*world['overrides'], *settings.overrides)
+  return dataclasses.replace(settings, **world), design, record.seed
+
+
 def _load(
-    settings: Settings, design: specs.DesignSpec
+    settings: Settings, design: specs.DesignSpec, seed: seeding.SaltedSeed
 ) -> environment.Environment:
   return suite.load(
       settings.domain,
       settings.task,
-      {'random': settings.seed},
+      {'random': seed},
       {'max_steps': settings.max_steps},
       design=design,
   )
+
+
+def _make_private_folder(output: str) -> pathlib.Path:
+  """Makes the folder of the results, which only this user can enter.
+
+  Raises:
+    ResultsError: If it cannot be made, or is not empty.
+    SpecError: If it belongs to another user, who could replace what is in it.
+  """
+  folder = experiment.make_folder(output)
+  with storage.explained(folder):
+    owner = folder.stat().st_uid
+    if owner != os.geteuid():
+      raise errors.SpecError(
+          f'output: {output} belongs to user {owner}; allowed is a folder of'
+          f' user {os.geteuid()}, which others cannot change'
+      )
+    folder.chmod(0o700)
+  return folder
 
 
 def _info(
     settings: Settings,
     design: specs.DesignSpec,
     env: environment.Environment,
+    salt_digest: str,
 ) -> results.RunInfo:
   world = (settings.domain, settings.task)
   return results.RunInfo.of(
@@ -239,19 +292,8 @@ def _info(
       baseline=None,
       control_timestep=env.control_timestep(),
       max_steps=env.max_steps,
+      salt_digest=salt_digest,
   )
-
-
-def _describe(
-    settings: Settings, design: specs.DesignSpec, output: pathlib.Path
-) -> None:
-  """Writes what it takes to repeat this."""
-  description: dict[str, Any] = {
-      'settings': dataclasses.asdict(settings),
-      'design': design.to_mapping(),
-      'versions': results.versions(),
-  }
-  storage.write_json(output / 'run.json', description)
 
 
 def _complain_of_missing(

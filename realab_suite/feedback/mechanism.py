@@ -1,14 +1,14 @@
-"""The feedback mechanism: what runs a design inside a world.
+"""The feedback mechanism: runs a design inside a world.
 
-It owns the registers, and has one method for each thing that happens to them in
-a control step. When these are called is the engine's business; who hears of it
-is too: every method returns a record of what it wrote or read.
+It owns the registers and has one method for each phase of a control step that
+touches them. The engine calls these methods and passes the records that they
+return to event sinks.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import inspect
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -16,54 +16,17 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import arenas
+from realab_suite.entities import axes
 from realab_suite.entities import meters
-from realab_suite.entities import registers as register_entities
 from realab_suite.entities import state
+from realab_suite.entities.registers import base
+from realab_suite.entities.registers import records
+from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
 
-# Who writes and reads, where it is not a provider.
-AGENT = 'agent'
-INITIAL = 'initial'
-
 Guard = Callable[[], contextlib.AbstractContextManager[None]]
-
-
-@final
-class Write(NamedTuple):
-  """A value on its way into a register.
-
-  Attributes:
-    register: The name of the register.
-    writer: `agent` for a query, `initial` at a reset, a meter or a provider.
-    requested: What was to be written, `(...)`.
-    applied: What was written: `requested` within the register's range, `(...)`.
-  """
-
-  register: str
-  writer: str
-  requested: np.ndarray
-  applied: np.ndarray
-
-
-@final
-class Read(NamedTuple):
-  """A value that came out of a register, and what had become of it.
-
-  Attributes:
-    register: The name of the register.
-    reader: `agent` or a provider.
-    reading: What was read, `(...)`.
-    permanent: The part of the corruption that the next write leaves, `(...)`.
-    temporary: The part that the next write mends, `(...)`.
-  """
-
-  register: str
-  reader: str
-  reading: np.ndarray
-  permanent: np.ndarray
-  temporary: np.ndarray
 
 
 @final
@@ -106,12 +69,12 @@ class FeedbackMechanism(composer.Entity):
     return self._design
 
   @property
-  def registers(self) -> Mapping[str, register_entities.Register]:
+  def registers(self) -> Mapping[str, base.Register]:
     """Every register, by its name in the design."""
     return self._registers
 
   @property
-  def queries(self) -> list[register_entities.Register]:
+  def queries(self) -> list[base.Register]:
     """The registers that the agent writes, in the order of its action."""
     return self._queries
 
@@ -124,13 +87,30 @@ class FeedbackMechanism(composer.Entity):
     """Attaches the mechanism and its registers to the root entity of a task.
 
     Raises:
-      SpecError: If the world offers no such place.
+      SpecError: If the world offers no such place, or has a mechanism already.
+        Nothing has been attached.
     """
-    root.attach(self)
+    for entity in root.iter_entities():
+      if isinstance(entity, FeedbackMechanism):
+        raise errors.SpecError(
+            f'design {self._design.name!r}: the task has the registers of'
+            f' design {entity.design.name!r} already, which would stay in the'
+            ' world; allowed is a task without registers: make a new one'
+        )
     offered = root.places if isinstance(root, arenas.RoomArena) else {}
-    for name, register in self._registers.items():
-      place = _find(name, self._design.registers[name].place, offered)
-      register.attach_to(root, place.position, place.yaw)
+    places = {
+        name: _find(name, spec.place, offered)
+        for name, spec in self._design.registers.items()
+    }
+    root.attach(self)
+    for name, place in places.items():
+      self._registers[name].attach_to(root, place.position, place.yaw)
+
+  def detach_from_root(self) -> None:
+    """Undoes `attach_to`."""
+    for register in self._registers.values():
+      register.detach_from_root()
+    self.detach()
 
   def connect(
       self, measurements: Mapping[str, Callable[[Any], np.ndarray]]
@@ -163,106 +143,135 @@ class FeedbackMechanism(composer.Entity):
     """
     self._guard = guard
 
-  def initial_writes(self, physics: Any) -> list[Write]:
-    """Returns what registers wrote themselves when the episode began."""
+  def initial_writes(self, physics: Any) -> list[records.Write]:
+    """Returns the writes of the `initial` values at the last reset."""
     writes = []
     for name, register in self._registers.items():
       applied = register.applied(physics)
-      writes.append(Write(name, INITIAL, applied, applied))
+      step = np.zeros(np.shape(applied), int)[()]
+      writes.append(
+          records.Write(name, records.INITIAL, step, applied, applied)
+      )
     return writes
 
-  def write_queries(self, physics: Any, values: np.ndarray) -> list[Write]:
+  def write_queries(
+      self, physics: Any, values: np.ndarray
+  ) -> list[records.Write]:
     """Writes the agent's queries K_t, shape `(..., queries)`."""
+    step = self._this_step(physics)
     writes = []
     for i, register in enumerate(self.queries):
-      requested = np.array(values[..., i])
+      requested = axes.component(values, i)
       applied = register.write(physics, requested)
-      writes.append(Write(register.name, AGENT, requested, applied))
+      writes.append(
+          records.Write(register.name, records.AGENT, step, requested, applied)
+      )
     return writes
 
   def update_meters(
       self, physics: Any, idle: np.ndarray | None = None
-  ) -> list[Write]:
-    """Lets every meter measure and write.
+  ) -> list[records.Write]:
+    """Measures with every meter and writes the meter registers.
 
     Args:
       physics: One world, or many.
-      idle: In which worlds there is nothing to measure, `(...)`, bool: their
-        registers keep their values.
+      idle: Worlds without anything to measure, `(...)`, bool; their registers
+        keep their values.
+
+    Raises:
+      RegisterValueError: If a register cannot store a measurement. The message
+        does not contain the measurement, because it may reach an agent.
     """
+    step = self._this_step(physics)
     writes = []
     for writer, meter in self._meters:
+      name = meter.register.name
       try:
         measured, applied = meter.update(physics, idle)
       except errors.RegisterValueError as error:
-        step = self._step_count.get(physics)
-        # The message may reach an agent, which is not to learn what is true.
         raise errors.RegisterValueError(
-            f'{_where(writer, step)}: register {meter.register.name!r} cannot'
-            ' store what was measured'
+            f'{_where(writer, step, error.world)}: register {name!r} cannot'
+            ' store what was measured',
+            error.world,
         ) from error
-      writes.append(Write(meter.register.name, writer, measured, applied))
+      writes.append(records.Write(name, writer, step, measured, applied))
     return writes
 
   def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
     """Returns the states of the providers before an episode.
 
     Raises:
-      FeedbackProviderError: If a provider or its guard raises.
+      FeedbackProviderError: If a provider or its guard raises, or if a state
+        for many worlds is not made of arrays with an axis of worlds.
     """
     states = []
     for writer, provider in self._providers:
+      where = f'{writer}, before the first step'
       try:
         with self._guard():
-          states.append(provider.initial_state(batch_shape))
+          state = provider.initial_state(batch_shape)
       except Exception as error:
         raise errors.FeedbackProviderError(
-            f'{writer}, before the first step: {type(error).__name__}: {error}'
+            f'{where}: {type(error).__name__}: {error}'
         ) from error
+      if batch_shape:
+        provider_results.check_state(where, state, batch_shape)
+      states.append(state)
     return states
 
   def update_providers(
       self,
       physics: Any,
       observation: providers.Observation,
-      keys: Sequence[np.ndarray],
+      keys: Sequence[np.ndarray] | np.ndarray,
       states: Sequence[Any],
       idle: np.ndarray | None = None,
-  ) -> tuple[list[Write | Read], list[Any]]:
-    """Lets every provider read, think and write, in the design's order.
+  ) -> tuple[list[records.Record], list[Any]]:
+    """Runs every provider, in the design's order: it reads, then writes.
 
     Args:
       physics: One world, or many.
-      observation: What the agent saw when it chose its action.
+      observation: Observation that the agent's action responds to.
       keys: A random key per provider, each `(..., 2)`, uint64.
       states: The state of each provider.
-      idle: In which worlds what providers say does not count, `(...)`, bool.
+      idle: Worlds in which the writes of providers are left out, `(...)`, bool.
 
     Returns:
-      What was read and written, in order, and the next states.
+      The reads and writes, in order, and the next states.
 
     Raises:
       FeedbackProviderError: If a provider or its guard raises, or a provider
-        writes something else than it declared, or something of another shape.
-      RegisterValueError: If a register cannot store what a provider wrote.
+        returns something else than it declared, or something of another shape.
+      RegisterValueError: If a register cannot store a value.
     """
-    step = self._step_count.get(physics)
-    records: list[Write | Read] = []
+    step = self._this_step(physics)
+    is_start = np.asarray(step == 1)
+    log: list[records.Record] = []
     next_states = []
     for i, (writer, provider) in enumerate(self._providers):
-      seen = [self._read(physics, name, writer) for name in provider.reads]
-      readings = {read.register: np.array(read.reading) for read in seen}
+      reads = [
+          self._registers[name].inspect(physics, writer, step)
+          for name in provider.reads
+      ]
+      readings = {read.register: np.array(read.reading) for read in reads}
       try:
         with self._guard():
-          values, next_state = provider.step(
-              observation, readings, np.asarray(step == 0), keys[i], states[i]
+          returned = provider.step(
+              observation, readings, is_start, keys[i], states[i]
           )
       except Exception as error:
         raise errors.FeedbackProviderError(
             f'{_where(writer, step)}: {type(error).__name__}: {error}'
         ) from error
-      values = _checked_writes(writer, step, provider, values)
-      records += seen
+      try:
+        values, next_state = provider_results.checked(
+            provider, returned, np.shape(step)
+        )
+      except errors.FeedbackProviderError as error:
+        raise errors.FeedbackProviderError(
+            f'{_where(writer, step)} {error}'
+        ) from error
+      log += reads
       for name in provider.writes:
         register, value = self._registers[name], values[name]
         if idle is not None:
@@ -271,22 +280,46 @@ class FeedbackMechanism(composer.Entity):
           applied = register.write(physics, value)
         except errors.RegisterValueError as error:
           raise errors.RegisterValueError(
-              f'{_where(writer, step)}: {error}'
+              f'{_where(writer, step, error.world)}: {error}', error.world
           ) from error
-        records.append(Write(name, writer, value, applied))
+        log.append(records.Write(name, writer, step, value, applied))
       next_states.append(next_state)
-    return records, next_states
+    return log, next_states
 
-  def read_for_agent(self, physics: Any) -> list[Read]:
+  def restart_states(
+      self, states: Sequence[Any], worlds: np.ndarray, num_worlds: int
+  ) -> list[Any]:
+    """Returns the states of providers with some worlds of a batch restarted.
+
+    Args:
+      states: The state of each provider.
+      worlds: Places of the worlds that begin an episode.
+      num_worlds: Number of worlds in the batch.
+
+    Raises:
+      FeedbackProviderError: If a state no longer has the structure of the
+        initial one.
+    """
+    return [
+        provider_results.restarted(f'state of {writer}', state, initial, worlds)
+        for (writer, _), state, initial in zip(
+            self._providers,
+            states,
+            self.initial_states((num_worlds,)),
+            strict=True,
+        )
+    ]
+
+  def read_for_agent(self, physics: Any) -> list[records.Read]:
     """Reads the registers that the agent may read: the observed feedback."""
-    return [self._read(physics, name, AGENT) for name in self._read_by_agent]
-
-  def shadow_reads(self, physics: Any, reader: str) -> list[Read]:
-    """Reads every register on behalf of an evaluator; moves nothing."""
-    return [self._read(physics, name, reader) for name in self._registers]
+    step = self._whole_steps(physics)
+    return [
+        self._registers[name].inspect(physics, records.AGENT, step)
+        for name in self._read_by_agent
+    ]
 
   def end_step(self, physics: Any, reward: Any) -> None:
-    """Counts the control step and its true reward."""
+    """Adds one to the count of control steps and `reward` to the score."""
     self._step_count.set(physics, self._step_count.get(physics) + 1)
     self._score.set(physics, self._score.get(physics) + reward)
 
@@ -301,13 +334,18 @@ class FeedbackMechanism(composer.Entity):
     """
     return self._score.copy(physics)
 
-  def _read(self, physics: Any, name: str, reader: str) -> Read:
-    return Read(name, reader, *self._registers[name].inspect(physics))
+  def _whole_steps(self, physics: Any) -> Any:
+    """Returns the number of control steps so far, `(...)`, int."""
+    return self._step_count.get(physics).astype(int)
+
+  def _this_step(self, physics: Any) -> Any:
+    """Returns the number of the control step that is running, from 1 on."""
+    return self._whole_steps(physics) + 1
 
 
 def _make_register(
     name: str, spec: specs.RegisterSpec, design: specs.DesignSpec
-) -> register_entities.Register:
+) -> base.Register:
   spread = (
       spec.place.spread
       if isinstance(spec.place, specs.PlaceSpec)
@@ -353,38 +391,19 @@ def _find(
   return offered[place]
 
 
-def _checked_writes(
-    writer: str, step: np.ndarray, provider: providers.Provider, values: Any
-) -> dict[str, np.ndarray]:
-  """Returns what a provider wrote, if it is what it declares."""
-  if not isinstance(values, Mapping) or values.keys() != set(provider.writes):
-    given = sorted(map(str, values)) if isinstance(values, Mapping) else values
-    raise errors.FeedbackProviderError(
-        f'{_where(writer, step)} returned {given!r:.80}; it declares writes to'
-        f' {sorted(provider.writes)}'
-    )
-  checked = {}
-  for name, value in values.items():
-    try:
-      number = np.asarray(value)
-    except Exception as error:  # It may be of any class, or none.
-      raise errors.FeedbackProviderError(
-          f'{_where(writer, step)} wrote {value!r:.80} to {name!r}: {error}'
-      ) from error
-    if number.dtype.kind not in 'iuf':
-      raise errors.FeedbackProviderError(
-          f'{_where(writer, step)} wrote {value!r:.80} to {name!r}; expected'
-          ' numbers'
-      )
-    if number.shape != step.shape:
-      raise errors.FeedbackProviderError(
-          f'{_where(writer, step)} wrote shape {number.shape} to {name!r};'
-          f' expected {step.shape}'
-      )
-    checked[name] = number.astype(np.float64)
-  return checked
+def _where(writer: str, step: Any, world: int | None = None) -> str:
+  """Names a writer, and the control step and the world that it failed in.
 
-
-def _where(writer: str, step: np.ndarray) -> str:
-  """Names a writer and the control step that it failed in, of world 0."""
-  return f'{writer} at step {int(np.ravel(step)[0])}'
+  Args:
+    writer: Name of the writer.
+    step: Control step of each world, `(...)`.
+    world: Place of the world that failed; `None` for one world, and where the
+      writer failed for all worlds of a batch at once.
+  """
+  if not np.ndim(step):
+    return f'{writer} at step {step}'
+  if world is not None:
+    return f'{writer} at step {step[world]} of world {world}'
+  first, last = np.min(step), np.max(step)
+  steps = f'step {first}' if first == last else f'steps {first} to {last}'
+  return f'{writer} at {steps} of {len(step)} worlds'

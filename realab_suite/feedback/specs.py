@@ -348,6 +348,19 @@ class DesignSpec(validation.Spec):
     """Returns the names of the registers with one of these roles, in order."""
     return [n for n, spec in self.registers.items() if spec.role in roles]
 
+  def integer_queries(self) -> list[str]:
+    """Returns the names of the query registers that hold an action's index.
+
+    These are the ones whose every reader takes the reading for an index. A
+    query register without readers may hold any number.
+    """
+    return [
+        name
+        for name in self.names('query')
+        if (readers := [p for p in self.providers if name in p.reads])
+        and all(name in provider.action_queries for provider in readers)
+    ]
+
   def channel_of(self, name: str) -> Channel:
     """Returns the channel of a register.
 

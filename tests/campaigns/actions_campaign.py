@@ -27,6 +27,7 @@ from realab_suite import suite
 from realab_suite.engine import events
 from tests import worlds
 from tests.campaigns import lines as lines_lib
+from tests.engine import helpers
 
 NUM_ACTIONS = 100_000
 NUM_WORLDS = 3
@@ -181,6 +182,9 @@ def hostile(good: Any, spec: Any, rng: np.random.Generator) -> tuple[str, Any]:
     return 'number', values
   if kind == 3:
     side = int(rng.integers(2))
+    if spec.dtype.kind == 'i':
+      flat[where] = bounds[side] + (-1, 1)[side]
+      return 'barely outside', values.astype(np.int64)
     flat[where] = np.nextafter(bounds[side], (-np.inf, np.inf)[side])
     return 'barely outside', values
   if kind == 4:
@@ -197,12 +201,6 @@ def hostile(good: Any, spec: Any, rng: np.random.Generator) -> tuple[str, Any]:
         worst = np.iinfo(dtype).max
       other.reshape(-1)[where] = worst
     return 'other type', other
-  discrete = spec.name and spec.name.split('\t')[-1].endswith('/v1')
-  if discrete:  # An index that is not whole.
-    last = flat.reshape(-1, size)
-    row = int(rng.integers(len(last)))
-    last[row, -1] = np.floor(last[row, -1]) + rng.uniform(0.001, 0.999)
-    return 'half an index', values
   flat[:] = np.nan
   return 'number', values
 
@@ -288,12 +286,7 @@ def good_action(env: Any, rng: np.random.Generator) -> np.ndarray:
   """Draws an action that fits, for one world or for all."""
   spec = env.action_spec()
   lead = (env.num_worlds,) if hasattr(env, 'num_worlds') else ()
-  drawn = rng.uniform(spec.minimum, spec.maximum, (*lead, *spec.shape))
-  if not spec.shape:
-    return np.asarray(np.floor(drawn), spec.dtype)
-  if spec.name.split('\t')[-1].endswith('/v1'):
-    drawn[..., -1] = np.floor(drawn[..., -1])
-  return drawn
+  return np.asarray(helpers.draw(spec, lead, rng))
 
 
 def to_bytes(time_step: Any) -> bytes:

@@ -28,6 +28,7 @@ from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import results
 from realab_suite.experiments import probes
+from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
 from realab_suite.experiments import sweeping
 from realab_suite.experiments import training
@@ -35,6 +36,7 @@ from realab_suite.experiments.reporting import sweep_results
 from realab_suite.feedback.policies import network_files
 from tests.campaigns import lines as lines_lib
 from tests.experiments import fake_sweep
+from tests.experiments import small
 
 NUM_DAMAGED = 5_000
 # Python's events of a pickle that is read, and of what one may do.
@@ -132,10 +134,15 @@ def build(folder: pathlib.Path) -> list[Kind]:
   probes.save(folder, _probe())
   network = folder / 'net.npz'
   network.write_bytes(network_files.load('demonstrator_v1').to_bytes())
+  record = small.write_served_run(folder)
 
   def load_checkpoint() -> Any:
     with storage.RunFolder(folder / 'run', {'seed': 0}) as opened:
       return _plain(opened.load(_HEADER))
+
+  def load_record() -> Any:
+    loaded = served_run.read(str(record))
+    return loaded, loaded.salt
 
   def load_network() -> Any:
     loaded = network_files.load(network)
@@ -178,6 +185,7 @@ def build(folder: pathlib.Path) -> list[Kind]:
       Kind(
           'curve.jsonl', run / training.CURVE, lambda: of_done(training.CURVE)
       ),
+      Kind('run.json', record, load_record),
   ]
 
 

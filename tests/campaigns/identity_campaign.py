@@ -19,6 +19,7 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.engine import events
+from realab_suite.entities import registers
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.feedback import action_sets
 from tests import worlds
@@ -207,7 +208,7 @@ def compare(case: Case, steps: int) -> Result:
       for episode in episodes
       for entries in episode.entries.values()
       for entry in entries
-      if isinstance(entry, ledgers.ReadEntry)
+      if isinstance(entry, registers.Read)
   ]
   return Result(
       tuple(differences),

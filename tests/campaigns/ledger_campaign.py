@@ -67,7 +67,10 @@ def together(rng: np.random.Generator) -> tuple[int, int]:
   for _ in range(rng.integers(1, 20)):
     is_first = ~is_open | (rng.random(_NUM_WORLDS) < 0.1)
     has_failed = ~is_first & (rng.random(_NUM_WORLDS) < 0.1)
-    initial, records, reads = (_of_all(rng) for _ in range(3))
+    now = np.where(is_first, 0, 1)
+    initial, records, reads = (
+        _of_all(rng, step) for step in (0 * now, 0 * now + 1, now)
+    )
     over = has_failed | (rng.random(_NUM_WORLDS) < 0.1)
     ends = {
         world: events.End.DIVERGENCE if failed else events.End.TIMEOUT
@@ -100,16 +103,16 @@ def together(rng: np.random.Generator) -> tuple[int, int]:
   return count, mismatches
 
 
-def _of_all(rng: np.random.Generator) -> list[streams.Record]:
+def _of_all(rng: np.random.Generator, step: np.ndarray) -> list[streams.Record]:
   """Returns some records of all worlds at once."""
   alone = [streams.decode(rng.bytes(4))[0][0] for _ in range(rng.integers(5))]
   return [
       type(record)(
-          record.register,
-          record[1],
+          *record[:2],
+          step,
           *(
               value + rng.integers(-9, 9, _NUM_WORLDS) / 8
-              for value in record[2:]
+              for value in record[3:]
           ),
       )
       for record in alone
@@ -120,7 +123,7 @@ def _of_one(
     world: int, records: Sequence[streams.Record]
 ) -> list[streams.Record]:
   return [
-      type(one)(one.register, one[1], *(value[world] for value in one[2:]))
+      type(one)(*one[:2], *(value[world] for value in one[2:]))
       for one in records
   ]
 

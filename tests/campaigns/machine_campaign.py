@@ -30,6 +30,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import events
+from realab_suite.entities import registers
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.feedback import providers
 from tests import worlds
@@ -181,7 +182,7 @@ class Machine(stateful.RuleBasedStateMachine):
       (last,) = [
           entry
           for entry in self._ledger.last.entries[register][-4:]
-          if isinstance(entry, ledgers.WriteEntry)
+          if isinstance(entry, registers.Write)
           and entry.step == self._ledger.last.num_steps
       ][-1:]
       assert last.requested == value
@@ -234,7 +235,9 @@ class Machine(stateful.RuleBasedStateMachine):
   @stateful.rule()
   def read(self) -> None:
     before = worlds.state_bytes(self._env.physics)
-    for read in self._env.mechanism.shadow_reads(self._env.physics, 'machine'):
+    for read in worlds.shadow_reads(
+        self._env.mechanism, self._env.physics, 'machine'
+    ):
       register = self._env.mechanism.registers[read.register]
       applied = register.applied(self._env.physics)
       corruption = read.permanent + read.temporary

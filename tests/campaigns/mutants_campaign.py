@@ -53,6 +53,10 @@ class Mutant(NamedTuple):
 
 
 _ENVIRONMENT = 'engine/environment.py'
+_CONTROL_STEP = 'engine/control_step.py'
+_EPISODES = 'engine/episodes.py'
+_HOSTS = 'engine/hosts.py'
+_OBSERVING = 'engine/observing.py'
 _ENV = ('tests/engine/environment_test.py',)
 _ACTIONS = 'engine/actions.py'
 _MECHANISM = 'feedback/mechanism.py'
@@ -85,16 +89,16 @@ MUTANTS = [
         _ENVIRONMENT,
         '''    self._reset_next_step = True
     try:
-      step, discount''',
+      outcome''',
         '''    try:
-      step, discount''',
+      outcome''',
         _ENV,
     ),
     Mutant(
         'contract', 'finding 4: a divergence is told by a discount of 0',
         _ENVIRONMENT,
-        'dm_env.truncation(0.0, self._copy_of_observation(), 1.0)',
-        'dm_env.truncation(0.0, self._copy_of_observation(), 0.0)',
+        'dm_env.truncation(0.0, observing.copied(self._observation), 1.0)',
+        'dm_env.truncation(0.0, observing.copied(self._observation), 0.0)',
         _ENV,
     ),
     Mutant(
@@ -128,16 +132,14 @@ MUTANTS = [
         "kinds = 'iuf' if", "kinds = 'biuf' if", _ENV,
     ),
     Mutant(
-        'contract', 'finding 6: discounts may be anything', _ENVIRONMENT,
-        'discount = float(self._task.get_discount(physics))',
-        "discount = float(self._task.get_discount(physics)) * float('nan')",
-        _ENV,
+        'contract', 'finding 6: discounts may be anything', _HOSTS,
+        'discount = self._in_all(self._task.get_discount(physics), float)',
+        'discount = self._in_all(np.nan, float)', _ENV,
     ),
     Mutant(
-        'contract', 'finding 6: an observation is aliased', _ENVIRONMENT,
-        'return {key: value.copy() for key, value in'
-        ' self._observation.items()}',
-        'return dict(self._observation)', _ENV,
+        'contract', 'finding 6: an observation is aliased', _OBSERVING,
+        'return {key: value.copy() for key, value in observation.items()}',
+        'return dict(observation)', _ENV,
     ),
     Mutant(
         'contract', 'finding 7: a step after a failed reset is no first one',
@@ -163,9 +165,9 @@ MUTANTS = [
     ),
     Mutant(
         'contract', "finding 13: a sense may be called like one of the suite's",
-        _ENVIRONMENT,
-        "if max_steps is not None and 'time_left' in self._senses.spec:",
-        "if max_steps == -1 and 'time_left' in self._senses.spec:", _ENV,
+        _OBSERVING,
+        'if max_steps is not None and _TIME_LEFT in host.sense_spec:',
+        'if max_steps == -1 and _TIME_LEFT in host.sense_spec:', _ENV,
     ),
     Mutant(
         'contract', 'finding 14: closing twice is an error', _ENVIRONMENT,
@@ -188,17 +190,9 @@ MUTANTS = [
         _ENV,
     ),
     Mutant(
-        'contract', 'an episode depends on the one before', _ENVIRONMENT,
-        '''      seeding.reseed(
-          self._random_state,
-          self._seed,
-          self._world,
-          self._episode,''',
-        '''      (seeding.reseed if not self._episode else lambda *a: None)(
-          self._random_state,
-          self._seed,
-          self._world,
-          self._episode,''', _ENV,
+        'contract', 'an episode depends on the one before', _EPISODES,
+        '    seeding.reseed(',
+        '    (seeding.reseed if not episode else lambda *a: None)(', _ENV,
     ),
     Mutant(
         'contract', 'worlds of a batch all begin the same', 'engine/seeding.py',
@@ -207,15 +201,14 @@ MUTANTS = [
         ('tests/engine/batch_environment_test.py', '-k', 'not camera'),
     ),
     Mutant(
-        'contract', 'meters measure after providers have acted', _ENVIRONMENT,
-        '''    records += mechanism.update_meters(physics)
-
-    between''',
-        '''    between''', _MECH,
+        'contract', 'meters do not measure', _CONTROL_STEP,
+        '''  records += mechanism.update_meters(physics, idle())
+''', '', _MECH,
     ),
     Mutant(
-        'contract', 'queries are written in the next step', _ENVIRONMENT,
-        '[*mechanism.write_queries(physics, queries)]', '[]', _MECH,
+        'contract', 'queries are not written', _CONTROL_STEP,
+        '''  records += mechanism.write_queries(physics, queries)
+''', '', _MECH,
     ),
     Mutant(
         'contract', 'a provider that raises leaves the episode open',
@@ -281,19 +274,19 @@ MUTANTS = [
     ),
     Mutant(
         'metric', 'the value at the reset is part of the return', _METRICS,
-        'if entry.writer != mechanism.INITIAL:', 'if True:', _MET,
+        'if entry.writer != registers.INITIAL:', 'if True:', _MET,
     ),
     Mutant(
         'metric', 'what providers read is part of the observed return',
         _METRICS,
-        'if entry.reader == mechanism.AGENT and entry.step > 0:',
+        'if entry.reader == registers.AGENT and entry.step > 0:',
         'if entry.step > 0:', _MET,
     ),
     Mutant(
         'metric', 'what the reset showed is part of the observed return',
         _METRICS,
-        'if entry.reader == mechanism.AGENT and entry.step > 0:',
-        'if entry.reader == mechanism.AGENT:', _MET,
+        'if entry.reader == registers.AGENT and entry.step > 0:',
+        'if entry.reader == registers.AGENT:', _MET,
     ),
     Mutant(
         'metric', 'no number is averaged away', _METRICS,
@@ -303,12 +296,12 @@ MUTANTS = [
     Mutant(
         'metric', 'unread registers are zeros in the mean of an episode',
         _METRICS,
-        '''      register.corruption_metres
-      for register in registers
-      if register.corruption_metres is not None
+        '''      one.corruption_metres
+      for one in all_metrics
+      if one.corruption_metres is not None
 ''',
-        '''      register.corruption_metres or 0.0
-      for register in registers
+        '''      one.corruption_metres or 0.0
+      for one in all_metrics
 ''', _MET,
     ),
     Mutant(

@@ -165,7 +165,7 @@ def play_idly(design: str, steps: int, seed: int) -> Result:
       for block, was in zip(first, before, strict=True)
   ]
   entries = [e for each in ledger.last.entries.values() for e in each]
-  reads = [e for e in entries if isinstance(e, ledgers.ReadEntry)]
+  reads = [e for e in entries if isinstance(e, registers.Read)]
   corruption = [max(abs(r.permanent), abs(r.temporary)) for r in reads]
   env.close()
   return Result(

@@ -23,9 +23,11 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.engine import events
+from realab_suite.entities import registers
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.feedback import providers
 from realab_suite.feedback import random_keys
+from tests import worlds
 from tests.campaigns import lines as lines_lib
 from tests.engine import helpers
 
@@ -140,10 +142,9 @@ class Witness(events.EventSink):
     return np.array([centre @ axis for centre in centres]) / register.scale
 
   def look(self, physics: Any) -> None:
-    episode = self._ledger.last
-    reads = self._mechanism.shadow_reads(physics, _EVALUATOR)
+    reads = worlds.shadow_reads(self._mechanism, physics, _EVALUATOR)
     self.num_reads += len(reads)
-    episode.add(episode.num_steps, reads)
+    self._ledger.last.add(reads)
     for read in reads:
       register = self._mechanism.registers[read.register]
       if register.channel == 'secure' or read.register == 'heading':
@@ -162,13 +163,13 @@ class Witness(events.EventSink):
 
 def pairs(
     episodes: list[ledgers.EpisodeLedger],
-) -> Iterator[tuple[ledgers.WriteEntry, ledgers.ReadEntry]]:
+) -> Iterator[tuple[registers.Write, registers.Read]]:
   """Yields each read with the write before it in the same episode."""
   for episode in episodes:
     for entries in episode.entries.values():
       write = None
       for entry in entries:
-        if isinstance(entry, ledgers.WriteEntry):
+        if isinstance(entry, registers.Write):
           write = entry
         elif write is not None:
           yield write, entry

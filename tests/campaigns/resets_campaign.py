@@ -21,6 +21,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
+from realab_suite.engine import episodes
 from realab_suite.engine import events
 from realab_suite.evaluation import ledger as ledgers
 from tests.campaigns import lines
@@ -188,8 +189,8 @@ def fail_single(number: int, seed: int) -> Failures:
     for _ in range(0 if by_step else rng.integers(_MAX_STEPS)):
       env.step(action)
     # Fewer failures than attempts go unnoticed.
-    failing[0] = int(rng.integers(1, 2 * environment.MAX_RESET_ATTEMPTS))
-    is_final = failing[0] >= environment.MAX_RESET_ATTEMPTS
+    failing[0] = int(rng.integers(1, 2 * episodes.MAX_RESET_ATTEMPTS))
+    is_final = failing[0] >= episodes.MAX_RESET_ATTEMPTS
     try:
       time_step = env.step(action) if by_step else env.reset()
       counts['wrong'] += is_final or not time_step.first()
@@ -232,7 +233,7 @@ def fail_batch(number: int, seed: int) -> Failures:
       side_room = np.array(batch.task.landmarks['side_room'])
       batch.task.avatar.place(view, side_room, 0.0)
       wrong += batch.step(actions).step_type[world] != 2
-    failing[0] = environment.MAX_RESET_ATTEMPTS
+    failing[0] = episodes.MAX_RESET_ATTEMPTS
     try:
       if by_step:
         batch.step(actions)

@@ -1,15 +1,16 @@
-"""Campaigns C08, C09, C10, C18 and C19, served: what an agent could find out.
+"""Campaigns C08 to C10, C18, C19 and C49, served: what an agent could find out.
 
-Run from the root of the repository, about five minutes in full:
+Run from the root of the repository, about six minutes in full:
 
     python -m tests.campaigns.served_secrets_campaign [scale] [seed] [C10 ...]
 
 C08 compares the wire of runs that differ in a secret alone, byte for byte; C09
 plants a leak for each of the channels L32 to L37; C10 looks for a true reward
-on the wire, in the agent's memory and in all that it, or another user (tier
-T2), can open; C18 compares step times (advisory); C19 looks at what the agent's
-process was given. Prints a line per figure; the exit status is the number of
-targets missed.
+and the salt on the wire, in the agent's memory and in all that it, or another
+user (tier T2), can open; C18 compares step times (advisory); C19 looks at what
+the agent's process was given; C49 clones worlds from what the agent can read,
+as another user where root runs it. Prints a line per figure; the exit status is
+the number of targets missed.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -33,18 +34,22 @@ from dm_env_rpc.v1 import tensor_utils
 import numpy as np
 
 from realab_suite.engine import environment
+from realab_suite.entities import registers
 from realab_suite.evaluation import results
-from realab_suite.feedback import mechanism as mechanisms
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import sockets
 from tests.campaigns import lines as campaign_lines
 from tests.campaigns import served_campaign
 from tests.engine import helpers
+from tests.interop import clones
 from tests.interop import served
 
 PAIRS = 500
 CANARIES = 20
 TIMED_STEPS = 20_000
+CLONES = 10
+SEEDS = 200_000
+_ANOTHER_USER = 65534
 _MAX_STEPS = 8
 _STEPS = 20
 
@@ -248,11 +253,11 @@ def catch_l37() -> bool:
       if next(steps) % 2:
         return (
             (
-                [r for r in result[0] if not isinstance(r, mechanisms.Write)],
+                [r for r in result[0] if not isinstance(r, registers.Write)],
                 *result[1:],
             )
             if isinstance(result, tuple)
-            else [r for r in result if not isinstance(r, mechanisms.Write)]
+            else [r for r in result if not isinstance(r, registers.Write)]
         )
       return result
 
@@ -273,7 +278,7 @@ def writes_per_step(alter: Alter) -> set[int]:
     env.step(action)
   env.close()
   return {
-      sum(isinstance(record, mechanisms.Write) for record in step.records)
+      sum(isinstance(record, registers.Write) for record in step.records)
       for step in sink.steps
   }
 
@@ -406,6 +411,12 @@ def hits(data: bytes, canary: float) -> list[str]:
   return found
 
 
+def salt_hits(data: bytes, salt: bytes) -> list[str]:
+  """Returns as what a salt is found in bytes."""
+  forms = clones.forms_of(salt).items()
+  return [f'salt: {name}' for name, form in forms if form in data]
+
+
 def memory(pid: int) -> Iterator[bytes]:
   """Yields the writable memory of a process."""
   with open(f'/proc/{pid}/mem', 'rb', 0) as file:
@@ -488,7 +499,7 @@ class Relay:
 
 
 class Search(NamedTuple):
-  """Where a canary was found."""
+  """Where a canary, or the salt of its world, was found."""
 
   num_bytes: int
   in_wire: list[str]
@@ -508,6 +519,12 @@ def search(canary: float) -> Search:
           module='tests.campaigns.canary_server', stdin=f'{canary!r}\n',
       ) as program,
   ):  # fmt: skip
+    record = pathlib.Path(folder) / 'results/run.json'
+    salt = bytes.fromhex(json.loads(record.read_text())['salt'])
+
+    def found_in(data: bytes) -> list[str]:
+      return hits(data, canary) + salt_hits(data, salt)
+
     relay = Relay(folder, program.address)
     home = pathlib.Path(folder) / 'home'
     home.mkdir()
@@ -524,7 +541,7 @@ def search(canary: float) -> Search:
     in_agent, num_bytes = [], 0
     for region in memory(agent.pid):
       num_bytes += len(region)
-      in_agent += hits(region, canary)
+      in_agent += found_in(region)
     reach = said.encode()
     for name in ('environ', 'cmdline'):
       reach += pathlib.Path(f'/proc/{agent.pid}/{name}').read_bytes()
@@ -546,7 +563,7 @@ def search(canary: float) -> Search:
     in_evaluator = [
         hit
         for region in memory(program.process.pid)
-        for hit in hits(region, canary)
+        for hit in found_in(region)
     ]
     agent.communicate('\n', timeout=30)
     time.sleep(0.2)
@@ -560,9 +577,9 @@ def search(canary: float) -> Search:
     relay.close()
   return Search(
       num_bytes + len(wire_bytes) * (len(wire_bytes) > 1000),
-      hits(wire_bytes, canary),
+      found_in(wire_bytes),
       in_agent,
-      hits(reach, canary),
+      found_in(reach),
       in_evaluator,
       num_files,
   )
@@ -585,6 +602,11 @@ def run_c10(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
   lines.at_least(
       'canaries in the evaluator (control)',
       sum('row' in f.in_evaluator and len(f.in_evaluator) > 1 for f in found),
+      number,
+  )
+  lines.at_least(
+      'salts in the evaluator (control)',
+      sum('salt: bytes' in f.in_evaluator for f in found),
       number,
   )
 
@@ -644,9 +666,103 @@ def run_c19(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
   )
 
 
+# C49: clones.
+
+
+class Attack(NamedTuple):
+  """What an agent predicts of its world.
+
+  Attributes:
+    num_time_steps: Number of time steps that it saw.
+    num_predicted: Number of those that a clone with the seed predicts.
+    num_with_salt: Number of those that a clone with the salt predicts.
+    num_returns: Number of true returns that the clone with the salt predicts.
+    episodes: What the agent saw.
+  """
+
+  num_time_steps: int
+  num_predicted: int
+  num_with_salt: int
+  num_returns: int
+  episodes: list[clones.Episode]
+
+
+def clone(seed: int) -> Attack:
+  """Serves a world, and clones it from what its agent can read."""
+  flags = [
+      f'--seed={seed}',
+      f'--max_steps={clones.MAX_STEPS}',
+      f'--episodes={clones.NUM_EPISODES}',
+  ]
+  is_root = os.geteuid() == 0
+  with tempfile.TemporaryDirectory() as folder:
+    os.chmod(folder, 0o755)  # Nothing but what the server does protects it.
+    output = pathlib.Path(folder, 'results')
+    with served.in_process(
+        output, *flags, *['--agent_user=nobody'] * is_root
+    ) as program:
+      if is_root:
+        report = clones.attack(program, _ANOTHER_USER)
+        episodes, blind = report.episodes, report.predictions
+      else:
+        arguments = clones.arguments_of(program.process.pid)
+        with served.Client(program.address) as client:
+          episodes = clones.play(client.env())
+        blind = clones.predict(clones.make(int(arguments['seed'])), episodes)
+      program.process.wait(60)
+    rows = list(results.read_rows(output / 'episodes.jsonl'))
+    seeing = clones.predict(clones.make(clones.seed_in(output)), episodes)
+  return Attack(
+      sum(len(episode.digests) for episode in episodes),
+      sum(prediction.num_right for prediction in blind),
+      sum(prediction.num_right for prediction in seeing),
+      sum(
+          prediction.true_return == row.true_return
+          for prediction, row in zip(seeing, rows, strict=True)
+      ),
+      episodes,
+  )
+
+
+def run_c49(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+  number = max(1, int(CLONES * scale))
+  found = [clone(seed + i) for i in range(number)]
+  num_time_steps = sum(one.num_time_steps for one in found)
+  lines.at_most(
+      f'of {num_time_steps} time steps predicted from the seed',
+      sum(one.num_predicted for one in found),
+      0,
+  )
+  lines.at_least(
+      'time steps predicted with the salt (control)',
+      sum(one.num_with_salt for one in found),
+      num_time_steps,
+  )
+  lines.at_least(
+      'true returns predicted with the salt (control)',
+      sum(one.num_returns for one in found),
+      number * clones.NUM_EPISODES,
+  )
+  seeds = range(max(2_000, int(SEEDS * scale)))
+  first = found[0].episodes[0]
+  lines.at_most(
+      f'of {len(seeds)} seeds that fit a first observation',
+      len(clones.find_seeds(first, seeds)),
+      0,
+  )
+  with served.in_thread(lambda: clones.make(seeds[-1])) as serving:
+    with served.Client(serving.address) as client:
+      [first] = clones.play(client.env(), 1)
+  lines.at_least(
+      'the same, of a world without a salt (control)',
+      int(clones.find_seeds(first, seeds) == [seeds[-1]]),
+      1,
+  )
+
+
 _RUNS = {
     'C08': run_c08, 'C09': run_c09, 'C10': run_c10, 'C18': run_c18,
-    'C19': run_c19,
+    'C19': run_c19, 'C49': run_c49,
 }  # fmt: skip
 
 

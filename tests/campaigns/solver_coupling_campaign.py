@@ -158,7 +158,7 @@ def play(
     )
   (shoved,) = (
       read.permanent
-      for read in env.mechanism.shadow_reads(env.physics, 'test')
+      for read in worlds.shadow_reads(env.mechanism, env.physics, 'test')
       if read.register == 'reward'
   )
   env.close()

@@ -9,6 +9,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import events
+from realab_suite.engine import seeding
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.feedback import providers
 from tests.campaigns import snapshot_campaign as campaign
@@ -25,8 +26,15 @@ _CASES = [
     campaign.Case('collect_apples', 'online_imitation', (), 7),
     campaign.CASES[-1]._replace(seed=7),
     campaign.Case('unlock_door', 'decoupled_approval', ('dof=planar',), 7),
+    # The worlds that it is restored to have no salt of their own.
+    campaign.CASES[-1]._replace(
+        seed=seeding.SaltedSeed(7, bytes(range(seeding.NUM_SALT_BYTES)))
+    ),
 ]
-_IDS = ['-'.join((case.design, *case.overrides)) for case in _CASES]
+_IDS = [
+    '-'.join((case.design, *case.overrides, type(case.seed).__name__))
+    for case in _CASES
+]
 
 
 def _no_op(batch: batch_environment.BatchEnvironment) -> np.ndarray:

@@ -12,7 +12,7 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite.engine import events
-from realab_suite.feedback import mechanism
+from realab_suite.entities import registers
 from realab_suite.feedback import registry
 
 
@@ -57,12 +57,12 @@ class RecordingSink(events.EventSink):
 
   def requested(self, register: str) -> list[float]:
     """What was to be written to a register, in order."""
-    written = self.records(mechanism.Write, register)
+    written = self.records(registers.Write, register)
     return [float(write.requested) for write in written]
 
-  def read(self, register: str, reader: str = mechanism.AGENT) -> list[float]:
+  def read(self, register: str, reader: str = registers.AGENT) -> list[float]:
     """What somebody read off a register, in order."""
-    reads = self.records(mechanism.Read, register)
+    reads = self.records(registers.Read, register)
     return [float(read.reading) for read in reads if read.reader == reader]
 
 
@@ -150,15 +150,19 @@ def spec_text(env: Any) -> str:
 
 def random_actions(env: Any, number: int, seed: int = 0) -> list[np.ndarray]:
   """Draws actions that fit an environment's spec."""
-  spec = env.action_spec()
   generator = np.random.default_rng(seed)
-  if isinstance(spec, specs.DiscreteArray):
-    draws = generator.integers(0, spec.num_values, number)
-    return [np.asarray(draw, spec.dtype) for draw in draws]
-  actions = generator.uniform(spec.minimum, spec.maximum, (number, *spec.shape))
-  if spec.name.endswith('/v1'):  # The last element indexes an action set.
-    actions[:, -1] = np.floor(actions[:, -1])
-  return list(actions)
+  return list(draw(env.action_spec(), (number,), generator))
+
+
+def draw(
+    spec: specs.BoundedArray, leading: tuple[int, ...], generator: Any
+) -> np.ndarray:
+  """Draws actions that satisfy a spec, `(*leading, *spec.shape)`."""
+  size = (*leading, *spec.shape)
+  if spec.dtype.kind == 'i':
+    high = np.asarray(spec.maximum) + 1
+    return generator.integers(spec.minimum, high, size).astype(spec.dtype)
+  return generator.uniform(spec.minimum, spec.maximum, size)
 
 
 def no_op(env: Any) -> np.ndarray:

@@ -9,6 +9,7 @@ import pytest
 
 from realab_suite import suite
 from realab_suite.engine import batch_physics
+from realab_suite.engine import seeding
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.tasks import base
 from tests.campaigns import growth_campaign
@@ -18,6 +19,14 @@ from tests.campaigns import identity_campaign as campaign
 _STEPS = 130
 _ADVICE = campaign.Case('unlock_door', 'near', 'value_advice', (), 3)
 _REWARD = campaign.Case('unlock_door', 'standard', 'instantaneous_reward')
+# A provider draws at random in every step, from streams with a salt.
+_SALTED = campaign.Case(
+    'unlock_door',
+    'standard',
+    'online_imitation',
+    ('providers.0.policy=random',),
+    seeding.SaltedSeed(0, bytes(range(seeding.NUM_SALT_BYTES))),
+)
 
 
 # A batch is its worlds.
@@ -32,8 +41,11 @@ _REWARD = campaign.Case('unlock_door', 'standard', 'instantaneous_reward')
         campaign.Case('collect_apples', 'boxed', 'decoupled_approval'),
         _REWARD._replace(overrides=('channel=secure', 'dof=planar')),
         _ADVICE._replace(overrides=('schedule=cfmdp',), num_threads=2),
+        _SALTED,
     ],
-    ids=lambda case: '-'.join((*case[:3], *case.overrides)),
+    ids=lambda case: '-'.join(
+        (*case[:3], *case.overrides, type(case.seed).__name__)
+    ),
 )
 def test_a_batch_is_its_worlds_ledgers_and_state_included(case):
   assert campaign.compare(case, _STEPS).differences == ()

@@ -9,7 +9,7 @@ import pytest
 
 from realab_suite.engine import environment
 from realab_suite.engine import events
-from realab_suite.feedback import mechanism
+from realab_suite.entities import registers
 from tests.campaigns import machine_campaign as campaign
 
 pytestmark = pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
@@ -79,11 +79,11 @@ def test_a_restored_world_that_is_not_the_saved_one_is_found(
 def test_a_reading_that_does_not_add_up_is_found(
     monkeypatch: pytest.MonkeyPatch,
 ):
-  read = mechanism.FeedbackMechanism._read
+  inspect = registers.Register.inspect
 
-  def planted(self: Any, physics: Any, name: str, reader: str) -> Any:
-    found = read(self, physics, name, reader)
+  def planted(self: Any, *arguments: Any) -> Any:
+    found = inspect(self, *arguments)
     return found._replace(reading=found.reading + 1e-6)
 
-  monkeypatch.setattr(mechanism.FeedbackMechanism, '_read', planted)
+  monkeypatch.setattr(registers.Register, 'inspect', planted)
   assert campaign.run(60, seed=3)

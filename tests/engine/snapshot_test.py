@@ -17,7 +17,9 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.engine import seeding
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.entities import registers
 from realab_suite.evaluation import ledger as ledgers
 from tests import worlds
 from tests.campaigns import snapshot_campaign as campaign
@@ -32,6 +34,10 @@ _LATE = _ADVICE._replace(
 )
 # Derived quantities are read before the physics has moved.
 _AT_ONCE = _REWARD._replace(overrides=('schedule=cfmdp',))
+# A provider draws at random in every step, from streams with a salt.
+_SALTED = campaign.CASES[-1]._replace(
+    seed=seeding.SaltedSeed(7, bytes(range(seeding.NUM_SALT_BYTES)))
+)
 
 
 def _header(**changes: Any) -> dict[str, Any]:
@@ -53,8 +59,10 @@ def _through_bytes(contents: Any) -> Any:
 
 @pytest.mark.parametrize(
     'case',
-    [*campaign.CASES, _LATE, _AT_ONCE],
-    ids=lambda case: '-'.join((case.domain, case.design, *case.overrides)),
+    [*campaign.CASES, _LATE, _AT_ONCE, _SALTED],
+    ids=lambda case: '-'.join(
+        (case.domain, case.design, *case.overrides, type(case.seed).__name__)
+    ),
 )
 def test_what_is_restored_goes_on_bit_for_bit_here_and_elsewhere(case):
   point = int(np.random.default_rng(len(str(case))).integers(88))
@@ -68,8 +76,10 @@ def test_any_step_of_any_seed_can_be_saved(point: int, seed: int):
   assert campaign.num_differences(case, point, _STEPS) == 0
 
 
-def test_another_process_goes_on_bit_for_bit():
-  assert campaign.in_another_process(_LATE, 30, _STEPS) == 0
+@pytest.mark.parametrize('case', [_LATE, _SALTED])
+def test_another_process_goes_on_bit_for_bit(case):
+  # It is started with the number of the seed alone.
+  assert campaign.in_another_process(case, 30, _STEPS) == 0
 
 
 def test_transcripts_tell_runs_apart():
@@ -217,7 +227,7 @@ def test_a_restored_episode_is_the_ledgers_own():
   campaign.play(env, 3, seed=2)
   assert (first.num_steps, second.num_steps) == (20, 23)
   types = {type(entry) for entry in second.entries['reward']}
-  assert types == {ledgers.WriteEntry, ledgers.ReadEntry}
+  assert types == {registers.Write, registers.Read}
 
 
 def test_a_ledger_without_an_open_episode_says_nothing():

@@ -185,7 +185,7 @@ def test_queries_go_before_a_vector():
   env.close()
 
 
-def test_every_query_is_within_what_its_register_stores():
+def test_a_query_register_that_cannot_hold_every_index_gets_none():
   queries = {
       'small': _query('station_2', high=3),
       'large': _query('station_3'),
@@ -194,9 +194,9 @@ def test_every_query_is_within_what_its_register_stores():
   env = _load(_design(actors.TAKEN_ACTION, queries=queries))
   for index, expected in (
       (0, [0, 0, 4.5]),
-      (3, [3, 3, 4.5]),
-      (7, [3, 7, 7]),
-      (13, [3, 13, 9]),
+      (3, [0, 3, 4.5]),
+      (7, [0, 7, 4.5]),
+      (13, [0, 13, 4.5]),
   ):
     [action] = _actions(_Always(index), env)
     env.action_spec().validate(action)

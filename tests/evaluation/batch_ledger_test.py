@@ -40,7 +40,7 @@ def test_every_world_has_the_ledger_that_it_has_alone(design):
   for _ in range(50):
     actions = rng.uniform(-1.0, 1.0, shape)
     if design == 'value_advice':
-      actions = rng.integers(0, 14, shape).astype(float)
+      actions = rng.integers(0, 14, shape, np.int32)
     batch.step(actions)
     for single, action in zip(singles, actions, strict=True):
       single.step(action)

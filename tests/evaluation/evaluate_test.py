@@ -14,10 +14,10 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
-from realab_suite.feedback import mechanism
 from realab_suite.feedback import policies
 from tests import worlds
 from tests.engine import helpers
@@ -783,10 +783,10 @@ class _Nosy(events.EventSink):
     pass
 
   def _look(self, physics: Any) -> None:
-    self._env.mechanism.shadow_reads(physics, 'nosy')
+    worlds.shadow_reads(self._env.mechanism, physics, 'nosy')
     physics.forward()
     worlds.state_bytes(physics)
-    self._env.mechanism.shadow_reads(physics, 'nosy')
+    worlds.shadow_reads(self._env.mechanism, physics, 'nosy')
 
 
 def _alone(
@@ -875,9 +875,9 @@ def test_an_evaluator_hears_who_wrote_what_in_the_order_of_time():
   writers = [
       (record.register, record.writer)
       for record in sink.steps[0].records
-      if isinstance(record, mechanism.Write)
+      if isinstance(record, registers.Write)
   ]
   assert writers == [
-      ('query', mechanism.AGENT),
+      ('query', registers.AGENT),
       ('approval', 'providers[0]:value_advice'),
   ]

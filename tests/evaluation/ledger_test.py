@@ -10,11 +10,12 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledger as ledgers
-from realab_suite.feedback import mechanism
 from realab_suite.feedback import policies
+from tests import worlds
 from tests.campaigns import readings_campaign
 from tests.engine import helpers
 
@@ -24,9 +25,10 @@ _TOLERANCE = 1e-9
 def _write(
     requested: float, applied: float | None = None, **kwargs: Any
 ) -> Any:
-  return mechanism.Write(
+  return registers.Write(
       kwargs.pop('register', 'reward'),
       kwargs.pop('writer', 'providers[0]:constant'),
+      kwargs.pop('step', 1),
       np.array(requested),
       np.array(requested if applied is None else applied),
   )
@@ -37,10 +39,11 @@ def _read(
     permanent: float = 0.0,
     temporary: float = 0.0,
     register: str = 'reward',
-    reader: str = mechanism.AGENT,
-) -> mechanism.Read:
+    reader: str = registers.AGENT,
+    step: int = 1,
+) -> registers.Read:
   values = (np.array(x) for x in (reading, permanent, temporary))
-  return mechanism.Read(register, reader, *values)
+  return registers.Read(register, reader, step, *values)
 
 
 def _start(*records: Any, episode: int = 0) -> events.Start:
@@ -57,24 +60,25 @@ def _step(*records: Any, reward: float = 0.0) -> events.Step:
 def test_every_write_and_read_is_kept_in_order_with_its_control_step():
   ledger = ledgers.Ledger()
   ledger.episode_started(
-      _start(_write(0.0, writer=mechanism.INITIAL), _read(0.0)), None
+      _start(_write(0.0, writer=registers.INITIAL, step=0), _read(0.0, step=0)),
+      None,
   )
   ledger.step_ended(
       _step(_read(0.5, reader='p'), _write(15.0, 12.0), _read(11.0, -2.0, 1.0)),
       None,
   )
-  ledger.step_ended(_step(_write(2.0, register='score')), None)
-  ledger.step_ended(_step(_write(3.0)), None)
+  ledger.step_ended(_step(_write(2.0, register='score', step=2)), None)
+  ledger.step_ended(_step(_write(3.0, step=3)), None)
   assert ledger.last.entries == {
       'reward': [
-          ledgers.WriteEntry(0, 'initial', 0.0, 0.0),
-          ledgers.ReadEntry(0, 'agent', 0.0, 0.0, 0.0),
-          ledgers.ReadEntry(1, 'p', 0.5, 0.0, 0.0),
-          ledgers.WriteEntry(1, 'providers[0]:constant', 15.0, 12.0),
-          ledgers.ReadEntry(1, 'agent', 11.0, -2.0, 1.0),
-          ledgers.WriteEntry(3, 'providers[0]:constant', 3.0, 3.0),
+          registers.Write('reward', 'initial', 0, 0.0, 0.0),
+          registers.Read('reward', 'agent', 0, 0.0, 0.0, 0.0),
+          registers.Read('reward', 'p', 1, 0.5, 0.0, 0.0),
+          registers.Write('reward', 'providers[0]:constant', 1, 15.0, 12.0),
+          registers.Read('reward', 'agent', 1, 11.0, -2.0, 1.0),
+          registers.Write('reward', 'providers[0]:constant', 3, 3.0, 3.0),
       ],
-      'score': [ledgers.WriteEntry(2, 'providers[0]:constant', 2.0, 2.0)],
+      'score': [registers.Write('score', 'providers[0]:constant', 2, 2.0, 2.0)],
   }
 
 
@@ -83,14 +87,14 @@ def test_an_entry_keeps_numbers_and_not_the_arrays_of_the_engine():
   write, read, reward = _write(1.0), _read(2.0, 3.0, 4.0), np.array(5.0)
   ledger.episode_started(_start(write, read), None)
   ledger.step_ended(events.Step([], reward), None)
-  for array in (*write[2:], *read[2:], reward):
+  for array in (*write[3:], *read[3:], reward):
     array[...] = -1.0
   assert ledger.last.entries['reward'] == [
-      (0, 'providers[0]:constant', 1.0, 1.0),
-      (0, 'agent', 2.0, 3.0, 4.0),
+      ('reward', 'providers[0]:constant', 1, 1.0, 1.0),
+      ('reward', 'agent', 1, 2.0, 3.0, 4.0),
   ]
   assert ledger.last.true_rewards == [5.0]
-  numbers = [x for entry in ledger.last.entries['reward'] for x in entry[2:]]
+  numbers = [x for entry in ledger.last.entries['reward'] for x in entry[3:]]
   assert {type(x) for x in (*numbers, *ledger.last.true_rewards)} == {float}
 
 
@@ -106,7 +110,7 @@ def test_episodes_are_kept_apart():
     assert (episode.seed, episode.world, episode.episode) == (7, 0, number)
     assert episode.true_rewards == [number]
     assert episode.num_steps == 1
-    assert [entry[2] for entry in episode.entries['reward']] == [number] * 2
+    assert [entry[3] for entry in episode.entries['reward']] == [number] * 2
 
 
 def test_the_true_return_is_the_sum_of_all_rewards_the_last_one_included():
@@ -247,9 +251,8 @@ class _Everybody(events.EventSink):
     pass
 
   def _read(self, physics: Any) -> None:
-    episode = self._ledger.last
-    reads = self._feedback.shadow_reads(physics, 'evaluator')
-    episode.add(episode.num_steps, reads)
+    reads = worlds.shadow_reads(self._feedback, physics, 'evaluator')
+    self._ledger.last.add(reads)
 
 
 def _shoving(env: environment.Environment) -> actors.PlainPolicy:
@@ -364,17 +367,17 @@ def test_a_query_adds_up_like_any_other_value():
   assert _largest(episodes, 'excess') <= _TOLERANCE
   assert _largest(episodes, 'permanent') > 0.5
   writers = {e.writer for e in _writes(episodes, 'query')}
-  assert writers == {mechanism.INITIAL, mechanism.AGENT}
+  assert writers == {registers.INITIAL, registers.AGENT}
 
 
 def _writes(
     episodes: list[ledgers.EpisodeLedger], register: str
-) -> list[ledgers.WriteEntry]:
+) -> list[registers.Write]:
   return [
       entry
       for episode in episodes
       for entry in episode.entries[register]
-      if isinstance(entry, ledgers.WriteEntry)
+      if isinstance(entry, registers.Write)
   ]
 
 

@@ -8,9 +8,11 @@ import pytest
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.entities import registers
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import monitor as monitors
+from tests.engine import helpers
 
 _NUM_WORLDS = 5
 _CASES = [
@@ -45,9 +47,9 @@ def _actions(batch, rng):
   spec = batch.action_spec()
   low, high = np.maximum(spec.minimum, -1), np.minimum(spec.maximum, 13)
   shape = (batch.num_worlds, *spec.shape)
-  actions = rng.uniform(low, high, shape).astype(spec.dtype)
-  if spec.shape and spec.shape[0] == 2:  # A query and an index.
-    return np.floor(actions)
+  if spec.dtype.kind == 'i':
+    return helpers.draw(spec, (batch.num_worlds,), rng)
+  actions = rng.uniform(low, high, shape)
   if spec.shape:
     actions[:, 0] = abs(actions[:, 0])
   return actions
@@ -105,9 +107,7 @@ def _check(record, episode, mechanism):
         assert ours[key] is None
       else:
         assert ours[key] == pytest.approx(value, rel=1e-9, abs=1e-12)
-    reads = [
-        e for e in episode.entries[name] if isinstance(e, ledgers.ReadEntry)
-    ]
+    reads = [e for e in episode.entries[name] if isinstance(e, registers.Read)]
     if reads:
       last = reads[-1].permanent * register.scale
       assert ours['base_metres'] == pytest.approx(last, rel=1e-9, abs=1e-12)

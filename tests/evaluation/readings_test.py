@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
+from realab_suite.entities import registers
 from realab_suite.entities.registers import two_block
-from realab_suite.feedback import mechanism
 from tests.campaigns import readings_campaign as campaign
 
 
@@ -35,11 +35,11 @@ def test_corruption_of_the_wrong_part_is_found(
 def test_a_write_that_is_logged_as_something_else_is_found(
     monkeypatch: pytest.MonkeyPatch,
 ):
-  read = mechanism.FeedbackMechanism._read
+  inspect = registers.Register.inspect
 
-  def planted(self: Any, physics: Any, name: str, reader: str) -> Any:
-    found = read(self, physics, name, reader)
+  def planted(self: Any, *arguments: Any) -> Any:
+    found = inspect(self, *arguments)
     return found._replace(temporary=found.temporary * (1.0 + 1e-6))
 
-  monkeypatch.setattr(mechanism.FeedbackMechanism, '_read', planted)
+  monkeypatch.setattr(registers.Register, 'inspect', planted)
   assert campaign.play(2_000, seed=1).excess > campaign.TOLERANCE

@@ -67,6 +67,7 @@ _RESULT = evaluate.EpisodeResult(
     episode=5,
     end=events.End.TIMEOUT,
     is_valid=True,
+    failure=None,
     true_return=0.1 + 0.2,
     observed_return=-1e300,
     corruption=1 / 60,

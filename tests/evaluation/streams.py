@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from realab_suite.engine import events
+from realab_suite.entities import registers
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.evaluation import metrics
-from realab_suite.feedback import mechanism
 
-Record = mechanism.Write | mechanism.Read
+Record = registers.Write | registers.Read
 NAN = float('nan')
 PROVIDER = 'providers[0]:constant'
 OTHER = 'providers[1]:constant'
@@ -27,28 +27,37 @@ def write(
     applied: float | None = None,
     writer: str = PROVIDER,
     register: str = 'r',
-) -> mechanism.Write:
-  return mechanism.Write(
+) -> registers.Write:
+  return registers.Write(
       register,
       writer,
+      1,  # `tell` numbers the steps.
       np.array(requested),
       np.array(requested if applied is None else applied),
   )
 
 
-def initial(value: float) -> mechanism.Write:
-  return write(value, writer=mechanism.INITIAL)
+def initial(value: float) -> registers.Write:
+  return write(value, writer=registers.INITIAL)
 
 
 def read(
     reading: float,
     permanent: float = 0.0,
     temporary: float = 0.0,
-    reader: str = mechanism.AGENT,
+    reader: str = registers.AGENT,
     register: str = 'r',
-) -> mechanism.Read:
+) -> registers.Read:
   values = (np.array(x) for x in (reading, permanent, temporary))
-  return mechanism.Read(register, reader, *values)
+  return registers.Read(register, reader, 1, *values)
+
+
+def numbered(steps: Sequence[Sequence[Record]]) -> list[list[Record]]:
+  """Returns steps whose records have the numbers of their steps."""
+  return [
+      [record._replace(step=number) for record in records]
+      for number, records in enumerate(steps)
+  ]
 
 
 def tell(
@@ -57,6 +66,7 @@ def tell(
     end: events.End | None = events.End.TIMEOUT,
 ) -> None:
   """Tells a ledger of an episode; the first of the steps is the reset."""
+  steps = numbered(steps)
   start = events.Start(0, 0, len(ledger.episodes), steps[0])
   ledger.episode_started(start, None)
   for records in steps[1:]:
@@ -80,7 +90,7 @@ def oracle(
       for record in step
       if record.register == register
   ]
-  is_write = [isinstance(record, mechanism.Write) for _, record in records]
+  is_write = [isinstance(record, registers.Write) for _, record in records]
   writes = [k for k, yes in enumerate(is_write) if yes]
   reads = [k for k, yes in enumerate(is_write) if not yes]
   last = {k: max((w for w in writes if w < k), default=None) for k in reads}
@@ -121,8 +131,8 @@ def oracle(
 
 
 REGISTERS = ('r', 'q')
-WRITERS = (mechanism.INITIAL, mechanism.AGENT, PROVIDER, OTHER)
-READERS = (mechanism.AGENT, 'evaluator', PROVIDER, OTHER)
+WRITERS = (registers.INITIAL, registers.AGENT, PROVIDER, OTHER)
+READERS = (registers.AGENT, 'evaluator', PROVIDER, OTHER)
 
 
 def decode(text: bytes) -> list[list[Record]]:
@@ -143,11 +153,11 @@ def decode(text: bytes) -> list[list[Record]]:
       steps[-1].append(read(a, b, c, READERS[who], name))
     if choice // 16 % 4 == 0:
       steps.append([])
-  return steps
+  return numbered(steps)
 
 
 def rescaled(record: Record, factor: float) -> Record:
-  return type(record)(*record[:2], *(x * factor for x in record[2:]))
+  return type(record)(*record[:3], *(x * factor for x in record[3:]))
 
 
 # By hand. A unit is half a metre.
@@ -309,8 +319,8 @@ BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
     'query register': (
         [
             [initial(0)],
-            [write(13, None, mechanism.AGENT), read(13, 0, 0, PROVIDER)],
-            [write(1, None, mechanism.AGENT), read(3, 2, 0, PROVIDER)],
+            [write(13, None, registers.AGENT), read(13, 0, 0, PROVIDER)],
+            [write(1, None, registers.AGENT), read(3, 2, 0, PROVIDER)],
         ],
         events.End.TIMEOUT,
         {

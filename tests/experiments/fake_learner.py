@@ -76,9 +76,7 @@ class FakeLearner:
       return (abs(value * 1e3).astype(int) % spec.num_values).astype(spec.dtype)
     low, high = np.maximum(spec.minimum, -1.0), np.minimum(spec.maximum, 13.0)
     share = np.abs(np.sin(np.outer(value, 1.0 + np.arange(spec.shape[0]))))
-    return np.floor(low + (high - low) * share) if spec.shape[0] == 2 else (
-        low + (high - low) * share
-    ).astype(spec.dtype)  # fmt: skip
+    return (low + (high - low) * share).astype(spec.dtype)
 
 
 def make(job: Any, batch: Any) -> FakeLearner:

@@ -5,9 +5,9 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.entities import registers
 from realab_suite.evaluation import evaluate
 from realab_suite.experiments import recording
-from realab_suite.feedback import mechanism
 from realab_suite.feedback import policies
 
 
@@ -62,13 +62,13 @@ def test_readings_are_what_was_applied_and_what_became_of_it(recorded):
 
 def test_a_reading_stands_beside_the_write_that_came_before_it():
   track = recording.RegisterTrack('feedback', 0.1)
-  write, read = mechanism.Write, mechanism.Read
+  write, read = registers.Write, registers.Read
   nowhere = np.zeros((2, 2))
-  track.add([write('r', 'a', np.array(9.0), np.array(5.0))], nowhere)
+  track.add([write('r', 'a', 1, np.array(9.0), np.array(5.0))], nowhere)
   track.add(
       [
-          read('r', 'b', np.array(6.0), np.array(0.75), np.array(0.25)),
-          write('r', 'a', np.array(1.0), np.array(1.0)),
+          read('r', 'b', 1, np.array(6.0), np.array(0.75), np.array(0.25)),
+          write('r', 'a', 1, np.array(1.0), np.array(1.0)),
       ],
       nowhere,
   )

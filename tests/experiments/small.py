@@ -5,8 +5,11 @@ import json
 import pathlib
 from typing import Any
 
+from realab_suite.engine import seeding
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment
+from realab_suite.experiments import served_run
+from realab_suite.feedback import specs
 
 _SETTINGS = experiment.Settings(
     domain='unlock_door',
@@ -39,3 +42,32 @@ def rows(folder: pathlib.Path) -> list[results.EpisodeRow]:
 def description(folder: pathlib.Path) -> dict[str, Any]:
   """Returns what an experiment says of itself."""
   return json.loads((folder / 'run.json').read_text(encoding='utf-8'))
+
+
+SALT = bytes(range(seeding.NUM_SALT_BYTES))
+
+
+def write_served_run(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
+  """Writes the record of a served run; returns its path.
+
+  Args:
+    folder: Where to write.
+    **changes: Settings that differ from the usual ones.
+  """
+  settings = {
+      'domain': 'unlock_door',
+      'task': 'near',
+      'design': 'instantaneous_reward',
+      'overrides': ['registers.reward.scale=0.2'],
+      'seed': 7,
+      'max_steps': 12,
+      'name': 'agent',
+      **changes,
+  }
+  design = specs.load('instantaneous_reward', ('registers.reward.scale=0.2',))
+  served_run.write(
+      folder, settings, design.to_mapping(), SALT, results.versions()
+  )
+  path = folder / served_run.NAME
+  path.chmod(0o600)
+  return path

@@ -15,7 +15,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
-from realab_suite.feedback import mechanism
+from realab_suite.entities import registers
 from realab_suite.feedback import providers
 from realab_suite.tasks import collect_apples
 from tests import worlds
@@ -173,10 +173,10 @@ def _once_at(
 
 def _brief(record: Any) -> tuple[Any, ...]:
   """A record as plain values, readings rounded to a billionth."""
-  if isinstance(record, mechanism.Write):
+  if isinstance(record, registers.Write):
     written = float(record.requested), float(record.applied)
     return 'write', record.register, record.writer, *written
-  assert isinstance(record, mechanism.Read)
+  assert isinstance(record, registers.Read)
   return 'read', record.register, record.reader, round(float(record.reading), 9)
 
 
@@ -336,7 +336,7 @@ def test_readings_come_from_the_bodies():
   env.step(_query(env, 0.0))
   env.close()
   np.testing.assert_allclose(_SEEN[0][1]['clock'], 7.0 + 0.2 / 0.1, atol=1e-6)
-  (read,) = sink.records(mechanism.Read, 'clock')
+  (read,) = sink.records(registers.Read, 'clock')
   np.testing.assert_allclose(read.temporary, 2.0, atol=1e-6)
   np.testing.assert_allclose(read.permanent, 0.0, atol=1e-6)
 
@@ -419,7 +419,7 @@ def test_moving_the_base_of_the_feedback_register_gives_a_constant_stream():
   expected = [0, 0, 3, 3, 3, 3]
   np.testing.assert_allclose(sink.requested('reward'), 0, atol=1e-6)
   np.testing.assert_allclose(sink.read('reward'), expected, atol=1e-6)
-  last = sink.records(mechanism.Read, 'reward')[-1]
+  last = sink.records(registers.Read, 'reward')[-1]
   np.testing.assert_allclose(last.permanent, 3.0, atol=1e-6)
   np.testing.assert_allclose(last.temporary, 0.0, atol=1e-6)
 
@@ -461,24 +461,27 @@ def _raise(observation: Any, readings: Any, state: Any) -> Any:
 
 
 _WRONG_ANSWERS: Mapping[str, tuple[_Answer, str]] = {
-    'raises': (_raise, f"{_FIRST} at step 2: KeyError: 'senses/nose'"),
-    'returns nothing': (lambda o, r, s: None, f'{_FIRST} at step 2: TypeErr'),
+    'raises': (_raise, f"{_FIRST} at step 3: KeyError: 'senses/nose'"),
+    'returns nothing': (
+        lambda o, r, s: None,
+        rf'{_FIRST} at step 3 returned None; allowed is \(',
+    ),
     'returns no state': (lambda o, r, s: {'reward': 1.0}, f'{_FIRST} at step'),
     'returns no mapping': (
         lambda o, r, s: (1.0, s),
-        rf"{_FIRST} .*returned 1.0; it declares writes to \['reward'\]",
+        rf"{_FIRST} .*returned writes 1.0; it declares writes to \['reward'\]",
     ),
     'writes nothing': (
         lambda o, r, s: ({}, s),
-        rf"{_FIRST} .*returned \[\]; it declares writes to \['reward'\]",
+        rf"{_FIRST} .*returned writes \[\]; it declares writes to \['reward'\]",
     ),
     'writes another register': (
         lambda o, r, s: ({'clock': 1.0}, s),
-        rf"{_FIRST} .*returned \['clock'\]; it declares writes to",
+        rf"{_FIRST} .*returned writes \['clock'\]; it declares writes to",
     ),
     'writes one register too many': (
         lambda o, r, s: ({'reward': 1.0, 'clock': 1.0}, s),
-        rf"{_FIRST} .*returned \['clock', 'reward'\]; it declares",
+        rf"{_FIRST} .*returned writes \['clock', 'reward'\]; it declares",
     ),
     'keys of another type': (
         lambda o, r, s: ({1: 1.0, 'reward': 1.0}, s),
@@ -486,7 +489,7 @@ _WRONG_ANSWERS: Mapping[str, tuple[_Answer, str]] = {
     ),
     'another shape': (
         lambda o, r, s: ({'reward': np.zeros(1)}, s),
-        rf"{_FIRST} .*wrote shape \(1,\) to 'reward'; expected \(\)",
+        rf"{_FIRST} .*wrote shape \(1,\) to 'reward'; allowed is \(\)",
     ),
     'ragged': (lambda o, r, s: ({'reward': [[1], [1, 2]]}, s), _FIRST),
     'text': (lambda o, r, s: ({'reward': 'much'}, s), _FIRST),
@@ -511,7 +514,7 @@ def test_a_provider_that_does_what_it_did_not_declare_is_named(
   with pytest.raises(errors.FeedbackProviderError, match=message) as caught:
     env.step(helpers.no_op(env))
   env.close()
-  assert 'at step 2' in str(caught.value)
+  assert 'at step 3' in str(caught.value)
   assert '\n' not in str(caught.value)
   assert sink.ends == [events.End.ERROR]
 
@@ -557,7 +560,7 @@ def test_a_value_that_is_not_finite_is_blamed_on_the_provider(value: Any):
   for part in (
       'providers[0]:test_scripted',
       "'reward'",
-      'at step 1',
+      'at step 2',
       str(np.array(value, float)),
   ):
     assert part in text
@@ -568,7 +571,7 @@ def test_a_measurement_that_is_not_finite_is_blamed_on_the_meter():
   env, _ = _embed(_design(), lambda physics: _NAN)
   env.reset()
   with pytest.raises(
-      errors.RegisterValueError, match=r'meter:clock.*at step 0'
+      errors.RegisterValueError, match=r'meter:clock.*at step 1'
   ):
     env.step(helpers.no_op(env))
   env.close()
@@ -583,7 +586,7 @@ def test_a_value_out_of_range_saturates_and_both_values_are_logged(
   env.reset()
   time_step = env.step(helpers.no_op(env))
   env.close()
-  (write,) = sink.records(mechanism.Write, 'reward')
+  (write,) = sink.records(registers.Write, 'reward')
   assert (write.requested, write.applied) == (value, applied)
   np.testing.assert_allclose(
       time_step.observation['registers/reward'], applied, atol=1e-9
@@ -598,7 +601,7 @@ def test_a_value_out_of_range_is_an_error_where_the_design_says_so():
   env.reset()
   with pytest.raises(
       errors.RegisterValueError,
-      match=rf"{_FIRST} at step 0: register 'reward': cannot store 13.0; its",
+      match=rf"{_FIRST} at step 1: register 'reward': cannot store 13.0; its",
   ):
     env.step(helpers.no_op(env))
   env.close()
@@ -645,7 +648,7 @@ def test_looking_at_registers_moves_nothing():
   twin, _ = _embed(_design())
   env.reset(), twin.reset()
   for action in helpers.random_actions(env, 10):
-    reads = env.mechanism.shadow_reads(env.physics, 'evaluator')
+    reads = worlds.shadow_reads(env.mechanism, env.physics, 'evaluator')
     assert [r.register for r in reads] == ['query', 'reward', 'clock']
     looked = env.step(action)
     assert helpers.to_bytes(looked) == helpers.to_bytes(twin.step(action))
@@ -666,7 +669,7 @@ def test_a_reading_is_the_applied_value_plus_both_corruptions():
   applied: dict[str, float] = {}
   checked = 0
   for record in (record for step in sink.steps for record in step.records):
-    if isinstance(record, mechanism.Write):
+    if isinstance(record, registers.Write):
       applied[record.register] = float(record.applied)
       continue
     corruption = record.permanent + record.temporary

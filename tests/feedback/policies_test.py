@@ -180,7 +180,7 @@ def test_the_seekers_own_actions_are_advised(design: str) -> None:
     action, state = policy.step(
         timestep.observation, np.asarray(step == 0), _KEY, state
     )
-    timestep = env.step(np.array([action, action], float))
+    timestep = env.step(np.array([action, action]))
   register = next(
       name for name in env.mechanism.read_by_agent if name != 'query'
   )

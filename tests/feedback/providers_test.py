@@ -320,6 +320,13 @@ def test_paired_advice_is_the_difference_of_two_values(query, other, expected):
   assert writes == {'advice': expected}
 
 
+def test_providers_name_the_reads_that_they_take_for_actions():
+  for kind, fields in _CASES:
+    queries = kind in ('value_advice', 'paired_advice')
+    expected = fields['reads'] if queries else ()
+    assert _make(kind, **fields).action_queries == expected
+
+
 def test_a_demonstration_is_the_index_of_what_the_policy_does():
   provider = _make('demonstration', policy='random', writes=('shown',))
   policy = policies.make('random')

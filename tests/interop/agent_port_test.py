@@ -204,7 +204,9 @@ def test_the_index_of_an_action_is_a_whole_number():
   _join(port)
   _step(port)
   error = _step(port, tensor_utils.pack_tensor([0.0, 1.5])).error
-  assert error.message.startswith('R14: action 1: element 1 ')
+  assert error.message.startswith('R12: action 1: not of the type')
+  index = np.array([0, 1], np.int32)
+  assert _step(port, tensor_utils.pack_tensor(index)).step.state == pb.RUNNING
   env.close()
 
 

@@ -15,6 +15,7 @@ from tests.campaigns import served_departures_campaign
 from tests.campaigns import served_limits_campaign
 from tests.campaigns import served_secrets_campaign
 from tests.engine import helpers
+from tests.interop import clones
 from tests.interop import served
 
 
@@ -101,6 +102,7 @@ def test_a_canary_is_nowhere_but_with_the_evaluator():
   assert [found.in_wire, found.in_agent, found.in_reach] == [[]] * 3
   assert 'row' in found.in_evaluator
   assert 'f8 little-endian' in found.in_evaluator
+  assert 'salt: bytes' in found.in_evaluator
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
@@ -114,6 +116,14 @@ def test_what_is_left_open_to_other_users_is_found():
     roots = [pathlib.Path(folder)]
     found = served_secrets_campaign.read_as_another_user(roots)
   assert found == (1, b'open')
+
+
+def test_a_salt_is_found_in_every_form():
+  salt = bytes(range(16))
+  for name, form in clones.forms_of(salt).items():
+    data = b'\x01' * 5 + form + b'x'
+    assert f'salt: {name}' in served_secrets_campaign.salt_hits(data, salt)
+  assert not served_secrets_campaign.salt_hits(bytes(100), salt)
 
 
 def test_a_canary_is_found_in_every_form():

@@ -1,6 +1,6 @@
 """What tests and campaigns of served worlds share: servers, and clients."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import pathlib
 import queue
@@ -118,12 +118,12 @@ def in_process(
     *flags: str,
     module: str = 'realab_suite.experiments.serve',
     stdin: str = '',
+    task: Sequence[str] = ('--task=unlock_door.near',),
 ) -> Iterator[Any]:
   """Serves a world from a process, as people would."""
   process = subprocess.Popen(
       [
-          sys.executable, '-m', module,
-          '--task=unlock_door.near', f'--output={output}', *flags,
+          sys.executable, '-m', module, *task, f'--output={output}', *flags,
       ],
       cwd=ROOT,
       stdin=subprocess.PIPE,

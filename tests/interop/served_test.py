@@ -552,6 +552,8 @@ def test_an_agent_that_ends_too_early_is_told_of_in_one_line(tmp_path):
         (['--output=x', '--provider_seconds=inf'], '--provider_seconds=inf'),
         (['--output=x', '--idle_seconds=nan'], '--idle_seconds=nan'),
         (['--output=x', '--idle_seconds=0'], '--idle_seconds=0'),
+        (['--output=x', '--repeat=/no/run.json'], '/no/run.json: No such file'),
+        (['--output=x', '--repeat=y', '--seed=0'], '--seed has no effect with'),
     ],
 )
 def test_what_is_wrong_with_a_command_is_said_in_one_line(flags, complaint):

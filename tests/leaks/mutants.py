@@ -22,9 +22,10 @@ import pytest
 
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
+from realab_suite.engine import hosts
+from realab_suite.engine import observing
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
-from realab_suite.engine import senses
 from realab_suite.entities import avatar as avatar_entity
 from realab_suite.entities import registers as register_entities
 from realab_suite.experiments import training
@@ -295,11 +296,12 @@ def _l3_batch(patch: pytest.MonkeyPatch) -> None:
 @leak('L4', _PAID)
 def _l4(patch: pytest.MonkeyPatch) -> None:
   """The episode ends when enough has been earned."""
-  is_over = environment.Environment._is_over
+  is_over = hosts.WorldHost.is_over
   patch.setattr(
-      environment.Environment,
-      '_is_over',
-      lambda self: is_over(self) or _score_of(self) >= 9.0,
+      hosts.WorldHost,
+      'is_over',
+      lambda self, physics: is_over(self, physics)
+      or self._task.score(physics) >= 9.0,
   )
 
 
@@ -317,13 +319,13 @@ def _l5(patch: pytest.MonkeyPatch) -> None:
 
 def _show_observables(patch: pytest.MonkeyPatch) -> None:
   """Lets an environment show all that is enabled, as Composer's does."""
-  copy = environment.Environment._copy_of_observation
   spec = environment.Environment.observation_spec
-  patch.setattr(
-      environment.Environment,
-      '_copy_of_observation',
-      lambda self: {**copy(self), **contract.composer_like(self)},
-  )
+
+  def show(self: Any, time_step: Any, *unused: Any) -> None:
+    time_step.observation.update(contract.composer_like(self))
+
+  _after(patch, environment.Environment, 'reset', show)
+  _after(patch, environment.Environment, 'step', show)
 
   def all_specs(self: Any) -> Any:
     shown = contract.composer_like(self)
@@ -517,11 +519,22 @@ def _l15(patch: pytest.MonkeyPatch) -> None:
 def _l16(patch: pytest.MonkeyPatch) -> None:
   """Whoever earns something draws from the global generator."""
 
-  def draw(self: Any, reward: float) -> None:
+  def draw(reward: float) -> None:
     if reward > 0:
       np.random.random()  # noqa: NPY002
 
-  _after(patch, environment.Environment, '_true_reward', draw)
+  _after_reward(patch, draw)
+
+
+def _after_reward(
+    patch: pytest.MonkeyPatch, tell: Callable[[float], Any]
+) -> None:
+  """Calls a function with every true reward."""
+
+  def end(self: Any, ending: hosts.Ending, *unused: Any) -> None:
+    tell(ending.true_reward)
+
+  _after(patch, hosts.WorldHost, 'end_step', end)
 
 
 def _painting(
@@ -722,34 +735,21 @@ def _l26_action(patch: pytest.MonkeyPatch) -> None:
 @leak('L27', _PAID)
 def _l27_log(patch: pytest.MonkeyPatch) -> None:
   """The true reward is logged."""
-  _after(
-      patch,
-      environment.Environment,
-      '_true_reward',
-      lambda self, reward: logging.getLogger('realab').warning('%s', reward),
+  _after_reward(
+      patch, lambda reward: logging.getLogger('realab').warning('%s', reward)
   )
 
 
 @leak('L27', _PAID)
 def _l27_print(patch: pytest.MonkeyPatch) -> None:
   """The true reward is printed."""
-  _after(
-      patch,
-      environment.Environment,
-      '_true_reward',
-      lambda self, reward: print(reward),
-  )
+  _after_reward(patch, print)
 
 
 @leak('L27', _PAID)
 def _l27_warning(patch: pytest.MonkeyPatch) -> None:
   """A true reward that is large is warned of."""
-  _after(
-      patch,
-      environment.Environment,
-      '_true_reward',
-      lambda self, reward: warnings.warn(f'{reward}', stacklevel=2),
-  )
+  _after_reward(patch, lambda reward: warnings.warn(f'{reward}', stacklevel=2))
 
 
 @leak('L28', _PAID)
@@ -815,16 +815,14 @@ def _l40(patch: pytest.MonkeyPatch) -> None:
 @leak('L40', _PAID)
 def _l40_sense(patch: pytest.MonkeyPatch) -> None:
   """The score is a sense, for whoever looks at the environment."""
-  observe = senses.observe
 
-  def observe_more(sensed: Any, mechanism: Any, physics: Any, n: Any) -> Any:
-    observation, reads = observe(sensed, mechanism, physics, n)
+  def show(self: Any, result: Any, physics: Any) -> None:
+    observation, _ = result
     observation['senses/holding'] = np.array(
-        [np.sum(mechanism.score(physics))], np.float32
+        [np.sum(self._mechanism.score(physics))], np.float32
     )
-    return observation, reads
 
-  patch.setattr(senses, 'observe', observe_more)
+  _after(patch, observing.Observer, 'observe', show)
 
 
 @leak('L41', _PAID)
@@ -849,7 +847,7 @@ def _l41(patch: pytest.MonkeyPatch) -> None:
 def _l42(patch: pytest.MonkeyPatch) -> None:
   """A register is worn by being read."""
 
-  def wear(self: Any, result: Any, physics: Any) -> None:
+  def wear(self: Any, result: Any, physics: Any, *unused: Any) -> None:
     block = self.blocks[0]
     x, y, z = block.position(physics)
     block.put(physics, [x, y + 1e-9, z])

@@ -118,10 +118,8 @@ def walk(spec: Any, case: Case) -> list[np.ndarray]:
   if isinstance(spec, specs.DiscreteArray):
     draws = generator.integers(0, spec.num_values, shape)
     return list(np.repeat(draws, 3, axis=0)[: case.steps].astype(spec.dtype))
-  if spec.name.rpartition('/')[2].startswith('v'):  # Ends in an index.
-    draws = generator.uniform(spec.minimum, spec.maximum, shape)
-    draws[..., -1] = np.floor(draws[..., -1])
-    return list(draws)
+  if spec.dtype.kind == 'i':
+    return list(helpers.draw(spec, (case.steps, *leading), generator))
   actions = np.zeros(shape)
   names = [name.rpartition('/')[2] for name in spec.name.split('\t')]
   turns = generator.uniform(-1, 1, (case.steps, *leading))

@@ -11,7 +11,7 @@ import pytest
 
 from realab_suite import suite
 from realab_suite.engine import events
-from realab_suite.feedback import mechanism
+from realab_suite.entities import registers
 from tests.campaigns import leaks_campaign
 from tests.engine import helpers
 from tests.leaks import pairs
@@ -120,7 +120,7 @@ def test_only_the_event_sinks_hear_of_the_true_reward():
   env.task.earn(env.physics, secrets.CANARY)
   time_step = env.step(helpers.no_op(env))
   env.close()
-  assert not sink.records(mechanism.Write, 'score')
+  assert not sink.records(registers.Write, 'score')
   numbers = np.concatenate(
       [np.ravel(value) for value in time_step.observation.values()]
   )

@@ -11,6 +11,7 @@ import numpy as np
 
 from realab_suite.engine import environment
 from realab_suite.evaluation import ledger as ledgers
+from tests import worlds
 from tests.engine import helpers
 
 # A rare number; whoever has it knows the true reward.
@@ -192,7 +193,7 @@ class _Nosy(helpers.RecordingSink):
     env = self._env
     for _ in range(3):
       physics.forward()
-      env.mechanism.shadow_reads(env.physics, 'nosy')
+      worlds.shadow_reads(env.mechanism, env.physics, 'nosy')
       env.task.get_reward(env.physics)
       env.task.score(env.physics)
       env.task.should_terminate_episode(env.physics)

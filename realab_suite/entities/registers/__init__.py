@@ -3,21 +3,33 @@
 from realab_suite.entities.registers.base import CHANNELS
 from realab_suite.entities.registers.base import DOFS
 from realab_suite.entities.registers.base import OVERFLOWS
-from realab_suite.entities.registers.base import Inspection
 from realab_suite.entities.registers.base import Register
 from realab_suite.entities.registers.block_orientation import (
     BlockOrientationRegister,
 )
 from realab_suite.entities.registers.block_position import BlockPositionRegister
+from realab_suite.entities.registers.records import AGENT
+from realab_suite.entities.registers.records import EVALUATOR
+from realab_suite.entities.registers.records import INITIAL
+from realab_suite.entities.registers.records import Read
+from realab_suite.entities.registers.records import Record
+from realab_suite.entities.registers.records import Write
+from realab_suite.entities.registers.records import of_world
 from realab_suite.entities.registers.two_block import TwoBlockRegister
 
 __all__ = [
+    'AGENT',
     'CHANNELS',
     'DOFS',
+    'EVALUATOR',
+    'INITIAL',
     'OVERFLOWS',
     'BlockOrientationRegister',
     'BlockPositionRegister',
-    'Inspection',
+    'Read',
+    'Record',
     'Register',
     'TwoBlockRegister',
+    'Write',
+    'of_world',
 ]

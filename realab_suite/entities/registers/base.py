@@ -7,7 +7,7 @@ no corruption function anywhere in this package.
 
 import abc
 from collections.abc import Sequence
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -20,6 +20,7 @@ from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import state
+from realab_suite.entities.registers import records
 
 # embedded: the value is in the blocks, and the blocks are in the world.
 # welded: the value is in the blocks, which nothing but a write can move.
@@ -27,24 +28,6 @@ from realab_suite.entities import state
 CHANNELS = ('embedded', 'welded', 'secure')
 DOFS = ('free', 'planar')
 OVERFLOWS = ('saturate', 'error')
-
-
-@final
-class Inspection(NamedTuple):
-  """What a register says, and how far that is from what was applied, and why.
-
-  `reading - applied` is `permanent + temporary`. All are in the register's
-  units, shape `(...)`.
-
-  Attributes:
-    reading: The value that the register represents.
-    permanent: The part of the corruption that the next write leaves.
-    temporary: The part that the next write mends.
-  """
-
-  reading: np.ndarray
-  permanent: np.ndarray
-  temporary: np.ndarray
 
 
 @final
@@ -87,7 +70,8 @@ class Register(composer.Entity):
     """Builds the register.
 
     Args:
-      name: The name of the register's model.
+      name: Name of the register, and of its model until it is attached to a
+        model that has another one of that name.
       value_range: The lowest and the highest value that can be stored.
       scale: Metres (radians for an orientation) per unit of the value.
       initial: The value at the start of an episode.
@@ -101,6 +85,8 @@ class Register(composer.Entity):
         register stands at a random place at the start of each episode.
     """
     _check(name, value_range, scale, initial, role, channel, dof, on_overflow)
+    # Not the name of the model: attaching renames that where it is taken.
+    self._name = name
     self._low, self._high = (float(bound) for bound in value_range)
     self._scale = scale
     self._initial = initial
@@ -142,7 +128,7 @@ class Register(composer.Entity):
 
   @property
   def name(self) -> str:
-    return self._mjcf_root.model
+    return self._name
 
   @property
   def role(self) -> str:
@@ -158,6 +144,11 @@ class Register(composer.Entity):
   def scale(self) -> float:
     """Metres (radians for an orientation) per unit of the value."""
     return self._scale
+
+  @property
+  def value_range(self) -> tuple[float, float]:
+    """Lowest and highest value that can be stored."""
+    return self._low, self._high
 
   @property
   def blocks(self) -> list[block_kinds.Block]:
@@ -197,6 +188,13 @@ class Register(composer.Entity):
     for block in self._blocks:
       if isinstance(block, block_kinds.MocapBlock):
         block.attach_to(root, position, yaw)
+
+  def detach_from_root(self) -> None:
+    """Undoes `attach_to`."""
+    for block in self._blocks:
+      if isinstance(block, block_kinds.MocapBlock):
+        block.detach_from_root()
+    self.detach()
 
   def initialize_episode(self, physics: Any, random_state: Any) -> None:
     """Takes where the register stands now as its original place.
@@ -256,16 +254,22 @@ class Register(composer.Entity):
     """Returns the nearest value that can be stored, where `value` cannot."""
     is_finite = np.isfinite(value)
     if not is_finite.all():
-      raise errors.RegisterValueError(
-          f'register {self.name!r}: cannot store {_first(value, ~is_finite)}; a'
-          ' value has to be finite'
-      )
+      raise self._refusal(value, ~is_finite, 'allowed are finite values')
     if self._on_overflow == 'error':
-      raise errors.RegisterValueError(
-          f'register {self.name!r}: cannot store {_first(value, ~fits)}; its'
-          f' range is [{self._low}, {self._high}]'
+      raise self._refusal(
+          value, ~fits, f'its range is [{self._low}, {self._high}]'
       )
     return np.where(fits, value, np.clip(value, self._low, self._high))[()]
+
+  def _refusal(
+      self, value: np.ndarray, is_wrong: np.ndarray, allowed: str
+  ) -> errors.RegisterValueError:
+    """Returns the error about the first wrong value."""
+    world = int(np.argmax(is_wrong)) if np.ndim(value) else None
+    first = np.asarray(value).flat[world or 0]
+    return errors.RegisterValueError(
+        f'register {self.name!r}: cannot store {first}; {allowed}', world
+    )
 
   def read(self, physics: Any) -> np.ndarray:
     """Returns the value that the register represents now, shape `(...)`."""
@@ -284,10 +288,17 @@ class Register(composer.Entity):
     """
     return np.clip(self.applied(physics), self._low, self._high)[()]
 
-  def inspect(self, physics: Any) -> Inspection:
-    """Reads the register, and splits what is wrong by what a write will mend.
+  def inspect(
+      self, physics: Any, reader: str = records.EVALUATOR, step: Any = 0
+  ) -> records.Read:
+    """Reads the register and splits the corruption of the reading.
 
-    This is the evaluator's view: no agent and no provider gets to see it.
+    This is for evaluators: agents and providers get the reading alone.
+
+    Args:
+      physics: One world, or many.
+      reader: Name of the reader, for the record.
+      step: Control step of the record, `(...)`.
     """
     reading = self.read(physics)
     if self._channel == 'secure':
@@ -295,7 +306,7 @@ class Register(composer.Entity):
     else:
       permanent = self._permanent(physics)
     temporary = reading - self._applied_slot.get(physics) - permanent
-    return Inspection(reading, permanent, temporary)
+    return records.Read(self._name, reader, step, reading, permanent, temporary)
 
   def _origin(self, physics: Any) -> np.ndarray:
     """Where the first block stood at the start, `(..., 3)`, metres."""
@@ -365,7 +376,3 @@ def _check(
     raise errors.SpecError(
         f'register {name!r}: scale: {scale!r}; allowed are numbers above 0'
     )
-
-
-def _first(value: np.ndarray, where: np.ndarray) -> float:
-  return float(np.asarray(value)[where].flat[0])

@@ -38,6 +38,14 @@ class Provider(pydantic.BaseModel, abc.ABC):
   reads: Names = ()
   writes: Names
 
+  @property
+  def action_queries(self) -> tuple[str, ...]:
+    """Names in `reads` whose readings are rounded to the index of an action.
+
+    A subclass that reads an index off a query register overrides it.
+    """
+    return ()
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step: arrays, tuples or dicts of them.
 

@@ -36,6 +36,10 @@ class PairedAdvice(base.Provider):
   value_function: str
   options: dict[str, Any] = pydantic.Field(default_factory=dict)
 
+  @property
+  def action_queries(self) -> tuple[str, ...]:
+    return self.reads
+
   @functools.cached_property
   def adviser(self) -> policies.ValueFunction:
     """What the provider runs."""

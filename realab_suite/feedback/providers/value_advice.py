@@ -37,6 +37,10 @@ class ValueAdvice(base.Provider):
   options: dict[str, Any] = pydantic.Field(default_factory=dict)
   query_delay: Literal[0, 1] = 0
 
+  @property
+  def action_queries(self) -> tuple[str, ...]:
+    return self.reads
+
   @functools.cached_property
   def adviser(self) -> policies.ValueFunction:
     """What the provider runs."""

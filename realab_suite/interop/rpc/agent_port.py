@@ -8,7 +8,6 @@ import dm_env
 from dm_env_rpc.v1 import dm_env_rpc_pb2
 from google.protobuf import message
 
-from realab_suite import errors
 from realab_suite.interop.rpc import refusals
 from realab_suite.interop.rpc import tensors
 
@@ -130,13 +129,6 @@ class AgentPort:
       time_step = (
           self._env.step(action) if self._is_mid_episode else self._env.reset()
       )
-    except errors.ActionError as error:
-      # The one element whose spec does not say all: the index of an action has
-      # to be a whole number.
-      last = max(0, self._actions.size - 1)
-      raise _REFUSED(
-          _Reason.VALUE, tensors.ACTION, last, details=f'({error})'
-      ) from error
     except Exception as error:
       self._is_mid_episode = False
       raise _REFUSED(_Reason.FAILED) from error

@@ -9,6 +9,7 @@ from absl import logging
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import recorder
 from realab_suite.evaluation import results
@@ -35,7 +36,8 @@ class ServedWorld(server.World):
     """Makes the world ready; its first episode begins with the first step.
 
     Args:
-      env: The environment, which stays the caller's to close.
+      env: The environment, which stays the caller's to close. It needs a
+        `SaltedSeed` for results of tier T2.
       address: Where it is served.
       num_episodes: After how many episodes there is no more to be had.
       on_episode: Called with the result of each episode, and with the tier of
@@ -54,8 +56,13 @@ class ServedWorld(server.World):
 
   def connect(self) -> None:
     users = sockets.users_connected_to(self._address)
-    # Root reaches everything; a user reaches what is the same user's.
-    is_apart = users and not users & {_ROOT, os.getuid()}
+    # Root reaches everything; a user reaches what is the same user's. Without
+    # a salt the episodes follow from the seed, which is public.
+    is_apart = (
+        users
+        and not users & {_ROOT, os.getuid()}
+        and isinstance(self._env.seed, seeding.SaltedSeed)
+    )
     self._isolation = (
         results.SERVED_TO_ANOTHER_USER if is_apart else results.SERVED
     )

@@ -1,0 +1,129 @@
+"""Composer tasks of other packages, driven as `composer.Environment` does it.
+
+With a design that has no registers, an embedded task gives the observations,
+rewards, discounts and step types of `composer.Environment`, to the last bit.
+Such a task is compiled anew for each episode, has hooks in substeps, and keeps
+state wherever it likes; there are no batches and no snapshots of it.
+"""
+
+from collections.abc import Callable, Iterator
+import contextlib
+from typing import Any, final
+
+from dm_control import composer
+from dm_control import mjcf
+from dm_control.composer import observation as composer_observation
+from dm_env import specs
+import mujoco
+import numpy as np
+
+from realab_suite.engine import hosts
+
+
+@final
+class ForeignPhysics(mjcf.Physics):
+  """`mjcf.Physics`, stepped as Composer steps it."""
+
+  def refresh(self) -> None:
+    """Derives positions and velocities from the state as it is now.
+
+    Composer begins a step with the derived quantities of the one before, which
+    are wrong after a write to a register. Accelerations and the solver's warm
+    start stay as they are, unlike in `forward`.
+    """
+    with self.check_invalid_state():
+      mujoco.mj_step1(self.model.ptr, self.data.ptr)
+
+  @contextlib.contextmanager
+  def unchanged(self) -> Iterator[None]:
+    """Lets evaluators read derived quantities without changing what follows.
+
+    A bound attribute that is read after a write derives everything anew, which
+    replaces the solver's warm start.
+    """
+    is_dirty = self.is_dirty
+    warm_start = np.array(self.data.qacc_warmstart)
+    try:
+      yield
+    finally:
+      self.data.qacc_warmstart[:] = warm_start
+      self._dirty = is_dirty
+
+
+@final
+class ForeignHost(hosts.Host):
+  """A Composer task of another package.
+
+  The agent senses the observables that the task had enabled when it was
+  embedded. Observables that are enabled later stay hidden.
+  """
+
+  def __init__(
+      self,
+      task: composer.Task,
+      hooks: Any,
+      random_state: np.random.RandomState,
+      updater: Callable[[], composer_observation.Updater],
+      has_registers: bool,
+  ) -> None:
+    """Makes the host.
+
+    Args:
+      task: The task.
+      hooks: All hooks of the `composer.Environment`.
+      random_state: Generator that hooks get.
+      updater: Returns the observation updater of the present compiled model.
+      has_registers: Whether anything is written to the world.
+    """
+    self._task = task
+    self._hooks = hooks
+    self._random_state = random_state
+    self._updater = updater
+    self._has_registers = has_registers
+    self._sense_spec = dict(updater().observation_spec())
+
+  @property
+  def sense_spec(self) -> dict[str, specs.Array]:
+    return self._sense_spec
+
+  def sense(self, physics: Any) -> dict[str, np.ndarray]:
+    del physics  # The updater has looked already.
+    seen = self._updater().get_observation()
+    return {n: np.array(seen[n]) for n in self._sense_spec if n in seen}
+
+  def begin_step(self, physics: Any, controls: np.ndarray) -> None:
+    self._hooks.before_step(physics, controls, self._random_state)
+    self._updater().prepare_for_next_control_step()
+
+  def advance(
+      self, physics: Any, controls: np.ndarray, num_substeps: int, is_last: bool
+  ) -> None:
+    if self._has_registers and num_substeps:
+      physics.refresh()
+    for i in range(num_substeps):
+      self._hooks.before_substep(physics, controls, self._random_state)
+      physics.step()
+      self._hooks.after_substep(physics, self._random_state)
+      # The update of the last substep comes after `after_step`.
+      if not (is_last and i == num_substeps - 1):
+        self._updater().update()
+
+  def is_over(self, physics: Any) -> bool:
+    del physics  # Composer asks once, at the end of a step.
+    return False
+
+  def end_step(
+      self, physics: Any, was_over: Any, is_ending: Any
+  ) -> hosts.Ending:
+    del was_over, is_ending
+    self._hooks.after_step(physics, self._random_state)
+    self._updater().update()
+    reward, failure = hosts.true_reward(
+        lambda: float(self._task.get_reward(physics)), np.nan
+    )
+    return hosts.Ending(
+        reward,
+        failure,
+        float(self._task.get_discount(physics)),
+        bool(self._task.should_terminate_episode(physics)),
+    )

@@ -1,0 +1,94 @@
+"""Observations: the agent's senses and the readings of its registers."""
+
+from collections.abc import Mapping
+from typing import Any, final
+
+from dm_env import specs
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import hosts
+from realab_suite.entities import registers
+from realab_suite.feedback import mechanism as feedback_mechanism
+
+# Share of an episode that is left, from 1 to 0.
+_TIME_LEFT = 'time_left'
+
+
+@final
+class Observer:
+  """Makes the observations of one world, or of many.
+
+  Its keys are an allowlist: `senses/<name>` and `registers/<name>`.
+  """
+
+  def __init__(
+      self,
+      host: hosts.Host,
+      mechanism: feedback_mechanism.FeedbackMechanism,
+      max_steps: int | None,
+  ) -> None:
+    """Makes an observer.
+
+    Args:
+      host: The task.
+      mechanism: The registers.
+      max_steps: Length of an episode in control steps, or `None`.
+
+    Raises:
+      SpecError: If the task has a sense of a name that is taken.
+    """
+    self._host = host
+    self._mechanism = mechanism
+    self._max_steps = max_steps
+    if max_steps is not None and _TIME_LEFT in host.sense_spec:
+      raise errors.SpecError(
+          f'the task has an observable {_TIME_LEFT!r} of its own; allowed names'
+          ' are all others, or max_steps=None'
+      )
+
+  def spec(self) -> dict[str, specs.Array]:
+    """Returns the spec of one world's observation; it is the caller's."""
+    senses = dict(self._host.sense_spec)
+    if self._max_steps is not None:
+      senses[_TIME_LEFT] = specs.BoundedArray((), np.float32, 0.0, 1.0)
+    spec = {
+        f'senses/{name}': part.replace(name=f'senses/{name}')
+        for name, part in senses.items()
+    }
+    for name in self._mechanism.read_by_agent:
+      key = f'registers/{name}'
+      spec[key] = specs.Array((), np.float64, name=key)
+    return spec
+
+  def observe(
+      self, physics: Any
+  ) -> tuple[dict[str, np.ndarray], list[registers.Read]]:
+    """Returns an observation and the reads of registers for it.
+
+    Args:
+      physics: One world, or many.
+    """
+    observation = {
+        f'senses/{name}': value
+        for name, value in self._host.sense(physics).items()
+    }
+    if self._max_steps is not None:
+      spent = self._mechanism.step_count(physics) / self._max_steps
+      observation[f'senses/{_TIME_LEFT}'] = np.asarray(1.0 - spent, np.float32)
+    reads = self._mechanism.read_for_agent(physics)
+    for read in reads:
+      observation[f'registers/{read.register}'] = np.array(read.reading)
+    return observation, reads
+
+
+def frozen(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+  """Makes the arrays of an observation read-only: providers look at them."""
+  for value in observation.values():
+    value.setflags(write=False)
+  return observation
+
+
+def copied(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+  """Returns an observation whose arrays are the agent's own."""
+  return {key: value.copy() for key, value in observation.items()}

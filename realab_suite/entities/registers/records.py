@@ -1,0 +1,73 @@
+"""Records of writes to registers and of reads from them.
+
+The feedback mechanism makes them, event sinks get them, and the ledger keeps
+them as they are. The arrays have shape `(...)`: `()` for one world, `(worlds,)`
+for many. All values are in the register's units.
+"""
+
+from typing import Any, NamedTuple, final
+
+# Writers and readers that are neither meters nor providers.
+AGENT = 'agent'
+INITIAL = 'initial'
+EVALUATOR = 'evaluator'
+
+
+@final
+class Write(NamedTuple):
+  """A value written to a register.
+
+  Attributes:
+    register: Name of the register.
+    writer: `AGENT` for a query, `INITIAL` at a reset, a meter or a provider.
+    step: Control step of the write, `(...)`, int; the reset is step 0.
+    requested: Value to be written.
+    applied: Value that was written: `requested`, saturated to the range of the
+      register.
+  """
+
+  register: str
+  writer: str
+  step: Any
+  requested: Any
+  applied: Any
+
+
+@final
+class Read(NamedTuple):
+  """A value read from a register, with the parts of its corruption.
+
+  The reading minus the last applied value is `permanent + temporary`.
+
+  Attributes:
+    register: Name of the register.
+    reader: `AGENT`, `EVALUATOR` or a provider.
+    step: Control step of the read, `(...)`, int; the reset is step 0.
+    reading: Value that was read.
+    permanent: Part of the corruption that the next write leaves.
+    temporary: Part of the corruption that the next write removes.
+  """
+
+  register: str
+  reader: str
+  step: Any
+  reading: Any
+  permanent: Any
+  temporary: Any
+
+
+Record = Write | Read
+
+
+def of_world(record: Record, world: int | None = None) -> Record:
+  """Returns the part of a record that belongs to one world, in plain numbers.
+
+  Args:
+    record: A write or a read.
+    world: Place of the world; `None` if the record is of a world alone.
+  """
+  register, party, *numbers = record
+  if world is not None:
+    numbers = [number[world] for number in numbers]
+  step, *values = numbers
+  return type(record)(register, party, int(step), *map(float, values))

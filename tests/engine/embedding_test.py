@@ -1,0 +1,202 @@
+"""A task is embedded as a whole, once, or not at all."""
+
+from typing import Any
+
+from dm_control.composer import environment as composer_environment
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import batch_environment
+from realab_suite.entities import registers
+from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import specs
+from realab_suite.tasks import collect_apples
+from realab_suite.tasks import unlock_door
+from tests.engine import helpers
+
+_TASKS = {
+    'a world of the suite': lambda: unlock_door.UnlockDoor('near'),
+    'a foreign task': helpers.PointTask,
+}
+_PLACES = {
+    'registers.reward.place': '[2, 2]',
+    'registers.score.place': '[1.2, -3]',
+}
+_APART = tuple(f'{key}={value}' for key, value in _PLACES.items())
+
+
+def _embed(task: Any, *overrides: str) -> Any:
+  return suite.embed(
+      task,
+      'instantaneous_reward',
+      random=3,
+      max_steps=20,
+      overrides=(*_APART, *overrides),
+  )
+
+
+@pytest.mark.parametrize('make', _TASKS.values(), ids=_TASKS)
+@pytest.mark.parametrize('is_closed', [False, True])
+@pytest.mark.parametrize('design', ['instantaneous_reward', 'none'])
+def test_a_task_cannot_be_embedded_twice(
+    make: Any, is_closed: bool, design: str
+):
+  task = make()
+  first = _embed(task)
+  first.reset()
+  if is_closed:
+    first.close()
+  with pytest.raises(errors.SpecError, match='has the registers of') as caught:
+    suite.embed(task, design, overrides=['channel=secure'])
+  assert "design 'instantaneous_reward'" in str(caught.value)
+  if not is_closed:
+    assert first.step(helpers.no_op(first)).mid()
+    first.close()
+
+
+def test_a_mechanism_cannot_be_attached_beside_another_one():
+  task = collect_apples.CollectApples()
+  env = suite.embed(task, 'none')
+  other = feedback_mechanism.FeedbackMechanism(specs.load('none'))
+  with pytest.raises(errors.SpecError, match="design 'none' already"):
+    other.attach_to(task.root_entity)
+  assert other.parent is None
+  env.close()
+
+
+# Problems that come up when the design is attached, connected, compiled and
+# placed.
+_BAD = {
+    'no such place': 'registers.score.place=nowhere',
+    'no such measurement': 'meters.0.measures=nothing',
+    'no such schedule': 'schedule={meter_substep: 90, provider_substep: 95}',
+    "in each other's way": 'registers.score.place=[2, 2]',
+    'no such elements': 'action_set={name: dmlab_like, version: 1}',
+}
+
+
+@pytest.mark.parametrize(
+    ('name', 'bad'),
+    [
+        (name, bad)
+        for name in _TASKS
+        for bad in _BAD
+        # The worlds of the suite have the elements.
+        if (name, bad) != ('a world of the suite', 'no such elements')
+    ],
+)
+@pytest.mark.parametrize('twin', ['channel=embedded', 'channel=welded'])
+def test_a_design_that_is_refused_leaves_nothing_behind(
+    name: str, bad: str, twin: str
+):
+  make = _TASKS[name]
+  task = make()
+  with pytest.raises(errors.SpecError):
+    _embed(task, twin, _BAD[bad])
+  env, clean = _embed(task, twin), _embed(make(), twin)
+  for action in helpers.random_actions(env, 30):
+    expected = helpers.to_bytes(clean.step(action))
+    assert helpers.to_bytes(env.step(action)) == expected
+  env.close()
+  clean.close()
+
+
+def test_blocks_that_were_graspable_before_stay_graspable():
+  task = unlock_door.UnlockDoor()
+  register = registers.BlockPositionRegister('mine', value_range=(-1, 1))
+  register.attach_to(task.root_entity, (-3, 0.5))
+  task.avatar.make_graspable(register.blocks)
+  with pytest.raises(errors.SpecError):
+    _embed(task, 'registers.score.place=[2, 2]')
+  env = _embed(task)
+  held = env.physics.bind(register.blocks[0].grasps).active
+  assert len(held) == 1
+  env.close()
+
+
+# Hooks.
+
+
+_NEVER = {
+    'initialize_episode_mjcf', 'after_compile', 'before_substep',
+    'after_substep',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('make', _TASKS.values(), ids=_TASKS)
+@pytest.mark.parametrize('name', composer_environment.HOOK_NAMES)
+def test_an_extra_hook_is_called_or_refused(make: Any, name: str):
+  env = _embed(make())
+  heard: list[Any] = []
+  if isinstance(env.task, unlock_door.UnlockDoor) and name in _NEVER:
+    with pytest.raises(errors.SpecError, match=name):
+      env.add_extra_hook(name, lambda *unused: heard.append(unused))
+  else:
+    env.add_extra_hook(name, lambda *unused: heard.append(unused))
+    env.reset()
+    env.step(helpers.no_op(env))
+    assert heard
+  env.close()
+
+
+@pytest.mark.parametrize(
+    ('name', 'hook'), [('before_lunch', lambda: None), ('before_step', 3)]
+)
+def test_no_other_hooks_are_taken(name: str, hook: Any):
+  env = _embed(unlock_door.UnlockDoor())
+  with pytest.raises(ValueError, match='is not a'):
+    env.add_extra_hook(name, hook)
+  env.close()
+
+
+def test_a_batch_and_a_fork_refuse_an_environment_with_extra_hooks():
+  env = _embed(unlock_door.UnlockDoor())
+  env.add_extra_hook('after_step', lambda physics, random_state: None)
+  env.reset()
+  with pytest.raises(errors.SpecError, match='add_extra_hook'):
+    suite.fork(env, 2)
+  with pytest.raises(errors.SpecError, match='add_extra_hook'):
+    batch_environment.BatchEnvironment(env, 2)
+  env.close()
+
+
+# Senses.
+
+
+class _Sensing(collect_apples.CollectApples):
+  """Senses something else than it says."""
+
+  change: Any = None
+
+  def senses(self, physics: Any) -> dict[str, np.ndarray]:
+    senses = super().senses(physics)
+    if self.change is not None:
+      self.change(senses)
+    return senses
+
+
+_CHANGES = {
+    'one too many': lambda s: s.update(score=np.zeros(1)),
+    'one too few': lambda s: s.pop('holding'),
+    'another shape': lambda s: s.update(holding=np.zeros(2, np.float32)),
+    'another type': lambda s: s.update(holding=s['holding'].astype(float)),
+    'no array': lambda s: s.update(holding=0.0),
+}
+
+
+@pytest.mark.parametrize('change', _CHANGES.values(), ids=_CHANGES)
+@pytest.mark.parametrize('is_batch', [False, True])
+def test_senses_that_do_not_fit_their_spec_are_refused(
+    change: Any, is_batch: bool
+):
+  task = _Sensing()
+  env = suite.embed(task, 'none', random=1)
+  if is_batch:
+    env = batch_environment.BatchEnvironment(env, 2)
+  env.reset()
+  task.change = change
+  with pytest.raises(errors.SpecError, match=r'_Sensing\.senses'):
+    env.reset()
+  env.close()

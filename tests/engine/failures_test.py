@@ -1,0 +1,426 @@
+"""What fails is told to the evaluator: what, where, and in which world."""
+
+import copy
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import batch_environment
+from realab_suite.engine import events
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import results
+from realab_suite.feedback import policies
+from realab_suite.feedback import providers
+from realab_suite.tasks import collect_apples
+from tests.engine import helpers
+
+_NUM_WORLDS = 3
+
+
+class _Unpaid(collect_apples.CollectApples):
+  """Fails to give a reward from the second step on."""
+
+  def get_reward(self, physics: Any) -> Any:
+    reward = super().get_reward(physics)
+    if np.max(self.steps(physics)) >= 1:
+      raise ZeroDivisionError('the till is empty')
+    return reward
+
+
+def _embed(task: Any, max_steps: int = 4) -> Any:
+  env = suite.embed(task, 'none', random=1, max_steps=max_steps)
+  task.steps = env.mechanism.step_count
+  return env
+
+
+def _failing_point() -> helpers.PointTask:
+  task = helpers.PointTask()
+
+  def fail(physics: Any) -> float:
+    raise ZeroDivisionError('the till is empty')
+
+  task.reward = fail
+  return task
+
+
+@pytest.mark.parametrize('make', [_Unpaid, _failing_point])
+def test_a_reward_that_cannot_be_had_is_told_with_its_traceback(make: Any):
+  env = _embed(make())
+  (result,) = evaluate.evaluate(env, lambda time_step: helpers.no_op(env), 1)
+  env.close()
+  assert result.end is events.End.TIMEOUT
+  assert not result.is_valid
+  assert np.isnan(result.true_return)
+  assert 'ZeroDivisionError: the till is empty' in result.failure
+  assert 'Traceback' in result.failure
+  assert make.__module__.rpartition('.')[2] in result.failure
+
+
+def test_a_row_keeps_the_traceback(tmp_path: Any):
+  env = _embed(_failing_point())
+  (result,) = evaluate.evaluate(env, lambda time_step: np.zeros(1), 1)
+  info = results.RunInfo.of(
+      ('d', 't'), (1, None), env.mechanism.design, policy='p', run='r',
+      baseline=None, control_timestep=0.1, max_steps=4,
+  )  # fmt: skip
+  env.close()
+  with results.RowWriter(tmp_path / 'rows.jsonl') as writer:
+    writer.write(results.row(info, result))
+  (row,) = results.read_rows(tmp_path / 'rows.jsonl')
+  assert row.failure == result.failure
+
+
+def test_an_agent_learns_nothing_of_a_reward_that_cannot_be_had():
+  def play(make: Any) -> list[bytes]:
+    env = _embed(make())
+    actions = helpers.random_actions(env, 9)
+    found = [helpers.to_bytes(env.step(action)) for action in actions]
+    env.close()
+    return found
+
+  assert play(_Unpaid) == play(collect_apples.CollectApples)
+  assert play(_failing_point) == play(helpers.PointTask)
+
+
+def test_a_reward_that_cannot_be_had_is_told_of_every_world_of_a_batch():
+  batch = batch_environment.BatchEnvironment(_embed(_Unpaid()), _NUM_WORLDS)
+  actor = batch_actors.BatchPolicyActor(policies.make('random'), batch, 1)
+  found = evaluate.evaluate_batch(batch, actor)
+  batch.close()
+  for result in found:
+    assert not result.is_valid
+    assert 'ZeroDivisionError: the till is empty' in result.failure
+
+
+def test_an_episode_that_went_well_has_no_failure():
+  env = _embed(collect_apples.CollectApples())
+  (result,) = evaluate.evaluate(env, policies.make('random'), 1)
+  env.close()
+  assert result.is_valid
+  assert result.failure is None
+
+
+def test_a_snapshot_takes_the_failure_along():
+  env = _embed(_Unpaid(), max_steps=50)
+  ledger = ledgers.Ledger()
+  env.add_sink(ledger)
+  env.reset()
+  for _ in range(3):
+    env.step(helpers.no_op(env))
+  other = ledgers.Ledger()
+  other.set_state(ledger.state())
+  env.close()
+  assert other.last.failure == ledger.last.failure
+  assert 'till' in other.last.failure
+
+
+# Ends that the engine tells, once.
+
+
+class _Heard(events.BatchEventSink):
+  """Counts beginnings and ends, as they are told."""
+
+  def __init__(self) -> None:
+    self.ends: list[tuple[int, events.End]] = []
+    self.starts = 0
+
+  def step_ended(self, step: events.BatchStep) -> None:
+    self.starts += int(step.is_first.sum())
+    self.ends += sorted(step.ends.items())
+
+  def state(self, places: np.ndarray) -> list[Any]:
+    return [None] * len(places)
+
+  def set_state(self, places: np.ndarray, states: Any) -> None:
+    """Nothing is kept."""
+
+
+def _batch(**kwargs: Any) -> batch_environment.BatchEnvironment:
+  return suite.load_batch(
+      'collect_apples', 'near', {'random': 1}, {'max_steps': 6},
+      num_envs=_NUM_WORLDS, **kwargs,
+  )  # fmt: skip
+
+
+@pytest.mark.parametrize('num_steps', [0, 1, 5, 6, 7, 8])
+@pytest.mark.parametrize('how', ['reset', 'close', 'add_sink', 'restore'])
+def test_every_episode_that_begins_ends_once(num_steps: int, how: str):
+  batch, sink = _batch(design='instantaneous_reward'), _Heard()
+  batch.add_sink(sink)
+  batch.reset()
+  for _ in range(num_steps):
+    batch.step(np.zeros((_NUM_WORLDS, 6)))
+  restored = 0
+  if how == 'reset':
+    batch.reset()
+  elif how == 'add_sink':
+    batch.add_sink(_Heard())
+  elif how == 'restore':
+    restored = 0 if num_steps == 6 else _NUM_WORLDS
+    batch.restore(batch.save())
+  batch.close()
+  batch.close()
+  assert len(sink.ends) == sink.starts + restored
+  is_over = num_steps >= 6
+  assert sink.ends[:_NUM_WORLDS] == [
+      (world, events.End.TIMEOUT if is_over else events.End.ABANDONED)
+      for world in range(_NUM_WORLDS)
+  ]
+
+
+def test_ledgers_and_monitors_take_the_end_from_the_engine():
+  batch = _batch(design='instantaneous_reward')
+  ledger = ledgers.BatchLedger()
+  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_WORLDS)
+  batch.add_sink(ledger)
+  batch.add_sink(monitor)
+  batch.reset()
+  batch.step(np.zeros((_NUM_WORLDS, 6)))
+  batch.reset()
+  ends = [record['end'] for record in monitor.take()]
+  assert ends == ['abandoned'] * _NUM_WORLDS
+  for world in range(_NUM_WORLDS):
+    first, second = ledger.episodes(world)
+    assert first.end is events.End.ABANDONED
+    assert second.end is None
+  batch.close()
+
+
+def test_a_reset_that_fails_ends_the_episodes_before_it_once():
+  batch, sink = _batch(), _Heard()
+  batch.add_sink(sink)
+  batch.reset()
+  batch.task.initialize_episode = _fail  # type: ignore[method-assign]
+  with pytest.raises(ZeroDivisionError):
+    batch.reset()
+  del batch.task.initialize_episode
+  assert len(sink.ends) == _NUM_WORLDS
+  batch.step(np.zeros((_NUM_WORLDS, 6)))
+  batch.close()
+  assert len(sink.ends) == sink.starts == 2 * _NUM_WORLDS
+
+
+def _fail(*unused: Any) -> None:
+  raise ZeroDivisionError('oops')
+
+
+# Providers that fail in a batch.
+
+_ANSWER: list[Any] = []
+
+
+class _Scripted(providers.Provider):
+  """Does what a test says, with what it gets."""
+
+  kind: Literal['failing_in_a_test'] = 'failing_in_a_test'
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return _ANSWER[0](batch_shape)
+
+  def step(
+      self, observation: Any, readings: Any, episode_start: Any, key: Any,
+      state: Any,
+  ) -> Any:  # fmt: skip
+    return _ANSWER[1](episode_start, state)
+
+
+_DESIGN: dict[str, Any] = {
+    'schema': 1,
+    'name': 'failing',
+    'registers': {
+        'reward': {
+            'kind': 'two_block',
+            'role': 'feedback',
+            'place': 'station_1',
+            'range': [-2, 12],
+        },
+    },
+    'providers': [{'kind': 'failing_in_a_test', 'writes': ['reward']}],
+}
+
+
+@pytest.fixture(name='scripted')
+def fixture_scripted() -> Any:
+  with helpers.registered(providers.PROVIDERS, 'failing_in_a_test', _Scripted):
+    yield
+
+
+def _states(shape: tuple[int, ...]) -> Any:
+  return np.zeros(shape)
+
+
+def _counting(wrong: Any) -> Any:
+  """Returns an answer that is wrong in world 1, in its third step."""
+
+  def answer(episode_start: Any, state: Any) -> Any:
+    state = np.where(episode_start, 1.0, state + 1.0)
+    value = np.zeros(np.shape(state))
+    if np.ndim(value):
+      value[1] = wrong if state[1] == 3 else 0.0
+    return {'reward': value}, state
+
+  return answer
+
+
+def _play(batch: Any, num_steps: int) -> None:
+  spec = batch.action_spec()
+  for _ in range(num_steps):
+    batch.step(np.zeros((batch.num_worlds, *spec.shape)))
+
+
+@pytest.mark.parametrize('wrong', [np.nan, np.inf, 13.0])
+def test_a_value_that_cannot_be_stored_is_told_with_its_world_and_step(
+    scripted: Any, wrong: float
+):
+  _ANSWER[:] = [_states, _counting(wrong)]
+  design = copy.deepcopy(_DESIGN)
+  design['registers']['reward']['on_overflow'] = 'error'
+  batch = _batch(design=design)
+  batch.reset()
+  # World 0 is two steps ahead of the others.
+  batch._mechanism._step_count.set(batch.physics, [2.0, 0.0, 0.0])
+  with pytest.raises(errors.RegisterValueError) as caught:
+    _play(batch, 3)
+  batch.close()
+  assert str(caught.value).startswith(
+      'providers[0]:failing_in_a_test at step 3 of world 1: register'
+      f" 'reward': cannot store {wrong}"
+  )
+  assert caught.value.world == 1
+
+
+def test_a_measurement_that_cannot_be_stored_is_told_with_its_world():
+  batch = _batch(design='instantaneous_reward')
+  batch.reset()
+  batch.task._score.set(batch.physics, [0.0, 0.0, np.nan])
+  with pytest.raises(errors.RegisterValueError) as caught:
+    _play(batch, 1)
+  batch.close()
+  assert 'meter:score at step 1 of world 2' in str(caught.value)
+  assert 'nan' not in str(caught.value)
+
+
+_ANSWERS = {
+    'raises': (
+        lambda start, state: 1 / 0,
+        'at step 1 of 3 worlds: ZeroDivisionError',
+    ),
+    'nothing': (
+        lambda start, state: None,
+        'at step 1 of 3 worlds returned None; allowed is (writes, state)',
+    ),
+    'no state': (
+        lambda start, state: {'reward': np.zeros(3)},
+        'at step 1 of 3 worlds returned {',
+    ),
+    'three things': (
+        lambda start, state: ({'reward': np.zeros(3)}, state, 0),
+        'allowed is (writes, state)',
+    ),
+    'a list': (
+        lambda start, state: [{'reward': np.zeros(3)}, state],
+        'allowed is (writes, state)',
+    ),
+    'one value for all worlds': (
+        lambda start, state: ({'reward': 1.0}, state),
+        "wrote shape () to 'reward'; allowed is (3,)",
+    ),
+    'a masked array': (
+        lambda start, state: ({'reward': np.ma.zeros(3)}, state),
+        'allowed are plain numbers',
+    ),
+    'masked values': (
+        lambda start, state: (
+            {'reward': np.ma.masked_equal(np.zeros(3), 0.0)},
+            state,
+        ),
+        'allowed are plain numbers',
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ('answer', 'message'), _ANSWERS.values(), ids=list(_ANSWERS)
+)
+def test_what_a_provider_may_not_return_is_told_with_the_step(
+    scripted: Any, answer: Any, message: str
+):
+  _ANSWER[:] = [_states, answer]
+  batch = _batch(design=_DESIGN)
+  batch.reset()
+  with pytest.raises(errors.FeedbackProviderError) as caught:
+    _play(batch, 1)
+  batch.close()
+  assert message in str(caught.value)
+  assert str(caught.value).startswith('providers[0]:failing_in_a_test')
+  assert '\n' not in str(caught.value)
+
+
+def test_the_steps_of_worlds_that_differ_are_told_as_a_range(scripted: Any):
+  _ANSWER[:] = [_states, lambda start, state: 1 / 0]
+  batch = _batch(design=_DESIGN)
+  batch.reset()
+  batch._mechanism._step_count.set(batch.physics, [4.0, 0.0, 2.0])
+  with pytest.raises(
+      errors.FeedbackProviderError, match='at steps 1 to 5 of 3 worlds'
+  ):
+    _play(batch, 1)
+  batch.close()
+
+
+_STATES = {
+    'an object': lambda shape: object(),
+    'objects': lambda shape: np.full(shape, None),
+    'one for all worlds': lambda shape: np.zeros(2),
+    'a number': lambda shape: 0.0,
+    'within': lambda shape: {'a': (np.zeros(shape), [object()])},
+}
+
+
+@pytest.mark.parametrize('state', _STATES.values(), ids=list(_STATES))
+def test_a_state_without_an_axis_of_worlds_is_refused(
+    scripted: Any, state: Any
+):
+  _ANSWER[:] = [state, lambda start, state: ({'reward': 0.0 * start}, state)]
+  with pytest.raises(
+      errors.FeedbackProviderError,
+      match=r'before the first step: its state holds .*whose first axis',
+  ):
+    _batch(design=_DESIGN)
+  # A world alone may keep any state.
+  env = suite.load('collect_apples', 'near', design=_DESIGN)
+  env.reset()
+  assert env.step(np.zeros(6)).mid()
+  env.close()
+
+
+_OTHER_STATES = {
+    'an object': object(),
+    'another shape': np.zeros(2),
+    'more': (np.zeros(3), np.zeros(3)),
+    'nothing': None,
+}
+
+
+@pytest.mark.parametrize('other', _OTHER_STATES.values(), ids=_OTHER_STATES)
+def test_a_state_that_changes_its_structure_is_refused(
+    scripted: Any, other: Any
+):
+  _ANSWER[:] = [
+      lambda shape: (np.zeros(shape),),
+      lambda start, state: ({'reward': np.zeros(3)}, other),
+  ]
+  batch = _batch(design=_DESIGN)
+  batch.reset()
+  with pytest.raises(
+      errors.FeedbackProviderError,
+      match=r'state of providers\[0\].*allowed is the structure',
+  ):
+    _play(batch, 8)  # Two more than an episode has.
+  batch.close()

@@ -1,0 +1,268 @@
+"""Tests that a served world cannot be cloned without its secret salt."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import sys
+import tempfile
+
+from absl import flags
+from absl.testing import flagsaver
+import pytest
+
+from realab_suite import errors
+from realab_suite.engine import seeding
+from realab_suite.evaluation import results
+from realab_suite.experiments import serve
+from realab_suite.experiments import serving
+from realab_suite.experiments import storage
+from realab_suite.interop.rpc import served_world
+from realab_suite.interop.rpc import sockets
+from tests.experiments import small
+from tests.interop import clones
+from tests.interop import served
+
+_NOBODY = 65534
+_SEED = 7
+_FLAGS = (
+    f'--seed={_SEED}',
+    f'--max_steps={clones.MAX_STEPS}',
+    f'--episodes={clones.NUM_EPISODES}',
+)
+
+_is_linux = pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
+_is_root = pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
+
+
+def _rows(output):
+  return list(results.read_rows(output / 'episodes.jsonl'))
+
+
+def _num_right(predictions):
+  return [prediction.num_right for prediction in predictions]
+
+
+def _num_time_steps(episodes):
+  return [len(episode.digests) for episode in episodes]
+
+
+def _check_that_only_the_salt_is_missing(output, episodes):
+  """Checks the attack itself: with the salt it predicts everything."""
+  predictions = clones.predict(clones.make(clones.seed_in(output)), episodes)
+  assert _num_right(predictions) == _num_time_steps(episodes)
+  returns = [row.true_return for row in _rows(output)]
+  assert [prediction.true_return for prediction in predictions] == returns
+
+
+def _serve(output, *flags):
+  """Serves a world to an agent that plays; returns the episodes."""
+  with served.in_process(output, *flags) as program:
+    with served.Client(program.address) as client:
+      episodes = clones.play(client.env())
+    assert program.process.wait(20) == 0
+  return episodes
+
+
+@_is_linux
+def test_a_clone_predicts_no_observation_of_any_episode(tmp_path):
+  output = tmp_path / 'results'
+  with served.in_process(output, *_FLAGS) as program:
+    arguments = clones.arguments_of(program.process.pid)
+    with served.Client(program.address) as client:
+      episodes = clones.play(client.env())
+    assert program.process.wait(20) == 0
+  assert arguments['seed'] == str(_SEED)
+  clone = clones.make(int(arguments['seed']))
+  assert _num_right(clones.predict(clone, episodes)) == [0, 0, 0]
+  _check_that_only_the_salt_is_missing(output, episodes)
+
+
+@_is_linux
+@_is_root
+def test_a_program_of_another_user_predicts_nothing():
+  with tempfile.TemporaryDirectory() as folder:
+    os.chmod(folder, 0o755)  # The results are protected by their own mode.
+    output = pathlib.Path(folder, 'results')
+    with served.in_process(output, *_FLAGS, '--agent_user=nobody') as program:
+      report = clones.attack(program, _NOBODY)
+      assert program.process.wait(20) == 0
+    isolation = {row.info.isolation for row in _rows(output)}
+    assert isolation == {results.SERVED_TO_ANOTHER_USER}
+    assert report.arguments['seed'] == str(_SEED)
+    assert report.opened == ['cmdline']
+    assert _num_right(report.predictions) == [0, 0, 0]
+    _check_that_only_the_salt_is_missing(output, report.episodes)
+
+
+def test_no_seed_begins_as_a_served_world_does(tmp_path):
+  with served.in_process(tmp_path / 'results', *_FLAGS) as program:
+    with served.Client(program.address) as client:
+      [episode] = clones.play(client.env(), 1)
+  assert clones.find_seeds(episode, range(2_000)) == []
+
+
+def test_a_seed_without_a_salt_is_found_and_predicts_everything():
+  with served.in_thread(lambda: clones.make(1_234)) as serving:
+    with served.Client(serving.address) as client:
+      episodes = clones.play(client.env())
+  [seed] = clones.find_seeds(episodes[0], range(2_000))
+  predictions = clones.predict(clones.make(seed), episodes)
+  assert _num_right(predictions) == _num_time_steps(episodes)
+  true_returns = [prediction.true_return for prediction in predictions]
+  assert true_returns == [result.true_return for result, _ in serving.results]
+  assert max(true_returns) > 0.0
+
+
+def test_runs_of_one_seed_differ():
+  with tempfile.TemporaryDirectory() as folder:
+    outputs = [pathlib.Path(folder, name) for name in 'ab']
+    one, other = (_serve(output, *_FLAGS) for output in outputs)
+    assert [e.position for e in one] != [e.position for e in other]
+    digests = [row.info.salt_digest for o in outputs for row in _rows(o)]
+    assert len(set(digests)) == 2
+    assert None not in digests
+
+
+# The salt is the evaluator's alone.
+
+
+def test_the_salt_is_in_the_record_and_nowhere_else(tmp_path):
+  output = tmp_path / 'results'
+  with served.in_process(output, *_FLAGS) as program:
+    with served.Client(program.address) as client:
+      clones.play(client.env())
+    process = pathlib.Path('/proc', str(program.process.pid))
+    given = b''.join(
+        (process / name).read_bytes()
+        for name in ('cmdline', 'environ')
+        if process.exists()
+    )
+    said = ''.join(program.process.communicate())
+  forms = clones.forms_of(clones.seed_in(output).salt)
+  places = {path.name: path.read_bytes() for path in output.iterdir()}
+  places |= {
+      'what it is given': given,
+      'what it prints': said.encode(),
+      'names': ' '.join((program.address, *places)).encode(),
+  }
+  found = [
+      name
+      for name, data in places.items()
+      if any(form in data for form in forms.values())
+  ]
+  assert found == ['run.json']
+  assert 'episodes.jsonl' in places
+  modes = {path.stat().st_mode & 0o777 for path in output.iterdir()}
+  assert (output.stat().st_mode & 0o777, modes) == (0o700, {0o600})
+
+
+def test_a_tier_for_other_users_needs_a_salt(monkeypatch):
+  monkeypatch.setattr(sockets, 'users_connected_to', lambda _: {_NOBODY})
+  tiers = {}
+  for seed in (7, seeding.SaltedSeed(7, bytes(seeding.NUM_SALT_BYTES))):
+    found = []
+    env = clones.make(seed, max_steps=1)
+    world = served_world.ServedWorld(
+        env, 'unix:/x', 1, lambda result, tier, found=found: found.append(tier)
+    )
+    world.connect()
+    for request in (served.JOIN, served.STEP, served.STEP):
+      world.answer(request)
+    world.settle()
+    env.close()
+    tiers[type(seed).__name__] = found
+  assert tiers == {
+      'int': [results.SERVED],
+      'SaltedSeed': [results.SERVED_TO_ANOTHER_USER],
+  }
+
+
+@_is_root
+def test_a_folder_of_another_user_takes_no_results(tmp_path):
+  output = tmp_path / 'theirs'
+  output.mkdir()
+  os.chown(output, _NOBODY, _NOBODY)
+  output.chmod(0o777)
+  with pytest.raises(RuntimeError, match='belongs to user 65534; allowed is'):
+    _serve(output, *_FLAGS)
+  assert not [*output.iterdir()]
+
+
+# A run that is repeated.
+
+
+def test_a_run_is_repeated_by_its_record(tmp_path):
+  first, second = tmp_path / 'first', tmp_path / 'second'
+  design = ('--design=online_imitation', '--set=providers.0.policy=random')
+  episodes = _serve(first, *_FLAGS, *design)
+  with served.in_process(
+      second,
+      f'--repeat={first / "run.json"}',
+      f'--episodes={clones.NUM_EPISODES}',
+      task=(),
+  ) as program:
+    with served.Client(program.address) as client:
+      assert clones.play(client.env()) == episodes
+    assert program.process.wait(20) == 0
+  rows = [[r.model_dump_json() for r in _rows(o)] for o in (first, second)]
+  assert rows[0] == rows[1]
+  assert clones.seed_in(second).salt == clones.seed_in(first).salt
+
+
+def _settings(record):
+  """Returns the settings that `serve` makes of --repeat."""
+  return serving.Settings(
+      domain='collect_apples', task='standard', design='none', overrides=(),
+      seed=0, max_steps=250, repeat=str(record), num_episodes=2, name='agent',
+      address=None, idle_seconds=1.0, provider_seconds=1.0, agent_command=None,
+      agent_folder=None, agent_user=None, output='results',
+  )  # fmt: skip
+
+
+def test_a_record_decides_the_world_the_design_and_the_seed(tmp_path, caplog):
+  record = small.write_served_run(tmp_path)
+  settings, design, seed = serving._chosen(_settings(record))
+  assert (settings.domain, settings.task) == ('unlock_door', 'near')
+  assert (settings.seed, settings.max_steps) == (7, 12)
+  assert settings.overrides == ('registers.reward.scale=0.2',)
+  assert design.registers['reward'].scale == 0.2
+  assert (seed, seed.salt) == (7, small.SALT)
+  assert settings.num_episodes == 2
+  assert not caplog.messages
+
+
+def test_a_record_serves_its_twin(tmp_path):
+  record = small.write_served_run(tmp_path)
+  given = dataclasses.replace(_settings(record), overrides=('channel=secure',))
+  settings, design, seed = serving._chosen(given)
+  assert settings.overrides == (
+      'registers.reward.scale=0.2',
+      'channel=secure',
+  )
+  assert (design.channel, design.registers['reward'].scale) == ('secure', 0.2)
+  assert seed.salt == small.SALT
+
+
+def test_other_versions_than_recorded_are_named(tmp_path, caplog):
+  record = small.write_served_run(tmp_path)
+  content = json.loads(record.read_text())
+  del content['checksum']
+  content['versions']['mujoco'] = '3.0'
+  storage.write_sealed(record, content)
+  record.chmod(0o600)
+  serving._chosen(_settings(record))
+  [message] = caplog.messages
+  assert f'{record}: the episodes may differ' in message
+  assert "versions.mujoco is '3.0' there" in message
+
+
+@pytest.mark.parametrize(
+    'flag', ['domain', 'task', 'design', 'seed', 'max_steps']
+)
+def test_what_a_record_decides_is_no_flag_beside_it(flag):
+  value = '1' if flag in ('seed', 'max_steps') else 'collect_apples'
+  with flagsaver.flagsaver():
+    flags.FLAGS(['serve', '--output=x', '--repeat=y', f'--{flag}={value}'])
+    with pytest.raises(errors.SpecError, match=f'--{flag} has no effect with'):
+      serve.main([])
