@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 import dataclasses
-from typing import final
+from typing import Any, final
 
 import dm_env
 import numpy as np
@@ -13,6 +13,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import endings
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.evaluation import metrics
 from realab_suite.feedback import mechanism as feedback_mechanism
@@ -30,10 +31,10 @@ class EpisodeResult:
     world: Which world of a batch.
     episode: The number of the episode.
     end: Why it ended.
-    is_valid: Whether figures may be drawn from it.
+    is_valid: Whether all figures are those of a whole episode; see `endings`.
     failure: Traceback of the exception that the task raised instead of giving a
       true reward, or `None`.
-    true_return: Sum of true rewards.
+    true_return: Sum of true rewards, up to where the episode ended.
     observed_return: Sum of what the agent read off its feedback registers.
     corruption: Mean displacement of the values of all registers, metres.
     registers: Metrics by register.
@@ -42,6 +43,8 @@ class EpisodeResult:
     num_substeps: Steps of the physics.
     num_provider_calls: How often providers were asked.
     num_queries: How many values the agent sent to providers.
+    max_true_return: The largest true return that the task offers, or `None` if
+      it does not name one.
   """
 
   seed: int
@@ -59,6 +62,12 @@ class EpisodeResult:
   num_substeps: int
   num_provider_calls: int
   num_queries: int
+  max_true_return: float | None = None
+
+  @property
+  def counts(self) -> bool:
+    """True if figures may be drawn from it; see `endings`."""
+    return self.is_valid or endings.is_given_up(self.end, self.true_return)
 
 
 def evaluate(
@@ -109,18 +118,20 @@ def evaluate(
   listeners = (ledger, *sinks)
   for sink in listeners:
     env.add_sink(sink)
-  results = []
+  results: list[EpisodeResult] = []
   try:
     env.rewind(first_episode)
-    for episode in range(first_episode, first_episode + num_episodes):
-      actor.begin(episode)
+    while len(results) < num_episodes:
+      actor.begin(first_episode + len(results))
       time_step = env.reset()
       while not time_step.last():
         time_step = env.step(actor.act(time_step))
-      result = result_of(ledger.last, env)
-      results.append(result)
-      if on_episode is not None:
-        on_episode(result)
+      # More than one, where a policy that holds the environment resets it.
+      for episode in ledger.episodes[len(results) : num_episodes]:
+        result = result_of(episode, env)
+        results.append(result)
+        if on_episode is not None:
+          on_episode(result)
   finally:
     for sink in listeners:
       env.remove_sink(sink)
@@ -165,6 +176,7 @@ def evaluate_batch(
           batch.mechanism,
           num_substeps,
           facts[world],
+          _max_true_return(batch.task),
       )
       for world in range(batch.num_worlds)
   ]
@@ -182,7 +194,13 @@ def result_of(
   Raises:
     ResultsError: If it has not ended.
   """
-  return _result(episode, env.mechanism, env.num_substeps, _facts(env))
+  return _result(
+      episode,
+      env.mechanism,
+      env.num_substeps,
+      _facts(env),
+      _max_true_return(env.task),
+  )
 
 
 def _result(
@@ -190,6 +208,7 @@ def _result(
     mechanism: feedback_mechanism.FeedbackMechanism,
     num_substeps: int,
     facts: dict[str, float],
+    max_true_return: float | None,
 ) -> EpisodeResult:
   """Returns the result of an episode that has ended."""
   by_register = {
@@ -221,7 +240,14 @@ def _result(
       num_substeps=num_steps * num_substeps,
       num_provider_calls=num_steps * len(mechanism.design.providers),
       num_queries=num_steps * len(mechanism.queries),
+      max_true_return=max_true_return,
   )
+
+
+def _max_true_return(task: Any) -> float | None:
+  if not isinstance(task, base.Task):
+    return None
+  return float(task.max_true_return)
 
 
 def _facts(env: environment.Environment) -> dict[str, float]:

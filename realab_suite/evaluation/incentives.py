@@ -35,7 +35,7 @@ from realab_suite import errors
 from realab_suite.engine import batch_environment
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import actors
-from realab_suite.evaluation import statistics
+from realab_suite.evaluation import intervals
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import policies as scripted_policies
 
@@ -336,13 +336,13 @@ class Summary:
 
   num_seeds: int
   num_states: int
-  signed: statistics.Interval
-  absolute: statistics.Interval
-  signed_metres: statistics.Interval
-  absolute_metres: statistics.Interval
-  most_signed_metres: statistics.Interval
-  most_absolute_metres: statistics.Interval
-  share_in_play: statistics.Interval
+  signed: intervals.Interval
+  absolute: intervals.Interval
+  signed_metres: intervals.Interval
+  absolute_metres: intervals.Interval
+  most_signed_metres: intervals.Interval
+  most_absolute_metres: intervals.Interval
+  share_in_play: intervals.Interval
 
 
 def combine(
@@ -355,7 +355,7 @@ def combine(
   """Sums up the probes of several seeds, with intervals over seeds.
 
   With one seed the intervals are over its states, and say nothing about other
-  seeds; see `statistics.mean_interval`.
+  seeds; see `intervals.mean_interval`.
 
   Args:
     probes_by_seed: The probe of each seed's policy.
@@ -372,9 +372,11 @@ def combine(
       for seed, one in probes_by_seed.items()
   }
 
-  def interval(name: str) -> statistics.Interval:
+  def interval(
+      name: str, bounds: intervals.Bounds = intervals.UNBOUNDED
+  ) -> intervals.Interval:
     values = {seed: getattr(one, name) for seed, one in found.items()}
-    return statistics.mean_interval(values, level=level)
+    return intervals.mean_interval(values, bounds=bounds, level=level)
 
   in_play = {
       seed: one.is_in_play.astype(float).tolist()
@@ -387,9 +389,13 @@ def combine(
       absolute=interval('absolute'),
       signed_metres=interval('signed_metres'),
       absolute_metres=interval('absolute_metres'),
-      most_signed_metres=interval('most_signed_metres'),
-      most_absolute_metres=interval('most_absolute_metres'),
-      share_in_play=statistics.mean_interval(in_play, level=level),
+      most_signed_metres=interval('most_signed_metres', intervals.NOT_NEGATIVE),
+      most_absolute_metres=interval(
+          'most_absolute_metres', intervals.NOT_NEGATIVE
+      ),
+      share_in_play=intervals.mean_interval(
+          in_play, bounds=intervals.SHARE, level=level
+      ),
   )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.engine import events
 from realab_suite.entities import registers
+from realab_suite.evaluation import endings
 
 
 @final
@@ -46,14 +47,8 @@ class EpisodeLedger:
 
   @property
   def is_valid(self) -> bool:
-    """Whether figures may be drawn from the episode.
-
-    What came before a divergence, an error or a reset in the middle of an
-    episode is censored, not counted, and so is an episode without a true
-    return.
-    """
-    ended_well = self.end in (events.End.TERMINATED, events.End.TIMEOUT)
-    return ended_well and bool(np.isfinite(self.true_rewards).all())
+    """True if all figures are those of a whole episode; see `endings`."""
+    return endings.is_valid(self.end, true_return(self))
 
   def add(
       self, records: Iterable[registers.Record], world: int | None = None

@@ -8,6 +8,7 @@ import numpy as np
 
 from realab_suite.engine import events
 from realab_suite.entities import registers
+from realab_suite.evaluation import endings
 from realab_suite.feedback import mechanism as feedback_mechanism
 
 # Rows of the sums over the reads of a register that follow a write.
@@ -27,7 +28,7 @@ class TrainingMonitor(events.BatchEventSink):
 
     seed, world, episode: Which episode it was.
     end: A value of `events.End`.
-    is_valid: Whether figures may be drawn from it.
+    is_valid: Whether its figures are those of a whole episode.
     num_steps: Its control steps.
     true_return: Sum of true rewards.
     observed_return: Sum of what the agent read off its feedback registers.
@@ -174,14 +175,13 @@ class TrainingMonitor(events.BatchEventSink):
     true_return = _number(self._true_return[world])
     observed = self._sums[_AGENT, self._feedback, world]
     seed, number, episode = (int(name) for name in self._names[:, world])
-    ended_well = end in (events.End.TERMINATED, events.End.TIMEOUT)
     self._records.append(
         {
             'seed': seed,
             'world': number,
             'episode': episode,
             'end': end.value,
-            'is_valid': ended_well and true_return is not None,
+            'is_valid': endings.is_valid(end, self._true_return[world]),
             'num_steps': int(self._num_steps[world]),
             'true_return': true_return,
             'observed_return': _number(observed.sum()),

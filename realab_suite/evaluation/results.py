@@ -23,6 +23,8 @@ import pydantic
 
 from realab_suite import __version__
 from realab_suite import errors
+from realab_suite.engine import events
+from realab_suite.evaluation import endings
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import metrics
 from realab_suite.feedback import specs
@@ -32,6 +34,8 @@ IN_PROCESS = 'T0 in-process'
 # Over a socket (docs/served.md): what the agent's code may be, see there.
 SERVED = 'T1 served to another process of the same user'
 SERVED_TO_ANOTHER_USER = 'T2 served to another user'
+
+_ENDS = {end.value: end for end in events.End}
 
 UNITS = {
     'true_return': 'true reward',
@@ -155,6 +159,14 @@ class EpisodeRow(pydantic.BaseModel):
   num_episodes: Literal[1] = 1
   num_provider_calls: int
   num_queries: int
+  # Rows of older files have none.
+  max_true_return: float | None = None
+
+  @property
+  def counts(self) -> bool:
+    """True if figures may be drawn from it; see `endings`."""
+    end = _ENDS.get(self.end)
+    return self.is_valid or endings.is_given_up(end, self.true_return)
 
   @pydantic.field_validator('corruption', mode='before')
   @classmethod

@@ -18,7 +18,7 @@ import math
 from typing import Any, final
 
 from realab_suite import errors
-from realab_suite.evaluation import statistics
+from realab_suite.evaluation import intervals
 from realab_suite.feedback import specs
 
 # What a learner's field says of the register that it names: this is maximised.
@@ -53,10 +53,10 @@ class Window:
 
   num_steps: float
   num_episodes: int
-  signed: statistics.Interval | None
-  absolute: statistics.Interval | None
-  signed_metres: statistics.Interval | None
-  absolute_metres: statistics.Interval | None
+  signed: intervals.Interval | None
+  absolute: intervals.Interval | None
+  signed_metres: intervals.Interval | None
+  absolute_metres: intervals.Interval | None
 
 
 def over_learning(
@@ -138,7 +138,9 @@ def _window(
     episodes: Mapping[int, Sequence[Mapping[str, Any]]],
     level: float,
 ) -> Window:
-  def interval(key: str) -> statistics.Interval | None:
+  def interval(
+      key: str, bounds: intervals.Bounds = intervals.UNBOUNDED
+  ) -> intervals.Interval | None:
     values = {
         seed: known
         for seed, registers in episodes.items()
@@ -146,13 +148,13 @@ def _window(
     }
     if not values:
       return None
-    return statistics.mean_interval(values, level=level)
+    return intervals.mean_interval(values, bounds=bounds, level=level)
 
   return Window(
       num_steps=num_steps,
       num_episodes=sum(len(registers) for registers in episodes.values()),
       signed=interval('corruption_signed'),
-      absolute=interval('corruption'),
+      absolute=interval('corruption', intervals.NOT_NEGATIVE),
       signed_metres=interval('corruption_signed_metres'),
-      absolute_metres=interval('corruption_metres'),
+      absolute_metres=interval('corruption_metres', intervals.NOT_NEGATIVE),
   )

@@ -40,7 +40,8 @@ class Tracer(events.BatchEventSink):
     self._actions: list[np.ndarray] = []
     num_worlds = batch.num_worlds
     self._num_steps = np.full(num_worlds, -1)
-    self._names = np.zeros((3, num_worlds), int)
+    # Objects, because seeds can be large.
+    self._names = np.zeros((3, num_worlds), object)
     self._start = self._positions()
     self._end = {
         name: np.full_like(blocks, np.nan)
@@ -56,7 +57,7 @@ class Tracer(events.BatchEventSink):
   def step_ended(self, step: events.BatchStep) -> None:
     if not self._actions:
       self._start = self._positions()
-      self._names = np.array([step.seed, step.world, step.episode], int)
+      self._names = np.array([step.seed, step.world, step.episode], object)
       return
     places = [w for w in step.ends if self._num_steps[w] < 0]
     if not places:
@@ -71,7 +72,7 @@ class Tracer(events.BatchEventSink):
     """Returns what has been kept, as plain data.
 
     Returns:
-      seed, world, episode: Which episodes, `(worlds,)`.
+      seed, world, episode: The episodes, a list of integers of any size each.
       num_steps: How many control steps each had; -1 where it has not ended.
       actions: `(steps, worlds, *action_spec.shape)`; those behind the end of an
         episode are of no account.
@@ -79,7 +80,7 @@ class Tracer(events.BatchEventSink):
         the middles of its blocks, each `(worlds, blocks, 2)` in metres; nan
         where that is not known. The base block, if there is one, comes first.
     """
-    seed, world, episode = self._names
+    seed, world, episode = self._names.tolist()
     longest = max(int(self._num_steps.max()), 0)
     return {
         'seed': seed,

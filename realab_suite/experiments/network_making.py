@@ -14,9 +14,10 @@ from realab_suite.agents import base
 from realab_suite.agents import controls
 from realab_suite.agents import features
 from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
-from realab_suite.evaluation import statistics
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import policies
 from realab_suite.feedback import specs
@@ -185,8 +186,8 @@ def _versions() -> dict[str, str]:
 
 def judge(
     policy: policies.Policy, variation: str, num_episodes: int, seed: int
-) -> list[float]:
-  """Returns the true return of a policy in the first episode of some worlds.
+) -> list[evaluate.EpisodeResult]:
+  """Returns the valid first episodes of a policy in some worlds.
 
   Args:
     policy: The policy.
@@ -206,7 +207,7 @@ def judge(
   with contextlib.closing(batch):
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     episodes = evaluate.evaluate_batch(batch, actor)
-  return [episode.true_return for episode in episodes if episode.is_valid]
+  return [episode for episode in episodes if episode.is_valid]
 
 
 def _reached(
@@ -214,14 +215,17 @@ def _reached(
 ) -> network_files.Reached:
   """Returns what comes of taking the best action in every step."""
   policy = networks.NetworkDemonstrator(network)
-  returns = judge(policy, variation, num_episodes, _JUDGED_SEED)
-  interval = statistics.mean_interval({_JUDGED_SEED: returns})
+  episodes = judge(policy, variation, num_episodes, _JUDGED_SEED)
+  interval = intervals.mean_interval(
+      {_JUDGED_SEED: [episode.true_return for episode in episodes]},
+      bounds=comparison.return_bounds(episodes),
+  )
   return network_files.Reached(
       task=f'{_DOMAIN}.{variation}',
       mean=interval.estimate,
       low=interval.low,
       high=interval.high,
       level=interval.level,
-      episodes=len(returns),
+      episodes=len(episodes),
       seed=_JUDGED_SEED,
   )

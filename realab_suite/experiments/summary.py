@@ -10,8 +10,8 @@ from typing import final
 import numpy as np
 
 from realab_suite.evaluation import comparison
+from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
-from realab_suite.evaluation import statistics
 
 NOTHING = '-'
 
@@ -26,7 +26,8 @@ class Line:
     summary: The run by itself and next to the baseline.
     permanent: Mean permanent part of the corruption, metres, or `None`.
     temporary: Mean temporary part of the corruption, metres, or `None`.
-    outcomes: Mean of each fact of the world over valid episodes.
+    outcomes: Mean of each fact of the world over the episodes that ran to
+      their end.
   """
 
   run: str
@@ -55,16 +56,17 @@ def summarize(
   margin = comparison.margin_of(scales.values())
   summaries = comparison.compare(rows, baseline, margin=margin)
   for run, summary in summaries.items():
-    valid = [row for row in rows[run] if row.is_valid]
+    counting = [row for row in rows[run] if row.counts]
+    facts = [row.facts for row in rows[run] if row.is_valid]
     lines.append(
         Line(
             run,
             summary,
-            _metres(valid, 'permanent', scales),
-            _metres(valid, 'temporary', scales),
+            _metres(counting, 'permanent', scales),
+            _metres(counting, 'temporary', scales),
             {
-                fact: float(np.mean([row.facts[fact] for row in valid]))
-                for fact in valid[0].facts
+                fact: float(np.mean([one[fact] for one in facts]))
+                for fact in (facts[0] if facts else ())
             },
         )
     )
@@ -73,7 +75,7 @@ def summarize(
 
 def as_text(lines: Sequence[Line]) -> str:
   """Returns two tables, legible as they are and as Markdown."""
-  facts = list(lines[0].outcomes)
+  facts = list(dict.fromkeys(fact for line in lines for fact in line.outcomes))
   main = [['run', 'true return', 'observed return', 'corruption (m)',
            'corrupts']]  # fmt: skip
   more = [['run', 'episodes', 'permanent (m)', 'temporary (m)',
@@ -83,7 +85,7 @@ def as_text(lines: Sequence[Line]) -> str:
     main.append(
         [
             line.run,
-            interval_text(summary.true_return),
+            return_text(summary),
             interval_text(summary.observed_return),
             interval_text(summary.corruption),
             _verdict(summary),
@@ -92,10 +94,10 @@ def as_text(lines: Sequence[Line]) -> str:
     more.append(
         [
             line.run,
-            _episodes(summary),
+            episodes_text(summary),
             number_text(line.permanent),
             number_text(line.temporary),
-            *(number_text(line.outcomes[fact]) for fact in facts),
+            *(number_text(line.outcomes.get(fact)) for fact in facts),
         ]
     )
   return f'{markdown(main)}\n\n{markdown(more)}'
@@ -121,7 +123,8 @@ def _record(line: Line) -> dict[str, object]:
       'run': line.run,
       'num_seeds': summary.num_seeds,
       'num_episodes': summary.num_episodes,
-      'num_invalid': summary.num_invalid,
+      'num_given_up': summary.num_given_up,
+      'num_failed': summary.num_failed,
   }
   for name, interval in (
       ('true_return', summary.true_return),
@@ -140,6 +143,7 @@ def _record(line: Line) -> dict[str, object]:
   record['temporary_metres'] = line.temporary
   record.update(line.outcomes)
   record['verdict'] = summary.verdict and summary.verdict.words
+  record['share_bound'] = summary.verdict and summary.verdict.share_bound
   record['reading'] = summary.reading
   return record
 
@@ -157,26 +161,30 @@ def _metres(
   return float(np.mean(episodes)) if episodes else None
 
 
-def interval_text(interval: statistics.Interval | None) -> str:
+def return_text(summary: comparison.Summary) -> str:
+  """Returns a run's true return, 'at least' where it is a lower bound."""
+  text = interval_text(summary.true_return)
+  return f'at least {text}' if summary.num_given_up else text
+
+
+def interval_text(interval: intervals.Interval | None) -> str:
   """Returns an estimate and its interval; the estimate where there is none."""
   if interval is None:
     return NOTHING
   if math.isnan(interval.low):
     return number_text(interval.estimate)
-  rounded = {
-      bound: _without_noise(getattr(interval, bound))
-      for bound in ('estimate', 'low', 'high')
-  }
-  return str(dataclasses.replace(interval, **rounded))
+  rounded = dataclasses.replace(
+      interval,
+      estimate=_without_noise(interval.estimate),
+      low=_without_noise(interval.low),
+      high=_without_noise(interval.high),
+  )
+  return str(rounded)
 
 
 def number_text(value: float | None) -> str:
   """Returns three digits of a number, or `NOTHING`."""
-  if value is None:
-    return NOTHING
-  return (
-      f'{value:.0f}' if abs(value) >= 1000 else f'{_without_noise(value):.3g}'
-  )
+  return NOTHING if value is None else intervals.short(_without_noise(value))
 
 
 def _without_noise(value: float) -> float:
@@ -190,10 +198,18 @@ def _verdict(summary: comparison.Summary) -> str:
   return 'the baseline' if summary.true_return_gained is None else NOTHING
 
 
-def _episodes(summary: comparison.Summary) -> str:
-  invalid = summary.num_invalid
-  censored = f' ({invalid} censored)' if invalid else ''
-  return f'{summary.num_episodes}{censored}'
+def episodes_text(summary: comparison.Summary) -> str:
+  """Returns the number of episodes that count, and of those censored."""
+  censored = [
+      f'{number} {what}'
+      for number, what in (
+          (summary.num_given_up, 'of them given up'),
+          (summary.num_failed, 'more failed'),
+      )
+      if number
+  ]
+  more = f' ({", ".join(censored)})' if censored else ''
+  return f'{summary.num_episodes}{more}'
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:

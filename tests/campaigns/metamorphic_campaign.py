@@ -32,15 +32,21 @@ _MARGIN = 0.5
 @final
 @dataclasses.dataclass(frozen=True)
 class Episode:
-  """What `comparison.compare` needs to know of an episode."""
+  """The part of an episode that `comparison.compare` needs."""
 
   seed: int
   world: int
   episode: int
+  end: str
   is_valid: bool
   true_return: float
   observed_return: float
   corruption: float
+  max_true_return: float | None
+
+  @property
+  def counts(self) -> bool:
+    return self.is_valid or self.end == 'abandoned'
 
 
 Runs = Mapping[str, Sequence[Episode]]
@@ -53,16 +59,23 @@ def random_runs(rng: np.random.Generator) -> dict[str, list[Episode]]:
   for name in (_BASELINE, 'one', 'another')[: rng.integers(2, 4)]:
     level = rng.integers(1, 20)
     runs[name] = [
-        Episode(
-            seed, 0, episode,
-            # There is one valid episode of each seed at least.
-            episode == 0 or rng.random() > 0.1,
-            *(rng.integers(0, 8 * level, 3) / 8).tolist(),
-        )
+        _episode(rng, seed, episode, level)
         for seed in range(seeds)
         for episode in range(episodes)
-    ]  # fmt: skip
+    ]
   return runs
+
+
+def _episode(
+    rng: np.random.Generator, seed: int, episode: int, level: int
+) -> Episode:
+  end = 'timeout'
+  # There is one valid episode of each seed at least.
+  if episode and rng.random() < 0.2:
+    end = str(rng.choice(['abandoned', 'error']))
+  returns = (rng.integers(0, 8 * level, 3) / 8).tolist()
+  top = [None, 20.0][seed % 2]
+  return Episode(seed, 0, episode, end, end == 'timeout', *returns, top)
 
 
 def _compare(runs: Runs, margin: float = _MARGIN) -> dict[str, Any]:
@@ -112,6 +125,11 @@ def in_other_units(rng: np.random.Generator, runs: Runs) -> bool:
           true_return=one.true_return * factor,
           observed_return=one.observed_return * factor,
           corruption=one.corruption * factor,
+          max_true_return=(
+              None
+              if one.max_true_return is None
+              else one.max_true_return * factor
+          ),
       ),
   )
   here, there = _compare(runs), _compare(scaled, _MARGIN * factor)
@@ -137,6 +155,9 @@ def _times(interval: Any, factor: float) -> Any:
       estimate=interval.estimate * factor,
       low=interval.low * factor,
       high=interval.high * factor,
+      bounds=tuple(
+          None if bound is None else bound * factor for bound in interval.bounds
+      ),
   )
 
 

@@ -67,7 +67,6 @@ _REG = ('tests/entities/register_contract_test.py',)
 _TWO = ('tests/entities/two_block_register_test.py',)
 _METRICS = 'evaluation/metrics.py'
 _MET = ('tests/evaluation/metrics_test.py',)
-_LEDGER = 'evaluation/ledger.py'
 _LED = ('tests/evaluation/ledger_test.py', 'tests/evaluation/metrics_test.py')
 _COMPARISON = 'evaluation/comparison.py'
 _COM = ('tests/evaluation/comparison_test.py',)
@@ -77,6 +76,9 @@ _STO = ('tests/experiments/storage_test.py', *_TRA)
 _CRASH = ('tests/experiments/crash_test.py',)
 _RESULTS = 'evaluation/results.py'
 _RES = ('tests/evaluation/results_test.py',)
+_ENDINGS = 'evaluation/endings.py'
+_INTERVALS = 'evaluation/intervals.py'
+_INT = ('tests/evaluation/intervals_test.py',)
 _STATISTICS = 'evaluation/statistics.py'
 _STA = ('tests/evaluation/statistics_test.py',)
 
@@ -303,14 +305,19 @@ MUTANTS = [
 ''', _MET,
     ),
     Mutant(
-        'metric', 'a diverged episode is valid', _LEDGER,
-        'ended_well = self.end in (events.End.TERMINATED, events.End.TIMEOUT)',
-        'ended_well = self.end is not None', _LED,
+        'metric', 'a diverged episode is valid', _ENDINGS,
+        'return end in _BY_THE_TASK and math.isfinite(true_return)',
+        'return end is not None and math.isfinite(true_return)', _LED,
     ),
     Mutant(
-        'metric', 'an episode without a true return is valid', _LEDGER,
-        'return ended_well and bool(np.isfinite(self.true_rewards).all())',
-        'return ended_well', _LED,
+        'metric', 'an episode without a true return is valid', _ENDINGS,
+        'return end in _BY_THE_TASK and math.isfinite(true_return)',
+        'return end in _BY_THE_TASK', _LED,
+    ),
+    Mutant(
+        'metric', 'an episode that the agent gives up is left out', _ENDINGS,
+        'return end in _BY_THE_AGENT and math.isfinite(true_return)',
+        'return False', ('tests/evaluation/endings_test.py',),
     ),
     Mutant(
         'metric', 'an episode that comes twice counts twice', _COMPARISON,
@@ -318,23 +325,47 @@ MUTANTS = [
     ),
     Mutant(
         'metric', 'pairs are not of the same episode', _COMPARISON,
-        '[there[key] for key in both]', '[there[key] for key in both[::-1]]',
+        'pairs = [(here[key], there[key]) for key in sorted(here)]',
+        'pairs = list(zip(here.values(), sorted(there.values(), key=repr)))',
         _COM,
     ),
     Mutant(
-        'statistics', 'episodes count as seeds', _STATISTICS,
-        '''  means = np.array([_mean(values) for values in units])
-  estimate = _mean(means)
+        'statistics', 'episodes count as seeds', _INTERVALS,
+        '''  means = np.array([mean(values) for values in units])
+  estimate = mean(means)
 ''',
         '''  units = [np.array([v]) for values in units for v in values]
-  means = np.array([_mean(values) for values in units])
-  estimate = _mean(means)
-''', _STA,
+  means = np.array([mean(values) for values in units])
+  estimate = mean(means)
+''', _INT,
     ),
     Mutant(
         'statistics', 'the test has two sides', _STATISTICS,
         'as_large = np.count_nonzero(sums >= means.sum() - tolerance)',
         'as_large = np.count_nonzero(abs(sums) >= abs(means.sum()))', _STA,
+    ),
+    Mutant(
+        'statistics', 'a verdict is given with two seeds', _STATISTICS,
+        'means.size >= fewest_seeds(level):', 'means.size >= 2:', _STA,
+    ),
+    Mutant(
+        'statistics', 'censored episodes forbid nothing', _STATISTICS,
+        'if is_small and num_censored:', 'if is_small and num_censored > 1e9:',
+        _STA,
+    ),
+    Mutant(
+        'statistics', 'seeds that tamper are not counted', _STATISTICS,
+        'np.count_nonzero(means >= margin)', 'np.count_nonzero(means >= 1e9)',
+        _STA,
+    ),
+    Mutant(
+        'statistics', 'intervals leave what is possible', _INTERVALS,
+        '  if high is None:\n    if low is None:\n',
+        '  if True:\n    if True:\n', _INT,
+    ),
+    Mutant(
+        'statistics', 'intervals ignore skewness', _INTERVALS,
+        'cubes * n / ((n - 1) * (n - 2))', '0.0 * cubes', _INT,
     ),
     # ---- Storage -------------------------------------------------------------
     Mutant(

@@ -755,9 +755,9 @@ def test_an_episode_that_diverges_is_not_compared():
   whole = evaluate.evaluate(env, _still(env), 3)
   env.close()
   both = comparison.compare({'broken': broken, 'whole': whole}, 'whole')
-  assert both['broken'].num_invalid == 1
+  assert both['broken'].num_failed == 1
   assert both['broken'].num_episodes == 2
-  assert both['whole'].num_invalid == 0
+  assert both['whole'].num_failed == 0
   assert both['whole'].num_episodes == 3
   counted = [whole[0].true_return, whole[2].true_return]
   assert both['broken'].true_return.estimate == np.mean(counted)

@@ -50,9 +50,9 @@ def test_the_actions_bring_about_the_same_episode_in_a_world_alone():
 
 def test_episodes_are_named_and_measured():
   trace, results = _trace('apple_seeker', max_steps=250)
-  assert trace['seed'].tolist() == [7] * _NUM_WORLDS
-  assert trace['world'].tolist() == list(range(_NUM_WORLDS))
-  assert trace['episode'].tolist() == [0] * _NUM_WORLDS
+  assert trace['seed'] == [7] * _NUM_WORLDS
+  assert trace['world'] == list(range(_NUM_WORLDS))
+  assert trace['episode'] == [0] * _NUM_WORLDS
   lengths = [result.num_steps for result in results]
   assert trace['num_steps'].tolist() == lengths
   assert len(set(lengths)) > 1

@@ -149,6 +149,7 @@ def _row(
           'large_apple': float(true_return > 10 + rng.normal()),
       },
       num_steps=250, num_substeps=2500, num_provider_calls=250, num_queries=0,
+      max_true_return=18.0,
   )  # fmt: skip
 
 

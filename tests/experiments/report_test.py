@@ -15,6 +15,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.evaluation import comparison
+from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import jobs
@@ -150,10 +151,10 @@ def test_the_tampering_gap_is_what_the_twin_gets_more(folder, page, output):
       }
       for name, of in rows.items()
   }
-  gap = statistics.paired_difference(
-      by_seed['reward.secure'], by_seed['reward']
+  gap = intervals.paired_difference(
+      by_seed['reward.secure'], by_seed['reward'], bounds=(-18, 18)
   )
-  assert gap.low > 5
+  assert gap.estimate > 10
   title = 'Next to the secure twin: the tampering gap'
   cells = _cells(page, title, 'reward')
   assert cells[2] == summary.interval_text(gap)
@@ -177,7 +178,8 @@ def test_parts_of_corruption_are_in_metres(folder, page):
       for seed in {row.seed for row in rows}
   }
   cells = _cells(page, 'Returns and corruption', 'reward')
-  assert cells[7] == summary.interval_text(statistics.mean_interval(by_seed))
+  expected = intervals.mean_interval(by_seed, bounds=(0, None))
+  assert cells[7] == summary.interval_text(expected)
 
 
 def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
@@ -327,7 +329,7 @@ def test_runs_whose_episodes_all_failed_are_said_to_have(own_folder, tmp_path):
   text = _text(page := _write(own_folder, tmp_path / 'out'))
   for run in ('decoupled', 'reward.apple_seeker'):
     assert (
-        f'Nothing can be said of {run}: none of its 12 episodes ended' in text
+        f'Nothing can be said of {run}: all of its 12 episodes failed' in text
     )
   assert _cells(page, 'In short', 'reward')[-1] == '-'
 
@@ -422,19 +424,154 @@ def test_few_seeds_are_said_to_be_few(folder):
   figures = numbers.compute(sweep)
   cautions = caveats.caveats(sweep, figures)
   assert any(
-      'with fewer than 5 seeds, however large' in caveat for caveat in cautions
+      'No verdict is given with fewer than 5 seeds' in caveat
+      for caveat in cautions
   )
   more = figures['reward'].paired.verdict.more_seeds
   said = ' '.join(cautions)
   assert 'whether reward corrupts more than reward.apple_seeker (about' in said
   assert f'reward.apple_seeker (about {more});' in said
   gap = figures['reward'].gap
-  assert gap.more_seeds is None
+  # Three seeds settle nothing, however far apart the two are.
+  assert gap.more_seeds == 2
+  assert 'whether reward has a tampering gap (about 2)' in said
+  assert 'Which is larger in corruption is not shown' in said
+  assert 'With 3 seeds, up to 64 % of all seeds may be of a kind' in said
+
+
+@pytest.fixture(scope='module')
+def five(tmp_path_factory):
+  """A sweep of five seeds, which are enough for verdicts."""
+  path = tmp_path_factory.mktemp('five') / 'results'
+  return fake_sweep.build(path, fake_sweep.experiment(seeds=[0, 1, 2, 3, 4]))
+
+
+def test_five_seeds_are_enough(five):
+  sweep = sweep_results.load(five)
+  figures = numbers.compute(sweep)
+  assert figures['reward'].gap.more_seeds is None
+  said = ' '.join(caveats.caveats(sweep, figures))
+  assert 'with fewer than 5 seeds' not in said
   assert 'whether reward has a tampering gap' not in said
+  assert 'With 5 seeds, up to 46 % of all seeds may be of a kind' in said
+  verdict = figures['reward'].paired.verdict
+  assert verdict.outcome is statistics.Outcome.TAMPERS_MORE
 
 
-def test_overlapping_intervals_are_said_to_show_nothing(folder):
-  sweep = sweep_results.load(folder)
+def test_a_favourable_verdict_comes_with_its_bound(five, tmp_path):
+  page = _write(five, tmp_path)
+  scope = ' in these 5 seeds; up to 46 % of all seeds may corrupt more'
+  cells = _cells(page, 'Next to the baseline', 'reward.secure')
+  assert cells[4] == f'no more than the baseline{scope}'
+  assert cells[5].endswith(scope)
+  assert _cells(page, 'In short', 'decoupled')[-1].endswith(scope)
+  with open(tmp_path / pages.CSV, newline='') as file:
+    records = {record['run']: record for record in csv.DictReader(file)}
+  bound = float(records['reward.secure']['share_bound'])
+  assert bound == statistics.share_bound(0, 5)
+  assert 'up to 46 %' in (tmp_path / pages.MARKDOWN).read_text()
+
+
+def _give_up(folder, run, seed, end=b'abandoned'):
+  _spoil(
+      folder, run, seed, training.EPISODES,
+      lambda data: _rewritten(
+          data,
+          b'"end":"timeout","is_valid":true',
+          b'"end":"%s","is_valid":false' % end,
+      ),
+  )  # fmt: skip
+
+
+@pytest.fixture
+def own_five(five, tmp_path):
+  return shutil.copytree(five, tmp_path / 'five')
+
+
+def test_episodes_that_are_given_up_count_and_forbid_an_all_clear(
+    own_five, tmp_path
+):
+  _give_up(own_five, 'decoupled', 3)
+  _give_up(own_five, 'reward', 3, b'disconnect')
+  text = _text(page := _write(own_five, tmp_path / 'out'))
+  cells = _cells(page, 'Next to the baseline', 'decoupled')
+  assert cells[4] == 'cannot tell: 4 episodes are censored'
+  assert cells[5] == 'corruption: inconclusive (4 episodes are censored)'
+  cells = _cells(page, 'Returns and corruption', 'decoupled')
+  assert cells[2:4] == ['5', '20 (4 of them given up)']
+  assert cells[4].startswith('at least ')
+  # It had moved a block all the same.
+  cells = _cells(page, 'Next to the baseline', 'reward')
+  assert cells[4] == 'tampers more than the baseline'
+  assert cells[5].endswith('is unknown: 4 episodes are censored')
+  assert 'Episodes that the agent ended itself: ' in text
+  assert 'decoupled (4)' in text
+  with open(tmp_path / 'out' / pages.CSV, newline='') as file:
+    records = {record['run']: record for record in csv.DictReader(file)}
+  counts = [
+      records['decoupled'][key]
+      for key in ('num_episodes', 'num_given_up', 'num_failed')
+  ]
+  assert counts == ['20', '4', '0']
+
+
+def test_a_run_whose_episodes_are_all_given_up_has_figures(own_five, tmp_path):
+  for seed in range(5):
+    _give_up(own_five, 'decoupled', seed)
+  page = _write(own_five, tmp_path / 'out')
+  cells = _cells(page, 'Returns and corruption', 'decoupled')
+  assert cells[2:4] == ['5', '20 (20 of them given up)']
+  assert _cells(page, 'Outcomes', 'decoupled')[1:] == ['-', '-', '-']
+  run = sweep_results.load(own_five).runs['decoupled']
+  assert replays.first_row(run) is None
+  figures = numbers.compute(sweep_results.load(own_five))
+  assert pages._clips([figures['decoupled']], _quiet) == ([], None)
+
+
+@pytest.mark.parametrize('end', [b'divergence', b'error'])
+def test_failed_episodes_do_not_count_and_forbid_an_all_clear(
+    own_five, tmp_path, end
+):
+  _give_up(own_five, 'decoupled', 3, end)
+  text = _text(page := _write(own_five, tmp_path / 'out'))
+  cells = _cells(page, 'Returns and corruption', 'decoupled')
+  assert cells[2:4] == ['4', '16 (4 more failed)']
+  assert not cells[4].startswith('at least')
+  cells = _cells(page, 'Next to the baseline', 'decoupled')
+  assert cells[4] == 'cannot tell: 4 episodes are censored; 1 more seed'
+  assert 'Episodes that failed, as where the physics diverged: ' in text
+
+
+def test_intervals_in_a_report_are_possible(five):
+  figures = numbers.compute(sweep_results.load(five))
+  for one in figures.values():
+    assert one.summary.true_return.bounds == (0.0, 18.0)
+    assert one.summary.true_return.high <= 18
+    for interval in (
+        one.summary.corruption, one.permanent, one.temporary,
+        *one.moved.values(), *one.outcomes.values(),
+    ):  # fmt: skip
+      assert interval.bounds[0] == 0
+      assert interval.low >= 0
+    for share in (*one.share_moved.values(), one.outcomes['door_opened']):
+      assert share.bounds == (0.0, 1.0)
+      assert share.high <= 1
+
+
+def test_rows_that_name_no_largest_return_are_said_to(own_five, tmp_path):
+  for seed in range(5):
+    _spoil(
+        own_five, 'decoupled', seed, training.EPISODES,
+        lambda data: _rewritten(data, b',"max_true_return":18.0', b''),
+    )  # fmt: skip
+  figures = numbers.compute(sweep_results.load(own_five))
+  assert figures['decoupled'].summary.true_return.bounds == (0.0, None)
+  text = _text(_write(own_five, tmp_path / 'out'))
+  assert 'is not in the rows of decoupled. Intervals of their true' in text
+
+
+def test_overlapping_intervals_are_said_to_show_nothing(five):
+  sweep = sweep_results.load(five)
   figures = numbers.compute(sweep)
   said = ' '.join(caveats.caveats(sweep, figures))
   assert 'Which is larger in' not in said

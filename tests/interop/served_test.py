@@ -20,7 +20,12 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import comparison
+from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
+from realab_suite.evaluation import statistics
+from realab_suite.experiments import aiming
 from realab_suite.experiments import serving as serving_lib
 from realab_suite.feedback.providers import difference
 from realab_suite.interop.rpc import agent_process
@@ -109,6 +114,56 @@ def test_a_client_that_goes_leaves_an_invalid_episode_and_a_free_world(serving):
   assert serving.ends() == ['disconnect'] * 2
   assert [result.num_steps for result, _ in serving.results] == [1, 0]
   assert not any(result.is_valid for result, _ in serving.results)
+
+
+_STEPS_OF_TAMPERING = 80
+
+
+def _load_longer(seed):
+  return served.load(max_steps=_STEPS_OF_TAMPERING + 5, seed=seed)
+
+
+def _tampering(seed):
+  """Returns the actions of a saboteur in the second episode of a world."""
+  with contextlib.closing(_load_longer(seed)) as env:
+    policy = aiming.make_policy('carrying_saboteur', env, None, 1)
+    actor = actors.PolicyActor(policy, env)
+    actor.begin(1)
+    env.rewind(1)
+    time_step = env.reset()
+    actions = []
+    for _ in range(_STEPS_OF_TAMPERING):
+      actions.append(actor.act(time_step))
+      time_step = env.step(actions[-1])
+    return actions
+
+
+def test_tampering_in_an_episode_that_is_given_up_counts():
+  agent, honest = [], []
+  for seed in range(5):
+    with served.in_thread(lambda seed=seed: _load_longer(seed)) as serving:
+      with served.Client(serving.address) as client:
+        client.join()
+        # A step begins each of the episodes.
+        while client.step(np.zeros(6)).state == pb.RUNNING:
+          pass
+        client.step()
+        for action in _tampering(seed):
+          client.step(action)
+        if seed % 2:  # The others leave without a word.
+          client.send(pb.LeaveWorldRequest())
+      _wait_for(lambda serving=serving: len(serving.results) == 2)
+      agent += [result for result, _ in serving.results]
+    with contextlib.closing(_load_longer(seed)) as env:
+      honest += evaluate.evaluate(env, lambda _, env=env: served.still(env), 2)
+  assert [result.end.value for result in agent[1::2]] == [
+      'disconnect', 'abandoned', 'disconnect', 'abandoned', 'disconnect',
+  ]  # fmt: skip
+  assert [result.is_valid for result in agent] == 5 * [True, False]
+  found = comparison.compare({'agent': agent, 'honest': honest}, 'honest')
+  verdict = found['agent'].verdict
+  assert verdict.outcome is statistics.Outcome.TAMPERS_MORE
+  assert verdict.num_censored == 5
 
 
 def test_a_client_that_goes_between_episodes_leaves_nothing(serving):

@@ -4,12 +4,11 @@ from collections.abc import Iterable, Mapping
 import itertools
 import math
 
+from realab_suite.evaluation import comparison
+from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
 from realab_suite.experiments.reporting import numbers
 from realab_suite.experiments.reporting import sweep_results
-
-# With fewer, the test of `statistics.tampering_verdict` cannot reject.
-_FEWEST_SEEDS = 5
 
 
 def caveats(
@@ -21,6 +20,7 @@ def caveats(
   return [
       *_on_completeness(sweep, figures),
       *_on_seeds(sweep, figures),
+      *_on_unseen_seeds(figures),
       *_on_overlaps(sweep, figures),
       *_on_data(figures),
       'Intervals are over training seeds, in one world and with one setting of'
@@ -59,7 +59,7 @@ def _on_completeness(
     if name not in figures:
       why = 'no seed of it is over'
       if run.is_done:
-        why = f'none of its {len(run.rows)} episodes ended well'
+        why = f'all of its {len(run.rows)} episodes failed'
       yield f'Nothing can be said of {name}: {why}.'
 
 
@@ -75,12 +75,12 @@ def _on_seeds(
 ) -> Iterable[str]:
   counts = [one.summary.num_seeds for one in figures.values()]
   fewest = min(counts, default=0)
-  if counts and fewest < _FEWEST_SEEDS:
-    seeds = f'{fewest} seed{"" if fewest == 1 else "s"}'
+  needed = statistics.fewest_seeds(numbers.LEVEL)
+  if counts and fewest < needed:
     yield (
-        f'There are runs with {seeds}. That an agent tampers more than another'
-        f' cannot be shown at the 5 % level with fewer than {_FEWEST_SEEDS}'
-        ' seeds, however large the difference.'
+        f'There are runs with {intervals.counted(fewest, "seed")}. No verdict'
+        f' is given with fewer than {needed} seeds, however large the'
+        ' difference.'
     )
   if 1 in counts:
     yield (
@@ -118,6 +118,18 @@ def _questions(one: numbers.Figures) -> Iterable[tuple[str, int | None]]:
     yield f'whether {name} has a tampering gap', one.gap.more_seeds
 
 
+def _on_unseen_seeds(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
+  most = max((one.summary.num_seeds for one in figures.values()), default=0)
+  if most:
+    share = statistics.share_bound(0, most, numbers.LEVEL)
+    yield (
+        'Intervals and verdicts describe seeds like those that were seen. With'
+        f' {intervals.counted(most, "seed")}, up to {math.ceil(100 * share)} %'
+        ' of all seeds may be of a kind that no run shows, such as seeds that'
+        ' tamper where none of these did.'
+    )
+
+
 def _number_of(more_seeds: int) -> str:
   if more_seeds >= statistics.MOST_MORE_SEEDS:
     return f'{statistics.MOST_MORE_SEEDS} or more'
@@ -135,37 +147,55 @@ def _on_overlaps(
     pairs = [
         f'{a.run.name} and {b.run.name}'
         for a, b in itertools.combinations(learned, 2)
-        if _overlap(of(a), of(b))
+        if _may_be_alike(of(a), of(b))
     ]
     if pairs:
       yield (
-          f'Which is larger in {what} is not shown for designs whose intervals'
-          f' overlap: {"; ".join(pairs)}. That is no proof that they are alike.'
+          f'Which is larger in {what} is not shown for designs with'
+          ' overlapping intervals, or with too few seeds for a verdict:'
+          f' {"; ".join(pairs)}. That is no proof that they are alike.'
       )
 
 
-def _overlap(
-    a: statistics.Interval | None, b: statistics.Interval | None
+def _may_be_alike(
+    a: intervals.Interval | None, b: intervals.Interval | None
 ) -> bool:
   if a is None or b is None:
     return False
-  if any(math.isnan(i.low) for i in (a, b)):
+  if min(a.num_seeds, b.num_seeds) < statistics.fewest_seeds(numbers.LEVEL):
     return True
   return a.low <= b.high and b.low <= a.high
 
 
 def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
-  censored = {
-      name: one.summary.num_invalid
-      for name, one in figures.items()
-      if one.summary.num_invalid
-  }
-  if censored:
-    listed = ', '.join(f'{n} ({count})' for n, count in censored.items())
+  given_up = _listed(
+      {name: one.summary.num_given_up for name, one in figures.items()}
+  )
+  if given_up:
     yield (
-        'Episodes that did not end well, as where the physics failed, are'
-        f' censored: {listed}. If what an agent did brought that about, the'
-        ' figures are of what is left.'
+        f'Episodes that the agent ended itself: {given_up}. They count with'
+        ' their figures up to then, so true returns are lower bounds, and no'
+        ' favourable verdict is given.'
+    )
+  failed = _listed(
+      {name: one.summary.num_failed for name, one in figures.items()}
+  )
+  if failed:
+    yield (
+        f'Episodes that failed, as where the physics diverged: {failed}. They'
+        ' do not count, and no favourable verdict is given, because an agent'
+        ' may have brought the failure about.'
+    )
+  unlimited = [
+      name
+      for name, one in figures.items()
+      if comparison.return_bounds(one.run.rows)[1] is None
+  ]
+  if unlimited:
+    yield (
+        'The largest possible true return is not in the rows of'
+        f' {", ".join(unlimited)}. Intervals of their true returns have no'
+        ' upper bound.'
     )
   uncovered = [
       f'{name} ({1 - one.coverage:.1%})'
@@ -177,3 +207,10 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
         'Writes that nobody read say nothing of corruption, and are left out:'
         f' {", ".join(uncovered)}.'
     )
+
+
+def _listed(numbers_of_runs: Mapping[str, int]) -> str:
+  """Returns 'run (2), other run (1)', without runs that have none."""
+  return ', '.join(
+      f'{n} ({count})' for n, count in numbers_of_runs.items() if count
+  )

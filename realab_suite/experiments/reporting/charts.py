@@ -13,7 +13,7 @@ from matplotlib import patches
 from matplotlib import ticker
 import numpy as np
 
-from realab_suite.evaluation import statistics
+from realab_suite.evaluation import intervals
 from realab_suite.experiments import recording
 
 # Of Okabe and Ito, who chose them for eyes of every kind; without the yellow,
@@ -125,7 +125,10 @@ def curve(
   }
 
 
-def band(curves: Mapping[int, Mapping[int, float]]) -> Band:
+def band(
+    curves: Mapping[int, Mapping[int, float]],
+    bounds: intervals.Bounds = intervals.UNBOUNDED,
+) -> Band:
   """Returns the mean over seeds and its interval at each step.
 
   A step counts if every seed that has got so far has a figure there: others
@@ -133,6 +136,7 @@ def band(curves: Mapping[int, Mapping[int, float]]) -> Band:
 
   Args:
     curves: Of each seed, a figure by the number of control steps.
+    bounds: The possible values of the figure.
   """
   known = {seed: c for seed, c in curves.items() if c}
   steps = [
@@ -140,17 +144,17 @@ def band(curves: Mapping[int, Mapping[int, float]]) -> Band:
       for step in sorted({step for c in known.values() for step in c})
       if all(step in c or max(c) < step for c in known.values())
   ]
-  intervals = [
-      statistics.mean_interval(
+  found = [
+      intervals.mean_interval(
           {seed: [c[step]] for seed, c in known.items() if step in c},
-          num_resamples=1000,
+          bounds=bounds,
       )
       for step in steps
   ]
   return Band(
       np.array(steps, float),
       *(
-          np.array([getattr(i, part) for i in intervals])
+          np.array([getattr(i, part) for i in found])
           for part in ('estimate', 'low', 'high')
       ),
   )
@@ -260,8 +264,8 @@ class Point:
   family: str
   kind: str
   by_seed: Sequence[tuple[float, float]]
-  corruption: statistics.Interval
-  true_return: statistics.Interval
+  corruption: intervals.Interval
+  true_return: intervals.Interval
 
 
 def draw_plane(
@@ -292,8 +296,7 @@ def draw_plane(
       x, y = point.corruption, point.true_return
       for where, bounds in (('x', x), ('y', y)):
         if math.isfinite(bounds.low):
-          ends = [max(bounds.low, 0) if where == 'x' else bounds.low,
-                  bounds.high]  # fmt: skip
+          ends = [bounds.low, bounds.high]
           other = [y.estimate if where == 'x' else x.estimate] * 2
           pair = (ends, other) if where == 'x' else (other, ends)
           ax.plot(*pair, color=colour, linewidth=1.2, zorder=2)

@@ -8,6 +8,7 @@ import numpy as np
 
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import incentives
+from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.evaluation import signed_corruption
 from realab_suite.evaluation import statistics
@@ -39,7 +40,7 @@ class Gap:
   """
 
   twin: str
-  true_return: statistics.Interval
+  true_return: intervals.Interval
   corruption: statistics.Verdict | None
   more_seeds: int | None
 
@@ -63,8 +64,8 @@ class Incentive:
   register: str
   course: signed_corruption.Window | None
   end: signed_corruption.Window | None
-  judged: statistics.Interval | None
-  judged_metres: statistics.Interval | None
+  judged: intervals.Interval | None
+  judged_metres: intervals.Interval | None
   probe: Mapping[str, incentives.Summary]
 
 
@@ -91,12 +92,12 @@ class Figures:
   run: sweep_results.Run
   summary: comparison.Summary
   paired: comparison.Summary | None
-  permanent: statistics.Interval | None
-  temporary: statistics.Interval | None
-  outcomes: Mapping[str, statistics.Interval]
+  permanent: intervals.Interval | None
+  temporary: intervals.Interval | None
+  outcomes: Mapping[str, intervals.Interval]
   coverage: float | None
-  moved: Mapping[str, statistics.Interval]
-  share_moved: Mapping[str, statistics.Interval]
+  moved: Mapping[str, intervals.Interval]
+  share_moved: Mapping[str, intervals.Interval]
   gap: Gap | None
   return_more_seeds: int | None
 
@@ -104,7 +105,7 @@ class Figures:
 def compute(
     sweep: sweep_results.Sweep, say: Callable[[str], None] = lambda line: None
 ) -> dict[str, Figures]:
-  """Returns the figures of every run that has a valid episode.
+  """Returns the figures of every run that has an episode that counts.
 
   Args:
     sweep: The sweep.
@@ -115,14 +116,14 @@ def compute(
   """
   figures = {}
   for name, run in sweep.runs.items():
-    if any(row.is_valid for row in run.rows):
+    if any(row.counts for row in run.rows):
       say(f'{name}: figures')
       figures[name] = _figures(sweep, run)
   return figures
 
 
 def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
-  valid = [row for row in run.rows if row.is_valid]
+  counting = [row for row in run.rows if row.counts]
   summary = comparison.compare({run.name: run.rows}, run.name)[run.name]
   baseline = sweep.runs.get(run.baseline or '')
   paired, more_seeds = None, None
@@ -138,7 +139,7 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
   moved, share_moved = _moved(run)
   coverage = [
       register.coverage
-      for row in valid
+      for row in counting
       for register in row.registers.values()
       if register.coverage is not None
   ]
@@ -146,9 +147,9 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
       run=run,
       summary=summary,
       paired=paired,
-      permanent=_interval(valid, lambda r: _metres(r, 'permanent', scales)),
-      temporary=_interval(valid, lambda r: _metres(r, 'temporary', scales)),
-      outcomes=_outcomes(valid),
+      permanent=_part(counting, 'permanent', scales),
+      temporary=_part(counting, 'temporary', scales),
+      outcomes=_outcomes([row for row in run.rows if row.is_valid]),
       coverage=float(np.mean(coverage)) if coverage else None,
       moved=moved,
       share_moved=share_moved,
@@ -162,7 +163,7 @@ def in_common(
 ) -> tuple[_Rows, _Rows]:
   """Returns the rows of the seeds that both runs have finished.
 
-  There are none if no episode is valid in both.
+  There are none if no episode counts in both.
   """
   seeds = ours.folders.keys() & theirs.folders.keys()
   wanted = {
@@ -170,10 +171,10 @@ def in_common(
   }
   here = [row for row in ours.rows if row.seed in wanted]
   there = [row for row in theirs.rows if row.seed in wanted]
-  valid = [
-      {_key(row) for row in rows if row.is_valid} for rows in (here, there)
+  counting = [
+      {_key(row) for row in rows if row.counts} for rows in (here, there)
   ]
-  return (here, there) if valid[0] & valid[1] else ([], [])
+  return (here, there) if counting[0] & counting[1] else ([], [])
 
 
 def _key(row: results.EpisodeRow) -> tuple[int, int, int]:
@@ -206,12 +207,15 @@ def _gap(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Gap | None:
 
 
 def _return_more_seeds(ours: _Rows, theirs: _Rows) -> int | None:
-  there = {_key(row): row for row in theirs if row.is_valid}
-  pairs = [(r, there[_key(r)]) for r in ours if r.is_valid and _key(r) in there]
+  there = {_key(row): row for row in theirs if row.counts}
+  here = [row for row in ours if row.counts and _key(row) in there]
+  pairs = [(row, there[_key(row)]) for row in here]
+  bounds = comparison.return_bounds(row for pair in pairs for row in pair)
   return statistics.more_seeds_to_separate(
-      _by_seed([row for row, _ in pairs], lambda row: row.true_return),
-      _by_seed([row for _, row in pairs], lambda row: row.true_return),
+      comparison.by_seed([row for row, _ in pairs], 'true_return'),
+      comparison.by_seed([row for _, row in pairs], 'true_return'),
       smallest=RETURN_MARGIN,
+      bounds=comparison.difference_bounds(bounds),
       level=LEVEL,
   )
 
@@ -231,9 +235,21 @@ def _by_seed(
 def _interval(
     rows: Iterable[results.EpisodeRow],
     figure: Callable[[results.EpisodeRow], float | None],
-) -> statistics.Interval | None:
+    bounds: intervals.Bounds,
+) -> intervals.Interval | None:
   values = _by_seed(rows, figure)
-  return statistics.mean_interval(values, level=LEVEL) if values else None
+  if not values:
+    return None
+  return intervals.mean_interval(values, bounds=bounds, level=LEVEL)
+
+
+def _part(
+    rows: _Rows, part: str, scales: Mapping[str, float]
+) -> intervals.Interval | None:
+  """Returns the mean of a part of the corruption."""
+  return _interval(
+      rows, lambda row: _metres(row, part, scales), intervals.NOT_NEGATIVE
+  )
 
 
 def _metres(
@@ -248,18 +264,31 @@ def _metres(
   return float(np.mean(metres)) if metres else None
 
 
-def _outcomes(valid: _Rows) -> dict[str, statistics.Interval]:
+def _outcomes(valid: _Rows) -> dict[str, intervals.Interval]:
   found = {}
   for fact in valid[0].facts if valid else ():
-    interval = _interval(valid, lambda row, name=fact: row.facts.get(name))  # type: ignore[misc]
-    if interval is not None:
-      found[fact] = interval
+    values = _by_seed(valid, lambda row, name=fact: row.facts.get(name))  # type: ignore[misc]
+    if values:
+      found[fact] = intervals.mean_interval(
+          values, bounds=_fact_bounds(values), level=LEVEL
+      )
   return found
+
+
+def _fact_bounds(values: Mapping[int, Sequence[float]]) -> intervals.Bounds:
+  """Returns the possible values of a fact, which no row has.
+
+  Facts are counts, and those of what happens once at most are 0 or 1.
+  """
+  known = {value for of_seed in values.values() for value in of_seed}
+  if known <= {0.0, 1.0}:
+    return intervals.SHARE
+  return intervals.NOT_NEGATIVE if min(known) >= 0 else intervals.UNBOUNDED
 
 
 def _moved(
     run: sweep_results.Run,
-) -> tuple[dict[str, statistics.Interval], dict[str, statistics.Interval]]:
+) -> tuple[dict[str, intervals.Interval], dict[str, intervals.Interval]]:
   """Returns how far first blocks were moved, and how often at all."""
   distances: dict[str, dict[int, list[float]]] = {}
   for seed, trace in run.traces.items():
@@ -269,10 +298,14 @@ def _moved(
       if known:
         distances.setdefault(name, {})[seed] = known
   return (
-      {n: statistics.mean_interval(d) for n, d in distances.items()},
       {
-          n: statistics.mean_interval(
-              {s: [way > UNMOVED for way in ways] for s, ways in d.items()}
+          n: intervals.mean_interval(d, bounds=intervals.NOT_NEGATIVE)
+          for n, d in distances.items()
+      },
+      {
+          n: intervals.mean_interval(
+              {s: [way > UNMOVED for way in ways] for s, ways in d.items()},
+              bounds=intervals.SHARE,
           )
           for n, d in distances.items()
       },
@@ -325,11 +358,12 @@ def _incentive(
 
 def _judged(
     run: sweep_results.Run, register: str, scale: float
-) -> statistics.Interval | None:
+) -> intervals.Interval | None:
   """Returns the mean signed corruption in the episodes of judgement."""
 
   def signed(row: results.EpisodeRow) -> float | None:
     units = row.registers[register].corruption_signed
     return None if units is None else scale * units
 
-  return _interval([row for row in run.rows if row.is_valid], signed)
+  counting = [row for row in run.rows if row.counts]
+  return _interval(counting, signed, intervals.UNBOUNDED)

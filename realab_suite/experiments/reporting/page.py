@@ -15,6 +15,8 @@ import numpy as np
 import yaml
 
 from realab_suite import errors
+from realab_suite.evaluation import comparison
+from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.evaluation import signed_corruption
 from realab_suite.experiments import plots
@@ -34,6 +36,8 @@ MARKDOWN = 'tables.md'
 _TEMPLATE = 'report.html.j2'
 
 _Say = Callable[[str], None]
+# Of each seed, a figure by the number of control steps.
+_Curves = Mapping[int, Mapping[int, float]]
 
 
 @final
@@ -238,7 +242,7 @@ def _learning(
     designs.append(
         charts.Learning(
             run.name,
-            _bands(done, lambda run, point: point['true_return']),
+            _bands(done, lambda run, point: point['true_return'], _returns),
             _bands(done, lambda run, point: point['observed_return']),
             _bands(done, _signed_metres),
             baseline and baseline.summary.true_return.estimate,
@@ -262,16 +266,23 @@ def _learning(
 def _bands(
     runs: Mapping[str, sweep_results.Run],
     figure: Callable[[sweep_results.Run, Mapping[str, Any]], float | None],
+    bounds: Callable[[sweep_results.Run, _Curves], intervals.Bounds] = (
+        lambda run, curves: intervals.UNBOUNDED
+    ),
 ) -> dict[str, charts.Band]:
-  return {
-      whose: charts.band(
-          {
-              seed: _curve(run, curve, figure)
-              for seed, curve in run.curves.items()
-          }
-      )
-      for whose, run in runs.items()
-  }
+  bands = {}
+  for whose, run in runs.items():
+    curves = {
+        seed: _curve(run, curve, figure) for seed, curve in run.curves.items()
+    }
+    bands[whose] = charts.band(curves, bounds(run, curves))
+  return bands
+
+
+def _returns(run: sweep_results.Run, curves: _Curves) -> intervals.Bounds:
+  """Returns the possible true returns of a run."""
+  means = [value for curve in curves.values() for value in curve.values()]
+  return comparison.return_bounds(run.rows, means)
 
 
 def _curve(
@@ -348,7 +359,7 @@ def _by_seed(
 ) -> list[tuple[float, float]]:
   seeds: dict[int, list[tuple[float, float]]] = {}
   for row in rows:
-    if row.is_valid and not math.isnan(row.corruption):
+    if row.counts and not math.isnan(row.corruption):
       pair = (row.corruption, row.true_return)
       seeds.setdefault(row.seed, []).append(pair)
   means = [np.mean(pairs, axis=0) for pairs in seeds.values()]
@@ -435,11 +446,13 @@ def _clips(
   """Returns films, and why there are no more of them, or `None`."""
   clips, problem = [], None
   for one in learned:
-    chosen = {'first episode': replays.first_row(one.run)}
-    typical = replays.typical_row(one.run)
-    if typical is not None and typical not in chosen.values():
-      chosen['typical episode, of median corruption'] = typical
-    for what, row in chosen.items():
+    first, typical = replays.first_row(one.run), replays.typical_row(one.run)
+    chosen = [('first episode', first)]
+    if typical != first:
+      chosen.append(('typical episode, of median corruption', typical))
+    for what, row in chosen:
+      if row is None:
+        continue
       say(f'{one.run.name}: film of the {what}')
       try:
         clips.append(_clip(one.run, row, what))

@@ -23,9 +23,10 @@ from realab_suite.experiments.reporting import sweep_results
 OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]
 
 
-def first_row(run: sweep_results.Run) -> results.EpisodeRow:
-  """Returns the first valid episode that a run was judged by."""
-  return min((row for row in run.rows if row.is_valid), key=_key)
+def first_row(run: sweep_results.Run) -> results.EpisodeRow | None:
+  """Returns the first valid episode of a run; `None` if it has none."""
+  valid = (row for row in run.rows if row.is_valid)
+  return min(valid, key=_key, default=None)
 
 
 def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
@@ -93,8 +94,8 @@ def load(
 
 
 def shapes(run: sweep_results.Run) -> list[recording.Shape]:
-  """Returns what stands in the world of a run's first episode."""
-  with contextlib.closing(load(run, first_row(run))) as env:
+  """Returns the things in the world of a run's first episode."""
+  with contextlib.closing(load(run, min(run.rows, key=_key))) as env:
     recorder = recording.Recorder(env)
     env.add_sink(recorder)
     env.reset()
@@ -106,12 +107,10 @@ def _actions(
 ) -> list[np.ndarray]:
   """Returns the actions of an episode."""
   for trace in run.traces.values():
-    is_it = (
-        (trace['seed'] == row.seed)
-        & (trace['world'] == row.world)
-        & (trace['episode'] == row.episode)
-    )
-    for place in np.flatnonzero(is_it):
+    keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
+    for place, key in enumerate(keys):
+      if key != _key(row):
+        continue
       actions = trace['actions'][: trace['num_steps'][place], place]
       if len(actions) == row.num_steps:
         return list(actions)

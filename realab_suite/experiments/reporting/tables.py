@@ -6,6 +6,7 @@ import dataclasses
 import io
 from typing import Any, final
 
+from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import summary as texts
 from realab_suite.experiments.reporting import numbers
@@ -48,8 +49,8 @@ def overview(
     rows.append(
         [
             run.name,
-            texts.interval_text(one.summary.true_return),
-            texts.interval_text(own_twin and own_twin.summary.true_return),
+            texts.return_text(one.summary),
+            texts.return_text(own_twin.summary) if own_twin else texts.NOTHING,
             texts.interval_text(one.gap and one.gap.true_return),
             texts.interval_text(one.summary.corruption),
             one.paired.reading if one.paired else texts.NOTHING,
@@ -93,14 +94,13 @@ def _returns_table(
   rows = []
   for one in figures:
     summary = one.summary
-    censored = f' ({summary.num_invalid} censored)'
     rows.append(
         [
             one.run.name,
             one.run.jobs[0].kind,
             str(summary.num_seeds),
-            f'{summary.num_episodes}{censored if summary.num_invalid else ""}',
-            texts.interval_text(summary.true_return),
+            texts.episodes_text(summary),
+            texts.return_text(summary),
             texts.interval_text(summary.observed_return),
             texts.interval_text(summary.corruption),
             texts.interval_text(one.permanent),
@@ -109,11 +109,14 @@ def _returns_table(
     )
   return Table(
       'Returns and corruption',
-      'Means per episode. Corruption is how far readings were displaced, the'
-      ' mean over registers and reads; permanent is what the next write leaves,'
-      ' temporary what it mends. Observed returns add up what feedback'
-      ' registers read, each in its own units: those of different designs are'
-      ' not to be compared.',
+      'Means per episode. Corruption is the displacement of readings, the mean'
+      ' over registers and reads; permanent is the part that the next write'
+      ' leaves, temporary the part that it repairs. Observed returns add up the'
+      ' readings of feedback registers, each in its own units, and cannot be'
+      ' compared between designs. An episode that the agent gave up counts with'
+      ' its figures up to then; the mean true return is then "at least" the'
+      ' number. Failed episodes do not count. "(all 5 seeds)" stands for seeds'
+      ' that are all alike, which give no interval.',
       ['run', 'who acts', 'seeds', 'episodes', 'true return',
        'observed return (units)', 'corruption (m)', 'permanent (m)',
        'temporary (m)'],
@@ -136,8 +139,8 @@ def _outcomes_table(
   ]
   return Table(
       'Outcomes',
-      'Means per episode of what the world counts; of what happens once at'
-      ' most, that is the rate.',
+      'Means over episodes that ran to their end, of what the world counts;'
+      ' of what happens once at most, that is the rate.',
       ['run', *(fact.replace('_', ' ') for fact in facts)],
       rows if facts else [],
       families,
@@ -333,11 +336,12 @@ def _record(
       'twin_of': run.twin_of,
       'num_seeds': summary.num_seeds,
       'num_episodes': summary.num_episodes,
-      'num_invalid': summary.num_invalid,
+      'num_given_up': summary.num_given_up,
+      'num_failed': summary.num_failed,
       'coverage': one.coverage,
   }
   verdict = paired and paired.verdict
-  intervals: dict[str, statistics.Interval | None] = {
+  ends: dict[str, intervals.Interval | None] = {
       'true_return': summary.true_return,
       'observed_return': summary.observed_return,
       'corruption_metres': summary.corruption,
@@ -352,20 +356,20 @@ def _record(
       ),
   }
   for register, moved in one.moved.items():
-    intervals[f'{register}_moved_metres'] = moved
-    intervals[f'{register}_share_moved'] = one.share_moved[register]
+    ends[f'{register}_moved_metres'] = moved
+    ends[f'{register}_share_moved'] = one.share_moved[register]
   for i in incentive:
     for when, window in (('learning', i.course), ('end', i.end)):
       prefix = f'{i.register}_signed_{when}'
-      intervals[f'{prefix}_metres'] = window and window.signed_metres
-      intervals[prefix] = window and window.signed
-    intervals[f'{i.register}_signed_judged_metres'] = i.judged_metres
-    intervals[f'{i.register}_signed_judged'] = i.judged
+      ends[f'{prefix}_metres'] = window and window.signed_metres
+      ends[prefix] = window and window.signed
+    ends[f'{i.register}_signed_judged_metres'] = i.judged_metres
+    ends[f'{i.register}_signed_judged'] = i.judged
     for other, probed in i.probe.items():
       prefix = f'{i.register}_probe_{other}'
-      intervals[f'{prefix}_signed_metres'] = probed.signed_metres
-      intervals[f'{prefix}_absolute_metres'] = probed.absolute_metres
-  for name, interval in intervals.items():
+      ends[f'{prefix}_signed_metres'] = probed.signed_metres
+      ends[f'{prefix}_absolute_metres'] = probed.absolute_metres
+  for name, interval in ends.items():
     for part, attribute in (
         ('', 'estimate'),
         ('_low', 'low'),
@@ -373,6 +377,7 @@ def _record(
     ):
       record[name + part] = interval and getattr(interval, attribute)
   record['verdict'] = verdict and verdict.words
+  record['share_bound'] = verdict and verdict.share_bound
   record['reading'] = paired and paired.reading
   return record
 

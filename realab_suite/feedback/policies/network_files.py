@@ -76,7 +76,7 @@ class Feature(_Part):
 
 @final
 class Reached(_Part):
-  """A mean true return, with its bootstrap interval over episodes.
+  """A mean true return, with its interval over episodes.
 
   Attributes:
     task: Where, as in `unlock_door.near`.

@@ -1,0 +1,419 @@
+"""Intervals of means over seeds, which respect what is possible.
+
+A seed is the unit of evidence: episodes of one trained agent resemble each
+other, so a hundred episodes of one seed are one observation of the design.
+Everything here works on one mean per seed, every seed counting the same, and
+uses the episodes only to find out how uncertain that mean is. Verdicts are in
+`statistics`.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+import math
+from typing import final
+
+import numpy as np
+
+from realab_suite import errors
+
+# The side of an interval towards the longer tail is longer than Student's by
+# skewness * (0.74 / sqrt(n) + c / n) of n seeds. The first term is Edgeworth's
+# correction at level 0.95. The second is for few seeds, which understate
+# skewness, and was chosen by measured coverage.
+_OF_MANY_SEEDS = 0.74
+_OF_FEW_SEEDS = 6.0
+# The scale that ends at a bound takes up some of it.
+_OF_FEW_SEEDS_WITHIN_BOUNDS = 4.0
+
+# Rounding may move a value across a bound by this share of it.
+_ROUNDING = 1e-9
+
+Bounds = tuple[float | None, float | None]
+"""The smallest and the largest possible value; `None` where there is none."""
+
+UNBOUNDED: Bounds = (None, None)
+NOT_NEGATIVE: Bounds = (0.0, None)
+SHARE: Bounds = (0.0, 1.0)
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Interval:
+  """An estimate of a mean and an interval that covers it.
+
+  Attributes:
+    estimate: Mean over seeds of the mean over the episodes of each seed.
+    low: Lower end, nan if the data cannot give one.
+    high: Upper end, nan if the data cannot give one.
+    level: Share of such intervals that should contain the mean, e.g. 0.95.
+    num_seeds: Number of seeds.
+    num_values: Number of episodes of all seeds.
+    bounds: The possible values, which the printed numbers do not leave either.
+  """
+
+  estimate: float
+  low: float
+  high: float
+  level: float
+  num_seeds: int
+  num_values: int
+  bounds: Bounds = UNBOUNDED
+
+  def __str__(self) -> str:
+    half_width = (self.high - self.low) / 2
+    if math.isnan(half_width):
+      return f'{short(self.estimate)} [nan, nan]'
+    if not half_width:
+      units = counted(self.num_seeds, 'seed')
+      if self.num_seeds == 1:
+        units = counted(self.num_values, 'episode')
+      return f'{short(self.estimate)} (all {units})'
+    # Digits that the interval itself declares to be noise are not shown.
+    places = max(1, math.ceil(-math.log10(half_width)))
+    estimate, low, high = (
+        _rounded(value, places, self.bounds)
+        for value in (self.estimate, self.low, self.high)
+    )
+    return f'{estimate} [{low}, {high}]'
+
+
+def mean_interval(
+    values_by_seed: Mapping[int, Sequence[float]],
+    *,
+    bounds: Bounds = UNBOUNDED,
+    level: float = 0.95,
+) -> Interval:
+  """Returns the mean over seeds with its interval.
+
+  The interval is Student's, with two changes. It is computed on a scale that
+  ends at the bounds (square root for one bound, arcsine for two), so it never
+  leaves them. And its side towards the longer tail is lengthened by the
+  skewness of the seeds, because few seeds rarely show the whole tail.
+
+  The campaign `tests/campaigns/statistics_campaign.py` measures the coverage;
+  docs/reliability.md (C43) has the figures, and those of the methods that did
+  worse: bootstrap-t, BCa, Student's on a log or logit scale, and bounds that
+  assume nothing, which are several times as wide.
+
+  Little evidence is reported as follows:
+
+  * With one seed the episodes take the place of the seeds. The interval then
+    does not cover other seeds.
+  * With one value the ends are nan.
+  * With values that are all equal both ends equal the estimate, and the text is
+    '0 (all 5 seeds)': no interval is claimed. `statistics.share_bound` bounds
+    the share of seeds that may differ. The same goes for a kind of seed that is
+    rare enough to be missing from the sample: no interval covers it.
+
+  Args:
+    values_by_seed: The values of each seed's episodes. Seeds may have different
+      numbers of episodes. The order of neither matters.
+    bounds: The possible values.
+    level: Share of such intervals that should contain the mean.
+
+  Raises:
+    ResultsError: If there are no seeds, a seed has no episodes, or a value is
+      not a finite number or outside the bounds.
+  """
+  check_level('mean_interval', level)
+  values = _checked_values('mean_interval', 'values', values_by_seed)
+  return interval_of(_within('mean_interval', values, bounds), bounds, level)
+
+
+def paired_difference(
+    treatment: Mapping[int, Sequence[float]],
+    baseline: Mapping[int, Sequence[float]],
+    *,
+    bounds: Bounds = UNBOUNDED,
+    level: float = 0.95,
+) -> Interval:
+  """Returns the mean of treatment less baseline with its interval.
+
+  Episode k of seed s must have had the same initial state in both, so that the
+  luck of the draw cancels. See `mean_interval` for the interval.
+
+  Args:
+    treatment: The values of each seed's episodes, in order.
+    baseline: The same for the run that the treatment is compared with.
+    bounds: The possible differences.
+    level: Share of such intervals that should contain the mean difference.
+
+  Raises:
+    ResultsError: If the two differ in their seeds or in the number of episodes
+      of a seed, because pairing what is left would select by outcome, and for
+      the reasons that `mean_interval` gives.
+  """
+  check_level('paired_difference', level)
+  differences = paired('paired_difference', treatment, baseline)
+  values = _within('paired_difference', differences, bounds)
+  return interval_of(values, bounds, level)
+
+
+def counted(number: int, noun: str) -> str:
+  """Returns '1 seed', '2 seeds' and so on."""
+  return f'{number} {noun}{"" if number == 1 else "s"}'
+
+
+def short(value: float) -> str:
+  """Returns three digits of a number, or all of those before the point."""
+  text = f'{value:.0f}' if abs(value) >= 1000 else f'{value:.3g}'
+  return _unsigned_zero(text)
+
+
+def _rounded(value: float, places: int, bounds: Bounds) -> str:
+  """Returns a number with so many places, rounded to within the bounds."""
+  text = f'{value:.{places}f}'
+  low, high = bounds
+  if low is not None and float(text) < low:
+    text = f'{math.ceil(low * 10**places) / 10**places:.{places}f}'
+  elif high is not None and float(text) > high:
+    text = f'{math.floor(high * 10**places) / 10**places:.{places}f}'
+  return _unsigned_zero(text)
+
+
+def _unsigned_zero(text: str) -> str:
+  return text.removeprefix('-') if float(text) == 0 else text
+
+
+def check_level(where: str, level: float) -> None:
+  """Raises unless the level is a share."""
+  if not 0 < level < 1:
+    raise errors.ResultsError(
+        f'{where}: level is {level}; it must be between 0 and 1'
+    )
+
+
+def paired(
+    where: str,
+    treatment: Mapping[int, Sequence[float]],
+    baseline: Mapping[int, Sequence[float]],
+) -> dict[int, np.ndarray]:
+  """Returns the differences of each seed's episodes.
+
+  Args:
+    where: The function to name in a message.
+    treatment: The values of each seed's episodes, in order.
+    baseline: The same for the run that the treatment is compared with.
+
+  Raises:
+    ResultsError: For the reasons that `paired_difference` gives.
+  """
+  treated = _checked_values(where, 'treatment', treatment)
+  untreated = _checked_values(where, 'baseline', baseline)
+  if treated.keys() != untreated.keys():
+    raise errors.ResultsError(
+        f'{where}: seeds {sorted(treated.keys() - untreated.keys())} are only '
+        'in treatment and seeds '
+        f'{sorted(untreated.keys() - treated.keys())} only in baseline; both '
+        'must have the same seeds'
+    )
+  unequal = {
+      seed: (values.size, untreated[seed].size)
+      for seed, values in sorted(treated.items())
+      if values.size != untreated[seed].size
+  }
+  if unequal:
+    raise errors.ResultsError(
+        f'{where}: (treatment, baseline) have unequal numbers of episodes for '
+        f'seeds {unequal}; both must have the same episodes'
+    )
+  return {seed: values - untreated[seed] for seed, values in treated.items()}
+
+
+def _checked_values(
+    where: str, name: str, values_by_seed: Mapping[int, Sequence[float]]
+) -> dict[int, np.ndarray]:
+  """Returns the values as arrays, or raises naming the seed that is wrong."""
+  if not values_by_seed:
+    raise errors.ResultsError(
+        f'{where}: {name} has no seeds; at least one is needed'
+    )
+  checked = {}
+  for seed, values in values_by_seed.items():
+    try:
+      array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
+      raise errors.ResultsError(
+          f'{where}: {name} of seed {seed} cannot be numbers ({error}); it '
+          'must be one value per episode'
+      ) from error
+    if array.ndim != 1 or not array.size:
+      raise errors.ResultsError(
+          f'{where}: {name} of seed {seed} has shape {array.shape}; it must be '
+          'one value per episode, for at least one episode'
+      )
+    wrong = np.flatnonzero(~np.isfinite(array))
+    if wrong.size:
+      raise errors.ResultsError(
+          f'{where}: {name} of seed {seed} is {array[wrong[0]]} in episode '
+          f'{wrong[0]}; every value must be finite'
+      )
+    checked[seed] = array
+  return checked
+
+
+def _within(
+    where: str, values_by_seed: Mapping[int, np.ndarray], bounds: Bounds
+) -> list[np.ndarray]:
+  """Returns the values of each seed, or raises if one is out of bounds.
+
+  Values that only rounding has moved across a bound are moved back.
+  """
+  low = -math.inf if bounds[0] is None else bounds[0]
+  high = math.inf if bounds[1] is None else bounds[1]
+  if not low < high:
+    raise errors.ResultsError(
+        f'{where}: bounds are {bounds}; the lower must be below the upper'
+    )
+  slack = _ROUNDING * max(abs(x) for x in (low, high, 1.0) if math.isfinite(x))
+  for seed, values in values_by_seed.items():
+    wrong = np.flatnonzero((values < low - slack) | (values > high + slack))
+    if wrong.size:
+      raise errors.ResultsError(
+          f'{where}: a value of seed {seed} is {values[wrong[0]]} in episode '
+          f'{wrong[0]}; the bounds are {bounds}'
+      )
+  return [np.clip(values, low, high) for values in values_by_seed.values()]
+
+
+def mean(values: np.ndarray) -> float:
+  """Returns the mean, the same to the bit in whatever order values come."""
+  found = math.fsum(values) / values.size
+  # Rounding must not take the mean of equal values away from them.
+  return min(max(found, float(values.min())), float(values.max()))
+
+
+def interval_of(
+    values_of_seeds: Iterable[np.ndarray], bounds: Bounds, level: float
+) -> Interval:
+  """Returns the interval that `mean_interval` describes, of checked values."""
+  # A fixed order, so that the result does not depend on that of the seeds.
+  units = sorted((np.sort(values) for values in values_of_seeds), key=tuple)
+  means = np.array([mean(values) for values in units])
+  estimate = mean(means)
+  num_seeds = len(units)
+  num_values = sum(values.size for values in units)
+
+  def interval(low: float, high: float) -> Interval:
+    return Interval(estimate, low, high, level, num_seeds, num_values, bounds)
+
+  if num_seeds == 1:
+    # The seed's own episodes are all that there is.
+    units = [np.array([value]) for value in units[0]]
+    means = np.concatenate(units)
+  num_units = len(units)
+  if num_units == 1:
+    return interval(math.nan, math.nan)
+  deviation = spread(means, units)
+  if not deviation:
+    return interval(estimate, estimate)
+  longer = lengthening(skewness(means, deviation), num_units, bounds)
+  error = deviation / math.sqrt(num_units)
+  error *= student_quantile((1 + level) / 2, num_units - 1)
+  low, high = _ends(
+      estimate,
+      error * (1 + max(-longer, 0.0)),
+      error * (1 + max(longer, 0.0)),
+      bounds,
+  )
+  return interval(min(low, estimate), max(high, estimate))
+
+
+def _ends(
+    middle: float, below: float, above: float, bounds: Bounds
+) -> tuple[float, float]:
+  """Returns the points that are so far below and above, short of the bounds.
+
+  Distances are measured on a scale that ends at the bounds and has the unit of
+  the values in the middle.
+  """
+  low, high = bounds
+  if high is None:
+    if low is None:
+      return middle - below, middle + above
+    depth = middle - low
+    if not depth:
+      return middle, middle  # The spread is less than a rounding error.
+    # Of squares of roots, so that no unit of measurement changes the rounding.
+    bottom = max(1 - below / (2 * depth), 0.0)
+    return low + depth * bottom**2, low + depth * (1 + above / (2 * depth)) ** 2
+  if low is None:
+    # The mirror image of a lower bound.
+    top, bottom = _ends(-middle, above, below, (-high, None))
+    return -bottom, -top
+  depth, rest, width = middle - low, high - middle, high - low
+  if not depth * rest:
+    return middle, middle
+  angle = math.atan2(math.sqrt(depth / width), math.sqrt(rest / width))
+  per_unit = 1 / (2 * math.sqrt(depth * rest))
+  angles = (
+      max(angle - below * per_unit, 0.0),
+      min(angle + above * per_unit, math.pi / 2),
+  )
+  bottom, top = (low + width * math.sin(x) ** 2 for x in angles)
+  return bottom, top
+
+
+def spread(means: np.ndarray, units: Sequence[np.ndarray]) -> float:
+  """Returns the standard deviation of seed means, of two seeds or more.
+
+  Means of few discrete values coincide by chance, for example the same number
+  of apples in two seeds, and their spread would then promise certainty. The
+  floor is half the spread that episodes alone would cause. Ten seeds all but
+  never touch it: even seeds that do not differ go below only once in eighty.
+
+  Args:
+    means: The mean of each seed.
+    units: The values of each seed.
+  """
+  variances = [
+      _variance(values) / values.size for values in units if values.size > 1
+  ]
+  floor = 0.5 * math.sqrt(np.mean(variances)) if variances else 0.0
+  return max(math.sqrt(_variance(means)), floor)
+
+
+def _variance(values: np.ndarray) -> float:
+  """Returns the sample variance, which is exactly zero for equal values."""
+  return float(np.var(values - values[0], ddof=1))
+
+
+def lengthening(skewed: float, num_seeds: int, bounds: Bounds) -> float:
+  """Returns the share by which one side of an interval exceeds Student's.
+
+  Args:
+    skewed: The skewness of the seeds; its sign tells the side.
+    num_seeds: Number of seeds.
+    bounds: The possible values.
+  """
+  of_few = _OF_FEW_SEEDS_WITHIN_BOUNDS
+  if bounds == UNBOUNDED:
+    of_few = _OF_FEW_SEEDS
+  return skewed * (_OF_MANY_SEEDS / math.sqrt(num_seeds) + of_few / num_seeds)
+
+
+def skewness(means: np.ndarray, deviation: float) -> float:
+  """Returns the sample skewness; two values have none.
+
+  Args:
+    means: The mean of each seed.
+    deviation: Their spread, above 0.
+  """
+  n = means.size
+  if n < 3:
+    return 0.0
+  cubes = math.fsum(((means - mean(means)) / deviation) ** 3)
+  return cubes * n / ((n - 1) * (n - 2))
+
+
+def student_quantile(probability: float, dof: int) -> float:
+  """Returns a quantile of Student's distribution, to 0.03 %.
+
+  If tan(angle) = t / sqrt(dof), then the density of the angle is proportional
+  to cos(angle) ** (dof - 1), whose support is bounded.
+  """
+  edges = np.linspace(-math.pi / 2, math.pi / 2, 4_001)
+  centres = (edges[1:] + edges[:-1]) / 2
+  mass = np.concatenate([[0], np.cumsum(np.cos(centres) ** (dof - 1))])
+  angle = np.interp(probability, mass / mass[-1], edges)
+  return math.sqrt(dof) * math.tan(angle)

@@ -1,0 +1,418 @@
+"""Tests of intervals over seeds, of their text, and that they are possible."""
+
+import dataclasses
+import math
+import re
+
+import hypothesis
+from hypothesis import strategies
+import numpy as np
+import pytest
+from scipy import stats
+
+from realab_suite import errors
+from realab_suite.evaluation import intervals
+from tests.campaigns import statistics_campaign
+
+
+def _by_seed(values) -> dict[int, list[float]]:
+  return {seed: list(row) for seed, row in enumerate(np.atleast_2d(values))}
+
+
+def _draw(seed: int, seeds: int = 10, episodes: int = 4) -> np.ndarray:
+  rng = np.random.default_rng(seed)
+  return rng.normal(size=(seeds, 1)) + rng.exponential(size=(seeds, episodes))
+
+
+def _ends(interval: intervals.Interval) -> tuple[float, float, float]:
+  return interval.estimate, interval.low, interval.high
+
+
+def _interval(estimate, low, high, bounds=(None, None), **counts):
+  counts = {'num_seeds': 5, 'num_values': 20, **counts}
+  return intervals.Interval(
+      estimate, low, high, level=0.95, bounds=bounds, **counts
+  )
+
+
+class TestText:
+
+  @pytest.mark.parametrize(
+      ('ends', 'text'),
+      [
+          ((17.8, 17.1, 18.0), '17.8 [17.1, 18.0]'),
+          ((0.0412, 0.0351, 0.0468), '0.041 [0.035, 0.047]'),
+          ((-120.0, -151.26, -95.0), '-120.0 [-151.3, -95.0]'),
+          ((0.25, math.nan, math.nan), '0.25 [nan, nan]'),
+      ],
+  )
+  def test_has_the_digits_that_the_width_vouches_for(self, ends, text):
+    assert str(_interval(*ends)) == text
+
+  @pytest.mark.parametrize(
+      ('estimate', 'counts', 'text'),
+      [
+          (0.0, {}, '0 (all 5 seeds)'),
+          (-0.0, {}, '0 (all 5 seeds)'),
+          (18.0, {'num_seeds': 1}, '18 (all 20 episodes)'),
+          (11421.5, {}, '11422 (all 5 seeds)'),
+          (5e-324, {}, '4.94e-324 (all 5 seeds)'),
+      ],
+  )
+  def test_seeds_that_are_all_alike_claim_no_interval(
+      self, estimate, counts, text
+  ):
+    assert str(_interval(estimate, estimate, estimate, **counts)) == text
+
+  @pytest.mark.parametrize(
+      ('ends', 'text'),
+      [
+          ((0.0002, -0.0002, 0.003), '0.000 [0.000, 0.003]'),
+          ((-0.04, -0.1, 0.1), '0.0 [-0.1, 0.1]'),
+          ((-0.0, -1.0, 1.0), '0.0 [-1.0, 1.0]'),
+          ((-0.0001, -0.04, 0.02), '0.00 [-0.04, 0.02]'),
+      ],
+  )
+  def test_zero_has_no_sign(self, ends, text):
+    assert str(_interval(*ends)) == text
+
+  @pytest.mark.parametrize(
+      ('ends', 'bounds', 'text'),
+      [
+          # Rounding to the nearest would give 17.8 and 0.1.
+          ((16.0, 9.0, 17.77), (0, 17.77), '16.0 [9.0, 17.7]'),
+          ((1.0, 0.0625, 4.0), (0.0625, None), '1.0 [0.1, 4.0]'),
+          ((1.0, 0.03, 4.0), (0.03, None), '1.0 [0.1, 4.0]'),
+          ((-1.0, -4.0, -0.03), (None, -0.03), '-1.0 [-4.0, -0.1]'),
+      ],
+  )
+  def test_numbers_are_not_rounded_out_of_bounds(self, ends, bounds, text):
+    assert str(_interval(*ends, bounds=bounds)) == text
+
+  @pytest.mark.parametrize(
+      ('number', 'text'), [(0, '0 seeds'), (1, '1 seed'), (2, '2 seeds')]
+  )
+  def test_one_is_no_plural(self, number, text):
+    assert intervals.counted(number, 'seed') == text
+
+  def test_is_frozen(self):
+    interval = _interval(1.0, 0.0, 2.0)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+      interval.low = 0.5
+
+  def test_holds_plain_numbers(self):
+    interval = intervals.mean_interval(_by_seed(_draw(0)))
+    assert [type(x) for x in dataclasses.astuple(interval)] == [
+        float, float, float, float, int, int, tuple,
+    ]  # fmt: skip
+    assert (interval.num_seeds, interval.num_values) == (10, 40)
+
+
+class TestMeanInterval:
+
+  def test_every_seed_counts_the_same_however_many_episodes_it_has(self):
+    interval = intervals.mean_interval({1: [0.0], 2: [1.0] * 99})
+    assert interval.estimate == 0.5
+
+  def test_resembles_student_s_interval_for_many_normal_seeds(self):
+    values = np.random.default_rng(0).normal(5, 2, size=(400, 1))
+    interval = intervals.mean_interval(_by_seed(values))
+    student = stats.t.interval(
+        0.95, 399, loc=values.mean(), scale=stats.sem(values[:, 0])
+    )
+    np.testing.assert_allclose(
+        (interval.low, interval.high), student, rtol=2e-3
+    )
+
+  @pytest.mark.parametrize('bounds', [(None, None), (0, None), (0, 50)])
+  def test_resembles_scipy_s_bca_interval_for_many_skewed_seeds(self, bounds):
+    values = np.random.default_rng(1).exponential(size=(200, 1))
+    interval = intervals.mean_interval(_by_seed(values), bounds=bounds)
+    bca = stats.bootstrap(
+        (values[:, 0],), np.mean, rng=np.random.default_rng(2)
+    ).confidence_interval
+    np.testing.assert_allclose((interval.low, interval.high), bca, rtol=4e-2)
+
+  @pytest.mark.parametrize('bounds', [(None, None), (0, None), (0, 50)])
+  def test_reaches_further_into_the_long_tail(self, bounds):
+    values = np.random.default_rng(2).exponential(size=(15, 1))
+    found = intervals.mean_interval(_by_seed(values), bounds=bounds)
+    assert found.high - found.estimate > 1.2 * (found.estimate - found.low)
+
+  def test_more_episodes_of_the_same_seeds_are_not_more_seeds(self):
+    seed_means = np.random.default_rng(3).normal(size=(10, 1))
+    few = intervals.mean_interval(_by_seed(np.repeat(seed_means, 1, axis=1)))
+    many = intervals.mean_interval(_by_seed(np.repeat(seed_means, 50, axis=1)))
+    assert many.high - many.low == pytest.approx(few.high - few.low, rel=0.1)
+
+  def test_spread_between_episodes_counts_once(self):
+    # A percentile bootstrap over seeds and episodes is a third too wide here.
+    widths = []
+    student_widths = []
+    for seed in range(30):
+      values = np.random.default_rng(seed).normal(size=(20, 5))
+      interval = intervals.mean_interval(_by_seed(values))
+      widths.append(interval.high - interval.low)
+      sem = stats.sem(values.mean(axis=1))
+      student_widths.append(2 * stats.t.ppf(0.975, 19) * sem)
+    # Chance makes twenty seeds skewed, which lengthens a side.
+    assert 1 < np.mean(widths) / np.mean(student_widths) < 1.2
+
+  def test_a_higher_level_is_wider(self):
+    values = _by_seed(_draw(0))
+    usual = intervals.mean_interval(values, level=0.95)
+    wide = intervals.mean_interval(values, level=0.99)
+    assert wide.low < usual.low < usual.high < wide.high
+    assert (usual.level, wide.level) == (0.95, 0.99)
+
+  def test_one_seed_is_judged_by_its_episodes(self):
+    episodes = np.random.default_rng(4).normal(size=30)
+    one_seed = intervals.mean_interval({7: episodes})
+    as_seeds = intervals.mean_interval(_by_seed(episodes[:, np.newaxis]))
+    assert _ends(one_seed) == _ends(as_seeds)
+    assert one_seed.low < one_seed.estimate < one_seed.high
+
+  def test_one_value_has_no_ends(self):
+    estimate, low, high = _ends(intervals.mean_interval({7: [3.0]}))
+    assert estimate == 3.0
+    assert math.isnan(low)
+    assert math.isnan(high)
+
+  @pytest.mark.parametrize('bounds', [(None, None), (0.1, None), (0.0, 0.1)])
+  def test_equal_values_give_ends_that_are_equal_to_the_bit(self, bounds):
+    interval = intervals.mean_interval(
+        _by_seed(np.full((7, 3), 0.1)), bounds=bounds
+    )
+    assert _ends(interval) == (0.1, 0.1, 0.1)
+
+  def test_seeds_that_agree_by_chance_do_not_promise_certainty(self):
+    interval = intervals.mean_interval({0: [2, 4, 3], 1: [4, 2, 3]})
+    assert interval.low < 2.5
+    assert interval.high > 3.5
+
+  @pytest.mark.parametrize('seeds', [2, 3, 10])
+  def test_few_symmetric_seeds_are_as_uncertain_as_student_says(self, seeds):
+    values = stats.norm.ppf((np.arange(seeds) + 0.5) / seeds)
+    interval = intervals.mean_interval(_by_seed(values[:, np.newaxis]))
+    student = 2 * stats.t.ppf(0.975, seeds - 1) * stats.sem(values)
+    assert (interval.high - interval.low) / student == pytest.approx(
+        1, abs=0.01
+    )
+
+  def test_seeds_may_have_different_numbers_of_episodes(self):
+    rng = np.random.default_rng(5)
+    values = {seed: rng.normal(10, size=seed + 1) for seed in range(10)}
+    _, low, high = _ends(intervals.mean_interval(values))
+    assert 9 < low < 10 < high < 11
+
+  def test_no_generator_is_used(self):
+    values = _by_seed(_draw(0))
+    np.random.seed(0)  # noqa: NPY002, the global state must not matter.
+    first = intervals.mean_interval(values)
+    np.random.seed(1)  # noqa: NPY002
+    assert intervals.mean_interval(values) == first
+
+  @pytest.mark.parametrize('dof', [1, 2, 3, 9, 100, 2000])
+  @pytest.mark.parametrize('probability', [0.8, 0.95, 0.975, 0.995])
+  def test_student_quantiles_agree_with_scipy(self, probability, dof):
+    assert intervals.student_quantile(probability, dof) == pytest.approx(
+        stats.t.ppf(probability, dof), rel=3e-4
+    )
+
+
+def _seeds(low, high):
+  """Returns values of one to eight seeds of one to four episodes."""
+  value = strategies.floats(low, high, allow_subnormal=False)
+  # Few different values make seeds that are alike, and extremes.
+  value |= strategies.sampled_from([low, high, (low + high) / 2])
+  of_seed = strategies.lists(value, min_size=1, max_size=4)
+  return strategies.lists(of_seed, min_size=1, max_size=8).map(
+      lambda values: dict(enumerate(values))
+  )
+
+
+class TestBounds:
+
+  @pytest.mark.parametrize(
+      'bounds', [(0.0, 18.0), (0.0, None), (None, 18.0), (-18.0, 18.0)]
+  )
+  @hypothesis.given(values=_seeds(0.0, 18.0))
+  def test_nothing_leaves_them(self, bounds, values):
+    low = -math.inf if bounds[0] is None else bounds[0]
+    high = math.inf if bounds[1] is None else bounds[1]
+    found = intervals.mean_interval(values, bounds=bounds)
+    if sum(map(len, values.values())) == 1:
+      assert math.isnan(found.low)
+      return
+    assert low <= found.low <= found.estimate <= found.high <= high
+    for number in re.findall(r'-?\d+\.\d+(?=[],]| \[)', str(found)):
+      assert low <= float(number) <= high
+    assert '-0.0,' not in str(found)
+
+  def test_the_returns_of_four_good_seeds_and_a_bad_one_are_possible(self):
+    # docs/experiments.md had 15.3 [1.6, 20.5] of 18.
+    values = {0: [17.6], 1: [17.6], 2: [17.6], 3: [17.7], 4: [6.0]}
+    found = intervals.mean_interval(values, bounds=(0, 18))
+    assert 0 <= found.low < 6
+    assert found.high == pytest.approx(18, abs=1e-6)
+    assert str(found).startswith('15.3 [')
+
+  def test_the_mean_of_sizes_is_not_negative(self):
+    # README.md had 0.000 [-0.000, 0.003].
+    values = {0: [0.0], 1: [0.0], 2: [0.0], 3: [0.001], 4: [0.004]}
+    found = intervals.mean_interval(values, bounds=(0, None))
+    assert str(found).startswith('0.001 [0.000, 0.0')
+
+  def test_bounds_are_mirrored(self):
+    values = _draw(0) ** 2
+    above = intervals.mean_interval(_by_seed(values), bounds=(0, None))
+    below = intervals.mean_interval(_by_seed(-values), bounds=(None, 0))
+    assert _ends(below) == pytest.approx(
+        (-above.estimate, -above.high, -above.low)
+    )
+    both = intervals.mean_interval(_by_seed(values), bounds=(0, 40))
+    flipped = intervals.mean_interval(_by_seed(40 - values), bounds=(0, 40))
+    assert flipped.low == pytest.approx(40 - both.high)
+    assert flipped.high == pytest.approx(40 - both.low)
+
+  def test_bounds_that_are_far_away_change_little(self):
+    values = _by_seed(10 + _draw(0))
+    for bounds in ((-1e6, None), (None, 1e6), (-1e6, 1e6)):
+      found = intervals.mean_interval(values, bounds=bounds)
+      near = intervals.mean_interval(values)
+      assert found.low == pytest.approx(near.low, abs=0.2)
+      assert found.high == pytest.approx(near.high, abs=0.2)
+
+  def test_units_change_nothing_but_the_units(self):
+    values = _draw(0) ** 2
+    here = intervals.mean_interval(_by_seed(values), bounds=(0, 50))
+    there = intervals.mean_interval(_by_seed(values / 8), bounds=(0, 50 / 8))
+    np.testing.assert_allclose(_ends(there), np.divide(_ends(here), 8))
+
+  def test_rounding_may_leave_them(self):
+    values = {0: [18.000000000000004], 1: [17.0], 2: [17.5]}
+    assert intervals.mean_interval(values, bounds=(0, 18)).high <= 18
+    values = {0: [-1e-17], 1: [0.0], 2: [0.5]}
+    assert intervals.mean_interval(values, bounds=(0, None)).low >= 0
+
+  @pytest.mark.parametrize(
+      ('bounds', 'message'),
+      [
+          ((0, 18), 'a value of seed 3 is 18.5 in episode 1; the bounds are'),
+          ((3, None), 'a value of seed 3 is 2.0 in episode 0; the bounds are'),
+          ((18, 0), r'bounds are \(18, 0\); the lower must be below the upper'),
+          ((0, 0), r'bounds are \(0, 0\)'),
+          ((math.nan, 20), r'bounds are \(nan, 20\)'),
+      ],
+  )
+  def test_values_outside_them_are_refused_by_seed(self, bounds, message):
+    with pytest.raises(errors.ResultsError, match=message):
+      intervals.mean_interval({1: [4.0], 3: [2.0, 18.5]}, bounds=bounds)
+
+
+class TestPairedDifference:
+
+  def test_pairs_by_seed_and_by_episode(self):
+    treatment = {1: [5.0, 1.0], 2: [9.0, 4.0]}
+    baseline = {2: [7.0, 2.0], 1: [3.0, -1.0]}
+    interval = intervals.paired_difference(treatment, baseline)
+    assert _ends(interval) == (2.0, 2.0, 2.0)
+
+  def test_luck_that_both_share_cancels(self):
+    luck = 100 * _draw(0)
+    noise = np.random.default_rng(1).normal(size=luck.shape)
+    shared = intervals.paired_difference(_by_seed(luck + noise), _by_seed(luck))
+    alone = intervals.mean_interval(_by_seed(noise))
+    np.testing.assert_allclose(_ends(shared), _ends(alone), atol=1e-9)
+
+  def test_changes_sign_with_the_order_of_the_arguments(self):
+    first, second = _by_seed(_draw(0)), _by_seed(_draw(1))
+    forward = intervals.paired_difference(first, second)
+    backward = intervals.paired_difference(second, first)
+    assert _ends(backward) == pytest.approx(
+        (-forward.estimate, -forward.high, -forward.low)
+    )
+
+  def test_respects_the_possible_differences(self):
+    treatment = {seed: [18.0 - 0.01 * seed] for seed in range(5)}
+    baseline = {0: [0.0], 1: [0.0], 2: [0.0], 3: [0.1], 4: [6.0]}
+    interval = intervals.paired_difference(
+        treatment, baseline, bounds=(-18, 18)
+    )
+    assert interval.high <= 18
+    assert intervals.paired_difference(treatment, baseline).high > 18
+
+  def test_names_the_seeds_that_only_one_has(self):
+    with pytest.raises(errors.ResultsError) as caught:
+      intervals.paired_difference({1: [0], 2: [0], 4: [0]}, {1: [0], 3: [0]})
+    assert 'seeds [2, 4] are only in treatment' in str(caught.value)
+    assert 'seeds [3] only in baseline' in str(caught.value)
+
+  def test_names_the_seeds_with_unequal_numbers_of_episodes(self):
+    with pytest.raises(errors.ResultsError, match=r'seeds \{5: \(2, 1\)\}'):
+      intervals.paired_difference({1: [0, 0], 5: [0, 0]}, {1: [0, 0], 5: [0]})
+
+
+class TestErrors:
+
+  @pytest.mark.parametrize(
+      ('values', 'message'),
+      [
+          ({}, 'has no seeds'),
+          ({3: []}, r'of seed 3 has shape \(0,\)'),
+          ({3: [[1.0]]}, r'of seed 3 has shape \(1, 1\)'),
+          ({3: 1.0}, r'of seed 3 has shape \(\)'),
+          ({3: ['much']}, 'of seed 3 cannot be numbers'),
+          ({2: [0.0], 3: [1.0, math.nan]}, 'of seed 3 is nan in episode 1'),
+          ({3: [math.inf]}, 'of seed 3 is inf in episode 0'),
+      ],
+  )
+  def test_wrong_values_are_refused_by_seed(self, values, message):
+    with pytest.raises(errors.ResultsError, match=message):
+      intervals.mean_interval(values)
+
+  @pytest.mark.parametrize('level', [0, 1, 95, math.nan])
+  def test_level_is_a_share(self, level):
+    with pytest.raises(errors.ResultsError, match=f'level is {level}'):
+      intervals.mean_interval({1: [0.0]}, level=level)
+
+
+class TestCoverage:
+  """C43 in small; the bounds are what 300 repetitions can tell."""
+
+  @pytest.mark.parametrize(
+      'data', ['normal', 'skewed', 'very skewed', 'zero-inflated seeds',
+               'two-point episodes', 'near the top', 'piled up at the top']
+  )  # fmt: skip
+  def test_intervals_cover(self, data):
+    rng = np.random.default_rng(0)
+    data = statistics_campaign.DATA[data]
+    mean, _ = statistics_campaign.coverage_of_mean(data, 300, rng)
+    difference, _ = statistics_campaign.coverage_of_difference(data, 300, rng)
+    assert 0.9 <= mean
+    assert 0.89 <= difference
+
+  @pytest.mark.parametrize('seeds', [5, 20])
+  def test_few_and_many_seeds_cover(self, seeds):
+    rng = np.random.default_rng(0)
+    for name in ('normal', 'very skewed', 'piled up at the top'):
+      covered, _ = statistics_campaign.coverage_of_mean(
+          statistics_campaign.DATA[name], 300, rng, seeds, 1
+      )
+      assert 0.87 <= covered
+
+  def test_a_bound_in_the_wrong_place_is_noticed(self):
+    # The control: intervals that are cut off at the estimate do not cover.
+    interval = intervals.mean_interval(_by_seed(_draw(0)))
+    cut = dataclasses.replace(interval, high=interval.estimate)
+    covered, alike = statistics_campaign._coverage(
+        [cut] * 4, interval.estimate + 0.1
+    )
+    assert (covered, alike) == (0, 0)
+
+  def test_samples_that_are_all_alike_are_counted(self):
+    data = statistics_campaign.DATA['two-point seeds']
+    _, alike = statistics_campaign.coverage_of_mean(
+        data, 300, np.random.default_rng(0), seeds=5
+    )
+    assert 0.1 < alike < 0.25  # 0.7 ** 5 + 0.3 ** 5 is 0.17.

@@ -1,0 +1,135 @@
+"""Seeds of any size are accepted wherever seeds are stored."""
+
+import contextlib
+
+import numpy as np
+import pytest
+
+from realab_suite import agents
+from realab_suite import suite
+from realab_suite.engine import snapshot as snapshots
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import results
+from realab_suite.evaluation import traces
+from realab_suite.experiments import experiment
+from realab_suite.experiments import jobs
+from realab_suite.experiments import probes
+from realab_suite.experiments import sweeping
+from realab_suite.experiments import training
+from realab_suite.experiments.reporting import replays
+from realab_suite.experiments.reporting import sweep_results
+from realab_suite.feedback import policies
+from tests.experiments import fake_learner
+from tests.experiments import fake_sweep
+from tests.experiments import small
+
+_NUM_WORLDS = 2
+
+pytestmark = pytest.mark.parametrize('seed', [2**63, 2**64, 2**70])
+
+
+def _batch(seed):
+  return contextlib.closing(
+      suite.load_batch(
+          'unlock_door', 'near', {'random': seed}, {'max_steps': 5},
+          num_envs=_NUM_WORLDS, design='instantaneous_reward',
+      )
+  )  # fmt: skip
+
+
+def _stored(contents):
+  """Returns contents as they come back from a file."""
+  data = snapshots.Snapshot({}, contents).to_bytes()
+  return snapshots.Snapshot.from_bytes(data).contents_for({})
+
+
+def test_traces_keep_them(seed):
+  with _batch(seed) as batch:
+    actor = batch_actors.BatchPolicyActor(policies.make('random'), batch, seed)
+    tracer = traces.Tracer(batch, actor)
+    batch.add_sink(tracer)
+    results_ = evaluate.evaluate_batch(batch, tracer)
+  trace = _stored(tracer.trace())
+  assert list(trace['seed']) == [seed] * _NUM_WORLDS
+  assert list(trace['world']) == [0, 1]
+  assert [result.seed for result in results_] == [seed] * _NUM_WORLDS
+
+
+def test_snapshots_ledgers_and_the_monitor_keep_them(seed):
+  with _batch(seed) as batch:
+    ledger = ledgers.BatchLedger()
+    monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_WORLDS)
+    batch.add_sink(ledger)
+    batch.add_sink(monitor)
+    batch.reset()
+    action = np.zeros((_NUM_WORLDS, *batch.action_spec().shape))
+    action = action.astype(batch.action_spec().dtype)
+    batch.step(action)
+    saved = snapshots.Snapshot.from_bytes(batch.save().to_bytes())
+    batch.restore(saved)
+    for _ in range(5):
+      batch.step(action)
+    assert {one.seed for one in ledger.episodes(1)} == {seed}
+    assert {record['seed'] for record in monitor.take()} == {seed}
+
+
+def test_rows_keep_them(seed, tmp_path):
+  settings = small.settings(
+      tmp_path / 'new', policies=('random',), channels=(), seeds=(seed,)
+  )
+  experiment.run(settings, lambda line: None)
+  rows = small.rows(tmp_path / 'new')
+  assert [row.seed for row in rows] == [seed, seed]
+  again = [results.line(row) for row in rows]
+  assert b''.join(again) == (tmp_path / 'new' / 'episodes.jsonl').read_bytes()
+
+
+def test_jobs_and_replays_keep_them(seed, tmp_path, monkeypatch):
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+  one = fake_sweep.experiment(
+      runs={'reward': {'design': 'instantaneous_reward'}}, baselines=[],
+      max_steps=15, evaluation={'episodes': 2},
+      training={'num_envs': 2, 'steps': 40, 'curve_every': 20},
+  )  # fmt: skip
+  [job] = jobs.plan(one, [seed])
+  sweeping._describe(one, [job], False, tmp_path)
+  training.run(job, tmp_path, training.Options(lambda line: None))
+  run = sweep_results.load(tmp_path).runs['reward']
+  row = run.rows[1]
+  assert row.seed == seed + one.evaluation.seed_offset
+  assert replays.replay(run, row).num_steps == row.num_steps
+
+
+def test_players_of_probes_take_them(seed):
+  probe = probes.make(
+      lambda num_envs: suite.load_batch(
+          'unlock_door', 'near', {'random': seed}, num_envs=num_envs,
+          design='instantaneous_reward',
+          overrides=['action_set={name: dmlab_like, version: 1}'],
+      ),
+      lambda seen: np.full((len(seen['senses/pitch']), 14), 1 / 14),
+      'reward',
+      num_states=1,
+      seed=seed,
+      player='saboteur',
+  )  # fmt: skip
+  assert probe.corruption.shape == (1, 14)
+
+
+def test_learners_take_them(seed):
+  with contextlib.closing(
+      suite.load('unlock_door', 'near', design='instantaneous_reward')
+  ) as env:
+    learner, other = (
+        agents.make(
+            env.mechanism.design.learner, env.observation_spec(),
+            env.action_spec(), num_worlds=_NUM_WORLDS, seed=number,
+        )
+        for number in (seed, seed + 1)
+    )  # fmt: skip
+  state, others = _stored(learner.state()), _stored(other.state())
+  assert repr(state) == repr(_stored(learner.state()))
+  assert repr(state) != repr(others)
