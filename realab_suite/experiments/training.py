@@ -152,19 +152,13 @@ def load_learner(
     batch: Worlds of its design; any number of them.
 
   Raises:
-    ResultsError: If there is none, or it is damaged.
+    ResultsError: If there is none, or it is damaged or another job's.
   """
   file = path / LEARNER
-  with storage.explained(file):
-    data = file.read_bytes()
-  try:
-    state = snapshots.Snapshot.from_bytes(data).contents_for(
-        _header(job, LEARNER)
-    )
-  except errors.StateLayoutError as error:
-    raise errors.ResultsError(f'{file}: {error}') from error
+  state = storage.read_archive(file, header(job.digest(), LEARNER))
   learner = make_learner(job, batch)
-  learner.set_state(state)
+  with storage.naming(file):
+    learner.set_state(state)
   return learner
 
 
@@ -209,9 +203,14 @@ class LearnerActor:
     )
 
 
-def _header(job: jobs.Job, what: str) -> dict[str, Any]:
-  """Returns what files of a job's own format have to agree in."""
-  return {'configuration': job.digest(), 'what': what}
+def header(digest: str, what: str) -> dict[str, Any]:
+  """Returns the header of an archive that a job writes.
+
+  Args:
+    digest: The digest of the job's configuration.
+    what: The name of what the archive holds.
+  """
+  return {'configuration': digest, 'what': what}
 
 
 def _judge_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
@@ -239,8 +238,9 @@ def _judge(
       results.line(results.row(info, result))
       for result in evaluate.evaluate_batch(batch, tracer)
   ]
-  trace = snapshots.Snapshot(_header(job, TRACE), tracer.trace())
-  storage.write_whole(folder.path / TRACE, trace.to_bytes())
+  storage.write_archive(
+      folder.path / TRACE, header(job.digest(), TRACE), tracer.trace()
+  )
   storage.write_whole(folder.path / EPISODES, b''.join(lines))
 
 
@@ -272,7 +272,7 @@ class _Training:
   def run(self) -> None:
     """Trains, or goes on with it, and judges what has been learned."""
     job, path = self._job, self._folder.path
-    saved = self._folder.load(_header(job, _CHECKPOINT))
+    saved = self._folder.load(header(job.digest(), _CHECKPOINT))
     marks = (saved or {}).get('marks', {})
     if saved is not None:
       self._done, self._segment = saved['done'], saved['segment']
@@ -282,12 +282,8 @@ class _Training:
     if saved is None:
       time_step = self._batch.reset()
     else:
-      learner.set_state(saved['learner'])
-      time_step = batch_environment.BatchTimeStep(**saved['time_step'])
-      if not self._sleep:
-        world = np.asarray(saved['batch'], np.uint8).tobytes()
-        self._batch.restore(snapshots.Snapshot.from_bytes(world))
-        self._monitor.take()
+      with self._folder.naming_checkpoint():
+        time_step = self._restore(learner, saved)
     with contextlib.ExitStack() as stack:
       stack.callback(lambda: self._batch.close())
       self._files = {
@@ -305,6 +301,17 @@ class _Training:
       )
       self._learn(learner, time_step, stack)
     self._judge_learner(learner)
+
+  def _restore(
+      self, learner: Learner, saved: Mapping[str, Any]
+  ) -> batch_environment.BatchTimeStep:
+    """Continues from a checkpoint; returns what the learner sees next."""
+    learner.set_state(saved['learner'])
+    if not self._sleep:
+      world = np.asarray(saved['batch'], np.uint8).tobytes()
+      self._batch.restore(snapshots.Snapshot.from_bytes(world))
+      self._monitor.take()
+    return batch_environment.BatchTimeStep(**saved['time_step'])
 
   def _begin_segment(self) -> None:
     """Makes worlds that nothing has happened in."""
@@ -393,7 +400,7 @@ class _Training:
       world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
     self._folder.save(
         self._done * self._num_envs,
-        _header(self._job, _CHECKPOINT),
+        header(self._job.digest(), _CHECKPOINT),
         {
             'done': self._done,
             'segment': self._segment,
@@ -410,8 +417,11 @@ class _Training:
 
   def _judge_learner(self, learner: Learner) -> None:
     job, evaluation = self._job, self._job.experiment.evaluation
-    snapshot = snapshots.Snapshot(_header(job, LEARNER), learner.state())
-    storage.write_whole(self._folder.path / LEARNER, snapshot.to_bytes())
+    storage.write_archive(
+        self._folder.path / LEARNER,
+        header(job.digest(), LEARNER),
+        learner.state(),
+    )
     seed = job.evaluation_seed
     actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')
     with contextlib.closing(
