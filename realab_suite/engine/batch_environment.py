@@ -679,7 +679,7 @@ def fork(
     for sink in sinks:
       batch.add_sink(sink)
     batch.restore(snapshot, range(num_envs))
-  except errors.RealabError:
+  except BaseException:
     copy.close()
     raise
   return batch

@@ -353,32 +353,35 @@ class JsonLines:
     """
     self._path = path
     self._hash = hashlib.sha256()
-    with explained(path):
-      self._file = open(path, 'a+b', buffering=0)
-      if mark is None:
-        self._file.seek(0)
-        whole = self._file.read().rfind(b'\n') + 1
-        self._file.truncate(whole)
-        return
-      size = mark['size']
-      self._file.seek(0)
-      while rest := size - self._file.tell():
-        data = self._file.read(min(rest, _CHUNK))
-        if not data:
-          break
-        self._hash.update(data)
-      here = self._file.tell()
-      problem = ''
-      if here < size:
-        problem = f'has {here} bytes, and the checkpoint knows of {size}'
-      elif self._hash.hexdigest() != mark['sha256']:
-        problem = 'not what it was when the checkpoint was written'
-      if problem:
-        self._file.close()
-        raise errors.ResultsError(
-            f'{path}: {problem}; remove {path.parent} to run it again'
-        )
-      self._file.truncate(size)
+    with explained(path), contextlib.ExitStack() as stack:
+      self._file = stack.enter_context(open(path, 'a+b', buffering=0))
+      self._cut_back(mark)
+      stack.pop_all()
+
+  def _cut_back(self, mark: Mark | None) -> None:
+    """Removes everything behind the mark, or half a line; see `__init__`."""
+    self._file.seek(0)
+    if mark is None:
+      whole = self._file.read().rfind(b'\n') + 1
+      self._file.truncate(whole)
+      return
+    size = mark['size']
+    while rest := size - self._file.tell():
+      data = self._file.read(min(rest, _CHUNK))
+      if not data:
+        break
+      self._hash.update(data)
+    here = self._file.tell()
+    problem = ''
+    if here < size:
+      problem = f'has {here} bytes, and the checkpoint knows of {size}'
+    elif self._hash.hexdigest() != mark['sha256']:
+      problem = 'not what it was when the checkpoint was written'
+    if problem:
+      raise errors.ResultsError(
+          f'{self._path}: {problem}; remove {self._path.parent} to run it again'
+      )
+    self._file.truncate(size)
 
   def append(self, records: Sequence[Mapping[str, Any]]) -> None:
     """Adds a line for each record.

@@ -277,15 +277,15 @@ class _Training:
     if saved is not None:
       self._done, self._segment = saved['done'], saved['segment']
       self._pending = saved['pending']
-    self._begin_segment()
-    learner = make_learner(job, self._batch)
-    if saved is None:
-      time_step = self._batch.reset()
-    else:
-      with self._folder.naming_checkpoint():
-        time_step = self._restore(learner, saved)
     with contextlib.ExitStack() as stack:
+      self._begin_segment()
       stack.callback(lambda: self._batch.close())
+      learner = make_learner(job, self._batch)
+      if saved is None:
+        time_step = self._batch.reset()
+      else:
+        with self._folder.naming_checkpoint():
+          time_step = self._restore(learner, saved)
       self._files = {
           name: stack.enter_context(
               contextlib.closing(
@@ -316,11 +316,13 @@ class _Training:
   def _begin_segment(self) -> None:
     """Makes worlds that nothing has happened in."""
     seed = _world_seed(self._job.seed, self._segment)
-    self._batch = load_batch(self._job, self._num_envs, seed, self._sleep)
-    self._monitor = monitors.TrainingMonitor(
-        self._batch.mechanism, self._num_envs
-    )
-    self._batch.add_sink(self._monitor)
+    with contextlib.ExitStack() as stack:
+      batch = load_batch(self._job, self._num_envs, seed, self._sleep)
+      stack.callback(batch.close)
+      monitor = monitors.TrainingMonitor(batch.mechanism, self._num_envs)
+      batch.add_sink(monitor)
+      stack.pop_all()
+    self._batch, self._monitor = batch, monitor
 
   def _learn(
       self,
