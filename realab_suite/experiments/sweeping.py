@@ -212,7 +212,7 @@ class _Sweep:
     folder = self._output / job.folder()
     log = self._output / LOGS / f'{folder.name}.log'
     try:
-      if storage.is_done(folder):
+      if jobs_lib.is_done(folder):
         self._finish(job, folder, None)
         return
     except errors.ResultsError as error:

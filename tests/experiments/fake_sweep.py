@@ -211,7 +211,14 @@ def _write_training(
     text = ''.join(json.dumps(line) + '\n' for line in lines)
     (path / name).write_text(text)
   probes.save(path, _probe(job, levels, rng))
-  return [training.CURVE, training.TRAINING_EPISODES, probes.PROBE]
+  header = training.header(job.digest(), training.LEARNER)
+  storage.write_archive(path / training.LEARNER, header, {'num_steps': 2468})
+  return [
+      training.CURVE,
+      training.TRAINING_EPISODES,
+      training.LEARNER,
+      probes.PROBE,
+  ]
 
 
 def _probe(

@@ -305,24 +305,10 @@ def _run(
       continue
     # Lines first, because they say what is wrong and where.
     rows += _rows(path / training.EPISODES, job)
-    storage.is_done(path)
+    jobs_lib.is_done(path)
     folders[job.seed] = path
-    configs[job.seed] = _config(path)
+    configs[job.seed] = jobs_lib.read_config(path)
   return Run(name, tuple(jobs), folders, tuple(rows), configs)
-
-
-def _config(folder: pathlib.Path) -> dict[str, Any]:
-  """Returns the configuration that a folder is named after."""
-  path = folder / storage.CONFIG
-  config = storage.read_json(path)
-  is_one = isinstance(config, dict)
-  if not is_one or not folder.name.endswith(f'-{jobs_lib.digest_of(config)}'):
-    raise errors.ResultsError(
-        f'{path}: not the configuration that the folder is named after; remove'
-        f' {folder} to run it again'
-    )
-  found: dict[str, Any] = config
-  return found
 
 
 def _rows(path: pathlib.Path, job: Job) -> list[results.EpisodeRow]:
