@@ -82,7 +82,13 @@ def main(argv: Sequence[str]) -> None:
     _train()
     return
   _refuse(
-      [_RUN, cli.SEED, learning_flags.TENSORBOARD, _PARENT],
+      [
+          _RUN,
+          cli.SEED,
+          learning_flags.TENSORBOARD,
+          learning_flags.OTHER_MACHINE,
+          _PARENT,
+      ],
       'without --experiment',
   )
   seeds = _seeds(_SEEDS.value)
@@ -137,7 +143,10 @@ def _train() -> None:
   experiment = spec.load(cli.required(learning_flags.EXPERIMENT))
   [job] = jobs.plan(experiment, [cli.SEED.value], [run])
   options = training.Options(
-      cli.say, learning_flags.TENSORBOARD.value, _PARENT.value
+      cli.say,
+      learning_flags.TENSORBOARD.value,
+      _PARENT.value,
+      learning_flags.OTHER_MACHINE.value,
   )
   training.run(job, pathlib.Path(cli.required(output_flag.OUTPUT)), options)
 
