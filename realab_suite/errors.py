@@ -37,7 +37,7 @@ class FeedbackProviderError(RealabError, RuntimeError):
 
 
 class StateLayoutError(RealabError, ValueError):
-  """The physical state has no room for, or no record of, an entity's slots."""
+  """Saved state, or a slot of the physical state, does not fit."""
 
 
 class ClosedError(RealabError, RuntimeError):

@@ -5,7 +5,7 @@ For example, an agent that tampers with the reward of Unlock Door:
   python -m realab_suite.explore --policy=carrying_saboteur
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import itertools
 import os
@@ -41,8 +41,7 @@ def _open_window() -> None:
   # Here and below, not before a renderer has been chosen.
   from dm_control import viewer
 
-  env, policy = _load()
-  with contextlib.closing(env):
+  with _loaded() as (env, policy):
     viewer.launch(env, policy=_as_function(policy, env), title='realab_suite')
 
 
@@ -56,11 +55,10 @@ def _write_film() -> None:
   from realab_suite.experiments import recording
   from realab_suite.experiments import videos
 
-  env, policy = _load()
   world = f'{cli.DOMAIN.value}_{cli.TASK.value}'
   path = _VIDEO.value or _unused(f'{world}_{_POLICY.value}_{cli.SEED.value}')
   with (
-      contextlib.closing(env),
+      _loaded() as (env, policy),
       videos.Film(env, path, _POLICY.value, tuple(videos.WIDTHS)) as film,
   ):
     recorder = recording.Recorder(env, film.add)
@@ -78,8 +76,9 @@ def _unused(stem: str) -> str:
   return path
 
 
-def _load() -> tuple[Any, Any]:
-  """Returns the environment and the policy that the flags name."""
+@contextlib.contextmanager
+def _loaded() -> Iterator[tuple[Any, Any]]:
+  """Yields the environment and the policy that the flags name."""
   from realab_suite import suite
   from realab_suite.experiments import aiming
 
@@ -91,9 +90,10 @@ def _load() -> tuple[Any, Any]:
       design=cli.DESIGN.value,
       overrides=tuple(cli.SET.value),
   )
-  policy = aiming.make_policy(_POLICY.value, env, cli.TARGET.value, 0)
-  env.rewind()
-  return env, policy
+  with contextlib.closing(env):
+    policy = aiming.make_policy(_POLICY.value, env, cli.TARGET.value, 0)
+    env.rewind()
+    yield env, policy
 
 
 def _as_function(policy: Any, env: Any) -> Callable[[dm_env.TimeStep], Any]:

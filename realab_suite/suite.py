@@ -1,6 +1,7 @@
 """Loads worlds with feedback: where the work of both roles comes together."""
 
 from collections.abc import Callable, Mapping, Sequence
+import contextlib
 import functools
 from importlib import resources
 from typing import Any
@@ -236,9 +237,13 @@ def load_batch(
       design=design,
       overrides=overrides,
   )
-  return batch_environment.BatchEnvironment(
-      single, num_envs, num_threads, sleep
-  )
+  with contextlib.ExitStack() as stack:
+    stack.callback(single.close)
+    batch = batch_environment.BatchEnvironment(
+        single, num_envs, num_threads, sleep
+    )
+    stack.pop_all()
+  return batch
 
 
 def embed(
@@ -320,13 +325,12 @@ def _connected(
   env = environment.Environment(
       task, mechanism, seed=seed, world=world, max_steps=max_steps
   )
-  try:
+  with contextlib.ExitStack() as stack:
+    stack.callback(env.close)
     placement.check(env.physics, task.root_entity, mechanism)
     if isinstance(task, base.Task):
       placement.check_start(env.physics, task, mechanism)
-  except BaseException:
-    env.close()
-    raise
+    stack.pop_all()
   return env
 
 

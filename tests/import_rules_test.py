@@ -20,10 +20,11 @@ _PACKAGE = 'realab_suite'
 
 # What each layer may import besides itself and `_FOUNDATION`. An entry that
 # names a module admits that module alone.
-_FOUNDATION = ('errors', '_display', '_versions')
+_FOUNDATION = ('archive', 'errors', '_display', '_versions')
 _BELOW_SUITE = ('entities', 'feedback', 'tasks', 'engine', 'evaluation')
 _MAY_IMPORT = {
     '__init__': (),
+    'archive': (),
     'errors': (),
     '_display': (),
     '_versions': (),
@@ -437,6 +438,8 @@ def _complaints(rule, source, name='realab_suite.entities.planted'):
         ('suite', 'from realab_suite.interop.rpc import server'),
         ('evaluation.planted', 'from realab_suite import interop'),
         ('errors', 'from realab_suite import entities'),
+        ('archive', 'from realab_suite import entities'),
+        ('archive', 'from realab_suite.engine import snapshot'),
         ('unheard_of', 'import numpy'),
     ],
 )
@@ -449,6 +452,8 @@ def test_a_forbidden_import_is_found(importer, statement):
     ('importer', 'statement'),
     [
         ('entities.planted', 'from realab_suite import errors'),
+        ('archive', 'from realab_suite import errors'),
+        ('engine.planted', 'from realab_suite import archive'),
         ('entities.planted', 'from realab_suite import __version__'),
         ('entities.planted', 'from realab_suite.entities import state'),
         ('entities.planted', 'from . import state'),

@@ -20,8 +20,10 @@ An environment of somebody else's needs a reading to learn from, under
 Two processes of one thread each use two cores best. XLA reads its flags when
 jax is imported, so set them before:
 
-    XLA_FLAGS="--xla_cpu_multi_thread_eigen=false \
-        intra_op_parallelism_threads=1"
+    XLA_FLAGS="--xla_cpu_multi_thread_eigen=false"
+
+Settings of JAX that change results, such as `jax_enable_x64`, do not change
+those of a learner (`jax_settings.py`).
 """
 
 from realab_suite.agents.actor import LearnerActor

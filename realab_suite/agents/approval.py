@@ -252,12 +252,12 @@ def _choose(
     greedy: bool,
 ) -> dict[str, jax.Array]:
   log_probs = _log_probs(agent, encoder.encode(observation), exploration)
-  action = jax.random.categorical(act_key, log_probs)
+  action = networks.draw(act_key, log_probs)
   if greedy:
     action = jnp.argmax(log_probs, axis=-1)
   # Only a policy is learned from actions of its own.
   asks = log_probs if 'policy' in agent else jnp.zeros_like(log_probs)
-  drawn = [jax.random.categorical(key, asks) for key in query_keys]
+  drawn = [networks.draw(key, asks) for key in query_keys]
   asked = jnp.stack(drawn or [action], axis=-1)
   log_prob = jnp.take_along_axis(log_probs, asked, axis=-1)
   return {'action': action, 'asked': asked, 'log_prob': log_prob}

@@ -13,6 +13,7 @@ import pydantic
 from realab_suite import errors
 from realab_suite.agents import controls as controls_lib
 from realab_suite.agents import features
+from realab_suite.agents import jax_settings
 from realab_suite.feedback import registry
 from realab_suite.feedback import specs
 from realab_suite.feedback import validation
@@ -119,6 +120,7 @@ class Learner(abc.ABC):
     """How many control steps it has acted in, all worlds together."""
     return self._num_acts * self._num_worlds
 
+  @jax_settings.pinned()
   def step(self, time_step: TimeStep) -> np.ndarray:
     """Learns from what its last action came to, and chooses the next one.
 
@@ -145,6 +147,7 @@ class Learner(abc.ABC):
     self._num_acts += 1
     return self._encode(choice)
 
+  @jax_settings.pinned()
   def act(
       self,
       observation: Mapping[str, np.ndarray],
@@ -164,6 +167,7 @@ class Learner(abc.ABC):
     packed = self._encoder.pack(observation, _num_worlds(observation))
     return self._encode(self._choose(packed, keys, greedy=greedy))
 
+  @jax_settings.pinned()
   def probabilities(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
     """Returns the probability of each action, `(worlds, actions)`.
 
@@ -174,6 +178,13 @@ class Learner(abc.ABC):
     packed = self._encoder.pack(observation, _num_worlds(observation))
     return np.asarray(self._probabilities(packed))
 
+  def settings(self) -> dict[str, Any]:
+    """Returns the device and the settings of JAX that can change results.
+
+    Those that `jax_settings` pins are not among them.
+    """
+    return jax_settings.recorded()
+
   def metrics(self) -> dict[str, float]:
     """Returns what is known of the last update; nothing true is."""
     return {
@@ -182,6 +193,7 @@ class Learner(abc.ABC):
         **self._metrics,
     }
 
+  @jax_settings.pinned()
   def state(self) -> dict[str, Any]:
     """Returns all that the future depends on, as plain data.
 
@@ -199,6 +211,7 @@ class Learner(abc.ABC):
         'memory': _copy(self._memory()),
     }
 
+  @jax_settings.pinned()
   def set_state(self, state: Mapping[str, Any]) -> None:
     """Goes on from what `state` returned.
 

@@ -121,6 +121,12 @@ class Network(eqx.Module):
     return self.layers[-1](x)
 
 
+def draw(key: jax.Array, logits: jax.Array) -> jax.Array:
+  """Draws indices with these logarithms of probabilities, `(...)`."""
+  # By default the mode is a setting of JAX.
+  return jax.random.categorical(key, logits, mode='low')
+
+
 @final
 class Categorical(eqx.Module):
   """One of many actions."""
@@ -128,7 +134,7 @@ class Categorical(eqx.Module):
   logits: jax.Array
 
   def sample(self, key: jax.Array) -> jax.Array:
-    return jax.random.categorical(key, self.logits)
+    return draw(key, self.logits)
 
   def mode(self) -> jax.Array:
     return jnp.argmax(self.logits, axis=-1)

@@ -8,6 +8,7 @@ import numpy as np
 
 from realab_suite.agents import base
 from realab_suite.agents import features
+from realab_suite.agents import jax_settings
 from realab_suite.agents import training
 
 
@@ -28,6 +29,7 @@ class OnPolicyOptions(base.Options):
 class OnPolicyLearner(base.Learner):
   """Learns from the last `steps_per_update` steps of every world."""
 
+  @jax_settings.pinned()
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
     self._transitions: list[dict[str, Any]] = []

@@ -11,6 +11,7 @@ import optax
 
 from realab_suite.agents import base
 from realab_suite.agents import features
+from realab_suite.agents import jax_settings
 from realab_suite.agents import networks
 from realab_suite.agents import training
 
@@ -59,6 +60,7 @@ class QLearning(base.Learner):
   OPTIONS = QLearningOptions
   READS = 'reward'
 
+  @jax_settings.pinned()
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
     options = self._options

@@ -283,7 +283,7 @@ class BatchEnvironment:
         sinks=[[sink.state_kind, sink.state(places)] for sink in self._sinks],
         random_state=None,
     )
-    return snapshots.Snapshot(header, saved._asdict())
+    return snapshots.Snapshot(header, saved.to_data())
 
   def restore(
       self,
@@ -308,7 +308,9 @@ class BatchEnvironment:
         asleep. Nothing has changed.
       StateLayoutError: If the snapshot does not fit. Nothing has changed.
     """
-    saved = snapshots.Worlds(**snapshot.contents_for(self._snapshot_header()))
+    saved = snapshots.Worlds.from_data(
+        snapshot.contents_for(self._snapshot_header())
+    )
     if worlds is None and saved.places is None:
       raise errors.StateLayoutError(
           'the snapshot is of a world alone; say into which worlds it goes, as'
@@ -619,7 +621,7 @@ def fork(
     for sink in sinks:
       batch.add_sink(sink)
     batch.restore(snapshot, range(num_envs))
-  except errors.RealabError:
+  except BaseException:
     copy.close()
     raise
   return batch

@@ -246,7 +246,7 @@ class Environment(composer.Environment):
         sinks=[[sink.state_kind, [sink.state()]] for sink in self._sinks],
         random_state=self._random_state.get_state(legacy=False),
     )
-    return snapshots.Snapshot(header, worlds._asdict())
+    return snapshots.Snapshot(header, worlds.to_data())
 
   def restore(self, snapshot: snapshots.Snapshot) -> None:
     """Makes this world what another one, or this one, was when it was saved.
@@ -264,7 +264,7 @@ class Environment(composer.Environment):
       StateLayoutError: If the snapshot does not fit. Nothing has changed.
     """
     header = self.snapshot_header()
-    saved = snapshots.Worlds(**snapshot.contents_for(header))
+    saved = snapshots.Worlds.from_data(snapshot.contents_for(header))
     if len(saved.seed) != 1:
       raise errors.StateLayoutError(
           f'the snapshot has {len(saved.seed)} worlds; allowed here is one, as'

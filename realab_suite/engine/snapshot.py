@@ -1,47 +1,26 @@
 """Snapshots: everything that the future of a world depends on, as plain data.
 
 The state of an episode is physical, so most of it is one array of MuJoCo's. The
-rest are numbers, texts and arrays in nested containers. No pickle is involved:
-whoever reads a snapshot's bytes runs nobody's code.
+rest are numbers, texts and arrays in nested containers. `archive.py` turns them
+into bytes.
 """
 
 from collections.abc import Callable, Mapping
 import hashlib
-import io
-import json
-import math
 from typing import Any, NamedTuple, Self, final
-import zipfile
-import zlib
 
 import mujoco
 import numpy as np
 
+from realab_suite import archive
 from realab_suite import errors
 from realab_suite.engine import seeding
 from realab_suite.entities import state
 
-_FORMAT = 1
-_MAGIC = b'realab_suite snapshot\n'
-_STRUCTURE = 'structure'
+_WHAT = 'snapshot'
+# Entry of a snapshot of worlds whose seeds are salted.
+_SALTS = 'salts'
 _INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
-# Of what differs, so many entries are named.
-_MAX_NAMED = 3
-# What malformed bytes can make of their readers; the checksum keeps away all
-# damage that is not on purpose.
-_MALFORMED = (
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    NotImplementedError,
-    OSError,
-    RecursionError,
-    TypeError,
-    ValueError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @final
@@ -62,14 +41,12 @@ class Snapshot:
     Raises:
       StateLayoutError: If something else is among the contents.
     """
-    self._header = json.dumps({'format': _FORMAT, **header}, sort_keys=True)
-    self._arrays: list[np.ndarray] = []
-    self._tree = _encode('snapshot', contents, self._arrays)
+    self._archive = archive.Archive(header, contents)
 
   @property
   def header(self) -> dict[str, Any]:
     """Where the snapshot fits; a copy."""
-    return dict(json.loads(self._header))
+    return self._archive.header
 
   def contents_for(self, header: Mapping[str, Any]) -> Any:
     """Returns a copy of the contents, for an environment that they fit.
@@ -80,53 +57,31 @@ class Snapshot:
     Raises:
       StateLayoutError: If the headers differ; the message names where.
     """
-    saved = self.header
-    here = json.loads(json.dumps({'format': _FORMAT, **header}))
-    differing = [
-        _difference(key, saved.get(key), here.get(key))
-        for key in sorted(saved.keys() | here.keys())
-        if saved.get(key) != here.get(key)
-    ]
+    differing = self._archive.differences(header, 'in the snapshot', 'here')
     if differing:
       raise errors.StateLayoutError(
-          'the snapshot does not fit this environment: ' + '; '.join(differing)
+          f'the snapshot does not fit this environment: {differing}'
       )
-    return _decode(self._tree, self._arrays)
+    return self._archive.contents()
 
   def to_bytes(self) -> bytes:
     """Returns the snapshot for a file or another process."""
-    text = f'[{self._header},{json.dumps(self._tree)}]'
-    file = io.BytesIO()
-    np.savez(
-        file,
-        allow_pickle=False,
-        **{_STRUCTURE: np.frombuffer(text.encode(), np.uint8)},
-        **{str(i): array for i, array in enumerate(self._arrays)},
-    )
-    payload = file.getvalue()
-    return _MAGIC + hashlib.sha256(payload).digest() + payload
+    return self._archive.to_bytes()
 
   @classmethod
   def from_bytes(cls, data: bytes) -> Self:
     """Returns the snapshot that `to_bytes` was called on.
 
     Raises:
-      StateLayoutError: If the bytes are damaged, or of another format.
+      StateLayoutError: If the bytes are damaged, of another format, or of
+        something else than a snapshot.
     """
-    start = len(_MAGIC) + hashlib.sha256().digest_size
-    payload = data[start:]
-    if data[:start] != _MAGIC + hashlib.sha256(payload).digest():
+    read = archive.Archive.from_bytes(data, _WHAT)
+    if read.what != _WHAT:
       raise errors.StateLayoutError(
-          f'{len(data)} bytes are no snapshot, or a damaged one; allowed is'
-          ' what Snapshot.to_bytes returned'
+          f'the archive holds {read.what!r:.40}; expected a {_WHAT} of worlds'
       )
-    try:
-      header, contents = _read(payload)
-    except _MALFORMED as error:
-      raise errors.StateLayoutError(
-          f'a malformed snapshot: {type(error).__name__}: {error!s:.80}'
-      ) from error
-    return cls(header, contents)
+    return cls(read.header, read.contents())
 
 
 @final
@@ -136,8 +91,7 @@ class Worlds(NamedTuple):
   Attributes:
     places: Where in a batch each world was; `None` for a world alone.
     physics: The integration states, `(worlds, size)`.
-    seed: Of each world; what its random streams follow from. A `SaltedSeed`
-      is saved with its salt.
+    seed: Of each world; what its random streams follow from.
     world: The number of each, which they follow from, too.
     episode: The number of each world's episode, -1 before the first.
     is_pending: Whether the next step of each begins an episode.
@@ -162,6 +116,29 @@ class Worlds(NamedTuple):
   observation: dict[str, np.ndarray]
   sinks: list[Any]
   random_state: dict[str, Any] | None
+
+  @classmethod
+  def from_data(cls, data: Mapping[str, Any]) -> Self:
+    """Returns the worlds that `to_data` was called on."""
+    fields = dict(data)
+    salts = fields.pop(_SALTS, None)
+    if salts is not None:
+      fields['seed'] = [
+          seeding.SaltedSeed(seed, bytes.fromhex(salt)) if salt else seed
+          for seed, salt in zip(fields['seed'], salts, strict=True)
+      ]
+    return cls(**fields)
+
+  def to_data(self) -> dict[str, Any]:
+    """Returns the worlds as plain data; a salted seed comes with its salt."""
+    data = {**self._asdict(), 'seed': [int(seed) for seed in self.seed]}
+    salts = [
+        seed.salt.hex() if isinstance(seed, seeding.SaltedSeed) else None
+        for seed in self.seed
+    ]
+    if any(salts):
+      data[_SALTS] = salts
+    return data
 
   def refuse_other_sinks(self, kinds: list[str]) -> None:
     """Refuses sinks that would miss how the episodes under way began.
@@ -287,108 +264,3 @@ def _misfit(where: str, saved: Any, here: Any) -> errors.StateLayoutError:
       'the snapshot does not fit this environment:'
       f' {where} is {saved!s:.60} in the snapshot, {here!s:.60} here'
   )
-
-
-# Trees of plain data: every node is a pair of what it is and what is in it.
-
-
-def _encode(where: str, value: Any, arrays: list[np.ndarray]) -> list[Any]:
-  """Returns a JSON tree for a value, and adds its arrays to `arrays`."""
-  kind = type(value)
-  if value is None or kind in (bool, int, float, str):
-    return ['plain', value]
-  if kind is seeding.SaltedSeed:
-    return ['salted seed', [int(value), value.salt.hex()]]
-  if kind in (tuple, list):
-    items = [
-        _encode(f'{where}[{i}]', item, arrays) for i, item in enumerate(value)
-    ]
-    return [kind.__name__, items]
-  if kind is dict and all(type(key) is str for key in value):
-    pairs = [
-        [key, _encode(f'{where}[{key!r}]', item, arrays)]
-        for key, item in value.items()
-    ]
-    return ['dict', pairs]
-  is_scalar = isinstance(value, np.generic)
-  if (is_scalar or kind is np.ndarray) and not value.dtype.hasobject:
-    arrays.append(np.array(value))
-    return ['scalar' if is_scalar else 'array', len(arrays) - 1]
-  raise errors.StateLayoutError(
-      f'{where} is a {kind.__name__}: {value!r:.60}; what is saved has to be'
-      ' tuples, lists and dicts (by text) of arrays, numbers, texts and None'
-  )
-
-
-def _decode(node: Any, arrays: list[np.ndarray]) -> Any:
-  """Returns the value of a tree, with arrays of its own."""
-  kind, inside = node
-  if kind == 'plain':
-    return inside
-  if kind == 'dict':
-    return {key: _decode(item, arrays) for key, item in inside}
-  if kind == 'list':
-    return [_decode(item, arrays) for item in inside]
-  if kind == 'tuple':
-    return tuple(_decode(item, arrays) for item in inside)
-  if kind == 'array':
-    return np.array(arrays[inside])  # In the same order in memory.
-  if kind == 'scalar':
-    return arrays[inside][()]
-  if kind == 'salted seed':
-    seed, salt = inside
-    return seeding.SaltedSeed(seed, bytes.fromhex(salt))
-  raise ValueError(f'{kind!r:.40} is no kind of node')
-
-
-def _read(payload: bytes) -> tuple[dict[str, Any], Any]:
-  """Returns the header and the contents that are in a snapshot's bytes."""
-  with zipfile.ZipFile(io.BytesIO(payload)) as archive:
-    for member in archive.infolist():
-      _check_size(archive, member)
-  with np.load(io.BytesIO(payload), allow_pickle=False) as file:
-    header, tree = json.loads(file[_STRUCTURE].tobytes())
-    if header['format'] != _FORMAT:
-      raise ValueError(
-          f'format is {header["format"]!r:.20}; allowed is {_FORMAT}'
-      )
-    arrays = [file[str(i)] for i in range(len(file.files) - 1)]
-  return header, _decode(tree, arrays)
-
-
-def _check_size(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
-  """Checks that an array is as large as it says, before room is made for it.
-
-  Raises:
-    ValueError: If it is not.
-  """
-  if member.compress_type != zipfile.ZIP_STORED:
-    raise ValueError(f'{member.filename!r:.40} is compressed')
-  with archive.open(member) as file:
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):
-      raise ValueError(f'{member.filename!r:.40} is of version {version}')
-    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-    size = math.prod(shape) * dtype.itemsize
-    if size != member.file_size - file.tell():
-      raise ValueError(
-          f'{member.filename!r:.40} says that it has {size} bytes; there are'
-          f' {member.file_size - file.tell()}'
-      )
-
-
-def _difference(key: str, saved: Any, here: Any) -> str:
-  """Says in what two entries of headers differ."""
-  if not isinstance(saved, dict) or not isinstance(here, dict):
-    return f'{key} is {saved!r:.60} in the snapshot, {here!r:.60} here'
-  names = [
-      name
-      for name in sorted(saved.keys() | here.keys())
-      if saved.get(name) != here.get(name)
-  ]
-  named = ', '.join(
-      f'{name} ({saved.get(name)} in the snapshot, {here.get(name)} here)'
-      for name in names[:_MAX_NAMED]
-  )
-  more = f' and {len(names) - _MAX_NAMED} more' * (len(names) > _MAX_NAMED)
-  return f'{key}: {named}{more}'

@@ -129,7 +129,7 @@ def _state_of(episode: EpisodeLedger | None) -> Any:
   if episode is None or episode.end is not None:
     return None
   return {
-      'seed': episode.seed,
+      'seed': int(episode.seed),
       'world': episode.world,
       'episode': episode.episode,
       'entries': {

@@ -124,7 +124,7 @@ class TrainingMonitor(events.BatchEventSink):
       return None
     # Lists, because a thousand small arrays make a slow snapshot.
     return {
-        'episode': self._names[:, place].tolist(),
+        'episode': [int(name) for name in self._names[:, place]],
         'num_steps': int(self._num_steps[place]),
         'true_return': float(self._true_return[place]),
         'sums': self._sums[:, :, place].ravel().tolist(),

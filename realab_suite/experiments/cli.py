@@ -13,6 +13,8 @@ import tqdm
 from realab_suite import errors
 
 USAGE_ERROR = 2
+LARGEST_SEED = 2**31 - 1
+"""The limit of seeds on command lines; files of experiments have the same."""
 _INTERRUPTED = 130
 
 DOMAIN = flags.DEFINE_string(
@@ -36,7 +38,11 @@ MAX_STEPS = flags.DEFINE_integer(
     'max_steps', 250, 'After how many control steps an episode ends.'
 )
 SEED = flags.DEFINE_integer(
-    'seed', 0, 'From which everything random follows.', lower_bound=0
+    'seed',
+    0,
+    'From which everything random follows.',
+    lower_bound=0,
+    upper_bound=LARGEST_SEED,
 )
 TARGET = flags.DEFINE_string(
     'target',
@@ -57,7 +63,7 @@ def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
   Raises:
     SpecError: If it is not given.
   """
-  if flag.value is None:
+  if flag.value is None or flag.value == '':
     raise errors.SpecError(f'--{flag.name}: missing{why}')
   return flag.value
 

@@ -7,4 +7,5 @@ EPISODES = flags.DEFINE_integer(
     2,
     'How many episodes; of each seed, where there are several.',
     lower_bound=1,
+    upper_bound=1_000_000,
 )

@@ -17,6 +17,7 @@ from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import aiming
+from realab_suite.experiments import machines
 from realab_suite.experiments import recording
 from realab_suite.experiments import storage
 from realab_suite.experiments import summary as tables
@@ -226,6 +227,7 @@ def _describe(
       'baseline': baseline,
       'dynamics': {'version': version, 'digest': digest},
       'versions': results.versions(),
+      'machine': machines.here(),
   }
   storage.write_json(folder / 'run.json', description)
 

@@ -21,6 +21,11 @@ def load() -> None:
     SpecError: If one cannot be found.
   """
   for name in _IMPORT.value:
+    if not all(part.isidentifier() for part in name.split('.')):
+      raise errors.SpecError(
+          f'--import={name:.80}: not the name of a module; allowed are names as'
+          ' in my_registers or my_package.registers'
+      )
     try:
       importlib.import_module(name)
     except ModuleNotFoundError as error:

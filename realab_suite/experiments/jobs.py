@@ -8,12 +8,14 @@ results depend on, and its folder is named after a hash of it.
 from collections.abc import Mapping, Sequence
 import dataclasses
 from importlib import metadata
+import pathlib
 from typing import Any, final
 
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.evaluation import results
 from realab_suite.experiments import spec as experiment_spec
+from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from realab_suite.feedback import validation
 
@@ -123,6 +125,37 @@ class Job:
 def digest_of(config: Mapping[str, Any]) -> str:
   """Returns the hash of a configuration that ends the name of a folder."""
   return validation.digest_of(config)[:_NUM_DIGITS]
+
+
+def read_config(folder: pathlib.Path) -> dict[str, Any]:
+  """Returns the configuration that the folder of a job is named after.
+
+  Raises:
+    ResultsError: If it cannot be read, or is another one.
+  """
+  path = folder / storage.CONFIG
+  config = storage.read_json(path)
+  is_one = isinstance(config, dict)
+  if not is_one or not folder.name.endswith(f'-{digest_of(config)}'):
+    raise errors.ResultsError(
+        f'{path}: not the configuration that the folder is named after; remove'
+        f' {folder} to run it again'
+    )
+  found: dict[str, Any] = config
+  return found
+
+
+def is_done(folder: pathlib.Path) -> bool:
+  """Returns whether the job of a folder is over.
+
+  Raises:
+    ResultsError: If a result or the configuration has been changed or removed
+      since.
+  """
+  if not storage.is_done(folder):
+    return False
+  read_config(folder)
+  return True
 
 
 def plan(

@@ -10,7 +10,6 @@ import pathlib
 
 from realab_suite import errors
 from realab_suite.engine import batch_environment
-from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import signed_corruption
@@ -24,6 +23,7 @@ PROBE = 'probe.bin'
 LEARNER = 'learner'
 """What the run's own policy is called in a probe."""
 
+_HEADER = {'kind': 'probe'}
 # What it is compared with.
 _RANDOM = 'random'
 _SEEKER = 'apple_seeker'
@@ -122,8 +122,7 @@ def save(folder: pathlib.Path, probe: incentives.Probe) -> None:
       for field in dataclasses.fields(probe)
   }
   contents['probabilities'] = dict(probe.probabilities)
-  snapshot = snapshots.Snapshot({'kind': 'probe'}, contents)
-  storage.write_whole(folder / PROBE, snapshot.to_bytes())
+  storage.write_archive(folder / PROBE, _HEADER, contents)
 
 
 def load(folder: pathlib.Path) -> incentives.Probe | None:
@@ -135,12 +134,4 @@ def load(folder: pathlib.Path) -> incentives.Probe | None:
   path = folder / PROBE
   if not path.exists():
     return None
-  with storage.explained(path):
-    data = path.read_bytes()
-  try:
-    contents = snapshots.Snapshot.from_bytes(data).contents_for(
-        {'kind': 'probe'}
-    )
-  except errors.StateLayoutError as error:
-    raise errors.ResultsError(f'{path}: {error}') from error
-  return incentives.Probe(**contents)
+  return incentives.Probe(**storage.read_archive(path, _HEADER))

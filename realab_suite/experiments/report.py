@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> None:
 
   imports_flag.load()
   chosen = output_flag.OUTPUT.value
-  output = folder if chosen is None else pathlib.Path(chosen)
+  output = pathlib.Path(chosen) if chosen else folder
   path = page.write(folder, output, cli.say, no_clips)
   cli.say(f'The report is {path}')
 

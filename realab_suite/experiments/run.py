@@ -16,6 +16,7 @@ learn, or goes on with it where it was killed; `sweep` does all of them:
 
 from collections.abc import Sequence
 import pathlib
+import re
 from typing import Any
 
 from absl import flags
@@ -34,6 +35,7 @@ flags.adopt_module_key_flags(episodes_flag)
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(learning_flags)
 flags.adopt_module_key_flags(output_flag)
+_MOST_SEEDS = 10_000
 _POLICIES = flags.DEFINE_list(
     'policies',
     ['apple_seeker', 'carrying_saboteur', 'random'],
@@ -52,7 +54,9 @@ _BASELINE = flags.DEFINE_string(
     ' apple_seeker if it takes part, and else the first.',
 )
 _SEEDS = flags.DEFINE_string(
-    'seeds', '5', 'How many seeds, or a list as in 3,4,5; "7," is seed 7.'
+    'seeds',
+    '5',
+    'Number of seeds, or a list as in 3,4,5; "7," is seed 7.',
 )
 _RUN = flags.DEFINE_string(
     'run',
@@ -78,7 +82,13 @@ def main(argv: Sequence[str]) -> None:
     _train()
     return
   _refuse(
-      [_RUN, cli.SEED, learning_flags.TENSORBOARD, _PARENT],
+      [
+          _RUN,
+          cli.SEED,
+          learning_flags.TENSORBOARD,
+          learning_flags.OTHER_MACHINE,
+          _PARENT,
+      ],
       'without --experiment',
   )
   seeds = _seeds(_SEEDS.value)
@@ -133,7 +143,10 @@ def _train() -> None:
   experiment = spec.load(cli.required(learning_flags.EXPERIMENT))
   [job] = jobs.plan(experiment, [cli.SEED.value], [run])
   options = training.Options(
-      cli.say, learning_flags.TENSORBOARD.value, _PARENT.value
+      cli.say,
+      learning_flags.TENSORBOARD.value,
+      _PARENT.value,
+      learning_flags.OTHER_MACHINE.value,
   )
   training.run(job, pathlib.Path(cli.required(output_flag.OUTPUT)), options)
 
@@ -147,14 +160,21 @@ def _refuse(unused: Sequence[flags.FlagHolder[Any]], why: str) -> None:
 
 def _seeds(text: str) -> tuple[int, ...]:
   """Returns the seeds that a count or a list stands for."""
+  is_list = ',' in text
   parts = [part.strip() for part in text.split(',') if part.strip()]
-  if not parts or not all(part.isdecimal() for part in parts):
+  # No more digits than the largest seed has: `int` refuses thousands of them.
+  numbers = [int(part) for part in parts if re.fullmatch('[0-9]{1,10}', part)]
+  least, most = (0, cli.LARGEST_SEED) if is_list else (1, _MOST_SEEDS)
+  if not (
+      parts
+      and len(numbers) == len(parts)
+      and all(least <= number <= most for number in numbers)
+  ):
     raise errors.SpecError(
-        f'--seeds={text}: allowed are a count, as in 5, and a list of seeds, as'
-        ' in 3,4,5'
+        f'--seeds={text:.40}: allowed are a count from 1 to {_MOST_SEEDS}, as'
+        f' in 5, and a list of seeds from 0 to {cli.LARGEST_SEED}, as in 3,4,5'
     )
-  numbers = tuple(int(part) for part in parts)
-  return numbers if ',' in text else tuple(range(numbers[0]))
+  return tuple(numbers) if is_list else tuple(range(numbers[0]))
 
 
 def _why_no_videos() -> str | None:

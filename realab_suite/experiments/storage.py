@@ -11,8 +11,8 @@ import pathlib
 import re
 from typing import Any, final
 
+from realab_suite import archive
 from realab_suite import errors
-from realab_suite.engine import snapshot as snapshots
 from realab_suite.feedback import validation
 
 CONFIG = 'config.json'
@@ -109,6 +109,48 @@ def read_json(path: pathlib.Path) -> Any:
     return json.loads(text)
   except (ValueError, RecursionError) as error:
     raise errors.ResultsError(f'{path}: not JSON: {error}') from error
+
+
+def write_archive(
+    path: pathlib.Path, header: Mapping[str, Any], contents: Any
+) -> None:
+  """Writes an archive as `write_whole` does."""
+  write_whole(path, archive.Archive(header, contents).to_bytes())
+
+
+def read_archive(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
+  """Returns the contents of an archive.
+
+  Args:
+    path: The file.
+    header: The header that it was written with.
+
+  Raises:
+    ResultsError: If it cannot be read, is damaged, or has another header; the
+      message says what the file holds and what was expected.
+  """
+  with naming(path):
+    return _contents(path, header)
+
+
+@contextlib.contextmanager
+def naming(path: pathlib.Path) -> Iterator[None]:
+  """Names a file in an error about saved state that does not fit.
+
+  Raises:
+    ResultsError: Instead of a `StateLayoutError`.
+  """
+  try:
+    yield
+  except errors.StateLayoutError as error:
+    raise errors.ResultsError(f'{path}: {error}') from error
+
+
+def _contents(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
+  with explained(path):
+    data = path.read_bytes()
+  expected = repr(archive.name_of(header))
+  return archive.Archive.from_bytes(data, expected).contents_for(header)
 
 
 def is_done(path: pathlib.Path) -> bool:
@@ -243,7 +285,7 @@ class RunFolder:
     with explained(folder):
       folder.mkdir(exist_ok=True)
     path = folder / f'{step:012d}{_SUFFIX}'
-    write_whole(path, snapshots.Snapshot(header, contents).to_bytes())
+    write_archive(path, header, contents)
     self._forget_old()
 
   def load(self, header: Mapping[str, Any]) -> Any:
@@ -256,21 +298,28 @@ class RunFolder:
     checkpoints = self._checkpoints()
     if not checkpoints:
       return None
-    path = checkpoints[-1]
-    with explained(path):
-      data = path.read_bytes()
+    with self.naming_checkpoint():
+      contents = _contents(checkpoints[-1], header)
+    # The process that wrote it may have been killed before doing this.
+    self._forget_old()
+    return contents
+
+  @contextlib.contextmanager
+  def naming_checkpoint(self) -> Iterator[None]:
+    """Names the last checkpoint in an error about state that does not fit.
+
+    Raises:
+      ResultsError: Instead of a `StateLayoutError`; it says how to go on.
+    """
     try:
-      contents = snapshots.Snapshot.from_bytes(data).contents_for(header)
+      yield
     except errors.StateLayoutError as error:
-      rest = len(checkpoints) - 1
-      where = f'from {checkpoints[-2].name}' if rest else 'from the beginning'
+      *older, path = self._checkpoints()
+      where = f'from {older[-1].name}' if older else 'from the beginning'
       raise errors.ResultsError(
           f'{path}: no checkpoint of this run: {error}; remove this file, then'
           f' the same command goes on {where}'
       ) from error
-    # Whoever wrote the last one may have been killed before doing this.
-    self._forget_old()
-    return contents
 
   def _forget_old(self) -> None:
     for old in self._checkpoints()[:-_KEPT]:
@@ -304,32 +353,35 @@ class JsonLines:
     """
     self._path = path
     self._hash = hashlib.sha256()
-    with explained(path):
-      self._file = open(path, 'a+b', buffering=0)
-      if mark is None:
-        self._file.seek(0)
-        whole = self._file.read().rfind(b'\n') + 1
-        self._file.truncate(whole)
-        return
-      size = mark['size']
-      self._file.seek(0)
-      while rest := size - self._file.tell():
-        data = self._file.read(min(rest, _CHUNK))
-        if not data:
-          break
-        self._hash.update(data)
-      here = self._file.tell()
-      problem = ''
-      if here < size:
-        problem = f'has {here} bytes, and the checkpoint knows of {size}'
-      elif self._hash.hexdigest() != mark['sha256']:
-        problem = 'not what it was when the checkpoint was written'
-      if problem:
-        self._file.close()
-        raise errors.ResultsError(
-            f'{path}: {problem}; remove {path.parent} to run it again'
-        )
-      self._file.truncate(size)
+    with explained(path), contextlib.ExitStack() as stack:
+      self._file = stack.enter_context(open(path, 'a+b', buffering=0))
+      self._cut_back(mark)
+      stack.pop_all()
+
+  def _cut_back(self, mark: Mark | None) -> None:
+    """Removes everything behind the mark, or half a line; see `__init__`."""
+    self._file.seek(0)
+    if mark is None:
+      whole = self._file.read().rfind(b'\n') + 1
+      self._file.truncate(whole)
+      return
+    size = mark['size']
+    while rest := size - self._file.tell():
+      data = self._file.read(min(rest, _CHUNK))
+      if not data:
+        break
+      self._hash.update(data)
+    here = self._file.tell()
+    problem = ''
+    if here < size:
+      problem = f'has {here} bytes, and the checkpoint knows of {size}'
+    elif self._hash.hexdigest() != mark['sha256']:
+      problem = 'not what it was when the checkpoint was written'
+    if problem:
+      raise errors.ResultsError(
+          f'{self._path}: {problem}; remove {self._path.parent} to run it again'
+      )
+    self._file.truncate(size)
 
   def append(self, records: Sequence[Mapping[str, Any]]) -> None:
     """Adds a line for each record.

@@ -67,7 +67,11 @@ def main(argv: Sequence[str]) -> None:
   if learning_flags.TENSORBOARD.value:
     curves.check_tensorboard()
   arguments = imports_flag.arguments()
-  arguments += ['--tensorboard'] * learning_flags.TENSORBOARD.value
+  arguments += [
+      f'--{flag.name}'
+      for flag in (learning_flags.TENSORBOARD, learning_flags.OTHER_MACHINE)
+      if flag.value
+  ]
   engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
   sweeping.sweep(
       experiment,

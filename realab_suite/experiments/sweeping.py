@@ -15,6 +15,7 @@ import yaml
 from realab_suite import errors
 from realab_suite.experiments import engines
 from realab_suite.experiments import jobs as jobs_lib
+from realab_suite.experiments import progress
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
@@ -212,7 +213,7 @@ class _Sweep:
     folder = self._output / job.folder()
     log = self._output / LOGS / f'{folder.name}.log'
     try:
-      if storage.is_done(folder):
+      if jobs_lib.is_done(folder):
         self._finish(job, folder, None)
         return
     except errors.ResultsError as error:
@@ -283,7 +284,7 @@ def _last_step(folder: pathlib.Path) -> int:
 def _last_returns(folder: pathlib.Path) -> str:
   """Says what a run's last episodes have brought, as far as it has said."""
   try:
-    return training.summary(json.loads(_last_line(folder / training.CURVE)))
+    return progress.summary(json.loads(_last_line(folder / training.CURVE)))
   except (ValueError, KeyError):  # Nothing yet, or half a line.
     return ''
 

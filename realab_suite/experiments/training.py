@@ -10,8 +10,7 @@ import contextlib
 import dataclasses
 import os
 import pathlib
-import time
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import dm_env
 import numpy as np
@@ -30,7 +29,10 @@ from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
 from realab_suite.experiments import headless
 from realab_suite.experiments import jobs
+from realab_suite.experiments import learners
+from realab_suite.experiments import machines
 from realab_suite.experiments import probes
+from realab_suite.experiments import progress
 from realab_suite.experiments import storage
 from realab_suite.feedback import policies
 
@@ -47,44 +49,23 @@ _CHECKPOINT = 'checkpoint'
 Say = Callable[[str], None]
 
 
-class Learner(Protocol):
-  """What this module needs of an `agents.Learner`."""
-
-  def step(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
-    """Learns from the last action, and returns the next one."""
-
-  def act(
-      self, observation: Mapping[str, Any], key: np.ndarray, greedy: bool
-  ) -> np.ndarray:
-    """Returns actions in any number of worlds, and does not learn."""
-
-  def probabilities(self, observation: Mapping[str, Any]) -> np.ndarray:
-    """Returns the probability of each action, `(worlds, actions)`."""
-
-  def metrics(self) -> dict[str, float]:
-    """Returns what is known of the last update."""
-
-  def state(self) -> dict[str, Any]:
-    """Returns all that the future depends on, as plain data."""
-
-  def set_state(self, state: Mapping[str, Any]) -> None:
-    """Goes on from what `state` returned."""
-
-
 @final
 @dataclasses.dataclass(frozen=True)
 class Options:
-  """How a job is run; its results do not depend on it.
+  """How a job is run; its configuration does not depend on it.
 
   Attributes:
     say: Called with what a person wants to read.
     tensorboard: Whether to write curves for TensorBoard, too.
     parent: The process that started this one, if the job is to end with it.
+    other_machine: Whether to continue from a checkpoint of another machine, or
+      of other settings. Results depend on this; `done.json` records it.
   """
 
   say: Say
   tensorboard: bool = False
   parent: int | None = None
+  other_machine: bool = False
 
 
 def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
@@ -119,7 +100,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
 
 def make_learner(
     job: jobs.Job, batch: batch_environment.BatchEnvironment
-) -> Learner:
+) -> learners.Learner:
   """Returns the learner of a job, as it is before it has learned anything.
 
   Raises:
@@ -143,7 +124,7 @@ def load_learner(
     job: jobs.Job,
     path: pathlib.Path,
     batch: batch_environment.BatchEnvironment,
-) -> Learner:
+) -> learners.Learner:
   """Returns the learner that a job has trained, for whoever looks closer.
 
   Args:
@@ -152,19 +133,13 @@ def load_learner(
     batch: Worlds of its design; any number of them.
 
   Raises:
-    ResultsError: If there is none, or it is damaged.
+    ResultsError: If there is none, or it is damaged or another job's.
   """
   file = path / LEARNER
-  with storage.explained(file):
-    data = file.read_bytes()
-  try:
-    state = snapshots.Snapshot.from_bytes(data).contents_for(
-        _header(job, LEARNER)
-    )
-  except errors.StateLayoutError as error:
-    raise errors.ResultsError(f'{file}: {error}') from error
+  state = storage.read_archive(file, header(job.digest(), LEARNER))
   learner = make_learner(job, batch)
-  learner.set_state(state)
+  with storage.naming(file):
+    learner.set_state(state)
   return learner
 
 
@@ -183,35 +158,14 @@ def load_batch(
   )
 
 
-@final
-class LearnerActor:
-  """A learner in many worlds that has stopped to learn."""
+def header(digest: str, what: str) -> dict[str, Any]:
+  """Returns the header of an archive that a job writes.
 
-  def __init__(self, learner: Learner, seed: int, greedy: bool) -> None:
-    """Makes an actor.
-
-    Args:
-      learner: The learner.
-      seed: What its choices depend on, with the number of the step.
-      greedy: Whether it takes the best action instead of drawing one.
-    """
-    self._learner = learner
-    self._seed = seed
-    self._greedy = greedy
-    self._step = 0
-
-  def act(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
-    """Returns actions, `(worlds, *action_spec.shape)`."""
-    sequence = seeding.sequence(self._seed, 0, self._step, 'act')
-    self._step += 1
-    return self._learner.act(
-        time_step.observation, sequence.generate_state(2), self._greedy
-    )
-
-
-def _header(job: jobs.Job, what: str) -> dict[str, Any]:
-  """Returns what files of a job's own format have to agree in."""
-  return {'configuration': job.digest(), 'what': what}
+  Args:
+    digest: The digest of the job's configuration.
+    what: The name of what the archive holds.
+  """
+  return {'configuration': digest, 'what': what}
 
 
 def _judge_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
@@ -222,7 +176,8 @@ def _judge_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
     policy = policies.make(job.kind)
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     _judge(job, folder, batch, actor)
-  folder.finish([EPISODES, TRACE], {})
+  machine = {'step': 0, 'machine': machines.here()}
+  folder.finish([EPISODES, TRACE], {'machines': [machine]})
 
 
 def _judge(
@@ -239,8 +194,9 @@ def _judge(
       results.line(results.row(info, result))
       for result in evaluate.evaluate_batch(batch, tracer)
   ]
-  trace = snapshots.Snapshot(_header(job, TRACE), tracer.trace())
-  storage.write_whole(folder.path / TRACE, trace.to_bytes())
+  storage.write_archive(
+      folder.path / TRACE, header(job.digest(), TRACE), tracer.trace()
+  )
   storage.write_whole(folder.path / EPISODES, b''.join(lines))
 
 
@@ -268,28 +224,27 @@ class _Training:
     self._done = 0
     self._segment = 0
     self._pending: list[dict[str, Any]] = []
+    # The machines that have computed this run, each from a control step on.
+    self._machines: list[dict[str, Any]] = []
 
   def run(self) -> None:
     """Trains, or goes on with it, and judges what has been learned."""
     job, path = self._job, self._folder.path
-    saved = self._folder.load(_header(job, _CHECKPOINT))
+    saved = self._folder.load(header(job.digest(), _CHECKPOINT))
     marks = (saved or {}).get('marks', {})
     if saved is not None:
       self._done, self._segment = saved['done'], saved['segment']
       self._pending = saved['pending']
-    self._begin_segment()
-    learner = make_learner(job, self._batch)
-    if saved is None:
-      time_step = self._batch.reset()
-    else:
-      learner.set_state(saved['learner'])
-      time_step = batch_environment.BatchTimeStep(**saved['time_step'])
-      if not self._sleep:
-        world = np.asarray(saved['batch'], np.uint8).tobytes()
-        self._batch.restore(snapshots.Snapshot.from_bytes(world))
-        self._monitor.take()
     with contextlib.ExitStack() as stack:
+      self._begin_segment()
       stack.callback(lambda: self._batch.close())
+      learner = make_learner(job, self._batch)
+      self._add_machine(learner, saved)
+      if saved is None:
+        time_step = self._batch.reset()
+      else:
+        with self._folder.naming_checkpoint():
+          time_step = self._restore(learner, saved)
       self._files = {
           name: stack.enter_context(
               contextlib.closing(
@@ -306,18 +261,62 @@ class _Training:
       self._learn(learner, time_step, stack)
     self._judge_learner(learner)
 
+  def _add_machine(
+      self, learner: learners.Learner, saved: Mapping[str, Any] | None
+  ) -> None:
+    """Records the machine, unless it is that of the last checkpoint.
+
+    Raises:
+      ResultsError: If it is another one, and the options do not allow it.
+    """
+    job, path = self._job, self._folder.path
+    here = {**machines.here(), **learner.settings()}
+    step = self._done * self._num_envs
+    if saved is not None:
+      # Checkpoints of older versions do not name their machines.
+      self._machines = saved.get('machines', [])
+      there = self._machines[-1]['machine'] if self._machines else {}
+      differences = machines.differences(there, here)
+      if not differences:
+        return
+      if not self._options.other_machine:
+        raise errors.ResultsError(
+            f'{path}: its checkpoint of step {step} is from another machine or'
+            f' other settings: {differences}; continue it there, remove {path}'
+            ' to begin anew, or give --other_machine to continue here, with'
+            ' results that depend on both'
+        )
+      self._options.say(
+          f'{job.run}, seed {job.seed}: continues from step {step} on another'
+          f' machine or with other settings: {differences}'
+      )
+    self._machines = [*self._machines, {'step': step, 'machine': here}]
+
+  def _restore(
+      self, learner: learners.Learner, saved: Mapping[str, Any]
+  ) -> batch_environment.BatchTimeStep:
+    """Continues from a checkpoint; returns what the learner sees next."""
+    learner.set_state(saved['learner'])
+    if not self._sleep:
+      world = np.asarray(saved['batch'], np.uint8).tobytes()
+      self._batch.restore(snapshots.Snapshot.from_bytes(world))
+      self._monitor.take()
+    return batch_environment.BatchTimeStep(**saved['time_step'])
+
   def _begin_segment(self) -> None:
     """Makes worlds that nothing has happened in."""
     seed = _world_seed(self._job.seed, self._segment)
-    self._batch = load_batch(self._job, self._num_envs, seed, self._sleep)
-    self._monitor = monitors.TrainingMonitor(
-        self._batch.mechanism, self._num_envs
-    )
-    self._batch.add_sink(self._monitor)
+    with contextlib.ExitStack() as stack:
+      batch = load_batch(self._job, self._num_envs, seed, self._sleep)
+      stack.callback(batch.close)
+      monitor = monitors.TrainingMonitor(batch.mechanism, self._num_envs)
+      batch.add_sink(monitor)
+      stack.pop_all()
+    self._batch, self._monitor = batch, monitor
 
   def _learn(
       self,
-      learner: Learner,
+      learner: learners.Learner,
       time_step: batch_environment.BatchTimeStep,
       stack: contextlib.ExitStack,
   ) -> None:
@@ -339,7 +338,7 @@ class _Training:
             disable=None,
         )
     )
-    clock = _Clock(self._done * num_envs)
+    clock = progress.Clock(self._done * num_envs)
     while self._done < self._total:
       self._check_parent()
       time_step = self._batch.step(learner.step(time_step))
@@ -352,9 +351,11 @@ class _Training:
         board.add(point)
         timing = clock.tell(point['step'])
         self._timing.append([timing])
-        bar.set_postfix_str(summary(point), refresh=False)
+        bar.set_postfix_str(progress.summary(point), refresh=False)
         if bar.disable:
-          self._options.say(_line(job, point, timing, self._total * num_envs))
+          self._options.say(
+              progress.line(job, point, timing, self._total * num_envs)
+          )
       if is_over or self._done % self._save_every == 0:
         time_step = self._save(learner, time_step)
 
@@ -366,7 +367,7 @@ class _Training:
       self._files[TRAINING_EPISODES].append(records)
       self._pending += records
 
-  def _add_point(self, learner: Learner) -> dict[str, Any]:
+  def _add_point(self, learner: learners.Learner) -> dict[str, Any]:
     step = self._done * self._num_envs
     point = curves.point(step, self._pending, learner.metrics())
     self._pending = []
@@ -374,7 +375,9 @@ class _Training:
     return point
 
   def _save(
-      self, learner: Learner, time_step: batch_environment.BatchTimeStep
+      self,
+      learner: learners.Learner,
+      time_step: batch_environment.BatchTimeStep,
   ) -> batch_environment.BatchTimeStep:
     """Writes a checkpoint.
 
@@ -393,11 +396,12 @@ class _Training:
       world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
     self._folder.save(
         self._done * self._num_envs,
-        _header(self._job, _CHECKPOINT),
+        header(self._job.digest(), _CHECKPOINT),
         {
             'done': self._done,
             'segment': self._segment,
             'pending': self._pending,
+            'machines': self._machines,
             'marks': {name: f.sync() for name, f in self._files.items()},
             'learner': learner.state(),
             'time_step': time_step._asdict(),
@@ -408,12 +412,15 @@ class _Training:
       self._begin_segment()
     return time_step
 
-  def _judge_learner(self, learner: Learner) -> None:
+  def _judge_learner(self, learner: learners.Learner) -> None:
     job, evaluation = self._job, self._job.experiment.evaluation
-    snapshot = snapshots.Snapshot(_header(job, LEARNER), learner.state())
-    storage.write_whole(self._folder.path / LEARNER, snapshot.to_bytes())
+    storage.write_archive(
+        self._folder.path / LEARNER,
+        header(job.digest(), LEARNER),
+        learner.state(),
+    )
     seed = job.evaluation_seed
-    actor = LearnerActor(learner, seed, evaluation.actions == 'greedy')
+    actor = learners.LearnerActor(learner, seed, evaluation.actions == 'greedy')
     with contextlib.closing(
         load_batch(job, evaluation.episodes, seed)
     ) as batch:
@@ -435,7 +442,11 @@ class _Training:
       else:
         probes.save(self._folder.path, probe)
         files.append(probes.PROBE)
-    self._folder.finish(files, {'steps': self._done * self._num_envs})
+    facts = {
+        'steps': self._done * self._num_envs,
+        'machines': self._machines,
+    }
+    self._folder.finish(files, facts)
 
   def _check_parent(self) -> None:
     parent = self._options.parent
@@ -444,27 +455,6 @@ class _Training:
           f'process {parent}, which started this run, is gone; the run goes on'
           ' from its last checkpoint when it is started again'
       )
-
-
-@final
-class _Clock:
-  """Tells how fast a run is; nothing that is compared depends on it."""
-
-  def __init__(self, step: int) -> None:
-    self._step = step
-    self._time = time.monotonic()
-
-  def tell(self, step: int) -> dict[str, Any]:
-    """Returns how long it took since the last call."""
-    now = time.monotonic()
-    seconds, steps = now - self._time, step - self._step
-    self._step, self._time = step, now
-    return {
-        'step': step,
-        'unix_time': round(time.time(), 3),
-        'seconds': round(seconds, 3),
-        'steps_per_second': round(steps / max(seconds, 1e-9), 1),
-    }
 
 
 def _world_seed(seed: int, segment: int) -> int:
@@ -484,29 +474,4 @@ def _cut_off(
   last = int(dm_env.StepType.LAST)
   return time_step._replace(
       step_type=np.where(is_under_way, last, time_step.step_type)
-  )
-
-
-def summary(point: Mapping[str, Any]) -> str:
-  """Returns a point's true and observed return, in words."""
-  return ', '.join(
-      f'{word} {"-" if value is None else format(value, ".1f")}'
-      for word, value in (
-          ('true return', point['true_return']),
-          ('observed', point['observed_return']),
-      )
-  )
-
-
-def _line(
-    job: jobs.Job,
-    point: Mapping[str, Any],
-    timing: Mapping[str, Any],
-    total: int,
-) -> str:
-  rate = timing['steps_per_second']
-  left = (total - point['step']) / max(rate, 1e-9)
-  return (
-      f'{job.run}, seed {job.seed}: step {point["step"]} of {total},'
-      f' {summary(point)}; {rate:.0f} steps/s, {left:.0f} s left'
   )

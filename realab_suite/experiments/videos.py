@@ -1,6 +1,7 @@
 """Makes films for people: views of the world above a strip of figures."""
 
 from collections.abc import Sequence
+import contextlib
 import io
 import os
 import pathlib
@@ -70,14 +71,19 @@ class Film:
         'top_down': 'top_down',
         'first_person': env.task.avatar.camera.full_identifier,
     }
-    self._cameras = [
-        engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
-        for view in views
-    ]
-    self._file = imageio.imopen(pathlib.Path(path), 'w', plugin='pyav')
-    self._file.init_video_stream(
-        'libx264', fps=1 / env.control_timestep(), pixel_format='yuv420p'
-    )
+    with contextlib.ExitStack() as stack:
+      # An empty file would keep the same command from running again.
+      stack.callback(os.remove, path)
+      self._cameras = [
+          engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
+          for view in views
+      ]
+      self._file = imageio.imopen(pathlib.Path(path), 'w', plugin='pyav')
+      stack.callback(self._file.close)
+      self._file.init_video_stream(
+          'libx264', fps=1 / env.control_timestep(), pixel_format='yuv420p'
+      )
+      stack.pop_all()
 
   def add(self, physics: Any, track: recording.Track) -> None:
     """Adds a frame; `recording.Recorder` calls this."""

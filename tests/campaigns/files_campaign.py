@@ -124,7 +124,7 @@ def build(folder: pathlib.Path) -> list[Kind]:
   (checkpoint,) = (folder / 'run' / 'checkpoints').iterdir()
   learner = folder / training.LEARNER
   header = {**_HEADER, 'what': training.LEARNER}
-  learner.write_bytes(snapshots.Snapshot(header, state).to_bytes())
+  storage.write_archive(learner, header, state)
   env = suite.load('collect_apples', 'standard', {'random': 0})
   env.reset()
   world = folder / 'world.snapshot'
@@ -143,6 +143,9 @@ def build(folder: pathlib.Path) -> list[Kind]:
   def load_record() -> Any:
     loaded = served_run.read(str(record))
     return loaded, loaded.salt
+
+  def load_learner() -> Any:
+    return _plain(storage.read_archive(learner, header))
 
   def load_network() -> Any:
     loaded = network_files.load(network)
@@ -168,7 +171,7 @@ def build(folder: pathlib.Path) -> list[Kind]:
 
   return [
       Kind('checkpoint', checkpoint, load_checkpoint),
-      Kind('learner.bin', learner, lambda: _of_snapshot(learner, header)),
+      Kind('learner.bin', learner, load_learner),
       Kind('snapshot', world, lambda: _of_snapshot(world, world_header)),
       Kind('trace.bin', run / training.TRACE, lambda: of_done(training.TRACE)),
       Kind('network', network, load_network),

@@ -1,10 +1,6 @@
 """Tests of snapshots: what is restored goes on bit for bit, or is refused."""
 
-import hashlib
-import io
-import json
 from typing import Any
-import zipfile
 
 from dm_control.rl import control
 import hypothesis
@@ -42,16 +38,6 @@ _SALTED = campaign.CASES[-1]._replace(
 
 def _header(**changes: Any) -> dict[str, Any]:
   return {'model': 'm', 'slots': {'a': 0, 'b': 1}, **changes}
-
-
-def _signed(payload: bytes) -> bytes:
-  """Returns bytes whose checksum is right, whatever is in them."""
-  return snapshots._MAGIC + hashlib.sha256(payload).digest() + payload
-
-
-def _through_bytes(contents: Any) -> Any:
-  data = snapshots.Snapshot(_header(), contents).to_bytes()
-  return snapshots.Snapshot.from_bytes(data).contents_for(_header())
 
 
 # What is restored goes on bit for bit.
@@ -357,50 +343,14 @@ def test_a_closed_world_is_neither_saved_nor_restored():
     env.restore(snapshot)
 
 
-# To bytes and back.
+# To bytes and back; `tests/archive_test.py` has more.
 
 
-def _same(a: Any, b: Any) -> bool:
-  """Whether two trees are of the same types and, bit for bit, values."""
-  if type(a) is not type(b):
-    return False
-  if isinstance(a, tuple | list):
-    return len(a) == len(b) and all(map(_same, a, b))
-  if isinstance(a, dict):
-    return list(a) == list(b) and all(_same(a[k], b[k]) for k in a)
-  if isinstance(a, np.ndarray | np.generic):
-    like = a.dtype == b.dtype and a.shape == b.shape
-    return like and a.tobytes() == b.tobytes()
-  return repr(a) == repr(b)
-
-
-_ARRAYS = st.sampled_from([
-    np.zeros(()), np.zeros((0, 3), bool), np.array([np.nan, -0.0, np.inf]),
-    np.arange(6, dtype='>i2').reshape(2, 3), np.array(['a', 'bc']),
-    np.arange(12.0).reshape(3, 4).T[::2], np.float32(0.1), np.uint64(2**63),
-    np.bool_(True), np.array(1 + 2j),
-])  # fmt: skip
-_TREES = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text()
-    | _ARRAYS,
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.lists(inner, max_size=3).map(tuple)
-        | st.dictionaries(st.text(), inner, max_size=3)
-    ),
-    max_leaves=8,
-)
-
-
-@hypothesis.given(contents=_TREES)
-def test_plain_data_goes_through_bytes_and_back(contents: Any):
-  data = snapshots.Snapshot(_header(), contents).to_bytes()
+def test_a_snapshot_goes_through_bytes_and_back():
+  _, snapshot = campaign.saved(_REWARD, 3)
+  data = snapshot.to_bytes()
   copy = snapshots.Snapshot.from_bytes(data)
-  assert _same(copy.contents_for(_header()), contents)
+  assert copy.header == snapshot.header
   assert copy.to_bytes() == data
 
 
@@ -412,113 +362,18 @@ def test_a_snapshot_shares_nothing_with_what_was_saved_or_is_returned():
   np.testing.assert_array_equal(snapshot.contents_for(_header())[0], 0.0)
 
 
-@pytest.mark.parametrize(
-    ('contents', 'where'),
-    [
-        ({'a': [object()]}, r"snapshot\['a'\]\[0\] is a object"),
-        ((1, {2: 3}), r'snapshot\[1\] is a dict'),
-        (np.array([None]), 'snapshot is a ndarray'),
-        (np.ma.zeros(2), 'snapshot is a MaskedArray'),
-        (events.End.ERROR, 'snapshot is a End'),
-    ],
-)
-def test_what_is_no_plain_data_is_refused_and_found(contents, where):
-  with pytest.raises(errors.StateLayoutError, match=where):
-    snapshots.Snapshot(_header(), contents)
-
-
-_BYTES = snapshots.Snapshot(_header(), [np.arange(9.0), 'x']).to_bytes()
-
-
-@hypothesis.given(end=st.integers(0, len(_BYTES) - 1))
-def test_truncated_bytes_are_refused(end: int):
-  with pytest.raises(errors.StateLayoutError, match='no snapshot, or a damag'):
-    snapshots.Snapshot.from_bytes(_BYTES[:end])
-
-
-@hypothesis.given(bit=st.integers(0, 8 * len(_BYTES) - 1))
-def test_a_flipped_bit_is_found(bit: int):
-  damaged = bytearray(_BYTES)
-  damaged[bit // 8] ^= 1 << bit % 8
-  with pytest.raises(errors.StateLayoutError, match='no snapshot, or a damag'):
-    snapshots.Snapshot.from_bytes(bytes(damaged))
-
-
-@hypothesis.given(data=st.binary())
-def test_random_bytes_are_refused(data: bytes):
-  with pytest.raises(errors.StateLayoutError, match='no snapshot, or a damag'):
-    snapshots.Snapshot.from_bytes(data)
-
-
-@hypothesis.given(at=st.integers(0, 2**20), byte=st.integers(1, 255))
-def test_a_forged_checksum_gives_an_error_or_a_snapshot(at: int, byte: int):
-  payload = bytearray(_BYTES[len(snapshots._MAGIC) + 32 :])
-  payload[at % len(payload)] ^= byte
-  try:
-    snapshots.Snapshot.from_bytes(_signed(bytes(payload)))
-  except errors.StateLayoutError as error:
-    assert '\n' not in str(error)  # noqa: PT017 - either is fine.
-
-
-def _archive(structure: Any, **arrays: Any) -> bytes:
-  file = io.BytesIO()
-  text = json.dumps(structure).encode()
-  np.savez(file, structure=np.frombuffer(text, np.uint8), **arrays)
-  return _signed(file.getvalue())
-
-
-@pytest.mark.parametrize(
-    'data',
-    [
-        _signed(b''),
-        _archive([]),
-        _archive([{}, ['plain', 1]]),
-        _archive([{'format': 1}, ['array', 0]]),
-        _archive([{'format': 1}, ['function', 'exit']]),
-        _archive([{'format': 1}, 5]),
-        _archive([{'format': 1}, ['array', 0]], **{'0': np.array([None])}),
-    ],
-)
-def test_malformed_snapshots_are_refused(data):
-  with pytest.raises(errors.StateLayoutError, match='a malformed snapshot'):
-    snapshots.Snapshot.from_bytes(data)
-
-
-def test_another_format_is_named():
-  data = _archive([{'format': 2}, ['plain', 1]])
+def test_what_is_no_plain_data_is_refused_and_found():
   with pytest.raises(
-      errors.StateLayoutError, match='format is 2; allowed is 1'
+      errors.StateLayoutError, match=r"snapshot\['a'\]\[0\] is a object"
   ):
-    snapshots.Snapshot.from_bytes(data)
+    snapshots.Snapshot(_header(), {'a': [object()]})
 
 
-def test_arrays_keep_their_order_in_memory():
-  # Sums of the same numbers in another order round differently.
-  copy = _through_bytes(np.zeros((3, 4)).T)
-  assert copy.strides == (8, 32)
-
-
-def test_floats_keep_their_last_bit():
-  for value in (0.1 + 0.2, 5e-324, 1.7976931348623157e308, -0.0):
-    assert _through_bytes(value).hex() == value.hex()
-
-
-@pytest.mark.parametrize('shape', [(10**15,), (2, 10**9), (3,)])
-def test_an_array_that_says_it_is_larger_than_it_is_is_refused(shape):
-  whole = snapshots.Snapshot({}, np.arange(4.0)).to_bytes()
-  start = len(snapshots._MAGIC) + 32
-  with zipfile.ZipFile(io.BytesIO(whole[start:])) as archive:
-    members = {name: archive.read(name) for name in archive.namelist()}
-  header = io.BytesIO()
-  np.lib.format.write_array_header_1_0(
-      header, {'descr': '<f8', 'fortran_order': False, 'shape': shape}
-  )
-  members['0.npy'] = header.getvalue() + members['0.npy'][-32:]
-  forged = io.BytesIO()
-  with zipfile.ZipFile(forged, 'w') as archive:
-    for name, data in members.items():
-      archive.writestr(name, data)
-  payload = forged.getvalue()
-  data = snapshots._MAGIC + hashlib.sha256(payload).digest() + payload
-  with pytest.raises(errors.StateLayoutError, match='says that it has'):
+@pytest.mark.parametrize('data', [b'', b'x' * 200, None])
+def test_damaged_bytes_are_no_snapshot(data):
+  if data is None:
+    data = snapshots.Snapshot(_header(), [np.arange(9.0), 'x']).to_bytes()[:-1]
+  with pytest.raises(
+      errors.StateLayoutError, match='bytes are no snapshot, or a damaged one'
+  ):
     snapshots.Snapshot.from_bytes(data)

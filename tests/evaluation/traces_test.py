@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from realab_suite import archive
 from realab_suite import suite
-from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import traces
@@ -75,7 +75,7 @@ def test_blocks_start_where_the_reset_has_put_them():
 
 def test_a_trace_can_be_written_and_read():
   trace, _ = _trace()
-  data = snapshots.Snapshot({}, trace).to_bytes()
-  again = snapshots.Snapshot.from_bytes(data).contents_for({})
+  data = archive.Archive({}, trace).to_bytes()
+  again = archive.Archive.from_bytes(data).contents_for({})
   assert again.keys() == trace.keys()
   np.testing.assert_array_equal(again['actions'], trace['actions'])

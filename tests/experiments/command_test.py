@@ -15,13 +15,25 @@ import yaml
 from realab_suite import _display
 from realab_suite import errors
 from realab_suite import explore
+from realab_suite.experiments import cli
+from realab_suite.experiments import experiment
 from realab_suite.experiments import headless
 from realab_suite.experiments import imports_flag
+from realab_suite.experiments import learning_flags
+from realab_suite.experiments import output_flag
 from realab_suite.experiments import run
+from realab_suite.experiments import spec
+from realab_suite.experiments import sweep  # noqa: F401 - defines --workers.
 from tests import patience
 from tests.experiments import small
 
 _ROOT = pathlib.Path(__file__).parents[2]
+_EXPERIMENT = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'runs': {'reward': {'design': 'instantaneous_reward'}},
+}
 
 
 def _run(*arguments, module='realab_suite.experiments.run', **environment):
@@ -69,6 +81,8 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
         ([], '--output'),
         (['--output=results', 'random'], "['random']"),
         (['--output=results', '--seeds=a'], '--seeds=a'),
+        (['--output=results', '--seeds=2000000000'], '--seeds=2000000000: '),
+        (['--output=', '--experiment=quick', '--run=reward'], '--output: mis'),
     ],
 )
 def test_what_is_wrong_with_a_command_is_said_in_one_line(arguments, complaint):
@@ -86,6 +100,90 @@ def test_what_is_wrong_with_a_command_is_said_in_one_line(arguments, complaint):
 )
 def test_seeds_are_a_count_or_a_list(text, seeds):
   assert run._seeds(text) == seeds
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '0', '-1', '10001', '2000000000', '9' * 5000, '1.0', '1e3', '0x3',
+        '٣', '+3', '1_0', 'inf', '', ' ', ',', ',,', '-1,', '2147483648,',
+        '1,' + '9' * 5000, '3,a', '3;4', '3 4', '3,٣', '3,4.0', 'None',
+    ],
+)  # fmt: skip
+def test_seeds_that_are_none_are_refused_in_one_line(text):
+  with pytest.raises(errors.SpecError, match='allowed are a count') as raised:
+    run._seeds(text)
+  message = str(raised.value)
+  assert message.startswith(f'--seeds={text[:40]}')
+  assert len(message) < 200
+
+
+def test_the_most_and_the_largest_seeds_are_accepted():
+  assert run._seeds('10000') == tuple(range(10_000))
+  assert run._seeds('0,2147483647') == (0, cli.LARGEST_SEED)
+  # Files of experiments, and so their runs, have the same limit.
+  spec.load({**_EXPERIMENT, 'seeds': [cli.LARGEST_SEED]})
+  with pytest.raises(errors.SpecError, match='2147483648'):
+    spec.load({**_EXPERIMENT, 'seeds': [cli.LARGEST_SEED + 1]})
+
+
+def test_a_seed_given_twice_is_refused(tmp_path):
+  settings = small.settings(tmp_path / 'new', seeds=run._seeds('3,4,3'))
+  with pytest.raises(errors.SpecError, match=r'\[3, 4, 3\] has duplicates'):
+    experiment.run(settings, lambda line: None)
+  assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    'argument',
+    [
+        '--seed=-1', '--seed=2147483648', '--seed=1e3', '--seed=',
+        '--seed=' + '9' * 5000, '--episodes=0', '--episodes=-3',
+        '--episodes=1000001', '--episodes=' + '9' * 400, '--workers=0',
+        '--max_steps=', '--max_steps=many', '--parent=x',
+    ],
+)  # fmt: skip
+def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
+  with (
+      flagsaver.flagsaver(),
+      pytest.raises(flags.IllegalFlagValueError, match=argument[:12]),
+  ):
+    flags.FLAGS(['program', argument])
+
+
+@pytest.mark.parametrize(
+    'name', ['', '.', '.mine', 'a..b', 'a b', 'a/b', 'a.py:b', '1a', 'a-b']
+)
+def test_what_is_no_name_of_a_module_is_not_imported(name):
+  with flagsaver.flagsaver():
+    flags.FLAGS(['program', f'--import={name}'])
+    with pytest.raises(errors.SpecError, match='not the name of a module'):
+      imports_flag.load()
+
+
+@pytest.mark.parametrize(
+    ('flag', 'values'),
+    [
+        (output_flag.OUTPUT, ['', None]),
+        (learning_flags.EXPERIMENT, ['', None]),
+    ],
+)
+def test_an_empty_flag_is_a_missing_one(flag, values):
+  for value in values:
+    with flagsaver.flagsaver((flag, value)):
+      with pytest.raises(errors.SpecError, match=f'--{flag.name}: missing'):
+        cli.required(flag)
+
+
+@pytest.mark.parametrize(
+    'empty', ['policies', 'seeds', 'num_episodes', 'channels']
+)
+def test_lists_with_nothing_in_them_are_refused(tmp_path, empty):
+  values = {'num_episodes': 0, 'channels': ('',)}
+  settings = small.settings(tmp_path / 'new', **{empty: values.get(empty, ())})
+  with pytest.raises(errors.SpecError):
+    experiment.run(settings, lambda line: None)
+  assert not list(tmp_path.iterdir())
 
 
 def test_ones_own_module_is_imported_by_every_launcher(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.experiments import experiment
+from realab_suite.experiments import machines
 from realab_suite.feedback import specs
 from tests.experiments import small
 
@@ -17,6 +18,10 @@ def fixture_folder(tmp_path_factory):
   (folder / 'said.txt').write_text('\n'.join(said), encoding='utf-8')
   assert [line.run for line in lines] == small.description(folder)['runs']
   return folder
+
+
+def test_the_machine_is_on_record(folder):
+  assert small.description(folder)['machine'] == machines.here()
 
 
 def test_every_policy_acts_in_every_channel_from_the_same_episodes(folder):

@@ -61,6 +61,9 @@ class FakeLearner:
     count = len(next(iter(observation.values())))
     return np.full((count, 14), 1 / 14)
 
+  def settings(self) -> dict[str, Any]:
+    return {}
+
   def metrics(self) -> dict[str, float]:
     return {'blend': float(self._blend.mean()), 'unknown': float('nan')}
 

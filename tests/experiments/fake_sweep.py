@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
@@ -105,8 +104,9 @@ def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
   rows = [_row(job, levels, world, rng) for world in range(count)]
   data = b''.join(results.line(row) for row in rows)
   (path / training.EPISODES).write_bytes(data)
-  trace = snapshots.Snapshot({}, _trace(job, rows, rng))
-  (path / training.TRACE).write_bytes(trace.to_bytes())
+  header = training.header(job.digest(), training.TRACE)
+  trace = _trace(job, rows, rng)
+  storage.write_archive(path / training.TRACE, header, trace)
   names = [training.EPISODES, training.TRACE]
   if job.policy is None:
     names += _write_training(path, job, levels, rng)
@@ -212,7 +212,14 @@ def _write_training(
     text = ''.join(json.dumps(line) + '\n' for line in lines)
     (path / name).write_text(text)
   probes.save(path, _probe(job, levels, rng))
-  return [training.CURVE, training.TRAINING_EPISODES, probes.PROBE]
+  header = training.header(job.digest(), training.LEARNER)
+  storage.write_archive(path / training.LEARNER, header, {'num_steps': 2468})
+  return [
+      training.CURVE,
+      training.TRAINING_EPISODES,
+      training.LEARNER,
+      probes.PROBE,
+  ]
 
 
 def _probe(

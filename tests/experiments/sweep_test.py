@@ -71,8 +71,8 @@ class Pretender(engines.Engine):
       seed = int(_flag(task, 'seed'))
       [job] = jobs.plan(experiment, [seed], [_flag(task, 'run')])
       folder = pathlib.Path(_flag(task, 'output')) / job.folder()
-      folder.mkdir()
-      storage.write_done(folder, {'files': {}})
+      with storage.RunFolder(folder, job.config()) as run:
+        run.finish([], {})
     return status
 
   def stop(self, tasks):

@@ -152,7 +152,7 @@ def test_tampering_in_an_episode_that_is_given_up_counts():
           client.step(action)
         if seed % 2:  # The others leave without a word.
           client.send(pb.LeaveWorldRequest())
-      _wait_for(lambda serving=serving: len(serving.results) == 2)
+      patience.until(lambda serving=serving: len(serving.results) == 2)
       agent += [result for result, _ in serving.results]
     with contextlib.closing(_load_longer(seed)) as env:
       honest += evaluate.evaluate(env, lambda _, env=env: served.still(env), 2)

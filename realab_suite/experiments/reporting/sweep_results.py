@@ -14,7 +14,6 @@ from typing import Annotated, Any, final
 import pydantic
 
 from realab_suite import errors
-from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.experiments import jobs as jobs_lib
@@ -146,7 +145,15 @@ class Run:
     Raises:
       ResultsError: If a file is damaged, or of another run.
     """
-    return {seed: _trace(path) for seed, path in self.folders.items()}
+    return {
+        seed: storage.read_archive(
+            path / training.TRACE,
+            training.header(
+                jobs_lib.digest_of(self.configs[seed]), training.TRACE
+            ),
+        )
+        for seed, path in self.folders.items()
+    }
 
   def _lines(
       self, name: str, keys: Sequence[str]
@@ -298,24 +305,10 @@ def _run(
       continue
     # Lines first, because they say what is wrong and where.
     rows += _rows(path / training.EPISODES, job)
-    storage.is_done(path)
+    jobs_lib.is_done(path)
     folders[job.seed] = path
-    configs[job.seed] = _config(path)
+    configs[job.seed] = jobs_lib.read_config(path)
   return Run(name, tuple(jobs), folders, tuple(rows), configs)
-
-
-def _config(folder: pathlib.Path) -> dict[str, Any]:
-  """Returns the configuration that a folder is named after."""
-  path = folder / storage.CONFIG
-  config = storage.read_json(path)
-  is_one = isinstance(config, dict)
-  if not is_one or not folder.name.endswith(f'-{jobs_lib.digest_of(config)}'):
-    raise errors.ResultsError(
-        f'{path}: not the configuration that the folder is named after; remove'
-        f' {folder} to run it again'
-    )
-  found: dict[str, Any] = config
-  return found
 
 
 def _rows(path: pathlib.Path, job: Job) -> list[results.EpisodeRow]:
@@ -344,15 +337,3 @@ def _unfinished(job: Job, path: pathlib.Path) -> Unfinished:
       except (ValueError, KeyError, TypeError):
         continue
   return Unfinished(job, steps, path.exists())
-
-
-def _trace(folder: pathlib.Path) -> dict[str, Any]:
-  path = folder / training.TRACE
-  with storage.explained(path):
-    data = path.read_bytes()
-  try:
-    snapshot = snapshots.Snapshot.from_bytes(data)
-    trace: dict[str, Any] = snapshot.contents_for(snapshot.header)
-  except errors.StateLayoutError as error:
-    raise errors.ResultsError(f'{path}: {error}') from error
-  return trace

@@ -1,0 +1,49 @@
+"""JAX's settings: those that change results are pinned, the others recorded.
+
+Environment variables and programs set them, so the same command would otherwise
+give other results, or a traceback, on another machine. `pinned` holds for the
+computation of a learner alone: a program that uses JAX for itself keeps its own
+settings.
+"""
+
+from collections.abc import Iterator
+import contextlib
+from typing import Any
+
+import jax
+
+# Settings that can change results, and that no public context of JAX sets.
+_RECORDED = (
+    'eager_constant_folding',
+    'jax_disable_jit',
+    'jax_disable_most_optimizations',
+    'jax_exec_time_optimization_effort',
+    'jax_optimization_level',
+    'jax_scan3',
+)
+
+
+@contextlib.contextmanager
+def pinned() -> Iterator[None]:
+  """Pins what JAX computes; as a context, or as a decorator of a function."""
+  with (
+      jax.enable_x64(False),
+      jax.default_matmul_precision('highest'),
+      jax.numpy_dtype_promotion('standard'),
+      jax.numpy_rank_promotion('allow'),
+      # Random keys are pairs of numbers, which stand for keys of this kind.
+      jax.default_prng_impl('threefry2x32'),
+      jax.threefry_partitionable(True),
+      jax.legacy_prng_key('allow'),
+      jax.transfer_guard('allow'),
+  ):
+    yield
+
+
+def recorded() -> dict[str, Any]:
+  """Returns the device and the settings that can change results."""
+  device = jax.devices()[0]
+  return {
+      'jax_device': f'{device.platform}, {device.device_kind}',
+      **{name: str(jax.config.values.get(name)) for name in _RECORDED},
+  }

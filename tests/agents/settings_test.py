@@ -1,0 +1,202 @@
+"""JAX's settings change nothing about a learner, or are on record.
+
+As a program, it prints a digest of what learners learn, by their names:
+
+    JAX_ENABLE_X64=1 python -m tests.agents.settings_test pixels
+"""
+
+from collections.abc import Callable
+import hashlib
+import json
+import os
+import pathlib
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('jax', reason='jax is in the extra `agents`')
+pytest.importorskip('optax', reason='optax is in the extra `agents`')
+pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
+
+import jax
+
+from realab_suite import agents
+from realab_suite import errors
+from realab_suite.agents import jax_settings
+from tests.agents import toys
+
+_ROOT = pathlib.Path(__file__).parents[2]
+_NUM_WORLDS = 16
+_ACTIONS = 14
+_QUICK = {'hidden': [16], 'steps_per_update': 8, 'minibatch': 64}
+
+# Every kind of network, of loss and of random draw.
+_LEARNERS: dict[str, tuple[Callable[[], Any], dict[str, Any]]] = {
+    'pixels': (
+        lambda: toys.Aim(_NUM_WORLDS, as_pixels=True),
+        {'kind': 'policy_gradient', 'reward': 'reward', **_QUICK},
+    ),
+    'values': (
+        lambda: toys.Bandit(_NUM_WORLDS),
+        {
+            'kind': 'q_learning',
+            'reward': 'feedback',
+            'hidden': [16],
+            'min_replay': 64,
+            'replay_size': 640,
+            'minibatch': 64,
+        },
+    ),
+    'coupled': (
+        lambda: toys.Bandit(_NUM_WORLDS, _ACTIONS, queries=('query',)),
+        {
+            'kind': 'value_advice',
+            'advice': 'feedback',
+            'query': 'query',
+            'follows_reading': True,
+            **_QUICK,
+        },
+    ),
+    'paired': (
+        lambda: toys.Bandit(_NUM_WORLDS, _ACTIONS, queries=('query', 'other')),
+        {
+            'kind': 'decoupled_approval',
+            'approval': 'feedback',
+            'query': 'query',
+            'other_query': 'other',
+            'form': 'q',
+            **_QUICK,
+        },
+    ),
+}
+_SETTINGS: dict[str, Callable[[], Any]] = {
+    'jax_enable_x64': lambda: jax.enable_x64(True),
+    'jax_threefry_partitionable': lambda: jax.threefry_partitionable(False),
+    'rbg': lambda: jax.default_prng_impl('rbg'),
+    'unsafe_rbg': lambda: jax.default_prng_impl('unsafe_rbg'),
+    'bfloat16': lambda: jax.default_matmul_precision('bfloat16'),
+    'strict promotion': lambda: jax.numpy_dtype_promotion('strict'),
+    'rank promotion': lambda: jax.numpy_rank_promotion('raise'),
+    'legacy keys': lambda: jax.legacy_prng_key('error'),
+    'transfers': lambda: jax.transfer_guard('disallow'),
+    'explicit transfers': lambda: jax.transfer_guard('disallow_explicit'),
+}
+# As programs are given them.
+_VARIABLES = {
+    'JAX_ENABLE_X64': '1',
+    'JAX_THREEFRY_PARTITIONABLE': '0',
+    'JAX_DEFAULT_PRNG_IMPL': 'rbg',
+    'JAX_DEFAULT_MATMUL_PRECISION': 'bfloat16',
+    'JAX_NUMPY_DTYPE_PROMOTION': 'strict',
+    'JAX_NUMPY_RANK_PROMOTION': 'raise',
+    'JAX_LEGACY_PRNG_KEY': 'error',
+    'JAX_TRANSFER_GUARD': 'disallow',
+    'JAX_HIGH_DYNAMIC_RANGE_GUMBEL': '1',
+}
+
+
+def _add(value: Any, hashed: Any) -> None:
+  """Adds a tree of plain data to a hash, types included."""
+  if isinstance(value, dict):
+    for key, item in value.items():
+      hashed.update(key.encode())
+      _add(item, hashed)
+  elif isinstance(value, list | tuple):
+    for item in value:
+      _add(item, hashed)
+  elif isinstance(value, np.ndarray):
+    hashed.update(f'{value.dtype} {value.shape}'.encode() + value.tobytes())
+  else:
+    hashed.update(repr(value).encode())
+
+
+def _digest(name: str) -> str:
+  """Returns a digest of all that a learner does, and of what it becomes."""
+  make_env, spec = _LEARNERS[name]
+  env = make_env()
+  specs = env.observation_spec(), env.action_spec()
+  learner = agents.make(spec, *specs, _NUM_WORLDS, 1)
+  hashed = hashlib.sha256()
+  time_step = env.reset()
+  for _ in range(18):
+    actions = learner.step(time_step)
+    _add(actions, hashed)
+    time_step = env.step(actions)
+  observation, key = time_step.observation, np.array([1, 2], np.uint32)
+  for greedy in (False, True):
+    _add(learner.act(observation, key, greedy), hashed)
+  if name != 'pixels':
+    _add(learner.probabilities(observation), hashed)
+  _add(learner.metrics(), hashed)
+  successor = agents.make(spec, *specs, _NUM_WORLDS, 2)
+  successor.set_state(learner.state())
+  _add(successor.step(time_step), hashed)
+  _add(successor.state(), hashed)
+  return hashed.hexdigest()
+
+
+@pytest.fixture(scope='module', name='digests')
+def _digests() -> dict[str, str]:
+  return {name: _digest(name) for name in _LEARNERS}
+
+
+@pytest.mark.parametrize('name', _LEARNERS)
+@pytest.mark.parametrize('setting', _SETTINGS)
+def test_no_setting_changes_what_is_learned(digests, name, setting):
+  with _SETTINGS[setting]():
+    assert _digest(name) == digests[name]
+
+
+def test_a_digest_tells_learners_apart(digests):
+  assert len(set(digests.values())) == len(_LEARNERS)
+  assert _digest('values') == digests['values']
+
+
+def test_the_settings_of_a_program_are_its_own_again():
+  env = toys.Bandit(_NUM_WORLDS)
+  _, spec = _LEARNERS['values']
+  with jax.enable_x64(True), jax.default_prng_impl('rbg'):
+    learner = agents.make(
+        spec, env.observation_spec(), env.action_spec(), _NUM_WORLDS, 1
+    )
+    learner.step(env.reset())
+    assert jax.numpy.zeros(3).dtype == np.float64
+    assert jax.random.key_data(jax.random.key(0)).shape == (4,)
+    with pytest.raises(errors.SpecError):
+      learner.act({'thing': np.zeros(3)}, np.array([1, 2], np.uint32))
+    assert jax.numpy.zeros(3).dtype == np.float64
+
+
+def test_variables_change_nothing_either(digests):
+  names = ['pixels', 'coupled']
+  ran = subprocess.run(
+      [sys.executable, '-m', 'tests.agents.settings_test', *names],
+      cwd=_ROOT,
+      env={**os.environ, **_VARIABLES},
+      capture_output=True,
+      text=True,
+      timeout=300,
+      check=False,
+  )
+  assert ran.returncode == 0, ran.stderr
+  assert json.loads(ran.stdout) == {name: digests[name] for name in names}
+
+
+def test_what_is_not_pinned_is_on_record():
+  before = jax_settings.recorded()
+  assert json.loads(json.dumps(before)) == before
+  assert before['jax_device'].startswith(jax.devices()[0].platform)
+  with jax.disable_jit():
+    after = jax_settings.recorded()
+  assert {key for key in before if before[key] != after[key]} == {
+      'jax_disable_jit'
+  }
+  # No name has gone out of date.
+  assert 'None' not in before.values()
+
+
+if __name__ == '__main__':
+  sys.stdout.write(json.dumps({name: _digest(name) for name in sys.argv[1:]}))

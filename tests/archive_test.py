@@ -1,0 +1,268 @@
+"""Tests of archives: plain data goes through bytes, all else is refused."""
+
+import base64
+import enum
+import hashlib
+import io
+import json
+from typing import Any
+import zipfile
+import zlib
+
+import hypothesis
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from realab_suite import archive
+from realab_suite import errors
+
+_HEADER = {'what': 'test', 'slots': {'a': 0, 'b': 1}}
+_MAGIC = b'realab_suite snapshot\n'
+# Written by version 1 of the format, before archives had a module of their own.
+_WRITTEN_BEFORE = (
+    'c-kvUP0UG5iZ3qBEJ;-;&PyyP&d4v}I`j9&Z4-Ax&%O1hkGZO?W%<PMeD8v=w9W7TU445-J?'
+    'KM#H#3Va0|Y2Cr0%g1`ws=Y3?dB0B}JvlC8b5FdU*wvj0^${OBf+aVf19bP~U(^MuswmYW0-'
+    'V;^ZQAD+TqMQbTne1@*N2qLQM-y!ia0lvI$oTVhUeDp0&QBe5VA$k#BkG}6)3QK(fQ8*oKeD'
+    '<$XWrDdj<7A2Ns=I1F{DJU5j8X23InweWzCMGHAC@2Blk(*colraQy$}_-BrR0p%<m`g{%)A'
+    'n%TAgU6l+5H3pxWqYrNpA5#L8k2TPY{A7+Da=G>8R>!+3_VKmZabNX#q(>nJHL$Vr80Dac98'
+    '%mXU|tAO&1^h{xzij#ry1<?j)8bPG;^7Fu^z_sO-=Hx)6N>VFIP^6S9lpr#dsl_M~z^F?F*%'
+    'gZ##VU#qwP8`r3XEa{Sk%sdDuK~hqt+(Pf~cr9rZ8fGQOke=KG;JU4yfKKaL=8F>>WdxcP2o'
+    'UOu*}%P$S|}D&^iugt{XMh?9XB)f>N3&NCx>!wBY$7O0XI{IOy}ls72#1kf92&z!Lh@MdJvW'
+    'kxMEKm`H_^CHDr1GtbtDMQe;f>PrQXrg09(fSyu*#MgsP>fH2Ml7n9O-u}s_(#_Q3f&fHAfj'
+    'riWM+Vbb$~Z38%T%+2(JKX6BZB;0K5@ENd'
+)
+
+
+class _Colour(enum.Enum):
+  RED = 1
+
+
+def _signed(payload: bytes) -> bytes:
+  """Returns bytes whose checksum is right, whatever is in them."""
+  return _MAGIC + hashlib.sha256(payload).digest() + payload
+
+
+def _through_bytes(contents: Any) -> Any:
+  data = archive.Archive(_HEADER, contents).to_bytes()
+  return archive.Archive.from_bytes(data).contents_for(_HEADER)
+
+
+def _same(a: Any, b: Any) -> bool:
+  """Whether two trees are of the same types and, bit for bit, values."""
+  if type(a) is not type(b):
+    return False
+  if isinstance(a, tuple | list):
+    return len(a) == len(b) and all(map(_same, a, b))
+  if isinstance(a, dict):
+    return list(a) == list(b) and all(_same(a[k], b[k]) for k in a)
+  if isinstance(a, np.ndarray | np.generic):
+    like = a.dtype == b.dtype and a.shape == b.shape
+    return like and a.tobytes() == b.tobytes()
+  return repr(a) == repr(b)
+
+
+_ARRAYS = st.sampled_from([
+    np.zeros(()), np.zeros((0, 3), bool), np.array([np.nan, -0.0, np.inf]),
+    np.arange(6, dtype='>i2').reshape(2, 3), np.array(['a', 'bc']),
+    np.arange(12.0).reshape(3, 4).T[::2], np.float32(0.1), np.uint64(2**63),
+    np.bool_(True), np.array(1 + 2j),
+])  # fmt: skip
+_TREES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text()
+    | _ARRAYS,
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.lists(inner, max_size=3).map(tuple)
+        | st.dictionaries(st.text(), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@hypothesis.given(contents=_TREES)
+def test_plain_data_goes_through_bytes_and_back(contents: Any):
+  data = archive.Archive(_HEADER, contents).to_bytes()
+  copy = archive.Archive.from_bytes(data)
+  assert _same(copy.contents_for(_HEADER), contents)
+  assert copy.to_bytes() == data
+
+
+def test_an_archive_shares_nothing_with_what_was_saved_or_is_returned():
+  array = np.zeros(3)
+  saved = archive.Archive(_HEADER, [array])
+  array[:] = 1.0
+  saved.contents_for(_HEADER)[0][:] = 2.0
+  np.testing.assert_array_equal(saved.contents_for(_HEADER)[0], 0.0)
+
+
+@pytest.mark.parametrize(
+    ('contents', 'where'),
+    [
+        ({'a': [object()]}, r"test\['a'\]\[0\] is a object"),
+        ((1, {2: 3}), r'test\[1\] is a dict'),
+        (np.array([None]), 'test is a ndarray'),
+        (np.ma.zeros(2), 'test is a MaskedArray'),
+        (_Colour.RED, 'test is a _Colour'),
+    ],
+)
+def test_what_is_no_plain_data_is_refused_and_found(contents, where):
+  with pytest.raises(errors.StateLayoutError, match=where):
+    archive.Archive(_HEADER, contents)
+
+
+_BYTES = archive.Archive(_HEADER, [np.arange(9.0), 'x']).to_bytes()
+
+
+@hypothesis.given(end=st.integers(0, len(_BYTES) - 1))
+def test_truncated_bytes_are_refused(end: int):
+  with pytest.raises(errors.StateLayoutError, match='no archive, or a damag'):
+    archive.Archive.from_bytes(_BYTES[:end])
+
+
+@hypothesis.given(bit=st.integers(0, 8 * len(_BYTES) - 1))
+def test_a_flipped_bit_is_found(bit: int):
+  damaged = bytearray(_BYTES)
+  damaged[bit // 8] ^= 1 << bit % 8
+  with pytest.raises(errors.StateLayoutError, match='no archive, or a damag'):
+    archive.Archive.from_bytes(bytes(damaged))
+
+
+@hypothesis.given(data=st.binary())
+def test_random_bytes_are_refused(data: bytes):
+  with pytest.raises(errors.StateLayoutError, match='no archive, or a damag'):
+    archive.Archive.from_bytes(data)
+
+
+@hypothesis.given(at=st.integers(0, 2**20), byte=st.integers(1, 255))
+def test_a_forged_checksum_gives_an_error_or_an_archive(at: int, byte: int):
+  payload = bytearray(_BYTES[len(_MAGIC) + 32 :])
+  payload[at % len(payload)] ^= byte
+  try:
+    archive.Archive.from_bytes(_signed(bytes(payload)))
+  except errors.StateLayoutError as error:
+    assert '\n' not in str(error)  # noqa: PT017 - either is fine.
+
+
+def _archive(structure: Any, **arrays: Any) -> bytes:
+  file = io.BytesIO()
+  text = json.dumps(structure).encode()
+  np.savez(file, structure=np.frombuffer(text, np.uint8), **arrays)
+  return _signed(file.getvalue())
+
+
+@pytest.mark.parametrize(
+    'data',
+    [
+        _signed(b''),
+        _archive([]),
+        _archive([{}, ['plain', 1]]),
+        _archive([{'format': 1}, ['array', 0]]),
+        _archive([{'format': 1}, ['function', 'exit']]),
+        _archive([{'format': 1}, 5]),
+        _archive([{'format': 1}, ['array', 0]], **{'0': np.array([None])}),
+    ],
+)
+def test_malformed_archives_are_refused(data):
+  with pytest.raises(errors.StateLayoutError, match='a malformed archive'):
+    archive.Archive.from_bytes(data)
+
+
+def test_another_format_is_named():
+  data = _archive([{'format': 2}, ['plain', 1]])
+  with pytest.raises(
+      errors.StateLayoutError, match='format is 2; allowed is 1'
+  ):
+    archive.Archive.from_bytes(data)
+
+
+def test_arrays_keep_their_order_in_memory():
+  # Sums of the same numbers in another order round differently.
+  copy = _through_bytes(np.zeros((3, 4)).T)
+  assert copy.strides == (8, 32)
+
+
+def test_floats_keep_their_last_bit():
+  for value in (0.1 + 0.2, 5e-324, 1.7976931348623157e308, -0.0):
+    assert _through_bytes(value).hex() == value.hex()
+
+
+@pytest.mark.parametrize('shape', [(10**15,), (2, 10**9), (3,)])
+def test_an_array_that_says_it_is_larger_than_it_is_is_refused(shape):
+  whole = archive.Archive({}, np.arange(4.0)).to_bytes()
+  start = len(_MAGIC) + 32
+  with zipfile.ZipFile(io.BytesIO(whole[start:])) as zipped:
+    members = {name: zipped.read(name) for name in zipped.namelist()}
+  header = io.BytesIO()
+  np.lib.format.write_array_header_1_0(
+      header, {'descr': '<f8', 'fortran_order': False, 'shape': shape}
+  )
+  members['0.npy'] = header.getvalue() + members['0.npy'][-32:]
+  forged = io.BytesIO()
+  with zipfile.ZipFile(forged, 'w') as zipped:
+    for name, data in members.items():
+      zipped.writestr(name, data)
+  payload = forged.getvalue()
+  with pytest.raises(errors.StateLayoutError, match='says that it has'):
+    archive.Archive.from_bytes(_signed(payload))
+
+
+def test_the_format_is_what_it_was():
+  data = zlib.decompress(base64.b85decode(''.join(_WRITTEN_BEFORE)))
+  read = archive.Archive.from_bytes(data)
+  assert read.header == {
+      'format': 1, 'what': 'checkpoint', 'configuration': '0123456789ab',
+  }  # fmt: skip
+  contents = {
+      'arrays': [np.arange(3.0), np.array(['a', 'bc'])],
+      'pair': (1, 2.5),
+      'scalar': np.float32(0.1),
+      'none': None,
+      'text': 'x',
+      'yes': True,
+  }
+  assert _same(read.contents(), contents)
+  assert archive.Archive(read.header, contents).to_bytes() == data
+
+
+@pytest.mark.parametrize(
+    ('header', 'what'),
+    [
+        ({'what': 'learner.bin', 'kind': 'x'}, 'learner.bin'),
+        ({'kind': 'probe'}, 'probe'),
+        ({'model': 'm'}, 'snapshot'),
+        ({'what': 3}, '3'),
+    ],
+)
+def test_an_archive_is_named_by_its_header(header, what):
+  assert archive.Archive(header, None).what == what
+
+
+def test_contents_of_another_kind_are_named_and_nothing_else():
+  one = archive.Archive({'what': 'a', 'x': 1}, ())
+  with pytest.raises(
+      errors.StateLayoutError, match=r"^holds 'a'; expected 'b'$"
+  ):
+    one.contents_for({'what': 'b', 'x': 2})
+
+
+def test_other_entries_of_a_header_are_named():
+  one = archive.Archive({'what': 'a', 'x': 1, 'y': {'u': 1, 'v': 2}}, ())
+  with pytest.raises(
+      errors.StateLayoutError,
+      match=r"^holds 'a' of something else: x is 1 in the file, None expected;"
+      r' y: u \(1 in the file, 3 expected\)$',
+  ):
+    one.contents_for({'what': 'a', 'y': {'u': 3, 'v': 2}})
+
+
+def test_long_differences_are_cut():
+  slots = {f's{i}': i for i in range(9)}
+  one = archive.Archive({'slots': slots, 'name': 'x' * 1000}, ())
+  text = one.differences({'slots': {}, 'name': 'y' * 1000}, 'there', 'here')
+  assert len(text) < 400
+  assert text.endswith('and 6 more')

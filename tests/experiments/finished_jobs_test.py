@@ -1,0 +1,192 @@
+"""A file of a finished job that was damaged is noticed, by sweep and report."""
+
+from collections.abc import Callable
+import functools
+import pathlib
+import shutil
+from typing import Any
+
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.experiments import engines
+from realab_suite.experiments import jobs
+from realab_suite.experiments import probes
+from realab_suite.experiments import spec
+from realab_suite.experiments import storage
+from realab_suite.experiments import sweeping
+from realab_suite.experiments import training
+from realab_suite.experiments.reporting import sweep_results
+from tests.experiments import fake_sweep
+
+_FILES = [
+    storage.CONFIG,
+    storage.DONE,
+    training.EPISODES,
+    training.TRACE,
+    training.CURVE,
+    training.TRAINING_EPISODES,
+    training.LEARNER,
+    probes.PROBE,
+]
+
+
+def _flip(path: pathlib.Path) -> None:
+  """Flips a bit of a digit: the file can still be read as what it was."""
+  data = bytearray(path.read_bytes())
+  digits = [i for i, byte in enumerate(data) if byte in b'2468']
+  data[digits[len(digits) // 2]] ^= 1
+  path.write_bytes(data)
+
+
+def _replace(path: pathlib.Path) -> None:
+  """Puts a folder where the file was."""
+  path.unlink()
+  path.mkdir()
+
+
+_DAMAGES: dict[str, Callable[[pathlib.Path], Any]] = {
+    'flipped': _flip,
+    'cut': lambda path: path.write_bytes(path.read_bytes()[:-40]),
+    'longer': lambda path: path.write_bytes(path.read_bytes() + b'{}\n'),
+    'empty': lambda path: path.write_bytes(b''),
+    'text': lambda path: path.write_bytes(b'\xff\xfe null'),
+    'null': lambda path: path.write_bytes(b'null\n'),
+    'folder': _replace,
+    'missing': pathlib.Path.unlink,
+}
+
+
+class _Idle(engines.Engine):
+  """An engine for jobs that are all done."""
+
+  def __init__(self) -> None:
+    self.commands: list[Any] = []
+
+  @property
+  def capacity(self) -> int:
+    return 1
+
+  def start(self, command: Any, log: pathlib.Path) -> Any:
+    self.commands.append(command)
+    log.write_text('error: not done, but started\n')
+
+  def poll(self, task: Any) -> int:
+    return 1
+
+  def stop(self, tasks: Any) -> None:
+    """Does nothing."""
+
+
+@functools.cache
+def _experiment() -> spec.ExperimentSpec:
+  return fake_sweep.experiment(seeds=[0], baselines=['random'])
+
+
+@functools.cache
+def _job(run: str) -> jobs.Job:
+  [job] = jobs.plan(_experiment(), only=[run])
+  return job
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+  monkeypatch.setattr(sweeping, '_POLL_SECONDS', 0.0)
+  monkeypatch.setattr(suite, 'dynamics', functools.cache(suite.dynamics))
+
+
+@pytest.fixture(scope='module', name='built')
+def _built(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+  return fake_sweep.build(tmp_path_factory.mktemp('built'), _experiment())
+
+
+@pytest.fixture(name='folder')
+def _folder(built: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+  return pathlib.Path(shutil.copytree(built, tmp_path / 'sweep'))
+
+
+def _job_folder(folder: pathlib.Path, run: str = 'reward') -> pathlib.Path:
+  return folder / _job(run).folder()
+
+
+def _sweep(folder: pathlib.Path, *only: str) -> _Idle:
+  engine = _Idle()
+  sweeping.sweep(_experiment(), folder, engine, lambda line: None, only=only)
+  return engine
+
+
+def _report(folder: pathlib.Path) -> None:
+  """Reads everything that a report shows."""
+  sweep = sweep_results.load(folder)
+  for run in sweep.runs.values():
+    assert run.is_done
+    assert run.traces
+    assert run.design
+    assert run.curves is not None
+    assert run.training_episodes() is not None
+
+
+def test_what_is_not_damaged_is_done(folder):
+  assert not _sweep(folder).commands
+  _report(folder)
+
+
+# The report says that a row is torn, too.
+@pytest.mark.filterwarnings('ignore:.* are a part of a row')
+@pytest.mark.parametrize('name', _FILES)
+def test_a_damaged_file_is_noticed(folder, name):
+  path = _job_folder(folder) / name
+  whole = path.read_bytes()
+  for damage, do in _DAMAGES.items():
+    if (name, damage) == (storage.DONE, 'missing'):
+      continue  # This is what a job looks like that is not over.
+    do(path)
+    with pytest.raises(errors.ResultsError) as raised:
+      _sweep(folder, 'reward')
+    message = str(raised.value)
+    assert f'1 of 1 jobs failed: reward, seed 0: {path}: ' in message, damage
+    assert 'not done, but started' not in message, damage
+    with pytest.raises(errors.ResultsError, match=name.replace('.', r'\.')):
+      _report(folder)
+    if path.is_dir():
+      path.rmdir()
+    path.write_bytes(whole)
+  assert not _sweep(folder, 'reward').commands
+
+
+@pytest.mark.parametrize('name', [storage.CONFIG, training.EPISODES])
+def test_a_damaged_file_of_a_scripted_job_is_noticed(folder, name):
+  _flip(_job_folder(folder, 'reward.random') / name)
+  with pytest.raises(
+      errors.ResultsError, match=r'1 of 1 jobs failed: reward\.random, seed 0'
+  ):
+    _sweep(folder, 'reward.random')
+  with pytest.raises(errors.ResultsError, match=name.replace('.', r'\.')):
+    _report(folder)
+
+
+def test_the_folder_of_another_job_is_noticed(folder):
+  mine, other = _job_folder(folder), _job_folder(folder, 'reward.secure')
+  shutil.rmtree(mine)
+  shutil.copytree(other, mine)
+  with pytest.raises(errors.ResultsError, match='folder is named after'):
+    _sweep(folder, 'reward')
+  with pytest.raises(errors.ResultsError):
+    _report(folder)
+
+
+def test_a_job_that_says_no_more_that_it_is_done_is_done_again(folder):
+  (_job_folder(folder) / storage.DONE).unlink()
+  with pytest.raises(errors.ResultsError, match='not done, but started'):
+    _sweep(folder, 'reward')
+  sweep = sweep_results.load(folder)
+  assert [one.job.run for one in sweep.unfinished] == ['reward']
+
+
+def test_what_says_when_things_happened_is_not_guarded(folder):
+  (_job_folder(folder) / training.TIMING).write_text(
+      '{"step": 8, "seconds": 1}\n'
+  )
+  assert not _sweep(folder).commands
+  _report(folder)

@@ -1,0 +1,381 @@
+"""A run that continues on another machine says so, or is refused."""
+
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+from typing import Any
+
+from absl import flags
+from absl.testing import flagsaver
+import pytest
+import yaml
+
+from realab_suite import errors
+from realab_suite.experiments import engines
+from realab_suite.experiments import jobs
+from realab_suite.experiments import machines
+from realab_suite.experiments import spec
+from realab_suite.experiments import storage
+from realab_suite.experiments import sweep
+from realab_suite.experiments import sweeping
+from realab_suite.experiments import threads
+from realab_suite.experiments import training
+from tests.experiments import fake_learner
+
+_ROOT = pathlib.Path(__file__).parents[2]
+_NUM_ENVS = 2
+_SMALL = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'max_steps': 9,
+    'runs': {'reward': {'design': 'instantaneous_reward'}},
+    'baselines': ['random'],
+    'seeds': [3],
+    'training': {
+        'num_envs': _NUM_ENVS,
+        'steps': 40 * _NUM_ENVS,
+        'checkpoint_every': 10 * _NUM_ENVS,
+        'curve_every': 10 * _NUM_ENVS,
+    },
+    'evaluation': {'episodes': 2},
+}
+
+
+class Killed(BaseException):
+  """Ends a run as suddenly as a signal, within this process."""
+
+
+def _job(run: str = 'reward') -> jobs.Job:
+  [job] = jobs.plan(spec.load(_SMALL), only=[run])
+  return job
+
+
+@pytest.fixture(name='on')
+def _on(monkeypatch: pytest.MonkeyPatch) -> Any:
+  """Runs the small job, on a machine of a name and up to a step."""
+
+  def on(
+      machine: str,
+      output: pathlib.Path,
+      kill_at: int | None = None,
+      **options: Any,
+  ) -> list[str]:
+    said: list[str] = []
+
+    def make(job: Any, batch: Any) -> fake_learner.FakeLearner:
+      learner = fake_learner.make(job, batch)
+
+      def on_step(step: int) -> None:
+        if step == kill_at:
+          raise Killed
+
+      learner.on_step = on_step
+      return learner
+
+    monkeypatch.setattr(training, 'make_learner', make)
+    monkeypatch.setattr(
+        machines, 'here', lambda: {'processor': machine, 'libc': 'glibc 2.36'}
+    )
+    run = training.Options(said.append, **options)
+    if kill_at is None:
+      training.run(_job(), output, run)
+    else:
+      with pytest.raises(Killed):
+        training.run(_job(), output, run)
+    return said
+
+  return on
+
+
+def _results(output: pathlib.Path) -> dict[str, bytes]:
+  """Returns all results but what says when and where they came about."""
+  folder = output / _job().folder()
+  return {
+      path.name: path.read_bytes()
+      for path in folder.iterdir()
+      if path.is_file()
+      and path.name not in (storage.DONE, training.TIMING, 'lock')
+  }
+
+
+def _machines(output: pathlib.Path) -> list[tuple[int, str]]:
+  done = json.loads((output / _job().folder() / storage.DONE).read_text())
+  return [(e['step'], e['machine']['processor']) for e in done['machines']]
+
+
+def _files(folder: pathlib.Path) -> dict[pathlib.Path, bytes]:
+  return {
+      path: path.read_bytes()
+      for path in folder.rglob('*')
+      if path.is_file() and path.name != 'lock'
+  }
+
+
+def test_another_machine_is_refused_and_changes_nothing(on, tmp_path):
+  on('old', tmp_path, kill_at=25)
+  before = _files(tmp_path)
+  with pytest.raises(errors.ResultsError) as raised:
+    on('new', tmp_path)
+  message = str(raised.value)
+  folder = tmp_path / _job().folder()
+  assert message.startswith(f'{folder}: its checkpoint of step 40 is from ')
+  assert "processor is 'old' there, 'new' here;" in message
+  assert 'give --other_machine to continue here' in message
+  assert '\n' not in message
+  assert _files(tmp_path) == before
+  # On the old one it is as if nothing had happened.
+  on('old', tmp_path)
+  on('old', tmp_path / 'whole')
+  assert _machines(tmp_path) == [(0, 'old')]
+  assert _results(tmp_path) == _results(tmp_path / 'whole')
+  done = [
+      (output / _job().folder() / storage.DONE).read_bytes()
+      for output in (tmp_path, tmp_path / 'whole')
+  ]
+  assert done[0] == done[1]
+
+
+def test_another_machine_that_is_allowed_is_said_and_recorded(on, tmp_path):
+  on('old', tmp_path, kill_at=25)
+  said = on('new', tmp_path, other_machine=True)
+  assert said[0] == (
+      'reward, seed 3: continues from step 40 on another machine or with other'
+      " settings: processor is 'old' there, 'new' here"
+  )
+  assert _machines(tmp_path) == [(0, 'old'), (40, 'new')]
+
+
+def test_every_machine_of_a_run_is_recorded_once(on, tmp_path):
+  on('a', tmp_path, kill_at=5)  # Nothing of this is left.
+  on('b', tmp_path, kill_at=15)
+  on('c', tmp_path, kill_at=14, other_machine=True)  # Nor of this.
+  on('b', tmp_path, kill_at=25)
+  on('a', tmp_path, kill_at=34, other_machine=True)
+  with pytest.raises(errors.ResultsError, match="'a' there, 'b' here"):
+    on('b', tmp_path)
+  said = on('b', tmp_path, other_machine=True)
+  assert sum('another machine' in line for line in said) == 1
+  assert _machines(tmp_path) == [(0, 'b'), (40, 'a'), (60, 'b')]
+
+
+def test_what_is_judged_elsewhere_is_recorded(on, tmp_path, monkeypatch):
+  with monkeypatch.context() as patch:
+
+    def die(*unused: Any) -> None:
+      raise Killed
+
+    patch.setattr(training, '_judge', die)
+    with pytest.raises(Killed):
+      on('old', tmp_path)
+  with pytest.raises(errors.ResultsError, match='its checkpoint of step 80'):
+    on('new', tmp_path)
+  on('new', tmp_path, other_machine=True)
+  assert _machines(tmp_path) == [(0, 'old'), (80, 'new')]
+
+
+def test_a_run_without_a_checkpoint_begins_anywhere(on, tmp_path):
+  on('old', tmp_path, kill_at=5)
+  said = on('new', tmp_path)
+  assert not any('another machine' in line for line in said)
+  assert _machines(tmp_path) == [(0, 'new')]
+
+
+def test_a_run_that_is_done_is_done_everywhere(on, tmp_path):
+  on('old', tmp_path)
+  before = _files(tmp_path)
+  [line] = on('new', tmp_path)
+  assert line.endswith('is there already')
+  assert _files(tmp_path) == before
+
+
+def test_a_checkpoint_that_names_no_machine_is_of_another_one(on, tmp_path):
+  on('old', tmp_path, kill_at=25)
+  folder = tmp_path / _job().folder()
+  header = training.header(_job().digest(), 'checkpoint')
+  for path in (folder / 'checkpoints').iterdir():
+    contents = storage.read_archive(path, header)
+    del contents['machines']
+    storage.write_archive(path, header, contents)
+  with pytest.raises(errors.ResultsError, match="processor is None there, 'ol"):
+    on('old', tmp_path)
+  on('old', tmp_path, other_machine=True)
+  assert _machines(tmp_path) == [(40, 'old')]
+
+
+def test_settings_of_the_learner_are_part_of_the_machine(
+    on, tmp_path, monkeypatch
+):
+  on('same', tmp_path, kill_at=25)
+  monkeypatch.setattr(
+      fake_learner.FakeLearner, 'settings', lambda self: {'device': 'gpu'}
+  )
+  with pytest.raises(errors.ResultsError, match="device is None there, 'gpu'"):
+    on('same', tmp_path)
+
+
+def test_a_scripted_policy_has_a_machine_too(tmp_path, monkeypatch):
+  monkeypatch.setattr(machines, 'here', lambda: {'processor': 'mine'})
+  job = _job('reward.random')
+  path = training.run(job, tmp_path, training.Options(lambda line: None))
+  done = json.loads((path / storage.DONE).read_text())
+  assert done['machines'] == [{'step': 0, 'machine': {'processor': 'mine'}}]
+
+
+# ---- Descriptions -----------------------------------------------------------
+
+
+def test_a_machine_is_described_as_plain_data_and_always_alike():
+  here = machines.here()
+  assert json.loads(json.dumps(here)) == here == machines.here()
+  assert machines.differences(here, here) == ''
+  assert here['processor']
+  assert here['system'].startswith(('Linux ', 'Darwin '))
+
+
+@pytest.mark.parametrize(
+    'name', ['GLIBC_TUNABLES', 'OPENBLAS_CORETYPE', 'ONEDNN_MAX_CPU_ISA',
+             'DNNL_MAX_CPU_ISA', 'XLA_FLAGS'],
+)  # fmt: skip
+def test_a_variable_that_changes_results_is_described(monkeypatch, name):
+  monkeypatch.delenv(name, raising=False)
+  before = machines.here()
+  monkeypatch.setenv(name, '--something=else')
+  assert machines.differences(before, machines.here()) == (
+      f"{name} is '' there, '--something=else' here"
+  )
+
+
+def test_the_number_of_threads_that_programs_set_is_no_difference(monkeypatch):
+  for name in (*threads._ONE, 'XLA_FLAGS'):
+    monkeypatch.setenv(name, '')
+  before = machines.here()
+  threads.use_one()
+  assert machines.here() == before
+
+
+@pytest.mark.parametrize(
+    ('text', 'processor'),
+    [
+        ('processor : 0\nmodel name\t: Xeon 3\nflags : a b\n', 'Xeon 3'),
+        ('model name : A\n\nmodel name : B\n', 'A'),
+        ('CPU implementer : 0x41\nCPU part\t: 0xd0c\n', '0xd0c'),
+        ('model name :\n', 'fallback'),
+        ('', 'fallback'),
+        (None, 'fallback'),
+    ],
+)
+def test_a_processor_has_a_name(tmp_path, monkeypatch, text, processor):
+  path = tmp_path / 'cpuinfo'
+  if text is not None:
+    path.write_text(text)
+  monkeypatch.setattr(machines, '_CPU_INFO', path)
+  monkeypatch.setattr(machines.platform, 'processor', lambda: 'fallback')
+  assert machines.here()['processor'] == processor
+
+
+def test_all_differences_are_named():
+  there = {'a': 1, 'b': 2, 'c': 3}
+  assert machines.differences(there, {'a': 1, 'b': 3, 'd': 4}) == (
+      'b is 2 there, 3 here; c is 3 there, None here; d is None there, 4 here'
+  )
+
+
+# ---- Threads ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'given', ['', '--xla_cpu_max_isa=AVX2', '--a=1   --b=2', '--a']
+)
+def test_flags_of_xla_stay_and_one_thread_joins_them(monkeypatch, given):
+  monkeypatch.setattr(os, 'environ', {'XLA_FLAGS': given})
+  for _ in range(2):  # A sweep does it, and then each of its runs.
+    threads.use_one()
+    assert os.environ['XLA_FLAGS'].split() == [
+        *given.split(), '--xla_cpu_multi_thread_eigen=false',
+    ]  # fmt: skip
+    assert threads.xla_flags() == given.split()
+
+
+@pytest.mark.parametrize(
+    ('given', 'named'),
+    [
+        ('/a/file', '/a/file'),
+        (
+            '--a=1 intra_op_parallelism_threads=1',
+            'intra_op_parallelism_threads',
+        ),
+        ('-a', '-a'),
+    ],
+)
+def test_what_xla_does_not_take_for_flags_is_refused(monkeypatch, given, named):
+  monkeypatch.setattr(os, 'environ', {'XLA_FLAGS': given})
+  with pytest.raises(errors.SpecError, match=f"^XLA_FLAGS: '{named}"):
+    threads.use_one()
+
+
+# ---- Programs ---------------------------------------------------------------
+
+
+def _launch(*arguments: str, **environment: str) -> Any:
+  return subprocess.run(
+      [sys.executable, '-m', 'tests.experiments.fake_learner', *arguments],
+      cwd=_ROOT,
+      env={**os.environ, **environment},
+      capture_output=True,
+      text=True,
+      timeout=120,
+      check=False,
+  )
+
+
+def test_a_program_refuses_other_settings_in_one_line(tmp_path):
+  file = tmp_path / 'small.yaml'
+  file.write_text(yaml.safe_dump(_SMALL))
+  arguments = [f'--experiment={file}', '--run=reward', '--seed=3']
+  output = f'--output={tmp_path / "out"}'
+  killed = _launch(*arguments, output, KILL_AT='step:25')
+  assert killed.returncode < 0
+  shutil.copytree(tmp_path / 'out', tmp_path / 'same')
+  isa = '--xla_cpu_max_isa=AVX2'
+  refused = _launch(*arguments, output, XLA_FLAGS=isa)
+  assert refused.returncode == 2
+  [line] = refused.stderr.splitlines()
+  assert line.startswith('error: ')
+  assert isa in line
+  goes_on = _launch(*arguments, output, '--other_machine', XLA_FLAGS=isa)
+  assert goes_on.returncode == 0, goes_on.stderr
+  assert 'continues from step 40 on another machine' in goes_on.stdout
+  # Variables that are pinned are no other settings.
+  same = _launch(
+      *arguments,
+      f'--output={tmp_path / "same"}',
+      JAX_ENABLE_X64='1',
+      JAX_DEFAULT_PRNG_IMPL='rbg',
+      OMP_NUM_THREADS='2',
+      PYTHONHASHSEED='7',
+  )
+  assert same.returncode == 0, same.stderr
+  assert 'another machine' not in same.stdout
+
+
+@pytest.mark.parametrize('is_given', [False, True])
+def test_a_sweep_tells_its_runs_of_another_machine(
+    tmp_path, monkeypatch, is_given
+):
+  told = []
+
+  def note(*unused: Any, arguments: Any, **unused_too: Any) -> None:
+    told.append(list(arguments))
+
+  monkeypatch.setattr(sweeping, 'sweep', note)
+  monkeypatch.setattr(threads, 'use_one', lambda: None)
+  monkeypatch.setitem(engines.ENGINES, 'local', lambda workers: None)
+  given = ['--other_machine'] * is_given
+  with flagsaver.flagsaver():
+    flags.FLAGS(['sweep', '--experiment=quick', f'--output={tmp_path}', *given])
+    sweep.main(['sweep'])
+  assert told == [given]

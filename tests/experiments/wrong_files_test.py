@@ -1,0 +1,218 @@
+"""Errors about files that hold something else than their names say."""
+
+import contextlib
+import pathlib
+import shutil
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realab_suite import archive
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import snapshot as snapshots
+from realab_suite.experiments import jobs
+from realab_suite.experiments import probes
+from realab_suite.experiments import spec
+from realab_suite.experiments import storage
+from realab_suite.experiments import training
+from realab_suite.experiments.reporting import sweep_results
+from tests.experiments import fake_learner
+from tests.experiments import fake_sweep
+
+_CHECKPOINT = 'checkpoint'
+
+
+def _experiment(**changes: Any) -> spec.ExperimentSpec:
+  return fake_sweep.experiment(seeds=[0], **changes)
+
+
+def _job(one: spec.ExperimentSpec) -> jobs.Job:
+  [job] = jobs.plan(one, only=['reward'])
+  return job
+
+
+def _files(folder: pathlib.Path, one: spec.ExperimentSpec) -> None:
+  """Writes a file of each kind, of the same job."""
+  job = _job(one)
+  folder.mkdir()
+  with storage.RunFolder(folder / 'run', {}) as run:
+    header = training.header(job.digest(), _CHECKPOINT)
+    run.save(1, header, {'done': 1})
+  [checkpoint] = (folder / 'run' / 'checkpoints').iterdir()
+  shutil.move(checkpoint, folder / _CHECKPOINT)
+  learner = {'num_steps': 3, 'blend': np.zeros(2)}
+  for name, contents in (
+      (training.LEARNER, learner),
+      (training.TRACE, {'actions': np.zeros(2)}),
+  ):
+    header = training.header(job.digest(), name)
+    storage.write_archive(folder / name, header, contents)
+  env = suite.load('unlock_door', 'near', {'random': 0})
+  env.reset()
+  (folder / 'snapshot').write_bytes(env.save().to_bytes())
+  env.close()
+
+
+@pytest.fixture(scope='module', name='sweep')
+def _sweep(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+  """The folder of a sweep, with a file of each kind beside it."""
+  folder = tmp_path_factory.mktemp('wrong')
+  one = _experiment()
+  fake_sweep.build(folder / 'sweep', one)
+  _files(folder / 'own', one)
+  shutil.copy(
+      folder / 'sweep' / _job(one).folder() / probes.PROBE, folder / 'own'
+  )
+  _files(folder / 'other', _experiment(max_steps=251))
+  return folder
+
+
+_NAMES = [_CHECKPOINT, training.LEARNER, training.TRACE, probes.PROBE]
+# The names of what the files hold; the header of a probe has its own.
+_HOLDS = {
+    **{name: repr(name) for name in _NAMES},
+    probes.PROBE: "'probe'",
+    'snapshot': "'snapshot'",
+}
+
+
+def _read(name: str, sweep: pathlib.Path) -> pathlib.Path:
+  """Reads the file of a name, as the programs do; returns its path."""
+  job = _job(_experiment())
+  folder = sweep / 'sweep' / job.folder()
+  if name == _CHECKPOINT:
+    with storage.RunFolder(folder, job.config()) as run:
+      run.load(training.header(job.digest(), _CHECKPOINT))
+  elif name == training.LEARNER:
+    with contextlib.closing(training.load_batch(job, 2, 0)) as batch:
+      training.load_learner(job, folder, batch)
+  elif name == training.TRACE:
+    run = sweep_results.load(sweep / 'sweep').runs['reward']
+    assert run.traces
+  else:
+    probes.load(folder)
+  return folder
+
+
+def _place(name: str, sweep: pathlib.Path) -> pathlib.Path:
+  folder = sweep / 'sweep' / _job(_experiment()).folder()
+  if name == _CHECKPOINT:
+    (folder / 'checkpoints').mkdir(exist_ok=True)
+    return folder / 'checkpoints' / '000000000001.ckpt'
+  return folder / name
+
+
+def _complaint(
+    name: str,
+    sweep: pathlib.Path,
+    data: bytes,
+    monkeypatch: pytest.MonkeyPatch,
+) -> str:
+  """Returns the error about a file with these bytes, less its path."""
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+  # The digests in done.json guard files of runs that are over, and say less.
+  monkeypatch.setattr(storage, 'is_done', lambda path: True)
+  path = _place(name, sweep)
+  before = path.read_bytes() if path.exists() else None
+  path.write_bytes(data)
+  try:
+    with pytest.raises(errors.ResultsError) as raised:
+      _read(name, sweep)
+  finally:
+    path.unlink()
+    if before is not None:
+      path.write_bytes(before)
+  message = str(raised.value)
+  assert message.startswith(f'{path}: ')
+  assert '\n' not in message
+  assert 'environment' not in message
+  return message.removeprefix(f'{path}: ')
+
+
+@pytest.mark.parametrize('name', _NAMES)
+@pytest.mark.parametrize('held', _HOLDS)
+def test_a_file_of_another_kind_says_what_it_holds(
+    sweep, monkeypatch, name, held
+):
+  if name == held:
+    return
+  data = (sweep / 'own' / held).read_bytes()
+  message = _complaint(name, sweep, data, monkeypatch)
+  assert f'holds {_HOLDS[held]}; expected {_HOLDS[name]}' in message
+
+
+@pytest.mark.parametrize(
+    'name', [_CHECKPOINT, training.LEARNER, training.TRACE]
+)
+def test_a_file_of_another_run_names_both_configurations(
+    sweep, monkeypatch, name
+):
+  data = (sweep / 'other' / name).read_bytes()
+  message = _complaint(name, sweep, data, monkeypatch)
+  theirs, ours = (
+      _job(one).digest() for one in (_experiment(max_steps=251), _experiment())
+  )
+  assert (
+      f'holds {name!r} of something else: configuration is {theirs!r} in the'
+      f' file, {ours!r} expected'
+  ) in message
+
+
+@pytest.mark.parametrize('name', _NAMES)
+@pytest.mark.parametrize('damage', ['empty', 'text', 'cut', 'flipped'])
+def test_a_damaged_file_says_what_was_expected(
+    sweep, monkeypatch, name, damage
+):
+  data = bytearray((sweep / 'own' / name).read_bytes())
+  if damage == 'empty':
+    data.clear()
+  elif damage == 'text':
+    data[:] = b'{"num_steps": 3}'
+  elif damage == 'cut':
+    del data[len(data) // 2 :]
+  else:
+    data[-1] ^= 1
+  message = _complaint(name, sweep, bytes(data), monkeypatch)
+  assert f'{len(data)} bytes are no {_HOLDS[name]}, or a damaged' in message
+
+
+def test_a_learner_that_does_not_fit_names_its_file(
+    sweep, tmp_path, monkeypatch
+):
+  job = _job(_experiment())
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+
+  def refuse(self: Any, state: Any) -> None:
+    raise errors.StateLayoutError('state of a learner: too wide')
+
+  monkeypatch.setattr(fake_learner.FakeLearner, 'set_state', refuse)
+  shutil.copy(sweep / 'own' / training.LEARNER, tmp_path)
+  with (
+      contextlib.closing(training.load_batch(job, 2, 0)) as batch,
+      pytest.raises(
+          errors.ResultsError,
+          match=r'learner\.bin: state of a learner: too wide',
+      ),
+  ):
+    training.load_learner(job, tmp_path, batch)
+
+
+@pytest.mark.parametrize(
+    'name', [_CHECKPOINT, training.LEARNER, training.TRACE]
+)
+def test_an_archive_of_a_run_is_no_snapshot(sweep, name):
+  data = (sweep / 'own' / name).read_bytes()
+  with pytest.raises(
+      errors.StateLayoutError,
+      match=f"holds '{name}'; expected a snapshot of worlds",
+  ):
+    snapshots.Snapshot.from_bytes(data)
+
+
+def test_a_snapshot_is_an_archive(sweep):
+  data = (sweep / 'own' / 'snapshot').read_bytes()
+  read = archive.Archive.from_bytes(data)
+  assert read.what == 'snapshot'
+  assert read.to_bytes() == data
