@@ -89,7 +89,7 @@ _DESIGN = {
             'reads': ['score'],
             'writes': ['plain', 'turned', 'planar', 'place', 'heading'],
         },
-        {'kind': 'whatever', 'writes': ['secure', 'turned']},
+        {'kind': 'whatever', 'writes': ['secure']},
     ],
 }  # fmt: skip
 

@@ -97,19 +97,26 @@ class _Scenario:
 def _design(
     *values: float, others: Mapping[str, Any] | None = None, **options: Any
 ) -> dict[str, Any]:
-  """Returns a design with a constant provider for each of the values."""
+  """Returns a design with a register and a constant provider for each value."""
   reward = {'kind': 'two_block', 'role': 'feedback', 'range': [-2, 12]}
+  more = {'bonus': [-3, 3], 'extra': [-3, 2]}
   return {
       'schema': 1,
       'name': 'golden',
       'dof': 'planar',
       'registers': {
           'reward': {**reward, 'place': [2, 2], **options},
+          **{
+              name: {**reward, 'place': place}
+              for (name, place), _ in zip(
+                  more.items(), values[1:], strict=False
+              )
+          },
           **(others or {}),
       },
       'providers': [
-          {'kind': 'constant', 'value': value, 'writes': ['reward']}
-          for value in values
+          {'kind': 'constant', 'value': value, 'writes': [name]}
+          for value, name in zip(values, ('reward', *more), strict=False)
       ],
   }
 
@@ -188,13 +195,17 @@ _SCENARIOS = {
     'the base is moved at the very end': _Scenario(
         _design(3), [0, 0], [_Move(2, _BASE, 3, True)], 0, 3, 3, 3, 0, 1, 0
     ),
-    # Of 3 and 4 the second counts; both are writes.
+    # 0, 3, 3 and 0, 4, 4: the agent's is the sum, each register has its own.
     'two providers': _Scenario(
-        _design(3, 4), [1, 1], [], 2, 8, 5, 3, 0, 0, 0
+        _design(3, 4), [1, 1], [], 2, 14, 3, 3, 0, 0, 0, register='bonus'
     ),
-    # What nobody read is not judged: 15 did not fit.
+    # 0, 12 out of 15, and 0, 4 - 1.
     'two providers, the first out of range': _Scenario(
-        _design(15, 4), [0], [_Move(1, _BASE, 1)], 0, 3, 3, 2, 0, 0.5, 0
+        _design(15, 4),
+        [0],
+        [_Move(1, _BASE, 1, register='bonus')],
+        0, 15, 2, 2, 0, 0.5, 0,
+        register='bonus',
     ),
     # Nobody mends anything: 5, then 7, 7 and 6.
     'no provider': _Scenario(

@@ -306,7 +306,7 @@ _ODD = {
     },
     'meters': [{'measures': 'score', 'writes': 'score'}],
     'providers': [
-        {'kind': 'constant', 'value': 7.0, 'writes': ['reward', 'turned']},
+        {'kind': 'constant', 'value': 7.0, 'writes': ['reward']},
         {'kind': 'difference', 'reads': ['score'], 'writes': ['turned']},
     ],
 }
