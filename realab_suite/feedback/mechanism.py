@@ -104,7 +104,9 @@ class FeedbackMechanism(composer.Entity):
     }
     root.attach(self)
     for name, place in places.items():
-      self._registers[name].attach_to(root, place.position, place.yaw)
+      self._registers[name].attach_to(
+          root, place.position, place.yaw, place.spread
+      )
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
@@ -346,11 +348,6 @@ class FeedbackMechanism(composer.Entity):
 def _make_register(
     name: str, spec: specs.RegisterSpec, design: specs.DesignSpec
 ) -> base.Register:
-  spread = (
-      spec.place.spread
-      if isinstance(spec.place, specs.PlaceSpec)
-      else (0.0, 0.0)
-  )
   kind = register_kinds.REGISTER_KINDS.get(spec.kind)
   common = dict(
       value_range=spec.range,
@@ -362,7 +359,6 @@ def _make_register(
       on_overflow=spec.on_overflow,
       block_size=spec.block_size,
       mass=spec.mass,
-      spread=spread,
   )
   for option in spec.options:
     if (

@@ -8,6 +8,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import sweeps
+from realab_suite.entities import arenas
 from realab_suite.entities import doors
 from realab_suite.entities import moving
 from realab_suite.entities import registers
@@ -228,6 +229,56 @@ def test_what_is_refused_overlaps_something(monkeypatch):
     room = obstacles.build_anyway(monkeypatch, things, named)
     assert room.deepest(2000) > 0.0
     room.env.close()
+
+
+# ---- Places that a world offers ----------------------------------------------
+
+
+def _poses(env, num_episodes=4):
+  """Returns where the blocks stand when episodes begin."""
+  poses = []
+  for _ in range(num_episodes):
+    env.reset()
+    mujoco.mj_kinematics(env.physics.model.ptr, env.physics.data.ptr)
+    for register in env.mechanism.registers.values():
+      for block in register.blocks:
+        geom = env.physics.bind(block.geom).element_id
+        poses.append(env.physics.data.geom_xpos[geom].copy())
+        poses.append(env.physics.data.geom_xmat[geom].copy())
+  return np.concatenate(poses)
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.6])
+@pytest.mark.parametrize('spread', [(0.0, 0.0), (0.5, 0.0), (0.3, 0.4)])
+@pytest.mark.parametrize('channel', registers.CHANNELS)
+@pytest.mark.parametrize(
+    'kind', ['two_block', 'block_position', 'block_orientation']
+)
+def test_a_named_place_is_what_its_numbers_are(kind, channel, spread, yaw):
+  register = {'kind': kind, 'channel': channel, 'range': [0, 1]}
+  offered = arenas.Place((0.5, 2.0), yaw, spread)
+
+  def offer(root):
+    root.offer({'spot': offered})
+
+  named = _embed(_room_with(offer), 'spot', **register)
+  place = {'position': [0.5, 2.0], 'yaw': yaw, 'spread': list(spread)}
+  numbered = _embed(_room_with(), place, **register)
+  poses = _poses(named)
+  np.testing.assert_array_equal(poses, _poses(numbered))
+  is_random = len(np.unique(np.split(poses, 4), axis=0)) > 1
+  assert is_random == any(spread)
+  named.close()
+  numbered.close()
+
+
+def test_the_region_of_a_named_place_is_checked():
+  def offer(root):
+    root.offer({'spot': arenas.Place((0.0, 2.0), 0.7, (1.0, 1.0))})
+
+  across = _barrier((-0.5, 2.6), (0.5, 2.6))
+  assert not _is_refused(_room_with(offer), 'spot', range=[0, 1])
+  assert _is_refused(_room_with(offer, across), 'spot', range=[0, 1])
 
 
 # ---- Each other's way --------------------------------------------------------
