@@ -385,8 +385,8 @@ def load(
     data = loading.parse_yaml(_shipped(design).read_bytes(), where)
   elif not isinstance(design, str | os.PathLike | Mapping):
     raise errors.SpecError(
-        f'design: {design!r:.80}; allowed are a name, a path, a mapping and a'
-        ' DesignSpec'
+        f'design: {messages.quote(design)}; allowed are a name, a path, a'
+        ' mapping and a DesignSpec'
     )
   elif isinstance(design, str) and not os.path.exists(design):
     raise errors.UnknownNameError(
