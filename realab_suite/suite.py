@@ -11,12 +11,14 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
 from realab_suite.feedback import loading
 from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import messages
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
@@ -47,8 +49,13 @@ def register_task(
     *tags: What `get_tasks_by_tag` finds it by.
 
   Raises:
-    SpecError: If there is such a task already.
+    SpecError: If a name is no text, or if there is such a task already.
   """
+  for name in (domain_name, task_name):
+    if not isinstance(name, str):
+      raise errors.SpecError(
+          f'task name {messages.quote(name)}; allowed are texts'
+      )
 
   def decorate(factory: TaskFactory) -> TaskFactory:
     if (domain_name, task_name) in _TASKS:
@@ -85,12 +92,20 @@ _register_ours()
 def _find(
     domain_name: str, task_name: str
 ) -> tuple[TaskFactory, frozenset[str]]:
-  if (domain_name, task_name) not in _TASKS:
+  are_texts = isinstance(domain_name, str) and isinstance(task_name, str)
+  if not are_texts or (domain_name, task_name) not in _TASKS:
     known = [f'{domain}.{task}' for domain, task in _TASKS]
     raise errors.UnknownNameError(
-        f'task {domain_name}.{task_name} is unknown; known are {known}'
+        f'task {_shown(domain_name)}.{_shown(task_name)} is unknown; known are'
+        f' {known}'
     )
   return _TASKS[domain_name, task_name]
+
+
+def _shown(name: Any) -> str:
+  """Returns a name as it is where that is short and one line."""
+  is_plain = isinstance(name, str) and name.isprintable() and len(name) <= 80
+  return name if is_plain else messages.quote(name)
 
 
 def get_tasks_by_tag(tag: str) -> tuple[tuple[str, str], ...]:
@@ -156,32 +171,28 @@ def load(
   Raises:
     SpecError: If a name, an argument or the design is wrong.
   """
-  if visualize_reward:
+  if visualize_reward is not False:
     raise errors.SpecError(
-        'visualize_reward=True would show the true reward to the agent; allowed'
-        ' is False'
+        f'visualize_reward={messages.quote(visualize_reward)} would show the'
+        ' true reward to the agent; allowed is False'
     )
   factory, _ = _find(domain_name, task_name)
-  for what, given in (
-      ('task_kwargs', task_kwargs),
-      ('environment_kwargs', environment_kwargs),
-  ):
-    if not isinstance(given, Mapping | None):
-      raise errors.SpecError(f'{what}: {given!r:.80}; allowed is a mapping')
-  kwargs = dict(task_kwargs or {})
+  options: dict[str, Any] = {'max_steps': MAX_STEPS}
+  options |= _keywords('environment_kwargs', environment_kwargs)
+  if unknown := [key for key in options if key not in ('max_steps', 'world')]:
+    raise errors.SpecError(
+        f'environment_kwargs: unknown {messages.quote(unknown)}; allowed are'
+        ' max_steps and world'
+    )
+  kwargs = _keywords('task_kwargs', task_kwargs)
   random = kwargs.pop('random', None)
   try:
     task = factory(**kwargs)
-  except TypeError as error:
-    raise errors.SpecError(
-        f'task_kwargs of {domain_name}.{task_name}: {error}'
-    ) from error
-  options = {'max_steps': MAX_STEPS, **(environment_kwargs or {})}
-  if unknown := set(options) - {'max_steps', 'world'}:
-    raise errors.SpecError(
-        f'environment_kwargs: unknown {sorted(unknown)}; allowed are max_steps'
-        ' and world'
-    )
+  except errors.RealabError:
+    raise
+  except Exception as error:  # It may be of any class.
+    place = messages.Place(f'task_kwargs of {domain_name}.{task_name}')
+    raise place.error(f'{type(error).__name__}: {error}') from error
   return embed(
       task,
       'none' if design is None else design,
@@ -213,8 +224,9 @@ def load_batch(
     task_name: As in `load`.
     task_kwargs: As in `load`.
     environment_kwargs: As in `load`.
-    num_envs: How many worlds.
-    num_threads: How many threads step them; 0 for all processors.
+    num_envs: Number of worlds, at most 65,536.
+    num_threads: Number of threads that step them, at most 1,024; 0 for all
+      processors.
     sleep: Whether blocks at rest fall asleep until something touches or writes
       them. That is faster, and other trajectories than `load` gives; such
       worlds cannot be saved, restored or forked.
@@ -224,11 +236,14 @@ def load_batch(
   Raises:
     SpecError: If a name, an argument or the design is wrong.
   """
-  if 'world' in (environment_kwargs or {}):
+  if 'world' in _keywords('environment_kwargs', environment_kwargs):
     raise errors.SpecError(
         'environment_kwargs: a batch has all worlds from 0 on; allowed is'
         ' max_steps'
     )
+  num_envs = arguments.num_worlds(num_envs)
+  num_threads = arguments.num_threads(num_threads)
+  sleep = arguments.flag('sleep', sleep)
   single = load(
       domain_name,
       task_name,
@@ -277,19 +292,18 @@ def embed(
   """
   if not isinstance(task, composer.Task):
     raise errors.SpecError(
-        f'task: {type(task).__name__}; allowed are Composer tasks'
+        f'task: {messages.quote(task)}; allowed are Composer tasks'
     )
-  if type(world) is not int or world < 0:
-    raise errors.SpecError(f'world: {world!r}; allowed are integers from 0 on')
+  world = arguments.world(world)
   seed = seeding.as_seed(random)
-  if max_steps is not None and (
-      isinstance(max_steps, bool)
-      or not isinstance(max_steps, int)
-      or max_steps < 1
-  ):
-    raise errors.SpecError(
-        f'max_steps: {max_steps!r}; allowed are positive integers and None'
-    )
+  max_steps = arguments.max_steps(max_steps)
+  measurements = _keywords('measurements', measurements)
+  for name, measure in measurements.items():
+    if not callable(measure):
+      raise errors.SpecError(
+          f'measurements: {messages.quote(name)}: {messages.quote(measure)};'
+          ' allowed is a function of the physics'
+      )
   mechanism = feedback_mechanism.FeedbackMechanism(
       specs.load(design, overrides)
   )
@@ -310,14 +324,14 @@ def _connected(
     seed: int,
     world: int,
     max_steps: int | None,
-    measurements: Mapping[str, Callable[[Any], Any]] | None,
+    measurements: Mapping[str, Callable[[Any], Any]],
 ) -> environment.Environment:
   """Returns the environment of a task that has a mechanism attached."""
   mechanism.connect(
       {
           'score': mechanism.score,
           **(task.measurements if isinstance(task, base.Task) else {}),
-          **(measurements or {}),
+          **measurements,
       }
   )
   if isinstance(task, base.Task):
@@ -332,6 +346,20 @@ def _connected(
       placement.check_start(env.physics, task, mechanism)
     stack.pop_all()
   return env
+
+
+def _keywords(what: str, given: Any) -> dict[str, Any]:
+  """Returns a copy of a mapping of names, empty for `None`."""
+  if given is None:
+    return {}
+  if not isinstance(given, Mapping) or not all(
+      isinstance(key, str) for key in given
+  ):
+    raise errors.SpecError(
+        f'{what}: {messages.quote(given)}; allowed is a mapping with texts as'
+        ' keys, and None'
+    )
+  return dict(given)
 
 
 def _blocks(mechanism: feedback_mechanism.FeedbackMechanism) -> list[Any]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import actions as actions_lib
+from realab_suite.engine import arguments
 from realab_suite.engine import batch_physics
 from realab_suite.engine import control_step
 from realab_suite.engine import environment
@@ -22,6 +23,7 @@ from realab_suite.engine import seeding
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import messages
 from realab_suite.tasks import base
 
 
@@ -72,16 +74,9 @@ class BatchEnvironment:
     Raises:
       SpecError: If there cannot be many of this environment.
     """
-    if type(num_worlds) is not int or num_worlds < 1:
-      raise errors.SpecError(
-          f'num_envs: {num_worlds!r}; allowed are positive integers'
-      )
-    if type(num_threads) is not int or num_threads < 0:
-      raise errors.SpecError(
-          f'num_threads: {num_threads!r}; allowed are integers from 0 on'
-      )
-    if type(sleep) is not bool:
-      raise errors.SpecError(f'sleep: {sleep!r}; allowed are True and False')
+    num_worlds = arguments.num_worlds(num_worlds)
+    num_threads = arguments.num_threads(num_threads)
+    sleep = arguments.flag('sleep', sleep)
     if not isinstance(single.task, base.Task):
       raise errors.SpecError(
           f'{type(single.task).__name__} compiles anew in each episode; a batch'
@@ -408,7 +403,7 @@ class BatchEnvironment:
         or len(set(worlds)) < len(worlds)
     ):
       raise errors.SpecError(
-          f'worlds: {worlds!r:.60}; allowed are integers from 0 to'
+          f'worlds: {messages.quote(worlds)}; allowed are integers from 0 to'
           f' {self._num_worlds - 1}, each once'
       )
     return np.array(worlds)
@@ -594,6 +589,14 @@ def fork(
       makes no sense.
     StateLayoutError: If the sinks differ, or if the compiled model was changed.
   """
+  num_envs = arguments.num_worlds(num_envs)
+  num_threads = arguments.num_threads(num_threads)
+  if not isinstance(sinks, Sequence) or not all(
+      isinstance(sink, events.BatchEventSink) for sink in sinks
+  ):
+    raise errors.SpecError(
+        f'sinks: {messages.quote(sinks)}; allowed is a list of BatchEventSinks'
+    )
   if isinstance(env, BatchEnvironment):
     if world is None:
       raise errors.SpecError(
@@ -601,12 +604,17 @@ def fork(
       )
     # To mypy, dm_control's classes are anything, and so is what derives.
     snapshot, single = BatchEnvironment.save(env, [world]), env._single
-  else:
+  elif isinstance(env, environment.Environment):
     if world is not None:
       raise errors.SpecError(
-          f'world: {world!r}; allowed is None, for the world is alone'
+          f'world: {messages.quote(world)}; allowed is None, for the world is'
+          ' alone'
       )
     snapshot, single = env.save(), env
+  else:
+    raise errors.SpecError(
+        f'env: {messages.quote(env)}; allowed are environments of this package'
+    )
   _refuse_step_hooks(single)
   # Compiled anew, which takes less time than one episode: what is closed frees
   # its compiled world.

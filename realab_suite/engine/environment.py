@@ -25,6 +25,7 @@ from realab_suite.engine import observing
 from realab_suite.engine import physics as engine_physics
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshot as snapshots
+from realab_suite.entities import state
 from realab_suite.feedback import action_sets
 from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.feedback import specs as specs_lib
@@ -491,7 +492,9 @@ class Environment(composer.Environment):
     kind = (
         engine_physics.ThinPhysics if self._is_ours else foreign.ForeignPhysics
     )
-    self._physics = kind.from_mjcf_model(self._task.root_entity.mjcf_model)
+    model = self._task.root_entity.mjcf_model
+    with state.room_for_slots(model):
+      self._physics = kind.from_mjcf_model(model)
     # Worlds of this package step from the state; see `ThinPhysics.advance`.
     self._physics.legacy_step = not self._is_ours
 

@@ -1,20 +1,39 @@
-"""Whether registers fit where a design puts them, value for value."""
+"""Whether registers fit where a design puts them, for every value and place."""
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, final
 
 from dm_control import composer
 import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import sweeps
 from realab_suite.entities import arenas
+from realab_suite.entities import moving
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.tasks import base
 
-_TOLERANCE = 1e-3
 _SOLVERS = (mujoco.mjtSolver.mjSOL_CG, mujoco.mjtSolver.mjSOL_NEWTON)
+# Geoms that are not looked at. Planes are ground, or are put into their places
+# when an episode begins, as in corridors of dm_control; the others have no
+# distances in MuJoCo.
+_LEFT_OUT = (
+    mujoco.mjtGeom.mjGEOM_PLANE,
+    mujoco.mjtGeom.mjGEOM_HFIELD,
+    mujoco.mjtGeom.mjGEOM_SDF,
+)
+# Fractions of a range at which registers are written to see where blocks go.
+# They are uneven, so that a motion to and fro is not taken for rest.
+_FEW = np.array([0.0, 0.07, 0.19, 0.3, 0.42, 0.55, 0.69, 0.81, 0.92, 1.0])
+# The same for registers whose blocks do not go straight.
+_MANY = np.linspace(0.0, 1.0, 257)
+# Deviation from a straight line that is noise, in parts of its length.
+_NOISE = 1e-9
+
+_Registers = Mapping[str, registers.Register]
+_Paths = dict[str, list[sweeps.Sweep]]
 
 
 def check(
@@ -24,8 +43,9 @@ def check(
 ) -> None:
   """Checks that no write can put a block where a block must not be.
 
-  Every register goes through its range of values, at every corner of the region
-  in which it may stand. The state is reset in the end.
+  It holds for every value and for every place of the region in which a register
+  may stand. Overlaps of up to `sweeps.TOLERANCE` are accepted. The state is
+  reset in the end.
 
   Args:
     physics: One world.
@@ -33,40 +53,36 @@ def check(
     mechanism: The feedback.
 
   Raises:
-    SpecError: If a block would be outside the arena, in something that does not
-      move, or in the way of another register; or if the solver couples meters
-      with what an agent can see.
+    SpecError: If a block would be outside the arena, in something that nothing
+      can push, or in the way of another register; or if the solver couples
+      meters with what an agent can see.
   """
   _check_solver(physics, mechanism)
-  geoms = {
-      name: [physics.bind(b.geom).element_id for b in register.blocks]
-      for name, register in mechanism.registers.items()
-  }
-  ours = [geom for ids in geoms.values() for geom in ids]
-  obstacles = [
-      geom for geom in _obstacles(physics.model.ptr) if geom not in ours
-  ]
-  boxes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-  for name, register in mechanism.registers.items():
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for value in _values(physics, register):
-      for geom in geoms[name]:
-        where = f'register {name!r} at value {value:g}'
-        _check_geom(physics, where, geom, root, obstacles)
-        centre = physics.data.geom_xpos[geom][:2]
-        reach = _reach(physics, geom)
-        low, high = (
-            np.minimum(low, centre - reach),
-            np.maximum(high, centre + reach),
-        )
-    for other, (other_low, other_high) in boxes.items():
-      if (low < other_high).all() and (other_low < high).all():
-        raise errors.SpecError(
-            f"registers {other!r} and {name!r} would be in each other's way:"
-            f' {_show(other_low, other_high)} and {_show(low, high)}; place'
-            ' them apart or narrow their ranges'
-        )
-    boxes[name] = low, high
+  space = sweeps.Space(physics.model.ptr)
+  paths = _paths(physics, mechanism.registers)
+  obstacles = _Crowd(space)
+  obstacles.add('', _obstacles(physics, root, paths))
+  blocks = _Crowd(space)
+  for name, path in paths.items():
+    for sweep in path:
+      _check_extent(name, sweep, root)
+      for _, obstacle in obstacles.near(sweep):
+        if (found := space.meet(sweep, obstacle)) is not None:
+          pose, distance = found
+          geom = physics.model.id2name(obstacle.geom, 'geom')
+          raise errors.SpecError(
+              f'{_where(name, pose)}, {-distance:.2g} m inside'
+              f' {geom or f"geom {obstacle.geom}"!r}; place it elsewhere or'
+              ' narrow its range'
+          )
+      for other, taken in blocks.near(sweep):
+        if space.meet(sweep, taken) is not None:
+          raise errors.SpecError(
+              f"registers {other!r} and {name!r} would be in each other's way:"
+              f' {_area(space, paths[other])} and {_area(space, path)}; place'
+              ' them apart or narrow their ranges'
+          )
+    blocks.add(name, path)
   physics.reset()
 
 
@@ -88,94 +104,236 @@ def check_start(
     SpecError: If a block stands where the avatar may begin.
   """
   low, high = np.array(task.start.low), np.array(task.start.high)
-  for name, register in mechanism.registers.items():
-    geoms = [physics.bind(block.geom).element_id for block in register.blocks]
-    # Where each block may be: whatever lies between the corners.
-    lows = np.full((len(geoms), 2), np.inf)
-    highs = -lows
-    for _ in _corners(physics, register):
-      mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
-      centres = physics.data.geom_xpos[geoms][:, :2]
-      reach = np.array([_reach(physics, geom) for geom in geoms])
-      lows = np.minimum(lows, centres - reach)
-      highs = np.maximum(highs, centres + reach)
-    gaps = np.maximum(np.maximum(low - highs, lows - high), 0.0)
-    for i in np.flatnonzero(np.linalg.norm(gaps, axis=1) < task.avatar.radius):
-      raise errors.SpecError(
-          f'register {name!r} would stand at {_show(lows[i], highs[i])}, where'
-          f' the avatar begins {_show(low, high)}; place it elsewhere'
-      )
+  space = sweeps.Space(physics.model.ptr)
+  # A geom of the avatar stands for all the places of the avatar's middle.
+  body = physics.bind(task.avatar.body).element_id
+  geom = int(physics.model.body_geomadr[body])
+  space.make_box(geom, np.array([*(high - low) / 2, 1.0]))
+  start = sweeps.Sweep(geom, np.array([*(low + high) / 2, 0.0]), np.eye(3))
+  for name, path in _standing(physics, mechanism.registers).items():
+    for sweep in path:
+      if space.meet(sweep, start, clearance=task.avatar.radius) is not None:
+        raise errors.SpecError(
+            f'register {name!r} would stand at {_area(space, [sweep])}, where'
+            f' the avatar begins {_show(low, high)}; place it elsewhere'
+        )
   physics.reset()
 
 
-def _corners(physics: Any, register: registers.Register) -> Iterator[None]:
-  """Puts a register, with its initial value, where it may stand."""
-  for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-    physics.reset()
-    register.settle(physics, register.spread * corner)
-    yield
-    if not register.spread.any():
-      return
+@final
+class _Crowd:
+  """Many sweeps, few of which are near any other one."""
+
+  def __init__(self, space: sweeps.Space) -> None:
+    self._space = space
+    self._members: list[tuple[str, sweeps.Sweep]] = []
+    self._bounds = np.zeros((0, 2, 3))
+
+  def add(self, name: str, path: Sequence[sweeps.Sweep]) -> None:
+    """Adds sweeps that share a name."""
+    if path:
+      bounds = [self._space.bounds(sweep) for sweep in path]
+      self._bounds = np.concatenate([self._bounds, bounds])
+      self._members += [(name, sweep) for sweep in path]
+
+  def near(self, sweep: sweeps.Sweep) -> Iterator[tuple[str, sweeps.Sweep]]:
+    """Yields the names and the sweeps that another sweep might meet."""
+    low, high = self._space.bounds(sweep)
+    is_near = (self._bounds[:, 0] <= high) & (low <= self._bounds[:, 1])
+    for i in np.flatnonzero(is_near.all(axis=1)):
+      yield self._members[i]
 
 
-def _values(physics: Any, register: registers.Register) -> Any:
-  """Puts a register into one state after the other, and yields its value."""
-  spec = register.value_spec
-  steps = 2 + int((spec.maximum - spec.minimum) * register.scale / 0.1)
-  values = np.linspace(spec.minimum, spec.maximum, min(steps, 64))
-  for corner in {(sx, sy) for sx in (-1, 1) for sy in (-1, 1)}:
-    physics.reset()
-    register.settle(physics, register.spread * corner)
-    for value in values:
-      register.write(physics, value)
-      mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
-      yield float(value)
-    if not register.spread.any():
-      return
+def _standing(physics: Any, named: _Registers) -> _Paths:
+  """Returns where the blocks of registers can be when an episode begins.
+
+  Every register is left in the middle of its region.
+  """
+  poses = []
+  for corner in ((1.0, 0.0), (0.0, 1.0), (0.0, 0.0)):
+    mujoco.mj_resetData(physics.model.ptr, physics.data.ptr)
+    physics.mark_as_dirty()
+    for register in named.values():
+      register.settle(physics, register.spread * corner)
+    mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
+    poses.append(np.array(physics.data.geom_xpos))
+  matrices = np.array(physics.data.geom_xmat).reshape(-1, 3, 3)
+  along, aside, centres = poses
+  motions = np.zeros((len(centres), 2, 5))
+  motions[:, 0, :3] = along - centres
+  motions[:, 1, :3] = aside - centres
+  return {
+      name: [
+          sweeps.Sweep(i, centres[i], matrices[i], motions[i])
+          for i in (physics.bind(b.geom).element_id for b in register.blocks)
+      ]
+      for name, register in named.items()
+  }
 
 
-def _check_geom(
-    physics: Any,
-    where: str,
-    geom: int,
-    root: composer.Entity,
-    obstacles: list[int],
-) -> None:
-  position = physics.data.geom_xpos[geom]
-  if isinstance(root, arenas.RoomArena) and not root.extent.contains(
-      position[:2]
-  ):
-    raise errors.SpecError(
-        f'{where} would sit at {_show(position[:2])}, outside the arena'
-        f' {_show(root.extent.low, root.extent.high)}'
+def _paths(physics: Any, named: _Registers) -> _Paths:
+  """Returns where the blocks of registers can be, whatever is written."""
+  standing = _standing(physics, named)
+  few = _trace(physics, named, _FEW)
+  curved = {
+      name: register
+      for name, register in named.items()
+      if not _is_straight(few[:, [sweep.geom for sweep in standing[name]]])
+  }
+  many = _trace(physics, curved, _MANY) if curved else few
+  paths: _Paths = {}
+  for name, register in named.items():
+    # From end to end where the way is straight, from sample to sample else.
+    trace = many if name in curved else few[[0, -1]]
+    spec = register.value_spec
+    values = np.linspace(spec.minimum, spec.maximum, len(trace))
+    paths[name] = [
+        leg
+        for sweep in standing[name]
+        for leg in _legs(
+            sweep,
+            np.column_stack([trace[:, sweep.geom], values]),
+            physics.model.geom_rbound[sweep.geom],
+        )
+    ]
+  return paths
+
+
+def _trace(
+    physics: Any, named: _Registers, fractions: np.ndarray
+) -> np.ndarray:
+  """Writes values of all registers, and returns where this puts geoms.
+
+  Args:
+    physics: One world.
+    named: The registers.
+    fractions: What to write, in parts of the range of each.
+
+  Returns:
+    Centre and angle about the vertical, `(fractions, geoms, 4)`.
+  """
+  trace = []
+  for fraction in fractions:
+    for register in named.values():
+      spec = register.value_spec
+      value = spec.minimum + fraction * (spec.maximum - spec.minimum)
+      register.write(physics, np.clip(value, spec.minimum, spec.maximum))
+    mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
+    matrices = physics.data.geom_xmat
+    angles = np.arctan2(matrices[:, 3], matrices[:, 0])
+    trace.append(np.column_stack([physics.data.geom_xpos, angles]))
+  traced = np.array(trace)
+  traced[..., 3] = np.unwrap(traced[..., 3], axis=0)
+  return traced
+
+
+def _is_straight(trace: np.ndarray) -> bool:
+  """Whether geoms go evenly from the first of `_FEW` to the last."""
+  way = trace[-1] - trace[0]
+  even = trace[0] + np.multiply.outer(_FEW, way)
+  return bool(np.abs(trace - even).max() <= _NOISE * (1 + np.abs(way).max()))
+
+
+def _legs(
+    sweep: sweeps.Sweep, trace: np.ndarray, radius: float
+) -> list[sweeps.Sweep]:
+  """Returns the poses of a geom as sweeps from sample to sample.
+
+  Args:
+    sweep: Its poses at the beginning of an episode.
+    trace: Centre, angle and value of each sample, `(samples, 5)`.
+    radius: Of the geom, metres.
+  """
+  # A curve is off the straight line between two samples by at most an eighth
+  # of how much it bends there; a corner is by at most half of it.
+  bend = np.zeros(len(trace))
+  bends = np.abs(np.diff(trace, 2, axis=0))
+  bend[1:-1] = np.linalg.norm(bends[:, :3], axis=1) + radius * bends[:, 3]
+  angle = np.arctan2(sweep.matrix[1, 0], sweep.matrix[0, 0])
+  legs = []
+  for i in range(len(trace) - 1):
+    middle = (trace[i] + trace[i + 1]) / 2
+    legs.append(
+        sweeps.Sweep(
+            sweep.geom,
+            middle[:3],
+            sweeps.turned(sweep.matrix, middle[3] - angle),
+            np.vstack([sweep.motions, (trace[i + 1] - trace[i]) / 2]),
+            float(middle[4]),
+            float(bend[i : i + 2].max()),
+        )
     )
-  for obstacle in obstacles:
-    distance = mujoco.mj_geomDistance(
-        physics.model.ptr, physics.data.ptr, geom, obstacle, 1.0, None
-    )
-    if distance < -_TOLERANCE:
-      name = physics.model.id2name(obstacle, 'geom') or f'geom {obstacle}'
-      raise errors.SpecError(
-          f'{where} would sit at {_show(position[:2])}, {-distance:.2g} m'
-          f' inside {name!r}; place it elsewhere or narrow its range'
-      )
+  return legs
 
 
-def _obstacles(model: mujoco.MjModel) -> list[int]:
-  """The solid geoms that nothing can push, the ground apart."""
-  ground = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
-  solid = (model.geom_contype | model.geom_conaffinity) != 0
-  bodies = model.geom_bodyid
+def _obstacles(
+    physics: Any, root: composer.Entity, paths: _Paths
+) -> list[sweeps.Sweep]:
+  """Returns the poses of solid geoms that nothing can push."""
+  mujoco.mj_resetData(physics.model.ptr, physics.data.ptr)
+  physics.mark_as_dirty()
+  mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
+  model, data = physics.model, physics.data
+  matrices = np.array(data.geom_xmat).reshape(-1, 3, 3)
+  is_solid = (model.geom_contype | model.geom_conaffinity) != 0
   # Doors and posts are moved, but not by being pushed.
-  fixed = (model.body_weldid[bodies] == 0) | (model.body_mocapid[bodies] >= 0)
-  flat = np.isin(model.geom_type, ground)
-  return list(np.flatnonzero(solid & fixed & ~flat))
+  carriers = model.body_weldid[model.geom_bodyid]
+  is_fixed = (carriers == 0) | (model.body_mocapid[carriers] >= 0)
+  is_left_out = np.isin(model.geom_type, _LEFT_OUT)
+  ours = {sweep.geom for path in paths.values() for sweep in path}
+  travels = _travels(physics, root)
+  obstacles = []
+  for geom in np.flatnonzero(is_solid & is_fixed & ~is_left_out).tolist():
+    if geom in ours:
+      continue
+    half = np.zeros(5)
+    half[:3] = np.array(travels.get(geom, (0.0, 0.0, 0.0))) / 2
+    obstacles.append(
+        sweeps.Sweep(
+            geom, data.geom_xpos[geom] + half[:3], matrices[geom], half[None]
+        )
+    )
+  return obstacles
 
 
-def _reach(physics: Any, geom: int) -> np.ndarray:
-  """Half the extent of a box along the world's x and y, metres."""
-  matrix = np.abs(physics.data.geom_xmat[geom].reshape(3, 3))
-  return (matrix @ physics.model.geom_size[geom])[:2]
+def _travels(physics: Any, root: composer.Entity) -> dict[int, np.ndarray]:
+  """Returns how far parts of a world go in an episode, by their geoms."""
+  return {
+      physics.bind(geom).element_id: entity.travel
+      for entity in root.iter_entities()
+      if isinstance(entity, moving.MovingPart)
+      for geom in entity.geoms
+  }
+
+
+def _check_extent(
+    name: str, sweep: sweeps.Sweep, root: composer.Entity
+) -> None:
+  """Refuses a block whose middle can be outside of the arena."""
+  if not isinstance(root, arenas.RoomArena):
+    return
+  for axis in range(2):
+    for side in (-1.0, 1.0):
+      ahead = side * sweep.motions[:, axis]
+      pose = sweep.pose(np.where(ahead > 0, 1.0, -1.0))
+      if not root.extent.contains(pose.centre[:2].tolist()):
+        raise errors.SpecError(
+            f'{_where(name, pose)}, outside the arena'
+            f' {_show(root.extent.low, root.extent.high)}'
+        )
+
+
+def _where(name: str, pose: sweeps.Sweep) -> str:
+  return (
+      f'register {name!r} at value {pose.value:g} would sit at'
+      f' {_show(pose.centre[:2])}'
+  )
+
+
+def _area(space: sweeps.Space, path: Sequence[sweeps.Sweep]) -> str:
+  """Prints the rectangle that sweeps fill."""
+  bounds = np.array([space.bounds(sweep) for sweep in path])
+  return _show(bounds[:, 0, :2].min(axis=0), bounds[:, 1, :2].max(axis=0))
 
 
 def _check_solver(

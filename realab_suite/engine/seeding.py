@@ -14,6 +14,7 @@ import zlib
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.feedback import messages
 
 NUM_SALT_BYTES = 16
 """Length of a salt."""
@@ -99,7 +100,7 @@ def as_seed(random: Any) -> int:
     if random >= 0:
       return int(random)
   raise errors.SpecError(
-      f'random: {random!r:.80}; allowed are a non-negative integer, a'
+      f'random: {messages.quote(random)}; allowed are a non-negative integer, a'
       ' RandomState or None'
   )
 

@@ -33,13 +33,31 @@ class Place:
   Attributes:
     position: `(x, y)`, metres.
     yaw: The way it faces, as an angle to the x axis, radians.
-    spread: Half-widths of the region around `position`, metres, in which it
-      stands at random.
+    spread: Half-widths of the region around `position`, metres, along the way
+      it faces and across, in which it stands at random.
   """
 
   position: tuple[float, float]
   yaw: float = 0.0
   spread: tuple[float, float] = (0.0, 0.0)
+
+  def __post_init__(self) -> None:
+    """Checks the numbers.
+
+    Raises:
+      SpecError: If one is missing, is not finite or is a negative half-width.
+    """
+    try:
+      numbers = np.array([*self.position, self.yaw, *self.spread], float)
+      is_valid = len(self.position) == len(self.spread) == 2
+      is_valid &= bool(np.isfinite(numbers).all() and (numbers[3:] >= 0).all())
+    except (TypeError, ValueError):
+      is_valid = False
+    if not is_valid:
+      raise errors.SpecError(
+          f'{self!r:.160}; allowed are finite numbers, two for the position,'
+          ' one for the yaw, and two from 0 on for the spread'
+      )
 
 
 @final

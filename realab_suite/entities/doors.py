@@ -63,7 +63,9 @@ class SlidingDoor(composer.Entity):
       position: The middle of the opening, `(x, y)`, metres.
     """
     root.attach(self).pos = (*position, 0.0)
-    self._leaf.attach_to(root, (*position, _HEIGHT / 2))
+    self._leaf.attach_to(
+        root, (*position, _HEIGHT / 2), (self._travel, 0.0, 0.0)
+    )
     self._closed_x = float(position[0])
 
   def advance(self, physics: Any, opening: np.ndarray, seconds: float) -> None:

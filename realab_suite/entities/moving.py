@@ -87,6 +87,7 @@ class MovingPart(composer.Entity):
         for geom in geoms
     ]
     self._frame: mjcf.Element | None = None
+    self._travel = np.zeros(3)
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
@@ -101,14 +102,24 @@ class MovingPart(composer.Entity):
     """The mocap body; bind it to read or write `mocap_pos`, `mocap_quat`."""
     return self._frame
 
+  @property
+  def travel(self) -> np.ndarray:
+    """The way from the start of an episode to the far end, `(3,)`, metres."""
+    return self._travel
+
   def attach_to(
-      self, root: composer.Entity, position: Sequence[float]
+      self,
+      root: composer.Entity,
+      position: Sequence[float],
+      travel: Sequence[float] = (0.0, 0.0, 0.0),
   ) -> mjcf.Element:
     """Attaches the part to the root entity of a task and returns its frame.
 
     Args:
       root: The entity that no other is parent of, usually the arena.
       position: Where the part is at the start of an episode, `(3,)`, metres.
+      travel: The straight way that the part may go from there, `(3,)`, metres.
+        No register may be in the way of a solid part.
 
     Raises:
       SpecError: If `root` is itself attached to something.
@@ -123,4 +134,5 @@ class MovingPart(composer.Entity):
     frame.pos = position
     frame.mocap = 'true'
     self._frame = frame
+    self._travel = np.array(travel, float)
     return frame

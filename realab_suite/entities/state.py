@@ -6,7 +6,10 @@ into a slot, never into a Python attribute. So one copy of MuJoCo's integration
 state is a snapshot of the whole episode, and many worlds can share one entity.
 """
 
+from collections.abc import Iterator
+import contextlib
 from typing import Any, final
+import weakref
 
 from dm_control import mjcf
 import mujoco
@@ -14,10 +17,16 @@ import numpy as np
 
 from realab_suite import errors
 
-# Every entity asks for the same capacity because PyMJCF merges `nuserdata` of
-# attached models only where they agree.
+# Numbers of userdata that every model with a slot asks for. All ask alike
+# because PyMJCF merges `nuserdata` of attached models only where they agree.
 CAPACITY = 256
 _PREFIX = 'userdata.'
+
+# The layout of each compiled model. Every slot needs it, and to find it takes a
+# look at all slots.
+_layouts: weakref.WeakKeyDictionary[Any, dict[str, int]] = (
+    weakref.WeakKeyDictionary()
+)
 
 
 @final
@@ -73,7 +82,7 @@ class Slot:
     """Finds the slot in the state of a world other than the last one."""
     model = physics.model
     if model is not self._model:
-      start = layout(model).get(self._numeric.full_identifier)
+      start = _cached_layout(model).get(self._numeric.full_identifier)
       if start is None:
         raise errors.StateLayoutError(
             f'{self._numeric.full_identifier}: not in the compiled model;'
@@ -86,6 +95,36 @@ class Slot:
     self._data = physics.data
 
 
+def make_room(mjcf_model: mjcf.RootElement) -> None:
+  """Lets a model have as much userdata as the slots in it need.
+
+  Worlds that this package loads have it. Elsewhere, as in a plain
+  `composer.Environment`, worlds have `CAPACITY` numbers; if that is too few,
+  call this once, when everything is attached.
+
+  Args:
+    mjcf_model: The model of the root entity.
+  """
+  numerics = mjcf_model.find_all('numeric')
+  needed = sum(int(n.size) for n in numerics if n.name.startswith(_PREFIX))
+  if needed > CAPACITY:
+    mjcf_model.size.nuserdata = needed
+
+
+@contextlib.contextmanager
+def room_for_slots(mjcf_model: mjcf.RootElement) -> Iterator[None]:
+  """Does `make_room` for as long as the context lasts.
+
+  Entities that are attached afterwards have to agree with the model.
+  """
+  before = mjcf_model.size.nuserdata
+  make_room(mjcf_model)
+  try:
+    yield
+  finally:
+    mjcf_model.size.nuserdata = before
+
+
 def layout(model: Any) -> dict[str, int]:
   """Maps the full name of every claimed slot to its first `userdata` index.
 
@@ -95,6 +134,12 @@ def layout(model: Any) -> dict[str, int]:
   Raises:
     StateLayoutError: If the claims need more room than the model has.
   """
+  return dict(_cached_layout(model))
+
+
+def _cached_layout(model: Any) -> dict[str, int]:
+  if model in _layouts:
+    return _layouts[model]
   starts, end = {}, 0
   for i in range(model.nnumeric):
     name = mujoco.mj_id2name(model.ptr, mujoco.mjtObj.mjOBJ_NUMERIC, i)
@@ -104,6 +149,6 @@ def layout(model: Any) -> dict[str, int]:
   if end > model.nuserdata:
     raise errors.StateLayoutError(
         f'{len(starts)} slots need {end} numbers of userdata; the model has'
-        f' {model.nuserdata}'
+        f' {model.nuserdata}; call state.make_room before it is compiled'
     )
-  return starts
+  return _layouts.setdefault(model, starts)

@@ -7,7 +7,6 @@ return to event sinks.
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
-import inspect
 from typing import Any, final
 
 from dm_control import composer
@@ -21,6 +20,7 @@ from realab_suite.entities import meters
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import records
+from realab_suite.feedback import messages
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
@@ -104,7 +104,9 @@ class FeedbackMechanism(composer.Entity):
     }
     root.attach(self)
     for name, place in places.items():
-      self._registers[name].attach_to(root, place.position, place.yaw)
+      self._registers[name].attach_to(
+          root, place.position, place.yaw, place.spread
+      )
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
@@ -346,11 +348,6 @@ class FeedbackMechanism(composer.Entity):
 def _make_register(
     name: str, spec: specs.RegisterSpec, design: specs.DesignSpec
 ) -> base.Register:
-  spread = (
-      spec.place.spread
-      if isinstance(spec.place, specs.PlaceSpec)
-      else (0.0, 0.0)
-  )
   kind = register_kinds.REGISTER_KINDS.get(spec.kind)
   common = dict(
       value_range=spec.range,
@@ -362,18 +359,14 @@ def _make_register(
       on_overflow=spec.on_overflow,
       block_size=spec.block_size,
       mass=spec.mass,
-      spread=spread,
   )
-  for option in spec.options:
-    if (
-        option in common
-        or option not in inspect.signature(kind._build).parameters
-    ):
-      raise errors.SpecError(
-          f'design {design.name!r}: registers.{name}.options: {option!r} is no'
-          f' option of a {spec.kind} register'
-      )
-  return kind(name, **common, **spec.options)
+  place = messages.Place(f'design {design.name!r}', ('registers', name))
+  try:
+    return kind(name, **common, **spec.options)
+  except errors.SpecError as error:
+    raise place.error(str(error)) from error
+  except Exception as error:  # It may be of any class.
+    raise place.error(f'{type(error).__name__}: {error}') from error
 
 
 def _find(

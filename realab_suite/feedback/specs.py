@@ -32,6 +32,11 @@ Channel = Literal['embedded', 'welded', 'secure']
 Dof = Literal['free', 'planar']
 Role = Literal['feedback', 'meter', 'query', 'signal']
 
+# Number of registers that a design may have. A hundred two-block registers load
+# in a second and take 10 ms for a control step, and both grow with the number.
+# The memory that MuJoCo reserves for contacts, 160 MB, grows with its square.
+MAX_REGISTERS = 100
+
 # Roles whose registers the agent reads, and those that it never does.
 READ_BY_AGENTS = ('feedback', 'signal')
 
@@ -246,7 +251,7 @@ class DesignSpec(validation.Spec):
     channel: `welded` and `secure` go for every register; `embedded` for those
       that do not say otherwise.
     dof: Of every register that does not say otherwise.
-    registers: The registers, by name.
+    registers: The registers, by name; at most `MAX_REGISTERS`.
     meters: What is measured into which meter register.
     providers: The feedback providers, in the order in which they act.
     schedule: When they act; `None` for a third and two thirds of the control
@@ -262,7 +267,9 @@ class DesignSpec(validation.Spec):
   description: str = ''
   channel: Channel = 'embedded'
   dof: Dof = 'free'
-  registers: dict[Name, RegisterSpec] = pydantic.Field(default_factory=dict)
+  registers: dict[Name, RegisterSpec] = pydantic.Field(
+      default_factory=dict, json_schema_extra={'maxProperties': MAX_REGISTERS}
+  )
   meters: Annotated[tuple[MeterSpec, ...], pydantic.Field(strict=False)] = ()
   providers: Annotated[
       tuple[Annotated[_Provider, _AnyProvider], ...],
@@ -288,6 +295,11 @@ class DesignSpec(validation.Spec):
 
   @pydantic.model_validator(mode='after')
   def _consistent(self) -> 'DesignSpec':
+    if len(self.registers) > MAX_REGISTERS:
+      raise ValueError(
+          f'registers: {len(self.registers)} are given; allowed are at most'
+          f' {MAX_REGISTERS}'
+      )
     consistency.check(self, READ_BY_AGENTS)
     return self
 
@@ -373,8 +385,8 @@ def load(
     data = loading.parse_yaml(_shipped(design).read_bytes(), where)
   elif not isinstance(design, str | os.PathLike | Mapping):
     raise errors.SpecError(
-        f'design: {design!r:.80}; allowed are a name, a path, a mapping and a'
-        ' DesignSpec'
+        f'design: {messages.quote(design)}; allowed are a name, a path, a'
+        ' mapping and a DesignSpec'
     )
   elif isinstance(design, str) and not os.path.exists(design):
     raise errors.UnknownNameError(

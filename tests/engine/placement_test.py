@@ -1,9 +1,21 @@
 """Registers are refused where something stands that nothing can push."""
 
+import hypothesis
+import mujoco
+import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.engine import sweeps
+from realab_suite.entities import arenas
+from realab_suite.entities import doors
+from realab_suite.entities import moving
+from realab_suite.entities import registers
+from realab_suite.feedback import register_kinds
+from realab_suite.tasks import collect_apples
+from tests.engine import helpers
+from tests.engine import obstacles
 
 
 def _design(place, **register):
@@ -60,3 +72,437 @@ def test_wherever_a_register_may_stand_the_avatar_does_not_begin(
       suite.load(*arguments, design=design)
   else:
     suite.load(*arguments, design=design).close()
+
+
+# ---- Every place of a region -------------------------------------------------
+
+
+def _room_with(*parts):
+  """Returns a task whose room has more in it."""
+  task = collect_apples.CollectApples()
+  for part in parts:
+    part(task.root_entity)
+  return task
+
+
+def _barrier(start, end):
+  return lambda root: root.add_barrier('barrier', start, end)
+
+
+def _post(position, radius=0.15):
+  def add(root):
+    root.mjcf_model.worldbody.add(
+        'geom', name='post', type='cylinder', size=(radius, 0.5),
+        pos=(*position, 0.5),
+    )  # fmt: skip
+
+  return add
+
+
+def _embed(task, place, **register):
+  return suite.embed(task, _design(place, **register), random=0)
+
+
+def _problem(load, *args, **kwargs):
+  """Returns the message of an error in the design, or '' if there is none."""
+  try:
+    load(*args, **kwargs).close()
+  except errors.SpecError as error:
+    return str(error)
+  return ''
+
+
+def _is_refused(task, place, **register):
+  return ' inside ' in _problem(_embed, task, place, **register)
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.7])
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+@pytest.mark.parametrize('channel', registers.CHANNELS)
+@pytest.mark.parametrize(
+    'kind', ['two_block', 'block_position', 'block_orientation']
+)
+def test_a_barrier_across_the_middle_of_a_region_is_found(
+    kind, channel, dof, yaw
+):
+  place = {'position': [0.0, 2.0], 'spread': [1.0, 1.0], 'yaw': yaw}
+  across = _barrier((-0.5, 2.0), (0.5, 2.0))
+  register = {'kind': kind, 'channel': channel, 'dof': dof, 'range': [0, 1]}
+  assert not _is_refused(_room_with(), place, **register)
+  assert _is_refused(_room_with(across), place, **register)
+
+
+def test_a_thin_post_in_a_long_path_is_found():
+  # A block that is written at 64 values, 0.108 m apart, misses it.
+  post = _post((-0.108, 2.0), radius=0.02)
+  long = {'range': [0, 68], 'block_size': 0.06}
+  assert not _is_refused(_room_with(), [-3.4, 2.0], **long)
+  assert _is_refused(_room_with(post), [-3.4, 2.0], **long)
+
+
+@pytest.mark.parametrize(
+    ('range_', 'is_refused'),
+    # The block is 0.2 m wide, the post begins 0.13 m from its middle, and its
+    # corner comes that far at 0.4 rad.
+    [([-0.2, 0.2], False), ([-0.2, 3.0], True), ([-3.0, 0.0], True)],
+)
+def test_a_block_that_turns_needs_room_for_its_corners(range_, is_refused):
+  turning = {'kind': 'block_orientation', 'scale': 1.0, 'range': range_}
+  post = _post((0.28, 2.0))
+  assert _is_refused(_room_with(post), [0.0, 2.0], **turning) == is_refused
+
+
+@pytest.mark.parametrize(
+    ('yaw', 'is_refused'), [(0.0, False), (np.pi / 2, True), (0.75, True)]
+)
+def test_a_region_turns_with_its_place(yaw, is_refused):
+  place = {'position': [0.0, 2.0], 'spread': [1.5, 0.0], 'yaw': yaw}
+  # To the north-east, and to the north.
+  task = _room_with(_post((0.8, 2.75)), _barrier((-0.5, 3.0), (0.0, 3.0)))
+  assert _is_refused(task, place, range=[0, 1]) == is_refused
+
+
+@pytest.mark.parametrize(
+    ('place', 'is_refused'), [([0.0, 2.0], False), ([1.6, 2.0], True)]
+)
+def test_where_a_door_will_be_is_no_place_for_a_register(place, is_refused):
+  def door(root):
+    doors.SlidingDoor(width=1.0).attach_to(root, (0.9, 2.0))
+
+  task = _room_with(door)
+  assert _is_refused(task, place, range=[0, 1]) == is_refused
+
+
+@pytest.mark.parametrize('geom', [
+    {'type': 'box', 'size': (0.1, 0.1, 0.1)},
+    {'type': 'cylinder', 'size': (0.1, 0.1)},
+    {'type': 'sphere', 'size': (0.1,)},
+])  # fmt: skip
+@pytest.mark.parametrize(
+    ('travel', 'is_refused'),
+    [((0, 0, 0), False), ((1.2, 1.2, 0), True), ((-1.2, 1.2, 0), False)],
+)
+def test_a_part_takes_the_way_it_says(geom, travel, is_refused):
+  def part(root):
+    moving.MovingPart('part', [geom]).attach_to(root, (1.0, 1.0, 0.1), travel)
+
+  task = _room_with(part)
+  assert _is_refused(task, [2.0, 2.0], range=[0, 1]) == is_refused
+
+
+# Differential: what the loader says, and what episodes do.
+
+
+@hypothesis.settings(max_examples=40)
+@hypothesis.given(obstacles.rooms)
+def test_what_is_accepted_overlaps_nothing(room):
+  try:
+    built = obstacles.build(*room)
+  except errors.SpecError as error:
+    hypothesis.event(f'refused: {str(error).split()[0]}')
+    return
+  hypothesis.event('accepted')
+  assert built.deepest(100) <= sweeps.TOLERANCE
+  assert built.deepest_start(5) <= sweeps.TOLERANCE
+  built.env.close()
+
+
+def test_what_is_refused_overlaps_something(monkeypatch):
+  # Found at random: a barrier, a yawed wall, a post, a door, two registers.
+  wide = {'kind': 'block_position', 'role': 'feedback', 'range': [0.0, 1.0]}
+  turning = {**wide, 'kind': 'block_orientation', 'scale': 1.5}
+  region = {'position': [0.0, 2.0], 'spread': [0.6, 0.4], 'yaw': 0.3}
+  box = obstacles.Obstacle('box', (0.4, 0.05, 0.3), (0.9, 2.3), 0.8, None)
+  post = obstacles.Obstacle('cylinder', (0.1, 0.3, 0.3), (0.3, 2.6), 0.0, None)
+  door = obstacles.Obstacle('box', (0.1, 0.1, 0.3), (2, 1), 0.0, (-1.5, 0.6))
+  other = {**wide, 'place': {'position': [0.7, 2.3], 'yaw': 2.0}}
+  for things, named in [
+      ([box], [{**wide, 'place': region}]),
+      ([post], [{**turning, 'place': region}]),
+      ([door], [{**wide, 'place': region}]),
+      ([box], [{**turning, 'place': region}]),
+      ([], [{**wide, 'place': region}, other]),
+      ([], [{**turning, 'place': region}, other]),
+  ]:
+    with pytest.raises(errors.SpecError, match=r"inside|each other's way"):
+      obstacles.build(things, named)
+    room = obstacles.build_anyway(monkeypatch, things, named)
+    assert room.deepest(2000) > 0.0
+    room.env.close()
+
+
+# ---- Places that a world offers ----------------------------------------------
+
+
+def _poses(env, num_episodes=4):
+  """Returns where the blocks stand when episodes begin."""
+  poses = []
+  for _ in range(num_episodes):
+    env.reset()
+    mujoco.mj_kinematics(env.physics.model.ptr, env.physics.data.ptr)
+    for register in env.mechanism.registers.values():
+      for block in register.blocks:
+        geom = env.physics.bind(block.geom).element_id
+        poses.append(env.physics.data.geom_xpos[geom].copy())
+        poses.append(env.physics.data.geom_xmat[geom].copy())
+  return np.concatenate(poses)
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.6])
+@pytest.mark.parametrize('spread', [(0.0, 0.0), (0.5, 0.0), (0.3, 0.4)])
+@pytest.mark.parametrize('channel', registers.CHANNELS)
+@pytest.mark.parametrize(
+    'kind', ['two_block', 'block_position', 'block_orientation']
+)
+def test_a_named_place_is_what_its_numbers_are(kind, channel, spread, yaw):
+  register = {'kind': kind, 'channel': channel, 'range': [0, 1]}
+  offered = arenas.Place((0.5, 2.0), yaw, spread)
+
+  def offer(root):
+    root.offer({'spot': offered})
+
+  named = _embed(_room_with(offer), 'spot', **register)
+  place = {'position': [0.5, 2.0], 'yaw': yaw, 'spread': list(spread)}
+  numbered = _embed(_room_with(), place, **register)
+  poses = _poses(named)
+  np.testing.assert_array_equal(poses, _poses(numbered))
+  is_random = len(np.unique(np.split(poses, 4), axis=0)) > 1
+  assert is_random == any(spread)
+  named.close()
+  numbered.close()
+
+
+def test_the_region_of_a_named_place_is_checked():
+  def offer(root):
+    root.offer({'spot': arenas.Place((0.0, 2.0), 0.7, (1.0, 1.0))})
+
+  across = _barrier((-0.5, 2.6), (0.5, 2.6))
+  assert not _is_refused(_room_with(offer), 'spot', range=[0, 1])
+  assert _is_refused(_room_with(offer, across), 'spot', range=[0, 1])
+
+
+# ---- Each other's way --------------------------------------------------------
+
+
+def _two(first, second):
+  return {
+      'schema': 1,
+      'name': 'two',
+      'registers': {
+          name: {'kind': 'block_position', 'role': 'feedback', **register}
+          for name, register in (('a', first), ('b', second))
+      },
+  }
+
+
+@pytest.mark.parametrize(
+    ('second', 'is_refused'),
+    [
+        # Beside the path, inside of the rectangle about it, and across it.
+        ({'place': [0.6, 2.9], 'range': [0, 1]}, False),
+        ({'place': [0.8, 1.9], 'range': [0, 1]}, False),
+        ({'place': [0.7, 2.5], 'range': [0, 1]}, True),
+        (
+            {'place': {'position': [1.2, 1.8], 'yaw': 2.4}, 'range': [0, 9]},
+            True,
+        ),
+        (
+            {
+                'place': {'position': [0.9, 2.0], 'spread': [0.3, 0.3]},
+                'range': [0, 1],
+            },
+            True,
+        ),
+    ],
+)
+def test_only_registers_that_can_meet_are_in_each_others_way(
+    second, is_refused
+):
+  diagonal = {
+      'place': {'position': [0.0, 1.7], 'yaw': np.pi / 4},
+      'range': [0, 15],
+  }
+  for design in (_two(diagonal, second), _two(second, diagonal)):
+    problem = _problem(suite.load, 'collect_apples', 'standard', design=design)
+    assert ("'a' and 'b' would be in each other's way" in problem) == is_refused
+
+
+def test_registers_may_touch():
+  side_by_side = _two(
+      {'place': [0.0, 2.0], 'range': [0, 5]},
+      {'place': [0.0, 2.2], 'range': [0, 5]},
+  )
+  suite.load('collect_apples', 'standard', design=side_by_side).close()
+
+
+# ---- Where the avatar begins -------------------------------------------------
+
+
+def _begins_in_a_block(place, **register):
+  design = _design(place, **register)
+  problem = _problem(suite.load, 'collect_apples', 'standard', design=design)
+  return 'where the avatar begins' in problem
+
+
+@pytest.mark.parametrize(
+    ('position', 'yaw', 'is_in_the_way'),
+    [
+        ([1.4, 1.0], 0.0, False),
+        ([1.0, 0.6], np.pi / 4, True),
+        ([1.0, 0.6], -np.pi / 4, False),
+        ([0.0, 0.5], np.pi / 2, True),
+    ],
+)
+def test_a_region_that_is_turned_is_kept_from_the_avatar(
+    position, yaw, is_in_the_way
+):
+  place = {'position': position, 'spread': [1.4, 0.0], 'yaw': yaw}
+  assert _begins_in_a_block(place, range=[0, 1]) == is_in_the_way
+
+
+@pytest.mark.parametrize(
+    ('gap', 'is_in_the_way'), [(0.17, True), (0.18, False)]
+)
+def test_the_avatar_is_round_where_it_begins(gap, is_in_the_way):
+  # It begins within 0.4 m of (0, -0.8), and has a radius of 0.25 m.
+  place = [0.4 + gap + 0.1, -0.4 + gap + 0.1]
+  assert _begins_in_a_block(place, range=[0, 1]) == is_in_the_way
+
+
+def test_the_avatar_begins_beside_the_initial_value_alone():
+  place, wide = [-1.8, -0.8], {'range': [0, 20]}
+  assert not _begins_in_a_block(place, initial=0, **wide)
+  assert _begins_in_a_block(place, initial=15, **wide)
+
+
+# ---- Kinds of one's own, and worlds of anybody's -----------------------------
+
+
+class _Circling(registers.Register):
+  """Goes round in a circle of 0.5 m, a turn for every 6.28 units."""
+
+  def _build_blocks(self):
+    self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
+    return [self._block]
+
+  def _put(self, physics, value):
+    position = np.array(self._origin(physics))
+    position[..., 0] += 0.5 * np.cos(value)
+    position[..., 1] += 0.5 * np.sin(value)
+    self._block.put(physics, position, heading=value)
+
+  def _look(self, physics):
+    return self._block.heading(physics)
+
+
+@pytest.mark.parametrize(
+    ('range_', 'post', 'is_refused'),
+    [
+        ([0, 2 * np.pi], (0.0, 2.0), False),
+        ([0, 2 * np.pi], (-0.35, 2.36), True),
+        ([0, 2 * np.pi], (0.5, 2.7), False),
+        ([-1.5, 1.5], (-0.35, 2.36), False),
+        ([0, 40 * np.pi], (-0.35, 2.36), True),
+    ],
+)
+def test_a_block_that_goes_in_circles_is_followed(range_, post, is_refused):
+  with helpers.registered(
+      register_kinds.REGISTER_KINDS, 'test_circling', _Circling
+  ):
+    task = _room_with(_post(post))
+    assert is_refused == _is_refused(
+        task, [0.0, 2.0], kind='test_circling', range=list(range_)
+    )
+
+
+def _foreign(**geom):
+  task = helpers.PointTask()
+  task.root_entity.mjcf_model.worldbody.add('geom', name='thing', **geom)
+  return task
+
+
+_FOREIGN = {
+    'a floor': ({'type': 'plane', 'size': (9, 9, 1)}, False),
+    'a floor above': (
+        {'type': 'plane', 'size': (9, 9, 1), 'pos': (0, 0, 0.1)},
+        False,
+    ),
+    # Corridors of dm_control put them into place when an episode begins.
+    'a plane that stands': (
+        {'type': 'plane', 'size': (9, 9, 1), 'zaxis': (1, 0, 0)},
+        False,
+    ),
+    'a ramp': (
+        {'type': 'box', 'size': (1, 1, 0.1), 'quat': (0.9, 0.2, 0, 0)},
+        True,
+    ),
+    'scenery': (
+        {'type': 'box', 'size': (1, 1, 1), 'contype': 0, 'conaffinity': 0},
+        False,
+    ),
+    'a ball overhead': (
+        {'type': 'sphere', 'size': (1,), 'pos': (0, 0, 3)},
+        False,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('kind', ['block_position', 'block_orientation'])
+@pytest.mark.parametrize(
+    ('geom', 'is_refused'), _FOREIGN.values(), ids=list(_FOREIGN)
+)
+def test_a_world_of_anybodys_is_checked_too(geom, is_refused, kind):
+  place = {'position': [0.0, 0.0], 'spread': [0.5, 0.5]}
+  assert is_refused == _is_refused(
+      _foreign(**geom), place, kind=kind, range=[-1, 1]
+  )
+
+
+def test_what_hangs_from_a_moving_part_is_an_obstacle():
+  def part(root):
+    hung = moving.MovingPart('part', [{'type': 'sphere', 'size': (0.1,)}])
+    body = hung.mjcf_model.worldbody.add('body', pos=(-2, 2, 0))
+    body.add('geom', type='box', size=(0.1, 0.1, 0.1))
+    hung.attach_to(root, (2.0, 0.0, 0.1))
+
+  assert _is_refused(_room_with(part), [0.0, 2.0], range=[0, 1])
+
+
+def test_many_registers_in_one_place_are_refused_without_solving_contacts(
+    monkeypatch,
+):
+  # 80 blocks in one another are 3,160 pairs in contact.
+  register = {
+      'kind': 'two_block', 'role': 'feedback', 'place': [2, 2], 'range': [0, 1]
+  }  # fmt: skip
+  design = {
+      'schema': 1,
+      'name': 'pile',
+      'registers': {f'r{i}': register for i in range(40)},
+  }
+  calls = []
+  forward = mujoco.mj_forward
+
+  def count(*args):
+    calls.append(args)
+    forward(*args)
+
+  monkeypatch.setattr(mujoco, 'mj_forward', count)
+  with pytest.raises(errors.SpecError, match="'r0' and 'r1' would be in each"):
+    suite.load('collect_apples', 'standard', design=design)
+  assert not calls
+
+
+def test_the_state_is_reset_when_all_is_checked():
+  place = {'position': [0.0, 2.0], 'spread': [0.5, 0.5]}
+  env = _embed(_room_with(), place, range=[0, 5])
+  block = env.mechanism.registers['value'].blocks[0]
+  assert block.position(env.physics)[:2] == pytest.approx([0.0, 0.0])
+  env.close()
+
+
+@pytest.mark.parametrize('low', [-0.7, -0.1, 0.1, 0.3])
+@pytest.mark.parametrize('high', [0.4, 0.7, 1.1, 2.3])
+def test_no_value_beyond_the_range_is_tried(low, high):
+  register = {'range': [low, high], 'initial': high, 'on_overflow': 'error'}
+  _embed(_room_with(), [0.0, 2.0], **register).close()

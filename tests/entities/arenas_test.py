@@ -93,6 +93,35 @@ def test_a_place_cannot_be_offered_twice():
   assert arena.places == before
 
 
+@pytest.mark.parametrize(
+    'place',
+    [
+        {'position': (0.0,)},
+        {'position': (0.0, 1.0, 2.0)},
+        {'position': 3.0},
+        {'position': 'centre'},
+        {'position': (0.0, float('nan'))},
+        {'position': (0.0, 'x')},
+        {'position': None},
+        {'position': (0.0, 0.0), 'yaw': float('inf')},
+        {'position': (0.0, 0.0), 'yaw': None},
+        {'position': (0.0, 0.0), 'yaw': (0.0, 0.0)},
+        {'position': (0.0, 0.0), 'spread': (0.1, -0.1)},
+        {'position': (0.0, 0.0), 'spread': 0.1},
+        {'position': (0.0, 0.0), 'spread': (0.1,)},
+        {'position': (0.0, 0.0), 'spread': (float('nan'), 0.0)},
+    ],
+)
+def test_a_place_that_is_none_is_refused(place):
+  with pytest.raises(errors.SpecError, match='allowed are finite numbers'):
+    arenas.Place(**place)
+
+
+def test_a_place_may_be_of_numpy():
+  place = arenas.Place(np.zeros(2), np.float32(0.5), np.ones(2))
+  assert tuple(place.spread) == (1.0, 1.0)
+
+
 # ---- Walls -------------------------------------------------------------------
 
 

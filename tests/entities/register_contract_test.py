@@ -79,7 +79,11 @@ def _make(variety: Variety, **options: Any) -> registers.Register:
   )
 
 
-def _world(kind: type[mjcf.Physics] = mjcf.Physics, **options: Any) -> World:
+def _world(
+    kind: type[mjcf.Physics] = mjcf.Physics,
+    spread: tuple[float, float] = (0.0, 0.0),
+    **options: Any,
+) -> World:
   columns = int(np.ceil(np.sqrt(len(_VARIETIES))))
   arena = arenas.OpenRoom(half_width=_SPACING * columns / 2)
   corner = -_SPACING * (columns - 1) / 2
@@ -88,7 +92,7 @@ def _world(kind: type[mjcf.Physics] = mjcf.Physics, **options: Any) -> World:
     register = _make(variety, **options)
     row, column = divmod(i, columns)
     place = (corner + _SPACING * column, corner + _SPACING * row)
-    register.attach_to(arena, place, variety.yaw)
+    register.attach_to(arena, place, variety.yaw, spread)
     made[variety.name] = register
   return World(worlds.compile_world(arena, kind), made)
 

@@ -187,3 +187,67 @@ def test_all_the_room_there_is_can_be_used():
   physics = worlds.compile_world(arena)
   last.vector.set(physics, 1.0)
   assert physics.data.userdata[-1] == 1.0
+
+
+def test_a_world_can_have_as_much_room_as_its_slots_need():
+  arena, counters = _world(*[9] * 60)
+  state.make_room(arena.mjcf_model)
+  environment = composer.Environment(composer.NullTask(arena))
+  for _ in range(2):
+    environment.reset()  # Compiles anew.
+    physics = environment.physics
+    assert physics.model.nuserdata == 600
+    for i, counter in enumerate(counters):
+      counter.vector.set(physics, i + 1.0)
+      counter.scalar.set(physics, -1.0 - i)
+    for i, counter in enumerate(counters):
+      np.testing.assert_array_equal(counter.vector.get(physics), i + 1.0)
+      assert counter.scalar.get(physics) == -1.0 - i
+
+
+def test_a_small_world_has_the_room_that_every_world_has():
+  arena, _ = _world(9)
+  for make_room in (lambda model: None, state.make_room):
+    make_room(arena.mjcf_model)
+    physics = worlds.compile_world(arena)
+    assert physics.model.nuserdata == state.CAPACITY
+
+
+@pytest.mark.parametrize('number', [1, 60])
+def test_entities_can_be_attached_to_a_world_that_had_room(number):
+  arena, counters = _world(*[9] * number)
+  with state.room_for_slots(arena.mjcf_model):
+    worlds.compile_world(arena)
+  last = _Counter('last')
+  arena.attach(last)
+  counters[0].detach()
+  arena.attach(counters[0])
+  with state.room_for_slots(arena.mjcf_model):
+    physics = worlds.compile_world(arena)
+  for counter in (*counters, last):
+    counter.scalar.set(physics, 1.0)
+  assert physics.data.userdata.sum() == number + 1
+
+
+def test_finding_slots_takes_no_longer_the_more_there_are(monkeypatch):
+  arena, counters = _world(*[1] * 30)
+  physics = worlds.compile_world(arena)
+  named = []
+  id2name = mujoco.mj_id2name
+
+  def count(*args):
+    named.append(args)
+    return id2name(*args)
+
+  monkeypatch.setattr(mujoco, 'mj_id2name', count)
+  for counter in counters:
+    counter.scalar.set(physics, 1.0)
+    counter.vector.set(physics, 1.0)
+  assert len(named) == physics.model.nnumeric == 60
+
+
+def test_the_layout_that_is_returned_is_the_callers():
+  arena, _ = _world(2)
+  physics = worlds.compile_world(arena)
+  state.layout(physics.model).clear()
+  assert len(state.layout(physics.model)) == 2

@@ -389,8 +389,8 @@ _DOES_NOT_FIT = {
     ),
     'sweep leaves the arena': (
         _reward(place=[0, 0], range=[0, 200]),
-        "register 'reward' at value 41.2698 would sit at (4.13, 0.25), outside"
-        ' the arena (-4, -4) to (4, 4)',
+        "register 'reward' at value 200 would sit at (20, 0.25), outside the"
+        ' arena (-4, -4) to (4, 4)',
     ),
     'outside the arena': (
         _reward(place=[9.0, 0]),

@@ -662,9 +662,9 @@ def _l24(patch: pytest.MonkeyPatch) -> None:
 def _hang_from_avatar(patch: pytest.MonkeyPatch) -> None:
   attach_to = register_entities.Register.attach_to
 
-  def attach(self: Any, root: Any, position: Any, yaw: float = 0.0) -> None:
+  def attach(self: Any, root: Any, *place: Any) -> None:
     if self.role != 'meter':
-      attach_to(self, root, position, yaw)
+      attach_to(self, root, *place)
       return
     (avatar,) = (
         entity

@@ -65,7 +65,6 @@ class Register(composer.Entity):
       on_overflow: str = 'saturate',
       block_size: float = 0.2,
       mass: float = 1.0,
-      spread: Sequence[float] = (0.0, 0.0),
   ) -> None:
     """Builds the register.
 
@@ -81,8 +80,6 @@ class Register(composer.Entity):
       on_overflow: Whether a value out of range is saturated or is an error.
       block_size: The length of an edge of a block, metres.
       mass: Of each block, kilograms.
-      spread: Half-widths of the region, `(x, y)` in metres, in which the
-        register stands at a random place at the start of each episode.
     """
     _check(name, value_range, scale, initial, role, channel, dof, on_overflow)
     # Not the name of the model: attaching renames that where it is taken.
@@ -96,7 +93,7 @@ class Register(composer.Entity):
     self._on_overflow = on_overflow
     self._block_size = block_size
     self._mass = mass
-    self._spread = np.array(spread, float)
+    self._spread = np.zeros(2)
     self._mjcf_root = mjcf.RootElement(model=name)
     self._applied_slot = state.Slot(self._mjcf_root, 'applied')
     self._stored_slot = state.Slot(self._mjcf_root, 'stored')
@@ -157,7 +154,7 @@ class Register(composer.Entity):
 
   @property
   def spread(self) -> np.ndarray:
-    """Half-widths of the region that the register stands in, `(2,)` metres."""
+    """Half-widths of the region that the register stands in, `(2,)`, metres."""
     return self._spread
 
   @property
@@ -172,6 +169,7 @@ class Register(composer.Entity):
       root: composer.Entity,
       position: Sequence[float],
       yaw: float = 0.0,
+      spread: Sequence[float] = (0.0, 0.0),
   ) -> None:
     """Puts the register into a world.
 
@@ -180,7 +178,10 @@ class Register(composer.Entity):
       position: Where the register stands, `(x, y)` in metres.
       yaw: The angle of the axis that carries the value to the world's x axis,
         radians.
+      spread: Half-widths of the region around `position`, `(x, y)` in metres in
+        the register's frame, in which it stands at random in each episode.
     """
+    self._spread = np.array(spread, float)
     frame = root.attach(self)
     frame.pos = [*position, 0.0]
     if yaw:

@@ -86,7 +86,7 @@ VALUE_FUNCTIONS: registry.Registry[Callable[..., ValueFunction]] = (
 )
 
 
-def make(name: str, **options: Any) -> Policy:
+def make(name: str, /, **options: Any) -> Policy:
   """Makes the policy registered as `name`.
 
   Raises:
@@ -96,7 +96,7 @@ def make(name: str, **options: Any) -> Policy:
   return _make(POLICIES, 'policy', name, options)
 
 
-def make_value_function(name: str, **options: Any) -> ValueFunction:
+def make_value_function(name: str, /, **options: Any) -> ValueFunction:
   """Makes the value function registered as `name`; raises like `make`."""
   return _make(VALUE_FUNCTIONS, 'value function', name, options)
 

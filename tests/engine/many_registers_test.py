@@ -1,0 +1,164 @@
+"""As many registers as a design may have load, step and are refused in time."""
+
+import cProfile
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.feedback import mechanism
+from realab_suite.feedback import specs
+from realab_suite.tasks import collect_apples
+from tests.engine import helpers
+
+_WORLD = 'collect_apples', 'standard'
+_COLUMNS = 20
+
+
+def _place(index):
+  """Returns a place of a grid that leaves room where the avatar begins."""
+  row, column = divmod(index, _COLUMNS)
+  return [-3.8 + 0.39 * column, 3.7 - 0.25 * row]
+
+
+def _design(number, place=_place, **register):
+  names = [f'r{i}' for i in range(number)]
+  return {
+      'schema': 1,
+      'name': 'many',
+      'registers': {
+          name: {
+              'kind': 'two_block',
+              'role': 'feedback',
+              'place': place(i),
+              'range': [0, 1],
+              'block_size': 0.06,
+              **register,
+          }
+          for i, name in enumerate(names)
+      },
+      'providers': [{'kind': 'constant', 'value': 0.5, 'writes': names}],
+  }
+
+
+def _readings(time_step):
+  return np.array([
+      value
+      for key, value in time_step.observation.items()
+      if key.startswith('registers/')
+  ])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('channel', 'dof'),
+    [('embedded', 'free'), ('welded', 'planar'), ('secure', 'planar')],
+)
+def test_the_largest_design_works(channel, dof):
+  design = _design(specs.MAX_REGISTERS, channel=channel, dof=dof)
+  env = suite.load(*_WORLD, {'random': 1}, design=design)
+  assert (_readings(env.reset()) == 0.0).all()
+  action = np.zeros(env.action_spec().shape)
+  for _ in range(3):
+    readings = _readings(env.step(action))
+    assert readings.shape == (specs.MAX_REGISTERS,)
+    np.testing.assert_allclose(readings, 0.5, atol=1e-6)
+  env.close()
+
+
+def test_many_worlds_of_the_largest_design_work():
+  design = _design(specs.MAX_REGISTERS)
+  batch = suite.load_batch(*_WORLD, {'random': 1}, num_envs=2, design=design)
+  alone = suite.load(*_WORLD, {'random': 1}, design=design)
+  batch.reset()
+  alone.reset()
+  action = np.zeros(alone.action_spec().shape)
+  saved = batch.save()
+  for _ in range(2):
+    readings = _readings(batch.step(np.array([action] * 2)))
+    np.testing.assert_array_equal(readings[:, 0], _readings(alone.step(action)))
+  batch.restore(saved)
+  np.testing.assert_allclose(_readings(batch.step(np.array([action] * 2))), 0.5)
+  fork = suite.fork(alone, 2)
+  np.testing.assert_allclose(_readings(fork.step(np.array([action] * 2))), 0.5)
+  for env in (batch, alone, fork):
+    env.close()
+
+
+def test_a_task_of_anybodys_can_have_many_too():
+  design = _design(60, dof='planar')
+  env = suite.embed(helpers.PointTask(), design, random=1, max_steps=None)
+  for _ in range(2):
+    env.reset()  # Compiles anew.
+    readings = _readings(env.step(helpers.no_op(env)))
+    np.testing.assert_allclose(readings, 0.5, atol=1e-6)
+  env.close()
+
+
+def test_a_task_has_room_after_a_design_that_was_refused():
+  task = collect_apples.CollectApples()
+  for number in (60, 90):
+    refused = _design(number, place=lambda i: [2.0, 2.0])
+    with pytest.raises(errors.SpecError, match="in each other's way"):
+      suite.embed(task, refused)
+  env = suite.embed(task, _design(70), random=1)
+  env.reset()
+  assert (_readings(env.step(helpers.no_op(env))) > 0.4).all()
+  env.close()
+
+
+@pytest.mark.parametrize('number', [specs.MAX_REGISTERS + 1, 999])
+def test_more_are_refused_before_anything_is_built(number, monkeypatch):
+  def build(*args, **kwargs):
+    raise AssertionError('something was built')
+
+  monkeypatch.setattr(mechanism.FeedbackMechanism, '_build', build)
+  monkeypatch.setattr(environment.Environment, '__init__', build)
+  message = (
+      rf'design: registers: {number} are given; allowed are at most'
+      rf' {specs.MAX_REGISTERS}$'
+  )
+  for load in (
+      lambda design: suite.load(*_WORLD, design=design),
+      lambda design: suite.load_batch(*_WORLD, num_envs=2, design=design),
+      specs.load,
+  ):
+    with pytest.raises(errors.SpecError, match=message):
+      load(_design(number))
+
+
+@pytest.mark.parametrize(
+    ('kind', 'channel', 'size'),
+    [
+        ('two_block', 'embedded', 1.0),
+        ('block_orientation', 'embedded', 0.06),
+        ('two_block', 'welded', 1.0),
+    ],
+)
+def test_the_largest_pile_is_refused(kind, channel, size):
+  # Each block is in contact with all others.
+  design = _design(
+      specs.MAX_REGISTERS,
+      place=lambda i: [2.0, 2.0],
+      kind=kind,
+      channel=channel,
+      block_size=size,
+  )
+  with pytest.raises(errors.SpecError, match="'r0' and 'r1' would be in each"):
+    suite.load(*_WORLD, design=design)
+
+
+def _calls(number):
+  """Returns how many calls of functions it takes to load a design."""
+  profile = cProfile.Profile()
+  profile.enable()
+  suite.load(*_WORLD, design=_design(number)).close()
+  profile.disable()
+  return sum(entry.callcount for entry in profile.getstats())
+
+
+def test_loading_takes_twice_as_much_for_twice_as_many():
+  _calls(1)  # What is done once only.
+  few, some, many = (_calls(number) for number in (1, 31, 61))
+  assert many - few < 2.2 * (some - few)
