@@ -45,7 +45,7 @@ TRACE = 'trace.bin'
 TENSORBOARD = 'tensorboard'
 _CHECKPOINT = 'checkpoint'
 
-# What a job has to be told besides its configuration does not change results.
+# Called with a line for people; what is said does not change results.
 Say = Callable[[str], None]
 
 

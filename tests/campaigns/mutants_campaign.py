@@ -385,7 +385,7 @@ MUTANTS = [
     ),
     Mutant(
         'storage', 'lines behind the checkpoint stay', _STORAGE,
-        '      self._file.truncate(size)\n', '', _STO,
+        '    self._file.truncate(size)\n', '', _STO,
     ),
     Mutant(
         'storage', 'lines are not synchronised before a checkpoint', _STORAGE,
@@ -419,14 +419,37 @@ MUTANTS = [
     ),
     Mutant(
         'storage', 'a checkpoint of another run is taken',
-        'engine/snapshot.py',
-        '        if saved.get(key) != here.get(key)\n', '        if False\n',
+        'archive.py',
+        '        if saved.get(key) != other.get(key)\n', '        if False\n',
         _STO,
     ),
     Mutant(
-        'storage', 'a damaged checkpoint is taken', 'engine/snapshot.py',
+        'storage', 'a damaged checkpoint is taken', 'archive.py',
         'if data[:start] != _MAGIC + hashlib.sha256(payload).digest():',
         'if not data:', _STO,
+    ),
+    Mutant(
+        'storage', 'a checkpoint of another kind is taken', 'archive.py',
+        '    if self.what != expected:\n', '    if not expected:\n',
+        ('tests/archive_test.py',),
+    ),
+    Mutant(
+        'storage', 'a run continues on another machine unasked',
+        'experiments/training.py',
+        '      if not differences:\n', '      if differences:\n',
+        ('tests/experiments/machines_test.py',),
+    ),
+    Mutant(
+        'storage', 'the configuration of a finished job is not checked',
+        'experiments/jobs.py',
+        '  read_config(folder)\n  return True\n', '  return True\n',
+        ('tests/experiments/finished_jobs_test.py',),
+    ),
+    Mutant(
+        'storage', 'worlds stay open when training fails',
+        'experiments/training.py',
+        '      stack.callback(lambda: self._batch.close())\n', '',
+        ('tests/experiments/closing_test.py',),
     ),
     Mutant(
         'storage', 'a full disk is not explained', _STORAGE,
