@@ -26,6 +26,7 @@ import jax
 from realab_suite import agents
 from realab_suite import errors
 from realab_suite.agents import jax_settings
+from tests import patience
 from tests.agents import toys
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -178,7 +179,7 @@ def test_variables_change_nothing_either(digests):
       env={**os.environ, **_VARIABLES},
       capture_output=True,
       text=True,
-      timeout=300,
+      timeout=patience.SECONDS,
       check=False,
   )
   assert ran.returncode == 0, ran.stderr

@@ -23,6 +23,7 @@ from realab_suite.experiments import sweep
 from realab_suite.experiments import sweeping
 from realab_suite.experiments import threads
 from realab_suite.experiments import training
+from tests import patience
 from tests.experiments import fake_learner
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -327,7 +328,7 @@ def _launch(*arguments: str, **environment: str) -> Any:
       env={**os.environ, **environment},
       capture_output=True,
       text=True,
-      timeout=120,
+      timeout=patience.SECONDS,
       check=False,
   )
 
