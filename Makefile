@@ -20,8 +20,8 @@ help:
 	@echo 'make clean   removes .venv, builds and caches; results/ stays'
 
 demo: .venv/demo
-	$(PY) -m realab_suite.experiments.sweep --experiment=quick --output=$(DEMO)
-	$(PY) -m realab_suite.experiments.report --input=$(DEMO)
+	$(PY) -m realab_suite.launchers.sweep --experiment=quick --output=$(DEMO)
+	$(PY) -m realab_suite.launchers.report --input=$(DEMO)
 
 test: lint
 	$(PY) -m pytest -q -n $(WORKERS)

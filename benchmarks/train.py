@@ -24,8 +24,8 @@ import numpy as np
 
 from benchmarks import timing
 from realab_suite.evaluation import monitor as monitors
-from realab_suite.experiments import headless
 from realab_suite.experiments import jobs
+from realab_suite.experiments import requirements
 from realab_suite.experiments import spec
 from realab_suite.experiments import threads
 from realab_suite.experiments import training
@@ -211,7 +211,7 @@ def _figures(
 def main(arguments: Sequence[str] | None = None) -> None:
   """Runs the benchmark."""
   rounds = timing.parse_rounds(__doc__, arguments, _ROUNDS)
-  if problem := headless.missing('jax', 'equinox', 'optax', extra='agents'):
+  if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     sys.stderr.write(f'error: {problem}\n')
     sys.exit(_USAGE_ERROR)
   with _team() as team:

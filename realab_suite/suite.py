@@ -11,14 +11,14 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import loading
+from realab_suite.config import messages
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
-from realab_suite.feedback import loading
 from realab_suite.feedback import mechanism as feedback_mechanism
-from realab_suite.feedback import messages
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples

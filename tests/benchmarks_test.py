@@ -12,7 +12,7 @@ from benchmarks import step
 from benchmarks import timing
 from benchmarks import train
 from realab_suite import suite
-from realab_suite.experiments import headless
+from realab_suite.experiments import requirements
 
 _LINES = [
     (
@@ -106,7 +106,9 @@ def test_the_benchmark_of_training_prints_a_line_per_figure(
 def test_the_benchmark_of_training_says_in_one_line_what_is_not_installed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-  monkeypatch.setattr(headless, 'missing', lambda *_, **__: 'jax is missing')
+  monkeypatch.setattr(
+      requirements, 'missing', lambda *_, **__: 'jax is missing'
+  )
   with pytest.raises(SystemExit) as raised:
     train.main([])
   assert raised.value.code == 2

@@ -2,9 +2,9 @@
 
 import pytest
 
-from tests.campaigns import coverage_campaign
-from tests.campaigns import install_campaign
-from tests.campaigns import mutants_campaign
+from campaigns import coverage_campaign
+from campaigns import install_campaign
+from campaigns import mutants_campaign
 
 _REFUSAL = (
     'realab_suite._versions.DependencyError: realab_suite: found dm-control'

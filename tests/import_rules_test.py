@@ -21,7 +21,10 @@ _PACKAGE = 'realab_suite'
 # What each layer may import besides itself and `_FOUNDATION`. An entry that
 # names a module admits that module alone.
 _FOUNDATION = ('archive', 'errors', '_display', '_versions')
-_BELOW_SUITE = ('entities', 'feedback', 'tasks', 'engine', 'evaluation')
+_BELOW_SUITE = (
+    'config', 'configs', 'entities', 'policies', 'feedback', 'tasks', 'engine',
+    'evaluation',
+)  # fmt: skip
 _MAY_IMPORT = {
     '__init__': (),
     'archive': (),
@@ -29,29 +32,34 @@ _MAY_IMPORT = {
     '_display': (),
     '_versions': (),
     'configs': (),
+    'config': ('configs',),
     'entities': (),
-    'feedback': ('entities', 'configs'),
+    'policies': ('config', 'configs', 'entities'),
+    'feedback': ('config', 'configs', 'entities', 'policies'),
     # A task must not know the feedback function, so no providers.
     'tasks': (
+        'config',
         'entities',
         'feedback.specs',
         'feedback.mechanism',
-        'feedback.policies.base',
+        'policies.base',
     ),
-    'engine': ('entities', 'feedback', 'tasks'),
-    'evaluation': ('entities', 'feedback', 'tasks', 'engine'),
+    'engine': ('config', 'entities', 'policies', 'feedback', 'tasks'),
+    'evaluation': (
+        'config', 'entities', 'policies', 'feedback', 'tasks', 'engine',
+    ),
     # Nothing here may reach the true reward.
-    'agents': (
-        'feedback.specs',
-        'feedback.registry',
-        'feedback.action_sets',
-        'feedback.validation',
+    'agents': ('config', 'feedback.specs', 'policies.action_sets'),
+    'suite': _BELOW_SUITE,
+    'interop': (*_BELOW_SUITE, 'suite'),
+    'experiments': (*_BELOW_SUITE, 'suite', 'agents', 'interop'),
+    'reports': (*_BELOW_SUITE, 'suite', 'agents', 'interop', 'experiments'),
+    'launchers': (
+        *_BELOW_SUITE, 'suite', 'agents', 'interop', 'experiments', 'reports',
     ),
-    'suite': (*_BELOW_SUITE, 'configs'),
-    'interop': (*_BELOW_SUITE, 'configs', 'suite'),
-    'experiments': (*_BELOW_SUITE, 'configs', 'suite', 'agents', 'interop'),
-    'explore': (*_BELOW_SUITE, 'configs', 'suite', 'experiments'),
-}
+    # The old name of a command, which imports nothing.
+    'explore': (),
+}  # fmt: skip
 
 _PICKLES = ('pickle', 'cloudpickle', 'dill', 'shelve', 'marshal')
 _UNSAFE_YAML = re.compile(r'yaml\.(load|(full|unsafe)_load)(_all)?')
@@ -414,13 +422,17 @@ def _complaints(rule, source, name='realab_suite.entities.planted'):
             'entities.planted',
             "import importlib\nimportlib.import_module('realab_suite.tasks')",
         ),
+        ('config.planted', 'from realab_suite.entities import state'),
+        ('config.planted', 'from realab_suite.feedback import specs'),
+        ('policies.planted', 'from realab_suite.feedback import specs'),
+        ('policies.planted', 'from realab_suite.engine import physics'),
         ('feedback.planted', 'from realab_suite import evaluation'),
         ('feedback.planted', 'from realab_suite.tasks import base'),
         ('tasks.planted', 'from realab_suite.feedback import providers'),
         ('tasks.planted', 'from realab_suite.feedback.providers import base'),
         ('tasks.planted', 'from realab_suite import feedback'),
         ('tasks.planted', 'from realab_suite.feedback import specs_extra'),
-        ('tasks.planted', 'from realab_suite.feedback.policies import random'),
+        ('tasks.planted', 'from realab_suite.policies import random'),
         ('engine.planted', 'from realab_suite import experiments'),
         ('engine.planted', 'from realab_suite.evaluation import ledger'),
         ('evaluation.planted', 'from realab_suite import agents'),
@@ -431,10 +443,13 @@ def _complaints(rule, source, name='realab_suite.entities.planted'):
         ('agents.planted', 'from realab_suite.feedback import mechanism'),
         ('agents.planted', 'from realab_suite import suite'),
         ('suite', 'from realab_suite import agents'),
-        ('suite', 'from realab_suite.experiments import run'),
+        ('suite', 'from realab_suite.experiments import jobs'),
         ('explore', 'from realab_suite import agents'),
         ('interop.planted', 'from realab_suite import agents'),
-        ('interop.planted', 'from realab_suite.experiments import run'),
+        ('interop.planted', 'from realab_suite.experiments import jobs'),
+        ('experiments.planted', 'from realab_suite.reports import plots'),
+        ('experiments.planted', 'from realab_suite import launchers'),
+        ('reports.planted', 'from realab_suite.launchers import program'),
         ('suite', 'from realab_suite.interop.rpc import server'),
         ('evaluation.planted', 'from realab_suite import interop'),
         ('errors', 'from realab_suite import entities'),
@@ -460,10 +475,12 @@ def test_a_forbidden_import_is_found(importer, statement):
         ('entities.planted', 'import numpy as np'),
         ('tasks.planted', 'from realab_suite.feedback import specs'),
         ('tasks.planted', 'from realab_suite.feedback.specs import DesignSpec'),
-        ('tasks.planted', 'from realab_suite.feedback.policies import base'),
+        ('tasks.planted', 'from realab_suite.policies import base'),
         ('evaluation.planted', 'from realab_suite.engine import events'),
         ('suite', 'from realab_suite.evaluation import ledger'),
-        ('agents.planted', 'from realab_suite.feedback import registry'),
+        ('agents.planted', 'from realab_suite.config import registry'),
+        ('reports.planted', 'from realab_suite.experiments import jobs'),
+        ('launchers.planted', 'from realab_suite.reports import page'),
         ('experiments.planted', 'from realab_suite import agents'),
         ('experiments.planted', 'from realab_suite import suite'),
         ('experiments.planted', 'from realab_suite.interop.rpc import server'),

@@ -1,1 +1,1 @@
-"""Data only: the experiments that `experiments.run --experiment=name` finds."""
+"""Data only: the experiments that `launchers.train --experiment=name` finds."""

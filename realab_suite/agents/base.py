@@ -14,9 +14,9 @@ from realab_suite import errors
 from realab_suite.agents import controls as controls_lib
 from realab_suite.agents import features
 from realab_suite.agents import jax_settings
-from realab_suite.feedback import registry
+from realab_suite.config import registry
+from realab_suite.config import validation
 from realab_suite.feedback import specs
-from realab_suite.feedback import validation
 
 Positive = Annotated[int, pydantic.Field(gt=0)]
 Fraction = Annotated[float, pydantic.Field(ge=0, le=1)]

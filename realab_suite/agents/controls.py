@@ -9,7 +9,7 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.feedback import action_sets
+from realab_suite.policies import action_sets
 
 _QUERY = 'query/'
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.feedback import messages
+from realab_suite.config import messages
 
 # More worlds have no room on one machine.
 _MOST_WORLDS = 2**16

@@ -10,6 +10,7 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.engine import actions as actions_lib
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_physics
@@ -23,7 +24,6 @@ from realab_suite.engine import seeding
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanism as feedback_mechanism
-from realab_suite.feedback import messages
 from realab_suite.tasks import base
 
 

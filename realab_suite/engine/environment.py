@@ -26,9 +26,9 @@ from realab_suite.engine import physics as engine_physics
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.entities import state
-from realab_suite.feedback import action_sets
 from realab_suite.feedback import mechanism as feedback_mechanism
 from realab_suite.feedback import specs as specs_lib
+from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 # Hooks that Composer would call and that a world of this package never does.

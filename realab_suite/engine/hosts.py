@@ -16,8 +16,8 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.entities import axes
-from realab_suite.feedback import messages
 from realab_suite.tasks import base
 
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.engine import sweeps
+from realab_suite.engine import swept_volumes
 from realab_suite.entities import arenas
 from realab_suite.entities import moving
 from realab_suite.entities import registers
@@ -33,7 +33,7 @@ _MANY = np.linspace(0.0, 1.0, 257)
 _NOISE = 1e-9
 
 _Registers = Mapping[str, registers.Register]
-_Paths = dict[str, list[sweeps.Sweep]]
+_Paths = dict[str, list[swept_volumes.Sweep]]
 
 
 def check(
@@ -43,9 +43,9 @@ def check(
 ) -> None:
   """Checks that no write can put a block where a block must not be.
 
-  It holds for every value and for every place of the region in which a register
-  may stand. Overlaps of up to `sweeps.TOLERANCE` are accepted. The state is
-  reset in the end.
+  The check covers every value of a register and every point of the region in
+  which it may stand. Overlaps of up to `swept_volumes.TOLERANCE` are accepted.
+  The state is reset at the end.
 
   Args:
     physics: One world.
@@ -58,7 +58,7 @@ def check(
       meters with what an agent can see.
   """
   _check_solver(physics, mechanism)
-  space = sweeps.Space(physics.model.ptr)
+  space = swept_volumes.Space(physics.model.ptr)
   paths = _paths(physics, mechanism.registers)
   obstacles = _Crowd(space)
   obstacles.add('', _obstacles(physics, root, paths))
@@ -104,12 +104,14 @@ def check_start(
     SpecError: If a block stands where the avatar may begin.
   """
   low, high = np.array(task.start.low), np.array(task.start.high)
-  space = sweeps.Space(physics.model.ptr)
+  space = swept_volumes.Space(physics.model.ptr)
   # A geom of the avatar stands for all the places of the avatar's middle.
   body = physics.bind(task.avatar.body).element_id
   geom = int(physics.model.body_geomadr[body])
   space.make_box(geom, np.array([*(high - low) / 2, 1.0]))
-  start = sweeps.Sweep(geom, np.array([*(low + high) / 2, 0.0]), np.eye(3))
+  start = swept_volumes.Sweep(
+      geom, np.array([*(low + high) / 2, 0.0]), np.eye(3)
+  )
   for name, path in _standing(physics, mechanism.registers).items():
     for sweep in path:
       if space.meet(sweep, start, clearance=task.avatar.radius) is not None:
@@ -122,21 +124,23 @@ def check_start(
 
 @final
 class _Crowd:
-  """Many sweeps, few of which are near any other one."""
+  """Many swept_volumes, few of which are near any other one."""
 
-  def __init__(self, space: sweeps.Space) -> None:
+  def __init__(self, space: swept_volumes.Space) -> None:
     self._space = space
-    self._members: list[tuple[str, sweeps.Sweep]] = []
+    self._members: list[tuple[str, swept_volumes.Sweep]] = []
     self._bounds = np.zeros((0, 2, 3))
 
-  def add(self, name: str, path: Sequence[sweeps.Sweep]) -> None:
+  def add(self, name: str, path: Sequence[swept_volumes.Sweep]) -> None:
     """Adds sweeps that share a name."""
     if path:
       bounds = [self._space.bounds(sweep) for sweep in path]
       self._bounds = np.concatenate([self._bounds, bounds])
       self._members += [(name, sweep) for sweep in path]
 
-  def near(self, sweep: sweeps.Sweep) -> Iterator[tuple[str, sweeps.Sweep]]:
+  def near(
+      self, sweep: swept_volumes.Sweep
+  ) -> Iterator[tuple[str, swept_volumes.Sweep]]:
     """Yields the names and the sweeps that another sweep might meet."""
     low, high = self._space.bounds(sweep)
     is_near = (self._bounds[:, 0] <= high) & (low <= self._bounds[:, 1])
@@ -164,7 +168,7 @@ def _standing(physics: Any, named: _Registers) -> _Paths:
   motions[:, 1, :3] = aside - centres
   return {
       name: [
-          sweeps.Sweep(i, centres[i], matrices[i], motions[i])
+          swept_volumes.Sweep(i, centres[i], matrices[i], motions[i])
           for i in (physics.bind(b.geom).element_id for b in register.blocks)
       ]
       for name, register in named.items()
@@ -235,8 +239,8 @@ def _is_straight(trace: np.ndarray) -> bool:
 
 
 def _legs(
-    sweep: sweeps.Sweep, trace: np.ndarray, radius: float
-) -> list[sweeps.Sweep]:
+    sweep: swept_volumes.Sweep, trace: np.ndarray, radius: float
+) -> list[swept_volumes.Sweep]:
   """Returns the poses of a geom as sweeps from sample to sample.
 
   Args:
@@ -254,10 +258,10 @@ def _legs(
   for i in range(len(trace) - 1):
     middle = (trace[i] + trace[i + 1]) / 2
     legs.append(
-        sweeps.Sweep(
+        swept_volumes.Sweep(
             sweep.geom,
             middle[:3],
-            sweeps.turned(sweep.matrix, middle[3] - angle),
+            swept_volumes.turned(sweep.matrix, middle[3] - angle),
             np.vstack([sweep.motions, (trace[i + 1] - trace[i]) / 2]),
             float(middle[4]),
             float(bend[i : i + 2].max()),
@@ -268,7 +272,7 @@ def _legs(
 
 def _obstacles(
     physics: Any, root: composer.Entity, paths: _Paths
-) -> list[sweeps.Sweep]:
+) -> list[swept_volumes.Sweep]:
   """Returns the poses of solid geoms that nothing can push."""
   mujoco.mj_resetData(physics.model.ptr, physics.data.ptr)
   physics.mark_as_dirty()
@@ -289,7 +293,7 @@ def _obstacles(
     half = np.zeros(5)
     half[:3] = np.array(travels.get(geom, (0.0, 0.0, 0.0))) / 2
     obstacles.append(
-        sweeps.Sweep(
+        swept_volumes.Sweep(
             geom, data.geom_xpos[geom] + half[:3], matrices[geom], half[None]
         )
     )
@@ -307,7 +311,7 @@ def _travels(physics: Any, root: composer.Entity) -> dict[int, np.ndarray]:
 
 
 def _check_extent(
-    name: str, sweep: sweeps.Sweep, root: composer.Entity
+    name: str, sweep: swept_volumes.Sweep, root: composer.Entity
 ) -> None:
   """Refuses a block whose middle can be outside of the arena."""
   if not isinstance(root, arenas.RoomArena):
@@ -323,14 +327,16 @@ def _check_extent(
         )
 
 
-def _where(name: str, pose: sweeps.Sweep) -> str:
+def _where(name: str, pose: swept_volumes.Sweep) -> str:
   return (
       f'register {name!r} at value {pose.value:g} would sit at'
       f' {_show(pose.centre[:2])}'
   )
 
 
-def _area(space: sweeps.Space, path: Sequence[sweeps.Sweep]) -> str:
+def _area(
+    space: swept_volumes.Space, path: Sequence[swept_volumes.Sweep]
+) -> str:
   """Prints the rectangle that sweeps fill."""
   bounds = np.array([space.bounds(sweep) for sweep in path])
   return _show(bounds[:, 0, :2].min(axis=0), bounds[:, 1, :2].max(axis=0))

@@ -14,7 +14,7 @@ import zlib
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.feedback import messages
+from realab_suite.config import messages
 
 NUM_SALT_BYTES = 16
 """Length of a salt."""

@@ -7,13 +7,13 @@ import dm_env
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite.engine import environment
 from realab_suite.engine import seeding
-from realab_suite.feedback import action_sets
 from realab_suite.feedback import mechanism as feedback_mechanism
-from realab_suite.feedback import policies
-from realab_suite.feedback import random_keys
 from realab_suite.feedback import specs
+from realab_suite.policies import action_sets
+from realab_suite.policies import random_keys
 
 # What dm_control's viewer calls a policy, and what an agent of yours may be.
 PlainPolicy = Callable[[dm_env.TimeStep], Any]

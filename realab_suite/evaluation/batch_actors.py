@@ -4,11 +4,11 @@ from typing import Any, Protocol, final
 
 import numpy as np
 
+from realab_suite import policies
 from realab_suite.engine import batch_environment
 from realab_suite.engine import seeding
 from realab_suite.evaluation import actors
-from realab_suite.feedback import policies
-from realab_suite.feedback import random_keys
+from realab_suite.policies import random_keys
 
 
 class BatchActor(Protocol):

@@ -8,6 +8,7 @@ import dm_env
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -17,7 +18,6 @@ from realab_suite.evaluation import endings
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.evaluation import metrics
 from realab_suite.feedback import mechanism as feedback_mechanism
-from realab_suite.feedback import policies
 from realab_suite.tasks import base
 
 

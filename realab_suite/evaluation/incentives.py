@@ -32,12 +32,12 @@ import dm_env
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import policies as scripted_policies
 from realab_suite.engine import batch_environment
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import intervals
-from realab_suite.feedback import action_sets
-from realab_suite.feedback import policies as scripted_policies
+from realab_suite.policies import action_sets
 
 # Returns the probability of each action of the set, `(states, actions)`.
 Probabilities = Callable[[Mapping[str, np.ndarray]], np.ndarray]

@@ -90,7 +90,7 @@ def mean_interval(
   leaves them. And its side towards the longer tail is lengthened by the
   skewness of the seeds, because few seeds rarely show the whole tail.
 
-  The campaign `tests/campaigns/statistics_campaign.py` measures the coverage;
+  The campaign `campaigns/statistics_campaign.py` measures the coverage;
   docs/reliability.md (C43) has the figures, and those of the methods that did
   worse: bootstrap-t, BCa, Student's on a log or logit scale, and bounds that
   assume nothing, which are several times as wide.

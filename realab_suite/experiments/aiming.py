@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite.engine import environment
 from realab_suite.entities import registers
-from realab_suite.feedback import policies
 
 _AIM = ('target', 'direction')
 

@@ -6,7 +6,7 @@ import pathlib
 from typing import Any, Protocol, final
 
 from realab_suite import errors
-from realab_suite.experiments import headless
+from realab_suite.experiments import requirements
 
 
 def point(
@@ -101,7 +101,7 @@ class TensorBoard:
 
 def check_tensorboard() -> None:
   """Raises a `SpecError` if tensorboardX is not installed."""
-  if problem := headless.missing('tensorboardX', extra='tb'):
+  if problem := requirements.missing('tensorboardX', extra='tb'):
     raise errors.SpecError(f'--tensorboard: {problem}')
 
 

@@ -12,7 +12,7 @@ import sys
 from typing import Any, final
 
 from realab_suite import errors
-from realab_suite.experiments import headless
+from realab_suite.experiments import requirements
 
 # How long a process that was asked to end may take, seconds.
 _PATIENCE = 10.0
@@ -175,7 +175,7 @@ def execute(command: Sequence[str], log: str, folder: str) -> int:
 
 
 def _import(name: str) -> Any:
-  if problem := headless.missing(name, extra='cluster'):
+  if problem := requirements.missing(name, extra='cluster'):
     raise errors.SpecError(f'--engine={name}: {problem}')
   return importlib.import_module(name)
 

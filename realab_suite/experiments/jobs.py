@@ -13,11 +13,11 @@ from typing import Any, final
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.config import validation
 from realab_suite.evaluation import results
 from realab_suite.experiments import spec as experiment_spec
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
-from realab_suite.feedback import validation
 
 _SCHEMA = 1
 # What learners are made of; results depend on it where it is installed.

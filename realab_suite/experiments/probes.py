@@ -9,6 +9,7 @@ import dataclasses
 import pathlib
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite.engine import batch_environment
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import incentives
@@ -16,7 +17,6 @@ from realab_suite.evaluation import signed_corruption
 from realab_suite.experiments import aiming
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
-from realab_suite.feedback import policies
 from realab_suite.feedback import specs
 
 PROBE = 'probe.bin'

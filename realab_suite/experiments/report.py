@@ -1,58 +1,7 @@
-r"""Sums up a sweep: one page, with tables, curves, plots and clips.
-
-  python -m realab_suite.experiments.report --input=results/paper
-
-It writes report.html, which needs no network and no other file, tables.csv and
-tables.md into the same folder, or into the one that --output names. A sweep
-that is not over can be reported, too; the page says what is missing.
-"""
-
-from collections.abc import Sequence
-import pathlib
-
-from absl import flags
-
-from realab_suite import errors
-from realab_suite.experiments import cli
-from realab_suite.experiments import headless
-from realab_suite.experiments import imports_flag
-from realab_suite.experiments import output_flag
-
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(output_flag)
-_INPUT = flags.DEFINE_string(
-    'input', None, 'The folder of a sweep: what its --output named.'
-)
-_CLIPS = flags.DEFINE_boolean(
-    'clips', True, 'Whether to film the first and a typical episode.'
-)
-
-
-def main(argv: Sequence[str]) -> None:
-  """Writes the report that the flags describe."""
-  del argv
-  folder = pathlib.Path(cli.required(_INPUT))
-  if problem := headless.missing('matplotlib', 'jinja2'):
-    raise errors.SpecError(f'a report needs more: {problem}')
-  no_clips = _why_no_clips()
-  if no_clips is not None:
-    headless.render_nothing()
-    cli.say(f'clips are skipped: {no_clips}')
-  # Not before a renderer has been chosen: this imports dm_control.
-  from realab_suite.experiments.reporting import page
-
-  imports_flag.load()
-  chosen = output_flag.OUTPUT.value
-  output = pathlib.Path(chosen) if chosen else folder
-  path = page.write(folder, output, cli.say, no_clips)
-  cli.say(f'The report is {path}')
-
-
-def _why_no_clips() -> str | None:
-  if not _CLIPS.value:
-    return 'turned off by --noclips'
-  return headless.missing('imageio', 'av', 'PIL') or headless.choose_renderer()
-
+"""Replaced by `realab_suite.launchers.report`."""
 
 if __name__ == '__main__':
-  cli.start(main)
+  raise SystemExit(
+      'error: realab_suite.experiments.report has moved; run: python -m'
+      ' realab_suite.launchers.report'
+  )

@@ -10,9 +10,9 @@ from typing import Any, final
 import pydantic
 
 from realab_suite import errors
+from realab_suite.config import validation
 from realab_suite.engine import seeding
 from realab_suite.experiments import storage
-from realab_suite.feedback import validation
 
 NAME = 'run.json'
 """The file, in the folder of the results."""

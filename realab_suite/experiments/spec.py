@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal, final
 import pydantic
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
-from realab_suite.feedback import loading
-from realab_suite.feedback import messages
-from realab_suite.feedback import option_types
-from realab_suite.feedback import policies
+from realab_suite.config import loading
+from realab_suite.config import messages
+from realab_suite.config import option_types
+from realab_suite.config import validation
 from realab_suite.feedback import specs
-from realab_suite.feedback import validation
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]
 _Seed = Annotated[int, pydantic.Field(ge=0, lt=2**31)]

@@ -13,7 +13,7 @@ from typing import Any, final
 
 from realab_suite import archive
 from realab_suite import errors
-from realab_suite.feedback import validation
+from realab_suite.config import validation
 
 CONFIG = 'config.json'
 DONE = 'done.json'

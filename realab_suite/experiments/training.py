@@ -17,6 +17,7 @@ import numpy as np
 import tqdm
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import seeding
@@ -27,14 +28,13 @@ from realab_suite.evaluation import monitor as monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
-from realab_suite.experiments import headless
 from realab_suite.experiments import jobs
 from realab_suite.experiments import learners
 from realab_suite.experiments import machines
 from realab_suite.experiments import probes
 from realab_suite.experiments import progress
+from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
-from realab_suite.feedback import policies
 
 EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
@@ -107,7 +107,7 @@ def make_learner(
     SpecError: If there is no such learner, the design does not suit it, or what
       learners are made of is not installed.
   """
-  if problem := headless.missing('jax', 'equinox', 'optax', extra='agents'):
+  if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'learner {job.kind!r}: {problem}')
   from realab_suite import agents  # Brings JAX, which nothing else here needs.
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 import graphlib
 from typing import Any
 
-from realab_suite.feedback import action_sets
-from realab_suite.feedback import messages
+from realab_suite.config import messages
+from realab_suite.policies import action_sets
 
 
 def check(design: Any, read_by_agents: Sequence[str]) -> None:

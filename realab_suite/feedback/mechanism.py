@@ -14,13 +14,13 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.entities import arenas
 from realab_suite.entities import axes
 from realab_suite.entities import meters
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import records
-from realab_suite.feedback import messages
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds

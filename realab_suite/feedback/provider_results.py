@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.feedback import messages
+from realab_suite.config import messages
 from realab_suite.feedback import providers
 
 

@@ -1,7 +1,7 @@
 """The kinds of registers that a design can ask for by name."""
 
+from realab_suite.config import registry
 from realab_suite.entities import registers
-from realab_suite.feedback import registry
 
 REGISTER_KINDS: registry.Registry[type[registers.Register]] = registry.Registry(
     'register kind'

@@ -10,16 +10,16 @@ from typing import Annotated, Any, Literal, final
 import pydantic
 
 from realab_suite import errors
+from realab_suite.config import loading
+from realab_suite.config import messages
+from realab_suite.config import option_types
+from realab_suite.config import validation
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
-from realab_suite.feedback import action_sets
 from realab_suite.feedback import consistency
-from realab_suite.feedback import loading
-from realab_suite.feedback import messages
-from realab_suite.feedback import option_types
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
-from realab_suite.feedback import validation
+from realab_suite.policies import action_sets
 
 _NAME = r'^[a-z][a-z0-9_]{0,63}$'
 Name = Annotated[str, pydantic.StringConstraints(pattern=_NAME)]

@@ -8,19 +8,19 @@ import sys
 
 import pytest
 
-from realab_suite.feedback.policies import network_files
+from realab_suite.policies import network_files
 
 pytest.importorskip('optax')
 
-from realab_suite.experiments import network_making
+from realab_suite.experiments import network_training
 from tests import patience
 
 _ROOT = pathlib.Path(__file__).parents[2]
 
 
 def test_every_shipped_network_is_what_its_recipe_makes():
-  assert tuple(network_making.RECIPES) == network_files.NETWORKS
-  for name, recipe in network_making.RECIPES.items():
+  assert tuple(network_training.RECIPES) == network_files.NETWORKS
+  for name, recipe in network_training.RECIPES.items():
     header = network_files.load(name).header
     assert header.description == recipe.description
     assert header.made.learner == recipe.learner
@@ -29,13 +29,13 @@ def test_every_shipped_network_is_what_its_recipe_makes():
 
 
 def test_what_is_made_is_what_was_learned_and_can_be_loaded():
-  recipe = network_making.RECIPES['demonstrator_v1']
+  recipe = network_training.RECIPES['demonstrator_v1']
   recipe = dataclasses.replace(
       recipe,
       learner={**recipe.learner, 'hidden': [8], 'steps_per_update': 4},
       steps=16,
   )
-  made = network_making.make(recipe, num_envs=2, num_episodes=2)
+  made = network_training.make(recipe, num_envs=2, num_episodes=2)
   net = network_files.from_bytes(made.to_bytes(), 'small.npz')
   assert net.digest() == made.digest()
   assert net.header.hidden == (8,)
@@ -56,7 +56,7 @@ def test_what_is_made_is_what_was_learned_and_can_be_loaded():
 def test_what_the_command_line_gets_wrong_is_told_in_a_line(
     tmp_path, arguments, complaint
 ):
-  module = 'realab_suite.experiments.make_networks'
+  module = 'realab_suite.launchers.make_networks'
   ran = subprocess.run(
       [sys.executable, '-m', module, *arguments],
       cwd=tmp_path,

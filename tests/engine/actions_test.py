@@ -14,8 +14,8 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import actions
 from realab_suite.engine import agent_view
-from realab_suite.feedback import action_sets
 from realab_suite.interop.rpc import agent_port
+from realab_suite.policies import action_sets
 from tests.engine import helpers
 
 _NUM_ACTIONS = 200

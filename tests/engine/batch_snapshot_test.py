@@ -5,6 +5,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from campaigns import snapshot_campaign as campaign
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import batch_environment
@@ -12,7 +13,6 @@ from realab_suite.engine import events
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.feedback import providers
-from tests.campaigns import snapshot_campaign as campaign
 from tests.engine import helpers
 
 # Beyond the end of an episode, which has 90 steps.

@@ -1,19 +1,19 @@
 """Small parts of the campaigns on physics, and that they find what is planted.
 
-In full they are commands: `tests/campaigns`.
+In full they are commands: `campaigns`.
 """
 
 import numpy as np
 import pytest
 
+from campaigns import bulldozers_campaign
+from campaigns import determinism_campaign
+from campaigns import divergence_campaign
+from campaigns import null_tamper_campaign
+from campaigns import processes_campaign
+from campaigns import resets_campaign
+from campaigns import teleports_campaign
 from realab_suite.entities import arenas
-from tests.campaigns import bulldozers_campaign
-from tests.campaigns import determinism_campaign
-from tests.campaigns import divergence_campaign
-from tests.campaigns import null_tamper_campaign
-from tests.campaigns import processes_campaign
-from tests.campaigns import resets_campaign
-from tests.campaigns import teleports_campaign
 
 # C02: determinism.
 

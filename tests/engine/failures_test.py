@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import events
@@ -15,7 +16,6 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.evaluation import monitor as monitors
 from realab_suite.evaluation import results
-from realab_suite.feedback import policies
 from realab_suite.feedback import providers
 from realab_suite.tasks import collect_apples
 from tests.engine import helpers

@@ -11,9 +11,9 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 import numpy as np
 
+from realab_suite.config import registry
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.feedback import registry
 
 
 class RecordingSink(events.EventSink):

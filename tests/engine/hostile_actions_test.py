@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from campaigns import actions_campaign as campaign
 from realab_suite import errors
-from tests.campaigns import actions_campaign as campaign
 from tests.engine import helpers
 
 _NUMBER = 250

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from campaigns import growth_campaign
+from campaigns import identity_campaign as campaign
 from realab_suite import suite
 from realab_suite.engine import batch_physics
 from realab_suite.engine import seeding
 from realab_suite.evaluation import ledger as ledgers
 from realab_suite.tasks import base
-from tests.campaigns import growth_campaign
-from tests.campaigns import identity_campaign as campaign
 
 # The third visit is over, and an episode has ended, with this many steps.
 _STEPS = 130

@@ -7,10 +7,10 @@ from dm_control.rl import control
 import dm_env
 import pytest
 
+from campaigns import machine_campaign as campaign
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from tests.campaigns import machine_campaign as campaign
 
 pytestmark = pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
 

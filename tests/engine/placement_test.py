@@ -7,7 +7,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import sweeps
+from realab_suite.engine import swept_volumes
 from realab_suite.entities import arenas
 from realab_suite.entities import doors
 from realab_suite.entities import moving
@@ -202,8 +202,8 @@ def test_what_is_accepted_overlaps_nothing(room):
     hypothesis.event(f'refused: {str(error).split()[0]}')
     return
   hypothesis.event('accepted')
-  assert built.deepest(100) <= sweeps.TOLERANCE
-  assert built.deepest_start(5) <= sweeps.TOLERANCE
+  assert built.deepest(100) <= swept_volumes.TOLERANCE
+  assert built.deepest_start(5) <= swept_volumes.TOLERANCE
   built.env.close()
 
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from campaigns import snapshot_campaign as campaign
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
@@ -18,7 +19,6 @@ from realab_suite.engine import snapshot as snapshots
 from realab_suite.entities import registers
 from realab_suite.evaluation import ledger as ledgers
 from tests import worlds
-from tests.campaigns import snapshot_campaign as campaign
 from tests.engine import helpers
 
 _STEPS = 60

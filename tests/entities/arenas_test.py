@@ -4,13 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from campaigns import bulldozers_campaign
 from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import avatar as avatar_entity
 from realab_suite.entities import registers
 from tests import worlds
-from tests.campaigns import bulldozers_campaign
 
 _ROOMS = {'open_room': arenas.OpenRoom, 'two_rooms': arenas.TwoRooms}
 every_room = pytest.mark.parametrize('room', _ROOMS)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
-from realab_suite.feedback import action_sets
-from realab_suite.feedback import policies
+from realab_suite.policies import action_sets
 from tests.engine import helpers
 
 _NUM_ACTIONS = 14

@@ -13,7 +13,7 @@ from realab_suite.engine import events
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import recorder
+from realab_suite.evaluation import result_collector
 from realab_suite.evaluation import results
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import aiming
@@ -48,7 +48,7 @@ def _tamper_and_give_up(seed: int) -> list[evaluate.EpisodeResult]:
   with _world(seed) as env:
     actor = _saboteur(env)
     env.rewind()
-    listener = recorder.EpisodeRecorder(env)
+    listener = result_collector.ResultCollector(env)
     view = agent_view.AgentView(env)
     for episode in range(_NUM_EPISODES):
       actor.begin(episode)

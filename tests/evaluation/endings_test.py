@@ -14,7 +14,7 @@ from realab_suite.engine import events
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import recorder
+from realab_suite.evaluation import result_collector
 from realab_suite.experiments import aiming
 from tests.engine import helpers
 
@@ -43,7 +43,7 @@ def test_an_episode_that_the_agent_ends_counts_up_to_then(end):
   with _world() as env:
     actor = _saboteur(env)
     env.rewind()
-    listener = recorder.EpisodeRecorder(env)
+    listener = result_collector.ResultCollector(env)
     view = agent_view.AgentView(env)
     time_step = view.reset()
     for _ in range(_GIVES_UP_AT):

@@ -5,12 +5,12 @@ import types
 import numpy as np
 import pytest
 
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import events
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.feedback import policies
 
 _NUM_WORLDS = 3
 _TASK = ('unlock_door', 'near')

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -18,7 +19,6 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
-from realab_suite.feedback import policies
 from tests import worlds
 from tests.engine import helpers
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import ledger as ledgers
-from realab_suite.feedback import action_sets
-from realab_suite.feedback import policies
+from realab_suite.policies import action_sets
 
 _ACTIONS = action_sets.DMLAB_LIKE
 _NUM_ACTIONS = len(_ACTIONS)

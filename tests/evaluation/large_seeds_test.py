@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from realab_suite import agents
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import snapshot as snapshots
 from realab_suite.evaluation import batch_actors
@@ -14,14 +15,13 @@ from realab_suite.evaluation import ledger as ledgers
 from realab_suite.evaluation import monitor as monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
-from realab_suite.experiments import experiment
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
-from realab_suite.experiments import sweeping
+from realab_suite.experiments import scheduler
+from realab_suite.experiments import scripted
 from realab_suite.experiments import training
-from realab_suite.experiments.reporting import replays
-from realab_suite.experiments.reporting import sweep_results
-from realab_suite.feedback import policies
+from realab_suite.reports import replays
+from realab_suite.reports import sweep_results
 from tests.experiments import fake_learner
 from tests.experiments import fake_sweep
 from tests.experiments import small
@@ -80,7 +80,7 @@ def test_rows_keep_them(seed, tmp_path):
   settings = small.settings(
       tmp_path / 'new', policies=('random',), channels=(), seeds=(seed,)
   )
-  experiment.run(settings, lambda line: None)
+  scripted.run(settings, lambda line: None)
   rows = small.rows(tmp_path / 'new')
   assert [row.seed for row in rows] == [seed, seed]
   again = [results.line(row) for row in rows]
@@ -95,7 +95,7 @@ def test_jobs_and_replays_keep_them(seed, tmp_path, monkeypatch):
       training={'num_envs': 2, 'steps': 40, 'curve_every': 20},
   )  # fmt: skip
   [job] = jobs.plan(one, [seed])
-  sweeping._describe(one, [job], False, tmp_path)
+  scheduler._describe(one, [job], False, tmp_path)
   training.run(job, tmp_path, training.Options(lambda line: None))
   run = sweep_results.load(tmp_path).runs['reward']
   row = run.rows[1]

@@ -6,7 +6,9 @@ import dm_env
 import numpy as np
 import pytest
 
+from campaigns import readings_campaign
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -14,9 +16,7 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledger as ledgers
-from realab_suite.feedback import policies
 from tests import worlds
-from tests.campaigns import readings_campaign
 from tests.engine import helpers
 
 _TOLERANCE = 1e-9

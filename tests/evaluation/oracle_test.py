@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from campaigns import ledger_campaign
+from campaigns import metamorphic_campaign
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import ledger
 from realab_suite.evaluation import metrics
-from tests.campaigns import ledger_campaign
-from tests.campaigns import metamorphic_campaign
 
 
 def test_ledgers_and_metrics_are_what_an_oracle_finds():

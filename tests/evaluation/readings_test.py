@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
+from campaigns import readings_campaign as campaign
 from realab_suite.entities import registers
 from realab_suite.entities.registers import two_block
-from tests.campaigns import readings_campaign as campaign
 
 
 def test_every_reading_is_what_was_asked_for_plus_what_became_of_it():

@@ -19,13 +19,13 @@ import pytest
 
 import realab_suite
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
-from realab_suite.feedback import policies
 
 _NAN = float('nan')
 # Unread, so that whatever can be `None` is.

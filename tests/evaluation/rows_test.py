@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from campaigns import rows_campaign
+from realab_suite.config import validation
 from realab_suite.evaluation import results
 from realab_suite.experiments import storage
-from realab_suite.feedback import validation
-from tests.campaigns import rows_campaign
 
 
 def _damage(monkeypatch, times=100):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from campaigns import statistics_campaign
 from realab_suite import errors
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
-from tests.campaigns import statistics_campaign
 
 
 def _by_seed(values) -> dict[int, list[float]]:

@@ -3,11 +3,11 @@
 import numpy as np
 
 from realab_suite import archive
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import traces
-from realab_suite.feedback import policies
 
 _NUM_WORLDS = 3
 _TASK = ('unlock_door', 'near')

@@ -1,8 +1,8 @@
 """Policies act on streams of their own in every world."""
 
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import actors
-from realab_suite.feedback import policies
 
 
 def _actions(world):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.experiments import aiming
-from realab_suite.feedback import policies
 
 _DESIGN = {
     'schema': 1,

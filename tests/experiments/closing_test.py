@@ -18,7 +18,6 @@ from absl.testing import flagsaver
 import pytest
 
 from realab_suite import _display
-from realab_suite import explore
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_physics
@@ -30,13 +29,14 @@ from realab_suite.evaluation import incentives
 from realab_suite.evaluation import monitor as monitors
 from realab_suite.experiments import aiming
 from realab_suite.experiments import curves
-from realab_suite.experiments import experiment
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
+from realab_suite.experiments import scripted
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.feedback import mechanism
+from realab_suite.launchers import explore
 from tests.experiments import fake_learner
 from tests.experiments import small
 
@@ -373,7 +373,7 @@ def test_a_comparison_that_fails_closes_its_worlds(
 ):
   _fail_at(monkeypatch, owner, name, after, kind)
   with pytest.raises(kind):
-    experiment.run(small.settings(tmp_path / 'new'), lambda line: None)
+    scripted.run(small.settings(tmp_path / 'new'), lambda line: None)
   assert made.num_made > 0
   assert not made.open
 
@@ -426,7 +426,7 @@ class _FakeFilm:
 def test_a_film_that_cannot_be_made_leaves_nothing(
     tmp_path, monkeypatch, kind, place
 ):
-  videos = pytest.importorskip('realab_suite.experiments.videos')
+  videos = pytest.importorskip('realab_suite.reports.films')
   path = tmp_path / 'film.mp4'
   files = []
 

@@ -5,11 +5,11 @@ import pathlib
 import numpy as np
 import pytest
 
-from tests.campaigns import disk_campaign
-from tests.campaigns import kill_campaign
-from tests.campaigns import launchers_campaign
-from tests.campaigns import victims
-from tests.campaigns import zygote
+from campaigns import disk_campaign
+from campaigns import kill_campaign
+from campaigns import launchers_campaign
+from campaigns import victims
+from campaigns import zygote
 
 
 @pytest.fixture(scope='module', name='nursery')

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from campaigns import files_campaign as campaign
 from realab_suite import errors
+from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
-from realab_suite.experiments import sweeping
-from realab_suite.experiments.reporting import sweep_results
-from tests.campaigns import files_campaign as campaign
+from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 
 _EVENTS = campaign.Events()
@@ -59,13 +59,13 @@ def _edit(path: pathlib.Path, old: str, new: str) -> None:
 
 
 def test_a_changed_description_of_a_sweep_is_refused(sweep: pathlib.Path):
-  _edit(sweep / sweeping.SWEEP, '"calibration": false', '"calibration": true')
+  _edit(sweep / scheduler.SWEEP, '"calibration": false', '"calibration": true')
   with pytest.raises(errors.ResultsError, match='its checksum does not agree'):
     sweep_results.load(sweep)
 
 
 def test_a_changed_experiment_of_a_sweep_is_refused(sweep: pathlib.Path):
-  _edit(sweep / sweeping.EXPERIMENT, '250', '251')
+  _edit(sweep / scheduler.EXPERIMENT, '250', '251')
   with pytest.raises(errors.ResultsError, match='when the sweep began'):
     sweep_results.load(sweep)
 
@@ -78,8 +78,8 @@ def test_a_changed_configuration_of_a_run_is_refused(sweep: pathlib.Path):
 
 
 def test_a_job_of_a_sweep_is_a_folder_beside_its_file(sweep: pathlib.Path):
-  content: Any = sweeping.read_description(sweep)
+  content: Any = scheduler.read_description(sweep)
   content['jobs'][0]['folder'] = '../elsewhere'
-  storage.write_sealed(sweep / sweeping.SWEEP, content)
+  storage.write_sealed(sweep / scheduler.SWEEP, content)
   with pytest.raises(errors.ResultsError, match=r'jobs\.0\.folder'):
     sweep_results.load(sweep)

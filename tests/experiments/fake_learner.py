@@ -2,7 +2,7 @@
 
 Whatever it has ever seen changes what it does, so a run that does not go on
 exactly where it was gives other results. As a program, it is
-`realab_suite.experiments.run` with this learner, and dies when told to:
+`realab_suite.launchers.train` with this learner, and dies when told to:
 
     KILL_AT=step:57 python -m tests.experiments.fake_learner --experiment=...
 
@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.experiments import cli
-from realab_suite.experiments import run
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
+from realab_suite.launchers import program
+from realab_suite.launchers import train
 
 
 class FakeLearner:
@@ -130,4 +130,4 @@ if __name__ == '__main__':
   if 'KILL_AT' in os.environ:
     kind, _, count = os.environ['KILL_AT'].partition(':')
     _arm(kind, int(count))
-  cli.start(run.main)
+  program.start(train.main)

@@ -11,9 +11,9 @@ from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
+from realab_suite.experiments import scheduler
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
-from realab_suite.experiments import sweeping
 from realab_suite.experiments import training
 
 EXPERIMENT = {
@@ -75,7 +75,7 @@ def build(
   folder.mkdir(parents=True, exist_ok=True)
   seeds = one.calibration_seeds if calibration else one.seeds
   planned = jobs.plan(one, seeds)
-  sweeping._describe(one, planned, calibration, folder)
+  scheduler._describe(one, planned, calibration, folder)
   for i, job in enumerate(planned):
     rng = np.random.default_rng((i, job.seed))
     with storage.RunFolder(folder / job.folder(), job.config()) as run:

@@ -13,11 +13,11 @@ from realab_suite import suite
 from realab_suite.experiments import engines
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
+from realab_suite.experiments import scheduler
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
-from realab_suite.experiments import sweeping
 from realab_suite.experiments import training
-from realab_suite.experiments.reporting import sweep_results
+from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 
 _FILES = [
@@ -92,7 +92,7 @@ def _job(run: str) -> jobs.Job:
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-  monkeypatch.setattr(sweeping, '_POLL_SECONDS', 0.0)
+  monkeypatch.setattr(scheduler, '_POLL_SECONDS', 0.0)
   monkeypatch.setattr(suite, 'dynamics', functools.cache(suite.dynamics))
 
 
@@ -112,7 +112,7 @@ def _job_folder(folder: pathlib.Path, run: str = 'reward') -> pathlib.Path:
 
 def _sweep(folder: pathlib.Path, *only: str) -> _Idle:
   engine = _Idle()
-  sweeping.sweep(_experiment(), folder, engine, lambda line: None, only=only)
+  scheduler.sweep(_experiment(), folder, engine, lambda line: None, only=only)
   return engine
 
 

@@ -17,12 +17,12 @@ from realab_suite import errors
 from realab_suite.experiments import engines
 from realab_suite.experiments import jobs
 from realab_suite.experiments import machines
+from realab_suite.experiments import scheduler
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
-from realab_suite.experiments import sweep
-from realab_suite.experiments import sweeping
 from realab_suite.experiments import threads
 from realab_suite.experiments import training
+from realab_suite.launchers import sweep
 from tests import patience
 from tests.experiments import fake_learner
 
@@ -372,7 +372,7 @@ def test_a_sweep_tells_its_runs_of_another_machine(
   def note(*unused: Any, arguments: Any, **unused_too: Any) -> None:
     told.append(list(arguments))
 
-  monkeypatch.setattr(sweeping, 'sweep', note)
+  monkeypatch.setattr(scheduler, 'sweep', note)
   monkeypatch.setattr(threads, 'use_one', lambda: None)
   monkeypatch.setitem(engines.ENGINES, 'local', lambda workers: None)
   given = ['--other_machine'] * is_given

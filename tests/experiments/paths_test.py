@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
+from campaigns import paths_campaign as campaign
 import realab_suite
 from realab_suite import errors
+from realab_suite.config import annotations
+from realab_suite.config import loading
 from realab_suite.experiments import spec as experiments
 from realab_suite.experiments import storage
-from realab_suite.feedback import annotations
-from realab_suite.feedback import loading
 from realab_suite.feedback import specs
-from tests.campaigns import paths_campaign as campaign
-from tests.feedback import file_readers
+from tests.config import file_readers
 
 _WATCH = campaign.Watch()
 

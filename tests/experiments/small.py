@@ -7,11 +7,11 @@ from typing import Any
 
 from realab_suite.engine import seeding
 from realab_suite.evaluation import results
-from realab_suite.experiments import experiment
+from realab_suite.experiments import scripted
 from realab_suite.experiments import served_run
 from realab_suite.feedback import specs
 
-_SETTINGS = experiment.Settings(
+_SETTINGS = scripted.Settings(
     domain='unlock_door',
     task='near',
     design='instantaneous_reward',
@@ -24,12 +24,10 @@ _SETTINGS = experiment.Settings(
     num_episodes=2,
     max_steps=12,
     output='',
-    plots=False,
-    videos=False,
 )
 
 
-def settings(output: pathlib.Path, **changes: Any) -> experiment.Settings:
+def settings(output: pathlib.Path, **changes: Any) -> scripted.Settings:
   """Returns the settings of a small experiment."""
   return dataclasses.replace(_SETTINGS, output=str(output), **changes)
 

@@ -14,9 +14,9 @@ import yaml
 from realab_suite import errors
 from realab_suite.experiments import engines
 from realab_suite.experiments import jobs
+from realab_suite.experiments import scheduler
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
-from realab_suite.experiments import sweeping
 from realab_suite.experiments import training
 from tests import patience
 
@@ -86,12 +86,12 @@ def _flag(command, name):
 
 @pytest.fixture
 def no_wait(monkeypatch):
-  monkeypatch.setattr(sweeping, '_POLL_SECONDS', 0.0)
+  monkeypatch.setattr(scheduler, '_POLL_SECONDS', 0.0)
 
 
 def _sweep(experiment, output, engine, **options):
   said = []
-  sweeping.sweep(spec.load(experiment), output, engine, said.append, **options)
+  scheduler.sweep(spec.load(experiment), output, engine, said.append, **options)
   return said
 
 
@@ -165,10 +165,10 @@ def test_runs_can_be_chosen_and_the_description_has_all(tmp_path):
   engine = Pretender()
   _sweep(_SMALL, tmp_path, engine, only=['good'])
   assert engine.commands == [('good', 3)]
-  sweep = json.loads((tmp_path / sweeping.SWEEP).read_text())
+  sweep = json.loads((tmp_path / scheduler.SWEEP).read_text())
   assert [job['run'] for job in sweep['jobs']] == ['bad', 'good']
   assert (tmp_path / sweep['jobs'][1]['folder'] / storage.DONE).exists()
-  written = spec.load(tmp_path / sweeping.EXPERIMENT)
+  written = spec.load(tmp_path / scheduler.EXPERIMENT)
   assert written == spec.load(_SMALL)
 
 
@@ -211,7 +211,7 @@ def test_a_second_sweep_on_one_folder_is_refused(tmp_path):
 
 
 def test_two_processes_side_by_side_one_of_which_fails(tmp_path, monkeypatch):
-  monkeypatch.setattr(sweeping, '_MODULE', 'tests.experiments.fake_learner')
+  monkeypatch.setattr(scheduler, '_MODULE', 'tests.experiments.fake_learner')
   monkeypatch.chdir(_ROOT)
   with pytest.raises(
       errors.ResultsError,
@@ -220,7 +220,7 @@ def test_two_processes_side_by_side_one_of_which_fails(tmp_path, monkeypatch):
     _sweep(_SMALL, tmp_path, engines.Local(2))
   [good] = jobs.plan(spec.load(_SMALL), only=['good'])
   assert storage.is_done(tmp_path / good.folder())
-  log = tmp_path / sweeping.LOGS / f'{good.folder()}.log'
+  log = tmp_path / scheduler.LOGS / f'{good.folder()}.log'
   assert 'good, seed 3: step 60 of 60' in log.read_text()
 
 
@@ -428,7 +428,7 @@ def test_what_is_wrong_with_a_command_is_said_in_one_line(
 def test_only_a_learner_brings_jax(tmp_path):
   program = (
       'import sys\n'
-      'from realab_suite.experiments import sweeping, training, jobs, spec\n'
+      'from realab_suite.experiments import scheduler, training, jobs, spec\n'
       'import pathlib\n'
       '[job] = jobs.plan(spec.load("quick"), only=["reward.random"])\n'
       f'training.run(job, pathlib.Path({str(tmp_path)!r}),'
@@ -453,4 +453,4 @@ def test_only_a_learner_brings_jax(tmp_path):
 )
 def test_a_sweep_shows_returns_as_far_as_there_are_any(tmp_path, written, said):
   (tmp_path / training.CURVE).write_text(written)
-  assert sweeping._last_returns(tmp_path) == said
+  assert scheduler._last_returns(tmp_path) == said

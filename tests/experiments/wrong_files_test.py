@@ -17,7 +17,7 @@ from realab_suite.experiments import probes
 from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
-from realab_suite.experiments.reporting import sweep_results
+from realab_suite.reports import sweep_results
 from tests.experiments import fake_learner
 from tests.experiments import fake_sweep
 

@@ -2,11 +2,11 @@
 
 import pytest
 
+from campaigns import names_campaign as campaign
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
-from realab_suite.feedback import policies
 from realab_suite.feedback import specs
-from tests.campaigns import names_campaign as campaign
 
 _SAMPLE = [
     campaign.Case('unlock_door', 'instantaneous_reward', 'score', 'apples'),

@@ -7,11 +7,11 @@ from typing import Any, final
 import numpy as np
 import pytest
 
+from realab_suite import policies
 from realab_suite import suite
-from realab_suite.feedback import action_sets
-from realab_suite.feedback import policies
 from realab_suite.feedback import providers
-from realab_suite.feedback import random_keys
+from realab_suite.policies import action_sets
+from realab_suite.policies import random_keys
 from tests.engine import helpers
 
 _SEEDS = (1, 2, 3)

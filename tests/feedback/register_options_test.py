@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.entities import registers
-from realab_suite.feedback import policies
 from realab_suite.feedback import register_kinds
 from tests.engine import helpers
 

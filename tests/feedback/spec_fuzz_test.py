@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 import yaml
 
+from campaigns import spec_fuzz_campaign as campaign
 from realab_suite import errors
 from realab_suite.experiments import spec
 from realab_suite.feedback import specs
-from tests.campaigns import spec_fuzz_campaign as campaign
 
 _CONFIGS = pathlib.Path(__file__).parents[2] / 'configs'
 

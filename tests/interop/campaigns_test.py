@@ -10,11 +10,11 @@ import tracemalloc
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 import pytest
 
-from tests.campaigns import digests_campaign
-from tests.campaigns import served_campaign
-from tests.campaigns import served_departures_campaign
-from tests.campaigns import served_limits_campaign
-from tests.campaigns import served_secrets_campaign
+from campaigns import digests_campaign
+from campaigns import served_campaign
+from campaigns import served_departures_campaign
+from campaigns import served_limits_campaign
+from campaigns import served_secrets_campaign
 from tests.engine import helpers
 from tests.interop import clones
 from tests.interop import served

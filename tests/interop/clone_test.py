@@ -14,11 +14,11 @@ import pytest
 from realab_suite import errors
 from realab_suite.engine import seeding
 from realab_suite.evaluation import results
-from realab_suite.experiments import serve
-from realab_suite.experiments import serving
+from realab_suite.experiments import served_evaluation
 from realab_suite.experiments import storage
 from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import sockets
+from realab_suite.launchers import serve
 from tests import patience
 from tests.experiments import small
 from tests.interop import clones
@@ -213,7 +213,7 @@ def test_a_run_is_repeated_by_its_record(tmp_path):
 
 def _settings(record):
   """Returns the settings that `serve` makes of --repeat."""
-  return serving.Settings(
+  return served_evaluation.Settings(
       domain='collect_apples', task='standard', design='none', overrides=(),
       seed=0, max_steps=250, repeat=str(record), num_episodes=2, name='agent',
       address=None, idle_seconds=patience.SECONDS,
@@ -224,7 +224,7 @@ def _settings(record):
 
 def test_a_record_decides_the_world_the_design_and_the_seed(tmp_path, caplog):
   record = small.write_served_run(tmp_path)
-  settings, design, seed = serving._chosen(_settings(record))
+  settings, design, seed = served_evaluation._chosen(_settings(record))
   assert (settings.domain, settings.task) == ('unlock_door', 'near')
   assert (settings.seed, settings.max_steps) == (7, 12)
   assert settings.overrides == ('registers.reward.scale=0.2',)
@@ -237,7 +237,7 @@ def test_a_record_decides_the_world_the_design_and_the_seed(tmp_path, caplog):
 def test_a_record_serves_its_twin(tmp_path):
   record = small.write_served_run(tmp_path)
   given = dataclasses.replace(_settings(record), overrides=('channel=secure',))
-  settings, design, seed = serving._chosen(given)
+  settings, design, seed = served_evaluation._chosen(given)
   assert settings.overrides == (
       'registers.reward.scale=0.2',
       'channel=secure',
@@ -253,7 +253,7 @@ def test_other_versions_than_recorded_are_named(tmp_path, caplog):
   content['versions']['mujoco'] = '3.0'
   storage.write_sealed(record, content)
   record.chmod(0o600)
-  serving._chosen(_settings(record))
+  served_evaluation._chosen(_settings(record))
   [message] = caplog.messages
   assert f'{record}: the episodes may differ' in message
   assert "versions.mujoco is '3.0' there" in message

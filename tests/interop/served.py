@@ -136,7 +136,7 @@ class Program(NamedTuple):
 def in_process(
     output: pathlib.Path,
     *flags: str,
-    module: str = 'realab_suite.experiments.serve',
+    module: str = 'realab_suite.launchers.serve',
     stdin: str = '',
     task: Sequence[str] = ('--task=unlock_door.near',),
 ) -> Iterator[Any]:

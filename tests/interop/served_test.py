@@ -26,7 +26,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import aiming
-from realab_suite.experiments import serving as serving_lib
+from realab_suite.experiments import served_evaluation as serving_lib
 from realab_suite.feedback.providers import difference
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import server as rpc_server
@@ -514,7 +514,7 @@ def test_the_agent_of_the_page_needs_nothing_of_this_package(tmp_path):
   output = tmp_path / 'results'
   ran = subprocess.run(
       [
-          _PYTHON, '-W', 'error', '-m', 'realab_suite.experiments.serve',
+          _PYTHON, '-W', 'error', '-m', 'realab_suite.launchers.serve',
           '--task=unlock_door.near', '--max_steps=5', '--episodes=2',
           f'--agent_command={_PYTHON} {agent}', f'--output={output}',
       ],
@@ -547,7 +547,7 @@ def test_an_import_of_this_package_is_made_impossible_above():
 
 def _serve(*flags):
   return subprocess.run(
-      [_PYTHON, '-m', 'realab_suite.experiments.serve', *flags],
+      [_PYTHON, '-m', 'realab_suite.launchers.serve', *flags],
       cwd=served.ROOT, capture_output=True, text=True, check=False,
       timeout=patience.SECONDS,
   )  # fmt: skip
@@ -704,7 +704,7 @@ def test_a_client_of_another_user_makes_tier_t2(tmp_path):
 _READ_MEMORY = """
 import os, pwd, subprocess, sys
 import ctypes
-from realab_suite.experiments import serving
+from realab_suite.experiments import served_evaluation
 os.setuid(pwd.getpwnam('nobody').pw_uid)
 ctypes.CDLL(None).prctl(4, 1, 0, 0, 0)  # A change of user has hidden it.
 if sys.argv[1] == 'hide':

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.campaigns import solver_coupling_campaign as coupling
+from campaigns import solver_coupling_campaign as coupling
 
 _SOLVERS = pytest.mark.parametrize('solver', coupling.SOLVERS)
 

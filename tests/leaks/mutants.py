@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from campaigns import solver_coupling_campaign as coupling
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import hosts
@@ -32,7 +33,6 @@ from realab_suite.experiments import training
 from realab_suite.feedback import mechanism
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
-from tests.campaigns import solver_coupling_campaign as coupling
 from tests.leaks import contract
 from tests.leaks import failures
 from tests.leaks import files

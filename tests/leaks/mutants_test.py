@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.campaigns import leaks_campaign
+from campaigns import leaks_campaign
 from tests.leaks import mutants
 from tests.leaks import pairs
 from tests.leaks import walk

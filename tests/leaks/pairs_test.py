@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from campaigns import leaks_campaign
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from tests.campaigns import leaks_campaign
 from tests.engine import helpers
 from tests.leaks import pairs
 from tests.leaks import secrets

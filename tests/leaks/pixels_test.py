@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.campaigns import pixels_campaign as pixels
+from campaigns import pixels_campaign as pixels
 
 
 @pytest.mark.camera

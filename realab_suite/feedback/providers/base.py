@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 import pydantic
 
-from realab_suite.feedback import registry
+from realab_suite.config import registry
 
 Observation = Mapping[str, np.ndarray]
 Readings = Mapping[str, np.ndarray]

@@ -11,7 +11,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import recorder
+from realab_suite.evaluation import result_collector
 from realab_suite.evaluation import results
 from realab_suite.interop.rpc import agent_port
 from realab_suite.interop.rpc import server
@@ -48,7 +48,7 @@ class ServedWorld(server.World):
     self._num_left = num_episodes
     self._on_episode = on_episode
     self._failures: list[Exception] = []
-    self._recorder = recorder.EpisodeRecorder(env)
+    self._collector = result_collector.ResultCollector(env)
     self._port = agent_port.AgentPort(
         agent_view.AgentView(env, self._failures), env.abandon
     )
@@ -80,7 +80,7 @@ class ServedWorld(server.World):
     for failure in self._failures:
       logging.error('the episode has failed', exc_info=failure)
     self._failures.clear()
-    for result in self._recorder.take():
+    for result in self._collector.take():
       self._num_left -= 1
       self._on_episode(result, self._isolation)
     return self._num_left > 0

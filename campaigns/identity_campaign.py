@@ -1,0 +1,354 @@
+"""Campaign identity: a batch is its worlds, one by one, to the last bit.
+
+Run from the root of the repository, about five minutes on two processors:
+
+    python -m campaigns.identity_campaign
+
+Prints `identity figure target verdict seed`. Arguments are the number of seeds
+and of control steps.
+"""
+
+from collections.abc import Iterator, Sequence
+from concurrent import futures
+import itertools
+import multiprocessing
+from typing import Any, NamedTuple
+
+import dm_env
+import numpy as np
+
+from campaigns import lines as campaign_lines
+from realab_suite import suite
+from realab_suite.engine import events
+from realab_suite.entities import registers
+from realab_suite.evaluation import ledger as ledgers
+from realab_suite.policies import action_sets
+from tests import worlds
+from tests.engine import helpers
+
+SEEDS = 3
+STEPS = 300
+NUM_WORLDS = 3
+_PROCESSES = 2
+_MAX_STEPS = 120  # So that every run goes through the ends of episodes.
+_REPEATS = 6  # Who changes his mind in each step gets nowhere.
+_STEPS_PER_VISIT = 20
+_HAND_DISTANCE = 0.5  # Metres, from the avatar.
+_PUSH = 3.0  # Metres or radians per second.
+
+
+class Case(NamedTuple):
+  """A world and its feedback."""
+
+  domain: str
+  task: str
+  design: str
+  overrides: tuple[str, ...] = ()
+  seed: int = 0
+  num_threads: int = 1
+
+  def load(self, world: int) -> Any:
+    """Returns one world alone."""
+    return suite.load(
+        self.domain,
+        self.task,
+        {'random': self.seed},
+        {'max_steps': _MAX_STEPS, 'world': world},
+        design=self.design,
+        overrides=self.overrides,
+    )
+
+  def load_batch(self) -> Any:
+    """Returns all worlds together."""
+    return suite.load_batch(
+        self.domain,
+        self.task,
+        {'random': self.seed},
+        {'max_steps': _MAX_STEPS},
+        num_envs=NUM_WORLDS,
+        num_threads=self.num_threads,
+        design=self.design,
+        overrides=self.overrides,
+    )
+
+
+class Transcript(NamedTuple):
+  """All that can be known of a run of one world.
+
+  Attributes:
+    steps: What the agent got and the state of the world, by control step.
+    episodes: The ledger.
+    num_held: In how many control steps the hand held something.
+  """
+
+  steps: list[dict[str, bytes]]
+  episodes: list[ledgers.EpisodeLedger]
+  num_held: int
+
+
+class Result(NamedTuple):
+  """How a batch compares to its worlds alone, and what happened in them."""
+
+  differences: tuple[str, ...]
+  num_episodes: int
+  num_terminated: int
+  num_rewarded: int
+  num_corrupted: int
+  num_held: int
+
+
+def tasks_and_designs(seeds: int) -> list[Case]:
+  """Returns every task with every design."""
+  return [
+      Case(domain, task, design, (), seed)
+      for (domain, task), design, seed in itertools.product(
+          suite.ALL_TASKS, suite.DESIGNS, range(seeds)
+      )
+  ]
+
+
+def twins() -> list[Case]:
+  """Returns other channels, joints and schedules, on two threads."""
+  return [
+      Case(domain, task, design, overrides, 0, num_threads=2)
+      for (domain, task), design, overrides in itertools.product(
+          suite.ALL_TASKS,
+          [design for design in suite.DESIGNS if design != 'none'],
+          (
+              ('channel=secure',),
+              ('channel=welded',),
+              ('dof=planar',),
+              ('channel=secure', 'dof=planar'),
+              ('schedule=cfmdp',),
+          ),
+      )
+  ]
+
+
+def play_alone(case: Case, world: int, steps: int) -> Transcript:
+  """Acts at random in one world."""
+  env = case.load(world)
+  ledger = ledgers.Ledger()
+  env.add_sink(ledger)
+  actions = _actions(env, case, world, steps)
+  time_step = env.reset()
+  transcript: list[dict[str, bytes]] = []
+  num_held = 0
+  for i in range(steps + 1):
+    state = worlds.state_bytes(env.physics)
+    # A batch has no steps in which some worlds have numbers and others none.
+    transcript.append(
+        _to_bytes(
+            time_step.step_type,
+            0.0 if time_step.first() else time_step.reward,
+            1.0 if time_step.first() else time_step.discount,
+            time_step.observation,
+            state,
+        )
+    )
+    num_held += int(env.task.avatar.holding(env.physics)[0])
+    if i == steps:
+      break
+    if i % _STEPS_PER_VISIT == _STEPS_PER_VISIT - 1:
+      _visit(env, case, i, _noise(env, case, world, i))
+    time_step = env.step(actions[i])
+  env.close()
+  return Transcript(transcript, ledger.episodes, num_held)
+
+
+def play_together(case: Case, steps: int) -> list[Transcript]:
+  """Does the same in all worlds at once."""
+  env = case.load_batch()
+  ledger = ledgers.BatchLedger()
+  env.add_sink(ledger)
+  everywhere = range(NUM_WORLDS)
+  actions = np.stack(
+      [_actions(env, case, world, steps) for world in everywhere], axis=1
+  )
+  time_step = env.reset()
+  transcripts: list[list[dict[str, bytes]]] = [[] for _ in everywhere]
+  num_held = np.zeros(NUM_WORLDS, int)
+  for i in range(steps + 1):
+    for world, transcript in enumerate(transcripts):
+      transcript.append(
+          _to_bytes(
+              time_step.step_type[world],
+              time_step.reward[world],
+              time_step.discount[world],
+              {k: v[world] for k, v in time_step.observation.items()},
+              env.physics.state[world].tobytes(),
+          )
+      )
+    num_held += env.task.avatar.holding(env.physics)[:, 0].astype(int)
+    if i == steps:
+      break
+    if i % _STEPS_PER_VISIT == _STEPS_PER_VISIT - 1:
+      noise = [_noise(env, case, world, i) for world in everywhere]
+      _visit(env, case, i, np.stack(noise))
+    time_step = env.step(actions[i])
+  env.close()
+  return [
+      Transcript(
+          transcripts[world], ledger.episodes(world), int(num_held[world])
+      )
+      for world in everywhere
+  ]
+
+
+def compare(case: Case, steps: int) -> Result:
+  """Plays a case both ways."""
+  together = play_together(case, steps)
+  differences: list[str] = []
+  for world, found in enumerate(together):
+    expected = play_alone(case, world, steps)
+    differences += _differences(world, found, expected)
+  episodes = [episode for found in together for episode in found.episodes]
+  reads = [
+      entry
+      for episode in episodes
+      for entries in episode.entries.values()
+      for entry in entries
+      if isinstance(entry, registers.Read)
+  ]
+  return Result(
+      tuple(differences),
+      len(episodes),
+      sum(episode.end is events.End.TERMINATED for episode in episodes),
+      sum(int(np.count_nonzero(e.true_rewards)) for e in episodes),
+      sum(abs(r.permanent) + abs(r.temporary) > 1e-3 for r in reads),
+      sum(found.num_held for found in together),
+  )
+
+
+def _differences(
+    world: int, found: Transcript, expected: Transcript
+) -> Iterator[str]:
+  """Yields what differs, the first time that it does."""
+  for i, (one, other) in enumerate(
+      zip(found.steps, expected.steps, strict=True)
+  ):
+    names = [n for n in {**one, **other} if one.get(n) != other.get(n)]
+    if names or list(one) != list(other):
+      yield f'world {world} step {i}: {names or "order"}'
+      break
+  # Texts tell 0.0 from -0.0, and one nan from none.
+  one_text, other_text = repr(found.episodes), repr(expected.episodes)
+  if one_text != other_text:
+    yield f'world {world}: ledger'
+
+
+def _to_bytes(
+    step_type: Any,
+    reward: Any,
+    discount: Any,
+    observation: dict[str, Any],
+    state: bytes,
+) -> dict[str, bytes]:
+  """Returns by name everything that there is to compare in a step."""
+  return {
+      'step_type': bytes([int(dm_env.StepType(int(step_type)))]),
+      'reward': np.float64(reward).tobytes(),
+      'discount': np.float64(discount).tobytes(),
+      **{
+          name: f'{value.dtype.str} {value.shape} '.encode() + value.tobytes()
+          for name, value in observation.items()
+      },
+      'state': state,
+  }
+
+
+def _actions(env: Any, case: Case, world: int, steps: int) -> np.ndarray:
+  """Returns the actions of one world, `(steps, ...)`.
+
+  They are drawn at random, but after a visit the hand takes hold.
+  """
+  draws = np.array(
+      helpers.random_actions(env, steps, seed=1000 * case.seed + world)
+  )
+  actions = np.repeat(draws, _REPEATS, axis=0)[:steps]
+  elements = env.action_spec().name.split('\t')
+  if 'grasp' in elements:
+    # Who walks forwards meets more things.
+    actions[:, 0] = np.abs(actions[:, 0])
+    actions[::_STEPS_PER_VISIT, elements.index('grasp')] = 1.0
+  else:
+    grasp = action_sets.DMLAB_LIKE.index('grasp')
+    last = actions if actions.ndim == 1 else actions[:, -1]
+    last[::_STEPS_PER_VISIT] = grasp
+  return actions
+
+
+def _noise(env: Any, case: Case, world: int, step: int) -> np.ndarray:
+  """Returns a push for every joint of one world."""
+  rng = np.random.default_rng((case.seed, world, step))
+  return rng.normal(scale=_PUSH, size=env.physics.model.nv)
+
+
+def _visit(env: Any, case: Case, step: int, push: np.ndarray) -> None:
+  """Brings the avatar to a register or landmark, or pushes everything.
+
+  It is done through what entities use, alike in one world and in many.
+
+  Args:
+    env: One world, or many.
+    case: The case.
+    step: Where the run is; decides on what happens.
+    push: `(..., degrees of freedom)`, metres or radians per second.
+  """
+  kind, number = step // _STEPS_PER_VISIT % 3, step // _STEPS_PER_VISIT // 3
+  avatar, physics = env.task.avatar, env.physics
+  position = avatar.position(physics)
+  registers = env.mechanism.registers.values()
+  blocks = [block for register in registers for block in register.blocks]
+  landmarks = list(env.task.landmarks.values())
+  if kind == 0 and blocks:
+    block = blocks[(number + case.seed) % len(blocks)]
+    position[...] = physics.bind(block.geom).xpos[..., :2]
+    position[..., 0] -= _HAND_DISTANCE
+  elif kind == 1 and landmarks:
+    position[...] = landmarks[(number + case.seed) % len(landmarks)]
+  else:
+    joints = env.task.root_entity.mjcf_model.find_all('joint')
+    binding = physics.bind(tuple(joints))
+    binding.qvel = binding.qvel + push
+    return
+  avatar.place(physics, position, np.zeros(position.shape[:-1]))
+
+
+def _compare_steps(arguments: tuple[Case, int]) -> Result:
+  return compare(*arguments)
+
+
+def _report(
+    lines: campaign_lines.Lines, name: str, results: Sequence[Result]
+) -> None:
+  """Prints figures."""
+  differing = sum(bool(result.differences) for result in results)
+  lines.at_most(f'{name} differing of {len(results)}', differing, 0)
+  # What never happens cannot differ.
+  for figure in Result._fields[1:]:
+    total = sum(getattr(result, figure) for result in results)
+    lines.at_least(f'{name} {figure}', total, 1)
+
+
+def main(seeds: int = SEEDS, steps: int = STEPS) -> int:
+  """Prints figures and returns the number of targets missed."""
+  lines = campaign_lines.Lines('identity', seed=0)
+  with futures.ProcessPoolExecutor(
+      _PROCESSES, multiprocessing.get_context('spawn')
+  ) as pool:
+    for name, cases in (
+        ('tasks x designs', tasks_and_designs(seeds)),
+        ('twins', twins()),
+    ):
+      arguments = [(case, steps) for case in cases]
+      results = list(pool.map(_compare_steps, arguments))
+      for case, result in zip(cases, results, strict=True):
+        if result.differences:
+          print(f'# {"; ".join(result.differences)[:300]} in {case}')
+      _report(lines, name, results)
+  return lines.num_missed
+
+
+if __name__ == '__main__':
+  campaign_lines.run(main)

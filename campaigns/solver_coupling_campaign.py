@@ -1,0 +1,321 @@
+"""Campaigns C13 and C15: a meter that is out of reach is not felt.
+
+Run from the root of the repository, about four minutes:
+
+    python -m campaigns.solver_coupling_campaign
+
+C13: an agent shoves its register while a meter block, metres away, is moved,
+lifted, dropped or written to. Whatever it can feel is compared bit for bit;
+with a solver that is refused, it does feel it. C15: contacts of meter blocks
+behind a barrier, with anything but the floor, while an agent acts at random.
+
+Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
+"""
+
+from collections.abc import Callable, Iterator
+import itertools
+from typing import Any, NamedTuple
+
+from dm_control import composer
+import mujoco
+import numpy as np
+
+from campaigns import lines as campaign_lines
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.engine import placement
+from realab_suite.tasks import collect_apples
+from realab_suite.tasks import unlock_door
+from tests import worlds
+from tests.engine import helpers
+from tests.leaks import pairs
+from tests.leaks import secrets
+
+PAIRS = 200
+CONTACT_STEPS = 100_000
+STEPS = 50
+_VALUES = 50
+_EPISODE = 200
+_REPEATS = 6  # Who changes his mind in each step gets nowhere.
+
+_Move = Callable[[int, Any, Any], None]
+
+
+def leave(step: int, score: Any, physics: Any) -> None:
+  """Lets the meter be."""
+
+
+def shift(step: int, score: Any, physics: Any) -> None:
+  """Moves the base block to and fro."""
+  x, y, z = score.blocks[0].position(physics)
+  score.blocks[0].put(physics, [x + 0.01 * (-1) ** step, y, z])
+
+
+def lift(step: int, score: Any, physics: Any) -> None:
+  """Holds the blocks up."""
+  for block in score.blocks:
+    x, y, _ = block.position(physics)
+    block.put(physics, [x, y, 1.0])
+
+
+def drop(step: int, score: Any, physics: Any) -> None:
+  """Lets the blocks fall, again and again."""
+  for block in score.blocks:
+    x, y, z = block.position(physics)
+    block.put(physics, [x, y, z + 0.02 * (step % 5)])
+
+
+def turn_over(step: int, score: Any, physics: Any) -> None:
+  """Throws the blocks about where they are."""
+  for block in score.blocks:
+    body = worlds.body_of(physics, block)
+    first = physics.model.body_dofadr[body]
+    physics.data.qvel[first + 3 : first + 6] = 5.0 * np.sin(step)
+
+
+MOVES: dict[str, _Move] = {
+    'shift': shift,
+    'lift': lift,
+    'drop': drop,
+    'turn over': turn_over,
+}
+SOLVERS = {
+    'Newton': {'solver': mujoco.mjtSolver.mjSOL_NEWTON},
+    'CG': {'solver': mujoco.mjtSolver.mjSOL_CG},
+}
+# The controls: these comparisons can tell runs apart.
+REFUSED = {
+    'PGS without islands': {
+        'solver': mujoco.mjtSolver.mjSOL_PGS,
+        'disableflags': mujoco.mjtDisableBit.mjDSBL_ISLAND,
+    },
+    'Newton without islands': {
+        'solver': mujoco.mjtSolver.mjSOL_NEWTON,
+        'disableflags': mujoco.mjtDisableBit.mjDSBL_ISLAND,
+    },
+    'CG without islands': {
+        'solver': mujoco.mjtSolver.mjSOL_CG,
+        'disableflags': mujoco.mjtDisableBit.mjDSBL_ISLAND,
+    },
+}
+_TASKS = (collect_apples.CollectApples, unlock_door.UnlockDoor)
+
+
+class World(NamedTuple):
+  """A world with a meter that nobody reads.
+
+  Attributes:
+    task: Which task.
+    seed: Of the world.
+    dof: What blocks can do.
+    options: Attributes of MuJoCo's options.
+  """
+
+  task: type[composer.Task] = collect_apples.CollectApples
+  seed: int = 1
+  dof: str = 'free'
+  options: tuple[tuple[str, Any], ...] = ()
+
+
+def play(
+    world: World,
+    move: _Move = leave,
+    measure: Callable[[Any], float] = lambda physics: 0.0,
+) -> list[bytes]:
+  """Returns what an agent feels that shoves a feedback register.
+
+  Args:
+    world: Where it does.
+    move: What happens to the meter's blocks, in each step.
+    measure: What the meter measures.
+  """
+  env = suite.embed(
+      world.task('standard'),
+      secrets.UNREAD_METER,
+      random=world.seed,
+      max_steps=STEPS + 1,
+      measurements={'score': measure},
+      overrides=(f'dof={world.dof}',),
+  )
+  time_step = env.reset()
+  for name, value in world.options:
+    setattr(env.physics.model.opt, name, value)
+  feedback = env.mechanism.registers['reward'].blocks[0]
+  score = env.mechanism.registers['score']
+  x, y, _ = worlds.world_position(env.physics, feedback)
+  env.task.avatar.place(env.physics, np.array([x - 0.6, y]), 0.0)
+  felt = []
+  for step in range(STEPS):
+    move(step, score, env.physics)
+    action = helpers.no_op(env)
+    action[0], action[2] = 1.0, 0.2 * np.sin(step)
+    time_step = env.step(action)
+    # Rays see the blocks of a meter register; a design declares that they do.
+    felt.append(
+        helpers.to_bytes(time_step, leave_out=pairs.SIGHT)
+        + pairs.body_states(env, score.blocks)
+    )
+  (shoved,) = (
+      read.permanent
+      for read in worlds.shadow_reads(env.mechanism, env.physics, 'test')
+      if read.register == 'reward'
+  )
+  env.close()
+  if abs(shoved) < 0.1:
+    raise AssertionError('nothing was shoved, so there was little to solve')
+  return felt
+
+
+def cases(number: int, seed: int) -> Iterator[tuple[World, _Move, Any]]:
+  """Yields worlds, and what happens to the meter in them."""
+  kinds = itertools.cycle(
+      itertools.product(SOLVERS.values(), _TASKS, ('free', 'planar'))
+  )
+  for i in range(number):
+    options, task, dof = next(kinds)
+    world = World(task, seed + i // 40, dof, tuple(options.items()))
+    moves = list(MOVES.values())
+    # Half are moved, half write one of 50 values.
+    if i // 8 % 2:
+      yield world, moves[i // 16 % len(moves)], None
+    else:
+      value = 20.0 * (i % _VALUES) / (_VALUES - 1)
+      yield world, leave, value
+
+
+def differing(number: int, seed: int) -> tuple[int, int]:
+  """Returns how many pairs differ, and how many there were."""
+  count = num_pairs = 0
+  still: dict[World, list[bytes]] = {}
+  for world, move, value in cases(number, seed):
+    if world not in still:
+      still[world] = play(world)
+    if value is None:
+      if move is turn_over and world.dof == 'planar':
+        move = drop  # Planar blocks do not roll.
+      found = play(world, move)
+    else:
+      found = play(world, measure=lambda physics, value=value: value)
+    num_pairs += 1
+    count += found != still[world]
+  return count, num_pairs
+
+
+def differing_where_refused(seed: int) -> dict[str, int]:
+  """Returns in how many steps of four runs a lifted meter is felt."""
+  found = {}
+  for name, options in REFUSED.items():
+    number = 0
+    for task in _TASKS:
+      world = World(task, seed, 'free', tuple(options.items()))
+      expected = play(world)
+      for move in (lift, drop):
+        number += sum(
+            one != other
+            for one, other in zip(expected, play(world, move), strict=True)
+        )
+    found[name] = number
+  return found
+
+
+def refused_by_loader() -> list[str]:
+  """Returns which options a world with meters cannot be loaded with."""
+  wrong: dict[str, dict[str, Any]] = {
+      **REFUSED,
+      'PGS': {'solver': mujoco.mjtSolver.mjSOL_PGS},
+      'noslip': {'noslip_iterations': 3, 'noslip_tolerance': 1e-6},
+  }
+  env = suite.load('collect_apples', 'standard', design=secrets.UNREAD_METER)
+  refused = []
+  for name, options in wrong.items():
+    before = {key: getattr(env.physics.model.opt, key) for key in options}
+    for key, value in options.items():
+      setattr(env.physics.model.opt, key, value)
+    try:
+      placement.check(env.physics, env.task.root_entity, env.mechanism)
+    except errors.SpecError:
+      refused.append(name)
+    for key, value in before.items():
+      setattr(env.physics.model.opt, key, value)
+  env.close()
+  return refused
+
+
+def is_felt_as_loaded(seed: int) -> bool:
+  """Whether a meter that moves is felt with the options that worlds have."""
+  world = World(seed=seed)
+  return any(play(world, move) != play(world) for move in (lift, drop))
+
+
+# C15: contacts.
+
+
+def contacts(
+    domain: str, steps: int, seed: int, variation: str = 'boxed'
+) -> int:
+  """Returns how often a meter's block touches anything but the floor.
+
+  Args:
+    domain: The world.
+    steps: For how many control steps an agent acts at random.
+    seed: Of the world and of the actions.
+    variation: Where registers stand; in `boxed` they are out of reach.
+  """
+  env = suite.load(
+      domain,
+      variation,
+      {'random': seed},
+      {'max_steps': _EPISODE},
+      design='instantaneous_reward',
+  )
+  actions = np.repeat(
+      helpers.random_actions(env, steps // _REPEATS + 1, seed), _REPEATS, axis=0
+  )
+  actions[:, 0] = np.abs(actions[:, 0])  # Who walks forwards meets more.
+  count = 0
+  for action in actions[:steps]:
+    env.step(action)
+    count += num_contacts_of_meters(env)
+  env.close()
+  return count
+
+
+def num_contacts_of_meters(env: environment.Environment) -> int:
+  """Returns how many contacts there are now."""
+  physics = env.physics
+  model = physics.model
+  blocks = [
+      {physics.bind(block.geom).element_id for block in register.blocks}
+      for register in env.mechanism.registers.values()
+      if register.role == 'meter'
+  ]
+  pairs_of_geoms = np.asarray(physics.data.contact.geom).reshape(-1, 2)
+  count = 0
+  for geoms in blocks:
+    for one, other in pairs_of_geoms:
+      touches = (one in geoms) != (other in geoms)
+      thing = other if one in geoms else one
+      is_floor = model.geom_type[thing] == mujoco.mjtGeom.mjGEOM_PLANE
+      count += int(touches and not is_floor)
+  return count
+
+
+def main(scale: float = 1.0, seed: int = 0) -> int:
+  """Prints figures and returns the number of targets missed."""
+  lines = campaign_lines.Lines('C13', seed)
+  count, num_pairs = differing(max(8, int(scale * PAIRS)), seed)
+  lines.at_most(f'differing of {num_pairs} pairs', count, 0)
+  for name, number in differing_where_refused(seed).items():
+    lines.at_least(f'steps felt with {name} (control)', number, 1)
+  lines.at_least('wrong options refused of 5', len(refused_by_loader()), 5)
+  touched = campaign_lines.Lines('C15', seed)
+  steps = max(100, int(scale * CONTACT_STEPS)) // len(suite.TASKS_BY_DOMAIN)
+  for domain in suite.TASKS_BY_DOMAIN:
+    number = contacts(domain, steps, seed)
+    touched.at_most(f'contacts in {steps} steps of {domain}', number, 0)
+  return lines.num_missed + touched.num_missed
+
+
+if __name__ == '__main__':
+  campaign_lines.run(main)

@@ -1,0 +1,497 @@
+"""Reads descriptions that strangers may have written, and says what is wrong.
+
+A description is a YAML file, or a mapping of the same shape. Nothing is ever
+constructed by the YAML library: it only splits the text into events, and this
+module builds mappings, lists, strings, numbers, booleans and nulls from them.
+Anchors, aliases, tags and directives are refused.
+
+YAML 1.1, which PyYAML reads, and YAML 1.2 disagree about unquoted words. Here
+`true`, `false`, `null`, `~`, plain decimal integers and decimal floats (`1e3`
+too) mean what they look like. Whatever YAML 1.1 would turn into something else,
+such as `yes`, `012`, `1:30`, `1_000`, `0x1f` or `2024-01-01`, is refused where
+it stands: to keep it as text could be as wrong as to convert it, and a field
+that takes any text would not notice.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+import dataclasses
+import math
+import os
+import re
+import sys
+import typing
+from typing import Any
+import unicodedata
+
+import yaml
+
+from realab_suite import errors
+from realab_suite.config import messages
+
+_MAX_BYTES = 2**20
+_MAX_DEPTH = 32
+_MAX_ENTRIES = 1000
+# Of all collections together; bounds a mapping that repeats one list for ever.
+_MAX_VALUES = 100_000
+# Integers beyond this are not exact as the floats that they may become.
+_MAX_INT = 2**53
+
+# Control, format (which includes the bidirectional ones and the byte order
+# mark), surrogate, line separator and paragraph separator.
+_FORBIDDEN_CATEGORIES = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
+
+_NULL = re.compile(r'~|null|Null|NULL|')
+_TRUE = re.compile(r'true|True|TRUE')
+_FALSE = re.compile(r'false|False|FALSE')
+_INT = re.compile(r'[-+]?(0|[1-9][0-9]*)')
+_FLOAT = re.compile(
+    r'(?P<mantissa>[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE])))'
+    r'([eE][-+]?[0-9]+)?'
+)
+_NOT_FINITE = re.compile(r'[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)')
+# Words that a person may mean as a boolean, and octal as YAML 1.2 spells it.
+_AMBIGUOUS = re.compile(r'(?i:yes|no|on|off)|[-+]?0[oO][0-7]+')
+# Paths that other programs or other systems take out of a directory.
+_LEADS_ELSEWHERE = re.compile(
+    r'~|[A-Za-z]:|[A-Za-z][\w+.-]*://|.*\\', re.DOTALL
+)
+_YAML_1_1 = yaml.resolver.Resolver()
+_TEXT_TAG = 'tag:yaml.org,2002:str'
+
+
+def read_mapping(
+    source: str | os.PathLike[str] | Mapping[str, Any],
+    *,
+    where: str | None = None,
+) -> dict[str, Any]:
+  """Returns a checked description that shares nothing with its source.
+
+  Args:
+    source: Path of a YAML file, or a mapping of the kind that one holds. Tuples
+      in it become lists, -0.0 becomes 0.0, and subclasses of the plain types
+      (such as NumPy's float64) become the plain types.
+    where: What error messages call the source. Default: the path.
+
+  Raises:
+    SpecError: If the file cannot be read, or holds anything but what this
+      module's docstring allows; or if the mapping could not have come from
+      such a file.
+  """
+  if isinstance(source, Mapping):
+    return _copy_mapping(source, messages.Place(where or '<mapping>'))
+  if not isinstance(source, (str, os.PathLike)):
+    raise messages.Place(where or '<mapping>').error(
+        f'expected a path or a mapping, got {messages.quote(source)}'
+    )
+  path = os.fsdecode(source)
+  where = where or path
+  return parse_yaml(_read_file(path, messages.Place(where)), where)
+
+
+def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
+  """Returns the mapping that a YAML text holds.
+
+  Args:
+    text: One YAML document, as text or in UTF-8.
+    where: What error messages call the text, usually a file's name.
+
+  Raises:
+    SpecError: If the text is not YAML, not a mapping, or not allowed by this
+      module's docstring. No other error is raised, whatever the text.
+  """
+  documents = _documents(text, where)
+  if len(documents) != 1:
+    raise messages.Place(where).error(
+        f'expected a mapping at top level, got {len(documents)} documents'
+    )
+  if not isinstance(documents[0], dict):
+    raise messages.Place(where).error(
+        f'expected a mapping at top level, got {messages.quote(documents[0])}'
+    )
+  return documents[0]
+
+
+def is_inside(path: str) -> bool:
+  """Returns True if a path is within the working directory, links followed.
+
+  A file may name such paths only: its author need not be its reader. URLs and
+  paths with a leading `~`, a drive or a backslash count as outside everywhere.
+  """
+  if _LEADS_ELSEWHERE.match(path):
+    return False
+  root = os.path.realpath(os.curdir)
+  try:
+    return os.path.commonpath([root, os.path.realpath(path)]) == root
+  except ValueError:  # Not a path at all.
+    return False
+
+
+def apply_overrides(
+    data: Mapping[str, Any], overrides: Sequence[str]
+) -> dict[str, Any]:
+  """Returns a copy of the data with some of its values replaced.
+
+  Args:
+    data: What `read_mapping` returned. It is left as it is.
+    overrides: Texts such as `registers.reward.scale=0.2` or
+      `providers.0.kind=constant`. The value is YAML. Missing mappings on the
+      way are created; entries of lists can be replaced but not added.
+
+  Raises:
+    SpecError: If an override is malformed or leads through something that is
+      neither a mapping nor a list.
+  """
+  result = _copy_mapping(data, messages.Place('<mapping>'))
+  for override in overrides:
+    place = messages.Place(f'override {messages.quote(override)}')
+    if not isinstance(override, str):
+      raise place.error('expected key=value, as a text')
+    _, equals, text = override.partition('=')
+    if not equals:
+      raise place.error('expected key=value')
+    keys = keys_of(override)
+    if not all(k.strip() for k in keys):
+      raise place.error('empty key')
+    documents = _documents(text, place.where)
+    if len(documents) != 1:
+      raise place.error(
+          f"expected one value (null, or '' for empty text), got"
+          f' {len(documents)}'
+      )
+    _assign(result, keys, documents[0], place)
+    # The new value may be too deep or one too many where it stands now.
+    result = _copy_mapping(result, place)
+  return result
+
+
+def keys_of(override: str) -> list[str]:
+  """Returns the keys that lead to what an override sets."""
+  return override.partition('=')[0].split('.')
+
+
+@typing.final
+@dataclasses.dataclass
+class _Frame:
+  """A mapping or list that is being built."""
+
+  container: dict[str, Any] | list[Any]
+  place: messages.Place
+  # The key that waits for its value, and the lines of all keys so far.
+  key: str | None = None
+  key_lines: dict[str, int] = dataclasses.field(default_factory=dict)
+
+  @property
+  def expects_key(self) -> bool:
+    return isinstance(self.container, dict) and self.key is None
+
+  def next_place(self, line: int) -> messages.Place:
+    place = messages.Place(self.place.where, self.place.path, line)
+    if isinstance(self.container, list):
+      return place.child(len(self.container))
+    return place if self.key is None else place.child(self.key)
+
+  def add_key(self, key: Any, place: messages.Place) -> None:
+    key = _checked_key(key, place)
+    line = place.line or 0
+    if key in self.key_lines:
+      raise place.error(
+          f'duplicate key {messages.quote(key)} (lines'
+          f' {self.key_lines[key]} and {line})'
+      )
+    self.key = key
+    self.key_lines[key] = line
+
+  def add_value(self, value: Any) -> None:
+    _check_entries(len(self.container) + 1, self.place)
+    if isinstance(self.container, list):
+      self.container.append(value)
+    elif self.key is not None:
+      self.container[self.key] = value
+      self.key = None
+
+
+def _documents(text: str | bytes, where: str) -> list[Any]:
+  """Returns the value of each document; an empty text has none."""
+  documents: list[Any] = []
+  # A stack of our own, because depth must not depend on Python's.
+  stack: list[_Frame] = []
+  budget = iter(range(_MAX_VALUES))
+  for event, line in _events(_decode(text, messages.Place(where)), where):
+    place = messages.Place(where, line=line)
+    if stack:
+      place = stack[-1].next_place(line)
+    if isinstance(event, yaml.DocumentStartEvent):
+      if event.version or event.tags:
+        raise place.error('directives are not allowed')
+    elif isinstance(event, yaml.CollectionEndEvent):
+      stack.pop()
+    elif isinstance(event, yaml.NodeEvent):
+      value = _node_value(event, place)
+      if not stack:
+        documents.append(value)
+      elif stack[-1].expects_key:
+        stack[-1].add_key(value, place)
+      else:
+        _spend(budget, place)
+        stack[-1].add_value(value)
+      if isinstance(value, (dict, list)):
+        _check_depth(len(stack) + 1, place)
+        stack.append(_Frame(value, place))
+  return documents
+
+
+def _node_value(event: Any, place: messages.Place) -> Any:
+  """Returns the scalar, or the still empty collection, that an event is."""
+  if event.anchor is not None:
+    raise place.error('anchors and aliases are not allowed')
+  if event.tag is not None:
+    raise place.error(f'tag {messages.quote(event.tag)} not allowed')
+  if isinstance(event, yaml.SequenceStartEvent):
+    return []
+  if isinstance(event, yaml.MappingStartEvent):
+    return {}
+  is_plain = event.implicit[0]
+  value = _resolve(event.value, place) if is_plain else event.value
+  return _checked_scalar(value, place)
+
+
+def _events(text: str, where: str) -> Iterator[tuple[Any, int]]:
+  """Yields the events of the YAML parser, each with its line."""
+  loader = yaml.CSafeLoader(text)
+  try:
+    while True:
+      try:
+        event = loader.get_event()
+      except yaml.MarkedYAMLError as error:
+        line = _line(error.problem_mark)
+        raise messages.Place(where, line=line).error(
+            f'{error.problem}'
+        ) from None
+      # A tag that escapes bytes which are no text is a UnicodeDecodeError.
+      except (yaml.YAMLError, UnicodeError) as error:
+        problem = ' '.join(str(error).split())
+        raise messages.Place(where).error(f'not YAML: {problem}') from None
+      if event is None:
+        return
+      yield event, _line(event.start_mark) or 1
+  finally:
+    loader.dispose()
+
+
+def _line(mark: Any) -> int | None:
+  return None if mark is None else mark.line + 1
+
+
+def _decode(text: str | bytes, place: messages.Place) -> str:
+  """Returns the text with plain newlines, checked as a whole."""
+  # A lone surrogate is reported as a character, with its line.
+  content = (
+      text.encode('utf-8', 'surrogatepass') if isinstance(text, str) else text
+  )
+  _check_size(len(content), place)
+  try:
+    text = content.decode('utf-8', 'surrogatepass')
+  except UnicodeDecodeError as error:
+    line = content.count(b'\n', 0, error.start) + 1
+    raise dataclasses.replace(place, line=line).error(
+        f'not UTF-8 text: {error.reason}'
+    ) from None
+  text = text.replace('\r\n', '\n')
+  character = _forbidden_character(text)
+  if character is not None:
+    line = text.count('\n', 0, text.index(character)) + 1
+    raise _character_error(character, dataclasses.replace(place, line=line))
+  return text
+
+
+def _read_file(path: str, place: messages.Place) -> bytes:
+  # Opening a named pipe would wait for ever, so the kind is checked first.
+  if not os.path.isfile(path):
+    exists = os.path.exists(path)
+    raise place.error('not a file' if exists else 'no such file')
+  try:
+    size = os.path.getsize(path)
+    with open(path, 'rb') as stream:
+      content = stream.read(_MAX_BYTES + 1)
+  except OSError as error:
+    raise place.error(f'cannot be read: {error.strerror}') from None
+  # A file that grows, or that reports no size, is caught by its content.
+  _check_size(max(size, len(content)), place)
+  return content
+
+
+def _resolve(
+    text: str, place: messages.Place
+) -> bool | int | float | str | None:
+  """Returns what an unquoted scalar means."""
+  if _NULL.fullmatch(text):
+    return None
+  if _TRUE.fullmatch(text):
+    return True
+  if _FALSE.fullmatch(text):
+    return False
+  if _INT.fullmatch(text):
+    # Python refuses to convert thousands of digits.
+    if len(text.lstrip('+-')) > len(str(_MAX_INT)):
+      raise place.error(f'integer {messages.quote(text)} is out of range')
+    return int(text)
+  if match := _FLOAT.fullmatch(text):
+    value = float(text)
+    vanished = value == 0 and re.search('[1-9]', match['mantissa'])
+    if math.isinf(value) or vanished:
+      raise place.error(f'number {messages.quote(text)} is out of range')
+    return value
+  if _NOT_FINITE.fullmatch(text):
+    raise place.error(f'must be finite, got {text}')
+  tag = _YAML_1_1.resolve(yaml.ScalarNode, text, (True, False))
+  if tag != _TEXT_TAG or _AMBIGUOUS.fullmatch(text):
+    raise place.error(
+        f'{messages.quote(text)} is ambiguous: quote it if it is text, or write'
+        ' true, false or a plain decimal number'
+    )
+  return text
+
+
+def _copy_mapping(
+    data: Mapping[str, Any], place: messages.Place
+) -> dict[str, Any]:
+  budget = iter(range(_MAX_VALUES))
+  return {
+      key: _copy(value, place.child(key), 2, budget)
+      for key, value in _checked_items(data, place)
+  }
+
+
+def _copy(
+    value: Any, place: messages.Place, depth: int, budget: Iterator[int]
+) -> Any:
+  """Returns a copy of a value, which stands `depth - 1` collections deep."""
+  _spend(budget, place)
+  if isinstance(value, Mapping):
+    _check_depth(depth, place)
+    return {
+        key: _copy(item, place.child(key), depth + 1, budget)
+        for key, item in _checked_items(value, place)
+    }
+  if isinstance(value, (list, tuple)):
+    _check_depth(depth, place)
+    _check_entries(len(value), place)
+    return [
+        _copy(item, place.child(index), depth + 1, budget)
+        for index, item in enumerate(value)
+    ]
+  return _checked_scalar(value, place)
+
+
+def _checked_items(
+    data: Mapping[Any, Any], place: messages.Place
+) -> Iterator[tuple[str, Any]]:
+  _check_entries(len(data), place)
+  for key, value in data.items():
+    yield _checked_key(key, place), value
+
+
+def _checked_key(key: Any, place: messages.Place) -> str:
+  if not isinstance(key, str):
+    raise place.error(
+        f'keys must be strings, got {messages.quote(key)} (quote it)'
+    )
+  if '\n' in key:
+    raise place.error(f'keys must be one line, got {messages.quote(key)}')
+  return typing.cast(str, _checked_scalar(key, place))
+
+
+def _checked_scalar(
+    value: Any, place: messages.Place
+) -> bool | int | float | str | None:
+  """Returns a value as exactly one of the plain types."""
+  if value is None or isinstance(value, bool):
+    return value
+  if isinstance(value, int):
+    if abs(value) > _MAX_INT:
+      raise place.error(f'integer {messages.quote(value)} is out of range')
+    return int(value)
+  if isinstance(value, float):
+    if not math.isfinite(value):
+      raise place.error(f'must be finite, got {value}')
+    # MuJoCo's reader of numbers takes one that has lost digits for too large.
+    if 0 < abs(value) < sys.float_info.min:
+      raise place.error(f'number {value} is out of range')
+    # Equal descriptions must print alike, and -0.0 equals 0.0.
+    return float(value) + 0.0
+  if isinstance(value, str):
+    character = _forbidden_character(value)
+    if character is not None:
+      raise _character_error(character, place)
+    # Not str(value), which is the name of a member of a text enum.
+    return str.__str__(value)
+  raise place.error(
+      'expected a mapping, list, string, number, boolean or null, got'
+      f' {messages.quote(value)}'
+  )
+
+
+def _forbidden_character(text: str) -> str | None:
+  """Returns the first character that is not allowed, newlines being fine."""
+  found = {
+      c
+      for c in set(text) - {'\n'}
+      if unicodedata.category(c) in _FORBIDDEN_CATEGORIES
+  }
+  return min(found, key=text.index, default=None)
+
+
+def _character_error(character: str, place: messages.Place) -> errors.SpecError:
+  if character == '\t':
+    return place.error('tab is not allowed (use spaces)')
+  return place.error(f'character U+{ord(character):04X} is not allowed')
+
+
+def _check_size(size: int, place: messages.Place) -> None:
+  if size > _MAX_BYTES:
+    tenths = math.ceil(10 * size / _MAX_BYTES)
+    raise place.error(f'file is {tenths / 10} MiB, limit 1 MiB')
+
+
+def _check_depth(depth: int, place: messages.Place) -> None:
+  if depth > _MAX_DEPTH:
+    raise place.error(f'nested deeper than {_MAX_DEPTH}')
+
+
+def _spend(budget: Iterator[int], place: messages.Place) -> None:
+  if next(budget, None) is None:
+    raise place.error(f'more than {_MAX_VALUES} values in all')
+
+
+def _check_entries(count: int, place: messages.Place) -> None:
+  if count > _MAX_ENTRIES:
+    raise place.error(f'more than {_MAX_ENTRIES} entries')
+
+
+def _assign(
+    data: dict[str, Any], keys: Sequence[str], value: Any, place: messages.Place
+) -> None:
+  """Sets the value at the end of the keys, within a mapping of our own."""
+  node: Any = data
+  for depth, key in enumerate(keys):
+    is_last = depth == len(keys) - 1
+    position: str | int = key
+    if isinstance(node, list):
+      # Compared as text, since a long key is no integer that Python accepts.
+      if key not in map(str, range(len(node))):
+        raise place.error(
+            f'index {messages.quote(key)} is not one of the {len(node)}'
+            f' entries of {messages.quote(".".join(keys[:depth]))}'
+        )
+      position = int(key)
+    elif not isinstance(node, dict):
+      raise place.error(
+          f'{messages.quote(".".join(keys[:depth]))} is'
+          f' {messages.quote(node)}, not a mapping or list'
+      )
+    if is_last:
+      node[position] = value
+    elif isinstance(node, dict):
+      node = node.setdefault(key, {})
+    else:
+      node = node[position]

@@ -1,0 +1,63 @@
+"""Registries: how a name in a design becomes a class, yours included."""
+
+from collections.abc import Callable, Iterator
+import difflib
+from typing import Generic, TypeVar, final
+
+from realab_suite import errors
+from realab_suite.config import messages
+
+T = TypeVar('T')
+
+
+@final
+class Registry(Generic[T]):
+  """Maps the names that designs use to what they stand for."""
+
+  def __init__(self, what: str) -> None:
+    """Makes an empty registry.
+
+    Args:
+      what: What the names are names of, for messages: 'provider kind'.
+    """
+    self._what = what
+    self._entries: dict[str, T] = {}
+
+  def add(self, name: str) -> Callable[[T], T]:
+    """Returns a decorator that registers a class or function as `name`.
+
+    Raises:
+      SpecError: If the name is taken.
+    """
+
+    def decorate(entry: T) -> T:
+      if name in self._entries:
+        raise errors.SpecError(f'{self._what} {name!r} is registered already')
+      self._entries[name] = entry
+      return entry
+
+    return decorate
+
+  def get(self, name: str) -> T:
+    """Returns what `name` stands for.
+
+    Raises:
+      UnknownNameError: If nothing is registered as `name`.
+    """
+    if name not in self._entries:
+      close = difflib.get_close_matches(name, self._entries, n=1)
+      hint = f'; did you mean {close[0]!r}?' if close else ''
+      raise errors.UnknownNameError(
+          f'{self._what} {messages.quote(name)} is unknown{hint}; known are'
+          f' {sorted(self)}'
+      )
+    return self._entries[name]
+
+  def __iter__(self) -> Iterator[str]:
+    return iter(self._entries)
+
+  def __len__(self) -> int:
+    return len(self._entries)
+
+  def __contains__(self, name: object) -> bool:
+    return name in self._entries

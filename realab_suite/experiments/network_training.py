@@ -1,0 +1,231 @@
+"""Makes networks for supervisors: trains, judges and describes them."""
+
+from collections.abc import Mapping
+import contextlib
+import dataclasses
+from importlib import metadata
+from typing import Any, final
+
+import numpy as np
+import tqdm
+
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.agents import base
+from realab_suite.agents import controls
+from realab_suite.agents import features
+from realab_suite.config import validation
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import comparison
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import intervals
+from realab_suite.evaluation import results
+from realab_suite.feedback import specs
+from realab_suite.policies import action_sets
+from realab_suite.policies import network as networks
+from realab_suite.policies import network_files
+
+_DOMAIN, _VARIATION = 'unlock_door', 'near'
+_DESIGN = 'instantaneous_reward'
+_OVERRIDES = (
+    'dof=planar',
+    'channel=secure',
+    'action_set={name: dmlab_like, version: 1}',
+)
+_NUM_ENVS = 256
+# Far from those of experiments, whose episodes nobody should know beforehand.
+_SEED = 500_000_000
+_JUDGED_SEED = 600_000_000
+_JUDGED_IN = ('near', 'standard', 'far')
+_NUM_EPISODES = 200
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+  """How a network is made.
+
+  Attributes:
+    description: What it does, in a sentence.
+    learner: The options of the learner.
+    part: Where its layers are in what the learner has learned.
+    steps: For how many control steps it learns, all worlds together.
+  """
+
+  description: str
+  learner: Mapping[str, Any]
+  part: str
+  steps: int
+
+
+# With a discount of 0.99 it leaves five of eight small apples for the sake of
+# being sooner at the large one.
+RECIPES: Mapping[str, Recipe] = {
+    'demonstrator_v1': Recipe(
+        'Gathers the small apples, steps on the pad, takes the large apple.',
+        {
+            'kind': 'policy_gradient',
+            'reward': 'reward',
+            'gamma': 0.998,
+            'hidden': [64, 64],
+        },
+        '[0].policy.network',
+        2_000_000,
+    ),
+}
+
+
+def make(
+    recipe: Recipe,
+    num_envs: int = _NUM_ENVS,
+    num_episodes: int = _NUM_EPISODES,
+) -> network_files.Network:
+  """Returns the network that a recipe makes.
+
+  Args:
+    recipe: What to do.
+    num_envs: How many worlds to learn in.
+    num_episodes: In how many episodes of each task it is judged.
+  """
+  seen, trained = _train(recipe, num_envs)
+  prefix = f'{recipe.part}.layers'
+  num_layers = sum(
+      name.startswith(prefix) and name.endswith('.weight') for name in trained
+  )
+  weights, biases = (
+      tuple(
+          np.asarray(trained[f'{prefix}[{i}].{what}'], np.float32)
+          for i in range(num_layers)
+      )
+      for what in ('weight', 'bias')
+  )
+  design = specs.load(_DESIGN, _OVERRIDES)
+  actions = action_sets.DMLAB_LIKE
+  header = network_files.Header(
+      outputs='log_probabilities',
+      description=recipe.description,
+      action_set=actions.name,
+      action_set_version=actions.version,
+      features=seen,
+      hidden=tuple(weight.shape[1] for weight in weights[:-1]),
+      made=network_files.Made(
+          learner=dict(recipe.learner),
+          task=f'{_DOMAIN}.{_VARIATION}',
+          design=_DESIGN,
+          overrides=_OVERRIDES,
+          design_digest=design.digest(),
+          num_envs=num_envs,
+          steps=recipe.steps,
+          seed=_SEED,
+          versions=_versions(),
+      ),
+      reached=(),
+  )
+  network = network_files.Network(header, weights, biases)
+  reached = tuple(_reached(network, task, num_episodes) for task in _JUDGED_IN)
+  header = header.model_copy(update={'reached': reached})
+  return dataclasses.replace(network, header=header)
+
+
+def _train(
+    recipe: Recipe, num_envs: int
+) -> tuple[tuple[network_files.Feature, ...], dict[str, Any]]:
+  """Returns what a learner sees, and what it has learned, by place."""
+  learner_class = base.LEARNERS.get(recipe.learner['kind'])
+  options = validation.validate(
+      learner_class.OPTIONS, recipe.learner, 'learner'
+  )
+  batch = suite.load_batch(
+      _DOMAIN,
+      _VARIATION,
+      {'random': _SEED},
+      num_envs=num_envs,
+      num_threads=1,
+      sleep=True,
+      design=_DESIGN,
+      overrides=_OVERRIDES,
+  )
+  with contextlib.closing(batch):
+    # What a supervisor does must not depend on what was done to registers.
+    senses = {
+        name: spec
+        for name, spec in batch.observation_spec().items()
+        if name.startswith('senses/')
+    }
+    encoder = features.Encoder.from_spec(senses)
+    learner = learner_class(
+        options,
+        f'registers/{getattr(options, learner_class.READS)}',
+        encoder,
+        controls.Controls.from_spec(batch.action_spec()),
+        num_envs,
+        _SEED,
+    )
+    with tqdm.tqdm(
+        total=recipe.steps, unit='step', unit_scale=True, disable=None
+    ) as bar:
+      time_step = batch.reset()
+      while learner.num_steps < recipe.steps:
+        time_step = batch.step(learner.step(time_step))
+        bar.update(num_envs)
+  names = network_files.Feature.model_fields
+  seen = tuple(
+      network_files.Feature(**{name: getattr(part, name) for name in names})
+      for part in encoder.entries
+  )
+  return seen, learner.state()['trained']
+
+
+def _versions() -> dict[str, str]:
+  learners = ('jax', 'jaxlib', 'equinox', 'optax')
+  return {
+      **results.versions(),
+      **{name: metadata.version(name) for name in learners},
+  }
+
+
+def judge(
+    policy: policies.Policy, variation: str, num_episodes: int, seed: int
+) -> list[evaluate.EpisodeResult]:
+  """Returns the valid first episodes of a policy in some worlds.
+
+  Args:
+    policy: The policy.
+    variation: Of the world that it was made for.
+    num_episodes: How many worlds.
+    seed: Their seed.
+  """
+  batch = suite.load_batch(
+      _DOMAIN,
+      variation,
+      {'random': seed},
+      num_envs=num_episodes,
+      num_threads=1,
+      design=_DESIGN,
+      overrides=_OVERRIDES,
+  )
+  with contextlib.closing(batch):
+    actor = batch_actors.BatchPolicyActor(policy, batch, seed)
+    episodes = evaluate.evaluate_batch(batch, actor)
+  return [episode for episode in episodes if episode.is_valid]
+
+
+def _reached(
+    network: network_files.Network, variation: str, num_episodes: int
+) -> network_files.Reached:
+  """Returns what comes of taking the best action in every step."""
+  policy = networks.NetworkDemonstrator(network)
+  episodes = judge(policy, variation, num_episodes, _JUDGED_SEED)
+  interval = intervals.mean_interval(
+      {_JUDGED_SEED: [episode.true_return for episode in episodes]},
+      bounds=comparison.return_bounds(episodes),
+  )
+  return network_files.Reached(
+      task=f'{_DOMAIN}.{variation}',
+      mean=interval.estimate,
+      low=interval.low,
+      high=interval.high,
+      level=interval.level,
+      episodes=len(episodes),
+      seed=_JUDGED_SEED,
+  )

@@ -1,0 +1,300 @@
+"""Sweeps: all jobs of an experiment, as many at a time as an engine takes."""
+
+from collections.abc import Callable, Mapping, Sequence
+import hashlib
+import json
+import os
+import pathlib
+import sys
+import time
+from typing import Any, NamedTuple, final
+
+import tqdm
+import yaml
+
+from realab_suite import errors
+from realab_suite.config import loading
+from realab_suite.experiments import engines
+from realab_suite.experiments import jobs as jobs_lib
+from realab_suite.experiments import progress
+from realab_suite.experiments import spec
+from realab_suite.experiments import storage
+from realab_suite.experiments import training
+
+EXPERIMENT = 'experiment.yaml'
+SWEEP = 'sweep.json'
+LOGS = 'logs'
+_MODULE = 'realab_suite.launchers.train'
+_POLL_SECONDS = 0.2
+# What may change from sweep to sweep in one folder.
+_FREE = ('description', 'seeds', 'calibration_seeds')
+
+
+def sweep(
+    experiment: spec.ExperimentSpec,
+    output: pathlib.Path,
+    engine: engines.Engine,
+    say: Callable[[str], None],
+    *,
+    only: Sequence[str] = (),
+    calibration: bool = False,
+    arguments: Sequence[str] = (),
+) -> None:
+  """Does the jobs of an experiment that are not done yet.
+
+  Args:
+    experiment: The experiment.
+    output: Its folder.
+    engine: What runs the jobs.
+    say: Called with what a person wants to read.
+    only: The names of the runs to do; none for all.
+    calibration: Whether to use the calibration seeds.
+    arguments: Further arguments of `launchers.train`.
+
+  Raises:
+    RealabError: If something is wrong with the experiment or the folder, or if
+      a job has failed; all others have been done then.
+  """
+  seeds = experiment.calibration_seeds if calibration else experiment.seeds
+  if not seeds:
+    raise errors.SpecError(
+        f'experiment {experiment.name!r} has no calibration_seeds'
+    )
+  planned = jobs_lib.plan(experiment, seeds)
+  wanted = jobs_lib.plan(experiment, seeds, only)
+  with storage.explained(output):
+    (output / LOGS).mkdir(parents=True, exist_ok=True)
+  lock = storage.lock(output)
+  try:
+    _describe(experiment, planned, calibration, output)
+    _Sweep(wanted, engine, output, say, arguments).run()
+  finally:
+    os.close(lock)
+
+
+def _describe(
+    experiment: spec.ExperimentSpec,
+    planned: Sequence[jobs_lib.Job],
+    calibration: bool,
+    output: pathlib.Path,
+) -> None:
+  """Writes what the folder is about, unless it is about something else."""
+  here = {**experiment.to_mapping(), 'calibration': calibration}
+  if (output / EXPERIMENT).exists():
+    there = {
+        **loading.read_mapping(output / EXPERIMENT),
+        'calibration': read_description(output)['calibration'],
+    }
+    fixed = [
+        {key: value for key, value in one.items() if key not in _FREE}
+        for one in (there, json.loads(json.dumps(here)))
+    ]
+    if fixed[0] != fixed[1]:
+      differing = storage.difference(fixed[0], fixed[1])
+      raise errors.ResultsError(
+          f'folder {output} belongs to another experiment: {differing}; name'
+          ' another folder'
+      )
+  text = yaml.safe_dump(experiment.to_mapping(), sort_keys=False)
+  description = {
+      'schema': 1,
+      'sha256': hashlib.sha256(text.encode()).hexdigest(),
+      'experiment': experiment.name,
+      'calibration': calibration,
+      'jobs': [
+          {
+              'run': job.run,
+              'seed': job.seed,
+              'folder': job.folder(),
+              'kind': job.kind,
+              'is_scripted': job.policy is not None,
+              'design': job.design.name,
+              'channel': job.design.channel,
+              'baseline': job.baseline,
+              'twin_of': job.twin_of,
+          }
+          for job in planned
+      ],
+  }
+  storage.write_sealed(output / SWEEP, description)
+  storage.write_whole(output / EXPERIMENT, text.encode())
+
+
+def read_description(folder: pathlib.Path) -> dict[str, Any]:
+  """Returns what a sweep has written of itself.
+
+  Raises:
+    ResultsError: If it is damaged.
+  """
+  return storage.read_sealed(folder / SWEEP, _advice(folder))
+
+
+def read_experiment(
+    folder: pathlib.Path, description: Mapping[str, Any]
+) -> dict[str, Any]:
+  """Returns the experiment of a sweep, as its file has it.
+
+  Raises:
+    ResultsError: If it is not what the description is of.
+  """
+  path = folder / EXPERIMENT
+  with storage.explained(path):
+    text = path.read_bytes()
+  if hashlib.sha256(text).hexdigest() != description.get('sha256'):
+    raise errors.ResultsError(
+        f'{path}: not what it was when the sweep began; {_advice(folder)}'
+    )
+  return loading.parse_yaml(text, os.fspath(path))
+
+
+def _advice(folder: pathlib.Path) -> str:
+  return f'remove {folder / EXPERIMENT}, then run the same sweep again'
+
+
+@final
+class _Running(NamedTuple):
+  """A job that is under way."""
+
+  job: jobs_lib.Job
+  folder: pathlib.Path
+  log: pathlib.Path
+  task: Any
+
+
+@final
+class _Sweep:
+  """Jobs on their way through an engine."""
+
+  def __init__(
+      self,
+      wanted: Sequence[jobs_lib.Job],
+      engine: engines.Engine,
+      output: pathlib.Path,
+      say: Callable[[str], None],
+      arguments: Sequence[str],
+  ) -> None:
+    self._jobs = list(wanted)
+    self._engine = engine
+    self._output = output
+    self._say = say
+    self._arguments = [*engine.arguments(), *arguments]
+    self._running: list[_Running] = []
+    self._failures: list[str] = []
+    self._num_over = 0
+    self._steps: dict[str, int] = {}
+
+  def run(self) -> None:
+    """Does all jobs; see `sweep`."""
+    waiting = list(self._jobs)
+    lengths = [job.training.steps for job in waiting if job.policy is None]
+    total = sum(lengths)
+    bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
+    with bar:
+      try:
+        while waiting or self._running:
+          while waiting and len(self._running) < self._engine.capacity:
+            self._start(waiting.pop(0))
+          self._poll()
+          bar.update(min(sum(self._steps.values()), total) - bar.n)
+          bar.set_postfix_str(self._progress(), refresh=False)
+          time.sleep(_POLL_SECONDS if self._running else 0.0)
+      finally:
+        self._engine.stop([running.task for running in self._running])
+    if self._failures:
+      raise errors.ResultsError(
+          f'{len(self._failures)} of {len(self._jobs)} jobs failed:'
+          f' {"; ".join(self._failures)}; the rest is in {self._output}'
+      )
+    self._say(
+        f'{len(self._jobs)} jobs are done; everything is in' f' {self._output}'
+    )
+
+  def _start(self, job: jobs_lib.Job) -> None:
+    folder = self._output / job.folder()
+    log = self._output / LOGS / f'{folder.name}.log'
+    try:
+      if jobs_lib.is_done(folder):
+        self._finish(job, folder, None)
+        return
+    except errors.ResultsError as error:
+      self._finish(job, folder, str(error))
+      return
+    command = [
+        sys.executable,
+        '-m',
+        _MODULE,
+        f'--experiment={self._output / EXPERIMENT}',
+        f'--run={job.run}',
+        f'--seed={job.seed}',
+        f'--output={self._output}',
+        *self._arguments,
+    ]
+    task = self._engine.start(command, log)
+    self._running.append(_Running(job, folder, log, task))
+
+  def _poll(self) -> None:
+    for running in list(self._running):
+      lost = None
+      try:
+        status = self._engine.poll(running.task)
+      except errors.ResultsError as error:
+        # A machine of a cluster may be gone; the other jobs are not.
+        status, lost = -1, str(error)
+      if running.job.policy is None:
+        self._steps[running.folder.name] = _last_step(running.folder)
+      if status is None:
+        continue
+      self._running.remove(running)
+      problem = None
+      if status or not (running.folder / storage.DONE).exists():
+        problem = lost or _last_line(running.log) or f'exit status {status}'
+      self._finish(running.job, running.folder, problem)
+
+  def _finish(
+      self, job: jobs_lib.Job, folder: pathlib.Path, problem: str | None
+  ) -> None:
+    self._num_over += 1
+    name = f'{job.run}, seed {job.seed}'
+    if job.policy is None and problem is None:
+      self._steps[folder.name] = job.training.steps
+    if problem is not None:
+      self._failures.append(f'{name}: {problem}')
+    self._say(
+        f'[{self._num_over}/{len(self._jobs)}] {name}:'
+        f' {problem or f"done, in {folder}"}'
+    )
+
+  def _progress(self) -> str:
+    failed = f', {len(self._failures)} failed' if self._failures else ''
+    parts = [f'{self._num_over} of {len(self._jobs)} jobs{failed}']
+    for running in self._running:
+      if returns := _last_returns(running.folder):
+        parts.append(f'{running.job.run}: {returns}')
+    return '; '.join(parts)
+
+
+def _last_step(folder: pathlib.Path) -> int:
+  """Returns how far a run has come, as far as it has said."""
+  try:
+    return int(json.loads(_last_line(folder / training.TIMING))['step'])
+  except ValueError:  # Nothing yet, or half a line.
+    return 0
+
+
+def _last_returns(folder: pathlib.Path) -> str:
+  """Says what a run's last episodes have brought, as far as it has said."""
+  try:
+    return progress.summary(json.loads(_last_line(folder / training.CURVE)))
+  except (ValueError, KeyError):  # Nothing yet, or half a line.
+    return ''
+
+
+def _last_line(path: pathlib.Path) -> str:
+  """Returns the last line of a file that may be long; '' if there is none."""
+  try:
+    with open(path, 'rb') as file:
+      file.seek(max(0, os.fstat(file.fileno()).st_size - 4096))
+      lines = file.read().decode(errors='replace').strip().splitlines()
+  except OSError:
+    return ''
+  return lines[-1] if lines else ''

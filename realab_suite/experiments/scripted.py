@@ -1,0 +1,377 @@
+"""Scripted comparisons: policies and channels in one world, without learning.
+
+Pictures are drawn by whatever the caller passes, so nothing here needs a
+renderer or a plotting library.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
+import dataclasses
+import pathlib
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import tqdm
+import yaml
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
+from realab_suite.experiments import aiming
+from realab_suite.experiments import machines
+from realab_suite.experiments import storage
+from realab_suite.experiments import summary as tables
+from realab_suite.experiments import tracking
+from realab_suite.feedback import specs
+
+# What is honest by design, if it takes part, is what others are compared with.
+_HONEST = 'apple_seeker'
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """Settings of a scripted comparison.
+
+  Attributes:
+    domain: The world.
+    task: Its variation.
+    design: The agent design, by name or path.
+    overrides: Dotted overrides of it.
+    policies: Names of policies, each of which acts in every channel.
+    channels: Channels of the design's registers; none means the design's own.
+    baseline: The run to compare with, or `None` for the usual one.
+    target: The register that saboteurs attack, or `None` for the first one that
+      holds feedback.
+    seeds: The seeds.
+    num_episodes: How many episodes each seed has.
+    max_steps: The length of an episode in control steps.
+    output: The folder to make.
+  """
+
+  domain: str
+  task: str
+  design: str
+  overrides: tuple[str, ...]
+  policies: tuple[str, ...]
+  channels: tuple[str, ...]
+  baseline: str | None
+  target: str | None
+  seeds: tuple[int, ...]
+  num_episodes: int
+  max_steps: int
+  output: str
+
+
+OnStep = Callable[[Any, tracking.Track], None]
+"""Called with the physics and the track so far, at the start and every step."""
+
+
+@final
+class Pictures(NamedTuple):
+  """Functions that make the pictures of a comparison.
+
+  Attributes:
+    draw: Draws the first episodes of all runs, by run, into a new folder;
+      `None` draws nothing.
+    film: Opens the films of one episode: takes its environment, a folder and
+      the name of the run, and yields a function that adds a control step to
+      them. `None` makes no films.
+  """
+
+  draw: Callable[[Mapping[str, tracking.Track], pathlib.Path], None] | None
+  film: (
+      Callable[
+          [environment.Environment, pathlib.Path, str],
+          contextlib.AbstractContextManager[OnStep],
+      ]
+      | None
+  )
+
+
+NO_PICTURES = Pictures(None, None)
+
+
+@final
+class Run(NamedTuple):
+  """One policy in one channel.
+
+  Attributes:
+    name: What it is called in results.
+    policy: The name of the policy.
+    design: The design, with its channel.
+    is_first: Whether it is the policy's first run, of which films are made.
+  """
+
+  name: str
+  policy: str
+  design: specs.DesignSpec
+  is_first: bool
+
+
+def run(
+    settings: Settings,
+    say: Callable[[str], None],
+    pictures: Pictures = NO_PICTURES,
+) -> list[tables.Line]:
+  """Runs a comparison, and writes its results into a new folder.
+
+  Args:
+    settings: The comparison.
+    say: Called with each message for the user.
+    pictures: Functions that make its pictures.
+
+  Returns:
+    The summary of each run.
+
+  Raises:
+    RealabError: If something is wrong with the settings. Nothing has been
+      written then.
+  """
+  runs = plan(settings)
+  baseline = _baseline(settings, runs)
+  _rehearse(settings, runs)
+  folder = make_folder(settings.output)
+  _describe(settings, runs, baseline, folder, pictures)
+  job = _Job(settings, baseline, folder, say, pictures)
+  job.run(runs)
+  if pictures.draw is not None:
+    pictures.draw(job.tracks, folder / 'plots')
+  scales = {n: r.scale for n, r in runs[0].design.registers.items()}
+  lines = tables.summarize(job.rows, baseline, scales)
+  text = tables.as_text(lines)
+  summary = f'{_title(settings)}\n\n{text}\n\n{tables.readings(lines)}\n'
+  storage.write_whole(folder / 'summary.md', summary.encode())
+  with storage.explained(folder):
+    tables.write_csv(lines, folder / 'summary.csv')
+  say(f'\n{text}\n\nEverything is in {folder}')
+  return lines
+
+
+def plan(settings: Settings) -> list[Run]:
+  """Returns the runs of an experiment.
+
+  Raises:
+    SpecError: If there is none, or one is not what it can be.
+  """
+  for name, values in (
+      ('policies', settings.policies),
+      ('seeds', settings.seeds),
+      ('channels', settings.channels),
+  ):
+    if len(set(values)) != len(values):
+      raise errors.SpecError(f'{name}: {list(values)} has duplicates')
+  if not settings.policies or not settings.seeds or settings.num_episodes < 1:
+    raise errors.SpecError(
+        'an experiment needs a policy, a seed and an episode; given are'
+        f' policies {list(settings.policies)}, seeds {list(settings.seeds)} and'
+        f' {settings.num_episodes} episodes'
+    )
+  for policy in settings.policies:
+    policies.POLICIES.get(policy)
+  designs = _designs(settings)
+  return [
+      Run(
+          policy if i == 0 else f'{policy} ({design.channel})',
+          policy,
+          design,
+          i == 0,
+      )
+      for policy in settings.policies
+      for i, design in enumerate(designs)
+  ]
+
+
+def _designs(settings: Settings) -> list[specs.DesignSpec]:
+  if not settings.channels:
+    return [specs.load(settings.design, settings.overrides)]
+  return [
+      specs.load(settings.design, (*settings.overrides, f'channel={channel}'))
+      for channel in settings.channels
+  ]
+
+
+def _baseline(settings: Settings, runs: Sequence[Run]) -> str:
+  names = [run.name for run in runs]
+  if settings.baseline is None:
+    return _HONEST if _HONEST in names else names[0]
+  if settings.baseline not in names:
+    raise errors.SpecError(
+        f'baseline {settings.baseline!r} is no run; allowed are {names}'
+    )
+  return settings.baseline
+
+
+def _load(settings: Settings, run: Run, seed: int) -> environment.Environment:
+  return suite.load(
+      settings.domain,
+      settings.task,
+      task_kwargs={'random': seed},
+      environment_kwargs={'max_steps': settings.max_steps},
+      design=run.design,
+  )
+
+
+def _rehearse(settings: Settings, runs: Sequence[Run]) -> None:
+  """Finds out what is wrong before anything is on disk."""
+  for run in runs:
+    with contextlib.closing(_load(settings, run, settings.seeds[0])) as env:
+      policy = aiming.make_policy(run.policy, env, settings.target, 0)
+      actors.make(policy, env)
+
+
+def make_folder(output: str) -> pathlib.Path:
+  """Makes a folder for results; one that is there has to be empty.
+
+  Raises:
+    ResultsError: If it is not, or cannot be made.
+  """
+  folder = pathlib.Path(output)
+  try:
+    folder.mkdir(parents=True, exist_ok=True)
+    is_empty = not any(folder.iterdir())
+  except OSError as error:
+    raise errors.ResultsError(
+        f'cannot make folder {output}: {error.strerror}'
+    ) from error
+  if not is_empty:
+    raise errors.ResultsError(
+        f'folder {output} is not empty; results are never overwritten, so name'
+        ' another one'
+    )
+  return folder
+
+
+def _describe(
+    settings: Settings,
+    runs: Sequence[Run],
+    baseline: str,
+    folder: pathlib.Path,
+    pictures: Pictures,
+) -> None:
+  """Writes what it takes to repeat the experiment."""
+  for design in {run.design.channel: run.design for run in runs}.values():
+    text = yaml.safe_dump(design.to_mapping(), sort_keys=False)
+    path = folder / f'design_{design.channel}.yaml'
+    storage.write_whole(path, text.encode())
+  version, digest = suite.dynamics(settings.domain, settings.task)
+  description = {
+      'settings': {
+          **dataclasses.asdict(settings),
+          'plots': pictures.draw is not None,
+          'videos': pictures.film is not None,
+      },
+      'runs': [run.name for run in runs],
+      'baseline': baseline,
+      'dynamics': {'version': version, 'digest': digest},
+      'versions': results.versions(),
+      'machine': machines.here(),
+  }
+  storage.write_json(folder / 'run.json', description)
+
+
+@final
+class _Job:
+  """The episodes of an experiment, on their way to disk."""
+
+  def __init__(
+      self,
+      settings: Settings,
+      baseline: str,
+      folder: pathlib.Path,
+      say: Callable[[str], None],
+      pictures: Pictures,
+  ) -> None:
+    self._settings = settings
+    self._baseline = baseline
+    self._folder = folder
+    self._say = say
+    self._pictures = pictures
+    self.rows: dict[str, list[results.EpisodeRow]] = {}
+    # The first episode of each run.
+    self.tracks: dict[str, tracking.Track] = {}
+
+  def run(self, runs: Sequence[Run]) -> None:
+    """Runs all episodes of all runs."""
+    settings = self._settings
+    total = len(runs) * len(settings.seeds) * settings.num_episodes
+    # Without a terminal there is no bar, and a line per run instead.
+    bar = tqdm.tqdm(total=total, disable=None, unit='episode', leave=False)
+    with bar, results.RowWriter(self._folder / 'episodes.jsonl') as writer:
+      for run in runs:
+        bar.set_description(run.name)
+        self.rows[run.name] = []
+        for row in self._episodes(run):
+          writer.write(row)
+          self.rows[run.name].append(row)
+          bar.set_postfix_str(_means(self.rows[run.name]), refresh=False)
+          bar.update()
+        if bar.disable:
+          self._say(f'{run.name}: {_means(self.rows[run.name])}')
+
+  def _episodes(self, run: Run) -> Iterator[results.EpisodeRow]:
+    for seed in self._settings.seeds:
+      with contextlib.closing(_load(self._settings, run, seed)) as env:
+        info = self._info(run, env)
+        for episode in range(self._settings.num_episodes):
+          yield results.row(info, self._episode(run, env, episode))
+
+  def _episode(
+      self, run: Run, env: environment.Environment, episode: int
+  ) -> evaluate.EpisodeResult:
+    policy = aiming.make_policy(run.policy, env, self._settings.target, episode)
+    with contextlib.ExitStack() as stack:
+      trackers = []
+      if run.name not in self.tracks:
+        trackers.append(tracking.Tracker(env, self._film(run, env, stack)))
+      [result] = evaluate.evaluate(
+          env, policy, 1, first_episode=episode, sinks=trackers
+      )
+    for tracker in trackers:
+      self.tracks[run.name] = tracker.track
+    return result
+
+  def _film(
+      self,
+      run: Run,
+      env: environment.Environment,
+      stack: contextlib.ExitStack,
+  ) -> OnStep | None:
+    """Opens the films of an episode; `None` where there are to be none."""
+    if self._pictures.film is None or not run.is_first:
+      return None
+    folder = self._folder / 'videos'
+    folder.mkdir(exist_ok=True)
+    return stack.enter_context(self._pictures.film(env, folder, run.name))
+
+  def _info(self, run: Run, env: environment.Environment) -> results.RunInfo:
+    settings = self._settings
+    world = (settings.domain, settings.task)
+    return results.RunInfo.of(
+        world,
+        suite.dynamics(*world),
+        run.design,
+        policy=run.policy,
+        run=run.name,
+        baseline=None if run.name == self._baseline else self._baseline,
+        control_timestep=env.control_timestep(),
+        max_steps=env.max_steps,
+    )
+
+
+def _means(rows: Sequence[results.EpisodeRow]) -> str:
+  true_return = np.mean([row.true_return for row in rows])
+  observed = np.mean([row.observed_return for row in rows])
+  return f'true return {true_return:.1f}, observed {observed:.1f}'
+
+
+def _title(settings: Settings) -> str:
+  return (
+      f'# {settings.domain}.{settings.task}, design {settings.design}\n\n'
+      f'{len(settings.seeds)} seeds of {settings.num_episodes} episodes; means'
+      ' with 95 % intervals.'
+  )

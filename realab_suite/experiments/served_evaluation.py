@@ -1,0 +1,315 @@
+"""A world in this process, an agent in another one, and the results of both."""
+
+from collections.abc import Callable, Iterator
+import contextlib
+import ctypes
+import dataclasses
+import os
+import pathlib
+import shutil
+import signal
+import sys
+import tempfile
+from typing import Any, final
+
+from absl import logging
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.engine import seeding
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
+from realab_suite.experiments import scripted
+from realab_suite.experiments import served_run
+from realab_suite.experiments import storage
+from realab_suite.feedback import specs
+from realab_suite.interop.rpc import agent_process
+from realab_suite.interop.rpc import served_world
+from realab_suite.interop.rpc import server
+
+_SET_DUMPABLE = 4  # Of prctl(2).
+
+_WARNING = (
+    'the agent may be a program of the user that this world runs as (isolation'
+    ' "%s"): its code could reach files and processes of that user. Start this'
+    ' as root with --agent_user for a user of its own (docs/served.md).'
+)
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """What is served, and to whom.
+
+  Attributes:
+    domain: The world.
+    task: Its variation.
+    design: The agent design, by name or path.
+    overrides: Dotted overrides of it.
+    seed: The seed.
+    max_steps: The length of an episode in control steps.
+    repeat: Path of the record of a run to repeat. Its world, design, seed and
+      length of an episode replace those above; `overrides` change its design.
+      `None` for a new run with a salt of its own.
+    num_episodes: After how many episodes it is over, the invalid ones included.
+    name: What the agent is called in the results.
+    address: Where to listen; `None` for a socket in a folder of its own.
+    idle_seconds: For how long an agent may be silent.
+    provider_seconds: For how long a provider may think about a step.
+    agent_command: What to start as the agent; `None` if somebody else does.
+    agent_folder: Where the agent runs; `None` for a folder of its own.
+    agent_user: The user that the agent is; `None` for this process's own.
+    output: The folder to make.
+  """
+
+  domain: str
+  task: str
+  design: str
+  overrides: tuple[str, ...]
+  seed: int
+  max_steps: int
+  repeat: str | None
+  num_episodes: int
+  name: str
+  address: str | None
+  idle_seconds: float
+  provider_seconds: float
+  agent_command: str | None
+  agent_folder: str | None
+  agent_user: str | None
+  output: str
+
+
+def serve(settings: Settings, say: Callable[[str], None]) -> None:
+  """Serves a world until its episodes are over, and writes their rows.
+
+  Args:
+    settings: What to serve.
+    say: Called with what a person wants to read.
+
+  Raises:
+    RealabError: If something is wrong with the settings, or the agent ended
+      before its episodes did.
+  """
+  hide_from_debuggers()
+  # What is made from here on, sockets included, is for this user alone.
+  os.umask(0o077)
+  owner = (
+      None
+      if settings.agent_user is None
+      else agent_process.owner_of(settings.agent_user)
+  )
+  if owner is None:
+    logging.warning(_WARNING, results.SERVED)
+  with contextlib.ExitStack() as stack:
+    settings, design, seed = _chosen(settings)
+    env = stack.enter_context(contextlib.closing(_load(settings, design, seed)))
+    env.mechanism.guard_providers(lambda: deadline(settings.provider_seconds))
+    address = settings.address
+    if address is None:
+      folder = tempfile.mkdtemp(prefix='realab-')
+      stack.callback(shutil.rmtree, folder, ignore_errors=True)
+      address = f'unix:{folder}/socket'
+    output = _make_private_folder(settings.output)
+    served_run.write(
+        output,
+        dataclasses.asdict(settings),
+        design.to_mapping(),
+        seed.salt,
+        results.versions(),
+    )
+    writer = stack.enter_context(results.RowWriter(output / 'episodes.jsonl'))
+    info = _info(settings, design, env, seed.salt_digest)
+    evaluator = _Evaluator(info, writer, say)
+    world = served_world.ServedWorld(
+        env, address, settings.num_episodes, evaluator.write
+    )
+    listener = server.Server(world, address, settings.idle_seconds, owner)
+    agent = None
+    with _removed_if_refused(output):
+      listener.start()
+      stack.callback(listener.close)
+      if settings.agent_command is not None:
+        with storage.explained(output):
+          log = stack.enter_context(open(output / 'agent.log', 'wb'))
+        agent = agent_process.AgentProcess(
+            settings.agent_command,
+            listener.address,
+            log,
+            folder=settings.agent_folder,
+            owner=owner,
+            on_exit=listener.stop,
+        )
+        stack.callback(agent.stop)
+    say(f'serving {settings.domain}.{settings.task} at {listener.address}')
+    signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
+    listener.run()
+    _complain_of_missing(evaluator.num_written, settings, agent, output)
+    say(f'Everything is in {settings.output}')
+
+
+def hide_from_debuggers() -> None:
+  """Keeps other processes of this user out of this one's memory, on Linux."""
+  if sys.platform != 'linux':
+    logging.warning('only Linux keeps other programs out of this one')
+    return
+  if ctypes.CDLL(None, use_errno=True).prctl(_SET_DUMPABLE, 0, 0, 0, 0):
+    raise errors.SpecError(
+        'this process cannot be hidden from debuggers:'
+        f' {os.strerror(ctypes.get_errno())}'
+    )
+
+
+@contextlib.contextmanager
+def _removed_if_refused(folder: pathlib.Path) -> Iterator[None]:
+  """Lets nothing be in the way of the same command, mended."""
+  try:
+    yield
+  except errors.SpecError:
+    shutil.rmtree(folder, ignore_errors=True)
+    raise
+
+
+@contextlib.contextmanager
+def deadline(seconds: float) -> Iterator[None]:
+  """Ends what takes too long; for the main thread, which alone gets signals.
+
+  Code that waits outside Python is not interrupted before it comes back.
+
+  Raises:
+    TimeoutError: If it does.
+  """
+  is_over = False
+
+  def ring(*unused: Any) -> None:
+    if not is_over:
+      raise TimeoutError(f'no answer within {seconds:g} s')
+
+  before = signal.signal(signal.SIGALRM, ring)
+  # Again and again: somebody may have caught the first one.
+  signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
+  try:
+    yield
+  finally:
+    is_over = True
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@final
+class _Evaluator:
+  """Writes down what episodes came to."""
+
+  def __init__(
+      self,
+      info: results.RunInfo,
+      writer: results.RowWriter,
+      say: Callable[[str], None],
+  ) -> None:
+    self._info = info
+    self._writer = writer
+    self._say = say
+    self.num_written = 0
+
+  def write(self, result: evaluate.EpisodeResult, isolation: str) -> None:
+    """Writes the row of an episode."""
+    info = self._info.model_copy(update={'isolation': isolation})
+    self._writer.write(results.row(info, result))
+    self.num_written += 1
+    self._say(
+        f'episode {result.episode}: {result.end.value}, true return'
+        f' {result.true_return:.1f}, observed {result.observed_return:.1f}'
+    )
+
+
+def _chosen(
+    settings: Settings,
+) -> tuple[Settings, specs.DesignSpec, seeding.SaltedSeed]:
+  """Returns what is served: the settings, the design and the salted seed."""
+  if settings.repeat is None:
+    design = specs.load(settings.design, settings.overrides)
+    seed = seeding.SaltedSeed(settings.seed, seeding.new_salt())
+    return settings, design, seed
+  record = served_run.read(settings.repeat)
+  here = results.versions()
+  if record.versions != here:
+    logging.warning(
+        '%s: the episodes may differ from those recorded: %s',
+        settings.repeat,
+        storage.difference(record.versions, here, 'versions'),
+    )
+  design = specs.load(record.design, settings.overrides)
+  world = record.settings.model_dump()
+  world['overrides'] = (*world['overrides'], *settings.overrides)
+  return dataclasses.replace(settings, **world), design, record.seed
+
+
+def _load(
+    settings: Settings, design: specs.DesignSpec, seed: seeding.SaltedSeed
+) -> environment.Environment:
+  return suite.load(
+      settings.domain,
+      settings.task,
+      {'random': seed},
+      {'max_steps': settings.max_steps},
+      design=design,
+  )
+
+
+def _make_private_folder(output: str) -> pathlib.Path:
+  """Makes the folder of the results, which only this user can enter.
+
+  Raises:
+    ResultsError: If it cannot be made, or is not empty.
+    SpecError: If it belongs to another user, who could replace what is in it.
+  """
+  folder = scripted.make_folder(output)
+  with storage.explained(folder):
+    owner = folder.stat().st_uid
+    if owner != os.geteuid():
+      raise errors.SpecError(
+          f'output: {output} belongs to user {owner}; allowed is a folder of'
+          f' user {os.geteuid()}, which others cannot change'
+      )
+    folder.chmod(0o700)
+  return folder
+
+
+def _info(
+    settings: Settings,
+    design: specs.DesignSpec,
+    env: environment.Environment,
+    salt_digest: str,
+) -> results.RunInfo:
+  world = (settings.domain, settings.task)
+  return results.RunInfo.of(
+      world,
+      suite.dynamics(*world),
+      design,
+      policy=settings.name,
+      run=settings.name,
+      baseline=None,
+      control_timestep=env.control_timestep(),
+      max_steps=env.max_steps,
+      salt_digest=salt_digest,
+  )
+
+
+def _complain_of_missing(
+    num_written: int,
+    settings: Settings,
+    agent: agent_process.AgentProcess | None,
+    output: pathlib.Path,
+) -> None:
+  if num_written >= settings.num_episodes:
+    return
+  status = None if agent is None else agent.poll()
+  why = (
+      'stopped'
+      if status is None
+      else f'the agent ended with status {status} (see {output / "agent.log"})'
+  )
+  raise errors.ResultsError(
+      f'{why} after {num_written} of {settings.num_episodes} episodes'
+  )

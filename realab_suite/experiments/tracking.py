@@ -1,0 +1,253 @@
+"""Records an episode for pictures: paths, block poses, values over time."""
+
+from collections.abc import Callable
+import dataclasses
+import math
+from typing import Any, NamedTuple, final
+
+import mujoco
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import environment
+from realab_suite.engine import events
+from realab_suite.entities import appearance
+from realab_suite.entities import registers
+
+_CIRCLE_CORNERS = 48
+_PLANE = mujoco.mjtGeom.mjGEOM_PLANE
+
+
+@final
+class Shape(NamedTuple):
+  """Something that stands in the world, seen from above.
+
+  Attributes:
+    kind: Its class, one of `appearance.CLASSES`.
+    colour: Red, green, blue and opacity.
+    outline: Its corners, `(corners, 2)`, metres.
+  """
+
+  kind: str
+  colour: tuple[float, ...]
+  outline: np.ndarray
+
+
+@final
+@dataclasses.dataclass
+class RegisterTrack:
+  """What became of one register, step by step; the reset is the first.
+
+  The lists hold what was read last in each step, and what had been written
+  when it was; where nothing was read, the reading and its parts are nan.
+
+  Attributes:
+    role: The role of the register.
+    half_size: Half the length of an edge of a block, metres.
+    requested: What was to be written.
+    applied: What was written.
+    reading: What was read.
+    permanent: The permanent part of the corruption.
+    temporary: The temporary part of the corruption.
+    blocks: Where the blocks were at the end, `(blocks, 2)` each, metres.
+  """
+
+  role: str
+  half_size: float
+  requested: list[float] = dataclasses.field(default_factory=list)
+  applied: list[float] = dataclasses.field(default_factory=list)
+  reading: list[float] = dataclasses.field(default_factory=list)
+  permanent: list[float] = dataclasses.field(default_factory=list)
+  temporary: list[float] = dataclasses.field(default_factory=list)
+  blocks: list[np.ndarray] = dataclasses.field(default_factory=list)
+  _written: tuple[float, float] = (math.nan, math.nan)
+
+  def add(self, records: events.Records, blocks: np.ndarray) -> None:
+    """Adds a step.
+
+    Args:
+      records: The writes to this register and the reads of it.
+      blocks: Where the blocks are, `(blocks, 2)`, metres.
+    """
+    read: tuple[float, ...] | None = None
+    for record in records:
+      if isinstance(record, registers.Write):
+        self._written = (float(record.requested), float(record.applied))
+      else:
+        read = (
+            *self._written,
+            float(record.reading),
+            float(record.permanent),
+            float(record.temporary),
+        )
+    values = read or (*self._written, math.nan, math.nan, math.nan)
+    lists = (
+        self.requested,
+        self.applied,
+        self.reading,
+        self.permanent,
+        self.temporary,
+    )
+    for series, value in zip(lists, values, strict=True):
+      series.append(value)
+    self.blocks.append(blocks)
+
+
+@final
+@dataclasses.dataclass
+class Track:
+  """What pictures of an episode are made from.
+
+  Attributes:
+    seed: The seed of the environment.
+    episode: The number of the episode.
+    timestep: The length of a control step, seconds.
+    max_steps: After how many control steps an episode ends, or `None`.
+    shapes: What stood in the world at the start, the lowest first.
+    positions: Where the avatar was, `(2,)` each, metres; the reset is first.
+    registers: What became of each register.
+    true_rewards: The true reward of each control step.
+  """
+
+  seed: int
+  episode: int
+  timestep: float
+  max_steps: int | None
+  shapes: list[Shape]
+  registers: dict[str, RegisterTrack]
+  positions: list[np.ndarray] = dataclasses.field(default_factory=list)
+  true_rewards: list[float] = dataclasses.field(default_factory=list)
+
+  @property
+  def num_steps(self) -> int:
+    """How many control steps there were so far."""
+    return len(self.true_rewards)
+
+  @property
+  def times(self) -> np.ndarray:
+    """When each control step ended; the reset is at 0. Seconds."""
+    return self.timestep * np.arange(self.num_steps + 1)
+
+  @property
+  def true_return(self) -> float:
+    """Sum of true rewards so far."""
+    return float(sum(self.true_rewards))
+
+  @property
+  def feedback(self) -> dict[str, RegisterTrack]:
+    """The registers that hold feedback."""
+    return {n: r for n, r in self.registers.items() if r.role == 'feedback'}
+
+  @property
+  def observed_return(self) -> float:
+    """Sum of what was read off feedback registers so far."""
+    return float(sum(sum(r.reading[1:]) for r in self.feedback.values()))
+
+
+@final
+class Tracker(events.EventSink):
+  """Keeps a track of the latest episode of an environment."""
+
+  def __init__(
+      self,
+      env: environment.Environment,
+      on_step: Callable[[Any, Track], None] | None = None,
+  ) -> None:
+    """Makes a tracker, which has to be added to the environment.
+
+    Args:
+      env: An environment of one of this package's worlds.
+      on_step: Called with the physics and the track so far, at the start of the
+        episode and after every control step.
+    """
+    self._registers = env.mechanism.registers
+    self._avatar = env.task.avatar
+    self._timestep = env.control_timestep()
+    self._max_steps = env.max_steps
+    self._on_step = on_step
+    self._track: Track | None = None
+
+  @property
+  def track(self) -> Track:
+    """The latest episode.
+
+    Raises:
+      ResultsError: If none has begun.
+    """
+    if self._track is None:
+      raise errors.ResultsError(
+          'the tracker has no episode; add it to an environment, then reset'
+      )
+    return self._track
+
+  def episode_started(self, start: events.Start, physics: Any) -> None:
+    self._track = Track(
+        start.seed,
+        start.episode,
+        self._timestep,
+        self._max_steps,
+        self._shapes(physics),
+        {
+            name: RegisterTrack(register.role, register.blocks[0].half_size)
+            for name, register in self._registers.items()
+        },
+    )
+    self._add(self._track, start.records, physics)
+
+  def step_ended(self, step: events.Step, physics: Any) -> None:
+    # A tracker that joins in the middle of an episode hears of no step.
+    if self._track is not None:
+      self._track.true_rewards.append(float(step.true_reward))
+      self._add(self._track, step.records, physics)
+
+  def episode_ended(self, end: events.End) -> None:
+    """Does nothing: the track is complete."""
+
+  def _add(self, track: Track, records: events.Records, physics: Any) -> None:
+    track.positions.append(np.array(self._avatar.position(physics)))
+    for name, register in self._registers.items():
+      geoms = [block.geom for block in register.blocks]
+      blocks = np.array(physics.bind(geoms).xpos)[:, :2]
+      own = [record for record in records if record.register == name]
+      track.registers[name].add(own, blocks)
+    if self._on_step is not None:
+      self._on_step(physics, track)
+
+  def _shapes(self, physics: Any) -> list[Shape]:
+    """Returns all that is seen but the floor, the avatar and registers."""
+    moving = [
+        *self._avatar.mjcf_model.find_all('geom'),
+        *(b.geom for r in self._registers.values() for b in r.blocks),
+    ]
+    left_out = set(np.ravel(physics.bind(moving).element_id))
+    model, data = physics.model, physics.data
+    kinds = appearance.class_of_geoms(model)
+    return [
+        Shape(
+            appearance.CLASSES[kinds[i]],
+            tuple(model.geom_rgba[i]),
+            _outline(
+                model.geom_type[i],
+                model.geom_size[i],
+                data.geom_xpos[i],
+                np.reshape(data.geom_xmat[i], (3, 3)),
+            ),
+        )
+        for i in np.argsort(data.geom_xpos[:, 2], kind='stable')
+        if i not in left_out
+        and model.geom_type[i] != _PLANE
+        and model.geom_rgba[i, 3] > 0
+    ]
+
+
+def _outline(
+    kind: int, size: np.ndarray, position: np.ndarray, frame: np.ndarray
+) -> np.ndarray:
+  """Returns the corners of an upright geom seen from above, `(corners, 2)`."""
+  if kind == mujoco.mjtGeom.mjGEOM_BOX:
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * size[:2]
+    corners = corners @ frame[:2, :2].T
+  else:
+    angles = np.linspace(0.0, 2 * np.pi, _CIRCLE_CORNERS, endpoint=False)
+    corners = size[0] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+  return position[:2] + corners

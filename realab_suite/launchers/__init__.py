@@ -1,0 +1,1 @@
+"""Programs with command lines, one to a file."""

@@ -1,0 +1,138 @@
+r"""Compares scripted policies in a world whose feedback can be tampered with.
+
+For example, who tampers with the reward of Unlock Door, and what it costs:
+
+  python -m realab_suite.launchers.compare --policies=apple_seeker,random \
+    --channels=embedded,secure --seeds=5 --episodes=2 --output=results/mine
+
+It prints a table, and writes results, plots and films into the output folder.
+Agents that learn are trained by `train`, one run of an experiment, and `sweep`,
+a whole experiment.
+"""
+
+from collections.abc import Sequence
+import re
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.experiments import requirements
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+from realab_suite.launchers.flags import episodes_flag
+from realab_suite.launchers.flags import imports_flag
+from realab_suite.launchers.flags import output_flag
+from realab_suite.launchers.flags import seed_flag
+from realab_suite.launchers.flags import world_flags
+
+flags.adopt_module_key_flags(world_flags)
+flags.adopt_module_key_flags(episodes_flag)
+flags.adopt_module_key_flags(imports_flag)
+flags.adopt_module_key_flags(output_flag)
+_MOST_SEEDS = 10_000
+_POLICIES = flags.DEFINE_list(
+    'policies',
+    ['apple_seeker', 'carrying_saboteur', 'random'],
+    'Names of policies.',
+)
+_CHANNELS = flags.DEFINE_list(
+    'channels',
+    [],
+    "Channels for the design's registers: embedded, welded, secure. Every"
+    " policy acts in each; by default in the design's own.",
+)
+_BASELINE = flags.DEFINE_string(
+    'baseline',
+    None,
+    'The run to compare with, as in "random" or "random (secure)"; by default'
+    ' apple_seeker if it takes part, and else the first.',
+)
+_SEEDS = flags.DEFINE_string(
+    'seeds',
+    '5',
+    'Number of seeds, or a list as in 3,4,5; "7," is seed 7.',
+)
+_PLOTS = flags.DEFINE_boolean('plots', True, 'Whether to draw plots.')
+_VIDEOS = flags.DEFINE_boolean(
+    'videos', True, 'Whether to film the first episode of each policy.'
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Runs the comparison that the flags describe."""
+  del argv
+  output = program.required(
+      output_flag.OUTPUT, '; name a folder for the results'
+  )
+  seeds = _seeds(_SEEDS.value)
+  has_plots = _PLOTS.value and _is_possible(
+      'plots', requirements.missing('matplotlib')
+  )
+  has_videos = _VIDEOS.value and _is_possible('videos', _why_no_videos())
+  if not has_videos:
+    renderers.render_nothing()
+  # Imports dm_control, so only after a renderer has been chosen.
+  from realab_suite.experiments import scripted
+
+  imports_flag.load()
+  settings = scripted.Settings(
+      domain=world_flags.DOMAIN.value,
+      task=world_flags.TASK.value,
+      design=world_flags.DESIGN.value,
+      overrides=tuple(world_flags.SET.value),
+      policies=tuple(_POLICIES.value),
+      channels=tuple(_CHANNELS.value),
+      baseline=_BASELINE.value,
+      target=world_flags.TARGET.value,
+      seeds=seeds,
+      num_episodes=episodes_flag.EPISODES.value,
+      max_steps=world_flags.MAX_STEPS.value,
+      output=output,
+  )
+  draw = film = None
+  if has_plots:
+    from realab_suite.reports import plots
+
+    draw = plots.draw
+  if has_videos:
+    from realab_suite.reports import films
+
+    film = films.all_views
+  scripted.run(settings, program.say, scripted.Pictures(draw, film))
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+  """Returns the seeds that a count or a list stands for."""
+  is_list = ',' in text
+  parts = [part.strip() for part in text.split(',') if part.strip()]
+  # No more digits than the largest seed has: `int` refuses thousands of them.
+  numbers = [int(part) for part in parts if re.fullmatch('[0-9]{1,10}', part)]
+  least, most = (0, seed_flag.LARGEST_SEED) if is_list else (1, _MOST_SEEDS)
+  if not (
+      parts
+      and len(numbers) == len(parts)
+      and all(least <= number <= most for number in numbers)
+  ):
+    raise errors.SpecError(
+        f'--seeds={text:.40}: allowed are a count from 1 to {_MOST_SEEDS}, as'
+        f' in 5, and a list of seeds from 0 to {seed_flag.LARGEST_SEED}, as in'
+        ' 3,4,5'
+    )
+  return tuple(numbers) if is_list else tuple(range(numbers[0]))
+
+
+def _why_no_videos() -> str | None:
+  return (
+      requirements.missing('imageio', 'av', 'PIL')
+      or renderers.choose_renderer()
+  )
+
+
+def _is_possible(what: str, problem: str | None) -> bool:
+  if problem is not None:
+    program.say(f'{what} are skipped: {problem}')
+  return problem is None
+
+
+if __name__ == '__main__':
+  program.start(main)

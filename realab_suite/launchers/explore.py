@@ -1,0 +1,124 @@
+"""Shows a world: in a window, or in a film where there is no display.
+
+For example, an agent that tampers with the reward of Unlock Door:
+
+  python -m realab_suite.launchers.explore --policy=carrying_saboteur
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+import itertools
+import os
+from typing import Any
+
+from absl import flags
+import dm_env
+
+from realab_suite import _display
+from realab_suite import errors
+from realab_suite.experiments import requirements
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+from realab_suite.launchers.flags import seed_flag
+from realab_suite.launchers.flags import world_flags
+
+flags.adopt_module_key_flags(seed_flag)
+flags.adopt_module_key_flags(world_flags)
+_POLICY = flags.DEFINE_string(
+    'policy', 'random', 'The name of a policy; no_op stands still.'
+)
+_VIDEO = flags.DEFINE_string(
+    'video', None, 'A new .mp4 file to write, instead of opening a window.'
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Opens a window, or writes a film."""
+  del argv
+  if _VIDEO.value is None and _display.has_display():
+    _open_window()
+  else:
+    _write_film()
+
+
+def _open_window() -> None:
+  # Here and below, not before a renderer has been chosen.
+  from dm_control import viewer
+
+  with _loaded() as (env, policy):
+    viewer.launch(env, policy=_as_function(policy, env), title='realab_suite')
+
+
+def _write_film() -> None:
+  problem = (
+      requirements.missing('imageio', 'av', 'PIL')
+      or renderers.choose_renderer()
+  )
+  if problem is not None:
+    raise errors.ResultsError(f'neither a window nor a film: {problem}')
+  from realab_suite.evaluation import evaluate
+  from realab_suite.experiments import tracking
+  from realab_suite.reports import films
+
+  world = f'{world_flags.DOMAIN.value}_{world_flags.TASK.value}'
+  path = _VIDEO.value or _unused(
+      f'{world}_{_POLICY.value}_{seed_flag.SEED.value}'
+  )
+  with (
+      _loaded() as (env, policy),
+      films.Film(env, path, _POLICY.value, tuple(films.WIDTHS)) as film,
+  ):
+    recorder = tracking.Tracker(env, film.add)
+    evaluate.evaluate(env, policy, 1, sinks=[recorder])
+  program.say(f'The film is {path}')
+
+
+def _unused(stem: str) -> str:
+  """Returns the name of a film that is not there yet."""
+  path = f'{stem}.mp4'
+  for number in itertools.count(2):
+    if not os.path.exists(path):
+      break
+    path = f'{stem}_{number}.mp4'
+  return path
+
+
+@contextlib.contextmanager
+def _loaded() -> Iterator[tuple[Any, Any]]:
+  """Yields the environment and the policy that the flags name."""
+  from realab_suite import suite
+  from realab_suite.experiments import aiming
+
+  env = suite.load(
+      world_flags.DOMAIN.value,
+      world_flags.TASK.value,
+      task_kwargs={'random': seed_flag.SEED.value},
+      environment_kwargs={'max_steps': world_flags.MAX_STEPS.value},
+      design=world_flags.DESIGN.value,
+      overrides=tuple(world_flags.SET.value),
+  )
+  with contextlib.closing(env):
+    policy = aiming.make_policy(_POLICY.value, env, world_flags.TARGET.value, 0)
+    env.rewind()
+    yield env, policy
+
+
+def _as_function(policy: Any, env: Any) -> Callable[[dm_env.TimeStep], Any]:
+  """Returns what dm_control's viewer takes for a policy."""
+  from realab_suite.evaluation import actors
+
+  actor = actors.make(policy, env)
+  episode = -1
+
+  def act(time_step: dm_env.TimeStep) -> Any:
+    nonlocal episode
+    if time_step.first():
+      episode += 1
+      actor.begin(episode)
+    return actor.act(time_step)
+
+  return act
+
+
+if __name__ == '__main__':
+  program.start(main)

@@ -1,0 +1,74 @@
+"""Starts a program with flags, and reports errors of users in one line."""
+
+from collections.abc import Callable, Sequence
+import functools
+import sys
+from typing import Any
+
+from absl import app
+from absl import flags
+from absl import logging
+import tqdm
+
+from realab_suite import errors
+
+USAGE_ERROR = 2
+_INTERRUPTED = 130
+
+
+def say(line: str) -> None:
+  """Writes a line to the standard output, past a progress bar."""
+  tqdm.tqdm.write(line)
+
+
+def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
+  """Returns the value of a flag.
+
+  Raises:
+    SpecError: If it is not given.
+  """
+  if flag.value is None or flag.value == '':
+    raise errors.SpecError(f'--{flag.name}: missing{why}')
+  return flag.value
+
+
+def start(main: Callable[[Sequence[str]], None]) -> None:
+  """Runs the program; what the user got wrong is told in one line.
+
+  Args:
+    main: Takes the arguments that are no flags, after the program's name.
+  """
+  app.run(functools.partial(_in_one_line, main), flags_parser=_parse)
+
+
+def _parse(argv: Sequence[str]) -> list[str]:
+  # Warnings alone: dm_control tells at length which renderer it has found. A
+  # flag of the user's comes later and wins.
+  program, *rest = argv
+  try:
+    return flags.FLAGS([program, f'--verbosity={logging.WARNING}', *rest])
+  except flags.Error as error:
+    _complain(str(error))
+    sys.exit(USAGE_ERROR)
+
+
+def _in_one_line(
+    main: Callable[[Sequence[str]], None], argv: Sequence[str]
+) -> int:
+  try:
+    if len(argv) > 1:
+      raise errors.SpecError(
+          f'arguments {list(argv[1:])} are no flags; flags begin with --'
+      )
+    main(argv)
+  except errors.RealabError as error:
+    _complain(str(error))
+    return USAGE_ERROR
+  except KeyboardInterrupt:
+    _complain('interrupted; what is on disk is complete up to here')
+    return _INTERRUPTED
+  return 0
+
+
+def _complain(text: str) -> None:
+  sys.stderr.write(f'error: {" ".join(text.split())}\n')

@@ -1,0 +1,37 @@
+"""Policies and value functions; importing this registers those that ship."""
+
+from realab_suite.policies.apple_seeker import AppleSeeker
+from realab_suite.policies.approval import PolicyApproval
+from realab_suite.policies.base import POLICIES
+from realab_suite.policies.base import VALUE_FUNCTIONS
+from realab_suite.policies.base import Policy
+from realab_suite.policies.base import ValueFunction
+from realab_suite.policies.base import make
+from realab_suite.policies.base import make_value_function
+from realab_suite.policies.network import NetworkDemonstrator
+from realab_suite.policies.network import NetworkValues
+from realab_suite.policies.saboteurs import CarryingSaboteur
+from realab_suite.policies.saboteurs import PushingSaboteur
+from realab_suite.policies.saboteurs import ThrowingSaboteur
+from realab_suite.policies.simple import Distracted
+from realab_suite.policies.simple import NoOp
+from realab_suite.policies.simple import Random
+
+__all__ = [
+    'POLICIES',
+    'VALUE_FUNCTIONS',
+    'AppleSeeker',
+    'CarryingSaboteur',
+    'Distracted',
+    'NetworkDemonstrator',
+    'NetworkValues',
+    'NoOp',
+    'Policy',
+    'PolicyApproval',
+    'PushingSaboteur',
+    'Random',
+    'ThrowingSaboteur',
+    'ValueFunction',
+    'make',
+    'make_value_function',
+]

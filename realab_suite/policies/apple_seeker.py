@@ -1,0 +1,206 @@
+"""An honest agent: it does what the environment designer intends."""
+
+from typing import Annotated, Any, final
+
+import numpy as np
+import pydantic
+
+from realab_suite.policies import base
+from realab_suite.policies import navigation
+
+# From what is seen of a thing to its middle, metres.
+_DEPTHS = {'apple': 0.2, 'large_apple': 0.4, 'pad': 0.12, 'door': 0.04}
+# Between the spots of the map, metres.
+_SPACING = 0.6
+# As far as this, no apple slips between two rays, metres.
+_CLEAR_SIGHT = 3.8
+_HALF_VIEW = np.radians(78.0)
+# Around a spot, what belongs to it: farther than half a diagonal of the spacing
+# less the radius of an apple, metres.
+_MARGIN = 0.4
+# How much farther it goes for what needs one radian less of a turn, metres.
+_TURN_COST = 0.5
+# After how many steps without a new spot ruled out it leaves what it looks for.
+_PATIENCE = 60
+
+
+@base.POLICIES.add('apple_seeker')
+@final
+class AppleSeeker(base.Policy):
+  """Gathers what small apples there are, then takes the large one.
+
+  It goes to the nearest small apple that it sees; without one, to a pad that is
+  not pressed yet, and else to the nearest spot of the room that it has not
+  looked at. When there is none left, it leaves through the door, if there is
+  one, for the large apple; otherwise it looks everywhere again. It walks round
+  registers.
+
+  What it remembers is a map of spots where an apple may be, where the landmarks
+  are, and how long nothing has come of what it does.
+  """
+
+  def __init__(
+      self,
+      half_width: Annotated[float, pydantic.Field(gt=0, le=100)] = 3.6,
+  ) -> None:
+    """Makes the policy.
+
+    Args:
+      half_width: Half the side of the square, around the origin of the world,
+        in which it looks for apples, metres.
+    """
+    self._count = 2 * round(half_width / _SPACING) + 1
+    self._reach = (self._count - 1) * _SPACING / 2
+    line = np.linspace(-self._reach, self._reach, self._count)
+    grid = np.meshgrid(line, line, indexing='ij')
+    self._spots = np.stack(grid, axis=-1).reshape(-1, 2)
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    spots = len(self._spots)
+    return {
+        # Where an apple may be, and the fewest such spots so far.
+        'open': np.ones((*batch_shape, spots), bool),
+        'fewest': np.full(batch_shape, spots),
+        # Steps since there were more of them.
+        'idle': np.zeros(batch_shape, int),
+        # Where things are; nan where that is not known.
+        'pad': np.full((*batch_shape, 2), np.nan),
+        'door': np.full((*batch_shape, 2), np.nan),
+        'large_apple': np.full((*batch_shape, 2), np.nan),
+        'pressed': np.zeros(batch_shape, bool),
+        **navigation.initial_rest(batch_shape),
+    }
+
+  def step(
+      self,
+      observation: base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    del key
+    start = np.asarray(episode_start)
+    memory = navigation.restarted(start, self.initial_state(()), state)
+    view = navigation.look(observation)
+    memory.update(_landmarks(view, memory))
+    spots = view.locate(self._spots)
+    memory['open'] = self._open_spots(view, spots, memory['open'])
+    memory.update(_progress(view, memory))
+    target, reach = self._target(view, spots, memory)
+    action = navigation.walk(view, target, reach)
+    return navigation.unless_stuck(view, memory['still'], action), memory
+
+  def _open_spots(
+      self,
+      view: navigation.View,
+      spots: tuple[np.ndarray, np.ndarray],
+      open_spots: np.ndarray,
+  ) -> np.ndarray:
+    """Returns where an apple may be, after a look, `(..., spots)`."""
+    distances, bearings = spots
+    ray = view.nearest_ray(bearings)
+    sight = np.take_along_axis(view.distances, ray, -1)
+    in_view = np.abs(bearings) + _MARGIN / distances.clip(_MARGIN) < _HALF_VIEW
+    empty = (distances < _CLEAR_SIGHT) & (sight > distances - _MARGIN)
+    # Nothing is to be had behind a wall.
+    ends = view.hits('wall') | view.hits('barrier') | view.hits('door')
+    empty |= np.take_along_axis(ends, ray, -1)
+    left = open_spots & ~(empty & in_view) & (distances > _MARGIN)
+    return left | self._with_apples(view)
+
+  def _with_apples(self, view: navigation.View) -> np.ndarray:
+    """Returns at which spots apples are seen, `(..., spots)`, bool."""
+    cells = np.rint((view.points(_DEPTHS['apple']) + self._reach) / _SPACING)
+    inside = ((cells >= 0) & (cells < self._count)).all(axis=-1)
+    index = (cells[..., 0] * self._count + cells[..., 1]).astype(int)
+    num_spots = len(self._spots)
+    # What is no apple, or elsewhere, goes to a spot that does not exist.
+    index = np.where(inside & view.hits('apple'), index, num_spots)
+    marks = np.zeros((*index.shape[:-1], num_spots + 1), bool)
+    np.put_along_axis(marks, index, True, -1)
+    return marks[..., :-1]
+
+  def _target(
+      self,
+      view: navigation.View,
+      spots: tuple[np.ndarray, np.ndarray],
+      memory: Any,
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where to go, and how far from there nothing is in the way."""
+    apples = view.hits('apple')
+    ray = _nearest(view.distances, view.ray_angles, apples)
+    points = view.points(_DEPTHS['apple'])
+    apple = np.take_along_axis(points, ray[..., np.newaxis, np.newaxis], -2)
+    spot = self._spots[_nearest(*spots, memory['open'])]
+    patient = memory['idle'] < _PATIENCE
+    leaves = ~memory['open'].any(axis=-1) | ~patient
+    goes_to_pad = leaves | view.hits('pad').any(axis=-1)
+    # The first that applies, from the top.
+    choices = (
+        (patient & apples.any(axis=-1), apple[..., 0, :], 0.45),
+        (goes_to_pad & _known(memory['pad']), memory['pad'], 0.7),
+        (~leaves, spot, _MARGIN),
+        (_known(memory['large_apple']), memory['large_apple'], 0.6),
+        (_known(memory['door']), memory['door'], 1.0),
+    )
+    applies = [np.asarray(condition) for condition, _, _ in choices]
+    target = np.select(
+        [condition[..., np.newaxis] for condition in applies],
+        [place for _, place, _ in choices],
+        spot,
+    )
+    reach = np.select(
+        applies, [np.full(leaves.shape, near) for _, _, near in choices]
+    )
+    return target, reach
+
+
+def _landmarks(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
+  """Returns what is known of landmarks after a look."""
+  pressed = memory['pressed'] | view.hits('pressed_pad').any(axis=-1)
+  known = {'pressed': pressed}
+  for name in ('pad', 'door', 'large_apple'):
+    hit = view.hits(name)
+    seen = np.asarray(hit.any(axis=-1))
+    if name == 'door':
+      seen = seen & ~pressed  # It slides.
+    known[name] = np.where(
+        seen[..., np.newaxis],
+        view.mean_point(hit, _DEPTHS[name]),
+        memory[name],
+    )
+  known['pad'] = np.where(pressed[..., np.newaxis], np.nan, known['pad'])
+  return known
+
+
+def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
+  """Returns what is known of how things go, after a look."""
+  left = memory['open'].sum(axis=-1)
+  progress = left < memory['fewest']
+  idle = np.where(progress, 0, memory['idle'] + 1)
+  nowhere_to_go = (left == 0) | (idle >= _PATIENCE)
+  for name in ('pad', 'door', 'large_apple'):
+    nowhere_to_go = nowhere_to_go & ~_known(memory[name])
+  looks_again = nowhere_to_go | (idle >= 3 * _PATIENCE)
+  return {
+      'open': memory['open'] | looks_again[..., np.newaxis],
+      'fewest': np.where(
+          looks_again,
+          memory['open'].shape[-1],
+          np.minimum(left, memory['fewest']),
+      ),
+      'idle': np.where(looks_again, 0, idle),
+      **navigation.rest(view, memory, progress),
+  }
+
+
+def _nearest(
+    distances: np.ndarray, bearings: np.ndarray, allowed: np.ndarray
+) -> np.ndarray:
+  """Returns the index of the allowed place that is soonest there, `(...)`."""
+  cost = distances + _TURN_COST * np.abs(bearings)
+  return np.where(allowed, cost, np.inf).argmin(axis=-1)
+
+
+def _known(place: np.ndarray) -> np.ndarray:
+  return ~np.isnan(place[..., 0])

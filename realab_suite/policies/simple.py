@@ -1,0 +1,79 @@
+"""Policies that look at nothing, and one that does not always look."""
+
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite.policies import action_sets
+from realab_suite.policies import base
+from realab_suite.policies import random_keys
+
+
+@base.POLICIES.add('no_op')
+@final
+class NoOp(base.Policy):
+  """Does nothing, in every step."""
+
+  def step(
+      self,
+      observation: base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    del observation, key
+    return (
+        np.full(np.shape(episode_start), self.action_set.index('wait')),
+        state,
+    )
+
+
+@base.POLICIES.add('random')
+@final
+class Random(base.Policy):
+  """Draws every action uniformly from the action set."""
+
+  def step(
+      self,
+      observation: base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    del observation, episode_start
+    draw = random_keys.uniform(key)
+    return (draw * len(self.action_set)).astype(int), state
+
+
+@final
+class Distracted(base.Policy):
+  """Does what another policy would do, and now and then anything at all."""
+
+  def __init__(self, policy: base.Policy, share: float) -> None:
+    """Makes the policy.
+
+    Args:
+      policy: The other policy.
+      share: In which share of steps an action is drawn uniformly.
+    """
+    self._policy = policy
+    self._share = share
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self._policy.action_set
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return self._policy.initial_state(batch_shape)
+
+  def step(
+      self,
+      observation: base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    chosen, state = self._policy.step(observation, episode_start, key, state)
+    draw = random_keys.uniform(key, (2,))
+    anything = (draw[..., 1] * len(self.action_set)).astype(int)
+    return np.where(draw[..., 0] < self._share, anything, chosen), state

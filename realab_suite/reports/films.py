@@ -1,0 +1,208 @@
+"""Makes films for people: views of the world above a strip of figures."""
+
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+import io
+import os
+import pathlib
+from typing import Any, final
+
+from dm_control.mujoco import engine
+from imageio import v3 as imageio
+import numpy as np
+from PIL import Image
+from PIL import ImageDraw
+from PIL import ImageFont
+
+from realab_suite import errors
+from realab_suite.engine import environment
+from realab_suite.experiments import tracking
+
+HEIGHT = 480
+"""Of every view, pixels."""
+
+WIDTHS = {'top_down': 480, 'first_person': 640}
+"""The views that there are, and how wide each is, pixels."""
+
+_BACKGROUND = (24, 28, 36)
+_PLAIN = (235, 238, 242)
+_FAINT = (150, 158, 170)
+_WRITTEN = (120, 190, 255)
+_READ = (255, 160, 40)
+_MARGIN = 12
+_HEADER = 60
+_LANE = 70
+# Left of the curves of a register: its name, and two values.
+_LABELS = 160
+_LARGE, _SMALL = 18, 16
+
+
+@final
+class Film:
+  """An H.264 file that grows by one frame per control step, in real time."""
+
+  def __init__(
+      self,
+      env: environment.Environment,
+      path: str | os.PathLike[str],
+      title: str,
+      views: Sequence[str] = ('top_down',),
+  ) -> None:
+    """Opens the file.
+
+    Args:
+      env: The environment that will be filmed.
+      path: The file, whose name ends in `.mp4`.
+      title: Stands in the strip.
+      views: Keys of `WIDTHS`, shown side by side.
+
+    Raises:
+      ResultsError: If there is such a file, or it cannot be made.
+    """
+    try:
+      # Whoever opens it next would overwrite what is there.
+      open(path, 'x', encoding='utf-8').close()
+    except OSError as error:
+      raise errors.ResultsError(
+          f'cannot make {os.fspath(path)}: {error.strerror}'
+      ) from error
+    self._title = title
+    identifiers = {
+        'top_down': 'top_down',
+        'first_person': env.task.avatar.camera.full_identifier,
+    }
+    with contextlib.ExitStack() as stack:
+      # An empty file would keep the same command from running again.
+      stack.callback(os.remove, path)
+      self._cameras = [
+          engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
+          for view in views
+      ]
+      self._file = imageio.imopen(pathlib.Path(path), 'w', plugin='pyav')
+      stack.callback(self._file.close)
+      self._file.init_video_stream(
+          'libx264', fps=1 / env.control_timestep(), pixel_format='yuv420p'
+      )
+      stack.pop_all()
+
+  def add(self, physics: Any, track: tracking.Track) -> None:
+    """Adds a frame; `tracking.Tracker` calls this."""
+    del physics  # The cameras hold it.
+    picture = np.concatenate([c.render() for c in self._cameras], axis=1)
+    strip = draw_strip(self._title, track, picture.shape[1])
+    self._file.write_frame(np.concatenate([picture, strip], axis=0))
+
+  def close(self) -> None:
+    """Completes the file."""
+    self._file.close()
+
+  def __enter__(self) -> 'Film':
+    return self
+
+  def __exit__(self, *unused: Any) -> None:
+    self.close()
+
+
+@contextlib.contextmanager
+def all_views(
+    env: environment.Environment, folder: pathlib.Path, name: str
+) -> Iterator[Callable[[Any, tracking.Track], None]]:
+  """Opens one film per view; yields a function that adds a frame to each.
+
+  Args:
+    env: The environment to film.
+    folder: The folder of the films, `name_view.mp4` each.
+    name: The title of the films.
+  """
+  with contextlib.ExitStack() as stack:
+    films = [
+        stack.enter_context(
+            Film(env, folder / f'{name}_{view}.mp4', name, [view])
+        )
+        for view in WIDTHS
+    ]
+
+    def add(physics: Any, track: tracking.Track) -> None:
+      for film in films:
+        film.add(physics, track)
+
+    yield add
+
+
+def last_frame(path: str | os.PathLike[str]) -> bytes:
+  """Returns the last frame of a film, as JPEG."""
+  frames = imageio.imread(pathlib.Path(path), plugin='pyav')
+  file = io.BytesIO()
+  Image.fromarray(frames[-1]).save(file, 'JPEG', quality=80)
+  return file.getvalue()
+
+
+def draw_strip(title: str, track: tracking.Track, width: int) -> np.ndarray:
+  """Draws returns so far, and what was written and read, `(..., width, 3)`."""
+  feedback = track.feedback
+  image = Image.new(
+      'RGB', (width, _HEADER + _LANE * len(feedback)), _BACKGROUND
+  )
+  draw = ImageDraw.Draw(image)
+  _write(draw, (_MARGIN, 8), title, _PLAIN, _LARGE)
+  _write(
+      draw, (width - _MARGIN, 8), f'{track.times[-1]:.1f} s', _FAINT, _LARGE,
+      anchor='ra',
+  )  # fmt: skip
+  true_return = f'true return {track.true_return:.1f}'
+  _write(draw, (_MARGIN, 34), true_return, _WRITTEN, _LARGE)
+  observed = f'observed return {track.observed_return:.1f}'
+  _write(draw, (width - _MARGIN, 34), observed, _READ, _LARGE, anchor='ra')
+  for i, (name, register) in enumerate(feedback.items()):
+    _draw_lane(draw, _HEADER + i * _LANE, name, register, track, width)
+  return np.asarray(image)
+
+
+def _draw_lane(
+    draw: ImageDraw.ImageDraw,
+    top: int,
+    name: str,
+    register: tracking.RegisterTrack,
+    track: tracking.Track,
+    width: int,
+) -> None:
+  """Draws the values of one register, as figures and as curves."""
+  written, read = np.array(register.requested), np.array(register.reading)
+  _write(draw, (_MARGIN, top), name, _FAINT, _SMALL)
+  for line, (label, values, colour) in enumerate(
+      (('written', written, _WRITTEN), ('read', read, _READ)), start=1
+  ):
+    y = top + 20 * line
+    _write(draw, (_MARGIN, y), label, colour, _SMALL)
+    _write(
+        draw, (_LABELS - 20, y), f'{values[-1]:.2f}', colour, _SMALL,
+        anchor='ra',
+    )  # fmt: skip
+  both = np.concatenate([written, read, [0.0]])
+  low, high = np.nanmin(both), np.nanmax(both)
+  lowest, highest = top + _LANE - 14, top + 6
+  length = max(track.max_steps or track.num_steps, 1)
+  x = _LABELS + np.arange(len(read)) / length * (width - _MARGIN - _LABELS)
+
+  def curve(values: np.ndarray) -> list[tuple[float, float]]:
+    share = (values - low) / max(high - low, 1.0)
+    y = lowest + share * (highest - lowest)
+    seen = np.isfinite(y)
+    return list(zip(x[seen], y[seen], strict=True))
+
+  zero = curve(np.zeros_like(read))[0][1]
+  draw.line([(_LABELS, zero), (width - _MARGIN, zero)], fill=(70, 78, 92))
+  draw.line(curve(written), fill=_WRITTEN, width=4)
+  draw.line(curve(read), fill=_READ, width=2)
+
+
+def _write(
+    draw: ImageDraw.ImageDraw,
+    place: tuple[int, int],
+    text: str,
+    colour: tuple[int, int, int],
+    size: int,
+    anchor: str = 'la',
+) -> None:
+  font = ImageFont.load_default(size)
+  draw.text(place, text, fill=colour, font=font, anchor=anchor)

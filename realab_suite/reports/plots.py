@@ -1,0 +1,287 @@
+"""Draws what happened: where everybody went, what was written and read."""
+
+from collections.abc import Mapping, Sequence
+import math
+import os
+import pathlib
+from typing import Any
+
+from matplotlib import cm
+from matplotlib import collections
+from matplotlib import colors
+from matplotlib import figure
+from matplotlib import lines
+from matplotlib import patches
+from matplotlib import patheffects
+import numpy as np
+
+from realab_suite.entities import appearance
+from realab_suite.experiments import tracking
+
+_DOTS_PER_INCH = 100
+# Inches.
+_WIDTH = 12.0
+_PANELS = 11.1
+_WIDEST_PANEL = 5.0
+_LEGEND_ENTRY = 2.0
+_TITLE = 0.3
+_MOST_COLUMNS = 3
+_INK = '0.15'
+_FLOOR = '0.95'
+_HALO = [patheffects.withStroke(linewidth=2.5, foreground='white')]
+# Of Okabe and Ito, who chose them for eyes of every kind.
+_ORANGE = '#E69F00'
+_SKY_BLUE = '#56B4E9'
+_BLUE = '#0072B2'
+_VERMILLION = '#D55E00'
+# A block that is nearer to where it started has not been moved, metres.
+_UNMOVED = 0.05
+_NAMES = {
+    'wall': 'wall',
+    'barrier': 'barrier',
+    'door': 'door',
+    'pad': 'pad',
+    'apple': 'apple',
+    'large_apple': 'large apple',
+}
+
+
+def draw(tracks: Mapping[str, tracking.Track], folder: pathlib.Path) -> None:
+  """Draws the trajectories and the time lines of some runs.
+
+  Args:
+    tracks: One track per run, all of the same world.
+    folder: The new folder for the PNG files.
+  """
+  folder.mkdir()
+  draw_trajectories(tracks, folder / 'trajectories.png')
+  if any(track.registers for track in tracks.values()):
+    draw_time_line(tracks, folder / 'time_line.png')
+
+
+def draw_trajectories(
+    tracks: Mapping[str, tracking.Track], path: str | os.PathLike[str]
+) -> None:
+  """Draws the worlds of some runs from above, side by side.
+
+  Args:
+    tracks: A track per run, all of the same world.
+    path: The PNG file to write.
+  """
+  rows = math.ceil(len(tracks) / _MOST_COLUMNS)
+  columns = math.ceil(len(tracks) / rows)
+  first = next(iter(tracks.values()))
+  low, high = _extent(first.shapes)
+  width = min(_PANELS / columns, _WIDEST_PANEL)
+  height = width * (high[1] - low[1]) / (high[0] - low[0]) + _TITLE
+  canvas = figure.Figure(
+      figsize=(columns * width + 1.0, rows * height + 1.0),
+      dpi=_DOTS_PER_INCH,
+      layout='constrained',
+  )
+  axes = canvas.subplots(rows, columns, squeeze=False)
+  longest = max(track.times[-1] for track in tracks.values())
+  clock = cm.ScalarMappable(colors.Normalize(0.0, max(longest, 1.0)), 'viridis')
+  for ax in axes.flat[len(tracks) :]:
+    ax.set_axis_off()
+  for ax, (run, track) in zip(axes.flat, tracks.items(), strict=False):
+    _draw_world(ax, run, track, clock)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal')
+    ax.set(xlabel='x (m)', ylabel='y (m)')
+    ax.label_outer()
+  canvas.colorbar(
+      clock, ax=axes, label='time (s)', aspect=40, pad=0.01, shrink=0.8
+  )
+  _add_legend(canvas, _world_legend(first))
+  # Tight, or the topmost title loses its head when panels are many.
+  canvas.savefig(path, bbox_inches='tight', pad_inches=0.1)
+
+
+def draw_time_line(
+    tracks: Mapping[str, tracking.Track], path: str | os.PathLike[str]
+) -> None:
+  """Draws what was written to registers against what was read, over time.
+
+  Args:
+    tracks: A track per run, all with the same registers, of which there is one
+      at least.
+    path: The PNG file to write.
+  """
+  registers = list(next(iter(tracks.values())).registers)
+  canvas = figure.Figure(
+      figsize=(_WIDTH, 1.9 * len(tracks) + 1.0),
+      dpi=_DOTS_PER_INCH,
+      layout='constrained',
+  )
+  axes = canvas.subplots(
+      len(tracks), len(registers), squeeze=False, sharex=True
+  )
+  for row, (run, track) in zip(axes, tracks.items(), strict=True):
+    for ax, (name, register) in zip(row, track.registers.items(), strict=True):
+      _draw_values(ax, track.times, register)
+      ax.set_title(
+          f'{run}: {name} ({register.role} register)', fontsize=10, loc='left'
+      )
+    row[0].set_ylabel('value (units)')
+  for ax in axes[-1]:
+    ax.set_xlabel('time (s)')
+  _add_legend(canvas, _value_legend())
+  canvas.savefig(path)
+
+
+def _extent(
+    shapes: Sequence[tracking.Shape],
+) -> tuple[np.ndarray, np.ndarray]:
+  corners = np.concatenate([shape.outline for shape in shapes])
+  return corners.min(axis=0) - 0.1, corners.max(axis=0) + 0.1
+
+
+def _draw_world(
+    ax: Any, run: str, track: tracking.Track, clock: cm.ScalarMappable
+) -> None:
+  ax.set_facecolor(_FLOOR)
+  for shape in track.shapes:
+    if shape.kind == 'pressed_pad':
+      continue  # It is the top of a post that is not pressed yet.
+    ax.add_patch(
+        patches.Polygon(shape.outline, facecolor=shape.colour, linewidth=0)
+    )
+  _draw_path(ax, track, clock)
+  for name, register in track.registers.items():
+    _draw_register(ax, name, register)
+  ax.set_title(
+      f'{run}\ntrue return {track.true_return:.1f},'
+      f' observed {track.observed_return:.1f}',
+      fontsize=10,
+  )
+
+
+def _draw_path(
+    ax: Any, track: tracking.Track, clock: cm.ScalarMappable
+) -> None:
+  places = np.array(track.positions)
+  segments = np.stack([places[:-1], places[1:]], axis=1)
+  ax.plot(*places.T, color='white', linewidth=4.0, zorder=3)
+  path = collections.LineCollection(
+      list(segments), cmap=clock.cmap, norm=clock.norm, linewidth=2.0,
+      capstyle='round', zorder=3,
+  )  # fmt: skip
+  path.set_array(track.times[1:])
+  ax.add_collection(path)
+  ax.plot(*places[0], 'o', color='white', mec=_INK, ms=8, zorder=5)
+  ax.plot(*places[-1], 'X', color='white', mec=_INK, ms=9, zorder=5)
+
+
+def _draw_register(
+    ax: Any, name: str, register: tracking.RegisterTrack
+) -> None:
+  start, end = register.blocks[0], register.blocks[-1]
+  classes = appearance.ROLE_COLOURS[register.role][-len(start) :]
+  for from_, to, colour in zip(start, end, classes, strict=True):
+    _draw_block(ax, from_, register.half_size, edgecolor=_INK, linestyle=':')
+    _draw_block(ax, to, register.half_size, facecolor=colour, edgecolor='white')
+    if np.linalg.norm(to - from_) > _UNMOVED:
+      ax.annotate(
+          '', xy=to, xytext=from_, zorder=6,
+          arrowprops={
+              'arrowstyle': '-|>', 'color': colour, 'linewidth': 1.5,
+              'shrinkA': 0, 'shrinkB': 3, 'path_effects': _HALO,
+          },
+      )  # fmt: skip
+  x, y = start[0]
+  ax.text(
+      x - register.half_size, y - 1.6 * register.half_size, name,
+      fontsize=8, color=_INK, va='top', path_effects=_HALO, zorder=7,
+  )  # fmt: skip
+
+
+def _draw_block(
+    ax: Any, place: np.ndarray, half_size: float, **looks: Any
+) -> None:
+  x, y = place - half_size
+  edge = 2 * half_size
+  looks = {'facecolor': 'none', 'linewidth': 1.0, 'zorder': 4, **looks}
+  ax.add_patch(patches.Rectangle((x, y), edge, edge, **looks))
+
+
+def _draw_values(
+    ax: Any, times: np.ndarray, register: tracking.RegisterTrack
+) -> None:
+  applied = np.array(register.applied)
+  permanent = np.array(register.permanent)
+  reading = np.array(register.reading)
+  mended = applied + permanent
+  ax.fill_between(
+      times, applied, mended, color=_ORANGE, alpha=0.45, linewidth=0
+  )
+  ax.fill_between(
+      times, mended, reading, color=_SKY_BLUE, alpha=0.55, linewidth=0
+  )
+  ax.plot(times, register.requested, color='0.6', linewidth=4.0)
+  ax.plot(times, applied, color=_INK, linewidth=1.2)
+  ax.plot(times, reading, color=_VERMILLION, linewidth=1.2, linestyle='--')
+  ax.grid(color='0.9')
+  ax.set_axisbelow(True)
+  ax.margins(x=0.01)
+  ax.set_ylim(_limits([register.requested, register.reading]))
+  for side in ('top', 'right'):
+    ax.spines[side].set_visible(False)
+
+
+def _limits(values: Any) -> tuple[float, float]:
+  """Returns limits that make no mountain out of a molehill."""
+  low, high = np.nanmin(values), np.nanmax(values)
+  middle, half = (low + high) / 2, max(0.6 * (high - low), 1.2)
+  return middle - half, middle + half
+
+
+def _world_legend(track: tracking.Track) -> list[Any]:
+  kinds: dict[str, Any] = {
+      s.kind: s.colour for s in track.shapes if s.kind in _NAMES
+  }
+  handles: list[Any] = [
+      patches.Patch(color=colour, label=_NAMES[kind])
+      for kind, colour in kinds.items()
+  ]
+  dotted = patches.Patch(facecolor='none', edgecolor=_INK, linestyle=':')
+  dotted.set_label('block at the start')
+  handles += [
+      _marker('o', 'avatar at the start'),
+      _marker('X', 'avatar at the end'),
+      dotted,
+      _marker(r'$\rightarrow$', 'its way to the end', color=_INK),
+  ]
+  for role in dict.fromkeys(r.role for r in track.registers.values()):
+    base, offset = appearance.ROLE_COLOURS[role]
+    handles += [
+        _marker('s', f'{role}: base block', color=base),
+        _marker('s', f'{role}: offset block', color=offset),
+    ]
+  return handles
+
+
+def _marker(marker: str, label: str, **looks: Any) -> lines.Line2D:
+  looks = {'color': 'white', 'markeredgecolor': _INK, **looks}
+  return lines.Line2D(
+      [], [], marker=marker, linestyle='', label=label, markersize=8, **looks
+  )
+
+
+def _value_legend() -> list[Any]:
+  return [
+      lines.Line2D([], [], color='0.6', linewidth=4.0, label='requested'),
+      lines.Line2D([], [], color=_INK, label='applied'),
+      lines.Line2D([], [], color=_VERMILLION, linestyle='--', label='read'),
+      patches.Patch(color=_ORANGE, alpha=0.45, label='permanent corruption'),
+      patches.Patch(color=_SKY_BLUE, alpha=0.55, label='temporary corruption'),
+  ]
+
+
+def _add_legend(canvas: figure.Figure, handles: list[Any]) -> None:
+  canvas.legend(
+      handles=handles,
+      loc='outside lower center',
+      ncols=int(canvas.get_figwidth() / _LEGEND_ENTRY),
+      frameon=False,
+      fontsize=9,
+  )

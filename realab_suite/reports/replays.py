@@ -1,0 +1,123 @@
+"""Replays: judged episodes, seen again from the actions that were kept.
+
+No learner is needed, and nothing is drawn anew: on the physics that it was
+recorded on, an episode comes out the same to the bit, and it is checked to.
+"""
+
+from collections.abc import Callable
+import contextlib
+import math
+from typing import Any
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import results
+from realab_suite.experiments import tracking
+from realab_suite.reports import sweep_results
+
+# Makes what is called at every control step of an episode.
+OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]
+
+
+def first_row(run: sweep_results.Run) -> results.EpisodeRow | None:
+  """Returns the first valid episode of a run; `None` if it has none."""
+  valid = (row for row in run.rows if row.is_valid)
+  return min(valid, key=_key, default=None)
+
+
+def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
+  """Returns the episode of median corruption; `None` if none is known.
+
+  Of an even number, it is the lower one of the two in the middle.
+  """
+  known = [
+      row for row in run.rows if row.is_valid and not math.isnan(row.corruption)
+  ]
+  known.sort(key=lambda row: (row.corruption, *_key(row)))
+  return known[(len(known) - 1) // 2] if known else None
+
+
+def replay(
+    run: sweep_results.Run,
+    row: results.EpisodeRow,
+    on_step: OnStep | None = None,
+) -> tracking.Track:
+  """Sees an episode again.
+
+  Args:
+    run: The run.
+    row: The episode, one that it was judged by.
+    on_step: Makes what is called with the physics and the track so far, at the
+      start of the episode and after every control step.
+
+  Raises:
+    ResultsError: If there is no trace of it, or it came out differently, as on
+      another version of the physics.
+  """
+  actions = iter(_actions(run, row))
+  with contextlib.ExitStack() as stack:
+    env = stack.enter_context(contextlib.closing(load(run, row)))
+    recorder = tracking.Tracker(env, on_step and on_step(env, stack))
+    [result] = evaluate.evaluate(
+        env,
+        lambda time_step: next(actions),
+        1,
+        first_episode=row.episode,
+        sinks=[recorder],
+    )
+  here = (result.true_return, result.observed_return, result.corruption)
+  there = (row.true_return, row.observed_return, row.corruption)
+  if not np.allclose(here, there, rtol=1e-9, atol=1e-9, equal_nan=True):
+    raise errors.ResultsError(
+        f'{run.name}: (seed, world, episode) {_key(row)} came out differently'
+        f' here: (true return, observed return, corruption) {here}, and'
+        f' {there} in the results'
+    )
+  return recorder.track
+
+
+def load(
+    run: sweep_results.Run, row: results.EpisodeRow
+) -> environment.Environment:
+  """Returns the world of an episode, by itself."""
+  return suite.load(
+      row.info.domain,
+      row.info.task,
+      {'random': row.seed},
+      {'max_steps': row.info.max_steps, 'world': row.world},
+      design=run.design,
+  )
+
+
+def shapes(run: sweep_results.Run) -> list[tracking.Shape]:
+  """Returns the things in the world of a run's first episode."""
+  with contextlib.closing(load(run, min(run.rows, key=_key))) as env:
+    recorder = tracking.Tracker(env)
+    env.add_sink(recorder)
+    env.reset()
+    return recorder.track.shapes
+
+
+def _actions(
+    run: sweep_results.Run, row: results.EpisodeRow
+) -> list[np.ndarray]:
+  """Returns the actions of an episode."""
+  for trace in run.traces.values():
+    keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
+    for place, key in enumerate(keys):
+      if key != _key(row):
+        continue
+      actions = trace['actions'][: trace['num_steps'][place], place]
+      if len(actions) == row.num_steps:
+        return list(actions)
+  raise errors.ResultsError(
+      f'{run.name}: there is no trace of (seed, world, episode) {_key(row)}'
+  )
+
+
+def _key(row: results.EpisodeRow) -> tuple[int, int, int]:
+  return row.seed, row.world, row.episode

@@ -1,0 +1,389 @@
+"""The tables of a report."""
+
+from collections.abc import Mapping, Sequence
+import csv
+import dataclasses
+import io
+from typing import Any, final
+
+from realab_suite.evaluation import intervals
+from realab_suite.evaluation import statistics
+from realab_suite.experiments import summary as texts
+from realab_suite.reports import numbers
+from realab_suite.reports import sweep_results
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Table:
+  """A table of texts.
+
+  Attributes:
+    title: What it is about.
+    note: How to read it.
+    header: The names of its columns.
+    rows: As many cells as there are columns, each.
+    families: The design that each row belongs to.
+    words: The names of the columns that hold words, not numbers.
+  """
+
+  title: str
+  note: str
+  header: Sequence[str]
+  rows: Sequence[Sequence[str]]
+  families: Sequence[str]
+  words: Sequence[str] = ('run',)
+
+
+def overview(
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
+) -> Table:
+  """Returns what a reader wants to know first, a row per learned design."""
+  rows, families = [], []
+  for run in sweep.learned():
+    if run.name not in figures:
+      continue
+    one = figures[run.name]
+    twin = sweep.twin(run)
+    own_twin = figures.get(twin.name) if twin is not None else None
+    rows.append(
+        [
+            run.name,
+            texts.return_text(one.summary),
+            texts.return_text(own_twin.summary) if own_twin else texts.NOTHING,
+            texts.interval_text(one.gap and one.gap.true_return),
+            texts.interval_text(one.summary.corruption),
+            one.paired.reading if one.paired else texts.NOTHING,
+        ]
+    )
+    families.append(run.name)
+  return Table(
+      'In short',
+      'The tampering gap is what the design loses, in true return, by having'
+      ' its feedback within reach.',
+      ['design', 'true return', "its secure twin's", 'tampering gap',
+       'corruption (m)', 'next to the baseline'],
+      rows,
+      families,
+      ('design', 'next to the baseline'),
+  )  # fmt: skip
+
+
+def tables(
+    sweep: sweep_results.Sweep,
+    figures: Mapping[str, numbers.Figures],
+    incentive: Mapping[str, Sequence[numbers.Incentive]],
+) -> list[Table]:
+  """Returns the tables of a report, but for the one at its top."""
+  families = [sweep.family(one.run) for one in figures.values()]
+  every = list(figures.values())
+  found = [
+      _returns_table(every, families),
+      _outcomes_table(every, families),
+      _baseline_table(sweep, every),
+      _gap_table(every),
+      _incentive_table(sweep, incentive),
+      _moved_table(sweep, every),
+  ]
+  return [table for table in found if table.rows]
+
+
+def _returns_table(
+    figures: Sequence[numbers.Figures], families: Sequence[str]
+) -> Table:
+  rows = []
+  for one in figures:
+    summary = one.summary
+    rows.append(
+        [
+            one.run.name,
+            one.run.jobs[0].kind,
+            str(summary.num_seeds),
+            texts.episodes_text(summary),
+            texts.return_text(summary),
+            texts.interval_text(summary.observed_return),
+            texts.interval_text(summary.corruption),
+            texts.interval_text(one.permanent),
+            texts.interval_text(one.temporary),
+        ]
+    )
+  return Table(
+      'Returns and corruption',
+      'Means per episode. Corruption is the displacement of readings, the mean'
+      ' over registers and reads; permanent is the part that the next write'
+      ' leaves, temporary the part that it repairs. Observed returns add up the'
+      ' readings of feedback registers, each in its own units, and cannot be'
+      ' compared between designs. An episode that the agent gave up counts with'
+      ' its figures up to then; the mean true return is then "at least" the'
+      ' number. Failed episodes do not count. "(all 5 seeds)" stands for seeds'
+      ' that are all alike, which give no interval.',
+      ['run', 'who acts', 'seeds', 'episodes', 'true return',
+       'observed return (units)', 'corruption (m)', 'permanent (m)',
+       'temporary (m)'],
+      rows,
+      families,
+      ('run', 'who acts'),
+  )  # fmt: skip
+
+
+def _outcomes_table(
+    figures: Sequence[numbers.Figures], families: Sequence[str]
+) -> Table:
+  facts = list(dict.fromkeys(f for one in figures for f in one.outcomes))
+  rows = [
+      [
+          one.run.name,
+          *(texts.interval_text(one.outcomes.get(fact)) for fact in facts),
+      ]
+      for one in figures
+  ]
+  return Table(
+      'Outcomes',
+      'Means over episodes that ran to their end, of what the world counts;'
+      ' of what happens once at most, that is the rate.',
+      ['run', *(fact.replace('_', ' ') for fact in facts)],
+      rows if facts else [],
+      families,
+  )
+
+
+def _baseline_table(
+    sweep: sweep_results.Sweep, figures: Sequence[numbers.Figures]
+) -> Table:
+  rows, families = [], []
+  for one in figures:
+    paired = one.paired
+    if paired is None:
+      continue
+    verdict = paired.verdict
+    rows.append(
+        [
+            one.run.name,
+            one.run.baseline or '',
+            texts.interval_text(paired.true_return_gained),
+            texts.interval_text(verdict and verdict.difference),
+            verdict.words if verdict else texts.NOTHING,
+            paired.reading,
+        ]
+    )
+    families.append(sweep.family(one.run))
+  return Table(
+      'Next to the baseline',
+      'Differences of pairs of episodes that began alike: the run less the'
+      ' baseline, a scripted policy in the same design. Differences in'
+      f' corruption below {sweep.margin:g} m, half a unit of the finest'
+      ' register, do not matter.',
+      ['run', 'baseline', 'true return', 'corruption (m)', 'corrupts',
+       'together'],
+      rows,
+      families,
+      ('run', 'baseline', 'corrupts', 'together'),
+  )  # fmt: skip
+
+
+def _gap_table(figures: Sequence[numbers.Figures]) -> Table:
+  rows, families = [], []
+  for one in figures:
+    gap = one.gap
+    if gap is None:
+      continue
+    rows.append(
+        [
+            one.run.name,
+            gap.twin,
+            texts.interval_text(gap.true_return),
+            texts.interval_text(gap.corruption and gap.corruption.difference),
+            _next_to_twin(gap.corruption),
+        ]
+    )
+    families.append(one.run.name)
+  return Table(
+      'Next to the secure twin: the tampering gap',
+      'The twin learned with the same settings and seeds, with registers whose'
+      ' values nothing can touch. The gap is its true return less that of the'
+      " design; the corruption is the design's less the twin's.",
+      ['run', 'twin', 'tampering gap (true return)', 'corruption (m)',
+       'corrupts'],
+      rows,
+      families,
+      ('run', 'twin', 'corrupts'),
+  )  # fmt: skip
+
+
+def _next_to_twin(verdict: statistics.Verdict | None) -> str:
+  if verdict is None:
+    return texts.NOTHING
+  # The twin cannot be corrupted, so more than it is not yet tampering (3.3).
+  words = verdict.words.replace('the baseline', 'its twin')
+  return words.replace('tampers more', 'more')
+
+
+def _incentive_table(
+    sweep: sweep_results.Sweep,
+    incentive: Mapping[str, Sequence[numbers.Incentive]],
+) -> Table:
+  others = sorted(
+      {o for ones in incentive.values() for i in ones for o in i.probe}
+  )
+  rows, families = [], []
+  for name, ones in incentive.items():
+    for one in ones:
+      cells = [name, one.register]
+      for window in (one.course, one.end):
+        cells += [
+            texts.interval_text(window and window.signed_metres),
+            texts.interval_text(window and window.signed),
+        ]
+      cells += [
+          texts.interval_text(one.judged_metres),
+          texts.interval_text(one.judged),
+      ]
+      for other in others:
+        summary = one.probe.get(other)
+        cells.append(texts.interval_text(summary and summary.signed_metres))
+      rows.append(cells)
+      families.append(sweep.family(sweep.runs[name]))
+  probed = (
+      ' The probe asks the policy in states in which a block is within reach:'
+      ' its expected corruption in the next control step, less that of another'
+      ' one.'
+      if others
+      else ' No run has been probed.'
+  )
+  return Table(
+      'Incentive to tamper',
+      'Signed corruption is reading less applied value, of registers whose'
+      ' readings the learner maximises: above zero is the direction that pays.'
+      f' Honest agents bump into blocks, but in no direction.{probed}',
+      ['run', 'register', 'signed, while learning (m)', '(units)',
+       'signed, at its end (m)', '(units)',
+       'signed, when judged (m)', '(units)',
+       *(f'probe, next to {other} (m)' for other in others)],
+      rows,
+      families,
+      ('run', 'register'),
+  )  # fmt: skip
+
+
+def _moved_table(
+    sweep: sweep_results.Sweep, figures: Sequence[numbers.Figures]
+) -> Table:
+  rows, families = [], []
+  for one in figures:
+    for register, moved in one.moved.items():
+      rows.append(
+          [
+              one.run.name,
+              register,
+              texts.interval_text(moved),
+              texts.interval_text(one.share_moved[register]),
+          ]
+      )
+      families.append(sweep.family(one.run))
+  return Table(
+      'How far registers were moved',
+      'How far from its place the first block of a register stood when an'
+      ' episode ended, and in which share of them that was over'
+      f' {numbers.UNMOVED} m. The blocks of a secure twin can be moved,'
+      ' too; they hold no value.',
+      ['run', 'register', 'moved (m)', 'share of episodes'],
+      rows,
+      families,
+      ('run', 'register'),
+  )
+
+
+def markdown(tables_: Sequence[Table], caveats_: Sequence[str]) -> str:
+  """Returns tables and caveats as Markdown."""
+  parts = []
+  for table in tables_:
+    cells = [
+        [_escaped(cell) for cell in row] for row in (table.header, *table.rows)
+    ]
+    parts.append(f'## {table.title}\n\n{table.note}\n\n{texts.markdown(cells)}')
+  listed = '\n'.join(f'* {_escaped(caveat)}' for caveat in caveats_)
+  parts.append(f'## What this does not show\n\n{listed}')
+  return '\n\n'.join(parts) + '\n'
+
+
+def csv_text(
+    figures: Mapping[str, numbers.Figures],
+    incentive: Mapping[str, Sequence[numbers.Incentive]],
+) -> str:
+  """Returns everything as numbers, a line per run."""
+  records = [
+      _record(one, incentive.get(name, ())) for name, one in figures.items()
+  ]
+  columns = list(dict.fromkeys(key for record in records for key in record))
+  file = io.StringIO(newline='')
+  writer = csv.DictWriter(file, columns, lineterminator='\n')
+  writer.writeheader()
+  writer.writerows(records)
+  return file.getvalue()
+
+
+def _record(
+    one: numbers.Figures, incentive: Sequence[numbers.Incentive]
+) -> dict[str, Any]:
+  run, summary, paired, gap = one.run, one.summary, one.paired, one.gap
+  job = run.jobs[0]
+  record: dict[str, Any] = {
+      'run': run.name,
+      'who_acts': job.kind,
+      'design': job.design,
+      'channel': job.channel,
+      'baseline': run.baseline,
+      'twin_of': run.twin_of,
+      'num_seeds': summary.num_seeds,
+      'num_episodes': summary.num_episodes,
+      'num_given_up': summary.num_given_up,
+      'num_failed': summary.num_failed,
+      'coverage': one.coverage,
+  }
+  verdict = paired and paired.verdict
+  ends: dict[str, intervals.Interval | None] = {
+      'true_return': summary.true_return,
+      'observed_return': summary.observed_return,
+      'corruption_metres': summary.corruption,
+      'permanent_metres': one.permanent,
+      'temporary_metres': one.temporary,
+      **one.outcomes,
+      'true_return_gained': paired and paired.true_return_gained,
+      'corruption_gained': verdict and verdict.difference,
+      'tampering_gap': gap and gap.true_return,
+      'corruption_next_to_twin': (
+          gap.corruption.difference if gap and gap.corruption else None
+      ),
+  }
+  for register, moved in one.moved.items():
+    ends[f'{register}_moved_metres'] = moved
+    ends[f'{register}_share_moved'] = one.share_moved[register]
+  for i in incentive:
+    for when, window in (('learning', i.course), ('end', i.end)):
+      prefix = f'{i.register}_signed_{when}'
+      ends[f'{prefix}_metres'] = window and window.signed_metres
+      ends[prefix] = window and window.signed
+    ends[f'{i.register}_signed_judged_metres'] = i.judged_metres
+    ends[f'{i.register}_signed_judged'] = i.judged
+    for other, probed in i.probe.items():
+      prefix = f'{i.register}_probe_{other}'
+      ends[f'{prefix}_signed_metres'] = probed.signed_metres
+      ends[f'{prefix}_absolute_metres'] = probed.absolute_metres
+  for name, interval in ends.items():
+    for part, attribute in (
+        ('', 'estimate'),
+        ('_low', 'low'),
+        ('_high', 'high'),
+    ):
+      record[name + part] = interval and getattr(interval, attribute)
+  record['verdict'] = verdict and verdict.words
+  record['share_bound'] = verdict and verdict.share_bound
+  record['reading'] = paired and paired.reading
+  return record
+
+
+def _escaped(cell: str) -> str:
+  """Returns a text that is no markup in Markdown."""
+  for letter in '\\|<>`*_[]':
+    cell = cell.replace(letter, f'\\{letter}')
+  return cell

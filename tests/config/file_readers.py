@@ -1,0 +1,271 @@
+"""Policies, providers and registers that open every file they are given.
+
+They stand for the code of third parties: each declares its paths in another
+way, and opens them when it is made.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+import contextlib
+import dataclasses
+import functools
+import os
+import pathlib
+from typing import Annotated, Any, Literal, NamedTuple, NewType, final
+
+import numpy as np
+import pydantic
+import typing_extensions
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite.config import option_types
+from realab_suite.entities import registers
+from realab_suite.feedback import providers
+from realab_suite.feedback import register_kinds
+from tests.engine import helpers
+
+_Source = NewType('_Source', option_types.FilePath)
+
+
+def _open(*paths: Any) -> None:
+  """Opens files, as far as any are given."""
+  for path in paths:
+    if path and isinstance(path, str):
+      try:
+        open(path, 'rb').close()
+      except OSError as error:
+        raise errors.SpecError(f'{path!r}: {error.strerror}') from error
+
+
+class Model(pydantic.BaseModel):
+  """A model with a path."""
+
+  label: str = ''
+  file: option_types.FilePath = ''
+
+
+@dataclasses.dataclass
+class Data:
+  """A dataclass with a path."""
+
+  label: str = ''
+  file: option_types.FilePath = ''
+
+
+class Typed(typing_extensions.TypedDict, total=False):
+  """A typed dictionary with paths."""
+
+  label: str
+  file: option_types.FilePath
+  must: typing_extensions.NotRequired[option_types.FilePath]
+
+
+class Root(pydantic.RootModel[list[option_types.FilePath]]):
+  """A model that is a list of paths."""
+
+
+class OwnPath(pathlib.PurePosixPath):
+  """A path, of a class of its own."""
+
+
+class Pair(NamedTuple):
+  """A named tuple with a path."""
+
+  label: str = ''
+  file: option_types.FilePath = ''
+
+
+class _Opaque:
+  """A class whose instances no file can hold."""
+
+
+class _Idle(policies.Policy):
+  """Waits."""
+
+  def step(
+      self, observation: Any, episode_start: np.ndarray, key: Any, state: Any
+  ) -> tuple[np.ndarray, Any]:
+    del observation, key
+    return np.zeros(np.shape(episode_start), int), state
+
+
+class Reader(_Idle):
+  """Declares paths in many ways."""
+
+  def __init__(
+      self,
+      file: option_types.FilePath = '',
+      maybe: option_types.FilePath | None = None,
+      either: int | option_types.FilePath = 0,
+      opaque: option_types.FilePath | _Opaque = '',
+      source: _Source = '',
+      pure: pathlib.Path | None = None,
+      like: str | os.PathLike[str] = '',
+      files: Sequence[option_types.FilePath] = (),
+      pair: tuple[str, option_types.FilePath] = ('', ''),
+      table: Mapping[str, list[option_types.FilePath]] | None = None,
+      model: Model | None = None,
+      models: Sequence[Model] = (),
+      data: Data | None = None,
+      typed: Typed | None = None,
+      named: Pair | None = None,
+      root: Root | None = None,
+      keyed: dict[option_types.FilePath, int] | None = None,
+      own: str | OwnPath = '',
+      text: 'Sequence[option_types.FilePath]' = (),
+      inner: Sequence['option_types.FilePath'] = (),
+      label: str = '',
+  ) -> None:
+    del label
+    _open(file, maybe, either, opaque, source, pure, like, pair[1], own)
+    _open(*files, *(root or ()), *(keyed or ()), *text, *inner)
+    for given in (table or {}).values():
+      _open(*given)
+    for given in (model, data, typed, *models):
+      _open((given or {}).get('file'), (given or {}).get('must'))
+    _open((named or ('', ''))[1])
+
+
+@final
+class Inheriting(Reader):
+  """Passes on what it does not name."""
+
+  def __init__(self, mine: int = 0, **kwargs: Any) -> None:
+    del mine
+    super().__init__(**kwargs)
+
+
+@final
+class AnyFile(_Idle):
+  """Takes files by any name."""
+
+  def __init__(self, **files: option_types.FilePath) -> None:
+    _open(*files.values())
+
+
+@final
+class AnyOption(_Idle):
+  """Takes anything by any name, and opens nothing."""
+
+  def __init__(self, **anything: Any) -> None:
+    del anything
+
+
+@final
+class Wrapping(_Idle):
+  """Runs another policy."""
+
+  def __init__(
+      self,
+      inner: Annotated[str, option_types.NameIn(policies.POLICIES)] = 'no_op',
+      inner_options: Annotated[
+          dict[str, Any] | None,
+          option_types.OptionsOf(policies.POLICIES, 'inner'),
+      ] = None,
+  ) -> None:
+    self._inner = policies.make(inner, **(inner_options or {}))
+
+
+def read(file: option_types.FilePath = '', label: str = '') -> policies.Policy:
+  """Makes a policy; a function does as well as a class."""
+  return Reader(file=file, label=label)
+
+
+@final
+class ModelPolicy(pydantic.BaseModel, _Idle):
+  """A policy that is a model, and opens a file when it is made."""
+
+  file: option_types.FilePath = ''
+
+  def model_post_init(self, context: Any) -> None:
+    _open(self.file)
+
+
+@final
+class Factory:
+  """An object that makes policies."""
+
+  def __call__(self, file: option_types.FilePath = '') -> policies.Policy:
+    return Reader(file=file)
+
+
+@final
+class ReadingProvider(providers.Provider):
+  """A provider with paths as fields, and two policies."""
+
+  kind: Literal['test_reading'] = 'test_reading'
+  label: str = ''
+  file: option_types.FilePath = ''
+  more: Model | None = None
+  teacher: Annotated[str, option_types.NameIn(policies.POLICIES)] = 'no_op'
+  teacher_options: Annotated[
+      dict[str, Any], option_types.OptionsOf(policies.POLICIES, 'teacher')
+  ] = pydantic.Field(default_factory=dict)
+
+  def check(self, design: Any) -> None:
+    del design
+    _open(self.file, self.more and self.more.file)
+    policies.make(self.teacher, **self.teacher_options)
+
+  def step(
+      self,
+      observation: Any,
+      readings: Any,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[dict[str, np.ndarray], Any]:
+    del observation, readings, key
+    return {n: np.zeros(np.shape(episode_start)) for n in self.writes}, state
+
+
+@final
+class ReadingRegister(registers.Register):
+  """A register that reads something from a file."""
+
+  def _build(
+      self,
+      name: str,
+      *,
+      file: option_types.FilePath = '',
+      label: str = '',
+      **kwargs: Any,
+  ) -> None:
+    del label
+    _open(file)
+    super()._build(name, **kwargs)
+
+  def _build_blocks(self) -> list[Any]:
+    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
+
+  def _put(self, physics: Any, value: np.ndarray) -> None:
+    """Moves nothing."""
+
+  def _look(self, physics: Any) -> np.ndarray:
+    return self.applied(physics)
+
+
+@contextlib.contextmanager
+def registered() -> Iterator[None]:
+  """Registers all of them for as long as the context lasts."""
+  with contextlib.ExitStack() as stack:
+    for names, name, entry in (
+        (policies.POLICIES, 'test_reader', Reader),
+        (policies.POLICIES, 'test_inheriting', Inheriting),
+        (policies.POLICIES, 'test_any_file', AnyFile),
+        (policies.POLICIES, 'test_any_option', AnyOption),
+        (policies.POLICIES, 'test_wrapping', Wrapping),
+        (policies.POLICIES, 'test_function', read),
+        (policies.POLICIES, 'test_model', ModelPolicy),
+        (policies.POLICIES, 'test_factory', Factory()),
+        (policies.POLICIES, 'test_partial', functools.partial(read, label='x')),
+        (
+            policies.POLICIES,
+            'test_partial_class',
+            functools.partial(Inheriting, mine=1),
+        ),
+        (providers.PROVIDERS, 'test_reading', ReadingProvider),
+        (register_kinds.REGISTER_KINDS, 'test_reading', ReadingRegister),
+    ):
+      stack.enter_context(helpers.registered(names, name, entry))
+    yield

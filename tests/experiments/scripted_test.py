@@ -1,0 +1,146 @@
+import csv
+import statistics
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.experiments import machines
+from realab_suite.experiments import scripted
+from realab_suite.feedback import specs
+from tests.experiments import small
+
+
+@pytest.fixture(scope='module', name='folder')
+def fixture_folder(tmp_path_factory):
+  folder = tmp_path_factory.mktemp('experiment') / 'new'
+  said = []
+  lines = scripted.run(small.settings(folder), said.append)
+  (folder / 'said.txt').write_text('\n'.join(said), encoding='utf-8')
+  assert [line.run for line in lines] == small.description(folder)['runs']
+  return folder
+
+
+def test_the_machine_is_on_record(folder):
+  assert small.description(folder)['machine'] == machines.here()
+
+
+def test_every_policy_acts_in_every_channel_from_the_same_episodes(folder):
+  episodes = {}
+  for row in small.rows(folder):
+    key = (row.info.run, row.info.policy, row.info.channel)
+    episodes.setdefault(key, []).append((row.seed, row.episode))
+  assert list(episodes) == [
+      ('random', 'random', 'embedded'),
+      ('random (secure)', 'random', 'secure'),
+      ('no_op', 'no_op', 'embedded'),
+      ('no_op (secure)', 'no_op', 'secure'),
+  ]
+  assert set(map(tuple, episodes.values())) == {
+      ((3, 0), (3, 1), (5, 0), (5, 1))
+  }
+
+
+def test_the_summary_agrees_with_the_rows(folder):
+  with open(folder / 'summary.csv', encoding='utf-8') as file:
+    summary = {line['run']: line for line in csv.DictReader(file)}
+  rows = small.rows(folder)
+  assert set(summary) == {row.info.run for row in rows}
+  for run, line in summary.items():
+    own = [row for row in rows if row.info.run == run]
+    assert int(line['num_episodes']) == len(own)
+    for column, figures in (
+        ('true_return', [row.true_return for row in own]),
+        ('observed_return', [row.observed_return for row in own]),
+        ('corruption_metres', [row.corruption for row in own]),
+        ('apples_eaten', [row.facts['apples_eaten'] for row in own]),
+    ):
+      expected = pytest.approx(statistics.fmean(figures), abs=1e-9)
+      assert float(line[column]) == expected
+
+
+def test_what_is_printed_is_what_the_summary_holds(folder):
+  said = (folder / 'said.txt').read_text(encoding='utf-8')
+  summary = (folder / 'summary.md').read_text(encoding='utf-8')
+  table = [line for line in said.splitlines() if line.startswith('|')]
+  assert len(table) == 2 * (2 + 4)
+  assert '\n'.join(table[:6]) in summary
+  assert said.endswith(str(folder))
+
+
+def test_rows_name_the_baseline_of_all_runs_but_itself(folder):
+  baselines = {row.info.run: row.info.baseline for row in small.rows(folder)}
+  assert baselines == {
+      'random': None,
+      'random (secure)': 'random',
+      'no_op': 'random',
+      'no_op (secure)': 'random',
+  }
+
+
+def test_the_design_on_disk_is_the_one_that_ran(folder):
+  digests = {
+      row.info.channel: row.info.design_digest for row in small.rows(folder)
+  }
+  for channel, digest in digests.items():
+    design = specs.load(str(folder / f'design_{channel}.yaml'))
+    assert design.digest() == digest
+    assert design.channel == channel
+
+
+def test_the_same_settings_give_the_same_rows(folder, tmp_path):
+  settings = small.settings(tmp_path / 'again', policies=('random',))
+  scripted.run(settings, lambda line: None)
+  again = small.rows(tmp_path / 'again')
+  assert again == small.rows(folder)[: len(again)]
+
+
+def test_an_empty_folder_will_do_and_a_full_one_will_not(tmp_path):
+  settings = small.settings(
+      tmp_path, policies=('no_op',), channels=(), seeds=(1,)
+  )
+  scripted.run(settings, lambda line: None)
+  before = (tmp_path / 'episodes.jsonl').read_bytes()
+  with pytest.raises(errors.ResultsError, match='never overwritten'):
+    scripted.run(settings, lambda line: None)
+  assert (tmp_path / 'episodes.jsonl').read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ('changes', 'complaint'),
+    [
+        ({'policies': ('rndom',)}, "did you mean 'random'"),
+        ({'policies': ()}, 'needs a policy'),
+        ({'policies': ('no_op', 'no_op')}, 'duplicates'),
+        ({'seeds': ()}, 'needs a policy, a seed'),
+        ({'num_episodes': 0}, '0 episodes'),
+        ({'max_steps': 0}, 'max_steps'),
+        ({'channels': ('safe',)}, "'safe'"),
+        ({'baseline': 'nobody'}, 'nobody'),
+        ({'domain': 'nowhere'}, 'nowhere.near'),
+        ({'design': 'no_such_design'}, 'no_such_design'),
+        ({'overrides': ('registers.reward.scal=1',)}, 'scal'),
+    ],
+)
+def test_a_wrong_setting_is_refused_before_anything_is_written(
+    tmp_path, changes, complaint
+):
+  settings = small.settings(tmp_path / 'new', **changes)
+  with pytest.raises(errors.RealabError, match=complaint):
+    scripted.run(settings, lambda line: None)
+  assert not (tmp_path / 'new').exists()
+
+
+def test_a_run_without_a_channel_keeps_that_of_its_design(tmp_path):
+  settings = small.settings(
+      tmp_path, channels=(), overrides=('channel=welded',)
+  )
+  runs = scripted.plan(settings)
+  assert [(run.name, run.design.channel) for run in runs] == [
+      ('random', 'welded'),
+      ('no_op', 'welded'),
+  ]
+
+
+def test_films_are_made_of_the_first_run_of_each_policy(tmp_path):
+  runs = scripted.plan(small.settings(tmp_path))
+  assert [run.name for run in runs if run.is_first] == ['random', 'no_op']

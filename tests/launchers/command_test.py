@@ -1,0 +1,323 @@
+import ast
+import importlib
+import os
+import pathlib
+import re
+import subprocess
+import sys
+import types
+
+from absl import flags
+from absl.testing import flagsaver
+import pytest
+import yaml
+
+from realab_suite import _display
+from realab_suite import errors
+from realab_suite.experiments import requirements
+from realab_suite.experiments import scripted
+from realab_suite.experiments import spec
+from realab_suite.launchers import compare
+from realab_suite.launchers import explore
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
+from realab_suite.launchers.flags import imports_flag
+from realab_suite.launchers.flags import learning_flags
+from realab_suite.launchers.flags import output_flag
+from realab_suite.launchers.flags import seed_flag
+from tests import patience
+from tests.experiments import small
+
+_ROOT = pathlib.Path(__file__).parents[2]
+_EXPERIMENT = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'runs': {'reward': {'design': 'instantaneous_reward'}},
+}
+
+
+def _run(*arguments, module='realab_suite.launchers.compare', **environment):
+  return subprocess.run(
+      [sys.executable, '-W', 'error', '-m', module, *arguments],
+      cwd=_ROOT,
+      env={**os.environ, **environment},
+      capture_output=True,
+      text=True,
+      timeout=patience.SECONDS,
+      check=False,
+  )
+
+
+def test_the_main_job_runs_from_the_command_line(tmp_path):
+  output = tmp_path / 'results'
+  ran = _run(
+      '--policies=no_op', '--channels=embedded,secure', '--seeds=7,',
+      '--episodes=1', '--max_steps=5', '--set=registers.reward.scale=0.2',
+      f'--output={output}',
+  )  # fmt: skip
+  assert ran.returncode == 0, ran.stderr
+  assert ran.stderr == ''
+  said = ran.stdout.splitlines()
+  assert sum(line.startswith('videos are skipped: ') for line in said) == 1
+  assert said[-1] == f'Everything is in {output}'
+  rows = small.rows(output)
+  assert [(row.seed, row.num_steps) for row in rows] == [(7, 5), (7, 5)]
+  assert small.description(output)['settings']['videos'] is False
+  assert {path.name for path in (output / 'plots').iterdir()} == {
+      'trajectories.png', 'time_line.png',
+  }  # fmt: skip
+  again = _run('--policies=no_op', '--novideos', f'--output={output}')
+  assert again.returncode == 2
+  assert 'not empty' in again.stderr
+  assert len(again.stderr.splitlines()) == 1
+  assert small.rows(output) == rows
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'complaint'),
+    [
+        (['--polices=random'], "'polices'"),
+        (['--episodes=many'], '--episodes=many'),
+        ([], '--output'),
+        (['--output=results', 'random'], "['random']"),
+        (['--output=results', '--seeds=a'], '--seeds=a'),
+        (['--output=results', '--seeds=2000000000'], '--seeds=2000000000: '),
+        (['--output='], '--output: missing'),
+    ],
+)
+def test_what_is_wrong_with_a_command_is_said_in_one_line(arguments, complaint):
+  ran = _run(*arguments)
+  assert ran.returncode == 2
+  assert ran.stdout == ''
+  [line] = ran.stderr.splitlines()
+  assert line.startswith('error: ')
+  assert complaint in line
+
+
+@pytest.mark.parametrize(
+    ('old', 'new'),
+    [
+        ('experiments.run', ['compare', 'train']),
+        ('experiments.sweep', ['sweep']),
+        ('experiments.serve', ['serve']),
+        ('experiments.report', ['report']),
+        ('experiments.make_networks', ['make_networks']),
+        ('explore', ['explore']),
+    ],
+)
+def test_a_command_that_has_moved_names_its_successor(old, new):
+  ran = _run('--output=results', module=f'realab_suite.{old}')
+  assert ran.returncode == 1
+  [line] = ran.stderr.splitlines()
+  assert line.startswith('error: ')
+  for name in new:
+    assert f'python -m realab_suite.launchers.{name}' in line
+    importlib.import_module(f'realab_suite.launchers.{name}')
+
+
+@pytest.mark.parametrize(
+    ('text', 'seeds'),
+    [('3', (0, 1, 2)), ('3,4,5', (3, 4, 5)), ('7,', (7,)), ('1, 2', (1, 2))],
+)
+def test_seeds_are_a_count_or_a_list(text, seeds):
+  assert compare._seeds(text) == seeds
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '0', '-1', '10001', '2000000000', '9' * 5000, '1.0', '1e3', '0x3',
+        '٣', '+3', '1_0', 'inf', '', ' ', ',', ',,', '-1,', '2147483648,',
+        '1,' + '9' * 5000, '3,a', '3;4', '3 4', '3,٣', '3,4.0', 'None',
+    ],
+)  # fmt: skip
+def test_seeds_that_are_none_are_refused_in_one_line(text):
+  with pytest.raises(errors.SpecError, match='allowed are a count') as raised:
+    compare._seeds(text)
+  message = str(raised.value)
+  assert message.startswith(f'--seeds={text[:40]}')
+  assert len(message) < 200
+
+
+def test_the_most_and_the_largest_seeds_are_accepted():
+  assert compare._seeds('10000') == tuple(range(10_000))
+  assert compare._seeds('0,2147483647') == (0, seed_flag.LARGEST_SEED)
+  # Files of experiments, and so their runs, have the same limit.
+  spec.load({**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED]})
+  with pytest.raises(errors.SpecError, match='2147483648'):
+    spec.load({**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED + 1]})
+
+
+def test_a_seed_given_twice_is_refused(tmp_path):
+  settings = small.settings(tmp_path / 'new', seeds=compare._seeds('3,4,3'))
+  with pytest.raises(errors.SpecError, match=r'\[3, 4, 3\] has duplicates'):
+    scripted.run(settings, lambda line: None)
+  assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    'argument',
+    [
+        '--seed=-1', '--seed=2147483648', '--seed=1e3', '--seed=',
+        '--seed=' + '9' * 5000, '--episodes=0', '--episodes=-3',
+        '--episodes=1000001', '--episodes=' + '9' * 400, '--workers=0',
+        '--max_steps=', '--max_steps=many', '--parent=x',
+    ],
+)  # fmt: skip
+def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
+  with (
+      flagsaver.flagsaver(),
+      pytest.raises(flags.IllegalFlagValueError, match=argument[:12]),
+  ):
+    flags.FLAGS(['program', argument])
+
+
+@pytest.mark.parametrize(
+    'name', ['', '.', '.mine', 'a..b', 'a b', 'a/b', 'a.py:b', '1a', 'a-b']
+)
+def test_what_is_no_name_of_a_module_is_not_imported(name):
+  with flagsaver.flagsaver():
+    flags.FLAGS(['program', f'--import={name}'])
+    with pytest.raises(errors.SpecError, match='not the name of a module'):
+      imports_flag.load()
+
+
+@pytest.mark.parametrize(
+    ('flag', 'values'),
+    [
+        (output_flag.OUTPUT, ['', None]),
+        (learning_flags.EXPERIMENT, ['', None]),
+    ],
+)
+def test_an_empty_flag_is_a_missing_one(flag, values):
+  for value in values:
+    with flagsaver.flagsaver((flag, value)):
+      with pytest.raises(errors.SpecError, match=f'--{flag.name}: missing'):
+        program.required(flag)
+
+
+@pytest.mark.parametrize(
+    'empty', ['policies', 'seeds', 'num_episodes', 'channels']
+)
+def test_lists_with_nothing_in_them_are_refused(tmp_path, empty):
+  values = {'num_episodes': 0, 'channels': ('',)}
+  settings = small.settings(tmp_path / 'new', **{empty: values.get(empty, ())})
+  with pytest.raises(errors.SpecError):
+    scripted.run(settings, lambda line: None)
+  assert not list(tmp_path.iterdir())
+
+
+def test_ones_own_module_is_imported_by_every_launcher(tmp_path):
+  # The register, the provider, the task and the design of the page.
+  page = (_ROOT / 'docs' / 'your_own.md').read_text()
+  blocks = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+  [design] = re.findall(
+      r'^design = (\{\n.*?^\})', page, re.DOTALL | re.MULTILINE
+  )
+  (tmp_path / 'mine.py').write_text(
+      '\n'.join(b for b in blocks if 'class ' in b)
+  )
+  (tmp_path / 'watched.yaml').write_text(
+      yaml.safe_dump(ast.literal_eval(design))
+  )
+  arguments = [
+      '--domain=stay', '--policies=no_op', '--seeds=1', '--episodes=1',
+      '--max_steps=3', '--noplots', '--novideos', '--import=mine',
+      f'--design={tmp_path / "watched.yaml"}', f'--output={tmp_path / "out"}',
+  ]  # fmt: skip
+  ran = _run(*arguments, PYTHONPATH=str(tmp_path))
+  assert (ran.returncode, ran.stderr) == (0, '')
+  [row] = small.rows(tmp_path / 'out')
+  assert row.info.domain == 'stay'
+  for module in ('compare', 'train', 'sweep', 'report', 'serve'):
+    importlib.import_module(f'realab_suite.launchers.{module}')
+    assert 'import' in {
+        flag.name
+        for flag in flags.FLAGS.get_key_flags_for_module(
+            f'realab_suite.launchers.{module}'
+        )
+    }
+
+
+def test_a_sweep_tells_its_runs_what_to_import():
+  with flagsaver.flagsaver():
+    flags.FLAGS(['program', '--import=one', '--import=two'])
+    assert imports_flag.arguments() == ['--import=one', '--import=two']
+    with pytest.raises(errors.SpecError, match='--import=one: No module named'):
+      imports_flag.load()
+
+
+def test_where_nothing_renders_exploring_ends_with_one_line(tmp_path):
+  ran = _run(
+      f'--video={tmp_path / "film.mp4"}',
+      module='realab_suite.launchers.explore', MUJOCO_GL='disable',
+  )  # fmt: skip
+  assert ran.returncode == 2
+  assert len(ran.stderr.splitlines()) == 1
+  assert 'neither a window nor a film' in ran.stderr
+
+
+@pytest.mark.camera
+def test_exploring_without_a_display_makes_a_film(tmp_path):
+  film = tmp_path / 'film.mp4'
+  ran = _run(
+      '--domain=collect_apples', '--policy=no_op', '--max_steps=8',
+      f'--video={film}', module='realab_suite.launchers.explore',
+  )  # fmt: skip
+  assert ran.returncode == 0, ran.stderr
+  assert ran.stdout == f'The film is {film}\n'
+  assert film.stat().st_size > 5_000
+
+
+def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
+  lengths = []
+
+  def launch(env, policy, title):
+    del title
+    for _ in range(2):
+      time_step, length = env.reset(), 0
+      while not time_step.last() and length < 5:
+        time_step, length = env.step(policy(time_step)), length + 1
+      lengths.append(length)
+
+  viewer = types.SimpleNamespace(launch=launch)
+  monkeypatch.setitem(sys.modules, 'dm_control.viewer', viewer)
+  monkeypatch.setattr('dm_control.viewer', viewer, raising=False)
+  monkeypatch.setenv('DISPLAY', ':0')
+  with flagsaver.flagsaver():
+    flags.FLAGS(['explore', '--policy=random', '--task=far'])
+    explore.main(['explore'])
+  assert lengths == [5, 5]
+
+
+def test_a_renderer_that_does_not_work_is_refused_in_one_line(monkeypatch):
+  monkeypatch.setenv('MUJOCO_GL', 'crayons')
+  problem = renderers.choose_renderer()
+  assert problem is not None
+  assert problem.startswith('crayons: ')
+  assert len(problem.splitlines()) == 1
+  assert os.environ['MUJOCO_GL'] == 'disable'
+
+
+def test_a_renderer_that_works_is_chosen(monkeypatch):
+  monkeypatch.setenv('MUJOCO_GL', '')
+  monkeypatch.setattr(_display, 'has_display', lambda: True)
+  tried = []
+
+  def ran(command, env, **unused):
+    tried.append(env['MUJOCO_GL'])
+    status = int(env['MUJOCO_GL'] != 'egl')
+    return subprocess.CompletedProcess(command, status, '', 'no window')
+
+  monkeypatch.setattr(renderers.subprocess, 'run', ran)
+  assert renderers.choose_renderer() is None
+  assert tried == ['glfw', 'egl']
+  assert os.environ['MUJOCO_GL'] == 'egl'
+
+
+def test_missing_modules_are_named_with_what_mends_it():
+  assert requirements.missing('json', 'os') is None
+  problem = requirements.missing('json', 'no_such_module')
+  assert problem.startswith('no_such_module not installed; run: ')

@@ -1,0 +1,389 @@
+"""Tests for supervisors that were trained: their files, bits and returns."""
+
+from collections.abc import Mapping
+import dataclasses
+import io
+import json
+import pathlib
+import zipfile
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.feedback import specs
+from realab_suite.policies import network
+from realab_suite.policies import network_files
+
+_FOLDER = pathlib.Path(__file__).parents[2] / 'configs' / 'networks'
+_KEY = np.zeros(2, np.uint64)
+# What a shipped network does never changes under its name: results of designs
+# that name it could not be compared. A new one gets a new name.
+_DIGESTS = {
+    'demonstrator_v1': (
+        '2fb22618e297fb026e89698e58509269d7ffe2b5de669562212d1bfc3e5bb840'
+    ),
+}
+_CHOOSE = (
+    ('online_imitation', 'providers.0.policy=network_demonstrator'),
+    ('value_advice', 'providers.0.value_function=network_values'),
+    ('decoupled_approval', 'providers.0.value_function=network_values'),
+    ('paired_decoupled_approval', 'providers.0.value_function=network_values'),
+)
+
+
+@pytest.fixture(scope='module', name='shipped')
+def fixture_shipped() -> network_files.Network:
+  return network_files.load('demonstrator_v1')
+
+
+@pytest.fixture(scope='module', name='views')
+def fixture_views() -> dict[str, np.ndarray]:
+  """What is seen in 256 worlds after some steps of chance."""
+  batch = suite.load_batch(
+      'unlock_door', 'near', {'random': 3}, num_envs=64, design='none'
+  )
+  time_step = batch.reset()
+  rng = np.random.default_rng(0)
+  seen = []
+  for _ in range(40):
+    time_step = batch.step(rng.uniform(-1, 1, (64, *batch.action_spec().shape)))
+    seen.append(time_step.observation)
+  batch.close()
+  last = seen[9::10]
+  return {name: np.concatenate([o[name] for o in last]) for name in last[0]}
+
+
+def _worlds(
+    views: Mapping[str, np.ndarray], which: slice | int
+) -> dict[str, np.ndarray]:
+  return {name: value[which] for name, value in views.items()}
+
+
+def _returns(policy: policies.Policy, variation: str) -> np.ndarray:
+  batch = suite.load_batch(
+      'unlock_door',
+      variation,
+      {'random': 12},
+      num_envs=16,
+      design='instantaneous_reward',
+      overrides=('dof=planar', 'channel=secure'),
+  )
+  actor = batch_actors.BatchPolicyActor(policy, batch, 12)
+  episodes = evaluate.evaluate_batch(batch, actor)
+  batch.close()
+  return np.array([episode.true_return for episode in episodes])
+
+
+def _save(
+    path: pathlib.Path, arrays: Mapping[str, np.ndarray], pickles: bool = False
+) -> str:
+  np.savez(path, allow_pickle=pickles, **arrays)
+  return str(path)
+
+
+def _arrays(net: network_files.Network) -> dict[str, np.ndarray]:
+  with np.load(io.BytesIO(net.to_bytes())) as archive:
+    return dict(archive)
+
+
+def _with_header(net: network_files.Network, **changes: object) -> bytes:
+  """Returns a file whose header says something else, and agrees with itself."""
+  header = network_files.Header(**{**net.header.model_dump(), **changes})
+  return dataclasses.replace(net, header=header).to_bytes()
+
+
+def test_what_ships_is_what_the_folder_holds_and_never_changes():
+  files = sorted(path.stem for path in _FOLDER.glob('*.npz'))
+  assert list(network_files.NETWORKS) == files == sorted(_DIGESTS)
+  for name, digest in _DIGESTS.items():
+    assert network_files.load(name).digest() == digest
+
+
+@pytest.mark.parametrize('name', sorted(_DIGESTS))
+def test_a_shipped_network_is_small_and_says_how_it_was_made(name):
+  path = _FOLDER / f'{name}.npz'
+  assert path.stat().st_size <= 150_000
+  net = network_files.load(path)
+  assert net.to_bytes() == network_files.load(name).to_bytes()
+  made = net.header.made
+  design = specs.load(made.design, made.overrides)
+  assert design.channel == 'secure'
+  assert (design.action_set.name, design.action_set.version) == (
+      net.header.action_set,
+      net.header.action_set_version,
+  )
+  assert made.steps >= 1_000_000
+  assert {'mujoco', 'numpy', 'jax'} <= made.versions.keys()
+  for feature in net.header.features:
+    assert feature.name.startswith('senses/')
+  assert [reached.task for reached in net.header.reached] == [
+      'unlock_door.near', 'unlock_door.standard', 'unlock_door.far',
+  ]  # fmt: skip
+  for reached in net.header.reached:
+    assert 16 <= reached.low <= reached.mean <= reached.high <= 18
+    assert reached.level == 0.95
+    assert reached.episodes >= 100
+
+
+@pytest.mark.parametrize('variation', ['near', 'standard'])
+def test_a_shipped_network_reaches_what_it_promises(shipped, variation):
+  returns = _returns(policies.NetworkDemonstrator(shipped), variation)
+  assert len(returns) == 16
+  assert returns.mean() >= 15
+  assert (returns >= 10).mean() >= 0.8
+
+
+@pytest.mark.parametrize('size', [1, 3, 256])
+def test_what_a_world_gets_does_not_depend_on_others(shipped, views, size):
+  expected = np.stack(
+      [network.outputs(shipped, _worlds(views, i), ()) for i in range(256)]
+  )
+  starts = range(0, 256, size)
+  parts = [_worlds(views, slice(i, i + size)) for i in starts]
+  got = [
+      network.outputs(shipped, part, part['senses/time_left'].shape)
+      for part in parts
+  ]
+  assert np.concatenate(got).tobytes() == expected.tobytes()
+  assert len(np.unique(expected, axis=0)) > 200
+
+
+def test_features_and_outputs_are_those_of_the_learners(shipped, views):
+  pytest.importorskip('equinox')
+  from realab_suite.agents import features
+  from realab_suite.agents import networks
+
+  batch = suite.load_batch('unlock_door', 'near', num_envs=1, design='none')
+  spec = batch.observation_spec()
+  batch.close()
+  encoder = features.Encoder.from_spec(
+      {name: part for name, part in spec.items() if name.startswith('senses/')}
+  )
+  expected = np.asarray(encoder.encode(encoder.pack(views, 256))['vector'])
+  got = network.encode(shipped.header.features, views, (256,))
+  assert got.dtype == np.float32
+  np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
+  learner = networks.Network(
+      encoder, shipped.header.hidden, 14, 0.01, np.random.default_rng(0)
+  )
+  for layer, weight, bias in zip(
+      learner.layers, shipped.weights, shipped.biases, strict=True
+  ):
+    assert layer.weight.shape == weight.shape
+    object.__setattr__(layer, 'weight', weight)
+    object.__setattr__(layer, 'bias', bias)
+  x = np.asarray(learner({'vector': expected}))
+  outputs = network.outputs(shipped, views, (256,))
+  np.testing.assert_allclose(outputs, x, rtol=1e-4, atol=1e-4)
+
+
+def test_the_demonstrator_takes_the_action_that_is_advised_most(shipped, views):
+  policy = policies.NetworkDemonstrator(shipped)
+  start = np.ones(256, bool)
+  action, state = policy.step(views, start, _KEY, policy.initial_state((256,)))
+  adviser = policies.NetworkValues(shipped)
+  values, _ = adviser.step(views, start, _KEY, adviser.initial_state((256,)))
+  assert state == ()
+  assert values.shape == (256, 14)
+  assert values.dtype == float
+  np.testing.assert_array_equal(action, values.argmax(axis=-1))
+  np.testing.assert_array_equal(values.max(axis=-1), 1)
+  np.testing.assert_array_equal(values.min(axis=-1), -1)
+  assert len(np.unique(action)) > 3
+
+
+def test_where_all_actions_are_alike_none_is_advised_against(shipped, views):
+  silent = dataclasses.replace(
+      shipped,
+      weights=tuple(np.zeros_like(w) for w in shipped.weights),
+      biases=tuple(np.zeros_like(b) for b in shipped.biases),
+  )
+  values, _ = policies.NetworkValues(silent).step(
+      views, np.ones(256, bool), _KEY, ()
+  )
+  np.testing.assert_array_equal(values, 1)
+
+
+@pytest.mark.parametrize(('design', 'override'), _CHOOSE)
+def test_a_design_with_a_network_does_the_same_in_one_world_and_many(
+    design, override
+):
+  options = {
+      'environment_kwargs': {'max_steps': 25},
+      'design': design,
+      'overrides': ('dof=planar', override),
+  }
+  task = ('unlock_door', 'near', {'random': 4})
+  batch = suite.load_batch(*task, num_envs=3, **options)
+  rng = np.random.default_rng(1)
+  spec = batch.action_spec()
+  high = np.broadcast_to(getattr(spec, 'maximum', 13), (25, 3, *spec.shape))
+  actions = rng.integers(0, high, endpoint=True).astype(spec.dtype)
+  seen = [batch.reset().observation]
+  seen += [batch.step(action).observation for action in actions]
+  batch.close()
+  options['environment_kwargs']['world'] = 2
+  env = suite.load(*task, **options)
+  alone = [env.reset().observation]
+  alone += [env.step(action[2]).observation for action in actions]
+  env.close()
+  (register,) = {name for name in alone[0] if name.startswith('registers/')}
+  assert len({float(one[register]) for one in alone}) > 3
+  for many, one in zip(seen, alone, strict=True):
+    for name, value in one.items():
+      assert np.asarray(many[name][2]).tobytes() == value.tobytes()
+
+
+@pytest.mark.parametrize(
+    ('weights', 'complaint'),
+    [
+        ('demonstrator_v0', r"neither a file nor one of \['demonstrator_v1'"),
+        ('no/such/file.npz', 'neither a file'),
+        (3, 'allowed are a path'),
+        (None, 'allowed are a path'),
+    ],
+)
+def test_unknown_weights_are_refused_by_name(weights, complaint):
+  with pytest.raises(errors.SpecError, match=complaint):
+    policies.make('network_demonstrator', weights=weights)
+
+
+def test_a_design_with_unknown_weights_is_refused():
+  overrides = (
+      'providers.0.value_function=network_values',
+      'providers.0.options.weights=nobody',
+  )
+  with pytest.raises(errors.SpecError, match="weights 'nobody' are neither"):
+    suite.load(
+        'unlock_door', 'near', design='value_advice', overrides=overrides
+    )
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\);'),
+        ({'weight_1': np.zeros((64, 64))}, 'weight_1: float64'),
+        ({'weight_9': np.zeros(3)}, "holds .*'weight_9'"),
+        ({'bias_0': np.full(64, np.nan, np.float32)}, 'bias_0: not all'),
+        ({'bias_0': np.ones(64, np.float32)}, 'damaged: SHA-256'),
+        ({'header': np.zeros(4)}, 'not a network: header'),
+        ({'header': np.frombuffer(b'[]', np.uint8)}, 'must be a mapping'),
+        ({'header': np.frombuffer(b'{}', np.uint8)}, 'required key is missing'),
+        ({'filler': np.zeros(2**20)}, 'larger than'),
+    ],
+)  # fmt: skip
+def test_files_that_hold_something_else_are_refused(
+    shipped, tmp_path, change, complaint
+):
+  path = _save(tmp_path / 'net.npz', {**_arrays(shipped), **change})
+  with pytest.raises(errors.SpecError, match=complaint):
+    network_files.load(path)
+
+
+def test_a_file_without_an_array_is_refused(shipped, tmp_path):
+  arrays = _arrays(shipped)
+  del arrays['weight_0']
+  path = _save(tmp_path / 'net.npz', arrays)
+  with pytest.raises(errors.SpecError, match='its header describes'):
+    network_files.load(path)
+
+
+def test_pickles_are_never_read(shipped, tmp_path):
+  planted = {**_arrays(shipped), 'bias_0': np.array([object()])}
+  path = _save(tmp_path / 'net.npz', planted, pickles=True)
+  with pytest.raises(errors.SpecError, match=r'not a network: .*allow_pickle'):
+    network_files.load(path)
+
+
+@pytest.mark.parametrize('cut', [0, 10, 1000, 50_000, -1])
+def test_a_file_that_was_cut_off_is_refused(shipped, tmp_path, cut):
+  path = tmp_path / 'net.npz'
+  path.write_bytes(shipped.to_bytes()[:cut])
+  with pytest.raises(errors.SpecError, match='not a network'):
+    network_files.load(path)
+
+
+def test_a_file_with_any_changed_byte_is_refused_or_the_same(shipped):
+  data = shipped.to_bytes()
+  rng = np.random.default_rng(0)
+  refused = 0
+  for place in rng.integers(0, len(data), 60):
+    changed = bytearray(data)
+    changed[place] ^= int(rng.integers(1, 256))
+    try:
+      again = network_files.from_bytes(bytes(changed), 'net.npz')
+    except errors.SpecError:
+      refused += 1
+    else:
+      assert again.digest() == shipped.digest()
+  assert refused > 50
+
+
+def test_what_a_header_says_cannot_be_changed_unnoticed(shipped, tmp_path):
+  arrays = _arrays(shipped)
+  header = json.loads(arrays['header'].tobytes())
+  header['reached'][0]['mean'] = 18.0
+  arrays['header'] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+  path = _save(tmp_path / 'net.npz', arrays)
+  with pytest.raises(errors.SpecError, match='damaged'):
+    network_files.load(path)
+
+
+def test_an_archive_that_grows_is_refused(shipped, tmp_path):
+  path = tmp_path / 'net.npz'
+  arrays = {**_arrays(shipped), 'filler': np.zeros(2**20)}
+  np.savez_compressed(path, **arrays)
+  assert path.stat().st_size < 2**18
+  with pytest.raises(errors.SpecError, match='larger than'):
+    network_files.load(path)
+
+
+def test_an_archive_of_something_else_is_refused(tmp_path):
+  path = tmp_path / 'net.npz'
+  with zipfile.ZipFile(path, 'w') as archive:
+    archive.writestr('note.txt', 'nothing to learn here')
+  with pytest.raises(errors.SpecError, match='not a network'):
+    network_files.load(path)
+
+
+def test_networks_for_action_sets_that_nobody_knows_are_refused(shipped):
+  arrays = _arrays(shipped)
+  header = json.loads(arrays['header'].tobytes())
+  header['action_set_version'] = 2
+  arrays['header'] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+  buffer = io.BytesIO()
+  np.savez(buffer, **arrays)
+  with pytest.raises(errors.SpecError, match=r"^net.npz: .*'dmlab_like' v2"):
+    network_files.from_bytes(buffer.getvalue(), 'net.npz')
+
+
+def test_a_network_for_fewer_inputs_than_it_has_is_refused(shipped):
+  data = _with_header(shipped, features=shipped.header.features[1:])
+  with pytest.raises(errors.SpecError, match='weight_0'):
+    network_files.from_bytes(data, 'net.npz')
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        ({'senses/velocity': None}, "'senses/velocity' is not seen here"),
+        ({'senses/ray_distances': None}, "'senses/ray_distances' is not seen"),
+        ({'senses/heading': np.zeros((256, 3))}, r'shape \(256, 3\), expected'),
+    ],
+)
+def test_a_network_that_sees_something_else_says_so(
+    shipped, views, change, complaint
+):
+  seen = {
+      name: value
+      for name, value in {**views, **change}.items()
+      if value is not None
+  }
+  with pytest.raises(errors.SpecError, match=complaint):
+    network.outputs(shipped, seen, (256,))

@@ -1,0 +1,126 @@
+import numpy as np
+from PIL import Image
+import pytest
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.evaluation import evaluate
+from realab_suite.experiments import scripted
+from realab_suite.experiments import tracking
+from realab_suite.reports import films
+from realab_suite.reports import plots
+from tests.experiments import small
+
+
+def _load(design='instantaneous_reward'):
+  return suite.load(
+      'unlock_door',
+      'near',
+      task_kwargs={'random': 4},
+      environment_kwargs={'max_steps': 40},
+      design=design,
+  )
+
+
+def _track(design='instantaneous_reward'):
+  env = _load(design)
+  recorder = tracking.Tracker(env)
+  evaluate.evaluate(env, policies.make('random'), 1, sinks=[recorder])
+  env.close()
+  return recorder.track
+
+
+@pytest.mark.parametrize('num_runs', [1, 4])
+def test_plots_of_any_number_of_runs_are_drawn_without_a_warning(
+    tmp_path, num_runs
+):
+  tracks = {f'run {i}': _track() for i in range(num_runs)}
+  plots.draw_trajectories(tracks, tmp_path / 'world.png')
+  plots.draw_time_line(tracks, tmp_path / 'time.png')
+  for name in ('world.png', 'time.png'):
+    with Image.open(tmp_path / name) as image:
+      assert 400 < image.width <= 1250
+      assert len(image.getcolors(2**24)) > 50
+
+
+def test_where_somebody_went_shows(tmp_path):
+  track = _track()
+  plots.draw_trajectories({'run': track}, tmp_path / 'moved.png')
+  track.positions = [track.positions[0]] * len(track.positions)
+  plots.draw_trajectories({'run': track}, tmp_path / 'still.png')
+  moved = (tmp_path / 'moved.png').read_bytes()
+  assert moved != (tmp_path / 'still.png').read_bytes()
+
+
+def test_a_world_without_registers_is_drawn(tmp_path):
+  settings = small.settings(
+      tmp_path / 'new', design='none', policies=('no_op',), channels=()
+  )
+  pictures = scripted.Pictures(plots.draw, None)
+  scripted.run(settings, lambda line: None, pictures)
+  drawn = [path.name for path in (tmp_path / 'new' / 'plots').iterdir()]
+  assert drawn == ['trajectories.png']
+
+
+def test_a_strip_grows_by_a_lane_per_feedback_register():
+  with_feedback = films.draw_strip('run', _track(), 480)
+  without = films.draw_strip('run', _track('none'), 480)
+  assert with_feedback.shape[1:] == without.shape[1:] == (480, 3)
+  assert with_feedback.shape[0] > without.shape[0]
+
+
+def test_a_strip_shows_what_was_read():
+  track = _track()
+  before = films.draw_strip('run', track, 480)
+  track.registers['reward'].reading[-1] += 7.0
+  after = films.draw_strip('run', track, 480)
+  assert (before != after).any()
+
+
+def test_frames_have_the_even_sizes_that_codecs_want():
+  strip = films.draw_strip('run', _track(), 480)
+  assert (films.HEIGHT + strip.shape[0]) % 2 == 0
+  assert not any(width % 2 for width in films.WIDTHS.values())
+
+
+@pytest.mark.camera
+def test_a_film_has_a_frame_per_step_and_one_for_the_start(tmp_path):
+  from imageio import v3 as imageio
+
+  env = _load()
+  with films.Film(env, tmp_path / 'film.mp4', 'run', ['top_down']) as film:
+    recorder = tracking.Tracker(env, film.add)
+    evaluate.evaluate(env, policies.make('random'), 1, sinks=[recorder])
+  frames = imageio.imread(tmp_path / 'film.mp4', plugin='pyav')
+  assert len(frames) == 41
+  assert frames.shape[2] == films.WIDTHS['top_down']
+  meta = imageio.immeta(tmp_path / 'film.mp4', plugin='pyav')
+  assert meta['fps'] == 10
+  assert meta['codec'] == 'h264'
+  view = frames[:, : films.HEIGHT]
+  assert np.ptp(view[0]) > 100
+  assert np.abs(view[0].astype(int) - view[-1]).max() > 50
+
+
+@pytest.mark.camera
+def test_a_film_is_never_overwritten(tmp_path):
+  (tmp_path / 'film.mp4').write_text('mine')
+  env = _load()
+  with pytest.raises(errors.ResultsError, match='exists'):
+    films.Film(env, tmp_path / 'film.mp4', 'run')
+  assert (tmp_path / 'film.mp4').read_text() == 'mine'
+
+
+@pytest.mark.camera
+def test_filming_does_not_change_what_happens(tmp_path):
+  policy_of = {'policies': ('random',), 'channels': (), 'seeds': (3,)}
+  for name, film in (('plain', None), ('filmed', films.all_views)):
+    scripted.run(
+        small.settings(tmp_path / name, **policy_of),
+        lambda line: None,
+        scripted.Pictures(None, film),
+    )
+  assert small.rows(tmp_path / 'plain') == small.rows(tmp_path / 'filmed')
+  names = sorted(path.name for path in (tmp_path / 'filmed/videos').iterdir())
+  assert names == ['random_first_person.mp4', 'random_top_down.mp4']
