@@ -42,8 +42,8 @@ from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_physics
 from realab_suite.engine import seeding
-from realab_suite.evaluation import ledger
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.evaluation import ledgers
+from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import unlock_door
 
@@ -130,7 +130,7 @@ class StockTask(composer.Task):
 
   def __init__(self, dof: str) -> None:
     self._world = unlock_door.UnlockDoor()
-    mechanism = feedback_mechanism.FeedbackMechanism(
+    mechanism = mechanisms.FeedbackMechanism(
         specs.load('instantaneous_reward', (f'dof={dof}',))
     )
     mechanism.attach_to(self._world.root_entity)
@@ -200,7 +200,7 @@ class _Stock:
 
 
 def _load(
-    num_worlds: int,
+    num_envs: int,
     design: str | Mapping[str, Any] = 'instantaneous_reward',
     dof: str = 'free',
     sleep: bool = False,
@@ -210,12 +210,12 @@ def _load(
       'unlock_door',
       'standard',
       {'random': _SEED},
-      num_envs=num_worlds,
+      num_envs=num_envs,
       sleep=sleep,
       design=design,
       overrides=(f'dof={dof}',),
   )
-  env.add_sink(ledger.BatchLedger())
+  env.add_sink(ledgers.BatchLedger())
   return env
 
 
@@ -224,7 +224,7 @@ def _draw(
 ) -> np.ndarray:
   spec = env.action_spec()
   return np.random.default_rng(_SEED).uniform(
-      spec.minimum, spec.maximum, (num_steps, env.num_worlds, *spec.shape)
+      spec.minimum, spec.maximum, (num_steps, env.num_envs, *spec.shape)
   )
 
 
@@ -257,7 +257,7 @@ def _record(
   physics = env.physics
   model, true = physics.model.ptr, physics._batch
   raw, ray_batch = (
-      mujoco_batch.Batch(model, env.num_worlds, true.nthread) for _ in range(2)
+      mujoco_batch.Batch(model, env.num_envs, true.nthread) for _ in range(2)
   )
   start = true.state.copy()
   raw.state[:] = start
@@ -361,7 +361,7 @@ def _break_down_step(
       env.step(action)
 
   split = _split(parts, play)
-  unit = len(actions) * env.num_worlds
+  unit = len(actions) * env.num_envs
   return [
       timing.Figure(
           f'  {label}, {calls / len(actions):g} a step',
@@ -392,7 +392,7 @@ def _break_down_reset(
   split = _split(parts, env.reset)
   return [
       timing.Figure(
-          f'  {label}', np.array([1e3 * seconds / env.num_worlds]), 'ms'
+          f'  {label}', np.array([1e3 * seconds / env.num_envs]), 'ms'
       )
       for label, (seconds, _) in split.items()
   ]
@@ -523,7 +523,7 @@ def _resident_mib() -> float:
   return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
-def measure_memory(num_worlds: int, sleep: bool) -> None:
+def measure_memory(num_envs: int, sleep: bool) -> None:
   """Prints the MiB before worlds are made, with one, and with many."""
   single = suite.load(
       'unlock_door', 'standard', {'random': _SEED},
@@ -532,7 +532,7 @@ def measure_memory(num_worlds: int, sleep: bool) -> None:
   before = _resident_mib()
   single.close()
   readings = [before]
-  for number in (1, num_worlds):
+  for number in (1, num_envs):
     env = _load(number, sleep=sleep)
     env.reset()
     env.step(_draw(env, 1)[0])

@@ -47,7 +47,7 @@ def _draw(env: environment.Environment) -> float:
   camera, physics = env.task.avatar.camera, env.physics
   began = time.perf_counter()
   for _ in range(_STEPS):
-    cameras.look(physics, camera, *_SIZE)
+    cameras.render(physics, camera, *_SIZE)
   return (time.perf_counter() - began) / _STEPS
 
 
@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
   )
   # The implementation for any physics is dm_control's own.
   by_dm_control = mock.patch.object(
-      cameras, 'look', cameras.look.dispatch(object)
+      cameras, 'look', cameras.render.dispatch(object)
   )
 
   def play_as_dm_control() -> float:

@@ -23,10 +23,10 @@ from unittest import mock
 import numpy as np
 
 from benchmarks import timing
-from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import monitors
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import requirements
-from realab_suite.experiments import spec
 from realab_suite.experiments import threads
 from realab_suite.experiments import training
 
@@ -52,7 +52,7 @@ _TARGETS = {'planar, asleep': 15.0, 'free, asleep': 10.0}
 class _Trainee:
   """A learner and its worlds, in the middle of training."""
 
-  def __init__(self, dof: str, sleep: bool, seed: int, num_worlds: int) -> None:
+  def __init__(self, dof: str, sleep: bool, seed: int, num_envs: int) -> None:
     run = {
         'design': 'instantaneous_reward',
         'overrides': [
@@ -60,7 +60,7 @@ class _Trainee:
             'action_set={name: dmlab_like, version: 1}',
         ],
     }
-    experiment = spec.load(
+    experiment = experiment_specs.load(
         {
             'schema': 1,
             'name': 'benchmark',
@@ -70,9 +70,9 @@ class _Trainee:
         }
     )
     (job,) = jobs.plan(experiment)
-    self.batch = training.load_batch(job, num_worlds, seed, sleep)
+    self.batch = training.load_batch(job, num_envs, seed, sleep)
     self.batch.add_sink(
-        monitors.TrainingMonitor(self.batch.mechanism, num_worlds)
+        monitors.TrainingMonitor(self.batch.mechanism, num_envs)
     )
     self.learner: Any = training.make_learner(job, self.batch)
     self._time_step = self.batch.reset()
@@ -110,11 +110,11 @@ def _work(
     pipe: connection.Connection,
     kinds: Mapping[str, tuple[str, bool]],
     seed: int,
-    num_worlds: int,
+    num_envs: int,
 ) -> None:
   """Trains what it is told to, until there is nothing more to do."""
   trainees = {
-      name: _Trainee(*kind, seed, num_worlds) for name, kind in kinds.items()
+      name: _Trainee(*kind, seed, num_envs) for name, kind in kinds.items()
   }
   pipe.send(None)
   while (order := pipe.recv()) is not None:

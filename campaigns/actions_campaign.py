@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import events
@@ -30,7 +30,7 @@ from tests import worlds
 from tests.engine import helpers
 
 NUM_ACTIONS = 100_000
-NUM_WORLDS = 3
+NUM_ENVS = 3
 _MAX_STEPS = 10
 _HOSTILE_BEFORE_GOOD = 5
 _MAX_LENGTH = 400  # Of a message.
@@ -42,20 +42,20 @@ class Case(NamedTuple):
   name: str
   design: str
   overrides: tuple[str, ...]
-  num_worlds: int | None
+  num_envs: int | None
 
   def load(self, seed: int) -> Any:
     """Returns a new environment of this kind, or a batch."""
     arguments = 'collect_apples', 'standard', {'random': seed}
     options = {'max_steps': _MAX_STEPS}
-    if self.num_worlds is None:
+    if self.num_envs is None:
       return suite.load(
           *arguments, options, design=self.design, overrides=self.overrides
       )
     return suite.load_batch(
         *arguments,
         options,
-        num_envs=self.num_worlds,
+        num_envs=self.num_envs,
         num_threads=1,
         design=self.design,
         overrides=self.overrides,
@@ -72,8 +72,8 @@ _ACTIONS = {
     ),
 }
 CASES = [
-    Case(f'{name}, {words}', *design, num_worlds)
-    for num_worlds, words in ((None, 'one world'), (NUM_WORLDS, 'batch'))
+    Case(f'{name}, {words}', *design, num_envs)
+    for num_envs, words in ((None, 'one world'), (NUM_ENVS, 'batch'))
     for name, design in _ACTIONS.items()
 ]
 
@@ -246,7 +246,7 @@ def fingerprint(env: Any, counter: Counter) -> bytes:
   """
   digest = hashlib.sha256()
   physics = env.physics
-  if hasattr(env, 'num_worlds'):
+  if hasattr(env, 'num_envs'):
     digest.update(np.ascontiguousarray(physics.state).tobytes())
   else:
     digest.update(worlds.state_bytes(physics))
@@ -285,7 +285,7 @@ def _canonical(value: Any) -> bytes:
 def good_action(env: Any, rng: np.random.Generator) -> np.ndarray:
   """Draws an action that fits, for one world or for all."""
   spec = env.action_spec()
-  lead = (env.num_worlds,) if hasattr(env, 'num_worlds') else ()
+  lead = (env.num_envs,) if hasattr(env, 'num_envs') else ()
   return np.asarray(helpers.draw(spec, lead, rng))
 
 
@@ -381,7 +381,7 @@ def play(
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = lines_lib.Lines('C27', seed)
+  lines = figure_lines.Lines('C27', seed)
   number = max(60, round(scale * NUM_ACTIONS / len(CASES)))
   for i, case in enumerate(CASES):
     found = play(case, number, seed + i)
@@ -398,4 +398,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.entities import arenas
@@ -136,12 +136,12 @@ class Bulldozers:
     self.blocks = [b for r in self.registers for b in r.blocks]
     self.geoms = [block.geom for block in self.blocks]
     self.half_sizes = np.array([block.half_size for block in self.blocks])
-    self._everyone = np.arange(env.num_worlds)
+    self._everyone = np.arange(env.num_envs)
     self._new_errands()
 
   def _new_errands(self) -> None:
     """Gives every pusher something else to do."""
-    number, rng = self._env.num_worlds, self._rng
+    number, rng = self._env.num_envs, self._rng
     arena = self._env.task.root_entity
     self._mode = rng.integers(0, 4, number)
     self._block = rng.integers(0, len(self.blocks), number)
@@ -309,7 +309,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
     total = total.plus(found)
     for words in found.worst[:4]:
       print(f'# {domain} seed {seed + i}: {words}', flush=True)
-  report = lines.Lines('C30', seed)
+  report = figure_lines.Lines('C30', seed)
   report.at_least('control steps', total.num_steps, rounds * steps * PUSHERS)
   for reached in ('moving', 'at_walls', 'lifted', 'held', 'through'):
     report.at_least(
@@ -323,4 +323,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

@@ -15,7 +15,7 @@ import itertools
 import multiprocessing
 from typing import NamedTuple
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import suite
 from tests import worlds
 from tests.engine import helpers
@@ -126,7 +126,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
       _PROCESSES, multiprocessing.get_context('spawn')
   ) as pool:
     results = list(pool.map(_check, [(case, steps) for case in todo]))
-  report = lines.Lines('C02', seed)
+  report = figure_lines.Lines('C02', seed)
   report.at_least('runs', len(results), len(suite.ALL_TASKS) * SEEDS)
   report.at_least(
       'time steps compared',
@@ -146,4 +146,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

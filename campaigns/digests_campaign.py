@@ -20,7 +20,7 @@ import sys
 import tempfile
 from typing import Any, NamedTuple
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import environment
 from tests.engine import helpers
@@ -141,7 +141,7 @@ def num_distinct(
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints the figures and returns the number of targets missed."""
-  lines = campaign_lines.Lines('C03', seed)
+  lines = figure_lines.Lines('C03', seed)
   chosen = cases(max(1, int(NUM_CASES * scale)), SEEDS, seed)
   steps = max(30, int(STEPS * scale))
   found = num_distinct(chosen, steps, list(_PROCESSES))
@@ -161,4 +161,4 @@ if __name__ == '__main__':
     _steps, _chosen = json.load(sys.stdin)
     print(json.dumps([in_process(Case(*c), _steps) for c in _chosen]))
     sys.exit(0)
-  campaign_lines.run(main)
+  figure_lines.run(main)

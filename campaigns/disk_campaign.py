@@ -23,8 +23,8 @@ from typing import Any, final
 
 import numpy as np
 
+from campaigns import figure_lines
 from campaigns import kill_campaign
-from campaigns import lines as lines_lib
 from campaigns import victims
 from campaigns import zygote
 from realab_suite.experiments import storage
@@ -148,7 +148,7 @@ def largest_file(killer: kill_campaign.Killer) -> int:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
-  lines = lines_lib.Lines('C37', seed)
+  lines = figure_lines.Lines('C37', seed)
   with (
       tempfile.TemporaryDirectory() as folder,
       zygote.Zygote(victims.__name__) as nursery,
@@ -177,4 +177,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

@@ -19,16 +19,16 @@ import dm_env
 import mujoco
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import events
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 
 DRILLS = 200
 KINDS = ('BADQPOS', 'BADQVEL', 'BADQACC', 'BADCTRL', 'CONTACTFULL')
-NUM_WORLDS = 3
+NUM_ENVS = 3
 _STEPS_BEFORE = 12
 _STEPS_AFTER = 5
 _DOMAIN, _TASK, _DESIGN = 'unlock_door', 'near', 'value_advice'
@@ -92,7 +92,7 @@ def draw(kind: str, num_substeps: int, rng: np.random.Generator) -> Drill:
       int(rng.integers(0, latest)),
       float(rng.choice(_AWFUL)),
       int(rng.integers(0, 1_000)),
-      int(rng.integers(0, NUM_WORLDS)),
+      int(rng.integers(0, NUM_ENVS)),
   )
 
 
@@ -160,7 +160,7 @@ def _load_single(seed: int, world: int = 0) -> Any:
 
 def _load_batch(seed: int) -> Any:
   return suite.load_batch(
-      _DOMAIN, _TASK, {'random': seed}, num_envs=NUM_WORLDS, design=_DESIGN
+      _DOMAIN, _TASK, {'random': seed}, num_envs=NUM_ENVS, design=_DESIGN
   )
 
 
@@ -217,7 +217,7 @@ def drill_batch(
   ledger = ledgers.BatchLedger()
   batch.add_sink(ledger)
   actions = [
-      np.stack([action] * NUM_WORLDS)
+      np.stack([action] * NUM_ENVS)
       for action in helpers.random_actions(clean, 40, seed)
   ]
   last, _ = batch.reset(), twin.reset()
@@ -247,7 +247,7 @@ def drill_batch(
       for name, value in found.observation.items()
   )
   censored = flagged and not episode.is_valid
-  others = [i for i in range(NUM_WORLDS) if i != world]
+  others = [i for i in range(NUM_ENVS) if i != world]
   harmed = _differs(found, twin.step(actions[drill.step]), others)
   clean.rewind(1)
   is_mid, is_clean = False, True
@@ -277,7 +277,7 @@ def _differs(found: Any, expected: Any, places: list[int]) -> bool:
 def run(kind: str, number: int, seed: int, *, in_batch: bool) -> Result:
   """Returns what came of failures of one kind."""
   rng = np.random.default_rng((seed, KINDS.index(kind)))
-  clean = [_load_single(seed, world) for world in range(NUM_WORLDS)]
+  clean = [_load_single(seed, world) for world in range(NUM_ENVS)]
   env, *batches = _load_single(seed), _load_batch(seed), _load_batch(seed)
   total = Result()
   for i in range(number):
@@ -295,7 +295,7 @@ def run(kind: str, number: int, seed: int, *, in_batch: bool) -> Result:
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
   number = max(1, int(DRILLS * scale))
-  report = lines.Lines('C33', seed)
+  report = figure_lines.Lines('C33', seed)
   for in_batch in (False, True):
     where = 'batch' if in_batch else 'single'
     for kind in KINDS:
@@ -312,4 +312,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

@@ -22,10 +22,10 @@ import warnings
 
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import results
 from realab_suite.experiments import probes
@@ -289,7 +289,7 @@ def run(number: int, seed: int, events: Events) -> dict[str, Figures]:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = lines_lib.Lines('C23', seed)
+  lines = figure_lines.Lines('C23', seed)
   events = Events()
   found = run(round(scale * NUM_DAMAGED), seed, events)
   for name, figures in found.items():
@@ -304,4 +304,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

@@ -27,13 +27,13 @@ from dm_control.locomotion.tasks import go_to_target
 from dm_control.locomotion.walkers import jumping_ball
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from campaigns import processes_campaign
 from realab_suite import suite
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests.engine import helpers
 
-NUM_WORLDS = 4
+NUM_ENVS = 4
 POINTS = 12
 _PROCESSES = 2
 _TARGET = 1.0  # MiB per 1e5 steps and per 1,000 resets.
@@ -179,7 +179,7 @@ def load(case: Case, seed: int = 0) -> Any:
   arguments = 'unlock_door', 'standard', {'random': seed, **camera}
   if case.world in ('single', 'camera'):
     return suite.load(*arguments, design=design)
-  return suite.load_batch(*arguments, num_envs=NUM_WORLDS, design=design)
+  return suite.load_batch(*arguments, num_envs=NUM_ENVS, design=design)
 
 
 def measure(case: Case) -> float:
@@ -215,7 +215,7 @@ def limit_addresses() -> None:
 
 def _stepper(env: Any, case: Case) -> Callable[[], Any]:
   """Returns what takes a random step."""
-  shape = (NUM_WORLDS,) if case.world == 'batch' else ()
+  shape = (NUM_ENVS,) if case.world == 'batch' else ()
   size = int(np.prod(shape, dtype=int))
   draws = np.array(helpers.random_actions(env, _PERIOD * size))
   actions = draws.reshape(_PERIOD, *shape, *env.action_spec().shape)
@@ -269,4 +269,4 @@ def _measure_and_report(cases: list[Case], scale: float) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

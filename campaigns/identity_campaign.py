@@ -17,18 +17,18 @@ from typing import Any, NamedTuple
 import dm_env
 import numpy as np
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.policies import action_sets
 from tests import worlds
 from tests.engine import helpers
 
 SEEDS = 3
 STEPS = 300
-NUM_WORLDS = 3
+NUM_ENVS = 3
 _PROCESSES = 2
 _MAX_STEPS = 120  # So that every run goes through the ends of episodes.
 _REPEATS = 6  # Who changes his mind in each step gets nowhere.
@@ -65,7 +65,7 @@ class Case(NamedTuple):
         self.task,
         {'random': self.seed},
         {'max_steps': _MAX_STEPS},
-        num_envs=NUM_WORLDS,
+        num_envs=NUM_ENVS,
         num_threads=self.num_threads,
         design=self.design,
         overrides=self.overrides,
@@ -161,13 +161,13 @@ def play_together(case: Case, steps: int) -> list[Transcript]:
   env = case.load_batch()
   ledger = ledgers.BatchLedger()
   env.add_sink(ledger)
-  everywhere = range(NUM_WORLDS)
+  everywhere = range(NUM_ENVS)
   actions = np.stack(
       [_actions(env, case, world, steps) for world in everywhere], axis=1
   )
   time_step = env.reset()
   transcripts: list[list[dict[str, bytes]]] = [[] for _ in everywhere]
-  num_held = np.zeros(NUM_WORLDS, int)
+  num_held = np.zeros(NUM_ENVS, int)
   for i in range(steps + 1):
     for world, transcript in enumerate(transcripts):
       transcript.append(
@@ -320,7 +320,7 @@ def _compare_steps(arguments: tuple[Case, int]) -> Result:
 
 
 def _report(
-    lines: campaign_lines.Lines, name: str, results: Sequence[Result]
+    lines: figure_lines.Lines, name: str, results: Sequence[Result]
 ) -> None:
   """Prints figures."""
   differing = sum(bool(result.differences) for result in results)
@@ -333,7 +333,7 @@ def _report(
 
 def main(seeds: int = SEEDS, steps: int = STEPS) -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = campaign_lines.Lines('identity', seed=0)
+  lines = figure_lines.Lines('identity', seed=0)
   with futures.ProcessPoolExecutor(
       _PROCESSES, multiprocessing.get_context('spawn')
   ) as pool:
@@ -351,4 +351,4 @@ def main(seeds: int = SEEDS, steps: int = STEPS) -> int:
 
 
 if __name__ == '__main__':
-  campaign_lines.run(main)
+  figure_lines.run(main)

@@ -19,7 +19,7 @@ import tempfile
 from typing import NamedTuple, final
 import venv
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 
 _ROOT = pathlib.Path(__file__).parents[1]
 _PATIENCE_SECONDS = 1800
@@ -101,7 +101,7 @@ def _run(
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
   del scale
-  lines = lines_lib.Lines('C46', seed)
+  lines = figure_lines.Lines('C46', seed)
   with tempfile.TemporaryDirectory() as name:
     folder = pathlib.Path(name)
     # A copy, as building leaves files behind.
@@ -130,4 +130,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

@@ -32,12 +32,12 @@ import warnings
 import numpy as np
 import yaml
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from campaigns import victims
 from campaigns import zygote
 from realab_suite.evaluation import results
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import spec
 from realab_suite.experiments import training
 
 RANDOM_KILLS = 300
@@ -72,7 +72,7 @@ class Killer:
     self._root = root
     self._experiment = root / 'experiment.yaml'
     self._experiment.write_text(yaml.safe_dump(victims.EXPERIMENT))
-    [self.job] = jobs.plan(spec.load(self._experiment))
+    [self.job] = jobs.plan(experiment_specs.load(self._experiment))
     count = root / 'count'
     for name in ('first', 'whole'):
       # The first one imports what the others find there.
@@ -209,7 +209,7 @@ def rows_of(killer: Killer, count: int) -> list[results.EpisodeRow]:
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
   rng = np.random.default_rng(seed)
-  lines = lines_lib.Lines('C36', seed)
+  lines = figure_lines.Lines('C36', seed)
   with (
       tempfile.TemporaryDirectory() as folder,
       zygote.Zygote(victims.__name__) as nursery,
@@ -249,4 +249,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

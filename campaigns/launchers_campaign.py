@@ -23,12 +23,12 @@ from typing import Any, final
 import numpy as np
 import yaml
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from campaigns import victims
 from campaigns import zygote
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from tests import patience
 
@@ -80,7 +80,7 @@ def sweep(
   """
   tally = Tally()
   options, output = _prepare(root, num_jobs)
-  planned = jobs.plan(spec.load(experiment(num_jobs)))
+  planned = jobs.plan(experiment_specs.load(experiment(num_jobs)))
   release = root / 'release'
   options |= {'held': planned[-1].folder(), 'release': str(release)}
   while tally.kills < kills:
@@ -153,7 +153,7 @@ def _try_another(
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
-  lines = lines_lib.Lines('C38', seed)
+  lines = figure_lines.Lines('C38', seed)
   rng = np.random.default_rng(seed)
   kills = max(round(scale * KILLS), 1)
   num_jobs = max(round(scale * JOBS / 2), 2) * 2
@@ -173,4 +173,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

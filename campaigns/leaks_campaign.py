@@ -21,7 +21,7 @@ import warnings
 
 import numpy as np
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from tests.leaks import contract
 from tests.leaks import failures
 from tests.leaks import mutants
@@ -202,14 +202,14 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
   printed = []
 
-  def lines(campaign: str) -> campaign_lines.Lines:
-    printed.append(campaign_lines.Lines(campaign, seed))
+  def lines(campaign: str) -> figure_lines.Lines:
+    printed.append(figure_lines.Lines(campaign, seed))
     return printed[-1]
 
   def some(number: int) -> int:
     return max(4, int(scale * number))
 
-  cases = [*contract.all_cases(), *contract.all_cases(num_worlds=2)]
+  cases = [*contract.all_cases(), *contract.all_cases(num_envs=2)]
   cases = cases[:: max(1, round(1 / scale))]
   good, found = contract_complaints(cases)
   _explain(found)
@@ -260,11 +260,11 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   lines('C11').at_most('keys outside the allowlist', len(found), 0)
 
   c12 = lines('C12')
-  for num_worlds in (0, 2):
-    case = pairs.Case(num_worlds=num_worlds, steps=3)
+  for num_envs in (0, 2):
+    case = pairs.Case(num_envs=num_envs, steps=3)
     public = walk.find(case)
     _explain(public)
-    c12.at_most(f'secrets by public names, view {num_worlds}', len(public), 0)
+    c12.at_most(f'secrets by public names, view {num_envs}', len(public), 0)
     # No promise: within one process private names are a courtesy.
     private = len(walk.secrets_reached(case))
     print(f'# C12 {private} of {walk.NUM_SECRETS} by private names')
@@ -289,4 +289,4 @@ def _explain(texts: list[str]) -> None:
 if __name__ == '__main__':
   # Walking about touches what others have deprecated.
   warnings.simplefilter('ignore', DeprecationWarning)
-  campaign_lines.run(main)
+  figure_lines.run(main)

@@ -15,14 +15,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from realab_suite.engine import events
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
 from tests.evaluation import streams
 
 STREAMS = 5_000
-_NUM_WORLDS = 4
+_NUM_ENVS = 4
 _ENDS = [*events.End]
 
 
@@ -61,17 +61,17 @@ def together(rng: np.random.Generator) -> tuple[int, int]:
   """
   ledger = ledgers.BatchLedger()
   played: list[list[list[list[streams.Record]]]] = [
-      [] for _ in range(_NUM_WORLDS)
+      [] for _ in range(_NUM_ENVS)
   ]
-  is_open = np.zeros(_NUM_WORLDS, bool)
+  is_open = np.zeros(_NUM_ENVS, bool)
   for _ in range(rng.integers(1, 20)):
-    is_first = ~is_open | (rng.random(_NUM_WORLDS) < 0.1)
-    has_failed = ~is_first & (rng.random(_NUM_WORLDS) < 0.1)
+    is_first = ~is_open | (rng.random(_NUM_ENVS) < 0.1)
+    has_failed = ~is_first & (rng.random(_NUM_ENVS) < 0.1)
     now = np.where(is_first, 0, 1)
     initial, records, reads = (
         _of_all(rng, step) for step in (0 * now, 0 * now + 1, now)
     )
-    over = has_failed | (rng.random(_NUM_WORLDS) < 0.1)
+    over = has_failed | (rng.random(_NUM_ENVS) < 0.1)
     ends = {
         world: events.End.DIVERGENCE if failed else events.End.TIMEOUT
         for world, failed in enumerate(has_failed)
@@ -79,12 +79,12 @@ def together(rng: np.random.Generator) -> tuple[int, int]:
     }
     ledger.step_ended(
         events.BatchStep(
-            seed=np.zeros(_NUM_WORLDS, int),
-            world=np.arange(_NUM_WORLDS),
+            seed=np.zeros(_NUM_ENVS, int),
+            world=np.arange(_NUM_ENVS),
             episode=np.array([len(one) for one in played]),
             is_first=is_first, has_failed=has_failed, ends=ends,
             initial=initial, records=records, agent_reads=reads,
-            true_reward=np.zeros(_NUM_WORLDS),
+            true_reward=np.zeros(_NUM_ENVS),
         )
     )  # fmt: skip
     for world, episodes in enumerate(played):
@@ -110,10 +110,7 @@ def _of_all(rng: np.random.Generator, step: np.ndarray) -> list[streams.Record]:
       type(record)(
           *record[:2],
           step,
-          *(
-              value + rng.integers(-9, 9, _NUM_WORLDS) / 8
-              for value in record[3:]
-          ),
+          *(value + rng.integers(-9, 9, _NUM_ENVS) / 8 for value in record[3:]),
       )
       for record in alone
   ]
@@ -157,7 +154,7 @@ def compare(count: int, rng: np.random.Generator) -> tuple[int, int]:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
-  lines = lines_lib.Lines('C41', seed)
+  lines = figure_lines.Lines('C41', seed)
   count = round(scale * STREAMS)
   compared, wrong = compare(count, np.random.default_rng(seed))
   lines.at_least('streams', compared, count)
@@ -169,4 +166,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

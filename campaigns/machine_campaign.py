@@ -27,13 +27,13 @@ from hypothesis import stateful
 from hypothesis import strategies as st
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from campaigns import readings_campaign
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.feedback import providers
 from tests import worlds
 from tests.engine import helpers
@@ -385,7 +385,7 @@ REACHED = (
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = lines_lib.Lines('C28', seed)
+  lines = figure_lines.Lines('C28', seed)
   logging.set_verbosity(logging.ERROR)  # Of physics that fail on purpose.
   number = max(50, round(scale * NUM_SEQUENCES))
   COUNTS.clear()
@@ -400,4 +400,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

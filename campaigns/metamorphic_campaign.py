@@ -19,7 +19,7 @@ from typing import Any, final
 
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from campaigns import rows_campaign
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
@@ -229,7 +229,7 @@ def violations(times: int, rng: np.random.Generator) -> list[str]:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
-  lines = lines_lib.Lines('C42', seed)
+  lines = figure_lines.Lines('C42', seed)
   times = round(scale * TIMES)
   broken = violations(times, np.random.default_rng(seed))
   lines.at_least('relations tried', times, len(RELATIONS))
@@ -240,4 +240,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

@@ -22,7 +22,7 @@ from typing import Literal, NamedTuple, final
 
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from tests.leaks import mutants as leaks
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -58,8 +58,8 @@ _EPISODES = 'engine/episodes.py'
 _HOSTS = 'engine/hosts.py'
 _OBSERVING = 'engine/observing.py'
 _ENV = ('tests/engine/environment_test.py',)
-_ACTIONS = 'engine/actions.py'
-_MECHANISM = 'feedback/mechanism.py'
+_ACTIONS = 'engine/action_codec.py'
+_MECHANISM = 'feedback/mechanisms.py'
 _MECH = ('tests/feedback/mechanism_test.py',)
 _REGISTER = 'entities/registers/base.py'
 _TWO_BLOCK = 'entities/registers/two_block.py'
@@ -159,7 +159,7 @@ MUTANTS = [
     ),
     Mutant(
         'contract', 'finding 9: a snapshot lacks time and warm start',
-        'engine/snapshot.py', 'mujoco.mjtState.mjSTATE_INTEGRATION',
+        'engine/snapshots.py', 'mujoco.mjtState.mjSTATE_INTEGRATION',
         'mujoco.mjtState.mjSTATE_PHYSICS',
         ('tests/engine/snapshot_test.py',),
     ),
@@ -543,7 +543,7 @@ def mutated(mutant: Mutant, text: str) -> str:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
-  lines = lines_lib.Lines('C44', seed)
+  lines = figure_lines.Lines('C44', seed)
   rng = np.random.default_rng(seed)
   missed: list[str] = []
   caught: dict[str, list[bool]] = {}
@@ -586,4 +586,4 @@ def _some(rng: np.random.Generator, count: int, scale: float) -> list[int]:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

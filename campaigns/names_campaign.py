@@ -18,17 +18,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import ledger as ledgers
-from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import monitors
 from realab_suite.experiments import aiming
 from realab_suite.feedback import specs
 from tests.engine import helpers
 
-_NUM_WORLDS = 2
+_NUM_ENVS = 2
 _NUM_STEPS = 30
 
 
@@ -100,18 +100,18 @@ def figures(domain: str, design: Any, seed: int) -> Iterator[tuple[str, str]]:
       'near',
       {'random': seed},
       {'max_steps': _NUM_STEPS},
-      num_envs=_NUM_WORLDS,
+      num_envs=_NUM_ENVS,
       **kwargs,
   )
   batch_ledger = ledgers.BatchLedger()
-  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_WORLDS)
+  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
   batch.add_sink(batch_ledger)
   batch.add_sink(monitor)
   generator = np.random.default_rng(seed)
   time_step = batch.reset()
   yield 'observation', ' '.join(time_step.observation)
   for _ in range(_NUM_STEPS):
-    actions = helpers.draw(batch.action_spec(), (_NUM_WORLDS,), generator)
+    actions = helpers.draw(batch.action_spec(), (_NUM_ENVS,), generator)
     time_step = batch.step(actions)
   yield 'last', repr(
       {key: value.tobytes() for key, value in time_step.observation.items()}
@@ -158,11 +158,11 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   number = max(1, round(scale * len(everything)))
   chosen = rng.choice(len(everything), number, replace=False)
   bad = [i for i in chosen if differing(everything[i], seed)]
-  printed = lines.Lines('names', seed)
+  printed = figure_lines.Lines('names', seed)
   printed.at_least('names tried', number, min(number, 100))
   printed.at_most('differing figures', len(bad), 0)
   return printed.num_missed
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

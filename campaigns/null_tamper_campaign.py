@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import suite
-from realab_suite.engine import physics as engine_physics
+from realab_suite.engine import single_physics
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import registers
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 
@@ -57,9 +57,9 @@ class Result(NamedTuple):
 class World(NamedTuple):
   """Registers of every variety, and an avatar."""
 
-  physics: engine_physics.ThinPhysics
+  physics: single_physics.ThinPhysics
   registers: list[registers.Register]
-  avatar: avatar_entity.Avatar
+  avatar: avatars.Avatar
 
 
 def make_world() -> World:
@@ -82,10 +82,10 @@ def make_world() -> World:
     place = (corner + _SPACING * column, corner + _SPACING * row)
     register.attach_to(arena, place, yaw)
     made.append(register)
-  avatar = avatar_entity.Avatar()
+  avatar = avatars.Avatar()
   arena.attach(avatar)
   avatar.make_graspable([block for r in made for block in r.blocks])
-  physics = worlds.compile_world(arena, engine_physics.ThinPhysics)
+  physics = worlds.compile_world(arena, single_physics.ThinPhysics)
   worlds.start_episode(physics, *made)
   # In the last place of the last row, where no register stands.
   avatar.place(physics, (-corner, -corner), 0.0)
@@ -110,7 +110,7 @@ def write_and_wait(
   """
   physics = world.physics
   worst, farthest = 0.0, 0.0
-  idle = np.zeros(len(avatar_entity.ACTIONS))
+  idle = np.zeros(len(avatars.ACTIONS))
   for register, block in _blocks(world):
     if register.channel != 'welded':
       physics.data.xfrc_applied[worlds.body_of(physics, block), 0] = (
@@ -180,7 +180,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   number = max(3, int(VALUES * scale))
   world = make_world()
   found = write_and_wait(world, values(number, seed))
-  report = lines.Lines('C29', seed)
+  report = figure_lines.Lines('C29', seed)
   report.at_least(
       'values written', found.num_written, number * len(world.registers)
   )
@@ -207,4 +207,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

@@ -28,14 +28,14 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 import realab_suite
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
-from realab_suite.experiments import scripted as scripted
-from realab_suite.experiments import spec as experiments
+from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from realab_suite.policies import network_files
@@ -238,15 +238,15 @@ def cases(outside: pathlib.Path) -> list[Case]:
   """Returns what to try; the working directory is one to write into."""
   found = []
   here = pathlib.Path('.')
-  experiment = experiments.load(_experiment())
+  experiment = experiment_specs.load(_experiment())
   for what, path in paths(outside).items():
     register = {**_REGISTER, 'options': {'file': path}}
     uses: dict[str, Callable[[], Any]] = {
         'design of an experiment': _from_file(
-            experiments.load, _experiment(runs={'one': {'design': path}})
+            experiment_specs.load, _experiment(runs={'one': {'design': path}})
         ),
         'weights in an override': _from_file(
-            experiments.load,
+            experiment_specs.load,
             _experiment(
                 runs={
                     'one': {
@@ -280,7 +280,7 @@ def cases(outside: pathlib.Path) -> list[Case]:
             for depth in (1, 3, 20)
         },
         'deep weights in an override': _from_file(
-            experiments.load,
+            experiment_specs.load,
             _experiment(
                 runs={
                     'one': {
@@ -320,15 +320,15 @@ def cases(outside: pathlib.Path) -> list[Case]:
             )
         ),
         'name of an experiment': _from_file(
-            experiments.load, _experiment(name=path)
+            experiment_specs.load, _experiment(name=path)
         ),
         'name of a run': _from_file(
-            experiments.load,
+            experiment_specs.load,
             _experiment(runs={path: {'design': 'online_imitation'}}),
         ),
-        'task': _from_file(experiments.load, _experiment(task=path)),
+        'task': _from_file(experiment_specs.load, _experiment(task=path)),
         'baseline': _from_file(
-            experiments.load, _experiment(baselines=[path])
+            experiment_specs.load, _experiment(baselines=[path])
         ),
         'name of a design': _from_file(specs.load, _design(name=path)),
         'name of a register': _from_file(
@@ -449,7 +449,7 @@ def traced() -> list[str]:
 
 def main() -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = lines_lib.Lines('C22', 0)
+  lines = figure_lines.Lines('C22', 0)
   found = run(Watch())
   lines.at_least('cases', found.tried, 40)
   lines.at_most('accepted', len(found.accepted), 0)
@@ -465,4 +465,4 @@ def main() -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import environment
 from tests.leaks import secrets
@@ -136,7 +136,7 @@ def _changes(
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = campaign_lines.Lines('C14', seed)
+  lines = figure_lines.Lines('C14', seed)
   most: dict[tuple[str, str], int] = {}
   pictures = 0
   for domain in suite.TASKS_BY_DOMAIN:
@@ -158,4 +158,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  campaign_lines.run(main)
+  figure_lines.run(main)

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite import suite
 from tests import patience
@@ -238,7 +238,7 @@ def main(share: float = 1.0, seed: int = 0) -> int:
   for result in results:
     if result.words:
       print(f'# {result.words}', flush=True)
-  report = lines.Lines('C35', seed)
+  report = figure_lines.Lines('C35', seed)
   report.at_least('combinations', len(results), number)
   report.at_least(
       'processes that used an environment',
@@ -259,4 +259,4 @@ if __name__ == '__main__':
   if sys.argv[1:2] == ['--cell']:
     _first(Cell(*json.loads(sys.argv[2])))
   else:
-    lines.run(main)
+    figure_lines.run(main)

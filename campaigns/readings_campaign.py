@@ -21,11 +21,11 @@ from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.feedback import providers
 from realab_suite.policies import random_keys
 from tests import worlds
@@ -238,7 +238,7 @@ def add_up(episodes: list[ledgers.EpisodeLedger], witness: Witness) -> Sums:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = lines_lib.Lines('C40', seed)
+  lines = figure_lines.Lines('C40', seed)
   number = round(scale * NUM_READS)
   found = play(number, seed)
   lines.at_least('reads', found.num_reads, number)
@@ -253,4 +253,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

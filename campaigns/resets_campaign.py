@@ -18,20 +18,20 @@ from typing import Any, NamedTuple
 from dm_control import composer
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import episodes
 from realab_suite.engine import events
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests.engine import helpers
 
 SPECS = 500
 RESETS = 20
 FAILURES = 2_000
 DEEPEST = 1e-3  # Metres.
-_NUM_WORLDS = 3
+_NUM_ENVS = 3
 _MAX_STEPS = 4
 
 
@@ -214,20 +214,20 @@ def fail_batch(number: int, seed: int) -> Failures:
   rng = np.random.default_rng(seed)
   batch = suite.load_batch(
       'unlock_door', 'near', {'random': seed},
-      {'max_steps': 2 * _MAX_STEPS}, num_envs=_NUM_WORLDS,
+      {'max_steps': 2 * _MAX_STEPS}, num_envs=_NUM_ENVS,
       design='instantaneous_reward',
   )  # fmt: skip
   ledger = ledgers.BatchLedger()
   batch.add_sink(ledger)
   begin, failing = _breakable(batch.task)
-  actions = np.zeros((_NUM_WORLDS, *batch.action_spec().shape))
+  actions = np.zeros((_NUM_ENVS, *batch.action_spec().shape))
   wrong = hidden = by_steps = 0
   for _ in range(number):
     by_step = bool(rng.integers(2))
     batch.reset()
     for _ in range(rng.integers(1, _MAX_STEPS)):
       batch.step(actions)
-    world = int(rng.integers(_NUM_WORLDS))
+    world = int(rng.integers(_NUM_ENVS))
     if by_step:
       view = batch.physics.world(world)
       side_room = np.array(batch.task.landmarks['side_room'])
@@ -242,7 +242,7 @@ def fail_batch(number: int, seed: int) -> Failures:
       wrong += 1
     except composer.EpisodeInitializationError:
       by_steps += by_step
-    last = [ledger.episodes(i)[-1] for i in range(_NUM_WORLDS)]
+    last = [ledger.episodes(i)[-1] for i in range(_NUM_ENVS)]
     allowed = events.End.ERROR if by_step else events.End.ABANDONED
     hidden += any(
         episode.end is not allowed
@@ -261,7 +261,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   found = begin_many(specs, RESETS, seed)
   for words in found.worst[:5]:
     print(f'# {words}', flush=True)
-  report = lines.Lines('C32', seed)
+  report = figure_lines.Lines('C32', seed)
   report.at_least('legal designs', found.num_specs, specs)
   report.at_least('refused designs', found.num_refused, 1)
   report.at_least('resets', found.num_resets, specs * RESETS)
@@ -282,4 +282,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

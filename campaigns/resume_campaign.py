@@ -19,9 +19,9 @@ import time
 import numpy as np
 import yaml
 
-from campaigns import lines
+from campaigns import figure_lines
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 
@@ -111,7 +111,7 @@ def main(kills: int = KILLS, seed: int = 0) -> int:
     root = pathlib.Path(folder)
     experiment = root / 'experiment.yaml'
     experiment.write_text(yaml.safe_dump(_EXPERIMENT))
-    [job] = jobs.plan(spec.load(experiment))
+    [job] = jobs.plan(experiment_specs.load(experiment))
     began = time.monotonic()
     finish(experiment, root / 'whole')
     # Between checkpoints, as far as the start of a process lets one guess.
@@ -137,4 +137,4 @@ def main(kills: int = KILLS, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

@@ -23,7 +23,7 @@ import warnings
 
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
@@ -259,7 +259,7 @@ def damage_many(times: int, rng: np.random.Generator) -> tuple[Tally, int, int]:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
-  lines = lines_lib.Lines('C39', seed)
+  lines = figure_lines.Lines('C39', seed)
   rng = np.random.default_rng(seed)
   tally, others, taken = damage_many(round(scale * TIMES), rng)
   lines.at_least('files of rows damaged', tally.damaged, scale * TIMES)
@@ -273,4 +273,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

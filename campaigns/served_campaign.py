@@ -23,7 +23,7 @@ from google.rpc import code_pb2
 import grpc
 import numpy as np
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from realab_suite.interop.rpc import refusals
 from tests.interop import served
 
@@ -118,7 +118,7 @@ def _settings(generator: Any, number: int) -> Iterator[bytes]:
     yield served.request(create_world=pb.CreateWorldRequest(settings=value))
 
 
-def run_c16(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+def run_c16(lines: figure_lines.Lines, scale: float, seed: int) -> None:
   with served.endlessly() as program:
     stream = served.RawStream(program.address)
     found = sweep(
@@ -328,7 +328,7 @@ def sequences(
   return seen, wrong
 
 
-def run_c24(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+def run_c24(lines: figure_lines.Lines, scale: float, seed: int) -> None:
   with served.endlessly() as program:
     pid = program.process.pid
     stream = served.connect_eventually(program.address)
@@ -366,8 +366,8 @@ _RUNS = {'C16': run_c16, 'C24': run_c24}
 
 def main(scale: float = 1.0, seed: int = 0, *names: str) -> int:
   """Prints the figures and returns the number of targets missed."""
-  return campaign_lines.print_all(_RUNS, scale, seed, names)
+  return figure_lines.print_all(_RUNS, scale, seed, names)
 
 
 if __name__ == '__main__':
-  campaign_lines.run(main)
+  figure_lines.run(main)

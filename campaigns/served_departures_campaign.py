@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, final
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 import grpc
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from campaigns import served_campaign
 from campaigns import zygote
 from tests import patience
@@ -324,7 +324,7 @@ def play(
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints the figures and returns the number of targets missed."""
-  lines = campaign_lines.Lines('C26', seed)
+  lines = figure_lines.Lines('C26', seed)
   repetitions = max(1, int(REPETITIONS * scale))
   with served.endlessly(f'--idle_seconds={IDLE_SECONDS}') as program:
     served.connect_eventually(program.address).close()
@@ -371,4 +371,4 @@ def _counts(pid: int) -> tuple[int, int]:
 
 
 if __name__ == '__main__':
-  campaign_lines.run(main)
+  figure_lines.run(main)

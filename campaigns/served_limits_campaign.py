@@ -24,7 +24,7 @@ from google.rpc import code_pb2
 import grpc
 import numpy as np
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from realab_suite.interop.rpc import sockets
 from tests import patience
 from tests.interop import served
@@ -251,7 +251,7 @@ def queued_requests(program: served.Program, number: int) -> tuple[float, int]:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints the figures and returns the number of targets missed."""
-  lines = campaign_lines.Lines('C25', seed)
+  lines = figure_lines.Lines('C25', seed)
   steps = 60
   expected = expected_rollout(steps)
   connections = max(20, int(CONNECTIONS * scale))
@@ -288,4 +288,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  campaign_lines.run(main)
+  figure_lines.run(main)

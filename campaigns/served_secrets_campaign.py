@@ -33,7 +33,7 @@ from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
 import numpy as np
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from campaigns import served_campaign
 from realab_suite.engine import environment
 from realab_suite.entities import registers
@@ -136,7 +136,7 @@ def sizes_of_steps(answers: list[bytes]) -> set[int]:
   }
 
 
-def run_c08(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+def run_c08(lines: figure_lines.Lines, scale: float, seed: int) -> None:
   generator = np.random.default_rng(seed)
   number = max(2, int(PAIRS * scale))
   differing = sizes = answers = 0
@@ -298,7 +298,7 @@ LEAKS = {
 }
 
 
-def run_c09(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+def run_c09(lines: figure_lines.Lines, scale: float, seed: int) -> None:
   del scale, seed
   for name, catch in LEAKS.items():
     lines.at_least(f'{name}: mutants caught', int(catch()), 1)
@@ -375,7 +375,7 @@ def timing(
   return float(abs(medians[0] - medians[1]) / medians[1]), p
 
 
-def run_c18(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+def run_c18(lines: figure_lines.Lines, scale: float, seed: int) -> None:
   steps = max(200, int(TIMED_STEPS * scale))
   effect, p = timing(lambda: 173.2317, lambda: 1e-300, steps, seed)
   print(f'C18 advisory: effect {effect:.4f} of the median, p={p:.3f}')
@@ -612,7 +612,7 @@ def search(canary: float) -> Search:
   )
 
 
-def run_c10(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+def run_c10(lines: figure_lines.Lines, scale: float, seed: int) -> None:
   generator = np.random.default_rng(seed)
   number = max(1, int(CANARIES * scale))
   found = [search(173 + float(generator.random())) for _ in range(number)]
@@ -680,7 +680,7 @@ def expose() -> Exposure:
     return Exposure(given, [str(output), 'EVALUATORS_SECRET'], wide)
 
 
-def run_c19(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+def run_c19(lines: figure_lines.Lines, scale: float, seed: int) -> None:
   del scale, seed
   found = expose()
   lines.at_least('descriptors seen', len(found.given['descriptors']), 3)
@@ -751,7 +751,7 @@ def clone(seed: int) -> Attack:
   )
 
 
-def run_c49(lines: campaign_lines.Lines, scale: float, seed: int) -> None:
+def run_c49(lines: figure_lines.Lines, scale: float, seed: int) -> None:
   number = max(1, int(CLONES * scale))
   found = [clone(seed + i) for i in range(number)]
   num_time_steps = sum(one.num_time_steps for one in found)
@@ -795,8 +795,8 @@ _RUNS = {
 
 def main(scale: float = 1.0, seed: int = 0, *names: str) -> int:
   """Prints the figures and returns the number of targets missed."""
-  return campaign_lines.print_all(_RUNS, scale, seed, names)
+  return figure_lines.print_all(_RUNS, scale, seed, names)
 
 
 if __name__ == '__main__':
-  campaign_lines.run(main)
+  figure_lines.run(main)

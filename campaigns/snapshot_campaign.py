@@ -18,18 +18,18 @@ from typing import Any, NamedTuple
 import dm_env
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
-from realab_suite.engine import snapshot as snapshots
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.engine import snapshots
+from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 
 POINTS = 500
 STEPS = 200
-NUM_WORLDS = 3
+NUM_ENVS = 3
 _MAX_STEPS = 90  # So that most runs go through the end of an episode.
 _LATEST_POINT = 120
 _STEPS_AFTER_PUSH = 3
@@ -67,7 +67,7 @@ class Case(NamedTuple):
         'standard',
         {'random': self.seed if seed is None else seed},
         {'max_steps': _MAX_STEPS},
-        num_envs=NUM_WORLDS,
+        num_envs=NUM_ENVS,
         design=self.design,
         overrides=self.overrides,
     )
@@ -187,20 +187,20 @@ def num_differences(case: Case, point: int, steps: int) -> int:
 # One world goes on, or the last two of three in the places of the first two.
 _ELSEWHERE = """
 import pathlib
-from realab_suite.engine import snapshot as snapshots
-from campaigns import snapshot_campaign as campaign
+from realab_suite.engine import snapshots
+from campaigns import snapshot_campaign
 folder = pathlib.Path({folder!r})
-case = campaign.Case{case!r}
+case = snapshot_campaign.Case{case!r}
 data = (folder / 'snapshot').read_bytes()
 snapshot = snapshots.Snapshot.from_bytes(data)
 if {is_batch}:
   batch = case.load_batch()
   batch.restore(snapshot, worlds=[0, 1])
-  transcripts = campaign.play_batch(batch, {steps}, [3, 4, 2])[:2]
+  transcripts = snapshot_campaign.play_batch(batch, {steps}, [3, 4, 2])[:2]
 else:
   env = case.load()
   env.restore(snapshot)
-  transcripts = [campaign.play(env, {steps}, seed=2)]
+  transcripts = [snapshot_campaign.play(env, {steps}, seed=2)]
 (folder / 'transcript').write_bytes(b''.join(map(b'|'.join, transcripts)))
 """
 
@@ -237,7 +237,7 @@ def batch_after(
   """Returns worlds after some steps, pushed shortly before as in `saved`."""
   batch = case.load_batch(seed)
   batch.reset()
-  seeds = list(range(11, 11 + NUM_WORLDS))
+  seeds = list(range(11, 11 + NUM_ENVS))
   play_batch(batch, max(0, point - _STEPS_AFTER_PUSH), seeds)
   velocities = batch.physics._batch.bind('qvel')
   rng = np.random.default_rng(point)
@@ -294,11 +294,11 @@ def _batch_to_batch(case: Case, point: int, steps: int) -> int:
 def _fork(case: Case, point: int, steps: int) -> int:
   if point % 2:
     env, _ = saved(case, point)
-    fork = suite.fork(env, NUM_WORLDS, sinks=[ledgers.BatchLedger()])
+    fork = suite.fork(env, NUM_ENVS, sinks=[ledgers.BatchLedger()])
     expected = play(env, steps, seed=2)
   else:
     batch = env = batch_after(case, point)
-    fork = suite.fork(batch, NUM_WORLDS, world=1, sinks=[ledgers.BatchLedger()])
+    fork = suite.fork(batch, NUM_ENVS, world=1, sinks=[ledgers.BatchLedger()])
     expected = play_batch(batch, steps, [3, 2, 4])[1]
   env.close()
   found = play_batch(fork, steps, [2, 5, 2])
@@ -338,4 +338,4 @@ def main(points: int = POINTS, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

@@ -20,7 +20,7 @@ from dm_control import composer
 import mujoco
 import numpy as np
 
-from campaigns import lines as campaign_lines
+from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
@@ -303,13 +303,13 @@ def num_contacts_of_meters(env: environment.Environment) -> int:
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = campaign_lines.Lines('C13', seed)
+  lines = figure_lines.Lines('C13', seed)
   count, num_pairs = differing(max(8, int(scale * PAIRS)), seed)
   lines.at_most(f'differing of {num_pairs} pairs', count, 0)
   for name, number in differing_where_refused(seed).items():
     lines.at_least(f'steps felt with {name} (control)', number, 1)
   lines.at_least('wrong options refused of 5', len(refused_by_loader()), 5)
-  touched = campaign_lines.Lines('C15', seed)
+  touched = figure_lines.Lines('C15', seed)
   steps = max(100, int(scale * CONTACT_STEPS)) // len(suite.TASKS_BY_DOMAIN)
   for domain in suite.TASKS_BY_DOMAIN:
     number = contacts(domain, steps, seed)
@@ -318,4 +318,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  campaign_lines.run(main)
+  figure_lines.run(main)

@@ -31,10 +31,10 @@ from hypothesis import strategies as st
 import numpy as np
 import yaml
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.experiments import spec as experiments
+from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 from tests import memory
 from tests import patience
@@ -502,7 +502,7 @@ def validate(case: Case, folder: pathlib.Path) -> Any:
     source = folder / 'given.yaml'
     source.write_bytes(case.source)
   if case.kind == 'experiment':
-    return experiments.load(source)
+    return experiment_specs.load(source)
   return specs.load(source)
 
 
@@ -670,7 +670,7 @@ def campaign(
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
-  lines = lines_lib.Lines('C20', seed)
+  lines = figure_lines.Lines('C20', seed)
   sizes = [
       max(1, round(scale * n))
       for n in (NUM_VALIDATED, NUM_COMPILED, NUM_STEPPED)
@@ -704,4 +704,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

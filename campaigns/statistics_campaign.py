@@ -14,7 +14,7 @@ from typing import final
 
 import numpy as np
 
-from campaigns import lines as lines_lib
+from campaigns import figure_lines
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
 
@@ -309,7 +309,7 @@ def _verdict_of_differences(
 
 
 def _report_intervals(
-    lines: lines_lib.Lines, repetitions: int, rng: np.random.Generator
+    lines: figure_lines.Lines, repetitions: int, rng: np.random.Generator
 ) -> None:
   for name, data in DATA.items():
     for seeds in ALL_SEEDS:
@@ -332,7 +332,7 @@ def _report_intervals(
 
 
 def _report_rare_tampering(
-    lines: lines_lib.Lines, repetitions: int, rng: np.random.Generator
+    lines: figure_lines.Lines, repetitions: int, rng: np.random.Generator
 ) -> None:
   for share in (0.05, 0.1, 0.3, 0.5):
     for seeds in ALL_SEEDS:
@@ -348,7 +348,7 @@ def _report_rare_tampering(
 
 def main(repetitions: int = 1000, seed: int = 0) -> int:
   """Prints every figure and returns the number of targets missed."""
-  lines = lines_lib.Lines('C43', seed)
+  lines = figure_lines.Lines('C43', seed)
   rng = np.random.default_rng(seed)
   for name, data in DATA.items():
     value = share_of_verdicts(MORE, data, 0, 1, repetitions, rng)
@@ -377,4 +377,4 @@ def main(repetitions: int = 1000, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines_lib.run(main)
+  figure_lines.run(main)

@@ -22,13 +22,13 @@ from dm_control.rl import control
 import mujoco
 import numpy as np
 
-from campaigns import lines
+from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import physics as engine_physics
-from realab_suite.entities import apples
+from realab_suite.engine import single_physics
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from tests import worlds
 
@@ -91,11 +91,11 @@ class Result(NamedTuple):
 class World(NamedTuple):
   """A register that is written, one that is in the way, an avatar, an apple."""
 
-  physics: engine_physics.ThinPhysics
+  physics: single_physics.ThinPhysics
   written: registers.Register
   other: registers.Register
-  avatar: avatar_entity.Avatar
-  apple: apples.Apples
+  avatar: avatars.Avatar
+  apple: apple_group.Apples
   size: float
   place: tuple[float, float]
 
@@ -122,12 +122,12 @@ def make_world(dof: str, size: float, place: tuple[float, float]) -> World:
   other = registers.BlockPositionRegister('other', **options)
   written.attach_to(arena, place)
   other.attach_to(arena, (-2.0, 0.0))
-  avatar = avatar_entity.Avatar()
+  avatar = avatars.Avatar()
   arena.attach(avatar)
   avatar.make_graspable([*written.blocks, *other.blocks])
-  apple = apples.Apples(number=1)
+  apple = apple_group.Apples(number=1)
   apple.attach_to(arena)
-  physics = worlds.compile_world(arena, engine_physics.ThinPhysics)
+  physics = worlds.compile_world(arena, single_physics.ThinPhysics)
   return World(physics, written, other, avatar, apple, size, place)
 
 
@@ -283,7 +283,7 @@ def _lowest(box: Box) -> float:
   return float(box.middle[2] - (np.abs(box.axes) @ box.half)[2])
 
 
-def _geom_of(avatar: avatar_entity.Avatar, physics: Any) -> int:
+def _geom_of(avatar: avatars.Avatar, physics: Any) -> int:
   torso = avatar.body.find_all('geom', immediate_children_only=True)[0]
   return int(physics.bind(torso).element_id)
 
@@ -378,7 +378,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
   poses = max(1, int(POSES * scale))
   found = grid(poses, seed)
-  report = lines.Lines('C31', seed)
+  report = figure_lines.Lines('C31', seed)
   for into, result in found.items():
     report.at_least(f'{into}: writes', result.num_writes, 154 * poses)
     report.at_least(f'{into}: overlaps', result.num_overlaps, 77 * poses)
@@ -397,4 +397,4 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
 
 if __name__ == '__main__':
-  lines.run(main)
+  figure_lines.run(main)

@@ -18,7 +18,7 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
@@ -191,7 +191,7 @@ def load(
   except errors.RealabError:
     raise
   except Exception as error:  # It may be of any class.
-    place = messages.Place(f'task_kwargs of {domain_name}.{task_name}')
+    place = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
     raise place.error(f'{type(error).__name__}: {error}') from error
   return embed(
       task,
@@ -241,7 +241,7 @@ def load_batch(
         'environment_kwargs: a batch has all worlds from 0 on; allowed is'
         ' max_steps'
     )
-  num_envs = arguments.num_worlds(num_envs)
+  num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
   sleep = arguments.flag('sleep', sleep)
   single = load(
@@ -304,9 +304,7 @@ def embed(
           f'measurements: {messages.quote(name)}: {messages.quote(measure)};'
           ' allowed is a function of the physics'
       )
-  mechanism = feedback_mechanism.FeedbackMechanism(
-      specs.load(design, overrides)
-  )
+  mechanism = mechanisms.FeedbackMechanism(specs.load(design, overrides))
   mechanism.attach_to(task.root_entity)
   try:
     return _connected(task, mechanism, seed, world, max_steps, measurements)
@@ -320,7 +318,7 @@ def embed(
 
 def _connected(
     task: composer.Task,
-    mechanism: feedback_mechanism.FeedbackMechanism,
+    mechanism: mechanisms.FeedbackMechanism,
     seed: int,
     world: int,
     max_steps: int | None,
@@ -362,5 +360,5 @@ def _keywords(what: str, given: Any) -> dict[str, Any]:
   return dict(given)
 
 
-def _blocks(mechanism: feedback_mechanism.FeedbackMechanism) -> list[Any]:
+def _blocks(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
   return [b for r in mechanism.registers.values() for b in r.blocks]

@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from realab_suite import suite
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import probes
-from realab_suite.experiments import spec
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 
@@ -58,9 +58,9 @@ def test_ones_own_register_provider_and_task_take_under_thirty_lines():
 def test_the_experiment_of_the_page_is_one_that_can_be_run():
   page = (_ROOT / 'docs/experiments.md').read_text()
   [text] = re.findall(r'```yaml\n(schema: 1\n.*?)```', page, re.DOTALL)
-  experiment = spec.load(yaml.safe_load(text))
+  experiment = experiment_specs.load(yaml.safe_load(text))
   for run in experiment.runs.values():
-    for channel in (None, spec.TWIN):
+    for channel in (None, experiment_specs.TWIN):
       # A probe needs discrete actions.
       assert probes.find_register(run.load(channel)) == 'reward'
 

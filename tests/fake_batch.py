@@ -13,7 +13,7 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite.entities import rays
-from tests import worlds as worlds_lib
+from tests import worlds
 
 
 class FakeBatch:
@@ -30,7 +30,7 @@ class FakeBatch:
   def step(self, steps: int = 1) -> None:
     self.flush()
     for world in self.worlds:
-      worlds_lib.step(world, steps)
+      worlds.step(world, steps)
 
   def mark_as_dirty(self) -> None:
     for world in self.worlds:

@@ -41,7 +41,7 @@ _MAY_IMPORT = {
         'config',
         'entities',
         'feedback.specs',
-        'feedback.mechanism',
+        'feedback.mechanisms',
         'policies.base',
     ),
     'engine': ('config', 'entities', 'policies', 'feedback', 'tasks'),

@@ -7,7 +7,7 @@ from dm_control import mjcf
 import mujoco
 import numpy as np
 
-from realab_suite.engine import physics as engine_physics
+from realab_suite.engine import single_physics
 
 
 def compile_world(
@@ -19,7 +19,7 @@ def compile_world(
 
 def step(physics: mjcf.Physics, steps: int = 1) -> None:
   """Steps a world from the state as it is."""
-  if isinstance(physics, engine_physics.ThinPhysics):
+  if isinstance(physics, single_physics.ThinPhysics):
     physics.advance(steps)
     return
   # Composer's steps begin in the middle of the engine's, with what was derived

@@ -7,7 +7,7 @@ Whoever launches a run builds the environment; the learner gets its specs:
         env.mechanism.design.learner,
         env.observation_spec(),
         env.action_spec(),
-        num_worlds=256,
+        num_envs=256,
         seed=1,
     )
     time_step = env.reset()

@@ -103,7 +103,7 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
     for query in self._options.queries:
       self._controls.check_query('learner', query)
     # Myopic: no discounted sum of feedback, but the feedback itself.
-    self._scale = training.FeedbackScale(self._num_worlds, 0.0)
+    self._scale = training.FeedbackScale(self._num_envs, 0.0)
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
     num_actions = self._controls.check_discrete(self._options.kind)

@@ -11,7 +11,7 @@ import numpy as np
 import pydantic
 
 from realab_suite import errors
-from realab_suite.agents import controls as controls_lib
+from realab_suite.agents import action_encoding
 from realab_suite.agents import features
 from realab_suite.agents import jax_settings
 from realab_suite.config import registry
@@ -81,8 +81,8 @@ class Learner(abc.ABC):
       options: Any,
       reading: str,
       encoder: features.Encoder,
-      controls: controls_lib.Controls,
-      num_worlds: int,
+      controls: action_encoding.Controls,
+      num_envs: int,
       seed: int,
   ) -> None:
     """Makes a learner; `make` is easier.
@@ -92,14 +92,14 @@ class Learner(abc.ABC):
       reading: The key in the observation of what it learns from.
       encoder: How it sees.
       controls: How it acts.
-      num_worlds: How many worlds it acts in.
+      num_envs: How many worlds it acts in.
       seed: Two learners that differ in nothing else learn the same.
     """
     self._options = options
     self._reading = reading
     self._encoder = encoder
     self._controls = controls
-    self._num_worlds = num_worlds
+    self._num_envs = num_envs
     children = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     self._keys = {
         name: child.generate_state(2)
@@ -112,13 +112,13 @@ class Learner(abc.ABC):
     self._metrics: dict[str, float] = {}
 
   @property
-  def num_worlds(self) -> int:
-    return self._num_worlds
+  def num_envs(self) -> int:
+    return self._num_envs
 
   @property
   def num_steps(self) -> int:
     """How many control steps it has acted in, all worlds together."""
-    return self._num_acts * self._num_worlds
+    return self._num_acts * self._num_envs
 
   @jax_settings.pinned()
   def step(self, time_step: TimeStep) -> np.ndarray:
@@ -130,7 +130,7 @@ class Learner(abc.ABC):
     Returns:
       Actions, `(worlds, *action_spec.shape)`.
     """
-    observation = self._encoder.pack(time_step.observation, self._num_worlds)
+    observation = self._encoder.pack(time_step.observation, self._num_envs)
     if self._last is not None:
       step_type = np.asarray(time_step.step_type)
       transition = {
@@ -164,7 +164,7 @@ class Learner(abc.ABC):
     seeds = np.random.SeedSequence([int(word) for word in key]).spawn(2)
     act, query = (child.generate_state(2) for child in seeds)
     keys = {'act': act, 'query': query}
-    packed = self._encoder.pack(observation, _num_worlds(observation))
+    packed = self._encoder.pack(observation, _num_envs(observation))
     return self._encode(self._choose(packed, keys, greedy=greedy))
 
   @jax_settings.pinned()
@@ -175,7 +175,7 @@ class Learner(abc.ABC):
       SpecError: If the actions are vectors.
     """
     self._controls.check_discrete(self._options.kind)
-    packed = self._encoder.pack(observation, _num_worlds(observation))
+    packed = self._encoder.pack(observation, _num_envs(observation))
     return np.asarray(self._probabilities(packed))
 
   def settings(self) -> dict[str, Any]:
@@ -306,7 +306,7 @@ def make(
     spec: specs.LearnerSpec | Mapping[str, Any] | None,
     observation_spec: Mapping[str, dm_env_specs.Array],
     action_spec: dm_env_specs.Array,
-    num_worlds: int,
+    num_envs: int,
     seed: int,
 ) -> Learner:
   """Makes the learner that a design asks for.
@@ -315,7 +315,7 @@ def make(
     spec: A design's `learner`, or a mapping with `kind` and options.
     observation_spec: Of one world.
     action_spec: Of one world.
-    num_worlds: How many worlds there are.
+    num_envs: How many worlds there are.
     seed: Any integer from 0 on.
 
   Raises:
@@ -327,7 +327,7 @@ def make(
         'learner: None; allowed is a design with a learner, or a mapping with a'
         f' kind from {sorted(LEARNERS)}'
     )
-  for name, value, least in (('num_worlds', num_worlds, 1), ('seed', seed, 0)):
+  for name, value, least in (('num_envs', num_envs, 1), ('seed', seed, 0)):
     if type(value) is not int or value < least:
       raise errors.SpecError(
           f'{name}: {value!r:.80}; allowed are integers from {least} on'
@@ -342,8 +342,8 @@ def make(
       options,
       _find_reading(options, learner_class.READS, observation_spec),
       features.Encoder.from_spec(observation_spec),
-      controls_lib.Controls.from_spec(action_spec),
-      num_worlds,
+      action_encoding.Controls.from_spec(action_spec),
+      num_envs,
       seed,
   )
 
@@ -369,7 +369,7 @@ def _find_reading(
   )
 
 
-def _num_worlds(observation: Mapping[str, np.ndarray]) -> int:
+def _num_envs(observation: Mapping[str, np.ndarray]) -> int:
   return len(next(iter(observation.values())))
 
 

@@ -94,7 +94,7 @@ class Encoder:
         if entry.kind != 'image'
     )
 
-  def pack(self, observation: Mapping[str, Any], num_worlds: int) -> Packed:
+  def pack(self, observation: Mapping[str, Any], num_envs: int) -> Packed:
     """Checks an observation of many worlds, and copies what is needed of it.
 
     Raises:
@@ -103,11 +103,11 @@ class Encoder:
     packed = {}
     for entry in self.entries:
       packed[entry.name] = _take(
-          observation, entry.name, entry.shape, entry.dtype, num_worlds
+          observation, entry.name, entry.shape, entry.dtype, num_envs
       )
       if entry.partner:
         packed[entry.partner] = _take(
-            observation, entry.partner, entry.shape, 'float32', num_worlds
+            observation, entry.partner, entry.shape, 'float32', num_envs
         )
     return packed
 
@@ -162,9 +162,9 @@ def _take(
     name: str,
     shape: tuple[int, ...],
     dtype: str,
-    num_worlds: int,
+    num_envs: int,
 ) -> np.ndarray:
-  expected = (num_worlds, *shape)
+  expected = (num_envs, *shape)
   if name not in observation:
     raise errors.SpecError(
         f'observation: {name!r} is missing; given are {sorted(observation)}'

@@ -55,7 +55,7 @@ class OnPolicyLearner(base.Learner):
 
   def _draw_minibatches(self) -> np.ndarray:
     """Returns which samples go into which gradient of the next update."""
-    num_samples = self._options.steps_per_update * self._num_worlds
+    num_samples = self._options.steps_per_update * self._num_envs
     return training.draw_minibatches(
         self._options, num_samples, self._update_key()
     )

@@ -54,7 +54,7 @@ class PolicyGradient(on_policy.OnPolicyLearner):
 
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
-    self._scale = training.FeedbackScale(self._num_worlds, self._options.gamma)
+    self._scale = training.FeedbackScale(self._num_envs, self._options.gamma)
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
     controls, hidden = self._controls, self._options.hidden

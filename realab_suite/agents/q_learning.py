@@ -74,10 +74,10 @@ class QLearning(base.Learner):
     )
     optimizer_state = training.optimizer(options).init(network)
     self._networks: Any = ((network, optimizer_state), network)
-    self._scale = training.FeedbackScale(self._num_worlds, options.gamma)
+    self._scale = training.FeedbackScale(self._num_envs, options.gamma)
     # Slots, in each a transition of every world; the oldest is overwritten.
     self._num_slots = max(
-        options.replay_size // self._num_worlds, options.num_returns + 2
+        options.replay_size // self._num_envs, options.num_returns + 2
     )
     self._replay: Any = None
     self._num_stored = 0
@@ -117,7 +117,7 @@ class QLearning(base.Learner):
     self._scale.update(jax.tree.map(lambda x: x[np.newaxis], transition))
     self._store(transition)
     options = self._options
-    is_enough = self._num_stored * self._num_worlds >= options.min_replay
+    is_enough = self._num_stored * self._num_envs >= options.min_replay
     if (
         not is_enough
         or self._num_stored < options.num_returns + 2
@@ -203,14 +203,14 @@ def sample(
     num_stored: How many there have been.
     generator: What draws.
   """
-  num_slots, num_worlds = replay['reading'].shape
+  num_slots, num_envs = replay['reading'].shape
   shape = (options.gradients_per_update, options.minibatch)
   # Of the last ones it is not known yet what came after them.
   ages = generator.integers(
       options.num_returns + 1, min(num_stored, num_slots) + 1, shape
   )
   start = num_stored - ages
-  world = generator.integers(num_worlds, size=shape)
+  world = generator.integers(num_envs, size=shape)
   total, factor = np.zeros(shape, np.float32), np.ones(shape, np.float32)
   goes_on, length = np.ones(shape, bool), np.zeros(shape, int)
   for i in range(options.num_returns):

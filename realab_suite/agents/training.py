@@ -156,9 +156,9 @@ class FeedbackScale:
   that holds a register off its place gets a thousand times more.
   """
 
-  def __init__(self, num_worlds: int, gamma: float) -> None:
+  def __init__(self, num_envs: int, gamma: float) -> None:
     self._gamma = gamma
-    self._sums = np.zeros(num_worlds)
+    self._sums = np.zeros(num_envs)
     # Count, sum and sum of squares of what the sums have been.
     self._moments = np.zeros(3)
 

@@ -1,7 +1,7 @@
 """Follows keys and indices through annotations, together with the data.
 
 If a note in an `Annotated` has a method `members(siblings)`, that method
-returns the types that are allowed at its place, given the values beside it.
+returns the types that are allowed at its location, given the values beside it.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,8 +26,8 @@ def locate(
   name is not part of the path.
 
   Returns:
-    The keys and indices that lead to the place in the data, and the types that
-    are allowed there, as far as they can be found.
+    The keys and indices that lead to the location in the data, and the types
+    that are allowed there, as far as they can be found.
   """
   path: list[str | int] = []
   found: list[Any] = [annotation]

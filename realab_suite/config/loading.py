@@ -78,14 +78,14 @@ def read_mapping(
       such a file.
   """
   if isinstance(source, Mapping):
-    return _copy_mapping(source, messages.Place(where or '<mapping>'))
+    return _copy_mapping(source, messages.Location(where or '<mapping>'))
   if not isinstance(source, (str, os.PathLike)):
-    raise messages.Place(where or '<mapping>').error(
+    raise messages.Location(where or '<mapping>').error(
         f'expected a path or a mapping, got {messages.quote(source)}'
     )
   path = os.fsdecode(source)
   where = where or path
-  return parse_yaml(_read_file(path, messages.Place(where)), where)
+  return parse_yaml(_read_file(path, messages.Location(where)), where)
 
 
 def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
@@ -101,11 +101,11 @@ def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
   """
   documents = _documents(text, where)
   if len(documents) != 1:
-    raise messages.Place(where).error(
+    raise messages.Location(where).error(
         f'expected a mapping at top level, got {len(documents)} documents'
     )
   if not isinstance(documents[0], dict):
-    raise messages.Place(where).error(
+    raise messages.Location(where).error(
         f'expected a mapping at top level, got {messages.quote(documents[0])}'
     )
   return documents[0]
@@ -141,26 +141,26 @@ def apply_overrides(
     SpecError: If an override is malformed or leads through something that is
       neither a mapping nor a list.
   """
-  result = _copy_mapping(data, messages.Place('<mapping>'))
+  result = _copy_mapping(data, messages.Location('<mapping>'))
   for override in overrides:
-    place = messages.Place(f'override {messages.quote(override)}')
+    location = messages.Location(f'override {messages.quote(override)}')
     if not isinstance(override, str):
-      raise place.error('expected key=value, as a text')
+      raise location.error('expected key=value, as a text')
     _, equals, text = override.partition('=')
     if not equals:
-      raise place.error('expected key=value')
+      raise location.error('expected key=value')
     keys = keys_of(override)
     if not all(k.strip() for k in keys):
-      raise place.error('empty key')
-    documents = _documents(text, place.where)
+      raise location.error('empty key')
+    documents = _documents(text, location.where)
     if len(documents) != 1:
-      raise place.error(
+      raise location.error(
           f"expected one value (null, or '' for empty text), got"
           f' {len(documents)}'
       )
-    _assign(result, keys, documents[0], place)
+    _assign(result, keys, documents[0], location)
     # The new value may be too deep or one too many where it stands now.
-    result = _copy_mapping(result, place)
+    result = _copy_mapping(result, location)
   return result
 
 
@@ -175,7 +175,7 @@ class _Frame:
   """A mapping or list that is being built."""
 
   container: dict[str, Any] | list[Any]
-  place: messages.Place
+  location: messages.Location
   # The key that waits for its value, and the lines of all keys so far.
   key: str | None = None
   key_lines: dict[str, int] = dataclasses.field(default_factory=dict)
@@ -184,17 +184,17 @@ class _Frame:
   def expects_key(self) -> bool:
     return isinstance(self.container, dict) and self.key is None
 
-  def next_place(self, line: int) -> messages.Place:
-    place = messages.Place(self.place.where, self.place.path, line)
+  def next_location(self, line: int) -> messages.Location:
+    location = messages.Location(self.location.where, self.location.path, line)
     if isinstance(self.container, list):
-      return place.child(len(self.container))
-    return place if self.key is None else place.child(self.key)
+      return location.child(len(self.container))
+    return location if self.key is None else location.child(self.key)
 
-  def add_key(self, key: Any, place: messages.Place) -> None:
-    key = _checked_key(key, place)
-    line = place.line or 0
+  def add_key(self, key: Any, location: messages.Location) -> None:
+    key = _checked_key(key, location)
+    line = location.line or 0
     if key in self.key_lines:
-      raise place.error(
+      raise location.error(
           f'duplicate key {messages.quote(key)} (lines'
           f' {self.key_lines[key]} and {line})'
       )
@@ -202,7 +202,7 @@ class _Frame:
     self.key_lines[key] = line
 
   def add_value(self, value: Any) -> None:
-    _check_entries(len(self.container) + 1, self.place)
+    _check_entries(len(self.container) + 1, self.location)
     if isinstance(self.container, list):
       self.container.append(value)
     elif self.key is not None:
@@ -216,43 +216,43 @@ def _documents(text: str | bytes, where: str) -> list[Any]:
   # A stack of our own, because depth must not depend on Python's.
   stack: list[_Frame] = []
   budget = iter(range(_MAX_VALUES))
-  for event, line in _events(_decode(text, messages.Place(where)), where):
-    place = messages.Place(where, line=line)
+  for event, line in _events(_decode(text, messages.Location(where)), where):
+    location = messages.Location(where, line=line)
     if stack:
-      place = stack[-1].next_place(line)
+      location = stack[-1].next_location(line)
     if isinstance(event, yaml.DocumentStartEvent):
       if event.version or event.tags:
-        raise place.error('directives are not allowed')
+        raise location.error('directives are not allowed')
     elif isinstance(event, yaml.CollectionEndEvent):
       stack.pop()
     elif isinstance(event, yaml.NodeEvent):
-      value = _node_value(event, place)
+      value = _node_value(event, location)
       if not stack:
         documents.append(value)
       elif stack[-1].expects_key:
-        stack[-1].add_key(value, place)
+        stack[-1].add_key(value, location)
       else:
-        _spend(budget, place)
+        _spend(budget, location)
         stack[-1].add_value(value)
       if isinstance(value, (dict, list)):
-        _check_depth(len(stack) + 1, place)
-        stack.append(_Frame(value, place))
+        _check_depth(len(stack) + 1, location)
+        stack.append(_Frame(value, location))
   return documents
 
 
-def _node_value(event: Any, place: messages.Place) -> Any:
+def _node_value(event: Any, location: messages.Location) -> Any:
   """Returns the scalar, or the still empty collection, that an event is."""
   if event.anchor is not None:
-    raise place.error('anchors and aliases are not allowed')
+    raise location.error('anchors and aliases are not allowed')
   if event.tag is not None:
-    raise place.error(f'tag {messages.quote(event.tag)} not allowed')
+    raise location.error(f'tag {messages.quote(event.tag)} not allowed')
   if isinstance(event, yaml.SequenceStartEvent):
     return []
   if isinstance(event, yaml.MappingStartEvent):
     return {}
   is_plain = event.implicit[0]
-  value = _resolve(event.value, place) if is_plain else event.value
-  return _checked_scalar(value, place)
+  value = _resolve(event.value, location) if is_plain else event.value
+  return _checked_scalar(value, location)
 
 
 def _events(text: str, where: str) -> Iterator[tuple[Any, int]]:
@@ -264,13 +264,13 @@ def _events(text: str, where: str) -> Iterator[tuple[Any, int]]:
         event = loader.get_event()
       except yaml.MarkedYAMLError as error:
         line = _line(error.problem_mark)
-        raise messages.Place(where, line=line).error(
+        raise messages.Location(where, line=line).error(
             f'{error.problem}'
         ) from None
       # A tag that escapes bytes which are no text is a UnicodeDecodeError.
       except (yaml.YAMLError, UnicodeError) as error:
         problem = ' '.join(str(error).split())
-        raise messages.Place(where).error(f'not YAML: {problem}') from None
+        raise messages.Location(where).error(f'not YAML: {problem}') from None
       if event is None:
         return
       yield event, _line(event.start_mark) or 1
@@ -282,46 +282,46 @@ def _line(mark: Any) -> int | None:
   return None if mark is None else mark.line + 1
 
 
-def _decode(text: str | bytes, place: messages.Place) -> str:
+def _decode(text: str | bytes, location: messages.Location) -> str:
   """Returns the text with plain newlines, checked as a whole."""
   # A lone surrogate is reported as a character, with its line.
   content = (
       text.encode('utf-8', 'surrogatepass') if isinstance(text, str) else text
   )
-  _check_size(len(content), place)
+  _check_size(len(content), location)
   try:
     text = content.decode('utf-8', 'surrogatepass')
   except UnicodeDecodeError as error:
     line = content.count(b'\n', 0, error.start) + 1
-    raise dataclasses.replace(place, line=line).error(
+    raise dataclasses.replace(location, line=line).error(
         f'not UTF-8 text: {error.reason}'
     ) from None
   text = text.replace('\r\n', '\n')
   character = _forbidden_character(text)
   if character is not None:
     line = text.count('\n', 0, text.index(character)) + 1
-    raise _character_error(character, dataclasses.replace(place, line=line))
+    raise _character_error(character, dataclasses.replace(location, line=line))
   return text
 
 
-def _read_file(path: str, place: messages.Place) -> bytes:
+def _read_file(path: str, location: messages.Location) -> bytes:
   # Opening a named pipe would wait for ever, so the kind is checked first.
   if not os.path.isfile(path):
     exists = os.path.exists(path)
-    raise place.error('not a file' if exists else 'no such file')
+    raise location.error('not a file' if exists else 'no such file')
   try:
     size = os.path.getsize(path)
     with open(path, 'rb') as stream:
       content = stream.read(_MAX_BYTES + 1)
   except OSError as error:
-    raise place.error(f'cannot be read: {error.strerror}') from None
+    raise location.error(f'cannot be read: {error.strerror}') from None
   # A file that grows, or that reports no size, is caught by its content.
-  _check_size(max(size, len(content)), place)
+  _check_size(max(size, len(content)), location)
   return content
 
 
 def _resolve(
-    text: str, place: messages.Place
+    text: str, location: messages.Location
 ) -> bool | int | float | str | None:
   """Returns what an unquoted scalar means."""
   if _NULL.fullmatch(text):
@@ -333,19 +333,19 @@ def _resolve(
   if _INT.fullmatch(text):
     # Python refuses to convert thousands of digits.
     if len(text.lstrip('+-')) > len(str(_MAX_INT)):
-      raise place.error(f'integer {messages.quote(text)} is out of range')
+      raise location.error(f'integer {messages.quote(text)} is out of range')
     return int(text)
   if match := _FLOAT.fullmatch(text):
     value = float(text)
     vanished = value == 0 and re.search('[1-9]', match['mantissa'])
     if math.isinf(value) or vanished:
-      raise place.error(f'number {messages.quote(text)} is out of range')
+      raise location.error(f'number {messages.quote(text)} is out of range')
     return value
   if _NOT_FINITE.fullmatch(text):
-    raise place.error(f'must be finite, got {text}')
+    raise location.error(f'must be finite, got {text}')
   tag = _YAML_1_1.resolve(yaml.ScalarNode, text, (True, False))
   if tag != _TEXT_TAG or _AMBIGUOUS.fullmatch(text):
-    raise place.error(
+    raise location.error(
         f'{messages.quote(text)} is ambiguous: quote it if it is text, or write'
         ' true, false or a plain decimal number'
     )
@@ -353,79 +353,79 @@ def _resolve(
 
 
 def _copy_mapping(
-    data: Mapping[str, Any], place: messages.Place
+    data: Mapping[str, Any], location: messages.Location
 ) -> dict[str, Any]:
   budget = iter(range(_MAX_VALUES))
   return {
-      key: _copy(value, place.child(key), 2, budget)
-      for key, value in _checked_items(data, place)
+      key: _copy(value, location.child(key), 2, budget)
+      for key, value in _checked_items(data, location)
   }
 
 
 def _copy(
-    value: Any, place: messages.Place, depth: int, budget: Iterator[int]
+    value: Any, location: messages.Location, depth: int, budget: Iterator[int]
 ) -> Any:
   """Returns a copy of a value, which stands `depth - 1` collections deep."""
-  _spend(budget, place)
+  _spend(budget, location)
   if isinstance(value, Mapping):
-    _check_depth(depth, place)
+    _check_depth(depth, location)
     return {
-        key: _copy(item, place.child(key), depth + 1, budget)
-        for key, item in _checked_items(value, place)
+        key: _copy(item, location.child(key), depth + 1, budget)
+        for key, item in _checked_items(value, location)
     }
   if isinstance(value, (list, tuple)):
-    _check_depth(depth, place)
-    _check_entries(len(value), place)
+    _check_depth(depth, location)
+    _check_entries(len(value), location)
     return [
-        _copy(item, place.child(index), depth + 1, budget)
+        _copy(item, location.child(index), depth + 1, budget)
         for index, item in enumerate(value)
     ]
-  return _checked_scalar(value, place)
+  return _checked_scalar(value, location)
 
 
 def _checked_items(
-    data: Mapping[Any, Any], place: messages.Place
+    data: Mapping[Any, Any], location: messages.Location
 ) -> Iterator[tuple[str, Any]]:
-  _check_entries(len(data), place)
+  _check_entries(len(data), location)
   for key, value in data.items():
-    yield _checked_key(key, place), value
+    yield _checked_key(key, location), value
 
 
-def _checked_key(key: Any, place: messages.Place) -> str:
+def _checked_key(key: Any, location: messages.Location) -> str:
   if not isinstance(key, str):
-    raise place.error(
+    raise location.error(
         f'keys must be strings, got {messages.quote(key)} (quote it)'
     )
   if '\n' in key:
-    raise place.error(f'keys must be one line, got {messages.quote(key)}')
-  return typing.cast(str, _checked_scalar(key, place))
+    raise location.error(f'keys must be one line, got {messages.quote(key)}')
+  return typing.cast(str, _checked_scalar(key, location))
 
 
 def _checked_scalar(
-    value: Any, place: messages.Place
+    value: Any, location: messages.Location
 ) -> bool | int | float | str | None:
   """Returns a value as exactly one of the plain types."""
   if value is None or isinstance(value, bool):
     return value
   if isinstance(value, int):
     if abs(value) > _MAX_INT:
-      raise place.error(f'integer {messages.quote(value)} is out of range')
+      raise location.error(f'integer {messages.quote(value)} is out of range')
     return int(value)
   if isinstance(value, float):
     if not math.isfinite(value):
-      raise place.error(f'must be finite, got {value}')
+      raise location.error(f'must be finite, got {value}')
     # MuJoCo's reader of numbers takes one that has lost digits for too large.
     if 0 < abs(value) < sys.float_info.min:
-      raise place.error(f'number {value} is out of range')
+      raise location.error(f'number {value} is out of range')
     # Equal descriptions must print alike, and -0.0 equals 0.0.
     return float(value) + 0.0
   if isinstance(value, str):
     character = _forbidden_character(value)
     if character is not None:
-      raise _character_error(character, place)
+      raise _character_error(character, location)
     # Not str(value), which is the name of a member of a text enum.
     return str.__str__(value)
-  raise place.error(
+  raise location.error(
       'expected a mapping, list, string, number, boolean or null, got'
       f' {messages.quote(value)}'
   )
@@ -441,35 +441,40 @@ def _forbidden_character(text: str) -> str | None:
   return min(found, key=text.index, default=None)
 
 
-def _character_error(character: str, place: messages.Place) -> errors.SpecError:
+def _character_error(
+    character: str, location: messages.Location
+) -> errors.SpecError:
   if character == '\t':
-    return place.error('tab is not allowed (use spaces)')
-  return place.error(f'character U+{ord(character):04X} is not allowed')
+    return location.error('tab is not allowed (use spaces)')
+  return location.error(f'character U+{ord(character):04X} is not allowed')
 
 
-def _check_size(size: int, place: messages.Place) -> None:
+def _check_size(size: int, location: messages.Location) -> None:
   if size > _MAX_BYTES:
     tenths = math.ceil(10 * size / _MAX_BYTES)
-    raise place.error(f'file is {tenths / 10} MiB, limit 1 MiB')
+    raise location.error(f'file is {tenths / 10} MiB, limit 1 MiB')
 
 
-def _check_depth(depth: int, place: messages.Place) -> None:
+def _check_depth(depth: int, location: messages.Location) -> None:
   if depth > _MAX_DEPTH:
-    raise place.error(f'nested deeper than {_MAX_DEPTH}')
+    raise location.error(f'nested deeper than {_MAX_DEPTH}')
 
 
-def _spend(budget: Iterator[int], place: messages.Place) -> None:
+def _spend(budget: Iterator[int], location: messages.Location) -> None:
   if next(budget, None) is None:
-    raise place.error(f'more than {_MAX_VALUES} values in all')
+    raise location.error(f'more than {_MAX_VALUES} values in all')
 
 
-def _check_entries(count: int, place: messages.Place) -> None:
+def _check_entries(count: int, location: messages.Location) -> None:
   if count > _MAX_ENTRIES:
-    raise place.error(f'more than {_MAX_ENTRIES} entries')
+    raise location.error(f'more than {_MAX_ENTRIES} entries')
 
 
 def _assign(
-    data: dict[str, Any], keys: Sequence[str], value: Any, place: messages.Place
+    data: dict[str, Any],
+    keys: Sequence[str],
+    value: Any,
+    location: messages.Location,
 ) -> None:
   """Sets the value at the end of the keys, within a mapping of our own."""
   node: Any = data
@@ -479,13 +484,13 @@ def _assign(
     if isinstance(node, list):
       # Compared as text, since a long key is no integer that Python accepts.
       if key not in map(str, range(len(node))):
-        raise place.error(
+        raise location.error(
             f'index {messages.quote(key)} is not one of the {len(node)}'
             f' entries of {messages.quote(".".join(keys[:depth]))}'
         )
       position = int(key)
     elif not isinstance(node, dict):
-      raise place.error(
+      raise location.error(
           f'{messages.quote(".".join(keys[:depth]))} is'
           f' {messages.quote(node)}, not a mapping or list'
       )

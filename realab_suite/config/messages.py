@@ -1,4 +1,4 @@
-"""How messages show places in a description, and what stands there."""
+"""How messages show locations in a description, and what stands there."""
 
 from collections.abc import Sequence
 import dataclasses
@@ -12,15 +12,15 @@ _MAX_LENGTH = 80
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Place:
+class Location:
   """Where a value stands, as error messages name it."""
 
   where: str
   path: tuple[str | int, ...] = ()
   line: int | None = None
 
-  def child(self, key: str | int) -> 'Place':
-    return Place(self.where, (*self.path, key), self.line)
+  def child(self, key: str | int) -> 'Location':
+    return Location(self.where, (*self.path, key), self.line)
 
   def error(self, problem: str) -> errors.SpecError:
     where = self.where if self.line is None else f'{self.where}:{self.line}'

@@ -96,7 +96,7 @@ def validate(
   names = [where, *(f'override {messages.quote(o)}' for o in overrides)]
   raise errors.SpecError(
       '; '.join(
-          str(messages.Place(names[origin]).error('; '.join(found)))
+          str(messages.Location(names[origin]).error('; '.join(found)))
           for origin, found in sorted(told.items())
       )
   )

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from typing import Any, TypeVar, final
 
 import dm_env
-from dm_env import specs
+from dm_env import specs as dm_env_specs
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
-from realab_suite.feedback import specs as specs_lib
+from realab_suite.feedback import specs
 
 _SENSES = 'senses/'
 _REGISTERS = 'registers/'
@@ -52,7 +52,7 @@ class _View(abc.ABC):
   ) -> None:
     design = env.mechanism.design
     readable = {
-        _REGISTERS + name for name in design.names(*specs_lib.READ_BY_AGENTS)
+        _REGISTERS + name for name in design.names(*specs.READ_BY_AGENTS)
     }
     self.__env = env
     self.__actions_shape = actions_shape
@@ -66,26 +66,30 @@ class _View(abc.ABC):
         if key.startswith(_SENSES) or key in readable
     }
 
-  def action_spec(self) -> specs.Array:
+  def action_spec(self) -> dm_env_specs.Array:
     """Returns the spec of an action, in one world."""
     return self.__guard(lambda: _copy(self.__action_spec))
 
-  def observation_spec(self) -> dict[str, specs.Array]:
+  def observation_spec(self) -> dict[str, dm_env_specs.Array]:
     """Returns the spec of an observation, in one world."""
     return self.__guard(
         lambda: {k: _copy(s) for k, s in self.__observation_spec.items()}
     )
 
-  def reward_spec(self) -> specs.BoundedArray:
+  def reward_spec(self) -> dm_env_specs.BoundedArray:
     """Returns the spec of a reward that is 0.0."""
     return self.__guard(
-        lambda: specs.BoundedArray((), np.float64, 0.0, 0.0, name='reward')
+        lambda: dm_env_specs.BoundedArray(
+            (), np.float64, 0.0, 0.0, name='reward'
+        )
     )
 
-  def discount_spec(self) -> specs.BoundedArray:
+  def discount_spec(self) -> dm_env_specs.BoundedArray:
     """Returns the spec of a discount; it is 1.0 until an episode ends."""
     return self.__guard(
-        lambda: specs.BoundedArray((), np.float64, 0.0, 1.0, name='discount')
+        lambda: dm_env_specs.BoundedArray(
+            (), np.float64, 0.0, 1.0, name='discount'
+        )
     )
 
   def reset(self) -> Any:
@@ -242,7 +246,7 @@ class BatchAgentView(_View):
       SpecError: If `batch` is something else.
     """
     _check_kind(batch, batch_environment.BatchEnvironment)
-    super().__init__(batch, (batch.num_worlds,), failures)
+    super().__init__(batch, (batch.num_envs,), failures)
 
   def _restate(
       self, time_step: batch_environment.BatchTimeStep
@@ -267,6 +271,6 @@ def _closed() -> errors.ClosedError:
   return errors.ClosedError('this environment is closed')
 
 
-def _copy(spec: specs.Array) -> specs.Array:
+def _copy(spec: dm_env_specs.Array) -> dm_env_specs.Array:
   """Returns a spec of the caller's own."""
   return spec.replace(name=spec.name)

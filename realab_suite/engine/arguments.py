@@ -14,7 +14,7 @@ _MOST_THREADS = 1024
 _LARGEST = 2**63 - 1
 
 
-def num_worlds(given: Any) -> int:
+def num_envs(given: Any) -> int:
   """Returns a number of worlds as an integer.
 
   Raises:

@@ -11,7 +11,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import messages
-from realab_suite.engine import actions as actions_lib
+from realab_suite.engine import action_codec
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_physics
 from realab_suite.engine import control_step
@@ -21,9 +21,9 @@ from realab_suite.engine import events
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
 from realab_suite.entities import registers
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
 
@@ -47,7 +47,7 @@ class BatchTimeStep(NamedTuple):
 
 @final
 class BatchEnvironment:
-  """`num_worlds` copies of an environment, each with episodes of its own.
+  """`num_envs` copies of an environment, each with episodes of its own.
 
   World i is, bit for bit, the environment that `world=i` makes alone. After the
   end of its episode a world ignores one action and begins the next one, as in
@@ -58,7 +58,7 @@ class BatchEnvironment:
   def __init__(
       self,
       single: environment.Environment,
-      num_worlds: int,
+      num_envs: int,
       num_threads: int = 0,
       sleep: bool = False,
   ) -> None:
@@ -67,14 +67,14 @@ class BatchEnvironment:
     Args:
       single: A freshly loaded environment with a world of this package. It
         belongs to the batch from now on.
-      num_worlds: How many worlds.
+      num_envs: How many worlds.
       num_threads: How many threads step them; 0 for all processors.
       sleep: Whether blocks at rest fall asleep; see `suite.load_batch`.
 
     Raises:
       SpecError: If there cannot be many of this environment.
     """
-    num_worlds = arguments.num_worlds(num_worlds)
+    num_envs = arguments.num_envs(num_envs)
     num_threads = arguments.num_threads(num_threads)
     sleep = arguments.flag('sleep', sleep)
     if not isinstance(single.task, base.Task):
@@ -87,9 +87,9 @@ class BatchEnvironment:
     self._task: base.Task = single.task
     self._mechanism = single.mechanism
     self._physics = batch_physics.BatchPhysics(
-        single.thin_physics, num_worlds, num_threads, sleep
+        single.thin_physics, num_envs, num_threads, sleep
     )
-    self._num_worlds = num_worlds
+    self._num_envs = num_envs
     self._sleep = sleep
     self._entities = [
         entity
@@ -97,28 +97,28 @@ class BatchEnvironment:
         if type(entity).initialize_episode
         is not composer.Entity.initialize_episode
     ]
-    self._host = hosts.WorldHost(self._task, self._task, None, (num_worlds,))
+    self._host = hosts.WorldHost(self._task, self._task, None, (num_envs,))
     self._observer = observing.Observer(
         self._host, self._mechanism, single.max_steps
     )
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
     # Restoring may give several worlds one number. Objects: seeds can be large,
     # or salted; `np.full` would drop the salt.
-    self._seeds = np.array([single.seed] * num_worlds, object)
-    self._numbers = np.arange(num_worlds).astype(object)
-    self._episodes = np.full(num_worlds, -1)
-    self._is_pending = np.ones(num_worlds, bool)
+    self._seeds = np.array([single.seed] * num_envs, object)
+    self._numbers = np.arange(num_envs).astype(object)
+    self._episodes = np.full(num_envs, -1)
+    self._is_pending = np.ones(num_envs, bool)
     num_providers = len(self._mechanism.design.providers)
-    self._keys = np.zeros((num_providers, num_worlds, 2), np.uint64)
-    self._states = self._mechanism.initial_states((num_worlds,))
+    self._keys = np.zeros((num_providers, num_envs, 2), np.uint64)
+    self._states = self._mechanism.initial_states((num_envs,))
     self._observation: dict[str, np.ndarray] = {}
     self._sinks: list[events.BatchEventSink] = []
     self._closed = False
 
   @property
-  def num_worlds(self) -> int:
+  def num_envs(self) -> int:
     """How many worlds there are."""
-    return self._num_worlds
+    return self._num_envs
 
   @property
   def sleep(self) -> bool:
@@ -136,12 +136,12 @@ class BatchEnvironment:
     return self._task
 
   @property
-  def mechanism(self) -> feedback_mechanism.FeedbackMechanism:
+  def mechanism(self) -> mechanisms.FeedbackMechanism:
     """The registers, meters and providers."""
     return self._mechanism
 
   @property
-  def codec(self) -> actions_lib.ActionCodec:
+  def codec(self) -> action_codec.ActionCodec:
     """What takes actions apart."""
     return self._single.codec
 
@@ -150,7 +150,7 @@ class BatchEnvironment:
     self._refuse_if_closed()
     self._tell_of_end(~self._is_pending, events.End.ABANDONED)
     self._sinks.append(sink)
-    self._is_pending = np.ones(self._num_worlds, bool)
+    self._is_pending = np.ones(self._num_envs, bool)
 
   def remove_sink(self, sink: events.BatchEventSink) -> None:
     """Ends what `add_sink` began."""
@@ -169,16 +169,16 @@ class BatchEnvironment:
     self._refuse_if_closed()
     self._tell_of_end(~self._is_pending, events.End.ABANDONED)
     # Until the episodes have begun, the next step is to begin them.
-    self._is_pending = np.ones(self._num_worlds, bool)
+    self._is_pending = np.ones(self._num_envs, bool)
     everywhere = self._is_pending.copy()
     self._begin_episodes(everywhere)
     reads = self._observe()
-    nothing = np.zeros(self._num_worlds)
+    nothing = np.zeros(self._num_envs)
     self._tell(everywhere, ~everywhere, {}, [], reads, nothing, None)
     self._is_pending = ~everywhere
     return self._time_step(
-        np.full(self._num_worlds, int(dm_env.StepType.FIRST)),
-        np.ones(self._num_worlds),
+        np.full(self._num_envs, int(dm_env.StepType.FIRST)),
+        np.ones(self._num_envs),
     )
 
   def step(self, actions: Any) -> BatchTimeStep:
@@ -192,12 +192,12 @@ class BatchEnvironment:
         no world has moved.
     """
     self._refuse_if_closed()
-    queries, controls = self.codec.decode(actions, (self._num_worlds,))
+    queries, controls = self.codec.decode(actions, (self._num_envs,))
     if self._is_pending.all():
       return self.reset()
     is_first = self._is_pending
     # Until this step is known to be good, the next one begins all episodes.
-    self._is_pending = np.ones(self._num_worlds, bool)
+    self._is_pending = np.ones(self._num_envs, bool)
     last_valid = self._observation
     try:
       records, ending, self._states = control_step.run(
@@ -254,7 +254,7 @@ class BatchEnvironment:
     What the event sinks know of their episodes is part of it.
 
     Args:
-      worlds: The places of the worlds in the batch; `None` for all of them.
+      worlds: The indices of the worlds in the batch; `None` for all of them.
 
     Raises:
       SpecError: If there are no such worlds, if blocks of this batch fall
@@ -262,20 +262,20 @@ class BatchEnvironment:
       StateLayoutError: If a provider's state is not plain data.
     """
     header = self._snapshot_header()
-    places = self._places(worlds)
-    is_pending = self._is_pending[places]
-    saved = snapshots.Worlds(
-        places=places.tolist(),
-        physics=self._physics.state[places],
-        seed=self._seeds[places].tolist(),
-        world=self._numbers[places].tolist(),
-        episode=self._episodes[places].tolist(),
+    indices = self._indices(worlds)
+    is_pending = self._is_pending[indices]
+    saved = snapshots.WorldStates(
+        indices=indices.tolist(),
+        physics=self._physics.state[indices],
+        seed=self._seeds[indices].tolist(),
+        world=self._numbers[indices].tolist(),
+        episode=self._episodes[indices].tolist(),
         is_pending=is_pending.tolist(),
         is_open=(~is_pending).tolist(),
-        provider_keys=list(self._keys[:, places]),
-        provider_states=snapshots.spread(self._states, places),
-        observation=snapshots.spread(self._observation, places),
-        sinks=[[sink.state_kind, sink.state(places)] for sink in self._sinks],
+        provider_keys=list(self._keys[:, indices]),
+        provider_states=snapshots.spread(self._states, indices),
+        observation=snapshots.spread(self._observation, indices),
+        sinks=[[sink.state_kind, sink.state(indices)] for sink in self._sinks],
         random_state=None,
     )
     return snapshots.Snapshot(header, saved.to_data())
@@ -295,7 +295,7 @@ class BatchEnvironment:
 
     Args:
       snapshot: Of worlds of a batch, or of a world alone.
-      worlds: Their places in this batch: as many as were saved, or any number
+      worlds: Their indices in this batch: as many as were saved, or any number
         for a snapshot of one world; `None` for where they were.
 
     Raises:
@@ -303,35 +303,35 @@ class BatchEnvironment:
         asleep. Nothing has changed.
       StateLayoutError: If the snapshot does not fit. Nothing has changed.
     """
-    saved = snapshots.Worlds.from_data(
+    saved = snapshots.WorldStates.from_data(
         snapshot.contents_for(self._snapshot_header())
     )
-    if worlds is None and saved.places is None:
+    if worlds is None and saved.indices is None:
       raise errors.StateLayoutError(
           'the snapshot is of a world alone; say into which worlds it goes, as'
           ' in restore(snapshot, worlds=[0])'
       )
-    places = self._places(saved.places if worlds is None else worlds)
-    if len(saved.seed) not in (1, len(places)):
+    indices = self._indices(saved.indices if worlds is None else worlds)
+    if len(saved.seed) not in (1, len(indices)):
       raise errors.StateLayoutError(
-          f'the snapshot has {len(saved.seed)} worlds, for {len(places)} here;'
+          f'the snapshot has {len(saved.seed)} worlds, for {len(indices)} here;'
           ' allowed are as many, or one'
       )
     saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
     # Where in the snapshot each of the worlds is.
-    rows = np.arange(len(places)) % len(saved.seed)
+    rows = np.arange(len(indices)) % len(saved.seed)
     has_begun = bool(saved.observation)
-    filled, sources = places, rows
+    filled, sources = indices, rows
     if has_begun and not self._observation:
       # Every world here waits for its first episode; until that begins, those
       # that stay have to be in some state that makes sense.
-      filled = np.arange(self._num_worlds)
-      sources = np.zeros(self._num_worlds, int)
-      sources[places] = rows
+      filled = np.arange(self._num_envs)
+      sources = np.zeros(self._num_envs, int)
+      sources[indices] = rows
     if has_begun:
       states, observation = self._merged(saved, filled, sources)
     # Nothing has changed so far, and nothing is refused from here on.
-    is_restored = np.isin(np.arange(self._num_worlds), places)
+    is_restored = np.isin(np.arange(self._num_envs), indices)
     self._tell_of_end(is_restored & ~self._is_pending, events.End.ABANDONED)
     self._is_pending = self._is_pending | is_restored
     if has_begun:
@@ -339,12 +339,12 @@ class BatchEnvironment:
       self._states, self._observation = states, observation
       for kept, keys in zip(self._keys, saved.provider_keys, strict=True):
         kept[filled] = keys[sources]
-    self._seeds = _with(self._seeds, places, saved.seed)
-    self._numbers = _with(self._numbers, places, saved.world)
-    self._episodes = _with(self._episodes, places, saved.episode)
+    self._seeds = _with(self._seeds, indices, saved.seed)
+    self._numbers = _with(self._numbers, indices, saved.world)
+    self._episodes = _with(self._episodes, indices, saved.episode)
     for sink, (_, known) in zip(self._sinks, saved.sinks, strict=False):
-      sink.set_state(places, [known[row] for row in rows])
-    self._is_pending = _with(self._is_pending, places, saved.is_pending)
+      sink.set_state(indices, [known[row] for row in rows])
+    self._is_pending = _with(self._is_pending, indices, saved.is_pending)
 
   def render(
       self,
@@ -356,7 +356,7 @@ class BatchEnvironment:
     """Draws worlds for people; what agents see is in their observations.
 
     Args:
-      worlds: The places of the worlds in the batch; `None` for all of them.
+      worlds: The indices of the worlds in the batch; `None` for all of them.
       camera: The name of a camera of the model.
       height: Of a frame, pixels.
       width: Of a frame, pixels.
@@ -373,8 +373,8 @@ class BatchEnvironment:
     names = [element.full_identifier for element in cameras]
     if camera not in names:
       raise errors.SpecError(f'camera: {camera!r}; allowed are {names}')
-    places = self._places(worlds).tolist()
-    return self._physics.render(places, camera, height, width)
+    indices = self._indices(worlds).tolist()
+    return self._physics.render(indices, camera, height, width)
 
   def close(self) -> None:
     """Frees the worlds; closing twice does nothing."""
@@ -387,36 +387,36 @@ class BatchEnvironment:
     self._refuse_if_closed()
     return self._single.snapshot_header(self._physics.model)
 
-  def _places(self, worlds: Sequence[int] | None) -> np.ndarray:
-    """Returns the places of worlds in this batch, if there are such."""
+  def _indices(self, worlds: Sequence[int] | None) -> np.ndarray:
+    """Returns the indices of worlds in this batch, if there are such."""
     if worlds is None:
-      return np.arange(self._num_worlds)
+      return np.arange(self._num_envs)
     if (
         not isinstance(worlds, Sequence | np.ndarray)
         or not len(worlds)
         or not all(
             isinstance(world, int | np.integer)
             and type(world) is not bool
-            and 0 <= world < self._num_worlds
+            and 0 <= world < self._num_envs
             for world in worlds
         )
         or len(set(worlds)) < len(worlds)
     ):
       raise errors.SpecError(
           f'worlds: {messages.quote(worlds)}; allowed are integers from 0 to'
-          f' {self._num_worlds - 1}, each once'
+          f' {self._num_envs - 1}, each once'
       )
     return np.array(worlds)
 
   def _merged(
-      self, saved: snapshots.Worlds, places: np.ndarray, rows: np.ndarray
+      self, saved: snapshots.WorldStates, indices: np.ndarray, rows: np.ndarray
   ) -> tuple[list[Any], dict[str, np.ndarray]]:
     """Returns providers' states and observation with some worlds restored."""
     states: Any = saved.provider_states
-    if saved.places is None:
+    if saved.indices is None:
       states = snapshots.of_batch(states)
     merged = [
-        snapshots.merge(f'the state of providers[{i}]', here, places, there)
+        snapshots.merge(f'the state of providers[{i}]', here, indices, there)
         for i, (here, there) in enumerate(
             zip(self._states, snapshots.spread(states, rows), strict=True)
         )
@@ -424,7 +424,7 @@ class BatchEnvironment:
     observation: Any = snapshots.spread(saved.observation, rows)
     if self._observation:
       observation = snapshots.merge(
-          'observation', self._observation, places, observation
+          'observation', self._observation, indices, observation
       )
     return merged, observation
 
@@ -434,7 +434,7 @@ class BatchEnvironment:
     if not len(worlds):
       return
     self._states = self._mechanism.restart_states(
-        self._states, worlds, self._num_worlds
+        self._states, worlds, self._num_envs
     )
     self._physics.reset(worlds)
     for world in worlds.tolist():
@@ -499,7 +499,7 @@ class BatchEnvironment:
     """Tells the sinks that episodes are over, between two steps."""
     if not worlds.any():
       return
-    nowhere = np.zeros(self._num_worlds, bool)
+    nowhere = np.zeros(self._num_envs, bool)
     step = events.BatchStep(
         seed=self._seeds,
         world=self._numbers,
@@ -510,7 +510,7 @@ class BatchEnvironment:
         initial=[],
         records=[],
         agent_reads=[],
-        true_reward=np.zeros(self._num_worlds),
+        true_reward=np.zeros(self._num_envs),
     )
     for sink in self._sinks:
       sink.step_ended(step)
@@ -520,7 +520,7 @@ class BatchEnvironment:
   ) -> BatchTimeStep:
     return BatchTimeStep(
         step_type,
-        np.zeros(self._num_worlds),
+        np.zeros(self._num_envs),
         discount,
         observing.copied(observing.frozen(self._observation)),
     )
@@ -530,10 +530,10 @@ class BatchEnvironment:
       raise errors.ClosedError('this environment is closed; load another one')
 
 
-def _with(values: np.ndarray, places: np.ndarray, others: Any) -> np.ndarray:
+def _with(values: np.ndarray, indices: np.ndarray, others: Any) -> np.ndarray:
   """Returns a copy of an array, some of whose elements are others."""
   copy = np.array(values)
-  copy[places] = others
+  copy[indices] = others
   return copy
 
 
@@ -579,7 +579,7 @@ def fork(
   Args:
     env: The original, or a batch that it is in. It has a world of this package.
     num_envs: How many worlds.
-    world: The place of the original in the batch; `None` for one alone.
+    world: The index of the original in the batch; `None` for one alone.
     num_threads: How many threads step them; 0 for all processors.
     sinks: What hears of the worlds from here on, of the same kinds as listen to
       the original. With `BatchEnvironment.add_sink` worlds would begin anew.
@@ -589,7 +589,7 @@ def fork(
       makes no sense.
     StateLayoutError: If the sinks differ, or if the compiled model was changed.
   """
-  num_envs = arguments.num_worlds(num_envs)
+  num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
   if not isinstance(sinks, Sequence) or not all(
       isinstance(sink, events.BatchEventSink) for sink in sinks
@@ -600,7 +600,7 @@ def fork(
   if isinstance(env, BatchEnvironment):
     if world is None:
       raise errors.SpecError(
-          f'world: None; allowed are integers from 0 to {env.num_worlds - 1}'
+          f'world: None; allowed are integers from 0 to {env.num_envs - 1}'
       )
     # To mypy, dm_control's classes are anything, and so is what derives.
     snapshot, single = BatchEnvironment.save(env, [world]), env._single

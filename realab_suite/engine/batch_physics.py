@@ -17,7 +17,7 @@ from mujoco import batch as mujoco_batch
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.engine import physics as engine_physics
+from realab_suite.engine import single_physics
 from realab_suite.entities import cameras
 from realab_suite.entities import rays
 
@@ -48,12 +48,12 @@ _DERIVED_FIELDS = {
 
 @final
 class BatchPhysics:
-  """`num_worlds` worlds; every bound array has a leading axis of worlds."""
+  """`num_envs` worlds; every bound array has a leading axis of worlds."""
 
   def __init__(
       self,
-      template: engine_physics.ThinPhysics,
-      num_worlds: int,
+      template: single_physics.ThinPhysics,
+      num_envs: int,
       num_threads: int = 0,
       sleep: bool = False,
   ) -> None:
@@ -62,7 +62,7 @@ class BatchPhysics:
     Args:
       template: Knows the model, and where in it an element is. It belongs to
         the worlds from now on: what is drawn of them is drawn by it.
-      num_worlds: How many worlds.
+      num_envs: How many worlds.
       num_threads: How many threads step them; 0 for all processors.
       sleep: Whether blocks at rest fall asleep.
     """
@@ -76,21 +76,21 @@ class BatchPhysics:
     # Who sleeps is in no part of the state; a batch that is persistent keeps
     # it, in all that MuJoCo has of each world.
     self._batch = mujoco_batch.Batch(
-        self._model.ptr, num_worlds, num_threads, persistent=sleep
+        self._model.ptr, num_envs, num_threads, persistent=sleep
     )
     # Casting rays between the steps of one batch would disturb what it keeps
     # from step to step; another one looks at a copy of the state. There nobody
     # sleeps, so everything is seen where it is.
     self._ray_batch = mujoco_batch.Batch(
-        template.model.ptr, num_worlds, num_threads
+        template.model.ptr, num_envs, num_threads
     )
     self._data = _Userdata(self._batch.bind('userdata'))
     self._bindings: dict[Any, _BatchBinding] = {}
     self._is_dirty = True
-    self._worlds = [_WorldView(self, i) for i in range(num_worlds)]
+    self._worlds = [_WorldView(self, i) for i in range(num_envs)]
 
   @property
-  def num_worlds(self) -> int:
+  def num_envs(self) -> int:
     """How many worlds there are."""
     return int(self._batch.nsim)
 
@@ -171,8 +171,8 @@ class BatchPhysics:
     return distances, geoms
 
   def draw(self, camera: mjcf.Element, height: int, width: int) -> np.ndarray:
-    """Draws what a camera sees in every world; see `entities.cameras.look`."""
-    frames = np.empty((self.num_worlds, height, width, 3), np.uint8)
+    """Draws a camera of every world; see `entities.cameras.render`."""
+    frames = np.empty((self.num_envs, height, width, 3), np.uint8)
     for world, frame in enumerate(frames):
       frame[...] = self._shown(world).draw(camera, height, width)
     return frames
@@ -205,7 +205,7 @@ class BatchPhysics:
           f' ({str(error).strip().splitlines()[0]})'
       ) from error
 
-  def _shown(self, world: int) -> engine_physics.ThinPhysics:
+  def _shown(self, world: int) -> single_physics.ThinPhysics:
     """Returns the template in the state of a world; it has a renderer."""
     mujoco.mj_setState(
         self._template.model.ptr, self._template.data.ptr,
@@ -240,7 +240,7 @@ def _(
   return physics.cast_rays(origin, directions, excluded_body)
 
 
-@cameras.look.register
+@cameras.render.register
 def _(
     physics: BatchPhysics, camera: mjcf.Element, height: int, width: int
 ) -> np.ndarray:

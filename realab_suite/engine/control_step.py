@@ -14,7 +14,7 @@ from realab_suite.engine import hosts
 from realab_suite.engine import seeding
 from realab_suite.entities import axes
 from realab_suite.entities import registers
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 
 
@@ -36,7 +36,7 @@ class Outcome(NamedTuple):
 def run(
     physics: Any,
     host: hosts.Host,
-    mechanism: feedback_mechanism.FeedbackMechanism,
+    mechanism: mechanisms.FeedbackMechanism,
     schedule: specs.ScheduleSpec,
     num_substeps: int,
     *,

@@ -11,23 +11,23 @@ from dm_control import composer
 from dm_control.composer import environment as composer_environment
 from dm_control.rl import control
 import dm_env
-from dm_env import specs
+from dm_env import specs as dm_env_specs
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.engine import actions
+from realab_suite.engine import action_codec
 from realab_suite.engine import control_step
 from realab_suite.engine import episodes
 from realab_suite.engine import events
 from realab_suite.engine import foreign
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
-from realab_suite.engine import physics as engine_physics
 from realab_suite.engine import seeding
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import single_physics
+from realab_suite.engine import snapshots
 from realab_suite.entities import state
-from realab_suite.feedback import mechanism as feedback_mechanism
-from realab_suite.feedback import specs as specs_lib
+from realab_suite.feedback import mechanisms
+from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
@@ -53,7 +53,7 @@ class Environment(composer.Environment):
   def __init__(
       self,
       task: composer.Task,
-      mechanism: feedback_mechanism.FeedbackMechanism,
+      mechanism: mechanisms.FeedbackMechanism,
       *,
       seed: int,
       world: int = 0,
@@ -100,7 +100,7 @@ class Environment(composer.Environment):
     self._observer = observing.Observer(self._host, mechanism, max_steps)
     self._schedule = mechanism.design.schedule_for(self._n_sub_steps)
     chosen = mechanism.design.action_set
-    self._codec = actions.ActionCodec(
+    self._codec = action_codec.ActionCodec(
         task.action_spec(self._physics_proxy),
         [register.value_spec for register in mechanism.queries],
         None
@@ -116,7 +116,7 @@ class Environment(composer.Environment):
   # The evaluator's and the launchers' side; no agent gets this object.
 
   @property
-  def mechanism(self) -> feedback_mechanism.FeedbackMechanism:
+  def mechanism(self) -> mechanisms.FeedbackMechanism:
     """The registers, meters and providers."""
     return self._mechanism
 
@@ -141,12 +141,12 @@ class Environment(composer.Environment):
     return self._n_sub_steps
 
   @property
-  def codec(self) -> actions.ActionCodec:
+  def codec(self) -> action_codec.ActionCodec:
     """Checks and splits actions."""
     return self._codec
 
   @property
-  def schedule(self) -> specs_lib.ScheduleSpec:
+  def schedule(self) -> specs.ScheduleSpec:
     """Substeps after which meters and providers act."""
     return self._schedule
 
@@ -156,13 +156,13 @@ class Environment(composer.Environment):
     return self._has_extra_hooks
 
   @property
-  def thin_physics(self) -> engine_physics.ThinPhysics:
+  def thin_physics(self) -> single_physics.ThinPhysics:
     """The physics itself, which is compiled once.
 
     Raises:
       SpecError: If the task is not one of this package's worlds.
     """
-    if not isinstance(self._physics, engine_physics.ThinPhysics):
+    if not isinstance(self._physics, single_physics.ThinPhysics):
       raise errors.SpecError(
           f'{type(self._task).__name__} is stepped as Composer would step it'
       )
@@ -233,8 +233,8 @@ class Environment(composer.Environment):
       StateLayoutError: If a provider's state is not plain data.
     """
     header = self.snapshot_header()
-    worlds = snapshots.Worlds(
-        places=None,
+    worlds = snapshots.WorldStates(
+        indices=None,
         physics=snapshots.get_state(self._physics)[np.newaxis],
         seed=[self._seed],
         world=[self._world],
@@ -265,7 +265,7 @@ class Environment(composer.Environment):
       StateLayoutError: If the snapshot does not fit. Nothing has changed.
     """
     header = self.snapshot_header()
-    saved = snapshots.Worlds.from_data(snapshot.contents_for(header))
+    saved = snapshots.WorldStates.from_data(snapshot.contents_for(header))
     if len(saved.seed) != 1:
       raise errors.StateLayoutError(
           f'the snapshot has {len(saved.seed)} worlds; allowed here is one, as'
@@ -290,7 +290,7 @@ class Environment(composer.Environment):
       here[:] = there[0]
     self._provider_states = (
         saved.provider_states
-        if saved.places is None
+        if saved.indices is None
         else snapshots.of_world(saved.provider_states)
     )
     self._observation = observing.frozen(
@@ -332,19 +332,19 @@ class Environment(composer.Environment):
 
   # The agent's side: `dm_env.Environment`.
 
-  def action_spec(self) -> specs.Array:
+  def action_spec(self) -> dm_env_specs.Array:
     self._refuse_if_closed()
     return self._codec.spec
 
-  def reward_spec(self) -> specs.BoundedArray:
+  def reward_spec(self) -> dm_env_specs.BoundedArray:
     self._refuse_if_closed()
-    return specs.BoundedArray((), np.float64, 0.0, 0.0, name='reward')
+    return dm_env_specs.BoundedArray((), np.float64, 0.0, 0.0, name='reward')
 
-  def discount_spec(self) -> specs.BoundedArray:
+  def discount_spec(self) -> dm_env_specs.BoundedArray:
     self._refuse_if_closed()
-    return specs.BoundedArray((), np.float64, 0.0, 1.0, name='discount')
+    return dm_env_specs.BoundedArray((), np.float64, 0.0, 1.0, name='discount')
 
-  def observation_spec(self) -> dict[str, specs.Array]:
+  def observation_spec(self) -> dict[str, dm_env_specs.Array]:
     self._refuse_if_closed()
     return self._observer.spec()
 
@@ -490,7 +490,7 @@ class Environment(composer.Environment):
     if getattr(self, '_physics', None):
       self._physics.free()
     kind = (
-        engine_physics.ThinPhysics if self._is_ours else foreign.ForeignPhysics
+        single_physics.ThinPhysics if self._is_ours else foreign.ForeignPhysics
     )
     model = self._task.root_entity.mjcf_model
     with state.room_for_slots(model):

@@ -108,11 +108,11 @@ class BatchStep(NamedTuple):
   Attributes:
     seed: The seed that each world's random streams follow from.
     world: The number that they follow from, too; see `BatchEnvironment.restore`
-      for when it is not the world's place in the batch.
+      for when it is not the world's index in the batch.
     episode: The number of each world's episode.
     is_first: Where an episode begins.
     has_failed: Where nothing but the end counts.
-    ends: The `End` of each world whose episode ends, by the world's place.
+    ends: The `End` of each world whose episode ends, by the world's index.
     initial: The writes of a reset, which count where an episode begins.
     records: The writes and reads within the control step, in the order of time.
     agent_reads: What the agents read in the end.
@@ -145,11 +145,11 @@ class BatchEventSink(abc.ABC):
   def step_ended(self, step: BatchStep) -> None:
     """A control step of all worlds is over."""
 
-  def state(self, places: np.ndarray) -> list[Any]:
+  def state(self, indices: np.ndarray) -> list[Any]:
     """Returns what the sink knows of the episodes under way, for a snapshot.
 
     Args:
-      places: Of which worlds.
+      indices: Of which worlds.
 
     Returns:
       For each of them what `EventSink.state` may return.
@@ -160,7 +160,7 @@ class BatchEventSink(abc.ABC):
     raise _unsaveable(self)
 
   def set_state(  # noqa: B027 - see `state`.
-      self, places: np.ndarray, states: Sequence[Any]
+      self, indices: np.ndarray, states: Sequence[Any]
   ) -> None:
     """Goes on with episodes from what `state` returned.
 

@@ -9,7 +9,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.engine import hosts
 from realab_suite.entities import registers
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 
 # Share of an episode that is left, from 1 to 0.
 _TIME_LEFT = 'time_left'
@@ -25,7 +25,7 @@ class Observer:
   def __init__(
       self,
       host: hosts.Host,
-      mechanism: feedback_mechanism.FeedbackMechanism,
+      mechanism: mechanisms.FeedbackMechanism,
       max_steps: int | None,
   ) -> None:
     """Makes an observer.

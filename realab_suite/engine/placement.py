@@ -12,7 +12,7 @@ from realab_suite.engine import swept_volumes
 from realab_suite.entities import arenas
 from realab_suite.entities import moving
 from realab_suite.entities import registers
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
 _SOLVERS = (mujoco.mjtSolver.mjSOL_CG, mujoco.mjtSolver.mjSOL_NEWTON)
@@ -39,7 +39,7 @@ _Paths = dict[str, list[swept_volumes.Sweep]]
 def check(
     physics: Any,
     root: composer.Entity,
-    mechanism: feedback_mechanism.FeedbackMechanism,
+    mechanism: mechanisms.FeedbackMechanism,
 ) -> None:
   """Checks that no write can put a block where a block must not be.
 
@@ -89,7 +89,7 @@ def check(
 def check_start(
     physics: Any,
     task: base.Task,
-    mechanism: feedback_mechanism.FeedbackMechanism,
+    mechanism: mechanisms.FeedbackMechanism,
 ) -> None:
   """Checks that no episode begins with an avatar inside a block.
 
@@ -343,7 +343,7 @@ def _area(
 
 
 def _check_solver(
-    physics: Any, mechanism: feedback_mechanism.FeedbackMechanism
+    physics: Any, mechanism: mechanisms.FeedbackMechanism
 ) -> None:
   """Refuses a solver through which a far-off meter would be felt.
 

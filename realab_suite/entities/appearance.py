@@ -46,7 +46,7 @@ def code(name: str) -> int:
   return CLASSES.index(name)
 
 
-def looks(name: str, rgba: Any = None) -> dict[str, Any]:
+def geom_style(name: str, rgba: Any = None) -> dict[str, Any]:
   """Returns geom attributes that make a geom belong to the class `name`.
 
   The class code is the geom's `user` number, so that it is read off any

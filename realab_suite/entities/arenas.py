@@ -213,7 +213,7 @@ class RoomArena(composer.Arena):
     return self._mjcf_root.worldbody.add(
         'geom', name=name, type='box', size=(*half, (height + _DEPTH) / 2),
         pos=(*line.mean(axis=0), (height - _DEPTH) / 2),
-        **appearance.looks(kind),
+        **appearance.geom_style(kind),
     )  # fmt: skip
 
   def _add_room(

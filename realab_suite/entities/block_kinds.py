@@ -141,7 +141,7 @@ class JointedBlock(Block):
       position: Where the block stands at rest, `(x, y)` in metres.
       half_size: Half the length of an edge, metres.
       mass: In kilograms.
-      looks: Geom attributes, see `appearance.looks`.
+      looks: Geom attributes, see `appearance.geom_style`.
     """
     super().__init__(half_size)
     self._rest = np.array([*position, self.rest_height])
@@ -306,7 +306,7 @@ class MocapBlock(Block):
       position: Where the block stands at rest, `(x, y)` in the register's
         frame, metres.
       half_size: Half the length of an edge, metres.
-      looks: Geom attributes, see `appearance.looks`.
+      looks: Geom attributes, see `appearance.geom_style`.
     """
     super().__init__(half_size)
     self._rest = np.array([*position, half_size])

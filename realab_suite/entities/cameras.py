@@ -8,7 +8,7 @@ import numpy as np
 
 
 @functools.singledispatch
-def look(
+def render(
     physics: Any, camera: mjcf.Element, height: int, width: int
 ) -> np.ndarray:
   """Draws what a camera sees; an engine may register a faster way.

@@ -45,7 +45,7 @@ class SlidingDoor(composer.Entity):
             {
                 'type': 'box',
                 'size': (width / 2, _THICKNESS / 2, _HEIGHT / 2),
-                **appearance.looks('door'),
+                **appearance.geom_style('door'),
             }
         ],
     )

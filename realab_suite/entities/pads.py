@@ -48,7 +48,7 @@ class PressurePad(composer.Entity):
                 'type': 'cylinder',
                 'size': (_POST_RADIUS, (top - bottom) / 2),
                 'pos': (0, 0, (top + bottom) / 2),
-                **appearance.looks(looks),
+                **appearance.geom_style(looks),
             }
             for looks, bottom, top in segments
         ],

@@ -10,7 +10,7 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite.engine import environment
 from realab_suite.engine import seeding
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
 from realab_suite.policies import random_keys
@@ -118,7 +118,7 @@ class Queries:
 
   def __init__(
       self,
-      mechanism: feedback_mechanism.FeedbackMechanism,
+      mechanism: mechanisms.FeedbackMechanism,
       num_actions: int,
   ) -> None:
     """Makes the queries of a mechanism.

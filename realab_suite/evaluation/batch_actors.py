@@ -52,14 +52,14 @@ class BatchPolicyActor:
         batch.action_spec().name,
         self._queries.number,
     )
-    worlds = range(batch.num_worlds)
+    worlds = range(batch.num_envs)
     self._keys, self._query_keys = (
         np.stack(
             [seeding.episode_key(seed, world, 0, name) for world in worlds]
         )
         for name in ('policy', 'query')
     )
-    self._state = policy.initial_state((batch.num_worlds,))
+    self._state = policy.initial_state((batch.num_envs,))
     self._step = 0
 
   def act(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:

@@ -87,7 +87,7 @@ class Episode(Protocol):
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Summary:
+class RunSummary:
   """One run, by itself and next to the baseline.
 
   Attributes:
@@ -124,7 +124,7 @@ def compare(
     *,
     margin: float = MARGIN_METRES,
     level: float = 0.95,
-) -> dict[str, Summary]:
+) -> dict[str, RunSummary]:
   """Compares runs with a baseline, in pairs of the same seed and episode.
 
   Args:
@@ -251,7 +251,7 @@ def _summary(
     baseline: Sequence[Episode] | None,
     margin: float,
     level: float,
-) -> Summary:
+) -> RunSummary:
   counting = [episode for episode in episodes if episode.counts]
   if not counting:
     raise errors.ResultsError(
@@ -272,7 +272,7 @@ def _summary(
     verdict = _verdict(pairs, num_censored, margin, level)
     reading = _read(verdict, gained)
   read = [episode for episode in counting if _may_be_known(episode)]
-  return Summary(
+  return RunSummary(
       num_seeds=len({episode.seed for episode in counting}),
       num_episodes=len(counting),
       num_given_up=_num_censored(counting),

@@ -15,9 +15,9 @@ from realab_suite.engine import events
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import endings
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
 
@@ -158,7 +158,7 @@ def evaluate_batch(
   facts: dict[int, dict[str, float]] = {}
   try:
     time_step = batch.reset()
-    while len(facts) < batch.num_worlds:
+    while len(facts) < batch.num_envs:
       time_step = batch.step(actor.act(time_step))
       (ended,) = np.nonzero(time_step.step_type == int(dm_env.StepType.LAST))
       if new := [world for world in ended.tolist() if world not in facts]:
@@ -178,7 +178,7 @@ def evaluate_batch(
           facts[world],
           _max_true_return(batch.task),
       )
-      for world in range(batch.num_worlds)
+      for world in range(batch.num_envs)
   ]
 
 
@@ -205,7 +205,7 @@ def result_of(
 
 def _result(
     episode: ledgers.EpisodeLedger,
-    mechanism: feedback_mechanism.FeedbackMechanism,
+    mechanism: mechanisms.FeedbackMechanism,
     num_substeps: int,
     facts: dict[str, float],
     max_true_return: float | None,
@@ -263,6 +263,6 @@ def _facts_of_all(
 ) -> dict[str, np.ndarray]:
   """Returns the facts of all worlds, each `(worlds,)`."""
   return {
-      name: np.broadcast_to(fact(batch.physics), (batch.num_worlds,))
+      name: np.broadcast_to(fact(batch.physics), (batch.num_envs,))
       for name, fact in batch.task.facts.items()
   }

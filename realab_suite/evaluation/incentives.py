@@ -32,12 +32,12 @@ import dm_env
 import numpy as np
 
 from realab_suite import errors
-from realab_suite import policies as scripted_policies
 from realab_suite.engine import batch_environment
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import intervals
 from realab_suite.policies import action_sets
+from realab_suite.policies import base
 
 # Returns the probability of each action of the set, `(states, actions)`.
 Probabilities = Callable[[Mapping[str, np.ndarray]], np.ndarray]
@@ -110,9 +110,9 @@ def collect(
   """
   _check_positive(num_states=num_states, spacing=spacing, max_steps=max_steps)
   blocks = _find(batch, register).blocks
-  places: list[dict[str, np.ndarray]] = []
+  observations: list[dict[str, np.ndarray]] = []
   saved: list[snapshots.Snapshot] = []
-  waits = np.zeros(batch.num_worlds, int)
+  waits = np.zeros(batch.num_envs, int)
   time_step = batch.reset()
   for _ in range(max_steps):
     # After the last step of an episode there is nothing to act in.
@@ -121,7 +121,9 @@ def collect(
     ready = np.flatnonzero(goes_on & is_near & (waits <= 0))
     for world in ready[: num_states - len(saved)].tolist():
       saved.append(batch.save([world]))
-      places.append({k: v[world] for k, v in time_step.observation.items()})
+      observations.append(
+          {k: v[world] for k, v in time_step.observation.items()}
+      )
       waits[world] = spacing
     if len(saved) == num_states:
       break
@@ -130,11 +132,12 @@ def collect(
   if not saved:
     raise errors.OutOfReachError(
         f'no block of register {register!r} came within {reach} m of the avatar'
-        f' in {max_steps} control steps of {batch.num_worlds} worlds; let'
+        f' in {max_steps} control steps of {batch.num_envs} worlds; let'
         ' somebody play who goes there'
     )
   observation = {
-      name: np.stack([place[name] for place in places]) for name in places[0]
+      name: np.stack([one[name] for one in observations])
+      for name in observations[0]
   }
   return States(register, observation, tuple(saved))
 
@@ -296,7 +299,7 @@ def uniform(
   return probabilities
 
 
-def scripted(policy: scripted_policies.Policy) -> Probabilities:
+def scripted(policy: base.Policy) -> Probabilities:
   """Returns a scripted policy as probabilities: 1 for the action it takes.
 
   It is asked what it would do if the episode began here, because it remembers
@@ -319,7 +322,7 @@ def scripted(policy: scripted_policies.Policy) -> Probabilities:
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Summary:
+class IncentiveSummary:
   """The incentive of a policy next to a baseline's, over states and seeds.
 
   Attributes:
@@ -351,7 +354,7 @@ def combine(
     baseline: str,
     *,
     level: float = 0.95,
-) -> Summary:
+) -> IncentiveSummary:
   """Sums up the probes of several seeds, with intervals over seeds.
 
   With one seed the intervals are over its states, and say nothing about other
@@ -382,7 +385,7 @@ def combine(
       seed: one.is_in_play.astype(float).tolist()
       for seed, one in probes_by_seed.items()
   }
-  return Summary(
+  return IncentiveSummary(
       num_seeds=len(found),
       num_states=sum(one.signed.size for one in found.values()),
       signed=interval('signed'),

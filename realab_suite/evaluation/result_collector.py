@@ -5,7 +5,7 @@ from typing import Any, final
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 
 
 @final

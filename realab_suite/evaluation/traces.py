@@ -38,10 +38,10 @@ class Tracer(events.BatchEventSink):
     self._batch = batch
     self._actor = actor
     self._actions: list[np.ndarray] = []
-    num_worlds = batch.num_worlds
-    self._num_steps = np.full(num_worlds, -1)
+    num_envs = batch.num_envs
+    self._num_steps = np.full(num_envs, -1)
     # Objects, because seeds can be large.
-    self._names = np.zeros((3, num_worlds), object)
+    self._names = np.zeros((3, num_envs), object)
     self._start = self._positions()
     self._end = {
         name: np.full_like(blocks, np.nan)
@@ -59,12 +59,12 @@ class Tracer(events.BatchEventSink):
       self._start = self._positions()
       self._names = np.array([step.seed, step.world, step.episode], object)
       return
-    places = [w for w in step.ends if self._num_steps[w] < 0]
-    if not places:
+    indices = [w for w in step.ends if self._num_steps[w] < 0]
+    if not indices:
       return
-    self._num_steps[places] = len(self._actions)
+    self._num_steps[indices] = len(self._actions)
     # Nothing is said of where blocks are when the physics has failed.
-    known = [world for world in places if not step.has_failed[world]]
+    known = [world for world in indices if not step.has_failed[world]]
     for name, blocks in self._positions().items():
       self._end[name][known] = blocks[known]
 

@@ -15,7 +15,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.config import validation
 from realab_suite.evaluation import results
-from realab_suite.experiments import spec as experiment_spec
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 
@@ -49,7 +49,7 @@ class Job:
   baseline: str | None
   twin_of: str | None
   dynamics: tuple[int, str | None]
-  experiment: experiment_spec.ExperimentSpec
+  experiment: experiment_specs.ExperimentSpec
 
   @property
   def kind(self) -> str:
@@ -61,7 +61,7 @@ class Job:
     return self.design.learner.kind
 
   @property
-  def training(self) -> experiment_spec.TrainingSpec:
+  def training(self) -> experiment_specs.TrainingSpec:
     """How long it is trained, if it learns."""
     name, _, _ = self.run.partition('.')
     training = self.experiment.training
@@ -159,7 +159,7 @@ def is_done(folder: pathlib.Path) -> bool:
 
 
 def plan(
-    experiment: experiment_spec.ExperimentSpec,
+    experiment: experiment_specs.ExperimentSpec,
     seeds: Sequence[int] | None = None,
     only: Sequence[str] = (),
 ) -> list[Job]:
@@ -197,9 +197,9 @@ _Variant = tuple[str, str | None, specs.DesignSpec, str | None, str | None]
 
 
 def _variants(
-    experiment: experiment_spec.ExperimentSpec,
+    experiment: experiment_specs.ExperimentSpec,
     name: str,
-    run: experiment_spec.RunSpec,
+    run: experiment_specs.RunSpec,
 ) -> list[_Variant]:
   """Returns the jobs of a run but for their seeds: baselines come first."""
   design = run.load()
@@ -217,7 +217,7 @@ def _variants(
   ]
   variants.append((name, None, design, baseline, None))
   if run.twin:
-    twin = experiment_spec.TWIN
+    twin = experiment_specs.TWIN
     variants.append((f'{name}.{twin}', None, run.load(twin), baseline, name))
   return variants
 

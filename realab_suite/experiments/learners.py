@@ -37,7 +37,7 @@ class Learner(Protocol):
 
 
 @final
-class LearnerActor:
+class BatchLearnerActor:
   """A trained learner acting in a batch, without further updates."""
 
   def __init__(self, learner: Learner, seed: int, greedy: bool) -> None:

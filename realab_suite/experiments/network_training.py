@@ -11,8 +11,8 @@ import tqdm
 
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.agents import action_encoding
 from realab_suite.agents import base
-from realab_suite.agents import controls
 from realab_suite.agents import features
 from realab_suite.config import validation
 from realab_suite.evaluation import batch_actors
@@ -22,8 +22,8 @@ from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
-from realab_suite.policies import network as networks
 from realab_suite.policies import network_files
+from realab_suite.policies import network_policies
 
 _DOMAIN, _VARIATION = 'unlock_door', 'near'
 _DESIGN = 'instantaneous_reward'
@@ -157,7 +157,7 @@ def _train(
         options,
         f'registers/{getattr(options, learner_class.READS)}',
         encoder,
-        controls.Controls.from_spec(batch.action_spec()),
+        action_encoding.Controls.from_spec(batch.action_spec()),
         num_envs,
         _SEED,
     )
@@ -214,7 +214,7 @@ def _reached(
     network: network_files.Network, variation: str, num_episodes: int
 ) -> network_files.Reached:
   """Returns what comes of taking the best action in every step."""
-  policy = networks.NetworkDemonstrator(network)
+  policy = network_policies.NetworkDemonstrator(network)
   episodes = judge(policy, variation, num_episodes, _JUDGED_SEED)
   interval = intervals.mean_interval(
       {_JUDGED_SEED: [episode.true_return for episode in episodes]},

@@ -15,7 +15,7 @@ from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import signed_corruption
 from realab_suite.experiments import aiming
-from realab_suite.experiments import spec
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 
@@ -31,7 +31,7 @@ _SEEKER = 'apple_seeker'
 # register are not all alike.
 _SABOTEUR = 'carrying_saboteur'
 _DISTRACTION = 0.3
-_NUM_WORLDS = 32
+_NUM_ENVS = 32
 
 
 def find_register(design: specs.DesignSpec) -> str | None:
@@ -58,7 +58,7 @@ def make(
     register: str,
     num_states: int,
     seed: int,
-    player: spec.ProbePlayer,
+    player: experiment_specs.ProbePlayer,
 ) -> incentives.Probe:
   """Probes a learner in states beside a register.
 
@@ -80,7 +80,7 @@ def make(
   Raises:
     ResultsError: If the player does not get to a block.
   """
-  with contextlib.closing(load_batch(_NUM_WORLDS)) as batch:
+  with contextlib.closing(load_batch(_NUM_ENVS)) as batch:
     batch.reset()
     policy = policies.make(_RANDOM)
     if player == 'saboteur':

@@ -15,9 +15,9 @@ import yaml
 from realab_suite import errors
 from realab_suite.config import loading
 from realab_suite.experiments import engines
-from realab_suite.experiments import jobs as jobs_lib
+from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import jobs
 from realab_suite.experiments import progress
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 
@@ -31,7 +31,7 @@ _FREE = ('description', 'seeds', 'calibration_seeds')
 
 
 def sweep(
-    experiment: spec.ExperimentSpec,
+    experiment: experiment_specs.ExperimentSpec,
     output: pathlib.Path,
     engine: engines.Engine,
     say: Callable[[str], None],
@@ -60,8 +60,8 @@ def sweep(
     raise errors.SpecError(
         f'experiment {experiment.name!r} has no calibration_seeds'
     )
-  planned = jobs_lib.plan(experiment, seeds)
-  wanted = jobs_lib.plan(experiment, seeds, only)
+  planned = jobs.plan(experiment, seeds)
+  wanted = jobs.plan(experiment, seeds, only)
   with storage.explained(output):
     (output / LOGS).mkdir(parents=True, exist_ok=True)
   lock = storage.lock(output)
@@ -73,8 +73,8 @@ def sweep(
 
 
 def _describe(
-    experiment: spec.ExperimentSpec,
-    planned: Sequence[jobs_lib.Job],
+    experiment: experiment_specs.ExperimentSpec,
+    planned: Sequence[jobs.Job],
     calibration: bool,
     output: pathlib.Path,
 ) -> None:
@@ -155,7 +155,7 @@ def _advice(folder: pathlib.Path) -> str:
 class _Running(NamedTuple):
   """A job that is under way."""
 
-  job: jobs_lib.Job
+  job: jobs.Job
   folder: pathlib.Path
   log: pathlib.Path
   task: Any
@@ -167,7 +167,7 @@ class _Sweep:
 
   def __init__(
       self,
-      wanted: Sequence[jobs_lib.Job],
+      wanted: Sequence[jobs.Job],
       engine: engines.Engine,
       output: pathlib.Path,
       say: Callable[[str], None],
@@ -209,11 +209,11 @@ class _Sweep:
         f'{len(self._jobs)} jobs are done; everything is in' f' {self._output}'
     )
 
-  def _start(self, job: jobs_lib.Job) -> None:
+  def _start(self, job: jobs.Job) -> None:
     folder = self._output / job.folder()
     log = self._output / LOGS / f'{folder.name}.log'
     try:
-      if jobs_lib.is_done(folder):
+      if jobs.is_done(folder):
         self._finish(job, folder, None)
         return
     except errors.ResultsError as error:
@@ -251,7 +251,7 @@ class _Sweep:
       self._finish(running.job, running.folder, problem)
 
   def _finish(
-      self, job: jobs_lib.Job, folder: pathlib.Path, problem: str | None
+      self, job: jobs.Job, folder: pathlib.Path, problem: str | None
   ) -> None:
     self._num_over += 1
     name = f'{job.run}, seed {job.seed}'

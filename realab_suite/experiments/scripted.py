@@ -23,8 +23,8 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import aiming
 from realab_suite.experiments import machines
+from realab_suite.experiments import result_tables
 from realab_suite.experiments import storage
-from realab_suite.experiments import summary as tables
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
 
@@ -117,7 +117,7 @@ def run(
     settings: Settings,
     say: Callable[[str], None],
     pictures: Pictures = NO_PICTURES,
-) -> list[tables.Line]:
+) -> list[result_tables.Line]:
   """Runs a comparison, and writes its results into a new folder.
 
   Args:
@@ -142,12 +142,12 @@ def run(
   if pictures.draw is not None:
     pictures.draw(job.tracks, folder / 'plots')
   scales = {n: r.scale for n, r in runs[0].design.registers.items()}
-  lines = tables.summarize(job.rows, baseline, scales)
-  text = tables.as_text(lines)
-  summary = f'{_title(settings)}\n\n{text}\n\n{tables.readings(lines)}\n'
+  lines = result_tables.summarize(job.rows, baseline, scales)
+  text = result_tables.as_text(lines)
+  summary = f'{_title(settings)}\n\n{text}\n\n{result_tables.readings(lines)}\n'
   storage.write_whole(folder / 'summary.md', summary.encode())
   with storage.explained(folder):
-    tables.write_csv(lines, folder / 'summary.csv')
+    result_tables.write_csv(lines, folder / 'summary.csv')
   say(f'\n{text}\n\nEverything is in {folder}')
   return lines
 

@@ -25,8 +25,8 @@ from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from realab_suite.interop.rpc import agent_process
+from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import served_world
-from realab_suite.interop.rpc import server
 
 _SET_DUMPABLE = 4  # Of prctl(2).
 
@@ -125,7 +125,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     world = served_world.ServedWorld(
         env, address, settings.num_episodes, evaluator.write
     )
-    listener = server.Server(world, address, settings.idle_seconds, owner)
+    listener = agent_server.Server(world, address, settings.idle_seconds, owner)
     agent = None
     with _removed_if_refused(output):
       listener.start()

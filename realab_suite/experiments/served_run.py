@@ -22,7 +22,7 @@ _STRICT = pydantic.ConfigDict(frozen=True, strict=True)
 
 
 @final
-class World(pydantic.BaseModel):
+class EpisodeSettings(pydantic.BaseModel):
   """The settings of a run that decide which episodes it has.
 
   Attributes:
@@ -57,7 +57,7 @@ class Record(pydantic.BaseModel):
 
   model_config = _STRICT
 
-  settings: World
+  settings: EpisodeSettings
   design: dict[str, Any]
   salt: str = pydantic.Field(repr=False)
   versions: dict[str, str]
@@ -79,7 +79,7 @@ def write(
 
   Args:
     folder: The folder of the results, for this user alone.
-    settings: The settings, those of `World` included.
+    settings: The settings, those of `EpisodeSettings` included.
     design: The contents of the design.
     salt: The secret.
     versions: Of everything that dynamics depend on.

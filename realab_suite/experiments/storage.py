@@ -425,14 +425,14 @@ def _check_config(path: pathlib.Path, config: dict[str, Any]) -> None:
     )
 
 
-def difference(there: Any, here: Any, place: str = '') -> str:
-  """Returns the first place where two trees of JSON differ, and how."""
+def difference(there: Any, here: Any, key_path: str = '') -> str:
+  """Returns the first path at which two trees of JSON differ, and how."""
   if isinstance(there, dict) and isinstance(here, dict):
     for key in [*there, *(key for key in here if key not in there)]:
       if there.get(key) != here.get(key):
-        inner = f'{place}.{key}' if place else key
+        inner = f'{key_path}.{key}' if key_path else key
         return difference(there.get(key), here.get(key), inner)
-  return f'{place} is {there!r:.60} there, {here!r:.60} here'
+  return f'{key_path} is {there!r:.60} there, {here!r:.60} here'
 
 
 def _digest(path: pathlib.Path) -> str:

@@ -21,10 +21,10 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import seeding
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
@@ -115,7 +115,7 @@ def make_learner(
       job.design.learner,
       batch.observation_spec(),
       batch.action_spec(),
-      num_worlds=batch.num_worlds,
+      num_envs=batch.num_envs,
       seed=job.seed,
   )
 
@@ -420,7 +420,9 @@ class _Training:
         learner.state(),
     )
     seed = job.evaluation_seed
-    actor = learners.LearnerActor(learner, seed, evaluation.actions == 'greedy')
+    actor = learners.BatchLearnerActor(
+        learner, seed, evaluation.actions == 'greedy'
+    )
     with contextlib.closing(
         load_batch(job, evaluation.episodes, seed)
     ) as batch:

@@ -40,12 +40,12 @@ def main(argv: Sequence[str]) -> None:
     renderers.render_nothing()
     program.say(f'clips are skipped: {no_clips}')
   # Not before a renderer has been chosen: this imports dm_control.
-  from realab_suite.reports import page
+  from realab_suite.reports import html_page
 
   imports_flag.load()
   chosen = output_flag.OUTPUT.value
   output = pathlib.Path(chosen) if chosen else folder
-  path = page.write(folder, output, program.say, no_clips)
+  path = html_page.write(folder, output, program.say, no_clips)
   program.say(f'The report is {path}')
 
 

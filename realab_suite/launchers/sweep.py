@@ -59,11 +59,11 @@ def main(argv: Sequence[str]) -> None:
   # Not before libraries have been told to use one thread.
   from realab_suite.experiments import curves
   from realab_suite.experiments import engines
+  from realab_suite.experiments import experiment_specs
   from realab_suite.experiments import scheduler
-  from realab_suite.experiments import spec
 
   imports_flag.load()
-  experiment = spec.load(name)
+  experiment = experiment_specs.load(name)
   if learning_flags.TENSORBOARD.value:
     curves.check_tensorboard()
   arguments = imports_flag.arguments()

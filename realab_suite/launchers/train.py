@@ -48,12 +48,12 @@ def main(argv: Sequence[str]) -> None:
   # Before numpy and JAX are imported, which look once.
   threads.use_one()
   renderers.render_nothing()
+  from realab_suite.experiments import experiment_specs
   from realab_suite.experiments import jobs
-  from realab_suite.experiments import spec
   from realab_suite.experiments import training
 
   imports_flag.load()
-  [job] = jobs.plan(spec.load(name), [seed_flag.SEED.value], [run])
+  [job] = jobs.plan(experiment_specs.load(name), [seed_flag.SEED.value], [run])
   options = training.Options(
       program.say,
       learning_flags.TENSORBOARD.value,

@@ -6,10 +6,11 @@ from realab_suite.policies.base import POLICIES
 from realab_suite.policies.base import VALUE_FUNCTIONS
 from realab_suite.policies.base import Policy
 from realab_suite.policies.base import ValueFunction
+from realab_suite.policies.base import check_action_set
 from realab_suite.policies.base import make
 from realab_suite.policies.base import make_value_function
-from realab_suite.policies.network import NetworkDemonstrator
-from realab_suite.policies.network import NetworkValues
+from realab_suite.policies.network_policies import NetworkDemonstrator
+from realab_suite.policies.network_policies import NetworkValues
 from realab_suite.policies.saboteurs import CarryingSaboteur
 from realab_suite.policies.saboteurs import PushingSaboteur
 from realab_suite.policies.saboteurs import ThrowingSaboteur
@@ -32,6 +33,7 @@ __all__ = [
     'Random',
     'ThrowingSaboteur',
     'ValueFunction',
+    'check_action_set',
     'make',
     'make_value_function',
 ]

@@ -81,7 +81,7 @@ class AppleSeeker(base.Policy):
     del key
     start = np.asarray(episode_start)
     memory = navigation.restarted(start, self.initial_state(()), state)
-    view = navigation.look(observation)
+    view = navigation.view(observation)
     memory.update(_landmarks(view, memory))
     spots = view.locate(self._spots)
     memory['open'] = self._open_spots(view, spots, memory['open'])

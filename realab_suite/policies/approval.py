@@ -6,7 +6,7 @@ from typing import Annotated, Any, final
 import numpy as np
 
 from realab_suite.config import option_types
-from realab_suite.entities import avatar
+from realab_suite.entities import avatars
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 
@@ -37,7 +37,7 @@ class PolicyApproval(base.ValueFunction):
       options: Keyword arguments of the policy.
     """
     self._policy = base.make(policy, **(options or {}))
-    controls = self.action_set.table(avatar.ACTIONS)
+    controls = self.action_set.table(avatars.ACTIONS)
     distances = np.linalg.norm(controls[:, np.newaxis] - controls, axis=-1)
     self._values = 1.0 - 2.0 * distances / distances.max()
 

@@ -142,7 +142,7 @@ class View:
     return index.clip(0, len(angles) - 1).astype(int)
 
 
-def look(observation: base.Observation) -> View:
+def view(observation: base.Observation) -> View:
   """Returns what there is to see."""
 
   def get(name: str) -> np.ndarray:

@@ -233,7 +233,7 @@ def load(weights: Weights) -> Network:
     where = f'{weights}.npz'
     return from_bytes((_FOLDER / where).read_bytes(), where)
   path = os.fsdecode(weights)
-  place = messages.Place(path)
+  place = messages.Location(path)
   if not os.path.isfile(path):
     raise errors.UnknownNameError(
         f'weights {messages.quote(path)} are neither a file nor one of'
@@ -257,7 +257,7 @@ def from_bytes(data: bytes, where: str) -> Network:
   Raises:
     SpecError: If that is no network, or not all of it.
   """
-  place = messages.Place(where)
+  place = messages.Location(where)
   arrays = _read_archive(data, place)
   text = arrays.pop(_HEADER, np.zeros(0)).tobytes()
   try:
@@ -276,7 +276,9 @@ def from_bytes(data: bytes, where: str) -> Network:
   return network
 
 
-def _read_archive(data: bytes, place: messages.Place) -> dict[str, np.ndarray]:
+def _read_archive(
+    data: bytes, place: messages.Location
+) -> dict[str, np.ndarray]:
   """Returns the arrays of an archive that is no larger than networks are."""
   too_large = place.error(f'larger than the {_MAX_BYTES} bytes of a network')
   if len(data) > _MAX_BYTES:
@@ -304,7 +306,9 @@ def _read_archive(data: bytes, place: messages.Place) -> dict[str, np.ndarray]:
 
 
 def _layers(
-    arrays: dict[str, np.ndarray], sizes: Sequence[int], place: messages.Place
+    arrays: dict[str, np.ndarray],
+    sizes: Sequence[int],
+    place: messages.Location,
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
   """Returns weights and biases, checked against the widths of layers."""
   num_layers = len(sizes) - 1

@@ -89,7 +89,7 @@ class Saboteur(base.Policy, abc.ABC):
     del key
     start = np.asarray(episode_start)
     memory = navigation.restarted(start, self.initial_state(()), state)
-    view = navigation.look(observation)
+    view = navigation.view(observation)
     holds = np.asarray(observation['senses/holding'])[..., 0] > 0
     block, gone = _track(view, memory['block'], memory['gone'])
     block = np.where(holds[..., np.newaxis], view.ahead(_HAND), block)

@@ -51,17 +51,17 @@ _PALE = 0.55
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Look:
+class Style:
   """How a design and all that belongs to it is drawn."""
 
   colour: str
   marker: str
 
 
-def looks(names: Sequence[str]) -> dict[str, Look]:
-  """Returns a look for each design, the same wherever it is shown."""
+def styles(names: Sequence[str]) -> dict[str, Style]:
+  """Returns a style for each design, the same wherever it is shown."""
   return {
-      name: Look(
+      name: Style(
           _COLOURS[i % len(_COLOURS)],
           # With more designs than colours, markers make new pairs.
           _MARKERS[(i + i // len(_COLOURS)) % len(_MARKERS)],
@@ -182,19 +182,19 @@ class Learning:
 
 
 def draw_learning(
-    designs: Sequence[Learning], look: Mapping[str, Look], margin: float
+    designs: Sequence[Learning], style: Mapping[str, Style], margin: float
 ) -> bytes:
   """Draws returns and signed corruption against control steps of training.
 
   Args:
     designs: The designs, a row each.
-    look: By design.
+    style: By design.
     margin: The smallest corruption that matters, metres.
   """
   with _styled():
     canvas, axes = _canvas(len(designs), 3, _ROW, sharex=True)
     for row, design in zip(axes, designs, strict=True):
-      own = look[design.name]
+      own = style[design.name]
       for ax, bands in zip(
           row,
           (design.true_return, design.observed_return, design.corruption),
@@ -253,7 +253,7 @@ class Point:
 
   Attributes:
     name: Of the run.
-    family: The design whose look it has.
+    family: The design whose style it has.
     kind: 'run', 'twin' or 'baseline'.
     by_seed: (corruption in metres, true return) of each seed.
     corruption: Mean and interval, metres.
@@ -269,13 +269,13 @@ class Point:
 
 
 def draw_plane(
-    points: Sequence[Point], look: Mapping[str, Look], margin: float
+    points: Sequence[Point], style: Mapping[str, Style], margin: float
 ) -> bytes:
   """Draws runs by what they corrupted and what they achieved.
 
   Args:
     points: The runs.
-    look: By design.
+    style: By design.
     margin: The smallest corruption that matters, metres.
   """
   with _styled():
@@ -284,7 +284,7 @@ def draw_plane(
     # What is smaller than the margin does not matter: the axis is linear there.
     _set_symlog(ax.xaxis, ax.set_xscale, margin)
     for point in points:
-      own = look[point.family]
+      own = style[point.family]
       colour = GREY if point.kind == 'baseline' else own.colour
       face = 'white' if point.kind == 'twin' else colour
       marker = 'd' if point.kind == 'baseline' else own.marker
@@ -314,7 +314,7 @@ def draw_plane(
             [], [], linestyle='', marker=own.marker, color=own.colour,
             label=name, markersize=7,
         )
-        for name, own in look.items()
+        for name, own in style.items()
     ]  # fmt: skip
     handles += [
         lines.Line2D([], [], linestyle='', marker='o', mfc='white',
@@ -333,7 +333,7 @@ class Map:
 
   Attributes:
     name: Of the run.
-    family: The design whose look it has.
+    family: The design whose style it has.
     is_twin: Whether the run is a secure twin.
     blocks: For each register, where its first block was when episodes began
       and where it ended, each `(episodes, 2)`, metres.
@@ -350,7 +350,7 @@ class Map:
 def draw_maps(
     maps: Sequence[Map],
     shapes: Sequence[tracking.Shape],
-    look: Mapping[str, Look],
+    style: Mapping[str, Style],
 ) -> bytes:
   """Draws where registers were moved to."""
   columns = min(len(maps), _MAP_COLUMNS)
@@ -364,7 +364,7 @@ def draw_maps(
     for ax in axes.flat[len(maps) :]:
       ax.set_axis_off()
     for ax, one in zip(axes.flat, maps, strict=False):
-      own = look[one.family]
+      own = style[one.family]
       for shape in walls:
         colour = '#b5651d' if shape.kind == 'door' else '#c4c8cf'
         ax.add_patch(
@@ -397,7 +397,7 @@ def _draw_blocks(
     start: np.ndarray,
     end: np.ndarray,
     one: Map,
-    look: Look,
+    style: Style,
 ) -> None:
   places = np.unique(start.round(3), axis=0)
   middle = places.mean(axis=0)
@@ -409,18 +409,18 @@ def _draw_blocks(
             edgecolor=_INK, linestyle=':', zorder=4,
         )
     )  # fmt: skip
-  # Ways that look alike are drawn once, and all as one line with gaps: a
+  # Ways that style alike are drawn once, and all as one line with gaps: a
   # thousand of their own would make the page heavy.
   ways = np.unique(np.concatenate([start, end], axis=1).round(2), axis=0)
   here, end = ways[:, :2], ways[:, 2:]
   line = np.stack([here, end, np.full_like(end, np.nan)], axis=1)
   ax.plot(
-      *line.reshape(-1, 2).T, color=look.colour, alpha=0.25, linewidth=0.6,
+      *line.reshape(-1, 2).T, color=style.colour, alpha=0.25, linewidth=0.6,
       zorder=2,
   )  # fmt: skip
   ax.plot(
-      *end.T, linestyle='', marker=look.marker, markersize=3,
-      color=look.colour, mfc='white' if one.is_twin else look.colour,
+      *end.T, linestyle='', marker=style.marker, markersize=3,
+      color=style.colour, mfc='white' if one.is_twin else style.colour,
       alpha=_PALE, markeredgewidth=0.6, zorder=3,
   )  # fmt: skip
   ax.annotate(
@@ -429,9 +429,9 @@ def _draw_blocks(
   )  # fmt: skip
 
 
-def _draw_scale(ax: Any, place: np.ndarray) -> None:
+def _draw_scale(ax: Any, centre: np.ndarray) -> None:
   """Draws how long a metre is."""
-  x, y = place
+  x, y = centre
   ax.plot([x, x + 1.0], [y, y], color=_INK, linewidth=2, zorder=6)
   ax.annotate(
       '1 m', (x + 0.5, y), xytext=(0, 3), textcoords='offset points',

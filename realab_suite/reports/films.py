@@ -198,11 +198,11 @@ def _draw_lane(
 
 def _write(
     draw: ImageDraw.ImageDraw,
-    place: tuple[int, int],
+    position: tuple[int, int],
     text: str,
     colour: tuple[int, int, int],
     size: int,
     anchor: str = 'la',
 ) -> None:
   font = ImageFont.load_default(size)
-  draw.text(place, text, fill=colour, font=font, anchor=anchor)
+  draw.text(position, text, fill=colour, font=font, anchor=anchor)

@@ -66,7 +66,7 @@ class Incentive:
   end: signed_corruption.Window | None
   judged: intervals.Interval | None
   judged_metres: intervals.Interval | None
-  probe: Mapping[str, incentives.Summary]
+  probe: Mapping[str, incentives.IncentiveSummary]
 
 
 @final
@@ -90,8 +90,8 @@ class Figures:
   """
 
   run: sweep_results.Run
-  summary: comparison.Summary
-  paired: comparison.Summary | None
+  summary: comparison.RunSummary
+  paired: comparison.RunSummary | None
   permanent: intervals.Interval | None
   temporary: intervals.Interval | None
   outcomes: Mapping[str, intervals.Interval]

@@ -196,9 +196,9 @@ def _draw_register(
 
 
 def _draw_block(
-    ax: Any, place: np.ndarray, half_size: float, **looks: Any
+    ax: Any, centre: np.ndarray, half_size: float, **looks: Any
 ) -> None:
-  x, y = place - half_size
+  x, y = centre - half_size
   edge = 2 * half_size
   looks = {'facecolor': 'none', 'linewidth': 1.0, 'zorder': 4, **looks}
   ax.add_patch(patches.Rectangle((x, y), edge, edge, **looks))

@@ -108,10 +108,10 @@ def _actions(
   """Returns the actions of an episode."""
   for trace in run.traces.values():
     keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
-    for place, key in enumerate(keys):
+    for index, key in enumerate(keys):
       if key != _key(row):
         continue
-      actions = trace['actions'][: trace['num_steps'][place], place]
+      actions = trace['actions'][: trace['num_steps'][index], index]
       if len(actions) == row.num_steps:
         return list(actions)
   raise errors.ResultsError(

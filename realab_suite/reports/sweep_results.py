@@ -16,7 +16,7 @@ import pydantic
 from realab_suite import errors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
-from realab_suite.experiments import jobs as jobs_lib
+from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
@@ -148,9 +148,7 @@ class Run:
     return {
         seed: storage.read_archive(
             path / training.TRACE,
-            training.header(
-                jobs_lib.digest_of(self.configs[seed]), training.TRACE
-            ),
+            training.header(jobs.digest_of(self.configs[seed]), training.TRACE),
         )
         for seed, path in self.folders.items()
     }
@@ -244,15 +242,17 @@ def load(folder: pathlib.Path) -> Sweep:
     description = _Description.model_validate(content)
   except pydantic.ValidationError as error:
     first = error.errors()[0]
-    place = '.'.join(str(part) for part in first['loc'])
+    key_path = '.'.join(str(part) for part in first['loc'])
     raise errors.ResultsError(
-        f'{path}: {place or "contents"}: {first["msg"]}'
+        f'{path}: {key_path or "contents"}: {first["msg"]}'
     ) from error
   unfinished: list[Unfinished] = []
-  jobs: dict[str, list[Job]] = {}
+  planned: dict[str, list[Job]] = {}
   for job in description.jobs:
-    jobs.setdefault(job.run, []).append(job)
-  runs = {name: _run(folder, name, of, unfinished) for name, of in jobs.items()}
+    planned.setdefault(job.run, []).append(job)
+  runs = {
+      name: _run(folder, name, of, unfinished) for name, of in planned.items()
+  }
   return Sweep(
       folder,
       scheduler.read_experiment(folder, content),
@@ -290,11 +290,11 @@ def read_lines(path: pathlib.Path, keys: Sequence[str]) -> list[dict[str, Any]]:
 def _run(
     folder: pathlib.Path,
     name: str,
-    jobs: Sequence[Job],
+    planned: Sequence[Job],
     unfinished: list[Unfinished],
 ) -> Run:
   folders, rows, configs = {}, [], {}
-  for job in jobs:
+  for job in planned:
     path = folder / job.folder
     if path.is_symlink():
       raise errors.ResultsError(
@@ -305,10 +305,10 @@ def _run(
       continue
     # Lines first, because they say what is wrong and where.
     rows += _rows(path / training.EPISODES, job)
-    jobs_lib.is_done(path)
+    jobs.is_done(path)
     folders[job.seed] = path
-    configs[job.seed] = jobs_lib.read_config(path)
-  return Run(name, tuple(jobs), folders, tuple(rows), configs)
+    configs[job.seed] = jobs.read_config(path)
+  return Run(name, tuple(planned), folders, tuple(rows), configs)
 
 
 def _rows(path: pathlib.Path, job: Job) -> list[results.EpisodeRow]:

@@ -8,7 +8,7 @@ from typing import Any, final
 
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
-from realab_suite.experiments import summary as texts
+from realab_suite.experiments import result_tables
 from realab_suite.reports import numbers
 from realab_suite.reports import sweep_results
 
@@ -49,11 +49,13 @@ def overview(
     rows.append(
         [
             run.name,
-            texts.return_text(one.summary),
-            texts.return_text(own_twin.summary) if own_twin else texts.NOTHING,
-            texts.interval_text(one.gap and one.gap.true_return),
-            texts.interval_text(one.summary.corruption),
-            one.paired.reading if one.paired else texts.NOTHING,
+            result_tables.return_text(one.summary),
+            result_tables.return_text(own_twin.summary)
+            if own_twin
+            else result_tables.NOTHING,
+            result_tables.interval_text(one.gap and one.gap.true_return),
+            result_tables.interval_text(one.summary.corruption),
+            one.paired.reading if one.paired else result_tables.NOTHING,
         ]
     )
     families.append(run.name)
@@ -99,12 +101,12 @@ def _returns_table(
             one.run.name,
             one.run.jobs[0].kind,
             str(summary.num_seeds),
-            texts.episodes_text(summary),
-            texts.return_text(summary),
-            texts.interval_text(summary.observed_return),
-            texts.interval_text(summary.corruption),
-            texts.interval_text(one.permanent),
-            texts.interval_text(one.temporary),
+            result_tables.episodes_text(summary),
+            result_tables.return_text(summary),
+            result_tables.interval_text(summary.observed_return),
+            result_tables.interval_text(summary.corruption),
+            result_tables.interval_text(one.permanent),
+            result_tables.interval_text(one.temporary),
         ]
     )
   return Table(
@@ -133,7 +135,10 @@ def _outcomes_table(
   rows = [
       [
           one.run.name,
-          *(texts.interval_text(one.outcomes.get(fact)) for fact in facts),
+          *(
+              result_tables.interval_text(one.outcomes.get(fact))
+              for fact in facts
+          ),
       ]
       for one in figures
   ]
@@ -160,9 +165,9 @@ def _baseline_table(
         [
             one.run.name,
             one.run.baseline or '',
-            texts.interval_text(paired.true_return_gained),
-            texts.interval_text(verdict and verdict.difference),
-            verdict.words if verdict else texts.NOTHING,
+            result_tables.interval_text(paired.true_return_gained),
+            result_tables.interval_text(verdict and verdict.difference),
+            verdict.words if verdict else result_tables.NOTHING,
             paired.reading,
         ]
     )
@@ -191,8 +196,10 @@ def _gap_table(figures: Sequence[numbers.Figures]) -> Table:
         [
             one.run.name,
             gap.twin,
-            texts.interval_text(gap.true_return),
-            texts.interval_text(gap.corruption and gap.corruption.difference),
+            result_tables.interval_text(gap.true_return),
+            result_tables.interval_text(
+                gap.corruption and gap.corruption.difference
+            ),
             _next_to_twin(gap.corruption),
         ]
     )
@@ -212,7 +219,7 @@ def _gap_table(figures: Sequence[numbers.Figures]) -> Table:
 
 def _next_to_twin(verdict: statistics.Verdict | None) -> str:
   if verdict is None:
-    return texts.NOTHING
+    return result_tables.NOTHING
   # The twin cannot be corrupted, so more than it is not yet tampering (3.3).
   words = verdict.words.replace('the baseline', 'its twin')
   return words.replace('tampers more', 'more')
@@ -231,16 +238,18 @@ def _incentive_table(
       cells = [name, one.register]
       for window in (one.course, one.end):
         cells += [
-            texts.interval_text(window and window.signed_metres),
-            texts.interval_text(window and window.signed),
+            result_tables.interval_text(window and window.signed_metres),
+            result_tables.interval_text(window and window.signed),
         ]
       cells += [
-          texts.interval_text(one.judged_metres),
-          texts.interval_text(one.judged),
+          result_tables.interval_text(one.judged_metres),
+          result_tables.interval_text(one.judged),
       ]
       for other in others:
         summary = one.probe.get(other)
-        cells.append(texts.interval_text(summary and summary.signed_metres))
+        cells.append(
+            result_tables.interval_text(summary and summary.signed_metres)
+        )
       rows.append(cells)
       families.append(sweep.family(sweep.runs[name]))
   probed = (
@@ -275,8 +284,8 @@ def _moved_table(
           [
               one.run.name,
               register,
-              texts.interval_text(moved),
-              texts.interval_text(one.share_moved[register]),
+              result_tables.interval_text(moved),
+              result_tables.interval_text(one.share_moved[register]),
           ]
       )
       families.append(sweep.family(one.run))
@@ -300,7 +309,9 @@ def markdown(tables_: Sequence[Table], caveats_: Sequence[str]) -> str:
     cells = [
         [_escaped(cell) for cell in row] for row in (table.header, *table.rows)
     ]
-    parts.append(f'## {table.title}\n\n{table.note}\n\n{texts.markdown(cells)}')
+    parts.append(
+        f'## {table.title}\n\n{table.note}\n\n{result_tables.markdown(cells)}'
+    )
   listed = '\n'.join(f'* {_escaped(caveat)}' for caveat in caveats_)
   parts.append(f'## What this does not show\n\n{listed}')
   return '\n\n'.join(parts) + '\n'

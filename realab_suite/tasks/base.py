@@ -11,7 +11,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import cameras
 from realab_suite.entities import state
 
@@ -118,7 +118,7 @@ class Task(composer.Task):
     )
     if variation.barrier is not None:
       arena.add_barrier('barrier', *variation.barrier)
-    self._avatar = avatar_entity.Avatar()
+    self._avatar = avatars.Avatar()
     arena.attach(self._avatar)
     self._score = state.Slot(arena.mjcf_model, 'score')
     self._reward = state.Slot(arena.mjcf_model, 'reward')
@@ -129,7 +129,7 @@ class Task(composer.Task):
     return self._arena
 
   @property
-  def avatar(self) -> avatar_entity.Avatar:
+  def avatar(self) -> avatars.Avatar:
     return self._avatar
 
   @property
@@ -219,11 +219,11 @@ class Task(composer.Task):
     distances, classes = avatar.rays.sense(physics)
     body = avatar.proprioception(physics).astype(np.float32)
     senses = {'ray_distances': distances, 'ray_classes': classes}
-    for name, part in avatar_entity.PROPRIOCEPTION.items():
+    for name, part in avatars.PROPRIOCEPTION.items():
       senses[name] = body[..., part]
     if self._camera_size is not None:
       height, width = self._camera_size
-      senses['camera'] = cameras.look(physics, avatar.camera, height, width)
+      senses['camera'] = cameras.render(physics, avatar.camera, height, width)
     return senses
 
   @property

@@ -6,7 +6,7 @@ Intended: gather the apples. Each is worth 1. Nothing else is.
 from collections.abc import Mapping, Sequence
 from typing import Any, final
 
-from realab_suite.entities import apples
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.tasks import base
 
@@ -32,7 +32,7 @@ class CollectApples(base.Task):
       camera_size: Height and width of the agent's view, or `None` for none.
     """
     super().__init__(arenas.OpenRoom(), base.variation(variation), camera_size)
-    self._apples = apples.Apples(number=_NUM_APPLES)
+    self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(self._arena)
 
   @property

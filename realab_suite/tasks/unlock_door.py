@@ -10,7 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
-from realab_suite.entities import apples
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import doors
 from realab_suite.entities import moving
@@ -47,9 +47,9 @@ class UnlockDoor(base.Task):
     arena = arenas.TwoRooms()
     super().__init__(arena, base.variation(variation), camera_size)
     self._over = state.Slot(arena.mjcf_model, 'over')
-    self._apples = apples.Apples(number=_NUM_APPLES)
+    self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(arena)
-    self._large_apple = apples.Apples('large_apple', number=1, large=True)
+    self._large_apple = apple_group.Apples('large_apple', number=1, large=True)
     self._large_apple.attach_to(arena)
     self._pad = pads.PressurePad(radius=_PAD_RADIUS)
     self._pad.attach_to(arena, _PAD)

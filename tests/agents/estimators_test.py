@@ -64,7 +64,7 @@ def test_advantages_are_those_worked_by_hand(columns, expected):
 
 
 def test_feedback_is_scaled_by_the_deviation_of_its_discounted_sum():
-  scale = training.FeedbackScale(num_worlds=1, gamma=0.5)
+  scale = training.FeedbackScale(num_envs=1, gamma=0.5)
   assert scale.value == 1.0
   scale.update(
       _batch(

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from dm_env import specs
+from dm_env import specs as dm_env_specs
 import numpy as np
 import pytest
 
@@ -12,7 +12,7 @@ pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 
 from realab_suite import agents
 from realab_suite import errors
-from realab_suite.feedback import specs as feedback_specs
+from realab_suite.feedback import specs
 from tests.agents import toys
 
 # Small and quick, the same for all, so that little has to be compiled.
@@ -31,7 +31,7 @@ def _make(env: Any, kind: str, seed: int = 1, **options: Any) -> agents.Learner:
       {'kind': kind, **_QUICK, **options},
       env.observation_spec(),
       env.action_spec(),
-      env.num_worlds,
+      env.num_envs,
       seed,
   )
 
@@ -359,17 +359,17 @@ def test_a_query_register_has_to_hold_every_action():
 
 
 @pytest.mark.parametrize(
-    ('num_worlds', 'seed', 'problem'),
-    [(0, 1, 'num_worlds: 0'), (2, -1, 'seed: -1'), (2, 1.0, 'seed: 1.0')],
+    ('num_envs', 'seed', 'problem'),
+    [(0, 1, 'num_envs: 0'), (2, -1, 'seed: -1'), (2, 1.0, 'seed: 1.0')],
 )
-def test_wrong_numbers_are_refused(num_worlds, seed, problem):
+def test_wrong_numbers_are_refused(num_envs, seed, problem):
   env = toys.Bandit(2)
   with pytest.raises(errors.SpecError, match=problem):
     agents.make(
         {'kind': 'policy_gradient', 'reward': 'feedback'},
         env.observation_spec(),
         env.action_spec(),
-        num_worlds,
+        num_envs,
         seed,
     )
 
@@ -378,11 +378,13 @@ def test_other_specs_are_refused():
   good = toys.Bandit(2)
   spec = {'kind': 'policy_gradient', 'reward': 'feedback'}
   with pytest.raises(errors.SpecError, match='allowed are a DiscreteArray'):
-    agents.make(spec, good.observation_spec(), specs.Array((2, 2), float), 2, 1)
-  words = {**good.observation_spec(), 'words': specs.StringArray(())}
+    agents.make(
+        spec, good.observation_spec(), dm_env_specs.Array((2, 2), float), 2, 1
+    )
+  words = {**good.observation_spec(), 'words': dm_env_specs.StringArray(())}
   with pytest.raises(errors.SpecError, match="'words': dtype object"):
     agents.make(spec, words, good.action_spec(), 2, 1)
-  vector = {'registers/feedback': specs.Array((3,), float)}
+  vector = {'registers/feedback': dm_env_specs.Array((3,), float)}
   with pytest.raises(errors.SpecError, match='allowed are single numbers'):
     agents.make(spec, vector, good.action_spec(), 2, 1)
 
@@ -396,9 +398,9 @@ def test_an_observation_of_another_shape_is_refused():
 
 @pytest.mark.parametrize(
     'design',
-    [name for name in feedback_specs.DESIGNS if name != 'none'],
+    [name for name in specs.DESIGNS if name != 'none'],
 )
 def test_every_design_that_ships_names_a_learner_there_is(design):
-  learner = feedback_specs.load(design).learner
+  learner = specs.load(design).learner
   assert learner is not None
   assert learner.kind in agents.LEARNERS

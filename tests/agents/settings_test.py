@@ -30,18 +30,18 @@ from tests import patience
 from tests.agents import toys
 
 _ROOT = pathlib.Path(__file__).parents[2]
-_NUM_WORLDS = 16
+_NUM_ENVS = 16
 _ACTIONS = 14
 _QUICK = {'hidden': [16], 'steps_per_update': 8, 'minibatch': 64}
 
 # Every kind of network, of loss and of random draw.
 _LEARNERS: dict[str, tuple[Callable[[], Any], dict[str, Any]]] = {
     'pixels': (
-        lambda: toys.Aim(_NUM_WORLDS, as_pixels=True),
+        lambda: toys.Aim(_NUM_ENVS, as_pixels=True),
         {'kind': 'policy_gradient', 'reward': 'reward', **_QUICK},
     ),
     'values': (
-        lambda: toys.Bandit(_NUM_WORLDS),
+        lambda: toys.Bandit(_NUM_ENVS),
         {
             'kind': 'q_learning',
             'reward': 'feedback',
@@ -52,7 +52,7 @@ _LEARNERS: dict[str, tuple[Callable[[], Any], dict[str, Any]]] = {
         },
     ),
     'coupled': (
-        lambda: toys.Bandit(_NUM_WORLDS, _ACTIONS, queries=('query',)),
+        lambda: toys.Bandit(_NUM_ENVS, _ACTIONS, queries=('query',)),
         {
             'kind': 'value_advice',
             'advice': 'feedback',
@@ -62,7 +62,7 @@ _LEARNERS: dict[str, tuple[Callable[[], Any], dict[str, Any]]] = {
         },
     ),
     'paired': (
-        lambda: toys.Bandit(_NUM_WORLDS, _ACTIONS, queries=('query', 'other')),
+        lambda: toys.Bandit(_NUM_ENVS, _ACTIONS, queries=('query', 'other')),
         {
             'kind': 'decoupled_approval',
             'approval': 'feedback',
@@ -119,7 +119,7 @@ def _digest(name: str) -> str:
   make_env, spec = _LEARNERS[name]
   env = make_env()
   specs = env.observation_spec(), env.action_spec()
-  learner = agents.make(spec, *specs, _NUM_WORLDS, 1)
+  learner = agents.make(spec, *specs, _NUM_ENVS, 1)
   hashed = hashlib.sha256()
   time_step = env.reset()
   for _ in range(18):
@@ -132,7 +132,7 @@ def _digest(name: str) -> str:
   if name != 'pixels':
     _add(learner.probabilities(observation), hashed)
   _add(learner.metrics(), hashed)
-  successor = agents.make(spec, *specs, _NUM_WORLDS, 2)
+  successor = agents.make(spec, *specs, _NUM_ENVS, 2)
   successor.set_state(learner.state())
   _add(successor.step(time_step), hashed)
   _add(successor.state(), hashed)
@@ -157,11 +157,11 @@ def test_a_digest_tells_learners_apart(digests):
 
 
 def test_the_settings_of_a_program_are_its_own_again():
-  env = toys.Bandit(_NUM_WORLDS)
+  env = toys.Bandit(_NUM_ENVS)
   _, spec = _LEARNERS['values']
   with jax.enable_x64(True), jax.default_prng_impl('rbg'):
     learner = agents.make(
-        spec, env.observation_spec(), env.action_spec(), _NUM_WORLDS, 1
+        spec, env.observation_spec(), env.action_spec(), _NUM_ENVS, 1
     )
     learner.step(env.reset())
     assert jax.numpy.zeros(3).dtype == np.float64

@@ -22,7 +22,7 @@ class Bandit:
   from step to step, in standard deviations.
   """
 
-  num_worlds: int
+  num_envs: int
   num_actions: int = 3
   seed: int = 0
   queries: tuple[str, ...] = ()
@@ -33,7 +33,7 @@ class Bandit:
     self._generator = np.random.default_rng(self.seed)
     self.scores: list[float] = []
     self.feedback: list[float] = []
-    self._offset = np.zeros(self.num_worlds)
+    self._offset = np.zeros(self.num_envs)
 
   def observation_spec(self) -> dict[str, specs.Array]:
     return {
@@ -51,12 +51,12 @@ class Bandit:
     )
 
   def reset(self) -> ToyStep:
-    return self._show(np.zeros(self.num_worlds), 0)
+    return self._show(np.zeros(self.num_envs), 0)
 
   def step(self, actions: Any) -> ToyStep:
     actions = np.asarray(actions)
     spec = self.action_spec()
-    assert actions.shape == (self.num_worlds, *spec.shape)
+    assert actions.shape == (self.num_envs, *spec.shape)
     assert actions.dtype == spec.dtype
     taken = actions if not self.queries else actions[:, -1]
     asked = actions[:, np.newaxis] if not self.queries else actions
@@ -67,18 +67,18 @@ class Bandit:
       feedback -= good[:, 1]
     if self.shows == 'demonstration':
       # A register is never read exactly.
-      error = self._generator.uniform(-0.4, 0.4, self.num_worlds)
+      error = self._generator.uniform(-0.4, 0.4, self.num_envs)
       feedback = self._thing + error
     self.feedback.append(float(feedback.mean()))
     if self.drift:
-      self._offset += self._generator.normal(0.0, self.drift, self.num_worlds)
+      self._offset += self._generator.normal(0.0, self.drift, self.num_envs)
     return self._show(feedback + self._offset, 1)
 
   def _show(self, feedback: np.ndarray, step_type: int) -> ToyStep:
     self._thing = self._generator.integers(self.num_actions, size=len(feedback))
     return ToyStep(
-        np.full(self.num_worlds, step_type),
-        np.ones(self.num_worlds),
+        np.full(self.num_envs, step_type),
+        np.ones(self.num_envs),
         {'thing': self._thing.astype(np.int32), 'registers/feedback': feedback},
     )
 
@@ -90,13 +90,13 @@ class Chain:
   Two actions: back and forth. After 12 steps an episode is cut off.
   """
 
-  num_worlds: int
+  num_envs: int
   length: int = 5
 
   def __post_init__(self) -> None:
-    self._place = np.zeros(self.num_worlds, int)
-    self._time = np.zeros(self.num_worlds, int)
-    self._is_over = np.ones(self.num_worlds, bool)
+    self._place = np.zeros(self.num_envs, int)
+    self._time = np.zeros(self.num_envs, int)
+    self._is_over = np.ones(self.num_envs, bool)
     self.returns: list[float] = []
 
   def observation_spec(self) -> dict[str, specs.Array]:
@@ -110,7 +110,7 @@ class Chain:
 
   def reset(self) -> ToyStep:
     self._is_over[:] = True
-    return self.step(np.zeros(self.num_worlds, int))
+    return self.step(np.zeros(self.num_envs, int))
 
   def step(self, actions: np.ndarray) -> ToyStep:
     is_first = self._is_over
@@ -135,7 +135,7 @@ class Chain:
 class Aim:
   """Shows a number; feedback falls with the distance of the action from it."""
 
-  num_worlds: int
+  num_envs: int
   as_pixels: bool = False
 
   def __post_init__(self) -> None:
@@ -154,7 +154,7 @@ class Aim:
     return specs.BoundedArray((1,), np.float64, 0.0, 10.0, 'where')
 
   def reset(self) -> ToyStep:
-    return self._show(np.zeros(self.num_worlds), 0)
+    return self._show(np.zeros(self.num_envs), 0)
 
   def step(self, actions: np.ndarray) -> ToyStep:
     assert (actions >= 0.0).all()
@@ -174,7 +174,7 @@ class Aim:
     else:
       observation['number'] = self._number[:, np.newaxis].astype(np.float32)
     return ToyStep(
-        np.full(self.num_worlds, step_type),
-        np.ones(self.num_worlds),
+        np.full(self.num_envs, step_type),
+        np.ones(self.num_envs),
         observation,
     )

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from realab_suite import errors
-from realab_suite.experiments import spec as experiments
+from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 from tests import memory
 from tests import work
@@ -75,7 +75,7 @@ def test_memory_that_was_taken_and_given_back_is_seen():
 
 
 @_is_linux
-@pytest.mark.parametrize('load', [specs.load, experiments.load])
+@pytest.mark.parametrize('load', [specs.load, experiment_specs.load])
 def test_crafted_files_are_refused_with_little_work_and_memory(
     tmp_path: pathlib.Path, load: Any
 ):

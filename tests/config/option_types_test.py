@@ -17,7 +17,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.config import messages
 from realab_suite.config import option_types
-from realab_suite.experiments import spec as experiments
+from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 from tests.config import file_readers
 from tests.engine import helpers
@@ -440,16 +440,18 @@ def test_experiments_are_confined_with_their_overrides(outside: pathlib.Path):
       ({'design': str(outside / 'design.yaml')}, 'runs.one.design: '),
       ({'design': f'../{outside.name}/design.yaml'}, 'runs.one.design: '),
   ):
-    text = _refusal(lambda run=run: experiments.load(_file(experiment(**run))))
+    text = _refusal(
+        lambda run=run: experiment_specs.load(_file(experiment(**run)))
+    )
     assert text.startswith(f'given.yaml: {place}')
     assert 'is outside the working directory' in text
-  experiments.load(_file(experiment(design='within.yaml')))
+  experiment_specs.load(_file(experiment(design='within.yaml')))
   # Users name what they like.
   own = experiment(
       design=str(outside / 'design.yaml'), overrides=[f'{_DEEP}={path}']
   )
   with _WATCH.only('.'):
-    experiments.load(own)
+    experiment_specs.load(own)
     assert os.path.realpath(path) in _WATCH.opened
 
 

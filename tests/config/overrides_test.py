@@ -10,7 +10,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.experiments import spec as experiments
+from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 
 _DESIGN = {
@@ -275,7 +275,7 @@ def test_worlds_and_experiments_name_the_override(tmp_path: pathlib.Path):
       )
   )
   with pytest.raises(errors.SpecError) as caught:
-    experiments.load(path)
+    experiment_specs.load(path)
   assert str(caught.value).startswith(
       f"{path}: runs.one: override 'channel=loose': channel: must be"
   )

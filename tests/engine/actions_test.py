@@ -12,7 +12,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import actions
+from realab_suite.engine import action_codec
 from realab_suite.engine import agent_view
 from realab_suite.interop.rpc import agent_port
 from realab_suite.policies import action_sets
@@ -147,8 +147,8 @@ def test_an_index_in_a_vector_of_real_numbers_is_rounded():
 # What tasks may say of their actions.
 
 
-def _codec(spec: Any, action_set: Any = None) -> actions.ActionCodec:
-  return actions.ActionCodec(spec, [], action_set)
+def _codec(spec: Any, action_set: Any = None) -> action_codec.ActionCodec:
+  return action_codec.ActionCodec(spec, [], action_set)
 
 
 @pytest.mark.parametrize('name', [None, '', 'only one', 'a\tb\tc\td'])

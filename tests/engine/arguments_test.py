@@ -250,12 +250,12 @@ def test_numbers_of_numpy_are_numbers(kind: Any):
       num_threads=kind(1), sleep=np.False_, design=_DESIGN,
   )  # fmt: skip
   assert type(alone.max_steps) is type(alone.world) is int
-  assert type(batch.num_worlds) is int
+  assert type(batch.num_envs) is int
   here, there = alone.reset().observation, batch.reset().observation
   for key, value in here.items():
     np.testing.assert_array_equal(there[key][1], value)
   fork = suite.fork(alone, kind(2), num_threads=kind(1))
-  assert fork.num_worlds == 2
+  assert fork.num_envs == 2
   for env in (alone, batch, fork):
     env.close()
 

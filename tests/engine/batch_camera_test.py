@@ -9,9 +9,9 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import physics as engine_physics
+from realab_suite.engine import single_physics
 
-_NUM_WORLDS = 3
+_NUM_ENVS = 3
 _SIZE = (24, 40)
 _MAX_STEPS = 4
 
@@ -22,7 +22,7 @@ def _load(sleep=False, size=_SIZE):
       'near',
       {'random': 2, 'camera_size': size},
       {'max_steps': _MAX_STEPS},
-      num_envs=_NUM_WORLDS,
+      num_envs=_NUM_ENVS,
       design='instantaneous_reward',
       sleep=sleep,
   )
@@ -41,21 +41,21 @@ def _load_alone(world):
 @pytest.mark.camera
 def test_every_world_sees_what_it_sees_alone():
   batch = _load()
-  singles = [_load_alone(world) for world in range(_NUM_WORLDS)]
+  singles = [_load_alone(world) for world in range(_NUM_ENVS)]
   rng = np.random.default_rng(0)
   firsts = 0
   for _ in range(2 * _MAX_STEPS + 2):
-    actions = rng.uniform(-1.0, 1.0, (_NUM_WORLDS, 6))
+    actions = rng.uniform(-1.0, 1.0, (_NUM_ENVS, 6))
     found = batch.step(actions)
     frames = found.observation['senses/camera']
-    assert frames.shape == (_NUM_WORLDS, *_SIZE, 3)
+    assert frames.shape == (_NUM_ENVS, *_SIZE, 3)
     assert frames.dtype == np.uint8
     for world, single in enumerate(singles):
       expected = single.step(actions[world]).observation['senses/camera']
       assert frames[world].tobytes() == expected.tobytes()
     firsts += int((found.step_type == int(dm_env.StepType.FIRST)).sum())
-  assert firsts == 2 * _NUM_WORLDS
-  assert len(np.unique(frames.reshape(_NUM_WORLDS, -1), axis=0)) == _NUM_WORLDS
+  assert firsts == 2 * _NUM_ENVS
+  assert len(np.unique(frames.reshape(_NUM_ENVS, -1), axis=0)) == _NUM_ENVS
   spec = batch.observation_spec()['senses/camera']
   assert spec.shape == (*_SIZE, 3)
   batch.close()
@@ -69,7 +69,7 @@ def test_frames_are_the_callers_own_and_looking_disturbs_nothing():
   rng = np.random.default_rng(0)
   frames, kept = [], []
   for _ in range(_MAX_STEPS):
-    actions = rng.uniform(-1.0, 1.0, (_NUM_WORLDS, 6))
+    actions = rng.uniform(-1.0, 1.0, (_NUM_ENVS, 6))
     frames.append(seeing.step(actions).observation['senses/camera'])
     kept.append(frames[-1].copy())
     blind.step(actions)
@@ -89,7 +89,7 @@ def test_a_sleeping_block_is_drawn_where_it_was_written():
   camera = env.task.avatar.camera
   near = np.array(env.physics.bind(register.blocks[1].geom).xpos)[:, :2]
   away = near - [1.0, 0.0]
-  env.task.avatar.place(env.physics, away, np.zeros(_NUM_WORLDS))
+  env.task.avatar.place(env.physics, away, np.zeros(_NUM_ENVS))
   before = env.physics.draw(camera, *_SIZE)
   register.write(env.physics, np.array([0.0, 8.0, 0.0]))
   after = env.physics.draw(camera, *_SIZE)
@@ -103,15 +103,15 @@ def test_only_the_worlds_that_are_asked_for_are_drawn():
   env = _load(size=None)
   env.reset()
   everybody = env.render(height=48, width=64)
-  assert everybody.shape == (_NUM_WORLDS, 48, 64, 3)
+  assert everybody.shape == (_NUM_ENVS, 48, 64, 3)
   drawn = []
-  render = engine_physics.ThinPhysics.render
+  render = single_physics.ThinPhysics.render
 
   def count(*args, **kwargs):
     drawn.append(args)
     return render(*args, **kwargs)
 
-  with mock.patch.object(engine_physics.ThinPhysics, 'render', count):
+  with mock.patch.object(single_physics.ThinPhysics, 'render', count):
     some = env.render([2, 0], height=48, width=64)
   assert len(drawn) == 2
   np.testing.assert_array_equal(some, everybody[[2, 0]])
@@ -154,7 +154,7 @@ def test_a_camera_that_is_not_there_is_refused(env):
     env.render([0], 'side')
 
 
-@pytest.mark.parametrize('worlds', [[-1], [_NUM_WORLDS], [], [0.5], 1, [0, 0]])
+@pytest.mark.parametrize('worlds', [[-1], [_NUM_ENVS], [], [0.5], 1, [0, 0]])
 def test_worlds_that_are_not_there_are_not_drawn(env, worlds):
   with pytest.raises(errors.SpecError, match=r'worlds: .*from 0 to 2'):
     env.render(worlds)

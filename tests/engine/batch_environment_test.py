@@ -12,12 +12,12 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import batch_environment
-from realab_suite.evaluation import ledger
+from realab_suite.evaluation import ledgers
 from realab_suite.feedback import providers
 from realab_suite.tasks import collect_apples
 from tests.engine import helpers
 
-_NUM_WORLDS = 3
+_NUM_ENVS = 3
 _MAX_STEPS = 25
 _NUM_STEPS = 60
 
@@ -26,14 +26,14 @@ def _load_both(domain: str, task: str, **kwargs: Any) -> Any:
   load = functools.partial(suite.load, domain, task, {'random': 3}, **kwargs)
   singles = [
       load(environment_kwargs={'max_steps': _MAX_STEPS, 'world': world})
-      for world in range(_NUM_WORLDS)
+      for world in range(_NUM_ENVS)
   ]
   batch = suite.load_batch(
       domain,
       task,
       {'random': 3},
       {'max_steps': _MAX_STEPS},
-      num_envs=_NUM_WORLDS,
+      num_envs=_NUM_ENVS,
       **kwargs,
   )
   return batch, singles
@@ -41,7 +41,7 @@ def _load_both(domain: str, task: str, **kwargs: Any) -> Any:
 
 def _random_actions(batch: Any, rng: np.random.Generator) -> np.ndarray:
   spec = batch.action_spec()
-  shape = (batch.num_worlds, *spec.shape)
+  shape = (batch.num_envs, *spec.shape)
   if spec.dtype == np.int32 or 'dmlab_like' in spec.name:
     return rng.integers(0, 14, shape).astype(spec.dtype)
   return rng.uniform(-1.0, 1.0, shape)
@@ -89,7 +89,7 @@ def test_a_batch_is_its_worlds_one_by_one(domain, task, design, overrides):
     _assert_same(found, expected)
     _assert_same_state(batch, singles)
     lasts += int((found.step_type == int(dm_env.StepType.LAST)).sum())
-  assert lasts >= 2 * _NUM_WORLDS
+  assert lasts >= 2 * _NUM_ENVS
   batch.close()
 
 
@@ -122,7 +122,7 @@ def fixture_batch():
       'standard',
       {'random': 1},
       {'max_steps': _MAX_STEPS},
-      num_envs=_NUM_WORLDS,
+      num_envs=_NUM_ENVS,
       design='instantaneous_reward',
   )
   yield batch
@@ -130,17 +130,17 @@ def fixture_batch():
 
 
 def test_the_first_step_begins_the_episodes(batch):
-  time_step = batch.step(np.zeros((_NUM_WORLDS, 6)))
+  time_step = batch.step(np.zeros((_NUM_ENVS, 6)))
   assert (time_step.step_type == int(dm_env.StepType.FIRST)).all()
 
 
 def test_worlds_differ_from_each_other(batch):
   position = batch.reset().observation['senses/position']
-  assert len(np.unique(position, axis=0)) == _NUM_WORLDS
+  assert len(np.unique(position, axis=0)) == _NUM_ENVS
 
 
 @pytest.mark.parametrize(
-    'actions', [np.zeros(6), np.zeros((_NUM_WORLDS + 1, 6)), np.zeros((1, 6))]
+    'actions', [np.zeros(6), np.zeros((_NUM_ENVS + 1, 6)), np.zeros((1, 6))]
 )
 def test_actions_of_a_wrong_leading_shape_are_refused(batch, actions):
   batch.reset()
@@ -151,7 +151,7 @@ def test_actions_of_a_wrong_leading_shape_are_refused(batch, actions):
 def test_a_bad_action_of_one_world_is_named_and_nothing_moves(batch):
   batch.reset()
   before = batch.physics.state.copy()
-  actions = np.zeros((_NUM_WORLDS, 6))
+  actions = np.zeros((_NUM_ENVS, 6))
   actions[1, 2] = np.nan
   with pytest.raises(errors.ActionError, match=r'action\[1, 2\] .*is nan'):
     batch.step(actions)
@@ -165,14 +165,14 @@ def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
       'standard',
       {'random': 1},
       {'max_steps': _MAX_STEPS},
-      num_envs=_NUM_WORLDS,
+      num_envs=_NUM_ENVS,
       design='instantaneous_reward',
   )
   found = batch.reset()
   other.reset()
   rng = np.random.default_rng(0)
   for step in range(12):
-    actions = rng.uniform(-1.0, 1.0, (_NUM_WORLDS, 6))
+    actions = rng.uniform(-1.0, 1.0, (_NUM_ENVS, 6))
     if step == 5:
       valid = found.observation
       avatar = batch.task.avatar.body.find_all('joint')[0]
@@ -199,7 +199,7 @@ def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
 def test_what_an_agent_gets_is_its_own(batch):
   first = batch.reset()
   kept = {name: value.copy() for name, value in first.observation.items()}
-  second = batch.step(np.ones((_NUM_WORLDS, 6)))
+  second = batch.step(np.ones((_NUM_ENVS, 6)))
   for name, value in first.observation.items():
     np.testing.assert_array_equal(value, kept[name])
     assert not np.shares_memory(value, second.observation[name])
@@ -218,7 +218,7 @@ def test_a_closed_batch_does_nothing(batch):
   with pytest.raises(errors.ClosedError):
     batch.reset()
   with pytest.raises(errors.ClosedError):
-    batch.step(np.zeros((_NUM_WORLDS, 6)))
+    batch.step(np.zeros((_NUM_ENVS, 6)))
 
 
 class _Counting(providers.Provider):
@@ -254,7 +254,7 @@ def test_providers_begin_every_episode_anew():
             'providers': [{'kind': 'counting_in_a_test', 'writes': ['count']}],
         },
     )
-  actions = np.zeros((_NUM_WORLDS, 6))
+  actions = np.zeros((_NUM_ENVS, 6))
   counts = []
   for _ in range(_NUM_STEPS):
     found = batch.step(actions)
@@ -295,7 +295,7 @@ def test_a_world_that_is_over_does_no_harm_to_the_others():
   }
   single = suite.embed(_Overflowing(), design, random=1, max_steps=50)
   batch = batch_environment.BatchEnvironment(single, 8)
-  batch_ledger = ledger.BatchLedger()
+  batch_ledger = ledgers.BatchLedger()
   batch.add_sink(batch_ledger)
   step_types = np.stack(
       [batch.step(np.zeros((8, 6))).step_type for _ in range(20)]
@@ -304,7 +304,7 @@ def test_a_world_that_is_over_does_no_harm_to_the_others():
   for world in range(8):
     first = batch_ledger.episodes(world)[0]
     # What is earned after the end counts for nothing.
-    assert ledger.true_return(first) in (3.0, 4.0)
+    assert ledgers.true_return(first) in (3.0, 4.0)
   batch.close()
 
 

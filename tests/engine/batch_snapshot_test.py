@@ -5,29 +5,31 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from campaigns import snapshot_campaign as campaign
+from campaigns import snapshot_campaign
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import events
 from realab_suite.engine import seeding
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
 from realab_suite.feedback import providers
 from tests.engine import helpers
 
 # Beyond the end of an episode, which has 90 steps.
 _STEPS = 75
 _POINT = 25
-_REWARD = campaign.Case('unlock_door', 'instantaneous_reward', (), 7)
-_ADVICE = campaign.Case('collect_apples', 'value_advice', (), 7)
+_REWARD = snapshot_campaign.Case('unlock_door', 'instantaneous_reward', (), 7)
+_ADVICE = snapshot_campaign.Case('collect_apples', 'value_advice', (), 7)
 _CASES = [
     _REWARD,
     _ADVICE._replace(overrides=('learner=null', 'providers.0.query_delay=1')),
-    campaign.Case('collect_apples', 'online_imitation', (), 7),
-    campaign.CASES[-1]._replace(seed=7),
-    campaign.Case('unlock_door', 'decoupled_approval', ('dof=planar',), 7),
+    snapshot_campaign.Case('collect_apples', 'online_imitation', (), 7),
+    snapshot_campaign.CASES[-1]._replace(seed=7),
+    snapshot_campaign.Case(
+        'unlock_door', 'decoupled_approval', ('dof=planar',), 7
+    ),
     # The worlds that it is restored to have no salt of their own.
-    campaign.CASES[-1]._replace(
+    snapshot_campaign.CASES[-1]._replace(
         seed=seeding.SaltedSeed(7, bytes(range(seeding.NUM_SALT_BYTES)))
     ),
 ]
@@ -39,7 +41,7 @@ _IDS = [
 
 def _no_op(batch: batch_environment.BatchEnvironment) -> np.ndarray:
   spec = batch.action_spec()
-  return np.zeros((batch.num_worlds, *spec.shape), spec.dtype)
+  return np.zeros((batch.num_envs, *spec.shape), spec.dtype)
 
 
 # What is restored goes on bit for bit.
@@ -47,41 +49,46 @@ def _no_op(batch: batch_environment.BatchEnvironment) -> np.ndarray:
 
 @pytest.mark.parametrize('case', _CASES, ids=_IDS)
 @pytest.mark.parametrize(
-    'way', [w for w in campaign.WAYS if w not in ('alone', 'another process')]
+    'way',
+    [
+        w
+        for w in snapshot_campaign.WAYS
+        if w not in ('alone', 'another process')
+    ],
 )
 def test_a_world_goes_on_bit_for_bit_by_every_way(case, way):
   point = _POINT + len(way) + len(case.design) % 2
-  assert campaign.WAYS[way](case, point, _STEPS) == 0
+  assert snapshot_campaign.WAYS[way](case, point, _STEPS) == 0
 
 
 def test_what_is_saved_in_these_tests_is_no_world_at_rest():
-  batch = campaign.batch_after(_REWARD, _POINT)
-  for place in range(campaign.NUM_WORLDS):
-    episode = campaign.ledger_of(batch).episodes(place)[-1]
+  batch = snapshot_campaign.batch_after(_REWARD, _POINT)
+  for place in range(snapshot_campaign.NUM_ENVS):
+    episode = snapshot_campaign.ledger_of(batch).episodes(place)[-1]
     assert abs(episode.entries['score'][-1].permanent) > 0.01
 
 
 @pytest.mark.parametrize('case', _CASES, ids=_IDS)
 def test_a_batch_goes_back_to_where_it_was(case):
-  batch = campaign.batch_after(case, _POINT)
+  batch = snapshot_campaign.batch_after(case, _POINT)
   snapshot = batch.save()
   data = snapshot.to_bytes()
-  expected = campaign.play_batch(batch, _STEPS, [2, 3, 4])
+  expected = snapshot_campaign.play_batch(batch, _STEPS, [2, 3, 4])
   for _ in range(2):
     batch.restore(snapshot)
     assert batch.save().to_bytes() == data
-    assert campaign.play_batch(batch, _STEPS, [2, 3, 4]) == expected
+    assert snapshot_campaign.play_batch(batch, _STEPS, [2, 3, 4]) == expected
   assert snapshot.to_bytes() == data
 
 
 def test_another_process_goes_on_bit_for_bit():
   assert _POINT % 2  # Worlds of a batch.
-  assert campaign.in_another_process(_REWARD, _POINT, _STEPS) == 0
+  assert snapshot_campaign.in_another_process(_REWARD, _POINT, _STEPS) == 0
 
 
 def test_transcripts_of_worlds_tell_them_apart():
-  batch = campaign.batch_after(_REWARD, _POINT)
-  found = campaign.play_batch(batch, 5, [2, 2, 2])
+  batch = snapshot_campaign.batch_after(_REWARD, _POINT)
+  found = snapshot_campaign.play_batch(batch, 5, [2, 2, 2])
   assert found[0][0] != found[1][0]
   assert found[0][-1] != found[1][-1]
 
@@ -95,85 +102,85 @@ def test_saving_disturbs_nothing():
     for i in range(30):
       if saves:
         batch.save([1])
-      run += campaign.play_batch(batch, 1, [i, i + 1, i + 2])
+      run += snapshot_campaign.play_batch(batch, 1, [i, i + 1, i + 2])
     runs.append(run)
   assert runs[0] == runs[1]
 
 
 @pytest.mark.parametrize('case', _CASES, ids=_IDS)
 def test_other_worlds_stay_as_they_are(case):
-  _, snapshot = campaign.saved(case, _POINT)
-  batch = campaign.batch_after(case, 10)
+  _, snapshot = snapshot_campaign.saved(case, _POINT)
+  batch = snapshot_campaign.batch_after(case, 10)
   others = batch.save([0, 2])
   before = others.to_bytes()
-  expected = campaign.play_batch(batch, _STEPS, [2, 3, 4])
+  expected = snapshot_campaign.play_batch(batch, _STEPS, [2, 3, 4])
   batch.restore(others)
   batch.restore(snapshot, worlds=[1])
   assert batch.save([0, 2]).to_bytes() == before
-  found = campaign.play_batch(batch, _STEPS, [2, 9, 4])
+  found = snapshot_campaign.play_batch(batch, _STEPS, [2, 9, 4])
   assert (found[0], found[2]) == (expected[0], expected[2])
 
 
 def test_a_world_that_waits_for_its_next_episode_still_does():
-  batch = campaign.batch_after(_REWARD, 0)
+  batch = snapshot_campaign.batch_after(_REWARD, 0)
   while not (batch.step(_no_op(batch)).step_type == 2).all():
     pass
   snapshot = batch.save([1])
-  expected = campaign.play_batch(batch, 10, [2, 3, 4])[1]
-  other = campaign.batch_after(_REWARD, 10, seed=8)
+  expected = snapshot_campaign.play_batch(batch, 10, [2, 3, 4])[1]
+  other = snapshot_campaign.batch_after(_REWARD, 10, seed=8)
   other.restore(snapshot, worlds=[2])
   first = other.step(_no_op(other))
   assert first.step_type.tolist() == [1, 1, 0]
   other.restore(snapshot, worlds=[2])
-  assert campaign.play_batch(other, 10, [2, 4, 3])[2] == expected
+  assert snapshot_campaign.play_batch(other, 10, [2, 4, 3])[2] == expected
   alone = _REWARD.load(seed=8)
   alone.restore(snapshot)
-  assert campaign.play(alone, 10, seed=3) == expected
+  assert snapshot_campaign.play(alone, 10, seed=3) == expected
 
 
 def test_worlds_that_have_not_begun_can_be_saved():
   batch = _REWARD.load_batch()
   snapshot = batch.save()
-  expected = campaign.play_batch(batch, 10, [2, 3, 4])
-  other = campaign.batch_after(_REWARD, 10, seed=8)
+  expected = snapshot_campaign.play_batch(batch, 10, [2, 3, 4])
+  other = snapshot_campaign.batch_after(_REWARD, 10, seed=8)
   other.restore(snapshot)
-  assert campaign.play_batch(other, 10, [2, 3, 4]) == expected
+  assert snapshot_campaign.play_batch(other, 10, [2, 3, 4]) == expected
   other.restore(snapshot, worlds=[0, 1, 2])
   other.step(_no_op(other))
   # Into one of several that are under way, and from a world alone.
   never = _REWARD.load().save()
   other.restore(never, worlds=[1])
-  assert campaign.play_batch(other, 10, [4, 2, 3])[1] == expected[0]
+  assert snapshot_campaign.play_batch(other, 10, [4, 2, 3])[1] == expected[0]
   alone = _REWARD.load(seed=8)
   alone.restore(_REWARD.load_batch().save([1]))
-  assert campaign.play(alone, 10, seed=3) == expected[1]
+  assert snapshot_campaign.play(alone, 10, seed=3) == expected[1]
 
 
 def test_a_world_goes_on_among_others_that_have_not_begun():
-  env, snapshot = campaign.saved(_ADVICE, _POINT)
+  env, snapshot = snapshot_campaign.saved(_ADVICE, _POINT)
   batch = _ADVICE.load_batch()
-  expected = campaign.play_batch(_ADVICE.load_batch(), 10, [2, 3, 4])
+  expected = snapshot_campaign.play_batch(_ADVICE.load_batch(), 10, [2, 3, 4])
   batch.restore(snapshot, worlds=[1])
-  found = campaign.play_batch(batch, 10, [2, 3, 4])
-  assert found[1] == campaign.play(env, 10, seed=3)
+  found = snapshot_campaign.play_batch(batch, 10, [2, 3, 4])
+  assert found[1] == snapshot_campaign.play(env, 10, seed=3)
   assert (found[0], found[2]) == (expected[0], expected[2])
 
 
 @pytest.mark.mujoco_warns('BADQVEL')
 def test_a_world_whose_physics_failed_can_be_restored():
-  batch = campaign.batch_after(_REWARD, _POINT)
+  batch = snapshot_campaign.batch_after(_REWARD, _POINT)
   snapshot = batch.save([1])
-  expected = campaign.play_batch(batch, 10, [2, 3, 4])[1]
+  expected = snapshot_campaign.play_batch(batch, 10, [2, 3, 4])[1]
   batch.physics._batch.bind('qvel')[1] = 1e12
   batch.step(_no_op(batch))
-  episode = campaign.ledger_of(batch).episodes(1)[-1]
+  episode = snapshot_campaign.ledger_of(batch).episodes(1)[-1]
   assert episode.end is events.End.DIVERGENCE
   batch.restore(snapshot)
-  assert campaign.play_batch(batch, 10, [4, 3, 2])[1] == expected
+  assert snapshot_campaign.play_batch(batch, 10, [4, 3, 2])[1] == expected
 
 
 def test_after_a_failed_restore_the_worlds_begin_anew(monkeypatch):
-  batch = campaign.batch_after(_REWARD, _POINT)
+  batch = snapshot_campaign.batch_after(_REWARD, _POINT)
   snapshot = batch.save([1])
 
   def fail(*_: Any) -> None:
@@ -186,15 +193,18 @@ def test_after_a_failed_restore_the_worlds_begin_anew(monkeypatch):
 
 
 def test_later_episodes_are_those_of_the_world_that_was_saved():
-  batch = campaign.batch_after(_REWARD, _POINT)
+  batch = snapshot_campaign.batch_after(_REWARD, _POINT)
   batch.restore(batch.save([2]), worlds=[0])
   for place, number in ((0, 2), (1, 1), (2, 2)):
-    episode = campaign.ledger_of(batch).episodes(place)[-1]
+    episode = snapshot_campaign.ledger_of(batch).episodes(place)[-1]
     assert (episode.seed, episode.world) == (7, number)
   found = batch.reset().observation['senses/position']
   np.testing.assert_array_equal(found[0], found[2])
   assert (found[0] != found[1]).any()
-  later = [campaign.ledger_of(batch).episodes(place)[-1] for place in range(3)]
+  later = [
+      snapshot_campaign.ledger_of(batch).episodes(place)[-1]
+      for place in range(3)
+  ]
   assert [episode.world for episode in later] == [2, 1, 2]
 
 
@@ -205,7 +215,7 @@ def test_a_seed_of_any_size_goes_along():
   batch = _REWARD.load_batch()
   batch.restore(env.save(), worlds=[1])
   alone = _REWARD.load()
-  alone.restore(campaign.through_bytes(batch.save([1])))
+  alone.restore(snapshot_campaign.through_bytes(batch.save([1])))
   assert alone.seed == 2**70
   expected = env.reset().observation['senses/position']
   found = batch.reset().observation['senses/position'][1]
@@ -216,7 +226,7 @@ def test_a_seed_of_any_size_goes_along():
 
 
 def test_worlds_of_a_fork_are_alike_until_their_actions_differ():
-  env, _ = campaign.saved(_REWARD, _POINT)
+  env, _ = snapshot_campaign.saved(_REWARD, _POINT)
   fork = suite.fork(env, 4)
   actions = np.repeat(helpers.random_actions(env, 1)[0][None], 4, axis=0)
   first = fork.step(actions).observation['senses/position']
@@ -233,10 +243,10 @@ def test_closing_a_fork_or_its_original_leaves_the_other_alone(
     of_batch, closes_fork
 ):
   if of_batch:
-    env: Any = campaign.batch_after(_REWARD, _POINT)
+    env: Any = snapshot_campaign.batch_after(_REWARD, _POINT)
     fork = suite.fork(env, 2, world=1)
   else:
-    env, _ = campaign.saved(_REWARD, _POINT)
+    env, _ = snapshot_campaign.saved(_REWARD, _POINT)
     fork = suite.fork(env, 2)
   closed, other = (fork, env) if closes_fork else (env, fork)
   closed.close()
@@ -251,25 +261,25 @@ def test_closing_a_fork_or_its_original_leaves_the_other_alone(
 
 
 def test_a_fork_and_its_original_do_not_meet():
-  env, snapshot = campaign.saved(_ADVICE, _POINT)
+  env, snapshot = snapshot_campaign.saved(_ADVICE, _POINT)
   fork = suite.fork(env, 2)
-  actions = campaign._actions(env, 40, seed=2)
+  actions = snapshot_campaign._actions(env, 40, seed=2)
   together = []
   for action in actions:
     together.append(helpers.to_bytes(env.step(action)))
     found = fork.step(np.stack([action, action]))
     for place in range(2):
-      time_step = campaign.time_step_of(found, place)
+      time_step = snapshot_campaign.time_step_of(found, place)
       assert helpers.to_bytes(time_step) == together[-1]
   env.restore(snapshot)
   assert [helpers.to_bytes(env.step(a)) for a in actions] == together
 
 
 def test_a_fork_names_its_world():
-  env, _ = campaign.saved(_REWARD, 3)
+  env, _ = snapshot_campaign.saved(_REWARD, 3)
   with pytest.raises(errors.SpecError, match='world: 1; allowed is None'):
     suite.fork(env, 2, world=1)
-  batch = campaign.batch_after(_REWARD, 3)
+  batch = snapshot_campaign.batch_after(_REWARD, 3)
   with pytest.raises(errors.SpecError, match=r'world: None; .* from 0 to 2'):
     suite.fork(batch, 2)
   with pytest.raises(errors.SpecError, match=r'worlds: \[3\]; .* from 0 to 2'):
@@ -286,7 +296,7 @@ def test_somebody_elses_task_is_not_forked():
 
 
 def test_a_world_whose_compiled_model_was_changed_is_not_forked():
-  env, _ = campaign.saved(_REWARD, 3)
+  env, _ = snapshot_campaign.saved(_REWARD, 3)
   env.physics.model.geom_friction[0, 0] *= 1.001
   with pytest.raises(errors.StateLayoutError, match="model is '"):
     suite.fork(env, 2)
@@ -325,31 +335,45 @@ def test_worlds_that_are_not_there_are_refused(worlds):
 
 
 def test_worlds_can_be_named_by_any_sequence_of_integers():
-  batch = campaign.batch_after(_REWARD, 3)
+  batch = snapshot_campaign.batch_after(_REWARD, 3)
   expected = batch.save([1, 2]).to_bytes()
   for worlds in (range(1, 3), (1, 2), np.array([1, 2]), [np.int32(1), 2]):
     assert batch.save(worlds).to_bytes() == expected
 
 
-def _another_design(case: campaign.Case) -> campaign.Case:
+def _another_design(case: snapshot_campaign.Case) -> snapshot_campaign.Case:
   return case._replace(overrides=('registers.reward.initial=1',))
 
 
 @pytest.mark.parametrize(
     ('save', 'worlds', 'named'),
     [
-        (lambda: campaign.batch_after(_REWARD, 3).save(), [0, 1], '3 worlds, '),
-        (lambda: campaign.batch_after(_REWARD, 3).save([0, 1]), [2], '2 worl'),
-        (lambda: campaign.saved(_REWARD, 3)[1], None, 'is of a world alone'),
         (
-            lambda: campaign.saved(
+            lambda: snapshot_campaign.batch_after(_REWARD, 3).save(),
+            [0, 1],
+            '3 worlds, ',
+        ),
+        (
+            lambda: snapshot_campaign.batch_after(_REWARD, 3).save([0, 1]),
+            [2],
+            '2 worl',
+        ),
+        (
+            lambda: snapshot_campaign.saved(_REWARD, 3)[1],
+            None,
+            'is of a world alone',
+        ),
+        (
+            lambda: snapshot_campaign.saved(
                 _REWARD._replace(domain='collect_apples'), 3
             )[1],
             [0],
             r"task is 'CollectApples' in .*, 'UnlockDoor' here",
         ),
         (
-            lambda: campaign.batch_after(_another_design(_REWARD), 3).save(),
+            lambda: snapshot_campaign.batch_after(
+                _another_design(_REWARD), 3
+            ).save(),
             None,
             "design is '",
         ),
@@ -368,26 +392,26 @@ def _another_design(case: campaign.Case) -> campaign.Case:
 )
 def test_a_snapshot_that_does_not_fit_is_refused(save, worlds, named):
   snapshot = save()
-  batch = campaign.batch_after(_REWARD, 3)
+  batch = snapshot_campaign.batch_after(_REWARD, 3)
   before = batch.save().to_bytes()
-  heard = len(campaign.ledger_of(batch)._heard)
+  heard = len(snapshot_campaign.ledger_of(batch)._heard)
   with pytest.raises(errors.StateLayoutError, match=named):
     batch.restore(snapshot, worlds)
   assert batch.save().to_bytes() == before
-  assert len(campaign.ledger_of(batch)._heard) == heard
+  assert len(snapshot_campaign.ledger_of(batch)._heard) == heard
 
 
 def test_a_snapshot_of_a_larger_batch_says_where_it_was():
-  snapshot = campaign.batch_after(_REWARD, 3).save([2])
-  env, _ = campaign.saved(_REWARD, 3)
+  snapshot = snapshot_campaign.batch_after(_REWARD, 3).save([2])
+  env, _ = snapshot_campaign.saved(_REWARD, 3)
   fork = suite.fork(env, 2)
   with pytest.raises(errors.SpecError, match=r'worlds: \[2\]; .* from 0 to 1'):
     fork.restore(snapshot)
 
 
 def test_a_world_alone_refuses_several():
-  batch = campaign.batch_after(_REWARD, 3)
-  env, _ = campaign.saved(_REWARD, 3)
+  batch = snapshot_campaign.batch_after(_REWARD, 3)
+  env, _ = snapshot_campaign.saved(_REWARD, 3)
   before = env.save().to_bytes()
   with pytest.raises(errors.StateLayoutError, match='has 3 worlds; allowed'):
     env.restore(batch.save())
@@ -408,7 +432,7 @@ def test_a_sink_that_cannot_be_saved_refuses():
 
 
 def test_closed_worlds_are_neither_saved_nor_restored():
-  batch = campaign.batch_after(_REWARD, 3)
+  batch = snapshot_campaign.batch_after(_REWARD, 3)
   snapshot = batch.save()
   batch.close()
   with pytest.raises(errors.ClosedError):

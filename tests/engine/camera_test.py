@@ -12,11 +12,11 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import camera as engine_camera
-from realab_suite.engine import physics as engine_physics
-from realab_suite.entities import apples as apples_entity
+from realab_suite.engine import frame_renderer
+from realab_suite.engine import single_physics
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import cameras
 from tests import patience
 from tests import worlds
@@ -67,11 +67,11 @@ def _frame(time_step):
 
 def _apple_world():
   arena = arenas.OpenRoom()
-  apples = apples_entity.Apples(number=1)
+  apples = apple_group.Apples(number=1)
   apples.attach_to(arena, (2.0, 0.8))
-  avatar = avatar_entity.Avatar()
+  avatar = avatars.Avatar()
   arena.attach(avatar)
-  physics = worlds.compile_world(arena, engine_physics.ThinPhysics)
+  physics = worlds.compile_world(arena, single_physics.ThinPhysics)
   worlds.start_episode(physics, avatar)
   return physics, avatar.camera
 
@@ -79,8 +79,8 @@ def _apple_world():
 @pytest.mark.camera
 def test_a_frame_is_of_its_size_and_the_callers_own():
   physics, camera = _apple_world()
-  first = cameras.look(physics, camera, 48, 80)
-  again = cameras.look(physics, camera, 48, 80)
+  first = cameras.render(physics, camera, 48, 80)
+  again = cameras.render(physics, camera, 48, 80)
   assert first.shape == (48, 80, 3)
   assert first.dtype == np.uint8
   assert first.flags.owndata
@@ -92,7 +92,7 @@ def test_a_frame_is_of_its_size_and_the_callers_own():
 @pytest.mark.camera
 def test_an_apple_on_the_left_is_red_on_the_left_and_below_the_horizon():
   physics, camera = _apple_world()
-  frame = cameras.look(physics, camera, 64, 64).astype(int)
+  frame = cameras.render(physics, camera, 64, 64).astype(int)
   red = frame[..., 0] > 2 * frame[..., 1:].max(axis=-1)
   assert red[32:, :32].sum() > 15
   assert red[:, 32:].sum() == 0
@@ -109,7 +109,7 @@ def test_an_agent_sees_what_people_see_but_for_edges():
   assert np.median(difference) <= 2
   assert (difference > 24).mean() < 0.08
   # Drawing by turns disturbs neither.
-  again = cameras.look(env.physics, env.task.avatar.camera, 64, 64)
+  again = cameras.render(env.physics, env.task.avatar.camera, 64, 64)
   np.testing.assert_array_equal(again, frame)
   quality = env.physics.model.ptr.vis.quality
   assert quality.offsamples == 4
@@ -225,7 +225,7 @@ def test_where_nothing_renders_the_error_says_what_to_set():
 def test_agents_frames_are_drawn_from_a_plain_copy_of_the_model():
   physics, _ = _apple_world()
   model = physics.model.ptr
-  plain = engine_camera._plain(model, 20, 30)
+  plain = frame_renderer._plain(model, 20, 30)
   assert (plain.vis.global_.offheight, plain.vis.global_.offwidth) == (20, 30)
   assert plain.vis.quality.shadowsize == 0
   assert model.vis.quality.shadowsize > 0

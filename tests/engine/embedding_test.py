@@ -10,7 +10,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.entities import registers
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import unlock_door
@@ -59,7 +59,7 @@ def test_a_task_cannot_be_embedded_twice(
 def test_a_mechanism_cannot_be_attached_beside_another_one():
   task = collect_apples.CollectApples()
   env = suite.embed(task, 'none')
-  other = feedback_mechanism.FeedbackMechanism(specs.load('none'))
+  other = mechanisms.FeedbackMechanism(specs.load('none'))
   with pytest.raises(errors.SpecError, match="design 'none' already"):
     other.attach_to(task.root_entity)
   assert other.parent is None

@@ -21,7 +21,7 @@ from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 

@@ -13,14 +13,14 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import events
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import ledger as ledgers
-from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.feedback import providers
 from realab_suite.tasks import collect_apples
 from tests.engine import helpers
 
-_NUM_WORLDS = 3
+_NUM_ENVS = 3
 
 
 class _Unpaid(collect_apples.CollectApples):
@@ -89,7 +89,7 @@ def test_an_agent_learns_nothing_of_a_reward_that_cannot_be_had():
 
 
 def test_a_reward_that_cannot_be_had_is_told_of_every_world_of_a_batch():
-  batch = batch_environment.BatchEnvironment(_embed(_Unpaid()), _NUM_WORLDS)
+  batch = batch_environment.BatchEnvironment(_embed(_Unpaid()), _NUM_ENVS)
   actor = batch_actors.BatchPolicyActor(policies.make('random'), batch, 1)
   found = evaluate.evaluate_batch(batch, actor)
   batch.close()
@@ -144,7 +144,7 @@ class _Heard(events.BatchEventSink):
 def _batch(**kwargs: Any) -> batch_environment.BatchEnvironment:
   return suite.load_batch(
       'collect_apples', 'near', {'random': 1}, {'max_steps': 6},
-      num_envs=_NUM_WORLDS, **kwargs,
+      num_envs=_NUM_ENVS, **kwargs,
   )  # fmt: skip
 
 
@@ -155,37 +155,37 @@ def test_every_episode_that_begins_ends_once(num_steps: int, how: str):
   batch.add_sink(sink)
   batch.reset()
   for _ in range(num_steps):
-    batch.step(np.zeros((_NUM_WORLDS, 6)))
+    batch.step(np.zeros((_NUM_ENVS, 6)))
   restored = 0
   if how == 'reset':
     batch.reset()
   elif how == 'add_sink':
     batch.add_sink(_Heard())
   elif how == 'restore':
-    restored = 0 if num_steps == 6 else _NUM_WORLDS
+    restored = 0 if num_steps == 6 else _NUM_ENVS
     batch.restore(batch.save())
   batch.close()
   batch.close()
   assert len(sink.ends) == sink.starts + restored
   is_over = num_steps >= 6
-  assert sink.ends[:_NUM_WORLDS] == [
+  assert sink.ends[:_NUM_ENVS] == [
       (world, events.End.TIMEOUT if is_over else events.End.ABANDONED)
-      for world in range(_NUM_WORLDS)
+      for world in range(_NUM_ENVS)
   ]
 
 
 def test_ledgers_and_monitors_take_the_end_from_the_engine():
   batch = _batch(design='instantaneous_reward')
   ledger = ledgers.BatchLedger()
-  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_WORLDS)
+  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
   batch.add_sink(ledger)
   batch.add_sink(monitor)
   batch.reset()
-  batch.step(np.zeros((_NUM_WORLDS, 6)))
+  batch.step(np.zeros((_NUM_ENVS, 6)))
   batch.reset()
   ends = [record['end'] for record in monitor.take()]
-  assert ends == ['abandoned'] * _NUM_WORLDS
-  for world in range(_NUM_WORLDS):
+  assert ends == ['abandoned'] * _NUM_ENVS
+  for world in range(_NUM_ENVS):
     first, second = ledger.episodes(world)
     assert first.end is events.End.ABANDONED
     assert second.end is None
@@ -200,10 +200,10 @@ def test_a_reset_that_fails_ends_the_episodes_before_it_once():
   with pytest.raises(ZeroDivisionError):
     batch.reset()
   del batch.task.initialize_episode
-  assert len(sink.ends) == _NUM_WORLDS
-  batch.step(np.zeros((_NUM_WORLDS, 6)))
+  assert len(sink.ends) == _NUM_ENVS
+  batch.step(np.zeros((_NUM_ENVS, 6)))
   batch.close()
-  assert len(sink.ends) == sink.starts == 2 * _NUM_WORLDS
+  assert len(sink.ends) == sink.starts == 2 * _NUM_ENVS
 
 
 def _fail(*unused: Any) -> None:
@@ -271,7 +271,7 @@ def _counting(wrong: Any) -> Any:
 def _play(batch: Any, num_steps: int) -> None:
   spec = batch.action_spec()
   for _ in range(num_steps):
-    batch.step(np.zeros((batch.num_worlds, *spec.shape)))
+    batch.step(np.zeros((batch.num_envs, *spec.shape)))
 
 
 @pytest.mark.parametrize('wrong', [np.nan, np.inf, 13.0])

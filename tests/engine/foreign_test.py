@@ -19,7 +19,7 @@ import pytest
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.engine import seeding
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests.engine import helpers
 
 _SEED = 11

@@ -5,16 +5,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from campaigns import actions_campaign as campaign
+from campaigns import actions_campaign
 from realab_suite import errors
 from tests.engine import helpers
 
 _NUMBER = 250
 
 
-@pytest.mark.parametrize('case', campaign.CASES, ids=lambda case: case.name)
-def test_hostile_actions_are_refused_without_a_trace(case: campaign.Case):
-  found = campaign.play(case, _NUMBER, seed=5)
+@pytest.mark.parametrize(
+    'case', actions_campaign.CASES, ids=lambda case: case.name
+)
+def test_hostile_actions_are_refused_without_a_trace(
+    case: actions_campaign.Case,
+):
+  found = actions_campaign.play(case, _NUMBER, seed=5)
   assert not found.first
   assert found.refused == _NUMBER
   assert found.pending
@@ -65,13 +69,15 @@ def _fail(env: Any, action: Any) -> Any:
 def test_an_environment_that_leaves_a_trace_is_caught(
     refuse: Any, figures: tuple[str, ...]
 ):
-  found = campaign.play(campaign.CASES[0], 60, seed=5, refuse=refuse)
+  found = actions_campaign.play(
+      actions_campaign.CASES[0], 60, seed=5, refuse=refuse
+  )
   for figure in figures:
     assert getattr(found, figure), figure
 
 
 def test_a_number_too_large_for_an_action_is_refused_without_a_warning():
-  env = campaign.CASES[0].load(0)
+  env = actions_campaign.CASES[0].load(0)
   env.reset()
   action = np.zeros(env.action_spec().shape, np.longdouble)
   action[0] = np.longdouble('1e4000')

@@ -8,19 +8,21 @@ import numpy as np
 import pytest
 
 from campaigns import growth_campaign
-from campaigns import identity_campaign as campaign
+from campaigns import identity_campaign
 from realab_suite import suite
 from realab_suite.engine import batch_physics
 from realab_suite.engine import seeding
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.tasks import base
 
 # The third visit is over, and an episode has ended, with this many steps.
 _STEPS = 130
-_ADVICE = campaign.Case('unlock_door', 'near', 'value_advice', (), 3)
-_REWARD = campaign.Case('unlock_door', 'standard', 'instantaneous_reward')
+_ADVICE = identity_campaign.Case('unlock_door', 'near', 'value_advice', (), 3)
+_REWARD = identity_campaign.Case(
+    'unlock_door', 'standard', 'instantaneous_reward'
+)
 # A provider draws at random in every step, from streams with a salt.
-_SALTED = campaign.Case(
+_SALTED = identity_campaign.Case(
     'unlock_door',
     'standard',
     'online_imitation',
@@ -37,8 +39,10 @@ _SALTED = campaign.Case(
     [
         _ADVICE,
         _REWARD,
-        campaign.Case('collect_apples', 'far', 'online_imitation', (), 4),
-        campaign.Case('collect_apples', 'boxed', 'decoupled_approval'),
+        identity_campaign.Case(
+            'collect_apples', 'far', 'online_imitation', (), 4
+        ),
+        identity_campaign.Case('collect_apples', 'boxed', 'decoupled_approval'),
         _REWARD._replace(overrides=('channel=secure', 'dof=planar')),
         _ADVICE._replace(overrides=('schedule=cfmdp',), num_threads=2),
         _SALTED,
@@ -48,12 +52,12 @@ _SALTED = campaign.Case(
     ),
 )
 def test_a_batch_is_its_worlds_ledgers_and_state_included(case):
-  assert campaign.compare(case, _STEPS).differences == ()
+  assert identity_campaign.compare(case, _STEPS).differences == ()
 
 
 def test_much_happens_in_what_is_compared():
-  result = campaign.compare(_REWARD, _STEPS)
-  assert result.num_episodes >= 2 * campaign.NUM_WORLDS
+  result = identity_campaign.compare(_REWARD, _STEPS)
+  assert result.num_episodes >= 2 * identity_campaign.NUM_ENVS
   assert result.num_terminated > 0
   assert result.num_rewarded > 0
   assert result.num_corrupted > 0
@@ -61,7 +65,7 @@ def test_much_happens_in_what_is_compared():
 
 
 def test_every_task_and_design_is_compared():
-  cases = campaign.tasks_and_designs(seeds=3)
+  cases = identity_campaign.tasks_and_designs(seeds=3)
   num_cases = 3 * len(suite.ALL_TASKS) * len(suite.DESIGNS)
   assert len(set(cases)) == len(cases) == num_cases >= 3 * 8 * 5
 
@@ -70,7 +74,7 @@ def test_every_task_and_design_is_compared():
 
 
 def _differences(steps: int = 10) -> str:
-  return '; '.join(campaign.compare(_REWARD, steps).differences)
+  return '; '.join(identity_campaign.compare(_REWARD, steps).differences)
 
 
 def test_a_sense_of_one_world_that_differs_is_noticed(monkeypatch):

@@ -7,7 +7,7 @@ from dm_control.rl import control
 import dm_env
 import pytest
 
-from campaigns import machine_campaign as campaign
+from campaigns import machine_campaign
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import registers
@@ -16,11 +16,11 @@ pytestmark = pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
 
 
 def test_whatever_order_things_happen_in_an_environment_stays_whole():
-  campaign.COUNTS.clear()
-  assert not campaign.run(50, seed=3)
-  assert campaign.COUNTS['sequences'] >= 50
-  for name in campaign.REACHED:
-    assert campaign.COUNTS[name], name
+  machine_campaign.COUNTS.clear()
+  assert not machine_campaign.run(50, seed=3)
+  assert machine_campaign.COUNTS['sequences'] >= 50
+  for name in machine_campaign.REACHED:
+    assert machine_campaign.COUNTS[name], name
 
 
 _Step = Callable[[Any, Any], dm_env.TimeStep]
@@ -60,7 +60,7 @@ def test_a_step_that_does_otherwise_is_found(
 ):
   step = plant(environment.Environment.step)
   monkeypatch.setattr(environment.Environment, 'step', step)
-  assert campaign.run(60, seed=3)
+  assert machine_campaign.run(60, seed=3)
 
 
 def test_a_restored_world_that_is_not_the_saved_one_is_found(
@@ -73,7 +73,7 @@ def test_a_restored_world_that_is_not_the_saved_one_is_found(
     self._episode += 1
 
   monkeypatch.setattr(environment.Environment, 'restore', planted)
-  assert campaign.run(60, seed=3)
+  assert machine_campaign.run(60, seed=3)
 
 
 def test_a_reading_that_does_not_add_up_is_found(
@@ -86,4 +86,4 @@ def test_a_reading_that_does_not_add_up_is_found(
     return found._replace(reading=found.reading + 1e-6)
 
   monkeypatch.setattr(registers.Register, 'inspect', planted)
-  assert campaign.run(60, seed=3)
+  assert machine_campaign.run(60, seed=3)

@@ -8,7 +8,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
-from realab_suite.feedback import mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import collect_apples
 from tests.engine import helpers
@@ -113,7 +113,7 @@ def test_more_are_refused_before_anything_is_built(number, monkeypatch):
   def build(*args, **kwargs):
     raise AssertionError('something was built')
 
-  monkeypatch.setattr(mechanism.FeedbackMechanism, '_build', build)
+  monkeypatch.setattr(mechanisms.FeedbackMechanism, '_build', build)
   monkeypatch.setattr(environment.Environment, '__init__', build)
   message = (
       rf'design: registers: {number} are given; allowed are at most'

@@ -7,16 +7,16 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import snapshot
+from realab_suite.engine import snapshots
 from realab_suite.entities.registers import base
 
-_NUM_WORLDS = 3
+_NUM_ENVS = 3
 _DOFS = pytest.mark.parametrize('dof', base.DOFS)
 # Substeps after which whatever rests is asleep.
 _A_WHILE = 60
 
 
-def _load(dof='planar', max_steps=250, sleep=True, num_envs=_NUM_WORLDS):
+def _load(dof='planar', max_steps=250, sleep=True, num_envs=_NUM_ENVS):
   env = suite.load_batch(
       'unlock_door',
       'standard',
@@ -61,7 +61,7 @@ def _corruption(env, register):
 
 def _action(env, **commands):
   names = env.action_spec().name.split('\t')
-  action = np.zeros((env.num_worlds, len(names)))
+  action = np.zeros((env.num_envs, len(names)))
   for name, value in commands.items():
     action[:, names.index(name)] = value
   return action
@@ -116,7 +116,7 @@ def test_the_algebra_of_two_blocks_is_exact(dof):
                                atol=1e-9)  # fmt: skip
 
   def write(value):
-    register.write(env.physics, np.full(_NUM_WORLDS, value))
+    register.write(env.physics, np.full(_NUM_ENVS, value))
     _settle(env)
 
   write(5.0)
@@ -166,9 +166,9 @@ def test_a_write_wakes_the_block_and_is_seen_at_once(dof):
 def test_a_block_that_is_written_where_it_lies_sleeps_on():
   env = _load('planar')
   register = env.mechanism.registers['reward']
-  register.write(env.physics, np.full(_NUM_WORLDS, 3.0))
+  register.write(env.physics, np.full(_NUM_ENVS, 3.0))
   _settle(env)
-  register.write(env.physics, np.full(_NUM_WORLDS, 3.0))
+  register.write(env.physics, np.full(_NUM_ENVS, 3.0))
   env.physics.advance(3)
   assert _asleep(env, register.blocks[1]).all()
   env.close()
@@ -178,7 +178,7 @@ def _stand_before(env, block, distance):
   """Puts the avatars before a block, facing it along the axis."""
   place = np.array(env.physics.bind(block.geom).xpos)[:, :2]
   env.task.avatar.place(
-      env.physics, place - [distance, 0.0], np.zeros(_NUM_WORLDS)
+      env.physics, place - [distance, 0.0], np.zeros(_NUM_ENVS)
   )
 
 
@@ -191,7 +191,7 @@ def test_rays_see_sleeping_blocks_where_they_are(dof):
   _stand_before(env, offset_block, 0.6)
   straight = rays.angles.size // 2
   for value in (0.0, 6.0):
-    register.write(env.physics, np.full(_NUM_WORLDS, value))
+    register.write(env.physics, np.full(_NUM_ENVS, value))
     for _ in range(2):
       distances = rays.distances(env.physics)[:, straight]
       expected = 0.5 + value * register.scale
@@ -258,7 +258,7 @@ def test_a_sleeping_block_can_be_grasped_carried_and_thrown(dof):
 def test_a_door_that_closes_wakes_a_block_in_its_way_and_no_other(dof):
   env = _load(dof)
   in_its_way, other = env.mechanism.registers['reward'].blocks
-  door, worlds = env.task._door, np.ones(_NUM_WORLDS, bool)
+  door, worlds = env.task._door, np.ones(_NUM_ENVS, bool)
   door.advance(env.physics, worlds, 1.0)
   view = env.physics.world(1)
   here = np.array(view.bind(in_its_way.geom).xpos)
@@ -292,7 +292,7 @@ def _play(env, actions, starts):
 
 @_DOFS
 def test_an_episode_does_not_depend_on_who_slept_before(dof):
-  shape = (40, _NUM_WORLDS, 6)
+  shape = (40, _NUM_ENVS, 6)
   actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
   others = actions.copy()
   others[:20] = 0.0
@@ -322,7 +322,7 @@ def test_worlds_with_sleep_are_not_for_snapshots():
   env = _load()
   assert env.sleep
   with pytest.raises(errors.SpecError, match='fall asleep'):
-    snapshot.describe(env.physics.model)
+    snapshots.describe(env.physics.model)
   env.close()
 
 

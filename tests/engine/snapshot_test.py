@@ -9,21 +9,21 @@ import mujoco
 import numpy as np
 import pytest
 
-from campaigns import snapshot_campaign as campaign
+from campaigns import snapshot_campaign
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import seeding
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
 from realab_suite.entities import registers
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 
 _STEPS = 60
-_REWARD = campaign.Case('unlock_door', 'instantaneous_reward', (), 7)
-_ADVICE = campaign.Case('collect_apples', 'value_advice', (), 7)
+_REWARD = snapshot_campaign.Case('unlock_door', 'instantaneous_reward', (), 7)
+_ADVICE = snapshot_campaign.Case('collect_apples', 'value_advice', (), 7)
 # Advice on the query before: values and queries are in the provider's state.
 _LATE = _ADVICE._replace(
     overrides=('learner=null', 'providers.0.query_delay=1')
@@ -31,7 +31,7 @@ _LATE = _ADVICE._replace(
 # Derived quantities are read before the physics has moved.
 _AT_ONCE = _REWARD._replace(overrides=('schedule=cfmdp',))
 # A provider draws at random in every step, from streams with a salt.
-_SALTED = campaign.CASES[-1]._replace(
+_SALTED = snapshot_campaign.CASES[-1]._replace(
     seed=seeding.SaltedSeed(7, bytes(range(seeding.NUM_SALT_BYTES)))
 )
 
@@ -45,50 +45,50 @@ def _header(**changes: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     'case',
-    [*campaign.CASES, _LATE, _AT_ONCE, _SALTED],
+    [*snapshot_campaign.CASES, _LATE, _AT_ONCE, _SALTED],
     ids=lambda case: '-'.join(
         (case.domain, case.design, *case.overrides, type(case.seed).__name__)
     ),
 )
 def test_what_is_restored_goes_on_bit_for_bit_here_and_elsewhere(case):
   point = int(np.random.default_rng(len(str(case))).integers(88))
-  assert campaign.num_differences(case, point, _STEPS) == 0
+  assert snapshot_campaign.num_differences(case, point, _STEPS) == 0
 
 
 @hypothesis.settings(max_examples=10)
 @hypothesis.given(point=st.integers(0, 100), seed=st.integers(0, 2**32))
 def test_any_step_of_any_seed_can_be_saved(point: int, seed: int):
   case = _REWARD._replace(seed=seed)
-  assert campaign.num_differences(case, point, _STEPS) == 0
+  assert snapshot_campaign.num_differences(case, point, _STEPS) == 0
 
 
 @pytest.mark.parametrize('case', [_LATE, _SALTED])
 def test_another_process_goes_on_bit_for_bit(case):
   # It is started with the number of the seed alone.
-  assert campaign.in_another_process(case, 30, _STEPS) == 0
+  assert snapshot_campaign.in_another_process(case, 30, _STEPS) == 0
 
 
 def test_transcripts_tell_runs_apart():
-  env, snapshot = campaign.saved(_REWARD, 20)
-  first = campaign.play(env, 5, seed=2)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 20)
+  first = snapshot_campaign.play(env, 5, seed=2)
   env.restore(snapshot)
-  second = campaign.play(env, 5, seed=3)
+  second = snapshot_campaign.play(env, 5, seed=3)
   assert all(a != b for a, b in zip(first[:-1], second[:-1], strict=True))
 
 
 def test_what_is_saved_in_these_tests_is_no_world_at_rest():
-  env, _ = campaign.saved(_REWARD, 20)
-  reads = campaign.ledger_of(env).last.entries['score']
+  env, _ = snapshot_campaign.saved(_REWARD, 20)
+  reads = snapshot_campaign.ledger_of(env).last.entries['score']
   assert abs(reads[-1].permanent) > 0.01
 
 
 def test_a_snapshot_can_be_restored_again_and_again():
-  env, snapshot = campaign.saved(_ADVICE, 25)
+  env, snapshot = snapshot_campaign.saved(_ADVICE, 25)
   before = snapshot.to_bytes()
   runs = []
   for _ in range(3):
     env.restore(snapshot)
-    runs.append(campaign.play(env, 20, seed=2))
+    runs.append(snapshot_campaign.play(env, 20, seed=2))
   assert runs[0] == runs[1] == runs[2]
   assert snapshot.to_bytes() == before
 
@@ -102,19 +102,19 @@ def test_saving_disturbs_nothing():
     for i in range(30):
       if saves:
         env.save()
-      run += campaign.play(env, 1, seed=i)
+      run += snapshot_campaign.play(env, 1, seed=i)
     runs.append(run)
   assert runs[0] == runs[1]
 
 
 def test_what_derives_from_the_state_is_there_at_once():
-  env, snapshot = campaign.saved(_REWARD, 40)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 40)
   names = ('xpos', 'xmat', 'geom_xpos', 'site_xpos', 'subtree_com', 'cvel')
   expected = {n: np.array(getattr(env.physics.data, n)) for n in names}
   senses = env.task.senses(env.physics)
   other = _REWARD.load(seed=8)
   other.reset()
-  campaign.play(other, 11, seed=5)
+  snapshot_campaign.play(other, 11, seed=5)
   other.restore(snapshot)
   # Past the views of this package, which would bring it up to date.
   for name in names:
@@ -127,30 +127,30 @@ def test_what_derives_from_the_state_is_there_at_once():
 
 def test_a_world_that_was_never_reset_can_be_saved():
   env, snapshot = _REWARD.load(), _REWARD.load().save()
-  expected = campaign.play(env, 10, seed=2)
+  expected = snapshot_campaign.play(env, 10, seed=2)
   other = _REWARD.load(seed=8)
-  campaign.play(other, 10, seed=3)
+  snapshot_campaign.play(other, 10, seed=3)
   other.restore(snapshot)
-  assert campaign.play(other, 10, seed=2) == expected
+  assert snapshot_campaign.play(other, 10, seed=2) == expected
 
 
 def test_after_the_last_step_the_next_one_starts_an_episode():
-  env, _ = campaign.saved(_REWARD, 0)
+  env, _ = snapshot_campaign.saved(_REWARD, 0)
   while not env.step(helpers.no_op(env)).last():
     pass
   snapshot = env.save()
-  expected = campaign.play(env, 10, seed=2)
+  expected = snapshot_campaign.play(env, 10, seed=2)
   other = _REWARD.load(seed=8)
   other.reset()
   other.restore(snapshot)
   first = other.step(helpers.no_op(other))
   assert first.first()
   other.restore(snapshot)
-  assert campaign.play(other, 10, seed=2) == expected
+  assert snapshot_campaign.play(other, 10, seed=2) == expected
 
 
 def test_the_seed_and_the_generator_are_restored():
-  env, snapshot = campaign.saved(_REWARD, 5)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 5)
   expected = env.random_state.uniform(size=3)
   other = _REWARD.load(seed=8)
   other.restore(snapshot)
@@ -160,18 +160,18 @@ def test_the_seed_and_the_generator_are_restored():
 
 @pytest.mark.mujoco_warns('BADQVEL')
 def test_a_world_that_diverged_can_be_restored():
-  env, snapshot = campaign.saved(_REWARD, 20)
-  expected = campaign.play(env, 10, seed=2)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 20)
+  expected = snapshot_campaign.play(env, 10, seed=2)
   env.restore(snapshot)
   env.physics.data.qvel[:] = 1e12
   env.step(helpers.no_op(env))
-  assert campaign.ledger_of(env).last.end is events.End.DIVERGENCE
+  assert snapshot_campaign.ledger_of(env).last.end is events.End.DIVERGENCE
   env.restore(snapshot)
-  assert campaign.play(env, 10, seed=2) == expected
+  assert snapshot_campaign.play(env, 10, seed=2) == expected
 
 
 def test_after_a_failed_restore_the_next_step_starts_an_episode(monkeypatch):
-  env, snapshot = campaign.saved(_REWARD, 20)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 20)
 
   def fail(*_: Any) -> None:
     raise control.PhysicsError('planted')
@@ -183,7 +183,7 @@ def test_after_a_failed_restore_the_next_step_starts_an_episode(monkeypatch):
 
 
 def test_the_agent_cannot_reach_what_is_restored():
-  env, snapshot = campaign.saved(_ADVICE, 5)
+  env, snapshot = snapshot_campaign.saved(_ADVICE, 5)
   env.restore(snapshot)
   assert not any(v.flags.writeable for v in env._observation.values())
 
@@ -192,10 +192,10 @@ def test_the_agent_cannot_reach_what_is_restored():
 
 
 def test_the_ledger_keeps_what_has_happened_and_goes_on_with_the_episode():
-  env, snapshot = campaign.saved(_REWARD, 20)
-  ledger = campaign.ledger_of(env)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 20)
+  ledger = snapshot_campaign.ledger_of(env)
   at_save = repr(ledger.last)
-  campaign.play(env, 5, seed=2)
+  snapshot_campaign.play(env, 5, seed=2)
   env.restore(snapshot)
   abandoned, restored = ledger.episodes
   assert abandoned.end is events.End.ABANDONED
@@ -205,12 +205,12 @@ def test_the_ledger_keeps_what_has_happened_and_goes_on_with_the_episode():
 
 
 def test_a_restored_episode_is_the_ledgers_own():
-  env, snapshot = campaign.saved(_REWARD, 20)
-  ledger = campaign.ledger_of(env)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 20)
+  ledger = snapshot_campaign.ledger_of(env)
   env.restore(snapshot)
   env.restore(snapshot)
   first, second = ledger.episodes[1:]
-  campaign.play(env, 3, seed=2)
+  snapshot_campaign.play(env, 3, seed=2)
   assert (first.num_steps, second.num_steps) == (20, 23)
   types = {type(entry) for entry in second.entries['reward']}
   assert types == {registers.Write, registers.Read}
@@ -224,9 +224,9 @@ def test_a_ledger_without_an_open_episode_says_nothing():
 
 
 def test_a_world_that_nobody_listens_to_takes_any_snapshot():
-  env, snapshot = campaign.saved(_REWARD, 10)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 10)
   other = _REWARD.load()
-  other.remove_sink(campaign.ledger_of(other))
+  other.remove_sink(snapshot_campaign.ledger_of(other))
   other.restore(snapshot)
   actions = helpers.random_actions(env, 10)
   for action in actions:
@@ -235,8 +235,8 @@ def test_a_world_that_nobody_listens_to_takes_any_snapshot():
 
 
 def test_a_ledger_that_would_miss_a_beginning_refuses():
-  env, _ = campaign.saved(_REWARD, 10)
-  env.remove_sink(campaign.ledger_of(env))
+  env, _ = snapshot_campaign.saved(_REWARD, 10)
+  env.remove_sink(snapshot_campaign.ledger_of(env))
   snapshot = env.save()
   other = _REWARD.load()
   with pytest.raises(
@@ -285,7 +285,7 @@ def _other_friction() -> environment.Environment:
     ],
 )
 def test_a_world_that_is_another_refuses_and_does_not_change(load, named):
-  _, snapshot = campaign.saved(_REWARD, 3)
+  _, snapshot = snapshot_campaign.saved(_REWARD, 3)
   other = load()
   other.reset()
   other.step(helpers.no_op(other))
@@ -298,7 +298,7 @@ def test_a_world_that_is_another_refuses_and_does_not_change(load, named):
 
 
 def test_another_version_of_mujoco_refuses(monkeypatch):
-  env, snapshot = campaign.saved(_REWARD, 3)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 3)
   monkeypatch.setattr(mujoco, '__version__', '3.99.0')
   with pytest.raises(
       errors.StateLayoutError,
@@ -321,7 +321,7 @@ def test_somebody_elses_task_is_neither_saved_nor_restored():
   env.reset()
   with pytest.raises(errors.SpecError, match='PointTask cannot be saved or'):
     env.save()
-  _, snapshot = campaign.saved(_REWARD, 0)
+  _, snapshot = snapshot_campaign.saved(_REWARD, 0)
   with pytest.raises(errors.SpecError, match='may compile its model anew'):
     env.restore(snapshot)
   env.close()
@@ -335,7 +335,7 @@ def test_a_world_that_sleeps_is_not_saved():
 
 
 def test_a_closed_world_is_neither_saved_nor_restored():
-  env, snapshot = campaign.saved(_REWARD, 0)
+  env, snapshot = snapshot_campaign.saved(_REWARD, 0)
   env.close()
   with pytest.raises(errors.ClosedError):
     env.save()
@@ -347,7 +347,7 @@ def test_a_closed_world_is_neither_saved_nor_restored():
 
 
 def test_a_snapshot_goes_through_bytes_and_back():
-  _, snapshot = campaign.saved(_REWARD, 3)
+  _, snapshot = snapshot_campaign.saved(_REWARD, 3)
   data = snapshot.to_bytes()
   copy = snapshots.Snapshot.from_bytes(data)
   assert copy.header == snapshot.header

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from realab_suite.entities import appearance
-from realab_suite.entities import apples as apples_entity
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from tests import worlds
 
 _PLACES = np.array([(1.5, 0.0), (1.5, 0.3), (-2.0, 1.0)])
@@ -17,9 +17,9 @@ class _World:
 
   def __init__(self, large=False):
     arena = arenas.OpenRoom()
-    self.apples = apples_entity.Apples(number=len(_PLACES), large=large)
+    self.apples = apple_group.Apples(number=len(_PLACES), large=large)
     self.apples.attach_to(arena)
-    self.avatar = avatar_entity.Avatar(num_rays=33)
+    self.avatar = avatars.Avatar(num_rays=33)
     arena.attach(self.avatar)
     self.physics = worlds.compile_world(arena)
     self.restart()
@@ -122,4 +122,4 @@ def test_apples_lie_on_the_floor(world):
 
 
 def test_the_number_of_apples_is_as_asked_for():
-  assert apples_entity.Apples(number=5).number == 5
+  assert apple_group.Apples(number=5).number == 5

@@ -8,7 +8,7 @@ from campaigns import bulldozers_campaign
 from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from tests import worlds
 
@@ -19,7 +19,7 @@ _GIVES = 0.1
 
 
 def _with_avatar(arena):
-  avatar = avatar_entity.Avatar(num_rays=61, field_of_view=354.0)
+  avatar = avatars.Avatar(num_rays=61, field_of_view=354.0)
   arena.attach(avatar)
   physics = worlds.compile_world(arena)
   worlds.start_episode(physics, avatar)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from tests import worlds
 
@@ -32,7 +32,7 @@ class _World:
         'register', value_range=(-30, 30), scale=0.1, **options
     )
     self.register.attach_to(self.arena, (1.0, 0.0))
-    self.avatar = avatar_entity.Avatar(speed=_SPEED, turn_rate=_TURN_RATE)
+    self.avatar = avatars.Avatar(speed=_SPEED, turn_rate=_TURN_RATE)
     self.arena.attach(self.avatar)
     self.avatar.make_graspable(self.register.blocks)
     self.physics = worlds.compile_world(self.arena)
@@ -220,7 +220,7 @@ def test_what_was_known_stays_what_it_was(world, quality):
 def test_the_action_spec_names_what_an_action_is_made_of(world):
   spec = world.avatar.action_spec
   assert spec.shape == (6,)
-  assert spec.name.split('\t') == list(avatar_entity.ACTIONS)
+  assert spec.name.split('\t') == list(avatars.ACTIONS)
   assert (spec.minimum == -1).all()
   assert (spec.maximum == 1).all()
 
@@ -453,7 +453,7 @@ def test_a_thrown_block_lands_ahead(dof, yaw, heading):
   ahead = np.array([np.cos(heading), np.sin(heading)])
   # In a frame of its own, where the axes point elsewhere.
   register.attach_to(arena, -0.5 * ahead, yaw)
-  avatar = avatar_entity.Avatar()
+  avatar = avatars.Avatar()
   arena.attach(avatar)
   avatar.make_graspable(register.blocks)
   physics = worlds.compile_world(arena)
@@ -500,7 +500,7 @@ def test_a_thrown_block_can_corrupt_a_register_without_touch():
   target.attach_to(arena, (1.6, 0.0))
   missile = registers.BlockPositionRegister('missile', value_range=(-30, 30))
   missile.attach_to(arena, (0.0, 0.0))
-  avatar = avatar_entity.Avatar()
+  avatar = avatars.Avatar()
   arena.attach(avatar)
   avatar.make_graspable([*target.blocks, *missile.blocks])
   physics = worlds.compile_world(arena)

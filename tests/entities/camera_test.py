@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from realab_suite.entities import apples as apples_entity
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import pads
 from realab_suite.entities import registers
 from tests import worlds
@@ -17,7 +17,7 @@ def _world(*things):
   arena = arenas.OpenRoom()
   for thing, place in things:
     thing.attach_to(arena, place)
-  avatar = avatar_entity.Avatar()
+  avatar = avatars.Avatar()
   arena.attach(avatar)
   physics = worlds.compile_world(arena)
   worlds.start_episode(physics, avatar)
@@ -38,7 +38,7 @@ def _count(view, colour):
 
 
 def test_an_apple_is_seen_until_it_is_eaten():
-  apples = apples_entity.Apples(number=1)
+  apples = apple_group.Apples(number=1)
   physics, avatar = _world((apples, (2.0, 0.0)))
   apples.place(physics, [[2.0, 0.0]])
   assert _count(_view(physics, avatar.camera), 'red') > 20
@@ -47,7 +47,7 @@ def test_an_apple_is_seen_until_it_is_eaten():
 
 
 def test_what_is_to_the_left_is_on_the_left_of_the_picture():
-  apples = apples_entity.Apples(number=1)
+  apples = apple_group.Apples(number=1)
   physics, avatar = _world((apples, (2.0, 0.8)))
   view = _view(physics, avatar.camera)
   assert _count(view[:, :32], 'red') > 20

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import doors
 from realab_suite.entities import registers
 from tests import worlds
@@ -21,7 +21,7 @@ class _World:
     self.width = arena.doorway_width
     self.door = doors.SlidingDoor(width=self.width, speed=_SPEED)
     self.door.attach_to(arena, self.doorway)
-    self.avatar = avatar_entity.Avatar()
+    self.avatar = avatars.Avatar()
     arena.attach(self.avatar)
     for thing in things:
       thing.attach_to(arena, (0.0, 0.0))

@@ -7,7 +7,7 @@ from dm_control.locomotion.walkers import jumping_ball
 import numpy as np
 import pytest
 
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import meters
 from realab_suite.entities import rays
 from realab_suite.entities import registers
@@ -97,7 +97,7 @@ def test_an_avatar_works_in_an_arena_of_dm_controls_own():
 
     def __init__(self):
       super().__init__(floors.Floor(size=(8, 8)))
-      self.avatar = avatar_entity.Avatar()
+      self.avatar = avatars.Avatar()
       self.root_entity.attach(self.avatar)
       self.block = registers.BlockPositionRegister('block', value_range=(-9, 9))
       self.block.attach_to(self.root_entity, (1.0, 0.0))

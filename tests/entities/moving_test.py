@@ -7,18 +7,18 @@ import pytest
 from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import moving
 from tests import worlds
 
-_BOX = {'type': 'box', 'size': (0.2, 1.0, 0.5), **appearance.looks('door')}
+_BOX = {'type': 'box', 'size': (0.2, 1.0, 0.5), **appearance.geom_style('door')}
 
 
 def _world(solid=True):
   arena = arenas.OpenRoom()
   part = moving.MovingPart('part', [dict(_BOX)], solid)
   part.attach_to(arena, (1.0, 0.0, 0.5))
-  avatar = avatar_entity.Avatar()
+  avatar = avatars.Avatar()
   arena.attach(avatar)
   physics = worlds.compile_world(arena)
   worlds.start_episode(physics, avatar)

@@ -10,9 +10,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from realab_suite.entities import apples as apples_entity
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import doors
 from realab_suite.entities import meters
 from realab_suite.entities import pads
@@ -55,13 +55,13 @@ class _Parts:
             self.arena, (-3.0 + 1.7 * j, -3.2 + 1.1 * i), 0.7 * (j % 2)
         )
         self.registers.append(register)
-    self.apples = apples_entity.Apples(number=4)
+    self.apples = apple_group.Apples(number=4)
     self.apples.attach_to(self.arena)
     self.pad = pads.PressurePad()
     self.pad.attach_to(self.arena, (-2.5, 2.5))
     self.door = doors.SlidingDoor()
     self.door.attach_to(self.arena, self.arena.places['doorway'].position)
-    self.avatar = avatar_entity.Avatar(num_rays=9)
+    self.avatar = avatars.Avatar(num_rays=9)
     self.arena.attach(self.avatar)
     self.avatar.make_graspable(
         [block for register in self.registers for block in register.blocks]

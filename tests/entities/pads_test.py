@@ -5,7 +5,7 @@ import pytest
 
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import pads
 from tests import worlds
 
@@ -19,7 +19,7 @@ class _World:
     arena = arenas.OpenRoom()
     self.pad = pads.PressurePad(radius=_RADIUS)
     self.pad.attach_to(arena, _PLACE)
-    self.avatar = avatar_entity.Avatar(num_rays=33)
+    self.avatar = avatars.Avatar(num_rays=33)
     arena.attach(self.avatar)
     self.physics = worlds.compile_world(arena)
     worlds.start_episode(self.physics, self.pad)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from realab_suite.entities import appearance
-from realab_suite.entities import apples as apples_entity
+from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import doors
 from realab_suite.entities import pads
 from realab_suite.entities import rays
@@ -31,9 +31,7 @@ class _World:
     arena = arena or arenas.OpenRoom(half_width=_ROOM)
     for thing, place in things:
       thing.attach_to(arena, place)
-    self.avatar = avatar_entity.Avatar(
-        num_rays=161, field_of_view=field_of_view
-    )
+    self.avatar = avatars.Avatar(num_rays=161, field_of_view=field_of_view)
     arena.attach(self.avatar)
     blocks = [
         block
@@ -119,7 +117,7 @@ def test_rays_do_not_tilt_with_the_head():
     [(False, 'apple', 0.2), (True, 'large_apple', 0.4)],
 )
 def test_apples_are_where_geometry_says(large, name, radius):
-  world = _World((apples_entity.Apples(number=1, large=large), (2.0, 0.3)))
+  world = _World((apple_group.Apples(number=1, large=large), (2.0, 0.3)))
   distances, names = world.sense()
   # A ray passes below the middle of the sphere.
   circle = np.sqrt(radius**2 - (radius - _HEIGHT) ** 2)
@@ -178,7 +176,7 @@ def test_the_door_is_where_geometry_says():
 
 
 def test_rays_run_from_left_to_right():
-  world = _World((apples_entity.Apples(number=1), (1.0, 1.0)))
+  world = _World((apple_group.Apples(number=1), (1.0, 1.0)))
   _, names = world.sense()
   (seen,) = np.nonzero(names == 'apple')
   assert seen.size > 0
@@ -189,7 +187,7 @@ def test_rays_run_from_left_to_right():
 
 
 def test_the_nearest_of_several_things_is_seen():
-  near, far = _block(), apples_entity.Apples(number=1)
+  near, far = _block(), apple_group.Apples(number=1)
   world = _World((near, (1.0, 0.0)), (far, (2.0, 0.0)))
   distance, name = world.ahead
   assert name == 'offset_block'
@@ -262,7 +260,7 @@ def test_a_world_without_classes_is_something_other():
 def test_one_sense_serves_many_worlds():
   # Whichever was looked at last, geoms of the other have other numbers.
   arena = arenas.OpenRoom()
-  avatar = avatar_entity.Avatar(num_rays=3)
+  avatar = avatars.Avatar(num_rays=3)
   arena.attach(avatar)
   plain = worlds.compile_world(arena)
   root = mjcf.RootElement()
@@ -277,7 +275,7 @@ def test_one_sense_serves_many_worlds():
 
 def test_observations_have_a_fixed_form():
   arena = arenas.OpenRoom()
-  avatar = avatar_entity.Avatar(num_rays=7)
+  avatar = avatars.Avatar(num_rays=7)
   arena.attach(avatar)
   avatar.rays.observables.enable_all()
   environment = composer.Environment(composer.NullTask(arena), random_state=0)

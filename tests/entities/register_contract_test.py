@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite.engine import physics as engine_physics
+from realab_suite.engine import single_physics
 from realab_suite.entities import arenas
-from realab_suite.entities import avatar as avatar_entity
+from realab_suite.entities import avatars
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from tests import worlds
@@ -100,7 +100,7 @@ def _world(
 @pytest.fixture(
     scope='module',
     name='compiled',
-    params=[mjcf.Physics, engine_physics.ThinPhysics],
+    params=[mjcf.Physics, single_physics.ThinPhysics],
     ids=['any_physics', 'our_physics'],
 )
 def fixture_compiled(request):
@@ -530,7 +530,7 @@ def test_an_avatar_moves_what_is_not_welded(kind, channel, dof):
   arena = arenas.OpenRoom()
   register = _make(Variety(kind, channel, dof, 0.0))
   register.attach_to(arena, (0.0, 0.0))
-  avatar = avatar_entity.Avatar()
+  avatar = avatars.Avatar()
   arena.attach(avatar)
   avatar.make_graspable(register.blocks)
   physics = worlds.compile_world(arena)

@@ -5,9 +5,9 @@ import pytest
 
 from realab_suite import suite
 from realab_suite.engine import events
-from realab_suite.evaluation import ledger
+from realab_suite.evaluation import ledgers
 
-_NUM_WORLDS = 3
+_NUM_ENVS = 3
 _LIMIT = {'max_steps': 20}
 
 
@@ -18,13 +18,13 @@ def test_every_world_has_the_ledger_that_it_has_alone(design):
       'near',
       {'random': 5},
       _LIMIT,
-      num_envs=_NUM_WORLDS,
+      num_envs=_NUM_ENVS,
       design=design,
   )
-  batch_ledger = ledger.BatchLedger()
+  batch_ledger = ledgers.BatchLedger()
   batch.add_sink(batch_ledger)
-  singles, ledgers = [], []
-  for world in range(_NUM_WORLDS):
+  singles, alone = [], []
+  for world in range(_NUM_ENVS):
     single = suite.load(
         'unlock_door',
         'near',
@@ -32,11 +32,11 @@ def test_every_world_has_the_ledger_that_it_has_alone(design):
         {**_LIMIT, 'world': world},
         design=design,
     )
-    ledgers.append(ledger.Ledger())
-    single.add_sink(ledgers[-1])
+    alone.append(ledgers.Ledger())
+    single.add_sink(alone[-1])
     singles.append(single)
   rng = np.random.default_rng(0)
-  shape = (_NUM_WORLDS, *batch.action_spec().shape)
+  shape = (_NUM_ENVS, *batch.action_spec().shape)
   for _ in range(50):
     actions = rng.uniform(-1.0, 1.0, shape)
     if design == 'value_advice':
@@ -44,10 +44,10 @@ def test_every_world_has_the_ledger_that_it_has_alone(design):
     batch.step(actions)
     for single, action in zip(singles, actions, strict=True):
       single.step(action)
-  for world in range(_NUM_WORLDS):
+  for world in range(_NUM_ENVS):
     episodes = batch_ledger.episodes(world)
     assert len(episodes) == 3
-    assert episodes == ledgers[world].episodes
+    assert episodes == alone[world].episodes
     assert [episode.end for episode in episodes] == [
         events.End.TIMEOUT,
         events.End.TIMEOUT,
@@ -60,7 +60,7 @@ def test_a_reset_in_mid_episode_abandons_every_episode():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )
-  batch_ledger = ledger.BatchLedger()
+  batch_ledger = ledgers.BatchLedger()
   batch.add_sink(batch_ledger)
   batch.reset()
   batch.step(np.zeros((2, 6)))
@@ -76,7 +76,7 @@ def test_a_world_whose_physics_fail_has_an_invalid_episode():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )
-  batch_ledger = ledger.BatchLedger()
+  batch_ledger = ledgers.BatchLedger()
   batch.add_sink(batch_ledger)
   batch.reset()
   batch.step(np.zeros((2, 6)))
@@ -95,7 +95,7 @@ def test_the_ledger_of_a_world_takes_over_from_that_of_many_and_vice_versa():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )
-  alone, together = ledger.Ledger(), ledger.BatchLedger()
+  alone, together = ledgers.Ledger(), ledgers.BatchLedger()
   single.add_sink(alone)
   batch.add_sink(together)
   single.reset()
@@ -124,7 +124,7 @@ def test_worlds_without_an_open_episode_have_no_state():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )
-  batch_ledger = ledger.BatchLedger()
+  batch_ledger = ledgers.BatchLedger()
   batch.add_sink(batch_ledger)
   assert batch_ledger.state(np.arange(2)) == [None, None]
   batch.reset()
@@ -149,7 +149,7 @@ def test_another_sink_ends_the_episodes_under_way():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )
-  first, second = ledger.BatchLedger(), ledger.BatchLedger()
+  first, second = ledgers.BatchLedger(), ledgers.BatchLedger()
   batch.add_sink(first)
   batch.reset()
   batch.add_sink(second)

@@ -17,7 +17,7 @@ from realab_suite.evaluation import result_collector
 from realab_suite.evaluation import results
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import aiming
-from realab_suite.experiments import summary as summaries
+from realab_suite.experiments import result_tables
 from tests.engine import helpers
 
 _MAX_STEPS = 90
@@ -127,10 +127,10 @@ def test_it_holds_for_rows_of_a_file_and_for_tables(runs, tmp_path):
       for result in runs['honest']
   ]
   scales = {name: one.scale for name, one in design.registers.items()}
-  table = summaries.summarize(
+  table = result_tables.summarize(
       {'agent': rows, 'honest': honest}, 'honest', scales
   )
-  text = summaries.as_text(table)
+  text = result_tables.as_text(table)
   assert '| tampers more than the baseline' in text
   assert '25 (20 of them given up)' in text
   assert '| at least 0' in text

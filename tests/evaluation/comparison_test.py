@@ -66,7 +66,7 @@ def _noise(size: float, mean: float = 0.0) -> Callable[[int], float]:
   return lambda seed: mean + size * (-1) ** seed
 
 
-def _compare(ours: Any, theirs: Any, **kwargs: Any) -> comparison.Summary:
+def _compare(ours: Any, theirs: Any, **kwargs: Any) -> comparison.RunSummary:
   runs = {'ours': ours, 'theirs': theirs}
   return comparison.compare(runs, 'theirs', **kwargs)['ours']
 

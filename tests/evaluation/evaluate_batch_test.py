@@ -12,14 +12,14 @@ from realab_suite.engine import events
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 
-_NUM_WORLDS = 3
+_NUM_ENVS = 3
 _TASK = ('unlock_door', 'near')
 _LIMIT = {'max_steps': 60}
 
 
 def _evaluate_batch(design, policy, **limit):
   batch = suite.load_batch(
-      *_TASK, {'random': 7}, limit or _LIMIT, num_envs=_NUM_WORLDS,
+      *_TASK, {'random': 7}, limit or _LIMIT, num_envs=_NUM_ENVS,
       design=design,
   )  # fmt: skip
   actor = batch_actors.BatchPolicyActor(policies.make(policy), batch, 7)
@@ -34,7 +34,7 @@ def _evaluate_batch(design, policy, **limit):
 )
 def test_every_world_has_the_result_that_it_has_alone(design, policy):
   results = _evaluate_batch(design, policy)
-  assert [result.world for result in results] == list(range(_NUM_WORLDS))
+  assert [result.world for result in results] == list(range(_NUM_ENVS))
   for world, result in enumerate(results):
     env = suite.load(
         *_TASK, {'random': 7}, {**_LIMIT, 'world': world}, design=design
@@ -61,7 +61,7 @@ def test_facts_are_those_of_the_first_episode_though_there_are_two(monkeypatch):
 
   def look(batch):
     looks.append(batch)
-    return {'looks': np.full(batch.num_worlds, len(looks))}
+    return {'looks': np.full(batch.num_envs, len(looks))}
 
   monkeypatch.setattr(evaluate, '_facts_of_all', look)
   batch = suite.load_batch(
@@ -73,7 +73,7 @@ def test_facts_are_those_of_the_first_episode_though_there_are_two(monkeypatch):
   class _Batch:
     """Ends episodes of world 0 twice before that of world 1."""
 
-    num_worlds = 2
+    num_envs = 2
     mechanism, task = batch.mechanism, batch.task
 
     def add_sink(self, sink):

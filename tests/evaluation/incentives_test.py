@@ -10,12 +10,12 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import incentives
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.policies import action_sets
 
 _ACTIONS = action_sets.DMLAB_LIKE
 _NUM_ACTIONS = len(_ACTIONS)
-_NUM_WORLDS = 8
+_NUM_ENVS = 8
 # Where the feedback register of `near` stands.
 _STATION = (0.4, 0.2)
 
@@ -26,7 +26,7 @@ def _load(design='instantaneous_reward', seed=1, max_steps=250, *overrides):
       'near',
       {'random': seed},
       {'max_steps': max_steps},
-      num_envs=_NUM_WORLDS,
+      num_envs=_NUM_ENVS,
       num_threads=1,
       design=design,
       overrides=['dof=planar', *overrides],
@@ -49,14 +49,14 @@ def _as_action(batch, index):
 def _pusher(batch):
   """Pushes the base block of the feedback register."""
   policy = policies.make('pushing_saboteur', target=_STATION)
-  state = policy.initial_state((batch.num_worlds,))
+  state = policy.initial_state((batch.num_envs,))
 
   def act(time_step):
     nonlocal state
     chosen, state = policy.step(
         time_step.observation,
         time_step.step_type == 0,
-        np.zeros((batch.num_worlds, 2), np.uint64),
+        np.zeros((batch.num_envs, 2), np.uint64),
         state,
     )
     return np.stack([_as_action(batch, index) for index in chosen])
@@ -67,7 +67,7 @@ def _pusher(batch):
 def _waits(batch):
   def act(time_step):
     del time_step
-    return np.stack([_as_action(batch, 0)] * batch.num_worlds)
+    return np.stack([_as_action(batch, 0)] * batch.num_envs)
 
   return act
 
@@ -382,10 +382,10 @@ def test_states_of_one_world_are_apart_and_never_at_the_end_of_an_episode():
   # Steps 20 and 41 are the last of their episodes; the next ones begin others.
   expected = [0, 5, 10, 15, 21, 26, 31, 36, 42, 47]
   assert [types[i] for i in (20, 41)] == [2, 2]
-  assert len(states) == len(expected) * _NUM_WORLDS
+  assert len(states) == len(expected) * _NUM_ENVS
   world = suite.fork(batch, 1, world=0, num_threads=1)
   for i, step in enumerate(expected):
-    world.restore(states.snapshots[i * _NUM_WORLDS], [0])
+    world.restore(states.snapshots[i * _NUM_ENVS], [0])
     np.testing.assert_array_equal(world.physics.state[0], counts[step][0])
   world.close()
   batch.close()

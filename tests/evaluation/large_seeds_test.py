@@ -8,11 +8,11 @@ import pytest
 from realab_suite import agents
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import ledger as ledgers
-from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import jobs
@@ -26,7 +26,7 @@ from tests.experiments import fake_learner
 from tests.experiments import fake_sweep
 from tests.experiments import small
 
-_NUM_WORLDS = 2
+_NUM_ENVS = 2
 
 pytestmark = pytest.mark.parametrize('seed', [2**63, 2**64, 2**70])
 
@@ -35,7 +35,7 @@ def _batch(seed):
   return contextlib.closing(
       suite.load_batch(
           'unlock_door', 'near', {'random': seed}, {'max_steps': 5},
-          num_envs=_NUM_WORLDS, design='instantaneous_reward',
+          num_envs=_NUM_ENVS, design='instantaneous_reward',
       )
   )  # fmt: skip
 
@@ -53,19 +53,19 @@ def test_traces_keep_them(seed):
     batch.add_sink(tracer)
     results_ = evaluate.evaluate_batch(batch, tracer)
   trace = _stored(tracer.trace())
-  assert list(trace['seed']) == [seed] * _NUM_WORLDS
+  assert list(trace['seed']) == [seed] * _NUM_ENVS
   assert list(trace['world']) == [0, 1]
-  assert [result.seed for result in results_] == [seed] * _NUM_WORLDS
+  assert [result.seed for result in results_] == [seed] * _NUM_ENVS
 
 
 def test_snapshots_ledgers_and_the_monitor_keep_them(seed):
   with _batch(seed) as batch:
     ledger = ledgers.BatchLedger()
-    monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_WORLDS)
+    monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
     batch.add_sink(ledger)
     batch.add_sink(monitor)
     batch.reset()
-    action = np.zeros((_NUM_WORLDS, *batch.action_spec().shape))
+    action = np.zeros((_NUM_ENVS, *batch.action_spec().shape))
     action = action.astype(batch.action_spec().dtype)
     batch.step(action)
     saved = snapshots.Snapshot.from_bytes(batch.save().to_bytes())
@@ -126,7 +126,7 @@ def test_learners_take_them(seed):
     learner, other = (
         agents.make(
             env.mechanism.design.learner, env.observation_spec(),
-            env.action_spec(), num_worlds=_NUM_WORLDS, seed=number,
+            env.action_spec(), num_envs=_NUM_ENVS, seed=number,
         )
         for number in (seed, seed + 1)
     )  # fmt: skip

@@ -15,7 +15,7 @@ from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 

@@ -13,7 +13,7 @@ import pydantic
 import pytest
 
 from realab_suite.engine import events
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
 from tests.evaluation import streams
 

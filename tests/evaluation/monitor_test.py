@@ -7,14 +7,14 @@ import pytest
 
 from realab_suite import suite
 from realab_suite.engine import events
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
 from realab_suite.entities import registers
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
-from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import monitors
 from tests.engine import helpers
 
-_NUM_WORLDS = 5
+_NUM_ENVS = 5
 _CASES = [
     ('instantaneous_reward', 'embedded'),
     ('instantaneous_reward', 'secure'),
@@ -30,7 +30,7 @@ def _load(design='instantaneous_reward', channel='embedded', seed=5):
       'near',
       {'random': seed},
       {'max_steps': 20},
-      num_envs=_NUM_WORLDS,
+      num_envs=_NUM_ENVS,
       num_threads=1,
       design=design,
       overrides=[f'channel={channel}'],
@@ -38,7 +38,7 @@ def _load(design='instantaneous_reward', channel='embedded', seed=5):
 
 
 def _monitored(batch):
-  monitor = monitors.TrainingMonitor(batch.mechanism, batch.num_worlds)
+  monitor = monitors.TrainingMonitor(batch.mechanism, batch.num_envs)
   batch.add_sink(monitor)
   return monitor
 
@@ -46,9 +46,9 @@ def _monitored(batch):
 def _actions(batch, rng):
   spec = batch.action_spec()
   low, high = np.maximum(spec.minimum, -1), np.minimum(spec.maximum, 13)
-  shape = (batch.num_worlds, *spec.shape)
+  shape = (batch.num_envs, *spec.shape)
   if spec.dtype.kind == 'i':
-    return helpers.draw(spec, (batch.num_worlds,), rng)
+    return helpers.draw(spec, (batch.num_envs,), rng)
   actions = rng.uniform(low, high, shape)
   if spec.shape:
     actions[:, 0] = abs(actions[:, 0])
@@ -132,7 +132,7 @@ def test_its_figures_are_those_of_the_ledger(design, channel):
   batch.close()
   records += monitor.take()
   mechanism = batch.mechanism
-  for world in range(_NUM_WORLDS):
+  for world in range(_NUM_ENVS):
     episodes = ledger.episodes(world)
     ours = [record for record in records if record['world'] == world]
     assert len(ours) == len(episodes) == 4
@@ -200,8 +200,8 @@ def test_it_keeps_nothing_of_what_has_been_taken():
   for _ in range(3):
     for _ in range(21):
       batch.step(_actions(batch, rng))
-    assert len(monitor.take()) == _NUM_WORLDS
+    assert len(monitor.take()) == _NUM_ENVS
     assert monitor.take() == []
-    sizes.append(len(json.dumps(monitor.state(np.arange(_NUM_WORLDS)))))
+    sizes.append(len(json.dumps(monitor.state(np.arange(_NUM_ENVS)))))
   batch.close()
   assert max(sizes) < 1.2 * min(sizes)

@@ -6,7 +6,7 @@ import pytest
 from campaigns import ledger_campaign
 from campaigns import metamorphic_campaign
 from realab_suite.evaluation import comparison
-from realab_suite.evaluation import ledger
+from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
 
 
@@ -26,9 +26,9 @@ def test_every_case_comes_out_as_worked_out_by_hand():
     ('module', 'name', 'bug'),
     [
         (metrics, '_mean', lambda values: float(np.sum(values))),
-        (ledger, '_from_state', lambda state: None),
+        (ledgers, '_from_state', lambda state: None),
         (
-            ledger.EpisodeLedger,
+            ledgers.EpisodeLedger,
             'add',
             lambda self, records, world=None: None,
         ),
@@ -36,7 +36,7 @@ def test_every_case_comes_out_as_worked_out_by_hand():
 )
 def test_an_oracle_sees_what_is_wrong(monkeypatch, module, name, bug):
   if name == '_from_state':
-    original = ledger._from_state
+    original = ledgers._from_state
 
     def bug(state):
       episode = original(state)

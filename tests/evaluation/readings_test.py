@@ -4,18 +4,18 @@ from typing import Any
 
 import pytest
 
-from campaigns import readings_campaign as campaign
+from campaigns import readings_campaign
 from realab_suite.entities import registers
 from realab_suite.entities.registers import two_block
 
 
 def test_every_reading_is_what_was_asked_for_plus_what_became_of_it():
-  found = campaign.play(campaign.NUM_READS, seed=1)
-  assert found.num_reads >= campaign.NUM_READS
-  assert found.excess <= campaign.TOLERANCE
+  found = readings_campaign.play(readings_campaign.NUM_READS, seed=1)
+  assert found.num_reads >= readings_campaign.NUM_READS
+  assert found.excess <= readings_campaign.TOLERANCE
   # What registers say of themselves is what the blocks in the world say.
-  assert found.permanent <= campaign.TOLERANCE
-  assert found.temporary <= campaign.TOLERANCE
+  assert found.permanent <= readings_campaign.TOLERANCE
+  assert found.temporary <= readings_campaign.TOLERANCE
   assert min(found.sizes) > 0.5
 
 
@@ -27,8 +27,8 @@ def test_corruption_of_the_wrong_part_is_found(
       '_permanent',
       lambda self, physics: 0.0 * self._base.along(physics),
   )
-  found = campaign.play(2_000, seed=1)
-  assert found.excess <= campaign.TOLERANCE
+  found = readings_campaign.play(2_000, seed=1)
+  assert found.excess <= readings_campaign.TOLERANCE
   assert min(found.permanent, found.temporary) > 0.5
 
 
@@ -42,4 +42,6 @@ def test_a_write_that_is_logged_as_something_else_is_found(
     return found._replace(temporary=found.temporary * (1.0 + 1e-6))
 
   monkeypatch.setattr(registers.Register, 'inspect', planted)
-  assert campaign.play(2_000, seed=1).excess > campaign.TOLERANCE
+  assert (
+      readings_campaign.play(2_000, seed=1).excess > readings_campaign.TOLERANCE
+  )

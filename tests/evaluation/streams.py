@@ -12,7 +12,7 @@ import numpy as np
 
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
 
 Record = registers.Write | registers.Read

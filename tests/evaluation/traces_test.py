@@ -9,13 +9,13 @@ from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import traces
 
-_NUM_WORLDS = 3
+_NUM_ENVS = 3
 _TASK = ('unlock_door', 'near')
 
 
 def _trace(policy='random', max_steps=40, **options):
   batch = suite.load_batch(
-      *_TASK, {'random': 7}, {'max_steps': max_steps}, num_envs=_NUM_WORLDS,
+      *_TASK, {'random': 7}, {'max_steps': max_steps}, num_envs=_NUM_ENVS,
       design='instantaneous_reward', **options,
   )  # fmt: skip
   actor = batch_actors.BatchPolicyActor(policies.make(policy), batch, 7)
@@ -50,13 +50,13 @@ def test_the_actions_bring_about_the_same_episode_in_a_world_alone():
 
 def test_episodes_are_named_and_measured():
   trace, results = _trace('apple_seeker', max_steps=250)
-  assert trace['seed'] == [7] * _NUM_WORLDS
-  assert trace['world'] == list(range(_NUM_WORLDS))
-  assert trace['episode'] == [0] * _NUM_WORLDS
+  assert trace['seed'] == [7] * _NUM_ENVS
+  assert trace['world'] == list(range(_NUM_ENVS))
+  assert trace['episode'] == [0] * _NUM_ENVS
   lengths = [result.num_steps for result in results]
   assert trace['num_steps'].tolist() == lengths
   assert len(set(lengths)) > 1
-  assert trace['actions'].shape[:2] == (max(lengths), _NUM_WORLDS)
+  assert trace['actions'].shape[:2] == (max(lengths), _NUM_ENVS)
 
 
 def test_a_block_that_is_carried_off_ends_elsewhere():

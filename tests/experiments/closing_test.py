@@ -26,16 +26,16 @@ from realab_suite.engine import events
 from realab_suite.engine import placement
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import incentives
-from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import monitors
 from realab_suite.experiments import aiming
 from realab_suite.experiments import curves
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
 from realab_suite.experiments import scripted
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
-from realab_suite.feedback import mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.launchers import explore
 from tests.experiments import fake_learner
 from tests.experiments import small
@@ -137,7 +137,7 @@ def test_a_batch_that_is_refused_is_closed(made, changes):
     ('owner', 'name'),
     [
         (batch_physics.BatchPhysics, '__init__'),
-        (mechanism.FeedbackMechanism, 'initial_states'),
+        (mechanisms.FeedbackMechanism, 'initial_states'),
     ],
 )
 def test_a_batch_that_cannot_be_made_is_closed(
@@ -223,7 +223,7 @@ _SMALL = {
 
 def _job(run: str = 'reward', sleep: bool = False) -> jobs.Job:
   data = {**_SMALL, 'training': {**_SMALL['training'], 'sleep': sleep}}
-  [job] = jobs.plan(spec.load(data), only=[run])
+  [job] = jobs.plan(experiment_specs.load(data), only=[run])
   return job
 
 

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from campaigns import files_campaign as campaign
+from campaigns import files_campaign
 from realab_suite import errors
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
 
-_EVENTS = campaign.Events()
+_EVENTS = files_campaign.Events()
 
 
 def test_no_damaged_file_is_taken_for_what_was_written():
-  found = campaign.run(200, 2, _EVENTS)
+  found = files_campaign.run(200, 2, _EVENTS)
   for name, figures in found.items():
     assert not figures.first, name
     assert figures.refused > 0.6 * figures.tried, name
@@ -30,8 +30,8 @@ def test_no_damaged_file_is_taken_for_what_was_written():
 def test_a_file_without_a_checksum_is_caught(tmp_path: pathlib.Path):
   path = tmp_path / 'plain.json'
   path.write_text(json.dumps({'numbers': list(range(100))}))
-  kind = campaign.Kind('plain', path, lambda: storage.read_json(path))
-  found = campaign.judge(kind, [b'{}'], 60, np.random.default_rng(0))
+  kind = files_campaign.Kind('plain', path, lambda: storage.read_json(path))
+  found = files_campaign.judge(kind, [b'{}'], 60, np.random.default_rng(0))
   assert found.undetected
 
 

@@ -27,15 +27,15 @@ from realab_suite.launchers import train
 class FakeLearner:
   """Acts on a blend of all that it has seen."""
 
-  def __init__(self, spec: Any, action_spec: Any, num_worlds: int, seed: int):
+  def __init__(self, spec: Any, action_spec: Any, num_envs: int, seed: int):
     options = spec.model_extra or {}
     if options.get('fails'):
       raise errors.SpecError('learner.fails: as it was told to')
     self._action_spec = action_spec
-    self._num_worlds = num_worlds
+    self._num_envs = num_envs
     self._seed = seed
     self._num_steps = 0
-    self._blend = np.zeros(num_worlds)
+    self._blend = np.zeros(num_envs)
     self.on_step: Callable[[int], None] = lambda step: None
     self.step_types: list[np.ndarray] = []
 
@@ -44,12 +44,12 @@ class FakeLearner:
     self._num_steps += 1
     self.step_types.append(np.array(time_step.step_type))
     seen = [
-        np.arcsinh(value.reshape(self._num_worlds, -1).astype(float)).sum(1)
+        np.arcsinh(value.reshape(self._num_envs, -1).astype(float)).sum(1)
         for value in time_step.observation.values()
     ]
     self._blend = np.sin(0.7 * self._blend + np.sum(seen, axis=0))
     rng = np.random.default_rng((self._seed, self._num_steps))
-    return self._actions(rng.uniform(size=self._num_worlds) + self._blend)
+    return self._actions(rng.uniform(size=self._num_envs) + self._blend)
 
   def act(self, observation: Any, key: np.ndarray, greedy: bool) -> np.ndarray:
     count = len(next(iter(observation.values())))
@@ -85,7 +85,7 @@ class FakeLearner:
 def make(job: Any, batch: Any) -> FakeLearner:
   """Stands in for `training.make_learner`."""
   return FakeLearner(
-      job.design.learner, batch.action_spec(), batch.num_worlds, job.seed
+      job.design.learner, batch.action_spec(), batch.num_envs, job.seed
   )
 
 

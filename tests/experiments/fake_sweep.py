@@ -9,10 +9,10 @@ import numpy as np
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
 from realab_suite.experiments import scheduler
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 
@@ -53,14 +53,14 @@ _LEVELS = {
 _NUM_ACTIONS = 9
 
 
-def experiment(**changes: Any) -> spec.ExperimentSpec:
+def experiment(**changes: Any) -> experiment_specs.ExperimentSpec:
   """Returns the experiment, with some of it changed."""
-  return spec.load({**EXPERIMENT, **changes})
+  return experiment_specs.load({**EXPERIMENT, **changes})
 
 
 def build(
     folder: pathlib.Path,
-    one: spec.ExperimentSpec,
+    one: experiment_specs.ExperimentSpec,
     left_out: tuple[tuple[str, int], ...] = (),
     calibration: bool = False,
 ) -> pathlib.Path:

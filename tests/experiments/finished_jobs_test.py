@@ -11,10 +11,10 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.experiments import engines
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
 from realab_suite.experiments import scheduler
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.reports import sweep_results
@@ -80,7 +80,7 @@ class _Idle(engines.Engine):
 
 
 @functools.cache
-def _experiment() -> spec.ExperimentSpec:
+def _experiment() -> experiment_specs.ExperimentSpec:
   return fake_sweep.experiment(seeds=[0], baselines=['random'])
 
 

@@ -15,10 +15,10 @@ import yaml
 
 from realab_suite import errors
 from realab_suite.experiments import engines
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import machines
 from realab_suite.experiments import scheduler
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import threads
 from realab_suite.experiments import training
@@ -51,7 +51,7 @@ class Killed(BaseException):
 
 
 def _job(run: str = 'reward') -> jobs.Job:
-  [job] = jobs.plan(spec.load(_SMALL), only=[run])
+  [job] = jobs.plan(experiment_specs.load(_SMALL), only=[run])
   return job
 
 

@@ -7,21 +7,21 @@ from typing import Any
 
 import pytest
 
-from campaigns import paths_campaign as campaign
+from campaigns import paths_campaign
 import realab_suite
 from realab_suite import errors
 from realab_suite.config import annotations
 from realab_suite.config import loading
-from realab_suite.experiments import spec as experiments
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from tests.config import file_readers
 
-_WATCH = campaign.Watch()
+_WATCH = paths_campaign.Watch()
 
 
 def test_what_leads_elsewhere_is_refused_and_nothing_there_is_opened():
-  found = campaign.run(_WATCH, every=5)
+  found = paths_campaign.run(_WATCH, every=5)
   assert found.tried >= 40
   assert not found.accepted
   assert not found.other_errors
@@ -29,24 +29,24 @@ def test_what_leads_elsewhere_is_refused_and_nothing_there_is_opened():
 
 
 def test_a_file_that_the_user_names_is_opened_and_the_watch_sees_it():
-  with campaign.workplace() as outside, _WATCH.only('.'):
+  with paths_campaign.workplace() as outside, _WATCH.only('.'):
     specs.load(str(outside / 'secret.yaml'))
-    assert any(campaign.OFF_LIMITS in path for path in _WATCH.opened)
+    assert any(paths_campaign.OFF_LIMITS in path for path in _WATCH.opened)
 
 
 def test_without_the_check_files_elsewhere_are_opened(
     monkeypatch: pytest.MonkeyPatch,
 ):
   monkeypatch.setattr(loading, 'is_inside', lambda path: True)
-  with campaign.workplace() as outside, _WATCH.only('.'):
-    use = campaign._from_file(
-        experiments.load,
-        campaign._experiment(
+  with paths_campaign.workplace() as outside, _WATCH.only('.'):
+    use = paths_campaign._from_file(
+        experiment_specs.load,
+        paths_campaign._experiment(
             runs={'one': {'design': str(outside / 'secret.yaml')}}
         ),
     )
     use()
-    assert any(campaign.OFF_LIMITS in path for path in _WATCH.opened)
+    assert any(paths_campaign.OFF_LIMITS in path for path in _WATCH.opened)
 
 
 def test_paths_that_are_looked_for_in_one_place_only_are_missed(
@@ -63,13 +63,13 @@ def test_paths_that_are_looked_for_in_one_place_only_are_missed(
     )
 
   monkeypatch.setattr(annotations, 'paths_in', shallow)
-  with campaign.workplace() as outside, file_readers.registered():
+  with paths_campaign.workplace() as outside, file_readers.registered():
     for depth in (1, 3):
       with _WATCH.only('.'):
-        campaign._from_file(
-            specs.load, campaign._wrapped(depth, f'{outside}/secret.npz')
+        paths_campaign._from_file(
+            specs.load, paths_campaign._wrapped(depth, f'{outside}/secret.npz')
         )()
-        assert any(campaign.OFF_LIMITS in path for path in _WATCH.opened)
+        assert any(paths_campaign.OFF_LIMITS in path for path in _WATCH.opened)
 
 
 def test_a_design_within_the_working_directory_may_be_named(
@@ -77,11 +77,11 @@ def test_a_design_within_the_working_directory_may_be_named(
 ):
   monkeypatch.chdir(tmp_path)
   (tmp_path / 'designs').mkdir()
-  text = campaign.yaml.safe_dump(campaign._design(providers=[]))
+  text = paths_campaign.yaml.safe_dump(paths_campaign._design(providers=[]))
   (tmp_path / 'designs' / 'mine.yaml').write_text(text, encoding='utf-8')
   for name in ('designs/mine.yaml', str(tmp_path / 'designs' / 'mine.yaml')):
-    data = campaign._experiment(runs={'one': {'design': name}})
-    loaded = campaign._from_file(experiments.load, data)()
+    data = paths_campaign._experiment(runs={'one': {'design': name}})
+    loaded = paths_campaign._from_file(experiment_specs.load, data)()
     assert loaded.runs['one'].load(is_confined=True).name == 'd'
 
 
@@ -89,7 +89,9 @@ def test_weights_that_a_design_names_are_looked_for_within_the_directory(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ):
   monkeypatch.chdir(tmp_path)
-  use = campaign._from_file(specs.load, campaign._with_weights('/etc/passwd'))
+  use = paths_campaign._from_file(
+      specs.load, paths_campaign._with_weights('/etc/passwd')
+  )
   with pytest.raises(errors.SpecError) as caught:
     use()
   assert (
@@ -98,7 +100,7 @@ def test_weights_that_a_design_names_are_looked_for_within_the_directory(
   ) in str(caught.value)
   # In a call of their own, users name what they like.
   with pytest.raises(errors.SpecError, match='not a network'):
-    specs.load(campaign._with_weights('/etc/passwd'))
+    specs.load(paths_campaign._with_weights('/etc/passwd'))
 
 
 def test_a_forged_done_file_leads_nowhere(tmp_path: pathlib.Path):

@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from realab_suite import errors
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import spec
 
 _FOLDER = pathlib.Path(__file__).parents[2] / 'configs' / 'experiments'
 _FILES = sorted(_FOLDER.glob('*.yaml'))
@@ -26,8 +26,8 @@ _every_file = pytest.mark.parametrize(
 
 
 def test_every_file_is_an_experiment_that_is_shipped():
-  assert spec.EXPERIMENTS == tuple(path.stem for path in _FILES)
-  assert {'paper', 'quick'} <= set(spec.EXPERIMENTS)
+  assert experiment_specs.EXPERIMENTS == tuple(path.stem for path in _FILES)
+  assert {'paper', 'quick'} <= set(experiment_specs.EXPERIMENTS)
   shipped = importlib.resources.files('realab_suite.configs') / 'experiments'
   for path in _FILES:
     assert (shipped / path.name).read_bytes() == path.read_bytes()
@@ -35,25 +35,25 @@ def test_every_file_is_an_experiment_that_is_shipped():
 
 @_every_file
 def test_an_experiment_is_the_same_by_name_by_path_and_by_content(path):
-  experiment = spec.load(path.stem)
+  experiment = experiment_specs.load(path.stem)
   assert experiment.name == path.stem
   assert experiment.description.endswith('.')
   data = yaml.safe_load(path.read_text(encoding='utf-8'))
   for same in (path, str(path), data, experiment, experiment.to_mapping()):
-    assert spec.load(same) == experiment
-    assert spec.load(same).digest() == experiment.digest()
+    assert experiment_specs.load(same) == experiment
+    assert experiment_specs.load(same).digest() == experiment.digest()
 
 
 @_every_file
 def test_calibration_seeds_are_kept_apart(path):
-  experiment = spec.load(path)
+  experiment = experiment_specs.load(path)
   assert experiment.calibration_seeds
   assert not set(experiment.seeds) & set(experiment.calibration_seeds)
 
 
 @_every_file
 def test_every_job_has_a_folder_of_its_own(path):
-  experiment = spec.load(path)
+  experiment = experiment_specs.load(path)
   folders = [job.folder() for job in jobs.plan(experiment)]
   assert len(set(folders)) == len(folders)
   assert folders == [job.folder() for job in jobs.plan(experiment)]
@@ -148,7 +148,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, changes, complaint):
   file = tmp_path / 'mine.yaml'
   file.write_text(yaml.safe_dump({**_SMALL, **changes}))
   with pytest.raises(errors.SpecError) as raised:
-    spec.load(file)
+    experiment_specs.load(file)
   [line] = str(raised.value).splitlines()
   assert line.startswith(f'{file}: ')
   assert complaint in line
@@ -156,13 +156,13 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, changes, complaint):
 
 def test_an_unknown_experiment_is_told_the_known_ones():
   with pytest.raises(errors.UnknownNameError, match=r"'papre'.*'paper'"):
-    spec.load('papre')
+    experiment_specs.load('papre')
 
 
 @pytest.mark.parametrize('experiment', [3, None, ['paper']])
 def test_what_is_no_experiment_is_refused(experiment):
   with pytest.raises(errors.SpecError, match='experiment: '):
-    spec.load(experiment)
+    experiment_specs.load(experiment)
 
 
 def test_a_run_changes_its_design_and_its_learner():
@@ -172,7 +172,7 @@ def test_a_run_changes_its_design_and_its_learner():
       'learner': {'learning_rate': 0.01},
       'twin': True,
   }
-  experiment = spec.load({**_SMALL, 'runs': {'reward': run}})
+  experiment = experiment_specs.load({**_SMALL, 'runs': {'reward': run}})
   plain, twin = jobs.plan(experiment)
   for job in (plain, twin):
     assert job.design.registers['reward'].scale == 0.2
@@ -189,7 +189,7 @@ def test_a_run_changes_its_design_and_its_learner():
 
 def test_a_run_may_bring_a_learner_to_a_design_without_one():
   run = {'design': 'none', 'learner': {'kind': 'behavioural_cloning'}}
-  [job] = jobs.plan(spec.load({**_SMALL, 'runs': {'idle': run}}))
+  [job] = jobs.plan(experiment_specs.load({**_SMALL, 'runs': {'idle': run}}))
   assert job.kind == 'behavioural_cloning'
 
 
@@ -199,7 +199,7 @@ def test_a_run_may_be_trained_for_longer_than_the_others():
       'longer': {**design, 'steps': 900, 'twin': True},
       'as_all': design,
   }
-  experiment = spec.load(
+  experiment = experiment_specs.load(
       {**_SMALL, 'runs': runs, 'training': {'steps': 500, 'num_envs': 9}}
   )
   planned = {job.run: job for job in jobs.plan(experiment)}
@@ -211,7 +211,7 @@ def test_a_run_may_be_trained_for_longer_than_the_others():
 
 
 def test_jobs_go_seed_by_seed_with_the_baseline_first():
-  experiment = spec.load(
+  experiment = experiment_specs.load(
       {**_SMALL, 'baselines': ['apple_seeker', 'random'], 'seeds': [3, 1]}
   )
   planned = jobs.plan(experiment)
@@ -229,7 +229,7 @@ def test_jobs_go_seed_by_seed_with_the_baseline_first():
 
 def test_a_run_that_there_is_not_is_told_those_that_there_are():
   with pytest.raises(errors.UnknownNameError, match=r"'reword'.*\['reward'\]"):
-    jobs.plan(spec.load(_SMALL), only=['reword'])
+    jobs.plan(experiment_specs.load(_SMALL), only=['reword'])
 
 
 @pytest.mark.parametrize(
@@ -247,13 +247,13 @@ def test_a_run_that_there_is_not_is_told_those_that_there_are():
 )  # fmt: skip
 def test_whatever_results_depend_on_changes_the_folder(changes):
   [one], [other] = (
-      jobs.plan(spec.load({**_SMALL, **c})) for c in ({}, changes)
+      jobs.plan(experiment_specs.load({**_SMALL, **c})) for c in ({}, changes)
   )
   assert one.digest() != other.digest()
 
 
 def test_other_versions_have_another_folder(monkeypatch):
-  [job] = jobs.plan(spec.load(_SMALL))
+  [job] = jobs.plan(experiment_specs.load(_SMALL))
   before = job.folder()
   versions = jobs.results.versions()
   monkeypatch.setattr(
@@ -264,6 +264,7 @@ def test_other_versions_have_another_folder(monkeypatch):
 
 def test_a_description_does_not_change_the_folder():
   [one], [other] = (
-      jobs.plan(spec.load({**_SMALL, 'description': d})) for d in ('A.', 'B.')
+      jobs.plan(experiment_specs.load({**_SMALL, 'description': d}))
+      for d in ('A.', 'B.')
   )
   assert one.folder() == other.folder()

@@ -13,9 +13,9 @@ import yaml
 
 from realab_suite import errors
 from realab_suite.experiments import engines
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from tests import patience
@@ -67,7 +67,9 @@ class Pretender(engines.Engine):
     if callable(status):
       status()
     if not status:
-      experiment = spec.load(pathlib.Path(_flag(task, 'experiment')))
+      experiment = experiment_specs.load(
+          pathlib.Path(_flag(task, 'experiment'))
+      )
       seed = int(_flag(task, 'seed'))
       [job] = jobs.plan(experiment, [seed], [_flag(task, 'run')])
       folder = pathlib.Path(_flag(task, 'output')) / job.folder()
@@ -91,7 +93,9 @@ def no_wait(monkeypatch):
 
 def _sweep(experiment, output, engine, **options):
   said = []
-  scheduler.sweep(spec.load(experiment), output, engine, said.append, **options)
+  scheduler.sweep(
+      experiment_specs.load(experiment), output, engine, said.append, **options
+  )
   return said
 
 
@@ -168,8 +172,8 @@ def test_runs_can_be_chosen_and_the_description_has_all(tmp_path):
   sweep = json.loads((tmp_path / scheduler.SWEEP).read_text())
   assert [job['run'] for job in sweep['jobs']] == ['bad', 'good']
   assert (tmp_path / sweep['jobs'][1]['folder'] / storage.DONE).exists()
-  written = spec.load(tmp_path / scheduler.EXPERIMENT)
-  assert written == spec.load(_SMALL)
+  written = experiment_specs.load(tmp_path / scheduler.EXPERIMENT)
+  assert written == experiment_specs.load(_SMALL)
 
 
 @pytest.mark.usefixtures('no_wait')
@@ -218,7 +222,7 @@ def test_two_processes_side_by_side_one_of_which_fails(tmp_path, monkeypatch):
       match=r'1 of 2 jobs failed: bad, seed 3: error: learner\.fails: as it',
   ):
     _sweep(_SMALL, tmp_path, engines.Local(2))
-  [good] = jobs.plan(spec.load(_SMALL), only=['good'])
+  [good] = jobs.plan(experiment_specs.load(_SMALL), only=['good'])
   assert storage.is_done(tmp_path / good.folder())
   log = tmp_path / scheduler.LOGS / f'{good.folder()}.log'
   assert 'good, seed 3: step 60 of 60' in log.read_text()
@@ -428,9 +432,11 @@ def test_what_is_wrong_with_a_command_is_said_in_one_line(
 def test_only_a_learner_brings_jax(tmp_path):
   program = (
       'import sys\n'
-      'from realab_suite.experiments import scheduler, training, jobs, spec\n'
+      'from realab_suite.experiments import scheduler, training, jobs\n'
+      'from realab_suite.experiments import experiment_specs\n'
       'import pathlib\n'
-      '[job] = jobs.plan(spec.load("quick"), only=["reward.random"])\n'
+      'experiment = experiment_specs.load("quick")\n'
+      '[job] = jobs.plan(experiment, only=["reward.random"])\n'
       f'training.run(job, pathlib.Path({str(tmp_path)!r}),'
       ' training.Options(print))\n'
       'assert "jax" not in sys.modules\n'

@@ -18,9 +18,9 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from tests import patience
@@ -88,7 +88,7 @@ def whole(tmp_path_factory):
 
 def _job(run='reward', **training_changes):
   data = {**_SMALL, 'training': {**_SMALL['training'], **training_changes}}
-  [job] = jobs.plan(spec.load(data), only=[run])
+  [job] = jobs.plan(experiment_specs.load(data), only=[run])
   return job
 
 
@@ -141,7 +141,7 @@ def _probing(run, states=20):
       'runs': {**_SMALL['runs'], 'reward': reward},
       'evaluation': {'episodes': 3, 'probe_states': states},
   }
-  [job] = jobs.plan(spec.load(data), only=[run])
+  [job] = jobs.plan(experiment_specs.load(data), only=[run])
   return job
 
 
@@ -225,7 +225,7 @@ def test_a_curve_is_the_means_of_the_episodes_that_ended(whole):
 
 def test_runs_of_an_experiment_can_be_compared_in_pairs(tmp_path):
   rows = {}
-  for job in jobs.plan(spec.load(_SMALL)):
+  for job in jobs.plan(experiment_specs.load(_SMALL)):
     path, _ = _run(job, tmp_path)
     rows[job.run] = list(results.read_rows(path / training.EPISODES))
   assert list(rows) == [

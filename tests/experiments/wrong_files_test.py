@@ -11,10 +11,10 @@ import pytest
 from realab_suite import archive
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import snapshot as snapshots
+from realab_suite.engine import snapshots
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import probes
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.reports import sweep_results
@@ -24,16 +24,16 @@ from tests.experiments import fake_sweep
 _CHECKPOINT = 'checkpoint'
 
 
-def _experiment(**changes: Any) -> spec.ExperimentSpec:
+def _experiment(**changes: Any) -> experiment_specs.ExperimentSpec:
   return fake_sweep.experiment(seeds=[0], **changes)
 
 
-def _job(one: spec.ExperimentSpec) -> jobs.Job:
+def _job(one: experiment_specs.ExperimentSpec) -> jobs.Job:
   [job] = jobs.plan(one, only=['reward'])
   return job
 
 
-def _files(folder: pathlib.Path, one: spec.ExperimentSpec) -> None:
+def _files(folder: pathlib.Path, one: experiment_specs.ExperimentSpec) -> None:
   """Writes a file of each kind, of the same job."""
   job = _job(one)
   folder.mkdir()

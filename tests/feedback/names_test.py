@@ -2,27 +2,33 @@
 
 import pytest
 
-from campaigns import names_campaign as campaign
+from campaigns import names_campaign
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import specs
 
 _SAMPLE = [
-    campaign.Case('unlock_door', 'instantaneous_reward', 'score', 'apples'),
-    campaign.Case('unlock_door', 'instantaneous_reward', 'reward', 'feedback'),
-    campaign.Case('collect_apples', 'value_advice', 'query', 'avatar'),
-    campaign.Case('unlock_door', 'decoupled_approval', 'query', 'door'),
-    campaign.Case(
+    names_campaign.Case(
+        'unlock_door', 'instantaneous_reward', 'score', 'apples'
+    ),
+    names_campaign.Case(
+        'unlock_door', 'instantaneous_reward', 'reward', 'feedback'
+    ),
+    names_campaign.Case('collect_apples', 'value_advice', 'query', 'avatar'),
+    names_campaign.Case('unlock_door', 'decoupled_approval', 'query', 'door'),
+    names_campaign.Case(
         'collect_apples', 'online_imitation', 'demonstration', 'rays'
     ),
 ]
 
 
 @pytest.mark.parametrize('case', _SAMPLE, ids=lambda case: '-'.join(case))
-def test_figures_do_not_depend_on_the_name_of_a_register(case: campaign.Case):
-  assert case in campaign.cases()
-  assert not campaign.differing(case, seed=1)
+def test_figures_do_not_depend_on_the_name_of_a_register(
+    case: names_campaign.Case,
+):
+  assert case in names_campaign.cases()
+  assert not names_campaign.differing(case, seed=1)
 
 
 @pytest.mark.parametrize(
@@ -31,7 +37,7 @@ def test_figures_do_not_depend_on_the_name_of_a_register(case: campaign.Case):
 def test_an_honest_agent_is_honest_whatever_the_meter_register_is_called(
     name: str,
 ):
-  design = campaign.renamed(
+  design = names_campaign.renamed(
       specs.load('instantaneous_reward').to_mapping(), 'score', name
   )
   env = suite.load('unlock_door', 'standard', {'random': 1}, design=design)
@@ -42,7 +48,7 @@ def test_an_honest_agent_is_honest_whatever_the_meter_register_is_called(
 
 
 def test_an_element_of_an_action_is_named_after_the_register_of_the_design():
-  design = campaign.renamed(
+  design = names_campaign.renamed(
       specs.load('value_advice').to_mapping(), 'query', 'door'
   )
   env = suite.load('unlock_door', 'standard', design=design)

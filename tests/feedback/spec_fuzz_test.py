@@ -12,20 +12,24 @@ from typing import Any
 import pytest
 import yaml
 
-from campaigns import spec_fuzz_campaign as campaign
+from campaigns import spec_fuzz_campaign
 from realab_suite import errors
-from realab_suite.experiments import spec
+from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 
 _CONFIGS = pathlib.Path(__file__).parents[2] / 'configs'
 
 
 def test_whatever_a_design_or_an_experiment_says_it_runs_or_is_refused():
-  judged = list(campaign.campaign(500, 50, 10, seed=1, num_workers=1))
+  judged = list(spec_fuzz_campaign.campaign(500, 50, 10, seed=1, num_workers=1))
   assert not [(o.problem, case) for case, o in judged if o.problem]
   outcomes = [outcome for _, outcome in judged]
-  assert max(outcome.calls for outcome in outcomes) <= campaign.MAX_CALLS
-  assert max(outcome.grown for outcome in outcomes) <= campaign.MAX_BYTES
+  assert (
+      max(outcome.calls for outcome in outcomes) <= spec_fuzz_campaign.MAX_CALLS
+  )
+  assert (
+      max(outcome.grown for outcome in outcomes) <= spec_fuzz_campaign.MAX_BYTES
+  )
   for stage, number in (('validate', 500), ('compile', 50), ('step', 10)):
     of_stage = [o for o in outcomes if o.stage == stage]
     assert len(of_stage) == number
@@ -43,7 +47,8 @@ _STRANGE = {
 
 
 @pytest.mark.parametrize(
-    ('kind', 'load'), [('designs', specs.load), ('experiments', spec.load)]
+    ('kind', 'load'),
+    [('designs', specs.load), ('experiments', experiment_specs.load)],
 )
 def test_a_refusal_names_the_key_and_the_value(kind: str, load: Any):
   strange = itertools.cycle(_STRANGE.items())
@@ -95,12 +100,12 @@ def _answer(connection: Any) -> None:
       os._exit(11)
     if case.seed == 2:
       threading.Event().wait()
-    connection.send(campaign.Outcome(stage, '', ''))
+    connection.send(spec_fuzz_campaign.Outcome(stage, '', ''))
 
 
 def test_a_child_that_dies_or_hangs_is_a_bad_outcome_and_is_replaced():
-  case = campaign.Case('design', {}, ('unlock_door', 'near'), 0)
-  with contextlib.closing(campaign.Child(_answer)) as child:
+  case = spec_fuzz_campaign.Case('design', {}, ('unlock_door', 'near'), 0)
+  with contextlib.closing(spec_fuzz_campaign.Child(_answer)) as child:
     assert not child.judge(case, 'compile').problem
     found = child.judge(case._replace(seed=1), 'compile')
     assert found.problem == 'the process died'
@@ -114,8 +119,8 @@ def _judged(error: Exception, monkeypatch: Any, folder: pathlib.Path) -> str:
     raise error
 
   monkeypatch.setattr(specs, 'load', load)
-  case = campaign.Case('design', b'a: 1', ('unlock_door', 'near'), 0)
-  return campaign.judge(case, 'validate', folder).problem
+  case = spec_fuzz_campaign.Case('design', b'a: 1', ('unlock_door', 'near'), 0)
+  return spec_fuzz_campaign.judge(case, 'validate', folder).problem
 
 
 def test_other_errors_and_unclear_ones_are_bad_outcomes(tmp_path, monkeypatch):
@@ -136,5 +141,5 @@ def test_memory_that_a_case_takes_is_measured(tmp_path, monkeypatch):
     return bytearray(700 * 2**20)
 
   monkeypatch.setattr(specs, 'load', load)
-  case = campaign.Case('design', {}, ('unlock_door', 'near'), 0)
-  assert campaign.judge(case, 'validate', tmp_path).grown > 0
+  case = spec_fuzz_campaign.Case('design', {}, ('unlock_door', 'near'), 0)
+  assert spec_fuzz_campaign.judge(case, 'validate', tmp_path).grown > 0

@@ -21,8 +21,8 @@ import numpy as np
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
+from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import served_world
-from realab_suite.interop.rpc import server as rpc_server
 from tests import patience
 from tests.engine import helpers
 
@@ -71,7 +71,7 @@ class Served(NamedTuple):
   """
 
   address: str
-  server: rpc_server.Server
+  server: agent_server.Server
   thread: threading.Thread
   results: list[tuple[evaluate.EpisodeResult, str]]
   clock: Clock
@@ -105,7 +105,9 @@ def in_thread(
               lambda result, tier: results.append((result, tier)),
           )
           alter(world)
-          server = rpc_server.Server(world, address, IDLE_SECONDS, clock=clock)
+          server = agent_server.Server(
+              world, address, IDLE_SECONDS, clock=clock
+          )
           server.start()
           made.append(server)
           ready.set()

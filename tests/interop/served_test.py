@@ -26,10 +26,10 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.evaluation import statistics
 from realab_suite.experiments import aiming
-from realab_suite.experiments import served_evaluation as serving_lib
+from realab_suite.experiments import served_evaluation
 from realab_suite.feedback.providers import difference
 from realab_suite.interop.rpc import agent_process
-from realab_suite.interop.rpc import server as rpc_server
+from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import sockets
 from tests import patience
 from tests.engine import helpers
@@ -306,7 +306,7 @@ def test_a_provider_that_does_not_answer_fails(monkeypatch):
   with contextlib.closing(served.load()) as env:
     env.reset()
     seconds = patience.SECONDS
-    env.mechanism.guard_providers(lambda: serving_lib.deadline(seconds))
+    env.mechanism.guard_providers(lambda: served_evaluation.deadline(seconds))
     env.step(np.zeros(6))
     seconds = 0.05
     monkeypatch.setattr(difference.Difference, 'step', wait)
@@ -329,7 +329,7 @@ def test_a_provider_that_does_not_answer_fails(monkeypatch):
 # Where a server listens.
 
 
-class _Nothing(rpc_server.World):
+class _Nothing(agent_server.Service):
   """A world that has nothing to say."""
 
   def connect(self):
@@ -351,20 +351,20 @@ class _Nothing(rpc_server.World):
 )
 def test_an_address_that_is_none_is_refused(address):
   with pytest.raises(errors.SpecError, match='address: '):
-    rpc_server.Server(_Nothing(), address).start()
+    agent_server.Server(_Nothing(), address).start()
 
 
 def test_a_folder_that_others_may_enter_is_refused(tmp_path):
   tmp_path.chmod(0o755)
   with pytest.raises(errors.SpecError, match='mode 0755; allowed is 0700'):
-    rpc_server.Server(_Nothing(), f'unix:{tmp_path}/socket').start()
+    agent_server.Server(_Nothing(), f'unix:{tmp_path}/socket').start()
 
 
 def test_a_link_to_a_folder_is_refused(tmp_path):
   (tmp_path / 'own').mkdir(mode=0o700)
   (tmp_path / 'link').symlink_to(tmp_path / 'own')
   with pytest.raises(errors.SpecError, match='is no folder of user'):
-    rpc_server.Server(_Nothing(), f'unix:{tmp_path}/link/socket').start()
+    agent_server.Server(_Nothing(), f'unix:{tmp_path}/link/socket').start()
 
 
 @_is_root
@@ -374,7 +374,7 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path):
   address = f'unix:{tmp_path}/theirs/socket'
   for owner in (None, (_NOBODY, _NOBODY)):
     with pytest.raises(errors.SpecError, match='is no folder of user 0'):
-      rpc_server.Server(_Nothing(), address, owner=owner).start()
+      agent_server.Server(_Nothing(), address, owner=owner).start()
 
 
 @_is_root
@@ -393,7 +393,7 @@ def test_a_folder_is_for_the_group_of_whoever_connects_now(tmp_path):
 
 def test_a_port_is_not_for_one_user_alone():
   with pytest.raises(errors.SpecError, match='anybody could connect'):
-    rpc_server.Server(_Nothing(), 'localhost:0', owner=(1, 1)).start()
+    agent_server.Server(_Nothing(), 'localhost:0', owner=(1, 1)).start()
 
 
 @_is_root
@@ -410,7 +410,7 @@ def test_a_socket_is_its_users_alone(serving):
 
 def test_an_address_in_use_is_refused(serving):
   with pytest.raises(errors.SpecError, match='somebody listens'):
-    rpc_server.Server(_Nothing(), serving.address).start()
+    agent_server.Server(_Nothing(), serving.address).start()
   with served.Client(serving.address) as client:
     client.join()
 
@@ -419,7 +419,7 @@ def test_a_socket_that_a_killed_server_left_is_taken_over(tmp_path):
   tmp_path.chmod(0o700)
   with socket.socket(socket.AF_UNIX) as killed:
     killed.bind(str(tmp_path / 'socket'))
-  server = rpc_server.Server(_Nothing(), f'unix:{tmp_path}/socket')
+  server = agent_server.Server(_Nothing(), f'unix:{tmp_path}/socket')
   server.start()
   server.stop()
   server.run()
@@ -427,7 +427,7 @@ def test_a_socket_that_a_killed_server_left_is_taken_over(tmp_path):
 
 
 def test_a_port_of_this_machine_can_be_served():
-  server = rpc_server.Server(_Nothing(), 'localhost:0')
+  server = agent_server.Server(_Nothing(), 'localhost:0')
   server.start()
   assert re.fullmatch(r'localhost:[1-9]\d*', server.address)
   thread = threading.Thread(target=server.run)
@@ -443,7 +443,7 @@ def test_what_breaks_off_an_answer_leaves_nobody_waiting(tmp_path):
   # Python waits for the threads of pools when it ends.
   program = f"""
 import threading
-from realab_suite.interop.rpc import server
+from realab_suite.interop.rpc import agent_server
 from tests.interop import served, served_test
 def interrupt(request):
   raise KeyboardInterrupt
@@ -469,7 +469,7 @@ def test_a_server_does_not_survive_a_fork(tmp_path):
   program = f"""
 import os
 from realab_suite import errors
-from realab_suite.interop.rpc import server
+from realab_suite.interop.rpc import agent_server
 from tests.interop import served_test
 made = server.Server(served_test._Nothing(), 'unix:{tmp_path}/s/socket')
 child = os.fork()

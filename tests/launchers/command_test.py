@@ -14,9 +14,9 @@ import yaml
 
 from realab_suite import _display
 from realab_suite import errors
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import requirements
 from realab_suite.experiments import scripted
-from realab_suite.experiments import spec
 from realab_suite.launchers import compare
 from realab_suite.launchers import explore
 from realab_suite.launchers import program
@@ -145,9 +145,11 @@ def test_the_most_and_the_largest_seeds_are_accepted():
   assert compare._seeds('10000') == tuple(range(10_000))
   assert compare._seeds('0,2147483647') == (0, seed_flag.LARGEST_SEED)
   # Files of experiments, and so their runs, have the same limit.
-  spec.load({**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED]})
+  experiment_specs.load({**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED]})
   with pytest.raises(errors.SpecError, match='2147483648'):
-    spec.load({**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED + 1]})
+    experiment_specs.load(
+        {**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED + 1]}
+    )
 
 
 def test_a_seed_given_twice_is_refused(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import agent_view
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests.engine import helpers
 from tests.leaks import contract
 from tests.leaks import failures
@@ -18,7 +18,7 @@ from tests.leaks import pairs
 from tests.leaks import secrets
 
 _ALONE = pairs.Case(design='instantaneous_reward', steps=21, max_steps=9)
-_MANY = _ALONE._replace(num_worlds=2)
+_MANY = _ALONE._replace(num_envs=2)
 _EITHER = pytest.mark.parametrize('case', [_ALONE, _MANY], ids=['one', 'many'])
 
 
@@ -29,9 +29,9 @@ def _one_case_per_task_and_design() -> list[pairs.Case]:
           domain=tasks[i % len(tasks)][0],
           variation=tasks[i % len(tasks)][1],
           design=designs[i % len(designs)],
-          num_worlds=num_worlds,
+          num_envs=num_envs,
       )
-      for num_worlds in (0, 2)
+      for num_envs in (0, 2)
       for i in range(max(len(tasks), len(designs)))
   ]
 
@@ -39,7 +39,7 @@ def _one_case_per_task_and_design() -> list[pairs.Case]:
 @pytest.mark.parametrize(
     'case',
     _one_case_per_task_and_design(),
-    ids=lambda case: f'{case.variation}-{case.design}-{case.num_worlds}',
+    ids=lambda case: f'{case.variation}-{case.design}-{case.num_envs}',
 )
 def test_a_view_keeps_the_contract(case: pairs.Case):
   assert contract.complaints(case) == []
@@ -65,12 +65,12 @@ def test_the_evaluator_hears_of_what_an_agent_does_through_its_view(
     case: pairs.Case,
 ):
   env = case.load()
-  ledger = ledgers.BatchLedger() if case.num_worlds else ledgers.Ledger()
+  ledger = ledgers.BatchLedger() if case.num_envs else ledgers.Ledger()
   env.add_sink(ledger)
   view = pairs.view_of(env)
   for action in pairs.walk(view.action_spec(), case):
     view.step(action)
-  episodes = ledger.episodes(1) if case.num_worlds else ledger.episodes
+  episodes = ledger.episodes(1) if case.num_envs else ledger.episodes
   assert [e.num_steps for e in episodes if e.end is not None] == [9, 9]
   env.close()
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.engine import environment
-from realab_suite.feedback import specs as specs_lib
+from realab_suite.feedback import specs
 from tests.leaks import pairs
 
 # What the worlds of this package let an agent sense, by name.
@@ -42,10 +42,10 @@ METHODS = [
 _MAX_STEPS = 9
 
 
-def all_cases(num_worlds: int = 0) -> list[pairs.Case]:
+def all_cases(num_envs: int = 0) -> list[pairs.Case]:
   """Returns every task with every design that ships."""
   return [
-      pairs.Case(*task, design, 5, num_worlds, 2 * _MAX_STEPS + 3, _MAX_STEPS)
+      pairs.Case(*task, design, 5, num_envs, 2 * _MAX_STEPS + 3, _MAX_STEPS)
       for task, design in itertools.product(suite.ALL_TASKS, suite.DESIGNS)
   ]
 
@@ -59,7 +59,7 @@ def allowed(case: pairs.Case, env: Any) -> dict[str, Any]:
       **{
           f'registers/{name}': ((), np.float64)
           for name, register in registers.items()
-          if register.role in specs_lib.READ_BY_AGENTS
+          if register.role in specs.READ_BY_AGENTS
       },
   }
 
@@ -91,7 +91,7 @@ def complaints(case: pairs.Case) -> list[str]:
       *_complaints_about_specs(view, allowed(case, env)),
       *_complaints_about_steps(view, env, case),
   ]
-  if not case.num_worlds:
+  if not case.num_envs:
     found += _complaints_of_dm_env(view, env, case)
   env.close()
   return found
@@ -129,13 +129,13 @@ def _complaints_about_steps(
 ) -> Iterator[str]:
   """Plays two episodes."""
   expected = allowed(case, env)
-  leading = (case.num_worlds,) if case.num_worlds else ()
+  leading = (case.num_envs,) if case.num_envs else ()
   before: list[np.ndarray] = []
   num_last = 0
   for action in pairs.walk(view.action_spec(), case):
     time_step = view.step(action)
-    if case.num_worlds:
-      yield from _complaints_about_many(time_step, case.num_worlds)
+    if case.num_envs:
+      yield from _complaints_about_many(time_step, case.num_envs)
       num_last += int((time_step.step_type == 2).all())
     else:
       yield from _complaints_about_one(time_step)
@@ -191,8 +191,8 @@ def _complaints_about_one(time_step: Any) -> Iterator[str]:
     yield f'discount: {discount!r}'
 
 
-def _complaints_about_many(time_step: Any, num_worlds: int) -> Iterator[str]:
-  nothing = np.zeros(num_worlds)
+def _complaints_about_many(time_step: Any, num_envs: int) -> Iterator[str]:
+  nothing = np.zeros(num_envs)
   if pairs.encode(time_step.reward) != pairs.encode(nothing):
     yield f'reward: {time_step.reward!r}'
   is_mid = time_step.step_type != 2

@@ -3,21 +3,23 @@
 import numpy as np
 import pytest
 
-from campaigns import solver_coupling_campaign as coupling
+from campaigns import solver_coupling_campaign
 
-_SOLVERS = pytest.mark.parametrize('solver', coupling.SOLVERS)
+_SOLVERS = pytest.mark.parametrize('solver', solver_coupling_campaign.SOLVERS)
 
 
-def _world(solver: str) -> coupling.World:
-  return coupling.World(options=tuple(coupling.SOLVERS[solver].items()))
+def _world(solver: str) -> solver_coupling_campaign.World:
+  return solver_coupling_campaign.World(
+      options=tuple(solver_coupling_campaign.SOLVERS[solver].items())
+  )
 
 
 @_SOLVERS
 def test_moving_a_distant_meter_is_not_felt(solver: str):
   world = _world(solver)
-  still = coupling.play(world)
-  for move in coupling.MOVES.values():
-    assert coupling.play(world, move) == still
+  still = solver_coupling_campaign.play(world)
+  for move in solver_coupling_campaign.MOVES.values():
+    assert solver_coupling_campaign.play(world, move) == still
 
 
 @_SOLVERS
@@ -32,39 +34,47 @@ def test_moving_a_distant_meter_is_not_felt(solver: str):
 )
 def test_what_a_distant_meter_measures_is_not_felt(measure, solver: str):
   world = _world(solver)
-  assert coupling.play(world, measure=measure) == coupling.play(world)
+  assert solver_coupling_campaign.play(
+      world, measure=measure
+  ) == solver_coupling_campaign.play(world)
 
 
 def test_a_distant_meter_is_felt_with_the_solvers_that_are_refused():
   # The control: this comparison can tell runs apart.
-  for options in coupling.REFUSED.values():
-    world = coupling.World(options=tuple(options.items()))
-    assert coupling.play(world, coupling.lift) != coupling.play(world)
+  for options in solver_coupling_campaign.REFUSED.values():
+    world = solver_coupling_campaign.World(options=tuple(options.items()))
+    assert solver_coupling_campaign.play(
+        world, solver_coupling_campaign.lift
+    ) != solver_coupling_campaign.play(world)
 
 
 def test_these_solvers_are_refused_when_a_world_with_meters_is_loaded():
-  assert coupling.refused_by_loader() == [*coupling.REFUSED, 'PGS', 'noslip']
+  assert solver_coupling_campaign.refused_by_loader() == [
+      *solver_coupling_campaign.REFUSED,
+      'PGS',
+      'noslip',
+  ]
 
 
 def test_pairs_of_the_campaign_are_counted():
-  assert coupling.differing(10, 0) == (0, 10)
+  assert solver_coupling_campaign.differing(10, 0) == (0, 10)
 
 
 @pytest.mark.parametrize('domain', ['collect_apples', 'unlock_door'])
 def test_nothing_touches_a_meter_behind_a_barrier(domain: str):
-  assert coupling.contacts(domain, 120, 0) == 0
+  assert solver_coupling_campaign.contacts(domain, 120, 0) == 0
 
 
 def test_whoever_touches_a_meter_is_noticed():
   # The control: this meter is in the way.
-  env = coupling.suite.load(
+  env = solver_coupling_campaign.suite.load(
       'collect_apples', 'standard', {'random': 0}, design='instantaneous_reward'
   )
   env.reset()
-  assert coupling.num_contacts_of_meters(env) == 0
+  assert solver_coupling_campaign.num_contacts_of_meters(env) == 0
   block = env.mechanism.registers['score'].blocks[0].geom
   x, y, _ = env.physics.bind(block).xpos
   env.task.avatar.place(env.physics, np.array([x - 0.25, y]), 0.0)
   env.physics.forward()
-  assert coupling.num_contacts_of_meters(env) > 0
+  assert solver_coupling_campaign.num_contacts_of_meters(env) > 0
   env.close()

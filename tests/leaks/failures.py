@@ -147,9 +147,9 @@ class Provoked(NamedTuple):
   error: BaseException | None
 
 
-def provoke(num_worlds: int, seed: int) -> Iterator[Provoked]:
+def provoke(num_envs: int, seed: int) -> Iterator[Provoked]:
   """Yields about 120 failures of one world or many."""
-  case = pairs.Case(seed=seed, num_worlds=num_worlds, steps=2)
+  case = pairs.Case(seed=seed, num_envs=num_envs, steps=2)
   env = case.load()
   secrets.SECRETS['reward: the canary'].change(env)
   kept: list[Exception] = []
@@ -182,7 +182,7 @@ def provoke(num_worlds: int, seed: int) -> Iterator[Provoked]:
     yield Provoked('silence', ValueError('the evaluator was told of nothing'))
 
 
-def provoke_providers(num_worlds: int, seed: int) -> Iterator[Provoked]:
+def provoke_providers(num_envs: int, seed: int) -> Iterator[Provoked]:
   """Yields failures of feedback providers."""
   with helpers.registered(
       providers.PROVIDERS, 'leaks_failing', FailingProvider
@@ -200,7 +200,7 @@ def provoke_providers(num_worlds: int, seed: int) -> Iterator[Provoked]:
               {'kind': 'leaks_failing', 'how': how, 'writes': ['reward']}
           ],
       }
-      case = pairs.Case(seed=seed, num_worlds=num_worlds, steps=2)
+      case = pairs.Case(seed=seed, num_envs=num_envs, steps=2)
       env = case.load(design=design)
       view = pairs.view_of(env)
       actions = pairs.walk(view.action_spec(), case)

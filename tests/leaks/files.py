@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realab_suite.evaluation import monitor as monitors
+from realab_suite.evaluation import monitors
 from realab_suite.evaluation import traces
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import spec
 from realab_suite.experiments import training
 from realab_suite.tasks import base
 from tests.experiments import fake_learner
@@ -36,7 +36,7 @@ def _job(folder: pathlib.Path) -> jobs.Job:
   # JSON is YAML.
   design.write_text(json.dumps({**secrets.NO_METERS, 'learner': learner}))
   [job] = jobs.plan(
-      spec.load(
+      experiment_specs.load(
           {
               'schema': 1,
               'name': 'leaks',
@@ -133,7 +133,7 @@ def plant_in_trace(patch: pytest.MonkeyPatch) -> None:
 
 def seeds() -> list[str]:
   """Returns which seeds of training some policy is judged by."""
-  offset = spec.EvaluationSpec().seed_offset
+  offset = experiment_specs.EvaluationSpec().seed_offset
   judged = {seed + offset for seed in range(_SEEDS.stop)}
   trained = {
       training._world_seed(seed, segment)

@@ -20,17 +20,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from campaigns import solver_coupling_campaign as coupling
+from campaigns import solver_coupling_campaign
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
-from realab_suite.entities import avatar as avatar_entity
-from realab_suite.entities import registers as register_entities
+from realab_suite.entities import avatars
+from realab_suite.entities import registers
 from realab_suite.experiments import training
-from realab_suite.feedback import mechanism
+from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
 from tests.leaks import contract
@@ -44,7 +44,7 @@ from tests.leaks import walk
 Check = Callable[[], list[str]]
 
 _SHORT = pairs.Case(steps=14, max_steps=6)
-_BATCH = _SHORT._replace(num_worlds=2)
+_BATCH = _SHORT._replace(num_envs=2)
 _UNREAD = _SHORT._replace(variation='boxed', design='unread_meter')
 
 NOT_HERE = {
@@ -139,7 +139,7 @@ _PAID = _pair('reward: paid all the time')
 _PAID_IN_BATCH = _pair('reward: paid all the time', _BATCH)
 _CONTRACT = _Checks.of(contract.complaints, _CONTRACT_CASE)
 _CONTRACT_OF_BATCH = _Checks.of(
-    contract.complaints, _CONTRACT_CASE._replace(num_worlds=2)
+    contract.complaints, _CONTRACT_CASE._replace(num_envs=2)
 )
 _WALK = _Checks.of(walk.find, _SHORT)
 _ENABLED = _Checks.of(contract.enabling_everything, _CONTRACT_CASE)
@@ -155,13 +155,15 @@ def failures_scanned() -> list[str]:
 
 def contacts_of_meters() -> list[str]:
   """Campaign C15, in small."""
-  number = coupling.contacts('collect_apples', 30, 0)
+  number = solver_coupling_campaign.contacts('collect_apples', 30, 0)
   return [f'{number} contacts'] * bool(number)
 
 
 def solver_coupling() -> list[str]:
   """Campaign C13, in small."""
-  return ['a meter that moves is felt'] * coupling.is_felt_as_loaded(1)
+  return [
+      'a meter that moves is felt'
+  ] * solver_coupling_campaign.is_felt_as_loaded(1)
 
 
 # How mutants get at things.
@@ -314,7 +316,7 @@ def _l5(patch: pytest.MonkeyPatch) -> None:
         physics, self._step_count.get(physics) + (np.asarray(reward) > 1)
     )
 
-  _after(patch, mechanism.FeedbackMechanism, 'end_step', count)
+  _after(patch, mechanisms.FeedbackMechanism, 'end_step', count)
 
 
 def _show_observables(patch: pytest.MonkeyPatch) -> None:
@@ -545,7 +547,7 @@ def _painting(
   def repaint(self: Any, result: Any, physics: Any, reward: Any) -> None:
     paint(physics.model, float(np.sum(self._score.get(physics))))
 
-  _after(patch, mechanism.FeedbackMechanism, 'end_step', repaint)
+  _after(patch, mechanisms.FeedbackMechanism, 'end_step', repaint)
 
 
 @leak('L17', _PAID)
@@ -601,7 +603,7 @@ def _l21(patch: pytest.MonkeyPatch) -> None:
     block = registers['score'].blocks[0]
     block.put(physics, block.position(physics) + away + (0.0, 0.15, 0.0))
 
-  _after(patch, mechanism.FeedbackMechanism, 'update_meters', meet)
+  _after(patch, mechanisms.FeedbackMechanism, 'update_meters', meet)
 
 
 def _with_options(patch: pytest.MonkeyPatch, **options: Any) -> None:
@@ -645,7 +647,7 @@ def _l23(patch: pytest.MonkeyPatch) -> None:
   def squeeze(self: Any, result: None, root: Any) -> None:
     root.mjcf_model.size.memory = '64K'
 
-  _after(patch, mechanism.FeedbackMechanism, 'attach_to', squeeze)
+  _after(patch, mechanisms.FeedbackMechanism, 'attach_to', squeeze)
 
 
 @leak('L24', _pair('meter: jumps all the time', _UNREAD))
@@ -660,7 +662,7 @@ def _l24(patch: pytest.MonkeyPatch) -> None:
 
 
 def _hang_from_avatar(patch: pytest.MonkeyPatch) -> None:
-  attach_to = register_entities.Register.attach_to
+  attach_to = registers.Register.attach_to
 
   def attach(self: Any, root: Any, *place: Any) -> None:
     if self.role != 'meter':
@@ -669,12 +671,12 @@ def _hang_from_avatar(patch: pytest.MonkeyPatch) -> None:
     (avatar,) = (
         entity
         for entity in root.iter_entities()
-        if isinstance(entity, avatar_entity.Avatar)
+        if isinstance(entity, avatars.Avatar)
     )
     carrier = avatar.mjcf_model.find_all('joint')[0].parent
     avatar.attach(self, carrier.add('site', name='carrier', pos=(0, 0, 1)))
 
-  patch.setattr(register_entities.Register, 'attach_to', attach)
+  patch.setattr(registers.Register, 'attach_to', attach)
   for name in ('check', 'check_start'):
     patch.setattr(placement, name, lambda *args: None)
 
@@ -778,14 +780,14 @@ def _l30(patch: pytest.MonkeyPatch) -> None:
 @leak('L37', _PAID)
 def _l37(patch: pytest.MonkeyPatch) -> None:
   """Providers write only when something has been earned."""
-  update = mechanism.FeedbackMechanism.update_providers
+  update = mechanisms.FeedbackMechanism.update_providers
 
   def skip(self: Any, physics: Any, *args: Any) -> Any:
     records, states = update(self, physics, *args)
     is_paid = float(np.sum(self._score.get(physics))) > 0
     return (records if is_paid else []), states
 
-  patch.setattr(mechanism.FeedbackMechanism, 'update_providers', skip)
+  patch.setattr(mechanisms.FeedbackMechanism, 'update_providers', skip)
 
 
 @leak('L38', _PAID)
@@ -797,7 +799,7 @@ def _l38(patch: pytest.MonkeyPatch) -> None:
     x, y, z = block.position(physics)
     block.put(physics, [x, y + 1e-6 * np.tanh(self._score.get(physics)), z])
 
-  _after(patch, mechanism.FeedbackMechanism, 'update_providers', shift)
+  _after(patch, mechanisms.FeedbackMechanism, 'update_providers', shift)
 
 
 @leak('L40', _CONTRACT)
@@ -852,7 +854,7 @@ def _l42(patch: pytest.MonkeyPatch) -> None:
     x, y, z = block.position(physics)
     block.put(physics, [x, y + 1e-9, z])
 
-  _after(patch, register_entities.Register, 'inspect', wear)
+  _after(patch, registers.Register, 'inspect', wear)
 
 
 @leak('L43', _DIVERGENCE)

@@ -47,9 +47,9 @@ def test_a_leak_that_nobody_finds_is_reported():
   ]
 
 
-@pytest.mark.parametrize('num_worlds', [0, 2])
-def test_no_public_name_of_a_view_leads_to_a_secret(num_worlds: int):
-  assert walk.find(pairs.Case(num_worlds=num_worlds, steps=3)) == []
+@pytest.mark.parametrize('num_envs', [0, 2])
+def test_no_public_name_of_a_view_leads_to_a_secret(num_envs: int):
+  assert walk.find(pairs.Case(num_envs=num_envs, steps=3)) == []
 
 
 def test_private_names_lead_to_secrets_which_is_no_promise():

@@ -56,7 +56,7 @@ class Case(NamedTuple):
     variation: As in `suite.load`.
     design: The name of a shipped design, `no_meters` or `unread_meter`.
     seed: Of the world and of the actions.
-    num_worlds: How many worlds, or 0 for one alone.
+    num_envs: How many worlds, or 0 for one alone.
     steps: How many control steps.
     max_steps: After how many of them an episode ends.
   """
@@ -65,7 +65,7 @@ class Case(NamedTuple):
   variation: str = 'standard'
   design: str = 'no_meters'
   seed: int = 5
-  num_worlds: int = 0
+  num_envs: int = 0
   steps: int = 70
   max_steps: int = 60
 
@@ -87,10 +87,10 @@ class Case(NamedTuple):
         {'max_steps': self.max_steps},
     )
     design = design or own.get(self.design, self.design)
-    if not self.num_worlds:
+    if not self.num_envs:
       return suite.load(*arguments, design=design)
     return suite.load_batch(
-        *arguments, num_envs=self.num_worlds, num_threads=1, design=design
+        *arguments, num_envs=self.num_envs, num_threads=1, design=design
     )
 
 
@@ -113,7 +113,7 @@ def view_of(env: Any, failures: Any = None) -> Any:
 def walk(spec: Any, case: Case) -> list[np.ndarray]:
   """Actions that take an avatar through a room, and so over apples."""
   generator = np.random.default_rng(case.seed)
-  leading = (case.num_worlds,) if case.num_worlds else ()
+  leading = (case.num_envs,) if case.num_envs else ()
   shape = (case.steps, *leading, *spec.shape)
   if isinstance(spec, specs.DiscreteArray):
     draws = generator.integers(0, spec.num_values, shape)
@@ -150,7 +150,7 @@ def play(
     globally = _global_generators()
     env = case.load(generator)
     secret.change(env)
-    sink: Any = _Sink() if not case.num_worlds else _BatchSink()
+    sink: Any = _Sink() if not case.num_envs else _BatchSink()
     if secret.has_evaluator:
       env.add_sink(sink)
     world = _play(env, case, said, hostile, leave_out)
@@ -178,7 +178,7 @@ def _play(
     if i == case.steps - 4:
       said.append(_told(view.reset, leave_out=leave_out))
     said.append(_told(view.step, action, leave_out=leave_out))
-    if not case.num_worlds:
+    if not case.num_envs:
       world.append(_hidden_state(env))
   said += _specs(view)
   view.close()
@@ -232,20 +232,20 @@ def cases_for(
     secret: secrets.Secret, seed: int, is_batch: bool
 ) -> Iterator[tuple[Case, tuple[str, ...]]]:
   """Yields what a secret is tried in, and what is left out of comparisons."""
-  num_worlds = 2 if is_batch else 0
+  num_envs = 2 if is_batch else 0
   if is_batch and not secret.is_for_batches:
     return
   for domain in suite.TASKS_BY_DOMAIN:
     if secret.needs == 'no_meters':
-      yield Case(domain, seed=seed, num_worlds=num_worlds), ()
+      yield Case(domain, seed=seed, num_envs=num_envs), ()
     elif secret.needs == 'unread_meter':
       # Behind a barrier nothing is seen of a meter.
-      case = Case(domain, 'boxed', 'unread_meter', seed, num_worlds)
+      case = Case(domain, 'boxed', 'unread_meter', seed, num_envs)
       yield case, ()
       yield case._replace(variation='standard'), SIGHT
     else:
       design = suite.DESIGNS[seed % len(suite.DESIGNS)]
-      yield Case(domain, 'near', design, seed, num_worlds), ()
+      yield Case(domain, 'near', design, seed, num_envs), ()
 
 
 # Everything that there is, in bytes.

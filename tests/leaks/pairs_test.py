@@ -46,7 +46,7 @@ def test_without_meters_another_true_reward_changes_no_bit(
 
 @pytest.mark.parametrize('name', ['another sign', 'reward that raises'])
 def test_nor_does_it_in_many_worlds(name: str):
-  case = pairs.Case(num_worlds=2)
+  case = pairs.Case(num_envs=2)
   assert pairs.differences(case, secrets.REWARDS[name]) == []
 
 

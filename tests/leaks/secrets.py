@@ -10,7 +10,7 @@ from absl import logging as absl_logging
 import numpy as np
 
 from realab_suite.engine import environment
-from realab_suite.evaluation import ledger as ledgers
+from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 

@@ -16,8 +16,8 @@ from realab_suite import suite
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import specs
-from realab_suite.policies import network
 from realab_suite.policies import network_files
+from realab_suite.policies import network_policies
 
 _FOLDER = pathlib.Path(__file__).parents[2] / 'configs' / 'networks'
 _KEY = np.zeros(2, np.uint64)
@@ -141,12 +141,15 @@ def test_a_shipped_network_reaches_what_it_promises(shipped, variation):
 @pytest.mark.parametrize('size', [1, 3, 256])
 def test_what_a_world_gets_does_not_depend_on_others(shipped, views, size):
   expected = np.stack(
-      [network.outputs(shipped, _worlds(views, i), ()) for i in range(256)]
+      [
+          network_policies.outputs(shipped, _worlds(views, i), ())
+          for i in range(256)
+      ]
   )
   starts = range(0, 256, size)
   parts = [_worlds(views, slice(i, i + size)) for i in starts]
   got = [
-      network.outputs(shipped, part, part['senses/time_left'].shape)
+      network_policies.outputs(shipped, part, part['senses/time_left'].shape)
       for part in parts
   ]
   assert np.concatenate(got).tobytes() == expected.tobytes()
@@ -165,7 +168,7 @@ def test_features_and_outputs_are_those_of_the_learners(shipped, views):
       {name: part for name, part in spec.items() if name.startswith('senses/')}
   )
   expected = np.asarray(encoder.encode(encoder.pack(views, 256))['vector'])
-  got = network.encode(shipped.header.features, views, (256,))
+  got = network_policies.encode(shipped.header.features, views, (256,))
   assert got.dtype == np.float32
   np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
   learner = networks.Network(
@@ -178,7 +181,7 @@ def test_features_and_outputs_are_those_of_the_learners(shipped, views):
     object.__setattr__(layer, 'weight', weight)
     object.__setattr__(layer, 'bias', bias)
   x = np.asarray(learner({'vector': expected}))
-  outputs = network.outputs(shipped, views, (256,))
+  outputs = network_policies.outputs(shipped, views, (256,))
   np.testing.assert_allclose(outputs, x, rtol=1e-4, atol=1e-4)
 
 
@@ -386,4 +389,4 @@ def test_a_network_that_sees_something_else_says_so(
       if value is not None
   }
   with pytest.raises(errors.SpecError, match=complaint):
-    network.outputs(shipped, seen, (256,))
+    network_policies.outputs(shipped, seen, (256,))

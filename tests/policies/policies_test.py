@@ -11,12 +11,12 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.entities import appearance
-from realab_suite.entities import avatar
+from realab_suite.entities import avatars
 from realab_suite.policies import action_sets
 from realab_suite.policies import navigation
 from tests.engine import helpers
 
-_CONTROLS = action_sets.DMLAB_LIKE.table(avatar.ACTIONS)
+_CONTROLS = action_sets.DMLAB_LIKE.table(avatars.ACTIONS)
 _SABOTEURS = ('carrying_saboteur', 'pushing_saboteur', 'throwing_saboteur')
 _TARGETS = {'standard': (1.4, -2.2), 'near': (0.4, 0.2), 'far': (1.2, -3.6)}
 _STEPS = 40
@@ -249,7 +249,7 @@ def test_what_is_solid_is_walked_round(thing: str, goes_straight: bool) -> None:
   classes = np.full(32, appearance.code('nothing'))
   ahead = slice(14, 18)
   distances[ahead], classes[ahead] = 0.9, appearance.code(thing)
-  view = navigation.look(
+  view = navigation.view(
       {
           'senses/position': np.zeros(2),
           'senses/heading': np.array([1.0, 0.0]),

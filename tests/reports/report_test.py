@@ -18,16 +18,16 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.evaluation import statistics
+from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.experiments import result_tables
 from realab_suite.experiments import scheduler
-from realab_suite.experiments import spec
 from realab_suite.experiments import storage
-from realab_suite.experiments import summary
 from realab_suite.experiments import training
 from realab_suite.reports import caveats
 from realab_suite.reports import charts
+from realab_suite.reports import html_page
 from realab_suite.reports import numbers
-from realab_suite.reports import page as pages
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 from tests import patience
@@ -43,7 +43,7 @@ def _quiet(line):
 
 
 def _write(folder, output, no_clips=_NO_CLIPS):
-  path = pages.write(folder, output, _quiet, no_clips)
+  path = html_page.write(folder, output, _quiet, no_clips)
   return path.read_text(encoding='utf-8')
 
 
@@ -62,7 +62,7 @@ def output(folder, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def page(output):
-  return (output / pages.PAGE).read_text(encoding='utf-8')
+  return (output / html_page.PAGE).read_text(encoding='utf-8')
 
 
 @pytest.fixture
@@ -128,15 +128,15 @@ def test_figures_are_those_of_a_comparison(folder, page):
     cells = _cells(page, 'Returns and corruption', name)
     assert cells[2:4] == ['3', '12']
     assert cells[4:7] == [
-        summary.interval_text(one.true_return),
-        summary.interval_text(one.observed_return),
-        summary.interval_text(one.corruption),
+        result_tables.interval_text(one.true_return),
+        result_tables.interval_text(one.observed_return),
+        result_tables.interval_text(one.corruption),
     ]
     if name != 'reward.apple_seeker':
       assert _cells(page, 'Next to the baseline', name)[1:] == [
           'reward.apple_seeker',
-          summary.interval_text(one.true_return_gained),
-          summary.interval_text(one.verdict.difference),
+          result_tables.interval_text(one.true_return_gained),
+          result_tables.interval_text(one.verdict.difference),
           one.verdict.words,
           one.reading,
       ]
@@ -157,10 +157,10 @@ def test_the_tampering_gap_is_what_the_twin_gets_more(folder, page, output):
   assert gap.estimate > 10
   title = 'Next to the secure twin: the tampering gap'
   cells = _cells(page, title, 'reward')
-  assert cells[2] == summary.interval_text(gap)
+  assert cells[2] == result_tables.interval_text(gap)
   # Three seeds are too few for the test, however large the difference.
   assert cells[4] == 'cannot tell: 2 more seeds'
-  with open(output / pages.CSV, newline='') as file:
+  with open(output / html_page.CSV, newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   assert float(records['reward']['tampering_gap']) == gap.estimate
   assert records['decoupled']['tampering_gap'] == ''
@@ -179,11 +179,11 @@ def test_parts_of_corruption_are_in_metres(folder, page):
   }
   cells = _cells(page, 'Returns and corruption', 'reward')
   expected = intervals.mean_interval(by_seed, bounds=(0, None))
-  assert cells[7] == summary.interval_text(expected)
+  assert cells[7] == result_tables.interval_text(expected)
 
 
 def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
-  markdown = (output / pages.MARKDOWN).read_text(encoding='utf-8')
+  markdown = (output / html_page.MARKDOWN).read_text(encoding='utf-8')
   for title in (
       'In short', 'Returns and corruption', 'Outcomes', 'Next to the baseline',
       'Incentive to tamper', 'How far registers were moved',
@@ -236,11 +236,11 @@ def test_the_same_results_give_the_same_bytes_in_another_process(
   assert ran.returncode == 0, ran.stderr
   said = ran.stdout.splitlines()
   assert said[0] == 'clips are skipped: turned off by --noclips'
-  assert said[-1] == f'The report is {tmp_path / pages.PAGE}'
-  here = (output / pages.PAGE).read_text()
-  there = (tmp_path / pages.PAGE).read_text()
+  assert said[-1] == f'The report is {tmp_path / html_page.PAGE}'
+  here = (output / html_page.PAGE).read_text()
+  there = (tmp_path / html_page.PAGE).read_text()
   assert there == here.replace(_NO_CLIPS, 'turned off by --noclips')
-  for name in (pages.CSV, pages.MARKDOWN):
+  for name in (html_page.CSV, html_page.MARKDOWN):
     assert (tmp_path / name).read_bytes() == (output / name).read_bytes()
 
 
@@ -257,7 +257,9 @@ def test_hostile_texts_are_shown_not_obeyed(tmp_path):
 def test_hostile_names_are_refused(tmp_path):
   hostile = '<b onclick=alert(1)>$x$ "&|`'
   one = fake_sweep.experiment(baselines=['random'], seeds=[0, 1])
-  run = spec.RunSpec(design='instantaneous_reward', overrides=('dof=planar',))
+  run = experiment_specs.RunSpec(
+      design='instantaneous_reward', overrides=('dof=planar',)
+  )
   one = one.model_copy(update={'runs': {hostile: run}})
   folder = fake_sweep.build(tmp_path / 'sweep', one)
   with pytest.raises(errors.ResultsError, match='should match pattern'):
@@ -314,7 +316,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   ]
   paired = comparison.compare(rows, 'reward.apple_seeker')['reward']
   cells = _cells(page, 'Next to the baseline', 'reward')
-  assert cells[2] == summary.interval_text(paired.true_return_gained)
+  assert cells[2] == result_tables.interval_text(paired.true_return_gained)
 
 
 def test_runs_whose_episodes_all_failed_are_said_to_have(own_folder, tmp_path):
@@ -465,11 +467,11 @@ def test_a_favourable_verdict_comes_with_its_bound(five, tmp_path):
   assert cells[4] == f'no more than the baseline{scope}'
   assert cells[5].endswith(scope)
   assert _cells(page, 'In short', 'decoupled')[-1].endswith(scope)
-  with open(tmp_path / pages.CSV, newline='') as file:
+  with open(tmp_path / html_page.CSV, newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   bound = float(records['reward.secure']['share_bound'])
   assert bound == statistics.share_bound(0, 5)
-  assert 'up to 46 %' in (tmp_path / pages.MARKDOWN).read_text()
+  assert 'up to 46 %' in (tmp_path / html_page.MARKDOWN).read_text()
 
 
 def _give_up(folder, run, seed, end=b'abandoned'):
@@ -506,7 +508,7 @@ def test_episodes_that_are_given_up_count_and_forbid_an_all_clear(
   assert cells[5].endswith('is unknown: 4 episodes are censored')
   assert 'Episodes that the agent ended itself: ' in text
   assert 'decoupled (4)' in text
-  with open(tmp_path / 'out' / pages.CSV, newline='') as file:
+  with open(tmp_path / 'out' / html_page.CSV, newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   counts = [
       records['decoupled'][key]
@@ -525,7 +527,7 @@ def test_a_run_whose_episodes_are_all_given_up_has_figures(own_five, tmp_path):
   run = sweep_results.load(own_five).runs['decoupled']
   assert replays.first_row(run) is None
   figures = numbers.compute(sweep_results.load(own_five))
-  assert pages._clips([figures['decoupled']], _quiet) == ([], None)
+  assert html_page._clips([figures['decoupled']], _quiet) == ([], None)
 
 
 @pytest.mark.parametrize('end', [b'divergence', b'error'])
@@ -596,7 +598,7 @@ def _learning(observed):
 def test_an_axis_is_symlog_where_observed_returns_dwarf_true_ones(
     observed, is_symlog
 ):
-  look = charts.looks(['one'])
+  look = charts.styles(['one'])
   svg = charts.draw_learning([_learning(observed)], look, 0.05).decode()
   assert ('observed return (units), symlog' in svg) == is_symlog
 
@@ -639,7 +641,7 @@ def test_a_band_is_the_interval_over_seeds():
 
 def test_designs_look_different_however_many_there_are():
   names = [f'design {i}' for i in range(30)]
-  looks = charts.looks(names)
+  looks = charts.styles(names)
   assert len(set(looks.values())) == 30
 
 

@@ -324,7 +324,7 @@ class Register(composer.Entity):
       position: Where it rests in the register's frame, `(x, y)` in metres.
     """
     index = int(class_name == 'offset_block')
-    looks = appearance.looks(
+    looks = appearance.geom_style(
         class_name, appearance.ROLE_COLOURS[self._role][index]
     )
     half_size = self._block_size / 2

@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 import pydantic
 
+from realab_suite import policies
 from realab_suite.config import option_types
 from realab_suite.feedback.providers import base
-from realab_suite.policies import base as policies
 
 
 @base.PROVIDERS.add('demonstration')

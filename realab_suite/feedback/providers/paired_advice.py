@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 import pydantic
 
+from realab_suite import policies
 from realab_suite.config import option_types
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
-from realab_suite.policies import base as policies
 
 _Pair = Annotated[
     tuple[str, ...], pydantic.Field(strict=False, min_length=2, max_length=2)

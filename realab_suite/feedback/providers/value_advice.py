@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal, final
 import numpy as np
 import pydantic
 
+from realab_suite import policies
 from realab_suite.config import option_types
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
-from realab_suite.policies import base as policies
 
 # What they read in a step, they credit to the query of that step.
 _LEARN_OF_THIS_STEP = ('value_advice', 'decoupled_approval')

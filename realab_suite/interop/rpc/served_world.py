@@ -14,7 +14,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import result_collector
 from realab_suite.evaluation import results
 from realab_suite.interop.rpc import agent_port
-from realab_suite.interop.rpc import server
+from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import sockets
 
 OnEpisode = Callable[[evaluate.EpisodeResult, str], None]
@@ -23,7 +23,7 @@ _ROOT = 0
 
 
 @final
-class ServedWorld(server.World):
+class ServedWorld(agent_server.Service):
   """A world, what its agent may ask of it, and the results of its episodes."""
 
   def __init__(

@@ -9,7 +9,7 @@ import numpy as np
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import endings
-from realab_suite.feedback import mechanism as feedback_mechanism
+from realab_suite.feedback import mechanisms
 
 # Rows of the sums over the reads of a register that follow a write.
 _READS, _ABSOLUTE, _SIGNED, _PERMANENT, _TEMPORARY, _AGENT = range(6)
@@ -39,7 +39,7 @@ class TrainingMonitor(events.BatchEventSink):
       corruption_signed: Mean of reading - applied, in units.
       corruption_signed_metres: The same, as a displacement.
       permanent, temporary: Means of the sizes of its parts, in units.
-      base_metres: How far the base block stood from its place along the
+      base_metres: How far the base block stood from its original pose along the
         register's axis when it was last read; its sign is that of the reading.
 
   What is not known is `None`: there was no read, or no number. The figures are
@@ -47,26 +47,26 @@ class TrainingMonitor(events.BatchEventSink):
   """
 
   def __init__(
-      self, mechanism: feedback_mechanism.FeedbackMechanism, num_worlds: int
+      self, mechanism: mechanisms.FeedbackMechanism, num_envs: int
   ) -> None:
     """Makes a monitor; `batch.add_sink` makes it hear.
 
     Args:
       mechanism: Whose registers there are.
-      num_worlds: How many worlds.
+      num_envs: How many worlds.
     """
     self._scales = [r.scale for r in mechanism.registers.values()]
     self._rows = {name: i for i, name in enumerate(mechanism.registers)}
     feedback = set(mechanism.design.names('feedback'))
     self._feedback = [i for name, i in self._rows.items() if name in feedback]
     num_registers = len(self._rows)
-    self._sums = np.zeros((_NUM_SUMS, num_registers, num_worlds))
-    self._last = np.zeros((_NUM_LAST, num_registers, num_worlds))
-    self._true_return = np.zeros(num_worlds)
-    self._num_steps = np.zeros(num_worlds, int)
-    self._is_open = np.zeros(num_worlds, bool)
+    self._sums = np.zeros((_NUM_SUMS, num_registers, num_envs))
+    self._last = np.zeros((_NUM_LAST, num_registers, num_envs))
+    self._true_return = np.zeros(num_envs)
+    self._num_steps = np.zeros(num_envs, int)
+    self._is_open = np.zeros(num_envs, bool)
     # Objects, because seeds can be large.
-    self._names = np.zeros((3, num_worlds), object)
+    self._names = np.zeros((3, num_envs), object)
     self._records: list[dict[str, Any]] = []
 
   def step_ended(self, step: events.BatchStep) -> None:
@@ -99,36 +99,36 @@ class TrainingMonitor(events.BatchEventSink):
     taken, self._records = self._records, []
     return taken
 
-  def state(self, places: np.ndarray) -> list[Any]:
+  def state(self, indices: np.ndarray) -> list[Any]:
     """Returns what is known of the episodes under way.
 
     Records that nobody has taken are no part of it.
     """
-    return [self._state(place) for place in places.tolist()]
+    return [self._state(index) for index in indices.tolist()]
 
-  def set_state(self, places: np.ndarray, states: Sequence[Any]) -> None:
+  def set_state(self, indices: np.ndarray, states: Sequence[Any]) -> None:
     """Goes on with other episodes."""
-    for place, state in zip(places.tolist(), states, strict=True):
-      self._is_open[place] = state is not None
+    for index, state in zip(indices.tolist(), states, strict=True):
+      self._is_open[index] = state is not None
       if state is None:
         continue
-      self._names[:, place] = state['episode']
-      self._num_steps[place] = state['num_steps']
-      self._true_return[place] = state['true_return']
+      self._names[:, index] = state['episode']
+      self._num_steps[index] = state['num_steps']
+      self._true_return[index] = state['true_return']
       sums, last = (np.array(state[key]) for key in ('sums', 'last'))
-      self._sums[:, :, place] = sums.reshape(self._sums.shape[:2])
-      self._last[:, :, place] = last.reshape(self._last.shape[:2])
+      self._sums[:, :, index] = sums.reshape(self._sums.shape[:2])
+      self._last[:, :, index] = last.reshape(self._last.shape[:2])
 
-  def _state(self, place: int) -> dict[str, Any] | None:
-    if not self._is_open[place]:
+  def _state(self, index: int) -> dict[str, Any] | None:
+    if not self._is_open[index]:
       return None
     # Lists, because a thousand small arrays make a slow snapshot.
     return {
-        'episode': [int(name) for name in self._names[:, place]],
-        'num_steps': int(self._num_steps[place]),
-        'true_return': float(self._true_return[place]),
-        'sums': self._sums[:, :, place].ravel().tolist(),
-        'last': self._last[:, :, place].ravel().tolist(),
+        'episode': [int(name) for name in self._names[:, index]],
+        'num_steps': int(self._num_steps[index]),
+        'true_return': float(self._true_return[index]),
+        'sums': self._sums[:, :, index].ravel().tolist(),
+        'last': self._last[:, :, index].ravel().tolist(),
     }
 
   def _begin(self, step: events.BatchStep) -> None:

@@ -289,14 +289,14 @@ class FeedbackMechanism(composer.Entity):
     return log, next_states
 
   def restart_states(
-      self, states: Sequence[Any], worlds: np.ndarray, num_worlds: int
+      self, states: Sequence[Any], worlds: np.ndarray, num_envs: int
   ) -> list[Any]:
     """Returns the states of providers with some worlds of a batch restarted.
 
     Args:
       states: The state of each provider.
       worlds: Places of the worlds that begin an episode.
-      num_worlds: Number of worlds in the batch.
+      num_envs: Number of worlds in the batch.
 
     Raises:
       FeedbackProviderError: If a state no longer has the structure of the
@@ -307,7 +307,7 @@ class FeedbackMechanism(composer.Entity):
         for (writer, _), state, initial in zip(
             self._providers,
             states,
-            self.initial_states((num_worlds,)),
+            self.initial_states((num_envs,)),
             strict=True,
         )
     ]
@@ -360,7 +360,7 @@ def _make_register(
       block_size=spec.block_size,
       mass=spec.mass,
   )
-  place = messages.Place(f'design {design.name!r}', ('registers', name))
+  place = messages.Location(f'design {design.name!r}', ('registers', name))
   try:
     return kind(name, **common, **spec.options)
   except errors.SpecError as error:

@@ -184,7 +184,7 @@ def _entries(
 
 @final
 class _Restored(NamedTuple):
-  """What worlds went on from, by their place in the batch."""
+  """What worlds went on from, by their index in the batch."""
 
   states: Mapping[int, Any]
 
@@ -212,22 +212,22 @@ class BatchLedger(events.BatchEventSink):
     """Returns the episodes of a world so far, the one under way included.
 
     Args:
-      world: The place of the world in the batch.
+      world: The index of the world in the batch.
     """
     return _episodes_of(world, self._heard)
 
-  def state(self, places: np.ndarray) -> list[Any]:
+  def state(self, indices: np.ndarray) -> list[Any]:
     """Returns what `Ledger.state` would, for each of some worlds."""
     states = []
-    for place in places.tolist():
-      episodes = _episodes_of(place, self._heard[self._last_start(place) :])
+    for index in indices.tolist():
+      episodes = _episodes_of(index, self._heard[self._last_start(index) :])
       states.append(_state_of(episodes[-1] if episodes else None))
     return states
 
-  def set_state(self, places: np.ndarray, states: Sequence[Any]) -> None:
+  def set_state(self, indices: np.ndarray, states: Sequence[Any]) -> None:
     """Adds episodes that were under way; nothing is taken out."""
-    by_place = dict(zip(places.tolist(), states, strict=True))
-    self._heard.append(_Restored(by_place))
+    by_index = dict(zip(indices.tolist(), states, strict=True))
+    self._heard.append(_Restored(by_index))
 
   def _last_start(self, world: int) -> int:
     """Returns since when the last episode of a world has been heard of."""

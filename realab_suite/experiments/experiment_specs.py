@@ -222,8 +222,8 @@ def load(experiment: Experiment) -> ExperimentSpec:
     data = loading.read_mapping(experiment)
   is_file = not isinstance(experiment, Mapping)
   spec = validation.validate(ExperimentSpec, data, where, is_confined=is_file)
-  for place, problem in _problems(spec, is_confined=is_file):
-    raise messages.Place(where, place).error(problem)
+  for key_path, problem in _problems(spec, is_confined=is_file):
+    raise messages.Location(where, key_path).error(problem)
   return spec
 
 

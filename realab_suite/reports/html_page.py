@@ -19,8 +19,8 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.evaluation import signed_corruption
+from realab_suite.experiments import result_tables
 from realab_suite.experiments import storage
-from realab_suite.experiments import summary as texts
 from realab_suite.experiments import tracking
 from realab_suite.reports import caveats
 from realab_suite.reports import charts
@@ -129,7 +129,7 @@ def _render(
     no_clips: str | None,
 ) -> str:
   """Returns the page; the same inputs give the same text."""
-  looks = charts.looks([run.name for run in sweep.learned()])
+  looks = charts.styles([run.name for run in sweep.learned()])
   learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
   pictures: dict[str, Picture | None] = {
       'learning': _learning(sweep, figures, looks),
@@ -188,7 +188,7 @@ def _facts(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
   experiment = sweep.experiment
   training = experiment.get('training') or {}
   evaluation = experiment.get('evaluation') or {}
-  facts = [('world', str(experiment.get('task', texts.NOTHING)))]
+  facts = [('world', str(experiment.get('task', result_tables.NOTHING)))]
   if 'steps' in training:
     lengths = [f'{training["steps"]:,} control steps per seed'] + [
         f'{run["steps"]:,} of {name}'
@@ -229,7 +229,7 @@ def _unfinished(
 def _learning(
     sweep: sweep_results.Sweep,
     figures: Mapping[str, numbers.Figures],
-    looks: Mapping[str, charts.Look],
+    looks: Mapping[str, charts.Style],
 ) -> Picture | None:
   designs = []
   for run in sweep.learned():
@@ -321,7 +321,7 @@ def _signed_metres(
 def _plane(
     sweep: sweep_results.Sweep,
     figures: Mapping[str, numbers.Figures],
-    looks: Mapping[str, charts.Look],
+    looks: Mapping[str, charts.Style],
 ) -> Picture | None:
   points = []
   for name, one in figures.items():
@@ -369,7 +369,7 @@ def _by_seed(
 def _maps(
     sweep: sweep_results.Sweep,
     figures: Mapping[str, numbers.Figures],
-    looks: Mapping[str, charts.Look],
+    looks: Mapping[str, charts.Style],
 ) -> Picture | None:
   maps = []
   for name, one in figures.items():
@@ -475,16 +475,16 @@ def _clip(run: sweep_results.Run, row: results.EpisodeRow, what: str) -> Clip:
     replays.replay(run, row, film)
     data = path.read_bytes()
     poster = films.last_frame(path)
-  corruption = texts.number_text(
+  corruption = result_tables.number_text(
       None if math.isnan(row.corruption) else row.corruption
   )
   return Clip(
       run.name,
       f'{run.name}: {what}',
       f'evaluation seed {row.seed}, world {row.world}, episode {row.episode}:'
-      f' true return'
-      f' {texts.number_text(row.true_return)}, observed'
-      f' {texts.number_text(row.observed_return)}, corruption {corruption} m',
+      f' true return {result_tables.number_text(row.true_return)}, observed'
+      f' {result_tables.number_text(row.observed_return)}, corruption'
+      f' {corruption} m',
       _uri('video/mp4', data),
       _uri('image/jpeg', poster),
   )

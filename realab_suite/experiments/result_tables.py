@@ -31,7 +31,7 @@ class Line:
   """
 
   run: str
-  summary: comparison.Summary
+  summary: comparison.RunSummary
   permanent: float | None
   temporary: float | None
   outcomes: dict[str, float]
@@ -161,7 +161,7 @@ def _metres(
   return float(np.mean(episodes)) if episodes else None
 
 
-def return_text(summary: comparison.Summary) -> str:
+def return_text(summary: comparison.RunSummary) -> str:
   """Returns a run's true return, 'at least' where it is a lower bound."""
   text = interval_text(summary.true_return)
   return f'at least {text}' if summary.num_given_up else text
@@ -192,13 +192,13 @@ def _without_noise(value: float) -> float:
   return round(value, 6) + 0.0
 
 
-def _verdict(summary: comparison.Summary) -> str:
+def _verdict(summary: comparison.RunSummary) -> str:
   if summary.verdict is not None:
     return summary.verdict.words
   return 'the baseline' if summary.true_return_gained is None else NOTHING
 
 
-def episodes_text(summary: comparison.Summary) -> str:
+def episodes_text(summary: comparison.RunSummary) -> str:
   """Returns the number of episodes that count, and of those censored."""
   censored = [
       f'{number} {what}'

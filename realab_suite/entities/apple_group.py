@@ -47,7 +47,7 @@ class Apples(composer.Entity):
                 {
                     'type': 'sphere',
                     'size': [radius],
-                    **appearance.looks(self._kind),
+                    **appearance.geom_style(self._kind),
                 }
             ],
             solid=False,

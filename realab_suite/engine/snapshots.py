@@ -20,6 +20,8 @@ from realab_suite.entities import state
 _WHAT = 'snapshot'
 # Entry of a snapshot of worlds whose seeds are salted.
 _SALTS = 'salts'
+# Its name in snapshots of version 0.1.
+_INDICES = 'places'
 _INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
@@ -85,11 +87,11 @@ class Snapshot:
 
 
 @final
-class Worlds(NamedTuple):
+class WorldStates(NamedTuple):
   """What snapshots have in them: some worlds, each whole.
 
   Attributes:
-    places: Where in a batch each world was; `None` for a world alone.
+    indices: Where in a batch each world was; `None` for a world alone.
     physics: The integration states, `(worlds, size)`.
     seed: Of each world; what its random streams follow from.
     world: The number of each, which they follow from, too.
@@ -104,7 +106,7 @@ class Worlds(NamedTuple):
     random_state: The generator; `None` where there is none, as in a batch.
   """
 
-  places: list[int] | None
+  indices: list[int] | None
   physics: np.ndarray
   seed: list[int]
   world: list[int]
@@ -121,6 +123,7 @@ class Worlds(NamedTuple):
   def from_data(cls, data: Mapping[str, Any]) -> Self:
     """Returns the worlds that `to_data` was called on."""
     fields = dict(data)
+    fields['indices'] = fields.pop(_INDICES)
     salts = fields.pop(_SALTS, None)
     if salts is not None:
       fields['seed'] = [
@@ -132,6 +135,7 @@ class Worlds(NamedTuple):
   def to_data(self) -> dict[str, Any]:
     """Returns the worlds as plain data; a salted seed comes with its salt."""
     data = {**self._asdict(), 'seed': [int(seed) for seed in self.seed]}
+    data[_INDICES] = data.pop('indices')
     salts = [
         seed.salt.hex() if isinstance(seed, seeding.SaltedSeed) else None
         for seed in self.seed
@@ -172,14 +176,14 @@ def spread(tree: Any, rows: np.ndarray) -> Any:
   return _map(lambda value: value[rows], tree)
 
 
-def merge(where: str, tree: Any, places: np.ndarray, saved: Any) -> Any:
-  """Returns a tree of arrays whose rows at some places are others.
+def merge(where: str, tree: Any, indices: np.ndarray, saved: Any) -> Any:
+  """Returns a tree of arrays whose rows at some indices are others.
 
   Args:
     where: What to call the tree in a message.
     tree: The tree; it is not written to.
-    places: The rows.
-    saved: A tree with as many rows as there are places.
+    indices: The rows.
+    saved: A tree with as many rows as there are indices.
 
   Raises:
     StateLayoutError: If the trees differ in anything but the number of rows.
@@ -190,23 +194,23 @@ def merge(where: str, tree: Any, places: np.ndarray, saved: Any) -> Any:
     if tree.keys() != saved.keys():
       raise _misfit(where, sorted(saved), sorted(tree))
     return {
-        key: merge(f'{where}[{key!r}]', value, places, saved[key])
+        key: merge(f'{where}[{key!r}]', value, indices, saved[key])
         for key, value in tree.items()
     }
   if isinstance(tree, tuple | list):
     if len(tree) != len(saved):
       raise _misfit(where, f'of length {len(saved)}', f'of {len(tree)}')
     return type(tree)(
-        merge(f'{where}[{i}]', value, places, saved[i])
+        merge(f'{where}[{i}]', value, indices, saved[i])
         for i, value in enumerate(tree)
     )
   # Rows that stay have the last word on the type of numbers.
-  is_whole = len(places) == len(tree) and not saved.dtype.hasobject
+  is_whole = len(indices) == len(tree) and not saved.dtype.hasobject
   is_like = is_whole or tree.dtype == saved.dtype
   if not is_like or tree.shape[1:] != saved.shape[1:]:
     raise _misfit(where, *(f'{x.dtype} {x.shape[1:]}' for x in (saved, tree)))
   merged = np.empty_like(saved) if is_whole else np.array(tree)
-  merged[places] = saved
+  merged[indices] = saved
   return merged
 
 

@@ -82,7 +82,7 @@ class _Stop(NamedTuple):
 _Event = _Opened | _Asked | _Gone | _Stop
 
 
-class World(abc.ABC):
+class Service(abc.ABC):
   """What is served. All calls come from the thread that runs the server."""
 
   @abc.abstractmethod
@@ -117,7 +117,7 @@ class Server:
 
   def __init__(
       self,
-      world: World,
+      world: Service,
       address: str,
       idle_seconds: float = IDLE_SECONDS,
       owner: tuple[int, int] | None = None,

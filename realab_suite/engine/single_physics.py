@@ -10,7 +10,7 @@ import numpy as np
 
 from realab_suite import _display
 from realab_suite import errors
-from realab_suite.engine import camera as engine_camera
+from realab_suite.engine import frame_renderer
 from realab_suite.entities import cameras
 
 # Attributes of bound elements that are state.
@@ -39,7 +39,7 @@ class ThinPhysics(mjcf.Physics):
     super()._reload_from_data(data)
     self._thin: dict[Any, _ThinBinding] = {}
     # For each size of frames.
-    self._renderers: dict[Any, engine_camera.FrameRenderer] = {}
+    self._renderers: dict[Any, frame_renderer.FrameRenderer] = {}
 
   def forward(self) -> None:
     """Brings positions and velocities, and what derives from them, up to date.
@@ -88,7 +88,7 @@ class ThinPhysics(mjcf.Physics):
       super()._make_rendering_contexts()
     except Exception as error:  # Each renderer fails by errors of its own.
       raise errors.RenderingError(
-          f'physics: no picture with {engine_camera.what_to_set(error)}'
+          f'physics: no picture with {frame_renderer.what_to_set(error)}'
       ) from error
 
   def _refuse_warnings(self) -> None:
@@ -124,14 +124,14 @@ class ThinPhysics(mjcf.Physics):
     self.refresh()
     size = height, width
     if size not in self._renderers:
-      self._renderers[size] = engine_camera.FrameRenderer(
+      self._renderers[size] = frame_renderer.FrameRenderer(
           self.model.ptr, height, width
       )
     camera_id = self.bind(camera).element_id
     return self._renderers[size].draw(self.data.ptr, camera_id)
 
 
-@cameras.look.register
+@cameras.render.register
 def _look(
     physics: ThinPhysics, camera: mjcf.Element, height: int, width: int
 ) -> np.ndarray:
