@@ -211,7 +211,7 @@ class BatchEnvironment:
           observation=self._observation,
           provider_keys=self._keys,
           provider_states=self._states,
-          is_first=is_first,
+          idle=lambda: is_first | self._physics.has_diverged(),
       )
       has_failed = self._physics.has_diverged() & ~is_first
       step_count = self._mechanism.step_count(self._physics)

@@ -68,7 +68,7 @@ class Environment(composer.Environment):
       world: Number of the world in a batch.
       max_steps: Length of an episode in control steps, or `None`.
     """
-    self._physics: Any
+    self._physics: single_physics.ThinPhysics | foreign.ForeignPhysics
     self._mechanism = mechanism
     self._seed, self._world, self._episode = seed, world, -1
     self._max_steps = max_steps
@@ -461,9 +461,9 @@ class Environment(composer.Environment):
 
   def _undisturbed(self) -> contextlib.AbstractContextManager[None]:
     """Returns a context in which sinks may look at the physics."""
-    if self._is_ours or not self._sinks:
-      return contextlib.nullcontext()
-    return self._physics.unchanged()
+    if isinstance(self._physics, foreign.ForeignPhysics) and self._sinks:
+      return self._physics.unchanged()
+    return contextlib.nullcontext()
 
   # Episodes.
 
@@ -489,7 +489,7 @@ class Environment(composer.Environment):
     """Compiles the model into a physics of this package's engine."""
     if getattr(self, '_physics', None):
       self._physics.free()
-    kind = (
+    kind: type[single_physics.ThinPhysics | foreign.ForeignPhysics] = (
         single_physics.ThinPhysics if self._is_ours else foreign.ForeignPhysics
     )
     model = self._task.root_entity.mjcf_model

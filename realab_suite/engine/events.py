@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
 Records = Sequence[registers.Record]
@@ -68,11 +69,11 @@ class EventSink(abc.ABC):
     return type(self).__name__
 
   @abc.abstractmethod
-  def episode_started(self, start: Start, physics: Any) -> None:
+  def episode_started(self, start: Start, physics: protocols.Physics) -> None:
     """An episode has begun. `physics` may be looked at, never written."""
 
   @abc.abstractmethod
-  def step_ended(self, step: Step, physics: Any) -> None:
+  def step_ended(self, step: Step, physics: protocols.Physics) -> None:
     """A control step is over. `physics` may be looked at, never written."""
 
   @abc.abstractmethod

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 import hashlib
 from typing import Any, NamedTuple, Self, final
 
+from dm_control import mjcf
 import mujoco
 import numpy as np
 
@@ -237,7 +238,7 @@ def describe(model: Any) -> dict[str, Any]:
   }
 
 
-def get_state(physics: Any) -> np.ndarray:
+def get_state(physics: mjcf.Physics) -> np.ndarray:
   """Returns all of the physics that the future depends on."""
   model, data = physics.model.ptr, physics.data.ptr
   values = np.empty(mujoco.mj_stateSize(model, _INTEGRATION))
@@ -245,7 +246,7 @@ def get_state(physics: Any) -> np.ndarray:
   return values
 
 
-def set_state(physics: Any, values: np.ndarray) -> None:
+def set_state(physics: mjcf.Physics, values: np.ndarray) -> None:
   """Does the opposite of `get_state`, and brings up to date what derives."""
   model, data = physics.model.ptr, physics.data.ptr
   # Warnings of what went on here before say nothing about what is restored.
