@@ -60,9 +60,10 @@ def test_the_experiment_of_the_page_is_one_that_can_be_run():
   [text] = re.findall(r'```yaml\n(schema: 1\n.*?)```', page, re.DOTALL)
   experiment = experiment_specs.load(yaml.safe_load(text))
   for run in experiment.runs.values():
-    for channel in (None, experiment_specs.TWIN):
+    design = run.load()
+    for one in (design, experiment_specs.secure_twin(design)):
       # A probe needs discrete actions.
-      assert probes.find_register(run.load(channel)) == 'reward'
+      assert probes.find_register(one) == 'reward'
 
 
 def test_the_example_in_a_task_of_dm_control_runs(capsys):
