@@ -241,7 +241,7 @@ class ReadingRegister(registers.Register):
   def _put(self, physics: Any, value: np.ndarray) -> None:
     """Moves nothing."""
 
-  def _look(self, physics: Any) -> np.ndarray:
+  def _read_blocks(self, physics: Any) -> np.ndarray:
     return self.applied(physics)
 
 

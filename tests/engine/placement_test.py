@@ -391,7 +391,7 @@ class _Circling(registers.Register):
     position[..., 1] += 0.5 * np.sin(value)
     self._block.put(physics, position, heading=value)
 
-  def _look(self, physics):
+  def _read_blocks(self, physics):
     return self._block.heading(physics)
 
 

@@ -88,7 +88,7 @@ def test_a_place_can_be_offered():
 def test_a_place_cannot_be_offered_twice():
   arena = arenas.OpenRoom()
   before = dict(arena.places)
-  with pytest.raises(errors.SpecError, match="'centre' is offered already"):
+  with pytest.raises(errors.SpecError, match="'centre' exists already"):
     arena.offer({'new': arenas.Place((0, 0)), 'centre': arenas.Place((1, 1))})
   assert arena.places == before
 

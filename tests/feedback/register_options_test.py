@@ -39,7 +39,7 @@ class _Fragile(registers.Register):
   def _put(self, physics: Any, value: np.ndarray) -> None:
     del physics, value
 
-  def _look(self, physics: Any) -> np.ndarray:
+  def _read_blocks(self, physics: Any) -> np.ndarray:
     return self.applied(physics)
 
 

@@ -876,7 +876,7 @@ class _Stubborn(registers.Register):
   def _put(self, physics: Any, value: np.ndarray) -> None:
     del physics, value
 
-  def _look(self, physics: Any) -> np.ndarray:
+  def _read_blocks(self, physics: Any) -> np.ndarray:
     return self.applied(physics) * 0 + self._held
 
 
