@@ -84,11 +84,11 @@ _CROSS = {
         'registers.reward: initial 99.0 must be in range [-2.0, 12.0]'
     ),
     'registers.query.role=meter': (
-        "providers[0]: value_advice reads the query off 'query', whose role is"
+        "providers[0]: value_advice reads the query from 'query', whose role is"
         " 'meter'"
     ),
     'registers.query.range=[0, 5]': (
-        'registers.query.range: [0.0, 5.0] leaves out actions of dmlab_like v1'
+        'registers.query.range: [0.0, 5.0] excludes actions of dmlab_like v1'
     ),
     'registers.reward.role=meter': (
         "providers[0].writes: register 'reward' has role 'meter'"

@@ -48,7 +48,7 @@ def test_a_task_cannot_be_embedded_twice(
   first.reset()
   if is_closed:
     first.close()
-  with pytest.raises(errors.SpecError, match='has the registers of') as caught:
+  with pytest.raises(errors.SpecError, match='the registers of') as caught:
     suite.embed(task, design, overrides=['channel=secure'])
   assert "design 'instantaneous_reward'" in str(caught.value)
   if not is_closed:
@@ -60,7 +60,7 @@ def test_a_mechanism_cannot_be_attached_beside_another_one():
   task = collect_apples.CollectApples()
   env = suite.embed(task, 'none')
   other = mechanisms.FeedbackMechanism(specs.load('none'))
-  with pytest.raises(errors.SpecError, match="design 'none' already"):
+  with pytest.raises(errors.SpecError, match="registers of design 'none'"):
     other.attach_to(task.root_entity)
   assert other.parent is None
   env.close()

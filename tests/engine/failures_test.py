@@ -390,7 +390,7 @@ def test_a_state_without_an_axis_of_worlds_is_refused(
   _ANSWER[:] = [state, lambda start, state: ({'reward': 0.0 * start}, state)]
   with pytest.raises(
       errors.FeedbackProviderError,
-      match=r'before the first step: its state holds .*whose first axis',
+      match=r'before the first step: its state contains .*whose first axis',
   ):
     _batch(design=_DESIGN)
   # A world alone may keep any state.

@@ -119,9 +119,9 @@ def _relay(**changes: Any) -> dict[str, Any]:
   }  # fmt: skip
 
 
-def _leaves_out(name: str, given: list[float], who: str) -> str:
+def _excludes(name: str, given: list[float], who: str) -> str:
   return (
-      f'registers.{name}.range: {[float(bound) for bound in given]} leaves out'
+      f'registers.{name}.range: {[float(bound) for bound in given]} excludes'
       f' actions of dmlab_like v1, whose indices {who} uses; allowed are ranges'
       ' that contain [0, 13]'
   )
@@ -147,15 +147,15 @@ _WRONG = {
     ),
     'a register written twice': (
         _design([_constant('a', 'a')]),
-        "providers[0].writes: register 'a' is there twice; allowed is once",
+        "providers[0].writes: register 'a' is listed twice; allowed is once",
     ),
     'a register written twice among others': (
         _design([_constant('c'), _constant('a', 'b', 'a')]),
-        "providers[1].writes: register 'a' is there twice; allowed is once",
+        "providers[1].writes: register 'a' is listed twice; allowed is once",
     ),
     'a register read twice': (
         _design([_constant('a', reads=('m', 'q', 'm'))]),
-        "providers[0].reads: register 'm' is there twice; allowed is once",
+        "providers[0].reads: register 'm' is listed twice; allowed is once",
     ),
     'two meters of one register': (
         _design([], meters=('m', 'm')),
@@ -169,36 +169,36 @@ _WRONG = {
     **{
         f'imitation in {given}': (
             _design([_constant('b'), _demonstration()], a=given),
-            _leaves_out('a', given, 'providers[1]'),
+            _excludes('a', given, 'providers[1]'),
         )
         for given in ([0, 12], [1, 13], [0, 12.9], [-5, 5], [0.001, 20])
     },
     **{
         f'a query in {given}': (
             _design([_advice()], q=given),
-            _leaves_out('q', given, 'providers[0]'),
+            _excludes('q', given, 'providers[0]'),
         )
         for given in ([0, 12], [1, 13], [-20, 0])
     },
     'an earlier query': (
         _design([_advice(query_delay=1)], q=[0, 1]),
-        _leaves_out('q', [0, 1], 'providers[0]'),
+        _excludes('q', [0, 1], 'providers[0]'),
     ),
     'the first of two queries': (
         _design([_paired('q', 'p')], q=[0, 1]),
-        _leaves_out('q', [0, 1], 'providers[0]'),
+        _excludes('q', [0, 1], 'providers[0]'),
     ),
     'the second of two queries': (
         _design([_paired('q', 'p')], p=[0, 1]),
-        _leaves_out('p', [0, 1], 'providers[0]'),
+        _excludes('p', [0, 1], 'providers[0]'),
     ),
     'a query of a provider of ones own': (
         _design([_relay()], q=[0, 1]),
-        _leaves_out('q', [0, 1], 'providers[0]'),
+        _excludes('q', [0, 1], 'providers[0]'),
     ),
     'an index that a provider of ones own writes': (
         _design([_relay()], a=[0, 1]),
-        _leaves_out('a', [0, 1], 'providers[0]'),
+        _excludes('a', [0, 1], 'providers[0]'),
     ),
     'a provider that fails in its check': (
         _design([_constant('c'), {'kind': 'test_broken', 'writes': ['a']}]),
@@ -254,7 +254,7 @@ def test_shipped_designs_hold_every_action():
     specs.load('online_imitation', ('registers.demonstration.range=[0, 12]',))
   assert str(caught.value) == (
       "override 'registers.demonstration.range=[0, 12]': "
-      + _leaves_out('demonstration', [0, 12], 'providers[0]')
+      + _excludes('demonstration', [0, 12], 'providers[0]')
   )
 
 

@@ -296,7 +296,7 @@ _WRONG = {
             meters=[],
             providers=[_advice()],
         ),
-        "value_advice reads the query off 'query', whose role is 'meter';"
+        "value_advice reads the query from 'query', whose role is 'meter';"
         ' allowed is query',
     ),
     'paired advice on one query': (
@@ -306,7 +306,7 @@ _WRONG = {
             meters=[],
             providers=[_advice(kind='paired_advice', reads=['query', 'query'])],
         ),
-        "providers[0].reads: register 'query' is there twice",
+        "providers[0].reads: register 'query' is listed twice",
     ),
     'paired advice on what is no query': (
         _design(
@@ -319,7 +319,7 @@ _WRONG = {
             meters=[],
             providers=[_advice(kind='paired_advice', reads=['query', 'other'])],
         ),
-        "paired_advice reads a query off 'other', whose role is 'meter';"
+        "paired_advice reads a query from 'other', whose role is 'meter';"
         ' allowed is query',
     ),
     'advice with another delay': (
@@ -343,8 +343,8 @@ _WRONG = {
                 'query': 'query',
             },
         ),
-        'query_delay: 1 values the query of the step before, and the learner'
-        ' value_advice takes what it reads',
+        'query_delay: 1 evaluates the query of the previous step, but the'
+        ' learner value_advice expects the value',
     ),
     'unknown value function': (
         _design(
@@ -379,7 +379,7 @@ _WRONG = {
 _DOES_NOT_FIT = {
     'unknown place': (
         _reward(place='moon'),
-        "registers.reward.place: this world offers no place 'moon'; allowed"
+        "registers.reward.place: this world has no place 'moon'; allowed"
         " are ['centre', 'east_wall'",
     ),
     'unknown measurement': (
