@@ -330,7 +330,7 @@ _LOAD = functools.partial(suite.load, 'collect_apples', 'standard')
         ({'visualize_reward': True}, 'visualize_reward=True would show the'),
         ({'design': 'nonesuch'}, "design 'nonesuch' is neither a file nor"),
         ({'design': 'none', 'overrides': ('x',)}, 'expected key=value'),
-        ({'overrides': None}, 'overrides: None; allowed is a list of texts'),
+        ({'overrides': None}, 'overrides: None; allowed is a list of strings'),
         ({'overrides': 'dof=free'}, "overrides: 'dof=free'; allowed is a lis"),
         ({'overrides': {'dof': 'free'}}, "overrides: {'dof': 'free'}; allowe"),
         ({'overrides': [3]}, 'override 3: expected key=value, as a text'),

@@ -287,5 +287,5 @@ def test_a_task_that_fails_to_be_made_is_an_argument_that_is_wrong(monkeypatch):
 @pytest.mark.parametrize('name', [None, 3, b'x', ['x'], _Mute()])
 def test_tasks_are_registered_by_texts(name: Any):
   for names in ((name, 'task'), ('domain', name)):
-    with pytest.raises(errors.SpecError, match='allowed are texts'):
+    with pytest.raises(errors.SpecError, match='allowed are strings'):
       suite.register_task(*names)

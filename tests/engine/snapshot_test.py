@@ -374,6 +374,6 @@ def test_damaged_bytes_are_no_snapshot(data):
   if data is None:
     data = snapshots.Snapshot(_header(), [np.arange(9.0), 'x']).to_bytes()[:-1]
   with pytest.raises(
-      errors.StateLayoutError, match='bytes are no snapshot, or a damaged one'
+      errors.StateLayoutError, match='bytes are not a valid snapshot'
   ):
     snapshots.Snapshot.from_bytes(data)

@@ -155,7 +155,7 @@ def test_a_file_of_another_run_names_both_configurations(
       _job(one).digest() for one in (_experiment(max_steps=251), _experiment())
   )
   assert (
-      f'holds {name!r} of something else: configuration is {theirs!r} in the'
+      f'holds {name!r} with another header: configuration is {theirs!r} in the'
       f' file, {ours!r} expected'
   ) in message
 
@@ -175,7 +175,7 @@ def test_a_damaged_file_says_what_was_expected(
   else:
     data[-1] ^= 1
   message = _complaint(name, sweep, bytes(data), monkeypatch)
-  assert f'{len(data)} bytes are no {_HOLDS[name]}, or a damaged' in message
+  assert f'{len(data)} bytes are not a valid {_HOLDS[name]}' in message
 
 
 def test_a_learner_that_does_not_fit_names_its_file(
