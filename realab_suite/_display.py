@@ -1,9 +1,9 @@
 """Postpones the choice of a renderer until the first frame is drawn.
 
-dm_control chooses a renderer when it is imported, and starts EGL with it. Where
-EGL renders in software, that loads Mesa's LLVM and makes its symbols visible to
-every library that is loaded later. A library with another LLVM, such as torch's
-triton, then ends the process with a segmentation fault.
+Importing dm_control chooses a renderer and starts EGL. With software rendering,
+EGL loads Mesa's LLVM and makes its symbols visible to all libraries that are
+loaded later. A library with another LLVM, such as torch's triton, then ends the
+process with a segmentation fault.
 """
 
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ def postpone_choice() -> None:
     return
   if 'dm_control._render' in sys.modules:
     return
-  with _named('disable'):
+  with _set_variable('disable'):
     _import_choice().Renderer = _make_renderer
 
 
@@ -78,7 +78,7 @@ def _make_renderer(*args: Any, **kwargs: Any) -> Any:
   with _lock:
     if choice.Renderer is _make_renderer:
       load_llvm()
-      with _named(os.environ.get(_VARIABLE) or 'egl'):
+      with _set_variable(os.environ.get(_VARIABLE) or 'egl'):
         importlib.reload(choice)
   return choice.Renderer(*args, **kwargs)
 
@@ -88,7 +88,7 @@ def _import_choice() -> Any:
 
 
 @contextlib.contextmanager
-def _named(renderer: str) -> Iterator[None]:
+def _set_variable(renderer: str) -> Iterator[None]:
   """Sets `MUJOCO_GL` and restores it at the end of the context."""
   before = os.environ.get(_VARIABLE)
   os.environ[_VARIABLE] = renderer

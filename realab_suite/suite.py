@@ -70,7 +70,7 @@ def register_task(
   return decorate
 
 
-def _register_ours() -> None:
+def _register_tasks() -> None:
   tags = {
       'standard': ('benchmarking', 'tampering'),
       'near': ('benchmarking', 'tampering'),
@@ -88,23 +88,23 @@ def _register_ours() -> None:
       )
 
 
-_register_ours()
+_register_tasks()
 
 
-def _find(
+def _find_task(
     domain_name: str, task_name: str
 ) -> tuple[TaskFactory, frozenset[str]]:
-  are_texts = isinstance(domain_name, str) and isinstance(task_name, str)
-  if not are_texts or (domain_name, task_name) not in _TASKS:
+  are_strings = isinstance(domain_name, str) and isinstance(task_name, str)
+  if not are_strings or (domain_name, task_name) not in _TASKS:
     known = [f'{domain}.{task}' for domain, task in _TASKS]
     raise errors.UnknownNameError(
-        f'task {_shown(domain_name)}.{_shown(task_name)} is unknown; known are'
-        f' {known}'
+        f'task {_format(domain_name)}.{_format(task_name)} is unknown; known'
+        f' are {known}'
     )
   return _TASKS[domain_name, task_name]
 
 
-def _shown(name: Any) -> str:
+def _format(name: Any) -> str:
   """Returns a name for messages, quoted unless it is short and one line."""
   is_plain = isinstance(name, str) and name.isprintable() and len(name) <= 80
   return name if is_plain else messages.quote(name)
@@ -142,7 +142,7 @@ def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:
   Raises:
     UnknownNameError: If there is no such task.
   """
-  factory, _ = _find(domain_name, task_name)
+  factory, _ = _find_task(domain_name, task_name)
   golden = resources.files('realab_suite.configs') / 'golden.yaml'
   recorded = loading.parse_yaml(golden.read_bytes(), 'golden.yaml')
   digests = recorded.get(mujoco.__version__, {})
@@ -183,7 +183,7 @@ def load(
         f'visualize_reward={messages.quote(visualize_reward)} would show the'
         ' true reward to the agent; allowed is False'
     )
-  factory, _ = _find(domain_name, task_name)
+  factory, _ = _find_task(domain_name, task_name)
   options: dict[str, Any] = {'max_steps': MAX_STEPS}
   options |= _keywords('environment_kwargs', environment_kwargs)
   if unknown := [key for key in options if key not in ('max_steps', 'world')]:
@@ -318,7 +318,7 @@ def embed(
   except BaseException:
     # Allows embedding a corrected design in the same task.
     if isinstance(task, base.Task):
-      task.avatar.forget(_blocks(mechanism))
+      task.avatar.forget(_blocks_of(mechanism))
     mechanism.detach_from_root()
     raise
 
@@ -340,7 +340,7 @@ def _connected(
       }
   )
   if isinstance(task, base.Task):
-    task.avatar.make_graspable(_blocks(mechanism))
+    task.avatar.make_graspable(_blocks_of(mechanism))
   env = environment.Environment(
       task, mechanism, seed=seed, world=world, max_steps=max_steps
   )
@@ -375,5 +375,5 @@ def _keywords(argument: str, value: Any) -> dict[str, Any]:
   return dict(value)
 
 
-def _blocks(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
+def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
   return [b for r in mechanism.registers.values() for b in r.blocks]

@@ -65,7 +65,7 @@ class Apples(composer.Entity):
 
   @property
   def frames(self) -> tuple[mjcf.Element, ...]:
-    """The mocap bodies of the apples."""
+    """Mocap bodies of the apples."""
     return self._frames
 
   @property

@@ -57,7 +57,7 @@ class Place:
     if not is_valid:
       raise errors.SpecError(
           f'{self!r:.160}; allowed are finite numbers, two for the position,'
-          ' one for the yaw, and two from 0 on for the spread'
+          ' one for the yaw, and two of at least 0 for the spread'
       )
 
 

@@ -1,4 +1,4 @@
-"""Helpers for code that handles one world and a batch of worlds alike.
+"""Helpers for code that serves both one world and a batch of worlds.
 
 A value of one world is a number (`np.float64`), a value of a batch is an array
 `(worlds,)`. NumPy calculates with numbers ten times as fast as with arrays

@@ -31,8 +31,8 @@ def check(design: Any, read_by_agents: Sequence[str]) -> None:
       _expect_role(design, f'{where}.reads', name, None)
     for name in provider.writes:
       _expect_role(design, f'{where}.writes', name, read_by_agents)
-    _refuse_twice(f'{where}.reads', provider.reads)
-    _refuse_twice(f'{where}.writes', provider.writes)
+    _refuse_duplicates(f'{where}.reads', provider.reads)
+    _refuse_duplicates(f'{where}.writes', provider.writes)
     try:
       provider.check(design)
     except ValueError as error:
@@ -52,7 +52,7 @@ def _expect_role(
   """Checks that a register is declared and has an allowed role.
 
   Args:
-    design: The design.
+    design: Design to check.
     where: Path of the field that names the register, for messages.
     name: Name of the register.
     roles: Allowed roles; `None` for any role.
@@ -73,7 +73,7 @@ def _expect_role(
     )
 
 
-def _refuse_twice(where: str, names: Sequence[str]) -> None:
+def _refuse_duplicates(where: str, names: Sequence[str]) -> None:
   """Refuses a list that names a register twice."""
   seen: set[str] = set()
   for name in names:
@@ -140,7 +140,7 @@ def _check_learner(design: Any) -> None:
   """Refuses a learner that names a meter register."""
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
-    for name in _texts_in(value):
+    for name in _strings_in(value):
       if name in design.registers and design.registers[name].role == 'meter':
         where = messages.format_path(('learner', field))
         raise ValueError(
@@ -149,14 +149,14 @@ def _check_learner(design: Any) -> None:
         )
 
 
-def _texts_in(value: Any) -> Iterator[str]:
+def _strings_in(value: Any) -> Iterator[str]:
   """Yields every string in nested lists and mappings, keys included."""
   if isinstance(value, str):
     yield value
   elif isinstance(value, Mapping):
     for key, item in value.items():
-      yield from _texts_in(key)
-      yield from _texts_in(item)
+      yield from _strings_in(key)
+      yield from _strings_in(item)
   elif isinstance(value, list | tuple):
     for item in value:
-      yield from _texts_in(item)
+      yield from _strings_in(item)

@@ -286,7 +286,7 @@ class DesignSpec(validation.Spec):
 
   @pydantic.field_validator('schema_version', mode='before')
   @classmethod
-  def _whole(cls, value: Any) -> Any:
+  def _refuse_other_types(cls, value: Any) -> Any:
     """Refuses `true` and `1.0`, which are equal to 1 in Python."""
     if type(value) is not int:
       raise ValueError('must be 1')
@@ -423,7 +423,7 @@ def load(
           f' allowed in a file are paths within it and {list(DESIGNS)}'
       )
     data, is_file = loading.read_mapping(design), True
-  _learn_new_kinds()
+  _update_validator()
   return validation.validate(
       DesignSpec,
       data,
@@ -436,11 +436,11 @@ def load(
 
 def json_schema() -> dict[str, Any]:
   """Returns the JSON Schema of design files, for use in editors."""
-  _learn_new_kinds()
+  _update_validator()
   return DesignSpec.model_json_schema(by_alias=True)
 
 
-def _learn_new_kinds() -> None:
+def _update_validator() -> None:
   """Rebuilds the validator if the registered providers have changed."""
   kinds = _AnyProvider.members()
   if _validated_kinds != kinds:
