@@ -42,10 +42,10 @@ _TASKS: dict[tuple[str, str], tuple[TaskFactory, frozenset[str]]] = {}
 def register_task(
     domain_name: str, task_name: str, *tags: str
 ) -> Callable[[TaskFactory], TaskFactory]:
-  """Returns a decorator that makes a world loadable by name.
+  """Returns a decorator that registers a task under a name.
 
   Args:
-    domain_name: Name of the world.
+    domain_name: Name of the domain.
     task_name: Name of the variation.
     *tags: Tags of the task; see `get_tasks_by_tag`.
 
@@ -77,14 +77,14 @@ def _register_tasks() -> None:
       'far': ('benchmarking', 'tampering'),
       'boxed': ('no_tampering_control',),
   }
-  worlds: dict[str, TaskFactory] = {
+  domains: dict[str, TaskFactory] = {
       'collect_apples': collect_apples.CollectApples,
       'unlock_door': unlock_door.UnlockDoor,
   }
-  for domain_name, world in worlds.items():
+  for domain_name, task_class in domains.items():
     for variation in base.VARIATIONS:
       register_task(domain_name, variation, *tags[variation])(
-          functools.partial(world, variation)
+          functools.partial(task_class, variation)
       )
 
 
@@ -125,13 +125,14 @@ TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]] = {
     domain: tuple(task for d, task in ALL_TASKS if d == domain)
     for domain in dict.fromkeys(domain for domain, _ in ALL_TASKS)
 }
+"""Names of the tasks of this package, by domain."""
 
 
 def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:
   """Returns the version and a digest of the dynamics of a task.
 
   Args:
-    domain_name: Name of the world.
+    domain_name: Name of the domain.
     task_name: Name of the variation.
 
   Returns:
@@ -162,7 +163,7 @@ def load(
   """Loads a task with the feedback of an agent design.
 
   Args:
-    domain_name: Name of the world, such as `'unlock_door'`.
+    domain_name: Name of the domain, such as `'unlock_door'`.
     task_name: Name of the variation, such as `'standard'`.
     task_kwargs: Seed `random` and keyword arguments of the task, such as
       `camera_size`.
