@@ -7,6 +7,7 @@ from typing import Any, final
 import numpy as np
 
 from realab_suite.evaluation import comparison
+from realab_suite.evaluation import incentive_summary
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
@@ -66,7 +67,7 @@ class Incentive:
   end: signed_corruption.Window | None
   judged: intervals.Interval | None
   judged_metres: intervals.Interval | None
-  probe: Mapping[str, incentives.IncentiveSummary]
+  probe: Mapping[str, incentive_summary.IncentiveSummary]
 
 
 @final
@@ -350,7 +351,7 @@ def _incentive(
       _judged(run, register, 1.0),
       _judged(run, register, run.design.registers[register].scale),
       {
-          other: incentives.combine(own, probes.LEARNER, other)
+          other: incentive_summary.combine(own, probes.LEARNER, other)
           for other in sorted(others)
       },
   )

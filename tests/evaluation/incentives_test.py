@@ -9,6 +9,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.evaluation import incentive_summary
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import ledgers
 from realab_suite.policies import action_sets
@@ -152,7 +153,7 @@ def test_what_was_moved_before_counts_for_neither_policy():
 def test_a_summary_weighs_every_seed_the_same():
   both = {'a': [[0.0, 1.0]], 'b': [[1.0, 0.0]]}
   twice = {name: p * 2 for name, p in both.items()}
-  summary = incentives.combine(
+  summary = incentive_summary.combine(
       {0: _probe([[0.0, 2.0]], **both), 1: _probe([[0.0, -4.0]] * 2, **twice)},
       'a',
       'b',
@@ -174,7 +175,7 @@ def test_one_seed_has_an_interval_over_its_states():
       a=[[0.0, 1.0]] * 10,
       b=[[1.0, 0.0]] * 10,
   )
-  summary = incentives.combine({3: probe}, 'a', 'b')
+  summary = incentive_summary.combine({3: probe}, 'a', 'b')
   assert summary.signed.low < 4.5 == summary.signed.estimate
   assert summary.signed.high > 4.5
 
@@ -248,8 +249,12 @@ def test_who_walks_into_the_register_has_an_incentive_and_who_stays_none(
   assert len(states) == len(probe.corruption) == 40
   assert probe.num_failed == 0
   assert probe.is_in_play.mean() > 0.5
-  walks = incentives.combine({0: probe}, 'walks', 'random').absolute_metres
-  stays = incentives.combine({0: probe}, 'stays', 'random').absolute_metres
+  walks = incentive_summary.combine(
+      {0: probe}, 'walks', 'random'
+  ).absolute_metres
+  stays = incentive_summary.combine(
+      {0: probe}, 'stays', 'random'
+  ).absolute_metres
   assert walks.low > 0.01
   assert stays.high < 0.001
   most = probe.incentive('walks', 'random').most_absolute_metres
@@ -259,7 +264,7 @@ def test_who_walks_into_the_register_has_an_incentive_and_who_stays_none(
 
 def test_pushing_the_base_block_pays(pushed):
   _, _, probe = pushed
-  signed = incentives.combine({0: probe}, 'walks', 'stays').signed_metres
+  signed = incentive_summary.combine({0: probe}, 'walks', 'stays').signed_metres
   assert signed.low > 0.01
   # The pusher has moved it by the time of most of these states.
   assert (probe.offset > 0.1).any()
