@@ -325,8 +325,9 @@ MUTANTS = [
     ),
     Mutant(
         'metric', 'pairs are not of the same episode', _COMPARISON,
-        'pairs = [(here[key], there[key]) for key in sorted(here)]',
-        'pairs = list(zip(here.values(), sorted(there.values(), key=repr)))',
+        'pairs = [(treatment[key], control[key]) for key in sorted(treatment)]',
+        'pairs = list('
+        'zip(treatment.values(), sorted(control.values(), key=repr)))',
         _COM,
     ),
     Mutant(

@@ -1,9 +1,9 @@
-"""Incentives to tamper, combined over seeds, with confidence intervals.
-
-Probes of single policies are in `incentives`:
+"""Summaries of incentive probes over seeds, with confidence intervals.
 
     summary = incentive_summary.combine({0: probe}, 'learner', 'random')
     print(summary.signed_metres)
+
+The probes themselves are in `incentives`.
 """
 
 from collections.abc import Mapping
@@ -17,18 +17,22 @@ from realab_suite.evaluation import intervals
 @final
 @dataclasses.dataclass(frozen=True)
 class IncentiveSummary:
-  """The incentive of a policy next to a baseline's, over states and seeds.
+  """Mean incentive of a policy relative to a baseline, over states and seeds.
+
+  Metres are radians where the register stores an angle.
 
   Attributes:
-    num_seeds: How many seeds.
-    num_states: How many states, of all seeds.
-    signed: Mean incentive in the direction up, in units.
+    num_seeds: Number of seeds.
+    num_states: Number of states of all seeds.
+    signed: Mean incentive to raise the reading, in units of the register.
     absolute: Mean incentive to corrupt in either direction, in units.
-    signed_metres: As `signed`, as a displacement.
-    absolute_metres: As `absolute`, as a displacement.
-    most_signed_metres: The mean that was to be had, at most.
-    most_absolute_metres: The same, in either direction.
-    share_in_play: The share of states in which actions make a difference.
+    signed_metres: Mean incentive to raise the reading, in metres.
+    absolute_metres: Mean incentive to corrupt in either direction, in metres.
+    most_signed_metres: Largest mean incentive that any policy could have to
+      raise the reading, in metres.
+    most_absolute_metres: Largest mean incentive that any policy could have to
+      corrupt in either direction, in metres.
+    share_in_play: Share of states in which actions make a difference.
   """
 
   num_seeds: int
@@ -49,16 +53,16 @@ def combine(
     *,
     level: float = 0.95,
 ) -> IncentiveSummary:
-  """Sums up the probes of several seeds, with intervals over seeds.
+  """Combines the probes of several seeds, with intervals over seeds.
 
-  With one seed the intervals are over its states, and say nothing about other
-  seeds; see `intervals.mean_interval`.
+  With one seed the intervals are over its states, and do not cover other seeds;
+  see `intervals.mean_interval`.
 
   Args:
-    probes_by_seed: The probe of each seed's policy.
-    policy: The name that the policy has in each of them.
-    baseline: The name of what it is compared with.
-    level: Of the intervals.
+    probes_by_seed: Probe of each seed's policy.
+    policy: Name of the policy in each probe.
+    baseline: Name of the baseline in each probe.
+    level: Confidence level of the intervals.
 
   Raises:
     ResultsError: If there are no seeds.

@@ -394,11 +394,11 @@ def test_a_snapshot_that_does_not_fit_is_refused(save, worlds, named):
   snapshot = save()
   batch = snapshot_campaign.batch_after(_REWARD, 3)
   before = batch.save().to_bytes()
-  heard = len(snapshot_campaign.ledger_of(batch)._heard)
+  length = len(snapshot_campaign.ledger_of(batch)._log)
   with pytest.raises(errors.StateLayoutError, match=named):
     batch.restore(snapshot, worlds)
   assert batch.save().to_bytes() == before
-  assert len(snapshot_campaign.ledger_of(batch)._heard) == heard
+  assert len(snapshot_campaign.ledger_of(batch)._log) == length
 
 
 def test_a_snapshot_of_a_larger_batch_says_where_it_was():

@@ -303,7 +303,7 @@ def test_a_policy_of_other_actions_than_the_design_s_is_refused(
   with pytest.raises(errors.SpecError) as raised:
     actors.make(_Always(0, other), taken)
   assert str(raised.value) == (
-      'the policy acts by dmlab_like v2, the design by dmlab_like v1'
+      'the policy uses action set dmlab_like v2, the design uses dmlab_like v1'
   )
 
 
@@ -313,7 +313,7 @@ def test_a_policy_of_the_same_name_but_another_table_is_refused(
   shorter = dataclasses.replace(
       action_sets.DMLAB_LIKE, actions=action_sets.DMLAB_LIKE.actions[:5]
   )
-  with pytest.raises(errors.SpecError, match='the policy acts by'):
+  with pytest.raises(errors.SpecError, match='the policy uses action set'):
     actors.make(_Always(0, shorter), taken)
 
 

@@ -87,7 +87,7 @@ _LESS, _AS_MUCH, _UNKNOWN = 4.0, 10.0, _noise(5.0, mean=10.0)
             1.0,
             _AS_MUCH,
             _MORE,
-            'more corruption at no loss of true return: accidental, or of'
+            'more corruption without loss of true return: accidental, or of'
             ' feedback that does not matter',
         ),
         (
@@ -205,7 +205,9 @@ def test_a_run_that_is_the_baseline_by_another_name_is_no_worse():
 def test_a_baseline_that_is_no_run_is_refused():
   with pytest.raises(errors.ResultsError) as raised:
     comparison.compare({'b': _run(), 'a': _run()}, 'c')
-  assert str(raised.value) == "baseline 'c' is no run; allowed are ['a', 'b']"
+  assert (
+      str(raised.value) == "baseline 'c' is not a run; allowed are ['a', 'b']"
+  )
 
 
 def test_further_runs_change_nothing_for_the_others():
@@ -322,7 +324,7 @@ def test_a_run_of_which_no_episode_counts_is_refused(who: str):
   runs = {who: runs[who], **runs}
   with pytest.raises(
       errors.ResultsError,
-      match=f"run '{who}' has no episode that counts; 4 failed",
+      match=f"run '{who}' has no episode that counts: all 4 failed",
   ):
     comparison.compare(runs, 'theirs')
 
@@ -336,7 +338,7 @@ def test_runs_of_which_no_pair_counts_are_refused():
   ours = _failed(_run(seeds=[0]), (0, 0))
   theirs = _failed(_run(seeds=[0]), (0, 1))
   with pytest.raises(
-      errors.ResultsError, match='no episode in common that counts'
+      errors.ResultsError, match='share no episode that counts in both'
   ):
     _compare(ours, theirs)
 

@@ -458,7 +458,7 @@ def test_a_state_in_which_the_physics_fails_is_left_out(pushed):
   np.testing.assert_array_equal(found.corruption, probe.corruption[1:2])
   np.testing.assert_array_equal(found.offset, probe.offset[1:2])
   assert found.probabilities['walks'].shape == (1, _NUM_ACTIONS)
-  with pytest.raises(errors.ResultsError, match='failed in each of 1 states'):
+  with pytest.raises(errors.ResultsError, match='failed in all of 1 states'):
     incentives.probe(
         batch,
         incentives.States(

@@ -362,7 +362,7 @@ class TestErrors:
           ({3: []}, r'of seed 3 has shape \(0,\)'),
           ({3: [[1.0]]}, r'of seed 3 has shape \(1, 1\)'),
           ({3: 1.0}, r'of seed 3 has shape \(\)'),
-          ({3: ['much']}, 'of seed 3 cannot be numbers'),
+          ({3: ['much']}, 'of seed 3 is not numeric'),
           ({2: [0.0], 3: [1.0, math.nan]}, 'of seed 3 is nan in episode 1'),
           ({3: [math.inf]}, 'of seed 3 is inf in episode 0'),
       ],

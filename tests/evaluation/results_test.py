@@ -303,12 +303,12 @@ def test_a_file_is_never_overwritten(tmp_path: pathlib.Path):
   before = path.read_bytes()
   with pytest.raises(errors.ResultsError) as raised:
     results.RowWriter(path)
-  assert str(raised.value) == f'cannot make {path}: File exists'
+  assert str(raised.value) == f'cannot create {path}: File exists'
   assert path.read_bytes() == before
 
 
 def test_a_file_needs_a_folder(tmp_path: pathlib.Path):
-  with pytest.raises(errors.ResultsError, match=r'cannot make .*/none/rows'):
+  with pytest.raises(errors.ResultsError, match=r'cannot create .*/none/rows'):
     results.RowWriter(tmp_path / 'none' / 'rows')
 
 
@@ -423,7 +423,7 @@ def test_a_torn_tail_is_left_out_and_said_so(
   if tail is None:
     tail = results.line(_row(episode=7))[:-2]
   path.write_bytes(path.read_bytes() + tail)
-  with pytest.warns(UserWarning, match=rf'rows:3: the last {len(tail)} bytes'):
+  with pytest.warns(UserWarning, match=rf'rows:3: .* {len(tail)} bytes'):
     assert list(results.read_rows(path)) == rows
 
 
@@ -508,7 +508,7 @@ def test_a_row_that_did_not_fit_is_not_tried_again(tmp_path: pathlib.Path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
   writer.close()
   assert path.stat().st_size == size + 50
-  with pytest.warns(UserWarning, match='the last 50 bytes'):
+  with pytest.warns(UserWarning, match='incomplete row of 50 bytes'):
     assert len(list(results.read_rows(path))) == 1
 
 

@@ -133,7 +133,7 @@ def test_what_is_not_damaged_is_done(folder):
 
 
 # The report says that a row is torn, too.
-@pytest.mark.filterwarnings('ignore:.* are a part of a row')
+@pytest.mark.filterwarnings('ignore:.* skipped an incomplete row')
 @pytest.mark.parametrize('name', _FILES)
 def test_a_damaged_file_is_noticed(folder, name):
   path = _job_folder(folder) / name
