@@ -172,7 +172,7 @@ def test_shared_randomness_is_refused():
   other = np.array([3, 4], np.uint32)
   approval.refuse_shared_randomness(act, np.stack([other, act + 1]))
   for queries in ([act], [other, act], [other, other]):
-    with pytest.raises(errors.SpecError, match='share the random key'):
+    with pytest.raises(errors.SpecError, match='all of them must differ'):
       approval.refuse_shared_randomness(act, np.stack(queries))
 
 
