@@ -204,7 +204,7 @@ def test_the_index_of_an_action_is_a_whole_number():
   _join(port)
   _step(port)
   error = _step(port, tensor_utils.pack_tensor([0.0, 1.5])).error
-  assert error.message.startswith('R12: action 1: not of the type')
+  assert error.message.startswith('R12: action 1: type differs')
   index = np.array([0, 1], np.int32)
   assert _step(port, tensor_utils.pack_tensor(index)).step.state == pb.RUNNING
   env.close()
@@ -303,7 +303,7 @@ def test_replies_to_steps_have_one_size(design):
 
 def test_integers_whose_size_would_tell_their_value_are_refused():
   spec = {'count': specs.BoundedArray((2,), np.int64, 0, 1000)}
-  with pytest.raises(errors.SpecError, match='observation count: int64'):
+  with pytest.raises(errors.SpecError, match='observation count: .* int64'):
     tensors.Observations(spec)
   tensors.Observations({'x': specs.BoundedArray((2,), np.int64, 0, 127)})
   tensors.Observations({'x': specs.Array((2,), np.uint8)})
