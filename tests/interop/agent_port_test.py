@@ -303,7 +303,7 @@ def test_replies_to_steps_have_one_size(design):
 
 def test_integers_whose_size_would_tell_their_value_are_refused():
   spec = {'count': specs.BoundedArray((2,), np.int64, 0, 1000)}
-  with pytest.raises(errors.SpecError, match='observation count: .* int64'):
+  with pytest.raises(errors.SpecError, match=r'observation count: .* int64'):
     tensors.Observations(spec)
   tensors.Observations({'x': specs.BoundedArray((2,), np.int64, 0, 127)})
   tensors.Observations({'x': specs.Array((2,), np.uint8)})
