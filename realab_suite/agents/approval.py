@@ -348,7 +348,7 @@ def policy_objective(
     asked: Queried actions, `(..., 1)`, or pairs of them, `(..., 2)`.
     old_log_prob: Logarithm of the probability of each queried action when it
       was drawn, with the shape of `asked`.
-    advantage: Feedback less the expected feedback, `(...)`.
+    advantage: Feedback minus the expected feedback, standardised, `(...)`.
     clip: Largest change of a probability ratio in one update.
   """
   chosen = jax.nn.one_hot(asked, log_probs.shape[-1])

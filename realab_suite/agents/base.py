@@ -115,6 +115,7 @@ class Learner(abc.ABC):
 
   @property
   def num_envs(self) -> int:
+    """Number of worlds."""
     return self._num_envs
 
   @property

@@ -173,6 +173,11 @@ def _take(
     dtype: str,
     num_envs: int,
 ) -> np.ndarray:
+  """Returns a copy of one entry of an observation.
+
+  Raises:
+    SpecError: If the entry is missing or has another shape.
+  """
   expected = (num_envs, *shape)
   if name not in observation:
     raise errors.SpecError(
@@ -200,6 +205,11 @@ def _partner(
 
 
 def _entry(name: str, spec: specs.Array, partner: str) -> _Entry:
+  """Returns the encoding of one entry of an observation spec.
+
+  Raises:
+    SpecError: If the entry is not numeric.
+  """
   dtype = np.dtype(spec.dtype)
   if dtype.kind not in 'biuf':
     raise errors.SpecError(

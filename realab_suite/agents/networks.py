@@ -153,18 +153,22 @@ class Categorical(eqx.Module):
   logits: jax.Array
 
   def sample(self, key: jax.Array) -> jax.Array:
+    """Draws one action for each distribution."""
     return draw(key, self.logits)
 
   def mode(self) -> jax.Array:
+    """Returns the most likely action of each distribution."""
     return jnp.argmax(self.logits, axis=-1)
 
   def log_prob(self, action: jax.Array) -> jax.Array:
+    """Returns the log-probability of the given actions, `(...)`."""
     log_probs = jax.nn.log_softmax(self.logits)
     # Use a sum over actions, because the gradient of a gather is slow.
     chosen = jax.nn.one_hot(action, self.logits.shape[-1])
     return jnp.sum(log_probs * chosen, axis=-1)
 
   def entropy(self) -> jax.Array:
+    """Returns the entropy of each distribution, `(...)`."""
     log_probs = jax.nn.log_softmax(self.logits)
     return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
 
@@ -180,18 +184,22 @@ class Gaussian(eqx.Module):
   log_std: jax.Array
 
   def sample(self, key: jax.Array) -> jax.Array:
+    """Draws one action for each distribution."""
     noise = jax.random.normal(key, self.mean.shape)
     return self.mean + jnp.exp(self.log_std) * noise
 
   def mode(self) -> jax.Array:
+    """Returns the most likely action of each distribution."""
     return self.mean
 
   def log_prob(self, action: jax.Array) -> jax.Array:
+    """Returns the log-probability of the given actions, `(...)`."""
     z = (action - self.mean) * jnp.exp(-self.log_std)
     per_element = -0.5 * (z**2 + math.log(2 * math.pi)) - self.log_std
     return jnp.sum(per_element, axis=-1)
 
   def entropy(self) -> jax.Array:
+    """Returns the entropy of each distribution, `(...)`."""
     per_element = self.log_std + 0.5 * math.log(2 * math.pi * math.e)
     entropy = jnp.sum(per_element)
     return jnp.broadcast_to(entropy, self.mean.shape[:-1])

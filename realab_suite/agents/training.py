@@ -177,6 +177,12 @@ class FeedbackScale:
   """
 
   def __init__(self, num_envs: int, gamma: float) -> None:
+    """Makes a scale.
+
+    Args:
+      num_envs: Number of worlds.
+      gamma: Discount of the sum; 0 for single readings.
+    """
     self._gamma = gamma
     self._sums = np.zeros(num_envs)
     # Count, sum and sum of squares of all sums so far.
@@ -206,7 +212,9 @@ class FeedbackScale:
       self._sums = np.where(is_valid, sums, 0.0)
 
   def state(self) -> dict[str, np.ndarray]:
+    """Returns the statistics as plain data."""
     return {'sums': self._sums, 'moments': self._moments}
 
   def set_state(self, state: dict[str, np.ndarray]) -> None:
+    """Continues from a state that `state` returned."""
     self._sums, self._moments = state['sums'], state['moments']

@@ -156,9 +156,9 @@ class Incentive:
   (radians where the register stores an angle).
 
   Attributes:
-    signed: Expected corruption of the policy less that of the baseline, in
+    signed: Expected corruption of the policy minus that of the baseline, in
       units of the register.
-    absolute: Expected size of the corruption that the step adds, less that of
+    absolute: Expected size of the corruption that the step adds, minus that of
       the baseline, in units.
     most_signed: Value of `signed` for a policy that always takes the action
       that raises the reading most, in units. Where it is 0, no action makes a
@@ -346,6 +346,11 @@ def _check_positive(**numbers: int) -> None:
 
 
 def _find(batch: batch_environment.BatchEnvironment, register: str) -> Any:
+  """Returns the register with a name.
+
+  Raises:
+    UnknownNameError: If the design has no such register.
+  """
   registers = batch.mechanism.registers
   if register not in registers:
     raise errors.UnknownNameError(

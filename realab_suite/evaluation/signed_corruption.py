@@ -133,13 +133,13 @@ def _in_windows(
 def _register(
     seed: int, record: Mapping[str, Any], register: str
 ) -> Mapping[str, Any]:
-  known = record['registers']
-  if register not in known:
+  by_name = record['registers']
+  if register not in by_name:
     raise errors.ResultsError(
         f'seed {seed}: register {register!r} has no record; allowed are'
-        f' {sorted(known)}'
+        f' {sorted(by_name)}'
     )
-  found: Mapping[str, Any] = known[register]
+  found: Mapping[str, Any] = by_name[register]
   return found
 
 
@@ -152,9 +152,9 @@ def _window(
       key: str, bounds: intervals.Bounds = intervals.UNBOUNDED
   ) -> intervals.Interval | None:
     values = {
-        seed: known
+        seed: means
         for seed, registers in episodes.items()
-        if (known := [r[key] for r in registers if r[key] is not None])
+        if (means := [r[key] for r in registers if r[key] is not None])
     }
     if not values:
       return None

@@ -120,7 +120,7 @@ def share_bound(num_above: int, num_seeds: int, level: float = 0.95) -> float:
   """Returns an upper bound on the share of all seeds that are above a margin.
 
   It is the exact bound of Clopper and Pearson: if the share were larger, fewer
-  than 1 - level of all samples would contain `num_above` such seeds or less.
+  than 1 - level of all samples would contain `num_above` such seeds or fewer.
   For none of n seeds it is 1 - (1 - level) ** (1 / n), about 3 / n at level
   0.95.
 
