@@ -179,8 +179,8 @@ def catch_l32() -> bool:
   """The world's process stays open to others of the same user."""
   program = (
       'import ctypes, sys\n'
-      'from realab_suite.experiments import serving\n'
-      'if sys.argv[1] == "hide": serving.hide_from_debuggers()\n'
+      'from realab_suite.experiments import served_evaluation\n'
+      'if sys.argv[1] == "hide": served_evaluation.hide_from_debuggers()\n'
       'sys.exit(ctypes.CDLL(None).prctl(3, 0, 0, 0, 0))\n'  # PR_GET_DUMPABLE
   )
 

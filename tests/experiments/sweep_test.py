@@ -240,9 +240,10 @@ def test_a_sweep_that_is_interrupted_leaves_nobody_behind(tmp_path):
       # Whoever runs tests in the background may have SIGINT ignored.
       'import signal\n'
       'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-      'from realab_suite.experiments import cli, sweep, sweeping\n'
-      "sweeping._MODULE = 'tests.experiments.fake_learner'\n"
-      'cli.start(sweep.main)\n'
+      'from realab_suite.experiments import scheduler\n'
+      'from realab_suite.launchers import program, sweep\n'
+      "scheduler._MODULE = 'tests.experiments.fake_learner'\n"
+      'program.start(sweep.main)\n'
   )
   output = tmp_path / 'out'
   with subprocess.Popen(
