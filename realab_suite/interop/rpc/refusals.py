@@ -68,7 +68,7 @@ class Reason(enum.Enum):
 
 @final
 class RequestRefused(errors.RealabError):
-  """The world refused a request of the agent, and did not change."""
+  """Error for a request of the agent that is refused."""
 
   def __init__(self, reason: Reason, *numbers: int, details: str = '') -> None:
     """Makes the error.

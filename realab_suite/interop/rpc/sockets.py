@@ -112,13 +112,19 @@ def users_connected_to(address: str) -> set[int]:
 
 
 def _make_private(folder: pathlib.Path, owner: tuple[int, int] | None) -> None:
-  """Makes a folder that only this user can read, and the owner can traverse.
+  """Makes a folder that only this user can access; a group may traverse it.
 
-  The folder belongs to this user, because its owner could replace the socket.
+  The folder must belong to this user, because the owner of a folder can replace
+  the socket in it.
+
+  Args:
+    folder: Path of the folder.
+    owner: Ids of the agent's user and group; `None` for those of this process.
+      The group may traverse the folder.
 
   Raises:
-    SpecError: If the folder cannot be made, or exists with another owner or
-      mode.
+    SpecError: If the folder cannot be made, or belongs to another user, or has
+      another mode.
   """
   allowed = 0o700 if owner is None else 0o710
   try:
