@@ -25,9 +25,11 @@ from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.reports import caveats
-from realab_suite.reports import charts
+from realab_suite.reports import chart_style
 from realab_suite.reports import html_page
+from realab_suite.reports import learning_chart
 from realab_suite.reports import numbers
+from realab_suite.reports import page_clips
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 from tests import patience
@@ -527,7 +529,7 @@ def test_a_run_whose_episodes_are_all_given_up_has_figures(own_five, tmp_path):
   run = sweep_results.load(own_five).runs['decoupled']
   assert replays.first_row(run) is None
   figures = numbers.compute(sweep_results.load(own_five))
-  assert html_page._clips([figures['decoupled']], _quiet) == ([], None)
+  assert page_clips.clips([figures['decoupled']], _quiet) == ([], None)
 
 
 @pytest.mark.parametrize('end', [b'divergence', b'error'])
@@ -588,8 +590,8 @@ def test_overlapping_intervals_are_said_to_show_nothing(five):
 def _learning(observed):
   steps = {0: {100: 1.0, 200: 5.0}, 1: {100: 2.0, 200: 6.0}}
   seen = {s: {n: x * observed for n, x in c.items()} for s, c in steps.items()}
-  bands = [{'run': charts.band(c)} for c in (steps, seen, steps)]
-  return charts.Learning('one', *bands, baseline=4.0)
+  bands = [{'run': learning_chart.band(c)} for c in (steps, seen, steps)]
+  return learning_chart.Learning('one', *bands, baseline=4.0)
 
 
 @pytest.mark.parametrize(
@@ -598,8 +600,8 @@ def _learning(observed):
 def test_an_axis_is_symlog_where_observed_returns_dwarf_true_ones(
     observed, is_symlog
 ):
-  look = charts.styles(['one'])
-  svg = charts.draw_learning([_learning(observed)], look, 0.05).decode()
+  look = chart_style.styles(['one'])
+  svg = learning_chart.draw([_learning(observed)], look, 0.05).decode()
   assert ('observed return (units), symlog' in svg) == is_symlog
 
 
@@ -612,20 +614,23 @@ def test_a_curve_has_a_point_for_as_many_steps_as_episodes_take():
       (20, 2, 4.0),
       (25, 2, 6.0),
   ]
-  assert charts.curve(points, 12) == {25: 4.5}
-  assert charts.curve(points, 10) == {10: 10.0, 25: pytest.approx(26 / 7)}
+  assert learning_chart.curve(points, 12) == {25: 4.5}
+  assert learning_chart.curve(points, 10) == {
+      10: 10.0,
+      25: pytest.approx(26 / 7),
+  }
   # What is left in the end goes with what was before.
-  assert charts.curve(points[:3], 12) == {15: 4.0}
-  assert charts.curve(points[:2], 12) == {10: 10.0}
-  assert charts.curve([], 12) == {}
+  assert learning_chart.curve(points[:3], 12) == {15: 4.0}
+  assert learning_chart.curve(points[:2], 12) == {10: 10.0}
+  assert learning_chart.curve([], 12) == {}
   # Windows end where they do whatever happened in them.
   odd = [(5, 0, None), (10, 1, 90.0), (15, 0, None), (20, 9, 2.0), (30, 9, 4.0)]
-  assert charts.curve(odd, 12) == {15: 90.0, 30: 3.0}
-  assert charts.curve(odd, 12, fewest=2) == {30: 3.0}
+  assert learning_chart.curve(odd, 12) == {15: 90.0, 30: 3.0}
+  assert learning_chart.curve(odd, 12, fewest=2) == {30: 3.0}
 
 
 def test_a_band_has_the_steps_at_which_all_seeds_that_got_there_are_known():
-  one = charts.band(
+  one = learning_chart.band(
       {0: {1: 1.0, 2: 9.0, 3: 3.0}, 1: {1: 3.0, 3: 5.0}, 2: {1: 2.0}, 3: {}}
   )
   assert one.steps.tolist() == [1, 3]
@@ -633,7 +638,7 @@ def test_a_band_has_the_steps_at_which_all_seeds_that_got_there_are_known():
 
 
 def test_a_band_is_the_interval_over_seeds():
-  one = charts.band({0: {100: 1.0, 200: 5.0}, 1: {100: 2.0}})
+  one = learning_chart.band({0: {100: 1.0, 200: 5.0}, 1: {100: 2.0}})
   assert one.steps.tolist() == [100, 200]
   assert one.mean.tolist() == [1.5, 5.0]
   assert one.low[0] < 1.0 < 2.0 < one.high[0]
@@ -641,7 +646,7 @@ def test_a_band_is_the_interval_over_seeds():
 
 def test_designs_look_different_however_many_there_are():
   names = [f'design {i}' for i in range(30)]
-  looks = charts.styles(names)
+  looks = chart_style.styles(names)
   assert len(set(looks.values())) == 30
 
 
