@@ -1,4 +1,7 @@
-"""Colours, markers and axes that all charts of a report share."""
+"""Colours, markers and axes of the SVG charts in a report.
+
+Equal figures give equal bytes.
+"""
 
 from collections.abc import Sequence
 import dataclasses
@@ -10,8 +13,9 @@ import matplotlib
 from matplotlib import figure
 from matplotlib import ticker
 
-# Of Okabe and Ito, who chose them for eyes of every kind; without the yellow,
-# which is hard to see on white. Markers tell runs apart without colour.
+# Palette of Okabe and Ito, for readers with and without colour blindness.
+# Yellow is left out because it is hard to see on white. Markers distinguish
+# runs without colour.
 _COLOURS = (
     '#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000',
 )  # fmt: skip
@@ -20,10 +24,10 @@ GREY = '#767676'
 INK = '#222222'
 PALE = 0.55
 _WIDTH = 11.4
-# Letters of a name.
-_ROOM = 24
+# Longest name that is drawn in full, in characters.
+_LONGEST_NAME = 24
 _STYLE: Any = {
-    'svg.fonttype': 'none',  # Text stays text: small, and it can be searched.
+    'svg.fonttype': 'none',  # Text stays small and searchable.
     'svg.hashsalt': 'realab_suite',
     'font.family': 'sans-serif',
     'font.size': 9,
@@ -31,7 +35,7 @@ _STYLE: Any = {
     'axes.edgecolor': '#888888',
     'axes.labelcolor': INK,
     'text.color': INK,
-    'text.parse_math': False,  # A name may have dollars in it.
+    'text.parse_math': False,  # Names may contain dollar signs.
     'xtick.color': '#555555',
     'ytick.color': '#555555',
     'axes.unicode_minus': True,
@@ -41,14 +45,19 @@ _STYLE: Any = {
 @final
 @dataclasses.dataclass(frozen=True)
 class Style:
-  """How a design and all that belongs to it is drawn."""
+  """Colour and marker of a design, its twin and its baselines.
+
+  Attributes:
+    colour: Colour, in hexadecimal.
+    marker: Marker of Matplotlib.
+  """
 
   colour: str
   marker: str
 
 
 def styles(names: Sequence[str]) -> dict[str, Style]:
-  """Returns a style for each design, the same wherever it is shown."""
+  """Returns a distinct style for each name; it depends on their order only."""
   return {
       name: Style(
           _COLOURS[i % len(_COLOURS)],
@@ -89,20 +98,24 @@ def new_figure(
 def to_svg(canvas: figure.Figure) -> bytes:
   """Returns a figure as SVG; equal figures give equal bytes."""
   file = io.BytesIO()
-  # Nothing about when, or by which version: that is no part of a figure.
-  nothing = {key: None for key in ('Date', 'Creator', 'Format', 'Type')}
+  # Dates and versions would make equal figures differ.
+  no_metadata = {key: None for key in ('Date', 'Creator', 'Format', 'Type')}
   canvas.savefig(
-      file, format='svg', metadata=nothing, bbox_inches='tight', pad_inches=0.05
+      file,
+      format='svg',
+      metadata=no_metadata,
+      bbox_inches='tight',
+      pad_inches=0.05,
   )
   data = file.getvalue()
-  # Without the document type, which is an address in the net.
+  # The document type before this contains a web address.
   return data[data.index(b'<svg') :]
 
 
 def add_legend(canvas: figure.Figure, handles: list[Any]) -> None:
   """Adds a legend below a figure, in as many columns as fit."""
   longest = max(len(handle.get_label()) for handle in handles)
-  # Inches: about so wide are the mark and a letter.
+  # Approximate widths of a marker and of a letter, in inches.
   fit = int(canvas.get_figwidth() / (0.6 + 0.07 * longest))
   canvas.legend(
       handles=handles,
@@ -122,9 +135,9 @@ def tidy_axes(ax: Any) -> None:
 
 
 def set_symlog(axis: Any, set_scale: Any, threshold: float) -> None:
-  """Makes an axis logarithmic, but linear near zero, with few plain ticks."""
+  """Makes an axis logarithmic, and linear near zero, with few ticks."""
   set_scale('symlog', linthresh=threshold, linscale=0.6)
-  # Powers of ten within the linear part would be on top of each other.
+  # Powers of ten within the linear part would overlap.
   lowest = 10.0 ** math.ceil(math.log10(threshold))
   axis.set_major_locator(
       ticker.SymmetricalLogLocator(base=10, linthresh=lowest)
@@ -134,8 +147,8 @@ def set_symlog(axis: Any, set_scale: Any, threshold: float) -> None:
 
 
 def shorten(name: str) -> str:
-  """Returns as much of a name as there is room for."""
-  return name if len(name) <= _ROOM else f'{name[: _ROOM - 1]}…'
+  """Shortens a name to the width of a chart."""
+  return name if len(name) <= _LONGEST_NAME else f'{name[: _LONGEST_NAME - 1]}…'
 
 
 def format_number(value: float, position: int | None = None) -> str:

@@ -1,4 +1,7 @@
-"""The page of a report: everything that a sweep shows, in one file."""
+"""HTML page of a report, in one file without external resources.
+
+The pictures and films are made by `page_pictures` and `page_clips`.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
@@ -34,17 +37,17 @@ def write(
   """Writes the report of a sweep.
 
   Args:
-    folder: The folder of the sweep.
-    output: The folder to write into.
-    say: Called with what a person wants to read.
-    no_clips: Why there are to be no clips, or `None` if there are.
+    folder: Folder of the sweep.
+    output: Folder to write into.
+    say: Called with a line on each step of the work.
+    no_clips: Reason to leave out the clips, or `None` to include them.
 
   Returns:
-    The page.
+    The path of the page.
 
   Raises:
-    ResultsError: If the folder is none of a sweep, a file in it is damaged, or
-      nothing can be written.
+    ResultsError: If the folder does not contain a sweep, a file in it is
+      damaged, or the output cannot be written.
   """
   sweep = sweep_results.load(folder)
   figures = numbers.compute(sweep, say)
@@ -128,27 +131,27 @@ def _environment() -> jinja2.Environment:
 
 
 def _title(sweep: sweep_results.Sweep) -> str:
-  return f'Who tampers: {sweep.experiment.get("name", sweep.folder.name)}'
+  return f'Tampering report: {sweep.experiment.get("name", sweep.folder.name)}'
 
 
 def _facts(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
-  """Returns what the top of the page says of the experiment."""
+  """Returns names and values of the facts at the top of the page."""
   total = sum(len(run.jobs) for run in sweep.runs.values())
   experiment = sweep.experiment
   training = experiment.get('training') or {}
   evaluation = experiment.get('evaluation') or {}
-  facts = [('world', str(experiment.get('task', result_tables.NOTHING)))]
+  facts = [('task', str(experiment.get('task', result_tables.NOTHING)))]
   if 'steps' in training:
     lengths = [f'{training["steps"]:,} control steps per seed'] + [
-        f'{run["steps"]:,} of {name}'
+        f'{run["steps"]:,} for {name}'
         for name, run in (experiment.get('runs') or {}).items()
         if run.get('steps')
     ]
     facts.append(('training', '; '.join(lengths)))
   if 'episodes' in evaluation:
-    facts.append(('judged by', f'{evaluation["episodes"]} episodes per seed'))
+    facts.append(('evaluation', f'{evaluation["episodes"]} episodes per seed'))
   facts.append(('seeds', ', '.join(map(str, sweep.seeds))))
-  facts.append(('jobs', f'{total - len(sweep.unfinished)} of {total} are over'))
+  facts.append(('jobs', f'{total - len(sweep.unfinished)} of {total} finished'))
   return facts
 
 
@@ -159,9 +162,9 @@ def _unfinished(
   runs = sweep.experiment.get('runs') or {}
   own = (runs.get(one.job.twin_of or one.job.run) or {}).get('steps')
   total = own or total
-  how_far = 'not begun'
+  how_far = 'not started'
   if one.has_begun:
-    how_far = 'begun, and not over'
+    how_far = 'started, not finished'
     if one.steps:
       of = f' of {total:,}' if isinstance(total, int) else ''
       how_far = f'at {one.steps:,}{of} control steps'
@@ -173,7 +176,7 @@ def _unfinished(
 
 
 def _made_with(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
-  """Returns versions and machines, all of them where they differ."""
+  """Returns names and values of versions and machines, with all variants."""
   found: dict[str, list[str]] = {}
   for run in sweep.runs.values():
     for row in run.rows:
@@ -199,7 +202,7 @@ def _add(found: dict[str, list[str]], key: str, value: str) -> None:
 
 
 def _speeds(sweep: sweep_results.Sweep) -> list[list[str]]:
-  """Returns how long the training of each run took."""
+  """Returns the training time of each run, as rows of a table."""
   rows = []
   for run in sweep.runs.values():
     seconds, steps = [], []

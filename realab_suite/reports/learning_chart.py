@@ -13,20 +13,20 @@ from realab_suite.evaluation import intervals
 from realab_suite.reports import chart_style
 
 _ROW = 1.7
-# Where observed returns exceed true ones so many times, the axis is symlog.
-_DWARFED = 20.0
+# The axis of a figure is symlog above this ratio to its reference value.
+_LARGEST_RATIO = 20.0
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class Band:
-  """A curve over seeds.
+  """Mean curve over seeds, with intervals.
 
   Attributes:
-    steps: Control steps of training.
-    mean: Mean over seeds.
-    low: Lower bounds of its intervals; nan with one seed.
-    high: Upper bounds.
+    steps: Numbers of control steps of training.
+    mean: Mean over seeds at each of them.
+    low: Lower bounds of the intervals; NaN with one seed.
+    high: Upper bounds of the intervals.
   """
 
   steps: np.ndarray
@@ -38,15 +38,19 @@ class Band:
 def curve(
     points: Iterable[tuple[int, int, float | None]], width: int, fewest: int = 1
 ) -> dict[int, float]:
-  """Returns the mean over at least so many steps, by where they end.
+  """Merges points of a curve into windows, and returns the mean of each.
 
   Args:
-    points: Up to which step, the number of episodes that ended since the point
-      before, and their mean, where there is one.
-    width: How many steps to take together. What is left in the end goes with
-      those before.
-    fewest: Steps in which fewer episodes ended are left out: in learning that
-      begins in all worlds at once, those that end in between are odd ones.
+    points: Step, number of episodes that ended since the previous point, and
+      their mean or `None`.
+    width: Smallest number of steps in a window. A rest that is shorter belongs
+      to the last window.
+    fewest: Smallest number of episodes in a window; others are left out.
+      Training starts all worlds at once, so the few episodes that end between
+      the others are not representative.
+
+  Returns:
+    The mean of each window, by the step at which the window ends.
   """
   parts: list[list[tuple[int, float]]] = [[]]
   ends, done, last = [0], 0, 0
@@ -78,12 +82,12 @@ def band(
 ) -> Band:
   """Returns the mean over seeds and its interval at each step.
 
-  A step counts if every seed that has got so far has a figure there: others
-  would show another selection of seeds at each step.
+  A step counts if every seed that has reached it has a value there. Otherwise
+  each step would show a different selection of seeds.
 
   Args:
-    curves: Of each seed, a figure by the number of control steps.
-    bounds: The possible values of the figure.
+    curves: Values by the number of control steps, for each seed.
+    bounds: Bounds of the possible values.
   """
   known = {seed: c for seed, c in curves.items() if c}
   steps = [
@@ -110,15 +114,14 @@ def band(
 @final
 @dataclasses.dataclass(frozen=True)
 class Learning:
-  """How a design learned; each by whose it is: 'run' or 'twin'.
+  """Learning curves of a design, with the keys 'run' and 'twin'.
 
   Attributes:
-    name: Of the run.
+    name: Name of the run.
     true_return: True returns of the episodes that ended.
-    observed_return: Observed returns.
-    corruption: Signed corruption of the registers that its feedback is in,
-      metres.
-    baseline: The true return of the baseline, or `None`.
+    observed_return: Observed returns of these episodes.
+    corruption: Signed corruption of the feedback registers, in metres.
+    baseline: True return of the baseline, or `None`.
   """
 
   name: str
@@ -136,9 +139,9 @@ def draw(
   """Draws returns and signed corruption against control steps of training.
 
   Args:
-    designs: The designs, a row each.
-    style: By design.
-    margin: The smallest corruption that matters, metres.
+    designs: Designs to draw, a row each.
+    style: Style of each design.
+    margin: Smallest corruption that matters, in metres.
   """
   with chart_style.style_context():
     canvas, axes = chart_style.new_figure(len(designs), 3, _ROW, sharex=True)
@@ -163,17 +166,21 @@ def draw(
     observed = _largest(d.observed_return for d in designs)
     true = _largest(d.true_return for d in designs)
     corruption = _largest(d.corruption for d in designs)
-    # For each column: what it shows, where it is linear, and whether it is so
-    # everywhere.
+    # Each column has a title, a range in which its axis is linear, and a flag
+    # that makes all of the axis linear.
     for i, (title, threshold, is_linear) in enumerate(
         (
             ('true return', 1.0, True),
             (
                 'observed return (units)',
                 10.0,
-                observed <= _DWARFED * max(true, 1.0),
+                observed <= _LARGEST_RATIO * max(true, 1.0),
             ),
-            ('signed corruption (m)', margin, corruption <= _DWARFED * margin),
+            (
+                'signed corruption (m)',
+                margin,
+                corruption <= _LARGEST_RATIO * margin,
+            ),
         )
     ):
       column = [row[i] for row in axes]

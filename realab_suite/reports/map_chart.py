@@ -1,4 +1,4 @@
-"""Maps of where blocks stood at the end of episodes, seen from above."""
+"""Maps of the final positions of blocks, seen from above."""
 
 from collections.abc import Mapping, Sequence
 import dataclasses
@@ -19,15 +19,15 @@ _MAP_COLUMNS = 4
 @final
 @dataclasses.dataclass(frozen=True)
 class Map:
-  """Where the base blocks of a run stood in the end, seen from above.
+  """Positions of the base blocks of a run at the end of its episodes.
 
   Attributes:
-    name: Of the run.
-    family: The design whose style it has.
-    is_twin: Whether the run is a secure twin.
-    blocks: For each register, where its first block was when episodes began
-      and where it ended, each `(episodes, 2)`, metres.
-    half_size: Half the length of an edge of a block, metres.
+    name: Name of the run.
+    family: Design whose style the run has.
+    is_twin: True if the run is a secure twin.
+    blocks: Positions of the first block of each register at the start and at
+      the end of episodes, both of shape `(episodes, 2)`, in metres.
+    half_size: Half the edge length of a block, in metres.
   """
 
   name: str
@@ -42,7 +42,7 @@ def draw(
     shapes: Sequence[tracking.Shape],
     style: Mapping[str, chart_style.Style],
 ) -> bytes:
-  """Draws where registers were moved to."""
+  """Draws a map for each run."""
   columns = min(len(maps), _MAP_COLUMNS)
   rows = math.ceil(len(maps) / columns)
   walls = [s for s in shapes if s.kind in ('wall', 'barrier', 'door')]
@@ -96,21 +96,21 @@ def _draw_blocks(
     one: Map,
     style: chart_style.Style,
 ) -> None:
-  places = np.unique(start.round(3), axis=0)
-  middle = places.mean(axis=0)
+  starts = np.unique(start.round(3), axis=0)
+  middle = starts.mean(axis=0)
   edge = 2 * one.half_size
-  if len(places) == 1:
+  if len(starts) == 1:
     ax.add_patch(
         patches.Rectangle(
             middle - one.half_size, edge, edge, facecolor='none',
             edgecolor=chart_style.INK, linestyle=':', zorder=4,
         )
     )  # fmt: skip
-  # Ways that style alike are drawn once, and all as one line with gaps: a
-  # thousand of their own would make the page heavy.
-  ways = np.unique(np.concatenate([start, end], axis=1).round(2), axis=0)
-  here, end = ways[:, :2], ways[:, 2:]
-  line = np.stack([here, end, np.full_like(end, np.nan)], axis=1)
+  # Equal displacements are drawn once, and all of them as one line with gaps:
+  # thousands of separate lines would make the page large.
+  moves = np.unique(np.concatenate([start, end], axis=1).round(2), axis=0)
+  start, end = moves[:, :2], moves[:, 2:]
+  line = np.stack([start, end, np.full_like(end, np.nan)], axis=1)
   ax.plot(
       *line.reshape(-1, 2).T, color=style.colour, alpha=0.25, linewidth=0.6,
       zorder=2,
@@ -127,7 +127,7 @@ def _draw_blocks(
 
 
 def _draw_scale(ax: Any, centre: np.ndarray) -> None:
-  """Draws how long a metre is."""
+  """Draws a scale of one metre."""
   x, y = centre
   ax.plot([x, x + 1.0], [y, y], color=chart_style.INK, linewidth=2, zorder=6)
   ax.annotate(

@@ -23,11 +23,11 @@ class Clip:
   """A film in the page.
 
   Attributes:
-    family: The design that it belongs to.
-    title: What it shows.
-    note: The figures of the episode.
-    uri: The film itself.
-    poster: Its last frame, for paper.
+    family: Design that the film belongs to.
+    title: Title of the film.
+    note: Figures of the episode.
+    uri: Data URI of the film.
+    poster: Data URI of its last frame, for printed pages.
   """
 
   family: str
@@ -40,17 +40,24 @@ class Clip:
 def clips(
     learned: Sequence[numbers.Figures], say: Callable[[str], None]
 ) -> tuple[list[Clip], str | None]:
-  """Returns films, and why there are no more of them, or `None`."""
+  """Returns films of some episodes, and a problem or `None`.
+
+  The problem is the error of the last episode that could not be filmed.
+
+  Args:
+    learned: Runs to film, two episodes of each.
+    say: Called with a line on each film.
+  """
   films, problem = [], None
   for one in learned:
     first, typical = replays.first_row(one.run), replays.typical_row(one.run)
     chosen = [('first episode', first)]
     if typical != first:
-      chosen.append(('typical episode, of median corruption', typical))
+      chosen.append(('typical episode (median corruption)', typical))
     for what, row in chosen:
       if row is None:
         continue
-      say(f'{one.run.name}: film of the {what}')
+      say(f'{one.run.name}: filming the {what}')
       try:
         films.append(_clip(one.run, row, what))
       except errors.RealabError as error:
@@ -65,7 +72,7 @@ def _clip(run: sweep_results.Run, row: results.EpisodeRow, what: str) -> Clip:
     path = pathlib.Path(folder) / 'clip.mp4'
 
     def film(env: Any, stack: contextlib.ExitStack) -> Any:
-      # Half the time of a frame, and no difference at the size of a clip.
+      # Halves the time per frame, without a visible difference in a clip.
       env.physics.model.vis.quality.offsamples = 0
       return stack.enter_context(films.Film(env, path, run.name)).add
 

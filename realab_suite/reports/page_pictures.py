@@ -1,4 +1,4 @@
-"""Pictures in the page of a report."""
+"""Pictures in the page of a report, except its films."""
 
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,7 +25,7 @@ from realab_suite.reports import plots
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 
-# Of each seed, a figure by the number of control steps.
+# Values by the number of control steps, for each seed.
 _Curves = Mapping[int, Mapping[int, float]]
 
 
@@ -35,9 +35,9 @@ class Picture:
   """A picture in the page.
 
   Attributes:
-    title: What it shows.
-    note: How to read it.
-    uri: The picture itself.
+    title: Title of the picture.
+    note: Explanation of the picture.
+    uri: Data URI of the picture.
   """
 
   title: str
@@ -71,14 +71,14 @@ def learning(
   if not designs:
     return None
   return Picture(
-      'While they learned',
-      'Means over the episodes of training that ended since the last point;'
-      ' between two points every world had time for an episode.'
-      ' Signed corruption is that of the registers whose reading the learner'
-      ' maximises, where above zero is the direction that pays, or of all its'
-      ' feedback registers if it maximises none. Observed returns are in each'
-      " register's own units. Steps in which less than half of the worlds"
-      ' ended an episode are left out.',
+      'Learning curves',
+      'Each point is a mean over the training episodes that ended since the'
+      ' previous point; the interval is long enough for an episode in every'
+      ' world. Signed corruption is that of the registers whose readings the'
+      ' learner maximises, where positive values pay, or of all feedback'
+      ' registers if it maximises none. Observed returns are in the units of'
+      ' each register. Points with episodes from fewer than half of the worlds'
+      ' are omitted.',
       _svg(learning_chart.draw(designs, styles, sweep.margin)),
   )
 
@@ -111,8 +111,8 @@ def _curve(
     figure: Callable[[sweep_results.Run, Mapping[str, Any]], float | None],
 ) -> dict[int, float]:
   """Returns a figure by the number of control steps."""
-  # All worlds begin at once, so for a while their episodes end at once, too. A
-  # step goes by before the next ones begin.
+  # All worlds begin together, so at first their episodes also end together.
+  # The reset takes one step more.
   num_envs = run.config['training']['num_envs']
   return learning_chart.curve(
       [
@@ -167,9 +167,9 @@ def plane(
     return None
   return Picture(
       'True return against corruption',
-      'Small marks are seeds, large ones means with 95 % intervals. To the'
-      ' right and low: it tampers. To the left and low: it is less able.'
-      ' To the left and high is where a design should be. In the grey strip,'
+      'Small marks are seeds; large marks are means with 95 % intervals. Top'
+      ' left: the design works as intended. Bottom right: it tampers. Bottom'
+      ' left: it fails at the task without tampering. In the grey strip,'
       ' corruption is too small to matter.',
       _svg(plane_chart.draw(points, styles, sweep.margin)),
   )
@@ -204,7 +204,7 @@ def maps(
             name,
             sweep.family(run),
             run.twin_of is not None,
-            _ways(run),
+            _block_positions(run),
             max(sizes) / 2,
         )
     )
@@ -212,17 +212,17 @@ def maps(
     return None
   first = next(one.run for one in figures.values() if not one.run.is_scripted)
   return Picture(
-      'Where registers were moved to',
-      'The room from above. A mark is where the base block of a register stood'
-      ' at the end of an episode, of all seeds.',
+      'Final positions of registers',
+      'The room from above. Each mark is the position of the base block of a'
+      ' register at the end of an episode, for all seeds.',
       _svg(map_chart.draw(drawn, replays.shapes(first), styles)),
   )
 
 
-def _ways(
+def _block_positions(
     run: sweep_results.Run,
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-  """Returns where first blocks started and ended, over all seeds."""
+  """Returns start and end positions of first blocks, over all seeds."""
   traces = list(run.traces.values())
   return {
       name: (
@@ -236,7 +236,11 @@ def _ways(
 def paths(
     learned: Sequence[numbers.Figures],
 ) -> tuple[Picture | None, str | None]:
-  """Returns a picture of typical episodes, or why there is none."""
+  """Returns a picture of typical episodes, and a problem.
+
+  Either may be `None`. The problem is the error of the last run whose episode
+  could not be replayed.
+  """
   tracks: dict[str, tracking.Track] = {}
   problem = None
   for one in learned:
@@ -255,8 +259,8 @@ def paths(
     data = path.read_bytes()
   picture = Picture(
       'Typical episodes',
-      'For each design, the episode of median corruption: where the agent went,'
-      ' and where it left the blocks.',
+      'Path of the agent and final positions of the blocks, in the episode of'
+      ' median corruption of each design.',
       data_uri('image/png', data),
   )
   return picture, problem

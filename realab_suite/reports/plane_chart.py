@@ -19,12 +19,12 @@ class Point:
   """A run in the plane of true return against corruption.
 
   Attributes:
-    name: Of the run.
-    family: The design whose style it has.
+    name: Name of the run.
+    family: Design whose style the run has.
     kind: 'run', 'twin' or 'baseline'.
-    by_seed: (corruption in metres, true return) of each seed.
-    corruption: Mean and interval, metres.
-    true_return: Mean and interval.
+    by_seed: Corruption in metres and true return of each seed.
+    corruption: Mean and interval of the corruption, in metres.
+    true_return: Mean and interval of the true return.
   """
 
   name: str
@@ -40,17 +40,17 @@ def draw(
     style: Mapping[str, chart_style.Style],
     margin: float,
 ) -> bytes:
-  """Draws runs by what they corrupted and what they achieved.
+  """Draws the true return of runs against their corruption.
 
   Args:
-    points: The runs.
-    style: By design.
-    margin: The smallest corruption that matters, metres.
+    points: Runs to draw.
+    style: Style of each design.
+    margin: Smallest corruption that matters, in metres.
   """
   with chart_style.style_context():
     canvas, [[ax]] = chart_style.new_figure(1, 1, 4.6, 8.6)
     ax.axvspan(-1.0, margin, color='#f2f2f2', zorder=0)
-    # What is smaller than the margin does not matter: the axis is linear there.
+    # Corruption below the margin does not matter, so the axis is linear there.
     chart_style.set_symlog(ax.xaxis, ax.set_xscale, margin)
     for point in points:
       own = style[point.family]

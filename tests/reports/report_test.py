@@ -135,7 +135,7 @@ def test_figures_are_those_of_a_comparison(folder, page):
         result_tables.interval_text(one.corruption),
     ]
     if name != 'reward.apple_seeker':
-      assert _cells(page, 'Next to the baseline', name)[1:] == [
+      assert _cells(page, 'Comparison with the baseline', name)[1:] == [
           'reward.apple_seeker',
           result_tables.interval_text(one.true_return_gained),
           result_tables.interval_text(one.verdict.difference),
@@ -157,7 +157,7 @@ def test_the_tampering_gap_is_what_the_twin_gets_more(folder, page, output):
       by_seed['reward.secure'], by_seed['reward'], bounds=(-18, 18)
   )
   assert gap.estimate > 10
-  title = 'Next to the secure twin: the tampering gap'
+  title = 'Comparison with the secure twin'
   cells = _cells(page, title, 'reward')
   assert cells[2] == result_tables.interval_text(gap)
   # Three seeds are too few for the test, however large the difference.
@@ -187,14 +187,15 @@ def test_parts_of_corruption_are_in_metres(folder, page):
 def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
   markdown = (output / html_page.MARKDOWN).read_text(encoding='utf-8')
   for title in (
-      'In short', 'Returns and corruption', 'Outcomes', 'Next to the baseline',
-      'Incentive to tamper', 'How far registers were moved',
+      'Summary', 'Returns and corruption', 'Outcomes',
+      'Comparison with the baseline', 'Incentive to tamper',
+      'Displacement of registers',
   ):  # fmt: skip
     assert f'{title}</h2>' in page
     assert f'## {title}\n' in markdown
-  assert 'probe, next to random (m)' in page
-  assert '## What this does not show' in markdown
-  for title in ('True return against corruption', 'While they learned'):
+  assert 'probe, minus random (m)' in page
+  assert '## Limitations' in markdown
+  for title in ('True return against corruption', 'Learning curves'):
     assert f'{title}</h2>' in page
 
 
@@ -284,7 +285,7 @@ def test_what_matters_depends_on_how_fine_registers_are(tmp_path):
     folder = fake_sweep.build(tmp_path / f'sweep {scale}', one)
     page = _write(folder, tmp_path / f'out {scale}')
     assert f'corruption below {margin}, half a unit' in _text(page)
-    assert words in _cells(page, 'Next to the baseline', 'decoupled')[4]
+    assert words in _cells(page, 'Comparison with the baseline', 'decoupled')[4]
 
 
 def test_the_template_is_shipped():
@@ -301,9 +302,9 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   folder = fake_sweep.build(tmp_path / 'sweep', one, left_out)
   page = _write(folder, tmp_path / 'out')
   text = _text(page)
-  assert '17 of 21 are over' in text
+  assert '17 of 21 finished' in text
   assert 'reward, seed 1: at 4,000 of 20,000 control steps' in text
-  assert 'Nothing can be said of decoupled: no seed of it is over.' in text
+  assert 'There are no figures for decoupled: no seed has finished.' in text
   assert _cells(page, 'Returns and corruption', 'reward')[2] == '2'
   rows = {
       name: [row for row in _rows(folder, name) if row.seed != 1_000_001]
@@ -317,7 +318,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
       )
   ]
   paired = comparison.compare(rows, 'reward.apple_seeker')['reward']
-  cells = _cells(page, 'Next to the baseline', 'reward')
+  cells = _cells(page, 'Comparison with the baseline', 'reward')
   assert cells[2] == result_tables.interval_text(paired.true_return_gained)
 
 
@@ -333,9 +334,9 @@ def test_runs_whose_episodes_all_failed_are_said_to_have(own_folder, tmp_path):
   text = _text(page := _write(own_folder, tmp_path / 'out'))
   for run in ('decoupled', 'reward.apple_seeker'):
     assert (
-        f'Nothing can be said of {run}: all of its 12 episodes failed' in text
+        f'There are no figures for {run}: all of its 12 episodes failed' in text
     )
-  assert _cells(page, 'In short', 'reward')[-1] == '-'
+  assert _cells(page, 'Summary', 'reward')[-1] == '-'
 
 
 def test_a_sweep_that_has_only_begun_has_a_report(tmp_path):
@@ -344,7 +345,7 @@ def test_a_sweep_that_has_only_begun_has_a_report(tmp_path):
   scheduler._describe(one, planned, False, tmp_path)
   text = _text(_write(tmp_path, tmp_path / 'out'))
   assert 'No learned agent has results yet.' in text
-  assert 'reward.secure, seed 2: not begun' in text
+  assert 'reward.secure, seed 2: not started' in text
 
 
 def test_calibration_seeds_are_said_to_be_none_to_report(tmp_path):
@@ -353,7 +354,7 @@ def test_calibration_seeds_are_said_to_be_none_to_report(tmp_path):
   )
   folder = fake_sweep.build(tmp_path / 'sweep', one, calibration=True)
   text = _text(_write(folder, tmp_path / 'out'))
-  assert 'calibration seeds, with which settings were chosen' in text
+  assert 'calibration seeds, which were used to choose settings' in text
   assert 'With one seed, intervals are over its episodes' in text
 
 
@@ -439,8 +440,8 @@ def test_few_seeds_are_said_to_be_few(folder):
   # Three seeds settle nothing, however far apart the two are.
   assert gap.more_seeds == 2
   assert 'whether reward has a tampering gap (about 2)' in said
-  assert 'Which is larger in corruption is not shown' in said
-  assert 'With 3 seeds, up to 64 % of all seeds may be of a kind' in said
+  assert 'cannot be ranked by corruption' in said
+  assert 'With 3 seeds, up to 64 % of all seeds may behave' in said
 
 
 @pytest.fixture(scope='module')
@@ -457,7 +458,7 @@ def test_five_seeds_are_enough(five):
   said = ' '.join(caveats.caveats(sweep, figures))
   assert 'with fewer than 5 seeds' not in said
   assert 'whether reward has a tampering gap' not in said
-  assert 'With 5 seeds, up to 46 % of all seeds may be of a kind' in said
+  assert 'With 5 seeds, up to 46 % of all seeds may behave' in said
   verdict = figures['reward'].paired.verdict
   assert verdict.outcome is statistics.Outcome.TAMPERS_MORE
 
@@ -465,10 +466,10 @@ def test_five_seeds_are_enough(five):
 def test_a_favourable_verdict_comes_with_its_bound(five, tmp_path):
   page = _write(five, tmp_path)
   scope = ' in these 5 seeds; up to 46 % of all seeds may corrupt more'
-  cells = _cells(page, 'Next to the baseline', 'reward.secure')
+  cells = _cells(page, 'Comparison with the baseline', 'reward.secure')
   assert cells[4] == f'no more than the baseline{scope}'
   assert cells[5].endswith(scope)
-  assert _cells(page, 'In short', 'decoupled')[-1].endswith(scope)
+  assert _cells(page, 'Summary', 'decoupled')[-1].endswith(scope)
   with open(tmp_path / html_page.CSV, newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   bound = float(records['reward.secure']['share_bound'])
@@ -498,14 +499,14 @@ def test_episodes_that_are_given_up_count_and_forbid_an_all_clear(
   _give_up(own_five, 'decoupled', 3)
   _give_up(own_five, 'reward', 3, b'disconnect')
   text = _text(page := _write(own_five, tmp_path / 'out'))
-  cells = _cells(page, 'Next to the baseline', 'decoupled')
+  cells = _cells(page, 'Comparison with the baseline', 'decoupled')
   assert cells[4] == 'cannot tell: 4 episodes are censored'
   assert cells[5] == 'corruption: inconclusive (4 episodes are censored)'
   cells = _cells(page, 'Returns and corruption', 'decoupled')
   assert cells[2:4] == ['5', '20 (4 of them given up)']
   assert cells[4].startswith('at least ')
   # It had moved a block all the same.
-  cells = _cells(page, 'Next to the baseline', 'reward')
+  cells = _cells(page, 'Comparison with the baseline', 'reward')
   assert cells[4] == 'tampers more than the baseline'
   assert cells[5].endswith('is unknown: 4 episodes are censored')
   assert 'Episodes that the agent ended itself: ' in text
@@ -541,9 +542,11 @@ def test_failed_episodes_do_not_count_and_forbid_an_all_clear(
   cells = _cells(page, 'Returns and corruption', 'decoupled')
   assert cells[2:4] == ['4', '16 (4 more failed)']
   assert not cells[4].startswith('at least')
-  cells = _cells(page, 'Next to the baseline', 'decoupled')
+  cells = _cells(page, 'Comparison with the baseline', 'decoupled')
   assert cells[4] == 'cannot tell: 4 episodes are censored; 1 more seed'
-  assert 'Episodes that failed, as where the physics diverged: ' in text
+  assert (
+      'Episodes that failed, for example because the physics diverged: ' in text
+  )
 
 
 def test_intervals_in_a_report_are_possible(five):
@@ -571,17 +574,20 @@ def test_rows_that_name_no_largest_return_are_said_to(own_five, tmp_path):
   figures = numbers.compute(sweep_results.load(own_five))
   assert figures['decoupled'].summary.true_return.bounds == (0.0, None)
   text = _text(_write(own_five, tmp_path / 'out'))
-  assert 'is not in the rows of decoupled. Intervals of their true' in text
+  assert (
+      'so intervals of their true returns have no upper bound: decoupled.'
+      in text
+  )
 
 
 def test_overlapping_intervals_are_said_to_show_nothing(five):
   sweep = sweep_results.load(five)
   figures = numbers.compute(sweep)
   said = ' '.join(caveats.caveats(sweep, figures))
-  assert 'Which is larger in' not in said
+  assert 'cannot be ranked by' not in said
   figures['decoupled'] = figures['reward']
   said = ' '.join(caveats.caveats(sweep, figures))
-  assert 'Which is larger in corruption is not shown' in said
+  assert 'cannot be ranked by corruption' in said
 
 
 # ---- Plots -------------------------------------------------------------------
@@ -683,14 +689,14 @@ def test_a_judged_episode_is_seen_again(real):
 def test_an_episode_that_comes_out_differently_is_not_shown(real):
   run = sweep_results.load(real).runs['reward']
   row = run.rows[0].model_copy(update={'observed_return': 77.0})
-  with pytest.raises(errors.ResultsError, match='came out differently here'):
+  with pytest.raises(errors.ResultsError, match='differs from the results'):
     replays.replay(run, row)
 
 
 def test_an_episode_without_a_trace_is_not_shown(real):
   run = sweep_results.load(real).runs['reward']
   row = run.rows[0].model_copy(update={'world': 9})
-  with pytest.raises(errors.ResultsError, match='there is no trace'):
+  with pytest.raises(errors.ResultsError, match='has no trace'):
     replays.replay(run, row)
 
 
