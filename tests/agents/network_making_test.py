@@ -50,7 +50,7 @@ def test_what_is_made_is_what_was_learned_and_can_be_loaded():
     ('arguments', 'complaint'),
     [
         ([], 'error: --output: missing'),
-        (['--output=new', 'demonstrator_v1'], 'are no flags'),
+        (['--output=new', 'demonstrator_v1'], 'are not flags'),
     ],
 )
 def test_what_the_command_line_gets_wrong_is_told_in_a_line(

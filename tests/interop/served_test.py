@@ -527,7 +527,7 @@ def test_the_agent_of_the_page_needs_nothing_of_this_package(tmp_path):
       ('timeout', 5, True)
   ] * 2
   assert {row.info.isolation for row in rows} == {results.SERVED}
-  assert 'agent may be a program of the user' in ran.stderr
+  assert 'the agent may run as the same user' in ran.stderr
   # Besides what it says, there may be what gRPC logs when a server goes.
   said = (output / 'agent.log').read_text().splitlines()
   assert len([line for line in said if line.startswith('1.0 ')]) == 2

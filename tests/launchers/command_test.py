@@ -61,7 +61,7 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
   assert ran.stderr == ''
   said = ran.stdout.splitlines()
   assert sum(line.startswith('videos are skipped: ') for line in said) == 1
-  assert said[-1] == f'Everything is in {output}'
+  assert said[-1] == f'Results are in {output}'
   rows = small.rows(output)
   assert [(row.seed, row.num_steps) for row in rows] == [(7, 5), (7, 5)]
   assert small.description(output)['settings']['videos'] is False
@@ -134,7 +134,7 @@ def test_seeds_are_a_count_or_a_list(text, seeds):
     ],
 )  # fmt: skip
 def test_seeds_that_are_none_are_refused_in_one_line(text):
-  with pytest.raises(errors.SpecError, match='allowed are a count') as raised:
+  with pytest.raises(errors.SpecError, match='allowed are a number') as raised:
     compare._seeds(text)
   message = str(raised.value)
   assert message.startswith(f'--seeds={text[:40]}')
@@ -258,7 +258,7 @@ def test_where_nothing_renders_exploring_ends_with_one_line(tmp_path):
   )  # fmt: skip
   assert ran.returncode == 2
   assert len(ran.stderr.splitlines()) == 1
-  assert 'neither a window nor a film' in ran.stderr
+  assert 'no display for a window' in ran.stderr
 
 
 @pytest.mark.camera

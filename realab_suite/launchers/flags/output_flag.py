@@ -1,10 +1,10 @@
-"""The flag that says where results go, which several programs have."""
+"""Flag `--output`, shared by several programs."""
 
 from absl import flags
 
 OUTPUT = flags.DEFINE_string(
     'output',
     None,
-    'The folder to write into; a report goes to the folder of its sweep by'
-    ' default.',
+    'Folder to write into. The default of a report is the folder of its'
+    ' sweep.',
 )
