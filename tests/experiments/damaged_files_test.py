@@ -60,20 +60,20 @@ def _edit(path: pathlib.Path, old: str, new: str) -> None:
 
 def test_a_changed_description_of_a_sweep_is_refused(sweep: pathlib.Path):
   _edit(sweep / scheduler.SWEEP, '"calibration": false', '"calibration": true')
-  with pytest.raises(errors.ResultsError, match='its checksum does not agree'):
+  with pytest.raises(errors.ResultsError, match='its checksum does not match'):
     sweep_results.load(sweep)
 
 
 def test_a_changed_experiment_of_a_sweep_is_refused(sweep: pathlib.Path):
   _edit(sweep / scheduler.EXPERIMENT, '250', '251')
-  with pytest.raises(errors.ResultsError, match='when the sweep began'):
+  with pytest.raises(errors.ResultsError, match='since the sweep began'):
     sweep_results.load(sweep)
 
 
 def test_a_changed_configuration_of_a_run_is_refused(sweep: pathlib.Path):
   folder, *_ = sorted(p for p in sweep.iterdir() if (p / 'done.json').exists())
   _edit(folder / storage.CONFIG, '"max_steps": 250', '"max_steps": 251')
-  with pytest.raises(errors.ResultsError, match='is named after'):
+  with pytest.raises(errors.ResultsError, match='name of its folder'):
     sweep_results.load(sweep)
 
 

@@ -170,7 +170,7 @@ def test_the_folder_of_another_job_is_noticed(folder):
   mine, other = _job_folder(folder), _job_folder(folder, 'reward.secure')
   shutil.rmtree(mine)
   shutil.copytree(other, mine)
-  with pytest.raises(errors.ResultsError, match='folder is named after'):
+  with pytest.raises(errors.ResultsError, match='name of its folder'):
     _sweep(folder, 'reward')
   with pytest.raises(errors.ResultsError):
     _report(folder)

@@ -125,7 +125,7 @@ def test_another_machine_is_refused_and_changes_nothing(on, tmp_path):
   folder = tmp_path / _job().folder()
   assert message.startswith(f'{folder}: its checkpoint of step 40 is from ')
   assert "processor is 'old' there, 'new' here;" in message
-  assert 'give --other_machine to continue here' in message
+  assert 'use --other_machine to continue here' in message
   assert '\n' not in message
   assert _files(tmp_path) == before
   # On the old one it is as if nothing had happened.
@@ -189,7 +189,7 @@ def test_a_run_that_is_done_is_done_everywhere(on, tmp_path):
   on('old', tmp_path)
   before = _files(tmp_path)
   [line] = on('new', tmp_path)
-  assert line.endswith('is there already')
+  assert line.endswith('has finished already')
   assert _files(tmp_path) == before
 
 

@@ -106,7 +106,7 @@ def test_weights_that_a_design_names_are_looked_for_within_the_directory(
 def test_a_forged_done_file_leads_nowhere(tmp_path: pathlib.Path):
   storage.write_done(tmp_path, {'files': {'../x': '0' * 64}})
   with pytest.raises(
-      errors.ResultsError, match=r"'\.\./x' is no file of a run"
+      errors.ResultsError, match=r"'\.\./x' is not a file of a run"
   ):
     storage.is_done(tmp_path)
 

@@ -130,7 +130,7 @@ def test_every_job_has_a_folder_of_its_own(path):
                     }
                 }
             },
-            "runs.a.twin: design 'value_advice' is secure itself",
+            "runs.a.twin: design 'value_advice' is secure already",
         ),
         ({'training': {'num_envs': 0}}, 'training.num_envs: '),
         ({'training': {'sleep': 1}}, 'training.sleep: '),

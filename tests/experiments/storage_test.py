@@ -59,10 +59,10 @@ def test_lines_without_a_mark_stay(tmp_path):
     [
         (
             lambda data: data[:-1],
-            'has 23 bytes, and the checkpoint knows of 24',
+            'has 23 bytes, but the checkpoint expects 24',
         ),
-        (lambda data: data.replace(b'1', b'7'), 'not what it was when the'),
-        (lambda data: bytes(len(data)), 'not what it was when the checkpoint'),
+        (lambda data: data.replace(b'1', b'7'), 'changed since the checkpoint'),
+        (lambda data: bytes(len(data)), 'changed since the checkpoint'),
     ],
 )
 def test_lines_that_are_not_what_they_were_are_refused(
@@ -110,7 +110,9 @@ def test_every_fact_of_a_run_that_is_over_is_guarded(tmp_path):
 @pytest.mark.parametrize('name', ['../x', '/x', '.x', ''])
 def test_a_run_that_is_over_names_files_of_its_own_folder(tmp_path, name):
   storage.write_done(tmp_path, {'files': {name: '0' * 64}})
-  with pytest.raises(errors.ResultsError, match='is no file of a run; remove'):
+  with pytest.raises(
+      errors.ResultsError, match='is not a file of a run; remove'
+  ):
     storage.is_done(tmp_path)
 
 
@@ -215,7 +217,9 @@ def test_a_file_that_cannot_be_written_is_what_it_was(tmp_path, monkeypatch):
     raise OSError(errno.ENOSPC, 'No space left on device')
 
   monkeypatch.setattr(storage.os, 'fsync', fail)
-  with pytest.raises(errors.ResultsError, match=r'file: No space left .* room'):
+  with pytest.raises(
+      errors.ResultsError, match=r'file: No space left .* space'
+  ):
     storage.write_whole(path, b'new')
   assert path.read_bytes() == b'old'
   assert [one.name for one in tmp_path.iterdir()] == ['file']

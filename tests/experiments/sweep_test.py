@@ -110,7 +110,7 @@ def test_all_jobs_are_done_and_none_twice(tmp_path):
       for run in ('bad.random', 'bad', 'good.random', 'good')
   ]
   assert engine.most == 2
-  assert said[-1] == f'8 jobs are done; everything is in {tmp_path}'
+  assert said[-1] == f'8 jobs finished; results are in {tmp_path}'
   again = Pretender()
   _sweep(data, tmp_path, again)
   assert again.commands == []
@@ -121,7 +121,7 @@ def test_a_job_that_fails_keeps_no_other_from_being_done(tmp_path):
   engine = Pretender(statuses={'bad': 2})
   with pytest.raises(
       errors.ResultsError,
-      match=r'1 of 2 jobs failed: bad, seed 3: error: bad is no good; the rest',
+      match=r'1 of 2 jobs failed: bad, seed 3: error: bad is no good; results',
   ):
     _sweep(_SMALL, tmp_path, engine)
   assert engine.commands == [('bad', 3), ('good', 3)]

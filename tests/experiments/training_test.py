@@ -82,7 +82,7 @@ def whole(tmp_path_factory):
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(training, 'make_learner', fake_learner.make)
     path, said = _run(_job(), tmp_path_factory.mktemp('whole'))
-  assert said[-1] == f'Everything is in {path}'
+  assert said[-1] == f'Results are in {path}'
   return path
 
 
@@ -352,7 +352,7 @@ def test_kill_minus_nine_changes_nothing(whole, tmp_path, point):
   assert killed.returncode == -signal.SIGKILL, killed.stderr
   assert again.returncode == 0, again.stderr
   path = tmp_path / 'killed' / whole.name
-  assert again.stdout.splitlines()[-1] == f'Everything is in {path}'
+  assert again.stdout.splitlines()[-1] == f'Results are in {path}'
   assert _results(path) == _results(whole)
 
 
@@ -362,7 +362,7 @@ def test_a_run_that_is_done_is_not_done_again(whole, tmp_path):
   before = {p: p.stat().st_mtime_ns for p in path.iterdir()}
   del before[path / 'lock']
   _, said = _run(job, tmp_path)
-  assert said == [f'{path} is there already']
+  assert said == [f'{path} has finished already']
   assert all(p.stat().st_mtime_ns == t for p, t in before.items())
 
 
@@ -373,7 +373,7 @@ def test_a_run_whose_results_were_changed_is_not_taken_for_done(
   path = shutil.copytree(whole, tmp_path / whole.name)
   with open(path / training.EPISODES, 'a') as file:
     file.write('\n')
-  with pytest.raises(errors.ResultsError, match=r'episodes\.jsonl: not what'):
+  with pytest.raises(errors.ResultsError, match=r'episodes\.jsonl: changed'):
     _run(job, tmp_path)
 
 
@@ -439,7 +439,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_goes_on(
   message = str(raised.value)
   assert message.startswith(f'{last}: ')
   assert (
-      f'remove this file, then the same command goes on from {first.name}'
+      f'remove this file, then the same command continues from {first.name}'
       in (message)
   )
   last.unlink()
@@ -454,7 +454,7 @@ def test_without_an_older_checkpoint_a_run_begins_anew(tmp_path, monkeypatch):
   path = tmp_path / job.folder()
   [only] = _checkpoints(path)
   only.write_bytes(b'')
-  with pytest.raises(errors.ResultsError, match='goes on from the beginning'):
+  with pytest.raises(errors.ResultsError, match='continues from the beginning'):
     _run(job, tmp_path)
   only.unlink()
   _run(job, tmp_path)
@@ -500,7 +500,7 @@ def test_a_full_disk_is_said_so_and_nothing_is_lost(
 
       patch.setattr(storage.os, 'fsync', failing)
     with pytest.raises(
-        errors.ResultsError, match=r'No space left .*; nothing that was compl'
+        errors.ResultsError, match=r'No space left .*; complete results are'
     ):
       _run(job, tmp_path)
   assert not list(path.rglob('*.partial'))

@@ -393,7 +393,7 @@ def test_results_that_were_changed_since_are_refused(own_folder):
   path = next(own_folder.glob('reward-1-*')) / training.EPISODES
   lines = path.read_text().splitlines(keepends=True)
   path.write_text(''.join(lines[:-1]))
-  with pytest.raises(errors.ResultsError, match='not what it was'):
+  with pytest.raises(errors.ResultsError, match='changed since'):
     sweep_results.load(own_folder)
 
 
