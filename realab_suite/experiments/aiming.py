@@ -11,7 +11,7 @@ from realab_suite.engine import environment
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
-_AIM = ('target', 'direction')
+_AIM_OPTIONS = ('target', 'direction')
 
 
 def make_policy(
@@ -33,17 +33,17 @@ def make_policy(
     SpecError: If the policy or the register does not exist.
   """
   takes = inspect.signature(policies.POLICIES.get(name)).parameters
-  options = [option for option in _AIM if option in takes]
+  options = [option for option in _AIM_OPTIONS if option in takes]
   if not options:
     return policies.make(name)
-  register = _find(name, env, target)
+  register = _target_register(name, env, target)
   env.rewind(episode)
   env.reset()
   where = aim(register, env.physics)
   return policies.make(name, **{option: where[option] for option in options})
 
 
-def _find(
+def _target_register(
     policy: str, env: environment.Environment, target: str | None
 ) -> registers.Register:
   mechanism = env.mechanism

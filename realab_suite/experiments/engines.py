@@ -17,7 +17,7 @@ from realab_suite.experiments import requirements
 # Time that a process has for ending after SIGTERM, in seconds.
 _PATIENCE = 10.0
 # Time limit of a Slurm job; the default of submitit is five minutes.
-_MOST_MINUTES = 24 * 60
+_MAX_MINUTES = 24 * 60
 
 
 class Engine(abc.ABC):
@@ -98,7 +98,7 @@ class Ray(Engine):
     """Connects to the cluster that RAY_ADDRESS names, or starts one here."""
     del workers  # Ray determines the number of processors.
     self._ray = _import('ray')
-    with _explained('ray'):
+    with _errors_in_one_line('ray'):
       self._ray.init(ignore_reinit_error=True, log_to_driver=False)
       self._execute = self._ray.remote(num_cpus=1, max_retries=0)(execute)
 
@@ -107,13 +107,13 @@ class Ray(Engine):
     return sys.maxsize
 
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
-    with _explained('ray'):
+    with _errors_in_one_line('ray'):
       return self._execute.remote(
           list(command), str(log.absolute()), os.getcwd()
       )
 
   def poll(self, task: Any) -> int | None:
-    with _explained('ray'):
+    with _errors_in_one_line('ray'):
       done, _ = self._ray.wait([task], timeout=0)
       return int(self._ray.get(done[0])) if done else None
 
@@ -136,17 +136,17 @@ class Submitit(Engine):
     return sys.maxsize
 
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
-    with _explained('submitit'):
+    with _errors_in_one_line('submitit'):
       executor = self._submitit.AutoExecutor(folder=str(log.parent))
       executor.update_parameters(
-          cpus_per_task=1, name=log.stem, timeout_min=_MOST_MINUTES
+          cpus_per_task=1, name=log.stem, timeout_min=_MAX_MINUTES
       )
       return executor.submit(
           execute, list(command), str(log.absolute()), os.getcwd()
       )
 
   def poll(self, task: Any) -> int | None:
-    with _explained('submitit'):
+    with _errors_in_one_line('submitit'):
       return int(task.result()) if task.done() else None
 
   def stop(self, tasks: Sequence[Any]) -> None:
@@ -181,7 +181,7 @@ def _import(name: str) -> Any:
 
 
 @contextlib.contextmanager
-def _explained(name: str) -> Any:
+def _errors_in_one_line(name: str) -> Any:
   """Turns any exception of an engine into an error of one line."""
   try:
     yield

@@ -156,7 +156,7 @@ class ExperimentSpec(validation.Spec):
 
   @pydantic.field_validator('baselines')
   @classmethod
-  def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+  def _check_baselines(cls, names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
       try:
         policies.make(name)
@@ -165,7 +165,7 @@ class ExperimentSpec(validation.Spec):
     return names
 
   @pydantic.model_validator(mode='after')
-  def _distinct(self) -> 'ExperimentSpec':
+  def _check_distinct(self) -> 'ExperimentSpec':
     seeds = (*self.seeds, *self.calibration_seeds)
     for what, values in (
         ('baselines', self.baselines),
@@ -223,12 +223,12 @@ def load(experiment: Experiment) -> ExperimentSpec:
     data = loading.read_mapping(experiment)
   is_file = not isinstance(experiment, Mapping)
   spec = validation.validate(ExperimentSpec, data, where, is_confined=is_file)
-  for key_path, problem in _problems(spec, is_confined=is_file):
+  for key_path, problem in _find_problems(spec, is_confined=is_file):
     raise messages.Location(where, key_path).error(problem)
   return spec
 
 
-def _problems(
+def _find_problems(
     spec: ExperimentSpec, is_confined: bool
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
   """Yields the key path and a description of each problem."""

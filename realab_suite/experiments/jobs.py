@@ -21,7 +21,7 @@ from realab_suite.feedback import specs
 
 _SCHEMA = 1
 # Packages that learners use. Results depend on their versions if installed.
-_LEARNERS_DEPEND_ON = ('jax', 'jaxlib', 'equinox', 'optax')
+_LEARNER_PACKAGES = ('jax', 'jaxlib', 'equinox', 'optax')
 _NUM_DIGITS = 12
 
 
@@ -97,7 +97,7 @@ class Job:
     }
     if self.policy is None:
       config['training'] = self.training.model_dump()
-      depends_on.update(_installed(_LEARNERS_DEPEND_ON))
+      depends_on.update(_installed(_LEARNER_PACKAGES))
     return config
 
   def digest(self) -> str:
@@ -136,8 +136,8 @@ def read_config(folder: pathlib.Path) -> dict[str, Any]:
   """
   path = folder / storage.CONFIG
   config = storage.read_json(path)
-  is_one = isinstance(config, dict)
-  if not is_one or not folder.name.endswith(f'-{digest_of(config)}'):
+  is_mapping = isinstance(config, dict)
+  if not is_mapping or not folder.name.endswith(f'-{digest_of(config)}'):
     raise errors.ResultsError(
         f'{path}: does not match the name of its folder; remove {folder} to run'
         ' the job again'

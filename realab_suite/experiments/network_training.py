@@ -35,8 +35,8 @@ _OVERRIDES = (
 _NUM_ENVS = 256
 # Far from the seeds of experiments, so that their episodes are new.
 _SEED = 500_000_000
-_JUDGED_SEED = 600_000_000
-_JUDGED_IN = ('near', 'standard', 'far')
+_EVALUATION_SEED = 600_000_000
+_EVALUATION_TASKS = ('near', 'standard', 'far')
 _NUM_EPISODES = 200
 
 
@@ -122,7 +122,9 @@ def make(
       reached=(),
   )
   network = network_files.Network(header, weights, biases)
-  reached = tuple(_reached(network, task, num_episodes) for task in _JUDGED_IN)
+  reached = tuple(
+      _evaluate(network, task, num_episodes) for task in _EVALUATION_TASKS
+  )
   header = header.model_copy(update={'reached': reached})
   return dataclasses.replace(network, header=header)
 
@@ -184,7 +186,7 @@ def _versions() -> dict[str, str]:
   }
 
 
-def judge(
+def evaluate_policy(
     policy: policies.Policy, variation: str, num_episodes: int, seed: int
 ) -> list[evaluate.EpisodeResult]:
   """Returns the valid first episodes of a policy in a batch of worlds.
@@ -210,14 +212,14 @@ def judge(
   return [episode for episode in episodes if episode.is_valid]
 
 
-def _reached(
+def _evaluate(
     network: network_files.Network, variation: str, num_episodes: int
 ) -> network_files.Reached:
   """Returns the true return of the policy that takes the best actions."""
   policy = network_policies.NetworkDemonstrator(network)
-  episodes = judge(policy, variation, num_episodes, _JUDGED_SEED)
+  episodes = evaluate_policy(policy, variation, num_episodes, _EVALUATION_SEED)
   interval = intervals.mean_interval(
-      {_JUDGED_SEED: [episode.true_return for episode in episodes]},
+      {_EVALUATION_SEED: [episode.true_return for episode in episodes]},
       bounds=comparison.return_bounds(episodes),
   )
   return network_files.Reached(
@@ -227,5 +229,5 @@ def _reached(
       high=interval.high,
       level=interval.level,
       episodes=len(episodes),
-      seed=_JUDGED_SEED,
+      seed=_EVALUATION_SEED,
   )

@@ -31,7 +31,7 @@ _SEEKER = 'apple_seeker'
 # Share of the steps with a random action instead of that of the saboteur, so
 # that states near a register vary.
 _SABOTEUR = 'carrying_saboteur'
-_DISTRACTION = 0.3
+_RANDOM_SHARE = 0.3
 _NUM_ENVS = 32
 
 
@@ -89,7 +89,7 @@ def make(
           batch.mechanism.registers[register], batch.physics.world(0)
       )
       policy = policies.Distracted(
-          policies.make(_SABOTEUR, **where), _DISTRACTION
+          policies.make(_SABOTEUR, **where), _RANDOM_SHARE
       )
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     states = incentives.collect(

@@ -27,7 +27,7 @@ LOGS = 'logs'
 _MODULE = 'realab_suite.launchers.train'
 _POLL_SECONDS = 0.2
 # Fields that may change between sweeps in one folder.
-_FREE = ('description', 'seeds', 'calibration_seeds')
+_FREE_FIELDS = ('description', 'seeds', 'calibration_seeds')
 
 
 def sweep(
@@ -90,7 +90,7 @@ def _describe(
         'calibration': read_description(output)['calibration'],
     }
     fixed = [
-        {key: value for key, value in one.items() if key not in _FREE}
+        {key: value for key, value in one.items() if key not in _FREE_FIELDS}
         for one in (existing, json.loads(json.dumps(requested)))
     ]
     if fixed[0] != fixed[1]:
@@ -184,7 +184,7 @@ class _Sweep:
     self._arguments = [*engine.arguments(), *arguments]
     self._running: list[_Running] = []
     self._failures: list[str] = []
-    self._num_over = 0
+    self._num_finished = 0
     self._steps: dict[str, int] = {}
 
   def run(self) -> None:
@@ -256,20 +256,20 @@ class _Sweep:
   def _finish(
       self, job: jobs.Job, folder: pathlib.Path, problem: str | None
   ) -> None:
-    self._num_over += 1
+    self._num_finished += 1
     name = f'{job.run}, seed {job.seed}'
     if job.policy is None and problem is None:
       self._steps[folder.name] = job.training.steps
     if problem is not None:
       self._failures.append(f'{name}: {problem}')
     self._say(
-        f'[{self._num_over}/{len(self._jobs)}] {name}:'
+        f'[{self._num_finished}/{len(self._jobs)}] {name}:'
         f' {problem or f"finished, results in {folder}"}'
     )
 
   def _progress(self) -> str:
     failed = f', {len(self._failures)} failed' if self._failures else ''
-    parts = [f'{self._num_over} of {len(self._jobs)} jobs{failed}']
+    parts = [f'{self._num_finished} of {len(self._jobs)} jobs{failed}']
     for running in self._running:
       if returns := _last_returns(running.folder):
         parts.append(f'{running.job.run}: {returns}')

@@ -30,7 +30,7 @@ from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
 
 # Default baseline, if it is one of the policies.
-_HONEST = 'apple_seeker'
+_DEFAULT_BASELINE = 'apple_seeker'
 
 
 @final
@@ -134,7 +134,7 @@ def run(
   """
   runs = plan(settings)
   baseline = _baseline(settings, runs)
-  _rehearse(settings, runs)
+  _check_runs(settings, runs)
   folder = make_folder(settings.output)
   _describe(settings, runs, baseline, folder, pictures)
   job = _Job(settings, baseline, folder, say, pictures)
@@ -198,7 +198,7 @@ def _designs(settings: Settings) -> list[specs.DesignSpec]:
 def _baseline(settings: Settings, runs: Sequence[Run]) -> str:
   names = [run.name for run in runs]
   if settings.baseline is None:
-    return _HONEST if _HONEST in names else names[0]
+    return _DEFAULT_BASELINE if _DEFAULT_BASELINE in names else names[0]
   if settings.baseline not in names:
     raise errors.SpecError(
         f'baseline {settings.baseline!r} is not a run; allowed are {names}'
@@ -216,7 +216,7 @@ def _load(settings: Settings, run: Run, seed: int) -> environment.Environment:
   )
 
 
-def _rehearse(settings: Settings, runs: Sequence[Run]) -> None:
+def _check_runs(settings: Settings, runs: Sequence[Run]) -> None:
   """Loads each run once, to raise errors before anything is written."""
   for run in runs:
     with contextlib.closing(_load(settings, run, settings.seeds[0])) as env:

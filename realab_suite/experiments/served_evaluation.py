@@ -28,7 +28,7 @@ from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import served_world
 
-_SET_DUMPABLE = 4  # Of prctl(2).
+_PR_SET_DUMPABLE = 4  # Of prctl(2).
 
 _WARNING = (
     'the agent may run as the same user as this program (isolation "%s"), so'
@@ -129,7 +129,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     )
     listener = agent_server.Server(world, address, settings.idle_seconds, owner)
     agent = None
-    with _removed_if_refused(output):
+    with _removed_on_error(output):
       listener.start()
       stack.callback(listener.close)
       if settings.agent_command is not None:
@@ -147,7 +147,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     say(f'serving {settings.domain}.{settings.task} at {listener.address}')
     signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
     listener.run()
-    _complain_of_missing(evaluator.num_written, settings, agent, output)
+    _check_all_written(evaluator.num_written, settings, agent, output)
     say(f'Results are in {settings.output}')
 
 
@@ -159,7 +159,7 @@ def hide_from_debuggers() -> None:
         ' Linux can prevent it'
     )
     return
-  if ctypes.CDLL(None, use_errno=True).prctl(_SET_DUMPABLE, 0, 0, 0, 0):
+  if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0):
     raise errors.SpecError(
         'this process cannot be hidden from debuggers:'
         f' {os.strerror(ctypes.get_errno())}'
@@ -167,7 +167,7 @@ def hide_from_debuggers() -> None:
 
 
 @contextlib.contextmanager
-def _removed_if_refused(folder: pathlib.Path) -> Iterator[None]:
+def _removed_on_error(folder: pathlib.Path) -> Iterator[None]:
   """Removes leftovers so that a corrected command can be rerun."""
   try:
     yield
@@ -187,11 +187,11 @@ def deadline(seconds: float) -> Iterator[None]:
   """
   is_over = False
 
-  def ring(*unused: Any) -> None:
+  def on_alarm(*unused: Any) -> None:
     if not is_over:
       raise TimeoutError(f'no answer within {seconds:g} s')
 
-  before = signal.signal(signal.SIGALRM, ring)
+  old_handler = signal.signal(signal.SIGALRM, on_alarm)
   # The timer repeats, because the code may catch the first exception.
   signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
   try:
@@ -199,7 +199,7 @@ def deadline(seconds: float) -> Iterator[None]:
   finally:
     is_over = True
     signal.setitimer(signal.ITIMER_REAL, 0)
-    signal.signal(signal.SIGALRM, before)
+    signal.signal(signal.SIGALRM, old_handler)
 
 
 @final
@@ -301,7 +301,7 @@ def _info(
   )
 
 
-def _complain_of_missing(
+def _check_all_written(
     num_written: int,
     settings: Settings,
     agent: agent_process.AgentProcess | None,

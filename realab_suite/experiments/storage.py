@@ -286,7 +286,7 @@ class RunFolder:
       folder.mkdir(exist_ok=True)
     path = folder / f'{step:012d}{_SUFFIX}'
     write_archive(path, header, contents)
-    self._forget_old()
+    self._remove_old()
 
   def load(self, header: Mapping[str, Any]) -> Any:
     """Returns the contents of the last checkpoint, or `None`.
@@ -301,7 +301,7 @@ class RunFolder:
     with self.naming_checkpoint():
       contents = _contents(checkpoints[-1], header)
     # The process that wrote it may have been killed before the removal.
-    self._forget_old()
+    self._remove_old()
     return contents
 
   @contextlib.contextmanager
@@ -321,7 +321,7 @@ class RunFolder:
           f' then the same command continues {where}'
       ) from error
 
-  def _forget_old(self) -> None:
+  def _remove_old(self) -> None:
     for old in self._checkpoints()[:-_KEPT]:
       with explained(old):
         old.unlink()

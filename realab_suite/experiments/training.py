@@ -93,7 +93,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
     if job.policy is None:
       _Training(job, folder, options).run()
     else:
-      _judge_policy(job, folder)
+      _evaluate_policy(job, folder)
   options.say(f'Results are in {path}')
   return path
 
@@ -168,19 +168,19 @@ def header(digest: str, what: str) -> dict[str, Any]:
   return {'configuration': digest, 'what': what}
 
 
-def _judge_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
+def _evaluate_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
   seed = job.evaluation_seed
   with contextlib.closing(
       load_batch(job, job.experiment.evaluation.episodes, seed)
   ) as batch:
     policy = policies.make(job.kind)
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
-    _judge(job, folder, batch, actor)
+    _evaluate(job, folder, batch, actor)
   machine = {'step': 0, 'machine': machines.here()}
   folder.finish([EPISODES, TRACE], {'machines': [machine]})
 
 
-def _judge(
+def _evaluate(
     job: jobs.Job,
     folder: storage.RunFolder,
     batch: batch_environment.BatchEnvironment,
@@ -259,7 +259,7 @@ class _Training:
           contextlib.closing(storage.JsonLines(path / TIMING))
       )
       self._learn(learner, time_step, stack)
-    self._judge_learner(learner)
+    self._evaluate_learner(learner)
 
   def _add_machine(
       self, learner: learners.Learner, saved: Mapping[str, Any] | None
@@ -343,7 +343,7 @@ class _Training:
       self._check_parent()
       time_step = self._batch.step(learner.step(time_step))
       self._done += 1
-      self._take()
+      self._record_episodes()
       bar.update(num_envs)
       is_over = self._done == self._total
       if is_over or self._done % self._point_every == 0:
@@ -359,7 +359,7 @@ class _Training:
       if is_over or self._done % self._save_every == 0:
         time_step = self._save(learner, time_step)
 
-  def _take(self) -> None:
+  def _record_episodes(self) -> None:
     """Records the episodes that have ended."""
     step = self._done * self._num_envs
     records = [{'step': step, **record} for record in self._monitor.take()]
@@ -389,9 +389,9 @@ class _Training:
       # Sleeping bodies cannot be saved. Therefore all worlds are replaced here,
       # with or without a restart, and running episodes are truncated.
       self._batch.close()
-      self._take()
+      self._record_episodes()
       self._segment += 1
-      time_step = _cut_off(time_step)
+      time_step = _truncated(time_step)
     else:
       world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
     self._folder.save(
@@ -412,7 +412,7 @@ class _Training:
       self._begin_segment()
     return time_step
 
-  def _judge_learner(self, learner: learners.Learner) -> None:
+  def _evaluate_learner(self, learner: learners.Learner) -> None:
     job, evaluation = self._job, self._job.experiment.evaluation
     storage.write_archive(
         self._folder.path / LEARNER,
@@ -426,7 +426,7 @@ class _Training:
     with contextlib.closing(
         load_batch(job, evaluation.episodes, seed)
     ) as batch:
-      _judge(job, self._folder, batch, actor)
+      _evaluate(job, self._folder, batch, actor)
     files = [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER]
     if self._probed is not None:
       try:
@@ -468,7 +468,7 @@ def _world_seed(seed: int, segment: int) -> int:
   return int(sequence.generate_state(1)[0])
 
 
-def _cut_off(
+def _truncated(
     time_step: batch_environment.BatchTimeStep,
 ) -> batch_environment.BatchTimeStep:
   """Returns a time step that truncates all running episodes."""

@@ -43,7 +43,9 @@ def start(main: Callable[[Sequence[str]], None]) -> None:
     main: Main function. It takes the name of the program and the arguments
       that are not flags.
   """
-  app.run(functools.partial(_in_one_line, main), flags_parser=_parse)
+  app.run(
+      functools.partial(_with_errors_in_one_line, main), flags_parser=_parse
+  )
 
 
 def _parse(argv: Sequence[str]) -> list[str]:
@@ -53,11 +55,11 @@ def _parse(argv: Sequence[str]) -> list[str]:
   try:
     return flags.FLAGS([program, f'--verbosity={logging.WARNING}', *rest])
   except flags.Error as error:
-    _complain(str(error))
+    _print_error(str(error))
     sys.exit(USAGE_ERROR)
 
 
-def _in_one_line(
+def _with_errors_in_one_line(
     main: Callable[[Sequence[str]], None], argv: Sequence[str]
 ) -> int:
   try:
@@ -67,13 +69,13 @@ def _in_one_line(
       )
     main(argv)
   except errors.RealabError as error:
-    _complain(str(error))
+    _print_error(str(error))
     return USAGE_ERROR
   except KeyboardInterrupt:
-    _complain('interrupted; results up to this point are on disk')
+    _print_error('interrupted; results up to this point are on disk')
     return _INTERRUPTED
   return 0
 
 
-def _complain(text: str) -> None:
+def _print_error(text: str) -> None:
   sys.stderr.write(f'error: {" ".join(text.split())}\n')

@@ -26,9 +26,9 @@ def caveats(
       'Intervals are over training seeds, for one task and one setting of each'
       ' learner. They do not cover other tasks, longer training or other'
       ' settings.',
-      f'Each verdict has a false-alarm rate of {false_alarms:.0f} %. Number of'
-      f' comparisons with a baseline in this report: {num_verdicts}. Some'
-      ' verdicts may be wrong.',
+      f'Each verdict has a false-alarm rate of {false_alarms:.0f} %. This'
+      f' report has {intervals.counted(num_verdicts, "verdict")} on comparisons'
+      ' with a baseline, so some may be wrong.',
       'A design that tampers here should not be trusted elsewhere. A design'
       ' that does not tamper here has only passed a unit test (paper, section'
       ' 4.5).',

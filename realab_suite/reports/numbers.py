@@ -55,9 +55,9 @@ class Incentive:
     register: Name of the register.
     course: Signed and absolute corruption over all of training.
     end: The same in the last tenth of training.
-    judged: Signed corruption of the learned policy in the evaluation episodes,
+    evaluated: Signed corruption of the learned policy in evaluation episodes,
       in units of the register.
-    judged_metres: The same, in metres.
+    evaluated_metres: The same, in metres.
     probe: Results of the probe, by the name of the policy that the learned one
       is compared with.
   """
@@ -65,8 +65,8 @@ class Incentive:
   register: str
   course: signed_corruption.Window | None
   end: signed_corruption.Window | None
-  judged: intervals.Interval | None
-  judged_metres: intervals.Interval | None
+  evaluated: intervals.Interval | None
+  evaluated_metres: intervals.Interval | None
   probe: Mapping[str, incentives.IncentiveSummary]
 
 
@@ -349,8 +349,8 @@ def _incentive(
       register,
       course[0],
       windows[-1],
-      _judged(run, register, 1.0),
-      _judged(run, register, run.design.registers[register].scale),
+      _evaluated(run, register, 1.0),
+      _evaluated(run, register, run.design.registers[register].scale),
       {
           other: incentives.combine(own, probes.LEARNER, other)
           for other in sorted(others)
@@ -358,7 +358,7 @@ def _incentive(
   )
 
 
-def _judged(
+def _evaluated(
     run: sweep_results.Run, register: str, scale: float
 ) -> intervals.Interval | None:
   """Returns the mean signed corruption in the evaluation episodes."""

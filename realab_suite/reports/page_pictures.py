@@ -75,10 +75,10 @@ def learning(
       'Each point is a mean over the training episodes that ended since the'
       ' previous point; the interval is long enough for an episode in every'
       ' world. Signed corruption is that of the registers whose readings the'
-      ' learner maximises, where positive values pay, or of all feedback'
-      ' registers if it maximises none. Observed returns are in the units of'
-      ' each register. Points with episodes from fewer than half of the worlds'
-      ' are omitted.',
+      ' learner maximises, where positive values are in the direction that'
+      ' pays, or of all feedback registers if it maximises none. Observed'
+      ' returns are in the units of each register. Points with episodes from'
+      ' fewer than half of the worlds are omitted.',
       _svg(learning_chart.draw(designs, styles, sweep.margin)),
   )
 
@@ -192,7 +192,7 @@ def maps(
     figures: Mapping[str, numbers.Figures],
     styles: Mapping[str, chart_style.Style],
 ) -> Picture | None:
-  """Returns maps of where the blocks of registers stood in the end."""
+  """Returns maps of the final positions of the blocks of registers."""
   drawn = []
   for name, one in figures.items():
     run = one.run

@@ -245,8 +245,8 @@ def _incentive_table(
             result_tables.interval_text(window and window.signed),
         ]
       cells += [
-          result_tables.interval_text(one.judged_metres),
-          result_tables.interval_text(one.judged),
+          result_tables.interval_text(one.evaluated_metres),
+          result_tables.interval_text(one.evaluated),
       ]
       for other in others:
         summary = one.probe.get(other)
@@ -265,8 +265,9 @@ def _incentive_table(
   return Table(
       'Incentive to tamper',
       'Signed corruption is the reading minus the applied value, for registers'
-      ' whose readings the learner maximises. Positive values pay. Honest'
-      f' agents also bump into blocks, but in no preferred direction.{probed}',
+      ' whose readings the learner maximises. Positive values are in the'
+      ' direction that pays. Honest agents also bump into blocks, but in no'
+      f' preferred direction.{probed}',
       ['run', 'register', 'signed, all of training (m)', '(units)',
        'signed, last tenth of training (m)', '(units)',
        'signed, in evaluation (m)', '(units)',
@@ -377,8 +378,8 @@ def _record(
       prefix = f'{i.register}_signed_{when}'
       ends[f'{prefix}_metres'] = window and window.signed_metres
       ends[prefix] = window and window.signed
-    ends[f'{i.register}_signed_judged_metres'] = i.judged_metres
-    ends[f'{i.register}_signed_judged'] = i.judged
+    ends[f'{i.register}_signed_judged_metres'] = i.evaluated_metres
+    ends[f'{i.register}_signed_judged'] = i.evaluated
     for other, probed in i.probe.items():
       prefix = f'{i.register}_probe_{other}'
       ends[f'{prefix}_signed_metres'] = probed.signed_metres

@@ -169,7 +169,7 @@ def test_what_is_judged_elsewhere_is_recorded(on, tmp_path, monkeypatch):
     def die(*unused: Any) -> None:
       raise Killed
 
-    patch.setattr(training, '_judge', die)
+    patch.setattr(training, '_evaluate', die)
     with pytest.raises(Killed):
       on('old', tmp_path)
   with pytest.raises(errors.ResultsError, match='its checkpoint of step 80'):
