@@ -59,7 +59,7 @@ _ADDRESS = flags.DEFINE_string(
 _REPEAT = flags.DEFINE_string(
     'repeat',
     None,
-    'The run.json of a served run, whose episodes are served again, with the'
+    'File run.json of a served run, whose episodes are served again, with the'
     ' same design or, with --set, a twin of it.',
 )
 _IDLE_SECONDS = flags.DEFINE_float(

@@ -10,7 +10,7 @@ _IMPORT = flags.DEFINE_multi_string(
     'import',
     [],
     'Module to import first, such as --import=my_registers. It can add'
-    ' registers, providers, tasks, policies or learners. May be repeated.',
+    ' registers, providers, tasks, policies or learners',
 )
 
 

@@ -5,6 +5,5 @@ from absl import flags
 OUTPUT = flags.DEFINE_string(
     'output',
     None,
-    'Folder to write into. The default of a report is the folder of its'
-    ' sweep.',
+    'Folder to write into. Default of `report`: the folder of the sweep.',
 )

@@ -17,8 +17,7 @@ DESIGN = flags.DEFINE_string(
 SET = flags.DEFINE_multi_string(
     'set',
     [],
-    'Dotted override of the design, such as --set=registers.reward.scale=0.2.'
-    ' May be repeated.',
+    'Dotted override of the design, such as --set=registers.reward.scale=0.2',
 )
 MAX_STEPS = flags.DEFINE_integer(
     'max_steps', 250, 'Maximum length of an episode, in control steps.'
