@@ -250,7 +250,7 @@ def _world_legend(track: tracking.Track) -> list[Any]:
       _marker('o', 'avatar at the start'),
       _marker('X', 'avatar at the end'),
       dotted,
-      _marker(r'$\rightarrow$', 'displacement of a block', color=_INK),
+      _marker(r'$\rightarrow$', 'block displacement', color=_INK),
   ]
   for role in dict.fromkeys(r.role for r in track.registers.values()):
     base, offset = appearance.ROLE_COLOURS[role]
