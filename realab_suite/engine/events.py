@@ -3,7 +3,7 @@
 import abc
 from collections.abc import Mapping, Sequence
 import enum
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 
@@ -132,6 +132,29 @@ class BatchStep(NamedTuple):
   agent_reads: Sequence[registers.Read]
   true_reward: np.ndarray
   failure: str | None = None
+
+  @classmethod
+  def between(
+      cls,
+      seed: np.ndarray,
+      world: np.ndarray,
+      episode: np.ndarray,
+      ends: Mapping[int, End],
+  ) -> Self:
+    """Returns a step in which episodes end and nothing else happens."""
+    nowhere = np.zeros(len(episode), bool)
+    return cls(
+        seed=seed,
+        world=world,
+        episode=episode,
+        is_first=nowhere,
+        has_failed=~nowhere,
+        ends=ends,
+        initial=[],
+        records=[],
+        agent_reads=[],
+        true_reward=np.zeros(len(episode)),
+    )
 
 
 class BatchEventSink(abc.ABC):

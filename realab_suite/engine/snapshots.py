@@ -5,7 +5,7 @@ rest are numbers, texts and arrays in nested containers. `archive.py` turns them
 into bytes.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import hashlib
 from typing import Any, NamedTuple, Self, final
 
@@ -160,6 +160,38 @@ class WorldStates(NamedTuple):
           f'the snapshot was saved with sinks {saved}; this environment has'
           f' {kinds}; allowed are the same ones, or none here'
       )
+
+  def merged_into(
+      self,
+      states: Sequence[Any],
+      observation: dict[str, np.ndarray],
+      indices: np.ndarray,
+      rows: np.ndarray,
+  ) -> tuple[list[Any], dict[str, np.ndarray]]:
+    """Returns a batch's provider states and observation with worlds restored.
+
+    Args:
+      states: State of each provider of the batch.
+      observation: Observation of the batch; empty before its first episode.
+      indices: Indices in the batch of the worlds to restore.
+      rows: The saved world that each of them gets.
+
+    Raises:
+      StateLayoutError: If the snapshot does not fit.
+    """
+    saved: Any = self.provider_states
+    if self.indices is None:
+      saved = of_batch(saved)
+    merged = [
+        merge(f'the state of providers[{i}]', here, indices, there)
+        for i, (here, there) in enumerate(
+            zip(states, spread(saved, rows), strict=True)
+        )
+    ]
+    seen = spread(self.observation, rows)
+    if observation:
+      seen = merge('observation', observation, indices, seen)
+    return merged, seen
 
 
 def of_batch(tree: Any) -> Any:

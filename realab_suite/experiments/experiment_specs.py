@@ -45,13 +45,10 @@ class RunSpec(validation.Spec):
   twin: bool = False
   steps: _Count | None = None
 
-  def load(
-      self, channel: str | None = None, *, is_confined: bool = False
-  ) -> specs.DesignSpec:
+  def load(self, *, is_confined: bool = False) -> specs.DesignSpec:
     """Returns the design with the changes of this run.
 
     Args:
-      channel: Channel to use, or `None` for that of the design.
       is_confined: True if the design and the files that it names must be within
         the working directory.
 
@@ -59,15 +56,21 @@ class RunSpec(validation.Spec):
       SpecError: If the design is invalid.
     """
     design = specs.load(self.design, self.overrides, is_confined=is_confined)
-    changes: dict[str, Any] = {}
-    if self.learner:
-      own = {} if design.learner is None else design.learner.model_dump()
-      changes['learner'] = {**own, **self.learner}
-    if channel is not None:
-      changes['channel'] = channel
-    # Later problems belong to the run and not to the file of the design.
-    changed = loading.read_mapping({**design.to_mapping(), **changes})
-    return validation.validate(specs.DesignSpec, changed, '')
+    if not self.learner:
+      return design
+    own = {} if design.learner is None else design.learner.model_dump()
+    return _changed(design, learner={**own, **self.learner})
+
+
+def secure_twin(design: specs.DesignSpec) -> specs.DesignSpec:
+  """Returns the secure twin of a design."""
+  return _changed(design, channel=TWIN)
+
+
+def _changed(design: specs.DesignSpec, **changes: Any) -> specs.DesignSpec:
+  # Problems from here on belong to the run and not to the file of the design.
+  changed = loading.read_mapping({**design.to_mapping(), **changes})
+  return validation.validate(specs.DesignSpec, changed, '')
 
 
 @final

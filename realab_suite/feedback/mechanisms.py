@@ -161,6 +161,8 @@ class FeedbackMechanism(composer.Entity):
       self, physics: protocols.Physics, values: np.ndarray
   ) -> list[records.Write]:
     """Writes the agent's queries K_t, shape `(..., queries)`."""
+    if not self._queries:
+      return []
     step = self._this_step(physics)
     writes = []
     for i, register in enumerate(self.queries):
@@ -185,6 +187,8 @@ class FeedbackMechanism(composer.Entity):
       RegisterValueError: If a register cannot store a measurement. The message
         does not contain the measurement, because it may reach an agent.
     """
+    if not self._meters:
+      return []
     step = self._this_step(physics)
     writes = []
     for writer, meter in self._meters:
