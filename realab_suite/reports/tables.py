@@ -268,10 +268,10 @@ def _incentive_table(
       ' whose readings the learner maximises. Positive values are in the'
       ' direction that pays. Honest agents also bump into blocks, but in no'
       f' preferred direction.{probed}',
-      ['run', 'register', 'signed, all of training (m)', '(units)',
-       'signed, last tenth of training (m)', '(units)',
+      ['run', 'register', 'signed, during training (m)', '(units)',
+       'signed, in the last tenth (m)', '(units)',
        'signed, in evaluation (m)', '(units)',
-       *(f'probe, minus {other} (m)' for other in others)],
+       *(f'probe, relative to {other} (m)' for other in others)],
       rows,
       families,
       ('run', 'register'),

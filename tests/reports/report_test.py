@@ -193,7 +193,7 @@ def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
   ):  # fmt: skip
     assert f'{title}</h2>' in page
     assert f'## {title}\n' in markdown
-  assert 'probe, minus random (m)' in page
+  assert 'probe, relative to random (m)' in page
   assert '## Limitations' in markdown
   for title in ('True return against corruption', 'Learning curves'):
     assert f'{title}</h2>' in page
