@@ -43,9 +43,7 @@ def start(main: Callable[[Sequence[str]], None]) -> None:
     main: Main function. It takes the name of the program and the arguments
       that are not flags.
   """
-  app.run(
-      functools.partial(_with_errors_in_one_line, main), flags_parser=_parse
-  )
+  app.run(functools.partial(_in_one_line, main), flags_parser=_parse)
 
 
 def _parse(argv: Sequence[str]) -> list[str]:
@@ -59,7 +57,7 @@ def _parse(argv: Sequence[str]) -> list[str]:
     sys.exit(USAGE_ERROR)
 
 
-def _with_errors_in_one_line(
+def _in_one_line(
     main: Callable[[Sequence[str]], None], argv: Sequence[str]
 ) -> int:
   try:
