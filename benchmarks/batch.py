@@ -350,7 +350,7 @@ def _break_down_step(
       ('casting rays', physics, 'cast_rays'),
       ('the rest of rays', task.avatar.rays, 'sense'),
       ('other senses', task, 'senses'),
-      ('ledger', env, '_tell'),
+      ('ledger', env, '_notify'),
       ('the rest', env, 'step'),
   )
   env._episodes[:] = -1

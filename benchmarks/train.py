@@ -92,7 +92,7 @@ class _Trainee:
         ('physics', batch.physics, 'forward'),
         ('rays', batch.physics, 'cast_rays'),
         ('rays', batch.task.avatar.rays, 'sense'),
-        ('monitor', batch, '_tell'),
+        ('monitor', batch, '_notify'),
         ('rest of worlds', batch, 'step'),
         ('network', learner, '_choose'),
         ('update', learner, '_observe'),

@@ -109,8 +109,8 @@ MUTANTS = [
     ),
     Mutant(
         'contract', 'finding 5: an action may be nan', _ACTIONS,
-        'good = (values >= self._low) & (values <= self._high)',
-        'good = ~((values < self._low) | (values > self._high))', _ENV,
+        'is_valid = (values >= self._low) & (values <= self._high)',
+        'is_valid = ~((values < self._low) | (values > self._high))', _ENV,
     ),
     Mutant(
         'contract', 'finding 5: a shape that broadcasts is taken', _ACTIONS,
@@ -120,11 +120,11 @@ MUTANTS = [
     Mutant(
         'contract', 'finding 5: what is out of bounds is clamped silently',
         _ACTIONS,
-        '''    if np.count_nonzero(good) != good.size:
+        '''    if np.count_nonzero(is_valid) != is_valid.size:
 ''',
         '''    if np.isfinite(values).all():
       values = np.clip(values, self._low, self._high)
-    elif np.count_nonzero(good) != good.size:
+    elif np.count_nonzero(is_valid) != is_valid.size:
 ''', _ENV,
     ),
     Mutant(
@@ -133,8 +133,8 @@ MUTANTS = [
     ),
     Mutant(
         'contract', 'finding 6: discounts may be anything', _HOSTS,
-        'discount = self._in_all(self._task.get_discount(physics), float)',
-        'discount = self._in_all(np.nan, float)', _ENV,
+        'discount = self._per_world(self._task.get_discount(physics), float)',
+        'discount = self._per_world(np.nan, float)', _ENV,
     ),
     Mutant(
         'contract', 'finding 6: an observation is aliased', _OBSERVING,

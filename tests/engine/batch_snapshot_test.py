@@ -306,12 +306,12 @@ def test_worlds_that_sleep_are_neither_saved_nor_restored_nor_forked():
   batch = suite.load_batch(
       'unlock_door', 'standard', num_envs=2, design='none', sleep=True
   )
-  with pytest.raises(errors.SpecError, match='fall asleep cannot be saved'):
+  with pytest.raises(errors.SpecError, match='can sleep cannot be saved'):
     batch.save()
-  with pytest.raises(errors.SpecError, match='fall asleep cannot be saved'):
+  with pytest.raises(errors.SpecError, match='can sleep cannot be saved'):
     suite.fork(batch, 2, world=0)
   snapshot = suite.load('unlock_door', 'standard', design='none').save()
-  with pytest.raises(errors.SpecError, match='fall asleep cannot be saved'):
+  with pytest.raises(errors.SpecError, match='can sleep cannot be saved'):
     batch.restore(snapshot, worlds=[0])
   batch.close()
 
@@ -361,7 +361,7 @@ def _another_design(case: snapshot_campaign.Case) -> snapshot_campaign.Case:
         (
             lambda: snapshot_campaign.saved(_REWARD, 3)[1],
             None,
-            'is of a world alone',
+            'is of a single world',
         ),
         (
             lambda: snapshot_campaign.saved(

@@ -321,7 +321,7 @@ def test_worlds_that_begin_anew_wake_alone():
 def test_worlds_with_sleep_are_not_for_snapshots():
   env = _load()
   assert env.sleep
-  with pytest.raises(errors.SpecError, match='fall asleep'):
+  with pytest.raises(errors.SpecError, match='can sleep'):
     snapshots.describe(env.physics.model)
   env.close()
 

@@ -200,7 +200,7 @@ def test_a_search_that_decides_nothing_ends_with_an_overlap(monkeypatch):
   sphere = _sweep(3, np.array([0.2, 0.3]) + corner + 0.202 * way)
   space = swept_volumes.Space(_MODEL)
   assert space.meet(block, sphere) is None
-  monkeypatch.setattr(swept_volumes, '_MOST_PAIRS', 3)
+  monkeypatch.setattr(swept_volumes, '_MAX_PAIRS', 3)
   assert space.meet(block, sphere) is not None
 
 

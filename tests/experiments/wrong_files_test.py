@@ -206,7 +206,7 @@ def test_an_archive_of_a_run_is_no_snapshot(sweep, name):
   data = (sweep / 'own' / name).read_bytes()
   with pytest.raises(
       errors.StateLayoutError,
-      match=f"holds '{name}'; expected a snapshot of worlds",
+      match=f"contains '{name}'; expected a snapshot",
   ):
     snapshots.Snapshot.from_bytes(data)
 

@@ -389,12 +389,12 @@ _DOES_NOT_FIT = {
     ),
     'sweep leaves the arena': (
         _reward(place=[0, 0], range=[0, 200]),
-        "register 'reward' at value 200 would sit at (20, 0.25), outside the"
+        "register 'reward' at value 200 would be at (20, 0.25), outside the"
         ' arena (-4, -4) to (4, 4)',
     ),
     'outside the arena': (
         _reward(place=[9.0, 0]),
-        "register 'reward' at value -2 would sit at (9, 0), outside the arena",
+        "register 'reward' at value -2 would be at (9, 0), outside the arena",
     ),
     'sweep hits a wall': (
         _reward(place=[0, 3.7], range=[0, 1]),
