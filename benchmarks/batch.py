@@ -1,23 +1,24 @@
-"""Many worlds together, against the raw batch engine doing the same.
+"""Benchmark of a batch of worlds against MuJoCo's own batch engine.
 
 `python -m benchmarks.batch` steps 256 worlds of Unlock Door with two free
 two-block registers, rays, a ledger and random actions that use the hand, on all
-processors. MuJoCo's own `Batch` replays it from a copy of the state: the same
-substeps, the same writes as assignments to whole arrays, one update of derived
-quantities, the same rays cast by a second `Batch`. Both have to end in the same
-state, bit for bit, in every round.
+processors. MuJoCo's `Batch` replays the steps from a copy of the state: the
+same substeps, the same writes as assignments to whole arrays, one update of
+derived quantities, and the same rays cast by a second `Batch`. Both have to end
+in the same state, bit for bit, in every round.
 
-The stock contestant is one `composer.Environment` as dm_control makes it, with
-the same world and registers: the model is compiled again in each episode, what
-the avatar senses are observables, and the task writes both registers after each
-step. It keeps no ledger.
+The stock contestant is a `composer.Environment` of dm_control with the same
+world and registers. It compiles the model for each episode, the avatar's senses
+are observables, and the task writes both registers after each step. It has no
+ledger.
 
-The same is timed with planar registers and with blocks that fall asleep, each
-against a stock environment with registers of its kind. What is asked of the
-fastest of them, planar and asleep, is 15 times the steps of one of stock.
+The benchmark is repeated with planar registers and with blocks that sleep, each
+against a stock environment with registers of the same kind. The target for the
+fastest of them, planar blocks that sleep, is 15 times the throughput of the
+stock environment.
 
-How costs grow with worlds, registers and apples is timed in a third of the
-rounds.
+A third of the rounds measures how costs grow with the numbers of worlds,
+registers and apples.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,14 +53,14 @@ _STEPS = 20
 _STOCK_STEPS = 100
 _ROUNDS = 8
 _SEED = 0
-# How many steps of how many worlds show how throughput grows.
+# Numbers of steps by numbers of worlds, to measure how throughput grows.
 _SIZES = {1: 64, 16: 16, 64: 8, 256: 4, 1024: 4}
 _REGISTERS = (1, 2, 4)
 _REGISTER_STEPS = 4
 _APPLES = (4, 8, 16)
 _MEMORY_WORLDS = 1024
 
-# How blocks can move, and whether they fall asleep.
+# Degrees of freedom of the blocks, and whether they sleep, by label.
 _KINDS = {
     'free': ('free', False),
     'free, asleep': ('free', True),
@@ -69,19 +70,19 @@ _KINDS = {
 _FASTEST = 'planar, asleep'
 
 # At least 0.85 of the throughput of the raw engine.
-_MOST_LOST = 15.0
+_MAX_LOST = 15.0
 # At least 15 times the throughput of stock Composer.
-_MOST_OF_STOCK = 100 / 15
+_MAX_OF_STOCK = 100 / 15
 _RESET_TARGET_MS = 0.2
 _MEMORY_TARGET_MIB = 1.0
 
-# What a world may set between substeps besides blocks and controls: the door,
-# eaten apples, the grip of the hand, what it throws.
+# Fields that a world may write between substeps besides blocks and controls: of
+# the door, eaten apples, the grip of the hand, and thrown blocks.
 _OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')
 _STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 Phase = tuple[list[tuple[np.ndarray, np.ndarray]], int]
-"""What is written, each a view and its new value, and substeps after it."""
+"""Writes, each a view and its new value, and the number of substeps after."""
 
 Rays = tuple[np.ndarray, np.ndarray, int]
 """Origins, directions and the body that rays pass through."""
@@ -90,14 +91,14 @@ Rays = tuple[np.ndarray, np.ndarray, int]
 @final
 @dataclasses.dataclass(frozen=True)
 class RawSteps:
-  """Steps of a batch, for the raw engine to replay.
+  """Recorded steps of a batch, which the raw engine replays.
 
   Attributes:
-    batch: Steps the worlds; the views of `steps` point into it.
-    ray_batch: Casts the rays.
-    start: The state before the first step.
-    steps: What happens in each control step.
-    rays: What is cast at the end of each control step.
+    batch: Batch that steps the worlds; the views in `steps` are of its arrays.
+    ray_batch: Batch that casts the rays.
+    start: State before the first step.
+    steps: Phases of each control step.
+    rays: Rays at the end of each control step.
   """
 
   batch: mujoco_batch.Batch
@@ -107,7 +108,7 @@ class RawSteps:
   rays: list[Rays]
 
   def replay(self) -> float:
-    """Runs the steps and returns the seconds that a control step took."""
+    """Runs the steps and returns the seconds per control step."""
     batch, ray_batch = self.batch, self.ray_batch
     batch.state[:] = self.start
     began = time.perf_counter()
@@ -126,7 +127,7 @@ class RawSteps:
 
 @final
 class StockTask(composer.Task):
-  """Unlock Door with two registers, as a task of stock Composer's."""
+  """Unlock Door with two registers, as a task for stock Composer."""
 
   def __init__(self, dof: str) -> None:
     self._world = unlock_door.UnlockDoor()
@@ -175,7 +176,7 @@ class StockTask(composer.Task):
 
 @final
 class _Stock:
-  """One world of stock Composer's, and how long it takes."""
+  """Contestant with one world in a stock `composer.Environment`."""
 
   def __init__(self, dof: str) -> None:
     self._env = composer.Environment(StockTask(dof), random_state=_SEED)
@@ -185,13 +186,13 @@ class _Stock:
     )
 
   def reset(self) -> float:
-    """Begins an episode and returns the seconds that it took."""
+    """Begins an episode and returns the seconds that it takes."""
     began = time.perf_counter()
     self._env.reset()
     return time.perf_counter() - began
 
   def step(self) -> float:
-    """Plays an episode and returns the seconds that a step took."""
+    """Plays an episode and returns the seconds per step."""
     self._env.reset()
     began = time.perf_counter()
     for action in self._actions:
@@ -205,7 +206,7 @@ def _load(
     dof: str = 'free',
     sleep: bool = False,
 ) -> batch_environment.BatchEnvironment:
-  """Loads worlds that an evaluator listens to."""
+  """Loads a batch with a ledger."""
   env = suite.load_batch(
       'unlock_door',
       'standard',
@@ -231,8 +232,8 @@ def _draw(
 def _play(
     env: batch_environment.BatchEnvironment, actions: np.ndarray
 ) -> float:
-  """Plays the first episodes and returns the seconds that a step took."""
-  # Only the environment of one world can be rewound so far.
+  """Plays the first episodes and returns the seconds per step."""
+  # `rewind` exists only for single environments.
   env._episodes[:] = -1
   env.reset()
   began = time.perf_counter()
@@ -242,7 +243,7 @@ def _play(
 
 
 def _reset(env: batch_environment.BatchEnvironment) -> float:
-  """Begins other episodes and returns the seconds that it took."""
+  """Begins new episodes and returns the seconds that this takes."""
   began = time.perf_counter()
   env.reset()
   return time.perf_counter() - began
@@ -251,7 +252,7 @@ def _reset(env: batch_environment.BatchEnvironment) -> float:
 def _record(
     env: batch_environment.BatchEnvironment, actions: np.ndarray
 ) -> RawSteps:
-  """Plays the first episodes, with the raw engine in step."""
+  """Plays the first episodes and records them for the raw engine."""
   env._episodes[:] = -1
   env.reset()
   physics = env.physics
@@ -261,7 +262,7 @@ def _record(
   )
   start = true.state.copy()
   raw.state[:] = start
-  # The meter and the provider write the blocks that carry the values.
+  # The meter and the provider write the offset blocks.
   meter, provider = (env.mechanism.registers[n] for n in ('score', 'reward'))
   routine = [
       [(raw.bind('ctrl'), true.bind('ctrl'))],
@@ -322,13 +323,13 @@ def _pose_views(
 
 
 def _check_same(env: batch_environment.BatchEnvironment, raw: RawSteps) -> None:
-  """Raises an error if the raw engine has not done the same."""
+  """Raises an error if the raw engine has reached another state."""
   for name in ('qpos', 'qvel', 'time', 'qacc_warmstart'):
     true, other = env.physics._batch.bind(name), raw.batch.bind(name)
     if true.tobytes() != other.tobytes():
       raise RuntimeError(
-          f'the raw engine ended with another {name} than the environment, so'
-          ' their times cannot be compared'
+          f'the raw engine and the environment differ in {name}, so their times'
+          ' cannot be compared'
       )
 
 
@@ -337,7 +338,7 @@ def _break_down_step(
     actions: np.ndarray,
     raw_us: float,
 ) -> list[timing.Figure]:
-  """Says where the time of a step goes, timers included."""
+  """Returns the time of each part of a step, including the timers."""
   task, mechanism, physics = env.task, env.mechanism, env.physics
   parts = (
       ('substeps', physics, 'advance'),
@@ -376,17 +377,17 @@ def _break_down_step(
 def _break_down_reset(
     env: batch_environment.BatchEnvironment,
 ) -> list[timing.Figure]:
-  """Says where the time of a reset goes, timers included."""
+  """Returns the time of each part of a reset, including the timers."""
   task = env.task
   parts = (
       ('resetting the state', env.physics, 'reset'),
       ('random states', seeding, 'random_state'),
       ('keys of providers', seeding, 'episode_key'),
-      ('where apples lie', task, '_scatter'),
+      ('positions of apples', task, '_scatter'),
       ('placing the avatar', task, '_place_avatar'),
       ('the rest of the world', task, 'initialize_episode'),
       ('registers', env, '_initialize'),
-      ('looking', env, '_observe'),
+      ('observations', env, '_observe'),
       ('the rest', env, 'reset'),
   )
   split = _split(parts, env.reset)
@@ -401,7 +402,12 @@ def _break_down_reset(
 def _split(
     parts: Sequence[tuple[str, Any, str]], work: Any
 ) -> dict[str, tuple[float, int]]:
-  """Returns the seconds and the calls of each of some methods in some work."""
+  """Returns the seconds and the number of calls of each part, by label.
+
+  Args:
+    parts: Label, owner and name of each method.
+    work: Function to time.
+  """
   watch = timing.Stopwatch()
   with contextlib.ExitStack() as stack:
     for label, owner, name in parts:
@@ -412,7 +418,7 @@ def _split(
 
 
 def _grow_worlds(rounds: int) -> list[timing.Figure]:
-  """Says how throughput grows with the number of worlds."""
+  """Measures how throughput grows with the number of worlds."""
   playing = {}
   for number, num_steps in _SIZES.items():
     env = _load(number)
@@ -434,7 +440,7 @@ def _grow_worlds(rounds: int) -> list[timing.Figure]:
 
 
 def _design(dof: str, number: int) -> dict[str, Any]:
-  """Returns a design of registers that are written in each step."""
+  """Returns a design with registers that are written in each step."""
   names = [f'register_{i}' for i in range(1, number + 1)]
   return {
       'schema': 1,
@@ -455,7 +461,7 @@ def _design(dof: str, number: int) -> dict[str, Any]:
 
 
 def _grow_registers(rounds: int) -> list[timing.Figure]:
-  """Says what registers cost; twice as many may cost twice as much."""
+  """Measures the cost of registers, which may grow linearly."""
   playing = {}
   for dof in ('free', 'planar'):
     for number in _REGISTERS:
@@ -484,7 +490,7 @@ def _grow_registers(rounds: int) -> list[timing.Figure]:
 
 
 def _grow_apples(rounds: int) -> list[timing.Figure]:
-  """Says what apples cost, which are looked at in each substep."""
+  """Measures the cost of apples, whose state is read in each phase."""
   playing = {}
   for number in _APPLES:
     with mock.patch.object(unlock_door, '_NUM_APPLES', number):
@@ -518,13 +524,13 @@ def _grow_apples(rounds: int) -> list[timing.Figure]:
 
 
 def _resident_mib() -> float:
-  """Returns how much memory this process has, as Linux counts it."""
+  """Returns the resident memory of this process on Linux, in MiB."""
   pages = int(pathlib.Path('/proc/self/statm').read_text().split()[1])
   return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
 def measure_memory(num_envs: int, sleep: bool) -> None:
-  """Prints the MiB before worlds are made, with one, and with many."""
+  """Prints the memory without a batch, with one world and with `num_envs`."""
   single = suite.load(
       'unlock_door', 'standard', {'random': _SEED},
       design='instantaneous_reward',
@@ -541,7 +547,7 @@ def measure_memory(num_envs: int, sleep: bool) -> None:
 
 
 def _measure_memory() -> list[timing.Figure]:
-  """Returns the memory of worlds, measured in processes of their own."""
+  """Measures the memory of worlds in separate processes."""
   figures = []
   for sleep in (False, True):
     code = (
@@ -573,7 +579,7 @@ def _measure_memory() -> list[timing.Figure]:
 def _compare_to_stock(
     seconds: Mapping[str, np.ndarray],
 ) -> list[timing.Figure]:
-  """Says how much a world gets done while one of stock takes a step."""
+  """Compares the worlds of each batch with a stock environment."""
   figures = []
   for label, (dof, _) in _KINDS.items():
     stock = seconds[f'stock, {dof}']
@@ -584,7 +590,7 @@ def _compare_to_stock(
               "a world's step, of a stock step",
               100 * taken / stock,
               '%',
-              round(_MOST_OF_STOCK, 2),
+              round(_MAX_OF_STOCK, 2),
           )
       )
     figures += [
@@ -636,7 +642,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
   timing.report([
       timing.Figure(
           'throughput lost to raw engine', 100 * (1 - raw_us / us), '%',
-          _MOST_LOST, ratios=us / raw_us,
+          _MAX_LOST, ratios=us / raw_us,
       ),
       timing.Figure("a world's step", us, 'us', ratios=us / raw_us),
       timing.Figure('raw step', raw_us, 'us'),
