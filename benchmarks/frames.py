@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import time
 from unittest import mock
 
+from dm_control import mjcf
 import numpy as np
 
 from benchmarks import timing
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
   )
   # The implementation for `mjcf.Physics` renders with dm_control.
   by_dm_control = mock.patch.object(
-      cameras, 'look', cameras.render.dispatch(object)
+      cameras, 'render', cameras.render.dispatch(mjcf.Physics)
   )
 
   def play_as_dm_control() -> float:
