@@ -41,10 +41,10 @@ class _Threads(threading.local):
 
 
 _threads = _Threads()
-_started: list[Any] = []
-_forked_from: list[int] = []
+_gl_contexts: list[Any] = []
+_parent_ids: list[int] = []
 # Freeing these in the wrong GL context would delete textures of others.
-_abandoned: list[mujoco.MjrContext] = []
+_unfreed: list[mujoco.MjrContext] = []
 
 
 @final
@@ -118,13 +118,13 @@ class FrameRenderer:
         self._model, data, self._option, None, self._camera,
         mujoco.mjtCatBit.mjCAT_ALL, self._scene,
     )  # fmt: skip
-    upside_down = np.empty((*self._size, 3), np.uint8)
+    flipped = np.empty((*self._size, 3), np.uint8)
     with self._gl.make_current():
       # Another renderer of this thread may have selected its own buffer.
       mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
       mujoco.mjr_render(self._rect, self._scene, self._context)
-      mujoco.mjr_readPixels(upside_down, None, self._rect, self._context)
-    return np.ascontiguousarray(upside_down[::-1])
+      mujoco.mjr_readPixels(flipped, None, self._rect, self._context)
+    return np.ascontiguousarray(flipped[::-1])
 
   def free(self) -> None:
     """Frees the graphics resources. Freeing them again has no effect."""
@@ -160,11 +160,11 @@ def _start() -> Any:
     _display.load_llvm()
     _threads.gl = _render.Renderer(max_width=1, max_height=1)
     reference = weakref.ref(_threads.gl)
-    _started.append(reference)
+    _gl_contexts.append(reference)
     if threading.current_thread() is not threading.main_thread():
       # At exit, the main thread would try to free this thread's context and
       # fail. Handlers run in reverse order, so this one precedes dm_control's.
-      atexit.register(_leave, reference)
+      atexit.register(_abandon, reference)
   return _threads.gl
 
 
@@ -173,7 +173,7 @@ def _free(
 ) -> None:
   """Frees a rendering context in its own thread, and abandons it elsewhere."""
   if gl.terminated:
-    _abandoned.append(context)
+    _unfreed.append(context)
   elif threading.current_thread() is thread:
     with gl.make_current():
       context.free()
@@ -181,39 +181,39 @@ def _free(
     if thread is not threading.main_thread():
       gl.free()  # Has no effect while another renderer uses it.
   else:
-    _abandoned.append(context)
+    _unfreed.append(context)
     if not thread.is_alive():
-      _disown(gl)
+      _mark_terminated(gl)
 
 
-def _leave(reference: weakref.ref[Any]) -> None:
+def _abandon(reference: weakref.ref[Any]) -> None:
   """Leaves a GL context to the operating system."""
   if (gl := reference()) is not None:
-    _disown(gl)
+    _mark_terminated(gl)
 
 
-def _disown(gl: Any) -> None:
+def _mark_terminated(gl: Any) -> None:
   """Marks a GL context as freed, so that dm_control does not free it."""
   gl._render_executor._terminated = True
 
 
 def _refuse_forks() -> None:
-  if _forked_from:
+  if _parent_ids:
     raise errors.ForkError(
-        f'camera: process {_forked_from[0]} started GL before it forked this'
+        f'camera: process {_parent_ids[0]} started GL before it forked this'
         ' one, so rendering would hang; start processes with spawn, or fork'
         ' before the first frame'
     )
 
 
-def _note_fork() -> None:
-  if _started and not _forked_from:
-    _forked_from.append(os.getppid())
-    for reference in _started:
-      _leave(reference)
+def _record_fork() -> None:
+  if _gl_contexts and not _parent_ids:
+    _parent_ids.append(os.getppid())
+    for reference in _gl_contexts:
+      _abandon(reference)
 
 
-os.register_at_fork(after_in_child=_note_fork)
+os.register_at_fork(after_in_child=_record_fork)
 
 
 def _first_line(error: Exception) -> str:

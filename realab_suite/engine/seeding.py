@@ -117,8 +117,8 @@ def sequence(
     stream: Name of the stream.
   """
   if isinstance(seed, SaltedSeed):
-    # A seed sequence is not a one-way function: with it alone, the salt, and so
-    # every other stream, could be computed from the words of one stream.
+    # A seed sequence is not a one-way function. With it alone, the salt and all
+    # other streams could be computed from the words of one stream.
     words = hashlib.blake2b(
         f'{seed},{world},{episode},{stream}'.encode(),
         key=seed.salt,

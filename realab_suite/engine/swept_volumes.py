@@ -113,13 +113,13 @@ class Space:
   """
 
   def __init__(self, model: mujoco.MjModel) -> None:
-    """Copies the model."""
+    """Copies a compiled model."""
     self._model = copy.copy(model)
     self._data = mujoco.MjData(self._model)
     self._is_box = model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
     # Half the size of a box around each geom, with the same centre.
     self._half = np.abs(model.geom_aabb[:, :3]) + model.geom_aabb[:, 3:]
-    # Distance around that box that belongs to the geom.
+    # Width of a margin around that box that is part of the geom.
     self._margin = np.zeros(model.ngeom)
     for geom in np.flatnonzero(model.geom_type == _CAPSULE).tolist():
       # MuJoCo does not detect a capsule that passes entirely through a box.
