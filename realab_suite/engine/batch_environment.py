@@ -62,7 +62,7 @@ class BatchEnvironment:
       num_threads: int = 0,
       sleep: bool = False,
   ) -> None:
-    """Initializes the batch. `suite.load_batch` is more convenient.
+    """Initializes the batch. Prefer `suite.load_batch`.
 
     Args:
       single: New environment with a task of this package. The batch takes

@@ -50,7 +50,7 @@ class Environment(composer.Environment):
       world: int = 0,
       max_steps: int | None = None,
   ) -> None:
-    """Initializes it. `suite.load` and `suite.embed` are more convenient.
+    """Initializes the environment. Prefer `suite.load` or `suite.embed`.
 
     Args:
       task: Task with `mechanism` attached to its root entity.
