@@ -1,8 +1,17 @@
-"""What holds for every test: no GL unless asked for, the same examples always.
+"""Settings of every test: no GL by default, and profiles of hypothesis.
 
-Tests run with `MUJOCO_GL=disable`. One that renders is marked `camera` and is
-run by a process of its own with `MUJOCO_GL=egl`, because the choice of renderer
-is made when dm_control is imported. Where there is no EGL it is skipped.
+Tests run with `MUJOCO_GL=disable`. A test that renders is marked `camera` and
+runs in a process of its own with `MUJOCO_GL=egl`, because dm_control chooses
+the renderer when it is imported. Such tests are skipped without EGL.
+
+`REALAB_HYPOTHESIS_PROFILE` selects the number of examples of property tests:
+
+* `ci`, the default: few examples, the same ones in every run.
+* `long`: many examples, other ones in every run. Run it as
+  `REALAB_HYPOTHESIS_PROFILE=long python -m pytest tests/...`.
+
+A property test whose examples are unusually cheap or expensive scales the
+number of the profile, `hypothesis.settings.default.max_examples`.
 """
 
 import functools
@@ -20,14 +29,20 @@ import pytest
 from tests import gate
 from tests import patience
 
-hypothesis.settings.register_profile(
-    'realab',
+_EVERY_PROFILE = hypothesis.settings(
     deadline=None,
-    derandomize=True,
     database=None,
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
-hypothesis.settings.load_profile('realab')
+hypothesis.settings.register_profile(
+    'ci', _EVERY_PROFILE, max_examples=30, derandomize=True
+)
+hypothesis.settings.register_profile(
+    'long', _EVERY_PROFILE, max_examples=1_000, print_blob=True
+)
+hypothesis.settings.load_profile(
+    os.environ.get('REALAB_HYPOTHESIS_PROFILE', 'ci')
+)
 
 _ROOT = pathlib.Path(__file__).parents[1]
 _RENDERS_SOMETHING = """
