@@ -10,8 +10,8 @@ the renderer when it is imported. Such tests are skipped without EGL.
 * `long`: many examples, other ones in every run. Run it as
   `REALAB_HYPOTHESIS_PROFILE=long python -m pytest tests/...`.
 
-A property test whose examples are unusually cheap or expensive scales the
-number of the profile, `hypothesis.settings.default.max_examples`.
+A property test whose examples are expensive scales the number of the profile
+with `tests/examples.py`.
 """
 
 import functools
@@ -35,10 +35,10 @@ _EVERY_PROFILE = hypothesis.settings(
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.register_profile(
-    'ci', _EVERY_PROFILE, max_examples=30, derandomize=True
+    'ci', _EVERY_PROFILE, max_examples=100, derandomize=True
 )
 hypothesis.settings.register_profile(
-    'long', _EVERY_PROFILE, max_examples=1_000, print_blob=True
+    'long', _EVERY_PROFILE, max_examples=4_000, print_blob=True
 )
 hypothesis.settings.load_profile(
     os.environ.get('REALAB_HYPOTHESIS_PROFILE', 'ci')

@@ -14,6 +14,7 @@ from realab_suite.entities import moving
 from realab_suite.entities import registers
 from realab_suite.feedback import register_kinds
 from realab_suite.tasks import collect_apples
+from tests import examples
 from tests.engine import helpers
 from tests.engine import obstacles
 
@@ -193,7 +194,7 @@ def test_a_part_takes_the_way_it_says(geom, travel, is_refused):
 # Differential: what the loader says, and what episodes do.
 
 
-@hypothesis.settings(max_examples=40)
+@examples.settings(15)
 @hypothesis.given(obstacles.rooms)
 def test_what_is_accepted_overlaps_nothing(room):
   try:

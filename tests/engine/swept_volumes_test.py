@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from realab_suite.engine import swept_volumes
+from tests import examples
 
 _XML = """<mujoco><worldbody>
   <geom type="box" size="0.1 0.1 0.1"/>
@@ -90,7 +91,7 @@ def _sampled(one, other, number, seed=0):
   )  # fmt: skip
 
 
-@hypothesis.settings(max_examples=150)
+@examples.settings(75)
 @hypothesis.given(_blocks(_BLOCK), _others)
 def test_what_keeps_apart_is_apart_and_what_meets_has_met(one, other):
   met = swept_volumes.Space(_MODEL).meet(one, other)

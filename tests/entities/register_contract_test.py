@@ -20,6 +20,7 @@ from realab_suite.entities import arenas
 from realab_suite.entities import avatars
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
+from tests import examples
 from tests import worlds
 
 _KINDS = {
@@ -143,7 +144,7 @@ def _shove_everything(world, random_state, register):
 @hypothesis.example(value=0.0)
 @hypothesis.example(value=_LOW)
 @hypothesis.example(value=_HIGH)
-@hypothesis.settings(max_examples=25)
+@examples.settings(10)
 def test_what_is_written_is_read(compiled, variety, value):
   register = compiled.registers[variety.name]
   worlds.start_episode(compiled.physics, register)
@@ -162,7 +163,7 @@ def test_what_is_written_is_read(compiled, variety, value):
         st.floats(min_value=_HIGH, allow_infinity=False),
     )
 )
-@hypothesis.settings(max_examples=10)
+@examples.settings(5)
 def test_a_value_out_of_range_is_saturated_and_the_writer_is_told(
     compiled, variety, value
 ):
