@@ -38,6 +38,18 @@ SCORED: dict[str, Any] = {
 }  # fmt: skip
 
 
+def one_register(
+    name: str, providers: Any = (), place: Any = 'station_1', **register: Any
+) -> dict[str, Any]:
+  """Returns a design with one two-block register."""
+  return {
+      'schema': 1,
+      'name': 'one_register',
+      'registers': {name: {'kind': 'two_block', 'place': place, **register}},
+      'providers': list(providers),
+  }
+
+
 def load_apples(
     design: Any = 'instantaneous_reward', seed: int = 7, max_steps: int = 40
 ) -> environment.Environment:
