@@ -117,7 +117,6 @@ def test_every_design_runs_in_every_world(
   env.reset()
   for action in helpers.random_actions(env, 4):
     time_step = env.step(action)
-  env.close()
   assert time_step.last()
   assert len(sink.steps) == 4
   spec = specs.load(design)
@@ -138,7 +137,6 @@ def test_what_a_design_writes_can_be_read_again(path: pathlib.Path):
   env.reset()
   for _ in range(20):
     env.step(helpers.no_op(env))
-  env.close()
   for step in sink.steps:
     applied = {}
     for record in step.records:

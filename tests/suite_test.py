@@ -202,7 +202,6 @@ def test_every_part_of_the_initial_state_that_matters_is_drawn(
 ):
   env = _load((task, 'none', ()))
   starts = [env.reset().observation for _ in range(5)]
-  env.close()
   for key in ('senses/position', 'senses/heading', 'senses/ray_distances'):
     assert len({start[key].tobytes() for start in starts}) == 5
 
@@ -226,8 +225,6 @@ def test_a_world_without_feedback_is_what_no_design_gives():
   for action in helpers.random_actions(without, 8):
     expected = helpers.to_bytes(without.step(action))
     assert helpers.to_bytes(with_none.step(action)) == expected
-  without.close()
-  with_none.close()
 
 
 def test_a_random_state_is_read_and_left_as_it_is():
@@ -239,16 +236,12 @@ def test_a_random_state_is_read_and_left_as_it_is():
   np.testing.assert_array_equal(generator.get_state()[1], before)
   assert first.seed == second.seed
   assert helpers.to_bytes(first.reset()) == helpers.to_bytes(second.reset())
-  first.close()
-  second.close()
 
 
 def test_without_a_seed_no_two_worlds_are_alike():
   envs = [suite.load(*suite.ALL_TASKS[0]) for _ in range(3)]
   assert len({env.seed for env in envs}) == 3
   assert len({helpers.to_bytes(env.reset()) for env in envs}) == 3
-  for env in envs:
-    env.close()
 
 
 def test_it_loads_as_dm_control_suites_do():
@@ -272,7 +265,6 @@ def test_an_episode_lasts_as_long_as_the_suite_says():
   assert env.max_steps == suite.MAX_STEPS == 250
   env.reset()
   steps = [env.step(helpers.no_op(env)) for _ in range(suite.MAX_STEPS)]
-  env.close()
   assert [step.last() for step in steps] == [False] * 249 + [True]
   left = [float(step.observation['senses/time_left']) for step in steps]
   np.testing.assert_allclose(left, 1 - np.arange(1, 251) / 250, atol=1e-6)
@@ -286,7 +278,6 @@ def test_an_episode_can_go_on_for_ever():
   assert 'senses/time_left' not in env.reset().observation
   for _ in range(suite.MAX_STEPS + 1):
     assert env.step(helpers.no_op(env)).mid()
-  env.close()
 
 
 def test_the_lists_of_names_agree():

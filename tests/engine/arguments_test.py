@@ -40,16 +40,14 @@ _NO_INTEGERS = _NO_NUMBERS | _TOO_SMALL | _TOO_LARGE
 def fixture_env():
   env = suite.load(*_WORLD, {'random': 1}, design=_DESIGN)
   env.reset()
-  yield env
-  env.close()
+  return env
 
 
 @pytest.fixture(scope='module', name='batch')
 def fixture_batch():
   batch = suite.load_batch(*_WORLD, {'random': 1}, num_envs=2, design=_DESIGN)
   batch.reset()
-  yield batch
-  batch.close()
+  return batch
 
 
 _TASK = collect_apples.CollectApples()
@@ -224,8 +222,6 @@ def test_numbers_of_numpy_are_numbers(kind: Any):
     np.testing.assert_array_equal(there[key][1], value)
   fork = suite.fork(alone, kind(2), num_threads=kind(1))
   assert fork.num_envs == 2
-  for env in (alone, batch, fork):
-    env.close()
 
 
 def test_the_largest_numbers_work():
@@ -235,7 +231,6 @@ def test_the_largest_numbers_work():
   time_step = env.reset()
   assert time_step.observation['senses/time_left'] == 1.0
   env.step(np.zeros(env.action_spec().shape))
-  env.close()
 
 
 def test_a_task_that_fails_to_be_made_is_an_argument_that_is_wrong(monkeypatch):

@@ -107,7 +107,6 @@ def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
       assert found.step_type[1] == int(dm_env.StepType.FIRST)
     if step == 7:
       assert found.step_type[1] == int(dm_env.StepType.MID)
-  other.close()
 
 
 def test_what_an_agent_gets_is_its_own(batch):
@@ -178,7 +177,6 @@ def test_providers_begin_every_episode_anew():
     _assert_same(found, [single.step(actions[0]) for single in singles])
     counts.append(float(found.observation['registers/count'][0]))
   assert counts.count(3.0) == 3
-  batch.close()
 
 
 class _Overflowing(collect_apples.CollectApples):
@@ -212,7 +210,6 @@ def test_a_world_that_is_over_does_no_harm_to_the_others():
     first = batch_ledger.episodes(world)[0]
     # What is earned after the end counts for nothing.
     assert ledgers.true_return(first) in (3.0, 4.0)
-  batch.close()
 
 
 def test_a_batch_of_a_world_whose_parts_want_every_step_is_refused():
@@ -221,7 +218,6 @@ def test_a_batch_of_a_world_whose_parts_want_every_step_is_refused():
   single = suite.embed(task, 'none', random=1)
   with pytest.raises(errors.SpecError, match=r'_Restless\.after_step'):
     batch_environment.BatchEnvironment(single, 2)
-  single.close()
 
 
 class _Restless(composer.Entity):

@@ -235,7 +235,6 @@ def test_worlds_that_sleep_are_neither_saved_nor_restored_nor_forked():
   snapshot = suite.load('unlock_door', 'standard', design='none').save()
   with pytest.raises(errors.SpecError, match='fall asleep cannot be saved'):
     batch.restore(snapshot, worlds=[0])
-  batch.close()
 
 
 # What does not fit is refused, and nothing has changed.

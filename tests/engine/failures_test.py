@@ -53,7 +53,6 @@ def _failing_point() -> helpers.PointTask:
 def test_a_reward_that_cannot_be_had_is_told_with_its_traceback(make: Any):
   env = _embed(make())
   (result,) = evaluate.evaluate(env, lambda time_step: helpers.no_op(env), 1)
-  env.close()
   assert result.end is events.End.TIMEOUT
   assert not result.is_valid
   assert np.isnan(result.true_return)
@@ -92,7 +91,6 @@ def test_a_reward_that_cannot_be_had_is_told_of_every_world_of_a_batch():
   batch = batch_environment.BatchEnvironment(_embed(_Unpaid()), _NUM_ENVS)
   actor = batch_actors.BatchPolicyActor(policies.make('random'), batch, 1)
   found = evaluate.evaluate_batch(batch, actor)
-  batch.close()
   for result in found:
     assert not result.is_valid
     assert 'ZeroDivisionError: the till is empty' in result.failure
@@ -101,7 +99,6 @@ def test_a_reward_that_cannot_be_had_is_told_of_every_world_of_a_batch():
 def test_an_episode_that_went_well_has_no_failure():
   env = _embed(collect_apples.CollectApples())
   (result,) = evaluate.evaluate(env, policies.make('random'), 1)
-  env.close()
   assert result.is_valid
   assert result.failure is None
 
@@ -115,7 +112,6 @@ def test_a_snapshot_takes_the_failure_along():
     env.step(helpers.no_op(env))
   other = ledgers.Ledger()
   other.set_state(ledger.state())
-  env.close()
   assert other.last.failure == ledger.last.failure
   assert 'till' in other.last.failure
 
@@ -189,7 +185,6 @@ def test_ledgers_and_monitors_take_the_end_from_the_engine():
     first, second = ledger.episodes(world)
     assert first.end is events.End.ABANDONED
     assert second.end is None
-  batch.close()
 
 
 def test_a_reset_that_fails_ends_the_episodes_before_it_once():
@@ -287,7 +282,6 @@ def test_a_value_that_cannot_be_stored_is_told_with_its_world_and_step(
   batch._mechanism._step_count.set(batch.physics, [2.0, 0.0, 0.0])
   with pytest.raises(errors.RegisterValueError) as caught:
     _play(batch, 3)
-  batch.close()
   assert str(caught.value).startswith(
       'providers[0]:failing_in_a_test at step 3 of world 1: register'
       f" 'reward': cannot store {wrong}"
@@ -301,7 +295,6 @@ def test_a_measurement_that_cannot_be_stored_is_told_with_its_world():
   batch.task._score.set(batch.physics, [0.0, 0.0, np.nan])
   with pytest.raises(errors.RegisterValueError) as caught:
     _play(batch, 1)
-  batch.close()
   assert 'meter:score at step 1 of world 2' in str(caught.value)
   assert 'nan' not in str(caught.value)
 
@@ -356,7 +349,6 @@ def test_what_a_provider_may_not_return_is_told_with_the_step(
   batch.reset()
   with pytest.raises(errors.FeedbackProviderError) as caught:
     _play(batch, 1)
-  batch.close()
   assert message in str(caught.value)
   assert str(caught.value).startswith('providers[0]:failing_in_a_test')
   assert '\n' not in str(caught.value)
@@ -371,7 +363,6 @@ def test_the_steps_of_worlds_that_differ_are_told_as_a_range(scripted: Any):
       errors.FeedbackProviderError, match='at steps 1 to 5 of 3 worlds'
   ):
     _play(batch, 1)
-  batch.close()
 
 
 _STATES = {
@@ -397,7 +388,6 @@ def test_a_state_without_an_axis_of_worlds_is_refused(
   env = suite.load('collect_apples', 'near', design=_DESIGN)
   env.reset()
   assert env.step(np.zeros(6)).mid()
-  env.close()
 
 
 _OTHER_STATES = {
@@ -423,4 +413,3 @@ def test_a_state_that_changes_its_structure_is_refused(
       match=r'state of providers\[0\].*allowed is the structure',
   ):
     _play(batch, 8)  # Two more than an episode has.
-  batch.close()

@@ -298,4 +298,3 @@ def test_a_write_holds_in_a_task_that_composer_steps(channel: str):
   for action in helpers.random_actions(env, 20):
     reading = env.step(action).observation['registers/r']
     np.testing.assert_allclose(reading, 7.0, atol=1e-6)
-  env.close()

@@ -24,7 +24,6 @@ def test_worlds_of_a_fork_are_alike_until_their_actions_differ():
   actions[2] *= -1.0
   second = fork.step(actions).observation['senses/position']
   assert len(np.unique(second, axis=0)) == 2
-  fork.close()
 
 
 @pytest.mark.parametrize('closes_fork', [True, False])
@@ -47,7 +46,6 @@ def test_closing_a_fork_or_its_original_leaves_the_other_alone(
     time_step = other.step(np.zeros((other.num_envs, 6) if is_batch else 6))
   assert 'senses/position' in time_step.observation
   suite.fork(other, 2, world=0 if is_batch else None).close()
-  other.close()
 
 
 def test_a_fork_and_its_original_do_not_meet():
@@ -82,7 +80,6 @@ def test_somebody_elses_task_is_not_forked():
   env = suite.embed(helpers.PointTask(), 'none', random=7)
   with pytest.raises(errors.SpecError, match='PointTask cannot be saved or'):
     suite.fork(env, 2)
-  env.close()
 
 
 def test_a_world_whose_compiled_model_was_changed_is_not_forked():

@@ -20,6 +20,13 @@ _STEPS = 130
 _REWARD = identity_campaign.Case(
     'unlock_door', 'standard', 'instantaneous_reward'
 )
+# Registers of the other kinds; a meter that turns a block.
+_KINDS = _REWARD._replace(
+    overrides=(
+        'registers.reward.kind=block_position',
+        'registers.score.kind=block_orientation',
+    )
+)
 # A provider draws at random in every step, from streams with a salt.
 _SALTED = identity_campaign.Case(
     'unlock_door',
@@ -52,7 +59,7 @@ _CASES = [
 
 @pytest.mark.parametrize(
     'case',
-    [*_CASES, _SALTED],
+    [*_CASES, _KINDS, _SALTED],
     ids=lambda case: '-'.join(
         (*case[:3], *case.overrides, type(case.seed).__name__)
     ),

@@ -159,8 +159,6 @@ def test_every_world_of_a_batch_and_of_a_fork_has_the_salt():
     alone = _first(_SALTED, environment_kwargs={'world': world})
     found = {k: v[world].tobytes() for k, v in first.observation.items()}
     assert found == alone
-  for env in (*forks, batch, single):
-    env.close()
 
 
 def test_event_sinks_get_the_seed_as_a_number():
@@ -168,5 +166,4 @@ def test_event_sinks_get_the_seed_as_a_number():
   sink = helpers.RecordingSink()
   env.add_sink(sink)
   env.reset()
-  env.close()
   assert [start.seed for start in sink.starts] == [7]

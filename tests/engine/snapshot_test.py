@@ -325,7 +325,6 @@ def test_somebody_elses_task_is_neither_saved_nor_restored():
   _, snapshot = snapshot_campaign.saved(_REWARD, 0)
   with pytest.raises(errors.SpecError, match='may compile its model anew'):
     env.restore(snapshot)
-  env.close()
 
 
 def test_a_world_that_sleeps_is_not_saved():

@@ -72,7 +72,6 @@ def test_the_evaluator_hears_of_what_an_agent_does_through_its_view(
     view.step(action)
   episodes = ledger.episodes(1) if case.num_envs else ledger.episodes
   assert [e.num_steps for e in episodes if e.end is not None] == [9, 9]
-  env.close()
 
 
 @_EITHER
@@ -91,7 +90,6 @@ def test_closing_a_view_leaves_the_environment_alone(case: pairs.Case):
   # The episode that was under way goes on.
   step_type = np.ravel(env.step(action).step_type)
   assert set(step_type.tolist()) == {1}
-  env.close()
 
 
 @_EITHER

@@ -77,4 +77,3 @@ def test_whoever_touches_a_meter_is_noticed():
   env.task.avatar.place(env.physics, np.array([x - 0.25, y]), 0.0)
   env.physics.forward()
   assert solver_coupling_campaign.num_contacts_of_meters(env) > 0
-  env.close()

@@ -119,7 +119,6 @@ def test_only_the_event_sinks_hear_of_the_true_reward():
   env.reset()
   env.task.earn(env.physics, secrets.CANARY)
   time_step = env.step(helpers.no_op(env))
-  env.close()
   assert not sink.records(registers.Write, 'score')
   numbers = np.concatenate(
       [np.ravel(value) for value in time_step.observation.values()]
