@@ -28,6 +28,15 @@ _LINES = [
 ]
 
 
+def _assert_lines(out: str, expected: dict[str, str]) -> None:
+  """Each figure has a line with its target, and a verdict if it has one."""
+  for name, target in expected.items():
+    (line,) = (x for x in out.splitlines() if x.startswith(f'{name}  '))
+    assert f' {target} ' in line
+    judged = {'met', 'missed'} & set(line.split())
+    assert bool(judged) == (target != '-')
+
+
 @pytest.mark.parametrize(('main', 'expected'), _LINES)
 def test_each_benchmark_prints_a_line_per_figure(
     main: Callable[[list[str]], None],
@@ -35,12 +44,7 @@ def test_each_benchmark_prints_a_line_per_figure(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
   main(['--rounds=1'])
-  lines = capsys.readouterr().out.splitlines()
-  for name, target in expected.items():
-    (line,) = (line for line in lines if line.startswith(f'{name}  '))
-    assert f' {target} ' in line
-    judged = {'met', 'missed'} & set(line.split())
-    assert bool(judged) == (target != '-')
+  _assert_lines(capsys.readouterr().out, expected)
 
 
 _FEW_WORLDS = {
@@ -65,8 +69,7 @@ def test_the_benchmark_of_many_worlds_prints_a_line_per_figure(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
   batch.main(['--rounds=1'])
-  lines = capsys.readouterr().out.splitlines()
-  for name, target in {
+  expected = {
       'throughput lost to raw engine': '<= 15 %',
       "a world's step, of a stock step": '<= 6.67 %',
       "a world's reset": '<= 0.2 ms',
@@ -74,11 +77,8 @@ def test_the_benchmark_of_many_worlds_prints_a_line_per_figure(
       'steps of 2 worlds': '-',
       'step, registers: 2 planar': '-',
       '2 registers to 1, free': '<= 2 x',
-  }.items():
-    (line,) = (line for line in lines if line.startswith(f'{name}  '))
-    assert f' {target} ' in line
-    judged = {'met', 'missed'} & set(line.split())
-    assert bool(judged) == (target != '-')
+  }
+  _assert_lines(capsys.readouterr().out, expected)
 
 
 def test_the_benchmark_of_training_prints_a_line_per_figure(
@@ -124,37 +124,24 @@ def test_a_worker_that_fails_ends_the_benchmark(
 
 
 @pytest.mark.usefixtures('few_worlds')
-def test_a_raw_batch_that_does_something_else_is_noticed(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ('benchmark', 'differs'), [(batch, 'another qpos'), (step, 'another state')]
+)
+def test_a_raw_engine_that_does_something_else_is_noticed(
+    monkeypatch: pytest.MonkeyPatch, benchmark: Any, differs: str
 ) -> None:
-  record = batch._record
+  record = benchmark._record
 
-  def record_carelessly(env: Any, actions: np.ndarray) -> batch.RawSteps:
+  def record_carelessly(env: Any, actions: np.ndarray) -> Any:
     raw = record(env, actions)
     writes, _ = raw.steps[-1][1]
     writes[0][1][:] += 1e-12
     return raw
 
-  monkeypatch.setattr(batch, '_record', record_carelessly)
+  monkeypatch.setattr(benchmark, '_record', record_carelessly)
   monkeypatch.setattr(batch, '_measure_memory', list)
-  with pytest.raises(RuntimeError, match='another qpos'):
-    batch.main(['--rounds=1'])
-
-
-def test_a_raw_engine_that_does_something_else_is_noticed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-  record = step._record
-
-  def record_carelessly(env: object, actions: np.ndarray) -> step.RawEpisode:
-    episode = record(env, actions)
-    writes, _ = episode.steps[-1][1]
-    writes[0][1][:] += 1e-12
-    return episode
-
-  monkeypatch.setattr(step, '_record', record_carelessly)
-  with pytest.raises(RuntimeError, match='another state'):
-    step.main(['--rounds=1'])
+  with pytest.raises(RuntimeError, match=differs):
+    benchmark.main(['--rounds=1'])
 
 
 def test_an_avatar_that_sees_by_other_means_is_noticed() -> None:
