@@ -110,7 +110,7 @@ def test_an_archive_shares_nothing_with_what_was_saved_or_is_returned():
         (_Colour.RED, 'test is a _Colour'),
     ],
 )
-def test_what_is_no_plain_data_is_refused_and_found(contents, where):
+def test_objects_in_an_archive_are_rejected_with_their_place(contents, where):
   with pytest.raises(errors.StateLayoutError, match=where):
     archive.Archive(_HEADER, contents)
 
@@ -192,7 +192,7 @@ def test_floats_keep_their_last_bit():
 
 
 @pytest.mark.parametrize('shape', [(10**15,), (2, 10**9), (3,)])
-def test_an_array_that_says_it_is_larger_than_it_is_is_refused(shape):
+def test_an_array_with_a_false_size_is_rejected(shape):
   whole = archive.Archive({}, np.arange(4.0)).to_bytes()
   start = len(_MAGIC) + 32
   with zipfile.ZipFile(io.BytesIO(whole[start:])) as zipped:
@@ -211,7 +211,7 @@ def test_an_array_that_says_it_is_larger_than_it_is_is_refused(shape):
     archive.Archive.from_bytes(_signed(payload))
 
 
-def test_the_format_is_what_it_was():
+def test_archives_of_earlier_versions_can_be_read():
   data = zlib.decompress(base64.b85decode(''.join(_WRITTEN_BEFORE)))
   read = archive.Archive.from_bytes(data)
   assert read.header == {

@@ -103,7 +103,7 @@ def test_the_benchmark_of_training_prints_a_line_per_figure(
     assert float(figures[f'processor time, {kind}'][0]) >= 0
 
 
-def test_the_benchmark_of_training_says_in_one_line_what_is_not_installed(
+def test_the_training_benchmark_names_missing_packages(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
   monkeypatch.setattr(
@@ -167,7 +167,7 @@ def test_a_benchmark_needs_a_round() -> None:
         ([1.0, 1.0, 1.0], [2.1, 2.1, 1.0], True, 'missed'),
     ],
 )
-def test_the_median_of_what_has_the_target_is_judged(
+def test_the_verdict_is_on_the_median(
     samples: list[float],
     ratios: list[float],
     target_is_ratio: bool,
@@ -182,7 +182,7 @@ def test_the_median_of_what_has_the_target_is_judged(
 @pytest.mark.parametrize(
     ('samples', 'verdict'), [([3.0, 2.0, 1.0], 'met'), ([9, 1, 1], 'missed')]
 )
-def test_of_a_rate_the_target_is_the_least(
+def test_the_target_of_a_rate_is_a_minimum(
     samples: list[float], verdict: str
 ) -> None:
   figure = timing.Figure('it', np.array(samples), '/s', 2.0)
@@ -190,7 +190,7 @@ def test_of_a_rate_the_target_is_the_least(
   assert ' >= 2 /s ' in str(figure)
 
 
-def test_a_stopwatch_gives_time_to_whoever_spends_it(
+def test_a_stopwatch_attributes_time_to_the_innermost_call(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
   clock = [0.0]

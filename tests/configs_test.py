@@ -62,7 +62,7 @@ def test_a_design_is_the_same_by_name_by_path_and_by_content(
 
 
 @_every_file
-def test_a_design_says_what_it_is_and_where_it_comes_from(path: pathlib.Path):
+def test_a_design_has_a_description_and_a_comment(path: pathlib.Path):
   assert specs.load(path).description.endswith('.')
   assert path.read_text(encoding='utf-8').startswith('# ')
 
@@ -127,7 +127,7 @@ def test_every_design_runs_in_every_world(
 
 
 @_every_file
-def test_what_a_design_writes_can_be_read_again(path: pathlib.Path):
+def test_applied_values_can_be_read_without_an_agent(path: pathlib.Path):
   # With a still agent no register is corrupted, whatever the design writes.
   env = suite.load(
       'collect_apples', 'far', {'random': 2}, {'max_steps': 20}, design=path

@@ -48,7 +48,7 @@ def test_every_block_of_a_page_runs_in_order(page, registries, capsys):
   assert capsys.readouterr().out
 
 
-def test_ones_own_register_provider_and_task_take_under_thirty_lines():
+def test_custom_parts_take_under_thirty_lines():
   blocks = _python_blocks(_ROOT / 'docs/your_own.md')
   assert len(blocks) >= 5
   for block in blocks:

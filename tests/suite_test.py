@@ -111,7 +111,7 @@ def played(request: pytest.FixtureRequest) -> Iterator[_Played]:
   result.env.close()
 
 
-def test_the_agent_gets_what_is_declared_and_nothing_else(played: _Played):
+def test_observations_have_exactly_the_declared_keys(played: _Played):
   expected: dict[str, Any] = dict(contract.SENSES)
   for name, register in played.design.registers.items():
     if register.role in ('feedback', 'signal'):
@@ -135,7 +135,7 @@ def test_an_episode_is_one_first_and_as_many_steps_as_were_asked_for(
   assert types == [0, *[1] * (_MAX_STEPS - 1), 2] * 2
 
 
-def test_the_reward_is_nothing_and_the_discount_says_only_who_terminated(
+def test_reward_is_0_and_discount_1_without_termination(
     played: _Played,
 ):
   reward, discount = played.env.reward_spec(), played.env.discount_spec()
@@ -151,7 +151,7 @@ def test_the_reward_is_nothing_and_the_discount_says_only_who_terminated(
     assert time_step.discount == 1.0
 
 
-def test_nobody_else_holds_the_arrays_that_an_agent_gets(played: _Played):
+def test_arrays_of_observations_are_not_shared(played: _Played):
   data = played.env.physics.data.ptr
   names = ('qpos', 'qvel', 'userdata', 'xpos', 'site_xpos', 'mocap_pos', 'ctrl')
   inside = [getattr(data, name) for name in names]
@@ -218,7 +218,7 @@ def test_no_sense_is_constant(task: tuple[str, str]):
     assert len({one[key].tobytes() for one in seen}) > 1, key
 
 
-def test_a_world_without_feedback_is_what_no_design_gives():
+def test_the_design_none_equals_no_design():
   (task, _, _), seed = _CASES[0], {'random': 3}
   without = suite.load(*task, seed, {'max_steps': 3})
   with_none = suite.load(*task, seed, {'max_steps': 3}, design='none')
@@ -260,7 +260,7 @@ def test_it_loads_as_dm_control_suites_do():
     env.reset()
 
 
-def test_an_episode_lasts_as_long_as_the_suite_says():
+def test_an_episode_lasts_250_steps_by_default():
   env = suite.load('collect_apples', 'boxed', {'random': 1})
   assert env.max_steps == suite.MAX_STEPS == 250
   env.reset()
@@ -270,7 +270,7 @@ def test_an_episode_lasts_as_long_as_the_suite_says():
   np.testing.assert_allclose(left, 1 - np.arange(1, 251) / 250, atol=1e-6)
 
 
-def test_an_episode_can_go_on_for_ever():
+def test_an_episode_without_max_steps_does_not_end():
   env = suite.load(
       'collect_apples', 'standard', {'random': 1}, {'max_steps': None}
   )
@@ -297,7 +297,7 @@ def test_the_lists_of_names_agree():
   assert {'none', 'instantaneous_reward'} < set(suite.DESIGNS)
 
 
-def test_a_task_of_ones_own_is_loadable_by_name():
+def test_a_registered_task_is_loadable_by_name():
   name = ('test_domain', 'mine')
   decorate = suite.register_task(*name, 'test_tag')
   decorate(functools.partial(collect_apples.CollectApples, 'near'))

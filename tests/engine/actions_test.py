@@ -61,7 +61,7 @@ def _actions(spec: Any) -> list[np.ndarray]:
 @pytest.mark.parametrize(
     ('design', 'overrides'), _CASES.values(), ids=list(_CASES)
 )
-def test_what_a_spec_admits_is_accepted(design: str, overrides: Any):
+def test_every_action_in_the_spec_is_accepted(design: str, overrides: Any):
   env = suite.load(
       'collect_apples', 'standard', {'random': 1}, {'max_steps': 10_000},
       design=design, overrides=overrides,
@@ -91,7 +91,9 @@ def test_what_a_spec_admits_is_accepted(design: str, overrides: Any):
 @pytest.mark.parametrize(
     ('design', 'overrides'), _CASES.values(), ids=list(_CASES)
 )
-def test_what_a_spec_admits_is_accepted_in_a_batch(design: str, overrides: Any):
+def test_every_action_in_the_spec_is_accepted_in_a_batch(
+    design: str, overrides: Any
+):
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, {'max_steps': 10_000},
       num_envs=4, design=design, overrides=overrides,

@@ -109,7 +109,7 @@ def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
       assert found.step_type[1] == int(dm_env.StepType.MID)
 
 
-def test_what_an_agent_gets_is_its_own(batch):
+def test_observations_of_a_batch_are_not_shared(batch):
   first = batch.reset()
   kept = {name: value.copy() for name, value in first.observation.items()}
   second = batch.step(np.ones((_NUM_ENVS, 6)))
@@ -212,7 +212,7 @@ def test_a_world_that_is_over_does_no_harm_to_the_others():
     assert ledgers.true_return(first) in (3.0, 4.0)
 
 
-def test_a_batch_of_a_world_whose_parts_want_every_step_is_refused():
+def test_a_batch_rejects_parts_with_hooks_of_single_worlds():
   task = collect_apples.CollectApples()
   task.root_entity.attach(_Restless())
   single = suite.embed(task, 'none', random=1)

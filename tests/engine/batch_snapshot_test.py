@@ -59,12 +59,12 @@ _WAYS = ['alone to batch', 'batch to alone', 'batch to batch', 'fork']
         for way in _WAYS[i % 2 :: 2]
     ],
 )
-def test_a_world_goes_on_bit_for_bit_by_every_way(case, way):
+def test_a_restored_world_continues_bit_for_bit_anywhere(case, way):
   point = _POINT + len(way) + len(case.design) % 2
   assert snapshot_campaign.WAYS[way](case, point, _STEPS) == 0
 
 
-def test_what_is_saved_in_these_tests_is_no_world_at_rest():
+def test_saved_worlds_contain_corruption():
   batch = snapshot_campaign.batch_after(_REWARD, _POINT)
   for place in range(snapshot_campaign.NUM_ENVS):
     episode = snapshot_campaign.ledger_of(batch).episodes(place)[-1]
@@ -72,7 +72,7 @@ def test_what_is_saved_in_these_tests_is_no_world_at_rest():
 
 
 @pytest.mark.parametrize('case', _CASES[::2], ids=_IDS[::2])
-def test_a_batch_goes_back_to_where_it_was(case):
+def test_a_batch_can_be_restored_to_an_earlier_step(case):
   batch = snapshot_campaign.batch_after(case, _POINT)
   snapshot = batch.save()
   data = snapshot.to_bytes()
@@ -83,7 +83,7 @@ def test_a_batch_goes_back_to_where_it_was(case):
   assert snapshot.to_bytes() == data
 
 
-def test_another_process_goes_on_bit_for_bit():
+def test_another_process_continues_bit_for_bit():
   assert _POINT % 2  # Worlds of a batch.
   assert snapshot_campaign.in_another_process(_REWARD, _POINT, _STEPS) == 0
 
@@ -95,7 +95,7 @@ def test_transcripts_of_worlds_tell_them_apart():
   assert found[0][-1] != found[1][-1]
 
 
-def test_saving_disturbs_nothing():
+def test_saving_changes_nothing():
   runs = []
   for saves in (False, True):
     batch = _REWARD.load_batch()
@@ -110,7 +110,7 @@ def test_saving_disturbs_nothing():
 
 
 @pytest.mark.parametrize('case', _CASES[1::2], ids=_IDS[1::2])
-def test_other_worlds_stay_as_they_are(case):
+def test_restoring_one_world_leaves_the_others_alone(case):
   _, snapshot = snapshot_campaign.saved(case, _POINT)
   batch = snapshot_campaign.batch_after(case, 10)
   others = batch.save([0, 2])
@@ -123,7 +123,7 @@ def test_other_worlds_stay_as_they_are(case):
   assert (found[0], found[2]) == (expected[0], expected[2])
 
 
-def test_a_world_that_waits_for_its_next_episode_still_does():
+def test_a_restored_world_after_last_begins_an_episode():
   batch = snapshot_campaign.batch_after(_REWARD, 0)
   while not (batch.step(_no_op(batch)).step_type == 2).all():
     pass
@@ -158,7 +158,7 @@ def test_worlds_that_have_not_begun_can_be_saved():
   assert snapshot_campaign.play(alone, 10, seed=3) == expected[1]
 
 
-def test_a_world_goes_on_among_others_that_have_not_begun():
+def test_a_world_continues_in_a_batch_that_has_not_begun():
   env, snapshot = snapshot_campaign.saved(_ADVICE, _POINT)
   batch = _ADVICE.load_batch()
   expected = snapshot_campaign.play_batch(_ADVICE.load_batch(), 10, [2, 3, 4])
@@ -194,7 +194,7 @@ def test_after_a_failed_restore_the_worlds_begin_anew(monkeypatch):
   assert batch.step(_no_op(batch)).step_type.tolist() == [1, 0, 1]
 
 
-def test_later_episodes_are_those_of_the_world_that_was_saved():
+def test_a_restored_world_keeps_its_later_episodes():
   batch = snapshot_campaign.batch_after(_REWARD, _POINT)
   batch.restore(batch.save([2]), worlds=[0])
   for place, number in ((0, 2), (1, 1), (2, 2)):
@@ -210,7 +210,7 @@ def test_later_episodes_are_those_of_the_world_that_was_saved():
   assert [episode.world for episode in later] == [2, 1, 2]
 
 
-def test_a_seed_of_any_size_goes_along():
+def test_a_snapshot_contains_seeds_of_any_size():
   case = _REWARD._replace(seed=2**70)
   env = case.load()
   env.reset()
@@ -312,7 +312,7 @@ def test_a_snapshot_that_does_not_fit_is_refused(save, worlds, named):
   assert len(snapshot_campaign.ledger_of(batch)._heard) == heard
 
 
-def test_a_snapshot_of_a_larger_batch_says_where_it_was():
+def test_a_snapshot_of_a_larger_batch_names_its_worlds():
   snapshot = snapshot_campaign.batch_after(_REWARD, 3).save([2])
   env, _ = snapshot_campaign.saved(_REWARD, 3)
   fork = suite.fork(env, 2)

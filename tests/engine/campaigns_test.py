@@ -26,7 +26,7 @@ from realab_suite.entities import arenas
         ((0.0, 9.0), True),
     ],
 )
-def test_what_is_outside_the_two_rooms(point, is_outside):
+def test_the_campaign_detects_points_outside_the_two_rooms(point, is_outside):
   found = bulldozers_campaign.is_outside(arenas.TwoRooms(), np.array(point))
   assert found.item() is is_outside
 
@@ -76,7 +76,7 @@ def test_depths_are_as_worked_out_by_hand():
   )
 
 
-def test_writes_into_what_is_in_the_way_stay_slow_and_shallow():
+def test_writes_into_obstacles_stay_slow_and_shallow():
   world = teleports_campaign.make_world('free', 0.2, (0.0, 0.0))
   for into in ('block', 'avatar', 'apple'):
     found = teleports_campaign.write_into(world, into, 0.5, 0.3, 0.2)

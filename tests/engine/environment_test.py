@@ -81,7 +81,7 @@ def test_taking_the_large_apple_ends_the_episode_with_discount_0():
 # Event sinks.
 
 
-def test_a_sink_hears_of_every_episode_and_why_it_ended():
+def test_a_sink_receives_every_episode_and_its_end():
   env, sink = _load(max_steps=2), helpers.RecordingSink()
   env.step(helpers.no_op(env))
   env.add_sink(sink)  # In mid-episode: this episode is not reported.
@@ -102,7 +102,7 @@ def test_a_sink_hears_of_every_episode_and_why_it_ended():
   assert {(start.seed, start.world) for start in sink.starts} == {(7, 0)}
 
 
-def test_a_sink_that_was_removed_hears_nothing_more():
+def test_a_removed_sink_receives_nothing():
   env, sink = _load(max_steps=2), helpers.RecordingSink()
   env.add_sink(sink)
   env.reset()
@@ -137,7 +137,7 @@ class _FailingSink(events.EventSink):
     """Keeps nothing."""
 
 
-def test_a_sink_that_fails_at_the_beginning_of_an_episode_leaves_none():
+def test_an_error_of_a_sink_ends_the_episode():
   env, ledger = _load(max_steps=3), ledgers.Ledger()
   env.add_sink(_FailingSink())
   env.add_sink(ledger)
@@ -192,7 +192,7 @@ def test_an_environment_cannot_be_copied():
 # Independence.
 
 
-def test_environments_do_not_know_of_each_other():
+def test_environments_are_independent():
   envs = {seed: _load(seed=seed, max_steps=7) for seed in (1, 2)}
   actions = {s: helpers.random_actions(envs[s], 30, s) for s in envs}
   alone = {
@@ -214,7 +214,7 @@ def _global_state() -> tuple[Any, ...]:
   return legacy[1].tobytes(), legacy[2:], random.getstate()
 
 
-def test_nobody_draws_from_the_global_generators():
+def test_global_generators_are_not_used():
   before = _global_state()
   env = _load(max_steps=5)
   for action in helpers.random_actions(env, 14):
@@ -239,7 +239,7 @@ def test_an_episode_does_not_depend_on_how_many_numbers_were_drawn():
   assert helpers.to_bytes(env.reset()) == helpers.to_bytes(twin.reset())
 
 
-def test_the_observation_and_the_spec_are_the_agents_to_change():
+def test_an_agent_may_change_its_observations_and_specs():
   env, twin = _pair()
   env.observation_spec().clear()
   assert 'registers/reward' in env.observation_spec()

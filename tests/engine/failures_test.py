@@ -50,7 +50,7 @@ def _failing_point() -> helpers.PointTask:
 
 
 @pytest.mark.parametrize('make', [_Unpaid, _failing_point])
-def test_a_reward_that_cannot_be_had_is_told_with_its_traceback(make: Any):
+def test_a_failing_reward_is_reported_with_its_traceback(make: Any):
   env = _embed(make())
   (result,) = evaluate.evaluate(env, lambda time_step: helpers.no_op(env), 1)
   assert result.end is events.End.TIMEOUT
@@ -61,7 +61,7 @@ def test_a_reward_that_cannot_be_had_is_told_with_its_traceback(make: Any):
   assert make.__module__.rpartition('.')[2] in result.failure
 
 
-def test_a_row_keeps_the_traceback(tmp_path: Any):
+def test_a_row_contains_the_traceback(tmp_path: Any):
   env = _embed(_failing_point())
   (result,) = evaluate.evaluate(env, lambda time_step: np.zeros(1), 1)
   info = results.RunInfo.of(
@@ -75,7 +75,7 @@ def test_a_row_keeps_the_traceback(tmp_path: Any):
   assert row.failure == result.failure
 
 
-def test_an_agent_learns_nothing_of_a_reward_that_cannot_be_had():
+def test_a_failing_reward_changes_nothing_for_the_agent():
   def play(make: Any) -> list[bytes]:
     env = _embed(make())
     actions = helpers.random_actions(env, 9)
@@ -87,7 +87,7 @@ def test_an_agent_learns_nothing_of_a_reward_that_cannot_be_had():
   assert play(_failing_point) == play(helpers.PointTask)
 
 
-def test_a_reward_that_cannot_be_had_is_told_of_every_world_of_a_batch():
+def test_a_failing_reward_is_reported_for_every_world_of_a_batch():
   batch = batch_environment.BatchEnvironment(_embed(_Unpaid()), _NUM_ENVS)
   actor = batch_actors.BatchPolicyActor(policies.make('random'), batch, 1)
   found = evaluate.evaluate_batch(batch, actor)
@@ -96,14 +96,14 @@ def test_a_reward_that_cannot_be_had_is_told_of_every_world_of_a_batch():
     assert 'ZeroDivisionError: the till is empty' in result.failure
 
 
-def test_an_episode_that_went_well_has_no_failure():
+def test_a_valid_episode_has_no_failure():
   env = _embed(collect_apples.CollectApples())
   (result,) = evaluate.evaluate(env, policies.make('random'), 1)
   assert result.is_valid
   assert result.failure is None
 
 
-def test_a_snapshot_takes_the_failure_along():
+def test_a_snapshot_contains_the_failure():
   env = _embed(_Unpaid(), max_steps=50)
   ledger = ledgers.Ledger()
   env.add_sink(ledger)
@@ -270,7 +270,7 @@ def _play(batch: Any, num_steps: int) -> None:
 
 
 @pytest.mark.parametrize('wrong', [np.nan, np.inf, 13.0])
-def test_a_value_that_cannot_be_stored_is_told_with_its_world_and_step(
+def test_an_error_of_a_write_names_the_step_and_the_world(
     scripted: Any, wrong: float
 ):
   _ANSWER[:] = [_states, _counting(wrong)]
@@ -289,7 +289,7 @@ def test_a_value_that_cannot_be_stored_is_told_with_its_world_and_step(
   assert caught.value.world == 1
 
 
-def test_a_measurement_that_cannot_be_stored_is_told_with_its_world():
+def test_an_error_of_a_meter_names_the_step_and_the_world():
   batch = _batch(design='instantaneous_reward')
   batch.reset()
   batch.task._score.set(batch.physics, [0.0, 0.0, np.nan])
@@ -341,7 +341,7 @@ _ANSWERS = {
 @pytest.mark.parametrize(
     ('answer', 'message'), _ANSWERS.values(), ids=list(_ANSWERS)
 )
-def test_what_a_provider_may_not_return_is_told_with_the_step(
+def test_an_invalid_result_of_a_provider_names_the_step(
     scripted: Any, answer: Any, message: str
 ):
   _ANSWER[:] = [_states, answer]
@@ -354,7 +354,7 @@ def test_what_a_provider_may_not_return_is_told_with_the_step(
   assert '\n' not in str(caught.value)
 
 
-def test_the_steps_of_worlds_that_differ_are_told_as_a_range(scripted: Any):
+def test_an_error_names_the_range_of_steps_of_a_batch(scripted: Any):
   _ANSWER[:] = [_states, lambda start, state: 1 / 0]
   batch = _batch(design=_DESIGN)
   batch.reset()

@@ -227,7 +227,7 @@ def _assert_identical(
 
 
 @pytest.mark.parametrize('name', _TASKS)
-def test_an_embedded_task_gives_what_composer_gives(name: str):
+def test_an_embedded_task_equals_composer_bit_for_bit(name: str):
   assert _assert_identical(functools.partial(_make, name), num_steps=15)
 
 

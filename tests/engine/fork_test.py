@@ -48,7 +48,7 @@ def test_closing_a_fork_or_its_original_leaves_the_other_alone(
   suite.fork(other, 2, world=0 if is_batch else None).close()
 
 
-def test_a_fork_and_its_original_do_not_meet():
+def test_a_fork_and_its_original_do_not_interact():
   env, snapshot = snapshot_campaign.saved(_ADVICE, _POINT)
   fork = suite.fork(env, 2)
   actions = snapshot_campaign._actions(env, 40, seed=2)
@@ -76,13 +76,13 @@ def test_a_fork_names_its_world():
     suite.fork(env, 0)
 
 
-def test_somebody_elses_task_is_not_forked():
+def test_foreign_tasks_cannot_be_forked():
   env = suite.embed(helpers.PointTask(), 'none', random=7)
   with pytest.raises(errors.SpecError, match='PointTask cannot be saved or'):
     suite.fork(env, 2)
 
 
-def test_a_world_whose_compiled_model_was_changed_is_not_forked():
+def test_a_world_with_a_changed_model_cannot_be_forked():
   env, _ = snapshot_campaign.saved(_REWARD, 3)
   env.physics.model.geom_friction[0, 0] *= 1.001
   with pytest.raises(errors.StateLayoutError, match="model is '"):

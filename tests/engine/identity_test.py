@@ -64,11 +64,11 @@ _CASES = [
         (*case[:3], *case.overrides, type(case.seed).__name__)
     ),
 )
-def test_a_batch_is_its_worlds_ledgers_and_state_included(case):
+def test_a_batch_equals_its_worlds_with_ledgers_and_state(case):
   assert identity_campaign.compare(case, _STEPS).differences == ()
 
 
-def test_much_happens_in_what_is_compared():
+def test_compared_runs_contain_ends_rewards_and_corruption():
   result = identity_campaign.compare(_REWARD, _STEPS)
   assert result.differences == ()
   assert result.num_episodes >= 2 * identity_campaign.NUM_ENVS
@@ -78,7 +78,7 @@ def test_much_happens_in_what_is_compared():
   assert result.num_held > 0
 
 
-def test_every_task_and_design_is_compared():
+def test_the_campaign_compares_every_task_and_design():
   cases = identity_campaign.tasks_and_designs(seeds=3)
   num_cases = 3 * len(suite.ALL_TASKS) * len(suite.DESIGNS)
   assert len(set(cases)) == len(cases) == num_cases >= 3 * 8 * 5
@@ -155,7 +155,7 @@ def _in_another_process(function: Any, *arguments: Any) -> Any:
     return pool.submit(function, *arguments).result()
 
 
-def test_growth_is_what_grows():
+def test_planted_growth_is_measured():
   assert 0.9 < _in_another_process(_grow_by_a_kilobyte) < 1.3
 
 
@@ -167,6 +167,6 @@ def test_growth_is_what_grows():
     ],
     ids=lambda case: f'{case.world}-{case.what}',
 )
-def test_memory_hardly_grows(case):
+def test_memory_does_not_grow(case):
   # Less than a kilobyte at a time, which is as fine as a short run can tell.
   assert _in_another_process(growth_campaign.measure, case) < 0.5

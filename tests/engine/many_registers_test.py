@@ -83,7 +83,7 @@ def test_many_worlds_of_the_largest_design_work():
   np.testing.assert_allclose(_readings(fork.step(np.array([action] * 2))), 0.5)
 
 
-def test_a_task_of_anybodys_can_have_many_too():
+def test_a_foreign_task_can_have_many_registers():
   design = _design(60, dof='planar')
   env = suite.embed(helpers.PointTask(), design, random=1, max_steps=None)
   for _ in range(2):
@@ -92,7 +92,7 @@ def test_a_task_of_anybodys_can_have_many_too():
     np.testing.assert_allclose(readings, 0.5, atol=1e-6)
 
 
-def test_a_task_has_room_after_a_design_that_was_refused():
+def test_a_task_has_slots_left_after_a_rejected_design():
   task = collect_apples.CollectApples()
   for number in (60, 90):
     refused = _design(number, place=lambda i: [2.0, 2.0])

@@ -58,7 +58,7 @@ def test_a_register_where_the_avatar_begins_is_refused():
 @pytest.mark.parametrize(
     ('spread', 'is_in_the_way'), [(0.5, False), (0.8, True)]
 )
-def test_wherever_a_register_may_stand_the_avatar_does_not_begin(
+def test_a_region_is_kept_from_the_start_of_the_avatar(
     spread: float, is_in_the_way: bool
 ):
   # The avatar, of a radius of 0.25 m, begins within 0.4 m of (0, -0.8).
@@ -166,7 +166,7 @@ def test_a_region_turns_with_its_place(yaw, is_refused):
 @pytest.mark.parametrize(
     ('place', 'is_refused'), [([0.0, 2.0], False), ([1.6, 2.0], True)]
 )
-def test_where_a_door_will_be_is_no_place_for_a_register(place, is_refused):
+def test_the_path_of_a_door_is_an_obstacle(place, is_refused):
   def door(root):
     doors.SlidingDoor(width=1.0).attach_to(root, (0.9, 2.0))
 
@@ -183,7 +183,7 @@ def test_where_a_door_will_be_is_no_place_for_a_register(place, is_refused):
         ({'type': 'sphere', 'size': (0.1,)}, (-1.2, 1.2, 0), False),
     ],
 )
-def test_a_part_takes_the_way_it_says(geom, travel, is_refused):
+def test_the_path_of_a_moving_part_is_an_obstacle(geom, travel, is_refused):
   def part(root):
     moving.MovingPart('part', [geom]).attach_to(root, (1.0, 1.0, 0.1), travel)
 
@@ -196,7 +196,7 @@ def test_a_part_takes_the_way_it_says(geom, travel, is_refused):
 
 @examples.settings(15)
 @hypothesis.given(obstacles.rooms)
-def test_what_is_accepted_overlaps_nothing(room):
+def test_accepted_rooms_have_no_overlap(room):
   try:
     built = obstacles.build(*room)
   except errors.SpecError as error:
@@ -208,7 +208,7 @@ def test_what_is_accepted_overlaps_nothing(room):
   built.env.close()
 
 
-def test_what_is_refused_overlaps_something(monkeypatch):
+def test_rejected_rooms_have_an_overlap(monkeypatch):
   # Found at random: a barrier, a yawed wall, a post, a door, two registers.
   wide = {'kind': 'block_position', 'role': 'feedback', 'range': [0.0, 1.0]}
   turning = {**wide, 'kind': 'block_orientation', 'scale': 1.5}
@@ -251,7 +251,7 @@ def _poses(env, num_episodes=4):
 
 @pytest.mark.parametrize('spread', [(0.0, 0.0), (0.3, 0.4)])
 @_VARIETIES
-def test_a_named_place_is_what_its_numbers_are(kind, channel, dof, yaw, spread):
+def test_a_named_place_equals_its_coordinates(kind, channel, dof, yaw, spread):
   register = {'kind': kind, 'channel': channel, 'dof': dof, 'range': [0, 1]}
   offered = arenas.Place((0.5, 2.0), yaw, spread)
 
@@ -300,9 +300,7 @@ def _two(first, second):
         ),
     ],
 )
-def test_only_registers_that_can_meet_are_in_each_others_way(
-    second, is_refused
-):
+def test_only_registers_that_can_meet_are_rejected(second, is_refused):
   diagonal = {
       'place': {'position': [0.0, 1.7], 'yaw': np.pi / 4},
       'range': [0, 15],
@@ -428,12 +426,12 @@ _FOREIGN = {
 @pytest.mark.parametrize(
     ('geom', 'is_refused'), _FOREIGN.values(), ids=list(_FOREIGN)
 )
-def test_a_world_of_anybodys_is_checked_too(geom, is_refused):
+def test_obstacles_of_foreign_worlds_are_checked(geom, is_refused):
   place = {'position': [0.0, 0.0], 'spread': [0.5, 0.5]}
   assert is_refused == _is_refused(_foreign(**geom), place)
 
 
-def test_what_hangs_from_a_moving_part_is_an_obstacle():
+def test_children_of_a_moving_part_are_obstacles():
   def part(root):
     hung = moving.MovingPart('part', [{'type': 'sphere', 'size': (0.1,)}])
     body = hung.mjcf_model.worldbody.add('body', pos=(-2, 2, 0))

@@ -105,7 +105,7 @@ def test_physics_that_fail_within_a_step_are_noticed_in_that_step(
 
 @pytest.mark.parametrize('how', ['qvel', 'qpos', 'force'])
 @_BREAKS
-def test_the_physics_of_somebody_elses_task_may_fail_too(how: str):
+def test_failing_physics_end_the_episode_of_a_foreign_task(how: str):
   env, sink = helpers.embed(helpers.PointTask(), helpers.SCORED)
   env.reset()
   env.step(_NO_OP)
@@ -161,7 +161,7 @@ def test_a_reset_that_keeps_failing_raises_and_the_next_step_is_a_first(
   assert [start.episode for start in sink.starts] == [1, 3]
 
 
-def test_what_a_failed_reset_left_behind_does_not_reach_the_next_episode():
+def test_a_failed_reset_does_not_affect_the_next_episode():
   task = helpers.PointTask()
   _failing(task, *range(1, 11))
   env, _ = helpers.embed(task)
@@ -184,7 +184,7 @@ def _fail(physics: Any, random_state: Any) -> None:
         ('begin', [events.End.ABANDONED] * 2),
     ],
 )
-def test_a_hook_that_raises_poisons_the_environment(hook: str, ends: Any):
+def test_a_hook_that_raises_ends_the_episode(hook: str, ends: Any):
   task = helpers.PointTask()
   env, sink = helpers.embed(task)
   env.reset()
@@ -200,7 +200,7 @@ def test_a_hook_that_raises_poisons_the_environment(hook: str, ends: Any):
   assert sink.ends == ends
 
 
-def test_a_provider_that_fails_poisons_the_environment():
+def test_a_provider_that_fails_ends_the_episode():
   env, sink = _load()
   env.reset()
   env.step(helpers.no_op(env))

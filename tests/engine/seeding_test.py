@@ -32,7 +32,7 @@ def _streams(seed, world=0, episode=0, stream='reset/0'):
   )
 
 
-def test_streams_without_a_salt_stay_what_they_were():
+def test_streams_without_a_salt_do_not_change():
   assert seeding.sequence(7, 0, 0, 'x').generate_state(2).tolist() == [
       3677903840,
       2023098282,
@@ -49,7 +49,7 @@ def test_streams_without_a_salt_stay_what_they_were():
   ]
 
 
-def test_streams_with_a_salt_stay_what_they_are():
+def test_streams_with_a_salt_do_not_change():
   # Runs are repeated by their salt.
   assert seeding.episode_key(_SALTED, 3, 5, 'policy').tolist() == [
       3044171645842236865,

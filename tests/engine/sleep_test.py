@@ -79,7 +79,7 @@ def test_blocks_at_rest_sleep_and_the_avatar_never_does(dof):
   assert (_trees(env).sum(axis=1) == _trees(env).shape[1] - 1).all()
 
 
-def test_nobody_sleeps_unless_asked():
+def test_sleep_is_off_by_default():
   env = suite.load_batch('unlock_door', 'near', num_envs=1)
   assert not env.sleep
   flags = env.physics.model.opt.enableflags
@@ -87,7 +87,7 @@ def test_nobody_sleeps_unless_asked():
 
 
 @_DOFS
-def test_where_nobody_acts_nothing_is_corrupted(dof):
+def test_sleeping_blocks_are_not_corrupted_without_actions(dof):
   env = _load(dof)
   for _ in range(200):
     env.step(_action(env))
@@ -281,7 +281,7 @@ def _play(env, actions, starts):
 
 
 @_DOFS
-def test_an_episode_does_not_depend_on_who_slept_before(dof):
+def test_an_episode_does_not_depend_on_earlier_sleep(dof):
   shape = (40, _NUM_ENVS, 6)
   actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
   others = actions.copy()

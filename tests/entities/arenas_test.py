@@ -104,7 +104,7 @@ def test_a_place_cannot_be_offered_twice():
         ('spread', [(0.1, -0.1), 0.1, (0.1,), (np.nan, 0.0)]),
     ],
 )
-def test_a_place_that_is_none_is_refused(key, values):
+def test_an_invalid_place_is_rejected(key, values):
   for value in values:
     with pytest.raises(errors.SpecError, match='allowed are finite numbers'):
       arenas.Place(**{'position': (0.0, 0.0), key: value})
@@ -304,7 +304,7 @@ def test_a_barrier_stops_an_avatar_and_not_its_view():
 
 
 @every_room
-def test_what_is_far_apart_is_not_coupled_by_the_solver(room):
+def test_the_solver_does_not_couple_distant_bodies(room):
   # Campaign C13: only Newton and CG solve islands one by one.
   options = worlds.compile_world(_ROOMS[room]()).model.opt
   assert options.solver == mujoco.mjtSolver.mjSOL_NEWTON

@@ -21,7 +21,7 @@ def fixture_world():
 
 
 @pytest.mark.parametrize('heading', [0.0, 2.0])
-def test_the_avatar_moves_as_fast_as_it_is_told(world, heading):
+def test_the_avatar_moves_at_the_commanded_speed(world, heading):
   for commands, expected in [
       ({'forward': 1.0}, (avatar_worlds.SPEED, 0, 0)),
       ({'forward': -0.5}, (-avatar_worlds.SPEED / 2, 0, 0)),
@@ -62,7 +62,7 @@ def test_an_avatar_walks_a_curve(world):
   )
 
 
-def test_an_avatar_stops_when_it_is_told_nothing(world):
+def test_an_avatar_stops_without_commands(world):
   world.place(-2.0, 0.0)
   world.act(50, forward=1.0, turn=1.0)
   world.act(50)
@@ -124,7 +124,7 @@ def test_an_avatar_that_is_placed_is_at_rest(world):
     'quality',
     ['position', 'angle', 'direction', 'velocity', 'pitch', 'holding'],
 )
-def test_what_was_known_stays_what_it_was(world, quality):
+def test_earlier_qualities_of_the_avatar_do_not_change(world, quality):
   look = getattr(world.avatar, quality)
   known = look(world.physics)
   before = np.array(known)
@@ -135,7 +135,7 @@ def test_what_was_known_stays_what_it_was(world, quality):
   np.testing.assert_array_equal(known, before)
 
 
-def test_the_action_spec_names_what_an_action_is_made_of(world):
+def test_the_action_spec_names_its_elements(world):
   spec = world.avatar.action_spec
   assert spec.shape == (6,)
   assert spec.name.split('\t') == list(avatars.ACTIONS)
@@ -178,7 +178,7 @@ def test_an_avatar_pushes_a_block(dof):
 
 
 @every_dof
-def test_a_block_that_nobody_pushes_comes_to_rest(dof):
+def test_a_block_comes_to_rest_after_a_push(dof):
   world = avatar_worlds.make(dof=dof)
   world.act(60, forward=1.0)
   world.act(200)
@@ -207,7 +207,7 @@ def test_a_planar_block_does_not_touch_the_floor():
 
 @every_dof
 @pytest.mark.parametrize('seed', range(2))
-def test_whatever_an_avatar_does_blocks_stay_in_the_room(dof, seed):
+def test_blocks_stay_in_the_room(dof, seed):
   world = avatar_worlds.make(registers.TwoBlockRegister, dof=dof)
   random_state = np.random.RandomState(seed)
   for _ in range(6):

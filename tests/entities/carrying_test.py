@@ -23,27 +23,27 @@ def fixture_world():
 # ---- Carrying ----------------------------------------------------------------
 
 
-def test_a_hand_takes_nothing_out_of_reach(world):
+def test_a_hand_does_not_grasp_a_block_out_of_reach(world):
   world.place(1.0 - avatar_worlds.HAND - 0.45, 0.0)
   world.act(10, grasp=1.0)
   assert not world.holding
 
 
 @every_dof
-def test_a_hand_takes_a_block_in_reach(dof):
+def test_a_hand_grasps_a_block_in_reach(dof):
   world = avatar_worlds.make(dof=dof)
   world.place(1.0 - avatar_worlds.HAND - 0.35, 0.0)
   world.act(10, grasp=1.0)
   assert world.holding
 
 
-def test_a_hand_does_not_take_what_is_behind(world):
+def test_a_hand_does_not_grasp_a_block_behind_the_avatar(world):
   world.place(1.0 - 0.45, 0.0, np.pi)
   world.act(10, grasp=1.0)
   assert not world.holding
 
 
-def test_a_hand_takes_nothing_unless_it_is_told_to(world):
+def test_a_hand_grasps_only_on_command(world):
   world.place(0.5, 0.0)
   for command in (0.0, 0.4, -1.0):
     world.act(10, grasp=command)
@@ -75,7 +75,7 @@ def test_a_free_block_is_lifted_while_it_is_held(world):
 
 
 @every_dof
-def test_a_hand_keeps_hold_until_it_is_told_otherwise(dof):
+def test_a_hand_holds_until_it_is_commanded_to_release(dof):
   world = avatar_worlds.make(dof=dof)
   world.grasp()
   for command in (0.0, 0.4, 1.0, -0.4):
@@ -102,7 +102,7 @@ def test_a_block_that_is_stuck_stays_behind(dof, size, mass, keeps_hold):
 
 
 @every_dof
-def test_a_hand_lets_go_when_it_is_told_to(dof):
+def test_a_hand_releases_a_block_on_command(dof):
   world = avatar_worlds.make(dof=dof)
   world.grasp()
   world.act(50, grasp=-1.0)
@@ -112,14 +112,14 @@ def test_a_hand_lets_go_when_it_is_told_to(dof):
   np.testing.assert_allclose(world.block[:2], before[:2], atol=0.02)
 
 
-def test_what_is_let_go_falls(world):
+def test_a_released_block_falls(world):
   world.grasp()
   world.act(100, grasp=-1.0)
   assert world.block[2] == pytest.approx(0.1, abs=0.01)
 
 
 @every_dof
-def test_a_hand_takes_one_block_and_that_is_the_nearest(dof):
+def test_a_hand_grasps_only_the_nearest_block(dof):
   world = avatar_worlds.make(registers.TwoBlockRegister, dof=dof)
   # The offset block stands at y = 0.25; both are in reach.
   world.place(1.0 - 0.6, 0.2)
@@ -228,7 +228,7 @@ def test_a_thrown_block_can_corrupt_a_register_without_touch():
 
 
 @every_dof
-def test_a_hand_lets_go_of_what_is_written(dof):
+def test_a_write_to_a_held_block_releases_it(dof):
   world = avatar_worlds.make(dof=dof)
   world.grasp()
   world.act(50, forward=-0.5)
@@ -244,7 +244,7 @@ def test_a_hand_lets_go_of_what_is_written(dof):
 
 
 @every_dof
-def test_a_write_to_one_block_takes_no_other_out_of_the_hand(dof):
+def test_a_write_does_not_release_another_block(dof):
   world = avatar_worlds.make(registers.TwoBlockRegister, dof=dof)
   world.place(0.4, -0.2)
   world.act(50, grasp=1.0)

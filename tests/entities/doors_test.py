@@ -72,7 +72,7 @@ def test_a_reset_shuts_the_door(world):
 
 
 @pytest.mark.parametrize(('run_up', 'aside'), [(1.0, 0.0), (3.0, -0.5)])
-def test_nobody_forces_a_shut_door(world, run_up, aside):
+def test_an_avatar_cannot_force_a_shut_door(world, run_up, aside):
   x, y = world.doorway
   world.avatar.place(world.physics, (x + aside, y - run_up), np.pi / 2)
   for side in (-1.0, 0.0, 1.0):
@@ -114,7 +114,7 @@ def test_a_half_open_door_does_not_let_through(world):
   assert world.avatar.position(world.physics)[1] < y
 
 
-def test_a_door_that_shuts_on_somebody_does_not_throw_them(world):
+def test_a_closing_door_does_not_throw_the_avatar(world):
   world.advance(True, 9.0)
   world.avatar.place(world.physics, world.doorway, np.pi / 2)
   fastest = 0.0

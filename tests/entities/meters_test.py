@@ -41,7 +41,7 @@ def fixture_world():
   return _World()
 
 
-def test_a_meter_writes_what_it_measures_when_it_is_told_to(world):
+def test_a_meter_writes_its_measurement_on_update(world):
   world.update()
   world.score.set(world.physics, 3.5)
   assert world.read() == pytest.approx(0.0, abs=1e-12)
@@ -55,7 +55,7 @@ def test_a_meter_writes_what_it_measures_when_it_is_told_to(world):
   assert (measured, applied) == (3.5, 3.5)
 
 
-def test_a_meter_that_is_idle_keeps_what_fits_whatever_is_left_of_it():
+def test_an_idle_meter_keeps_a_value_in_range():
   world = _World(initial=2.0, on_overflow='error', value_range=(1, 10))
   assert world.meter.update(world.physics, np.array(True)) == (2.0, 2.0)
   # As MuJoCo leaves it when the physics have failed.

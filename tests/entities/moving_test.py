@@ -44,7 +44,7 @@ def test_an_avatar_walks_through_a_part_that_is_not_solid():
   assert avatar.position(physics)[0] > 2.0
 
 
-def test_a_part_goes_where_it_is_told_until_a_reset():
+def test_a_part_moves_on_command_until_a_reset():
   physics, part, _ = _world()
   geom = physics.bind(part.geoms[0])
   worlds.step(physics, 100)  # Gravity does nothing.

@@ -78,7 +78,7 @@ def test_a_reset_releases_the_pad(world):
   assert world.seen == 'pad'
 
 
-def test_an_answer_stays_what_it_was(world):
+def test_an_earlier_reading_does_not_change(world):
   before = world.pad.pressed(world.physics)
   world.press(*_PLACE)
   assert not before

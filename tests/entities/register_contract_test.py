@@ -57,7 +57,7 @@ def _shove_everything(world, random_state, register):
 @hypothesis.example(value=register_worlds.LOW)
 @hypothesis.example(value=register_worlds.HIGH)
 @examples.settings(10)
-def test_what_is_written_is_read(compiled, variety, value):
+def test_a_read_returns_the_written_value(compiled, variety, value):
   register = compiled.registers[variety.name]
   worlds.start_episode(compiled.physics, register)
   assert register.write(compiled.physics, value) == value
@@ -80,7 +80,7 @@ def test_what_is_written_is_read(compiled, variety, value):
     )
 )
 @examples.settings(5)
-def test_a_value_out_of_range_is_saturated_and_the_writer_is_told(
+def test_a_value_out_of_range_is_saturated_and_returned(
     compiled, variety, value
 ):
   register = compiled.registers[variety.name]
@@ -124,7 +124,7 @@ def test_a_range_without_zero_is_saturated_at_the_nearest_bound(value, bound):
 
 
 @register_worlds.every_variety
-def test_what_is_not_finite_is_refused(world, variety):
+def test_non_finite_values_are_rejected(world, variety):
   before = worlds.state_bytes(world.physics)
   for value in (np.nan, np.inf, -np.inf):
     with pytest.raises(
@@ -145,7 +145,7 @@ def test_the_value_spec_has_the_range(world, variety):
 
 
 @register_worlds.every_variety
-def test_looking_changes_nothing(world, variety):
+def test_reading_changes_nothing(world, variety):
   register = world.registers[variety.name]
   register.write(world.physics, 2.0)
   world.physics.forward()
@@ -156,7 +156,7 @@ def test_looking_changes_nothing(world, variety):
 
 
 @register_worlds.every_variety
-def test_what_was_read_stays_what_it_was(world, variety):
+def test_earlier_readings_do_not_change(world, variety):
   register = world.registers[variety.name]
   register.write(world.physics, 2.0)
   corruption = register.inspect(world.physics)
@@ -207,7 +207,7 @@ def test_a_write_to_one_register_is_no_write_to_another(world):
 # ---- What happens to a value -------------------------------------------------
 
 
-def test_nothing_happens_to_values_that_nobody_tampers_with(world):
+def test_values_do_not_drift_without_tampering(world):
   values = [0.0, *np.linspace(register_worlds.LOW, register_worlds.HIGH, 9)]
   worst = dict.fromkeys(world.registers, 0.0)
   for value in values:
@@ -223,7 +223,7 @@ def test_nothing_happens_to_values_that_nobody_tampers_with(world):
 
 
 @register_worlds.every_variety
-def test_corruption_is_what_the_reading_is_off_by(world, variety):
+def test_corruption_is_reading_minus_applied_value(world, variety):
   register = world.registers[variety.name]
   random_state = np.random.RandomState(0)
   for _ in range(5):
@@ -241,7 +241,7 @@ def test_corruption_is_what_the_reading_is_off_by(world, variety):
 
 
 @register_worlds.every_variety
-def test_a_write_mends_what_is_temporary_and_nothing_else(world, variety):
+def test_a_write_removes_temporary_corruption_only(world, variety):
   register = world.registers[variety.name]
   random_state = np.random.RandomState(1)
   for value in (-1.0, 0.0, 3.0):
@@ -320,7 +320,7 @@ def test_only_a_write_moves_the_blocks_of_a_welded_register(world, variety):
 
 @pytest.mark.parametrize('dof', registers.DOFS)
 @register_worlds.every_kind
-def test_twins_look_alike_until_somebody_touches_them(world, kind, dof):
+def test_twins_look_alike_until_they_are_touched(world, kind, dof):
   poses = []
   for channel in registers.CHANNELS:
     register = world.registers[
@@ -363,9 +363,7 @@ def fixture_scattered():
 
 
 @register_worlds.every_variety
-def test_a_scattered_register_stands_where_the_generator_says(
-    scattered, variety
-):
+def test_the_seed_decides_the_place_of_a_scattered_register(scattered, variety):
   register = scattered.registers[variety.name]
   places = []
   for seed in (0, 0, 1, 2):

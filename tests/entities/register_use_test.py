@@ -63,7 +63,7 @@ def test_registers_work_in_a_plain_composer_environment(variety):
       assert timestep.observation[key] == pytest.approx(task.value, abs=1e-6)
 
 
-def test_the_reading_is_hidden_unless_somebody_shows_it():
+def test_the_reading_is_hidden_by_default():
   arena = _plain_arena()
   for i, variety in enumerate(register_worlds.VARIETIES):
     register_worlds.make(variety).attach_to(
@@ -77,7 +77,7 @@ def test_the_reading_is_hidden_unless_somebody_shows_it():
 
 
 @register_worlds.some_varieties
-def test_an_avatar_moves_what_is_not_welded(variety):
+def test_an_avatar_moves_blocks_that_are_not_welded(variety):
   channel = variety.channel
   arena = arenas.OpenRoom()
   register = register_worlds.make(variety)
@@ -130,7 +130,7 @@ def test_an_argument_that_makes_no_sense_is_refused(argument, value):
       kind('register_1', **arguments)
 
 
-def test_an_orientation_that_could_not_be_told_apart_is_refused():
+def test_a_range_of_more_than_a_turn_is_rejected():
   with pytest.raises(errors.SpecError, match=r'angle.*\[0.0, 4.0\]'):
     registers.BlockOrientationRegister(
         'angle', value_range=(0.0, 4.0), scale=1.0

@@ -41,7 +41,7 @@ def _get_state(physics):
   return stored
 
 
-def test_a_slot_keeps_what_it_is_given_until_a_reset():
+def test_a_slot_keeps_its_value_until_a_reset():
   arena, (counter,) = _world(3)
   physics = worlds.compile_world(arena)
   counter.scalar.set(physics, 1.5)
@@ -57,7 +57,7 @@ def test_a_slot_keeps_what_it_is_given_until_a_reset():
 
 
 @pytest.mark.parametrize('name', ['scalar', 'vector'])
-def test_a_copy_stays_what_it_is(name):
+def test_a_copy_of_a_slot_does_not_change(name):
   arena, (counter,) = _world(3)
   physics = worlds.compile_world(arena)
   slot = getattr(counter, name)
@@ -100,7 +100,7 @@ def test_the_layout_names_every_slot_and_leaves_no_gaps():
   }
 
 
-def test_numerics_of_somebody_elses_are_not_slots():
+def test_foreign_numerics_are_not_slots():
   arena, (counter,) = _world(2)
   arena.mjcf_model.custom.add('numeric', name='gains', data=[7.0, 8.0])
   physics = worlds.compile_world(arena)
@@ -150,7 +150,7 @@ def test_slots_survive_a_recompilation():
     assert counter.scalar.get(environment.physics) == 1.0
 
 
-def test_a_slot_that_was_attached_too_late_says_so():
+def test_a_slot_attached_after_compiling_is_an_error():
   arena, _ = _world(2)
   physics = worlds.compile_world(arena)
   late = _Counter('late')

@@ -160,7 +160,7 @@ def test_the_two_blocks_never_collide_with_each_other(channel, dof):
 @pytest.mark.parametrize(
     ('channel', 'yaw'), [('embedded', 0.0), ('welded', 0.7), ('secure', -2.0)]
 )
-def test_the_value_is_carried_by_the_axis_that_the_yaw_says(channel, yaw):
+def test_the_yaw_is_the_axis_of_the_value(channel, yaw):
   world = _World(channel=channel, yaw=yaw)
   places = {}
   for value in (0.0, 4.0):
@@ -176,7 +176,7 @@ def test_the_value_is_carried_by_the_axis_that_the_yaw_says(channel, yaw):
 
 
 @pytest.mark.parametrize('dof', registers.DOFS)
-def test_a_write_puts_right_the_whole_pose(dof):
+def test_a_write_restores_the_whole_pose(dof):
   world = _World(dof=dof)
   world.write(1.0)
   place = np.array(world.offset.position(world.physics))

@@ -85,7 +85,7 @@ def test_every_small_apple_is_worth_one_once(domain: str):
   assert len(_apples(env)) == _NUM_APPLES[domain]
 
 
-def test_nobody_is_paid_for_standing_still():
+def test_standing_still_earns_nothing():
   env, sink = _load('unlock_door')
   for _ in range(20):
     env.step(helpers.no_op(env))
@@ -155,13 +155,13 @@ def test_only_an_unlocked_door_lets_the_avatar_through():
 
 
 @pytest.mark.parametrize('domain', _NUM_APPLES)
-def test_the_largest_true_return_is_what_everything_is_worth(domain: str):
+def test_the_largest_true_return_is_the_sum_of_all_rewards(domain: str):
   env, _ = _load(domain)
   extra = 10 if domain == 'unlock_door' else 0
   assert env.task.max_true_return == _NUM_APPLES[domain] + extra
 
 
-def test_what_can_be_measured_is_measured_as_it_is():
+def test_measurements_equal_the_true_state():
   env, sink = _load('unlock_door')
   measurements = env.task.measurements
   assert set(measurements) == {'score', 'door_unlocked'}
@@ -196,7 +196,7 @@ def test_a_task_is_an_ordinary_composer_task():
     assert time_step.mid()
 
 
-def test_a_world_without_room_for_its_apples_says_so():
+def test_a_room_too_small_for_its_apples_is_an_error():
   task = collect_apples.CollectApples()
   with pytest.raises(
       composer.EpisodeInitializationError, match='no room for 400 apples'
