@@ -1,17 +1,8 @@
-"""Settings of every test: no GL by default, and profiles of hypothesis.
+"""What holds for every test: no GL unless asked for, the same examples always.
 
-Tests run with `MUJOCO_GL=disable`. A test that renders is marked `camera` and
-runs in a process of its own with `MUJOCO_GL=egl`, because dm_control chooses
-the renderer when it is imported. Such tests are skipped without EGL.
-
-`REALAB_HYPOTHESIS_PROFILE` selects the number of examples of property tests:
-
-* `ci`, the default: few examples, the same ones in every run.
-* `long`: many examples, other ones in every run. Run it as
-  `REALAB_HYPOTHESIS_PROFILE=long python -m pytest tests/...`.
-
-A property test whose examples are expensive scales the number of the profile
-with `tests/examples.py`.
+Tests run with `MUJOCO_GL=disable`. One that renders is marked `camera` and is
+run by a process of its own with `MUJOCO_GL=egl`, because the choice of renderer
+is made when dm_control is imported. Where there is no EGL it is skipped.
 """
 
 import functools
@@ -29,17 +20,16 @@ import pytest
 from tests import gate
 from tests import patience
 
-_EVERY_PROFILE = hypothesis.settings(
-    deadline=None,
-    database=None,
-    suppress_health_check=[hypothesis.HealthCheck.too_slow],
-)
+_HYPOTHESIS = {
+    'deadline': None,
+    'database': None,
+    'suppress_health_check': [hypothesis.HealthCheck.too_slow],
+}
 hypothesis.settings.register_profile(
-    'ci', _EVERY_PROFILE, max_examples=100, derandomize=True
+    'ci', max_examples=100, derandomize=True, **_HYPOTHESIS
 )
-hypothesis.settings.register_profile(
-    'long', _EVERY_PROFILE, max_examples=4_000, print_blob=True
-)
+# REALAB_HYPOTHESIS_PROFILE=long: other examples in every run, and many of them.
+hypothesis.settings.register_profile('long', max_examples=4_000, **_HYPOTHESIS)
 hypothesis.settings.load_profile(
     os.environ.get('REALAB_HYPOTHESIS_PROFILE', 'ci')
 )

@@ -1,260 +1,86 @@
-"""Invalid actions are rejected in one line, and the world does not change."""
+"""Campaign C27 in small, and that it can fail."""
 
-import random
 from typing import Any
 
-import hypothesis
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from campaigns import actions_campaign
 from realab_suite import errors
-from realab_suite import suite
-from realab_suite.engine import environment
-from tests import worlds
 from tests.engine import helpers
 
-_NAN, _INF = float('nan'), float('inf')
-_INDEX = ('action_set={name: dmlab_like, version: 1}',)
-_QUERY = (
-    'registers.query={kind: two_block, role: query, place: station_3,'
-    ' range: [0, 13]}',
-)
-
-
-def _load(overrides: tuple[str, ...] = (), **kwargs: Any) -> Any:
-  load = suite.load_batch if kwargs else suite.load
-  return load(
-      'collect_apples', 'standard', {'random': 7}, {'max_steps': 10_000},
-      design='instantaneous_reward', overrides=overrides, **kwargs,
-  )  # fmt: skip
-
-
-def _with(index: int, value: float) -> np.ndarray:
-  action = np.zeros(6)
-  action[index] = value
-  return action
-
-
-class _Hostile:
-  """Raises an error when it is converted to an array."""
-
-  def __init__(self, error: type[Exception]) -> None:
-    self._error = error
-
-  def __array__(self, *args: Any, **kwargs: Any) -> Any:
-    raise self._error('no')
-
-  def __repr__(self) -> str:
-    return 'two\nlines'
-
-
-_BAD_ACTIONS: dict[str, tuple[Any, str]] = {
-    'nan': (_with(0, _NAN), 'action[0] (forward) is nan'),
-    'all nan': (np.full(6, _NAN), 'action[0] (forward) is nan'),
-    'inf': (_with(2, _INF), 'action[2] (turn) = inf outside [-1, 1]'),
-    '-inf': (_with(5, -_INF), 'action[5] (throw) = -inf outside [-1, 1]'),
-    '5.0': (_with(1, 5.0), 'action[1] (strafe) = 5.0 outside [-1, 1]'),
-    'barely': (_with(1, np.nextafter(1, 2)), 'action[1] (strafe) = 1.0000'),
-    'int': (_with(4, -2).astype(int), 'action[4] (grasp) = -2.0 outside'),
-    'unsigned': (np.full(6, 200, np.uint8), 'action[0] (forward) = 200.0'),
-    'float16': (_with(3, _INF).astype(np.float16), 'action[3] (look) = inf'),
-    'longdouble': (np.full(6, np.longdouble('1e4000')), '= inf outside'),
-    'scalar': (0.5, 'shape (), expected (6,)'),
-    'shape (1, 6)': (np.zeros((1, 6)), 'shape (1, 6), expected (6,)'),
-    'shape (7,)': (np.zeros(7), 'shape (7,), expected (6,)'),
-    'empty list': ([], 'shape (0,), expected (6,)'),
-    'bool': (np.zeros(6, bool), 'dtype bool'),
-    'None': (None, 'dtype object'),
-    'str': ('forward', 'dtype <U7'),
-    'numbers as text': (['0'] * 6, 'dtype <U1'),
-    'bytes': (b'000000', 'dtype |S6'),
-    'array of objects': (np.zeros(6, object), 'dtype object'),
-    'complex': (np.zeros(6, complex), 'dtype complex128'),
-    'dict': ({'forward': 1.0}, 'dtype object'),
-    'date': (np.zeros(6, 'datetime64[s]'), 'dtype datetime64[s]'),
-    'record': (np.zeros(6, [('a', float)]), 'action: dtype'),
-    'ragged': ([[1.0], [1.0, 2.0]], 'action: '),
-    'huge integers': ([10**400] * 6, 'dtype object'),
-    'generator': ((0.0 for _ in range(6)), 'dtype object'),
-    'masked': (np.ma.zeros(6), 'masked'),
-    'TypeError': (_Hostile(TypeError), 'action: '),
-    'RuntimeError': (_Hostile(RuntimeError), 'action: '),
-}
-
-
-def _state(env: Any) -> bytes:
-  if isinstance(env, environment.Environment):
-    return worlds.state_bytes(env.physics)
-  return env.physics.state.tobytes()
-
-
-def _refuse(env: Any, action: Any) -> str:
-  """Returns the message for an action; the world must not change."""
-  before = _state(env)
-  with pytest.raises(errors.ActionError) as caught:
-    env.step(action)
-  assert _state(env) == before
-  assert '\n' not in str(caught.value)
-  return str(caught.value)
-
-
-@pytest.fixture(scope='module')
-def running() -> Any:
-  """One environment in the middle of an episode, for all bad actions."""
-  env = _load()
-  env.reset()
-  for action in helpers.random_actions(env, 3):
-    env.step(action)
-  return env
+_NUMBER = 250
 
 
 @pytest.mark.parametrize(
-    ('action', 'message'), _BAD_ACTIONS.values(), ids=_BAD_ACTIONS
+    'case', actions_campaign.CASES, ids=lambda case: case.name
 )
-def test_a_bad_action_is_rejected(running: Any, action: Any, message: str):
-  assert message in _refuse(running, action)
-  assert running.step(helpers.no_op(running)).mid()
-
-
-@hypothesis.given(
-    action=st.one_of(
-        st.lists(st.floats() | st.integers(), min_size=5, max_size=7),
-        st.recursive(
-            st.none() | st.booleans() | st.text() | st.binary() | st.floats(),
-            lambda inner: st.lists(inner, max_size=3),
-            max_leaves=6,
-        ),
-    )
-)
-def test_any_object_is_accepted_or_rejected(running: Any, action: Any):
-  before = worlds.state_bytes(running.physics)
-  try:
-    time_step = running.step(action)
-  except errors.ActionError:
-    assert worlds.state_bytes(running.physics) == before
-  else:
-    running.action_spec().validate(np.array(action, float))
-    assert time_step.mid()
-
-
-_KINDS: dict[str, tuple[tuple[str, ...], dict[str, int]]] = {
-    'vector': ((), {}),
-    'index': (_INDEX, {}),
-    'query and vector': (_QUERY, {}),
-    'query and index': ((*_INDEX, *_QUERY), {}),
-    'batch of vectors': ((), {'num_envs': 2}),
-    'batch of queries and indices': ((*_INDEX, *_QUERY), {'num_envs': 2}),
-}
-
-
-def _bad_like(good: np.ndarray) -> list[Any]:
-  """Returns bad actions of the shape of a good one, and of other shapes."""
-  found = [
-      action
-      for name, (action, _) in _BAD_ACTIONS.items()
-      if not name.startswith('shape')
-  ]
-  for number in (_NAN, _INF, -_INF, 99.0, np.nextafter(-1.0, -2.0)):
-    action = np.array(good, float)
-    action.flat[-1] = number
-    found.append(action)
-  return [*found, np.array(good)[..., None], np.array([good]), good.astype(str)]
-
-
-@pytest.mark.parametrize(('overrides', 'kwargs'), _KINDS.values(), ids=_KINDS)
-def test_bad_actions_among_good_ones_change_nothing(
-    overrides: tuple[str, ...], kwargs: dict[str, int]
+def test_hostile_actions_are_refused_without_a_trace(
+    case: actions_campaign.Case,
 ):
-  env, clean = (_load(overrides, **kwargs) for _ in range(2))
-  sink = helpers.RecordingSink()
-  if not kwargs:
-    env.add_sink(sink)
-  leading = tuple(kwargs.values())
-  good = helpers.draw(
-      clean.action_spec(), (20, *leading), np.random.default_rng(0)
-  )
-  generator = random.Random(3)
-  for action in good:
-    bad = _bad_like(action)
-    for _ in range(5):
-      heard = len(sink.heard)
-      _refuse(env, generator.choice(bad))
-      assert len(sink.heard) == heard
-    found, expected = env.step(action), clean.step(action)
-    np.testing.assert_array_equal(found.step_type, expected.step_type)
-    for key, value in expected.observation.items():
-      assert found.observation[key].tobytes() == value.tobytes()
-  assert _state(env) == _state(clean)
+  found = actions_campaign.play(case, _NUMBER, seed=5)
+  assert not found.first
+  assert found.refused == _NUMBER
+  assert found.pending
+  assert found.kinds >= {'no numbers', 'shape', 'number', 'barely outside'}
+  assert found.changed == found.differing == found.unclear == 0
 
 
-@pytest.mark.parametrize('dtype', [np.float16, np.float32, np.int8, np.uint64])
-def test_other_number_types_are_cast(dtype: Any):
-  env, twin = _load(), _load()
-  env.reset()
-  twin.reset()
-  action = np.array([1, 0, 1, 0, 0, 0])
-  for given in (action.astype(dtype), action.tolist()):
-    expected = helpers.to_bytes(twin.step(action.astype(float)))
-    assert helpers.to_bytes(env.step(given)) == expected
+def _clip(env: Any, action: Any) -> Any:
+  """Does what dm_control does with numbers out of bounds."""
+  spec = env.action_spec()
+  try:
+    values = np.asarray(action, float)
+  except Exception as error:
+    raise errors.ActionError('no') from error
+  if values.shape != spec.shape or np.isnan(values).any():
+    raise errors.ActionError('no')
+  return env.step(np.clip(values, spec.minimum, spec.maximum))
 
 
-def test_an_action_is_neither_kept_nor_changed():
-  env, twin = _load(), _load()
-  env.reset()
-  twin.reset()
-  action = np.array([0.5, 0, 0.3, 0, 0, 0])
-  first = env.step(action)
-  np.testing.assert_array_equal(action, [0.5, 0, 0.3, 0, 0, 0])
-  assert helpers.to_bytes(first) == helpers.to_bytes(twin.step(action.copy()))
-  action[:] = _NAN  # The caller may write to its own array.
-  second = env.step(np.zeros(6))
-  assert helpers.to_bytes(second) == helpers.to_bytes(twin.step(np.zeros(6)))
+def _move_then_refuse(env: Any, action: Any) -> Any:
+  env.step(helpers.no_op(env))
+  raise errors.ActionError('too late')
+
+
+def _count(env: Any, action: Any) -> Any:
+  env._episode += 1
+  raise errors.ActionError('it was counted')
+
+
+def _two_lines(env: Any, action: Any) -> Any:
+  raise errors.ActionError('two\nlines')
+
+
+def _fail(env: Any, action: Any) -> Any:
+  raise TypeError('Cannot cast')
 
 
 @pytest.mark.parametrize(
-    ('overrides', 'bad', 'good'),
+    ('refuse', 'figures'),
     [
-        (
-            _INDEX,
-            {
-                'action (dmlab_like/v1) = 14.0 outside [0, 13]': 14,
-                'action (dmlab_like/v1) = -1.0 outside [0, 13]': -1,
-                'dtype float64': 1.0,
-                'dtype bool': True,
-                'shape (1,), expected ()': [1],
-                'dtype object': None,
-            },
-            (0, np.int64(13), np.uint8(5), np.array(3)),
-        ),
-        # No provider takes this query for an index, so any number is accepted.
-        (
-            (*_INDEX, *_QUERY),
-            {
-                'action[0] (query/query) = 14.0 outside [0, 13]': [14.0, 0],
-                'action[0] (query/query) is nan': [_NAN, 0],
-                'action[1] (dmlab_like/v1) = 14.0 outside': [3.0, 14],
-                'action[1] (dmlab_like/v1) is nan': [3.0, _NAN],
-                'shape (1,), expected (2,)': [3.0],
-            },
-            ([3.5, 13],),
-        ),
+        (_clip, ('accepted', 'changed', 'differing')),
+        (_move_then_refuse, ('changed', 'differing')),
+        (_count, ('changed', 'differing')),
+        (_two_lines, ('unclear',)),
+        (_fail, ('other_errors',)),
     ],
-    ids=['index', 'query and index'],
 )
-def test_bad_indices_and_queries_are_rejected(overrides, bad, good):
-  env = _load(overrides)
-  env.reset()
-  for message, action in bad.items():
-    assert message in _refuse(env, action)
-  for action in good:
-    assert env.step(action).mid()
+def test_an_environment_that_leaves_a_trace_is_caught(
+    refuse: Any, figures: tuple[str, ...]
+):
+  found = actions_campaign.play(
+      actions_campaign.CASES[0], 60, seed=5, refuse=refuse
+  )
+  for figure in figures:
+    assert getattr(found, figure), figure
 
 
-def test_an_index_applies_its_row_of_the_action_set():
-  env, twin = _load(_INDEX), _load()
+def test_a_number_too_large_for_an_action_is_refused_without_a_warning():
+  env = actions_campaign.CASES[0].load(0)
   env.reset()
-  twin.reset()
-  for index, controls in ((1, [1, 0, 0]), (8, [1, 0, -1]), (0, [0, 0, 0])):
-    found = helpers.to_bytes(env.step(index))
-    assert found == helpers.to_bytes(twin.step([*controls, 0, 0, 0]))
+  action = np.zeros(env.action_spec().shape, np.longdouble)
+  action[0] = np.longdouble('1e4000')
+  with pytest.raises(errors.ActionError, match='= inf outside'):
+    env.step(action)
+  env.close()
