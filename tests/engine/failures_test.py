@@ -144,8 +144,13 @@ def _batch(**kwargs: Any) -> batch_environment.BatchEnvironment:
   )  # fmt: skip
 
 
-@pytest.mark.parametrize('num_steps', [0, 1, 5, 6, 7, 8])
-@pytest.mark.parametrize('how', ['reset', 'close', 'add_sink', 'restore'])
+@pytest.mark.parametrize(
+    ('how', 'num_steps'),
+    [
+        ('reset', 0), ('reset', 6), ('close', 5), ('close', 7),
+        ('add_sink', 1), ('add_sink', 8), ('restore', 6), ('restore', 7),
+    ],
+)  # fmt: skip
 def test_every_episode_that_begins_ends_once(num_steps: int, how: str):
   batch, sink = _batch(design='instantaneous_reward'), _Heard()
   batch.add_sink(sink)
