@@ -60,7 +60,7 @@ def test_tests_see_a_bug_and_pass_without_it(tmp_path):
   assert not mutants_campaign.is_caught(harmless, tmp_path)
 
 
-def test_uncovered_lines_are_counted_and_named():
+def test_what_tests_did_not_go_through_is_counted_and_named():
   one = {
       'summary': {
           'num_statements': 6, 'num_branches': 4,
