@@ -20,14 +20,19 @@ import pytest
 from tests import gate
 from tests import patience
 
+_HYPOTHESIS = {
+    'deadline': None,
+    'database': None,
+    'suppress_health_check': [hypothesis.HealthCheck.too_slow],
+}
 hypothesis.settings.register_profile(
-    'realab',
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+    'ci', max_examples=100, derandomize=True, **_HYPOTHESIS
 )
-hypothesis.settings.load_profile('realab')
+# REALAB_HYPOTHESIS_PROFILE=long: other examples in every run, and many of them.
+hypothesis.settings.register_profile('long', max_examples=4_000, **_HYPOTHESIS)
+hypothesis.settings.load_profile(
+    os.environ.get('REALAB_HYPOTHESIS_PROFILE', 'ci')
+)
 
 _ROOT = pathlib.Path(__file__).parents[1]
 _RENDERS_SOMETHING = """

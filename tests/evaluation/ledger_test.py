@@ -6,7 +6,6 @@ import dm_env
 import numpy as np
 import pytest
 
-from campaigns import readings_campaign
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
@@ -18,6 +17,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
+from tests.evaluation import streams
 
 _TOLERANCE = 1e-9
 
@@ -329,7 +329,7 @@ def _play(
   evaluate.evaluate(env, policy, 2, sinks=listeners)
   env.close()
   # Every register is read by the evaluator after every step.
-  pairs = list(readings_campaign.pairs(ledger.episodes))
+  pairs = list(streams.pairs(ledger.episodes))
   assert len(pairs) > 2 * 201 * len(env.mechanism.registers)
   return ledger.episodes
 
@@ -343,9 +343,7 @@ def _largest(episodes: list[ledgers.EpisodeLedger], part: str) -> float:
       'temporary': lambda write, read: read.temporary,
       'saturation': lambda write, read: write.applied - write.requested,
   }
-  return max(
-      abs(parts[part](*pair)) for pair in readings_campaign.pairs(episodes)
-  )
+  return max(abs(parts[part](*pair)) for pair in streams.pairs(episodes))
 
 
 @pytest.mark.parametrize('dof', ['free', 'planar'])

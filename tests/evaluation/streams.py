@@ -4,7 +4,7 @@ One is an oracle that asks of every read which write came last before it, by
 brute force; the other is a table of cases that were worked out by hand.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import math
 from typing import Any
 
@@ -73,6 +73,20 @@ def tell(
     ledger.step_ended(events.Step(records, np.array(0.0)), None)
   if end is not None:
     ledger.episode_ended(end)
+
+
+def pairs(
+    episodes: Sequence[ledgers.EpisodeLedger],
+) -> Iterator[tuple[registers.Write, registers.Read]]:
+  """Yields each read with the write before it in the same episode."""
+  for episode in episodes:
+    for entries in episode.entries.values():
+      write = None
+      for entry in entries:
+        if isinstance(entry, registers.Write):
+          write = entry
+        elif write is not None:
+          yield write, entry
 
 
 def measured(
