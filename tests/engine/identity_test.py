@@ -1,13 +1,10 @@
-"""Tests of the campaigns on batches and memory, each in small."""
+"""A batch is its worlds: a small part of the campaign `identity`."""
 
-from concurrent import futures
-import multiprocessing
 from typing import Any
 
 import numpy as np
 import pytest
 
-from campaigns import growth_campaign
 from campaigns import identity_campaign
 from realab_suite import suite
 from realab_suite.engine import batch_physics
@@ -120,40 +117,3 @@ def test_a_ledger_of_one_world_that_differs_is_noticed(monkeypatch, what):
 
   monkeypatch.setattr(ledgers.BatchLedger, 'episodes', tell_carelessly)
   assert _differences() == 'world 1: ledger'
-
-
-# Memory.
-
-
-def _grow_by_a_kilobyte() -> float:
-  """Returns the growth per 1,000 acts, MiB."""
-  hoard: list[bytearray] = []
-  return growth_campaign.growth(
-      lambda: hoard.append(bytearray(1024)), 11_000, 1_000
-  )
-
-
-def _in_another_process(function: Any, *arguments: Any) -> Any:
-  """Returns what a function does where no other test has left anything."""
-  with futures.ProcessPoolExecutor(
-      1, multiprocessing.get_context('spawn')
-  ) as pool:
-    return pool.submit(function, *arguments).result()
-
-
-def test_growth_is_what_grows():
-  assert 0.9 < _in_another_process(_grow_by_a_kilobyte) < 1.3
-
-
-@pytest.mark.parametrize(
-    'case',
-    [
-        growth_campaign.Case('single', 'step', 1_500, 1_500),
-        growth_campaign.Case('batch', 'step', 600, 600),
-        growth_campaign.Case('single', 'reset', 600, 600),
-    ],
-    ids=lambda case: f'{case.world}-{case.what}',
-)
-def test_memory_hardly_grows(case):
-  # Less than a kilobyte at a time, which is as fine as a short run can tell.
-  assert _in_another_process(growth_campaign.measure, case) < 0.5
