@@ -23,8 +23,8 @@ import grpc
 
 from campaigns import figure_lines
 from campaigns import served_campaign
-from campaigns import zygote
 from tests import patience
+from tests import zygote
 from tests.interop import served
 
 REPETITIONS = 50

@@ -1,14 +1,14 @@
-"""A process that has imported everything, and forks a child for every task.
+"""A process that imports a module once, and forks a child for every call.
 
-A child costs milliseconds where a new interpreter costs seconds, so that
-thousands of them can be killed:
+A child takes milliseconds where a new interpreter takes seconds, so thousands
+of them can be killed:
 
-    with zygote.Zygote('campaigns.kill_campaign') as nursery:
-      pid = nursery.start('victim', folder=folder, ...)
+    with zygote.Zygote('tests.experiments.crashes') as nursery:
+      pid = nursery.start('run_training', output=folder, ...)
       os.kill(pid, signal.SIGKILL)
       status, said = nursery.wait(pid)
 
-It is a new interpreter of one thread, whatever the process is that uses it.
+It is a new interpreter with one thread, whatever process uses it.
 """
 
 from collections.abc import Mapping
@@ -26,11 +26,11 @@ _ROOT = pathlib.Path(__file__).parents[1]
 
 @final
 class Ended(NamedTuple):
-  """How a child ended.
+  """End of a child.
 
   Attributes:
-    status: Its exit status; less than zero, the signal that ended it.
-    said: What it wrote to the standard output and error.
+    status: Exit status; below zero, minus the signal that ended it.
+    said: Text of its standard output and error.
   """
 
   status: int
@@ -43,7 +43,7 @@ class Zygote:
 
   def __init__(self, module: str) -> None:
     self._process = subprocess.Popen(
-        [sys.executable, '-m', 'campaigns.zygote', module],
+        [sys.executable, '-m', 'tests.zygote', module],
         cwd=_ROOT,
         env={**os.environ, 'MUJOCO_GL': 'disable', 'OMP_NUM_THREADS': '1'},
         stdin=subprocess.PIPE,
@@ -59,15 +59,15 @@ class Zygote:
       self._process.stdin.close()
 
   def start(self, function: str, /, **arguments: Any) -> int:
-    """Forks a child that calls a function; returns its number."""
+    """Forks a child that calls a function; returns its process id."""
     return int(self._ask({'call': function, 'with': arguments}))
 
   def wait(self, pid: int) -> Ended:
-    """Returns how a child ended, when it has."""
+    """Waits for the end of a child."""
     return Ended(*self._ask({'wait': pid}))
 
   def call(self, function: str, /, **arguments: Any) -> Ended:
-    """Calls a function in a child, and returns how that ended."""
+    """Calls a function in a child, and waits for its end."""
     return self.wait(self.start(function, **arguments))
 
   def _ask(self, question: Mapping[str, Any]) -> Any:
@@ -77,7 +77,7 @@ class Zygote:
 
 
 def _serve(module: Any) -> None:
-  """Does what each line of the standard input says."""
+  """Executes the commands on the standard input, one a line."""
   pipes = {}
   for line in sys.stdin:
     task = json.loads(line)
@@ -87,7 +87,6 @@ def _serve(module: Any) -> None:
       said = _all_of(pipes.pop(pid))
       answer: Any = [os.waitstatus_to_exitcode(status), said]
     else:
-      # A pipe, as a file would be subject to what is done to the disk.
       reading, writing = os.pipe()
       answer = os.fork()
       if not answer:
@@ -98,7 +97,7 @@ def _serve(module: Any) -> None:
 
 
 def _all_of(pipe: int) -> str:
-  """Returns what is in a pipe, which somebody else may hold open."""
+  """Returns the content of a pipe, which another process may hold open."""
   os.set_blocking(pipe, False)
   parts = []
   try:
@@ -111,7 +110,7 @@ def _all_of(pipe: int) -> str:
 
 
 def _live(function: Any, arguments: dict[str, Any], pipe: int) -> NoReturn:
-  """Calls a function with streams of its own, and ends this process."""
+  """Calls a function with its own streams, and ends this process."""
   for stream in (1, 2):
     os.dup2(pipe, stream)
   os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
