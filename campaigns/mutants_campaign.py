@@ -28,7 +28,9 @@ from tests.leaks import mutants as leaks
 ROOT = pathlib.Path(__file__).parents[1]
 _PATIENCE_SECONDS = 600
 _TESTS_FAILED = 1  # The exit status of pytest; 2 and more is something else.
-_COPIED = ('realab_suite', 'configs', 'tests', 'examples', 'setup.cfg')
+_COPIED = (
+    'realab_suite', 'configs', 'campaigns', 'tests', 'examples', 'setup.cfg',
+)  # fmt: skip
 
 
 @final

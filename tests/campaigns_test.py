@@ -3,14 +3,7 @@
 import pytest
 
 from campaigns import coverage_campaign
-from campaigns import install_campaign
 from campaigns import mutants_campaign
-
-_REFUSAL = (
-    'realab_suite._versions.DependencyError: realab_suite: found dm-control'
-    ' 1.0.50 and mujoco 4.0.0; needs dm-control>=1.0.50,<2 and mujoco>=3.17,<4;'
-    ' run: python -m pip install "dm-control>=1.0.50,<2" "mujoco>=3.17,<4"'
-)
 
 
 @pytest.mark.parametrize(
@@ -82,18 +75,3 @@ def test_every_target_of_coverage_is_of_a_module_that_is_there():
       assert (mutants_campaign.ROOT / 'realab_suite' / place).exists()
   for tests in coverage_campaign.TESTS:
     assert (mutants_campaign.ROOT / tests).exists()
-
-
-@pytest.mark.parametrize(
-    ('lane', 'works', 'is_refused'),
-    [
-        (install_campaign.Lane('', '', 0, 'ran'), True, False),
-        (install_campaign.Lane('no such version', '', 1, ''), False, False),
-        (install_campaign.Lane('', '', 1, f'Trace\n{_REFUSAL}'), False, True),
-        (install_campaign.Lane('', '', 1, 'AttributeError: x'), False, False),
-        (install_campaign.Lane('', '', -11, ''), False, False),
-    ],
-)
-def test_a_lane_works_or_is_refused_or_neither(lane, works, is_refused):
-  assert lane.works is works
-  assert lane.is_refused_in_one_line is is_refused

@@ -11,7 +11,6 @@ import numpy.typing as npt
 import pydantic
 import pytest
 
-from campaigns import paths_campaign
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
@@ -20,9 +19,10 @@ from realab_suite.config import option_types
 from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 from tests.config import file_readers
+from tests.config import off_limits
 from tests.engine import helpers
 
-_WATCH = paths_campaign.Watch()
+_WATCH = off_limits.Watch()
 _REGISTER = {
     'kind': 'two_block',
     'role': 'feedback',
@@ -49,7 +49,7 @@ def _readers() -> Iterator[None]:
 @pytest.fixture
 def outside() -> Iterator[pathlib.Path]:
   """A folder that is off limits, beside the working directory."""
-  with paths_campaign.workplace() as folder:
+  with off_limits.workplace() as folder:
     yield folder
 
 
@@ -91,7 +91,7 @@ def _refusal(load: Callable[[], Any]) -> str:
   with _WATCH.only('.'):
     with pytest.raises(errors.SpecError) as caught:
       load()
-    opened = [p for p in _WATCH.opened if paths_campaign.OFF_LIMITS in p]
+    opened = [p for p in _WATCH.opened if off_limits.FOLDER in p]
   assert not opened
   text = str(caught.value)
   assert text.isprintable()
@@ -305,7 +305,7 @@ def test_a_path_within_the_directory_may_be_named(
     ],
 )
 def test_what_leads_out_of_the_directory(path: str, outside: pathlib.Path):
-  paths_campaign.paths(outside)  # Makes links.
+  off_limits.make_paths(outside)  # Makes links.
   os.symlink('loop', 'loop')
   design = _design(_wrapped(2, 'network_demonstrator', weights=path))
   text = _refusal(lambda: specs.load(_file(design)))
