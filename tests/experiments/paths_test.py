@@ -212,4 +212,4 @@ def test_no_module_reads_a_model_from_a_file_or_a_text():
       if (match := reads.search(path.read_text(encoding='utf-8')))
   }
   # A box that tells whether anything renders, in a process of its own.
-  assert found in ({}, {'headless.py': 'from_xml_string'})
+  assert found in ({}, {'renderers.py': 'from_xml_string'})
