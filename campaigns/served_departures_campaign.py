@@ -22,7 +22,6 @@ from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 import grpc
 
 from campaigns import figure_lines
-from campaigns import served_campaign
 from tests import patience
 from tests import zygote
 from tests.interop import served
@@ -38,18 +37,19 @@ def _ask_without_waiting(stream: served.RawStream) -> None:
   stream.tell(served.STEP)
 
 
-# What a client does before it goes: requests in turn.
+_OUTSIDE = served.request(create_world=pb.CreateWorldRequest())
+# Requests of a client before it leaves, in turn.
 POINTS: dict[str, list[bytes | Callable[[served.RawStream], None]]] = {
     'connected': [served.LEAVE],
     'joined': [served.JOIN],
-    'refused': [served_campaign.OUTSIDE[0]],
+    'refused': [_OUTSIDE],
     'joined and refused': [served.JOIN, served.JOIN],
     'first step': [served.JOIN, served.STEP],
     'second step': [served.JOIN, served.STEP, served.STEP],
     'refused in mid-episode': [
         served.JOIN,
         served.STEP,
-        served_campaign.HOSTILE['bare step'],
+        served.request(step=pb.StepRequest()),
     ],
     'last step': [served.JOIN, *[served.STEP] * 21],
     'reset after the last step': [
