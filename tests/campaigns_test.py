@@ -1,29 +1,30 @@
-"""Campaigns that take long have parts that do not, and they are tried here."""
+"""Tests for the campaigns on planted bugs and on coverage."""
 
 import pytest
 
 from campaigns import coverage_campaign
 from campaigns import mutants_campaign
+from campaigns import planting
 
 
 @pytest.mark.parametrize(
     'mutant', mutants_campaign.MUTANTS, ids=lambda mutant: mutant.what
 )
 def test_a_bug_can_be_planted_and_its_tests_are_there(mutant):
-  path = mutants_campaign.ROOT / 'realab_suite' / mutant.file
+  path = planting.ROOT / 'realab_suite' / mutant.file
   text = path.read_text(encoding='utf-8')
-  spoilt = mutants_campaign.mutated(mutant, text)
+  spoilt = planting.mutated(mutant, text)
   assert spoilt != text
   compile(spoilt, mutant.file, 'exec')
   files = [one for one in mutant.tests if one.endswith('.py')]
   assert files
-  assert all((mutants_campaign.ROOT / one).exists() for one in files)
+  assert all((planting.ROOT / one).exists() for one in files)
 
 
 def test_a_bug_that_cannot_be_planted_is_named():
   mutant = mutants_campaign.MUTANTS[0]
   with pytest.raises(ValueError, match='0 times; allowed is once'):
-    mutants_campaign.mutated(mutant, '')
+    planting.mutated(mutant, '')
 
 
 def test_there_are_as_many_bugs_as_were_asked_for():
@@ -41,16 +42,16 @@ def test_there_are_as_many_bugs_as_were_asked_for():
 
 
 def test_tests_see_a_bug_and_pass_without_it(tmp_path):
-  mutants_campaign.copy_package(tmp_path)
+  planting.copy_package(tmp_path)
   [mutant] = (
       m for m in mutants_campaign.MUTANTS if m.what == 'metres are units'
   )
   case = (
       'tests/evaluation/metrics_test.py::test_metrics_are_what_a_hand_works_out'
   )
-  assert mutants_campaign.is_caught(mutant._replace(tests=[case]), tmp_path)
+  assert planting.is_caught(mutant._replace(tests=[case]), tmp_path)
   harmless = mutant._replace(new=mutant.old.replace(' * ', '*'), tests=[case])
-  assert not mutants_campaign.is_caught(harmless, tmp_path)
+  assert not planting.is_caught(harmless, tmp_path)
 
 
 def test_what_tests_did_not_go_through_is_counted_and_named():
@@ -72,6 +73,6 @@ def test_what_tests_did_not_go_through_is_counted_and_named():
 def test_every_target_of_coverage_is_of_a_module_that_is_there():
   for places, _ in coverage_campaign.TARGETS.values():
     for place in places:
-      assert (mutants_campaign.ROOT / 'realab_suite' / place).exists()
+      assert (planting.ROOT / 'realab_suite' / place).exists()
   for tests in coverage_campaign.TESTS:
-    assert (mutants_campaign.ROOT / tests).exists()
+    assert (planting.ROOT / tests).exists()
