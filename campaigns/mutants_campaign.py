@@ -52,7 +52,7 @@ _STA = ('tests/evaluation/statistics_test.py',)
 MUTANTS = [
     # ---- Contract ------------------------------------------------------------
     planting.Mutant(
-        'contract', 'finding 3: after a physics error the episode goes on',
+        'contract', 'finding 3: after a physics error the episode continues',
         _ENVIRONMENT,
         '''    self._reset_next_step = True
     try:
@@ -62,7 +62,7 @@ MUTANTS = [
         _ENV,
     ),
     planting.Mutant(
-        'contract', 'finding 4: a divergence is told by a discount of 0',
+        'contract', 'finding 4: a divergence has discount 0',
         _ENVIRONMENT,
         'dm_env.truncation(0.0, observing.copied(self._observation), 1.0)',
         'dm_env.truncation(0.0, observing.copied(self._observation), 0.0)',
@@ -80,12 +80,12 @@ MUTANTS = [
         'good = ~((values < self._low) | (values > self._high))', _ENV,
     ),
     planting.Mutant(
-        'contract', 'finding 5: a shape that broadcasts is taken', _ACTIONS,
+        'contract', 'finding 5: a shape that broadcasts is accepted', _ACTIONS,
         'if values.shape != expected:',
         'if values.size not in (1, int(np.prod(expected))):', _ENV,
     ),
     planting.Mutant(
-        'contract', 'finding 5: what is out of bounds is clamped silently',
+        'contract', 'finding 5: a value out of bounds is clamped silently',
         _ACTIONS,
         '''    if np.count_nonzero(good) != good.size:
 ''',
@@ -95,7 +95,7 @@ MUTANTS = [
 ''', _ENV,
     ),
     planting.Mutant(
-        'contract', 'an action of booleans is taken', _ACTIONS,
+        'contract', 'an action of booleans is accepted', _ACTIONS,
         "kinds = 'iuf' if", "kinds = 'biuf' if", _ENV,
     ),
     planting.Mutant(
@@ -109,7 +109,7 @@ MUTANTS = [
         'return dict(observation)', _ENV,
     ),
     planting.Mutant(
-        'contract', 'finding 7: a step after a failed reset is no first one',
+        'contract', 'finding 7: a step after a failed reset is not FIRST',
         _ENVIRONMENT,
         '''    self._reset_next_step = True
     self._episode += 1
@@ -143,7 +143,7 @@ MUTANTS = [
 ''', '', _ENV,
     ),
     planting.Mutant(
-        'contract', 'finding 14: a closed environment comes to life again',
+        'contract', 'finding 14: a closed environment can be used',
         _ENVIRONMENT,
         '''    if self._closed:
       raise errors.ClosedError(''',
@@ -189,7 +189,7 @@ MUTANTS = [
 ''', (*_ENV, *_LED),
     ),
     planting.Mutant(
-        'contract', 'a register stores what is not finite', _REGISTER,
+        'contract', 'a register stores a value that is not finite', _REGISTER,
         'if not is_finite.all():', 'if not is_finite.any() and False:', _REG,
     ),
     planting.Mutant(
@@ -198,7 +198,7 @@ MUTANTS = [
         'value', _REG,
     ),
     planting.Mutant(
-        'contract', 'a hand keeps a block that is written', _REGISTER.replace(
+        'contract', 'a hand keeps a block that a register writes', _REGISTER.replace(
             'registers/base', 'block_kinds'
         ),
         'physics.bind(self._grasps).active = 0', 'pass', _TWO + _REG + (
@@ -212,20 +212,20 @@ MUTANTS = [
     ),
     # ---- Metrics -------------------------------------------------------------
     planting.Mutant(
-        'metric', 'corruption is judged by what was requested', _METRICS,
+        'metric', 'corruption is relative to the requested value', _METRICS,
         'errors.append(entry.reading - last.applied)',
         'errors.append(entry.reading - last.requested)', _MET,
     ),
     planting.Mutant(
-        'metric', 'a write that nobody read counts as read', _METRICS,
+        'metric', 'a write without a read counts as read', _METRICS,
         'num_writes_read += not last_was_read', 'num_writes_read += 1', _MET,
     ),
     planting.Mutant(
-        'metric', 'reads before any write are not told apart', _METRICS,
+        'metric', 'reads before any write are not counted separately', _METRICS,
         '      too_early += 1\n', '', _MET,
     ),
     planting.Mutant(
-        'metric', 'what was never read has no corruption instead of none known',
+        'metric', 'without a read, corruption is zero instead of unknown',
         _METRICS,
         'return float(np.mean(values)) if values else None',
         'return float(np.mean(values)) if values else 0.0', _MET,
@@ -244,19 +244,19 @@ MUTANTS = [
         'if entry.writer != registers.INITIAL:', 'if True:', _MET,
     ),
     planting.Mutant(
-        'metric', 'what providers read is part of the observed return',
+        'metric', "a provider's read is part of the observed return",
         _METRICS,
         'if entry.reader == registers.AGENT and entry.step > 0:',
         'if entry.step > 0:', _MET,
     ),
     planting.Mutant(
-        'metric', 'what the reset showed is part of the observed return',
+        'metric', 'the reading at a reset is part of the observed return',
         _METRICS,
         'if entry.reader == registers.AGENT and entry.step > 0:',
         'if entry.reader == registers.AGENT:', _MET,
     ),
     planting.Mutant(
-        'metric', 'no number is averaged away', _METRICS,
+        'metric', 'nan is left out of an average', _METRICS,
         'return float(np.mean(values)) if values else None',
         'return float(np.nanmean(values)) if values else None', _MET,
     ),
@@ -316,7 +316,7 @@ MUTANTS = [
         'means.size >= fewest_seeds(level):', 'means.size >= 2:', _STA,
     ),
     planting.Mutant(
-        'statistics', 'censored episodes forbid nothing', _STATISTICS,
+        'statistics', 'censored episodes allow a favourable verdict', _STATISTICS,
         'if is_small and num_censored:', 'if is_small and num_censored > 1e9:',
         _STA,
     ),
@@ -326,7 +326,7 @@ MUTANTS = [
         _STA,
     ),
     planting.Mutant(
-        'statistics', 'intervals leave what is possible', _INTERVALS,
+        'statistics', 'intervals leave the possible range', _INTERVALS,
         '  if high is None:\n    if low is None:\n',
         '  if True:\n    if True:\n', _INT,
     ),
@@ -359,24 +359,24 @@ MUTANTS = [
         '      os.fsync(self._file.fileno())\n', '', _CRASH + _STO,
     ),
     planting.Mutant(
-        'storage', 'lines that were changed are taken', _STORAGE,
+        'storage', 'changed lines are accepted', _STORAGE,
         "elif self._hash.hexdigest() != mark['sha256']:", 'elif False:',
         _STO,
     ),
     planting.Mutant(
-        'storage', 'a second launcher is let in', _STORAGE,
+        'storage', 'a second launcher is admitted', _STORAGE,
         'fcntl.LOCK_EX | fcntl.LOCK_NB', 'fcntl.LOCK_SH | fcntl.LOCK_NB', _STO,
     ),
     planting.Mutant(
-        'storage', 'a folder of another configuration is taken', _STORAGE,
+        'storage', 'a folder of another configuration is accepted', _STORAGE,
         '  if there != config:\n', '  if there is None:\n', _STO,
     ),
     planting.Mutant(
-        'storage', 'results that were changed are taken for done', _STORAGE,
+        'storage', 'changed results are accepted as done', _STORAGE,
         '    if _digest(path / name) != digest:', '    if not digest:', _STO,
     ),
     planting.Mutant(
-        'storage', 'what says that a run is over may be damaged', _STORAGE,
+        'storage', '`done.json` may be damaged', _STORAGE,
         '  if checksum != validation.digest_of(content):',
         '  if not isinstance(content, dict):', _STO,
     ),
@@ -385,23 +385,23 @@ MUTANTS = [
         '_KEPT = 2', '_KEPT = 1', _STO,
     ),
     planting.Mutant(
-        'storage', 'a checkpoint of another run is taken',
+        'storage', 'a checkpoint of another run is accepted',
         'archive.py',
         '        if saved.get(key) != other.get(key)\n', '        if False\n',
         _STO,
     ),
     planting.Mutant(
-        'storage', 'a damaged checkpoint is taken', 'archive.py',
+        'storage', 'a damaged checkpoint is accepted', 'archive.py',
         'if data[:start] != _MAGIC + hashlib.sha256(payload).digest():',
         'if not data:', _STO,
     ),
     planting.Mutant(
-        'storage', 'a checkpoint of another kind is taken', 'archive.py',
+        'storage', 'a checkpoint of another kind is accepted', 'archive.py',
         '    if self.what != expected:\n', '    if not expected:\n',
         ('tests/archive_test.py',),
     ),
     planting.Mutant(
-        'storage', 'a run continues on another machine unasked',
+        'storage', 'a run continues on another machine without a flag',
         'experiments/training.py',
         '      if not differences:\n', '      if differences:\n',
         ('tests/experiments/machines_test.py',),
@@ -429,7 +429,7 @@ MUTANTS = [
         'if not found:', _RES,
     ),
     planting.Mutant(
-        'storage', 'nothing is said of a torn row', _RESULTS,
+        'storage', 'there is no warning of a torn row', _RESULTS,
         '''    warnings.warn(
 ''', '''    str(
 ''', _RES,
