@@ -1,8 +1,8 @@
-# Two commands do everything on a machine with Python 3.11 or 3.12, git and
-# make: `make demo` and `make test`. Both keep what they install in .venv.
+# `make demo` and `make test` need only Python 3.11 or 3.12, git and make. Both
+# install into .venv.
 
-# The first of these that is Python 3.11 or 3.12 makes .venv; another one:
-# `make demo PYTHON=/path/to/python3.12`.
+# Candidates for the Python of .venv; the first that is Python 3.11 or 3.12 is
+# used. To use another one: `make demo PYTHON=/path/to/python3.12`.
 PYTHON = python3.12 python3.11 python3
 PY = .venv/bin/python
 INSTALL = $(PY) -m pip install -qq --disable-pip-version-check \
@@ -13,11 +13,11 @@ DEMO := results/demo-$(shell date +%Y%m%d-%H%M%S)
 .PHONY: help demo test lint format clean
 
 help:
-	@echo 'make demo    trains agents in Unlock Door, and reports who tampers'
-	@echo 'make test    lint, types and tests, as before every merge'
-	@echo 'make lint    lint and types alone'
-	@echo 'make format  formats the code and mends what the linter can'
-	@echo 'make clean   removes .venv, builds and caches; results/ stays'
+	@echo 'make demo    train agents in Unlock Door and report which tamper'
+	@echo 'make test    run lint, type checks and tests, as before every merge'
+	@echo 'make lint    run lint and type checks only'
+	@echo 'make format  format the code and apply the fixes of the linter'
+	@echo 'make clean   remove .venv, builds and caches, but not results/'
 
 demo: .venv/demo
 	$(PY) -m realab_suite.launchers.sweep --experiment=quick --output=$(DEMO)
@@ -40,20 +40,22 @@ clean:
 		.pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Stamps: what is installed is renewed only when one of these files changes.
+# Stamp files: packages are installed again only if a prerequisite changes.
 .venv/demo: setup.cfg pyproject.toml constraints.txt | .venv/made
-	@echo 'Installing realab_suite into .venv; this takes a minute.'
+	@echo 'Installing realab_suite into .venv; this takes about a minute.'
 	@$(INSTALL) -e '.[agents,report]'
 	@touch $@
 
-# Holds everything that .venv/demo stands for, so both are up to date.
+# Includes all packages of .venv/demo, so it updates both stamps.
 .venv/dev: setup.cfg pyproject.toml constraints.txt | .venv/made
-	@echo 'Installing realab_suite and its tools into .venv; this takes a minute.'
+	@echo 'Installing realab_suite and its tools into .venv; this takes about a' \
+	  'minute.'
 	@$(INSTALL) -e '.[agents,report,rpc,dev]'
 	@touch .venv/demo $@
 
-# Debian and Ubuntu ship Python without ensurepip, and `venv` then leaves half
-# an environment behind: such a Python is passed over, and named if all are.
+# Debian and Ubuntu ship Python without ensurepip; `venv` then creates an
+# incomplete environment. Such a Python is skipped. If no candidate is usable,
+# the error message names it.
 .venv/made:
 	@bare=; for python in $(PYTHON); do \
 	  version=$$("$$python" -c \
@@ -62,7 +64,7 @@ clean:
 	  if "$$python" -c 'import ensurepip' 2>/dev/null; then \
 	    "$$python" -m venv .venv || exit 1; \
 	    case "$$($(PY) -V)" in "Python $$version."*) ;; *) \
-	      echo ".venv holds another Python: run 'make clean' first." >&2; \
+	      echo ".venv uses another Python: run 'make clean' first." >&2; \
 	      exit 1;; \
 	    esac; \
 	    touch $@; exit 0; \
@@ -70,11 +72,11 @@ clean:
 	  bare="$$version"; \
 	done; \
 	if [ -n "$$bare" ]; then \
-	  echo "Python $$bare cannot make virtual environments here: run" \
-	    "'sudo apt install python$$bare-venv', then make again." >&2; \
+	  echo "Python $$bare cannot create virtual environments here: run" \
+	    "'sudo apt install python$$bare-venv', then run make again." >&2; \
 	else \
-	  echo 'realab_suite needs Python 3.11 or 3.12 (not 3.13: labmaze has no' \
-	    'wheels); none of these is one: $(PYTHON). Name one with' \
+	  echo 'realab_suite needs Python 3.11 or 3.12 (labmaze has no wheels for' \
+	    '3.13), but found neither among: $(PYTHON). Specify one with' \
 	    "'make PYTHON=/path/to/python3.12'." >&2; \
 	fi; \
 	exit 1

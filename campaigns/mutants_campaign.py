@@ -198,7 +198,7 @@ MUTANTS = [
         'value', _REG,
     ),
     planting.Mutant(
-        'contract', 'a hand keeps a block that a register writes', _REGISTER.replace(
+        'contract', 'a hand keeps a written block', _REGISTER.replace(
             'registers/base', 'block_kinds'
         ),
         'physics.bind(self._grasps).active = 0', 'pass', _TWO + _REG + (
@@ -316,7 +316,7 @@ MUTANTS = [
         'means.size >= fewest_seeds(level):', 'means.size >= 2:', _STA,
     ),
     planting.Mutant(
-        'statistics', 'censored episodes allow a favourable verdict', _STATISTICS,
+        'statistics', 'censored episodes allow any verdict', _STATISTICS,
         'if is_small and num_censored:', 'if is_small and num_censored > 1e9:',
         _STA,
     ),

@@ -1,1 +1,1 @@
-"""Data only: the YAML files that ship as `realab_suite.configs`."""
+"""Data only: the YAML files shipped as `realab_suite.configs`."""

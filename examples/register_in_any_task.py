@@ -1,8 +1,8 @@
-"""A register and a meter in a task of dm_control's own, in plain Composer.
+"""A register and a meter in a task of dm_control, in plain Composer.
 
-A ball rolls about. The meter measures how far it is from the middle, and writes
-it into a two-block register that stands in the same arena. The ball can run
-into the blocks, and then the register says something else than what is true.
+A ball rolls around. The meter measures its distance from the middle and writes
+the distance to a two-block register in the same arena. The ball can collide
+with the blocks; the reading of the register is then wrong.
 
   python examples/register_in_any_task.py
 """
@@ -40,12 +40,12 @@ class MeteredGoToTarget(tasks.GoToTarget):
   def before_step(self, physics, action, random_state) -> None:
     super().before_step(physics, action, random_state)
     self.meter.update(physics)
-    # This environment steps from derived quantities: they have to be current.
+    # Composer steps from derived quantities, which have to be up to date.
     physics.forward()
 
 
 def main() -> None:
-  """Rolls the ball at random, and says what the register says."""
+  """Rolls the ball at random and prints the last reading of the register."""
   task = MeteredGoToTarget()
   env = composer.Environment(task, time_limit=20.0, random_state=1)
   spec = env.action_spec()

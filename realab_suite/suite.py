@@ -16,6 +16,7 @@ from realab_suite.config import messages
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
+from realab_suite.engine import forking
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
 from realab_suite.feedback import mechanisms
@@ -30,7 +31,7 @@ MAX_STEPS = 250
 DESIGNS = specs.DESIGNS
 """Names of the designs that ship with the package."""
 
-fork = batch_environment.fork
+fork = forking.fork
 """Makes a batch whose worlds all go on from where one world is."""
 
 TaskFactory = Callable[..., base.Task]

@@ -1,5 +1,7 @@
 """Tests for the campaigns on planted bugs and on coverage."""
 
+import re
+
 import pytest
 
 from campaigns import coverage_campaign
@@ -76,3 +78,21 @@ def test_every_target_of_coverage_is_of_a_module_that_is_there():
       assert (planting.ROOT / 'realab_suite' / place).exists()
   for tests in coverage_campaign.TESTS:
     assert (planting.ROOT / tests).exists()
+
+
+def test_the_figures_are_of_all_campaigns_and_no_others():
+  text = (planting.ROOT / 'docs' / 'reliability_figures.md').read_text(
+      encoding='utf-8'
+  )
+  rows = [row.split('|') for row in text.splitlines() if row.startswith('| ')]
+  named = {
+      name
+      for row in rows
+      if len(row) == 8
+      for name in re.findall(r'`(\w+)`', row[3])
+  }
+  there = {
+      path.name.removesuffix('_campaign.py')
+      for path in (planting.ROOT / 'campaigns').glob('*_campaign.py')
+  }
+  assert named == there

@@ -1,4 +1,4 @@
-"""What the documentation tells people to type works, as it stands."""
+"""Tests that code, commands and names in the documentation are correct."""
 
 import pathlib
 import re
@@ -15,6 +15,19 @@ from realab_suite.feedback import register_kinds
 
 _ROOT = pathlib.Path(__file__).parents[1]
 _MAX_LINES = 30
+# Without the changelog, which names files that were removed later.
+_PAGES = [
+    _ROOT / 'README.md',
+    _ROOT / 'CONTRIBUTING.md',
+    _ROOT / 'GLOSSARY.md',
+    *_ROOT.glob('docs/*.md'),
+    *_ROOT.glob('*/README.md'),
+]
+# Files of the reader and of results, and the end of a pattern.
+_OTHER_FILES = frozenset({
+    '/path/to/agent.py', 'agent.py', 'mine.py', 'watched.yaml', '_test.py',
+    'experiment.yaml', 'tables.md', 'logs/', 'tensorboard/',
+})  # fmt: skip
 
 
 def _python_blocks(path):
@@ -23,7 +36,7 @@ def _python_blocks(path):
 
 @pytest.fixture
 def registries():
-  """Takes out again what a page registers."""
+  """Removes the entries that a page registers."""
   before = [
       (registry, dict(registry))
       for registry in (
@@ -39,7 +52,7 @@ def registries():
 
 
 @pytest.mark.parametrize('page', ['README.md', 'docs/your_own.md'])
-def test_every_block_of_a_page_runs_in_order(page, registries, capsys):
+def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
   blocks = _python_blocks(_ROOT / page)
   assert blocks
   names = {'__name__': 'page'}
@@ -48,21 +61,22 @@ def test_every_block_of_a_page_runs_in_order(page, registries, capsys):
   assert capsys.readouterr().out
 
 
-def test_ones_own_register_provider_and_task_take_under_thirty_lines():
+def test_every_block_of_your_own_has_under_thirty_lines():
   blocks = _python_blocks(_ROOT / 'docs/your_own.md')
   assert len(blocks) >= 5
   for block in blocks:
     assert len(block.splitlines()) < _MAX_LINES, block
 
 
-def test_the_experiment_of_the_page_is_one_that_can_be_run():
+def test_the_experiment_in_the_docs_can_be_run():
   page = (_ROOT / 'docs/experiments.md').read_text()
   [text] = re.findall(r'```yaml\n(schema: 1\n.*?)```', page, re.DOTALL)
   experiment = experiment_specs.load(yaml.safe_load(text))
   for run in experiment.runs.values():
-    for channel in (None, experiment_specs.TWIN):
+    design = run.load()
+    for one in (design, experiment_specs.secure_twin(design)):
       # A probe needs discrete actions.
-      assert probes.find_register(run.load(channel)) == 'reward'
+      assert probes.find_register(one) == 'reward'
 
 
 def test_the_example_in_a_task_of_dm_control_runs(capsys):
@@ -72,13 +86,65 @@ def test_the_example_in_a_task_of_dm_control_runs(capsys):
   assert 'written' in capsys.readouterr().out
 
 
-def test_links_between_pages_lead_somewhere():
-  pages = [*_ROOT.glob('*.md'), *(_ROOT / 'docs').glob('*.md')]
-  links = [
-      (page, target)
-      for page in pages
-      for target in re.findall(r'\]\(([^)#:]+)\)', page.read_text())
-  ]
+def _mentions(pattern):
+  """Returns the matches of a pattern in all pages, with their pages."""
+  return {
+      (page, match)
+      for page in _PAGES
+      for match in re.findall(pattern, page.read_text())
+  }
+
+
+def _exists(page, path):
+  return any(
+      (folder / path).exists()
+      for folder in (
+          page.parent, _ROOT, _ROOT / 'realab_suite', _ROOT / 'tests',
+          _ROOT / 'campaigns',
+      )
+  )  # fmt: skip
+
+
+def test_links_between_pages_lead_to_files():
+  links = _mentions(r'\]\(([^)#:]+)\)')
   assert links
   for page, target in links:
     assert (page.parent / target).exists(), f'{page.name} -> {target}'
+
+
+def test_files_and_folders_in_pages_exist():
+  files = _mentions(r'[\w./-]*\w\.(?:py|yaml|md|npz|toml|cfg|j2)\b')
+  folders = _mentions(r'`((?:[a-z_]+/)+)`')
+  assert files
+  assert folders
+  assert not [
+      f'{page.name} names {path}'
+      for page, path in files | folders
+      if path not in _OTHER_FILES and not _exists(page, path)
+  ]
+
+
+def test_programs_in_pages_exist():
+  programs = _mentions(
+      r'python -m ((?:benchmarks|campaigns|realab_suite|tests)\.[a-z_.]+)'
+  )
+  assert programs
+  for page, module in programs:
+    path = f'{module.replace(".", "/")}.py'
+    assert (_ROOT / path).exists(), f'{page.name} starts {module}'
+
+
+def test_attributes_of_modules_in_pages_exist():
+  sources = {}
+  for path in (_ROOT / 'realab_suite').rglob('[a-z]*.py'):
+    sources[path.stem] = sources.get(path.stem, '') + path.read_text()
+  tasks = {f'{domain}.{task}' for domain, task in suite.ALL_TASKS}
+  checked = 0
+  for page, (module, name) in _mentions(r'`(?:\w+\.)*([a-z_]+)\.(\w+)[(`]'):
+    is_file = name in ('csv', 'html', 'json', 'jsonl', 'md', 'py')
+    if module in sources and not is_file and f'{module}.{name}' not in tasks:
+      checked += 1
+      assert re.search(
+          rf'^(?:class |def )?{name}\b', sources[module], re.MULTILINE
+      ), f'{page.name} names {module}.{name}'
+  assert checked

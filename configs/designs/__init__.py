@@ -1,1 +1,1 @@
-"""Data only: the agent designs that `suite.load(..., design=name)` finds."""
+"""Data only: the agent designs for `suite.load(..., design=name)`."""

@@ -1,1 +1,1 @@
-"""Data only: the experiments that `launchers.train --experiment=name` finds."""
+"""Data only: the experiments for `launchers.sweep --experiment=name`."""

@@ -1,1 +1,1 @@
-"""Data only: the networks that supervisors run, made by `make_networks`."""
+"""Data only: networks of supervisors, trained by `launchers.make_networks`."""

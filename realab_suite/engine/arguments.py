@@ -1,5 +1,6 @@
 """Checks of the numbers that worlds are loaded, multiplied and forked with."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,36 @@ def world(given: Any) -> int:
     SpecError: If it is not one.
   """
   return _integer('world', given, 0, _LARGEST)
+
+
+def indices(given: Any, num_envs: int) -> np.ndarray:
+  """Returns indices of worlds of a batch; all of them for `None`.
+
+  Args:
+    given: A sequence of indices, or `None`.
+    num_envs: Number of worlds in the batch.
+
+  Raises:
+    SpecError: If one is no index in this batch, or is given twice.
+  """
+  if given is None:
+    return np.arange(num_envs)
+  if (
+      not isinstance(given, Sequence | np.ndarray)
+      or not len(given)
+      or not all(
+          isinstance(index, int | np.integer)
+          and type(index) is not bool
+          and 0 <= index < num_envs
+          for index in given
+      )
+      or len(set(given)) < len(given)
+  ):
+    raise errors.SpecError(
+        f'worlds: {messages.quote(given)}; allowed are integers from 0 to'
+        f' {num_envs - 1}, each once'
+    )
+  return np.array(given)
 
 
 def max_steps(given: Any) -> int | None:

@@ -10,7 +10,6 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.config import messages
 from realab_suite.engine import action_codec
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_physics
@@ -18,6 +17,7 @@ from realab_suite.engine import control_step
 from realab_suite.engine import environment
 from realab_suite.engine import episodes
 from realab_suite.engine import events
+from realab_suite.engine import hooks
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
@@ -82,7 +82,7 @@ class BatchEnvironment:
           f'{type(single.task).__name__} compiles anew in each episode; a batch'
           ' takes worlds of this package'
       )
-    _refuse_step_hooks(single)
+    hooks.refuse_in_batch(single.task, single.has_extra_hooks)
     self._single = single
     self._task: base.Task = single.task
     self._mechanism = single.mechanism
@@ -114,6 +114,11 @@ class BatchEnvironment:
     self._observation: dict[str, np.ndarray] = {}
     self._sinks: list[events.BatchEventSink] = []
     self._closed = False
+
+  @property
+  def original(self) -> environment.Environment:
+    """The environment that the worlds are copies of."""
+    return self._single
 
   @property
   def num_envs(self) -> int:
@@ -169,8 +174,7 @@ class BatchEnvironment:
     self._refuse_if_closed()
     self._tell_of_end(~self._is_pending, events.End.ABANDONED)
     # Until the episodes have begun, the next step is to begin them.
-    self._is_pending = np.ones(self._num_envs, bool)
-    everywhere = self._is_pending.copy()
+    self._is_pending = everywhere = np.ones(self._num_envs, bool)
     self._begin_episodes(everywhere)
     reads = self._observe()
     nothing = np.zeros(self._num_envs)
@@ -211,7 +215,7 @@ class BatchEnvironment:
           observation=self._observation,
           provider_keys=self._keys,
           provider_states=self._states,
-          is_first=is_first,
+          idle=lambda: is_first | self._physics.has_diverged(),
       )
       has_failed = self._physics.has_diverged() & ~is_first
       step_count = self._mechanism.step_count(self._physics)
@@ -261,8 +265,8 @@ class BatchEnvironment:
         asleep, or if a sink cannot be saved.
       StateLayoutError: If a provider's state is not plain data.
     """
-    header = self._snapshot_header()
-    indices = self._indices(worlds)
+    header = self._single.snapshot_header(self._physics.model)
+    indices = arguments.indices(worlds, self._num_envs)
     is_pending = self._is_pending[indices]
     saved = snapshots.WorldStates(
         indices=indices.tolist(),
@@ -303,15 +307,16 @@ class BatchEnvironment:
         asleep. Nothing has changed.
       StateLayoutError: If the snapshot does not fit. Nothing has changed.
     """
-    saved = snapshots.WorldStates.from_data(
-        snapshot.contents_for(self._snapshot_header())
-    )
+    header = self._single.snapshot_header(self._physics.model)
+    saved = snapshots.WorldStates.from_data(snapshot.contents_for(header))
     if worlds is None and saved.indices is None:
       raise errors.StateLayoutError(
           'the snapshot is of a world alone; say into which worlds it goes, as'
           ' in restore(snapshot, worlds=[0])'
       )
-    indices = self._indices(saved.indices if worlds is None else worlds)
+    indices = arguments.indices(
+        saved.indices if worlds is None else worlds, self._num_envs
+    )
     if len(saved.seed) not in (1, len(indices)):
       raise errors.StateLayoutError(
           f'the snapshot has {len(saved.seed)} worlds, for {len(indices)} here;'
@@ -329,7 +334,9 @@ class BatchEnvironment:
       sources = np.zeros(self._num_envs, int)
       sources[indices] = rows
     if has_begun:
-      states, observation = self._merged(saved, filled, sources)
+      states, observation = saved.merged_into(
+          self._states, self._observation, filled, sources
+      )
     # Nothing has changed so far, and nothing is refused from here on.
     is_restored = np.isin(np.arange(self._num_envs), indices)
     self._tell_of_end(is_restored & ~self._is_pending, events.End.ABANDONED)
@@ -373,7 +380,7 @@ class BatchEnvironment:
     names = [element.full_identifier for element in cameras]
     if camera not in names:
       raise errors.SpecError(f'camera: {camera!r}; allowed are {names}')
-    indices = self._indices(worlds).tolist()
+    indices = arguments.indices(worlds, self._num_envs).tolist()
     return self._physics.render(indices, camera, height, width)
 
   def close(self) -> None:
@@ -382,51 +389,6 @@ class BatchEnvironment:
       self._tell_of_end(~self._is_pending, events.End.ABANDONED)
     self._closed = True
     self._single.close()
-
-  def _snapshot_header(self) -> dict[str, Any]:
-    self._refuse_if_closed()
-    return self._single.snapshot_header(self._physics.model)
-
-  def _indices(self, worlds: Sequence[int] | None) -> np.ndarray:
-    """Returns the indices of worlds in this batch, if there are such."""
-    if worlds is None:
-      return np.arange(self._num_envs)
-    if (
-        not isinstance(worlds, Sequence | np.ndarray)
-        or not len(worlds)
-        or not all(
-            isinstance(world, int | np.integer)
-            and type(world) is not bool
-            and 0 <= world < self._num_envs
-            for world in worlds
-        )
-        or len(set(worlds)) < len(worlds)
-    ):
-      raise errors.SpecError(
-          f'worlds: {messages.quote(worlds)}; allowed are integers from 0 to'
-          f' {self._num_envs - 1}, each once'
-      )
-    return np.array(worlds)
-
-  def _merged(
-      self, saved: snapshots.WorldStates, indices: np.ndarray, rows: np.ndarray
-  ) -> tuple[list[Any], dict[str, np.ndarray]]:
-    """Returns providers' states and observation with some worlds restored."""
-    states: Any = saved.provider_states
-    if saved.indices is None:
-      states = snapshots.of_batch(states)
-    merged = [
-        snapshots.merge(f'the state of providers[{i}]', here, indices, there)
-        for i, (here, there) in enumerate(
-            zip(self._states, snapshots.spread(states, rows), strict=True)
-        )
-    ]
-    observation: Any = snapshots.spread(saved.observation, rows)
-    if self._observation:
-      observation = snapshots.merge(
-          'observation', self._observation, indices, observation
-      )
-    return merged, observation
 
   def _begin_episodes(self, where: np.ndarray) -> None:
     """Begins an episode in some worlds, `(worlds,)` bool."""
@@ -499,18 +461,11 @@ class BatchEnvironment:
     """Tells the sinks that episodes are over, between two steps."""
     if not worlds.any():
       return
-    nowhere = np.zeros(self._num_envs, bool)
-    step = events.BatchStep(
-        seed=self._seeds,
-        world=self._numbers,
-        episode=self._episodes.copy(),
-        is_first=nowhere,
-        has_failed=~nowhere,
-        ends={int(world): end for world in np.flatnonzero(worlds)},
-        initial=[],
-        records=[],
-        agent_reads=[],
-        true_reward=np.zeros(self._num_envs),
+    step = events.BatchStep.between(
+        self._seeds,
+        self._numbers,
+        self._episodes.copy(),
+        {int(world): end for world in np.flatnonzero(worlds)},
     )
     for sink in self._sinks:
       sink.step_ended(step)
@@ -537,99 +492,8 @@ def _with(values: np.ndarray, indices: np.ndarray, others: Any) -> np.ndarray:
   return copy
 
 
-def _refuse_step_hooks(single: environment.Environment) -> None:
-  """Refuses hooks that a batch never calls."""
-  if single.has_extra_hooks:
-    raise errors.SpecError(
-        'add_extra_hook: a batch never calls extra hooks; allowed is an'
-        ' environment without them'
-    )
-  for entity in single.task.root_entity.iter_entities():
-    for hook in ('before_step', 'after_step'):
-      if getattr(type(entity), hook) is not getattr(composer.Entity, hook):
-        raise errors.SpecError(
-            f'{type(entity).__name__}.{hook}: a batch calls the hooks of the'
-            ' task only'
-        )
-
-
 def _end(has_failed: bool, is_ending: bool) -> events.End:
   """Why the episode of a world has ended."""
   if has_failed:
     return events.End.DIVERGENCE
   return events.End.TERMINATED if is_ending else events.End.TIMEOUT
-
-
-def fork(
-    env: environment.Environment | BatchEnvironment,
-    num_envs: int,
-    *,
-    world: int | None = None,
-    num_threads: int = 0,
-    sinks: Sequence[events.BatchEventSink] = (),
-) -> BatchEnvironment:
-  """Makes a batch whose worlds all go on from where one world is.
-
-  They have the same random streams, which are those of the original: worlds
-  that get the same actions stay the same, bit for bit, and their later episodes
-  are those that the original would have. The original stays as it is; either
-  can be closed before the other. Both share their entities, so they are not for
-  two threads.
-
-  Args:
-    env: The original, or a batch that it is in. It has a world of this package.
-    num_envs: How many worlds.
-    world: The index of the original in the batch; `None` for one alone.
-    num_threads: How many threads step them; 0 for all processors.
-    sinks: What hears of the worlds from here on, of the same kinds as listen to
-      the original. With `BatchEnvironment.add_sink` worlds would begin anew.
-
-  Raises:
-    SpecError: If there is no such world, if it cannot be saved, or if a number
-      makes no sense.
-    StateLayoutError: If the sinks differ, or if the compiled model was changed.
-  """
-  num_envs = arguments.num_envs(num_envs)
-  num_threads = arguments.num_threads(num_threads)
-  if not isinstance(sinks, Sequence) or not all(
-      isinstance(sink, events.BatchEventSink) for sink in sinks
-  ):
-    raise errors.SpecError(
-        f'sinks: {messages.quote(sinks)}; allowed is a list of BatchEventSinks'
-    )
-  if isinstance(env, BatchEnvironment):
-    if world is None:
-      raise errors.SpecError(
-          f'world: None; allowed are integers from 0 to {env.num_envs - 1}'
-      )
-    # To mypy, dm_control's classes are anything, and so is what derives.
-    snapshot, single = BatchEnvironment.save(env, [world]), env._single
-  elif isinstance(env, environment.Environment):
-    if world is not None:
-      raise errors.SpecError(
-          f'world: {messages.quote(world)}; allowed is None, for the world is'
-          ' alone'
-      )
-    snapshot, single = env.save(), env
-  else:
-    raise errors.SpecError(
-        f'env: {messages.quote(env)}; allowed are environments of this package'
-    )
-  _refuse_step_hooks(single)
-  # Compiled anew, which takes less time than one episode: what is closed frees
-  # its compiled world.
-  copy = environment.Environment(
-      single.task,
-      single.mechanism,
-      seed=single.seed,
-      max_steps=single.max_steps,
-  )
-  try:
-    batch = BatchEnvironment(copy, num_envs, num_threads)
-    for sink in sinks:
-      batch.add_sink(sink)
-    batch.restore(snapshot, range(num_envs))
-  except BaseException:
-    copy.close()
-    raise
-  return batch

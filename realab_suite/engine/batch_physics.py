@@ -19,6 +19,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.engine import single_physics
 from realab_suite.entities import cameras
+from realab_suite.entities import protocols
 from realab_suite.entities import rays
 
 # Positions and velocities, and what derives from them: what `mj_step1` does.
@@ -109,7 +110,7 @@ class BatchPhysics:
     """The integration state of every world, `(worlds, size)`, live."""
     return self._batch.state
 
-  def world(self, index: int) -> '_WorldView':
+  def world(self, index: int) -> protocols.Physics:
     """Returns one world, for what is done to one at a time, as at a reset."""
     return self._worlds[index]
 

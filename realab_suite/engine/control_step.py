@@ -5,7 +5,7 @@ worlds: `()` for one world, `(worlds,)` for many. Nothing here keeps state, and
 nothing here notifies event sinks.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
 
 
 def run(
-    physics: Any,
+    physics: hosts.SteppedPhysics,
     host: hosts.Host,
     mechanism: mechanisms.FeedbackMechanism,
     schedule: specs.ScheduleSpec,
@@ -45,7 +45,7 @@ def run(
     observation: dict[str, np.ndarray],
     provider_keys: np.ndarray,
     provider_states: Sequence[Any],
-    is_first: np.ndarray | None = None,
+    idle: Callable[[], np.ndarray | None] = lambda: None,
 ) -> Outcome:
   """Runs a control step; the caller observes and notifies the sinks.
 
@@ -61,18 +61,14 @@ def run(
     provider_keys: Key of each provider's episode, `(providers, ..., 2)`,
       uint64.
     provider_states: State of each provider.
-    is_first: In a batch, the worlds that begin an episode next, `(worlds,)`
-      bool. They take part without effect: what happens in them does not count.
-      `None` for one world.
+    idle: In a batch, returns the worlds whose records do not count, `(worlds,)`
+      bool: those that begin an episode next, and those that have failed since.
+      For one world, returns `None`.
 
   Raises:
     PhysicsError: If the physics of one world has failed. In a batch, a world
       that has failed is left out instead.
   """
-
-  def idle() -> np.ndarray | None:
-    return None if is_first is None else is_first | physics.has_diverged()
-
   was_over = host.is_over(physics)
   host.begin_step(physics, controls)
   records: list[registers.Record] = []

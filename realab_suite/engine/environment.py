@@ -8,7 +8,6 @@ import contextlib
 from typing import Any, final
 
 from dm_control import composer
-from dm_control.composer import environment as composer_environment
 from dm_control.rl import control
 import dm_env
 from dm_env import specs as dm_env_specs
@@ -20,6 +19,7 @@ from realab_suite.engine import control_step
 from realab_suite.engine import episodes
 from realab_suite.engine import events
 from realab_suite.engine import foreign
+from realab_suite.engine import hooks
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
@@ -30,14 +30,6 @@ from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
 from realab_suite.tasks import base
-
-# Hooks that Composer would call and that a world of this package never does.
-_UNUSED_HOOKS = (
-    'initialize_episode_mjcf',
-    'after_compile',
-    'before_substep',
-    'after_substep',
-)
 
 
 @final
@@ -68,7 +60,7 @@ class Environment(composer.Environment):
       world: Number of the world in a batch.
       max_steps: Length of an episode in control steps, or `None`.
     """
-    self._physics: Any
+    self._physics: single_physics.ThinPhysics | foreign.ForeignPhysics
     self._mechanism = mechanism
     self._seed, self._world, self._episode = seed, world, -1
     self._max_steps = max_steps
@@ -79,7 +71,7 @@ class Environment(composer.Environment):
     # tasks are treated as Composer does.
     self._is_ours = isinstance(task, base.Task)
     if isinstance(task, base.Task):
-      _refuse_substep_hooks(task)
+      hooks.refuse_in_substeps(task)
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
@@ -179,17 +171,8 @@ class Environment(composer.Environment):
       SpecError: If this environment never calls such a hook.
     """
     self._refuse_if_closed()
-    if self._is_ours and hook_name in _UNUSED_HOOKS:
-      allowed = [
-          name
-          for name in composer_environment.HOOK_NAMES
-          if name not in _UNUSED_HOOKS
-      ]
-      raise errors.SpecError(
-          f'add_extra_hook: {hook_name!r} is never called in'
-          f' {type(self._task).__name__}, which compiles once and has no Python'
-          f' in substeps; allowed are {allowed}'
-      )
+    if isinstance(self._task, base.Task):
+      hooks.refuse_unused(self._task, hook_name)
     super().add_extra_hook(hook_name, hook_callable)
     self._has_extra_hooks = True
 
@@ -461,9 +444,9 @@ class Environment(composer.Environment):
 
   def _undisturbed(self) -> contextlib.AbstractContextManager[None]:
     """Returns a context in which sinks may look at the physics."""
-    if self._is_ours or not self._sinks:
-      return contextlib.nullcontext()
-    return self._physics.unchanged()
+    if isinstance(self._physics, foreign.ForeignPhysics) and self._sinks:
+      return self._physics.unchanged()
+    return contextlib.nullcontext()
 
   # Episodes.
 
@@ -489,7 +472,7 @@ class Environment(composer.Environment):
     """Compiles the model into a physics of this package's engine."""
     if getattr(self, '_physics', None):
       self._physics.free()
-    kind = (
+    kind: type[single_physics.ThinPhysics | foreign.ForeignPhysics] = (
         single_physics.ThinPhysics if self._is_ours else foreign.ForeignPhysics
     )
     model = self._task.root_entity.mjcf_model
@@ -510,16 +493,3 @@ class Environment(composer.Environment):
   def _refuse_if_closed(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
-
-
-def _refuse_substep_hooks(task: base.Task) -> None:
-  """Refuses hooks in substeps, which would never be called."""
-  parts = [(task, composer.Task)]
-  parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
-  for part, kind in parts:
-    for hook in ('before_substep', 'after_substep'):
-      if getattr(type(part), hook) is not getattr(kind, hook):
-        raise errors.SpecError(
-            f'{type(part).__name__}.{hook}: worlds of this package have no'
-            ' hooks in substeps; use latch_events'
-        )

@@ -3,11 +3,12 @@
 import abc
 from collections.abc import Mapping, Sequence
 import enum
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, Self, final
 
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
 Records = Sequence[registers.Record]
@@ -68,11 +69,11 @@ class EventSink(abc.ABC):
     return type(self).__name__
 
   @abc.abstractmethod
-  def episode_started(self, start: Start, physics: Any) -> None:
+  def episode_started(self, start: Start, physics: protocols.Physics) -> None:
     """An episode has begun. `physics` may be looked at, never written."""
 
   @abc.abstractmethod
-  def step_ended(self, step: Step, physics: Any) -> None:
+  def step_ended(self, step: Step, physics: protocols.Physics) -> None:
     """A control step is over. `physics` may be looked at, never written."""
 
   @abc.abstractmethod
@@ -131,6 +132,29 @@ class BatchStep(NamedTuple):
   agent_reads: Sequence[registers.Read]
   true_reward: np.ndarray
   failure: str | None = None
+
+  @classmethod
+  def between(
+      cls,
+      seed: np.ndarray,
+      world: np.ndarray,
+      episode: np.ndarray,
+      ends: Mapping[int, End],
+  ) -> Self:
+    """Returns a step in which episodes end and nothing else happens."""
+    nowhere = np.zeros(len(episode), bool)
+    return cls(
+        seed=seed,
+        world=world,
+        episode=episode,
+        is_first=nowhere,
+        has_failed=~nowhere,
+        ends=ends,
+        initial=[],
+        records=[],
+        agent_reads=[],
+        true_reward=np.zeros(len(episode)),
+    )
 
 
 class BatchEventSink(abc.ABC):

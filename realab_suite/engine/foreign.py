@@ -34,6 +34,10 @@ class ForeignPhysics(mjcf.Physics):
     with self.check_invalid_state():
       mujoco.mj_step1(self.model.ptr, self.data.ptr)
 
+  def advance(self, num_substeps: int) -> None:
+    """Steps as Composer does."""
+    self.step(num_substeps)
+
   @contextlib.contextmanager
   def unchanged(self) -> Iterator[None]:
     """Lets evaluators read derived quantities without changing what follows.
@@ -86,34 +90,40 @@ class ForeignHost(hosts.Host):
   def sense_spec(self) -> dict[str, specs.Array]:
     return self._sense_spec
 
-  def sense(self, physics: Any) -> dict[str, np.ndarray]:
+  def sense(self, physics: hosts.SteppedPhysics) -> dict[str, np.ndarray]:
     del physics  # The updater has looked already.
     seen = self._updater().get_observation()
     return {n: np.array(seen[n]) for n in self._sense_spec if n in seen}
 
-  def begin_step(self, physics: Any, controls: np.ndarray) -> None:
+  def begin_step(
+      self, physics: hosts.SteppedPhysics, controls: np.ndarray
+  ) -> None:
     self._hooks.before_step(physics, controls, self._random_state)
     self._updater().prepare_for_next_control_step()
 
   def advance(
-      self, physics: Any, controls: np.ndarray, num_substeps: int, is_last: bool
+      self,
+      physics: hosts.SteppedPhysics,
+      controls: np.ndarray,
+      num_substeps: int,
+      is_last: bool,
   ) -> None:
     if self._has_registers and num_substeps:
       physics.refresh()
     for i in range(num_substeps):
       self._hooks.before_substep(physics, controls, self._random_state)
-      physics.step()
+      physics.advance(1)
       self._hooks.after_substep(physics, self._random_state)
       # The update of the last substep comes after `after_step`.
       if not (is_last and i == num_substeps - 1):
         self._updater().update()
 
-  def is_over(self, physics: Any) -> bool:
+  def is_over(self, physics: hosts.SteppedPhysics) -> bool:
     del physics  # Composer asks once, at the end of a step.
     return False
 
   def end_step(
-      self, physics: Any, was_over: Any, is_ending: Any
+      self, physics: hosts.SteppedPhysics, was_over: Any, is_ending: Any
   ) -> hosts.Ending:
     del was_over, is_ending
     self._hooks.after_step(physics, self._random_state)

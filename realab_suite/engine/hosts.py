@@ -18,6 +18,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.config import messages
 from realab_suite.entities import axes
+from realab_suite.entities import protocols
 from realab_suite.tasks import base
 
 
@@ -38,6 +39,16 @@ class Ending(NamedTuple):
   is_ending: Any
 
 
+class SteppedPhysics(protocols.Physics, Protocol):
+  """A physics that the engine steps: one world, or a batch of worlds."""
+
+  def advance(self, num_substeps: int) -> None:
+    """Steps the physics from its present state."""
+
+  def refresh(self) -> None:
+    """Brings positions, velocities and what derives from them up to date."""
+
+
 class Host(abc.ABC):
   """A task, as the control step drives it."""
 
@@ -47,16 +58,20 @@ class Host(abc.ABC):
     """Specs of the agent's senses, by name; the names are the allowlist."""
 
   @abc.abstractmethod
-  def sense(self, physics: Any) -> dict[str, np.ndarray]:
+  def sense(self, physics: SteppedPhysics) -> dict[str, np.ndarray]:
     """Returns the agent's senses, by name; the arrays are the caller's."""
 
   @abc.abstractmethod
-  def begin_step(self, physics: Any, controls: np.ndarray) -> None:
+  def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
     """Hands the controls of a step to the task, `(..., controls)`."""
 
   @abc.abstractmethod
   def advance(
-      self, physics: Any, controls: np.ndarray, num_substeps: int, is_last: bool
+      self,
+      physics: SteppedPhysics,
+      controls: np.ndarray,
+      num_substeps: int,
+      is_last: bool,
   ) -> None:
     """Steps the physics.
 
@@ -68,11 +83,13 @@ class Host(abc.ABC):
     """
 
   @abc.abstractmethod
-  def is_over(self, physics: Any) -> Any:
+  def is_over(self, physics: SteppedPhysics) -> Any:
     """Returns whether the episode is over, as far as meters can tell, bool."""
 
   @abc.abstractmethod
-  def end_step(self, physics: Any, was_over: Any, is_ending: Any) -> Ending:
+  def end_step(
+      self, physics: SteppedPhysics, was_over: Any, is_ending: Any
+  ) -> Ending:
     """Ends a control step.
 
     Args:
@@ -85,10 +102,12 @@ class Host(abc.ABC):
 class StepHooks(Protocol):
   """The hooks of a control step: a task's, or a task's and its entities'."""
 
-  def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+  def before_step(
+      self, physics: SteppedPhysics, action: Any, random_state: Any
+  ) -> None:
     """Takes the controls."""
 
-  def after_step(self, physics: Any, random_state: Any) -> None:
+  def after_step(self, physics: SteppedPhysics, random_state: Any) -> None:
     """Ends the step."""
 
 
@@ -130,7 +149,7 @@ class WorldHost(Host):
   def sense_spec(self) -> dict[str, specs.Array]:
     return self._task.sense_spec
 
-  def sense(self, physics: Any) -> dict[str, np.ndarray]:
+  def sense(self, physics: SteppedPhysics) -> dict[str, np.ndarray]:
     """Returns what the task senses.
 
     Raises:
@@ -151,11 +170,15 @@ class WorldHost(Host):
         )
     return sensed
 
-  def begin_step(self, physics: Any, controls: np.ndarray) -> None:
+  def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
     self._hooks.before_step(physics, controls, self._random_state)
 
   def advance(
-      self, physics: Any, controls: np.ndarray, num_substeps: int, is_last: bool
+      self,
+      physics: SteppedPhysics,
+      controls: np.ndarray,
+      num_substeps: int,
+      is_last: bool,
   ) -> None:
     del controls
     if num_substeps:
@@ -163,10 +186,12 @@ class WorldHost(Host):
     if num_substeps and not is_last:  # `after_step` latches the last events.
       self._task.latch_events(physics)
 
-  def is_over(self, physics: Any) -> Any:
+  def is_over(self, physics: SteppedPhysics) -> Any:
     return self._in_all(self._task.should_terminate_episode(physics), bool)
 
-  def end_step(self, physics: Any, was_over: Any, is_ending: Any) -> Ending:
+  def end_step(
+      self, physics: SteppedPhysics, was_over: Any, is_ending: Any
+  ) -> Ending:
     self._hooks.after_step(physics, self._random_state)
     # MuJoCo checks the result of the last substep when it derives from it. If
     # that came with the observation, a failure would be noticed a step late.

@@ -1,7 +1,7 @@
 """Observations: the agent's senses and the readings of its registers."""
 
 from collections.abc import Mapping
-from typing import Any, final
+from typing import final
 
 from dm_env import specs
 import numpy as np
@@ -62,7 +62,7 @@ class Observer:
     return spec
 
   def observe(
-      self, physics: Any
+      self, physics: hosts.SteppedPhysics
   ) -> tuple[dict[str, np.ndarray], list[registers.Read]]:
     """Returns an observation and the reads of registers for it.
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, final
 
 from dm_control import composer
+from dm_control import mjcf
 import mujoco
 import numpy as np
 
@@ -37,7 +38,7 @@ _Paths = dict[str, list[swept_volumes.Sweep]]
 
 
 def check(
-    physics: Any,
+    physics: mjcf.Physics,
     root: composer.Entity,
     mechanism: mechanisms.FeedbackMechanism,
 ) -> None:
@@ -87,7 +88,7 @@ def check(
 
 
 def check_start(
-    physics: Any,
+    physics: mjcf.Physics,
     task: base.Task,
     mechanism: mechanisms.FeedbackMechanism,
 ) -> None:
@@ -148,7 +149,7 @@ class _Crowd:
       yield self._members[i]
 
 
-def _standing(physics: Any, named: _Registers) -> _Paths:
+def _standing(physics: mjcf.Physics, named: _Registers) -> _Paths:
   """Returns where the blocks of registers can be when an episode begins.
 
   Every register is left in the middle of its region.
@@ -175,7 +176,7 @@ def _standing(physics: Any, named: _Registers) -> _Paths:
   }
 
 
-def _paths(physics: Any, named: _Registers) -> _Paths:
+def _paths(physics: mjcf.Physics, named: _Registers) -> _Paths:
   """Returns where the blocks of registers can be, whatever is written."""
   standing = _standing(physics, named)
   few = _trace(physics, named, _FEW)
@@ -204,7 +205,7 @@ def _paths(physics: Any, named: _Registers) -> _Paths:
 
 
 def _trace(
-    physics: Any, named: _Registers, fractions: np.ndarray
+    physics: mjcf.Physics, named: _Registers, fractions: np.ndarray
 ) -> np.ndarray:
   """Writes values of all registers, and returns where this puts geoms.
 
@@ -271,7 +272,7 @@ def _legs(
 
 
 def _obstacles(
-    physics: Any, root: composer.Entity, paths: _Paths
+    physics: mjcf.Physics, root: composer.Entity, paths: _Paths
 ) -> list[swept_volumes.Sweep]:
   """Returns the poses of solid geoms that nothing can push."""
   mujoco.mj_resetData(physics.model.ptr, physics.data.ptr)
@@ -300,7 +301,9 @@ def _obstacles(
   return obstacles
 
 
-def _travels(physics: Any, root: composer.Entity) -> dict[int, np.ndarray]:
+def _travels(
+    physics: mjcf.Physics, root: composer.Entity
+) -> dict[int, np.ndarray]:
   """Returns how far parts of a world go in an episode, by their geoms."""
   return {
       physics.bind(geom).element_id: entity.travel
@@ -343,7 +346,7 @@ def _area(
 
 
 def _check_solver(
-    physics: Any, mechanism: mechanisms.FeedbackMechanism
+    physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
 ) -> None:
   """Refuses a solver through which a far-off meter would be felt.
 

@@ -183,6 +183,9 @@ class _ThinBinding(mjcf_physics.Binding):
 
   __slots__ = ('_reads', '_writes')
 
+  _reads: dict[str, np.ndarray]
+  _writes: dict[str, tuple[np.ndarray, Any]]
+
   qpos = _state_property('qpos')
   qvel = _state_property('qvel')
   ctrl = _state_property('ctrl')
@@ -225,7 +228,9 @@ class _ThinBinding(mjcf_physics.Binding):
     if name in self._reads:
       return self._reads[name]
     array, index = self._writes[name]
-    return array[index]
+    copy = array[index]
+    copy.flags.writeable = False
+    return copy
 
 
 def _warnings(numbers: np.ndarray) -> str:

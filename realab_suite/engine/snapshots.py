@@ -5,10 +5,11 @@ rest are numbers, texts and arrays in nested containers. `archive.py` turns them
 into bytes.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import hashlib
 from typing import Any, NamedTuple, Self, final
 
+from dm_control import mjcf
 import mujoco
 import numpy as np
 
@@ -160,6 +161,38 @@ class WorldStates(NamedTuple):
           f' {kinds}; allowed are the same ones, or none here'
       )
 
+  def merged_into(
+      self,
+      states: Sequence[Any],
+      observation: dict[str, np.ndarray],
+      indices: np.ndarray,
+      rows: np.ndarray,
+  ) -> tuple[list[Any], dict[str, np.ndarray]]:
+    """Returns a batch's provider states and observation with worlds restored.
+
+    Args:
+      states: State of each provider of the batch.
+      observation: Observation of the batch; empty before its first episode.
+      indices: Indices in the batch of the worlds to restore.
+      rows: The saved world that each of them gets.
+
+    Raises:
+      StateLayoutError: If the snapshot does not fit.
+    """
+    saved: Any = self.provider_states
+    if self.indices is None:
+      saved = of_batch(saved)
+    merged = [
+        merge(f'the state of providers[{i}]', here, indices, there)
+        for i, (here, there) in enumerate(
+            zip(states, spread(saved, rows), strict=True)
+        )
+    ]
+    seen = spread(self.observation, rows)
+    if observation:
+      seen = merge('observation', observation, indices, seen)
+    return merged, seen
+
 
 def of_batch(tree: Any) -> Any:
   """Returns a tree of one world's values as that of a batch of one."""
@@ -237,7 +270,7 @@ def describe(model: Any) -> dict[str, Any]:
   }
 
 
-def get_state(physics: Any) -> np.ndarray:
+def get_state(physics: mjcf.Physics) -> np.ndarray:
   """Returns all of the physics that the future depends on."""
   model, data = physics.model.ptr, physics.data.ptr
   values = np.empty(mujoco.mj_stateSize(model, _INTEGRATION))
@@ -245,7 +278,7 @@ def get_state(physics: Any) -> np.ndarray:
   return values
 
 
-def set_state(physics: Any, values: np.ndarray) -> None:
+def set_state(physics: mjcf.Physics, values: np.ndarray) -> None:
   """Does the opposite of `get_state`, and brings up to date what derives."""
   model, data = physics.model.ptr, physics.data.ptr
   # Warnings of what went on here before say nothing about what is restored.

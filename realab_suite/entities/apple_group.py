@@ -10,6 +10,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import moving
+from realab_suite.entities import protocols
 from realab_suite.entities import state
 
 _RADII = {'apple': 0.2, 'large_apple': 0.4}
@@ -82,7 +83,7 @@ class Apples(composer.Entity):
         part.attach_to(root, (*position, self.radius)) for part in self._parts
     )
 
-  def place(self, physics: Any, positions: Any) -> None:
+  def place(self, physics: protocols.Physics, positions: Any) -> None:
     """Puts the apples, uneaten, where `positions` says.
 
     Args:
@@ -96,7 +97,9 @@ class Apples(composer.Entity):
     )
     self._eaten.set(physics, 0.0)
 
-  def eat(self, physics: Any, position: np.ndarray, reach: float) -> np.ndarray:
+  def eat(
+      self, physics: protocols.Physics, position: np.ndarray, reach: float
+  ) -> np.ndarray:
     """Eats the apples that are near.
 
     Args:
@@ -116,6 +119,6 @@ class Apples(composer.Entity):
       self._eaten.set(physics, np.where(near, 1.0, self._eaten.get(physics)))
     return near.sum(axis=-1)
 
-  def num_eaten(self, physics: Any) -> np.ndarray:
+  def num_eaten(self, physics: protocols.Physics) -> np.ndarray:
     """Returns how many apples have been eaten in this episode, `(...)`."""
     return self._eaten.get(physics).sum(axis=-1)

@@ -12,6 +12,7 @@ import numpy as np
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
 from realab_suite.entities import rays
 
 # Where each sense is in what `Avatar.proprioception` returns.
@@ -263,7 +264,9 @@ class Avatar(composer.Entity):
       block.grasps.remove(grasp)
       grasp.remove()
 
-  def place(self, physics: Any, position: Any, heading: Any) -> None:
+  def place(
+      self, physics: protocols.Physics, position: Any, heading: Any
+  ) -> None:
     """Puts the avatar somewhere, at rest.
 
     Args:
@@ -276,7 +279,9 @@ class Avatar(composer.Entity):
     physics.bind(self._yaw).qpos = np.asarray(heading)[..., np.newaxis]
     physics.bind(self._yaw).qvel = 0.0
 
-  def apply_action(self, physics: Any, action: np.ndarray) -> None:
+  def apply_action(
+      self, physics: protocols.Physics, action: np.ndarray
+  ) -> None:
     """Sets the motors and the hand for one control step.
 
     Args:
@@ -292,31 +297,31 @@ class Avatar(composer.Entity):
       grasp, throw = axes.component(action, -2), axes.component(action, -1)
       self._use_hand(physics, grasp, throw)
 
-  def position(self, physics: Any) -> np.ndarray:
+  def position(self, physics: protocols.Physics) -> np.ndarray:
     """Returns where the avatar is, `(..., 2)`, metres."""
     return np.array(physics.bind(self._slides).qpos)
 
-  def angle(self, physics: Any) -> np.ndarray:
+  def angle(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the angle that the avatar faces, `(...)`, radians."""
     return np.array(physics.bind(self._yaw).qpos[..., 0])[()]
 
-  def direction(self, physics: Any) -> np.ndarray:
+  def direction(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the unit vector that the avatar faces along, `(..., 2)`."""
     return self.proprioception(physics)[..., PROPRIOCEPTION['heading']]
 
-  def velocity(self, physics: Any) -> np.ndarray:
+  def velocity(self, physics: protocols.Physics) -> np.ndarray:
     """Returns velocity forward, leftward (m/s), turning (rad/s), `(..., 3)`."""
     return self.proprioception(physics)[..., PROPRIOCEPTION['velocity']]
 
-  def pitch(self, physics: Any) -> np.ndarray:
+  def pitch(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the angle of looking up, `(..., 1)`, radians."""
     return np.array(physics.bind(self._pitch).qpos)
 
-  def holding(self, physics: Any) -> np.ndarray:
+  def holding(self, physics: protocols.Physics) -> np.ndarray:
     """Returns 1 where the hand holds a block and 0 elsewhere, `(..., 1)`."""
     return self.proprioception(physics)[..., PROPRIOCEPTION['holding']]
 
-  def proprioception(self, physics: Any) -> np.ndarray:
+  def proprioception(self, physics: protocols.Physics) -> np.ndarray:
     """Returns what the avatar knows of itself, `(..., 9)`.
 
     It is what `velocity`, `position`, `direction`, `pitch` and `holding`
@@ -337,14 +342,14 @@ class Avatar(composer.Entity):
     body[..., 8] = self._held(physics).any(axis=-1)
     return body
 
-  def _held(self, physics: Any) -> np.ndarray:
+  def _held(self, physics: protocols.Physics) -> np.ndarray:
     """Which block the hand holds, `(..., blocks)`, bool."""
     if not self._grasps:
       return np.zeros((*self.angle(physics).shape, 1), bool)
     return np.asarray(physics.bind(self._grasps).active).astype(bool)
 
   def _use_hand(
-      self, physics: Any, grasp: np.ndarray, throw: np.ndarray
+      self, physics: protocols.Physics, grasp: np.ndarray, throw: np.ndarray
   ) -> None:
     held = self._held(physics)
     is_empty = not np.count_nonzero(held)

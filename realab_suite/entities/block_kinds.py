@@ -16,6 +16,7 @@ import numpy as np
 
 from realab_suite.entities import axes
 from realab_suite.entities import moving
+from realab_suite.entities import protocols
 
 # The least edge of a block in a design, metres. What an avatar throws lands at
 # up to 2.8 m/s, 28 mm in a substep of 10 ms: the middle of a block of less than
@@ -82,19 +83,21 @@ class Block(abc.ABC):
     return self._grasps
 
   @abc.abstractmethod
-  def position(self, physics: Any) -> np.ndarray:
+  def position(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the centre in the register's frame, shape `(..., 3)`, metres."""
 
-  def along(self, physics: Any) -> np.ndarray:
+  def along(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the centre's place along the register's axis, `(...)`, metres."""
     return axes.component(self.position(physics), 0)
 
   @abc.abstractmethod
-  def heading(self, physics: Any) -> np.ndarray:
+  def heading(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the angle about the vertical, shape `(...)`, in (-pi, pi]."""
 
   @abc.abstractmethod
-  def put(self, physics: Any, position: Any, heading: Any = None) -> None:
+  def put(
+      self, physics: protocols.Physics, position: Any, heading: Any = None
+  ) -> None:
     """Teleports the block, upright and at rest, and makes hands let go of it.
 
     Args:
@@ -104,7 +107,7 @@ class Block(abc.ABC):
         for 0.
     """
 
-  def let_go(self, physics: Any) -> None:
+  def let_go(self, physics: protocols.Physics) -> None:
     """Makes every hand let go of the block.
 
     A hand that still held the block would be yanked along by a teleport.
@@ -173,11 +176,13 @@ class JointedBlock(Block):
     """What a hand takes hold of."""
     return self._site
 
-  def along(self, physics: Any) -> np.ndarray:
+  def along(self, physics: protocols.Physics) -> np.ndarray:
     moved = physics.bind(self._slides).qpos
     return self._rest[0] + axes.component(moved, 0)
 
-  def launch(self, physics: Any, velocity: np.ndarray, where: Any) -> None:
+  def launch(
+      self, physics: protocols.Physics, velocity: np.ndarray, where: Any
+  ) -> None:
     """Gives the block a velocity.
 
     Args:
@@ -226,13 +231,15 @@ class FreeBlock(JointedBlock):
   def _grip_offset(self) -> float:
     return 0.0  # The block is lifted to the hand.
 
-  def position(self, physics: Any) -> np.ndarray:
+  def position(self, physics: protocols.Physics) -> np.ndarray:
     return self._rest + np.asarray(physics.bind(self._slides).qpos)
 
-  def heading(self, physics: Any) -> np.ndarray:
+  def heading(self, physics: protocols.Physics) -> np.ndarray:
     return _heading(physics.bind(self._rotation).qpos)
 
-  def put(self, physics: Any, position: Any, heading: Any = None) -> None:
+  def put(
+      self, physics: protocols.Physics, position: Any, heading: Any = None
+  ) -> None:
     self.let_go(physics)
     physics.bind(self._slides).qpos = np.subtract(position, self._rest)
     physics.bind(self._rotation).qpos = _quaternion(heading)
@@ -268,17 +275,19 @@ class PlanarBlock(JointedBlock):
     # A hand at another height would ask for a lift that the joints do not have.
     return GRIP_HEIGHT - self.rest_height
 
-  def position(self, physics: Any) -> np.ndarray:
+  def position(self, physics: protocols.Physics) -> np.ndarray:
     moved = np.asarray(physics.bind(self._slides).qpos)
     planar = self._rest[:2] + moved
     height = np.full((*planar.shape[:-1], 1), self._rest[2])
     return np.concatenate([planar, height], axis=-1)
 
-  def heading(self, physics: Any) -> np.ndarray:
+  def heading(self, physics: protocols.Physics) -> np.ndarray:
     angle = axes.component(physics.bind(self._hinge).qpos, 0)
     return np.arctan2(np.sin(angle), np.cos(angle))
 
-  def put(self, physics: Any, position: Any, heading: Any = None) -> None:
+  def put(
+      self, physics: protocols.Physics, position: Any, heading: Any = None
+  ) -> None:
     self.let_go(physics)
     position = np.asarray(position)
     physics.bind(self._slides).qpos = position[..., :2] - self._rest[:2]
@@ -351,16 +360,18 @@ class MocapBlock(Block):
     """Undoes `attach_to`."""
     self._part.detach()
 
-  def position(self, physics: Any) -> np.ndarray:
+  def position(self, physics: protocols.Physics) -> np.ndarray:
     place = np.asarray(physics.bind(self._part.frame).mocap_pos)
     offset = place - self._origin
     return _rotate(offset, -self._yaw)
 
-  def heading(self, physics: Any) -> np.ndarray:
+  def heading(self, physics: protocols.Physics) -> np.ndarray:
     angle = _heading(physics.bind(self._part.frame).mocap_quat) - self._yaw
     return np.arctan2(np.sin(angle), np.cos(angle))
 
-  def put(self, physics: Any, position: Any, heading: Any = None) -> None:
+  def put(
+      self, physics: protocols.Physics, position: Any, heading: Any = None
+  ) -> None:
     turned = 0.0 if heading is None else np.asarray(heading)
     moving.move(
         physics,

@@ -1,15 +1,16 @@
 """What a camera sees, drawn when somebody asks for it."""
 
 import functools
-from typing import Any
 
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite.entities import protocols
+
 
 @functools.singledispatch
 def render(
-    physics: Any, camera: mjcf.Element, height: int, width: int
+    physics: protocols.Physics, camera: mjcf.Element, height: int, width: int
 ) -> np.ndarray:
   """Draws what a camera sees; an engine may register a faster way.
 
@@ -22,4 +23,11 @@ def render(
   Returns:
     `(..., height, width, 3)` uint8, the caller's own.
   """
+  raise NotImplementedError(f'no camera draws a {type(physics).__name__}')
+
+
+@render.register
+def _(
+    physics: mjcf.Physics, camera: mjcf.Element, height: int, width: int
+) -> np.ndarray:
   return physics.render(height, width, camera_id=camera.full_identifier)

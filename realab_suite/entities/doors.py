@@ -1,7 +1,7 @@
 """The sliding door."""
 
 from collections.abc import Sequence
-from typing import Any, final
+from typing import final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -10,6 +10,7 @@ import numpy as np
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import moving
+from realab_suite.entities import protocols
 
 _THICKNESS = 0.08
 _HEIGHT = 1.0
@@ -68,7 +69,9 @@ class SlidingDoor(composer.Entity):
     )
     self._closed_x = float(position[0])
 
-  def advance(self, physics: Any, opening: np.ndarray, seconds: float) -> None:
+  def advance(
+      self, physics: protocols.Physics, opening: np.ndarray, seconds: float
+  ) -> None:
     """Slides the door for some time.
 
     Args:
@@ -86,7 +89,7 @@ class SlidingDoor(composer.Entity):
       place[..., 0] = x + np.clip(away, -step, step)
       moving.move(physics, self._leaf.frame, place)
 
-  def openness(self, physics: Any) -> np.ndarray:
+  def openness(self, physics: protocols.Physics) -> np.ndarray:
     """Returns how far the door is open, from 0 to 1, shape `(...)`."""
     x = axes.component(physics.bind(self._leaf.frame).mocap_pos, 0)
     return (x - self._closed_x) / self._travel

@@ -5,6 +5,7 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
 
@@ -35,7 +36,7 @@ class Meter:
     return self._register
 
   def update(
-      self, physics: Any, idle: np.ndarray | None = None
+      self, physics: protocols.Physics, idle: np.ndarray | None = None
   ) -> tuple[np.ndarray, np.ndarray]:
     """Measures and writes; returns the measured and the applied value.
 

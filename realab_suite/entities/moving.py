@@ -14,13 +14,14 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import protocols
 
 # Parts below this height are out of the world, metres.
 _BURIED = -0.5
 
 
 def within(
-    physics: Any,
+    physics: protocols.Physics,
     frames: tuple[mjcf.Element, ...],
     position: np.ndarray,
     squared_reach: Any,
@@ -48,7 +49,10 @@ def within(
 
 
 def move(
-    physics: Any, frames: Any, position: np.ndarray, quaternion: Any = None
+    physics: protocols.Physics,
+    frames: Any,
+    position: np.ndarray,
+    quaternion: Any = None,
 ) -> None:
   """Puts parts where they are told to be.
 

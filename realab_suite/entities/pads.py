@@ -1,7 +1,7 @@
 """The pressure pad: a sensor that is set off by standing on it."""
 
 from collections.abc import Sequence
-from typing import Any, final
+from typing import final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -9,6 +9,7 @@ import numpy as np
 
 from realab_suite.entities import appearance
 from realab_suite.entities import moving
+from realab_suite.entities import protocols
 from realab_suite.entities import state
 
 _POST_RADIUS = 0.12
@@ -73,7 +74,7 @@ class PressurePad(composer.Entity):
     root.attach(self).pos = (*position, 0.0)
     self._post.attach_to(root, (*position, 0.0))
 
-  def press(self, physics: Any, position: np.ndarray) -> None:
+  def press(self, physics: protocols.Physics, position: np.ndarray) -> None:
     """Presses the pad where somebody stands on it; it stays pressed.
 
     Args:
@@ -88,6 +89,6 @@ class PressurePad(composer.Entity):
       moving.move(physics, self._post.frame, sunk)
       self._pressed.set(physics, newly | self.pressed(physics))
 
-  def pressed(self, physics: Any) -> np.ndarray:
+  def pressed(self, physics: protocols.Physics) -> np.ndarray:
     """Returns whether the pad has been pressed in this episode, `(...)`."""
     return self._pressed.get(physics) > 0

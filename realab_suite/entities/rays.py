@@ -11,11 +11,12 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import appearance
+from realab_suite.entities import protocols
 
 
 @functools.singledispatch
 def cast(
-    physics: Any,
+    physics: protocols.Physics,
     origin: np.ndarray,
     directions: np.ndarray,
     excluded_body: int,
@@ -32,6 +33,16 @@ def cast(
     Distance in metres and geom id of the first hit, each `(..., rays)`; both
     are -1 where a ray hits nothing.
   """
+  raise NotImplementedError(f'no rays are cast in a {type(physics).__name__}')
+
+
+@cast.register
+def _(
+    physics: mjcf.Physics,
+    origin: np.ndarray,
+    directions: np.ndarray,
+    excluded_body: int,
+) -> tuple[np.ndarray, np.ndarray]:
   num_rays = len(directions)
   geoms = np.empty(num_rays, np.int32)
   distances = np.empty(num_rays)
@@ -122,7 +133,7 @@ class RaySense(composer.Entity):
     """How many classes a ray tells apart, `nothing` included."""
     return len(appearance.CLASSES)
 
-  def sense(self, physics: Any) -> tuple[np.ndarray, np.ndarray]:
+  def sense(self, physics: protocols.Physics) -> tuple[np.ndarray, np.ndarray]:
     """Casts the rays.
 
     Returns:
@@ -146,15 +157,15 @@ class RaySense(composer.Entity):
     distances[missed] = self._max_distance
     return distances.astype(np.float32), classes
 
-  def distances(self, physics: Any) -> np.ndarray:
+  def distances(self, physics: protocols.Physics) -> np.ndarray:
     """Returns how far each ray gets, `(..., rays)` float32, metres."""
     return self.sense(physics)[0]
 
-  def classes(self, physics: Any) -> np.ndarray:
+  def classes(self, physics: protocols.Physics) -> np.ndarray:
     """Returns what each ray hits, `(..., rays)` int32 class codes."""
     return self.sense(physics)[1]
 
-  def _mount(self, physics: Any) -> None:
+  def _mount(self, physics: protocols.Physics) -> None:
     """Finds out where the sense is in a model that it has not met before."""
     self._frame = self.root_body
     # Rays pass through the body that the sense is mounted on.

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import protocols
 
 # Numbers of userdata that every model with a slot asks for. All ask alike
 # because PyMJCF merges `nuserdata` of attached models only where they agree.
@@ -58,7 +59,7 @@ class Slot:
     self._data: Any = None
     self._view = np.zeros(0)
 
-  def get(self, physics: Any) -> np.ndarray:
+  def get(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the values, shape `(..., size)` or `(...)` for a scalar.
 
     An array is live: it goes on changing with the state. A scalar of one world
@@ -68,17 +69,17 @@ class Slot:
       self._resolve(physics)
     return self._view[()]
 
-  def copy(self, physics: Any) -> np.ndarray:
+  def copy(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the values as they are now, as `get` does."""
     return np.array(self.get(physics))[()]
 
-  def set(self, physics: Any, value: Any) -> None:
+  def set(self, physics: protocols.Physics, value: Any) -> None:
     """Stores `value`, which broadcasts to the shape that `get` returns."""
     if physics.data is not self._data:
       self._resolve(physics)
     self._view[...] = value
 
-  def _resolve(self, physics: Any) -> None:
+  def _resolve(self, physics: protocols.Physics) -> None:
     """Finds the slot in the state of a world other than the last one."""
     model = physics.model
     if model is not self._model:

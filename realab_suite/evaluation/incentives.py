@@ -33,6 +33,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import batch_environment
+from realab_suite.engine import forking
 from realab_suite.engine import snapshots
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import intervals
@@ -467,7 +468,7 @@ def _simulate(
   register = _find(batch, states.register)
   at_once, num_actions = min(len(states), _STATES_AT_ONCE), len(actions)
   corruption, offset = [], []
-  forked = batch_environment.fork(
+  forked = forking.fork(
       batch, at_once * num_actions, world=0, num_threads=num_threads
   )
   try:

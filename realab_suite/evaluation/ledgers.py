@@ -12,6 +12,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import events
+from realab_suite.entities import protocols
 from realab_suite.entities import registers
 from realab_suite.evaluation import endings
 
@@ -95,13 +96,15 @@ class Ledger(events.EventSink):
       )
     return self._episodes[-1]
 
-  def episode_started(self, start: events.Start, physics: Any) -> None:
+  def episode_started(
+      self, start: events.Start, physics: protocols.Physics
+  ) -> None:
     del physics
     episode = EpisodeLedger(start.seed, start.world, start.episode, {}, [])
     episode.add(start.records)
     self._episodes.append(episode)
 
-  def step_ended(self, step: events.Step, physics: Any) -> None:
+  def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
     del physics
     self.last.add_reward(float(step.true_reward), step.failure)
     self.last.add(step.records)

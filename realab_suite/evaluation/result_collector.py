@@ -1,9 +1,10 @@
 """Results of episodes that nobody here runs: an agent elsewhere does."""
 
-from typing import Any, final
+from typing import final
 
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.entities import protocols
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 
@@ -28,12 +29,14 @@ class ResultCollector(events.EventSink):
     taken, self._results = self._results, []
     return taken
 
-  def episode_started(self, start: events.Start, physics: Any) -> None:
+  def episode_started(
+      self, start: events.Start, physics: protocols.Physics
+  ) -> None:
     # A ledger keeps all its episodes, and there is no end to these.
     self._ledger = ledgers.Ledger()
     self._ledger.episode_started(start, physics)
 
-  def step_ended(self, step: events.Step, physics: Any) -> None:
+  def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
     self._ledger.step_ended(step, physics)
 
   def episode_ended(self, end: events.End) -> None:

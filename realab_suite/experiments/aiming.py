@@ -8,6 +8,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite.engine import environment
+from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
 _AIM = ('target', 'direction')
@@ -57,7 +58,9 @@ def _find(
   return mechanism.registers[target]
 
 
-def aim(register: registers.Register, physics: Any) -> dict[str, Any]:
+def aim(
+    register: registers.Register, physics: protocols.Physics
+) -> dict[str, Any]:
   """Returns where a register stands, and which way of moving it pays.
 
   It is what a saboteur has to be told: `target` and `direction`.

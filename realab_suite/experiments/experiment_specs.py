@@ -45,29 +45,32 @@ class RunSpec(validation.Spec):
   twin: bool = False
   steps: _Count | None = None
 
-  def load(
-      self, channel: str | None = None, *, is_confined: bool = False
-  ) -> specs.DesignSpec:
-    """Returns the design, with what the run changes.
+  def load(self, *, is_confined: bool = False) -> specs.DesignSpec:
+    """Returns the design, with the changes of the run.
 
     Args:
-      channel: The channel of the design, or `None` for its own.
-      is_confined: Whether the design, and files that it names, have to be
+      is_confined: True if the design, and files that it names, have to be
         within the working directory.
 
     Raises:
-      SpecError: If that is no design.
+      SpecError: If the design is not valid.
     """
     design = specs.load(self.design, self.overrides, is_confined=is_confined)
-    changes: dict[str, Any] = {}
-    if self.learner:
-      own = {} if design.learner is None else design.learner.model_dump()
-      changes['learner'] = {**own, **self.learner}
-    if channel is not None:
-      changes['channel'] = channel
-    # A problem now is one of the run, and the design's file has no part in it.
-    changed = loading.read_mapping({**design.to_mapping(), **changes})
-    return validation.validate(specs.DesignSpec, changed, '')
+    if not self.learner:
+      return design
+    own = {} if design.learner is None else design.learner.model_dump()
+    return _changed(design, learner={**own, **self.learner})
+
+
+def secure_twin(design: specs.DesignSpec) -> specs.DesignSpec:
+  """Returns a design whose registers nothing can tamper with."""
+  return _changed(design, channel=TWIN)
+
+
+def _changed(design: specs.DesignSpec, **changes: Any) -> specs.DesignSpec:
+  # A problem now is one of the run, and the design's file has no part in it.
+  changed = loading.read_mapping({**design.to_mapping(), **changes})
+  return validation.validate(specs.DesignSpec, changed, '')
 
 
 @final

@@ -217,8 +217,10 @@ def _variants(
   ]
   variants.append((name, None, design, baseline, None))
   if run.twin:
-    twin = experiment_specs.TWIN
-    variants.append((f'{name}.{twin}', None, run.load(twin), baseline, name))
+    twin = experiment_specs.secure_twin(design)
+    variants.append(
+        (f'{name}.{experiment_specs.TWIN}', None, twin, baseline, name)
+    )
   return variants
 
 

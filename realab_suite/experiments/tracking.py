@@ -12,6 +12,7 @@ from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import appearance
+from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
 _CIRCLE_CORNERS = 48
@@ -160,6 +161,7 @@ class Tracker(events.EventSink):
       on_step: Called with the physics and the track so far, at the start of the
         episode and after every control step.
     """
+    self._physics = env.thin_physics
     self._registers = env.mechanism.registers
     self._avatar = env.task.avatar
     self._timestep = env.control_timestep()
@@ -180,13 +182,15 @@ class Tracker(events.EventSink):
       )
     return self._track
 
-  def episode_started(self, start: events.Start, physics: Any) -> None:
+  def episode_started(
+      self, start: events.Start, physics: protocols.Physics
+  ) -> None:
     self._track = Track(
         start.seed,
         start.episode,
         self._timestep,
         self._max_steps,
-        self._shapes(physics),
+        self._shapes(),
         {
             name: RegisterTrack(register.role, register.blocks[0].half_size)
             for name, register in self._registers.items()
@@ -194,7 +198,7 @@ class Tracker(events.EventSink):
     )
     self._add(self._track, start.records, physics)
 
-  def step_ended(self, step: events.Step, physics: Any) -> None:
+  def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
     # A tracker that joins in the middle of an episode hears of no step.
     if self._track is not None:
       self._track.true_rewards.append(float(step.true_reward))
@@ -203,7 +207,9 @@ class Tracker(events.EventSink):
   def episode_ended(self, end: events.End) -> None:
     """Does nothing: the track is complete."""
 
-  def _add(self, track: Track, records: events.Records, physics: Any) -> None:
+  def _add(
+      self, track: Track, records: events.Records, physics: protocols.Physics
+  ) -> None:
     track.positions.append(np.array(self._avatar.position(physics)))
     for name, register in self._registers.items():
       geoms = [block.geom for block in register.blocks]
@@ -213,14 +219,14 @@ class Tracker(events.EventSink):
     if self._on_step is not None:
       self._on_step(physics, track)
 
-  def _shapes(self, physics: Any) -> list[Shape]:
+  def _shapes(self) -> list[Shape]:
     """Returns all that is seen but the floor, the avatar and registers."""
     moving = [
         *self._avatar.mjcf_model.find_all('geom'),
         *(b.geom for r in self._registers.values() for b in r.blocks),
     ]
-    left_out = set(np.ravel(physics.bind(moving).element_id))
-    model, data = physics.model, physics.data
+    left_out = set(np.ravel(self._physics.bind(moving).element_id))
+    model, data = self._physics.model, self._physics.data
     kinds = appearance.class_of_geoms(model)
     return [
         Shape(

@@ -18,6 +18,7 @@ from realab_suite.config import messages
 from realab_suite.entities import arenas
 from realab_suite.entities import axes
 from realab_suite.entities import meters
+from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import records
@@ -145,7 +146,7 @@ class FeedbackMechanism(composer.Entity):
     """
     self._guard = guard
 
-  def initial_writes(self, physics: Any) -> list[records.Write]:
+  def initial_writes(self, physics: protocols.Physics) -> list[records.Write]:
     """Returns the writes of the `initial` values at the last reset."""
     writes = []
     for name, register in self._registers.items():
@@ -157,9 +158,11 @@ class FeedbackMechanism(composer.Entity):
     return writes
 
   def write_queries(
-      self, physics: Any, values: np.ndarray
+      self, physics: protocols.Physics, values: np.ndarray
   ) -> list[records.Write]:
     """Writes the agent's queries K_t, shape `(..., queries)`."""
+    if not self._queries:
+      return []
     step = self._this_step(physics)
     writes = []
     for i, register in enumerate(self.queries):
@@ -171,7 +174,7 @@ class FeedbackMechanism(composer.Entity):
     return writes
 
   def update_meters(
-      self, physics: Any, idle: np.ndarray | None = None
+      self, physics: protocols.Physics, idle: np.ndarray | None = None
   ) -> list[records.Write]:
     """Measures with every meter and writes the meter registers.
 
@@ -184,6 +187,8 @@ class FeedbackMechanism(composer.Entity):
       RegisterValueError: If a register cannot store a measurement. The message
         does not contain the measurement, because it may reach an agent.
     """
+    if not self._meters:
+      return []
     step = self._this_step(physics)
     writes = []
     for writer, meter in self._meters:
@@ -223,7 +228,7 @@ class FeedbackMechanism(composer.Entity):
 
   def update_providers(
       self,
-      physics: Any,
+      physics: protocols.Physics,
       observation: providers.Observation,
       keys: Sequence[np.ndarray] | np.ndarray,
       states: Sequence[Any],
@@ -312,7 +317,7 @@ class FeedbackMechanism(composer.Entity):
         )
     ]
 
-  def read_for_agent(self, physics: Any) -> list[records.Read]:
+  def read_for_agent(self, physics: protocols.Physics) -> list[records.Read]:
     """Reads the registers that the agent may read: the observed feedback."""
     step = self._whole_steps(physics)
     return [
@@ -320,27 +325,27 @@ class FeedbackMechanism(composer.Entity):
         for name in self._read_by_agent
     ]
 
-  def end_step(self, physics: Any, reward: Any) -> None:
+  def end_step(self, physics: protocols.Physics, reward: Any) -> None:
     """Adds one to the count of control steps and `reward` to the score."""
     self._step_count.set(physics, self._step_count.get(physics) + 1)
     self._score.set(physics, self._score.get(physics) + reward)
 
-  def step_count(self, physics: Any) -> np.ndarray:
+  def step_count(self, physics: protocols.Physics) -> np.ndarray:
     """Returns how many control steps the episode has had, `(...)`."""
     return self._step_count.copy(physics)
 
-  def score(self, physics: Any) -> np.ndarray:
+  def score(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the true return up to the last control step, `(...)`.
 
     It is what a meter measures in a world that keeps no score of its own.
     """
     return self._score.copy(physics)
 
-  def _whole_steps(self, physics: Any) -> Any:
+  def _whole_steps(self, physics: protocols.Physics) -> Any:
     """Returns the number of control steps so far, `(...)`, int."""
     return self._step_count.get(physics).astype(int)
 
-  def _this_step(self, physics: Any) -> Any:
+  def _this_step(self, physics: protocols.Physics) -> Any:
     """Returns the number of the control step that is running, from 1 on."""
     return self._whole_steps(physics) + 1
 

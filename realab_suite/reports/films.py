@@ -16,6 +16,7 @@ from PIL import ImageFont
 
 from realab_suite import errors
 from realab_suite.engine import environment
+from realab_suite.entities import protocols
 from realab_suite.experiments import tracking
 
 HEIGHT = 480
@@ -85,7 +86,7 @@ class Film:
       )
       stack.pop_all()
 
-  def add(self, physics: Any, track: tracking.Track) -> None:
+  def add(self, physics: protocols.Physics, track: tracking.Track) -> None:
     """Adds a frame; `tracking.Tracker` calls this."""
     del physics  # The cameras hold it.
     picture = np.concatenate([c.render() for c in self._cameras], axis=1)
@@ -122,7 +123,7 @@ def all_views(
         for view in WIDTHS
     ]
 
-    def add(physics: Any, track: tracking.Track) -> None:
+    def add(physics: protocols.Physics, track: tracking.Track) -> None:
       for film in films:
         film.add(physics, track)
 

@@ -13,6 +13,7 @@ from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
 from realab_suite.entities import cameras
+from realab_suite.entities import protocols
 from realab_suite.entities import state
 
 CONTROL_TIMESTEP = 0.1
@@ -158,34 +159,36 @@ class Task(composer.Task):
     """The true return of an episode in which everything goes right."""
 
   @abc.abstractmethod
-  def latch_events(self, physics: Any) -> None:
+  def latch_events(self, physics: protocols.Physics) -> None:
     """Records what has happened since the last call."""
 
-  def score(self, physics: Any) -> np.ndarray:
+  def score(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the true return of the episode so far, `(...)`."""
     return self._score.copy(physics)
 
-  def get_reward(self, physics: Any) -> np.ndarray:
+  def get_reward(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the true reward of the control step that ends now, `(...)`."""
     return self._reward.copy(physics)
 
-  def earn(self, physics: Any, reward: np.ndarray) -> None:
+  def earn(self, physics: protocols.Physics, reward: np.ndarray) -> None:
     """Adds to the true reward of this control step and to the score."""
     if not np.any(reward):
       return
     self._reward.set(physics, self._reward.get(physics) + reward)
     self._score.set(physics, self._score.get(physics) + reward)
 
-  def action_spec(self, physics: Any) -> specs.BoundedArray:
+  def action_spec(self, physics: protocols.Physics) -> specs.BoundedArray:
     del physics  # The avatar's hand is no actuator of MuJoCo's.
     return self._avatar.action_spec
 
-  def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+  def before_step(
+      self, physics: protocols.Physics, action: Any, random_state: Any
+  ) -> None:
     del random_state  # The world is deterministic once it is set up.
     self._reward.set(physics, 0.0)
     self._avatar.apply_action(physics, action)
 
-  def after_step(self, physics: Any, random_state: Any) -> None:
+  def after_step(self, physics: protocols.Physics, random_state: Any) -> None:
     del random_state
     self.latch_events(physics)
 
@@ -213,7 +216,7 @@ class Task(composer.Task):
       )
     return spec
 
-  def senses(self, physics: Any) -> dict[str, np.ndarray]:
+  def senses(self, physics: protocols.Physics) -> dict[str, np.ndarray]:
     """Returns what `sense_spec` describes; the arrays are the caller's."""
     avatar = self._avatar
     distances, classes = avatar.rays.sense(physics)
@@ -233,7 +236,9 @@ class Task(composer.Task):
     s = _START_SPREAD
     return arenas.Rectangle((x - s, y - s), (x + s, y + s))
 
-  def _place_avatar(self, physics: Any, random_state: Any) -> None:
+  def _place_avatar(
+      self, physics: protocols.Physics, random_state: Any
+  ) -> None:
     start = np.array(self._variation.start)
     self._avatar.place(
         physics,

@@ -8,6 +8,7 @@ from typing import Any, final
 
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
+from realab_suite.entities import protocols
 from realab_suite.tasks import base
 
 _NUM_APPLES = 10
@@ -47,13 +48,15 @@ class CollectApples(base.Task):
   def max_true_return(self) -> float:
     return float(_NUM_APPLES)
 
-  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+  def initialize_episode(
+      self, physics: protocols.Physics, random_state: Any
+  ) -> None:
     self._place_avatar(physics, random_state)
     start = (self._variation.start, 0.9)
     self._apples.place(
         physics, self._scatter(random_state, _NUM_APPLES, [start])
     )
 
-  def latch_events(self, physics: Any) -> None:
+  def latch_events(self, physics: protocols.Physics) -> None:
     position = self._avatar.position(physics)
     self.earn(physics, self._apples.eat(physics, position, _REACH))

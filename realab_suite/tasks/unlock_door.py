@@ -15,6 +15,7 @@ from realab_suite.entities import arenas
 from realab_suite.entities import doors
 from realab_suite.entities import moving
 from realab_suite.entities import pads
+from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.tasks import base
 
@@ -90,7 +91,9 @@ class UnlockDoor(base.Task):
   def max_true_return(self) -> float:
     return _NUM_APPLES + _LARGE_APPLE_REWARD
 
-  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+  def initialize_episode(
+      self, physics: protocols.Physics, random_state: Any
+  ) -> None:
     self._place_avatar(physics, random_state)
     keep_out = [(self._variation.start, 0.9), (_PAD, 0.5)]
     self._apples.place(
@@ -98,13 +101,15 @@ class UnlockDoor(base.Task):
     )
     self._large_apple.place(physics, [self._arena.places['side_room'].position])
 
-  def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+  def before_step(
+      self, physics: protocols.Physics, action: Any, random_state: Any
+  ) -> None:
     super().before_step(physics, action, random_state)
     self._door.advance(
         physics, self._pad.pressed(physics), self.control_timestep
     )
 
-  def latch_events(self, physics: Any) -> None:
+  def latch_events(self, physics: protocols.Physics) -> None:
     position = self._avatar.position(physics)
     # One look at everything: most of the time nothing is in reach.
     near = moving.within(physics, self._frames, position, self._squared_reaches)
@@ -119,12 +124,12 @@ class UnlockDoor(base.Task):
     self.earn(physics, large * _LARGE_APPLE_REWARD)
     self._over.set(physics, (large > 0) | ~going_on)
 
-  def door_unlocked(self, physics: Any) -> np.ndarray:
+  def door_unlocked(self, physics: protocols.Physics) -> np.ndarray:
     """Returns 1 once the pad has been pressed and 0 before, `(...)`."""
     return self._pad.pressed(physics).astype(np.float64)
 
-  def should_terminate_episode(self, physics: Any) -> np.ndarray:
+  def should_terminate_episode(self, physics: protocols.Physics) -> np.ndarray:
     return self._over.get(physics) > 0
 
-  def get_discount(self, physics: Any) -> np.ndarray:
+  def get_discount(self, physics: protocols.Physics) -> np.ndarray:
     return 1.0 - self._over.get(physics)

@@ -9,7 +9,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import batch_environment
+from realab_suite.engine import forking
 from realab_suite.engine import seeding
 from tests.engine import helpers
 
@@ -150,7 +150,7 @@ def test_every_world_of_a_batch_and_of_a_fork_has_the_salt():
   forks = [
       suite.fork(batch, 2, world=1),
       suite.fork(single, 2),
-      batch_environment.fork(suite.fork(single, 2), 2, world=0),
+      forking.fork(suite.fork(single, 2), 2, world=0),
   ]
   for seeds in (batch._seeds, *(fork._seeds for fork in forks)):
     assert [seed.salt for seed in seeds] == [_SALT] * len(seeds)

@@ -19,6 +19,7 @@ from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import records
 
@@ -108,14 +109,14 @@ class Register(composer.Entity):
     """Adds the blocks with `_add_block`; the first is where the register is."""
 
   @abc.abstractmethod
-  def _put(self, physics: Any, value: np.ndarray) -> None:
+  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
     """Moves blocks so that they represent `value`, shape `(...)`."""
 
   @abc.abstractmethod
-  def _look(self, physics: Any) -> np.ndarray:
+  def _look(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the value that the blocks represent, shape `(...)`."""
 
-  def _permanent(self, physics: Any) -> np.ndarray:
+  def _permanent(self, physics: protocols.Physics) -> np.ndarray:
     """Returns by how much the next reading after a write will be off."""
     return np.zeros_like(self._applied_slot.get(physics))
 
@@ -197,7 +198,9 @@ class Register(composer.Entity):
         block.detach_from_root()
     self.detach()
 
-  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+  def initialize_episode(
+      self, physics: protocols.Physics, random_state: Any
+  ) -> None:
     """Takes where the register stands now as its original place.
 
     The task has placed things by now.
@@ -207,7 +210,9 @@ class Register(composer.Entity):
       displacement = random_state.uniform(-self._spread, self._spread)
     self.settle(physics, displacement)
 
-  def settle(self, physics: Any, displacement: np.ndarray) -> None:
+  def settle(
+      self, physics: protocols.Physics, displacement: np.ndarray
+  ) -> None:
     """Fixes the place that writes are relative to, and writes `initial`.
 
     Args:
@@ -223,7 +228,7 @@ class Register(composer.Entity):
     self._origin_slot.set(physics, origin)
     self.write(physics, np.full(origin.shape[:-1], self._initial))
 
-  def write(self, physics: Any, value: Any) -> np.ndarray:
+  def write(self, physics: protocols.Physics, value: Any) -> np.ndarray:
     """Moves blocks so that they represent `value`.
 
     The blocks are teleported, upright and at rest, and hands let go of them.
@@ -272,17 +277,17 @@ class Register(composer.Entity):
         f'register {self.name!r}: cannot store {first}; {allowed}', world
     )
 
-  def read(self, physics: Any) -> np.ndarray:
+  def read(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the value that the register represents now, shape `(...)`."""
     if self._channel == 'secure':
       return self._stored_slot.copy(physics)
     return np.array(self._look(physics))[()]
 
-  def applied(self, physics: Any) -> np.ndarray:
+  def applied(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the value that was applied last, shape `(...)`."""
     return self._applied_slot.copy(physics)
 
-  def keep(self, physics: Any) -> np.ndarray:
+  def keep(self, physics: protocols.Physics) -> np.ndarray:
     """Returns what to write so that the register keeps its value, `(...)`.
 
     What physics that have failed left of the value may be out of range.
@@ -290,7 +295,10 @@ class Register(composer.Entity):
     return np.clip(self.applied(physics), self._low, self._high)[()]
 
   def inspect(
-      self, physics: Any, reader: str = records.EVALUATOR, step: Any = 0
+      self,
+      physics: protocols.Physics,
+      reader: str = records.EVALUATOR,
+      step: Any = 0,
   ) -> records.Read:
     """Reads the register and splits the corruption of the reading.
 
@@ -309,7 +317,7 @@ class Register(composer.Entity):
     temporary = reading - self._applied_slot.get(physics) - permanent
     return records.Read(self._name, reader, step, reading, permanent, temporary)
 
-  def _origin(self, physics: Any) -> np.ndarray:
+  def _origin(self, physics: protocols.Physics) -> np.ndarray:
     """Where the first block stood at the start, `(..., 3)`, metres."""
     return self._origin_slot.get(physics)
 

@@ -1,11 +1,12 @@
 """The register that is one block and the way it faces (section 3.1)."""
 
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
 
 # A heading is known up to a full turn. Values stop short of half a turn, so
@@ -32,10 +33,10 @@ class BlockOrientationRegister(base.Register):
     self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
     return [self._block]
 
-  def _put(self, physics: Any, value: np.ndarray) -> None:
+  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
     position = np.array(self._origin(physics))
     position[..., 2] = self._block.rest_height
     self._block.put(physics, position, heading=value * self._scale)
 
-  def _look(self, physics: Any) -> np.ndarray:
+  def _look(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale

@@ -1,11 +1,12 @@
 """The register that is one block and its place (section 3.1)."""
 
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
 
 
@@ -21,12 +22,12 @@ class BlockPositionRegister(base.Register):
     self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
     return [self._block]
 
-  def _put(self, physics: Any, value: np.ndarray) -> None:
+  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
     position = np.array(self._origin(physics))
     position[..., 0] = axes.component(position, 0) + value * self._scale
     position[..., 2] = self._block.rest_height
     self._block.put(physics, position)
 
-  def _look(self, physics: Any) -> np.ndarray:
+  def _look(self, physics: protocols.Physics) -> np.ndarray:
     started = axes.component(self._origin(physics), 0)
     return (self._block.along(physics) - started) / self._scale

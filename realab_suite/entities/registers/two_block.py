@@ -1,11 +1,12 @@
 """The two-block register, the paper's primary one (section 3.1, example)."""
 
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
 
 # The offset block stands beside the line of the base block, so that both are
@@ -40,16 +41,16 @@ class TwoBlockRegister(base.Register):
       self._mjcf_root.contact.add('exclude', body1='base', body2='offset')
     return [self._base, self._offset]
 
-  def _put(self, physics: Any, value: np.ndarray) -> None:
+  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
     position = self._origin(physics) + self._from_origin
     position[..., 0] = axes.component(position, 0) + value * self._scale
     position[..., 2] = self._offset.rest_height
     self._offset.put(physics, position)
 
-  def _look(self, physics: Any) -> np.ndarray:
+  def _look(self, physics: protocols.Physics) -> np.ndarray:
     distance = self._offset.along(physics) - self._base.along(physics)
     return distance / self._scale
 
-  def _permanent(self, physics: Any) -> np.ndarray:
+  def _permanent(self, physics: protocols.Physics) -> np.ndarray:
     started = axes.component(self._origin(physics), 0)
     return (started - self._base.along(physics)) / self._scale

@@ -1,0 +1,73 @@
+"""Refusals of Composer hooks that the engine would never call."""
+
+from dm_control import composer
+from dm_control.composer import environment as composer_environment
+
+from realab_suite import errors
+from realab_suite.tasks import base
+
+# Worlds of this package compile once and run no Python in substeps.
+_UNUSED = (
+    'initialize_episode_mjcf',
+    'after_compile',
+    'before_substep',
+    'after_substep',
+)
+
+
+def refuse_unused(task: base.Task, hook_name: str) -> None:
+  """Refuses an extra hook that a world of this package never calls.
+
+  Raises:
+    SpecError: If the hook is one of those.
+  """
+  if hook_name in _UNUSED:
+    allowed = [
+        name for name in composer_environment.HOOK_NAMES if name not in _UNUSED
+    ]
+    raise errors.SpecError(
+        f'add_extra_hook: {hook_name!r} is never called in'
+        f' {type(task).__name__}, which compiles once and has no Python in'
+        f' substeps; allowed are {allowed}'
+    )
+
+
+def refuse_in_substeps(task: base.Task) -> None:
+  """Refuses a world whose task or entities have hooks in substeps.
+
+  Raises:
+    SpecError: If there is such a hook.
+  """
+  parts = [(task, composer.Task)]
+  parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
+  for part, kind in parts:
+    for hook in ('before_substep', 'after_substep'):
+      if getattr(type(part), hook) is not getattr(kind, hook):
+        raise errors.SpecError(
+            f'{type(part).__name__}.{hook}: worlds of this package have no'
+            ' hooks in substeps; use latch_events'
+        )
+
+
+def refuse_in_batch(task: base.Task, has_extra_hooks: bool) -> None:
+  """Refuses a world with step hooks besides those of its task.
+
+  Args:
+    task: The world.
+    has_extra_hooks: True if hooks were added to its environment.
+
+  Raises:
+    SpecError: If there are such hooks: a batch would not call them.
+  """
+  if has_extra_hooks:
+    raise errors.SpecError(
+        'add_extra_hook: a batch never calls extra hooks; allowed is an'
+        ' environment without them'
+    )
+  for entity in task.root_entity.iter_entities():
+    for hook in ('before_step', 'after_step'):
+      if getattr(type(entity), hook) is not getattr(composer.Entity, hook):
+        raise errors.SpecError(
+            f'{type(entity).__name__}.{hook}: a batch calls the hooks of the'
+            ' task only'
+        )
