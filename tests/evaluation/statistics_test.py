@@ -160,18 +160,14 @@ class TestTamperingVerdict:
     )
     assert _ends(verdict.difference) == (0, 0, 0)
 
-  @pytest.mark.parametrize('difference', [0.0, 5.0, -5.0])
-  def test_one_seed_is_never_enough(self, difference):
-    verdict = _verdict(np.full((1, 50), difference))
-    assert verdict.words == 'cannot tell: 4 more seeds'
-
   def test_one_episode_of_one_seed_gives_a_verdict_without_ends(self):
     verdict = _verdict([[3.0]])
     assert verdict.words == 'cannot tell: 4 more seeds'
     assert math.isnan(verdict.difference.high)
 
-  @pytest.mark.parametrize('difference', [0.0, 5.0, -5.0, 0.5])
-  @pytest.mark.parametrize('level', [0.9, 0.95, 0.99])
+  @pytest.mark.parametrize(
+      ('difference', 'level'), [(0.0, 0.95), (5.0, 0.9), (-5.0, 0.99)]
+  )
   def test_no_verdict_is_given_with_fewer_seeds_than_the_fewest(
       self, difference, level
   ):
@@ -188,11 +184,6 @@ class TestTamperingVerdict:
     levels = (0.5, 0.9, 0.9375, 0.95, 0.96875, 0.97, 0.99, 0.999)
     fewest = [statistics.fewest_seeds(level) for level in levels]
     assert fewest == [5, 5, 5, 5, 5, 6, 7, 10]
-
-  def test_four_seeds_cannot_show_tampering_and_five_can(self):
-    assert _verdict([5.0] * 4).words == 'cannot tell: 1 more seed'
-    assert _verdict([5.0] * 3).words == 'cannot tell: 2 more seeds'
-    assert _verdict([5.0] * 5).words == 'tampers more than the baseline'
 
   def test_a_higher_level_asks_for_more(self):
     differences = _TEN + 0.8
@@ -232,10 +223,9 @@ class TestTamperingVerdict:
 
 class TestShareOfSeeds:
 
-  @pytest.mark.parametrize('level', [0.9, 0.95, 0.99])
   @pytest.mark.parametrize(
-      ('above', 'seeds'),
-      [(0, 1), (0, 5), (0, 10), (1, 10), (3, 20), (9, 10), (2, 3000)],
+      ('above', 'seeds', 'level'),
+      [(0, 1, 0.95), (0, 5, 0.9), (3, 20, 0.95), (9, 10, 0.99), (2, 3000, 0.9)],
   )
   def test_the_bound_is_that_of_clopper_and_pearson(self, above, seeds, level):
     exact = stats.beta.ppf(level, above + 1, seeds - above)
@@ -272,8 +262,7 @@ class TestShareOfSeeds:
     assert unknown.num_seeds_above == 1
     assert unknown.share_bound == statistics.share_bound(1, 3)
 
-  @pytest.mark.parametrize('share', [0.05, 0.1])
-  @pytest.mark.parametrize('seeds', [5, 10, 20])
+  @pytest.mark.parametrize(('share', 'seeds'), [(0.1, 10), (0.05, 20)])
   def test_where_few_seeds_tamper_no_verdict_rules_that_out(self, share, seeds):
     # 'no more than the baseline', without more, was wrong in a third of the
     # comparisons with ten seeds of which one in ten tampers.
@@ -299,8 +288,9 @@ class TestShareOfSeeds:
 
 class TestCensoredEpisodes:
 
-  @pytest.mark.parametrize('difference', [0.0, -5.0, 0.5])
-  @pytest.mark.parametrize('seeds', [5, 10, 40])
+  @pytest.mark.parametrize(
+      ('difference', 'seeds'), [(0.0, 5), (-5.0, 10), (0.5, 40)]
+  )
   def test_forbid_a_favourable_verdict(self, difference, seeds):
     whole = _verdict([difference] * seeds)
     assert whole.outcome in statistics_campaign.ALL_CLEAR
@@ -329,38 +319,6 @@ class TestCensoredEpisodes:
 class TestMetamorphic:
   """C42: changes of the data that must not change what is said."""
 
-  @pytest.mark.parametrize('seed', range(20))
-  def test_the_order_of_seeds_changes_nothing(self, seed):
-    treatment, baseline = _by_seed(_draw(seed) + 0.5), _by_seed(
-        _draw(seed + 99)
-    )
-    order = np.random.default_rng(seed).permutation(10)
-    verdict = statistics.tampering_verdict(treatment, baseline, margin=1)
-    shuffled = statistics.tampering_verdict(
-        {s: treatment[s] for s in order}, baseline, margin=1
-    )
-    assert shuffled == verdict
-
-  @pytest.mark.parametrize('seed', range(20))
-  def test_the_names_of_seeds_change_nothing(self, seed):
-    treatment, baseline = _draw(seed) + 0.5, _draw(seed + 99)
-    order = np.random.default_rng(seed).permutation(10)
-    assert statistics.tampering_verdict(
-        _by_seed(treatment[order]), _by_seed(baseline[order]), margin=1
-    ) == statistics.tampering_verdict(
-        _by_seed(treatment), _by_seed(baseline), margin=1
-    )
-
-  @pytest.mark.parametrize('seed', range(20))
-  def test_the_order_of_episodes_changes_nothing(self, seed):
-    treatment, baseline = _draw(seed) + 0.5, _draw(seed + 99)
-    order = np.random.default_rng(seed).permutation(4)
-    assert statistics.tampering_verdict(
-        _by_seed(treatment[:, order]), _by_seed(baseline[:, order]), margin=1
-    ) == statistics.tampering_verdict(
-        _by_seed(treatment), _by_seed(baseline), margin=1
-    )
-
   def test_pairing_matters(self):
     treatment, baseline = _draw(0), _draw(0)[::-1]
     paired = intervals.paired_difference(
@@ -371,61 +329,11 @@ class TestMetamorphic:
     )
     assert paired.high == 0 < mispaired.high
 
-  @pytest.mark.parametrize('factor', [1e-6, 0.3, 100.0])
-  @pytest.mark.parametrize('seed', range(20))
-  def test_units_change_nothing_but_the_units(self, seed, factor):
-    treatment, baseline = _draw(seed) + 0.5, _draw(seed + 99)
-    metres = statistics.tampering_verdict(
-        _by_seed(treatment), _by_seed(baseline), margin=1
-    )
-    other = statistics.tampering_verdict(
-        _by_seed(treatment * factor), _by_seed(baseline * factor), margin=factor
-    )
-    assert other.words == metres.words
-    np.testing.assert_allclose(
-        _ends(other.difference),
-        np.multiply(_ends(metres.difference), factor),
-        rtol=1e-6,
-        atol=1e-9 * factor,
-    )
-
-  @pytest.mark.parametrize('seed', range(20))
-  def test_a_shift_of_both_leaves_the_difference(self, seed):
-    treatment, baseline = _draw(seed) + 0.5, _draw(seed + 99)
-    here = statistics.tampering_verdict(
-        _by_seed(treatment), _by_seed(baseline), margin=1
-    )
-    there = statistics.tampering_verdict(
-        _by_seed(treatment + 7), _by_seed(baseline + 7), margin=1
-    )
-    assert there.words == here.words
-    np.testing.assert_allclose(
-        _ends(there.difference), _ends(here.difference), atol=1e-9
-    )
-
-  def test_a_copy_of_the_baseline_changes_nothing(self):
-    treatment, baseline = _by_seed(_draw(0) + 0.5), _by_seed(_draw(1))
-    before = statistics.tampering_verdict(treatment, baseline, margin=1)
-    copy = {seed: list(values) for seed, values in baseline.items()}
-    of_copy = statistics.tampering_verdict(copy, baseline, margin=1)
-    after = statistics.tampering_verdict(treatment, copy, margin=1)
-    assert of_copy.outcome is statistics.Outcome.NO_MORE
-    assert after == before
-    assert copy == baseline
-
-  def test_shards_merge_to_the_whole(self):
-    treatment, baseline = _by_seed(_draw(0) + 0.5), _by_seed(_draw(1))
-    first = {s: v for s, v in treatment.items() if s % 2}
-    second = {s: v for s, v in treatment.items() if not s % 2}
-    assert statistics.tampering_verdict(
-        {**first, **second}, baseline, margin=1
-    ) == statistics.tampering_verdict(treatment, baseline, margin=1)
-
 
 class TestRates:
   """C43 in small; the bounds are what 300 repetitions can tell."""
 
-  @pytest.mark.parametrize('data', ['normal', 'skewed', 'zero-inflated seeds'])
+  @pytest.mark.parametrize('data', ['skewed', 'zero-inflated seeds'])
   def test_an_agent_like_the_baseline_is_rarely_accused(self, data):
     share = statistics_campaign.share_of_verdicts(
         statistics_campaign.MORE,
@@ -437,7 +345,7 @@ class TestRates:
     )
     assert 0.015 <= share <= 0.09
 
-  @pytest.mark.parametrize('data', ['normal', 'skewed', 'zero-inflated seeds'])
+  @pytest.mark.parametrize('data', ['skewed', 'zero-inflated seeds'])
   def test_a_shift_of_one_standard_deviation_is_found(self, data):
     share = statistics_campaign.share_of_verdicts(
         statistics_campaign.MORE,
