@@ -4,7 +4,6 @@ from collections.abc import Iterator
 import contextlib
 import pathlib
 import pickle
-import shutil
 import sys
 from typing import Any
 
@@ -13,12 +12,8 @@ from hypothesis import strategies as st
 import pytest
 
 from realab_suite import errors
-from realab_suite.experiments import scheduler
-from realab_suite.experiments import storage
-from realab_suite.reports import sweep_results
 from tests import damage
 from tests import examples
-from tests.experiments import fake_sweep
 from tests.experiments import file_kinds
 
 # Audit events of a pickle that is read, and of a command that one may run.
@@ -99,47 +94,3 @@ def test_reading_a_pickle_is_heard():
   with _listening():
     pickle.loads(pickle.dumps(pathlib.PurePath('x')))
   assert 'pickle.find_class' in _HEARD
-
-
-@pytest.fixture(scope='module')
-def built(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-  folder = tmp_path_factory.mktemp('built')
-  return fake_sweep.build(folder, fake_sweep.experiment(seeds=[0]))
-
-
-@pytest.fixture
-def sweep(built: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
-  return pathlib.Path(shutil.copytree(built, tmp_path / 'sweep'))
-
-
-def _edit(path: pathlib.Path, old: str, new: str) -> None:
-  text = path.read_text(encoding='utf-8')
-  assert old in text
-  path.write_text(text.replace(old, new, 1), encoding='utf-8')
-
-
-def test_a_changed_description_of_a_sweep_is_refused(sweep: pathlib.Path):
-  _edit(sweep / scheduler.SWEEP, '"calibration": false', '"calibration": true')
-  with pytest.raises(errors.ResultsError, match='its checksum does not agree'):
-    sweep_results.load(sweep)
-
-
-def test_a_changed_experiment_of_a_sweep_is_refused(sweep: pathlib.Path):
-  _edit(sweep / scheduler.EXPERIMENT, '250', '251')
-  with pytest.raises(errors.ResultsError, match='when the sweep began'):
-    sweep_results.load(sweep)
-
-
-def test_a_changed_configuration_of_a_run_is_refused(sweep: pathlib.Path):
-  folder, *_ = sorted(p for p in sweep.iterdir() if (p / 'done.json').exists())
-  _edit(folder / storage.CONFIG, '"max_steps": 250', '"max_steps": 251')
-  with pytest.raises(errors.ResultsError, match='is named after'):
-    sweep_results.load(sweep)
-
-
-def test_a_job_of_a_sweep_is_a_folder_beside_its_file(sweep: pathlib.Path):
-  content: Any = scheduler.read_description(sweep)
-  content['jobs'][0]['folder'] = '../elsewhere'
-  storage.write_sealed(sweep / scheduler.SWEEP, content)
-  with pytest.raises(errors.ResultsError, match=r'jobs\.0\.folder'):
-    sweep_results.load(sweep)

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from realab_suite import errors
-from realab_suite import suite
 from realab_suite.experiments import engines
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
@@ -93,7 +92,6 @@ def _job(run: str) -> jobs.Job:
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setattr(scheduler, '_POLL_SECONDS', 0.0)
-  monkeypatch.setattr(suite, 'dynamics', functools.cache(suite.dynamics))
 
 
 @pytest.fixture(scope='module', name='built')
@@ -190,3 +188,36 @@ def test_what_says_when_things_happened_is_not_guarded(folder):
   )
   assert not _sweep(folder).commands
   _report(folder)
+
+
+def _edit(path: pathlib.Path, old: str, new: str) -> None:
+  text = path.read_text(encoding='utf-8')
+  assert old in text
+  path.write_text(text.replace(old, new, 1), encoding='utf-8')
+
+
+def test_a_changed_description_of_a_sweep_is_refused(folder):
+  _edit(folder / scheduler.SWEEP, '"calibration": false', '"calibration": true')
+  with pytest.raises(errors.ResultsError, match='its checksum does not agree'):
+    _report(folder)
+
+
+def test_a_changed_experiment_of_a_sweep_is_refused(folder):
+  _edit(folder / scheduler.EXPERIMENT, '250', '251')
+  with pytest.raises(errors.ResultsError, match='when the sweep began'):
+    _report(folder)
+
+
+def test_a_changed_configuration_of_a_run_is_refused(folder):
+  config = _job_folder(folder) / storage.CONFIG
+  _edit(config, '"max_steps": 250', '"max_steps": 251')
+  with pytest.raises(errors.ResultsError, match='is named after'):
+    _report(folder)
+
+
+def test_a_job_of_a_sweep_is_a_folder_beside_its_file(folder):
+  content: Any = scheduler.read_description(folder)
+  content['jobs'][0]['folder'] = '../elsewhere'
+  storage.write_sealed(folder / scheduler.SWEEP, content)
+  with pytest.raises(errors.ResultsError, match=r'jobs\.0\.folder'):
+    _report(folder)

@@ -3,6 +3,7 @@ import importlib
 import os
 import pathlib
 import re
+import runpy
 import subprocess
 import sys
 import types
@@ -28,6 +29,7 @@ from realab_suite.launchers.flags import output_flag
 from realab_suite.launchers.flags import seed_flag
 from tests import patience
 from tests.experiments import small
+from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]
 _EXPERIMENT = {
@@ -68,10 +70,10 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
   assert {path.name for path in (output / 'plots').iterdir()} == {
       'trajectories.png', 'time_line.png',
   }  # fmt: skip
-  again = _run('--policies=no_op', '--novideos', f'--output={output}')
-  assert again.returncode == 2
-  assert 'not empty' in again.stderr
-  assert len(again.stderr.splitlines()) == 1
+  again = in_process.complaint(
+      compare, '--policies=no_op', '--novideos', f'--output={output}'
+  )
+  assert 'not empty' in again
   assert small.rows(output) == rows
 
 
@@ -88,12 +90,7 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_command_is_said_in_one_line(arguments, complaint):
-  ran = _run(*arguments)
-  assert ran.returncode == 2
-  assert ran.stdout == ''
-  [line] = ran.stderr.splitlines()
-  assert line.startswith('error: ')
-  assert complaint in line
+  assert complaint in in_process.complaint(compare, *arguments)
 
 
 @pytest.mark.parametrize(
@@ -108,10 +105,9 @@ def test_what_is_wrong_with_a_command_is_said_in_one_line(arguments, complaint):
     ],
 )
 def test_a_command_that_has_moved_names_its_successor(old, new):
-  ran = _run('--output=results', module=f'realab_suite.{old}')
-  assert ran.returncode == 1
-  [line] = ran.stderr.splitlines()
-  assert line.startswith('error: ')
+  with pytest.raises(SystemExit, match=r'\Aerror: .*\Z') as raised:
+    runpy.run_module(f'realab_suite.{old}', run_name='__main__')
+  line = str(raised.value)
   for name in new:
     assert f'python -m realab_suite.launchers.{name}' in line
     importlib.import_module(f'realab_suite.launchers.{name}')
@@ -128,9 +124,8 @@ def test_seeds_are_a_count_or_a_list(text, seeds):
 @pytest.mark.parametrize(
     'text',
     [
-        '0', '-1', '10001', '2000000000', '9' * 5000, '1.0', '1e3', '0x3',
-        '٣', '+3', '1_0', 'inf', '', ' ', ',', ',,', '-1,', '2147483648,',
-        '1,' + '9' * 5000, '3,a', '3;4', '3 4', '3,٣', '3,4.0', 'None',
+        '0', '-1', '10001', '9' * 5000, '1.0', '٣', '+3', '1_0', '', ',',
+        '2147483648,', '3,a', '3 4', '3,٣',
     ],
 )  # fmt: skip
 def test_seeds_that_are_none_are_refused_in_one_line(text):
@@ -163,9 +158,8 @@ def test_a_seed_given_twice_is_refused(tmp_path):
     'argument',
     [
         '--seed=-1', '--seed=2147483648', '--seed=1e3', '--seed=',
-        '--seed=' + '9' * 5000, '--episodes=0', '--episodes=-3',
-        '--episodes=1000001', '--episodes=' + '9' * 400, '--workers=0',
-        '--max_steps=', '--max_steps=many', '--parent=x',
+        '--episodes=0', '--episodes=' + '9' * 400, '--workers=0',
+        '--max_steps=many', '--parent=x',
     ],
 )  # fmt: skip
 def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
@@ -176,9 +170,7 @@ def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
     flags.FLAGS(['program', argument])
 
 
-@pytest.mark.parametrize(
-    'name', ['', '.', '.mine', 'a..b', 'a b', 'a/b', 'a.py:b', '1a', 'a-b']
-)
+@pytest.mark.parametrize('name', ['', '.mine', 'a..b', 'a b', 'a/b', '1a'])
 def test_what_is_no_name_of_a_module_is_not_imported(name):
   with flagsaver.flagsaver():
     flags.FLAGS(['program', f'--import={name}'])
@@ -188,10 +180,7 @@ def test_what_is_no_name_of_a_module_is_not_imported(name):
 
 @pytest.mark.parametrize(
     ('flag', 'values'),
-    [
-        (output_flag.OUTPUT, ['', None]),
-        (learning_flags.EXPERIMENT, ['', None]),
-    ],
+    [(output_flag.OUTPUT, ['', None]), (learning_flags.EXPERIMENT, ['', None])],
 )
 def test_an_empty_flag_is_a_missing_one(flag, values):
   for value in values:
@@ -261,12 +250,13 @@ def test_where_nothing_renders_exploring_ends_with_one_line(tmp_path):
   assert 'neither a window nor a film' in ran.stderr
 
 
-@pytest.mark.camera
+@pytest.mark.usefixtures('egl')
 def test_exploring_without_a_display_makes_a_film(tmp_path):
   film = tmp_path / 'film.mp4'
   ran = _run(
       '--domain=collect_apples', '--policy=no_op', '--max_steps=8',
       f'--video={film}', module='realab_suite.launchers.explore',
+      MUJOCO_GL='egl',
   )  # fmt: skip
   assert ran.returncode == 0, ran.stderr
   assert ran.stdout == f'The film is {film}\n'
