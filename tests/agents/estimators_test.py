@@ -46,12 +46,7 @@ def _batch(**columns: list) -> dict[str, np.ndarray]:
             [0.0, -4.0, 0.0, -3.0],
         ),
         # It was cut off there: the value of what was seen last, 6, counts.
-        (
-            {
-                'is_valid': [True, True, False, True],
-            },
-            [0.75, -1.0, 0.0, -3.0],
-        ),
+        ({'is_valid': [True, True, False, True]}, [0.75, -1.0, 0.0, -3.0]),
         # Somebody began anew in the middle: the second action came to nothing.
         ({'is_valid': [True, False, True, True]}, [1.0, 0.0, -0.75, -3.0]),
     ],
@@ -67,10 +62,7 @@ def test_feedback_is_scaled_by_the_deviation_of_its_discounted_sum():
   scale = training.FeedbackScale(num_envs=1, gamma=0.5)
   assert scale.value == 1.0
   scale.update(
-      _batch(
-          reading=[4.0, 2.0, 7.0, 1.0],
-          is_valid=[True, True, False, True],
-      )
+      _batch(reading=[4.0, 2.0, 7.0, 1.0], is_valid=[True, True, False, True])
   )
   # The sums are 4, 4 and, in the next episode, 1.
   assert scale.value == pytest.approx(np.std([4.0, 4.0, 1.0]), rel=1e-3)
