@@ -83,11 +83,6 @@ def test_what_is_not_for_agents_is_denied(payload, is_running, port):
   assert _ask(port, **payload).error.code == _DENIED
 
 
-def test_an_agent_chooses_no_settings_when_it_joins(port):
-  join = pb.JoinWorldRequest(world_name='world', settings={'seed': _TENSOR})
-  assert _ask(port, join_world=join).error.code == _DENIED
-
-
 def test_there_is_one_world(port):
   join = pb.JoinWorldRequest(world_name='another')
   assert _ask(port, join_world=join).error.code == _INVALID
