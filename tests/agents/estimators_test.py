@@ -51,7 +51,7 @@ def _batch(**columns: list) -> dict[str, np.ndarray]:
         ({'is_valid': [True, False, True, True]}, [1.0, 0.0, -0.75, -3.0]),
     ],
 )
-def test_advantages_are_those_worked_by_hand(columns, expected):
+def test_advantages_equal_those_worked_out_by_hand(columns, expected):
   values = np.array([[2.0], [4.0], [6.0], [8.0], [2.0]])
   batch = _batch(reading=[1.0, 0.0, 2.0, 4.0], **columns)
   got = training.advantages(batch, values[:-1], values[1:], 0.5, 0.5)
@@ -124,7 +124,7 @@ _settings = hypothesis.settings(max_examples=15, deadline=None)
 @pytest.mark.parametrize('queries', [1, 2])
 @_any_case
 @_settings
-def test_what_actions_do_to_the_register_is_nothing_to_decoupled_approval(
+def test_corruption_by_actions_does_not_bias_decoupled_approval(
     queries, logits, approvals, corruption
 ):
   approvals, corruption = np.array(approvals), np.array(corruption)
@@ -140,7 +140,7 @@ def test_what_actions_do_to_the_register_is_nothing_to_decoupled_approval(
 
 @_any_case
 @_settings
-def test_what_actions_do_to_the_register_is_reward_to_coupled_approval(
+def test_corruption_by_actions_biases_coupled_approval(
     logits, approvals, corruption
 ):
   approvals, corruption = np.array(approvals), np.array(corruption)
@@ -151,7 +151,7 @@ def test_what_actions_do_to_the_register_is_reward_to_coupled_approval(
   np.testing.assert_allclose(corrupted - honest, bias, atol=2e-5)
 
 
-def test_a_coupled_update_is_led_astray():
+def test_corruption_redirects_a_coupled_update():
   corruption = np.array([0.0, 0.0, 0.0, 2.0])
   approvals = np.array([1.0, 0.0, 0.0, 0.0])
   flat = np.zeros(_ACTIONS)
@@ -168,7 +168,7 @@ def test_shared_randomness_is_refused():
       approval.refuse_shared_randomness(act, np.stack(queries))
 
 
-def test_sums_of_readings_stop_where_an_episode_does():
+def test_sums_of_readings_stop_at_the_end_of_an_episode():
   """Every third step of a world's life is looked at, by hand."""
   replay = {
       'observation': {'x': np.arange(8)[:, np.newaxis]},

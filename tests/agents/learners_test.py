@@ -220,7 +220,7 @@ def test_vectors_have_no_probabilities():
     learner.probabilities({'number': np.zeros((2, 1))})
 
 
-def test_an_actor_acts_in_one_world_and_learns_nothing():
+def test_an_actor_acts_in_one_world_without_learning():
   env = toys.Bandit(1)
   learner = _make(env, 'policy_gradient', reward='feedback')
   before = learner.state()
@@ -238,7 +238,7 @@ def test_an_actor_acts_in_one_world_and_learns_nothing():
   _assert_same(learner.state(), before)
 
 
-def test_the_decoupled_query_tells_nothing_of_the_action():
+def test_the_decoupled_query_is_independent_of_the_action():
   env = toys.Bandit(4000, _ACTIONS, queries=_PAIR)
   for other_query in (None, 'other'):
     learner = _make(
@@ -265,7 +265,7 @@ def test_the_coupled_query_is_the_action():
   np.testing.assert_array_equal(actions[:, 0], actions[:, 1])
 
 
-def test_a_query_that_a_learner_does_not_use_is_left_alone():
+def test_an_unused_query_is_zero():
   env = toys.Bandit(50, _ACTIONS, queries=_PAIR)
   learner = _make(env, 'policy_gradient', reward='feedback')
   actions = learner.step(env.reset())

@@ -13,7 +13,7 @@ from realab_suite.launchers import make_networks
 from tests.launchers import in_process
 
 
-def test_every_shipped_network_is_what_its_recipe_makes():
+def test_every_shipped_network_matches_its_recipe():
   assert tuple(network_training.RECIPES) == network_files.NETWORKS
   for name, recipe in network_training.RECIPES.items():
     header = network_files.load(name).header
@@ -23,7 +23,7 @@ def test_every_shipped_network_is_what_its_recipe_makes():
     assert list(header.hidden) == recipe.learner['hidden']
 
 
-def test_what_is_made_is_what_was_learned_and_can_be_loaded():
+def test_a_made_network_can_be_loaded():
   recipe = network_training.RECIPES['demonstrator_v1']
   recipe = dataclasses.replace(
       recipe,
@@ -48,7 +48,7 @@ def test_what_is_made_is_what_was_learned_and_can_be_loaded():
         (['--output=new', 'demonstrator_v1'], 'are no flags'),
     ],
 )
-def test_what_the_command_line_gets_wrong_is_told_in_a_line(
+def test_a_wrong_command_is_refused_in_one_line(
     tmp_path, monkeypatch, arguments, complaint
 ):
   monkeypatch.chdir(tmp_path)

@@ -158,17 +158,17 @@ _CASES = [
 
 
 @pytest.mark.parametrize(('setting', 'name'), _CASES)
-def test_no_setting_changes_what_is_learned(digests, name, setting):
+def test_no_setting_changes_a_learner(digests, name, setting):
   with _SETTINGS[setting]():
     assert _digest(name) == digests[name]
 
 
-def test_a_digest_tells_learners_apart(digests):
+def test_different_learners_have_different_digests(digests):
   assert len(set(digests.values())) == len(_LEARNERS)
   assert _digest('values') == digests['values']
 
 
-def test_the_settings_of_a_program_are_its_own_again():
+def test_settings_are_restored_after_each_call():
   env = toys.Bandit(_NUM_ENVS)
   _, spec = _LEARNERS['values']
   with jax.enable_x64(True), jax.default_prng_impl('rbg'):
@@ -183,7 +183,7 @@ def test_the_settings_of_a_program_are_its_own_again():
     assert jax.numpy.zeros(3).dtype == np.float64
 
 
-def test_variables_change_nothing_either(digests):
+def test_no_variable_changes_a_learner(digests):
   names = ['coupled']
   ran = subprocess.run(
       [sys.executable, '-m', 'tests.agents.settings_test', *names],
@@ -198,7 +198,7 @@ def test_variables_change_nothing_either(digests):
   assert json.loads(ran.stdout) == {name: digests[name] for name in names}
 
 
-def test_what_is_not_pinned_is_on_record():
+def test_settings_that_are_not_pinned_are_recorded():
   before = jax_settings.recorded()
   assert json.loads(json.dumps(before)) == before
   assert before['jax_device'].startswith(jax.devices()[0].platform)

@@ -144,7 +144,7 @@ def test_an_index_becomes_the_vector_of_its_action(continuous):
     assert action.tolist() == vector
 
 
-def test_a_world_with_other_elements_gets_them_in_its_own_order():
+def test_elements_are_in_the_order_of_the_world():
   task = helpers.PointTask()
   env = suite.embed(task, _design(action_set=None, queries={}))
   backwards = action_sets.ActionSet(
@@ -183,7 +183,7 @@ def test_queries_go_before_a_vector():
   env.close()
 
 
-def test_a_query_register_that_cannot_hold_every_index_gets_none():
+def test_an_index_outside_a_query_register_is_not_written():
   queries = {
       'small': _query('station_2', high=3),
       'large': _query('station_3'),
@@ -206,7 +206,7 @@ def test_a_query_register_that_cannot_hold_every_index_gets_none():
 
 
 @pytest.mark.parametrize('query_policy', [actors.TAKEN_ACTION, None])
-def test_the_action_that_is_taken_is_asked_about_by_default(query_policy):
+def test_the_default_query_is_the_action_taken(query_policy):
   env = _load(_design(query_policy))
   actions = np.array(_actions(policies.make('random'), env, 60))
   assert (actions[:, 0] == actions[:, 1]).all()
@@ -218,7 +218,7 @@ def test_the_action_that_is_taken_is_asked_about_by_default(query_policy):
     ('design', 'is_taken'),
     [('value_advice', True), ('decoupled_approval', False)],
 )
-def test_the_designs_that_ship_ask_as_they_say(design, is_taken):
+def test_shipped_designs_follow_their_query_policy(design, is_taken):
   env = _load(design)
   actions = np.array(_actions(policies.make('random'), env, 60))
   same = actions[:, 0] == actions[:, 1]
@@ -226,7 +226,7 @@ def test_the_designs_that_ship_ask_as_they_say(design, is_taken):
   env.close()
 
 
-def test_what_is_asked_about_does_not_depend_on_the_action(independent):
+def test_an_independent_query_does_not_depend_on_the_action(independent):
   asked = [
       np.array(_actions(policy, independent, 200))[:, 0].tolist()
       for policy in (_Always(0), _Always(13), policies.make('random'))
@@ -234,7 +234,7 @@ def test_what_is_asked_about_does_not_depend_on_the_action(independent):
   assert asked[0] == asked[1] == asked[2]
 
 
-def test_what_is_asked_about_tells_nothing_of_the_action(independent):
+def test_an_independent_query_carries_no_information_on_the_action(independent):
   actions = np.array(_actions(policies.make('random'), independent, 7_000))
   asked, done = actions.T
   pairs = Counter(zip(asked, done, strict=True))
@@ -256,7 +256,7 @@ def _asked(seed: int, episode: int) -> list[float]:
   return actions[:, 0].tolist()
 
 
-def test_what_is_asked_about_follows_from_the_seed_and_the_episode():
+def test_queries_are_determined_by_seed_and_episode():
   first = _asked(seed=7, episode=0)
   assert _asked(seed=7, episode=0) == first
   assert _asked(seed=8, episode=0) != first
@@ -264,7 +264,7 @@ def test_what_is_asked_about_follows_from_the_seed_and_the_episode():
 
 
 @pytest.mark.parametrize('query_policy', ['random', ['taken_action']])
-def test_another_way_of_asking_is_refused(query_policy):
+def test_an_unknown_query_policy_is_refused(query_policy):
   env = _load(_design(query_policy))
   with pytest.raises(errors.SpecError) as raised:
     actors.make(_Always(0), env)
@@ -279,7 +279,7 @@ def test_another_way_of_asking_is_refused(query_policy):
 # Whose actions they are.
 
 
-def test_a_policy_of_other_actions_than_the_design_s_is_refused(taken):
+def test_a_policy_with_another_action_set_is_refused(taken):
   other = dataclasses.replace(action_sets.DMLAB_LIKE, version=2)
   with pytest.raises(errors.SpecError) as raised:
     actors.make(_Always(0, other), taken)
@@ -288,7 +288,7 @@ def test_a_policy_of_other_actions_than_the_design_s_is_refused(taken):
   )
 
 
-def test_a_policy_of_the_same_name_but_another_table_is_refused(taken):
+def test_a_policy_with_another_table_of_actions_is_refused(taken):
   shorter = dataclasses.replace(
       action_sets.DMLAB_LIKE, actions=action_sets.DMLAB_LIKE.actions[:5]
   )
@@ -296,7 +296,7 @@ def test_a_policy_of_the_same_name_but_another_table_is_refused(taken):
     actors.make(_Always(0, shorter), taken)
 
 
-def test_a_policy_of_what_a_world_has_not_is_refused():
+def test_a_policy_that_sets_unknown_elements_is_refused():
   env = suite.embed(helpers.PointTask(), 'none')
   with pytest.raises(
       errors.SpecError, match=r"sets 'forward'; this world has \['push'\]"
@@ -308,7 +308,7 @@ def test_a_policy_of_what_a_world_has_not_is_refused():
 # What a policy is told.
 
 
-def test_a_policy_is_told_when_an_episode_begins(continuous):
+def test_a_policy_is_notified_of_the_start_of_an_episode(continuous):
   policy = _Always(0)
   actor = actors.make(policy, continuous)
   for episode, number in ((4, 3), (5, 2)):
@@ -334,7 +334,7 @@ def test_no_two_steps_have_the_same_key(continuous):
   assert [key for _, _, key, _ in again.told] == keys[40:60]
 
 
-def test_an_actor_that_was_not_told_of_an_episode_is_in_the_first_one(
+def test_an_actor_begins_in_episode_0(
     continuous,
 ):
   untold = actors.make(policies.make('random'), continuous)
@@ -364,7 +364,7 @@ def test_a_function_is_called_with_the_time_step_and_nothing_else(taken):
   assert all(time_step is _SEEN for time_step in seen)
 
 
-def test_a_policy_of_this_package_is_not_taken_for_a_function(taken):
+def test_a_callable_policy_is_treated_as_a_policy(taken):
   class _CallablePolicy(_Always):
 
     def __call__(self, time_step: dm_env.TimeStep) -> Any:

@@ -12,7 +12,7 @@ _LIMIT = {'max_steps': 20}
 
 
 @pytest.mark.parametrize('design', ['instantaneous_reward', 'value_advice'])
-def test_every_world_has_the_ledger_that_it_has_alone(design):
+def test_a_batch_ledger_equals_the_ledgers_of_its_worlds(design):
   batch = suite.load_batch(
       'unlock_door',
       'near',
@@ -72,7 +72,7 @@ def test_a_reset_in_mid_episode_abandons_every_episode():
 
 
 @pytest.mark.mujoco_warns('BADQVEL')
-def test_a_world_whose_physics_fail_has_an_invalid_episode():
+def test_divergence_makes_an_episode_invalid():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )
@@ -90,7 +90,7 @@ def test_a_world_whose_physics_fail_has_an_invalid_episode():
   batch.close()
 
 
-def test_the_ledger_of_a_world_takes_over_from_that_of_many_and_vice_versa():
+def test_snapshots_move_between_ledger_and_batch_ledger():
   single = suite.load('collect_apples', 'standard', {'random': 1}, {'world': 2})
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
@@ -145,7 +145,7 @@ def test_worlds_without_an_open_episode_have_no_state():
   batch.close()
 
 
-def test_another_sink_ends_the_episodes_under_way():
+def test_adding_a_sink_abandons_open_episodes():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )

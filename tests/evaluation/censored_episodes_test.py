@@ -29,7 +29,7 @@ def _failed(run: Sequence[episodes.Episode], *keys: tuple[int, int]) -> Any:
   ]
 
 
-def test_what_has_failed_is_counted_and_not_used():
+def test_failed_episodes_are_counted_and_not_used():
   ours = _failed(episodes.run(9.0, 0.25), (0, 0), (3, 1))
   summary = episodes.compare(ours, episodes.run())
   assert (summary.num_seeds, summary.num_episodes) == (10, 18)
@@ -40,7 +40,7 @@ def test_what_has_failed_is_counted_and_not_used():
   assert summary.verdict.difference.estimate == 0.25
 
 
-def test_what_has_failed_in_the_baseline_leaves_no_pair():
+def test_failed_baseline_episodes_are_left_out_of_pairs():
   ours = [
       dataclasses.replace(e, true_return=50.0) if e.episode == 0 else e
       for e in episodes.run()
@@ -53,7 +53,7 @@ def test_what_has_failed_in_the_baseline_leaves_no_pair():
   assert (summary.num_episodes, summary.num_failed) == (20, 0)
 
 
-def test_a_seed_without_an_episode_that_counts_is_no_seed():
+def test_a_seed_whose_episodes_all_failed_is_left_out():
   ours = _failed(episodes.run(4.0, 1.0), (0, 0), (0, 1))
   summary = episodes.compare(ours, episodes.run())
   assert (summary.num_seeds, summary.num_failed) == (9, 2)
@@ -61,7 +61,7 @@ def test_a_seed_without_an_episode_that_counts_is_no_seed():
 
 
 @pytest.mark.parametrize('who', ['ours', 'theirs'])
-def test_a_run_of_which_no_episode_counts_is_refused(who):
+def test_a_run_whose_episodes_all_failed_is_refused(who):
   runs = {
       'ours': episodes.run(seeds=[0, 1]),
       'theirs': episodes.run(seeds=[0, 1]),
@@ -80,7 +80,7 @@ def test_a_run_without_episodes_is_refused():
     episodes.compare([], episodes.run())
 
 
-def test_runs_of_which_no_pair_counts_are_refused():
+def test_runs_without_a_valid_pair_are_refused():
   ours = _failed(episodes.run(seeds=[0]), (0, 0))
   theirs = _failed(episodes.run(seeds=[0]), (0, 1))
   with pytest.raises(
@@ -162,7 +162,7 @@ def test_no_favourable_verdict_is_given_while_any_episode_is_censored(
   assert summary.reading == f'corruption: inconclusive ({censored})'
 
 
-def test_an_episode_given_up_before_the_first_read_hides_nothing():
+def test_episodes_without_corruption_do_not_hide_the_others():
   # Its corruption is unknown; that of the others is not.
   ours = _given_up(
       episodes.run(4.0, 1.0), (0, 0), (3, 1), corruption=episodes.NAN
@@ -204,7 +204,7 @@ def _returns(**by_seed: float) -> Callable[[int], float]:
   return lambda seed: by_seed.get(f'seed_{seed}', by_seed['rest'])
 
 
-def test_intervals_of_returns_are_possible():
+def test_intervals_of_returns_stay_in_bounds():
   good = _returns(rest=18.0, seed_4=6.0)
   ours = _with_top(episodes.run(good, seeds=range(5)), 18.0)
   theirs = _with_top(episodes.run(0.0, seeds=range(5)), 18.0)
@@ -237,7 +237,7 @@ def test_corruption_is_not_negative():
         (-1.0, [-3.0, -2.0], (None, None)),
     ],
 )
-def test_returns_are_bounded_as_far_as_is_known(top, returns, bounds):
+def test_returns_have_the_bounds_of_the_task(top, returns, bounds):
   run = [
       episodes.Episode(0, i, true_return=value, max_true_return=top)
       for i, value in enumerate(returns)
@@ -246,13 +246,13 @@ def test_returns_are_bounded_as_far_as_is_known(top, returns, bounds):
   assert comparison.compare({'run': run}, 'run')['run'].num_episodes == 2
 
 
-def test_rows_with_and_without_a_maximum_have_none_together():
+def test_one_row_without_a_maximum_removes_the_upper_bound():
   run = [episodes.Episode(0, 0, max_true_return=18.0), episodes.Episode(0, 1)]
   assert comparison.return_bounds(run) == (0.0, None)
   assert comparison.return_bounds(run[:1], [-0.5, 3.0]) == (None, 18.0)
 
 
-def test_failed_episodes_bound_nothing():
+def test_failed_episodes_do_not_affect_bounds():
   run = _failed([episodes.Episode(0, 0), episodes.Episode(0, 1)], (0, 1))
   assert comparison.return_bounds(_with_top(run, 18.0)) == (0.0, 18.0)
 
@@ -264,7 +264,7 @@ def test_failed_episodes_bound_nothing():
     ('ours', 'theirs'),
     [(episodes.NAN, episodes.NAN), (episodes.NAN, 0.0), (1.0, episodes.NAN)],
 )
-def test_without_corruption_there_are_returns_alone(ours, theirs):
+def test_runs_without_corruption_are_compared_by_returns(ours, theirs):
   summary = episodes.compare(
       episodes.run(4.0, ours), episodes.run(10.0, theirs)
   )
@@ -288,7 +288,7 @@ def test_a_run_without_registers_is_its_own_baseline():
 # C42: what must not matter.
 
 
-def test_an_episode_without_corruption_that_comes_twice_counts_once():
+def test_a_repeated_episode_without_corruption_counts_once():
   # As read from a file twice: no nan is the same object as another.
   runs = {
       'theirs': episodes.run(),
@@ -299,7 +299,7 @@ def test_an_episode_without_corruption_that_comes_twice_counts_once():
   assert (summary.num_episodes, summary.corruption) == (20, None)
 
 
-def test_an_episode_that_comes_twice_but_differs_is_refused():
+def test_conflicting_rows_of_an_episode_are_refused():
   # One of them is wrong, and nothing says which.
   ours = episodes.run(4.0, 1.0)
   ours.append(dataclasses.replace(ours[5], true_return=99.0))

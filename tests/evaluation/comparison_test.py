@@ -62,7 +62,7 @@ _LESS, _AS_MUCH, _UNKNOWN = 4.0, 10.0, episodes.noise(5.0, mean=10.0)
         ),
     ],
 )
-def test_returns_and_corruption_are_read_together(
+def test_the_reading_combines_returns_and_corruption(
     corruption, true_return, outcome, reading
 ):
   summary = episodes.compare(
@@ -74,7 +74,7 @@ def test_returns_and_corruption_are_read_together(
 
 
 @pytest.mark.parametrize('true_return', [_LESS, _AS_MUCH, _UNKNOWN])
-def test_without_a_verdict_the_reading_is_why(true_return):
+def test_the_reading_explains_a_missing_verdict(true_return):
   ours = episodes.run(true_return, episodes.noise(1.0, mean=1.0))
   summary = episodes.compare(ours, episodes.run(10.0, 1.0))
   more = summary.verdict.more_seeds
@@ -86,7 +86,7 @@ def test_without_a_verdict_the_reading_is_why(true_return):
 @pytest.mark.parametrize(
     'true_return', [10.0, 12.0, episodes.noise(1.0, mean=12.0)]
 )
-def test_as_much_or_more_true_return_is_no_loss(true_return):
+def test_equal_or_higher_return_is_not_a_loss(true_return):
   summary = episodes.compare(episodes.run(true_return), episodes.run())
   assert summary.true_return_gained.low >= 0
   assert summary.reading == (
@@ -94,7 +94,7 @@ def test_as_much_or_more_true_return_is_no_loss(true_return):
   )
 
 
-def test_a_loss_has_to_be_beyond_doubt():
+def test_an_uncertain_loss_is_inconclusive():
   doubtful = episodes.compare(
       episodes.run(episodes.noise(1.0, mean=9.8), 1.0), episodes.run()
   )
@@ -107,7 +107,7 @@ def test_a_loss_has_to_be_beyond_doubt():
   assert certain.reading.endswith('it tampers')
 
 
-def test_less_corruption_than_the_baseline_is_no_more():
+def test_less_corruption_gives_the_outcome_no_more():
   summary = episodes.compare(episodes.run(10.0, 0.0), episodes.run(10.0, 1.0))
   assert summary.verdict.outcome is _NO_MORE
   assert summary.verdict.difference.estimate == -1.0
@@ -140,7 +140,7 @@ def test_a_run_is_not_compared_with_itself():
   assert (theirs.num_given_up, theirs.num_failed) == (0, 0)
 
 
-def test_a_run_that_is_the_baseline_by_another_name_is_no_worse():
+def test_a_copy_of_the_baseline_does_not_differ_from_it():
   summary = episodes.compare(
       episodes.run(3.0, episodes.noise(0.5, 1.0)),
       episodes.run(3.0, episodes.noise(0.5, 1.0)),
@@ -149,7 +149,7 @@ def test_a_run_that_is_the_baseline_by_another_name_is_no_worse():
   assert summary.verdict.outcome is _NO_MORE
 
 
-def test_a_baseline_that_is_no_run_is_refused():
+def test_an_unknown_baseline_is_refused():
   with pytest.raises(errors.ResultsError) as raised:
     comparison.compare({'b': episodes.run(), 'a': episodes.run()}, 'c')
   assert str(raised.value) == "baseline 'c' is no run; allowed are ['a', 'b']"
@@ -158,7 +158,7 @@ def test_a_baseline_that_is_no_run_is_refused():
 # Pairs.
 
 
-def test_differences_are_taken_between_episodes_of_the_same_number():
+def test_differences_pair_episodes_by_number():
   # Episodes differ far more from each other than the two runs do.
   theirs = [
       dataclasses.replace(e, true_return=100.0 * e.episode + e.seed)
@@ -217,7 +217,7 @@ def test_a_difference_within_the_margin_does_not_matter():
   assert lenient.verdict.outcome is _NO_MORE
 
 
-def test_five_seeds_tell_at_95_percent_and_not_at_99():
+def test_five_seeds_suffice_at_95_percent_and_not_at_99():
   seeds = range(5)
   ours, theirs = episodes.run(4.0, 1.0, seeds=seeds), episodes.run(seeds=seeds)
   assert episodes.compare(ours, theirs).verdict.outcome is _MORE
@@ -258,5 +258,5 @@ def test_figures_are_means_over_seeds_of_their_own_kind():
     ('scales', 'margin'),
     [([], 0.05), ([0.1, 0.1], 0.05), ([0.1, 0.01], 0.005), ([0.3], 0.15)],
 )
-def test_what_matters_is_half_a_unit_of_the_finest_register(scales, margin):
+def test_the_margin_is_half_a_unit_of_the_finest_register(scales, margin):
   assert comparison.margin_of(scales) == pytest.approx(margin)

@@ -140,7 +140,7 @@ def test_rows_and_tables_count_episodes_that_are_given_up(runs, tmp_path):
   assert table[0].summary.verdict == direct.verdict
 
 
-def test_a_policy_that_resets_its_world_is_judged_by_what_it_did():
+def test_a_reset_by_the_policy_keeps_the_corruption_so_far():
   # It holds the environment, and begins another episode in the middle.
   with _world(0) as env:
     saboteur = _saboteur(env)
@@ -167,7 +167,7 @@ def test_a_policy_that_resets_its_world_is_judged_by_what_it_did():
   assert seen == [alone]
 
 
-def test_an_actor_that_resets_its_batch_is_judged_by_what_it_did():
+def test_a_reset_by_an_actor_of_a_batch_gives_up_the_episodes():
   batch = suite.load_batch(
       'unlock_door', 'near', {'random': 0}, {'max_steps': 12}, num_envs=2,
       design='instantaneous_reward',
@@ -202,7 +202,7 @@ def test_an_actor_that_resets_its_batch_is_judged_by_what_it_did():
         (events.End.ERROR, False, False),
     ],
 )
-def test_every_end_is_whole_or_given_up_or_failed(end, is_valid, is_given_up):
+def test_every_end_is_valid_given_up_or_failed(end, is_valid, is_given_up):
   assert endings.is_valid(end, 3.0) is is_valid
   assert endings.is_given_up(end, 3.0) is is_given_up
   for unknown in (math.nan, math.inf, -math.inf):
@@ -210,14 +210,14 @@ def test_every_end_is_whole_or_given_up_or_failed(end, is_valid, is_given_up):
     assert endings.is_given_up(end, unknown) is False
 
 
-def test_there_is_no_other_end():
+def test_these_are_all_the_ends():
   ends = {events.End(value) for value in (
       'terminated', 'timeout', 'abandoned', 'disconnect', 'divergence', 'error',
   )}  # fmt: skip
   assert set(events.End) == ends
 
 
-def test_tasks_of_others_name_no_largest_return():
+def test_foreign_tasks_have_no_largest_return():
   env = suite.embed(helpers.PointTask(), 'none', random=7, max_steps=3)
   with contextlib.closing(env):
     [result] = evaluate.evaluate(env, lambda time_step: helpers.no_op(env), 1)

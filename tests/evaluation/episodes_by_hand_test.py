@@ -233,7 +233,7 @@ def _play(scenario: _Scenario) -> evaluate.EpisodeResult:
 
 
 @pytest.mark.parametrize('name', _SCENARIOS)
-def test_an_episode_comes_out_as_worked_out_by_hand(name):
+def test_an_episode_has_the_figures_worked_out_by_hand(name):
   scenario = _SCENARIOS[name]
   result = _play(scenario)
   assert result.is_valid
@@ -260,7 +260,7 @@ def test_the_corruption_of_an_episode_is_the_mean_over_registers_in_metres():
   assert result.corruption == pytest.approx(4 / 3 * 0.05 / 2)
 
 
-def test_the_observed_return_is_read_off_every_feedback_register_alone():
+def test_the_observed_return_sums_feedback_registers_only():
   reward = {'kind': 'two_block', 'role': 'feedback', 'range': [-2, 12]}
   signal = {**reward, 'role': 'signal', 'place': [-3, -3]}
   bonus = {**reward, 'place': [2, -3], 'initial': 1}

@@ -36,7 +36,7 @@ def _evaluate_batch(design, policy, **limit):
         ('decoupled_approval', 'random'),
     ],
 )
-def test_every_world_has_the_result_that_it_has_alone(design, policy):
+def test_a_world_of_a_batch_has_the_result_of_a_single_world(design, policy):
   results = _evaluate_batch(design, policy)
   assert [result.world for result in results] == list(range(_NUM_ENVS))
   for world, result in enumerate(results):
@@ -60,7 +60,7 @@ def test_a_world_that_ends_early_is_judged_by_its_first_episode():
   assert all(sum(result.facts.values()) > 0 for result in results)
 
 
-def test_facts_are_those_of_the_first_episode_though_there_are_two(monkeypatch):
+def test_facts_are_taken_from_the_first_of_two_episodes(monkeypatch):
   looks = []
 
   def look(batch):

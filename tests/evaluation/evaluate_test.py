@@ -18,7 +18,7 @@ from tests.evaluation import rooms
 # What is counted.
 
 
-def test_a_result_says_which_episode_it_is_and_what_it_took():
+def test_a_result_holds_the_episode_and_its_counts():
   env = rooms.load(design='decoupled_approval', max_steps=5)
   results = evaluate.evaluate(env, rooms.still(env), 3, first_episode=4)
   assert [result.episode for result in results] == [4, 5, 6]
@@ -49,7 +49,7 @@ def test_every_provider_and_every_query_is_counted():
   assert result.num_substeps == 4 * 5  # Of 10 ms, in steps of 50 ms.
 
 
-def test_the_facts_are_those_of_the_end_of_each_episode():
+def test_facts_are_taken_at_the_end_of_each_episode():
   env = rooms.load('collect_apples', 'standard', max_steps=120)
   [one] = evaluate.evaluate(env, policies.make('apple_seeker'), 1)
   busy = evaluate.evaluate(env, policies.make('apple_seeker'), 2)
@@ -63,7 +63,7 @@ def test_the_facts_are_those_of_the_end_of_each_episode():
   assert busy[0].facts != idle[0].facts
 
 
-def test_a_world_of_somebody_else_has_no_facts():
+def test_a_foreign_task_has_no_facts():
   env = suite.embed(helpers.PointTask(), 'none', max_steps=2)
   [result] = evaluate.evaluate(env, rooms.still(env), 1)
   env.close()
@@ -71,7 +71,7 @@ def test_a_world_of_somebody_else_has_no_facts():
   assert result.facts == {}
 
 
-def test_without_registers_there_is_no_corruption_to_speak_of():
+def test_corruption_is_nan_without_registers():
   env = rooms.load(design='none', max_steps=3)
   [result] = evaluate.evaluate(env, rooms.still(env), 1)
   env.close()
@@ -81,7 +81,7 @@ def test_without_registers_there_is_no_corruption_to_speak_of():
   assert result.num_provider_calls == 0
 
 
-def test_an_episode_that_the_task_ends_is_valid_and_counts_the_last_reward():
+def test_a_terminated_episode_is_valid_and_counts_the_last_reward():
   task = helpers.PointTask()
   env = suite.embed(task, 'none', max_steps=9)
   asked: list[None] = []
@@ -100,7 +100,7 @@ def test_an_episode_that_the_task_ends_is_valid_and_counts_the_last_reward():
 
 
 @pytest.mark.parametrize('number', [0, -1])
-def test_there_has_to_be_an_episode(number):
+def test_fewer_than_one_episode_is_refused(number):
   env = rooms.load(design='none')
   with pytest.raises(errors.ResultsError, match=f'num_episodes: {number}'):
     evaluate.evaluate(env, rooms.still(env), number)
@@ -150,7 +150,7 @@ class _Order(events.EventSink):
     self.heard.append(end.value)
 
 
-def test_each_result_is_told_of_before_the_next_episode_begins():
+def test_each_result_is_reported_before_the_next_episode():
   env = rooms.load(design='none', max_steps=1)
   heard: list[Any] = []
   results = evaluate.evaluate(
@@ -168,7 +168,7 @@ def _raise(result: Any) -> None:
 
 
 @pytest.mark.parametrize('who', ['policy', 'policy at once', 'on_episode'])
-def test_nobody_goes_on_listening_after_somebody_raised(who):
+def test_sinks_are_removed_after_an_exception(who):
   env = rooms.load(max_steps=4)
   outsider, guest = helpers.RecordingSink(), helpers.RecordingSink()
   env.add_sink(outsider)
@@ -191,7 +191,7 @@ def test_nobody_goes_on_listening_after_somebody_raised(who):
   twin.close()
 
 
-def test_nobody_goes_on_listening_after_the_last_episode():
+def test_sinks_are_removed_after_the_last_episode():
   env = rooms.load(max_steps=2)
   guest = helpers.RecordingSink()
   evaluate.evaluate(env, rooms.still(env), 1, sinks=[guest])
@@ -202,7 +202,7 @@ def test_nobody_goes_on_listening_after_the_last_episode():
   assert guest.ends == heard == [events.End.TIMEOUT]
 
 
-def test_a_provider_that_fails_ends_the_evaluation_and_nobody_listens():
+def test_sinks_are_removed_when_a_provider_fails():
   env = rooms.load()
 
   def act(time_step: dm_env.TimeStep) -> np.ndarray:
@@ -218,7 +218,7 @@ def test_a_provider_that_fails_ends_the_evaluation_and_nobody_listens():
   env.close()
 
 
-def test_a_policy_that_does_not_fit_is_refused_before_anybody_listens():
+def test_no_sink_is_added_for_a_policy_that_does_not_fit():
   env = suite.embed(helpers.PointTask(), 'none')
   with pytest.raises(errors.SpecError, match='this world has'):
     evaluate.evaluate(env, policies.make('random'), 1)
@@ -247,7 +247,7 @@ def test_an_episode_that_diverges_is_kept_and_flagged():
 
 
 @pytest.mark.mujoco_warns('BADQVEL')
-def test_an_episode_that_diverges_at_once_is_flagged_too():
+def test_divergence_in_the_first_step_is_flagged():
   env = rooms.load()
   [result] = evaluate.evaluate(env, rooms.diverging(env, 0, 0), 1)
   env.close()

@@ -100,11 +100,11 @@ def _assert_starts_do_not_depend_on_the_past(
 
 
 @pytest.mark.parametrize('world', _WORLDS)
-def test_an_episode_begins_the_same_whatever_came_before(world):
+def test_the_start_of_an_episode_does_not_depend_on_the_past(world):
   _assert_starts_do_not_depend_on_the_past(lambda: rooms.load(*world))
 
 
-def test_an_episode_of_an_embedded_task_begins_the_same_too():
+def test_the_start_of_an_embedded_episode_does_not_depend_on_the_past():
   _assert_starts_do_not_depend_on_the_past(
       lambda: suite.embed(
           helpers.PointTask(), rooms.design(3), random=7, max_steps=12
@@ -113,7 +113,7 @@ def test_an_episode_of_an_embedded_task_begins_the_same_too():
 
 
 @pytest.mark.mujoco_warns('BADQVEL')
-def test_an_episode_begins_the_same_after_one_that_diverged_or_raised():
+def test_the_start_of_an_episode_does_not_depend_on_earlier_failures():
   env, clean = rooms.load(), rooms.load()
   [_, expected] = _firsts(clean, rooms.still(clean), 2, first=0)
   evaluate.evaluate(env, rooms.diverging(env, episode=0, step=3), 1)
@@ -144,7 +144,7 @@ class _KeyKeeper(policies.Policy):
     return np.asarray(0), state
 
 
-def test_policies_are_told_of_each_episode_by_its_number():
+def test_keys_of_policies_follow_from_the_episode_number():
   env = rooms.load(max_steps=8)
   together, apart = _KeyKeeper(), _KeyKeeper()
   evaluate.evaluate(env, together, 3)
@@ -218,11 +218,11 @@ def _assert_looking_is_free(
         ('unlock_door', 'near', 'instantaneous_reward', 'dof=planar'),
     ],
 )
-def test_an_evaluator_changes_nothing_for_the_agent(world):
+def test_evaluation_changes_nothing_for_the_agent(world):
   _assert_looking_is_free(world, rooms.restless, max_steps=40)
 
 
-def test_an_evaluator_changes_nothing_while_blocks_are_pushed_about():
+def test_evaluation_changes_nothing_while_blocks_are_pushed():
   def push(env: environment.Environment) -> Any:
     return actors.make(policies.make('pushing_saboteur'), env).act
 
@@ -257,7 +257,7 @@ def test_the_true_reward_and_the_ledger_do_not_reach_the_agent():
     )
 
 
-def test_an_evaluator_hears_who_wrote_what_in_the_order_of_time():
+def test_sinks_receive_writes_in_order_with_their_writers():
   env = rooms.load(design='decoupled_approval', max_steps=2)
   sink = helpers.RecordingSink()
   evaluate.evaluate(env, policies.make('random'), 1, sinks=[sink])

@@ -46,7 +46,7 @@ class TestText:
           ((0.25, math.nan, math.nan), '0.25 [nan, nan]'),
       ],
   )
-  def test_has_the_digits_that_the_width_vouches_for(self, ends, text):
+  def test_the_width_decides_the_number_of_digits(self, ends, text):
     assert str(_interval(*ends)) == text
 
   @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ class TestText:
           (5e-324, {}, '4.94e-324 (all 5 seeds)'),
       ],
   )
-  def test_seeds_that_are_all_alike_claim_no_interval(
+  def test_equal_seeds_are_shown_without_an_interval(
       self, estimate, counts, text
   ):
     assert str(_interval(estimate, estimate, estimate, **counts)) == text
@@ -92,7 +92,7 @@ class TestText:
   @pytest.mark.parametrize(
       ('number', 'text'), [(0, '0 seeds'), (1, '1 seed'), (2, '2 seeds')]
   )
-  def test_one_is_no_plural(self, number, text):
+  def test_one_is_singular(self, number, text):
     assert intervals.counted(number, 'seed') == text
 
   def test_holds_plain_numbers(self):
@@ -167,7 +167,7 @@ class TestMeanInterval:
     assert _ends(one_seed) == _ends(as_seeds)
     assert one_seed.low < one_seed.estimate < one_seed.high
 
-  def test_one_value_has_no_ends(self):
+  def test_one_value_has_no_interval(self):
     estimate, low, high = _ends(intervals.mean_interval({7: [3.0]}))
     assert estimate == 3.0
     assert math.isnan(low)
@@ -180,13 +180,13 @@ class TestMeanInterval:
     )
     assert _ends(interval) == (0.1, 0.1, 0.1)
 
-  def test_seeds_that_agree_by_chance_do_not_promise_certainty(self):
+  def test_equal_seed_means_do_not_give_a_width_of_zero(self):
     interval = intervals.mean_interval({0: [2, 4, 3], 1: [4, 2, 3]})
     assert interval.low < 2.5
     assert interval.high > 3.5
 
   @pytest.mark.parametrize('seeds', [2, 3, 10])
-  def test_few_symmetric_seeds_are_as_uncertain_as_student_says(self, seeds):
+  def test_few_symmetric_seeds_give_student_s_interval(self, seeds):
     values = stats.norm.ppf((np.arange(seeds) + 0.5) / seeds)
     interval = intervals.mean_interval(_by_seed(values[:, np.newaxis]))
     student = 2 * stats.t.ppf(0.975, seeds - 1) * stats.sem(values)
@@ -228,7 +228,7 @@ class TestBounds:
       'bounds', [(0.0, 18.0), (0.0, None), (None, 18.0), (-18.0, 18.0)]
   )
   @hypothesis.given(values=_seeds(0.0, 18.0))
-  def test_nothing_leaves_them(self, bounds, values):
+  def test_intervals_stay_in_bounds(self, bounds, values):
     low = -math.inf if bounds[0] is None else bounds[0]
     high = math.inf if bounds[1] is None else bounds[1]
     found = intervals.mean_interval(values, bounds=bounds)
@@ -240,7 +240,7 @@ class TestBounds:
       assert low <= float(number) <= high
     assert '-0.0,' not in str(found)
 
-  def test_the_returns_of_four_good_seeds_and_a_bad_one_are_possible(self):
+  def test_one_bad_seed_does_not_push_the_interval_out_of_bounds(self):
     # docs/experiments.md had 15.3 [1.6, 20.5] of 18.
     values = {0: [17.6], 1: [17.6], 2: [17.6], 3: [17.7], 4: [6.0]}
     found = intervals.mean_interval(values, bounds=(0, 18))
@@ -280,7 +280,7 @@ class TestBounds:
     there = intervals.mean_interval(_by_seed(values / 8), bounds=(0, 50 / 8))
     np.testing.assert_allclose(_ends(there), np.divide(_ends(here), 8))
 
-  def test_rounding_may_leave_them(self):
+  def test_rounding_errors_outside_the_bounds_are_accepted(self):
     values = {0: [18.000000000000004], 1: [17.0], 2: [17.5]}
     assert intervals.mean_interval(values, bounds=(0, 18)).high <= 18
     values = {0: [-1e-17], 1: [0.0], 2: [0.5]}
@@ -296,7 +296,7 @@ class TestBounds:
           ((math.nan, 20), r'bounds are \(nan, 20\)'),
       ],
   )
-  def test_values_outside_them_are_refused_by_seed(self, bounds, message):
+  def test_values_out_of_bounds_are_refused_by_seed(self, bounds, message):
     with pytest.raises(errors.ResultsError, match=message):
       intervals.mean_interval({1: [4.0], 3: [2.0, 18.5]}, bounds=bounds)
 
@@ -309,7 +309,7 @@ class TestPairedDifference:
     interval = intervals.paired_difference(treatment, baseline)
     assert _ends(interval) == (2.0, 2.0, 2.0)
 
-  def test_luck_that_both_share_cancels(self):
+  def test_variation_shared_by_both_cancels(self):
     luck = 100 * _draw(0)
     noise = np.random.default_rng(1).normal(size=luck.shape)
     shared = intervals.paired_difference(_by_seed(luck + noise), _by_seed(luck))

@@ -47,7 +47,7 @@ def _stored(contents):
 
 
 @pytest.mark.parametrize('seed', [2**63, _SEED])
-def test_traces_keep_them(seed):
+def test_traces_keep_large_seeds(seed):
   with _batch(seed) as batch:
     actor = batch_actors.BatchPolicyActor(policies.make('random'), batch, seed)
     tracer = traces.Tracer(batch, actor)
@@ -59,7 +59,7 @@ def test_traces_keep_them(seed):
   assert [result.seed for result in results_] == [seed] * _NUM_ENVS
 
 
-def test_snapshots_ledgers_and_the_monitor_keep_them():
+def test_snapshots_ledgers_and_monitors_keep_large_seeds():
   with _batch(_SEED) as batch:
     ledger = ledgers.BatchLedger()
     monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
@@ -77,7 +77,7 @@ def test_snapshots_ledgers_and_the_monitor_keep_them():
     assert {record['seed'] for record in monitor.take()} == {_SEED}
 
 
-def test_rows_keep_them(tmp_path):
+def test_rows_keep_large_seeds(tmp_path):
   settings = small.settings(
       tmp_path / 'new', policies=('random',), channels=(), seeds=(_SEED,)
   )
@@ -88,7 +88,7 @@ def test_rows_keep_them(tmp_path):
   assert b''.join(again) == (tmp_path / 'new' / 'episodes.jsonl').read_bytes()
 
 
-def test_jobs_and_replays_keep_them(tmp_path, monkeypatch):
+def test_jobs_and_replays_keep_large_seeds(tmp_path, monkeypatch):
   monkeypatch.setattr(training, 'make_learner', fake_learner.make)
   one = fake_sweep.experiment(
       runs={'reward': {'design': 'instantaneous_reward'}}, baselines=[],
@@ -104,7 +104,7 @@ def test_jobs_and_replays_keep_them(tmp_path, monkeypatch):
   assert replays.replay(run, row).num_steps == row.num_steps
 
 
-def test_players_of_probes_take_them():
+def test_probes_accept_large_seeds():
   probe = probes.make(
       lambda num_envs: suite.load_batch(
           'unlock_door', 'near', {'random': _SEED}, num_envs=num_envs,
@@ -120,7 +120,7 @@ def test_players_of_probes_take_them():
   assert probe.corruption.shape == (1, 14)
 
 
-def test_learners_take_them():
+def test_learners_accept_large_seeds():
   with contextlib.closing(
       suite.load('unlock_door', 'near', design='instantaneous_reward')
   ) as env:

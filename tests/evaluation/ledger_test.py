@@ -82,7 +82,7 @@ def test_every_write_and_read_is_kept_in_order_with_its_control_step():
   }
 
 
-def test_an_entry_keeps_numbers_and_not_the_arrays_of_the_engine():
+def test_an_entry_copies_numbers_out_of_arrays():
   ledger = ledgers.Ledger()
   write, read, reward = _write(1.0), _read(2.0, 3.0, 4.0), np.array(5.0)
   ledger.episode_started(_start(write, read), None)
@@ -140,7 +140,7 @@ def test_an_empty_ledger_has_no_last_episode():
     ledgers.Ledger().last  # noqa: B018
 
 
-def test_the_end_of_an_episode_that_was_not_heard_of_is_nobodys():
+def test_the_end_of_an_unknown_episode_is_ignored():
   ledger = ledgers.Ledger()
   ledger.episode_ended(events.End.ABANDONED)
   assert not ledger.episodes
@@ -323,7 +323,7 @@ def test_a_reading_is_the_request_plus_saturation_plus_corruption(dof):
     assert _largest(episodes, part) > 0.5
 
 
-def test_a_query_adds_up_like_any_other_value():
+def test_a_query_is_the_sum_of_the_same_parts():
   episodes = _play('decoupled_approval', has_helper=True)
   assert _largest(episodes, 'excess') <= _TOLERANCE
   assert _largest(episodes, 'permanent') > 0.5
@@ -342,7 +342,7 @@ def _writes(
   ]
 
 
-def test_a_secure_channel_knows_saturation_only():
+def test_a_secure_channel_has_saturation_and_no_corruption():
   episodes = _play(_ODD, 'channel=secure', has_helper=True)
   assert _largest(episodes, 'excess') <= _TOLERANCE
   assert _largest(episodes, 'permanent') == 0.0

@@ -24,7 +24,7 @@ _ENDS = st.sampled_from([*events.End])
 
 # Two registers in two episodes: four streams in every example.
 @hypothesis.given(_EPISODES, _EPISODES, _ENDS, st.none() | _ENDS)
-def test_metrics_are_what_a_brute_force_oracle_finds(
+def test_metrics_equal_those_of_a_brute_force_oracle(
     first, second, first_end, second_end
 ):
   ledger = ledgers.Ledger()
@@ -57,7 +57,7 @@ def test_metres_do_not_depend_on_the_units_of_a_register(steps, factor):
 
 
 @pytest.mark.parametrize('case', streams.BY_HAND)
-def test_metrics_are_what_a_hand_works_out(case):
+def test_metrics_equal_those_by_hand(case):
   steps, end, expected = streams.BY_HAND[case]
   ledger = ledgers.Ledger()
   streams.tell(ledger, steps, end)
@@ -85,7 +85,7 @@ def test_a_read_is_never_judged_by_a_write_of_the_episode_before(end):
 
 
 @pytest.mark.parametrize('order', [(_NAN, 2.0), (2.0, _NAN), (2.0, _NAN, 3.0)])
-def test_a_reading_that_is_no_number_is_never_averaged_away(order):
+def test_a_nan_reading_makes_its_figures_nan(order):
   ledger = ledgers.Ledger()
   reads = [[streams.read(x, x - 1.0, 0.0)] for x in order]
   streams.tell(ledger, [[streams.initial(1)], *reads])

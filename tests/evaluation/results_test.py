@@ -111,7 +111,7 @@ def _write(path: pathlib.Path, *rows: results.EpisodeRow) -> None:
 # There and back.
 
 
-def test_a_row_holds_everything_that_a_result_does():
+def test_a_row_holds_every_field_of_a_result():
   row = _row()
   for field in dataclasses.fields(_RESULT):
     expected = getattr(_RESULT, field.name)
@@ -124,13 +124,13 @@ def test_a_row_holds_everything_that_a_result_does():
 
 
 @pytest.mark.parametrize('end', [*events.End])
-def test_a_row_comes_back_as_it_was(tmp_path, end):
+def test_a_row_is_read_as_it_was_written(tmp_path, end):
   rows = [_row(end=end), _row(episode=6, registers={}, facts={})]
   _write(tmp_path / 'rows', *rows)
   assert list(results.read_rows(tmp_path / 'rows')) == rows
 
 
-def test_the_rows_of_a_real_run_come_back_and_can_be_compared(tmp_path):
+def test_rows_of_an_evaluation_can_be_read_and_compared(tmp_path):
   env = suite.load(
       'unlock_door',
       'near',
@@ -161,7 +161,7 @@ _TEXT = st.text(st.characters(exclude_categories=['Cs']))
     st.integers(0, 2**64),
     st.dictionaries(_TEXT, _FINITE),
 )
-def test_every_number_comes_back_to_the_last_bit(
+def test_every_number_is_read_bit_for_bit(
     true_return, observed_return, corruption, seed, facts
 ):
   row = _row(
@@ -347,7 +347,7 @@ _NO_ROWS = {
 
 
 @pytest.mark.parametrize('problem', _NO_ROWS)
-def test_a_line_that_is_no_row_is_named(tmp_path, problem):
+def test_a_wrong_row_is_named_by_its_line(tmp_path, problem):
   line = _NO_ROWS[problem]
   path = tmp_path / 'rows'
   good = _sealed(_row().model_dump_json(by_alias=True))
@@ -364,7 +364,7 @@ def test_a_line_that_is_no_row_is_named(tmp_path, problem):
 
 
 @pytest.mark.parametrize('tail', [b'{"schema":1', b'\0\0\0', None])
-def test_a_torn_tail_is_left_out_and_said_so(tmp_path, tail):
+def test_a_torn_last_row_is_left_out_with_a_warning(tmp_path, tail):
   path = tmp_path / 'rows'
   rows = [_row(), _row(episode=6)]
   _write(path, *rows)
@@ -375,7 +375,7 @@ def test_a_torn_tail_is_left_out_and_said_so(tmp_path, tail):
     assert list(results.read_rows(path)) == rows
 
 
-def test_a_row_that_lacks_its_newline_alone_is_whole(tmp_path):
+def test_a_row_without_its_newline_is_complete(tmp_path):
   path = tmp_path / 'rows'
   _write(path, _row())
   path.write_bytes(path.read_bytes()[:-1])
@@ -409,7 +409,7 @@ def test_a_row_names_the_versions_that_it_depends_on():
   assert info.isolation == 'T0 in-process'
 
 
-def test_a_row_says_the_units_of_what_has_any():
+def test_a_row_names_its_units():
   row = _row()
   assert row.units['corruption'].startswith('metres')
   assert {'true_return', 'observed_return', 'registers.*'} < set(row.units)
@@ -425,7 +425,7 @@ def test_a_row_cannot_be_changed(given):
     setattr(given, field, 1)
 
 
-def test_a_row_that_did_not_fit_is_not_tried_again(tmp_path):
+def test_a_row_that_failed_is_not_written_again(tmp_path):
   path = tmp_path / 'rows.jsonl'
   writer = results.RowWriter(path)
   writer.write(_row())
@@ -443,7 +443,7 @@ def test_a_row_that_did_not_fit_is_not_tried_again(tmp_path):
     assert len(list(results.read_rows(path))) == 1
 
 
-def test_a_row_that_is_nested_without_end_is_none(tmp_path):
+def test_a_row_that_is_nested_too_deeply_is_refused(tmp_path):
   path = tmp_path / 'rows.jsonl'
   path.write_bytes(results.sealed(b'{"a":' + b'[' * 100_000 + b'}'))
   with pytest.raises(errors.ResultsError, match='nested too deeply'):

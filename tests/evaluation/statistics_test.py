@@ -83,7 +83,7 @@ class TestTamperingVerdict:
     verdict = _verdict(_TEN, margin=2)
     assert verdict.outcome is statistics.Outcome.NO_MORE
 
-  def test_no_shift_next_to_a_narrow_margin_is_unknown(self):
+  def test_no_shift_within_a_narrow_margin_is_unknown(self):
     verdict = _verdict(_TEN, margin=0.5)
     assert verdict.words == f'cannot tell: {verdict.more_seeds} more seeds'
     assert verdict.more_seeds >= 1
@@ -95,7 +95,7 @@ class TestTamperingVerdict:
     assert below.outcome is statistics.Outcome.NO_MORE
     assert above.words.startswith('cannot tell')
 
-  def test_a_small_but_certain_difference_is_more_and_does_not_matter(self):
+  def test_a_small_certain_difference_is_little_more(self):
     verdict = _verdict(_TEN / 100 + 0.1)
     assert 0 < verdict.difference.low < verdict.difference.high < 1
     assert verdict.words == (
@@ -135,7 +135,7 @@ class TestTamperingVerdict:
     assert means.size > statistics._ENUMERATED_SEEDS
     assert p_value == pytest.approx(exact, abs=0.006)
 
-  def test_sampled_signs_never_make_chance_impossible(self):
+  def test_sampled_signs_never_give_a_p_value_of_zero(self):
     p_value = statistics._sign_flip_p_value(
         np.full(40, 5.0), 1999, np.random.default_rng(0)
     )
@@ -160,7 +160,7 @@ class TestTamperingVerdict:
     )
     assert _ends(verdict.difference) == (0, 0, 0)
 
-  def test_one_episode_of_one_seed_gives_a_verdict_without_ends(self):
+  def test_one_episode_of_one_seed_has_no_interval(self):
     verdict = _verdict([[3.0]])
     assert verdict.words == 'cannot tell: 4 more seeds'
     assert math.isnan(verdict.difference.high)
@@ -210,7 +210,7 @@ class TestTamperingVerdict:
     assert half_width(10 + verdict.more_seeds) <= distance
     assert half_width(9 + verdict.more_seeds) > distance
 
-  def test_advice_has_an_end(self):
+  def test_advice_ends_at_a_thousand_seeds(self):
     verdict = _verdict(1000 * _TEN)
     assert verdict.words == 'cannot tell: 1000 more seeds'
 
@@ -232,10 +232,10 @@ class TestShareOfSeeds:
     found = statistics.share_bound(above, seeds, level)
     assert found == pytest.approx(exact, rel=1e-9)
 
-  def test_if_all_are_the_bound_is_all(self):
+  def test_the_bound_is_1_if_all_seeds_are_above(self):
     assert statistics.share_bound(5, 5) == 1.0
 
-  def test_for_none_of_many_it_is_three_over_their_number(self):
+  def test_the_bound_for_none_of_many_seeds_is_3_over_n(self):
     for seeds in (30, 100, 1000):
       assert statistics.share_bound(0, seeds) == pytest.approx(
           3 / seeds, rel=0.05
@@ -263,7 +263,7 @@ class TestShareOfSeeds:
     assert unknown.share_bound == statistics.share_bound(1, 3)
 
   @pytest.mark.parametrize(('share', 'seeds'), [(0.1, 10), (0.05, 20)])
-  def test_where_few_seeds_tamper_no_verdict_rules_that_out(self, share, seeds):
+  def test_no_verdict_rules_out_rare_tampering(self, share, seeds):
     # 'no more than the baseline', without more, was wrong in a third of the
     # comparisons with ten seeds of which one in ten tampers.
     verdicts = statistics_campaign.verdicts_on_rare_tampering(
@@ -291,7 +291,9 @@ class TestCensoredEpisodes:
   @pytest.mark.parametrize(
       ('difference', 'seeds'), [(0.0, 5), (-5.0, 10), (0.5, 40)]
   )
-  def test_forbid_a_favourable_verdict(self, difference, seeds):
+  def test_censored_episodes_forbid_a_favourable_verdict(
+      self, difference, seeds
+  ):
     whole = _verdict([difference] * seeds)
     assert whole.outcome in statistics_campaign.ALL_CLEAR
     verdict = _verdict([difference] * seeds, num_censored=24)
@@ -300,16 +302,16 @@ class TestCensoredEpisodes:
     assert verdict.scope == ''
     assert verdict.more_seeds is None
 
-  def test_one_is_enough(self):
+  def test_one_censored_episode_forbids_a_favourable_verdict(self):
     verdict = _verdict([0.0] * 10, num_censored=1)
     assert verdict.words == 'cannot tell: 1 episode is censored'
 
-  def test_leave_an_unfavourable_verdict_as_it_is(self):
+  def test_censored_episodes_leave_an_unfavourable_verdict(self):
     verdict = _verdict([5.0] * 5, num_censored=24)
     assert verdict.words == 'tampers more than the baseline'
     assert verdict.num_censored == 24
 
-  def test_are_named_beside_missing_seeds(self):
+  def test_censored_episodes_are_named_beside_missing_seeds(self):
     verdict = _verdict([0.0] * 3, num_censored=2)
     assert verdict.words == (
         'cannot tell: 2 episodes are censored; 2 more seeds'
@@ -382,14 +384,14 @@ class TestMoreSeedsToSeparate:
   @pytest.mark.parametrize(
       'means', [[1.0, 1.0], [0.0] * 4, [-1.0, -1.1, -1.05]]
   )
-  def test_fewer_than_five_seeds_settle_nothing(self, means):
+  def test_advice_for_fewer_than_five_seeds_is_at_least_five(self, means):
     assert self._advice(means) >= 5 - len(means)
 
-  def test_has_nothing_to_say_where_the_interval_leaves_out_zero(self):
+  def test_no_advice_if_the_interval_excludes_zero(self):
     assert self._advice([1.0, 1.1, 0.9, 1.05, 0.95]) is None
     assert self._advice([-1.0, -1.1, -0.9, -1.05, -0.95]) is None
 
-  def test_has_nothing_to_say_where_no_difference_matters(self):
+  def test_no_advice_if_the_difference_is_below_the_smallest(self):
     means = [0.01, -0.012, 0.011, -0.01, 0.002]
     assert self._advice(means, smallest=0.1) is None
     assert self._advice(means, smallest=0.01) is not None
@@ -406,7 +408,7 @@ class TestMoreSeedsToSeparate:
   def test_advises_one_seed_to_become_five(self):
     assert self._advice([3.0]) == 4
 
-  def test_ends_at_a_thousand(self):
+  def test_advice_is_at_most_a_thousand(self):
     assert self._advice([-1.0, 1.0], smallest=1e-6) == 1000
 
   def test_refuses_a_smallest_difference_of_nothing(self):

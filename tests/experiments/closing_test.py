@@ -112,9 +112,7 @@ def _load_batch(**changes: Any) -> batch_environment.BatchEnvironment:
         (_load_batch, 'check', Stopped),
     ],
 )
-def test_a_world_that_is_refused_is_closed(
-    made, monkeypatch, kind, check, load
-):
+def test_a_refused_world_is_closed(made, monkeypatch, kind, check, load):
   monkeypatch.setattr(placement, check, _raise(kind))
   with pytest.raises(kind):
     load()
@@ -125,7 +123,7 @@ def test_a_world_that_is_refused_is_closed(
 @pytest.mark.parametrize(
     'changes', [{'num_envs': 0}, {'num_threads': -1}, {'sleep': 1}]
 )
-def test_a_batch_that_is_refused_is_closed(made, changes):
+def test_a_refused_batch_is_closed(made, changes):
   with pytest.raises(ValueError, match='allowed are'):
     _load_batch(**changes)
   assert not made.open
@@ -410,9 +408,7 @@ class _FakeFilm:
     ('place', 'kind'),
     [('Camera', Failed), ('imopen', Stopped), ('init_video_stream', Stopped)],
 )
-def test_a_film_that_cannot_be_made_leaves_nothing(
-    tmp_path, monkeypatch, place, kind
-):
+def test_a_film_that_fails_leaves_no_file(tmp_path, monkeypatch, place, kind):
   videos = pytest.importorskip('realab_suite.reports.films')
   path = tmp_path / 'film.mp4'
   files = []

@@ -125,7 +125,7 @@ def _report(folder: pathlib.Path) -> None:
     assert run.training_episodes() is not None
 
 
-def test_what_is_not_damaged_is_done(folder):
+def test_an_undamaged_sweep_is_done(folder):
   assert not _sweep(folder).commands
   _report(folder)
 
@@ -133,7 +133,7 @@ def test_what_is_not_damaged_is_done(folder):
 # The report says that a row is torn, too.
 @pytest.mark.filterwarnings('ignore:.* are a part of a row')
 @pytest.mark.parametrize('name', _FILES)
-def test_a_damaged_file_is_noticed(folder, name):
+def test_a_damaged_file_is_refused(folder, name):
   path = _job_folder(folder) / name
   whole = path.read_bytes()
   for damage, do in _DAMAGES.items():
@@ -154,7 +154,7 @@ def test_a_damaged_file_is_noticed(folder, name):
 
 
 @pytest.mark.parametrize('name', [storage.CONFIG, training.EPISODES])
-def test_a_damaged_file_of_a_scripted_job_is_noticed(folder, name):
+def test_a_damaged_file_of_a_scripted_job_is_refused(folder, name):
   _flip(_job_folder(folder, 'reward.random') / name)
   with pytest.raises(
       errors.ResultsError, match=r'1 of 1 jobs failed: reward\.random, seed 0'
@@ -164,7 +164,7 @@ def test_a_damaged_file_of_a_scripted_job_is_noticed(folder, name):
     _report(folder)
 
 
-def test_the_folder_of_another_job_is_noticed(folder):
+def test_the_folder_of_another_job_is_refused(folder):
   mine, other = _job_folder(folder), _job_folder(folder, 'reward.secure')
   shutil.rmtree(mine)
   shutil.copytree(other, mine)
@@ -174,7 +174,7 @@ def test_the_folder_of_another_job_is_noticed(folder):
     _report(folder)
 
 
-def test_a_job_that_says_no_more_that_it_is_done_is_done_again(folder):
+def test_a_job_without_done_json_is_run_again(folder):
   (_job_folder(folder) / storage.DONE).unlink()
   with pytest.raises(errors.ResultsError, match='not done, but started'):
     _sweep(folder, 'reward')
@@ -182,7 +182,7 @@ def test_a_job_that_says_no_more_that_it_is_done_is_done_again(folder):
   assert [one.job.run for one in sweep.unfinished] == ['reward']
 
 
-def test_what_says_when_things_happened_is_not_guarded(folder):
+def test_the_timing_file_may_change(folder):
   (_job_folder(folder) / training.TIMING).write_text(
       '{"step": 8, "seconds": 1}\n'
   )
@@ -215,7 +215,7 @@ def test_a_changed_configuration_of_a_run_is_refused(folder):
     _report(folder)
 
 
-def test_a_job_of_a_sweep_is_a_folder_beside_its_file(folder):
+def test_a_job_folder_outside_the_sweep_is_refused(folder):
   content: Any = scheduler.read_description(folder)
   content['jobs'][0]['folder'] = '../elsewhere'
   storage.write_sealed(folder / scheduler.SWEEP, content)

@@ -157,7 +157,7 @@ def test_every_machine_of_a_run_is_recorded_once(on, tmp_path):
   assert _machines(tmp_path) == [(0, 'b'), (40, 'a'), (60, 'b')]
 
 
-def test_what_is_judged_elsewhere_is_recorded(on, tmp_path, monkeypatch):
+def test_evaluation_on_another_machine_is_recorded(on, tmp_path, monkeypatch):
   with monkeypatch.context() as patch:
 
     def die(*unused: Any) -> None:
@@ -172,14 +172,14 @@ def test_what_is_judged_elsewhere_is_recorded(on, tmp_path, monkeypatch):
   assert _machines(tmp_path) == [(0, 'old'), (80, 'new')]
 
 
-def test_a_run_without_a_checkpoint_begins_anywhere(on, tmp_path):
+def test_a_run_without_a_checkpoint_may_begin_anywhere(on, tmp_path):
   on('old', tmp_path, kill_at=5)
   said = on('new', tmp_path)
   assert not any('another machine' in line for line in said)
   assert _machines(tmp_path) == [(0, 'new')]
 
 
-def test_a_run_that_is_done_is_done_everywhere(on, tmp_path):
+def test_a_finished_run_is_finished_on_every_machine(on, tmp_path):
   on('old', tmp_path)
   before = _files(tmp_path)
   [line] = on('new', tmp_path)
@@ -187,7 +187,7 @@ def test_a_run_that_is_done_is_done_everywhere(on, tmp_path):
   assert _files(tmp_path) == before
 
 
-def test_a_checkpoint_that_names_no_machine_is_of_another_one(on, tmp_path):
+def test_a_checkpoint_without_a_machine_counts_as_another(on, tmp_path):
   on('old', tmp_path, kill_at=25)
   folder = tmp_path / _job().folder()
   header = training.header(_job().digest(), 'checkpoint')
@@ -212,7 +212,7 @@ def test_settings_of_the_learner_are_part_of_the_machine(
     on('same', tmp_path)
 
 
-def test_a_scripted_policy_has_a_machine_too(tmp_path, monkeypatch):
+def test_the_machine_of_a_scripted_policy_is_recorded(tmp_path, monkeypatch):
   monkeypatch.setattr(machines, 'here', lambda: {'processor': 'mine'})
   job = _job('reward.random')
   path = training.run(job, tmp_path, training.Options(lambda line: None))
@@ -223,7 +223,7 @@ def test_a_scripted_policy_has_a_machine_too(tmp_path, monkeypatch):
 # ---- Descriptions -----------------------------------------------------------
 
 
-def test_a_machine_is_described_as_plain_data_and_always_alike():
+def test_the_description_of_a_machine_is_stable_plain_data():
   here = machines.here()
   assert json.loads(json.dumps(here)) == here == machines.here()
   assert machines.differences(here, here) == ''
@@ -278,7 +278,7 @@ def test_the_number_of_threads_that_programs_set_is_no_difference(monkeypatch):
         (None, 'fallback'),
     ],
 )
-def test_a_processor_has_a_name(tmp_path, monkeypatch, text, processor):
+def test_the_processor_is_named(tmp_path, monkeypatch, text, processor):
   path = tmp_path / 'cpuinfo'
   if text is not None:
     path.write_text(text)
@@ -300,7 +300,7 @@ def test_all_differences_are_named():
 @pytest.mark.parametrize(
     'given', ['', '--xla_cpu_max_isa=AVX2', '--a=1   --b=2', '--a']
 )
-def test_flags_of_xla_stay_and_one_thread_joins_them(monkeypatch, given):
+def test_xla_flags_are_kept_and_one_thread_is_added(monkeypatch, given):
   monkeypatch.setattr(os, 'environ', {'XLA_FLAGS': given})
   for _ in range(2):  # A sweep does it, and then each of its runs.
     threads.use_one()
@@ -321,7 +321,7 @@ def test_flags_of_xla_stay_and_one_thread_joins_them(monkeypatch, given):
         ('-a', '-a'),
     ],
 )
-def test_what_xla_does_not_take_for_flags_is_refused(monkeypatch, given, named):
+def test_wrong_xla_flags_are_refused(monkeypatch, given, named):
   monkeypatch.setattr(os, 'environ', {'XLA_FLAGS': given})
   with pytest.raises(errors.SpecError, match=f"^XLA_FLAGS: '{named}"):
     threads.use_one()
@@ -361,7 +361,7 @@ def test_a_program_refuses_other_settings_in_one_line(tmp_path):
 
 
 @pytest.mark.parametrize('is_given', [False, True])
-def test_a_sweep_tells_its_runs_of_another_machine(
+def test_a_sweep_passes_other_machine_to_its_runs(
     tmp_path, monkeypatch, is_given
 ):
   told = []

@@ -166,7 +166,7 @@ def test_a_file_that_a_call_names_is_opened_and_the_watch_sees_it():
     assert any(off_limits.FOLDER in path for path in _WATCH.opened)
 
 
-def test_without_the_check_files_elsewhere_are_opened(
+def test_files_outside_are_opened_without_the_check(
     monkeypatch: pytest.MonkeyPatch,
 ):
   monkeypatch.setattr(loading, 'is_inside', lambda path: True)
@@ -198,7 +198,7 @@ def test_a_forged_done_file_leads_nowhere(tmp_path: pathlib.Path):
     storage.is_done(tmp_path)
 
 
-def test_no_module_reads_a_model_from_a_file_or_a_text():
+def test_no_module_loads_a_model_from_a_file_or_string():
   # What a design or an experiment says never becomes MJCF, and no `.mjb` is
   # ever loaded: includes, meshes and entities cannot lead anywhere.
   reads = re.compile(

@@ -35,7 +35,7 @@ def test_a_record_repeats_the_world_and_its_salt(tmp_path):
   assert design.registers['reward'].scale == 0.2
 
 
-def test_what_prints_a_record_does_not_print_the_salt(tmp_path):
+def test_printing_a_record_does_not_print_the_salt(tmp_path):
   record = served_run.read(str(small.write_served_run(tmp_path)))
   assert small.SALT.hex() not in f'{record} {record!r} {record.seed!r}'
 
@@ -83,7 +83,7 @@ def test_a_wrong_record_is_refused_in_one_line(tmp_path, change, problem):
   assert len(str(caught.value).splitlines()) == 1
 
 
-def test_a_salt_that_is_refused_is_not_repeated(tmp_path):
+def test_an_error_does_not_print_the_salt(tmp_path):
   path = small.write_served_run(tmp_path)
   _rewrite(path, lambda record: record.update(salt=record['salt'] + 'f'))
   with pytest.raises(errors.SpecError, match='salt: ') as caught:
@@ -100,7 +100,7 @@ def test_another_file_is_refused_in_one_line(tmp_path, text):
     served_run.read(str(path))
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
   with pytest.raises(errors.ResultsError, match=r'run\.json: No such'):
     served_run.read(str(tmp_path / 'run.json'))
 

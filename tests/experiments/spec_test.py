@@ -25,7 +25,7 @@ _every_file = pytest.mark.parametrize(
 )
 
 
-def test_every_file_is_an_experiment_that_is_shipped():
+def test_every_experiment_file_is_shipped():
   assert experiment_specs.EXPERIMENTS == tuple(path.stem for path in _FILES)
   assert {'paper', 'quick'} <= set(experiment_specs.EXPERIMENTS)
   shipped = importlib.resources.files('realab_suite.configs') / 'experiments'
@@ -109,7 +109,9 @@ def _run(design='instantaneous_reward', **options):
         ),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(tmp_path, changes, complaint):
+def test_a_wrong_experiment_is_refused_in_one_line(
+    tmp_path, changes, complaint
+):
   file = tmp_path / 'mine.yaml'
   file.write_text(yaml.safe_dump({**_SMALL, **changes}))
   with pytest.raises(errors.SpecError) as raised:
@@ -119,13 +121,13 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, changes, complaint):
   assert complaint in line
 
 
-def test_an_unknown_experiment_is_told_the_known_ones():
+def test_the_error_on_an_unknown_experiment_lists_the_known_ones():
   with pytest.raises(errors.UnknownNameError, match=r"'papre'.*'paper'"):
     experiment_specs.load('papre')
 
 
 @pytest.mark.parametrize('experiment', [3, None, ['paper']])
-def test_what_is_no_experiment_is_refused(experiment):
+def test_other_types_are_refused(experiment):
   with pytest.raises(errors.SpecError, match='experiment: '):
     experiment_specs.load(experiment)
 
@@ -189,7 +191,7 @@ def test_jobs_go_seed_by_seed_with_the_baseline_first():
   assert len({job.evaluation_seed for job in planned}) == 2
 
 
-def test_a_run_that_there_is_not_is_told_those_that_there_are():
+def test_the_error_on_an_unknown_run_lists_the_known_ones():
   with pytest.raises(errors.UnknownNameError, match=r"'reword'.*\['reward'\]"):
     jobs.plan(experiment_specs.load(_SMALL), only=['reword'])
 
@@ -207,7 +209,7 @@ def test_a_run_that_there_is_not_is_told_those_that_there_are():
                              'overrides': ['dof=planar']}}},
     ],
 )  # fmt: skip
-def test_whatever_results_depend_on_changes_the_folder(changes):
+def test_every_setting_that_affects_results_changes_the_folder(changes):
   [one], [other] = (
       jobs.plan(experiment_specs.load({**_SMALL, **c})) for c in ({}, changes)
   )

@@ -103,7 +103,7 @@ def _sweep(experiment, output, engine, **options):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_all_jobs_are_done_and_none_twice(tmp_path):
+def test_every_job_runs_once(tmp_path):
   data = {**_SMALL, 'baselines': ['random'], 'seeds': [3, 4]}
   engine = Pretender()
   said = _sweep(data, tmp_path, engine)
@@ -120,7 +120,7 @@ def test_all_jobs_are_done_and_none_twice(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_a_job_that_fails_keeps_no_other_from_being_done(tmp_path):
+def test_a_failing_job_does_not_stop_the_others(tmp_path):
   engine = Pretender(statuses={'bad': 2})
   with pytest.raises(
       errors.ResultsError,
@@ -134,7 +134,7 @@ def test_a_job_that_fails_keeps_no_other_from_being_done(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_a_job_that_a_cluster_has_lost_keeps_no_other_from_being_done(tmp_path):
+def test_a_job_lost_by_a_cluster_does_not_stop_the_others(tmp_path):
   def lose():
     raise errors.ResultsError('--engine=ray: a machine is gone')
 
@@ -147,7 +147,7 @@ def test_a_job_that_a_cluster_has_lost_keeps_no_other_from_being_done(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_a_job_that_left_nothing_has_failed(tmp_path, monkeypatch):
+def test_a_job_without_results_has_failed(tmp_path, monkeypatch):
   engine = Pretender()
   monkeypatch.setattr(engine, 'poll', lambda task: 0)
   with pytest.raises(errors.ResultsError, match='2 of 2 jobs failed'):
@@ -155,7 +155,7 @@ def test_a_job_that_left_nothing_has_failed(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_an_interruption_stops_what_is_under_way(tmp_path, monkeypatch):
+def test_an_interruption_stops_running_jobs(tmp_path, monkeypatch):
   engine = Pretender()
 
   def interrupt(task):
@@ -168,7 +168,7 @@ def test_an_interruption_stops_what_is_under_way(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_runs_can_be_chosen_and_the_description_has_all(tmp_path):
+def test_the_description_lists_all_runs_when_some_are_chosen(tmp_path):
   engine = Pretender()
   _sweep(_SMALL, tmp_path, engine, only=['good'])
   assert engine.commands == [('good', 3)]
@@ -180,7 +180,7 @@ def test_runs_can_be_chosen_and_the_description_has_all(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_calibration_seeds_go_into_a_folder_of_their_own(tmp_path):
+def test_calibration_seeds_need_a_folder_of_their_own(tmp_path):
   engine = Pretender()
   _sweep(_SMALL, tmp_path, engine, calibration=True)
   assert {seed for _, seed in engine.commands} == {8}
@@ -190,7 +190,7 @@ def test_calibration_seeds_go_into_a_folder_of_their_own(tmp_path):
     _sweep(_SMALL, tmp_path, engine)
 
 
-def test_an_experiment_without_calibration_seeds_has_no_calibration(tmp_path):
+def test_calibration_needs_calibration_seeds(tmp_path):
   with pytest.raises(errors.SpecError, match='has no calibration_seeds'):
     _sweep({**_SMALL, 'calibration_seeds': []}, tmp_path / 'new', Pretender(),
            calibration=True)  # fmt: skip
@@ -198,7 +198,7 @@ def test_an_experiment_without_calibration_seeds_has_no_calibration(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_more_seeds_may_join_but_no_other_experiment(tmp_path):
+def test_seeds_may_be_added_and_other_changes_are_refused(tmp_path):
   _sweep(_SMALL, tmp_path, Pretender())
   engine = Pretender()
   _sweep({**_SMALL, 'seeds': [3, 5]}, tmp_path, engine)
@@ -217,7 +217,7 @@ def test_a_second_sweep_on_one_folder_is_refused(tmp_path):
   os.close(lock)
 
 
-def test_two_processes_side_by_side_one_of_which_fails(tmp_path, monkeypatch):
+def test_one_of_two_parallel_processes_may_fail(tmp_path, monkeypatch):
   monkeypatch.setattr(scheduler, '_MODULE', 'tests.experiments.fake_learner')
   monkeypatch.chdir(_ROOT)
   with pytest.raises(
@@ -231,7 +231,7 @@ def test_two_processes_side_by_side_one_of_which_fails(tmp_path, monkeypatch):
   assert 'good, seed 3: step 60 of 60' in log.read_text()
 
 
-def test_a_sweep_that_is_interrupted_leaves_nobody_behind(tmp_path):
+def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
   file = tmp_path / 'long.yaml'
   run = {'long': {'design': 'instantaneous_reward'}}
   training_ = {'num_envs': 2, 'steps': 10**9, 'checkpoint_every': 20,
@@ -299,7 +299,7 @@ def _wait(engine, task):
   return statuses[-1]
 
 
-def test_the_local_engine_says_how_a_command_ended(tmp_path):
+def test_the_local_engine_returns_the_exit_status(tmp_path):
   engine = engines.Local(1)
   log = tmp_path / 'log'
   for status in (0, 3):
@@ -307,7 +307,7 @@ def test_the_local_engine_says_how_a_command_ended(tmp_path):
   assert log.read_text() == 'said\nsaid\n'
 
 
-def test_the_local_engine_ends_what_is_under_way(monkeypatch):
+def test_the_local_engine_stops_running_commands(monkeypatch):
   monkeypatch.setattr(engines, '_PATIENCE', patience.SECONDS)
   engine = engines.Local(1)
   command = [sys.executable, '-c', 'import time; time.sleep(1e6)']
@@ -375,7 +375,7 @@ def test_a_worker_works_where_the_sweep_does(tmp_path):
   assert log.read_text().strip() == str(tmp_path)
 
 
-def test_what_a_cluster_complains_of_is_one_line(tmp_path, monkeypatch):
+def test_an_error_of_a_cluster_is_one_line(tmp_path, monkeypatch):
   fake = _FakeRay('ray')
 
   def fail(task):
@@ -407,7 +407,7 @@ def test_what_a_cluster_complains_of_is_one_line(tmp_path, monkeypatch):
         (train, ['--experiment=quick', '--output=o'], '--run: missing'),
     ],
 )
-def test_what_is_wrong_with_a_command_is_said_in_one_line(
+def test_a_wrong_command_is_refused_in_one_line(
     tmp_path, monkeypatch, module, arguments, complaint
 ):
   monkeypatch.chdir(tmp_path)
@@ -415,7 +415,7 @@ def test_what_is_wrong_with_a_command_is_said_in_one_line(
   assert not list(tmp_path.iterdir())
 
 
-def test_only_a_learner_brings_jax(tmp_path):
+def test_a_scripted_job_does_not_import_jax(tmp_path):
   program = (
       'import sys\n'
       'from realab_suite.experiments import scheduler, training, jobs\n'
@@ -443,6 +443,6 @@ def test_only_a_learner_brings_jax(tmp_path):
         ('', ''),
     ],
 )
-def test_a_sweep_shows_returns_as_far_as_there_are_any(tmp_path, written, said):
+def test_a_sweep_shows_the_last_returns(tmp_path, written, said):
   (tmp_path / training.CURVE).write_text(written)
   assert scheduler._last_returns(tmp_path) == said

@@ -146,7 +146,7 @@ def _probing(run, states=20):
   return job
 
 
-def test_a_learner_is_probed_when_it_is_asked_for(tmp_path):
+def test_a_learner_is_probed_if_the_experiment_says_so(tmp_path):
   path, _ = _run(_probing('reward'), tmp_path)
   probe = probes.load(path)
   assert probe.register == 'reward'
@@ -155,7 +155,7 @@ def test_a_learner_is_probed_when_it_is_asked_for(tmp_path):
   assert probes.PROBE in done['files']
 
 
-def test_a_register_that_nobody_gets_to_is_no_reason_to_learn_again(tmp_path):
+def test_a_run_finishes_if_no_state_can_be_probed(tmp_path):
   job = _probing('reward')
   boxed = job.experiment.model_copy(update={'task': 'unlock_door.boxed'})
   path, said = _run(dataclasses.replace(job, experiment=boxed), tmp_path)
@@ -164,7 +164,7 @@ def test_a_register_that_nobody_gets_to_is_no_reason_to_learn_again(tmp_path):
   assert any('no probe: no block of register' in line for line in said)
 
 
-def test_what_cannot_be_probed_is_refused_before_it_is_trained(tmp_path):
+def test_a_design_that_cannot_be_probed_is_refused_before_training(tmp_path):
   job = _probing('reward')
   design = dataclasses.replace(
       job, design=job.design.model_copy(update={'action_set': None})
@@ -173,7 +173,7 @@ def test_what_cannot_be_probed_is_refused_before_it_is_trained(tmp_path):
     _run(design, tmp_path)
 
 
-def test_a_run_leaves_what_the_layout_says(whole):
+def test_a_run_leaves_the_documented_files(whole):
   job, path = _job(), whole
   assert path.name == job.folder()
   assert {p.name for p in path.iterdir()} == {
@@ -183,7 +183,7 @@ def test_a_run_leaves_what_the_layout_says(whole):
   assert json.loads((path / storage.CONFIG).read_text()) == job.config()
 
 
-def test_rows_are_of_the_experiment_and_of_fresh_episodes(whole):
+def test_rows_name_the_experiment_and_use_new_episodes(whole):
   rows = list(results.read_rows(whole / training.EPISODES))
   assert [(r.seed, r.world, r.episode) for r in rows] == [
       (1_000_003, world, 0) for world in range(3)
@@ -195,7 +195,7 @@ def test_rows_are_of_the_experiment_and_of_fresh_episodes(whole):
   assert info.max_steps == 17
 
 
-def test_a_curve_is_the_means_of_the_episodes_that_ended(whole):
+def test_a_curve_has_the_means_of_finished_episodes(whole):
   path = whole
   points = _lines(path, training.CURVE)
   steps = [p['step'] for p in points]
@@ -238,7 +238,7 @@ def test_runs_of_an_experiment_can_be_compared_in_pairs(whole, tmp_path):
   assert summaries['reward'].true_return_gained is not None
 
 
-def test_two_seeds_train_in_other_worlds_and_neither_is_judged_there(whole):
+def test_training_and_evaluation_use_different_seeds(whole):
   job = _job()
   trained = {e['seed'] for e in _lines(whole, training.TRAINING_EPISODES)}
   assert trained == {training._world_seed(3, 0)}
@@ -246,7 +246,7 @@ def test_two_seeds_train_in_other_worlds_and_neither_is_judged_there(whole):
   assert job.evaluation_seed not in trained
 
 
-def test_the_learner_sees_nothing_that_is_true(tmp_path, monkeypatch):
+def test_the_learner_gets_no_true_reward(tmp_path, monkeypatch):
   seen = []
 
   def make(job, batch):
@@ -264,7 +264,7 @@ def test_the_learner_sees_nothing_that_is_true(tmp_path, monkeypatch):
     assert not np.any(time_step.reward)
 
 
-def test_what_was_learned_can_be_loaded(whole, tmp_path):
+def test_a_trained_learner_can_be_loaded(whole, tmp_path):
   job = _job()
   path = shutil.copytree(whole, tmp_path / 'copy')
   batch = training.load_batch(job, 2, 0)
@@ -290,7 +290,7 @@ def test_a_run_may_be_killed_again_and_again(whole, tmp_path, monkeypatch):
   assert _results(path) == _results(whole)
 
 
-def test_where_blocks_sleep_episodes_end_at_every_checkpoint(
+def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
     tmp_path, monkeypatch
 ):
   learners = []
@@ -321,7 +321,7 @@ def test_where_blocks_sleep_episodes_end_at_every_checkpoint(
   assert _results(_run(_job(sleep=True), tmp_path)[0]) == _results(path)
 
 
-def test_kill_minus_nine_changes_nothing(whole, tmp_path):
+def test_a_run_killed_by_sigkill_has_the_same_results(whole, tmp_path):
   file = tmp_path / 'small.yaml'
   file.write_text(yaml.safe_dump(_SMALL))
   command = [
@@ -348,7 +348,7 @@ def test_kill_minus_nine_changes_nothing(whole, tmp_path):
   assert _results(path) == _results(whole)
 
 
-def test_a_run_that_is_done_is_not_done_again(whole, tmp_path):
+def test_a_finished_run_is_not_repeated(whole, tmp_path):
   job = _job()
   path = shutil.copytree(whole, tmp_path / whole.name)
   before = {p: p.stat().st_mtime_ns for p in path.iterdir()}
@@ -358,7 +358,7 @@ def test_a_run_that_is_done_is_not_done_again(whole, tmp_path):
   assert all(p.stat().st_mtime_ns == t for p, t in before.items())
 
 
-def test_a_run_ends_with_the_sweep_that_started_it(tmp_path):
+def test_a_run_ends_if_its_sweep_is_gone(tmp_path):
   parent = os.getppid() + 1
   with pytest.raises(errors.ResultsError, match=f'process {parent}, which'):
     _run(_job(), tmp_path, parent=parent)
@@ -397,7 +397,7 @@ def _checkpoints(path):
 
 
 # `wrong_files_test` has the other ways in which a checkpoint may be wrong.
-def test_a_damaged_checkpoint_is_named_and_the_one_before_goes_on(
+def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
     whole, tmp_path, monkeypatch
 ):
   job = _job()
@@ -419,7 +419,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_goes_on(
   assert _results(path) == _results(whole)
 
 
-def test_without_an_older_checkpoint_a_run_begins_anew(tmp_path, monkeypatch):
+def test_a_run_without_an_older_checkpoint_restarts(tmp_path, monkeypatch):
   job = _job()
   _kill(job, tmp_path, monkeypatch, 25)
   path = tmp_path / job.folder()
@@ -430,7 +430,7 @@ def test_without_an_older_checkpoint_a_run_begins_anew(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize('where', ['checkpoint', 'lines', 'episodes'])
-def test_a_full_disk_is_said_so_and_nothing_is_lost(
+def test_a_full_disk_is_reported_and_nothing_is_lost(
     whole, tmp_path, monkeypatch, where
 ):
   job = _job()

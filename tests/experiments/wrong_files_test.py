@@ -138,7 +138,7 @@ def _complaint(
         (probes.PROBE, _CHECKPOINT),
     ],
 )
-def test_a_file_of_another_kind_says_what_it_holds(
+def test_the_error_on_a_file_of_another_kind_names_both_kinds(
     sweep, monkeypatch, name, held
 ):
   data = (sweep / 'own' / held).read_bytes()
@@ -149,7 +149,7 @@ def test_a_file_of_another_kind_says_what_it_holds(
 @pytest.mark.parametrize(
     'name', [_CHECKPOINT, training.LEARNER, training.TRACE]
 )
-def test_a_file_of_another_run_names_both_configurations(
+def test_the_error_on_a_file_of_another_run_names_both_configurations(
     sweep, monkeypatch, name
 ):
   data = (sweep / 'other' / name).read_bytes()
@@ -173,7 +173,7 @@ def test_a_file_of_another_run_names_both_configurations(
         (probes.PROBE, 'flipped'),
     ],
 )
-def test_a_damaged_file_says_what_was_expected(
+def test_the_error_on_a_damaged_file_names_the_expected_kind(
     sweep, monkeypatch, name, damage
 ):
   data = bytearray((sweep / 'own' / name).read_bytes())
@@ -189,7 +189,7 @@ def test_a_damaged_file_says_what_was_expected(
   assert f'{len(data)} bytes are no {_HOLDS[name]}, or a damaged' in message
 
 
-def test_a_learner_that_does_not_fit_names_its_file(
+def test_the_error_on_a_learner_that_does_not_fit_names_its_file(
     sweep, tmp_path, monkeypatch
 ):
   job = _job(_experiment())
@@ -210,7 +210,7 @@ def test_a_learner_that_does_not_fit_names_its_file(
     training.load_learner(job, tmp_path, batch)
 
 
-def test_an_archive_of_a_run_is_no_snapshot(sweep):
+def test_an_archive_of_a_run_is_refused_as_a_snapshot(sweep):
   data = (sweep / 'own' / training.LEARNER).read_bytes()
   with pytest.raises(
       errors.StateLayoutError,

@@ -50,12 +50,12 @@ class _Nothing(agent_server.Service):
     'address',
     ['socket', 'unix:socket', 'unix:/' + 'x' * 200, 'localhost:http', ':1'],
 )
-def test_an_address_that_is_none_is_refused(address):
+def test_a_wrong_address_is_refused(address):
   with pytest.raises(errors.SpecError, match='address: '):
     agent_server.Server(_Nothing(), address).start()
 
 
-def test_a_folder_that_others_may_enter_is_refused(tmp_path):
+def test_a_folder_open_to_others_is_refused(tmp_path):
   tmp_path.chmod(0o755)
   with pytest.raises(errors.SpecError, match='mode 0755; allowed is 0700'):
     agent_server.Server(_Nothing(), f'unix:{tmp_path}/socket').start()
@@ -69,7 +69,7 @@ def test_a_link_to_a_folder_is_refused(tmp_path):
 
 
 @_is_root
-def test_a_folder_of_somebody_else_is_refused(tmp_path):
+def test_a_folder_of_another_user_is_refused(tmp_path):
   (tmp_path / 'theirs').mkdir(mode=0o700)
   os.chown(tmp_path / 'theirs', _NOBODY, _NOBODY)
   address = f'unix:{tmp_path}/theirs/socket'
@@ -79,7 +79,7 @@ def test_a_folder_of_somebody_else_is_refused(tmp_path):
 
 
 @_is_root
-def test_a_folder_is_for_the_group_of_whoever_connects_now(tmp_path):
+def test_a_folder_belongs_to_the_group_of_the_current_client(tmp_path):
   folder = tmp_path / 'own'
   for group in (_NOBODY, _NOBODY - 1):
     with sockets.prepared(f'unix:{folder}/socket', (_NOBODY, group)):
@@ -92,18 +92,18 @@ def test_a_folder_is_for_the_group_of_whoever_connects_now(tmp_path):
       pass
 
 
-def test_a_port_is_not_for_one_user_alone():
+def test_a_port_cannot_be_limited_to_one_user():
   with pytest.raises(errors.SpecError, match='anybody could connect'):
     agent_server.Server(_Nothing(), 'localhost:0', owner=(1, 1)).start()
 
 
 @_is_root
-def test_nothing_can_be_kept_from_root():
+def test_an_agent_cannot_be_root():
   with pytest.raises(errors.SpecError, match='is root'):
     agent_process.owner_of('root')
 
 
-def test_a_socket_is_its_users_alone(serving):
+def test_a_socket_is_open_to_its_user_only(serving):
   path = sockets.path_of(serving.address)
   assert path.parent.stat().st_mode & 0o777 == 0o700
   assert path.stat().st_mode & 0o777 == 0o600
@@ -116,7 +116,7 @@ def test_an_address_in_use_is_refused(serving):
     client.join()
 
 
-def test_a_socket_that_a_killed_server_left_is_taken_over(tmp_path):
+def test_the_socket_of_a_killed_server_is_reused(tmp_path):
   tmp_path.chmod(0o700)
   with socket.socket(socket.AF_UNIX) as killed:
     killed.bind(str(tmp_path / 'socket'))
@@ -140,7 +140,7 @@ def test_a_port_of_this_machine_can_be_served():
   thread.join()
 
 
-def test_what_breaks_off_an_answer_leaves_nobody_waiting(tmp_path):
+def test_an_interrupted_answer_does_not_block_the_exit(tmp_path):
   # Python waits for the threads of pools when it ends.
   program = f"""
 import threading

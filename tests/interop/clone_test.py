@@ -122,11 +122,11 @@ def test_a_program_of_another_user_predicts_nothing():
     _check_that_only_the_salt_is_missing(output, report.episodes)
 
 
-def test_no_seed_begins_as_a_served_world_does(run):
+def test_no_seed_has_the_start_of_a_served_world(run):
   assert clones.find_seeds(run.episodes[0], range(500)) == []
 
 
-def test_a_seed_without_a_salt_is_found_and_predicts_everything():
+def test_a_seed_without_a_salt_can_be_found():
   with served.in_thread(lambda: clones.make(234)) as serving:
     with served.Client(serving.address) as client:
       episodes = clones.play(client.env())
@@ -192,7 +192,7 @@ def test_a_tier_for_other_users_needs_a_salt(monkeypatch):
 
 
 @_is_root
-def test_a_folder_of_another_user_takes_no_results(tmp_path):
+def test_a_folder_of_another_user_is_refused(tmp_path):
   output = tmp_path / 'theirs'
   output.mkdir()
   os.chown(output, _NOBODY, _NOBODY)
@@ -205,7 +205,7 @@ def test_a_folder_of_another_user_takes_no_results(tmp_path):
 # A run that is repeated.
 
 
-def test_a_run_is_repeated_by_its_record(tmp_path):
+def test_a_record_repeats_a_run(tmp_path):
   first, second = tmp_path / 'first', tmp_path / 'second'
   design = ('--design=online_imitation', '--set=providers.0.policy=random')
   episodes = _serve(first, *_FLAGS, *design)
@@ -255,7 +255,7 @@ def test_a_record_serves_its_twin(tmp_path):
   assert seed.salt == small.SALT
 
 
-def test_other_versions_than_recorded_are_named(tmp_path, caplog):
+def test_versions_that_differ_from_the_record_are_named(tmp_path, caplog):
   record = small.write_served_run(tmp_path)
   content = json.loads(record.read_text())
   del content['checksum']
@@ -271,7 +271,7 @@ def test_other_versions_than_recorded_are_named(tmp_path, caplog):
 @pytest.mark.parametrize(
     'flag', ['domain', 'task', 'design', 'seed', 'max_steps']
 )
-def test_what_a_record_decides_is_no_flag_beside_it(flag):
+def test_flags_that_a_record_decides_are_refused(flag):
   value = '1' if flag in ('seed', 'max_steps') else 'collect_apples'
   with flagsaver.flagsaver():
     flags.FLAGS(['serve', '--output=x', '--repeat=y', f'--{flag}={value}'])

@@ -46,7 +46,7 @@ def _example():
   return block
 
 
-def test_the_agent_of_the_page_needs_nothing_of_this_package(tmp_path):
+def test_the_documented_agent_does_not_import_this_package(tmp_path):
   agent = tmp_path / 'agent.py'
   agent.write_text(_IMPORTS_ARE_IMPOSSIBLE + _example())
   output = tmp_path / 'results'
@@ -82,7 +82,7 @@ def _serve(*flags):
   )  # fmt: skip
 
 
-def test_an_agent_that_ends_too_early_is_told_of_in_one_line(tmp_path):
+def test_an_agent_that_ends_early_gives_one_line(tmp_path):
   output = tmp_path / 'results'
   ran = _serve(
       f'--output={output}',
@@ -109,9 +109,7 @@ def test_an_agent_that_ends_too_early_is_told_of_in_one_line(tmp_path):
         (['--output=x', '--repeat=y', '--seed=0'], '--seed has no effect with'),
     ],
 )
-def test_what_is_wrong_with_a_command_is_said_in_one_line(
-    monkeypatch, flags, complaint
-):
+def test_a_wrong_command_is_refused_in_one_line(monkeypatch, flags, complaint):
   # These would change the process of the tests.
   monkeypatch.setattr(served_evaluation, 'hide_from_debuggers', lambda: None)
   monkeypatch.setattr(os, 'umask', lambda mode: mode)
@@ -120,7 +118,7 @@ def test_what_is_wrong_with_a_command_is_said_in_one_line(
   assert complaint in ended.stderr.splitlines()[-1]
 
 
-def test_a_command_that_cannot_start_is_told_of(tmp_path):
+def test_a_command_that_cannot_start_is_reported(tmp_path):
   ran = _serve(f'--output={tmp_path / "r"}', '--agent_command=/no/such/agent')
   assert ran.returncode == 2
   assert 'cannot start' in ran.stderr.splitlines()[-1]
@@ -134,7 +132,7 @@ def _start_agent(command, log):
   return agent, ended
 
 
-def test_an_agent_has_ended_though_its_children_say_something(tmp_path):
+def test_an_agent_has_ended_though_a_child_still_runs(tmp_path):
   with open(tmp_path / 'log', 'wb') as log:
     # A session of its own outlives the agent's group.
     agent, ended = _start_agent(
@@ -148,7 +146,7 @@ def test_an_agent_has_ended_though_its_children_say_something(tmp_path):
   os.kill(child, signal.SIGKILL)  # It is still there.
 
 
-def test_the_log_of_an_agent_has_an_end(tmp_path, monkeypatch):
+def test_the_log_of_an_agent_is_limited(tmp_path, monkeypatch):
   monkeypatch.setattr(agent_process, 'MAX_LOG_BYTES', 1000)
   monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
   program = "for i in range(9): print('x' * 100_000, flush=True)"
@@ -173,7 +171,7 @@ def test_a_log_that_cannot_be_written_does_not_stop_an_agent(
   assert 'the log of the agent ends here' in caplog.text
 
 
-def test_an_agent_that_does_not_want_to_end_is_ended(tmp_path):
+def test_an_agent_that_ignores_sigterm_is_killed(tmp_path):
   agent = tmp_path / 'agent.py'
   stubborn = (
       'import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n'
@@ -190,7 +188,7 @@ def test_an_agent_that_does_not_want_to_end_is_ended(tmp_path):
   assert 'stays' in (output / 'agent.log').read_text()
 
 
-def test_a_server_that_is_asked_to_end_writes_down_what_there_is(tmp_path):
+def test_a_terminated_server_writes_its_results(tmp_path):
   with served.in_process(tmp_path / 'results') as program:
     with served.Client(program.address) as client:
       client.join()
@@ -207,7 +205,7 @@ def test_a_server_that_is_asked_to_end_writes_down_what_there_is(tmp_path):
 
 @_is_linux
 @_is_root
-def test_a_client_of_another_user_makes_tier_t2(tmp_path):
+def test_a_client_of_another_user_gives_tier_t2(tmp_path):
   with served.in_process(
       tmp_path / 'results', '--agent_user=nobody', '--max_steps=3'
   ) as program:
@@ -258,7 +256,7 @@ os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 @_is_linux
 @_is_root
 @pytest.mark.parametrize(('how', 'status'), [('hide', 13), ('show', 0)])
-def test_the_memory_of_a_world_is_not_for_others_of_the_same_user(how, status):
+def test_the_memory_of_a_world_is_closed_to_the_same_user(how, status):
   ran = subprocess.run(
       [_PYTHON, '-W', 'ignore', '-c', _READ_MEMORY, how],
       cwd=served.ROOT, timeout=patience.SECONDS, check=False,

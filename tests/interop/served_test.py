@@ -51,7 +51,7 @@ def test_a_stock_client_gets_what_an_agent_in_the_process_gets(serving):
   assert serving.ends()[:2] == ['timeout', 'timeout']
 
 
-def test_a_second_client_is_turned_away_at_once():
+def test_a_second_client_is_refused_at_once():
   is_asked, may_answer = threading.Event(), threading.Event()
 
   def hold(world):
@@ -83,7 +83,7 @@ def test_a_second_client_is_turned_away_at_once():
     assert first.step().state == pb.RUNNING
 
 
-def test_a_client_that_goes_leaves_an_invalid_episode_and_a_free_world(serving):
+def test_a_disconnect_ends_the_episode_and_frees_the_world(serving):
   first = served.Client(serving.address)
   first.join()
   first.step()
@@ -120,7 +120,7 @@ def _tampering(seed):
     return actions
 
 
-def test_tampering_in_an_episode_that_is_given_up_counts():
+def test_tampering_before_giving_up_counts():
   agent, honest = [], []
   for seed in range(5):
     with served.in_thread(lambda seed=seed: _load_longer(seed)) as serving:
@@ -163,7 +163,7 @@ def test_a_silent_client_loses_the_world():
     patience.until(lambda: serving.ends() == ['disconnect'] * 2)
 
 
-def test_a_client_that_says_something_now_and_then_stays():
+def test_a_client_that_sends_occasionally_stays():
   with served.in_thread() as serving:
     with served.Client(serving.address) as client:
       client.join()
@@ -195,7 +195,7 @@ def test_one_thread_alone_runs_the_world():
     assert threads == {serving.thread.ident}
 
 
-def test_what_is_compressed_is_not_unpacked(serving):
+def test_compressed_messages_are_refused(serving):
   channel = grpc.insecure_channel(
       serving.address, compression=grpc.Compression.Gzip
   )
@@ -229,7 +229,7 @@ def test_after_the_last_episode_the_server_ends():
     assert serving.ends() == ['timeout']
 
 
-def test_a_failing_provider_ends_the_episode_and_says_nothing(caplog):
+def test_a_failing_provider_ends_the_episode_and_reveals_nothing(caplog):
   def fail(world):
     mechanism = world._env.mechanism
     update = mechanism.update_providers

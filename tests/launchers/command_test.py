@@ -89,7 +89,7 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
         (['--output='], '--output: missing'),
     ],
 )
-def test_what_is_wrong_with_a_command_is_said_in_one_line(arguments, complaint):
+def test_a_wrong_command_is_refused_in_one_line(arguments, complaint):
   assert complaint in in_process.complaint(compare, *arguments)
 
 
@@ -128,7 +128,7 @@ def test_seeds_are_a_count_or_a_list(text, seeds):
         '2147483648,', '3,a', '3 4', '3,٣',
     ],
 )  # fmt: skip
-def test_seeds_that_are_none_are_refused_in_one_line(text):
+def test_wrong_seeds_are_refused_in_one_line(text):
   with pytest.raises(errors.SpecError, match='allowed are a count') as raised:
     compare._seeds(text)
   message = str(raised.value)
@@ -171,7 +171,7 @@ def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
 
 
 @pytest.mark.parametrize('name', ['', '.mine', 'a..b', 'a b', 'a/b', '1a'])
-def test_what_is_no_name_of_a_module_is_not_imported(name):
+def test_wrong_names_of_modules_are_refused(name):
   with flagsaver.flagsaver():
     flags.FLAGS(['program', f'--import={name}'])
     with pytest.raises(errors.SpecError, match='not the name of a module'):
@@ -182,7 +182,7 @@ def test_what_is_no_name_of_a_module_is_not_imported(name):
     ('flag', 'values'),
     [(output_flag.OUTPUT, ['', None]), (learning_flags.EXPERIMENT, ['', None])],
 )
-def test_an_empty_flag_is_a_missing_one(flag, values):
+def test_an_empty_flag_counts_as_missing(flag, values):
   for value in values:
     with flagsaver.flagsaver((flag, value)):
       with pytest.raises(errors.SpecError, match=f'--{flag.name}: missing'):
@@ -192,7 +192,7 @@ def test_an_empty_flag_is_a_missing_one(flag, values):
 @pytest.mark.parametrize(
     'empty', ['policies', 'seeds', 'num_episodes', 'channels']
 )
-def test_lists_with_nothing_in_them_are_refused(tmp_path, empty):
+def test_empty_lists_are_refused(tmp_path, empty):
   values = {'num_episodes': 0, 'channels': ('',)}
   settings = small.settings(tmp_path / 'new', **{empty: values.get(empty, ())})
   with pytest.raises(errors.SpecError):
@@ -200,7 +200,7 @@ def test_lists_with_nothing_in_them_are_refused(tmp_path, empty):
   assert not list(tmp_path.iterdir())
 
 
-def test_ones_own_module_is_imported_by_every_launcher(tmp_path):
+def test_every_launcher_imports_the_user_s_module(tmp_path):
   # The register, the provider, the task and the design of the page.
   page = (_ROOT / 'docs' / 'your_own.md').read_text()
   blocks = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
@@ -232,7 +232,7 @@ def test_ones_own_module_is_imported_by_every_launcher(tmp_path):
     }
 
 
-def test_a_sweep_tells_its_runs_what_to_import():
+def test_a_sweep_passes_imports_to_its_runs():
   with flagsaver.flagsaver():
     flags.FLAGS(['program', '--import=one', '--import=two'])
     assert imports_flag.arguments() == ['--import=one', '--import=two']
@@ -240,7 +240,7 @@ def test_a_sweep_tells_its_runs_what_to_import():
       imports_flag.load()
 
 
-def test_where_nothing_renders_exploring_ends_with_one_line(tmp_path):
+def test_exploring_without_a_renderer_gives_one_line(tmp_path):
   ran = _run(
       f'--video={tmp_path / "film.mp4"}',
       module='realab_suite.launchers.explore', MUJOCO_GL='disable',
@@ -309,7 +309,7 @@ def test_a_renderer_that_works_is_chosen(monkeypatch):
   assert os.environ['MUJOCO_GL'] == 'egl'
 
 
-def test_missing_modules_are_named_with_what_mends_it():
+def test_missing_modules_are_named_with_the_command_to_install_them():
   assert requirements.missing('json', 'os') is None
   problem = requirements.missing('json', 'no_such_module')
   assert problem.startswith('no_such_module not installed; run: ')

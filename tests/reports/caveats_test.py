@@ -12,7 +12,7 @@ from realab_suite.reports import sweep_results
 from tests.reports import pages
 
 
-def test_few_seeds_are_said_to_be_few(folder):
+def test_a_report_on_few_seeds_gives_no_verdict(folder):
   sweep = sweep_results.load(folder)
   figures = numbers.compute(sweep)
   cautions = caveats.caveats(sweep, figures)
@@ -58,7 +58,7 @@ def test_a_favourable_verdict_comes_with_its_bound(five, tmp_path):
   assert 'up to 46 %' in (tmp_path / html_page.MARKDOWN).read_text()
 
 
-def test_episodes_that_are_given_up_count_and_forbid_an_all_clear(
+def test_episodes_given_up_count_and_forbid_a_favourable_verdict(
     own_five, tmp_path
 ):
   pages.give_up(own_five, 'decoupled', 3)
@@ -98,7 +98,7 @@ def test_a_run_whose_episodes_are_all_given_up_has_figures(own_five, tmp_path):
   assert html_page._clips([figures['decoupled']], pages.quiet) == ([], None)
 
 
-def test_failed_episodes_do_not_count_and_forbid_an_all_clear(
+def test_failed_episodes_are_left_out_and_forbid_a_favourable_verdict(
     own_five, tmp_path
 ):
   pages.give_up(own_five, 'decoupled', 3, b'divergence')
@@ -111,7 +111,7 @@ def test_failed_episodes_do_not_count_and_forbid_an_all_clear(
   assert 'Episodes that failed, as where the physics diverged: ' in text
 
 
-def test_intervals_in_a_report_are_possible(five):
+def test_intervals_in_a_report_stay_in_bounds(five):
   figures = numbers.compute(sweep_results.load(five))
   for one in figures.values():
     assert one.summary.true_return.bounds == (0.0, 18.0)
@@ -127,7 +127,7 @@ def test_intervals_in_a_report_are_possible(five):
       assert share.high <= 1
 
 
-def test_rows_that_name_no_largest_return_are_said_to(own_five, tmp_path):
+def test_rows_without_a_largest_return_give_a_caveat(own_five, tmp_path):
   for seed in range(5):
     pages.spoil(
         own_five, 'decoupled', seed, training.EPISODES,
@@ -139,7 +139,7 @@ def test_rows_that_name_no_largest_return_are_said_to(own_five, tmp_path):
   assert 'is not in the rows of decoupled. Intervals of their true' in text
 
 
-def test_overlapping_intervals_are_said_to_show_nothing(five):
+def test_overlapping_intervals_give_a_caveat(five):
   sweep = sweep_results.load(five)
   figures = numbers.compute(sweep)
   said = ' '.join(caveats.caveats(sweep, figures))

@@ -15,7 +15,7 @@ def _learning(observed):
 @pytest.mark.parametrize(
     ('observed', 'is_symlog'), [(1.0, False), (99.0, True)]
 )
-def test_an_axis_is_symlog_where_observed_returns_dwarf_true_ones(
+def test_an_axis_is_symlog_if_observed_returns_are_much_larger(
     observed, is_symlog
 ):
   look = charts.styles(['one'])
@@ -23,7 +23,7 @@ def test_an_axis_is_symlog_where_observed_returns_dwarf_true_ones(
   assert ('observed return (units), symlog' in svg) == is_symlog
 
 
-def test_a_curve_has_a_point_for_as_many_steps_as_episodes_take():
+def test_a_curve_has_a_point_per_length_of_an_episode():
   # In twelve steps every world ends an episode; those that end sooner are odd.
   points = [
       (5, 1, 10.0),
@@ -44,7 +44,7 @@ def test_a_curve_has_a_point_for_as_many_steps_as_episodes_take():
   assert charts.curve(odd, 12, fewest=2) == {30: 3.0}
 
 
-def test_a_band_has_the_steps_at_which_all_seeds_that_got_there_are_known():
+def test_a_band_has_the_steps_shared_by_its_seeds():
   one = charts.band(
       {0: {1: 1.0, 2: 9.0, 3: 3.0}, 1: {1: 3.0, 3: 5.0}, 2: {1: 2.0}, 3: {}}
   )
@@ -59,7 +59,7 @@ def test_a_band_is_the_interval_over_seeds():
   assert one.low[0] < 1.0 < 2.0 < one.high[0]
 
 
-def test_designs_look_different_however_many_there_are():
+def test_thirty_designs_have_thirty_styles():
   names = [f'design {i}' for i in range(30)]
   looks = charts.styles(names)
   assert len(set(looks.values())) == 30

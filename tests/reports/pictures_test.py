@@ -57,7 +57,7 @@ def test_plots_of_any_number_of_runs_are_drawn_without_a_warning(
       assert len(image.getcolors(2**24)) > 50
 
 
-def test_where_somebody_went_shows(tmp_path, track):
+def test_a_plot_shows_the_path(tmp_path, track):
   plots.draw_trajectories({'run': track}, tmp_path / 'moved.png')
   track.positions = [track.positions[0]] * len(track.positions)
   plots.draw_trajectories({'run': track}, tmp_path / 'still.png')

@@ -34,7 +34,7 @@ def real(tmp_path_factory):
   return folder
 
 
-def test_a_judged_episode_is_seen_again(real):
+def test_a_replay_repeats_the_episode(real):
   run = sweep_results.load(real).runs['reward']
   row = run.rows[2]
   track = replays.replay(run, row)
@@ -43,14 +43,14 @@ def test_a_judged_episode_is_seen_again(real):
   assert track.observed_return == pytest.approx(row.observed_return)
 
 
-def test_an_episode_that_comes_out_differently_is_not_shown(real):
+def test_a_replay_that_differs_is_refused(real):
   run = sweep_results.load(real).runs['reward']
   row = run.rows[0].model_copy(update={'observed_return': 77.0})
   with pytest.raises(errors.ResultsError, match='came out differently here'):
     replays.replay(run, row)
 
 
-def test_an_episode_without_a_trace_is_not_shown(real):
+def test_a_replay_without_a_trace_is_refused(real):
   run = sweep_results.load(real).runs['reward']
   row = run.rows[0].model_copy(update={'world': 9})
   with pytest.raises(errors.ResultsError, match='there is no trace'):

@@ -30,7 +30,7 @@ from tests.reports import pages
 _ROOT = pathlib.Path(__file__).parents[2]
 
 
-def test_figures_are_those_of_a_comparison(folder, page):
+def test_figures_equal_those_of_the_comparison(folder, page):
   names = ('reward.apple_seeker', 'reward.random', 'reward', 'reward.secure')
   rows = {name: pages.rows(folder, name) for name in names}
   for name, one in comparison.compare(rows, 'reward.apple_seeker').items():
@@ -51,7 +51,7 @@ def test_figures_are_those_of_a_comparison(folder, page):
       ]
 
 
-def test_the_tampering_gap_is_what_the_twin_gets_more(folder, page, output):
+def test_the_tampering_gap_is_the_difference_to_the_twin(folder, page, output):
   rows = {
       name: pages.rows(folder, name) for name in ('reward', 'reward.secure')
   }
@@ -152,7 +152,7 @@ def test_the_same_results_give_the_same_bytes_in_another_process(
     assert (tmp_path / name).read_bytes() == (output / name).read_bytes()
 
 
-def test_hostile_texts_are_shown_not_obeyed(tmp_path):
+def test_markup_in_texts_is_escaped(tmp_path):
   one = fake_sweep.experiment(
       description='<script>alert(2)</script>', baselines=['random'],
       seeds=[0, 1],
@@ -176,7 +176,7 @@ def test_hostile_names_are_refused(tmp_path):
     sweep_results.load(folder)
 
 
-def test_what_matters_depends_on_how_fine_registers_are(tmp_path):
+def test_the_margin_depends_on_the_scale_of_registers(tmp_path):
   run = fake_sweep.EXPERIMENT['runs']['decoupled']
   for scale, margin, words in (
       (0.1, '0.05 m', 'less than matters'), (0.01, '0.005 m', 'tampers more'),
@@ -226,7 +226,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   assert cells[2] == result_tables.interval_text(paired.true_return_gained)
 
 
-def test_runs_whose_episodes_all_failed_are_said_to_have(own_folder, tmp_path):
+def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):
   for run in ('decoupled', 'reward.apple_seeker'):
     for seed in (0, 1, 2):
       pages.spoil(
@@ -252,7 +252,7 @@ def test_a_sweep_that_has_only_begun_has_a_report(tmp_path):
   assert 'reward.secure, seed 2: not begun' in text
 
 
-def test_calibration_seeds_are_said_to_be_none_to_report(tmp_path):
+def test_a_report_on_calibration_seeds_says_so(tmp_path):
   one = fake_sweep.experiment(
       runs={'reward': fake_sweep.EXPERIMENT['runs']['reward']}
   )
@@ -262,12 +262,12 @@ def test_calibration_seeds_are_said_to_be_none_to_report(tmp_path):
   assert 'With one seed, intervals are over its episodes' in text
 
 
-def test_a_folder_of_no_sweep_is_refused(tmp_path):
+def test_a_folder_without_a_sweep_is_refused(tmp_path):
   with pytest.raises(errors.ResultsError, match=r'no sweep\.json'):
     sweep_results.load(tmp_path)
 
 
-def test_a_description_that_is_none_is_refused(own_folder):
+def test_a_wrong_description_is_refused(own_folder):
   content = {'experiment': 'x', 'jobs': []}
   storage.write_sealed(own_folder / scheduler.SWEEP, content)
   with pytest.raises(errors.ResultsError, match=r'sweep\.json: calibration'):
@@ -293,7 +293,7 @@ def test_a_row_of_another_run_is_refused(own_folder):
     sweep_results.load(own_folder)
 
 
-def test_results_that_were_changed_since_are_refused(own_folder):
+def test_changed_results_are_refused(own_folder):
   path = next(own_folder.glob('reward-1-*')) / training.EPISODES
   lines = path.read_text().splitlines(keepends=True)
   path.write_text(''.join(lines[:-1]))
