@@ -1,4 +1,4 @@
-"""Tests for what is estimated: advantages, scales, and what approval learns."""
+"""Tests of estimators: advantages, scales, and gradients from approval."""
 
 import hypothesis
 from hypothesis import strategies as st
@@ -45,9 +45,9 @@ def _batch(**columns: list) -> dict[str, np.ndarray]:
             },
             [0.0, -4.0, 0.0, -3.0],
         ),
-        # It was cut off there: the value of what was seen last, 6, counts.
+        # It was cut off there: the value of the last observation, 6, counts.
         ({'is_valid': [True, True, False, True]}, [0.75, -1.0, 0.0, -3.0]),
-        # Somebody began anew in the middle: the second action came to nothing.
+        # A reset in the middle: the second action has no effect.
         ({'is_valid': [True, False, True, True]}, [1.0, 0.0, -0.75, -3.0]),
     ],
 )
@@ -131,7 +131,7 @@ def test_corruption_by_actions_does_not_bias_decoupled_approval(
   honest = _expected_update(logits, approvals, 0 * corruption, queries)
   corrupted = _expected_update(logits, approvals, corruption, queries)
   np.testing.assert_allclose(corrupted, honest, atol=2e-5)
-  # And it is what it should be: the policy gradient of the mean approval.
+  # It equals the policy gradient of the mean approval.
   pi = np.exp(np.asarray(jax.nn.log_softmax(jnp.asarray(logits)), float))
   np.testing.assert_allclose(
       honest, pi * (approvals - pi @ approvals), atol=2e-5

@@ -1,4 +1,4 @@
-"""Tests for learners: they learn toys, go on from a state, refuse bad specs."""
+"""Tests of learners: they learn toys, resume from a state, refuse bad specs."""
 
 from typing import Any
 

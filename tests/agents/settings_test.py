@@ -1,4 +1,4 @@
-"""JAX's settings change nothing about a learner, or are on record.
+"""Tests that settings of JAX do not change a learner, or are recorded.
 
 As a program, it prints a digest of what learners learn, by their names:
 
@@ -116,7 +116,7 @@ def _add(value: Any, hashed: Any) -> None:
 
 
 def _digest(name: str) -> str:
-  """Returns a digest of all that a learner does, and of what it becomes."""
+  """Returns a digest of the actions of a learner and of its state."""
   make_env, spec = _LEARNERS[name]
   env = make_env()
   specs = env.observation_spec(), env.action_spec()

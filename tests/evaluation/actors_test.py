@@ -1,4 +1,4 @@
-"""Tests of actors: what becomes of an index, and what is asked about."""
+"""Tests of actors: indices become actions, and queries are added."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -41,7 +41,7 @@ _ACTION_SET = {'name': 'dmlab_like', 'version': 1}
 
 
 class _Always(policies.Policy):
-  """Chooses the same action for ever, and writes down what it is told."""
+  """A policy of one action; records its inputs."""
 
   def __init__(
       self, index: int, action_set: action_sets.ActionSet | None = None
@@ -202,7 +202,7 @@ def test_an_index_outside_a_query_register_is_not_written():
   env.close()
 
 
-# What is asked about.
+# Queries.
 
 
 @pytest.mark.parametrize('query_policy', [actors.TAKEN_ACTION, None])
@@ -305,7 +305,7 @@ def test_a_policy_that_sets_unknown_elements_is_refused():
   env.close()
 
 
-# What a policy is told.
+# Inputs of a policy.
 
 
 def test_a_policy_is_notified_of_the_start_of_an_episode(continuous):

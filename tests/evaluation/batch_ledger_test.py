@@ -1,4 +1,4 @@
-"""The ledger of a batch is the ledgers of its worlds."""
+"""Tests of the batch ledger: it equals the ledgers of its worlds."""
 
 import numpy as np
 import pytest
@@ -114,7 +114,7 @@ def test_snapshots_move_between_ledger_and_batch_ledger():
   assert alone.last == together.episodes(1)[-1]
   assert [episode.num_steps for episode in alone.episodes] == [3, 4]
   batch.step(np.zeros((2, 6)))
-  # What one of them hears, the other does not.
+  # From here on the two are independent.
   assert (alone.last.num_steps, together.episodes(1)[-1].num_steps) == (4, 5)
   batch.close()
 

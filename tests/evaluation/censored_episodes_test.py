@@ -285,7 +285,7 @@ def test_a_run_without_registers_is_its_own_baseline():
   assert summary.true_return.estimate == 3.0
 
 
-# C42: what must not matter.
+# C42: repeated episodes.
 
 
 def test_a_repeated_episode_without_corruption_counts_once():
@@ -300,7 +300,7 @@ def test_a_repeated_episode_without_corruption_counts_once():
 
 
 def test_conflicting_rows_of_an_episode_are_refused():
-  # One of them is wrong, and nothing says which.
+  # One of them is wrong, and there is no way to find out which.
   ours = episodes.run(4.0, 1.0)
   ours.append(dataclasses.replace(ours[5], true_return=99.0))
   with pytest.raises(errors.ResultsError, match=r"'ours'.*\(2, 0, 1\)"):

@@ -1,4 +1,4 @@
-"""Tests of comparisons: what returns and corruption say together."""
+"""Tests of comparisons of runs by true return and corruption."""
 
 import dataclasses
 

@@ -15,8 +15,8 @@ from tests.evaluation import rooms
 
 # C07: a golden table, worked out by hand.
 #
-# A bead that nobody pushes, and registers of planar blocks, which stay where
-# they are. In each scenario somebody moves blocks along the axis of a register,
+# A bead that is not pushed, and registers of planar blocks, which stay where
+# they are. Each scenario moves blocks along the axis of a register,
 # by so many of its units, either before a control step or at its end: after the
 # provider has written, before the agent reads.
 
@@ -34,7 +34,7 @@ class _Move:
 
 @dataclasses.dataclass(frozen=True)
 class _Scenario:
-  """What happens, and the figures of one of the registers."""
+  """Events of an episode, and the figures of one of the registers."""
 
   design: Mapping[str, Any]
   true_rewards: Sequence[float]
@@ -51,7 +51,7 @@ class _Scenario:
 
 
 def _growth_of(name: str, role: str, **options: Any) -> dict[str, Any]:
-  """Returns a design whose feedback is by how much a register has grown."""
+  """Returns a design whose feedback is the growth of a register."""
   other = {
       'kind': 'two_block',
       'role': role,
@@ -96,7 +96,7 @@ _SCENARIOS = {
         [_Move(1, _BASE, -1.5), _Move(3, _BASE, 1.5)],
         1, 12, 4, 4, 0, 0.75, 0,
     ),
-    # The next write mends it before anybody reads.
+    # The next write restores it before it is read.
     'the offset is moved in time': _Scenario(
         rooms.design(3), [0, 0], [_Move(2, _OFFSET, 5)], 0, 6, 3, 3, 0, 0, 0
     ),
@@ -121,7 +121,7 @@ _SCENARIOS = {
         rooms.design(12), [0], [_Move(1, _OFFSET, 5, True)],
         0, 17, 2, 2, 0, 0, 2.5,
     ),
-    # The last step's end is what the agent reads: 3, then 3 - 3.
+    # The agent reads the end of the last step: 3, then 3 - 3.
     'the base is moved at the very end': _Scenario(
         rooms.design(3), [0, 0], [_Move(2, _BASE, 3, True)], 0, 3, 3, 3, 0, 1, 0
     ),
@@ -137,7 +137,7 @@ _SCENARIOS = {
         0, 15, 2, 2, 0, 0.5, 0,
         register='bonus',
     ),
-    # Nobody mends anything: 5, then 7, 7 and 6.
+    # Nothing is restored: 5, then 7, 7 and 6.
     'no provider': _Scenario(
         rooms.design(initial=5),
         [0, 0, 0],

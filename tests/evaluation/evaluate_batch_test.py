@@ -1,4 +1,4 @@
-"""What a batch is judged by is what its worlds alone are judged by."""
+"""Tests of batch evaluation: results equal those of single worlds."""
 
 import types
 

@@ -15,7 +15,7 @@ from realab_suite.evaluation import evaluate
 from tests.engine import helpers
 from tests.evaluation import rooms
 
-# What is counted.
+# Counts.
 
 
 def test_a_result_holds_the_episode_and_its_counts():
@@ -131,11 +131,11 @@ def test_a_callable_gets_time_steps_and_its_actions_are_taken():
   env.close()
 
 
-# Who is told.
+# Notifications.
 
 
 class _Order(events.EventSink):
-  """Writes down who was told of what, in order."""
+  """Records the events of an episode in order."""
 
   def __init__(self, heard: list[Any]) -> None:
     self.heard = heard

@@ -1,4 +1,4 @@
-"""Incentives: by hand, by their properties, and in a world with a register."""
+"""Tests of incentives: by hand, by properties, and in a world."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -104,7 +104,7 @@ def _probe(corruption, offset=None, scale=0.1, **probabilities):
 
 @pytest.fixture(scope='module', name='pushed')
 def _pushed():
-  """States in which a block is pushed, and what was probed in them."""
+  """States in which a block is pushed, and their probe."""
   batch = _load()
   states = incentives.collect(
       batch, _pusher(batch), 'reward', num_states=40, reach=0.45

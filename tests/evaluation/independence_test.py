@@ -25,7 +25,7 @@ _WORLDS = [
 ]
 
 
-# Which state an episode begins in.
+# The first state of an episode.
 
 
 class _Starts(events.EventSink):
@@ -155,11 +155,11 @@ def test_keys_of_policies_follow_from_the_episode_number():
   assert len({key for keys in together.keys for key in keys}) == 3 * 8
 
 
-# C05: looking is free.
+# C05: sinks change nothing.
 
 
 class _Nosy(events.EventSink):
-  """Looks at everything that there is to be looked at."""
+  """A sink that reads everything it can."""
 
   def __init__(self, env: environment.Environment) -> None:
     self._env = env
@@ -183,7 +183,7 @@ class _Nosy(events.EventSink):
 def _alone(
     env: environment.Environment, policy: Any, number: int
 ) -> list[bytes]:
-  """Returns what an agent gets when nobody listens, and where things end."""
+  """Returns all that an agent gets without sinks, and the final state."""
   transcript: list[bytes] = []
   for _ in range(number):
     time_step = env.reset()

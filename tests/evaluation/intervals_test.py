@@ -1,4 +1,4 @@
-"""Tests of intervals over seeds, of their text, and that they are possible."""
+"""Tests of intervals over seeds: text, bounds and coverage."""
 
 import dataclasses
 import math
@@ -369,7 +369,7 @@ class TestErrors:
 
 
 class TestCoverage:
-  """C43 in small; the bounds are what 300 repetitions can tell."""
+  """C43 in small, with bounds for 300 repetitions."""
 
   @pytest.mark.parametrize(
       'data',

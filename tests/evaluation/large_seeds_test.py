@@ -1,4 +1,4 @@
-"""Seeds of any size are accepted wherever seeds are stored."""
+"""Tests that seeds of any size can be stored."""
 
 import contextlib
 

@@ -1,4 +1,4 @@
-"""Tests of the ledger: what is heard, and what every read adds up to."""
+"""Tests of the ledger: its entries, and the parts of each reading."""
 
 from typing import Any
 
@@ -54,7 +54,7 @@ def _step(*records: Any, reward: float = 0.0) -> events.Step:
   return events.Step(records, np.array(reward))
 
 
-# What is heard.
+# Entries.
 
 
 def test_every_write_and_read_is_kept_in_order_with_its_control_step():
@@ -146,7 +146,7 @@ def test_the_end_of_an_unknown_episode_is_ignored():
   assert not ledger.episodes
   ledger.episode_started(_start(), None)
   ledger.episode_ended(events.End.TERMINATED)
-  # It left, came back in the middle of another episode, and heard it end.
+  # It was removed, added again in another episode, and notified of its end.
   ledger.episode_ended(events.End.ABANDONED)
   assert ledger.last.end is events.End.TERMINATED
 
@@ -200,11 +200,11 @@ def test_the_step_in_which_something_raises_is_not_counted(failing):
 _APART = ('registers.reward.place=[2, 2]', 'registers.score.place=[2, -3]')
 
 
-# C40: what every read adds up to.
+# C40: each reading is a sum of its parts.
 
 
 class _Everybody(events.EventSink):
-  """Has an evaluator read every register, too."""
+  """Reads every register as an evaluator."""
 
   def __init__(self, ledger: ledgers.Ledger, feedback: Any) -> None:
     self._ledger = ledger
@@ -225,7 +225,7 @@ class _Everybody(events.EventSink):
 
 
 def _shoving(env: environment.Environment) -> actors.PlainPolicy:
-  """Returns the random policy, with somebody else about who moves blocks."""
+  """Returns the random policy, which also moves blocks at random."""
   actor = actors.make(policies.make('random'), env)
   random = np.random.default_rng(0)
   blocks = [b for r in env.mechanism.registers.values() for b in r.blocks]

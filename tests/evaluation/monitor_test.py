@@ -1,4 +1,4 @@
-"""The monitor says of every episode what the ledger says, and keeps nothing."""
+"""Tests of the training monitor: figures of the ledger at a constant size."""
 
 import json
 

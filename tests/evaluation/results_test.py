@@ -1,4 +1,4 @@
-"""Tests of result rows: what is written comes back, and says enough."""
+"""Tests of result rows: writing, reading, damage and provenance."""
 
 from collections.abc import Callable
 import dataclasses
@@ -108,7 +108,7 @@ def _write(path: pathlib.Path, *rows: results.EpisodeRow) -> None:
       writer.write(row)
 
 
-# There and back.
+# Writing and reading.
 
 
 def test_a_row_holds_every_field_of_a_result():
@@ -210,7 +210,7 @@ def test_numbers_of_numpy_are_written_as_numbers(tmp_path):
   assert line['facts'] == {'apples_eaten': 2.0}
 
 
-# What is not a number.
+# Missing and infinite numbers.
 
 
 def test_no_corruption_is_nan_in_python_and_null_in_a_file(tmp_path):
@@ -241,7 +241,7 @@ def _measured(**changes: Any) -> metrics.RegisterMetrics:
 def test_no_number_is_lost_between_writing_and_reading(tmp_path, changes, bad):
   # A task may reward with nan, and a register kind may read as inf. Such a row
   # may be refused when it is made or written, or it may come back as it was;
-  # a file that nobody can read is worse than either.
+  # an unreadable file is worse than either.
   path = tmp_path / 'rows'
   try:
     row = _row(**changes(bad))
@@ -392,7 +392,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content):
   assert str(path) in str(raised.value)
 
 
-# What a row says of where it comes from.
+# Provenance.
 
 
 def test_a_row_names_the_versions_that_it_depends_on():
@@ -413,7 +413,7 @@ def test_a_row_names_its_units():
   row = _row()
   assert row.units['corruption'].startswith('metres')
   assert {'true_return', 'observed_return', 'registers.*'} < set(row.units)
-  # Of its own: nobody changes those of the next row.
+  # Each row has a copy of its own.
   row.units['corruption'] = 'miles'
   assert _row().units['corruption'].startswith('metres')
 

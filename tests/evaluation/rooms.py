@@ -68,7 +68,7 @@ def design(
 
 
 class Oops(Exception):
-  """What a test raises on purpose."""
+  """An exception that a test raises on purpose."""
 
 
 def raising(env: environment.Environment, step: int) -> Any:

@@ -1,4 +1,4 @@
-"""Signed corruption: which direction pays, and how it went while learning."""
+"""Tests of signed corruption, and of its means over parts of learning."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Tests of the tampering verdict: what it needs, and what it claims."""
+"""Tests of the tampering verdict: outcomes, bounds and advice."""
 
 import math
 
@@ -319,7 +319,7 @@ class TestCensoredEpisodes:
 
 
 class TestMetamorphic:
-  """C42: changes of the data that must not change what is said."""
+  """C42: changes of the data that must not change the verdict."""
 
   def test_pairing_matters(self):
     treatment, baseline = _draw(0), _draw(0)[::-1]
@@ -333,7 +333,7 @@ class TestMetamorphic:
 
 
 class TestRates:
-  """C43 in small; the bounds are what 300 repetitions can tell."""
+  """C43 in small, with bounds for 300 repetitions."""
 
   @pytest.mark.parametrize('data', ['skewed', 'zero-inflated seeds'])
   def test_an_agent_like_the_baseline_is_rarely_accused(self, data):

@@ -1,4 +1,4 @@
-"""Streams of writes and reads, and two ways to say what comes of them.
+"""Streams of writes and reads, and two ways to compute their metrics.
 
 One is an oracle that asks of every read which write came last before it, by
 brute force; the other is a table of cases that were worked out by hand.
@@ -188,7 +188,7 @@ def _figures(*values: Any) -> dict[str, Any]:
   return dict(zip(names, values, strict=True))
 
 
-# The episode, its end, and what is to come out of it.
+# The episode, its end, and the expected figures.
 BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
     'never read': (
         [[initial(0)], [write(1)], [write(2)]],
@@ -216,7 +216,7 @@ BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
         [[read(9, 1, 1)], [read(7), write(3), read(3)]],
         events.End.TIMEOUT,
         _figures(
-            # agent_reading_sum: 7 + 3: not what the reset showed.
+            # agent_reading_sum: 7 + 3, without the reading of the reset.
             0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
             3.0, 10.0, 1, 3, 2, 1, 1.0,
         ),
@@ -309,7 +309,7 @@ BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
             2.0, 2.5, 2, 2, 0, 2, 1.0,
         ),
     ),
-    # The reset came before anybody had read what was written.
+    # The reset came before the value was read.
     'reset in the middle of a step': (
         [[initial(0), read(0)], [write(8)]],
         events.End.ABANDONED,

@@ -1,4 +1,4 @@
-"""What is kept of an episode is enough to see it again."""
+"""Tests of traces: an episode can be repeated from its trace."""
 
 import numpy as np
 

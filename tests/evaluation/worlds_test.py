@@ -1,4 +1,4 @@
-"""Policies act on streams of their own in every world."""
+"""Test that policies have a random stream of their own in each world."""
 
 from realab_suite import policies
 from realab_suite import suite

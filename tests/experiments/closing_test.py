@@ -1,4 +1,4 @@
-"""Whatever is opened is closed when something after it fails.
+"""Tests that environments and files are closed after a failure.
 
 Environments are counted: those that were made, less those that were closed. A
 batch and a fork hold one each.
@@ -46,11 +46,11 @@ _DESIGN = 'instantaneous_reward'
 
 
 class Failed(Exception):
-  """What a part of the program raises here."""
+  """An exception that a part of the program raises."""
 
 
 class Stopped(BaseException):
-  """What ctrl-C raises, as far as `except Exception` is concerned."""
+  """An exception that, like ctrl-C, `except Exception` does not catch."""
 
 
 class Environments:
@@ -233,7 +233,7 @@ def _run(job: jobs.Job, output: pathlib.Path) -> None:
 
 _BATCH = batch_environment.BatchEnvironment
 _LEARNER = fake_learner.FakeLearner
-# What fails when a learner is trained and judged, and after how many calls.
+# Functions that fail in training and evaluation, and after how many calls.
 _PLACES: list[tuple[Any, str, int]] = [
     (training, 'make_learner', 0),
     (monitors.TrainingMonitor, '__init__', 0),

@@ -1,4 +1,4 @@
-"""A file of a finished job that was damaged is noticed, by sweep and report."""
+"""Tests that sweeps and reports refuse damaged files of finished jobs."""
 
 from collections.abc import Callable
 import functools
@@ -32,7 +32,7 @@ _FILES = [
 
 
 def _flip(path: pathlib.Path) -> None:
-  """Flips a bit of a digit: the file can still be read as what it was."""
+  """Flips a bit of a digit, so that the file can still be parsed."""
   data = bytearray(path.read_bytes())
   digits = [i for i, byte in enumerate(data) if byte in b'2468']
   data[digits[len(digits) // 2]] ^= 1

@@ -1,4 +1,4 @@
-"""A run that continues on another machine says so, or is refused."""
+"""Tests of runs that continue on another machine, and of its description."""
 
 import functools
 import json
@@ -94,7 +94,7 @@ def _on(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def _results(output: pathlib.Path) -> dict[str, bytes]:
-  """Returns all results but what says when and where they came about."""
+  """Returns all results except times and machines."""
   folder = output / _job().folder()
   return {
       path.name: path.read_bytes()

@@ -199,7 +199,7 @@ def test_a_forged_done_file_leads_nowhere(tmp_path: pathlib.Path):
 
 
 def test_no_module_loads_a_model_from_a_file_or_string():
-  # What a design or an experiment says never becomes MJCF, and no `.mjb` is
+  # No text of a design or an experiment becomes MJCF, and no `.mjb` is
   # ever loaded: includes, meshes and entities cannot lead anywhere.
   reads = re.compile(
       r'mjcf\.from_|from_xml_(path|string)|from_binary_path|mj_loadXML'
@@ -211,5 +211,5 @@ def test_no_module_loads_a_model_from_a_file_or_string():
       for path in package.rglob('*.py')
       if (match := reads.search(path.read_text(encoding='utf-8')))
   }
-  # A box that tells whether anything renders, in a process of its own.
+  # A box that tests a renderer, in a process of its own.
   assert found in ({}, {'renderers.py': 'from_xml_string'})

@@ -1,4 +1,4 @@
-"""A learner is asked what it would do beside a register, and it is kept."""
+"""Tests of probes of learners beside a register."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Tests of the record of a served run: who may read it, and what it repeats."""
+"""Tests of the record of a served run: permissions, contents and errors."""
 
 import json
 import os

@@ -43,7 +43,7 @@ def rows(folder: pathlib.Path) -> list[results.EpisodeRow]:
 
 
 def description(folder: pathlib.Path) -> dict[str, Any]:
-  """Returns what an experiment says of itself."""
+  """Returns the description of an experiment."""
   return json.loads((folder / 'run.json').read_text(encoding='utf-8'))
 
 

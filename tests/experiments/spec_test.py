@@ -1,4 +1,4 @@
-"""Experiments say what they are, and what is wrong with them."""
+"""Tests of experiment specs: files, errors and planned jobs."""
 
 import importlib.resources
 import pathlib

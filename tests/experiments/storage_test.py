@@ -1,4 +1,4 @@
-"""Folders of runs: what they refuse, and what they say."""
+"""Tests of folders of runs: lines, locks, checkpoints and errors."""
 
 import errno
 import json
@@ -176,7 +176,7 @@ def test_the_first_difference_is_named_by_its_place():
   )
   assert storage.difference(there, {'d': 0}).startswith('a is {')
   assert storage.difference({}, {'d': 0}) == 'd is None there, 0 here'
-  # One has the key, and says nothing by it.
+  # One has the key, with the value None.
   assert storage.difference({'a': {'b': None}}, {'a': {}}) == (
       "a is {'b': None} there, {} here"
   )

@@ -240,7 +240,7 @@ def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
       yaml.safe_dump({**_SMALL, 'runs': run, 'training': training_})
   )
   program = (
-      # Whoever runs tests in the background may have SIGINT ignored.
+      # SIGINT may be ignored where tests run in the background.
       'import signal\n'
       'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
       'from realab_suite.experiments import scheduler\n'

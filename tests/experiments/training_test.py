@@ -1,4 +1,4 @@
-"""A run that is killed and goes on is a run that was not."""
+"""Tests of runs: results, resuming after a kill, and errors."""
 
 import dataclasses
 import errno
@@ -65,7 +65,7 @@ _SMALL = {
 
 
 class Killed(BaseException):
-  """Ends a run as suddenly as a signal, within this process."""
+  """Ends a run like a signal, within this process."""
 
 
 _make_learner = training.make_learner
@@ -78,7 +78,7 @@ def fake(monkeypatch):
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory):
-  """The folder of the small run that nothing has happened to; read only."""
+  """The folder of the small run without an interruption; read only."""
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(training, 'make_learner', fake_learner.make)
     path, said = _run(_job(), tmp_path_factory.mktemp('whole'))
@@ -278,7 +278,7 @@ def test_a_trained_learner_can_be_loaded(whole, tmp_path):
   batch.close()
 
 
-# ---- Going on ---------------------------------------------------------------
+# ---- Resuming ---------------------------------------------------------------
 
 
 def test_a_run_may_be_killed_again_and_again(whole, tmp_path, monkeypatch):
@@ -364,7 +364,7 @@ def test_a_run_ends_if_its_sweep_is_gone(tmp_path):
     _run(_job(), tmp_path, parent=parent)
 
 
-# ---- What goes wrong --------------------------------------------------------
+# ---- Errors -----------------------------------------------------------------
 
 
 def test_a_second_launcher_is_refused_with_the_process_of_the_first(tmp_path):

@@ -1,4 +1,4 @@
-"""Errors about files that hold something else than their names say."""
+"""Tests of errors about files whose contents do not fit their names."""
 
 import contextlib
 import pathlib
@@ -70,7 +70,7 @@ def _sweep(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 _NAMES = [_CHECKPOINT, training.LEARNER, training.TRACE, probes.PROBE]
-# The names of what the files hold; the header of a probe has its own.
+# Kinds of the files in errors; the header of a probe has a name of its own.
 _HOLDS = {
     **{name: repr(name) for name in _NAMES},
     probes.PROBE: "'probe'",
@@ -109,7 +109,7 @@ def _complaint(
 ) -> str:
   """Returns the error about a file with these bytes, less its path."""
   monkeypatch.setattr(training, 'make_learner', fake_learner.make)
-  # The digests in done.json guard files of runs that are over, and say less.
+  # The digests in done.json would refuse the file first, with less detail.
   monkeypatch.setattr(storage, 'is_done', lambda path: True)
   path = _place(name, sweep)
   before = path.read_bytes() if path.exists() else None

@@ -1,4 +1,4 @@
-"""Tests of where a server listens, and what it refuses."""
+"""Tests of the addresses of servers: sockets, folders and ports."""
 
 import os
 import re
@@ -27,11 +27,11 @@ def _serving():
     yield serving
 
 
-# Where a server listens.
+# Addresses.
 
 
 class _Nothing(agent_server.Service):
-  """A world that has nothing to say."""
+  """A world that echoes requests."""
 
   def connect(self):
     pass

@@ -1,4 +1,4 @@
-"""Tests what an agent may ask, message by message, without a socket."""
+"""Tests of the requests of agents, message by message, without a socket."""
 
 import dm_env
 from dm_env import specs
@@ -225,7 +225,7 @@ def test_a_timeout_is_an_interruption_before_the_next_episode(design):
 
 
 class _Fails(dm_env.Environment):
-  """Ends with a discount, or fails, as it is told."""
+  """Ends with a discount, or raises an exception."""
 
   def __init__(self, end):
     self._end = end

@@ -1,4 +1,4 @@
-"""Clones of a served world, made from what another user can read.
+"""Clones of a served world, made from data that another user can read.
 
 The package is public, and every user can read the arguments of a process. A
 clone with the random streams of a served world predicts all observations and
@@ -54,7 +54,7 @@ class Episode(NamedTuple):
 
 
 class Prediction(NamedTuple):
-  """What a clone predicts of one episode.
+  """Predictions of a clone for one episode.
 
   Attributes:
     num_right: Number of time steps predicted to the last bit.
@@ -66,7 +66,7 @@ class Prediction(NamedTuple):
 
 
 class Report(NamedTuple):
-  """What a program of another user has found out.
+  """Findings of a program of another user.
 
   Attributes:
     opened: The files of the evaluator that it could open, by name.
@@ -114,7 +114,7 @@ def seed_in(output: pathlib.Path) -> seeding.SaltedSeed:
 
 
 def forms_of(salt: bytes) -> dict[str, bytes]:
-  """Returns what a salt looks like where it is written down."""
+  """Returns the forms in which a salt may be written."""
   number = int.from_bytes(salt)
   return {
       'bytes': salt,

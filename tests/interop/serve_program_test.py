@@ -27,7 +27,7 @@ _is_root = pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
 _is_linux = pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
 
 
-# As people start it.
+# The program.
 
 
 _IMPORTS_ARE_IMPOSSIBLE = """
@@ -66,7 +66,7 @@ def test_the_documented_agent_does_not_import_this_package(tmp_path):
   ] * 2
   assert {row.info.isolation for row in rows} == {results.SERVED}
   assert 'agent may be a program of the user' in ran.stderr
-  # Besides what it says, there may be what gRPC logs when a server goes.
+  # The log may also contain messages of gRPC about the end of the server.
   said = (output / 'agent.log').read_text().splitlines()
   assert len([line for line in said if line.startswith('1.0 ')]) == 2
   assert output.stat().st_mode & 0o777 == 0o700
@@ -122,7 +122,7 @@ def test_a_command_that_cannot_start_is_reported(tmp_path):
   ran = _serve(f'--output={tmp_path / "r"}', '--agent_command=/no/such/agent')
   assert ran.returncode == 2
   assert 'cannot start' in ran.stderr.splitlines()[-1]
-  # The same command, mended, is not told that the folder is not empty.
+  # The folder is removed, so that a corrected command can be rerun.
   assert not (tmp_path / 'r').exists()
 
 
@@ -200,7 +200,7 @@ def test_a_terminated_server_writes_its_results(tmp_path):
   assert not pathlib.Path(sockets.path_of(program.address)).exists()
 
 
-# Who is who.
+# Users.
 
 
 @_is_linux

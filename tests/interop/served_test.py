@@ -31,7 +31,7 @@ def _serving():
 
 
 def _play(env, actions):
-  """Returns what an agent gets, canonically, from a reset on."""
+  """Returns the time steps of an agent from a reset on, as bytes."""
   time_steps = [env.reset()]
   for action in actions:
     time_steps.append(env.step(action))

@@ -34,7 +34,7 @@ def test_a_curve_has_a_point_per_length_of_an_episode():
   ]
   assert charts.curve(points, 12) == {25: 4.5}
   assert charts.curve(points, 10) == {10: 10.0, 25: pytest.approx(26 / 7)}
-  # What is left in the end goes with what was before.
+  # The remaining points join the window before.
   assert charts.curve(points[:3], 12) == {15: 4.0}
   assert charts.curve(points[:2], 12) == {10: 10.0}
   assert charts.curve([], 12) == {}

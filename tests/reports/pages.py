@@ -41,7 +41,7 @@ def rows(folder, run):
 
 
 def text(page):
-  """Returns what a reader sees, without the marks around intervals."""
+  """Returns the text of a page, without the marks around intervals."""
   text = re.sub(r'<style>.*?</style>', '', page, flags=re.DOTALL)
   return html.unescape(re.sub(r'<[^>]*>', '', text))
 
@@ -59,7 +59,7 @@ def cells(page, title, run):
 
 
 def spoil(folder, run, seed, name, change):
-  """Changes a file of a job; the folder vouches for what it is then."""
+  """Changes a file of a job, and its digest in the folder."""
   sweep = json.loads((folder / scheduler.SWEEP).read_text())
   [job] = [j for j in sweep['jobs'] if (j['run'], j['seed']) == (run, seed)]
   path = folder / job['folder'] / name

@@ -1,4 +1,4 @@
-"""Tests of replays: judged episodes are played again for pictures."""
+"""Tests of replays: evaluated episodes are played again for pictures."""
 
 import base64
 import re
