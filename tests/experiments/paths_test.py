@@ -166,7 +166,7 @@ def test_a_file_that_a_call_names_is_opened_and_the_watch_sees_it():
     assert any(off_limits.FOLDER in path for path in _WATCH.opened)
 
 
-def test_files_outside_are_opened_without_the_check(
+def test_without_the_check_files_elsewhere_are_opened(
     monkeypatch: pytest.MonkeyPatch,
 ):
   monkeypatch.setattr(loading, 'is_inside', lambda path: True)
@@ -198,8 +198,8 @@ def test_a_forged_done_file_leads_nowhere(tmp_path: pathlib.Path):
     storage.is_done(tmp_path)
 
 
-def test_no_module_loads_a_model_from_a_file_or_string():
-  # No text of a design or an experiment becomes MJCF, and no `.mjb` is
+def test_no_module_reads_a_model_from_a_file_or_a_text():
+  # What a design or an experiment says never becomes MJCF, and no `.mjb` is
   # ever loaded: includes, meshes and entities cannot lead anywhere.
   reads = re.compile(
       r'mjcf\.from_|from_xml_(path|string)|from_binary_path|mj_loadXML'
@@ -211,5 +211,5 @@ def test_no_module_loads_a_model_from_a_file_or_string():
       for path in package.rglob('*.py')
       if (match := reads.search(path.read_text(encoding='utf-8')))
   }
-  # A box that tests a renderer, in a process of its own.
+  # A box that tells whether anything renders, in a process of its own.
   assert found in ({}, {'renderers.py': 'from_xml_string'})
