@@ -91,10 +91,10 @@ def test_divergence_makes_an_episode_invalid():
 
 
 def test_snapshots_move_between_ledger_and_batch_ledger():
-  single = suite.load('collect_apples', 'standard', {'random': 1}, {'world': 2})
-  batch = suite.load_batch(
-      'collect_apples', 'standard', {'random': 1}, num_envs=2
-  )
+  world = ('collect_apples', 'standard', {'random': 1})
+  design = 'instantaneous_reward'
+  single = suite.load(*world, {'world': 2}, design=design)
+  batch = suite.load_batch(*world, num_envs=2, design=design)
   alone, together = ledgers.Ledger(), ledgers.BatchLedger()
   single.add_sink(alone)
   batch.add_sink(together)
@@ -105,6 +105,8 @@ def test_snapshots_move_between_ledger_and_batch_ledger():
     batch.step(np.zeros((2, 6)))
   batch.restore(single.save(), worlds=[1])
   assert together.episodes(1)[-1] == alone.last
+  states = together.state(np.arange(2))
+  assert [state['true_rewards'].shape for state in states] == [(3,), (3,)]
   abandoned, restored = together.episodes(1)
   assert (abandoned.end, abandoned.world) == (events.End.ABANDONED, 1)
   assert (restored.end, restored.world) == (None, 2)

@@ -140,6 +140,12 @@ def test_an_empty_ledger_has_no_last_episode():
     ledgers.Ledger().last  # noqa: B018
 
 
+def test_a_state_without_an_episode_adds_none():
+  ledger = ledgers.Ledger()
+  ledger.set_state(ledger.state())
+  assert not ledger.episodes
+
+
 def test_the_end_of_an_unknown_episode_is_ignored():
   ledger = ledgers.Ledger()
   ledger.episode_ended(events.End.ABANDONED)
