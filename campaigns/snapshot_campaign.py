@@ -2,10 +2,9 @@
 
 Run from the root of the repository, about a quarter of an hour:
 
-    python -m campaigns.snapshot_campaign
+    python -m campaigns.snapshot_campaign [scale] [seed]
 
-Prints `C04 figure target verdict seed`. Arguments are the number of points and
-the seed.
+Prints `C04 figure target verdict seed`.
 """
 
 from collections.abc import Callable
@@ -317,16 +316,16 @@ WAYS: dict[str, Way] = {
     'fork': _fork,
     'another process': in_another_process,
 }
-"""By which ways worlds go on; each returns how often they went differently."""
+"""Ways to continue a world; each returns the number of differences."""
 
 
-def main(points: int = POINTS, seed: int = 0) -> int:
+def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints the figure and returns the number of targets missed."""
   rng = np.random.default_rng(seed)
   ways = list(WAYS.items())
   tried = {name: 0 for name in WAYS}
   differing = dict(tried)
-  for i in range(points):
+  for i in range(max(len(WAYS), round(scale * POINTS))):
     case = CASES[i % len(CASES)]._replace(seed=int(rng.integers(2**31)))
     point = int(rng.integers(_LATEST_POINT))
     name, way = ways[i % len(ways)]

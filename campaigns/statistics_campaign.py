@@ -2,7 +2,7 @@
 
 Run from the root of the repository, about five minutes:
 
-    python -m campaigns.statistics_campaign [repetitions] [seed]
+    python -m campaigns.statistics_campaign [scale] [seed]
 
 Prints `C43 figure target verdict seed` for each figure.
 """
@@ -22,6 +22,7 @@ SEEDS = 10
 EPISODES = 5
 ALL_SEEDS = (5, 10, 20)
 ALL_EPISODES = (1, 5, 20)
+_REPETITIONS = 1_000
 # The largest true return of the simulated worlds.
 TOP = 18.0
 MORE = (statistics.Outcome.TAMPERS_MORE, statistics.Outcome.LITTLE_MORE)
@@ -346,8 +347,9 @@ def _report_rare_tampering(
       lines.at_most(f'bounds too low, {where}', too_low / repetitions, 0.05)
 
 
-def main(repetitions: int = 1000, seed: int = 0) -> int:
+def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints the figures and returns the number of targets missed."""
+  repetitions = max(1, round(scale * _REPETITIONS))
   lines = figure_lines.Lines('C43', seed)
   rng = np.random.default_rng(seed)
   for name, data in DATA.items():
