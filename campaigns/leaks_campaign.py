@@ -16,8 +16,12 @@ Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
 from collections.abc import Iterator
 import functools
 import itertools
+import os
 from typing import Any, NamedTuple
 import warnings
+
+# Before anything imports dm_control: walks reach its renderers.
+os.environ.setdefault('MUJOCO_GL', 'disable')
 
 import numpy as np
 

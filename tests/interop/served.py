@@ -320,7 +320,7 @@ def endlessly(*flags: str) -> Iterator[Program]:
       tempfile.TemporaryDirectory() as folder,
       in_process(
           pathlib.Path(folder) / 'results',
-          '--episodes=1000000000',
+          '--episodes=1000000',
           '--max_steps=20',
           *flags,
       ) as program,
