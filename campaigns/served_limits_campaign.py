@@ -76,10 +76,15 @@ def rollout(stream: served.RawStream, steps: int) -> str:
   return digest.hexdigest()
 
 
-def expected_rollout(steps: int) -> str:
-  """Returns the digest of the first episodes without an attack."""
-  with served.endlessly() as program:
-    stream = served.connect_eventually(program.address)
+def _repeated_rollout(program: served.Program, steps: int) -> str:
+  """Returns the digest of the same episodes without an attack."""
+  with served.in_process(
+      program.output.parent / 'again',
+      f'--repeat={program.output / "run.json"}',
+      '--episodes=1000',
+      task=(),
+  ) as again:
+    stream = served.connect_eventually(again.address)
     stream.ask(served.JOIN)
     stream.ask(served.STEP)
     digest = rollout(stream, steps)
@@ -100,7 +105,6 @@ class Attack(NamedTuple):
 def attack(
     how: Callable[[served.RawStream, served.Program], tuple[int, float]],
     steps: int,
-    expected: str,
 ) -> Attack:
   """Serves a world, attacks it, and plays as its agent."""
   with served.endlessly() as program:
@@ -111,7 +115,8 @@ def attack(
       num_refused, seconds = how(stream, program)
       digest = rollout(stream, steps)
     stream.close()
-  return Attack(memory.growth, seconds, num_refused, digest == expected)
+    is_undisturbed = digest == _repeated_rollout(program, steps)
+  return Attack(memory.growth, seconds, num_refused, is_undisturbed)
 
 
 def _refused(ask: Callable[[], Any], code: int) -> tuple[int, float]:
@@ -253,7 +258,6 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints the figures and returns the number of targets missed."""
   lines = figure_lines.Lines('C25', seed)
   steps = 60
-  expected = expected_rollout(steps)
   connections = max(20, int(CONNECTIONS * scale))
   keys = max(1_000, int(SETTINGS_KEYS * scale))
   attacks: dict[str, tuple[Any, int]] = {
@@ -275,7 +279,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
       ),
   }
   for name, (how, number) in attacks.items():
-    found = attack(how, steps, expected)
+    found = attack(how, steps)
     lines.at_least(f'{name}: refused', found.num_refused, number)
     lines.at_most(f'{name}: memory growth, MiB', found.growth, 256)
     lines.at_most(f'{name}: seconds to refuse', found.seconds, 1.0)
