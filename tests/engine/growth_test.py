@@ -119,7 +119,6 @@ def test_growth_is_measured():
 @pytest.mark.parametrize(
     'case',
     [
-        _Case('single', 'step', 1_500),
         _Case('batch', 'step', 600),
         _Case('single', 'reset', 600),
     ],
