@@ -27,7 +27,7 @@ def test_a_run_has_operations_to_be_killed_at(killer):
   assert 50 < killer.num_operations <= _MOST_OPERATIONS
 
 
-@examples.settings(8)
+@examples.settings(6)
 @hypothesis.given(
     kills=st.lists(
         st.tuples(

@@ -183,7 +183,7 @@ def test_a_design_runs_or_is_refused_and_nothing_overlaps(
   assert refusal.isprintable()
 
 
-@examples.settings(150)
+@examples.settings(80)
 @hypothesis.given(task=_TASKS, design=_spoiled())
 def test_a_spoiled_design_runs_or_is_refused_in_one_line(
     task: tuple[str, str], design: Any
@@ -222,7 +222,7 @@ def _damaged(draw: Any) -> tuple[str, bytes]:
   return folder, text.encode()
 
 
-@examples.settings(150)
+@examples.settings(80)
 @hypothesis.given(damaged=_damaged())
 def test_a_damaged_file_is_loaded_or_refused_in_one_line(
     tmp_path_factory: pytest.TempPathFactory, damaged: tuple[str, bytes]
