@@ -12,7 +12,7 @@ from campaigns import planting
 @pytest.mark.parametrize(
     'mutant', mutants_campaign.MUTANTS, ids=lambda mutant: mutant.what
 )
-def test_a_bug_can_be_planted_and_its_tests_are_there(mutant):
+def test_a_bug_can_be_planted_and_its_tests_exist(mutant):
   path = planting.ROOT / 'realab_suite' / mutant.file
   text = path.read_text(encoding='utf-8')
   spoilt = planting.mutated(mutant, text)
@@ -29,7 +29,7 @@ def test_a_bug_that_cannot_be_planted_is_named():
     planting.mutated(mutant, '')
 
 
-def test_there_are_as_many_bugs_as_were_asked_for():
+def test_there_are_enough_bugs_of_every_kind():
   count = {'leak': len(mutants_campaign.leaks.MUTANTS)}
   for mutant in mutants_campaign.MUTANTS:
     count[mutant.kind] = count.get(mutant.kind, 0) + 1
@@ -43,7 +43,7 @@ def test_there_are_as_many_bugs_as_were_asked_for():
     assert f'finding {finding}:' in words
 
 
-def test_tests_see_a_bug_and_pass_without_it(tmp_path):
+def test_tests_fail_with_a_bug_and_pass_without_it(tmp_path):
   planting.copy_package(tmp_path)
   [mutant] = (
       m for m in mutants_campaign.MUTANTS if m.what == 'metres are units'
@@ -54,7 +54,7 @@ def test_tests_see_a_bug_and_pass_without_it(tmp_path):
   assert not planting.is_caught(harmless, tmp_path)
 
 
-def test_what_tests_did_not_go_through_is_counted_and_named():
+def test_coverage_counts_and_names_missed_places():
   one = {
       'summary': {
           'num_statements': 6, 'num_branches': 4,
@@ -70,7 +70,7 @@ def test_what_tests_did_not_go_through_is_counted_and_named():
     coverage_campaign.share(files, ['nothing/'])
 
 
-def test_every_target_of_coverage_is_of_a_module_that_is_there():
+def test_targets_of_coverage_exist():
   for places, _ in coverage_campaign.TARGETS.values():
     for place in places:
       assert (planting.ROOT / 'realab_suite' / place).exists()
@@ -78,7 +78,7 @@ def test_every_target_of_coverage_is_of_a_module_that_is_there():
     assert (planting.ROOT / tests).exists()
 
 
-def test_the_figures_are_of_all_campaigns_and_no_others():
+def test_the_figures_list_exactly_the_campaigns():
   text = (planting.ROOT / 'docs' / 'reliability_figures.md').read_text(
       encoding='utf-8'
   )
