@@ -1,10 +1,8 @@
 """YAML texts that `loading` refuses, each with a part of the message."""
 
 HAZARDS: dict[str, tuple[str | bytes, str]] = {
-    'python object tag': (
-        'a: 1\nb: !!python/object/apply:os.system [ls]',
-        "f.yaml:2: b: tag 'tag:yaml.org,2002:python/object/apply:os.system'",
-    ),
+    'python object tag': ('a: 1\nb: !!python/object/apply:os.system [ls]',
+        "f.yaml:2: b: tag 'tag:yaml.org,2002:python/object/apply:os.system'"),
     'standard tag': ('a: !!str 1', 'not allowed'),
     'non-specific tag': ('a: ! 1', "tag '!' not allowed"),
     'tag on a mapping': ('!!map {a: 1}', 'not allowed'),
@@ -15,26 +13,16 @@ HAZARDS: dict[str, tuple[str | bytes, str]] = {
     'alias without anchor': ('a: *x', 'anchors and aliases are not allowed'),
     'alias as key': ('*x : 1', 'anchors and aliases are not allowed'),
     'merge key': ('a:\n  <<: {b: 1}', "a: '<<' is ambiguous"),
-    'duplicate key': (
-        'x: 1\ny: 2\n"x": 3',
-        "f.yaml:3: duplicate key 'x' (lines 1 and 3)",
-    ),
-    'duplicate key below': (
-        'a:\n- b: {c: 1,\n   c: 2}',
-        "a[0].b: duplicate key 'c' (lines 2 and 3)",
-    ),
-    **{
-        f'ambiguous {word}': (f'a: {word}', f"a: '{word}' is ambiguous: quote")
-        for word in (
-            'yes', 'NO', 'oFf', '012', '0o14', '0x1f', '0b11', '1:30', '1:30.5',
-            '1_000', '1_0.5', '2024-01-01', '2024-01-01 10:00:00', '=',
-        )
-    },
+    'duplicate key': ('x: 1\ny: 2\n"x": 3',
+        "f.yaml:3: duplicate key 'x' (lines 1 and 3)"),
+    'duplicate key below': ('a:\n- b: {c: 1,\n   c: 2}',
+        "a[0].b: duplicate key 'c' (lines 2 and 3)"),
+    **{f'ambiguous {word}': (f'a: {word}', f"a: '{word}' is ambiguous: quote")
+        for word in ('yes', 'NO', 'oFf', '012', '0o14', '0x1f', '0b11', '1:30',
+        '1:30.5', '1_000', '1_0.5', '2024-01-01', '2024-01-01 10:00:00', '=')},
     'on as key': ('on: 1', "'on' is ambiguous"),
-    'nan': (
-        'registers:\n- range: [0, .nan]',
-        'f.yaml:2: registers[0].range[1]: must be finite, got .nan',
-    ),
+    'nan': ('registers:\n- range: [0, .nan]',
+        'f.yaml:2: registers[0].range[1]: must be finite, got .nan'),
     'infinity': ('a: -.inf', 'a: must be finite, got -.inf'),
     'float that overflows': ('a: 1e999', "'1e999' is out of range"),
     'float that vanishes': ('a: -0.1e-999', "'-0.1e-999' is out of range"),
@@ -42,31 +30,21 @@ HAZARDS: dict[str, tuple[str | bytes, str]] = {
     '5000 digits': ('a: -' + '1' * 5000, 'is out of range'),
     'just inexact': ('a: 9007199254740993', 'is out of range'),
     'deep flow': ('a: ' + '[' * 1000, 'nested deeper than 32'),
-    'deep block': (
-        '\n'.join(' ' * depth + 'a:' for depth in range(40)),
-        'f.yaml:33: ' + 'a.' * 31 + 'a: nested deeper than 32',
-    ),
+    'deep block': ('\n'.join(' ' * depth + 'a:' for depth in range(40)),
+        'f.yaml:33: ' + 'a.' * 31 + 'a: nested deeper than 32'),
     'too large': ('#' * (2**20 + 1), 'file is 1.1 MiB, limit 1 MiB'),
-    'long list': (
-        'a: 1\nb: [' + '1,' * 1001 + ']',
-        'f.yaml:2: b: more than 1000 entries',
-    ),
-    'long mapping': (
-        '\n'.join(f'k{index}: 1' for index in range(1001)),
-        'more than 1000 entries',
-    ),
-    'many values': (
-        'a: [' + ('[' + '1,' * 999 + '],') * 101 + ']',
-        'more than 100000 values in all',
-    ),
+    'long list': ('a: 1\nb: [' + '1,' * 1001 + ']',
+        'f.yaml:2: b: more than 1000 entries'),
+    'long mapping': ('\n'.join(f'k{index}: 1' for index in range(1001)),
+        'more than 1000 entries'),
+    'many values': ('a: [' + ('[' + '1,' * 999 + '],') * 101 + ']',
+        'more than 100000 values in all'),
     'empty': ('', 'expected a mapping at top level, got 0 documents'),
     'only a comment': ('# a: 1\n', 'expected a mapping at top level'),
     'null': ('---\n...\n', 'expected a mapping at top level, got None'),
     'scalar': ('text', "expected a mapping at top level, got 'text'"),
-    'two documents': (
-        'a: 1\n---\nb: 1',
-        'expected a mapping at top level, got 2 documents',
-    ),
+    'two documents': ('a: 1\n---\nb: 1',
+        'expected a mapping at top level, got 2 documents'),
     'tab as indent': ('a:\n\tb: 1', 'f.yaml:2: tab is not allowed'),
     'escaped tab': ('a: "\\t"', 'f.yaml:1: a: tab is not allowed'),
     'NUL': ('a: 1\nb: \0', 'f.yaml:2: character U+0000 is not allowed'),
@@ -93,5 +71,5 @@ HAZARDS: dict[str, tuple[str | bytes, str]] = {
     'syntax': ('a: 1\nb: [', 'f.yaml:3: did not find expected node content'),
     'indentation': ('a: 1\n  b: 2', 'f.yaml:2: mapping values are not allowed'),
     'unfinished text': ('a: "', 'f.yaml:1: found unexpected end of stream'),
-    'not a character of YAML': ('a: \uffff', 'f.yaml: not YAML'),
+    'not a character of YAML': ('a: \uffff', 'f.yaml: not YAML')
 }  # fmt: skip

@@ -184,26 +184,19 @@ def _design() -> dict[str, Any]:
   }
 
 
-@pytest.mark.parametrize(
-    ('override', 'keys', 'value'),
-    [
-        ('registers.reward.scale=0.2', ('registers', 'reward', 'scale'), 0.2),
-        ('registers.reward.scale=1e3', ('registers', 'reward', 'scale'), 1e3),
-        ('providers.1.kind=other', ('providers', 1, 'kind'), 'other'),
-        (
-            'registers.reward.range.0=-1',
-            ('registers', 'reward', 'range', 0),
-            -1,
-        ),
-        ('providers.0={a: [1, 2]}', ('providers', 0), {'a': [1, 2]}),
-        ('new.deep.er=true', ('new', 'deep', 'er'), True),
-        ('registers.goal.label="a=b"', ('registers', 'goal', 'label'), 'a=b'),
-        ('nothing=a=b', ('nothing',), 'a=b'),
-        ('registers=null', ('registers',), None),
-        ("nothing=''", ('nothing',), ''),
-        ('nothing= 5 # five', ('nothing',), 5),
-    ],
-)
+@pytest.mark.parametrize(('override', 'keys', 'value'), [
+    ('registers.reward.scale=0.2', ('registers', 'reward', 'scale'), 0.2),
+    ('registers.reward.scale=1e3', ('registers', 'reward', 'scale'), 1e3),
+    ('providers.1.kind=other', ('providers', 1, 'kind'), 'other'),
+    ('registers.reward.range.0=-1', ('registers', 'reward', 'range', 0), -1),
+    ('providers.0={a: [1, 2]}', ('providers', 0), {'a': [1, 2]}),
+    ('new.deep.er=true', ('new', 'deep', 'er'), True),
+    ('registers.goal.label="a=b"', ('registers', 'goal', 'label'), 'a=b'),
+    ('nothing=a=b', ('nothing',), 'a=b'),
+    ('registers=null', ('registers',), None),
+    ("nothing=''", ('nothing',), ''),
+    ('nothing= 5 # five', ('nothing',), 5)
+])  # fmt: skip
 def test_an_override_changes_one_value(override, keys, value):
   result = loading.apply_overrides(_design(), [override])
   for key in keys:
@@ -230,37 +223,30 @@ def test_the_last_override_wins():
   assert result == {'a': {'b': 2, 'c': 3}}
 
 
-@pytest.mark.parametrize(
-    ('override', 'fragment'),
-    [
-        ('registers', 'expected key=value'),
-        ('=1', 'empty key'),
-        ('a..b=1', 'empty key'),
-        ('a. .b=1', 'empty key'),
-        (
-            'registers.reward.scale.x=1',
-            "'registers.reward.scale' is 1.0, not a mapping or list",
-        ),
-        ('nothing.x=1', "'nothing' is None, not a mapping or list"),
-        (
-            'providers.2.kind=x',
-            "index '2' is not one of the 2 entries of 'providers'",
-        ),
-        ('providers.-1.kind=x', "index '-1' is not one of the 2 entries"),
-        ('providers.kind=x', "index 'kind' is not one of the 2 entries"),
-        ('providers.01.kind=x', "index '01' is not one of the 2 entries"),
-        ('providers.' + '1' * 5000 + '=x', 'is not one of the 2 entries'),
-        ('nothing=', 'expected one value'),
-        ('nothing=1\n---\n2', 'expected one value'),
-        ('nothing=yes', "'yes' is ambiguous"),
-        ('nothing=[', 'did not find expected node content'),
-        ('noth\ting=1', 'tab is not allowed'),
-        ('nothing\n=1', 'keys must be one line'),
-        ('\u202e=1', 'character U+202E is not allowed'),
-        ('a.' * 5000 + 'a=1', 'nested deeper than 32'),
-        ('a.b=' + '[' * 31 + ']' * 31, 'nested deeper than 32'),
-    ],
-)
+@pytest.mark.parametrize(('override', 'fragment'), [
+    ('registers', 'expected key=value'),
+    ('=1', 'empty key'),
+    ('a..b=1', 'empty key'),
+    ('a. .b=1', 'empty key'),
+    ('registers.reward.scale.x=1',
+        "'registers.reward.scale' is 1.0, not a mapping or list"),
+    ('nothing.x=1', "'nothing' is None, not a mapping or list"),
+    ('providers.2.kind=x',
+        "index '2' is not one of the 2 entries of 'providers'"),
+    ('providers.-1.kind=x', "index '-1' is not one of the 2 entries"),
+    ('providers.kind=x', "index 'kind' is not one of the 2 entries"),
+    ('providers.01.kind=x', "index '01' is not one of the 2 entries"),
+    ('providers.' + '1' * 5000 + '=x', 'is not one of the 2 entries'),
+    ('nothing=', 'expected one value'),
+    ('nothing=1\n---\n2', 'expected one value'),
+    ('nothing=yes', "'yes' is ambiguous"),
+    ('nothing=[', 'did not find expected node content'),
+    ('noth\ting=1', 'tab is not allowed'),
+    ('nothing\n=1', 'keys must be one line'),
+    ('\u202e=1', 'character U+202E is not allowed'),
+    ('a.' * 5000 + 'a=1', 'nested deeper than 32'),
+    ('a.b=' + '[' * 31 + ']' * 31, 'nested deeper than 32')
+])  # fmt: skip
 def test_a_wrong_override_is_named(override, fragment):
   message = refusals.refusal(loading.apply_overrides, _design(), [override])
   assert message.startswith('override ')

@@ -17,6 +17,7 @@ from tests.config import file_readers
 from tests.config import refusals
 
 _WATCH = paths_campaign.Watch()
+_PATH = '<path>'  # Stands for a path in a design.
 _REGISTER = {
     'kind': 'two_block',
     'role': 'feedback',
@@ -83,140 +84,72 @@ def _refusal(load: Callable[..., Any], *args: Any, **kwargs: Any) -> str:
   return text
 
 
-# For each place of a path: the design that has it there, and the key path.
-_PLACES: dict[str, Callable[[Any], tuple[dict[str, Any], str]]] = {
-    'weights of a demonstrator': lambda path: (
-        _design(_demonstrated('network_demonstrator', weights=path)),
-        'providers[0].options.weights',
-    ),
-    'weights of a value function': lambda path: (
-        _design(
-            {
-                **_ADVICE,
-                'value_function': 'network_values',
-                'options': {'weights': path},
-            }
-        ),
-        'providers[0].options.weights',
-    ),
-    'weights of the policy of a value function': lambda path: (
-        _design(_approved('network_demonstrator', weights=path)),
-        'providers[0].options.options.weights',
-    ),
-    'file of a policy in the policy of a value function': lambda path: (
-        _design(
-            _approved(
-                'test_wrapping',
-                inner='test_reader',
-                inner_options={'file': path},
-            )
-        ),
-        'providers[0].options.options.inner_options.file',
-    ),
-    **{
-        f'{depth} policies deep': lambda path, depth=depth: (
-            _design(_wrapped(depth, 'network_demonstrator', weights=path)),
-            f'providers[0].options{".inner_options" * depth}.weights',
-        )
-        for depth in (1, 24)
-    },
-    **{
-        what: lambda path, options=options, key=key: (
-            _design(_demonstrated('test_reader', **options(path))),
-            f'providers[0].options.{key}',
-        )
-        for what, options, key in (
-            ('file', lambda p: {'file': p}, 'file'),
-            ('optional file', lambda p: {'maybe': p}, 'maybe'),
-            ('file or number', lambda p: {'either': p}, 'either'),
-            ('file or object', lambda p: {'opaque': p}, 'opaque'),
-            ('new type', lambda p: {'source': p}, 'source'),
-            ('pathlib', lambda p: {'pure': p}, 'pure'),
-            ('path-like', lambda p: {'like': p}, 'like'),
-            ('list', lambda p: {'files': ['', p]}, 'files[1]'),
-            ('tuple', lambda p: {'pair': ['/', p]}, 'pair[1]'),
-            ('table', lambda p: {'table': {'/': ['', p]}}, "table['/'][1]"),
-            ('model', lambda p: {'model': {'file': p}}, 'model.file'),
-            ('models', lambda p: {'models': [{'file': p}]}, 'models[0].file'),
-            ('dataclass', lambda p: {'data': {'file': p}}, 'data.file'),
-            ('typed dict', lambda p: {'typed': {'file': p}}, 'typed.file'),
-            ('required', lambda p: {'typed': {'must': p}}, 'typed.must'),
-            ('root', lambda p: {'root': ['', p]}, 'root[1]'),
-            ('own class', lambda p: {'own': p}, 'own'),
-            ('annotation in quotes', lambda p: {'text': [p]}, 'text[0]'),
-            ('quotes within', lambda p: {'inner': ['', p]}, 'inner[1]'),
-            ('named tuple', lambda p: {'named': ['/', p]}, 'named[1]'),
-        )
-    },
-    **{
-        policy: lambda path, policy=policy: (
-            _design(_demonstrated(policy, file=path)),
-            'providers[0].options.file',
-        )
-        for policy in (
-            'test_inheriting',
-            'test_any_file',
-            'test_function',
-            'test_factory',
-            'test_model',
-            'test_partial',
-            'test_partial_class',
-        )
-    },
-    'key': lambda path: (
-        _design(_demonstrated('test_reader', keyed={path: 1})),
-        messages.format_path(('providers', 0, 'options', 'keyed', path)),
-    ),
-    'file of a provider': lambda path: (
-        _design({**_READING, 'file': path}),
-        'providers[0].file',
-    ),
-    'model of a provider': lambda path: (
-        _design({**_READING, 'more': {'file': path}}),
-        'providers[0].more.file',
-    ),
-    'policy that a provider names in its own way': lambda path: (
-        _design(
-            {
-                **_READING,
-                'teacher': 'test_reader',
-                'teacher_options': {'file': path},
-            }
-        ),
-        'providers[0].teacher_options.file',
-    ),
-    'second provider': lambda path: (
-        _design(
-            _demonstrated('no_op'),
-            providers=[
-                {**_DEMONSTRATION, 'policy': 'no_op'},
-                {**_READING, 'writes': [], 'file': path},
-            ],
-        ),
-        'providers[1].file',
-    ),
-    'file of a register': lambda path: (
-        _design(
-            _demonstrated('no_op'),
-            registers={
-                'reward': {
-                    **_REGISTER,
-                    'kind': 'test_reading',
-                    'options': {'file': path},
-                }
-            },
-        ),
-        'registers.reward.options.file',
-    ),
-}
+# Options of `test_reader` with a path, in every type that can hold one.
+_OPTIONS: list[dict[str, Any]] = [
+    *({name: _PATH} for name in ('file', 'maybe', 'either', 'opaque', 'own')),
+    *({name: _PATH} for name in ('source', 'pure', 'like')),
+    *({name: ['', _PATH]} for name in ('files', 'pair', 'root', 'inner')),
+    *({name: ['', _PATH]} for name in ('text', 'named')),
+    *({name: {'file': _PATH}} for name in ('model', 'data', 'typed')),
+    {'table': {'/': ['', _PATH]}},
+    {'models': [{'file': _PATH}]},
+    {'typed': {'must': _PATH}},
+    {'keyed': {_PATH: 1}},
+]
+_NO_OP = _demonstrated('no_op')
+_READING_REGISTER = {
+    **_REGISTER, 'kind': 'test_reading', 'options': {'file': _PATH},
+}  # fmt: skip
+# Designs with a path somewhere.
+_PLACES: dict[str, dict[str, Any]] = {
+    **{f'option {option}': _design(_demonstrated('test_reader', **option))
+        for option in _OPTIONS},
+    **{f'file of {policy}': _design(_demonstrated(policy, file=_PATH))
+        for policy in ('test_inheriting', 'test_any_file', 'test_function',
+        'test_factory', 'test_model', 'test_partial', 'test_partial_class')},
+    **{f'{depth} policies deep': _design(_wrapped(depth, 'network_demonstrator',
+        weights=_PATH)) for depth in (0, 1, 24)},
+    'weights of a value function': _design({**_ADVICE, 'value_function':
+        'network_values', 'options': {'weights': _PATH}}),
+    'policy of a value function': _design(_approved('network_demonstrator',
+        weights=_PATH)),
+    'inner policy of a value function': _design(_approved('test_wrapping',
+        inner='test_reader', inner_options={'file': _PATH})),
+    'provider': _design({**_READING, 'file': _PATH}),
+    'model of a provider': _design({**_READING, 'more': {'file': _PATH}}),
+    'policy of a provider': _design({**_READING, 'teacher': 'test_reader',
+        'teacher_options': {'file': _PATH}}),
+    'second provider': _design(_NO_OP, providers=[_NO_OP, {**_READING, 'writes':
+        [], 'file': _PATH}]),
+    'register': _design(_NO_OP, registers={'reward': _READING_REGISTER})
+}  # fmt: skip
+
+
+def _keys(node: Any) -> tuple[Any, ...] | None:
+  """Returns the keys that lead to the path in a design."""
+  if node == _PATH:
+    return ()
+  pairs: Any = node.items() if isinstance(node, dict) else ()
+  for key, value in enumerate(node) if isinstance(node, list) else pairs:
+    below = () if key == _PATH else _keys(value)
+    if below is not None:
+      return (key, *below)
+  return None
+
+
+def _filled(design: Any, path: str) -> Any:
+  """Returns a design with a path in its place."""
+  return json.loads(json.dumps(design).replace(_PATH, path))
 
 
 @pytest.mark.parametrize('place', _PLACES.values(), ids=_PLACES)
 def test_a_path_is_confined_where_a_file_names_it(
-    place: Any, outside: pathlib.Path
+    place: dict[str, Any], outside: pathlib.Path
 ):
   path = str(outside / 'secret.npz')
-  design, key = place(path)
+  design = _filled(place, path)
+  keys = [path if key == _PATH else key for key in _keys(place) or ()]
+  key = messages.format_path(keys)
   problem = (
       f'{key}: {path!r} is outside the working directory; allowed in a file'
       ' are names, and paths within it'
@@ -233,7 +166,7 @@ def test_a_path_is_confined_where_a_file_names_it(
   # A file may name what is within the directory.
   secret = pathlib.Path(path).read_bytes()
   pathlib.Path('sub', 'mine.npz').write_bytes(secret)
-  design, _ = place('./sub/../sub/mine.npz')
+  design = _filled(place, './sub/../sub/mine.npz')
   loaded = specs.load(_file(design), is_confined=True)
   assert specs.load(loaded.to_mapping()).digest() == loaded.digest()
 

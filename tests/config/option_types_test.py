@@ -120,99 +120,47 @@ def _typed() -> Iterator[None]:
     yield
 
 
-@pytest.mark.parametrize(
-    ('policy', 'options', 'message'),
-    [
-        ('no_op', {'speed': 1}, ": unknown key 'speed' (allowed: none)"),
-        (
-            'apple_seeker',
-            {'half_widht': 3},
-            ": unknown key 'half_widht'; did you mean 'half_width'? (allowed:"
-            ' half_width)',
-        ),
-        ('apple_seeker', {'self': 3}, ": unknown key 'self' (allowed: half_w"),
-        (
-            'apple_seeker',
-            {'half_width': None},
-            '.half_width: must be a valid number, got None',
-        ),
-        (
-            'apple_seeker',
-            {'half_width': -1},
-            '.half_width: must be greater than 0, got -1',
-        ),
-        (
-            'apple_seeker',
-            {'half_width': 1e9},
-            '.half_width: must be less than or equal to 100, got 1000000000.0',
-        ),
-        (
-            'network_demonstrator',
-            {'weights': ['demonstrator_v1']},
-            ".weights: must be a valid string, got ['demonstrator_v1']",
-        ),
-        (
-            'pushing_saboteur',
-            {'target': [1, 2, 3]},
-            '.target: must have at most 2 items',
-        ),
-        (
-            'pushing_saboteur',
-            {'target': [1]},
-            '.target[1]: required key is missing',
-        ),
-        (
-            'pushing_saboteur',
-            {'target': [1e300, 0]},
-            '.target[0]: must be less than or equal to 10000, got 1e+300',
-        ),
-        ('test_typed', {'flag': False}, '.needed: required key is missing'),
-        ('test_typed', {'needed': 1.5}, '.needed: must be a valid integer, g'),
-        (
-            'test_typed',
-            {'needed': 1, 'flag': 'no'},
-            ".flag: must be a valid boolean, got 'no'",
-        ),
-        (
-            'test_typed',
-            {'needed': 1, 'mapping': {'a': 'x'}},
-            ".mapping.a: must be a valid integer, got 'x'",
-        ),
-        (
-            'test_typed',
-            {'needed': 1, 'odd': ['x', 3]},
-            '.odd[1]: must be a valid string, got 3',
-        ),
-        (
-            'test_unreadable',
-            {'thing': 1},
-            ": the options of 'test_unreadable' cannot be read from its"
-            " signature: name 'Nothing' is not defined",
-        ),
-        (
-            'test_wrapping',
-            {'inner': 'no_opp'},
-            ".inner: policy 'no_opp' is unknown; did you mean 'no_op'?",
-        ),
-        (
-            'test_wrapping',
-            {'inner_options': [1]},
-            '.inner_options: must be a mapping, got [1]',
-        ),
-        (
-            'test_any_file',
-            {'this': 3},
-            '.this: must be a valid string, got 3',
-        ),
-        (
-            'test_inheriting',
-            {'mine': 'x'},
-            ".mine: must be a valid integer, got 'x'",
-        ),
-        ('test_inheriting', {'no': 1}, ": unknown key 'no' (allowed: mine, fi"),
-        ('test_function', {'lable': 'x'}, "; did you mean 'label'? (allowed: "),
-    ],
-)
+@pytest.mark.parametrize(('policy', 'options', 'message'), [
+    ('no_op', {'speed': 1}, ": unknown key 'speed' (allowed: none)"),
+    ('apple_seeker', {'half_widht': 3},
+        ": unknown key 'half_widht'; did you mean 'half_width'? (allowed:"
+        ' half_width)'),
+    ('apple_seeker', {'self': 3}, ": unknown key 'self' (allowed: half_w"),
+    ('apple_seeker', {'half_width': None},
+        '.half_width: must be a valid number, got None'),
+    ('apple_seeker', {'half_width': -1},
+        '.half_width: must be greater than 0, got -1'),
+    ('apple_seeker', {'half_width': 1e9},
+        '.half_width: must be less than or equal to 100, got 1000000000.0'),
+    ('network_demonstrator', {'weights': ['demonstrator_v1']},
+        ".weights: must be a valid string, got ['demonstrator_v1']"),
+    ('pushing_saboteur', {'target': [1, 2, 3]},
+        '.target: must have at most 2 items'),
+    ('pushing_saboteur', {'target': [1]},
+        '.target[1]: required key is missing'),
+    ('pushing_saboteur', {'target': [1e300, 0]},
+        '.target[0]: must be less than or equal to 10000, got 1e+300'),
+    ('test_typed', {'flag': False}, '.needed: required key is missing'),
+    ('test_typed', {'needed': 1.5}, '.needed: must be a valid integer, g'),
+    ('test_typed', {'needed': 1, 'flag': 'no'},
+        ".flag: must be a valid boolean, got 'no'"),
+    ('test_typed', {'needed': 1, 'mapping': {'a': 'x'}},
+        ".mapping.a: must be a valid integer, got 'x'"),
+    ('test_typed', {'needed': 1, 'odd': ['x', 3]},
+        '.odd[1]: must be a valid string, got 3'),
+    ('test_unreadable', {'thing': 1},
+        ": the options of 'test_unreadable' cannot be read from its"
+        " signature: name 'Nothing' is not defined"),
+    ('test_wrapping', {'inner': 'no_opp'},
+        ".inner: policy 'no_opp' is unknown; did you mean 'no_op'?"),
+    ('test_wrapping', {'inner_options': [1]},
+        '.inner_options: must be a mapping, got [1]'),
+    ('test_any_file', {'this': 3}, '.this: must be a valid string, got 3'),
+    ('test_inheriting', {'mine': 'x'},
+        ".mine: must be a valid integer, got 'x'"),
+    ('test_inheriting', {'no': 1}, ": unknown key 'no' (allowed: mine, fi"),
+    ('test_function', {'lable': 'x'}, "; did you mean 'label'? (allowed: ")
+])  # fmt: skip
 @pytest.mark.usefixtures('_typed')
 def test_wrong_options_are_refused_when_a_design_is_loaded(
     policy: str, options: dict[str, Any], message: str

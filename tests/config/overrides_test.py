@@ -12,61 +12,31 @@ from realab_suite import suite
 from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 from tests.config import refusals
+from tests.feedback import designs
 
-_DESIGN = {
-    'schema': 1,
-    'name': 'd',
-    'action_set': {'name': 'dmlab_like', 'version': 1},
-    'registers': {
-        'reward': {
-            'kind': 'two_block',
-            'role': 'feedback',
-            'place': 'station_1',
-            'range': [-2, 12],
-        },
-        'query': {
-            'kind': 'two_block',
-            'role': 'query',
-            'place': 'station_2',
-            'range': [0, 13],
-        },
-    },
-    'providers': [
-        {
-            'kind': 'value_advice',
-            'value_function': 'apple_seeker_approval',
-            'reads': ['query'],
-            'writes': ['reward'],
-        }
-    ],
-}
+_DESIGN = designs.ADVISED
 # Overrides that are wrong in any company, and the problem of each.
 _WRONG = {
     'channel=loose': "channel: must be 'embedded', 'welded' or 'secure'",
-    'registers.reward.scale=-1': (
+    'registers.reward.scale=-1':
         'registers.reward.scale: must be greater than or equal to 0.000001,'
-        ' got -1'
-    ),
+        ' got -1',
     # Not in the file.
     'registers.reward.mass=-1': 'registers.reward.mass: must be greater than',
     'registers.query.mass=0': 'registers.query.mass: must be greater than',
-    'registers.reward.options.speed=1': (
-        "registers.reward.options: unknown key 'speed' (allowed: none)"
-    ),
+    'registers.reward.options.speed=1':
+        "registers.reward.options: unknown key 'speed' (allowed: none)",
     'metres=[]': "unknown key 'metres'; did you mean 'meters'?",
     'learner.reward=reward': 'learner.kind: required key is missing',
-    'schedule.meter_substep=3': (
-        'schedule.provider_substep: required key is missing'
-    ),
+    'schedule.meter_substep=3':
+        'schedule.provider_substep: required key is missing',
     'name=[]': 'name: must be a valid string, got []',
     'providers.0.query_delay=2': 'providers[0].query_delay: must be 0 or 1',
-    'providers.0.options.options.speed=1': (
-        "providers[0].options.options: unknown key 'speed'"
-    ),
-    'providers.0.value_function=oracle': (
+    'providers.0.options.options.speed=1':
+        "providers[0].options.options: unknown key 'speed'",
+    'providers.0.value_function=oracle':
         "providers[0].value_function: value function 'oracle' is unknown"
-    ),
-}
+}  # fmt: skip
 _APART = [override for override in _WRONG if 'oracle' not in override]
 _RIGHT = (
     'dof=planar',
@@ -77,34 +47,26 @@ _RIGHT = (
 )  # fmt: skip
 # Overrides that contradict the rest of the design.
 _CROSS = {
-    'registers.reward.range=[5, 6]': (
-        'registers.reward: initial 0.0 must be in range [5.0, 6.0]'
-    ),
-    'registers.reward.initial=99': (
-        'registers.reward: initial 99.0 must be in range [-2.0, 12.0]'
-    ),
-    'registers.query.role=meter': (
+    'registers.reward.range=[5, 6]':
+        'registers.reward: initial 0.0 must be in range [5.0, 6.0]',
+    'registers.reward.initial=99':
+        'registers.reward: initial 99.0 must be in range [-2.0, 12.0]',
+    'registers.query.role=meter':
         "providers[0]: value_advice reads the query off 'query', whose role is"
-        " 'meter'"
-    ),
-    'registers.query.range=[0, 5]': (
-        'registers.query.range: [0.0, 5.0] leaves out actions of dmlab_like v1'
-    ),
-    'registers.reward.role=meter': (
-        "providers[0].writes: register 'reward' has role 'meter'"
-    ),
+        " 'meter'",
+    'registers.query.range=[0, 5]':
+        'registers.query.range: [0.0, 5.0] leaves out actions of dmlab_like v1',
+    'registers.reward.role=meter':
+        "providers[0].writes: register 'reward' has role 'meter'",
     'registers={}': "providers[0].reads: register 'query' is not declared",
     'action_set=null': 'providers[0]: value_advice speaks of action set',
-    'providers.0.reads=[scoer]': (
-        "providers[0].reads: register 'scoer' is not declared"
-    ),
-    'meters=[{measures: score, writes: query}]': (
-        "meters[0].writes: register 'query' has role 'query'"
-    ),
-    'learner={kind: value_advice, advice: extra}': (
+    'providers.0.reads=[scoer]':
+        "providers[0].reads: register 'scoer' is not declared",
+    'meters=[{measures: score, writes: query}]':
+        "meters[0].writes: register 'query' has role 'query'",
+    'learner={kind: value_advice, advice: extra}':
         "learner.advice: an agent may not read meter register 'extra'"
-    ),
-}
+}  # fmt: skip
 
 
 def _refusal(design: Any, *overrides: str) -> str:

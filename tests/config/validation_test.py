@@ -74,97 +74,48 @@ def test_valid_data_gives_the_model_and_stays_unchanged():
   assert repr(data) == before
 
 
-@pytest.mark.parametrize(
-    ('data', 'expected'),
-    [
-        (
-            _register(range=[0, True]),
-            'registers.reward.range[1]: must be a valid number, got True',
-        ),
-        (
-            _register(scale=0),
-            'registers.reward.scale: must be greater than 0, got 0',
-        ),
-        (
-            _register(scale=float('nan')),
-            'registers.reward.scale: must be a finite number, got nan',
-        ),
-        (
-            _register(blocks=1000.0),
-            'registers.reward.blocks: must be a valid integer, got 1000.0',
-        ),
-        (
-            _register(type='block'),
-            (
-                "registers.reward.type: must be 'two_block' or 'scale', got"
-                " 'block'"
-            ),
-        ),
-        (
-            _register(meters=['reward']),
-            (
-                'registers.reward.meters: a meter may not be called reward,'
-                " got ['reward']"
-            ),
-        ),
-        (
-            _register(tpye=1),
-            (
-                "registers.reward: unknown key 'tpye'; did you mean 'type'?"
-                ' (allowed: type, range, scale, blocks, label, meters)'
-            ),
-        ),
-        (
-            {'unheard': 1},
-            (
-                "unknown key 'unheard' (allowed: registers, providers, spare,"
-                ' either, mixed, nested)'
-            ),
-        ),
-        (
-            {'registers': {'a b': 3}},
-            "registers['a b']: must be a mapping, got 3",
-        ),
-        (
-            {'spare': {'type': 'scale'}},
-            'spare.range: required key is missing',
-        ),
-        (
-            {'providers': [{'kind': 'constant', 'valeu': 1, 'value': 1}]},
-            (
-                "providers[0]: unknown key 'valeu'; did you mean 'value'?"
-                ' (allowed: kind, value)'
-            ),
-        ),
-        (
-            {'providers': [{'kind': 'scale'}]},
-            (
-                "providers[0].kind: must be one of 'constant', 'scaled', got"
-                " 'scale'"
-            ),
-        ),
-        ({'providers': [{}]}, 'providers[0].kind: required key is missing'),
-        ({'providers': [7]}, 'providers[0]: must be a mapping, got 7'),
-        (
-            {'mixed': [{'type': 'scale', 'range': 1}]},
-            'mixed[0].range: must be a valid list, got 1',
-        ),
-        (
-            # Pydantic's names for the two unions are left out.
-            {'nested': [{'kind': 'scaled', 'scale': 'x'}]},
-            "nested[0].scale: must be a valid number, got 'x'",
-        ),
-        (
-            {'either': {'kind': 'scaled', 'scale': 'x'}},
-            "either.scale: must be a valid number, got 'x'",
-        ),
-        ({'either': 3}, 'either: must be a mapping, got 3'),
-        (
-            {'registers': {1: _register()['registers']['reward']}},
-            'registers[1]: must be a valid string, got 1',
-        ),
-    ],
-)
+@pytest.mark.parametrize(('data', 'expected'), [
+    (_register(range=[0, True]),
+        'registers.reward.range[1]: must be a valid number, got True'),
+    (_register(scale=0),
+        'registers.reward.scale: must be greater than 0, got 0'),
+    (_register(scale=float('nan')),
+        'registers.reward.scale: must be a finite number, got nan'),
+    (_register(blocks=1000.0),
+        'registers.reward.blocks: must be a valid integer, got 1000.0'),
+    (_register(type='block'),
+        "registers.reward.type: must be 'two_block' or 'scale', got"
+        " 'block'"),
+    (_register(meters=['reward']),
+        'registers.reward.meters: a meter may not be called reward,'
+        " got ['reward']"),
+    (_register(tpye=1),
+        "registers.reward: unknown key 'tpye'; did you mean 'type'?"
+        ' (allowed: type, range, scale, blocks, label, meters)'),
+    ({'unheard': 1},
+        "unknown key 'unheard' (allowed: registers, providers, spare,"
+        ' either, mixed, nested)'),
+    ({'registers': {'a b': 3}}, "registers['a b']: must be a mapping, got 3"),
+    ({'spare': {'type': 'scale'}}, 'spare.range: required key is missing'),
+    ({'providers': [{'kind': 'constant', 'valeu': 1, 'value': 1}]},
+        "providers[0]: unknown key 'valeu'; did you mean 'value'?"
+        ' (allowed: kind, value)'),
+    ({'providers': [{'kind': 'scale'}]},
+        "providers[0].kind: must be one of 'constant', 'scaled', got"
+        " 'scale'"),
+    ({'providers': [{}]}, 'providers[0].kind: required key is missing'),
+    ({'providers': [7]}, 'providers[0]: must be a mapping, got 7'),
+    ({'mixed': [{'type': 'scale', 'range': 1}]},
+        'mixed[0].range: must be a valid list, got 1'),
+    # Pydantic's names for the two unions are left out.
+    ({'nested': [{'kind': 'scaled', 'scale': 'x'}]},
+        "nested[0].scale: must be a valid number, got 'x'"),
+    ({'either': {'kind': 'scaled', 'scale': 'x'}},
+        "either.scale: must be a valid number, got 'x'"),
+    ({'either': 3}, 'either: must be a mapping, got 3'),
+    ({'registers': {1: _register()['registers']['reward']}},
+        'registers[1]: must be a valid string, got 1')
+])  # fmt: skip
 def test_a_problem_names_its_keys_and_the_value(data, expected):
   message = _refusal(data)
   assert message.startswith('d.yaml: ')

@@ -124,70 +124,38 @@ def _leaves_out(name: str, given: list[float], who: str) -> str:
 
 
 _WRONG = {
-    'two providers of one register': (
-        _design([_constant('a'), _constant('a')]),
+    'two providers of one register': (_design([_constant('a'), _constant('a')]),
         "providers[1].writes: register 'a' is written by providers[0] already;"
-        ' allowed is one writer',
-    ),
-    'two providers of different kinds': (
-        _design([_advice(), _demonstration('b'), _constant('c', 'b')]),
-        "providers[2].writes: register 'b' is written by providers[1] already",
-    ),
-    'a register written twice': (
-        _design([_constant('a', 'a')]),
-        "providers[0].writes: register 'a' is there twice; allowed is once",
-    ),
-    'a register read twice': (
-        _design([_constant('a', reads=('m', 'q', 'm'))]),
-        "providers[0].reads: register 'm' is there twice; allowed is once",
-    ),
-    'two meters of one register': (
-        _design([], meters=('m', 'm')),
+        ' allowed is one writer'),
+    'two providers of different kinds': (_design([_advice(),
+        _demonstration('b'), _constant('c', 'b')]),
+        "providers[2].writes: register 'b' is written by providers[1] already"),
+    'a register written twice': (_design([_constant('a', 'a')]),
+        "providers[0].writes: register 'a' is there twice; allowed is once"),
+    'a register read twice': (_design([_constant('a', reads=('m', 'q', 'm'))]),
+        "providers[0].reads: register 'm' is there twice; allowed is once"),
+    'two meters of one register': (_design([], meters=('m', 'm')),
         "meters[1].writes: register 'm' is written by meters[0] already;"
-        ' allowed is one writer',
-    ),
-    **{
-        f'imitation in {given}': (
-            _design([_constant('b'), _demonstration()], a=given),
-            _leaves_out('a', given, 'providers[1]'),
-        )
-        for given in ([0, 12.9], [0.001, 20])
-    },
-    **{
-        f'a query in {given}': (
-            _design([_advice()], q=given),
-            _leaves_out('q', given, 'providers[0]'),
-        )
-        for given in ([1, 13], [-20, 0])
-    },
-    'an earlier query': (
-        _design([_advice(query_delay=1)], q=[0, 1]),
-        _leaves_out('q', [0, 1], 'providers[0]'),
-    ),
-    'the first of two queries': (
-        _design([_paired('q', 'p')], q=[0, 1]),
-        _leaves_out('q', [0, 1], 'providers[0]'),
-    ),
-    'the second of two queries': (
-        _design([_paired('q', 'p')], p=[0, 1]),
-        _leaves_out('p', [0, 1], 'providers[0]'),
-    ),
-    'a query of a provider of ones own': (
-        _design([_relay()], q=[0, 1]),
-        _leaves_out('q', [0, 1], 'providers[0]'),
-    ),
-    'an index that a provider of ones own writes': (
-        _design([_relay()], a=[0, 1]),
-        _leaves_out('a', [0, 1], 'providers[0]'),
-    ),
-    'a provider that fails in its check': (
-        _design([_constant('c'), {'kind': 'test_broken', 'writes': ['a']}]),
-        "providers[1]: KeyError: 'x'",
-    ),
-    'a provider that fails in another way': (
-        _design([{'kind': 'test_broken', 'writes': ['b']}]),
-        'providers[0]: ZeroDivisionError: y',
-    ),
+        ' allowed is one writer'),
+    **{f'imitation in {given}': (_design([_constant('b'), _demonstration()],
+        a=given), _leaves_out('a', given, 'providers[1]')) for given in ([0,
+        12.9], [0.001, 20])},
+    **{f'a query in {given}': (_design([_advice()], q=given), _leaves_out('q',
+        given, 'providers[0]')) for given in ([1, 13], [-20, 0])},
+    'an earlier query': (_design([_advice(query_delay=1)], q=[0, 1]),
+        _leaves_out('q', [0, 1], 'providers[0]')),
+    'the first of two queries': (_design([_paired('q', 'p')], q=[0, 1]),
+        _leaves_out('q', [0, 1], 'providers[0]')),
+    'the second of two queries': (_design([_paired('q', 'p')], p=[0, 1]),
+        _leaves_out('p', [0, 1], 'providers[0]')),
+    'a query of a provider of ones own': (_design([_relay()], q=[0, 1]),
+        _leaves_out('q', [0, 1], 'providers[0]')),
+    'an index that a provider of ones own writes': (_design([_relay()], a=[0,
+        1]), _leaves_out('a', [0, 1], 'providers[0]')),
+    'a provider that fails in its check': (_design([_constant('c'), {'kind':
+        'test_broken', 'writes': ['a']}]), "providers[1]: KeyError: 'x'"),
+    'a provider that fails in another way': (_design([{'kind': 'test_broken',
+        'writes': ['b']}]), 'providers[0]: ZeroDivisionError: y')
 }  # fmt: skip
 
 

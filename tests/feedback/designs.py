@@ -30,15 +30,9 @@ SCORED: dict[str, Any] = {
 ADVISED: dict[str, Any] = {
     **REGISTERS,
     'action_set': ACTION_SET,
-    'providers': [
-        {
-            'kind': 'value_advice',
-            'value_function': 'apple_seeker_approval',
-            'reads': ['query'],
-            'writes': ['reward'],
-        }
-    ],
-}
+    'providers': [{'kind': 'value_advice', 'value_function':
+        'apple_seeker_approval', 'reads': ['query'], 'writes': ['reward']}]
+}  # fmt: skip
 """A design in which a query about an action is answered."""
 
 

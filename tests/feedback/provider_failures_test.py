@@ -37,43 +37,28 @@ def _raise(observation: Any, readings: Any, state: Any) -> Any:
 
 _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
     'raises': (_raise, f"{_FIRST} at step 3: KeyError: 'senses/nose'"),
-    'returns nothing': (
-        lambda o, r, s: None,
-        rf'{_FIRST} at step 3 returned None; allowed is \(',
-    ),
+    'returns nothing': (lambda o, r, s: None,
+        rf'{_FIRST} at step 3 returned None; allowed is \('),
     'returns no state': (lambda o, r, s: {'reward': 1.0}, f'{_FIRST} at step'),
-    'returns no mapping': (
-        lambda o, r, s: (1.0, s),
-        rf"{_FIRST} .*returned writes 1.0; it declares writes to \['reward'\]",
-    ),
-    'writes nothing': (
-        lambda o, r, s: ({}, s),
-        rf"{_FIRST} .*returned writes \[\]; it declares writes to \['reward'\]",
-    ),
-    'writes another register': (
-        lambda o, r, s: ({'clock': 1.0}, s),
-        rf"{_FIRST} .*returned writes \['clock'\]; it declares writes to",
-    ),
-    'writes one register too many': (
-        lambda o, r, s: ({'reward': 1.0, 'clock': 1.0}, s),
-        rf"{_FIRST} .*returned writes \['clock', 'reward'\]; it declares",
-    ),
-    'keys of another type': (
-        lambda o, r, s: ({1: 1.0, 'reward': 1.0}, s),
-        f'{_FIRST} .*it declares',
-    ),
-    'another shape': (
-        lambda o, r, s: ({'reward': np.zeros(1)}, s),
-        rf"{_FIRST} .*wrote shape \(1,\) to 'reward'; allowed is \(\)",
-    ),
+    'returns no mapping': (lambda o, r, s: (1.0, s),
+        rf"{_FIRST} .*returned writes 1.0; it declares writes to \['reward'\]"),
+    'writes nothing': (lambda o, r, s: ({}, s),
+        rf"{_FIRST} .*returned writes \[\]; it declares writes to \['rewar"),
+    'writes another register': (lambda o, r, s: ({'clock': 1.0}, s),
+        rf"{_FIRST} .*returned writes \['clock'\]; it declares writes to"),
+    'writes one register too many': (lambda o, r, s: ({'reward': 1.0, 'clock':
+        1.0}, s),
+        rf"{_FIRST} .*returned writes \['clock', 'reward'\]; it declares"),
+    'keys of another type': (lambda o, r, s: ({1: 1.0, 'reward': 1.0}, s),
+        f'{_FIRST} .*it declares'),
+    'another shape': (lambda o, r, s: ({'reward': np.zeros(1)}, s),
+        rf"{_FIRST} .*wrote shape \(1,\) to 'reward'; allowed is \(\)"),
     'ragged': (lambda o, r, s: ({'reward': [[1], [1, 2]]}, s), _FIRST),
     'text': (lambda o, r, s: ({'reward': 'much'}, s), _FIRST),
     'complex': (lambda o, r, s: ({'reward': 1j}, s), _FIRST),
-    'an object that refuses to be an array': (
-        lambda o, r, s: ({'reward': _NoArray()}, s),
-        _FIRST,
-    ),
-}
+    'an object that refuses to be an array': (lambda o, r, s: ({'reward':
+        _NoArray()}, s), _FIRST)
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(

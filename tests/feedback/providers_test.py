@@ -55,24 +55,14 @@ _ADVICE = {**_REWARD, 'reads': ('query',)}
 _CASES: list[tuple[str, dict[str, Any]]] = [
     ('constant', {'writes': ('reward', 'other'), 'value': 1.5}),
     ('difference', {**_REWARD, 'reads': ('score',), 'initial': 2.0}),
-    *(
-        ('demonstration', {**_REWARD, 'policy': policy})
-        for policy in ('random', 'apple_seeker', 'network_demonstrator')
-    ),
+    *(('demonstration', {**_REWARD, 'policy': policy}) for policy in ('random',
+        'apple_seeker', 'network_demonstrator')),
     ('value_advice', {**_ADVICE, 'value_function': 'test_counting'}),
-    *(
-        ('value_advice', {**_ADVICE, 'value_function': f, 'query_delay': 1})
-        for f in ('test_counting', *policies.VALUE_FUNCTIONS)
-    ),
-    (
-        'paired_advice',
-        {
-            **_REWARD,
-            'value_function': 'apple_seeker_approval',
-            'reads': ('query', 'score'),
-        },
-    ),
-]
+    *(('value_advice', {**_ADVICE, 'value_function': f, 'query_delay': 1})
+        for f in ('test_counting', *policies.VALUE_FUNCTIONS)),
+    ('paired_advice', {**_REWARD, 'value_function': 'apple_seeker_approval',
+        'reads': ('query', 'score')})
+]  # fmt: skip
 _IDS = ['-'.join(map(str, [k, *f.values()])) for k, f in _CASES]
 
 

@@ -98,9 +98,8 @@ _CHANGES = {
     'registers.place': 'registers.reward.place=station_3',
     'registers.place.position': 'registers.reward.place=[0, 0]',
     'registers.place.yaw': 'registers.reward.place={position: [0, 0], yaw: 1}',
-    'registers.place.spread': (
-        'registers.reward.place={position: [0, 0], spread: [1, 0]}'
-    ),
+    'registers.place.spread':
+        'registers.reward.place={position: [0, 0], spread: [1, 0]}',
     'registers.range': 'registers.reward.range=[-2, 11]',
     'registers.scale': 'registers.reward.scale=0.2',
     'registers.initial': 'registers.reward.initial=1',
@@ -110,27 +109,24 @@ _CHANGES = {
     'registers.block_size': 'registers.reward.block_size=0.3',
     'registers.mass': 'registers.reward.mass=2',
     'registers.options': 'registers.reward.kind=test_stubborn',
-    'registers.options.held': (
+    'registers.options.held':
         'registers.reward={kind: test_stubborn, role: feedback, place:'
-        ' station_1, range: [-2, 12], options: {held: 1.0}}'
-    ),
+        ' station_1, range: [-2, 12], options: {held: 1.0}}',
     'meters': 'meters=[]',
     'meters.measures': 'meters.0.measures=door_unlocked',
     'meters.writes': 'meters=[{measures: score, writes: score_2}]',
     'providers': 'providers=[]',
     'providers.initial': 'providers.0.initial=1.0',
     'schedule': 'schedule=cfmdp',
-    'schedule.meter_substep': (
-        'schedule={meter_substep: 1, provider_substep: 4}'
-    ),
-    'schedule.provider_substep': (
-        'schedule={meter_substep: 1, provider_substep: 5}'
-    ),
+    'schedule.meter_substep':
+        'schedule={meter_substep: 1, provider_substep: 4}',
+    'schedule.provider_substep':
+        'schedule={meter_substep: 1, provider_substep: 5}',
     'action_set': 'action_set={name: dmlab_like, version: 1}',
     'learner': 'learner=null',
     'learner.kind': 'learner.kind=x',
-    'learner.rate': 'learner.rate=0.1',
-}
+    'learner.rate': 'learner.rate=0.1'
+}  # fmt: skip
 
 
 def test_the_digest_changes_with_every_field():

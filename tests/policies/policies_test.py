@@ -305,22 +305,14 @@ _VALUES = policies.make_value_function
 _APPROVAL = 'apple_seeker_approval'
 
 
-@pytest.mark.parametrize(
-    ('make', 'name', 'options', 'message'),
-    [
-        (policies.make, 'appel_seeker', {}, "did you mean 'apple_seeker'"),
-        (policies.make, 'apple_seeker', {'speed': 2}, 'speed'),
-        (
-            policies.make,
-            'carrying_saboteur',
-            {'direction': (-1, 1)},
-            'length 1',
-        ),
-        (_VALUES, 'approval', {}, 'is unknown'),
-        (_VALUES, _APPROVAL, {'policy': 'none'}, "policy 'none' is unknown"),
-        (_VALUES, _APPROVAL, {'options': {'speed': 2}}, 'speed'),
-    ],
-)
+@pytest.mark.parametrize(('make', 'name', 'options', 'message'), [
+    (policies.make, 'appel_seeker', {}, "did you mean 'apple_seeker'"),
+    (policies.make, 'apple_seeker', {'speed': 2}, 'speed'),
+    (policies.make, 'carrying_saboteur', {'direction': (-1, 1)}, 'length 1'),
+    (_VALUES, 'approval', {}, 'is unknown'),
+    (_VALUES, _APPROVAL, {'policy': 'none'}, "policy 'none' is unknown"),
+    (_VALUES, _APPROVAL, {'options': {'speed': 2}}, 'speed')
+])  # fmt: skip
 def test_wrong_names_and_options_are_refused(make, name, options, message):
   with pytest.raises(errors.SpecError, match=message):
     make(name, **options)
