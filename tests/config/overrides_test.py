@@ -59,7 +59,7 @@ _CROSS = {
     'registers.reward.role=meter':
         "providers[0].writes: register 'reward' has role 'meter'",
     'registers={}': "providers[0].reads: register 'query' is not declared",
-    'action_set=null': 'providers[0]: value_advice speaks of action set',
+    'action_set=null': 'providers[0]: value_advice uses action set',
     'providers.0.reads=[scoer]':
         "providers[0].reads: register 'scoer' is not declared",
     'meters=[{measures: score, writes: query}]':

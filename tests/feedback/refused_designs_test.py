@@ -88,7 +88,7 @@ _WRONG = {
         "an agent may not read meter register 'score'",
     'learner={reward: reward}': 'learner.kind: required key is missing',
     'providers.0={kind: demonstration, policy: no_op, writes: [reward]}':
-        'demonstration speaks of action set dmlab_like v1; the design has None',
+        'demonstration uses action set dmlab_like v1; the design has None',
     'action_set={name: dmlab, version: 1}':
         "action_set: action set 'dmlab' v1 is unknown; known are"
         " ['dmlab_like v1']",

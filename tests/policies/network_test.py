@@ -260,8 +260,8 @@ def test_unknown_weights_are_refused(weights, complaint):
     [
         ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\);'),
         ({'weight_1': np.zeros((64, 64))}, 'weight_1: float64'),
-        ({'weight_9': np.zeros(3)}, "holds .*'weight_9'"),
-        ({'bias_0': np.full(64, np.nan, np.float32)}, 'bias_0: not all'),
+        ({'weight_9': np.zeros(3)}, "contains .*'weight_9'"),
+        ({'bias_0': np.full(64, np.nan, np.float32)}, 'bias_0: all numbers'),
         ({'bias_0': np.ones(64, np.float32)}, 'damaged: SHA-256'),
         ({'header': np.zeros(4)}, 'not a network: header'),
         ({'header': np.frombuffer(b'[]', np.uint8)}, 'must be a mapping'),
@@ -363,8 +363,11 @@ def test_a_header_with_too_few_features_is_refused(shipped):
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        ({'senses/ray_distances': None}, "'senses/ray_distances' is not seen"),
-        ({'senses/heading': np.zeros((256, 3))}, r'shape \(256, 3\), expected'),
+        ({'senses/ray_distances': None}, "'senses/ray_distances' is missing"),
+        (
+            {'senses/heading': np.zeros((256, 3))},
+            r'shape \(256, 3\); allowed is',
+        ),
     ],
 )
 def test_observations_that_do_not_fit_a_network_are_refused(
