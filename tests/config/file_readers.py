@@ -1,7 +1,7 @@
-"""Policies, providers and registers that open every file they are given.
+"""Policies, providers and registers that open all files of their options.
 
-They stand for the code of third parties: each declares its paths in another
-way, and opens them when it is made.
+They represent third-party code: each declares its paths in another way, and
+opens them in its constructor.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,23 +12,22 @@ import os
 import pathlib
 from typing import Annotated, Any, Literal, NamedTuple, NewType, final
 
-import numpy as np
 import pydantic
 import typing_extensions
 
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite.config import option_types
-from realab_suite.entities import registers
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from tests.engine import helpers
+from tests.feedback import stubs
 
 _Source = NewType('_Source', option_types.FilePath)
 
 
 def _open(*paths: Any) -> None:
-  """Opens files, as far as any are given."""
+  """Opens the paths that are not empty."""
   for path in paths:
     if path and isinstance(path, str):
       try:
@@ -76,20 +75,10 @@ class Pair(NamedTuple):
 
 
 class _Opaque:
-  """A class whose instances no file can hold."""
+  """Class whose instances a file cannot contain."""
 
 
-class _Idle(policies.Policy):
-  """Waits."""
-
-  def step(
-      self, observation: Any, episode_start: np.ndarray, key: Any, state: Any
-  ) -> tuple[np.ndarray, Any]:
-    del observation, key
-    return np.zeros(np.shape(episode_start), int), state
-
-
-class Reader(_Idle):
+class Reader(stubs.Idle):
   """Declares paths in many ways."""
 
   def __init__(
@@ -128,7 +117,7 @@ class Reader(_Idle):
 
 @final
 class Inheriting(Reader):
-  """Passes on what it does not name."""
+  """Passes its other options on."""
 
   def __init__(self, mine: int = 0, **kwargs: Any) -> None:
     del mine
@@ -136,7 +125,7 @@ class Inheriting(Reader):
 
 
 @final
-class AnyFile(_Idle):
+class AnyFile(stubs.Idle):
   """Takes files by any name."""
 
   def __init__(self, **files: option_types.FilePath) -> None:
@@ -144,7 +133,7 @@ class AnyFile(_Idle):
 
 
 @final
-class AnyOption(_Idle):
+class AnyOption(stubs.Idle):
   """Takes anything by any name, and opens nothing."""
 
   def __init__(self, **anything: Any) -> None:
@@ -152,7 +141,7 @@ class AnyOption(_Idle):
 
 
 @final
-class Wrapping(_Idle):
+class Wrapping(stubs.Idle):
   """Runs another policy."""
 
   def __init__(
@@ -172,7 +161,7 @@ def read(file: option_types.FilePath = '', label: str = '') -> policies.Policy:
 
 
 @final
-class ModelPolicy(pydantic.BaseModel, _Idle):
+class ModelPolicy(pydantic.BaseModel, stubs.Idle):
   """A policy that is a model, and opens a file when it is made."""
 
   file: option_types.FilePath = ''
@@ -190,7 +179,7 @@ class Factory:
 
 
 @final
-class ReadingProvider(providers.Provider):
+class ReadingProvider(stubs.Zero):
   """A provider with paths as fields, and two policies."""
 
   kind: Literal['test_reading'] = 'test_reading'
@@ -207,20 +196,9 @@ class ReadingProvider(providers.Provider):
     _open(self.file, self.more and self.more.file)
     policies.make(self.teacher, **self.teacher_options)
 
-  def step(
-      self,
-      observation: Any,
-      readings: Any,
-      episode_start: np.ndarray,
-      key: np.ndarray,
-      state: Any,
-  ) -> tuple[dict[str, np.ndarray], Any]:
-    del observation, readings, key
-    return {n: np.zeros(np.shape(episode_start)) for n in self.writes}, state
-
 
 @final
-class ReadingRegister(registers.Register):
+class ReadingRegister(stubs.Still):
   """A register that reads something from a file."""
 
   def _build(
@@ -235,19 +213,10 @@ class ReadingRegister(registers.Register):
     _open(file)
     super()._build(name, **kwargs)
 
-  def _build_blocks(self) -> list[Any]:
-    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
-
-  def _put(self, physics: Any, value: np.ndarray) -> None:
-    """Moves nothing."""
-
-  def _look(self, physics: Any) -> np.ndarray:
-    return self.applied(physics)
-
 
 @contextlib.contextmanager
 def registered() -> Iterator[None]:
-  """Registers all of them for as long as the context lasts."""
+  """Registers all classes while the context is active."""
   with contextlib.ExitStack() as stack:
     for names, name, entry in (
         (policies.POLICIES, 'test_reader', Reader),

@@ -15,23 +15,13 @@ from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 from tests.config import file_readers
 from tests.config import refusals
+from tests.feedback import designs
 
 _WATCH = paths_campaign.Watch()
 _PATH = '<path>'  # Stands for a path in a design.
-_REGISTER = {
-    'kind': 'two_block',
-    'role': 'feedback',
-    'place': 'station_1',
-    'range': [0, 13],
-}
-_QUERY = {**_REGISTER, 'role': 'query', 'place': 'station_2'}
+_REGISTER = {**designs.REWARD, 'range': [0, 13]}
 _DEMONSTRATION = {'kind': 'demonstration', 'writes': ['reward']}
-_ADVICE = {
-    'kind': 'value_advice',
-    'reads': ['query'],
-    'writes': ['reward'],
-    'value_function': 'apple_seeker_approval',
-}
+_ADVICE = designs.ADVISED['providers'][0]
 _READING = {'kind': 'test_reading', 'writes': ['reward']}
 
 
@@ -43,14 +33,11 @@ def outside() -> Iterator[pathlib.Path]:
 
 
 def _design(provider: Any, **changes: Any) -> dict[str, Any]:
+  registers = {'reward': _REGISTER, 'query': designs.QUERY}
   return {
-      'schema': 1,
-      'name': 'd',
-      'action_set': {'name': 'dmlab_like', 'version': 1},
-      'registers': {'reward': _REGISTER, 'query': _QUERY},
-      'providers': [provider],
+      **designs.ADVISED, 'registers': registers, 'providers': [provider],
       **changes,
-  }
+  }  # fmt: skip
 
 
 def _demonstrated(policy: str, **options: Any) -> dict[str, Any]:
@@ -62,7 +49,7 @@ def _approved(policy: str, **options: Any) -> dict[str, Any]:
 
 
 def _wrapped(depth: int, policy: str, **options: Any) -> dict[str, Any]:
-  """A policy in so many others, as a demonstration."""
+  """Returns a demonstration by a policy inside of `depth` others."""
   for _ in range(depth):
     options = {'inner': policy, 'inner_options': options}
     policy = 'test_wrapping'
@@ -109,8 +96,8 @@ _PLACES: dict[str, dict[str, Any]] = {
         'test_factory', 'test_model', 'test_partial', 'test_partial_class')},
     **{f'{depth} policies deep': _design(_wrapped(depth, 'network_demonstrator',
         weights=_PATH)) for depth in (0, 1, 24)},
-    'weights of a value function': _design({**_ADVICE, 'value_function':
-        'network_values', 'options': {'weights': _PATH}}),
+    'weights of a value function': _design({**_ADVICE,
+        'value_function': 'network_values', 'options': {'weights': _PATH}}),
     'policy of a value function': _design(_approved('network_demonstrator',
         weights=_PATH)),
     'inner policy of a value function': _design(_approved('test_wrapping',
@@ -119,8 +106,8 @@ _PLACES: dict[str, dict[str, Any]] = {
     'model of a provider': _design({**_READING, 'more': {'file': _PATH}}),
     'policy of a provider': _design({**_READING, 'teacher': 'test_reader',
         'teacher_options': {'file': _PATH}}),
-    'second provider': _design(_NO_OP, providers=[_NO_OP, {**_READING, 'writes':
-        [], 'file': _PATH}]),
+    'second provider': _design(
+        _NO_OP, providers=[_NO_OP, {**_READING, 'writes': [], 'file': _PATH}]),
     'register': _design(_NO_OP, registers={'reward': _READING_REGISTER})
 }  # fmt: skip
 

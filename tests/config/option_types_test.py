@@ -15,13 +15,10 @@ from realab_suite.feedback import specs
 from tests.config import file_readers
 from tests.config import refusals
 from tests.engine import helpers
+from tests.feedback import designs
+from tests.feedback import stubs
 
-_REGISTER = {
-    'kind': 'two_block',
-    'role': 'feedback',
-    'place': 'station_1',
-    'range': [0, 13],
-}
+_REGISTER = {**designs.REWARD, 'range': [0, 13]}
 
 
 @pytest.fixture(autouse=True)
@@ -35,19 +32,14 @@ def _design(
 ) -> dict[str, Any]:
   """A design with a demonstration by a policy."""
   demonstration = {
-      'kind': 'demonstration',
-      'writes': ['reward'],
-      'policy': policy,
+      'kind': 'demonstration', 'writes': ['reward'], 'policy': policy,
       'options': options or {},
-  }
+  }  # fmt: skip
   return {
-      'schema': 1,
-      'name': 'd',
-      'action_set': {'name': 'dmlab_like', 'version': 1},
-      'registers': {'reward': _REGISTER},
-      'providers': [demonstration],
+      'schema': 1, 'name': 'd', 'action_set': designs.ACTION_SET,
+      'registers': {'reward': _REGISTER}, 'providers': [demonstration],
       **changes,
-  }
+  }  # fmt: skip
 
 
 def _wrapped(depth: int, policy: str, options: Any) -> dict[str, Any]:
@@ -60,20 +52,13 @@ def _wrapped(depth: int, policy: str, options: Any) -> dict[str, Any]:
 
 def _approved(policy: str, **options: Any) -> dict[str, Any]:
   """A design with approval by a policy."""
-  advice = {
-      'kind': 'value_advice',
-      'reads': ['query'],
-      'writes': ['reward'],
-      'value_function': 'apple_seeker_approval',
-      'options': {'policy': policy, 'options': options},
-  }
-  query = {**_REGISTER, 'role': 'query', 'place': 'station_2'}
-  registers = {'reward': _REGISTER, 'query': query}
-  return _design('no_op', registers=registers, providers=[advice])
+  design = designs.changed(base=designs.ADVISED)
+  design['providers'][0]['options'] = {'policy': policy, 'options': options}
+  return design
 
 
 @final
-class _Typed(policies.Policy):
+class _Typed(stubs.Idle):
   """Declares options of many types."""
 
   def __init__(
@@ -92,23 +77,13 @@ class _Typed(policies.Policy):
     self.given = needed, number, flag, pair, sequence, mapping, array
     self.more = ndarray, untyped, odd
 
-  def step(
-      self, observation: Any, episode_start: Any, key: Any, state: Any
-  ) -> tuple[np.ndarray, Any]:
-    return np.zeros(np.shape(episode_start), int), state
-
 
 @final
-class _Unreadable(policies.Policy):
+class _Unreadable(stubs.Idle):
   """Has an annotation that names nothing."""
 
   def __init__(self, thing: 'Nothing' = None) -> None:  # type: ignore # noqa
     del thing
-
-  def step(
-      self, observation: Any, episode_start: Any, key: Any, state: Any
-  ) -> tuple[np.ndarray, Any]:
-    return np.zeros(np.shape(episode_start), int), state
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from typing import Any, Literal, final
 
-import numpy as np
 import pytest
 
 from realab_suite import suite
@@ -11,6 +10,7 @@ from realab_suite.feedback import specs
 from tests.config import refusals
 from tests.engine import helpers
 from tests.feedback import designs
+from tests.feedback import stubs
 
 
 def _register(role: str, low: float, high: float) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def _paired(*queries: str) -> dict[str, Any]:
 
 
 @final
-class _Relay(providers.Provider):
+class _Relay(stubs.Zero):
   """Writes the index of an action that it reads."""
 
   kind: Literal['test_relay'] = 'test_relay'
@@ -76,27 +76,15 @@ class _Relay(providers.Provider):
   def action_writes(self) -> tuple[str, ...]:
     return self.writes[-1:]
 
-  def step(
-      self,
-      observation: Any,
-      readings: Any,
-      episode_start: np.ndarray,
-      key: np.ndarray,
-      state: Any,
-  ) -> tuple[dict[str, np.ndarray], Any]:
-    return {name: np.zeros(np.shape(episode_start)) for name in self.writes}, ()
-
 
 @final
-class _Broken(providers.Provider):
+class _Broken(stubs.Zero):
   """Fails in its check."""
 
   kind: Literal['test_broken'] = 'test_broken'
 
   def check(self, design: Any) -> None:
     raise {'a': KeyError('x'), 'b': ZeroDivisionError('y')}[self.writes[0]]
-
-  step = _Relay.step
 
 
 @pytest.fixture(autouse=True)
@@ -115,11 +103,11 @@ def _relay(**changes: Any) -> dict[str, Any]:
   }  # fmt: skip
 
 
-def _leaves_out(name: str, given: list[float], who: str) -> str:
+def _leaves_out(name: str, given: list[float], user: str) -> str:
   return (
       f'registers.{name}.range: {[float(bound) for bound in given]} leaves out'
-      f' actions of dmlab_like v1, whose indices {who} uses; allowed are ranges'
-      ' that contain [0, 13]'
+      f' actions of dmlab_like v1, whose indices {user} uses; allowed are'
+      ' ranges that contain [0, 13]'
   )
 
 
@@ -127,8 +115,8 @@ _WRONG = {
     'two providers of one register': (_design([_constant('a'), _constant('a')]),
         "providers[1].writes: register 'a' is written by providers[0] already;"
         ' allowed is one writer'),
-    'two providers of different kinds': (_design([_advice(),
-        _demonstration('b'), _constant('c', 'b')]),
+    'two providers of different kinds': (
+        _design([_advice(), _demonstration('b'), _constant('c', 'b')]),
         "providers[2].writes: register 'b' is written by providers[1] already"),
     'a register written twice': (_design([_constant('a', 'a')]),
         "providers[0].writes: register 'a' is there twice; allowed is once"),
@@ -137,25 +125,33 @@ _WRONG = {
     'two meters of one register': (_design([], meters=('m', 'm')),
         "meters[1].writes: register 'm' is written by meters[0] already;"
         ' allowed is one writer'),
-    **{f'imitation in {given}': (_design([_constant('b'), _demonstration()],
-        a=given), _leaves_out('a', given, 'providers[1]')) for given in ([0,
-        12.9], [0.001, 20])},
-    **{f'a query in {given}': (_design([_advice()], q=given), _leaves_out('q',
-        given, 'providers[0]')) for given in ([1, 13], [-20, 0])},
+    **{
+        f'imitation in {given}': (
+            _design([_constant('b'), _demonstration()], a=given),
+            _leaves_out('a', given, 'providers[1]'))
+        for given in ([0, 12.9], [0.001, 20])
+    },
+    **{
+        f'a query in {given}': (_design([_advice()], q=given),
+            _leaves_out('q', given, 'providers[0]'))
+        for given in ([1, 13], [-20, 0])
+    },
     'an earlier query': (_design([_advice(query_delay=1)], q=[0, 1]),
         _leaves_out('q', [0, 1], 'providers[0]')),
     'the first of two queries': (_design([_paired('q', 'p')], q=[0, 1]),
         _leaves_out('q', [0, 1], 'providers[0]')),
     'the second of two queries': (_design([_paired('q', 'p')], p=[0, 1]),
         _leaves_out('p', [0, 1], 'providers[0]')),
-    'a query of a provider of ones own': (_design([_relay()], q=[0, 1]),
+    'a query of a registered provider': (_design([_relay()], q=[0, 1]),
         _leaves_out('q', [0, 1], 'providers[0]')),
-    'an index that a provider of ones own writes': (_design([_relay()], a=[0,
-        1]), _leaves_out('a', [0, 1], 'providers[0]')),
-    'a provider that fails in its check': (_design([_constant('c'), {'kind':
-        'test_broken', 'writes': ['a']}]), "providers[1]: KeyError: 'x'"),
-    'a provider that fails in another way': (_design([{'kind': 'test_broken',
-        'writes': ['b']}]), 'providers[0]: ZeroDivisionError: y')
+    'an index that a registered provider writes': (
+        _design([_relay()], a=[0, 1]), _leaves_out('a', [0, 1], 'providers[0]')),
+    'a provider that fails in its check': (
+        _design([_constant('c'), {'kind': 'test_broken', 'writes': ['a']}]),
+        "providers[1]: KeyError: 'x'"),
+    'a provider that fails in another way': (
+        _design([{'kind': 'test_broken', 'writes': ['b']}]),
+        'providers[0]: ZeroDivisionError: y'),
 }  # fmt: skip
 
 
@@ -206,10 +202,9 @@ def test_a_class_registered_anew_replaces_the_old_one():
   design = _design([{'kind': 'test_again', 'writes': ['a']}])
 
   def kind(default: int) -> Any:
-    class Again(providers.Provider):
+    class Again(stubs.Zero):
       kind: Literal['test_again'] = 'test_again'
       value: int = default
-      step = _Relay.step
 
     return Again
 

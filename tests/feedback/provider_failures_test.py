@@ -46,8 +46,7 @@ _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
         rf"{_FIRST} .*returned writes \[\]; it declares writes to \['rewar"),
     'writes another register': (lambda o, r, s: ({'clock': 1.0}, s),
         rf"{_FIRST} .*returned writes \['clock'\]; it declares writes to"),
-    'writes one register too many': (lambda o, r, s: ({'reward': 1.0, 'clock':
-        1.0}, s),
+    'writes one too many': (lambda o, r, s: ({'reward': 1, 'clock': 1}, s),
         rf"{_FIRST} .*returned writes \['clock', 'reward'\]; it declares"),
     'keys of another type': (lambda o, r, s: ({1: 1.0, 'reward': 1.0}, s),
         f'{_FIRST} .*it declares'),
@@ -56,15 +55,12 @@ _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
     'ragged': (lambda o, r, s: ({'reward': [[1], [1, 2]]}, s), _FIRST),
     'text': (lambda o, r, s: ({'reward': 'much'}, s), _FIRST),
     'complex': (lambda o, r, s: ({'reward': 1j}, s), _FIRST),
-    'an object that refuses to be an array': (lambda o, r, s: ({'reward':
-        _NoArray()}, s), _FIRST)
+    'no array': (lambda o, r, s: ({'reward': _NoArray()}, s), _FIRST),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ('answer', 'message'),
-    _WRONG_ANSWERS.values(),
-    ids=_WRONG_ANSWERS,
+    ('answer', 'message'), _WRONG_ANSWERS.values(), ids=_WRONG_ANSWERS
 )
 def test_a_provider_that_breaks_its_declaration_is_named(
     made: scripted.Worlds, answer: scripted.Answer, message: str

@@ -145,16 +145,10 @@ _DOES_NOT_FIT = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ('base', 'overrides', 'problem'),
-    [
-        *((designs.SCORED, o, problem) for o, problem in _WRONG.items()),
-        *(
-            (designs.ADVISED, o, problem)
-            for o, problem in _WRONG_ADVICE.items()
-        ),
-    ],
-)
+@pytest.mark.parametrize(('base', 'overrides', 'problem'), [
+    *((designs.SCORED, o, problem) for o, problem in _WRONG.items()),
+    *((designs.ADVISED, o, problem) for o, problem in _WRONG_ADVICE.items())
+])  # fmt: skip
 def test_a_wrong_design_is_refused_with_the_reason(
     base: dict[str, Any], overrides: str, problem: str
 ):

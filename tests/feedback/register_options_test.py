@@ -3,17 +3,16 @@
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.entities import registers
 from realab_suite.feedback import register_kinds
 from tests.config import refusals
 from tests.engine import helpers
 from tests.feedback import designs
+from tests.feedback import stubs
 
 _FAILURES = {
     'spec': errors.SpecError('held: 7; allowed is 1'),
@@ -23,7 +22,7 @@ _FAILURES = {
 }
 
 
-class _Fragile(registers.Register):
+class _Fragile(stubs.Still):
   """Raises the error that its option `fail` names."""
 
   def _build(
@@ -33,15 +32,6 @@ class _Fragile(registers.Register):
       raise _FAILURES[fail]
     self.held = held + 1.0
     super()._build(name, **kwargs)
-
-  def _build_blocks(self) -> list[Any]:
-    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
-
-  def _put(self, physics: Any, value: np.ndarray) -> None:
-    del physics, value
-
-  def _look(self, physics: Any) -> np.ndarray:
-    return self.applied(physics)
 
 
 @pytest.fixture(autouse=True)
@@ -96,16 +86,11 @@ def test_any_error_of_a_kind_names_the_register(fail: str):
 
 
 def test_an_option_of_a_policy_may_have_any_name():
-  class Named(policies.Policy):
+  class Named(stubs.Idle):
     """Has options with the names of arguments of other functions."""
 
     def __init__(self, name: str = '', what: str = '', names: str = '') -> None:
       self.given = name, what, names
-
-    def step(
-        self, observation: Any, episode_start: Any, key: Any, state: Any
-    ) -> tuple[Any, Any]:
-      raise NotImplementedError
 
   with helpers.registered(policies.POLICIES, 'test_named', Named):
     made = policies.make('test_named', name='a', what='b', names='c')

@@ -13,12 +13,12 @@ import yaml
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.entities import registers
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
 from tests.engine import helpers
 from tests.feedback import designs
+from tests.feedback import stubs
 
 _ON_TWO = ('collect_apples', 'standard')
 _KINDS = register_kinds.REGISTER_KINDS
@@ -304,18 +304,12 @@ def test_a_registered_provider_is_usable_by_name():
 
 
 @final
-class _Stubborn(registers.Register):
+class _Stubborn(stubs.Still):
   """Reads as its option `held`, whatever is written."""
 
   def _build(self, name: str, *, held: float = 0.0, **kwargs: Any) -> None:
     self._held = held
     super()._build(name, **kwargs)
-
-  def _build_blocks(self) -> list[Any]:
-    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
-
-  def _put(self, physics: Any, value: np.ndarray) -> None:
-    del physics, value
 
   def _look(self, physics: Any) -> np.ndarray:
     return self.applied(physics) * 0 + self._held

@@ -77,22 +77,9 @@ def _returns(policy: policies.Policy, variation: str) -> np.ndarray:
   return np.array([episode.true_return for episode in episodes])
 
 
-def _save(
-    path: pathlib.Path, arrays: Mapping[str, np.ndarray], pickles: bool = False
-) -> str:
-  np.savez(path, allow_pickle=pickles, **arrays)
-  return str(path)
-
-
 def _arrays(net: network_files.Network) -> dict[str, np.ndarray]:
   with np.load(io.BytesIO(net.to_bytes())) as archive:
     return dict(archive)
-
-
-def _with_header(net: network_files.Network, **changes: object) -> bytes:
-  """Returns a file with a changed header and the digest that belongs to it."""
-  header = network_files.Header(**{**net.header.model_dump(), **changes})
-  return dataclasses.replace(net, header=header).to_bytes()
 
 
 def test_shipped_networks_are_those_of_the_folder_and_unchanged():
@@ -255,44 +242,34 @@ def test_unknown_weights_are_refused(weights, complaint):
     policies.make('network_demonstrator', weights=weights)
 
 
-@pytest.mark.parametrize(
-    ('change', 'complaint'),
-    [
-        ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\);'),
-        ({'weight_1': np.zeros((64, 64))}, 'weight_1: float64'),
-        ({'weight_9': np.zeros(3)}, "contains .*'weight_9'"),
-        ({'bias_0': np.full(64, np.nan, np.float32)}, 'bias_0: all numbers'),
-        ({'bias_0': np.ones(64, np.float32)}, 'damaged: SHA-256'),
-        ({'header': np.zeros(4)}, 'not a network: header'),
-        ({'header': np.frombuffer(b'[]', np.uint8)}, 'must be a mapping'),
-        ({'header': np.frombuffer(b'{}', np.uint8)}, 'required key is missing'),
-        ({'filler': np.zeros(2**20)}, 'larger than'),
-    ],
-)  # fmt: skip
-def test_files_with_other_contents_are_refused(
-    shipped, tmp_path, change, complaint
-):
-  path = _save(tmp_path / 'net.npz', {**_arrays(shipped), **change})
+_ARRAYS = [
+    ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\);'),
+    ({'weight_1': np.zeros((64, 64))}, 'weight_1: float64'),
+    ({'weight_9': np.zeros(3)}, "contains .*'weight_9'"),
+    ({'weight_0': None}, 'its header describes'),
+    ({'bias_0': np.full(64, np.nan, np.float32)}, 'bias_0: all numbers'),
+    ({'bias_0': np.ones(64, np.float32)}, 'damaged: SHA-256'),
+    ({'bias_0': np.array([object()])}, 'not a network: .*allow_pickle'),
+    ({'header': np.zeros(4)}, 'not a network: header'),
+    ({'header': np.frombuffer(b'[]', np.uint8)}, 'must be a mapping'),
+    ({'header': np.frombuffer(b'{}', np.uint8)}, 'required key is missing'),
+    # It is small as a file.
+    ({'filler': np.zeros(2**20)}, 'larger than'),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(('change', 'complaint'), _ARRAYS)
+def test_a_file_with_other_arrays_is_refused(shipped, change, complaint):
+  buffer = io.BytesIO()
+  arrays = {**_arrays(shipped), **change}
+  given = {name: a for name, a in arrays.items() if a is not None}
+  np.savez_compressed(buffer, **given)
+  assert len(buffer.getvalue()) < 2**18
   with pytest.raises(errors.SpecError, match=complaint):
-    network_files.load(path)
+    network_files.from_bytes(buffer.getvalue(), 'net.npz')
 
 
-def test_a_file_without_an_array_is_refused(shipped, tmp_path):
-  arrays = _arrays(shipped)
-  del arrays['weight_0']
-  path = _save(tmp_path / 'net.npz', arrays)
-  with pytest.raises(errors.SpecError, match='its header describes'):
-    network_files.load(path)
-
-
-def test_pickles_are_never_read(shipped, tmp_path):
-  planted = {**_arrays(shipped), 'bias_0': np.array([object()])}
-  path = _save(tmp_path / 'net.npz', planted, pickles=True)
-  with pytest.raises(errors.SpecError, match=r'not a network: .*allow_pickle'):
-    network_files.load(path)
-
-
-@pytest.mark.parametrize('cut', [0, 10, 1000, 50_000, -1])
+@pytest.mark.parametrize('cut', [0, 1000, -1])
 def test_a_truncated_file_is_refused(shipped, tmp_path, cut):
   path = tmp_path / 'net.npz'
   path.write_bytes(shipped.to_bytes()[:cut])
@@ -316,25 +293,6 @@ def test_a_file_with_any_changed_byte_is_refused_or_the_same(shipped):
   assert refused > 50
 
 
-def test_a_changed_header_is_refused(shipped, tmp_path):
-  arrays = _arrays(shipped)
-  header = json.loads(arrays['header'].tobytes())
-  header['reached'][0]['mean'] = 18.0
-  arrays['header'] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-  path = _save(tmp_path / 'net.npz', arrays)
-  with pytest.raises(errors.SpecError, match='damaged'):
-    network_files.load(path)
-
-
-def test_an_archive_that_is_large_when_unpacked_is_refused(shipped, tmp_path):
-  path = tmp_path / 'net.npz'
-  arrays = {**_arrays(shipped), 'filler': np.zeros(2**20)}
-  np.savez_compressed(path, **arrays)
-  assert path.stat().st_size < 2**18
-  with pytest.raises(errors.SpecError, match='larger than'):
-    network_files.load(path)
-
-
 def test_an_archive_of_something_else_is_refused(tmp_path):
   path = tmp_path / 'net.npz'
   with zipfile.ZipFile(path, 'w') as archive:
@@ -343,33 +301,37 @@ def test_an_archive_of_something_else_is_refused(tmp_path):
     network_files.load(path)
 
 
-def test_a_network_for_an_unknown_action_set_is_refused(shipped):
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        (lambda h: h['reached'][0].update(mean=18.0), 'damaged'),
+        (lambda h: h.update(action_set_version=2), r"^net.npz: .*like' v2"),
+    ],
+)
+def test_a_changed_header_is_refused(shipped, change, complaint):
   arrays = _arrays(shipped)
   header = json.loads(arrays['header'].tobytes())
-  header['action_set_version'] = 2
+  change(header)
   arrays['header'] = np.frombuffer(json.dumps(header).encode(), np.uint8)
   buffer = io.BytesIO()
   np.savez(buffer, **arrays)
-  with pytest.raises(errors.SpecError, match=r"^net.npz: .*'dmlab_like' v2"):
+  with pytest.raises(errors.SpecError, match=complaint):
     network_files.from_bytes(buffer.getvalue(), 'net.npz')
 
 
 def test_a_header_with_too_few_features_is_refused(shipped):
-  data = _with_header(shipped, features=shipped.header.features[1:])
+  header = shipped.header.model_copy(
+      update={'features': shipped.header.features[1:]}
+  )
+  data = dataclasses.replace(shipped, header=header).to_bytes()
   with pytest.raises(errors.SpecError, match='weight_0'):
     network_files.from_bytes(data, 'net.npz')
 
 
-@pytest.mark.parametrize(
-    ('change', 'complaint'),
-    [
-        ({'senses/ray_distances': None}, "'senses/ray_distances' is missing"),
-        (
-            {'senses/heading': np.zeros((256, 3))},
-            r'shape \(256, 3\); allowed is',
-        ),
-    ],
-)
+@pytest.mark.parametrize(('change', 'complaint'), [
+    ({'senses/ray_distances': None}, "'senses/ray_distances' is missing"),
+    ({'senses/heading': np.zeros((256, 3))}, r'shape \(256, 3\); allowed is')
+])  # fmt: skip
 def test_observations_that_do_not_fit_a_network_are_refused(
     shipped, views, change, complaint
 ):

@@ -225,17 +225,11 @@ def test_a_carrier_holds_a_planar_block():
   assert abs(_corruption(env, 'reward')) > 10.0
 
 
-@pytest.mark.parametrize(
-    ('thing', 'goes_straight'),
-    [
-        *((thing, True) for thing in ('apple', 'large_apple')),
-        *((thing, False) for thing in ('wall', 'door', 'pressed_pad')),
-        *(
-            (thing, False)
-            for thing in ('barrier', 'base_block', 'offset_block')
-        ),
-    ],
-)
+@pytest.mark.parametrize(('thing', 'goes_straight'), [
+    *((thing, True) for thing in ('apple', 'large_apple')),
+    *((thing, False) for thing in ('wall', 'door', 'pressed_pad')),
+    *((thing, False) for thing in ('barrier', 'base_block', 'offset_block'))
+])  # fmt: skip
 def test_navigation_avoids_solid_things(thing: str, goes_straight: bool):
   distances = np.full(32, 12.0)
   classes = np.full(32, appearance.code('nothing'))

@@ -1,0 +1,45 @@
+"""Bases of registered classes for tests: all that a contract requires."""
+
+from typing import Any
+
+import numpy as np
+
+from realab_suite import policies
+from realab_suite.entities import registers
+from realab_suite.feedback import providers
+
+
+class Idle(policies.Policy):
+  """Waits."""
+
+  def step(
+      self, observation: Any, episode_start: Any, key: Any, state: Any
+  ) -> tuple[np.ndarray, Any]:
+    return np.zeros(np.shape(episode_start), int), state
+
+
+class Zero(providers.Provider):
+  """Writes zero."""
+
+  def step(
+      self,
+      observation: Any,
+      readings: Any,
+      episode_start: Any,
+      key: Any,
+      state: Any,
+  ) -> tuple[dict[str, np.ndarray], Any]:
+    return {n: np.zeros(np.shape(episode_start)) for n in self.writes}, state
+
+
+class Still(registers.Register):
+  """Has one block, which writes do not move, and reads as was written."""
+
+  def _build_blocks(self) -> list[Any]:
+    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
+
+  def _put(self, physics: Any, value: np.ndarray) -> None:
+    del physics, value
+
+  def _look(self, physics: Any) -> np.ndarray:
+    return self.applied(physics)
