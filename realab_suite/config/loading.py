@@ -5,14 +5,10 @@ constructs no objects: it only splits the text into events, and this module
 builds mappings, lists, strings, numbers, booleans and nulls from them. Anchors,
 aliases, tags and directives are refused.
 
-YAML 1.1, which PyYAML reads, and YAML 1.2 disagree about unquoted words. Here
-`true`, `false`, `null`, `~`, plain decimal integers and decimal floats
-(including `1e3`) have their usual meaning. Words that YAML 1.1 converts, such
-as `yes`, `012`, `1:30`, `1_000`, `0x1f` or `2024-01-01`, are refused. Keeping
-them as text could be as wrong as converting them, and a field that accepts any
-text would not detect it.
-
-This module checks no schema; see `validation`.
+Unquoted `true`, `false`, `null`, `~`, plain decimal integers and decimal floats
+(including `1e3`) have their usual meaning. Other words that YAML 1.1 converts,
+such as `yes`, `012`, `1:30`, `0x1f` or `2024-01-01`, are refused, because YAML
+1.2 keeps them as text. `validation` checks descriptions against a schema.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,8 +29,7 @@ from realab_suite.config import messages
 _MAX_BYTES = 2**20
 _MAX_DEPTH = 32
 _MAX_ENTRIES = 1000
-# Number of values in all collections together. It bounds mappings that contain
-# one list many times.
+# In all collections together; bounds mappings that contain one list many times.
 _MAX_VALUES = 100_000
 # Larger integers are not exact as floats, and a field may convert them.
 _MAX_INT = 2**53

@@ -23,14 +23,12 @@ _WRONG = {
         ' got -1',
     # Not in the file.
     'registers.reward.mass=-1': 'registers.reward.mass: must be greater than',
-    'registers.query.mass=0': 'registers.query.mass: must be greater than',
     'registers.reward.options.speed=1':
         "registers.reward.options: unknown key 'speed' (allowed: none)",
     'metres=[]': "unknown key 'metres'; did you mean 'meters'?",
     'learner.reward=reward': 'learner.kind: required key is missing',
     'schedule.meter_substep=3':
         'schedule.provider_substep: required key is missing',
-    'name=[]': 'name: must be a valid string, got []',
     'providers.0.query_delay=2': 'providers[0].query_delay: must be 0 or 1',
     'providers.0.options.options.speed=1':
         "providers[0].options.options: unknown key 'speed'",
@@ -49,8 +47,6 @@ _RIGHT = (
 _CROSS = {
     'registers.reward.range=[5, 6]':
         'registers.reward: initial 0.0 must be in range [5.0, 6.0]',
-    'registers.reward.initial=99':
-        'registers.reward: initial 99.0 must be in range [-2.0, 12.0]',
     'registers.query.role=meter':
         "providers[0]: value_advice reads the query off 'query', whose role is"
         " 'meter'",
@@ -60,8 +56,6 @@ _CROSS = {
         "providers[0].writes: register 'reward' has role 'meter'",
     'registers={}': "providers[0].reads: register 'query' is not declared",
     'action_set=null': 'providers[0]: value_advice uses action set',
-    'providers.0.reads=[scoer]':
-        "providers[0].reads: register 'scoer' is not declared",
     'meters=[{measures: score, writes: query}]':
         "meters[0].writes: register 'query' has role 'query'",
     'learner={kind: value_advice, advice: extra}':

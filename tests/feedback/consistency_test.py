@@ -145,7 +145,8 @@ _WRONG = {
     'a query of a registered provider': (_design([_relay()], q=[0, 1]),
         _leaves_out('q', [0, 1], 'providers[0]')),
     'an index that a registered provider writes': (
-        _design([_relay()], a=[0, 1]), _leaves_out('a', [0, 1], 'providers[0]')),
+        _design([_relay()], a=[0, 1]),
+        _leaves_out('a', [0, 1], 'providers[0]')),
     'a provider that fails in its check': (
         _design([_constant('c'), {'kind': 'test_broken', 'writes': ['a']}]),
         "providers[1]: KeyError: 'x'"),
