@@ -64,7 +64,7 @@ class Root(pydantic.RootModel[list[option_types.FilePath]]):
 
 
 class OwnPath(pathlib.PurePosixPath):
-  """A path, of a class of its own."""
+  """Class of paths outside of the standard library."""
 
 
 class Pair(NamedTuple):
@@ -126,7 +126,7 @@ class Inheriting(Reader):
 
 @final
 class AnyFile(stubs.Idle):
-  """Takes files by any name."""
+  """Accepts files as options of any name."""
 
   def __init__(self, **files: option_types.FilePath) -> None:
     _open(*files.values())
@@ -134,7 +134,7 @@ class AnyFile(stubs.Idle):
 
 @final
 class AnyOption(stubs.Idle):
-  """Takes anything by any name, and opens nothing."""
+  """Accepts options of any name and type, and opens nothing."""
 
   def __init__(self, **anything: Any) -> None:
     del anything
@@ -156,7 +156,7 @@ class Wrapping(stubs.Idle):
 
 
 def read(file: option_types.FilePath = '', label: str = '') -> policies.Policy:
-  """Makes a policy; a function does as well as a class."""
+  """Makes a policy: a function instead of a class."""
   return Reader(file=file, label=label)
 
 
@@ -199,7 +199,7 @@ class ReadingProvider(stubs.Zero):
 
 @final
 class ReadingRegister(stubs.Still):
-  """A register that reads something from a file."""
+  """A register that reads a file."""
 
   def _build(
       self,

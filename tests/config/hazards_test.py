@@ -25,7 +25,7 @@ _MAX_SHARE = 1_000.0  # An order of magnitude above the worst one.
 _MAX_GROWTH = 100 * 2**20
 _is_linux = pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
 _BIG = 2**20  # The largest size of a file, in bytes.
-# Texts that are no descriptions at all.
+# Texts that are not descriptions.
 _NOT_PARSED: dict[str, str | bytes] = {
     **{name: text for name, (text, _) in hazards.HAZARDS.items()},
     **{
@@ -36,7 +36,7 @@ _NOT_PARSED: dict[str, str | bytes] = {
     'escapes': 'a: "' + '\\u0041' * 150_000,
     'comments': '#\n' * 400_000,
 }
-# Descriptions whose parts are all allowed, but not as a design.
+# Descriptions that are neither designs nor experiments.
 _PARSED: dict[str, str] = {
     'wide': 'a: [' + ','.join(['x' * 900] * 999) + ']',
     'many registers': 'schema: 1\nname: a\nregisters:\n'
@@ -62,7 +62,7 @@ for _ in range(2):  # The second time it is no more than the first.
 
 @_is_linux
 def test_memory_that_was_taken_and_given_back_is_measured():
-  # In a process of its own: a large one may give back as much meanwhile.
+  # In a separate process, because a large one may free as much memory.
   subprocess.run(
       [sys.executable, '-c', _TAKE_AND_GIVE_BACK], cwd=_ROOT, check=True
   )

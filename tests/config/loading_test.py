@@ -74,7 +74,7 @@ def test_an_unreadable_file_is_refused(tmp_path, monkeypatch):
   path = tmp_path / 'design.yaml'
   path.write_text('a: 1', encoding='utf-8')
 
-  # Not chmod, which does not stop a superuser.
+  # A superuser can read a file without permissions, so chmod is no use.
   def refuse(path: str) -> int:
     raise PermissionError(13, 'Permission denied', path)
 

@@ -63,7 +63,7 @@ def _file(design: Any) -> str:
 
 
 def _refusal(load: Callable[..., Any], *args: Any, **kwargs: Any) -> str:
-  """Returns why something is refused; nothing is opened off limits."""
+  """Returns the refusal of a call that opens no file off limits."""
   with _WATCH.only('.'):
     text = refusals.refusal(load, *args, **kwargs)
     opened = [p for p in _WATCH.opened if paths_campaign.OFF_LIMITS in p]
@@ -144,7 +144,7 @@ def test_a_path_is_confined_where_a_file_names_it(
   assert _refusal(specs.load, _file(design)) == f'given.yaml: {problem}'
   text = _refusal(specs.load, design, is_confined=True)
   assert text == f'design: {problem}'
-  # A caller of `load` may name any file, and the option does open it.
+  # A mapping may name any file, and the option opens it.
   with _WATCH.only('.'):
     spec = specs.load(design)
     if key.startswith('registers'):  # A register is made with its world.
@@ -312,7 +312,7 @@ def test_experiments_are_confined_with_their_overrides(outside: pathlib.Path):
     assert text.startswith(f'given.yaml: {place}')
     assert 'is outside the working directory' in text
   experiment_specs.load(_file(experiment(design='within.yaml')))
-  # Users name what they like.
+  # An experiment that is not a file may name any path.
   own = experiment(
       design=str(outside / 'design.yaml'), overrides=[f'{_DEEP}={path}']
   )

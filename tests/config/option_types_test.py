@@ -30,7 +30,7 @@ def _readers() -> Iterator[None]:
 def _design(
     policy: str, options: dict[str, Any] | None = None, **changes: Any
 ) -> dict[str, Any]:
-  """A design with a demonstration by a policy."""
+  """Returns a design with a demonstration by a policy."""
   demonstration = {
       'kind': 'demonstration', 'writes': ['reward'], 'policy': policy,
       'options': options or {},
@@ -43,7 +43,7 @@ def _design(
 
 
 def _wrapped(depth: int, policy: str, options: Any) -> dict[str, Any]:
-  """A design with a policy that is inside of others."""
+  """Returns a design with a policy inside of `depth` others."""
   for _ in range(depth):
     options = {'inner': policy, 'inner_options': options}
     policy = 'test_wrapping'
@@ -51,7 +51,7 @@ def _wrapped(depth: int, policy: str, options: Any) -> dict[str, Any]:
 
 
 def _approved(policy: str, **options: Any) -> dict[str, Any]:
-  """A design with approval by a policy."""
+  """Returns a design with approval by a policy."""
   design = designs.changed(base=designs.ADVISED)
   design['providers'][0]['options'] = {'policy': policy, 'options': options}
   return design
@@ -80,7 +80,7 @@ class _Typed(stubs.Idle):
 
 @final
 class _Unreadable(stubs.Idle):
-  """Has an annotation that names nothing."""
+  """Has an annotation with an undefined name."""
 
   def __init__(self, thing: 'Nothing' = None) -> None:  # type: ignore # noqa
     del thing

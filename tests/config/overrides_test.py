@@ -1,4 +1,4 @@
-"""Tests for overrides: a problem is reported where a user can fix it."""
+"""Tests for overrides: an error names the override that causes it."""
 
 import json
 import pathlib
@@ -15,7 +15,7 @@ from tests.config import refusals
 from tests.feedback import designs
 
 _DESIGN = designs.ADVISED
-# Overrides that are wrong in any company, and the problem of each.
+# Overrides that are wrong with any others, and the problem of each.
 _WRONG = {
     'channel=loose': "channel: must be 'embedded', 'welded' or 'secure'",
     'registers.reward.scale=-1':
@@ -220,7 +220,7 @@ def test_worlds_and_experiments_name_the_override(tmp_path: pathlib.Path):
 
 
 @hypothesis.given(
-    # Without the one that keeps options from being checked.
+    # Without 'oracle', because options of an unknown name are not checked.
     wrong=st.lists(
         st.sampled_from(_APART), min_size=1, max_size=9, unique=True
     ),

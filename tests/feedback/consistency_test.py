@@ -23,7 +23,7 @@ def _register(role: str, low: float, high: float) -> dict[str, Any]:
 def _design(
     given: list[dict[str, Any]], meters: tuple[str, ...] = (), **ranges: Any
 ) -> dict[str, Any]:
-  """A design of providers; `ranges` are those of some registers."""
+  """Returns a design; `ranges` are those of some registers."""
   roles = {
       'a': 'feedback', 'b': 'feedback', 'c': 'signal', 'm': 'meter',
       'n': 'meter', 'q': 'query', 'p': 'query',

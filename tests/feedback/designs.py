@@ -33,7 +33,7 @@ ADVISED: dict[str, Any] = {
     'providers': [{'kind': 'value_advice', 'value_function':
         'apple_seeker_approval', 'reads': ['query'], 'writes': ['reward']}]
 }  # fmt: skip
-"""A design in which a query about an action is answered."""
+"""A design with advice on a queried action."""
 
 
 def changed(*overrides: str, base: dict[str, Any] = SCORED) -> dict[str, Any]:

@@ -275,7 +275,7 @@ def test_other_channels_deliver_values_as_they_were_written(
 
 
 def test_a_lifted_block_rests_after_a_write(made: scripted.Worlds):
-  # With the velocity or the accelerations of before it would go on falling.
+  # With its previous velocity or acceleration, the block would keep falling.
   heights = []
   for lift in (0.0, 1.0):
     env, _ = made.scripted()
@@ -301,7 +301,7 @@ def test_a_lifted_block_rests_after_a_write(made: scripted.Worlds):
         ('score', 0, -0.5, 23, [0, 0, 5, 0, 0, 0], [0, 0, 5, 0, 0, 0]),
         # Its offset: a spike and the opposite.
         ('score', 1, 0.1, 26, [0, 0, 1, -1, 0, 0], [0, 0, 1, -1, 0, 0]),
-        # The base of the feedback register: from then on.
+        # The base of the feedback register: a constant error.
         ('reward', 0, -0.3, 23, [0] * 6, [0, 0, 3, 3, 3, 3]),
         # Its offset: one reading.
         ('reward', 1, 0.2, 30, [0] * 6, [0, 0, 2, 0, 0, 0]),

@@ -20,7 +20,7 @@ _STEPS = 6
 
 @final
 class _Counting(policies.ValueFunction):
-  """Values action a at 100 per step so far, plus a."""
+  """Values action a in step s of an episode at 100 * s + a."""
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return np.zeros(batch_shape)
@@ -80,7 +80,7 @@ def _observations(seed: int) -> list[dict[str, np.ndarray]]:
 
 
 def _inputs(world: int, step: int) -> tuple[Any, ...]:
-  """Observation, readings, start and key of a step; world 1 starts over."""
+  """Returns the inputs of a step; world 1 starts again in step 3."""
   generator = np.random.default_rng((world, step))
   readings = {
       'score': np.array(generator.uniform(0, 20)),
@@ -98,7 +98,7 @@ def _stack(parts: list[Any]) -> Any:
 
 
 def _stacked_inputs(worlds: int | None, step: int) -> tuple[Any, ...]:
-  """The inputs of one world alone, or of many with a leading axis."""
+  """Returns the inputs of one world, or of a batch with a leading axis."""
   if worlds is None:
     return _inputs(0, step)
   inputs = [_inputs(world, step) for world in range(worlds)]
@@ -238,7 +238,7 @@ def test_constant_writes_one_value_everywhere():
         # 100 * step + action, of this step or of the step before.
         (0, [3, 4, 5, 6], (0, 2), [103, 204, 105, 206]),
         (1, [3, 4, 5, 6], (0, 2), [0, 103, 0, 105]),
-        # A query is read off blocks: rounded, and within the action set.
+        # Readings of a query are rounded and clipped to the action set.
         (1, [2.4, 2.6, 99.0, 0.0], (0,), [0, 102, 203, 313]),
     ],
 )

@@ -87,7 +87,7 @@ def test_any_error_of_a_kind_names_the_register(fail: str):
 
 def test_an_option_of_a_policy_may_have_any_name():
   class Named(stubs.Idle):
-    """Has options with the names of arguments of other functions."""
+    """Has options with the names of arguments of `policies.make`."""
 
     def __init__(self, name: str = '', what: str = '', names: str = '') -> None:
       self.given = name, what, names

@@ -305,7 +305,7 @@ def test_a_registered_provider_is_usable_by_name():
 
 @final
 class _Stubborn(stubs.Still):
-  """Reads as its option `held`, whatever is written."""
+  """Has the reading `held`, independently of writes."""
 
   def _build(self, name: str, *, held: float = 0.0, **kwargs: Any) -> None:
     self._held = held

@@ -1,4 +1,4 @@
-"""Bases of registered classes for tests: all that a contract requires."""
+"""Base classes of policies, providers and registers in tests."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ class Zero(providers.Provider):
 
 
 class Still(registers.Register):
-  """Has one block, which writes do not move, and reads as was written."""
+  """Has a block that writes do not move, and reads the applied value."""
 
   def _build_blocks(self) -> list[Any]:
     return [self._add_block('block', 'offset_block', (0.0, 0.0))]

@@ -41,7 +41,7 @@ def fixture_shipped() -> network_files.Network:
 
 @pytest.fixture(scope='module', name='views')
 def fixture_views() -> dict[str, np.ndarray]:
-  """Observations of 256 worlds after some random actions."""
+  """Returns observations of 256 worlds after some random actions."""
   batch = suite.load_batch(
       'unlock_door', 'near', {'random': 3}, num_envs=64, design='none'
   )
@@ -253,7 +253,7 @@ _ARRAYS = [
     ({'header': np.zeros(4)}, 'not a network: header'),
     ({'header': np.frombuffer(b'[]', np.uint8)}, 'must be a mapping'),
     ({'header': np.frombuffer(b'{}', np.uint8)}, 'required key is missing'),
-    # It is small as a file.
+    # Large only when it is unpacked.
     ({'filler': np.zeros(2**20)}, 'larger than'),
 ]  # fmt: skip
 

@@ -62,7 +62,7 @@ def _load(
 
 @pytest.fixture(scope='module', name='views')
 def fixture_views() -> list[list[dict[str, np.ndarray]]]:
-  """The observations of the seeker in three worlds."""
+  """Returns the observations of the seeker in three worlds."""
   seeker = policies.make('apple_seeker')
   return [
       [seen for seen, _ in _run(_load(seed=seed), seeker, _STEPS)]
@@ -92,7 +92,7 @@ def test_a_batch_gives_the_actions_of_its_worlds_alone(
   policy = policies.make(name)
   together, alone = policy.initial_state((3,)), [policy.initial_state(())] * 3
   for step in range(_STEPS):
-    # One world begins another episode when the others do not.
+    # One world begins a second episode in step 20.
     start = np.array([step == 0, step in (0, 20), step == 0])
     seen = [view[step] for view in views]
     actions, together = policy.step(
@@ -286,7 +286,7 @@ def test_approval_falls_with_the_distance_from_the_policys_action():
   assert values.shape == (2, len(approval.action_set))
   name = approval.action_set.index
   assert values[0, name('wait')] == 1.0
-  # The farthest apart are walking in a bend and walking backward.
+  # The most distant actions are walking in a bend and walking backward.
   farthest = np.linalg.norm(
       _CONTROLS[name('forward_turn_left')] - [-1, 0, 0, 0, 0, 0]
   )
