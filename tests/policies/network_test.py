@@ -293,6 +293,11 @@ def test_a_file_with_any_changed_byte_is_refused_or_the_same(shipped):
   assert refused > 50
 
 
+def test_a_large_file_is_refused():
+  with pytest.raises(errors.SpecError, match='larger than'):
+    network_files.from_bytes(bytes(2**22 + 1), 'net.npz')
+
+
 def test_an_archive_of_something_else_is_refused(tmp_path):
   path = tmp_path / 'net.npz'
   with zipfile.ZipFile(path, 'w') as archive:
