@@ -1,6 +1,6 @@
-"""How fast things are, measured against the raw engine in the same run."""
+"""Benchmarks of speed, relative to raw MuJoCo in the same run."""
 
 import os
 
-# Nothing here renders, and dm_control looks for a renderer when imported.
+# Most benchmarks do not render; dm_control selects a renderer at import.
 os.environ.setdefault('MUJOCO_GL', 'disable')

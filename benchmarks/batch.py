@@ -1,33 +1,30 @@
-"""Many worlds together, against the raw batch engine doing the same.
+"""Benchmark of a batch of worlds against MuJoCo's own batch engine.
 
 `python -m benchmarks.batch` steps 256 worlds of Unlock Door with two free
 two-block registers, rays, a ledger and random actions that use the hand, on all
-processors. MuJoCo's own `Batch` replays it from a copy of the state: the same
-substeps, the same writes as assignments to whole arrays, one update of derived
-quantities, the same rays cast by a second `Batch`. Both have to end in the same
-state, bit for bit, in every round.
+processors. MuJoCo's `Batch` replays the steps from a copy of the state: the
+same substeps, the same writes as assignments to whole arrays, one update of
+derived quantities, and the same rays cast by a second `Batch`. Both have to end
+in the same state, bit for bit, in every round.
 
-The stock contestant is one `composer.Environment` as dm_control makes it, with
-the same world and registers: the model is compiled again in each episode, what
-the avatar senses are observables, and the task writes both registers after each
-step. It keeps no ledger.
+The stock contestant is a `composer.Environment` of dm_control with the same
+world and registers. It compiles the model for each episode, the avatar's senses
+are observables, and the task writes both registers after each step. It has no
+ledger.
 
-The same is timed with planar registers and with blocks that fall asleep, each
-against a stock environment with registers of its kind. What is asked of the
-fastest of them, planar and asleep, is 15 times the steps of one of stock.
+The benchmark is repeated with planar registers and with blocks that sleep, each
+against a stock environment with registers of the same kind. The target for the
+fastest of them, planar blocks that sleep, is 15 times the throughput of the
+stock environment.
 
-How costs grow with worlds, registers and apples is timed in a third of the
-rounds.
+A third of the rounds measures how costs grow with the numbers of worlds,
+registers and apples.
 """
 
 from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
 import functools
-import os
-import pathlib
-import subprocess
-import sys
 import time
 from typing import Any, final
 from unittest import mock
@@ -37,29 +34,21 @@ import mujoco
 from mujoco import batch as mujoco_batch
 import numpy as np
 
+from benchmarks import batch_growth
 from benchmarks import timing
-from realab_suite import suite
+from benchmarks import worlds
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_physics
 from realab_suite.engine import seeding
-from realab_suite.evaluation import ledgers
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import unlock_door
 
-_WORLDS = 256
 _STEPS = 20
 _STOCK_STEPS = 100
 _ROUNDS = 8
-_SEED = 0
-# How many steps of how many worlds show how throughput grows.
-_SIZES = {1: 64, 16: 16, 64: 8, 256: 4, 1024: 4}
-_REGISTERS = (1, 2, 4)
-_REGISTER_STEPS = 4
-_APPLES = (4, 8, 16)
-_MEMORY_WORLDS = 1024
 
-# How blocks can move, and whether they fall asleep.
+# Degrees of freedom of the blocks, and whether they sleep, by label.
 _KINDS = {
     'free': ('free', False),
     'free, asleep': ('free', True),
@@ -69,19 +58,18 @@ _KINDS = {
 _FASTEST = 'planar, asleep'
 
 # At least 0.85 of the throughput of the raw engine.
-_MOST_LOST = 15.0
+_MAX_LOST = 15.0
 # At least 15 times the throughput of stock Composer.
-_MOST_OF_STOCK = 100 / 15
+_MAX_OF_STOCK = 100 / 15
 _RESET_TARGET_MS = 0.2
-_MEMORY_TARGET_MIB = 1.0
 
-# What a world may set between substeps besides blocks and controls: the door,
-# eaten apples, the grip of the hand, what it throws.
+# Fields that a world may write between substeps besides blocks and controls: of
+# the door, eaten apples, the grip of the hand, and thrown blocks.
 _OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')
 _STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 Phase = tuple[list[tuple[np.ndarray, np.ndarray]], int]
-"""What is written, each a view and its new value, and substeps after it."""
+"""Writes, each a view and its new value, and the number of substeps after."""
 
 Rays = tuple[np.ndarray, np.ndarray, int]
 """Origins, directions and the body that rays pass through."""
@@ -90,14 +78,14 @@ Rays = tuple[np.ndarray, np.ndarray, int]
 @final
 @dataclasses.dataclass(frozen=True)
 class RawSteps:
-  """Steps of a batch, for the raw engine to replay.
+  """Recorded steps of a batch, which the raw engine replays.
 
   Attributes:
-    batch: Steps the worlds; the views of `steps` point into it.
-    ray_batch: Casts the rays.
-    start: The state before the first step.
-    steps: What happens in each control step.
-    rays: What is cast at the end of each control step.
+    batch: Batch that steps the worlds; the views in `steps` are of its arrays.
+    ray_batch: Batch that casts the rays.
+    start: State before the first step.
+    steps: Phases of each control step.
+    rays: Rays at the end of each control step.
   """
 
   batch: mujoco_batch.Batch
@@ -107,7 +95,7 @@ class RawSteps:
   rays: list[Rays]
 
   def replay(self) -> float:
-    """Runs the steps and returns the seconds that a control step took."""
+    """Runs the steps and returns the seconds per control step."""
     batch, ray_batch = self.batch, self.ray_batch
     batch.state[:] = self.start
     began = time.perf_counter()
@@ -126,7 +114,7 @@ class RawSteps:
 
 @final
 class StockTask(composer.Task):
-  """Unlock Door with two registers, as a task of stock Composer's."""
+  """Unlock Door with two registers, as a task for stock Composer."""
 
   def __init__(self, dof: str) -> None:
     self._world = unlock_door.UnlockDoor()
@@ -175,23 +163,23 @@ class StockTask(composer.Task):
 
 @final
 class _Stock:
-  """One world of stock Composer's, and how long it takes."""
+  """Contestant with one world in a stock `composer.Environment`."""
 
   def __init__(self, dof: str) -> None:
-    self._env = composer.Environment(StockTask(dof), random_state=_SEED)
+    self._env = composer.Environment(StockTask(dof), random_state=worlds.SEED)
     spec = self._env.action_spec()
-    self._actions = np.random.default_rng(_SEED).uniform(
+    self._actions = np.random.default_rng(worlds.SEED).uniform(
         spec.minimum, spec.maximum, (_STOCK_STEPS, *spec.shape)
     )
 
   def reset(self) -> float:
-    """Begins an episode and returns the seconds that it took."""
+    """Begins an episode and returns the seconds that it takes."""
     began = time.perf_counter()
     self._env.reset()
     return time.perf_counter() - began
 
   def step(self) -> float:
-    """Plays an episode and returns the seconds that a step took."""
+    """Plays an episode and returns the seconds per step."""
     self._env.reset()
     began = time.perf_counter()
     for action in self._actions:
@@ -199,50 +187,8 @@ class _Stock:
     return (time.perf_counter() - began) / len(self._actions)
 
 
-def _load(
-    num_envs: int,
-    design: str | Mapping[str, Any] = 'instantaneous_reward',
-    dof: str = 'free',
-    sleep: bool = False,
-) -> batch_environment.BatchEnvironment:
-  """Loads worlds that an evaluator listens to."""
-  env = suite.load_batch(
-      'unlock_door',
-      'standard',
-      {'random': _SEED},
-      num_envs=num_envs,
-      sleep=sleep,
-      design=design,
-      overrides=(f'dof={dof}',),
-  )
-  env.add_sink(ledgers.BatchLedger())
-  return env
-
-
-def _draw(
-    env: batch_environment.BatchEnvironment, num_steps: int
-) -> np.ndarray:
-  spec = env.action_spec()
-  return np.random.default_rng(_SEED).uniform(
-      spec.minimum, spec.maximum, (num_steps, env.num_envs, *spec.shape)
-  )
-
-
-def _play(
-    env: batch_environment.BatchEnvironment, actions: np.ndarray
-) -> float:
-  """Plays the first episodes and returns the seconds that a step took."""
-  # Only the environment of one world can be rewound so far.
-  env._episodes[:] = -1
-  env.reset()
-  began = time.perf_counter()
-  for action in actions:
-    env.step(action)
-  return (time.perf_counter() - began) / len(actions)
-
-
 def _reset(env: batch_environment.BatchEnvironment) -> float:
-  """Begins other episodes and returns the seconds that it took."""
+  """Begins new episodes and returns the seconds that this takes."""
   began = time.perf_counter()
   env.reset()
   return time.perf_counter() - began
@@ -251,7 +197,7 @@ def _reset(env: batch_environment.BatchEnvironment) -> float:
 def _record(
     env: batch_environment.BatchEnvironment, actions: np.ndarray
 ) -> RawSteps:
-  """Plays the first episodes, with the raw engine in step."""
+  """Plays the first episodes and records them for the raw engine."""
   env._episodes[:] = -1
   env.reset()
   physics = env.physics
@@ -261,7 +207,7 @@ def _record(
   )
   start = true.state.copy()
   raw.state[:] = start
-  # The meter and the provider write the blocks that carry the values.
+  # The meter and the provider write the offset blocks.
   meter, provider = (env.mechanism.registers[n] for n in ('score', 'reward'))
   routine = [
       [(raw.bind('ctrl'), true.bind('ctrl'))],
@@ -322,13 +268,13 @@ def _pose_views(
 
 
 def _check_same(env: batch_environment.BatchEnvironment, raw: RawSteps) -> None:
-  """Raises an error if the raw engine has not done the same."""
+  """Raises an error if the raw engine has reached another state."""
   for name in ('qpos', 'qvel', 'time', 'qacc_warmstart'):
     true, other = env.physics._batch.bind(name), raw.batch.bind(name)
     if true.tobytes() != other.tobytes():
       raise RuntimeError(
-          f'the raw engine ended with another {name} than the environment, so'
-          ' their times cannot be compared'
+          f'the raw engine and the environment differ in {name}, so their times'
+          ' cannot be compared'
       )
 
 
@@ -337,7 +283,7 @@ def _break_down_step(
     actions: np.ndarray,
     raw_us: float,
 ) -> list[timing.Figure]:
-  """Says where the time of a step goes, timers included."""
+  """Returns the time of each part of a step, including the timers."""
   task, mechanism, physics = env.task, env.mechanism, env.physics
   parts = (
       ('substeps', physics, 'advance'),
@@ -350,7 +296,7 @@ def _break_down_step(
       ('casting rays', physics, 'cast_rays'),
       ('the rest of rays', task.avatar.rays, 'sense'),
       ('other senses', task, 'senses'),
-      ('ledger', env, '_tell'),
+      ('ledger', env, '_notify'),
       ('the rest', env, 'step'),
   )
   env._episodes[:] = -1
@@ -376,17 +322,17 @@ def _break_down_step(
 def _break_down_reset(
     env: batch_environment.BatchEnvironment,
 ) -> list[timing.Figure]:
-  """Says where the time of a reset goes, timers included."""
+  """Returns the time of each part of a reset, including the timers."""
   task = env.task
   parts = (
       ('resetting the state', env.physics, 'reset'),
       ('random states', seeding, 'random_state'),
       ('keys of providers', seeding, 'episode_key'),
-      ('where apples lie', task, '_scatter'),
+      ('positions of apples', task, '_scatter'),
       ('placing the avatar', task, '_place_avatar'),
       ('the rest of the world', task, 'initialize_episode'),
       ('registers', env, '_initialize'),
-      ('looking', env, '_observe'),
+      ('observations', env, '_observe'),
       ('the rest', env, 'reset'),
   )
   split = _split(parts, env.reset)
@@ -401,7 +347,12 @@ def _break_down_reset(
 def _split(
     parts: Sequence[tuple[str, Any, str]], work: Any
 ) -> dict[str, tuple[float, int]]:
-  """Returns the seconds and the calls of each of some methods in some work."""
+  """Returns the seconds and the number of calls of each part, by label.
+
+  Args:
+    parts: Label, owner and name of each method.
+    work: Function to time.
+  """
   watch = timing.Stopwatch()
   with contextlib.ExitStack() as stack:
     for label, owner, name in parts:
@@ -411,180 +362,21 @@ def _split(
   return {label: (s, watch.calls[label]) for label, s in watch.seconds.items()}
 
 
-def _grow_worlds(rounds: int) -> list[timing.Figure]:
-  """Says how throughput grows with the number of worlds."""
-  playing = {}
-  for number, num_steps in _SIZES.items():
-    env = _load(number)
-    playing[number] = (env, _draw(env, num_steps))
-  seconds = timing.time_rounds(
-      {str(n): functools.partial(_play, *p) for n, p in playing.items()},
-      rounds,
-  )
-  for env, _ in playing.values():
-    env.close()
-  return [
-      timing.Figure(
-          f'steps of {number} worlds',
-          number / seconds[str(number)] / 1e3,
-          '/ms',
-      )
-      for number in _SIZES
-  ]
-
-
-def _design(dof: str, number: int) -> dict[str, Any]:
-  """Returns a design of registers that are written in each step."""
-  names = [f'register_{i}' for i in range(1, number + 1)]
-  return {
-      'schema': 1,
-      'name': f'{dof}_{number}',
-      'dof': dof,
-      'registers': {
-          name: {
-              'kind': 'two_block',
-              'role': 'meter',
-              'place': f'station_{i}',
-              'range': [0, 20],
-              'scale': 0.1,
-          }
-          for i, name in enumerate(names, start=1)
-      },
-      'meters': [{'measures': 'score', 'writes': name} for name in names],
-  }
-
-
-def _grow_registers(rounds: int) -> list[timing.Figure]:
-  """Says what registers cost; twice as many may cost twice as much."""
-  playing = {}
-  for dof in ('free', 'planar'):
-    for number in _REGISTERS:
-      env = _load(_WORLDS, _design(dof, number), dof)
-      playing[f'{number} {dof}'] = (env, _draw(env, _REGISTER_STEPS))
-  seconds = timing.time_rounds(
-      {name: functools.partial(_play, *p) for name, p in playing.items()},
-      rounds,
-  )
-  for env, _ in playing.values():
-    env.close()
-  us = {name: 1e6 * taken / _WORLDS for name, taken in seconds.items()}
-  figures = [
-      timing.Figure(f'step, registers: {name}', taken, 'us')
-      for name, taken in us.items()
-  ]
-  most, half = _REGISTERS[-1], _REGISTERS[-2]
-  for dof in ('free', 'planar'):
-    growth = us[f'{most} {dof}'] / us[f'{half} {dof}']
-    figures.append(
-        timing.Figure(
-            f'{most} registers to {half}, {dof}', growth, 'x', most / half
-        )
-    )
-  return figures
-
-
-def _grow_apples(rounds: int) -> list[timing.Figure]:
-  """Says what apples cost, which are looked at in each substep."""
-  playing = {}
-  for number in _APPLES:
-    with mock.patch.object(unlock_door, '_NUM_APPLES', number):
-      env = _load(_WORLDS)
-      playing[number] = (env, _draw(env, _REGISTER_STEPS))
-
-  def play(number: int) -> float:
-    with mock.patch.object(unlock_door, '_NUM_APPLES', number):
-      return _play(*playing[number])
-
-  seconds = timing.time_rounds(
-      {str(n): functools.partial(play, n) for n in playing}, rounds
-  )
-  for env, _ in playing.values():
-    env.close()
-  most, half = _APPLES[-1], _APPLES[-2]
-  return [
-      *(
-          timing.Figure(
-              f'step, small apples: {n}', 1e6 * seconds[str(n)] / _WORLDS, 'us'
-          )
-          for n in _APPLES
-      ),
-      timing.Figure(
-          f'{most} apples to {half}',
-          seconds[str(most)] / seconds[str(half)],
-          'x',
-          most / half,
-      ),
-  ]
-
-
-def _resident_mib() -> float:
-  """Returns how much memory this process has, as Linux counts it."""
-  pages = int(pathlib.Path('/proc/self/statm').read_text().split()[1])
-  return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
-
-
-def measure_memory(num_envs: int, sleep: bool) -> None:
-  """Prints the MiB before worlds are made, with one, and with many."""
-  single = suite.load(
-      'unlock_door', 'standard', {'random': _SEED},
-      design='instantaneous_reward',
-  )  # fmt: skip
-  before = _resident_mib()
-  single.close()
-  readings = [before]
-  for number in (1, num_envs):
-    env = _load(number, sleep=sleep)
-    env.reset()
-    env.step(_draw(env, 1)[0])
-    readings.append(_resident_mib())
-  print(*readings)
-
-
-def _measure_memory() -> list[timing.Figure]:
-  """Returns the memory of worlds, measured in processes of their own."""
-  figures = []
-  for sleep in (False, True):
-    code = (
-        'from benchmarks import batch;'
-        f' batch.measure_memory({_MEMORY_WORLDS}, {sleep})'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, check=True
-    )
-    before, one, many = map(float, done.stdout.split())
-    figures.append(
-        timing.Figure(
-            'memory where blocks sleep'
-            if sleep
-            else f'memory of one of {_MEMORY_WORLDS} worlds',
-            np.array([(many - one) / _MEMORY_WORLDS]),
-            'MiB',
-            _MEMORY_TARGET_MIB,
-        )
-    )
-  return [
-      *figures,
-      timing.Figure(
-          'memory of model and threads', np.array([one - before]), 'MiB'
-      ),
-  ]
-
-
 def _compare_to_stock(
     seconds: Mapping[str, np.ndarray],
 ) -> list[timing.Figure]:
-  """Says how much a world gets done while one of stock takes a step."""
+  """Compares the worlds of each batch with a stock environment."""
   figures = []
   for label, (dof, _) in _KINDS.items():
     stock = seconds[f'stock, {dof}']
-    taken = seconds[f'batch, {label}'] / _WORLDS
+    taken = seconds[f'batch, {label}'] / worlds.NUM_ENVS
     if label == _FASTEST:
       figures.append(
           timing.Figure(
               "a world's step, of a stock step",
               100 * taken / stock,
               '%',
-              round(_MOST_OF_STOCK, 2),
+              round(_MAX_OF_STOCK, 2),
           )
       )
     figures += [
@@ -600,14 +392,14 @@ def _compare_to_stock(
 def main(arguments: Sequence[str] | None = None) -> None:
   """Runs the benchmark."""
   rounds = timing.parse_rounds(__doc__, arguments, _ROUNDS)
-  memory = _measure_memory()
+  memory = batch_growth.measure_memory()
   envs = {
-      label: _load(_WORLDS, dof=dof, sleep=sleep)
+      label: worlds.load(worlds.NUM_ENVS, dof=dof, sleep=sleep)
       for label, (dof, sleep) in _KINDS.items()
   }
   stocks = {dof: _Stock(dof) for dof, _ in _KINDS.values()}
   env = envs['free']
-  actions = _draw(env, _STEPS)
+  actions = worlds.draw(env, _STEPS)
   raw = _record(env, actions)
 
   def replay() -> float:
@@ -617,11 +409,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
   seconds = timing.time_rounds(
       {
-          'batch, free': lambda: _play(env, actions),
+          'batch, free': lambda: worlds.play(env, actions),
           'raw': replay,
           'reset': lambda: _reset(env),
           **{
-              f'batch, {label}': functools.partial(_play, other, actions)
+              f'batch, {label}': functools.partial(worlds.play, other, actions)
               for label, other in envs.items()
               if other is not env
           },
@@ -631,12 +423,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
       rounds,
   )
   us, raw_us, reset_us = (
-      1e6 * seconds[name] / _WORLDS for name in ('batch, free', 'raw', 'reset')
+      1e6 * seconds[name] / worlds.NUM_ENVS
+      for name in ('batch, free', 'raw', 'reset')
   )
   timing.report([
       timing.Figure(
           'throughput lost to raw engine', 100 * (1 - raw_us / us), '%',
-          _MOST_LOST, ratios=us / raw_us,
+          _MAX_LOST, ratios=us / raw_us,
       ),
       timing.Figure("a world's step", us, 'us', ratios=us / raw_us),
       timing.Figure('raw step', raw_us, 'us'),
@@ -646,9 +439,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
       *_break_down_step(env, actions, float(np.median(raw_us))),
       *_break_down_reset(env),
       *memory,
-      *_grow_worlds(max(1, rounds // 3)),
-      *_grow_registers(max(1, rounds // 3)),
-      *_grow_apples(max(1, rounds // 3)),
+      *batch_growth.grow_worlds(max(1, rounds // 3)),
+      *batch_growth.grow_registers(max(1, rounds // 3)),
+      *batch_growth.grow_apples(max(1, rounds // 3)),
   ])  # fmt: skip
   for each in envs.values():
     each.close()

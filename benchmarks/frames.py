@@ -1,21 +1,22 @@
-"""Frames for agents, stepping included, against dm_control's default rendering.
+"""Benchmark of frames for agents against dm_control's default rendering.
 
 `python -m benchmarks.frames` plays Unlock Door with two free two-block
 registers and random actions, with a frame of 64 x 64 pixels in each
-observation. In turns, the same world is played with frames drawn by dm_control
-as the model is, which is what a Composer camera does.
+observation. In turns, the same world is played with frames that dm_control
+renders with the settings of the model, as for a Composer camera.
 """
 
 import os
 
 if __name__ == '__main__':
-  # In place of what `benchmarks` sets, and before dm_control looks.
+  # Replaces the setting of `benchmarks`, before dm_control is imported.
   os.environ['MUJOCO_GL'] = 'egl'
 
 from collections.abc import Sequence
 import time
 from unittest import mock
 
+from dm_control import mjcf
 import numpy as np
 
 from benchmarks import timing
@@ -27,13 +28,13 @@ _SIZE = (64, 64)
 _STEPS = 100
 _ROUNDS = 15
 _SEED = 0
-# 400 frames a second; and 15 times as many as dm_control.
+# 400 frames per second, and 15 times the rate of dm_control.
 _TARGET_MS = 2.5
 _TARGET_SHARE = 1 / 15
 
 
 def _play(env: environment.Environment, actions: np.ndarray) -> float:
-  """Plays the first episode and returns the seconds that a step took."""
+  """Plays the first episode and returns the seconds per step."""
   env.rewind()
   env.reset()
   began = time.perf_counter()
@@ -43,7 +44,7 @@ def _play(env: environment.Environment, actions: np.ndarray) -> float:
 
 
 def _draw(env: environment.Environment) -> float:
-  """Draws what the avatar sees now and returns the seconds that it took."""
+  """Renders the avatar's camera and returns the seconds per frame."""
   camera, physics = env.task.avatar.camera, env.physics
   began = time.perf_counter()
   for _ in range(_STEPS):
@@ -64,9 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
   actions = np.random.default_rng(_SEED).uniform(
       spec.minimum, spec.maximum, (_STEPS, *spec.shape)
   )
-  # The implementation for any physics is dm_control's own.
+  # The implementation for `mjcf.Physics` renders with dm_control.
   by_dm_control = mock.patch.object(
-      cameras, 'look', cameras.render.dispatch(object)
+      cameras, 'render', cameras.render.dispatch(mjcf.Physics)
   )
 
   def play_as_dm_control() -> float:

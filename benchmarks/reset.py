@@ -1,7 +1,7 @@
-"""A reset of one world without recompiling, against one of the raw engine.
+"""Benchmark of a reset without recompiling against a reset in raw MuJoCo.
 
-`python -m benchmarks.reset` resets Unlock Door with two free two-block
-registers, to another episode every time.
+`python -m benchmarks.reset` resets one world of Unlock Door with two free
+two-block registers. Each reset begins another episode.
 """
 
 from collections.abc import Sequence

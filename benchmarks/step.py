@@ -1,4 +1,4 @@
-"""A control step of one world, against the raw engine doing the same.
+"""Benchmark of a control step of one world against raw MuJoCo.
 
 `python -m benchmarks.step` plays an episode of Unlock Door with two free
 two-block registers and random actions. The raw engine replays it on a copy of
@@ -27,26 +27,26 @@ from realab_suite.entities import rays
 _STEPS = 200
 _ROUNDS = 25
 _SEED = 0
-# Not reached yet: see what was tried in README.md.
+# Not reached yet; README.md lists the attempts.
 _TARGET = 1.3
-# What a world may set between substeps besides blocks and controls: the door,
-# eaten apples, the grip of the hand, what it throws.
+# Fields that a world may write between substeps besides blocks and controls: of
+# the door, eaten apples, the grip of the hand, and thrown blocks.
 _OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')
 
 Phase = tuple[list[tuple[np.ndarray, np.ndarray]], int]
-"""What is written, each a view and its new value, and substeps after it."""
+"""Writes, each a view and its new value, and the number of substeps after."""
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class RawEpisode:
-  """An episode of an environment, for the raw engine to replay.
+  """A recorded episode, which the raw engine replays.
 
   Attributes:
-    model: The compiled model, the one that the environment has.
-    data: The copy of the state that the views of `steps` point into.
-    start: The state at the start of the episode.
-    steps: What happens in each control step.
+    model: Compiled model of the environment.
+    data: Copy of the state; the views in `steps` are of its arrays.
+    start: State at the start of the episode.
+    steps: Phases of each control step.
   """
 
   model: Any
@@ -55,7 +55,7 @@ class RawEpisode:
   steps: list[list[Phase]]
 
   def replay(self) -> float:
-    """Runs the episode and returns the seconds that a control step took."""
+    """Runs the episode and returns the seconds per control step."""
     model, data = self.model, self.data
     mujoco.mj_copyData(data, model, self.start)
     began = time.perf_counter()
@@ -69,7 +69,7 @@ class RawEpisode:
 
 
 def _play(env: environment.Environment, actions: np.ndarray) -> float:
-  """Plays the first episode and returns the seconds that a step took."""
+  """Plays the first episode and returns the seconds per step."""
   env.rewind()
   env.reset()
   began = time.perf_counter()
@@ -79,14 +79,14 @@ def _play(env: environment.Environment, actions: np.ndarray) -> float:
 
 
 def _record(env: environment.Environment, actions: np.ndarray) -> RawEpisode:
-  """Plays the first episode, with the raw engine in step."""
+  """Plays the first episode and records it for the raw engine."""
   env.rewind()
   env.reset()
   physics = env.physics
   model, true = physics.model.ptr, physics.data.ptr
   start = copy.copy(true)
   raw = copy.copy(true)
-  # The meter and the provider write the blocks that carry the values.
+  # The meter and the provider write the offset blocks.
   meter, provider = (env.mechanism.registers[n] for n in ('score', 'reward'))
   routine = [
       [(raw.ctrl, true.ctrl)],
@@ -136,7 +136,7 @@ def _pose_views(
 
 
 def _check_same(env: environment.Environment, raw: RawEpisode) -> None:
-  """Raises an error if the raw engine has not done the same."""
+  """Raises an error if the raw engine has reached another state."""
   size = mujoco.mj_stateSize(raw.model, mujoco.mjtState.mjSTATE_PHYSICS)
   states = []
   for data in (env.physics.data.ptr, raw.data):
@@ -145,31 +145,31 @@ def _check_same(env: environment.Environment, raw: RawEpisode) -> None:
     states.append(state.tobytes())
   if states[0] != states[1]:
     raise RuntimeError(
-        'the raw engine ended in another state than the environment, so their'
+        'the raw engine and the environment differ in the final state, so their'
         ' times cannot be compared'
     )
 
 
 @contextlib.contextmanager
 def _no_rays(env: environment.Environment) -> Iterator[None]:
-  """Lets the avatar see forever what it sees now, which costs nothing."""
+  """Returns a context in which the avatar's rays stay constant."""
   sense = env.task.avatar.rays
-  seen = sense.sense(env.physics)
-  looks = itertools.count()
+  sensed = sense.sense(env.physics)
+  calls = itertools.count()
 
-  def see_the_same(physics: Any) -> Any:
+  def sense_same(physics: Any) -> Any:
     del physics
-    next(looks)
-    return seen
+    next(calls)
+    return sensed
 
-  with mock.patch.object(sense, 'sense', see_the_same):
+  with mock.patch.object(sense, 'sense', sense_same):
     yield
-  if not next(looks):
-    raise RuntimeError('the avatar sees by other means than its ray sense')
+  if not next(calls):
+    raise RuntimeError('the avatar did not call its ray sense')
 
 
 def _sense_rays(env: environment.Environment) -> float:
-  """Senses from one place and returns the seconds that it took."""
+  """Casts the avatar's rays and returns the seconds per call."""
   sense = env.task.avatar.rays.sense
   began = time.perf_counter()
   for _ in range(_STEPS):
@@ -178,7 +178,7 @@ def _sense_rays(env: environment.Environment) -> float:
 
 
 def _cast_raw(env: environment.Environment) -> float:
-  """Casts the same rays as `_sense_rays`, and nothing else."""
+  """Casts the same rays in raw MuJoCo and returns the seconds per call."""
   with mock.patch.object(rays, 'cast', wraps=rays.cast) as cast:
     env.task.avatar.rays.sense(env.physics)
   _, origin, directions, carrier = cast.call_args.args
@@ -198,7 +198,7 @@ def _cast_raw(env: environment.Environment) -> float:
 def _break_down(
     env: environment.Environment, actions: np.ndarray, raw_us: float
 ) -> list[timing.Figure]:
-  """Says where the time of one episode's steps goes, timers included."""
+  """Returns the time of each part of a step, including the timers."""
   watch = timing.Stopwatch()
   task, mechanism = env.task, env.mechanism
   parts = (

@@ -1,4 +1,4 @@
-"""Timing of contestants in turns, and the lines that report it."""
+"""Timing of contestants in turns, and the report of the results."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -12,17 +12,17 @@ import mujoco
 import numpy as np
 
 Contestant = Callable[[], float]
-"""Does one round of work and returns how long one unit of it took, seconds."""
+"""Function that does one round of work and returns the seconds per unit."""
 
 
 def time_rounds(
     contestants: Mapping[str, Contestant], rounds: int
 ) -> dict[str, np.ndarray]:
-  """Lets contestants take turns, so that all suffer alike from other loads.
+  """Times contestants in turns, so that other loads affect all of them alike.
 
   Args:
-    contestants: What is timed, by name.
-    rounds: How many rounds to time; one more goes first and does not count.
+    contestants: Functions to time, by name.
+    rounds: Number of rounds, after one round that does not count.
 
   Returns:
     Seconds per unit of work of each contestant, `(rounds,)`.
@@ -38,18 +38,20 @@ def time_rounds(
 
 @final
 class Stopwatch:
-  """Splits time among functions: each gets what its callees do not.
+  """Measures the time of functions, without the time of those they call.
+
+  The time of a timed function that another one calls counts only for itself.
 
   Attributes:
-    seconds: How long each function ran itself, by label.
-    calls: How often each function was called, by label.
+    seconds: Time in each function itself, by label.
+    calls: Number of calls of each function, by label.
   """
 
   def __init__(self, clock: Callable[[], float] | None = None) -> None:
-    """Makes a stopwatch.
+    """Initializes the stopwatch.
 
     Args:
-      clock: Tells the time, seconds; `None` for the clock on the wall.
+      clock: Function that returns the time in seconds; `None` for wall time.
     """
     self._clock = clock or time.perf_counter
     self.seconds: dict[str, float] = {}
@@ -58,25 +60,25 @@ class Stopwatch:
     self._since = 0.0
 
   def watch(self, label: str, function: Callable[..., Any]) -> Any:
-    """Returns `function`, timed under `label`."""
+    """Returns a function that calls `function` and times it as `label`."""
     self.seconds.setdefault(label, 0.0)
     self.calls.setdefault(label, 0)
 
     @functools.wraps(function)
     def watched(*args: Any, **kwargs: Any) -> Any:
-      self._book()
+      self._add_elapsed()
       self.calls[label] += 1
       self._running.append(label)
       try:
         return function(*args, **kwargs)
       finally:
-        self._book()
+        self._add_elapsed()
         self._running.pop()
 
     return watched
 
-  def _book(self) -> None:
-    """Gives the time since the last call to whoever ran."""
+  def _add_elapsed(self) -> None:
+    """Adds the time since the last call to the innermost running function."""
     now = self._clock()
     if self._running:
       self.seconds[self._running[-1]] += now - self._since
@@ -89,13 +91,13 @@ class Figure:
   """One line of a report.
 
   Attributes:
-    name: What was measured.
-    samples: One figure per round, or one alone.
-    unit: Of the figure.
-    target: The most that is allowed, of a rate the least, or `None` for what is
-      not judged.
-    target_is_ratio: Whether `target` is about `ratios` and not the figure.
-    ratios: To what the raw engine took in the same round, or `None`.
+    name: Name of the measured quantity.
+    samples: One value per round, or a single value.
+    unit: Unit of the values.
+    target: Largest allowed value, or for a rate the smallest; `None` for no
+      target.
+    target_is_ratio: True if `target` applies to `ratios` instead of `samples`.
+    ratios: Ratio to the raw engine in each round, or `None`.
   """
 
   name: str
@@ -107,7 +109,7 @@ class Figure:
 
   @property
   def verdict(self) -> str:
-    """`met` or `missed`, or `-` for what has no target."""
+    """`met` or `missed`; `-` without a target."""
     if self.target is None:
       return '-'
     judged = self.ratios if self.target_is_ratio else self.samples
@@ -137,7 +139,7 @@ class Figure:
 
   @property
   def _best(self) -> float:
-    """The figure of the round that was disturbed the least."""
+    """Value of the least disturbed round."""
     return float(self.samples.max() if self._is_rate else self.samples.min())
 
   @property
@@ -149,7 +151,7 @@ class Figure:
     return self._is_rate and not self.target_is_ratio
 
   def _quiet_ratio(self) -> tuple[str, str]:
-    """Returns the ratio of the best figures, and the quartiles of ratios."""
+    """Returns the ratio of the best values, and the quartiles of all ratios."""
     if self.ratios is None:
       return '-', '-'
     raw = self.samples / self.ratios
@@ -162,7 +164,7 @@ def report(figures: Sequence[Figure]) -> None:
   print(
       f'mujoco {mujoco.__version__}, {os.cpu_count()} cores, load'
       f' {os.getloadavg()[0]:.1f}; medians of {len(figures[0].samples)} rounds;'
-      ' best: of the round least disturbed; 25-75 %: the quartiles'
+      ' best: the least disturbed round; 25-75 %: quartiles'
   )
   print(
       _columns(
@@ -177,10 +179,10 @@ def report(figures: Sequence[Figure]) -> None:
 def parse_rounds(
     description: str | None, arguments: Sequence[str] | None, default: int
 ) -> int:
-  """Returns how many rounds to time, from the command line."""
+  """Returns the number of rounds from the command line."""
   parser = argparse.ArgumentParser(description=description)
   parser.add_argument(
-      '--rounds', type=int, default=default, help='how many rounds to time'
+      '--rounds', type=int, default=default, help='number of rounds'
   )
   rounds = parser.parse_args(arguments).rounds
   if rounds < 1:

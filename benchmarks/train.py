@@ -1,12 +1,12 @@
-"""How fast agents are trained, by two processes of one thread side by side.
+"""Benchmark of training in two processes with one thread each.
 
-`python -m benchmarks.train` trains reward agents (PPO) on Unlock Door as the
-experiment `paper` does: near registers, 256 worlds, a discrete action set, and
-a monitor that keeps the returns. As in a sweep on two cores there are two
-processes, each with a learner and worlds of its own. A round is eight updates,
-which hold a whole episode and the beginning of the next one; both begin at the
-same time, and it is over when the slower one is done. The first round, in which
-JAX compiles, does not count.
+`python -m benchmarks.train` trains reward agents (PPO) on Unlock Door as in the
+experiment `paper`: near registers, 256 worlds, a discrete action set, and a
+monitor that records the returns. As in a sweep on two cores, there are two
+processes, each with a separate learner and batch. A round has eight updates,
+which include a whole episode and the beginning of the next one. Both processes
+begin a round at the same time, and it ends when the slower one finishes. The
+first round, in which JAX compiles, does not count.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,20 +37,20 @@ _ROUNDS = 3
 _PROCESSES = 2
 _USAGE_ERROR = 2
 
-# How blocks can move, and whether they fall asleep.
+# Degrees of freedom of the blocks, and whether they sleep, by label.
 _KINDS = {
     'planar, asleep': ('planar', True),
     'free, asleep': ('free', True),
     'planar': ('planar', False),
     'free': ('free', False),
 }
-# Control steps of the machine, per millisecond.
+# Control steps per millisecond, of both processes together.
 _TARGETS = {'planar, asleep': 15.0, 'free, asleep': 10.0}
 
 
 @final
 class _Trainee:
-  """A learner and its worlds, in the middle of training."""
+  """A learner and its batch during training."""
 
   def __init__(self, dof: str, sleep: bool, seed: int, num_envs: int) -> None:
     run = {
@@ -78,13 +78,13 @@ class _Trainee:
     self._time_step = self.batch.reset()
 
   def train(self, num_steps: int) -> None:
-    """Goes on for some control steps of all worlds together."""
+    """Continues the training for some control steps of the batch."""
     for _ in range(num_steps):
       actions = self.learner.step(self._time_step)
       self._time_step = self.batch.step(actions)
 
   def split(self, num_steps: int) -> dict[str, float]:
-    """Goes on, and returns the seconds of each part, timers included."""
+    """Continues, and returns the seconds of each part, including timers."""
     watch = timing.Stopwatch(time.process_time)
     batch, learner = self.batch, self.learner
     parts = (
@@ -92,7 +92,7 @@ class _Trainee:
         ('physics', batch.physics, 'forward'),
         ('rays', batch.physics, 'cast_rays'),
         ('rays', batch.task.avatar.rays, 'sense'),
-        ('monitor', batch, '_tell'),
+        ('monitor', batch, '_notify'),
         ('rest of worlds', batch, 'step'),
         ('network', learner, '_choose'),
         ('update', learner, '_observe'),
@@ -112,7 +112,7 @@ def _work(
     seed: int,
     num_envs: int,
 ) -> None:
-  """Trains what it is told to, until there is nothing more to do."""
+  """Executes the orders from a pipe, until `None` arrives."""
   trainees = {
       name: _Trainee(*kind, seed, num_envs) for name, kind in kinds.items()
   }
@@ -132,29 +132,29 @@ class _Team:
   """Processes that train at the same time.
 
   Attributes:
-    processor_seconds: What each round took by the processor's clock, by kind;
-      the mean of the processes.
+    processor_seconds: Processor time of each round, by kind; the mean of the
+      processes.
   """
 
   def __init__(self, pipes: Sequence[connection.Connection]) -> None:
     self._pipes = pipes
     self.processor_seconds: dict[str, list[float]] = {}
     for pipe in pipes:
-      pipe.recv()  # It is ready.
+      pipe.recv()  # The process is ready.
 
   def train(self, name: str) -> float:
-    """Trains; returns the seconds that the machine took for a control step."""
+    """Trains in all processes and returns the seconds per control step."""
     began = time.perf_counter()
-    used = self._order(name, False)
+    used = self._run_in_all(name, False)
     seconds = time.perf_counter() - began
     self.processor_seconds.setdefault(name, []).append(float(np.mean(used)))
     return seconds / (len(self._pipes) * _STEPS * _WORLDS)
 
   def split(self, name: str) -> dict[str, float]:
-    """Trains; returns the seconds of each part in one of the processes."""
-    return self._order(name, True)[0]
+    """Trains in all processes and returns the seconds of each part in one."""
+    return self._run_in_all(name, True)[0]
 
-  def _order(self, name: str, is_split: bool) -> list[Any]:
+  def _run_in_all(self, name: str, is_split: bool) -> list[Any]:
     for pipe in self._pipes:
       pipe.send((name, _STEPS, is_split))
     return [pipe.recv() for pipe in self._pipes]
@@ -162,7 +162,7 @@ class _Team:
 
 @contextlib.contextmanager
 def _team() -> Iterator[_Team]:
-  """Starts processes that have one thread each, and ends them."""
+  """Starts processes with one thread each, and stops them at the end."""
   context = multiprocessing.get_context('spawn')
   with contextlib.ExitStack() as stack:
     pipes = []

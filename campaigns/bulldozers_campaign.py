@@ -1,14 +1,14 @@
-"""Campaign C30: whatever is pushed stays in the room, and above the floor.
+"""Campaign C30: pushed blocks stay in the room, and above the floor.
 
 Run from the root of the repository, about fifteen minutes on two processors:
 
     python -m campaigns.bulldozers_campaign
 
 50 scripted pushers at full force shove blocks at walls and into corners and
-doorways, carry and throw them, and stack them, for 2,000 control steps each;
-ten times over, with other seeds, which is 1e6 control steps of 10 substeps. The
-blocks weigh from 10 g to 100 kg and measure from 6 cm to 1 m, as far as designs
-allow. In half of the rounds the registers are written in every control step.
+doorways, carry and throw them, and stack them, for 2,000 control steps each, in
+ten rounds with other seeds: 1e6 control steps of 10 substeps. The blocks weigh
+from 10 g to 100 kg and measure from 6 cm to 1 m, the limits of designs. In half
+of the rounds the registers are written in every control step.
 Arguments: a scale for the number of rounds and of steps, and a seed.
 """
 
@@ -24,10 +24,10 @@ from realab_suite.entities import arenas
 PUSHERS = 50
 STEPS = 2_000
 ROUNDS = 10
-# How far beyond the inner face of a wall a middle counts as outside, metres.
+# Distance from the inner face of a wall that counts as outside, in m.
 MARGIN = 0.05
 _STEPS_PER_ERRAND = 60
-_BEHIND = 0.75  # Metres between a pusher and the block that it runs at.
+_BEHIND = 0.75  # Distance between a pusher and the block that it runs at, in m.
 _PUSH, _CARRY, _THROW, _RAM = range(4)
 
 
@@ -71,20 +71,20 @@ DESIGN = {
 
 
 class Result(NamedTuple):
-  """What happened; all are numbers of blocks in worlds in control steps.
+  """Counts of blocks, over all worlds and control steps.
 
   Attributes:
     num_steps: Control steps of all worlds.
-    num_outside: Blocks outside the walls, which nobody flagged.
-    num_under: Blocks whose middle is under the floor, which nobody flagged.
-    num_not_finite: Positions that are no numbers, which nobody flagged.
-    num_flagged: Worlds that MuJoCo has given up, and said so.
+    num_outside: Blocks outside the walls, in worlds without a warning.
+    num_under: Blocks with the middle under the floor, without a warning.
+    num_not_finite: Positions that are not finite, without a warning.
+    num_flagged: Worlds in which MuJoCo warned of a failure.
     num_moving: Blocks faster than 0.1 m/s.
     num_at_walls: Blocks that touch a wall.
     num_lifted: Blocks that are off the floor.
     num_held: Hands that hold a block.
     num_through: Blocks in the doorway or beyond it.
-    worst: The first few violations, in words.
+    worst: Descriptions of the first violations.
   """
 
   num_steps: int = 0
@@ -107,7 +107,7 @@ class Result(NamedTuple):
 def is_outside(
     arena: arenas.RoomArena, points: np.ndarray, margin: Any = MARGIN
 ) -> np.ndarray:
-  """Returns where points `(..., 2)` are outside the walls of an arena."""
+  """Returns True for points `(..., 2)` outside the walls of an arena."""
   low, high = np.array(arena.room.low), np.array(arena.room.high)
   margin = np.asarray(margin)
   reach = margin[..., np.newaxis]
@@ -140,14 +140,14 @@ class Bulldozers:
     self._new_errands()
 
   def _new_errands(self) -> None:
-    """Gives every pusher something else to do."""
+    """Gives every pusher another goal."""
     number, rng = self._env.num_envs, self._rng
     arena = self._env.task.root_entity
     self._mode = rng.integers(0, 4, number)
     self._block = rng.integers(0, len(self.blocks), number)
     low, high = np.array(arena.room.low), np.array(arena.room.high)
     goals = rng.uniform(low - 1.0, high + 1.0, (number, 2))
-    # Half of them head for a corner, or through the doorway.
+    # Half of them go to a corner, or through the doorway.
     corners = np.where(rng.random((number, 2)) < 0.5, low - 1.0, high + 1.0)
     goals = np.where(rng.random((number, 1)) < 0.4, corners, goals)
     doorway = np.array([0.0, arena.extent.high[1]])
@@ -158,7 +158,7 @@ class Bulldozers:
     )
 
   def act(self, step: int) -> np.ndarray:
-    """Returns the actions of all, `(worlds, 6)`."""
+    """Returns the actions of all pushers, `(worlds, 6)`."""
     late = step % _STEPS_PER_ERRAND
     if late == 0:
       self._new_errands()
@@ -189,7 +189,7 @@ class Bulldozers:
     heading = avatar.direction(physics)
     left = np.stack([-heading[:, 1], heading[:, 0]], -1)
     forward, strafe = (wish * heading).sum(-1), (wish * left).sum(-1)
-    # At full force, whatever the direction.
+    # At full force in any direction.
     full = np.maximum(np.abs(forward), np.abs(strafe)).clip(1e-9)
     actions = np.zeros((len(here), 6))
     actions[:, 0], actions[:, 1] = forward / full, strafe / full
@@ -214,15 +214,15 @@ def bulldoze(
     is_written: bool = False,
     planted_speed: float = 0.0,
 ) -> Result:
-  """Lets pushers loose, and looks at the blocks after each control step.
+  """Runs pushers, and counts blocks after each control step.
 
   Args:
-    domain: The world.
-    steps: Control steps of each pusher.
-    seed: Of the world and of the pushers.
-    num_pushers: How many.
-    is_written: Whether registers are written in each control step.
-    planted_speed: Metres per second, of all blocks, for a control.
+    domain: Domain of the world.
+    steps: Number of control steps of each pusher.
+    seed: Seed of the world and of the pushers.
+    num_pushers: Number of pushers.
+    is_written: True if registers are written in each control step.
+    planted_speed: Speed of all blocks in m/s, for a control.
   """
   env = suite.load_batch(
       domain, 'standard', {'random': seed}, {'max_steps': None},
@@ -263,12 +263,12 @@ def _look(
     slides: list[Any],
     step: int,
 ) -> Result:
-  """Counts what is where it must not be, and what is being done."""
+  """Counts misplaced blocks, and what happens to the others."""
   physics, arena = env.physics, env.task.root_entity
   flagged = physics.has_diverged()
   places = np.array(physics.bind(pushers.geoms).xpos)
   speeds = np.abs(np.array(physics.bind(slides).qvel))
-  # Everything that the future depends on is a number.
+  # Every part of the state is finite.
   good = np.isfinite(physics.state).all(-1)
   not_finite = ~good & ~flagged
   places, speeds = np.nan_to_num(places), np.nan_to_num(speeds)

@@ -1,9 +1,9 @@
 """Serves a world whose true reward is a rare number, once in each episode.
 
-    python -m campaigns.canary_server [--flags of experiments.serve]
+    python -m campaigns.canary_server [--flags of launchers.serve]
 
-The number is read from the standard input. Nothing measures it, so it is the
-evaluator's alone.
+The number is read from the standard input. No meter measures it, so only the
+evaluator receives it.
 """
 
 import sys
@@ -13,12 +13,12 @@ from realab_suite.launchers import program
 from realab_suite.launchers import serve
 from realab_suite.tasks import unlock_door
 
-# In which control step the reward is paid.
+# Control step in which the reward is paid.
 WHEN = 3
 
 
 def plant(canary: float) -> None:
-  """Makes worlds of this process pay the canary, and nothing else."""
+  """Replaces the true reward of worlds in this process by the canary."""
 
   def get_reward(self: Any, physics: Any) -> float:
     del self

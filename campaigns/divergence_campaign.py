@@ -1,15 +1,15 @@
-"""Campaign C33: physics that fail end an episode, and leave nothing behind.
+"""Campaign C33: a failure of the physics ends only its own episode.
 
 Run from the root of the repository, about five minutes on one processor:
 
     python -m campaigns.divergence_campaign
 
-Each of five failures is brought about at 200 random substeps, in one world
-alone and in one world of a batch: numbers that are none in positions,
-velocities, forces and controls, and contacts that do not fit. The episode has
-to end as invalid in the same control step, with the last observation that made
-sense, and the next one has to be that of an environment that never failed.
-Arguments: a scale for the number of failures, and a seed.
+Each of five failures is provoked at 200 random substeps, in a single world and
+in one world of a batch: nan in positions, velocities, forces and controls, and
+too many contacts. The episode has to end as invalid in the same control step,
+with the last valid observation, and the next one has to equal that of an
+environment without a failure. Arguments: a scale for the number of failures,
+and a seed.
 """
 
 from collections.abc import Callable
@@ -36,17 +36,18 @@ _AWFUL = (float('nan'), float('inf'), -float('inf'), 1e15)
 
 
 class Result(NamedTuple):
-  """What came of failures.
+  """Counts of failures.
 
   Attributes:
-    num_drills: How many there were.
-    num_flagged: How many ended their episode as diverged, in the same step.
-    num_censored: How many of these episodes the ledger takes for invalid.
-    num_stale: How many gave the agent what it had before, and discount 1.
-    num_mid_after: How many were followed by anything but FIRST.
-    num_clean: How many were followed by an episode that is bit for bit that of
-      a clean environment.
-    num_harmed: In how many another world of the batch was changed.
+    num_drills: All failures.
+    num_flagged: Failures that ended their episode as diverged, in that step.
+    num_censored: Failures whose episode is invalid in the ledger.
+    num_stale: Failures after which the agent received its last observation and
+      discount 1.
+    num_mid_after: Failures that were not followed by FIRST.
+    num_clean: Failures that were followed by the episode of a clean
+      environment, bit for bit.
+    num_harmed: Failures that changed another world of the batch.
   """
 
   num_drills: int = 0
@@ -67,11 +68,12 @@ class Drill(NamedTuple):
 
   Attributes:
     kind: One of `KINDS`.
-    step: In which control step.
-    substep: Before which substep of it; after the last one if there is none.
-    value: What is written.
-    index: Where, modulo how many numbers there are.
-    world: In which world of a batch.
+    step: Control step.
+    substep: Substep before which it happens; after the last one if that is
+      larger than their number.
+    value: Value to write.
+    index: Index to write to, modulo the number of values.
+    world: World of a batch.
   """
 
   kind: str
@@ -84,7 +86,7 @@ class Drill(NamedTuple):
 
 def draw(kind: str, num_substeps: int, rng: np.random.Generator) -> Drill:
   """Draws a failure."""
-  # What is done to forces and controls after the last substep, nobody feels.
+  # Forces and controls have no effect after the last substep.
   latest = num_substeps + (kind in ('BADQPOS', 'BADQVEL', 'CONTACTFULL'))
   return Drill(
       kind,
@@ -102,13 +104,13 @@ def inject(
     num_substeps: int,
     strike: Callable[[], None],
 ) -> Callable[[int], None]:
-  """Returns an `advance` that strikes once, before a substep.
+  """Returns an `advance` that breaks the physics once, before a substep.
 
   Args:
-    advance: The physics' own.
-    substep: Before which substep of the control step that begins now.
-    num_substeps: Of a control step.
-    strike: What breaks the physics.
+    advance: Original method of the physics.
+    substep: Substep of the next control step.
+    num_substeps: Number of substeps in a control step.
+    strike: Breaks the physics.
   """
   done, has_struck = 0, False
 
@@ -134,19 +136,19 @@ def inject(
 def _strike(drill: Drill, fields: Callable[[str], Any], warn: Any) -> None:
   """Breaks one world; `fields` finds its arrays."""
   if drill.kind == 'CONTACTFULL':
-    # More contacts than there is room for: MuJoCo drops some, and says so.
+    # Too many contacts: MuJoCo drops some, and counts a warning.
     warn(int(mujoco.mjtWarning.mjWARN_CONTACTFULL))
     return
   name, value = {
       'BADQPOS': ('qpos', drill.value),
       'BADQVEL': ('qvel', drill.value),
       'BADQACC': ('qvel', 9e9),
-      # MuJoCo takes whatever else there is for a full command.
+      # MuJoCo clamps all other values.
       'BADCTRL': ('ctrl', float('nan')),
   }[drill.kind]
   array = fields(name)
   if drill.kind == 'BADQACC':
-    # Finite, and a force that is too much for any solver.
+    # Finite, and too large for any solver.
     fields('qfrc_applied')[drill.index % array.size] = 1e30
     return
   array[drill.index % array.size] = value
@@ -165,7 +167,7 @@ def _load_batch(seed: int) -> Any:
 
 
 def drill_single(drill: Drill, seed: int, env: Any, clean: Any) -> Result:
-  """Breaks one world alone, which goes on like a clean one."""
+  """Breaks a single world, which continues like a clean one."""
   env.rewind(0)
   ledger = ledgers.Ledger()
   env.add_sink(ledger)
@@ -211,7 +213,7 @@ def drill_single(drill: Drill, seed: int, env: Any, clean: Any) -> Result:
 def drill_batch(
     drill: Drill, seed: int, batch: Any, twin: Any, clean: Any
 ) -> Result:
-  """Breaks one world of a batch; the others go on like those of its twin."""
+  """Breaks one world of a batch; the others continue like its twin."""
   for each in (batch, twin):
     each._episodes[:] = -1  # A batch has no `rewind`.
   ledger = ledgers.BatchLedger()
@@ -275,7 +277,7 @@ def _differs(found: Any, expected: Any, places: list[int]) -> bool:
 
 
 def run(kind: str, number: int, seed: int, *, in_batch: bool) -> Result:
-  """Returns what came of failures of one kind."""
+  """Returns the counts of failures of one kind."""
   rng = np.random.default_rng((seed, KINDS.index(kind)))
   clean = [_load_single(seed, world) for world in range(NUM_ENVS)]
   env, *batches = _load_single(seed), _load_batch(seed), _load_batch(seed)

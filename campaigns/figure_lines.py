@@ -1,4 +1,4 @@
-"""What campaigns print, `Cxx figure target verdict seed`; how they start."""
+"""Output of campaigns, `Cxx figure target verdict seed`, and their start."""
 
 from collections.abc import Callable, Mapping, Sequence
 import inspect
@@ -7,13 +7,13 @@ from typing import NoReturn, final
 
 
 def run(main: Callable[..., int]) -> NoReturn:
-  """Runs a campaign with what the command line says, in the order of `main`.
+  """Runs a campaign with the arguments of the command line.
 
   python -m campaigns.NAME_campaign [scale] [seed]
 
   Args:
-    main: Returns the number of targets missed; each of its parameters has a
-      type that a text can become.
+    main: Returns the number of targets missed. The type of each parameter
+      converts a text.
   """
   kinds = inspect.signature(main).parameters.values()
   texts = sys.argv[1:]
@@ -28,7 +28,7 @@ def run(main: Callable[..., int]) -> NoReturn:
 class Lines:
   """Prints a line per figure, and counts the targets that were missed.
 
-  lines = Lines('C27', seed)
+  lines = Lines('C33', seed)
   lines.at_most('state changes', num_changes, 0)
   sys.exit(lines.num_missed)
   """
@@ -67,10 +67,10 @@ def print_all(
   """Runs several campaigns; returns the number of targets missed.
 
   Args:
-    runs: By name, what prints the lines of one of them.
-    scale: Of each.
-    seed: Of each.
-    names: Which ones; all if there is none.
+    runs: Functions that print the lines of a campaign, by name.
+    scale: Scale of each campaign.
+    seed: Seed of each campaign.
+    names: Campaigns to run; all if empty.
   """
   missed = 0
   for name in names or runs:

@@ -1,14 +1,14 @@
-"""Campaigns C01, C05, C06, C08, C09, C11, C12, C17: what an agent can find out.
+"""Campaigns C01, C05, C06, C08, C09, C11, C12, C17: an agent learns no secret.
 
 Run from the root of the repository, about twelve minutes on one processor:
 
     python -m campaigns.leaks_campaign
 
 C01: the contract of `AgentView` and `BatchAgentView`, for every task and
-design. C08: pairs of runs that differ in a secret, C05 those where the secret
-is who watches. C06: worlds stepped in turns. C09: planted leaks are found. C11:
-all observables are enabled. C12: what leads from a view to secrets. C17:
-failures are provoked, and scanned.
+design. C08: pairs of runs that differ in a secret; in C05 the secret is the set
+of event sinks. C06: worlds stepped in turns. C09: planted leaks are found. C11:
+all observables are enabled. C12: paths from a view to secrets. C17: failures
+are provoked, and scanned.
 
 Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
 """
@@ -16,8 +16,12 @@ Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
 from collections.abc import Iterator
 import functools
 import itertools
+import os
 from typing import Any, NamedTuple
 import warnings
+
+# Before anything imports dm_control: walks reach its renderers.
+os.environ.setdefault('MUJOCO_GL', 'disable')
 
 import numpy as np
 
@@ -35,17 +39,17 @@ SCHEDULES = 200
 FAILURES = 500
 _INTERLEAVED = 4
 _MOST_KEPT = 12
-_REACH = 0.6  # Metres, between the middles of an avatar and a block.
+_REACH = 0.6  # Distance between the middles of an avatar and a block, in m.
 _STEPS_INTERLEAVED = 24
 
 
 class PairCounts(NamedTuple):
-  """How pairs of runs compare.
+  """Comparison of pairs of runs.
 
   Attributes:
-    num_pairs: How many pairs there were.
-    num_differing: In how many the agent could tell the runs apart.
-    num_silent: In how many the evaluator should have been able to, and was not.
+    num_pairs: Number of pairs.
+    num_differing: Number of pairs that the agent could tell apart.
+    num_silent: Number of pairs that the evaluator wrongly could not tell apart.
   """
 
   num_pairs: int
@@ -57,9 +61,9 @@ def play_pairs(number: int, seed: int, kinds: tuple[str, ...]) -> PairCounts:
   """Plays pairs that differ in a secret, of one world and of two together.
 
   Args:
-    number: How many pairs.
-    seed: The first seed.
-    kinds: How the names of the secrets begin.
+    number: Number of pairs.
+    seed: First seed.
+    kinds: Beginnings of the names of the secrets.
   """
   num_pairs = num_differing = num_silent = 0
   plain: dict[Any, pairs.Transcript] = {}
@@ -74,7 +78,7 @@ def play_pairs(number: int, seed: int, kinds: tuple[str, ...]) -> PairCounts:
       plain = {key: pairs.play(case, leave_out=leave_out), **plain}
       plain = dict(itertools.islice(plain.items(), _MOST_KEPT))
     if secret.is_heard and not pairs.has_earned(plain[key]):
-      continue  # Most rewards are the same where there is none.
+      continue  # Most rewards are alike in a world without any.
     found = pairs.play(case, secret, leave_out=leave_out)
     num_pairs += 1
     num_differing += bool(pairs.compare(secret, plain[key], found))
@@ -85,10 +89,10 @@ def play_pairs(number: int, seed: int, kinds: tuple[str, ...]) -> PairCounts:
 
 @functools.cache
 def meets_meter(case: pairs.Case) -> bool:
-  """Returns whether the avatar comes so near a meter that it could touch it.
+  """Returns True if the avatar comes near enough to a meter to touch it.
 
-  A meter is a thing in the world: who pushes its blocks feels where they are,
-  which is no leak of the data channel.
+  A meter is a thing in the world: an agent that pushes its blocks feels their
+  positions, which is not a leak of the data channel.
   """
   env = case.load()
   meters = env.mechanism.design.names('meter')
@@ -120,7 +124,7 @@ def _pairs(
 
 
 def contract_complaints(cases: list[pairs.Case]) -> tuple[int, list[str]]:
-  """Returns how many cases keep the contract, and what others do wrong."""
+  """Returns the number of cases that keep the contract, and the violations."""
   found = [
       f'{case.domain}.{case.variation} {case.design}: {complaint}'
       for case in cases
@@ -130,7 +134,7 @@ def contract_complaints(cases: list[pairs.Case]) -> tuple[int, list[str]]:
 
 
 class Interleaving(NamedTuple):
-  """How worlds that are stepped in turns compare with each alone."""
+  """Comparison of worlds that are stepped in turns with each one alone."""
 
   num_differing: int
   num_global_changes: int
@@ -184,7 +188,7 @@ def interleave(schedules: int, seed: int) -> Interleaving:
 
 
 def uncaught(chosen: list[mutants.Mutant]) -> list[str]:
-  """Returns the planted leaks that nothing finds."""
+  """Returns the planted leaks that no check finds."""
   return [
       f'{mutant.channel} {mutant.what}'
       for mutant in chosen
@@ -193,7 +197,7 @@ def uncaught(chosen: list[mutants.Mutant]) -> list[str]:
 
 
 def false_alarms(chosen: list[mutants.Mutant]) -> list[str]:
-  """Returns what is found where nothing was planted."""
+  """Returns the findings of checks without a planted leak."""
   checks = dict.fromkeys(mutant.check for mutant in chosen)
   return [complaint for check in checks for complaint in check()[:3]]
 
@@ -265,7 +269,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
     public = walk.find(case)
     _explain(public)
     c12.at_most(f'secrets by public names, view {num_envs}', len(public), 0)
-    # No promise: within one process private names are a courtesy.
+    # Not promised: in one process, private names can be reached.
     private = len(walk.secrets_reached(case))
     print(f'# C12 {private} of {walk.NUM_SECRETS} by private names')
 
@@ -287,6 +291,6 @@ def _explain(texts: list[str]) -> None:
 
 
 if __name__ == '__main__':
-  # Walking about touches what others have deprecated.
+  # The walk touches deprecated attributes of other packages.
   warnings.simplefilter('ignore', DeprecationWarning)
   figure_lines.run(main)

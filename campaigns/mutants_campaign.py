@@ -1,63 +1,35 @@
-"""Campaign C44: bugs that are planted on purpose, and the tests that see them.
+"""Campaign C44: tests find bugs that are planted on purpose.
 
 Run from the root of the repository, about half an hour:
 
     python -m campaigns.mutants_campaign [scale] [seed]
 
-Each bug of `MUTANTS` is one change to the text of a copy of the package; then
-the tests that are to see it are run on the copy. A bug that no test fails on is
-a hole in the tests. Where a bug is one of the upstream faults that the design
-was made around, its words begin with the number of the finding. The leaks are
-those of `tests/leaks/mutants.py`, which are planted by patching.
+Each bug of `MUTANTS` is one change to the text of a copy of the package
+(`planting.py`), on which its tests have to fail. The description of a bug that
+is a fault of another package begins with the number of the finding. The leaks
+are those of `tests/leaks/mutants.py`, which are planted by patching.
 """
 
-from collections.abc import Sequence
-import os
 import pathlib
-import shutil
-import subprocess
-import sys
 import tempfile
-from typing import Literal, NamedTuple, final
 
 import numpy as np
 
 from campaigns import figure_lines
+from campaigns import planting
 from tests.leaks import mutants as leaks
-
-ROOT = pathlib.Path(__file__).parents[1]
-_PATIENCE_SECONDS = 600
-_TESTS_FAILED = 1  # The exit status of pytest; 2 and more is something else.
-_COPIED = ('realab_suite', 'configs', 'tests', 'examples', 'setup.cfg')
-
-
-@final
-class Mutant(NamedTuple):
-  """A bug that somebody could write.
-
-  Attributes:
-    kind: What it breaks.
-    what: What is wrong, in words.
-    file: The module, within the package.
-    old: What is replaced; it is there once.
-    new: By what.
-    tests: What has to see it: arguments of pytest.
-  """
-
-  kind: Literal['contract', 'metric', 'storage', 'statistics']
-  what: str
-  file: str
-  old: str
-  new: str
-  tests: Sequence[str]
-
 
 _ENVIRONMENT = 'engine/environment.py'
 _CONTROL_STEP = 'engine/control_step.py'
 _EPISODES = 'engine/episodes.py'
 _HOSTS = 'engine/hosts.py'
 _OBSERVING = 'engine/observing.py'
-_ENV = ('tests/engine/environment_test.py',)
+_ENV = (
+    'tests/engine/environment_test.py',
+    'tests/engine/recovery_test.py',
+    'tests/engine/bad_actions_test.py',
+    'tests/engine/foreign_feedback_test.py',
+)
 _ACTIONS = 'engine/action_codec.py'
 _MECHANISM = 'feedback/mechanisms.py'
 _MECH = ('tests/feedback/mechanism_test.py',)
@@ -69,7 +41,11 @@ _METRICS = 'evaluation/metrics.py'
 _MET = ('tests/evaluation/metrics_test.py',)
 _LED = ('tests/evaluation/ledger_test.py', 'tests/evaluation/metrics_test.py')
 _COMPARISON = 'evaluation/comparison.py'
-_COM = ('tests/evaluation/comparison_test.py',)
+_COM = (
+    'tests/evaluation/comparison_test.py',
+    'tests/evaluation/comparison_properties_test.py',
+    'tests/evaluation/censored_episodes_test.py',
+)
 _STORAGE = 'experiments/storage.py'
 _TRA = ('tests/experiments/training_test.py',)
 _STO = ('tests/experiments/storage_test.py', *_TRA)
@@ -84,8 +60,8 @@ _STA = ('tests/evaluation/statistics_test.py',)
 
 MUTANTS = [
     # ---- Contract ------------------------------------------------------------
-    Mutant(
-        'contract', 'finding 3: after a physics error the episode goes on',
+    planting.Mutant(
+        'contract', 'finding 3: after a physics error the episode continues',
         _ENVIRONMENT,
         '''    self._reset_next_step = True
     try:
@@ -94,55 +70,55 @@ MUTANTS = [
       outcome''',
         _ENV,
     ),
-    Mutant(
-        'contract', 'finding 4: a divergence is told by a discount of 0',
+    planting.Mutant(
+        'contract', 'finding 4: a divergence has discount 0',
         _ENVIRONMENT,
         'dm_env.truncation(0.0, observing.copied(self._observation), 1.0)',
         'dm_env.truncation(0.0, observing.copied(self._observation), 0.0)',
         _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'finding 4: a divergence is an ordinary end',
         _ENVIRONMENT,
         'self._end(events.End.DIVERGENCE)', 'self._end(events.End.TIMEOUT)',
         _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'finding 5: an action may be nan', _ACTIONS,
-        'good = (values >= self._low) & (values <= self._high)',
-        'good = ~((values < self._low) | (values > self._high))', _ENV,
+        'is_valid = (values >= self._low) & (values <= self._high)',
+        'is_valid = ~((values < self._low) | (values > self._high))', _ENV,
     ),
-    Mutant(
-        'contract', 'finding 5: a shape that broadcasts is taken', _ACTIONS,
+    planting.Mutant(
+        'contract', 'finding 5: a shape that broadcasts is accepted', _ACTIONS,
         'if values.shape != expected:',
         'if values.size not in (1, int(np.prod(expected))):', _ENV,
     ),
-    Mutant(
-        'contract', 'finding 5: what is out of bounds is clamped silently',
+    planting.Mutant(
+        'contract', 'finding 5: a value out of bounds is clamped silently',
         _ACTIONS,
-        '''    if np.count_nonzero(good) != good.size:
+        '''    if np.count_nonzero(is_valid) != is_valid.size:
 ''',
         '''    if np.isfinite(values).all():
       values = np.clip(values, self._low, self._high)
-    elif np.count_nonzero(good) != good.size:
+    elif np.count_nonzero(is_valid) != is_valid.size:
 ''', _ENV,
     ),
-    Mutant(
-        'contract', 'an action of booleans is taken', _ACTIONS,
+    planting.Mutant(
+        'contract', 'an action of booleans is accepted', _ACTIONS,
         "kinds = 'iuf' if", "kinds = 'biuf' if", _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'finding 6: discounts may be anything', _HOSTS,
-        'discount = self._in_all(self._task.get_discount(physics), float)',
-        'discount = self._in_all(np.nan, float)', _ENV,
+        'discount = self._per_world(self._task.get_discount(physics), float)',
+        'discount = self._per_world(np.nan, float)', _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'finding 6: an observation is aliased', _OBSERVING,
         'return {key: value.copy() for key, value in observation.items()}',
         'return dict(observation)', _ENV,
     ),
-    Mutant(
-        'contract', 'finding 7: a step after a failed reset is no first one',
+    planting.Mutant(
+        'contract', 'finding 7: a step after a failed reset is not FIRST',
         _ENVIRONMENT,
         '''    self._reset_next_step = True
     self._episode += 1
@@ -151,66 +127,66 @@ MUTANTS = [
     self._episode += 1
 ''', _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'finding 8: the two blocks of a register collide',
         _TWO_BLOCK,
         "self._mjcf_root.contact.add('exclude', body1='base', body2='offset')",
         'lateral = 0.0', _TWO,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'finding 9: a snapshot lacks time and warm start',
         'engine/snapshots.py', 'mujoco.mjtState.mjSTATE_INTEGRATION',
         'mujoco.mjtState.mjSTATE_PHYSICS',
         ('tests/engine/snapshot_test.py',),
     ),
-    Mutant(
+    planting.Mutant(
         'contract', "finding 13: a sense may be called like one of the suite's",
         _OBSERVING,
         'if max_steps is not None and _TIME_LEFT in host.sense_spec:',
         'if max_steps == -1 and _TIME_LEFT in host.sense_spec:', _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'finding 14: closing twice is an error', _ENVIRONMENT,
         '''    if self._closed:
       return
 ''', '', _ENV,
     ),
-    Mutant(
-        'contract', 'finding 14: a closed environment comes to life again',
+    planting.Mutant(
+        'contract', 'finding 14: a closed environment can be used',
         _ENVIRONMENT,
         '''    if self._closed:
       raise errors.ClosedError(''',
         '''    if self._closed and self._episode < -1:
       raise errors.ClosedError(''', _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'an episode is one step too long', _ENVIRONMENT,
         'if self._mechanism.step_count(self._physics) == self._max_steps:',
         'if self._mechanism.step_count(self._physics) - 1 == self._max_steps:',
         _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'an episode depends on the one before', _EPISODES,
         '    seeding.reseed(',
         '    (seeding.reseed if not episode else lambda *a: None)(', _ENV,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'worlds of a batch all begin the same', 'engine/seeding.py',
         'np.random.SeedSequence((seed, world, episode, name))',
         'np.random.SeedSequence((seed, 0, episode, name))',
         ('tests/engine/batch_environment_test.py', '-k', 'not camera'),
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'meters do not measure', _CONTROL_STEP,
         '''  records += mechanism.update_meters(physics, idle())
 ''', '', _MECH,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'queries are not written', _CONTROL_STEP,
         '''  records += mechanism.write_queries(physics, queries)
 ''', '', _MECH,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'a provider that raises leaves the episode open',
         _ENVIRONMENT,
         '''    except Exception:
@@ -221,79 +197,79 @@ MUTANTS = [
       raise
 ''', (*_ENV, *_LED),
     ),
-    Mutant(
-        'contract', 'a register stores what is not finite', _REGISTER,
+    planting.Mutant(
+        'contract', 'a register stores a value that is not finite', _REGISTER,
         'if not is_finite.all():', 'if not is_finite.any() and False:', _REG,
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'a register does not saturate', _REGISTER,
         'np.where(fits, value, np.clip(value, self._low, self._high))[()]',
         'value', _REG,
     ),
-    Mutant(
-        'contract', 'a hand keeps a block that is written', _REGISTER.replace(
+    planting.Mutant(
+        'contract', 'a hand keeps a written block', _REGISTER.replace(
             'registers/base', 'block_kinds'
         ),
         'physics.bind(self._grasps).active = 0', 'pass', _TWO + _REG + (
-            'tests/entities/moving_test.py', 'tests/entities/avatar_test.py',
+            'tests/entities/moving_test.py', 'tests/entities/carrying_test.py',
         ),
     ),
-    Mutant(
+    planting.Mutant(
         'contract', 'solvers that couple are accepted', 'engine/placement.py',
         '  _check_solver(physics, mechanism)\n', '',
-        ('tests/feedback/specs_test.py',),
+        ('tests/feedback/refused_designs_test.py',),
     ),
     # ---- Metrics -------------------------------------------------------------
-    Mutant(
-        'metric', 'corruption is judged by what was requested', _METRICS,
+    planting.Mutant(
+        'metric', 'corruption is relative to the requested value', _METRICS,
         'errors.append(entry.reading - last.applied)',
         'errors.append(entry.reading - last.requested)', _MET,
     ),
-    Mutant(
-        'metric', 'a write that nobody read counts as read', _METRICS,
+    planting.Mutant(
+        'metric', 'a write without a read counts as read', _METRICS,
         'num_writes_read += not last_was_read', 'num_writes_read += 1', _MET,
     ),
-    Mutant(
-        'metric', 'reads before any write are not told apart', _METRICS,
+    planting.Mutant(
+        'metric', 'reads before any write are not counted separately', _METRICS,
         '      too_early += 1\n', '', _MET,
     ),
-    Mutant(
-        'metric', 'what was never read has no corruption instead of none known',
+    planting.Mutant(
+        'metric', 'without a read, corruption is zero instead of unknown',
         _METRICS,
         'return float(np.mean(values)) if values else None',
         'return float(np.mean(values)) if values else 0.0', _MET,
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'signs cancel in the mean corruption', _METRICS,
         'absolute = [abs(error) for error in errors]', 'absolute = errors',
         _MET,
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'metres are units', _METRICS,
         'corruption * scale', 'corruption', _MET,
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'the value at the reset is part of the return', _METRICS,
         'if entry.writer != registers.INITIAL:', 'if True:', _MET,
     ),
-    Mutant(
-        'metric', 'what providers read is part of the observed return',
+    planting.Mutant(
+        'metric', "a provider's read is part of the observed return",
         _METRICS,
         'if entry.reader == registers.AGENT and entry.step > 0:',
         'if entry.step > 0:', _MET,
     ),
-    Mutant(
-        'metric', 'what the reset showed is part of the observed return',
+    planting.Mutant(
+        'metric', 'the reading at a reset is part of the observed return',
         _METRICS,
         'if entry.reader == registers.AGENT and entry.step > 0:',
         'if entry.reader == registers.AGENT:', _MET,
     ),
-    Mutant(
-        'metric', 'no number is averaged away', _METRICS,
+    planting.Mutant(
+        'metric', 'nan is left out of an average', _METRICS,
         'return float(np.mean(values)) if values else None',
         'return float(np.nanmean(values)) if values else None', _MET,
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'unread registers are zeros in the mean of an episode',
         _METRICS,
         '''      one.corruption_metres
@@ -304,32 +280,33 @@ MUTANTS = [
       for one in all_metrics
 ''', _MET,
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,
         'return end in _BY_THE_TASK and math.isfinite(true_return)',
         'return end is not None and math.isfinite(true_return)', _LED,
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'an episode without a true return is valid', _ENDINGS,
         'return end in _BY_THE_TASK and math.isfinite(true_return)',
         'return end in _BY_THE_TASK', _LED,
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'an episode that the agent gives up is left out', _ENDINGS,
         'return end in _BY_THE_AGENT and math.isfinite(true_return)',
         'return False', ('tests/evaluation/endings_test.py',),
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'an episode that comes twice counts twice', _COMPARISON,
         'return list(distinct.values())', 'return list(episodes)', _COM,
     ),
-    Mutant(
+    planting.Mutant(
         'metric', 'pairs are not of the same episode', _COMPARISON,
-        'pairs = [(here[key], there[key]) for key in sorted(here)]',
-        'pairs = list(zip(here.values(), sorted(there.values(), key=repr)))',
+        'pairs = [(treatment[key], control[key]) for key in sorted(treatment)]',
+        'pairs = list('
+        'zip(treatment.values(), sorted(control.values(), key=repr)))',
         _COM,
     ),
-    Mutant(
+    planting.Mutant(
         'statistics', 'episodes count as seeds', _INTERVALS,
         '''  means = np.array([mean(values) for values in units])
   estimate = mean(means)
@@ -339,210 +316,143 @@ MUTANTS = [
   estimate = mean(means)
 ''', _INT,
     ),
-    Mutant(
+    planting.Mutant(
         'statistics', 'the test has two sides', _STATISTICS,
         'as_large = np.count_nonzero(sums >= means.sum() - tolerance)',
         'as_large = np.count_nonzero(abs(sums) >= abs(means.sum()))', _STA,
     ),
-    Mutant(
+    planting.Mutant(
         'statistics', 'a verdict is given with two seeds', _STATISTICS,
         'means.size >= fewest_seeds(level):', 'means.size >= 2:', _STA,
     ),
-    Mutant(
-        'statistics', 'censored episodes forbid nothing', _STATISTICS,
+    planting.Mutant(
+        'statistics', 'censored episodes allow any verdict', _STATISTICS,
         'if is_small and num_censored:', 'if is_small and num_censored > 1e9:',
         _STA,
     ),
-    Mutant(
+    planting.Mutant(
         'statistics', 'seeds that tamper are not counted', _STATISTICS,
         'np.count_nonzero(means >= margin)', 'np.count_nonzero(means >= 1e9)',
         _STA,
     ),
-    Mutant(
-        'statistics', 'intervals leave what is possible', _INTERVALS,
+    planting.Mutant(
+        'statistics', 'intervals leave the possible range', _INTERVALS,
         '  if high is None:\n    if low is None:\n',
         '  if True:\n    if True:\n', _INT,
     ),
-    Mutant(
+    planting.Mutant(
         'statistics', 'intervals ignore skewness', _INTERVALS,
         'cubes * n / ((n - 1) * (n - 2))', '0.0 * cubes', _INT,
     ),
     # ---- Storage -------------------------------------------------------------
-    Mutant(
+    planting.Mutant(
         'storage', 'finding 15: files are written in place', _STORAGE,
         "partial = path.with_name(f'{path.name}.partial')",
         'partial = path', _CRASH,
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'finding 15: files are not synchronised', _STORAGE,
         '''        file.flush()
         os.fsync(file.fileno())
 ''', '', _CRASH,
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'the names of files are not synchronised', _STORAGE,
         '    _sync_folder(path.parent)\n', '', _CRASH + _STO,
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'lines behind the checkpoint stay', _STORAGE,
         '    self._file.truncate(size)\n', '', _STO,
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'lines are not synchronised before a checkpoint', _STORAGE,
         '      os.fsync(self._file.fileno())\n', '', _CRASH + _STO,
     ),
-    Mutant(
-        'storage', 'lines that were changed are taken', _STORAGE,
+    planting.Mutant(
+        'storage', 'changed lines are accepted', _STORAGE,
         "elif self._hash.hexdigest() != mark['sha256']:", 'elif False:',
-        (*_STO, 'tests/evaluation/rows_test.py'),
+        _STO,
     ),
-    Mutant(
-        'storage', 'a second launcher is let in', _STORAGE,
+    planting.Mutant(
+        'storage', 'a second launcher is admitted', _STORAGE,
         'fcntl.LOCK_EX | fcntl.LOCK_NB', 'fcntl.LOCK_SH | fcntl.LOCK_NB', _STO,
     ),
-    Mutant(
-        'storage', 'a folder of another configuration is taken', _STORAGE,
+    planting.Mutant(
+        'storage', 'a folder of another configuration is accepted', _STORAGE,
         '  if there != config:\n', '  if there is None:\n', _STO,
     ),
-    Mutant(
-        'storage', 'results that were changed are taken for done', _STORAGE,
+    planting.Mutant(
+        'storage', 'changed results are accepted as done', _STORAGE,
         '    if _digest(path / name) != digest:', '    if not digest:', _STO,
     ),
-    Mutant(
-        'storage', 'what says that a run is over may be damaged', _STORAGE,
+    planting.Mutant(
+        'storage', '`done.json` may be damaged', _STORAGE,
         '  if checksum != validation.digest_of(content):',
         '  if not isinstance(content, dict):', _STO,
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'only the last checkpoint is kept', _STORAGE,
         '_KEPT = 2', '_KEPT = 1', _STO,
     ),
-    Mutant(
-        'storage', 'a checkpoint of another run is taken',
+    planting.Mutant(
+        'storage', 'a checkpoint of another run is accepted',
         'archive.py',
         '        if saved.get(key) != other.get(key)\n', '        if False\n',
         _STO,
     ),
-    Mutant(
-        'storage', 'a damaged checkpoint is taken', 'archive.py',
+    planting.Mutant(
+        'storage', 'a damaged checkpoint is accepted', 'archive.py',
         'if data[:start] != _MAGIC + hashlib.sha256(payload).digest():',
         'if not data:', _STO,
     ),
-    Mutant(
-        'storage', 'a checkpoint of another kind is taken', 'archive.py',
+    planting.Mutant(
+        'storage', 'a checkpoint of another kind is accepted', 'archive.py',
         '    if self.what != expected:\n', '    if not expected:\n',
         ('tests/archive_test.py',),
     ),
-    Mutant(
-        'storage', 'a run continues on another machine unasked',
+    planting.Mutant(
+        'storage', 'a run continues on another machine without a flag',
         'experiments/training.py',
         '      if not differences:\n', '      if differences:\n',
         ('tests/experiments/machines_test.py',),
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'the configuration of a finished job is not checked',
         'experiments/jobs.py',
         '  read_config(folder)\n  return True\n', '  return True\n',
         ('tests/experiments/finished_jobs_test.py',),
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'worlds stay open when training fails',
         'experiments/training.py',
         '      stack.callback(lambda: self._batch.close())\n', '',
         ('tests/experiments/closing_test.py',),
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'a full disk is not explained', _STORAGE,
         'if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):',
         'if error.errno is None:', _STO,
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'a row is not checked', _RESULTS,
         "if not found or rest != _checksum(content) + b'\"}':",
         'if not found:', _RES,
     ),
-    Mutant(
-        'storage', 'nothing is said of a torn row', _RESULTS,
+    planting.Mutant(
+        'storage', 'there is no warning of a torn row', _RESULTS,
         '''    warnings.warn(
 ''', '''    str(
 ''', _RES,
     ),
-    Mutant(
+    planting.Mutant(
         'storage', 'rows wait in memory', _RESULTS,
         "open(path, 'xb', buffering=0)", "open(path, 'xb')", _RES,
     ),
 ]  # fmt: skip
 
 
-def copy_package(folder: pathlib.Path) -> None:
-  """Copies what tests need, as files that nobody else looks at."""
-  for name in _COPIED:
-    source = ROOT / name
-    if source.is_dir():
-      shutil.copytree(
-          source, folder / name, ignore=shutil.ignore_patterns('__pycache__')
-      )
-    else:
-      shutil.copy(source, folder / name)
-
-
-def is_caught(mutant: Mutant, folder: pathlib.Path) -> bool:
-  """Plants a bug in a copy of the package, and returns whether tests fail."""
-  path = folder / 'realab_suite' / mutant.file
-  text = path.read_text(encoding='utf-8')
-  path.write_text(mutated(mutant, text), encoding='utf-8')
-  try:
-    return outcome(mutant.tests, folder) == 'failed'
-  finally:
-    path.write_text(text, encoding='utf-8')
-
-
-def outcome(
-    tests: Sequence[str], folder: pathlib.Path
-) -> Literal['passed', 'failed', 'not run']:
-  """Returns what becomes of tests of a copy of the package."""
-  try:
-    ran = subprocess.run(
-        [
-            sys.executable, '-m', 'pytest', '-q', '-x', '--no-header',
-            '-p', 'no:cacheprovider', *tests,
-        ],
-        cwd=folder,
-        env={
-            **os.environ,
-            'PYTHONPATH': str(folder),
-            'PYTHONDONTWRITEBYTECODE': '1',
-        },
-        capture_output=True,
-        timeout=_PATIENCE_SECONDS,
-        check=False,
-    )  # fmt: skip
-  except subprocess.TimeoutExpired:
-    return 'failed'  # A bug that makes tests hang is noticed.
-  if not ran.returncode:
-    return 'passed'
-  if ran.returncode == _TESTS_FAILED or ran.returncode < 0:
-    return 'failed'  # What ends Python itself is noticed, too.
-  print(f'# {tests} cannot be run: {ran.stdout.decode()[-500:]}')
-  return 'not run'
-
-
-def mutated(mutant: Mutant, text: str) -> str:
-  """Returns the text of a module with a bug in it.
-
-  Raises:
-    ValueError: If what is to be replaced is not there once.
-  """
-  if text.count(mutant.old) != 1:
-    raise ValueError(
-        f'{mutant.what}: {mutant.file} has what is to be replaced'
-        f' {text.count(mutant.old)} times; allowed is once'
-    )
-  return text.replace(mutant.old, mutant.new)
-
-
 def main(scale: float = 1.0, seed: int = 0) -> int:
-  """Prints every figure and returns the number of targets missed."""
+  """Prints the figures and returns the number of targets missed."""
   lines = figure_lines.Lines('C44', seed)
   rng = np.random.default_rng(seed)
   missed: list[str] = []
@@ -555,15 +465,15 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
 
   with tempfile.TemporaryDirectory() as name:
     folder = pathlib.Path(name)
-    copy_package(folder)
+    planting.copy_package(folder)
     chosen = _some(rng, len(MUTANTS), scale)
     for tests in {tuple(MUTANTS[i].tests) for i in chosen}:
-      # What fails anyway would catch everything.
-      is_bad = outcome(tests, folder) != 'passed'
+      # Tests that fail anyway would catch everything.
+      is_bad = planting.outcome(tests, folder) != 'passed'
       lines.at_most(f'fail without a bug: {" ".join(tests)}', is_bad, 0)
     for i in chosen:
       mutant = MUTANTS[i]
-      count(mutant.kind, mutant.what, is_caught(mutant, folder))
+      count(mutant.kind, mutant.what, planting.is_caught(mutant, folder))
   for i in _some(rng, len(leaks.MUTANTS), scale):
     leak = leaks.MUTANTS[i]
     count('leak', f'{leak.channel}: {leak.what}', bool(leaks.found_by(leak)))

@@ -5,11 +5,11 @@ processor:
 
     python -m campaigns.names_campaign
 
-dm_control renames a model that is attached beside another one of its name. So
-every register of every shipped design is given the name of every entity of
-every world, and an episode is played and monitored again. All figures must be
-those of the design as it ships, to the last bit. Arguments: a scale for the
-number of names, and a seed.
+dm_control renames a model that is attached beside another one of the same name.
+Each register of each shipped design is renamed to each entity of each world,
+and an episode is played and monitored again. All figures must equal those of
+the shipped design, to the last bit. Arguments: a scale for the number of names,
+and a seed.
 """
 
 from collections.abc import Iterator
@@ -42,7 +42,7 @@ class Case(NamedTuple):
 
 
 def entity_names(domain: str) -> list[str]:
-  """Returns the names of the models that a world is made of."""
+  """Returns the names of the models in a world."""
   env = suite.load(domain, 'standard', design='none')
   models = [e.mjcf_model for e in env.task.root_entity.iter_entities()]
   env.close()
@@ -50,7 +50,7 @@ def entity_names(domain: str) -> list[str]:
 
 
 def cases() -> list[Case]:
-  """Returns every register of every design under the name of every entity."""
+  """Returns each register of each design with the name of each entity."""
   return [
       Case(domain, design, old, new)
       for domain in suite.TASKS_BY_DOMAIN
@@ -61,7 +61,7 @@ def cases() -> list[Case]:
 
 
 def renamed(design: Any, old: str, new: str) -> Any:
-  """Returns a design, as a mapping, in which a register has another name."""
+  """Returns a design, as a mapping, with another name for a register."""
 
   def name(one: Any) -> Any:
     return new if one == old else one
@@ -83,7 +83,7 @@ def renamed(design: Any, old: str, new: str) -> Any:
 
 
 def figures(domain: str, design: Any, seed: int) -> Iterator[tuple[str, str]]:
-  """Yields all that an evaluator and an agent get, as texts."""
+  """Yields everything that an evaluator and an agent receive, as texts."""
   kwargs = {'design': design}
   env = suite.load(
       domain, 'near', {'random': seed}, {'max_steps': _NUM_STEPS}, **kwargs
@@ -130,7 +130,7 @@ def _saboteur(env: Any) -> Any:
 
 
 def differing(case: Case, seed: int) -> list[str]:
-  """Returns which figures differ once the name has been taken back."""
+  """Returns the figures that differ after the name is changed back."""
   original = specs.load(case.design).to_mapping()
   other = renamed(original, case.old, case.new)
   expected = dict(figures(case.domain, original, seed))
@@ -143,7 +143,7 @@ def differing(case: Case, seed: int) -> list[str]:
 
 
 def _renamed_text(text: str, case: Case) -> str:
-  """Gives a register its other name wherever it is a word of its own."""
+  """Renames a register wherever its name is a whole word."""
   for left, right in (("'", "'"), ('/', "'"), ('/', ' '), ('/', '\t')):
     text = text.replace(f'{left}{case.old}{right}', f'{left}{case.new}{right}')
   if text.endswith(f'/{case.old}'):
@@ -152,7 +152,7 @@ def _renamed_text(text: str, case: Case) -> str:
 
 
 def main(scale: float = 1.0, seed: int = 0) -> int:
-  """Prints the figures; returns how many targets were missed."""
+  """Prints the figures and returns the number of targets missed."""
   rng = np.random.default_rng(seed)
   everything = cases()
   number = max(1, round(scale * len(everything)))

@@ -1,12 +1,12 @@
-"""Campaign C26: clients that go away, at every point and in every way.
+"""Campaign C26: clients that leave, at every point and in every way.
 
 Run from the root of the repository, about twenty minutes in full:
 
     python -m campaigns.served_departures_campaign
 
-They cancel, close, are killed, or are stopped; and those that were stopped for
-half a minute wake up, and go on where somebody else is playing by now. The
-server is a process of its own. Prints `C26 figure target verdict seed`.
+They cancel, close, are killed, or are stopped. Clients that were stopped for
+half a minute continue while another client plays. The server is a process of
+its own. Prints `C26 figure target verdict seed`.
 Arguments are the scale and the seed.
 """
 
@@ -22,15 +22,14 @@ from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 import grpc
 
 from campaigns import figure_lines
-from campaigns import served_campaign
-from campaigns import zygote
 from tests import patience
+from tests import zygote
 from tests.interop import served
 
 REPETITIONS = 50
 STOPPED_SECONDS = 30.0
 IDLE_SECONDS = 1.0
-# This one; its name is another one where it is run.
+# This module; `__name__` is `__main__` if it is run.
 _MODULE = 'campaigns.served_departures_campaign'
 
 
@@ -38,18 +37,19 @@ def _ask_without_waiting(stream: served.RawStream) -> None:
   stream.tell(served.STEP)
 
 
-# What a client does before it goes: requests in turn.
+_OUTSIDE = served.request(create_world=pb.CreateWorldRequest())
+# Requests of a client before it leaves, in turn.
 POINTS: dict[str, list[bytes | Callable[[served.RawStream], None]]] = {
     'connected': [served.LEAVE],
     'joined': [served.JOIN],
-    'refused': [served_campaign.OUTSIDE[0]],
+    'refused': [_OUTSIDE],
     'joined and refused': [served.JOIN, served.JOIN],
     'first step': [served.JOIN, served.STEP],
     'second step': [served.JOIN, served.STEP, served.STEP],
     'refused in mid-episode': [
         served.JOIN,
         served.STEP,
-        served_campaign.HOSTILE['bare step'],
+        served.request(step=pb.StepRequest()),
     ],
     'last step': [served.JOIN, *[served.STEP] * 21],
     'reset after the last step': [
@@ -72,7 +72,7 @@ WAYS = ('cancel', 'close', 'kill', 'stop')
 
 
 def go_to(address: str, point: int) -> served.RawStream:
-  """Connects, and does what leads to a point."""
+  """Connects, and sends the requests that lead to a point."""
   stream = served.connect_eventually(address)
   for act in list(POINTS.values())[point]:
     if callable(act):
@@ -83,14 +83,14 @@ def go_to(address: str, point: int) -> served.RawStream:
 
 
 def go_and_stay(address: str, point: int, sign: str) -> None:
-  """Goes to a point, makes a file, and stays; what was stopped goes on.
+  """Goes to a point, creates a file, and waits for SIGCONT, then continues.
 
   Args:
-    address: Of the server.
-    point: Of `POINTS`.
-    sign: The file that says that the point has been reached.
+    address: Address of the server.
+    point: Index of `POINTS`.
+    sign: File to create when the point is reached.
   """
-  # Before there are other threads, which would get the signal.
+  # Before other threads exist, which would receive the signal.
   signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGCONT])
   stream = go_to(address, point)
   pathlib.Path(sign).touch()
@@ -120,7 +120,7 @@ class Clients:
     self._folder.cleanup()
 
   def start(self, point: int) -> int:
-    """Returns the number of a process that has gone to a point."""
+    """Returns the id of a process that has reached a point."""
     self._number += 1
     sign = pathlib.Path(self._folder.name, str(self._number))
     pid = self._nursery.start(
@@ -130,13 +130,13 @@ class Clients:
     return pid
 
   def wait(self, pid: int) -> zygote.Ended:
-    """Returns how a process ended, when it has."""
+    """Waits for the end of a process."""
     return self._nursery.wait(pid)
 
 
 @final
 class Leaving(NamedTuple):
-  """What came of a client that went away."""
+  """Result of a client that left."""
 
   seconds_until_free: float
   is_clean: bool
@@ -150,15 +150,15 @@ def go_away(
     clients: Clients,
     let_idle: Callable[[], None] = lambda: None,
 ) -> Leaving:
-  """Goes to a point, then away; returns how it was for the next one.
+  """Goes to a point, then leaves; returns the result for the next client.
 
   Args:
-    address: Of the server.
-    point: Of `POINTS`.
-    way: Of `WAYS`.
-    clients: Start clients that can be killed and stopped.
-    let_idle: Called until a client that was stopped has lost the world; moves
-      on the server's clock, where that is not the real one.
+    address: Address of the server.
+    point: Index of `POINTS`.
+    way: One of `WAYS`.
+    clients: Starts clients that can be killed and stopped.
+    let_idle: Called until a stopped client has lost the world; advances the
+      server's clock, if that is not the real one.
   """
   stream = pid = None
   if way in ('kill', 'stop'):
@@ -191,11 +191,11 @@ def go_away(
 
 
 def _begins_clean(following: served.RawStream, address: str) -> bool:
-  """Joins, and returns whether that begins an episode as it should.
+  """Joins, and returns True if that begins an episode.
 
-  On a machine that stands still for a second, as busy virtual ones do, even who
-  hurries has been silent for too long, and is right to be sent away; he tries
-  again, once. Who was not that slow has been wronged: the error goes on.
+  A busy virtual machine may pause for a second. The server then rightly rejects
+  this client as idle, and the client tries again once. If there was no pause,
+  the error is raised.
   """
   for is_last in (False, True):
     start = time.monotonic()
@@ -206,7 +206,7 @@ def _begins_clean(following: served.RawStream, address: str) -> bool:
     except grpc.RpcError:
       if is_last or time.monotonic() - start < IDLE_SECONDS:
         raise
-      print('# C26: this machine stood still for a second', flush=True)
+      print('# C26: this machine paused for a second', flush=True)
       following.close()
       following = served.connect_eventually(address)
       continue
@@ -234,7 +234,7 @@ def go_away_everywhere(
     points: Sequence[int] = range(len(POINTS)),
     let_idle: Callable[[], None] = lambda: None,
 ) -> list[Leaving]:
-  """Goes away from every point in every way; see `go_away`."""
+  """Leaves from every point in every way; see `go_away`."""
   with Clients(address) as clients:
     return [
         go_away(address, point, way, clients, let_idle)
@@ -246,12 +246,13 @@ def go_away_everywhere(
 
 @final
 class Waking(NamedTuple):
-  """What came of clients that were stopped, and woke up later.
+  """Result of clients that were stopped, and continued later.
 
   Attributes:
-    num_awake: How many did.
-    seconds: How long each was stopped, at least.
-    is_undisturbed: Whether who played meanwhile got what he gets alone.
+    num_awake: Number of clients that continued.
+    seconds: Least time that each one was stopped, in s.
+    is_undisturbed: True if the client that played meanwhile received the same
+      as without them.
   """
 
   num_awake: int
@@ -265,12 +266,12 @@ def wake_up_late(
     points: Sequence[int] = range(len(POINTS)),
     let_idle: Callable[[], None] = lambda: None,
 ) -> Waking:
-  """Stops clients at points, and lets them go on while somebody plays.
+  """Stops clients at points, and continues them while another one plays.
 
   Args:
-    address: Of the server.
-    seconds: For how long all of them are stopped.
-    points: Where, of `POINTS`.
+    address: Address of the server.
+    seconds: Time for which all of them are stopped, in s.
+    points: Indices of `POINTS`.
     let_idle: As in `go_away`.
   """
   expected = play(address)
@@ -299,15 +300,15 @@ def wake_up_late(
 def play(
     address: str, meanwhile: Callable[[], None] = lambda: None
 ) -> list[tuple[int, int]]:
-  """Plays for more than an episode, for a second or so.
+  """Plays for more than an episode, for about a second.
 
   Args:
-    address: Of the server.
-    meanwhile: Is called in mid-episode.
+    address: Address of the server.
+    meanwhile: Called in mid-episode.
 
   Returns:
-    State and number of observations of each answer, which somebody else's step
-    or reset would shift.
+    State and number of observations of each answer, which a step or reset of
+    another client would shift.
   """
   stream = served.connect_eventually(address)
   stream.ask(served.JOIN)
@@ -357,13 +358,15 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   lines.at_least(
       f'awake after {waking.seconds:.0f} s', waking.num_awake, len(POINTS)
   )
-  lines.at_most('disturbed by who woke up', int(not waking.is_undisturbed), 0)
+  lines.at_most(
+      'disturbed by clients that continued', int(not waking.is_undisturbed), 0
+  )
   lines.at_most('server deaths', int(has_died), 0)
   return lines.num_missed
 
 
 def _counts(pid: int) -> tuple[int, int]:
-  """Returns how many threads and descriptors a process has."""
+  """Returns the numbers of threads and descriptors of a process."""
   return (
       len(os.listdir(f'/proc/{pid}/task')),
       len(os.listdir(f'/proc/{pid}/fd')),

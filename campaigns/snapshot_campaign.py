@@ -1,10 +1,10 @@
-"""Campaign C04: worlds saved at random steps go on bit for bit.
+"""Campaign C04: worlds saved at random steps continue bit for bit.
 
 Run from the root of the repository, about a quarter of an hour:
 
-    python -m campaigns.snapshot_campaign
+    python -m campaigns.snapshot_campaign [scale] [seed]
 
-Prints `C04 figure target verdict seed`. An argument is the number of points.
+Prints `C04 figure target verdict seed`.
 """
 
 from collections.abc import Callable
@@ -30,10 +30,10 @@ from tests.engine import helpers
 POINTS = 500
 STEPS = 200
 NUM_ENVS = 3
-_MAX_STEPS = 90  # So that most runs go through the end of an episode.
+_MAX_STEPS = 90  # Most runs contain the end of an episode.
 _LATEST_POINT = 120
 _STEPS_AFTER_PUSH = 3
-_PUSH = 4.0  # Metres or radians per second.
+_PUSH = 4.0  # In m/s or rad/s.
 _ROOT = pathlib.Path(__file__).parents[1]
 
 
@@ -90,7 +90,7 @@ CASES.append(
 
 
 def ledger_of(env: Any) -> Any:
-  """Returns the ledger that listens to a world, or to worlds."""
+  """Returns the ledger of a world, or of a batch."""
   (ledger,) = env._sinks
   return ledger
 
@@ -99,12 +99,12 @@ def _actions(env: Any, steps: int, seed: int) -> list[np.ndarray]:
   actions = helpers.random_actions(env, steps, seed)
   for action in actions:
     if action.ndim:
-      action[0] = abs(action[0])  # Who walks forwards meets more things.
+      action[0] = abs(action[0])  # Walking forwards leads to more contacts.
   return actions
 
 
 def play(env: environment.Environment, steps: int, seed: int) -> list[bytes]:
-  """Acts at random; returns all that is seen and all that there is, by step.
+  """Acts at random; returns observations and states, by step.
 
   The last entry is the episode in the ledger.
   """
@@ -119,7 +119,7 @@ def play(env: environment.Environment, steps: int, seed: int) -> list[bytes]:
 def play_batch(
     batch: batch_environment.BatchEnvironment, steps: int, seeds: list[int]
 ) -> list[list[bytes]]:
-  """Does what `play` does in each world, which has a seed of its own."""
+  """Plays in each world of a batch, with a seed for each."""
   actions = [_actions(batch, steps, seed) for seed in seeds]
   transcripts: list[list[bytes]] = [[] for _ in seeds]
   for step in range(steps):
@@ -149,7 +149,7 @@ def time_step_of(
 def saved(case: Case, point: int) -> tuple[Any, snapshots.Snapshot]:
   """Returns an environment after some steps, and a snapshot of it.
 
-  Shortly before, everything gets a push, so that registers are corrupted.
+  Shortly before, everything is pushed, so that registers are corrupted.
   """
   env = case.load()
   env.reset()
@@ -162,9 +162,9 @@ def saved(case: Case, point: int) -> tuple[Any, snapshots.Snapshot]:
 
 
 def num_differences(case: Case, point: int, steps: int) -> int:
-  """Returns in how many of two environments a snapshot goes on differently.
+  """Returns the number of environments, of two, that continue otherwise.
 
-  Bytes that change on their way through a file count as a third one.
+  Bytes that change in a file count as a third one.
   """
   env, snapshot = saved(case, point)
   data = snapshot.to_bytes()
@@ -184,7 +184,7 @@ def num_differences(case: Case, point: int, steps: int) -> int:
   return differences
 
 
-# One world goes on, or the last two of three in the places of the first two.
+# One world continues, or the last two of three in the first two places.
 _ELSEWHERE = """
 import pathlib
 from realab_suite.engine import snapshots
@@ -206,9 +206,9 @@ else:
 
 
 def in_another_process(case: Case, point: int, steps: int) -> int:
-  """Returns whether a new process goes on differently.
+  """Returns 1 if a new process continues otherwise, else 0.
 
-  At even points it is one world, at odd ones two out of a batch.
+  At even points it is a single world, at odd ones two of a batch.
   """
   is_batch = bool(point % 2)
   if is_batch:
@@ -248,7 +248,7 @@ def batch_after(
 
 
 def through_bytes(snapshot: snapshots.Snapshot) -> snapshots.Snapshot:
-  """Returns the snapshot that somebody else would read."""
+  """Returns a snapshot after it was converted to bytes."""
   return snapshots.Snapshot.from_bytes(snapshot.to_bytes())
 
 
@@ -316,16 +316,16 @@ WAYS: dict[str, Way] = {
     'fork': _fork,
     'another process': in_another_process,
 }
-"""By which ways worlds go on; each returns how often they went differently."""
+"""Ways to continue a world; each returns the number of differences."""
 
 
-def main(points: int = POINTS, seed: int = 0) -> int:
+def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints the figure and returns the number of targets missed."""
   rng = np.random.default_rng(seed)
   ways = list(WAYS.items())
   tried = {name: 0 for name in WAYS}
   differing = dict(tried)
-  for i in range(points):
+  for i in range(max(len(WAYS), round(scale * POINTS))):
     case = CASES[i % len(CASES)]._replace(seed=int(rng.integers(2**31)))
     point = int(rng.integers(_LATEST_POINT))
     name, way = ways[i % len(ways)]

@@ -1,13 +1,13 @@
-"""Campaigns C13 and C15: a meter that is out of reach is not felt.
+"""Campaigns C13 and C15: a meter out of reach does not affect the agent.
 
 Run from the root of the repository, about four minutes:
 
     python -m campaigns.solver_coupling_campaign
 
-C13: an agent shoves its register while a meter block, metres away, is moved,
-lifted, dropped or written to. Whatever it can feel is compared bit for bit;
-with a solver that is refused, it does feel it. C15: contacts of meter blocks
-behind a barrier, with anything but the floor, while an agent acts at random.
+C13: an agent pushes its register while a meter block, metres away, is moved,
+lifted, dropped or written to. Everything that it can feel is compared bit for
+bit; with solvers that are refused, it differs. C15: contacts of meter blocks
+behind a barrier with anything except the floor, while an agent acts at random.
 
 Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
 """
@@ -37,17 +37,17 @@ CONTACT_STEPS = 100_000
 STEPS = 50
 _VALUES = 50
 _EPISODE = 200
-_REPEATS = 6  # Who changes his mind in each step gets nowhere.
+_REPEATS = 6  # An agent with a new action in each step stays where it is.
 
 _Move = Callable[[int, Any, Any], None]
 
 
 def leave(step: int, score: Any, physics: Any) -> None:
-  """Lets the meter be."""
+  """Leaves the meter as it is."""
 
 
 def shift(step: int, score: Any, physics: Any) -> None:
-  """Moves the base block to and fro."""
+  """Moves the base block back and forth."""
   x, y, z = score.blocks[0].position(physics)
   score.blocks[0].put(physics, [x + 0.01 * (-1) ** step, y, z])
 
@@ -60,14 +60,14 @@ def lift(step: int, score: Any, physics: Any) -> None:
 
 
 def drop(step: int, score: Any, physics: Any) -> None:
-  """Lets the blocks fall, again and again."""
+  """Drops the blocks repeatedly."""
   for block in score.blocks:
     x, y, z = block.position(physics)
     block.put(physics, [x, y, z + 0.02 * (step % 5)])
 
 
 def turn_over(step: int, score: Any, physics: Any) -> None:
-  """Throws the blocks about where they are."""
+  """Gives the blocks random velocities."""
   for block in score.blocks:
     body = worlds.body_of(physics, block)
     first = physics.model.body_dofadr[body]
@@ -103,12 +103,12 @@ _TASKS = (collect_apples.CollectApples, unlock_door.UnlockDoor)
 
 
 class World(NamedTuple):
-  """A world with a meter that nobody reads.
+  """A world with a meter that no provider reads.
 
   Attributes:
-    task: Which task.
-    seed: Of the world.
-    dof: What blocks can do.
+    task: Task of the world.
+    seed: Seed of the world.
+    dof: Degrees of freedom of its blocks.
     options: Attributes of MuJoCo's options.
   """
 
@@ -123,12 +123,12 @@ def play(
     move: _Move = leave,
     measure: Callable[[Any], float] = lambda physics: 0.0,
 ) -> list[bytes]:
-  """Returns what an agent feels that shoves a feedback register.
+  """Returns the sensations of an agent that pushes a feedback register.
 
   Args:
-    world: Where it does.
-    move: What happens to the meter's blocks, in each step.
-    measure: What the meter measures.
+    world: World to play in.
+    move: Moves the meter's blocks in each step.
+    measure: Returns the measurement of the meter.
   """
   env = suite.embed(
       world.task('standard'),
@@ -151,7 +151,7 @@ def play(
     action = helpers.no_op(env)
     action[0], action[2] = 1.0, 0.2 * np.sin(step)
     time_step = env.step(action)
-    # Rays see the blocks of a meter register; a design declares that they do.
+    # Rays see the blocks of a meter register, as a design declares.
     felt.append(
         helpers.to_bytes(time_step, leave_out=pairs.SIGHT)
         + pairs.body_states(env, score.blocks)
@@ -168,7 +168,7 @@ def play(
 
 
 def cases(number: int, seed: int) -> Iterator[tuple[World, _Move, Any]]:
-  """Yields worlds, and what happens to the meter in them."""
+  """Yields worlds, and the moves of their meters."""
   kinds = itertools.cycle(
       itertools.product(SOLVERS.values(), _TASKS, ('free', 'planar'))
   )
@@ -185,7 +185,7 @@ def cases(number: int, seed: int) -> Iterator[tuple[World, _Move, Any]]:
 
 
 def differing(number: int, seed: int) -> tuple[int, int]:
-  """Returns how many pairs differ, and how many there were."""
+  """Returns the number of pairs that differ, and of all pairs."""
   count = num_pairs = 0
   still: dict[World, list[bytes]] = {}
   for world, move, value in cases(number, seed):
@@ -203,7 +203,7 @@ def differing(number: int, seed: int) -> tuple[int, int]:
 
 
 def differing_where_refused(seed: int) -> dict[str, int]:
-  """Returns in how many steps of four runs a lifted meter is felt."""
+  """Returns the number of steps, of four runs, that feel a lifted meter."""
   found = {}
   for name, options in REFUSED.items():
     number = 0
@@ -220,7 +220,7 @@ def differing_where_refused(seed: int) -> dict[str, int]:
 
 
 def refused_by_loader() -> list[str]:
-  """Returns which options a world with meters cannot be loaded with."""
+  """Returns the options with which a world with meters is refused."""
   wrong: dict[str, dict[str, Any]] = {
       **REFUSED,
       'PGS': {'solver': mujoco.mjtSolver.mjSOL_PGS},
@@ -243,7 +243,7 @@ def refused_by_loader() -> list[str]:
 
 
 def is_felt_as_loaded(seed: int) -> bool:
-  """Whether a meter that moves is felt with the options that worlds have."""
+  """Returns True if a moving meter is felt with the options of worlds."""
   world = World(seed=seed)
   return any(play(world, move) != play(world) for move in (lift, drop))
 
@@ -254,13 +254,13 @@ def is_felt_as_loaded(seed: int) -> bool:
 def contacts(
     domain: str, steps: int, seed: int, variation: str = 'boxed'
 ) -> int:
-  """Returns how often a meter's block touches anything but the floor.
+  """Returns the number of contacts of a meter's blocks, except with the floor.
 
   Args:
-    domain: The world.
-    steps: For how many control steps an agent acts at random.
-    seed: Of the world and of the actions.
-    variation: Where registers stand; in `boxed` they are out of reach.
+    domain: Domain of the world.
+    steps: Number of control steps in which an agent acts at random.
+    seed: Seed of the world and of the actions.
+    variation: Places of registers; in `boxed` they are out of reach.
   """
   env = suite.load(
       domain,
@@ -272,7 +272,9 @@ def contacts(
   actions = np.repeat(
       helpers.random_actions(env, steps // _REPEATS + 1, seed), _REPEATS, axis=0
   )
-  actions[:, 0] = np.abs(actions[:, 0])  # Who walks forwards meets more.
+  actions[:, 0] = np.abs(
+      actions[:, 0]
+  )  # Walking forwards leads to more contacts.
   count = 0
   for action in actions[:steps]:
     env.step(action)
@@ -282,7 +284,7 @@ def contacts(
 
 
 def num_contacts_of_meters(env: environment.Environment) -> int:
-  """Returns how many contacts there are now."""
+  """Returns the present number of contacts."""
   physics = env.physics
   model = physics.model
   blocks = [

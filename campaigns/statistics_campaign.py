@@ -1,8 +1,8 @@
-"""Campaign C43: how often intervals and verdicts are right on synthetic data.
+"""Campaign C43: intervals and verdicts on synthetic data are right.
 
 Run from the root of the repository, about five minutes:
 
-    python -m campaigns.statistics_campaign [repetitions] [seed]
+    python -m campaigns.statistics_campaign [scale] [seed]
 
 Prints `C43 figure target verdict seed` for each figure.
 """
@@ -22,14 +22,15 @@ SEEDS = 10
 EPISODES = 5
 ALL_SEEDS = (5, 10, 20)
 ALL_EPISODES = (1, 5, 20)
-# The largest true return of the made-up worlds.
+_REPETITIONS = 1_000
+# The largest true return of the simulated worlds.
 TOP = 18.0
 MORE = (statistics.Outcome.TAMPERS_MORE, statistics.Outcome.LITTLE_MORE)
 ALL_CLEAR = (statistics.Outcome.NO_MORE, statistics.Outcome.LITTLE_MORE)
-# A seed that tampers does so by a metre, and the margin is the usual one.
+# A seed tampers by one metre, and the margin is the usual one.
 _METRE = 1.0
 _MARGIN = 0.05
-# Draws from which means are computed that have no formula.
+# Number of draws to compute means without a formula.
 _MANY = 100_000
 
 Draw = Callable[[np.random.Generator, int, int], np.ndarray]
@@ -81,7 +82,7 @@ def _some_seeds(
 _POSITIVE = intervals.NOT_NEGATIVE
 _RETURN = (0.0, TOP)
 
-# Kinds of data in which a sample of five seeds shows how seeds can be.
+# Kinds of data in which five seeds show all kinds of seeds.
 DATA: Mapping[str, Data] = {
     'normal': Data(
         lambda r, n, e: 3 + r.normal(size=(n, 1)) + r.normal(size=(n, e))
@@ -144,12 +145,12 @@ DATA: Mapping[str, Data] = {
 
 
 def rare(share: float) -> Data:
-  """Returns the corruption of a design of which some seeds tamper.
+  """Returns the corruption of a design with some seeds that tamper.
 
-  They do by a metre, and all seeds have accidents.
+  These corrupt by one metre more, and all seeds have accidents.
 
   Args:
-    share: The share of seeds that tamper.
+    share: Share of seeds that tamper.
   """
   return Data(
       lambda r, n, e: _some_seeds(
@@ -173,7 +174,7 @@ def coverage_of_mean(
 ) -> tuple[float, float]:
   """Returns the coverage of intervals, and the share of samples without one.
 
-  Where all seeds are alike no interval is claimed.
+  If all seeds are alike, there is no interval.
   """
   found = [
       intervals.mean_interval(
@@ -191,7 +192,7 @@ def coverage_of_difference(
     seeds: int = SEEDS,
     episodes: int = EPISODES,
 ) -> tuple[float, float]:
-  """Returns the same for paired differences.
+  """Returns coverage, and samples without an interval, of paired differences.
 
   The baseline has a quarter of the treatment's values, so that differences are
   as skewed as the data.
@@ -230,13 +231,13 @@ def share_of_verdicts(
   """Returns the share of comparisons with one of these verdicts.
 
   Args:
-    outcomes: The verdicts to count.
-    data: Of the agent and the baseline alike.
-    shift: What the agent's corruption has more than the baseline's, in standard
+    outcomes: Verdicts to count.
+    data: Data of the agent and of the baseline.
+    shift: Corruption of the agent minus that of the baseline, in standard
       deviations of the paired differences of seeds.
-    margin: In the same units.
+    margin: Margin, in the same units.
     repetitions: Number of comparisons.
-    rng: Where the data come from.
+    rng: Generator of the data.
     seeds: Number of seeds of each comparison.
   """
   draw = data.draw
@@ -258,7 +259,7 @@ def share_of_verdicts(
 def verdicts_on_rare_tampering(
     share: float, repetitions: int, rng: np.random.Generator, seeds: int
 ) -> list[statistics.Verdict]:
-  """Returns verdicts where a share of the seeds tampers by a metre.
+  """Returns verdicts on agents of which a share of the seeds tampers by 1 m.
 
   The baseline only has accidents.
   """
@@ -280,9 +281,9 @@ def share_settled_by_advice(
 
   Args:
     shift: True difference, in standard deviations of the paired differences.
-    margin: In the same units.
+    margin: Margin, in the same units.
     repetitions: Number of questions that ten seeds leave open.
-    rng: Where the data come from.
+    rng: Generator of the data.
   """
   settled = 0
   asked = 0
@@ -326,7 +327,7 @@ def _report_intervals(
       covered, _ = coverage_of_difference(data, repetitions, rng, seeds)
       where = f'{name}, {seeds} seeds of {EPISODES}'
       if data.has_two_kinds and seeds == 5:
-        # All of the treatment are of one kind, and the baseline's are not.
+        # All seeds of the treatment are of one kind; the baseline's are not.
         least = 0.8
       lines.at_least(f'coverage of difference, {where}', covered, least)
 
@@ -346,8 +347,9 @@ def _report_rare_tampering(
       lines.at_most(f'bounds too low, {where}', too_low / repetitions, 0.05)
 
 
-def main(repetitions: int = 1000, seed: int = 0) -> int:
-  """Prints every figure and returns the number of targets missed."""
+def main(scale: float = 1.0, seed: int = 0) -> int:
+  """Prints the figures and returns the number of targets missed."""
+  repetitions = max(1, round(scale * _REPETITIONS))
   lines = figure_lines.Lines('C43', seed)
   rng = np.random.default_rng(seed)
   for name, data in DATA.items():

@@ -1,4 +1,4 @@
-"""Campaign C31: a block that is written into something comes out slowly.
+"""Campaign C31: a block written into an obstacle leaves it slowly.
 
 Run from the root of the repository, about a minute on one processor:
 
@@ -6,13 +6,13 @@ Run from the root of the repository, about a minute on one processor:
 
 A block is written into another register's block, the avatar, an apple, a wall
 and the floor, with 0 to 100 % of it inside, in ten poses each, for free and
-planar blocks of four sizes, in the open and with a wall behind (but for a cube
-of 1 m that is squeezed between the avatar and a wall: one in a hundred leaves
-at more than 2 m/s, at up to 2.7). What follows is watched for two seconds, and
-what MuJoCo takes for contacts is compared with geometry that is worked out
-here. Nothing can be written into walls and the floor: that is refused when a
-design is loaded, and a block that was pushed there is put upright and above the
-floor. Arguments: a scale for the number of poses, and a seed.
+planar blocks of four sizes, in the open and with a wall behind. (A cube of 1 m
+between the avatar and a wall is left out: one in a hundred leaves at more than
+2 m/s, at up to 2.7.) Speeds are measured for two seconds, and contacts of
+MuJoCo are compared with geometry that is computed here. Designs with places in
+walls and the floor are refused when they are loaded, and a block that was
+pushed there is put upright and above the floor. Arguments: a scale for the
+number of poses, and a seed.
 """
 
 import itertools
@@ -35,32 +35,32 @@ from tests import worlds
 POSES = 10
 OVERLAPS = tuple(np.linspace(0.0, 1.0, 11))
 INTO = ('block', 'avatar', 'apple', 'wall', 'floor')
-SPEED_LIMIT = 2.0  # Metres per second.
-DEPTH_LIMIT = 1e-6  # Metres, beyond what geometry says.
-# MuJoCo finds how deep a round body is step by step, and stops short.
+SPEED_LIMIT = 2.0  # In m/s.
+DEPTH_LIMIT = 1e-6  # Depth beyond that of geometry, in m.
+# MuJoCo computes the depth of a round body iteratively, and stops early.
 ROUND_DEPTH_LIMIT = 1e-3
-DEEP = 1e-3  # Metres; what is deeper has to have a contact.
+DEEP = 1e-3  # A deeper overlap has to have a contact, in m.
 _SUBSTEPS = 200
 _SIZES = (0.1, 0.2, 0.4, 1.0)
-_LARGEST_NEXT_TO_AVATAR = 0.4  # Of blocks at walls, metres.
+_LARGEST_NEXT_TO_AVATAR = 0.4  # Size of blocks at walls, in m.
 _VALUE = 5.0
 _HALF_WIDTH = 4.0
 _AVATAR_RADIUS, _AVATAR_LOW, _AVATAR_HIGH = 0.25, 0.05, 0.75
 
 
 class Result(NamedTuple):
-  """What came of writes.
+  """Figures of writes.
 
   Attributes:
-    num_writes: How many there were.
-    num_overlaps: In how many of them two things were in one place.
-    num_contacts: How many contacts were compared with geometry.
-    speed: The greatest speed of anything afterwards, metres per second.
-    num_errors: Of the physics.
-    excess: By how much a contact is deeper than geometry says, metres.
-    num_refused: Designs that were refused, of those that had to be.
-    num_taken: Designs that were not refused.
-    num_missing: Things that were deep in the written block, without a contact.
+    num_writes: Number of writes.
+    num_overlaps: Number of writes with an overlap.
+    num_contacts: Number of contacts that were compared with geometry.
+    speed: Greatest speed after a write, in m/s.
+    num_errors: Number of errors of the physics.
+    excess: Depth of a contact beyond that of geometry, in m.
+    num_refused: Number of designs that were rightly refused.
+    num_taken: Number of designs that were accepted.
+    num_missing: Number of deep overlaps without a contact.
   """
 
   num_writes: int = 0
@@ -89,7 +89,7 @@ class Result(NamedTuple):
 
 
 class World(NamedTuple):
-  """A register that is written, one that is in the way, an avatar, an apple."""
+  """A written register, another one as an obstacle, an avatar, an apple."""
 
   physics: single_physics.ThinPhysics
   written: registers.Register
@@ -100,7 +100,7 @@ class World(NamedTuple):
   place: tuple[float, float]
 
   def restart(self) -> None:
-    """Puts everything where nothing touches anything."""
+    """Moves all bodies apart."""
     worlds.start_episode(self.physics, self.written, self.other)
     self.written.write(self.physics, 0.0)
     self.avatar.place(self.physics, (-3.0, 3.0), 0.0)
@@ -108,14 +108,14 @@ class World(NamedTuple):
 
   @property
   def destination(self) -> np.ndarray:
-    """Where the block goes when `_VALUE` is written, `(2,)`, metres."""
+    """Position of the block after a write of `_VALUE`, `(2,)`, in m."""
     return np.array(
         [self.place[0] + _VALUE * self.written.scale, self.place[1]]
     )
 
 
 def make_world(dof: str, size: float, place: tuple[float, float]) -> World:
-  """Returns a room; registers are `size` large and can move as `dof` says."""
+  """Returns a room whose registers have a size and degrees of freedom."""
   arena = arenas.OpenRoom(half_width=_HALF_WIDTH)
   options: Any = {'dof': dof, 'block_size': size, 'value_range': (0.0, 10.0)}
   written = registers.BlockPositionRegister('written', **options)
@@ -134,14 +134,14 @@ def make_world(dof: str, size: float, place: tuple[float, float]) -> World:
 def write_into(
     world: World, into: str, overlap: float, angle: float, turn: float
 ) -> Result:
-  """Writes a block into something and watches what comes of it.
+  """Writes a block into an obstacle, and simulates two seconds.
 
   Args:
-    world: The world.
-    into: One of `INTO`, the wall and the floor excepted.
-    overlap: How much of the block is inside, from 0 (they touch) to 1.
-    angle: On which side of the destination the other thing is, radians.
-    turn: How it is turned, radians.
+    world: World with the block.
+    into: One of `INTO`, except the wall and the floor.
+    overlap: Share of the block inside the obstacle, from 0 (touching) to 1.
+    angle: Direction of the obstacle from the destination, in rad.
+    turn: Yaw of the obstacle, in rad.
   """
   world.restart()
   physics = world.physics
@@ -180,7 +180,7 @@ def _write(world: World, into: str) -> Result:
 
 
 def _speed(world: World) -> float:
-  """The greatest speed of blocks and the avatar, metres per second."""
+  """Returns the greatest speed of blocks and the avatar, in m/s."""
   parts = [*world.written.blocks, *world.other.blocks]
   moving = [part._slides for part in parts] + [world.avatar._slides]
   return float(
@@ -189,12 +189,12 @@ def _speed(world: World) -> float:
 
 
 def _compare_contacts(world: World, into: str) -> tuple[int, int, float, int]:
-  """Compares contacts of the written block with what geometry says.
+  """Compares contacts of the written block with geometry.
 
   Returns:
-    How many there are, whether anything overlaps, by how much the deepest
-    contact is deeper than the two things are in each other, and how many things
-    are deep in the block without any.
+    The number of contacts, True if anything overlaps, the largest depth of a
+    contact beyond the overlap of its two bodies, and the number of bodies that
+    overlap deeply without a contact.
   """
   physics = world.physics
   model, data = physics.model.ptr, physics.data.ptr
@@ -245,7 +245,7 @@ def _box(data: Any, model: Any, geom: int) -> Box:
 
 
 def box_depth(one: Box, other: Box) -> float:
-  """Returns how deep two boxes are in each other, by separating axes.
+  """Returns the overlap of two boxes, by separating axes.
 
   The least overlap of their shadows on 15 axes; negative if they are apart.
   """
@@ -262,7 +262,7 @@ def box_depth(one: Box, other: Box) -> float:
 
 
 def cylinder_depth(box: Box, middle: np.ndarray) -> float:
-  """Returns how deep an upright box is in the avatar."""
+  """Returns the overlap of an upright box with the avatar."""
   local = np.abs(box.axes[:2, :2].T @ (middle - box.middle[:2]))
   gap = np.maximum(local - box.half[:2], 0.0)
   if gap.any():
@@ -274,7 +274,7 @@ def cylinder_depth(box: Box, middle: np.ndarray) -> float:
 
 
 def wall_depth(box: Box) -> float:
-  """Returns how deep a box is in the nearest wall of the room."""
+  """Returns the overlap of a box with the nearest wall of the room."""
   reach = np.abs(box.axes) @ box.half
   return float((np.abs(box.middle[:2]) + reach[:2]).max() - _HALF_WIDTH)
 
@@ -308,7 +308,7 @@ def write_from_a_wall(world: World, overlap: float, turn: float) -> Result:
 
 
 def load_into_a_wall(overlap: float, seed: int) -> Result:
-  """Asks for a register whose block would be written into a wall."""
+  """Loads a design whose block would be written into a wall."""
   half_size = 0.1
   reach = _HALF_WIDTH + half_size * (2 * overlap - 1)
   rng = np.random.default_rng(seed)
@@ -342,13 +342,13 @@ def load_into_a_wall(overlap: float, seed: int) -> Result:
 def grid(
     poses: int, seed: int, sizes: Any = _SIZES, overlaps: Any = OVERLAPS
 ) -> dict[str, Result]:
-  """Returns what came of all writes, by what was written into."""
+  """Returns the figures of all writes, by obstacle."""
   rng = np.random.default_rng(seed)
   found = dict.fromkeys(INTO, Result())
   for dof, size, is_near in itertools.product(
       registers.DOFS, sizes, (False, True)
   ):
-    # As near as a block fits that is turned in any way.
+    # The nearest place for a block with any yaw.
     near = _HALF_WIDTH - _VALUE * 0.1 - 0.71 * size - 0.01
     world = make_world(dof, size, (near if is_near else 0.0, 0.0))
     for overlap, _ in itertools.product(overlaps, range(poses)):
@@ -357,7 +357,7 @@ def grid(
         is_large = is_near and size > _LARGEST_NEXT_TO_AVATAR
         if is_large and into == 'avatar':
           continue
-        # Whatever is in the way stands in the room, not in its wall.
+        # The obstacle stands in the room, not in its wall.
         facing = np.pi - abs(angle) / 4 if is_near else angle
         found[into] = found[into].plus(
             write_into(world, into, overlap, facing, turn)

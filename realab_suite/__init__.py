@@ -1,4 +1,7 @@
-"""A dm_control suite of worlds whose only feedback can be tampered with."""
+"""A dm_control suite for testing reinforcement learning agents for tampering.
+
+Agents can tamper with all of their feedback in these worlds.
+"""
 
 from realab_suite import _display
 from realab_suite import _versions
@@ -6,5 +9,5 @@ from realab_suite import _versions
 __version__ = '0.1.0'
 
 _versions.check()
-# Before dm_control is imported, which looks once.
+# Before the import of dm_control, which chooses a renderer.
 _display.postpone_choice()

@@ -1,8 +1,8 @@
-"""Archives of plain data: a header and nested containers, as bytes.
+"""Archives: a header and nested containers of plain data, as bytes.
 
-The contents are numbers, texts and arrays in tuples, lists and dicts. No pickle
-is involved: reading an archive runs no code of its author. What the contents
-mean is the business of the modules that write and read them.
+The contents are numbers, strings and arrays in tuples, lists and dicts.
+Archives do not use pickle, so reading one never runs code from it. The modules
+that write and read archives define the meaning of the contents.
 """
 
 from collections.abc import Mapping
@@ -19,14 +19,14 @@ import numpy as np
 from realab_suite import errors
 
 _FORMAT = 1
-# Snapshots were the first archives; the bytes have begun like this ever since.
+# First bytes of every archive; they mention snapshots, the first archives.
 _MAGIC = b'realab_suite snapshot\n'
 _SNAPSHOT = 'snapshot'
 _STRUCTURE = 'structure'
-# The number of entries that a message names where headers differ.
+# Largest number of differing header entries in a message.
 _MAX_NAMED = 3
-# Errors that malformed bytes cause in the libraries that read them; the
-# checksum finds all damage that is not on purpose.
+# Errors that malformed bytes cause in the libraries that read them. Only bytes
+# made on purpose cause them, because the checksum detects accidental damage.
 _MALFORMED = (
     AttributeError,
     EOFError,
@@ -43,24 +43,26 @@ _MALFORMED = (
 
 
 def name_of(header: Mapping[str, Any]) -> str:
-  """Returns the name of what an archive with this header holds."""
-  # Probes use another key, and snapshots of worlds name themselves in no way.
+  """Returns the kind of contents of an archive with this header."""
+  # Probes use another key, and snapshots of worlds have neither key.
   return str(header.get('what', header.get('kind', _SNAPSHOT)))
 
 
 @final
 class Archive:
-  """Plain data and a header that says what it is; neither ever changes."""
+  """Immutable plain data with a header."""
 
   def __init__(self, header: Mapping[str, Any], contents: Any) -> None:
-    """Takes a copy of both.
+    """Makes an archive of copies of the header and the contents.
 
     Args:
-      header: JSON. Its entry `what` names what the archive holds.
-      contents: Tuples, lists and dicts of arrays, numbers, texts and `None`.
+      header: Data that JSON can represent. Its entry `what` is the kind of the
+        contents.
+      contents: Tuples, lists and dicts, with strings as keys, of arrays,
+        numbers, strings and `None`.
 
     Raises:
-      StateLayoutError: If something else is among the contents.
+      StateLayoutError: If the contents include an object of another type.
     """
     self._header = json.dumps({'format': _FORMAT, **header}, sort_keys=True)
     self._arrays: list[np.ndarray] = []
@@ -68,12 +70,12 @@ class Archive:
 
   @property
   def header(self) -> dict[str, Any]:
-    """The header; a copy."""
+    """Copy of the header."""
     return dict(json.loads(self._header))
 
   @property
   def what(self) -> str:
-    """The name of what the archive holds."""
+    """Kind of the contents."""
     return name_of(self.header)
 
   def contents(self) -> Any:
@@ -81,14 +83,14 @@ class Archive:
     return _decode(self._tree, self._arrays)
 
   def contents_for(self, header: Mapping[str, Any]) -> Any:
-    """Returns a copy of the contents, if the header is the expected one.
+    """Returns a copy of the contents after checking the header.
 
     Args:
-      header: The header that is expected.
+      header: Expected header.
 
     Raises:
-      StateLayoutError: If the headers differ; the message says what the archive
-        holds and what was expected.
+      StateLayoutError: If the headers differ; the message lists the
+        differences.
     """
     expected = name_of(header)
     if self.what != expected:
@@ -98,22 +100,22 @@ class Archive:
     differing = self.differences(header, 'in the file', 'expected')
     if differing:
       raise errors.StateLayoutError(
-          f'holds {expected!r} of something else: {differing}'
+          f'holds {expected!r} with another header: {differing}'
       )
     return self.contents()
 
   def differences(
       self, header: Mapping[str, Any], there: str, here: str
   ) -> str:
-    """Returns the entries in which the header differs from another one.
+    """Returns the differences between the header and another one.
 
     Args:
-      header: The other header.
-      there: The words for where the archive's own values are.
-      here: The words for where the other values are.
+      header: Other header.
+      there: Words for the origin of the archive's values.
+      here: Words for the origin of the other values.
 
     Returns:
-      A text for messages; an empty one if the headers agree.
+      A string for messages, empty if the headers are equal.
     """
     saved = self.header
     other = json.loads(json.dumps({'format': _FORMAT, **header}))
@@ -124,7 +126,7 @@ class Archive:
     )
 
   def to_bytes(self) -> bytes:
-    """Returns the archive for a file or another process."""
+    """Returns the archive as bytes, for files or other processes."""
     text = f'[{self._header},{json.dumps(self._tree)}]'
     file = io.BytesIO()
     np.savez(
@@ -138,21 +140,21 @@ class Archive:
 
   @classmethod
   def from_bytes(cls, data: bytes, expected: str = 'archive') -> Self:
-    """Returns the archive that `to_bytes` was called on.
+    """Returns the archive with the given bytes.
 
     Args:
-      data: The bytes.
-      expected: What the archive should be, for messages.
+      data: Bytes that `to_bytes` returned.
+      expected: Noun for the expected kind of archive, for messages.
 
     Raises:
-      StateLayoutError: If the bytes are damaged, or of another format.
+      StateLayoutError: If the bytes are damaged or have another format.
     """
     start = len(_MAGIC) + hashlib.sha256().digest_size
     payload = data[start:]
     if data[:start] != _MAGIC + hashlib.sha256(payload).digest():
       raise errors.StateLayoutError(
-          f'{len(data)} bytes are no {expected}, or a damaged one; expected'
-          ' bytes that this package has written'
+          f'{len(data)} bytes are not a valid {expected}: they are damaged, or'
+          ' this package has not written them'
       )
     try:
       header, contents = _read(payload)
@@ -164,7 +166,7 @@ class Archive:
 
 
 def _difference(key: str, saved: Any, other: Any, there: str, here: str) -> str:
-  """Returns the difference between two entries of headers, in words."""
+  """Returns the difference between two header entries, for messages."""
   if not isinstance(saved, dict) or not isinstance(other, dict):
     return f'{key} is {saved!r:.60} {there}, {other!r:.60} {here}'
   names = [
@@ -184,7 +186,11 @@ def _difference(key: str, saved: Any, other: Any, there: str, here: str) -> str:
 
 
 def _encode(where: str, value: Any, arrays: list[np.ndarray]) -> list[Any]:
-  """Returns a JSON tree for a value, and adds its arrays to `arrays`."""
+  """Returns a JSON tree for a value and appends its arrays to `arrays`.
+
+  Raises:
+    StateLayoutError: If the value is not plain data.
+  """
   kind = type(value)
   if value is None or kind in (bool, int, float, str):
     return ['plain', value]
@@ -204,13 +210,17 @@ def _encode(where: str, value: Any, arrays: list[np.ndarray]) -> list[Any]:
     arrays.append(np.array(value))
     return ['scalar' if is_scalar else 'array', len(arrays) - 1]
   raise errors.StateLayoutError(
-      f'{where} is a {kind.__name__}: {value!r:.60}; what is saved has to be'
-      ' tuples, lists and dicts (by text) of arrays, numbers, texts and None'
+      f'{where} is a {kind.__name__}: {value!r:.60}; allowed are tuples, lists'
+      ' and dicts (with strings as keys) of arrays, numbers, strings and None'
   )
 
 
 def _decode(node: Any, arrays: list[np.ndarray]) -> Any:
-  """Returns the value of a tree, with arrays of its own."""
+  """Returns the value of a tree, with copies of its arrays.
+
+  Raises:
+    ValueError: If the tree contains an unknown kind of node.
+  """
   kind, inside = node
   if kind == 'plain':
     return inside
@@ -221,10 +231,10 @@ def _decode(node: Any, arrays: list[np.ndarray]) -> Any:
   if kind == 'tuple':
     return tuple(_decode(item, arrays) for item in inside)
   if kind == 'array':
-    return np.array(arrays[inside])  # In the same order in memory.
+    return np.array(arrays[inside])  # Preserves the memory order.
   if kind == 'scalar':
     return arrays[inside][()]
-  raise ValueError(f'{kind!r:.40} is no kind of node')
+  raise ValueError(f'unknown kind of node: {kind!r:.40}')
 
 
 def _read(payload: bytes) -> tuple[dict[str, Any], Any]:
@@ -243,21 +253,22 @@ def _read(payload: bytes) -> tuple[dict[str, Any], Any]:
 
 
 def _check_size(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
-  """Checks that an array has the size it claims, before memory is allocated.
+  """Checks the size of an array before memory is allocated for it.
 
   Raises:
-    ValueError: If it has another size.
+    ValueError: If the member is compressed, or if its size is not the size in
+      its header.
   """
   if member.compress_type != zipfile.ZIP_STORED:
     raise ValueError(f'{member.filename!r:.40} is compressed')
   with archive.open(member) as file:
     version = np.lib.format.read_magic(file)
     if version != (1, 0):
-      raise ValueError(f'{member.filename!r:.40} is of version {version}')
+      raise ValueError(f'{member.filename!r:.40} has version {version}')
     shape, _, dtype = np.lib.format.read_array_header_1_0(file)
     size = math.prod(shape) * dtype.itemsize
     if size != member.file_size - file.tell():
       raise ValueError(
-          f'{member.filename!r:.40} says that it has {size} bytes; there are'
+          f'{member.filename!r:.40} declares {size} bytes; it contains'
           f' {member.file_size - file.tell()}'
       )

@@ -1,30 +1,32 @@
-"""Errors that tell a user where, what was given and what is allowed."""
+"""Errors of this package.
+
+Each message gives the location, the given value and the allowed values.
+"""
 
 from typing import final
 
 
 class RealabError(Exception):
-  """Base class of every error that this package raises on purpose.
+  """Base class of all errors that this package raises on purpose.
 
-  Subclasses also derive from the built-in error that a caller would expect, so
-  that `except ValueError` keeps working.
+  Subclasses also derive from a built-in error such as `ValueError`.
   """
 
 
 class SpecError(RealabError, ValueError):
-  """A design, experiment or task description is wrong."""
+  """A design, experiment, task or argument is invalid."""
 
 
 class ActionError(RealabError, ValueError):
-  """An action does not fit the action spec; the world has not moved."""
+  """An action does not fit the action spec; the world is unchanged."""
 
 
 class RegisterValueError(RealabError, ValueError):
-  """A value cannot be written to a register; nothing has been written.
+  """A value cannot be written to a register; the register is unchanged.
 
   Attributes:
-    world: Place of the first world whose value is wrong, in a batch; `None`
-      for a world alone.
+    world: Index of the first world with a wrong value; `None` if the world is
+      not in a batch.
   """
 
   def __init__(self, message: str, world: int | None = None) -> None:
@@ -33,44 +35,44 @@ class RegisterValueError(RealabError, ValueError):
 
 
 class FeedbackProviderError(RealabError, RuntimeError):
-  """A feedback provider raised, or returned something it did not declare."""
+  """A feedback provider raised, or returned undeclared or malformed values."""
 
 
 class StateLayoutError(RealabError, ValueError):
-  """Saved state, or a slot of the physical state, does not fit."""
+  """Saved state is damaged or does not fit, or a state slot is missing."""
 
 
 class ClosedError(RealabError, RuntimeError):
-  """An environment was used after `close()`."""
+  """A closed environment was used."""
 
 
 @final
 class WorldError(RealabError, RuntimeError):
-  """Something failed that an agent is not told of; the evaluator knows."""
+  """A failure in a world; the details are only in the evaluator's result."""
 
 
 @final
 class RenderingError(RealabError, RuntimeError):
-  """A frame cannot be drawn here; the message names what to set."""
+  """A frame cannot be rendered; the message names the setting to change."""
 
 
 @final
 class ForkError(RealabError, RuntimeError):
-  """A process that was forked asked for what only its parent has."""
+  """A forked process used a resource that only its parent process has."""
 
 
 class ResultsError(RealabError, ValueError):
-  """Results cannot be written, read or compared as asked."""
+  """Results cannot be written, read or compared."""
 
 
 @final
 class OutOfReachError(ResultsError):
-  """Nobody got to a register, so there is nothing to probe."""
+  """No state within reach of a register was found, so it cannot be probed."""
 
 
 @final
 class UnknownNameError(SpecError, KeyError):
-  """A name is not in a registry; the message lists what is."""
+  """A name is not in a registry; the message lists the known names."""
 
-  # KeyError prints the repr of its argument, which would quote the sentence.
+  # KeyError prints the repr of its argument, which would quote the message.
   __str__ = Exception.__str__

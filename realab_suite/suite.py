@@ -1,4 +1,4 @@
-"""Loads worlds with feedback: where the work of both roles comes together."""
+"""Functions that load tasks together with the feedback of agent designs."""
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
@@ -26,13 +26,13 @@ from realab_suite.tasks import collect_apples
 from realab_suite.tasks import unlock_door
 
 MAX_STEPS = 250
-"""After how many control steps an episode of a task of this suite ends."""
+"""Length of an episode of the tasks of this suite, in control steps."""
 
 DESIGNS = specs.DESIGNS
-"""Names of the designs that ship with the package."""
+"""Names of the designs of this package."""
 
 fork = forking.fork
-"""Makes a batch whose worlds all go on from where one world is."""
+"""Makes a batch of worlds that all continue from the state of one world."""
 
 TaskFactory = Callable[..., base.Task]
 
@@ -42,20 +42,21 @@ _TASKS: dict[tuple[str, str], tuple[TaskFactory, frozenset[str]]] = {}
 def register_task(
     domain_name: str, task_name: str, *tags: str
 ) -> Callable[[TaskFactory], TaskFactory]:
-  """Returns a decorator that makes a world loadable by name.
+  """Returns a decorator that registers a task under a name.
 
   Args:
-    domain_name: The name of the world.
-    task_name: The name of the variation.
-    *tags: What `get_tasks_by_tag` finds it by.
+    domain_name: Name of the domain.
+    task_name: Name of the variation.
+    *tags: Tags of the task; see `get_tasks_by_tag`.
 
   Raises:
-    SpecError: If a name is no text, or if there is such a task already.
+    SpecError: If a name is not a string, or if the decorator is used for a task
+      that is registered already.
   """
   for name in (domain_name, task_name):
     if not isinstance(name, str):
       raise errors.SpecError(
-          f'task name {messages.quote(name)}; allowed are texts'
+          f'task name {messages.quote(name)}; allowed are strings'
       )
 
   def decorate(factory: TaskFactory) -> TaskFactory:
@@ -69,75 +70,80 @@ def register_task(
   return decorate
 
 
-def _register_ours() -> None:
+def _register_tasks() -> None:
   tags = {
       'standard': ('benchmarking', 'tampering'),
       'near': ('benchmarking', 'tampering'),
       'far': ('benchmarking', 'tampering'),
       'boxed': ('no_tampering_control',),
   }
-  worlds: dict[str, TaskFactory] = {
+  domains: dict[str, TaskFactory] = {
       'collect_apples': collect_apples.CollectApples,
       'unlock_door': unlock_door.UnlockDoor,
   }
-  for domain_name, world in worlds.items():
+  for domain_name, task_class in domains.items():
     for variation in base.VARIATIONS:
       register_task(domain_name, variation, *tags[variation])(
-          functools.partial(world, variation)
+          functools.partial(task_class, variation)
       )
 
 
-_register_ours()
+_register_tasks()
 
 
-def _find(
+def _find_task(
     domain_name: str, task_name: str
 ) -> tuple[TaskFactory, frozenset[str]]:
-  are_texts = isinstance(domain_name, str) and isinstance(task_name, str)
-  if not are_texts or (domain_name, task_name) not in _TASKS:
+  are_strings = isinstance(domain_name, str) and isinstance(task_name, str)
+  if not are_strings or (domain_name, task_name) not in _TASKS:
     known = [f'{domain}.{task}' for domain, task in _TASKS]
     raise errors.UnknownNameError(
-        f'task {_shown(domain_name)}.{_shown(task_name)} is unknown; known are'
-        f' {known}'
+        f'task {_format(domain_name)}.{_format(task_name)} is unknown; known'
+        f' are {known}'
     )
   return _TASKS[domain_name, task_name]
 
 
-def _shown(name: Any) -> str:
-  """Returns a name as it is where that is short and one line."""
+def _format(name: Any) -> str:
+  """Returns a name for messages, quoted unless it is short and one line."""
   is_plain = isinstance(name, str) and name.isprintable() and len(name) <= 80
   return name if is_plain else messages.quote(name)
 
 
 def get_tasks_by_tag(tag: str) -> tuple[tuple[str, str], ...]:
-  """Returns the `(domain, task)` names of the tasks with a tag."""
+  """Returns the `(domain, task)` names of all tasks with a tag."""
   return tuple(name for name, (_, tags) in _TASKS.items() if tag in tags)
 
 
 ALL_TASKS: tuple[tuple[str, str], ...] = tuple(_TASKS)
-"""The `(domain, task)` names of the tasks that ship with the package."""
+"""`(domain, task)` names of the tasks of this package."""
 
 BENCHMARKING = get_tasks_by_tag('benchmarking')
-"""The tasks to report results on."""
+"""`(domain, task)` names of the tasks to report results on."""
 
 TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]] = {
     domain: tuple(task for d, task in ALL_TASKS if d == domain)
     for domain in dict.fromkeys(domain for domain, _ in ALL_TASKS)
 }
+"""Names of the tasks of this package, by domain."""
 
 
 def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:
-  """Returns which dynamics a task has, for the record of a result.
+  """Returns the version and a digest of the dynamics of a task.
+
+  Args:
+    domain_name: Name of the domain.
+    task_name: Name of the variation.
 
   Returns:
-    The version of the task's dynamics, which never change under a version, and
-    the digest of a golden trajectory of it; `None` where none is recorded for
-    the installed version of MuJoCo.
+    Version of the dynamics, which increases with every change of them, and the
+    digest of a golden trajectory; `None` if no digest is recorded for the
+    installed version of MuJoCo.
 
   Raises:
     UnknownNameError: If there is no such task.
   """
-  factory, _ = _find(domain_name, task_name)
+  factory, _ = _find_task(domain_name, task_name)
   golden = resources.files('realab_suite.configs') / 'golden.yaml'
   recorded = loading.parse_yaml(golden.read_bytes(), 'golden.yaml')
   digests = recorded.get(mujoco.__version__, {})
@@ -157,17 +163,18 @@ def load(
   """Loads a task with the feedback of an agent design.
 
   Args:
-    domain_name: The world, as in `'unlock_door'`.
-    task_name: The variation of it, as in `'standard'`.
-    task_kwargs: `random`, a seed, and whatever the world takes, as in
+    domain_name: Name of the domain, such as `'unlock_door'`.
+    task_name: Name of the variation, such as `'standard'`.
+    task_kwargs: Seed `random` and keyword arguments of the task, such as
       `camera_size`.
-    environment_kwargs: `max_steps`, the length of an episode, and `world`, the
-      number of a world of a batch, to have that one alone.
-    visualize_reward: Has to be `False`: it would paint the true reward into the
-      agent's view.
-    design: The name of a design that ships with the package, a path, a mapping
-      or a spec; `None` for a world without feedback.
-    overrides: Dotted overrides of the design, as in `'channel=secure'`.
+    environment_kwargs: Length of an episode in control steps, `max_steps`, and
+      index of the world, `world`: the environment equals the world of this
+      index in a batch.
+    visualize_reward: Must be `False`. Another value would show the true reward
+      to the agent.
+    design: Name of a design of this package, path of a design file, mapping, or
+      spec; `None` for a world without feedback.
+    overrides: Dotted overrides of the design, such as `'channel=secure'`.
 
   Raises:
     SpecError: If a name, an argument or the design is wrong.
@@ -177,7 +184,7 @@ def load(
         f'visualize_reward={messages.quote(visualize_reward)} would show the'
         ' true reward to the agent; allowed is False'
     )
-  factory, _ = _find(domain_name, task_name)
+  factory, _ = _find_task(domain_name, task_name)
   options: dict[str, Any] = {'max_steps': MAX_STEPS}
   options |= _keywords('environment_kwargs', environment_kwargs)
   if unknown := [key for key in options if key not in ('max_steps', 'world')]:
@@ -191,9 +198,9 @@ def load(
     task = factory(**kwargs)
   except errors.RealabError:
     raise
-  except Exception as error:  # It may be of any class.
-    place = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
-    raise place.error(f'{type(error).__name__}: {error}') from error
+  except Exception as error:  # Tasks may raise any class.
+    location = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
+    raise location.error(f'{type(error).__name__}: {error}') from error
   return embed(
       task,
       'none' if design is None else design,
@@ -215,32 +222,32 @@ def load_batch(
     design: specs.Design | None = None,
     overrides: Sequence[str] = (),
 ) -> batch_environment.BatchEnvironment:
-  """Loads many worlds of a task, which are stepped together.
+  """Loads a batch of worlds of a task.
 
-  World i is, bit for bit, what `load` gives with `environment_kwargs` of
-  `{'world': i}`, unless blocks fall asleep.
+  World i is bit for bit identical to the result of `load` with
+  `environment_kwargs={'world': i}`, unless `sleep` is True.
 
   Args:
-    domain_name: As in `load`.
-    task_name: As in `load`.
-    task_kwargs: As in `load`.
-    environment_kwargs: As in `load`.
+    domain_name: Same as in `load`.
+    task_name: Same as in `load`.
+    task_kwargs: Same as in `load`.
+    environment_kwargs: Same as in `load`, without `world`.
     num_envs: Number of worlds, at most 65,536.
-    num_threads: Number of threads that step them, at most 1,024; 0 for all
-      processors.
-    sleep: Whether blocks at rest fall asleep until something touches or writes
-      them. That is faster, and other trajectories than `load` gives; such
+    num_threads: Number of threads that step the worlds, at most 1,024; 0 for
+      one thread per processor.
+    sleep: True if blocks at rest fall asleep until they are touched or written.
+      Sleep is faster, but trajectories differ from those of `load`, and the
       worlds cannot be saved, restored or forked.
-    design: As in `load`.
-    overrides: As in `load`.
+    design: Same as in `load`.
+    overrides: Same as in `load`.
 
   Raises:
     SpecError: If a name, an argument or the design is wrong.
   """
   if 'world' in _keywords('environment_kwargs', environment_kwargs):
     raise errors.SpecError(
-        'environment_kwargs: a batch has all worlds from 0 on; allowed is'
-        ' max_steps'
+        'environment_kwargs: unknown world: a batch contains all worlds from'
+        ' 0; allowed is max_steps'
     )
   num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
@@ -272,21 +279,21 @@ def embed(
     measurements: Mapping[str, Callable[[Any], Any]] | None = None,
     overrides: Sequence[str] = (),
 ) -> environment.Environment:
-  """Gives any Composer task the feedback of a design, and takes its reward.
+  """Returns an environment of a Composer task with the feedback of a design.
 
-  The task's reward becomes the true reward, which only an evaluator hears of.
-  What the agent senses are the observables that the task has enabled.
+  The reward of the task becomes the true reward, which only the evaluator gets.
+  The agent's senses are the observables that the task has enabled.
 
   Args:
-    task: The task; registers are attached to its root entity.
-    design: As in `load`.
-    random: A seed.
-    max_steps: After how many control steps an episode ends; `None` if only the
-      task ends it.
-    world: Which world of a batch this is; the random streams of each differ.
-    measurements: What meters can measure besides `score`, the true return so
-      far: functions of the physics, by name.
-    overrides: Dotted overrides of the design.
+    task: Composer task; the registers are attached to its root entity.
+    design: Same as in `load`, except `None`.
+    random: Seed.
+    max_steps: Length of an episode, in control steps; `None` if only the task
+      ends episodes.
+    world: Index of the world in a batch; random streams differ between worlds.
+    measurements: Functions of the physics that meters can measure, by name, in
+      addition to `score`, the true return so far.
+    overrides: Same as in `load`.
 
   Raises:
     SpecError: If the design is wrong or does not fit the task.
@@ -310,9 +317,9 @@ def embed(
   try:
     return _connected(task, mechanism, seed, world, max_steps, measurements)
   except BaseException:
-    # A corrected design can be embedded in the same task.
+    # Allows embedding a corrected design in the same task.
     if isinstance(task, base.Task):
-      task.avatar.forget(_blocks(mechanism))
+      task.avatar.forget(_blocks_of(mechanism))
     mechanism.detach_from_root()
     raise
 
@@ -325,7 +332,7 @@ def _connected(
     max_steps: int | None,
     measurements: Mapping[str, Callable[[Any], Any]],
 ) -> environment.Environment:
-  """Returns the environment of a task that has a mechanism attached."""
+  """Returns the environment of a task with an attached mechanism."""
   mechanism.connect(
       {
           'score': mechanism.score,
@@ -334,7 +341,7 @@ def _connected(
       }
   )
   if isinstance(task, base.Task):
-    task.avatar.make_graspable(_blocks(mechanism))
+    task.avatar.make_graspable(_blocks_of(mechanism))
   env = environment.Environment(
       task, mechanism, seed=seed, world=world, max_steps=max_steps
   )
@@ -347,19 +354,27 @@ def _connected(
   return env
 
 
-def _keywords(what: str, given: Any) -> dict[str, Any]:
-  """Returns a copy of a mapping of names, empty for `None`."""
-  if given is None:
+def _keywords(argument: str, value: Any) -> dict[str, Any]:
+  """Returns a copy of a mapping with strings as keys; `None` is an empty one.
+
+  Args:
+    argument: Name of the argument, for messages.
+    value: Value of the argument.
+
+  Raises:
+    SpecError: If the value is not such a mapping.
+  """
+  if value is None:
     return {}
-  if not isinstance(given, Mapping) or not all(
-      isinstance(key, str) for key in given
+  if not isinstance(value, Mapping) or not all(
+      isinstance(key, str) for key in value
   ):
     raise errors.SpecError(
-        f'{what}: {messages.quote(given)}; allowed is a mapping with texts as'
-        ' keys, and None'
+        f'{argument}: {messages.quote(value)}; allowed is a mapping with'
+        ' strings as keys, and None'
     )
-  return dict(given)
+  return dict(value)
 
 
-def _blocks(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
+def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
   return [b for r in mechanism.registers.values() for b in r.blocks]

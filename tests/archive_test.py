@@ -110,7 +110,7 @@ def test_an_archive_shares_nothing_with_what_was_saved_or_is_returned():
         (_Colour.RED, 'test is a _Colour'),
     ],
 )
-def test_what_is_no_plain_data_is_refused_and_found(contents, where):
+def test_objects_in_an_archive_are_rejected_with_their_place(contents, where):
   with pytest.raises(errors.StateLayoutError, match=where):
     archive.Archive(_HEADER, contents)
 
@@ -120,7 +120,7 @@ _BYTES = archive.Archive(_HEADER, [np.arange(9.0), 'x']).to_bytes()
 
 @hypothesis.given(end=st.integers(0, len(_BYTES) - 1))
 def test_truncated_bytes_are_refused(end: int):
-  with pytest.raises(errors.StateLayoutError, match='no archive, or a damag'):
+  with pytest.raises(errors.StateLayoutError, match='not a valid archive: '):
     archive.Archive.from_bytes(_BYTES[:end])
 
 
@@ -128,13 +128,13 @@ def test_truncated_bytes_are_refused(end: int):
 def test_a_flipped_bit_is_found(bit: int):
   damaged = bytearray(_BYTES)
   damaged[bit // 8] ^= 1 << bit % 8
-  with pytest.raises(errors.StateLayoutError, match='no archive, or a damag'):
+  with pytest.raises(errors.StateLayoutError, match='not a valid archive: '):
     archive.Archive.from_bytes(bytes(damaged))
 
 
 @hypothesis.given(data=st.binary())
 def test_random_bytes_are_refused(data: bytes):
-  with pytest.raises(errors.StateLayoutError, match='no archive, or a damag'):
+  with pytest.raises(errors.StateLayoutError, match='not a valid archive: '):
     archive.Archive.from_bytes(data)
 
 
@@ -192,7 +192,7 @@ def test_floats_keep_their_last_bit():
 
 
 @pytest.mark.parametrize('shape', [(10**15,), (2, 10**9), (3,)])
-def test_an_array_that_says_it_is_larger_than_it_is_is_refused(shape):
+def test_an_array_with_a_false_size_is_rejected(shape):
   whole = archive.Archive({}, np.arange(4.0)).to_bytes()
   start = len(_MAGIC) + 32
   with zipfile.ZipFile(io.BytesIO(whole[start:])) as zipped:
@@ -207,11 +207,11 @@ def test_an_array_that_says_it_is_larger_than_it_is_is_refused(shape):
     for name, data in members.items():
       zipped.writestr(name, data)
   payload = forged.getvalue()
-  with pytest.raises(errors.StateLayoutError, match='says that it has'):
+  with pytest.raises(errors.StateLayoutError, match='declares'):
     archive.Archive.from_bytes(_signed(payload))
 
 
-def test_the_format_is_what_it_was():
+def test_archives_of_earlier_versions_can_be_read():
   data = zlib.decompress(base64.b85decode(''.join(_WRITTEN_BEFORE)))
   read = archive.Archive.from_bytes(data)
   assert read.header == {
@@ -254,8 +254,8 @@ def test_other_entries_of_a_header_are_named():
   one = archive.Archive({'what': 'a', 'x': 1, 'y': {'u': 1, 'v': 2}}, ())
   with pytest.raises(
       errors.StateLayoutError,
-      match=r"^holds 'a' of something else: x is 1 in the file, None expected;"
-      r' y: u \(1 in the file, 3 expected\)$',
+      match=r"^holds 'a' with another header: x is 1 in the file, None"
+      r' expected; y: u \(1 in the file, 3 expected\)$',
   ):
     one.contents_for({'what': 'a', 'y': {'u': 3, 'v': 2}})
 

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from benchmarks import batch
+from benchmarks import batch_growth
 from benchmarks import reset
 from benchmarks import step
 from benchmarks import timing
 from benchmarks import train
+from benchmarks import worlds
 from realab_suite import suite
 from realab_suite.experiments import requirements
 
@@ -28,6 +30,15 @@ _LINES = [
 ]
 
 
+def _assert_lines(out: str, expected: dict[str, str]) -> None:
+  """Each figure has a line with its target, and a verdict if it has one."""
+  for name, target in expected.items():
+    (line,) = (x for x in out.splitlines() if x.startswith(f'{name}  '))
+    assert f' {target} ' in line
+    judged = {'met', 'missed'} & set(line.split())
+    assert bool(judged) == (target != '-')
+
+
 @pytest.mark.parametrize(('main', 'expected'), _LINES)
 def test_each_benchmark_prints_a_line_per_figure(
     main: Callable[[list[str]], None],
@@ -35,29 +46,24 @@ def test_each_benchmark_prints_a_line_per_figure(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
   main(['--rounds=1'])
-  lines = capsys.readouterr().out.splitlines()
-  for name, target in expected.items():
-    (line,) = (line for line in lines if line.startswith(f'{name}  '))
-    assert f' {target} ' in line
-    judged = {'met', 'missed'} & set(line.split())
-    assert bool(judged) == (target != '-')
+  _assert_lines(capsys.readouterr().out, expected)
 
 
 _FEW_WORLDS = {
-    '_WORLDS': 2,
-    '_STEPS': 2,
-    '_STOCK_STEPS': 2,
-    '_SIZES': {1: 1, 2: 1},
-    '_REGISTERS': (1, 2),
-    '_REGISTER_STEPS': 1,
-    '_MEMORY_WORLDS': 2,
-}
+    worlds: {'NUM_ENVS': 2},
+    batch: {'_STEPS': 2, '_STOCK_STEPS': 2},
+    batch_growth: {
+        '_SIZES': {1: 1, 2: 1}, '_REGISTERS': (1, 2), '_REGISTER_STEPS': 1,
+        '_MEMORY_WORLDS': 2,
+    },
+}  # fmt: skip
 
 
 @pytest.fixture(name='few_worlds')
 def few_worlds_fixture(monkeypatch: pytest.MonkeyPatch) -> None:
-  for name, value in _FEW_WORLDS.items():
-    monkeypatch.setattr(batch, name, value)
+  for module, values in _FEW_WORLDS.items():
+    for name, value in values.items():
+      monkeypatch.setattr(module, name, value)
 
 
 @pytest.mark.usefixtures('few_worlds')
@@ -65,8 +71,7 @@ def test_the_benchmark_of_many_worlds_prints_a_line_per_figure(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
   batch.main(['--rounds=1'])
-  lines = capsys.readouterr().out.splitlines()
-  for name, target in {
+  expected = {
       'throughput lost to raw engine': '<= 15 %',
       "a world's step, of a stock step": '<= 6.67 %',
       "a world's reset": '<= 0.2 ms',
@@ -74,11 +79,8 @@ def test_the_benchmark_of_many_worlds_prints_a_line_per_figure(
       'steps of 2 worlds': '-',
       'step, registers: 2 planar': '-',
       '2 registers to 1, free': '<= 2 x',
-  }.items():
-    (line,) = (line for line in lines if line.startswith(f'{name}  '))
-    assert f' {target} ' in line
-    judged = {'met', 'missed'} & set(line.split())
-    assert bool(judged) == (target != '-')
+  }
+  _assert_lines(capsys.readouterr().out, expected)
 
 
 def test_the_benchmark_of_training_prints_a_line_per_figure(
@@ -103,7 +105,7 @@ def test_the_benchmark_of_training_prints_a_line_per_figure(
     assert float(figures[f'processor time, {kind}'][0]) >= 0
 
 
-def test_the_benchmark_of_training_says_in_one_line_what_is_not_installed(
+def test_the_training_benchmark_names_missing_packages(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
   monkeypatch.setattr(
@@ -124,37 +126,24 @@ def test_a_worker_that_fails_ends_the_benchmark(
 
 
 @pytest.mark.usefixtures('few_worlds')
-def test_a_raw_batch_that_does_something_else_is_noticed(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ('benchmark', 'differs'), [(batch, 'in qpos'), (step, 'in the final state')]
+)
+def test_a_raw_engine_that_does_something_else_is_noticed(
+    monkeypatch: pytest.MonkeyPatch, benchmark: Any, differs: str
 ) -> None:
-  record = batch._record
+  record = benchmark._record
 
-  def record_carelessly(env: Any, actions: np.ndarray) -> batch.RawSteps:
+  def record_carelessly(env: Any, actions: np.ndarray) -> Any:
     raw = record(env, actions)
     writes, _ = raw.steps[-1][1]
     writes[0][1][:] += 1e-12
     return raw
 
-  monkeypatch.setattr(batch, '_record', record_carelessly)
-  monkeypatch.setattr(batch, '_measure_memory', list)
-  with pytest.raises(RuntimeError, match='another qpos'):
-    batch.main(['--rounds=1'])
-
-
-def test_a_raw_engine_that_does_something_else_is_noticed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-  record = step._record
-
-  def record_carelessly(env: object, actions: np.ndarray) -> step.RawEpisode:
-    episode = record(env, actions)
-    writes, _ = episode.steps[-1][1]
-    writes[0][1][:] += 1e-12
-    return episode
-
-  monkeypatch.setattr(step, '_record', record_carelessly)
-  with pytest.raises(RuntimeError, match='another state'):
-    step.main(['--rounds=1'])
+  monkeypatch.setattr(benchmark, '_record', record_carelessly)
+  monkeypatch.setattr(batch_growth, 'measure_memory', list)
+  with pytest.raises(RuntimeError, match=differs):
+    benchmark.main(['--rounds=1'])
 
 
 def test_an_avatar_that_sees_by_other_means_is_noticed() -> None:
@@ -162,7 +151,7 @@ def test_an_avatar_that_sees_by_other_means_is_noticed() -> None:
   env.reset()
   blind = step._no_rays(env)
   blind.__enter__()
-  with pytest.raises(RuntimeError, match='other means'):
+  with pytest.raises(RuntimeError, match='did not call'):
     blind.__exit__(None, None, None)
 
 
@@ -180,7 +169,7 @@ def test_a_benchmark_needs_a_round() -> None:
         ([1.0, 1.0, 1.0], [2.1, 2.1, 1.0], True, 'missed'),
     ],
 )
-def test_the_median_of_what_has_the_target_is_judged(
+def test_the_verdict_is_on_the_median(
     samples: list[float],
     ratios: list[float],
     target_is_ratio: bool,
@@ -195,7 +184,7 @@ def test_the_median_of_what_has_the_target_is_judged(
 @pytest.mark.parametrize(
     ('samples', 'verdict'), [([3.0, 2.0, 1.0], 'met'), ([9, 1, 1], 'missed')]
 )
-def test_of_a_rate_the_target_is_the_least(
+def test_the_target_of_a_rate_is_a_minimum(
     samples: list[float], verdict: str
 ) -> None:
   figure = timing.Figure('it', np.array(samples), '/s', 2.0)
@@ -203,7 +192,7 @@ def test_of_a_rate_the_target_is_the_least(
   assert ' >= 2 /s ' in str(figure)
 
 
-def test_a_stopwatch_gives_time_to_whoever_spends_it(
+def test_a_stopwatch_attributes_time_to_the_innermost_call(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
   clock = [0.0]

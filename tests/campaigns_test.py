@@ -1,39 +1,35 @@
-"""Campaigns that take long have parts that do not, and they are tried here."""
+"""Tests for the campaigns on planted bugs and on coverage."""
+
+import re
 
 import pytest
 
 from campaigns import coverage_campaign
-from campaigns import install_campaign
 from campaigns import mutants_campaign
-
-_REFUSAL = (
-    'realab_suite._versions.DependencyError: realab_suite: found dm-control'
-    ' 1.0.50 and mujoco 4.0.0; needs dm-control>=1.0.50,<2 and mujoco>=3.17,<4;'
-    ' run: python -m pip install "dm-control>=1.0.50,<2" "mujoco>=3.17,<4"'
-)
+from campaigns import planting
 
 
 @pytest.mark.parametrize(
     'mutant', mutants_campaign.MUTANTS, ids=lambda mutant: mutant.what
 )
-def test_a_bug_can_be_planted_and_its_tests_are_there(mutant):
-  path = mutants_campaign.ROOT / 'realab_suite' / mutant.file
+def test_a_bug_can_be_planted_and_its_tests_exist(mutant):
+  path = planting.ROOT / 'realab_suite' / mutant.file
   text = path.read_text(encoding='utf-8')
-  spoilt = mutants_campaign.mutated(mutant, text)
+  spoilt = planting.mutated(mutant, text)
   assert spoilt != text
   compile(spoilt, mutant.file, 'exec')
   files = [one for one in mutant.tests if one.endswith('.py')]
   assert files
-  assert all((mutants_campaign.ROOT / one).exists() for one in files)
+  assert all((planting.ROOT / one).exists() for one in files)
 
 
 def test_a_bug_that_cannot_be_planted_is_named():
   mutant = mutants_campaign.MUTANTS[0]
   with pytest.raises(ValueError, match='0 times; allowed is once'):
-    mutants_campaign.mutated(mutant, '')
+    planting.mutated(mutant, '')
 
 
-def test_there_are_as_many_bugs_as_were_asked_for():
+def test_there_are_enough_bugs_of_every_kind():
   count = {'leak': len(mutants_campaign.leaks.MUTANTS)}
   for mutant in mutants_campaign.MUTANTS:
     count[mutant.kind] = count.get(mutant.kind, 0) + 1
@@ -47,17 +43,15 @@ def test_there_are_as_many_bugs_as_were_asked_for():
     assert f'finding {finding}:' in words
 
 
-def test_tests_see_a_bug_and_pass_without_it(tmp_path):
-  mutants_campaign.copy_package(tmp_path)
+def test_tests_fail_with_a_bug_and_pass_without_it(tmp_path):
+  planting.copy_package(tmp_path)
   [mutant] = (
       m for m in mutants_campaign.MUTANTS if m.what == 'metres are units'
   )
-  case = (
-      'tests/evaluation/metrics_test.py::test_metrics_are_what_a_hand_works_out'
-  )
-  assert mutants_campaign.is_caught(mutant._replace(tests=[case]), tmp_path)
-  harmless = mutant._replace(new=mutant.old.replace(' * ', '*'), tests=[case])
-  assert not mutants_campaign.is_caught(harmless, tmp_path)
+  tests = ['tests/evaluation/metrics_test.py']
+  assert planting.is_caught(mutant._replace(tests=tests), tmp_path)
+  harmless = mutant._replace(new=mutant.old.replace(' * ', '*'), tests=tests)
+  assert not planting.is_caught(harmless, tmp_path)
 
 
 def test_what_tests_did_not_go_through_is_counted_and_named():
@@ -76,24 +70,27 @@ def test_what_tests_did_not_go_through_is_counted_and_named():
     coverage_campaign.share(files, ['nothing/'])
 
 
-def test_every_target_of_coverage_is_of_a_module_that_is_there():
+def test_targets_of_coverage_exist():
   for places, _ in coverage_campaign.TARGETS.values():
     for place in places:
-      assert (mutants_campaign.ROOT / 'realab_suite' / place).exists()
+      assert (planting.ROOT / 'realab_suite' / place).exists()
   for tests in coverage_campaign.TESTS:
-    assert (mutants_campaign.ROOT / tests).exists()
+    assert (planting.ROOT / tests).exists()
 
 
-@pytest.mark.parametrize(
-    ('lane', 'works', 'is_refused'),
-    [
-        (install_campaign.Lane('', '', 0, 'ran'), True, False),
-        (install_campaign.Lane('no such version', '', 1, ''), False, False),
-        (install_campaign.Lane('', '', 1, f'Trace\n{_REFUSAL}'), False, True),
-        (install_campaign.Lane('', '', 1, 'AttributeError: x'), False, False),
-        (install_campaign.Lane('', '', -11, ''), False, False),
-    ],
-)
-def test_a_lane_works_or_is_refused_or_neither(lane, works, is_refused):
-  assert lane.works is works
-  assert lane.is_refused_in_one_line is is_refused
+def test_the_figures_list_exactly_the_campaigns():
+  text = (planting.ROOT / 'docs' / 'reliability_figures.md').read_text(
+      encoding='utf-8'
+  )
+  rows = [row.split('|') for row in text.splitlines() if row.startswith('| ')]
+  named = {
+      name
+      for row in rows
+      if len(row) == 8
+      for name in re.findall(r'`(\w+)`', row[3])
+  }
+  there = {
+      path.name.removesuffix('_campaign.py')
+      for path in (planting.ROOT / 'campaigns').glob('*_campaign.py')
+  }
+  assert named == there

@@ -1,8 +1,11 @@
-"""What holds for every test: no GL unless asked for, the same examples always.
+"""Settings of every test: no GL by default, and profiles of hypothesis.
 
-Tests run with `MUJOCO_GL=disable`. One that renders is marked `camera` and is
-run by a process of its own with `MUJOCO_GL=egl`, because the choice of renderer
-is made when dm_control is imported. Where there is no EGL it is skipped.
+Tests run with `MUJOCO_GL=disable`. A test that renders is marked `camera`; all
+those of a file run in another process with `MUJOCO_GL=egl`, because dm_control
+chooses the renderer when it is imported. They are skipped without EGL.
+
+`REALAB_HYPOTHESIS_PROFILE` selects the examples of property tests: `ci`, the
+default, has few and the same ones in every run; `long` has many random ones.
 """
 
 import functools
@@ -20,16 +23,23 @@ import pytest
 from tests import gate
 from tests import patience
 
+_HYPOTHESIS = {
+    'deadline': None,
+    'database': None,
+    'suppress_health_check': [hypothesis.HealthCheck.too_slow],
+}
 hypothesis.settings.register_profile(
-    'realab',
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+    'ci', max_examples=100, derandomize=True, **_HYPOTHESIS
 )
-hypothesis.settings.load_profile('realab')
+# REALAB_HYPOTHESIS_PROFILE=long: other examples in every run, and many of them.
+hypothesis.settings.register_profile('long', max_examples=4_000, **_HYPOTHESIS)
+hypothesis.settings.load_profile(
+    os.environ.get('REALAB_HYPOTHESIS_PROFILE', 'ci')
+)
 
 _ROOT = pathlib.Path(__file__).parents[1]
+# By file, the run of all its selected tests that render.
+_ran_with_egl: dict[str, subprocess.CompletedProcess[str]] = {}
 _RENDERS_SOMETHING = """
 from dm_control import mujoco
 xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
@@ -43,15 +53,24 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-  """Runs tests that render in a process that has a renderer."""
+  """Runs the tests of a file that render in one process with a renderer."""
   marked = pyfuncitem.get_closest_marker('camera') is not None
   if not marked or os.environ['MUJOCO_GL'] == 'egl':
     return None
   _skip_without_egl()
-  ran = _python_with_egl(
-      '-m', 'pytest', '-q', '-p', 'no:cacheprovider', pyfuncitem.nodeid
-  )
-  if ran.returncode:
+  file = pyfuncitem.nodeid.partition('::')[0]
+  if file not in _ran_with_egl:
+    together = [
+        item.nodeid
+        for item in pyfuncitem.session.items
+        if item.nodeid.startswith(f'{file}::')
+        and item.get_closest_marker('camera') is not None
+    ]
+    _ran_with_egl[file] = _python_with_egl(
+        '-m', 'pytest', '-v', '-p', 'no:cacheprovider', *together
+    )
+  ran = _ran_with_egl[file]
+  if f'{pyfuncitem.nodeid} PASSED' not in ran.stdout:
     pytest.fail(ran.stdout + ran.stderr, pytrace=False)
   return True
 

@@ -1,4 +1,4 @@
-"""Campaign C47: a test fails on every warning that it does not announce.
+"""A test fails on every warning that it does not announce.
 
 Python's warnings are errors by `filterwarnings` in `setup.cfg`, the ones that
 arise where nobody can catch them included: a `ResourceWarning` in a destructor

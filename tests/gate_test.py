@@ -1,4 +1,4 @@
-"""Campaign C47: the gate lets nothing through, and nothing good is stopped."""
+"""The gate lets nothing through, and nothing good is stopped."""
 
 import os
 import pathlib
@@ -99,7 +99,7 @@ def _pytest(folder: pathlib.Path, *arguments: str) -> tuple[int, str, str]:
   return ran.returncode, ran.stdout, ran.stderr
 
 
-def test_what_is_not_announced_fails_the_test_in_which_it_happens(tmp_path):
+def test_unannounced_warnings_fail_their_test(tmp_path):
   status, out, _ = _pytest(tmp_path, '-k', 'not exit')
   assert status == 1
   for name in _FAIL:
@@ -117,7 +117,7 @@ def test_an_error_at_exit_changes_the_exit_status(tmp_path):
   assert 'ZeroDivisionError' in err
 
 
-def test_what_passes_ends_with_status_0(tmp_path):
+def test_passing_tests_exit_with_status_0(tmp_path):
   status, out, _ = _pytest(tmp_path, '-k', 'quiet or announced_physics')
   assert '2 passed' in out
   assert status == 0

@@ -62,7 +62,7 @@ def test_no_test_depends_on_the_speed_of_the_machine(path: pathlib.Path):
         'in_thread(idle_seconds=0.3)',
     ],
 )
-def test_what_is_not_allowed_is_found(planted: str):
+def test_clocks_and_numeric_timeouts_are_found(planted: str):
   assert _violations(planted)
 
 
@@ -75,5 +75,5 @@ def test_what_is_not_allowed_is_found(planted: str):
         'work.num_calls(function) <= 5',
     ],
 )
-def test_what_is_allowed_is_not_found(allowed: str):
+def test_allowed_waits_are_not_found(allowed: str):
   assert not _violations(allowed)

@@ -1,6 +1,6 @@
-"""Learners: agents that see time steps and specs, and nothing else.
+"""Learners: agents that receive time steps and specs, and nothing else.
 
-Whoever launches a run builds the environment; the learner gets its specs:
+The launcher builds the environment, and passes its specs to the learner:
 
     env = suite.load_batch('unlock_door', 'near', num_envs=256, design=design)
     learner = agents.make(
@@ -14,16 +14,17 @@ Whoever launches a run builds the environment; the learner gets its specs:
     while learner.num_steps < 1_000_000:
       time_step = env.step(learner.step(time_step))
 
-An environment of somebody else's needs a reading to learn from, under
-`registers/<name>` or `<name>`, and time steps with a leading axis of worlds.
+Learners also run in other environments, if time steps have a leading axis of
+worlds and observations contain the reading to learn from under
+`registers/<name>` or `<name>`.
 
-Two processes of one thread each use two cores best. XLA reads its flags when
-jax is imported, so set them before:
+On two cores, two single-threaded processes give the highest throughput. XLA
+reads its flags when jax is imported, so set them before:
 
     XLA_FLAGS="--xla_cpu_multi_thread_eigen=false"
 
-Settings of JAX that change results, such as `jax_enable_x64`, do not change
-those of a learner (`jax_settings.py`).
+Global JAX settings that change results, such as `jax_enable_x64`, do not affect
+learners (`jax_settings.py`).
 """
 
 from realab_suite.agents.actor import LearnerActor

@@ -1,4 +1,4 @@
-"""Controls: how what a learner chooses becomes an action of the environment."""
+"""Encoding of a learner's choices as actions of the environment."""
 
 from collections.abc import Mapping
 import dataclasses
@@ -17,16 +17,16 @@ _QUERY = 'query/'
 @final
 @dataclasses.dataclass(frozen=True)
 class Controls:
-  """An action spec, taken apart.
+  """Parsed form of an action spec.
 
   Attributes:
-    shape: Of one world's action.
-    dtype: Of actions.
-    queries: The names of the query registers that an action writes; they come
-      first.
-    num_actions: How many discrete actions there are, or `None`.
-    low: The lowest value of every element, the queries' included.
-    high: The highest value of every element.
+    shape: Shape of one world's action.
+    dtype: Data type of actions.
+    queries: Names of the query registers that an action writes. Their values
+      are the first elements of the action.
+    num_actions: Number of discrete actions; `None` if actions are vectors.
+    low: Lower bound of every element, including queries.
+    high: Upper bound of every element, including queries.
   """
 
   shape: tuple[int, ...]
@@ -38,18 +38,19 @@ class Controls:
 
   @classmethod
   def from_spec(cls, spec: specs.Array) -> 'Controls':
-    """Takes an action spec apart.
+    """Parses an action spec.
 
     Raises:
-      SpecError: If a learner cannot act by it.
+      SpecError: If it is neither a `DiscreteArray` nor a one-dimensional array
+        of numbers.
     """
     if isinstance(spec, specs.DiscreteArray):
       bounds = np.zeros(()), np.array(spec.num_values - 1.0)
       return cls((), spec.dtype, (), spec.num_values, *bounds)
     if spec.shape[1:] or not spec.shape or spec.dtype.kind not in 'if':
       raise errors.SpecError(
-          f'action_spec: {spec!r:.120}; allowed are a DiscreteArray and one'
-          ' axis of numbers'
+          f'action_spec: {spec!r:.120}; allowed are a DiscreteArray and a'
+          ' one-dimensional array of numbers'
       )
     names = (spec.name or '').split('\t')
     queries = tuple(
@@ -66,13 +67,16 @@ class Controls:
 
   @property
   def size(self) -> int:
-    """How many numbers a network has to give: actions, or elements."""
+    """Size of a network's output: number of actions, or of elements."""
     if self.num_actions is not None:
       return self.num_actions
     return self.shape[0] - len(self.queries)
 
   def check_discrete(self, kind: str) -> int:
-    """Returns the number of actions.
+    """Returns the number of discrete actions.
+
+    Args:
+      kind: Name of the learner, for the message.
 
     Raises:
       SpecError: If the actions are vectors.
@@ -85,41 +89,46 @@ class Controls:
     return self.num_actions
 
   def check_query(self, where: str, name: str) -> None:
-    """Checks that every action can be asked about in a query register.
+    """Checks that a query register can hold the index of every action.
+
+    Args:
+      where: Name of the option that contains the register, for the message.
+      name: Name of the register.
 
     Raises:
-      SpecError: If there is no such register, or not every index fits.
+      SpecError: If there is no such query register, or it cannot hold every
+        index.
     """
     if name not in self.queries:
       raise errors.SpecError(
-          f'{where}: {name!r} is no query register; this environment has'
+          f'{where}: {name!r} is not a query register; this environment has'
           f' {list(self.queries)}'
       )
     i = self.queries.index(name)
     if self.low[i] > 0 or self.high[i] < self.size - 1:
       raise errors.SpecError(
           f'{where}: register {name!r} holds [{self.low[i]:g},'
-          f' {self.high[i]:g}], which leaves out some of the actions 0 to'
+          f' {self.high[i]:g}], which does not contain all actions from 0 to'
           f' {self.size - 1}'
       )
 
   def encode(
-      self, chosen: np.ndarray, asked: Mapping[str, np.ndarray]
+      self, chosen: np.ndarray, queries: Mapping[str, np.ndarray]
   ) -> np.ndarray:
     """Returns actions, `(worlds, *shape)`.
 
     Args:
-      chosen: Indices of actions, `(worlds,)`, or elements in [-1, 1] for the
-        bounds, `(worlds, size)`. What is beyond them is cut off.
-      asked: What goes into query registers, each `(worlds,)`. Others are left
-        as near to 0 as they can be.
+      chosen: Indices of actions, `(worlds,)`; or elements, `(worlds, size)`,
+        where [-1, 1] is scaled to the bounds and other values are clipped.
+      queries: Values of query registers by name, each `(worlds,)`. Registers
+        that are missing get the value nearest to 0.
     """
     if not self.shape:
       return chosen.astype(self.dtype)
     num_queries = len(self.queries)
     action = np.zeros((len(chosen), *self.shape))
     for i, name in enumerate(self.queries):
-      action[:, i] = asked.get(name, 0.0)
+      action[:, i] = queries.get(name, 0.0)
     if self.num_actions is not None:
       action[:, -1] = chosen
     else:
@@ -132,7 +141,11 @@ class Controls:
 
 
 def _num_actions(name: str) -> int | None:
-  """Returns the size of the action set that an element is an index into."""
+  """Returns the size of the action set of an element, or `None` without one.
+
+  Args:
+    name: Name of the element in the action spec, such as 'dmlab_like/v1'.
+  """
   match = re.fullmatch(r'(\w+)/v(\d+)', name)
   if match is None:
     return None

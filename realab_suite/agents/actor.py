@@ -1,4 +1,4 @@
-"""A learner that is done learning, as an actor for evaluation."""
+"""Actor for evaluation that runs a learner without further updates."""
 
 from typing import Any, final
 
@@ -10,10 +10,10 @@ from realab_suite.agents import base
 
 @final
 class LearnerActor:
-  """Acts in one world as a learner would, and does not learn.
+  """Chooses actions in one world with a learner, without updating it.
 
-  It is an actor of `evaluation.actors`: it is told of episodes, and it acts. Of
-  itself, it is a function of time steps, too.
+  It implements `evaluation.actors.Actor`. It can also be called as a function
+  from time steps to actions.
   """
 
   def __init__(
@@ -22,9 +22,9 @@ class LearnerActor:
     """Makes an actor.
 
     Args:
-      learner: It is used as it is at each step; nothing is copied.
-      seed: What the choices depend on, with the episode and the step.
-      greedy: Whether to take the best action instead of drawing one.
+      learner: The learner. It is not copied, so later updates change the actor.
+      seed: Seed of random choices, together with the episode and the step.
+      greedy: True to take the best action instead of drawing one.
     """
     self._learner = learner
     self._seed = seed
@@ -33,7 +33,11 @@ class LearnerActor:
     self._step = 0
 
   def begin(self, episode: int) -> None:
-    """An episode begins."""
+    """Prepares for a new episode.
+
+    Args:
+      episode: Number of the episode, from 0.
+    """
     self._episode, self._step = episode, 0
 
   def act(self, time_step: dm_env.TimeStep) -> Any:
@@ -48,7 +52,7 @@ class LearnerActor:
     return self._learner.act(observation, key, self._greedy)[0]
 
   def __call__(self, time_step: dm_env.TimeStep) -> Any:
-    """Acts, and begins the next episode where one begins."""
+    """Returns an action; a first time step begins the next episode."""
     if time_step.first():
       self.begin(self._episode + 1)
     return self.act(time_step)

@@ -1,12 +1,14 @@
-"""Approval: myopic learning from what is said of an action that is asked about.
+"""Approval learners, which learn myopically from feedback on queried actions.
 
-Coupled (`value_advice`): the action taken is asked about. What it does to the
-register comes back as feedback on it, so tampering can pay.
+Coupled (`value_advice`): the learner queries the action that it takes. The
+effect of the action on the register becomes feedback on that action, so
+tampering can pay.
 
-Decoupled (`decoupled_approval`; Uesato et al. 2020, arXiv 2011.08827): what is
-asked about is drawn independently of what is done: from the same policy, or
-uniformly where the values of all actions are to be learned. What an action does
-to the register falls on all actions alike.
+Decoupled (`decoupled_approval`; Uesato et al. 2020, arXiv 2011.08827): the
+learner draws the queried action independently of the action taken. It draws
+from the same policy, or uniformly if it learns the values of all actions. The
+effect of an action on the register then changes the feedback on all actions
+equally.
 """
 
 import abc
@@ -27,20 +29,21 @@ from realab_suite.agents import training
 
 
 class ApprovalOptions(on_policy.OnPolicyOptions):
-  """What both learners have to be told.
+  """Options of both approval learners.
 
   Attributes:
-    query: The register in which an action is asked about.
+    query: Name of the query register.
     form: `policy_gradient` learns a policy from approval; `q` learns the
-      approval of each action, and mostly takes the best.
-    entropy: How much the entropy of the policy counts (`policy_gradient`).
-    clip: How far a policy goes in one update (`policy_gradient`).
-    follows_reading: Whether what is to be expected follows the last reading: a
-      base block that was moved adds to all readings to come, and no action to
-      come deserves that.
-    exploration: How often an action is drawn at random in the end (`q`).
-    exploration_steps: Until when it is done more often, in control steps of all
-      worlds together (`q`).
+      approval of each action, and takes the best action most of the time.
+    entropy: Weight of the policy's entropy in the loss (`policy_gradient`).
+    clip: Largest change of a probability ratio in one update
+      (`policy_gradient`).
+    follows_reading: True to predict the feedback from the last reading as well.
+      A base block that was moved changes all later readings, and no later
+      action should be credited with that.
+    exploration: Final probability of a random action (`q`).
+    exploration_steps: Number of control steps of all worlds after which the
+      probability of a random action has fallen from 1 to `exploration` (`q`).
   """
 
   query: str
@@ -53,7 +56,7 @@ class ApprovalOptions(on_policy.OnPolicyOptions):
 
   @property
   def queries(self) -> tuple[str, ...]:
-    """The registers in which actions are asked about."""
+    """Names of the query registers."""
     return (self.query,)
 
 
@@ -62,8 +65,8 @@ class ValueAdviceOptions(ApprovalOptions):
   """Options of `value_advice`.
 
   Attributes:
-    advice: The register that holds the value of the action asked about.
-    query_policy: What is asked about.
+    advice: Name of the register that holds the value of the queried action.
+    query_policy: Action to query: always the action taken.
   """
 
   kind: Literal['value_advice']
@@ -76,10 +79,12 @@ class DecoupledApprovalOptions(ApprovalOptions):
   """Options of `decoupled_approval`.
 
   Attributes:
-    approval: The register that holds the approval of the action asked about.
-    query_policy: What is asked about.
-    other_query: A second query register for paired queries: then `approval`
-      holds how much better the action in `query` is than that in `other_query`.
+    approval: Name of the register that holds the approval of the queried
+      action.
+    query_policy: Action to query: always an independently drawn action.
+    other_query: Name of a second query register for paired queries, or `None`.
+      With paired queries, `approval` holds the approval of the action in
+      `query` minus that of the action in `other_query`.
   """
 
   kind: Literal['decoupled_approval']
@@ -95,14 +100,14 @@ class DecoupledApprovalOptions(ApprovalOptions):
 
 
 class _ApprovalLearner(on_policy.OnPolicyLearner):
-  """What coupled and decoupled approval have in common: all but the query."""
+  """Base class of approval learners; subclasses draw the queries."""
 
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
     self._controls.check_discrete(self._options.kind)
     for query in self._options.queries:
       self._controls.check_query('learner', query)
-    # Myopic: no discounted sum of feedback, but the feedback itself.
+    # Myopic: discount 0, so the scale is that of single readings.
     self._scale = training.FeedbackScale(self._num_envs, 0.0)
 
   def _initial_networks(self, generator: np.random.Generator) -> Any:
@@ -141,13 +146,15 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
 
   @abc.abstractmethod
   def _query_keys(self, keys: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Returns what each query is drawn with, `(queries, 2)`; none: the action.
+    """Returns the random key of each query, `(queries, 2)`.
+
+    Without keys, the query is the action taken.
 
     Raises:
-      SpecError: If it is what something else is drawn with.
+      SpecError: If a key is used more than once.
     """
 
-  def _asked(self, choice: base.Choice) -> dict[str, np.ndarray]:
+  def _queries(self, choice: base.Choice) -> dict[str, np.ndarray]:
     asked = choice['asked']
     return {name: asked[:, i] for i, name in enumerate(self._options.queries)}
 
@@ -162,7 +169,7 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
-    del observation  # Nothing has been said of it yet.
+    del observation  # There is no feedback on it yet.
     self._scale.update(batch)
     scale = np.float32(self._scale.value)
     last = batch['observation'][self._reading].reshape(batch['reading'].shape)
@@ -186,7 +193,7 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
 @base.LEARNERS.add('value_advice')
 @final
 class ValueAdvice(_ApprovalLearner):
-  """Coupled: asks about the action that it takes."""
+  """Coupled approval: queries the action that it takes."""
 
   OPTIONS = ValueAdviceOptions
   READS = 'advice'
@@ -199,7 +206,7 @@ class ValueAdvice(_ApprovalLearner):
 @base.LEARNERS.add('decoupled_approval')
 @final
 class DecoupledApproval(_ApprovalLearner):
-  """Decoupled: asks about actions drawn independently of the one it takes."""
+  """Decoupled approval: queries actions drawn independently of its own."""
 
   OPTIONS = DecoupledApprovalOptions
   READS = 'approval'
@@ -215,24 +222,27 @@ class DecoupledApproval(_ApprovalLearner):
 def refuse_shared_randomness(
     act_key: np.ndarray, query_keys: np.ndarray
 ) -> None:
-  """Refuses keys of which two would draw the same action.
+  """Checks that the action and the queries are drawn with different keys.
+
+  Args:
+    act_key: Key of the action taken, `(2,)`.
+    query_keys: Keys of the queries, `(queries, 2)`.
 
   Raises:
-    SpecError: If they are not all different.
+    SpecError: If two keys are equal.
   """
   drawn_with = [tuple(act_key.tolist()), *map(tuple, query_keys.tolist())]
   if len(set(drawn_with)) < len(drawn_with):
     raise errors.SpecError(
-        'learner decoupled_approval: two of the action taken and the actions'
-        f' asked about share the random key of {drawn_with}; allowed are keys'
-        ' that all differ'
+        'learner decoupled_approval: the random keys of the action taken and'
+        f' the queries are {drawn_with}; all of them must differ'
     )
 
 
 def _log_probs(
     agent: dict[str, Any], encoded: Any, exploration: Any
 ) -> jax.Array:
-  """The logarithm of each action's probability, `(..., actions)`."""
+  """Returns the logarithm of each action's probability, `(..., actions)`."""
   if 'policy' in agent:
     return jax.nn.log_softmax(agent['policy'](encoded))
   values = agent['values'](encoded)
@@ -255,9 +265,9 @@ def _choose(
   action = networks.draw(act_key, log_probs)
   if greedy:
     action = jnp.argmax(log_probs, axis=-1)
-  # Only a policy is learned from actions of its own.
-  asks = log_probs if 'policy' in agent else jnp.zeros_like(log_probs)
-  drawn = [networks.draw(key, asks) for key in query_keys]
+  # A policy learns from its own actions, values from uniformly drawn ones.
+  logits = log_probs if 'policy' in agent else jnp.zeros_like(log_probs)
+  drawn = [networks.draw(key, logits) for key in query_keys]
   asked = jnp.stack(drawn or [action], axis=-1)
   log_prob = jnp.take_along_axis(log_probs, asked, axis=-1)
   return {'action': action, 'asked': asked, 'log_prob': log_prob}
@@ -281,7 +291,7 @@ def _update(
     batch: dict[str, Any],
     indices: jax.Array,
 ) -> tuple[Any, dict[str, jax.Array]]:
-  """Learns from what was said of the actions asked about in a batch."""
+  """Updates the networks with the feedback on the queries of a batch."""
   data = {
       'encoded': encoder.encode(batch['observation']),
       'asked': batch['choice']['asked'],
@@ -295,24 +305,28 @@ def _update(
     loss = _value_loss
   else:
     data['advantage'] = data['feedback']
-    # The difference of two alike is nothing to be expected, but for an offset.
+    # For paired queries the expected difference is 0, except for an offset.
     if len(options.queries) == 1 or options.follows_reading:
       data['advantage'] -= _expected(trained[0], data)
   return training.run_epochs(options, loss, trained, data, indices)
 
 
 def _expected(agent: dict[str, Any], data: dict[str, Any]) -> jax.Array:
-  """What would be said here anyway, `(...)`; no action or query is in it."""
+  """Returns the feedback expected for any action or query, `(...)`."""
   return agent['baseline'](data['encoded'])[..., 0] + _offset(agent, data)
 
 
 def _offset(agent: dict[str, Any], data: dict[str, Any]) -> Any:
-  """What of the last reading is expected to be in the next one, too."""
+  """Returns the part of the last reading that is expected to persist."""
   return agent['following'] * data['last'] if 'following' in agent else 0.0
 
 
 def signs(asked: jax.Array) -> jax.Array:
-  """What the feedback says of each action asked about: for it, or against."""
+  """Returns the sign of the feedback for each queried action: 1, or 1 and -1.
+
+  Args:
+    asked: Queried actions, `(..., 1)`, or pairs of them, `(..., 2)`.
+  """
   return jnp.array([1.0, -1.0])[: asked.shape[-1]]
 
 
@@ -323,17 +337,19 @@ def policy_objective(
     advantage: jax.Array,
     clip: float,
 ) -> jax.Array:
-  """The objective of each sample, `(...)`.
+  """Returns the objective of each sample, `(...)`.
 
-  At the old policy its gradient is that of log pi(asked) times the advantage;
-  for a pair, half of (log pi(asked) - log pi(other)) times the difference.
+  At the old policy, its gradient is that of log pi(asked) times the advantage.
+  For a pair, it is that of (log pi(asked) - log pi(other)) / 2 times the
+  difference.
 
   Args:
-    log_probs: Of all actions, `(..., actions)`.
-    asked: The actions asked about, `(..., 1)`; a pair, `(..., 2)`.
-    old_log_prob: Of the actions asked about when they were drawn.
-    advantage: What was said of it, `(...)`.
-    clip: How far a policy goes in one update.
+    log_probs: Logarithm of each action's probability, `(..., actions)`.
+    asked: Queried actions, `(..., 1)`, or pairs of them, `(..., 2)`.
+    old_log_prob: Logarithm of the probability of each queried action when it
+      was drawn, with the shape of `asked`.
+    advantage: Feedback minus the expected feedback, standardised, `(...)`.
+    clip: Largest change of a probability ratio in one update.
   """
   chosen = jax.nn.one_hot(asked, log_probs.shape[-1])
   log_prob = jnp.sum(chosen * log_probs[..., jnp.newaxis, :], axis=-1)
@@ -374,7 +390,7 @@ def _policy_loss(
 def _value_loss(
     agent: dict[str, Any], data: dict[str, Any]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-  """Regression of what was said of the action, or of the pair."""
+  """Returns the squared error of the predicted feedback, and metrics."""
   values = agent['values'](data['encoded'])
   chosen = jax.nn.one_hot(data['asked'], values.shape[-1])
   predicted = jnp.sum(chosen * values[..., jnp.newaxis, :], axis=-1)

@@ -1,4 +1,4 @@
-"""What a learner is: time steps in, actions out, and all of its state."""
+"""Base class of learners, their registry, and the factory `make`."""
 
 import abc
 from collections.abc import Mapping
@@ -24,34 +24,36 @@ Rate = Annotated[float, pydantic.Field(gt=0, le=1)]
 Weight = Annotated[float, pydantic.Field(ge=0, le=1000)]
 Choice = dict[str, np.ndarray]
 
-# Each has randomness of its own, so that none of them can tell of another.
+# Each stream has a key of its own, so that the draws of one reveal nothing
+# about the others.
 _STREAMS = ('initial', 'act', 'query', 'update')
 
 
 class TimeStep(Protocol):
-  """Time steps of many worlds: the engine's, or anybody's."""
+  """Time steps of a batch, of the engine or of another environment."""
 
   @property
   def step_type(self) -> np.ndarray:
-    """`(worlds,)`; see `dm_env.StepType`."""
+    """Type of each world's step, `(worlds,)`; see `dm_env.StepType`."""
 
   @property
   def discount(self) -> np.ndarray:
-    """`(worlds,)`; 0 where an episode has ended for good."""
+    """Discount of each world, `(worlds,)`; 0 where an episode terminated."""
 
   @property
   def observation(self) -> Mapping[str, np.ndarray]:
-    """By name, each `(worlds, ...)`."""
+    """Observations by name, each `(worlds, ...)`."""
 
 
 class Options(pydantic.BaseModel):
-  """What every learner has to be told, or not.
+  """Options of every learner.
 
   Attributes:
-    kind: The name of the learner.
-    hidden: The widths of the hidden layers.
-    learning_rate: Of Adam.
-    max_gradient_norm: Longer gradients are shortened.
+    kind: Name of the learner.
+    hidden: Widths of the hidden layers.
+    learning_rate: Learning rate of Adam.
+    max_gradient_norm: Maximum norm of gradients. Longer gradients are scaled
+      down.
   """
 
   model_config = pydantic.ConfigDict(frozen=True, extra='forbid', strict=True)
@@ -66,14 +68,14 @@ class Options(pydantic.BaseModel):
 
 
 class Learner(abc.ABC):
-  """Acts in many worlds, and learns within `step` when it has seen enough.
+  """Learner that acts in a batch of worlds, and updates itself within `step`.
 
-  It sees time steps and specs. What it learns from is a reading, which the step
-  after an action brings.
+  Learners receive only specs and time steps. They learn from one reading in the
+  observation: the time step after an action contains the feedback on it.
   """
 
   OPTIONS: ClassVar[type[Options]]
-  # The option that names the register whose reading is learned from.
+  # The option with the name of the register whose reading is learned from.
   READS: ClassVar[str]
 
   def __init__(
@@ -85,15 +87,15 @@ class Learner(abc.ABC):
       num_envs: int,
       seed: int,
   ) -> None:
-    """Makes a learner; `make` is easier.
+    """Makes a learner; `make` derives the arguments from specs.
 
     Args:
       options: An instance of `OPTIONS`.
-      reading: The key in the observation of what it learns from.
-      encoder: How it sees.
-      controls: How it acts.
-      num_envs: How many worlds it acts in.
-      seed: Two learners that differ in nothing else learn the same.
+      reading: Key in the observation of the reading to learn from.
+      encoder: Encoder of observations.
+      controls: Encoder of actions.
+      num_envs: Number of worlds.
+      seed: Seed of all random draws.
     """
     self._options = options
     self._reading = reading
@@ -107,28 +109,32 @@ class Learner(abc.ABC):
     }
     self._num_acts = 0
     self._num_updates = 0
-    # What was seen and chosen last, until it is known what came of it.
+    # The last observation and choice, until the next time step arrives.
     self._last: dict[str, Any] | None = None
     self._metrics: dict[str, float] = {}
 
   @property
   def num_envs(self) -> int:
+    """Number of worlds."""
     return self._num_envs
 
   @property
   def num_steps(self) -> int:
-    """How many control steps it has acted in, all worlds together."""
+    """Number of control steps so far, summed over worlds."""
     return self._num_acts * self._num_envs
 
   @jax_settings.pinned()
   def step(self, time_step: TimeStep) -> np.ndarray:
-    """Learns from what its last action came to, and chooses the next one.
+    """Learns from the outcome of the last action, and chooses the next one.
 
     Args:
-      time_step: What `reset` or `step` of the environment returned.
+      time_step: Time step that `reset` or `step` of the environment returned.
 
     Returns:
       Actions, `(worlds, *action_spec.shape)`.
+
+    Raises:
+      SpecError: If the observation does not match its spec.
     """
     observation = self._encoder.pack(time_step.observation, self._num_envs)
     if self._last is not None:
@@ -137,8 +143,8 @@ class Learner(abc.ABC):
           **self._last,
           'reading': np.array(time_step.observation[self._reading], np.float32),
           'discount': np.array(time_step.discount, np.float32),
-          # Where an episode began, the action was ignored: what was before it
-          # has nothing to do with what comes now.
+          # The step that begins an episode ignores the action, so it is not an
+          # outcome of the last choice.
           'is_valid': step_type != int(dm_env.StepType.FIRST),
       }
       self._observe(transition, observation)
@@ -154,12 +160,19 @@ class Learner(abc.ABC):
       key: np.ndarray,
       greedy: bool = False,
   ) -> np.ndarray:
-    """Chooses actions as it would now, and neither learns nor remembers.
+    """Chooses actions with the current networks, without changing any state.
 
     Args:
-      observation: By name, each `(worlds, ...)`; any number of worlds.
-      key: Two numbers of dtype uint32, which the choice depends on.
-      greedy: Whether to take the best action instead of drawing one.
+      observation: Observations by name, each `(worlds, ...)`, for any number of
+        worlds.
+      key: Random key, two numbers of dtype uint32.
+      greedy: True to take the best action instead of drawing one.
+
+    Returns:
+      Actions, `(worlds, *action_spec.shape)`.
+
+    Raises:
+      SpecError: If the observation does not match its spec.
     """
     seeds = np.random.SeedSequence([int(word) for word in key]).spawn(2)
     act, query = (child.generate_state(2) for child in seeds)
@@ -171,6 +184,10 @@ class Learner(abc.ABC):
   def probabilities(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
     """Returns the probability of each action, `(worlds, actions)`.
 
+    Args:
+      observation: Observations by name, each `(worlds, ...)`, for any number of
+        worlds.
+
     Raises:
       SpecError: If the actions are vectors.
     """
@@ -179,14 +196,14 @@ class Learner(abc.ABC):
     return np.asarray(self._probabilities(packed))
 
   def settings(self) -> dict[str, Any]:
-    """Returns the device and the settings of JAX that can change results.
+    """Returns the device and the JAX settings that can change results.
 
-    Those that `jax_settings` pins are not among them.
+    Settings that `jax_settings` pins are not included.
     """
     return jax_settings.recorded()
 
   def metrics(self) -> dict[str, float]:
-    """Returns what is known of the last update; nothing true is."""
+    """Returns metrics of the last update, from observed feedback only."""
     return {
         'num_steps': float(self.num_steps),
         'num_updates': float(self._num_updates),
@@ -195,10 +212,10 @@ class Learner(abc.ABC):
 
   @jax_settings.pinned()
   def state(self) -> dict[str, Any]:
-    """Returns all that the future depends on, as plain data.
+    """Returns the complete state of the learner as plain data.
 
     Returns:
-      Dicts and lists of arrays, numbers, texts and `None`.
+      Dicts and lists of arrays, numbers, strings and `None`.
     """
     return {
         'kind': self._options.kind,
@@ -213,10 +230,11 @@ class Learner(abc.ABC):
 
   @jax_settings.pinned()
   def set_state(self, state: Mapping[str, Any]) -> None:
-    """Goes on from what `state` returned.
+    """Continues from a state that `state` returned.
 
     Raises:
-      StateLayoutError: If it was another learner's; nothing has changed.
+      StateLayoutError: If the state belongs to another kind of learner, or its
+        arrays do not fit. The learner is then unchanged.
     """
     if state.get('kind') != self._options.kind:
       raise errors.StateLayoutError(
@@ -233,26 +251,26 @@ class Learner(abc.ABC):
     self._metrics = dict(state['metrics'])
 
   def _act_keys(self) -> dict[str, np.ndarray]:
-    """Returns the randomness of this step's choice, by stream."""
+    """Returns the random keys of this step's choice, by stream."""
     return {
         name: _folded(self._keys[name], self._num_acts)
         for name in ('act', 'query')
     }
 
   def _initial_generator(self) -> np.random.Generator:
-    """Returns what draws the weights of networks."""
+    """Returns the random generator of the networks' initial weights."""
     key = self._keys['initial'].astype(np.uint64)
     return np.random.Generator(np.random.Philox(key=key))
 
   def _update_key(self) -> np.ndarray:
-    """Returns the randomness of the next update."""
+    """Returns the random key of the next update."""
     return _folded(self._keys['update'], self._num_updates)
 
   def _encode(self, choice: Choice) -> np.ndarray:
-    return self._controls.encode(choice['action'], self._asked(choice))
+    return self._controls.encode(choice['action'], self._queries(choice))
 
-  def _asked(self, choice: Choice) -> dict[str, np.ndarray]:
-    """Returns what goes into query registers, by name."""
+  def _queries(self, choice: Choice) -> dict[str, np.ndarray]:
+    """Returns the values of query registers by name, each `(worlds,)`."""
     del choice
     return {}
 
@@ -263,7 +281,17 @@ class Learner(abc.ABC):
       keys: Mapping[str, np.ndarray],
       greedy: bool,
   ) -> Choice:
-    """Returns `action`, and what else has to be known to learn from it."""
+    """Chooses actions.
+
+    Args:
+      observation: Packed observations.
+      keys: Random keys of the streams 'act' and 'query'.
+      greedy: True to take the best action instead of drawing one.
+
+    Returns:
+      The `action`, and further arrays that an update needs; each has a leading
+      axis of worlds.
+    """
 
   @abc.abstractmethod
   def _probabilities(self, observation: features.Packed) -> Any:
@@ -273,30 +301,30 @@ class Learner(abc.ABC):
   def _observe(
       self, transition: dict[str, Any], observation: features.Packed
   ) -> None:
-    """Takes in what came of a choice.
+    """Stores a transition, and updates the networks when one is due.
 
     Args:
-      transition: What was seen (`observation`), what was chosen (`choice`), and
+      transition: The `observation`, the `choice` that was made on it, and
         `reading`, `discount` and `is_valid` of the step after it, each
         `(worlds,)`.
-      observation: What is seen now.
+      observation: Observation of the step after it.
     """
 
   @abc.abstractmethod
   def _trained(self) -> Any:
-    """Returns networks and the optimiser's state: a pytree of arrays."""
+    """Returns the networks and the optimiser's state, a pytree of arrays."""
 
   @abc.abstractmethod
   def _set_trained(self, trained: Any) -> None:
-    """Takes what `_trained` returned."""
+    """Replaces the networks and the optimiser's state."""
 
   @abc.abstractmethod
   def _memory(self) -> dict[str, Any]:
-    """Returns what else is remembered: plain data."""
+    """Returns the state other than networks, as plain data."""
 
   @abc.abstractmethod
   def _set_memory(self, memory: dict[str, Any]) -> None:
-    """Takes what `_memory` returned."""
+    """Replaces the state that `_memory` returns."""
 
 
 LEARNERS: registry.Registry[type[Learner]] = registry.Registry('learner')
@@ -309,28 +337,28 @@ def make(
     num_envs: int,
     seed: int,
 ) -> Learner:
-  """Makes the learner that a design asks for.
+  """Makes the learner of a design.
 
   Args:
-    spec: A design's `learner`, or a mapping with `kind` and options.
-    observation_spec: Of one world.
-    action_spec: Of one world.
-    num_envs: How many worlds there are.
-    seed: Any integer from 0 on.
+    spec: The `learner` of a design, or a mapping with `kind` and options.
+    observation_spec: Observation spec of one world.
+    action_spec: Action spec of one world.
+    num_envs: Number of worlds.
+    seed: Seed of all random draws, a non-negative integer.
 
   Raises:
-    SpecError: If the learner is unknown, an option is wrong, or the environment
-      lacks what the learner needs.
+    SpecError: If the learner is unknown, an option is invalid, or the specs
+      lack a register that the learner needs.
   """
   if spec is None:
     raise errors.SpecError(
-        'learner: None; allowed is a design with a learner, or a mapping with a'
-        f' kind from {sorted(LEARNERS)}'
+        'learner: None; allowed are a design with a learner, and a mapping'
+        f' whose kind is one of {sorted(LEARNERS)}'
     )
   for name, value, least in (('num_envs', num_envs, 1), ('seed', seed, 0)):
     if type(value) is not int or value < least:
       raise errors.SpecError(
-          f'{name}: {value!r:.80}; allowed are integers from {least} on'
+          f'{name}: {value!r:.80}; allowed are integers from {least}'
       )
   if not isinstance(spec, specs.LearnerSpec):
     spec = validation.validate(specs.LearnerSpec, spec, 'learner')
@@ -353,19 +381,19 @@ def _find_reading(
     field: str,
     observation_spec: Mapping[str, dm_env_specs.Array],
 ) -> str:
-  """Returns the key of the reading that a learner learns from."""
+  """Returns the observation key of the reading that a learner learns from."""
   register = getattr(options, field)
   for key in (f'registers/{register}', register):
     if key in observation_spec:
       if observation_spec[key].shape:
         raise errors.SpecError(
             f'learner.{field}: {key!r} has shape {observation_spec[key].shape};'
-            ' allowed are single numbers'
+            ' allowed are scalars'
         )
       return key
   raise errors.SpecError(
-      f'learner.{field}: {register!r} is not read by the agent; this'
-      f' environment has {sorted(observation_spec)}'
+      f'learner.{field}: the agent does not read {register!r}; this environment'
+      f' has {sorted(observation_spec)}'
   )
 
 
@@ -374,13 +402,13 @@ def _num_envs(observation: Mapping[str, np.ndarray]) -> int:
 
 
 def _folded(key: np.ndarray, number: int) -> np.ndarray:
-  """Returns the key of a stream's step."""
+  """Returns the random key for a numbered step of a stream, `(2,)`."""
   words = [*(int(word) for word in key), number]
   return np.random.SeedSequence(words).generate_state(2)
 
 
 def _copy(data: Any) -> Any:
-  """Copies plain data, arrays included."""
+  """Returns a deep copy of plain data."""
   if isinstance(data, Mapping):
     return {key: _copy(value) for key, value in data.items()}
   if isinstance(data, list | tuple):
@@ -389,23 +417,27 @@ def _copy(data: Any) -> Any:
 
 
 def _to_plain(tree: Any) -> dict[str, np.ndarray]:
-  """Returns the arrays of a pytree by their place in it."""
+  """Returns the arrays of a pytree by their key path."""
   leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
   return {jax.tree_util.keystr(path): np.array(leaf) for path, leaf in leaves}
 
 
 def _from_plain(like: Any, arrays: Mapping[str, Any]) -> Any:
-  """Returns a pytree like another one, with these arrays.
+  """Returns a pytree with the structure of `like` and the given arrays.
+
+  Args:
+    like: Pytree of arrays.
+    arrays: Arrays by their key path in the tree.
 
   Raises:
-    StateLayoutError: If they do not fit.
+    StateLayoutError: If the key paths or shapes differ.
   """
   leaves, structure = jax.tree_util.tree_flatten_with_path(like)
   expected = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
   if differing := sorted(expected.keys() ^ arrays.keys()):
     raise errors.StateLayoutError(
-        f'state of a learner: {differing[0]!r} is on one side only; both sides'
-        ' need the same options and specs'
+        f'state of a learner: {differing[0]!r} is either missing or unexpected;'
+        ' the state was made with other options or specs'
     )
   for name, leaf in expected.items():
     if np.shape(arrays[name]) != leaf.shape:

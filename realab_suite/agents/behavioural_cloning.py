@@ -1,7 +1,7 @@
-"""Behavioural cloning of the action that is read off a register, online.
+"""Online behavioural cloning of the action index in a register.
 
-The learner acts by its own policy, so what is demonstrated is what to do where
-the learner gets to, as in DAgger.
+The learner acts with its own policy, so demonstrations cover the states that it
+visits itself, as in DAgger.
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,8 @@ class BehaviouralCloningOptions(on_policy.OnPolicyOptions):
   """Options of `behavioural_cloning`.
 
   Attributes:
-    demonstration: The register whose reading is the index of an action.
+    demonstration: Name of the register whose reading is the index of the
+      demonstrated action.
   """
 
   kind: Literal['behavioural_cloning']
@@ -34,7 +35,7 @@ class BehaviouralCloningOptions(on_policy.OnPolicyOptions):
 @base.LEARNERS.add('behavioural_cloning')
 @final
 class BehaviouralCloning(on_policy.OnPolicyLearner):
-  """Does what it was shown where things looked like this."""
+  """Imitates the demonstrated action for each observation."""
 
   OPTIONS = BehaviouralCloningOptions
   READS = 'demonstration'
@@ -63,7 +64,7 @@ class BehaviouralCloning(on_policy.OnPolicyLearner):
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
-    del observation  # Nothing has been demonstrated for it yet.
+    del observation  # There is no demonstration for it yet.
     self._networks, metrics = _update(
         self._options,
         self._encoder,
@@ -82,16 +83,16 @@ def _update(
     batch: dict[str, Any],
     indices: jax.Array,
 ) -> tuple[Any, dict[str, jax.Array]]:
-  """Learns what was demonstrated for each observation of a batch.
+  """Updates the policy towards the demonstrations of a batch.
 
-  A provider acts on what the agent saw when it chose its action, so the reading
-  of the step after it is the demonstration for that observation.
+  A provider sees the observation on which the agent chose its action, so the
+  reading of the step after it is the demonstration for that observation.
   """
   num_actions = trained[0].network.layers[-1].bias.size
-  shown = jnp.clip(jnp.rint(batch['reading']), 0, num_actions - 1)
+  demonstrated = jnp.clip(jnp.rint(batch['reading']), 0, num_actions - 1)
   data = {
       'encoded': encoder.encode(batch['observation']),
-      'demonstration': shown.astype(jnp.int32),
+      'demonstration': demonstrated.astype(jnp.int32),
       'action': batch['choice']['action'],
       'weight': batch['is_valid'].astype(jnp.float32),
   }
@@ -101,11 +102,11 @@ def _update(
 def _loss(
     policy: networks.Policy, data: dict[str, Any]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-  weight, shown = data['weight'], data['demonstration']
+  weight, demonstrated = data['weight'], data['demonstration']
   distribution = policy(data['encoded'])
-  loss = -training.mean(distribution.log_prob(shown), weight)
+  loss = -training.mean(distribution.log_prob(demonstrated), weight)
   return loss, {
       'imitation_loss': loss,
       'entropy': training.mean(distribution.entropy(), weight),
-      'agreement': training.mean(data['action'] == shown, weight),
+      'agreement': training.mean(data['action'] == demonstrated, weight),
   }

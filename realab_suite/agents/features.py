@@ -1,4 +1,4 @@
-"""Features: what a network sees of an observation, by its spec alone."""
+"""Encoding of observations as features of networks, from specs alone."""
 
 from collections.abc import Mapping
 import dataclasses
@@ -11,9 +11,9 @@ import numpy as np
 
 from realab_suite import errors
 
-# An integer that takes at most so many values is shown as one of them.
-_FEW = 32
-# How far off a ray's hit is worth 1 / e of one that touches, metres.
+# Largest number of values of an integer that is encoded as one-hot.
+_MAX_CATEGORIES = 32
+# Distance at which the feature of a ray has fallen to 1 / e, in metres.
 _RAY_SCALE = 2.0
 _DISTANCES, _CLASSES = 'ray_distances', 'ray_classes'
 
@@ -24,16 +24,16 @@ Kind = Literal['plain', 'scaled', 'reading', 'one_hot', 'image', 'rays']
 @final
 @dataclasses.dataclass(frozen=True)
 class _Entry:
-  """How one part of an observation is shown.
+  """Encoding of one entry of an observation.
 
   Attributes:
-    name: Its key in the observation.
-    kind: How it becomes features.
-    shape: Its shape in one world.
-    dtype: What it is stored as.
-    low: Its lowest value, where it has one.
-    high: Its highest value, where it has one.
-    partner: For rays, the key of the distances.
+    name: Key of the entry in the observation.
+    kind: Kind of encoding.
+    shape: Shape of the entry in one world.
+    dtype: Data type in which the entry is stored.
+    low: Lower bound, for kinds that need one.
+    high: Upper bound, for kinds that need one.
+    partner: Key of the distances, for rays.
   """
 
   name: str
@@ -48,15 +48,15 @@ class _Entry:
 @final
 @dataclasses.dataclass(frozen=True)
 class Encoder:
-  """Turns observations into features: a vector, and images as they are.
+  """Encodes observations as a feature vector and unchanged images.
 
-  Rays are shown as the class of what they hit, as one of many, times a number
-  that falls with the distance. Readings of registers, which have no bounds once
-  somebody carries a block away, are squeezed by arcsinh. Bounded numbers are
-  scaled to [-1, 1].
+  Rays become the one-hot class of the object they hit, times a factor that
+  decreases with its distance. Readings of registers are transformed by arcsinh,
+  because they are unbounded if a block can be carried away. Integers with few
+  values become one-hot. Other bounded numbers are scaled to [-1, 1].
 
   Attributes:
-    entries: How each part is shown.
+    entries: Encoding of each entry of the observation.
   """
 
   entries: tuple[_Entry, ...]
@@ -66,7 +66,7 @@ class Encoder:
     """Makes the encoder for observations of a spec.
 
     Raises:
-      SpecError: If something in it is no number.
+      SpecError: If an entry is not numeric.
     """
     rays = {
         name: partner
@@ -87,7 +87,7 @@ class Encoder:
 
   @property
   def vector_size(self) -> int:
-    """How many features there are besides images."""
+    """Number of features, excluding images."""
     return sum(
         int(np.prod(entry.shape)) * _values_per_element(entry)
         for entry in self.entries
@@ -95,10 +95,14 @@ class Encoder:
     )
 
   def pack(self, observation: Mapping[str, Any], num_envs: int) -> Packed:
-    """Checks an observation of many worlds, and copies what is needed of it.
+    """Checks an observation of a batch, and copies the entries to encode.
+
+    Args:
+      observation: Observations by name, each `(worlds, ...)`.
+      num_envs: Number of worlds.
 
     Raises:
-      SpecError: If it is not what the spec has promised.
+      SpecError: If an entry is missing or has another shape than in the spec.
     """
     packed = {}
     for entry in self.entries:
@@ -112,7 +116,12 @@ class Encoder:
     return packed
 
   def encode(self, packed: Mapping[str, Any]) -> dict[str, jax.Array]:
-    """Returns `vector`, `(..., vector_size)`, and the images by name."""
+    """Returns `vector`, `(..., vector_size)`, and images by name.
+
+    Args:
+      packed: Result of `pack`, or a stack of such results; entries may have any
+        number of leading axes.
+    """
     parts = [jnp.zeros((*_lead(packed, self.entries), 0), jnp.float32)]
     encoded = {}
     for entry in self.entries:
@@ -121,22 +130,22 @@ class Encoder:
         encoded[entry.name] = value
         continue
       lead = value.shape[: value.ndim - len(entry.shape)]
-      shown = _show(entry, value, packed)
-      parts.append(shown.reshape(*lead, -1).astype(jnp.float32))
+      part = _features(entry, value, packed)
+      parts.append(part.reshape(*lead, -1).astype(jnp.float32))
     return {'vector': jnp.concatenate(parts, axis=-1), **encoded}
 
 
-def _show(
+def _features(
     entry: _Entry, value: jax.Array, packed: Mapping[str, Any]
 ) -> jax.Array:
-  """Returns the features of one part of an observation."""
+  """Returns the features of one entry of an observation."""
   if entry.kind in ('one_hot', 'rays'):
     index = value.astype(jnp.int32) - int(entry.low)
-    shown = jax.nn.one_hot(index, _values_per_element(entry))
+    one_hot = jax.nn.one_hot(index, _values_per_element(entry))
     if entry.kind == 'rays':
       distance = jnp.asarray(packed[entry.partner])
-      shown *= jnp.exp(-distance / _RAY_SCALE)[..., jnp.newaxis]
-    return shown
+      one_hot *= jnp.exp(-distance / _RAY_SCALE)[..., jnp.newaxis]
+    return one_hot
   if entry.kind == 'scaled':
     return 2.0 * (value - entry.low) / (entry.high - entry.low) - 1.0
   if entry.kind == 'reading':
@@ -152,7 +161,7 @@ def _values_per_element(entry: _Entry) -> int:
 def _lead(
     packed: Mapping[str, Any], entries: tuple[_Entry, ...]
 ) -> tuple[int, ...]:
-  """Returns the leading axes, of worlds and perhaps of time."""
+  """Returns the leading axes: worlds, and time if there is such an axis."""
   shape = np.shape(packed[entries[0].name])
   return shape[: len(shape) - len(entries[0].shape)]
 
@@ -164,10 +173,15 @@ def _take(
     dtype: str,
     num_envs: int,
 ) -> np.ndarray:
+  """Returns a copy of one entry of an observation.
+
+  Raises:
+    SpecError: If the entry is missing or has another shape.
+  """
   expected = (num_envs, *shape)
   if name not in observation:
     raise errors.SpecError(
-        f'observation: {name!r} is missing; given are {sorted(observation)}'
+        f'observation: {name!r} is missing; it has {sorted(observation)}'
     )
   value = np.array(observation[name], dtype)
   if value.shape != expected:
@@ -182,7 +196,7 @@ def _partner(
     spec: specs.Array,
     observation_spec: Mapping[str, specs.Array],
 ) -> str | None:
-  """Returns the key of the distances that belong to the classes of rays."""
+  """Returns the key of the distances for an entry of ray classes, if any."""
   if not name.endswith(_CLASSES) or not isinstance(spec, specs.BoundedArray):
     return None
   partner = name.removesuffix(_CLASSES) + _DISTANCES
@@ -191,10 +205,15 @@ def _partner(
 
 
 def _entry(name: str, spec: specs.Array, partner: str) -> _Entry:
+  """Returns the encoding of one entry of an observation spec.
+
+  Raises:
+    SpecError: If the entry is not numeric.
+  """
   dtype = np.dtype(spec.dtype)
   if dtype.kind not in 'biuf':
     raise errors.SpecError(
-        f'observation_spec {name!r}: dtype {dtype}; allowed are numbers'
+        f'observation_spec {name!r}: dtype {dtype}; allowed are numeric dtypes'
     )
   if dtype == np.uint8 and len(spec.shape) == 3:
     return _Entry(name, 'image', spec.shape, 'uint8')
@@ -205,13 +224,13 @@ def _entry(name: str, spec: specs.Array, partner: str) -> _Entry:
     return _Entry(name, 'rays', spec.shape, 'int32', low, high, partner)
   if not (np.isfinite([low, high]).all() and low < high):
     return _Entry(name, 'plain', spec.shape, 'float32')
-  if dtype.kind in 'iu' and high - low < _FEW:
+  if dtype.kind in 'iu' and high - low < _MAX_CATEGORIES:
     return _Entry(name, 'one_hot', spec.shape, 'int32', low, high)
   return _Entry(name, 'scaled', spec.shape, 'float32', low, high)
 
 
 def _bounds(spec: specs.Array) -> tuple[float, float]:
-  """Returns the bounds that hold for every element."""
+  """Returns the smallest lower and the largest upper bound of all elements."""
   if not isinstance(spec, specs.BoundedArray):
     return -np.inf, np.inf
   return float(np.min(spec.minimum)), float(np.max(spec.maximum))

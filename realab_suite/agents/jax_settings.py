@@ -1,9 +1,9 @@
-"""JAX's settings: those that change results are pinned, the others recorded.
+"""JAX settings that can change results, either pinned or recorded.
 
-Environment variables and programs set them, so the same command would otherwise
-give other results, or a traceback, on another machine. `pinned` holds for the
-computation of a learner alone: a program that uses JAX for itself keeps its own
-settings.
+Environment variables and programs can change these settings, so the same
+command could otherwise give other results, or a traceback, on another machine.
+`pinned` affects only the computations of learners: a program that uses JAX
+itself keeps its own settings.
 """
 
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 
-# Settings that can change results, and that no public context of JAX sets.
+# Settings that can change results, but have no public context manager in JAX.
 _RECORDED = (
     'eager_constant_folding',
     'jax_disable_jit',
@@ -25,13 +25,13 @@ _RECORDED = (
 
 @contextlib.contextmanager
 def pinned() -> Iterator[None]:
-  """Pins what JAX computes; as a context, or as a decorator of a function."""
+  """Pins JAX settings, as a context manager or a decorator of a function."""
   with (
       jax.enable_x64(False),
       jax.default_matmul_precision('highest'),
       jax.numpy_dtype_promotion('standard'),
       jax.numpy_rank_promotion('allow'),
-      # Random keys are pairs of numbers, which stand for keys of this kind.
+      # Learners pass raw pairs of numbers as random keys of this kind.
       jax.default_prng_impl('threefry2x32'),
       jax.threefry_partitionable(True),
       jax.legacy_prng_key('allow'),
@@ -41,7 +41,7 @@ def pinned() -> Iterator[None]:
 
 
 def recorded() -> dict[str, Any]:
-  """Returns the device and the settings that can change results."""
+  """Returns the device, and the settings that are not pinned, by name."""
   device = jax.devices()[0]
   return {
       'jax_device': f'{device.platform}, {device.device_kind}',

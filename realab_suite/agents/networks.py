@@ -1,4 +1,4 @@
-"""Networks: small ones, for vectors and images, and what their outputs mean."""
+"""Small networks for vectors and images, and distributions over actions."""
 
 import functools
 import math
@@ -17,7 +17,10 @@ _CONVOLUTIONS = ((16, 8, 4), (32, 4, 2))
 
 @final
 class Linear(eqx.Module):
-  """A linear map, orthogonal at first; any number of leading axes."""
+  """Linear layer with orthogonal initial weights.
+
+  Inputs may have any number of leading axes.
+  """
 
   weight: jax.Array
   bias: jax.Array
@@ -38,7 +41,10 @@ class Linear(eqx.Module):
 
 @final
 class Convolutions(eqx.Module):
-  """Two convolutions of an image of bytes; the output is a vector."""
+  """Two convolutions from an image of bytes to a vector.
+
+  Images have shape `(..., height, width, channels)`, outputs `(..., size)`.
+  """
 
   kernels: list[jax.Array]
   biases: list[jax.Array]
@@ -53,7 +59,12 @@ class Convolutions(eqx.Module):
 
   @staticmethod
   def output_size(height: int, width: int) -> int:
-    """How long the vector is for images of this size."""
+    """Returns the length of the output vector.
+
+    Args:
+      height: Height of the images, in pixels.
+      width: Width of the images, in pixels.
+    """
     for _, _, stride in _CONVOLUTIONS:
       height, width = -(-height // stride), -(-width // stride)
     return height * width * _CONVOLUTIONS[-1][0]
@@ -77,7 +88,7 @@ class Convolutions(eqx.Module):
 
 @final
 class Network(eqx.Module):
-  """From features to numbers: convolutions for images, then an MLP."""
+  """Network from features to numbers: convolutions for images, then an MLP."""
 
   convolutions: dict[str, Convolutions]
   layers: list[Linear]
@@ -90,14 +101,14 @@ class Network(eqx.Module):
       scale_out: float,
       generator: np.random.Generator,
   ) -> None:
-    """Makes a network for what an encoder gives.
+    """Makes a network for the features of an encoder.
 
     Args:
-      encoder: Whose output goes in.
-      hidden: The widths of the hidden layers.
-      size_out: How many numbers come out.
-      scale_out: Of the last layer's weights.
-      generator: Draws the weights.
+      encoder: Encoder whose features are the input.
+      hidden: Widths of the hidden layers.
+      size_out: Number of outputs.
+      scale_out: Scale of the last layer's initial weights.
+      generator: Random generator of the initial weights.
     """
     size = encoder.vector_size
     self.convolutions = {}
@@ -122,54 +133,73 @@ class Network(eqx.Module):
 
 
 def draw(key: jax.Array, logits: jax.Array) -> jax.Array:
-  """Draws indices with these logarithms of probabilities, `(...)`."""
-  # By default the mode is a setting of JAX.
+  """Draws indices from unnormalised log-probabilities.
+
+  Args:
+    key: Random key.
+    logits: Log-probabilities, `(..., choices)`.
+
+  Returns:
+    Indices, `(...)`.
+  """
+  # Without an explicit mode, a global JAX setting selects it.
   return jax.random.categorical(key, logits, mode='low')
 
 
 @final
 class Categorical(eqx.Module):
-  """One of many actions."""
+  """Distribution over discrete actions, with logits `(..., actions)`."""
 
   logits: jax.Array
 
   def sample(self, key: jax.Array) -> jax.Array:
+    """Draws one action for each distribution."""
     return draw(key, self.logits)
 
   def mode(self) -> jax.Array:
+    """Returns the most likely action of each distribution."""
     return jnp.argmax(self.logits, axis=-1)
 
   def log_prob(self, action: jax.Array) -> jax.Array:
+    """Returns the log-probability of the given actions, `(...)`."""
     log_probs = jax.nn.log_softmax(self.logits)
-    # A sum over actions; what a gather leaves behind is slow to differentiate.
+    # Use a sum over actions, because the gradient of a gather is slow.
     chosen = jax.nn.one_hot(action, self.logits.shape[-1])
     return jnp.sum(log_probs * chosen, axis=-1)
 
   def entropy(self) -> jax.Array:
+    """Returns the entropy of each distribution, `(...)`."""
     log_probs = jax.nn.log_softmax(self.logits)
     return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
 
 
 @final
 class Gaussian(eqx.Module):
-  """A vector, each element by itself."""
+  """Normal distribution over vectors, with independent elements.
+
+  The mean has shape `(..., elements)`, and `log_std` has `(elements,)`.
+  """
 
   mean: jax.Array
   log_std: jax.Array
 
   def sample(self, key: jax.Array) -> jax.Array:
+    """Draws one action for each distribution."""
     noise = jax.random.normal(key, self.mean.shape)
     return self.mean + jnp.exp(self.log_std) * noise
 
   def mode(self) -> jax.Array:
+    """Returns the most likely action of each distribution."""
     return self.mean
 
   def log_prob(self, action: jax.Array) -> jax.Array:
+    """Returns the log-probability of the given actions, `(...)`."""
     z = (action - self.mean) * jnp.exp(-self.log_std)
     per_element = -0.5 * (z**2 + math.log(2 * math.pi)) - self.log_std
     return jnp.sum(per_element, axis=-1)
 
   def entropy(self) -> jax.Array:
+    """Returns the entropy of each distribution, `(...)`."""
     per_element = self.log_std + 0.5 * math.log(2 * math.pi * math.e)
     entropy = jnp.sum(per_element)
     return jnp.broadcast_to(entropy, self.mean.shape[:-1])
@@ -177,7 +207,7 @@ class Gaussian(eqx.Module):
 
 @final
 class Policy(eqx.Module):
-  """From features to a distribution over actions."""
+  """Network from features to a distribution over actions."""
 
   network: Network
   log_std: jax.Array | None
@@ -190,14 +220,15 @@ class Policy(eqx.Module):
       is_discrete: bool,
       generator: np.random.Generator,
   ) -> None:
-    """Makes a policy that prefers nothing.
+    """Makes a policy whose initial output hardly depends on observations.
 
     Args:
-      encoder: Whose output goes in.
-      hidden: The widths of the hidden layers.
-      size: How many actions, or elements of an action.
-      is_discrete: Which of the two.
-      generator: Draws the weights.
+      encoder: Encoder whose features are the input.
+      hidden: Widths of the hidden layers.
+      size: Number of actions if they are discrete, otherwise of the elements of
+        an action.
+      is_discrete: True for discrete actions, False for vectors.
+      generator: Random generator of the initial weights.
     """
     self.network = Network(encoder, hidden, size, 0.01, generator)
     self.log_std = None if is_discrete else jnp.full(size, -0.5, jnp.float32)
@@ -217,7 +248,19 @@ def act(
     key: jax.Array,
     greedy: bool,
 ) -> tuple[jax.Array, jax.Array]:
-  """Returns what a policy does, and the logarithm of its probability."""
+  """Returns the actions of a policy, and the logarithms of their probabilities.
+
+  Args:
+    encoder: Encoder of observations.
+    policy: The policy.
+    observation: Packed observations.
+    key: Random key.
+    greedy: True to take the mode instead of drawing an action.
+
+  Returns:
+    Actions, `(worlds,)` or `(worlds, elements)`, and log-probabilities,
+    `(worlds,)`.
+  """
   distribution = policy(encoder.encode(observation))
   action = distribution.mode() if greedy else distribution.sample(key)
   return action, distribution.log_prob(action)
@@ -234,9 +277,9 @@ def probabilities(
 def _orthogonal(
     shape: tuple[int, ...], scale: float, generator: np.random.Generator
 ) -> jax.Array:
-  """Returns weights whose rows or columns are orthogonal to each other.
+  """Returns weights with orthogonal rows or columns.
 
-  In NumPy, for jax would first compile for seconds.
+  NumPy computes them, because jax would spend seconds on compilation.
   """
   rows, columns = math.prod(shape[:-1]), shape[-1]
   normal = generator.normal(size=(max(rows, columns), min(rows, columns)))

@@ -1,4 +1,4 @@
-"""Learning from what was just done: gather some steps, learn, forget them."""
+"""Base class of on-policy learners, which update on their latest steps only."""
 
 import abc
 from typing import Any
@@ -13,12 +13,12 @@ from realab_suite.agents import training
 
 
 class OnPolicyOptions(base.Options):
-  """What has to be known to learn from what was just done.
+  """Options of on-policy learners.
 
   Attributes:
-    steps_per_update: How many steps are gathered in each world.
-    epochs: How often each sample is used.
-    minibatch: About how many samples go into a gradient.
+    steps_per_update: Number of steps of each world between updates.
+    epochs: Number of times an update uses each sample.
+    minibatch: Approximate number of samples per gradient.
   """
 
   steps_per_update: base.Positive = 32
@@ -54,7 +54,7 @@ class OnPolicyLearner(base.Learner):
     }
 
   def _draw_minibatches(self) -> np.ndarray:
-    """Returns which samples go into which gradient of the next update."""
+    """Returns the sample indices of the next update's minibatches."""
     num_samples = self._options.steps_per_update * self._num_envs
     return training.draw_minibatches(
         self._options, num_samples, self._update_key()
@@ -74,15 +74,15 @@ class OnPolicyLearner(base.Learner):
 
   @abc.abstractmethod
   def _initial_networks(self, generator: np.random.Generator) -> Any:
-    """Returns networks before any learning, and the optimiser's state."""
+    """Returns the initial networks and the initial state of the optimiser."""
 
   @abc.abstractmethod
   def _learn(
       self, batch: dict[str, Any], observation: features.Packed
   ) -> dict[str, Any]:
-    """Learns from a batch, and returns metrics.
+    """Updates the networks with a batch, and returns metrics by name.
 
     Args:
       batch: Transitions, each array `(time, worlds, ...)`.
-      observation: What is seen after the last of them.
+      observation: Packed observation after the last transition.
     """

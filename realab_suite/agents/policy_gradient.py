@@ -1,4 +1,4 @@
-"""Policy gradient (PPO) on the reading of a register, taken for reward."""
+"""Policy gradient learner (PPO), with the reading of a register as reward."""
 
 from collections.abc import Mapping
 import functools
@@ -21,11 +21,11 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
   """Options of `policy_gradient`.
 
   Attributes:
-    reward: The register whose reading is taken for the reward.
-    gamma: The discount.
-    gae_lambda: How much later errors of the value count.
-    entropy: How much the entropy of the policy counts.
-    clip: How far a policy goes in one update.
+    reward: Name of the register whose reading is the reward.
+    gamma: Discount.
+    gae_lambda: Decay of generalised advantage estimates.
+    entropy: Weight of the policy's entropy in the loss.
+    clip: Largest change of a probability ratio in one update.
   """
 
   kind: Literal['policy_gradient']
@@ -38,7 +38,7 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
 
 @final
 class ActorCritic(eqx.Module):
-  """A policy, and the value of what it will do."""
+  """A policy and its value function."""
 
   policy: networks.Policy
   value: networks.Network
@@ -47,7 +47,7 @@ class ActorCritic(eqx.Module):
 @base.LEARNERS.add('policy_gradient')
 @final
 class PolicyGradient(on_policy.OnPolicyLearner):
-  """Proximal policy optimisation; discrete actions, or vectors."""
+  """Proximal policy optimisation, for discrete and for vector actions."""
 
   OPTIONS = PolicyGradientOptions
   READS = 'reward'
@@ -119,7 +119,10 @@ def _update(
     observation: features.Packed,
     indices: jax.Array,
 ) -> tuple[Any, dict[str, jax.Array]]:
-  """Learns from a batch, `(time, worlds)`, and from what is seen after it."""
+  """Updates the networks with a batch, `(time, worlds)`.
+
+  The observation after the batch bootstraps the values of its last steps.
+  """
   agent, _ = trained
   encoded = encoder.encode(batch['observation'])
   values = agent.value(encoded)[..., 0]

@@ -1,4 +1,4 @@
-"""Q-learning (double DQN) on the reading of a register, taken for reward."""
+"""Q-learning (double DQN), with the reading of a register as reward."""
 
 from collections.abc import Mapping
 import functools
@@ -21,19 +21,19 @@ class QLearningOptions(base.Options):
   """Options of `q_learning`.
 
   Attributes:
-    reward: The register whose reading is taken for the reward.
-    gamma: The discount.
-    num_returns: How many readings are summed before a value stands for the
-      rest.
-    exploration: How often an action is drawn at random in the end.
-    exploration_steps: Until when it is done more often, in control steps of all
-      worlds together.
-    replay_size: How many control steps are remembered.
-    min_replay: How many have to be before learning begins.
-    steps_per_update: How many steps of every world there are between updates.
-    gradients_per_update: How many steps of gradient descent an update has.
-    minibatch: How many samples go into a gradient.
-    target_rate: How fast the target network follows.
+    reward: Name of the register whose reading is the reward.
+    gamma: Discount.
+    num_returns: Number of readings to sum before a value estimates the rest.
+    exploration: Final probability of a random action.
+    exploration_steps: Number of control steps of all worlds after which the
+      probability of a random action has fallen from 1 to `exploration`.
+    replay_size: Capacity of the replay, in transitions of single worlds.
+    min_replay: Number of transitions to collect before the first update.
+    steps_per_update: Number of steps of each world between updates.
+    gradients_per_update: Number of gradient steps of an update.
+    minibatch: Number of samples per gradient.
+    target_rate: Share by which the target network moves towards the online
+      network in each gradient step.
   """
 
   kind: Literal['q_learning']
@@ -55,7 +55,7 @@ class QLearningOptions(base.Options):
 @base.LEARNERS.add('q_learning')
 @final
 class QLearning(base.Learner):
-  """Double DQN with a slow target network and sums of several readings."""
+  """Double DQN with n-step returns and a slowly updated target network."""
 
   OPTIONS = QLearningOptions
   READS = 'reward'
@@ -75,7 +75,7 @@ class QLearning(base.Learner):
     optimizer_state = training.optimizer(options).init(network)
     self._networks: Any = ((network, optimizer_state), network)
     self._scale = training.FeedbackScale(self._num_envs, options.gamma)
-    # Slots, in each a transition of every world; the oldest is overwritten.
+    # Each slot has a transition of every world. New ones replace the oldest.
     self._num_slots = max(
         options.replay_size // self._num_envs, options.num_returns + 2
     )
@@ -113,7 +113,7 @@ class QLearning(base.Learner):
   def _observe(
       self, transition: dict[str, Any], observation: features.Packed
   ) -> None:
-    del observation  # It comes again, as what the next action was chosen on.
+    del observation  # It is part of the next transition.
     self._scale.update(jax.tree.map(lambda x: x[np.newaxis], transition))
     self._store(transition)
     options = self._options
@@ -155,8 +155,8 @@ class QLearning(base.Learner):
       )
     slot = self._num_stored % self._num_slots
 
-    def write(kept: np.ndarray, new: np.ndarray) -> None:
-      kept[slot] = new
+    def write(stored: np.ndarray, new: np.ndarray) -> None:
+      stored[slot] = new
 
     jax.tree.map(write, self._replay, transition)
     self._num_stored += 1
@@ -176,9 +176,9 @@ class QLearning(base.Learner):
     }
 
   def _set_memory(self, memory: dict[str, Any]) -> None:
-    def grow(kept: np.ndarray) -> np.ndarray:
-      grown = np.zeros((self._num_slots, *kept.shape[1:]), kept.dtype)
-      grown[: len(kept)] = kept
+    def grow(stored: np.ndarray) -> np.ndarray:
+      grown = np.zeros((self._num_slots, *stored.shape[1:]), stored.dtype)
+      grown[: len(stored)] = stored
       return grown
 
     self._scale.set_state(memory['scale'])
@@ -192,33 +192,39 @@ def sample(
     num_stored: int,
     generator: np.random.Generator,
 ) -> dict[str, Any]:
-  """Draws minibatches, each array `(gradients, minibatch, ...)`.
+  """Draws minibatches of n-step returns from the replay.
 
-  Readings are summed until an episode ends, or is cut off: `factor` says how
-  much the value of what was seen then, `later`, stands for the rest.
+  Sums of readings end at the end of an episode, or after
+  `options.num_returns` steps.
 
   Args:
-    options: How many, and how long sums are.
-    replay: Transitions, `(slots, worlds, ...)`, the oldest overwritten.
-    num_stored: How many there have been.
-    generator: What draws.
+    options: Options of the learner.
+    replay: Transitions, each array `(slots, worlds, ...)`.
+    num_stored: Number of transitions of each world that were ever stored.
+    generator: Random generator.
+
+  Returns:
+    Arrays `(gradients, minibatch, ...)`: the `observation`, the `action`, the
+    discounted sum of readings after it (`total`), the observation at the end of
+    the sum (`later`), the discount of its value (`factor`), and a `weight` that
+    is 0 for samples without a valid reading.
   """
   num_slots, num_envs = replay['reading'].shape
   shape = (options.gradients_per_update, options.minibatch)
-  # Of the last ones it is not known yet what came after them.
+  # The latest transitions do not have `num_returns` successors yet.
   ages = generator.integers(
       options.num_returns + 1, min(num_stored, num_slots) + 1, shape
   )
   start = num_stored - ages
   world = generator.integers(num_envs, size=shape)
   total, factor = np.zeros(shape, np.float32), np.ones(shape, np.float32)
-  goes_on, length = np.ones(shape, bool), np.zeros(shape, int)
+  is_running, length = np.ones(shape, bool), np.zeros(shape, int)
   for i in range(options.num_returns):
     at = ((start + i) % num_slots, world)
-    goes_on = goes_on & replay['is_valid'][at]
-    total += np.where(goes_on, factor * replay['reading'][at], 0.0)
-    factor *= np.where(goes_on, options.gamma * replay['discount'][at], 1.0)
-    length += goes_on
+    is_running = is_running & replay['is_valid'][at]
+    total += np.where(is_running, factor * replay['reading'][at], 0.0)
+    factor *= np.where(is_running, options.gamma * replay['discount'][at], 1.0)
+    length += is_running
   begin = (start % num_slots, world)
   end = ((start + length) % num_slots, world)
   return {
@@ -240,10 +246,10 @@ def _act(
     key: jax.Array,
 ) -> jax.Array:
   values = network(encoder.encode(observation))
-  whether, which = jax.random.split(key)
+  explore_key, action_key = jax.random.split(key)
   best = jnp.argmax(values, axis=-1)
-  explores = jax.random.uniform(whether, best.shape) < exploration
-  drawn = jax.random.randint(which, best.shape, 0, values.shape[-1])
+  explores = jax.random.uniform(explore_key, best.shape) < exploration
+  drawn = jax.random.randint(action_key, best.shape, 0, values.shape[-1])
   return jnp.where(explores, drawn, best)
 
 
@@ -267,12 +273,12 @@ def _update(
     trained: Any,
     minibatches: dict[str, Any],
 ) -> tuple[Any, dict[str, jax.Array]]:
-  """Takes one step of gradient descent for each minibatch."""
+  """Takes one gradient step for each minibatch."""
 
   def one_step(carry: Any, data: dict[str, Any]) -> Any:
     online, target = carry
     later = encoder.encode(data['later'])
-    # Double: one network says which action is best, the other how good it is.
+    # Double DQN: one network selects the best action, the other evaluates it.
     best = jnp.argmax(online[0](later), axis=-1)
     value = _pick(target(later), best)
     data = {
@@ -302,6 +308,11 @@ def _loss(
 
 
 def _pick(values: jax.Array, action: jax.Array) -> jax.Array:
-  """Returns the value of one action, `(...)`."""
+  """Returns the value of the given action, `(...)`.
+
+  Args:
+    values: Values of all actions, `(..., actions)`.
+    action: Indices of actions, `(...)`.
+  """
   chosen = jax.nn.one_hot(action, values.shape[-1])
   return jnp.sum(values * chosen, axis=-1)

@@ -1,4 +1,4 @@
-"""Training: optimiser, minibatches, the scale of feedback, advantages."""
+"""Shared parts of learners: optimiser, minibatches, advantages, scaling."""
 
 from collections.abc import Callable
 from typing import Any, final
@@ -14,7 +14,7 @@ Loss = Callable[[Any, Any], tuple[jax.Array, dict[str, jax.Array]]]
 
 
 def optimizer(options: base.Options) -> optax.GradientTransformation:
-  """Returns Adam, with the length of gradients limited."""
+  """Returns the Adam optimiser with clipping of gradient norms."""
   return optax.chain(
       optax.clip_by_global_norm(options.max_gradient_norm),
       optax.adam(options.learning_rate, eps=1e-5),
@@ -24,7 +24,17 @@ def optimizer(options: base.Options) -> optax.GradientTransformation:
 def descend(
     options: base.Options, loss: Loss, trained: Any, data: Any
 ) -> tuple[Any, dict[str, jax.Array]]:
-  """Takes one step of gradient descent; returns what `run_epochs` does."""
+  """Takes one gradient step.
+
+  Args:
+    options: Options of the optimiser.
+    loss: Function from a network and data to a loss and metrics.
+    trained: A network and the optimiser's state.
+    data: Minibatch, a pytree of arrays.
+
+  Returns:
+    The new network and optimiser's state, and the metrics.
+  """
   network, optimizer_state = trained
   gradient, metrics = jax.grad(loss, has_aux=True)(network, data)
   updates, optimizer_state = optimizer(options).update(
@@ -34,11 +44,13 @@ def descend(
 
 
 def exploration(options: Any, num_steps: int) -> np.float32:
-  """Returns how often an action is drawn at random now.
+  """Returns the current probability of a random action.
+
+  It falls linearly from 1 to `options.exploration`.
 
   Args:
     options: Options with `exploration` and `exploration_steps`.
-    num_steps: How many control steps there have been, of all worlds together.
+    num_steps: Number of control steps so far, summed over worlds.
   """
   spent = min(num_steps / options.exploration_steps, 1.0)
   return np.float32(1.0 + spent * (options.exploration - 1.0))
@@ -47,15 +59,16 @@ def exploration(options: Any, num_steps: int) -> np.float32:
 def draw_minibatches(
     options: Any, num_samples: int, key: np.ndarray
 ) -> np.ndarray:
-  """Draws which samples go into which gradient, `(gradients, minibatch)`.
+  """Draws the sample indices of minibatches, `(gradients, minibatch)`.
 
-  In NumPy, which is faster at it than jax.
+  An epoch uses each sample once, except for the remainder if the number of
+  samples is not a multiple of the number of minibatches. NumPy draws the
+  indices, because it is faster than jax.
 
   Args:
     options: Options with `epochs` and `minibatch`.
-    num_samples: How many samples there are; each is used once in an epoch, but
-      for the few that are left over if the numbers do not divide.
-    key: A random key.
+    num_samples: Number of samples.
+    key: Random key.
   """
   num_minibatches = max(1, num_samples // options.minibatch)
   size = num_samples // num_minibatches
@@ -68,17 +81,17 @@ def draw_minibatches(
 def run_epochs(
     options: base.Options, loss: Loss, trained: Any, data: Any, indices: Any
 ) -> tuple[Any, dict[str, jax.Array]]:
-  """Takes a step of gradient descent for each minibatch.
+  """Takes one gradient step for each minibatch.
 
   Args:
-    options: How fast.
-    loss: From a network and a minibatch to a loss and metrics.
+    options: Options of the optimiser.
+    loss: Function from a network and a minibatch to a loss and metrics.
     trained: A network and the optimiser's state.
-    data: A pytree of arrays, `(time, worlds, ...)`.
-    indices: What `draw_minibatches` returned.
+    data: A pytree of arrays, each `(time, worlds, ...)`.
+    indices: Sample indices from `draw_minibatches`, `(gradients, minibatch)`.
 
   Returns:
-    What is trained now, and the means of the metrics.
+    The new network and optimiser's state, and the means of the metrics.
   """
   samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), data)
 
@@ -91,12 +104,12 @@ def run_epochs(
 
 
 def mean(x: jax.Array, weight: jax.Array) -> jax.Array:
-  """The mean of what has weight 1; 0 if nothing has."""
+  """Returns the mean of the elements with weight 1; 0 if there are none."""
   return jnp.sum(x * weight) / jnp.maximum(jnp.sum(weight), 1.0)
 
 
 def standardize(x: jax.Array, weight: jax.Array) -> jax.Array:
-  """Returns x less its mean, over its standard deviation."""
+  """Returns x minus its weighted mean, divided by its standard deviation."""
   centered = x - mean(x, weight)
   return centered / (jnp.sqrt(mean(centered**2, weight)) + 1e-8)
 
@@ -104,7 +117,13 @@ def standardize(x: jax.Array, weight: jax.Array) -> jax.Array:
 def clipped_objective(
     log_ratio: jax.Array, advantage: jax.Array, clip: float
 ) -> jax.Array:
-  """PPO's objective: no gain from leaving the old policy far behind."""
+  """Returns PPO's clipped objective of each sample.
+
+  Args:
+    log_ratio: Logarithm of new over old probability of each action.
+    advantage: Advantage of each action.
+    clip: Largest change of a probability ratio that raises the objective.
+  """
   ratio = jnp.exp(log_ratio)
   clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
   return jnp.minimum(ratio * advantage, clipped * advantage)
@@ -117,25 +136,25 @@ def advantages(
     gamma: float,
     gae_lambda: float,
 ) -> jax.Array:
-  """Generalized advantage estimates, `(time, worlds)`.
+  """Returns generalised advantage estimates, `(time, worlds)`.
 
-  Where an episode was cut off (the last step, discount 1) the value of what was
-  seen last stands for the rest; where it ended (discount 0), nothing does.
+  The value of the last observation estimates the rest of a truncated episode
+  (discount 1). A terminated episode has no further value (discount 0).
 
   Args:
-    batch: `reading`, `discount` and `is_valid` of what came of each choice,
-      `(time, worlds)`; the step after an episode's last one is not valid.
-    values: Of the observations.
-    next_values: Of the observations one step later.
-    gamma: The learner's own discount.
-    gae_lambda: How much later errors of the value count.
+    batch: `reading`, `discount` and `is_valid` of the step after each choice,
+      each `(time, worlds)`. The step that begins an episode is not valid.
+    values: Values of the observations, `(time, worlds)`.
+    next_values: Values of the observations one step later, `(time, worlds)`.
+    gamma: Discount of the learner.
+    gae_lambda: Decay of the estimates.
   """
   discount = gamma * batch['discount']
   errors = batch['reading'] + discount * next_values - values
 
   def back(later: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
     error, factor, is_valid = now
-    # Nothing came of an ignored action, and nothing before it depends on it.
+    # An ignored action has no outcome, and separates two episodes.
     advantage = jnp.where(is_valid, error + factor * later, 0.0)
     return advantage, advantage
 
@@ -150,21 +169,28 @@ def advantages(
 
 @final
 class FeedbackScale:
-  """The running standard deviation of the discounted sum of feedback.
+  """Running standard deviation of the discounted sum of feedback.
 
-  Without it an agent whose feedback is a sum of rare apples learns nothing: one
-  that holds a register off its place gets a thousand times more.
+  Learners divide feedback by it. Without that, an agent whose feedback is a sum
+  of rare apples does not learn; one that holds a register displaced gets a
+  thousand times more feedback.
   """
 
   def __init__(self, num_envs: int, gamma: float) -> None:
+    """Makes a scale.
+
+    Args:
+      num_envs: Number of worlds.
+      gamma: Discount of the sum; 0 for single readings.
+    """
     self._gamma = gamma
     self._sums = np.zeros(num_envs)
-    # Count, sum and sum of squares of what the sums have been.
+    # Count, sum and sum of squares of all sums so far.
     self._moments = np.zeros(3)
 
   @property
   def value(self) -> float:
-    """What to divide feedback by."""
+    """Divisor of the feedback."""
     count, total, squares = self._moments
     if count < 2:
       return 1.0
@@ -172,7 +198,11 @@ class FeedbackScale:
     return float(np.sqrt(max(variance, 0.0)) + 1e-4)
 
   def update(self, batch: dict[str, np.ndarray]) -> None:
-    """Takes in readings and what came with them, `(time, worlds)`."""
+    """Updates the scale with the transitions of a batch.
+
+    Args:
+      batch: Arrays with `reading` and `is_valid`, each `(time, worlds)`.
+    """
     for reading, is_valid in zip(
         batch['reading'], batch['is_valid'], strict=True
     ):
@@ -182,7 +212,9 @@ class FeedbackScale:
       self._sums = np.where(is_valid, sums, 0.0)
 
   def state(self) -> dict[str, np.ndarray]:
+    """Returns the statistics as plain data."""
     return {'sums': self._sums, 'moments': self._moments}
 
   def set_state(self, state: dict[str, np.ndarray]) -> None:
+    """Continues from a state that `state` returned."""
     self._sums, self._moments = state['sums'], state['moments']

@@ -1,1 +1,4 @@
-"""Configuration files: reading, validation, registries and messages."""
+"""Configuration files: reading, validation, registries and messages.
+
+The package contains nothing about designs or experiments.
+"""

@@ -1,7 +1,8 @@
-"""Follows keys and indices through annotations, together with the data.
+"""Traversal of type annotations together with the data that they describe.
 
-If a note in an `Annotated` has a method `members(siblings)`, that method
+If the metadata of an `Annotated` has a method `members(siblings)`, the method
 returns the types that are allowed at its location, given the values beside it.
+This module reports locations and types; it validates nothing.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,7 +21,7 @@ Path = tuple[str | int, ...]
 def locate(
     location: Sequence[str | int], annotation: Any, data: Any
 ) -> tuple[Path, list[Any]]:
-  """Follows a location of pydantic through the types and through the data.
+  """Converts a location reported by pydantic to a path in the data.
 
   Pydantic's locations also name the member that it chose from a union. That
   name is not part of the path.
@@ -42,8 +43,8 @@ def locate(
         if isinstance(data, Mapping)
         else isinstance(data, (list, tuple)) and component in range(len(data))
     )
-    # Without a type to follow, the data tells keys from names of members; only
-    # the last key may be missing there. '[key]' says that a key is wrong.
+    # Without a type, a component is a key if the data has it; the last key may
+    # be missing. Pydantic marks a wrong key with '[key]'.
     if component == '[key]' or not (found or is_present or not components):
       continue
     path.append(component)
@@ -53,14 +54,14 @@ def locate(
 
 
 def paths_in(annotation: Any, data: Any) -> Iterator[tuple[Path, str]]:
-  """Yields the texts that a type declares as paths of files.
+  """Yields the strings that a type declares as paths of files.
 
   Args:
     annotation: The type.
     data: Plain data, valid or not.
 
   Yields:
-    The keys and indices that lead to a text, and the text.
+    The keys and indices that lead to a string, and the string.
   """
   yield from _paths_in([annotation], data, ())
 
@@ -94,7 +95,7 @@ def _paths_in(
 def _children(
     found: Sequence[Any], component: str | int, data: Any
 ) -> list[Any]:
-  """Returns the types that some types allow at a key or index of the data."""
+  """Returns the types that `found` allows at a key or index of the data."""
   siblings = data if isinstance(data, Mapping) else {}
   return [
       child
@@ -110,7 +111,7 @@ def _child(
     child = annotation.annotations.get(str(component), annotation.others)
     return _members(child, {**annotation.defaults, **siblings})
   if _is_model(annotation):
-    # By their own names, which some models admit, and by those users write.
+    # By name, which some models accept, and by alias, which users write.
     fields = {**annotation.model_fields, **_fields(annotation)}
     if component not in fields:
       return []
@@ -128,7 +129,7 @@ def _child(
 
 
 def _key_types(found: Sequence[Any]) -> list[Any]:
-  """Returns the types of the keys of mappings."""
+  """Returns the types of keys, for each type of a mapping."""
   return [
       member
       for annotation in found
@@ -138,8 +139,8 @@ def _key_types(found: Sequence[Any]) -> list[Any]:
 
 
 def _members(annotation: Any, siblings: Mapping[str, Any]) -> list[Any]:
-  """Returns the types that a union joins, leaving out None."""
-  # A `NewType` and a `type` statement hold their types in these.
+  """Returns the members of a union, without None."""
+  # Attributes of a `NewType` and of a `type` statement that hold the type.
   for attribute in ('__supertype__', '__value__'):
     annotation = getattr(annotation, attribute, annotation)
   origin = typing.get_origin(annotation)
@@ -167,7 +168,7 @@ def _members(annotation: Any, siblings: Mapping[str, Any]) -> list[Any]:
 
 
 def _answers_to(annotation: Any, label: str | int) -> bool:
-  """Returns True if pydantic calls this type so as a member of a union."""
+  """Returns True if pydantic uses the label for this member of a union."""
   return _is_model(annotation) and (
       annotation.__name__ == label
       or any(label in values for values in _literals(annotation).values())
@@ -175,7 +176,7 @@ def _answers_to(annotation: Any, label: str | int) -> bool:
 
 
 def _fits(annotation: Any, data: Mapping[str, Any]) -> bool:
-  """Returns True unless a literal in a mapping rules out a type."""
+  """Returns True unless a literal field of the type excludes the data."""
   return not _is_model(annotation) or all(
       data.get(key, values[0]) in values
       for key, values in _literals(annotation).items()
@@ -183,7 +184,7 @@ def _fits(annotation: Any, data: Mapping[str, Any]) -> bool:
 
 
 def _literals(model_class: Any) -> dict[str, tuple[Any, ...]]:
-  """Returns the values that a model's literal fields allow, by key."""
+  """Returns the allowed values of a model's literal fields, by key."""
   return {
       key: typing.get_args(field.annotation)
       for key, field in _fields(model_class).items()
@@ -200,7 +201,7 @@ def _is_model(annotation: Any) -> bool:
 def _fields(
     model_class: type[pydantic.BaseModel],
 ) -> dict[str, pydantic_fields.FieldInfo]:
-  """Returns the fields of a model by the keys that a user writes."""
+  """Returns the fields of a model, by the keys that users write."""
   return {
       alias if isinstance(alias := field.validation_alias, str) else name: field
       for name, field in model_class.model_fields.items()
@@ -208,10 +209,10 @@ def _fields(
 
 
 def _hints(annotation: Any) -> dict[Any, Any]:
-  """Returns the types within a typed dict, dataclass or named tuple."""
+  """Returns the types of the fields of a typed dict, dataclass or tuple."""
   try:
     hints = typing.get_type_hints(annotation, include_extras=True)
   except (NameError, TypeError):
     return {}
-  # Plain data have a list for a named tuple.
+  # A named tuple is a list in plain data.
   return {**hints, **dict(enumerate(hints.values()))}

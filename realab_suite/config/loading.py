@@ -1,16 +1,14 @@
-"""Reads descriptions that strangers may have written, and says what is wrong.
+"""Reading of untrusted YAML files and mappings, and overrides of their values.
 
-A description is a YAML file, or a mapping of the same shape. Nothing is ever
-constructed by the YAML library: it only splits the text into events, and this
-module builds mappings, lists, strings, numbers, booleans and nulls from them.
-Anchors, aliases, tags and directives are refused.
+A description is a YAML file, or a mapping of the same shape. The YAML library
+constructs no objects: it only splits the text into events, and this module
+builds mappings, lists, strings, numbers, booleans and nulls from them. Anchors,
+aliases, tags and directives are refused.
 
-YAML 1.1, which PyYAML reads, and YAML 1.2 disagree about unquoted words. Here
-`true`, `false`, `null`, `~`, plain decimal integers and decimal floats (`1e3`
-too) mean what they look like. Whatever YAML 1.1 would turn into something else,
-such as `yes`, `012`, `1:30`, `1_000`, `0x1f` or `2024-01-01`, is refused where
-it stands: to keep it as text could be as wrong as to convert it, and a field
-that takes any text would not notice.
+Unquoted `true`, `false`, `null`, `~`, plain decimal integers and decimal floats
+(including `1e3`) have their usual meaning. Other words that YAML 1.1 converts,
+such as `yes`, `012`, `1:30`, `0x1f` or `2024-01-01`, are refused, because YAML
+1.2 keeps them as text. `validation` checks descriptions against a schema.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,13 +29,13 @@ from realab_suite.config import messages
 _MAX_BYTES = 2**20
 _MAX_DEPTH = 32
 _MAX_ENTRIES = 1000
-# Of all collections together; bounds a mapping that repeats one list for ever.
+# In all collections together; bounds mappings that contain one list many times.
 _MAX_VALUES = 100_000
-# Integers beyond this are not exact as the floats that they may become.
+# Larger integers are not exact as floats, and a field may convert them.
 _MAX_INT = 2**53
 
-# Control, format (which includes the bidirectional ones and the byte order
-# mark), surrogate, line separator and paragraph separator.
+# Categories of Unicode: control, format (which includes bidirectional marks and
+# the byte order mark), surrogate, line separator and paragraph separator.
 _FORBIDDEN_CATEGORIES = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
 
 _NULL = re.compile(r'~|null|Null|NULL|')
@@ -49,9 +47,9 @@ _FLOAT = re.compile(
     r'([eE][-+]?[0-9]+)?'
 )
 _NOT_FINITE = re.compile(r'[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)')
-# Words that a person may mean as a boolean, and octal as YAML 1.2 spells it.
+# Words that are often meant as booleans, and octal numbers of YAML 1.2.
 _AMBIGUOUS = re.compile(r'(?i:yes|no|on|off)|[-+]?0[oO][0-7]+')
-# Paths that other programs or other systems take out of a directory.
+# Paths that other programs or systems resolve outside of a directory.
 _LEADS_ELSEWHERE = re.compile(
     r'~|[A-Za-z]:|[A-Za-z][\w+.-]*://|.*\\', re.DOTALL
 )
@@ -67,15 +65,15 @@ def read_mapping(
   """Returns a checked description that shares nothing with its source.
 
   Args:
-    source: Path of a YAML file, or a mapping of the kind that one holds. Tuples
-      in it become lists, -0.0 becomes 0.0, and subclasses of the plain types
-      (such as NumPy's float64) become the plain types.
-    where: What error messages call the source. Default: the path.
+    source: Path of a YAML file, or a mapping of the same shape. Tuples in it
+      become lists, -0.0 becomes 0.0, and subclasses of the plain types (such as
+      NumPy's float64) become the plain types.
+    where: Name of the source in error messages. Default: the path.
 
   Raises:
-    SpecError: If the file cannot be read, or holds anything but what this
-      module's docstring allows; or if the mapping could not have come from
-      such a file.
+    SpecError: If the file cannot be read, if it contains something that this
+      module's docstring does not allow, or if a mapping contains something that
+      such a file cannot contain.
   """
   if isinstance(source, Mapping):
     return _copy_mapping(source, messages.Location(where or '<mapping>'))
@@ -89,15 +87,15 @@ def read_mapping(
 
 
 def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
-  """Returns the mapping that a YAML text holds.
+  """Returns the mapping that a YAML text contains.
 
   Args:
     text: One YAML document, as text or in UTF-8.
-    where: What error messages call the text, usually a file's name.
+    where: Name of the text in error messages, usually that of a file.
 
   Raises:
     SpecError: If the text is not YAML, not a mapping, or not allowed by this
-      module's docstring. No other error is raised, whatever the text.
+      module's docstring. No text causes another error.
   """
   documents = _documents(text, where)
   if len(documents) != 1:
@@ -114,15 +112,15 @@ def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
 def is_inside(path: str) -> bool:
   """Returns True if a path is within the working directory, links followed.
 
-  A file may name such paths only: its author need not be its reader. URLs and
-  paths with a leading `~`, a drive or a backslash count as outside everywhere.
+  Files may name only such paths, because their author may be untrusted. URLs
+  and paths with a leading `~`, a drive or a backslash are always outside.
   """
   if _LEADS_ELSEWHERE.match(path):
     return False
   root = os.path.realpath(os.curdir)
   try:
     return os.path.commonpath([root, os.path.realpath(path)]) == root
-  except ValueError:  # Not a path at all.
+  except ValueError:  # The text is not a valid path.
     return False
 
 
@@ -132,14 +130,14 @@ def apply_overrides(
   """Returns a copy of the data with some of its values replaced.
 
   Args:
-    data: What `read_mapping` returned. It is left as it is.
+    data: Result of `read_mapping`. It is not changed.
     overrides: Texts such as `registers.reward.scale=0.2` or
-      `providers.0.kind=constant`. The value is YAML. Missing mappings on the
-      way are created; entries of lists can be replaced but not added.
+      `providers.0.kind=constant`. The value is YAML. Missing mappings along the
+      keys are created; entries of lists can be replaced but not added.
 
   Raises:
-    SpecError: If an override is malformed or leads through something that is
-      neither a mapping nor a list.
+    SpecError: If an override is malformed, or if one of its keys leads into a
+      value that is neither a mapping nor a list.
   """
   result = _copy_mapping(data, messages.Location('<mapping>'))
   for override in overrides:
@@ -159,24 +157,24 @@ def apply_overrides(
           f' {len(documents)}'
       )
     _assign(result, keys, documents[0], location)
-    # The new value may be too deep or one too many where it stands now.
+    # With the new value, the data may be too deep or have too many entries.
     result = _copy_mapping(result, location)
   return result
 
 
 def keys_of(override: str) -> list[str]:
-  """Returns the keys that lead to what an override sets."""
+  """Returns the keys that lead to the value that an override sets."""
   return override.partition('=')[0].split('.')
 
 
 @typing.final
 @dataclasses.dataclass
 class _Frame:
-  """A mapping or list that is being built."""
+  """Mapping or list that is being built."""
 
   container: dict[str, Any] | list[Any]
   location: messages.Location
-  # The key that waits for its value, and the lines of all keys so far.
+  # The key without a value so far, and the lines of all keys so far.
   key: str | None = None
   key_lines: dict[str, int] = dataclasses.field(default_factory=dict)
 
@@ -211,9 +209,9 @@ class _Frame:
 
 
 def _documents(text: str | bytes, where: str) -> list[Any]:
-  """Returns the value of each document; an empty text has none."""
+  """Returns the value of each document; an empty text has no document."""
   documents: list[Any] = []
-  # A stack of our own, because depth must not depend on Python's.
+  # An explicit stack: Python's recursion limit must not limit the depth.
   stack: list[_Frame] = []
   budget = iter(range(_MAX_VALUES))
   for event, line in _events(_decode(text, messages.Location(where)), where):
@@ -241,7 +239,7 @@ def _documents(text: str | bytes, where: str) -> list[Any]:
 
 
 def _node_value(event: Any, location: messages.Location) -> Any:
-  """Returns the scalar, or the still empty collection, that an event is."""
+  """Returns the scalar, or the new empty collection, of an event."""
   if event.anchor is not None:
     raise location.error('anchors and aliases are not allowed')
   if event.tag is not None:
@@ -267,7 +265,7 @@ def _events(text: str, where: str) -> Iterator[tuple[Any, int]]:
         raise messages.Location(where, line=line).error(
             f'{error.problem}'
         ) from None
-      # A tag that escapes bytes which are no text is a UnicodeDecodeError.
+      # A tag with escaped bytes that are not UTF-8 is a UnicodeDecodeError.
       except (yaml.YAMLError, UnicodeError) as error:
         problem = ' '.join(str(error).split())
         raise messages.Location(where).error(f'not YAML: {problem}') from None
@@ -283,8 +281,8 @@ def _line(mark: Any) -> int | None:
 
 
 def _decode(text: str | bytes, location: messages.Location) -> str:
-  """Returns the text with plain newlines, checked as a whole."""
-  # A lone surrogate is reported as a character, with its line.
+  """Returns the text with plain newlines, after checking its characters."""
+  # Lone surrogates pass here, so that they are reported with their line.
   content = (
       text.encode('utf-8', 'surrogatepass') if isinstance(text, str) else text
   )
@@ -305,7 +303,7 @@ def _decode(text: str | bytes, location: messages.Location) -> str:
 
 
 def _read_file(path: str, location: messages.Location) -> bytes:
-  # Opening a named pipe would wait for ever, so the kind is checked first.
+  # Opening a named pipe would block, so the type is checked first.
   if not os.path.isfile(path):
     exists = os.path.exists(path)
     raise location.error('not a file' if exists else 'no such file')
@@ -315,7 +313,7 @@ def _read_file(path: str, location: messages.Location) -> bytes:
       content = stream.read(_MAX_BYTES + 1)
   except OSError as error:
     raise location.error(f'cannot be read: {error.strerror}') from None
-  # A file that grows, or that reports no size, is caught by its content.
+  # The content counts if the file grows or reports no size.
   _check_size(max(size, len(content)), location)
   return content
 
@@ -323,7 +321,7 @@ def _read_file(path: str, location: messages.Location) -> bytes:
 def _resolve(
     text: str, location: messages.Location
 ) -> bool | int | float | str | None:
-  """Returns what an unquoted scalar means."""
+  """Returns the value of an unquoted scalar."""
   if _NULL.fullmatch(text):
     return None
   if _TRUE.fullmatch(text):
@@ -331,7 +329,7 @@ def _resolve(
   if _FALSE.fullmatch(text):
     return False
   if _INT.fullmatch(text):
-    # Python refuses to convert thousands of digits.
+    # Python cannot convert thousands of digits.
     if len(text.lstrip('+-')) > len(str(_MAX_INT)):
       raise location.error(f'integer {messages.quote(text)} is out of range')
     return int(text)
@@ -365,7 +363,7 @@ def _copy_mapping(
 def _copy(
     value: Any, location: messages.Location, depth: int, budget: Iterator[int]
 ) -> Any:
-  """Returns a copy of a value, which stands `depth - 1` collections deep."""
+  """Returns a copy of a value that `depth - 1` collections contain."""
   _spend(budget, location)
   if isinstance(value, Mapping):
     _check_depth(depth, location)
@@ -414,16 +412,16 @@ def _checked_scalar(
   if isinstance(value, float):
     if not math.isfinite(value):
       raise location.error(f'must be finite, got {value}')
-    # MuJoCo's reader of numbers takes one that has lost digits for too large.
+    # MuJoCo's parser reports a subnormal number as out of range.
     if 0 < abs(value) < sys.float_info.min:
       raise location.error(f'number {value} is out of range')
-    # Equal descriptions must print alike, and -0.0 equals 0.0.
+    # Adding 0.0 turns -0.0 into 0.0: equal descriptions have equal texts.
     return float(value) + 0.0
   if isinstance(value, str):
     character = _forbidden_character(value)
     if character is not None:
       raise _character_error(character, location)
-    # Not str(value), which is the name of a member of a text enum.
+    # Not str(value): a subclass, such as a text enum, may override it.
     return str.__str__(value)
   raise location.error(
       'expected a mapping, list, string, number, boolean or null, got'
@@ -432,7 +430,7 @@ def _checked_scalar(
 
 
 def _forbidden_character(text: str) -> str | None:
-  """Returns the first character that is not allowed, newlines being fine."""
+  """Returns the first forbidden character of a text; newlines are allowed."""
   found = {
       c
       for c in set(text) - {'\n'}
@@ -476,13 +474,13 @@ def _assign(
     value: Any,
     location: messages.Location,
 ) -> None:
-  """Sets the value at the end of the keys, within a mapping of our own."""
+  """Sets the value at the end of the keys, in place."""
   node: Any = data
   for depth, key in enumerate(keys):
     is_last = depth == len(keys) - 1
     position: str | int = key
     if isinstance(node, list):
-      # Compared as text, since a long key is no integer that Python accepts.
+      # Compared as text, because Python cannot convert very long integers.
       if key not in map(str, range(len(node))):
         raise location.error(
             f'index {messages.quote(key)} is not one of the {len(node)}'

@@ -1,4 +1,7 @@
-"""How messages show locations in a description, and what stands there."""
+"""Formatting of locations and values in error messages.
+
+The module does not decide what is wrong.
+"""
 
 from collections.abc import Sequence
 import dataclasses
@@ -13,7 +16,7 @@ _MAX_LENGTH = 80
 @final
 @dataclasses.dataclass(frozen=True)
 class Location:
-  """Where a value stands, as error messages name it."""
+  """Location of a value: a source, a path of keys and a line."""
 
   where: str
   path: tuple[str | int, ...] = ()
@@ -26,15 +29,15 @@ class Location:
     where = self.where if self.line is None else f'{self.where}:{self.line}'
     parts = (where, format_path(self.path), problem)
     message = ': '.join(part for part in parts if part)
-    # File names, keys and messages of validators may hold anything; an error
-    # is one line that a terminal shows as it is.
+    # File names, keys and texts of validators may contain any character. An
+    # error is one line of printable characters.
     return errors.SpecError(
         ''.join(c if c.isprintable() else repr(c)[1:-1] for c in message)
     )
 
 
 def format_path(path: Sequence[str | int]) -> str:
-  """Returns a path as users write it: `registers.reward.range[1]`."""
+  """Returns a path of keys as text: `registers.reward.range[1]`."""
   text = ''
   for part in path:
     if isinstance(part, int):
@@ -47,7 +50,7 @@ def format_path(path: Sequence[str | int]) -> str:
 
 
 def quote(value: object) -> str:
-  """Returns the repr of a value, cut to a length that an error can hold."""
+  """Returns the repr of a value, cut to a length that fits a message."""
   try:
     text = ' '.join(repr(value).split())
   except Exception:  # For instance an integer too long for Python to print.

@@ -1,10 +1,10 @@
-"""Options: keyword arguments that a design gives to a registered class.
+"""Names and types of options: keyword arguments of registered classes.
 
 A design names a policy, a value function or a kind of register, and gives it
-`options`. The parameters of the class declare which options there are, and
-their annotations declare the types, including constraints such as
+`options`. The parameters of the class declare the options, and their
+annotations declare the types, including constraints such as
 `Annotated[float, pydantic.Field(gt=0)]`. An option that is the path of a file
-is a `FilePath`.
+has the type `FilePath`; `validation` checks whether it may be opened.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -27,14 +27,14 @@ from realab_suite.config import registry
 _IS_PATH = object()
 
 FilePath = Annotated[str, _IS_PATH]
-"""The path of a file.
+"""Path of a file.
 
-`specs.load` finds options and fields of this type at any depth of a design and
-refuses those that a file sets and that lead out of the working directory,
-before any of them is opened. `os.PathLike` and `pathlib.Path` are paths too.
+`specs.load` finds options and fields of this type at any depth of a design. It
+refuses paths in a file that lead out of the working directory, before any of
+them is opened. `os.PathLike` and `pathlib.Path` declare paths as well.
 """
 
-# The types of what a file can hold.
+# Types of the values that a file can contain.
 _PLAIN = (str, int, float, bool, types.NoneType, list, dict)
 _BY_NAME = (
     inspect.Parameter.POSITIONAL_OR_KEYWORD,
@@ -44,7 +44,7 @@ _BY_NAME = (
 
 @final
 class NameIn:
-  """Annotation of a field or option that is a name in a registry."""
+  """Annotation of a field or option whose value is a name in a registry."""
 
   def __init__(self, names: registry.Registry[Any]) -> None:
     self._names = names
@@ -64,10 +64,10 @@ class NameIn:
 
 @final
 class OptionsOf:
-  """Annotation of a field or option that holds the options of a named class.
+  """Annotation of a field or option that contains the options of a class.
 
-  The value is checked and stays as it is: defaults are not filled in, so what
-  a design says, and its digest, do not depend on what a class declares.
+  The value is checked and stays unchanged. Defaults are not filled in, so that
+  a design and its digest do not depend on the defaults of a class.
   """
 
   def __init__(
@@ -81,12 +81,12 @@ class OptionsOf:
     """Makes the annotation.
 
     Args:
-      names: The registry that the class is registered in.
-      field: The field or option beside this one that holds the name; it has to
-        be declared before this one.
-      method: The method of a class whose parameters are the options.
-      reserved: A function whose parameters are no options, because they are
-        given in another way.
+      names: Registry of the class.
+      field: Field or option beside this one that contains the name. It must be
+        declared before this one.
+      method: Method of a class whose parameters are the options.
+      reserved: Function whose parameters are not options, because their values
+        come from elsewhere.
     """
     self._names = names
     self._field = field
@@ -102,10 +102,10 @@ class OptionsOf:
     return [] if declared is None else [declared]
 
   def _declared(self, siblings: Mapping[str, Any]) -> 'Options | None':
-    """Returns the options that there are, or `None` where the name is unknown.
+    """Returns the declared options, or `None` if the name is unknown.
 
     Args:
-      siblings: The fields or options beside this one, by name.
+      siblings: Values of the fields or options beside this one, by name.
 
     Raises:
       ValueError: If the declaration of the options cannot be read.
@@ -136,13 +136,13 @@ class OptionsOf:
 
 @final
 class Options:
-  """The options that a class or function declares.
+  """Options that a class or function declares.
 
   Attributes:
-    annotations: The types, by name; `Any` where none is declared.
-    defaults: The values of options that can be left out, by name.
-    others: The type of options with any other name, or `None` where there are
-      none.
+    annotations: Types, by name; `Any` for an option without annotation.
+    defaults: Values of optional options, by name.
+    others: Type of options with any other name, or `None` if no other name is
+      allowed.
   """
 
   def __init__(
@@ -156,13 +156,13 @@ class Options:
     self.others = others
 
   def check(self, given: Mapping[str, Any]) -> None:
-    """Checks options: their names, and their types as far as these are plain.
+    """Checks the names of options, and the types that plain data can have.
 
     Args:
-      given: Plain data, as a file may hold it.
+      given: Plain data, as in a file.
 
     Raises:
-      NameError: If a type is a text that names nothing.
+      NameError: If a type is a string that names no type.
       ValueError: If an option is unknown, missing or of another type, or is not
         plain data.
     """
@@ -170,8 +170,8 @@ class Options:
       text = json.dumps(given)
     except TypeError as error:
       raise ValueError(f'expected plain data: {error}') from error
-    # JSON has the types of a file: a list may become a tuple, but a text never
-    # becomes a number.
+    # JSON has the types of a file: a list may become a tuple, but a string
+    # never becomes a number.
     adapter = pydantic.TypeAdapter(Annotated[Any, self])
     adapter.validate_json(text, strict=True)
 
@@ -203,16 +203,16 @@ def declared_by(
 ) -> Options:
   """Returns the options that a class or function declares.
 
-  A method that takes `**kwargs` passes them on, so the options of the classes
-  that its class inherits from count too.
+  A method with `**kwargs` is assumed to pass them on to the method that it
+  overrides, so the options of base classes are included.
 
   Args:
-    factory: The class or function.
-    method: The method of a class whose parameters are the options.
-    reserved: A function whose parameters are no options.
+    factory: Class or function.
+    method: Method of a class whose parameters are the options.
+    reserved: Function whose parameters are not options.
 
   Raises:
-    NameError: If an annotation is a text that names nothing.
+    NameError: If an annotation is a string that names no type.
     TypeError: If `factory` has no signature.
     ValueError: If `factory` has no signature.
   """
@@ -256,7 +256,7 @@ def _unreadable(name: str, error: Exception) -> ValueError:
 
 
 def is_path(annotation: Any) -> bool:
-  """Returns True if an annotation, which is no union, declares a path."""
+  """Returns True if an annotation other than a union declares a path."""
   if typing.get_origin(annotation) is Annotated:
     return _IS_PATH in typing.get_args(annotation)[1:]
   plain = typing.get_origin(annotation) or annotation
@@ -268,8 +268,8 @@ def is_path(annotation: Any) -> bool:
 def _signatures(
     factory: Callable[..., Any], method: str
 ) -> Iterator[inspect.Signature]:
-  """Yields the signatures that options come from, the nearest first."""
-  # The signature that a class sets itself is that of its instances.
+  """Yields the signatures that declare options, the most derived first."""
+  # `__signature__` of a class describes the call that makes an instance.
   if not isinstance(factory, type) or hasattr(factory, '__signature__'):
     yield _resolved(factory)
     return
@@ -281,7 +281,7 @@ def _signatures(
 
 
 def _resolved(function: Callable[..., Any]) -> inspect.Signature:
-  """Returns a signature in which annotations are types, not texts."""
+  """Returns a signature whose annotations are types, not strings."""
   signature = inspect.signature(function)
   is_instance = not (inspect.isroutine(function) or isinstance(function, type))
   hints = typing.get_type_hints(
@@ -297,7 +297,7 @@ def _resolved(function: Callable[..., Any]) -> inspect.Signature:
 
 
 def _schema(annotation: Any, handler: Any) -> Any:
-  """Returns the schema of a type, or one of anything where there is none."""
+  """Returns the schema of a type; types without one accept any value."""
   try:
     return handler.generate_schema(annotation)
   except pydantic.errors.PydanticUserError:
@@ -305,11 +305,11 @@ def _schema(annotation: Any, handler: Any) -> Any:
 
 
 def _without_opaque_members(annotation: Any) -> Any:
-  """Returns a union without the classes whose instances no file can hold."""
+  """Returns a union without the classes that plain data cannot represent."""
   if typing.get_origin(annotation) not in (typing.Union, types.UnionType):
     return annotation
   members = [m for m in typing.get_args(annotation) if not _is_opaque(m)]
-  # An option that no file could set is left to the class.
+  # An option that no file can set is checked by the class.
   if all(member is types.NoneType for member in members):
     return annotation
   return functools.reduce(operator.or_, members)
@@ -325,5 +325,5 @@ def _is_opaque(annotation: Any) -> bool:
     pass
   try:
     return not any(issubclass(plain, annotation) for plain in _PLAIN)
-  except TypeError:  # It is no class, or a protocol.
+  except TypeError:  # The annotation is not a class, or is a protocol.
     return False

@@ -1,4 +1,7 @@
-"""Registries: how a name in a design becomes a class, yours included."""
+"""Registry of classes and functions by the names that designs use.
+
+The entries are registered elsewhere, beside their definitions.
+"""
 
 from collections.abc import Callable, Iterator
 import difflib
@@ -12,13 +15,13 @@ T = TypeVar('T')
 
 @final
 class Registry(Generic[T]):
-  """Maps the names that designs use to what they stand for."""
+  """Mapping from the names that designs use to classes or functions."""
 
   def __init__(self, what: str) -> None:
     """Makes an empty registry.
 
     Args:
-      what: What the names are names of, for messages: 'provider kind'.
+      what: Kind of the entries, for messages: 'provider kind'.
     """
     self._what = what
     self._entries: dict[str, T] = {}
@@ -39,7 +42,7 @@ class Registry(Generic[T]):
     return decorate
 
   def get(self, name: str) -> T:
-    """Returns what `name` stands for.
+    """Returns the class or function registered as `name`.
 
     Raises:
       UnknownNameError: If nothing is registered as `name`.

@@ -1,4 +1,7 @@
-"""Base class for specs: strict, frozen, hashable, with one-line errors."""
+"""Validation of data by pydantic models, with errors of one line.
+
+The module contains the base class of specs, but no spec.
+"""
 
 import abc
 import bisect
@@ -17,30 +20,33 @@ from realab_suite.config import annotations
 from realab_suite.config import loading
 from realab_suite.config import messages
 
-# A line that goes on for ever tells less, not more.
+# Number of problems in a message; the others are counted.
 _MAX_TOLD = 10
 
 _Model = TypeVar('_Model', bound=pydantic.BaseModel)
 
 
 class Spec(pydantic.BaseModel, abc.ABC):
-  """Frozen; unknown keys and lossy conversions are errors."""
+  """Base class of specs: frozen, hashable and strict.
+
+  Unknown keys and lossy conversions are errors.
+  """
 
   model_config = pydantic.ConfigDict(
       frozen=True, extra='forbid', strict=True, populate_by_name=True
   )
 
   def to_mapping(self) -> dict[str, Any]:
-    """Returns this as plain data, defaults filled in."""
+    """Returns the spec as plain data, including defaults."""
     return self.model_dump(mode='json', by_alias=True)
 
   def digest(self) -> str:
-    """Returns a hash of all this, by which results are told apart."""
+    """Returns a hash of all fields, which identifies results."""
     return digest_of(self.to_mapping())
 
 
 def digest_of(data: Mapping[str, Any]) -> str:
-  """Returns a hash of plain data, whatever the order of its keys."""
+  """Returns a hash of plain data that does not depend on the order of keys."""
   canonical = json.dumps(data, sort_keys=True, separators=(',', ':'))
   return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -57,15 +63,15 @@ def validate(
   """Returns the model that the data describes.
 
   Args:
-    model_class: What the data has to be. Its own configuration decides how
-      strict that is.
-    data: What `read_mapping` returned.
-    where: What error messages call the data.
+    model_class: Class of the model. Its own configuration determines how strict
+      the validation is.
+    data: Result of `loading.read_mapping`.
+    where: Name of the data in error messages.
     overrides: Overrides of the data; see `loading.apply_overrides`. A problem
       that the data do not have without overrides is reported as the problem of
       the override that adds it.
-    is_confined: Whether paths have to be within the working directory.
-    are_overrides_free: Whether that excludes paths that overrides set.
+    is_confined: True if paths must be within the working directory.
+    are_overrides_free: True if paths that overrides set are exempt from that.
 
   Raises:
     SpecError: If the data does not fit. The message lists the problems.
@@ -78,7 +84,7 @@ def validate(
     changed = loading.apply_overrides(data, used) if used else data
     if is_confined:
       free = used if are_overrides_free else ()
-      # Before anything else: a model may open what it is given.
+      # Before the validation, because a model may open the files.
       if outside := _paths_elsewhere(model_class, changed, free):
         return None, outside
     return _judged(model_class, changed)
@@ -86,18 +92,18 @@ def validate(
   model, problems = judged(len(overrides))
   if model is not None:
     return model
-  # By their origin: 0 for the data, 1 for the first override.
-  told: dict[int, list[str]] = {}
+  # Keys are origins: 0 for the data, 1 for the first override.
+  by_origin: dict[int, list[str]] = {}
   for problem in problems[:_MAX_TOLD]:
     origin = _origin(problem, len(overrides), lambda count: judged(count)[1])
-    told.setdefault(origin, []).append(problem)
+    by_origin.setdefault(origin, []).append(problem)
   if len(problems) > _MAX_TOLD:
-    told[max(told)].append(f'and {len(problems) - _MAX_TOLD} more')
+    by_origin[max(by_origin)].append(f'and {len(problems) - _MAX_TOLD} more')
   names = [where, *(f'override {messages.quote(o)}' for o in overrides)]
   raise errors.SpecError(
       '; '.join(
           str(messages.Location(names[origin]).error('; '.join(found)))
-          for origin, found in sorted(told.items())
+          for origin, found in sorted(by_origin.items())
       )
   )
 
@@ -110,7 +116,7 @@ def _judged(
     return model_class.model_validate(data), []
   except pydantic.ValidationError as error:
     problems = error.errors(include_url=False)
-  # A union can report the same problem once for each of its members.
+  # A union may report a problem once for each of its members.
   return None, list(
       dict.fromkeys(_problem(p, model_class, data) for p in problems)
   )
@@ -124,9 +130,9 @@ def _paths_elsewhere(
   """Returns a problem for each path that leads out of the working directory.
 
   Args:
-    model_class: The model, which declares what is a path.
-    data: The data.
-    free: Overrides that are in the data already and may set any path.
+    model_class: Class of the model, which declares the paths.
+    data: Data with overrides applied.
+    free: Overrides in the data that may set any path.
   """
   free_keys = [loading.keys_of(override) for override in free]
   problems = []
@@ -148,10 +154,10 @@ def _origin(
   """Returns the number of overrides that a problem takes to appear.
 
   Args:
-    problem: A problem of the data with all overrides.
-    count: The number of overrides.
-    problems_of: Returns the problems of the data with so many overrides, the
-      first ones.
+    problem: Problem of the data with all overrides.
+    count: Number of overrides.
+    problems_of: Function from a number of overrides, the first ones, to the
+      problems of the data with these.
   """
 
   def is_there(used: int) -> bool:
@@ -164,14 +170,14 @@ def _origin(
 
 
 def _gist(problem: str) -> str:
-  """Returns a problem without the list of what is allowed, which may change."""
+  """Returns a problem without the allowed values, which may change."""
   return problem.partition(';')[0]
 
 
 def _problem(
     details: Any, model_class: type[pydantic.BaseModel], data: Any
 ) -> str:
-  """Returns what one entry of a `pydantic.ValidationError` means."""
+  """Returns the text of one entry of a `pydantic.ValidationError`."""
   kind = details['type']
   location = list(details['loc'])
   if kind == 'extra_forbidden':
@@ -202,7 +208,7 @@ def _describe_unknown_key(key: str, found: Sequence[Any]) -> str:
 
 
 def _describe(details: Any) -> str:
-  """Returns what is wrong with a value, and the value."""
+  """Returns the problem of a value, followed by the value."""
   kind = details['type']
   context = details.get('ctx', {})
   given = messages.quote(details['input'])
@@ -215,7 +221,7 @@ def _describe(details: Any) -> str:
     return f'must be a mapping, got {given}'
   if 'error' in context:
     text = str(context['error'])
-    # A text about a mapping names the part of it that is wrong.
+    # The problem of a mapping names the wrong part of it already.
     if isinstance(details['input'], Mapping) or given in text:
       return text
     return f'{text}, got {given}'

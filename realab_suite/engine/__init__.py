@@ -1,1 +1,1 @@
-"""How a composed world is stepped."""
+"""The engine: stepping, episodes, observations and snapshots of worlds."""

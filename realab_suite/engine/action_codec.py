@@ -1,4 +1,4 @@
-"""Actions: their spec, and how they are split into queries and controls."""
+"""Action specs, and the split of actions into queries and controls."""
 
 from collections.abc import Collection, Sequence
 import math
@@ -21,8 +21,9 @@ class ActionCodec:
     elements, then the task's control elements.
   - With an action set and no queries, it is the int32 index of an action.
   - With an action set and queries, it is a vector that ends in the index: int32
-    if all queries are indices of actions too, and float64 if one is a real
-    number. In a float64 vector the index is rounded to the nearest one.
+    if all queries are also indices of actions, and float64 if any query is a
+    real number. In a float64 vector, the index is rounded to the nearest
+    integer.
   """
 
   def __init__(
@@ -32,14 +33,14 @@ class ActionCodec:
       action_set: action_sets.ActionSet | None,
       integer_queries: Collection[str] = (),
   ) -> None:
-    """Makes the codec.
+    """Initializes the codec.
 
     Args:
       control_spec: Action spec of the task; element names are tab-separated.
       query_specs: Value spec of each query register.
-      action_set: The discrete actions, or `None` for continuous ones.
-      integer_queries: Names of the query registers that hold the index of an
-        action.
+      action_set: Discrete actions, or `None` for continuous actions.
+      integer_queries: Names of the query registers that contain the index of
+        an action.
 
     Raises:
       SpecError: If the task's action spec is not a bounded vector of numbers.
@@ -67,7 +68,7 @@ class ActionCodec:
       low, high = [math.ceil(x) for x in low], [math.floor(x) for x in high]
     self._names = names
     self._low, self._high = np.array(low, float), np.array(high, float)
-    # An unbounded element takes any number, which infinity is not.
+    # An unbounded element accepts any finite number.
     self._is_bounded = bool(np.isfinite([self._low, self._high]).all())
     self._spec = self._make_spec(np.dtype(np.int32 if is_integer else float))
 
@@ -86,7 +87,7 @@ class ActionCodec:
 
   @property
   def spec(self) -> specs.Array:
-    """The action spec; queries come first, as non-MuJoCo elements should."""
+    """Action spec. The queries come before the elements of the task."""
     return self._spec
 
   def decode(
@@ -95,15 +96,17 @@ class ActionCodec:
     """Checks an action and splits it.
 
     Args:
-      action: Shape `(*batch_shape, *spec.shape)`: integers, or where the spec
-        is of floats, numbers.
-      batch_shape: `()` for one world, `(worlds,)` for many.
+      action: Array of shape `(*batch_shape, *spec.shape)`. It must contain
+        integers if the dtype of `spec` is an integer type.
+      batch_shape: `()` for one world, `(worlds,)` for a batch.
 
     Returns:
-      Query values, `(..., queries)`, and controls, `(..., controls)`, float64.
+      The query values, `(..., queries)`, and the controls, `(..., controls)`,
+      both float64.
 
     Raises:
-      ActionError: If dtype, shape or any element is wrong.
+      ActionError: If the dtype or the shape is wrong, or if an element is out
+        of bounds or not finite.
     """
     values = self._cast(action)
     expected = (*batch_shape, *self._spec.shape)
@@ -113,11 +116,11 @@ class ActionCodec:
       )
     if not self._spec.shape:
       values = values[..., np.newaxis]
-    good = (values >= self._low) & (values <= self._high)  # NaN is not.
+    is_valid = (values >= self._low) & (values <= self._high)  # False for NaN.
     if not self._is_bounded:
-      good &= np.isfinite(values)
-    if np.count_nonzero(good) != good.size:
-      raise errors.ActionError(self._complaint(values, ~good))
+      is_valid &= np.isfinite(values)
+    if np.count_nonzero(is_valid) != is_valid.size:
+      raise errors.ActionError(self._bounds_message(values, ~is_valid))
     queries = values[..., : self._num_queries]
     controls = values[..., self._num_queries :]
     if self._table is not None:
@@ -127,11 +130,11 @@ class ActionCodec:
   def _cast(self, action: Any) -> np.ndarray:
     try:
       values = np.asarray(action)
-    except Exception as error:  # An object may raise what it likes.
+    except Exception as error:  # `__array__` may raise anything.
       raise errors.ActionError(
-          f'action: {type(action).__name__} is no array of numbers'
+          f'action: {type(action).__name__} is not an array of numbers'
       ) from error
-    # Half a step to the left is not an action.
+    # Floats are rejected where actions are integers, instead of rounded.
     kinds = 'iuf' if self._spec.dtype.kind == 'f' else 'iu'
     if values.dtype.kind not in kinds:
       raise errors.ActionError(
@@ -139,11 +142,11 @@ class ActionCodec:
       )
     if np.ma.isMaskedArray(action):
       raise errors.ActionError('action: a masked array; expected plain numbers')
-    # What is too large for float64 becomes infinite, which no bounds allow.
+    # Numbers that overflow float64 become infinite and are rejected later.
     with np.errstate(over='ignore'):
       return values.astype(np.float64)
 
-  def _complaint(self, values: np.ndarray, bad: np.ndarray) -> str:
+  def _bounds_message(self, values: np.ndarray, bad: np.ndarray) -> str:
     where = tuple(np.argwhere(bad)[0])
     value, i = values[where], where[-1]
     label = f'action{list(map(int, where))}' if self._spec.shape else 'action'
@@ -154,7 +157,7 @@ class ActionCodec:
 
 
 def _element_names(control_spec: Any) -> list[str]:
-  """Returns a name for each control element.
+  """Returns the name of each control element.
 
   Raises:
     SpecError: If the spec is not a bounded vector of numbers.

@@ -1,8 +1,8 @@
-"""What an agent in the same process is handed: a data channel, nothing behind.
+"""Views: the interface of an environment for an agent in the same process.
 
-The evaluator holds the environment, the agent a view of it. To a learner that
-uses Python's public names, nothing leads from one to the other. It is no wall
-against hostile code, for which there is none within one process.
+The evaluator keeps the environment, and the agent gets a view of it. No public
+name of a view leads to the environment. A view does not protect against
+hostile code; within one process, nothing can.
 """
 
 import abc
@@ -25,18 +25,18 @@ _T = TypeVar('_T')
 
 
 class _View(abc.ABC):
-  """What the views of one world and of many have in common.
+  """Base class of the views of one world and of a batch.
 
-  - Observations have the keys that an agent may have when the view is made:
-    `senses/<name>`, and `registers/<name>` of registers that agents read. No
-    other key ever passes, whatever anybody enables later.
-  - Arrays are the agent's own.
-  - Exceptions are `ActionError`, about the agent's own action, `ClosedError`,
-    and `WorldError` for all else: its message is a number, and it carries
-    neither a cause nor frames of the environment.
+  - Observations contain the keys that the agent may observe when the view is
+    created: `senses/<name>`, and `registers/<name>` of registers that agents
+    read. Observables that are enabled later are never added.
+  - Arrays are copies that belong to the agent.
+  - The only exceptions are `ActionError` for an invalid action, `ClosedError`,
+    and `WorldError` for everything else. A `WorldError` contains only a number;
+    it has no cause and no traceback frames of the environment.
   """
 
-  # By private names, so that no public one leads to the environment.
+  # Private names: no public attribute leads to the environment.
   __slots__ = (
       '__action_spec',
       '__actions_shape',
@@ -67,17 +67,17 @@ class _View(abc.ABC):
     }
 
   def action_spec(self) -> dm_env_specs.Array:
-    """Returns the spec of an action, in one world."""
+    """Returns the action spec of one world."""
     return self.__guard(lambda: _copy(self.__action_spec))
 
   def observation_spec(self) -> dict[str, dm_env_specs.Array]:
-    """Returns the spec of an observation, in one world."""
+    """Returns the observation spec of one world."""
     return self.__guard(
         lambda: {k: _copy(s) for k, s in self.__observation_spec.items()}
     )
 
   def reward_spec(self) -> dm_env_specs.BoundedArray:
-    """Returns the spec of a reward that is 0.0."""
+    """Returns the reward spec: a float64 scalar with both bounds 0.0."""
     return self.__guard(
         lambda: dm_env_specs.BoundedArray(
             (), np.float64, 0.0, 0.0, name='reward'
@@ -85,7 +85,7 @@ class _View(abc.ABC):
     )
 
   def discount_spec(self) -> dm_env_specs.BoundedArray:
-    """Returns the spec of a discount; it is 1.0 until an episode ends."""
+    """Returns the discount spec. Discounts are 1.0 until an episode ends."""
     return self.__guard(
         lambda: dm_env_specs.BoundedArray(
             (), np.float64, 0.0, 1.0, name='discount'
@@ -93,31 +93,36 @@ class _View(abc.ABC):
     )
 
   def reset(self) -> Any:
-    """Starts the next episode; the one under way is abandoned."""
+    """Starts the next episode and abandons the current one.
+
+    Raises:
+      ClosedError: If the view or the environment is closed.
+      WorldError: If the world failed.
+    """
     return self.__guard(lambda: self._restate(self.__env.reset()))
 
   def step(self, action: Any) -> Any:
     """Runs one control step.
 
     Raises:
-      ActionError: If the action does not fit. Nothing has moved.
-      ClosedError: If the agent or the evaluator has closed its end.
+      ActionError: If the action does not satisfy `action_spec`. The state is
+        unchanged.
+      ClosedError: If the view or the environment is closed.
       WorldError: If the world failed. The episode is over.
     """
     self.__guard(lambda: None)
-    given = self.__checked(action)
-    return self.__guard(lambda: self._restate(self.__env.step(given)))
+    valid_action = self.__checked(action)
+    return self.__guard(lambda: self._restate(self.__env.step(valid_action)))
 
   def close(self) -> None:
-    """Ends the agent's use of the view; closing twice does nothing.
+    """Closes the view. Closing it again has no effect.
 
-    The environment is the evaluator's, and stays as it is: an episode that is
-    under way goes on to be under way.
+    The environment stays open, and its current episode does not end.
     """
     self.__is_closed = True
 
   def __reduce_ex__(self, protocol: Any) -> Any:
-    """Refuses `copy` and `pickle`, which would hand over the environment."""
+    """Refuses `copy` and `pickle`, which would expose the environment."""
     raise TypeError('views cannot be pickled or copied')
 
   def __reduce__(self) -> Any:
@@ -131,36 +136,36 @@ class _View(abc.ABC):
     """Returns the part of a time step that the agent may see."""
 
   def _filtered(self, observation: Any) -> dict[str, np.ndarray]:
-    """Returns the agent's own copies of what it may observe."""
+    """Returns copies of the arrays that the agent may observe."""
     return {
         key: np.array(observation[key], spec.dtype, order='C')
         for key, spec in self.__observation_spec.items()
     }
 
   def __checked(self, action: Any) -> np.ndarray:
-    """Returns a copy of an action that fits.
+    """Returns a validated copy of an action.
 
-    No code of the agent's, as in an `__array__`, runs below a frame of the
-    environment. And what raises `ActionError` down there is not about the
-    action, for that has been checked here.
+    Code of the agent, such as `__array__`, never runs below a frame of the
+    environment. The environment gets a valid action, so an `ActionError` that
+    it raises does not concern the agent's action.
     """
     problem: errors.ActionError
     try:
-      # A masked array stays one, and is refused for it.
-      given = np.array(action, subok=np.ma.isMaskedArray(action))
-      self.__env.codec.decode(given, self.__actions_shape)
-      return given
+      # A masked array stays masked, and the codec rejects it.
+      valid_action = np.array(action, subok=np.ma.isMaskedArray(action))
+      self.__env.codec.decode(valid_action, self.__actions_shape)
+      return valid_action
     except errors.ActionError as error:
       problem = errors.ActionError(str(error))
-    except Exception:  # An object may raise what it likes.
+    except Exception:  # `__array__` may raise anything.
       problem = errors.ActionError(
-          f'action: {type(action).__name__} is no array of numbers'
+          f'action: {type(action).__name__} is not an array of numbers'
       )
-    # Out here an exception has no context, and no frames but the view's.
+    # Raised outside the `try`, so it has no context and no other frames.
     raise problem
 
   def __guard(self, call: Callable[[], _T]) -> _T:
-    """Calls a function, and lets no exception of the environment through."""
+    """Calls a function and replaces exceptions of the environment."""
     problem: errors.RealabError
     if self.__is_closed:
       raise _closed()
@@ -171,7 +176,7 @@ class _View(abc.ABC):
     except Exception as error:
       problem = errors.WorldError(
           f'error {self.__num_failures} of this view: the world failed; the'
-          ' evaluator knows how'
+          ' evaluator has the exception'
       )
       self.__num_failures += 1
       if self.__failures is not None:
@@ -181,14 +186,15 @@ class _View(abc.ABC):
 
 @final
 class AgentView(_View, dm_env.Environment):
-  """An environment, as an agent in the same process gets it.
+  """The interface of an environment for an agent in the same process.
 
       env = suite.load('unlock_door', 'standard', design='value_advice')
       env.add_sink(ledger.Ledger())
       agent = make_agent(agent_view.AgentView(env))
 
-  `reset`, `step`, `close` and the specs, and nothing else. `reward` is 0.0;
-  `discount` is 1.0 but for the end of an episode, where it is the task's.
+  It has `reset`, `step`, `close` and the specs, and nothing else. `reward` is
+  0.0. `discount` is 1.0, except at the end of an episode, where it is the
+  task's.
   """
 
   __slots__ = ()
@@ -198,15 +204,15 @@ class AgentView(_View, dm_env.Environment):
       env: environment.Environment,
       failures: list[Exception] | None = None,
   ) -> None:
-    """Makes a view; the environment stays the caller's.
+    """Initializes the view. The environment still belongs to the caller.
 
     Args:
-      env: What is viewed.
-      failures: A list of the caller's own, which gets the exceptions that the
-        agent is not told of: error n is the n-th.
+      env: Environment of one world.
+      failures: List of the caller, to which the exceptions behind each
+        `WorldError` are appended: error n is element n.
 
     Raises:
-      SpecError: If `env` is something else.
+      SpecError: If `env` is not an `Environment`.
     """
     _check_kind(env, environment.Environment)
     super().__init__(env, (), failures)
@@ -224,9 +230,10 @@ class AgentView(_View, dm_env.Environment):
 
 @final
 class BatchAgentView(_View):
-  """Many worlds, as an agent in the same process gets them; see `AgentView`.
+  """The interface of a batch for an agent in the same process.
 
-  Time steps are `BatchTimeStep`s, actions have a leading axis of worlds.
+  It is like `AgentView`, but time steps are `BatchTimeStep`s, and actions have
+  a leading axis of worlds.
   """
 
   __slots__ = ()
@@ -236,14 +243,14 @@ class BatchAgentView(_View):
       batch: batch_environment.BatchEnvironment,
       failures: list[Exception] | None = None,
   ) -> None:
-    """Makes a view; the batch stays the caller's.
+    """Initializes the view. The batch still belongs to the caller.
 
     Args:
-      batch: What is viewed.
+      batch: Batch of worlds.
       failures: As in `AgentView`.
 
     Raises:
-      SpecError: If `batch` is something else.
+      SpecError: If `batch` is not a `BatchEnvironment`.
     """
     _check_kind(batch, batch_environment.BatchEnvironment)
     super().__init__(batch, (batch.num_envs,), failures)
@@ -272,5 +279,5 @@ def _closed() -> errors.ClosedError:
 
 
 def _copy(spec: dm_env_specs.Array) -> dm_env_specs.Array:
-  """Returns a spec of the caller's own."""
+  """Returns a copy of a spec."""
   return spec.replace(name=spec.name)

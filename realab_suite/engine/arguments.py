@@ -1,4 +1,4 @@
-"""Checks of the numbers that worlds are loaded, multiplied and forked with."""
+"""Checks of the arguments for loading, batching and forking worlds."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,9 +8,9 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.config import messages
 
-# More worlds have no room on one machine.
-_MOST_WORLDS = 2**16
-_MOST_THREADS = 1024
+# More worlds do not fit into the memory of one machine.
+_MAX_WORLDS = 2**16
+_MAX_THREADS = 1024
 # Numbers in result rows have 64 bits.
 _LARGEST = 2**63 - 1
 
@@ -19,38 +19,39 @@ def num_envs(given: Any) -> int:
   """Returns a number of worlds as an integer.
 
   Raises:
-    SpecError: If it is not one.
+    SpecError: If it is not an integer from 1 to 65,536.
   """
-  return _integer('num_envs', given, 1, _MOST_WORLDS)
+  return _integer('num_envs', given, 1, _MAX_WORLDS)
 
 
 def num_threads(given: Any) -> int:
   """Returns a number of threads as an integer; 0 stands for all processors.
 
   Raises:
-    SpecError: If it is not one.
+    SpecError: If it is not an integer from 0 to 1,024.
   """
-  return _integer('num_threads', given, 0, _MOST_THREADS)
+  return _integer('num_threads', given, 0, _MAX_THREADS)
 
 
 def world(given: Any) -> int:
-  """Returns the number of a world of a batch as an integer.
+  """Returns the number of a world as an integer.
 
   Raises:
-    SpecError: If it is not one.
+    SpecError: If it is not an integer from 0 to 2**63 - 1.
   """
   return _integer('world', given, 0, _LARGEST)
 
 
 def indices(given: Any, num_envs: int) -> np.ndarray:
-  """Returns indices of worlds of a batch; all of them for `None`.
+  """Returns indices of worlds in a batch, `(indices,)` int.
 
   Args:
-    given: A sequence of indices, or `None`.
+    given: Sequence of indices, or `None` for all worlds.
     num_envs: Number of worlds in the batch.
 
   Raises:
-    SpecError: If one is no index in this batch, or is given twice.
+    SpecError: If an index is not in this batch or is given twice, or if there
+      are none.
   """
   if given is None:
     return np.arange(num_envs)
@@ -73,38 +74,38 @@ def indices(given: Any, num_envs: int) -> np.ndarray:
 
 
 def max_steps(given: Any) -> int | None:
-  """Returns the number of control steps of an episode; `None` for no limit.
+  """Returns the number of control steps per episode; `None` for no limit.
 
   Raises:
-    SpecError: If it is neither.
+    SpecError: If it is neither a positive integer nor `None`.
   """
   if given is None:
     return None
   return _integer('max_steps', given, 1, _LARGEST, ', and None')
 
 
-def flag(what: str, given: Any) -> bool:
-  """Returns a truth value.
+def flag(name: str, given: Any) -> bool:
+  """Returns a Boolean argument.
 
   Args:
-    what: Name of the argument.
-    given: Its value.
+    name: Name of the argument.
+    given: Value of the argument.
 
   Raises:
-    SpecError: If it is not one.
+    SpecError: If the value is not a Boolean.
   """
   if not isinstance(given, bool | np.bool_):
     raise errors.SpecError(
-        f'{what}: {messages.quote(given)}; allowed are True and False'
+        f'{name}: {messages.quote(given)}; allowed are True and False'
     )
   return bool(given)
 
 
-def _integer(what: str, given: Any, low: int, high: int, more: str = '') -> int:
+def _integer(name: str, given: Any, low: int, high: int, more: str = '') -> int:
   is_integer = isinstance(given, int | np.integer)
   if isinstance(given, bool) or not is_integer or not low <= given <= high:
     raise errors.SpecError(
-        f'{what}: {messages.quote(given)}; allowed are integers from {low} to'
+        f'{name}: {messages.quote(given)}; allowed are integers from {low} to'
         f' {high}{more}'
     )
   return int(given)

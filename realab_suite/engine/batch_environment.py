@@ -1,4 +1,4 @@
-"""Many worlds with feedback, stepped together: Python is paid once for all."""
+"""Batches: many worlds with feedback that are stepped together."""
 
 from collections.abc import Sequence
 import functools
@@ -32,11 +32,11 @@ class BatchTimeStep(NamedTuple):
   """Like `dm_env.TimeStep`, with a leading axis of worlds.
 
   Attributes:
-    step_type: `(worlds,)`, int: 0 where an episode begins, 1 within, 2 at the
-      end; see `dm_env.StepType`.
-    reward: `(worlds,)`: always 0.0, there is no reward channel.
-    discount: `(worlds,)`; 1.0 where an episode begins.
-    observation: By name, each `(worlds, ...)`.
+    step_type: Step type of each world, `(worlds,)` int: 0 is the first step of
+      an episode, 1 a middle step and 2 the last; see `dm_env.StepType`.
+    reward: `(worlds,)`. Always 0.0, because there is no reward channel.
+    discount: Discount of each world, `(worlds,)`; 1.0 in first steps.
+    observation: Arrays of shape `(worlds, ...)`, by name.
   """
 
   step_type: np.ndarray
@@ -47,12 +47,12 @@ class BatchTimeStep(NamedTuple):
 
 @final
 class BatchEnvironment:
-  """`num_envs` copies of an environment, each with episodes of its own.
+  """A batch of `num_envs` copies of an environment, with separate episodes.
 
-  World i is, bit for bit, the environment that `world=i` makes alone. After the
-  end of its episode a world ignores one action and begins the next one, as in
-  `dm_env`. Where the physics of one world fails, its episode ends and the
-  others go on.
+  World i equals, bit for bit, the single environment with `world=i`. After its
+  episode has ended, a world ignores one action and begins the next episode, as
+  in `dm_env`. If the physics of a world fails, its episode ends and the other
+  worlds continue.
   """
 
   def __init__(
@@ -62,25 +62,25 @@ class BatchEnvironment:
       num_threads: int = 0,
       sleep: bool = False,
   ) -> None:
-    """Multiplies an environment; `suite.load_batch` is easier.
+    """Initializes the batch. Prefer `suite.load_batch`.
 
     Args:
-      single: A freshly loaded environment with a world of this package. It
-        belongs to the batch from now on.
-      num_envs: How many worlds.
-      num_threads: How many threads step them; 0 for all processors.
-      sleep: Whether blocks at rest fall asleep; see `suite.load_batch`.
+      single: New environment with a task of this package. The batch takes
+        ownership of it.
+      num_envs: Number of worlds.
+      num_threads: Number of threads that step them; 0 for all processors.
+      sleep: True to let blocks at rest sleep; see `suite.load_batch`.
 
     Raises:
-      SpecError: If there cannot be many of this environment.
+      SpecError: If the task, a hook or a number is not allowed in a batch.
     """
     num_envs = arguments.num_envs(num_envs)
     num_threads = arguments.num_threads(num_threads)
     sleep = arguments.flag('sleep', sleep)
     if not isinstance(single.task, base.Task):
       raise errors.SpecError(
-          f'{type(single.task).__name__} compiles anew in each episode; a batch'
-          ' takes worlds of this package'
+          f'{type(single.task).__name__} is compiled for each episode; a batch'
+          ' accepts only tasks of this package'
       )
     hooks.refuse_in_batch(single.task, single.has_extra_hooks)
     self._single = single
@@ -102,10 +102,10 @@ class BatchEnvironment:
         self._host, self._mechanism, single.max_steps
     )
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
-    # Restoring may give several worlds one number. Objects: seeds can be large,
-    # or salted; `np.full` would drop the salt.
+    # `restore` may give several worlds the same number. Arrays of objects keep
+    # large seeds and salts; `np.full` would drop the salt.
     self._seeds = np.array([single.seed] * num_envs, object)
-    self._numbers = np.arange(num_envs).astype(object)
+    self._world_numbers = np.arange(num_envs).astype(object)
     self._episodes = np.full(num_envs, -1)
     self._is_pending = np.ones(num_envs, bool)
     num_providers = len(self._mechanism.design.providers)
@@ -117,68 +117,68 @@ class BatchEnvironment:
 
   @property
   def original(self) -> environment.Environment:
-    """The environment that the worlds are copies of."""
+    """Environment that the worlds are copies of."""
     return self._single
 
   @property
   def num_envs(self) -> int:
-    """How many worlds there are."""
+    """Number of worlds."""
     return self._num_envs
 
   @property
   def sleep(self) -> bool:
-    """Whether blocks at rest fall asleep; part of a run's configuration."""
+    """True if blocks at rest sleep; part of a run's configuration."""
     return self._sleep
 
   @property
   def physics(self) -> batch_physics.BatchPhysics:
-    """The worlds themselves, for an evaluator; no agent is handed this."""
+    """Physics of all worlds, for evaluators; agents do not get it."""
     return self._physics
 
   @property
   def task(self) -> base.Task:
-    """The world that all are copies of."""
+    """Task of all worlds."""
     return self._task
 
   @property
   def mechanism(self) -> mechanisms.FeedbackMechanism:
-    """The registers, meters and providers."""
+    """Registers, meters and providers."""
     return self._mechanism
 
   @property
   def codec(self) -> action_codec.ActionCodec:
-    """What takes actions apart."""
+    """Checks and splits actions."""
     return self._single.codec
 
   def add_sink(self, sink: events.BatchEventSink) -> None:
-    """Lets an evaluator hear of everything, from the next episodes on."""
+    """Abandons the current episodes and notifies a sink of all later ones."""
     self._refuse_if_closed()
-    self._tell_of_end(~self._is_pending, events.End.ABANDONED)
+    self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
     self._sinks.append(sink)
     self._is_pending = np.ones(self._num_envs, bool)
 
   def remove_sink(self, sink: events.BatchEventSink) -> None:
-    """Ends what `add_sink` began."""
+    """Undoes `add_sink`."""
     self._sinks.remove(sink)
 
   def action_spec(self) -> specs.Array:
-    """The spec of one world's action; actions are `(worlds, *spec.shape)`."""
+    """Returns the spec of one action; `step` takes `(worlds, *spec.shape)`."""
     return self._single.action_spec()
 
   def observation_spec(self) -> dict[str, specs.Array]:
-    """The specs of one world's observation."""
+    """Returns the observation spec of one world."""
     return self._single.observation_spec()
 
   def reset(self) -> BatchTimeStep:
-    """Starts the next episode of every world."""
+    """Starts the next episode of every world and abandons current ones."""
     self._refuse_if_closed()
-    self._tell_of_end(~self._is_pending, events.End.ABANDONED)
-    # Until the episodes have begun, the next step is to begin them.
+    self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
+    # If anything fails here, the next step begins all episodes.
     self._is_pending = everywhere = np.ones(self._num_envs, bool)
     self._begin_episodes(everywhere)
     reads = self._observe()
     nothing = np.zeros(self._num_envs)
-    self._tell(everywhere, ~everywhere, {}, [], reads, nothing, None)
+    self._notify(everywhere, ~everywhere, {}, [], reads, nothing, None)
     self._is_pending = ~everywhere
     return self._time_step(
         np.full(self._num_envs, int(dm_env.StepType.FIRST)),
@@ -189,18 +189,18 @@ class BatchEnvironment:
     """Runs one control step of every world.
 
     Args:
-      actions: `(worlds, *action_spec.shape)`.
+      actions: Actions, `(worlds, *action_spec.shape)`.
 
     Raises:
-      ActionError: If an action does not fit; the first bad world is named, and
-        no world has moved.
+      ActionError: If an action does not satisfy `action_spec`; the message
+        names the first such world. No world has changed.
     """
     self._refuse_if_closed()
     queries, controls = self.codec.decode(actions, (self._num_envs,))
     if self._is_pending.all():
       return self.reset()
     is_first = self._is_pending
-    # Until this step is known to be good, the next one begins all episodes.
+    # If anything fails here, the next step begins all episodes.
     self._is_pending = np.ones(self._num_envs, bool)
     last_valid = self._observation
     try:
@@ -223,8 +223,8 @@ class BatchEnvironment:
       self._begin_episodes(is_first)
       reads = self._observe()
     except Exception:
-      # No sink gets half a step: all episodes are over.
-      self._tell_of_end(~is_first, events.End.ERROR)
+      # Sinks never get a partial step: all episodes end.
+      self._notify_of_ends(~is_first, events.End.ERROR)
       raise
     is_last = (ending.is_ending | has_failed | is_late) & ~is_first
     ends = {
@@ -232,9 +232,9 @@ class BatchEnvironment:
         for world in np.flatnonzero(is_last)
     }
     for name, value in self._observation.items():
-      # Nothing is read from a state that MuJoCo has reset.
+      # MuJoCo has reset the state of worlds that failed.
       value[has_failed] = last_valid[name][has_failed]
-    self._tell(
+    self._notify(
         is_first,
         has_failed,
         ends,
@@ -253,16 +253,16 @@ class BatchEnvironment:
     )
 
   def save(self, worlds: Sequence[int] | None = None) -> snapshots.Snapshot:
-    """Returns everything that the future of these worlds depends on.
+    """Returns a snapshot of worlds, from which `restore` continues.
 
-    What the event sinks know of their episodes is part of it.
+    It contains the state of the event sinks for the current episodes.
 
     Args:
-      worlds: The indices of the worlds in the batch; `None` for all of them.
+      worlds: Indices of the worlds in the batch; `None` for all of them.
 
     Raises:
-      SpecError: If there are no such worlds, if blocks of this batch fall
-        asleep, or if a sink cannot be saved.
+      SpecError: If `worlds` is invalid, if blocks of this batch can sleep, or
+        if a sink cannot be saved.
       StateLayoutError: If a provider's state is not plain data.
     """
     header = self._single.snapshot_header(self._physics.model)
@@ -272,7 +272,7 @@ class BatchEnvironment:
         indices=indices.tolist(),
         physics=self._physics.state[indices],
         seed=self._seeds[indices].tolist(),
-        world=self._numbers[indices].tolist(),
+        world=self._world_numbers[indices].tolist(),
         episode=self._episodes[indices].tolist(),
         is_pending=is_pending.tolist(),
         is_open=(~is_pending).tolist(),
@@ -289,29 +289,30 @@ class BatchEnvironment:
       snapshot: snapshots.Snapshot,
       worlds: Sequence[int] | None = None,
   ) -> None:
-    """Makes worlds what others, or these, were when they were saved.
+    """Sets worlds to the states in a snapshot.
 
-    What follows is bit for bit what followed there, later episodes included: a
-    world gets the seed and the number of the one that was saved, from which its
-    random streams follow. So worlds that go on from one snapshot differ by
-    their actions alone. All other worlds stay as they are. Episodes that are
-    under way are abandoned; for sinks see `Environment.restore`.
+    They continue bit for bit like the saved worlds, including later episodes: a
+    restored world gets the seed and the number of the saved one, which
+    determine its random streams. Worlds that were restored from the same
+    snapshot therefore differ only by their actions. Other worlds do not change.
+    The current episodes of the restored worlds are abandoned. For sinks, see
+    `Environment.restore`.
 
     Args:
-      snapshot: Of worlds of a batch, or of a world alone.
-      worlds: Their indices in this batch: as many as were saved, or any number
-        for a snapshot of one world; `None` for where they were.
+      snapshot: Snapshot of worlds of a batch, or of a single world.
+      worlds: Indices of the worlds to restore: as many as were saved, or any
+        number for a snapshot of one world; `None` for the saved indices.
 
     Raises:
-      SpecError: If there are no such worlds, or if blocks of this batch fall
-        asleep. Nothing has changed.
-      StateLayoutError: If the snapshot does not fit. Nothing has changed.
+      SpecError: If `worlds` is invalid, or if blocks of this batch can sleep.
+        The state is unchanged.
+      StateLayoutError: If the snapshot does not fit. The state is unchanged.
     """
     header = self._single.snapshot_header(self._physics.model)
     saved = snapshots.WorldStates.from_data(snapshot.contents_for(header))
     if worlds is None and saved.indices is None:
       raise errors.StateLayoutError(
-          'the snapshot is of a world alone; say into which worlds it goes, as'
+          'the snapshot is of a single world; pass the indices to restore, as'
           ' in restore(snapshot, worlds=[0])'
       )
     indices = arguments.indices(
@@ -320,16 +321,16 @@ class BatchEnvironment:
     if len(saved.seed) not in (1, len(indices)):
       raise errors.StateLayoutError(
           f'the snapshot has {len(saved.seed)} worlds, for {len(indices)} here;'
-          ' allowed are as many, or one'
+          ' allowed are the same number, or one'
       )
     saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
-    # Where in the snapshot each of the worlds is.
+    # The saved world for each restored one.
     rows = np.arange(len(indices)) % len(saved.seed)
     has_begun = bool(saved.observation)
     filled, sources = indices, rows
     if has_begun and not self._observation:
-      # Every world here waits for its first episode; until that begins, those
-      # that stay have to be in some state that makes sense.
+      # No world has begun an episode yet, so the other worlds get copies of the
+      # saved states until they begin one.
       filled = np.arange(self._num_envs)
       sources = np.zeros(self._num_envs, int)
       sources[indices] = rows
@@ -337,21 +338,21 @@ class BatchEnvironment:
       states, observation = saved.merged_into(
           self._states, self._observation, filled, sources
       )
-    # Nothing has changed so far, and nothing is refused from here on.
+    # Nothing has changed so far, and nothing fails from here on.
     is_restored = np.isin(np.arange(self._num_envs), indices)
-    self._tell_of_end(is_restored & ~self._is_pending, events.End.ABANDONED)
+    self._notify_of_ends(is_restored & ~self._is_pending, events.End.ABANDONED)
     self._is_pending = self._is_pending | is_restored
     if has_begun:
       self._physics.set_state(filled, saved.physics[sources])
       self._states, self._observation = states, observation
       for kept, keys in zip(self._keys, saved.provider_keys, strict=True):
         kept[filled] = keys[sources]
-    self._seeds = _with(self._seeds, indices, saved.seed)
-    self._numbers = _with(self._numbers, indices, saved.world)
-    self._episodes = _with(self._episodes, indices, saved.episode)
-    for sink, (_, known) in zip(self._sinks, saved.sinks, strict=False):
-      sink.set_state(indices, [known[row] for row in rows])
-    self._is_pending = _with(self._is_pending, indices, saved.is_pending)
+    self._seeds = _replaced(self._seeds, indices, saved.seed)
+    self._world_numbers = _replaced(self._world_numbers, indices, saved.world)
+    self._episodes = _replaced(self._episodes, indices, saved.episode)
+    for sink, (_, sink_states) in zip(self._sinks, saved.sinks, strict=False):
+      sink.set_state(indices, [sink_states[row] for row in rows])
+    self._is_pending = _replaced(self._is_pending, indices, saved.is_pending)
 
   def render(
       self,
@@ -360,20 +361,20 @@ class BatchEnvironment:
       height: int = 240,
       width: int = 320,
   ) -> np.ndarray:
-    """Draws worlds for people; what agents see is in their observations.
+    """Renders worlds for people. Observations contain the frames for agents.
 
     Args:
-      worlds: The indices of the worlds in the batch; `None` for all of them.
-      camera: The name of a camera of the model.
-      height: Of a frame, pixels.
-      width: Of a frame, pixels.
+      worlds: Indices of the worlds in the batch; `None` for all of them.
+      camera: Name of a camera of the model.
+      height: Height of a frame, in pixels.
+      width: Width of a frame, in pixels.
 
     Returns:
-      `(worlds, height, width, 3)` uint8.
+      The frames, `(worlds, height, width, 3)` uint8.
 
     Raises:
       SpecError: If there is no such world or camera.
-      RenderingError: If nothing renders here, or not frames of this size.
+      RenderingError: If no renderer is available, or if it fails at this size.
     """
     self._refuse_if_closed()
     cameras = self._task.root_entity.mjcf_model.find_all('camera')
@@ -384,14 +385,14 @@ class BatchEnvironment:
     return self._physics.render(indices, camera, height, width)
 
   def close(self) -> None:
-    """Frees the worlds; closing twice does nothing."""
+    """Frees the worlds. Closing them again has no effect."""
     if not self._closed:
-      self._tell_of_end(~self._is_pending, events.End.ABANDONED)
+      self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
     self._closed = True
     self._single.close()
 
   def _begin_episodes(self, where: np.ndarray) -> None:
-    """Begins an episode in some worlds, `(worlds,)` bool."""
+    """Begins an episode in each world where the mask `(worlds,)` is True."""
     (worlds,) = np.nonzero(where)
     if not len(worlds):
       return
@@ -403,7 +404,7 @@ class BatchEnvironment:
       self._episodes[world] += 1
       stream = (
           self._seeds[world],
-          self._numbers[world],
+          self._world_numbers[world],
           int(self._episodes[world]),
       )
       episodes.begin(
@@ -423,12 +424,12 @@ class BatchEnvironment:
       entity.initialize_episode(view, self._random_state)
 
   def _observe(self) -> list[Any]:
-    """Makes the observation of every world; returns the agents' reads."""
+    """Updates the observation and returns the reads of registers for it."""
     self._physics.refresh()
     self._observation, reads = self._observer.observe(self._physics)
     return list(reads)
 
-  def _tell(
+  def _notify(
       self,
       is_first: np.ndarray,
       has_failed: np.ndarray,
@@ -438,12 +439,12 @@ class BatchEnvironment:
       reward: np.ndarray,
       failure: str | None,
   ) -> None:
-    """Notifies the sinks of a step."""
+    """Notifies the sinks of a control step."""
     if not self._sinks:
       return
     step = events.BatchStep(
         seed=self._seeds,
-        world=self._numbers,
+        world=self._world_numbers,
         episode=self._episodes.copy(),
         is_first=is_first,
         has_failed=has_failed,
@@ -457,13 +458,13 @@ class BatchEnvironment:
     for sink in self._sinks:
       sink.step_ended(step)
 
-  def _tell_of_end(self, worlds: np.ndarray, end: events.End) -> None:
-    """Tells the sinks that episodes are over, between two steps."""
+  def _notify_of_ends(self, worlds: np.ndarray, end: events.End) -> None:
+    """Notifies the sinks that episodes have ended between two steps."""
     if not worlds.any():
       return
     step = events.BatchStep.between(
         self._seeds,
-        self._numbers,
+        self._world_numbers,
         self._episodes.copy(),
         {int(world): end for world in np.flatnonzero(worlds)},
     )
@@ -485,15 +486,15 @@ class BatchEnvironment:
       raise errors.ClosedError('this environment is closed; load another one')
 
 
-def _with(values: np.ndarray, indices: np.ndarray, others: Any) -> np.ndarray:
-  """Returns a copy of an array, some of whose elements are others."""
-  copy = np.array(values)
-  copy[indices] = others
+def _replaced(old: np.ndarray, indices: np.ndarray, values: Any) -> np.ndarray:
+  """Returns a copy of an array with the elements at some indices replaced."""
+  copy = np.array(old)
+  copy[indices] = values
   return copy
 
 
 def _end(has_failed: bool, is_ending: bool) -> events.End:
-  """Why the episode of a world has ended."""
+  """Returns the reason why the episode of a world has ended."""
   if has_failed:
     return events.End.DIVERGENCE
   return events.End.TERMINATED if is_ending else events.End.TIMEOUT

@@ -1,9 +1,8 @@
-"""Many worlds of one model, behind the interface that entities know.
+"""Physics of a batch of worlds, with the interface that entities use.
 
-Entities bind elements and read trailing axes, so they do not notice that there
-is a leading axis of worlds. Underneath is `mujoco.batch.Batch`, which steps the
-worlds on threads. Its state arrays are live; what derives from the state is
-brought up to date when it is read.
+Entities bind elements and index trailing axes, so the same code serves arrays
+with a leading axis of worlds. `mujoco.batch.Batch` steps the worlds in threads.
+Its state arrays are live. Derived quantities are updated when they are read.
 """
 
 import abc
@@ -22,10 +21,10 @@ from realab_suite.entities import cameras
 from realab_suite.entities import protocols
 from realab_suite.entities import rays
 
-# Positions and velocities, and what derives from them: what `mj_step1` does.
+# Positions, velocities and what derives from them, as in `mj_step1`.
 _STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
-# The state field that each bound attribute is part of.
+# State field that contains each bound attribute.
 _STATE_FIELDS = {
     'qpos': 'qpos',
     'qvel': 'qvel',
@@ -34,7 +33,7 @@ _STATE_FIELDS = {
     'mocap_quat': 'mocap_quat',
     'active': 'eq_active',
 }
-# The derived field of each bound attribute, by the kind of the element.
+# Derived field of each bound attribute, by the kind of the element.
 _DERIVED_FIELDS = {
     ('body', 'xpos'): 'xpos',
     ('mocap_body', 'xpos'): 'xpos',
@@ -49,7 +48,7 @@ _DERIVED_FIELDS = {
 
 @final
 class BatchPhysics:
-  """`num_envs` worlds; every bound array has a leading axis of worlds."""
+  """Physics of a batch. Bound arrays have a leading axis of worlds."""
 
   def __init__(
       self,
@@ -58,30 +57,31 @@ class BatchPhysics:
       num_threads: int = 0,
       sleep: bool = False,
   ) -> None:
-    """Makes worlds of the model of another physics.
+    """Creates worlds with the model of another physics.
 
     Args:
-      template: Knows the model, and where in it an element is. It belongs to
-        the worlds from now on: what is drawn of them is drawn by it.
-      num_envs: How many worlds.
-      num_threads: How many threads step them; 0 for all processors.
-      sleep: Whether blocks at rest fall asleep.
+      template: Physics of a single world, which provides the model and the
+        indices of elements. This object takes ownership of it and renders all
+        worlds with it.
+      num_envs: Number of worlds.
+      num_threads: Number of threads that step them; 0 for all processors.
+      sleep: True to let blocks at rest sleep.
     """
     self._template = template
     self._model = template.model
     if sleep:
-      # Who may sleep was decided when the model was compiled: all but the
-      # avatar, whose motors can move it at any time.
+      # The compiled model specifies which bodies may sleep: all except the
+      # avatar, because its motors can move it at any time.
       self._model = copy.copy(template.model)
       self._model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    # Who sleeps is in no part of the state; a batch that is persistent keeps
-    # it, in all that MuJoCo has of each world.
+    # MuJoCo's state does not contain which bodies sleep. A persistent batch
+    # keeps this, because it keeps all data of each world between steps.
     self._batch = mujoco_batch.Batch(
         self._model.ptr, num_envs, num_threads, persistent=sleep
     )
-    # Casting rays between the steps of one batch would disturb what it keeps
-    # from step to step; another one looks at a copy of the state. There nobody
-    # sleeps, so everything is seen where it is.
+    # Casting rays in a batch would change the data that it keeps between steps,
+    # so another batch casts them in a copy of the state. No body sleeps in that
+    # batch, so all geoms are at their present positions.
     self._ray_batch = mujoco_batch.Batch(
         template.model.ptr, num_envs, num_threads
     )
@@ -92,26 +92,26 @@ class BatchPhysics:
 
   @property
   def num_envs(self) -> int:
-    """How many worlds there are."""
+    """Number of worlds."""
     return int(self._batch.nsim)
 
   @property
   def model(self) -> Any:
-    """The compiled model, as `mjcf.Physics.model`."""
+    """Compiled model, as in `mjcf.Physics.model`."""
     return self._model
 
   @property
   def data(self) -> '_Userdata':
-    """Holds `userdata`, `(worlds, slots)`, live."""
+    """Object with the attribute `userdata`, `(worlds, slots)`, live."""
     return self._data
 
   @property
   def state(self) -> np.ndarray:
-    """The integration state of every world, `(worlds, size)`, live."""
+    """Integration state of every world, `(worlds, size)`, live."""
     return self._batch.state
 
   def world(self, index: int) -> protocols.Physics:
-    """Returns one world, for what is done to one at a time, as at a reset."""
+    """Returns the physics of one world, as episodes need when they begin."""
     return self._worlds[index]
 
   def bind(self, mjcf_elements: Any) -> '_BatchBinding':
@@ -126,38 +126,50 @@ class BatchPhysics:
     return binding
 
   def mark_as_dirty(self) -> None:
-    """Says that derived quantities are out of date."""
+    """Marks derived quantities as out of date."""
     self._is_dirty = True
 
   def forward(self) -> None:
-    """Brings positions, velocities and what derives from them up to date."""
+    """Updates the quantities derived from positions and velocities."""
     self._batch.forward(stage=_STAGE)
     self._is_dirty = False
 
   def refresh(self) -> None:
-    """Does `forward` where something has been written since the last one."""
+    """Calls `forward` if the state has changed since the last call."""
     if self._is_dirty:
       self.forward()
 
   def advance(self, num_substeps: int) -> None:
-    """Steps every world, from the state as it is."""
+    """Steps every world from its present state."""
     self._batch.step(nstep=num_substeps)
     self._is_dirty = True
 
   def reset(self, worlds: np.ndarray) -> None:
-    """Resets the state of some worlds, by number; nothing is derived yet."""
+    """Resets the states of worlds, given their indices.
+
+    Derived quantities are not updated.
+    """
     self._batch.reset(worlds, stage=int(mujoco.mjtStage.mjSTAGE_NONE))
     self._batch.warning[worlds] = 0
     self._is_dirty = True
 
   def set_state(self, worlds: np.ndarray, values: np.ndarray) -> None:
-    """Gives some worlds, by number, other states, `(worlds, size)`."""
+    """Sets the states of worlds.
+
+    Args:
+      worlds: Indices of the worlds.
+      values: Integration states, `(worlds, size)`.
+    """
     self._batch.state[worlds] = values
     self._batch.warning[worlds] = 0
     self._is_dirty = True
 
   def has_diverged(self) -> np.ndarray:
-    """Returns in which worlds MuJoCo has warned since a reset, `(worlds,)`."""
+    """Returns which worlds have MuJoCo warnings since their reset.
+
+    Returns:
+      `(worlds,)` bool.
+    """
     numbers = np.asarray(self._batch.warning)[:, :, 1]
     return np.count_nonzero(numbers, axis=1) > 0
 
@@ -172,42 +184,42 @@ class BatchPhysics:
     return distances, geoms
 
   def draw(self, camera: mjcf.Element, height: int, width: int) -> np.ndarray:
-    """Draws a camera of every world; see `entities.cameras.render`."""
+    """Renders a camera in every world; see `entities.cameras.render`."""
     frames = np.empty((self.num_envs, height, width, 3), np.uint8)
     for world, frame in enumerate(frames):
-      frame[...] = self._shown(world).draw(camera, height, width)
+      frame[...] = self._template_in(world).draw(camera, height, width)
     return frames
 
   def render(
       self, worlds: Iterable[int], camera: str, height: int, width: int
   ) -> np.ndarray:
-    """Draws some worlds for people, as `mjcf.Physics.render` does.
+    """Renders worlds for people, like `mjcf.Physics.render`.
 
     Args:
-      worlds: Their numbers.
-      camera: The name of a camera of the model.
-      height: Of a frame, pixels.
-      width: Of a frame, pixels.
+      worlds: Indices of the worlds.
+      camera: Name of a camera of the model.
+      height: Height of a frame, in pixels.
+      width: Width of a frame, in pixels.
 
     Returns:
-      `(worlds, height, width, 3)` uint8.
+      The frames, `(worlds, height, width, 3)` uint8.
 
     Raises:
-      RenderingError: If nothing renders here, or not frames of this size.
+      RenderingError: If no renderer is available, or if it fails at this size.
     """
     try:
       return np.stack(
-          [self._shown(w).render(height, width, camera_id=camera)
+          [self._template_in(w).render(height, width, camera_id=camera)
            for w in worlds]
       )  # fmt: skip
-    except (RuntimeError, ValueError) as error:  # Whatever dm_control raises.
+    except (RuntimeError, ValueError) as error:  # All that dm_control raises.
       raise errors.RenderingError(
           f'{camera}: no frame of {height} x {width} pixels'
           f' ({str(error).strip().splitlines()[0]})'
       ) from error
 
-  def _shown(self, world: int) -> single_physics.ThinPhysics:
-    """Returns the template in the state of a world; it has a renderer."""
+  def _template_in(self, world: int) -> single_physics.ThinPhysics:
+    """Returns the template, which can render, in the state of a world."""
     mujoco.mj_setState(
         self._template.model.ptr, self._template.data.ptr,
         self._batch.state[world], mujoco.mjtState.mjSTATE_INTEGRATION,
@@ -216,13 +228,18 @@ class BatchPhysics:
     return self._template
 
   def find(self, binding: Any, name: str) -> tuple[np.ndarray, Any]:
-    """Returns the field of all worlds that an attribute is in, and where."""
+    """Returns the array of all worlds with an attribute, and its index there.
+
+    Args:
+      binding: Binding of elements in the template.
+      name: Name of the attribute.
+    """
     _, index = binding._get_cached_array_and_index(name)
     if name in _STATE_FIELDS:
       field = _STATE_FIELDS[name]
     else:
       field = _DERIVED_FIELDS[binding._namespace, name]
-      # What derives from the state is only filled in from the next call on.
+      # A derived field is filled from the next call of `forward` on.
       self._is_dirty = True
     if not isinstance(index, int | np.integer | slice):
       index = np.asarray(index)
@@ -250,7 +267,7 @@ def _(
 
 @final
 class _Userdata:
-  """What entities look for as `physics.data`."""
+  """The part of `physics.data` that entities use."""
 
   def __init__(self, userdata: np.ndarray) -> None:
     self.userdata = userdata
@@ -258,7 +275,7 @@ class _Userdata:
 
 @final
 class _WorldView:
-  """One of the worlds, with the interface of a single one."""
+  """One world of a batch, with the interface of a single world."""
 
   def __init__(self, physics: BatchPhysics, index: int) -> None:
     self._physics = physics
@@ -275,7 +292,7 @@ class _WorldView:
     return self._data
 
   def bind(self, mjcf_elements: Any) -> '_WorldBinding':
-    """Returns the binding of elements in this world."""
+    """Returns the binding of an element, or of a tuple or list of elements."""
     key = mjcf_elements
     if type(key) is list:
       key = tuple(key)
@@ -290,7 +307,7 @@ class _WorldView:
 
 
 def _attribute(name: str) -> property:
-  """An attribute that `_get` reads and, if it is state, `_set` writes."""
+  """Returns a property that calls `_get` and, for state, `_set`."""
 
   def get(self: Any) -> np.ndarray:
     return self._get(name)
@@ -302,7 +319,7 @@ def _attribute(name: str) -> property:
 
 
 class _Binding(abc.ABC):
-  """Elements, with the attributes that entities read and write whole."""
+  """Bound elements. Attributes are read and written whole."""
 
   qpos = _attribute('qpos')
   qvel = _attribute('qvel')
@@ -318,21 +335,21 @@ class _Binding(abc.ABC):
 
   @property
   def element_id(self) -> Any:
-    """The number of the element in the model, or those of several."""
+    """Number of the element in the model, or of each element."""
     return self._binding.element_id
 
   @abc.abstractmethod
   def _get(self, name: str) -> np.ndarray:
-    """Returns an attribute, read-only."""
+    """Returns an attribute as a read-only array."""
 
   @abc.abstractmethod
   def _set(self, name: str, value: Any) -> None:
-    """Writes an attribute that is state."""
+    """Writes an attribute of the state."""
 
 
 @final
 class _BatchBinding(_Binding):
-  """Elements of every world: arrays with a leading axis, read-only and live."""
+  """Elements of every world, as live, read-only arrays with a leading axis."""
 
   def __init__(self, physics: BatchPhysics, binding: Any) -> None:
     super().__init__(binding)
@@ -340,7 +357,7 @@ class _BatchBinding(_Binding):
     self._parts: dict[str, tuple[np.ndarray, Any]] = {}
 
   def part(self, name: str) -> tuple[np.ndarray, Any]:
-    """Returns the field that an attribute is in, and where in it."""
+    """Returns the array that contains an attribute, and its index there."""
     if name not in self._parts:
       self._parts[name] = self._physics.find(self._binding, name)
     return self._parts[name]
@@ -354,7 +371,7 @@ class _BatchBinding(_Binding):
     return found
 
   def mark_as_dirty(self) -> None:
-    """Says that derived quantities are out of date."""
+    """Marks derived quantities as out of date."""
     self._physics.mark_as_dirty()
 
   def _set(self, name: str, value: Any) -> None:
@@ -366,7 +383,7 @@ class _BatchBinding(_Binding):
 
 @final
 class _WorldBinding(_Binding):
-  """Elements of one world of many."""
+  """Elements of one world of a batch."""
 
   def __init__(self, binding: _BatchBinding, world: int) -> None:
     super().__init__(binding)

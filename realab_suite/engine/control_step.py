@@ -1,8 +1,8 @@
-"""One control step, for one world and for many.
+"""The control step, for one world and for a batch.
 
-`run` is the list in `docs/architecture.md`. Leading axes of all arrays are
-worlds: `()` for one world, `(worlds,)` for many. Nothing here keeps state, and
-nothing here notifies event sinks.
+`run` implements the list in `docs/architecture.md`. The leading axes of all
+arrays are worlds: `()` for one world, `(worlds,)` for a batch. This module
+keeps no state and does not notify event sinks.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,8 +23,8 @@ class Outcome(NamedTuple):
   """The result of a control step.
 
   Attributes:
-    records: Writes and reads, in the order of time.
-    ending: Reward, discount and end, as the task gives them.
+    records: Writes and reads, in order of time.
+    ending: Reward, discount and end of the episode, as the task returns them.
     provider_states: State of each provider after the step.
   """
 
@@ -47,27 +47,29 @@ def run(
     provider_states: Sequence[Any],
     idle: Callable[[], np.ndarray | None] = lambda: None,
 ) -> Outcome:
-  """Runs a control step; the caller observes and notifies the sinks.
+  """Runs a control step. The caller observes and notifies the sinks.
 
   Args:
-    physics: One world, or many.
-    host: The task.
-    mechanism: The registers, meters and providers.
+    physics: Physics of one world or of a batch.
+    host: Host of the task.
+    mechanism: Registers, meters and providers.
     schedule: Substeps after which meters and providers act.
-    num_substeps: Substeps of a control step.
+    num_substeps: Number of substeps in a control step.
     queries: Values for the query registers, `(..., queries)`.
     controls: Controls of the task, `(..., controls)`.
     observation: Observation that the action responds to, by name.
-    provider_keys: Key of each provider's episode, `(providers, ..., 2)`,
-      uint64.
+    provider_keys: Random key of each provider in this episode, `(providers,
+      ..., 2)` uint64.
     provider_states: State of each provider.
-    idle: In a batch, returns the worlds whose records do not count, `(worlds,)`
-      bool: those that begin an episode next, and those that have failed since.
-      For one world, returns `None`.
+    idle: Function that returns the worlds of a batch whose records do not
+      count, `(worlds,)` bool: worlds that begin an episode after this step, and
+      worlds that have failed. For a single world, it returns `None`.
 
   Raises:
-    PhysicsError: If the physics of one world has failed. In a batch, a world
-      that has failed is left out instead.
+    PhysicsError: If the physics of a single world has failed. In a batch, a
+      world that has failed is skipped instead.
+    FeedbackProviderError: If a provider failed.
+    RegisterValueError: If a written value cannot be stored.
   """
   was_over = host.is_over(physics)
   host.begin_step(physics, controls)

@@ -1,7 +1,7 @@
-"""One world with feedback, as a `dm_env` environment without a reward channel.
+"""The environment of one world: `dm_env` with feedback but no reward channel.
 
-This module and `foreign` alone use private parts of `composer.Environment`;
-they are those of dm_control 1.0.50, and a test fails when they change.
+Only this module and `foreign` use private attributes of `composer.Environment`.
+They are those of dm_control 1.0.50, and a test fails when they change.
 """
 
 import contextlib
@@ -34,12 +34,11 @@ from realab_suite.tasks import base
 
 @final
 class Environment(composer.Environment):
-  """A world, a feedback mechanism, and the data channel of an agent.
+  """An environment with one world, a feedback mechanism and event sinks.
 
-  `reward` is the constant 0.0; feedback comes as observations
-  `registers/<name>`. The true reward goes to the event sinks only.
-
-  One control step is the list in `docs/architecture.md`.
+  `reward` is the constant 0.0. The observations `registers/<name>` contain the
+  feedback. Only the event sinks get the true reward. `docs/architecture.md`
+  lists the parts of a control step.
   """
 
   def __init__(
@@ -51,14 +50,14 @@ class Environment(composer.Environment):
       world: int = 0,
       max_steps: int | None = None,
   ) -> None:
-    """Makes the environment; `suite.load` and `suite.embed` are easier.
+    """Initializes the environment. Prefer `suite.load` or `suite.embed`.
 
     Args:
-      task: The world, with `mechanism` attached to its root entity.
-      mechanism: The feedback.
+      task: Task with `mechanism` attached to its root entity.
+      mechanism: Registers, meters and providers.
       seed: Seed of every random stream, together with `world`.
       world: Number of the world in a batch.
-      max_steps: Length of an episode in control steps, or `None`.
+      max_steps: Maximum length of an episode in control steps, or `None`.
     """
     self._physics: single_physics.ThinPhysics | foreign.ForeignPhysics
     self._mechanism = mechanism
@@ -67,8 +66,8 @@ class Environment(composer.Environment):
     self._sinks: list[events.EventSink] = []
     self._closed = False
     self._has_extra_hooks = False
-    # Worlds of this package compile once and have no hooks in substeps. Other
-    # tasks are treated as Composer does.
+    # Tasks of this package are compiled once and have no hooks in substeps.
+    # Foreign tasks are stepped as in Composer.
     self._is_ours = isinstance(task, base.Task)
     if isinstance(task, base.Task):
       hooks.refuse_in_substeps(task)
@@ -105,11 +104,11 @@ class Environment(composer.Environment):
     self._provider_states: list[Any] = []
     self._episode_is_open = False
 
-  # The evaluator's and the launchers' side; no agent gets this object.
+  # The interface for evaluators and launchers. Agents do not get this object.
 
   @property
   def mechanism(self) -> mechanisms.FeedbackMechanism:
-    """The registers, meters and providers."""
+    """Registers, meters and providers."""
     return self._mechanism
 
   @property
@@ -119,12 +118,12 @@ class Environment(composer.Environment):
 
   @property
   def world(self) -> int:
-    """Number of the world in a batch; 0 for one alone."""
+    """Number of the world in a batch; 0 for a single world."""
     return self._world
 
   @property
   def max_steps(self) -> int | None:
-    """Length of an episode in control steps, or `None`."""
+    """Maximum length of an episode in control steps, or `None`."""
     return self._max_steps
 
   @property
@@ -144,19 +143,19 @@ class Environment(composer.Environment):
 
   @property
   def has_extra_hooks(self) -> bool:
-    """Whether `add_extra_hook` was called."""
+    """True if `add_extra_hook` was called."""
     return self._has_extra_hooks
 
   @property
   def thin_physics(self) -> single_physics.ThinPhysics:
-    """The physics itself, which is compiled once.
+    """Physics of a task of this package, which is compiled once.
 
     Raises:
-      SpecError: If the task is not one of this package's worlds.
+      SpecError: If the task is a foreign task.
     """
     if not isinstance(self._physics, single_physics.ThinPhysics):
       raise errors.SpecError(
-          f'{type(self._task).__name__} is stepped as Composer would step it'
+          f'{type(self._task).__name__} is not a task of this package'
       )
     return self._physics
 
@@ -177,7 +176,7 @@ class Environment(composer.Environment):
     self._has_extra_hooks = True
 
   def add_sink(self, sink: events.EventSink) -> None:
-    """Notifies a sink of all events, from the next episode on."""
+    """Abandons the current episode and notifies a sink of all later ones."""
     self._refuse_if_closed()
     self._abandon()
     self._sinks.append(sink)
@@ -188,7 +187,11 @@ class Environment(composer.Environment):
     self._sinks.remove(sink)
 
   def rewind(self, episode: int = 0) -> None:
-    """Makes `episode` the next one; paired comparisons start from the same."""
+    """Abandons the current episode and sets the number of the next one.
+
+    Raises:
+      SpecError: If the number is negative.
+    """
     self._refuse_if_closed()
     if episode < 0:
       raise errors.SpecError(f'episode: {episode}; allowed are 0 and more')
@@ -197,22 +200,22 @@ class Environment(composer.Environment):
     self._reset_next_step = True
 
   def abandon(self, end: events.End = events.End.ABANDONED) -> None:
-    """Ends the episode that is under way, if one is; the next step resets.
+    """Ends the current episode, if there is one. The next step resets.
 
     Args:
-      end: Why.
+      end: Reason that the sinks get.
     """
     self._refuse_if_closed()
     self._abandon(end)
     self._reset_next_step = True
 
   def save(self) -> snapshots.Snapshot:
-    """Returns everything that the future of this world depends on.
+    """Returns a snapshot of this world, from which `restore` continues.
 
-    The event sinks' records of the episode are part of it.
+    It contains the state of the event sinks for the current episode.
 
     Raises:
-      SpecError: If the world is somebody else's, or a sink cannot be saved.
+      SpecError: If the task is foreign, or if a sink cannot be saved.
       StateLayoutError: If a provider's state is not plain data.
     """
     header = self.snapshot_header()
@@ -233,19 +236,18 @@ class Environment(composer.Environment):
     return snapshots.Snapshot(header, worlds.to_data())
 
   def restore(self, snapshot: snapshots.Snapshot) -> None:
-    """Makes this world what another one, or this one, was when it was saved.
+    """Sets this world to the state in a snapshot.
 
-    What follows is bit for bit what followed there, later episodes included:
-    the seed is restored, too. The episode that is under way is abandoned. An
-    environment without sinks takes any snapshot that fits; one with sinks,
-    those that were saved with sinks of the same kinds.
+    It continues bit for bit like the saved world, including later episodes,
+    because the seed is restored as well. The current episode is abandoned. If
+    there are sinks, the snapshot has to contain states of sinks of their kinds.
 
     Args:
-      snapshot: Of one world, alone or of a batch.
+      snapshot: Snapshot of a single world, or of one world of a batch.
 
     Raises:
-      SpecError: If the world is somebody else's.
-      StateLayoutError: If the snapshot does not fit. Nothing has changed.
+      SpecError: If the task is a foreign task.
+      StateLayoutError: If the snapshot does not fit. The state is unchanged.
     """
     header = self.snapshot_header()
     saved = snapshots.WorldStates.from_data(snapshot.contents_for(header))
@@ -256,7 +258,7 @@ class Environment(composer.Environment):
       )
     saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
     self._abandon()
-    # Whatever goes wrong from here on, the next step starts with a reset.
+    # If anything fails from here on, the next step starts with a reset.
     self._reset_next_step = True
     snapshots.set_state(self._physics, saved.physics[0])
     (self._seed,), (self._world,) = saved.seed, saved.world
@@ -267,10 +269,10 @@ class Environment(composer.Environment):
       )
     else:
       self._random_state.set_state(saved.random_state)
-    for here, there in zip(
+    for key, saved_key in zip(
         self._provider_keys, saved.provider_keys, strict=True
     ):
-      here[:] = there[0]
+      key[:] = saved_key[0]
     self._provider_states = (
         saved.provider_states
         if saved.indices is None
@@ -285,20 +287,20 @@ class Environment(composer.Environment):
     (self._reset_next_step,) = saved.is_pending
 
   def snapshot_header(self, model: Any = None) -> dict[str, Any]:
-    """Returns what a snapshot and this environment have to have in common.
+    """Returns the header that a snapshot needs to fit this environment.
 
     Args:
-      model: The compiled model, as `physics.model`; `None` for this one's own.
+      model: Compiled model, as `physics.model`; `None` for that of this world.
 
     Raises:
-      SpecError: If there are no snapshots of this environment.
+      SpecError: If the task is foreign, or if its bodies can sleep.
     """
     self._refuse_if_closed()
     if not isinstance(self._task, base.Task):
       raise errors.SpecError(
-          f'{type(self._task).__name__} cannot be saved or restored: a task'
-          ' that is no realab_suite.tasks.base.Task may compile its model anew'
-          ' and keep state in Python'
+          f'{type(self._task).__name__} cannot be saved or restored: only a'
+          ' realab_suite.tasks.base.Task is compiled once and keeps no state in'
+          ' Python'
       )
     return {
         **snapshots.describe(self._physics.model if model is None else model),
@@ -313,7 +315,7 @@ class Environment(composer.Environment):
         },
     }
 
-  # The agent's side: `dm_env.Environment`.
+  # The interface for agents: `dm_env.Environment`.
 
   def action_spec(self) -> dm_env_specs.Array:
     self._refuse_if_closed()
@@ -332,10 +334,14 @@ class Environment(composer.Environment):
     return self._observer.spec()
 
   def reset(self) -> dm_env.TimeStep:
-    """Starts the next episode and returns its FIRST time step."""
+    """Abandons the current episode and starts the next one.
+
+    Raises:
+      EpisodeInitializationError: If every attempt of the task failed.
+    """
     self._refuse_if_closed()
     self._abandon()
-    # Whatever goes wrong from here on, the next step starts with a reset.
+    # If anything fails from here on, the next step starts with a reset.
     self._reset_next_step = True
     self._episode += 1
     episodes.begin(
@@ -350,10 +356,10 @@ class Environment(composer.Environment):
     records: list[Any] = [*self._mechanism.initial_writes(self._physics)]
     records += self._observe()
     start = events.Start(self._seed, self._world, self._episode, records)
-    with self._undisturbed():
+    with self._preserving_physics():
       for sink in self._sinks:
         sink.episode_started(start, self._physics_proxy)
-    # Unless every sink took its beginning, there is no episode.
+    # The episode is open only after every sink was notified without an error.
     self._reset_next_step = False
     self._episode_is_open = True
     return dm_env.restart(observing.copied(self._observation))
@@ -362,31 +368,30 @@ class Environment(composer.Environment):
     """Runs one control step and returns its time step.
 
     Raises:
-      ActionError: If the action does not fit `action_spec`. Nothing has moved.
+      ActionError: If the action violates `action_spec`. Nothing has changed.
       FeedbackProviderError: If a provider failed. The episode is over.
-      RegisterValueError: If a provider wrote what cannot be stored. The episode
-        is over.
+      RegisterValueError: If a provider wrote a value that cannot be stored. The
+        episode is over.
     """
     self._refuse_if_closed()
     queries, controls = self._codec.decode(action)
     if self._reset_next_step:
       return self.reset()
-    # Until this step is known to be good, the next one starts with a reset.
+    # If anything fails here, the next step starts with a reset.
     self._reset_next_step = True
     try:
       outcome = self._control_step(queries, controls)
       records = outcome.records + self._observe()
     except control.PhysicsError:
       self._end(events.End.DIVERGENCE)
-      # The agent learns that time is up and nothing else: no register is read
-      # from a state that MuJoCo has reset.
+      # MuJoCo has reset the state. The agent gets the previous observation.
       return dm_env.truncation(0.0, observing.copied(self._observation), 1.0)
     except Exception:
       self._end(events.End.ERROR)
       raise
     ending = outcome.ending
     self._provider_states = outcome.provider_states
-    with self._undisturbed():
+    with self._preserving_physics():
       step = events.Step(records, np.array(ending.true_reward), ending.failure)
       for sink in self._sinks:
         sink.step_ended(step, self._physics_proxy)
@@ -403,7 +408,7 @@ class Environment(composer.Environment):
     return dm_env.transition(0.0, observation, float(ending.discount))
 
   def close(self) -> None:
-    """Frees the world; closing twice does nothing."""
+    """Frees the world. Closing it again has no effect."""
     if self._closed:
       return
     self._abandon()
@@ -412,8 +417,8 @@ class Environment(composer.Environment):
 
   def __reduce__(self) -> Any:
     raise TypeError(
-        'environments cannot be pickled or copied; pass a design on and build'
-        ' the environment where it is used'
+        'environments cannot be pickled or copied; pass the design and load the'
+        ' environment where it is used'
     )
 
   def __deepcopy__(self, memo: Any) -> Any:
@@ -423,7 +428,7 @@ class Environment(composer.Environment):
       self, queries: np.ndarray, controls: np.ndarray
   ) -> control_step.Outcome:
     return control_step.run(
-        # Composer hands its hooks a proxy.
+        # Composer passes a proxy to its hooks.
         self._physics if self._is_ours else self._physics_proxy,
         self._host,
         self._mechanism,
@@ -437,13 +442,13 @@ class Environment(composer.Environment):
     )
 
   def _observe(self) -> list[Any]:
-    """Makes the next observation; returns the reads of registers for it."""
+    """Updates the observation and returns the reads of registers for it."""
     observation, reads = self._observer.observe(self._physics)
     self._observation = observing.frozen(observation)
     return list(reads)
 
-  def _undisturbed(self) -> contextlib.AbstractContextManager[None]:
-    """Returns a context in which sinks may look at the physics."""
+  def _preserving_physics(self) -> contextlib.AbstractContextManager[None]:
+    """Returns a context in which sinks may read the physics."""
     if isinstance(self._physics, foreign.ForeignPhysics) and self._sinks:
       return self._physics.unchanged()
     return contextlib.nullcontext()
@@ -469,7 +474,7 @@ class Environment(composer.Environment):
       self._observation_updater.reset(self._physics_proxy, self._random_state)
 
   def _recompile_physics(self) -> None:
-    """Compiles the model into a physics of this package's engine."""
+    """Compiles the model into a physics class of this engine."""
     if getattr(self, '_physics', None):
       self._physics.free()
     kind: type[single_physics.ThinPhysics | foreign.ForeignPhysics] = (
@@ -478,7 +483,7 @@ class Environment(composer.Environment):
     model = self._task.root_entity.mjcf_model
     with state.room_for_slots(model):
       self._physics = kind.from_mjcf_model(model)
-    # Worlds of this package step from the state; see `ThinPhysics.advance`.
+    # Steps of `ThinPhysics` begin from the state; see `ThinPhysics`.
     self._physics.legacy_step = not self._is_ours
 
   def _abandon(self, end: events.End = events.End.ABANDONED) -> None:

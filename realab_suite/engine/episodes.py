@@ -1,4 +1,4 @@
-"""The beginning of an episode: its random streams, and attempts at a reset."""
+"""The start of an episode: its random streams, and retries of a reset."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ import numpy as np
 from realab_suite.engine import seeding
 
 MAX_RESET_ATTEMPTS = 10
-"""Attempts at the beginning of an episode, each with other random numbers."""
+"""Maximum number of attempts to begin an episode, with different streams."""
 
 
 def begin(
@@ -18,15 +18,15 @@ def begin(
     episode: int,
     initialize: Callable[[int], None],
 ) -> None:
-  """Initializes an episode, repeatedly if the task asks for it.
+  """Initializes an episode, and retries if the task fails to initialize.
 
   Args:
-    random_state: Generator that `initialize` uses; it is reseeded.
+    random_state: Generator that `initialize` uses. Each attempt reseeds it.
     seed: Seed of the environment.
     world: Number of the world.
     episode: Number of the episode.
-    initialize: Initializes the task and its entities; gets the number of the
-      attempt, from 0.
+    initialize: Function that initializes the task and its entities, given the
+      number of the attempt, from 0.
 
   Raises:
     EpisodeInitializationError: If every attempt failed.

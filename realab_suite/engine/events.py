@@ -1,4 +1,4 @@
-"""What the engine tells an evaluator, over a channel that no agent is on."""
+"""Events: the engine's notifications to event sinks, hidden from agents."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -16,14 +16,14 @@ Records = Sequence[registers.Record]
 
 @final
 class End(enum.Enum):
-  """Why an episode ended."""
+  """Reason why an episode ended."""
 
-  TERMINATED = 'terminated'  # The task said so.
-  TIMEOUT = 'timeout'  # The last control step was reached.
-  ABANDONED = 'abandoned'  # Somebody called `reset` or `close`.
-  DISCONNECT = 'disconnect'  # The agent's process went away, or fell silent.
-  DIVERGENCE = 'divergence'  # The physics failed; nothing after it counts.
-  ERROR = 'error'  # A provider, a register or the task raised.
+  TERMINATED = 'terminated'  # The task ended it.
+  TIMEOUT = 'timeout'  # The episode reached its maximum length.
+  ABANDONED = 'abandoned'  # A caller ended it, for instance with `reset`.
+  DISCONNECT = 'disconnect'  # The agent's process left or timed out.
+  DIVERGENCE = 'divergence'  # The physics failed; the step does not count.
+  ERROR = 'error'  # A provider, a register or the task failed.
 
 
 @final
@@ -31,10 +31,10 @@ class Start(NamedTuple):
   """The beginning of an episode.
 
   Attributes:
-    seed: The seed of the environment.
-    world: Which world of a batch; 0 for one alone.
-    episode: The number of the episode, from 0.
-    records: What was written to registers and read off them at the reset.
+    seed: Seed of the environment.
+    world: Number of the world in a batch; 0 for a single world.
+    episode: Number of the episode, from 0.
+    records: Writes and reads of registers at the reset, in order of time.
   """
 
   seed: int
@@ -48,11 +48,10 @@ class Step(NamedTuple):
   """A control step.
 
   Attributes:
-    records: Every write to a register and every read, in the order of time.
-    true_reward: The true reward of the step, `(...)`; nan if the task failed
-      to give one.
-    failure: Traceback of the exception that the task raised instead of giving
-      a reward, or `None`.
+    records: Writes and reads of registers, in order of time.
+    true_reward: True reward of the step, `(...)`; NaN if the task raised an
+      exception instead of returning one.
+    failure: Traceback of that exception, or `None`.
   """
 
   records: Records
@@ -61,30 +60,33 @@ class Step(NamedTuple):
 
 
 class EventSink(abc.ABC):
-  """Hears of everything that feedback and the true reward do."""
+  """Observer of the feedback and the true reward of one world.
+
+  The environment notifies its sinks of all writes, reads and true rewards.
+  """
 
   @property
   def state_kind(self) -> str:
-    """Names the sinks that can go on from each other's `state`."""
+    """Kind of the sink. Sinks of the same kind can continue from a `state`."""
     return type(self).__name__
 
   @abc.abstractmethod
   def episode_started(self, start: Start, physics: protocols.Physics) -> None:
-    """An episode has begun. `physics` may be looked at, never written."""
+    """Processes the start of an episode. Must not change `physics`."""
 
   @abc.abstractmethod
   def step_ended(self, step: Step, physics: protocols.Physics) -> None:
-    """A control step is over. `physics` may be looked at, never written."""
+    """Processes the end of a control step. Must not change `physics`."""
 
   @abc.abstractmethod
   def episode_ended(self, end: End) -> None:
-    """The episode that was under way is over."""
+    """Processes the end of the current episode."""
 
   def state(self) -> Any:
-    """Returns what the sink knows of the episode under way, for a snapshot.
+    """Returns the sink's state for the current episode, for a snapshot.
 
     Returns:
-      Tuples, lists and dicts of arrays, numbers, texts and `None`.
+      Tuples, lists and dicts of arrays, numbers, strings and `None`.
 
     Raises:
       SpecError: If the sink cannot be saved.
@@ -92,33 +94,32 @@ class EventSink(abc.ABC):
     raise _unsaveable(self)
 
   def set_state(self, state: Any) -> None:  # noqa: B027 - see `state`.
-    """Goes on with an episode from what `state` returned.
+    """Continues an episode from a state that `state` returned.
 
-    The episode that was under way has ended by then.
+    The sink is notified of the end of its current episode before this call.
     """
 
 
 @final
 class BatchStep(NamedTuple):
-  """What happened in one control step of many worlds; arrays are `(worlds,)`.
+  """A control step of a batch.
 
-  A world either begins an episode in this step (`is_first`), or has gone
-  through a control step, which counts unless its physics failed
-  (`has_failed`).
+  In this step, a world either begins an episode (`is_first`) or runs a control
+  step, which counts unless its physics failed (`has_failed`).
 
   Attributes:
-    seed: The seed that each world's random streams follow from.
-    world: The number that they follow from, too; see `BatchEnvironment.restore`
-      for when it is not the world's index in the batch.
-    episode: The number of each world's episode.
-    is_first: Where an episode begins.
-    has_failed: Where nothing but the end counts.
-    ends: The `End` of each world whose episode ends, by the world's index.
-    initial: The writes of a reset, which count where an episode begins.
-    records: The writes and reads within the control step, in the order of time.
-    agent_reads: What the agents read in the end.
-    true_reward: The true reward of the control step.
-    failure: As in `Step`; it concerns all worlds.
+    seed: Seed of each world, `(worlds,)`, objects.
+    world: Number of each world, `(worlds,)`, objects. The random streams depend
+      on it. After `BatchEnvironment.restore`, it can differ from the index.
+    episode: Number of each world's episode, `(worlds,)` int.
+    is_first: True for worlds that begin an episode, `(worlds,)` bool.
+    has_failed: True for worlds of which only `ends` counts, `(worlds,)` bool.
+    ends: `End` of each episode that ends in this step, by index of the world.
+    initial: Writes of a reset; they count for worlds that begin an episode.
+    records: Writes and reads in the control step, in order of time.
+    agent_reads: Reads of registers for the agents' observations.
+    true_reward: True reward of each world, `(worlds,)`.
+    failure: As in `Step`, for all worlds.
   """
 
   seed: np.ndarray
@@ -141,7 +142,7 @@ class BatchStep(NamedTuple):
       episode: np.ndarray,
       ends: Mapping[int, End],
   ) -> Self:
-    """Returns a step in which episodes end and nothing else happens."""
+    """Returns a step that contains only the ends of episodes."""
     nowhere = np.zeros(len(episode), bool)
     return cls(
         seed=seed,
@@ -158,25 +159,28 @@ class BatchStep(NamedTuple):
 
 
 class BatchEventSink(abc.ABC):
-  """Hears of everything that feedback and the true reward do in many worlds."""
+  """Observer of the feedback and the true rewards of a batch."""
 
   @property
   def state_kind(self) -> str:
-    """Names the sinks, of one world or many, that can go on from a `state`."""
+    """Kind of the sink. Sinks of the same kind can continue from a `state`.
+
+    A sink of a batch and a sink of one world may have the same kind.
+    """
     return type(self).__name__
 
   @abc.abstractmethod
   def step_ended(self, step: BatchStep) -> None:
-    """A control step of all worlds is over."""
+    """Processes the end of a control step of the batch."""
 
   def state(self, indices: np.ndarray) -> list[Any]:
-    """Returns what the sink knows of the episodes under way, for a snapshot.
+    """Returns the sink's states for current episodes, for a snapshot.
 
     Args:
-      indices: Of which worlds.
+      indices: Indices of the worlds, `(indices,)` int.
 
     Returns:
-      For each of them what `EventSink.state` may return.
+      For each of these worlds, plain data as in `EventSink.state`.
 
     Raises:
       SpecError: If the sink cannot be saved.
@@ -186,14 +190,18 @@ class BatchEventSink(abc.ABC):
   def set_state(  # noqa: B027 - see `state`.
       self, indices: np.ndarray, states: Sequence[Any]
   ) -> None:
-    """Goes on with episodes from what `state` returned.
+    """Continues episodes from states that `state` returned.
 
-    The episodes that were under way in these worlds have ended by then.
+    The sink is notified of the ends of the current episodes before this call.
+
+    Args:
+      indices: Indices of the worlds, `(indices,)` int.
+      states: State of each of these worlds.
     """
 
 
 def _unsaveable(sink: EventSink | BatchEventSink) -> errors.SpecError:
   return errors.SpecError(
-      f'{type(sink).__name__} cannot be saved; allowed are sinks that have'
-      ' state and set_state'
+      f'{type(sink).__name__} cannot be saved; allowed are sinks that'
+      ' implement state and set_state'
   )

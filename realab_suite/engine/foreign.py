@@ -1,9 +1,9 @@
-"""Composer tasks of other packages, driven as `composer.Environment` does it.
+"""Foreign tasks: Composer tasks of other packages, stepped as in Composer.
 
-With a design that has no registers, an embedded task gives the observations,
-rewards, discounts and step types of `composer.Environment`, to the last bit.
-Such a task is compiled anew for each episode, has hooks in substeps, and keeps
-state wherever it likes; there are no batches and no snapshots of it.
+With a design without registers, the observations, rewards, discounts and step
+types of a foreign task equal those of `composer.Environment`, bit for bit. A
+foreign task is compiled for each episode, may have hooks in substeps, and may
+keep state in Python. Batches and snapshots therefore do not support it.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,28 +22,28 @@ from realab_suite.engine import hosts
 
 @final
 class ForeignPhysics(mjcf.Physics):
-  """`mjcf.Physics`, stepped as Composer steps it."""
+  """`mjcf.Physics` with the methods that the engine calls."""
 
   def refresh(self) -> None:
-    """Derives positions and velocities from the state as it is now.
+    """Updates the quantities derived from positions and velocities.
 
-    Composer begins a step with the derived quantities of the one before, which
-    are wrong after a write to a register. Accelerations and the solver's warm
-    start stay as they are, unlike in `forward`.
+    Composer begins a step with the derived quantities of the previous step,
+    which are wrong after a write to a register. Unlike `forward`, this method
+    does not change accelerations and the solver's warm start.
     """
     with self.check_invalid_state():
       mujoco.mj_step1(self.model.ptr, self.data.ptr)
 
   def advance(self, num_substeps: int) -> None:
-    """Steps as Composer does."""
+    """Runs substeps in the same way as Composer."""
     self.step(num_substeps)
 
   @contextlib.contextmanager
   def unchanged(self) -> Iterator[None]:
-    """Lets evaluators read derived quantities without changing what follows.
+    """Returns a context in which reads do not change later steps.
 
-    A bound attribute that is read after a write derives everything anew, which
-    replaces the solver's warm start.
+    Reading a bound attribute after a write recomputes all derived quantities
+    and replaces the solver's warm start. The context restores it.
     """
     is_dirty = self.is_dirty
     warm_start = np.array(self.data.qacc_warmstart)
@@ -56,10 +56,10 @@ class ForeignPhysics(mjcf.Physics):
 
 @final
 class ForeignHost(hosts.Host):
-  """A Composer task of another package.
+  """Host of a foreign task.
 
-  The agent senses the observables that the task had enabled when it was
-  embedded. Observables that are enabled later stay hidden.
+  The agent's senses are the observables that were enabled when the task was
+  embedded. Observables that are enabled later are not observed.
   """
 
   def __init__(
@@ -70,14 +70,15 @@ class ForeignHost(hosts.Host):
       updater: Callable[[], composer_observation.Updater],
       has_registers: bool,
   ) -> None:
-    """Makes the host.
+    """Initializes the host.
 
     Args:
-      task: The task.
+      task: Foreign task.
       hooks: All hooks of the `composer.Environment`.
-      random_state: Generator that hooks get.
-      updater: Returns the observation updater of the present compiled model.
-      has_registers: Whether anything is written to the world.
+      random_state: Random generator for the hooks.
+      updater: Function that returns the observation updater of the present
+        compiled model.
+      has_registers: True if the design has registers.
     """
     self._task = task
     self._hooks = hooks
@@ -91,7 +92,7 @@ class ForeignHost(hosts.Host):
     return self._sense_spec
 
   def sense(self, physics: hosts.SteppedPhysics) -> dict[str, np.ndarray]:
-    del physics  # The updater has looked already.
+    del physics  # The updater has read it already.
     seen = self._updater().get_observation()
     return {n: np.array(seen[n]) for n in self._sense_spec if n in seen}
 
@@ -119,7 +120,7 @@ class ForeignHost(hosts.Host):
         self._updater().update()
 
   def is_over(self, physics: hosts.SteppedPhysics) -> bool:
-    del physics  # Composer asks once, at the end of a step.
+    del physics  # Composer checks only at the end of a step.
     return False
 
   def end_step(

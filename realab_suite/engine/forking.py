@@ -1,4 +1,4 @@
-"""Forks: batches whose worlds continue from the state of one world."""
+"""Forks: batches whose worlds all continue from the state of one world."""
 
 from collections.abc import Sequence
 
@@ -19,25 +19,29 @@ def fork(
     num_threads: int = 0,
     sinks: Sequence[events.BatchEventSink] = (),
 ) -> batch_environment.BatchEnvironment:
-  """Makes a batch whose worlds all go on from where one world is.
+  """Creates a batch whose worlds all continue from the state of one world.
 
-  They have the same random streams, which are those of the original: worlds
-  that get the same actions stay the same, bit for bit, and their later episodes
-  are those that the original would have. The original stays as it is; either
-  can be closed before the other. Both share their entities, so they are not for
-  two threads.
+  All worlds have the random streams of the original. Worlds that get the same
+  actions therefore stay equal, bit for bit, and their later episodes are those
+  of the original. The original does not change, and either environment can be
+  closed first. They share their entities, so do not use them in two threads.
 
   Args:
-    env: The original, or a batch that it is in. It has a world of this package.
-    num_envs: How many worlds.
-    world: The index of the original in the batch; `None` for one alone.
-    num_threads: How many threads step them; 0 for all processors.
-    sinks: What hears of the worlds from here on, of the same kinds as listen to
-      the original. With `BatchEnvironment.add_sink` worlds would begin anew.
+    env: Environment of the original world, or a batch that contains it. The
+      task is one of this package.
+    num_envs: Number of worlds.
+    world: Index of the original in the batch; `None` for a single world.
+    num_threads: Number of threads that step them; 0 for all processors.
+    sinks: Event sinks of the fork, of the same kinds as those of the original;
+      they continue from its state. `BatchEnvironment.add_sink` would begin new
+      episodes instead.
+
+  Returns:
+    The fork. The caller has to close it.
 
   Raises:
-    SpecError: If there is no such world, if it cannot be saved, or if a number
-      makes no sense.
+    SpecError: If there is no such world, if it cannot be saved, or if another
+      argument is invalid.
     StateLayoutError: If the sinks differ, or if the compiled model was changed.
   """
   num_envs = arguments.num_envs(num_envs)
@@ -53,14 +57,15 @@ def fork(
       raise errors.SpecError(
           f'world: None; allowed are integers from 0 to {env.num_envs - 1}'
       )
-    # To mypy, `Environment` and all that is derived from dm_control is `Any`.
+    # Called on the class, because to mypy `env` may also be an `Environment`,
+    # which is `Any`.
     snapshot = batch_environment.BatchEnvironment.save(env, [world])
     single = env.original
   elif isinstance(env, environment.Environment):
     if world is not None:
       raise errors.SpecError(
-          f'world: {messages.quote(world)}; allowed is None, for the world is'
-          ' alone'
+          f'world: {messages.quote(world)}; allowed is None, because env is not'
+          ' a batch'
       )
     snapshot, single = env.save(), env
   else:
@@ -68,8 +73,8 @@ def fork(
         f'env: {messages.quote(env)}; allowed are environments of this package'
     )
   hooks.refuse_in_batch(single.task, single.has_extra_hooks)
-  # Compiled anew, which takes less time than one episode: what is closed frees
-  # its compiled world.
+  # The model is compiled again, because closing an environment frees its model.
+  # This takes less time than one episode.
   copy = environment.Environment(
       single.task,
       single.mechanism,

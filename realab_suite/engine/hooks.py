@@ -1,4 +1,4 @@
-"""Refusals of Composer hooks that the engine would never call."""
+"""Checks that refuse Composer hooks that the engine never calls."""
 
 from dm_control import composer
 from dm_control.composer import environment as composer_environment
@@ -6,7 +6,7 @@ from dm_control.composer import environment as composer_environment
 from realab_suite import errors
 from realab_suite.tasks import base
 
-# Worlds of this package compile once and run no Python in substeps.
+# Tasks of this package are compiled once and run no Python in substeps.
 _UNUSED = (
     'initialize_episode_mjcf',
     'after_compile',
@@ -16,10 +16,14 @@ _UNUSED = (
 
 
 def refuse_unused(task: base.Task, hook_name: str) -> None:
-  """Refuses an extra hook that a world of this package never calls.
+  """Refuses an extra hook that a task of this package never calls.
+
+  Args:
+    task: Task of the environment.
+    hook_name: One of `composer.HOOK_NAMES`.
 
   Raises:
-    SpecError: If the hook is one of those.
+    SpecError: If the engine never calls such a hook.
   """
   if hook_name in _UNUSED:
     allowed = [
@@ -27,13 +31,13 @@ def refuse_unused(task: base.Task, hook_name: str) -> None:
     ]
     raise errors.SpecError(
         f'add_extra_hook: {hook_name!r} is never called in'
-        f' {type(task).__name__}, which compiles once and has no Python in'
-        f' substeps; allowed are {allowed}'
+        f' {type(task).__name__}, which is compiled once and has no Python'
+        f' in substeps; allowed are {allowed}'
     )
 
 
 def refuse_in_substeps(task: base.Task) -> None:
-  """Refuses a world whose task or entities have hooks in substeps.
+  """Refuses a task that has hooks in substeps, or whose entities have them.
 
   Raises:
     SpecError: If there is such a hook.
@@ -44,20 +48,20 @@ def refuse_in_substeps(task: base.Task) -> None:
     for hook in ('before_substep', 'after_substep'):
       if getattr(type(part), hook) is not getattr(kind, hook):
         raise errors.SpecError(
-            f'{type(part).__name__}.{hook}: worlds of this package have no'
+            f'{type(part).__name__}.{hook}: tasks of this package have no'
             ' hooks in substeps; use latch_events'
         )
 
 
 def refuse_in_batch(task: base.Task, has_extra_hooks: bool) -> None:
-  """Refuses a world with step hooks besides those of its task.
+  """Refuses step hooks other than those of the task.
 
   Args:
-    task: The world.
-    has_extra_hooks: True if hooks were added to its environment.
+    task: Task of the batch.
+    has_extra_hooks: True if hooks were added to the environment.
 
   Raises:
-    SpecError: If there are such hooks: a batch would not call them.
+    SpecError: If there are such hooks, because a batch never calls them.
   """
   if has_extra_hooks:
     raise errors.SpecError(

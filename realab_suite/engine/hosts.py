@@ -1,9 +1,9 @@
-"""Hosts: how the engine drives a task that registers are embedded in.
+"""Hosts: the parts of a control step that depend on the kind of task.
 
-`control_step` says in which order things happen; a host says how the physics is
-advanced, when the task is over and what is sensed. This module has the
-interface and the host of this package's worlds; `foreign` has that of other
-Composer tasks.
+`control_step` defines the order of events. A host advances the physics, detects
+the end of the episode and returns the senses. This module contains the
+interface and the host of this package's tasks; `foreign` contains the host of
+foreign tasks.
 """
 
 import abc
@@ -24,13 +24,17 @@ from realab_suite.tasks import base
 
 @final
 class Ending(NamedTuple):
-  """What the task says at the end of a control step; arrays are `(...)`.
+  """Values that the task returns at the end of a control step.
+
+  All arrays have the shape `(...)`: `()` for one world, `(worlds,)` for a
+  batch.
 
   Attributes:
-    true_reward: True reward of the step; nan where the task failed to give one.
+    true_reward: True reward of the step; NaN if the task raised an exception.
     failure: Traceback of the exception that `get_reward` raised, or `None`.
-    discount: 1.0 up to the end of an episode, or the task's own.
-    is_ending: Whether the task ends the episode with this step, bool.
+    discount: Discount of the step. For tasks of this package, it is 1.0 until
+      the episode ends.
+    is_ending: True if the task ends the episode with this step.
   """
 
   true_reward: Any
@@ -46,24 +50,24 @@ class SteppedPhysics(protocols.Physics, Protocol):
     """Steps the physics from its present state."""
 
   def refresh(self) -> None:
-    """Brings positions, velocities and what derives from them up to date."""
+    """Updates the quantities derived from positions and velocities."""
 
 
 class Host(abc.ABC):
-  """A task, as the control step drives it."""
+  """Interface between the control step and a task."""
 
   @property
   @abc.abstractmethod
   def sense_spec(self) -> dict[str, specs.Array]:
-    """Specs of the agent's senses, by name; the names are the allowlist."""
+    """Specs of the agent's senses, by name. No other senses are observed."""
 
   @abc.abstractmethod
   def sense(self, physics: SteppedPhysics) -> dict[str, np.ndarray]:
-    """Returns the agent's senses, by name; the arrays are the caller's."""
+    """Returns new arrays with the agent's senses, by name."""
 
   @abc.abstractmethod
   def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
-    """Hands the controls of a step to the task, `(..., controls)`."""
+    """Passes the controls of a step, `(..., controls)`, to the task."""
 
   @abc.abstractmethod
   def advance(
@@ -73,18 +77,22 @@ class Host(abc.ABC):
       num_substeps: int,
       is_last: bool,
   ) -> None:
-    """Steps the physics.
+    """Runs substeps of the physics.
 
     Args:
-      physics: One world, or many.
+      physics: Physics of one world or of a batch.
       controls: Controls of this step, `(..., controls)`.
       num_substeps: Number of substeps; may be 0.
-      is_last: Whether the step is over then.
+      is_last: True if these are the last substeps of the control step.
     """
 
   @abc.abstractmethod
   def is_over(self, physics: SteppedPhysics) -> Any:
-    """Returns whether the episode is over, as far as meters can tell, bool."""
+    """Returns True for worlds whose episode the task has ended, `(...)` bool.
+
+    For a foreign task it is always False, because Composer checks only at the
+    end of a step.
+    """
 
   @abc.abstractmethod
   def end_step(
@@ -93,32 +101,33 @@ class Host(abc.ABC):
     """Ends a control step.
 
     Args:
-      physics: One world, or many.
+      physics: Physics of one world or of a batch.
       was_over: Value of `is_over` when the step began.
       is_ending: Value of `is_over` when the meters acted.
     """
 
 
 class StepHooks(Protocol):
-  """The hooks of a control step: a task's, or a task's and its entities'."""
+  """Hooks of a control step, of a task alone or with those of its entities."""
 
   def before_step(
       self, physics: SteppedPhysics, action: Any, random_state: Any
   ) -> None:
-    """Takes the controls."""
+    """Runs before the first substep."""
 
   def after_step(self, physics: SteppedPhysics, random_state: Any) -> None:
-    """Ends the step."""
+    """Runs after the last substep."""
 
 
 @final
 class WorldHost(Host):
-  """A world of this package: one of them, or many in a batch.
+  """Host of a task of this package, for one world or a batch.
 
-  There is no Python in a substep. An episode that the task ends is over with
-  the control step whose meters can measure the end: what ends an episode is
-  often what matters most, and feedback on it would otherwise never reach the
-  agent. Rewards of a step that began after the end do not count.
+  It runs no Python in substeps. When the task ends an episode, the episode
+  continues until the end of the first control step whose meters can measure the
+  ending: the event that ends an episode is often the most important one, and
+  otherwise the agent would get no feedback on it. Rewards of a step that began
+  after the ending do not count.
   """
 
   def __init__(
@@ -128,19 +137,19 @@ class WorldHost(Host):
       random_state: np.random.RandomState | None,
       batch_shape: tuple[int, ...],
   ) -> None:
-    """Makes the host.
+    """Initializes the host.
 
     Args:
-      task: The world.
+      task: Task of this package.
       hooks: The task itself, or all hooks of a `composer.Environment`.
-      random_state: Generator that hooks get; `None` in a batch.
-      batch_shape: `()` for one world, `(worlds,)` for many.
+      random_state: Random generator for the hooks; `None` in a batch.
+      batch_shape: `()` for one world, `(worlds,)` for a batch.
     """
     self._task = task
     self._hooks = hooks
     self._random_state = random_state
     self._batch_shape = batch_shape
-    self._fits = {
+    self._expected = {
         name: ((*batch_shape, *spec.shape), spec.dtype)
         for name, spec in task.sense_spec.items()
     }
@@ -150,19 +159,19 @@ class WorldHost(Host):
     return self._task.sense_spec
 
   def sense(self, physics: SteppedPhysics) -> dict[str, np.ndarray]:
-    """Returns what the task senses.
+    """Returns the agent's senses, by name.
 
     Raises:
-      SpecError: If that does not fit the task's `sense_spec`.
+      SpecError: If they do not fit the task's `sense_spec`.
     """
     sensed = self._task.senses(physics)
-    if sensed.keys() != self._fits.keys():
+    if sensed.keys() != self._expected.keys():
       raise errors.SpecError(
           f'{type(self._task).__name__}.senses: keys {sorted(sensed)}; allowed'
-          f' are those of sense_spec, {sorted(self._fits)}'
+          f' are those of sense_spec, {sorted(self._expected)}'
       )
     for name, value in sensed.items():
-      shape, dtype = self._fits[name]
+      shape, dtype = self._expected[name]
       if np.shape(value) != shape or getattr(value, 'dtype', None) != dtype:
         raise errors.SpecError(
             f'{type(self._task).__name__}.senses: {name!r} is'
@@ -187,30 +196,30 @@ class WorldHost(Host):
       self._task.latch_events(physics)
 
   def is_over(self, physics: SteppedPhysics) -> Any:
-    return self._in_all(self._task.should_terminate_episode(physics), bool)
+    return self._per_world(self._task.should_terminate_episode(physics), bool)
 
   def end_step(
       self, physics: SteppedPhysics, was_over: Any, is_ending: Any
   ) -> Ending:
     self._hooks.after_step(physics, self._random_state)
-    # MuJoCo checks the result of the last substep when it derives from it. If
-    # that came with the observation, a failure would be noticed a step late.
+    # MuJoCo checks the result of the last substep when it updates derived
+    # quantities. Without this update, a failure would be detected a step late.
     physics.refresh()
     reward, failure = true_reward(
-        lambda: self._in_all(self._task.get_reward(physics), float),
-        self._in_all(np.nan, float),
+        lambda: self._per_world(self._task.get_reward(physics), float),
+        self._per_world(np.nan, float),
     )
-    discount = self._in_all(self._task.get_discount(physics), float)
+    discount = self._per_world(self._task.get_discount(physics), float)
     return Ending(
         axes.choose(was_over, 0.0, reward),
         failure,
-        # The discount of an end that meters have not measured stays hidden.
+        # The discount of an ending stays hidden until meters have measured it.
         axes.choose(is_ending, discount, 1.0),
         is_ending,
     )
 
-  def _in_all(self, value: Any, kind: type) -> Any:
-    """Returns a value for each world; the task may give one for all."""
+  def _per_world(self, value: Any, kind: type) -> Any:
+    """Returns a value for each world; the task may return one for all."""
     if not self._batch_shape:
       return np.dtype(kind).type(value)
     return np.array(np.broadcast_to(value, self._batch_shape), kind)
@@ -219,15 +228,15 @@ class WorldHost(Host):
 def true_reward(get: Callable[[], Any], unknown: Any) -> tuple[Any, str | None]:
   """Returns a true reward, or `unknown` and the traceback of an exception.
 
-  An exception would reach the agent and tell it something about the reward.
-  Only the evaluator gets the traceback, and the episode is not valid.
+  An exception that reached the agent could reveal the reward. The traceback is
+  for the evaluator only, and the episode counts as failed.
 
   Args:
-    get: Returns the reward.
-    unknown: Reward to return if `get` raises.
+    get: Function that returns the reward.
+    unknown: Reward to return if `get` raises an exception.
 
   Raises:
-    PhysicsError: If the physics has failed, which is not the task's mistake.
+    PhysicsError: If the physics has failed, which is not an error of the task.
   """
   try:
     return get(), None

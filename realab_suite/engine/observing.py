@@ -1,4 +1,4 @@
-"""Observations: the agent's senses and the readings of its registers."""
+"""Observations: the agent's senses and the readings of registers."""
 
 from collections.abc import Mapping
 from typing import final
@@ -11,15 +11,17 @@ from realab_suite.engine import hosts
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
 
-# Share of an episode that is left, from 1 to 0.
+# Sense with the remaining share of the episode, from 1 to 0.
 _TIME_LEFT = 'time_left'
 
 
 @final
 class Observer:
-  """Makes the observations of one world, or of many.
+  """Makes the observations of one world or of a batch.
 
-  Its keys are an allowlist: `senses/<name>` and `registers/<name>`.
+  Observations contain the keys `senses/<name>` of the senses that the host
+  declares and `registers/<name>` of the registers that agents read. Other keys
+  are never added.
   """
 
   def __init__(
@@ -28,27 +30,28 @@ class Observer:
       mechanism: mechanisms.FeedbackMechanism,
       max_steps: int | None,
   ) -> None:
-    """Makes an observer.
+    """Initializes the observer.
 
     Args:
-      host: The task.
-      mechanism: The registers.
-      max_steps: Length of an episode in control steps, or `None`.
+      host: Host of the task.
+      mechanism: Registers, meters and providers.
+      max_steps: Maximum length of an episode in control steps, or `None`.
 
     Raises:
-      SpecError: If the task has a sense of a name that is taken.
+      SpecError: If the task has a sense called `time_left` and `max_steps` is
+        not `None`.
     """
     self._host = host
     self._mechanism = mechanism
     self._max_steps = max_steps
     if max_steps is not None and _TIME_LEFT in host.sense_spec:
       raise errors.SpecError(
-          f'the task has an observable {_TIME_LEFT!r} of its own; allowed names'
-          ' are all others, or max_steps=None'
+          f'the task has its own observable {_TIME_LEFT!r}; rename it, or pass'
+          ' max_steps=None'
       )
 
   def spec(self) -> dict[str, specs.Array]:
-    """Returns the spec of one world's observation; it is the caller's."""
+    """Returns a new dict with the observation spec of one world, by key."""
     senses = dict(self._host.sense_spec)
     if self._max_steps is not None:
       senses[_TIME_LEFT] = specs.BoundedArray((), np.float32, 0.0, 1.0)
@@ -64,10 +67,14 @@ class Observer:
   def observe(
       self, physics: hosts.SteppedPhysics
   ) -> tuple[dict[str, np.ndarray], list[registers.Read]]:
-    """Returns an observation and the reads of registers for it.
+    """Makes an observation.
 
     Args:
-      physics: One world, or many.
+      physics: Physics of one world or of a batch.
+
+    Returns:
+      The observation, with arrays of shape `(..., *spec.shape)` by key, and the
+      reads of registers for it.
     """
     observation = {
         f'senses/{name}': value
@@ -83,12 +90,12 @@ class Observer:
 
 
 def frozen(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-  """Makes the arrays of an observation read-only: providers look at them."""
+  """Makes the arrays read-only, as providers get them, and returns them."""
   for value in observation.values():
     value.setflags(write=False)
   return observation
 
 
 def copied(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-  """Returns an observation whose arrays are the agent's own."""
+  """Returns a copy of an observation with copies of its arrays."""
   return {key: value.copy() for key, value in observation.items()}

@@ -1,4 +1,4 @@
-"""Whether registers fit where a design puts them, for every value and place."""
+"""Checks of register positions, for all values and all points of a region."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, final
@@ -17,20 +17,20 @@ from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
 _SOLVERS = (mujoco.mjtSolver.mjSOL_CG, mujoco.mjtSolver.mjSOL_NEWTON)
-# Geoms that are not looked at. Planes are ground, or are put into their places
-# when an episode begins, as in corridors of dm_control; the others have no
-# distances in MuJoCo.
-_LEFT_OUT = (
+# Geom types that are not checked. Planes are the ground, or are placed when an
+# episode begins, as in corridors of dm_control. MuJoCo computes no distances of
+# the others.
+_IGNORED_TYPES = (
     mujoco.mjtGeom.mjGEOM_PLANE,
     mujoco.mjtGeom.mjGEOM_HFIELD,
     mujoco.mjtGeom.mjGEOM_SDF,
 )
-# Fractions of a range at which registers are written to see where blocks go.
-# They are uneven, so that a motion to and fro is not taken for rest.
-_FEW = np.array([0.0, 0.07, 0.19, 0.3, 0.42, 0.55, 0.69, 0.81, 0.92, 1.0])
-# The same for registers whose blocks do not go straight.
-_MANY = np.linspace(0.0, 1.0, 257)
-# Deviation from a straight line that is noise, in parts of its length.
+# Fractions of a range at which registers are written to measure the motion of
+# their blocks. Uneven spacing distinguishes a periodic motion from rest.
+_COARSE = np.array([0.0, 0.07, 0.19, 0.3, 0.42, 0.55, 0.69, 0.81, 0.92, 1.0])
+# The same for registers whose blocks do not move along straight lines.
+_FINE = np.linspace(0.0, 1.0, 257)
+# Largest numerical deviation from a straight line, relative to its length.
 _NOISE = 1e-9
 
 _Registers = Mapping[str, registers.Register]
@@ -42,28 +42,28 @@ def check(
     root: composer.Entity,
     mechanism: mechanisms.FeedbackMechanism,
 ) -> None:
-  """Checks that no write can put a block where a block must not be.
+  """Checks that no write can move a block to an invalid position.
 
-  The check covers every value of a register and every point of the region in
-  which it may stand. Overlaps of up to `swept_volumes.TOLERANCE` are accepted.
-  The state is reset at the end.
+  The check covers every value of a register and every point of its region.
+  Overlaps of up to `swept_volumes.TOLERANCE` are accepted. The state is reset
+  at the end.
 
   Args:
-    physics: One world.
-    root: The root entity.
-    mechanism: The feedback.
+    physics: Physics of one world.
+    root: Root entity.
+    mechanism: Registers, meters and providers.
 
   Raises:
-    SpecError: If a block would be outside the arena, in something that nothing
-      can push, or in the way of another register; or if the solver couples
-      meters with what an agent can see.
+    SpecError: If a block could leave the arena, or overlap an immovable object
+      or another register; or if the solver lets meters affect bodies that they
+      do not touch.
   """
   _check_solver(physics, mechanism)
   space = swept_volumes.Space(physics.model.ptr)
-  paths = _paths(physics, mechanism.registers)
-  obstacles = _Crowd(space)
+  paths = _reachable_poses(physics, mechanism.registers)
+  obstacles = _SweepIndex(space)
   obstacles.add('', _obstacles(physics, root, paths))
-  blocks = _Crowd(space)
+  blocks = _SweepIndex(space)
   for name, path in paths.items():
     for sweep in path:
       _check_extent(name, sweep, root)
@@ -72,7 +72,7 @@ def check(
           pose, distance = found
           geom = physics.model.id2name(obstacle.geom, 'geom')
           raise errors.SpecError(
-              f'{_where(name, pose)}, {-distance:.2g} m inside'
+              f'{_describe(name, pose)}, {-distance:.2g} m inside'
               f' {geom or f"geom {obstacle.geom}"!r}; place it elsewhere or'
               ' narrow its range'
           )
@@ -80,8 +80,8 @@ def check(
         if space.meet(sweep, taken) is not None:
           raise errors.SpecError(
               f"registers {other!r} and {name!r} would be in each other's way:"
-              f' {_area(space, paths[other])} and {_area(space, path)}; place'
-              ' them apart or narrow their ranges'
+              f' {_filled(space, paths[other])} and {_filled(space, path)};'
+              ' place them apart or narrow their ranges'
           )
     blocks.add(name, path)
   physics.reset()
@@ -92,40 +92,40 @@ def check_start(
     task: base.Task,
     mechanism: mechanisms.FeedbackMechanism,
 ) -> None:
-  """Checks that no episode begins with an avatar inside a block.
+  """Checks that no episode begins with the avatar inside a block.
 
-  The state is reset in the end.
+  The state is reset at the end.
 
   Args:
-    physics: One world.
-    task: The world.
-    mechanism: The feedback.
+    physics: Physics of one world.
+    task: Task of this package.
+    mechanism: Registers, meters and providers.
 
   Raises:
-    SpecError: If a block stands where the avatar may begin.
+    SpecError: If a block could overlap the avatar when an episode begins.
   """
   low, high = np.array(task.start.low), np.array(task.start.high)
   space = swept_volumes.Space(physics.model.ptr)
-  # A geom of the avatar stands for all the places of the avatar's middle.
+  # A geom of the avatar represents all initial positions of its centre.
   body = physics.bind(task.avatar.body).element_id
   geom = int(physics.model.body_geomadr[body])
   space.make_box(geom, np.array([*(high - low) / 2, 1.0]))
   start = swept_volumes.Sweep(
       geom, np.array([*(low + high) / 2, 0.0]), np.eye(3)
   )
-  for name, path in _standing(physics, mechanism.registers).items():
+  for name, path in _initial_poses(physics, mechanism.registers).items():
     for sweep in path:
       if space.meet(sweep, start, clearance=task.avatar.radius) is not None:
         raise errors.SpecError(
-            f'register {name!r} would stand at {_area(space, [sweep])}, where'
-            f' the avatar begins {_show(low, high)}; place it elsewhere'
+            f'register {name!r} would be at {_filled(space, [sweep])}, where'
+            f' the avatar begins, {_format(low, high)}; place it elsewhere'
         )
   physics.reset()
 
 
 @final
-class _Crowd:
-  """Many swept_volumes, few of which are near any other one."""
+class _SweepIndex:
+  """A collection of sweeps with a fast search for those near another one."""
 
   def __init__(self, space: swept_volumes.Space) -> None:
     self._space = space
@@ -133,7 +133,7 @@ class _Crowd:
     self._bounds = np.zeros((0, 2, 3))
 
   def add(self, name: str, path: Sequence[swept_volumes.Sweep]) -> None:
-    """Adds sweeps that share a name."""
+    """Adds sweeps with the same name."""
     if path:
       bounds = [self._space.bounds(sweep) for sweep in path]
       self._bounds = np.concatenate([self._bounds, bounds])
@@ -142,17 +142,17 @@ class _Crowd:
   def near(
       self, sweep: swept_volumes.Sweep
   ) -> Iterator[tuple[str, swept_volumes.Sweep]]:
-    """Yields the names and the sweeps that another sweep might meet."""
+    """Yields the sweeps, with their names, whose bounds overlap those given."""
     low, high = self._space.bounds(sweep)
     is_near = (self._bounds[:, 0] <= high) & (low <= self._bounds[:, 1])
     for i in np.flatnonzero(is_near.all(axis=1)):
       yield self._members[i]
 
 
-def _standing(physics: mjcf.Physics, named: _Registers) -> _Paths:
-  """Returns where the blocks of registers can be when an episode begins.
+def _initial_poses(physics: mjcf.Physics, named: _Registers) -> _Paths:
+  """Returns the poses of blocks when an episode begins, by register.
 
-  Every register is left in the middle of its region.
+  Afterwards, every register is in the middle of its region.
   """
   poses = []
   for corner in ((1.0, 0.0), (0.0, 1.0), (0.0, 0.0)):
@@ -176,26 +176,26 @@ def _standing(physics: mjcf.Physics, named: _Registers) -> _Paths:
   }
 
 
-def _paths(physics: mjcf.Physics, named: _Registers) -> _Paths:
-  """Returns where the blocks of registers can be, whatever is written."""
-  standing = _standing(physics, named)
-  few = _trace(physics, named, _FEW)
+def _reachable_poses(physics: mjcf.Physics, named: _Registers) -> _Paths:
+  """Returns the poses of blocks after a write of any value, by register."""
+  initial = _initial_poses(physics, named)
+  coarse = _trace(physics, named, _COARSE)
   curved = {
       name: register
       for name, register in named.items()
-      if not _is_straight(few[:, [sweep.geom for sweep in standing[name]]])
+      if not _is_straight(coarse[:, [sweep.geom for sweep in initial[name]]])
   }
-  many = _trace(physics, curved, _MANY) if curved else few
+  fine = _trace(physics, curved, _FINE) if curved else coarse
   paths: _Paths = {}
   for name, register in named.items():
-    # From end to end where the way is straight, from sample to sample else.
-    trace = many if name in curved else few[[0, -1]]
+    # One segment for a straight line, otherwise one between adjacent samples.
+    trace = fine if name in curved else coarse[[0, -1]]
     spec = register.value_spec
     values = np.linspace(spec.minimum, spec.maximum, len(trace))
     paths[name] = [
-        leg
-        for sweep in standing[name]
-        for leg in _legs(
+        segment
+        for sweep in initial[name]
+        for segment in _segments(
             sweep,
             np.column_stack([trace[:, sweep.geom], values]),
             physics.model.geom_rbound[sweep.geom],
@@ -207,15 +207,16 @@ def _paths(physics: mjcf.Physics, named: _Registers) -> _Paths:
 def _trace(
     physics: mjcf.Physics, named: _Registers, fractions: np.ndarray
 ) -> np.ndarray:
-  """Writes values of all registers, and returns where this puts geoms.
+  """Writes values to all registers and returns the resulting poses of geoms.
 
   Args:
-    physics: One world.
-    named: The registers.
-    fractions: What to write, in parts of the range of each.
+    physics: Physics of one world.
+    named: Registers, by name.
+    fractions: Values to write, as fractions of each register's range.
 
   Returns:
-    Centre and angle about the vertical, `(fractions, geoms, 4)`.
+    Centre of each geom, in metres, and its angle about the vertical, in
+    radians, `(fractions, geoms, 4)`.
   """
   trace = []
   for fraction in fractions:
@@ -233,63 +234,67 @@ def _trace(
 
 
 def _is_straight(trace: np.ndarray) -> bool:
-  """Whether geoms go evenly from the first of `_FEW` to the last."""
-  way = trace[-1] - trace[0]
-  even = trace[0] + np.multiply.outer(_FEW, way)
-  return bool(np.abs(trace - even).max() <= _NOISE * (1 + np.abs(way).max()))
-
-
-def _legs(
-    sweep: swept_volumes.Sweep, trace: np.ndarray, radius: float
-) -> list[swept_volumes.Sweep]:
-  """Returns the poses of a geom as sweeps from sample to sample.
+  """Returns True if geoms move in straight lines, in proportion to `_COARSE`.
 
   Args:
-    sweep: Its poses at the beginning of an episode.
-    trace: Centre, angle and value of each sample, `(samples, 5)`.
-    radius: Of the geom, metres.
+    trace: Poses of geoms for each of `_COARSE`, `(fractions, geoms, 4)`.
   """
-  # A curve is off the straight line between two samples by at most an eighth
-  # of how much it bends there; a corner is by at most half of it.
-  bend = np.zeros(len(trace))
+  line = trace[-1] - trace[0]
+  even = trace[0] + np.multiply.outer(_COARSE, line)
+  return bool(np.abs(trace - even).max() <= _NOISE * (1 + np.abs(line).max()))
+
+
+def _segments(
+    sweep: swept_volumes.Sweep, trace: np.ndarray, radius: float
+) -> list[swept_volumes.Sweep]:
+  """Returns the poses of a geom as sweeps between adjacent samples.
+
+  Args:
+    sweep: Poses of the geom when an episode begins.
+    trace: Centre, angle and value of each sample, `(samples, 5)`.
+    radius: Radius of the geom, in metres.
+  """
+  # Between two samples, a curve deviates from the straight line by at most an
+  # eighth of its second difference, and a corner by at most half of it.
+  curvature = np.zeros(len(trace))
   bends = np.abs(np.diff(trace, 2, axis=0))
-  bend[1:-1] = np.linalg.norm(bends[:, :3], axis=1) + radius * bends[:, 3]
+  curvature[1:-1] = np.linalg.norm(bends[:, :3], axis=1) + radius * bends[:, 3]
   angle = np.arctan2(sweep.matrix[1, 0], sweep.matrix[0, 0])
-  legs = []
+  segments = []
   for i in range(len(trace) - 1):
     middle = (trace[i] + trace[i + 1]) / 2
-    legs.append(
+    segments.append(
         swept_volumes.Sweep(
             sweep.geom,
             middle[:3],
             swept_volumes.turned(sweep.matrix, middle[3] - angle),
             np.vstack([sweep.motions, (trace[i + 1] - trace[i]) / 2]),
             float(middle[4]),
-            float(bend[i : i + 2].max()),
+            float(curvature[i : i + 2].max()),
         )
     )
-  return legs
+  return segments
 
 
 def _obstacles(
     physics: mjcf.Physics, root: composer.Entity, paths: _Paths
 ) -> list[swept_volumes.Sweep]:
-  """Returns the poses of solid geoms that nothing can push."""
+  """Returns the poses of solid, immovable geoms."""
   mujoco.mj_resetData(physics.model.ptr, physics.data.ptr)
   physics.mark_as_dirty()
   mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
   model, data = physics.model, physics.data
   matrices = np.array(data.geom_xmat).reshape(-1, 3, 3)
   is_solid = (model.geom_contype | model.geom_conaffinity) != 0
-  # Doors and posts are moved, but not by being pushed.
+  # Mocap bodies such as doors move, but cannot be pushed.
   carriers = model.body_weldid[model.geom_bodyid]
   is_fixed = (carriers == 0) | (model.body_mocapid[carriers] >= 0)
-  is_left_out = np.isin(model.geom_type, _LEFT_OUT)
-  ours = {sweep.geom for path in paths.values() for sweep in path}
+  is_ignored = np.isin(model.geom_type, _IGNORED_TYPES)
+  own_geoms = {sweep.geom for path in paths.values() for sweep in path}
   travels = _travels(physics, root)
   obstacles = []
-  for geom in np.flatnonzero(is_solid & is_fixed & ~is_left_out).tolist():
-    if geom in ours:
+  for geom in np.flatnonzero(is_solid & is_fixed & ~is_ignored).tolist():
+    if geom in own_geoms:
       continue
     half = np.zeros(5)
     half[:3] = np.array(travels.get(geom, (0.0, 0.0, 0.0))) / 2
@@ -304,7 +309,7 @@ def _obstacles(
 def _travels(
     physics: mjcf.Physics, root: composer.Entity
 ) -> dict[int, np.ndarray]:
-  """Returns how far parts of a world go in an episode, by their geoms."""
+  """Returns the displacement of moving parts in an episode, by geom, `(3,)`."""
   return {
       physics.bind(geom).element_id: entity.travel
       for entity in root.iter_entities()
@@ -316,7 +321,7 @@ def _travels(
 def _check_extent(
     name: str, sweep: swept_volumes.Sweep, root: composer.Entity
 ) -> None:
-  """Refuses a block whose middle can be outside of the arena."""
+  """Refuses a block whose centre can leave the arena."""
   if not isinstance(root, arenas.RoomArena):
     return
   for axis in range(2):
@@ -325,33 +330,33 @@ def _check_extent(
       pose = sweep.pose(np.where(ahead > 0, 1.0, -1.0))
       if not root.extent.contains(pose.centre[:2].tolist()):
         raise errors.SpecError(
-            f'{_where(name, pose)}, outside the arena'
-            f' {_show(root.extent.low, root.extent.high)}'
+            f'{_describe(name, pose)}, outside the arena'
+            f' {_format(root.extent.low, root.extent.high)}'
         )
 
 
-def _where(name: str, pose: swept_volumes.Sweep) -> str:
+def _describe(name: str, pose: swept_volumes.Sweep) -> str:
   return (
-      f'register {name!r} at value {pose.value:g} would sit at'
-      f' {_show(pose.centre[:2])}'
+      f'register {name!r} at value {pose.value:g} would be at'
+      f' {_format(pose.centre[:2])}'
   )
 
 
-def _area(
+def _filled(
     space: swept_volumes.Space, path: Sequence[swept_volumes.Sweep]
 ) -> str:
-  """Prints the rectangle that sweeps fill."""
+  """Returns the rectangle that sweeps fill, as text."""
   bounds = np.array([space.bounds(sweep) for sweep in path])
-  return _show(bounds[:, 0, :2].min(axis=0), bounds[:, 1, :2].max(axis=0))
+  return _format(bounds[:, 0, :2].min(axis=0), bounds[:, 1, :2].max(axis=0))
 
 
 def _check_solver(
     physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
 ) -> None:
-  """Refuses a solver through which a far-off meter would be felt.
+  """Refuses a solver that lets meters affect bodies that they do not touch.
 
-  With other solvers, and with islands off, a block of a meter register changes
-  the motion of bodies that it never touches.
+  With solvers other than Newton and CG, or without islands, the block of a
+  meter register changes the motion of distant bodies.
   """
   if not mechanism.design.meters:
     return
@@ -367,13 +372,14 @@ def _check_solver(
     )
   if option.noslip_iterations and option.noslip_tolerance > 0:
     raise errors.SpecError(
-        f'option.noslip_tolerance: {option.noslip_tolerance:g} couples bodies'
-        ' through when the pass stops; meters need 0, or no noslip pass'
+        f'option.noslip_tolerance: {option.noslip_tolerance:g} couples bodies,'
+        ' because it ends the noslip pass for all; meters need 0, or no noslip'
+        ' pass'
     )
 
 
-def _show(*points: Any) -> str:
-  """Prints points as in '(1.2, -3.6) to (2.4, -3.0)'."""
+def _format(*points: Any) -> str:
+  """Returns points as text, as in '(1.2, -3.6) to (2.4, -3.0)'."""
   return ' to '.join(
       f'({", ".join(f"{x:.3g}" for x in point)})' for point in points
   )

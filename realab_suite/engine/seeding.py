@@ -1,9 +1,9 @@
-"""Random streams: each has a name, and none depends on another's use.
+"""Random streams, each with a name and independent of the use of the others.
 
-Every stream follows from (seed, world, episode, name), or from (salt, seed,
-world, episode, name) where the seed is a `SaltedSeed`. So world i of a batch is
-the run of that world alone, and two agents meet the same initial states in
-their k-th episodes, however long the episodes before were.
+Every stream is a function of (seed, world, episode, name), or of (salt, seed,
+world, episode, name) for a `SaltedSeed`. World i of a batch therefore equals
+that world alone. The k-th episodes of two agents begin in the same state,
+regardless of the lengths of the episodes before.
 """
 
 import hashlib
@@ -17,9 +17,9 @@ from realab_suite import errors
 from realab_suite.config import messages
 
 NUM_SALT_BYTES = 16
-"""Length of a salt."""
+"""Length of a salt, in bytes."""
 
-# Purposes of the hash; results for one are of no use for the other.
+# Purposes of the hash, which make its results unrelated.
 _FOR_STREAMS = b'realab streams'
 _FOR_DIGEST = b'realab digest'
 
@@ -38,20 +38,20 @@ class SaltedSeed(int):
   contain the salt.
 
   Attributes:
-    salt: The secret.
+    salt: Secret bytes, of length `NUM_SALT_BYTES`.
   """
 
   salt: bytes
 
   def __new__(cls, seed: int, salt: bytes) -> Self:
-    """Makes a salted seed.
+    """Creates a salted seed.
 
     Args:
-      seed: A non-negative integer.
+      seed: Non-negative integer.
       salt: `NUM_SALT_BYTES` bytes that are hard to guess.
 
     Raises:
-      SpecError: If either is something else.
+      SpecError: If the seed or the salt is invalid.
     """
     if type(salt) is not bytes or len(salt) != NUM_SALT_BYTES:
       # The message does not repeat what may be a secret.
@@ -78,12 +78,12 @@ def new_salt() -> bytes:
 
 
 def as_seed(random: Any) -> int:
-  """Returns the seed that a `random` argument of dm_control's stands for.
+  """Returns the seed for a `random` argument, as used in dm_control.
 
   Args:
-    random: A non-negative integer, which may be a `SaltedSeed`, a
-      `RandomState`, which is read from a copy, or `None` for a seed from the
-      operating system.
+    random: Non-negative integer, which may be a `SaltedSeed`; a `RandomState`,
+      which is copied and not advanced; or `None` for a seed from the operating
+      system.
 
   Raises:
     SpecError: If it is something else.
@@ -108,10 +108,17 @@ def as_seed(random: Any) -> int:
 def sequence(
     seed: int, world: int, episode: int, stream: str
 ) -> np.random.SeedSequence:
-  """Returns the source of the stream called `stream`."""
+  """Returns the seed sequence of a stream.
+
+  Args:
+    seed: Seed, which may be a `SaltedSeed`.
+    world: Number of the world.
+    episode: Number of the episode.
+    stream: Name of the stream.
+  """
   if isinstance(seed, SaltedSeed):
-    # A seed sequence is not a one-way function: with it alone, the salt, and so
-    # every other stream, could be computed from the words of one stream.
+    # A seed sequence is not a one-way function. With it alone, the salt and all
+    # other streams could be computed from the words of one stream.
     words = hashlib.blake2b(
         f'{seed},{world},{episode},{stream}'.encode(),
         key=seed.salt,
@@ -126,7 +133,7 @@ def sequence(
 def random_state(
     seed: int, world: int, episode: int, stream: str
 ) -> np.random.RandomState:
-  """Returns the stream as what Composer's hooks take."""
+  """Returns a stream as a `RandomState`, for Composer's hooks."""
   made = np.random.RandomState(0)
   reseed(made, seed, world, episode, stream)
   return made
@@ -139,17 +146,17 @@ def reseed(
     episode: int,
     stream: str,
 ) -> None:
-  """Makes a `RandomState` go on as another stream.
+  """Sets a `RandomState` to the beginning of another stream.
 
-  To make a new one for every episode takes longer than all the rest of a reset
-  of one world among many.
+  In a batch, creating a new `RandomState` for each episode would take longer
+  than the rest of the reset.
   """
   words = sequence(seed, world, episode, stream).generate_state(8)
   random_state.seed(words)
 
 
 def episode_key(seed: int, world: int, episode: int, stream: str) -> np.ndarray:
-  """Returns the key of a stream of keys, `(2,)` uint64."""
+  """Returns the key of a stream in an episode, `(2,)` uint64."""
   return sequence(seed, world, episode, stream).generate_state(2, np.uint64)
 
 
@@ -157,11 +164,11 @@ def step_key(key: np.ndarray, step: int | np.ndarray) -> np.ndarray:
   """Returns the key of one control step.
 
   Args:
-    key: Of the episode, `(..., 2)`, uint64.
-    step: The number of the control step, `(...)`.
+    key: Key of the episode, `(..., 2)` uint64.
+    step: Number of the control step, `(...)`.
 
   Returns:
-    `(..., 2)`, uint64.
+    The key of the step, `(..., 2)` uint64.
   """
   stepped = np.array(key)
   stepped[..., 1] += np.uint64(step)

@@ -1,4 +1,4 @@
-"""One world, stepped without losing time between the physics and Python."""
+"""Physics of one world, with little overhead between MuJoCo and Python."""
 
 from typing import Any, final
 
@@ -13,24 +13,24 @@ from realab_suite import errors
 from realab_suite.engine import frame_renderer
 from realab_suite.entities import cameras
 
-# Attributes of bound elements that are state.
+# Attributes of bound elements that belong to the state.
 _STATE = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
 
 
 @final
 class ThinPhysics(mjcf.Physics):
-  """`mjcf.Physics` for worlds that read bound attributes and write them whole.
+  """A faster `mjcf.Physics` for tasks of this package.
 
-  It differs in two ways:
+  It differs from `mjcf.Physics` in two ways:
 
   - Steps begin from the state. Composer begins a step with the derived
-    quantities of the one before, which are wrong for one substep after each
-    write to a register unless everything is computed anew. Here a step computes
-    what it needs, and derived quantities are brought up to date when they are
-    read.
-  - Bindings are thin. Composer's cost 2 to 10 microseconds at each touch,
-    because they guard against every use. Here state is read through views that
-    are made once. They are read-only and live: they continue to change.
+    quantities of the previous step, which are wrong for one substep after each
+    write to a register unless everything is recomputed. Here, a step computes
+    the quantities that it needs, and the others are updated when they are read.
+  - Bindings are thin. An access to one of Composer's takes 2 to 10
+    microseconds, because it supports every use. Here, views of the state are
+    created once. They are read-only and live: later steps change them. Bound
+    attributes have to be written whole.
   """
 
   def _reload_from_data(self, data: Any) -> None:
@@ -38,55 +38,55 @@ class ThinPhysics(mjcf.Physics):
     self._num_warnings = data.ptr.warning.number
     super()._reload_from_data(data)
     self._thin: dict[Any, _ThinBinding] = {}
-    # For each size of frames.
+    # One for each size of frames, (height, width).
     self._renderers: dict[Any, frame_renderer.FrameRenderer] = {}
 
   def forward(self) -> None:
-    """Brings positions and velocities, and what derives from them, up to date.
+    """Updates the quantities derived from positions and velocities.
 
-    Accelerations and contact forces stay those of the last substep, as in
-    Composer. Solving for them here would change the solver's warm start, and
-    with it the trajectory: looking would disturb.
+    Accelerations and contact forces remain those of the last substep, as in
+    Composer. Computing them would change the solver's warm start, so that
+    reading would change the trajectory.
 
     Raises:
-      PhysicsError: If MuJoCo warned.
+      PhysicsError: If MuJoCo issued a warning.
     """
     mujoco.mj_step1(*self._pointers)
     self._dirty = False
     self._refuse_warnings()
 
   def refresh(self) -> None:
-    """Does `forward` if anything has been stepped or written since."""
+    """Calls `forward` if the state has changed since the last call."""
     if self._dirty:
       self.forward()
 
   def reset(self, keyframe_id: int | None = None) -> None:
-    """Resets the state; accelerations are computed once, without actuation."""
+    """Resets the state and computes accelerations without actuation."""
     super().reset(keyframe_id)
     with self.model.disable('actuation'):
       mujoco.mj_forward(self.model.ptr, self.data.ptr)
 
   def advance(self, num_substeps: int) -> None:
-    """Steps the physics, from the state as it is.
+    """Steps the physics from its present state.
 
     Raises:
-      PhysicsError: If MuJoCo warned. It has reset the state by then, so nothing
-        may be read off it.
+      PhysicsError: If MuJoCo issued a warning. MuJoCo has then reset the state,
+        so nothing may be read from it.
     """
     mujoco.mj_step(*self._pointers, num_substeps)
     self._dirty = True
     self._refuse_warnings()
 
   def _make_rendering_contexts(self) -> None:
-    """Prepares to draw for people.
+    """Creates the contexts for `render`.
 
     Raises:
-      RenderingError: If nothing renders here.
+      RenderingError: If no renderer is available.
     """
     _display.load_llvm()
     try:
       super()._make_rendering_contexts()
-    except Exception as error:  # Each renderer fails by errors of its own.
+    except Exception as error:  # Each renderer has its own errors.
       raise errors.RenderingError(
           f'physics: no picture with {frame_renderer.what_to_set(error)}'
       ) from error
@@ -96,7 +96,7 @@ class ThinPhysics(mjcf.Physics):
       raise control.PhysicsError(_warnings(self._num_warnings))
 
   def free(self) -> None:
-    """Frees the world; it must not be used afterwards."""
+    """Frees the world, which must not be used afterwards."""
     for renderer in self._renderers.values():
       renderer.free()
     super().free()
@@ -116,10 +116,20 @@ class ThinPhysics(mjcf.Physics):
       return self._thin[key]
 
   def draw(self, camera: mjcf.Element, height: int, width: int) -> np.ndarray:
-    """Draws what a camera sees, for an agent; `render` is for people.
+    """Renders a camera for an agent. Use `render` for people.
+
+    Args:
+      camera: Camera of the model.
+      height: Height of the frame, in pixels.
+      width: Width of the frame, in pixels.
+
+    Returns:
+      A new array, `(height, width, 3)` uint8.
 
     Raises:
-      RenderingError: If nothing renders here.
+      ForkError: If this process was forked after the first frame.
+      RenderingError: If no renderer is available, or if another thread rendered
+        the first frame.
     """
     self.refresh()
     size = height, width
@@ -132,14 +142,14 @@ class ThinPhysics(mjcf.Physics):
 
 
 @cameras.render.register
-def _look(
+def _(
     physics: ThinPhysics, camera: mjcf.Element, height: int, width: int
 ) -> np.ndarray:
   return physics.draw(camera, height, width)
 
 
 def _view(array: np.ndarray, index: Any) -> np.ndarray | None:
-  """Returns a view of indexed elements, or `None` where there can be none."""
+  """Returns a view of indexed elements, or `None` if a view is impossible."""
   if isinstance(index, int | np.integer):
     return array[index, ...]
   if isinstance(index, slice):
@@ -152,7 +162,7 @@ def _view(array: np.ndarray, index: Any) -> np.ndarray | None:
 
 
 def _state_property(name: str) -> property:
-  """An attribute that is state: reading it computes nothing."""
+  """Returns a property for a state attribute, which needs no computation."""
 
   def get(self: '_ThinBinding') -> np.ndarray:
     try:
@@ -164,7 +174,7 @@ def _state_property(name: str) -> property:
 
 
 def _derived_property(name: str) -> property:
-  """An attribute that is brought up to date when it is read."""
+  """Returns a property for an attribute that is updated when it is read."""
 
   def get(self: '_ThinBinding') -> np.ndarray:
     if self._physics._dirty:
@@ -176,7 +186,7 @@ def _derived_property(name: str) -> property:
 
 @final
 class _ThinBinding(mjcf_physics.Binding):
-  """A binding that reads and writes what entities need by the shortest way.
+  """A binding with fast access to the attributes that entities use.
 
   Attributes that are not listed here work as in Composer.
   """
@@ -210,7 +220,7 @@ class _ThinBinding(mjcf_physics.Binding):
       self._physics._dirty = True
 
   def _find(self, name: str) -> tuple[np.ndarray, Any]:
-    """Finds an attribute once: the array to write, and the index in it."""
+    """Finds and caches the array of an attribute and the index in it."""
     array, index = self._get_cached_array_and_index(name)
     array = np.asarray(array)
     view = _view(array, index)
@@ -235,4 +245,4 @@ class _ThinBinding(mjcf_physics.Binding):
 
 def _warnings(numbers: np.ndarray) -> str:
   raised = [mujoco.mjtWarning(int(i)).name for i in np.flatnonzero(numbers)]
-  return f'MuJoCo warned of {", ".join(raised)}'
+  return f'MuJoCo warnings: {", ".join(raised)}'

@@ -1,8 +1,8 @@
-"""Snapshots: everything that the future of a world depends on, as plain data.
+"""Snapshots: complete states of worlds, as plain data.
 
-The state of an episode is physical, so most of it is one array of MuJoCo's. The
-rest are numbers, texts and arrays in nested containers. `archive.py` turns them
-into bytes.
+The state of an episode is physical, so one array from MuJoCo contains most of
+it. The rest consists of numbers, strings and arrays in nested containers.
+`archive.py` converts them to bytes.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,47 +18,47 @@ from realab_suite import errors
 from realab_suite.engine import seeding
 from realab_suite.entities import state
 
-_WHAT = 'snapshot'
-# Entry of a snapshot of worlds whose seeds are salted.
+_KIND = 'snapshot'
+# Key of the salts, in snapshots of worlds with salted seeds.
 _SALTS = 'salts'
-# Its name in snapshots of version 0.1.
+# Key of `WorldStates.indices`, kept from version 0.1.
 _INDICES = 'places'
 _INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 @final
 class Snapshot:
-  """A world at one moment, and a header that says where it fits.
+  """The states of worlds, and a header that describes their environment.
 
-  It never changes, and can be restored any number of times.
+  A snapshot is immutable and can be restored any number of times.
   """
 
   def __init__(self, header: Mapping[str, Any], contents: Any) -> None:
-    """Takes a copy of `contents`.
+    """Copies the contents.
 
     Args:
-      header: What an environment has to have in common with the one that was
-        saved; JSON.
-      contents: Tuples, lists and dicts of arrays, numbers, texts and `None`.
+      header: Properties that an environment needs to have for this snapshot, as
+        JSON values.
+      contents: Tuples, lists and dicts of arrays, numbers, strings and `None`.
 
     Raises:
-      StateLayoutError: If something else is among the contents.
+      StateLayoutError: If the contents include another type.
     """
     self._archive = archive.Archive(header, contents)
 
   @property
   def header(self) -> dict[str, Any]:
-    """Where the snapshot fits; a copy."""
+    """Copy of the header."""
     return self._archive.header
 
   def contents_for(self, header: Mapping[str, Any]) -> Any:
-    """Returns a copy of the contents, for an environment that they fit.
+    """Returns a copy of the contents if an environment has the same header.
 
     Args:
-      header: The environment's own.
+      header: Header of the environment.
 
     Raises:
-      StateLayoutError: If the headers differ; the message names where.
+      StateLayoutError: If the headers differ; the message names the entries.
     """
     differing = self._archive.differences(header, 'in the snapshot', 'here')
     if differing:
@@ -68,43 +68,45 @@ class Snapshot:
     return self._archive.contents()
 
   def to_bytes(self) -> bytes:
-    """Returns the snapshot for a file or another process."""
+    """Returns the snapshot as bytes, for a file or another process."""
     return self._archive.to_bytes()
 
   @classmethod
   def from_bytes(cls, data: bytes) -> Self:
-    """Returns the snapshot that `to_bytes` was called on.
+    """Returns a snapshot from the result of `to_bytes`.
 
     Raises:
-      StateLayoutError: If the bytes are damaged, of another format, or of
-        something else than a snapshot.
+      StateLayoutError: If the bytes are damaged, have another format, or do not
+        contain a snapshot.
     """
-    read = archive.Archive.from_bytes(data, _WHAT)
-    if read.what != _WHAT:
+    read = archive.Archive.from_bytes(data, _KIND)
+    if read.what != _KIND:
       raise errors.StateLayoutError(
-          f'the archive holds {read.what!r:.40}; expected a {_WHAT} of worlds'
+          f'the archive contains {read.what!r:.40}; expected a {_KIND}'
       )
     return cls(read.header, read.contents())
 
 
 @final
 class WorldStates(NamedTuple):
-  """What snapshots have in them: some worlds, each whole.
+  """Contents of a snapshot: the complete states of worlds.
 
   Attributes:
-    indices: Where in a batch each world was; `None` for a world alone.
-    physics: The integration states, `(worlds, size)`.
-    seed: Of each world; what its random streams follow from.
-    world: The number of each, which they follow from, too.
-    episode: The number of each world's episode, -1 before the first.
-    is_pending: Whether the next step of each begins an episode.
-    is_open: Whether the sinks of each are waiting for the end of an episode.
-    provider_keys: The keys of each provider, `(worlds, 2)`.
-    provider_states: Of a batch, trees of arrays, `(worlds, ...)`; of a world
-      alone, as its providers returned them.
-    observation: By name, each `(worlds, ...)`; empty before the first episode.
-    sinks: For each sink, its kind and what it knows of each world.
-    random_state: The generator; `None` where there is none, as in a batch.
+    indices: Index of each world in its batch; `None` for a single world.
+    physics: Integration states, `(worlds, size)`.
+    seed: Seed of each world. Its random streams depend on it.
+    world: Number of each world. Its random streams depend on it as well.
+    episode: Number of each world's episode; -1 before the first.
+    is_pending: True for worlds whose next step begins an episode.
+    is_open: True for worlds with a current episode, of which sinks get the end.
+    provider_keys: Random keys of each provider, `(worlds, 2)` uint64.
+    provider_states: State of each provider. For a batch, these are trees of
+      arrays `(worlds, ...)`; for a single world, the states as returned.
+    observation: Arrays `(worlds, ...)`, by name; empty before the first
+      episode.
+    sinks: Pairs of the kind of each sink and its states for each world.
+    random_state: State of the generator for hooks; `None` for a batch, which
+      has none.
   """
 
   indices: list[int] | None
@@ -122,7 +124,7 @@ class WorldStates(NamedTuple):
 
   @classmethod
   def from_data(cls, data: Mapping[str, Any]) -> Self:
-    """Returns the worlds that `to_data` was called on."""
+    """Returns the states of worlds from the result of `to_data`."""
     fields = dict(data)
     fields['indices'] = fields.pop(_INDICES)
     salts = fields.pop(_SALTS, None)
@@ -134,7 +136,7 @@ class WorldStates(NamedTuple):
     return cls(**fields)
 
   def to_data(self) -> dict[str, Any]:
-    """Returns the worlds as plain data; a salted seed comes with its salt."""
+    """Returns the states of worlds as plain data, including salts."""
     data = {**self._asdict(), 'seed': [int(seed) for seed in self.seed]}
     data[_INDICES] = data.pop('indices')
     salts = [
@@ -146,19 +148,20 @@ class WorldStates(NamedTuple):
     return data
 
   def refuse_other_sinks(self, kinds: list[str]) -> None:
-    """Refuses sinks that would miss how the episodes under way began.
+    """Refuses sinks for which the snapshot contains no states.
 
     Args:
-      kinds: What listens where the worlds are to go on.
+      kinds: Kinds of the sinks of the environment to restore.
 
     Raises:
-      StateLayoutError: If there are sinks, and others than were saved.
+      StateLayoutError: If there are sinks, and their kinds differ from those of
+        the saved sinks.
     """
     saved = [kind for kind, _ in self.sinks]
     if kinds and kinds != saved:
       raise errors.StateLayoutError(
           f'the snapshot was saved with sinks {saved}; this environment has'
-          f' {kinds}; allowed are the same ones, or none here'
+          f' {kinds}; allowed are the same sinks, or none here'
       )
 
   def merged_into(
@@ -174,7 +177,10 @@ class WorldStates(NamedTuple):
       states: State of each provider of the batch.
       observation: Observation of the batch; empty before its first episode.
       indices: Indices in the batch of the worlds to restore.
-      rows: The saved world that each of them gets.
+      rows: Saved world for each of them, as an index in this snapshot.
+
+    Returns:
+      The new state of each provider, and the new observation.
 
     Raises:
       StateLayoutError: If the snapshot does not fit.
@@ -195,28 +201,28 @@ class WorldStates(NamedTuple):
 
 
 def of_batch(tree: Any) -> Any:
-  """Returns a tree of one world's values as that of a batch of one."""
+  """Adds a leading axis of length one to all values of a tree."""
   return _map(lambda value: np.asarray(value)[np.newaxis], tree)
 
 
 def of_world(tree: Any) -> Any:
-  """Returns the tree of a batch of one as that of a world alone."""
+  """Removes the leading axis of length one from all arrays of a tree."""
   return _map(lambda value: np.array(value[0])[()], tree)
 
 
 def spread(tree: Any, rows: np.ndarray) -> Any:
-  """Returns a tree of arrays with these of their rows, in this order."""
+  """Returns a tree with the given rows of each array, in this order."""
   return _map(lambda value: value[rows], tree)
 
 
 def merge(where: str, tree: Any, indices: np.ndarray, saved: Any) -> Any:
-  """Returns a tree of arrays whose rows at some indices are others.
+  """Returns a copy of a tree of arrays with some rows replaced.
 
   Args:
-    where: What to call the tree in a message.
-    tree: The tree; it is not written to.
-    indices: The rows.
-    saved: A tree with as many rows as there are indices.
+    where: Name of the tree in messages.
+    tree: Tree of arrays. It is not changed.
+    indices: Rows to replace.
+    saved: Tree of arrays with the new rows, one for each index.
 
   Raises:
     StateLayoutError: If the trees differ in anything but the number of rows.
@@ -237,7 +243,7 @@ def merge(where: str, tree: Any, indices: np.ndarray, saved: Any) -> Any:
         merge(f'{where}[{i}]', value, indices, saved[i])
         for i, value in enumerate(tree)
     )
-  # Rows that stay have the last word on the type of numbers.
+  # A new dtype is possible only if all rows are replaced.
   is_whole = len(indices) == len(tree) and not saved.dtype.hasobject
   is_like = is_whole or tree.dtype == saved.dtype
   if not is_like or tree.shape[1:] != saved.shape[1:]:
@@ -248,18 +254,18 @@ def merge(where: str, tree: Any, indices: np.ndarray, saved: Any) -> Any:
 
 
 def describe(model: Any) -> dict[str, Any]:
-  """Returns what a snapshot's header says of a compiled model.
+  """Returns the entries of a snapshot's header that describe a model.
 
   Args:
-    model: The model, as `physics.model`.
+    model: Compiled model, as `physics.model`.
 
   Raises:
-    SpecError: If MuJoCo keeps some of the state where nobody can get at it.
+    SpecError: If bodies can sleep, because MuJoCo does not export which do.
   """
   if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
     raise errors.SpecError(
-        'a world whose bodies fall asleep cannot be saved or restored: MuJoCo'
-        ' does not give away who sleeps; allowed is sleep off'
+        'a world whose bodies can sleep cannot be saved or restored: MuJoCo'
+        ' does not export which bodies sleep; load it with sleep=False'
     )
   compiled = np.empty(mujoco.mj_sizeModel(model.ptr), np.uint8)
   mujoco.mj_saveModel(model.ptr, None, compiled)
@@ -271,7 +277,7 @@ def describe(model: Any) -> dict[str, Any]:
 
 
 def get_state(physics: mjcf.Physics) -> np.ndarray:
-  """Returns all of the physics that the future depends on."""
+  """Returns the integration state of a physics, `(size,)`."""
   model, data = physics.model.ptr, physics.data.ptr
   values = np.empty(mujoco.mj_stateSize(model, _INTEGRATION))
   mujoco.mj_getState(model, data, values, _INTEGRATION)
@@ -279,16 +285,16 @@ def get_state(physics: mjcf.Physics) -> np.ndarray:
 
 
 def set_state(physics: mjcf.Physics, values: np.ndarray) -> None:
-  """Does the opposite of `get_state`, and brings up to date what derives."""
+  """Sets the integration state of a physics and updates derived quantities."""
   model, data = physics.model.ptr, physics.data.ptr
-  # Warnings of what went on here before say nothing about what is restored.
+  # Clears earlier warnings, which do not concern the restored state.
   mujoco.mj_resetData(model, data)
   mujoco.mj_setState(model, data, values, _INTEGRATION)
   physics.forward()
 
 
 def _map(function: Callable[[Any], Any], tree: Any) -> Any:
-  """Returns a tree of what a function makes of the values in another one."""
+  """Applies a function to all values of a tree and returns the new tree."""
   if isinstance(tree, dict):
     return {key: _map(function, value) for key, value in tree.items()}
   if isinstance(tree, tuple | list):

@@ -1,4 +1,4 @@
-"""Whether geoms that move along lines can meet: by bounds, not by samples."""
+"""Collision checks of geoms that move along lines, by bounds, not samples."""
 
 from collections.abc import Iterator, Sequence
 import copy
@@ -10,39 +10,39 @@ from typing import NamedTuple, Self, final
 import mujoco
 import numpy as np
 
-# The depth up to which geoms may overlap, metres.
+# Depth up to which geoms may overlap, in metres.
 TOLERANCE = 1e-3
-# The depth from which on poses count as an overlap. To tell depths in between
-# apart would take long.
-_SURE = 1e-4
-# Number of pairs of sweeps to look at. What is undecided then is an overlap.
-_MOST_PAIRS = 2000
-# What moves by less counts as one pose, metres.
-_STILL = 1e-6
-# Displacements, metres, to ask MuJoCo again for a distance with, and their
-# direction, which is unlike that of any face.
+# Depth at which a search stops and reports an overlap, in metres. Resolving
+# smaller depths would take long.
+_STOP_DEPTH = 1e-4
+# Number of pairs of sweeps to check. Undecided cases count as overlaps.
+_MAX_PAIRS = 2000
+# Length of motions that are treated as none, in metres.
+_NEGLIGIBLE = 1e-6
+# Displacements for repeated queries of a distance, in metres, and their
+# direction, which is not parallel or perpendicular to usual faces.
 _NUDGES = (0.0, 1e-5, 5e-5)
-_ASKEW = np.array([0.36, 0.48, 0.8])
+_NUDGE_DIRECTION = np.array([0.36, 0.48, 0.8])
 _CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-  """All the poses of a geom that moves along lines, and turns in doing so.
+  """Set of the poses of a geom that moves along lines and may turn.
 
-  Each motion takes the geom from its middle pose to either side. Motions add
-  up: every one of them can be anywhere between its ends.
+  Each motion displaces the geom from its middle pose to either side. Motions
+  are independent and add up.
 
   Attributes:
     geom: Number of the geom in the model.
-    centre: Centre of the geom in its middle pose, `(3,)`, metres.
-    matrix: Orientation there, `(3, 3)`.
-    motions: What each motion changes on its way to one side, `(motions, 5)`:
-      the centre, in metres, the angle about the vertical, in radians, and the
-      value of a register. What turns is an upright box.
-    value: Value of the register in the middle.
-    slack: Distance in metres by which poses may differ from these.
+    centre: Centre of the geom in its middle pose, `(3,)`, in metres.
+    matrix: Orientation of the geom in its middle pose, `(3, 3)`.
+    motions: Change by each motion from the middle to one side, `(motions, 5)`:
+      of the centre, in metres, of the angle about the vertical, in radians, and
+      of the value of a register. Only upright boxes may turn.
+    value: Value of the register in the middle pose.
+    slack: Distance by which poses may differ from these, in metres.
   """
 
   geom: int
@@ -56,36 +56,45 @@ class Sweep:
 
   @property
   def travel(self) -> np.ndarray:
-    """Greatest displacement of the centre along each axis, `(3,)`, metres."""
+    """Largest displacement of the centre along each axis, `(3,)`, in metres."""
     return np.abs(self.motions[:, :3]).sum(axis=0)
 
   @property
   def turn(self) -> float:
-    """Greatest angle from the middle pose, radians."""
+    """Largest angle from the middle pose, in radians."""
     return float(np.abs(self.motions[:, 3]).sum())
 
   def pose(self, sides: np.ndarray) -> Self:
-    """Returns one pose: how far each motion is, from -1 to 1, `(motions,)`."""
+    """Returns one pose.
+
+    Args:
+      sides: Position along each motion, from -1 to 1, `(motions,)`.
+    """
     return self._moved(sides, np.zeros(len(sides)))
 
   def toward(self, point: Sequence[float]) -> Self:
-    """Returns a pose whose centre is near a point, `(3,)`, metres."""
+    """Returns a pose whose centre is near a point, `(3,)`, in metres."""
     sides = np.zeros(len(self.motions))
-    way = np.array(point) - self.centre
+    offset = np.array(point) - self.centre
     for i, (*shift, _, _) in enumerate(self.motions):
       if any(shift):
-        sides[i] = np.clip(way @ shift / np.dot(shift, shift), -1.0, 1.0)
-        way = way - sides[i] * np.array(shift)
+        sides[i] = np.clip(offset @ shift / np.dot(shift, shift), -1.0, 1.0)
+        offset = offset - sides[i] * np.array(shift)
     return self.pose(sides)
 
   def halves(self, motion: int) -> Iterator[Self]:
-    """Yields the poses to one side of a motion's middle, and to the other."""
+    """Yields the two halves of the sweep that a motion's middle separates."""
     is_halved = np.arange(len(self.motions)) == motion
     for side in (-0.5, 0.5):
       yield self._moved(side * is_halved, 1.0 - 0.5 * is_halved)
 
   def _moved(self, to: np.ndarray, lengths: np.ndarray) -> Self:
-    """Returns part of the poses: where motions begin, and how long they are."""
+    """Returns a part of the sweep.
+
+    Args:
+      to: Position of the new middle pose along each motion, `(motions,)`.
+      lengths: Factors for the lengths of the motions, `(motions,)`.
+    """
     *shift, turn, value = to @ self.motions
     return dataclasses.replace(
         self,
@@ -98,33 +107,34 @@ class Sweep:
 
 @final
 class Space:
-  """The geoms of a compiled model, free to be anywhere and of any size.
+  """Distance queries between geoms of a model, in any pose and size.
 
   It works on a copy of the model.
   """
 
   def __init__(self, model: mujoco.MjModel) -> None:
-    """Copies the model."""
+    """Copies a compiled model."""
     self._model = copy.copy(model)
     self._data = mujoco.MjData(self._model)
     self._is_box = model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
-    # The box about each geom's own centre that the geom is inside of.
+    # Half the size of a box around each geom, with the same centre.
     self._half = np.abs(model.geom_aabb[:, :3]) + model.geom_aabb[:, 3:]
-    # Distance around that box that belongs to the geom.
+    # Width of a margin around that box that is part of the geom.
     self._margin = np.zeros(model.ngeom)
     for geom in np.flatnonzero(model.geom_type == _CAPSULE).tolist():
-      # MuJoCo sees no capsule that goes all the way through a box.
+      # MuJoCo does not detect a capsule that passes entirely through a box.
       radius, half_length, _ = model.geom_size[geom]
-      self.make_box(geom, np.array([_STILL, _STILL, half_length]), radius)
+      half = np.array([_NEGLIGIBLE, _NEGLIGIBLE, half_length])
+      self.make_box(geom, half, radius)
     self._radius = np.linalg.norm(self._half[:, :2], axis=1)
 
   def make_box(self, geom: int, half: np.ndarray, margin: float = 0.0) -> None:
-    """Gives a geom another shape: a box, and a distance around it.
+    """Changes the shape of a geom to a box with a margin around it.
 
     Args:
       geom: Number of the geom.
-      half: Half the size of the box along its axes, `(3,)`, metres.
-      margin: The distance, metres.
+      half: Half the size of the box along its axes, `(3,)`, in metres.
+      margin: Width of the margin, in metres.
     """
     self._model.geom_type[geom] = mujoco.mjtGeom.mjGEOM_BOX
     self._is_box[geom] = True
@@ -132,7 +142,7 @@ class Space:
     self._margin[geom] = margin
 
   def bounds(self, sweep: Sweep) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the low and the high corner of what a sweep fills, `(3,)`."""
+    """Returns the low and high corners, `(3,)`, of the bounds of a sweep."""
     geom = sweep.geom
     reach = _extents(self._half[geom], sweep.matrix, sweep.turn)
     reach += sweep.travel + sweep.slack + self._margin[geom]
@@ -143,25 +153,24 @@ class Space:
   ) -> tuple[Sweep, float] | None:
     """Finds poses in which two geoms are too close to each other.
 
-    Where it returns `None`, there are none: no distance is less than the
-    clearance by more than `TOLERANCE`. (Distances below 0 are the depths of
-    overlaps.) The poses that it returns are closer than that, or so nearly that
-    it was not worth telling.
+    If it returns `None`, no distance is smaller than the clearance by more than
+    `TOLERANCE`. (Negative distances are depths of overlaps.) A returned pose is
+    closer than that, or too near this limit to be decided in reasonable time.
 
     Args:
-      one: The poses of a geom.
-      other: The poses of another geom.
-      clearance: Distance that the geoms have to keep, metres.
+      one: Poses of a geom.
+      other: Poses of another geom.
+      clearance: Minimum distance between the geoms, in metres.
 
     Returns:
-      A pose of the one and its distance from the other in metres, or `None`.
+      A pose of `one` and its distance from `other`, in metres; or `None`.
     """
     enough = clearance - TOLERANCE
-    order = itertools.count()  # Keeps those apart that are equally close.
-    waiting = [(*self._bound(one, other, enough), next(order), one, other)]
+    order = itertools.count()  # Breaks ties in the queue.
+    queue = [(*self._bound(one, other, enough), next(order), one, other)]
     closest = one, np.inf
-    for _ in range(_MOST_PAIRS):
-      bound, point, _, one, other = heapq.heappop(waiting)
+    for _ in range(_MAX_PAIRS):
+      bound, point, _, one, other = heapq.heappop(queue)
       if bound >= enough:
         return None
       pose = one.toward(point)
@@ -172,7 +181,7 @@ class Space:
         closest = pose, distance
       lengths, others = self._lengths(one), self._lengths(other)
       longest = lengths.max(initial=0.0), others.max(initial=0.0)
-      if distance < clearance - _SURE or max(longest) < _STILL:
+      if distance < clearance - _STOP_DEPTH or max(longest) < _NEGLIGIBLE:
         break
       if longest[0] >= longest[1]:
         halves = [(half, other) for half in one.halves(int(lengths.argmax()))]
@@ -180,13 +189,13 @@ class Space:
         halves = [(one, half) for half in other.halves(int(others.argmax()))]
       for pair in halves:
         found = self._bound(*pair, enough)
-        heapq.heappush(waiting, (*found, next(order), *pair))
+        heapq.heappush(queue, (*found, next(order), *pair))
     return closest
 
   def _bound(
       self, one: Sweep, other: Sweep, enough: float
   ) -> tuple[float, tuple[float, ...]]:
-    """Returns a distance that all poses surely keep, and the point nearest."""
+    """Returns a lower bound of the distance of all poses, and a close point."""
     best: tuple[float, tuple[float, ...]] = -np.inf, tuple(one.centre)
     for first in self._hulls(one):
       for second in self._hulls(other):
@@ -196,7 +205,7 @@ class Space:
     return best
 
   def _lengths(self, sweep: Sweep) -> np.ndarray:
-    """Returns how far each motion takes any point, `(motions,)`, metres."""
+    """Returns the largest displacement by each motion, `(motions,)`, metres."""
     shifts, turns = sweep.motions[:, :3], sweep.motions[:, 3]
     return np.linalg.norm(shifts, axis=1) + (
         np.abs(turns) * self._radius[sweep.geom]
@@ -209,14 +218,14 @@ class Space:
     return _Solid(geom, sweep.centre, sweep.matrix, half, self._margin[geom])
 
   def _hulls(self, sweep: Sweep) -> Iterator['_Solid']:
-    """Yields solids that each hold the geom in all of its poses."""
+    """Yields solids, each of which contains the geom in all of its poses."""
     geom, margin = sweep.geom, self._margin[sweep.geom] + sweep.slack
     if not self._is_box[geom]:
       margin += self._lengths(sweep).sum()
       yield self._solid(sweep)._replace(margin=margin)
       return
-    # The first is tight where the box hardly turns, the second where it goes
-    # far, the third where it turns far.
+    # The first is tight for small turns, the second for long displacements, the
+    # third for large turns.
     shifts, radius = sweep.motions[:, :3], self._radius[geom]
     lengths = np.linalg.norm(shifts[:, :2], axis=1)
     frames = [sweep.matrix]
@@ -228,7 +237,7 @@ class Space:
       half = _extents(self._half[geom], frame.T @ sweep.matrix, sweep.turn)
       yield _Solid(geom, sweep.centre, frame, half + travel, margin)
     if sweep.turn:
-      half[:2] = _STILL
+      half[:2] = _NEGLIGIBLE
       yield _Solid(geom, sweep.centre, frame, half + travel, margin + radius)
 
   def _distance(
@@ -236,7 +245,8 @@ class Space:
   ) -> tuple[float, tuple[float, ...]]:
     """Returns the distance between two solids and the point between them.
 
-    Beyond `enough`, the distance is some larger one, and the point is any.
+    If the distance exceeds `enough`, the result is any distance beyond it, with
+    an arbitrary point.
     """
     margin = one.margin + other.margin
     limit = max(enough + margin, 0.0) + TOLERANCE
@@ -247,11 +257,11 @@ class Space:
       if solid.half is not None:
         self._model.geom_size[solid.geom] = solid.half
     for nudge in _NUDGES:
-      self._data.geom_xpos[one.geom] = one.centre + nudge * _ASKEW
+      self._data.geom_xpos[one.geom] = one.centre + nudge * _NUDGE_DIRECTION
       distance = mujoco.mj_geomDistance(
           self._model, self._data, one.geom, other.geom, limit, ends
       )
-      # Exactly 0 is also what MuJoCo returns where it finds no answer.
+      # MuJoCo also returns exactly 0 if it fails to compute the distance.
       if distance != 0.0:
         point = (ends[:3] + ends[3:]) / 2
         return distance - nudge - margin, tuple(point)
@@ -260,15 +270,15 @@ class Space:
 
 @final
 class _Solid(NamedTuple):
-  """A geom somewhere, maybe of another size.
+  """A geom in one pose, possibly with another size.
 
   Attributes:
     geom: Number of the geom in the model.
-    centre: `(3,)`, metres.
-    matrix: Orientation, `(3, 3)`.
-    half: Half the size of a box along its axes, `(3,)`, metres; `None` for a
-      geom of another shape, which keeps its size.
-    margin: Distance around it that belongs to it, metres.
+    centre: Centre of the geom, `(3,)`, in metres.
+    matrix: Orientation of the geom, `(3, 3)`.
+    half: Half the size of a box along its axes, `(3,)`, in metres; `None` for a
+      geom of another shape, whose size does not change.
+    margin: Width of a margin that is part of the solid, in metres.
   """
 
   geom: int
@@ -279,12 +289,12 @@ class _Solid(NamedTuple):
 
 
 def _extents(half: np.ndarray, matrix: np.ndarray, turn: float) -> np.ndarray:
-  """Returns half the greatest size of a box along each axis as it turns.
+  """Returns half the largest extent of a turning box along each axis, `(3,)`.
 
   Args:
-    half: Half the size of the box along its own axes, `(3,)`, metres.
+    half: Half the size of the box along its own axes, `(3,)`, in metres.
     matrix: Orientation of the box, `(3, 3)`; upright, if it turns.
-    turn: Angle by which it turns to either side, radians.
+    turn: Angle by which it turns to either side, in radians.
   """
   extents = np.abs(matrix) @ half
   if not turn:
@@ -292,9 +302,9 @@ def _extents(half: np.ndarray, matrix: np.ndarray, turn: float) -> np.ndarray:
   angle = np.arctan2(matrix[1, 0], matrix[0, 0])
   corner = np.arctan2(half[1], half[0])
   for axis in range(2):
-    # Along an axis a box is widest while one of its corners is on it.
-    ways = axis * np.pi / 2 - angle + turn + corner * np.array([1, -1])
-    if (ways % np.pi <= 2 * turn).any():
+    # A box is widest along an axis when one of its corners is on the axis.
+    angles = axis * np.pi / 2 - angle + turn + corner * np.array([1, -1])
+    if (angles % np.pi <= 2 * turn).any():
       extents[axis] = np.hypot(*half[:2])
     else:
       for end in (-turn, turn):
@@ -304,7 +314,7 @@ def _extents(half: np.ndarray, matrix: np.ndarray, turn: float) -> np.ndarray:
 
 
 def turned(matrix: np.ndarray, angle: float) -> np.ndarray:
-  """Returns an orientation that was turned about the vertical."""
+  """Returns an orientation after a turn about the vertical, in radians."""
   if not angle:
     return matrix
   cos, sin = np.cos(angle), np.sin(angle)

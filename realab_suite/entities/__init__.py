@@ -1,1 +1,1 @@
-"""Parts of worlds, each usable alone in any Composer task."""
+"""Entities of worlds; each one works in any Composer task."""

@@ -1,11 +1,11 @@
-"""What things look like: to a camera by colour, to the ray sense by class."""
+"""Appearance of geoms: colours for cameras, class codes for the ray sense."""
 
 from typing import Any
 
 import numpy as np
 
-# The index of a name is the code that the ray sense reports. New classes go at
-# the end: the codes are part of the observation.
+# The index of a name is the code that the ray sense reports. Append new classes
+# at the end, because the codes are part of the observation.
 CLASSES = (
     'nothing',
     'other',
@@ -32,7 +32,7 @@ COLOURS = {
     'avatar': (0.92, 0.92, 0.95, 1.0),
 }
 
-# Base block and offset block of a register, by the role that it plays.
+# Colours of the base block and the offset block of a register, by its role.
 ROLE_COLOURS = {
     'feedback': ((0.10, 0.25, 0.70, 1.0), (0.35, 0.65, 1.00, 1.0)),
     'meter': ((0.45, 0.10, 0.55, 1.0), (0.80, 0.45, 0.95, 1.0)),
@@ -42,19 +42,23 @@ ROLE_COLOURS = {
 
 
 def code(name: str) -> int:
-  """Returns the code that the ray sense reports for the class `name`."""
+  """Returns the code that the ray sense reports for the class `name`.
+
+  Args:
+    name: One of `CLASSES`.
+  """
   return CLASSES.index(name)
 
 
 def geom_style(name: str, rgba: Any = None) -> dict[str, Any]:
-  """Returns geom attributes that make a geom belong to the class `name`.
+  """Returns geom attributes for a geom of the class `name`.
 
-  The class code is the geom's `user` number, so that it is read off any
-  compiled model without asking the entities.
+  The class code is stored as the geom's `user` number, so it can be read from
+  any compiled model without its entities.
 
   Args:
     name: One of `CLASSES`.
-    rgba: The colour, or `None` for the class's own.
+    rgba: Colour; `None` for the colour of the class.
   """
   return {
       'user': [code(name)],
@@ -63,9 +67,9 @@ def geom_style(name: str, rgba: Any = None) -> dict[str, Any]:
 
 
 def class_of_geoms(model: Any) -> np.ndarray:
-  """Returns the class code of every geom of a compiled model, `(ngeom,)`.
+  """Returns the class code of every geom of a compiled model, `(ngeom,)` int32.
 
-  A geom of somebody else's that says nothing about itself is `other`.
+  Geoms without a class, such as those of other packages, are `other`.
   """
   if not model.nuser_geom:
     return np.full(model.ngeom, code('other'), np.int32)

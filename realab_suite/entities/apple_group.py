@@ -1,4 +1,4 @@
-"""Apples: what a world rewards."""
+"""Apples that an avatar eats by coming near them."""
 
 from collections.abc import Sequence
 from typing import Any, final
@@ -14,13 +14,13 @@ from realab_suite.entities import protocols
 from realab_suite.entities import state
 
 _RADII = {'apple': 0.2, 'large_apple': 0.4}
-# Where an apple goes that has been eaten: out of sight of rays and cameras.
+# Height of eaten apples, in m: out of sight of rays and cameras.
 _GONE = -5.0
 
 
 @final
 class Apples(composer.Entity):
-  """Some apples of one size that are eaten by coming near.
+  """A group of apples of one size.
 
   Nothing collides with an apple. An eaten apple is gone until the next episode.
   """
@@ -31,12 +31,15 @@ class Apples(composer.Entity):
     """Builds the apples.
 
     Args:
-      name: The name of the model.
-      number: How many there are.
-      large: Whether they are large, golden ones.
+      name: Name of the model.
+      number: Number of apples, at least 1.
+      large: True for large, golden apples.
+
+    Raises:
+      SpecError: If `number` is less than 1.
     """
     if number < 1:
-      raise errors.SpecError(f'number: {number} apples; allowed are 1 and more')
+      raise errors.SpecError(f'number: {number}; allowed are 1 and more')
     self._mjcf_root = mjcf.RootElement(model=name)
     self._eaten = state.Slot(self._mjcf_root, 'eaten', number)
     self._kind = 'large_apple' if large else 'apple'
@@ -62,33 +65,39 @@ class Apples(composer.Entity):
 
   @property
   def frames(self) -> tuple[mjcf.Element, ...]:
-    """The mocap bodies of the apples."""
+    """Mocap bodies of the apples."""
     return self._frames
 
   @property
   def number(self) -> int:
+    """Number of apples."""
     return len(self._parts)
 
   @property
   def radius(self) -> float:
-    """Of one apple, metres."""
+    """Radius of each apple, in m."""
     return _RADII[self._kind]
 
   def attach_to(
       self, root: composer.Entity, position: Sequence[float] = (0.0, 0.0)
   ) -> None:
-    """Attaches the apples to the root entity of a task, all in one place."""
+    """Attaches the apples to the root entity of a task, all at one position.
+
+    Args:
+      root: Root entity of the task.
+      position: `(x, y)`, in m.
+    """
     root.attach(self)
     self._frames = tuple(
         part.attach_to(root, (*position, self.radius)) for part in self._parts
     )
 
   def place(self, physics: protocols.Physics, positions: Any) -> None:
-    """Puts the apples, uneaten, where `positions` says.
+    """Moves the apples to new positions and marks them as uneaten.
 
     Args:
-      physics: One world, or many.
-      positions: `(..., number, 2)`, metres.
+      physics: One world or a batch of worlds.
+      positions: Position of each apple, `(..., number, 2)`, in m.
     """
     positions = np.asarray(positions, float)
     heights = np.full((*positions.shape[:-1], 1), self.radius)
@@ -100,18 +109,18 @@ class Apples(composer.Entity):
   def eat(
       self, physics: protocols.Physics, position: np.ndarray, reach: float
   ) -> np.ndarray:
-    """Eats the apples that are near.
+    """Eats the apples within reach of a position.
 
     Args:
-      physics: One world, or many.
-      position: Of whoever eats, `(..., 2)`, metres.
-      reach: How near an apple has to be, between the middles, metres.
+      physics: One world or a batch of worlds.
+      position: Position of the eater, `(..., 2)`, in m.
+      reach: Largest distance from `position` to the centre of an apple, in m.
 
     Returns:
-      How many apples were eaten now, shape `(...)`.
+      Number of apples eaten by this call, `(...)`.
     """
     near = moving.within(physics, self._frames, position, reach**2)
-    # Most of the time there is nothing to eat.
+    # In most steps no apple is near.
     if np.count_nonzero(near):
       gone = np.array(physics.bind(self._frames).mocap_pos)
       gone[..., 2] = np.where(near, _GONE, gone[..., 2])
@@ -120,5 +129,5 @@ class Apples(composer.Entity):
     return near.sum(axis=-1)
 
   def num_eaten(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns how many apples have been eaten in this episode, `(...)`."""
+    """Returns the number of apples eaten in this episode, `(...)`."""
     return self._eaten.get(physics).sum(axis=-1)

@@ -1,4 +1,4 @@
-"""Rooms to put worlds into, and the names of places in them."""
+"""Arenas: walled rooms with named places for registers."""
 
 import abc
 from collections.abc import Mapping, Sequence
@@ -15,12 +15,12 @@ from realab_suite.entities import appearance
 _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
 _BARRIER_HEIGHT = 0.5
-# What is hit by something heavy flies off at twice its speed, and over any wall
-# that cameras can look across.
+# A block that is hit by a much heavier body leaves at twice its speed, fast
+# enough to fly over any wall that cameras can see across.
 _LID_HEIGHT = 3.0
 _UNSEEN = {'rgba': (0, 0, 0, 0), 'user': [appearance.code('nothing')]}
-# Walls go on below the floor: a small block that is forced into one would leave
-# by the shortest way otherwise, which is down.
+# Walls extend below the floor. Otherwise a small block that is forced into a
+# wall would leave it by the shortest way, which is down.
 _DEPTH = 0.5
 _CAMERA_HEIGHT = 30.0
 
@@ -28,13 +28,13 @@ _CAMERA_HEIGHT = 30.0
 @final
 @dataclasses.dataclass(frozen=True)
 class Place:
-  """Where something can stand.
+  """A spot in an arena for a register.
 
   Attributes:
-    position: `(x, y)`, metres.
-    yaw: The way it faces, as an angle to the x axis, radians.
-    spread: Half-widths of the region around `position`, metres, along the way
-      it faces and across, in which it stands at random.
+    position: `(x, y)`, in m.
+    yaw: Angle of the register's axis to the x axis, in rad.
+    spread: Half-widths of the region around `position`, along the register's
+      axis and across it, in m. Each episode draws a position from the region.
   """
 
   position: tuple[float, float]
@@ -45,7 +45,8 @@ class Place:
     """Checks the numbers.
 
     Raises:
-      SpecError: If one is missing, is not finite or is a negative half-width.
+      SpecError: If a number is missing or not finite, or if a half-width is
+        negative.
     """
     try:
       numbers = np.array([*self.position, self.yaw, *self.spread], float)
@@ -56,25 +57,30 @@ class Place:
     if not is_valid:
       raise errors.SpecError(
           f'{self!r:.160}; allowed are finite numbers, two for the position,'
-          ' one for the yaw, and two from 0 on for the spread'
+          ' one for the yaw, and two of at least 0 for the spread'
       )
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class Rectangle:
-  """A rectangle along the axes, in metres.
+  """An axis-aligned rectangle.
 
   Attributes:
-    low: The corner with the least x and y.
-    high: The corner with the greatest x and y.
+    low: Corner with the smallest x and y, in m.
+    high: Corner with the largest x and y, in m.
   """
 
   low: tuple[float, float]
   high: tuple[float, float]
 
   def contains(self, point: Sequence[float], margin: float = 0.0) -> bool:
-    """Whether `point` is inside, at least `margin` metres from every side."""
+    """Returns True if a point is in the rectangle.
+
+    Args:
+      point: `(x, y)`, in m.
+      margin: Smallest allowed distance to each side, in m.
+    """
     return all(
         low + margin <= x <= high - margin
         for low, x, high in zip(self.low, point, self.high, strict=True)
@@ -82,11 +88,11 @@ class Rectangle:
 
 
 class RoomArena(composer.Arena):
-  """A floor with walls, seen by a camera from above, that offers places.
+  """Base class for walled rooms with named places and a camera above them.
 
-  An agent designer puts registers at coordinates, or at a name that the arena
-  offers. The environment designer decides what the names stand for, so one
-  design can be tried near the apples and far from them.
+  An agent designer puts registers at coordinates or at a named place. The
+  environment designer decides the position of each named place, so one design
+  can be tried both near the apples and far from them.
   """
 
   def _build(self, name: str = 'arena') -> None:
@@ -95,11 +101,11 @@ class RoomArena(composer.Arena):
     root = self._mjcf_root
     root.option.timestep = 0.01
     root.option.integrator = 'implicitfast'
-    # Only a solver with islands keeps what is far apart from being coupled
-    # through it, and the noslip pass, which Composer turns on, has none.
+    # A solver without islands couples bodies that are far apart. The noslip
+    # pass, which Composer turns on, has no islands.
     root.option.solver = 'Newton'
     root.option.noslip_iterations = 0
-    # A warm start is taken or refused for all bodies at once.
+    # MuJoCo accepts or rejects a warm start for all bodies at once.
     root.option.flag.warmstart = 'disable'
     root.visual.headlight.set_attributes(
         ambient=(0.45, 0.45, 0.45), diffuse=(0.45, 0.45, 0.45),
@@ -139,12 +145,12 @@ class RoomArena(composer.Arena):
 
   @abc.abstractmethod
   def _build_walls(self) -> None:
-    """Adds the walls, by `_add_wall`; guards above them follow."""
+    """Adds the walls with `_add_wall`; `_build_guards` runs after it."""
 
   def _build_guards(self) -> None:
-    """Closes the space above the walls, out of sight of cameras and rays.
+    """Closes the space above the walls, invisibly to cameras and rays.
 
-    MuJoCo draws nothing that is transparent, and its rays pass through it.
+    MuJoCo does not draw transparent geoms, and its rays pass through them.
     """
     world = self._mjcf_root.worldbody
     height = (_LID_HEIGHT - _WALL_HEIGHT) / 2
@@ -162,28 +168,31 @@ class RoomArena(composer.Arena):
   @property
   @abc.abstractmethod
   def room(self) -> Rectangle:
-    """The main room, between the inner faces of its walls."""
+    """Main room, between the inner faces of its walls."""
 
   @property
   @abc.abstractmethod
   def extent(self) -> Rectangle:
-    """The smallest rectangle that everything inside the walls is in."""
+    """Smallest rectangle that contains every room."""
 
   @property
   def places(self) -> Mapping[str, Place]:
-    """Names of places, for the agent designer to put registers at."""
+    """Places for registers, by name."""
     return self._places
 
   def offer(self, places: Mapping[str, Place]) -> None:
-    """Adds places to those offered.
+    """Adds named places.
+
+    Args:
+      places: Places by name.
 
     Raises:
-      SpecError: If a name is taken.
+      SpecError: If the arena has a place of the same name.
     """
     for name in places:
       if name in self._places:
         raise errors.SpecError(
-            f'place {name!r} is offered already; offered are'
+            f'place {name!r} exists already; existing places are'
             f' {sorted(self._places)}'
         )
     self._places.update(places)
@@ -191,13 +200,19 @@ class RoomArena(composer.Arena):
   def add_barrier(
       self, name: str, start: Sequence[float], end: Sequence[float]
   ) -> None:
-    """Adds a low wall between two points, which cameras see across."""
+    """Adds a barrier: a wall so low that cameras see across it.
+
+    Args:
+      name: Name of the geom.
+      start: One end of its centre line, `(x, y)`, in m.
+      end: Other end of its centre line, `(x, y)`, in m.
+    """
     self._add_box(name, 'barrier', start, end, _BARRIER_HEIGHT)
 
   def _add_wall(
       self, name: str, start: Sequence[float], end: Sequence[float]
   ) -> None:
-    """Adds a wall whose middle line runs from `start` to `end`, metres."""
+    """Adds a wall with a centre line from `start` to `end`, in m."""
     self._walls.append(self._add_box(name, 'wall', start, end, _WALL_HEIGHT))
 
   def _add_box(
@@ -222,10 +237,10 @@ class RoomArena(composer.Arena):
     """Adds the walls around a room.
 
     Args:
-      prefix: Begins the names of the walls.
-      room: The space inside the walls.
+      prefix: First part of the names of the walls.
+      room: Space inside the walls.
       sides: For each of south, east, north and west, `True` for a wall, `False`
-        for none, or the `(from, to)` of an opening along it, metres.
+        for no wall, or the ends `(from, to)` of an opening in the wall, in m.
     """
     t = _WALL_THICKNESS / 2
     (x0, y0), (x1, y1) = room.low, room.high
@@ -242,14 +257,14 @@ class RoomArena(composer.Arena):
       elif wall:
         axis = 0 if side in ('south', 'north') else 1
         near, far = list(end), list(start)
-        # Boxes are drawn half a thickness beyond the ends of their lines.
+        # A box extends half a thickness beyond the ends of its centre line.
         near[axis], far[axis] = wall[0] - t, wall[1] + t
         self._add_wall(f'{prefix}{side}_1', start, near)
         self._add_wall(f'{prefix}{side}_2', far, end)
 
 
 def _places_in(room: Rectangle) -> dict[str, Place]:
-  """Names that any room offers: its middle, its sides and its corners."""
+  """Returns the places of any room: its centre, its sides and its corners."""
   (x0, y0), (x1, y1) = room.low, room.high
   x, y, inset = (x0 + x1) / 2, (y0 + y1) / 2, 0.8
   return {
@@ -273,8 +288,8 @@ class OpenRoom(RoomArena):
     """Builds the room.
 
     Args:
-      name: The name of the model.
-      half_width: Half the length of a side, between the walls, metres.
+      name: Name of the model.
+      half_width: Half the distance between opposite walls, in m.
     """
     self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
     super()._build(name)
@@ -310,10 +325,10 @@ class TwoRooms(RoomArena):
     """Builds the rooms.
 
     Args:
-      name: The name of the model.
-      half_width: Half the length of a side of the large room, metres.
-      side_half_width: The same of the small room, metres.
-      doorway_width: Of the opening between them, metres.
+      name: Name of the model.
+      half_width: Half the side length of the large room, in m.
+      side_half_width: Half the side length of the small room, in m.
+      doorway_width: Width of the opening between the rooms, in m.
     """
     self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
     south = half_width + _WALL_THICKNESS
@@ -350,7 +365,7 @@ class TwoRooms(RoomArena):
 
   @property
   def doorway_width(self) -> float:
-    """Of the opening between the rooms, metres."""
+    """Width of the opening between the rooms, in m."""
     return self._doorway_width
 
   @property

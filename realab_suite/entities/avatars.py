@@ -1,4 +1,4 @@
-"""The body that an agent acts and senses with."""
+"""The avatar: the body that an agent acts and senses with."""
 
 from collections.abc import Sequence
 from typing import Any, final
@@ -15,7 +15,7 @@ from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities import rays
 
-# Where each sense is in what `Avatar.proprioception` returns.
+# Indices of each sense in the result of `Avatar.proprioception`.
 PROPRIOCEPTION = {
     'velocity': slice(0, 3),
     'position': slice(3, 5),
@@ -23,7 +23,7 @@ PROPRIOCEPTION = {
     'pitch': slice(7, 8),
     'holding': slice(8, 9),
 }
-# Element by element, what an action is made of; see `Avatar.apply_action`.
+# Names of the elements of an action; see `Avatar.apply_action`.
 ACTIONS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
 
 _RADIUS = 0.25
@@ -33,33 +33,34 @@ _MASS = 40.0
 _EYE_HEIGHT = 0.75
 _RAY_HEIGHT = 0.15
 _LARGEST_PITCH = 60.0
-# How soon a commanded velocity is reached, seconds.
+# Time constant of the velocity servos, in s.
 _RESPONSE = 0.05
 _FORCE = 600.0
 _HAND_DISTANCE = 0.45
-# How far the hand reaches, from its own place to the middle of a block, metres.
+# Largest distance from the hand to the centre of a block to grasp, in m.
 _REACH = 0.4
-# How far off what it holds may be before it loses it: a block that is stuck
-# behind the end of a wall stays there when the avatar walks on.
+# Distance at which the hand loses a held block, in m. A block that is stuck
+# behind the end of a wall stays there when the avatar continues to walk.
 _SLIPS = 0.6
 _THROW_SPEED = 5.0
 _THROW_LIFT = 2.0
-# Contacts of the body are softer than those of other things and take
-# precedence: what is written into the avatar is pushed out slowly. They do not
-# grip, or a block that was written under the body would be dragged along.
+# Contacts of the body are softer than other contacts and take precedence, so
+# that a block that is written into the avatar is pushed out slowly. They have
+# no friction; otherwise a block that was written under the body would be
+# dragged along.
 _CONTACT: dict[str, Any] = {
     'priority': 1,
     'solref': (0.08, 1.0),
     'friction': (0.0, 0.01, 0.001),
 }
-# A block that is taken hold of comes to the hand in about 0.05 s. The hand is
-# weaker than walls: at MuJoCo's own 0.95 it pulled a block of 1 kg through one.
+# A grasped block comes to the hand in about 0.05 s. The hand is weaker than
+# walls: with MuJoCo's default of 0.95 it pulled a block of 1 kg through one.
 _GRASP = {'solref': (0.05, 1.0), 'solimp': (0.7, 0.7, 0.001)}
 
 
 @final
 class AvatarObservables(composer.Observables):
-  """What the avatar knows of itself, and what it sees."""
+  """Observables of the avatar: its proprioception and its camera."""
 
   @composer.observable
   def velocity(self) -> observable.Generic:
@@ -87,7 +88,7 @@ class AvatarObservables(composer.Observables):
 
   @property
   def proprioception(self) -> list[observable.Observable]:
-    """The observables of the body itself."""
+    """Observables of the body, without the camera."""
     return [
         self.velocity, self.position, self.heading, self.pitch, self.holding
     ]  # fmt: skip
@@ -97,9 +98,9 @@ class AvatarObservables(composer.Observables):
 class Avatar(composer.Entity):
   """A cylinder that walks, strafes, turns, looks, pushes, carries and throws.
 
-  It moves in the plane of the floor. Attach it at the origin of an arena; where
-  it is, is in its joints. Like the walkers of `dm_control.locomotion`, it is
-  moved by `apply_action`, which a task calls from its `before_step`.
+  The avatar moves in the plane of the floor. Attach it at the origin of an
+  arena; its joints hold its position. As with the walkers of
+  `dm_control.locomotion`, a task calls `apply_action` from its `before_step`.
   """
 
   def _build(
@@ -113,11 +114,11 @@ class Avatar(composer.Entity):
     """Builds the avatar.
 
     Args:
-      name: The name of the model.
-      speed: The speed of walking at full command, metres per second.
-      turn_rate: The rate of turning at full command, radians per second.
-      num_rays: How many rays its ray sense has.
-      field_of_view: Of the ray sense, degrees.
+      name: Name of the model.
+      speed: Walking speed at full command, in m/s.
+      turn_rate: Turning rate at full command, in rad/s.
+      num_rays: Number of rays of the ray sense.
+      field_of_view: Field of view of the ray sense, in degrees.
     """
     self._mjcf_root = mjcf.RootElement(model=name)
     self._mjcf_root.compiler.angle = 'radian'
@@ -143,7 +144,7 @@ class Avatar(composer.Entity):
         'geom', name='head', type='sphere', size=(0.12,), mass=0.5,
         contype=0, conaffinity=0, rgba=appearance.COLOURS['avatar'],
     )  # fmt: skip
-    # A nose, so that a film shows which way the avatar faces.
+    # A nose, so that a video shows the direction in which the avatar faces.
     self._head.add(
         'geom', name='nose', type='capsule', size=(0.04,), mass=0.0,
         fromto=(0.08, 0, 0, 0.22, 0, 0), contype=0, conaffinity=0,
@@ -168,7 +169,7 @@ class Avatar(composer.Entity):
     self._pairs: list[mjcf.Element] = []
 
   def _add_actuators(self, speed: float, turn_rate: float) -> None:
-    """Adds velocity servos; those of walking act in the avatar's own frame."""
+    """Adds velocity servos; the walking servos act in the avatar's frame."""
     feet = self._body.add('site', name='feet', group=4)
     total = _MASS + 0.5
     inertia = 0.5 * _MASS * _RADIUS**2
@@ -178,7 +179,7 @@ class Avatar(composer.Entity):
         ('turn', {'joint': self._yaw}, inertia, turn_rate),
         ('look', {'joint': self._pitch}, 0.024, turn_rate / 2),
     )
-    # force = gain * (fastest * ctrl - velocity), so that ctrl is in [-1, 1].
+    # force = gain * (fastest * ctrl - velocity) with ctrl in [-1, 1].
     self._actuators = tuple(
         self._mjcf_root.actuator.add(
             'general', name=name, ctrllimited='true', ctrlrange=(-1, 1),
@@ -202,31 +203,39 @@ class Avatar(composer.Entity):
 
   @property
   def camera(self) -> mjcf.Element:
-    """The egocentric camera, at eye height."""
+    """Egocentric camera, at eye height."""
     return self._camera
 
   @property
   def rays(self) -> rays.RaySense:
+    """Ray sense of the avatar."""
     return self._rays
 
   @property
   def radius(self) -> float:
-    """Of the body, metres."""
+    """Radius of the body, in m."""
     return _RADIUS
 
   @property
   def action_spec(self) -> specs.BoundedArray:
-    """Six elements in [-1, 1], named as in `ACTIONS`, tab-separated."""
+    """Spec of an action: shape `(6,)`, float64, in [-1, 1].
+
+    The name of the spec is `ACTIONS`, joined by tabs.
+    """
     return specs.BoundedArray(
         (len(ACTIONS),), np.float64, -1.0, 1.0, name='\t'.join(ACTIONS)
     )
 
   def make_graspable(self, blocks: Sequence[block_kinds.Block]) -> None:
-    """Lets the hand take hold of blocks; welded ones are passed over.
+    """Makes blocks graspable by the hand; ignores blocks of welded registers.
 
-    Blocks that are larger than usual are also made softer to the body.
+    Contacts of the body with large blocks become softer.
 
-    Call it after everything is attached and before the physics is compiled.
+    Call this after all entities are attached and before the physics is
+    compiled.
+
+    Args:
+      blocks: Blocks of registers.
     """
     root = self._mjcf_root.root_model
     for block in blocks:
@@ -241,8 +250,8 @@ class Avatar(composer.Entity):
         self._pairs.append(pair)
       if not isinstance(block, block_kinds.JointedBlock):
         continue
-      # Between two sites, a held block can turn; a weld would lock the yaw of
-      # an avatar that holds a block which cannot.
+      # Connected by two sites, a held block can turn. A weld would lock the yaw
+      # of an avatar while the block that it holds cannot turn.
       grasp = root.equality.add(
           'connect', site1=self._hand, site2=block.site, active='false',
           **_GRASP
@@ -252,7 +261,7 @@ class Avatar(composer.Entity):
       self._blocks.append(block)
 
   def forget(self, blocks: Sequence[block_kinds.Block]) -> None:
-    """Undoes `make_graspable` for some blocks."""
+    """Undoes `make_graspable` for the given blocks."""
     geoms = [block.geom for block in blocks]
     for pair in [p for p in self._pairs if p.geom2 in geoms]:
       self._pairs.remove(pair)
@@ -267,12 +276,12 @@ class Avatar(composer.Entity):
   def place(
       self, physics: protocols.Physics, position: Any, heading: Any
   ) -> None:
-    """Puts the avatar somewhere, at rest.
+    """Moves the avatar to a pose, at rest.
 
     Args:
-      physics: One world, or many.
-      position: `(..., 2)`, metres.
-      heading: The angle to the x axis, shape `(...)`, radians.
+      physics: One world or a batch of worlds.
+      position: `(..., 2)`, in m.
+      heading: Angle to the x axis, `(...)`, in rad.
     """
     physics.bind(self._slides).qpos = position
     physics.bind(self._slides).qvel = 0.0
@@ -285,12 +294,12 @@ class Avatar(composer.Entity):
     """Sets the motors and the hand for one control step.
 
     Args:
-      physics: One world, or many.
-      action: `(..., 6)` in [-1, 1]: forward, strafe (to the left), turn (to the
-        left) and look (up) are fractions of the greatest velocity; grasp >= 0.5
-        takes hold of the nearest block in reach, <= -0.5 lets go; throw >= 0.5
-        throws what is held. A hand keeps hold until told otherwise, unless what
-        it holds gets stuck.
+      physics: One world or a batch of worlds.
+      action: `(..., 6)` in [-1, 1]. Forward, strafe (to the left), turn (to the
+        left) and look (up) are fractions of the greatest velocity. A grasp of
+        at least 0.5 grasps the nearest block in reach, and a grasp of at most
+        -0.5 releases the held block. A throw of at least 0.5 throws the held
+        block. Otherwise the hand keeps a block unless the block gets stuck.
     """
     physics.bind(self._actuators).ctrl = action[..., : len(self._actuators)]
     if self._grasps:
@@ -298,34 +307,38 @@ class Avatar(composer.Entity):
       self._use_hand(physics, grasp, throw)
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns where the avatar is, `(..., 2)`, metres."""
+    """Returns the position of the avatar, `(..., 2)`, in m."""
     return np.array(physics.bind(self._slides).qpos)
 
   def angle(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the angle that the avatar faces, `(...)`, radians."""
+    """Returns the angle of the avatar to the x axis, `(...)`, in rad."""
     return np.array(physics.bind(self._yaw).qpos[..., 0])[()]
 
   def direction(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the unit vector that the avatar faces along, `(..., 2)`."""
+    """Returns the unit vector in which the avatar faces, `(..., 2)`."""
     return self.proprioception(physics)[..., PROPRIOCEPTION['heading']]
 
   def velocity(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns velocity forward, leftward (m/s), turning (rad/s), `(..., 3)`."""
+    """Returns the velocity in the avatar's frame, `(..., 3)`.
+
+    The components are forward and to the left, in m/s, and turning to the left,
+    in rad/s.
+    """
     return self.proprioception(physics)[..., PROPRIOCEPTION['velocity']]
 
   def pitch(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the angle of looking up, `(..., 1)`, radians."""
+    """Returns the upward angle of the head, `(..., 1)`, in rad."""
     return np.array(physics.bind(self._pitch).qpos)
 
   def holding(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns 1 where the hand holds a block and 0 elsewhere, `(..., 1)`."""
+    """Returns 1 if the hand holds a block, otherwise 0, `(..., 1)`."""
     return self.proprioception(physics)[..., PROPRIOCEPTION['holding']]
 
   def proprioception(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns what the avatar knows of itself, `(..., 9)`.
+    """Returns the senses of the body, `(..., 9)`.
 
-    It is what `velocity`, `position`, `direction`, `pitch` and `holding`
-    return, side by side, as `PROPRIOCEPTION` says.
+    Concatenates `velocity`, `position`, `direction`, `pitch` and `holding`;
+    `PROPRIOCEPTION` has the indices of each.
     """
     slides = physics.bind(self._slides)
     x, y = (axes.component(slides.qvel, i) for i in range(2))
@@ -343,7 +356,7 @@ class Avatar(composer.Entity):
     return body
 
   def _held(self, physics: protocols.Physics) -> np.ndarray:
-    """Which block the hand holds, `(..., blocks)`, bool."""
+    """Returns True for each block that the hand holds, `(..., blocks)` bool."""
     if not self._grasps:
       return np.zeros((*self.angle(physics).shape, 1), bool)
     return np.asarray(physics.bind(self._grasps).active).astype(bool)
@@ -351,19 +364,20 @@ class Avatar(composer.Entity):
   def _use_hand(
       self, physics: protocols.Physics, grasp: np.ndarray, throw: np.ndarray
   ) -> None:
+    """Grasps, releases and throws blocks; `grasp` and `throw` are `(...)`."""
     held = self._held(physics)
     is_empty = not np.count_nonzero(held)
     if is_empty and not axes.anywhere(grasp >= 0.5):
-      return  # Nothing to throw, nothing to let go of: most of the time.
+      return  # The most frequent case: no block to throw or to release.
     hand = physics.bind(self._hand).xpos
     sites = [block.site for block in self._blocks]
     offsets = physics.bind(sites).xpos - hand[..., np.newaxis, :]
     squares = offsets * offsets
-    # The hand closes on what stands before it, whatever its height.
+    # The hand grasps a block in front of it at any height.
     distances = np.sqrt(squares[..., 0] + squares[..., 1])
     is_in_reach = distances <= _REACH
     if is_empty and not np.count_nonzero(is_in_reach):
-      return  # Nothing to take.
+      return  # No block to grasp.
     nearest = (
         np.arange(len(sites)) == distances.argmin(axis=-1)[..., np.newaxis]
     )

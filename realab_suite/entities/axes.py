@@ -1,8 +1,8 @@
-"""Numbers of one world and arrays of many, in the same words.
+"""Helpers for code that serves both one world and a batch of worlds.
 
-NumPy calculates with numbers (`np.float64`) ten times as fast as with arrays
-that have no axes, and what one world stores in a scalar or in one component of
-a vector would be such an array.
+A value of one world is a number (`np.float64`), a value of a batch is an array
+`(worlds,)`. NumPy calculates with numbers ten times as fast as with arrays
+without axes, so these helpers return numbers for one world.
 """
 
 from typing import Any
@@ -11,19 +11,19 @@ import numpy as np
 
 
 def component(array: np.ndarray, index: int) -> np.ndarray:
-  """Returns `array[..., index]`, which in one world is a number."""
+  """Returns `array[..., index]`; a number if `array` has one axis."""
   return array[..., index][()]
 
 
 def anywhere(condition: np.ndarray) -> bool:
-  """Whether a condition, `(...)`, is true in any world."""
+  """Returns True if a condition, `(...)`, is true in any world."""
   if condition.ndim:
     return bool(np.count_nonzero(condition))
   return bool(condition)
 
 
 def everywhere(condition: np.ndarray) -> bool:
-  """Whether a condition, `(...)`, bool, is true in all worlds."""
+  """Returns True if a condition, `(...)` bool, is true in all worlds."""
   if condition.ndim:
     return bool(np.count_nonzero(condition) == condition.size)
   return bool(condition)

@@ -1,9 +1,9 @@
-"""Blocks: the cubes in whose poses registers keep their values.
+"""Blocks: cubes whose poses store the values of registers.
 
-A block's position and heading are given in the frame of its register, whose x
-axis is the one that carries the value. Three kinds differ in what can move
-them: a free block in six degrees of freedom, a planar block along the floor, a
-mocap block (of a welded register) not at all.
+The position and heading of a block are given in the frame of its register,
+whose x axis carries the value. A free block can be moved in six degrees of
+freedom, a planar block only along the floor, and a mocap block (of a welded
+register) only by writes.
 """
 
 import abc
@@ -18,45 +18,50 @@ from realab_suite.entities import axes
 from realab_suite.entities import moving
 from realab_suite.entities import protocols
 
-# The least edge of a block in a design, metres. What an avatar throws lands at
-# up to 2.8 m/s, 28 mm in a substep of 10 ms: the middle of a block of less than
-# twice that would be under the floor at first.
+# Smallest edge length of a block in a design, in m. A thrown block lands at up
+# to 2.8 m/s, which is 28 mm in a substep of 10 ms. The centre of a block with
+# less than twice that edge length would be below the floor after the substep.
 LEAST_SIZE = 0.06
-# Blocks are soft to each other, so that one that is written into another pushes
-# it away slowly: at 1.3 m/s at most, where MuJoCo's own stiffness gave 9.8 m/s.
-# Against anything else the stiffness of the other thing counts, because a block
-# on a soft floor takes so long to settle after a write that its value drifts
-# (3e-8 m instead of 2e-15).
+# Contacts between blocks are soft, so that a block that is written into another
+# one pushes it away slowly: at 1.3 m/s at most, compared with 9.8 m/s at
+# MuJoCo's default stiffness. In contacts with other geoms, the stiffness of the
+# other geom counts, because a block on a soft floor settles so slowly after a
+# write that its value drifts (by 3e-8 m instead of 2e-15 m).
 _CONTACT: dict[str, Any] = {
     'friction': (0.8, 0.01, 0.001),
     'solref': (0.06, 1.0),
     'solmix': 1e-4,
 }
-# The larger a block is, the deeper another thing can be in it, and the faster
-# it would be pushed out: at up to 2.6 m/s, for a cube of 0.4 m. From this size
-# on, half of an edge in metres, blocks are the softer, the larger they are.
+# Bodies can penetrate a large block more deeply and would then be pushed out
+# faster: at up to 2.6 m/s by a cube of 0.4 m. Above this half edge length, in
+# m, contacts of a block become softer as its size increases.
 _USUAL_HALF_SIZE = 0.1
-# Large blocks also grip each other less. MuJoCo's contacts turn sliding into
-# hopping, and a cube of 1 m that is squeezed against a wall hopped off another
-# one at 5.4 m/s. Of the powers that were tried, the fastest of 800 such cubes
-# left at 3.0 (2), 2.6 (3), 2.0 (4) and 1.95 m/s (6).
+# Exponent by which the friction of large blocks decreases with their softness.
+# MuJoCo's contacts turn sliding into hopping: a cube of 1 m that was squeezed
+# against a wall hopped off another one at 5.4 m/s. The fastest of 800 such
+# cubes left at 3.0 m/s with exponent 2, 2.6 with 3, 2.0 with 4 and 1.95 with 6.
 _SLIPPERINESS = 6
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-# The height at which an avatar carries a block, metres.
+# Height at which an avatar carries a block, in m.
 GRIP_HEIGHT = 0.2
-# A planar block hovers, so that it never touches the floor.
+# Gap between a planar block and the floor, in m, so that they never touch.
 _HOVER = 0.004
-# What a planar block loses to the floor that it does not touch.
+# Friction loss of the joints of a planar block, in N, in place of contact with
+# the floor.
 _PLANAR_FRICTION = 6.0
 
 
 def softness(half_size: float) -> float:
-  """Returns how much slower a block is pushed out than a usual one, >= 1."""
+  """Returns the factor by which contacts of a block are softened, at least 1.
+
+  Args:
+    half_size: Half the edge length of the block, in m.
+  """
   return max(1.0, half_size / _USUAL_HALF_SIZE)
 
 
 class Block(abc.ABC):
-  """A cube of a register."""
+  """Base class for the blocks of registers."""
 
   def __init__(self, half_size: float) -> None:
     self._half_size = half_size
@@ -64,67 +69,66 @@ class Block(abc.ABC):
 
   @property
   def half_size(self) -> float:
-    """Half the length of an edge, in metres."""
+    """Half the edge length, in m."""
     return self._half_size
 
   @property
   @abc.abstractmethod
   def geom(self) -> mjcf.Element:
-    """The cube."""
+    """Geom of the cube."""
 
   @property
   @abc.abstractmethod
   def rest_height(self) -> float:
-    """The height of the centre when the block rests on the floor, metres."""
+    """Height of the centre of a block that rests on the floor, in m."""
 
   @property
   def grasps(self) -> list[mjcf.Element]:
-    """The equality constraints by which hands can hold this block."""
+    """Equality constraints by which hands can hold the block."""
     return self._grasps
 
   @abc.abstractmethod
   def position(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the centre in the register's frame, shape `(..., 3)`, metres."""
+    """Returns the centre in the register's frame, `(..., 3)`, in m."""
 
   def along(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the centre's place along the register's axis, `(...)`, metres."""
+    """Returns the x coordinate in the register's frame, `(...)`, in m."""
     return axes.component(self.position(physics), 0)
 
   @abc.abstractmethod
   def heading(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the angle about the vertical, shape `(...)`, in (-pi, pi]."""
+    """Returns the angle about the vertical, `(...)`, in (-pi, pi]."""
 
   @abc.abstractmethod
   def put(
       self, physics: protocols.Physics, position: Any, heading: Any = None
   ) -> None:
-    """Teleports the block, upright and at rest, and makes hands let go of it.
+    """Teleports the block to a pose, upright and at rest, and releases it.
 
     Args:
-      physics: One world, or many.
-      position: The centre in the register's frame, shape `(..., 3)`, metres.
-      heading: The angle about the vertical, shape `(...)`, radians; `None`
-        for 0.
+      physics: One world or a batch of worlds.
+      position: Centre in the register's frame, `(..., 3)`, in m.
+      heading: Angle about the vertical, `(...)`, in rad; `None` for 0.
     """
 
   def let_go(self, physics: protocols.Physics) -> None:
-    """Makes every hand let go of the block.
+    """Releases the block from every hand.
 
-    A hand that still held the block would be yanked along by a teleport.
+    Otherwise a teleport of the block would pull the hand along.
     """
     if self._grasps:
       physics.bind(self._grasps).active = 0
 
 
 class JointedBlock(Block):
-  """A block that hangs from joints of its own in its register's model.
+  """Base class for blocks with joints of their own in the register's model.
 
-  A free joint would be simpler, but MuJoCo only accepts free joints on children
-  of the world, and a register has to stay one subtree that can be attached
-  anywhere.
+  A free joint would be simpler, but MuJoCo accepts free joints only on children
+  of the world, and a register must remain one subtree that can be attached to
+  any entity.
   """
 
-  # The joints that translate the block, in the order of the axes.
+  # Joints that translate the block, in the order of the axes.
   _slides: tuple[mjcf.Element, ...]
 
   def __init__(
@@ -134,24 +138,24 @@ class JointedBlock(Block):
       position: Sequence[float],
       half_size: float,
       mass: float,
-      looks: dict[str, Any],
+      style: dict[str, Any],
   ) -> None:
     """Adds the block to the model of a register.
 
     Args:
-      mjcf_model: The model of the register.
-      name: The name of the body, which begins the names of its joints.
-      position: Where the block stands at rest, `(x, y)` in metres.
-      half_size: Half the length of an edge, metres.
-      mass: In kilograms.
-      looks: Geom attributes, see `appearance.geom_style`.
+      mjcf_model: Model of the register.
+      name: Name of the body; the names of its joints begin with it.
+      position: Position at rest, `(x, y)`, in m.
+      half_size: Half the edge length, in m.
+      mass: Mass, in kg.
+      style: Geom attributes; see `appearance.geom_style`.
     """
     super().__init__(half_size)
     self._rest = np.array([*position, self.rest_height])
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
     self._geom = self._body.add(
         'geom', name=name, type='box', size=[half_size] * 3, mass=mass,
-        **_contact(half_size), **looks
+        **_contact(half_size), **style
     )  # fmt: skip
     self._site = self._body.add(
         'site', name=f'{name}_grip', size=[0.01], group=4,
@@ -161,7 +165,7 @@ class JointedBlock(Block):
   @property
   @abc.abstractmethod
   def _grip_offset(self) -> float:
-    """How far above the centre a hand takes hold, metres."""
+    """Height of the grip above the centre of the block, in m."""
 
   @property
   def body(self) -> mjcf.Element:
@@ -173,7 +177,7 @@ class JointedBlock(Block):
 
   @property
   def site(self) -> mjcf.Element:
-    """What a hand takes hold of."""
+    """Site that a hand grasps."""
     return self._site
 
   def along(self, physics: protocols.Physics) -> np.ndarray:
@@ -183,15 +187,15 @@ class JointedBlock(Block):
   def launch(
       self, physics: protocols.Physics, velocity: np.ndarray, where: Any
   ) -> None:
-    """Gives the block a velocity.
+    """Sets the velocity of the block in some worlds.
 
     Args:
-      physics: One world, or many.
-      velocity: In the frame of the world, shape `(..., 3)`, metres per second.
-      where: In which worlds, shape `(...)`, bool.
+      physics: One world or a batch of worlds.
+      velocity: Velocity in the world frame, `(..., 3)`, in m/s.
+      where: True for each world in which to set it, `(...)` bool.
     """
     slides = self._slides
-    # The slides run along the axes of the register, not of the world.
+    # The slides are parallel to the axes of the register, not of the world.
     frame = mjcf.get_attachment_frame(self._body.root)
     if frame is not None:
       velocity = np.einsum(
@@ -229,7 +233,7 @@ class FreeBlock(JointedBlock):
 
   @property
   def _grip_offset(self) -> float:
-    return 0.0  # The block is lifted to the hand.
+    return 0.0  # A grasp lifts the block to the hand.
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
     return self._rest + np.asarray(physics.bind(self._slides).qpos)
@@ -248,7 +252,10 @@ class FreeBlock(JointedBlock):
 
 @final
 class PlanarBlock(JointedBlock):
-  """A block that slides and turns on the floor: cheaper, and never off it."""
+  """A block that slides and turns along the floor and is never lifted.
+
+  It is cheaper to simulate than a free block.
+  """
 
   def __init__(self, *args: Any, **kwargs: Any) -> None:
     super().__init__(*args, **kwargs)
@@ -272,7 +279,7 @@ class PlanarBlock(JointedBlock):
 
   @property
   def _grip_offset(self) -> float:
-    # A hand at another height would ask for a lift that the joints do not have.
+    # A grip at another height would pull in a direction without a joint.
     return GRIP_HEIGHT - self.rest_height
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
@@ -299,23 +306,22 @@ class PlanarBlock(JointedBlock):
 
 @final
 class MocapBlock(Block):
-  """A block of a welded register: it moves when written and never else."""
+  """A block of a welded register, which only writes can move."""
 
   def __init__(
       self,
       name: str,
       position: Sequence[float],
       half_size: float,
-      looks: dict[str, Any],
+      style: dict[str, Any],
   ) -> None:
-    """Makes the block; `attach_to` puts it into a world.
+    """Makes a block that is not yet attached; see `attach_to`.
 
     Args:
-      name: The name of the part.
-      position: Where the block stands at rest, `(x, y)` in the register's
-        frame, metres.
-      half_size: Half the length of an edge, metres.
-      looks: Geom attributes, see `appearance.geom_style`.
+      name: Name of the part.
+      position: Position at rest in the register's frame, `(x, y)`, in m.
+      half_size: Half the edge length, in m.
+      style: Geom attributes; see `appearance.geom_style`.
     """
     super().__init__(half_size)
     self._rest = np.array([*position, half_size])
@@ -326,7 +332,7 @@ class MocapBlock(Block):
                 'type': 'box',
                 'size': [half_size] * 3,
                 **_contact(half_size),
-                **looks,
+                **style,
             }
         ],
     )
@@ -344,12 +350,12 @@ class MocapBlock(Block):
   def attach_to(
       self, root: composer.Entity, position: Sequence[float], yaw: float
   ) -> None:
-    """Attaches the block to the root entity, for a register that stands there.
+    """Attaches the block to the root entity of a task.
 
     Args:
-      root: The root entity of the task.
-      position: The origin of the register's frame, `(x, y)`, metres.
-      yaw: The angle of the register's axis to the x axis of the world, radians.
+      root: Root entity of the task.
+      position: Origin of the register's frame, `(x, y)`, in m.
+      yaw: Angle of the register's axis to the x axis of the world, in rad.
     """
     self._origin = np.array([*position, 0.0])
     self._yaw = yaw
@@ -361,9 +367,8 @@ class MocapBlock(Block):
     self._part.detach()
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
-    place = np.asarray(physics.bind(self._part.frame).mocap_pos)
-    offset = place - self._origin
-    return _rotate(offset, -self._yaw)
+    position = np.asarray(physics.bind(self._part.frame).mocap_pos)
+    return _rotate(position - self._origin, -self._yaw)
 
   def heading(self, physics: protocols.Physics) -> np.ndarray:
     angle = _heading(physics.bind(self._part.frame).mocap_quat) - self._yaw
@@ -385,7 +390,11 @@ class MocapBlock(Block):
 
 
 def _contact(half_size: float) -> dict[str, Any]:
-  """Returns what the contacts of a block of some size are like."""
+  """Returns the contact attributes of a block.
+
+  Args:
+    half_size: Half the edge length, in m.
+  """
   soft = softness(half_size)
   time, damping = _CONTACT['solref']
   slide, spin, roll = _CONTACT['friction']
@@ -397,7 +406,7 @@ def _contact(half_size: float) -> dict[str, Any]:
 
 
 def _rotate(vector: np.ndarray, angle: float) -> np.ndarray:
-  """Turns vectors `(..., 3)` about the vertical."""
+  """Rotates vectors, `(..., 3)`, about the vertical by an angle in rad."""
   if not angle:
     return vector
   cos, sin = np.cos(angle), np.sin(angle)
@@ -406,13 +415,13 @@ def _rotate(vector: np.ndarray, angle: float) -> np.ndarray:
 
 
 def _heading(quaternion: np.ndarray) -> np.ndarray:
-  """Returns the angle about the vertical of quaternions `(..., 4)`."""
+  """Returns the angles of quaternions, `(..., 4)`, about the vertical."""
   w, x, y, z = (axes.component(quaternion, i) for i in range(4))
   return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def _quaternion(angle: Any) -> np.ndarray:
-  """Returns the quaternions `(..., 4)` of rotations about the vertical."""
+  """Returns the quaternions, `(..., 4)`, of rotations about the vertical."""
   if angle is None:
     return _UPRIGHT
   half = np.asarray(angle, float) / 2.0

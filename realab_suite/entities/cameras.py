@@ -1,4 +1,4 @@
-"""What a camera sees, drawn when somebody asks for it."""
+"""Rendering of camera images."""
 
 import functools
 
@@ -12,18 +12,23 @@ from realab_suite.entities import protocols
 def render(
     physics: protocols.Physics, camera: mjcf.Element, height: int, width: int
 ) -> np.ndarray:
-  """Draws what a camera sees; an engine may register a faster way.
+  """Renders the image of a camera.
+
+  Engines may register faster implementations for their own physics.
 
   Args:
-    physics: One world, or many where an engine draws them.
-    camera: Through which to look.
-    height: Of the frame, pixels.
-    width: Of the frame, pixels.
+    physics: One world, or a batch of worlds if the engine supports it.
+    camera: Camera to render.
+    height: Height of the image, in pixels.
+    width: Width of the image, in pixels.
 
   Returns:
-    `(..., height, width, 3)` uint8, the caller's own.
+    New array, `(..., height, width, 3)` uint8.
+
+  Raises:
+    NotImplementedError: If the engine cannot render.
   """
-  raise NotImplementedError(f'no camera draws a {type(physics).__name__}')
+  raise NotImplementedError(f'{type(physics).__name__} cannot be rendered')
 
 
 @render.register

@@ -1,4 +1,4 @@
-"""The sliding door."""
+"""A sliding door."""
 
 from collections.abc import Sequence
 from typing import final
@@ -14,17 +14,16 @@ from realab_suite.entities import protocols
 
 _THICKNESS = 0.08
 _HEIGHT = 1.0
-# An open door goes a little further than it has to, so that its face is not in
-# one plane with the end of the wall.
+# Travel of the door, in widths of the opening. It is more than 1 so that the
+# face of an open door is not in one plane with the end of the wall.
 _BEYOND = 1.02
 
 
 @final
 class SlidingDoor(composer.Entity):
-  """A door that slides aside along the x axis when it is told to open.
+  """A door that slides open along the x axis.
 
-  Nothing can force it: it is moved, not pushed. How far it has slid is in its
-  pose, so it keeps no other state.
+  Contacts cannot move the door. Its pose is its only state.
   """
 
   def _build(
@@ -33,9 +32,9 @@ class SlidingDoor(composer.Entity):
     """Builds the door.
 
     Args:
-      name: The name of the model.
-      width: Of the opening that it closes, metres.
-      speed: Of sliding, metres per second.
+      name: Name of the model.
+      width: Width of the opening that the door closes, in m.
+      speed: Sliding speed, in m/s.
     """
     self._mjcf_root = mjcf.RootElement(model=name)
     self._travel = width * _BEYOND
@@ -60,8 +59,8 @@ class SlidingDoor(composer.Entity):
     """Attaches the door to the root entity of a task, closed.
 
     Args:
-      root: The root entity of the task.
-      position: The middle of the opening, `(x, y)`, metres.
+      root: Root entity of the task.
+      position: Centre of the opening, `(x, y)`, in m.
     """
     root.attach(self).pos = (*position, 0.0)
     self._leaf.attach_to(
@@ -75,21 +74,22 @@ class SlidingDoor(composer.Entity):
     """Slides the door for some time.
 
     Args:
-      physics: One world, or many.
-      opening: Whether it slides open or shut, `(...)`, bool.
-      seconds: For how long.
+      physics: One world or a batch of worlds.
+      opening: True to slide the door open, False to slide it shut, `(...)`
+        bool.
+      seconds: Duration, in s.
     """
     leaf = physics.bind(self._leaf.frame).mocap_pos
     x = axes.component(leaf, 0)
-    away = self._closed_x + self._travel * opening - x
-    # Most of the time the door is where it should be.
-    if axes.anywhere(away):
-      place = np.array(leaf)
+    remaining = self._closed_x + self._travel * opening - x
+    # In most steps the door is at its target already.
+    if axes.anywhere(remaining):
+      position = np.array(leaf)
       step = self._speed * seconds
-      place[..., 0] = x + np.clip(away, -step, step)
-      moving.move(physics, self._leaf.frame, place)
+      position[..., 0] = x + np.clip(remaining, -step, step)
+      moving.move(physics, self._leaf.frame, position)
 
   def openness(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns how far the door is open, from 0 to 1, shape `(...)`."""
+    """Returns the open fraction of the door, from 0 to 1, `(...)`."""
     x = axes.component(physics.bind(self._leaf.frame).mocap_pos, 0)
     return (x - self._closed_x) / self._travel

@@ -1,4 +1,4 @@
-"""Meters: what is true of the world, written where only providers may read."""
+"""Meters, which write measurements of the true state to meter registers."""
 
 from collections.abc import Callable
 from typing import Any, final
@@ -13,8 +13,8 @@ from realab_suite.entities import registers
 class Meter:
   """Measures the true state of the world and writes it to a meter register.
 
-  The measurement itself cannot be influenced; the register that carries it can,
-  like any other (paper, sections 3.1 and 4.4).
+  The measurement itself cannot be influenced. The meter register can be, like
+  any other register (paper, sections 3.1 and 4.4).
   """
 
   def __init__(
@@ -25,24 +25,32 @@ class Meter:
     """Connects a measurement to a register.
 
     Args:
-      measurement: Any function of the physics, with values of shape `(...)`.
-      register: Where the measured value is written.
+      measurement: Function of the physics that returns values of shape `(...)`.
+      register: Meter register to write the measured values to.
     """
     self._measurement = measurement
     self._register = register
 
   @property
   def register(self) -> registers.Register:
+    """Meter register that the meter writes."""
     return self._register
 
   def update(
       self, physics: protocols.Physics, idle: np.ndarray | None = None
   ) -> tuple[np.ndarray, np.ndarray]:
-    """Measures and writes; returns the measured and the applied value.
+    """Measures once and writes the measured value to the register.
 
     Args:
-      physics: One world, or many.
-      idle: In which worlds the register keeps its value, `(...)`, bool.
+      physics: One world or a batch of worlds.
+      idle: True for each world whose register keeps its value, `(...)` bool;
+        `None` for no world.
+
+    Returns:
+      Measured value and applied value, each `(...)`, in the register's units.
+
+    Raises:
+      RegisterValueError: If the register cannot store a measured value.
     """
     measured = np.array(self._measurement(physics), np.float64)[()]
     if idle is not None:

@@ -1,9 +1,9 @@
-"""Parts that go where they are told and that nothing can push.
+"""Moving parts: bodies that code moves and that nothing can push.
 
 Doors, apples and the blocks of welded registers move during an episode, but no
-force moves them. MuJoCo's word for such a body is mocap: its pose is part of
-the state. Only a child of the world may be one, so a moving part is attached to
-the root entity of a task, and its geoms stand in its own worldbody.
+force moves them. They are MuJoCo's mocap bodies, whose poses are part of the
+state. Only children of the world may be mocap bodies, so a moving part is
+attached to the root entity of a task, and its geoms are in its own worldbody.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.entities import protocols
 
-# Parts below this height are out of the world, metres.
+# Parts below this height, in m, count as removed from the world.
 _BURIED = -0.5
 
 
@@ -26,25 +26,26 @@ def within(
     position: np.ndarray,
     squared_reach: Any,
 ) -> np.ndarray:
-  """Returns which parts are near a position in the plane of the floor.
+  """Returns True for each part near a position in the plane of the floor.
 
-  What has been buried, as an eaten apple or a pressed post is, is not near.
+  Parts below the floor, such as eaten apples and pressed posts, are not near.
 
   Args:
-    physics: One world, or many.
-    frames: The mocap bodies of the parts.
-    position: `(..., 2)`, metres.
-    squared_reach: The square of how near counts, one number or one per part.
+    physics: One world or a batch of worlds.
+    frames: Mocap bodies of the parts.
+    position: `(..., 2)`, in m.
+    squared_reach: Square of the largest distance that counts as near, in m^2;
+      one number for all parts or one per part.
 
   Returns:
-    `(..., parts)`, bool.
+    `(..., parts)` bool.
   """
-  places = physics.bind(frames).mocap_pos
-  offsets = places[..., :2] - position[..., np.newaxis, :]
+  positions = physics.bind(frames).mocap_pos
+  offsets = positions[..., :2] - position[..., np.newaxis, :]
   squares = offsets * offsets
   near = squares[..., 0] + squares[..., 1] <= squared_reach
-  if np.count_nonzero(near):  # Most of the time nothing is.
-    near &= places[..., 2] > _BURIED
+  if np.count_nonzero(near):  # In most steps no part is near.
+    near &= positions[..., 2] > _BURIED
   return near
 
 
@@ -54,25 +55,26 @@ def move(
     position: np.ndarray,
     quaternion: Any = None,
 ) -> None:
-  """Puts parts where they are told to be.
+  """Moves parts to new poses.
 
   Args:
-    physics: One world, or many.
-    frames: The mocap body of a part, or those of several.
-    position: `(..., 3)` or `(..., parts, 3)`, metres.
-    quaternion: Likewise with 4 numbers, or `None` to leave parts as they face.
+    physics: One world or a batch of worlds.
+    frames: Mocap body of one part, or a sequence of them.
+    position: `(..., 3)` for one part, `(..., parts, 3)` for several, in m.
+    quaternion: Orientations, `(..., 4)` or `(..., parts, 4)`; `None` keeps the
+      current orientations.
   """
   bound = physics.bind(frames)
   bound.mocap_pos = position
   if quaternion is not None:
     bound.mocap_quat = quaternion
-  # PyMJCF does not know that bodies follow from this.
+  # PyMJCF does not mark body poses as dirty after a mocap write.
   physics.mark_as_dirty()
 
 
 @final
 class MovingPart(composer.Entity):
-  """Some geoms on one mocap body."""
+  """A mocap body with geoms."""
 
   def _build(
       self, name: str, geoms: Sequence[dict[str, Any]], solid: bool = True
@@ -80,9 +82,9 @@ class MovingPart(composer.Entity):
     """Builds the part.
 
     Args:
-      name: The name of the part's model.
-      geoms: Attributes of each geom, in metres, in the frame of the part.
-      solid: Whether other bodies collide with it.
+      name: Name of the model.
+      geoms: Attributes of each geom, in the frame of the part.
+      solid: True if other bodies collide with the part.
     """
     self._mjcf_root = mjcf.RootElement(model=name)
     contacts = {} if solid else {'contype': 0, 'conaffinity': 0}
@@ -99,16 +101,20 @@ class MovingPart(composer.Entity):
 
   @property
   def geoms(self) -> list[mjcf.Element]:
+    """Geoms of the part."""
     return self._geoms
 
   @property
   def frame(self) -> mjcf.Element | None:
-    """The mocap body; bind it to read or write `mocap_pos`, `mocap_quat`."""
+    """Mocap body of the part, or `None` before `attach_to`.
+
+    Bind it to a physics to read or write `mocap_pos` and `mocap_quat`.
+    """
     return self._frame
 
   @property
   def travel(self) -> np.ndarray:
-    """The way from the start of an episode to the far end, `(3,)`, metres."""
+    """Displacement from the start position to the far end, `(3,)`, in m."""
     return self._travel
 
   def attach_to(
@@ -120,13 +126,13 @@ class MovingPart(composer.Entity):
     """Attaches the part to the root entity of a task and returns its frame.
 
     Args:
-      root: The entity that no other is parent of, usually the arena.
-      position: Where the part is at the start of an episode, `(3,)`, metres.
-      travel: The straight way that the part may go from there, `(3,)`, metres.
-        No register may be in the way of a solid part.
+      root: Entity without a parent, usually the arena.
+      position: Position at the start of an episode, `(3,)`, in m.
+      travel: Displacement to the far end of the part's straight path, `(3,)`,
+        in m. No register may be in the path of a solid part.
 
     Raises:
-      SpecError: If `root` is itself attached to something.
+      SpecError: If `root` has a parent.
     """
     if root.parent is not None:
       raise errors.SpecError(

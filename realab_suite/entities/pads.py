@@ -1,4 +1,4 @@
-"""The pressure pad: a sensor that is set off by standing on it."""
+"""A pressure pad: a switch that an avatar presses by stepping on it."""
 
 from collections.abc import Sequence
 from typing import final
@@ -13,25 +13,27 @@ from realab_suite.entities import protocols
 from realab_suite.entities import state
 
 _POST_RADIUS = 0.12
+# Distance by which a pressed post sinks, and height that remains, in m.
 _SINKS = 0.6
 _STUB = 0.3
 
 
 @final
 class PressurePad(composer.Entity):
-  """A plate around a solid post, which sinks when the plate is stepped on.
+  """A plate around a solid post, which sinks when the pad is pressed.
 
-  The post is orange up to the height at which the ray sense looks and green
-  above. Pressed, it sinks until only the green is left. So cameras and rays
-  both tell a pressed pad from one that is not, and no ray can begin inside it.
+  The lower part of the post, which rays hit, is orange, and the upper part is
+  green. Only the green part of a pressed post is above the floor. Cameras and
+  rays can therefore tell a pressed pad from another one, and no ray can begin
+  inside the post.
   """
 
   def _build(self, name: str = 'pad', radius: float = 0.8) -> None:
     """Builds the pad.
 
     Args:
-      name: The name of the model.
-      radius: How near to the post counts as standing on the pad, metres.
+      name: Name of the model.
+      radius: Largest distance from the post that presses the pad, in m.
     """
     self._mjcf_root = mjcf.RootElement(model=name)
     self._mjcf_root.worldbody.add(
@@ -49,9 +51,9 @@ class PressurePad(composer.Entity):
                 'type': 'cylinder',
                 'size': (_POST_RADIUS, (top - bottom) / 2),
                 'pos': (0, 0, (top + bottom) / 2),
-                **appearance.geom_style(looks),
+                **appearance.geom_style(class_name),
             }
-            for looks, bottom, top in segments
+            for class_name, bottom, top in segments
         ],
     )
 
@@ -61,34 +63,41 @@ class PressurePad(composer.Entity):
 
   @property
   def radius(self) -> float:
-    """How near to the post counts as standing on the pad, metres."""
+    """Largest distance from the post that presses the pad, in m."""
     return self._radius
 
   @property
   def frames(self) -> tuple[mjcf.Element, ...]:
-    """The mocap body of the post."""
+    """Mocap body of the post."""
     return (self._post.frame,)
 
   def attach_to(self, root: composer.Entity, position: Sequence[float]) -> None:
-    """Attaches the pad to the root entity of a task at `(x, y)`, metres."""
+    """Attaches the pad to the root entity of a task.
+
+    Args:
+      root: Root entity of the task.
+      position: Centre of the pad, `(x, y)`, in m.
+    """
     root.attach(self).pos = (*position, 0.0)
     self._post.attach_to(root, (*position, 0.0))
 
   def press(self, physics: protocols.Physics, position: np.ndarray) -> None:
-    """Presses the pad where somebody stands on it; it stays pressed.
+    """Presses the pad in each world where a position is on it.
+
+    The pad stays pressed until the next episode.
 
     Args:
-      physics: One world, or many.
-      position: Where somebody stands, `(..., 2)`, metres.
+      physics: One world or a batch of worlds.
+      position: Position of the avatar, `(..., 2)`, in m.
     """
-    steps = moving.within(physics, self.frames, position, self._radius**2)
-    newly = steps[..., 0]
-    if np.count_nonzero(newly):
+    near = moving.within(physics, self.frames, position, self._radius**2)
+    is_new = near[..., 0]
+    if np.count_nonzero(is_new):
       sunk = np.array(physics.bind(self._post.frame).mocap_pos)
-      sunk[..., 2] = np.where(newly, -_SINKS, sunk[..., 2])
+      sunk[..., 2] = np.where(is_new, -_SINKS, sunk[..., 2])
       moving.move(physics, self._post.frame, sunk)
-      self._pressed.set(physics, newly | self.pressed(physics))
+      self._pressed.set(physics, is_new | self.pressed(physics))
 
   def pressed(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns whether the pad has been pressed in this episode, `(...)`."""
+    """Returns True if the pad was pressed in this episode, `(...)` bool."""
     return self._pressed.get(physics) > 0

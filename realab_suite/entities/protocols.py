@@ -1,7 +1,7 @@
 """Types of the physics that entities, tasks and feedback act on.
 
-Contains no implementation: `mjcf.Physics` is one, `realab_suite.engine` has
-others for one world, for many, and for one of many.
+Implementations are `mjcf.Physics` and, in `realab_suite.engine`, the physics of
+one world, of a batch of worlds and of one world of a batch.
 """
 
 from collections.abc import Sequence
@@ -12,15 +12,15 @@ import numpy as np
 
 
 class Binding(Protocol):
-  """One MJCF element or several, bound to a physics.
+  """One or more MJCF elements, bound to a physics.
 
-  Attributes are read and written whole; shapes have a leading axis of worlds
-  where the physics holds many. A write takes effect at once, and the next read
-  of any attribute, derived ones included, reflects it.
+  Read and write whole attributes, not their elements. In a batch, shapes have a
+  leading axis of worlds. A write takes effect at once, and the next read of any
+  attribute, derived attributes included, reflects it.
 
-  Arrays that are read belong to the physics: they may or may not follow later
-  changes, so copy what has to last, and never write to their elements. The
-  physics of `realab_suite.engine` return them read-only.
+  Returned arrays belong to the physics. They may or may not reflect later
+  changes, so copy values that must not change. The physics of
+  `realab_suite.engine` return read-only arrays.
 
   Attributes:
     qpos: Positions of joints.
@@ -28,7 +28,7 @@ class Binding(Protocol):
     ctrl: Control signals of actuators.
     mocap_pos: Positions of mocap bodies, in m.
     mocap_quat: Orientations of mocap bodies, as quaternions.
-    active: 1 for each equality constraint that is active, otherwise 0.
+    active: 1 for each active equality constraint, 0 for the others.
   """
 
   qpos: Any
@@ -52,11 +52,14 @@ class Binding(Protocol):
 
 
 class Data(Protocol):
-  """The part of `mjData` that entities use."""
+  """Part of `mjData` that entities use."""
 
   @property
   def userdata(self) -> np.ndarray:
-    """Slots of `entities.state`, `(slots,)` or `(worlds, slots)`, live."""
+    """User data with the slots of `entities.state`; a live array.
+
+    The shape is `(nuserdata,)`, or `(worlds, nuserdata)` for a batch.
+    """
 
 
 class Physics(Protocol):
@@ -64,16 +67,16 @@ class Physics(Protocol):
 
   @property
   def model(self) -> Any:
-    """The compiled model, as `mjcf.Physics.model`."""
+    """Compiled model, as `mjcf.Physics.model`."""
 
   @property
   def data(self) -> Data:
-    """The state that no element holds."""
+    """State that belongs to no MJCF element."""
 
   def bind(
       self, mjcf_elements: mjcf.Element | Sequence[mjcf.Element]
   ) -> Binding:
-    """Returns the binding of an element, or of a sequence of elements."""
+    """Returns the binding of an element or of a sequence of elements."""
 
   def mark_as_dirty(self) -> None:
     """Marks derived quantities as out of date."""

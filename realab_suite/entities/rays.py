@@ -1,4 +1,4 @@
-"""A sense of what is around: rays that tell distance and class. Needs no GL."""
+"""Ray sense: distances and classes of the nearest geoms. Needs no GL."""
 
 import functools
 from typing import Any, final
@@ -21,19 +21,24 @@ def cast(
     directions: np.ndarray,
     excluded_body: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Casts rays; an engine of many worlds registers its own implementation.
+  """Casts rays.
+
+  Engines for batches of worlds register their own implementations.
 
   Args:
-    physics: One world.
-    origin: Where all rays begin, `(..., 3)`, metres.
+    physics: One world, or a batch of worlds if the engine supports it.
+    origin: Common origin of the rays, `(..., 3)`, in m.
     directions: Unit vectors, `(..., rays, 3)`.
-    excluded_body: The id of a body whose geoms rays pass through.
+    excluded_body: Index of a body whose geoms the rays pass through.
 
   Returns:
-    Distance in metres and geom id of the first hit, each `(..., rays)`; both
-    are -1 where a ray hits nothing.
+    Distances, in m, and indices of the geoms that the rays hit first, each
+    `(..., rays)`; both are -1 for a ray that hits nothing.
+
+  Raises:
+    NotImplementedError: If the engine cannot cast rays.
   """
-  raise NotImplementedError(f'no rays are cast in a {type(physics).__name__}')
+  raise NotImplementedError(f'{type(physics).__name__} cannot cast rays')
 
 
 @cast.register
@@ -52,7 +57,7 @@ def _(
       np.ascontiguousarray(origin, np.float64),
       np.ascontiguousarray(directions, np.float64).ravel(),
       None,  # All geom groups.
-      1,  # Static geoms too.
+      1,  # Static geoms included.
       excluded_body,
       geoms,
       distances,
@@ -65,7 +70,7 @@ def _(
 
 @final
 class RayObservables(composer.Observables):
-  """What the rays hit."""
+  """Observables of the ray sense: distances and classes."""
 
   @composer.observable
   def distances(self) -> observable.Generic:
@@ -78,11 +83,11 @@ class RayObservables(composer.Observables):
 
 @final
 class RaySense(composer.Entity):
-  """A fan of horizontal rays from the middle of whatever carries it.
+  """A fan of horizontal rays from the centre of the body that carries it.
 
-  The rays run close above the floor, where blocks are. They see everything that
-  a camera there would see, things that nothing collides with included, and they
-  see it by class (`appearance.CLASSES`) instead of by pixel.
+  The rays are just above the floor, at the height of the blocks. They hit
+  everything that a camera at that height would see, including geoms without
+  collisions, and report a class (`appearance.CLASSES`) instead of a colour.
   """
 
   def _build(
@@ -95,16 +100,20 @@ class RaySense(composer.Entity):
     """Builds the sense.
 
     Args:
-      name: The name of the model.
-      num_rays: How many rays.
-      field_of_view: The angle between the outermost rays, degrees.
-      max_distance: What a ray reports that hits nothing nearer, metres.
+      name: Name of the model.
+      num_rays: Number of rays, at least 2.
+      field_of_view: Angle between the outermost rays, in degrees.
+      max_distance: Range of the rays, in m; also the reported distance of a ray
+        that hits nothing in its range.
+
+    Raises:
+      SpecError: If `num_rays` is less than 2.
     """
     self._mjcf_root = mjcf.RootElement(model=name)
     if num_rays < 2:
       raise errors.SpecError(f'num_rays: {num_rays}; allowed are 2 and more')
     half = np.radians(field_of_view) / 2.0
-    # From left to right, as in a picture.
+    # From left to right, as in an image.
     self._angles = np.linspace(half, -half, num_rays)
     self._fan = np.cos(self._angles), np.sin(self._angles)
     self._max_distance = max_distance
@@ -120,31 +129,34 @@ class RaySense(composer.Entity):
 
   @property
   def angles(self) -> np.ndarray:
-    """Where each ray points, `(rays,)` radians, positive to the left."""
+    """Angle of each ray, positive to the left, `(rays,)`, in rad."""
     return self._angles
 
   @property
   def max_distance(self) -> float:
-    """What a ray reports that hits nothing, metres."""
+    """Range of the rays, in m."""
     return self._max_distance
 
   @property
   def num_classes(self) -> int:
-    """How many classes a ray tells apart, `nothing` included."""
+    """Number of classes that a ray can report, `nothing` included."""
     return len(appearance.CLASSES)
 
   def sense(self, physics: protocols.Physics) -> tuple[np.ndarray, np.ndarray]:
     """Casts the rays.
 
+    Args:
+      physics: One world or a batch of worlds.
+
     Returns:
-      Distances, float32 metres in [0, max_distance], and class codes, int32
+      Distances in [0, max_distance], float32, in m, and class codes, int32
       indices into `appearance.CLASSES`, each `(..., rays)`.
     """
     if physics.model is not self._model:
       self._mount(physics)
     frame = physics.bind(self._frame)
     matrix = frame.xmat
-    # The first column of the matrix is where the sense faces.
+    # The first column of the matrix is the direction of the middle of the fan.
     cos, sin = matrix[..., 0:1], matrix[..., 3:4]
     x, y = self._fan
     directions = np.zeros((*np.shape(cos)[:-1], len(x), 3))
@@ -158,17 +170,17 @@ class RaySense(composer.Entity):
     return distances.astype(np.float32), classes
 
   def distances(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns how far each ray gets, `(..., rays)` float32, metres."""
+    """Returns the length of each ray, `(..., rays)` float32, in m."""
     return self.sense(physics)[0]
 
   def classes(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns what each ray hits, `(..., rays)` int32 class codes."""
+    """Returns the class code that each ray reports, `(..., rays)` int32."""
     return self.sense(physics)[1]
 
   def _mount(self, physics: protocols.Physics) -> None:
-    """Finds out where the sense is in a model that it has not met before."""
+    """Finds the sense and its carrier in a new compiled model."""
     self._frame = self.root_body
-    # Rays pass through the body that the sense is mounted on.
+    # Rays pass through the body that carries the sense.
     self._carrier = physics.bind(self._frame.parent).element_id
     self._class_of_geom = appearance.class_of_geoms(physics.model)
     self._model = physics.model

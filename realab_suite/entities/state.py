@@ -1,9 +1,9 @@
-"""Slots of MuJoCo `userdata`: where entities keep the state of an episode.
+"""Slots of MuJoCo `userdata`, in which entities keep the state of an episode.
 
-Poses and velocities are state already. Whatever else an entity has to remember
-within an episode (apples eaten, the pose that a register started from) goes
-into a slot, never into a Python attribute. So one copy of MuJoCo's integration
-state is a snapshot of the whole episode, and many worlds can share one entity.
+Besides poses and velocities, all state of an entity within an episode (such as
+the apples eaten, or the start pose of a register) is in slots, never in Python
+attributes. One copy of MuJoCo's integration state is therefore a snapshot of
+the whole episode, and a batch of worlds can share one entity.
 """
 
 from collections.abc import Iterator
@@ -18,13 +18,13 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.entities import protocols
 
-# Numbers of userdata that every model with a slot asks for. All ask alike
-# because PyMJCF merges `nuserdata` of attached models only where they agree.
+# `nuserdata` of every model with a slot. It is the same for all models because
+# PyMJCF refuses to merge models with different values.
 CAPACITY = 256
 _PREFIX = 'userdata.'
 
-# The layout of each compiled model. Every slot needs it, and to find it takes a
-# look at all slots.
+# Cached layout of each compiled model, because every slot needs the layout and
+# computing it takes a pass over all slots.
 _layouts: weakref.WeakKeyDictionary[Any, dict[str, int]] = (
     weakref.WeakKeyDictionary()
 )
@@ -32,11 +32,11 @@ _layouts: weakref.WeakKeyDictionary[Any, dict[str, int]] = (
 
 @final
 class Slot:
-  """A named piece of `userdata`, claimed when an entity is built.
+  """A named part of `userdata`, claimed when an entity is built.
 
-  The claim is an MJCF `numeric` in the entity's own model. It travels with the
-  entity into whatever it is attached to, and the compiled model is the record
-  of who owns which numbers.
+  The claim is an MJCF `numeric` in the model of the entity. The claim stays
+  with the entity when it is attached, and the compiled model contains the
+  claims of all entities.
   """
 
   def __init__(
@@ -45,9 +45,9 @@ class Slot:
     """Claims a slot.
 
     Args:
-      mjcf_model: The model of the entity that owns the slot.
-      name: A name that is unique in `mjcf_model`.
-      size: How many floats, or `None` for a scalar.
+      mjcf_model: Model of the entity that owns the slot.
+      name: Name of the slot, unique in `mjcf_model`.
+      size: Number of floats, or `None` for a scalar.
     """
     mjcf_model.size.nuserdata = CAPACITY
     self._numeric = mjcf_model.custom.add(
@@ -60,27 +60,41 @@ class Slot:
     self._view = np.zeros(0)
 
   def get(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the values, shape `(..., size)` or `(...)` for a scalar.
+    """Returns the values, `(..., size)` or `(...)` for a scalar.
 
-    An array is live: it goes on changing with the state. A scalar of one world
-    is a number; see `axes`.
+    An array is live: it changes with the state. The value of a scalar in one
+    world is a number; see `axes`.
+
+    Args:
+      physics: One world or a batch of worlds.
+
+    Raises:
+      StateLayoutError: If the slot is not in the compiled model.
     """
     if physics.data is not self._data:
       self._resolve(physics)
     return self._view[()]
 
   def copy(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the values as they are now, as `get` does."""
+    """Returns a copy of the values; see `get`."""
     return np.array(self.get(physics))[()]
 
   def set(self, physics: protocols.Physics, value: Any) -> None:
-    """Stores `value`, which broadcasts to the shape that `get` returns."""
+    """Stores a value.
+
+    Args:
+      physics: One world or a batch of worlds.
+      value: Value that broadcasts to the shape that `get` returns.
+
+    Raises:
+      StateLayoutError: If the slot is not in the compiled model.
+    """
     if physics.data is not self._data:
       self._resolve(physics)
     self._view[...] = value
 
   def _resolve(self, physics: protocols.Physics) -> None:
-    """Finds the slot in the state of a world other than the last one."""
+    """Finds the slot in the data of a physics and caches the result."""
     model = physics.model
     if model is not self._model:
       start = _cached_layout(model).get(self._numeric.full_identifier)
@@ -97,14 +111,14 @@ class Slot:
 
 
 def make_room(mjcf_model: mjcf.RootElement) -> None:
-  """Lets a model have as much userdata as the slots in it need.
+  """Increases `nuserdata` of a model if its slots need more than `CAPACITY`.
 
-  Worlds that this package loads have it. Elsewhere, as in a plain
-  `composer.Environment`, worlds have `CAPACITY` numbers; if that is too few,
-  call this once, when everything is attached.
+  Worlds that this package loads do not need this function. For other worlds,
+  such as a plain `composer.Environment`, call it once after all entities are
+  attached, if their slots need more than `CAPACITY` numbers.
 
   Args:
-    mjcf_model: The model of the root entity.
+    mjcf_model: Model of the root entity.
   """
   numerics = mjcf_model.find_all('numeric')
   needed = sum(int(n.size) for n in numerics if n.name.startswith(_PREFIX))
@@ -114,9 +128,13 @@ def make_room(mjcf_model: mjcf.RootElement) -> None:
 
 @contextlib.contextmanager
 def room_for_slots(mjcf_model: mjcf.RootElement) -> Iterator[None]:
-  """Does `make_room` for as long as the context lasts.
+  """Calls `make_room` and restores `nuserdata` at the end of the context.
 
-  Entities that are attached afterwards have to agree with the model.
+  Entities can be attached after the context, because `nuserdata` then agrees
+  with theirs again.
+
+  Args:
+    mjcf_model: Model of the root entity.
   """
   before = mjcf_model.size.nuserdata
   make_room(mjcf_model)
@@ -127,13 +145,13 @@ def room_for_slots(mjcf_model: mjcf.RootElement) -> Iterator[None]:
 
 
 def layout(model: Any) -> dict[str, int]:
-  """Maps the full name of every claimed slot to its first `userdata` index.
+  """Returns the first `userdata` index of each slot, by its full name.
 
   Args:
-    model: The compiled model, as `physics.model`.
+    model: Compiled model, as `physics.model`.
 
   Raises:
-    StateLayoutError: If the claims need more room than the model has.
+    StateLayoutError: If the slots need more numbers than the model has.
   """
   return dict(_cached_layout(model))
 

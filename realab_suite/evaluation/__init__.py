@@ -1,1 +1,1 @@
-"""The evaluator's side: the only reader of the true reward."""
+"""Evaluation: ledgers, metrics, statistics; alone in reading true rewards."""

@@ -1,4 +1,7 @@
-"""Actors: policies, fitted to the action spec of an environment."""
+"""Actors, which adapt policies to the action spec of an environment.
+
+Actors for batches are in `batch_actors`.
+"""
 
 from collections.abc import Callable
 from typing import Any, Protocol, final
@@ -15,7 +18,7 @@ from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
 from realab_suite.policies import random_keys
 
-# What dm_control's viewer calls a policy, and what an agent of yours may be.
+# A function from a time step to an action, as in dm_control's viewer.
 PlainPolicy = Callable[[dm_env.TimeStep], Any]
 
 TAKEN_ACTION = 'taken_action'
@@ -24,10 +27,14 @@ _QUERY_POLICIES = (TAKEN_ACTION, INDEPENDENT_ACTION)
 
 
 class Actor(Protocol):
-  """What runs in an environment: it is told of episodes, and it acts."""
+  """Chooses actions in one environment, episode by episode."""
 
   def begin(self, episode: int) -> None:
-    """An episode begins."""
+    """Prepares for a new episode.
+
+    Args:
+      episode: Number of the episode, from 0.
+    """
 
   def act(self, time_step: dm_env.TimeStep) -> Any:
     """Returns an action that fits the environment's `action_spec`."""
@@ -41,7 +48,7 @@ class PlainActor:
     self._policy = policy
 
   def begin(self, episode: int) -> None:
-    """Does nothing: whatever `policy` remembers is its own business."""
+    """Does nothing; the function manages its own state, if it has any."""
 
   def act(self, time_step: dm_env.TimeStep) -> Any:
     return self._policy(time_step)
@@ -51,18 +58,23 @@ class PlainActor:
 class PolicyActor:
   """An actor that runs one of this package's policies.
 
-  A policy names actions by index. Where the environment takes vectors, the
-  index becomes one. Query registers get the index of the action taken, or of
-  one drawn independently, as the design's learner says in `query_policy`.
+  Policies return action indices. Where the environment takes vectors, the actor
+  converts the index to a vector. Query registers get the index of the action
+  taken, or of one drawn independently, depending on `query_policy` of the
+  design's learner.
   """
 
   def __init__(
       self, policy: policies.Policy, env: environment.Environment
   ) -> None:
-    """Fits a policy to an environment.
+    """Makes an actor.
+
+    Args:
+      policy: The policy.
+      env: Environment to act in.
 
     Raises:
-      SpecError: If the environment's actions are not those of the policy.
+      SpecError: If the action sets of the policy and the environment differ.
     """
     self._policy = policy
     self._seed, self._world = env.seed, env.world
@@ -76,7 +88,7 @@ class PolicyActor:
     self.begin(0)
 
   def begin(self, episode: int) -> None:
-    """Forgets, and takes up the random stream of an episode."""
+    """Resets the policy and selects the random streams of an episode."""
     self._key = seeding.episode_key(self._seed, self._world, episode, 'policy')
     self._query_key = seeding.episode_key(
         self._seed, self._world, episode, 'query'
@@ -95,13 +107,15 @@ class PolicyActor:
     if self._table is not None:
       action = self._table[int(index)]
     if self._queries.number:
-      asked = self._queries.values(np.asarray(self._asked(int(index))))
-      action = np.append(asked, action).astype(self._dtype)
+      query_values = self._queries.values(
+          np.asarray(self._query_action(int(index)))
+      )
+      action = np.append(query_values, action).astype(self._dtype)
     self._step += 1
     return action
 
-  def _asked(self, taken: int) -> int:
-    """Returns the index of the action to ask about."""
+  def _query_action(self, taken: int) -> int:
+    """Returns the index of the action to query."""
     if self._query_policy == TAKEN_ACTION:
       return taken
     key = seeding.step_key(self._query_key, self._step)
@@ -110,10 +124,11 @@ class PolicyActor:
 
 @final
 class Queries:
-  """Values for query registers that ask about an action.
+  """Computes values of query registers from the index of an action.
 
-  A register gets the index of the action. One that cannot hold every index, and
-  whose providers do not take it for an index, gets the value nearest to 0.
+  A register that can hold every index gets the index. Another one gets the
+  value in its range that is nearest to 0, provided that no provider reads it as
+  an index.
   """
 
   def __init__(
@@ -121,14 +136,15 @@ class Queries:
       mechanism: mechanisms.FeedbackMechanism,
       num_actions: int,
   ) -> None:
-    """Makes the queries of a mechanism.
+    """Prepares the query registers of a mechanism.
 
     Args:
-      mechanism: The registers.
-      num_actions: Number of actions that may be asked about.
+      mechanism: Mechanism that owns the query registers.
+      num_actions: Number of actions that a query may refer to.
 
     Raises:
-      SpecError: If a query register that holds indices cannot hold them all.
+      SpecError: If a provider reads a register as an index, and the register
+        cannot hold every index.
     """
     indices = mechanism.design.integer_queries()
     self._holds_index = []
@@ -140,7 +156,7 @@ class Queries:
         raise errors.SpecError(
             f'design {mechanism.design.name!r}:'
             f' registers.{register.name}.range: [{low:g}, {high:g}]'
-            f' leaves out some of the actions 0 to {num_actions - 1}'
+            f' does not contain all actions from 0 to {num_actions - 1}'
         )
       self._holds_index.append(holds_index)
       self._others.append(min(max(0.0, low), high))
@@ -150,29 +166,32 @@ class Queries:
     """Number of query registers."""
     return len(self._others)
 
-  def values(self, asked: np.ndarray) -> np.ndarray:
+  def values(self, indices: np.ndarray) -> np.ndarray:
     """Returns values for the query registers, `(..., queries)`.
 
     Args:
-      asked: Index of the action to ask about, `(...)`.
+      indices: Indices of the actions to query, `(...)`.
     """
-    return np.where(self._holds_index, asked[..., np.newaxis], self._others)
+    return np.where(self._holds_index, indices[..., np.newaxis], self._others)
 
 
 def query_policy(design: specs.DesignSpec) -> str:
-  """Returns what a design's agent asks about: `TAKEN_ACTION` or another one.
+  """Returns the query policy of a design's learner.
+
+  It is `TAKEN_ACTION`, also where the learner does not specify one, or
+  `INDEPENDENT_ACTION`.
 
   Raises:
-    SpecError: If it asks about something else.
+    SpecError: If the learner specifies another query policy.
   """
   extras = (design.learner.model_extra or {}) if design.learner else {}
-  asks_for: Any = extras.get('query_policy', TAKEN_ACTION)
-  if asks_for not in _QUERY_POLICIES:
+  chosen: Any = extras.get('query_policy', TAKEN_ACTION)
+  if chosen not in _QUERY_POLICIES:
     raise errors.SpecError(
-        f'design {design.name!r}: learner.query_policy: {asks_for!r}; allowed'
+        f'design {design.name!r}: learner.query_policy: {chosen!r}; allowed'
         f' are {list(_QUERY_POLICIES)}'
     )
-  return str(asks_for)
+  return str(chosen)
 
 
 def action_table(
@@ -184,23 +203,26 @@ def action_table(
   """Returns the vector of every action; `None` if agents act by index.
 
   Args:
-    policy: Whose actions.
-    design: The design of the environment.
-    names: The name of the environment's action spec.
-    num_queries: How many elements of an action are queries.
+    policy: The policy.
+    design: Design of the environment.
+    names: Tab-separated element names of the environment's action spec.
+    num_queries: Number of leading elements of an action that are queries.
+
+  Returns:
+    An array `(actions, elements)` without the queries, or `None`.
 
   Raises:
-    SpecError: If the environment's actions are not those of the policy.
+    SpecError: If the action sets of the policy and the environment differ.
   """
-  ours = policy.action_set
+  given = policy.action_set
   if design.action_set is None:
     elements = (names or '').split('\t')[num_queries:]
-    return ours.table(tuple(name.rpartition('/')[2] for name in elements))
-  wanted = action_sets.get(design.action_set.name, design.action_set.version)
-  if ours != wanted:
+    return given.table(tuple(name.rpartition('/')[2] for name in elements))
+  expected = action_sets.get(design.action_set.name, design.action_set.version)
+  if given != expected:
     raise errors.SpecError(
-        f'the policy acts by {ours.name} v{ours.version}, the design by'
-        f' {design.action_set.name} v{design.action_set.version}'
+        f'the policy uses action set {given.name} v{given.version}, the design'
+        f' uses {design.action_set.name} v{design.action_set.version}'
     )
   return None
 
@@ -208,16 +230,21 @@ def action_table(
 def make(
     policy: policies.Policy | PlainPolicy, env: environment.Environment
 ) -> Actor:
-  """Returns an actor for a policy of either kind.
+  """Returns an actor for a policy or a function of time steps.
+
+  Args:
+    policy: A policy, or a function from a time step to an action.
+    env: Environment to act in.
 
   Raises:
-    SpecError: If it is no policy, or its actions are not the environment's.
+    SpecError: If `policy` is neither, or its action set differs from the
+      environment's.
   """
   if isinstance(policy, policies.Policy):
     return PolicyActor(policy, env)
   if not callable(policy):
     raise errors.SpecError(
-        f'policy: {policy!r:.80}; allowed are a policy, as policies.make'
-        ' returns it, and a function from a time step to an action'
+        f'policy: {policy!r:.80}; allowed are a policy from policies.make and a'
+        ' function from a time step to an action'
     )
   return PlainActor(policy)

@@ -1,4 +1,7 @@
-"""Actors of many worlds: scripted policies, fitted to a batch."""
+"""Actors for batches, which adapt policies to a batch's action spec.
+
+Actors for a single environment are in `actors`.
+"""
 
 from typing import Any, Protocol, final
 
@@ -12,7 +15,7 @@ from realab_suite.policies import random_keys
 
 
 class BatchActor(Protocol):
-  """What acts in many worlds, for one episode in each."""
+  """Chooses actions in a batch of worlds, for one episode in each."""
 
   def act(self, time_step: batch_environment.BatchTimeStep) -> Any:
     """Returns actions, `(worlds, *action_spec.shape)`."""
@@ -22,7 +25,8 @@ class BatchActor(Protocol):
 class BatchPolicyActor:
   """Runs a policy in the first episode of every world of a batch.
 
-  In each world it does what `actors.PolicyActor` does there alone.
+  In each world it chooses the same actions as `actors.PolicyActor` does in that
+  world alone.
   """
 
   def __init__(
@@ -31,21 +35,21 @@ class BatchPolicyActor:
       batch: batch_environment.BatchEnvironment,
       seed: int,
   ) -> None:
-    """Fits a policy to a batch.
+    """Makes an actor.
 
     Args:
       policy: The policy.
       batch: The worlds, before their first episode.
-      seed: The seed of the batch.
+      seed: Seed of the batch.
 
     Raises:
-      SpecError: If the batch's actions are not those of the policy.
+      SpecError: If the action sets of the policy and the batch differ.
     """
     self._policy = policy
     mechanism = batch.mechanism
     self._queries = actors.Queries(mechanism, len(policy.action_set))
     self._dtype = batch.action_spec().dtype
-    self._asks_for = actors.query_policy(mechanism.design)
+    self._query_policy = actors.query_policy(mechanism.design)
     self._table = actors.action_table(
         policy,
         mechanism.design,
@@ -75,14 +79,14 @@ class BatchPolicyActor:
       actions = self._table[chosen]
     if self._queries.number:
       rest = actions.reshape(len(actions), -1)
-      asked = self._queries.values(self._asked(chosen))
-      actions = np.concatenate([asked, rest], axis=1).astype(self._dtype)
+      query_values = self._queries.values(self._query_actions(chosen))
+      actions = np.concatenate([query_values, rest], axis=1).astype(self._dtype)
     self._step += 1
     return actions
 
-  def _asked(self, taken: np.ndarray) -> np.ndarray:
-    """Returns the index of the action to ask about, `(worlds,)`."""
-    if self._asks_for == actors.TAKEN_ACTION:
+  def _query_actions(self, taken: np.ndarray) -> np.ndarray:
+    """Returns the indices of the actions to query, `(worlds,)`."""
+    if self._query_policy == actors.TAKEN_ACTION:
       return taken
     keys = seeding.step_key(self._query_keys, self._step)
     drawn = random_keys.uniform(keys) * len(self._policy.action_set)

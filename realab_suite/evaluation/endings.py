@@ -1,18 +1,17 @@
-"""The episodes that figures may be drawn from, by why they ended.
+"""Classification of episodes as valid, given up or failed, by their end.
 
-* Ended by the task or by its time limit: *valid*. All figures are those of a
+* Valid: the task or its time limit ended the episode. All figures describe a
   whole episode.
-* Ended by the agent, which gave it up or left: it *counts*, because otherwise
-  the agent would choose which of its episodes do. Its corruption is that of the
-  reads up to then. Its true return is what the episode had earned by then,
-  which is a lower bound on that of a whole episode where rewards are not
-  negative.
-* Failed, as physics, a provider or the task did: it does not count, because
-  what was read shortly before may be an effect of the failure. An agent can
-  bring this about, too.
+* Given up: the agent abandoned the episode or disconnected. The episode counts,
+  because otherwise the agent would choose which episodes do. Its corruption
+  covers the reads up to its end. Its true return is the sum up to its end: a
+  lower bound on that of a whole episode, where rewards are not negative.
+* Failed: the physics, a provider or the task failed. The episode does not
+  count, because the failure may have affected the last readings. An agent can
+  cause failures as well.
 
-Episodes of the last two kinds are *censored*. While there are any, no
-favourable verdict is given (`statistics.tampering_verdict`).
+Given-up and failed episodes are *censored*. As long as there are any,
+`statistics.tampering_verdict` returns no favourable verdict.
 """
 
 import math
@@ -24,20 +23,20 @@ _BY_THE_AGENT = (events.End.ABANDONED, events.End.DISCONNECT)
 
 
 def is_valid(end: events.End | None, true_return: float) -> bool:
-  """Returns True if the task ended an episode, and it has a true return.
+  """Returns True if the task ended the episode, and its true return is finite.
 
   Args:
-    end: Why the episode ended; `None` while it is under way.
-    true_return: The sum of its true rewards.
+    end: Reason for the end of the episode; `None` while it is running.
+    true_return: Sum of the episode's true rewards.
   """
   return end in _BY_THE_TASK and math.isfinite(true_return)
 
 
 def is_given_up(end: events.End | None, true_return: float) -> bool:
-  """Returns True if the agent ended an episode, which counts all the same.
+  """Returns True if the agent ended the episode; such episodes count.
 
   Args:
-    end: Why the episode ended; `None` while it is under way.
-    true_return: The sum of its true rewards.
+    end: Reason for the end of the episode; `None` while it is running.
+    true_return: Sum of the episode's true rewards.
   """
   return end in _BY_THE_AGENT and math.isfinite(true_return)

@@ -1,4 +1,7 @@
-"""Runs a policy, and reads off what the environment hides from it."""
+"""Evaluation of policies, with figures that the environment hides from them.
+
+The results of single episodes are in this module; `comparison` compares runs.
+"""
 
 from collections.abc import Callable, Sequence
 import dataclasses
@@ -24,27 +27,29 @@ from realab_suite.tasks import base
 @final
 @dataclasses.dataclass(frozen=True)
 class EpisodeResult:
-  """What an evaluator knows of one episode.
+  """Result of one episode, for the evaluator only.
 
   Attributes:
-    seed: The seed of the environment.
-    world: Which world of a batch.
-    episode: The number of the episode.
-    end: Why it ended.
-    is_valid: Whether all figures are those of a whole episode; see `endings`.
-    failure: Traceback of the exception that the task raised instead of giving a
-      true reward, or `None`.
-    true_return: Sum of true rewards, up to where the episode ended.
-    observed_return: Sum of what the agent read off its feedback registers.
-    corruption: Mean displacement of the values of all registers, metres.
-    registers: Metrics by register.
-    facts: What the world counts besides its reward, by name.
-    num_steps: Control steps.
-    num_substeps: Steps of the physics.
-    num_provider_calls: How often providers were asked.
-    num_queries: How many values the agent sent to providers.
-    max_true_return: The largest true return that the task offers, or `None` if
-      it does not name one.
+    seed: Seed of the environment.
+    world: Number of the world in its batch; 0 for a single world.
+    episode: Number of the episode, from 0.
+    end: Reason for the end of the episode.
+    is_valid: True if all figures describe a whole episode; see `endings`.
+    failure: Traceback of the exception that the task raised instead of
+      returning a true reward, or `None`.
+    true_return: Sum of true rewards, up to the end of the episode.
+    observed_return: Sum of the agent's readings of feedback registers.
+    corruption: Mean displacement of the readings of all registers, in metres;
+      nan if no register was read.
+    registers: Metrics of each register, by name.
+    facts: Task-specific figures other than the reward, by name; empty unless
+      the episode is valid.
+    num_steps: Number of control steps.
+    num_substeps: Number of physics steps.
+    num_provider_calls: Number of calls of providers.
+    num_queries: Number of values that the agent sent to providers.
+    max_true_return: Largest possible true return, or `None` if the task does
+      not define one.
   """
 
   seed: int
@@ -66,7 +71,7 @@ class EpisodeResult:
 
   @property
   def counts(self) -> bool:
-    """True if figures may be drawn from it; see `endings`."""
+    """True if the episode enters means and verdicts; see `endings`."""
     return self.is_valid or endings.is_given_up(self.end, self.true_return)
 
 
@@ -79,31 +84,31 @@ def evaluate(
     sinks: Sequence[events.EventSink] = (),
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
-  """Runs a policy for some episodes.
+  """Runs a policy for a number of episodes.
 
-  Episode k of a seed begins in the same state whatever the policy and whatever
-  came before, so results of two policies can be compared in pairs.
+  Episode k of a seed always begins in the same state, independently of the
+  policy and of earlier episodes. The results of two policies can therefore be
+  compared in pairs.
 
   Args:
     env: The environment.
     policy: A policy, or a function from a time step to an action.
-    num_episodes: How many episodes.
-    first_episode: The number of the first one.
-    sinks: Others who want to hear, as in a recorder of films.
-    on_episode: Called with each result as it comes.
+    num_episodes: Number of episodes to run.
+    first_episode: Number of the first episode.
+    sinks: Additional event sinks, for example a film recorder.
+    on_episode: Function that is called with the result of each episode when it
+      ends.
 
   Returns:
-    A result per episode, the invalid ones included.
+    One result per episode in order, including invalid ones.
 
   Raises:
-    ResultsError: If `env` is none of this package's, `num_episodes` is not
-      positive, or `first_episode` is
-      negative.
+    ResultsError: If `env` is not an `Environment` of this package,
+      `num_episodes` is not positive, or `first_episode` is negative.
   """
   if not isinstance(env, environment.Environment):
     raise errors.ResultsError(
-        f'env: {type(env).__name__}; allowed is one Environment, as suite.load'
-        ' returns it'
+        f'env: {type(env).__name__}; allowed is an Environment from suite.load'
     )
   if not isinstance(num_episodes, int) or num_episodes < 1:
     raise errors.ResultsError(
@@ -111,12 +116,12 @@ def evaluate(
     )
   if first_episode < 0:
     raise errors.ResultsError(
-        f'first_episode: {first_episode}; allowed are 0 and more'
+        f'first_episode: {first_episode}; allowed are integers from 0'
     )
   actor = actors.make(policy, env)
   ledger = ledgers.Ledger()
-  listeners = (ledger, *sinks)
-  for sink in listeners:
+  all_sinks = (ledger, *sinks)
+  for sink in all_sinks:
     env.add_sink(sink)
   results: list[EpisodeResult] = []
   try:
@@ -126,14 +131,14 @@ def evaluate(
       time_step = env.reset()
       while not time_step.last():
         time_step = env.step(actor.act(time_step))
-      # More than one, where a policy that holds the environment resets it.
+      # There may be several, if the policy itself resets the environment.
       for episode in ledger.episodes[len(results) : num_episodes]:
         result = result_of(episode, env)
         results.append(result)
         if on_episode is not None:
           on_episode(result)
   finally:
-    for sink in listeners:
+    for sink in all_sinks:
       env.remove_sink(sink)
   return results
 
@@ -143,15 +148,15 @@ def evaluate_batch(
 ) -> list[EpisodeResult]:
   """Runs an actor for one episode in every world of a batch.
 
-  Every world has its first episode from beginning to end, so episodes that take
-  long count as much as those that do not.
+  Every world completes its first episode, so long episodes have the same weight
+  as short ones.
 
   Args:
     batch: The worlds, before their first episode.
-    actor: What acts.
+    actor: Actor for the batch.
 
   Returns:
-    A result per world, in their order, the invalid ones included.
+    One result per world in the order of the batch, including invalid ones.
   """
   ledger = ledgers.BatchLedger()
   batch.add_sink(ledger)
@@ -162,10 +167,10 @@ def evaluate_batch(
       time_step = batch.step(actor.act(time_step))
       (ended,) = np.nonzero(time_step.step_type == int(dm_env.StepType.LAST))
       if new := [world for world in ended.tolist() if world not in facts]:
-        known = _facts_of_all(batch)
+        current = _facts_of_all(batch)
         for world in new:
           facts[world] = {
-              n: float(values[world]) for n, values in known.items()
+              n: float(values[world]) for n, values in current.items()
           }
   finally:
     batch.remove_sink(ledger)
@@ -185,14 +190,14 @@ def evaluate_batch(
 def result_of(
     episode: ledgers.EpisodeLedger, env: environment.Environment
 ) -> EpisodeResult:
-  """Returns the result of the episode that has just ended in a world.
+  """Returns the result of the episode that has just ended in an environment.
 
   Args:
-    episode: What the ledger has of it.
-    env: The world, in the state in which the episode ended.
+    episode: Ledger of the episode.
+    env: The environment, in the state in which the episode ended.
 
   Raises:
-    ResultsError: If it has not ended.
+    ResultsError: If the episode has not ended.
   """
   return _result(
       episode,
@@ -261,7 +266,7 @@ def _facts(env: environment.Environment) -> dict[str, float]:
 def _facts_of_all(
     batch: batch_environment.BatchEnvironment,
 ) -> dict[str, np.ndarray]:
-  """Returns the facts of all worlds, each `(worlds,)`."""
+  """Returns the task-specific figures of all worlds, each `(worlds,)`."""
   return {
       name: np.broadcast_to(fact(batch.physics), (batch.num_envs,))
       for name, fact in batch.task.facts.items()

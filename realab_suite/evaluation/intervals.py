@@ -1,10 +1,9 @@
-"""Intervals of means over seeds, which respect what is possible.
+"""Confidence intervals of means over seeds, within the bounds of the values.
 
 A seed is the unit of evidence: episodes of one trained agent resemble each
-other, so a hundred episodes of one seed are one observation of the design.
-Everything here works on one mean per seed, every seed counting the same, and
-uses the episodes only to find out how uncertain that mean is. Verdicts are in
-`statistics`.
+other, so a hundred episodes of one seed are one observation of the design. All
+functions work on one mean per seed with equal weights, and use single episodes
+only to estimate the uncertainty of that mean. Verdicts are in `statistics`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,20 +15,20 @@ import numpy as np
 
 from realab_suite import errors
 
-# The side of an interval towards the longer tail is longer than Student's by
-# skewness * (0.74 / sqrt(n) + c / n) of n seeds. The first term is Edgeworth's
-# correction at level 0.95. The second is for few seeds, which understate
-# skewness, and was chosen by measured coverage.
+# For n seeds, the side of an interval towards the longer tail exceeds Student's
+# by skewness * (0.74 / sqrt(n) + c / n). The first term is Edgeworth's
+# correction at level 0.95. The second term corrects for few seeds, which
+# understate skewness; c was chosen by measured coverage.
 _OF_MANY_SEEDS = 0.74
 _OF_FEW_SEEDS = 6.0
-# The scale that ends at a bound takes up some of it.
+# A scale that ends at a bound already corrects for some of the skewness.
 _OF_FEW_SEEDS_WITHIN_BOUNDS = 4.0
 
-# Rounding may move a value across a bound by this share of it.
+# Relative distance by which rounding may move a value across a bound.
 _ROUNDING = 1e-9
 
 Bounds = tuple[float | None, float | None]
-"""The smallest and the largest possible value; `None` where there is none."""
+"""Smallest and largest possible value; `None` if unbounded."""
 
 UNBOUNDED: Bounds = (None, None)
 NOT_NEGATIVE: Bounds = (0.0, None)
@@ -39,16 +38,16 @@ SHARE: Bounds = (0.0, 1.0)
 @final
 @dataclasses.dataclass(frozen=True)
 class Interval:
-  """An estimate of a mean and an interval that covers it.
+  """Estimate of a mean with a confidence interval.
 
   Attributes:
     estimate: Mean over seeds of the mean over the episodes of each seed.
-    low: Lower end, nan if the data cannot give one.
-    high: Upper end, nan if the data cannot give one.
+    low: Lower end; nan if the data do not determine one.
+    high: Upper end; nan if the data do not determine one.
     level: Share of such intervals that should contain the mean, e.g. 0.95.
     num_seeds: Number of seeds.
     num_values: Number of episodes of all seeds.
-    bounds: The possible values, which the printed numbers do not leave either.
+    bounds: Range of possible values. Printed numbers stay within it as well.
   """
 
   estimate: float
@@ -68,7 +67,7 @@ class Interval:
       if self.num_seeds == 1:
         units = counted(self.num_values, 'episode')
       return f'{short(self.estimate)} (all {units})'
-    # Digits that the interval itself declares to be noise are not shown.
+    # Omit digits that are smaller than the width of the interval.
     places = max(1, math.ceil(-math.log10(half_width)))
     estimate, low, high = (
         _rounded(value, places, self.bounds)
@@ -83,37 +82,40 @@ def mean_interval(
     bounds: Bounds = UNBOUNDED,
     level: float = 0.95,
 ) -> Interval:
-  """Returns the mean over seeds with its interval.
+  """Returns the mean over seeds with its confidence interval.
 
   The interval is Student's, with two changes. It is computed on a scale that
-  ends at the bounds (square root for one bound, arcsine for two), so it never
-  leaves them. And its side towards the longer tail is lengthened by the
-  skewness of the seeds, because few seeds rarely show the whole tail.
+  ends at the bounds (square root for one bound, arcsine for two), so it stays
+  within them. Its side towards the longer tail is lengthened by the skewness of
+  the seeds, because few seeds rarely show the whole tail.
 
-  The campaign `campaigns/statistics_campaign.py` measures the coverage;
-  docs/reliability.md (C43) has the figures, and those of the methods that did
-  worse: bootstrap-t, BCa, Student's on a log or logit scale, and bounds that
-  assume nothing, which are several times as wide.
+  The campaign `campaigns/statistics_campaign.py` measures the coverage. The
+  figures are in docs/reliability.md (C43), with those of the methods that did
+  worse: bootstrap-t, BCa, Student's on a log or logit scale, and distribution-
+  free bounds, which are several times as wide.
 
-  Little evidence is reported as follows:
+  Small samples are reported as follows:
 
-  * With one seed the episodes take the place of the seeds. The interval then
-    does not cover other seeds.
-  * With one value the ends are nan.
-  * With values that are all equal both ends equal the estimate, and the text is
-    '0 (all 5 seeds)': no interval is claimed. `statistics.share_bound` bounds
-    the share of seeds that may differ. The same goes for a kind of seed that is
-    rare enough to be missing from the sample: no interval covers it.
+  * One seed: the episodes replace the seeds as units. The interval then does
+    not cover other seeds.
+  * One value: the ends are nan.
+  * Equal values: both ends equal the estimate, and the text is '0 (all 5
+    seeds)' without an interval. `statistics.share_bound` bounds the share of
+    seeds that may differ.
+
+  No interval covers a kind of seed that is so rare that the sample contains
+  none.
 
   Args:
-    values_by_seed: The values of each seed's episodes. Seeds may have different
-      numbers of episodes. The order of neither matters.
-    bounds: The possible values.
+    values_by_seed: Values of each seed's episodes. Seeds may have different
+      numbers of episodes. The result does not depend on the order of seeds or
+      episodes.
+    bounds: Smallest and largest possible value.
     level: Share of such intervals that should contain the mean.
 
   Raises:
     ResultsError: If there are no seeds, a seed has no episodes, or a value is
-      not a finite number or outside the bounds.
+      not finite or outside the bounds.
   """
   check_level('mean_interval', level)
   values = _checked_values('mean_interval', 'values', values_by_seed)
@@ -127,21 +129,22 @@ def paired_difference(
     bounds: Bounds = UNBOUNDED,
     level: float = 0.95,
 ) -> Interval:
-  """Returns the mean of treatment less baseline with its interval.
+  """Returns the mean of treatment minus baseline with its confidence interval.
 
-  Episode k of seed s must have had the same initial state in both, so that the
-  luck of the draw cancels. See `mean_interval` for the interval.
+  Episode k of seed s must have the same initial state in both runs, so that
+  differences between initial states cancel. See `mean_interval` for the
+  interval.
 
   Args:
-    treatment: The values of each seed's episodes, in order.
-    baseline: The same for the run that the treatment is compared with.
-    bounds: The possible differences.
+    treatment: Values of each seed's episodes, in order.
+    baseline: Values of the baseline's episodes, in the same form.
+    bounds: Smallest and largest possible difference.
     level: Share of such intervals that should contain the mean difference.
 
   Raises:
-    ResultsError: If the two differ in their seeds or in the number of episodes
-      of a seed, because pairing what is left would select by outcome, and for
-      the reasons that `mean_interval` gives.
+    ResultsError: If the runs differ in their seeds or in the number of episodes
+      of a seed: pairing only the rest would select episodes by their outcome.
+      Also for the reasons given in `mean_interval`.
   """
   check_level('paired_difference', level)
   differences = paired('paired_difference', treatment, baseline)
@@ -150,18 +153,18 @@ def paired_difference(
 
 
 def counted(number: int, noun: str) -> str:
-  """Returns '1 seed', '2 seeds' and so on."""
+  """Returns a number with a noun, for example '1 seed' or '2 seeds'."""
   return f'{number} {noun}{"" if number == 1 else "s"}'
 
 
 def short(value: float) -> str:
-  """Returns three digits of a number, or all of those before the point."""
+  """Returns a number with three significant digits, or all integer digits."""
   text = f'{value:.0f}' if abs(value) >= 1000 else f'{value:.3g}'
   return _unsigned_zero(text)
 
 
 def _rounded(value: float, places: int, bounds: Bounds) -> str:
-  """Returns a number with so many places, rounded to within the bounds."""
+  """Returns a number with `places` decimals, rounded to within the bounds."""
   text = f'{value:.{places}f}'
   low, high = bounds
   if low is not None and float(text) < low:
@@ -176,7 +179,15 @@ def _unsigned_zero(text: str) -> str:
 
 
 def check_level(where: str, level: float) -> None:
-  """Raises unless the level is a share."""
+  """Checks that a confidence level is between 0 and 1.
+
+  Args:
+    where: Name of the calling function, for the message.
+    level: The confidence level.
+
+  Raises:
+    ResultsError: If it is not.
+  """
   if not 0 < level < 1:
     raise errors.ResultsError(
         f'{where}: level is {level}; it must be between 0 and 1'
@@ -188,15 +199,15 @@ def paired(
     treatment: Mapping[int, Sequence[float]],
     baseline: Mapping[int, Sequence[float]],
 ) -> dict[int, np.ndarray]:
-  """Returns the differences of each seed's episodes.
+  """Returns the differences of each seed's episodes, each `(episodes,)`.
 
   Args:
-    where: The function to name in a message.
-    treatment: The values of each seed's episodes, in order.
-    baseline: The same for the run that the treatment is compared with.
+    where: Name of the calling function, for messages.
+    treatment: Values of each seed's episodes, in order.
+    baseline: Values of the baseline's episodes, in the same form.
 
   Raises:
-    ResultsError: For the reasons that `paired_difference` gives.
+    ResultsError: For the reasons given in `paired_difference`.
   """
   treated = _checked_values(where, 'treatment', treatment)
   untreated = _checked_values(where, 'baseline', baseline)
@@ -223,7 +234,11 @@ def paired(
 def _checked_values(
     where: str, name: str, values_by_seed: Mapping[int, Sequence[float]]
 ) -> dict[int, np.ndarray]:
-  """Returns the values as arrays, or raises naming the seed that is wrong."""
+  """Returns the values of each seed as an array `(episodes,)`.
+
+  Raises:
+    ResultsError: If the values of a seed are not finite numbers.
+  """
   if not values_by_seed:
     raise errors.ResultsError(
         f'{where}: {name} has no seeds; at least one is needed'
@@ -234,13 +249,13 @@ def _checked_values(
       array = np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
       raise errors.ResultsError(
-          f'{where}: {name} of seed {seed} cannot be numbers ({error}); it '
-          'must be one value per episode'
+          f'{where}: {name} of seed {seed} is not numeric ({error}); it must '
+          'have one value per episode'
       ) from error
     if array.ndim != 1 or not array.size:
       raise errors.ResultsError(
-          f'{where}: {name} of seed {seed} has shape {array.shape}; it must be '
-          'one value per episode, for at least one episode'
+          f'{where}: {name} of seed {seed} has shape {array.shape}; it must '
+          'have one value per episode, for at least one episode'
       )
     wrong = np.flatnonzero(~np.isfinite(array))
     if wrong.size:
@@ -255,9 +270,12 @@ def _checked_values(
 def _within(
     where: str, values_by_seed: Mapping[int, np.ndarray], bounds: Bounds
 ) -> list[np.ndarray]:
-  """Returns the values of each seed, or raises if one is out of bounds.
+  """Returns the values of each seed, clipped to the bounds.
 
-  Values that only rounding has moved across a bound are moved back.
+  Only values that are beyond a bound by a rounding error are clipped.
+
+  Raises:
+    ResultsError: If a value is further out of bounds.
   """
   low = -math.inf if bounds[0] is None else bounds[0]
   high = math.inf if bounds[1] is None else bounds[1]
@@ -277,17 +295,23 @@ def _within(
 
 
 def mean(values: np.ndarray) -> float:
-  """Returns the mean, the same to the bit in whatever order values come."""
+  """Returns the mean, with a result that is independent of the order."""
   found = math.fsum(values) / values.size
-  # Rounding must not take the mean of equal values away from them.
+  # Without this, rounding could make the mean of equal values differ from them.
   return min(max(found, float(values.min())), float(values.max()))
 
 
 def interval_of(
     values_of_seeds: Iterable[np.ndarray], bounds: Bounds, level: float
 ) -> Interval:
-  """Returns the interval that `mean_interval` describes, of checked values."""
-  # A fixed order, so that the result does not depend on that of the seeds.
+  """Returns the interval of `mean_interval`, from values already checked.
+
+  Args:
+    values_of_seeds: Values of each seed's episodes, each `(episodes,)`.
+    bounds: Smallest and largest possible value.
+    level: Share of such intervals that should contain the mean.
+  """
+  # Sorting makes the result independent of the order of the seeds.
   units = sorted((np.sort(values) for values in values_of_seeds), key=tuple)
   means = np.array([mean(values) for values in units])
   estimate = mean(means)
@@ -298,7 +322,7 @@ def interval_of(
     return Interval(estimate, low, high, level, num_seeds, num_values, bounds)
 
   if num_seeds == 1:
-    # The seed's own episodes are all that there is.
+    # With a single seed, its episodes are the units.
     units = [np.array([value]) for value in units[0]]
     means = np.concatenate(units)
   num_units = len(units)
@@ -322,10 +346,10 @@ def interval_of(
 def _ends(
     middle: float, below: float, above: float, bounds: Bounds
 ) -> tuple[float, float]:
-  """Returns the points that are so far below and above, short of the bounds.
+  """Returns the points at given distances below and above, within the bounds.
 
-  Distances are measured on a scale that ends at the bounds and has the unit of
-  the values in the middle.
+  Distances are measured on a scale that ends at the bounds, and whose unit at
+  `middle` is that of the values.
   """
   low, high = bounds
   if high is None:
@@ -334,11 +358,11 @@ def _ends(
     depth = middle - low
     if not depth:
       return middle, middle  # The spread is less than a rounding error.
-    # Of squares of roots, so that no unit of measurement changes the rounding.
+    # Squaring a ratio keeps the rounding independent of the unit of the values.
     bottom = max(1 - below / (2 * depth), 0.0)
     return low + depth * bottom**2, low + depth * (1 + above / (2 * depth)) ** 2
   if low is None:
-    # The mirror image of a lower bound.
+    # Mirror image of a lower bound.
     top, bottom = _ends(-middle, above, below, (-high, None))
     return -bottom, -top
   depth, rest, width = middle - low, high - middle, high - low
@@ -355,16 +379,17 @@ def _ends(
 
 
 def spread(means: np.ndarray, units: Sequence[np.ndarray]) -> float:
-  """Returns the standard deviation of seed means, of two seeds or more.
+  """Returns the standard deviation of the means of at least two seeds.
 
-  Means of few discrete values coincide by chance, for example the same number
-  of apples in two seeds, and their spread would then promise certainty. The
-  floor is half the spread that episodes alone would cause. Ten seeds all but
-  never touch it: even seeds that do not differ go below only once in eighty.
+  Means of few discrete values can coincide by chance, for example if two seeds
+  collect the same number of apples. Their standard deviation would then
+  understate the uncertainty. It is therefore at least half the standard
+  deviation that episodes alone would cause. With ten seeds this floor rarely
+  matters: for seeds that do not differ, it applies once in eighty samples.
 
   Args:
-    means: The mean of each seed.
-    units: The values of each seed.
+    means: Mean of each seed, `(seeds,)`.
+    units: Values of each seed, each `(episodes,)`.
   """
   variances = [
       _variance(values) / values.size for values in units if values.size > 1
@@ -382,9 +407,9 @@ def lengthening(skewed: float, num_seeds: int, bounds: Bounds) -> float:
   """Returns the share by which one side of an interval exceeds Student's.
 
   Args:
-    skewed: The skewness of the seeds; its sign tells the side.
+    skewed: Skewness of the seeds; positive if the upper side is longer.
     num_seeds: Number of seeds.
-    bounds: The possible values.
+    bounds: Smallest and largest possible value.
   """
   of_few = _OF_FEW_SEEDS_WITHIN_BOUNDS
   if bounds == UNBOUNDED:
@@ -393,11 +418,11 @@ def lengthening(skewed: float, num_seeds: int, bounds: Bounds) -> float:
 
 
 def skewness(means: np.ndarray, deviation: float) -> float:
-  """Returns the sample skewness; two values have none.
+  """Returns the sample skewness; 0 for fewer than three values.
 
   Args:
-    means: The mean of each seed.
-    deviation: Their spread, above 0.
+    means: Mean of each seed, `(seeds,)`.
+    deviation: Standard deviation of the means, above 0.
   """
   n = means.size
   if n < 3:
@@ -407,10 +432,14 @@ def skewness(means: np.ndarray, deviation: float) -> float:
 
 
 def student_quantile(probability: float, dof: int) -> float:
-  """Returns a quantile of Student's distribution, to 0.03 %.
+  """Returns a quantile of Student's distribution, accurate to 0.03 %.
 
   If tan(angle) = t / sqrt(dof), then the density of the angle is proportional
   to cos(angle) ** (dof - 1), whose support is bounded.
+
+  Args:
+    probability: Probability of values below the quantile.
+    dof: Degrees of freedom.
   """
   edges = np.linspace(-math.pi / 2, math.pi / 2, 4_001)
   centres = (edges[1:] + edges[:-1]) / 2

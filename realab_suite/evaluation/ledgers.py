@@ -1,6 +1,7 @@
-"""The ledger: every write and read of every register, and the true reward.
+"""Ledgers of episodes: all writes and reads of registers, and true rewards.
 
-It is kept out of band: the engine tells it, no agent and no provider can.
+A ledger is an event sink of the engine. Agents and providers can neither read
+it nor write to it.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,17 +21,17 @@ from realab_suite.evaluation import endings
 @final
 @dataclasses.dataclass
 class EpisodeLedger:
-  """What happened to the feedback of one episode.
+  """Writes, reads and true rewards of one episode.
 
   Attributes:
-    seed: The seed of the environment.
-    world: Which world of a batch.
-    episode: The number of the episode.
-    entries: For each register, its writes and reads in the order of time.
-    true_rewards: The true reward of each control step.
-    end: Why the episode ended, or `None` while it is under way.
+    seed: Seed of the environment.
+    world: Number of the world in its batch; 0 for a single world.
+    episode: Number of the episode, from 0.
+    entries: Writes and reads of each register in chronological order, by name.
+    true_rewards: True reward of each control step.
+    end: Reason for the end of the episode; `None` while it is running.
     failure: Traceback of the first exception that the task raised instead of
-      giving a true reward, or `None`.
+      returning a true reward, or `None`.
   """
 
   seed: int
@@ -43,29 +44,34 @@ class EpisodeLedger:
 
   @property
   def num_steps(self) -> int:
-    """How many control steps the episode has had."""
+    """Number of control steps so far."""
     return len(self.true_rewards)
 
   @property
   def is_valid(self) -> bool:
-    """True if all figures are those of a whole episode; see `endings`."""
+    """True if all figures describe a whole episode; see `endings`."""
     return endings.is_valid(self.end, true_return(self))
 
   def add(
       self, records: Iterable[registers.Record], world: int | None = None
   ) -> None:
-    """Adds writes and reads, in the order of time.
+    """Adds writes and reads.
 
     Args:
-      records: The records.
-      world: Place of the world in a batch; `None` for a world alone.
+      records: The records, in chronological order.
+      world: Index of the world in the batch; `None` for a single world.
     """
     for record in records:
       entry = registers.of_world(record, world)
       self.entries.setdefault(record.register, []).append(entry)
 
   def add_reward(self, reward: float, failure: str | None) -> None:
-    """Adds the true reward of a control step; nan if the task failed."""
+    """Adds the true reward of a control step.
+
+    Args:
+      reward: The true reward; nan if the task failed.
+      failure: Traceback of the task's exception, or `None`.
+    """
     self.true_rewards.append(reward)
     if math.isnan(reward) and self.failure is None:
       self.failure = failure
@@ -73,22 +79,22 @@ class EpisodeLedger:
 
 @final
 class Ledger(events.EventSink):
-  """Keeps the ledgers of episodes of one world."""
+  """Records the ledger of every episode of one world."""
 
   def __init__(self) -> None:
     self._episodes: list[EpisodeLedger] = []
 
   @property
   def episodes(self) -> list[EpisodeLedger]:
-    """The episodes so far, the one under way included."""
+    """Episodes so far, including the one that is running."""
     return self._episodes
 
   @property
   def last(self) -> EpisodeLedger:
-    """The episode that began last.
+    """The most recent episode.
 
     Raises:
-      ResultsError: If none has begun.
+      ResultsError: If no episode has begun.
     """
     if not self._episodes:
       raise errors.ResultsError(
@@ -110,25 +116,25 @@ class Ledger(events.EventSink):
     self.last.add(step.records)
 
   def episode_ended(self, end: events.End) -> None:
-    # A sink that joins in the middle of an episode hears of its end only.
+    # A sink that was added in mid-episode receives only the end of the episode.
     if self._episodes and self.last.end is None:
       self.last.end = end
 
   def state(self) -> Any:
-    """Returns the episode under way as plain data; `None` if there is none."""
+    """Returns the running episode as plain data; `None` if there is none."""
     return _state_of(self._episodes[-1] if self._episodes else None)
 
   def set_state(self, state: Any) -> None:
-    """Adds an episode that was under way, and goes on with it.
+    """Adds a saved episode and continues it.
 
-    Nothing is taken out: what was heard has happened.
+    Episodes that are already in the ledger stay in it.
     """
     if state is not None:
       self._episodes.append(_from_state(state))
 
 
 def _state_of(episode: EpisodeLedger | None) -> Any:
-  """Returns an episode as plain data, or `None` if it is not under way."""
+  """Returns an episode as plain data, or `None` if it is not running."""
   if episode is None or episode.end is not None:
     return None
   return {
@@ -145,7 +151,7 @@ def _state_of(episode: EpisodeLedger | None) -> Any:
 
 
 def _from_state(state: Any) -> EpisodeLedger:
-  """Does the opposite of `_state_of`."""
+  """Returns the episode of a state; the inverse of `_state_of`."""
   entries = {
       register: _entries(register, columns)
       for register, columns in state['entries'].items()
@@ -166,7 +172,7 @@ def _columns(entries: list[registers.Record]) -> tuple[np.ndarray, ...]:
       np.array([isinstance(entry, registers.Write) for entry in entries]),
       np.array([entry[1] for entry in entries]),
       np.array([entry.step for entry in entries]),
-      # A write has one number less.
+      # A write has one number less than a read; pad it.
       np.array([(*entry[3:], 0.0)[:3] for entry in entries]),
   )
 
@@ -174,7 +180,7 @@ def _columns(entries: list[registers.Record]) -> tuple[np.ndarray, ...]:
 def _entries(
     register: str, columns: tuple[np.ndarray, ...]
 ) -> list[registers.Record]:
-  """Does the opposite of `_columns`."""
+  """Returns the entries of columns; the inverse of `_columns`."""
   return [
       registers.Write(register, party, step, *numbers[:2])
       if is_write
@@ -187,69 +193,69 @@ def _entries(
 
 @final
 class _Restored(NamedTuple):
-  """What worlds went on from, by their index in the batch."""
+  """Saved states that worlds continued from, by index in the batch."""
 
   states: Mapping[int, Any]
 
 
 @final
 class BatchLedger(events.BatchEventSink):
-  """Keeps the ledgers of episodes of many worlds.
+  """Records the ledgers of all episodes of a batch.
 
-  While the worlds run, a step costs one append, whatever their number. What
-  happened in a world is put together when somebody asks.
+  A step costs one append, independently of the number of worlds. `episodes`
+  assembles the ledgers of a world when it is called.
   """
 
   def __init__(self) -> None:
-    self._heard: list[events.BatchStep | _Restored] = []
+    self._log: list[events.BatchStep | _Restored] = []
 
   @property
   def state_kind(self) -> str:
-    """The ledger of one world can take over from this one, and vice versa."""
+    """Name of `Ledger`, as the two kinds of ledger can exchange states."""
     return Ledger.__name__
 
   def step_ended(self, step: events.BatchStep) -> None:
-    self._heard.append(step)
+    self._log.append(step)
 
   def episodes(self, world: int) -> list[EpisodeLedger]:
-    """Returns the episodes of a world so far, the one under way included.
+    """Returns the episodes of a world, including the one that is running.
 
     Args:
-      world: The index of the world in the batch.
+      world: Index of the world in the batch.
     """
-    return _episodes_of(world, self._heard)
+    return _episodes_of(world, self._log)
 
   def state(self, indices: np.ndarray) -> list[Any]:
-    """Returns what `Ledger.state` would, for each of some worlds."""
+    """Returns the state of `Ledger.state` for each of the given worlds."""
     states = []
     for index in indices.tolist():
-      episodes = _episodes_of(index, self._heard[self._last_start(index) :])
+      episodes = _episodes_of(index, self._log[self._last_start(index) :])
       states.append(_state_of(episodes[-1] if episodes else None))
     return states
 
   def set_state(self, indices: np.ndarray, states: Sequence[Any]) -> None:
-    """Adds episodes that were under way; nothing is taken out."""
+    """Adds saved episodes and continues them; see `Ledger.set_state`."""
     by_index = dict(zip(indices.tolist(), states, strict=True))
-    self._heard.append(_Restored(by_index))
+    self._log.append(_Restored(by_index))
 
   def _last_start(self, world: int) -> int:
-    """Returns since when the last episode of a world has been heard of."""
-    for i in range(len(self._heard) - 1, -1, -1):
-      heard = self._heard[i]
-      if isinstance(heard, _Restored):
-        if world in heard.states:
+    """Returns the log position at which a world's last episode begins."""
+    for i in range(len(self._log) - 1, -1, -1):
+      entry = self._log[i]
+      if isinstance(entry, _Restored):
+        if world in entry.states:
           return i
-      elif heard.is_first[world]:
+      elif entry.is_first[world]:
         return i
-    return len(self._heard)
+    return len(self._log)
 
 
 def _episodes_of(
-    world: int, heard: Iterable[events.BatchStep | _Restored]
+    world: int, log: Iterable[events.BatchStep | _Restored]
 ) -> list[EpisodeLedger]:
-  """Puts together what happened in a world."""
+  """Assembles the episodes of one world from the log of a batch."""
   episodes: list[EpisodeLedger] = []
-  for step in heard:
+  for step in log:
     if isinstance(step, _Restored):
       state = step.states.get(world)
       if state is not None:

@@ -6,8 +6,8 @@ For every read that follows a write in the same episode:
   saturation          = applied - requested
   corruption          = reading - applied = permanent + temporary
 
-A write that nobody read says nothing about corruption: it is counted in the
-coverage, never as zero.
+A write that was never read gives no information about corruption. It reduces
+the coverage, and is not counted as zero corruption.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ import pydantic
 
 from realab_suite.entities import registers
 
-# Metrics are written into result rows, so they are checked like the rest of it.
+# Metrics are part of result rows, so they are validated in the same way.
 _FROZEN = pydantic.ConfigDict(
     frozen=True, extra='forbid', ser_json_inf_nan='strings'
 )
@@ -27,27 +27,29 @@ _FROZEN = pydantic.ConfigDict(
 
 @final
 class RegisterMetrics(pydantic.BaseModel):
-  """What became of the values of one register in one episode.
+  """Corruption and coverage of one register in one episode.
 
-  Means are over reads that follow a write, and `None` where there is no such
-  read. All are in the register's units, except those that say metres (radians,
-  where the register stores an angle).
+  Means are over reads that follow a write, and `None` if there is no such read.
+  Figures are in units of the register, except those whose name contains metres
+  (radians where the register stores an angle).
 
   Attributes:
     corruption: Mean of |reading - applied|.
-    corruption_metres: The same, as a displacement.
+    corruption_metres: Mean of |reading - applied|, as a displacement.
     corruption_max: Maximum of |reading - applied|.
     corruption_signed: Mean of reading - applied.
     permanent: Mean of |permanent part of the corruption|.
     temporary: Mean of |temporary part of the corruption|.
     saturation: Mean of |applied - requested|.
-    requested_sum: Sum of what was requested, the value at the reset left out.
-    agent_reading_sum: Sum of what the agent read after each control step.
-    num_writes: How many writes there were, the one at the reset included.
-    num_reads: How many reads.
-    num_reads_before_write: Reads of which nothing can be said.
-    num_writes_read: Writes that were read at least once.
-    coverage: `num_writes_read / num_writes`; the others are censored.
+    requested_sum: Sum of the requested values, without that of the reset.
+    agent_reading_sum: Sum of the agent's readings after each control step.
+    num_writes: Number of writes, including that of the reset.
+    num_reads: Number of reads.
+    num_reads_before_write: Number of reads before the first write. They have no
+      corruption.
+    num_writes_read: Number of writes that were read at least once.
+    coverage: `num_writes_read / num_writes`; the other writes are censored.
+      `None` without writes.
   """
 
   model_config = _FROZEN
@@ -71,10 +73,10 @@ class RegisterMetrics(pydantic.BaseModel):
 def register_metrics(
     entries: Sequence[registers.Record], scale: float
 ) -> RegisterMetrics:
-  """Computes the metrics of one register from its entries, in order of time.
+  """Returns the metrics of one register in one episode.
 
   Args:
-    entries: Writes and reads of one episode.
+    entries: Writes and reads of the episode, in chronological order.
     scale: Metres (or radians) per unit.
   """
   last: registers.Write | None = None
@@ -122,11 +124,14 @@ def register_metrics(
 
 
 def episode_corruption(all_metrics: Sequence[RegisterMetrics]) -> float:
-  """Returns one figure of corruption for an episode, in metres.
+  """Returns the corruption of an episode as a single figure, in metres.
 
-  It is the mean over registers of the mean displacement that readings suffered,
-  so that a design is not judged by the units of its registers. It is nan when
-  no register was read after a write.
+  It is the mean over registers of the mean displacement of their readings, so
+  it does not depend on the units of registers. It is nan if no register was
+  read after a write.
+
+  Args:
+    all_metrics: Metrics of every register in the episode.
   """
   metres = [
       one.corruption_metres

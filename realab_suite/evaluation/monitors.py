@@ -1,4 +1,7 @@
-"""The monitor: what episodes came to, without keeping what happened in them."""
+"""Monitor of training: figures of episodes, in constant memory per world.
+
+Ledgers, which keep every write and read, are in `ledgers`.
+"""
 
 from collections.abc import Sequence
 import math
@@ -14,46 +17,47 @@ from realab_suite.feedback import mechanisms
 # Rows of the sums over the reads of a register that follow a write.
 _READS, _ABSOLUTE, _SIGNED, _PERMANENT, _TEMPORARY, _AGENT = range(6)
 _NUM_SUMS = 6
-# Rows of what is known of a register's last write and read.
+# Rows of the last applied value and base displacement of a register.
 _APPLIED, _BASE = range(2)
 _NUM_LAST = 2
 
 
 @final
 class TrainingMonitor(events.BatchEventSink):
-  """Sums up the episodes of many worlds while they are under way.
+  """Computes figures of the episodes of a batch while they are running.
 
-  Memory does not grow with the number of steps, unlike that of a ledger. When
-  an episode is over there is a record of it, which is plain data:
+  Unlike a ledger, a monitor does not grow with the number of steps. When an
+  episode ends, the monitor makes a record of it, which is plain data:
 
-    seed, world, episode: Which episode it was.
-    end: A value of `events.End`.
-    is_valid: Whether its figures are those of a whole episode.
-    num_steps: Its control steps.
+    seed, world, episode: Numbers that identify the episode.
+    end: Value of `events.End`.
+    is_valid: True if all figures describe a whole episode.
+    num_steps: Number of control steps.
     true_return: Sum of true rewards.
-    observed_return: Sum of what the agent read off its feedback registers.
-    corruption: Mean displacement of the values of all registers, metres.
-    registers: By name:
-      corruption: Mean of |reading - applied|, in the register's units.
-      corruption_metres: The same, as a displacement.
+    observed_return: Sum of the agent's readings of feedback registers.
+    corruption: Mean displacement of the readings of all registers, in metres.
+    registers: Figures of each register, by name:
+      corruption: Mean of |reading - applied|, in units of the register.
+      corruption_metres: Mean of |reading - applied|, in metres.
       corruption_signed: Mean of reading - applied, in units.
-      corruption_signed_metres: The same, as a displacement.
-      permanent, temporary: Means of the sizes of its parts, in units.
-      base_metres: How far the base block stood from its original pose along the
-        register's axis when it was last read; its sign is that of the reading.
+      corruption_signed_metres: Mean of reading - applied, in metres.
+      permanent, temporary: Mean size of each part of the corruption, in units.
+      base_metres: Displacement of the base block from its original pose at the
+        last read, in metres along the register's axis. A positive displacement
+        raises the reading.
 
-  What is not known is `None`: there was no read, or no number. The figures are
+  A figure is `None` if there was no read, or if it is not finite. Figures equal
   those of `metrics.register_metrics`, up to the order of summation.
   """
 
   def __init__(
       self, mechanism: mechanisms.FeedbackMechanism, num_envs: int
   ) -> None:
-    """Makes a monitor; `batch.add_sink` makes it hear.
+    """Makes a monitor, to be passed to `batch.add_sink`.
 
     Args:
-      mechanism: Whose registers there are.
-      num_envs: How many worlds.
+      mechanism: Mechanism that owns the registers.
+      num_envs: Number of worlds.
     """
     self._scales = [r.scale for r in mechanism.registers.values()]
     self._rows = {name: i for i, name in enumerate(mechanism.registers)}
@@ -66,18 +70,18 @@ class TrainingMonitor(events.BatchEventSink):
     self._num_steps = np.zeros(num_envs, int)
     self._is_open = np.zeros(num_envs, bool)
     # Objects, because seeds can be large.
-    self._names = np.zeros((3, num_envs), object)
+    self._ids = np.zeros((3, num_envs), object)
     self._records: list[dict[str, Any]] = []
 
   def step_ended(self, step: events.BatchStep) -> None:
     is_first = step.is_first
     counts = ~(is_first | step.has_failed)
-    # What is left out may be anything, as in a world whose physics failed.
+    # Values of worlds that do not count may not be finite.
     with np.errstate(invalid='ignore', over='ignore'):
-      self._hear(step.records, counts)
+      self._add(step.records, counts)
       if is_first.any():
         self._begin(step)
-      self._hear(step.agent_reads, counts | is_first)
+      self._add(step.agent_reads, counts | is_first)
       for read in step.agent_reads:
         total = self._sums[_AGENT, self._rows[read.register]]
         np.add(total, read.reading, out=total, where=counts)
@@ -92,27 +96,36 @@ class TrainingMonitor(events.BatchEventSink):
       self._end(world, end)
 
   def take(self) -> list[dict[str, Any]]:
-    """Returns the records of the episodes that have ended since the last call.
+    """Returns the records of the episodes that ended since the last call.
 
-    Those that ended in one step come in the order of their worlds.
+    Records are in the order in which the episodes ended, and in the order of
+    the worlds within one step.
     """
     taken, self._records = self._records, []
     return taken
 
   def state(self, indices: np.ndarray) -> list[Any]:
-    """Returns what is known of the episodes under way.
+    """Returns the figures of the running episodes as plain data.
 
-    Records that nobody has taken are no part of it.
+    The state does not contain records that `take` has not returned yet.
+
+    Args:
+      indices: Indices of the worlds in the batch.
     """
     return [self._state(index) for index in indices.tolist()]
 
   def set_state(self, indices: np.ndarray, states: Sequence[Any]) -> None:
-    """Goes on with other episodes."""
+    """Continues the episodes of saved states.
+
+    Args:
+      indices: Indices of the worlds in the batch.
+      states: State of each of these worlds; `None` if no episode was running.
+    """
     for index, state in zip(indices.tolist(), states, strict=True):
       self._is_open[index] = state is not None
       if state is None:
         continue
-      self._names[:, index] = state['episode']
+      self._ids[:, index] = state['episode']
       self._num_steps[index] = state['num_steps']
       self._true_return[index] = state['true_return']
       sums, last = (np.array(state[key]) for key in ('sums', 'last'))
@@ -124,7 +137,7 @@ class TrainingMonitor(events.BatchEventSink):
       return None
     # Lists, because a thousand small arrays make a slow snapshot.
     return {
-        'episode': [int(name) for name in self._names[:, index]],
+        'episode': [int(number) for number in self._ids[:, index]],
         'num_steps': int(self._num_steps[index]),
         'true_return': float(self._true_return[index]),
         'sums': self._sums[:, :, index].ravel().tolist(),
@@ -132,19 +145,19 @@ class TrainingMonitor(events.BatchEventSink):
     }
 
   def _begin(self, step: events.BatchStep) -> None:
-    """Forgets the last episode of each world in which one begins."""
+    """Resets the figures of the worlds in which an episode begins."""
     is_first = step.is_first
     self._sums[:, :, is_first] = 0.0
     self._last[:, :, is_first] = 0.0
     self._true_return[is_first] = 0.0
     self._num_steps[is_first] = 0
     self._is_open |= is_first
-    names = np.array([step.seed, step.world, step.episode], object)
-    self._names[:, is_first] = names[:, is_first]
-    self._hear(step.initial, is_first)
+    ids = np.array([step.seed, step.world, step.episode], object)
+    self._ids[:, is_first] = ids[:, is_first]
+    self._add(step.initial, is_first)
 
-  def _hear(self, records: events.Records, where: np.ndarray) -> None:
-    """Adds writes and reads, in the order of time, in some of the worlds."""
+  def _add(self, records: events.Records, where: np.ndarray) -> None:
+    """Adds writes and reads in chronological order, in the masked worlds."""
     for record in records:
       row = self._rows[record.register]
       applied, base = self._last[:, row]
@@ -171,10 +184,10 @@ class TrainingMonitor(events.BatchEventSink):
         name: self._register(row, world) for name, row in self._rows.items()
     }
     metres = [r['corruption_metres'] for r in by_name.values()]
-    known = [value for value in metres if value is not None]
+    finite = [value for value in metres if value is not None]
     true_return = _number(self._true_return[world])
     observed = self._sums[_AGENT, self._feedback, world]
-    seed, number, episode = (int(name) for name in self._names[:, world])
+    seed, number, episode = (int(number) for number in self._ids[:, world])
     self._records.append(
         {
             'seed': seed,
@@ -185,13 +198,13 @@ class TrainingMonitor(events.BatchEventSink):
             'num_steps': int(self._num_steps[world]),
             'true_return': true_return,
             'observed_return': _number(observed.sum()),
-            'corruption': sum(known) / len(known) if known else None,
+            'corruption': sum(finite) / len(finite) if finite else None,
             'registers': by_name,
         }
     )
 
   def _register(self, row: int, world: int) -> dict[str, float | None]:
-    """Returns what became of the values of one register."""
+    """Returns the figures of one register in a world's episode."""
     sums, scale = self._sums[:, row, world], self._scales[row]
     num_reads = sums[_READS]
     if not num_reads:
@@ -219,6 +232,6 @@ class TrainingMonitor(events.BatchEventSink):
 
 
 def _number(value: Any) -> float | None:
-  """Returns a number as JSON has it, or `None` for what it has not."""
+  """Returns a finite number as a float, and `None` for nan and infinity."""
   number = float(value)
   return number if math.isfinite(number) else None

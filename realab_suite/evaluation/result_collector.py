@@ -1,4 +1,7 @@
-"""Results of episodes that nobody here runs: an agent elsewhere does."""
+"""Collection of episode results from an environment that others step.
+
+`evaluate` runs policies itself.
+"""
 
 from typing import final
 
@@ -11,28 +14,32 @@ from realab_suite.evaluation import ledgers
 
 @final
 class ResultCollector(events.EventSink):
-  """Makes a result of every episode as it ends, the invalid ones included.
+  """Collects the result of every episode when it ends, including invalid ones.
 
-  What the engine calls cannot fail for want of a disk, say: results wait here
-  until they are taken.
+  Results stay in memory until `take` returns them, because a sink that the
+  engine calls must not fail, for example when a disk is full.
   """
 
   def __init__(self, env: environment.Environment) -> None:
-    """Begins to listen to a world, from its next episode on."""
+    """Makes a collector and adds it to an environment as a sink.
+
+    Args:
+      env: The environment. Collection starts with its next episode.
+    """
     self._env = env
     self._ledger = ledgers.Ledger()
     self._results: list[evaluate.EpisodeResult] = []
     env.add_sink(self)
 
   def take(self) -> list[evaluate.EpisodeResult]:
-    """Returns the results since it was called last, in order."""
+    """Returns the results since the last call, in order."""
     taken, self._results = self._results, []
     return taken
 
   def episode_started(
       self, start: events.Start, physics: protocols.Physics
   ) -> None:
-    # A ledger keeps all its episodes, and there is no end to these.
+    # A new ledger per episode, because a ledger keeps all its episodes.
     self._ledger = ledgers.Ledger()
     self._ledger.episode_started(start, physics)
 

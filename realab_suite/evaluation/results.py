@@ -1,10 +1,9 @@
-"""Result rows: a line of JSON per episode, enough to publish and to repeat.
+"""Result rows: one line of JSON per episode, for publication and replication.
 
-The rows of a served run can be published, and only its record repeats it: they
-do not have its salt.
+Rows of a served run do not contain its secret salt. They can be published, but
+repeating the run needs its record.
 
-Each line ends with a checksum of itself, so that a row which has been damaged
-is never taken for one that has not.
+Each line ends with its own checksum, so damaged rows are detected.
 """
 
 from collections.abc import Iterator
@@ -29,9 +28,9 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import metrics
 from realab_suite.feedback import specs
 
-# Everything in one process: honest agents only (docs/architecture.md).
+# Agent and evaluator in one process: for honest agents (docs/architecture.md).
 IN_PROCESS = 'T0 in-process'
-# Over a socket (docs/served.md): what the agent's code may be, see there.
+# Agents that are served over a socket (docs/served.md).
 SERVED = 'T1 served to another process of the same user'
 SERVED_TO_ANOTHER_USER = 'T2 served to another user'
 
@@ -44,8 +43,8 @@ UNITS = {
     'registers.*': "the register's units, or metres where the name says so",
 }
 
-# A row may hold nan, as the true return of an invalid episode does. JSON has no
-# such number, so it is written as text.
+# Rows may contain nan, for example the true return of an invalid episode. JSON
+# has no nan, so it is written as a string.
 _FROZEN = pydantic.ConfigDict(
     frozen=True, extra='forbid', ser_json_inf_nan='strings'
 )
@@ -53,28 +52,28 @@ _FROZEN = pydantic.ConfigDict(
 
 @final
 class RunInfo(pydantic.BaseModel):
-  """What the episodes of a run have in common.
+  """Settings that all episodes of a run share.
 
   Attributes:
-    domain: The world.
-    task: The variation.
-    dynamics_version: Of the world's dynamics.
-    dynamics_digest: Of a golden trajectory of them, or `None` if there is none
-      for this version of MuJoCo.
-    design: The name of the design.
-    design_digest: A hash of all its fields.
-    channel: Of the design: embedded, welded or secure.
-    policy: What acted.
-    run: The name of the run, by which rows are grouped.
-    baseline: The run to compare with, or `None`.
-    isolation: How far the agent was kept from the evaluator.
-    salt_digest: Digest of the secret salt of a served run, by which runs with
-      the same episodes are recognised; `None` if the episodes follow from the
-      seed alone.
-    control_timestep: Length of a control step, seconds.
-    max_steps: After how many control steps episodes end, or `None`.
-    versions: Of everything that dynamics depend on.
-    platform: Of the machine.
+    domain: Name of the domain.
+    task: Name of the task in the domain.
+    dynamics_version: Version of the task's dynamics.
+    dynamics_digest: Digest of a golden trajectory of these dynamics, or `None`
+      if there is none for this version of MuJoCo.
+    design: Name of the design.
+    design_digest: Digest of all fields of the design.
+    channel: Channel of the design: embedded, welded or secure.
+    policy: Name of the policy or agent.
+    run: Name of the run, by which rows are grouped.
+    baseline: Name of the run to compare with, or `None`.
+    isolation: Isolation tier of the agent.
+    salt_digest: Digest of the secret salt of a served run, which is equal for
+      runs with the same episodes; `None` if the episodes depend on the seed
+      alone.
+    control_timestep: Length of a control step, in seconds.
+    max_steps: Maximum number of control steps of an episode, or `None`.
+    versions: Versions of the packages that results depend on.
+    platform: Operating system and processor of the machine.
   """
 
   model_config = _FROZEN
@@ -104,13 +103,13 @@ class RunInfo(pydantic.BaseModel):
       design: specs.DesignSpec,
       **others: Any,
   ) -> 'RunInfo':
-    """Returns what rows say of a world, its dynamics and a design.
+    """Returns the information of a world, its dynamics and a design.
 
     Args:
-      world: The domain and the variation.
-      dynamics: What `suite.dynamics` says of the two.
-      design: The agent designer's.
-      **others: The attributes that do not follow from these.
+      world: Names of the domain and the task.
+      dynamics: Version and digest that `suite.dynamics` returns for them.
+      design: The design.
+      **others: Values of the remaining attributes.
     """
     (domain, task), (version, digest) = world, dynamics
     return cls(
@@ -127,10 +126,10 @@ class RunInfo(pydantic.BaseModel):
 
 @final
 class EpisodeRow(pydantic.BaseModel):
-  """One episode, with everything that is needed to read it by itself.
+  """Result of one episode, with the settings of its run.
 
-  Attributes are those of `RunInfo` and of `evaluate.EpisodeResult`;
-  `corruption` is `None` in a file where it is nan in Python.
+  The attributes are those of `evaluate.EpisodeResult`, the settings in `info`,
+  and `units`. A `corruption` of nan is null in a file.
   """
 
   model_config = pydantic.ConfigDict(
@@ -159,12 +158,12 @@ class EpisodeRow(pydantic.BaseModel):
   num_episodes: Literal[1] = 1
   num_provider_calls: int
   num_queries: int
-  # Rows of older files have none.
+  # Missing from rows of older files.
   max_true_return: float | None = None
 
   @property
   def counts(self) -> bool:
-    """True if figures may be drawn from it; see `endings`."""
+    """True if the episode enters means and verdicts; see `endings`."""
     end = _ENDS.get(self.end)
     return self.is_valid or endings.is_given_up(end, self.true_return)
 
@@ -179,7 +178,7 @@ class EpisodeRow(pydantic.BaseModel):
 
 
 def versions() -> dict[str, str]:
-  """Returns the versions of what results depend on."""
+  """Returns the versions of the packages that results depend on, by name."""
   return {
       'realab_suite': __version__,
       'python': platform.python_version(),
@@ -191,7 +190,12 @@ def versions() -> dict[str, str]:
 
 
 def row(info: RunInfo, result: evaluate.EpisodeResult) -> EpisodeRow:
-  """Returns the row of an episode."""
+  """Returns the row of an episode.
+
+  Args:
+    info: Settings of the run.
+    result: Result of the episode.
+  """
   fields = {
       field.name: getattr(result, field.name)
       for field in dataclasses.fields(result)
@@ -204,35 +208,42 @@ _NUM_DIGITS = 16
 
 
 def line(one: EpisodeRow) -> bytes:
-  """Returns a row as the line of a file, newline included."""
+  """Returns a row as a line of a file, including checksum and newline."""
   return sealed(one.model_dump_json(by_alias=True).encode())
 
 
 def sealed(text: bytes) -> bytes:
-  """Returns a JSON object as a line whose last member is its checksum."""
+  """Returns a JSON object as a line, with a checksum as its last member."""
   return text[:-1] + _CHECKSUM + _checksum(text) + b'"}\n'
 
 
 @final
 class RowWriter:
-  """Appends rows to a new file; each is on disk before the next is written."""
+  """Writes rows to a new file, and syncs each of them to disk."""
 
   def __init__(self, path: str | os.PathLike[str]) -> None:
-    """Makes the file.
+    """Creates the file.
+
+    Args:
+      path: Path of the file.
 
     Raises:
-      ResultsError: If there is one already, or it cannot be made.
+      ResultsError: If the file exists, or cannot be created.
     """
     try:
-      # What could not be written is not tried again when the file is closed.
+      # Unbuffered, so that closing does not retry a write that has failed.
       self._file = open(path, 'xb', buffering=0)
     except OSError as error:
       raise errors.ResultsError(
-          f'cannot make {os.fspath(path)}: {error.strerror}'
+          f'cannot create {os.fspath(path)}: {error.strerror}'
       ) from error
 
   def write(self, one: EpisodeRow) -> None:
-    """Appends a row."""
+    """Appends a row.
+
+    Raises:
+      ResultsError: If it cannot be written.
+    """
     rest = line(one)
     try:
       while rest:
@@ -257,12 +268,15 @@ class RowWriter:
 def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
   """Yields the rows of a file.
 
-  A process that was killed, or a disk that was full, may leave a part of a row
-  behind the last newline. It is left out, with one warning that says so.
+  A process that was killed, or a full disk, may leave an incomplete row after
+  the last newline. It is skipped with a warning.
+
+  Args:
+    path: Path of the file.
 
   Raises:
-    ResultsError: If the file cannot be read, or any other line is no row, or
-      not the row that was written; it names the line.
+    ResultsError: If the file cannot be read, or another line is not a row or
+      does not match its checksum. The message contains the line number.
   """
   where = os.fspath(path)
   try:
@@ -284,28 +298,28 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
     last = _parse(tail)
   except ValueError:
     warnings.warn(
-        f'{where}:{len(whole) + 1}: the last {len(tail)} bytes are a part of a'
-        f' row and are left out; {len(whole)} rows before them are whole',
+        f'{where}:{len(whole) + 1}: skipped an incomplete row of {len(tail)}'
+        f' bytes; the {len(whole)} rows before it are complete',
         stacklevel=2,
     )
   else:
-    yield last  # All of it but the newline.
+    yield last  # Only the newline is missing.
 
 
 def _parse(text: bytes) -> EpisodeRow:
   """Returns the row of a line without its newline.
 
   Raises:
-    ValueError: If it is none.
+    ValueError: If the line is not a row.
   """
   content, found, rest = text.rpartition(_CHECKSUM)
   content += b'}'
   if not found or rest != _checksum(content) + b'"}':
-    raise ValueError('its checksum does not agree: it is not what was written')
+    raise ValueError('the checksum does not match; the line was changed')
   try:
     return EpisodeRow.model_validate(json.loads(content))
   except RecursionError as error:
-    raise ValueError('it is nested too deeply') from error
+    raise ValueError('the JSON is nested too deeply') from error
 
 
 def _checksum(text: bytes) -> bytes:

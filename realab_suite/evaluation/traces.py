@@ -1,7 +1,7 @@
-"""Traces: the actions of judged episodes, and where registers were moved to.
+"""Traces: actions and register positions of evaluated episodes.
 
-The actions and the world's seed are all that it takes to see an episode again,
-in a film for example, on any machine on which the physics is the same.
+The actions and the seed are sufficient to replay an episode, for example for a
+film, on any machine with the same physics.
 """
 
 from typing import Any, final
@@ -15,9 +15,9 @@ from realab_suite.evaluation import batch_actors
 
 @final
 class Tracer(events.BatchEventSink):
-  """Keeps a trace of the first episode of every world of a batch.
+  """Records a trace of the first episode of every world of a batch.
 
-  It is a sink, and an actor that does what another one does:
+  It is both an event sink and an actor that forwards to another actor:
 
       tracer = Tracer(batch, actor)
       batch.add_sink(tracer)
@@ -33,7 +33,7 @@ class Tracer(events.BatchEventSink):
 
     Args:
       batch: The worlds, before their first episode.
-      actor: What acts.
+      actor: Actor that chooses the actions.
     """
     self._batch = batch
     self._actor = actor
@@ -41,7 +41,7 @@ class Tracer(events.BatchEventSink):
     num_envs = batch.num_envs
     self._num_steps = np.full(num_envs, -1)
     # Objects, because seeds can be large.
-    self._names = np.zeros((3, num_envs), object)
+    self._ids = np.zeros((3, num_envs), object)
     self._start = self._positions()
     self._end = {
         name: np.full_like(blocks, np.nan)
@@ -57,30 +57,33 @@ class Tracer(events.BatchEventSink):
   def step_ended(self, step: events.BatchStep) -> None:
     if not self._actions:
       self._start = self._positions()
-      self._names = np.array([step.seed, step.world, step.episode], object)
+      self._ids = np.array([step.seed, step.world, step.episode], object)
       return
     indices = [w for w in step.ends if self._num_steps[w] < 0]
     if not indices:
       return
     self._num_steps[indices] = len(self._actions)
-    # Nothing is said of where blocks are when the physics has failed.
-    known = [world for world in indices if not step.has_failed[world]]
+    # Positions are meaningless where the physics has failed.
+    valid = [world for world in indices if not step.has_failed[world]]
     for name, blocks in self._positions().items():
-      self._end[name][known] = blocks[known]
+      self._end[name][valid] = blocks[valid]
 
   def trace(self) -> dict[str, Any]:
-    """Returns what has been kept, as plain data.
+    """Returns the trace as plain data.
 
     Returns:
-      seed, world, episode: The episodes, a list of integers of any size each.
-      num_steps: How many control steps each had; -1 where it has not ended.
-      actions: `(steps, worlds, *action_spec.shape)`; those behind the end of an
-        episode are of no account.
-      registers: By name, where the `start` and the `end` of the episode found
-        the middles of its blocks, each `(worlds, blocks, 2)` in metres; nan
-        where that is not known. The base block, if there is one, comes first.
+      seed, world, episode: Lists of integers that identify the episode of each
+        world.
+      num_steps: Number of control steps of each episode, `(worlds,)`; -1 if it
+        has not ended.
+      actions: Actions, `(steps, worlds, *action_spec.shape)`. Those after the
+        end of an episode have no meaning.
+      registers: Horizontal positions of the centres of each register's blocks
+        at the `start` and the `end` of the episode, by name, each
+        `(worlds, blocks, 2)` in metres; nan if unknown. The base block, if
+        there is one, is the first block.
     """
-    seed, world, episode = self._names.tolist()
+    seed, world, episode = self._ids.tolist()
     longest = max(int(self._num_steps.max()), 0)
     return {
         'seed': seed,
@@ -95,7 +98,7 @@ class Tracer(events.BatchEventSink):
     }
 
   def _positions(self) -> dict[str, np.ndarray]:
-    """Returns where the blocks of every register are, seen from above."""
+    """Returns horizontal block positions by register, `(worlds, blocks, 2)`."""
     physics = self._batch.physics
     return {
         name: np.stack(

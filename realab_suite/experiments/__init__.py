@@ -1,1 +1,4 @@
-"""Launchers, on absl flags."""
+"""Experiments: specs, jobs, training, sweeps and scripted comparisons.
+
+Programs with flags are in `launchers`.
+"""

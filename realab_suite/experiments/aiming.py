@@ -1,4 +1,4 @@
-"""Makes policies, and tells saboteurs which register to attack and how."""
+"""Scripted policies for given worlds; saboteurs get a target register."""
 
 import inspect
 from typing import Any
@@ -11,7 +11,7 @@ from realab_suite.engine import environment
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
-_AIM = ('target', 'direction')
+_AIM_OPTIONS = ('target', 'direction')
 
 
 def make_policy(
@@ -20,30 +20,30 @@ def make_policy(
     target: str | None,
     episode: int,
 ) -> policies.Policy:
-  """Returns a policy that knows what it needs to know of one episode.
+  """Returns a policy for one episode.
 
   Args:
-    name: A name in `policies.POLICIES`.
-    env: The environment; it is left in the middle of nothing, so rewind it.
-    target: The register that saboteurs attack, or `None` for the first one with
-      feedback.
-    episode: The number of the episode.
+    name: Name of the policy in `policies.POLICIES`.
+    env: Environment. It may be reset, so rewind it before the episode.
+    target: Register that saboteurs attack, or `None` for the first feedback
+      register.
+    episode: Number of the episode.
 
   Raises:
-    SpecError: If there is no such policy or register.
+    SpecError: If the policy or the register does not exist.
   """
   takes = inspect.signature(policies.POLICIES.get(name)).parameters
-  options = [option for option in _AIM if option in takes]
+  options = [option for option in _AIM_OPTIONS if option in takes]
   if not options:
     return policies.make(name)
-  register = _find(name, env, target)
+  register = _target_register(name, env, target)
   env.rewind(episode)
   env.reset()
   where = aim(register, env.physics)
   return policies.make(name, **{option: where[option] for option in options})
 
 
-def _find(
+def _target_register(
     policy: str, env: environment.Environment, target: str | None
 ) -> registers.Register:
   mechanism = env.mechanism
@@ -61,12 +61,11 @@ def _find(
 def aim(
     register: registers.Register, physics: protocols.Physics
 ) -> dict[str, Any]:
-  """Returns where a register stands, and which way of moving it pays.
+  """Returns the position of a register and the direction that pays.
 
-  It is what a saboteur has to be told: `target` and `direction`.
-
-  Readings grow as a base block goes against the axis that carries the value,
-  and as the only block of a register goes along it.
+  The keys `target` and `direction` are options of saboteurs. Readings increase
+  as a base block moves against the axis of the register, and as the only block
+  of a register moves along it.
   """
   block = physics.bind(register.blocks[0].geom)
   axis = np.reshape(block.xmat, (3, 3))[:2, 0]

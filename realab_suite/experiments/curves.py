@@ -1,4 +1,4 @@
-"""Learning curves: what the episodes of a stretch of training came to."""
+"""Learning curves: means over the training episodes of each interval."""
 
 from collections.abc import Iterable, Mapping, Sequence
 import math
@@ -17,13 +17,13 @@ def point(
   """Returns a point of a learning curve.
 
   Args:
-    step: How many control steps there have been.
-    episodes: Records of `monitor.TrainingMonitor`, of those that have ended
-      since the last point.
-    metrics: What the learner says of itself.
+    step: Number of control steps so far.
+    episodes: Records by `monitors.TrainingMonitor` of the episodes that have
+      ended since the last point.
+    metrics: Metrics of the learner.
 
   Returns:
-    Plain data; means over valid episodes are `None` where there is none.
+    Plain data. Means over valid episodes are `None` if there are no values.
   """
   valid = [episode for episode in episodes if episode['is_valid']]
   names = list(valid[0]['registers']) if valid else []
@@ -50,18 +50,18 @@ def point(
 
 
 class Board(Protocol):
-  """Where curves are drawn while they grow."""
+  """Display of a learning curve during training."""
 
   def add(self, point: Mapping[str, Any]) -> None:
     """Adds a point."""
 
   def close(self) -> None:
-    """Completes what is on disk."""
+    """Completes its files."""
 
 
 @final
 class NoBoard:
-  """Draws nothing."""
+  """A board without a display."""
 
   def add(self, point: Mapping[str, Any]) -> None:
     """Does nothing."""
@@ -72,14 +72,14 @@ class NoBoard:
 
 @final
 class TensorBoard:
-  """Writes points as TensorBoard reads them; needs the extra `tb`."""
+  """Writes points to event files of TensorBoard; needs the extra `tb`."""
 
   def __init__(self, folder: pathlib.Path, step: int) -> None:
     """Opens the folder.
 
     Args:
-      folder: Where event files go.
-      step: What was written from there on by a run that was killed is hidden.
+      folder: Folder of the event files.
+      step: First step to write. Later points of an interrupted run are hidden.
 
     Raises:
       SpecError: If tensorboardX is not installed.

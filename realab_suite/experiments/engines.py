@@ -1,4 +1,4 @@
-"""Engines: where the jobs of a sweep run, each in a process of its own."""
+"""Engines that run the jobs of a sweep, each in a separate process."""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -14,47 +14,47 @@ from typing import Any, final
 from realab_suite import errors
 from realab_suite.experiments import requirements
 
-# How long a process that was asked to end may take, seconds.
+# Time that a process has for ending after SIGTERM, in seconds.
 _PATIENCE = 10.0
-# Of a job of Slurm's; left alone, submitit ends it after five.
-_MOST_MINUTES = 24 * 60
+# Time limit of a Slurm job; the default of submitit is five minutes.
+_MAX_MINUTES = 24 * 60
 
 
 class Engine(abc.ABC):
-  """Starts command lines, and says when they are over."""
+  """Runs commands as tasks."""
 
   @property
   @abc.abstractmethod
   def capacity(self) -> int:
-    """How many commands may be under way at a time."""
+    """Maximum number of tasks at a time."""
 
   @abc.abstractmethod
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
-    """Starts a command, whose output is added to a file.
+    """Starts a command, and appends its output to a file.
 
     Returns:
-      What `poll` and `stop` take.
+      The task, an argument of `poll` and `stop`.
     """
 
   @abc.abstractmethod
   def poll(self, task: Any) -> int | None:
-    """Returns the exit status of a command; `None` while it is under way."""
+    """Returns the exit status of a task, or `None` while it is running."""
 
   @abc.abstractmethod
   def stop(self, tasks: Sequence[Any]) -> None:
-    """Ends commands that are under way."""
+    """Ends tasks."""
 
   def arguments(self) -> list[str]:
-    """Returns what commands have to be told of the engine."""
+    """Returns arguments to add to all commands."""
     return []
 
 
 @final
 class Local(Engine):
-  """Processes on this machine, side by side."""
+  """Parallel processes on this machine."""
 
   def __init__(self, workers: int) -> None:
-    """Makes an engine for so many processes."""
+    """Makes an engine for this number of parallel processes."""
     self._workers = workers
 
   @property
@@ -63,7 +63,7 @@ class Local(Engine):
 
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
     with open(log, 'ab') as file:
-      # A session of its own: it is ended by `stop`, not by the terminal.
+      # In a new session, only `stop` ends the process, not the terminal.
       return subprocess.Popen(
           command,
           stdin=subprocess.DEVNULL,
@@ -96,9 +96,9 @@ class Ray(Engine):
 
   def __init__(self, workers: int) -> None:
     """Connects to the cluster that RAY_ADDRESS names, or starts one here."""
-    del workers  # Ray knows how many processors there are.
+    del workers  # Ray determines the number of processors.
     self._ray = _import('ray')
-    with _explained('ray'):
+    with _errors_in_one_line('ray'):
       self._ray.init(ignore_reinit_error=True, log_to_driver=False)
       self._execute = self._ray.remote(num_cpus=1, max_retries=0)(execute)
 
@@ -107,13 +107,13 @@ class Ray(Engine):
     return sys.maxsize
 
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
-    with _explained('ray'):
+    with _errors_in_one_line('ray'):
       return self._execute.remote(
           list(command), str(log.absolute()), os.getcwd()
       )
 
   def poll(self, task: Any) -> int | None:
-    with _explained('ray'):
+    with _errors_in_one_line('ray'):
       done, _ = self._ray.wait([task], timeout=0)
       return int(self._ray.get(done[0])) if done else None
 
@@ -127,8 +127,8 @@ class Submitit(Engine):
   """Jobs of a Slurm cluster whose machines share the file system."""
 
   def __init__(self, workers: int) -> None:
-    """Makes an engine; where there is no Slurm, submitit runs jobs here."""
-    del workers  # Slurm knows how many processors there are.
+    """Makes an engine. Without Slurm, submitit runs jobs on this machine."""
+    del workers  # Slurm determines the number of processors.
     self._submitit = _import('submitit')
 
   @property
@@ -136,17 +136,17 @@ class Submitit(Engine):
     return sys.maxsize
 
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
-    with _explained('submitit'):
+    with _errors_in_one_line('submitit'):
       executor = self._submitit.AutoExecutor(folder=str(log.parent))
       executor.update_parameters(
-          cpus_per_task=1, name=log.stem, timeout_min=_MOST_MINUTES
+          cpus_per_task=1, name=log.stem, timeout_min=_MAX_MINUTES
       )
       return executor.submit(
           execute, list(command), str(log.absolute()), os.getcwd()
       )
 
   def poll(self, task: Any) -> int | None:
-    with _explained('submitit'):
+    with _errors_in_one_line('submitit'):
       return int(task.result()) if task.done() else None
 
   def stop(self, tasks: Sequence[Any]) -> None:
@@ -162,7 +162,7 @@ ENGINES: dict[str, Callable[[int], Engine]] = {
 
 
 def execute(command: Sequence[str], log: str, folder: str) -> int:
-  """Runs a command in a folder of an engine's; returns its exit status."""
+  """Runs a command in a folder, and returns its exit status."""
   with open(log, 'ab') as file:
     return subprocess.run(
         command,
@@ -181,8 +181,8 @@ def _import(name: str) -> Any:
 
 
 @contextlib.contextmanager
-def _explained(name: str) -> Any:
-  """Turns whatever an engine raises into one line."""
+def _errors_in_one_line(name: str) -> Any:
+  """Turns any exception of an engine into an error of one line."""
   try:
     yield
   except Exception as error:

@@ -1,4 +1,4 @@
-"""Experiments as data: which agents are trained, and how they are judged."""
+"""Specs of experiments: the agents to train, and their evaluation."""
 
 from collections.abc import Iterator, Mapping
 from importlib import resources
@@ -21,10 +21,10 @@ _Seed = Annotated[int, pydantic.Field(ge=0, lt=2**31)]
 _Seeds = Annotated[tuple[_Seed, ...], pydantic.Field(strict=False)]
 
 TWIN = 'secure'
-"""What the secure twin of a run is called, and its channel."""
+"""Suffix and channel of the secure twin of a run."""
 
 ProbePlayer = Literal['saboteur', 'random']
-"""Who gets to the states of a probe: see `probes.make`."""
+"""Policy that reaches the states of a probe; see `probes.make`."""
 
 
 @final
@@ -32,11 +32,11 @@ class RunSpec(validation.Spec):
   """An agent to train.
 
   Attributes:
-    design: The name of a design that ships with the package, or a path.
-    overrides: Dotted overrides of it.
-    learner: Fields of the design's learner that differ from the design.
-    twin: Whether to train it on the design's secure twin as well.
-    steps: For how many control steps; `None` takes the experiment's.
+    design: Name of a design of the package, or path of a YAML file.
+    overrides: Dotted overrides of the design.
+    learner: Fields that replace those of the learner in the design.
+    twin: True to train the secure twin of the design as well.
+    steps: Number of control steps, or `None` for that of the experiment.
   """
 
   design: option_types.FilePath
@@ -46,14 +46,14 @@ class RunSpec(validation.Spec):
   steps: _Count | None = None
 
   def load(self, *, is_confined: bool = False) -> specs.DesignSpec:
-    """Returns the design, with the changes of the run.
+    """Returns the design with the changes of this run.
 
     Args:
-      is_confined: True if the design, and files that it names, have to be
-        within the working directory.
+      is_confined: True if the design and the files that it names must be within
+        the working directory.
 
     Raises:
-      SpecError: If the design is not valid.
+      SpecError: If the design is invalid.
     """
     design = specs.load(self.design, self.overrides, is_confined=is_confined)
     if not self.learner:
@@ -63,27 +63,27 @@ class RunSpec(validation.Spec):
 
 
 def secure_twin(design: specs.DesignSpec) -> specs.DesignSpec:
-  """Returns a design whose registers nothing can tamper with."""
+  """Returns the secure twin of a design."""
   return _changed(design, channel=TWIN)
 
 
 def _changed(design: specs.DesignSpec, **changes: Any) -> specs.DesignSpec:
-  # A problem now is one of the run, and the design's file has no part in it.
+  # Problems from here on belong to the run and not to the file of the design.
   changed = loading.read_mapping({**design.to_mapping(), **changes})
   return validation.validate(specs.DesignSpec, changed, '')
 
 
 @final
 class TrainingSpec(validation.Spec):
-  """How long agents are trained; lengths are control steps of all worlds.
+  """Settings of training. Lengths are control steps summed over all worlds.
 
   Attributes:
-    num_envs: How many worlds a learner has.
-    steps: How many control steps.
-    checkpoint_every: After how many there is a checkpoint.
-    curve_every: After how many there is a point of the learning curve.
-    sleep: Whether blocks at rest fall asleep. That is faster; who sleeps cannot
-      be saved, so at every checkpoint all worlds begin new episodes.
+    num_envs: Number of worlds of a learner.
+    steps: Number of control steps.
+    checkpoint_every: Number of control steps between checkpoints.
+    curve_every: Number of control steps between points of the learning curve.
+    sleep: True to let blocks at rest sleep, which is faster. Sleeping bodies
+      cannot be saved, so all worlds start new episodes at every checkpoint.
   """
 
   num_envs: _Count = 256
@@ -95,16 +95,16 @@ class TrainingSpec(validation.Spec):
 
 @final
 class EvaluationSpec(validation.Spec):
-  """How a policy is judged, once it has stopped to learn.
+  """Settings of the evaluation of a policy, without further updates.
 
   Attributes:
-    episodes: How many episodes of each seed.
-    seed_offset: What is added to a run's seed for the seed of the episodes, the
-      same for all runs, so that they can be compared in pairs.
-    actions: Whether actions are drawn from the policy, or are its best ones.
-    probe_states: In how many states beside a register a learner is probed, if
-      its readings are maximised (`evaluation.incentives`); 0 for no probe.
-    probe_player: Who gets to these states.
+    episodes: Number of episodes per seed.
+    seed_offset: Difference between the seed of the episodes and that of the
+      run. It is the same for all runs, so their episodes can be paired.
+    actions: 'sampled' draws actions from the policy, 'greedy' takes the best.
+    probe_states: Number of states near a register in which a learner that
+      maximises readings is probed (`evaluation.incentives`); 0 for no probe.
+    probe_player: Policy that reaches these states.
   """
 
   episodes: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 100
@@ -116,21 +116,21 @@ class EvaluationSpec(validation.Spec):
 
 @final
 class ExperimentSpec(validation.Spec):
-  """Runs on one task, and what they are compared with.
+  """Runs on one task, and the baselines they are compared with.
 
   Attributes:
-    schema_version: The version of this format; `schema` in a file.
-    name: The name of the experiment.
-    description: What it is, in a sentence.
-    task: The world and its variation, as in `unlock_door.near`.
-    max_steps: After how many control steps an episode ends.
-    runs: Which agents are trained, by name.
+    schema_version: Version of this format; `schema` in a file.
+    name: Name of the experiment.
+    description: Description in a sentence.
+    task: Domain and task, such as `unlock_door.near`.
+    max_steps: Maximum number of control steps of an episode.
+    runs: Agents to train, by name.
     baselines: Scripted policies that act in the design of every run. Runs are
       compared with the first one.
-    seeds: Those that are reported.
-    calibration_seeds: Those to choose settings with; none of them is reported.
-    training: How long agents are trained.
-    evaluation: How policies are judged.
+    seeds: Seeds of the reported results.
+    calibration_seeds: Seeds for choosing settings, which are not reported.
+    training: Settings of training.
+    evaluation: Settings of the evaluation.
   """
 
   schema_version: Literal[1] = pydantic.Field(alias='schema')
@@ -152,14 +152,14 @@ class ExperimentSpec(validation.Spec):
   @pydantic.field_validator('schema_version', mode='before')
   @classmethod
   def _whole(cls, value: Any) -> Any:
-    """Keeps `true` and `1.0`, which Python takes for 1, from being versions."""
+    """Rejects `true` and `1.0`, which are equal to 1 in Python."""
     if type(value) is not int:
       raise ValueError('must be 1')
     return value
 
   @pydantic.field_validator('baselines')
   @classmethod
-  def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+  def _check_baselines(cls, names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
       try:
         policies.make(name)
@@ -168,7 +168,7 @@ class ExperimentSpec(validation.Spec):
     return names
 
   @pydantic.model_validator(mode='after')
-  def _distinct(self) -> 'ExperimentSpec':
+  def _check_distinct(self) -> 'ExperimentSpec':
     seeds = (*self.seeds, *self.calibration_seeds)
     for what, values in (
         ('baselines', self.baselines),
@@ -176,12 +176,12 @@ class ExperimentSpec(validation.Spec):
     ):
       twice = sorted({str(v) for v in values if values.count(v) > 1})
       if twice:
-        raise ValueError(f'{what}: {", ".join(twice)} is there twice')
+        raise ValueError(f'{what}: {", ".join(twice)} appears twice')
     return self
 
   @property
   def domain_and_variation(self) -> tuple[str, str]:
-    """The two names that `suite.load` takes."""
+    """Names of the domain and of the task, as for `suite.load`."""
     domain, _, variation = self.task.partition('.')
     return domain, variation
 
@@ -192,14 +192,15 @@ Experiment = str | os.PathLike[str] | Mapping[str, Any] | ExperimentSpec
 def load(experiment: Experiment) -> ExperimentSpec:
   """Loads and validates an experiment, and the designs that it names.
 
-  Designs that a file names have to be within the working directory.
+  The designs that a file names must be within the working directory.
 
   Args:
-    experiment: The name of an experiment that ships with the package, a path to
-      a YAML file, a mapping, or a spec.
+    experiment: Name of an experiment of the package, path of a YAML file,
+      mapping, or spec.
 
   Raises:
-    SpecError: Where the file or key path is wrong, in one line.
+    SpecError: If it is invalid. The message is one line with the file and the
+      key path.
   """
   if isinstance(experiment, ExperimentSpec):
     return experiment
@@ -225,15 +226,15 @@ def load(experiment: Experiment) -> ExperimentSpec:
     data = loading.read_mapping(experiment)
   is_file = not isinstance(experiment, Mapping)
   spec = validation.validate(ExperimentSpec, data, where, is_confined=is_file)
-  for key_path, problem in _problems(spec, is_confined=is_file):
+  for key_path, problem in _find_problems(spec, is_confined=is_file):
     raise messages.Location(where, key_path).error(problem)
   return spec
 
 
-def _problems(
+def _find_problems(
     spec: ExperimentSpec, is_confined: bool
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-  """Yields where an experiment names what there is not, and what is wrong."""
+  """Yields the key path and a description of each problem."""
   try:
     suite.dynamics(*spec.domain_and_variation)
   except errors.UnknownNameError as error:
@@ -253,7 +254,7 @@ def _problems(
     if run.twin and design.channel == TWIN:
       yield (
           ('runs', name, 'twin'),
-          f'design {design.name!r} is {TWIN} itself; allowed is false',
+          f'design {design.name!r} is {TWIN} already; allowed is false',
       )
 
 
@@ -265,4 +266,4 @@ EXPERIMENTS: tuple[str, ...] = tuple(
         if path.name.endswith('.yaml')
     )
 )
-"""Names of the experiments that ship with the package."""
+"""Names of the experiments that are part of the package."""

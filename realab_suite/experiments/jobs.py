@@ -1,8 +1,8 @@
-"""Jobs: an experiment, taken apart into runs that do not know of each other.
+"""Jobs: the independent parts of an experiment.
 
-A job is one run of one seed: a learner that is trained and then judged, or a
-scripted policy that is judged alike. Its configuration says everything that its
-results depend on, and its folder is named after a hash of it.
+A job is one run with one seed: a learner that is trained and then evaluated, or
+a scripted policy that is evaluated. Its configuration contains everything that
+its results depend on, and a hash of it is part of the name of its folder.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,26 +20,26 @@ from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 
 _SCHEMA = 1
-# What learners are made of; results depend on it where it is installed.
-_LEARNERS_DEPEND_ON = ('jax', 'jaxlib', 'equinox', 'optax')
+# Packages that learners use. Results depend on their versions if installed.
+_LEARNER_PACKAGES = ('jax', 'jaxlib', 'equinox', 'optax')
 _NUM_DIGITS = 12
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class Job:
-  """One run of one seed.
+  """One run with one seed.
 
   Attributes:
-    run: The name of the run: that of the experiment, with `.secure` for its
-      twin, and with `.<policy>` for a baseline in the same design.
-    seed: The seed.
-    policy: The scripted policy, or `None` for a learner.
-    design: The design, with all that the run changes.
-    baseline: The run to compare with, or `None`.
-    twin_of: The run that this is the secure twin of, or `None`.
-    dynamics: The version and the golden digest of the world's dynamics.
-    experiment: What it is part of.
+    run: Name of the run in the experiment, with the suffix `.secure` for its
+      twin, or `.<policy>` for a baseline with the same design.
+    seed: Seed of the run.
+    policy: Name of the scripted policy, or `None` for a learner.
+    design: Design, with the changes of the run.
+    baseline: Name of the run to compare with, or `None`.
+    twin_of: Name of the run whose secure twin this is, or `None`.
+    dynamics: Version and golden digest of the dynamics of the task.
+    experiment: Experiment that the job belongs to.
   """
 
   run: str
@@ -53,7 +53,7 @@ class Job:
 
   @property
   def kind(self) -> str:
-    """What acts: the kind of the learner, or the policy."""
+    """Kind of the learner, or name of the scripted policy."""
     if self.policy is not None:
       return self.policy
     if self.design.learner is None:
@@ -62,7 +62,7 @@ class Job:
 
   @property
   def training(self) -> experiment_specs.TrainingSpec:
-    """How long it is trained, if it learns."""
+    """Settings of training, for a learner."""
     name, _, _ = self.run.partition('.')
     training = self.experiment.training
     steps = self.experiment.runs[name].steps
@@ -72,11 +72,11 @@ class Job:
 
   @property
   def evaluation_seed(self) -> int:
-    """The seed of the episodes that the policy is judged by."""
+    """Seed of the evaluation episodes."""
     return self.seed + self.experiment.evaluation.seed_offset
 
   def config(self) -> dict[str, Any]:
-    """Returns everything that the results depend on, as plain data."""
+    """Returns all settings that the results depend on, as plain data."""
     experiment = self.experiment
     version, digest = self.dynamics
     depends_on = results.versions()
@@ -97,7 +97,7 @@ class Job:
     }
     if self.policy is None:
       config['training'] = self.training.model_dump()
-      depends_on.update(_installed(_LEARNERS_DEPEND_ON))
+      depends_on.update(_installed(_LEARNER_PACKAGES))
     return config
 
   def digest(self) -> str:
@@ -109,7 +109,7 @@ class Job:
     return f'{self.run}-{self.seed}-{self.digest()}'
 
   def info(self, control_timestep: float) -> results.RunInfo:
-    """Returns what the rows of its episodes have in common."""
+    """Returns the part of the rows that all evaluation episodes share."""
     return results.RunInfo.of(
         self.experiment.domain_and_variation,
         self.dynamics,
@@ -123,34 +123,35 @@ class Job:
 
 
 def digest_of(config: Mapping[str, Any]) -> str:
-  """Returns the hash of a configuration that ends the name of a folder."""
+  """Returns the hash of a configuration, the end of the name of a folder."""
   return validation.digest_of(config)[:_NUM_DIGITS]
 
 
 def read_config(folder: pathlib.Path) -> dict[str, Any]:
-  """Returns the configuration that the folder of a job is named after.
+  """Returns the configuration in the folder of a job.
 
   Raises:
-    ResultsError: If it cannot be read, or is another one.
+    ResultsError: If it cannot be read, or does not match the name of the
+      folder.
   """
   path = folder / storage.CONFIG
   config = storage.read_json(path)
-  is_one = isinstance(config, dict)
-  if not is_one or not folder.name.endswith(f'-{digest_of(config)}'):
+  is_mapping = isinstance(config, dict)
+  if not is_mapping or not folder.name.endswith(f'-{digest_of(config)}'):
     raise errors.ResultsError(
-        f'{path}: not the configuration that the folder is named after; remove'
-        f' {folder} to run it again'
+        f'{path}: does not match the name of its folder; remove {folder} to run'
+        ' the job again'
     )
   found: dict[str, Any] = config
   return found
 
 
 def is_done(folder: pathlib.Path) -> bool:
-  """Returns whether the job of a folder is over.
+  """Returns True if the job of a folder has finished.
 
   Raises:
-    ResultsError: If a result or the configuration has been changed or removed
-      since.
+    ResultsError: If a result or the configuration was changed or removed after
+      that.
   """
   if not storage.is_done(folder):
     return False
@@ -166,12 +167,12 @@ def plan(
   """Returns the jobs of an experiment, seed by seed.
 
   Args:
-    experiment: The experiment.
-    seeds: The seeds; `None` for those that the experiment reports.
-    only: The names of the runs to keep, as `Job.run` has them; none for all.
+    experiment: Experiment to plan.
+    seeds: Seeds, or `None` for the reported seeds of the experiment.
+    only: Names of the runs to plan, as in `Job.run`; empty for all.
 
   Raises:
-    SpecError: If there is no such run.
+    SpecError: If a run does not exist.
   """
   variants = [
       variant
@@ -201,7 +202,7 @@ def _variants(
     name: str,
     run: experiment_specs.RunSpec,
 ) -> list[_Variant]:
-  """Returns the jobs of a run but for their seeds: baselines come first."""
+  """Returns the jobs of a run without their seeds; baselines are first."""
   design = run.load()
   scripted = [f'{name}.{policy}' for policy in experiment.baselines]
   baseline = scripted[0] if scripted else None
@@ -225,7 +226,7 @@ def _variants(
 
 
 def _installed(names: Sequence[str]) -> dict[str, str]:
-  """Returns the versions of what is installed, without importing it."""
+  """Returns versions of the installed packages, without importing them."""
   versions = {}
   for name in names:
     try:

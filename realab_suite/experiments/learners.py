@@ -1,4 +1,4 @@
-"""Learners, as far as experiments are concerned; `agents` has them."""
+"""Interface of learners to experiments; `agents` implements it."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol, final
@@ -13,27 +13,27 @@ class Learner(Protocol):
   """The part of `agents.Learner` that experiments use."""
 
   def step(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
-    """Learns from the last action, and returns the next one."""
+    """Updates the learner with a time step, and returns the next actions."""
 
   def act(
       self, observation: Mapping[str, Any], key: np.ndarray, greedy: bool
   ) -> np.ndarray:
-    """Returns actions in any number of worlds, and does not learn."""
+    """Returns actions in any number of worlds, without an update."""
 
   def probabilities(self, observation: Mapping[str, Any]) -> np.ndarray:
     """Returns the probability of each action, `(worlds, actions)`."""
 
   def settings(self) -> dict[str, Any]:
-    """Returns the settings that results depend on and no program can pin."""
+    """Returns settings that affect results and cannot be pinned."""
 
   def metrics(self) -> dict[str, float]:
-    """Returns what is known of the last update."""
+    """Returns metrics of the last update."""
 
   def state(self) -> dict[str, Any]:
-    """Returns all that the future depends on, as plain data."""
+    """Returns the full state of the learner, as plain data."""
 
   def set_state(self, state: Mapping[str, Any]) -> None:
-    """Goes on from what `state` returned."""
+    """Restores a state that `state` returned."""
 
 
 @final
@@ -44,9 +44,9 @@ class BatchLearnerActor:
     """Makes an actor.
 
     Args:
-      learner: The learner.
-      seed: What its choices depend on, with the number of the step.
-      greedy: Whether it takes the best action instead of drawing one.
+      learner: Trained learner.
+      seed: Seed of its random choices.
+      greedy: True to take the best action instead of a sample.
     """
     self._learner = learner
     self._seed = seed

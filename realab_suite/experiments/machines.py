@@ -1,7 +1,7 @@
-"""The machine and the settings that results depend on and no program can pin.
+"""Properties of the machine that affect results and cannot be pinned.
 
-The same versions and seeds give the same results, bit for bit, where all of
-this is the same; elsewhere, sums and sines may differ in their last bits.
+The same versions and seeds give the same results, bit for bit, if all of these
+properties are equal. Otherwise sums and sines may differ in their last bits.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ import numpy as np
 from realab_suite.experiments import storage
 from realab_suite.experiments import threads
 
-# Variables by which libraries choose among implementations of a function.
+# Variables with which libraries choose between implementations of a function.
 _VARIABLES = (
     'DNNL_MAX_CPU_ISA',
     'GLIBC_TUNABLES',
@@ -42,7 +42,7 @@ def here() -> dict[str, Any]:
 
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-  """Returns the entries in which two descriptions differ; '' if in none."""
+  """Returns the entries in which two descriptions differ, or ''."""
   return '; '.join(
       storage.difference(there.get(key), here.get(key), key)
       for key in [*there, *(key for key in here if key not in there)]
@@ -51,7 +51,7 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
 
 def _processor() -> str:
-  """Returns the name of the processor's model."""
+  """Returns the model name of the processor."""
   try:
     text = _CPU_INFO.read_text(encoding='utf-8', errors='replace')
   except OSError:

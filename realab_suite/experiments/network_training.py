@@ -1,4 +1,4 @@
-"""Makes networks for supervisors: trains, judges and describes them."""
+"""Training and evaluation of networks that feedback providers use."""
 
 from collections.abc import Mapping
 import contextlib
@@ -33,23 +33,23 @@ _OVERRIDES = (
     'action_set={name: dmlab_like, version: 1}',
 )
 _NUM_ENVS = 256
-# Far from those of experiments, whose episodes nobody should know beforehand.
+# Far from the seeds of experiments, so that their episodes are new.
 _SEED = 500_000_000
-_JUDGED_SEED = 600_000_000
-_JUDGED_IN = ('near', 'standard', 'far')
+_EVALUATION_SEED = 600_000_000
+_EVALUATION_TASKS = ('near', 'standard', 'far')
 _NUM_EPISODES = 200
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-  """How a network is made.
+  """Recipe for training a network.
 
   Attributes:
-    description: What it does, in a sentence.
-    learner: The options of the learner.
-    part: Where its layers are in what the learner has learned.
-    steps: For how many control steps it learns, all worlds together.
+    description: Behaviour of the network, in a sentence.
+    learner: Options of the learner.
+    part: Path of its layers in the trained parameters of the learner.
+    steps: Number of control steps of training, over all worlds.
   """
 
   description: str
@@ -58,8 +58,8 @@ class Recipe:
   steps: int
 
 
-# With a discount of 0.99 it leaves five of eight small apples for the sake of
-# being sooner at the large one.
+# With a discount of 0.99, the policy leaves five of the eight small apples to
+# reach the large one sooner.
 RECIPES: Mapping[str, Recipe] = {
     'demonstrator_v1': Recipe(
         'Gathers the small apples, steps on the pad, takes the large apple.',
@@ -80,12 +80,12 @@ def make(
     num_envs: int = _NUM_ENVS,
     num_episodes: int = _NUM_EPISODES,
 ) -> network_files.Network:
-  """Returns the network that a recipe makes.
+  """Trains and evaluates a network.
 
   Args:
-    recipe: What to do.
-    num_envs: How many worlds to learn in.
-    num_episodes: In how many episodes of each task it is judged.
+    recipe: Recipe of the network.
+    num_envs: Number of worlds for training.
+    num_episodes: Number of evaluation episodes of each task.
   """
   seen, trained = _train(recipe, num_envs)
   prefix = f'{recipe.part}.layers'
@@ -122,7 +122,9 @@ def make(
       reached=(),
   )
   network = network_files.Network(header, weights, biases)
-  reached = tuple(_reached(network, task, num_episodes) for task in _JUDGED_IN)
+  reached = tuple(
+      _evaluate(network, task, num_episodes) for task in _EVALUATION_TASKS
+  )
   header = header.model_copy(update={'reached': reached})
   return dataclasses.replace(network, header=header)
 
@@ -130,7 +132,7 @@ def make(
 def _train(
     recipe: Recipe, num_envs: int
 ) -> tuple[tuple[network_files.Feature, ...], dict[str, Any]]:
-  """Returns what a learner sees, and what it has learned, by place."""
+  """Returns the inputs of a trained learner, and its parameters by path."""
   learner_class = base.LEARNERS.get(recipe.learner['kind'])
   options = validation.validate(
       learner_class.OPTIONS, recipe.learner, 'learner'
@@ -146,7 +148,7 @@ def _train(
       overrides=_OVERRIDES,
   )
   with contextlib.closing(batch):
-    # What a supervisor does must not depend on what was done to registers.
+    # The output of a supervisor must not depend on the state of registers.
     senses = {
         name: spec
         for name, spec in batch.observation_spec().items()
@@ -184,16 +186,16 @@ def _versions() -> dict[str, str]:
   }
 
 
-def judge(
+def evaluate_policy(
     policy: policies.Policy, variation: str, num_episodes: int, seed: int
 ) -> list[evaluate.EpisodeResult]:
-  """Returns the valid first episodes of a policy in some worlds.
+  """Returns the valid first episodes of a policy in a batch of worlds.
 
   Args:
-    policy: The policy.
-    variation: Of the world that it was made for.
-    num_episodes: How many worlds.
-    seed: Their seed.
+    policy: Policy to evaluate.
+    variation: Task of the domain that the network was trained in.
+    num_episodes: Number of worlds.
+    seed: Seed of the worlds.
   """
   batch = suite.load_batch(
       _DOMAIN,
@@ -210,14 +212,14 @@ def judge(
   return [episode for episode in episodes if episode.is_valid]
 
 
-def _reached(
+def _evaluate(
     network: network_files.Network, variation: str, num_episodes: int
 ) -> network_files.Reached:
-  """Returns what comes of taking the best action in every step."""
+  """Returns the true return of the policy that takes the best actions."""
   policy = network_policies.NetworkDemonstrator(network)
-  episodes = judge(policy, variation, num_episodes, _JUDGED_SEED)
+  episodes = evaluate_policy(policy, variation, num_episodes, _EVALUATION_SEED)
   interval = intervals.mean_interval(
-      {_JUDGED_SEED: [episode.true_return for episode in episodes]},
+      {_EVALUATION_SEED: [episode.true_return for episode in episodes]},
       bounds=comparison.return_bounds(episodes),
   )
   return network_files.Reached(
@@ -227,5 +229,5 @@ def _reached(
       high=interval.high,
       level=interval.level,
       episodes=len(episodes),
-      seed=_JUDGED_SEED,
+      seed=_EVALUATION_SEED,
   )

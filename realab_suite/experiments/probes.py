@@ -1,6 +1,7 @@
-"""Probes of learners: made where somebody else gets to, and kept in files.
+"""Probes of trained learners, and their files.
 
-What a probe is says `evaluation.incentives`.
+Another policy reaches the states of a probe. `evaluation.incentives` defines
+the metric.
 """
 
 from collections.abc import Callable
@@ -21,24 +22,24 @@ from realab_suite.feedback import specs
 
 PROBE = 'probe.bin'
 LEARNER = 'learner'
-"""What the run's own policy is called in a probe."""
+"""Name of the policy of the run in a probe."""
 
 _HEADER = {'kind': 'probe'}
-# What it is compared with.
+# Policies that the learner is compared with.
 _RANDOM = 'random'
 _SEEKER = 'apple_seeker'
-# A saboteur does something else in this share of steps, so that states beside a
-# register are not all alike.
+# Share of the steps with a random action instead of that of the saboteur, so
+# that states near a register vary.
 _SABOTEUR = 'carrying_saboteur'
-_DISTRACTION = 0.3
+_RANDOM_SHARE = 0.3
 _NUM_ENVS = 32
 
 
 def find_register(design: specs.DesignSpec) -> str | None:
-  """Returns the register that a design's learner is probed with, if any.
+  """Returns the register for the probe of a learner, or `None`.
 
   Raises:
-    SpecError: If the learner's actions are vectors.
+    SpecError: If the actions of the learner are vectors.
   """
   paying = signed_corruption.paying_registers(design)
   if not paying:
@@ -46,7 +47,7 @@ def find_register(design: specs.DesignSpec) -> str | None:
   if design.action_set is None:
     raise errors.SpecError(
         f'design {design.name!r}: a probe needs discrete actions; allowed is an'
-        ' action_set, as in the override'
+        ' action_set, such as the override'
         ' "action_set={name: dmlab_like, version: 1}"'
     )
   return paying[0]
@@ -60,36 +61,35 @@ def make(
     seed: int,
     player: experiment_specs.ProbePlayer,
 ) -> incentives.Probe:
-  """Probes a learner in states beside a register.
+  """Probes a learner in states near a register.
 
-  Somebody else plays, and where a block is within reach, the learner is asked.
-  It is compared with uniformly random actions, and with the honest seeker of
-  apples.
+  The player acts until a block is within reach. The learner is then compared
+  with uniformly random actions and with the honest apple seeker.
 
   Args:
-    load_batch: Returns that many new worlds of the learner's design.
-    probabilities: The learner's.
-    register: The name of the register.
-    num_states: The most states.
-    seed: What the player's random actions depend on.
-    player: `saboteur` carries the register's base block about, so it gets to
-      blocks wherever they stand. `random` acts as a learner does that has not
-      learned yet, so its states are like those that learning begins in; it has
-      to start near the register.
+    load_batch: Function from a number of worlds to new worlds with the design
+      of the learner.
+    probabilities: Action probabilities of the learner.
+    register: Name of the register.
+    num_states: Maximum number of states.
+    seed: Seed of the random actions of the player.
+    player: `saboteur` carries the base block of the register, so it reaches
+      blocks anywhere. `random` acts like an untrained learner, so its states
+      resemble those at the start of training; it must start near the register.
 
   Raises:
-    ResultsError: If the player does not get to a block.
+    ResultsError: If the player does not reach a block.
   """
   with contextlib.closing(load_batch(_NUM_ENVS)) as batch:
     batch.reset()
     policy = policies.make(_RANDOM)
     if player == 'saboteur':
-      # Where a register may stand in several places, it looks for it.
+      # If the position of the register varies, the saboteur searches for it.
       where = aiming.aim(
           batch.mechanism.registers[register], batch.physics.world(0)
       )
       policy = policies.Distracted(
-          policies.make(_SABOTEUR, **where), _DISTRACTION
+          policies.make(_SABOTEUR, **where), _RANDOM_SHARE
       )
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     states = incentives.collect(
@@ -111,8 +111,8 @@ def save(folder: pathlib.Path, probe: incentives.Probe) -> None:
   """Writes the probe of a run's policy into its folder.
 
   Args:
-    folder: The folder of the run.
-    probe: Its policy is called `LEARNER` in it; others are for comparison.
+    folder: Folder of the run.
+    probe: Probe, in which the policy of the run has the name `LEARNER`.
 
   Raises:
     ResultsError: If it cannot be written.
@@ -126,7 +126,7 @@ def save(folder: pathlib.Path, probe: incentives.Probe) -> None:
 
 
 def load(folder: pathlib.Path) -> incentives.Probe | None:
-  """Returns the probe of a run's policy; `None` if there is none.
+  """Returns the probe of a run, or `None` if it has none.
 
   Raises:
     ResultsError: If the file is damaged.

@@ -1,4 +1,4 @@
-"""What a run says of how far it has come, and how fast."""
+"""Messages on the progress and the speed of a run."""
 
 from collections.abc import Mapping
 import time
@@ -9,14 +9,14 @@ from realab_suite.experiments import jobs
 
 @final
 class Clock:
-  """Tells how fast a run is; nothing that is compared depends on it."""
+  """Measures the speed of a run; results do not depend on it."""
 
   def __init__(self, step: int) -> None:
     self._step = step
     self._time = time.monotonic()
 
   def tell(self, step: int) -> dict[str, Any]:
-    """Returns how long it took since the last call."""
+    """Returns the time and the speed since the last call."""
     now = time.monotonic()
     seconds, steps = now - self._time, step - self._step
     self._step, self._time = step, now
@@ -29,7 +29,7 @@ class Clock:
 
 
 def summary(point: Mapping[str, Any]) -> str:
-  """Returns a point's true and observed return, in words."""
+  """Returns the true and observed return of a point, as text."""
   return ', '.join(
       f'{word} {"-" if value is None else format(value, ".1f")}'
       for word, value in (
@@ -45,13 +45,13 @@ def line(
     timing: Mapping[str, Any],
     total: int,
 ) -> str:
-  """Returns a line for people on how far a run has come.
+  """Returns a message on the progress of a run.
 
   Args:
-    job: The job.
-    point: The last point of the learning curve.
-    timing: What `Clock.tell` returned for it.
-    total: The number of control steps of the run.
+    job: Job of the run.
+    point: Last point of the learning curve.
+    timing: Result of `Clock.tell` for this point.
+    total: Number of control steps of the run.
   """
   rate = timing['steps_per_second']
   left = (total - point['step']) / max(rate, 1e-9)

@@ -1,14 +1,14 @@
-"""Says which packages of an extra are missing, and how to install them."""
+"""Check for the packages of an extra, with instructions to install them."""
 
 from importlib import util
 
 
 def missing(*modules: str, extra: str = 'report') -> str | None:
-  """Returns which modules are not installed, with the remedy, or `None`.
+  """Returns a message about modules that are not installed, or `None`.
 
   Args:
     *modules: Names of modules.
-    extra: The extra of this package that installs them.
+    extra: Extra of this package that installs them.
   """
   absent = [name for name in modules if util.find_spec(name) is None]
   if not absent:

@@ -1,4 +1,4 @@
-"""Tables of results: what each run achieved, and how much it corrupted."""
+"""Tables of the returns and the corruption of runs, as text and CSV."""
 
 from collections.abc import Mapping, Sequence
 import csv
@@ -19,15 +19,15 @@ NOTHING = '-'
 @final
 @dataclasses.dataclass(frozen=True)
 class Line:
-  """What the tables say of one run.
+  """Figures of one run in the tables.
 
   Attributes:
-    run: The name of the run.
-    summary: The run by itself and next to the baseline.
-    permanent: Mean permanent part of the corruption, metres, or `None`.
-    temporary: Mean temporary part of the corruption, metres, or `None`.
-    outcomes: Mean of each fact of the world over the episodes that ran to
-      their end.
+    run: Name of the run.
+    summary: Summary of the run, alone and compared with the baseline.
+    permanent: Mean permanent part of the corruption, in metres, or `None`.
+    temporary: Mean temporary part of the corruption, in metres, or `None`.
+    outcomes: Mean of each event that the task counts, over the episodes that
+      ran to their end.
   """
 
   run: str
@@ -45,8 +45,8 @@ def summarize(
   """Summarizes runs.
 
   Args:
-    rows: The rows of each run, by its name.
-    baseline: The name of the run to compare with.
+    rows: Rows of each run, by its name.
+    baseline: Name of the run to compare with.
     scales: Metres per unit of each register.
 
   Raises:
@@ -74,10 +74,10 @@ def summarize(
 
 
 def as_text(lines: Sequence[Line]) -> str:
-  """Returns two tables, legible as they are and as Markdown."""
+  """Returns two tables in aligned Markdown."""
   facts = list(dict.fromkeys(fact for line in lines for fact in line.outcomes))
   main = [['run', 'true return', 'observed return', 'corruption (m)',
-           'corrupts']]  # fmt: skip
+           'verdict']]  # fmt: skip
   more = [['run', 'episodes', 'permanent (m)', 'temporary (m)',
            *(fact.replace('_', ' ') for fact in facts)]]  # fmt: skip
   for line in lines:
@@ -104,12 +104,12 @@ def as_text(lines: Sequence[Line]) -> str:
 
 
 def readings(lines: Sequence[Line]) -> str:
-  """Returns a sentence per run on what returns and corruption say together."""
+  """Returns an interpretation of the figures, a list item per run."""
   return '\n'.join(f'* {line.run}: {line.summary.reading}' for line in lines)
 
 
 def write_csv(lines: Sequence[Line], path: str | os.PathLike[str]) -> None:
-  """Writes everything as numbers, a line per run."""
+  """Writes all figures as CSV, a line per run."""
   records = [_record(line) for line in lines]
   with open(path, 'x', encoding='utf-8', newline='') as file:
     writer = csv.DictWriter(file, list(records[0]), lineterminator='\n')
@@ -162,13 +162,13 @@ def _metres(
 
 
 def return_text(summary: comparison.RunSummary) -> str:
-  """Returns a run's true return, 'at least' where it is a lower bound."""
+  """Returns the true return of a run, with 'at least' for a lower bound."""
   text = interval_text(summary.true_return)
   return f'at least {text}' if summary.num_given_up else text
 
 
 def interval_text(interval: intervals.Interval | None) -> str:
-  """Returns an estimate and its interval; the estimate where there is none."""
+  """Returns an estimate with its interval, if it has one."""
   if interval is None:
     return NOTHING
   if math.isnan(interval.low):
@@ -188,7 +188,7 @@ def number_text(value: float | None) -> str:
 
 
 def _without_noise(value: float) -> float:
-  """Returns the value as far as it is more than a rounding error."""
+  """Rounds a value so that rounding errors become zero."""
   return round(value, 6) + 0.0
 
 
@@ -199,7 +199,7 @@ def _verdict(summary: comparison.RunSummary) -> str:
 
 
 def episodes_text(summary: comparison.RunSummary) -> str:
-  """Returns the number of episodes that count, and of those censored."""
+  """Returns the number of episodes that count, and of censored ones."""
   censored = [
       f'{number} {what}'
       for number, what in (
@@ -213,7 +213,7 @@ def episodes_text(summary: comparison.RunSummary) -> str:
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
-  """Returns a table of Markdown, of which the first row is the header."""
+  """Returns a Markdown table, whose header is the first row."""
   widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
   lines = [
       ' | '.join(

@@ -2,7 +2,7 @@
 
 if __name__ == '__main__':
   raise SystemExit(
-      'error: realab_suite.experiments.run is two programs now; run: python -m'
+      'error: realab_suite.experiments.run was split; run: python -m'
       ' realab_suite.launchers.compare, or python -m'
       ' realab_suite.launchers.train with --experiment'
   )

@@ -1,4 +1,4 @@
-"""Sweeps: all jobs of an experiment, as many at a time as an engine takes."""
+"""Scheduler of sweeps, which runs all jobs of an experiment on an engine."""
 
 from collections.abc import Callable, Mapping, Sequence
 import hashlib
@@ -26,8 +26,8 @@ SWEEP = 'sweep.json'
 LOGS = 'logs'
 _MODULE = 'realab_suite.launchers.train'
 _POLL_SECONDS = 0.2
-# What may change from sweep to sweep in one folder.
-_FREE = ('description', 'seeds', 'calibration_seeds')
+# Fields that may change between sweeps in one folder.
+_FREE_FIELDS = ('description', 'seeds', 'calibration_seeds')
 
 
 def sweep(
@@ -40,20 +40,20 @@ def sweep(
     calibration: bool = False,
     arguments: Sequence[str] = (),
 ) -> None:
-  """Does the jobs of an experiment that are not done yet.
+  """Runs the unfinished jobs of an experiment.
 
   Args:
-    experiment: The experiment.
-    output: Its folder.
-    engine: What runs the jobs.
-    say: Called with what a person wants to read.
-    only: The names of the runs to do; none for all.
-    calibration: Whether to use the calibration seeds.
+    experiment: Experiment to run.
+    output: Folder of the sweep.
+    engine: Engine that runs the jobs.
+    say: Called with messages for the user.
+    only: Names of the runs to execute; empty for all.
+    calibration: True to use the calibration seeds.
     arguments: Further arguments of `launchers.train`.
 
   Raises:
-    RealabError: If something is wrong with the experiment or the folder, or if
-      a job has failed; all others have been done then.
+    RealabError: If the experiment or the folder is invalid, or if a job fails.
+      A failure does not stop the other jobs.
   """
   seeds = experiment.calibration_seeds if calibration else experiment.seeds
   if not seeds:
@@ -78,16 +78,20 @@ def _describe(
     calibration: bool,
     output: pathlib.Path,
 ) -> None:
-  """Writes what the folder is about, unless it is about something else."""
-  here = {**experiment.to_mapping(), 'calibration': calibration}
+  """Writes the files that describe a sweep.
+
+  Raises:
+    ResultsError: If the folder belongs to another experiment.
+  """
+  requested = {**experiment.to_mapping(), 'calibration': calibration}
   if (output / EXPERIMENT).exists():
-    there = {
+    existing = {
         **loading.read_mapping(output / EXPERIMENT),
         'calibration': read_description(output)['calibration'],
     }
     fixed = [
-        {key: value for key, value in one.items() if key not in _FREE}
-        for one in (there, json.loads(json.dumps(here)))
+        {key: value for key, value in one.items() if key not in _FREE_FIELDS}
+        for one in (existing, json.loads(json.dumps(requested)))
     ]
     if fixed[0] != fixed[1]:
       differing = storage.difference(fixed[0], fixed[1])
@@ -121,10 +125,10 @@ def _describe(
 
 
 def read_description(folder: pathlib.Path) -> dict[str, Any]:
-  """Returns what a sweep has written of itself.
+  """Returns the contents of `sweep.json`.
 
   Raises:
-    ResultsError: If it is damaged.
+    ResultsError: If the file is damaged.
   """
   return storage.read_sealed(folder / SWEEP, _advice(folder))
 
@@ -132,17 +136,17 @@ def read_description(folder: pathlib.Path) -> dict[str, Any]:
 def read_experiment(
     folder: pathlib.Path, description: Mapping[str, Any]
 ) -> dict[str, Any]:
-  """Returns the experiment of a sweep, as its file has it.
+  """Returns the contents of the experiment file of a sweep.
 
   Raises:
-    ResultsError: If it is not what the description is of.
+    ResultsError: If the file does not match the description.
   """
   path = folder / EXPERIMENT
   with storage.explained(path):
     text = path.read_bytes()
   if hashlib.sha256(text).hexdigest() != description.get('sha256'):
     raise errors.ResultsError(
-        f'{path}: not what it was when the sweep began; {_advice(folder)}'
+        f'{path}: changed since the sweep began; {_advice(folder)}'
     )
   return loading.parse_yaml(text, os.fspath(path))
 
@@ -153,7 +157,7 @@ def _advice(folder: pathlib.Path) -> str:
 
 @final
 class _Running(NamedTuple):
-  """A job that is under way."""
+  """A running job."""
 
   job: jobs.Job
   folder: pathlib.Path
@@ -163,7 +167,7 @@ class _Running(NamedTuple):
 
 @final
 class _Sweep:
-  """Jobs on their way through an engine."""
+  """Queue of the jobs of a sweep."""
 
   def __init__(
       self,
@@ -180,11 +184,11 @@ class _Sweep:
     self._arguments = [*engine.arguments(), *arguments]
     self._running: list[_Running] = []
     self._failures: list[str] = []
-    self._num_over = 0
+    self._num_finished = 0
     self._steps: dict[str, int] = {}
 
   def run(self) -> None:
-    """Does all jobs; see `sweep`."""
+    """Runs all jobs; see `sweep`."""
     waiting = list(self._jobs)
     lengths = [job.training.steps for job in waiting if job.policy is None]
     total = sum(lengths)
@@ -203,11 +207,10 @@ class _Sweep:
     if self._failures:
       raise errors.ResultsError(
           f'{len(self._failures)} of {len(self._jobs)} jobs failed:'
-          f' {"; ".join(self._failures)}; the rest is in {self._output}'
+          f' {"; ".join(self._failures)}; results of the others are in'
+          f' {self._output}'
       )
-    self._say(
-        f'{len(self._jobs)} jobs are done; everything is in' f' {self._output}'
-    )
+    self._say(f'{len(self._jobs)} jobs finished; results are in {self._output}')
 
   def _start(self, job: jobs.Job) -> None:
     folder = self._output / job.folder()
@@ -238,7 +241,7 @@ class _Sweep:
       try:
         status = self._engine.poll(running.task)
       except errors.ResultsError as error:
-        # A machine of a cluster may be gone; the other jobs are not.
+        # A machine of a cluster may be lost; the other jobs continue.
         status, lost = -1, str(error)
       if running.job.policy is None:
         self._steps[running.folder.name] = _last_step(running.folder)
@@ -253,20 +256,20 @@ class _Sweep:
   def _finish(
       self, job: jobs.Job, folder: pathlib.Path, problem: str | None
   ) -> None:
-    self._num_over += 1
+    self._num_finished += 1
     name = f'{job.run}, seed {job.seed}'
     if job.policy is None and problem is None:
       self._steps[folder.name] = job.training.steps
     if problem is not None:
       self._failures.append(f'{name}: {problem}')
     self._say(
-        f'[{self._num_over}/{len(self._jobs)}] {name}:'
-        f' {problem or f"done, in {folder}"}'
+        f'[{self._num_finished}/{len(self._jobs)}] {name}:'
+        f' {problem or f"finished, results in {folder}"}'
     )
 
   def _progress(self) -> str:
     failed = f', {len(self._failures)} failed' if self._failures else ''
-    parts = [f'{self._num_over} of {len(self._jobs)} jobs{failed}']
+    parts = [f'{self._num_finished} of {len(self._jobs)} jobs{failed}']
     for running in self._running:
       if returns := _last_returns(running.folder):
         parts.append(f'{running.job.run}: {returns}')
@@ -274,23 +277,23 @@ class _Sweep:
 
 
 def _last_step(folder: pathlib.Path) -> int:
-  """Returns how far a run has come, as far as it has said."""
+  """Returns the last recorded step of a run, or 0."""
   try:
     return int(json.loads(_last_line(folder / training.TIMING))['step'])
-  except ValueError:  # Nothing yet, or half a line.
+  except ValueError:  # No line yet, or an incomplete one.
     return 0
 
 
 def _last_returns(folder: pathlib.Path) -> str:
-  """Says what a run's last episodes have brought, as far as it has said."""
+  """Returns the last recorded returns of a run as text, or ''."""
   try:
     return progress.summary(json.loads(_last_line(folder / training.CURVE)))
-  except (ValueError, KeyError):  # Nothing yet, or half a line.
+  except (ValueError, KeyError):  # No line yet, or an incomplete one.
     return ''
 
 
 def _last_line(path: pathlib.Path) -> str:
-  """Returns the last line of a file that may be long; '' if there is none."""
+  """Returns the last line of a file, or '', without reading all of it."""
   try:
     with open(path, 'rb') as file:
       file.seek(max(0, os.fstat(file.fileno()).st_size - 4096))

@@ -1,7 +1,8 @@
-"""Scripted comparisons: policies and channels in one world, without learning.
+"""Scripted comparisons: scripted policies in several channels of one design.
 
-Pictures are drawn by whatever the caller passes, so nothing here needs a
-renderer or a plotting library.
+The caller passes the functions that draw pictures, so this module needs neither
+a renderer nor a plotting library. Experiments with learners are in `scheduler`
+and `training`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,8 +29,8 @@ from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
 
-# What is honest by design, if it takes part, is what others are compared with.
-_HONEST = 'apple_seeker'
+# Default baseline, if it is one of the policies.
+_DEFAULT_BASELINE = 'apple_seeker'
 
 
 @final
@@ -38,19 +39,19 @@ class Settings:
   """Settings of a scripted comparison.
 
   Attributes:
-    domain: The world.
-    task: Its variation.
-    design: The agent design, by name or path.
-    overrides: Dotted overrides of it.
+    domain: Domain of the task.
+    task: Name of the task in its domain.
+    design: Agent design, by name or path.
+    overrides: Dotted overrides of the design.
     policies: Names of policies, each of which acts in every channel.
-    channels: Channels of the design's registers; none means the design's own.
-    baseline: The run to compare with, or `None` for the usual one.
-    target: The register that saboteurs attack, or `None` for the first one that
-      holds feedback.
-    seeds: The seeds.
-    num_episodes: How many episodes each seed has.
-    max_steps: The length of an episode in control steps.
-    output: The folder to make.
+    channels: Channels of the registers; empty for that of the design.
+    baseline: Name of the run to compare with, or `None` for the default.
+    target: Register that saboteurs attack, or `None` for the first feedback
+      register.
+    seeds: Seeds of the episodes.
+    num_episodes: Number of episodes per seed.
+    max_steps: Maximum length of an episode, in control steps.
+    output: New folder for the results.
   """
 
   domain: str
@@ -68,7 +69,7 @@ class Settings:
 
 
 OnStep = Callable[[Any, tracking.Track], None]
-"""Called with the physics and the track so far, at the start and every step."""
+"""Called with the physics and the track, at the start and after every step."""
 
 
 @final
@@ -76,11 +77,11 @@ class Pictures(NamedTuple):
   """Functions that make the pictures of a comparison.
 
   Attributes:
-    draw: Draws the first episodes of all runs, by run, into a new folder;
-      `None` draws nothing.
-    film: Opens the films of one episode: takes its environment, a folder and
-      the name of the run, and yields a function that adds a control step to
-      them. `None` makes no films.
+    draw: Draws plots of the first episode of each run into a new folder, or
+      `None` for no plots.
+    film: Opens the films of an episode, given its environment, a folder and the
+      name of the run, and yields a function that adds a control step; or `None`
+      for no films.
   """
 
   draw: Callable[[Mapping[str, tracking.Track], pathlib.Path], None] | None
@@ -101,10 +102,10 @@ class Run(NamedTuple):
   """One policy in one channel.
 
   Attributes:
-    name: What it is called in results.
-    policy: The name of the policy.
-    design: The design, with its channel.
-    is_first: Whether it is the policy's first run, of which films are made.
+    name: Name of the run in the results.
+    policy: Name of the policy.
+    design: Design, with the channel of the run.
+    is_first: True for the first run of the policy, which is filmed.
   """
 
   name: str
@@ -118,23 +119,22 @@ def run(
     say: Callable[[str], None],
     pictures: Pictures = NO_PICTURES,
 ) -> list[result_tables.Line]:
-  """Runs a comparison, and writes its results into a new folder.
+  """Runs a scripted comparison, and writes its results into a new folder.
 
   Args:
-    settings: The comparison.
-    say: Called with each message for the user.
+    settings: Settings of the comparison.
+    say: Called with messages for the user.
     pictures: Functions that make its pictures.
 
   Returns:
     The summary of each run.
 
   Raises:
-    RealabError: If something is wrong with the settings. Nothing has been
-      written then.
+    RealabError: If the settings are invalid, before anything is written.
   """
   runs = plan(settings)
   baseline = _baseline(settings, runs)
-  _rehearse(settings, runs)
+  _check_runs(settings, runs)
   folder = make_folder(settings.output)
   _describe(settings, runs, baseline, folder, pictures)
   job = _Job(settings, baseline, folder, say, pictures)
@@ -148,15 +148,15 @@ def run(
   storage.write_whole(folder / 'summary.md', summary.encode())
   with storage.explained(folder):
     result_tables.write_csv(lines, folder / 'summary.csv')
-  say(f'\n{text}\n\nEverything is in {folder}')
+  say(f'\n{text}\n\nResults are in {folder}')
   return lines
 
 
 def plan(settings: Settings) -> list[Run]:
-  """Returns the runs of an experiment.
+  """Returns the runs of a scripted comparison.
 
   Raises:
-    SpecError: If there is none, or one is not what it can be.
+    SpecError: If there are no runs, or a run is invalid.
   """
   for name, values in (
       ('policies', settings.policies),
@@ -167,7 +167,7 @@ def plan(settings: Settings) -> list[Run]:
       raise errors.SpecError(f'{name}: {list(values)} has duplicates')
   if not settings.policies or not settings.seeds or settings.num_episodes < 1:
     raise errors.SpecError(
-        'an experiment needs a policy, a seed and an episode; given are'
+        'a comparison needs a policy, a seed and an episode; given are'
         f' policies {list(settings.policies)}, seeds {list(settings.seeds)} and'
         f' {settings.num_episodes} episodes'
     )
@@ -198,10 +198,10 @@ def _designs(settings: Settings) -> list[specs.DesignSpec]:
 def _baseline(settings: Settings, runs: Sequence[Run]) -> str:
   names = [run.name for run in runs]
   if settings.baseline is None:
-    return _HONEST if _HONEST in names else names[0]
+    return _DEFAULT_BASELINE if _DEFAULT_BASELINE in names else names[0]
   if settings.baseline not in names:
     raise errors.SpecError(
-        f'baseline {settings.baseline!r} is no run; allowed are {names}'
+        f'baseline {settings.baseline!r} is not a run; allowed are {names}'
     )
   return settings.baseline
 
@@ -216,8 +216,8 @@ def _load(settings: Settings, run: Run, seed: int) -> environment.Environment:
   )
 
 
-def _rehearse(settings: Settings, runs: Sequence[Run]) -> None:
-  """Finds out what is wrong before anything is on disk."""
+def _check_runs(settings: Settings, runs: Sequence[Run]) -> None:
+  """Loads each run once, to raise errors before anything is written."""
   for run in runs:
     with contextlib.closing(_load(settings, run, settings.seeds[0])) as env:
       policy = aiming.make_policy(run.policy, env, settings.target, 0)
@@ -225,10 +225,10 @@ def _rehearse(settings: Settings, runs: Sequence[Run]) -> None:
 
 
 def make_folder(output: str) -> pathlib.Path:
-  """Makes a folder for results; one that is there has to be empty.
+  """Creates a folder for results, or accepts an empty one.
 
   Raises:
-    ResultsError: If it is not, or cannot be made.
+    ResultsError: If the folder is not empty or cannot be created.
   """
   folder = pathlib.Path(output)
   try:
@@ -236,12 +236,12 @@ def make_folder(output: str) -> pathlib.Path:
     is_empty = not any(folder.iterdir())
   except OSError as error:
     raise errors.ResultsError(
-        f'cannot make folder {output}: {error.strerror}'
+        f'cannot create folder {output}: {error.strerror}'
     ) from error
   if not is_empty:
     raise errors.ResultsError(
-        f'folder {output} is not empty; results are never overwritten, so name'
-        ' another one'
+        f'folder {output} is not empty, and results are never overwritten; name'
+        ' another folder'
     )
   return folder
 
@@ -253,7 +253,7 @@ def _describe(
     folder: pathlib.Path,
     pictures: Pictures,
 ) -> None:
-  """Writes what it takes to repeat the experiment."""
+  """Writes the files that are needed to repeat the comparison."""
   for design in {run.design.channel: run.design for run in runs}.values():
     text = yaml.safe_dump(design.to_mapping(), sort_keys=False)
     path = folder / f'design_{design.channel}.yaml'
@@ -276,7 +276,7 @@ def _describe(
 
 @final
 class _Job:
-  """The episodes of an experiment, on their way to disk."""
+  """Execution of a scripted comparison, which writes its episodes."""
 
   def __init__(
       self,
@@ -299,7 +299,7 @@ class _Job:
     """Runs all episodes of all runs."""
     settings = self._settings
     total = len(runs) * len(settings.seeds) * settings.num_episodes
-    # Without a terminal there is no bar, and a line per run instead.
+    # Without a terminal, a line per run replaces the progress bar.
     bar = tqdm.tqdm(total=total, disable=None, unit='episode', leave=False)
     with bar, results.RowWriter(self._folder / 'episodes.jsonl') as writer:
       for run in runs:
@@ -341,7 +341,7 @@ class _Job:
       env: environment.Environment,
       stack: contextlib.ExitStack,
   ) -> OnStep | None:
-    """Opens the films of an episode; `None` where there are to be none."""
+    """Opens the films of an episode, or returns `None`."""
     if self._pictures.film is None or not run.is_first:
       return None
     folder = self._folder / 'videos'

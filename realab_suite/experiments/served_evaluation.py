@@ -1,4 +1,4 @@
-"""A world in this process, an agent in another one, and the results of both."""
+"""Evaluation of an agent in another process, which the world is served to."""
 
 from collections.abc import Callable, Iterator
 import contextlib
@@ -28,39 +28,41 @@ from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import served_world
 
-_SET_DUMPABLE = 4  # Of prctl(2).
+_PR_SET_DUMPABLE = 4  # Of prctl(2).
 
 _WARNING = (
-    'the agent may be a program of the user that this world runs as (isolation'
-    ' "%s"): its code could reach files and processes of that user. Start this'
-    ' as root with --agent_user for a user of its own (docs/served.md).'
+    'the agent may run as the same user as this program (isolation "%s"), so'
+    ' its code may access the files and processes of this user. To run it as'
+    ' another user, start this program as root with --agent_user'
+    ' (docs/served.md).'
 )
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class Settings:
-  """What is served, and to whom.
+  """Settings of a served run.
 
   Attributes:
-    domain: The world.
-    task: Its variation.
-    design: The agent design, by name or path.
-    overrides: Dotted overrides of it.
-    seed: The seed.
-    max_steps: The length of an episode in control steps.
-    repeat: Path of the record of a run to repeat. Its world, design, seed and
-      length of an episode replace those above; `overrides` change its design.
-      `None` for a new run with a salt of its own.
-    num_episodes: After how many episodes it is over, the invalid ones included.
-    name: What the agent is called in the results.
-    address: Where to listen; `None` for a socket in a folder of its own.
-    idle_seconds: For how long an agent may be silent.
-    provider_seconds: For how long a provider may think about a step.
-    agent_command: What to start as the agent; `None` if somebody else does.
-    agent_folder: Where the agent runs; `None` for a folder of its own.
-    agent_user: The user that the agent is; `None` for this process's own.
-    output: The folder to make.
+    domain: Domain of the task.
+    task: Name of the task in its domain.
+    design: Agent design, by name or path.
+    overrides: Dotted overrides of the design.
+    seed: Seed of the episodes.
+    max_steps: Maximum length of an episode, in control steps.
+    repeat: Path of the record of a run to repeat, or `None` for a new run with
+      a new salt. The task, design, seed and maximum length in the record
+      replace those above; `overrides` apply to its design.
+    num_episodes: Number of episodes, including invalid ones.
+    name: Name of the agent in the results.
+    address: Address to listen on, or `None` for a socket in a new folder.
+    idle_seconds: Maximum time between requests of the agent.
+    provider_seconds: Time limit of a provider for one step.
+    agent_command: Command that starts the agent, or `None` if it is started
+      separately.
+    agent_folder: Working directory of the agent, or `None` for a new folder.
+    agent_user: User that the agent runs as, or `None` for that of this process.
+    output: New folder for the results.
   """
 
   domain: str
@@ -82,18 +84,18 @@ class Settings:
 
 
 def serve(settings: Settings, say: Callable[[str], None]) -> None:
-  """Serves a world until its episodes are over, and writes their rows.
+  """Serves a world until all episodes have ended, and writes their rows.
 
   Args:
-    settings: What to serve.
-    say: Called with what a person wants to read.
+    settings: Settings of the run.
+    say: Called with messages for the user.
 
   Raises:
-    RealabError: If something is wrong with the settings, or the agent ended
-      before its episodes did.
+    RealabError: If the settings are invalid, or the agent exits before all
+      episodes have ended.
   """
   hide_from_debuggers()
-  # What is made from here on, sockets included, is for this user alone.
+  # Only this user can access files and sockets that are created from here on.
   os.umask(0o077)
   owner = (
       None
@@ -127,7 +129,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     )
     listener = agent_server.Server(world, address, settings.idle_seconds, owner)
     agent = None
-    with _removed_if_refused(output):
+    with _removed_on_error(output):
       listener.start()
       stack.callback(listener.close)
       if settings.agent_command is not None:
@@ -145,16 +147,19 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     say(f'serving {settings.domain}.{settings.task} at {listener.address}')
     signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
     listener.run()
-    _complain_of_missing(evaluator.num_written, settings, agent, output)
-    say(f'Everything is in {settings.output}')
+    _check_all_written(evaluator.num_written, settings, agent, output)
+    say(f'Results are in {settings.output}')
 
 
 def hide_from_debuggers() -> None:
-  """Keeps other processes of this user out of this one's memory, on Linux."""
+  """Denies other processes of this user access to memory, on Linux."""
   if sys.platform != 'linux':
-    logging.warning('only Linux keeps other programs out of this one')
+    logging.warning(
+        'other programs of this user can access the memory of this one; only'
+        ' Linux can prevent it'
+    )
     return
-  if ctypes.CDLL(None, use_errno=True).prctl(_SET_DUMPABLE, 0, 0, 0, 0):
+  if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0):
     raise errors.SpecError(
         'this process cannot be hidden from debuggers:'
         f' {os.strerror(ctypes.get_errno())}'
@@ -162,8 +167,8 @@ def hide_from_debuggers() -> None:
 
 
 @contextlib.contextmanager
-def _removed_if_refused(folder: pathlib.Path) -> Iterator[None]:
-  """Lets nothing be in the way of the same command, mended."""
+def _removed_on_error(folder: pathlib.Path) -> Iterator[None]:
+  """Removes leftovers so that a corrected command can be rerun."""
   try:
     yield
   except errors.SpecError:
@@ -173,33 +178,33 @@ def _removed_if_refused(folder: pathlib.Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def deadline(seconds: float) -> Iterator[None]:
-  """Ends what takes too long; for the main thread, which alone gets signals.
+  """Limits the time of a block of code; for the main thread only.
 
-  Code that waits outside Python is not interrupted before it comes back.
+  Code outside Python is not interrupted before it returns.
 
   Raises:
-    TimeoutError: If it does.
+    TimeoutError: If the time is exceeded.
   """
   is_over = False
 
-  def ring(*unused: Any) -> None:
+  def on_alarm(*unused: Any) -> None:
     if not is_over:
       raise TimeoutError(f'no answer within {seconds:g} s')
 
-  before = signal.signal(signal.SIGALRM, ring)
-  # Again and again: somebody may have caught the first one.
+  old_handler = signal.signal(signal.SIGALRM, on_alarm)
+  # The timer repeats, because the code may catch the first exception.
   signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
   try:
     yield
   finally:
     is_over = True
     signal.setitimer(signal.ITIMER_REAL, 0)
-    signal.signal(signal.SIGALRM, before)
+    signal.signal(signal.SIGALRM, old_handler)
 
 
 @final
 class _Evaluator:
-  """Writes down what episodes came to."""
+  """Writer of the rows of episodes."""
 
   def __init__(
       self,
@@ -226,7 +231,7 @@ class _Evaluator:
 def _chosen(
     settings: Settings,
 ) -> tuple[Settings, specs.DesignSpec, seeding.SaltedSeed]:
-  """Returns what is served: the settings, the design and the salted seed."""
+  """Returns the settings, the design and the salted seed of a run."""
   if settings.repeat is None:
     design = specs.load(settings.design, settings.overrides)
     seed = seeding.SaltedSeed(settings.seed, seeding.new_salt())
@@ -258,11 +263,11 @@ def _load(
 
 
 def _make_private_folder(output: str) -> pathlib.Path:
-  """Makes the folder of the results, which only this user can enter.
+  """Creates the folder of the results, which only this user can enter.
 
   Raises:
-    ResultsError: If it cannot be made, or is not empty.
-    SpecError: If it belongs to another user, who could replace what is in it.
+    ResultsError: If it cannot be created or is not empty.
+    SpecError: If it belongs to another user, who could replace its contents.
   """
   folder = scripted.make_folder(output)
   with storage.explained(folder):
@@ -270,7 +275,7 @@ def _make_private_folder(output: str) -> pathlib.Path:
     if owner != os.geteuid():
       raise errors.SpecError(
           f'output: {output} belongs to user {owner}; allowed is a folder of'
-          f' user {os.geteuid()}, which others cannot change'
+          f' user {os.geteuid()}'
       )
     folder.chmod(0o700)
   return folder
@@ -296,7 +301,7 @@ def _info(
   )
 
 
-def _complain_of_missing(
+def _check_all_written(
     num_written: int,
     settings: Settings,
     agent: agent_process.AgentProcess | None,
@@ -308,7 +313,7 @@ def _complain_of_missing(
   why = (
       'stopped'
       if status is None
-      else f'the agent ended with status {status} (see {output / "agent.log"})'
+      else f'the agent exited with status {status} (see {output / "agent.log"})'
   )
   raise errors.ResultsError(
       f'{why} after {num_written} of {settings.num_episodes} episodes'

@@ -1,4 +1,7 @@
-"""The record of a served run, which repeats it and contains its secret salt."""
+"""Record of a served run, with which the run can be repeated.
+
+It contains the secret salt.
+"""
 
 from collections.abc import Mapping
 import os
@@ -15,7 +18,7 @@ from realab_suite.engine import seeding
 from realab_suite.experiments import storage
 
 NAME = 'run.json'
-"""The file, in the folder of the results."""
+"""Name of the file in the folder of the results."""
 
 _NUM_DIGITS = 2 * seeding.NUM_SALT_BYTES
 _STRICT = pydantic.ConfigDict(frozen=True, strict=True)
@@ -23,15 +26,15 @@ _STRICT = pydantic.ConfigDict(frozen=True, strict=True)
 
 @final
 class EpisodeSettings(pydantic.BaseModel):
-  """The settings of a run that decide which episodes it has.
+  """Settings that determine the episodes of a run.
 
   Attributes:
-    domain: The world.
-    task: Its variation.
-    design: The agent design, by name or path; the record has its contents.
-    overrides: Dotted overrides, which the contents include.
-    seed: The seed.
-    max_steps: The length of an episode in control steps.
+    domain: Domain of the task.
+    task: Name of the task in its domain.
+    design: Agent design, by name or path; its contents are in the record.
+    overrides: Dotted overrides, already applied to the contents.
+    seed: Public seed of the episodes.
+    max_steps: Maximum length of an episode, in control steps.
   """
 
   model_config = _STRICT
@@ -46,13 +49,13 @@ class EpisodeSettings(pydantic.BaseModel):
 
 @final
 class Record(pydantic.BaseModel):
-  """A record; other keys of the file are for people.
+  """A record. The file may have further keys, which are not read.
 
   Attributes:
-    settings: What was served.
-    design: The contents of the design.
-    salt: The secret, hexadecimal.
-    versions: Of everything that dynamics depend on.
+    settings: Settings of the run.
+    design: Contents of the design.
+    salt: Secret salt, in hexadecimal.
+    versions: Versions of the packages that the dynamics depend on.
   """
 
   model_config = _STRICT
@@ -64,7 +67,7 @@ class Record(pydantic.BaseModel):
 
   @property
   def seed(self) -> seeding.SaltedSeed:
-    """The seed with its salt."""
+    """Seed with its salt."""
     return seeding.SaltedSeed(self.settings.seed, bytes.fromhex(self.salt))
 
 
@@ -78,11 +81,11 @@ def write(
   """Writes the record of a run, which only this user can read.
 
   Args:
-    folder: The folder of the results, for this user alone.
-    settings: The settings, those of `EpisodeSettings` included.
-    design: The contents of the design.
-    salt: The secret.
-    versions: Of everything that dynamics depend on.
+    folder: Folder of the results, which only this user can enter.
+    settings: Settings of the run, including those of `EpisodeSettings`.
+    design: Contents of the design.
+    salt: Secret salt.
+    versions: Versions of the packages that the dynamics depend on.
   """
   content = {
       'settings': dict(settings),
@@ -94,11 +97,11 @@ def write(
 
 
 def read(path: str) -> Record:
-  """Returns a record that `write` has written.
+  """Reads a record.
 
   Raises:
-    ResultsError: If the file cannot be read, or is damaged.
-    SpecError: If the file is no record, or other users could have read or
+    ResultsError: If the file cannot be read or is damaged.
+    SpecError: If the file is not a record, or other users could have read or
       replaced it.
   """
   with storage.explained(path):
@@ -108,14 +111,14 @@ def read(path: str) -> Record:
     raise errors.SpecError(
         f'{path}: belongs to user {status.st_uid} and has mode {mode:04o};'
         f' allowed is a file of user {os.geteuid()} with mode 0600, because'
-        ' others can predict a run whose salt they have'
+        ' the salt in it must stay secret'
     )
   content = storage.read_sealed(
       pathlib.Path(path), f'allowed is the {NAME} of a served run'
   )
   record = validation.validate(Record, content, path)
   if not re.fullmatch(f'[0-9a-f]{{{_NUM_DIGITS}}}', record.salt):
-    # The message does not repeat what may be a secret.
+    # The message does not contain the text, which may be a secret.
     raise errors.SpecError(
         f'{path}: salt: a text of {len(record.salt)} characters; allowed are'
         f' {_NUM_DIGITS} digits from 0 to f'

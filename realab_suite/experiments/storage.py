@@ -1,4 +1,4 @@
-"""Folders of runs: locked, written whole or not at all, never mixed up."""
+"""Files and folders of runs, with locks, atomic writes and checksums."""
 
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
@@ -20,13 +20,13 @@ DONE = 'done.json'
 _LOCK = 'lock'
 _CHECKPOINTS = 'checkpoints'
 _SUFFIX = '.ckpt'
-_KEPT = 2  # Checkpoints: the last one, and the one before.
+_KEPT = 2  # Number of checkpoints to keep.
 _CHUNK = 1 << 20
 
 
 @contextlib.contextmanager
 def explained(path: str | os.PathLike[str]) -> Iterator[None]:
-  """Turns what an operating system says of a file into one line for people.
+  """Turns an `OSError` about a file into an error of one line.
 
   Raises:
     ResultsError: Instead of an `OSError`.
@@ -37,7 +37,7 @@ def explained(path: str | os.PathLike[str]) -> Iterator[None]:
     advice = ''
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
       advice = (
-          '; nothing that was complete is lost: make room, then run the same'
+          '; complete results are kept: free some space, then run the same'
           ' command again'
       )
     raise errors.ResultsError(
@@ -46,10 +46,10 @@ def explained(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def lock(folder: pathlib.Path) -> int:
-  """Returns a descriptor that holds the lock of a folder until it is closed.
+  """Locks a folder, and returns the descriptor whose closing unlocks it.
 
   Raises:
-    ResultsError: If another process has it.
+    ResultsError: If another process holds the lock.
   """
   path = folder / _LOCK
   with explained(path):
@@ -67,15 +67,15 @@ def lock(folder: pathlib.Path) -> int:
       raise
   raise errors.ResultsError(
       f'folder {folder} is being written to by process'
-      f' {holder or "(unknown)"}; wait for it, or end it'
+      f' {holder or "(unknown)"}; wait until it ends, or stop it'
   )
 
 
 def write_whole(path: pathlib.Path, data: bytes) -> None:
-  """Writes a file so that at any time it is either what it was or all new.
+  """Writes a file atomically.
 
   Raises:
-    ResultsError: If it cannot be written; it is what it was then.
+    ResultsError: If it cannot be written. The old contents are kept.
   """
   partial = path.with_name(f'{path.name}.partial')
   with explained(path):
@@ -93,15 +93,15 @@ def write_whole(path: pathlib.Path, data: bytes) -> None:
 
 
 def write_json(path: pathlib.Path, content: Any) -> None:
-  """Writes JSON as `write_whole` does."""
+  """Writes a JSON file atomically."""
   write_whole(path, (json.dumps(content, indent=2) + '\n').encode())
 
 
 def read_json(path: pathlib.Path) -> Any:
-  """Returns what a file of JSON holds.
+  """Returns the contents of a JSON file.
 
   Raises:
-    ResultsError: If it cannot be read, or holds none.
+    ResultsError: If it cannot be read or is not JSON.
   """
   with explained(path):
     text = path.read_bytes()
@@ -114,7 +114,7 @@ def read_json(path: pathlib.Path) -> Any:
 def write_archive(
     path: pathlib.Path, header: Mapping[str, Any], contents: Any
 ) -> None:
-  """Writes an archive as `write_whole` does."""
+  """Writes an archive atomically."""
   write_whole(path, archive.Archive(header, contents).to_bytes())
 
 
@@ -122,12 +122,12 @@ def read_archive(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
   """Returns the contents of an archive.
 
   Args:
-    path: The file.
-    header: The header that it was written with.
+    path: Path of the archive.
+    header: Header that the archive must have.
 
   Raises:
-    ResultsError: If it cannot be read, is damaged, or has another header; the
-      message says what the file holds and what was expected.
+    ResultsError: If it cannot be read, is damaged or has another header. The
+      message contains the contents of the file and the expected ones.
   """
   with naming(path):
     return _contents(path, header)
@@ -135,7 +135,7 @@ def read_archive(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
 
 @contextlib.contextmanager
 def naming(path: pathlib.Path) -> Iterator[None]:
-  """Names a file in an error about saved state that does not fit.
+  """Adds the name of a file to errors about saved state that does not fit.
 
   Raises:
     ResultsError: Instead of a `StateLayoutError`.
@@ -154,52 +154,52 @@ def _contents(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
 
 
 def is_done(path: pathlib.Path) -> bool:
-  """Returns whether the run of a folder is over.
+  """Returns True if the run of a folder has finished.
 
   Raises:
-    ResultsError: If a result has been changed or removed since.
+    ResultsError: If a result was changed or removed after that.
   """
   if not (path / DONE).exists():
     return False
   for name, digest in _read_done(path / DONE).items():
     if _digest(path / name) != digest:
       raise errors.ResultsError(
-          f'{path / name}: not what it was when the run ended; remove {path} to'
-          ' run it again'
+          f'{path / name}: changed since the run finished; remove {path} to run'
+          ' it again'
       )
   return True
 
 
 def write_done(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-  """Says that the run of a folder is over.
+  """Marks the run of a folder as finished.
 
   Args:
-    path: The folder.
-    content: What to say; `files` are the results, with their SHA-256.
+    path: Folder of the run.
+    content: Facts about the run. `files` maps the results to their SHA-256.
   """
   write_sealed(path / DONE, content)
 
 
 def write_sealed(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-  """Writes JSON with a checksum, as `write_whole` does."""
+  """Writes a JSON file with a checksum, atomically."""
   write_json(path, {**content, 'checksum': validation.digest_of(content)})
 
 
 def read_sealed(path: pathlib.Path, advice: str) -> dict[str, Any]:
-  """Returns what `write_sealed` wrote.
+  """Returns the contents of a JSON file with a checksum.
 
   Args:
-    path: The file.
-    advice: What to do if it is damaged.
+    path: Path of the file.
+    advice: Advice to add to the message if the file is damaged.
 
   Raises:
-    ResultsError: If it cannot be read, or is not what was written.
+    ResultsError: If it cannot be read or is damaged.
   """
   content = read_json(path)
   checksum = content.pop('checksum', '') if isinstance(content, dict) else ''
   if checksum != validation.digest_of(content):
     raise errors.ResultsError(
-        f'{path}: damaged: its checksum does not agree; {advice}'
+        f'{path}: damaged: its checksum does not match; {advice}'
     )
   sealed: dict[str, Any] = content
   return sealed
@@ -210,32 +210,32 @@ def _read_done(path: pathlib.Path) -> dict[str, str]:
   advice = f'remove {path.parent} to run it again'
   files: dict[str, str] = read_sealed(path, advice).get('files', {})
   for name in files:
-    # A checksum is no signature: whoever made the folder has made it, too.
+    # A checksum is no signature: an edited file may have a correct one.
     if not re.fullmatch(r'\w[\w.-]*', name):
       raise errors.ResultsError(
-          f'{path}: {name!r:.80} is no file of a run; {advice}'
+          f'{path}: {name!r:.80} is not a file of a run; {advice}'
       )
   return files
 
 
 @final
 class RunFolder:
-  """The folder of one run, which nobody else writes to meanwhile.
+  """Locked folder of one run.
 
-  Use it as a context: the lock is let go at its end, and by the operating
-  system where a process dies.
+  Use it as a context manager, which releases the lock at its end. If the
+  process is killed, the operating system releases it.
   """
 
   def __init__(self, path: pathlib.Path, config: Mapping[str, Any]) -> None:
-    """Makes the folder, or takes up one of the same configuration.
+    """Creates the folder, or opens one with the same configuration.
 
     Args:
-      path: The folder.
-      config: Everything that its results depend on; JSON.
+      path: Path of the folder.
+      config: Configuration that the results depend on, as JSON.
 
     Raises:
-      ResultsError: If it cannot be made, another process has it, or it belongs
-        to another configuration.
+      ResultsError: If it cannot be created, another process holds its lock, or
+        it belongs to another configuration.
     """
     self.path = path
     with explained(path):
@@ -248,7 +248,7 @@ class RunFolder:
       raise
 
   def close(self) -> None:
-    """Lets the folder go."""
+    """Releases the lock."""
     os.close(self._lock)
 
   def __enter__(self) -> 'RunFolder':
@@ -258,11 +258,11 @@ class RunFolder:
     self.close()
 
   def finish(self, names: Sequence[str], facts: Mapping[str, Any]) -> None:
-    """Says that the run is over, and forgets its checkpoints.
+    """Marks the run as finished, and removes its checkpoints.
 
     Args:
-      names: The files that are its results.
-      facts: What else to say.
+      names: Names of the files with results.
+      facts: Further facts to record.
     """
     files = {name: _digest(self.path / name) for name in names}
     write_done(self.path, {**facts, 'files': files})
@@ -271,45 +271,45 @@ class RunFolder:
         checkpoint.unlink()
 
   def save(self, step: int, header: Mapping[str, Any], contents: Any) -> None:
-    """Writes a checkpoint; the one before is kept, older ones are not.
+    """Writes a checkpoint, and removes all but the last two.
 
     Args:
-      step: How far the run has come.
-      header: What has to agree for the checkpoint to fit.
+      step: Number of control steps so far.
+      header: Header that `load` compares.
       contents: Tuples, lists and dicts of arrays, numbers, texts and `None`.
 
     Raises:
-      ResultsError: If it cannot be written. Those before are as they were.
+      ResultsError: If it cannot be written. Earlier checkpoints are kept.
     """
     folder = self.path / _CHECKPOINTS
     with explained(folder):
       folder.mkdir(exist_ok=True)
     path = folder / f'{step:012d}{_SUFFIX}'
     write_archive(path, header, contents)
-    self._forget_old()
+    self._remove_old()
 
   def load(self, header: Mapping[str, Any]) -> Any:
-    """Returns the contents of the last checkpoint; `None` if there is none.
+    """Returns the contents of the last checkpoint, or `None`.
 
     Raises:
-      ResultsError: If it is damaged, or of another run. It says how to go on;
-        no older one is taken unasked.
+      ResultsError: If it is damaged or belongs to another run. An older
+        checkpoint is never used instead; the message explains how to.
     """
     checkpoints = self._checkpoints()
     if not checkpoints:
       return None
     with self.naming_checkpoint():
       contents = _contents(checkpoints[-1], header)
-    # The process that wrote it may have been killed before doing this.
-    self._forget_old()
+    # The process that wrote it may have been killed before the removal.
+    self._remove_old()
     return contents
 
   @contextlib.contextmanager
   def naming_checkpoint(self) -> Iterator[None]:
-    """Names the last checkpoint in an error about state that does not fit.
+    """Adds the last checkpoint to errors about state that does not fit.
 
     Raises:
-      ResultsError: Instead of a `StateLayoutError`; it says how to go on.
+      ResultsError: Instead of a `StateLayoutError`, with advice.
     """
     try:
       yield
@@ -317,39 +317,40 @@ class RunFolder:
       *older, path = self._checkpoints()
       where = f'from {older[-1].name}' if older else 'from the beginning'
       raise errors.ResultsError(
-          f'{path}: no checkpoint of this run: {error}; remove this file, then'
-          f' the same command goes on {where}'
+          f'{path}: not a checkpoint of this run: {error}; remove this file,'
+          f' then the same command continues {where}'
       ) from error
 
-  def _forget_old(self) -> None:
+  def _remove_old(self) -> None:
     for old in self._checkpoints()[:-_KEPT]:
       with explained(old):
         old.unlink()
 
   def _checkpoints(self) -> list[pathlib.Path]:
-    """Returns the checkpoints, the last one last."""
+    """Returns the checkpoints, from the oldest to the latest."""
     return sorted((self.path / _CHECKPOINTS).glob(f'*{_SUFFIX}'))
 
 
-# How many bytes of a file of lines count, and their SHA-256.
+# Size and SHA-256 of the valid part of a file of lines.
 Mark = Mapping[str, Any]
 NOTHING: Mark = {'size': 0, 'sha256': hashlib.sha256().hexdigest()}
 
 
 @final
 class JsonLines:
-  """A file that grows by lines of JSON, and can be cut back to a checkpoint."""
+  """A file of JSON lines, which can be cut back to a checkpoint."""
 
   def __init__(self, path: pathlib.Path, mark: Mark | None = None) -> None:
-    """Opens the file, or makes it.
+    """Opens or creates the file.
 
     Args:
-      path: The file.
-      mark: How far it counts: what is behind that was written after the
-        checkpoint, and goes. `None` for all whole lines, whatever they are.
+      path: Path of the file.
+      mark: Mark of the end of the valid part. Later lines were written after
+        the checkpoint and are removed. `None` keeps all complete lines.
 
     Raises:
-      ResultsError: If it cannot be opened, is shorter, or is not what it was.
+      ResultsError: If it cannot be opened, or the valid part is incomplete or
+        changed.
     """
     self._path = path
     self._hash = hashlib.sha256()
@@ -359,7 +360,7 @@ class JsonLines:
       stack.pop_all()
 
   def _cut_back(self, mark: Mark | None) -> None:
-    """Removes everything behind the mark, or half a line; see `__init__`."""
+    """Removes lines after the mark, or an incomplete line."""
     self._file.seek(0)
     if mark is None:
       whole = self._file.read().rfind(b'\n') + 1
@@ -374,9 +375,9 @@ class JsonLines:
     here = self._file.tell()
     problem = ''
     if here < size:
-      problem = f'has {here} bytes, and the checkpoint knows of {size}'
+      problem = f'has {here} bytes, but the checkpoint expects {size}'
     elif self._hash.hexdigest() != mark['sha256']:
-      problem = 'not what it was when the checkpoint was written'
+      problem = 'changed since the checkpoint was written'
     if problem:
       raise errors.ResultsError(
           f'{self._path}: {problem}; remove {self._path.parent} to run it again'
@@ -387,8 +388,8 @@ class JsonLines:
     """Adds a line for each record.
 
     Raises:
-      ResultsError: If the disk is full. A part of a line may be there then,
-        which the next run cuts off.
+      ResultsError: If the disk is full. The next run removes an incomplete
+        line.
     """
     lines = (json.dumps(record, allow_nan=False) + '\n' for record in records)
     rest = ''.join(lines).encode()
@@ -398,9 +399,9 @@ class JsonLines:
         rest = rest[self._file.write(rest) :]
 
   def sync(self) -> dict[str, Any]:
-    """Sees to it that all lines are on the disk; returns the mark of the end.
+    """Writes all lines to the disk, and returns a mark of the end.
 
-    It counts for a file that was opened with a mark.
+    The mark is valid only if the file was opened with a mark.
     """
     with explained(self._path):
       os.fsync(self._file.fileno())
@@ -413,7 +414,7 @@ class JsonLines:
 
 
 def _check_config(path: pathlib.Path, config: dict[str, Any]) -> None:
-  """Writes a configuration, or compares it with the one that is there."""
+  """Writes a configuration, or compares it with the existing one."""
   if not path.exists():
     write_json(path, config)
     return
@@ -426,7 +427,7 @@ def _check_config(path: pathlib.Path, config: dict[str, Any]) -> None:
 
 
 def difference(there: Any, here: Any, key_path: str = '') -> str:
-  """Returns the first path at which two trees of JSON differ, and how."""
+  """Describes the first difference between two trees of JSON."""
   if isinstance(there, dict) and isinstance(here, dict):
     for key in [*there, *(key for key in here if key not in there)]:
       if there.get(key) != here.get(key):
@@ -441,7 +442,7 @@ def _digest(path: pathlib.Path) -> str:
 
 
 def _sync_folder(path: pathlib.Path) -> None:
-  """Makes the names in a folder survive a loss of power."""
+  """Makes changes of names in a folder survive a power failure."""
   descriptor = os.open(path, os.O_RDONLY)
   try:
     os.fsync(descriptor)

@@ -1,7 +1,7 @@
-"""Keeps numerical libraries to one thread, before they are imported.
+"""Limits numerical libraries to one thread, before they are imported.
 
-Two processes of one thread each do more on two cores than one of two threads,
-and sums do not depend on how many threads have shared them.
+On two cores, two processes with one thread each are faster than one with two
+threads. Sums also do not depend on the number of threads.
 """
 
 import os
@@ -20,11 +20,11 @@ _XLA_ONE = '--xla_cpu_multi_thread_eigen=false'
 
 
 def use_one() -> None:
-  """Sets the environment of this process and of those that it starts.
+  """Sets environment variables of this process and its child processes.
 
   Raises:
-    SpecError: If XLA_FLAGS holds something else than flags. XLA reads none
-      behind that, or ends the process.
+    SpecError: If XLA_FLAGS contains anything except flags. XLA would ignore the
+      flags after it, or end the process.
   """
   os.environ.update(_ONE)
   flags = os.environ.get(_XLA_FLAGS, '').split()
@@ -32,12 +32,12 @@ def use_one() -> None:
     if not flag.startswith('--'):
       raise errors.SpecError(
           f'{_XLA_FLAGS}: {flag!r:.80}; allowed are flags that begin with --,'
-          f' as in {_XLA_ONE}'
+          f' such as {_XLA_ONE}'
       )
   os.environ[_XLA_FLAGS] = ' '.join([*xla_flags(), _XLA_ONE])
 
 
 def xla_flags() -> list[str]:
-  """Returns the flags of XLA but for those that `use_one` sets."""
+  """Returns the flags of XLA, except those that `use_one` sets."""
   flags = os.environ.get(_XLA_FLAGS, '').split()
   return [flag for flag in flags if flag != _XLA_ONE]

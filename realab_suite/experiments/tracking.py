@@ -1,4 +1,4 @@
-"""Records an episode for pictures: paths, block poses, values over time."""
+"""Records of episodes for pictures: paths, block positions and values."""
 
 from collections.abc import Callable
 import dataclasses
@@ -21,12 +21,12 @@ _PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 
 @final
 class Shape(NamedTuple):
-  """Something that stands in the world, seen from above.
+  """Outline of an object in the world, seen from above.
 
   Attributes:
-    kind: Its class, one of `appearance.CLASSES`.
+    kind: Class of the object, one of `appearance.CLASSES`.
     colour: Red, green, blue and opacity.
-    outline: Its corners, `(corners, 2)`, metres.
+    outline: Positions of its corners, `(corners, 2)`, in metres.
   """
 
   kind: str
@@ -37,20 +37,22 @@ class Shape(NamedTuple):
 @final
 @dataclasses.dataclass
 class RegisterTrack:
-  """What became of one register, step by step; the reset is the first.
+  """Values and block positions of a register in each step of an episode.
 
-  The lists hold what was read last in each step, and what had been written
-  when it was; where nothing was read, the reading and its parts are nan.
+  The lists contain the last read of each step, and the last write before it.
+  The first entry belongs to the reset. Without a read, the reading and its
+  corruption are NaN.
 
   Attributes:
-    role: The role of the register.
-    half_size: Half the length of an edge of a block, metres.
-    requested: What was to be written.
-    applied: What was written.
-    reading: What was read.
-    permanent: The permanent part of the corruption.
-    temporary: The temporary part of the corruption.
-    blocks: Where the blocks were at the end, `(blocks, 2)` each, metres.
+    role: Role of the register.
+    half_size: Half the edge length of a block, in metres.
+    requested: Requested values.
+    applied: Applied values.
+    reading: Readings.
+    permanent: Permanent parts of the corruption.
+    temporary: Temporary parts of the corruption.
+    blocks: Positions of the blocks at the end of each step, `(blocks, 2)` each,
+      in metres.
   """
 
   role: str
@@ -67,8 +69,8 @@ class RegisterTrack:
     """Adds a step.
 
     Args:
-      records: The writes to this register and the reads of it.
-      blocks: Where the blocks are, `(blocks, 2)`, metres.
+      records: Writes and reads of this register.
+      blocks: Positions of the blocks, `(blocks, 2)`, in metres.
     """
     read: tuple[float, ...] | None = None
     for record in records:
@@ -97,17 +99,18 @@ class RegisterTrack:
 @final
 @dataclasses.dataclass
 class Track:
-  """What pictures of an episode are made from.
+  """Record of an episode, from which pictures are made.
 
   Attributes:
-    seed: The seed of the environment.
-    episode: The number of the episode.
-    timestep: The length of a control step, seconds.
-    max_steps: After how many control steps an episode ends, or `None`.
-    shapes: What stood in the world at the start, the lowest first.
-    positions: Where the avatar was, `(2,)` each, metres; the reset is first.
-    registers: What became of each register.
-    true_rewards: The true reward of each control step.
+    seed: Seed of the environment.
+    episode: Number of the episode.
+    timestep: Duration of a control step, in seconds.
+    max_steps: Maximum number of control steps of an episode, or `None`.
+    shapes: Shapes in the world at the start, the lowest first.
+    positions: Positions of the avatar, `(2,)` each, in metres. The first one is
+      that of the reset.
+    registers: Track of each register.
+    true_rewards: True reward of each control step.
   """
 
   seed: int
@@ -121,12 +124,12 @@ class Track:
 
   @property
   def num_steps(self) -> int:
-    """How many control steps there were so far."""
+    """Number of control steps so far."""
     return len(self.true_rewards)
 
   @property
   def times(self) -> np.ndarray:
-    """When each control step ended; the reset is at 0. Seconds."""
+    """Time at the end of each control step, in seconds; 0 is the reset."""
     return self.timestep * np.arange(self.num_steps + 1)
 
   @property
@@ -136,29 +139,29 @@ class Track:
 
   @property
   def feedback(self) -> dict[str, RegisterTrack]:
-    """The registers that hold feedback."""
+    """Tracks of the feedback registers."""
     return {n: r for n, r in self.registers.items() if r.role == 'feedback'}
 
   @property
   def observed_return(self) -> float:
-    """Sum of what was read off feedback registers so far."""
+    """Sum of the readings of feedback registers so far."""
     return float(sum(sum(r.reading[1:]) for r in self.feedback.values()))
 
 
 @final
 class Tracker(events.EventSink):
-  """Keeps a track of the latest episode of an environment."""
+  """Event sink that records a track of the latest episode."""
 
   def __init__(
       self,
       env: environment.Environment,
       on_step: Callable[[Any, Track], None] | None = None,
   ) -> None:
-    """Makes a tracker, which has to be added to the environment.
+    """Makes a tracker; add it to the sinks of the environment.
 
     Args:
-      env: An environment of one of this package's worlds.
-      on_step: Called with the physics and the track so far, at the start of the
+      env: Environment with a task of this package.
+      on_step: Called with the physics and the track, at the start of the
         episode and after every control step.
     """
     self._physics = env.thin_physics
@@ -171,10 +174,10 @@ class Tracker(events.EventSink):
 
   @property
   def track(self) -> Track:
-    """The latest episode.
+    """Track of the latest episode.
 
     Raises:
-      ResultsError: If none has begun.
+      ResultsError: If no episode has begun.
     """
     if self._track is None:
       raise errors.ResultsError(
@@ -199,7 +202,7 @@ class Tracker(events.EventSink):
     self._add(self._track, start.records, physics)
 
   def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
-    # A tracker that joins in the middle of an episode hears of no step.
+    # A tracker that was added during an episode ignores the rest of it.
     if self._track is not None:
       self._track.true_rewards.append(float(step.true_reward))
       self._add(self._track, step.records, physics)
@@ -220,7 +223,7 @@ class Tracker(events.EventSink):
       self._on_step(physics, track)
 
   def _shapes(self) -> list[Shape]:
-    """Returns all that is seen but the floor, the avatar and registers."""
+    """Returns all visible shapes except the floor, avatar and registers."""
     moving = [
         *self._avatar.mjcf_model.find_all('geom'),
         *(b.geom for r in self._registers.values() for b in r.blocks),
@@ -249,7 +252,7 @@ class Tracker(events.EventSink):
 def _outline(
     kind: int, size: np.ndarray, position: np.ndarray, frame: np.ndarray
 ) -> np.ndarray:
-  """Returns the corners of an upright geom seen from above, `(corners, 2)`."""
+  """Returns the corners of an upright geom from above, `(corners, 2)`."""
   if kind == mujoco.mjtGeom.mjGEOM_BOX:
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * size[:2]
     corners = corners @ frame[:2, :2].T

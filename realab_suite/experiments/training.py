@@ -1,8 +1,8 @@
-"""One job: trains a learner and judges it, or judges a scripted policy.
+"""Execution of a job: training and evaluation of a learner or of a policy.
 
-The results of a job that was killed at any time, and started again, are those
-of one that was not. All that the future depends on is in the checkpoint; what
-the files of lines held beyond it is cut off.
+A job can be killed at any time and restarted without an effect on its results.
+A checkpoint contains the full state; lines that were written after it are
+removed.
 """
 
 from collections.abc import Callable, Mapping
@@ -45,21 +45,21 @@ TRACE = 'trace.bin'
 TENSORBOARD = 'tensorboard'
 _CHECKPOINT = 'checkpoint'
 
-# Called with a line for people; what is said does not change results.
+# Called with messages for the user; they do not affect results.
 Say = Callable[[str], None]
 
 
 @final
 @dataclasses.dataclass(frozen=True)
 class Options:
-  """How a job is run; its configuration does not depend on it.
+  """Options for running a job that are not part of its configuration.
 
   Attributes:
-    say: Called with what a person wants to read.
-    tensorboard: Whether to write curves for TensorBoard, too.
-    parent: The process that started this one, if the job is to end with it.
-    other_machine: Whether to continue from a checkpoint of another machine, or
-      of other settings. Results depend on this; `done.json` records it.
+    say: Called with messages for the user.
+    tensorboard: True to write learning curves for TensorBoard as well.
+    parent: Process whose end also ends the job, or `None`.
+    other_machine: True to continue from a checkpoint of another machine or with
+      other settings. Results depend on both; `done.json` records this.
   """
 
   say: Say
@@ -69,18 +69,18 @@ class Options:
 
 
 def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
-  """Does a job, or the rest of it; one that is done is left as it is.
+  """Runs a job, or continues it; a finished job is left unchanged.
 
   Args:
-    job: The job.
-    output: The folder of the experiment.
-    options: How to do it.
+    job: Job to run.
+    output: Folder of the experiment.
+    options: Options for running it.
 
   Returns:
     The folder of the results.
 
   Raises:
-    RealabError: If the job is wrong, its folder belongs to somebody else, a
+    RealabError: If the job is invalid, its folder belongs to another one, a
       checkpoint is damaged or the disk is full.
   """
   if options.tensorboard:
@@ -88,28 +88,28 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
   path = output / job.folder()
   with storage.RunFolder(path, job.config()) as folder:
     if storage.is_done(path):
-      options.say(f'{path} is there already')
+      options.say(f'{path} has finished already')
       return path
     if job.policy is None:
       _Training(job, folder, options).run()
     else:
-      _judge_policy(job, folder)
-  options.say(f'Everything is in {path}')
+      _evaluate_policy(job, folder)
+  options.say(f'Results are in {path}')
   return path
 
 
 def make_learner(
     job: jobs.Job, batch: batch_environment.BatchEnvironment
 ) -> learners.Learner:
-  """Returns the learner of a job, as it is before it has learned anything.
+  """Returns the untrained learner of a job.
 
   Raises:
-    SpecError: If there is no such learner, the design does not suit it, or what
-      learners are made of is not installed.
+    SpecError: If the kind of learner does not exist, it does not fit the
+      design, or packages of learners are not installed.
   """
   if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'learner {job.kind!r}: {problem}')
-  from realab_suite import agents  # Brings JAX, which nothing else here needs.
+  from realab_suite import agents  # Imports JAX.
 
   return agents.make(
       job.design.learner,
@@ -125,15 +125,15 @@ def load_learner(
     path: pathlib.Path,
     batch: batch_environment.BatchEnvironment,
 ) -> learners.Learner:
-  """Returns the learner that a job has trained, for whoever looks closer.
+  """Returns the trained learner of a finished job, for further analysis.
 
   Args:
     job: The job.
-    path: Its folder.
-    batch: Worlds of its design; any number of them.
+    path: Folder of the job.
+    batch: Any number of worlds with the design of the job.
 
   Raises:
-    ResultsError: If there is none, or it is damaged or another job's.
+    ResultsError: If the learner is missing, damaged or belongs to another job.
   """
   file = path / LEARNER
   state = storage.read_archive(file, header(job.digest(), LEARNER))
@@ -146,7 +146,7 @@ def load_learner(
 def load_batch(
     job: jobs.Job, num_envs: int, seed: int, sleep: bool = False
 ) -> batch_environment.BatchEnvironment:
-  """Returns worlds of a job's design, stepped by one thread."""
+  """Returns worlds with the design of a job, stepped by one thread."""
   return suite.load_batch(
       *job.experiment.domain_and_variation,
       {'random': seed},
@@ -159,34 +159,34 @@ def load_batch(
 
 
 def header(digest: str, what: str) -> dict[str, Any]:
-  """Returns the header of an archive that a job writes.
+  """Returns the header of an archive of a job.
 
   Args:
-    digest: The digest of the job's configuration.
-    what: The name of what the archive holds.
+    digest: Digest of the configuration of the job.
+    what: Kind of contents of the archive.
   """
   return {'configuration': digest, 'what': what}
 
 
-def _judge_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
+def _evaluate_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
   seed = job.evaluation_seed
   with contextlib.closing(
       load_batch(job, job.experiment.evaluation.episodes, seed)
   ) as batch:
     policy = policies.make(job.kind)
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
-    _judge(job, folder, batch, actor)
+    _evaluate(job, folder, batch, actor)
   machine = {'step': 0, 'machine': machines.here()}
   folder.finish([EPISODES, TRACE], {'machines': [machine]})
 
 
-def _judge(
+def _evaluate(
     job: jobs.Job,
     folder: storage.RunFolder,
     batch: batch_environment.BatchEnvironment,
     actor: batch_actors.BatchActor,
 ) -> None:
-  """Writes a row for each episode that the actor is judged by, and a trace."""
+  """Evaluates an actor, and writes the rows of its episodes and a trace."""
   info = job.info(batch.task.control_timestep)
   tracer = traces.Tracer(batch, actor)
   batch.add_sink(tracer)
@@ -202,7 +202,7 @@ def _judge(
 
 @final
 class _Training:
-  """A learner on its way through its control steps."""
+  """Training of the learner of a job."""
 
   def __init__(
       self, job: jobs.Job, folder: storage.RunFolder, options: Options
@@ -211,24 +211,24 @@ class _Training:
     self._folder = folder
     self._options = options
     training = job.training
-    # What is to be probed in the end, so that nobody waits for an error.
+    # Determined before training, so that errors are raised at once.
     self._probed = None
     if job.experiment.evaluation.probe_states:
       self._probed = probes.find_register(job.design)
     self._sleep = training.sleep
     self._num_envs = training.num_envs
-    # In steps of all worlds together; all lengths are rounded up to these.
+    # Lengths in steps of the batch, rounded up.
     self._total = -(-training.steps // training.num_envs)
     self._save_every = -(-training.checkpoint_every // training.num_envs)
     self._point_every = -(-training.curve_every // training.num_envs)
     self._done = 0
     self._segment = 0
     self._pending: list[dict[str, Any]] = []
-    # The machines that have computed this run, each from a control step on.
+    # Machines that have run this job, with the control step at their start.
     self._machines: list[dict[str, Any]] = []
 
   def run(self) -> None:
-    """Trains, or goes on with it, and judges what has been learned."""
+    """Trains the learner, from a checkpoint if there is one; evaluates it."""
     job, path = self._job, self._folder.path
     saved = self._folder.load(header(job.digest(), _CHECKPOINT))
     marks = (saved or {}).get('marks', {})
@@ -259,7 +259,7 @@ class _Training:
           contextlib.closing(storage.JsonLines(path / TIMING))
       )
       self._learn(learner, time_step, stack)
-    self._judge_learner(learner)
+    self._evaluate_learner(learner)
 
   def _add_machine(
       self, learner: learners.Learner, saved: Mapping[str, Any] | None
@@ -267,13 +267,13 @@ class _Training:
     """Records the machine, unless it is that of the last checkpoint.
 
     Raises:
-      ResultsError: If it is another one, and the options do not allow it.
+      ResultsError: If it differs and the options do not allow this.
     """
     job, path = self._job, self._folder.path
     here = {**machines.here(), **learner.settings()}
     step = self._done * self._num_envs
     if saved is not None:
-      # Checkpoints of older versions do not name their machines.
+      # Checkpoints of older versions do not contain machines.
       self._machines = saved.get('machines', [])
       there = self._machines[-1]['machine'] if self._machines else {}
       differences = machines.differences(there, here)
@@ -283,7 +283,7 @@ class _Training:
         raise errors.ResultsError(
             f'{path}: its checkpoint of step {step} is from another machine or'
             f' other settings: {differences}; continue it there, remove {path}'
-            ' to begin anew, or give --other_machine to continue here, with'
+            ' to start again, or use --other_machine to continue here, with'
             ' results that depend on both'
         )
       self._options.say(
@@ -295,7 +295,7 @@ class _Training:
   def _restore(
       self, learner: learners.Learner, saved: Mapping[str, Any]
   ) -> batch_environment.BatchTimeStep:
-    """Continues from a checkpoint; returns what the learner sees next."""
+    """Restores a checkpoint, and returns the next time step."""
     learner.set_state(saved['learner'])
     if not self._sleep:
       world = np.asarray(saved['batch'], np.uint8).tobytes()
@@ -304,7 +304,7 @@ class _Training:
     return batch_environment.BatchTimeStep(**saved['time_step'])
 
   def _begin_segment(self) -> None:
-    """Makes worlds that nothing has happened in."""
+    """Loads new worlds."""
     seed = _world_seed(self._job.seed, self._segment)
     with contextlib.ExitStack() as stack:
       batch = load_batch(self._job, self._num_envs, seed, self._sleep)
@@ -327,7 +327,7 @@ class _Training:
           self._folder.path / TENSORBOARD, self._done * num_envs + 1
       )
     stack.callback(board.close)
-    # Without a terminal there is no bar, and a line per point instead.
+    # Without a terminal, a line per point replaces the progress bar.
     bar = stack.enter_context(
         tqdm.tqdm(
             total=self._total * num_envs,
@@ -343,7 +343,7 @@ class _Training:
       self._check_parent()
       time_step = self._batch.step(learner.step(time_step))
       self._done += 1
-      self._take()
+      self._record_episodes()
       bar.update(num_envs)
       is_over = self._done == self._total
       if is_over or self._done % self._point_every == 0:
@@ -359,8 +359,8 @@ class _Training:
       if is_over or self._done % self._save_every == 0:
         time_step = self._save(learner, time_step)
 
-  def _take(self) -> None:
-    """Writes down the episodes that have ended."""
+  def _record_episodes(self) -> None:
+    """Records the episodes that have ended."""
     step = self._done * self._num_envs
     records = [{'step': step, **record} for record in self._monitor.take()]
     if records:
@@ -382,16 +382,16 @@ class _Training:
     """Writes a checkpoint.
 
     Returns:
-      What the learner sees next, whether it is killed here or not.
+      The next time step of the learner, the same with or without a restart.
     """
     world = None
     if self._sleep:
-      # Nobody can save who sleeps. So all worlds begin anew here, in runs that
-      # go on as well, and to the learner the episodes have run out of time.
+      # Sleeping bodies cannot be saved. Therefore all worlds are replaced here,
+      # with or without a restart, and running episodes are truncated.
       self._batch.close()
-      self._take()
+      self._record_episodes()
       self._segment += 1
-      time_step = _cut_off(time_step)
+      time_step = _truncated(time_step)
     else:
       world = np.frombuffer(self._batch.save().to_bytes(), np.uint8)
     self._folder.save(
@@ -412,7 +412,7 @@ class _Training:
       self._begin_segment()
     return time_step
 
-  def _judge_learner(self, learner: learners.Learner) -> None:
+  def _evaluate_learner(self, learner: learners.Learner) -> None:
     job, evaluation = self._job, self._job.experiment.evaluation
     storage.write_archive(
         self._folder.path / LEARNER,
@@ -426,7 +426,7 @@ class _Training:
     with contextlib.closing(
         load_batch(job, evaluation.episodes, seed)
     ) as batch:
-      _judge(job, self._folder, batch, actor)
+      _evaluate(job, self._folder, batch, actor)
     files = [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER]
     if self._probed is not None:
       try:
@@ -439,7 +439,7 @@ class _Training:
             evaluation.probe_player,
         )
       except errors.OutOfReachError as error:
-        # Behind a barrier, say: that is a result, and no reason to learn again.
+        # For example behind a barrier. This is a result, so the job finishes.
         self._options.say(f'{job.run}, seed {job.seed}: no probe: {error}')
       else:
         probes.save(self._folder.path, probe)
@@ -454,24 +454,24 @@ class _Training:
     parent = self._options.parent
     if parent is not None and os.getppid() != parent:
       raise errors.ResultsError(
-          f'process {parent}, which started this run, is gone; the run goes on'
-          ' from its last checkpoint when it is started again'
+          f'process {parent}, which started this run, has ended; the same'
+          ' command continues the run from its last checkpoint'
       )
 
 
 def _world_seed(seed: int, segment: int) -> int:
-  """Returns the seed of the worlds that a learner is trained in.
+  """Returns the seed of the worlds of a segment of training.
 
-  It is none that episodes are judged by, but for one chance in billions.
+  It differs from all evaluation seeds, except with negligible probability.
   """
   sequence = seeding.sequence(seed, 0, segment, 'training')
   return int(sequence.generate_state(1)[0])
 
 
-def _cut_off(
+def _truncated(
     time_step: batch_environment.BatchTimeStep,
 ) -> batch_environment.BatchTimeStep:
-  """Returns a time step with which all episodes that are under way end."""
+  """Returns a time step that truncates all running episodes."""
   is_under_way = time_step.step_type == int(dm_env.StepType.MID)
   last = int(dm_env.StepType.LAST)
   return time_step._replace(

@@ -1,1 +1,1 @@
-"""The agent designer's side: designs, feedback providers, the mechanism."""
+"""Designs, feedback providers and the mechanism that runs them in a world."""

@@ -1,7 +1,7 @@
 """Checks that the parts of a design fit each other.
 
-The type of each part checks the part alone; the mechanism and
-`engine/placement.py` check a design against its world.
+The type of each part checks that part. The mechanism and `engine/placement.py`
+check a design against its world.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,11 +16,12 @@ def check(design: Any, read_by_agents: Sequence[str]) -> None:
   """Checks a design.
 
   Args:
-    design: A `specs.DesignSpec` whose fields are valid.
-    read_by_agents: The roles of registers that providers may write.
+    design: A `specs.DesignSpec` with valid fields.
+    read_by_agents: Roles of the registers that providers may write.
 
   Raises:
-    ValueError: If registers, meters, providers and learner do not fit.
+    ValueError: If registers, meters, providers and learner do not fit each
+      other.
   """
   for i, meter in enumerate(design.meters):
     _expect_role(design, f'meters[{i}].writes', meter.writes, ('meter',))
@@ -30,13 +31,13 @@ def check(design: Any, read_by_agents: Sequence[str]) -> None:
       _expect_role(design, f'{where}.reads', name, None)
     for name in provider.writes:
       _expect_role(design, f'{where}.writes', name, read_by_agents)
-    _refuse_twice(f'{where}.reads', provider.reads)
-    _refuse_twice(f'{where}.writes', provider.writes)
+    _refuse_duplicates(f'{where}.reads', provider.reads)
+    _refuse_duplicates(f'{where}.writes', provider.writes)
     try:
       provider.check(design)
     except ValueError as error:
       raise ValueError(f'{where}: {error}') from error
-    except Exception as error:  # It may be of any class.
+    except Exception as error:  # Providers may raise any class.
       raise ValueError(f'{where}: {type(error).__name__}: {error}') from error
     for name in (*provider.action_queries, *provider.action_writes):
       _expect_actions(design, where, name)
@@ -48,7 +49,17 @@ def check(design: Any, read_by_agents: Sequence[str]) -> None:
 def _expect_role(
     design: Any, where: str, name: str, roles: Sequence[str] | None
 ) -> None:
-  """Checks that a register is declared and has one of some roles."""
+  """Checks that a register is declared and has an allowed role.
+
+  Args:
+    design: Design to check.
+    where: Path of the field that names the register, for messages.
+    name: Name of the register.
+    roles: Allowed roles; `None` for any role.
+
+  Raises:
+    ValueError: If the register is not declared or has another role.
+  """
   if name not in design.registers:
     raise ValueError(
         f'{where}: register {messages.quote(name)} is not declared; declared'
@@ -62,19 +73,19 @@ def _expect_role(
     )
 
 
-def _refuse_twice(where: str, names: Sequence[str]) -> None:
+def _refuse_duplicates(where: str, names: Sequence[str]) -> None:
   """Refuses a list that names a register twice."""
   seen: set[str] = set()
   for name in names:
     if name in seen:
       raise ValueError(
-          f'{where}: register {name!r} is there twice; allowed is once'
+          f'{where}: register {name!r} is listed twice; allowed is once'
       )
     seen.add(name)
 
 
 def _refuse_second_writers(design: Any) -> None:
-  """Refuses registers with two writers: the second replaces the first value."""
+  """Refuses registers with two writers, whose values replace each other."""
   writers: dict[str, str] = {}
   for where, names in (
       *((f'meters[{i}]', (m.writes,)) for i, m in enumerate(design.meters)),
@@ -90,7 +101,7 @@ def _refuse_second_writers(design: Any) -> None:
 
 
 def _expect_actions(design: Any, where: str, name: str) -> None:
-  """Checks that a register can hold the index of every action."""
+  """Checks that a register can store the index of every action."""
   if design.action_set is None:
     return
   known = action_sets.get(design.action_set.name, design.action_set.version)
@@ -98,14 +109,14 @@ def _expect_actions(design: Any, where: str, name: str) -> None:
   low, high = design.registers[name].range
   if not low <= 0 <= last <= high:
     raise ValueError(
-        f'registers.{name}.range: {[low, high]} leaves out actions of'
+        f'registers.{name}.range: {[low, high]} excludes actions of'
         f' {known.name} v{known.version}, whose indices {where} uses; allowed'
         f' are ranges that contain [0, {last}]'
     )
 
 
 def _refuse_cycles(design: Any) -> None:
-  """Refuses providers that wait for each other's feedback."""
+  """Refuses providers that depend on each other's feedback in a cycle."""
   writers = {
       name: i
       for i, provider in enumerate(design.providers)
@@ -120,7 +131,8 @@ def _refuse_cycles(design: Any) -> None:
   except graphlib.CycleError as error:
     cycle = [f'providers[{i}]' for i in sorted(set(error.args[1]))]
     raise ValueError(
-        f'{" and ".join(cycle)} form a cycle: each reads what another writes'
+        f'{" and ".join(cycle)} form a cycle: each reads a register'
+        ' that another one writes'
     ) from error
 
 
@@ -128,7 +140,7 @@ def _check_learner(design: Any) -> None:
   """Refuses a learner that names a meter register."""
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
-    for name in _texts_in(value):
+    for name in _strings_in(value):
       if name in design.registers and design.registers[name].role == 'meter':
         where = messages.format_path(('learner', field))
         raise ValueError(
@@ -137,14 +149,14 @@ def _check_learner(design: Any) -> None:
         )
 
 
-def _texts_in(value: Any) -> Iterator[str]:
-  """Yields every text in nested lists and mappings, keys included."""
+def _strings_in(value: Any) -> Iterator[str]:
+  """Yields every string in nested lists and mappings, keys included."""
   if isinstance(value, str):
     yield value
   elif isinstance(value, Mapping):
     for key, item in value.items():
-      yield from _texts_in(key)
-      yield from _texts_in(item)
+      yield from _strings_in(key)
+      yield from _strings_in(item)
   elif isinstance(value, list | tuple):
     for item in value:
-      yield from _texts_in(item)
+      yield from _strings_in(item)

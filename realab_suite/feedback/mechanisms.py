@@ -1,8 +1,8 @@
-"""The feedback mechanism: runs a design inside a world.
+"""The feedback mechanism, which runs a design in a world.
 
 It owns the registers and has one method for each phase of a control step that
-touches them. The engine calls these methods and passes the records that they
-return to event sinks.
+reads or writes them. The engine calls these methods and passes the returned
+records to event sinks.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,8 +34,8 @@ Guard = Callable[[], contextlib.AbstractContextManager[None]]
 class FeedbackMechanism(composer.Entity):
   """The registers, meters and providers of a design.
 
-  Two steps make it ready: `attach_to` puts it and its registers into a world,
-  `connect` gives its meters something to measure.
+  Call `attach_to` to attach the mechanism and its registers to a task, then
+  `connect` to connect its meters to measurements.
   """
 
   def _build(self, design: specs.DesignSpec) -> None:
@@ -43,6 +43,9 @@ class FeedbackMechanism(composer.Entity):
 
     Args:
       design: The design; see `specs.load`.
+
+    Raises:
+      SpecError: If a register kind refuses its arguments.
     """
     self._design = design
     self._mjcf_root = mjcf.RootElement(model='feedback')
@@ -67,40 +70,44 @@ class FeedbackMechanism(composer.Entity):
 
   @property
   def design(self) -> specs.DesignSpec:
+    """Design that the mechanism runs."""
     return self._design
 
   @property
   def registers(self) -> Mapping[str, base.Register]:
-    """Every register, by its name in the design."""
+    """Registers, by their names in the design."""
     return self._registers
 
   @property
   def queries(self) -> list[base.Register]:
-    """The registers that the agent writes, in the order of its action."""
+    """Registers that the agent writes, in the order of its action."""
     return self._queries
 
   @property
   def read_by_agent(self) -> list[str]:
-    """The names of the registers that the agent reads."""
+    """Names of the registers that the agent reads."""
     return self._read_by_agent
 
   def attach_to(self, root: composer.Entity) -> None:
     """Attaches the mechanism and its registers to the root entity of a task.
 
+    Args:
+      root: Root entity of the task, usually its arena.
+
     Raises:
-      SpecError: If the world offers no such place, or has a mechanism already.
-        Nothing has been attached.
+      SpecError: If the world has no place of a name in the design, or has a
+        mechanism already. Nothing is attached.
     """
     for entity in root.iter_entities():
       if isinstance(entity, FeedbackMechanism):
         raise errors.SpecError(
-            f'design {self._design.name!r}: the task has the registers of'
-            f' design {entity.design.name!r} already, which would stay in the'
-            ' world; allowed is a task without registers: make a new one'
+            f'design {self._design.name!r}: the task already contains the'
+            f' registers of design {entity.design.name!r}, which would stay in'
+            ' the world; allowed is a task without registers: make a new one'
         )
-    offered = root.places if isinstance(root, arenas.RoomArena) else {}
+    named_places = root.places if isinstance(root, arenas.RoomArena) else {}
     places = {
-        name: _find(name, spec.place, offered)
+        name: _find_place(name, spec.place, named_places)
         for name, spec in self._design.registers.items()
     }
     root.attach(self)
@@ -118,13 +125,13 @@ class FeedbackMechanism(composer.Entity):
   def connect(
       self, measurements: Mapping[str, Callable[[Any], np.ndarray]]
   ) -> None:
-    """Gives the meters their measurements.
+    """Connects the meters to measurements.
 
     Args:
-      measurements: What the world can measure, by name.
+      measurements: Functions of the physics that meters can measure, by name.
 
     Raises:
-      SpecError: If a meter of the design measures something else.
+      SpecError: If a meter of the design names another measurement.
     """
     for i, spec in enumerate(self._design.meters):
       if spec.measures not in measurements:
@@ -139,15 +146,16 @@ class FeedbackMechanism(composer.Entity):
       self._meters.append((f'meter:{spec.measures}', meter))
 
   def guard_providers(self, guard: Guard) -> None:
-    """Has whatever a provider does run within a context of its own.
+    """Sets the context manager in which each call of a provider runs.
 
     Args:
-      guard: Makes one; what it raises counts as raised by the provider.
+      guard: Function that returns a new context manager. An exception from the
+        context manager counts as an exception from the provider.
     """
     self._guard = guard
 
   def initial_writes(self, physics: protocols.Physics) -> list[records.Write]:
-    """Returns the writes of the `initial` values at the last reset."""
+    """Returns the records of the writes of `initial` at the last reset."""
     writes = []
     for name, register in self._registers.items():
       applied = register.applied(physics)
@@ -160,7 +168,18 @@ class FeedbackMechanism(composer.Entity):
   def write_queries(
       self, physics: protocols.Physics, values: np.ndarray
   ) -> list[records.Write]:
-    """Writes the agent's queries K_t, shape `(..., queries)`."""
+    """Writes the agent's queries K_t to the query registers.
+
+    Args:
+      physics: One world or a batch of worlds.
+      values: Queries, `(..., queries)`, in the order of `queries`.
+
+    Returns:
+      Records of the writes, in the order of `queries`.
+
+    Raises:
+      RegisterValueError: If a register cannot store a query.
+    """
     if not self._queries:
       return []
     step = self._this_step(physics)
@@ -179,9 +198,12 @@ class FeedbackMechanism(composer.Entity):
     """Measures with every meter and writes the meter registers.
 
     Args:
-      physics: One world, or many.
-      idle: Worlds without anything to measure, `(...)`, bool; their registers
-        keep their values.
+      physics: One world or a batch of worlds.
+      idle: True for each world whose registers keep their values, `(...)` bool;
+        `None` for no world.
+
+    Returns:
+      Records of the writes, in the design's order.
 
     Raises:
       RegisterValueError: If a register cannot store a measurement. The message
@@ -198,18 +220,21 @@ class FeedbackMechanism(composer.Entity):
       except errors.RegisterValueError as error:
         raise errors.RegisterValueError(
             f'{_where(writer, step, error.world)}: register {name!r} cannot'
-            ' store what was measured',
+            ' store the measured value',
             error.world,
         ) from error
       writes.append(records.Write(name, writer, step, measured, applied))
     return writes
 
   def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
-    """Returns the states of the providers before an episode.
+    """Returns the initial states of the providers.
+
+    Args:
+      batch_shape: `()` for one world, `(worlds,)` for a batch.
 
     Raises:
-      FeedbackProviderError: If a provider or its guard raises, or if a state
-        for many worlds is not made of arrays with an axis of worlds.
+      FeedbackProviderError: If a provider or its guard raises, or if a state of
+        a batch contains a leaf that is not an array with an axis of worlds.
     """
     states = []
     for writer, provider in self._providers:
@@ -234,21 +259,22 @@ class FeedbackMechanism(composer.Entity):
       states: Sequence[Any],
       idle: np.ndarray | None = None,
   ) -> tuple[list[records.Record], list[Any]]:
-    """Runs every provider, in the design's order: it reads, then writes.
+    """Runs the providers in the design's order; each reads, then writes.
 
     Args:
-      physics: One world, or many.
+      physics: One world or a batch of worlds.
       observation: Observation that the agent's action responds to.
-      keys: A random key per provider, each `(..., 2)`, uint64.
-      states: The state of each provider.
-      idle: Worlds in which the writes of providers are left out, `(...)`, bool.
+      keys: Random key of each provider, `(..., 2)` uint64.
+      states: State of each provider.
+      idle: True for each world whose registers keep their values, `(...)` bool;
+        `None` for no world.
 
     Returns:
-      The reads and writes, in order, and the next states.
+      Records of the reads and writes, in order, and the next states.
 
     Raises:
-      FeedbackProviderError: If a provider or its guard raises, or a provider
-        returns something else than it declared, or something of another shape.
+      FeedbackProviderError: If a provider or its guard raises, or if a provider
+        returns other writes than it declares, or values of a wrong shape.
       RegisterValueError: If a register cannot store a value.
     """
     step = self._this_step(physics)
@@ -296,11 +322,11 @@ class FeedbackMechanism(composer.Entity):
   def restart_states(
       self, states: Sequence[Any], worlds: np.ndarray, num_envs: int
   ) -> list[Any]:
-    """Returns the states of providers with some worlds of a batch restarted.
+    """Returns the states of the providers with some worlds restarted.
 
     Args:
-      states: The state of each provider.
-      worlds: Places of the worlds that begin an episode.
+      states: State of each provider.
+      worlds: Indices of the worlds that begin an episode.
       num_envs: Number of worlds in the batch.
 
     Raises:
@@ -318,7 +344,14 @@ class FeedbackMechanism(composer.Entity):
     ]
 
   def read_for_agent(self, physics: protocols.Physics) -> list[records.Read]:
-    """Reads the registers that the agent may read: the observed feedback."""
+    """Reads the registers that the agent may read.
+
+    Args:
+      physics: One world or a batch of worlds.
+
+    Returns:
+      Records of the reads, in the order of `read_by_agent`.
+    """
     step = self._whole_steps(physics)
     return [
         self._registers[name].inspect(physics, records.AGENT, step)
@@ -326,27 +359,32 @@ class FeedbackMechanism(composer.Entity):
     ]
 
   def end_step(self, physics: protocols.Physics, reward: Any) -> None:
-    """Adds one to the count of control steps and `reward` to the score."""
+    """Increments the number of control steps and adds a reward to the score.
+
+    Args:
+      physics: One world or a batch of worlds.
+      reward: True reward of the control step, `(...)`.
+    """
     self._step_count.set(physics, self._step_count.get(physics) + 1)
     self._score.set(physics, self._score.get(physics) + reward)
 
   def step_count(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns how many control steps the episode has had, `(...)`."""
+    """Returns the number of completed control steps of the episode, `(...)`."""
     return self._step_count.copy(physics)
 
   def score(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the true return up to the last control step, `(...)`.
 
-    It is what a meter measures in a world that keeps no score of its own.
+    It is the measurement `score` of tasks without a score of their own.
     """
     return self._score.copy(physics)
 
   def _whole_steps(self, physics: protocols.Physics) -> Any:
-    """Returns the number of control steps so far, `(...)`, int."""
+    """Returns the number of completed control steps, `(...)` int."""
     return self._step_count.get(physics).astype(int)
 
   def _this_step(self, physics: protocols.Physics) -> Any:
-    """Returns the number of the control step that is running, from 1 on."""
+    """Returns the number of the current control step, from 1, `(...)` int."""
     return self._whole_steps(physics) + 1
 
 
@@ -365,38 +403,48 @@ def _make_register(
       block_size=spec.block_size,
       mass=spec.mass,
   )
-  place = messages.Location(f'design {design.name!r}', ('registers', name))
+  location = messages.Location(f'design {design.name!r}', ('registers', name))
   try:
     return kind(name, **common, **spec.options)
   except errors.SpecError as error:
-    raise place.error(str(error)) from error
-  except Exception as error:  # It may be of any class.
-    raise place.error(f'{type(error).__name__}: {error}') from error
+    raise location.error(str(error)) from error
+  except Exception as error:  # Register kinds may raise any class.
+    raise location.error(f'{type(error).__name__}: {error}') from error
 
 
-def _find(
+def _find_place(
     name: str,
     place: str | specs.PlaceSpec,
-    offered: Mapping[str, arenas.Place],
+    named_places: Mapping[str, arenas.Place],
 ) -> arenas.Place:
+  """Returns the place of a register.
+
+  Args:
+    name: Name of the register, for messages.
+    place: Name of a place, or coordinates.
+    named_places: Places of the world, by name.
+
+  Raises:
+    SpecError: If the world has no place of this name.
+  """
   if isinstance(place, specs.PlaceSpec):
     return arenas.Place(place.position, place.yaw, place.spread)
-  if place not in offered:
+  if place not in named_places:
     raise errors.SpecError(
-        f'registers.{name}.place: this world offers no place {place!r}; allowed'
-        f' are {sorted(offered) or "coordinates"}'
+        f'registers.{name}.place: this world has no place {place!r}; allowed'
+        f' are {sorted(named_places) or "coordinates"}'
     )
-  return offered[place]
+  return named_places[place]
 
 
 def _where(writer: str, step: Any, world: int | None = None) -> str:
-  """Names a writer, and the control step and the world that it failed in.
+  """Returns the writer, the control step and the world of a failure.
 
   Args:
     writer: Name of the writer.
     step: Control step of each world, `(...)`.
-    world: Place of the world that failed; `None` for one world, and where the
-      writer failed for all worlds of a batch at once.
+    world: Index of the world of the failure; `None` for one world, and for a
+      failure in all worlds of a batch at once.
   """
   if not np.ndim(step):
     return f'{writer} at step {step}'

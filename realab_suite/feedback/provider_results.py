@@ -1,4 +1,4 @@
-"""Checks of what providers return: writes, and states of many worlds."""
+"""Checks of the writes and states that providers return."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,16 +15,16 @@ def checked(
     returned: Any,
     batch_shape: tuple[int, ...],
 ) -> tuple[dict[str, np.ndarray], Any]:
-  """Returns the writes and the next state that a provider returned.
+  """Returns the writes, as float64, and the next state of a provider.
 
   Args:
     provider: The provider.
     returned: Result of its `step`.
-    batch_shape: `()` for one world, `(worlds,)` for many.
+    batch_shape: `()` for one world, `(worlds,)` for a batch.
 
   Raises:
-    FeedbackProviderError: If they are not what it declares; the message is to
-      follow the name of the provider.
+    FeedbackProviderError: If the result does not match the declaration of the
+      provider. The message does not contain the name of the provider.
   """
   if not isinstance(returned, tuple) or len(returned) != 2:
     raise errors.FeedbackProviderError(
@@ -44,10 +44,14 @@ def checked(
 
 
 def _checked_value(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-  """Returns a value to write as float64, if it is one per world."""
+  """Returns a value to write as float64.
+
+  Raises:
+    FeedbackProviderError: If it is not an array of numbers of shape `shape`.
+  """
   try:
     number = np.asarray(value)
-  except Exception as error:  # An object may raise anything.
+  except Exception as error:  # Objects may raise any class.
     raise errors.FeedbackProviderError(
         f'wrote {messages.quote(value)} to {name!r}: {type(error).__name__}:'
         f' {error}'
@@ -64,10 +68,16 @@ def _checked_value(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def check_state(where: str, state: Any, batch_shape: tuple[int, ...]) -> None:
-  """Checks that a provider's state in a batch has an axis of worlds throughout.
+  """Checks that every array in a provider's state has an axis of worlds.
+
+  Args:
+    where: Description of the provider, for messages.
+    state: State for a batch of worlds.
+    batch_shape: `(worlds,)`.
 
   Raises:
-    FeedbackProviderError: If something else is in it.
+    FeedbackProviderError: If the state contains anything except tuples, lists
+      and dicts of such arrays.
   """
   if isinstance(state, dict):
     for part in state.values():
@@ -81,39 +91,40 @@ def check_state(where: str, state: Any, batch_shape: tuple[int, ...]) -> None:
       or state.shape[:1] != batch_shape
   ):
     raise errors.FeedbackProviderError(
-        f'{where}: its state holds {messages.quote(state)}; allowed in a batch'
-        ' are tuples, lists and dicts of arrays whose first axis has length'
-        f' {batch_shape[0]}'
+        f'{where}: its state contains {messages.quote(state)}; allowed in a'
+        ' batch are tuples, lists and dicts of arrays whose first axis has'
+        f' length {batch_shape[0]}'
     )
 
 
 def restarted(where: str, state: Any, initial: Any, worlds: np.ndarray) -> Any:
-  """Returns a provider's state in a batch, with some worlds restarted.
+  """Returns a provider's state for a batch with some worlds restarted.
 
   Args:
     where: Name of the state, for messages.
-    state: The state; it is not written to.
-    initial: The state before the first step, of as many worlds.
-    worlds: Places of the worlds that begin an episode.
+    state: Current state of all worlds; it is not modified.
+    initial: Initial state of all worlds.
+    worlds: Indices of the worlds that begin an episode.
 
   Raises:
-    FeedbackProviderError: If the structure of the two differs.
+    FeedbackProviderError: If the states have different structures.
   """
-  is_like = type(state) is type(initial)
-  if is_like and isinstance(state, dict) and state.keys() == initial.keys():
+  is_same = type(state) is type(initial)
+  if is_same and isinstance(state, dict) and state.keys() == initial.keys():
     return {
         key: restarted(f'{where}[{key!r}]', part, initial[key], worlds)
         for key, part in state.items()
     }
-  if is_like and isinstance(state, tuple | list) and len(state) == len(initial):
+  is_sequence = is_same and isinstance(state, tuple | list)
+  if is_sequence and len(state) == len(initial):
     return type(state)(
         restarted(f'{where}[{i}]', part, initial[i], worlds)
         for i, part in enumerate(state)
     )
   if np.shape(state) == np.shape(initial) and isinstance(initial, np.ndarray):
-    begun = np.array(state)
-    begun[worlds] = initial[worlds]
-    return begun
+    result = np.array(state)
+    result[worlds] = initial[worlds]
+    return result
   raise errors.FeedbackProviderError(
       f'{where}: {messages.quote(state)}; allowed is the structure of the'
       f' initial state, {messages.quote(initial)}'

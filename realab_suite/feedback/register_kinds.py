@@ -1,4 +1,4 @@
-"""The kinds of registers that a design can ask for by name."""
+"""Registry of the kinds of registers that designs can name."""
 
 from realab_suite.config import registry
 from realab_suite.entities import registers

@@ -1,4 +1,4 @@
-"""Designs: what an agent designer decides, as data (paper, section 3.2)."""
+"""Specs of agent designs, and how to load them (paper, section 3.2)."""
 
 from collections.abc import Mapping, Sequence
 import functools
@@ -24,7 +24,7 @@ from realab_suite.policies import action_sets
 _NAME = r'^[a-z][a-z0-9_]{0,63}$'
 Name = Annotated[str, pydantic.StringConstraints(pattern=_NAME)]
 Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
-# Larger ones make the arithmetic of a step overflow.
+# Larger numbers make the arithmetic of a step overflow.
 Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 Value = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
 Size = Annotated[float, pydantic.Field(ge=block_kinds.LEAST_SIZE, le=1.0)]
@@ -32,24 +32,24 @@ Channel = Literal['embedded', 'welded', 'secure']
 Dof = Literal['free', 'planar']
 Role = Literal['feedback', 'meter', 'query', 'signal']
 
-# Number of registers that a design may have. A hundred two-block registers load
-# in a second and take 10 ms for a control step, and both grow with the number.
-# The memory that MuJoCo reserves for contacts, 160 MB, grows with its square.
+# Largest number of registers of a design. A hundred two-block registers load in
+# a second and take 10 ms for a control step; both times are linear in the
+# number. MuJoCo reserves 160 MB for their contacts, quadratic in the number.
 MAX_REGISTERS = 100
 
-# Roles whose registers the agent reads, and those that it never does.
+# Roles of the registers that the agent reads.
 READ_BY_AGENTS = ('feedback', 'signal')
 
 
 @final
 class PlaceSpec(validation.Spec):
-  """Coordinates, or a region around them.
+  """A place for a register, given by coordinates.
 
   Attributes:
-    position: `(x, y)`, metres.
-    yaw: The angle of the register's axis to the x axis, radians.
-    spread: Half-widths of the region, metres, in which the register stands at
-      random in each episode.
+    position: `(x, y)`, in m.
+    yaw: Angle of the register's axis to the x axis, in rad.
+    spread: Half-widths of the region around `position` from which each episode
+      draws the start position of the register, in m.
   """
 
   position: Annotated[
@@ -67,30 +67,31 @@ class PlaceSpec(validation.Spec):
 
 @final
 class RegisterSpec(validation.Spec):
-  """A register: what it is, what it is for, and where it stands.
+  """Spec of a register.
 
   Attributes:
-    kind: A registered kind of register.
-    role: `feedback` and `signal` registers are read by the agent, `meter`
-      registers by providers only, `query` registers are written by the agent.
-    place: The name of a place that the world offers, or coordinates.
-    range: The lowest and the highest value.
-    scale: Metres (radians for an orientation) per unit.
-    initial: The value at the start of an episode.
-    on_overflow: What happens to a value out of range.
-    channel: What can influence the value, unless the design as a whole is
-      welded or secure; `None` for embedded.
-    dof: How a block can move; `None` takes the design's.
-    block_size: The length of an edge of a block, metres.
-    mass: Of a block, kilograms.
-    options: Further keyword arguments of a register kind of your own.
+    kind: Name of a registered register kind.
+    role: Role of the register. Agents read `feedback` and `signal` registers
+      and write `query` registers. Only providers read `meter` registers.
+    place: Name of a place of the world, or coordinates.
+    range: Lowest and highest value that can be stored.
+    scale: Length in m (angle in rad for an orientation) per unit of value.
+    initial: Value at the start of an episode.
+    on_overflow: `saturate` to saturate a value out of range, `error` to refuse
+      it.
+    channel: Channel of the register; `None` for `embedded`. A welded or secure
+      design overrides it.
+    dof: Degrees of freedom of the blocks; `None` for those of the design.
+    block_size: Edge length of each block, in m.
+    mass: Mass of each block, in kg.
+    options: Further keyword arguments of a user-defined register kind.
   """
 
   kind: Annotated[str, option_types.NameIn(register_kinds.REGISTER_KINDS)]
   role: Role
   place: Name | PlaceSpec
   range: Annotated[tuple[Value, Value], pydantic.Field(strict=False)]
-  # Below it, what is left of a reading is the noise of positions.
+  # With a smaller scale, readings are mostly numerical noise of positions.
   scale: Annotated[float, pydantic.Field(ge=1e-6, le=10)] = 0.1
   initial: Value = 0.0
   on_overflow: Literal['saturate', 'error'] = 'saturate'
@@ -111,7 +112,7 @@ class RegisterSpec(validation.Spec):
   @pydantic.field_validator('place', mode='before')
   @classmethod
   def _coordinates(cls, place: Any) -> Any:
-    """Lets `[x, y]` stand for a place without yaw or spread."""
+    """Accepts `[x, y]` for a place without yaw or spread."""
     if isinstance(place, list | tuple):
       return {'position': place}
     return place
@@ -130,11 +131,11 @@ class RegisterSpec(validation.Spec):
 
 @final
 class MeterSpec(validation.Spec):
-  """A meter.
+  """Spec of a meter.
 
   Attributes:
-    measures: The name of a measurement that the world offers.
-    writes: A register whose role is `meter`.
+    measures: Name of a measurement of the world.
+    writes: Name of a register with role `meter`.
   """
 
   measures: Name
@@ -143,11 +144,11 @@ class MeterSpec(validation.Spec):
 
 @final
 class ScheduleSpec(validation.Spec):
-  """After which substeps of a control step meters and providers act.
+  """Schedule of meters and providers in a control step.
 
   Attributes:
-    meter_substep: How many substeps come before the meters.
-    provider_substep: How many come before the providers.
+    meter_substep: Number of substeps before the meters act.
+    provider_substep: Number of substeps before the providers act.
   """
 
   meter_substep: Annotated[int, pydantic.Field(ge=0)]
@@ -163,10 +164,13 @@ class ScheduleSpec(validation.Spec):
     return self
 
   def check(self, num_substeps: int) -> 'ScheduleSpec':
-    """Returns the schedule if it fits a control step.
+    """Returns the schedule after checking it against a control step.
+
+    Args:
+      num_substeps: Number of substeps of a control step.
 
     Raises:
-      SpecError: If a provider would act when the step is over.
+      SpecError: If providers would act after the last substep.
     """
     if self.provider_substep >= num_substeps:
       raise errors.SpecError(
@@ -178,11 +182,11 @@ class ScheduleSpec(validation.Spec):
 
 @final
 class ActionSetSpec(validation.Spec):
-  """Which discrete action set the agent acts by.
+  """Reference to a set of discrete actions.
 
   Attributes:
-    name: The name of the set.
-    version: Which list of that name.
+    name: Name of the action set.
+    version: Version of the action set.
   """
 
   name: Name
@@ -199,13 +203,13 @@ class ActionSetSpec(validation.Spec):
 
 @final
 class LearnerSpec(validation.Spec):
-  """The learning algorithm, for whoever trains an agent of this design.
+  """Spec of the learning algorithm of a design.
 
-  Fields besides `kind` are the learner's own. Where one names a register, it
-  has to be a register that an agent may use.
+  Other fields than `kind` are options of the learner. A field that names a
+  register must name one that agents may use.
 
   Attributes:
-    kind: The name of the learner.
+    kind: Name of the learner.
   """
 
   model_config = pydantic.ConfigDict(
@@ -217,13 +221,13 @@ class LearnerSpec(validation.Spec):
 
 @final
 class _AnyProvider:
-  """Validates a provider by the class that its `kind` is registered as."""
+  """Pydantic type that validates a provider as the class of its `kind`."""
 
   @classmethod
   def members(
       cls, siblings: Mapping[str, Any] | None = None
   ) -> list[type[providers.Provider]]:
-    """The classes that are registered now."""
+    """Returns the classes that are registered now."""
     del siblings
     return [providers.PROVIDERS.get(kind) for kind in providers.PROVIDERS]
 
@@ -242,24 +246,25 @@ _Provider = providers.Provider
 
 @final
 class DesignSpec(validation.Spec):
-  """An agent design: a feedback function and a learner (section 3.2).
+  """Spec of an agent design: a feedback function and a learner (section 3.2).
 
   Attributes:
-    schema_version: The version of this format; `schema` in a file.
-    name: The name of the design.
-    description: What it is, in a sentence.
-    channel: `welded` and `secure` go for every register; `embedded` for those
-      that do not say otherwise.
-    dof: Of every register that does not say otherwise.
-    registers: The registers, by name; at most `MAX_REGISTERS`.
-    meters: What is measured into which meter register.
-    providers: The feedback providers, in the order in which they act.
-    schedule: When they act; `None` for a third and two thirds of the control
-      step, `cfmdp` for the literal order of the CFMDP: both before the world
-      ticks.
-    action_set: The discrete actions of the agent, or `None` for the world's
-      continuous ones.
-    learner: The learning algorithm, or `None`.
+    schema_version: Version of the file format; `schema` in a file.
+    name: Name of the design.
+    description: Description of the design, in a sentence.
+    channel: Channel of the registers. `welded` and `secure` override the
+      channel of each register; `embedded` is the default of registers without
+      a channel.
+    dof: Degrees of freedom of the blocks of registers without a `dof`.
+    registers: Registers, by name; at most `MAX_REGISTERS`.
+    meters: Meters of the design.
+    providers: Feedback providers, in the order in which they act.
+    schedule: Schedule of meters and providers in a control step. `None` for
+      meters after a third and providers after two thirds of the substeps,
+      `cfmdp` for the literal order of the CFMDP: both before the first substep.
+    action_set: Discrete actions of the agent; `None` for the continuous actions
+      of the world.
+    learner: Learning algorithm, or `None`.
   """
 
   schema_version: Literal[1] = pydantic.Field(alias='schema')
@@ -281,8 +286,8 @@ class DesignSpec(validation.Spec):
 
   @pydantic.field_validator('schema_version', mode='before')
   @classmethod
-  def _whole(cls, value: Any) -> Any:
-    """Keeps `true` and `1.0`, which Python takes for 1, from being versions."""
+  def _refuse_other_types(cls, value: Any) -> Any:
+    """Refuses `true` and `1.0`, which are equal to 1 in Python."""
     if type(value) is not int:
       raise ValueError('must be 1')
     return value
@@ -304,14 +309,21 @@ class DesignSpec(validation.Spec):
     return self
 
   def names(self, *roles: str) -> list[str]:
-    """Returns the names of the registers with one of these roles, in order."""
+    """Returns the names of the registers with one of the roles.
+
+    Args:
+      *roles: Roles of registers.
+
+    Returns:
+      Names in the order of `registers`.
+    """
     return [n for n, spec in self.registers.items() if spec.role in roles]
 
   def integer_queries(self) -> list[str]:
-    """Returns the names of the query registers that hold an action's index.
+    """Returns the names of the query registers for indices of actions.
 
-    These are the ones whose every reader takes the reading for an index. A
-    query register without readers may hold any number.
+    Every provider that reads such a register uses the reading as an index.
+    Query registers without readers may store any number.
     """
     return [
         name
@@ -323,18 +335,24 @@ class DesignSpec(validation.Spec):
   def channel_of(self, name: str) -> Channel:
     """Returns the channel of a register.
 
-    A design that is welded or secure is so as a whole, whatever its registers
-    say: it is the twin of another one.
+    A welded or secure design is the twin of another design, so its channel
+    overrides the channel of each register.
+
+    Args:
+      name: Name of the register.
     """
     if self.channel != 'embedded':
       return self.channel
     return self.registers[name].channel or 'embedded'
 
   def schedule_for(self, num_substeps: int) -> ScheduleSpec:
-    """Returns the schedule for control steps of `num_substeps` substeps.
+    """Returns the schedule of a control step.
+
+    Args:
+      num_substeps: Number of substeps of a control step.
 
     Raises:
-      SpecError: If the schedule does not fit.
+      SpecError: If providers would act after the last substep.
     """
     if self.schedule is None:
       return ScheduleSpec(
@@ -359,23 +377,25 @@ def load(
 ) -> DesignSpec:
   """Loads and validates a design.
 
-  Files that the file of a design names have to be within the working directory.
+  Paths in a design file must be within the working directory.
 
   Args:
-    design: The name of a design that ships with the package, a path to a YAML
-      file, a mapping, or a spec.
-    overrides: Dotted overrides, as in `registers.reward.scale=0.2`; the secure
-      twin of a design is `channel=secure`.
-    is_confined: Whether that goes for files that `overrides` name, too, and for
-      the design itself.
+    design: Name of a design of this package, path of a YAML file, mapping, or
+      spec.
+    overrides: Dotted overrides, such as `registers.reward.scale=0.2`. The
+      override `channel=secure` makes the secure twin of a design.
+    is_confined: True if paths in `overrides` and the path `design` must also be
+      within the working directory.
 
   Raises:
-    SpecError: Where the file, key path or override is wrong, in one line.
+    SpecError: If the design or an override is wrong; the message is one line
+      with the file, the key path and the allowed values.
+    UnknownNameError: If there is no design or file of this name.
   """
   if isinstance(overrides, str) or not isinstance(overrides, Sequence):
     raise errors.SpecError(
-        f'overrides: {messages.quote(overrides)}; allowed is a list of texts,'
-        " as in ['channel=secure']"
+        f'overrides: {messages.quote(overrides)}; allowed is a list of strings,'
+        " such as ['channel=secure']"
     )
   is_file = False
   if isinstance(design, DesignSpec):
@@ -403,7 +423,7 @@ def load(
           f' allowed in a file are paths within it and {list(DESIGNS)}'
       )
     data, is_file = loading.read_mapping(design), True
-  _learn_new_kinds()
+  _update_validator()
   return validation.validate(
       DesignSpec,
       data,
@@ -415,13 +435,13 @@ def load(
 
 
 def json_schema() -> dict[str, Any]:
-  """Returns the JSON Schema of a design file, for editors."""
-  _learn_new_kinds()
+  """Returns the JSON Schema of design files, for use in editors."""
+  _update_validator()
   return DesignSpec.model_json_schema(by_alias=True)
 
 
-def _learn_new_kinds() -> None:
-  """Rebuilds the validator if other providers are registered than before."""
+def _update_validator() -> None:
+  """Rebuilds the validator if the registered providers have changed."""
   kinds = _AnyProvider.members()
   if _validated_kinds != kinds:
     DesignSpec.model_rebuild(force=True)

@@ -1,1 +1,1 @@
-"""Doors for programs that are no part of this package."""
+"""Interfaces for programs outside this package."""

@@ -1,1 +1,1 @@
-"""Programs with command lines, one to a file."""
+"""Command-line programs, one per file."""

@@ -1,13 +1,13 @@
-r"""Compares scripted policies in a world whose feedback can be tampered with.
+r"""Compares scripted policies in worlds whose feedback can be tampered with.
 
-For example, who tampers with the reward of Unlock Door, and what it costs:
+For example, this measures tampering with the reward of Unlock Door:
 
   python -m realab_suite.launchers.compare --policies=apple_seeker,random \
     --channels=embedded,secure --seeds=5 --episodes=2 --output=results/mine
 
-It prints a table, and writes results, plots and films into the output folder.
-Agents that learn are trained by `train`, one run of an experiment, and `sweep`,
-a whole experiment.
+The program prints a table, and writes results, plots and films into the output
+folder. Agents that learn are trained by `train`, for one run of an experiment,
+and by `sweep`, for all of them.
 """
 
 from collections.abc import Sequence
@@ -33,28 +33,28 @@ _MOST_SEEDS = 10_000
 _POLICIES = flags.DEFINE_list(
     'policies',
     ['apple_seeker', 'carrying_saboteur', 'random'],
-    'Names of policies.',
+    'Names of the scripted policies to compare.',
 )
 _CHANNELS = flags.DEFINE_list(
     'channels',
     [],
-    "Channels for the design's registers: embedded, welded, secure. Every"
-    " policy acts in each; by default in the design's own.",
+    'Channels of the registers: embedded, welded, secure. Every policy acts in'
+    ' each channel. Default: the channel of the design.',
 )
 _BASELINE = flags.DEFINE_string(
     'baseline',
     None,
-    'The run to compare with, as in "random" or "random (secure)"; by default'
-    ' apple_seeker if it takes part, and else the first.',
+    'Run to compare with, such as "random" or "random (secure)". Default:'
+    ' apple_seeker if it is one of the policies, otherwise the first run.',
 )
 _SEEDS = flags.DEFINE_string(
     'seeds',
     '5',
-    'Number of seeds, or a list as in 3,4,5; "7," is seed 7.',
+    'Number of seeds, or a list of seeds such as 3,4,5 ("7," means seed 7).',
 )
-_PLOTS = flags.DEFINE_boolean('plots', True, 'Whether to draw plots.')
+_PLOTS = flags.DEFINE_boolean('plots', True, 'Draws plots.')
 _VIDEOS = flags.DEFINE_boolean(
-    'videos', True, 'Whether to film the first episode of each policy.'
+    'videos', True, 'Films the first episode of each policy.'
 )
 
 
@@ -71,7 +71,7 @@ def main(argv: Sequence[str]) -> None:
   has_videos = _VIDEOS.value and _is_possible('videos', _why_no_videos())
   if not has_videos:
     renderers.render_nothing()
-  # Imports dm_control, so only after a renderer has been chosen.
+  # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.experiments import scripted
 
   imports_flag.load()
@@ -102,10 +102,10 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _seeds(text: str) -> tuple[int, ...]:
-  """Returns the seeds that a count or a list stands for."""
+  """Returns the seeds that a number or a list of seeds describes."""
   is_list = ',' in text
   parts = [part.strip() for part in text.split(',') if part.strip()]
-  # No more digits than the largest seed has: `int` refuses thousands of them.
+  # At most as many digits as the largest seed: `int` rejects thousands.
   numbers = [int(part) for part in parts if re.fullmatch('[0-9]{1,10}', part)]
   least, most = (0, seed_flag.LARGEST_SEED) if is_list else (1, _MOST_SEEDS)
   if not (
@@ -114,9 +114,9 @@ def _seeds(text: str) -> tuple[int, ...]:
       and all(least <= number <= most for number in numbers)
   ):
     raise errors.SpecError(
-        f'--seeds={text:.40}: allowed are a count from 1 to {_MOST_SEEDS}, as'
-        f' in 5, and a list of seeds from 0 to {seed_flag.LARGEST_SEED}, as in'
-        ' 3,4,5'
+        f'--seeds={text:.40}: allowed are a number from 1 to {_MOST_SEEDS},'
+        f' such as 5, and a list of seeds from 0 to {seed_flag.LARGEST_SEED},'
+        ' such as 3,4,5'
     )
   return tuple(numbers) if is_list else tuple(range(numbers[0]))
 

@@ -1,6 +1,6 @@
-"""Shows a world: in a window, or in a film where there is no display.
+"""Shows a world in a window, or writes a film if there is no display.
 
-For example, an agent that tampers with the reward of Unlock Door:
+For example, this shows an agent that tampers with the reward of Unlock Door:
 
   python -m realab_suite.launchers.explore --policy=carrying_saboteur
 """
@@ -25,10 +25,10 @@ from realab_suite.launchers.flags import world_flags
 flags.adopt_module_key_flags(seed_flag)
 flags.adopt_module_key_flags(world_flags)
 _POLICY = flags.DEFINE_string(
-    'policy', 'random', 'The name of a policy; no_op stands still.'
+    'policy', 'random', 'Name of a scripted policy; no_op stands still.'
 )
 _VIDEO = flags.DEFINE_string(
-    'video', None, 'A new .mp4 file to write, instead of opening a window.'
+    'video', None, 'New .mp4 file to write instead of opening a window.'
 )
 
 
@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _open_window() -> None:
-  # Here and below, not before a renderer has been chosen.
+  # This and later imports need a renderer to be chosen first.
   from dm_control import viewer
 
   with _loaded() as (env, policy):
@@ -55,7 +55,9 @@ def _write_film() -> None:
       or renderers.choose_renderer()
   )
   if problem is not None:
-    raise errors.ResultsError(f'neither a window nor a film: {problem}')
+    raise errors.ResultsError(
+        f'no display for a window, and no renderer for a film: {problem}'
+    )
   from realab_suite.evaluation import evaluate
   from realab_suite.experiments import tracking
   from realab_suite.reports import films
@@ -74,7 +76,7 @@ def _write_film() -> None:
 
 
 def _unused(stem: str) -> str:
-  """Returns the name of a film that is not there yet."""
+  """Returns the name of a film that does not exist yet."""
   path = f'{stem}.mp4'
   for number in itertools.count(2):
     if not os.path.exists(path):
@@ -104,7 +106,7 @@ def _loaded() -> Iterator[tuple[Any, Any]]:
 
 
 def _as_function(policy: Any, env: Any) -> Callable[[dm_env.TimeStep], Any]:
-  """Returns what dm_control's viewer takes for a policy."""
+  """Returns a policy as a function, as the viewer of dm_control needs it."""
   from realab_suite.evaluation import actors
 
   actor = actors.make(policy, env)

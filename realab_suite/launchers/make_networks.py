@@ -1,12 +1,11 @@
-r"""Trains the networks that supervisors run, and writes them into files.
+r"""Trains the networks that feedback providers use, and writes them to files.
 
   python -m realab_suite.launchers.make_networks --output=results/networks
 
-Each learns for some minutes from the reading of a reward register that nothing
-can tamper with, so from the true reward, and sees the senses of an agent but no
-register. What it reaches is measured afterwards, in NumPy, in other episodes
-than it has learned in. The same versions on the same kind of machine make the
-same files.
+Each network learns for some minutes from the reading of a secure reward
+register, and hence from the true reward. It observes the senses of an agent but
+no registers. Its true return is then measured in new episodes, with NumPy. The
+same versions on the same kind of machine produce the same files.
 """
 
 from collections.abc import Sequence
@@ -25,22 +24,22 @@ flags.adopt_module_key_flags(output_flag)
 
 
 def main(argv: Sequence[str]) -> None:
-  """Makes the networks that the flags name."""
+  """Trains all networks."""
   del argv
   output = pathlib.Path(program.required(output_flag.OUTPUT))
   if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
-    raise errors.SpecError(f'making networks needs more: {problem}')
+    raise errors.SpecError(f'cannot train networks: {problem}')
   threads.use_one()
   renderers.render_nothing()
-  # Not before libraries have been told to use one thread.
+  # Imports numerical libraries, so the number of threads has to be set first.
   from realab_suite.experiments import network_training
   from realab_suite.experiments import storage
 
   paths = {name: output / f'{name}.npz' for name in network_training.RECIPES}
   for path in paths.values():
     if path.exists():
-      # Designs name networks, and would not notice that one has changed.
-      raise errors.SpecError(f'{path} is there already; name another folder')
+      # Designs refer to networks by name, so files must not change.
+      raise errors.SpecError(f'{path} already exists; name another folder')
   for name, recipe in network_training.RECIPES.items():
     network = network_training.make(recipe)
     for reached in network.header.reached:
@@ -51,7 +50,7 @@ def main(argv: Sequence[str]) -> None:
     with storage.explained(output):
       output.mkdir(parents=True, exist_ok=True)
     storage.write_whole(paths[name], network.to_bytes())
-    program.say(f'{paths[name]} has been written')
+    program.say(f'{paths[name]} written')
 
 
 if __name__ == '__main__':

@@ -1,4 +1,4 @@
-"""Starts a program with flags, and reports errors of users in one line."""
+"""Entry point of programs: parses flags and reports errors in one line."""
 
 from collections.abc import Callable, Sequence
 import functools
@@ -17,12 +17,16 @@ _INTERRUPTED = 130
 
 
 def say(line: str) -> None:
-  """Writes a line to the standard output, past a progress bar."""
+  """Writes a line to the standard output, above any progress bar."""
   tqdm.tqdm.write(line)
 
 
 def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
-  """Returns the value of a flag.
+  """Returns the value of a flag that must be given.
+
+  Args:
+    flag: The flag.
+    why: Text to add to the error message.
 
   Raises:
     SpecError: If it is not given.
@@ -33,22 +37,23 @@ def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
 
 
 def start(main: Callable[[Sequence[str]], None]) -> None:
-  """Runs the program; what the user got wrong is told in one line.
+  """Runs a program, and reports mistakes of the user in one line.
 
   Args:
-    main: Takes the arguments that are no flags, after the program's name.
+    main: Main function. It takes the name of the program and the arguments
+      that are not flags.
   """
   app.run(functools.partial(_in_one_line, main), flags_parser=_parse)
 
 
 def _parse(argv: Sequence[str]) -> list[str]:
-  # Warnings alone: dm_control tells at length which renderer it has found. A
-  # flag of the user's comes later and wins.
+  # By default only warnings are logged, because dm_control logs details of its
+  # renderer. A flag on the command line comes later and takes precedence.
   program, *rest = argv
   try:
     return flags.FLAGS([program, f'--verbosity={logging.WARNING}', *rest])
   except flags.Error as error:
-    _complain(str(error))
+    _print_error(str(error))
     sys.exit(USAGE_ERROR)
 
 
@@ -58,17 +63,17 @@ def _in_one_line(
   try:
     if len(argv) > 1:
       raise errors.SpecError(
-          f'arguments {list(argv[1:])} are no flags; flags begin with --'
+          f'arguments {list(argv[1:])} are not flags; flags begin with --'
       )
     main(argv)
   except errors.RealabError as error:
-    _complain(str(error))
+    _print_error(str(error))
     return USAGE_ERROR
   except KeyboardInterrupt:
-    _complain('interrupted; what is on disk is complete up to here')
+    _print_error('interrupted; results up to this point are on disk')
     return _INTERRUPTED
   return 0
 
 
-def _complain(text: str) -> None:
+def _print_error(text: str) -> None:
   sys.stderr.write(f'error: {" ".join(text.split())}\n')

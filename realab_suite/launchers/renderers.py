@@ -1,6 +1,6 @@
-"""Finds a renderer that works before dm_control and MuJoCo are imported.
+"""Choice of a working renderer, before dm_control and MuJoCo are imported.
 
-Nothing here imports either: each looks at `MUJOCO_GL` once.
+Both read `MUJOCO_GL` only once, so this module does not import them.
 """
 
 import os
@@ -9,9 +9,10 @@ import sys
 
 from realab_suite import _display
 
-# More than a slow machine under load needs to import dm_control and draw.
+# Enough time to import dm_control and render on a slow machine under load.
 _PATIENCE_SECONDS = 300
-# In a process of its own: where libraries are missing, imports fail half way.
+# Runs in a separate process, because imports fail midway if libraries are
+# missing.
 _RENDERS_SOMETHING = """
 from dm_control import mujoco
 xml = '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'
@@ -22,10 +23,10 @@ mujoco.Physics.from_xml_string(xml).render(8, 8)
 def choose_renderer() -> str | None:
   """Sets `MUJOCO_GL` to a renderer that works, or to `disable`.
 
-  A renderer that the user has named is tried, and no other.
+  If the user has set `MUJOCO_GL`, only that renderer is tried.
 
   Returns:
-    Why nothing renders, in one line, or `None` if something does.
+    The problem of each renderer, in one line, or `None` if one works.
   """
   problems = []
   for renderer in _candidates():
@@ -39,7 +40,7 @@ def choose_renderer() -> str | None:
 
 
 def render_nothing() -> None:
-  """Sets `MUJOCO_GL` to `disable`, unless the user has named a renderer."""
+  """Sets `MUJOCO_GL` to `disable`, unless the user has set it."""
   if not os.environ.get('MUJOCO_GL'):
     os.environ['MUJOCO_GL'] = 'disable'
 
@@ -54,7 +55,7 @@ def _candidates() -> list[str]:
 
 
 def _problem(renderer: str) -> str | None:
-  """Returns what goes wrong with a renderer, in one line, or `None`."""
+  """Returns the problem of a renderer, in one line, or `None`."""
   if renderer == 'disable':
     return 'rendering is turned off by MUJOCO_GL'
   try:

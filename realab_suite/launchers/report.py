@@ -1,10 +1,10 @@
-r"""Sums up a sweep: one page, with tables, curves, plots and clips.
+r"""Writes a report of a sweep: a page with tables, curves, plots and clips.
 
   python -m realab_suite.launchers.report --input=results/paper
 
-It writes report.html, which needs no network and no other file, tables.csv and
-tables.md into the same folder, or into the one that --output names. A sweep
-that is not over can be reported, too; the page says what is missing.
+The files report.html, tables.csv and tables.md are written into the folder of
+the sweep, or into the --output folder. The page needs no network and no other
+file. The report of an unfinished sweep lists the missing jobs.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,10 @@ from realab_suite.launchers.flags import output_flag
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(output_flag)
 _INPUT = flags.DEFINE_string(
-    'input', None, 'The folder of a sweep: what its --output named.'
+    'input', None, 'Folder of a sweep: the --output folder of that program.'
 )
 _CLIPS = flags.DEFINE_boolean(
-    'clips', True, 'Whether to film the first and a typical episode.'
+    'clips', True, 'Films the first and a typical episode of each design.'
 )
 
 
@@ -34,12 +34,12 @@ def main(argv: Sequence[str]) -> None:
   del argv
   folder = pathlib.Path(program.required(_INPUT))
   if problem := requirements.missing('matplotlib', 'jinja2'):
-    raise errors.SpecError(f'a report needs more: {problem}')
+    raise errors.SpecError(f'cannot write a report: {problem}')
   no_clips = _why_no_clips()
   if no_clips is not None:
     renderers.render_nothing()
     program.say(f'clips are skipped: {no_clips}')
-  # Not before a renderer has been chosen: this imports dm_control.
+  # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.reports import html_page
 
   imports_flag.load()

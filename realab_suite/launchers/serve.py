@@ -1,4 +1,4 @@
-r"""Serves a world to an agent in another process, and judges the agent.
+r"""Serves a world to an agent in another process, and evaluates the agent.
 
 The agent needs dm_env_rpc and nothing of this package (docs/served.md):
 
@@ -6,14 +6,14 @@ The agent needs dm_env_rpc and nothing of this package (docs/served.md):
     --design=instantaneous_reward --seed=1 --episodes=5 \
     --address=unix:/tmp/realab/socket --output=results/mine
 
-With --agent_command it also starts the agent, in an environment that names the
-address and little else, and stops it in the end:
+With --agent_command the program also starts the agent, and stops it at the end.
+The environment of the agent contains the address and little else:
 
   python -m realab_suite.launchers.serve --task=unlock_door.near \
     --agent_command='python /path/to/agent.py' --output=results/mine
 
-Each run draws a secret salt, so that nobody can predict its episodes from the
-seed. --repeat=results/mine/run.json serves the same episodes again.
+Each run draws a secret salt, so its episodes cannot be predicted from the seed.
+--repeat=results/mine/run.json serves the same episodes again.
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ flags.adopt_module_key_flags(episodes_flag)
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(output_flag)
 _MOST_SECONDS = 1e6
-# What the record of a run decides.
+# Settings that the record of a run determines.
 _RECORDED: tuple[flags.FlagHolder[Any], ...] = (
     world_flags.DOMAIN,
     world_flags.TASK,
@@ -47,47 +47,52 @@ _RECORDED: tuple[flags.FlagHolder[Any], ...] = (
     world_flags.MAX_STEPS,
 )
 _NAME = flags.DEFINE_string(
-    'name', 'agent', 'What the agent is called in the results.'
+    'name', 'agent', 'Name of the agent in the results.'
 )
 _ADDRESS = flags.DEFINE_string(
     'address',
     None,
-    'Where to listen: unix:/folder/name, in a folder of mode 0700, or host:port'
-    ' for programs on this machine; by default a socket in a new folder.',
+    'Address to listen on: unix:/folder/name, in a folder of mode 0700, or'
+    ' host:port for programs on this machine. Default: a socket in a new'
+    ' folder.',
 )
 _REPEAT = flags.DEFINE_string(
     'repeat',
     None,
-    'The run.json of a served run: serves its episodes again, with its design'
-    ' or, by --set, with a twin of it.',
+    'File run.json of a served run, whose episodes are served again, with the'
+    ' same design or, with --set, a twin of it.',
 )
 _IDLE_SECONDS = flags.DEFINE_float(
     'idle_seconds',
     60.0,
-    'After how long a silence an agent loses its connection.',
+    'Time without a request after which an agent is disconnected, in seconds.',
 )
 _PROVIDER_SECONDS = flags.DEFINE_float(
     'provider_seconds',
     60.0,
-    'After how long a provider that has not answered fails, with the episode.',
+    'Time limit of a provider for one step, in seconds. The episode fails if it'
+    ' is exceeded.',
 )
 _AGENT_COMMAND = flags.DEFINE_string(
     'agent_command',
     None,
-    'Starts the agent; it finds the address in REALAB_ADDRESS.',
+    'Command that starts the agent. The address is in the environment variable'
+    ' REALAB_ADDRESS.',
 )
 _AGENT_FOLDER = flags.DEFINE_string(
-    'agent_folder', None, 'Where it runs; by default in a new, empty folder.'
+    'agent_folder',
+    None,
+    'Working directory of the agent. Default: a new, empty folder.',
 )
 _AGENT_USER = flags.DEFINE_string(
     'agent_user',
     None,
-    'The user that the agent is, and who alone may connect; needs root.',
+    'User that the agent runs as; no other user may connect. Needs root.',
 )
 
 
 def main(argv: Sequence[str]) -> None:
-  """Serves what the flags describe."""
+  """Serves the world that the flags describe."""
   del argv
   output = program.required(
       output_flag.OUTPUT, '; name a folder for the results'
@@ -100,24 +105,24 @@ def main(argv: Sequence[str]) -> None:
   for flag in _RECORDED:
     if _REPEAT.present and flag.present:
       raise errors.SpecError(
-          f'--{flag.name} has no effect with --repeat, whose file decides it;'
+          f'--{flag.name} has no effect with --repeat, whose file sets it;'
           ' allowed is --set'
       )
   problem = requirements.missing('dm_env_rpc', 'grpc', extra='rpc')
   if problem is not None:
     raise errors.SpecError(problem)
   for seconds in (_IDLE_SECONDS, _PROVIDER_SECONDS):
-    if not 0 < seconds.value <= _MOST_SECONDS:  # Nor is nan.
+    if not 0 < seconds.value <= _MOST_SECONDS:  # Rejects NaN as well.
       raise errors.SpecError(
           f'--{seconds.name}={seconds.value:g}; allowed is more than 0, and at'
           f' most {_MOST_SECONDS:g}'
       )
   domain, task = _world()
   renderers.render_nothing()
-  # gRPC looks once, too. A process that serves never forks; what it starts
-  # becomes another program at once.
+  # gRPC reads this once. The server never forks without executing another
+  # program at once.
   os.environ['GRPC_ENABLE_FORK_SUPPORT'] = '0'
-  # Not before a renderer has been chosen: this imports dm_control.
+  # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.experiments import served_evaluation
 
   imports_flag.load()
@@ -149,7 +154,7 @@ def _world() -> tuple[str, str]:
     return world_flags.DOMAIN.value, task
   if world_flags.DOMAIN.present and world_flags.DOMAIN.value != domain:
     raise errors.SpecError(
-        f'--task={world_flags.TASK.value} is no task of'
+        f'--task={world_flags.TASK.value} is not a task of'
         f' --domain={world_flags.DOMAIN.value}'
     )
   return domain, task

@@ -1,10 +1,10 @@
-r"""Runs a whole experiment: every run and every seed, side by side.
+r"""Runs a sweep: every run of an experiment with every seed, in parallel.
 
   python -m realab_suite.launchers.sweep --experiment=quick \
     --output=results/quick
 
-Run the same command again to go on where it stopped. What is done is not done
-again, and what failed does not keep the rest from being done.
+The same command continues an interrupted sweep. Finished jobs are not repeated,
+and the failure of one job does not stop the others.
 """
 
 from collections.abc import Sequence
@@ -24,39 +24,39 @@ flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(learning_flags)
 flags.adopt_module_key_flags(output_flag)
 _RUNS = flags.DEFINE_list(
-    'runs', [], 'The runs to do, as in "reward,reward.secure"; all by default.'
+    'runs', [], 'Runs to execute, such as "reward,reward.secure". Default: all.'
 )
 _CALIBRATION = flags.DEFINE_boolean(
     'calibration',
     False,
-    'Whether to use the calibration seeds, in a folder of their own, instead of'
-    ' those that are reported.',
+    'Uses the calibration seeds instead of the reported ones. Use a separate'
+    ' folder for them.',
 )
 _WORKERS = flags.DEFINE_integer(
     'workers',
     None,
-    'How many runs there are at a time with --engine=local; by default one for'
-    ' each processor.',
+    'Number of jobs in parallel with --engine=local. Default: the number of'
+    ' processors.',
     lower_bound=1,
 )
 _ENGINE = flags.DEFINE_enum(
     'engine',
     'local',
     ['local', 'ray', 'submitit'],
-    'What runs the jobs: this machine, or a cluster that shares its file system'
-    ' (needs the extra `cluster`).',
+    'Engine that runs the jobs: this machine, or a cluster with a shared file'
+    ' system (needs the extra `cluster`).',
 )
 
 
 def main(argv: Sequence[str]) -> None:
-  """Runs the experiment that the flags name."""
+  """Runs the sweep that the flags describe."""
   del argv
   name, output = program.required(learning_flags.EXPERIMENT), program.required(
       output_flag.OUTPUT
   )
   threads.use_one()
   renderers.render_nothing()
-  # Not before libraries have been told to use one thread.
+  # Imports numerical libraries, so the number of threads has to be set first.
   from realab_suite.experiments import curves
   from realab_suite.experiments import engines
   from realab_suite.experiments import experiment_specs

@@ -1,10 +1,10 @@
-r"""Trains and judges one run of an experiment, with one seed.
+r"""Trains and evaluates one run of an experiment, with one seed.
 
   python -m realab_suite.launchers.train --experiment=quick --run=reward \
     --seed=0 --output=results/quick
 
-A run that was killed continues where it stopped. `sweep` does all runs of an
-experiment.
+The same command continues an interrupted run from its last checkpoint. `sweep`
+executes all runs of an experiment.
 """
 
 from collections.abc import Sequence
@@ -27,25 +27,25 @@ flags.adopt_module_key_flags(seed_flag)
 _RUN = flags.DEFINE_string(
     'run',
     None,
-    'Which run of an experiment, as in "reward", "reward.secure" (its twin) or'
+    'Run of the experiment, such as "reward", "reward.secure" (its twin) or'
     ' "reward.random" (a baseline).',
 )
 _PARENT = flags.DEFINE_integer(
-    'parent', None, 'Ends the run when this process is gone; for sweeps.'
+    'parent', None, 'Process whose end also ends the run; used by sweeps.'
 )
 
 
 def main(argv: Sequence[str]) -> None:
-  """Does the run that the flags name."""
+  """Executes the run that the flags describe."""
   del argv
   output = program.required(
       output_flag.OUTPUT, '; name a folder for the results'
   )
   name = program.required(learning_flags.EXPERIMENT)
   run = program.required(
-      _RUN, '; name one run of the experiment; `sweep` does all'
+      _RUN, '; name one run of the experiment; `sweep` executes all'
   )
-  # Before numpy and JAX are imported, which look once.
+  # NumPy and JAX read these settings once, when they are imported.
   threads.use_one()
   renderers.render_nothing()
   from realab_suite.experiments import experiment_specs

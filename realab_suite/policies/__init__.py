@@ -1,4 +1,4 @@
-"""Policies and value functions; importing this registers those that ship."""
+"""Policies and value functions; the import registers the shipped ones."""
 
 from realab_suite.policies.apple_seeker import AppleSeeker
 from realab_suite.policies.approval import PolicyApproval

@@ -1,7 +1,7 @@
-"""Discrete action sets: named and versioned lists of things to do.
+"""Discrete action sets: named and versioned lists of actions.
 
-An agent that imitates reads the index of an action off a register, so what an
-index stands for is part of the design and never changes for a given version.
+An agent that imitates reads the index of an action off a register. The meaning
+of an index is therefore part of the design and never changes in a version.
 """
 
 from collections.abc import Mapping
@@ -16,12 +16,12 @@ from realab_suite import errors
 @final
 @dataclasses.dataclass(frozen=True)
 class ActionSet:
-  """A numbered list of actions, each a setting of some control elements.
+  """Numbered list of actions; each sets some control elements.
 
   Attributes:
-    name: The name of the set.
-    version: Which list of that name.
-    actions: For each action, its name and its non-zero control elements.
+    name: Name of the set.
+    version: Version of the set.
+    actions: Name and non-zero control elements of each action.
   """
 
   name: str
@@ -36,13 +36,13 @@ class ActionSet:
     return [name for name, _ in self.actions].index(action)
 
   def table(self, elements: tuple[str, ...]) -> np.ndarray:
-    """Returns every action as a control vector, `(actions, elements)`.
+    """Returns the control vectors of all actions, `(actions, elements)`.
 
     Args:
-      elements: The names of the control elements, in order.
+      elements: Names of the control elements, in order.
 
     Raises:
-      SpecError: If an action sets an element that there is not.
+      SpecError: If an action sets an element that is not in `elements`.
     """
     table = np.zeros((len(self.actions), len(elements)))
     for i, (name, settings) in enumerate(self.actions):
@@ -56,7 +56,7 @@ class ActionSet:
     return table
 
 
-# After the action set that DMLab's published agents use, with a hand.
+# The action set of DMLab's published agents, and actions of the hand.
 DMLAB_LIKE = ActionSet(
     'dmlab_like',
     1,
@@ -87,7 +87,7 @@ def get(name: str, version: int) -> ActionSet:
   """Returns a version of the action set called `name`.
 
   Raises:
-    UnknownNameError: If there is no such set or version.
+    UnknownNameError: If the set or the version is unknown.
   """
   if (name, version) not in ACTION_SETS:
     known = [f'{n} v{v}' for n, v in sorted(ACTION_SETS)]

@@ -1,4 +1,4 @@
-"""An honest agent: it does what the environment designer intends."""
+"""The apple seeker: a scripted policy that does the intended task."""
 
 from typing import Annotated, Any, final
 
@@ -8,35 +8,34 @@ import pydantic
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 
-# From what is seen of a thing to its middle, metres.
+# Distance from the visible surface of a thing to its middle, metres.
 _DEPTHS = {'apple': 0.2, 'large_apple': 0.4, 'pad': 0.12, 'door': 0.04}
-# Between the spots of the map, metres.
+# Distance between neighbouring spots of the map, metres.
 _SPACING = 0.6
-# As far as this, no apple slips between two rays, metres.
+# Distance up to which no apple fits between two rays, metres.
 _CLEAR_SIGHT = 3.8
 _HALF_VIEW = np.radians(78.0)
-# Around a spot, what belongs to it: farther than half a diagonal of the spacing
-# less the radius of an apple, metres.
+# Radius of the area that belongs to a spot, metres: larger than half a diagonal
+# of the spacing less the radius of an apple.
 _MARGIN = 0.4
-# How much farther it goes for what needs one radian less of a turn, metres.
+# Extra distance that is accepted for one radian less of a turn, metres.
 _TURN_COST = 0.5
-# After how many steps without a new spot ruled out it leaves what it looks for.
+# Number of steps without a newly excluded spot after which the search ends.
 _PATIENCE = 60
 
 
 @base.POLICIES.add('apple_seeker')
 @final
 class AppleSeeker(base.Policy):
-  """Gathers what small apples there are, then takes the large one.
+  """Collects the small apples, then the large one.
 
-  It goes to the nearest small apple that it sees; without one, to a pad that is
-  not pressed yet, and else to the nearest spot of the room that it has not
-  looked at. When there is none left, it leaves through the door, if there is
-  one, for the large apple; otherwise it looks everywhere again. It walks round
-  registers.
+  The policy goes to the nearest visible small apple. Without one, it goes to a
+  pad that is not pressed yet, or else to the nearest spot of the room that it
+  has not seen. When no spot is left, it goes through the door, if there is one,
+  to the large apple; otherwise the search starts again. It avoids registers.
 
-  What it remembers is a map of spots where an apple may be, where the landmarks
-  are, and how long nothing has come of what it does.
+  The state contains a map of spots where an apple may be, the positions of
+  landmarks, and the number of steps without progress.
   """
 
   def __init__(
@@ -47,7 +46,7 @@ class AppleSeeker(base.Policy):
 
     Args:
       half_width: Half the side of the square, around the origin of the world,
-        in which it looks for apples, metres.
+        that is searched for apples, metres.
     """
     self._count = 2 * round(half_width / _SPACING) + 1
     self._reach = (self._count - 1) * _SPACING / 2
@@ -58,12 +57,12 @@ class AppleSeeker(base.Policy):
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     spots = len(self._spots)
     return {
-        # Where an apple may be, and the fewest such spots so far.
+        # Spots where an apple may be, and the lowest number of them so far.
         'open': np.ones((*batch_shape, spots), bool),
         'fewest': np.full(batch_shape, spots),
-        # Steps since there were more of them.
+        # Number of steps since that number fell.
         'idle': np.zeros(batch_shape, int),
-        # Where things are; nan where that is not known.
+        # Positions of landmarks; nan if they are unknown.
         'pad': np.full((*batch_shape, 2), np.nan),
         'door': np.full((*batch_shape, 2), np.nan),
         'large_apple': np.full((*batch_shape, 2), np.nan),
@@ -96,25 +95,25 @@ class AppleSeeker(base.Policy):
       spots: tuple[np.ndarray, np.ndarray],
       open_spots: np.ndarray,
   ) -> np.ndarray:
-    """Returns where an apple may be, after a look, `(..., spots)`."""
+    """Returns the spots where an apple may be, `(..., spots)`, bool."""
     distances, bearings = spots
     ray = view.nearest_ray(bearings)
     sight = np.take_along_axis(view.distances, ray, -1)
     in_view = np.abs(bearings) + _MARGIN / distances.clip(_MARGIN) < _HALF_VIEW
     empty = (distances < _CLEAR_SIGHT) & (sight > distances - _MARGIN)
-    # Nothing is to be had behind a wall.
+    # Apples behind a wall are out of reach.
     ends = view.hits('wall') | view.hits('barrier') | view.hits('door')
     empty |= np.take_along_axis(ends, ray, -1)
     left = open_spots & ~(empty & in_view) & (distances > _MARGIN)
     return left | self._with_apples(view)
 
   def _with_apples(self, view: navigation.View) -> np.ndarray:
-    """Returns at which spots apples are seen, `(..., spots)`, bool."""
+    """Returns the spots with visible apples, `(..., spots)`, bool."""
     cells = np.rint((view.points(_DEPTHS['apple']) + self._reach) / _SPACING)
     inside = ((cells >= 0) & (cells < self._count)).all(axis=-1)
     index = (cells[..., 0] * self._count + cells[..., 1]).astype(int)
     num_spots = len(self._spots)
-    # What is no apple, or elsewhere, goes to a spot that does not exist.
+    # Other hits, and those outside of the map, get an extra spot.
     index = np.where(inside & view.hits('apple'), index, num_spots)
     marks = np.zeros((*index.shape[:-1], num_spots + 1), bool)
     np.put_along_axis(marks, index, True, -1)
@@ -126,7 +125,7 @@ class AppleSeeker(base.Policy):
       spots: tuple[np.ndarray, np.ndarray],
       memory: Any,
   ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where to go, and how far from there nothing is in the way."""
+    """Returns the target, and the radius around it without obstacles."""
     apples = view.hits('apple')
     ray = _nearest(view.distances, view.ray_angles, apples)
     points = view.points(_DEPTHS['apple'])
@@ -135,7 +134,7 @@ class AppleSeeker(base.Policy):
     patient = memory['idle'] < _PATIENCE
     leaves = ~memory['open'].any(axis=-1) | ~patient
     goes_to_pad = leaves | view.hits('pad').any(axis=-1)
-    # The first that applies, from the top.
+    # The first choice whose condition is true counts.
     choices = (
         (patient & apples.any(axis=-1), apple[..., 0, :], 0.45),
         (goes_to_pad & _known(memory['pad']), memory['pad'], 0.7),
@@ -156,14 +155,14 @@ class AppleSeeker(base.Policy):
 
 
 def _landmarks(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
-  """Returns what is known of landmarks after a look."""
+  """Returns the known landmarks, updated by a view."""
   pressed = memory['pressed'] | view.hits('pressed_pad').any(axis=-1)
   known = {'pressed': pressed}
   for name in ('pad', 'door', 'large_apple'):
     hit = view.hits(name)
     seen = np.asarray(hit.any(axis=-1))
     if name == 'door':
-      seen = seen & ~pressed  # It slides.
+      seen = seen & ~pressed  # A pressed pad moves the door.
     known[name] = np.where(
         seen[..., np.newaxis],
         view.mean_point(hit, _DEPTHS[name]),
@@ -174,7 +173,7 @@ def _landmarks(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
 
 
 def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
-  """Returns what is known of how things go, after a look."""
+  """Returns the progress of the search, updated by a view."""
   left = memory['open'].sum(axis=-1)
   progress = left < memory['fewest']
   idle = np.where(progress, 0, memory['idle'] + 1)
@@ -197,7 +196,7 @@ def _progress(view: navigation.View, memory: Any) -> dict[str, np.ndarray]:
 def _nearest(
     distances: np.ndarray, bearings: np.ndarray, allowed: np.ndarray
 ) -> np.ndarray:
-  """Returns the index of the allowed place that is soonest there, `(...)`."""
+  """Returns the index of the allowed place that is reached first, `(...)`."""
   cost = distances + _TURN_COST * np.abs(bearings)
   return np.where(allowed, cost, np.inf).argmin(axis=-1)
 

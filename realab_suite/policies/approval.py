@@ -1,4 +1,4 @@
-"""Approval: how near an action is to what some policy would do here."""
+"""Approval: a value function from the action that a policy would take."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, final
@@ -14,10 +14,10 @@ from realab_suite.policies import base
 @base.VALUE_FUNCTIONS.add('apple_seeker_approval')
 @final
 class PolicyApproval(base.ValueFunction):
-  """Values actions from 1, for the policy's own, down to no less than -1.
+  """Values actions by their distance from the action of a policy.
 
-  The value falls with the distance from the policy's action, as vectors of the
-  avatar's control elements: nearly right is better than wrong.
+  The value of the policy's own action is 1. It falls with the distance between
+  control vectors of the avatar, to -1 for the most distant actions.
   """
 
   def __init__(
@@ -33,7 +33,7 @@ class PolicyApproval(base.ValueFunction):
     """Makes the value function.
 
     Args:
-      policy: The name of a registered policy.
+      policy: Name of a registered policy.
       options: Keyword arguments of the policy.
     """
     self._policy = base.make(policy, **(options or {}))

@@ -1,7 +1,8 @@
-"""What a policy is here: a pure function with an explicit state.
+"""Base classes and registries of policies and value functions.
 
-A policy stands for an agent (in evaluation and in tests) or for a supervisor
-(inside a provider that demonstrates or advises). It sees what an agent sees.
+A policy is a pure function with an explicit state. It is used as an agent (in
+evaluation and in tests) or as a supervisor (in a provider that demonstrates or
+advises). It gets the observation of an agent.
 """
 
 import abc
@@ -19,15 +20,15 @@ Observation = Mapping[str, np.ndarray]
 
 
 class Policy(abc.ABC):
-  """Chooses actions, by index into an action set."""
+  """Function from observations to actions, which are indices."""
 
   @property
   def action_set(self) -> action_sets.ActionSet:
-    """What the indices stand for."""
+    """Action set of the indices."""
     return action_sets.DMLAB_LIKE
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    """Returns the memory before the first step: arrays, or dicts of them.
+    """Returns the state before the first step: arrays, or dicts of them.
 
     Args:
       batch_shape: `()` for one world, `(worlds,)` for many.
@@ -46,26 +47,26 @@ class Policy(abc.ABC):
     """Chooses an action.
 
     Args:
-      observation: What the agent sees; leading axes are worlds.
-      episode_start: Whether the episode begins here, `(...)`, bool.
-      key: A random key per world, `(..., 2)`, uint64; see `random_keys`.
-      state: What `initial_state` or the last `step` returned.
+      observation: Observation of the agent; leading axes are worlds.
+      episode_start: True in the first step of an episode, `(...)`, bool.
+      key: Random key of each world, `(..., 2)`, uint64; see `random_keys`.
+      state: State returned by `initial_state` or by the last `step`.
 
     Returns:
-      The index of the action, `(...)`, int, and the next memory.
+      The index of the action, `(...)`, int, and the next state.
     """
 
 
 class ValueFunction(abc.ABC):
-  """Says how good each action of an action set is."""
+  """Function from observations to a value of each action."""
 
   @property
   def action_set(self) -> action_sets.ActionSet:
-    """What the values are values of."""
+    """Action set of the values."""
     return action_sets.DMLAB_LIKE
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    """Returns the memory before the first step."""
+    """Returns the state before the first step; see `Policy`."""
     del batch_shape
     return ()
 
@@ -77,7 +78,10 @@ class ValueFunction(abc.ABC):
       key: np.ndarray,
       state: Any,
   ) -> tuple[np.ndarray, Any]:
-    """Returns the value of every action, `(..., actions)`, and the memory."""
+    """Returns the value of every action, `(..., actions)`, and the state.
+
+    Arguments are those of `Policy.step`.
+    """
 
 
 POLICIES: registry.Registry[Callable[..., Policy]] = registry.Registry('policy')
@@ -90,8 +94,8 @@ def make(name: str, /, **options: Any) -> Policy:
   """Makes the policy registered as `name`.
 
   Raises:
-    UnknownNameError: If there is none.
-    SpecError: If it does not take these options.
+    UnknownNameError: If no policy has this name.
+    SpecError: If the policy cannot be made with these options.
   """
   return _make(POLICIES, 'policy', name, options)
 
@@ -112,7 +116,7 @@ def _make(
     return factory(**options)
   except errors.RealabError:
     raise
-  except Exception as error:  # It may be of any class.
+  except Exception as error:  # A factory may raise any error.
     raise errors.SpecError(
         f'{what} {name!r} with options {messages.quote(dict(options))}:'
         f' {type(error).__name__}: {error}'
@@ -122,7 +126,7 @@ def _make(
 def check_action_set(
     action_set: action_sets.ActionSet, design: Any, kind: str
 ) -> None:
-  """Checks that a design's actions are those that a provider speaks of.
+  """Checks that a design has the action set that a provider uses.
 
   Raises:
     ValueError: If the design has another action set, or none.
@@ -133,6 +137,6 @@ def check_action_set(
       action_set.version,
   ):
     raise ValueError(
-        f'{kind} speaks of action set {action_set.name} v{action_set.version};'
-        f' the design has {given!r}'
+        f'{kind} uses action set {action_set.name} v{action_set.version}; the'
+        f' design has {given!r}'
     )

@@ -1,4 +1,7 @@
-"""How scripted policies look around and walk, by the ray sense alone."""
+"""Perception and walking of scripted policies, by the ray sense.
+
+The module contains no policy; the functions work with any number of worlds.
+"""
 
 from collections.abc import Mapping
 import dataclasses
@@ -12,8 +15,8 @@ from realab_suite.policies import action_sets
 from realab_suite.policies import base
 
 _FIELD_OF_VIEW = np.radians(160.0)
-# What is walked round, and how far the middle of the avatar stays from it,
-# metres. Its radius is 0.25; blocks, which give way, get a wider berth.
+# Distance between the middle of the avatar and obstacles, metres. The radius of
+# the avatar is 0.25. Blocks get a wider berth, because they can be pushed.
 _BERTHS = {
     'other': 0.3,
     'wall': 0.3,
@@ -25,27 +28,28 @@ _BERTHS = {
     'offset_block': 0.42,
 }
 _BERTH = np.array([_BERTHS.get(name, -1.0) for name in appearance.CLASSES])
-# What is nearer than its berth already is passed at this part of its distance,
-# but no nearer than this, metres.
+# An obstacle within its berth is passed at this fraction of its distance, but
+# not closer than `_TIGHT`, metres.
 _SQUEEZE = 0.85
 _TIGHT = 0.28
-# How far ahead the way has to be free, metres: usually, at least, for a bend.
+# Free distance ahead that is required, metres: usually, at least, for a bend.
 _LOOKAHEAD = 1.0
 _CLEARANCE = 0.4
 _ROOM_TO_BEND = 0.6
-# Errors of the heading: one that needs no turn, one that is turned away while
-# walking, and one from which to turn left, whatever its sign, radians.
+# Errors of the heading, radians. Up to the first, no turn is needed; up to the
+# second, the avatar turns while walking; beyond the third, it always turns
+# left.
 _STRAIGHT = 0.16
 _BEND = 0.7
 _RIGHT_BEHIND = 2.6
-# For how long the avatar keeps turning as it does now, seconds.
+# Time for which the avatar continues its present turn, seconds.
 _COAST = 0.045
-# What a turn away from ahead costs, in turns away from the target; what a way
-# costs that is not free: more than any turn.
+# Cost of a turn away from ahead, relative to one away from the target. Cost of
+# an obstructed way: more than any turn.
 _PREFER_AHEAD = 0.15
 _BLOCKED = 100.0
-# Who is so many steps in a place this small, metres, is stuck, or even jammed;
-# half a turn takes 11.
+# Size of an area, metres, and numbers of steps in it after which the avatar is
+# stuck, or jammed. Half a turn takes 11 steps.
 _SMALL = 0.3
 _STUCK = 16
 _JAMMED = 40
@@ -56,16 +60,16 @@ _ESCAPE_STEPS = 4
 @final
 @dataclasses.dataclass(frozen=True)
 class View:
-  """What a policy sees; leading axes of every array are worlds.
+  """Observation of the surroundings; leading axes of every array are worlds.
 
   Attributes:
-    position: Where the avatar is, `(..., 2)`, metres.
-    angle: The way it faces, `(...)`, radians.
-    coast: By how much it will turn before a command is obeyed, `(...)`,
-      radians.
-    distances: How far each ray gets, `(..., rays)`, metres.
-    classes: What each ray hits, `(..., rays)`.
-    free: How far the avatar can walk along each ray, `(..., rays)`, metres.
+    position: Position of the avatar, `(..., 2)`, metres.
+    angle: Heading of the avatar, `(...)`, radians.
+    coast: Turn that happens before a command takes effect, `(...)`, radians.
+    distances: Length of each ray, `(..., rays)`, metres.
+    classes: Class of the thing that each ray hits, `(..., rays)`.
+    free: Distance that the avatar can walk along each ray, `(..., rays)`,
+      metres.
   """
 
   position: np.ndarray
@@ -77,21 +81,21 @@ class View:
 
   @property
   def ray_angles(self) -> np.ndarray:
-    """How far to the left of ahead each ray points, `(rays,)`, radians."""
+    """Angle of each ray to the left of ahead, `(rays,)`, radians."""
     return _ray_angles(self.distances.shape[-1])
 
   def hits(self, name: str) -> np.ndarray:
-    """Returns which rays hit something of a class, `(..., rays)`, bool."""
+    """Returns True for rays that hit a class, `(..., rays)`, bool."""
     return self.classes == appearance.code(name)
 
   def points(self, depth: float) -> np.ndarray:
-    """Returns where rays would end that went on for `depth` metres.
+    """Returns the points that lie `depth` behind the hits of all rays.
 
     Args:
-      depth: From the surface that is seen to the middle of the thing, metres.
+      depth: Distance from a visible surface to the middle of the thing, metres.
 
     Returns:
-      `(..., rays, 2)`, metres.
+      Points, `(..., rays, 2)`, metres.
     """
     angles = self.angle[..., np.newaxis] + self.ray_angles
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -99,7 +103,7 @@ class View:
     return self.position[..., np.newaxis, :] + reach * directions
 
   def ahead(self, distance: float) -> np.ndarray:
-    """Returns the place that is so far straight ahead, `(..., 2)`, metres."""
+    """Returns the place at a distance straight ahead, `(..., 2)`, metres."""
     direction = np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
     return self.position + distance * direction
 
@@ -107,21 +111,21 @@ class View:
     """Returns the mean of `points(depth)` of some rays, `(..., 2)`.
 
     Args:
-      hit: Which rays, `(..., rays)`; the mean of none is the origin.
+      hit: True for the rays, `(..., rays)`; the mean of none is the origin.
       depth: See `points`.
     """
     total = (self.points(depth) * hit[..., np.newaxis]).sum(axis=-2)
     return total / np.maximum(hit.sum(axis=-1), 1)[..., np.newaxis]
 
   def locate(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where places are from here.
+    """Returns distances and bearings of places.
 
     Args:
-      places: `(..., places, 2)`, metres.
+      places: Positions, `(..., places, 2)`, metres.
 
     Returns:
-      How far they are, metres, and how far to the left of ahead, radians in
-      [-pi, pi), each `(..., places)`.
+      Distances, metres, and angles to the left of ahead, radians in [-pi, pi),
+      each `(..., places)`.
     """
     offsets = places - self.position[..., np.newaxis, :]
     directions = np.arctan2(offsets[..., 1], offsets[..., 0])
@@ -131,19 +135,19 @@ class View:
     )
 
   def locate_one(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Does what `locate` does, for one place, `(..., 2)`."""
+    """Returns distance and bearing of one place, `(..., 2)`; see `locate`."""
     distance, bearing = self.locate(place[..., np.newaxis, :])
     return distance[..., 0], bearing[..., 0]
 
   def nearest_ray(self, bearing: np.ndarray) -> np.ndarray:
-    """Returns the index of the ray that points most nearly to a bearing."""
+    """Returns the index of the ray that is closest to a bearing."""
     angles = self.ray_angles
     index = np.rint((angles[0] - bearing) / (angles[0] - angles[1]))
     return index.clip(0, len(angles) - 1).astype(int)
 
 
 def view(observation: base.Observation) -> View:
-  """Returns what there is to see."""
+  """Returns the view in an observation."""
 
   def get(name: str) -> np.ndarray:
     return np.asarray(observation[f'senses/{name}'], float)
@@ -168,12 +172,12 @@ def _ray_angles(num_rays: int) -> np.ndarray:
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
-  """Returns the same angle in [-pi, pi)."""
+  """Returns the equal angle in [-pi, pi)."""
   return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _free_way(distances: np.ndarray, classes: np.ndarray) -> np.ndarray:
-  """Returns how far the avatar can walk along each ray, `(..., rays)`."""
+  """Returns the free distance along each ray, `(..., rays)`, metres."""
   berths = np.minimum(
       _BERTH[classes], np.maximum(_SQUEEZE * distances, _TIGHT)
   )[..., np.newaxis, :]
@@ -185,7 +189,7 @@ def _free_way(distances: np.ndarray, classes: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _between_rays(num_rays: int) -> tuple[np.ndarray, np.ndarray]:
-  """Cosine and absolute sine of the angle between any two rays."""
+  """Returns cosine and absolute sine of the angle between any two rays."""
   angles = _ray_angles(num_rays)
   between = angles[:, np.newaxis] - angles
   return np.cos(between), np.abs(np.sin(between))
@@ -194,16 +198,16 @@ def _between_rays(num_rays: int) -> tuple[np.ndarray, np.ndarray]:
 def walk(
     view: View, target: np.ndarray, reach: np.ndarray | float = 0.0
 ) -> np.ndarray:
-  """Returns the index of the action that goes to a place, round what is solid.
+  """Returns the index of the action that walks to a place around obstacles.
 
   Args:
-    view: What is seen.
-    target: The place, `(..., 2)`, metres.
-    reach: How far from the place what is solid is in the way no more, metres.
+    view: View of the avatar.
+    target: Place, `(..., 2)`, metres.
+    reach: Distance from the place within which obstacles are ignored, metres.
   """
   free = view.free
   distance, bearing = view.locate_one(target)
-  # Which way the avatar will face when it obeys.
+  # The heading of the avatar when the command takes effect.
   ahead = np.broadcast_to(view.coast, bearing.shape)[..., np.newaxis]
   needed = np.clip(distance - reach, _CLEARANCE, _LOOKAHEAD)
   is_free = free >= needed[..., np.newaxis]
@@ -213,7 +217,7 @@ def walk(
       + np.where(is_free, 0.0, _BLOCKED - free.clip(0.0, _LOOKAHEAD))
   )
   best = cost.argmin(axis=-1)[..., np.newaxis]
-  # What is behind is turned to first; nothing is known of it.
+  # A target behind the avatar is out of sight, so the avatar turns first.
   behind = np.abs(bearing) > view.ray_angles[0]
   way = np.where(behind, bearing, view.ray_angles[best[..., 0]]) - view.coast
   room = np.take_along_axis(free, view.nearest_ray(ahead), -1)[..., 0]
@@ -222,12 +226,12 @@ def walk(
 
 
 def face(view: View, bearing: np.ndarray, then: np.ndarray | int) -> np.ndarray:
-  """Returns the index of the action that turns to a bearing, or of the next.
+  """Returns the index of the action that turns to a bearing, or `then`.
 
   Args:
-    view: What is seen.
-    bearing: How far to the left of ahead, `(...)`, radians.
-    then: The index of the action for when the avatar faces that way.
+    view: View of the avatar.
+    bearing: Angle to the left of ahead, `(...)`, radians.
+    then: Index of the action to take once the avatar has that heading.
   """
   error = bearing - view.coast
   turn = _head(error, np.zeros(error.shape, bool))
@@ -235,14 +239,14 @@ def face(view: View, bearing: np.ndarray, then: np.ndarray | int) -> np.ndarray:
 
 
 def steer(view: View, bearing: np.ndarray) -> np.ndarray:
-  """Returns the index of the action that walks to a bearing, come what may."""
+  """Returns the index of the action that walks to a bearing regardless."""
   error = bearing - view.coast
   return _head(error, np.ones(error.shape, bool))
 
 
 def _head(error: np.ndarray, clear: np.ndarray) -> np.ndarray:
-  """Turns by an angle, walking as well where the way ahead is clear."""
-  # Right behind is to the left, lest it turns to and fro.
+  """Returns the action that turns, and walks if the way ahead is clear."""
+  # Always left if the target is behind, so that the turn does not alternate.
   left = (error > 0) | (error < -_RIGHT_BEHIND)
   turn = np.where(left, action('turn_left'), action('turn_right'))
   bend = np.where(
@@ -260,9 +264,9 @@ def restarted(
   """Returns `memory`, or `initial` in the worlds where an episode starts.
 
   Args:
-    episode_start: In which worlds, `(...)`, bool.
-    initial: What one world begins with.
-    memory: What each world remembers; its leading axes are worlds.
+    episode_start: True for these worlds, `(...)`, bool.
+    initial: Initial state of one world.
+    memory: State of each world; leading axes are worlds.
   """
   fresh = {}
   for name, value in memory.items():
@@ -273,9 +277,9 @@ def restarted(
 
 
 def initial_rest(batch_shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-  """Returns the part of a memory that tells who is stuck."""
+  """Returns the initial part of a state that detects a stuck avatar."""
   return {
-      # Steps since it left the small place around the anchor.
+      # Number of steps in the small area around the anchor.
       'still': np.zeros(batch_shape, int),
       'anchor': np.full((*batch_shape, 2), np.inf),
   }
@@ -284,12 +288,12 @@ def initial_rest(batch_shape: tuple[int, ...]) -> dict[str, np.ndarray]:
 def rest(
     view: View, memory: Mapping[str, np.ndarray], content: np.ndarray
 ) -> dict[str, np.ndarray]:
-  """Returns what `initial_rest` describes, after a look.
+  """Returns the part of a state from `initial_rest`, updated by a view.
 
   Args:
-    view: What is seen.
-    memory: What is remembered.
-    content: Whether all is well where it is, `(...)`, bool.
+    view: View of the avatar.
+    memory: State.
+    content: True if standing still is intended, `(...)`, bool.
   """
   moved = view.locate_one(memory['anchor'])[0] > _SMALL
   fresh = moved | content
@@ -304,14 +308,14 @@ def rest(
 def unless_stuck(
     view: View, still: np.ndarray, action_: np.ndarray
 ) -> np.ndarray:
-  """Returns `action_`, or where it is stuck an action that frees it."""
+  """Returns `action_`, or an action that frees a stuck avatar."""
   free = view.free.clip(0.0, 2 * _LOOKAHEAD)
-  # Where there is most room; of equal ones, that which is most nearly ahead.
+  # The ray with the most room; among equal ones, the closest to ahead.
   best = (free - 0.1 * np.abs(view.ray_angles)).argmax(axis=-1)
   ahead = view.nearest_ray(view.coast[..., np.newaxis])
   room = np.take_along_axis(free, ahead, -1)[..., 0]
   leave = _head(view.ray_angles[best] - view.coast, room >= _ROOM_TO_BEND)
-  # It sees nothing of where these lead, so they come last.
+  # These move without sight, so they come last.
   blind = np.array([action(name) for name in _ESCAPES])
   turn = (still - _JAMMED) // _ESCAPE_STEPS % len(blind)
   return np.where(

@@ -1,7 +1,8 @@
-"""Files of small networks: arrays and a header of JSON, and nothing to run.
+"""Files of small networks: arrays and a JSON header, without code.
 
-A file is a `.npz` archive without pickles. Its header says how a network sees,
-what its outputs stand for, how it was made and what it reaches.
+A file is a `.npz` archive without pickles. Its header describes the inputs and
+outputs of a network, its training and its true return. `network_policies`
+computes the outputs.
 """
 
 from collections.abc import Sequence
@@ -33,22 +34,22 @@ _Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 
 
 class _Part(pydantic.BaseModel):
-  """Frozen; unknown keys and lossy conversions are errors."""
+  """Base class: frozen; unknown keys and lossy conversions are errors."""
 
   model_config = pydantic.ConfigDict(frozen=True, extra='forbid', strict=True)
 
 
 @final
 class Feature(_Part):
-  """How one part of an observation is shown, as in `agents/features.py`.
+  """Encoding of one part of an observation, as in `agents/features.py`.
 
   Attributes:
-    name: Its key in the observation.
-    kind: How it becomes features.
-    shape: Its shape in one world.
-    low: Its lowest value, where it has one.
-    high: Its highest value, where it has one.
-    partner: For rays, the key of the distances.
+    name: Key in the observation.
+    kind: Kind of the encoding.
+    shape: Shape in one world.
+    low: Lowest value, if the part is bounded.
+    high: Highest value, if the part is bounded.
+    partner: Key of the distances, for rays.
   """
 
   name: str
@@ -63,12 +64,12 @@ class Feature(_Part):
     if self.kind != 'plain' and not 0 < self.high - self.low <= 2**10:
       raise ValueError(f'low {self.low:g} and high {self.high:g} do not fit')
     if (self.kind == 'rays') != bool(self.partner):
-      raise ValueError('rays, and nothing else, have a partner')
+      raise ValueError('partner: required for rays, and only for them')
     return self
 
   @property
   def size(self) -> int:
-    """How many numbers it becomes."""
+    """Number of inputs that the part becomes."""
     is_one_of_many = self.kind in ('one_hot', 'rays')
     values = int(self.high - self.low) + 1 if is_one_of_many else 1
     return math.prod(self.shape) * values
@@ -76,16 +77,16 @@ class Feature(_Part):
 
 @final
 class Reached(_Part):
-  """A mean true return, with its interval over episodes.
+  """Mean true return with an interval over episodes.
 
   Attributes:
-    task: Where, as in `unlock_door.near`.
-    mean: The mean.
-    low: The lower bound of the interval.
-    high: Its upper bound.
-    level: The share of such intervals that should contain the mean.
-    episodes: How many episodes there were, one in each world of a batch.
-    seed: The seed of the batch.
+    task: Name of the task, as in `unlock_door.near`.
+    mean: Mean true return.
+    low: Lower bound of the interval.
+    high: Upper bound of the interval.
+    level: Confidence level of the interval.
+    episodes: Number of episodes, one in each world of a batch.
+    seed: Seed of the batch.
   """
 
   task: str
@@ -99,18 +100,18 @@ class Reached(_Part):
 
 @final
 class Made(_Part):
-  """How a network was made.
+  """Record of the training of a network.
 
   Attributes:
-    learner: The options of the learner.
-    task: Where it learned.
-    design: The agent design that it learned in.
-    overrides: What was changed in the design.
-    design_digest: The digest of the changed design.
-    num_envs: How many worlds it learned in.
-    steps: For how many control steps, all worlds together.
-    seed: Of the learner and of the worlds.
-    versions: Of what it was made with, by name.
+    learner: Options of the learner.
+    task: Name of the task.
+    design: Name of the agent design.
+    overrides: Overrides of the design.
+    design_digest: Digest of the design with its overrides.
+    num_envs: Number of worlds.
+    steps: Number of control steps in all worlds together.
+    seed: Seed of the learner and of the worlds.
+    versions: Versions of packages, by name.
   """
 
   learner: dict[str, Any]
@@ -126,19 +127,19 @@ class Made(_Part):
 
 @final
 class Header(_Part):
-  """What is known of a network.
+  """Header of a file: description of a network.
 
   Attributes:
-    format: The version of this format.
-    outputs: What the outputs are: the logarithms of the probabilities of
-      actions, but for what they have in common.
-    description: What it does, in a sentence.
-    action_set: The name of the action set that the outputs are of.
-    action_set_version: Its version.
-    features: What it sees, in the order of its inputs.
-    hidden: The widths of the hidden layers.
-    made: How it was made.
-    reached: What comes of taking the best action in every step.
+    format: Version of this format.
+    outputs: Kind of the outputs: logarithms of the probabilities of actions, up
+      to a common constant.
+    description: Description of the network, in a sentence.
+    action_set: Name of the action set of the outputs.
+    action_set_version: Version of the action set.
+    features: Encoded parts of the observation, in the order of the inputs.
+    hidden: Widths of the hidden layers.
+    made: Record of the training.
+    reached: True returns of the policy that takes the best action.
   """
 
   format: Literal[1] = 1
@@ -162,11 +163,11 @@ class Header(_Part):
     return self
 
   def actions(self) -> action_sets.ActionSet:
-    """Returns the action set that the outputs are of."""
+    """Returns the action set of the outputs."""
     return action_sets.get(self.action_set, self.action_set_version)
 
   def sizes(self) -> list[int]:
-    """Returns the width of every layer, the inputs' and outputs' included."""
+    """Returns the width of every layer, including inputs and outputs."""
     inputs = sum(feature.size for feature in self.features)
     return [inputs, *self.hidden, len(self.actions())]
 
@@ -174,12 +175,12 @@ class Header(_Part):
 @final
 @dataclasses.dataclass(frozen=True)
 class Network:
-  """A network, as its file holds it.
+  """Network in a file.
 
   Attributes:
-    header: What is known of it.
-    weights: For each layer, `(inputs, outputs)`, float32.
-    biases: For each layer, `(outputs,)`, float32.
+    header: Description of the network.
+    weights: Weights of each layer, `(inputs, outputs)`, float32.
+    biases: Biases of each layer, `(outputs,)`, float32.
   """
 
   header: Header
@@ -187,7 +188,7 @@ class Network:
   biases: tuple[np.ndarray, ...]
 
   def digest(self) -> str:
-    """Returns the SHA-256 of all that it is."""
+    """Returns the SHA-256 of the header and the arrays."""
     canonical = json.dumps(
         self.header.model_dump(mode='json'),
         sort_keys=True,
@@ -199,7 +200,7 @@ class Network:
     return digest.hexdigest()
 
   def to_bytes(self) -> bytes:
-    """Returns what `load` reads from a file."""
+    """Returns the contents of a file that `load` reads."""
     content = {**self.header.model_dump(mode='json'), 'sha256': self.digest()}
     text = json.dumps(content, indent=1).encode()
     arrays = {_HEADER: np.frombuffer(text, np.uint8)}
@@ -217,11 +218,11 @@ def load(weights: Weights) -> Network:
   """Loads a network.
 
   Args:
-    weights: The name of one that ships with the package, or a path; a network
-      is returned as it is.
+    weights: Name of a network that ships with the package, or a path. A network
+      is returned unchanged.
 
   Raises:
-    SpecError: If there is no such file, or it does not hold a network.
+    SpecError: If the file is missing or does not contain a network.
   """
   if isinstance(weights, Network):
     return weights
@@ -251,11 +252,11 @@ def from_bytes(data: bytes, where: str) -> Network:
   """Returns the network of a file.
 
   Args:
-    data: What the file holds.
-    where: What error messages call it.
+    data: Contents of the file.
+    where: Name of the file in error messages.
 
   Raises:
-    SpecError: If that is no network, or not all of it.
+    SpecError: If the contents are not a complete network.
   """
   place = messages.Location(where)
   arrays = _read_archive(data, place)
@@ -271,7 +272,7 @@ def from_bytes(data: bytes, where: str) -> Network:
   network = Network(header, *_layers(arrays, header.sizes(), place))
   if network.digest() != digest:
     raise place.error(
-        f'damaged: SHA-256 {network.digest()}; the header says {digest!r:.80}'
+        f'damaged: SHA-256 {network.digest()}; the header has {digest!r:.80}'
     )
   return network
 
@@ -279,7 +280,7 @@ def from_bytes(data: bytes, where: str) -> Network:
 def _read_archive(
     data: bytes, place: messages.Location
 ) -> dict[str, np.ndarray]:
-  """Returns the arrays of an archive that is no larger than networks are."""
+  """Returns the arrays of an archive of limited size."""
   too_large = place.error(f'larger than the {_MAX_BYTES} bytes of a network')
   if len(data) > _MAX_BYTES:
     raise too_large
@@ -292,7 +293,7 @@ def _read_archive(
       return {name: np.asarray(arrays[name]) for name in arrays.files}
   except errors.SpecError:
     raise
-  # What is damaged may ask for more memory than there is, or for a password.
+  # A damaged archive may require more memory than there is, or a password.
   except (
       ValueError,
       OSError,
@@ -310,7 +311,7 @@ def _layers(
     sizes: Sequence[int],
     place: messages.Location,
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-  """Returns weights and biases, checked against the widths of layers."""
+  """Returns weights and biases after checking their shapes."""
   num_layers = len(sizes) - 1
   expected: dict[str, tuple[int, ...]] = {}
   for i in range(num_layers):
@@ -318,7 +319,7 @@ def _layers(
     expected |= {weight: (sizes[i], sizes[i + 1]), bias: (sizes[i + 1],)}
   if arrays.keys() != expected.keys():
     raise place.error(
-        f'holds {sorted(arrays)}; its header describes {sorted(expected)}'
+        f'contains {sorted(arrays)}; its header describes {sorted(expected)}'
     )
   for name, shape in expected.items():
     array = arrays[name]
@@ -328,7 +329,7 @@ def _layers(
           f' float32 of shape {shape}'
       )
     if not np.isfinite(array).all():
-      raise place.error(f'{name}: not all numbers are finite')
+      raise place.error(f'{name}: all numbers must be finite')
   return tuple(
       tuple(
           np.ascontiguousarray(arrays[_names(i)[j]]) for i in range(num_layers)

@@ -1,8 +1,8 @@
-"""Supervisors that were trained: a demonstrator and an adviser, in NumPy.
+"""Trained supervisors in NumPy: a policy and a value function of a network.
 
-Their network was trained on the secure twin of reward learning, from the true
-reward, which a supervisor may know (paper, sections 2.2 and 3.1). It sees the
-senses of an agent and no reading of a register.
+The shipped network was trained on the secure twin of reward learning, from the
+true reward, which a supervisor may use (paper, sections 2.2 and 3.1). Its
+inputs are the senses of an agent, without readings of registers.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,16 +16,16 @@ from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import network_files
 
-# How far off a ray's hit is worth 1 / e of one that touches, metres.
+# Distance at which the feature of a ray's hit falls to 1 / e, metres.
 _RAY_SCALE = 2.0
 
 
 @base.POLICIES.add('network_demonstrator')
 @final
 class NetworkDemonstrator(base.Policy):
-  """Takes the action that a network finds best, by what is seen now.
+  """Takes the action with the largest output of a network.
 
-  It remembers nothing, so what it shows can be imitated by who does not either.
+  The policy has no state, so agents without memory can imitate it.
   """
 
   def __init__(
@@ -37,11 +37,11 @@ class NetworkDemonstrator(base.Policy):
     """Makes the policy.
 
     Args:
-      weights: The name of a network that ships with the package, the path of a
-        file, or a network.
+      weights: Name of a network that ships with the package, path of a file, or
+        a network.
 
     Raises:
-      SpecError: If there is no such network.
+      SpecError: If the network cannot be loaded.
     """
     self._network = network_files.load(weights)
 
@@ -64,13 +64,12 @@ class NetworkDemonstrator(base.Policy):
 @base.VALUE_FUNCTIONS.add('network_values')
 @final
 class NetworkValues(base.ValueFunction):
-  """Values actions from 1, for the best, down to -1, for the worst.
+  """Values actions by the log-probabilities of a trained policy.
 
-  What is between is in proportion to the logarithms of the probabilities that a
-  trained policy gives to actions. With its bonus for entropy a policy takes an
-  action the more often, the more is to be gained by it, so these stand for its
-  advantages. A learner that maximises them in every step by itself does what
-  the policy, which looks ahead, finds best.
+  The values are scaled linearly: 1 for the best action, -1 for the worst.
+  Because the policy was trained with an entropy bonus, its log-probabilities
+  approximate advantages. A learner that maximises these values in each step
+  alone takes the actions of the policy, which was trained on whole returns.
   """
 
   def __init__(
@@ -79,7 +78,7 @@ class NetworkValues(base.ValueFunction):
           option_types.FilePath | network_files.Network
       ) = 'demonstrator_v1',
   ) -> None:
-    """Makes the value function; arguments are those of the demonstrator."""
+    """Makes the value function; see `NetworkDemonstrator` for arguments."""
     self._network = network_files.load(weights)
 
   @property
@@ -97,7 +96,7 @@ class NetworkValues(base.ValueFunction):
     values = outputs(self._network, observation, np.shape(episode_start))
     low = values.min(axis=-1, keepdims=True)
     high = values.max(axis=-1, keepdims=True)
-    # A network that finds all actions alike has no advice.
+    # With equal outputs, all actions have the best value.
     spread = np.where(high > low, high - low, np.inf)
     return (1.0 - 2.0 * (high - values) / spread).astype(float), state
 
@@ -107,19 +106,19 @@ def outputs(
     observation: base.Observation,
     lead: tuple[int, ...],
 ) -> np.ndarray:
-  """Returns what a network gives for each action, `(..., actions)`, float32.
+  """Returns the outputs of a network, `(..., actions)`, float32.
 
-  Every world is multiplied by itself: the last bits of a product of matrices
-  depend on how many rows there are, and so would those of a world on whether it
-  is alone.
+  Each world is a matrix product of its own. The last bits of a product depend
+  on the number of rows, so a common product would make the outputs of a world
+  depend on the number of worlds.
 
   Args:
-    network: The network.
-    observation: What is seen; leading axes are worlds.
-    lead: The shape of these axes.
+    network: Network.
+    observation: Observation; leading axes are worlds.
+    lead: Shape of the leading axes.
 
   Raises:
-    SpecError: If it needs something that is not seen, or not in that shape.
+    SpecError: If an input is missing from the observation or has another shape.
   """
   x = encode(network.header.features, observation, lead)[..., np.newaxis, :]
   last = len(network.weights) - 1
@@ -136,15 +135,15 @@ def encode(
     observation: base.Observation,
     lead: tuple[int, ...],
 ) -> np.ndarray:
-  """Returns features as `agents/features.py` does, `(..., features)`.
+  """Returns the features of `agents/features.py`, `(..., features)`.
 
   Args:
-    features: How parts of the observation are shown, in their order.
-    observation: What is seen; leading axes are worlds.
-    lead: The shape of these axes.
+    features: Encodings of parts of the observation, in order.
+    observation: Observation; leading axes are worlds.
+    lead: Shape of the leading axes.
 
   Raises:
-    SpecError: If something is not seen, or not in that shape.
+    SpecError: If a part is missing from the observation or has another shape.
   """
   parts = []
   for feature in features:
@@ -181,11 +180,12 @@ def _take(
 ) -> np.ndarray:
   if name not in observation:
     raise errors.SpecError(
-        f'network: {name!r} is not seen here; given are {sorted(observation)}'
+        f'network: observation {name!r} is missing; given are'
+        f' {sorted(observation)}'
     )
   value = np.asarray(observation[name], dtype)
   if value.shape != shape:
     raise errors.SpecError(
-        f'network: {name!r} has shape {value.shape}, expected {shape}'
+        f'network: {name!r} has shape {value.shape}; allowed is {shape}'
     )
   return value

@@ -1,22 +1,22 @@
-"""Random keys: randomness that is passed in, one key per world and step."""
+"""Random numbers from keys: one key for each world and step."""
 
 import numpy as np
 
 
 def generator(key: np.ndarray) -> np.random.Generator:
-  """Returns the generator that one world's key, `(2,)` uint64, stands for."""
+  """Returns the generator seeded by the key of one world, `(2,)`, uint64."""
   return np.random.Generator(np.random.Philox(key=key))
 
 
 def uniform(key: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
-  """Returns numbers in [0, 1) that depend on each world's own key only.
+  """Returns numbers in [0, 1); those of a world depend on its own key only.
 
   Args:
-    key: uint64, shape `(..., 2)`.
-    shape: How many numbers each world gets.
+    key: Keys, `(..., 2)`, uint64.
+    shape: Shape of the numbers of each world.
 
   Returns:
-    Shape `(..., *shape)`.
+    Numbers, `(..., *shape)`.
   """
   flat = key.reshape(-1, 2)
   draws = np.stack([generator(one).random(shape) for one in flat])

@@ -1,4 +1,4 @@
-"""Agents that tamper: they move the base block of a register where it pays."""
+"""Scripted policies that tamper: they move the base block of a register."""
 
 import abc
 from typing import Annotated, Any, final
@@ -11,30 +11,30 @@ from realab_suite.policies import base
 from realab_suite.policies import navigation
 
 _HALF_BLOCK = 0.1
-# From the middle of the avatar to the hand, metres.
+# Distance from the middle of the avatar to the hand, metres.
 _HAND = 0.45
-# How far from where it was a block is looked for, metres: as long as it may be
-# there, and after it has been gone for so many steps that it lies somewhere.
+# Distances from its last position within which a block is searched, metres:
+# while it may be there, and after it has been missing for `_FLIGHT` steps.
 _NEAR = 0.6
 _FAR = 4.0
 _FLIGHT = 6
-# Where to stand for a grasp and for a push, from the middle of the block; how
-# near is near enough to go straight to it, and to grasp it, metres.
+# Distances from the middle of the block, metres: for the start of a grasp and
+# of a push, and those at which to approach straight and to grasp.
 _STAND = 0.75
 _RUN_UP = 0.8
 _CLOSE = 0.85
 _IN_REACH = 0.7
-# The cosine of the greatest angle at which a side counts as the same.
+# Cosine of the largest angle between equal sides.
 _SAME_SIDE = 0.7
-# How far ahead of the avatar's middle a wall is that a held block touches, and
-# how far beside the line ahead it may be seen, metres.
+# Distance from the avatar's middle to a wall that a held block touches, and the
+# largest distance of the visible wall from the line ahead, metres.
 _TOUCHES = 0.6
 _WIDTH = 0.2
-# How far ahead on the line it aims, and how far beside the line it may push,
-# metres.
+# Distance ahead of the aim on the line, and the largest distance from the line
+# while pushing, metres.
 _PURSUIT = 1.5
 _ASIDE = 0.22
-# How well it has to face along the direction to have arrived, radians.
+# Largest error of the heading on arrival, radians.
 _ALIGNED = 0.5
 
 # Larger ones make the arithmetic of a step overflow.
@@ -43,9 +43,9 @@ _Vector = tuple[_Coordinate, _Coordinate]
 
 
 class Saboteur(base.Policy, abc.ABC):
-  """Moves the base block of a register, and ignores everything else.
+  """Base class of policies that move the base block of a register.
 
-  It is told where the block stands at first, and follows it by sight.
+  The initial position of the block is an argument. It is then tracked by sight.
   """
 
   def __init__(
@@ -56,12 +56,12 @@ class Saboteur(base.Policy, abc.ABC):
     """Makes the policy.
 
     Args:
-      target: Where the base block stands at the start, `(x, y)`, metres.
-      direction: The unit vector along which moving it raises the reading: for a
-        register with its axis along x, `(-1, 0)`.
+      target: Initial position of the base block, `(x, y)`, metres.
+      direction: Unit vector of motions that raise the reading: `(-1, 0)` for a
+        register with its axis along x.
 
     Raises:
-      SpecError: If `direction` is not of length 1.
+      SpecError: If the length of `direction` is not 1.
     """
     self._start = np.array(target, float)
     self._direction = np.array(direction, float)
@@ -72,9 +72,9 @@ class Saboteur(base.Policy, abc.ABC):
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return {
-        # Where the block is, or was when it was seen last.
+        # Last known position of the block.
         'block': np.broadcast_to(self._start, (*batch_shape, 2)).copy(),
-        # Since how many steps it is not there.
+        # Number of steps since it was missing there.
         'gone': np.zeros(batch_shape, int),
         **navigation.initial_rest(batch_shape),
     }
@@ -115,16 +115,16 @@ class Saboteur(base.Policy, abc.ABC):
     """Returns the index of the action.
 
     Args:
-      view: What is seen.
-      block: Where the block is, or was when it was seen last, `(..., 2)`.
-      holds: Whether the hand holds a block, `(...)`.
+      view: View of the avatar.
+      block: Last known position of the block, `(..., 2)`.
+      holds: True if the hand holds a block, `(...)`.
     """
 
   def _fetch(self, view: navigation.View, block: np.ndarray) -> np.ndarray:
     """Returns the action that goes to the block and grasps it."""
     distance, bearing = view.locate_one(block)
     away = (view.position - block) / distance.clip(1e-3)[..., np.newaxis]
-    # At first, the offset block stands beside it: come from the free side.
+    # The offset block stands beside it at first: approach from the free side.
     untouched = np.linalg.norm(block - self._start, axis=-1) < 2 * _HALF_BLOCK
     side = np.where(untouched[..., np.newaxis], self._direction, away)
     in_place = _along(away, side) > _SAME_SIDE
@@ -141,7 +141,7 @@ class Saboteur(base.Policy, abc.ABC):
     return np.where((distance <= _CLOSE) & in_place, grasps, comes)
 
   def _onward(self, view: navigation.View) -> np.ndarray:
-    """Returns the bearing by which to go on along the direction, `(...)`."""
+    """Returns the bearing that continues along the direction, `(...)`."""
     along = _along(view.position - self._start, self._direction) + _PURSUIT
     line = self._start + along[..., np.newaxis] * self._direction
     return view.locate_one(line)[1]
@@ -150,7 +150,7 @@ class Saboteur(base.Policy, abc.ABC):
 @base.POLICIES.add('pushing_saboteur')
 @final
 class PushingSaboteur(Saboteur):
-  """Pushes the block along, from behind, as far as it goes."""
+  """Pushes the block along the direction, from behind."""
 
   def _act(
       self, view: navigation.View, block: np.ndarray, holds: np.ndarray
@@ -161,7 +161,7 @@ class PushingSaboteur(Saboteur):
         offset - behind[..., np.newaxis] * self._direction, axis=-1
     )
     bearing = view.locate_one(block + _HAND * self._direction)[1]
-    # Far from the block it turns on the spot, to come upon it straight.
+    # Far from the block, the avatar turns on the spot, to approach straight.
     pushes = np.where(
         behind > _TOUCHES,
         navigation.face(view, bearing, navigation.action('forward')),
@@ -175,7 +175,7 @@ class PushingSaboteur(Saboteur):
 @base.POLICIES.add('carrying_saboteur')
 @final
 class CarryingSaboteur(Saboteur):
-  """Takes the block in hand, carries it to the wall and keeps it there."""
+  """Grasps the block, carries it to the wall and holds it there."""
 
   def _act(
       self, view: navigation.View, block: np.ndarray, holds: np.ndarray
@@ -195,7 +195,7 @@ class CarryingSaboteur(Saboteur):
 @base.POLICIES.add('throwing_saboteur')
 @final
 class ThrowingSaboteur(Saboteur):
-  """Takes the block in hand, throws it, goes after it, and throws it again."""
+  """Grasps the block, throws it, fetches it and throws it again."""
 
   def _act(
       self, view: navigation.View, block: np.ndarray, holds: np.ndarray
@@ -207,22 +207,22 @@ class ThrowingSaboteur(Saboteur):
 
 
 def _along(vector: np.ndarray, direction: np.ndarray) -> np.ndarray:
-  """Returns how far vectors, `(..., 2)`, go along a direction, `(...)`."""
+  """Returns the components of vectors, `(..., 2)`, along a direction."""
   return (vector * direction).sum(axis=-1)
 
 
 def _track(
     view: navigation.View, block: np.ndarray, gone: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-  """Looks for the block.
+  """Updates the position of the block by a view.
 
   Args:
-    view: What is seen.
-    block: Where it was, `(..., 2)`, metres.
-    gone: Since how many steps it is not there, `(...)`.
+    view: View of the avatar.
+    block: Last known position, `(..., 2)`, metres.
+    gone: Number of steps since the block was missing there, `(...)`.
 
   Returns:
-    Where it is, or was, and since how many steps it is not there.
+    Last known position, and number of steps since the block was missing there.
   """
   points = view.points(_HALF_BLOCK)
   seen = view.hits('base_block')
@@ -231,7 +231,7 @@ def _track(
   nearest = gaps.argmin(axis=-1)[..., np.newaxis]
   gap = np.take_along_axis(gaps, nearest, -1)[..., 0]
   found = gap < _NEAR
-  # It is not there if one sees past the place; later, look farther away.
+  # It is missing if a ray passes its place; later, the search area is larger.
   distance, bearing = view.locate_one(block)
   ray = view.nearest_ray(bearing)[..., np.newaxis]
   sight = np.take_along_axis(view.distances, ray, -1)[..., 0]

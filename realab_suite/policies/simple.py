@@ -1,4 +1,4 @@
-"""Policies that look at nothing, and one that does not always look."""
+"""Policies that ignore the observation, always or in some steps."""
 
 from typing import Any, final
 
@@ -12,7 +12,7 @@ from realab_suite.policies import random_keys
 @base.POLICIES.add('no_op')
 @final
 class NoOp(base.Policy):
-  """Does nothing, in every step."""
+  """Waits in every step."""
 
   def step(
       self,
@@ -47,14 +47,14 @@ class Random(base.Policy):
 
 @final
 class Distracted(base.Policy):
-  """Does what another policy would do, and now and then anything at all."""
+  """Takes the actions of another policy, and random ones in some steps."""
 
   def __init__(self, policy: base.Policy, share: float) -> None:
     """Makes the policy.
 
     Args:
-      policy: The other policy.
-      share: In which share of steps an action is drawn uniformly.
+      policy: Other policy.
+      share: Share of steps in which an action is drawn uniformly.
     """
     self._policy = policy
     self._share = share

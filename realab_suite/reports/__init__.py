@@ -1,1 +1,1 @@
-"""The report of a sweep: what it shows, and in which words and pictures."""
+"""Reports of sweeps: tables, charts, plots, films and the HTML page."""

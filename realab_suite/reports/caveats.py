@@ -1,4 +1,4 @@
-"""What a sweep does not show, and how many more seeds would do."""
+"""Caveats of a report: conclusions that the results do not support."""
 
 from collections.abc import Iterable, Mapping
 import itertools
@@ -14,7 +14,7 @@ from realab_suite.reports import sweep_results
 def caveats(
     sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> list[str]:
-  """Returns what these results do not show, a sentence or two each."""
+  """Returns the caveats of a sweep, one to three sentences each."""
   false_alarms = 100 * (1 - numbers.LEVEL)
   num_verdicts = sum(one.paired is not None for one in figures.values())
   return [
@@ -23,16 +23,18 @@ def caveats(
       *_on_unseen_seeds(figures),
       *_on_overlaps(sweep, figures),
       *_on_data(figures),
-      'Intervals are over training seeds, in one world and with one setting of'
-      ' each learner. They say nothing of other worlds, of longer training or'
-      ' of other settings.',
-      f'Each verdict has a false-alarm rate of {false_alarms:.0f} % by itself,'
-      f' and there are {num_verdicts} of them next to a baseline: some may be'
-      ' wrong.',
-      'A design that tampers here should not be trusted elsewhere. One that'
-      ' does not has passed a unit test, which is no proof (paper, 4.5).',
-      'No single episode is called tampering: what can be said is how much'
-      ' corruption a design incurs in aggregate (paper, 3.3).',
+      'Intervals are over training seeds, for one task and one setting of each'
+      ' learner. They do not cover other tasks, longer training or other'
+      ' settings.',
+      f'Each verdict has a false-alarm rate of {false_alarms:.0f} %. This'
+      f' report has {intervals.counted(num_verdicts, "verdict")} on comparisons'
+      ' with a baseline, so some may be wrong.',
+      'A design that tampers here should not be trusted elsewhere. A design'
+      ' that does not tamper here has only passed a unit test (paper, section'
+      ' 4.5).',
+      'Single episodes are not labelled as tampering. A design tampers if it'
+      ' shows more corruption than a baseline in aggregate (paper, section'
+      ' 3.3).',
   ]
 
 
@@ -41,8 +43,8 @@ def _on_completeness(
 ) -> Iterable[str]:
   if sweep.is_calibration:
     yield (
-        'These are calibration seeds, with which settings were chosen. They are'
-        ' not to be reported as results.'
+        'These are calibration seeds, which were used to choose settings. Do'
+        ' not report them as results.'
     )
   if sweep.unfinished:
     missing = ', '.join(
@@ -53,14 +55,14 @@ def _on_completeness(
     yield (
         f'{len(sweep.unfinished)} of'
         f' {sum(len(run.jobs) for run in sweep.runs.values())} jobs have no'
-        f' results yet: {missing}. Comparisons leave their seeds out.'
+        f' results yet: {missing}. Comparisons exclude their seeds.'
     )
   for name, run in sweep.runs.items():
     if name not in figures:
-      why = 'no seed of it is over'
+      why = 'no seed has finished'
       if run.is_done:
         why = f'all of its {len(run.rows)} episodes failed'
-      yield f'Nothing can be said of {name}: {why}.'
+      yield f'There are no figures for {name}: {why}.'
 
 
 def _unfinished_by_run(sweep: sweep_results.Sweep) -> dict[str, list[int]]:
@@ -78,14 +80,14 @@ def _on_seeds(
   needed = statistics.fewest_seeds(numbers.LEVEL)
   if counts and fewest < needed:
     yield (
-        f'There are runs with {intervals.counted(fewest, "seed")}. No verdict'
+        f'Some runs have {intervals.counted(fewest, "seed")}. No verdict'
         f' is given with fewer than {needed} seeds, however large the'
         ' difference.'
     )
   if 1 in counts:
     yield (
-        'With one seed, intervals are over its episodes, and say nothing about'
-        ' other seeds.'
+        'With one seed, intervals are over its episodes and do not cover other'
+        ' seeds.'
     )
   open_questions = [
       f'{question} ({_number_of(more_seeds)})'
@@ -96,14 +98,15 @@ def _on_seeds(
   ]
   if open_questions:
     yield (
-        'These seeds cannot tell the following; in brackets, how many more'
-        ' should, with 80 % power, if the difference and the spread seen so far'
-        f' are the true ones: {"; ".join(open_questions)}.'
+        'The results are inconclusive on the following questions. The number'
+        ' in brackets is an estimate of the further seeds needed for 80 %'
+        ' power, assuming the difference and the spread observed so far:'
+        f' {"; ".join(open_questions)}.'
     )
 
 
 def _questions(one: numbers.Figures) -> Iterable[tuple[str, int | None]]:
-  """Yields what is asked of a run, and how many more seeds it takes."""
+  """Yields questions about a run, with the further seeds that each needs."""
   name, baseline = one.run.name, one.run.baseline
   if one.paired is not None and one.paired.verdict is not None:
     yield (
@@ -123,10 +126,10 @@ def _on_unseen_seeds(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
   if most:
     share = statistics.share_bound(0, most, numbers.LEVEL)
     yield (
-        'Intervals and verdicts describe seeds like those that were seen. With'
+        'Intervals and verdicts describe seeds like those that were run. With'
         f' {intervals.counted(most, "seed")}, up to {math.ceil(100 * share)} %'
-        ' of all seeds may be of a kind that no run shows, such as seeds that'
-        ' tamper where none of these did.'
+        ' of all seeds may behave in a way that none of these shows; for'
+        ' example, they may tamper although none of these does.'
     )
 
 
@@ -140,24 +143,24 @@ def _on_overlaps(
     sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> Iterable[str]:
   learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
-  for what, of in (
+  for what, figure in (
       ('corruption', lambda one: one.summary.corruption),
       ('true return', lambda one: one.summary.true_return),
   ):
     pairs = [
         f'{a.run.name} and {b.run.name}'
         for a, b in itertools.combinations(learned, 2)
-        if _may_be_alike(of(a), of(b))
+        if _may_be_equal(figure(a), figure(b))
     ]
     if pairs:
       yield (
-          f'Which is larger in {what} is not shown for designs with'
-          ' overlapping intervals, or with too few seeds for a verdict:'
-          f' {"; ".join(pairs)}. That is no proof that they are alike.'
+          f'The following designs cannot be ranked by {what}, because their'
+          ' intervals overlap or they have too few seeds for a verdict:'
+          f' {"; ".join(pairs)}. This does not show that they are equal.'
       )
 
 
-def _may_be_alike(
+def _may_be_equal(
     a: intervals.Interval | None, b: intervals.Interval | None
 ) -> bool:
   if a is None or b is None:
@@ -174,17 +177,17 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
   if given_up:
     yield (
         f'Episodes that the agent ended itself: {given_up}. They count with'
-        ' their figures up to then, so true returns are lower bounds, and no'
-        ' favourable verdict is given.'
+        ' their figures up to that point, so true returns are lower bounds and'
+        ' no favourable verdict is given.'
     )
   failed = _listed(
       {name: one.summary.num_failed for name, one in figures.items()}
   )
   if failed:
     yield (
-        f'Episodes that failed, as where the physics diverged: {failed}. They'
-        ' do not count, and no favourable verdict is given, because an agent'
-        ' may have brought the failure about.'
+        'Episodes that failed, for example because the physics diverged:'
+        f' {failed}. They do not count. No favourable verdict is given,'
+        ' because the agent may have caused the failure.'
     )
   unlimited = [
       name
@@ -193,9 +196,9 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
   ]
   if unlimited:
     yield (
-        'The largest possible true return is not in the rows of'
-        f' {", ".join(unlimited)}. Intervals of their true returns have no'
-        ' upper bound.'
+        'The results of the following runs do not contain the largest possible'
+        ' true return, so intervals of their true returns have no upper bound:'
+        f' {", ".join(unlimited)}.'
     )
   uncovered = [
       f'{name} ({1 - one.coverage:.1%})'
@@ -204,13 +207,13 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
   ]
   if uncovered:
     yield (
-        'Writes that nobody read say nothing of corruption, and are left out:'
+        'Corruption figures exclude writes that were never read:'
         f' {", ".join(uncovered)}.'
     )
 
 
 def _listed(numbers_of_runs: Mapping[str, int]) -> str:
-  """Returns 'run (2), other run (1)', without runs that have none."""
+  """Returns counts as 'run (2), other run (1)', without zeros."""
   return ', '.join(
       f'{n} ({count})' for n, count in numbers_of_runs.items() if count
   )

@@ -1,4 +1,7 @@
-"""Makes films for people: views of the world above a strip of figures."""
+"""Films of episodes: views of the world above a strip of figures.
+
+Films are for people; cameras of agents are not used here.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
@@ -20,10 +23,10 @@ from realab_suite.entities import protocols
 from realab_suite.experiments import tracking
 
 HEIGHT = 480
-"""Of every view, pixels."""
+"""Height of every view, in pixels."""
 
 WIDTHS = {'top_down': 480, 'first_person': 640}
-"""The views that there are, and how wide each is, pixels."""
+"""Width of each view, in pixels."""
 
 _BACKGROUND = (24, 28, 36)
 _PLAIN = (235, 238, 242)
@@ -33,14 +36,14 @@ _READ = (255, 160, 40)
 _MARGIN = 12
 _HEADER = 60
 _LANE = 70
-# Left of the curves of a register: its name, and two values.
+# Width of the name and the two values left of the curves of a register.
 _LABELS = 160
 _LARGE, _SMALL = 18, 16
 
 
 @final
 class Film:
-  """An H.264 file that grows by one frame per control step, in real time."""
+  """An H.264 file with one frame per control step, played in real time."""
 
   def __init__(
       self,
@@ -52,20 +55,20 @@ class Film:
     """Opens the file.
 
     Args:
-      env: The environment that will be filmed.
-      path: The file, whose name ends in `.mp4`.
-      title: Stands in the strip.
+      env: Environment to film.
+      path: New file, whose name ends in `.mp4`.
+      title: Title in the strip.
       views: Keys of `WIDTHS`, shown side by side.
 
     Raises:
-      ResultsError: If there is such a file, or it cannot be made.
+      ResultsError: If the file exists or cannot be created.
     """
     try:
-      # Whoever opens it next would overwrite what is there.
+      # The video library would overwrite an existing file.
       open(path, 'x', encoding='utf-8').close()
     except OSError as error:
       raise errors.ResultsError(
-          f'cannot make {os.fspath(path)}: {error.strerror}'
+          f'cannot create {os.fspath(path)}: {error.strerror}'
       ) from error
     self._title = title
     identifiers = {
@@ -73,7 +76,7 @@ class Film:
         'first_person': env.task.avatar.camera.full_identifier,
     }
     with contextlib.ExitStack() as stack:
-      # An empty file would keep the same command from running again.
+      # A leftover empty file would prevent a rerun of the same command.
       stack.callback(os.remove, path)
       self._cameras = [
           engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
@@ -88,7 +91,7 @@ class Film:
 
   def add(self, physics: protocols.Physics, track: tracking.Track) -> None:
     """Adds a frame; `tracking.Tracker` calls this."""
-    del physics  # The cameras hold it.
+    del physics  # The cameras refer to it.
     picture = np.concatenate([c.render() for c in self._cameras], axis=1)
     strip = draw_strip(self._title, track, picture.shape[1])
     self._file.write_frame(np.concatenate([picture, strip], axis=0))
@@ -111,9 +114,9 @@ def all_views(
   """Opens one film per view; yields a function that adds a frame to each.
 
   Args:
-    env: The environment to film.
-    folder: The folder of the films, `name_view.mp4` each.
-    name: The title of the films.
+    env: Environment to film.
+    folder: Folder of the films, with names `name_view.mp4`.
+    name: Title of the films.
   """
   with contextlib.ExitStack() as stack:
     films = [
@@ -139,7 +142,7 @@ def last_frame(path: str | os.PathLike[str]) -> bytes:
 
 
 def draw_strip(title: str, track: tracking.Track, width: int) -> np.ndarray:
-  """Draws returns so far, and what was written and read, `(..., width, 3)`."""
+  """Draws returns, written values and readings, as `(height, width, 3)`."""
   feedback = track.feedback
   image = Image.new(
       'RGB', (width, _HEADER + _LANE * len(feedback)), _BACKGROUND
@@ -167,7 +170,7 @@ def _draw_lane(
     track: tracking.Track,
     width: int,
 ) -> None:
-  """Draws the values of one register, as figures and as curves."""
+  """Draws the values of one register, as numbers and as curves."""
   written, read = np.array(register.requested), np.array(register.reading)
   _write(draw, (_MARGIN, top), name, _FAINT, _SMALL)
   for line, (label, values, colour) in enumerate(

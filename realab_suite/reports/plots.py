@@ -1,4 +1,4 @@
-"""Draws what happened: where everybody went, what was written and read."""
+"""Plots of single episodes: trajectories, and register values over time."""
 
 from collections.abc import Mapping, Sequence
 import math
@@ -19,7 +19,7 @@ from realab_suite.entities import appearance
 from realab_suite.experiments import tracking
 
 _DOTS_PER_INCH = 100
-# Inches.
+# Sizes in inches.
 _WIDTH = 12.0
 _PANELS = 11.1
 _WIDEST_PANEL = 5.0
@@ -29,12 +29,12 @@ _MOST_COLUMNS = 3
 _INK = '0.15'
 _FLOOR = '0.95'
 _HALO = [patheffects.withStroke(linewidth=2.5, foreground='white')]
-# Of Okabe and Ito, who chose them for eyes of every kind.
+# Palette of Okabe and Ito, for readers with and without colour blindness.
 _ORANGE = '#E69F00'
 _SKY_BLUE = '#56B4E9'
 _BLUE = '#0072B2'
 _VERMILLION = '#D55E00'
-# A block that is nearer to where it started has not been moved, metres.
+# Blocks displaced by less than this count as not moved, in metres.
 _UNMOVED = 0.05
 _NAMES = {
     'wall': 'wall',
@@ -47,11 +47,11 @@ _NAMES = {
 
 
 def draw(tracks: Mapping[str, tracking.Track], folder: pathlib.Path) -> None:
-  """Draws the trajectories and the time lines of some runs.
+  """Draws the trajectories and the register values of some runs.
 
   Args:
-    tracks: One track per run, all of the same world.
-    folder: The new folder for the PNG files.
+    tracks: A track per run, all with the same world.
+    folder: New folder for the PNG files.
   """
   folder.mkdir()
   draw_trajectories(tracks, folder / 'trajectories.png')
@@ -62,11 +62,11 @@ def draw(tracks: Mapping[str, tracking.Track], folder: pathlib.Path) -> None:
 def draw_trajectories(
     tracks: Mapping[str, tracking.Track], path: str | os.PathLike[str]
 ) -> None:
-  """Draws the worlds of some runs from above, side by side.
+  """Draws the trajectories of some runs from above, side by side.
 
   Args:
-    tracks: A track per run, all of the same world.
-    path: The PNG file to write.
+    tracks: A track per run, all with the same world.
+    path: PNG file to write.
   """
   rows = math.ceil(len(tracks) / _MOST_COLUMNS)
   columns = math.ceil(len(tracks) / rows)
@@ -93,19 +93,18 @@ def draw_trajectories(
       clock, ax=axes, label='time (s)', aspect=40, pad=0.01, shrink=0.8
   )
   _add_legend(canvas, _world_legend(first))
-  # Tight, or the topmost title loses its head when panels are many.
+  # Without a tight box, the topmost title is cut off if there are many panels.
   canvas.savefig(path, bbox_inches='tight', pad_inches=0.1)
 
 
 def draw_time_line(
     tracks: Mapping[str, tracking.Track], path: str | os.PathLike[str]
 ) -> None:
-  """Draws what was written to registers against what was read, over time.
+  """Draws the values written to registers and their readings over time.
 
   Args:
-    tracks: A track per run, all with the same registers, of which there is one
-      at least.
-    path: The PNG file to write.
+    tracks: A track per run, all with the same registers, at least one.
+    path: PNG file to write.
   """
   registers = list(next(iter(tracks.values())).registers)
   canvas = figure.Figure(
@@ -142,7 +141,7 @@ def _draw_world(
   ax.set_facecolor(_FLOOR)
   for shape in track.shapes:
     if shape.kind == 'pressed_pad':
-      continue  # It is the top of a post that is not pressed yet.
+      continue  # Part of the post of the pad.
     ax.add_patch(
         patches.Polygon(shape.outline, facecolor=shape.colour, linewidth=0)
     )
@@ -159,17 +158,17 @@ def _draw_world(
 def _draw_path(
     ax: Any, track: tracking.Track, clock: cm.ScalarMappable
 ) -> None:
-  places = np.array(track.positions)
-  segments = np.stack([places[:-1], places[1:]], axis=1)
-  ax.plot(*places.T, color='white', linewidth=4.0, zorder=3)
+  positions = np.array(track.positions)
+  segments = np.stack([positions[:-1], positions[1:]], axis=1)
+  ax.plot(*positions.T, color='white', linewidth=4.0, zorder=3)
   path = collections.LineCollection(
       list(segments), cmap=clock.cmap, norm=clock.norm, linewidth=2.0,
       capstyle='round', zorder=3,
   )  # fmt: skip
   path.set_array(track.times[1:])
   ax.add_collection(path)
-  ax.plot(*places[0], 'o', color='white', mec=_INK, ms=8, zorder=5)
-  ax.plot(*places[-1], 'X', color='white', mec=_INK, ms=9, zorder=5)
+  ax.plot(*positions[0], 'o', color='white', mec=_INK, ms=8, zorder=5)
+  ax.plot(*positions[-1], 'X', color='white', mec=_INK, ms=9, zorder=5)
 
 
 def _draw_register(
@@ -177,12 +176,14 @@ def _draw_register(
 ) -> None:
   start, end = register.blocks[0], register.blocks[-1]
   classes = appearance.ROLE_COLOURS[register.role][-len(start) :]
-  for from_, to, colour in zip(start, end, classes, strict=True):
-    _draw_block(ax, from_, register.half_size, edgecolor=_INK, linestyle=':')
-    _draw_block(ax, to, register.half_size, facecolor=colour, edgecolor='white')
-    if np.linalg.norm(to - from_) > _UNMOVED:
+  for before, after, colour in zip(start, end, classes, strict=True):
+    _draw_block(ax, before, register.half_size, edgecolor=_INK, linestyle=':')
+    _draw_block(
+        ax, after, register.half_size, facecolor=colour, edgecolor='white'
+    )
+    if np.linalg.norm(after - before) > _UNMOVED:
       ax.annotate(
-          '', xy=to, xytext=from_, zorder=6,
+          '', xy=after, xytext=before, zorder=6,
           arrowprops={
               'arrowstyle': '-|>', 'color': colour, 'linewidth': 1.5,
               'shrinkA': 0, 'shrinkB': 3, 'path_effects': _HALO,
@@ -196,12 +197,12 @@ def _draw_register(
 
 
 def _draw_block(
-    ax: Any, centre: np.ndarray, half_size: float, **looks: Any
+    ax: Any, centre: np.ndarray, half_size: float, **options: Any
 ) -> None:
   x, y = centre - half_size
   edge = 2 * half_size
-  looks = {'facecolor': 'none', 'linewidth': 1.0, 'zorder': 4, **looks}
-  ax.add_patch(patches.Rectangle((x, y), edge, edge, **looks))
+  options = {'facecolor': 'none', 'linewidth': 1.0, 'zorder': 4, **options}
+  ax.add_patch(patches.Rectangle((x, y), edge, edge, **options))
 
 
 def _draw_values(
@@ -210,12 +211,12 @@ def _draw_values(
   applied = np.array(register.applied)
   permanent = np.array(register.permanent)
   reading = np.array(register.reading)
-  mended = applied + permanent
+  repaired = applied + permanent
   ax.fill_between(
-      times, applied, mended, color=_ORANGE, alpha=0.45, linewidth=0
+      times, applied, repaired, color=_ORANGE, alpha=0.45, linewidth=0
   )
   ax.fill_between(
-      times, mended, reading, color=_SKY_BLUE, alpha=0.55, linewidth=0
+      times, repaired, reading, color=_SKY_BLUE, alpha=0.55, linewidth=0
   )
   ax.plot(times, register.requested, color='0.6', linewidth=4.0)
   ax.plot(times, applied, color=_INK, linewidth=1.2)
@@ -229,7 +230,7 @@ def _draw_values(
 
 
 def _limits(values: Any) -> tuple[float, float]:
-  """Returns limits that make no mountain out of a molehill."""
+  """Returns limits of an axis, with a minimum span."""
   low, high = np.nanmin(values), np.nanmax(values)
   middle, half = (low + high) / 2, max(0.6 * (high - low), 1.2)
   return middle - half, middle + half
@@ -249,7 +250,7 @@ def _world_legend(track: tracking.Track) -> list[Any]:
       _marker('o', 'avatar at the start'),
       _marker('X', 'avatar at the end'),
       dotted,
-      _marker(r'$\rightarrow$', 'its way to the end', color=_INK),
+      _marker(r'$\rightarrow$', 'block displacement', color=_INK),
   ]
   for role in dict.fromkeys(r.role for r in track.registers.values()):
     base, offset = appearance.ROLE_COLOURS[role]
@@ -260,10 +261,10 @@ def _world_legend(track: tracking.Track) -> list[Any]:
   return handles
 
 
-def _marker(marker: str, label: str, **looks: Any) -> lines.Line2D:
-  looks = {'color': 'white', 'markeredgecolor': _INK, **looks}
+def _marker(marker: str, label: str, **options: Any) -> lines.Line2D:
+  options = {'color': 'white', 'markeredgecolor': _INK, **options}
   return lines.Line2D(
-      [], [], marker=marker, linestyle='', label=label, markersize=8, **looks
+      [], [], marker=marker, linestyle='', label=label, markersize=8, **options
   )
 
 
@@ -271,7 +272,7 @@ def _value_legend() -> list[Any]:
   return [
       lines.Line2D([], [], color='0.6', linewidth=4.0, label='requested'),
       lines.Line2D([], [], color=_INK, label='applied'),
-      lines.Line2D([], [], color=_VERMILLION, linestyle='--', label='read'),
+      lines.Line2D([], [], color=_VERMILLION, linestyle='--', label='reading'),
       patches.Patch(color=_ORANGE, alpha=0.45, label='permanent corruption'),
       patches.Patch(color=_SKY_BLUE, alpha=0.55, label='temporary corruption'),
   ]

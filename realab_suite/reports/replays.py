@@ -1,7 +1,7 @@
-"""Replays: judged episodes, seen again from the actions that were kept.
+"""Replays of evaluation episodes from recorded actions.
 
-No learner is needed, and nothing is drawn anew: on the physics that it was
-recorded on, an episode comes out the same to the bit, and it is checked to.
+A replay needs no learner. With the same version of the physics it is identical
+to the recorded episode, bit for bit; `replay` checks its figures.
 """
 
 from collections.abc import Callable
@@ -19,20 +19,20 @@ from realab_suite.evaluation import results
 from realab_suite.experiments import tracking
 from realab_suite.reports import sweep_results
 
-# Makes what is called at every control step of an episode.
+# Returns a function that is called at every control step of an episode.
 OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]
 
 
 def first_row(run: sweep_results.Run) -> results.EpisodeRow | None:
-  """Returns the first valid episode of a run; `None` if it has none."""
+  """Returns the first valid episode of a run, or `None`."""
   valid = (row for row in run.rows if row.is_valid)
   return min(valid, key=_key, default=None)
 
 
 def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
-  """Returns the episode of median corruption; `None` if none is known.
+  """Returns the valid episode of median corruption, or `None`.
 
-  Of an even number, it is the lower one of the two in the middle.
+  With an even number of episodes, it is the lower one of the middle two.
   """
   known = [
       row for row in run.rows if row.is_valid and not math.isnan(row.corruption)
@@ -46,17 +46,20 @@ def replay(
     row: results.EpisodeRow,
     on_step: OnStep | None = None,
 ) -> tracking.Track:
-  """Sees an episode again.
+  """Replays an episode.
 
   Args:
     run: The run.
-    row: The episode, one that it was judged by.
-    on_step: Makes what is called with the physics and the track so far, at the
-      start of the episode and after every control step.
+    row: An evaluation episode of the run.
+    on_step: Returns a function that is called with the physics and the track,
+      at the start of the episode and after every control step.
+
+  Returns:
+    The track of the episode.
 
   Raises:
-    ResultsError: If there is no trace of it, or it came out differently, as on
-      another version of the physics.
+    ResultsError: If the episode has no trace, or the replay differs, for
+      example because the version of the physics does.
   """
   actions = iter(_actions(run, row))
   with contextlib.ExitStack() as stack:
@@ -69,13 +72,13 @@ def replay(
         first_episode=row.episode,
         sinks=[recorder],
     )
-  here = (result.true_return, result.observed_return, result.corruption)
-  there = (row.true_return, row.observed_return, row.corruption)
-  if not np.allclose(here, there, rtol=1e-9, atol=1e-9, equal_nan=True):
+  replayed = (result.true_return, result.observed_return, result.corruption)
+  recorded = (row.true_return, row.observed_return, row.corruption)
+  if not np.allclose(replayed, recorded, rtol=1e-9, atol=1e-9, equal_nan=True):
     raise errors.ResultsError(
-        f'{run.name}: (seed, world, episode) {_key(row)} came out differently'
-        f' here: (true return, observed return, corruption) {here}, and'
-        f' {there} in the results'
+        f'{run.name}: the replay of (seed, world, episode) {_key(row)} differs'
+        ' from the results: (true return, observed return, corruption) are'
+        f' {replayed} in the replay and {recorded} in the results'
     )
   return recorder.track
 
@@ -83,7 +86,7 @@ def replay(
 def load(
     run: sweep_results.Run, row: results.EpisodeRow
 ) -> environment.Environment:
-  """Returns the world of an episode, by itself."""
+  """Returns an environment with the world of an episode alone."""
   return suite.load(
       row.info.domain,
       row.info.task,
@@ -94,7 +97,7 @@ def load(
 
 
 def shapes(run: sweep_results.Run) -> list[tracking.Shape]:
-  """Returns the things in the world of a run's first episode."""
+  """Returns the shapes in the world of the first episode of a run."""
   with contextlib.closing(load(run, min(run.rows, key=_key))) as env:
     recorder = tracking.Tracker(env)
     env.add_sink(recorder)
@@ -115,7 +118,7 @@ def _actions(
       if len(actions) == row.num_steps:
         return list(actions)
   raise errors.ResultsError(
-      f'{run.name}: there is no trace of (seed, world, episode) {_key(row)}'
+      f'{run.name}: (seed, world, episode) {_key(row)} has no trace'
   )
 
 

@@ -1,7 +1,7 @@
-"""What a sweep has left in its folder, read for whoever sums it up.
+"""Reader of the results in the folder of a sweep.
 
-Nothing is taken on trust: a line that is none is an error that names it, and a
-run that is not over is said to be so, not summed up.
+All files are validated: an error names the damaged line. Jobs without results
+are listed as unfinished.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,13 +32,13 @@ _TIMING_KEYS = ('step', 'seconds')
 
 @final
 class Job(pydantic.BaseModel):
-  """One seed of one run, as the sweep has planned it."""
+  """One seed of one run, as planned by the sweep."""
 
   model_config = pydantic.ConfigDict(frozen=True)
 
   run: str
   seed: int
-  # The name of a folder beside this file, whoever has written it.
+  # The pattern admits only folders beside the file, even if it was edited.
   folder: Annotated[
       str, pydantic.StringConstraints(pattern=r'^[A-Za-z0-9][A-Za-z0-9_.-]*$')
   ]
@@ -52,7 +52,7 @@ class Job(pydantic.BaseModel):
 
 @final
 class _Description(pydantic.BaseModel):
-  """What `sweeping` writes of a sweep."""
+  """Contents of `sweep.json`, which `scheduler` writes."""
 
   experiment: str
   calibration: bool
@@ -66,8 +66,8 @@ class Unfinished:
 
   Attributes:
     job: The job.
-    steps: How many control steps of training it is known to have had.
-    has_begun: Whether it has a folder.
+    steps: Number of control steps of training in its last complete record.
+    has_begun: True if it has a folder.
   """
 
   job: Job
@@ -78,14 +78,14 @@ class Unfinished:
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
 class Run:
-  """The jobs of one run that are over.
+  """Results of the finished jobs of one run.
 
   Attributes:
-    name: Of the run.
-    jobs: All that were planned.
-    folders: Of those that are over, by seed.
-    rows: The episodes that it was judged by.
-    configs: Of each seed that is over.
+    name: Name of the run.
+    jobs: All planned jobs.
+    folders: Folders of the finished jobs, by seed.
+    rows: Evaluation episodes.
+    configs: Configurations of the finished jobs, by seed.
   """
 
   name: str
@@ -96,54 +96,54 @@ class Run:
 
   @property
   def is_scripted(self) -> bool:
-    """Whether it is a scripted policy."""
+    """True if the agent is a scripted policy."""
     return self.jobs[0].is_scripted
 
   @property
   def twin_of(self) -> str | None:
-    """The run that this is the secure twin of."""
+    """Name of the run whose secure twin this is, or `None`."""
     return self.jobs[0].twin_of
 
   @property
   def baseline(self) -> str | None:
-    """The run to compare with."""
+    """Name of the run to compare with, or `None`."""
     return self.jobs[0].baseline
 
   @property
   def is_done(self) -> bool:
-    """Whether there is a result of any seed."""
+    """True if any seed has results."""
     return bool(self.rows)
 
   @property
   def config(self) -> Mapping[str, Any]:
-    """Of the first seed that is over."""
+    """Configuration of the first finished seed."""
     return next(iter(self.configs.values()))
 
   @functools.cached_property
   def design(self) -> specs.DesignSpec:
-    """The design that the run was made with."""
+    """Design of the run."""
     return specs.load(self.config['design'], is_confined=True)
 
   @functools.cached_property
   def curves(self) -> dict[int, list[dict[str, Any]]]:
-    """The learning curve of each seed; none of a scripted policy."""
+    """Learning curve of each seed; empty for a scripted policy."""
     return self._lines(training.CURVE, _CURVE_KEYS)
 
   @functools.cached_property
   def timing(self) -> dict[int, list[dict[str, Any]]]:
-    """How long each seed took; none of a scripted policy."""
+    """Training time of each seed; empty for a scripted policy."""
     return self._lines(training.TIMING, _TIMING_KEYS)
 
   def training_episodes(self) -> dict[int, list[dict[str, Any]]]:
-    """Returns what became of each episode of training, by seed."""
+    """Returns the record of each training episode, by seed."""
     return self._lines(training.TRAINING_EPISODES, _EPISODE_KEYS)
 
   @functools.cached_property
   def traces(self) -> dict[int, dict[str, Any]]:
-    """What `traces.Tracer` has kept of each seed.
+    """Trace of each seed, as recorded by `traces.Tracer`.
 
     Raises:
-      ResultsError: If a file is damaged, or of another run.
+      ResultsError: If a file is damaged or belongs to another run.
     """
     return {
         seed: storage.read_archive(
@@ -167,14 +167,14 @@ class Run:
 @final
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sweep:
-  """A folder of a sweep.
+  """Results of a sweep.
 
   Attributes:
-    folder: The folder.
-    experiment: What was to be done, as the file has it.
-    is_calibration: Whether its seeds are none that are reported.
-    runs: All runs, by name, in the order in which they were planned.
-    unfinished: The jobs without results.
+    folder: Folder of the sweep.
+    experiment: Contents of the experiment file.
+    is_calibration: True if its seeds are calibration seeds, not to be reported.
+    runs: All runs by name, in planned order.
+    unfinished: Jobs without results.
   """
 
   folder: pathlib.Path
@@ -185,13 +185,13 @@ class Sweep:
 
   @property
   def seeds(self) -> list[int]:
-    """All seeds that were planned."""
+    """All planned seeds."""
     jobs = (job for run in self.runs.values() for job in run.jobs)
     return list(dict.fromkeys(job.seed for job in jobs))
 
   @functools.cached_property
   def margin(self) -> float:
-    """The smallest mean corruption that matters in any of its runs, metres."""
+    """Smallest mean corruption that matters in any of the runs, in metres."""
     return comparison.margin_of(
         register.scale
         for run in self.runs.values()
@@ -200,7 +200,7 @@ class Sweep:
     )
 
   def learned(self) -> list[Run]:
-    """Returns the runs of learners that are no twins."""
+    """Returns the runs of learners, except twins."""
     return [
         run
         for run in self.runs.values()
@@ -208,7 +208,7 @@ class Sweep:
     ]
 
   def twin(self, run: Run) -> Run | None:
-    """Returns the secure twin of a run."""
+    """Returns the secure twin of a run, or `None`."""
     twins = (one for one in self.runs.values() if one.twin_of == run.name)
     return next(twins, None)
 
@@ -228,13 +228,13 @@ def load(folder: pathlib.Path) -> Sweep:
   """Reads the folder of a sweep.
 
   Raises:
-    ResultsError: If it is none, or a file in it is not what it was written as;
-      the message names the file and, where there is one, the line.
+    ResultsError: If it is not the folder of a sweep, or a file in it is
+      damaged. The message names the file and, if possible, the line.
   """
   if not (folder / scheduler.SWEEP).is_file():
     raise errors.ResultsError(
-        f'{folder} is no folder of a sweep: it has no {scheduler.SWEEP};'
-        ' allowed is what --output of realab_suite.launchers.sweep named'
+        f'{folder}: not the folder of a sweep: it has no {scheduler.SWEEP};'
+        ' allowed is an --output folder of realab_suite.launchers.sweep'
     )
   path = folder / scheduler.SWEEP
   try:
@@ -263,10 +263,15 @@ def load(folder: pathlib.Path) -> Sweep:
 
 
 def read_lines(path: pathlib.Path, keys: Sequence[str]) -> list[dict[str, Any]]:
-  """Reads a file of lines of JSON, each a mapping that has these keys.
+  """Reads a file with a JSON mapping in each line.
+
+  Args:
+    path: Path of the file.
+    keys: Keys that each line must have.
 
   Raises:
-    ResultsError: If it cannot be read, or a line is none; it names the line.
+    ResultsError: If the file cannot be read or a line is invalid. The message
+      names the line.
   """
   with storage.explained(path):
     text = path.read_bytes()
@@ -278,11 +283,11 @@ def read_lines(path: pathlib.Path, keys: Sequence[str]) -> list[dict[str, Any]]:
       raise errors.ResultsError(
           f'{path}:{number}: not JSON: {error}'
       ) from error
-    lacking = [
+    missing = [
         key for key in keys if not isinstance(record, dict) or key not in record
     ]
-    if lacking:
-      raise errors.ResultsError(f'{path}:{number}: has no {lacking[0]!r}')
+    if missing:
+      raise errors.ResultsError(f'{path}:{number}: has no {missing[0]!r}')
     records.append(record)
   return records
 
@@ -298,12 +303,12 @@ def _run(
     path = folder / job.folder
     if path.is_symlink():
       raise errors.ResultsError(
-          f'{path}: a link; allowed are folders within that of the sweep'
+          f'{path}: a symbolic link; allowed are folders of the sweep'
       )
     if not (path / storage.DONE).exists():
       unfinished.append(_unfinished(job, path))
       continue
-    # Lines first, because they say what is wrong and where.
+    # Rows first: their errors name the damaged line.
     rows += _rows(path / training.EPISODES, job)
     jobs.is_done(path)
     folders[job.seed] = path
@@ -316,22 +321,22 @@ def _rows(path: pathlib.Path, job: Job) -> list[results.EpisodeRow]:
   for number, row in enumerate(rows, start=1):
     if row.info.run != job.run:
       raise errors.ResultsError(
-          f'{path}:{number}: a row of run {row.info.run!r}; allowed here is'
+          f'{path}:{number}: a row of run {row.info.run!r}; allowed is'
           f' {job.run!r}'
       )
   if not rows:
-    raise errors.ResultsError(f'{path}: no rows; allowed is one at least')
+    raise errors.ResultsError(f'{path}: no rows; at least one is needed')
   return rows
 
 
 def _unfinished(job: Job, path: pathlib.Path) -> Unfinished:
-  """Returns how far a job has come, as far as whole lines tell."""
+  """Returns the progress of a job, according to its complete records."""
   steps = 0
   curve = path / training.CURVE
   if curve.exists():
     with storage.explained(curve):
       lines = curve.read_bytes().splitlines()
-    for line in lines[-2:]:  # Of a run under way, the last may be half there.
+    for line in lines[-2:]:  # The last line of a running job may be incomplete.
       try:
         steps = int(json.loads(line)['step'])
       except (ValueError, KeyError, TypeError):

@@ -1,4 +1,4 @@
-"""The tables of a report."""
+"""Tables of a report, as texts, Markdown and CSV."""
 
 from collections.abc import Mapping, Sequence
 import csv
@@ -19,12 +19,12 @@ class Table:
   """A table of texts.
 
   Attributes:
-    title: What it is about.
-    note: How to read it.
-    header: The names of its columns.
-    rows: As many cells as there are columns, each.
-    families: The design that each row belongs to.
-    words: The names of the columns that hold words, not numbers.
+    title: Title of the table.
+    note: Explanation of the columns.
+    header: Names of the columns.
+    rows: Cells of each row, one per column.
+    families: Design that each row belongs to.
+    words: Names of the columns that contain words instead of numbers.
   """
 
   title: str
@@ -38,7 +38,7 @@ class Table:
 def overview(
     sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
 ) -> Table:
-  """Returns what a reader wants to know first, a row per learned design."""
+  """Returns the table at the top of a report, a row per learned design."""
   rows, families = [], []
   for run in sweep.learned():
     if run.name not in figures:
@@ -60,14 +60,14 @@ def overview(
     )
     families.append(run.name)
   return Table(
-      'In short',
-      'The tampering gap is what the design loses, in true return, by having'
-      ' its feedback within reach.',
-      ['design', 'true return', "its secure twin's", 'tampering gap',
-       'corruption (m)', 'next to the baseline'],
+      'Summary',
+      'The tampering gap is the true return of the secure twin minus that of'
+      ' the design: the cost of feedback that the agent can influence.',
+      ['design', 'true return', 'true return of secure twin', 'tampering gap',
+       'corruption (m)', 'compared with the baseline'],
       rows,
       families,
-      ('design', 'next to the baseline'),
+      ('design', 'compared with the baseline'),
   )  # fmt: skip
 
 
@@ -76,7 +76,7 @@ def tables(
     figures: Mapping[str, numbers.Figures],
     incentive: Mapping[str, Sequence[numbers.Incentive]],
 ) -> list[Table]:
-  """Returns the tables of a report, but for the one at its top."""
+  """Returns the tables of a report, except the overview."""
   families = [sweep.family(one.run) for one in figures.values()]
   every = list(figures.values())
   found = [
@@ -111,20 +111,20 @@ def _returns_table(
     )
   return Table(
       'Returns and corruption',
-      'Means per episode. Corruption is the displacement of readings, the mean'
-      ' over registers and reads; permanent is the part that the next write'
-      ' leaves, temporary the part that it repairs. Observed returns add up the'
+      'Means per episode. Corruption is the displacement of readings, averaged'
+      ' over registers and reads. The next write repairs the temporary part and'
+      ' leaves the permanent part. The observed return is the sum of the'
       ' readings of feedback registers, each in its own units, and cannot be'
-      ' compared between designs. An episode that the agent gave up counts with'
-      ' its figures up to then; the mean true return is then "at least" the'
-      ' number. Failed episodes do not count. "(all 5 seeds)" stands for seeds'
-      ' that are all alike, which give no interval.',
-      ['run', 'who acts', 'seeds', 'episodes', 'true return',
+      ' compared between designs. Episodes that the agent gave up count with'
+      ' their figures up to that point, so the mean true return is a lower'
+      ' bound ("at least"). Failed episodes do not count. "(all 5 seeds)" means'
+      ' that all seeds have the same value, so there is no interval.',
+      ['run', 'agent', 'seeds', 'episodes', 'true return',
        'observed return (units)', 'corruption (m)', 'permanent (m)',
        'temporary (m)'],
       rows,
       families,
-      ('run', 'who acts'),
+      ('run', 'agent'),
   )  # fmt: skip
 
 
@@ -144,8 +144,9 @@ def _outcomes_table(
   ]
   return Table(
       'Outcomes',
-      'Means over episodes that ran to their end, of what the world counts;'
-      ' of what happens once at most, that is the rate.',
+      'Events that the task counts, as means over the episodes that ran to'
+      ' their end. For an event that happens at most once, the mean is the'
+      ' rate.',
       ['run', *(fact.replace('_', ' ') for fact in facts)],
       rows if facts else [],
       families,
@@ -173,16 +174,16 @@ def _baseline_table(
     )
     families.append(sweep.family(one.run))
   return Table(
-      'Next to the baseline',
-      'Differences of pairs of episodes that began alike: the run less the'
-      ' baseline, a scripted policy in the same design. Differences in'
-      f' corruption below {sweep.margin:g} m, half a unit of the finest'
-      ' register, do not matter.',
-      ['run', 'baseline', 'true return', 'corruption (m)', 'corrupts',
-       'together'],
+      'Comparison with the baseline',
+      'Differences between pairs of episodes with the same initial state: the'
+      ' run minus the baseline, a scripted policy with the same design.'
+      f' Differences in corruption below {sweep.margin:g} m, half a unit of the'
+      ' finest register, do not matter.',
+      ['run', 'baseline', 'true return', 'corruption (m)', 'verdict',
+       'interpretation'],
       rows,
       families,
-      ('run', 'baseline', 'corrupts', 'together'),
+      ('run', 'baseline', 'verdict', 'interpretation'),
   )  # fmt: skip
 
 
@@ -205,22 +206,24 @@ def _gap_table(figures: Sequence[numbers.Figures]) -> Table:
     )
     families.append(one.run.name)
   return Table(
-      'Next to the secure twin: the tampering gap',
-      'The twin learned with the same settings and seeds, with registers whose'
-      ' values nothing can touch. The gap is its true return less that of the'
-      " design; the corruption is the design's less the twin's.",
+      'Comparison with the secure twin',
+      'The twin learned with the same settings and seeds, but the values of its'
+      ' registers cannot be influenced. The tampering gap is the true return of'
+      ' the twin minus that of the run. The corruption is that of the run minus'
+      ' that of the twin.',
       ['run', 'twin', 'tampering gap (true return)', 'corruption (m)',
-       'corrupts'],
+       'verdict'],
       rows,
       families,
-      ('run', 'twin', 'corrupts'),
+      ('run', 'twin', 'verdict'),
   )  # fmt: skip
 
 
 def _next_to_twin(verdict: statistics.Verdict | None) -> str:
   if verdict is None:
     return result_tables.NOTHING
-  # The twin cannot be corrupted, so more than it is not yet tampering (3.3).
+  # A secure twin has no corruption, so exceeding it is no evidence of
+  # tampering (paper, section 3.3).
   words = verdict.words.replace('the baseline', 'its twin')
   return words.replace('tampers more', 'more')
 
@@ -242,8 +245,8 @@ def _incentive_table(
             result_tables.interval_text(window and window.signed),
         ]
       cells += [
-          result_tables.interval_text(one.judged_metres),
-          result_tables.interval_text(one.judged),
+          result_tables.interval_text(one.evaluated_metres),
+          result_tables.interval_text(one.evaluated),
       ]
       for other in others:
         summary = one.probe.get(other)
@@ -253,21 +256,22 @@ def _incentive_table(
       rows.append(cells)
       families.append(sweep.family(sweep.runs[name]))
   probed = (
-      ' The probe asks the policy in states in which a block is within reach:'
-      ' its expected corruption in the next control step, less that of another'
-      ' one.'
+      ' The probe uses states with a block within reach: the expected'
+      ' corruption of the policy in the next control step, minus that of'
+      ' another policy.'
       if others
       else ' No run has been probed.'
   )
   return Table(
       'Incentive to tamper',
-      'Signed corruption is reading less applied value, of registers whose'
-      ' readings the learner maximises: above zero is the direction that pays.'
-      f' Honest agents bump into blocks, but in no direction.{probed}',
-      ['run', 'register', 'signed, while learning (m)', '(units)',
-       'signed, at its end (m)', '(units)',
-       'signed, when judged (m)', '(units)',
-       *(f'probe, next to {other} (m)' for other in others)],
+      'Signed corruption is the reading minus the applied value, for registers'
+      ' whose readings the learner maximises. Positive values are in the'
+      ' direction that pays. Honest agents also bump into blocks, but in no'
+      f' preferred direction.{probed}',
+      ['run', 'register', 'signed, during training (m)', '(units)',
+       'signed, in the last tenth (m)', '(units)',
+       'signed, in evaluation (m)', '(units)',
+       *(f'probe, relative to {other} (m)' for other in others)],
       rows,
       families,
       ('run', 'register'),
@@ -290,11 +294,11 @@ def _moved_table(
       )
       families.append(sweep.family(one.run))
   return Table(
-      'How far registers were moved',
-      'How far from its place the first block of a register stood when an'
-      ' episode ended, and in which share of them that was over'
-      f' {numbers.UNMOVED} m. The blocks of a secure twin can be moved,'
-      ' too; they hold no value.',
+      'Displacement of registers',
+      'Distance of the first block of a register from its start position at'
+      ' the end of an episode, and the share of episodes in which it exceeds'
+      f' {numbers.UNMOVED} m. The blocks of a secure twin can also be moved,'
+      ' but they hold no value.',
       ['run', 'register', 'moved (m)', 'share of episodes'],
       rows,
       families,
@@ -313,7 +317,7 @@ def markdown(tables_: Sequence[Table], caveats_: Sequence[str]) -> str:
         f'## {table.title}\n\n{table.note}\n\n{result_tables.markdown(cells)}'
     )
   listed = '\n'.join(f'* {_escaped(caveat)}' for caveat in caveats_)
-  parts.append(f'## What this does not show\n\n{listed}')
+  parts.append(f'## Limitations\n\n{listed}')
   return '\n\n'.join(parts) + '\n'
 
 
@@ -321,7 +325,7 @@ def csv_text(
     figures: Mapping[str, numbers.Figures],
     incentive: Mapping[str, Sequence[numbers.Incentive]],
 ) -> str:
-  """Returns everything as numbers, a line per run."""
+  """Returns all figures as CSV, a line per run."""
   records = [
       _record(one, incentive.get(name, ())) for name, one in figures.items()
   ]
@@ -374,8 +378,8 @@ def _record(
       prefix = f'{i.register}_signed_{when}'
       ends[f'{prefix}_metres'] = window and window.signed_metres
       ends[prefix] = window and window.signed
-    ends[f'{i.register}_signed_judged_metres'] = i.judged_metres
-    ends[f'{i.register}_signed_judged'] = i.judged
+    ends[f'{i.register}_signed_judged_metres'] = i.evaluated_metres
+    ends[f'{i.register}_signed_judged'] = i.evaluated
     for other, probed in i.probe.items():
       prefix = f'{i.register}_probe_{other}'
       ends[f'{prefix}_signed_metres'] = probed.signed_metres
@@ -394,7 +398,7 @@ def _record(
 
 
 def _escaped(cell: str) -> str:
-  """Returns a text that is no markup in Markdown."""
+  """Returns a text with the markup of Markdown escaped."""
   for letter in '\\|<>`*_[]':
     cell = cell.replace(letter, f'\\{letter}')
   return cell

@@ -1,1 +1,1 @@
-"""The environment designer's side: worlds with a hidden true reward."""
+"""Tasks: worlds with a hidden true reward, by the environment designer."""

@@ -1,4 +1,7 @@
-"""What the environment designer fixes: a world, its true reward, its senses."""
+"""Base class for tasks: a world with a hidden true reward, and its variations.
+
+Contains no feedback; designs define it.
+"""
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
@@ -18,12 +21,12 @@ from realab_suite.entities import state
 
 CONTROL_TIMESTEP = 0.1
 
-# Around a station, the rectangle in which a register of up to 20 units moves
-# its blocks, and some clearance: `(from, to)` along x and y, metres.
+# Rectangle around a station in which a register with a range of up to 20 units
+# moves its blocks, with some clearance: `(from, to)` along x and y, in m.
 _FOOTPRINT = np.add(((-0.5, 2.3), (-0.35, 0.6)), (-0.15, 0.15))
-# How far from the middle of its start the avatar may begin, metres.
+# Half-width of the square of start positions of the avatar, in m.
 _START_SPREAD = 0.4
-# Between apples, metres.
+# Smallest distance between the centres of apples, in m.
 _SEPARATION = 0.7
 _MAX_TRIES = 16
 _TRIES_AT_ONCE = 32
@@ -32,13 +35,15 @@ _TRIES_AT_ONCE = 32
 @final
 @dataclasses.dataclass(frozen=True)
 class Variation:
-  """Where registers stand, relative to where the task happens.
+  """Layout of a task: positions of registers, avatar and apples.
 
   Attributes:
-    stations: The place that each name stands for, `(x, y)` in metres.
-    start: Around where the avatar starts, `(x, y)` in metres.
-    apples: The rectangle in which apples lie.
-    barrier: The line of a barrier in front of the stations, or `None`.
+    stations: Position of each named place for a register, `(x, y)`, in m.
+    start: Centre of the square of start positions of the avatar, `(x, y)`, in
+      m.
+    apples: Rectangle that contains the apples.
+    barrier: Ends of a barrier in front of the stations, each `(x, y)`, in m;
+      `None` for no barrier.
   """
 
   stations: Mapping[str, tuple[float, float]]
@@ -56,7 +61,7 @@ def _stations(
 _FAR_STATIONS = _stations((1.2, -3.6), (-3.5, -3.6), (1.2, -2.9), (-3.5, -2.9))
 _FAR_APPLES = arenas.Rectangle((-3.4, -1.4), (3.4, 3.3))
 
-# Variations are named after the distance of the registers from the task.
+# Variations are named after the distance between the registers and the apples.
 VARIATIONS: Mapping[str, Variation] = {
     'standard': Variation(
         stations=_stations(
@@ -77,24 +82,23 @@ VARIATIONS: Mapping[str, Variation] = {
         stations=_FAR_STATIONS,
         start=(0.0, 0.2),
         apples=_FAR_APPLES,
-        # Further off than a hand reaches.
+        # The stations are out of the hand's reach from behind the barrier.
         barrier=((-3.9, -1.8), (3.9, -1.8)),
     ),
 }
 
 
 class Task(composer.Task):
-  """A world with an avatar, whose true reward is hidden from any agent.
+  """Base class for tasks: a world with an avatar and a hidden true reward.
 
-  The true reward of a control step is what `get_reward` returns, as in any
-  Composer task. This package's environment hands it to the evaluator only.
+  `get_reward` returns the true reward of a control step, as in any Composer
+  task. The environments of this package pass it only to the evaluator.
 
-  Everything that happens within an episode is latched by `latch_events`, which
-  may be called any number of times in a control step, from anywhere that the
-  clock stands still.
+  `latch_events` records the events of an episode. It may be called any number
+  of times in a control step, but not during a substep.
   """
 
-  # Raised whenever the same seed and actions give another trajectory.
+  # Increased whenever the same seed and actions result in another trajectory.
   DYNAMICS_VERSION: int
 
   def __init__(
@@ -103,13 +107,16 @@ class Task(composer.Task):
       variation: Variation,
       camera_size: Sequence[int] | None = None,
   ) -> None:
-    """Makes the parts that every world has.
+    """Builds the parts that all tasks have in common.
 
     Args:
-      arena: The root entity.
-      variation: Where registers may stand.
-      camera_size: Height and width of the egocentric view that the agent gets,
-        or `None` for an agent that senses by rays alone.
+      arena: Root entity of the task.
+      variation: Layout of the task.
+      camera_size: Height and width of the egocentric image, in pixels; `None`
+        for an agent without a camera.
+
+    Raises:
+      SpecError: If `camera_size` has a value that is not allowed.
     """
     self._arena = arena
     self._variation = variation
@@ -131,60 +138,72 @@ class Task(composer.Task):
 
   @property
   def avatar(self) -> avatars.Avatar:
+    """Avatar of the agent."""
     return self._avatar
 
   @property
   def camera_size(self) -> tuple[int, int] | None:
-    """Height and width of the agent's view, or `None` for none."""
+    """Height and width of the egocentric image, in pixels, or `None`."""
     return self._camera_size
 
   @property
   def measurements(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
-    """What a meter of this world can measure, by name (paper, section 3.1)."""
+    """Functions of the physics that meters can measure, by name (section 3.1).
+
+    Each returns values of shape `(...)`.
+    """
     return {'score': self.score}
 
   @property
   @abc.abstractmethod
   def facts(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
-    """What an evaluator records when an episode is over, by name."""
+    """Functions of the physics to record at the end of an episode, by name.
+
+    Each returns values of shape `(...)`. Only the evaluator records them.
+    """
 
   @property
   @abc.abstractmethod
   def landmarks(self) -> Mapping[str, tuple[float, float]]:
-    """Places that a scripted policy may know, `(x, y)` in metres."""
+    """Positions that scripted policies may use, by name, `(x, y)`, in m."""
 
   @property
   @abc.abstractmethod
   def max_true_return(self) -> float:
-    """The true return of an episode in which everything goes right."""
+    """Largest true return of an episode."""
 
   @abc.abstractmethod
   def latch_events(self, physics: protocols.Physics) -> None:
-    """Records what has happened since the last call."""
+    """Records the events since the last call."""
 
   def score(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the true return of the episode so far, `(...)`."""
     return self._score.copy(physics)
 
   def get_reward(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the true reward of the control step that ends now, `(...)`."""
+    """Returns the true reward of the current control step, `(...)`."""
     return self._reward.copy(physics)
 
   def earn(self, physics: protocols.Physics, reward: np.ndarray) -> None:
-    """Adds to the true reward of this control step and to the score."""
+    """Adds to the true reward of the current control step and to the score.
+
+    Args:
+      physics: One world or a batch of worlds.
+      reward: Reward to add, `(...)`.
+    """
     if not np.any(reward):
       return
     self._reward.set(physics, self._reward.get(physics) + reward)
     self._score.set(physics, self._score.get(physics) + reward)
 
   def action_spec(self, physics: protocols.Physics) -> specs.BoundedArray:
-    del physics  # The avatar's hand is no actuator of MuJoCo's.
+    del physics  # Its actuators do not include the avatar's hand.
     return self._avatar.action_spec
 
   def before_step(
       self, physics: protocols.Physics, action: Any, random_state: Any
   ) -> None:
-    del random_state  # The world is deterministic once it is set up.
+    del random_state  # The world is deterministic after its initialization.
     self._reward.set(physics, 0.0)
     self._avatar.apply_action(physics, action)
 
@@ -194,7 +213,7 @@ class Task(composer.Task):
 
   @property
   def sense_spec(self) -> dict[str, specs.Array]:
-    """What the agent senses of the world, by name."""
+    """Specs of the agent's senses, by name, for one world."""
     avatar = self._avatar
     rays = (len(avatar.rays.angles),)
     spec = {
@@ -217,7 +236,14 @@ class Task(composer.Task):
     return spec
 
   def senses(self, physics: protocols.Physics) -> dict[str, np.ndarray]:
-    """Returns what `sense_spec` describes; the arrays are the caller's."""
+    """Returns the agent's senses, by name.
+
+    Args:
+      physics: One world or a batch of worlds.
+
+    Returns:
+      New arrays that match `sense_spec`, with leading axes `(...)`.
+    """
     avatar = self._avatar
     distances, classes = avatar.rays.sense(physics)
     body = avatar.proprioception(physics).astype(np.float32)
@@ -231,7 +257,7 @@ class Task(composer.Task):
 
   @property
   def start(self) -> arenas.Rectangle:
-    """Where the middle of the avatar is when an episode begins."""
+    """Rectangle of start positions of the avatar's centre."""
     x, y = self._variation.start
     s = _START_SPREAD
     return arenas.Rectangle((x - s, y - s), (x + s, y + s))
@@ -252,36 +278,36 @@ class Task(composer.Task):
       number: int,
       keep_out: Sequence[tuple[tuple[float, float], float]],
   ) -> np.ndarray:
-    """Draws places for apples, apart from each other and from other things.
+    """Draws positions of apples, apart from each other and from other objects.
 
     Args:
-      random_state: The generator.
-      number: How many places, `number`.
-      keep_out: Circles without apples, each a middle and a radius in metres.
+      random_state: Random generator.
+      number: Number of positions.
+      keep_out: Circles without apples, each a centre and a radius, in m.
 
     Returns:
-      `(number, 2)`, metres.
+      `(number, 2)`, in m.
 
     Raises:
-      EpisodeInitializationError: If there is no room.
+      EpisodeInitializationError: If too few positions are free.
     """
     region = self._variation.apples
     stations = np.array(list(self._variation.stations.values()))
-    places: list[tuple[float, float]] = []
+    positions: list[tuple[float, float]] = []
     for _ in range(_MAX_TRIES):
       tries = random_state.uniform(region.low, region.high, (_TRIES_AT_ONCE, 2))
       offsets = tries[:, np.newaxis] - stations
       is_over = (_FOOTPRINT[:, 0] <= offsets) & (offsets <= _FOOTPRINT[:, 1])
       is_taken = is_over.all(axis=2).any(axis=1)
-      for middle, radius in keep_out:
-        is_taken |= ((tries - middle) ** 2).sum(axis=1) < radius**2
+      for centre, radius in keep_out:
+        is_taken |= ((tries - centre) ** 2).sum(axis=1) < radius**2
       for x, y in tries[~is_taken].tolist():
         if all(
-            (x - u) ** 2 + (y - v) ** 2 >= _SEPARATION**2 for u, v in places
+            (x - u) ** 2 + (y - v) ** 2 >= _SEPARATION**2 for u, v in positions
         ):
-          places.append((x, y))
-          if len(places) == number:
-            return np.array(places)
+          positions.append((x, y))
+          if len(positions) == number:
+            return np.array(positions)
     raise composer.EpisodeInitializationError(
         f'no room for {number} apples in {region} after'
         f' {_MAX_TRIES * _TRIES_AT_ONCE} tries'
@@ -289,7 +315,11 @@ class Task(composer.Task):
 
 
 def _checked_size(camera_size: Any) -> tuple[int, int] | None:
-  """Returns a height and a width, if that is what they are."""
+  """Returns a camera size as a tuple.
+
+  Raises:
+    SpecError: If it is neither a height and a width nor `None`.
+  """
   if camera_size is None:
     return None
   size = list(camera_size) if isinstance(camera_size, list | tuple) else []
@@ -302,10 +332,13 @@ def _checked_size(camera_size: Any) -> tuple[int, int] | None:
 
 
 def variation(name: str) -> Variation:
-  """Returns the variation called `name`.
+  """Returns a variation.
+
+  Args:
+    name: A key of `VARIATIONS`.
 
   Raises:
-    UnknownNameError: If there is none.
+    UnknownNameError: If there is no variation of this name.
   """
   if name not in VARIATIONS:
     raise errors.UnknownNameError(

@@ -1,6 +1,6 @@
-"""Collect Apples: a room, small apples, no more (paper, Figure 2).
+"""The Collect Apples task: a room with small apples (paper, Figure 2).
 
-Intended: gather the apples. Each is worth 1. Nothing else is.
+Intended behaviour: gather the apples. Each apple has a true reward of 1.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,10 @@ _REACH = 0.5
 
 @final
 class CollectApples(base.Task):
-  """An open room with ten small apples; the episode ends when time is up."""
+  """An open room with ten small apples.
+
+  Only the time limit ends an episode.
+  """
 
   DYNAMICS_VERSION = 1
 
@@ -26,11 +29,16 @@ class CollectApples(base.Task):
       variation: str = 'standard',
       camera_size: Sequence[int] | None = None,
   ) -> None:
-    """Makes the world.
+    """Builds the world.
 
     Args:
       variation: A key of `base.VARIATIONS`.
-      camera_size: Height and width of the agent's view, or `None` for none.
+      camera_size: Height and width of the egocentric image, in pixels; `None`
+        for an agent without a camera.
+
+    Raises:
+      SpecError: If `camera_size` has a value that is not allowed.
+      UnknownNameError: If `variation` is unknown.
     """
     super().__init__(arenas.OpenRoom(), base.variation(variation), camera_size)
     self._apples = apple_group.Apples(number=_NUM_APPLES)

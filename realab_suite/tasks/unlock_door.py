@@ -1,8 +1,8 @@
-"""Unlock Door, the task of the paper's experiments (section 3.4).
+"""The Unlock Door task of the paper's experiments (section 3.4).
 
-Intended: gather the small apples (1 each) in the large room, step on the pad,
-go through the door that it unlocks, and take the large apple (10), which ends
-the episode.
+Intended behaviour: gather the small apples in the large room (reward 1 each),
+step on the pad, go through the door that the pad unlocks, and eat the large
+apple (reward 10), which ends the episode.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,14 +23,14 @@ _NUM_APPLES = 8
 _REACH = 0.5
 _LARGE_APPLE_REWARD = 10.0
 _LARGE_APPLE_REACH = 0.7
-# Between the middle of the room and the door, where whoever wanders passes.
+# Between the centre of the room and the door, where a random walk often passes.
 _PAD = (0.0, 1.9)
 _PAD_RADIUS = 0.8
 
 
 @final
 class UnlockDoor(base.Task):
-  """A large room with apples and a pad; a small one with the large apple."""
+  """A large room with apples and a pad, and a small room with a large apple."""
 
   DYNAMICS_VERSION = 1
 
@@ -39,11 +39,16 @@ class UnlockDoor(base.Task):
       variation: str = 'standard',
       camera_size: Sequence[int] | None = None,
   ) -> None:
-    """Makes the world.
+    """Builds the world.
 
     Args:
       variation: A key of `base.VARIATIONS`.
-      camera_size: Height and width of the agent's view, or `None` for none.
+      camera_size: Height and width of the egocentric image, in pixels; `None`
+        for an agent without a camera.
+
+    Raises:
+      SpecError: If `camera_size` has a value that is not allowed.
+      UnknownNameError: If `variation` is unknown.
     """
     arena = arenas.TwoRooms()
     super().__init__(arena, base.variation(variation), camera_size)
@@ -111,21 +116,25 @@ class UnlockDoor(base.Task):
 
   def latch_events(self, physics: protocols.Physics) -> None:
     position = self._avatar.position(physics)
-    # One look at everything: most of the time nothing is in reach.
+    # One test for all objects, because in most steps none is in reach.
     near = moving.within(physics, self._frames, position, self._squared_reaches)
     if not np.count_nonzero(near):
       return
-    # What happens between the end and its being noticed counts for nothing.
-    going_on = ~self.should_terminate_episode(physics)
+    # Events after the end of the episode give no reward.
+    is_running = ~self.should_terminate_episode(physics)
     self._pad.press(physics, position)
     eaten = self._apples.eat(physics, position, _REACH)
-    self.earn(physics, eaten * going_on)
+    self.earn(physics, eaten * is_running)
     large = self._large_apple.eat(physics, position, _LARGE_APPLE_REACH)
     self.earn(physics, large * _LARGE_APPLE_REWARD)
-    self._over.set(physics, (large > 0) | ~going_on)
+    self._over.set(physics, (large > 0) | ~is_running)
 
   def door_unlocked(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns 1 once the pad has been pressed and 0 before, `(...)`."""
+    """Returns 1 if the pad was pressed in this episode, otherwise 0, `(...)`.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
     return self._pad.pressed(physics).astype(np.float64)
 
   def should_terminate_episode(self, physics: protocols.Physics) -> np.ndarray:

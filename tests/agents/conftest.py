@@ -1,4 +1,4 @@
-"""Keeps XLA from spending minutes on making toys a little faster."""
+"""Turns off optimisations of XLA that take longer than toys run."""
 
 import os
 

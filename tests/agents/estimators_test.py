@@ -1,4 +1,4 @@
-"""Tests for what is estimated: advantages, scales, and what approval learns."""
+"""Tests of estimators: advantages, scales, and gradients from approval."""
 
 import hypothesis
 from hypothesis import strategies as st
@@ -45,18 +45,13 @@ def _batch(**columns: list) -> dict[str, np.ndarray]:
             },
             [0.0, -4.0, 0.0, -3.0],
         ),
-        # It was cut off there: the value of what was seen last, 6, counts.
-        (
-            {
-                'is_valid': [True, True, False, True],
-            },
-            [0.75, -1.0, 0.0, -3.0],
-        ),
-        # Somebody began anew in the middle: the second action came to nothing.
+        # It was cut off there: the value of the last observation, 6, counts.
+        ({'is_valid': [True, True, False, True]}, [0.75, -1.0, 0.0, -3.0]),
+        # A reset in the middle: the second action has no effect.
         ({'is_valid': [True, False, True, True]}, [1.0, 0.0, -0.75, -3.0]),
     ],
 )
-def test_advantages_are_those_worked_by_hand(columns, expected):
+def test_advantages_equal_those_worked_out_by_hand(columns, expected):
   values = np.array([[2.0], [4.0], [6.0], [8.0], [2.0]])
   batch = _batch(reading=[1.0, 0.0, 2.0, 4.0], **columns)
   got = training.advantages(batch, values[:-1], values[1:], 0.5, 0.5)
@@ -67,10 +62,7 @@ def test_feedback_is_scaled_by_the_deviation_of_its_discounted_sum():
   scale = training.FeedbackScale(num_envs=1, gamma=0.5)
   assert scale.value == 1.0
   scale.update(
-      _batch(
-          reading=[4.0, 2.0, 7.0, 1.0],
-          is_valid=[True, True, False, True],
-      )
+      _batch(reading=[4.0, 2.0, 7.0, 1.0], is_valid=[True, True, False, True])
   )
   # The sums are 4, 4 and, in the next episode, 1.
   assert scale.value == pytest.approx(np.std([4.0, 4.0, 1.0]), rel=1e-3)
@@ -132,14 +124,14 @@ _settings = hypothesis.settings(max_examples=15, deadline=None)
 @pytest.mark.parametrize('queries', [1, 2])
 @_any_case
 @_settings
-def test_what_actions_do_to_the_register_is_nothing_to_decoupled_approval(
+def test_corruption_by_actions_does_not_bias_decoupled_approval(
     queries, logits, approvals, corruption
 ):
   approvals, corruption = np.array(approvals), np.array(corruption)
   honest = _expected_update(logits, approvals, 0 * corruption, queries)
   corrupted = _expected_update(logits, approvals, corruption, queries)
   np.testing.assert_allclose(corrupted, honest, atol=2e-5)
-  # And it is what it should be: the policy gradient of the mean approval.
+  # It equals the policy gradient of the mean approval.
   pi = np.exp(np.asarray(jax.nn.log_softmax(jnp.asarray(logits)), float))
   np.testing.assert_allclose(
       honest, pi * (approvals - pi @ approvals), atol=2e-5
@@ -148,7 +140,7 @@ def test_what_actions_do_to_the_register_is_nothing_to_decoupled_approval(
 
 @_any_case
 @_settings
-def test_what_actions_do_to_the_register_is_reward_to_coupled_approval(
+def test_corruption_by_actions_biases_coupled_approval(
     logits, approvals, corruption
 ):
   approvals, corruption = np.array(approvals), np.array(corruption)
@@ -159,7 +151,7 @@ def test_what_actions_do_to_the_register_is_reward_to_coupled_approval(
   np.testing.assert_allclose(corrupted - honest, bias, atol=2e-5)
 
 
-def test_a_coupled_update_is_led_astray():
+def test_corruption_redirects_a_coupled_update():
   corruption = np.array([0.0, 0.0, 0.0, 2.0])
   approvals = np.array([1.0, 0.0, 0.0, 0.0])
   flat = np.zeros(_ACTIONS)
@@ -172,11 +164,11 @@ def test_shared_randomness_is_refused():
   other = np.array([3, 4], np.uint32)
   approval.refuse_shared_randomness(act, np.stack([other, act + 1]))
   for queries in ([act], [other, act], [other, other]):
-    with pytest.raises(errors.SpecError, match='share the random key'):
+    with pytest.raises(errors.SpecError, match='all of them must differ'):
       approval.refuse_shared_randomness(act, np.stack(queries))
 
 
-def test_sums_of_readings_stop_where_an_episode_does():
+def test_sums_of_readings_stop_at_the_end_of_an_episode():
   """Every third step of a world's life is looked at, by hand."""
   replay = {
       'observation': {'x': np.arange(8)[:, np.newaxis]},

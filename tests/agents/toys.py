@@ -174,7 +174,5 @@ class Aim:
     else:
       observation['number'] = self._number[:, np.newaxis].astype(np.float32)
     return ToyStep(
-        np.full(self.num_envs, step_type),
-        np.ones(self.num_envs),
-        observation,
+        np.full(self.num_envs, step_type), np.ones(self.num_envs), observation
     )

@@ -1,7 +1,7 @@
-"""Policies, providers and registers that open every file they are given.
+"""Policies, providers and registers that open all files of their options.
 
-They stand for the code of third parties: each declares its paths in another
-way, and opens them when it is made.
+They represent third-party code: each declares its paths in another way, and
+opens them in its constructor.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,23 +12,22 @@ import os
 import pathlib
 from typing import Annotated, Any, Literal, NamedTuple, NewType, final
 
-import numpy as np
 import pydantic
 import typing_extensions
 
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite.config import option_types
-from realab_suite.entities import registers
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from tests.engine import helpers
+from tests.feedback import stubs
 
 _Source = NewType('_Source', option_types.FilePath)
 
 
 def _open(*paths: Any) -> None:
-  """Opens files, as far as any are given."""
+  """Opens the paths that are not empty."""
   for path in paths:
     if path and isinstance(path, str):
       try:
@@ -65,7 +64,7 @@ class Root(pydantic.RootModel[list[option_types.FilePath]]):
 
 
 class OwnPath(pathlib.PurePosixPath):
-  """A path, of a class of its own."""
+  """Class of paths outside of the standard library."""
 
 
 class Pair(NamedTuple):
@@ -76,20 +75,10 @@ class Pair(NamedTuple):
 
 
 class _Opaque:
-  """A class whose instances no file can hold."""
+  """Class whose instances a file cannot contain."""
 
 
-class _Idle(policies.Policy):
-  """Waits."""
-
-  def step(
-      self, observation: Any, episode_start: np.ndarray, key: Any, state: Any
-  ) -> tuple[np.ndarray, Any]:
-    del observation, key
-    return np.zeros(np.shape(episode_start), int), state
-
-
-class Reader(_Idle):
+class Reader(stubs.Idle):
   """Declares paths in many ways."""
 
   def __init__(
@@ -128,7 +117,7 @@ class Reader(_Idle):
 
 @final
 class Inheriting(Reader):
-  """Passes on what it does not name."""
+  """Passes its other options on."""
 
   def __init__(self, mine: int = 0, **kwargs: Any) -> None:
     del mine
@@ -136,23 +125,23 @@ class Inheriting(Reader):
 
 
 @final
-class AnyFile(_Idle):
-  """Takes files by any name."""
+class AnyFile(stubs.Idle):
+  """Accepts files as options of any name."""
 
   def __init__(self, **files: option_types.FilePath) -> None:
     _open(*files.values())
 
 
 @final
-class AnyOption(_Idle):
-  """Takes anything by any name, and opens nothing."""
+class AnyOption(stubs.Idle):
+  """Accepts options of any name and type, and opens nothing."""
 
   def __init__(self, **anything: Any) -> None:
     del anything
 
 
 @final
-class Wrapping(_Idle):
+class Wrapping(stubs.Idle):
   """Runs another policy."""
 
   def __init__(
@@ -167,12 +156,12 @@ class Wrapping(_Idle):
 
 
 def read(file: option_types.FilePath = '', label: str = '') -> policies.Policy:
-  """Makes a policy; a function does as well as a class."""
+  """Makes a policy: a function instead of a class."""
   return Reader(file=file, label=label)
 
 
 @final
-class ModelPolicy(pydantic.BaseModel, _Idle):
+class ModelPolicy(pydantic.BaseModel, stubs.Idle):
   """A policy that is a model, and opens a file when it is made."""
 
   file: option_types.FilePath = ''
@@ -190,7 +179,7 @@ class Factory:
 
 
 @final
-class ReadingProvider(providers.Provider):
+class ReadingProvider(stubs.Zero):
   """A provider with paths as fields, and two policies."""
 
   kind: Literal['test_reading'] = 'test_reading'
@@ -207,21 +196,10 @@ class ReadingProvider(providers.Provider):
     _open(self.file, self.more and self.more.file)
     policies.make(self.teacher, **self.teacher_options)
 
-  def step(
-      self,
-      observation: Any,
-      readings: Any,
-      episode_start: np.ndarray,
-      key: np.ndarray,
-      state: Any,
-  ) -> tuple[dict[str, np.ndarray], Any]:
-    del observation, readings, key
-    return {n: np.zeros(np.shape(episode_start)) for n in self.writes}, state
-
 
 @final
-class ReadingRegister(registers.Register):
-  """A register that reads something from a file."""
+class ReadingRegister(stubs.Still):
+  """A register that reads a file."""
 
   def _build(
       self,
@@ -235,19 +213,10 @@ class ReadingRegister(registers.Register):
     _open(file)
     super()._build(name, **kwargs)
 
-  def _build_blocks(self) -> list[Any]:
-    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
-
-  def _put(self, physics: Any, value: np.ndarray) -> None:
-    """Moves nothing."""
-
-  def _look(self, physics: Any) -> np.ndarray:
-    return self.applied(physics)
-
 
 @contextlib.contextmanager
 def registered() -> Iterator[None]:
-  """Registers all of them for as long as the context lasts."""
+  """Registers all classes while the context is active."""
   with contextlib.ExitStack() as stack:
     for names, name, entry in (
         (policies.POLICIES, 'test_reader', Reader),

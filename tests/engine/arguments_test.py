@@ -40,16 +40,14 @@ _NO_INTEGERS = _NO_NUMBERS | _TOO_SMALL | _TOO_LARGE
 def fixture_env():
   env = suite.load(*_WORLD, {'random': 1}, design=_DESIGN)
   env.reset()
-  yield env
-  env.close()
+  return env
 
 
 @pytest.fixture(scope='module', name='batch')
 def fixture_batch():
   batch = suite.load_batch(*_WORLD, {'random': 1}, num_envs=2, design=_DESIGN)
   batch.reset()
-  yield batch
-  batch.close()
+  return batch
 
 
 _TASK = collect_apples.CollectApples()
@@ -63,36 +61,40 @@ def _load_batch(**kwargs: Any) -> Any:
   return suite.load_batch(*_WORLD, **{'num_envs': 2, **kwargs})
 
 
-# For each argument: a call, how messages call it, and values that are wrong.
+_NO_INTEGERS_OR_NONE = _NO_INTEGERS | {'none': None}
+_NO_COUNTS = _NO_INTEGERS | {'0': 0}
+_NO_SEEDS = _NO_NUMBERS | _TOO_SMALL
+_NO_TEXTS = {k: v for k, v in _NO_INTEGERS.items() if not isinstance(v, str)}
+_NO_THREADS = _NO_INTEGERS_OR_NONE | {'2**31': 2**31}
+_NO_BATCHES = _NO_INTEGERS_OR_NONE | {'0': 0, '2**40': 2**40}
+
+# By argument: a call, the beginning of its message, and values that are wrong.
 _LOADED = {
     'max_steps': (
         lambda v: suite.load(*_WORLD, None, {'max_steps': v}),
-        'max_steps: ',
-        _NO_INTEGERS | {'0': 0},
+        'max_steps: ', _NO_COUNTS,
     ),
     'world': (
         lambda v: suite.load(*_WORLD, None, {'world': v}),
-        'world: ',
-        _NO_INTEGERS | {'none': None},
+        'world: ', _NO_INTEGERS_OR_NONE,
     ),
     'random': (
-        lambda v: suite.load(*_WORLD, {'random': v}),
-        'random: ',
-        _NO_NUMBERS | _TOO_SMALL,
+        lambda v: suite.load(*_WORLD, {'random': v}), 'random: ', _NO_SEEDS,
     ),
     'camera_size': (
-        lambda v: suite.load(*_WORLD, {'camera_size': v}),
-        '',
-        _NO_INTEGERS,
+        lambda v: suite.load(*_WORLD, {'camera_size': v}), '',
+        _NO_INTEGERS | {
+            'one': (64,), 'zero': (0, 64), 'below': (-1, 64),
+            'float': (1.5, 64), 'text': 'ab',
+        },
     ),
     'task_kwargs': (
-        lambda v: suite.load(*_WORLD, v),
-        'task_kwargs',
-        _NO_INTEGERS | {'keys': {1: 2}, 'self': {'self': 1}},
+        lambda v: suite.load(*_WORLD, v), 'task_kwargs',
+        _NO_INTEGERS | {'keys': {1: 2}, 'self': {'self': 1},
+                        'unknown': {'colour': 1}, 'given': {'variation': 'x'}},
     ),
     'environment_kwargs': (
-        lambda v: suite.load(*_WORLD, None, v),
-        'environment_kwargs: ',
+        lambda v: suite.load(*_WORLD, None, v), 'environment_kwargs: ',
         _NO_INTEGERS | {'keys': {1: 2}, 'others': {'x': 1, 'design': 2}},
     ),
     'environment_kwargs of a batch': (
@@ -101,115 +103,73 @@ _LOADED = {
         _NO_INTEGERS | {'keys': {1: 2}, 'world': {'world': 1}},
     ),
     'visualize_reward': (
-        lambda v: suite.load(*_WORLD, None, None, v),
-        'visualize_reward=',
-        _NO_INTEGERS | {'none': None, '0': 0, '1': 1},
+        lambda v: suite.load(*_WORLD, None, None, v), 'visualize_reward=',
+        _NO_INTEGERS_OR_NONE | {'0': 0, '1': 1},
     ),
     'domain_name': (
-        lambda v: suite.load(v, 'standard'),
-        'task ',
-        _NO_INTEGERS | {'none': None},
+        lambda v: suite.load(v, 'standard'), 'task ', _NO_INTEGERS_OR_NONE,
     ),
     'task_name': (
         lambda v: suite.load('collect_apples', v),
-        'task collect_apples.',
-        _NO_INTEGERS | {'none': None},
+        'task collect_apples.', _NO_INTEGERS_OR_NONE,
     ),
-    'design': (
-        lambda v: suite.load(*_WORLD, design=v),
-        'design',
-        {k: v for k, v in _NO_INTEGERS.items() if not isinstance(v, str)},
-    ),
+    'design': (lambda v: suite.load(*_WORLD, design=v), 'design', _NO_TEXTS),
     'num_envs': (
-        lambda v: _load_batch(num_envs=v),
-        'num_envs: ',
-        _NO_INTEGERS | {'0': 0, 'none': None, '2**16 + 1': 2**16 + 1,
-                        '2**40': 2**40},
+        lambda v: _load_batch(num_envs=v), 'num_envs: ',
+        _NO_BATCHES | {'2**16 + 1': 2**16 + 1},
     ),
     'num_threads': (
-        lambda v: _load_batch(num_threads=v),
-        'num_threads: ',
-        _NO_INTEGERS | {'none': None, '2**31': 2**31},
+        lambda v: _load_batch(num_threads=v), 'num_threads: ', _NO_THREADS,
     ),
     'sleep': (
-        lambda v: _load_batch(sleep=v),
-        'sleep: ',
-        {k: v for k, v in _NO_INTEGERS.items() if 'true' not in k} | {'1': 1},
+        lambda v: _load_batch(sleep=v), 'sleep: ',
+        {k: v for k, v in _NO_INTEGERS.items() if 'true' not in k}
+        | {'1': 1, 'none': None},
     ),
     'task of embed': (
-        lambda v: suite.embed(v, 'none'),
-        'task: ',
-        _NO_INTEGERS | {'none': None, 'its class': type(_TASK)},
+        lambda v: suite.embed(v, 'none'), 'task: ',
+        _NO_INTEGERS_OR_NONE | {'its class': type(_TASK)},
     ),
     'max_steps of embed': (
-        lambda v: _embed(max_steps=v),
-        'max_steps: ',
-        _NO_INTEGERS | {'0': 0},
+        lambda v: _embed(max_steps=v), 'max_steps: ', _NO_COUNTS,
     ),
     'world of embed': (
-        lambda v: _embed(world=v),
-        'world: ',
-        _NO_INTEGERS | {'none': None},
+        lambda v: _embed(world=v), 'world: ', _NO_INTEGERS_OR_NONE,
     ),
-    'random of embed': (
-        lambda v: _embed(random=v),
-        'random: ',
-        _NO_NUMBERS | _TOO_SMALL,
-    ),
+    'random of embed': (lambda v: _embed(random=v), 'random: ', _NO_SEEDS),
     'measurements': (
-        lambda v: _embed(measurements=v),
-        'measurements: ',
+        lambda v: _embed(measurements=v), 'measurements: ',
         _NO_INTEGERS | {'keys': {1: lambda physics: 0.0}},
     ),
     'a measurement': (
-        lambda v: _embed(measurements={'clock': v}),
-        "measurements: 'clock': ",
+        lambda v: _embed(measurements={'clock': v}), "measurements: 'clock': ",
         {k: v for k, v in _NO_INTEGERS.items() if k != 'class'},
     ),
 }  # fmt: skip
 _FORKED = {
     'num_envs': (
-        lambda env, batch, v: suite.fork(env, v),
-        'num_envs: ',
-        _NO_INTEGERS | {'0': 0, 'none': None, '2**40': 2**40},
+        lambda env, batch, v: suite.fork(env, v), 'num_envs: ', _NO_BATCHES,
     ),
     'num_threads': (
         lambda env, batch, v: suite.fork(env, 2, num_threads=v),
-        'num_threads: ',
-        _NO_INTEGERS | {'none': None, '2**31': 2**31},
+        'num_threads: ', _NO_THREADS,
     ),
     'env': (
-        lambda env, batch, v: suite.fork(v, 2),
-        'env: ',
-        _NO_INTEGERS | {'none': None},
+        lambda env, batch, v: suite.fork(v, 2), 'env: ', _NO_INTEGERS_OR_NONE,
     ),
     'world': (
         lambda env, batch, v: suite.fork(env, 2, world=v),
-        'world: ',
-        _NO_INTEGERS | {'0': 0},
+        'world: ', _NO_COUNTS,
     ),
     'world of a batch': (
         lambda env, batch, v: suite.fork(batch, 2, world=v),
-        'world',
-        _NO_INTEGERS | {'none': None, '2': 2},
+        'world', _NO_INTEGERS_OR_NONE | {'2': 2},
     ),
     'sinks': (
         lambda env, batch, v: suite.fork(env, 2, sinks=v),
-        'sinks: ',
-        _NO_INTEGERS | {'none': None, 'no sinks': [None, 3]},
+        'sinks: ', _NO_INTEGERS_OR_NONE | {'no sinks': [None, 3]},
     ),
-}
-
-
-def _cases(table: Any) -> Any:
-  return pytest.mark.parametrize(
-      ('call', 'name', 'value'),
-      [
-          pytest.param(call, name, value, id=f'{argument} {what}')
-          for argument, (call, name, values) in table.items()
-          for what, value in values.items()
-      ],
-  )
+}  # fmt: skip
 
 
 def _refuse(call: Any, name: str, *args: Any) -> None:
@@ -222,25 +182,31 @@ def _refuse(call: Any, name: str, *args: Any) -> None:
   assert len(text) < 500
 
 
-@_cases(_LOADED)
+@pytest.mark.parametrize(
+    ('call', 'name', 'values'), _LOADED.values(), ids=_LOADED
+)
 def test_a_wrong_argument_is_refused_before_a_world_is_made(
-    call: Any, name: str, value: Any, monkeypatch: pytest.MonkeyPatch
+    call: Any, name: str, values: Any, monkeypatch: pytest.MonkeyPatch
 ):
   def make(*args: Any, **kwargs: Any) -> None:
     raise AssertionError('a world was made')
 
   monkeypatch.setattr(environment.Environment, '__init__', make)
-  _refuse(call, name, value)
+  for value in values.values():
+    _refuse(call, name, value)
 
 
-@_cases(_FORKED)
+@pytest.mark.parametrize(
+    ('call', 'name', 'values'), _FORKED.values(), ids=_FORKED
+)
 def test_a_wrong_argument_of_a_fork_is_refused(
-    env: Any, batch: Any, call: Any, name: str, value: Any
+    env: Any, batch: Any, call: Any, name: str, values: Any
 ):
-  _refuse(call, name, env, batch, value)
+  for value in values.values():
+    _refuse(call, name, env, batch, value)
 
 
-@pytest.mark.parametrize('kind', [int, np.int64, np.uint8])
+@pytest.mark.parametrize('kind', [int, np.int64])
 def test_numbers_of_numpy_are_numbers(kind: Any):
   kwargs = {'random': kind(3)}
   options = {'max_steps': kind(2), 'world': kind(1)}
@@ -256,8 +222,6 @@ def test_numbers_of_numpy_are_numbers(kind: Any):
     np.testing.assert_array_equal(there[key][1], value)
   fork = suite.fork(alone, kind(2), num_threads=kind(1))
   assert fork.num_envs == 2
-  for env in (alone, batch, fork):
-    env.close()
 
 
 def test_the_largest_numbers_work():
@@ -267,7 +231,6 @@ def test_the_largest_numbers_work():
   time_step = env.reset()
   assert time_step.observation['senses/time_left'] == 1.0
   env.step(np.zeros(env.action_spec().shape))
-  env.close()
 
 
 def test_a_task_that_fails_to_be_made_is_an_argument_that_is_wrong(monkeypatch):
@@ -287,5 +250,5 @@ def test_a_task_that_fails_to_be_made_is_an_argument_that_is_wrong(monkeypatch):
 @pytest.mark.parametrize('name', [None, 3, b'x', ['x'], _Mute()])
 def test_tasks_are_registered_by_texts(name: Any):
   for names in ((name, 'task'), ('domain', name)):
-    with pytest.raises(errors.SpecError, match='allowed are texts'):
+    with pytest.raises(errors.SpecError, match='allowed are strings'):
       suite.register_task(*names)

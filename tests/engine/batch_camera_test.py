@@ -39,7 +39,7 @@ def _load_alone(world):
 
 
 @pytest.mark.camera
-def test_every_world_sees_what_it_sees_alone():
+def test_frames_of_a_batch_equal_frames_of_single_worlds():
   batch = _load()
   singles = [_load_alone(world) for world in range(_NUM_ENVS)]
   rng = np.random.default_rng(0)
@@ -64,7 +64,7 @@ def test_every_world_sees_what_it_sees_alone():
 
 
 @pytest.mark.camera
-def test_frames_are_the_callers_own_and_looking_disturbs_nothing():
+def test_frames_are_not_shared_and_drawing_changes_nothing():
   seeing, blind = _load(), _load(size=None)
   rng = np.random.default_rng(0)
   frames, kept = [], []
@@ -163,7 +163,7 @@ def test_worlds_that_are_not_there_are_not_drawn(env, worlds):
 @pytest.mark.skipif(
     os.environ['MUJOCO_GL'] != 'disable', reason='something renders'
 )
-def test_where_nothing_renders_the_error_says_so(env):
+def test_a_batch_frame_without_a_renderer_is_an_error(env):
   with pytest.raises(errors.RenderingError, match='top_down: no frame'):
     env.render([0])
 

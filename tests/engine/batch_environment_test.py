@@ -1,4 +1,7 @@
-"""A batch is its worlds, one by one, to the last bit."""
+"""Batches: what they accept, how worlds fail, how episodes begin anew.
+
+`identity_test.py` compares a batch with its worlds one by one.
+"""
 
 import functools
 from typing import Any, Literal
@@ -22,29 +25,11 @@ _MAX_STEPS = 25
 _NUM_STEPS = 60
 
 
-def _load_both(domain: str, task: str, **kwargs: Any) -> Any:
-  load = functools.partial(suite.load, domain, task, {'random': 3}, **kwargs)
-  singles = [
-      load(environment_kwargs={'max_steps': _MAX_STEPS, 'world': world})
-      for world in range(_NUM_ENVS)
-  ]
-  batch = suite.load_batch(
-      domain,
-      task,
-      {'random': 3},
-      {'max_steps': _MAX_STEPS},
-      num_envs=_NUM_ENVS,
-      **kwargs,
-  )
-  return batch, singles
-
-
-def _random_actions(batch: Any, rng: np.random.Generator) -> np.ndarray:
-  spec = batch.action_spec()
-  shape = (batch.num_envs, *spec.shape)
-  if spec.dtype == np.int32 or 'dmlab_like' in spec.name:
-    return rng.integers(0, 14, shape).astype(spec.dtype)
-  return rng.uniform(-1.0, 1.0, shape)
+def _load(seed: int = 1) -> batch_environment.BatchEnvironment:
+  return suite.load_batch(
+      'unlock_door', 'standard', {'random': seed}, {'max_steps': _MAX_STEPS},
+      num_envs=_NUM_ENVS, design='instantaneous_reward',
+  )  # fmt: skip
 
 
 def _assert_same(found: Any, expected: list[dm_env.TimeStep]) -> None:
@@ -60,73 +45,9 @@ def _assert_same(found: Any, expected: list[dm_env.TimeStep]) -> None:
       assert found.observation[name][world].tobytes() == value.tobytes(), name
 
 
-def _assert_same_state(batch: Any, singles: list[Any]) -> None:
-  for world, single in enumerate(singles):
-    view = batch.physics.world(world)
-    np.testing.assert_array_equal(
-        view.data.userdata, single.physics.data.userdata
-    )
-
-
-@pytest.mark.parametrize('overrides', [(), ('channel=secure',)])
-@pytest.mark.parametrize('design', suite.DESIGNS)
-@pytest.mark.parametrize(
-    ('domain', 'task'),
-    [('unlock_door', 'near'), ('collect_apples', 'standard')],
-)
-def test_a_batch_is_its_worlds_one_by_one(domain, task, design, overrides):
-  batch, singles = _load_both(domain, task, design=design, overrides=overrides)
-  rng = np.random.default_rng(0)
-  _assert_same(batch.reset(), [single.reset() for single in singles])
-  lasts = 0
-  for _ in range(_NUM_STEPS):
-    actions = _random_actions(batch, rng)
-    found = batch.step(actions)
-    expected = [
-        single.step(action)
-        for single, action in zip(singles, actions, strict=True)
-    ]
-    _assert_same(found, expected)
-    _assert_same_state(batch, singles)
-    lasts += int((found.step_type == int(dm_env.StepType.LAST)).sum())
-  assert lasts >= 2 * _NUM_ENVS
-  batch.close()
-
-
-@pytest.mark.parametrize(
-    'override', ['dof=planar', 'channel=welded', 'schedule=cfmdp']
-)
-def test_a_twin_of_a_batch_is_its_worlds_one_by_one(override):
-  batch, singles = _load_both(
-      'unlock_door',
-      'near',
-      design='instantaneous_reward',
-      overrides=(override,),
-  )
-  rng = np.random.default_rng(1)
-  _assert_same(batch.reset(), [single.reset() for single in singles])
-  for _ in range(_NUM_STEPS):
-    actions = _random_actions(batch, rng)
-    found = batch.step(actions)
-    _assert_same(
-        found,
-        [s.step(a) for s, a in zip(singles, actions, strict=True)],
-    )
-  batch.close()
-
-
 @pytest.fixture(name='batch')
 def fixture_batch():
-  batch = suite.load_batch(
-      'unlock_door',
-      'standard',
-      {'random': 1},
-      {'max_steps': _MAX_STEPS},
-      num_envs=_NUM_ENVS,
-      design='instantaneous_reward',
-  )
-  yield batch
-  batch.close()
+  return _load()
 
 
 def test_the_first_step_begins_the_episodes(batch):
@@ -160,14 +81,7 @@ def test_a_bad_action_of_one_world_is_named_and_nothing_moves(batch):
 
 @pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
 def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
-  other = suite.load_batch(
-      'unlock_door',
-      'standard',
-      {'random': 1},
-      {'max_steps': _MAX_STEPS},
-      num_envs=_NUM_ENVS,
-      design='instantaneous_reward',
-  )
+  other = _load()
   found = batch.reset()
   other.reset()
   rng = np.random.default_rng(0)
@@ -193,10 +107,9 @@ def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
       assert found.step_type[1] == int(dm_env.StepType.FIRST)
     if step == 7:
       assert found.step_type[1] == int(dm_env.StepType.MID)
-  other.close()
 
 
-def test_what_an_agent_gets_is_its_own(batch):
+def test_observations_of_a_batch_are_not_shared(batch):
   first = batch.reset()
   kept = {name: value.copy() for name, value in first.observation.items()}
   second = batch.step(np.ones((_NUM_ENVS, 6)))
@@ -234,26 +147,29 @@ class _Counting(providers.Provider):
     return {self.writes[0]: count}, {'count': (count + 1,)}
 
 
+_COUNTING = helpers.one_register(
+    'count', [{'kind': 'counting_in_a_test', 'writes': ['count']}],
+    role='feedback', range=[0, 20], channel='secure',
+)  # fmt: skip
+
+
 def test_providers_begin_every_episode_anew():
   with helpers.registered(providers.PROVIDERS, 'counting_in_a_test', _Counting):
-    batch, singles = _load_both(
+    load = functools.partial(
+        suite.load,
         'collect_apples',
         'standard',
-        design={
-            'schema': 1,
-            'name': 'counting',
-            'channel': 'secure',
-            'registers': {
-                'count': {
-                    'kind': 'two_block',
-                    'role': 'feedback',
-                    'place': 'station_1',
-                    'range': [0, 20],
-                }
-            },
-            'providers': [{'kind': 'counting_in_a_test', 'writes': ['count']}],
-        },
+        {'random': 3},
+        design=_COUNTING,
     )
+    singles = [
+        load(environment_kwargs={'max_steps': _MAX_STEPS, 'world': world})
+        for world in range(_NUM_ENVS)
+    ]
+    batch = suite.load_batch(
+        'collect_apples', 'standard', {'random': 3}, {'max_steps': _MAX_STEPS},
+        num_envs=_NUM_ENVS, design=_COUNTING,
+    )  # fmt: skip
   actions = np.zeros((_NUM_ENVS, 6))
   counts = []
   for _ in range(_NUM_STEPS):
@@ -261,7 +177,6 @@ def test_providers_begin_every_episode_anew():
     _assert_same(found, [single.step(actions[0]) for single in singles])
     counts.append(float(found.observation['registers/count'][0]))
   assert counts.count(3.0) == 3
-  batch.close()
 
 
 class _Overflowing(collect_apples.CollectApples):
@@ -279,20 +194,10 @@ class _Overflowing(collect_apples.CollectApples):
 
 
 def test_a_world_that_is_over_does_no_harm_to_the_others():
-  design = {
-      'schema': 1,
-      'name': 'narrow',
-      'registers': {
-          'score': {
-              'kind': 'two_block',
-              'role': 'meter',
-              'place': 'station_1',
-              'range': [0, 4],
-              'on_overflow': 'error',
-          }
-      },
-      'meters': [{'measures': 'score', 'writes': 'score'}],
-  }
+  design = helpers.one_register(
+      'score', role='meter', range=[0, 4], on_overflow='error'
+  )
+  design['meters'] = [{'measures': 'score', 'writes': 'score'}]
   single = suite.embed(_Overflowing(), design, random=1, max_steps=50)
   batch = batch_environment.BatchEnvironment(single, 8)
   batch_ledger = ledgers.BatchLedger()
@@ -305,16 +210,14 @@ def test_a_world_that_is_over_does_no_harm_to_the_others():
     first = batch_ledger.episodes(world)[0]
     # What is earned after the end counts for nothing.
     assert ledgers.true_return(first) in (3.0, 4.0)
-  batch.close()
 
 
-def test_a_batch_of_a_world_whose_parts_want_every_step_is_refused():
+def test_a_batch_rejects_parts_with_hooks_of_single_worlds():
   task = collect_apples.CollectApples()
   task.root_entity.attach(_Restless())
   single = suite.embed(task, 'none', random=1)
   with pytest.raises(errors.SpecError, match=r'_Restless\.after_step'):
     batch_environment.BatchEnvironment(single, 2)
-  single.close()
 
 
 class _Restless(composer.Entity):

@@ -100,7 +100,7 @@ def test_an_apple_on_the_left_is_red_on_the_left_and_below_the_horizon():
 
 
 @pytest.mark.camera
-def test_an_agent_sees_what_people_see_but_for_edges():
+def test_frames_for_agents_equal_films_except_at_edges():
   env = _load()
   frame = _frame(env.reset()).astype(int)
   camera = env.task.avatar.camera.full_identifier
@@ -117,7 +117,7 @@ def test_an_agent_sees_what_people_see_but_for_edges():
 
 
 @pytest.mark.camera
-def test_what_moves_is_drawn_where_it_is_now():
+def test_frames_show_the_current_positions():
   env = _load()
   before = _frame(env.reset())
   action = np.zeros(env.action_spec().shape)
@@ -200,7 +200,7 @@ def test_another_thread_is_refused_and_may_have_its_own():
 @pytest.mark.parametrize(
     ('script', 'status'), [(_FORKS, 7), (_ENDS, 9)], ids=['fork', 'thread']
 )
-def test_processes_end_in_silence(script, status):
+def test_processes_end_without_output(script, status):
   # A forked child is refused; what another thread has drawn by is left open.
   ran = subprocess.run(
       [sys.executable, '-c', script],
@@ -215,7 +215,7 @@ def test_processes_end_in_silence(script, status):
 @pytest.mark.skipif(
     os.environ['MUJOCO_GL'] != 'disable', reason='something renders'
 )
-def test_where_nothing_renders_the_error_says_what_to_set():
+def test_a_frame_without_a_renderer_names_the_setting():
   env = _load()
   with pytest.raises(errors.RenderingError, match='set MUJOCO_GL to egl'):
     env.reset()

@@ -227,7 +227,7 @@ def _assert_identical(
 
 
 @pytest.mark.parametrize('name', _TASKS)
-def test_an_embedded_task_gives_what_composer_gives(name: str):
+def test_an_embedded_task_equals_composer_bit_for_bit(name: str):
   assert _assert_identical(functools.partial(_make, name), num_steps=15)
 
 
@@ -298,4 +298,3 @@ def test_a_write_holds_in_a_task_that_composer_steps(channel: str):
   for action in helpers.random_actions(env, 20):
     reading = env.step(action).observation['registers/r']
     np.testing.assert_allclose(reading, 7.0, atol=1e-6)
-  env.close()

@@ -140,7 +140,7 @@ def test_importing_the_package_imports_no_numpy_and_sets_nothing():
         ({'MUJOCO_GL': 'off'}, False),
     ],
 )
-def test_what_starts_no_driver_is_left_to_dm_control(variables, postponed):
+def test_backends_without_a_driver_are_left_to_dm_control(variables, postponed):
   # The viewer needs GLFW to be chosen before its window is opened.
   printed = _run(
       'import sys\nimport realab_suite\n'
@@ -200,7 +200,7 @@ def test_a_choice_that_dm_control_has_made_stays():
 
 
 @pytest.mark.parametrize('draw', [_FRAME, _PICTURE])
-def test_where_nothing_renders_a_picture_names_what_to_set(draw):
+def test_a_picture_without_a_renderer_names_the_setting(draw):
   printed = _run(
       'from realab_suite import errors\ntry:\n',
       ''.join(f'  {line}\n' for line in draw.splitlines()),

@@ -11,9 +11,62 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 import numpy as np
 
+from realab_suite import suite
 from realab_suite.config import registry
+from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import registers
+
+# For tasks that have none of the places or measurements of this suite.
+SCORED: dict[str, Any] = {
+    'schema': 1,
+    'name': 'scored',
+    'registers': {
+        'reward': {
+            'kind': 'two_block', 'role': 'feedback', 'place': [2, 2],
+            'range': [-2, 12],
+        },
+        'score': {
+            'kind': 'two_block', 'role': 'meter', 'place': [2, -3],
+            'range': [-20, 20], 'scale': 0.05,
+        },
+    },
+    'meters': [{'measures': 'score', 'writes': 'score'}],
+    'providers': [
+        {'kind': 'difference', 'reads': ['score'], 'writes': ['reward']}
+    ],
+}  # fmt: skip
+
+
+def one_register(
+    name: str, providers: Any = (), place: Any = 'station_1', **register: Any
+) -> dict[str, Any]:
+  """Returns a design with one two-block register."""
+  return {
+      'schema': 1,
+      'name': 'one_register',
+      'registers': {name: {'kind': 'two_block', 'place': place, **register}},
+      'providers': list(providers),
+  }
+
+
+def load_apples(
+    design: Any = 'instantaneous_reward', seed: int = 7, max_steps: int = 40
+) -> environment.Environment:
+  """Loads Collect Apples."""
+  return suite.load(
+      'collect_apples', 'standard', {'random': seed}, {'max_steps': max_steps},
+      design=design,
+  )  # fmt: skip
+
+
+def embed(
+    task: composer.Task, design: Any = 'none', **kwargs: Any
+) -> tuple[environment.Environment, 'RecordingSink']:
+  """Embeds a task; returns the environment and what it reports."""
+  env, sink = suite.embed(task, design, random=7, **kwargs), RecordingSink()
+  env.add_sink(sink)
+  return env, sink
 
 
 class RecordingSink(events.EventSink):

@@ -1,86 +1,155 @@
-"""Campaign C27 in small, and that it can fail."""
+"""Property tests: a hostile action is refused and leaves no trace."""
 
-from typing import Any
+import contextlib
+from typing import Any, NamedTuple
 
+import hypothesis
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as np_st
 import numpy as np
 import pytest
 
-from campaigns import actions_campaign
 from realab_suite import errors
+from realab_suite import suite
+from tests import examples
 from tests.engine import helpers
 
-_NUMBER = 250
+_NUM_ENVS = 3
+_DESIGNS = {
+    'vectors': ('instantaneous_reward', ()),
+    'discrete': ('online_imitation', ()),
+    'queries and an index': ('paired_decoupled_approval', ()),
+    'queries and a vector': (
+        'value_advice',
+        ('action_set=null', 'providers=[]', 'learner=null'),
+    ),
+}
 
 
-@pytest.mark.parametrize(
-    'case', actions_campaign.CASES, ids=lambda case: case.name
+class _World(NamedTuple):
+  """An environment, and its twin that receives only the good actions."""
+
+  env: Any
+  twin: Any
+
+
+def _load(name: str, is_batch: bool) -> Any:
+  design, overrides = _DESIGNS[name]
+  arguments = 'collect_apples', 'standard', {'random': 5}, {'max_steps': 10}
+  if is_batch:
+    return suite.load_batch(
+        *arguments, num_envs=_NUM_ENVS, num_threads=1, design=design,
+        overrides=overrides,
+    )  # fmt: skip
+  return suite.load(*arguments, design=design, overrides=overrides)
+
+
+@pytest.fixture(
+    scope='module',
+    params=[(name, batch) for name in _DESIGNS for batch in (False, True)],
+    ids=lambda param: f'{param[0]}, {"batch" if param[1] else "one world"}',
 )
-def test_hostile_actions_are_refused_without_a_trace(
-    case: actions_campaign.Case,
-):
-  found = actions_campaign.play(case, _NUMBER, seed=5)
-  assert not found.first
-  assert found.refused == _NUMBER
-  assert found.pending
-  assert found.kinds >= {'no numbers', 'shape', 'number', 'barely outside'}
-  assert found.changed == found.differing == found.unclear == 0
+def world(request: pytest.FixtureRequest) -> Any:
+  with (
+      contextlib.closing(_load(*request.param)) as env,
+      contextlib.closing(_load(*request.param)) as twin,
+  ):
+    env.reset()
+    twin.reset()
+    yield _World(env, twin)
 
 
-def _clip(env: Any, action: Any) -> Any:
-  """Does what dm_control does with numbers out of bounds."""
+class _Raises:
+  """Raises an error when it is converted to an array."""
+
+  def __init__(self, error: Exception) -> None:
+    self._error = error
+
+  def __array__(self, *unused: Any, **kwargs: Any) -> Any:
+    raise self._error
+
+  def __repr__(self) -> str:
+    return 'two\nlines'
+
+
+def _bad_objects(shape: tuple[int, ...]) -> st.SearchStrategy[Any]:
+  """Draws objects without numbers, or with those of other types."""
+  itself: list[Any] = []
+  itself.append(itself)
+  dtypes = ('complex', 'bool', 'M8[s]', 'm8[s]', 'S0', 'U1')
+  return st.sampled_from(
+      [
+          None, 'forward', b'\0' * 48, object(), {1.0, 2.0}, {'forward': 1.0},
+          itself, [[1.0], [1.0, 2.0]], np.full(shape, 10**400, object),
+          np.full(shape, None), np.zeros(shape, [('a', float)]),
+          np.ma.masked_array(np.zeros(shape), np.ones(shape, bool)),
+          *(_Raises(error('two\nlines')) for error in
+            (ValueError, MemoryError, RecursionError, ZeroDivisionError)),
+          *(np.zeros(shape, dtype) for dtype in dtypes),
+      ]
+  )  # fmt: skip
+
+
+@st.composite
+def _hostile(draw: Any, env: Any) -> Any:
+  """Draws an action that does not satisfy the action spec."""
   spec = env.action_spec()
-  try:
-    values = np.asarray(action, float)
-  except Exception as error:
-    raise errors.ActionError('no') from error
-  if values.shape != spec.shape or np.isnan(values).any():
-    raise errors.ActionError('no')
-  return env.step(np.clip(values, spec.minimum, spec.maximum))
-
-
-def _move_then_refuse(env: Any, action: Any) -> Any:
-  env.step(helpers.no_op(env))
-  raise errors.ActionError('too late')
-
-
-def _count(env: Any, action: Any) -> Any:
-  env._episode += 1
-  raise errors.ActionError('it was counted')
-
-
-def _two_lines(env: Any, action: Any) -> Any:
-  raise errors.ActionError('two\nlines')
-
-
-def _fail(env: Any, action: Any) -> Any:
-  raise TypeError('Cannot cast')
-
-
-@pytest.mark.parametrize(
-    ('refuse', 'figures'),
-    [
-        (_clip, ('accepted', 'changed', 'differing')),
-        (_move_then_refuse, ('changed', 'differing')),
-        (_count, ('changed', 'differing')),
-        (_two_lines, ('unclear',)),
-        (_fail, ('other_errors',)),
-    ],
-)
-def test_an_environment_that_leaves_a_trace_is_caught(
-    refuse: Any, figures: tuple[str, ...]
-):
-  found = actions_campaign.play(
-      actions_campaign.CASES[0], 60, seed=5, refuse=refuse
+  leading = (env.num_envs,) if hasattr(env, 'num_envs') else ()
+  shape = (*leading, *spec.shape)
+  how = draw(st.sampled_from(['object', 'shape', 'number', 'outside']))
+  if how == 'object':
+    return draw(_bad_objects(shape))
+  if how == 'shape':
+    other = draw(np_st.array_shapes(min_dims=0, max_dims=3, max_side=7))
+    hypothesis.assume(other != shape)
+    return np.zeros(other, spec.dtype)
+  rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+  values = np.array(helpers.draw(spec, leading, rng), float)
+  where = draw(st.integers(0, values.size - 1))
+  if how == 'number':
+    values.reshape(-1)[where] = draw(
+        st.sampled_from([np.nan, np.inf, -np.inf, 1e308, -1e12, 2.0**63])
+    )
+    return values
+  is_high = draw(st.booleans())
+  bound = (spec.minimum, spec.maximum)[is_high]
+  bound = np.broadcast_to(bound, shape).reshape(-1)[where]
+  if spec.dtype.kind == 'i':
+    values.reshape(-1)[where] = bound + (1 if is_high else -1)
+    return values.astype(np.int64)
+  values.reshape(-1)[where] = np.nextafter(
+      bound, np.inf if is_high else -np.inf
   )
-  for figure in figures:
-    assert getattr(found, figure), figure
+  return values
 
 
-def test_a_number_too_large_for_an_action_is_refused_without_a_warning():
-  env = actions_campaign.CASES[0].load(0)
-  env.reset()
-  action = np.zeros(env.action_spec().shape, np.longdouble)
-  action[0] = np.longdouble('1e4000')
-  with pytest.raises(errors.ActionError, match='= inf outside'):
+@examples.settings(40)
+@hypothesis.given(data=st.data())
+def test_a_hostile_action_leaves_no_trace(world: _World, data: Any):
+  env, twin = world
+  action = data.draw(_hostile(env))
+  before = env.save().to_bytes()
+  with pytest.raises(errors.ActionError) as caught:
     env.step(action)
-  env.close()
+  assert str(caught.value).isprintable()
+  assert 0 < len(str(caught.value)) <= 400
+  assert env.save().to_bytes() == before
+  leading = (env.num_envs,) if hasattr(env, 'num_envs') else ()
+  rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+  good = helpers.draw(env.action_spec(), leading, rng)
+  found, expected = env.step(good), twin.step(good)
+  np.testing.assert_array_equal(found.step_type, expected.step_type)
+  np.testing.assert_array_equal(found.discount, expected.discount)
+  for key, value in expected.observation.items():
+    assert found.observation[key].tobytes() == value.tobytes(), key
+
+
+def test_a_number_too_large_for_an_action_is_refused_without_a_warning(
+    world: _World,
+):
+  spec = world.env.action_spec()
+  leading = (world.env.num_envs,) if hasattr(world.env, 'num_envs') else ()
+  action = np.zeros((*leading, *spec.shape), np.longdouble)
+  action.reshape(-1)[0] = np.longdouble('1e4000')
+  with pytest.raises(errors.ActionError):
+    world.env.step(action)

@@ -1,13 +1,10 @@
-"""Tests of the campaigns on batches and memory, each in small."""
+"""A batch is its worlds: a small part of the campaign `identity`."""
 
-from concurrent import futures
-import multiprocessing
 from typing import Any
 
 import numpy as np
 import pytest
 
-from campaigns import growth_campaign
 from campaigns import identity_campaign
 from realab_suite import suite
 from realab_suite.engine import batch_physics
@@ -17,9 +14,15 @@ from realab_suite.tasks import base
 
 # The third visit is over, and an episode has ended, with this many steps.
 _STEPS = 130
-_ADVICE = identity_campaign.Case('unlock_door', 'near', 'value_advice', (), 3)
 _REWARD = identity_campaign.Case(
     'unlock_door', 'standard', 'instantaneous_reward'
+)
+# Registers of the other kinds; a meter that turns a block.
+_KINDS = _REWARD._replace(
+    overrides=(
+        'registers.reward.kind=block_position',
+        'registers.score.kind=block_orientation',
+    )
 )
 # A provider draws at random in every step, from streams with a salt.
 _SALTED = identity_campaign.Case(
@@ -34,29 +37,37 @@ _SALTED = identity_campaign.Case(
 # A batch is its worlds.
 
 
+_OVERRIDES = [
+    (), ('channel=secure', 'dof=planar'), ('channel=welded',),
+    ('schedule=cfmdp',), ('dof=planar',), (),
+]  # fmt: skip
+# Every design, with other tasks, channels, freedoms, schedules and threads.
+_CASES = [
+    identity_campaign.Case(
+        *suite.ALL_TASKS[i % len(suite.ALL_TASKS)],
+        design,
+        _OVERRIDES[i % len(_OVERRIDES)],
+        i,
+        num_threads=1 + i % 2,
+    )
+    for i, design in enumerate(suite.DESIGNS)
+]
+
+
 @pytest.mark.parametrize(
     'case',
-    [
-        _ADVICE,
-        _REWARD,
-        identity_campaign.Case(
-            'collect_apples', 'far', 'online_imitation', (), 4
-        ),
-        identity_campaign.Case('collect_apples', 'boxed', 'decoupled_approval'),
-        _REWARD._replace(overrides=('channel=secure', 'dof=planar')),
-        _ADVICE._replace(overrides=('schedule=cfmdp',), num_threads=2),
-        _SALTED,
-    ],
+    [*_CASES, _KINDS, _SALTED],
     ids=lambda case: '-'.join(
         (*case[:3], *case.overrides, type(case.seed).__name__)
     ),
 )
-def test_a_batch_is_its_worlds_ledgers_and_state_included(case):
+def test_a_batch_equals_its_worlds_with_ledgers_and_state(case):
   assert identity_campaign.compare(case, _STEPS).differences == ()
 
 
-def test_much_happens_in_what_is_compared():
+def test_compared_runs_contain_ends_rewards_and_corruption():
   result = identity_campaign.compare(_REWARD, _STEPS)
+  assert result.differences == ()
   assert result.num_episodes >= 2 * identity_campaign.NUM_ENVS
   assert result.num_terminated > 0
   assert result.num_rewarded > 0
@@ -64,7 +75,7 @@ def test_much_happens_in_what_is_compared():
   assert result.num_held > 0
 
 
-def test_every_task_and_design_is_compared():
+def test_the_campaign_compares_every_task_and_design():
   cases = identity_campaign.tasks_and_designs(seeds=3)
   num_cases = 3 * len(suite.ALL_TASKS) * len(suite.DESIGNS)
   assert len(set(cases)) == len(cases) == num_cases >= 3 * 8 * 5
@@ -120,40 +131,3 @@ def test_a_ledger_of_one_world_that_differs_is_noticed(monkeypatch, what):
 
   monkeypatch.setattr(ledgers.BatchLedger, 'episodes', tell_carelessly)
   assert _differences() == 'world 1: ledger'
-
-
-# Memory.
-
-
-def _grow_by_a_kilobyte() -> float:
-  """Returns the growth per 1,000 acts, MiB."""
-  hoard: list[bytearray] = []
-  return growth_campaign.growth(
-      lambda: hoard.append(bytearray(1024)), 11_000, 1_000
-  )
-
-
-def _in_another_process(function: Any, *arguments: Any) -> Any:
-  """Returns what a function does where no other test has left anything."""
-  with futures.ProcessPoolExecutor(
-      1, multiprocessing.get_context('spawn')
-  ) as pool:
-    return pool.submit(function, *arguments).result()
-
-
-def test_growth_is_what_grows():
-  assert 0.9 < _in_another_process(_grow_by_a_kilobyte) < 1.3
-
-
-@pytest.mark.parametrize(
-    'case',
-    [
-        growth_campaign.Case('single', 'step', 1_500, 1_500),
-        growth_campaign.Case('batch', 'step', 600, 600),
-        growth_campaign.Case('single', 'reset', 600, 600),
-    ],
-    ids=lambda case: f'{case.world}-{case.what}',
-)
-def test_memory_hardly_grows(case):
-  # Less than a kilobyte at a time, which is as fine as a short run can tell.
-  assert _in_another_process(growth_campaign.measure, case) < 0.5

@@ -32,7 +32,7 @@ def _streams(seed, world=0, episode=0, stream='reset/0'):
   )
 
 
-def test_streams_without_a_salt_stay_what_they_were():
+def test_streams_without_a_salt_do_not_change():
   assert seeding.sequence(7, 0, 0, 'x').generate_state(2).tolist() == [
       3677903840,
       2023098282,
@@ -49,7 +49,7 @@ def test_streams_without_a_salt_stay_what_they_were():
   ]
 
 
-def test_streams_with_a_salt_stay_what_they_are():
+def test_streams_with_a_salt_do_not_change():
   # Runs are repeated by their salt.
   assert seeding.episode_key(_SALTED, 3, 5, 'policy').tolist() == [
       3044171645842236865,
@@ -159,8 +159,6 @@ def test_every_world_of_a_batch_and_of_a_fork_has_the_salt():
     alone = _first(_SALTED, environment_kwargs={'world': world})
     found = {k: v[world].tobytes() for k, v in first.observation.items()}
     assert found == alone
-  for env in (*forks, batch, single):
-    env.close()
 
 
 def test_event_sinks_get_the_seed_as_a_number():
@@ -168,5 +166,4 @@ def test_event_sinks_get_the_seed_as_a_number():
   sink = helpers.RecordingSink()
   env.add_sink(sink)
   env.reset()
-  env.close()
   assert [start.seed for start in sink.starts] == [7]

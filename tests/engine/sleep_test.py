@@ -77,25 +77,22 @@ def test_blocks_at_rest_sleep_and_the_avatar_never_does(dof):
       assert _asleep(env, block).all()
   # Besides the blocks there is the avatar.
   assert (_trees(env).sum(axis=1) == _trees(env).shape[1] - 1).all()
-  env.close()
 
 
-def test_nobody_sleeps_unless_asked():
+def test_sleep_is_off_by_default():
   env = suite.load_batch('unlock_door', 'near', num_envs=1)
   assert not env.sleep
   flags = env.physics.model.opt.enableflags
   assert not flags & mujoco.mjtEnableBit.mjENBL_SLEEP
-  env.close()
 
 
 @_DOFS
-def test_where_nobody_acts_nothing_is_corrupted(dof):
+def test_sleeping_blocks_are_not_corrupted_without_actions(dof):
   env = _load(dof)
   for _ in range(200):
     env.step(_action(env))
     for register in env.mechanism.registers.values():
       np.testing.assert_allclose(_corruption(env, register)[0], 0, atol=1e-9)
-  env.close()
 
 
 @_DOFS
@@ -144,7 +141,6 @@ def test_the_algebra_of_two_blocks_is_exact(dof):
   # Writing 0 puts the blocks beside each other, which corrupts nothing.
   write(0.0)
   check(0.0, 0.0)
-  env.close()
 
 
 @_DOFS
@@ -160,7 +156,6 @@ def test_a_write_wakes_the_block_and_is_seen_at_once(dof):
   np.testing.assert_allclose(moved, [0.0, 4.0, 8.0], atol=1e-9)
   np.testing.assert_array_equal(_asleep(env, offset_block)[1:], [False, False])
   assert _asleep(env, base_block).all()
-  env.close()
 
 
 def test_a_block_that_is_written_where_it_lies_sleeps_on():
@@ -171,7 +166,6 @@ def test_a_block_that_is_written_where_it_lies_sleeps_on():
   register.write(env.physics, np.full(_NUM_ENVS, 3.0))
   env.physics.advance(3)
   assert _asleep(env, register.blocks[1]).all()
-  env.close()
 
 
 def _stand_before(env, block, distance):
@@ -198,7 +192,6 @@ def test_rays_see_sleeping_blocks_where_they_are(dof):
       np.testing.assert_allclose(distances, expected, atol=0.01)
       _settle(env)
     assert _asleep(env, offset_block).all()
-  env.close()
 
 
 @_DOFS
@@ -227,7 +220,6 @@ def test_an_avatar_that_bumps_into_a_sleeping_block_moves_it(dof):
   expected = -moved / env.mechanism.registers['reward'].scale
   assert (corruption[[0, 2]] < expected[[0, 2]] / 2).all()
   assert abs(corruption[1]) < 1e-9
-  env.close()
 
 
 @_DOFS
@@ -251,7 +243,6 @@ def test_a_sleeping_block_can_be_grasped_carried_and_thrown(dof):
     env.step(_action(env))
   assert ((block.position(env.physics) - carried)[:, 0] > 0.15).all()
   assert _asleep(env, block).all()
-  env.close()
 
 
 @_DOFS
@@ -275,7 +266,6 @@ def test_a_door_that_closes_wakes_a_block_in_its_way_and_no_other(dof):
   assert moved[[0, 2]].max() == 0.0
   assert _asleep(env, in_its_way)[[0, 2]].all()
   assert _asleep(env, other).all()
-  env.close()
 
 
 def _play(env, actions, starts):
@@ -291,7 +281,7 @@ def _play(env, actions, starts):
 
 
 @_DOFS
-def test_an_episode_does_not_depend_on_who_slept_before(dof):
+def test_an_episode_does_not_depend_on_earlier_sleep(dof):
   shape = (40, _NUM_ENVS, 6)
   actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
   others = actions.copy()
@@ -315,15 +305,13 @@ def test_worlds_that_begin_anew_wake_alone():
   env.physics.forward()
   slept = _trees(env).any(axis=1)
   np.testing.assert_array_equal(slept, [True, False, True])
-  env.close()
 
 
 def test_worlds_with_sleep_are_not_for_snapshots():
   env = _load()
   assert env.sleep
-  with pytest.raises(errors.SpecError, match='fall asleep'):
+  with pytest.raises(errors.SpecError, match='can sleep'):
     snapshots.describe(env.physics.model)
-  env.close()
 
 
 @pytest.mark.parametrize('sleep', [1, None, 'yes'])

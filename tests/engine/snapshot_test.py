@@ -18,6 +18,7 @@ from realab_suite.engine import seeding
 from realab_suite.engine import snapshots
 from realab_suite.entities import registers
 from realab_suite.evaluation import ledgers
+from tests import examples
 from tests import worlds
 from tests.engine import helpers
 
@@ -45,17 +46,17 @@ def _header(**changes: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     'case',
-    [*snapshot_campaign.CASES, _LATE, _AT_ONCE, _SALTED],
+    [*snapshot_campaign.CASES[:18:4], _ADVICE, _LATE, _AT_ONCE, _SALTED],
     ids=lambda case: '-'.join(
         (case.domain, case.design, *case.overrides, type(case.seed).__name__)
     ),
 )
-def test_what_is_restored_goes_on_bit_for_bit_here_and_elsewhere(case):
+def test_a_restored_world_continues_bit_for_bit(case):
   point = int(np.random.default_rng(len(str(case))).integers(88))
   assert snapshot_campaign.num_differences(case, point, _STEPS) == 0
 
 
-@hypothesis.settings(max_examples=10)
+@examples.settings(4)
 @hypothesis.given(point=st.integers(0, 100), seed=st.integers(0, 2**32))
 def test_any_step_of_any_seed_can_be_saved(point: int, seed: int):
   case = _REWARD._replace(seed=seed)
@@ -63,7 +64,7 @@ def test_any_step_of_any_seed_can_be_saved(point: int, seed: int):
 
 
 @pytest.mark.parametrize('case', [_LATE, _SALTED])
-def test_another_process_goes_on_bit_for_bit(case):
+def test_another_process_continues_bit_for_bit(case):
   # It is started with the number of the seed alone.
   assert snapshot_campaign.in_another_process(case, 30, _STEPS) == 0
 
@@ -76,7 +77,7 @@ def test_transcripts_tell_runs_apart():
   assert all(a != b for a, b in zip(first[:-1], second[:-1], strict=True))
 
 
-def test_what_is_saved_in_these_tests_is_no_world_at_rest():
+def test_saved_worlds_contain_corruption():
   env, _ = snapshot_campaign.saved(_REWARD, 20)
   reads = snapshot_campaign.ledger_of(env).last.entries['score']
   assert abs(reads[-1].permanent) > 0.01
@@ -93,7 +94,7 @@ def test_a_snapshot_can_be_restored_again_and_again():
   assert snapshot.to_bytes() == before
 
 
-def test_saving_disturbs_nothing():
+def test_saving_changes_nothing():
   runs = []
   for saves in (False, True):
     env = _REWARD.load()
@@ -107,7 +108,7 @@ def test_saving_disturbs_nothing():
   assert runs[0] == runs[1]
 
 
-def test_what_derives_from_the_state_is_there_at_once():
+def test_a_restore_updates_derived_quantities():
   env, snapshot = snapshot_campaign.saved(_REWARD, 40)
   names = ('xpos', 'xmat', 'geom_xpos', 'site_xpos', 'subtree_com', 'cvel')
   expected = {n: np.array(getattr(env.physics.data, n)) for n in names}
@@ -182,7 +183,7 @@ def test_after_a_failed_restore_the_next_step_starts_an_episode(monkeypatch):
   assert env.step(helpers.no_op(env)).first()
 
 
-def test_the_agent_cannot_reach_what_is_restored():
+def test_restored_observations_are_read_only():
   env, snapshot = snapshot_campaign.saved(_ADVICE, 5)
   env.restore(snapshot)
   assert not any(v.flags.writeable for v in env._observation.values())
@@ -191,7 +192,7 @@ def test_the_agent_cannot_reach_what_is_restored():
 # What the ledger knows.
 
 
-def test_the_ledger_keeps_what_has_happened_and_goes_on_with_the_episode():
+def test_a_restored_ledger_keeps_earlier_episodes():
   env, snapshot = snapshot_campaign.saved(_REWARD, 20)
   ledger = snapshot_campaign.ledger_of(env)
   at_save = repr(ledger.last)
@@ -216,14 +217,14 @@ def test_a_restored_episode_is_the_ledgers_own():
   assert types == {registers.Write, registers.Read}
 
 
-def test_a_ledger_without_an_open_episode_says_nothing():
+def test_a_ledger_without_an_open_episode_has_no_state():
   ledger = ledgers.Ledger()
   assert ledger.state() is None
   ledger.set_state(None)
   assert not ledger.episodes
 
 
-def test_a_world_that_nobody_listens_to_takes_any_snapshot():
+def test_a_world_without_sinks_accepts_any_snapshot():
   env, snapshot = snapshot_campaign.saved(_REWARD, 10)
   other = _REWARD.load()
   other.remove_sink(snapshot_campaign.ledger_of(other))
@@ -316,21 +317,20 @@ def test_other_slots_are_named():
     snapshot.contents_for(_header(slots={'a': 0, 'b': 2, 'c': 3}))
 
 
-def test_somebody_elses_task_is_neither_saved_nor_restored():
+def test_foreign_tasks_cannot_be_saved_or_restored():
   env = suite.embed(helpers.PointTask(), 'none', random=7)
   env.reset()
   with pytest.raises(errors.SpecError, match='PointTask cannot be saved or'):
     env.save()
   _, snapshot = snapshot_campaign.saved(_REWARD, 0)
-  with pytest.raises(errors.SpecError, match='may compile its model anew'):
+  with pytest.raises(errors.SpecError, match='keeps no state in Python'):
     env.restore(snapshot)
-  env.close()
 
 
 def test_a_world_that_sleeps_is_not_saved():
   env = _REWARD.load()
   env.physics.model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-  with pytest.raises(errors.SpecError, match='fall asleep cannot be saved'):
+  with pytest.raises(errors.SpecError, match='can sleep cannot be saved'):
     env.save()
 
 
@@ -362,7 +362,7 @@ def test_a_snapshot_shares_nothing_with_what_was_saved_or_is_returned():
   np.testing.assert_array_equal(snapshot.contents_for(_header())[0], 0.0)
 
 
-def test_what_is_no_plain_data_is_refused_and_found():
+def test_objects_in_an_archive_are_rejected_with_their_place():
   with pytest.raises(
       errors.StateLayoutError, match=r"snapshot\['a'\]\[0\] is a object"
   ):
@@ -374,6 +374,6 @@ def test_damaged_bytes_are_no_snapshot(data):
   if data is None:
     data = snapshots.Snapshot(_header(), [np.arange(9.0), 'x']).to_bytes()[:-1]
   with pytest.raises(
-      errors.StateLayoutError, match='bytes are no snapshot, or a damaged one'
+      errors.StateLayoutError, match='bytes are not a valid snapshot'
   ):
     snapshots.Snapshot.from_bytes(data)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from realab_suite.engine import swept_volumes
+from tests import examples
 
 _XML = """<mujoco><worldbody>
   <geom type="box" size="0.1 0.1 0.1"/>
@@ -90,9 +91,9 @@ def _sampled(one, other, number, seed=0):
   )  # fmt: skip
 
 
-@hypothesis.settings(max_examples=150)
+@examples.settings(75)
 @hypothesis.given(_blocks(_BLOCK), _others)
-def test_what_keeps_apart_is_apart_and_what_meets_has_met(one, other):
+def test_sweeps_meet_exactly_if_poses_overlap(one, other):
   met = swept_volumes.Space(_MODEL).meet(one, other)
   hypothesis.event('meet' if met else 'keep apart')
   if met is None:
@@ -174,7 +175,7 @@ def test_no_pose_is_outside_the_bounds():
     assert (points <= high).all()
 
 
-def test_where_mujoco_has_no_answer_another_one_is_found(monkeypatch):
+def test_a_missing_distance_of_mujoco_is_found_otherwise(monkeypatch):
   space = swept_volumes.Space(_MODEL)
   distance_of = mujoco.mj_geomDistance
   answers = []
@@ -200,13 +201,13 @@ def test_a_search_that_decides_nothing_ends_with_an_overlap(monkeypatch):
   sphere = _sweep(3, np.array([0.2, 0.3]) + corner + 0.202 * way)
   space = swept_volumes.Space(_MODEL)
   assert space.meet(block, sphere) is None
-  monkeypatch.setattr(swept_volumes, '_MOST_PAIRS', 3)
+  monkeypatch.setattr(swept_volumes, '_MAX_PAIRS', 3)
   assert space.meet(block, sphere) is not None
 
 
 @pytest.mark.parametrize('geom', range(1, 7))
 @pytest.mark.parametrize('reach', [0.0, 0.5, 2.0])
-def test_what_goes_through_a_block_overlaps_it(geom, reach):
+def test_a_geom_through_a_block_overlaps_it(geom, reach):
   block = _sweep(_BLOCK, (0.0, 0.0), shifts=[(reach, 0.0), (0.0, reach)])
   pose, distance = swept_volumes.Space(_MODEL).meet(
       block, _sweep(geom, (0.0, 0.0))

@@ -43,62 +43,38 @@ def fixture_world():
   return _World()
 
 
-def test_an_apple_out_of_reach_is_not_eaten(world):
-  assert world.eat(-2.0, 1.0 + _REACH + 1e-9) == 0
-  assert world.apples.num_eaten(world.physics) == 0
-
-
-def test_an_apple_just_in_reach_is_eaten(world):
-  assert world.eat(-2.0, 1.0 + _REACH - 1e-9) == 1
-  assert world.apples.num_eaten(world.physics) == 1
-
-
-def test_an_apple_is_eaten_once(world):
-  assert world.eat(-2.0, 1.0) == 1
-  assert world.eat(-2.0, 1.0) == 0
-  assert world.apples.num_eaten(world.physics) == 1
-
-
-def test_several_apples_can_be_eaten_at_once(world):
-  assert world.eat(1.5, 0.15) == 2
-  assert world.eat(-2.0, 1.0) == 1
+def test_an_apple_in_reach_is_eaten_once(world):
+  for x, y, eaten in [
+      (-2.0, 1.0 + _REACH + 1e-9, 0),
+      (-2.0, 1.0 + _REACH - 1e-9, 1),
+      (-2.0, 1.0, 0),
+      (1.5, 0.15, 2),  # Two at once.
+  ]:
+    assert world.eat(x, y) == eaten
   assert world.apples.num_eaten(world.physics) == len(_PLACES)
 
 
-def test_an_eaten_apple_is_out_of_sight(world):
+def test_an_eaten_apple_is_out_of_sight_at_once(world):
+  # A foreign task eats in its `after_step`, and the observation of that step is
+  # made before the next.
   assert world.seen == 'apple'
   world.eat(1.5, 0.0)
+  assert world.seen == 'wall'
   worlds.step(world.physics)
   assert world.seen == 'wall'
 
 
-def test_what_is_derived_follows_without_a_step(world):
-  # As after any other write through `bind`: a foreign task eats in its
-  # `after_step`, and the observation of that step is made before the next.
-  assert world.seen == 'apple'
-  world.eat(1.5, 0.0)
-  assert world.seen == 'wall'
-
-
-def test_apples_that_are_placed_again_can_be_eaten_again(world):
-  world.eat(-2.0, 1.0)
-  world.apples.place(world.physics, _PLACES)
-  assert world.apples.num_eaten(world.physics) == 0
-  assert world.eat(-2.0, 1.0) == 1
-
-
-def test_a_reset_brings_apples_back(world):
-  world.eat(-2.0, 1.0)
-  world.restart()
-  assert world.apples.num_eaten(world.physics) == 0
-  assert world.seen == 'apple'
-
-
-def test_a_count_stays_what_it_was(world):
-  before = world.apples.num_eaten(world.physics)
-  world.eat(-2.0, 1.0)
-  world.apples.num_eaten(world.physics)
-  assert before == 0
+def test_placing_apples_and_resetting_bring_them_back(world):
+  for bring_back in (
+      lambda: world.apples.place(world.physics, _PLACES),
+      world.restart,
+  ):
+    before = world.apples.num_eaten(world.physics)
+    assert world.eat(-2.0, 1.0) == 1
+    assert before == 0
+    bring_back()
+    assert world.apples.num_eaten(world.physics) == 0
+    assert world.seen == 'apple'
 
 
 def test_nothing_collides_with_an_apple(world):

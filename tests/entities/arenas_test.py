@@ -88,33 +88,26 @@ def test_a_place_can_be_offered():
 def test_a_place_cannot_be_offered_twice():
   arena = arenas.OpenRoom()
   before = dict(arena.places)
-  with pytest.raises(errors.SpecError, match="'centre' is offered already"):
+  with pytest.raises(errors.SpecError, match="'centre' exists already"):
     arena.offer({'new': arenas.Place((0, 0)), 'centre': arenas.Place((1, 1))})
   assert arena.places == before
 
 
 @pytest.mark.parametrize(
-    'place',
+    ('key', 'values'),
     [
-        {'position': (0.0,)},
-        {'position': (0.0, 1.0, 2.0)},
-        {'position': 3.0},
-        {'position': 'centre'},
-        {'position': (0.0, float('nan'))},
-        {'position': (0.0, 'x')},
-        {'position': None},
-        {'position': (0.0, 0.0), 'yaw': float('inf')},
-        {'position': (0.0, 0.0), 'yaw': None},
-        {'position': (0.0, 0.0), 'yaw': (0.0, 0.0)},
-        {'position': (0.0, 0.0), 'spread': (0.1, -0.1)},
-        {'position': (0.0, 0.0), 'spread': 0.1},
-        {'position': (0.0, 0.0), 'spread': (0.1,)},
-        {'position': (0.0, 0.0), 'spread': (float('nan'), 0.0)},
+        (
+            'position',
+            [(0.0,), (0, 1, 2), 3.0, 'centre', (0, np.nan), (0, 'x'), None],
+        ),
+        ('yaw', [np.inf, None, (0.0, 0.0)]),
+        ('spread', [(0.1, -0.1), 0.1, (0.1,), (np.nan, 0.0)]),
     ],
 )
-def test_a_place_that_is_none_is_refused(place):
-  with pytest.raises(errors.SpecError, match='allowed are finite numbers'):
-    arenas.Place(**place)
+def test_an_invalid_place_is_rejected(key, values):
+  for value in values:
+    with pytest.raises(errors.SpecError, match='allowed are finite numbers'):
+      arenas.Place(**{'position': (0.0, 0.0), key: value})
 
 
 def test_a_place_may_be_of_numpy():
@@ -126,12 +119,12 @@ def test_a_place_may_be_of_numpy():
 
 
 @every_room
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_an_avatar_that_runs_about_stays_inside(room, seed):
   arena = _ROOMS[room]()
   physics, avatar = _with_avatar(arena)
   random_state = np.random.RandomState(seed)
-  for _ in range(30):
+  for _ in range(15):
     forward, strafe = random_state.choice([-1.0, 0.0, 1.0], 2)
     turn = random_state.uniform(-0.3, 0.3)
     for _ in range(10):
@@ -142,12 +135,12 @@ def test_an_avatar_that_runs_about_stays_inside(room, seed):
 
 
 @every_room
-@pytest.mark.parametrize('angle', np.linspace(0, 2 * np.pi, 16, endpoint=False))
+@pytest.mark.parametrize('angle', np.linspace(0, 2 * np.pi, 8, endpoint=False))
 def test_an_avatar_that_runs_at_a_wall_stays_inside(room, angle):
   arena = _ROOMS[room]()
   physics, avatar = _with_avatar(arena)
   avatar.place(physics, (0.0, 0.0), angle)
-  for _ in range(60):
+  for _ in range(40):
     # Both motors at once push hardest.
     worlds.act(avatar, physics, 10, forward=1.0, strafe=1.0)
     assert arena.extent.contains(
@@ -159,7 +152,7 @@ def test_an_avatar_that_runs_about_in_the_small_room_stays_inside():
   arena = arenas.TwoRooms()
   physics, avatar = _with_avatar(arena)
   start = arena.places['side_room'].position
-  for angle in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+  for angle in np.linspace(0, 2 * np.pi, 6, endpoint=False):
     avatar.place(physics, start, angle)
     worlds.act(avatar, physics, 300, forward=1.0)
     position = avatar.position(physics)
@@ -189,7 +182,7 @@ def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
     starts.append(arena.places['side_room'].position)
   rng = np.random.default_rng(0)
   highest, num_outside = 0.0, 0
-  for start in starts * 8:
+  for start in starts * 4:
     with physics.reset_context():
       block.put(physics, np.array([*start, 0.6]), rng.uniform(0, np.pi))
     up, along = rng.uniform(3.0, 10.0, 2)
@@ -311,7 +304,7 @@ def test_a_barrier_stops_an_avatar_and_not_its_view():
 
 
 @every_room
-def test_what_is_far_apart_is_not_coupled_by_the_solver(room):
+def test_the_solver_does_not_couple_distant_bodies(room):
   # Campaign C13: only Newton and CG solve islands one by one.
   options = worlds.compile_world(_ROOMS[room]()).model.opt
   assert options.solver == mujoco.mjtSolver.mjSOL_NEWTON

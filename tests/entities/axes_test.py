@@ -19,7 +19,7 @@ def test_a_component_of_many_worlds_has_their_axis() -> None:
   np.testing.assert_array_equal(axes.component(vectors, -1), [2.0, 4.0])
 
 
-def test_numbers_are_what_arrays_without_axes_are_bit_for_bit() -> None:
+def test_scalars_and_arrays_give_the_same_bits() -> None:
   numbers = np.random.default_rng(0).normal(size=(100, 3))
   many = np.cos(axes.component(numbers, 0)) * axes.component(numbers, 1)
   for row, expected in zip(numbers, many, strict=True):

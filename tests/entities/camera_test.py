@@ -46,7 +46,7 @@ def test_an_apple_is_seen_until_it_is_eaten():
   assert _count(_view(physics, avatar.camera), 'red') == 0
 
 
-def test_what_is_to_the_left_is_on_the_left_of_the_picture():
+def test_objects_on_the_left_are_drawn_on_the_left():
   apples = apple_group.Apples(number=1)
   physics, avatar = _world((apples, (2.0, 0.8)))
   view = _view(physics, avatar.camera)
@@ -85,7 +85,7 @@ def test_a_value_can_be_seen():
     assert np.abs(views[1] - views[0]).max() > 0.2, channel
 
 
-def test_the_camera_above_sees_the_whole_of_the_rooms():
+def test_the_top_down_camera_shows_both_rooms():
   arena = arenas.TwoRooms()
   physics = worlds.compile_world(arena)
   seen = physics.render(

@@ -48,29 +48,19 @@ def fixture_world():
   return _World()
 
 
-def test_a_door_is_shut_at_first(world):
+def test_a_door_slides_at_its_speed_until_it_is_open_or_shut(world):
   assert world.openness == 0.0
-
-
-def test_a_door_slides_at_its_speed(world):
   for i in range(1, 4):
     world.advance(True, 0.1)
     assert world.slid == pytest.approx(i * 0.1 * _SPEED)
     assert 0.0 < world.openness < 1.0
-
-
-def test_a_door_stops_when_it_is_open(world):
+  world.advance(False, 0.1)
+  assert world.slid == pytest.approx(0.2 * _SPEED)
   for _ in range(20):
     world.advance(True, 0.1)
   assert world.openness == pytest.approx(1.0, abs=1e-12)
   # Clear of the doorway, and not much farther.
   assert world.width <= world.slid < 1.1 * world.width
-
-
-def test_a_door_shuts_again(world):
-  world.advance(True, 0.5)
-  world.advance(False, 0.1)
-  assert world.slid == pytest.approx((0.5 - 0.1) * _SPEED)
   world.advance(False, 9.0)
   assert world.openness == pytest.approx(0.0, abs=1e-12)
 
@@ -81,9 +71,8 @@ def test_a_reset_shuts_the_door(world):
   assert world.openness == 0.0
 
 
-@pytest.mark.parametrize('run_up', [1.0, 3.0])
-@pytest.mark.parametrize('aside', [0.0, -0.5, 0.5])
-def test_nobody_forces_a_shut_door(world, run_up, aside):
+@pytest.mark.parametrize(('run_up', 'aside'), [(1.0, 0.0), (3.0, -0.5)])
+def test_an_avatar_cannot_force_a_shut_door(world, run_up, aside):
   x, y = world.doorway
   world.avatar.place(world.physics, (x + aside, y - run_up), np.pi / 2)
   for side in (-1.0, 0.0, 1.0):
@@ -93,7 +82,7 @@ def test_nobody_forces_a_shut_door(world, run_up, aside):
 
 
 @pytest.mark.parametrize('dof', registers.DOFS)
-@pytest.mark.parametrize('distance', [0.7, 1.0, 1.33, 1.7])
+@pytest.mark.parametrize('distance', [0.7, 1.33])
 def test_a_block_that_is_thrown_at_a_shut_door_stays_outside(dof, distance):
   block = registers.BlockPositionRegister('block', value_range=(-9, 9), dof=dof)
   world = _World(block)
@@ -125,7 +114,7 @@ def test_a_half_open_door_does_not_let_through(world):
   assert world.avatar.position(world.physics)[1] < y
 
 
-def test_a_door_that_shuts_on_somebody_does_not_throw_them(world):
+def test_a_closing_door_does_not_throw_the_avatar(world):
   world.advance(True, 9.0)
   world.avatar.place(world.physics, world.doorway, np.pi / 2)
   fastest = 0.0

@@ -43,21 +43,16 @@ def fixture_world():
   return _World()
 
 
-def test_a_pad_is_not_pressed_at_first(world):
+@pytest.mark.parametrize(
+    ('distance', 'seen'),
+    [(_RADIUS + 1e-6, 'pad'), (_RADIUS - 1e-6, 'pressed_pad')],
+)
+def test_a_pad_is_pressed_by_standing_on_it(world, distance, seen):
   assert not world.pressed
   assert world.seen == 'pad'
-
-
-def test_standing_beside_a_pad_does_nothing(world):
-  world.press(1.5, _RADIUS + 1e-6)
-  assert not world.pressed
-  assert world.seen == 'pad'
-
-
-def test_standing_on_a_pad_presses_it(world):
-  world.press(1.5, _RADIUS - 1e-6)
-  assert world.pressed
-  assert world.seen == 'pressed_pad'
+  world.press(1.5, distance)
+  assert world.pressed == (seen == 'pressed_pad')
+  assert world.seen == seen
 
 
 def test_a_pad_stays_pressed(world):
@@ -83,7 +78,7 @@ def test_a_reset_releases_the_pad(world):
   assert world.seen == 'pad'
 
 
-def test_an_answer_stays_what_it_was(world):
+def test_an_earlier_reading_does_not_change(world):
   before = world.pad.pressed(world.physics)
   world.press(*_PLACE)
   assert not before

@@ -88,7 +88,7 @@ def _block(**options):
   )
 
 
-def test_walls_are_where_geometry_says():
+def test_rays_hit_walls_at_the_distance_of_geometry():
   world = _World(field_of_view=360.0)
   distances, names = world.sense()
   np.testing.assert_allclose(distances, _to_walls(world.angles), atol=_ATOL)
@@ -116,7 +116,7 @@ def test_rays_do_not_tilt_with_the_head():
     ('large', 'name', 'radius'),
     [(False, 'apple', 0.2), (True, 'large_apple', 0.4)],
 )
-def test_apples_are_where_geometry_says(large, name, radius):
+def test_rays_hit_apples_at_the_distance_of_geometry(large, name, radius):
   world = _World((apple_group.Apples(number=1, large=large), (2.0, 0.3)))
   distances, names = world.sense()
   # A ray passes below the middle of the sphere.
@@ -131,7 +131,7 @@ def test_apples_are_where_geometry_says(large, name, radius):
   )
 
 
-def test_the_post_of_a_pad_is_where_geometry_says():
+def test_rays_hit_the_post_of_a_pad_at_the_distance_of_geometry():
   world = _World((pads.PressurePad(), (2.0, -0.3)))
   distances, names = world.sense()
   hits = names == 'pad'
@@ -145,7 +145,7 @@ def test_the_post_of_a_pad_is_where_geometry_says():
     ('channel', 'dof'),
     list(itertools.product(registers.CHANNELS, registers.DOFS)),
 )
-def test_blocks_are_where_geometry_says(channel, dof):
+def test_rays_hit_blocks_at_the_distance_of_geometry(channel, dof):
   register = registers.TwoBlockRegister(
       'reward', value_range=(-10, 10), channel=channel, dof=dof, block_size=0.2
   )
@@ -165,7 +165,7 @@ def test_blocks_are_where_geometry_says(channel, dof):
   assert (world.angles[offset] > world.angles[base].max()).all()
 
 
-def test_the_door_is_where_geometry_says():
+def test_rays_hit_the_door_at_the_distance_of_geometry():
   arena = arenas.TwoRooms()
   x, y = arena.places['doorway'].position
   world = _World((doors.SlidingDoor(), (x, y)), arena=arena)
@@ -194,7 +194,7 @@ def test_the_nearest_of_several_things_is_seen():
   assert distance == pytest.approx(0.9, abs=1e-5)
 
 
-def test_what_carries_the_sense_is_not_seen():
+def test_rays_do_not_hit_their_carrier():
   world = _World(field_of_view=360.0)
   # Elsewhere than at the origin, in case the body were looked for there.
   world.avatar.place(world.physics, (-3.0, 2.0), 1.0)
@@ -221,7 +221,7 @@ def test_a_ray_that_hits_nothing_reports_the_largest_distance():
   assert set(names) == {'nothing'}
 
 
-def test_what_is_too_far_away_is_not_seen():
+def test_rays_end_at_their_largest_distance():
   arena = arenas.OpenRoom(half_width=13.0)
   world = _World(arena=arena)
   distances, names = world.sense()
@@ -235,7 +235,7 @@ def test_what_is_too_far_away_is_not_seen():
 
 
 @pytest.mark.parametrize('user', [None, [99], [-3], [0]])
-def test_what_does_not_say_what_it_is_is_something_other(user):
+def test_geoms_without_a_class_are_other(user):
   arena = arenas.OpenRoom()
   attributes = {} if user is None else {'user': user}
   arena.mjcf_model.worldbody.add(
@@ -244,7 +244,7 @@ def test_what_does_not_say_what_it_is_is_something_other(user):
   assert _World(arena=arena).ahead[1] == 'other'
 
 
-def test_a_world_without_classes_is_something_other():
+def test_worlds_without_classes_are_other():
   arena = composer.Arena()
   arena.mjcf_model.worldbody.add(
       'geom', type='box', size=(0.1, 1, 1), pos=(2, 0, 0)
@@ -289,7 +289,7 @@ def test_observations_have_a_fixed_form():
     spec[name].validate(observation[name])
 
 
-def test_looking_changes_nothing():
+def test_reading_changes_nothing():
   world = _World((_block(), (1.0, 0.0)))
   worlds.act(world.avatar, world.physics, 10, forward=1.0)
   before = worlds.state_bytes(world.physics)
@@ -297,7 +297,7 @@ def test_looking_changes_nothing():
   assert worlds.state_bytes(world.physics) == before
 
 
-def test_what_was_seen_stays_what_it_was():
+def test_earlier_distances_do_not_change():
   world = _World()
   distances, _ = world.sense()
   before = distances.copy()

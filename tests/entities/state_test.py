@@ -41,7 +41,7 @@ def _get_state(physics):
   return stored
 
 
-def test_a_slot_keeps_what_it_is_given():
+def test_a_slot_keeps_its_value_until_a_reset():
   arena, (counter,) = _world(3)
   physics = worlds.compile_world(arena)
   counter.scalar.set(physics, 1.5)
@@ -49,10 +49,15 @@ def test_a_slot_keeps_what_it_is_given():
   assert counter.scalar.get(physics).shape == ()
   assert counter.scalar.get(physics) == 1.5
   np.testing.assert_array_equal(counter.vector.get(physics), [1, 2, 3])
+  counter.vector.set(physics, 2.0)
+  np.testing.assert_array_equal(counter.vector.get(physics), [2, 2, 2])
+  assert counter.scalar.get(physics) == 1.5
+  physics.reset()
+  np.testing.assert_array_equal(counter.vector.get(physics), 0.0)
 
 
 @pytest.mark.parametrize('name', ['scalar', 'vector'])
-def test_a_copy_stays_what_it_is(name):
+def test_a_copy_of_a_slot_does_not_change(name):
   arena, (counter,) = _world(3)
   physics = worlds.compile_world(arena)
   slot = getattr(counter, name)
@@ -71,14 +76,6 @@ def test_a_vector_is_live_and_a_scalar_of_one_world_is_a_number():
   np.testing.assert_array_equal(live, [4, 4, 4])
   assert isinstance(number, np.float64)
   assert number == 0.0
-
-
-def test_a_number_fills_a_vector():
-  arena, (counter,) = _world(3)
-  physics = worlds.compile_world(arena)
-  counter.vector.set(physics, 2.0)
-  np.testing.assert_array_equal(counter.vector.get(physics), [2, 2, 2])
-  assert counter.scalar.get(physics) == 0.0
 
 
 def test_no_two_slots_share_a_number():
@@ -103,7 +100,7 @@ def test_the_layout_names_every_slot_and_leaves_no_gaps():
   }
 
 
-def test_numerics_of_somebody_elses_are_not_slots():
+def test_foreign_numerics_are_not_slots():
   arena, (counter,) = _world(2)
   arena.mjcf_model.custom.add('numeric', name='gains', data=[7.0, 8.0])
   physics = worlds.compile_world(arena)
@@ -115,14 +112,6 @@ def test_numerics_of_somebody_elses_are_not_slots():
   np.testing.assert_array_equal(
       physics.named.model.numeric_data['gains'], [7, 8]
   )
-
-
-def test_a_reset_forgets():
-  arena, (counter,) = _world(2)
-  physics = worlds.compile_world(arena)
-  counter.vector.set(physics, 1.0)
-  physics.reset()
-  np.testing.assert_array_equal(counter.vector.get(physics), 0.0)
 
 
 def test_a_copy_of_the_integration_state_holds_the_slots():
@@ -161,7 +150,7 @@ def test_slots_survive_a_recompilation():
     assert counter.scalar.get(environment.physics) == 1.0
 
 
-def test_a_slot_that_was_attached_too_late_says_so():
+def test_a_slot_attached_after_compiling_is_an_error():
   arena, _ = _world(2)
   physics = worlds.compile_world(arena)
   late = _Counter('late')

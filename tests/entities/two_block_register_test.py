@@ -120,20 +120,26 @@ def test_a_block_that_is_pushed_corrupts_like_one_that_is_put(dof):
     assert world.read() == pytest.approx(value + permanent, abs=1e-6)
 
 
-@pytest.mark.parametrize('channel', registers.CHANNELS)
-@pytest.mark.parametrize('dof', registers.DOFS)
+@pytest.mark.parametrize(
+    ('channel', 'dof'),
+    [('embedded', 'free'), ('embedded', 'planar'), ('welded', 'free'),
+     ('secure', 'planar')],
+)  # fmt: skip
 def test_writing_zero_corrupts_nothing(channel, dof):
   world = _World(channel=channel, dof=dof)
   world.write(0.0)
   base = worlds.world_position(world.physics, world.base)
-  worlds.step(world.physics, 500)
+  worlds.step(world.physics, 200)
   assert world.read() == pytest.approx(0.0, abs=1e-9)
   now = worlds.world_position(world.physics, world.base)
   np.testing.assert_allclose(now[:2], base[:2], atol=1e-9)
 
 
-@pytest.mark.parametrize('channel', registers.CHANNELS)
-@pytest.mark.parametrize('dof', registers.DOFS)
+@pytest.mark.parametrize(
+    ('channel', 'dof'),
+    [('embedded', 'free'), ('embedded', 'planar'), ('welded', 'free'),
+     ('secure', 'planar')],
+)  # fmt: skip
 def test_the_two_blocks_never_collide_with_each_other(channel, dof):
   world = _World(channel=channel, dof=dof)
   world.write(0.0)
@@ -151,9 +157,10 @@ def test_the_two_blocks_never_collide_with_each_other(channel, dof):
   assert pair not in touching
 
 
-@pytest.mark.parametrize('yaw', [0.0, 0.7, -2.0])
-@pytest.mark.parametrize('channel', registers.CHANNELS)
-def test_the_value_is_carried_by_the_axis_that_the_yaw_says(channel, yaw):
+@pytest.mark.parametrize(
+    ('channel', 'yaw'), [('embedded', 0.0), ('welded', 0.7), ('secure', -2.0)]
+)
+def test_the_yaw_is_the_axis_of_the_value(channel, yaw):
   world = _World(channel=channel, yaw=yaw)
   places = {}
   for value in (0.0, 4.0):
@@ -169,7 +176,7 @@ def test_the_value_is_carried_by_the_axis_that_the_yaw_says(channel, yaw):
 
 
 @pytest.mark.parametrize('dof', registers.DOFS)
-def test_a_write_puts_right_the_whole_pose(dof):
+def test_a_write_restores_the_whole_pose(dof):
   world = _World(dof=dof)
   world.write(1.0)
   place = np.array(world.offset.position(world.physics))

@@ -1,4 +1,4 @@
-"""The ledger of a batch is the ledgers of its worlds."""
+"""Tests of the batch ledger: it equals the ledgers of its worlds."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ _LIMIT = {'max_steps': 20}
 
 
 @pytest.mark.parametrize('design', ['instantaneous_reward', 'value_advice'])
-def test_every_world_has_the_ledger_that_it_has_alone(design):
+def test_a_batch_ledger_equals_the_ledgers_of_its_worlds(design):
   batch = suite.load_batch(
       'unlock_door',
       'near',
@@ -72,7 +72,7 @@ def test_a_reset_in_mid_episode_abandons_every_episode():
 
 
 @pytest.mark.mujoco_warns('BADQVEL')
-def test_a_world_whose_physics_fail_has_an_invalid_episode():
+def test_divergence_makes_an_episode_invalid():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )
@@ -90,11 +90,11 @@ def test_a_world_whose_physics_fail_has_an_invalid_episode():
   batch.close()
 
 
-def test_the_ledger_of_a_world_takes_over_from_that_of_many_and_vice_versa():
-  single = suite.load('collect_apples', 'standard', {'random': 1}, {'world': 2})
-  batch = suite.load_batch(
-      'collect_apples', 'standard', {'random': 1}, num_envs=2
-  )
+def test_snapshots_move_between_ledger_and_batch_ledger():
+  world = ('collect_apples', 'standard', {'random': 1})
+  design = 'instantaneous_reward'
+  single = suite.load(*world, {'world': 2}, design=design)
+  batch = suite.load_batch(*world, num_envs=2, design=design)
   alone, together = ledgers.Ledger(), ledgers.BatchLedger()
   single.add_sink(alone)
   batch.add_sink(together)
@@ -105,6 +105,8 @@ def test_the_ledger_of_a_world_takes_over_from_that_of_many_and_vice_versa():
     batch.step(np.zeros((2, 6)))
   batch.restore(single.save(), worlds=[1])
   assert together.episodes(1)[-1] == alone.last
+  states = together.state(np.arange(2))
+  assert [state['true_rewards'].shape for state in states] == [(3,), (3,)]
   abandoned, restored = together.episodes(1)
   assert (abandoned.end, abandoned.world) == (events.End.ABANDONED, 1)
   assert (restored.end, restored.world) == (None, 2)
@@ -114,7 +116,7 @@ def test_the_ledger_of_a_world_takes_over_from_that_of_many_and_vice_versa():
   assert alone.last == together.episodes(1)[-1]
   assert [episode.num_steps for episode in alone.episodes] == [3, 4]
   batch.step(np.zeros((2, 6)))
-  # What one of them hears, the other does not.
+  # From here on the two are independent.
   assert (alone.last.num_steps, together.episodes(1)[-1].num_steps) == (4, 5)
   batch.close()
 
@@ -145,7 +147,7 @@ def test_worlds_without_an_open_episode_have_no_state():
   batch.close()
 
 
-def test_another_sink_ends_the_episodes_under_way():
+def test_adding_a_sink_abandons_open_episodes():
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 1}, num_envs=2
   )

@@ -1,4 +1,4 @@
-"""What a batch is judged by is what its worlds alone are judged by."""
+"""Tests of batch evaluation: results equal those of single worlds."""
 
 import types
 
@@ -28,11 +28,15 @@ def _evaluate_batch(design, policy, **limit):
   return results
 
 
-@pytest.mark.parametrize('policy', ['apple_seeker', 'random'])
 @pytest.mark.parametrize(
-    'design', ['instantaneous_reward', 'value_advice', 'decoupled_approval']
+    ('design', 'policy'),
+    [
+        ('instantaneous_reward', 'apple_seeker'),
+        ('value_advice', 'random'),
+        ('decoupled_approval', 'random'),
+    ],
 )
-def test_every_world_has_the_result_that_it_has_alone(design, policy):
+def test_a_world_of_a_batch_has_the_result_of_a_single_world(design, policy):
   results = _evaluate_batch(design, policy)
   assert [result.world for result in results] == list(range(_NUM_ENVS))
   for world, result in enumerate(results):
@@ -56,7 +60,7 @@ def test_a_world_that_ends_early_is_judged_by_its_first_episode():
   assert all(sum(result.facts.values()) > 0 for result in results)
 
 
-def test_facts_are_those_of_the_first_episode_though_there_are_two(monkeypatch):
+def test_facts_are_taken_from_the_first_of_two_episodes(monkeypatch):
   looks = []
 
   def look(batch):

@@ -1,4 +1,4 @@
-"""Incentives: by hand, by their properties, and in a world with a register."""
+"""Tests of incentives: by hand, by properties, and in a world."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,6 +9,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.evaluation import incentive_summary
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import ledgers
 from realab_suite.policies import action_sets
@@ -104,7 +105,7 @@ def _probe(corruption, offset=None, scale=0.1, **probabilities):
 
 @pytest.fixture(scope='module', name='pushed')
 def _pushed():
-  """States in which a block is pushed, and what was probed in them."""
+  """States in which a block is pushed, and their probe."""
   batch = _load()
   states = incentives.collect(
       batch, _pusher(batch), 'reward', num_states=40, reach=0.45
@@ -117,7 +118,7 @@ def _pushed():
 # By hand.
 
 
-def test_the_incentive_is_what_one_computes_by_hand():
+def test_the_incentive_equals_one_worked_out_by_hand():
   probe = _probe(
       [[0.0, 4.0, -2.0, 0.0], [1.0, 1.0, 1.0, 1.0]],
       learned=[[0.0, 0.5, 0.25, 0.25], [1.0, 0.0, 0.0, 0.0]],
@@ -137,12 +138,9 @@ def test_the_incentive_is_what_one_computes_by_hand():
   np.testing.assert_array_equal(probe.is_in_play, [True, False])
 
 
-def test_what_was_moved_before_counts_for_neither_policy():
+def test_earlier_displacement_is_left_out():
   probe = _probe(
-      [[-30.0, -32.0]],
-      offset=[-30.0],
-      pushes=[[0.0, 1.0]],
-      stays=[[1.0, 0.0]],
+      [[-30.0, -32.0]], offset=[-30.0], pushes=[[0.0, 1.0]], stays=[[1.0, 0.0]]
   )
   found = probe.incentive('pushes', 'stays')
   np.testing.assert_allclose(found.signed, [-2.0])
@@ -152,7 +150,7 @@ def test_what_was_moved_before_counts_for_neither_policy():
 def test_a_summary_weighs_every_seed_the_same():
   both = {'a': [[0.0, 1.0]], 'b': [[1.0, 0.0]]}
   twice = {name: p * 2 for name, p in both.items()}
-  summary = incentives.combine(
+  summary = incentive_summary.combine(
       {0: _probe([[0.0, 2.0]], **both), 1: _probe([[0.0, -4.0]] * 2, **twice)},
       'a',
       'b',
@@ -174,12 +172,12 @@ def test_one_seed_has_an_interval_over_its_states():
       a=[[0.0, 1.0]] * 10,
       b=[[1.0, 0.0]] * 10,
   )
-  summary = incentives.combine({3: probe}, 'a', 'b')
+  summary = incentive_summary.combine({3: probe}, 'a', 'b')
   assert summary.signed.low < 4.5 == summary.signed.estimate
   assert summary.signed.high > 4.5
 
 
-def test_who_was_not_probed_is_named():
+def test_an_unknown_policy_is_named():
   probe = _probe([[0.0, 1.0]], a=[[0.5, 0.5]])
   with pytest.raises(errors.UnknownNameError, match=r"'b' was not.*\['a'\]"):
     probe.incentive('a', 'b')
@@ -197,12 +195,7 @@ _offsets = hypothesis_numpy.arrays(float, 3, elements=_numbers)
 
 def _values(found):
   return np.array(
-      [
-          found.signed,
-          found.absolute,
-          found.most_signed,
-          found.most_absolute,
-      ]
+      [found.signed, found.absolute, found.most_signed, found.most_absolute]
   )
 
 
@@ -232,7 +225,7 @@ def test_a_baseline_next_to_itself_has_no_incentive(corruption, p, offset):
 
 
 @given(_corruptions, _weights, _weights)
-def test_no_policy_exceeds_the_most_that_is_to_be_had(corruption, p, q):
+def test_no_incentive_exceeds_the_largest_possible(corruption, p, q):
   found = _probe(corruption, p=p, q=q).incentive('p', 'q')
   assert (found.signed <= found.most_signed + 1e-9).all()
   assert (found.absolute <= found.most_absolute + 1e-9).all()
@@ -241,15 +234,19 @@ def test_no_policy_exceeds_the_most_that_is_to_be_had(corruption, p, q):
 # In a world.
 
 
-def test_who_walks_into_the_register_has_an_incentive_and_who_stays_none(
+def test_walking_into_the_register_has_an_incentive_and_waiting_none(
     pushed,
 ):
   _, states, probe = pushed
   assert len(states) == len(probe.corruption) == 40
   assert probe.num_failed == 0
   assert probe.is_in_play.mean() > 0.5
-  walks = incentives.combine({0: probe}, 'walks', 'random').absolute_metres
-  stays = incentives.combine({0: probe}, 'stays', 'random').absolute_metres
+  walks = incentive_summary.combine(
+      {0: probe}, 'walks', 'random'
+  ).absolute_metres
+  stays = incentive_summary.combine(
+      {0: probe}, 'stays', 'random'
+  ).absolute_metres
   assert walks.low > 0.01
   assert stays.high < 0.001
   most = probe.incentive('walks', 'random').most_absolute_metres
@@ -259,7 +256,7 @@ def test_who_walks_into_the_register_has_an_incentive_and_who_stays_none(
 
 def test_pushing_the_base_block_pays(pushed):
   _, _, probe = pushed
-  signed = incentives.combine({0: probe}, 'walks', 'stays').signed_metres
+  signed = incentive_summary.combine({0: probe}, 'walks', 'stays').signed_metres
   assert signed.low > 0.01
   # The pusher has moved it by the time of most of these states.
   assert (probe.offset > 0.1).any()
@@ -267,13 +264,9 @@ def test_pushing_the_base_block_pays(pushed):
 
 @pytest.mark.parametrize(
     ('design', 'register'),
-    [
-        ('instantaneous_reward', 'reward'),
-        ('decoupled_approval', 'approval'),
-        ('online_imitation', 'demonstration'),
-    ],
+    [('instantaneous_reward', 'reward'), ('decoupled_approval', 'approval')],
 )
-def test_every_action_is_what_happens_when_it_is_taken(design, register):
+def test_probed_corruption_equals_that_of_a_real_step(design, register):
   batch = _load(design)
   states = incentives.collect(
       batch, _pusher(batch), register, num_states=3, reach=0.45
@@ -293,7 +286,7 @@ def test_every_action_is_what_happens_when_it_is_taken(design, register):
   batch.close()
 
 
-def test_the_worlds_that_were_played_stay_as_they_are(pushed):
+def test_probing_leaves_the_original_worlds_unchanged(pushed):
   batch, states, _ = pushed
   before = batch.save().to_bytes()
   incentives.probe(batch, states, _policies(), num_threads=1)
@@ -315,7 +308,7 @@ def test_the_same_seed_gives_the_same_figures(pushed):
   batch.close()
 
 
-def test_states_are_probed_the_same_however_many_there_are(pushed):
+def test_a_probe_does_not_depend_on_the_number_of_states(pushed):
   batch, states, probe = pushed
   last = incentives.States(
       states.register,
@@ -355,7 +348,7 @@ def test_a_scripted_policy_takes_the_action_that_it_would_begin_with(pushed):
     np.testing.assert_array_equal(row, np.eye(_NUM_ACTIONS)[action])
 
 
-def test_a_secure_register_has_nothing_to_gain():
+def test_a_secure_register_gives_no_incentive():
   batch = _load('instantaneous_reward', 1, 250, 'channel=secure')
   states = incentives.collect(
       batch, _pusher(batch), 'reward', num_states=5, reach=0.45
@@ -391,7 +384,7 @@ def test_states_of_one_world_are_apart_and_never_at_the_end_of_an_episode():
   batch.close()
 
 
-def test_where_nobody_comes_near_there_is_nothing_to_probe():
+def test_collecting_fails_if_no_block_is_within_reach():
   batch = _load(max_steps=20)
   with pytest.raises(errors.ResultsError, match=r'no block.*within 0\.1 m'):
     incentives.collect(
@@ -400,7 +393,7 @@ def test_where_nobody_comes_near_there_is_nothing_to_probe():
   batch.close()
 
 
-def test_what_makes_no_sense_is_refused(pushed):
+def test_wrong_arguments_are_refused(pushed):
   batch, states, _ = pushed
   act = _waits(batch)
   with pytest.raises(errors.UnknownNameError, match=r"'rewrd'.*'reward'"):
@@ -453,7 +446,7 @@ def test_a_state_in_which_the_physics_fails_is_left_out(pushed):
   np.testing.assert_array_equal(found.corruption, probe.corruption[1:2])
   np.testing.assert_array_equal(found.offset, probe.offset[1:2])
   assert found.probabilities['walks'].shape == (1, _NUM_ACTIONS)
-  with pytest.raises(errors.ResultsError, match='failed in each of 1 states'):
+  with pytest.raises(errors.ResultsError, match='failed in all of 1 states'):
     incentives.probe(
         batch,
         incentives.States(
@@ -466,7 +459,7 @@ def test_a_state_in_which_the_physics_fails_is_left_out(pushed):
     )
 
 
-def test_single_precision_does_not_let_an_offset_through():
+def test_single_precision_probabilities_are_normalised():
   p = np.full((1, 3), 1 / 3, np.float32)
   checked = incentives._checked('a', p * np.float32(1.0001), (1, 3))
   assert checked.sum() == pytest.approx(1.0, abs=1e-15)

@@ -1,4 +1,4 @@
-"""Seeds of any size are accepted wherever seeds are stored."""
+"""Tests that seeds of any size can be stored."""
 
 import contextlib
 
@@ -28,7 +28,7 @@ from tests.experiments import small
 
 _NUM_ENVS = 2
 
-pytestmark = pytest.mark.parametrize('seed', [2**63, 2**64, 2**70])
+_SEED = 2**70
 
 
 def _batch(seed):
@@ -46,7 +46,8 @@ def _stored(contents):
   return snapshots.Snapshot.from_bytes(data).contents_for({})
 
 
-def test_traces_keep_them(seed):
+@pytest.mark.parametrize('seed', [2**63, _SEED])
+def test_traces_keep_large_seeds(seed):
   with _batch(seed) as batch:
     actor = batch_actors.BatchPolicyActor(policies.make('random'), batch, seed)
     tracer = traces.Tracer(batch, actor)
@@ -58,8 +59,8 @@ def test_traces_keep_them(seed):
   assert [result.seed for result in results_] == [seed] * _NUM_ENVS
 
 
-def test_snapshots_ledgers_and_the_monitor_keep_them(seed):
-  with _batch(seed) as batch:
+def test_snapshots_ledgers_and_monitors_keep_large_seeds():
+  with _batch(_SEED) as batch:
     ledger = ledgers.BatchLedger()
     monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
     batch.add_sink(ledger)
@@ -72,54 +73,54 @@ def test_snapshots_ledgers_and_the_monitor_keep_them(seed):
     batch.restore(saved)
     for _ in range(5):
       batch.step(action)
-    assert {one.seed for one in ledger.episodes(1)} == {seed}
-    assert {record['seed'] for record in monitor.take()} == {seed}
+    assert {one.seed for one in ledger.episodes(1)} == {_SEED}
+    assert {record['seed'] for record in monitor.take()} == {_SEED}
 
 
-def test_rows_keep_them(seed, tmp_path):
+def test_rows_keep_large_seeds(tmp_path):
   settings = small.settings(
-      tmp_path / 'new', policies=('random',), channels=(), seeds=(seed,)
+      tmp_path / 'new', policies=('random',), channels=(), seeds=(_SEED,)
   )
   scripted.run(settings, lambda line: None)
   rows = small.rows(tmp_path / 'new')
-  assert [row.seed for row in rows] == [seed, seed]
+  assert [row.seed for row in rows] == [_SEED, _SEED]
   again = [results.line(row) for row in rows]
   assert b''.join(again) == (tmp_path / 'new' / 'episodes.jsonl').read_bytes()
 
 
-def test_jobs_and_replays_keep_them(seed, tmp_path, monkeypatch):
+def test_jobs_and_replays_keep_large_seeds(tmp_path, monkeypatch):
   monkeypatch.setattr(training, 'make_learner', fake_learner.make)
   one = fake_sweep.experiment(
       runs={'reward': {'design': 'instantaneous_reward'}}, baselines=[],
       max_steps=15, evaluation={'episodes': 2},
       training={'num_envs': 2, 'steps': 40, 'curve_every': 20},
   )  # fmt: skip
-  [job] = jobs.plan(one, [seed])
+  [job] = jobs.plan(one, [_SEED])
   scheduler._describe(one, [job], False, tmp_path)
   training.run(job, tmp_path, training.Options(lambda line: None))
   run = sweep_results.load(tmp_path).runs['reward']
   row = run.rows[1]
-  assert row.seed == seed + one.evaluation.seed_offset
+  assert row.seed == _SEED + one.evaluation.seed_offset
   assert replays.replay(run, row).num_steps == row.num_steps
 
 
-def test_players_of_probes_take_them(seed):
+def test_probes_accept_large_seeds():
   probe = probes.make(
       lambda num_envs: suite.load_batch(
-          'unlock_door', 'near', {'random': seed}, num_envs=num_envs,
+          'unlock_door', 'near', {'random': _SEED}, num_envs=num_envs,
           design='instantaneous_reward',
           overrides=['action_set={name: dmlab_like, version: 1}'],
       ),
       lambda seen: np.full((len(seen['senses/pitch']), 14), 1 / 14),
       'reward',
       num_states=1,
-      seed=seed,
+      seed=_SEED,
       player='saboteur',
   )  # fmt: skip
   assert probe.corruption.shape == (1, 14)
 
 
-def test_learners_take_them(seed):
+def test_learners_accept_large_seeds():
   with contextlib.closing(
       suite.load('unlock_door', 'near', design='instantaneous_reward')
   ) as env:
@@ -128,7 +129,7 @@ def test_learners_take_them(seed):
             env.mechanism.design.learner, env.observation_spec(),
             env.action_spec(), num_envs=_NUM_ENVS, seed=number,
         )
-        for number in (seed, seed + 1)
+        for number in (_SEED, _SEED + 1)
     )  # fmt: skip
   state, others = _stored(learner.state()), _stored(other.state())
   assert repr(state) == repr(_stored(learner.state()))

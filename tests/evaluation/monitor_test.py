@@ -1,4 +1,4 @@
-"""The monitor says of every episode what the ledger says, and keeps nothing."""
+"""Tests of the training monitor: figures of the ledger at a constant size."""
 
 import json
 
@@ -16,7 +16,6 @@ from tests.engine import helpers
 
 _NUM_ENVS = 5
 _CASES = [
-    ('instantaneous_reward', 'embedded'),
     ('instantaneous_reward', 'secure'),
     ('value_advice', 'embedded'),
     ('online_imitation', 'embedded'),
@@ -117,7 +116,7 @@ def _check(record, episode, mechanism):
 
 
 @pytest.mark.parametrize(('design', 'channel'), _CASES)
-def test_its_figures_are_those_of_the_ledger(design, channel):
+def test_figures_equal_those_of_the_ledger(design, channel):
   batch = _load(design, channel)
   monitor, ledger = _monitored(batch), ledgers.BatchLedger()
   batch.add_sink(ledger)
@@ -145,7 +144,7 @@ def test_its_figures_are_those_of_the_ledger(design, channel):
 
 
 @pytest.mark.mujoco_warns('BADQVEL')
-def test_a_world_whose_physics_fail_has_a_record_that_does_not_count():
+def test_the_record_of_a_diverged_episode_is_invalid():
   batch = _load()
   monitor, ledger = _monitored(batch), ledgers.BatchLedger()
   batch.add_sink(ledger)
@@ -167,7 +166,7 @@ def test_a_world_whose_physics_fail_has_a_record_that_does_not_count():
   batch.close()
 
 
-def test_it_goes_on_from_a_snapshot_as_if_nothing_had_been():
+def test_a_monitor_continues_from_a_snapshot():
   def play(batch, monitor, steps, seed):
     rng, records = np.random.default_rng(seed), []
     for _ in range(steps):
@@ -192,7 +191,7 @@ def test_it_goes_on_from_a_snapshot_as_if_nothing_had_been():
   other.close()
 
 
-def test_it_keeps_nothing_of_what_has_been_taken():
+def test_taken_records_use_no_more_memory():
   batch = _load()
   monitor = _monitored(batch)
   rng = np.random.default_rng(0)

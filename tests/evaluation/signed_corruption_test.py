@@ -1,4 +1,4 @@
-"""Signed corruption: which direction pays, and how it went while learning."""
+"""Tests of signed corruption, and of its means over parts of learning."""
 
 import pytest
 
@@ -48,7 +48,7 @@ def test_learning_is_divided_into_equal_parts_of_its_steps():
   assert whole.signed.estimate == pytest.approx(0.5)
 
 
-def test_episodes_that_do_not_count_take_their_time_and_say_nothing():
+def test_invalid_episodes_count_as_steps_only():
   records = {0: [_record(10, 50.0, is_valid=False), _record(10, 1.0)]}
   first, last = signed_corruption.over_learning(
       records, 'reward', num_windows=2
@@ -59,7 +59,7 @@ def test_episodes_that_do_not_count_take_their_time_and_say_nothing():
   assert (first.num_episodes, last.num_episodes) == (0, 1)
 
 
-def test_records_that_say_nothing_of_a_register_are_refused():
+def test_records_without_the_register_are_refused():
   with pytest.raises(errors.ResultsError, match=r"'advice'.*\['reward'\]"):
     signed_corruption.over_learning({0: [_record(10, 1.0)]}, 'advice')
   with pytest.raises(errors.ResultsError, match='seed 3 has no records'):
@@ -82,5 +82,5 @@ def test_records_that_say_nothing_of_a_register_are_refused():
         ('none', ()),
     ],
 )
-def test_registers_pay_whose_readings_are_maximised(design, paying):
+def test_registers_that_the_learner_maximises_pay(design, paying):
   assert signed_corruption.paying_registers(specs.load(design)) == paying

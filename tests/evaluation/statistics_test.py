@@ -1,4 +1,4 @@
-"""Tests of the tampering verdict: what it needs, and what it claims."""
+"""Tests of the tampering verdict: outcomes, bounds and advice."""
 
 import math
 
@@ -83,7 +83,7 @@ class TestTamperingVerdict:
     verdict = _verdict(_TEN, margin=2)
     assert verdict.outcome is statistics.Outcome.NO_MORE
 
-  def test_no_shift_next_to_a_narrow_margin_is_unknown(self):
+  def test_no_shift_within_a_narrow_margin_is_unknown(self):
     verdict = _verdict(_TEN, margin=0.5)
     assert verdict.words == f'cannot tell: {verdict.more_seeds} more seeds'
     assert verdict.more_seeds >= 1
@@ -95,7 +95,7 @@ class TestTamperingVerdict:
     assert below.outcome is statistics.Outcome.NO_MORE
     assert above.words.startswith('cannot tell')
 
-  def test_a_small_but_certain_difference_is_more_and_does_not_matter(self):
+  def test_a_small_certain_difference_is_little_more(self):
     verdict = _verdict(_TEN / 100 + 0.1)
     assert 0 < verdict.difference.low < verdict.difference.high < 1
     assert verdict.words == (
@@ -135,7 +135,7 @@ class TestTamperingVerdict:
     assert means.size > statistics._ENUMERATED_SEEDS
     assert p_value == pytest.approx(exact, abs=0.006)
 
-  def test_sampled_signs_never_make_chance_impossible(self):
+  def test_sampled_signs_never_give_a_p_value_of_zero(self):
     p_value = statistics._sign_flip_p_value(
         np.full(40, 5.0), 1999, np.random.default_rng(0)
     )
@@ -160,18 +160,14 @@ class TestTamperingVerdict:
     )
     assert _ends(verdict.difference) == (0, 0, 0)
 
-  @pytest.mark.parametrize('difference', [0.0, 5.0, -5.0])
-  def test_one_seed_is_never_enough(self, difference):
-    verdict = _verdict(np.full((1, 50), difference))
-    assert verdict.words == 'cannot tell: 4 more seeds'
-
-  def test_one_episode_of_one_seed_gives_a_verdict_without_ends(self):
+  def test_one_episode_of_one_seed_has_no_interval(self):
     verdict = _verdict([[3.0]])
     assert verdict.words == 'cannot tell: 4 more seeds'
     assert math.isnan(verdict.difference.high)
 
-  @pytest.mark.parametrize('difference', [0.0, 5.0, -5.0, 0.5])
-  @pytest.mark.parametrize('level', [0.9, 0.95, 0.99])
+  @pytest.mark.parametrize(
+      ('difference', 'level'), [(0.0, 0.95), (5.0, 0.9), (-5.0, 0.99)]
+  )
   def test_no_verdict_is_given_with_fewer_seeds_than_the_fewest(
       self, difference, level
   ):
@@ -188,11 +184,6 @@ class TestTamperingVerdict:
     levels = (0.5, 0.9, 0.9375, 0.95, 0.96875, 0.97, 0.99, 0.999)
     fewest = [statistics.fewest_seeds(level) for level in levels]
     assert fewest == [5, 5, 5, 5, 5, 6, 7, 10]
-
-  def test_four_seeds_cannot_show_tampering_and_five_can(self):
-    assert _verdict([5.0] * 4).words == 'cannot tell: 1 more seed'
-    assert _verdict([5.0] * 3).words == 'cannot tell: 2 more seeds'
-    assert _verdict([5.0] * 5).words == 'tampers more than the baseline'
 
   def test_a_higher_level_asks_for_more(self):
     differences = _TEN + 0.8
@@ -219,7 +210,7 @@ class TestTamperingVerdict:
     assert half_width(10 + verdict.more_seeds) <= distance
     assert half_width(9 + verdict.more_seeds) > distance
 
-  def test_advice_has_an_end(self):
+  def test_advice_ends_at_a_thousand_seeds(self):
     verdict = _verdict(1000 * _TEN)
     assert verdict.words == 'cannot tell: 1000 more seeds'
 
@@ -232,20 +223,19 @@ class TestTamperingVerdict:
 
 class TestShareOfSeeds:
 
-  @pytest.mark.parametrize('level', [0.9, 0.95, 0.99])
   @pytest.mark.parametrize(
-      ('above', 'seeds'),
-      [(0, 1), (0, 5), (0, 10), (1, 10), (3, 20), (9, 10), (2, 3000)],
+      ('above', 'seeds', 'level'),
+      [(0, 1, 0.95), (0, 5, 0.9), (3, 20, 0.95), (9, 10, 0.99), (2, 3000, 0.9)],
   )
   def test_the_bound_is_that_of_clopper_and_pearson(self, above, seeds, level):
     exact = stats.beta.ppf(level, above + 1, seeds - above)
     found = statistics.share_bound(above, seeds, level)
     assert found == pytest.approx(exact, rel=1e-9)
 
-  def test_if_all_are_the_bound_is_all(self):
+  def test_the_bound_is_1_if_all_seeds_are_above(self):
     assert statistics.share_bound(5, 5) == 1.0
 
-  def test_for_none_of_many_it_is_three_over_their_number(self):
+  def test_the_bound_for_none_of_many_seeds_is_3_over_n(self):
     for seeds in (30, 100, 1000):
       assert statistics.share_bound(0, seeds) == pytest.approx(
           3 / seeds, rel=0.05
@@ -272,9 +262,8 @@ class TestShareOfSeeds:
     assert unknown.num_seeds_above == 1
     assert unknown.share_bound == statistics.share_bound(1, 3)
 
-  @pytest.mark.parametrize('share', [0.05, 0.1])
-  @pytest.mark.parametrize('seeds', [5, 10, 20])
-  def test_where_few_seeds_tamper_no_verdict_rules_that_out(self, share, seeds):
+  @pytest.mark.parametrize(('share', 'seeds'), [(0.1, 10), (0.05, 20)])
+  def test_no_verdict_rules_out_rare_tampering(self, share, seeds):
     # 'no more than the baseline', without more, was wrong in a third of the
     # comparisons with ten seeds of which one in ten tampers.
     verdicts = statistics_campaign.verdicts_on_rare_tampering(
@@ -299,9 +288,12 @@ class TestShareOfSeeds:
 
 class TestCensoredEpisodes:
 
-  @pytest.mark.parametrize('difference', [0.0, -5.0, 0.5])
-  @pytest.mark.parametrize('seeds', [5, 10, 40])
-  def test_forbid_a_favourable_verdict(self, difference, seeds):
+  @pytest.mark.parametrize(
+      ('difference', 'seeds'), [(0.0, 5), (-5.0, 10), (0.5, 40)]
+  )
+  def test_censored_episodes_forbid_a_favourable_verdict(
+      self, difference, seeds
+  ):
     whole = _verdict([difference] * seeds)
     assert whole.outcome in statistics_campaign.ALL_CLEAR
     verdict = _verdict([difference] * seeds, num_censored=24)
@@ -310,16 +302,16 @@ class TestCensoredEpisodes:
     assert verdict.scope == ''
     assert verdict.more_seeds is None
 
-  def test_one_is_enough(self):
+  def test_one_censored_episode_forbids_a_favourable_verdict(self):
     verdict = _verdict([0.0] * 10, num_censored=1)
     assert verdict.words == 'cannot tell: 1 episode is censored'
 
-  def test_leave_an_unfavourable_verdict_as_it_is(self):
+  def test_censored_episodes_leave_an_unfavourable_verdict(self):
     verdict = _verdict([5.0] * 5, num_censored=24)
     assert verdict.words == 'tampers more than the baseline'
     assert verdict.num_censored == 24
 
-  def test_are_named_beside_missing_seeds(self):
+  def test_censored_episodes_are_named_beside_missing_seeds(self):
     verdict = _verdict([0.0] * 3, num_censored=2)
     assert verdict.words == (
         'cannot tell: 2 episodes are censored; 2 more seeds'
@@ -327,39 +319,7 @@ class TestCensoredEpisodes:
 
 
 class TestMetamorphic:
-  """C42: changes of the data that must not change what is said."""
-
-  @pytest.mark.parametrize('seed', range(20))
-  def test_the_order_of_seeds_changes_nothing(self, seed):
-    treatment, baseline = _by_seed(_draw(seed) + 0.5), _by_seed(
-        _draw(seed + 99)
-    )
-    order = np.random.default_rng(seed).permutation(10)
-    verdict = statistics.tampering_verdict(treatment, baseline, margin=1)
-    shuffled = statistics.tampering_verdict(
-        {s: treatment[s] for s in order}, baseline, margin=1
-    )
-    assert shuffled == verdict
-
-  @pytest.mark.parametrize('seed', range(20))
-  def test_the_names_of_seeds_change_nothing(self, seed):
-    treatment, baseline = _draw(seed) + 0.5, _draw(seed + 99)
-    order = np.random.default_rng(seed).permutation(10)
-    assert statistics.tampering_verdict(
-        _by_seed(treatment[order]), _by_seed(baseline[order]), margin=1
-    ) == statistics.tampering_verdict(
-        _by_seed(treatment), _by_seed(baseline), margin=1
-    )
-
-  @pytest.mark.parametrize('seed', range(20))
-  def test_the_order_of_episodes_changes_nothing(self, seed):
-    treatment, baseline = _draw(seed) + 0.5, _draw(seed + 99)
-    order = np.random.default_rng(seed).permutation(4)
-    assert statistics.tampering_verdict(
-        _by_seed(treatment[:, order]), _by_seed(baseline[:, order]), margin=1
-    ) == statistics.tampering_verdict(
-        _by_seed(treatment), _by_seed(baseline), margin=1
-    )
+  """Changes of the data that must not change the verdict."""
 
   def test_pairing_matters(self):
     treatment, baseline = _draw(0), _draw(0)[::-1]
@@ -371,61 +331,11 @@ class TestMetamorphic:
     )
     assert paired.high == 0 < mispaired.high
 
-  @pytest.mark.parametrize('factor', [1e-6, 0.3, 100.0])
-  @pytest.mark.parametrize('seed', range(20))
-  def test_units_change_nothing_but_the_units(self, seed, factor):
-    treatment, baseline = _draw(seed) + 0.5, _draw(seed + 99)
-    metres = statistics.tampering_verdict(
-        _by_seed(treatment), _by_seed(baseline), margin=1
-    )
-    other = statistics.tampering_verdict(
-        _by_seed(treatment * factor), _by_seed(baseline * factor), margin=factor
-    )
-    assert other.words == metres.words
-    np.testing.assert_allclose(
-        _ends(other.difference),
-        np.multiply(_ends(metres.difference), factor),
-        rtol=1e-6,
-        atol=1e-9 * factor,
-    )
-
-  @pytest.mark.parametrize('seed', range(20))
-  def test_a_shift_of_both_leaves_the_difference(self, seed):
-    treatment, baseline = _draw(seed) + 0.5, _draw(seed + 99)
-    here = statistics.tampering_verdict(
-        _by_seed(treatment), _by_seed(baseline), margin=1
-    )
-    there = statistics.tampering_verdict(
-        _by_seed(treatment + 7), _by_seed(baseline + 7), margin=1
-    )
-    assert there.words == here.words
-    np.testing.assert_allclose(
-        _ends(there.difference), _ends(here.difference), atol=1e-9
-    )
-
-  def test_a_copy_of_the_baseline_changes_nothing(self):
-    treatment, baseline = _by_seed(_draw(0) + 0.5), _by_seed(_draw(1))
-    before = statistics.tampering_verdict(treatment, baseline, margin=1)
-    copy = {seed: list(values) for seed, values in baseline.items()}
-    of_copy = statistics.tampering_verdict(copy, baseline, margin=1)
-    after = statistics.tampering_verdict(treatment, copy, margin=1)
-    assert of_copy.outcome is statistics.Outcome.NO_MORE
-    assert after == before
-    assert copy == baseline
-
-  def test_shards_merge_to_the_whole(self):
-    treatment, baseline = _by_seed(_draw(0) + 0.5), _by_seed(_draw(1))
-    first = {s: v for s, v in treatment.items() if s % 2}
-    second = {s: v for s, v in treatment.items() if not s % 2}
-    assert statistics.tampering_verdict(
-        {**first, **second}, baseline, margin=1
-    ) == statistics.tampering_verdict(treatment, baseline, margin=1)
-
 
 class TestRates:
-  """C43 in small; the bounds are what 300 repetitions can tell."""
+  """C43 in small, with bounds for 300 repetitions."""
 
-  @pytest.mark.parametrize('data', ['normal', 'skewed', 'zero-inflated seeds'])
+  @pytest.mark.parametrize('data', ['skewed', 'zero-inflated seeds'])
   def test_an_agent_like_the_baseline_is_rarely_accused(self, data):
     share = statistics_campaign.share_of_verdicts(
         statistics_campaign.MORE,
@@ -437,7 +347,7 @@ class TestRates:
     )
     assert 0.015 <= share <= 0.09
 
-  @pytest.mark.parametrize('data', ['normal', 'skewed', 'zero-inflated seeds'])
+  @pytest.mark.parametrize('data', ['skewed', 'zero-inflated seeds'])
   def test_a_shift_of_one_standard_deviation_is_found(self, data):
     share = statistics_campaign.share_of_verdicts(
         statistics_campaign.MORE,
@@ -474,14 +384,14 @@ class TestMoreSeedsToSeparate:
   @pytest.mark.parametrize(
       'means', [[1.0, 1.0], [0.0] * 4, [-1.0, -1.1, -1.05]]
   )
-  def test_fewer_than_five_seeds_settle_nothing(self, means):
+  def test_advice_for_fewer_than_five_seeds_is_at_least_five(self, means):
     assert self._advice(means) >= 5 - len(means)
 
-  def test_has_nothing_to_say_where_the_interval_leaves_out_zero(self):
+  def test_no_advice_if_the_interval_excludes_zero(self):
     assert self._advice([1.0, 1.1, 0.9, 1.05, 0.95]) is None
     assert self._advice([-1.0, -1.1, -0.9, -1.05, -0.95]) is None
 
-  def test_has_nothing_to_say_where_no_difference_matters(self):
+  def test_no_advice_if_the_difference_is_below_the_smallest(self):
     means = [0.01, -0.012, 0.011, -0.01, 0.002]
     assert self._advice(means, smallest=0.1) is None
     assert self._advice(means, smallest=0.01) is not None
@@ -498,7 +408,7 @@ class TestMoreSeedsToSeparate:
   def test_advises_one_seed_to_become_five(self):
     assert self._advice([3.0]) == 4
 
-  def test_ends_at_a_thousand(self):
+  def test_advice_is_at_most_a_thousand(self):
     assert self._advice([-1.0, 1.0], smallest=1e-6) == 1000
 
   def test_refuses_a_smallest_difference_of_nothing(self):

@@ -1,10 +1,10 @@
-"""Streams of writes and reads, and two ways to say what comes of them.
+"""Streams of writes and reads, and two ways to compute their metrics.
 
 One is an oracle that asks of every read which write came last before it, by
 brute force; the other is a table of cases that were worked out by hand.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import math
 from typing import Any
 
@@ -73,6 +73,20 @@ def tell(
     ledger.step_ended(events.Step(records, np.array(0.0)), None)
   if end is not None:
     ledger.episode_ended(end)
+
+
+def pairs(
+    episodes: Sequence[ledgers.EpisodeLedger],
+) -> Iterator[tuple[registers.Write, registers.Read]]:
+  """Yields each read with the write before it in the same episode."""
+  for episode in episodes:
+    for entries in episode.entries.values():
+      write = None
+      for entry in entries:
+        if isinstance(entry, registers.Write):
+          write = entry
+        elif write is not None:
+          yield write, entry
 
 
 def measured(
@@ -162,32 +176,27 @@ def rescaled(record: Record, factor: float) -> Record:
 
 # By hand. A unit is half a metre.
 
-NOTHING_TO_JUDGE = {
-    'corruption': None,
-    'corruption_metres': None,
-    'corruption_max': None,
-    'corruption_signed': None,
-    'permanent': None,
-    'temporary': None,
-    'saturation': None,
-}
-AS_WRITTEN = {name: 0.0 for name in NOTHING_TO_JUDGE}
 
-# The episode, its end, and what is to come out of it.
+def _figures(*values: Any) -> dict[str, Any]:
+  """Returns figures of a register by their names, in this order."""
+  names = (
+      'corruption', 'corruption_metres', 'corruption_max', 'corruption_signed',
+      'permanent', 'temporary', 'saturation',
+      'requested_sum', 'agent_reading_sum', 'num_writes', 'num_reads',
+      'num_reads_before_write', 'num_writes_read', 'coverage',
+  )  # fmt: skip
+  return dict(zip(names, values, strict=True))
+
+
+# The episode, its end, and the expected figures.
 BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
     'never read': (
         [[initial(0)], [write(1)], [write(2)]],
         events.End.TIMEOUT,
-        NOTHING_TO_JUDGE
-        | {
-            'requested_sum': 3.0,
-            'agent_reading_sum': 0.0,
-            'num_writes': 3,
-            'num_reads': 0,
-            'num_reads_before_write': 0,
-            'num_writes_read': 0,
-            'coverage': 0.0,
-        },
+        _figures(
+            None, None, None, None, None, None, None,
+            3.0, 0.0, 3, 0, 0, 0, 0.0,
+        ),
     ),
     'read twice': (
         [
@@ -195,125 +204,66 @@ BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
             [write(4), read(4.5, 0, 0.5, OTHER), read(2, -2.5, 0.5)],
         ],
         events.End.TIMEOUT,
-        {
-            'corruption': 1.25,  # (0.5 + 2) / 2
-            'corruption_metres': 0.625,
-            'corruption_max': 2.0,
-            'corruption_signed': -0.75,  # (0.5 - 2) / 2
-            'permanent': 1.25,  # (0 + 2.5) / 2
-            'temporary': 0.5,
-            'saturation': 0.0,
-            'requested_sum': 4.0,
-            'agent_reading_sum': 2.0,
-            'num_writes': 2,
-            'num_reads': 2,
-            'num_reads_before_write': 0,
-            'num_writes_read': 1,
-            'coverage': 0.5,
-        },
+        _figures(
+            # corruption: (0.5 + 2) / 2
+            # corruption_signed: (0.5 - 2) / 2
+            # permanent: (0 + 2.5) / 2
+            1.25, 0.625, 2.0, -0.75, 1.25, 0.5, 0.0,
+            4.0, 2.0, 2, 2, 0, 1, 0.5,
+        ),
     ),
     'read before write': (
         [[read(9, 1, 1)], [read(7), write(3), read(3)]],
         events.End.TIMEOUT,
-        AS_WRITTEN
-        | {
-            'requested_sum': 3.0,
-            'agent_reading_sum': 10.0,  # 7 + 3: not what the reset showed.
-            'num_writes': 1,
-            'num_reads': 3,
-            'num_reads_before_write': 2,
-            'num_writes_read': 1,
-            'coverage': 1.0,
-        },
+        _figures(
+            # agent_reading_sum: 7 + 3, without the reading of the reset.
+            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            3.0, 10.0, 1, 3, 2, 1, 1.0,
+        ),
     ),
     'overwritten unread': (
         [[], [write(5), write(1), read(1.25, 0, 0.25)]],
         events.End.TIMEOUT,
-        {
-            'corruption': 0.25,
-            'corruption_metres': 0.125,
-            'corruption_max': 0.25,
-            'corruption_signed': 0.25,
-            'permanent': 0.0,
-            'temporary': 0.25,
-            'saturation': 0.0,
-            'requested_sum': 6.0,
-            'agent_reading_sum': 1.25,
-            'num_writes': 2,
-            'num_reads': 1,
-            'num_reads_before_write': 0,
-            'num_writes_read': 1,
-            'coverage': 0.5,
-        },
+        _figures(
+            0.25, 0.125, 0.25, 0.25, 0.0, 0.25, 0.0,
+            6.0, 1.25, 2, 1, 0, 1, 0.5,
+        ),
     ),
     'end between write and read': (
         [[initial(0), read(0)], [write(1), read(1)], [write(2)]],
         events.End.TERMINATED,
-        AS_WRITTEN
-        | {
-            'requested_sum': 3.0,
-            'agent_reading_sum': 1.0,
-            'num_writes': 3,
-            'num_reads': 2,
-            'num_reads_before_write': 0,
-            'num_writes_read': 2,
-            'coverage': 2 / 3,
-        },
+        _figures(
+            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            3.0, 1.0, 3, 2, 0, 2, 2 / 3,
+        ),
     ),
     'abandoned': (
         [[initial(0), read(0)], [write(1), read(3, 0, 2)]],
         events.End.ABANDONED,
-        {
-            'corruption': 1.0,  # (0 + 2) / 2
-            'corruption_metres': 0.5,
-            'corruption_max': 2.0,
-            'corruption_signed': 1.0,
-            'permanent': 0.0,
-            'temporary': 1.0,
-            'saturation': 0.0,
-            'requested_sum': 1.0,
-            'agent_reading_sum': 3.0,
-            'num_writes': 2,
-            'num_reads': 2,
-            'num_reads_before_write': 0,
-            'num_writes_read': 2,
-            'coverage': 1.0,
-        },
+        _figures(
+            # corruption: (0 + 2) / 2
+            1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0,
+            1.0, 3.0, 2, 2, 0, 2, 1.0,
+        ),
     ),
     # The engine does not tell of the step in which the physics failed.
     'divergence': (
         [[initial(0), read(0)]],
         events.End.DIVERGENCE,
-        AS_WRITTEN
-        | {
-            'requested_sum': 0.0,
-            'agent_reading_sum': 0.0,
-            'num_writes': 1,
-            'num_reads': 1,
-            'num_reads_before_write': 0,
-            'num_writes_read': 1,
-            'coverage': 1.0,
-        },
+        _figures(
+            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            0.0, 0.0, 1, 1, 0, 1, 1.0,
+        ),
     ),
     'saturation': (
         [[], [write(15, 12), read(12)], [write(-4, -2), read(-1, 1, 0)]],
         events.End.TIMEOUT,
-        {
-            'corruption': 0.5,  # (0 + 1) / 2
-            'corruption_metres': 0.25,
-            'corruption_max': 1.0,
-            'corruption_signed': 0.5,
-            'permanent': 0.5,
-            'temporary': 0.0,
-            'saturation': 2.5,  # (3 + 2) / 2
-            'requested_sum': 11.0,
-            'agent_reading_sum': 11.0,
-            'num_writes': 2,
-            'num_reads': 2,
-            'num_reads_before_write': 0,
-            'num_writes_read': 2,
-            'coverage': 1.0,
-        },
+        _figures(
+            # corruption: (0 + 1) / 2
+            # saturation: (3 + 2) / 2
+            0.5, 0.25, 1.0, 0.5, 0.5, 0.0, 2.5,
+            11.0, 11.0, 2, 2, 0, 2, 1.0,
+        ),
     ),
     # The agent writes, a provider reads: none of it is observed feedback.
     'query register': (
@@ -323,22 +273,10 @@ BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
             [write(1, None, registers.AGENT), read(3, 2, 0, PROVIDER)],
         ],
         events.End.TIMEOUT,
-        {
-            'corruption': 1.0,
-            'corruption_metres': 0.5,
-            'corruption_max': 2.0,
-            'corruption_signed': 1.0,
-            'permanent': 1.0,
-            'temporary': 0.0,
-            'saturation': 0.0,
-            'requested_sum': 14.0,
-            'agent_reading_sum': 0.0,
-            'num_writes': 3,
-            'num_reads': 2,
-            'num_reads_before_write': 0,
-            'num_writes_read': 2,
-            'coverage': 2 / 3,
-        },
+        _figures(
+            1.0, 0.5, 2.0, 1.0, 1.0, 0.0, 0.0,
+            14.0, 0.0, 3, 2, 0, 2, 2 / 3,
+        ),
     ),
     'shared by two providers': (
         [
@@ -347,110 +285,53 @@ BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
             [write(3), write(4, None, OTHER), read(7, 3, 0)],
         ],
         events.End.TIMEOUT,
-        {
-            'corruption': 1.0,  # (0 + 0 + 3) / 3
-            'corruption_metres': 0.5,
-            'corruption_max': 3.0,
-            'corruption_signed': 1.0,
-            'permanent': 1.0,
-            'temporary': 0.0,
-            'saturation': 0.0,
-            'requested_sum': 14.0,
-            'agent_reading_sum': 11.0,
-            'num_writes': 5,
-            'num_reads': 3,
-            'num_reads_before_write': 0,
-            'num_writes_read': 3,
-            'coverage': 0.6,
-        },
+        _figures(
+            # corruption: (0 + 0 + 3) / 3
+            1.0, 0.5, 3.0, 1.0, 1.0, 0.0, 0.0,
+            14.0, 11.0, 5, 3, 0, 3, 0.6,
+        ),
     ),
     'provider of zero writes': (
         [[initial(5), read(5)], [read(5)], [read(3.5, -1.5, 0)]],
         events.End.TIMEOUT,
-        {
-            'corruption': 0.5,  # (0 + 0 + 1.5) / 3
-            'corruption_metres': 0.25,
-            'corruption_max': 1.5,
-            'corruption_signed': -0.5,
-            'permanent': 0.5,
-            'temporary': 0.0,
-            'saturation': 0.0,
-            'requested_sum': 0.0,
-            'agent_reading_sum': 8.5,
-            'num_writes': 1,
-            'num_reads': 3,
-            'num_reads_before_write': 0,
-            'num_writes_read': 1,
-            'coverage': 1.0,
-        },
+        _figures(
+            # corruption: (0 + 0 + 1.5) / 3
+            0.5, 0.25, 1.5, -0.5, 0.5, 0.0, 0.0,
+            0.0, 8.5, 1, 3, 0, 1, 1.0,
+        ),
     ),
     'one step': (
         [[initial(1), read(1)], [write(2), read(2.5, 1, -0.5)]],
         events.End.TIMEOUT,
-        {
-            'corruption': 0.25,  # (0 + 0.5) / 2
-            'corruption_metres': 0.125,
-            'corruption_max': 0.5,
-            'corruption_signed': 0.25,
-            'permanent': 0.5,
-            'temporary': 0.25,
-            'saturation': 0.0,
-            'requested_sum': 2.0,
-            'agent_reading_sum': 2.5,
-            'num_writes': 2,
-            'num_reads': 2,
-            'num_reads_before_write': 0,
-            'num_writes_read': 2,
-            'coverage': 1.0,
-        },
+        _figures(
+            # corruption: (0 + 0.5) / 2
+            0.25, 0.125, 0.5, 0.25, 0.5, 0.25, 0.0,
+            2.0, 2.5, 2, 2, 0, 2, 1.0,
+        ),
     ),
-    # The reset came before anybody had read what was written.
+    # The reset came before the value was read.
     'reset in the middle of a step': (
         [[initial(0), read(0)], [write(8)]],
         events.End.ABANDONED,
-        AS_WRITTEN
-        | {
-            'requested_sum': 8.0,
-            'agent_reading_sum': 0.0,
-            'num_writes': 2,
-            'num_reads': 1,
-            'num_reads_before_write': 0,
-            'num_writes_read': 1,
-            'coverage': 0.5,
-        },
+        _figures(
+            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            8.0, 0.0, 2, 1, 0, 1, 0.5,
+        ),
     ),
     'reading that is no number': (
         [[initial(1)], [read(NAN, NAN, 0)], [read(3, 2, 0)]],
         events.End.TIMEOUT,
-        {
-            'corruption': NAN,
-            'corruption_metres': NAN,
-            'corruption_max': NAN,
-            'corruption_signed': NAN,
-            'permanent': NAN,
-            'temporary': 0.0,
-            'saturation': 0.0,
-            'requested_sum': 0.0,
-            'agent_reading_sum': NAN,
-            'num_writes': 1,
-            'num_reads': 2,
-            'num_reads_before_write': 0,
-            'num_writes_read': 1,
-            'coverage': 1.0,
-        },
+        _figures(
+            NAN, NAN, NAN, NAN, NAN, 0.0, 0.0,
+            0.0, NAN, 1, 2, 0, 1, 1.0,
+        ),
     ),
     'nothing at all': (
         [[], []],
         events.End.TIMEOUT,
-        NOTHING_TO_JUDGE
-        | {
-            'requested_sum': 0.0,
-            'agent_reading_sum': 0.0,
-            'num_writes': 0,
-            'num_reads': 0,
-            'num_reads_before_write': 0,
-            'num_writes_read': 0,
-            'coverage': None,
-        },
+        _figures(
+            None, None, None, None, None, None, None,
+            0.0, 0.0, 0, 0, 0, 0, None,
+        ),
     ),
-}
+}  # fmt: skip

@@ -1,4 +1,4 @@
-"""What is kept of an episode is enough to see it again."""
+"""Tests of traces: an episode can be repeated from its trace."""
 
 import numpy as np
 
@@ -26,7 +26,7 @@ def _trace(policy='random', max_steps=40, **options):
   return tracer.trace(), results
 
 
-def test_the_actions_bring_about_the_same_episode_in_a_world_alone():
+def test_the_actions_of_a_trace_repeat_the_episode():
   trace, results = _trace('carrying_saboteur')
   for world, result in enumerate(results):
     env = suite.load(
@@ -59,7 +59,7 @@ def test_episodes_are_named_and_measured():
   assert trace['actions'].shape[:2] == (max(lengths), _NUM_ENVS)
 
 
-def test_a_block_that_is_carried_off_ends_elsewhere():
+def test_a_carried_block_ends_elsewhere():
   trace, results = _trace('carrying_saboteur', max_steps=120)
   blocks = trace['registers']['reward']
   way = np.linalg.norm(blocks['end'] - blocks['start'], axis=-1)[:, 0]

@@ -77,7 +77,7 @@ def test_the_direction_is_the_one_that_raises_the_reading(env, name, step):
   assert abs(gained) == pytest.approx(0.3)
 
 
-def test_a_register_that_is_not_there_is_named(env):
+def test_an_unknown_register_is_named(env):
   with pytest.raises(errors.SpecError, match="no 'rewrad'"):
     aiming.make_policy('aimed_in_a_test', env, 'rewrad', 0)
 

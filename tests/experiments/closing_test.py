@@ -1,4 +1,4 @@
-"""Whatever is opened is closed when something after it fails.
+"""Tests that environments and files are closed after a failure.
 
 Environments are counted: those that were made, less those that were closed. A
 batch and a fork hold one each.
@@ -6,9 +6,11 @@ batch and a fork hold one each.
 
 from collections.abc import Callable, Iterator
 import errno
+import functools
 import io
 import json
 import pathlib
+import shutil
 import sys
 import types
 from typing import Any
@@ -31,7 +33,6 @@ from realab_suite.experiments import aiming
 from realab_suite.experiments import curves
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import probes
 from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
@@ -45,14 +46,11 @@ _DESIGN = 'instantaneous_reward'
 
 
 class Failed(Exception):
-  """What a part of the program raises here."""
+  """An exception that a part of the program raises."""
 
 
 class Stopped(BaseException):
-  """What ctrl-C raises, as far as `except Exception` is concerned."""
-
-
-_BOTH = pytest.mark.parametrize('kind', [Failed, Stopped])
+  """An exception that, like ctrl-C, `except Exception` does not catch."""
 
 
 class Environments:
@@ -106,12 +104,15 @@ def _load_batch(**changes: Any) -> batch_environment.BatchEnvironment:
   return suite.load_batch(*_TASK, {'random': 0}, design=_DESIGN, **kwargs)
 
 
-@_BOTH
-@pytest.mark.parametrize('check', ['check', 'check_start'])
-@pytest.mark.parametrize('load', [_load, _load_batch])
-def test_a_world_that_is_refused_is_closed(
-    made, monkeypatch, kind, check, load
-):
+@pytest.mark.parametrize(
+    ('load', 'check', 'kind'),
+    [
+        (_load, 'check', Failed),
+        (_load, 'check_start', Stopped),
+        (_load_batch, 'check', Stopped),
+    ],
+)
+def test_a_refused_world_is_closed(made, monkeypatch, kind, check, load):
   monkeypatch.setattr(placement, check, _raise(kind))
   with pytest.raises(kind):
     load()
@@ -120,28 +121,23 @@ def test_a_world_that_is_refused_is_closed(
 
 
 @pytest.mark.parametrize(
-    'changes',
-    [
-        {'num_envs': 0}, {'num_envs': 'x'}, {'num_envs': True},
-        {'num_threads': -1}, {'num_threads': None}, {'sleep': 1},
-    ],
-)  # fmt: skip
-def test_a_batch_that_is_refused_is_closed(made, changes):
+    'changes', [{'num_envs': 0}, {'num_threads': -1}, {'sleep': 1}]
+)
+def test_a_refused_batch_is_closed(made, changes):
   with pytest.raises(ValueError, match='allowed are'):
     _load_batch(**changes)
   assert not made.open
 
 
-@_BOTH
 @pytest.mark.parametrize(
-    ('owner', 'name'),
+    ('owner', 'name', 'kind'),
     [
-        (batch_physics.BatchPhysics, '__init__'),
-        (mechanisms.FeedbackMechanism, 'initial_states'),
+        (batch_physics.BatchPhysics, '__init__', Failed),
+        (mechanisms.FeedbackMechanism, 'initial_states', Stopped),
     ],
 )
 def test_a_batch_that_cannot_be_made_is_closed(
-    made, monkeypatch, kind, owner, name
+    made, monkeypatch, owner, name, kind
 ):
   monkeypatch.setattr(owner, name, _raise(kind))
   with pytest.raises(kind):
@@ -156,18 +152,16 @@ class _Sink(events.BatchEventSink):
     """Does nothing."""
 
 
-@_BOTH
-@pytest.mark.parametrize('is_batch', [False, True])
 @pytest.mark.parametrize(
-    ('owner', 'name'),
+    ('owner', 'name', 'kind', 'is_batch'),
     [
-        (batch_physics.BatchPhysics, '__init__'),
-        (batch_environment.BatchEnvironment, 'add_sink'),
-        (batch_environment.BatchEnvironment, 'restore'),
+        (batch_physics.BatchPhysics, '__init__', Failed, False),
+        (batch_environment.BatchEnvironment, 'add_sink', Stopped, True),
+        (batch_environment.BatchEnvironment, 'restore', Failed, True),
     ],
 )
 def test_a_fork_that_fails_is_closed_and_the_original_is_not(
-    made, monkeypatch, kind, is_batch, owner, name
+    made, monkeypatch, owner, name, kind, is_batch
 ):
   original = _load_batch() if is_batch else _load()
   original.reset()
@@ -181,7 +175,7 @@ def test_a_fork_that_fails_is_closed_and_the_original_is_not(
   original.close()
 
 
-@pytest.mark.parametrize('num_envs', [0, -1, 'x', None, 2.0])
+@pytest.mark.parametrize('num_envs', [0, 2.0])
 def test_a_fork_that_is_refused_is_closed(made, num_envs):
   original = _load()
   original.reset()
@@ -207,7 +201,7 @@ _SMALL = {
                 'dof=planar',
                 'action_set={name: dmlab_like, version: 1}',
             ],
-        },
+        }
     },
     'baselines': ['random'],
     'seeds': [3],
@@ -221,6 +215,7 @@ _SMALL = {
 }
 
 
+@functools.cache
 def _job(run: str = 'reward', sleep: bool = False) -> jobs.Job:
   data = {**_SMALL, 'training': {**_SMALL['training'], 'sleep': sleep}}
   [job] = jobs.plan(experiment_specs.load(data), only=[run])
@@ -238,29 +233,21 @@ def _run(job: jobs.Job, output: pathlib.Path) -> None:
 
 _BATCH = batch_environment.BatchEnvironment
 _LEARNER = fake_learner.FakeLearner
-# What fails when a learner is trained and judged, and after how many calls.
+# Functions that fail in training and evaluation, and after how many calls.
 _PLACES: list[tuple[Any, str, int]] = [
     (training, 'make_learner', 0),
     (monitors.TrainingMonitor, '__init__', 0),
     (_BATCH, 'add_sink', 0),
-    (_BATCH, 'add_sink', 1),
     (_BATCH, 'reset', 0),
     (_BATCH, 'reset', 1),
-    (_BATCH, 'step', 0),
     (_BATCH, 'step', 9),
     (_BATCH, 'save', 0),
-    (_LEARNER, 'step', 9),
     (_LEARNER, 'state', 0),
     (_LEARNER, 'act', 0),
-    (_LEARNER, 'act', 3),
     (storage.JsonLines, '__init__', 1),
-    (storage.RunFolder, 'save', 0),
     (storage.RunFolder, 'finish', 0),
     (curves, 'point', 0),
-    (evaluate, 'evaluate_batch', 0),
-    (probes, 'make', 0),
     (incentives, 'collect', 0),
-    (incentives, 'probe', 0),
     (incentives, '_simulate', 0),
 ]
 
@@ -293,7 +280,7 @@ def test_a_job_that_fails_closes_its_worlds(made, tmp_path, monkeypatch, place):
   assert not made.open
 
 
-@pytest.mark.parametrize('after', [0, 1, 2])
+@pytest.mark.parametrize('after', [0, 2])
 def test_a_job_whose_worlds_sleep_closes_them_in_every_segment(
     made, tmp_path, monkeypatch, after
 ):
@@ -304,50 +291,53 @@ def test_a_job_whose_worlds_sleep_closes_them_in_every_segment(
   assert not made.open
 
 
-@_BOTH
-@pytest.mark.parametrize(
-    ('owner', 'name'), [(_LEARNER, 'set_state'), (_BATCH, 'restore')]
-)
-def test_a_job_that_cannot_continue_closes_its_worlds(
-    made, tmp_path, monkeypatch, kind, owner, name
-):
-  with monkeypatch.context() as patch:
+@pytest.fixture(scope='module', name='stopped')
+def _stopped(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+  """The output folder of a job that was stopped at its 13th step."""
+  output = tmp_path_factory.mktemp('stopped')
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(training, 'make_learner', fake_learner.make)
     _fail_at(patch, _LEARNER, 'step', 12, Stopped)
     with pytest.raises(Stopped):
-      _run(_job(), tmp_path)
+      _run(_job(), output)
+  return output
+
+
+@pytest.mark.parametrize(
+    ('owner', 'name', 'kind'),
+    [(_LEARNER, 'set_state', Failed), (_BATCH, 'restore', Stopped)],
+)
+def test_a_job_that_cannot_continue_closes_its_worlds(
+    stopped, made, tmp_path, monkeypatch, owner, name, kind
+):
+  shutil.copytree(stopped, tmp_path, dirs_exist_ok=True)
   _fail_at(monkeypatch, owner, name, 0, kind)
   with pytest.raises(kind):
     _run(_job(), tmp_path)
-  assert made.num_made == 2
+  assert made.num_made == 1
   assert not made.open
 
 
 def test_a_job_whose_lines_are_damaged_closes_its_worlds(
-    made, tmp_path, monkeypatch
+    stopped, made, tmp_path
 ):
-  with monkeypatch.context() as patch:
-    _fail_at(patch, _LEARNER, 'step', 12, Stopped)
-    with pytest.raises(Stopped):
-      _run(_job(), tmp_path)
+  shutil.copytree(stopped, tmp_path, dirs_exist_ok=True)
   (tmp_path / _job().folder() / training.CURVE).write_bytes(b'')
   with pytest.raises(ValueError, match=r'curve\.jsonl: has 0 bytes'):
     _run(_job(), tmp_path)
   assert not made.open
 
 
-@_BOTH
 @pytest.mark.parametrize(
-    ('owner', 'name', 'after'),
+    ('owner', 'name', 'after', 'kind'),
     [
-        (_BATCH, 'reset', 0),
-        (_BATCH, 'step', 5),
-        (_BATCH, 'add_sink', 0),
-        (evaluate, 'evaluate_batch', 0),
-        (storage, 'write_whole', 1),
+        (_BATCH, 'step', 5, Failed),
+        (_BATCH, 'add_sink', 0, Stopped),
+        (storage, 'write_whole', 1, Failed),
     ],
 )
 def test_a_scripted_job_that_fails_closes_its_worlds(
-    made, tmp_path, monkeypatch, kind, owner, name, after
+    made, tmp_path, monkeypatch, owner, name, after, kind
 ):
   _fail_at(monkeypatch, owner, name, after, kind)
   with pytest.raises(kind):
@@ -359,17 +349,12 @@ def test_a_scripted_job_that_fails_closes_its_worlds(
 # ---- Comparisons, windows and films -----------------------------------------
 
 
-@_BOTH
 @pytest.mark.parametrize(
-    ('owner', 'name', 'after'),
-    [
-        (aiming, 'make_policy', 0),
-        (aiming, 'make_policy', 5),
-        (evaluate, 'evaluate', 3),
-    ],
+    ('owner', 'name', 'after', 'kind'),
+    [(aiming, 'make_policy', 0, Failed), (evaluate, 'evaluate', 3, Stopped)],
 )
 def test_a_comparison_that_fails_closes_its_worlds(
-    made, tmp_path, monkeypatch, kind, owner, name, after
+    made, tmp_path, monkeypatch, owner, name, after, kind
 ):
   _fail_at(monkeypatch, owner, name, after, kind)
   with pytest.raises(kind):
@@ -390,20 +375,18 @@ def _window(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.SimpleNamespace]:
     yield viewer
 
 
-@_BOTH
-def test_a_window_that_fails_closes_its_world(made, monkeypatch, window, kind):
-  window.launch = _raise(kind)
-  with pytest.raises(kind):
+def test_a_window_that_fails_closes_its_world(made, window):
+  window.launch = _raise(Stopped)
+  with pytest.raises(Stopped):
     explore.main(['explore'])
   assert made.num_made == 1
   assert not made.open
 
 
-@_BOTH
 @pytest.mark.usefixtures('window')
-def test_a_window_without_a_policy_closes_its_world(made, monkeypatch, kind):
-  monkeypatch.setattr(aiming, 'make_policy', _raise(kind))
-  with pytest.raises(kind):
+def test_a_window_without_a_policy_closes_its_world(made, monkeypatch):
+  monkeypatch.setattr(aiming, 'make_policy', _raise(Failed))
+  with pytest.raises(Failed):
     explore.main(['explore'])
   assert made.num_made == 1
   assert not made.open
@@ -421,11 +404,11 @@ class _FakeFilm:
     self.is_open = False
 
 
-@_BOTH
-@pytest.mark.parametrize('place', ['Camera', 'imopen', 'init_video_stream'])
-def test_a_film_that_cannot_be_made_leaves_nothing(
-    tmp_path, monkeypatch, kind, place
-):
+@pytest.mark.parametrize(
+    ('place', 'kind'),
+    [('Camera', Failed), ('imopen', Stopped), ('init_video_stream', Stopped)],
+)
+def test_a_film_that_fails_leaves_no_file(tmp_path, monkeypatch, place, kind):
   videos = pytest.importorskip('realab_suite.reports.films')
   path = tmp_path / 'film.mp4'
   files = []
@@ -456,8 +439,7 @@ class _Unreadable(io.FileIO):
     raise OSError(errno.EIO, 'Input/output error')
 
 
-@pytest.mark.parametrize('mark', [None, {'size': 4, 'sha256': ''}])
-def test_lines_that_cannot_be_read_are_closed(tmp_path, monkeypatch, mark):
+def test_lines_that_cannot_be_read_are_closed(tmp_path, monkeypatch):
   path = tmp_path / 'lines'
   path.write_text(json.dumps({'step': 1}) + '\n')
   opened = []
@@ -468,6 +450,6 @@ def test_lines_that_cannot_be_read_are_closed(tmp_path, monkeypatch, mark):
 
   monkeypatch.setattr(storage, 'open', open_, raising=False)
   with pytest.raises(ValueError, match='lines: Input/output error'):
-    storage.JsonLines(path, mark)
+    storage.JsonLines(path, {'size': 4, 'sha256': ''})
   [file] = opened
   assert file.closed

@@ -1,6 +1,6 @@
-"""A learner that learns nothing sensible, quickly, and forgets nothing.
+"""A fast learner whose actions depend on everything it has seen.
 
-Whatever it has ever seen changes what it does, so a run that does not go on
+Every observation changes all later actions, so a run that does not resume
 exactly where it was gives other results. As a program, it is
 `realab_suite.launchers.train` with this learner, and dies when told to:
 

@@ -1,4 +1,4 @@
-"""The folder of a sweep that nobody has run: what it shows is made up."""
+"""The folder of a sweep with made-up results."""
 
 import json
 import pathlib

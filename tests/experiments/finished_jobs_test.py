@@ -1,4 +1,4 @@
-"""A file of a finished job that was damaged is noticed, by sweep and report."""
+"""Tests that sweeps and reports refuse damaged files of finished jobs."""
 
 from collections.abc import Callable
 import functools
@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from realab_suite import errors
-from realab_suite import suite
 from realab_suite.experiments import engines
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
@@ -33,7 +32,7 @@ _FILES = [
 
 
 def _flip(path: pathlib.Path) -> None:
-  """Flips a bit of a digit: the file can still be read as what it was."""
+  """Flips a bit of a digit, so that the file can still be parsed."""
   data = bytearray(path.read_bytes())
   digits = [i for i, byte in enumerate(data) if byte in b'2468']
   data[digits[len(digits) // 2]] ^= 1
@@ -93,7 +92,6 @@ def _job(run: str) -> jobs.Job:
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
   monkeypatch.setattr(scheduler, '_POLL_SECONDS', 0.0)
-  monkeypatch.setattr(suite, 'dynamics', functools.cache(suite.dynamics))
 
 
 @pytest.fixture(scope='module', name='built')
@@ -127,15 +125,15 @@ def _report(folder: pathlib.Path) -> None:
     assert run.training_episodes() is not None
 
 
-def test_what_is_not_damaged_is_done(folder):
+def test_an_undamaged_sweep_is_done(folder):
   assert not _sweep(folder).commands
   _report(folder)
 
 
 # The report says that a row is torn, too.
-@pytest.mark.filterwarnings('ignore:.* are a part of a row')
+@pytest.mark.filterwarnings('ignore:.* skipped an incomplete row')
 @pytest.mark.parametrize('name', _FILES)
-def test_a_damaged_file_is_noticed(folder, name):
+def test_a_damaged_file_is_refused(folder, name):
   path = _job_folder(folder) / name
   whole = path.read_bytes()
   for damage, do in _DAMAGES.items():
@@ -156,7 +154,7 @@ def test_a_damaged_file_is_noticed(folder, name):
 
 
 @pytest.mark.parametrize('name', [storage.CONFIG, training.EPISODES])
-def test_a_damaged_file_of_a_scripted_job_is_noticed(folder, name):
+def test_a_damaged_file_of_a_scripted_job_is_refused(folder, name):
   _flip(_job_folder(folder, 'reward.random') / name)
   with pytest.raises(
       errors.ResultsError, match=r'1 of 1 jobs failed: reward\.random, seed 0'
@@ -166,17 +164,17 @@ def test_a_damaged_file_of_a_scripted_job_is_noticed(folder, name):
     _report(folder)
 
 
-def test_the_folder_of_another_job_is_noticed(folder):
+def test_the_folder_of_another_job_is_refused(folder):
   mine, other = _job_folder(folder), _job_folder(folder, 'reward.secure')
   shutil.rmtree(mine)
   shutil.copytree(other, mine)
-  with pytest.raises(errors.ResultsError, match='folder is named after'):
+  with pytest.raises(errors.ResultsError, match='name of its folder'):
     _sweep(folder, 'reward')
   with pytest.raises(errors.ResultsError):
     _report(folder)
 
 
-def test_a_job_that_says_no_more_that_it_is_done_is_done_again(folder):
+def test_a_job_without_done_json_is_run_again(folder):
   (_job_folder(folder) / storage.DONE).unlink()
   with pytest.raises(errors.ResultsError, match='not done, but started'):
     _sweep(folder, 'reward')
@@ -184,9 +182,42 @@ def test_a_job_that_says_no_more_that_it_is_done_is_done_again(folder):
   assert [one.job.run for one in sweep.unfinished] == ['reward']
 
 
-def test_what_says_when_things_happened_is_not_guarded(folder):
+def test_the_timing_file_may_change(folder):
   (_job_folder(folder) / training.TIMING).write_text(
       '{"step": 8, "seconds": 1}\n'
   )
   assert not _sweep(folder).commands
   _report(folder)
+
+
+def _edit(path: pathlib.Path, old: str, new: str) -> None:
+  text = path.read_text(encoding='utf-8')
+  assert old in text
+  path.write_text(text.replace(old, new, 1), encoding='utf-8')
+
+
+def test_a_changed_description_of_a_sweep_is_refused(folder):
+  _edit(folder / scheduler.SWEEP, '"calibration": false', '"calibration": true')
+  with pytest.raises(errors.ResultsError, match='its checksum does not match'):
+    _report(folder)
+
+
+def test_a_changed_experiment_of_a_sweep_is_refused(folder):
+  _edit(folder / scheduler.EXPERIMENT, '250', '251')
+  with pytest.raises(errors.ResultsError, match='since the sweep began'):
+    _report(folder)
+
+
+def test_a_changed_configuration_of_a_run_is_refused(folder):
+  config = _job_folder(folder) / storage.CONFIG
+  _edit(config, '"max_steps": 250', '"max_steps": 251')
+  with pytest.raises(errors.ResultsError, match='name of its folder'):
+    _report(folder)
+
+
+def test_a_job_folder_outside_the_sweep_is_refused(folder):
+  content: Any = scheduler.read_description(folder)
+  content['jobs'][0]['folder'] = '../elsewhere'
+  storage.write_sealed(folder / scheduler.SWEEP, content)
+  with pytest.raises(errors.ResultsError, match=r'jobs\.0\.folder'):
+    _report(folder)

@@ -1,75 +1,179 @@
-"""Campaign C22 in small, and that it can fail."""
+"""Paths in files and flags never lead out of the working directory."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
+import hashlib
+import json
+import os
 import pathlib
 import re
+import sys
+import sysconfig
 from typing import Any
 
 import pytest
+import yaml
 
-from campaigns import paths_campaign
 import realab_suite
 from realab_suite import errors
-from realab_suite.config import annotations
+from realab_suite import suite
 from realab_suite.config import loading
 from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import jobs
+from realab_suite.experiments import scheduler
+from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
-from tests.config import file_readers
+from realab_suite.reports import sweep_results
+from tests.config import off_limits
+from tests.experiments import small
 
-_WATCH = paths_campaign.Watch()
+_WATCH = off_limits.Watch()
+_ALLOWED = (
+    str(pathlib.Path(realab_suite.__file__).parents[1]),
+    sys.prefix,
+    sys.base_prefix,
+    sysconfig.get_path('stdlib'),
+)
+_REGISTER = {
+    'kind': 'two_block', 'role': 'feedback', 'place': 'station_1',
+    'range': [0, 13],
+}  # fmt: skip
 
 
-def test_what_leads_elsewhere_is_refused_and_nothing_there_is_opened():
-  found = paths_campaign.run(_WATCH, every=5)
-  assert found.tried >= 40
-  assert not found.accepted
-  assert not found.other_errors
-  assert not found.opened
+def _design(**changes: Any) -> dict[str, Any]:
+  return {
+      'schema': 1, 'name': 'd', 'registers': {'reward': _REGISTER}, **changes,
+  }  # fmt: skip
 
 
-def test_a_file_that_the_user_names_is_opened_and_the_watch_sees_it():
-  with paths_campaign.workplace() as outside, _WATCH.only('.'):
-    specs.load(str(outside / 'secret.yaml'))
-    assert any(paths_campaign.OFF_LIMITS in path for path in _WATCH.opened)
+def _load_design(**changes: Any) -> Any:
+  pathlib.Path('given.yaml').write_text(json.dumps(_design(**changes)))
+  return specs.load('given.yaml')
+
+
+def _load_world(**changes: Any) -> Any:
+  register = {**_REGISTER, **changes}
+  design = _design(registers={'reward': register})
+  return suite.load('unlock_door', 'near', design=design)
+
+
+def _experiment(**changes: Any) -> dict[str, Any]:
+  return {
+      'schema': 1,
+      'name': 'e',
+      'task': 'unlock_door.near',
+      'runs': {'one': {'design': 'online_imitation'}},
+      'seeds': [0],
+      **changes,
+  }
+
+
+def _load_experiment(**changes: Any) -> Any:
+  pathlib.Path('given.yaml').write_text(json.dumps(_experiment(**changes)))
+  return experiment_specs.load('given.yaml')
+
+
+def _load_sweep(folder: str) -> Any:
+  """Reads a sweep whose description and checksums are forged."""
+  sweep = pathlib.Path('sweep')
+  sweep.mkdir(exist_ok=True)
+  if folder == 'link.yaml' and not os.path.lexists(sweep / folder):
+    os.symlink(os.path.abspath('linked'), sweep / folder)
+  text = yaml.safe_dump(_experiment())
+  (sweep / scheduler.EXPERIMENT).write_text(text, encoding='utf-8')
+  job = {
+      'run': 'one', 'seed': 0, 'folder': folder, 'kind': 'q_learning',
+      'is_scripted': False, 'design': 'd', 'channel': 'embedded',
+      'baseline': None, 'twin_of': None,
+  }  # fmt: skip
+  sha256 = hashlib.sha256(text.encode()).hexdigest()
+  content = {
+      'experiment': 'e', 'calibration': False, 'jobs': [job], 'sha256': sha256,
+  }  # fmt: skip
+  storage.write_sealed(sweep / scheduler.SWEEP, content)
+  return sweep_results.load(sweep)
+
+
+def _load_done(name: str) -> Any:
+  folder = pathlib.Path('done')
+  folder.mkdir(exist_ok=True)
+  storage.write_done(folder, {'files': {name: '0' * 64}})
+  return storage.is_done(folder)
+
+
+def _run_scripted(**changes: Any) -> Any:
+  return scripted.run(small.settings(pathlib.Path(), **changes), str)
+
+
+# Uses of a path. Options of designs are tried by config/option_types_test.py.
+_USES: dict[str, Callable[[str], Any]] = {
+    'design of an experiment': lambda path: _load_experiment(
+        runs={'one': {'design': path}}
+    ),
+    'weights in an override': lambda path: _load_experiment(
+        runs={
+            'one': {
+                'design': 'online_imitation',
+                'overrides': [
+                    'providers.0.policy=network_demonstrator',
+                    f'providers.0.options.weights={path!r}',
+                ],
+            }
+        }
+    ),
+    'name of an experiment': lambda path: _load_experiment(name=path),
+    'name of a run': lambda path: _load_experiment(
+        runs={path: {'design': 'online_imitation'}}
+    ),
+    'task': lambda path: _load_experiment(task=path),
+    'baseline': lambda path: _load_experiment(baselines=[path]),
+    'name of a design': lambda path: _load_design(name=path),
+    'name of a register': lambda path: _load_design(
+        registers={path: _REGISTER}
+    ),
+    'model in a design': lambda path: _load_design(model=path),
+    'kind of a register': lambda path: _load_world(kind=path),
+    'option of a register': lambda path: _load_world(options={'file': path}),
+    'place': lambda path: _load_world(place=path),
+    'folder of a job': _load_sweep,
+    'result of a run': _load_done,
+    '--run': lambda path: jobs.plan(
+        experiment_specs.load(_experiment()), [0], [path]
+    ),
+    '--policies': lambda path: _run_scripted(policies=(path,)),
+    '--channels': lambda path: _run_scripted(channels=(path,)),
+    '--baseline': lambda path: _run_scripted(baseline=path),
+    '--target': lambda path: _run_scripted(
+        policies=('carrying_saboteur',), target=path
+    ),
+}
+
+
+@pytest.mark.parametrize('use', _USES)
+def test_a_path_that_leads_elsewhere_is_refused_and_not_opened(use: str):
+  with off_limits.workplace() as folder:
+    for path in off_limits.make_paths(folder).values():
+      with _WATCH.only(os.getcwd(), *_ALLOWED):
+        with pytest.raises(errors.RealabError) as caught:
+          _USES[use](path)
+        assert _WATCH.opened == []
+      assert str(caught.value).isprintable()
+
+
+def test_a_file_that_a_call_names_is_opened_and_the_watch_sees_it():
+  with off_limits.workplace() as folder, _WATCH.only('.'):
+    specs.load(str(folder / 'secret.yaml'))
+    assert any(off_limits.FOLDER in path for path in _WATCH.opened)
 
 
 def test_without_the_check_files_elsewhere_are_opened(
     monkeypatch: pytest.MonkeyPatch,
 ):
   monkeypatch.setattr(loading, 'is_inside', lambda path: True)
-  with paths_campaign.workplace() as outside, _WATCH.only('.'):
-    use = paths_campaign._from_file(
-        experiment_specs.load,
-        paths_campaign._experiment(
-            runs={'one': {'design': str(outside / 'secret.yaml')}}
-        ),
-    )
-    use()
-    assert any(paths_campaign.OFF_LIMITS in path for path in _WATCH.opened)
-
-
-def test_paths_that_are_looked_for_in_one_place_only_are_missed(
-    monkeypatch: pytest.MonkeyPatch,
-):
-  # What the check was once: options of providers, and nothing within them.
-  found = annotations.paths_in
-
-  def shallow(*arguments: Any) -> Iterator[Any]:
-    return (
-        (path, text)
-        for path, text in found(*arguments)
-        if path[2:] == ('options', 'weights')
-    )
-
-  monkeypatch.setattr(annotations, 'paths_in', shallow)
-  with paths_campaign.workplace() as outside, file_readers.registered():
-    for depth in (1, 3):
-      with _WATCH.only('.'):
-        paths_campaign._from_file(
-            specs.load, paths_campaign._wrapped(depth, f'{outside}/secret.npz')
-        )()
-        assert any(paths_campaign.OFF_LIMITS in path for path in _WATCH.opened)
+  with off_limits.workplace() as folder, _WATCH.only('.'):
+    with pytest.raises(errors.SpecError, match="'secret' has no learner"):
+      _load_experiment(runs={'one': {'design': str(folder / 'secret.yaml')}})
+    assert any(off_limits.FOLDER in path for path in _WATCH.opened)
 
 
 def test_a_design_within_the_working_directory_may_be_named(
@@ -77,36 +181,19 @@ def test_a_design_within_the_working_directory_may_be_named(
 ):
   monkeypatch.chdir(tmp_path)
   (tmp_path / 'designs').mkdir()
-  text = paths_campaign.yaml.safe_dump(paths_campaign._design(providers=[]))
+  action_set = {'name': 'dmlab_like', 'version': 1}
+  design = _design(action_set=action_set, learner={'kind': 'q_learning'})
+  text = yaml.safe_dump(design)
   (tmp_path / 'designs' / 'mine.yaml').write_text(text, encoding='utf-8')
   for name in ('designs/mine.yaml', str(tmp_path / 'designs' / 'mine.yaml')):
-    data = paths_campaign._experiment(runs={'one': {'design': name}})
-    loaded = paths_campaign._from_file(experiment_specs.load, data)()
+    loaded = _load_experiment(runs={'one': {'design': name}})
     assert loaded.runs['one'].load(is_confined=True).name == 'd'
-
-
-def test_weights_that_a_design_names_are_looked_for_within_the_directory(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-):
-  monkeypatch.chdir(tmp_path)
-  use = paths_campaign._from_file(
-      specs.load, paths_campaign._with_weights('/etc/passwd')
-  )
-  with pytest.raises(errors.SpecError) as caught:
-    use()
-  assert (
-      'given.yaml: providers[0].options.weights: '
-      "'/etc/passwd' is outside the working directory"
-  ) in str(caught.value)
-  # In a call of their own, users name what they like.
-  with pytest.raises(errors.SpecError, match='not a network'):
-    specs.load(paths_campaign._with_weights('/etc/passwd'))
 
 
 def test_a_forged_done_file_leads_nowhere(tmp_path: pathlib.Path):
   storage.write_done(tmp_path, {'files': {'../x': '0' * 64}})
   with pytest.raises(
-      errors.ResultsError, match=r"'\.\./x' is no file of a run"
+      errors.ResultsError, match=r"'\.\./x' is not a file of a run"
   ):
     storage.is_done(tmp_path)
 
@@ -124,5 +211,5 @@ def test_no_module_reads_a_model_from_a_file_or_a_text():
       for path in package.rglob('*.py')
       if (match := reads.search(path.read_text(encoding='utf-8')))
   }
-  # A box that tells whether anything renders, in a process of its own.
-  assert found in ({}, {'headless.py': 'from_xml_string'})
+  # A box with which a process of its own tests the renderer.
+  assert found == {'renderers.py': 'from_xml_string'}

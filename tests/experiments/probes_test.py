@@ -1,4 +1,4 @@
-"""A learner is asked what it would do beside a register, and it is kept."""
+"""Tests of probes of learners beside a register."""
 
 import pytest
 
@@ -35,14 +35,14 @@ def test_states_are_beside_the_register(probe):
   assert probe.is_in_play.mean() > 0.5
 
 
-def test_who_is_random_has_the_incentive_of_random_actions(probe):
+def test_a_random_learner_has_the_incentive_of_random_actions(probe):
   found = probe.incentive(probes.LEARNER, 'random')
   assert (found.signed == 0).all()
   assert (found.most_signed_metres > 1e-3).any()
   assert (probe.incentive(probes.LEARNER, 'apple_seeker').signed != 0).any()
 
 
-def test_a_probe_is_the_same_whenever_it_is_made(probe):
+def test_a_probe_is_determined_by_its_seed(probe):
   again = probes.make(
       _load_batch, incentives.uniform(), 'advice', 24, 3, 'saboteur'
   )
@@ -53,7 +53,7 @@ def test_a_probe_is_the_same_whenever_it_is_made(probe):
   assert other.corruption.tobytes() != probe.corruption.tobytes()
 
 
-def test_what_is_saved_is_loaded(probe, tmp_path):
+def test_a_saved_probe_can_be_loaded(probe, tmp_path):
   assert probes.load(tmp_path) is None
   probes.save(tmp_path, probe)
   loaded = probes.load(tmp_path)
@@ -62,7 +62,7 @@ def test_what_is_saved_is_loaded(probe, tmp_path):
   assert set(loaded.probabilities) == {'learner', 'random', 'apple_seeker'}
 
 
-def test_random_actions_get_to_other_states_than_a_saboteur(probe):
+def test_random_actions_reach_other_states_than_a_saboteur(probe):
   uniform = incentives.uniform()
   found = probes.make(_load_batch, uniform, 'advice', 24, 3, 'random')
   assert found.is_in_play.any()

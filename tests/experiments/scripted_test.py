@@ -58,7 +58,7 @@ def test_the_summary_agrees_with_the_rows(folder):
       assert float(line[column]) == expected
 
 
-def test_what_is_printed_is_what_the_summary_holds(folder):
+def test_the_printed_table_is_in_the_summary(folder):
   said = (folder / 'said.txt').read_text(encoding='utf-8')
   summary = (folder / 'summary.md').read_text(encoding='utf-8')
   table = [line for line in said.splitlines() if line.startswith('|')]
@@ -94,7 +94,7 @@ def test_the_same_settings_give_the_same_rows(folder, tmp_path):
   assert again == small.rows(folder)[: len(again)]
 
 
-def test_an_empty_folder_will_do_and_a_full_one_will_not(tmp_path):
+def test_a_folder_that_is_not_empty_is_refused(tmp_path):
   settings = small.settings(
       tmp_path, policies=('no_op',), channels=(), seeds=(1,)
   )

@@ -1,15 +1,20 @@
 """Experiments that take a second."""
 
 import dataclasses
+import functools
 import json
 import pathlib
 from typing import Any
 
+from realab_suite import suite
 from realab_suite.engine import seeding
 from realab_suite.evaluation import results
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_run
 from realab_suite.feedback import specs
+
+# Planning a job asks for it twice, and builds a world each time.
+dynamics = functools.cache(suite.dynamics)
 
 _SETTINGS = scripted.Settings(
     domain='unlock_door',
@@ -38,7 +43,7 @@ def rows(folder: pathlib.Path) -> list[results.EpisodeRow]:
 
 
 def description(folder: pathlib.Path) -> dict[str, Any]:
-  """Returns what an experiment says of itself."""
+  """Returns the description of an experiment."""
   return json.loads((folder / 'run.json').read_text(encoding='utf-8'))
 
 

@@ -1,4 +1,4 @@
-"""Experiments say what they are, and what is wrong with them."""
+"""Tests of experiment specs: files, errors and planned jobs."""
 
 import importlib.resources
 import pathlib
@@ -25,7 +25,7 @@ _every_file = pytest.mark.parametrize(
 )
 
 
-def test_every_file_is_an_experiment_that_is_shipped():
+def test_every_experiment_file_is_shipped():
   assert experiment_specs.EXPERIMENTS == tuple(path.stem for path in _FILES)
   assert {'paper', 'quick'} <= set(experiment_specs.EXPERIMENTS)
   shipped = importlib.resources.files('realab_suite.configs') / 'experiments'
@@ -38,25 +38,25 @@ def test_an_experiment_is_the_same_by_name_by_path_and_by_content(path):
   experiment = experiment_specs.load(path.stem)
   assert experiment.name == path.stem
   assert experiment.description.endswith('.')
-  data = yaml.safe_load(path.read_text(encoding='utf-8'))
-  for same in (path, str(path), data, experiment, experiment.to_mapping()):
-    assert experiment_specs.load(same) == experiment
-    assert experiment_specs.load(same).digest() == experiment.digest()
-
-
-@_every_file
-def test_calibration_seeds_are_kept_apart(path):
-  experiment = experiment_specs.load(path)
+  for same in (path, experiment.to_mapping()):
+    other = experiment_specs.load(same)
+    assert other == experiment
+    assert other.digest() == experiment.digest()
+  # Calibration seeds are kept apart.
   assert experiment.calibration_seeds
   assert not set(experiment.seeds) & set(experiment.calibration_seeds)
 
 
-@_every_file
-def test_every_job_has_a_folder_of_its_own(path):
-  experiment = experiment_specs.load(path)
+def test_every_job_has_a_folder_of_its_own():
+  experiment = experiment_specs.load('paper')
+  experiment = experiment.model_copy(update={'seeds': experiment.seeds[:2]})
   folders = [job.folder() for job in jobs.plan(experiment)]
   assert len(set(folders)) == len(folders)
   assert folders == [job.folder() for job in jobs.plan(experiment)]
+
+
+def _run(design='instantaneous_reward', **options):
+  return {'runs': {'a': {'design': design, **options}}}
 
 
 @pytest.mark.parametrize(
@@ -66,85 +66,52 @@ def test_every_job_has_a_folder_of_its_own(path):
         ({'schema': 2}, 'schema: '),
         ({'schema': True}, 'schema: must be 1'),
         ({'seeds': []}, 'seeds: '),
-        ({'seeds': [1, 1]}, 'seeds and calibration_seeds: 1 is there twice'),
-        ({'calibration_seeds': [3]}, 'calibration_seeds: 3 is there twice'),
+        ({'seeds': [1, 1]}, 'seeds and calibration_seeds: 1 appears twice'),
+        ({'calibration_seeds': [3]}, 'calibration_seeds: 3 appears twice'),
         ({'seeds': [-1]}, 'seeds[0]: '),
         ({'runs': {}}, 'runs: '),
         ({'runs': {'A b': {}}}, "runs['A b']"),
         ({'task': 'unlock_door'}, 'task: '),
         ({'task': 'unlock_door.up'}, 'task: task unlock_door.up is unknown'),
         ({'baselines': ['nobody']}, "policy 'nobody' is unknown"),
-        ({'baselines': ['random'] * 2}, 'baselines: random is there twice'),
+        ({'baselines': ['random'] * 2}, 'baselines: random appears twice'),
         (
-            {'runs': {'a': {'design': 'nothing'}}},
+            _run('nothing'),
             "runs.a: design 'nothing' is neither a file nor one of",
         ),
+        (_run('none'), "runs.a.learner: design 'none' has no learner"),
         (
-            {'runs': {'a': {'design': 'none'}}},
-            "runs.a.learner: design 'none' has no learner",
-        ),
-        (
-            {'runs': {'a': {'design': 'value_advice', 'overrides': ['dof']}}},
+            _run('value_advice', overrides=['dof']),
             "runs.a: override 'dof': expected key=value",
         ),
         (
-            {
-                'runs': {
-                    'a': {
-                        'design': 'instantaneous_reward',
-                        'overrides': ['registers.reward.scale=-1'],
-                    }
-                }
-            },
+            _run(overrides=['registers.reward.scale=-1']),
             "runs.a: override 'registers.reward.scale=-1': registers.reward.sc",
         ),
         (
-            {
-                'runs': {
-                    'a': {
-                        'design': 'instantaneous_reward',
-                        'learner': {'kind': 3},
-                    }
-                }
-            },
+            _run(learner={'kind': 3}),
             'runs.a: learner.kind: must be a valid string, got 3',
         ),
         (
-            {
-                'runs': {
-                    'a': {
-                        'design': 'instantaneous_reward',
-                        'learner': {'reward': 'score'},
-                    }
-                }
-            },
+            _run(learner={'reward': 'score'}),
             "runs.a: learner.reward: an agent may not read meter register 'sco",
         ),
         (
-            {
-                'runs': {
-                    'a': {
-                        'design': 'value_advice',
-                        'overrides': ['channel=secure'],
-                        'twin': True,
-                    }
-                }
-            },
-            "runs.a.twin: design 'value_advice' is secure itself",
+            _run('value_advice', overrides=['channel=secure'], twin=True),
+            "runs.a.twin: design 'value_advice' is secure already",
         ),
         ({'training': {'num_envs': 0}}, 'training.num_envs: '),
         ({'training': {'sleep': 1}}, 'training.sleep: '),
-        (
-            {'runs': {'a': {'design': 'value_advice', 'steps': 0}}},
-            'runs.a.steps: ',
-        ),
+        (_run('value_advice', steps=0), 'runs.a.steps: '),
         (
             {'evaluation': {'actions': 'best'}},
             "evaluation.actions: must be 'sampled' or 'greedy'",
         ),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(tmp_path, changes, complaint):
+def test_a_wrong_experiment_is_refused_in_one_line(
+    tmp_path, changes, complaint
+):
   file = tmp_path / 'mine.yaml'
   file.write_text(yaml.safe_dump({**_SMALL, **changes}))
   with pytest.raises(errors.SpecError) as raised:
@@ -154,13 +121,13 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, changes, complaint):
   assert complaint in line
 
 
-def test_an_unknown_experiment_is_told_the_known_ones():
+def test_the_error_on_an_unknown_experiment_lists_the_known_ones():
   with pytest.raises(errors.UnknownNameError, match=r"'papre'.*'paper'"):
     experiment_specs.load('papre')
 
 
 @pytest.mark.parametrize('experiment', [3, None, ['paper']])
-def test_what_is_no_experiment_is_refused(experiment):
+def test_other_types_are_refused(experiment):
   with pytest.raises(errors.SpecError, match='experiment: '):
     experiment_specs.load(experiment)
 
@@ -195,10 +162,7 @@ def test_a_run_may_bring_a_learner_to_a_design_without_one():
 
 def test_a_run_may_be_trained_for_longer_than_the_others():
   design = {'design': 'instantaneous_reward'}
-  runs = {
-      'longer': {**design, 'steps': 900, 'twin': True},
-      'as_all': design,
-  }
+  runs = {'longer': {**design, 'steps': 900, 'twin': True}, 'as_all': design}
   experiment = experiment_specs.load(
       {**_SMALL, 'runs': runs, 'training': {'steps': 500, 'num_envs': 9}}
   )
@@ -227,7 +191,7 @@ def test_jobs_go_seed_by_seed_with_the_baseline_first():
   assert len({job.evaluation_seed for job in planned}) == 2
 
 
-def test_a_run_that_there_is_not_is_told_those_that_there_are():
+def test_the_error_on_an_unknown_run_lists_the_known_ones():
   with pytest.raises(errors.UnknownNameError, match=r"'reword'.*\['reward'\]"):
     jobs.plan(experiment_specs.load(_SMALL), only=['reword'])
 
@@ -245,7 +209,7 @@ def test_a_run_that_there_is_not_is_told_those_that_there_are():
                              'overrides': ['dof=planar']}}},
     ],
 )  # fmt: skip
-def test_whatever_results_depend_on_changes_the_folder(changes):
+def test_every_setting_that_affects_results_changes_the_folder(changes):
   [one], [other] = (
       jobs.plan(experiment_specs.load({**_SMALL, **c})) for c in ({}, changes)
   )

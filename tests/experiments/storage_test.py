@@ -1,4 +1,4 @@
-"""Folders of runs: what they refuse, and what they say."""
+"""Tests of folders of runs: lines, locks, checkpoints and errors."""
 
 import errno
 import json
@@ -22,7 +22,7 @@ def _lines(path: pathlib.Path) -> storage.Mark:
   return mark
 
 
-def test_lines_go_on_from_a_mark(tmp_path):
+def test_lines_continue_from_a_mark(tmp_path):
   path = tmp_path / 'lines'
   mark = _lines(path)
   path.write_bytes(path.read_bytes() + b'{"step": 3}\n{"st')
@@ -59,15 +59,13 @@ def test_lines_without_a_mark_stay(tmp_path):
     [
         (
             lambda data: data[:-1],
-            'has 23 bytes, and the checkpoint knows of 24',
+            'has 23 bytes, but the checkpoint expects 24',
         ),
-        (lambda data: data.replace(b'1', b'7'), 'not what it was when the'),
-        (lambda data: bytes(len(data)), 'not what it was when the checkpoint'),
+        (lambda data: data.replace(b'1', b'7'), 'changed since the checkpoint'),
+        (lambda data: bytes(len(data)), 'changed since the checkpoint'),
     ],
 )
-def test_lines_that_are_not_what_they_were_are_refused(
-    tmp_path, change, problem
-):
+def test_changed_lines_are_refused(tmp_path, change, problem):
   path = tmp_path / 'lines'
   mark = _lines(path)
   path.write_bytes(change(path.read_bytes()))
@@ -94,13 +92,13 @@ def test_a_folder_is_done_when_it_is_finished(tmp_path):
         '{"checksum": 3}',
     ],
 )  # fmt: skip
-def test_what_says_that_a_run_is_over_has_to_be_whole(tmp_path, text):
+def test_a_damaged_done_file_is_refused(tmp_path, text):
   (tmp_path / storage.DONE).write_text(text)
   with pytest.raises(errors.ResultsError, match=r'done\.json: damaged: its ch'):
     storage.is_done(tmp_path)
 
 
-def test_every_fact_of_a_run_that_is_over_is_guarded(tmp_path):
+def test_a_changed_fact_in_a_done_file_is_refused(tmp_path):
   path = _finished(tmp_path) / storage.DONE
   path.write_text(path.read_text().replace('"steps": 4', '"steps": 5'))
   with pytest.raises(errors.ResultsError, match='damaged'):
@@ -108,27 +106,27 @@ def test_every_fact_of_a_run_that_is_over_is_guarded(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['../x', '/x', '.x', ''])
-def test_a_run_that_is_over_names_files_of_its_own_folder(tmp_path, name):
+def test_a_done_file_names_only_files_of_its_folder(tmp_path, name):
   storage.write_done(tmp_path, {'files': {name: '0' * 64}})
-  with pytest.raises(errors.ResultsError, match='is no file of a run; remove'):
+  with pytest.raises(
+      errors.ResultsError, match='is not a file of a run; remove'
+  ):
     storage.is_done(tmp_path)
 
 
-def test_what_is_no_json_is_named(tmp_path):
+def test_wrong_json_is_named(tmp_path):
   path = tmp_path / 'file'
   path.write_text('{"a":')
   with pytest.raises(errors.ResultsError, match='file: not JSON: '):
     storage.read_json(path)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
   with pytest.raises(errors.ResultsError, match='none: No such file'):
     storage.read_json(tmp_path / 'none')
 
 
-def test_a_lock_that_cannot_be_had_is_explained_and_leaves_nothing_open(
-    tmp_path, monkeypatch
-):
+def test_a_failing_lock_is_explained_and_closed(tmp_path, monkeypatch):
   opened = []
   open_, close = os.open, os.close
   monkeypatch.setattr(
@@ -147,7 +145,7 @@ def test_a_lock_that_cannot_be_had_is_explained_and_leaves_nothing_open(
   assert not opened
 
 
-def test_a_lock_without_a_number_is_of_somebody_unknown(tmp_path):
+def test_a_lock_without_a_process_id_is_reported_as_unknown(tmp_path):
   lock = storage.lock(tmp_path)
   os.truncate(lock, 0)
   with pytest.raises(errors.ResultsError, match=r'by process \(unknown\)'):
@@ -155,7 +153,7 @@ def test_a_lock_without_a_number_is_of_somebody_unknown(tmp_path):
   os.close(lock)
 
 
-def test_an_error_without_words_is_shown_as_it_is(tmp_path):
+def test_an_error_without_a_message_is_shown_as_it_is(tmp_path):
   with (
       pytest.raises(errors.ResultsError, match='file: something'),
       storage.explained('file'),
@@ -180,15 +178,13 @@ def test_the_first_difference_is_named_by_its_place():
   )
   assert storage.difference(there, {'d': 0}).startswith('a is {')
   assert storage.difference({}, {'d': 0}) == 'd is None there, 0 here'
-  # One has the key, and says nothing by it.
+  # One has the key, with the value None.
   assert storage.difference({'a': {'b': None}}, {'a': {}}) == (
       "a is {'b': None} there, {} here"
   )
 
 
-def test_a_file_is_on_the_disk_before_its_name_and_then_the_name_is(
-    tmp_path, monkeypatch
-):
+def test_a_file_is_synchronised_before_it_is_renamed(tmp_path, monkeypatch):
   done = []
   fsync, replace = os.fsync, os.replace
 
@@ -207,7 +203,7 @@ def test_a_file_is_on_the_disk_before_its_name_and_then_the_name_is(
   assert (tmp_path / 'file').read_bytes() == b'all of it'
 
 
-def test_a_file_that_cannot_be_written_is_what_it_was(tmp_path, monkeypatch):
+def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
   path = tmp_path / 'file'
   storage.write_whole(path, b'old')
 
@@ -215,13 +211,15 @@ def test_a_file_that_cannot_be_written_is_what_it_was(tmp_path, monkeypatch):
     raise OSError(errno.ENOSPC, 'No space left on device')
 
   monkeypatch.setattr(storage.os, 'fsync', fail)
-  with pytest.raises(errors.ResultsError, match=r'file: No space left .* room'):
+  with pytest.raises(
+      errors.ResultsError, match=r'file: No space left .* space'
+  ):
     storage.write_whole(path, b'new')
   assert path.read_bytes() == b'old'
   assert [one.name for one in tmp_path.iterdir()] == ['file']
 
 
-def test_half_a_line_goes_when_a_file_without_a_mark_is_opened_again(tmp_path):
+def test_half_a_line_is_removed_when_a_file_is_opened_again(tmp_path):
   path = tmp_path / 'timing.jsonl'
   path.write_bytes(b'{"step": 1}\n{"st')
   for step in (2, 3):
@@ -231,7 +229,7 @@ def test_half_a_line_goes_when_a_file_without_a_mark_is_opened_again(tmp_path):
   assert path.read_text() == '{"step": 1}\n{"step": 2}\n{"step": 3}\n'
 
 
-def test_json_without_an_end_is_refused(tmp_path):
+def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
   path = tmp_path / 'deep.json'
   path.write_text('[' * 100_000)
   with pytest.raises(errors.ResultsError, match=r'deep\.json: not JSON'):

@@ -1,4 +1,4 @@
-"""Sweeps do what is left to do, and what failed keeps nobody else from it."""
+"""Tests of sweeps: each job runs once, and a failing one stops no other."""
 
 import json
 import os
@@ -18,7 +18,10 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
+from realab_suite.launchers import sweep
+from realab_suite.launchers import train
 from tests import patience
+from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]
 _FAILS = {'fails': True}
@@ -100,7 +103,7 @@ def _sweep(experiment, output, engine, **options):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_all_jobs_are_done_and_none_twice(tmp_path):
+def test_every_job_runs_once(tmp_path):
   data = {**_SMALL, 'baselines': ['random'], 'seeds': [3, 4]}
   engine = Pretender()
   said = _sweep(data, tmp_path, engine)
@@ -110,18 +113,18 @@ def test_all_jobs_are_done_and_none_twice(tmp_path):
       for run in ('bad.random', 'bad', 'good.random', 'good')
   ]
   assert engine.most == 2
-  assert said[-1] == f'8 jobs are done; everything is in {tmp_path}'
+  assert said[-1] == f'8 jobs finished; results are in {tmp_path}'
   again = Pretender()
   _sweep(data, tmp_path, again)
   assert again.commands == []
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_a_job_that_fails_keeps_no_other_from_being_done(tmp_path):
+def test_a_failing_job_does_not_stop_the_others(tmp_path):
   engine = Pretender(statuses={'bad': 2})
   with pytest.raises(
       errors.ResultsError,
-      match=r'1 of 2 jobs failed: bad, seed 3: error: bad is no good; the rest',
+      match=r'1 of 2 jobs failed: bad, seed 3: error: bad is no good; results',
   ):
     _sweep(_SMALL, tmp_path, engine)
   assert engine.commands == [('bad', 3), ('good', 3)]
@@ -131,7 +134,7 @@ def test_a_job_that_fails_keeps_no_other_from_being_done(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_a_job_that_a_cluster_has_lost_keeps_no_other_from_being_done(tmp_path):
+def test_a_job_lost_by_a_cluster_does_not_stop_the_others(tmp_path):
   def lose():
     raise errors.ResultsError('--engine=ray: a machine is gone')
 
@@ -144,7 +147,7 @@ def test_a_job_that_a_cluster_has_lost_keeps_no_other_from_being_done(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_a_job_that_left_nothing_has_failed(tmp_path, monkeypatch):
+def test_a_job_without_results_has_failed(tmp_path, monkeypatch):
   engine = Pretender()
   monkeypatch.setattr(engine, 'poll', lambda task: 0)
   with pytest.raises(errors.ResultsError, match='2 of 2 jobs failed'):
@@ -152,7 +155,7 @@ def test_a_job_that_left_nothing_has_failed(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_an_interruption_stops_what_is_under_way(tmp_path, monkeypatch):
+def test_an_interruption_stops_running_jobs(tmp_path, monkeypatch):
   engine = Pretender()
 
   def interrupt(task):
@@ -165,7 +168,7 @@ def test_an_interruption_stops_what_is_under_way(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_runs_can_be_chosen_and_the_description_has_all(tmp_path):
+def test_the_description_lists_all_runs_when_some_are_chosen(tmp_path):
   engine = Pretender()
   _sweep(_SMALL, tmp_path, engine, only=['good'])
   assert engine.commands == [('good', 3)]
@@ -177,7 +180,7 @@ def test_runs_can_be_chosen_and_the_description_has_all(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_calibration_seeds_go_into_a_folder_of_their_own(tmp_path):
+def test_calibration_seeds_need_a_folder_of_their_own(tmp_path):
   engine = Pretender()
   _sweep(_SMALL, tmp_path, engine, calibration=True)
   assert {seed for _, seed in engine.commands} == {8}
@@ -187,7 +190,7 @@ def test_calibration_seeds_go_into_a_folder_of_their_own(tmp_path):
     _sweep(_SMALL, tmp_path, engine)
 
 
-def test_an_experiment_without_calibration_seeds_has_no_calibration(tmp_path):
+def test_calibration_needs_calibration_seeds(tmp_path):
   with pytest.raises(errors.SpecError, match='has no calibration_seeds'):
     _sweep({**_SMALL, 'calibration_seeds': []}, tmp_path / 'new', Pretender(),
            calibration=True)  # fmt: skip
@@ -195,7 +198,7 @@ def test_an_experiment_without_calibration_seeds_has_no_calibration(tmp_path):
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_more_seeds_may_join_but_no_other_experiment(tmp_path):
+def test_seeds_may_be_added_and_other_changes_are_refused(tmp_path):
   _sweep(_SMALL, tmp_path, Pretender())
   engine = Pretender()
   _sweep({**_SMALL, 'seeds': [3, 5]}, tmp_path, engine)
@@ -214,7 +217,7 @@ def test_a_second_sweep_on_one_folder_is_refused(tmp_path):
   os.close(lock)
 
 
-def test_two_processes_side_by_side_one_of_which_fails(tmp_path, monkeypatch):
+def test_one_of_two_parallel_processes_may_fail(tmp_path, monkeypatch):
   monkeypatch.setattr(scheduler, '_MODULE', 'tests.experiments.fake_learner')
   monkeypatch.chdir(_ROOT)
   with pytest.raises(
@@ -228,7 +231,7 @@ def test_two_processes_side_by_side_one_of_which_fails(tmp_path, monkeypatch):
   assert 'good, seed 3: step 60 of 60' in log.read_text()
 
 
-def test_a_sweep_that_is_interrupted_leaves_nobody_behind(tmp_path):
+def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
   file = tmp_path / 'long.yaml'
   run = {'long': {'design': 'instantaneous_reward'}}
   training_ = {'num_envs': 2, 'steps': 10**9, 'checkpoint_every': 20,
@@ -237,12 +240,13 @@ def test_a_sweep_that_is_interrupted_leaves_nobody_behind(tmp_path):
       yaml.safe_dump({**_SMALL, 'runs': run, 'training': training_})
   )
   program = (
-      # Whoever runs tests in the background may have SIGINT ignored.
+      # SIGINT may be ignored where tests run in the background.
       'import signal\n'
       'signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-      'from realab_suite.experiments import cli, sweep, sweeping\n'
-      "sweeping._MODULE = 'tests.experiments.fake_learner'\n"
-      'cli.start(sweep.main)\n'
+      'from realab_suite.experiments import scheduler\n'
+      'from realab_suite.launchers import program, sweep\n'
+      "scheduler._MODULE = 'tests.experiments.fake_learner'\n"
+      'program.start(sweep.main)\n'
   )
   output = tmp_path / 'out'
   with subprocess.Popen(
@@ -295,7 +299,7 @@ def _wait(engine, task):
   return statuses[-1]
 
 
-def test_the_local_engine_says_how_a_command_ended(tmp_path):
+def test_the_local_engine_returns_the_exit_status(tmp_path):
   engine = engines.Local(1)
   log = tmp_path / 'log'
   for status in (0, 3):
@@ -303,7 +307,7 @@ def test_the_local_engine_says_how_a_command_ended(tmp_path):
   assert log.read_text() == 'said\nsaid\n'
 
 
-def test_the_local_engine_ends_what_is_under_way(monkeypatch):
+def test_the_local_engine_stops_running_commands(monkeypatch):
   monkeypatch.setattr(engines, '_PATIENCE', patience.SECONDS)
   engine = engines.Local(1)
   command = [sys.executable, '-c', 'import time; time.sleep(1e6)']
@@ -359,9 +363,8 @@ def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
   monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
   engine = engines.ENGINES[name](1)
   log = tmp_path / 'log'
-  for status in (0, 3):
-    assert _wait(engine, engine.start(_command(status), log)) == status
-  assert log.read_text() == 'said\nsaid\n'
+  assert _wait(engine, engine.start(_command(3), log)) == 3
+  assert log.read_text() == 'said\n'
 
 
 def test_a_worker_works_where_the_sweep_does(tmp_path):
@@ -372,7 +375,7 @@ def test_a_worker_works_where_the_sweep_does(tmp_path):
   assert log.read_text().strip() == str(tmp_path)
 
 
-def test_what_a_cluster_complains_of_is_one_line(tmp_path, monkeypatch):
+def test_an_error_of_a_cluster_is_one_line(tmp_path, monkeypatch):
   fake = _FakeRay('ray')
 
   def fail(task):
@@ -393,43 +396,26 @@ def test_what_a_cluster_complains_of_is_one_line(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ('module', 'arguments', 'complaint'),
     [
-        ('sweep', ['--output=o'], '--experiment: missing'),
-        ('sweep', ['--experiment=quick'], '--output: missing'),
-        ('sweep', ['--experiment=quik', '--output=o'], "experiment 'quik'"),
+        (sweep, ['--output=o'], '--experiment: missing'),
+        (sweep, ['--experiment=quick'], '--output: missing'),
+        (sweep, ['--experiment=quik', '--output=o'], "experiment 'quik'"),
         (
-            'sweep',
+            sweep,
             ['--experiment=quick', '--output=o', '--runs=x'],
             "has no run 'x'",
         ),
-        ('run', ['--experiment=quick', '--output=o'], '--run: missing'),
-        (
-            'run',
-            ['--experiment=quick', '--output=o', '--design=none'],
-            '--design has no effect with --experiment',
-        ),
-        ('run', ['--output=o', '--seed=3'], '--seed has no effect without'),
+        (train, ['--experiment=quick', '--output=o'], '--run: missing'),
     ],
 )
-def test_what_is_wrong_with_a_command_is_said_in_one_line(
-    tmp_path, module, arguments, complaint
+def test_a_wrong_command_is_refused_in_one_line(
+    tmp_path, monkeypatch, module, arguments, complaint
 ):
-  ran = subprocess.run(
-      [sys.executable, '-m', f'realab_suite.experiments.{module}', *arguments],
-      cwd=tmp_path,
-      env={**os.environ, 'PYTHONPATH': str(_ROOT)},
-      capture_output=True,
-      text=True,
-      timeout=patience.SECONDS,
-      check=False,
-  )
-  assert ran.returncode == 2, ran.stderr
-  [line] = ran.stderr.splitlines()
-  assert line.startswith('error: ')
-  assert complaint in line
+  monkeypatch.chdir(tmp_path)
+  assert complaint in in_process.complaint(module, *arguments)
   assert not list(tmp_path.iterdir())
 
 
-def test_only_a_learner_brings_jax(tmp_path):
+def test_a_scripted_job_does_not_import_jax(tmp_path):
   program = (
       'import sys\n'
       'from realab_suite.experiments import scheduler, training, jobs\n'
@@ -457,6 +443,6 @@ def test_only_a_learner_brings_jax(tmp_path):
         ('', ''),
     ],
 )
-def test_a_sweep_shows_returns_as_far_as_there_are_any(tmp_path, written, said):
+def test_a_sweep_shows_the_last_returns(tmp_path, written, said):
   (tmp_path / training.CURVE).write_text(written)
   assert scheduler._last_returns(tmp_path) == said

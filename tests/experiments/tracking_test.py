@@ -43,12 +43,12 @@ def test_a_track_has_the_returns_of_the_evaluation(recorded):
   assert track.observed_return == pytest.approx(result.observed_return)
 
 
-def test_a_listener_hears_of_the_reset_and_of_every_step(recorded):
+def test_the_callback_is_called_at_the_reset_and_every_step(recorded):
   result, _, seen = recorded
   assert seen == list(range(result.num_steps + 1))
 
 
-def test_readings_are_what_was_applied_and_what_became_of_it(recorded):
+def test_readings_are_applied_values_plus_corruption(recorded):
   _, track, _ = recorded
   for register in track.registers.values():
     values = np.array(
@@ -60,7 +60,7 @@ def test_readings_are_what_was_applied_and_what_became_of_it(recorded):
     assert len(register.blocks) == track.num_steps + 1
 
 
-def test_a_reading_stands_beside_the_write_that_came_before_it():
+def test_a_reading_is_paired_with_the_write_before_it():
   track = tracking.RegisterTrack('feedback', 0.1)
   write, read = registers.Write, registers.Read
   nowhere = np.zeros((2, 2))
@@ -92,7 +92,7 @@ def test_the_world_is_seen_from_above_without_avatar_and_registers(recorded):
   assert kinds.count('other') == 1
 
 
-def test_shapes_lie_where_the_arena_says(env, recorded):
+def test_shapes_lie_within_the_arena(env, recorded):
   _, track, _ = recorded
   corners = np.concatenate(
       [s.outline for s in track.shapes if s.kind == 'wall']
@@ -102,6 +102,6 @@ def test_shapes_lie_where_the_arena_says(env, recorded):
   np.testing.assert_allclose(corners.max(axis=0), np.add(extent.high, 0.2))
 
 
-def test_a_recorder_without_an_episode_says_so(env):
+def test_a_tracker_without_an_episode_raises(env):
   with pytest.raises(errors.ResultsError, match='no episode'):
     tracking.Tracker(env).track  # noqa: B018

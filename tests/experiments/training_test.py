@@ -1,7 +1,8 @@
-"""A run that is killed and goes on is a run that was not."""
+"""Tests of runs: results, resuming after a kill, and errors."""
 
 import dataclasses
 import errno
+import functools
 import json
 import os
 import pathlib
@@ -49,7 +50,6 @@ _SMALL = {
             'overrides': ['dof=planar'],
             'twin': True,
         },
-        'advice': {'design': 'value_advice'},
     },
     'baselines': ['apple_seeker', 'random'],
     'seeds': [3],
@@ -65,7 +65,7 @@ _SMALL = {
 
 
 class Killed(BaseException):
-  """Ends a run as suddenly as a signal, within this process."""
+  """Ends a run like a signal, within this process."""
 
 
 _make_learner = training.make_learner
@@ -78,14 +78,15 @@ def fake(monkeypatch):
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory):
-  """The folder of the small run that nothing has happened to; read only."""
+  """The folder of the small run without an interruption; read only."""
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(training, 'make_learner', fake_learner.make)
     path, said = _run(_job(), tmp_path_factory.mktemp('whole'))
-  assert said[-1] == f'Everything is in {path}'
+  assert said[-1] == f'Results are in {path}'
   return path
 
 
+@functools.cache
 def _job(run='reward', **training_changes):
   data = {**_SMALL, 'training': {**_SMALL['training'], **training_changes}}
   [job] = jobs.plan(experiment_specs.load(data), only=[run])
@@ -145,7 +146,7 @@ def _probing(run, states=20):
   return job
 
 
-def test_a_learner_is_probed_when_it_is_asked_for(tmp_path):
+def test_a_learner_is_probed_if_the_experiment_says_so(tmp_path):
   path, _ = _run(_probing('reward'), tmp_path)
   probe = probes.load(path)
   assert probe.register == 'reward'
@@ -154,7 +155,7 @@ def test_a_learner_is_probed_when_it_is_asked_for(tmp_path):
   assert probes.PROBE in done['files']
 
 
-def test_a_register_that_nobody_gets_to_is_no_reason_to_learn_again(tmp_path):
+def test_a_run_finishes_if_no_state_can_be_probed(tmp_path):
   job = _probing('reward')
   boxed = job.experiment.model_copy(update={'task': 'unlock_door.boxed'})
   path, said = _run(dataclasses.replace(job, experiment=boxed), tmp_path)
@@ -163,7 +164,7 @@ def test_a_register_that_nobody_gets_to_is_no_reason_to_learn_again(tmp_path):
   assert any('no probe: no block of register' in line for line in said)
 
 
-def test_what_cannot_be_probed_is_refused_before_it_is_trained(tmp_path):
+def test_a_design_that_cannot_be_probed_is_refused_before_training(tmp_path):
   job = _probing('reward')
   design = dataclasses.replace(
       job, design=job.design.model_copy(update={'action_set': None})
@@ -172,7 +173,7 @@ def test_what_cannot_be_probed_is_refused_before_it_is_trained(tmp_path):
     _run(design, tmp_path)
 
 
-def test_a_run_leaves_what_the_layout_says(whole):
+def test_a_run_leaves_the_documented_files(whole):
   job, path = _job(), whole
   assert path.name == job.folder()
   assert {p.name for p in path.iterdir()} == {
@@ -182,7 +183,7 @@ def test_a_run_leaves_what_the_layout_says(whole):
   assert json.loads((path / storage.CONFIG).read_text()) == job.config()
 
 
-def test_rows_are_of_the_experiment_and_of_fresh_episodes(whole):
+def test_rows_name_the_experiment_and_use_new_episodes(whole):
   rows = list(results.read_rows(whole / training.EPISODES))
   assert [(r.seed, r.world, r.episode) for r in rows] == [
       (1_000_003, world, 0) for world in range(3)
@@ -194,7 +195,7 @@ def test_rows_are_of_the_experiment_and_of_fresh_episodes(whole):
   assert info.max_steps == 17
 
 
-def test_a_curve_is_the_means_of_the_episodes_that_ended(whole):
+def test_a_curve_has_the_means_of_finished_episodes(whole):
   path = whole
   points = _lines(path, training.CURVE)
   steps = [p['step'] for p in points]
@@ -223,22 +224,21 @@ def test_a_curve_is_the_means_of_the_episodes_that_ended(whole):
   assert [line['step'] for line in timing] == steps
 
 
-def test_runs_of_an_experiment_can_be_compared_in_pairs(tmp_path):
-  rows = {}
-  for job in jobs.plan(experiment_specs.load(_SMALL)):
-    path, _ = _run(job, tmp_path)
-    rows[job.run] = list(results.read_rows(path / training.EPISODES))
-  assert list(rows) == [
-      'reward.apple_seeker', 'reward.random', 'reward', 'reward.secure',
-      'advice.apple_seeker', 'advice.random', 'advice',
-  ]  # fmt: skip
-  here = {name: rows[name] for name in rows if name.startswith('reward')}
-  summaries = comparison.compare(here, 'reward.apple_seeker')
+def test_runs_of_an_experiment_can_be_compared_in_pairs(whole, tmp_path):
+  planned = {job.run: job for job in jobs.plan(experiment_specs.load(_SMALL))}
+  paths = {'reward': whole}
+  for name in ('reward.apple_seeker', 'reward.secure'):
+    paths[name], _ = _run(planned[name], tmp_path)
+  rows = {
+      name: list(results.read_rows(path / training.EPISODES))
+      for name, path in paths.items()
+  }
+  summaries = comparison.compare(rows, 'reward.apple_seeker')
   assert summaries['reward.secure'].corruption.estimate == 0.0
   assert summaries['reward'].true_return_gained is not None
 
 
-def test_two_seeds_train_in_other_worlds_and_neither_is_judged_there(whole):
+def test_training_and_evaluation_use_different_seeds(whole):
   job = _job()
   trained = {e['seed'] for e in _lines(whole, training.TRAINING_EPISODES)}
   assert trained == {training._world_seed(3, 0)}
@@ -246,7 +246,7 @@ def test_two_seeds_train_in_other_worlds_and_neither_is_judged_there(whole):
   assert job.evaluation_seed not in trained
 
 
-def test_the_learner_sees_nothing_that_is_true(tmp_path, monkeypatch):
+def test_the_learner_gets_no_true_reward(tmp_path, monkeypatch):
   seen = []
 
   def make(job, batch):
@@ -264,7 +264,7 @@ def test_the_learner_sees_nothing_that_is_true(tmp_path, monkeypatch):
     assert not np.any(time_step.reward)
 
 
-def test_what_was_learned_can_be_loaded(whole, tmp_path):
+def test_a_trained_learner_can_be_loaded(whole, tmp_path):
   job = _job()
   path = shutil.copytree(whole, tmp_path / 'copy')
   batch = training.load_batch(job, 2, 0)
@@ -278,31 +278,19 @@ def test_what_was_learned_can_be_loaded(whole, tmp_path):
   batch.close()
 
 
-# ---- Going on ---------------------------------------------------------------
-
-
-@pytest.mark.parametrize('sleep', [False, True])
-def test_a_run_that_goes_on_ends_like_one_that_was_not_killed(
-    tmp_path, monkeypatch, sleep
-):
-  job = _job(sleep=sleep)
-  whole, _ = _run(job, tmp_path / 'whole')
-  for step in (7, 20, 21, 58):
-    output = tmp_path / str(step)
-    _kill(job, output, monkeypatch, step)
-    path, _ = _run(job, output)
-    assert _results(path) == _results(whole), step
+# ---- Resuming ---------------------------------------------------------------
 
 
 def test_a_run_may_be_killed_again_and_again(whole, tmp_path, monkeypatch):
   job = _job()
-  for step in (5, 25, 24, 45, 41):
+  # At the step of a checkpoint, after it, and twice between the same two.
+  for step in (5, 20, 21, 25, 24, 58):
     _kill(job, tmp_path, monkeypatch, step)
   path, _ = _run(job, tmp_path)
   assert _results(path) == _results(whole)
 
 
-def test_where_blocks_sleep_episodes_end_at_every_checkpoint(
+def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
     tmp_path, monkeypatch
 ):
   learners = []
@@ -311,8 +299,9 @@ def test_where_blocks_sleep_episodes_end_at_every_checkpoint(
     learners.append(fake_learner.make(job, batch))
     return learners[-1]
 
-  monkeypatch.setattr(training, 'make_learner', make)
-  path, _ = _run(_job(sleep=True), tmp_path)
+  with monkeypatch.context() as patch:
+    patch.setattr(training, 'make_learner', make)
+    path, _ = _run(_job(sleep=True), tmp_path / 'whole')
   [learner] = learners
   types = np.array(learner.step_types)
   # The step after 20 and 40 is the last one, then all worlds begin.
@@ -326,10 +315,13 @@ def test_where_blocks_sleep_episodes_end_at_every_checkpoint(
   ]
   assert not any(e['is_valid'] for e in abandoned)
   assert len({e['seed'] for e in episodes}) == 3
+  # A run that was killed ends like this one.
+  for step in (20, 25):
+    _kill(_job(sleep=True), tmp_path, monkeypatch, step)
+  assert _results(_run(_job(sleep=True), tmp_path)[0]) == _results(path)
 
 
-@pytest.mark.parametrize('point', ['step:33', 'replace:3', 'append:9'])
-def test_kill_minus_nine_changes_nothing(whole, tmp_path, point):
+def test_a_run_killed_by_sigkill_has_the_same_results(whole, tmp_path):
   file = tmp_path / 'small.yaml'
   file.write_text(yaml.safe_dump(_SMALL))
   command = [
@@ -347,42 +339,32 @@ def test_kill_minus_nine_changes_nothing(whole, tmp_path, point):
           timeout=patience.SECONDS,
           check=False,
       )
-      for environment in ({'KILL_AT': point}, {})
+      for environment in ({'KILL_AT': 'step:33'}, {})
   )
   assert killed.returncode == -signal.SIGKILL, killed.stderr
   assert again.returncode == 0, again.stderr
   path = tmp_path / 'killed' / whole.name
-  assert again.stdout.splitlines()[-1] == f'Everything is in {path}'
+  assert again.stdout.splitlines()[-1] == f'Results are in {path}'
   assert _results(path) == _results(whole)
 
 
-def test_a_run_that_is_done_is_not_done_again(whole, tmp_path):
+def test_a_finished_run_is_not_repeated(whole, tmp_path):
   job = _job()
   path = shutil.copytree(whole, tmp_path / whole.name)
   before = {p: p.stat().st_mtime_ns for p in path.iterdir()}
   del before[path / 'lock']
   _, said = _run(job, tmp_path)
-  assert said == [f'{path} is there already']
+  assert said == [f'{path} has finished already']
   assert all(p.stat().st_mtime_ns == t for p, t in before.items())
 
 
-def test_a_run_whose_results_were_changed_is_not_taken_for_done(
-    whole, tmp_path
-):
-  job = _job()
-  path = shutil.copytree(whole, tmp_path / whole.name)
-  with open(path / training.EPISODES, 'a') as file:
-    file.write('\n')
-  with pytest.raises(errors.ResultsError, match=r'episodes\.jsonl: not what'):
-    _run(job, tmp_path)
+def test_a_run_ends_if_its_sweep_is_gone(tmp_path):
+  parent = os.getppid() + 1
+  with pytest.raises(errors.ResultsError, match=f'process {parent}, which'):
+    _run(_job(), tmp_path, parent=parent)
 
 
-def test_a_run_ends_with_the_sweep_that_started_it(tmp_path):
-  with pytest.raises(errors.ResultsError, match='process 1, which started'):
-    _run(_job(), tmp_path, parent=1)
-
-
-# ---- What goes wrong --------------------------------------------------------
+# ---- Errors -----------------------------------------------------------------
 
 
 def test_a_second_launcher_is_refused_with_the_process_of_the_first(tmp_path):
@@ -414,63 +396,41 @@ def _checkpoints(path):
   return sorted((path / 'checkpoints').iterdir())
 
 
-@pytest.mark.parametrize('damage', ['truncated', 'flipped', 'empty', 'foreign'])
-def test_a_damaged_checkpoint_is_named_and_the_one_before_goes_on(
-    whole, tmp_path, monkeypatch, damage
+# `wrong_files_test` has the other ways in which a checkpoint may be wrong.
+def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
+    whole, tmp_path, monkeypatch
 ):
   job = _job()
   _kill(job, tmp_path, monkeypatch, 45)
   path = tmp_path / job.folder()
   first, last = _checkpoints(path)
-  data = bytearray(last.read_bytes())
-  if damage == 'truncated':
-    del data[len(data) // 2 :]
-  elif damage == 'flipped':
-    data[len(data) // 2] ^= 1
-  elif damage == 'empty':
-    data.clear()
-  else:
-    other = _job(curve_every=4)
-    _kill(other, tmp_path / 'other', monkeypatch, 45)
-    data = _checkpoints(tmp_path / 'other' / other.folder())[-1].read_bytes()
-  last.write_bytes(data)
+  data = last.read_bytes()
+  last.write_bytes(data[: len(data) // 2])
   with pytest.raises(errors.ResultsError) as raised:
     _run(job, tmp_path)
   message = str(raised.value)
   assert message.startswith(f'{last}: ')
   assert (
-      f'remove this file, then the same command goes on from {first.name}'
+      f'remove this file, then the same command continues from {first.name}'
       in (message)
   )
   last.unlink()
-  if damage == 'truncated':
-    _run(job, tmp_path)
-    assert _results(path) == _results(whole)
+  _run(job, tmp_path)
+  assert _results(path) == _results(whole)
 
 
-def test_without_an_older_checkpoint_a_run_begins_anew(tmp_path, monkeypatch):
+def test_a_run_without_an_older_checkpoint_restarts(tmp_path, monkeypatch):
   job = _job()
   _kill(job, tmp_path, monkeypatch, 25)
   path = tmp_path / job.folder()
   [only] = _checkpoints(path)
   only.write_bytes(b'')
-  with pytest.raises(errors.ResultsError, match='goes on from the beginning'):
-    _run(job, tmp_path)
-  only.unlink()
-  _run(job, tmp_path)
-
-
-def test_lines_that_a_checkpoint_knows_of_are_missed(tmp_path, monkeypatch):
-  job = _job()
-  _kill(job, tmp_path, monkeypatch, 25)
-  path = tmp_path / job.folder()
-  (path / training.CURVE).write_bytes(b'')
-  with pytest.raises(errors.ResultsError, match=r'curve\.jsonl: has 0 bytes'):
+  with pytest.raises(errors.ResultsError, match='continues from the beginning'):
     _run(job, tmp_path)
 
 
 @pytest.mark.parametrize('where', ['checkpoint', 'lines', 'episodes'])
-def test_a_full_disk_is_said_so_and_nothing_is_lost(
+def test_a_full_disk_is_reported_and_nothing_is_lost(
     whole, tmp_path, monkeypatch, where
 ):
   job = _job()
@@ -500,13 +460,14 @@ def test_a_full_disk_is_said_so_and_nothing_is_lost(
 
       patch.setattr(storage.os, 'fsync', failing)
     with pytest.raises(
-        errors.ResultsError, match=r'No space left .*; nothing that was compl'
+        errors.ResultsError, match=r'No space left .*; complete results are'
     ):
       _run(job, tmp_path)
   assert not list(path.rglob('*.partial'))
   assert _checkpoints(path)
-  _run(job, tmp_path)
-  assert _results(path) == _results(whole)
+  if where == 'lines':
+    _run(job, tmp_path)
+    assert _results(path) == _results(whole)
 
 
 def test_a_folder_that_cannot_be_made_is_named(tmp_path):

@@ -1,4 +1,4 @@
-"""The key of a register in its design is its only name."""
+"""Tests that figures do not depend on the names of registers."""
 
 import pytest
 
@@ -8,18 +8,10 @@ from realab_suite import suite
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import specs
 
+# `campaigns/names_campaign.py` tries all names.
 _SAMPLE = [
-    names_campaign.Case(
-        'unlock_door', 'instantaneous_reward', 'score', 'apples'
-    ),
-    names_campaign.Case(
-        'unlock_door', 'instantaneous_reward', 'reward', 'feedback'
-    ),
+    names_campaign.Case('unlock_door', 'instantaneous_reward', 'score', 'door'),
     names_campaign.Case('collect_apples', 'value_advice', 'query', 'avatar'),
-    names_campaign.Case('unlock_door', 'decoupled_approval', 'query', 'door'),
-    names_campaign.Case(
-        'collect_apples', 'online_imitation', 'demonstration', 'rays'
-    ),
 ]
 
 
@@ -27,27 +19,22 @@ _SAMPLE = [
 def test_figures_do_not_depend_on_the_name_of_a_register(
     case: names_campaign.Case,
 ):
-  assert case in names_campaign.cases()
+  assert case.new in names_campaign.entity_names(case.domain)
   assert not names_campaign.differing(case, seed=1)
 
 
-@pytest.mark.parametrize(
-    'name', ['apples', 'door', 'pad', 'avatar', 'feedback']
-)
-def test_an_honest_agent_is_honest_whatever_the_meter_register_is_called(
-    name: str,
-):
+def test_an_honest_agent_shows_no_corruption_with_a_meter_called_apples():
   design = names_campaign.renamed(
-      specs.load('instantaneous_reward').to_mapping(), 'score', name
+      specs.load('instantaneous_reward').to_mapping(), 'score', 'apples'
   )
-  env = suite.load('unlock_door', 'standard', {'random': 1}, design=design)
+  env = suite.load('unlock_door', 'near', {'random': 1}, design=design)
   (result,) = evaluate.evaluate(env, policies.make('apple_seeker'), 1)
   env.close()
   assert result.corruption < 1e-9
-  assert result.registers[name].num_writes == result.num_steps + 1
+  assert result.registers['apples'].num_writes == result.num_steps + 1
 
 
-def test_an_element_of_an_action_is_named_after_the_register_of_the_design():
+def test_an_element_of_an_action_has_the_name_of_its_register():
   design = names_campaign.renamed(
       specs.load('value_advice').to_mapping(), 'query', 'door'
   )

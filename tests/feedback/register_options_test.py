@@ -1,29 +1,29 @@
-"""What goes wrong with the options of registers and policies names its key."""
+"""Tests for options of register kinds: errors name the register."""
 
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.entities import registers
 from realab_suite.feedback import register_kinds
+from tests.config import refusals
 from tests.engine import helpers
+from tests.feedback import designs
+from tests.feedback import stubs
 
 _FAILURES = {
     'spec': errors.SpecError('held: 7; allowed is 1'),
     'unknown': errors.UnknownNameError('held: seven; known is one'),
     'value': ValueError('seven\nis too many'),
-    'key': KeyError('seven'),
     'zero': ZeroDivisionError(),
 }
 
 
-class _Fragile(registers.Register):
-  """Fails as it is told to."""
+class _Fragile(stubs.Still):
+  """Raises the error that its option `fail` names."""
 
   def _build(
       self, name: str, *, fail: str = '', held: Any = 0.0, **kwargs: Any
@@ -33,15 +33,6 @@ class _Fragile(registers.Register):
     self.held = held + 1.0
     super()._build(name, **kwargs)
 
-  def _build_blocks(self) -> list[Any]:
-    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
-
-  def _put(self, physics: Any, value: np.ndarray) -> None:
-    del physics, value
-
-  def _look(self, physics: Any) -> np.ndarray:
-    return self.applied(physics)
-
 
 @pytest.fixture(autouse=True)
 def _fragile() -> Iterator[None]:
@@ -50,40 +41,22 @@ def _fragile() -> Iterator[None]:
     yield
 
 
-def _design(kind: str = 'test_fragile', **options: Any) -> dict[str, Any]:
-  register = {
-      'kind': kind, 'role': 'feedback', 'place': [0, 2], 'range': [0, 1]
-  }  # fmt: skip
-  return {
-      'schema': 1,
-      'name': 'd',
-      'registers': {'other': {**register, 'options': {}, 'kind': 'two_block',
-                              'place': [2, 2]},
-                    'reward': {**register, 'options': options}},
-  }  # fmt: skip
-
-
-def _refusal(design: dict[str, Any]) -> str:
-  with pytest.raises(errors.SpecError) as caught:
-    suite.load('collect_apples', 'standard', design=design)
-  text = str(caught.value)
-  assert '\n' not in text
-  return text
+def _load(kind: str = 'test_fragile', **options: Any) -> Any:
+  design = designs.changed(f'registers.reward.kind={kind}')
+  design['registers']['reward']['options'] = options
+  return suite.load('collect_apples', 'standard', design=design)
 
 
 def test_a_kind_gets_its_options():
-  env = suite.load('collect_apples', 'standard', design=_design(held=2))
+  env = _load(held=2)
   assert env.mechanism.registers['reward'].held == 3.0
   env.close()
 
 
 @pytest.mark.parametrize('kind', ['test_fragile', 'two_block'])
-@pytest.mark.parametrize(
-    'option',
-    ['name', 'self', 'value_range', 'scale', 'role', 'args', 'kwargs', 'held_'],
-)
-def test_what_is_no_option_of_a_kind_is_refused(kind: str, option: str):
-  text = _refusal(_design(kind, **{option: 1}))
+@pytest.mark.parametrize('option', ['name', 'self', 'scale', 'kwargs', 'held_'])
+def test_an_unknown_option_is_refused(kind: str, option: str):
+  text = refusals.refusal(_load, kind, **{option: 1})
   assert 'registers.reward.options' in text
   assert f"'{option}'" in text
   assert ('held' in text.split('allowed')[1]) == (kind == 'test_fragile')
@@ -91,40 +64,33 @@ def test_what_is_no_option_of_a_kind_is_refused(kind: str, option: str):
 
 @pytest.mark.parametrize('held', ['x', [1], {'a': 1}, None])
 def test_a_value_that_a_kind_cannot_use_names_the_register(held: Any):
-  text = _refusal(_design(held=held))
+  text = refusals.refusal(_load, held=held)
   assert 'registers.reward' in text
-  assert 'registers.other' not in text
+  assert 'registers.score' not in text
 
 
 @pytest.mark.parametrize('fail', _FAILURES)
-def test_whatever_a_kind_raises_names_the_register(fail: str):
+def test_any_error_of_a_kind_names_the_register(fail: str):
   failure = _FAILURES[fail]
-  text = _refusal(_design(fail=fail))
+  with pytest.raises(errors.SpecError) as caught:
+    _load(fail=fail)
+  text = str(caught.value)
+  assert '\n' not in text
   assert 'registers.reward' in text
   if isinstance(failure, errors.SpecError):
     assert text.endswith(str(failure))
   else:
     assert type(failure).__name__ in text
     assert 'seven' in text or not str(failure)
+    assert caught.value.__cause__ is failure
 
 
-def test_what_a_kind_raises_is_the_cause():
-  with pytest.raises(errors.SpecError) as caught:
-    suite.load('collect_apples', 'standard', design=_design(fail='value'))
-  assert caught.value.__cause__ is _FAILURES['value']
-
-
-def test_an_option_of_a_policy_may_be_called_as_anything():
-  class Named(policies.Policy):
-    """Has options with names that other functions use, too."""
+def test_an_option_of_a_policy_may_have_any_name():
+  class Named(stubs.Idle):
+    """Has options with the names of arguments of `policies.make`."""
 
     def __init__(self, name: str = '', what: str = '', names: str = '') -> None:
       self.given = name, what, names
-
-    def step(
-        self, observation: Any, episode_start: Any, key: Any, state: Any
-    ) -> tuple[Any, Any]:
-      raise NotImplementedError
 
   with helpers.registered(policies.POLICIES, 'test_named', Named):
     made = policies.make('test_named', name='a', what='b', names='c')

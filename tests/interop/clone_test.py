@@ -6,6 +6,7 @@ import os
 import pathlib
 import sys
 import tempfile
+from typing import Any, NamedTuple
 
 from absl import flags
 from absl.testing import flagsaver
@@ -65,18 +66,43 @@ def _serve(output, *flags):
   return episodes
 
 
-@_is_linux
-def test_a_clone_predicts_no_observation_of_any_episode(tmp_path):
-  output = tmp_path / 'results'
+class _Run(NamedTuple):
+  """A served run, and everything that others can see of it."""
+
+  output: pathlib.Path
+  address: str
+  arguments: dict[str, str]
+  given: bytes
+  printed: str
+  episodes: list[Any]
+
+
+@pytest.fixture(scope='module', name='run')
+def _run(tmp_path_factory):
+  output = tmp_path_factory.mktemp('run') / 'results'
   with served.in_process(output, *_FLAGS) as program:
-    arguments = clones.arguments_of(program.process.pid)
+    process = pathlib.Path('/proc', str(program.process.pid))
+    given = b''.join(
+        (process / name).read_bytes()
+        for name in ('cmdline', 'environ')
+        if process.exists()
+    )
+    arguments = {}
+    if sys.platform == 'linux':
+      arguments = clones.arguments_of(program.process.pid)
     with served.Client(program.address) as client:
       episodes = clones.play(client.env())
+    printed = ''.join(program.process.communicate())
     assert program.process.wait(patience.SECONDS) == 0
-  assert arguments['seed'] == str(_SEED)
-  clone = clones.make(int(arguments['seed']))
-  assert _num_right(clones.predict(clone, episodes)) == [0, 0, 0]
-  _check_that_only_the_salt_is_missing(output, episodes)
+  return _Run(output, program.address, arguments, given, printed, episodes)
+
+
+@_is_linux
+def test_a_clone_predicts_no_observation_of_any_episode(run):
+  assert run.arguments['seed'] == str(_SEED)
+  clone = clones.make(int(run.arguments['seed']))
+  assert _num_right(clones.predict(clone, run.episodes)) == [0, 0, 0]
+  _check_that_only_the_salt_is_missing(run.output, run.episodes)
 
 
 @_is_linux
@@ -96,18 +122,15 @@ def test_a_program_of_another_user_predicts_nothing():
     _check_that_only_the_salt_is_missing(output, report.episodes)
 
 
-def test_no_seed_begins_as_a_served_world_does(tmp_path):
-  with served.in_process(tmp_path / 'results', *_FLAGS) as program:
-    with served.Client(program.address) as client:
-      [episode] = clones.play(client.env(), 1)
-  assert clones.find_seeds(episode, range(2_000)) == []
+def test_no_seed_has_the_start_of_a_served_world(run):
+  assert clones.find_seeds(run.episodes[0], range(500)) == []
 
 
-def test_a_seed_without_a_salt_is_found_and_predicts_everything():
-  with served.in_thread(lambda: clones.make(1_234)) as serving:
+def test_a_seed_without_a_salt_can_be_found():
+  with served.in_thread(lambda: clones.make(234)) as serving:
     with served.Client(serving.address) as client:
       episodes = clones.play(client.env())
-  [seed] = clones.find_seeds(episodes[0], range(2_000))
+  [seed] = clones.find_seeds(episodes[0], range(500))
   predictions = clones.predict(clones.make(seed), episodes)
   assert _num_right(predictions) == _num_time_steps(episodes)
   true_returns = [prediction.true_return for prediction in predictions]
@@ -115,37 +138,26 @@ def test_a_seed_without_a_salt_is_found_and_predicts_everything():
   assert max(true_returns) > 0.0
 
 
-def test_runs_of_one_seed_differ():
-  with tempfile.TemporaryDirectory() as folder:
-    outputs = [pathlib.Path(folder, name) for name in 'ab']
-    one, other = (_serve(output, *_FLAGS) for output in outputs)
-    assert [e.position for e in one] != [e.position for e in other]
-    digests = [row.info.salt_digest for o in outputs for row in _rows(o)]
-    assert len(set(digests)) == 2
-    assert None not in digests
+def test_runs_of_one_seed_differ(run, tmp_path):
+  other = _serve(tmp_path / 'other', *_FLAGS)
+  assert [e.position for e in run.episodes] != [e.position for e in other]
+  outputs = (run.output, tmp_path / 'other')
+  digests = [row.info.salt_digest for o in outputs for row in _rows(o)]
+  assert len(set(digests)) == 2
+  assert None not in digests
 
 
 # The salt is the evaluator's alone.
 
 
-def test_the_salt_is_in_the_record_and_nowhere_else(tmp_path):
-  output = tmp_path / 'results'
-  with served.in_process(output, *_FLAGS) as program:
-    with served.Client(program.address) as client:
-      clones.play(client.env())
-    process = pathlib.Path('/proc', str(program.process.pid))
-    given = b''.join(
-        (process / name).read_bytes()
-        for name in ('cmdline', 'environ')
-        if process.exists()
-    )
-    said = ''.join(program.process.communicate())
+def test_the_salt_is_in_the_record_and_nowhere_else(run):
+  output = run.output
   forms = clones.forms_of(clones.seed_in(output).salt)
   places = {path.name: path.read_bytes() for path in output.iterdir()}
   places |= {
-      'what it is given': given,
-      'what it prints': said.encode(),
-      'names': ' '.join((program.address, *places)).encode(),
+      'what it is given': run.given,
+      'what it prints': run.printed.encode(),
+      'names': ' '.join((run.address, *places)).encode(),
   }
   found = [
       name
@@ -180,7 +192,7 @@ def test_a_tier_for_other_users_needs_a_salt(monkeypatch):
 
 
 @_is_root
-def test_a_folder_of_another_user_takes_no_results(tmp_path):
+def test_a_folder_of_another_user_is_refused(tmp_path):
   output = tmp_path / 'theirs'
   output.mkdir()
   os.chown(output, _NOBODY, _NOBODY)
@@ -193,7 +205,7 @@ def test_a_folder_of_another_user_takes_no_results(tmp_path):
 # A run that is repeated.
 
 
-def test_a_run_is_repeated_by_its_record(tmp_path):
+def test_a_record_repeats_a_run(tmp_path):
   first, second = tmp_path / 'first', tmp_path / 'second'
   design = ('--design=online_imitation', '--set=providers.0.policy=random')
   episodes = _serve(first, *_FLAGS, *design)
@@ -238,15 +250,12 @@ def test_a_record_serves_its_twin(tmp_path):
   record = small.write_served_run(tmp_path)
   given = dataclasses.replace(_settings(record), overrides=('channel=secure',))
   settings, design, seed = served_evaluation._chosen(given)
-  assert settings.overrides == (
-      'registers.reward.scale=0.2',
-      'channel=secure',
-  )
+  assert settings.overrides == ('registers.reward.scale=0.2', 'channel=secure')
   assert (design.channel, design.registers['reward'].scale) == ('secure', 0.2)
   assert seed.salt == small.SALT
 
 
-def test_other_versions_than_recorded_are_named(tmp_path, caplog):
+def test_versions_that_differ_from_the_record_are_named(tmp_path, caplog):
   record = small.write_served_run(tmp_path)
   content = json.loads(record.read_text())
   del content['checksum']
@@ -262,7 +271,7 @@ def test_other_versions_than_recorded_are_named(tmp_path, caplog):
 @pytest.mark.parametrize(
     'flag', ['domain', 'task', 'design', 'seed', 'max_steps']
 )
-def test_what_a_record_decides_is_no_flag_beside_it(flag):
+def test_flags_that_a_record_decides_are_refused(flag):
   value = '1' if flag in ('seed', 'max_steps') else 'collect_apples'
   with flagsaver.flagsaver():
     flags.FLAGS(['serve', '--output=x', '--repeat=y', f'--{flag}={value}'])

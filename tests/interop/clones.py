@@ -1,4 +1,4 @@
-"""Clones of a served world, made from what another user can read.
+"""Clones of a served world, made from data that another user can read.
 
 The package is public, and every user can read the arguments of a process. A
 clone with the random streams of a served world predicts all observations and
@@ -54,7 +54,7 @@ class Episode(NamedTuple):
 
 
 class Prediction(NamedTuple):
-  """What a clone predicts of one episode.
+  """Predictions of a clone for one episode.
 
   Attributes:
     num_right: Number of time steps predicted to the last bit.
@@ -66,7 +66,7 @@ class Prediction(NamedTuple):
 
 
 class Report(NamedTuple):
-  """What a program of another user has found out.
+  """Findings of a program of another user.
 
   Attributes:
     opened: The files of the evaluator that it could open, by name.
@@ -114,7 +114,7 @@ def seed_in(output: pathlib.Path) -> seeding.SaltedSeed:
 
 
 def forms_of(salt: bytes) -> dict[str, bytes]:
-  """Returns what a salt looks like where it is written down."""
+  """Returns the forms in which a salt may be written."""
   number = int.from_bytes(salt)
   return {
       'bytes': salt,
@@ -222,23 +222,23 @@ def _main(address: str, pid: str, folder: str, user: str) -> None:
   os.setgid(int(user))
   os.setuid(int(user))
   arguments = arguments_of(int(pid))
+  process = pathlib.Path('/proc', pid)
+  secrets = ('environ', 'maps', 'mem', 'auxv', 'stack', 'fd/0')
   with served.Client(address) as client:
-    episodes = play(client.env())
+    env = client.env()
+    # While the process surely runs: files of one that ends can be opened, and
+    # are empty.
+    opened = _opened(process / name for name in ('cmdline', *secrets))
+    episodes = play(env)
+  names = ('run.json', 'episodes.jsonl')
+  opened += _opened(pathlib.Path(folder, name) for name in names)
   clone = make(int(arguments['seed']), design)
-  report = Report(
-      _opened(pathlib.Path('/proc', pid), pathlib.Path(folder)),
-      arguments,
-      episodes,
-      predict(clone, episodes),
-  )
+  report = Report(opened, arguments, episodes, predict(clone, episodes))
   print(json.dumps(report))
 
 
-def _opened(process: pathlib.Path, results: pathlib.Path) -> list[str]:
-  """Returns which files of a process and its results can be opened."""
-  secrets = ('environ', 'maps', 'mem', 'auxv', 'stack', 'fd/0')
-  files = [process / name for name in ('cmdline', *secrets)]
-  files += [results / name for name in ('run.json', 'episodes.jsonl')]
+def _opened(files: Iterable[pathlib.Path]) -> list[str]:
+  """Returns the names of the files that can be opened."""
   opened = []
   for file in files:
     with contextlib.suppress(OSError), open(file, 'rb'):

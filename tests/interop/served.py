@@ -1,4 +1,4 @@
-"""What tests and campaigns of served worlds share: servers, and clients."""
+"""Servers and clients for tests and campaigns of served worlds."""
 
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
@@ -166,7 +166,7 @@ def in_process(
 
 
 class Client:
-  """A client that says what it likes, and hears what there is to hear."""
+  """A client that sends any bytes, and returns the replies."""
 
   def __init__(self, address: str) -> None:
     self.channel = grpc.insecure_channel(
@@ -250,7 +250,7 @@ def request(**payload: Any) -> bytes:
 
 
 def response(answer: bytes) -> pb.EnvironmentResponse:
-  """Returns what bytes are an answer of."""
+  """Parses a reply."""
   return pb.EnvironmentResponse.FromString(answer)
 
 
@@ -320,12 +320,12 @@ def endlessly(*flags: str) -> Iterator[Program]:
       tempfile.TemporaryDirectory() as folder,
       in_process(
           pathlib.Path(folder) / 'results',
-          '--episodes=1000000000',
+          '--episodes=1000000',
           '--max_steps=20',
           *flags,
       ) as program,
   ):
-    # Nobody reads what it says.
+    # Its output is not read.
     for stream in (program.process.stdout, program.process.stderr):
       threading.Thread(target=_drain, args=[stream], daemon=True).start()
     yield program
@@ -338,6 +338,6 @@ def _drain(stream: Any) -> None:
 
 
 def rss(pid: int) -> float:
-  """Returns how much memory a process has, in MiB."""
+  """Returns the memory of a process, in MiB."""
   pages = int(pathlib.Path(f'/proc/{pid}/statm').read_text().split()[1])
   return pages * resource.getpagesize() / _MIB

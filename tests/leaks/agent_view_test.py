@@ -45,7 +45,7 @@ def test_a_view_keeps_the_contract(case: pairs.Case):
   assert contract.complaints(case) == []
 
 
-def test_a_view_tells_what_the_environment_tells():
+def test_a_view_returns_the_time_steps_of_the_environment():
   env, other = _ALONE.load(), _ALONE.load()
   view = agent_view.AgentView(other)
   assert isinstance(view, dm_env.Environment)
@@ -53,7 +53,7 @@ def test_a_view_tells_what_the_environment_tells():
     assert pairs.encode(view.step(action)) == pairs.encode(env.step(action))
 
 
-def test_a_view_of_many_worlds_tells_what_the_batch_tells():
+def test_a_batch_view_returns_the_time_steps_of_the_batch():
   batch, other = _MANY.load(), _MANY.load()
   view = agent_view.BatchAgentView(other)
   for action in pairs.walk(batch.action_spec(), _MANY):
@@ -61,7 +61,7 @@ def test_a_view_of_many_worlds_tells_what_the_batch_tells():
 
 
 @_EITHER
-def test_the_evaluator_hears_of_what_an_agent_does_through_its_view(
+def test_sinks_record_steps_taken_through_a_view(
     case: pairs.Case,
 ):
   env = case.load()
@@ -72,7 +72,6 @@ def test_the_evaluator_hears_of_what_an_agent_does_through_its_view(
     view.step(action)
   episodes = ledger.episodes(1) if case.num_envs else ledger.episodes
   assert [e.num_steps for e in episodes if e.end is not None] == [9, 9]
-  env.close()
 
 
 @_EITHER
@@ -91,7 +90,6 @@ def test_closing_a_view_leaves_the_environment_alone(case: pairs.Case):
   # The episode that was under way goes on.
   step_type = np.ravel(env.step(action).step_type)
   assert set(step_type.tolist()) == {1}
-  env.close()
 
 
 @_EITHER
@@ -112,13 +110,13 @@ def test_a_view_of_something_else_is_refused():
     agent_view.BatchAgentView(env)  # type: ignore[arg-type]
 
 
-def test_a_view_is_not_copied_with_what_is_behind_it():
+def test_a_view_cannot_be_deep_copied():
   view = agent_view.AgentView(_ALONE.load())
   with pytest.raises(TypeError, match='cannot be pickled or copied'):
     copy.deepcopy(view)
 
 
-def test_the_evaluator_gets_the_failures_that_an_agent_is_not_told_of():
+def test_errors_hidden_from_the_agent_reach_the_evaluator():
   env = _ALONE.load()
   kept: list[Exception] = []
   view = agent_view.AgentView(env, kept)
@@ -133,7 +131,7 @@ def test_the_evaluator_gets_the_failures_that_an_agent_is_not_told_of():
   assert [str(e) for e in kept] == [f'the true reward is {secrets.CANARY}'] * 2
 
 
-def test_a_task_that_says_it_was_the_action_is_not_believed():
+def test_an_action_error_of_a_task_is_a_world_error():
   env = _ALONE.load()
   view = agent_view.AgentView(env)
   view.reset()
@@ -147,7 +145,7 @@ def test_a_task_that_says_it_was_the_action_is_not_believed():
     view.step(action)
 
 
-def test_what_a_bad_action_says_is_what_the_environment_says():
+def test_view_and_environment_reject_actions_with_one_message():
   env = _ALONE.load()
   view = agent_view.AgentView(env)
   for action in (None, 'a', [np.nan] * 6, np.zeros(2), [[1.0], [2.0, 3.0]]):
@@ -194,7 +192,7 @@ def test_a_discount_before_the_end_of_an_episode_is_1():
   assert view.step([0.1]).discount == 0.25
 
 
-def test_enabling_an_observable_of_somebody_elses_task_shows_nothing():
+def test_enabling_an_observable_of_a_foreign_task_shows_nothing():
   task = helpers.PointTask()
   env = suite.embed(task, 'none', random=1, max_steps=5)
   view = agent_view.AgentView(env)
@@ -215,7 +213,7 @@ def test_enabling_every_observable_shows_the_agent_nothing_more(domain: str):
 
 
 @pytest.mark.mujoco_warns('BADQPOS')
-def test_an_episode_whose_physics_fail_tells_an_agent_nothing():
+def test_failing_physics_leak_nothing_to_the_agent():
   for domain in suite.TASKS_BY_DOMAIN:
     assert contract.divergence(_ALONE._replace(domain=domain)) == []
 
@@ -243,7 +241,7 @@ def test_no_key_of_an_observation_names_a_meter_or_query_register():
     assert roles <= {'feedback', 'signal'}
 
 
-def test_five_hundred_failures_tell_an_agent_nothing():
+def test_five_hundred_failures_leak_nothing():
   scanned = failures.scan(2)
   assert scanned.found == []
   assert scanned.num_failures >= 500
@@ -262,5 +260,5 @@ def test_five_hundred_failures_tell_an_agent_nothing():
         ('one\ntwo', 'another line'),
     ],
 )
-def test_a_text_that_says_too_much_is_noticed(text: str, what: str):
+def test_a_text_with_a_secret_is_detected(text: str, what: str):
   assert what in ' '.join(failures.complaints_about_text(text))

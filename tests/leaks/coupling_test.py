@@ -32,7 +32,7 @@ def test_moving_a_distant_meter_is_not_felt(solver: str):
     ],
     ids=['another', 'jumps once', 'jumps all the time'],
 )
-def test_what_a_distant_meter_measures_is_not_felt(measure, solver: str):
+def test_the_values_of_a_distant_meter_are_not_felt(measure, solver: str):
   world = _world(solver)
   assert solver_coupling_campaign.play(
       world, measure=measure
@@ -65,7 +65,7 @@ def test_nothing_touches_a_meter_behind_a_barrier(domain: str):
   assert solver_coupling_campaign.contacts(domain, 120, 0) == 0
 
 
-def test_whoever_touches_a_meter_is_noticed():
+def test_contacts_with_a_meter_are_counted():
   # The control: this meter is in the way.
   env = solver_coupling_campaign.suite.load(
       'collect_apples', 'standard', {'random': 0}, design='instantaneous_reward'
@@ -77,4 +77,3 @@ def test_whoever_touches_a_meter_is_noticed():
   env.task.avatar.place(env.physics, np.array([x - 0.25, y]), 0.0)
   env.physics.forward()
   assert solver_coupling_campaign.num_contacts_of_meters(env) > 0
-  env.close()

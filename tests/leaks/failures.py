@@ -31,7 +31,7 @@ _FORBIDDEN = {
     'another line': re.compile(r'\n'),
 }
 _WORLD_ERROR = re.compile(
-    r'error \d+ of this view: the world failed; the evaluator knows how'
+    r'error \d+ of this view: the world failed; the evaluator has the exception'
 )
 _OURS = (agent_view.__file__, __file__)
 

@@ -31,7 +31,7 @@ def test_nothing_is_found_where_nothing_was_planted(check: mutants.Check):
 
 
 def test_every_channel_has_a_planted_leak_or_a_reason_for_none():
-  planted = set(mutants.channels())
+  planted = {mutant.channel for mutant in mutants.MUTANTS}
   assert not planted & set(mutants.NOT_HERE)
   assert sorted(planted | set(mutants.NOT_HERE)) == sorted(_CHANNELS)
   assert len(planted) >= 36
@@ -40,7 +40,7 @@ def test_every_channel_has_a_planted_leak_or_a_reason_for_none():
   )
 
 
-def test_a_leak_that_nobody_finds_is_reported():
+def test_an_undetected_leak_is_reported():
   blind = mutants.MUTANTS[0]._replace(check=list)
   assert leaks_campaign.uncaught([blind]) == [
       'L1 The reward is the true reward.'
@@ -52,6 +52,6 @@ def test_no_public_name_of_a_view_leads_to_a_secret(num_envs: int):
   assert walk.find(pairs.Case(num_envs=num_envs, steps=3)) == []
 
 
-def test_private_names_lead_to_secrets_which_is_no_promise():
+def test_private_names_lead_to_secrets():
   reached = walk.secrets_reached(pairs.Case(steps=3))
   assert 'environment' in reached

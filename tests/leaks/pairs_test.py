@@ -45,7 +45,7 @@ def test_without_meters_another_true_reward_changes_no_bit(
 
 
 @pytest.mark.parametrize('name', ['another sign', 'reward that raises'])
-def test_nor_does_it_in_many_worlds(name: str):
+def test_another_true_reward_changes_no_bit_in_a_batch(name: str):
   case = pairs.Case(num_envs=2)
   assert pairs.differences(case, secrets.REWARDS[name]) == []
 
@@ -59,9 +59,7 @@ def test_nor_does_it_in_many_worlds(name: str):
         ('jumps once', 'standard'),
     ],
 )
-def test_what_a_meter_that_nobody_reads_says_changes_no_bit(
-    name: str, variation: str
-):
+def test_an_unread_meter_changes_no_bit(name: str, variation: str):
   secret = secrets.METERS[name]
   ((case, leave_out),) = [
       (case, leave_out)
@@ -73,18 +71,18 @@ def test_what_a_meter_that_nobody_reads_says_changes_no_bit(
 
 
 @pytest.mark.parametrize('name', ['reward that draws 3', 'provider that draws'])
-def test_whoever_draws_numbers_changes_no_bit(name: str):
+def test_drawing_random_numbers_changes_no_bit(name: str):
   case = pairs.Case(design='instantaneous_reward', steps=24, max_steps=9)
   assert pairs.differences(case, secrets.RANDOM[name]) == []
 
 
 @pytest.mark.parametrize('name', secrets.OBSERVERS)
-def test_whoever_watches_changes_no_bit(name: str):
+def test_observers_change_no_bit(name: str):
   case = pairs.Case(design='instantaneous_reward', steps=24, max_steps=9)
   assert pairs.differences(case, secrets.OBSERVERS[name]) == []
 
 
-def test_with_meters_another_true_reward_does_show():
+def test_with_meters_another_true_reward_is_visible():
   # The control: these comparisons can tell runs apart.
   case = pairs.Case(design='instantaneous_reward')
   found = pairs.differences(case, secrets.REWARDS['another scale'])
@@ -104,14 +102,14 @@ def test_another_seed_is_another_transcript():
   assert one.agent != other.agent
 
 
-def test_the_true_reward_reaches_the_evaluator_as_it_is():
+def test_the_true_reward_reaches_the_evaluator_unchanged():
   found = pairs.play(pairs.Case(), secrets.REWARDS['the canary'])
   eaten = sum(map(float, found.true_rewards)) / secrets.CANARY
   assert eaten >= 1
   assert eaten == pytest.approx(round(eaten))
 
 
-def test_only_the_event_sinks_hear_of_the_true_reward():
+def test_only_event_sinks_receive_the_true_reward():
   # Nothing that a provider gets has anything to do with it either.
   env = pairs.Case().load()
   sink = helpers.RecordingSink()
@@ -119,7 +117,6 @@ def test_only_the_event_sinks_hear_of_the_true_reward():
   env.reset()
   env.task.earn(env.physics, secrets.CANARY)
   time_step = env.step(helpers.no_op(env))
-  env.close()
   assert not sink.records(registers.Write, 'score')
   numbers = np.concatenate(
       [np.ravel(value) for value in time_step.observation.values()]
@@ -133,11 +130,11 @@ def test_pairs_of_the_campaign_are_counted():
   assert counts == leaks_campaign.PairCounts(3, 0, 0)
 
 
-def test_worlds_that_are_stepped_in_turns_do_not_meet():
+def test_worlds_that_are_stepped_in_turns_do_not_interact():
   assert leaks_campaign.interleave(2, 0) == leaks_campaign.Interleaving(0, 0)
 
 
-def test_worlds_that_meet_are_noticed(monkeypatch: pytest.MonkeyPatch):
+def test_interacting_worlds_are_detected(monkeypatch: pytest.MonkeyPatch):
   shared = np.zeros(())
   encode = pairs.encode
 

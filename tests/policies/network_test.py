@@ -1,4 +1,4 @@
-"""Tests for supervisors that were trained: their files, bits and returns."""
+"""Tests for network policies: their files, outputs and returns."""
 
 from collections.abc import Mapping
 import dataclasses
@@ -21,8 +21,8 @@ from realab_suite.policies import network_policies
 
 _FOLDER = pathlib.Path(__file__).parents[2] / 'configs' / 'networks'
 _KEY = np.zeros(2, np.uint64)
-# What a shipped network does never changes under its name: results of designs
-# that name it could not be compared. A new one gets a new name.
+# A shipped network never changes, so that results of designs that name it stay
+# comparable. A new one gets a new name.
 _DIGESTS = {
     'demonstrator_v1': (
         '2fb22618e297fb026e89698e58509269d7ffe2b5de669562212d1bfc3e5bb840'
@@ -30,8 +30,6 @@ _DIGESTS = {
 }
 _CHOOSE = (
     ('online_imitation', 'providers.0.policy=network_demonstrator'),
-    ('value_advice', 'providers.0.value_function=network_values'),
-    ('decoupled_approval', 'providers.0.value_function=network_values'),
     ('paired_decoupled_approval', 'providers.0.value_function=network_values'),
 )
 
@@ -43,7 +41,7 @@ def fixture_shipped() -> network_files.Network:
 
 @pytest.fixture(scope='module', name='views')
 def fixture_views() -> dict[str, np.ndarray]:
-  """What is seen in 256 worlds after some steps of chance."""
+  """Returns observations of 256 worlds after some random actions."""
   batch = suite.load_batch(
       'unlock_door', 'near', {'random': 3}, num_envs=64, design='none'
   )
@@ -79,25 +77,12 @@ def _returns(policy: policies.Policy, variation: str) -> np.ndarray:
   return np.array([episode.true_return for episode in episodes])
 
 
-def _save(
-    path: pathlib.Path, arrays: Mapping[str, np.ndarray], pickles: bool = False
-) -> str:
-  np.savez(path, allow_pickle=pickles, **arrays)
-  return str(path)
-
-
 def _arrays(net: network_files.Network) -> dict[str, np.ndarray]:
   with np.load(io.BytesIO(net.to_bytes())) as archive:
     return dict(archive)
 
 
-def _with_header(net: network_files.Network, **changes: object) -> bytes:
-  """Returns a file whose header says something else, and agrees with itself."""
-  header = network_files.Header(**{**net.header.model_dump(), **changes})
-  return dataclasses.replace(net, header=header).to_bytes()
-
-
-def test_what_ships_is_what_the_folder_holds_and_never_changes():
+def test_shipped_networks_are_those_of_the_folder_and_unchanged():
   files = sorted(path.stem for path in _FOLDER.glob('*.npz'))
   assert list(network_files.NETWORKS) == files == sorted(_DIGESTS)
   for name, digest in _DIGESTS.items():
@@ -105,7 +90,7 @@ def test_what_ships_is_what_the_folder_holds_and_never_changes():
 
 
 @pytest.mark.parametrize('name', sorted(_DIGESTS))
-def test_a_shipped_network_is_small_and_says_how_it_was_made(name):
+def test_a_shipped_network_is_small_and_records_its_training(name):
   path = _FOLDER / f'{name}.npz'
   assert path.stat().st_size <= 150_000
   net = network_files.load(path)
@@ -130,16 +115,17 @@ def test_a_shipped_network_is_small_and_says_how_it_was_made(name):
     assert reached.episodes >= 100
 
 
-@pytest.mark.parametrize('variation', ['near', 'standard'])
-def test_a_shipped_network_reaches_what_it_promises(shipped, variation):
-  returns = _returns(policies.NetworkDemonstrator(shipped), variation)
+def test_a_shipped_network_reaches_its_return(shipped):
+  returns = _returns(policies.NetworkDemonstrator(shipped), 'standard')
   assert len(returns) == 16
   assert returns.mean() >= 15
   assert (returns >= 10).mean() >= 0.8
 
 
-@pytest.mark.parametrize('size', [1, 3, 256])
-def test_what_a_world_gets_does_not_depend_on_others(shipped, views, size):
+@pytest.mark.parametrize('size', [3, 256])
+def test_outputs_do_not_depend_on_the_other_worlds_of_a_batch(
+    shipped, views, size
+):
   expected = np.stack(
       [
           network_policies.outputs(shipped, _worlds(views, i), ())
@@ -156,7 +142,7 @@ def test_what_a_world_gets_does_not_depend_on_others(shipped, views, size):
   assert len(np.unique(expected, axis=0)) > 200
 
 
-def test_features_and_outputs_are_those_of_the_learners(shipped, views):
+def test_features_and_outputs_equal_those_of_the_learners(shipped, views):
   pytest.importorskip('equinox')
   from realab_suite.agents import features
   from realab_suite.agents import networks
@@ -185,7 +171,7 @@ def test_features_and_outputs_are_those_of_the_learners(shipped, views):
   np.testing.assert_allclose(outputs, x, rtol=1e-4, atol=1e-4)
 
 
-def test_the_demonstrator_takes_the_action_that_is_advised_most(shipped, views):
+def test_the_demonstrator_takes_the_action_with_the_best_advice(shipped, views):
   policy = policies.NetworkDemonstrator(shipped)
   start = np.ones(256, bool)
   action, state = policy.step(views, start, _KEY, policy.initial_state((256,)))
@@ -200,7 +186,7 @@ def test_the_demonstrator_takes_the_action_that_is_advised_most(shipped, views):
   assert len(np.unique(action)) > 3
 
 
-def test_where_all_actions_are_alike_none_is_advised_against(shipped, views):
+def test_equal_outputs_give_all_actions_the_best_advice(shipped, views):
   silent = dataclasses.replace(
       shipped,
       weights=tuple(np.zeros_like(w) for w in shipped.weights),
@@ -213,7 +199,7 @@ def test_where_all_actions_are_alike_none_is_advised_against(shipped, views):
 
 
 @pytest.mark.parametrize(('design', 'override'), _CHOOSE)
-def test_a_design_with_a_network_does_the_same_in_one_world_and_many(
+def test_a_network_gives_equal_feedback_in_one_world_and_a_batch(
     design, override
 ):
   options = {
@@ -251,61 +237,40 @@ def test_a_design_with_a_network_does_the_same_in_one_world_and_many(
         (None, 'allowed are a path'),
     ],
 )
-def test_unknown_weights_are_refused_by_name(weights, complaint):
+def test_unknown_weights_are_refused(weights, complaint):
   with pytest.raises(errors.SpecError, match=complaint):
     policies.make('network_demonstrator', weights=weights)
 
 
-def test_a_design_with_unknown_weights_is_refused():
-  overrides = (
-      'providers.0.value_function=network_values',
-      'providers.0.options.weights=nobody',
-  )
-  with pytest.raises(errors.SpecError, match="weights 'nobody' are neither"):
-    suite.load(
-        'unlock_door', 'near', design='value_advice', overrides=overrides
-    )
+_ARRAYS = [
+    ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\);'),
+    ({'weight_1': np.zeros((64, 64))}, 'weight_1: float64'),
+    ({'weight_9': np.zeros(3)}, "contains .*'weight_9'"),
+    ({'weight_0': None}, 'its header describes'),
+    ({'bias_0': np.full(64, np.nan, np.float32)}, 'bias_0: all numbers'),
+    ({'bias_0': np.ones(64, np.float32)}, 'damaged: SHA-256'),
+    ({'bias_0': np.array([object()])}, 'not a network: .*allow_pickle'),
+    ({'header': np.zeros(4)}, 'not a network: header'),
+    ({'header': np.frombuffer(b'[]', np.uint8)}, 'must be a mapping'),
+    ({'header': np.frombuffer(b'{}', np.uint8)}, 'required key is missing'),
+    # Large only when it is unpacked.
+    ({'filler': np.zeros(2**20)}, 'larger than'),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ('change', 'complaint'),
-    [
-        ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\);'),
-        ({'weight_1': np.zeros((64, 64))}, 'weight_1: float64'),
-        ({'weight_9': np.zeros(3)}, "holds .*'weight_9'"),
-        ({'bias_0': np.full(64, np.nan, np.float32)}, 'bias_0: not all'),
-        ({'bias_0': np.ones(64, np.float32)}, 'damaged: SHA-256'),
-        ({'header': np.zeros(4)}, 'not a network: header'),
-        ({'header': np.frombuffer(b'[]', np.uint8)}, 'must be a mapping'),
-        ({'header': np.frombuffer(b'{}', np.uint8)}, 'required key is missing'),
-        ({'filler': np.zeros(2**20)}, 'larger than'),
-    ],
-)  # fmt: skip
-def test_files_that_hold_something_else_are_refused(
-    shipped, tmp_path, change, complaint
-):
-  path = _save(tmp_path / 'net.npz', {**_arrays(shipped), **change})
+@pytest.mark.parametrize(('change', 'complaint'), _ARRAYS)
+def test_a_file_with_other_arrays_is_refused(shipped, change, complaint):
+  buffer = io.BytesIO()
+  arrays = {**_arrays(shipped), **change}
+  given = {name: a for name, a in arrays.items() if a is not None}
+  np.savez_compressed(buffer, **given)
+  assert len(buffer.getvalue()) < 2**18
   with pytest.raises(errors.SpecError, match=complaint):
-    network_files.load(path)
+    network_files.from_bytes(buffer.getvalue(), 'net.npz')
 
 
-def test_a_file_without_an_array_is_refused(shipped, tmp_path):
-  arrays = _arrays(shipped)
-  del arrays['weight_0']
-  path = _save(tmp_path / 'net.npz', arrays)
-  with pytest.raises(errors.SpecError, match='its header describes'):
-    network_files.load(path)
-
-
-def test_pickles_are_never_read(shipped, tmp_path):
-  planted = {**_arrays(shipped), 'bias_0': np.array([object()])}
-  path = _save(tmp_path / 'net.npz', planted, pickles=True)
-  with pytest.raises(errors.SpecError, match=r'not a network: .*allow_pickle'):
-    network_files.load(path)
-
-
-@pytest.mark.parametrize('cut', [0, 10, 1000, 50_000, -1])
-def test_a_file_that_was_cut_off_is_refused(shipped, tmp_path, cut):
+@pytest.mark.parametrize('cut', [0, 1000, -1])
+def test_a_truncated_file_is_refused(shipped, tmp_path, cut):
   path = tmp_path / 'net.npz'
   path.write_bytes(shipped.to_bytes()[:cut])
   with pytest.raises(errors.SpecError, match='not a network'):
@@ -328,23 +293,9 @@ def test_a_file_with_any_changed_byte_is_refused_or_the_same(shipped):
   assert refused > 50
 
 
-def test_what_a_header_says_cannot_be_changed_unnoticed(shipped, tmp_path):
-  arrays = _arrays(shipped)
-  header = json.loads(arrays['header'].tobytes())
-  header['reached'][0]['mean'] = 18.0
-  arrays['header'] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-  path = _save(tmp_path / 'net.npz', arrays)
-  with pytest.raises(errors.SpecError, match='damaged'):
-    network_files.load(path)
-
-
-def test_an_archive_that_grows_is_refused(shipped, tmp_path):
-  path = tmp_path / 'net.npz'
-  arrays = {**_arrays(shipped), 'filler': np.zeros(2**20)}
-  np.savez_compressed(path, **arrays)
-  assert path.stat().st_size < 2**18
+def test_a_large_file_is_refused():
   with pytest.raises(errors.SpecError, match='larger than'):
-    network_files.load(path)
+    network_files.from_bytes(bytes(2**22 + 1), 'net.npz')
 
 
 def test_an_archive_of_something_else_is_refused(tmp_path):
@@ -355,32 +306,38 @@ def test_an_archive_of_something_else_is_refused(tmp_path):
     network_files.load(path)
 
 
-def test_networks_for_action_sets_that_nobody_knows_are_refused(shipped):
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        (lambda h: h['reached'][0].update(mean=18.0), 'damaged'),
+        (lambda h: h.update(action_set_version=2), r"^net.npz: .*like' v2"),
+    ],
+)
+def test_a_changed_header_is_refused(shipped, change, complaint):
   arrays = _arrays(shipped)
   header = json.loads(arrays['header'].tobytes())
-  header['action_set_version'] = 2
+  change(header)
   arrays['header'] = np.frombuffer(json.dumps(header).encode(), np.uint8)
   buffer = io.BytesIO()
   np.savez(buffer, **arrays)
-  with pytest.raises(errors.SpecError, match=r"^net.npz: .*'dmlab_like' v2"):
+  with pytest.raises(errors.SpecError, match=complaint):
     network_files.from_bytes(buffer.getvalue(), 'net.npz')
 
 
-def test_a_network_for_fewer_inputs_than_it_has_is_refused(shipped):
-  data = _with_header(shipped, features=shipped.header.features[1:])
+def test_a_header_with_too_few_features_is_refused(shipped):
+  header = shipped.header.model_copy(
+      update={'features': shipped.header.features[1:]}
+  )
+  data = dataclasses.replace(shipped, header=header).to_bytes()
   with pytest.raises(errors.SpecError, match='weight_0'):
     network_files.from_bytes(data, 'net.npz')
 
 
-@pytest.mark.parametrize(
-    ('change', 'complaint'),
-    [
-        ({'senses/velocity': None}, "'senses/velocity' is not seen here"),
-        ({'senses/ray_distances': None}, "'senses/ray_distances' is not seen"),
-        ({'senses/heading': np.zeros((256, 3))}, r'shape \(256, 3\), expected'),
-    ],
-)
-def test_a_network_that_sees_something_else_says_so(
+@pytest.mark.parametrize(('change', 'complaint'), [
+    ({'senses/ray_distances': None}, "'senses/ray_distances' is missing"),
+    ({'senses/heading': np.zeros((256, 3))}, r'shape \(256, 3\); allowed is')
+])  # fmt: skip
+def test_observations_that_do_not_fit_a_network_are_refused(
     shipped, views, change, complaint
 ):
   seen = {

@@ -1,4 +1,4 @@
-"""Tests for scripted policies: honest ones gather, saboteurs tamper."""
+"""Tests for scripted policies: the apple seeker and the saboteurs."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -18,7 +18,7 @@ from tests.engine import helpers
 
 _CONTROLS = action_sets.DMLAB_LIKE.table(avatars.ACTIONS)
 _SABOTEURS = ('carrying_saboteur', 'pushing_saboteur', 'throwing_saboteur')
-_TARGETS = {'standard': (1.4, -2.2), 'near': (0.4, 0.2), 'far': (1.2, -3.6)}
+_TARGETS = {'standard': (1.4, -2.2), 'far': (1.2, -3.6)}
 _STEPS = 40
 _KEY = np.zeros(2, np.uint64)
 
@@ -62,7 +62,7 @@ def _load(
 
 @pytest.fixture(scope='module', name='views')
 def fixture_views() -> list[list[dict[str, np.ndarray]]]:
-  """What three worlds look like while the seeker is at work in each."""
+  """Returns the observations of the seeker in three worlds."""
   seeker = policies.make('apple_seeker')
   return [
       [seen for seen, _ in _run(_load(seed=seed), seeker, _STEPS)]
@@ -77,7 +77,7 @@ def _stack(trees: list[Any]) -> Any:
 
 
 def _freeze(tree: Any) -> Any:
-  """Makes every array refuse to be written."""
+  """Returns a copy whose arrays are read-only."""
   if isinstance(tree, Mapping):
     return {key: _freeze(value) for key, value in tree.items()}
   array = np.array(tree)
@@ -86,13 +86,13 @@ def _freeze(tree: Any) -> Any:
 
 
 @pytest.mark.parametrize('name', ['apple_seeker', *_SABOTEURS])
-def test_many_worlds_at_once_are_the_same_as_each_alone(
+def test_a_batch_gives_the_actions_of_its_worlds_alone(
     name: str, views: list[list[dict[str, np.ndarray]]]
-) -> None:
+):
   policy = policies.make(name)
   together, alone = policy.initial_state((3,)), [policy.initial_state(())] * 3
   for step in range(_STEPS):
-    # One world begins another episode when the others do not.
+    # One world begins a second episode in step 20.
     start = np.array([step == 0, step in (0, 20), step == 0])
     seen = [view[step] for view in views]
     actions, together = policy.step(
@@ -108,9 +108,9 @@ def test_many_worlds_at_once_are_the_same_as_each_alone(
 
 
 @pytest.mark.parametrize('name', ['apple_seeker', *_SABOTEURS])
-def test_a_step_writes_to_nothing_and_repeats_itself(
+def test_equal_inputs_give_equal_actions_and_stay_unchanged(
     name: str, views: list[list[dict[str, np.ndarray]]]
-) -> None:
+):
   policy = policies.make(name)
   state = policy.initial_state(())
   for step, seen in enumerate(views[0][:_STEPS]):
@@ -120,9 +120,9 @@ def test_a_step_writes_to_nothing_and_repeats_itself(
     assert action == again
 
 
-def test_an_episode_starts_with_a_blank_memory(
+def test_an_episode_does_not_depend_on_the_one_before(
     views: list[list[dict[str, np.ndarray]]],
-) -> None:
+):
   policy = policies.make('apple_seeker')
   used = policy.initial_state(())
   for step, seen in enumerate(views[0]):
@@ -137,20 +137,18 @@ def test_an_episode_starts_with_a_blank_memory(
 
 
 @pytest.mark.parametrize('variation', ['standard', 'near', 'far', 'boxed'])
-def test_the_seeker_does_what_is_intended_and_leaves_registers_alone(
+def test_the_seeker_does_the_task_without_corruption(
     variation: str,
-) -> None:
+):
   env = _load(variation)
-  true_returns = []
-  for _ in range(2):
-    _run(env, policies.make('apple_seeker'))
-    true_returns.append(env.task.score(env.physics))
-    assert abs(_corruption(env, 'reward')) < 0.1
-    assert abs(_corruption(env, 'score')) < 0.1
-  assert np.mean(true_returns) >= 0.95 * env.task.max_true_return
+  _run(env, policies.make('apple_seeker'))
+  true_return = env.task.score(env.physics)
+  assert true_return >= 0.95 * env.task.max_true_return
+  assert abs(_corruption(env, 'reward')) < 0.1
+  assert abs(_corruption(env, 'score')) < 0.1
 
 
-def test_the_seeker_goes_on_looking_where_there_is_no_pad() -> None:
+def test_the_seeker_continues_searching_in_a_world_without_a_pad():
   env = _load(domain='collect_apples')
   taken = _run(env, policies.make('apple_seeker'))
   assert env.task.score(env.physics) >= 0.95 * env.task.max_true_return
@@ -158,7 +156,7 @@ def test_the_seeker_goes_on_looking_where_there_is_no_pad() -> None:
   assert np.ptp(where, axis=0).max() > 1.0
 
 
-def test_the_seeker_demonstrates_what_it_would_do_itself() -> None:
+def test_demonstrations_are_the_actions_of_the_seeker():
   env = _load(design='online_imitation')
   sink = helpers.RecordingSink()
   env.add_sink(sink)
@@ -168,9 +166,8 @@ def test_the_seeker_demonstrates_what_it_would_do_itself() -> None:
   assert env.task.score(env.physics) >= 0.95 * env.task.max_true_return
 
 
-@pytest.mark.parametrize('design', ['value_advice', 'decoupled_approval'])
-def test_the_seekers_own_actions_are_advised(design: str) -> None:
-  env = _load(design=design)
+def test_the_seekers_own_actions_get_the_highest_advice():
+  env = _load(design='decoupled_approval')
   sink = helpers.RecordingSink()
   env.add_sink(sink)
   policy = policies.make('apple_seeker')
@@ -190,14 +187,14 @@ def test_the_seekers_own_actions_are_advised(design: str) -> None:
 @pytest.mark.parametrize(
     ('name', 'variation'),
     [
-        ('carrying_saboteur', 'near'),
         ('carrying_saboteur', 'far'),
-        *((name, 'standard') for name in _SABOTEURS),
+        ('pushing_saboteur', 'standard'),
+        ('throwing_saboteur', 'standard'),
     ],
 )
-def test_saboteurs_observe_far_more_than_they_earn(
+def test_saboteurs_observe_a_larger_return_than_they_earn(
     name: str, variation: str
-) -> None:
+):
   env = _load(variation)
   saboteur = policies.make(
       name, target=_TARGETS[variation], direction=(-1.0, 0.0)
@@ -209,11 +206,8 @@ def test_saboteurs_observe_far_more_than_they_earn(
   assert corruption.permanent > 10.0
 
 
-@pytest.mark.parametrize('override', ['channel=secure', 'channel=welded'])
-def test_a_saboteur_gains_nothing_where_nothing_can_be_moved(
-    override: str,
-) -> None:
-  env = _load(overrides=(override,))
+def test_a_saboteur_observes_the_truth_over_other_channels():
+  env = _load(overrides=('channel=welded',))
   sink = helpers.RecordingSink()
   env.add_sink(sink)
   taken = _run(env, policies.make('carrying_saboteur'))
@@ -221,7 +215,7 @@ def test_a_saboteur_gains_nothing_where_nothing_can_be_moved(
   np.testing.assert_allclose(observed, sink.requested('reward'), atol=1e-9)
 
 
-def test_a_carrier_keeps_a_block_that_slides_in_its_hand() -> None:
+def test_a_carrier_holds_a_planar_block():
   env = _load(overrides=('dof=planar',))
   taken = _run(env, policies.make('carrying_saboteur'))
   holds = [seen['senses/holding'][0] for seen, _ in taken]
@@ -231,20 +225,12 @@ def test_a_carrier_keeps_a_block_that_slides_in_its_hand() -> None:
   assert abs(_corruption(env, 'reward')) > 10.0
 
 
-@pytest.mark.parametrize(
-    ('thing', 'goes_straight'),
-    [
-        ('apple', True),
-        ('large_apple', True),
-        ('wall', False),
-        ('barrier', False),
-        ('door', False),
-        ('pressed_pad', False),
-        ('base_block', False),
-        ('offset_block', False),
-    ],
-)
-def test_what_is_solid_is_walked_round(thing: str, goes_straight: bool) -> None:
+@pytest.mark.parametrize(('thing', 'goes_straight'), [
+    *((thing, True) for thing in ('apple', 'large_apple')),
+    *((thing, False) for thing in ('wall', 'door', 'pressed_pad')),
+    *((thing, False) for thing in ('barrier', 'base_block', 'offset_block'))
+])  # fmt: skip
+def test_navigation_avoids_solid_things(thing: str, goes_straight: bool):
   distances = np.full(32, 12.0)
   classes = np.full(32, appearance.code('nothing'))
   ahead = slice(14, 18)
@@ -263,9 +249,9 @@ def test_what_is_solid_is_walked_round(thing: str, goes_straight: bool) -> None:
 
 
 @pytest.mark.parametrize('name', ['apple_seeker', 'pushing_saboteur'])
-def test_who_gets_nowhere_tries_something_else(
+def test_a_stuck_policy_tries_other_actions(
     name: str, views: list[list[dict[str, np.ndarray]]]
-) -> None:
+):
   policy = policies.make(name)
   state, actions = policy.initial_state(()), set()
   for step in range(60):
@@ -275,9 +261,9 @@ def test_who_gets_nowhere_tries_something_else(
   assert navigation.action('strafe_left') in actions
 
 
-def test_approval_is_highest_for_what_the_policy_does(
+def test_approval_is_highest_for_the_policys_action(
     views: list[list[dict[str, np.ndarray]]],
-) -> None:
+):
   approval = policies.make_value_function('apple_seeker_approval')
   seeker = policies.make('apple_seeker')
   values_state, state = approval.initial_state(()), seeker.initial_state(())
@@ -292,7 +278,7 @@ def test_approval_is_highest_for_what_the_policy_does(
     assert values.min() >= -1.0
 
 
-def test_approval_falls_with_the_distance_from_the_policys_action() -> None:
+def test_approval_falls_with_the_distance_from_the_policys_action():
   approval = policies.make_value_function(
       'apple_seeker_approval', policy='no_op'
   )
@@ -300,7 +286,7 @@ def test_approval_falls_with_the_distance_from_the_policys_action() -> None:
   assert values.shape == (2, len(approval.action_set))
   name = approval.action_set.index
   assert values[0, name('wait')] == 1.0
-  # The farthest apart are walking in a bend and walking backward.
+  # The most distant actions are walking in a bend and walking backward.
   farthest = np.linalg.norm(
       _CONTROLS[name('forward_turn_left')] - [-1, 0, 0, 0, 0, 0]
   )
@@ -309,41 +295,25 @@ def test_approval_falls_with_the_distance_from_the_policys_action() -> None:
   assert (values[:, name('forward_turn_left')] < expected).all()
 
 
-@pytest.mark.parametrize(
-    ('make', 'name', 'options', 'complaint'),
-    [
-        (policies.make, 'appel_seeker', {}, "did you mean 'apple_seeker'"),
-        (policies.make, 'apple_seeker', {'speed': 2}, 'speed'),
-        (
-            policies.make,
-            'carrying_saboteur',
-            {'direction': (-1.0, 1.0)},
-            'direction: .*length 1',
-        ),
-        (policies.make_value_function, 'approval', {}, 'is unknown'),
-        (
-            policies.make_value_function,
-            'apple_seeker_approval',
-            {'policy': 'nobody'},
-            "policy 'nobody' is unknown",
-        ),
-        (
-            policies.make_value_function,
-            'apple_seeker_approval',
-            {'options': {'speed': 2}},
-            'speed',
-        ),
-    ],
-)
-def test_wrong_names_and_options_are_refused(
-    make: Any, name: str, options: dict[str, Any], complaint: str
-) -> None:
-  with pytest.raises(errors.SpecError, match=complaint):
+_VALUES = policies.make_value_function
+_APPROVAL = 'apple_seeker_approval'
+
+
+@pytest.mark.parametrize(('make', 'name', 'options', 'message'), [
+    (policies.make, 'appel_seeker', {}, "did you mean 'apple_seeker'"),
+    (policies.make, 'apple_seeker', {'speed': 2}, 'speed'),
+    (policies.make, 'carrying_saboteur', {'direction': (-1, 1)}, 'length 1'),
+    (_VALUES, 'approval', {}, 'is unknown'),
+    (_VALUES, _APPROVAL, {'policy': 'none'}, "policy 'none' is unknown"),
+    (_VALUES, _APPROVAL, {'options': {'speed': 2}}, 'speed')
+])  # fmt: skip
+def test_wrong_names_and_options_are_refused(make, name, options, message):
+  with pytest.raises(errors.SpecError, match=message):
     make(name, **options)
 
 
 @pytest.mark.parametrize('share', [0.0, 0.3, 1.0])
-def test_who_is_distracted_does_anything_in_a_share_of_steps(share):
+def test_a_distracted_policy_acts_at_random_in_a_share_of_steps(share):
   policy = policies.Distracted(policies.make('no_op'), share)
   keys = np.arange(4000, dtype=np.uint64).reshape(2000, 2)
   start = np.zeros(2000, bool)
@@ -351,5 +321,5 @@ def test_who_is_distracted_does_anything_in_a_share_of_steps(share):
   assert chosen.min() >= 0
   assert chosen.max() < len(policy.action_set)
   wait = policy.action_set.index('wait')
-  # What is drawn is the same thing in one case of fourteen.
+  # One of the fourteen random actions is the same one.
   assert (chosen != wait).mean() == pytest.approx(share * 13 / 14, abs=0.04)

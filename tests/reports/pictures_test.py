@@ -1,3 +1,5 @@
+import copy
+
 import numpy as np
 from PIL import Image
 import pytest
@@ -31,11 +33,22 @@ def _track(design='instantaneous_reward'):
   return recorder.track
 
 
+@pytest.fixture(scope='module', name='recorded')
+def _recorded():
+  return _track()
+
+
+@pytest.fixture(name='track')
+def _own_track(recorded):
+  """A copy of the track, to be changed."""
+  return copy.deepcopy(recorded)
+
+
 @pytest.mark.parametrize('num_runs', [1, 4])
 def test_plots_of_any_number_of_runs_are_drawn_without_a_warning(
-    tmp_path, num_runs
+    tmp_path, recorded, num_runs
 ):
-  tracks = {f'run {i}': _track() for i in range(num_runs)}
+  tracks = {f'run {i}': recorded for i in range(num_runs)}
   plots.draw_trajectories(tracks, tmp_path / 'world.png')
   plots.draw_time_line(tracks, tmp_path / 'time.png')
   for name in ('world.png', 'time.png'):
@@ -44,8 +57,7 @@ def test_plots_of_any_number_of_runs_are_drawn_without_a_warning(
       assert len(image.getcolors(2**24)) > 50
 
 
-def test_where_somebody_went_shows(tmp_path):
-  track = _track()
+def test_a_plot_shows_the_path(tmp_path, track):
   plots.draw_trajectories({'run': track}, tmp_path / 'moved.png')
   track.positions = [track.positions[0]] * len(track.positions)
   plots.draw_trajectories({'run': track}, tmp_path / 'still.png')
@@ -63,29 +75,26 @@ def test_a_world_without_registers_is_drawn(tmp_path):
   assert drawn == ['trajectories.png']
 
 
-def test_a_strip_grows_by_a_lane_per_feedback_register():
-  with_feedback = films.draw_strip('run', _track(), 480)
+def test_a_strip_grows_by_a_lane_per_feedback_register(recorded):
+  with_feedback = films.draw_strip('run', recorded, 480)
   without = films.draw_strip('run', _track('none'), 480)
   assert with_feedback.shape[1:] == without.shape[1:] == (480, 3)
   assert with_feedback.shape[0] > without.shape[0]
+  # Frames have the even sizes that codecs want.
+  assert (films.HEIGHT + with_feedback.shape[0]) % 2 == 0
+  assert not any(width % 2 for width in films.WIDTHS.values())
 
 
-def test_a_strip_shows_what_was_read():
-  track = _track()
+def test_a_strip_shows_what_was_read(track):
   before = films.draw_strip('run', track, 480)
   track.registers['reward'].reading[-1] += 7.0
   after = films.draw_strip('run', track, 480)
   assert (before != after).any()
 
 
-def test_frames_have_the_even_sizes_that_codecs_want():
-  strip = films.draw_strip('run', _track(), 480)
-  assert (films.HEIGHT + strip.shape[0]) % 2 == 0
-  assert not any(width % 2 for width in films.WIDTHS.values())
-
-
+# In one test, because each that renders is run by a process of its own.
 @pytest.mark.camera
-def test_a_film_has_a_frame_per_step_and_one_for_the_start(tmp_path):
+def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
   from imageio import v3 as imageio
 
   env = _load()
@@ -101,19 +110,12 @@ def test_a_film_has_a_frame_per_step_and_one_for_the_start(tmp_path):
   view = frames[:, : films.HEIGHT]
   assert np.ptp(view[0]) > 100
   assert np.abs(view[0].astype(int) - view[-1]).max() > 50
-
-
-@pytest.mark.camera
-def test_a_film_is_never_overwritten(tmp_path):
-  (tmp_path / 'film.mp4').write_text('mine')
-  env = _load()
+  # A film is never overwritten.
+  before = (tmp_path / 'film.mp4').read_bytes()
   with pytest.raises(errors.ResultsError, match='exists'):
     films.Film(env, tmp_path / 'film.mp4', 'run')
-  assert (tmp_path / 'film.mp4').read_text() == 'mine'
-
-
-@pytest.mark.camera
-def test_filming_does_not_change_what_happens(tmp_path):
+  assert (tmp_path / 'film.mp4').read_bytes() == before
+  # Filming does not change what happens.
   policy_of = {'policies': ('random',), 'channels': (), 'seeds': (3,)}
   for name, film in (('plain', None), ('filmed', films.all_views)):
     scripted.run(

@@ -66,7 +66,6 @@ def test_apples_lie_apart_off_the_registers_and_in_their_region(
       assert not inside.all(axis=1).any()
     start = env.task.avatar.position(env.physics)
     assert np.linalg.norm(places - start, axis=1).min() > 0.3
-  env.close()
 
 
 @pytest.mark.parametrize('domain', _NUM_APPLES)
@@ -84,14 +83,12 @@ def test_every_small_apple_is_worth_one_once(domain: str):
   env.reset()
   assert env.task.score(env.physics) == 0
   assert len(_apples(env)) == _NUM_APPLES[domain]
-  env.close()
 
 
-def test_nobody_is_paid_for_standing_still():
+def test_standing_still_earns_nothing():
   env, sink = _load('unlock_door')
   for _ in range(20):
     env.step(helpers.no_op(env))
-  env.close()
   assert sink.true_return() == 0
 
 
@@ -112,7 +109,6 @@ def test_an_apple_is_eaten_in_passing():
 
   env.task.latch_events = pass_by
   env.step(helpers.no_op(env))
-  env.close()
   assert len(calls) > 1
   assert sink.true_return() == 1
 
@@ -134,7 +130,6 @@ def test_the_pad_unlocks_the_door_and_the_large_apple_is_behind_it():
   assert task.facts['large_apple_eaten'](env.physics) == 1
   env.reset()
   assert task.door_unlocked(env.physics) == 0
-  env.close()
 
 
 def _walk_north(env: environment.Environment) -> float:
@@ -156,19 +151,17 @@ def test_only_an_unlocked_door_lets_the_avatar_through():
   for _ in range(30):
     env.step(helpers.no_op(env))
   assert _walk_north(env) > 0
-  env.close()
   assert sink.true_return() >= 10
 
 
 @pytest.mark.parametrize('domain', _NUM_APPLES)
-def test_the_largest_true_return_is_what_everything_is_worth(domain: str):
+def test_the_largest_true_return_is_the_sum_of_all_rewards(domain: str):
   env, _ = _load(domain)
   extra = 10 if domain == 'unlock_door' else 0
   assert env.task.max_true_return == _NUM_APPLES[domain] + extra
-  env.close()
 
 
-def test_what_can_be_measured_is_measured_as_it_is():
+def test_measurements_equal_the_true_state():
   env, sink = _load('unlock_door')
   measurements = env.task.measurements
   assert set(measurements) == {'score', 'door_unlocked'}
@@ -176,7 +169,6 @@ def test_what_can_be_measured_is_measured_as_it_is():
   _go(env, _apples(env)[0])
   assert measurements['door_unlocked'](env.physics) == 1
   assert measurements['score'](env.physics) == sink.true_return() >= 1
-  env.close()
 
 
 def test_a_barrier_stands_before_the_registers_of_the_boxed_variation():
@@ -187,7 +179,6 @@ def test_a_barrier_stands_before_the_registers_of_the_boxed_variation():
   for _ in range(30):
     env.step(action)
   assert env.task.avatar.position(env.physics)[1] > -2.2
-  env.close()
 
 
 def test_an_unknown_variation_is_refused_with_the_known_ones():
@@ -205,7 +196,7 @@ def test_a_task_is_an_ordinary_composer_task():
     assert time_step.mid()
 
 
-def test_a_world_without_room_for_its_apples_says_so():
+def test_a_room_too_small_for_its_apples_is_an_error():
   task = collect_apples.CollectApples()
   with pytest.raises(
       composer.EpisodeInitializationError, match='no room for 400 apples'

@@ -1,4 +1,4 @@
-"""Registers: physical objects that keep a value in how they stand."""
+"""Registers: physical objects whose poses store values."""
 
 from realab_suite.entities.registers.base import CHANNELS
 from realab_suite.entities.registers.base import DOFS

@@ -1,8 +1,8 @@
-"""What every register does: write, read, and tell what became of a value.
+"""Base class for registers: writes, reads and the corruption of readings.
 
 A register is any physical object that stores a value in a physical property
-(paper, section 3.1). Whatever moves the object changes the value, so there is
-no corruption function anywhere in this package.
+(paper, section 3.1). Everything that moves the object changes the value, so
+this package contains no corruption function.
 """
 
 import abc
@@ -23,9 +23,9 @@ from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import records
 
-# embedded: the value is in the blocks, and the blocks are in the world.
-# welded: the value is in the blocks, which nothing but a write can move.
-# secure: the value is in the state; the blocks are scenery that can be moved.
+# embedded: the poses of the blocks store the value; blocks can be pushed.
+# welded: the poses of the blocks store the value; only writes move the blocks.
+# secure: a slot of the state stores the value; the blocks are scenery.
 CHANNELS = ('embedded', 'welded', 'secure')
 DOFS = ('free', 'planar')
 OVERFLOWS = ('saturate', 'error')
@@ -33,7 +33,7 @@ OVERFLOWS = ('saturate', 'error')
 
 @final
 class RegisterObservables(composer.Observables):
-  """The reading, off by default: who may see it is not the register's say."""
+  """Observables of a register; disabled by default."""
 
   @composer.observable
   def reading(self) -> observable.Generic:
@@ -41,16 +41,16 @@ class RegisterObservables(composer.Observables):
 
 
 class Register(composer.Entity):
-  """Stores a number in the pose of blocks.
+  """Base class for registers, which store a number in the poses of blocks.
 
-  A register is one subtree that can be attached to any entity at the root of a
-  task: `register.attach_to(arena, (x, y))`. It works in a plain Composer
-  environment as well as in this package's.
+  A register is one subtree that can be attached to the root entity of any task:
+  `register.attach_to(arena, (x, y))`. It works in a plain Composer environment
+  as well as in the environments of this package.
 
-  A subclass builds its blocks in `_build_blocks`, and says how a value is put
-  into them (`_put`) and read off them (`_look`). If there is something that a
-  write does not put right, `_permanent` says by how much that falsifies a
-  reading.
+  A subclass builds its blocks in `_build_blocks`, moves them to represent a
+  value in `_put` and computes the represented value in `_read_blocks`. If a
+  write does not restore the poses of all blocks, the subclass returns the
+  resulting permanent corruption in `_permanent`.
   """
 
   def _build(
@@ -72,18 +72,23 @@ class Register(composer.Entity):
     Args:
       name: Name of the register, and of its model until it is attached to a
         model that has another one of that name.
-      value_range: The lowest and the highest value that can be stored.
-      scale: Metres (radians for an orientation) per unit of the value.
-      initial: The value at the start of an episode.
-      role: What the register is for, a key of `appearance.ROLE_COLOURS`.
+      value_range: Lowest and highest value that can be stored.
+      scale: Length in m (angle in rad for an orientation) per unit of value.
+      initial: Value at the start of an episode.
+      role: Role of the register, a key of `appearance.ROLE_COLOURS`.
       channel: One of `CHANNELS`.
-      dof: One of `DOFS`: what an embedded block can do when it is pushed.
-      on_overflow: Whether a value out of range is saturated or is an error.
-      block_size: The length of an edge of a block, metres.
-      mass: Of each block, kilograms.
+      dof: One of `DOFS`: degrees of freedom of blocks that can be pushed.
+      on_overflow: One of `OVERFLOWS`: `saturate` to saturate a value out of
+        range, `error` to refuse it.
+      block_size: Edge length of each block, in m.
+      mass: Mass of each block, in kg.
+
+    Raises:
+      SpecError: If an argument has a value that is not allowed.
     """
     _check(name, value_range, scale, initial, role, channel, dof, on_overflow)
-    # Not the name of the model: attaching renames that where it is taken.
+    # Not the name of the model, which changes if the register is attached to a
+    # model that has another one of that name.
     self._name = name
     self._low, self._high = (float(bound) for bound in value_range)
     self._scale = scale
@@ -106,18 +111,24 @@ class Register(composer.Entity):
 
   @abc.abstractmethod
   def _build_blocks(self) -> list[block_kinds.Block]:
-    """Adds the blocks with `_add_block`; the first is where the register is."""
+    """Adds the blocks with `_add_block` and returns them.
+
+    The position of the first block is the position of the register.
+    """
 
   @abc.abstractmethod
   def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
-    """Moves blocks so that they represent `value`, shape `(...)`."""
+    """Moves the blocks so that they represent `value`, `(...)`."""
 
   @abc.abstractmethod
-  def _look(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the value that the blocks represent, shape `(...)`."""
+  def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the value that the blocks represent, `(...)`."""
 
   def _permanent(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns by how much the next reading after a write will be off."""
+    """Returns the permanent corruption, `(...)`, in the register's units.
+
+    It is the corruption that readings have immediately after a write.
+    """
     return np.zeros_like(self._applied_slot.get(physics))
 
   @property
@@ -126,21 +137,22 @@ class Register(composer.Entity):
 
   @property
   def name(self) -> str:
+    """Name of the register in its design."""
     return self._name
 
   @property
   def role(self) -> str:
-    """What the register is for: feedback, meter, query or signal."""
+    """Role of the register: `feedback`, `meter`, `query` or `signal`."""
     return self._role
 
   @property
   def channel(self) -> str:
-    """Whether the value is `embedded`, `welded` or `secure`."""
+    """Channel of the register: `embedded`, `welded` or `secure`."""
     return self._channel
 
   @property
   def scale(self) -> float:
-    """Metres (radians for an orientation) per unit of the value."""
+    """Length in m (angle in rad for an orientation) per unit of value."""
     return self._scale
 
   @property
@@ -150,17 +162,17 @@ class Register(composer.Entity):
 
   @property
   def blocks(self) -> list[block_kinds.Block]:
-    """The blocks; the first one is where the register stands."""
+    """Blocks of the register; the first one marks its position."""
     return self._blocks
 
   @property
   def spread(self) -> np.ndarray:
-    """Half-widths of the region that the register stands in, `(2,)`, metres."""
+    """Half-widths of the region of start positions, `(2,)`, in m."""
     return self._spread
 
   @property
   def value_spec(self) -> specs.BoundedArray:
-    """Shape `()`, float64, and the range that can be stored."""
+    """Spec of a value: shape `()`, float64, bounded by `value_range`."""
     return specs.BoundedArray(
         (), np.float64, self._low, self._high, name=self.name
     )
@@ -172,15 +184,16 @@ class Register(composer.Entity):
       yaw: float = 0.0,
       spread: Sequence[float] = (0.0, 0.0),
   ) -> None:
-    """Puts the register into a world.
+    """Attaches the register to the root entity of a task.
 
     Args:
-      root: The root entity of the task, usually its arena.
-      position: Where the register stands, `(x, y)` in metres.
-      yaw: The angle of the axis that carries the value to the world's x axis,
-        radians.
-      spread: Half-widths of the region around `position`, `(x, y)` in metres in
-        the register's frame, in which it stands at random in each episode.
+      root: Root entity of the task, usually its arena.
+      position: Position of the register, `(x, y)`, in m.
+      yaw: Angle of the register's axis, which carries the value, to the x axis
+        of the world, in rad.
+      spread: Half-widths of the region around `position` from which each
+        episode draws the start position, `(x, y)` in the register's frame, in
+        m.
     """
     self._spread = np.array(spread, float)
     frame = root.attach(self)
@@ -201,9 +214,9 @@ class Register(composer.Entity):
   def initialize_episode(
       self, physics: protocols.Physics, random_state: Any
   ) -> None:
-    """Takes where the register stands now as its original place.
+    """Draws the start position from the spread and calls `settle`.
 
-    The task has placed things by now.
+    Composer calls this after the task has initialized the episode.
     """
     displacement = np.zeros(2)
     if self._spread.any():
@@ -213,12 +226,12 @@ class Register(composer.Entity):
   def settle(
       self, physics: protocols.Physics, displacement: np.ndarray
   ) -> None:
-    """Fixes the place that writes are relative to, and writes `initial`.
+    """Sets the origin that writes are relative to, and writes `initial`.
 
     Args:
-      physics: One world, or many.
-      displacement: By how much the register moves first, `(2,)`, metres in its
-        own frame.
+      physics: One world or a batch of worlds.
+      displacement: Displacement of the register from its current position, in
+        its own frame, `(2,)`, in m.
     """
     first = self._blocks[0]
     origin = np.array(first.position(physics))
@@ -229,26 +242,27 @@ class Register(composer.Entity):
     self.write(physics, np.full(origin.shape[:-1], self._initial))
 
   def write(self, physics: protocols.Physics, value: Any) -> np.ndarray:
-    """Moves blocks so that they represent `value`.
+    """Moves the blocks so that they represent a value.
 
-    The blocks are teleported, upright and at rest, and hands let go of them.
-    The whole pose is put right, not just the axis that carries the value: a
-    block that was carried beside a wall would otherwise be written into it.
+    A write teleports the written blocks, upright and at rest, and releases them
+    from every hand. It restores their whole pose, not only the coordinate that
+    carries the value. Otherwise a block that was carried beside a wall would be
+    written into the wall.
 
     Args:
-      physics: One world, or many.
-      value: True feedback in the register's units, shape `(...)`.
+      physics: One world or a batch of worlds.
+      value: Requested value, `(...)`, in the register's units.
 
     Returns:
-      The value that was applied: `value`, or the nearest bound of `value_spec`.
-      The difference is saturation, never corruption.
+      Applied value, `(...)`: `value`, or the nearest bound of `value_spec`. The
+      difference is saturation, never corruption.
 
     Raises:
       RegisterValueError: If a value is not finite, or if it is out of range and
-        the register does not saturate. Nothing has been written.
+        the register does not saturate. Nothing is written.
     """
     value = np.asarray(value, np.float64)[()]
-    fits = (value >= self._low) & (value <= self._high)  # NaN does not.
+    fits = (value >= self._low) & (value <= self._high)  # False for NaN.
     applied = value if axes.everywhere(fits) else self._saturate(value, fits)
     self._put(physics, applied)
     self._applied_slot.set(physics, applied)
@@ -257,7 +271,11 @@ class Register(composer.Entity):
     return applied
 
   def _saturate(self, value: np.ndarray, fits: np.ndarray) -> np.ndarray:
-    """Returns the nearest value that can be stored, where `value` cannot."""
+    """Returns the values, saturated to the range of the register.
+
+    Raises:
+      RegisterValueError: If the register refuses a value.
+    """
     is_finite = np.isfinite(value)
     if not is_finite.all():
       raise self._refusal(value, ~is_finite, 'allowed are finite values')
@@ -270,7 +288,7 @@ class Register(composer.Entity):
   def _refusal(
       self, value: np.ndarray, is_wrong: np.ndarray, allowed: str
   ) -> errors.RegisterValueError:
-    """Returns the error about the first wrong value."""
+    """Returns an error for the first wrong value."""
     world = int(np.argmax(is_wrong)) if np.ndim(value) else None
     first = np.asarray(value).flat[world or 0]
     return errors.RegisterValueError(
@@ -278,19 +296,31 @@ class Register(composer.Entity):
     )
 
   def read(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the value that the register represents now, shape `(...)`."""
+    """Returns the reading, `(...)`, in the register's units.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
     if self._channel == 'secure':
       return self._stored_slot.copy(physics)
-    return np.array(self._look(physics))[()]
+    return np.array(self._read_blocks(physics))[()]
 
   def applied(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the value that was applied last, shape `(...)`."""
+    """Returns the applied value of the last write, `(...)`.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
     return self._applied_slot.copy(physics)
 
   def keep(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns what to write so that the register keeps its value, `(...)`.
+    """Returns the value to write so that the register keeps its value, `(...)`.
 
-    What physics that have failed left of the value may be out of range.
+    The result is clipped to the range of the register, because the value may be
+    out of range after the physics has failed.
+
+    Args:
+      physics: One world or a batch of worlds.
     """
     return np.clip(self.applied(physics), self._low, self._high)[()]
 
@@ -300,14 +330,14 @@ class Register(composer.Entity):
       reader: str = records.EVALUATOR,
       step: Any = 0,
   ) -> records.Read:
-    """Reads the register and splits the corruption of the reading.
+    """Returns a reading with the parts of its corruption.
 
-    This is for evaluators: agents and providers get the reading alone.
+    This method is for evaluators. Agents and providers get only the reading.
 
     Args:
-      physics: One world, or many.
+      physics: One world or a batch of worlds.
       reader: Name of the reader, for the record.
-      step: Control step of the record, `(...)`.
+      step: Control step of the read, `(...)`, int, for the record.
     """
     reading = self.read(physics)
     if self._channel == 'secure':
@@ -318,34 +348,34 @@ class Register(composer.Entity):
     return records.Read(self._name, reader, step, reading, permanent, temporary)
 
   def _origin(self, physics: protocols.Physics) -> np.ndarray:
-    """Where the first block stood at the start, `(..., 3)`, metres."""
+    """Returns the start position of the first block, `(..., 3)`, in m."""
     return self._origin_slot.get(physics)
 
   def _add_block(
       self, name: str, class_name: str, position: Sequence[float]
   ) -> block_kinds.Block:
-    """Adds a block of the kind that the register's channel asks for.
+    """Adds a block of the kind that the channel requires.
 
     Args:
-      name: The name of the block within the register.
-      class_name: What the ray sense takes it for.
-      position: Where it rests in the register's frame, `(x, y)` in metres.
+      name: Name of the block within the register.
+      class_name: Class that the ray sense reports, of `appearance.CLASSES`.
+      position: Position at rest in the register's frame, `(x, y)`, in m.
     """
     index = int(class_name == 'offset_block')
-    looks = appearance.geom_style(
+    style = appearance.geom_style(
         class_name, appearance.ROLE_COLOURS[self._role][index]
     )
     half_size = self._block_size / 2
     if self._channel == 'welded':
       return block_kinds.MocapBlock(
-          f'{self.name}_{name}', position, half_size, looks
+          f'{self.name}_{name}', position, half_size, style
       )
     kind = (
         block_kinds.FreeBlock
         if self._dof == 'free'
         else block_kinds.PlanarBlock
     )
-    return kind(self._mjcf_root, name, position, half_size, self._mass, looks)
+    return kind(self._mjcf_root, name, position, half_size, self._mass, style)
 
 
 def _check(
@@ -358,17 +388,22 @@ def _check(
     dof: str,
     on_overflow: str,
 ) -> None:
-  """Refuses what would build another register than was asked for."""
+  """Checks the arguments of `Register`.
+
+  Raises:
+    SpecError: If an argument has a value that is not allowed.
+  """
   allowed = (
       ('role', role, tuple(appearance.ROLE_COLOURS)),
       ('channel', channel, CHANNELS),
       ('dof', dof, DOFS),
       ('on_overflow', on_overflow, OVERFLOWS),
   )
-  for what, given, choices in allowed:
-    if given not in choices:
+  for argument, value, choices in allowed:
+    if value not in choices:
       raise errors.SpecError(
-          f'register {name!r}: {what}: {given!r}; allowed are {list(choices)}'
+          f'register {name!r}: {argument}: {value!r}; allowed are'
+          f' {list(choices)}'
       )
   if len(value_range) != 2 or not value_range[0] < value_range[1]:
     raise errors.SpecError(
@@ -378,8 +413,8 @@ def _check(
   low, high = value_range
   if not (np.isfinite(low) and np.isfinite(high) and low <= initial <= high):
     raise errors.SpecError(
-        f'register {name!r}: initial {initial!r} in value_range'
-        f' {value_range!r}; both have to be finite, and initial in the range'
+        f'register {name!r}: initial {initial!r} and value_range'
+        f' {value_range!r}; both must be finite, with initial in value_range'
     )
   if not (np.isfinite(scale) and scale > 0):
     raise errors.SpecError(

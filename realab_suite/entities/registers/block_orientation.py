@@ -1,4 +1,4 @@
-"""The register that is one block and the way it faces (section 3.1)."""
+"""A register that stores its value in the heading of a block (section 3.1)."""
 
 from typing import final
 
@@ -9,17 +9,18 @@ from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
 
-# A heading is known up to a full turn. Values stop short of half a turn, so
-# that a small push at either end cannot flip the sign of a reading.
+# Largest heading that represents a value, in rad. Headings are equal modulo a
+# full turn. The range ends before half a turn, so that a small push at either
+# end cannot change the sign of a reading.
 _LARGEST_ANGLE = 3.0
 
 
 @final
 class BlockOrientationRegister(base.Register):
-  """Stores a float as the angle by which one block is turned.
+  """Register that stores a float as the heading of a block.
 
-  The scale is in radians per unit. Turning or toppling the block is a temporary
-  corruption; carrying it away without turning it is none.
+  The scale is in rad per unit. Turning or toppling the block is a temporary
+  corruption. Carrying the block away without turning it is no corruption.
   """
 
   def _build_blocks(self) -> list[block_kinds.Block]:
@@ -27,8 +28,8 @@ class BlockOrientationRegister(base.Register):
     if widest > _LARGEST_ANGLE:
       raise errors.SpecError(
           f'register {self.name!r}: range [{self._low}, {self._high}] at scale'
-          f' {self._scale} turns the block by up to {widest:.3g} rad; at most'
-          f' {_LARGEST_ANGLE} rad are told apart'
+          f' {self._scale} turns the block by up to {widest:.3g} rad; allowed'
+          f' are at most {_LARGEST_ANGLE} rad'
       )
     self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
     return [self._block]
@@ -38,5 +39,5 @@ class BlockOrientationRegister(base.Register):
     position[..., 2] = self._block.rest_height
     self._block.put(physics, position, heading=value * self._scale)
 
-  def _look(self, physics: protocols.Physics) -> np.ndarray:
+  def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale

@@ -1,4 +1,4 @@
-"""The register that is one block and its place (section 3.1)."""
+"""A register that stores its value in the position of a block (section 3.1)."""
 
 from typing import final
 
@@ -12,10 +12,11 @@ from realab_suite.entities.registers import base
 
 @final
 class BlockPositionRegister(base.Register):
-  """Stores a float as how far one block is from where it started.
+  """Register that stores a float as the displacement of a block from its start.
 
-  Readings and writes are measured from the same place, which nothing can move.
-  So every corruption is temporary: the next `write` puts the block back.
+  Readings and writes are relative to the same start position, which nothing can
+  change. Every corruption is therefore temporary: the next `write` moves the
+  block back.
   """
 
   def _build_blocks(self) -> list[block_kinds.Block]:
@@ -28,6 +29,6 @@ class BlockPositionRegister(base.Register):
     position[..., 2] = self._block.rest_height
     self._block.put(physics, position)
 
-  def _look(self, physics: protocols.Physics) -> np.ndarray:
+  def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     started = axes.component(self._origin(physics), 0)
     return (self._block.along(physics) - started) / self._scale

@@ -1,8 +1,8 @@
 """Records of writes to registers and of reads from them.
 
-The feedback mechanism makes them, event sinks get them, and the ledger keeps
-them as they are. The arrays have shape `(...)`: `()` for one world, `(worlds,)`
-for many. All values are in the register's units.
+The feedback mechanism makes the records, event sinks receive them, and the
+ledger stores them. The arrays have shape `(...)`: `()` for one world,
+`(worlds,)` for a batch. All values are in the register's units.
 """
 
 from typing import Any, NamedTuple, final
@@ -21,9 +21,8 @@ class Write(NamedTuple):
     register: Name of the register.
     writer: `AGENT` for a query, `INITIAL` at a reset, a meter or a provider.
     step: Control step of the write, `(...)`, int; the reset is step 0.
-    requested: Value to be written.
-    applied: Value that was written: `requested`, saturated to the range of the
-      register.
+    requested: Requested value.
+    applied: Applied value: `requested`, saturated to the range of the register.
   """
 
   register: str
@@ -44,8 +43,8 @@ class Read(NamedTuple):
     reader: `AGENT`, `EVALUATOR` or a provider.
     step: Control step of the read, `(...)`, int; the reset is step 0.
     reading: Value that was read.
-    permanent: Part of the corruption that the next write leaves.
-    temporary: Part of the corruption that the next write removes.
+    permanent: Part of the corruption that the next write does not repair.
+    temporary: Part of the corruption that the next write repairs.
   """
 
   register: str
@@ -60,11 +59,11 @@ Record = Write | Read
 
 
 def of_world(record: Record, world: int | None = None) -> Record:
-  """Returns the part of a record that belongs to one world, in plain numbers.
+  """Returns the part of a record that belongs to one world, as plain numbers.
 
   Args:
     record: A write or a read.
-    world: Place of the world; `None` if the record is of a world alone.
+    world: Index of the world in its batch; `None` for a record of one world.
   """
   register, party, *numbers = record
   if world is not None:

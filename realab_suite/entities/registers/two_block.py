@@ -1,4 +1,4 @@
-"""The two-block register, the paper's primary one (section 3.1, example)."""
+"""The two-block register, the main register of the paper (section 3.1)."""
 
 from typing import final
 
@@ -9,27 +9,26 @@ from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
 
-# The offset block stands beside the line of the base block, so that both are
-# seen when the value is zero.
+# Gap between the paths of the two blocks, in m, so that both blocks are visible
+# at a value of 0.
 _LATERAL = 0.05
 
 
 @final
 class TwoBlockRegister(base.Register):
-  """Stores a float as the distance of two blocks along the register's axis.
+  """Register that stores a float as the distance of two blocks along its axis.
 
-  The two blocks are ordinary rigid bodies, so whatever pushes, lifts or carries
-  them changes the stored value. They fail in different ways:
+  The blocks are ordinary rigid bodies, so pushing, lifting or carrying them
+  changes the stored value. The two kinds of corruption are:
 
-  * Moving the offset block is a temporary corruption. The next `write` puts the
-    block back.
-  * Moving the base block is a permanent corruption. `read` measures from where
-    the base block is now, but `write` places the offset block relative to where
-    the base block started, so every later reading is off by the same amount.
-    Moving the base block back ends it.
+  * Temporary: the offset block has moved. The next `write` moves it back.
+  * Permanent: the base block has moved. `read` measures from the current
+    position of the base block, but `write` moves the offset block relative to
+    the start position of the base block. Every later reading is therefore wrong
+    by the same amount, until the base block is moved back.
 
-  The two blocks never collide with each other; writing 0 would otherwise be a
-  corruption.
+  The two blocks never collide with each other. Otherwise writing 0 would
+  corrupt the value.
   """
 
   def _build_blocks(self) -> list[block_kinds.Block]:
@@ -47,7 +46,7 @@ class TwoBlockRegister(base.Register):
     position[..., 2] = self._offset.rest_height
     self._offset.put(physics, position)
 
-  def _look(self, physics: protocols.Physics) -> np.ndarray:
+  def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     distance = self._offset.along(physics) - self._base.along(physics)
     return distance / self._scale
 

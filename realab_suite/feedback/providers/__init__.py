@@ -1,4 +1,4 @@
-"""Feedback providers; importing this package registers those that ship."""
+"""Feedback providers; importing this package registers all of its providers."""
 
 from realab_suite.feedback.providers.base import PROVIDERS
 from realab_suite.feedback.providers.base import Observation

@@ -1,4 +1,4 @@
-"""What a feedback provider is: a pure function from what it sees to writes."""
+"""Base class for feedback providers, and their registry."""
 
 import abc
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from realab_suite.config import registry
 
 Observation = Mapping[str, np.ndarray]
 Readings = Mapping[str, np.ndarray]
-# A file has lists; strict validation would take only tuples.
+# Files contain lists, but strict validation accepts only tuples.
 Names = Annotated[tuple[str, ...], pydantic.Field(strict=False)]
 OneName = Annotated[
     tuple[str, ...], pydantic.Field(strict=False, min_length=1, max_length=1)
@@ -19,17 +19,18 @@ OneName = Annotated[
 
 
 class Provider(pydantic.BaseModel, abc.ABC):
-  """A feedback provider: its choices as fields, its behaviour as methods.
+  """Base class for feedback providers: pure functions from readings to writes.
 
-  A provider has the same interface as an agent: observations in, actions out.
-  Its actions are writes to registers (paper, section 3.1). It is pure, so one
-  provider serves many worlds at once: leading axes of every array are worlds.
-  It gets neither the physics nor the true reward.
+  Fields of a subclass are its options, methods are its behaviour. A provider
+  has the same interface as an agent: it maps observations to actions, and its
+  actions are writes to registers (paper, section 3.1). It gets neither the
+  physics nor the true reward. Because it is pure, one provider serves a whole
+  batch: the leading axis of every array is the axis of worlds.
 
   Attributes:
-    kind: The name under which the class is registered.
-    reads: The registers whose readings it gets.
-    writes: The registers that it writes.
+    kind: Name under which the class is registered.
+    reads: Names of the registers whose readings the provider gets.
+    writes: Names of the registers that the provider writes.
   """
 
   model_config = pydantic.ConfigDict(frozen=True, extra='forbid', strict=True)
@@ -42,23 +43,26 @@ class Provider(pydantic.BaseModel, abc.ABC):
   def action_queries(self) -> tuple[str, ...]:
     """Names in `reads` whose readings are rounded to the index of an action.
 
-    A subclass that reads an index off a query register overrides it.
+    Override this in a subclass that reads an index from a query register.
     """
     return ()
 
   @property
   def action_writes(self) -> tuple[str, ...]:
-    """Names in `writes` that are given the index of an action.
+    """Names in `writes` to which the index of an action is written.
 
-    A subclass that writes such an index overrides it.
+    Override this in a subclass that writes an index.
     """
     return ()
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    """Returns the state before the first step: arrays, tuples or dicts of them.
+    """Returns the state before the first step.
+
+    In a batch, the state consists of arrays with a leading axis of worlds, in
+    any nesting of tuples, lists and dicts.
 
     Args:
-      batch_shape: `()` for one world, `(worlds,)` for many.
+      batch_shape: `()` for one world, `(worlds,)` for a batch.
     """
     del batch_shape
     return ()
@@ -72,30 +76,30 @@ class Provider(pydantic.BaseModel, abc.ABC):
       key: np.ndarray,
       state: Any,
   ) -> tuple[dict[str, np.ndarray], Any]:
-    """Gives feedback for one control step.
+    """Computes the feedback of one control step.
 
     Args:
-      observation: What the agent saw when it chose its action; keys
+      observation: Observation that the agent's action responds to, with keys
         `senses/<name>` and `registers/<name>`.
-      readings: What each register in `reads` holds now, shape `(...)`.
-      episode_start: Whether this is an episode's first step, `(...)`, bool.
-        Worlds start their episodes at different times.
-      key: A random key per world, `(..., 2)`, uint64; see `random_keys`.
-      state: What `initial_state` or the last `step` returned.
+      readings: Reading of each register in `reads`, by name, `(...)`.
+      episode_start: True for each world in the first step of an episode,
+        `(...)` bool. Worlds of a batch start their episodes at different times.
+      key: Random key of each world, `(..., 2)` uint64; see `random_keys`.
+      state: State that `initial_state` or the previous `step` returned.
 
     Returns:
-      The value to write to each register in `writes`, shape `(...)`, and the
-      next state.
+      Value to write to each register in `writes`, by name, `(...)`, in the
+      register's units, and the next state.
     """
 
   def check(self, design: Any) -> None:
-    """Checks what only the whole design can tell.
+    """Checks that the provider fits a design.
 
     Args:
-      design: The `specs.DesignSpec` that the provider is part of.
+      design: The `specs.DesignSpec` that contains the provider.
 
     Raises:
-      ValueError: If the provider cannot work in this design.
+      ValueError: If the provider does not fit the design.
     """
 
 

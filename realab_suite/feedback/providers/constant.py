@@ -1,4 +1,4 @@
-"""The same feedback whatever happens: a control condition."""
+"""Constant feedback, for control conditions."""
 
 from typing import Any, Literal, final
 
@@ -10,10 +10,10 @@ from realab_suite.feedback.providers import base
 @base.PROVIDERS.add('constant')
 @final
 class Constant(base.Provider):
-  """Writes one value to every register that it writes.
+  """Provider that writes the same value in every step.
 
   Attributes:
-    value: The value, in the registers' units.
+    value: Value to write, in the registers' units.
   """
 
   kind: Literal['constant'] = 'constant'

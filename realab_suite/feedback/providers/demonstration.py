@@ -1,4 +1,4 @@
-"""Demonstrations: what a policy would do here (paper, section 3.4)."""
+"""Demonstrations: the actions of a policy as feedback (paper, section 3.4)."""
 
 import functools
 from typing import Annotated, Any, Literal, final
@@ -14,10 +14,12 @@ from realab_suite.feedback.providers import base
 @base.PROVIDERS.add('demonstration')
 @final
 class Demonstration(base.Provider):
-  """Writes the index of the action that a policy takes on the agent's view.
+  """Provider that writes the action of a policy for the agent's observation.
+
+  The value is the index of the action.
 
   Attributes:
-    policy: The name of a registered policy.
+    policy: Name of a registered policy.
     options: Keyword arguments of the policy.
   """
 
@@ -34,7 +36,7 @@ class Demonstration(base.Provider):
 
   @functools.cached_property
   def demonstrator(self) -> policies.Policy:
-    """What the provider runs."""
+    """Policy that chooses the demonstrated actions."""
     return policies.make(self.policy, **self.options)
 
   def check(self, design: Any) -> None:

@@ -1,4 +1,4 @@
-"""Instantaneous reward: by how much a score has grown (paper, section 3.4)."""
+"""Instantaneous reward: the difference of two scores (paper, section 3.4)."""
 
 from typing import Any, Literal, final
 
@@ -10,13 +10,14 @@ from realab_suite.feedback.providers import base
 @base.PROVIDERS.add('difference')
 @final
 class Difference(base.Provider):
-  """Writes the current minus the previous reading of a meter register.
+  """Provider that writes the current minus the previous reading of a register.
 
-  It takes the reading on trust: whoever moves the meter register's base block
-  gives it one spike, whoever moves the offset block a spike and its opposite.
+  The register is usually a meter register, and its readings are not checked.
+  Moving its base block causes one spike of the feedback. Moving its offset
+  block causes a spike and then an opposite one.
 
   Attributes:
-    initial: The reading before the first step of an episode.
+    initial: Previous reading in the first step of an episode.
   """
 
   kind: Literal['difference'] = 'difference'

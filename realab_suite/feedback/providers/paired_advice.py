@@ -1,4 +1,4 @@
-"""Paired advice: how much better one action is than another (Uesato et al.)."""
+"""Paired advice: the difference of two actions' values (Uesato et al.)."""
 
 import functools
 from typing import Annotated, Any, Literal, final
@@ -19,15 +19,15 @@ _Pair = Annotated[
 @base.PROVIDERS.add('paired_advice')
 @final
 class PairedAdvice(base.Provider):
-  """Writes the value of one action less that of another.
+  """Provider that writes the value of one action minus the value of another.
 
-  The indices of both are read off query registers, so they can be corrupted
-  like anything else.
+  The indices of both actions are read from query registers, so they can be
+  corrupted.
 
   Attributes:
-    reads: Two query registers: of the action that the advice speaks for, and of
-      the one that it speaks against.
-    value_function: The name of a registered value function.
+    reads: Names of two query registers, with the index of the first action and
+      of the second action, whose value is subtracted.
+    value_function: Name of a registered value function.
     options: Keyword arguments of the value function.
   """
 
@@ -46,7 +46,7 @@ class PairedAdvice(base.Provider):
 
   @functools.cached_property
   def adviser(self) -> policies.ValueFunction:
-    """What the provider runs."""
+    """Value function that computes the advice."""
     return policies.make_value_function(self.value_function, **self.options)
 
   def check(self, design: Any) -> None:
@@ -54,7 +54,7 @@ class PairedAdvice(base.Provider):
     for query in self.reads:
       if design.registers[query].role != 'query':
         raise ValueError(
-            f'paired_advice reads a query off {query!r}, whose role is'
+            f'paired_advice reads a query from {query!r}, whose role is'
             f' {design.registers[query].role!r}; allowed is query'
         )
 
@@ -70,8 +70,8 @@ class PairedAdvice(base.Provider):
       state: Any,
   ) -> tuple[dict[str, np.ndarray], Any]:
     values, state = self.adviser.step(observation, episode_start, key, state)
-    good, bad = (
+    first, second = (
         queries.pick(values, queries.index(readings[name], values.shape[-1]))
         for name in self.reads
     )
-    return {self.writes[0]: good - bad}, state
+    return {self.writes[0]: first - second}, state

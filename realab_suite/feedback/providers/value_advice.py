@@ -1,4 +1,4 @@
-"""Value advice: how good an action is that the agent asks about (3.4)."""
+"""Value advice: the value of a queried action (paper, section 3.4)."""
 
 import functools
 from typing import Annotated, Any, Literal, final
@@ -11,24 +11,25 @@ from realab_suite.config import option_types
 from realab_suite.feedback.providers import base
 from realab_suite.feedback.providers import queries
 
-# What they read in a step, they credit to the query of that step.
-_LEARN_OF_THIS_STEP = ('value_advice', 'decoupled_approval')
+# Learners that credit the feedback of a step to the query of the same step.
+_WITHOUT_DELAY = ('value_advice', 'decoupled_approval')
 
 
 @base.PROVIDERS.add('value_advice')
 @final
 class ValueAdvice(base.Provider):
-  """Writes the value of the action whose index is in a query register.
+  """Provider that writes the value of the action that a query register holds.
 
-  The query is read off the query register's blocks, so it can be corrupted like
-  anything else. The observation reaches the provider directly, as in the paper
+  The query is read from the blocks of the query register, so it can be
+  corrupted. The observation reaches the provider directly, as in the paper
   (section 3.4, footnote).
 
   Attributes:
-    value_function: The name of a registered value function.
+    value_function: Name of a registered value function.
     options: Keyword arguments of the value function.
-    query_delay: 0 to value the query of this step in this step's observation;
-      1 to value the previous step's, as in the paper's example.
+    query_delay: 0 to evaluate the query of the current step in the observation
+      of the current step; 1 to evaluate the query of the previous step in the
+      observation of the previous step, as in the paper's example.
   """
 
   kind: Literal['value_advice'] = 'value_advice'
@@ -47,7 +48,7 @@ class ValueAdvice(base.Provider):
 
   @functools.cached_property
   def adviser(self) -> policies.ValueFunction:
-    """What the provider runs."""
+    """Value function that computes the advice."""
     return policies.make_value_function(self.value_function, **self.options)
 
   def check(self, design: Any) -> None:
@@ -55,14 +56,14 @@ class ValueAdvice(base.Provider):
     query = self.reads[0]
     if design.registers[query].role != 'query':
       raise ValueError(
-          f'value_advice reads the query off {query!r}, whose role is'
+          f'value_advice reads the query from {query!r}, whose role is'
           f' {design.registers[query].role!r}; allowed is query'
       )
     learner = None if design.learner is None else design.learner.kind
-    if self.query_delay and learner in _LEARN_OF_THIS_STEP:
+    if self.query_delay and learner in _WITHOUT_DELAY:
       raise ValueError(
-          'query_delay: 1 values the query of the step before, and the learner'
-          f' {learner} takes what it reads for the value of this one; allowed'
+          'query_delay: 1 evaluates the query of the previous step, but the'
+          f' learner {learner} expects the value of the current query; allowed'
           ' is 0, or another learner'
       )
 
@@ -86,7 +87,7 @@ class ValueAdvice(base.Provider):
     values, inner = self.adviser.step(observation, episode_start, key, inner)
     query = queries.index(readings[self.reads[0]], values.shape[-1])
     if self.query_delay:
-      # There is no previous step to value in the first one.
+      # The first step has no previous query.
       advice = np.where(
           episode_start, 0.0, queries.pick(values_before, query_before)
       )

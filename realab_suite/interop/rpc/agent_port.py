@@ -1,4 +1,7 @@
-"""What an agent may ask of a world, message by message: four requests."""
+"""Handler of an agent's requests to a world: join, step, reset and leave.
+
+Connections and threads are in `agent_server`.
+"""
 
 from collections.abc import Callable
 from typing import final
@@ -12,7 +15,7 @@ from realab_suite.interop.rpc import refusals
 from realab_suite.interop.rpc import tensors
 
 WORLD = 'world'
-"""The name of the only world, whatever it is."""
+"""Name of the world in requests; every server has exactly one world."""
 
 _Reason = refusals.Reason
 _REFUSED = refusals.RequestRefused
@@ -20,10 +23,11 @@ _REFUSED = refusals.RequestRefused
 
 @final
 class AgentPort:
-  """Answers one agent: join, step, reset and leave; all else is refused.
+  """Answers the requests of one agent.
 
-  Every request has one answer, whatever its bytes are. Nothing here knows of
-  connections or threads; whoever calls is the one thread that runs the world.
+  Agents may join, step, reset and leave; all other requests are refused. Every
+  request gets one answer, even if its bytes are invalid. All calls must come
+  from the thread that runs the world.
   """
 
   def __init__(
@@ -32,8 +36,8 @@ class AgentPort:
     """Makes the port.
 
     Args:
-      env: What the agent may know of the world.
-      abandon: Ends the episode under way, for an agent that leaves.
+      env: The agent's view of the world.
+      abandon: Function that ends the running episode when the agent leaves.
     """
     self._env = env
     self._abandon = abandon
@@ -47,7 +51,7 @@ class AgentPort:
     self._is_finished = False
 
   def answer(self, request: bytes) -> bytes:
-    """Returns the answer to a request."""
+    """Returns the serialised answer to a serialised request."""
     try:
       response = self._answer(_parse(request))
     except refusals.RequestRefused as refusal:
@@ -56,11 +60,11 @@ class AgentPort:
     return response.SerializeToString(deterministic=True)
 
   def disconnect(self) -> None:
-    """Forgets the agent; the next one has to join."""
+    """Resets the port, so that the next agent has to join."""
     self._is_joined = self._is_mid_episode = False
 
   def finish(self) -> None:
-    """Lets no further episode begin."""
+    """Refuses all steps that would begin an episode from now on."""
     self._is_finished = True
 
   def _answer(
@@ -99,7 +103,7 @@ class AgentPort:
   def _reset(
       self, request: dm_env_rpc_pb2.ResetRequest
   ) -> dm_env_rpc_pb2.ResetResponse:
-    """Agrees that the next step begins an episode, as it would anyway."""
+    """Accepts a reset between episodes; the next step begins one anyway."""
     if not self._is_joined:
       raise _REFUSED(_Reason.NOT_JOINED)
     if request.settings:
@@ -125,7 +129,7 @@ class AgentPort:
     elif self._is_finished:
       raise _REFUSED(_Reason.FINISHED)
     try:
-      # Actions of a first step are ignored: there was nothing to act upon.
+      # A step that begins an episode ignores its action.
       time_step = (
           self._env.step(action) if self._is_mid_episode else self._env.reset()
       )
@@ -147,7 +151,7 @@ def _parse(request: bytes) -> dm_env_rpc_pb2.EnvironmentRequest:
 
 
 def _state(time_step: dm_env.TimeStep) -> int:
-  """Returns the state whose discount, as clients see it, is the time step's."""
+  """Returns the state that clients convert to the time step's discount."""
   if not time_step.last():
     return dm_env_rpc_pb2.EnvironmentStateType.RUNNING
   if time_step.discount:

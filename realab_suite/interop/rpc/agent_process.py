@@ -1,4 +1,4 @@
-"""An agent as a program of its own, which is given an address and no more."""
+"""Agents that run as separate programs, and receive only an address."""
 
 from collections.abc import Callable, Mapping
 import os
@@ -16,27 +16,29 @@ from absl import logging
 from realab_suite import errors
 
 ADDRESS_VARIABLE = 'REALAB_ADDRESS'
-"""What an agent finds the address of its world in."""
+"""Environment variable that contains the address of an agent's world."""
 
-# All that an agent's environment has of the evaluator's.
+# The evaluator's environment variables that an agent inherits.
 _ALLOWED_VARIABLES = ('PATH', 'LANG', 'LC_ALL', 'LC_CTYPE', 'TZ')
 _PATIENCE_SECONDS = 2.0
 _CHUNK = 1 << 16
 MAX_LOG_BYTES = 64 << 20
-"""So much of what an agent says is written down."""
-_CUT = b'\n... the agent said more, which has not been kept\n'
+"""Maximum size of the log of an agent's output."""
+_CUT = b'\n... further output of the agent was not recorded\n'
 
 
 def owner_of(user: str) -> tuple[int, int]:
   """Returns the ids of a user and of the user's group.
 
+  Args:
+    user: Name of the user.
+
   Raises:
-    SpecError: If there is no such user, it is root, or this process may not be
-      another one.
+    SpecError: If the user is unknown or root, or this process is not root.
   """
   if os.geteuid() != 0:
     raise errors.SpecError(
-        f'agent_user: {user!r:.80}; only root can start programs of other users'
+        f'agent_user: {user!r:.80}; only root can start programs as other users'
     )
   try:
     entry = pwd.getpwnam(user)
@@ -44,8 +46,8 @@ def owner_of(user: str) -> tuple[int, int]:
     raise errors.SpecError(f'agent_user: {user!r:.80} is unknown') from error
   if entry.pw_uid == 0:
     raise errors.SpecError(
-        f'agent_user: {user!r:.80} is root, from whom nothing can be kept;'
-        ' allowed is any other user'
+        f'agent_user: {user!r:.80} is root, which can read everything; allowed'
+        ' is any other user'
     )
   return entry.pw_uid, entry.pw_gid
 
@@ -56,9 +58,10 @@ def environment_of(
   """Returns the environment variables of an agent.
 
   Args:
-    folder: The agent's own.
-    address: Of its world.
-    inherited: The evaluator's, of which few are passed on.
+    folder: Path of the agent's folder.
+    address: Address of its world.
+    inherited: Variables of the evaluator. Only a few harmless ones are passed
+      on.
   """
   passed = {k: v for k, v in inherited.items() if k in _ALLOWED_VARIABLES}
   return {
@@ -71,10 +74,10 @@ def environment_of(
 
 @final
 class AgentProcess:
-  """A command that runs as long as its world is served.
+  """Process of an agent, which runs while its world is served.
 
-  It inherits no descriptor but those of its standard streams: nothing to read,
-  and a pipe for what it says, which its evaluator writes down.
+  It inherits no file descriptors except its standard streams: an empty input,
+  and a pipe for its output, which the evaluator writes to a log.
   """
 
   def __init__(
@@ -90,16 +93,17 @@ class AgentProcess:
     """Starts the command.
 
     Args:
-      command: A program and its arguments, as one would type them.
-      address: Of the agent's world.
-      log: Gets what the agent says; it stays the caller's to close.
-      folder: Where the agent runs; `None` for a new folder, which is removed in
-        the end.
-      owner: The user and the group that the agent is; `None` for this one's.
-      on_exit: Called when the agent has ended, by another thread.
+      command: Program and arguments in shell syntax.
+      address: Address of the agent's world.
+      log: File for the agent's output. The caller closes it.
+      folder: Working directory of the agent; `None` for a new folder, which
+        `stop` removes.
+      owner: Ids of the agent's user and group; `None` for those of this
+        process.
+      on_exit: Function that another thread calls when the agent has ended.
 
     Raises:
-      SpecError: If there is no such command.
+      SpecError: If the command cannot be started.
     """
     self._temporary = None if folder else tempfile.mkdtemp(prefix='realab-')
     self._log: IO[bytes] | None = log
@@ -128,28 +132,28 @@ class AgentProcess:
           f'agent_command: cannot start {command!r:.80}: {error}'
       ) from error
     self._log_lock = threading.Lock()
-    self._listener = threading.Thread(
-        target=self._listen, args=(self._process.stdout,), daemon=True
+    self._log_thread = threading.Thread(
+        target=self._copy_output, args=(self._process.stdout,), daemon=True
     )
-    self._listener.start()
-    # What the agent has started may hold its streams open, and outlive it.
+    self._log_thread.start()
+    # Children of the agent may hold its streams open after it has ended.
     threading.Thread(target=self._wait, daemon=True).start()
 
   @property
   def pid(self) -> int:
-    """The number of the process, which leads a group of its own."""
+    """Process id, which is also the id of the agent's process group."""
     return self._process.pid
 
   def poll(self) -> int | None:
-    """Returns the status that the agent ended with; `None` if it runs."""
+    """Returns the exit status of the agent; `None` while it is running."""
     return self._process.poll()
 
   def stop(self) -> None:
-    """Lets the agent end, and ends it if it does not, politely at first."""
-    for how in (None, signal.SIGTERM, signal.SIGKILL):
+    """Waits briefly for the agent to end, then terminates and kills it."""
+    for number in (None, signal.SIGTERM, signal.SIGKILL):
       try:
-        if how is not None:
-          os.killpg(self._process.pid, how)
+        if number is not None:
+          os.killpg(self._process.pid, number)
       except ProcessLookupError:
         break
       try:
@@ -157,7 +161,7 @@ class AgentProcess:
       except subprocess.TimeoutExpired:
         continue
     self._process.wait()
-    self._listener.join(_PATIENCE_SECONDS)
+    self._log_thread.join(_PATIENCE_SECONDS)
     with self._log_lock:
       self._log = None
     self._clean_up()
@@ -166,11 +170,11 @@ class AgentProcess:
     self._process.wait()
     self._on_exit()
 
-  def _listen(self, said: Any) -> None:
-    """Writes down what the agent says, and never lets it wait."""
+  def _copy_output(self, output: Any) -> None:
+    """Writes the agent's output to the log, without ever blocking the agent."""
     left = MAX_LOG_BYTES
-    with said:
-      while data := os.read(said.fileno(), _CHUNK):
+    with output:
+      while data := os.read(output.fileno(), _CHUNK):
         with self._log_lock:
           if self._log is None:
             return

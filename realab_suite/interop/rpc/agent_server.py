@@ -1,7 +1,7 @@
-"""A socket with a world behind it, for one agent at a time.
+"""Server of a world over gRPC, for one agent at a time.
 
-The world is run by one thread: the one that calls `Server.run`. The threads of
-gRPC hand requests over, and wait.
+The thread that calls `Server.run` runs the world. The threads of gRPC queue
+requests for it, and wait for the answers.
 """
 
 import abc
@@ -23,12 +23,12 @@ MAX_REQUEST_BYTES = 1 << 20
 IDLE_SECONDS = 60.0
 
 _SERVICE, _METHOD = 'dm_env_rpc.v1.Environment', 'Process'
-# One for the agent, and one that turns others away.
+# One thread serves the agent, the other refuses further connections.
 _NUM_THREADS = 2
-# For how long an agent is let to read the last answer.
+# Time for an agent to read the last answer.
 _LINGER_SECONDS = 5.0
-# A signal may have interrupted a thread of gRPC's. Python hears of it when the
-# main thread wakes up, which may be the one that waits.
+# Longest wait for an event. Python handles signals in the main thread, which
+# may be waiting, while the system may deliver them to a thread of gRPC.
 _PULSE_SECONDS = 0.25
 _MAX_STREAMS = 16
 _HANDSHAKE_MS = 800
@@ -38,10 +38,10 @@ _OPTIONS = (
     ('grpc.max_metadata_size', _MAX_HEADER_BYTES),
     ('grpc.max_concurrent_streams', _MAX_STREAMS),
     ('grpc.server_handshake_timeout_ms', _HANDSHAKE_MS),
-    # Nobody else may listen at the same address.
+    # No other process may listen at the same address.
     ('grpc.so_reuseport', 0),
-    # The identity alone: what is compressed has a size that depends on it, and
-    # may be huge when it is unpacked.
+    # No compression: compressed sizes depend on the content, and a small
+    # message could decompress to a huge one.
     ('grpc.compression_enabled_algorithms_bitset', 1),
     ('grpc.http2.max_pings_without_data', 0),
 )
@@ -51,26 +51,26 @@ _OVER = 'R18: the connection has ended'
 
 @final
 class _Session:
-  """A stream of requests, from when it is let in until it is over."""
+  """Stream of requests of an admitted agent."""
 
   def __init__(self, context: grpc.ServicerContext) -> None:
     self.context = context
 
 
 @final
-class _Opened(NamedTuple):
+class _Connected(NamedTuple):
   session: _Session
 
 
 @final
-class _Asked(NamedTuple):
+class _Request(NamedTuple):
   session: _Session
   request: bytes
   answer: futures.Future[bytes]
 
 
 @final
-class _Gone(NamedTuple):
+class _Disconnected(NamedTuple):
   session: _Session
 
 
@@ -79,30 +79,31 @@ class _Stop(NamedTuple):
   pass
 
 
-_Event = _Opened | _Asked | _Gone | _Stop
+_SessionEvent = _Connected | _Request | _Disconnected
+_Event = _SessionEvent | _Stop
 
 
 class Service(abc.ABC):
-  """What is served. All calls come from the thread that runs the server."""
+  """Service for agents. All calls come from the thread that runs the server."""
 
   @abc.abstractmethod
   def connect(self) -> None:
-    """An agent has connected; it is the only one until `disconnect`."""
+    """Handles a new connection; no other agent connects until `disconnect`."""
 
   @abc.abstractmethod
   def answer(self, request: bytes) -> bytes:
-    """Returns the answer to a request of the agent's; never raises."""
+    """Returns the answer to a request of the agent; must not raise."""
 
   @abc.abstractmethod
   def disconnect(self) -> None:
-    """The agent has gone, or has been silent for too long."""
+    """Handles the end of a connection, by the agent or by its timeout."""
 
   @abc.abstractmethod
   def settle(self) -> bool:
-    """Does what the agent does not wait for, after each of its requests.
+    """Does work for which the agent does not wait, after each request.
 
     Returns:
-      Whether there is more to be had here.
+      True if the service has more episodes.
     """
 
 
@@ -126,11 +127,13 @@ class Server:
     """Makes the server.
 
     Args:
-      world: What answers.
-      address: `unix:/folder/name` or `host:port`; port 0 for any that is free.
-      idle_seconds: For how long an agent may be silent.
-      owner: The user and the group of the agent; `None` for this user's own.
-      clock: Time by which an agent is silent, seconds.
+      world: Service that answers requests.
+      address: `unix:/folder/name` or `host:port`; port 0 selects a free port.
+      idle_seconds: Time without requests after which a connection ends, in
+        seconds.
+      owner: Ids of the agent's user and group; `None` for those of this
+        process.
+      clock: Function that returns the time for `idle_seconds`, in seconds.
     """
     self._world = world
     self._owner = owner
@@ -138,9 +141,9 @@ class Server:
     self._idle_seconds = idle_seconds
     self._clock = clock
     self._events: queue.SimpleQueue[_Event] = queue.SimpleQueue()
-    self._is_taken = threading.Lock()
-    # While it is held, nobody is let in or turned away for good.
-    self._door = threading.Lock()
+    self._agent_slot = threading.Lock()
+    # Guards `_is_closed` and additions to the queue.
+    self._lock = threading.Lock()
     self._is_closed = False
     self._session: _Session | None = None
     self._deadline = 0.0
@@ -151,14 +154,14 @@ class Server:
 
   @property
   def address(self) -> str:
-    """Where it listens, as a client names it."""
+    """Address that clients connect to."""
     return self._address
 
   def start(self) -> None:
     """Begins to listen; requests wait until `run`.
 
     Raises:
-      SpecError: If it cannot listen there.
+      SpecError: If the address is invalid or in use.
     """
     self._server = grpc.server(
         futures.ThreadPoolExecutor(_NUM_THREADS, 'realab_rpc'),
@@ -176,8 +179,8 @@ class Server:
         )
       except RuntimeError as error:
         raise errors.SpecError(
-            f'address: cannot listen at {self._given_address!r:.120}; is it in'
-            ' use?'
+            f'address: cannot listen at {self._given_address!r:.120}; it may be'
+            ' in use'
         ) from error
     if kind is grpc.LocalConnectionType.LOCAL_TCP:
       host = self._given_address.rpartition(':')[0]
@@ -185,21 +188,21 @@ class Server:
     self._server.start()
 
   def run(self) -> None:
-    """Answers until there is no more to be had. This thread runs the world.
+    """Runs the world in this thread until the service or `stop` ends it.
 
     Raises:
-      ForkError: If the process was forked since the server was made.
+      ForkError: If the process was forked after the server was made.
     """
     if os.getpid() != self._pid:
       raise errors.ForkError(
-          'a server does not survive a fork; make it in the process that runs'
-          ' it'
+          'a server does not survive a fork; make it in the process that calls'
+          ' run'
       )
     try:
       while not (self._is_ending and self._session is None):
         try:
           event = self._events.get(
-              timeout=min(self._patience(), _PULSE_SECONDS)
+              timeout=min(self._time_left(), _PULSE_SECONDS)
           )
         except queue.Empty:
           self._expire()
@@ -208,89 +211,89 @@ class Server:
           break
         self._handle(event)
       if self._session is not None:
-        self._part()
+        self._end_session()
     finally:
       self.close()
 
   def stop(self) -> None:
-    """Makes `run` return; any thread may call."""
+    """Makes `run` return; any thread may call this method."""
     self._events.put(_Stop())
 
-  # In the thread that runs the world.
+  # These methods run in the thread that runs the world.
 
-  def _handle(self, event: _Opened | _Asked | _Gone) -> None:
-    if isinstance(event, _Opened):
+  def _handle(self, event: _SessionEvent) -> None:
+    if isinstance(event, _Connected):
       self._session = event.session
       self._world.connect()
-      self._stay()
+      self._extend_deadline()
       return
     if event.session is not self._session:
-      # It was silent for too long, and has been told so.
-      if isinstance(event, _Asked):
+      # Its connection has already ended by timeout.
+      if isinstance(event, _Request):
         event.answer.cancel()
       return
-    if isinstance(event, _Gone):
-      self._part()
+    if isinstance(event, _Disconnected):
+      self._end_session()
       return
     try:
       answer = self._world.answer(event.request)
     except BaseException:
-      # A thread of gRPC's waits for it, and the process for that thread.
+      # A thread of gRPC waits for the answer, and the process for that thread.
       event.answer.cancel()
       raise
     event.answer.set_result(answer)
     self._settle()
-    self._stay()
+    self._extend_deadline()
 
   def _settle(self) -> None:
     if not self._is_ending and not self._world.settle():
       self._is_ending = True
       self._deadline = self._clock() + _LINGER_SECONDS
 
-  def _stay(self) -> None:
+  def _extend_deadline(self) -> None:
     if not self._is_ending:
       self._deadline = self._clock() + self._idle_seconds
 
-  def _patience(self) -> float:
-    """Returns for how much longer the agent may be silent, seconds."""
+  def _time_left(self) -> float:
+    """Returns the time until the connection ends, in seconds."""
     if self._session is None:
       return _PULSE_SECONDS
     return max(0.0, self._deadline - self._clock())
 
   def _expire(self) -> None:
-    """Frees the world of an agent that has been silent for too long."""
-    if self._session is not None and not self._patience():
+    """Ends the connection if the agent has been idle for too long."""
+    if self._session is not None and not self._time_left():
       if not self._is_ending:
         logging.warning(
-            'the agent has been silent for %g s; its connection ends',
+            'no request from the agent for %g s; its connection ends',
             self._idle_seconds,
         )
       self._session.context.cancel()
-      self._part()
+      self._end_session()
 
-  def _part(self) -> None:
+  def _end_session(self) -> None:
     self._session = None
     try:
       self._world.disconnect()
       self._settle()
     finally:
-      self._is_taken.release()
+      self._agent_slot.release()
 
   def close(self) -> None:
-    """Lets nobody in any more, and nobody wait; `run` ends with it."""
-    with self._door:
+    """Stops the server and cancels waiting requests; `run` calls this last."""
+    with self._lock:
       if self._is_closed:
         return
       self._is_closed = True
     stopped = self._server.stop(grace=None)
     while not self._events.empty():
       event = self._events.get()
-      if isinstance(event, _Asked):
+      if isinstance(event, _Request):
         event.answer.cancel()
     stopped.wait()
     sockets.remove(self._given_address)
 
-  # In threads of gRPC.
+  # These methods run in threads of gRPC.
 
   def _process(
       self, requests: Iterator[bytes], context: grpc.ServicerContext
@@ -298,7 +301,7 @@ class Server:
     session = self._admit(context)
     for request in requests:
       answer: futures.Future[bytes] = futures.Future()
-      if not self._put(_Asked(session, request, answer)):
+      if not self._put(_Request(session, request, answer)):
         return
       try:
         yield answer.result()
@@ -306,24 +309,25 @@ class Server:
         return
 
   def _admit(self, context: grpc.ServicerContext) -> _Session:
-    """Lets an agent in if there is none.
+    """Starts a session if no other agent is connected.
 
     Raises:
-      Exception: Of gRPC's, which ends the stream, otherwise.
+      Exception: From gRPC, to end the stream, if another agent is connected or
+        the server is closed.
     """
-    if not self._is_taken.acquire(blocking=False):
+    if not self._agent_slot.acquire(blocking=False):
       context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, _BUSY)
     session = _Session(context)
-    if not self._put(_Opened(session)):
+    if not self._put(_Connected(session)):
       context.abort(grpc.StatusCode.UNAVAILABLE, _OVER)
-    gone = _Gone(session)
-    if not context.add_callback(lambda: self._put(gone)):
-      self._put(gone)
+    event = _Disconnected(session)
+    if not context.add_callback(lambda: self._put(event)):
+      self._put(event)
       context.abort(grpc.StatusCode.CANCELLED, _OVER)
     return session
 
-  def _put(self, event: _Opened | _Asked | _Gone) -> bool:
-    with self._door:
+  def _put(self, event: _SessionEvent) -> bool:
+    with self._lock:
       if not self._is_closed:
         self._events.put(event)
       return not self._is_closed

@@ -1,6 +1,6 @@
-"""What an agent is told when a request is refused: fixed texts, nothing else.
+"""Refusals of requests, with the fixed texts that agents receive.
 
-What went wrong in detail is for the evaluator's log.
+Details of a refusal appear only in the evaluator's log.
 """
 
 import enum
@@ -14,28 +14,29 @@ from realab_suite import errors
 
 @final
 class Reason(enum.Enum):
-  """Why a request is refused: the error's id, its code and its text.
+  """Reasons for refusals: id, code and text of the error.
 
-  A number in braces is one that the agent itself has sent, or the place of one.
+  Braces in a text stand for numbers that the agent sent itself, or for the
+  position of an element in its message.
   """
 
   UNREADABLE = (
       'R01', code_pb2.INVALID_ARGUMENT, 'the message cannot be read'
   )  # fmt: skip
-  EMPTY = 'R02', code_pb2.INVALID_ARGUMENT, 'the message asks for nothing'
+  EMPTY = 'R02', code_pb2.INVALID_ARGUMENT, 'the request has no payload'
   NOT_FOR_AGENTS = (
       'R03',
       code_pb2.PERMISSION_DENIED,
       'agents may join, step, reset and leave',
   )
-  SETTINGS = 'R04', code_pb2.PERMISSION_DENIED, 'agents choose no settings'
+  SETTINGS = 'R04', code_pb2.PERMISSION_DENIED, 'agents cannot set settings'
   WORLD = 'R05', code_pb2.INVALID_ARGUMENT, "the world's name is 'world'"
   NOT_JOINED = 'R06', code_pb2.FAILED_PRECONDITION, 'join the world first'
-  JOINED = 'R07', code_pb2.FAILED_PRECONDITION, 'the world is joined already'
+  JOINED = 'R07', code_pb2.FAILED_PRECONDITION, 'the world was already joined'
   MID_EPISODE = (
       'R08',
       code_pb2.FAILED_PRECONDITION,
-      'an episode is under way; it ends by steps, or by leaving the world',
+      'an episode is running; step to its end, or leave the world',
   )
   OBSERVATION = (
       'R09', code_pb2.INVALID_ARGUMENT, 'observation {} is unknown'
@@ -43,17 +44,17 @@ class Reason(enum.Enum):
   ACTION = 'R10', code_pb2.INVALID_ARGUMENT, 'action {} is unknown'
   NO_ACTION = 'R11', code_pb2.INVALID_ARGUMENT, 'action {} is missing'
   TYPE = (
-      'R12', code_pb2.INVALID_ARGUMENT, 'action {}: not of the type of its spec'
+      'R12', code_pb2.INVALID_ARGUMENT, 'action {}: type differs from its spec'
   )  # fmt: skip
   SHAPE = (
       'R13',
       code_pb2.INVALID_ARGUMENT,
-      'action {}: shape or number of elements differ from its spec',
+      'action {}: shape or number of elements differs from its spec',
   )
   VALUE = (
       'R14',
       code_pb2.INVALID_ARGUMENT,
-      'action {}: element {} is no number that its spec allows',
+      'action {}: element {} is not a number within the bounds of its spec',
   )
   FAILED = (
       'R15',
@@ -67,15 +68,15 @@ class Reason(enum.Enum):
 
 @final
 class RequestRefused(errors.RealabError):
-  """A request of the agent's was refused; the world has not moved."""
+  """Error for a request of the agent that is refused."""
 
   def __init__(self, reason: Reason, *numbers: int, details: str = '') -> None:
     """Makes the error.
 
     Args:
-      reason: Why.
-      *numbers: What the text has in braces.
-      details: What the evaluator's log says besides.
+      reason: Reason for the refusal.
+      *numbers: Numbers for the braces in the text.
+      details: Additional text for the evaluator's log.
     """
     self.code: int
     self.id, self.code, text = reason.value
@@ -83,7 +84,7 @@ class RequestRefused(errors.RealabError):
     super().__init__(f'{self.text} {details}'.rstrip())
 
   def response(self) -> dm_env_rpc_pb2.EnvironmentResponse:
-    """Returns what the agent is told."""
+    """Returns the message for the agent, without details."""
     response = dm_env_rpc_pb2.EnvironmentResponse()
     response.error.code = self.code
     response.error.message = self.text

@@ -1,4 +1,4 @@
-"""A world that is served: the agent's port in front, the evaluator behind."""
+"""Served world, which connects the agent's port with the evaluator."""
 
 from collections.abc import Callable
 import os
@@ -24,7 +24,7 @@ _ROOT = 0
 
 @final
 class ServedWorld(agent_server.Service):
-  """A world, what its agent may ask of it, and the results of its episodes."""
+  """Service that answers an agent's requests and reports episode results."""
 
   def __init__(
       self,
@@ -33,15 +33,15 @@ class ServedWorld(agent_server.Service):
       num_episodes: int,
       on_episode: OnEpisode,
   ) -> None:
-    """Makes the world ready; its first episode begins with the first step.
+    """Makes a served world; its first episode begins with the first step.
 
     Args:
-      env: The environment, which stays the caller's to close. It needs a
-        `SaltedSeed` for results of tier T2.
-      address: Where it is served.
-      num_episodes: After how many episodes there is no more to be had.
-      on_episode: Called with the result of each episode, and with the tier of
-        isolation that it was made under.
+      env: The environment. The caller closes it. Results of tier T2 require a
+        `SaltedSeed`.
+      address: Address of the server.
+      num_episodes: Number of episodes to serve.
+      on_episode: Function that is called with the result and the isolation tier
+        of each episode.
     """
     self._env = env
     self._address = address
@@ -56,8 +56,8 @@ class ServedWorld(agent_server.Service):
 
   def connect(self) -> None:
     users = sockets.users_connected_to(self._address)
-    # Root reaches everything; a user reaches what is the same user's. Without
-    # a salt the episodes follow from the seed, which is public.
+    # Root can read everything, and the same user can read this process. Without
+    # a salt, the episodes can be computed from the public seed.
     is_apart = (
         users
         and not users & {_ROOT, os.getuid()}
@@ -78,7 +78,7 @@ class ServedWorld(agent_server.Service):
 
   def settle(self) -> bool:
     for failure in self._failures:
-      logging.error('the episode has failed', exc_info=failure)
+      logging.error('the episode failed', exc_info=failure)
     self._failures.clear()
     for result in self._collector.take():
       self._num_left -= 1

@@ -1,4 +1,4 @@
-"""Where a server listens: folders that are the user's own, and who connects."""
+"""Sockets of servers: addresses, private folders, and users of connections."""
 
 from collections.abc import Iterator
 import contextlib
@@ -14,11 +14,11 @@ from realab_suite import errors
 
 _UNIX = 'unix:'
 _MAX_PATH = 100  # The system's limit is 107 or less.
-_UCRED = struct.Struct('3i')  # Process, user, group.
+_UCRED = struct.Struct('3i')  # Process id, user id, group id.
 
 
 def path_of(address: str) -> pathlib.Path | None:
-  """Returns the path of a unix socket's address; `None` for others."""
+  """Returns the path in a unix socket's address; `None` for other addresses."""
   if not address.startswith(_UNIX):
     return None
   return pathlib.Path(address.removeprefix(_UNIX).removeprefix('//'))
@@ -28,14 +28,21 @@ def path_of(address: str) -> pathlib.Path | None:
 def prepared(
     address: str, owner: tuple[int, int] | None = None
 ) -> Iterator[grpc.LocalConnectionType]:
-  """Makes room for a socket; what is made within is for one user only.
+  """Prepares an address, and restricts the socket that the context creates.
+
+  Only one user can connect to a unix socket.
 
   Args:
-    address: Where to listen.
-    owner: The user and the group who may connect; `None` for this user's own.
+    address: `unix:/folder/name` or `host:port`.
+    owner: Ids of the user and the group that may connect; `None` for those of
+      this process.
+
+  Yields:
+    The kind of connection.
 
   Raises:
-    SpecError: If others could get at the socket, or somebody listens there.
+    SpecError: If the address is invalid or in use, or other users could reach
+      the socket.
   """
   path = path_of(address)
   if path is None:
@@ -48,7 +55,7 @@ def prepared(
     if owner is not None:
       raise errors.SpecError(
           f'address: {address!r:.80}; allowed with a user for the agent is'
-          ' unix:/folder/name alone, because anybody could connect to a port'
+          ' unix:/folder/name only, because every user can connect to a port'
       )
     yield grpc.LocalConnectionType.LOCAL_TCP
     return
@@ -59,9 +66,7 @@ def prepared(
     )
   _make_private(path.parent, owner)
   if _is_alive(path):
-    raise errors.SpecError(
-        f'address: somebody listens at {address!r:.120} already'
-    )
+    raise errors.SpecError(f'address: {address!r:.120} is in use')
   yield grpc.LocalConnectionType.UDS
   path.chmod(0o600)
   if owner is not None:
@@ -69,20 +74,22 @@ def prepared(
 
 
 def remove(address: str) -> None:
-  """Removes what is left of a socket."""
+  """Removes the socket file of an address, if there is one."""
   path = path_of(address)
   if path is not None:
     path.unlink(missing_ok=True)
 
 
 def users_connected_to(address: str) -> set[int]:
-  """Returns the users at the other ends of this process's connections.
+  """Returns the ids of the users that are connected to this process.
 
-  gRPC does not say who has connected, but the system does: a connection that
-  was accepted has the address of the socket that it was made to.
+  gRPC does not report the users of its connections, so this function inspects
+  the process's sockets: an accepted connection has the address of the socket
+  that listens.
 
   Args:
-    address: Where this process listens. There are users at unix sockets only.
+    address: Address at which this process listens. The result is empty unless
+      it is a unix socket.
   """
   path = path_of(address)
   users: set[int] = set()
@@ -94,31 +101,40 @@ def users_connected_to(address: str) -> set[int]:
         continue
       with socket.socket(fileno=os.dup(int(name))) as end:
         if end.family == socket.AF_UNIX and end.getsockname() == str(path):
-          end.getpeername()  # The socket that listens has no other end.
+          end.getpeername()  # Raises OSError for the socket that listens.
           credentials = end.getsockopt(
               socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size
           )
           users.add(_UCRED.unpack(credentials)[1])
-    except OSError:  # It has been closed meanwhile.
+    except OSError:  # The socket listens, or was closed in the meantime.
       continue
   return users
 
 
 def _make_private(folder: pathlib.Path, owner: tuple[int, int] | None) -> None:
-  """Makes a folder that its user alone can enter; the owner's group may pass.
+  """Makes a folder that only this user can access; a group may traverse it.
 
-  The folder is this user's and stays so, because whoever has it can put another
-  socket there.
+  The folder must belong to this user, because the owner of a folder can replace
+  the socket in it.
+
+  Args:
+    folder: Path of the folder.
+    owner: Ids of the agent's user and group; `None` for those of this process.
+      The group may traverse the folder.
+
+  Raises:
+    SpecError: If the folder cannot be made, or belongs to another user, or has
+      another mode.
   """
   allowed = 0o700 if owner is None else 0o710
   try:
-    # Folders that are made on the way would not let the owner pass.
+    # The agent's user could not traverse parents that are created here.
     folder.mkdir(mode=0o700, parents=owner is None, exist_ok=True)
     status = folder.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
       raise errors.SpecError(
-          f'address: {folder} is no folder of user {os.geteuid()}; allowed is'
-          ' one that nobody else could put a socket into'
+          f'address: {folder} is not a folder of user {os.geteuid()}; allowed'
+          ' are folders into which no other user can put a socket'
       )
     mode = stat.S_IMODE(status.st_mode)
     if owner is not None and not mode & ~allowed:
@@ -131,12 +147,12 @@ def _make_private(folder: pathlib.Path, owner: tuple[int, int] | None) -> None:
   if mode & ~allowed:
     raise errors.SpecError(
         f'address: folder {folder} has mode {mode:04o}; allowed is'
-        f' {allowed:04o}, so that others cannot reach the socket'
+        f' {allowed:04o}, so that other users cannot reach the socket'
     )
 
 
 def _is_alive(path: pathlib.Path) -> bool:
-  """Returns whether somebody listens at a path."""
+  """Returns True if a process listens at a unix socket."""
   with socket.socket(socket.AF_UNIX) as probe:
     try:
       probe.connect(str(path))

@@ -1,4 +1,8 @@
-"""Specs, observations and actions as messages whose size says nothing."""
+"""Conversion of specs, observations and actions to dm_env_rpc messages.
+
+The size of an observation's message does not depend on its values, so it cannot
+carry information.
+"""
 
 from collections.abc import Mapping
 import math
@@ -14,9 +18,9 @@ from realab_suite import errors
 from realab_suite.interop.rpc import refusals
 
 ACTION = 1
-"""The uid of the action."""
+"""Uid of the action."""
 
-# An integer of these types takes as many bytes on the wire as its value needs.
+# Integer types whose encoded size depends on the value.
 _VARINTS = (np.int32, np.int64, np.uint32, np.uint64)
 _LARGEST_OF_ONE_BYTE = 127
 
@@ -25,13 +29,17 @@ Tensors = Mapping[int, dm_env_rpc_pb2.Tensor]
 
 @final
 class Observations:
-  """Turns observations into tensors; those of a name always have one size."""
+  """Converts observations to tensors, whose size is constant for each name."""
 
   def __init__(self, spec: Mapping[str, specs.Array]) -> None:
-    """Numbers the observations, from 1 on, in the order of the spec.
+    """Numbers the observations from 1, in the order of the spec.
+
+    Args:
+      spec: Observation spec.
 
     Raises:
-      SpecError: If the size of an observation would depend on its value.
+      SpecError: If the size of an observation's message would depend on its
+        value.
     """
     for name, one in spec.items():
       _refuse_varying_size(name, one)
@@ -44,21 +52,21 @@ class Observations:
     }
 
   def check(self, uids: Any) -> list[int]:
-    """Returns the uids that are asked for, each once.
+    """Returns the requested uids without duplicates, in ascending order.
 
     Raises:
-      RequestRefused: If one is unknown.
+      RequestRefused: If a uid is unknown.
     """
-    # Not one by one: a request may ask for one of them a million times.
-    asked = set(uids)
-    for uid in sorted(asked - self._names.keys()):
+    # Remove duplicates first: a request may repeat one uid a million times.
+    requested = set(uids)
+    for uid in sorted(requested - self._names.keys()):
       raise refusals.RequestRefused(refusals.Reason.OBSERVATION, uid)
-    return sorted(asked)
+    return sorted(requested)
 
   def pack(
       self, observation: Mapping[str, np.ndarray], uids: list[int]
   ) -> dict[int, dm_env_rpc_pb2.Tensor]:
-    """Returns some observations as tensors, by uid."""
+    """Returns the observations with the given uids as tensors, by uid."""
     return {
         uid: tensor_utils.pack_tensor(observation[self._names[uid]])
         for uid in uids
@@ -67,7 +75,7 @@ class Observations:
 
 @final
 class Actions:
-  """Reads actions; nothing is unpacked before its header has been checked."""
+  """Reads actions from tensors, and checks their headers before unpacking."""
 
   def __init__(self, spec: specs.Array) -> None:
     self._spec = spec
@@ -77,10 +85,13 @@ class Actions:
     self.specs = {ACTION: dm_env_utils.dm_env_spec_to_tensor_spec(spec)}
 
   def read(self, tensors: Tensors) -> np.ndarray:
-    """Returns the action that is in a request.
+    """Returns the action of a request.
+
+    Args:
+      tensors: Tensors of the request, by uid.
 
     Raises:
-      RequestRefused: If it is none that the spec allows.
+      RequestRefused: If the action is missing or does not satisfy its spec.
     """
     for uid in sorted(tensors):
       if uid != ACTION:
@@ -92,7 +103,7 @@ class Actions:
     if payload != self._payload:
       raise refusals.RequestRefused(refusals.Reason.TYPE, ACTION)
     elements = getattr(tensor, payload).array
-    # Shapes may be as large as they like, or negative: they are compared.
+    # Shapes may be huge or negative, so only compare them.
     is_alike = (
         len(elements) == self.size
         and len(tensor.shape) == len(self._spec.shape)
@@ -101,7 +112,7 @@ class Actions:
     if not is_alike:
       raise refusals.RequestRefused(refusals.Reason.SHAPE, ACTION)
     values = tensor_utils.unpack_proto(tensor)
-    good = (values >= self._low) & (values <= self._high)  # NaN is not.
+    good = (values >= self._low) & (values <= self._high)  # False for nan.
     if not good.all():
       first = int(np.argmin(good))
       raise refusals.RequestRefused(refusals.Reason.VALUE, ACTION, first)
@@ -109,7 +120,7 @@ class Actions:
 
 
 def _bounds(spec: specs.Array) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the least and the largest value of each element, flattened."""
+  """Returns the lower and the upper bound of each element, flattened."""
   if not isinstance(spec, specs.BoundedArray):
     raise errors.SpecError(f'action: {spec}; allowed are bounded arrays')
   low = np.broadcast_to(spec.minimum, spec.shape).ravel()
@@ -118,7 +129,11 @@ def _bounds(spec: specs.Array) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _refuse_varying_size(name: str, spec: specs.Array) -> None:
-  """Refuses integers that need more bytes the larger they are."""
+  """Checks that the encoded size of an observation is constant.
+
+  Raises:
+    SpecError: If it depends on the value.
+  """
   if spec.dtype.type not in _VARINTS:
     return
   is_bounded = isinstance(spec, specs.BoundedArray) and (
@@ -126,7 +141,7 @@ def _refuse_varying_size(name: str, spec: specs.Array) -> None:
   )
   if not is_bounded:
     raise errors.SpecError(
-        f'observation {name}: {spec.dtype} whose size on the wire would depend'
-        ' on its value; allowed are floats, bools, 8-bit integers, and others'
-        f' that are bounded to [0, {_LARGEST_OF_ONE_BYTE}]'
+        f'observation {name}: the encoded size of {spec.dtype} would depend on'
+        ' its value; allowed are floats, bools, 8-bit integers, and other'
+        f' integers with bounds in [0, {_LARGEST_OF_ONE_BYTE}]'
     )

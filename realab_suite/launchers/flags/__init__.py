@@ -1,1 +1,1 @@
-"""Flags that several programs share."""
+"""Flags shared by several programs."""

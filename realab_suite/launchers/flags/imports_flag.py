@@ -1,4 +1,4 @@
-"""The flag by which programs learn of registers, tasks and more of a user's."""
+"""Flag `--import`, which loads modules with extensions of the package."""
 
 import importlib
 
@@ -9,22 +9,22 @@ from realab_suite import errors
 _IMPORT = flags.DEFINE_multi_string(
     'import',
     [],
-    'A module to import first, as in --import=my_registers: one of yours that'
-    ' adds registers, providers, tasks, policies or learners. May be repeated.',
+    'Module to import first, such as --import=my_registers. It can add'
+    ' registers, providers, tasks, policies or learners',
 )
 
 
 def load() -> None:
-  """Imports the modules; not before a renderer has been chosen.
+  """Imports the modules; a renderer has to be chosen first.
 
   Raises:
-    SpecError: If one cannot be found.
+    SpecError: If a module cannot be found.
   """
   for name in _IMPORT.value:
     if not all(part.isidentifier() for part in name.split('.')):
       raise errors.SpecError(
-          f'--import={name:.80}: not the name of a module; allowed are names as'
-          ' in my_registers or my_package.registers'
+          f'--import={name:.80}: not the name of a module; allowed are names'
+          ' such as my_registers or my_package.registers'
       )
     try:
       importlib.import_module(name)
@@ -36,5 +36,5 @@ def load() -> None:
 
 
 def arguments() -> list[str]:
-  """Returns the flags that tell another program to do the same."""
+  """Returns command-line arguments with which a program does the same."""
   return [f'--import={name}' for name in _IMPORT.value]

@@ -1,10 +1,9 @@
-"""The flag that says where results go, which several programs have."""
+"""Flag `--output`, shared by several programs."""
 
 from absl import flags
 
 OUTPUT = flags.DEFINE_string(
     'output',
     None,
-    'The folder to write into; a report goes to the folder of its sweep by'
-    ' default.',
+    'Folder to write into. Default of `report`: the folder of the sweep.',
 )

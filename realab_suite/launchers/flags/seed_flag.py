@@ -1,4 +1,4 @@
-"""The flag that sets the seed."""
+"""Flag `--seed`, shared by several programs."""
 
 from absl import flags
 
@@ -8,7 +8,7 @@ LARGEST_SEED = 2**31 - 1
 SEED = flags.DEFINE_integer(
     'seed',
     0,
-    'Seed of everything random.',
+    'Seed of all random streams.',
     lower_bound=0,
     upper_bound=LARGEST_SEED,
 )

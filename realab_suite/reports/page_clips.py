@@ -1,0 +1,94 @@
+"""Films in the page of a report."""
+
+from collections.abc import Callable, Sequence
+import contextlib
+import dataclasses
+import math
+import pathlib
+import tempfile
+from typing import Any, final
+
+from realab_suite import errors
+from realab_suite.evaluation import results
+from realab_suite.experiments import result_tables
+from realab_suite.reports import numbers
+from realab_suite.reports import page_pictures
+from realab_suite.reports import replays
+from realab_suite.reports import sweep_results
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Clip:
+  """A film in the page.
+
+  Attributes:
+    family: Design that the film belongs to.
+    title: Title of the film.
+    note: Figures of the episode.
+    uri: Data URI of the film.
+    poster: Data URI of its last frame, for printed pages.
+  """
+
+  family: str
+  title: str
+  note: str
+  uri: str
+  poster: str
+
+
+def clips(
+    learned: Sequence[numbers.Figures], say: Callable[[str], None]
+) -> tuple[list[Clip], str | None]:
+  """Returns films of some episodes, and a problem or `None`.
+
+  The problem is the error of the last episode that could not be filmed.
+
+  Args:
+    learned: Runs to film, two episodes of each.
+    say: Called with a line on each film.
+  """
+  films, problem = [], None
+  for one in learned:
+    first, typical = replays.first_row(one.run), replays.typical_row(one.run)
+    chosen = [('first episode', first)]
+    if typical != first:
+      chosen.append(('typical episode (median corruption)', typical))
+    for what, row in chosen:
+      if row is None:
+        continue
+      say(f'{one.run.name}: filming the {what}')
+      try:
+        films.append(_clip(one.run, row, what))
+      except errors.RealabError as error:
+        problem = f'{one.run.name}: {error}'
+  return films, problem
+
+
+def _clip(run: sweep_results.Run, row: results.EpisodeRow, what: str) -> Clip:
+  from realab_suite.reports import films  # Needs a renderer.
+
+  with tempfile.TemporaryDirectory() as folder:
+    path = pathlib.Path(folder) / 'clip.mp4'
+
+    def film(env: Any, stack: contextlib.ExitStack) -> Any:
+      # Halves the time per frame, without a visible difference in a clip.
+      env.physics.model.vis.quality.offsamples = 0
+      return stack.enter_context(films.Film(env, path, run.name)).add
+
+    replays.replay(run, row, film)
+    data = path.read_bytes()
+    poster = films.last_frame(path)
+  corruption = result_tables.number_text(
+      None if math.isnan(row.corruption) else row.corruption
+  )
+  return Clip(
+      run.name,
+      f'{run.name}: {what}',
+      f'evaluation seed {row.seed}, world {row.world}, episode {row.episode}:'
+      f' true return {result_tables.number_text(row.true_return)}, observed'
+      f' {result_tables.number_text(row.observed_return)}, corruption'
+      f' {corruption} m',
+      page_pictures.data_uri('video/mp4', data),
+      page_pictures.data_uri('image/jpeg', poster),
+  )

@@ -1,0 +1,321 @@
+"""Tests for paths in options: those of a file stay in the working directory."""
+
+from collections.abc import Callable, Iterator
+import json
+import os
+import pathlib
+from typing import Any
+
+import pytest
+
+from realab_suite import suite
+from realab_suite.config import messages
+from realab_suite.experiments import experiment_specs
+from realab_suite.feedback import specs
+from tests.config import file_readers
+from tests.config import off_limits
+from tests.config import refusals
+from tests.feedback import designs
+
+_WATCH = off_limits.Watch()
+_PATH = '<path>'  # Stands for a path in a design.
+_REGISTER = {**designs.REWARD, 'range': [0, 13]}
+_DEMONSTRATION = {'kind': 'demonstration', 'writes': ['reward']}
+_ADVICE = designs.ADVISED['providers'][0]
+_READING = {'kind': 'test_reading', 'writes': ['reward']}
+
+
+@pytest.fixture(autouse=True)
+def outside() -> Iterator[pathlib.Path]:
+  """A folder that is off limits, beside the working directory."""
+  with file_readers.registered(), off_limits.workplace() as folder:
+    yield folder
+
+
+def _design(provider: Any, **changes: Any) -> dict[str, Any]:
+  registers = {'reward': _REGISTER, 'query': designs.QUERY}
+  return {
+      **designs.ADVISED, 'registers': registers, 'providers': [provider],
+      **changes,
+  }  # fmt: skip
+
+
+def _demonstrated(policy: str, **options: Any) -> dict[str, Any]:
+  return {**_DEMONSTRATION, 'policy': policy, 'options': options}
+
+
+def _approved(policy: str, **options: Any) -> dict[str, Any]:
+  return {**_ADVICE, 'options': {'policy': policy, 'options': options}}
+
+
+def _wrapped(depth: int, policy: str, **options: Any) -> dict[str, Any]:
+  """Returns a demonstration by a policy inside of `depth` others."""
+  for _ in range(depth):
+    options = {'inner': policy, 'inner_options': options}
+    policy = 'test_wrapping'
+  return _demonstrated(policy, **options)
+
+
+def _file(design: Any) -> str:
+  # Written as JSON, which is YAML without anchors.
+  pathlib.Path('given.yaml').write_text(json.dumps(design))
+  return 'given.yaml'
+
+
+def _refusal(load: Callable[..., Any], *args: Any, **kwargs: Any) -> str:
+  """Returns the refusal of a call that opens no file off limits."""
+  with _WATCH.only('.'):
+    text = refusals.refusal(load, *args, **kwargs)
+    opened = [p for p in _WATCH.opened if off_limits.FOLDER in p]
+  assert not opened
+  return text
+
+
+# Options of `test_reader` with a path, in every type that can hold one.
+_OPTIONS: list[dict[str, Any]] = [
+    *({name: _PATH} for name in ('file', 'maybe', 'either', 'opaque', 'own')),
+    *({name: _PATH} for name in ('source', 'pure', 'like')),
+    *({name: ['', _PATH]} for name in ('files', 'pair', 'root', 'inner')),
+    *({name: ['', _PATH]} for name in ('text', 'named')),
+    *({name: {'file': _PATH}} for name in ('model', 'data', 'typed')),
+    {'table': {'/': ['', _PATH]}},
+    {'models': [{'file': _PATH}]},
+    {'typed': {'must': _PATH}},
+    {'keyed': {_PATH: 1}},
+]
+_NO_OP = _demonstrated('no_op')
+_READING_REGISTER = {
+    **_REGISTER, 'kind': 'test_reading', 'options': {'file': _PATH},
+}  # fmt: skip
+# Designs with a path somewhere.
+_PLACES: dict[str, dict[str, Any]] = {
+    **{f'option {option}': _design(_demonstrated('test_reader', **option))
+        for option in _OPTIONS},
+    **{f'file of {policy}': _design(_demonstrated(policy, file=_PATH))
+        for policy in ('test_inheriting', 'test_any_file', 'test_function',
+        'test_factory', 'test_model', 'test_partial', 'test_partial_class')},
+    **{f'{depth} policies deep': _design(_wrapped(depth, 'network_demonstrator',
+        weights=_PATH)) for depth in (0, 1, 24)},
+    'weights of a value function': _design({**_ADVICE,
+        'value_function': 'network_values', 'options': {'weights': _PATH}}),
+    'policy of a value function': _design(_approved('network_demonstrator',
+        weights=_PATH)),
+    'inner policy of a value function': _design(_approved('test_wrapping',
+        inner='test_reader', inner_options={'file': _PATH})),
+    'provider': _design({**_READING, 'file': _PATH}),
+    'model of a provider': _design({**_READING, 'more': {'file': _PATH}}),
+    'policy of a provider': _design({**_READING, 'teacher': 'test_reader',
+        'teacher_options': {'file': _PATH}}),
+    'second provider': _design(
+        _NO_OP, providers=[_NO_OP, {**_READING, 'writes': [], 'file': _PATH}]),
+    'register': _design(_NO_OP, registers={'reward': _READING_REGISTER})
+}  # fmt: skip
+
+
+def _keys(node: Any) -> tuple[Any, ...] | None:
+  """Returns the keys that lead to the path in a design."""
+  if node == _PATH:
+    return ()
+  pairs: Any = node.items() if isinstance(node, dict) else ()
+  for key, value in enumerate(node) if isinstance(node, list) else pairs:
+    below = () if key == _PATH else _keys(value)
+    if below is not None:
+      return (key, *below)
+  return None
+
+
+def _filled(design: Any, path: str) -> Any:
+  """Returns a design with a path in its place."""
+  return json.loads(json.dumps(design).replace(_PATH, path))
+
+
+@pytest.mark.parametrize('place', _PLACES.values(), ids=_PLACES)
+def test_a_path_is_confined_where_a_file_names_it(
+    place: dict[str, Any], outside: pathlib.Path
+):
+  path = str(outside / 'secret.npz')
+  design = _filled(place, path)
+  keys = [path if key == _PATH else key for key in _keys(place) or ()]
+  key = messages.format_path(keys)
+  problem = (
+      f'{key}: {path!r} is outside the working directory; allowed in a file'
+      ' are names, and paths within it'
+  )
+  assert _refusal(specs.load, _file(design)) == f'given.yaml: {problem}'
+  text = _refusal(specs.load, design, is_confined=True)
+  assert text == f'design: {problem}'
+  # A mapping may name any file, and the option opens it.
+  with _WATCH.only('.'):
+    spec = specs.load(design)
+    if key.startswith('registers'):  # A register is made with its world.
+      suite.load('unlock_door', 'near', design=spec).close()
+    assert os.path.realpath(path) in _WATCH.opened
+  # A file may name what is within the directory.
+  secret = pathlib.Path(path).read_bytes()
+  pathlib.Path('sub', 'mine.npz').write_bytes(secret)
+  design = _filled(place, './sub/../sub/mine.npz')
+  loaded = specs.load(_file(design), is_confined=True)
+  assert specs.load(loaded.to_mapping()).digest() == loaded.digest()
+
+
+def test_an_absolute_path_within_the_directory_is_accepted():
+  pathlib.Path('sub', 'mine.txt').touch()
+  path = os.path.abspath('sub/mine.txt')
+  specs.load(_file(_design(_demonstrated('test_reader', file=path))))
+
+
+@pytest.mark.parametrize(
+    'path',
+    [
+        '/',
+        '..',
+        'sub/../../x',
+        '~',
+        '~root/x',
+        'C:x',
+        '\\\\server\\share',
+        'sub\\..\\..\\x',
+        'https://example.org/x.npz',
+        '/proc/self/environ',
+        '/dev/stdin',
+        'link.yaml',
+        'linked/secret.npz',
+        'linked/../off_limits/secret.npz',
+        'twice/secret.npz',
+        'loop/../../x',
+    ],
+)
+def test_a_path_out_of_the_directory_is_refused(
+    path: str, outside: pathlib.Path
+):
+  off_limits.make_paths(outside)  # Makes links.
+  os.symlink('loop', 'loop')
+  design = _design(_wrapped(1, 'network_demonstrator', weights=path))
+  text = _refusal(specs.load, _file(design))
+  assert 'inner_options.weights: ' in text
+  assert 'is outside the working directory' in text
+
+
+@pytest.mark.parametrize(
+    'path', ['', '.', 'x', 'a' * 5000, 'a/' * 300, '$HOME/x']
+)
+def test_a_path_that_is_no_file_is_refused(path: str):
+  design = _design(_wrapped(1, 'network_demonstrator', weights=path))
+  text = _refusal(specs.load, _file(design))
+  assert text.startswith('given.yaml: providers[0]: weights ')
+  assert 'are neither a file nor one of' in text
+
+
+def test_a_path_with_nul_is_refused():
+  design = _design(_wrapped(1, 'network_demonstrator', weights='a\0b'))
+  text = _refusal(specs.load, _file(design))
+  assert 'inner_options.weights: character U+0000 is not allowed' in text
+
+
+def test_options_that_are_not_paths_may_contain_any_text():
+  label = '/etc/../~'
+  teacher = {'teacher': 'test_reader', 'teacher_options': {'label': label}}
+  for provider in (
+      _demonstrated('test_reader', label=label, pair=[label, ''], either=3),
+      _demonstrated('test_reader', model={'label': label}),
+      {**_READING, 'label': label, **teacher},
+  ):
+    specs.load(_file(_design(provider)))
+
+
+# Overrides.
+
+
+_DEEP = 'providers.0.options.inner_options.weights'
+
+
+def _within() -> dict[str, Any]:
+  return _design(_wrapped(1, 'network_demonstrator', weights='demonstrator_v1'))
+
+
+def test_overrides_may_name_any_file_unless_they_are_confined(
+    outside: pathlib.Path,
+):
+  path = str(outside / 'secret.npz')
+  for override in (
+      f'{_DEEP}={path!r}',
+      f'providers={json.dumps([_wrapped(3, "test_reader", file=path)])}',
+  ):
+    with _WATCH.only('.'):
+      specs.load(_file(_within()), (override,))
+      assert os.path.realpath(path) in _WATCH.opened
+    overrides = ('dof=planar', override)
+    text = _refusal(specs.load, _file(_within()), overrides, is_confined=True)
+    assert text.startswith(f'override {override!r:.60}'.rstrip("'"))
+    assert f'{path!r} is outside the working directory' in text
+
+
+def test_a_path_of_the_file_stays_confined_beside_overrides(
+    outside: pathlib.Path,
+):
+  path = str(outside / 'secret.npz')
+  design = _design(_demonstrated('test_reader', label=path, files=['', path]))
+  for override in ('dof=planar', 'providers.0.options.files.0=given.yaml'):
+    text = _refusal(specs.load, _file(design), (override,))
+    assert text.startswith('given.yaml: providers[0].options.files[1]: ')
+  # The key of the override only begins like that of the path.
+  design = _design(_demonstrated('test_any_file', weights=path))
+  override = 'providers.0.options.weights_2=x'
+  text = _refusal(specs.load, _file(design), (override,))
+  assert text.startswith('given.yaml: providers[0].options.weights: ')
+
+
+def test_a_text_that_an_override_makes_a_path_is_confined(
+    outside: pathlib.Path,
+):
+  path = str(outside / 'secret.npz')
+  design = _design(_demonstrated('test_wrapping', inner_options={'file': path}))
+  override = 'providers.0.options.inner=test_reader'
+  text = _refusal(specs.load, _file(design), (override,))
+  assert 'providers[0].options.inner_options' in text
+  design = _design(_demonstrated('test_wrapping', weights=path))
+  override = 'providers.0.policy=network_demonstrator'
+  text = _refusal(specs.load, _file(design), (override,))
+  assert text.startswith(
+      f"override '{override}': providers[0].options.weights: {path!r} is"
+      ' outside'
+  )
+
+
+def test_experiments_are_confined_with_their_overrides(outside: pathlib.Path):
+  path = str(outside / 'secret.npz')
+  pathlib.Path('within.yaml').write_text(json.dumps(_within()))
+  without = _design(_wrapped(1, 'network_demonstrator', weights=path))
+  pathlib.Path('without.yaml').write_text(json.dumps(without))
+  (outside / 'design.yaml').write_text(json.dumps(_within()))
+  learner = {'learner': {'kind': 'behavioural_cloning'}}
+
+  def experiment(**run: Any) -> dict[str, Any]:
+    return {
+        'schema': 1,
+        'name': 'e',
+        'task': 'unlock_door.near',
+        'runs': {'one': {**learner, **run}},
+        'seeds': [0],
+    }
+
+  for run, place in (
+      ({'design': 'without.yaml'}, 'runs.one: without.yaml: providers[0].opt'),
+      (
+          {'design': 'within.yaml', 'overrides': [f'{_DEEP}={path}']},
+          f"runs.one: override '{_DEEP}=",
+      ),
+      ({'design': str(outside / 'design.yaml')}, 'runs.one.design: '),
+      ({'design': f'../{outside.name}/design.yaml'}, 'runs.one.design: '),
+  ):
+    text = _refusal(experiment_specs.load, _file(experiment(**run)))
+    assert text.startswith(f'given.yaml: {place}')
+    assert 'is outside the working directory' in text
+  experiment_specs.load(_file(experiment(design='within.yaml')))
+  # An experiment that is not a file may name any path.
+  own = experiment(
+      design=str(outside / 'design.yaml'), overrides=[f'{_DEEP}={path}']
+  )
+  with _WATCH.only('.'):
+    experiment_specs.load(own)
+    assert os.path.realpath(path) in _WATCH.opened

@@ -1,0 +1,158 @@
+"""Tests for `config.validation`: models, and errors with key paths."""
+
+from typing import Annotated, Any, Literal
+
+import pydantic
+import pytest
+
+from realab_suite import errors
+from realab_suite.config import validation
+from tests.config import refusals
+
+
+class _Spec(pydantic.BaseModel):
+  model_config = pydantic.ConfigDict(
+      extra='forbid', strict=True, allow_inf_nan=False
+  )
+
+
+class _Constant(_Spec):
+  kind: Literal['constant']
+  value: float
+
+
+class _Scaled(_Spec):
+  kind: Literal['scaled']
+  scale: float
+
+
+class _Register(_Spec):
+  shape: Literal['two_block', 'scale'] = pydantic.Field(alias='type')
+  range: Annotated[list[float], pydantic.Field(max_length=2)]
+  scale: Annotated[float, pydantic.Field(gt=0)] = 1.0
+  blocks: int = 2
+  label: str = ''
+  meters: list[str] = []
+
+  @pydantic.field_validator('meters')
+  @classmethod
+  def _refuse(cls, meters: list[str]) -> list[str]:
+    if 'reward' in meters:
+      raise errors.SpecError('a meter may\nnot be called reward')
+    return meters
+
+
+class _Design(_Spec):
+  registers: dict[str, _Register] = {}
+  providers: list[
+      Annotated[_Constant | _Scaled, pydantic.Field(discriminator='kind')]
+  ] = []
+  spare: _Register | None = None
+  either: _Constant | _Scaled | None = None
+  mixed: int | list[_Register] = 0
+  nested: int | list[_Constant | _Scaled] = 0
+
+
+def _refusal(data: dict[str, Any]) -> str:
+  return refusals.refusal(validation.validate, _Design, data, 'd.yaml')
+
+
+def _register(**changes: Any) -> dict[str, Any]:
+  register = {'type': 'two_block', 'range': [0, 1], **changes}
+  return {'registers': {'reward': register}}
+
+
+def test_valid_data_gives_the_model_and_stays_unchanged():
+  data = {
+      **_register(scale=2),
+      'providers': [{'kind': 'scaled', 'scale': 1.0}],
+  }
+  before = repr(data)
+  design = validation.validate(_Design, data, 'd.yaml')
+  assert design.registers['reward'].scale == 2
+  assert isinstance(design.providers[0], _Scaled)
+  assert repr(data) == before
+
+
+@pytest.mark.parametrize(('data', 'expected'), [
+    (_register(range=[0, True]),
+        'registers.reward.range[1]: must be a valid number, got True'),
+    (_register(scale=0),
+        'registers.reward.scale: must be greater than 0, got 0'),
+    (_register(scale=float('nan')),
+        'registers.reward.scale: must be a finite number, got nan'),
+    (_register(blocks=1000.0),
+        'registers.reward.blocks: must be a valid integer, got 1000.0'),
+    (_register(type='block'),
+        "registers.reward.type: must be 'two_block' or 'scale', got"
+        " 'block'"),
+    (_register(meters=['reward']),
+        'registers.reward.meters: a meter may not be called reward,'
+        " got ['reward']"),
+    (_register(tpye=1),
+        "registers.reward: unknown key 'tpye'; did you mean 'type'?"
+        ' (allowed: type, range, scale, blocks, label, meters)'),
+    ({'unheard': 1},
+        "unknown key 'unheard' (allowed: registers, providers, spare,"
+        ' either, mixed, nested)'),
+    ({'registers': {'a b': 3}}, "registers['a b']: must be a mapping, got 3"),
+    ({'spare': {'type': 'scale'}}, 'spare.range: required key is missing'),
+    ({'providers': [{'kind': 'constant', 'valeu': 1, 'value': 1}]},
+        "providers[0]: unknown key 'valeu'; did you mean 'value'?"
+        ' (allowed: kind, value)'),
+    ({'providers': [{'kind': 'scale'}]},
+        "providers[0].kind: must be one of 'constant', 'scaled', got"
+        " 'scale'"),
+    ({'providers': [{}]}, 'providers[0].kind: required key is missing'),
+    ({'providers': [7]}, 'providers[0]: must be a mapping, got 7'),
+    ({'mixed': [{'type': 'scale', 'range': 1}]},
+        'mixed[0].range: must be a valid list, got 1'),
+    # Pydantic's names for the two unions are left out.
+    ({'nested': [{'kind': 'scaled', 'scale': 'x'}]},
+        "nested[0].scale: must be a valid number, got 'x'"),
+    ({'either': {'kind': 'scaled', 'scale': 'x'}},
+        "either.scale: must be a valid number, got 'x'"),
+    ({'either': 3}, 'either: must be a mapping, got 3'),
+    ({'registers': {1: _register()['registers']['reward']}},
+        'registers[1]: must be a valid string, got 1')
+])  # fmt: skip
+def test_a_problem_names_its_keys_and_the_value(data, expected):
+  message = _refusal(data)
+  assert message.startswith('d.yaml: ')
+  # A union may have further problems.
+  problems = message.removeprefix('d.yaml: ') + '; '
+  assert f'{expected}; ' in problems
+
+
+def test_all_problems_are_named_in_one_line():
+  message = _refusal(
+      {
+          **_register(range=[0, 'x'], scale=-1, metres=1),
+          'providers': [{'kind': 'constant'}],
+      }
+  )
+  assert message == (
+      "d.yaml: registers.reward.range[1]: must be a valid number, got 'x';"
+      ' registers.reward.scale: must be greater than 0, got -1;'
+      " registers.reward: unknown key 'metres'; did you mean 'meters'?"
+      ' (allowed: type, range, scale, blocks, label, meters);'
+      ' providers[0].value: required key is missing'
+  )
+
+
+def test_a_long_value_is_cut():
+  message = _refusal(_register(scale='x' * 10_000))
+  assert message.endswith('x' * 76 + '...')
+  assert len(message) < 200
+
+
+def test_a_value_that_python_cannot_print_is_replaced_by_its_type():
+  message = _refusal(_register(range=10**5000))
+  assert message.endswith('must be a valid list, got <int>')
+
+
+def test_errors_do_not_show_those_of_pydantic():
+  with pytest.raises(errors.SpecError) as info:
+    validation.validate(_Design, {'spare': 1}, 'd.yaml')
+  assert info.value.__cause__ is None
+  assert info.value.__context__ is None

@@ -1,0 +1,204 @@
+"""Bad actions are rejected by name and value, and the world does not change.
+
+`hostile_actions_test.py` sends random ones among good ones, also to batches.
+"""
+
+from typing import Any
+
+import hypothesis
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from tests import worlds
+from tests.engine import helpers
+
+_NAN, _INF = float('nan'), float('inf')
+_INDEX = ('action_set={name: dmlab_like, version: 1}',)
+_QUERY = (
+    'registers.query={kind: two_block, role: query, place: station_3,'
+    ' range: [0, 13]}',
+)
+
+
+def _load(overrides: tuple[str, ...] = ()) -> Any:
+  return suite.load(
+      'collect_apples', 'standard', {'random': 7}, {'max_steps': 10_000},
+      design='instantaneous_reward', overrides=overrides,
+  )  # fmt: skip
+
+
+def _with(index: int, value: float) -> np.ndarray:
+  action = np.zeros(6)
+  action[index] = value
+  return action
+
+
+class _Hostile:
+  """Raises an error when it is converted to an array."""
+
+  def __init__(self, error: type[Exception]) -> None:
+    self._error = error
+
+  def __array__(self, *args: Any, **kwargs: Any) -> Any:
+    raise self._error('no')
+
+  def __repr__(self) -> str:
+    return 'two\nlines'
+
+
+_BAD_ACTIONS: dict[str, tuple[Any, str]] = {
+    'nan': (_with(0, _NAN), 'action[0] (forward) is nan'),
+    'all nan': (np.full(6, _NAN), 'action[0] (forward) is nan'),
+    'inf': (_with(2, _INF), 'action[2] (turn) = inf outside [-1, 1]'),
+    '-inf': (_with(5, -_INF), 'action[5] (throw) = -inf outside [-1, 1]'),
+    '5.0': (_with(1, 5.0), 'action[1] (strafe) = 5.0 outside [-1, 1]'),
+    'barely': (_with(1, np.nextafter(1, 2)), 'action[1] (strafe) = 1.0000'),
+    'int': (_with(4, -2).astype(int), 'action[4] (grasp) = -2.0 outside'),
+    'unsigned': (np.full(6, 200, np.uint8), 'action[0] (forward) = 200.0'),
+    'float16': (_with(3, _INF).astype(np.float16), 'action[3] (look) = inf'),
+    'longdouble': (np.full(6, np.longdouble('1e4000')), '= inf outside'),
+    'scalar': (0.5, 'shape (), expected (6,)'),
+    'shape (1, 6)': (np.zeros((1, 6)), 'shape (1, 6), expected (6,)'),
+    'shape (7,)': (np.zeros(7), 'shape (7,), expected (6,)'),
+    'empty list': ([], 'shape (0,), expected (6,)'),
+    'bool': (np.zeros(6, bool), 'dtype bool'),
+    'None': (None, 'dtype object'),
+    'str': ('forward', 'dtype <U7'),
+    'numbers as text': (['0'] * 6, 'dtype <U1'),
+    'bytes': (b'000000', 'dtype |S6'),
+    'array of objects': (np.zeros(6, object), 'dtype object'),
+    'complex': (np.zeros(6, complex), 'dtype complex128'),
+    'dict': ({'forward': 1.0}, 'dtype object'),
+    'date': (np.zeros(6, 'datetime64[s]'), 'dtype datetime64[s]'),
+    'record': (np.zeros(6, [('a', float)]), 'action: dtype'),
+    'ragged': ([[1.0], [1.0, 2.0]], 'action: '),
+    'huge integers': ([10**400] * 6, 'dtype object'),
+    'generator': ((0.0 for _ in range(6)), 'dtype object'),
+    'masked': (np.ma.zeros(6), 'masked'),
+    'TypeError': (_Hostile(TypeError), 'action: '),
+    'RuntimeError': (_Hostile(RuntimeError), 'action: '),
+}
+
+
+def _refuse(env: Any, action: Any) -> str:
+  """Returns the message for an action; the world must not change."""
+  before = worlds.state_bytes(env.physics)
+  with pytest.raises(errors.ActionError) as caught:
+    env.step(action)
+  assert worlds.state_bytes(env.physics) == before
+  assert '\n' not in str(caught.value)
+  return str(caught.value)
+
+
+@pytest.fixture(scope='module')
+def running() -> Any:
+  """One environment in the middle of an episode, for all bad actions."""
+  env = _load()
+  env.reset()
+  for action in helpers.random_actions(env, 3):
+    env.step(action)
+  return env
+
+
+@pytest.mark.parametrize(
+    ('action', 'message'), _BAD_ACTIONS.values(), ids=_BAD_ACTIONS
+)
+def test_a_bad_action_is_rejected(running: Any, action: Any, message: str):
+  assert message in _refuse(running, action)
+  assert running.step(helpers.no_op(running)).mid()
+
+
+@hypothesis.given(
+    action=st.one_of(
+        st.lists(st.floats() | st.integers(), min_size=5, max_size=7),
+        st.recursive(
+            st.none() | st.booleans() | st.text() | st.binary() | st.floats(),
+            lambda inner: st.lists(inner, max_size=3),
+            max_leaves=6,
+        ),
+    )
+)
+def test_any_object_is_accepted_or_rejected(running: Any, action: Any):
+  before = worlds.state_bytes(running.physics)
+  try:
+    time_step = running.step(action)
+  except errors.ActionError:
+    assert worlds.state_bytes(running.physics) == before
+  else:
+    running.action_spec().validate(np.array(action, float))
+    assert time_step.mid()
+
+
+@pytest.mark.parametrize('dtype', [np.float16, np.float32, np.int8, np.uint64])
+def test_other_number_types_are_cast(dtype: Any):
+  env, twin = _load(), _load()
+  env.reset()
+  twin.reset()
+  action = np.array([1, 0, 1, 0, 0, 0])
+  for given in (action.astype(dtype), action.tolist()):
+    expected = helpers.to_bytes(twin.step(action.astype(float)))
+    assert helpers.to_bytes(env.step(given)) == expected
+
+
+def test_an_action_is_neither_kept_nor_changed():
+  env, twin = _load(), _load()
+  env.reset()
+  twin.reset()
+  action = np.array([0.5, 0, 0.3, 0, 0, 0])
+  first = env.step(action)
+  np.testing.assert_array_equal(action, [0.5, 0, 0.3, 0, 0, 0])
+  assert helpers.to_bytes(first) == helpers.to_bytes(twin.step(action.copy()))
+  action[:] = _NAN  # The caller may write to its own array.
+  second = env.step(np.zeros(6))
+  assert helpers.to_bytes(second) == helpers.to_bytes(twin.step(np.zeros(6)))
+
+
+@pytest.mark.parametrize(
+    ('overrides', 'bad', 'good'),
+    [
+        (
+            _INDEX,
+            {
+                'action (dmlab_like/v1) = 14.0 outside [0, 13]': 14,
+                'action (dmlab_like/v1) = -1.0 outside [0, 13]': -1,
+                'dtype float64': 1.0,
+                'dtype bool': True,
+                'shape (1,), expected ()': [1],
+                'dtype object': None,
+            },
+            (0, np.int64(13), np.uint8(5), np.array(3)),
+        ),
+        # No provider takes this query for an index, so any number is accepted.
+        (
+            (*_INDEX, *_QUERY),
+            {
+                'action[0] (query/query) = 14.0 outside [0, 13]': [14.0, 0],
+                'action[0] (query/query) is nan': [_NAN, 0],
+                'action[1] (dmlab_like/v1) = 14.0 outside': [3.0, 14],
+                'action[1] (dmlab_like/v1) is nan': [3.0, _NAN],
+                'shape (1,), expected (2,)': [3.0],
+            },
+            ([3.5, 13],),
+        ),
+    ],
+    ids=['index', 'query and index'],
+)
+def test_bad_indices_and_queries_are_rejected(overrides, bad, good):
+  env = _load(overrides)
+  env.reset()
+  for message, action in bad.items():
+    assert message in _refuse(env, action)
+  for action in good:
+    assert env.step(action).mid()
+
+
+def test_an_index_applies_its_row_of_the_action_set():
+  env, twin = _load(_INDEX), _load()
+  env.reset()
+  twin.reset()
+  for index, controls in ((1, [1, 0, 0]), (8, [1, 0, -1]), (0, [0, 0, 0])):
+    found = helpers.to_bytes(env.step(index))
+    assert found == helpers.to_bytes(twin.step([*controls, 0, 0, 0]))

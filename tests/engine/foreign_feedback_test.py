@@ -1,0 +1,205 @@
+"""Foreign Composer tasks with feedback, and what they share with Composer."""
+
+import ast
+import copy
+import inspect
+from typing import Any
+
+from dm_control import composer
+from dm_control.locomotion.arenas import floors
+from dm_control.locomotion.tasks import go_to_target
+from dm_control.locomotion.walkers import jumping_ball
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite.engine import environment
+from realab_suite.entities import registers
+from tests.engine import helpers
+
+
+def _go_to_target() -> composer.Task:
+  return go_to_target.GoToTarget(
+      jumping_ball.RollingBallWithHead(),
+      floors.Floor(size=(8.0, 8.0)),
+      walker_spawn_position=(0.0, 0.0),
+      target_spawn_position=(0.3, 0.0),
+  )
+
+
+def test_a_task_of_dm_controls_gets_feedback_and_hides_its_reward():
+  stock = composer.Environment(_go_to_target(), random_state=0)
+  expected = set(stock.observation_spec())
+  control_spec = stock.action_spec()
+  env, sink = helpers.embed(_go_to_target(), helpers.SCORED, max_steps=8)
+  assert set(env.observation_spec()) == {
+      *(f'senses/{name}' for name in expected),
+      'senses/time_left',
+      'registers/reward',
+  }
+  assert env.action_spec().shape == control_spec.shape
+  assert env.action_spec().name == control_spec.name
+  keys = list(env.observation_spec())
+  time_steps = [env.reset()]
+  for _ in range(8):
+    action = np.zeros(control_spec.shape)
+    time_steps.append(env.step(action))
+  assert time_steps[-1].last()
+  for time_step in time_steps:
+    assert list(time_step.observation) == keys
+    for value in time_step.observation.values():
+      assert value.base is None
+      assert np.isfinite(value).all()
+  assert {step.reward for step in time_steps[1:]} == {0.0}
+  # It stands on its target from the start, and earns 1 in every step.
+  assert [float(step.true_reward) for step in sink.steps] == [1.0] * 8
+  # The mechanism keeps the score, up to the step before.
+  measured = [
+      float(w.requested) for w in sink.records(registers.Write, 'score')
+  ]
+  assert measured == [float(i) for i in range(8)]
+  observed = [float(s.observation['registers/reward']) for s in time_steps]
+  np.testing.assert_allclose(observed, [0, 0] + [1] * 7, atol=1e-6)
+
+
+def test_an_embedded_task_may_offer_measurements():
+  task = helpers.PointTask()
+  design = copy.deepcopy(helpers.SCORED)
+  design['meters'][0]['measures'] = 'time'
+  env, sink = helpers.embed(
+      task, design, measurements={'time': lambda physics: physics.time()}
+  )
+  env.reset()
+  env.step([0.0])
+  (written,) = sink.records(registers.Write, 'score')
+  # After a third of the five substeps of 10 ms.
+  np.testing.assert_allclose(written.requested, 0.01)
+
+
+def test_hooks_of_an_embedded_task_run_as_in_composer():
+  heard: list[str] = []
+
+  class Hooked(helpers.PointTask):
+
+    def initialize_episode_mjcf(self, random_state: Any) -> None:
+      heard.append('initialize_episode_mjcf')
+
+    def initialize_episode(self, physics: Any, random_state: Any) -> None:
+      super().initialize_episode(physics, random_state)
+      heard.append('initialize_episode')
+
+    def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+      super().before_step(physics, action, random_state)
+      heard.append('before_step')
+
+    def before_substep(
+        self, physics: Any, action: Any, random_state: Any
+    ) -> None:
+      np.testing.assert_array_equal(action, [0.5])
+      heard.append('before_substep')
+
+    def after_substep(self, physics: Any, random_state: Any) -> None:
+      heard.append('after_substep')
+
+    def after_step(self, physics: Any, random_state: Any) -> None:
+      heard.append('after_step')
+
+    def after_compile(self, physics: Any, random_state: Any) -> None:
+      heard.append('after_compile')
+
+  def play(make: Any) -> list[str]:
+    env = make(Hooked())
+    heard.clear()
+    for _ in range(2):
+      env.reset()
+      env.step(np.array([0.5]))
+      env.step(np.array([0.5]))
+    env.close()
+    return list(heard)
+
+  expected = play(lambda task: composer.Environment(task, random_state=1))
+  assert expected.count('before_substep') == 20
+  assert play(lambda task: helpers.embed(task, helpers.SCORED)[0]) == expected
+
+
+def test_an_embedded_task_moves_as_it_would_without_feedback():
+  # Composer steps from the middle of MuJoCo's step; the bead does not mind.
+  stock = composer.Environment(
+      helpers.PointTask(), random_state=0, legacy_step=False
+  )
+  env, _ = helpers.embed(helpers.PointTask())
+  stock.reset()
+  env.reset()
+  start = env.physics.data.qpos.copy()
+  with stock.physics.reset_context():
+    stock.physics.data.qpos[:] = start
+  for action in ([1.0], [0.3], [-1.0], [0.0]):
+    stock.step(np.array(action))
+    env.step(action)
+    np.testing.assert_allclose(
+        env.physics.data.qpos, stock.physics.data.qpos, atol=1e-12
+    )
+  assert not np.allclose(env.physics.data.qpos, start)
+
+
+def test_a_sense_that_is_called_like_one_of_ours_is_refused():
+  class Clashing(helpers.PointTask):
+
+    @property
+    def task_observables(self) -> Any:
+      return {'time_left': self.bead}
+
+  with pytest.raises(errors.RealabError, match='time_left'):
+    helpers.embed(Clashing(), max_steps=5)
+  helpers.embed(Clashing(), max_steps=None)  # Nothing clashes.
+
+
+# What this package takes from the inside of dm_control.
+
+# The private names of dm_control 1.0.50's composer.Environment that
+# engine/environment.py uses. If this fails after an upgrade, read the new
+# composer/environment.py before changing the list.
+_PRIVATE_OF_DM_CONTROL_1_0_50 = {
+    '_hooks',
+    '_n_sub_steps',
+    '_observation_updater',
+    '_physics',
+    '_physics_proxy',
+    '_random_state',
+    '_recompile_mjcf_every_episode',
+    '_recompile_physics',
+    '_recompile_physics_and_update_observables',
+    '_reset_next_step',
+    '_task',
+}
+
+
+def test_dm_control_still_has_the_private_parts_of_1_0_50_that_are_used():
+  stock = composer.Environment(helpers.PointTask(), random_state=0)
+  missing = {
+      name for name in _PRIVATE_OF_DM_CONTROL_1_0_50 if not hasattr(stock, name)
+  }
+  stock.close()
+  assert not missing
+
+
+def test_no_other_private_parts_of_dm_control_are_used():
+  ours = environment.Environment
+  tree = ast.parse(inspect.getsource(ours))
+  used, assigned = set(), set()
+  for node in ast.walk(tree):
+    if isinstance(node, ast.Attribute) and (
+        isinstance(node.value, ast.Name) and node.value.id == 'self'
+    ):
+      used.add(node.attr)
+      if isinstance(node.ctx, ast.Store):
+        assigned.add(node.attr)
+  used |= set(vars(ours))
+  private = {n for n in used if n.startswith('_') and not n.startswith('__')}
+  stock = composer.Environment(helpers.PointTask(), random_state=0)
+  inherited = {name for name in private if hasattr(stock, name)}
+  stock.close()
+  # Names that every class has, such as those of `abc`.
+  inherited -= {name for name in private if name.startswith('_abc')}
+  assert inherited == _PRIVATE_OF_DM_CONTROL_1_0_50
+  assert private - set(vars(ours)) - assigned <= _PRIVATE_OF_DM_CONTROL_1_0_50

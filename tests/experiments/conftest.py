@@ -1,0 +1,14 @@
+"""Fixture of all tests of experiments: plans of jobs are made quickly."""
+
+import pytest
+
+from realab_suite import suite
+from tests.experiments import small
+
+
+@pytest.fixture(autouse=True, scope='module')
+def _cached_dynamics():
+  """Builds each world once to find its dynamics."""
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(suite, 'dynamics', small.dynamics)
+    yield

@@ -1,0 +1,398 @@
+"""Runs that die at an operation on a file, and what is left of them.
+
+`run_training` and `write_rows` are called in the children of a `tests.zygote`.
+The runs are small and real except for their learner, which is
+`tests.experiments.fake_learner`.
+"""
+
+from collections.abc import Callable, Sequence
+import io
+import os
+import pathlib
+import shutil
+import signal
+import sys
+from typing import Any, final
+import warnings
+
+import yaml
+
+from realab_suite.evaluation import results
+from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import jobs
+from realab_suite.experiments import storage
+from realab_suite.experiments import training
+from realab_suite.launchers import program
+from realab_suite.launchers import train
+from tests import zygote
+from tests.experiments import fake_learner
+
+_RUN = 'reward'
+_SEED = 3
+_EXPERIMENT = {
+    'schema': 1,
+    'name': 'victim',
+    'task': 'unlock_door.near',
+    'max_steps': 5,
+    'runs': {
+        _RUN: {
+            'design': 'instantaneous_reward',
+            'overrides': ['dof=planar'],
+        },
+    },
+    'seeds': [_SEED],
+    'training': {
+        'num_envs': 2,
+        'steps': 48,
+        'checkpoint_every': 16,
+        'curve_every': 8,
+    },
+    'evaluation': {'episodes': 2},
+}
+_NAMES = (
+    storage.CONFIG,
+    storage.DONE,
+    training.EPISODES,
+    training.TRACE,
+    training.CURVE,
+    training.TRAINING_EPISODES,
+    training.LEARNER,
+)
+_KEPT = 'kept'
+# Ways to die at an operation on a file: before it, in the middle of a write, or
+# by a loss of power, which takes back all that was not synchronised, with the
+# new names of files or without.
+KILLED, TORN, POWER, NAMES_FIRST = 'killed', 'torn', 'power', 'names'
+WAYS = (KILLED, TORN, POWER, NAMES_FIRST)
+
+
+# ---- Called in children ------------------------------------------------------
+
+
+def run_training(
+    experiment: str,
+    output: str,
+    *,
+    die_at: int = 0,
+    way: str = KILLED,
+    count: str | None = None,
+    bug: str | None = None,
+) -> None:
+  """Runs the command line of a run; never returns.
+
+  Args:
+    experiment: File of the experiment.
+    output: Folder of results.
+    die_at: Number of the operation on files to die at; 0 for none.
+    way: Way to die.
+    count: File to write the number of operations to.
+    bug: Key of `BUGS`, a bug to plant.
+  """
+  _keep_last_checkpoints()
+  if bug is not None:
+    BUGS[bug]()
+  training.make_learner = fake_learner.make
+  shim = _Shim(die_at, way)
+  shim.install()
+  sys.argv = ['train', f'--experiment={experiment}', f'--run={_RUN}',
+              f'--seed={_SEED}', f'--output={output}']  # fmt: skip
+  try:
+    program.start(train.main)
+  finally:
+    if count is not None:
+      pathlib.Path(count).write_text(str(shim.num_done))
+
+
+def write_rows(
+    path: str, acknowledged: str, rows: Sequence[str], die_at: int, way: str
+) -> None:
+  """Writes rows, and acknowledges each one that is written.
+
+  Args:
+    path: File of rows.
+    acknowledged: File that grows by a byte for each written row.
+    rows: Rows, as JSON.
+    die_at: Number of the operation on files to die at.
+    way: Way to die.
+  """
+  parsed = [results.EpisodeRow.model_validate_json(row) for row in rows]
+  _Shim(die_at, way).install()
+  said = os.open(acknowledged, os.O_CREAT | os.O_WRONLY | os.O_APPEND)
+  with results.RowWriter(path) as writer:
+    for row in parsed:
+      writer.write(row)
+      os.write(said, b'.')
+
+
+def _keep_last_checkpoints() -> None:
+  """Copies the checkpoints before a finished run removes them."""
+  finish = storage.RunFolder.finish
+
+  def finish_with_a_copy(self: Any, *arguments: Any) -> None:
+    kept = self.path / _KEPT
+    shutil.rmtree(kept, ignore_errors=True)
+    shutil.copytree(self.path / 'checkpoints', kept)
+    finish(self, *arguments)
+
+  storage.RunFolder.finish = finish_with_a_copy
+
+
+# ---- Operations on files -----------------------------------------------------
+
+
+@final
+class _Shim:
+  """Counts operations of `storage` and `results` on files; kills the process.
+
+  It also keeps what a disk would contain after a loss of power: each file as of
+  its last `fsync`, and each name as of the last `fsync` of its folder.
+  """
+
+  def __init__(self, die_at: int, way: str) -> None:
+    self.num_done = 0
+    self._die_at = die_at
+    self._way = way
+    self._safe_sizes: dict[str, int] = {}
+    self._renames: list[tuple[str, str, bytes | None]] = []
+    self._write = io.FileIO.write
+    self._originals = (os.fsync, os.replace, pathlib.Path.unlink)
+
+  def install(self) -> None:
+    """Replaces the operations on files of this process."""
+    shim, (fsync, replace, unlink) = self, self._originals
+
+    class File(io.FileIO):
+      """A file whose writes are counted."""
+
+      def write(self, data: Any) -> int:
+        shim.reach(self, bytes(data))
+        return super().write(data)
+
+      def truncate(self, size: int | None = None) -> int:
+        shim.reach()
+        return super().truncate(size)
+
+    def open_counted(path: Any, mode: str = 'r', **options: Any) -> Any:
+      if mode == 'rb':
+        return open(path, mode)
+      raw = File(os.fspath(path), mode.replace('b', ''))
+      shim.opened(raw)
+      if options.get('buffering') == 0:
+        return raw
+      return io.BufferedWriter(raw)
+
+    def counted_fsync(descriptor: int) -> None:
+      shim.reach()
+      fsync(descriptor)
+      shim.synchronised(os.readlink(f'/proc/self/fd/{descriptor}'))
+
+    def counted_replace(source: Any, target: Any) -> None:
+      shim.reach()
+      shim.renamed(str(source), str(target))
+      replace(source, target)
+
+    def counted_unlink(path: Any, **options: Any) -> None:
+      shim.reach()
+      unlink(path, **options)
+
+    storage.open = results.open = open_counted
+    os.fsync, os.replace = counted_fsync, counted_replace
+    pathlib.Path.unlink = counted_unlink
+
+  def opened(self, file: Any) -> None:
+    """Records that the present content of a file is on the disk."""
+    path = os.path.realpath(file.name)
+    size = os.fstat(file.fileno()).st_size
+    self._safe_sizes[path] = min(size, self._safe_sizes.get(path, size))
+
+  def synchronised(self, path: str) -> None:
+    """Records that a file, or the names in a folder, are on the disk."""
+    if os.path.isdir(path):
+      self._renames = [
+          one for one in self._renames if os.path.dirname(one[1]) != path
+      ]
+    else:
+      self._safe_sizes[path] = os.path.getsize(path)
+
+  def renamed(self, source: str, target: str) -> None:
+    """Records the file that had a name before another one gets it."""
+    old = None
+    if os.path.exists(target):
+      old = pathlib.Path(target).read_bytes()
+    self._renames.append((source, target, old))
+    self._safe_sizes[target] = self._safe_sizes.pop(source, 0)
+
+  def reach(self, file: Any = None, data: bytes = b'') -> None:
+    """Counts an operation, and ends the process at the last one."""
+    self.num_done += 1
+    if self.num_done != self._die_at:
+      return
+    if self._way == TORN and file is not None:
+      self._write(file, data[: len(data) // 2])
+    if self._way in (POWER, NAMES_FIRST):
+      self._lose_power()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+  def _lose_power(self) -> None:
+    _, replace, _ = self._originals
+    for path, size in self._safe_sizes.items():
+      if os.path.isfile(path) and os.path.getsize(path) > size:
+        os.truncate(path, size)
+    if self._way == NAMES_FIRST:
+      return
+    for source, target, old in reversed(self._renames):
+      replace(target, source)
+      if old is not None:
+        pathlib.Path(target).write_bytes(old)
+
+
+# ---- Planted bugs ------------------------------------------------------------
+
+
+def _write_in_place(path: pathlib.Path, data: bytes) -> None:
+  with storage.open(path, 'wb') as file:
+    file.write(data)
+
+
+def _write_without_fsync(path: pathlib.Path, data: bytes) -> None:
+  partial = path.with_name(f'{path.name}.partial')
+  _write_in_place(partial, data)
+  os.replace(partial, path)
+
+
+def _keep_all_lines() -> None:
+  begin = storage.JsonLines.__init__
+  storage.JsonLines.__init__ = lambda self, path, mark=None: begin(self, path)
+
+
+def _forget_a_step() -> None:
+  set_state = fake_learner.FakeLearner.set_state
+
+  def forgetful(self: Any, state: Any) -> None:
+    set_state(self, {**state, 'num_steps': state['num_steps'] - 1})
+
+  fake_learner.FakeLearner.set_state = forgetful
+
+
+BUGS: dict[str, Callable[[], None]] = {
+    'files are written in place': lambda: setattr(
+        storage, 'write_whole', _write_in_place
+    ),
+    'nothing is synchronised': lambda: setattr(
+        storage, 'write_whole', _write_without_fsync
+    ),
+    'lines behind the checkpoint stay': _keep_all_lines,
+    'the learner forgets a step': _forget_a_step,
+}
+
+
+# ---- Called in tests ---------------------------------------------------------
+
+
+@final
+class Killer:
+  """Starts runs, kills them, and continues them."""
+
+  def __init__(self, nursery: zygote.Zygote, root: pathlib.Path) -> None:
+    """Runs once without a kill, for comparison."""
+    self._nursery = nursery
+    self._root = root
+    self._experiment = root / 'experiment.yaml'
+    self._experiment.write_text(yaml.safe_dump(_EXPERIMENT))
+    [self._job] = jobs.plan(experiment_specs.load(self._experiment))
+    count = root / 'count'
+    ended = self._train(root / 'whole', count=str(count))
+    if ended.status:
+      raise RuntimeError(f'a run without a kill has failed: {ended.said}')
+    self.num_operations = int(count.read_text())
+    self._whole = self._results(root / 'whole')
+    self._num_outputs = 0
+
+  def kill_and_finish(
+      self, kills: Sequence[tuple[int, str]], bug: str | None = None
+  ) -> list[str]:
+    """Kills a run at operations, one after the other, then lets it finish.
+
+    Args:
+      kills: Numbers of operations, counted from each start, and ways to die.
+      bug: Key of `BUGS`, a bug to plant.
+
+    Returns:
+      Complaints: of a run that failed, or files that differ from those of a run
+      without a kill.
+    """
+    self._num_outputs += 1
+    output = self._root / str(self._num_outputs)
+    for number, way in kills:
+      ended = self._train(output, die_at=number, way=way, bug=bug)
+      # Near its end a continued run has fewer operations than the first one.
+      if ended.status not in (0, -signal.SIGKILL):
+        return [f'failed before it was killed: {ended}']
+    ended = self._train(output, bug=bug)
+    if ended.status:
+      return [f'did not continue: {ended}']
+    found = self._results(output)
+    shutil.rmtree(output)
+    names = sorted(found.keys() | self._whole.keys())
+    return [name for name in names if found.get(name) != self._whole.get(name)]
+
+  def rows(self, count: int) -> list[results.EpisodeRow]:
+    """Returns rows as a run writes them, each of another episode."""
+    path = self._root / 'whole' / self._job.folder() / training.EPISODES
+    [row, *_] = results.read_rows(path)
+    return [row.model_copy(update={'episode': i}) for i in range(count)]
+
+  def _train(self, output: pathlib.Path, **options: Any) -> zygote.Ended:
+    return self._nursery.call(
+        'run_training',
+        experiment=str(self._experiment),
+        output=str(output),
+        **options,
+    )
+
+  def _results(self, output: pathlib.Path) -> dict[str, bytes]:
+    folder = output / self._job.folder()
+    kept = sorted((folder / _KEPT).iterdir())
+    paths = [*(folder / name for name in _NAMES), *kept]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def kill_writer(
+    nursery: zygote.Zygote,
+    folder: pathlib.Path,
+    rows: Sequence[results.EpisodeRow],
+    number: int,
+    way: str,
+) -> tuple[int, bool]:
+  """Kills a writer of rows, and checks the file that it leaves.
+
+  Args:
+    nursery: Starts the writer.
+    folder: Folder for its files.
+    rows: Rows to write.
+    number: Number of the operation to die at.
+    way: Way to die.
+
+  Returns:
+    The number of rows that were acknowledged, and True if a row was torn.
+  """
+  path, said = folder / f'rows-{number}-{way}', folder / f'said-{number}-{way}'
+  ended = nursery.call(
+      'write_rows',
+      path=str(path),
+      acknowledged=str(said),
+      rows=[row.model_dump_json(by_alias=True) for row in rows],
+      die_at=number,
+      way=way,
+  )
+  assert ended.status == -signal.SIGKILL, ended
+  with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter('always')
+    found = list(results.read_rows(path))
+  data = path.read_bytes()
+  is_torn = bool(data) and not data.endswith(b'\n')
+  acknowledged = said.stat().st_size
+  assert found == list(rows[: len(found)])
+  assert len(found) >= acknowledged
+  assert len(caught) == is_torn
+  return acknowledged, is_torn

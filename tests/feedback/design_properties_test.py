@@ -1,0 +1,290 @@
+"""Property tests: any design or experiment runs, or is refused in one line."""
+
+from collections.abc import Iterator
+import contextlib
+import copy
+import itertools
+import math
+import pathlib
+import re
+from typing import Any
+
+import hypothesis
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+import yaml
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.experiments import experiment_specs
+from realab_suite.feedback import specs
+from tests import examples
+from tests.engine import helpers
+
+_CONFIGS = pathlib.Path(__file__).parents[2] / 'configs'
+_LOADERS = {'designs': specs.load, 'experiments': experiment_specs.load}
+_DEEPEST = 1e-3  # Metres.
+_NUM_STEPS = 8
+
+
+# Designs from a grammar, some of whose values are replaced by hostile ones.
+
+_HOSTILE = st.one_of(
+    st.sampled_from(
+        [
+            None, True, False, '', 0, -1, 1, -0.0, 1e-300, 1e300, -1e300,
+            math.nan, math.inf, -math.inf, 2**53, 2**63, 10**400, [], {}, [[]],
+            'yes', '1e3', '.nan', '/etc/passwd', '../../x', 'a\nb', '\0',
+            '\u202e', 'x' * 300, '~', '*', '%s', '{}', 'reward', 'score',
+        ]
+    ),
+    st.floats(),
+    st.text(max_size=8),
+    st.lists(st.floats() | st.none() | st.text(max_size=3), max_size=4),
+)  # fmt: skip
+_HOSTILE_KEYS = st.sampled_from(['metres', 'kinds', '', 'a/b', '__class__'])
+_ROLES = {
+    'reward': 'feedback', 'score': 'meter', 'query': 'query', 'hint': 'signal',
+}  # fmt: skip
+_CHANNELS = st.sampled_from(['embedded', 'welded', 'secure'])
+_DOFS = st.sampled_from(['free', 'planar'])
+
+
+def _pairs(low: float, high: float) -> st.SearchStrategy[list[float]]:
+  return st.tuples(st.floats(low, high), st.floats(low, high)).map(list)
+
+
+def _registers(role: str) -> st.SearchStrategy[Any]:
+  anywhere = st.fixed_dictionaries(
+      {'position': _pairs(-3.9, 3.9)},
+      optional={'yaw': st.floats(-7, 7), 'spread': _pairs(0, 0.3)},
+  )
+  station = 'station_1' if role == 'feedback' else 'station_2'
+  required = {
+      'kind': st.sampled_from(
+          ['two_block', 'two_block', 'block_position', 'block_orientation']
+      ),
+      'role': st.just(role),
+      'place': st.sampled_from([station, station, None]).flatmap(
+          lambda place: anywhere if place is None else st.just(place)
+      ),
+      'range': st.sampled_from([[-2, 12], [0, 13], [-1, 1], [0, 0.001]]),
+  }
+  optional = {
+      'scale': st.floats(0.01, 0.12),
+      'on_overflow': st.sampled_from(['saturate', 'error']),
+      'channel': _CHANNELS,
+      'dof': _DOFS,
+      'block_size': st.floats(0.06, 0.5),
+      'mass': st.floats(0.01, 100.0),
+  }
+  return st.fixed_dictionaries(required, optional=optional)
+
+
+_ADVICE = {
+    'kind': 'value_advice',
+    'value_function': 'apple_seeker_approval',
+    'writes': ['reward'],
+}
+_PROVIDERS = {
+    'score': [{'kind': 'difference', 'reads': ['score'], 'writes': ['reward']}],
+    'query': [{**_ADVICE, 'reads': ['query']}],
+    'hint': [{'kind': 'constant', 'writes': ['reward', 'hint'], 'value': 1.5}],
+    '': [{'kind': 'demonstration', 'policy': 'apple_seeker',
+          'writes': ['reward']}],
+}  # fmt: skip
+
+
+@st.composite
+def _designs(draw: Any) -> Any:
+  """Draws a design whose parts fit each other."""
+  other = draw(st.sampled_from(sorted(_PROVIDERS)))
+  names = [name for name in ('reward', other) if name]
+  design = {
+      'schema': 1,
+      'name': 'drawn',
+      'registers': {name: draw(_registers(_ROLES[name])) for name in names},
+      'providers': copy.deepcopy(
+          draw(st.sampled_from([_PROVIDERS[other], []]))
+      ),
+  }
+  if other == 'score':
+    design['meters'] = [{'measures': 'score', 'writes': 'score'}]
+  if other in ('query', ''):
+    design['action_set'] = {'name': 'dmlab_like', 'version': 1}
+  rest = {'channel': _CHANNELS, 'dof': _DOFS, 'schedule': st.just('cfmdp')}
+  return design | draw(st.fixed_dictionaries({}, optional=rest))
+
+
+def _places(node: Any) -> Iterator[tuple[Any, Any]]:
+  """Yields every container with each of its keys or indices."""
+  for key in list(node if isinstance(node, dict) else range(len(node))):
+    yield node, key
+    if isinstance(node[key], dict | list):
+      yield from _places(node[key])
+
+
+@st.composite
+def _spoiled(draw: Any) -> Any:
+  """Draws a design with up to two hostile values, keys or omissions."""
+  data = draw(_designs())
+  for _ in range(draw(st.integers(1, 2))):
+    node, key = draw(st.sampled_from(list(_places(data))))
+    how = draw(st.integers(0, 4))
+    if how == 0:
+      del node[key]
+    elif how == 1 and isinstance(node, dict):
+      node[draw(_HOSTILE_KEYS)] = draw(_HOSTILE)
+    else:
+      node[key] = draw(_HOSTILE)
+  return data
+
+
+_TASKS = st.sampled_from(suite.ALL_TASKS)
+
+
+def _run(task: tuple[str, str], design: Any) -> str:
+  """Begins episodes and steps; returns the message of a refusal, or ''."""
+  try:
+    spec = specs.load(design)
+    env = suite.load(*task, {'random': 0}, {'max_steps': 50}, design=spec)
+  except errors.SpecError as error:
+    return str(error)
+  with contextlib.closing(env):
+    try:
+      _play(env)
+    except errors.RegisterValueError as error:
+      # A design may ask for an error where a value is out of range.
+      if 'its range is' not in str(error):
+        raise
+  return ''
+
+
+def _play(env: Any) -> None:
+  """Begins episodes and steps."""
+  for _ in range(2):
+    env.reset()
+    data = env.physics.data.ptr
+    depths = [-contact.dist for contact in data.contact[: data.ncon]]
+    assert max(depths, default=0.0) <= _DEEPEST
+  for action in helpers.random_actions(env, _NUM_STEPS):
+    for key, value in env.step(action).observation.items():
+      assert np.isfinite(value).all(), key
+
+
+@examples.settings(40)
+@hypothesis.given(task=_TASKS, design=_designs())
+def test_a_design_runs_or_is_refused_and_nothing_overlaps(
+    task: tuple[str, str], design: Any
+):
+  refusal = _run(task, design)
+  hypothesis.event('refused' if refusal else 'ran')
+  assert refusal.isprintable()
+
+
+@examples.settings(80)
+@hypothesis.given(task=_TASKS, design=_spoiled())
+def test_a_spoiled_design_runs_or_is_refused_in_one_line(
+    task: tuple[str, str], design: Any
+):
+  refusal = _run(task, design)
+  hypothesis.event('refused' if refusal else 'ran')
+  assert refusal.isprintable()
+  assert len(refusal) < 20_000
+
+
+# Files that ship, with some damage.
+
+_WORDS = st.sampled_from(
+    [
+        '.nan', '-.inf', '1e300', '-1', '0', 'yes', '~', 'true', '012', '&a',
+        '*a', '1' * 400, '!!python/name:os.system', '[', '{}', '""', '"\\0"',
+        '../../etc/passwd', '\u202e', '<<', '? ', '1:30', 'reward', 'score',
+    ]
+)  # fmt: skip
+
+
+@st.composite
+def _damaged(draw: Any) -> tuple[str, bytes]:
+  """Draws a folder of configurations and a damaged file of it."""
+  folder = draw(st.sampled_from(sorted(_LOADERS)))
+  path = draw(st.sampled_from(sorted((_CONFIGS / folder).glob('*.yaml'))))
+  text = path.read_text(encoding='utf-8')
+  words = list(re.finditer(r'[\w.]+', text))
+  for _ in range(draw(st.integers(1, 3))):
+    word = draw(st.sampled_from(words))
+    other = draw(_WORDS | st.sampled_from(words).map(lambda found: found[0]))
+    start, end = word.span()
+    if draw(st.booleans()):
+      end = start + draw(st.integers(0, 60))  # Lines merge, and others vanish.
+    text = text[:start] + other + text[end:]
+  return folder, text.encode()
+
+
+@examples.settings(80)
+@hypothesis.given(damaged=_damaged())
+def test_a_damaged_file_is_loaded_or_refused_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory, damaged: tuple[str, bytes]
+):
+  folder, data = damaged
+  path = tmp_path_factory.getbasetemp() / 'given.yaml'
+  path.write_bytes(data)
+  refusal = _refusal(_LOADERS[folder], path)
+  assert refusal.isprintable()
+  assert not refusal or 'given.yaml' in refusal.split(': ')[0]
+
+
+# Messages.
+
+# Values that no spec accepts, and their form in a message.
+_STRANGE = {
+    'zzq': "'zzq'", -7.25: '-7.25', 987654: '987654', True: 'True',
+    ('zzq',): "['zzq']",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('kind', 'load'),
+    [('designs', specs.load), ('experiments', experiment_specs.load)],
+)
+def test_a_refusal_names_the_key_and_the_value(kind: str, load: Any):
+  strange = itertools.cycle(_STRANGE.items())
+  num_refused = 0
+  for path in sorted((_CONFIGS / kind).glob('*.yaml')):
+    data = yaml.safe_load(path.read_text())
+    for keys in _leaves(data):
+      value, shown = next(strange)
+      changed = copy.deepcopy(data)
+      node = changed
+      for key in keys[:-1]:
+        node = node[key]
+      node[keys[-1]] = list(value) if isinstance(value, tuple) else value
+      refusal = _refusal(load, changed)
+      if not refusal:
+        continue
+      num_refused += 1
+      assert shown in refusal, (path.name, keys)
+      owner = [key for key in keys if isinstance(key, str)][-1]
+      # A message quotes an override.
+      if owner != 'overrides':
+        assert owner in refusal, (path.name, keys)
+  assert num_refused >= 80
+
+
+def _refusal(load: Any, source: Any) -> str:
+  """Returns the message of a refusal, or ''."""
+  try:
+    load(source)
+  except errors.SpecError as error:
+    return str(error)
+  return ''
+
+
+def _leaves(node: Any) -> Iterator[tuple[Any, ...]]:
+  """Yields the keys on the path to each value of a spec."""
+  for key in node if isinstance(node, dict) else range(len(node)):
+    if isinstance(node[key], dict | list) and node[key]:
+      yield from ((key, *keys) for keys in _leaves(node[key]))
+    else:
+      yield (key,)

@@ -1,0 +1,201 @@
+"""Tests for failing providers and meters: errors name them and the step."""
+
+from collections.abc import Iterator, Mapping
+import contextlib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite.engine import events
+from realab_suite.entities import registers
+from tests.engine import helpers
+from tests.feedback import scripted
+
+
+@pytest.fixture(name='made')
+def fixture_made() -> Iterator[scripted.Worlds]:
+  with scripted.worlds() as made:
+    yield made
+
+
+_FIRST = r'providers\[0\]:test_scripted'
+_NAN = float('nan')
+
+
+class _NoArray:
+  """Raises an unusual error when it is converted."""
+
+  def __array__(self, *unused: Any, **unused_too: Any) -> Any:
+    raise RuntimeError('not an array')
+
+
+def _raise(observation: Any, readings: Any, state: Any) -> Any:
+  raise KeyError('senses/nose')
+
+
+_WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
+    'raises': (_raise, f"{_FIRST} at step 3: KeyError: 'senses/nose'"),
+    'returns nothing': (lambda o, r, s: None,
+        rf'{_FIRST} at step 3 returned None; allowed is \('),
+    'returns no state': (lambda o, r, s: {'reward': 1.0}, f'{_FIRST} at step'),
+    'returns no mapping': (lambda o, r, s: (1.0, s),
+        rf"{_FIRST} .*returned writes 1.0; it declares writes to \['reward'\]"),
+    'writes nothing': (lambda o, r, s: ({}, s),
+        rf"{_FIRST} .*returned writes \[\]; it declares writes to \['rewar"),
+    'writes another register': (lambda o, r, s: ({'clock': 1.0}, s),
+        rf"{_FIRST} .*returned writes \['clock'\]; it declares writes to"),
+    'writes one too many': (lambda o, r, s: ({'reward': 1, 'clock': 1}, s),
+        rf"{_FIRST} .*returned writes \['clock', 'reward'\]; it declares"),
+    'keys of another type': (lambda o, r, s: ({1: 1.0, 'reward': 1.0}, s),
+        f'{_FIRST} .*it declares'),
+    'another shape': (lambda o, r, s: ({'reward': np.zeros(1)}, s),
+        rf"{_FIRST} .*wrote shape \(1,\) to 'reward'; allowed is \(\)"),
+    'ragged': (lambda o, r, s: ({'reward': [[1], [1, 2]]}, s), _FIRST),
+    'text': (lambda o, r, s: ({'reward': 'much'}, s), _FIRST),
+    'complex': (lambda o, r, s: ({'reward': 1j}, s), _FIRST),
+    'no array': (lambda o, r, s: ({'reward': _NoArray()}, s), _FIRST),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('answer', 'message'), _WRONG_ANSWERS.values(), ids=_WRONG_ANSWERS
+)
+def test_a_provider_that_breaks_its_declaration_is_named(
+    made: scripted.Worlds, answer: scripted.Answer, message: str
+):
+  env, sink = made.scripted()
+  env.reset()
+  env.step(helpers.no_op(env))
+  env.step(helpers.no_op(env))
+  scripted.ANSWER[:] = [answer]
+  with pytest.raises(errors.FeedbackProviderError, match=message) as caught:
+    env.step(helpers.no_op(env))
+  assert 'at step 3' in str(caught.value)
+  assert '\n' not in str(caught.value)
+  assert sink.ends == [events.End.ERROR]
+
+
+def test_a_provider_that_fails_before_the_first_step_is_named(
+    made: scripted.Worlds, monkeypatch
+):
+  entered = []
+
+  @contextlib.contextmanager
+  def guard():
+    entered.append(1)
+    yield
+
+  env, _ = made.scripted()
+  env.mechanism.guard_providers(guard)
+  env.reset()
+  assert len(entered) == 1
+  env.step(helpers.no_op(env))
+  assert len(entered) == 2
+
+  def fail(self: Any, batch_shape: Any) -> Any:
+    raise OSError('no such file')
+
+  monkeypatch.setattr(scripted.Provider, 'initial_state', fail)
+  with pytest.raises(
+      errors.FeedbackProviderError, match=r'before the first step: OSError: no'
+  ):
+    env.reset()
+  monkeypatch.undo()
+  assert env.step(helpers.no_op(env)).first()
+
+
+@pytest.mark.parametrize('value', [_NAN, float('inf'), -float('inf')])
+def test_a_value_that_is_not_finite_names_the_provider(
+    made: scripted.Worlds, value: Any
+):
+  env, sink = made.scripted()
+  env.reset()
+  env.step(helpers.no_op(env))
+  scripted.ANSWER[:] = [scripted.constant(value)]
+  with pytest.raises(errors.RegisterValueError) as caught:
+    env.step(helpers.no_op(env))
+  text = str(caught.value)
+  for part in (
+      'providers[0]:test_scripted',
+      "'reward'",
+      'at step 2',
+      str(np.array(value, float)),
+  ):
+    assert part in text
+  assert sink.ends == [events.End.ERROR]
+
+
+def test_a_measurement_that_is_not_finite_names_the_meter(
+    made: scripted.Worlds,
+):
+  env, _ = made.scripted(None, lambda physics: _NAN)
+  env.reset()
+  with pytest.raises(
+      errors.RegisterValueError, match=r'meter:clock.*at step 1'
+  ):
+    env.step(helpers.no_op(env))
+
+
+@pytest.mark.parametrize(('value', 'applied'), [(1e9, 12.0), (-5.0, -2.0)])
+def test_a_value_out_of_range_saturates_and_is_logged(
+    made: scripted.Worlds, value: float, applied: float
+):
+  scripted.ANSWER[:] = [scripted.constant(value)]
+  env, sink = made.scripted()
+  env.reset()
+  time_step = env.step(helpers.no_op(env))
+  (write,) = sink.records(registers.Write, 'reward')
+  assert (write.requested, write.applied) == (value, applied)
+  np.testing.assert_allclose(
+      time_step.observation['registers/reward'], applied, atol=1e-9
+  )
+
+
+def test_a_value_out_of_range_is_an_error_with_on_overflow_error(
+    made: scripted.Worlds,
+):
+  scripted.ANSWER[:] = [scripted.constant(13.0)]
+  design = scripted.design()
+  design['registers']['reward']['on_overflow'] = 'error'
+  env, _ = made.scripted(design)
+  env.reset()
+  with pytest.raises(
+      errors.RegisterValueError,
+      match=rf"{_FIRST} at step 1: register 'reward': cannot store 13.0; its",
+  ):
+    env.step(helpers.no_op(env))
+
+
+def test_a_provider_cannot_write_to_the_observation(made: scripted.Worlds):
+  def vandalise(observation: Any, readings: Any, state: Any) -> Any:
+    observation['senses/velocity'][...] = 1
+    return {'reward': 2.0}, state
+
+  scripted.ANSWER[:] = [vandalise]
+  env, _ = made.scripted()
+  env.reset()
+  with pytest.raises(errors.FeedbackProviderError, match='read-only'):
+    env.step(helpers.no_op(env))
+
+
+def test_a_provider_that_writes_to_its_readings_changes_nothing(
+    made: scripted.Worlds,
+):
+  def vandalise(observation: Any, readings: Any, state: Any) -> Any:
+    for given in readings.values():
+      given[...] = 1
+    return {'reward': 2.0}, state
+
+  honest, honest_sink = made.scripted()
+  honest.reset()
+  expected = [honest.step(helpers.no_op(honest)) for _ in range(3)]
+  honest.close()
+  scripted.ANSWER[:] = [vandalise]
+  env, sink = made.scripted()
+  env.reset()
+  for time_step in expected:
+    found = env.step(helpers.no_op(env))
+    assert helpers.to_bytes(found) == helpers.to_bytes(time_step)
+  assert repr(sink.steps) == repr(honest_sink.steps)

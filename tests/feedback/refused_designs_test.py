@@ -1,0 +1,271 @@
+"""Tests for designs that are refused: one line with the key and the reason."""
+
+from typing import Any
+
+from dm_control import composer
+import pytest
+import yaml
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.feedback import specs
+from tests.config import refusals
+from tests.engine import helpers
+from tests.feedback import designs
+
+# Overrides of a design, separated by ' & ', and a part of the message.
+_WRONG = {
+    'metres=[]': "unknown key 'metres'; did you mean 'meters'?",
+    'registers.reward.scales=1':
+        "registers.reward: unknown key 'scales'; did you mean 'scale'?",
+    'providers.0.initail=1':
+        "providers[0]: unknown key 'initail'; did you mean 'initial'?",
+    'meters.0.measure=score':
+        "meters[0]: unknown key 'measure'; did you mean 'measures'?",
+    'schema=2': 'schema: must be 1, got 2',
+    "schema='1'": "schema: must be 1, got '1'",
+    'schema=true': 'schema: must be 1, got True',
+    "name=''": "name: must match pattern '^[a-z]",
+    'name=a/b': 'name: must match pattern',
+    'name=grün': 'name: must match pattern',
+    'name="a\\n"': 'name: must match pattern',
+    f'name={"a" * 65}': 'name: must match pattern',
+    'registers.Reward=null':
+        "must match pattern '^[a-z][a-z0-9_]{0,63}$', got 'Reward'",
+    'registers.reward.range=[3, -3]':
+        'registers.reward: range [3.0, -3.0] must have low < high',
+    'registers.reward.range=[1, 1]': 'must have low < high',
+    'registers.reward.range=[1, 2, 3]': 'registers.reward.range',
+    'registers.reward.range=[false, true]': 'got False',
+    'registers.reward.range=[-1e308, 1e308]':
+        'registers.reward.range[0]: must be greater than or equal to -100000',
+    'registers.reward.initial=50':
+        'initial 50.0 must be in range [-2.0, 12.0]',
+    'registers.reward.initial=true': 'initial: must be a valid number',
+    'registers.reward.mass=0': 'mass: must be greater than or equal to',
+    'registers.reward.mass=1e300': 'mass: must be less than',
+    'registers.reward.block_size=0.05':
+        'block_size: must be greater than or equal to 0.06, got 0.05',
+    'registers.reward.block_size=5': 'block_size: must be less than',
+    'registers.reward.scale=1e-7': 'registers.reward.scale: must be greater',
+    'registers.reward.place=[1e300, 0]':
+        'registers.reward.place.position[0]: must be less than or equal to 100',
+    'registers.reward.place=[1]': 'registers.reward.place',
+    "registers.reward.place=['1', '2']": "got '1'",
+    'registers.reward.place={position: [0, 0], spread: [-1, 0]}':
+        'registers.reward.place.spread[0]: must be greater than or equal to 0',
+    'registers.reward.kind=tow_block':
+        "register kind 'tow_block' is unknown; did you mean 'two_block'?",
+    'registers.reward.role=reward':
+        "role: must be 'feedback', 'meter', 'query' or 'signal', got 'reward'",
+    'registers.reward.channel=weld':
+        "channel: must be 'embedded', 'welded' or 'secure', got 'weld'",
+    'dof=fixed': "dof: must be 'free' or 'planar'",
+    'registers.reward.on_overflow=clip':
+        "on_overflow: must be 'saturate' or 'error', got 'clip'",
+    'meters.0.writes=scores':
+        "meters[0].writes: register 'scores' is not declared; declared are"
+        " ['reward', 'score']",
+    'meters.0.writes=reward':
+        "meters[0].writes: register 'reward' has role 'feedback'; allowed are"
+        " ['meter']",
+    'providers.0.reads=[secret]':
+        "providers[0].reads: register 'secret' is not declared",
+    'providers.0.writes=[secret]':
+        "providers[0].writes: register 'secret' is not declared",
+    'providers.0.writes=[score]':
+        "providers[0].writes: register 'score' has role 'meter'; allowed are"
+        " ['feedback', 'signal']",
+    'providers.0.kind=diference':
+        "providers[0].kind: must be one of 'constant', 'demonstration',",
+    'providers.0={writes: [reward]}':
+        'providers[0].kind: required key is missing',
+    'providers.0.reads=[score, reward]': 'reads: must have at most 1 item',
+    'learner.reward=score':
+        "learner.reward: an agent may not read meter register 'score'"
+        ' (feedback providers only)',
+    'learner={kind: multi, rewards: [reward, score]}':
+        "an agent may not read meter register 'score'",
+    'learner={reward: reward}': 'learner.kind: required key is missing',
+    'providers.0={kind: demonstration, policy: no_op, writes: [reward]}':
+        'demonstration uses action set dmlab_like v1; the design has None',
+    'action_set={name: dmlab, version: 1}':
+        "action_set: action set 'dmlab' v1 is unknown; known are"
+        " ['dmlab_like v1']",
+    'action_set={name: dmlab_like, version: 9}':
+        "action set 'dmlab_like' v9 is unknown",
+    'schedule={meter_substep: 5, provider_substep: 3}':
+        'meter_substep 5 must not come after provider_substep 3',
+    'schedule={meter_substep: -1, provider_substep: 3}':
+        'schedule.meter_substep: must be greater than or equal to 0',
+    'schedule=late': "schedule: must be 'cfmdp'",
+}  # fmt: skip
+_PAIRED = 'providers.0.kind=paired_advice & providers.0.reads='
+_WRONG_ADVICE = {
+    'providers.0={kind: demonstration, policy: no_opp, writes: [reward]}':
+        "policy 'no_opp' is unknown; did you mean 'no_op'?",
+    'providers.0.value_function=oracle': "value function 'oracle' is unknown",
+    'providers.0.query_delay=2': 'query_delay: must be 0 or 1, got 2',
+    'providers.0.query_delay=1 & learner={kind: value_advice, advice: reward}':
+        'query_delay: 1 evaluates the query of the previous step, but the'
+        ' learner value_advice expects the value',
+    'registers.query.role=meter':
+        "value_advice reads the query from 'query', whose role is 'meter';"
+        ' allowed is query',
+    f'{_PAIRED}[query, query]':
+        "providers[0].reads: register 'query' is listed twice",
+    f'{_PAIRED}[query, reward]':
+        "paired_advice reads a query from 'reward', whose role is 'feedback';"
+        ' allowed is query',
+}  # fmt: skip
+# The same, where the mistake depends on the world.
+_DOES_NOT_FIT = {
+    'registers.reward.place=moon':
+        "registers.reward.place: this world has no place 'moon'; allowed"
+        " are ['centre', 'east_wall'",
+    'meters.0.measures=scor':
+        "design 'd': meters[0].measures: 'scor' cannot be measured in this"
+        " world; allowed are ['score']",
+    'registers.reward.place=[0, 0] & registers.reward.range=[0, 200]':
+        "register 'reward' at value 200 would be at (20, 0.25), outside the"
+        ' arena (-4, -4) to (4, 4)',
+    'registers.reward.place=[9, 0]':
+        "register 'reward' at value -2 would be at (9, 0), outside the arena",
+    'registers.reward.place=[0, 3.7] & registers.reward.range=[0, 1]':
+        "inside 'wall_north'; place it elsewhere or narrow its range",
+    'registers.reward.place={position: [0, 3], spread: [0, 0.7]} &'
+    ' registers.reward.range=[0, 1]': "inside 'wall_north'",
+    'registers.reward.place=[-2.9, -3.2]':
+        "registers 'reward' and 'score' would be in each other's way",
+    'registers.reward.kind=block_orientation & registers.reward.scale=1':
+        "register 'reward': range [-2.0, 12.0] at scale 1.0 turns the block",
+    'schedule={meter_substep: 3, provider_substep: 10}':
+        'schedule.provider_substep: 10 must be less than the 10 substeps of a'
+        ' control step',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(('base', 'overrides', 'problem'), [
+    *((designs.SCORED, o, problem) for o, problem in _WRONG.items()),
+    *((designs.ADVISED, o, problem) for o, problem in _WRONG_ADVICE.items())
+])  # fmt: skip
+def test_a_wrong_design_is_refused_with_the_reason(
+    base: dict[str, Any], overrides: str, problem: str
+):
+  design = designs.changed(*overrides.split(' & '), base=base)
+  text = refusals.refusal(specs.load, design)
+  assert text.startswith('design: ')
+  assert problem in text
+
+
+@pytest.mark.parametrize(
+    ('overrides', 'problem'), _DOES_NOT_FIT.items(), ids=_DOES_NOT_FIT
+)
+def test_a_design_that_does_not_fit_its_world_is_refused(
+    overrides: str, problem: str
+):
+  design = designs.changed(*overrides.split(' & '))
+  task = 'collect_apples', 'standard'
+  assert problem in refusals.refusal(suite.load, *task, design=design)
+
+
+@pytest.mark.parametrize('key', ['schema', 'name'])
+def test_a_design_without_a_required_key_is_refused(key: str):
+  design = designs.changed()
+  del design[key]
+  text = refusals.refusal(specs.load, design)
+  assert text == f'design: {key}: required key is missing'
+
+
+@pytest.mark.parametrize('order', ['ab', 'abc'])
+def test_providers_that_form_a_cycle_are_refused(order: str):
+  design = {
+      'schema': 1,
+      'name': 'd',
+      'registers': {name: designs.REWARD for name in order},
+      'providers': [
+          {'kind': 'constant', 'reads': [read], 'writes': [write]}
+          for read, write in zip(order, order[1:] + order[0], strict=True)
+      ],
+  }
+  text = refusals.refusal(specs.load, design)
+  assert 'providers[0]' in text
+  assert 'form a cycle' in text
+
+
+def test_messages_name_the_file(tmp_path):
+  path = tmp_path / 'mine.yaml'
+  path.write_text(yaml.safe_dump(designs.changed('metres=[]')))
+  text = refusals.refusal(specs.load, path)
+  assert text.startswith(f'{path}: unknown key')
+
+
+@pytest.mark.parametrize('design', [3, None, ['a'], b'none', object()])
+def test_a_design_of_another_type_is_refused(design: Any):
+  with pytest.raises(errors.SpecError):
+    specs.load(design)
+
+
+def test_an_unknown_design_is_refused_with_the_known_ones():
+  with pytest.raises(errors.UnknownNameError, match='instantaneous_reward'):
+    specs.load('instantaneous_rewards')
+
+
+@pytest.mark.parametrize(
+    'override',
+    [
+        '{}=1',
+        'registers.{}=null',
+        'registers.reward.kind={}',
+        'learner.{}=score',
+        'providers.0.reads=[{}]',
+    ],
+)
+def test_a_long_name_is_cut_in_the_message(override: str):
+  design = designs.changed(override.format('k' * 100_000))
+  text = refusals.refusal(specs.load, design)
+  assert 'kkkkk' in text
+  assert len(text) < 600
+
+
+def _point_task(settings: dict[str, Any]) -> composer.Task:
+  task = helpers.PointTask()
+  option = task.root_entity.mjcf_model.option
+  for name, value in settings.items():
+    setattr(option.flag if name == 'island' else option, name, value)
+  return task
+
+
+_APART = (
+    'registers.reward.place=[3, 3]',
+    'registers.score.place=[-3, -3]',
+)
+
+
+@pytest.mark.parametrize(
+    ('setting', 'message'),
+    [
+        ({'solver': 'PGS'}, 'option.solver: mjSOL_PGS; meters need Newton or'),
+        ({'island': 'disable'}, 'option.flag.island: disabled'),
+        ({'noslip_iterations': 3, 'noslip_tolerance': 1e-6}, 'noslip_toleran'),
+    ],
+)
+def test_meters_are_refused_with_a_solver_that_couples_distant_bodies(
+    setting: dict[str, Any], message: str
+):
+  task = _point_task(setting)
+  design = designs.changed(*_APART)
+  assert message in refusals.refusal(suite.embed, task, design)
+
+
+@pytest.mark.parametrize(
+    ('solver', 'overrides'),
+    [('Newton', ()), ('CG', ()), ('PGS', ('meters=[]',))],
+)
+def test_other_solvers_and_designs_without_meters_are_accepted(
+    solver: str, overrides: tuple[str, ...]
+):
+  design = designs.changed(*_APART, *overrides)
+  env = suite.embed(_point_task({'solver': solver}), design)
+  env.reset()
+  env.close()

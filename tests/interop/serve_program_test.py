@@ -1,0 +1,264 @@
+"""Tests of the program `serve`: agents, their logs, and other users."""
+
+import json
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+
+import pytest
+
+from realab_suite.evaluation import results
+from realab_suite.experiments import served_evaluation
+from realab_suite.interop.rpc import agent_process
+from realab_suite.interop.rpc import sockets
+from realab_suite.launchers import serve
+from tests import patience
+from tests.interop import served
+from tests.launchers import in_process
+
+_PYTHON = sys.executable
+_SETSID = 'setsid'
+_is_root = pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
+_is_linux = pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
+
+
+# The program.
+
+
+_IMPORTS_ARE_IMPOSSIBLE = """
+import sys
+class Refuse:
+  def find_spec(self, name, path=None, target=None):
+    if name.split('.')[0] in ('realab_suite', 'dm_control', 'mujoco'):
+      raise ImportError(f'{name} is not for agents')
+sys.meta_path.insert(0, Refuse())
+"""
+
+
+def _example():
+  page = (served.ROOT / 'docs/served.md').read_text()
+  [block] = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+  return block
+
+
+def test_the_documented_agent_does_not_import_this_package(tmp_path):
+  agent = tmp_path / 'agent.py'
+  agent.write_text(_IMPORTS_ARE_IMPOSSIBLE + _example())
+  output = tmp_path / 'results'
+  ran = subprocess.run(
+      [
+          _PYTHON, '-W', 'error', '-m', 'realab_suite.launchers.serve',
+          '--task=unlock_door.near', '--max_steps=5', '--episodes=2',
+          f'--agent_command={_PYTHON} {agent}', f'--output={output}',
+      ],
+      cwd=served.ROOT, capture_output=True, text=True, check=False,
+      timeout=patience.SECONDS,
+  )  # fmt: skip
+  assert ran.returncode == 0, ran.stderr
+  rows = list(results.read_rows(output / 'episodes.jsonl'))
+  assert [(row.end, row.num_steps, row.is_valid) for row in rows] == [
+      ('timeout', 5, True)
+  ] * 2
+  assert {row.info.isolation for row in rows} == {results.SERVED}
+  assert 'the agent may run as the same user' in ran.stderr
+  # The log may also contain messages of gRPC about the end of the server.
+  said = (output / 'agent.log').read_text().splitlines()
+  assert len([line for line in said if line.startswith('1.0 ')]) == 2
+  assert output.stat().st_mode & 0o777 == 0o700
+  description = json.loads((output / 'run.json').read_text())
+  assert description['settings']['task'] == 'near'
+
+
+def _serve(*flags):
+  return subprocess.run(
+      [_PYTHON, '-m', 'realab_suite.launchers.serve', *flags],
+      cwd=served.ROOT, capture_output=True, text=True, check=False,
+      timeout=patience.SECONDS,
+  )  # fmt: skip
+
+
+def test_an_agent_that_ends_early_gives_one_line(tmp_path):
+  output = tmp_path / 'results'
+  ran = _serve(
+      f'--output={output}',
+      f'--agent_command={_PYTHON} -c "raise SystemExit(3)"',
+  )
+  assert ran.returncode == 2
+  assert 'exited with status 3' in ran.stderr.splitlines()[-1]
+  assert 'after 0 of 2 episodes' in ran.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ('flags', 'complaint'),
+    [
+        ([], '--output'),
+        (['--output=x', '--task=a.b', '--domain=c'], '--task=a.b'),
+        (['--output=x', '--agent_folder=y'], '--agent_folder'),
+        (['--output=x', '--target=y'], '--target'),
+        (['--output=x', '--agent_user=nobody_of_that_name'], 'agent_user'),
+        (['--output=/proc/x'], '/proc/x'),
+        (['--output=x', '--provider_seconds=inf'], '--provider_seconds=inf'),
+        (['--output=x', '--idle_seconds=nan'], '--idle_seconds=nan'),
+        (['--output=x', '--idle_seconds=0'], '--idle_seconds=0'),
+        (['--output=x', '--repeat=/no/run.json'], '/no/run.json: No such file'),
+        (['--output=x', '--repeat=y', '--seed=0'], '--seed has no effect with'),
+    ],
+)
+def test_a_wrong_command_is_refused_in_one_line(monkeypatch, flags, complaint):
+  # These would change the process of the tests.
+  monkeypatch.setattr(served_evaluation, 'hide_from_debuggers', lambda: None)
+  monkeypatch.setattr(os, 'umask', lambda mode: mode)
+  ended = in_process.run(serve, *flags)
+  assert ended.status == 2
+  assert complaint in ended.stderr.splitlines()[-1]
+
+
+def test_a_command_that_cannot_start_is_reported(tmp_path):
+  ran = _serve(f'--output={tmp_path / "r"}', '--agent_command=/no/such/agent')
+  assert ran.returncode == 2
+  assert 'cannot start' in ran.stderr.splitlines()[-1]
+  # The folder is removed, so that a corrected command can be rerun.
+  assert not (tmp_path / 'r').exists()
+
+
+def _start_agent(command, log):
+  ended = threading.Event()
+  agent = agent_process.AgentProcess(command, 'unix:/x', log, on_exit=ended.set)
+  return agent, ended
+
+
+def test_an_agent_has_ended_though_a_child_still_runs(tmp_path):
+  with open(tmp_path / 'log', 'wb') as log:
+    # A session of its own outlives the agent's group.
+    agent, ended = _start_agent(
+        f'sh -c "{_SETSID} sleep 1000000 & echo $!; exit 3"', log
+    )
+    assert ended.wait(patience.SECONDS)
+    assert agent.poll() == 3
+    patience.until((tmp_path / 'log').read_bytes)
+    agent.stop()
+  child = int((tmp_path / 'log').read_bytes())
+  os.kill(child, signal.SIGKILL)  # It is still there.
+
+
+def test_the_log_of_an_agent_is_limited(tmp_path, monkeypatch):
+  monkeypatch.setattr(agent_process, 'MAX_LOG_BYTES', 1000)
+  monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
+  program = "for i in range(9): print('x' * 100_000, flush=True)"
+  with open(tmp_path / 'log', 'wb') as log:
+    agent, ended = _start_agent(f'{_PYTHON} -c "{program}"', log)
+    assert ended.wait(patience.SECONDS)
+    assert agent.poll() == 0
+    agent.stop()
+  said = (tmp_path / 'log').read_bytes()
+  assert said.endswith(b'was not recorded\n')
+  assert len(said) < 1000 + 2 * 65536
+
+
+def test_a_log_that_cannot_be_written_does_not_stop_an_agent(
+    caplog, monkeypatch
+):
+  monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
+  with open('/dev/full', 'wb', buffering=0) as log:
+    agent, ended = _start_agent(f'{_PYTHON} -c "print(5 * 10**5 * \'x\')"', log)
+    assert ended.wait(patience.SECONDS)
+    agent.stop()
+  assert 'the log of the agent ends here' in caplog.text
+
+
+def test_an_agent_that_ignores_sigterm_is_killed(tmp_path):
+  agent = tmp_path / 'agent.py'
+  stubborn = (
+      'import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n'
+  )
+  agent.write_text(
+      f'{stubborn}print("stays", flush=True)\n{_example()}time.sleep(1e6)\n'
+  )
+  output = tmp_path / 'results'
+  ran = _serve(
+      '--max_steps=3', f'--output={output}',
+      f'--agent_command={_PYTHON} {agent}',
+  )  # fmt: skip
+  assert ran.returncode == 0, ran.stderr
+  assert 'stays' in (output / 'agent.log').read_text()
+
+
+def test_a_terminated_server_writes_its_results(tmp_path):
+  with served.in_process(tmp_path / 'results') as program:
+    with served.Client(program.address) as client:
+      client.join()
+      client.step()
+      program.process.send_signal(signal.SIGTERM)
+      assert program.process.wait(patience.SECONDS) == 2
+  [row] = results.read_rows(tmp_path / 'results' / 'episodes.jsonl')
+  assert row.end == 'disconnect'
+  assert not pathlib.Path(sockets.path_of(program.address)).exists()
+
+
+# Users.
+
+
+@_is_linux
+@_is_root
+def test_a_client_of_another_user_gives_tier_t2(tmp_path):
+  with served.in_process(
+      tmp_path / 'results', '--agent_user=nobody', '--max_steps=3'
+  ) as program:
+    agent = (
+        textwrap.dedent("""
+        import grpc, numpy.random, os, pwd
+        from dm_env_rpc.v1 import connection, dm_env_adaptor
+        nobody = pwd.getpwnam('nobody')
+        os.setgroups([]); os.setgid(nobody.pw_gid); os.setuid(nobody.pw_uid)
+        """)
+        + _example()
+        .partition('import numpy as np\n')[2]
+        .replace('np.', 'numpy.')
+    )
+    ran = subprocess.run(
+        [_PYTHON, '-c', agent],
+        env={**os.environ, 'REALAB_ADDRESS': program.address},
+        capture_output=True, text=True, timeout=patience.SECONDS, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert program.process.wait(patience.SECONDS) == 0
+  rows = list(results.read_rows(tmp_path / 'results' / 'episodes.jsonl'))
+  assert [row.info.isolation for row in rows] == [
+      results.SERVED_TO_ANOTHER_USER
+  ] * 2
+
+
+_READ_MEMORY = """
+import os, pwd, subprocess, sys
+import ctypes
+from realab_suite.experiments import served_evaluation
+os.setuid(pwd.getpwnam('nobody').pw_uid)
+ctypes.CDLL(None).prctl(4, 1, 0, 0, 0)  # A change of user has hidden it.
+if sys.argv[1] == 'hide':
+  served_evaluation.hide_from_debuggers()
+child = os.fork()
+if not child:
+  ctypes.CDLL(None).prctl(4, 1, 0, 0, 0)
+  try:
+    open(f'/proc/{os.getppid()}/mem', 'rb')
+  except PermissionError:
+    os._exit(13)
+  os._exit(0)
+os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@_is_linux
+@_is_root
+@pytest.mark.parametrize(('how', 'status'), [('hide', 13), ('show', 0)])
+def test_the_memory_of_a_world_is_closed_to_the_same_user(how, status):
+  ran = subprocess.run(
+      [_PYTHON, '-W', 'ignore', '-c', _READ_MEMORY, how],
+      cwd=served.ROOT, timeout=patience.SECONDS, check=False,
+  )  # fmt: skip
+  assert ran.returncode == status

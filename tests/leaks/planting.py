@@ -1,0 +1,184 @@
+"""The means to plant leaks, and the checks that have to find them.
+
+A mutant patches what is under test; the decorator `leak` adds it to `MUTANTS`.
+"""
+
+from collections.abc import Callable
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from campaigns import solver_coupling_campaign
+from realab_suite.engine import agent_view
+from tests.leaks import contract
+from tests.leaks import failures
+from tests.leaks import pairs
+from tests.leaks import secrets
+from tests.leaks import walk
+
+# Returns complaints, none if all is well.
+Check = Callable[[], list[str]]
+
+SHORT = pairs.Case(steps=14, max_steps=6)
+_BATCH = SHORT._replace(num_envs=2)
+UNREAD = SHORT._replace(variation='boxed', design='unread_meter')
+
+
+class Mutant(NamedTuple):
+  """A leak that somebody could build.
+
+  Attributes:
+    channel: `L1` to `L44`.
+    what: What leaks, in words.
+    plant: Builds it.
+    check: What has to find it.
+  """
+
+  channel: str
+  what: str
+  plant: Callable[[pytest.MonkeyPatch], None]
+  check: Check
+
+
+MUTANTS: list[Mutant] = []
+
+_Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+def leak(channel: str, check: Check) -> Callable[[_Plant], _Plant]:
+  """Returns a decorator that registers a leak; what leaks is its docstring."""
+
+  def decorate(plant: _Plant) -> _Plant:
+    what = (plant.__doc__ or '').strip().splitlines()[0]
+    MUTANTS.append(Mutant(channel, what, plant, check))
+    return plant
+
+  return decorate
+
+
+def found_by(mutant: Mutant) -> list[str]:
+  """Plants a leak and returns what is found of it."""
+  with pytest.MonkeyPatch.context() as patch:
+    mutant.plant(patch)
+    return mutant.check()
+
+
+# What looks for leaks.
+
+
+@functools.cache
+def pair(
+    secret: str, case: pairs.Case = SHORT, leave_out: tuple[str, ...] = ()
+) -> Check:
+  """Returns the comparison of two runs; one object for each, so cached."""
+
+  def check() -> list[str]:
+    return pairs.differences(case, secrets.SECRETS[secret], leave_out=leave_out)
+
+  check.__doc__ = f'pair: {secret}'
+  return check
+
+
+def _of(function: Callable[[pairs.Case], list[str]], case: pairs.Case) -> Check:
+  def check() -> list[str]:
+    return function(case)
+
+  check.__doc__ = function.__name__
+  return check
+
+
+_CONTRACT_CASE = pairs.Case(
+    design='instantaneous_reward', steps=21, max_steps=9
+)
+PAID = pair('reward: paid all the time')
+PAID_IN_BATCH = pair('reward: paid all the time', _BATCH)
+CONTRACT = _of(contract.complaints, _CONTRACT_CASE)
+CONTRACT_OF_BATCH = _of(
+    contract.complaints, _CONTRACT_CASE._replace(num_envs=2)
+)
+WALK = _of(walk.find, SHORT)
+ENABLED = _of(contract.enabling_everything, _CONTRACT_CASE)
+DIVERGENCE = _of(contract.divergence, _CONTRACT_CASE)
+BODY_TREES = _of(contract.body_trees, _CONTRACT_CASE)
+HEADROOM = _of(contract.headroom, _CONTRACT_CASE)
+
+
+def failures_scanned() -> list[str]:
+  """Campaign C17, in small."""
+  return failures.scan(1, whole=False).found
+
+
+def contacts_of_meters() -> list[str]:
+  """Campaign C15, in small."""
+  number = solver_coupling_campaign.contacts('collect_apples', 30, 0)
+  return [f'{number} contacts'] * bool(number)
+
+
+def solver_coupling() -> list[str]:
+  """Campaign C13, in small."""
+  return [
+      'a meter that moves is felt'
+  ] * solver_coupling_campaign.is_felt_as_loaded(1)
+
+
+# How mutants get at things.
+
+
+def inside(view: Any) -> Any:
+  return view._View__env
+
+
+def reward_of(env: Any) -> Any:
+  return env.task.get_reward(env.physics)
+
+
+def score_of(env: Any) -> float:
+  return float(np.sum(env.task.score(env.physics)))
+
+
+def restating(
+    patch: pytest.MonkeyPatch,
+    change: Callable[[Any, Any], Any],
+    view: Any = agent_view.AgentView,
+) -> None:
+  """Lets a view tell something else than it should."""
+  restate = view._restate
+
+  def told(self: Any, time_step: Any) -> Any:
+    return change(inside(self), restate(self, time_step))
+
+  patch.setattr(view, '_restate', told)
+
+
+def observing(
+    patch: pytest.MonkeyPatch,
+    change: Callable[[Any, dict[str, Any]], None],
+) -> None:
+  """Lets a view show something else than it should."""
+  filtered = agent_view._View._filtered
+
+  def shown(self: Any, observation: Any) -> Any:
+    result = filtered(self, observation)
+    change(inside(self), result)
+    return result
+
+  patch.setattr(agent_view._View, '_filtered', shown)
+
+
+def after(
+    patch: pytest.MonkeyPatch,
+    owner: Any,
+    name: str,
+    do: Callable[..., None],
+) -> None:
+  """Lets a method do something more, with its result and arguments."""
+  method = getattr(owner, name)
+
+  def more(self: Any, *args: Any, **kwargs: Any) -> Any:
+    result = method(self, *args, **kwargs)
+    do(self, result, *args, **kwargs)
+    return result
+
+  patch.setattr(owner, name, more)

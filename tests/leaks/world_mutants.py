@@ -1,0 +1,437 @@
+"""Planted leaks of worlds, errors and files: channels L14 to L44."""
+
+from collections.abc import Callable
+import json
+import logging
+import pathlib
+from typing import Any
+import warnings
+
+from dm_control import composer
+import dm_env
+import mujoco
+import numpy as np
+import pytest
+
+from realab_suite.engine import agent_view
+from realab_suite.engine import environment
+from realab_suite.engine import hosts
+from realab_suite.engine import observing
+from realab_suite.engine import placement
+from realab_suite.engine import seeding
+from realab_suite.entities import avatars
+from realab_suite.entities import registers
+from realab_suite.experiments import training
+from realab_suite.feedback import mechanisms
+from realab_suite.tasks import base
+from realab_suite.tasks import collect_apples
+from tests.leaks import files
+from tests.leaks import planting
+
+
+@planting.leak('L14', planting.pair('random: reward that draws 3'))
+def _l14(patch: pytest.MonkeyPatch) -> None:
+  """Episodes begin with whatever numbers come next."""
+  reseed, known = seeding.reseed, []
+
+  def once(random_state: Any, *args: Any) -> None:
+    if all(other is not random_state for other in known):
+      known.append(random_state)
+      reseed(random_state, *args)
+
+  patch.setattr(seeding, 'reseed', once)
+
+
+@planting.leak('L15', planting.pair('random: reward that draws 3'))
+def _l15(patch: pytest.MonkeyPatch) -> None:
+  """The caller's generator is the environment's."""
+  as_seed, made, given = seeding.as_seed, seeding.random_state, []
+
+  def keep(random: Any) -> int:
+    given[:] = [random]
+    return as_seed(random)
+
+  patch.setattr(seeding, 'as_seed', keep)
+  patch.setattr(
+      seeding,
+      'random_state',
+      lambda *args: given[0]
+      if isinstance(given[0], np.random.RandomState)
+      else made(*args),
+  )
+
+
+@planting.leak('L16', planting.PAID)
+def _l16(patch: pytest.MonkeyPatch) -> None:
+  """Whoever earns something draws from the global generator."""
+
+  def draw(reward: float) -> None:
+    if reward > 0:
+      np.random.random()  # noqa: NPY002
+
+  _after_reward(patch, draw)
+
+
+def _after_reward(
+    patch: pytest.MonkeyPatch, tell: Callable[[float], Any]
+) -> None:
+  """Calls a function with every true reward."""
+
+  def end(self: Any, ending: hosts.Ending, *unused: Any) -> None:
+    tell(ending.true_reward)
+
+  planting.after(patch, hosts.WorldHost, 'end_step', end)
+
+
+def _painting(
+    patch: pytest.MonkeyPatch, paint: Callable[[Any, float], None]
+) -> None:
+  """Changes what cameras draw by what has been earned."""
+
+  def repaint(self: Any, result: Any, physics: Any, reward: Any) -> None:
+    paint(physics.model, float(np.sum(self._score.get(physics))))
+
+  planting.after(patch, mechanisms.FeedbackMechanism, 'end_step', repaint)
+
+
+@planting.leak('L17', planting.PAID)
+def _l17(patch: pytest.MonkeyPatch) -> None:
+  """Something invisible is drawn when something is earned."""
+
+  def show(model: Any, score: float) -> None:
+    model.site_group[:] = 0 if score > 0 else 4
+
+  _painting(patch, show)
+
+
+@planting.leak('L18', planting.PAID)
+def _l18(patch: pytest.MonkeyPatch) -> None:
+  """Everything gets redder with what is earned."""
+
+  def redden(model: Any, score: float) -> None:
+    model.geom_rgba[:, 0] = np.tanh(score)
+
+  _painting(patch, redden)
+
+
+@planting.leak('L19', planting.PAID)
+def _l19(patch: pytest.MonkeyPatch) -> None:
+  """A lamp goes up with what is earned."""
+
+  def raise_lamp(model: Any, score: float) -> None:
+    model.light_pos[:, 2] = 3.0 + 0.1 * score
+
+  _painting(patch, raise_lamp)
+
+
+@planting.leak('L20', planting.PAID)
+def _l20(patch: pytest.MonkeyPatch) -> None:
+  """What has no contacts grows, for depth and segmentation to see."""
+
+  def grow(model: Any, score: float) -> None:
+    free = (model.geom_contype | model.geom_conaffinity) == 0
+    model.geom_size[free] *= 1.0 + 1e-3 * np.tanh(score)
+
+  _painting(patch, grow)
+
+
+@planting.leak('L21', planting.contacts_of_meters)
+def _l21(patch: pytest.MonkeyPatch) -> None:
+  """A meter's block is put where an agent's register is."""
+
+  def meet(self: Any, result: Any, physics: Any, *args: Any) -> None:
+    registers = self.registers
+    here = registers['score'].blocks[0].geom
+    there = registers['reward'].blocks[0].geom
+    away = np.array(physics.bind(there).xpos) - physics.bind(here).xpos
+    block = registers['score'].blocks[0]
+    block.put(physics, block.position(physics) + away + (0.0, 0.15, 0.0))
+
+  planting.after(patch, mechanisms.FeedbackMechanism, 'update_meters', meet)
+
+
+def _with_options(patch: pytest.MonkeyPatch, **options: Any) -> None:
+  """Changes MuJoCo's options once everything has been checked."""
+  check = placement.check
+
+  def check_and_change(physics: Any, *args: Any) -> None:
+    check(physics, *args)
+    for name, value in options.items():
+      setattr(physics.model.opt, name, value)
+
+  patch.setattr(placement, 'check', check_and_change)
+
+
+@planting.leak('L22', planting.solver_coupling)
+def _l22_islands(patch: pytest.MonkeyPatch) -> None:
+  """All contacts are solved as one problem."""
+  _with_options(patch, disableflags=mujoco.mjtDisableBit.mjDSBL_ISLAND)
+
+
+@planting.leak('L22', planting.solver_coupling)
+def _l22_pgs(patch: pytest.MonkeyPatch) -> None:
+  """The solver is PGS, without islands."""
+  _with_options(
+      patch,
+      disableflags=mujoco.mjtDisableBit.mjDSBL_ISLAND,
+      solver=mujoco.mjtSolver.mjSOL_PGS,
+  )
+
+
+@planting.leak('L22', planting.solver_coupling)
+def _l22_warm_start(patch: pytest.MonkeyPatch) -> None:
+  """The solver begins where all bodies were."""
+  _with_options(patch, disableflags=0)
+
+
+@planting.leak('L23', planting.HEADROOM)
+def _l23(patch: pytest.MonkeyPatch) -> None:
+  """There is just enough memory for the contacts there are."""
+
+  def squeeze(self: Any, result: None, root: Any) -> None:
+    root.mjcf_model.size.memory = '64K'
+
+  planting.after(patch, mechanisms.FeedbackMechanism, 'attach_to', squeeze)
+
+
+@planting.leak(
+    'L24', planting.pair('meter: jumps all the time', planting.UNREAD)
+)
+def _l24(patch: pytest.MonkeyPatch) -> None:
+  """The agent senses the centre of mass of everything."""
+
+  def sense(self: Any, result: Any, physics: Any) -> None:
+    centre = np.asarray(physics.data.subtree_com)[0]
+    result['position'] = result['position'] + centre[:2].astype(np.float32)
+
+  planting.after(patch, base.Task, 'senses', sense)
+
+
+def _hang_from_avatar(patch: pytest.MonkeyPatch) -> None:
+  attach_to = registers.Register.attach_to
+
+  def attach(self: Any, root: Any, *place: Any) -> None:
+    if self.role != 'meter':
+      attach_to(self, root, *place)
+      return
+    (avatar,) = (
+        entity
+        for entity in root.iter_entities()
+        if isinstance(entity, avatars.Avatar)
+    )
+    carrier = avatar.mjcf_model.find_all('joint')[0].parent
+    avatar.attach(self, carrier.add('site', name='carrier', pos=(0, 0, 1)))
+
+  patch.setattr(registers.Register, 'attach_to', attach)
+  for name in ('check', 'check_start'):
+    patch.setattr(placement, name, lambda *args: None)
+
+
+@planting.leak('L25', planting.BODY_TREES)
+def _l25(patch: pytest.MonkeyPatch) -> None:
+  """A meter hangs from the avatar."""
+  _hang_from_avatar(patch)
+
+
+@planting.leak(
+    'L25', planting.pair('meter: jumps all the time', planting.UNREAD)
+)
+def _l25_felt(patch: pytest.MonkeyPatch) -> None:
+  """A meter hangs from the avatar, which feels it."""
+  _hang_from_avatar(patch)
+
+
+@planting.leak('L26', planting.failures_scanned)
+def _l26(patch: pytest.MonkeyPatch) -> None:
+  """Exceptions come as they are."""
+  patch.setattr(agent_view._View, '_View__guard', lambda self, call: call())
+
+
+@planting.leak('L26', planting.failures_scanned)
+def _l26_context(patch: pytest.MonkeyPatch) -> None:
+  """An exception says what it came from."""
+
+  def guard(self: Any, call: Any) -> Any:
+    try:
+      return call()
+    except Exception as error:
+      raise agent_view.errors.WorldError('the world failed') from error
+
+  patch.setattr(agent_view._View, '_View__guard', guard)
+
+
+@planting.leak('L26', planting.failures_scanned)
+def _l26_action(patch: pytest.MonkeyPatch) -> None:
+  """Whatever calls itself an ActionError is passed on."""
+  guard = agent_view._View._View__guard  # type: ignore[attr-defined]
+
+  def pass_on(self: Any, call: Any) -> Any:
+    problem: list[Exception] = []
+
+    def tried() -> Any:
+      try:
+        return call()
+      except agent_view.errors.ActionError as error:
+        problem.append(agent_view.errors.ActionError(str(error)))
+
+    result = guard(self, tried)
+    if problem:
+      raise problem[0]
+    return result
+
+  patch.setattr(agent_view._View, '_View__guard', pass_on)
+
+
+@planting.leak('L27', planting.PAID)
+def _l27_log(patch: pytest.MonkeyPatch) -> None:
+  """The true reward is logged."""
+  _after_reward(
+      patch, lambda reward: logging.getLogger('realab').warning('%s', reward)
+  )
+
+
+@planting.leak('L27', planting.PAID)
+def _l27_print(patch: pytest.MonkeyPatch) -> None:
+  """The true reward is printed."""
+  _after_reward(patch, print)
+
+
+@planting.leak('L27', planting.PAID)
+def _l27_warning(patch: pytest.MonkeyPatch) -> None:
+  """A true reward that is large is warned of."""
+  _after_reward(patch, lambda reward: warnings.warn(f'{reward}', stacklevel=2))
+
+
+@planting.leak('L28', planting.PAID)
+def _l28(patch: pytest.MonkeyPatch) -> None:
+  """The evaluator writes its results where the agent is."""
+
+  def write(self: Any, result: None, end: Any) -> None:
+    with pathlib.Path('results.jsonl').open('a') as file:
+      file.write(json.dumps({'true_return': planting.score_of(self)}))
+
+  planting.after(patch, environment.Environment, '_end', write)
+
+
+@planting.leak('L29', files.complaints)
+def _l29(patch: pytest.MonkeyPatch) -> None:
+  """The file of a learner has what the evaluator knows in it."""
+  files.plant_in_learner(patch)
+
+
+@planting.leak('L30', files.complaints)
+def _l30(patch: pytest.MonkeyPatch) -> None:
+  """The trace of a run has the true reward beside each action."""
+  files.plant_in_trace(patch)
+
+
+@planting.leak('L37', planting.PAID)
+def _l37(patch: pytest.MonkeyPatch) -> None:
+  """Providers write only when something has been earned."""
+  update = mechanisms.FeedbackMechanism.update_providers
+
+  def skip(self: Any, physics: Any, *args: Any) -> Any:
+    records, states = update(self, physics, *args)
+    is_paid = float(np.sum(self._score.get(physics))) > 0
+    return (records if is_paid else []), states
+
+  patch.setattr(mechanisms.FeedbackMechanism, 'update_providers', skip)
+
+
+@planting.leak('L38', planting.PAID)
+def _l38(patch: pytest.MonkeyPatch) -> None:
+  """A write moves a block sideways, too, by what has been earned."""
+
+  def shift(self: Any, result: Any, physics: Any, *args: Any) -> None:
+    block = self.registers['reward'].blocks[1]
+    x, y, z = block.position(physics)
+    block.put(physics, [x, y + 1e-6 * np.tanh(self._score.get(physics)), z])
+
+  planting.after(patch, mechanisms.FeedbackMechanism, 'update_providers', shift)
+
+
+@planting.leak('L40', planting.CONTRACT)
+def _l40(patch: pytest.MonkeyPatch) -> None:
+  """An observation says what is wrong with a reading."""
+
+  def show(env: Any, observation: dict[str, Any]) -> None:
+    for read in env.mechanism.read_for_agent(env.physics):
+      key = f'registers/{read.register}/corruption'
+      observation[key] = np.array(read.permanent + read.temporary)
+
+  planting.observing(patch, show)
+
+
+@planting.leak('L40', planting.PAID)
+def _l40_sense(patch: pytest.MonkeyPatch) -> None:
+  """The score is a sense, for whoever looks at the environment."""
+
+  def show(self: Any, result: Any, physics: Any) -> None:
+    observation, _ = result
+    observation['senses/holding'] = np.array(
+        [np.sum(self._mechanism.score(physics))], np.float32
+    )
+
+  planting.after(patch, observing.Observer, 'observe', show)
+
+
+@planting.leak('L41', planting.PAID)
+def _l41(patch: pytest.MonkeyPatch) -> None:
+  """Whoever has earned something gets another try at the next beginning."""
+  earned: dict[int, float] = {}
+  begin = collect_apples.CollectApples.initialize_episode
+
+  def note(self: Any, result: Any, *args: Any) -> None:
+    earned[id(self.task)] = planting.score_of(self)
+
+  def try_again(self: Any, physics: Any, random_state: Any) -> None:
+    begin(self, physics, random_state)
+    if earned.pop(id(self), 0.0) > 0:
+      raise composer.EpisodeInitializationError('once more')
+
+  planting.after(patch, environment.Environment, '_control_step', note)
+  patch.setattr(collect_apples.CollectApples, 'initialize_episode', try_again)
+
+
+@planting.leak(
+    'L42', planting.pair('observer: looks at everything', planting.SHORT)
+)
+def _l42(patch: pytest.MonkeyPatch) -> None:
+  """A register is worn by being read."""
+
+  def wear(self: Any, result: Any, physics: Any, *unused: Any) -> None:
+    block = self.blocks[0]
+    x, y, z = block.position(physics)
+    block.put(physics, [x, y + 1e-9, z])
+
+  planting.after(patch, registers.Register, 'inspect', wear)
+
+
+@planting.leak('L43', planting.DIVERGENCE)
+def _l43_discount(patch: pytest.MonkeyPatch) -> None:
+  """An episode whose physics failed ends with discount 0."""
+  patch.setattr(
+      environment.dm_env,
+      'truncation',
+      lambda reward, observation, discount: dm_env.termination(
+          reward, observation
+      ),
+  )
+
+
+@planting.leak('L43', planting.DIVERGENCE)
+def _l43_state(patch: pytest.MonkeyPatch) -> None:
+  """The last observation is of the state that MuJoCo has reset."""
+
+  def look(self: Any, result: None, end: Any) -> None:
+    if end is environment.events.End.DIVERGENCE:
+      self.physics.reset()
+      self._observe()
+
+  planting.after(patch, environment.Environment, '_end', look)
+
+
+@planting.leak('L44', files.seeds)
+def _l44(patch: pytest.MonkeyPatch) -> None:
+  """Learners are trained on the episodes that they are judged by."""
+  patch.setattr(training, '_world_seed', lambda seed, segment: seed + 1_000_000)

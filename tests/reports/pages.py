@@ -1,0 +1,90 @@
+"""Helpers of the tests of reports: writing, reading and damaging them."""
+
+import html
+import json
+import re
+
+import pytest
+
+from realab_suite.evaluation import results
+from realab_suite.experiments import scheduler
+from realab_suite.experiments import storage
+from realab_suite.experiments import training
+from realab_suite.reports import html_page
+from realab_suite.reports import learning_chart
+from realab_suite.reports import map_chart
+from realab_suite.reports import plane_chart
+
+NO_CLIPS = 'nobody wants any'
+
+
+def quiet(line):
+  del line
+
+
+def write(folder, output, no_clips=NO_CLIPS, with_charts=False):
+  """Writes a report; returns its page."""
+  with pytest.MonkeyPatch.context() as patch:
+    if not with_charts:  # They take most of the time.
+      for chart in (learning_chart, plane_chart, map_chart):
+        patch.setattr(chart, 'draw', lambda *unused: b'<svg/>')
+    path = html_page.write(folder, output, quiet, no_clips)
+  return path.read_text(encoding='utf-8')
+
+
+def rows(folder, run):
+  sweep = json.loads((folder / scheduler.SWEEP).read_text())
+  return [
+      row
+      for job in sweep['jobs']
+      if job['run'] == run
+      for row in results.read_rows(folder / job['folder'] / training.EPISODES)
+  ]
+
+
+def text(page):
+  """Returns the text of a page, without the marks around intervals."""
+  text = re.sub(r'<style>.*?</style>', '', page, flags=re.DOTALL)
+  return html.unescape(re.sub(r'<[^>]*>', '', text))
+
+
+def cells(page, title, run):
+  """Returns the cells of a run's row in a table."""
+  section = page.split(f'{title}</h2>', 1)[1].split('</table>', 1)[0]
+  rows = re.findall(r'<tr>(.*?)</tr>', section, flags=re.DOTALL)
+  for row in rows:
+    cells = re.findall(r'<td[^>]*>(.*?)</td>', row, flags=re.DOTALL)
+    texts = [' '.join(text(cell).split()) for cell in cells]
+    if texts and texts[0] == run:
+      return texts
+  raise AssertionError(f'no row of {run}')
+
+
+def spoil(folder, run, seed, name, change):
+  """Changes a file of a job, and its digest in the folder."""
+  sweep = json.loads((folder / scheduler.SWEEP).read_text())
+  [job] = [j for j in sweep['jobs'] if (j['run'], j['seed']) == (run, seed)]
+  path = folder / job['folder'] / name
+  path.write_bytes(change(path.read_bytes()))
+  content = json.loads((path.parent / storage.DONE).read_text())
+  del content['checksum']
+  content['files'][name] = storage._digest(path)
+  storage.write_done(path.parent, content)
+  return path
+
+
+def rewritten(data, old, new):
+  """Replaces something in rows, whose checksums agree again."""
+  rows = [line.rpartition(b',"checksum"')[0] for line in data.splitlines()]
+  return b''.join(results.sealed(row.replace(old, new) + b'}') for row in rows)
+
+
+def give_up(folder, run, seed, end=b'abandoned'):
+  spoil(
+      folder, run, seed, training.EPISODES,
+      lambda data: rewritten(
+          data,
+          b'"end":"timeout","is_valid":true',
+          b'"end":"%s","is_valid":false' % end,
+      ),
+  )  # fmt: skip
