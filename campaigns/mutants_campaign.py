@@ -109,8 +109,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'finding 6: discounts may be anything', _HOSTS,
-        'discount = self._per_world(self._task.get_discount(physics), float)',
-        'discount = self._per_world(np.nan, float)', _ENV,
+        'self._per_world(self._task.get_discount(physics), np.float64)',
+        'self._per_world(np.nan, np.float64)', _ENV,
     ),
     planting.Mutant(
         'contract', 'finding 6: an observation is aliased', _OBSERVING,

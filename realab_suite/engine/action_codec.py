@@ -142,6 +142,8 @@ class ActionCodec:
       )
     if np.ma.isMaskedArray(action):
       raise errors.ActionError('action: a masked array; expected plain numbers')
+    if values.dtype == np.float64:
+      return values.copy()
     # Numbers that overflow float64 become infinite and are rejected later.
     with np.errstate(over='ignore'):
       return values.astype(np.float64)

@@ -96,5 +96,5 @@ def run(
   host.advance(physics, controls, rest, is_last=True)
   ending = host.end_step(physics, was_over, is_ending)
   reward = ending.true_reward
-  mechanism.end_step(physics, axes.choose(np.isfinite(reward), reward, 0.0))
+  mechanism.end_step(physics, axes.choose(axes.is_finite(reward), reward, 0.0))
   return Outcome(records, ending, next_states)

@@ -391,21 +391,21 @@ class Environment(composer.Environment):
       raise
     ending = outcome.ending
     self._provider_states = outcome.provider_states
-    with self._preserving_physics():
+    if self._sinks:
       step = events.Step(records, np.array(ending.true_reward), ending.failure)
-      for sink in self._sinks:
-        sink.step_ended(step, self._physics_proxy)
+      with self._preserving_physics():
+        for sink in self._sinks:
+          sink.step_ended(step, self._physics_proxy)
     observation = observing.copied(self._observation)
+    discount = float(ending.discount)
     if ending.is_ending:
       self._end(events.End.TERMINATED)
-      return dm_env.TimeStep(
-          dm_env.StepType.LAST, 0.0, float(ending.discount), observation
-      )
+      return dm_env.TimeStep(dm_env.StepType.LAST, 0.0, discount, observation)
     if self._mechanism.step_count(self._physics) == self._max_steps:
       self._end(events.End.TIMEOUT)
       return dm_env.truncation(0.0, observation, 1.0)
     self._reset_next_step = False
-    return dm_env.transition(0.0, observation, float(ending.discount))
+    return dm_env.transition(0.0, observation, discount)
 
   def close(self) -> None:
     """Frees the world. Closing it again has no effect."""

@@ -9,7 +9,7 @@ foreign tasks.
 import abc
 from collections.abc import Callable
 import traceback
-from typing import Any, NamedTuple, Protocol, final
+from typing import Any, NamedTuple, NoReturn, Protocol, final
 
 from dm_control.rl import control
 from dm_env import specs
@@ -149,6 +149,7 @@ class WorldHost(Host):
     self._hooks = hooks
     self._random_state = random_state
     self._batch_shape = batch_shape
+    self._unknown_reward = self._per_world(np.nan, np.float64)
     self._expected = {
         name: ((*batch_shape, *spec.shape), spec.dtype)
         for name, spec in task.sense_spec.items()
@@ -165,19 +166,30 @@ class WorldHost(Host):
       SpecError: If they do not fit the task's `sense_spec`.
     """
     sensed = self._task.senses(physics)
+    try:
+      found = {n: (value.shape, value.dtype) for n, value in sensed.items()}
+    except AttributeError:
+      found = {}
+    if found != self._expected:
+      self._refuse(sensed)
+    return sensed
+
+  def _refuse(self, sensed: dict[str, Any]) -> NoReturn:
+    """Raises a SpecError for senses that differ from `sense_spec`."""
+    where = f'{type(self._task).__name__}.senses'
     if sensed.keys() != self._expected.keys():
       raise errors.SpecError(
-          f'{type(self._task).__name__}.senses: keys {sorted(sensed)}; allowed'
-          f' are those of sense_spec, {sorted(self._expected)}'
+          f'{where}: keys {sorted(sensed)}; allowed are those of sense_spec,'
+          f' {sorted(self._expected)}'
       )
     for name, value in sensed.items():
       shape, dtype = self._expected[name]
       if np.shape(value) != shape or getattr(value, 'dtype', None) != dtype:
         raise errors.SpecError(
-            f'{type(self._task).__name__}.senses: {name!r} is'
-            f' {messages.quote(value)}; allowed is {dtype} of shape {shape}'
+            f'{where}: {name!r} is {messages.quote(value)}; allowed is {dtype}'
+            f' of shape {shape}'
         )
-    return sensed
+    raise errors.SpecError(f'{where}: values that are not arrays')
 
   def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
     self._hooks.before_step(physics, controls, self._random_state)
@@ -196,7 +208,9 @@ class WorldHost(Host):
       self._task.latch_events(physics)
 
   def is_over(self, physics: SteppedPhysics) -> Any:
-    return self._per_world(self._task.should_terminate_episode(physics), bool)
+    return self._per_world(
+        self._task.should_terminate_episode(physics), np.bool_
+    )
 
   def end_step(
       self, physics: SteppedPhysics, was_over: Any, is_ending: Any
@@ -206,10 +220,10 @@ class WorldHost(Host):
     # quantities. Without this update, a failure would be detected a step late.
     physics.refresh()
     reward, failure = true_reward(
-        lambda: self._per_world(self._task.get_reward(physics), float),
-        self._per_world(np.nan, float),
+        lambda: self._per_world(self._task.get_reward(physics), np.float64),
+        self._unknown_reward,
     )
-    discount = self._per_world(self._task.get_discount(physics), float)
+    discount = self._per_world(self._task.get_discount(physics), np.float64)
     return Ending(
         axes.choose(was_over, 0.0, reward),
         failure,
@@ -218,10 +232,10 @@ class WorldHost(Host):
         is_ending,
     )
 
-  def _per_world(self, value: Any, kind: type) -> Any:
+  def _per_world(self, value: Any, kind: type[np.generic]) -> Any:
     """Returns a value for each world; the task may return one for all."""
     if not self._batch_shape:
-      return np.dtype(kind).type(value)
+      return kind(value)
     return np.array(np.broadcast_to(value, self._batch_shape), kind)
 
 

@@ -44,6 +44,7 @@ class Observer:
     self._host = host
     self._mechanism = mechanism
     self._max_steps = max_steps
+    self._keys = {name: f'senses/{name}' for name in host.sense_spec}
     if max_steps is not None and _TIME_LEFT in host.sense_spec:
       raise errors.SpecError(
           f'the task has its own observable {_TIME_LEFT!r}; rename it, or pass'
@@ -76,9 +77,9 @@ class Observer:
       The observation, with arrays of shape `(..., *spec.shape)` by key, and the
       reads of registers for it.
     """
+    keys = self._keys
     observation = {
-        f'senses/{name}': value
-        for name, value in self._host.sense(physics).items()
+        keys[name]: value for name, value in self._host.sense(physics).items()
     }
     if self._max_steps is not None:
       spent = self._mechanism.step_count(physics) / self._max_steps

@@ -1,5 +1,6 @@
 """Physics of one world, with little overhead between MuJoCo and Python."""
 
+import operator
 from typing import Any, final
 
 from dm_control import mjcf
@@ -40,6 +41,9 @@ class ThinPhysics(mjcf.Physics):
     self._thin: dict[Any, _ThinBinding] = {}
     # One for each size of frames, (height, width).
     self._renderers: dict[Any, frame_renderer.FrameRenderer] = {}
+
+  # Read many times in a control step; dm_control's is a function in Python.
+  data = property(operator.attrgetter('_data'))
 
   def forward(self) -> None:
     """Updates the quantities derived from positions and velocities.
@@ -92,7 +96,7 @@ class ThinPhysics(mjcf.Physics):
       ) from error
 
   def _refuse_warnings(self) -> None:
-    if np.count_nonzero(self._num_warnings):
+    if any(self._num_warnings.tolist()):
       raise control.PhysicsError(_warnings(self._num_warnings))
 
   def free(self) -> None:

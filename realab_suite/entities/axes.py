@@ -5,6 +5,7 @@ A value of one world is a number (`np.float64`), a value of a batch is an array
 without axes, so these helpers return numbers for one world.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 
 def component(array: np.ndarray, index: int) -> np.ndarray:
   """Returns `array[..., index]`; a number if `array` has one axis."""
-  return array[..., index][()]
+  return array[index] if array.ndim == 1 else array[..., index][()]
 
 
 def anywhere(condition: np.ndarray) -> bool:
@@ -29,8 +30,15 @@ def everywhere(condition: np.ndarray) -> bool:
   return bool(condition)
 
 
+def is_finite(value: Any) -> Any:
+  """Returns True where a value, `(...)`, is finite."""
+  if isinstance(value, np.ndarray) and value.ndim:
+    return np.isfinite(value)
+  return math.isfinite(value)
+
+
 def choose(condition: np.ndarray, yes: Any, no: Any) -> Any:
   """Returns `yes` where a condition, `(...)`, is true, and `no` elsewhere."""
-  if np.ndim(condition):
+  if isinstance(condition, np.ndarray) and condition.ndim:
     return np.where(condition, yes, no)
   return yes if condition else no

@@ -118,6 +118,7 @@ class RaySense(composer.Entity):
     self._fan = np.cos(self._angles), np.sin(self._angles)
     self._max_distance = max_distance
     self._class_of_geom = np.zeros(0, np.int32)
+    self._nothing = appearance.code('nothing')
     self._model: Any = None
 
   def _build_observables(self) -> RayObservables:
@@ -165,7 +166,7 @@ class RaySense(composer.Entity):
     distances, geoms = cast(physics, frame.xpos, directions, self._carrier)
     missed = (geoms < 0) | (distances > self._max_distance)
     classes = self._class_of_geom[geoms]
-    classes[missed] = appearance.code('nothing')
+    classes[missed] = self._nothing
     distances[missed] = self._max_distance
     return distances.astype(np.float32), classes
 

@@ -381,7 +381,8 @@ class FeedbackMechanism(composer.Entity):
 
   def _whole_steps(self, physics: protocols.Physics) -> Any:
     """Returns the number of completed control steps, `(...)` int."""
-    return self._step_count.get(physics).astype(int)
+    count = self._step_count.get(physics)
+    return count.astype(int) if count.ndim else np.int64(count)
 
   def _this_step(self, physics: protocols.Physics) -> Any:
     """Returns the number of the current control step, from 1, `(...)` int."""

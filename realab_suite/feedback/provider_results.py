@@ -31,8 +31,10 @@ def checked(
         f'returned {messages.quote(returned)}; allowed is (writes, state)'
     )
   values, state = returned
-  if not isinstance(values, Mapping) or values.keys() != set(provider.writes):
-    given = sorted(map(str, values)) if isinstance(values, Mapping) else values
+  # Almost all are dicts, which the check for mappings is slow for.
+  is_mapping = type(values) is dict or isinstance(values, Mapping)
+  if not is_mapping or values.keys() != set(provider.writes):
+    given = sorted(map(str, values)) if is_mapping else values
     raise errors.FeedbackProviderError(
         f'returned writes {messages.quote(given)}; it declares writes to'
         f' {sorted(provider.writes)}'
@@ -43,12 +45,14 @@ def checked(
   }, state
 
 
-def _checked_value(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _checked_value(name: str, value: Any, shape: tuple[int, ...]) -> Any:
   """Returns a value to write as float64.
 
   Raises:
     FeedbackProviderError: If it is not an array of numbers of shape `shape`.
   """
+  if type(value) is np.float64 and not shape:
+    return value  # The usual case, without the time of the checks.
   try:
     number = np.asarray(value)
   except Exception as error:  # Objects may raise any class.
