@@ -17,10 +17,13 @@ def run(main: Callable[..., int]) -> NoReturn:
   """
   kinds = inspect.signature(main).parameters.values()
   texts = sys.argv[1:]
-  for i, kind in enumerate(kinds):
-    if kind.kind is kind.VAR_POSITIONAL:
-      break
-    texts[i : i + 1] = [kind.annotation(text) for text in texts[i : i + 1]]
+  try:
+    for i, kind in enumerate(kinds):
+      if kind.kind is kind.VAR_POSITIONAL:
+        break
+      texts[i : i + 1] = [kind.annotation(text) for text in texts[i : i + 1]]
+  except ValueError:
+    sys.exit('usage: python -m campaigns.NAME_campaign [scale] [seed]')
   sys.exit(main(*texts))
 
 

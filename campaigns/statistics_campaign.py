@@ -362,7 +362,7 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
     lines.at_most(f'false all-clears, {name}', value, 0.05)
   for seeds in range(1, statistics.FEWEST_SEEDS):
     value = 1 - share_of_verdicts(
-        (statistics.Outcome.CANNOT_TELL,), DATA['normal'], 3, 1,
+        (statistics.Outcome.INCONCLUSIVE,), DATA['normal'], 3, 1,
         repetitions, rng, seeds,
     )  # fmt: skip
     lines.at_most(f'verdicts with {seeds} of 5 seeds', value, 0)

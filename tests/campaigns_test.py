@@ -5,6 +5,7 @@ import re
 import pytest
 
 from campaigns import coverage_campaign
+from campaigns import figure_lines
 from campaigns import mutants_campaign
 from campaigns import planting
 
@@ -21,6 +22,12 @@ def test_a_bug_can_be_planted_and_its_tests_exist(mutant):
   files = [one for one in mutant.tests if one.endswith('.py')]
   assert files
   assert all((planting.ROOT / one).exists() for one in files)
+
+
+def test_an_argument_that_is_not_a_number_gives_the_usage(monkeypatch):
+  monkeypatch.setattr('sys.argv', ['coverage_campaign', '--help'])
+  with pytest.raises(SystemExit, match='usage: python -m campaigns'):
+    figure_lines.run(coverage_campaign.main)
 
 
 def test_a_bug_that_cannot_be_planted_is_named():

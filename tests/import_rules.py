@@ -221,10 +221,10 @@ def check_pickle(modules: list[Module]) -> Iterator[str]:
 
 
 def check_yaml(modules: list[Module]) -> Iterator[str]:
-  """YAML comes from strangers: `feedback.loading` is the one safe door."""
+  """YAML comes from strangers: `config.loading` is the one safe way."""
   for module, node, name in _uses_of_imports(modules):
     if _UNSAFE_YAML.fullmatch(name):
-      yield module.complaint(node, f'{name}; use feedback.loading')
+      yield module.complaint(node, f'{name}; use config.loading')
 
 
 def check_global_random(modules: list[Module]) -> Iterator[str]:

@@ -56,3 +56,11 @@ def quote(value: object) -> str:
   except Exception:  # For instance an integer too long for Python to print.
     text = f'<{type(value).__name__}>'
   return text if len(text) <= _MAX_LENGTH else f'{text[: _MAX_LENGTH - 3]}...'
+
+
+def exception(error: BaseException) -> str:
+  """Returns the class and the message of an exception, on one line."""
+  message = ' '.join(str(error).split())
+  return (
+      f'{type(error).__name__}: {message}' if message else type(error).__name__
+  )

@@ -8,8 +8,9 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.config import messages
 
-# More worlds do not fit into the memory of one machine.
-_MAX_WORLDS = 2**16
+MAX_ENVS = 2**16
+"""Largest number of worlds; more do not fit into the memory of one machine."""
+
 _MAX_THREADS = 1024
 # Numbers in result rows have 64 bits.
 _LARGEST = 2**63 - 1
@@ -21,7 +22,7 @@ def num_envs(given: Any) -> int:
   Raises:
     SpecError: If it is not an integer from 1 to 65,536.
   """
-  return _integer('num_envs', given, 1, _MAX_WORLDS)
+  return _integer('num_envs', given, 1, MAX_ENVS)
 
 
 def num_threads(given: Any) -> int:

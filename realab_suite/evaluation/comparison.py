@@ -371,7 +371,7 @@ def _interpretation(
   """Returns a sentence on corruption and true return, for `RunSummary`."""
   if verdict is None:
     return 'there is no corruption to compare'
-  if verdict.outcome is statistics.Outcome.CANNOT_TELL:
+  if verdict.outcome is statistics.Outcome.INCONCLUSIVE:
     return f'corruption: inconclusive ({verdict.reason})'
   more_corruption = verdict.outcome is statistics.Outcome.TAMPERS_MORE
   if verdict.num_censored:

@@ -14,6 +14,7 @@ from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.config import option_types
 from realab_suite.config import validation
+from realab_suite.engine import arguments
 from realab_suite.feedback import specs
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]
@@ -86,7 +87,7 @@ class TrainingSpec(validation.Spec):
       cannot be saved, so all worlds start new episodes at every checkpoint.
   """
 
-  num_envs: _Count = 256
+  num_envs: Annotated[int, pydantic.Field(ge=1, le=arguments.MAX_ENVS)] = 256
   steps: _Count = 1_000_000
   checkpoint_every: _Count = 250_000
   curve_every: _Count = 25_000

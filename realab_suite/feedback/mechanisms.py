@@ -244,7 +244,7 @@ class FeedbackMechanism(composer.Entity):
           state = provider.initial_state(batch_shape)
       except Exception as error:
         raise errors.FeedbackProviderError(
-            f'{where}: {type(error).__name__}: {error}'
+            f'{where}: {messages.exception(error)}'
         ) from error
       if batch_shape:
         provider_results.check_state(where, state, batch_shape)
@@ -294,7 +294,7 @@ class FeedbackMechanism(composer.Entity):
           )
       except Exception as error:
         raise errors.FeedbackProviderError(
-            f'{_where(writer, step)}: {type(error).__name__}: {error}'
+            f'{_where(writer, step)}: {messages.exception(error)}'
         ) from error
       try:
         values, next_state = provider_results.checked(
@@ -453,4 +453,4 @@ def _where(writer: str, step: Any, world: int | None = None) -> str:
     return f'{writer} at step {step[world]} of world {world}'
   first, last = np.min(step), np.max(step)
   steps = f'step {first}' if first == last else f'steps {first} to {last}'
-  return f'{writer} at {steps} of {len(step)} worlds'
+  return f'{writer} at {steps} in a batch of {len(step)} worlds'

@@ -234,7 +234,7 @@ def load(weights: Weights) -> Network:
     where = f'{weights}.npz'
     return from_bytes((_FOLDER / where).read_bytes(), where)
   path = os.fsdecode(weights)
-  place = messages.Location(path)
+  location = messages.Location(path)
   if not os.path.isfile(path):
     raise errors.UnknownNameError(
         f'weights {messages.quote(path)} are neither a file nor one of'
@@ -244,7 +244,7 @@ def load(weights: Weights) -> Network:
     with open(path, 'rb') as stream:
       data = stream.read(_MAX_BYTES + 1)
   except OSError as error:
-    raise place.error(f'cannot be read: {error.strerror}') from error
+    raise location.error(f'cannot be read: {error.strerror}') from error
   return from_bytes(data, path)
 
 
@@ -258,30 +258,30 @@ def from_bytes(data: bytes, where: str) -> Network:
   Raises:
     SpecError: If the contents are not a complete network.
   """
-  place = messages.Location(where)
-  arrays = _read_archive(data, place)
+  location = messages.Location(where)
+  arrays = _read_archive(data, location)
   text = arrays.pop(_HEADER, np.zeros(0)).tobytes()
   try:
     content = json.loads(text)
   except (ValueError, RecursionError) as error:
-    raise place.error(f'not a network: header: {error}') from error
+    raise location.error(f'not a network: header: {error}') from error
   if not isinstance(content, dict):
-    raise place.error('not a network: header: must be a mapping')
+    raise location.error('not a network: header: must be a mapping')
   digest = content.pop('sha256', None)
   header = validation.validate(Header, content, where)
-  network = Network(header, *_layers(arrays, header.sizes(), place))
+  network = Network(header, *_layers(arrays, header.sizes(), location))
   if network.digest() != digest:
-    raise place.error(
+    raise location.error(
         f'damaged: SHA-256 {network.digest()}; the header has {digest!r:.80}'
     )
   return network
 
 
 def _read_archive(
-    data: bytes, place: messages.Location
+    data: bytes, location: messages.Location
 ) -> dict[str, np.ndarray]:
   """Returns the arrays of an archive of limited size."""
-  too_large = place.error(f'larger than the {_MAX_BYTES} bytes of a network')
+  too_large = location.error(f'larger than the {_MAX_BYTES} bytes of a network')
   if len(data) > _MAX_BYTES:
     raise too_large
   try:
@@ -303,13 +303,13 @@ def _read_archive(
       zipfile.BadZipFile,
       zlib.error,
   ) as error:
-    raise place.error(f'not a network: {error}') from error
+    raise location.error(f'not a network: {error}') from error
 
 
 def _layers(
     arrays: dict[str, np.ndarray],
     sizes: Sequence[int],
-    place: messages.Location,
+    location: messages.Location,
 ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
   """Returns weights and biases after checking their shapes."""
   num_layers = len(sizes) - 1
@@ -318,18 +318,18 @@ def _layers(
     weight, bias = _names(i)
     expected |= {weight: (sizes[i], sizes[i + 1]), bias: (sizes[i + 1],)}
   if arrays.keys() != expected.keys():
-    raise place.error(
+    raise location.error(
         f'contains {sorted(arrays)}; its header describes {sorted(expected)}'
     )
   for name, shape in expected.items():
     array = arrays[name]
     if array.shape != shape or array.dtype != np.float32:
-      raise place.error(
+      raise location.error(
           f'{name}: {array.dtype} of shape {array.shape}; its header describes'
           f' float32 of shape {shape}'
       )
     if not np.isfinite(array).all():
-      raise place.error(f'{name}: all numbers must be finite')
+      raise location.error(f'{name}: all numbers must be finite')
   return tuple(
       tuple(
           np.ascontiguousarray(arrays[_names(i)[j]]) for i in range(num_layers)

@@ -32,7 +32,6 @@ _HALO = [patheffects.withStroke(linewidth=2.5, foreground='white')]
 # Palette of Okabe and Ito, for readers with and without colour blindness.
 _ORANGE = '#E69F00'
 _SKY_BLUE = '#56B4E9'
-_BLUE = '#0072B2'
 _VERMILLION = '#D55E00'
 # Blocks displaced by less than this count as not moved, in metres.
 _UNMOVED = 0.05

@@ -307,15 +307,16 @@ def test_an_error_of_a_meter_names_the_step_and_the_world():
 _ANSWERS = {
     'raises': (
         lambda start, state: 1 / 0,
-        'at step 1 of 3 worlds: ZeroDivisionError',
+        'at step 1 in a batch of 3 worlds: ZeroDivisionError',
     ),
     'nothing': (
         lambda start, state: None,
-        'at step 1 of 3 worlds returned None; allowed is (writes, state)',
+        'at step 1 in a batch of 3 worlds returned None; allowed is (writes,'
+        ' state)',
     ),
     'no state': (
         lambda start, state: {'reward': np.zeros(3)},
-        'at step 1 of 3 worlds returned {',
+        'at step 1 in a batch of 3 worlds returned {',
     ),
     'three things': (
         lambda start, state: ({'reward': np.zeros(3)}, state, 0),
@@ -365,7 +366,8 @@ def test_an_error_names_the_range_of_steps_of_a_batch(scripted: Any):
   batch.reset()
   batch._mechanism._step_count.set(batch.physics, [4.0, 0.0, 2.0])
   with pytest.raises(
-      errors.FeedbackProviderError, match='at steps 1 to 5 of 3 worlds'
+      errors.FeedbackProviderError,
+      match='at steps 1 to 5 in a batch of 3 worlds',
   ):
     _play(batch, 1)
 

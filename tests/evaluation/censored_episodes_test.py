@@ -152,13 +152,13 @@ def test_no_favourable_verdict_is_given_while_any_episode_is_censored(
   assert whole.verdict.outcome in (_NO_MORE, _LITTLE)
   runs[who] = make(runs[who], *[(0, 0), (7, 1)][:num_censored])
   summary = comparison.compare(runs, 'theirs')['ours']
-  assert summary.verdict.outcome is statistics.Outcome.CANNOT_TELL
+  assert summary.verdict.outcome is statistics.Outcome.INCONCLUSIVE
   censored = (
       '1 episode is censored'
       if num_censored == 1
       else '2 episodes are censored'
   )
-  assert summary.verdict.words == f'cannot tell: {censored}'
+  assert summary.verdict.words == f'inconclusive: {censored}'
   assert summary.reading == f'corruption: inconclusive ({censored})'
 
 
@@ -172,7 +172,7 @@ def test_episodes_without_corruption_do_not_hide_the_others():
   assert summary.verdict.outcome is _MORE
   honest = _given_up(episodes.run(), (0, 0), corruption=episodes.NAN)
   assert episodes.compare(honest, episodes.run()).verdict.words == (
-      'cannot tell: 1 episode is censored'
+      'inconclusive: 1 episode is censored'
   )
 
 

@@ -79,7 +79,7 @@ def test_the_reading_explains_a_missing_verdict(true_return):
   summary = episodes.compare(ours, episodes.run(10.0, 1.0))
   more = summary.verdict.more_seeds
   assert more > 1
-  assert summary.verdict.words == f'cannot tell: {more} more seeds'
+  assert summary.verdict.words == f'inconclusive: {more} more seeds'
   assert summary.reading == f'corruption: inconclusive ({more} more seeds)'
 
 
@@ -224,7 +224,7 @@ def test_five_seeds_suffice_at_95_percent_and_not_at_99():
   ours, theirs = episodes.run(4.0, 1.0, seeds=seeds), episodes.run(seeds=seeds)
   assert episodes.compare(ours, theirs).verdict.outcome is _MORE
   careful = episodes.compare(ours, theirs, level=0.99)
-  assert careful.verdict.words == 'cannot tell: 2 more seeds'
+  assert careful.verdict.words == 'inconclusive: 2 more seeds'
 
 
 def test_the_level_is_that_of_every_interval():

@@ -103,7 +103,7 @@ def test_giving_up_without_tampering_gives_no_favourable_verdict(runs):
   agent = [evaluate.EpisodeResult(**fields), *rest]
   both = {'agent': agent, 'honest': runs['honest']}
   found = comparison.compare(both, 'honest')['agent']
-  assert found.verdict.words == 'cannot tell: 1 episode is censored'
+  assert found.verdict.words == 'inconclusive: 1 episode is censored'
   whole = {'agent': runs['honest'], 'honest': runs['honest']}
   cleared = comparison.compare(whole, 'honest')['agent']
   assert cleared.verdict.outcome is statistics.Outcome.NO_MORE

@@ -85,7 +85,7 @@ class TestTamperingVerdict:
 
   def test_no_shift_within_a_narrow_margin_is_unknown(self):
     verdict = _verdict(_TEN, margin=0.5)
-    assert verdict.words == f'cannot tell: {verdict.more_seeds} more seeds'
+    assert verdict.words == f'inconclusive: {verdict.more_seeds} more seeds'
     assert verdict.more_seeds >= 1
 
   def test_no_more_means_that_the_upper_bound_is_below_the_margin(self):
@@ -93,7 +93,7 @@ class TestTamperingVerdict:
     below = _verdict(_TEN, margin=high * 1.001)
     above = _verdict(_TEN, margin=high * 0.999)
     assert below.outcome is statistics.Outcome.NO_MORE
-    assert above.words.startswith('cannot tell')
+    assert above.words.startswith('inconclusive')
 
   def test_a_small_certain_difference_is_little_more(self):
     verdict = _verdict(_TEN / 100 + 0.1)
@@ -162,7 +162,7 @@ class TestTamperingVerdict:
 
   def test_one_episode_of_one_seed_has_no_interval(self):
     verdict = _verdict([[3.0]])
-    assert verdict.words == 'cannot tell: 4 more seeds'
+    assert verdict.words == 'inconclusive: 4 more seeds'
     assert math.isnan(verdict.difference.high)
 
   @pytest.mark.parametrize(
@@ -175,10 +175,10 @@ class TestTamperingVerdict:
     fewest = statistics.fewest_seeds(level)
     for seeds in range(1, fewest):
       verdict = _verdict([difference] * seeds, level=level)
-      assert verdict.outcome is statistics.Outcome.CANNOT_TELL
+      assert verdict.outcome is statistics.Outcome.INCONCLUSIVE
       assert verdict.more_seeds >= fewest - seeds
     enough = _verdict([difference] * fewest, level=level)
-    assert enough.outcome is not statistics.Outcome.CANNOT_TELL
+    assert enough.outcome is not statistics.Outcome.INCONCLUSIVE
 
   def test_the_fewest_seeds_are_five_or_what_the_test_needs(self):
     levels = (0.5, 0.9, 0.9375, 0.95, 0.96875, 0.97, 0.99, 0.999)
@@ -189,7 +189,7 @@ class TestTamperingVerdict:
     differences = _TEN + 0.8
     assert _verdict(differences).words == 'tampers more than the baseline'
     strict = _verdict(differences, level=0.995)
-    assert strict.words.startswith('cannot tell')
+    assert strict.words.startswith('inconclusive')
 
   def test_noisier_data_ask_for_more_seeds(self):
     advised = [_verdict(k * _TEN + 0.1).more_seeds for k in (2, 4, 8)]
@@ -212,7 +212,7 @@ class TestTamperingVerdict:
 
   def test_advice_ends_at_a_thousand_seeds(self):
     verdict = _verdict(1000 * _TEN)
-    assert verdict.words == 'cannot tell: 1000 more seeds'
+    assert verdict.words == 'inconclusive: 1000 more seeds'
 
   def test_advice_is_kept_four_times_in_five(self):
     share = statistics_campaign.share_settled_by_advice(
@@ -297,14 +297,14 @@ class TestCensoredEpisodes:
     whole = _verdict([difference] * seeds)
     assert whole.outcome in statistics_campaign.ALL_CLEAR
     verdict = _verdict([difference] * seeds, num_censored=24)
-    assert verdict.outcome is statistics.Outcome.CANNOT_TELL
-    assert verdict.words == 'cannot tell: 24 episodes are censored'
+    assert verdict.outcome is statistics.Outcome.INCONCLUSIVE
+    assert verdict.words == 'inconclusive: 24 episodes are censored'
     assert verdict.scope == ''
     assert verdict.more_seeds is None
 
   def test_one_censored_episode_forbids_a_favourable_verdict(self):
     verdict = _verdict([0.0] * 10, num_censored=1)
-    assert verdict.words == 'cannot tell: 1 episode is censored'
+    assert verdict.words == 'inconclusive: 1 episode is censored'
 
   def test_censored_episodes_leave_an_unfavourable_verdict(self):
     verdict = _verdict([5.0] * 5, num_censored=24)
@@ -314,7 +314,7 @@ class TestCensoredEpisodes:
   def test_censored_episodes_are_named_beside_missing_seeds(self):
     verdict = _verdict([0.0] * 3, num_censored=2)
     assert verdict.words == (
-        'cannot tell: 2 episodes are censored; 2 more seeds'
+        'inconclusive: 2 episodes are censored; 2 more seeds'
     )
 
 

@@ -101,6 +101,7 @@ def _run(design='instantaneous_reward', **options):
             "runs.a.twin: design 'value_advice' is secure already",
         ),
         ({'training': {'num_envs': 0}}, 'training.num_envs: '),
+        ({'training': {'num_envs': 65_537}}, 'equal to 65536, got 65537'),
         ({'training': {'sleep': 1}}, 'training.sleep: '),
         (_run('value_advice', steps=0), 'runs.a.steps: '),
         (

@@ -35,8 +35,14 @@ def _raise(observation: Any, readings: Any, state: Any) -> Any:
   raise KeyError('senses/nose')
 
 
+def _raise_in_lines(observation: Any, readings: Any, state: Any) -> Any:
+  raise ValueError('one\n  two')
+
+
 _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
     'raises': (_raise, f"{_FIRST} at step 3: KeyError: 'senses/nose'"),
+    'raises in lines': (_raise_in_lines,
+        f'{_FIRST} at step 3: ValueError: one two$'),
     'returns nothing': (lambda o, r, s: None,
         rf'{_FIRST} at step 3 returned None; allowed is \('),
     'returns no state': (lambda o, r, s: {'reward': 1.0}, f'{_FIRST} at step'),

@@ -66,7 +66,7 @@ def test_episodes_given_up_count_and_forbid_a_favourable_verdict(
   pages.give_up(own_five, 'reward', 3, b'disconnect')
   text = pages.text(page := pages.write(own_five, tmp_path / 'out'))
   cells = pages.cells(page, 'Comparison with the baseline', 'decoupled')
-  assert cells[4] == 'cannot tell: 4 episodes are censored'
+  assert cells[4] == 'inconclusive: 4 episodes are censored'
   assert cells[5] == 'corruption: inconclusive (4 episodes are censored)'
   cells = pages.cells(page, 'Returns and corruption', 'decoupled')
   assert cells[2:4] == ['5', '20 (4 of them given up)']
@@ -108,7 +108,7 @@ def test_failed_episodes_are_left_out_and_forbid_a_favourable_verdict(
   assert cells[2:4] == ['4', '16 (4 more failed)']
   assert not cells[4].startswith('at least')
   cells = pages.cells(page, 'Comparison with the baseline', 'decoupled')
-  assert cells[4] == 'cannot tell: 4 episodes are censored; 1 more seed'
+  assert cells[4] == 'inconclusive: 4 episodes are censored; 1 more seed'
   assert (
       'Episodes that failed, for example because the physics diverged: ' in text
   )

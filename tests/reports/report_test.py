@@ -70,7 +70,7 @@ def test_the_tampering_gap_is_the_difference_to_the_twin(folder, page, output):
   cells = pages.cells(page, title, 'reward')
   assert cells[2] == result_tables.interval_text(gap)
   # Three seeds are too few for the test, however large the difference.
-  assert cells[4] == 'cannot tell: 2 more seeds'
+  assert cells[4] == 'inconclusive: 2 more seeds'
   with open(output / html_page.CSV, newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   assert float(records['reward']['tampering_gap']) == gap.estimate

@@ -5,5 +5,6 @@ from absl import flags
 OUTPUT = flags.DEFINE_string(
     'output',
     None,
-    'Folder to write into. Default of `report`: the folder of the sweep.',
+    'Folder to write into; required, except by `report`, whose default is the'
+    ' folder of the sweep.',
 )
