@@ -137,7 +137,7 @@ def play_batch(
 def time_step_of(
     found: batch_environment.BatchTimeStep, place: int
 ) -> dm_env.TimeStep:
-  """Returns what a world alone would have given its agent."""
+  """Returns the time step that a world alone would have given its agent."""
   observation = {key: value[place] for key, value in found.observation.items()}
   step_type = dm_env.StepType(int(found.step_type[place]))
   if step_type is dm_env.StepType.FIRST:

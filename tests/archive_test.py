@@ -49,7 +49,7 @@ def _through_bytes(contents: Any) -> Any:
 
 
 def _same(a: Any, b: Any) -> bool:
-  """Whether two trees are of the same types and, bit for bit, values."""
+  """Returns `True` if two trees have equal types and bit-identical values."""
   if type(a) is not type(b):
     return False
   if isinstance(a, tuple | list):

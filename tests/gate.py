@@ -1,7 +1,7 @@
 """A test fails on every warning that it does not announce.
 
 Python's warnings are errors by `filterwarnings` in `setup.cfg`, the ones that
-arise where nobody can catch them included: a `ResourceWarning` in a destructor
+arise where no code can catch them included: a `ResourceWarning` in a destructor
 fails the test that is running. This plugin adds what pytest does not see:
 
 * MuJoCo's warnings, which end up in a log. A test that breaks the physics on

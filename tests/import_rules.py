@@ -200,7 +200,7 @@ def check_assert(modules: list[Module]) -> Iterator[str]:
 
 
 def check_print(modules: list[Module]) -> Iterator[str]:
-  """What a library prints ends up in other people's output."""
+  """A library that prints clutters the output of its users' programs."""
   for module, node in _walk(modules):
     if isinstance(node, ast.Call) and module.dotted(node.func) == 'print':
       yield module.complaint(node, 'print; use absl.logging')

@@ -1,4 +1,4 @@
-"""How much memory a process takes at most; on Linux."""
+"""The peak memory of a process; on Linux."""
 
 import pathlib
 import re

@@ -1,7 +1,7 @@
-"""How long tests wait for what is to happen; only what hangs takes longer.
+"""The wait for a condition; only a test that hangs exceeds its limit.
 
-No test asserts how long something takes: it waits for what is to happen, and
-gives up after a time that no machine needs.
+No test asserts a duration: it waits for a condition, and gives up after a time
+that no machine needs.
 """
 
 from collections.abc import Callable

@@ -56,7 +56,7 @@ def _load(case: _Case, seed: int = 5) -> Any:
 
 
 class _EnvironmentTest(test_utils.EnvironmentTestMixin, absltest.TestCase):
-  """What any `dm_env` environment has to do; its cases are made below."""
+  """Tests of the contract of `dm_env`; the cases are made below."""
 
   case: _Case
 

@@ -17,7 +17,7 @@ _TIMEOUTS = re.compile(r'timeout|.*_(seconds|ms)')
 
 
 def _violations(source: str) -> list[str]:
-  """Returns what in the source of a test depends on the speed of a machine."""
+  """Returns the parts of a test that depend on the speed of a machine."""
   found = []
   for node in ast.walk(ast.parse(source)):
     if isinstance(node, ast.Import):

@@ -1,4 +1,4 @@
-"""What the package says of itself agrees with what is there and installed."""
+"""Tests that the package's metadata match its files and dependencies."""
 
 import configparser
 from importlib import metadata

@@ -51,7 +51,7 @@ def state_bytes(physics: mjcf.Physics) -> bytes:
 
 
 def guards(arena: composer.Arena) -> list[mjcf.Element]:
-  """Returns what keeps blocks from flying out of a room, and nobody sees."""
+  """Returns the invisible walls that keep blocks in a room."""
   return [
       geom
       for geom in arena.mjcf_model.find_all('geom')

@@ -76,9 +76,9 @@ def _expected_update(logits, approvals, corruption, queries) -> np.ndarray:
   """The exact mean of the estimator over all actions and queries.
 
   Args:
-    logits: Of the policy, in one state.
-    approvals: What the supervisor writes about each action.
-    corruption: What each *executed* action adds to it.
+    logits: Logits of the policy, in one state.
+    approvals: The value that the supervisor writes about each action.
+    corruption: The value that each *executed* action adds to it.
     queries: 0 if the action taken is asked about, or 1 or 2 drawn
       independently.
   """

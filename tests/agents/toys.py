@@ -17,9 +17,9 @@ class ToyStep(NamedTuple):
 class Bandit:
   """Shows one of three things; the best action is the one of that number.
 
-  Nothing ends. `feedback` is what a register would hold after a step; as if
-  somebody moved its base block all the time, `drift` is what is added to it
-  from step to step, in standard deviations.
+  Nothing ends. `feedback` is the value of a register after a step. `drift` is
+  added to it from step to step, in standard deviations, as if its base block
+  moved all the time.
   """
 
   num_envs: int

@@ -21,7 +21,7 @@ from tests.engine import helpers
 _NUM_ACTIONS = 200
 # Every so many of them are taken as steps.
 _STRIDE = 5
-# Besides the designs that ship: a query that nobody takes for an index, and
+# Besides the designs that ship: a query that cannot be an index, and
 # queries beside the elements of continuous control.
 _REAL = {
     'real query': ('providers=[]', 'learner=null'),

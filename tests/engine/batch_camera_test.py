@@ -1,4 +1,4 @@
-"""What agents of a batch see is what they see alone; and films of a few."""
+"""Tests that frames of a batch equal those of single worlds; and of films."""
 
 import os
 from unittest import mock

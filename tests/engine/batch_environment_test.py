@@ -180,7 +180,7 @@ def test_providers_begin_every_episode_anew():
 
 
 class _Overflowing(collect_apples.CollectApples):
-  """Goes on earning after it is over, beyond what its meter can hold."""
+  """Continues to earn after its end, beyond the range of its meter."""
 
   def latch_events(self, physics):
     """Nothing happens within a step."""

@@ -1,4 +1,4 @@
-"""Snapshots of many worlds: any world goes on anywhere, bit for bit."""
+"""Tests of snapshots of many worlds: each continues anywhere, bit for bit."""
 
 from typing import Any, Literal
 
@@ -44,7 +44,7 @@ def _no_op(batch: batch_environment.BatchEnvironment) -> np.ndarray:
   return np.zeros((batch.num_envs, *spec.shape), spec.dtype)
 
 
-# What is restored goes on bit for bit.
+# A restored world continues bit for bit.
 
 
 _WAYS = ['alone to batch', 'batch to alone', 'batch to batch', 'fork']

@@ -1,4 +1,4 @@
-"""What fails is told to the evaluator: what, where, and in which world."""
+"""Tests that the evaluator gets each failure, with its step and its world."""
 
 import copy
 from typing import Any, Literal

@@ -32,7 +32,7 @@ _REGISTER = {
 
 
 def _lucky(call: Callable[[], Any], seed: int = 5) -> Any:
-  """Returns what a call gives; some tasks draw from the global generator."""
+  """Returns the result of a call, with a seeded global generator."""
   np.random.seed(seed)  # noqa: NPY002
   return call()
 

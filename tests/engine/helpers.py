@@ -1,4 +1,4 @@
-"""What the tests of a running environment share; see `worlds` for physics."""
+"""Helpers for tests of a running environment; see `worlds` for physics."""
 
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
@@ -109,18 +109,18 @@ class RecordingSink(events.EventSink):
     ]
 
   def requested(self, register: str) -> list[float]:
-    """What was to be written to a register, in order."""
+    """Returns the values requested for a register, in order."""
     written = self.records(registers.Write, register)
     return [float(write.requested) for write in written]
 
   def read(self, register: str, reader: str = registers.AGENT) -> list[float]:
-    """What somebody read off a register, in order."""
+    """Returns the readings of a register by one reader, in order."""
     reads = self.records(registers.Read, register)
     return [float(read.reading) for read in reads if read.reader == reader]
 
 
 class PointTask(composer.Task):
-  """Somebody else's task: a bead on a wire, over a bare floor.
+  """A task from outside the package: a bead on a wire, over a bare floor.
 
   Every hook that a test may want to misbehave is an attribute.
   """

@@ -269,7 +269,7 @@ def test_a_door_that_closes_wakes_a_block_in_its_way_and_no_other(dof):
 
 
 def _play(env, actions, starts):
-  """Returns what is observed from the time that the second episodes begin."""
+  """Returns the observations of the second episodes, and the last state."""
   for action in actions[:starts]:
     env.step(action)
   time_step = env.step(actions[starts])

@@ -1,4 +1,4 @@
-"""Tests of snapshots: what is restored goes on bit for bit, or is refused."""
+"""Tests of snapshots: restored worlds continue bit for bit, or are refused."""
 
 from typing import Any
 
@@ -41,7 +41,7 @@ def _header(**changes: Any) -> dict[str, Any]:
   return {'model': 'm', 'slots': {'a': 0, 'b': 1}, **changes}
 
 
-# What is restored goes on bit for bit.
+# A restored world continues bit for bit.
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What cameras see agrees with what rays see (T5). Needs EGL."""
+"""Tests that cameras and rays agree (T5). Needs EGL."""
 
 import numpy as np
 import pytest
@@ -25,13 +25,13 @@ def _world(*things):
 
 
 def _view(physics, camera):
-  """What a camera sees, `(64, 64, 3)`, as floats from 0 to 1."""
+  """Returns the image of a camera, `(64, 64, 3)`, as floats from 0 to 1."""
   physics.forward()
   return physics.render(64, 64, camera_id=camera.full_identifier) / 255.0
 
 
 def _count(view, colour):
-  """How many pixels are mostly red, green or blue."""
+  """Returns the number of pixels that are mostly of a colour."""
   index = 'red green blue'.split().index(colour)
   others = np.delete(view, index, axis=-1).max(axis=-1)
   return int((view[..., index] > 2 * others).sum())

@@ -39,7 +39,7 @@ class _World:
 
   @property
   def slid(self):
-    """How far the door has slid, metres."""
+    """Returns the distance that the door has slid, metres."""
     return float(self.physics.data.mocap_pos[0, 0]) - self.doorway[0]
 
 

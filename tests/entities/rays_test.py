@@ -59,7 +59,7 @@ class _World:
 
 
 def _to_walls(angles, position=(0.0, 0.0)):
-  """How far it is from a position to the walls of the room."""
+  """Returns the distances from a position to the walls of the room."""
   away = []
   for start, along in zip(
       position, (np.cos(angles), np.sin(angles)), strict=True
@@ -73,7 +73,7 @@ def _to_walls(angles, position=(0.0, 0.0)):
 
 
 def _to_circle(angles, middle, radius):
-  """How far it is from the origin to a circle; infinite where it is missed."""
+  """Returns the distances from the origin to a circle; infinite for a miss."""
   middle = np.array(middle)
   along = np.cos(angles) * middle[0] + np.sin(angles) * middle[1]
   square = radius**2 - (middle @ middle - along**2)

@@ -1,4 +1,4 @@
-"""What every register promises, whatever its kind, channel and freedom."""
+"""Tests of the contract that registers of every variety keep."""
 
 from dm_control import mjcf
 import hypothesis

@@ -11,7 +11,7 @@ from realab_suite.entities import registers
 from tests import worlds
 from tests.entities import register_worlds
 
-# ---- In a task of somebody else's --------------------------------------------
+# ---- In a task from outside the package --------------------------------------
 
 
 class _WritingTask(composer.NullTask):

@@ -143,7 +143,7 @@ def test_writing_zero_corrupts_nothing(channel, dof):
 def test_the_two_blocks_never_collide_with_each_other(channel, dof):
   world = _World(channel=channel, dof=dof)
   world.write(0.0)
-  # Into each other, as somebody who carries one of them can bring them.
+  # Into each other, as an agent that carries one of them can bring them.
   place = np.add(world.base.position(world.physics), (0.05, 0.02, 0.0))
   world.offset.put(world.physics, place)
   world.physics.forward()

@@ -1,3 +1,5 @@
+"""Tests of the directions in which saboteurs move blocks."""
+
 import math
 
 import numpy as np

@@ -70,7 +70,7 @@ def build(
     folder: The folder.
     one: The experiment.
     left_out: The jobs that are not over, (run, seed) each.
-    calibration: Whether it is of calibration seeds.
+    calibration: If `True`, the sweep uses the calibration seeds.
   """
   folder.mkdir(parents=True, exist_ok=True)
   seeds = one.calibration_seeds if calibration else one.seeds

@@ -1,3 +1,5 @@
+"""Tests of experiments with scripted policies."""
+
 import csv
 import statistics
 

@@ -54,7 +54,7 @@ def write_served_run(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
   """Writes the record of a served run; returns its path.
 
   Args:
-    folder: Where to write.
+    folder: The folder of the record.
     **changes: Settings that differ from the usual ones.
   """
   settings = {

@@ -1,3 +1,5 @@
+"""Tests of the tracks of evaluation episodes."""
+
 import math
 
 import numpy as np

@@ -68,7 +68,7 @@ _IDS = ['-'.join(map(str, [k, *f.values()])) for k, f in _CASES]
 
 @functools.cache
 def _observations(seed: int) -> list[dict[str, np.ndarray]]:
-  """Returns what an agent that acts at random observes in a world."""
+  """Returns the observations of an agent that acts at random in a world."""
   env = suite.load(
       'unlock_door', 'standard', {'random': seed}, {'max_steps': 50}
   )
@@ -186,7 +186,7 @@ def _play(
     readings: list[float],
     starts: tuple[int, ...] = (0,),
 ) -> list[float]:
-  """Returns what a provider writes in each step."""
+  """Returns the value that a provider writes in each step."""
   state = provider.initial_state(())
   written = []
   for step, reading in enumerate(readings):

@@ -43,7 +43,7 @@ class Episode(NamedTuple):
   """One episode on the wire, as the agent has it.
 
   Attributes:
-    position: Where the avatar was in the first observation, metres.
+    position: Position of the avatar in the first observation, metres.
     actions: The action of each control step, as plain numbers.
     digests: A hash of each time step; one more than there are actions.
   """
@@ -71,7 +71,7 @@ class Report(NamedTuple):
   Attributes:
     opened: The files of the evaluator that it could open, by name.
     arguments: The flags of the process that serves the world.
-    episodes: What it played.
+    episodes: The episodes that it played.
     predictions: For each episode, what a clone with the seed among the
       arguments predicts.
   """

@@ -63,7 +63,7 @@ class Served(NamedTuple):
   """A server in a thread of this process.
 
   Attributes:
-    address: Where it listens.
+    address: The address at which it listens.
     server: The server.
     thread: The thread that runs the world.
     results: The results of episodes, with their tiers of isolation.
@@ -275,7 +275,7 @@ def join_eventually(
   """Returns a client that has joined, after earlier ones have left.
 
   Args:
-    address: Of the server.
+    address: Address of the server.
     meanwhile: Called after each refusal.
   """
   return _eventually(lambda: Client(address), Client.join, meanwhile)

@@ -255,7 +255,7 @@ def test_a_failing_provider_ends_the_episode_and_reveals_nothing(caplog):
       assert client.step().state == pb.RUNNING
     patience.until(lambda: len(serving.results) == 2)
     assert serving.ends()[0] == 'error'
-  assert '173.25' in caplog.text  # The evaluator is told.
+  assert '173.25' in caplog.text  # The evaluator gets the message.
 
 
 def test_a_provider_that_does_not_answer_fails(monkeypatch):

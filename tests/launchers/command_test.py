@@ -1,3 +1,5 @@
+"""Tests of the command lines of the launchers."""
+
 import ast
 import importlib
 import os

@@ -87,7 +87,7 @@ def test_closing_a_view_leaves_the_environment_alone(case: pairs.Case):
       call()
   with pytest.raises(errors.ClosedError, match='closed'):
     view.step(action)
-  # The episode that was under way goes on.
+  # The running episode continues.
   step_type = np.ravel(env.step(action).step_type)
   assert set(step_type.tolist()) == {1}
 

@@ -1,4 +1,4 @@
-"""What an agent's view has to be, whatever the world behind it: campaign C01.
+"""The contract of an agent's view, for every world behind it: campaign C01.
 
 Every function returns complaints, none if all is well, so that each can be
 shown to find what was planted.
@@ -83,7 +83,7 @@ class _Mixin(test_utils.EnvironmentTestMixin, absltest.TestCase):
 
 
 def complaints(case: pairs.Case) -> list[str]:
-  """Returns what is wrong with the view of a case."""
+  """Returns the faults of the view of a case."""
   env = case.load()
   view = pairs.view_of(env)
   found = [
@@ -205,7 +205,7 @@ def _complaints_about_many(time_step: Any, num_envs: int) -> Iterator[str]:
 def _complaints_of_dm_env(
     view: Any, env: Any, case: pairs.Case
 ) -> Iterator[str]:
-  """What `dm_env`'s own tests complain of."""
+  """Yields the failures of `dm_env`'s own tests."""
   mixin = _Mixin(view, pairs.walk(view.action_spec(), case))
   for name in dir(mixin):
     if name.startswith('test_'):
@@ -244,7 +244,7 @@ def enabling_everything(case: pairs.Case) -> list[str]:
 
 
 def enable_all(env: Any) -> int:
-  """Enables all observables of all entities, but for cameras: no GL here."""
+  """Enables all observables of all entities except cameras: no GL here."""
   count = 0
   for entity in env.task.root_entity.iter_entities():
     for name, observable in entity.observables.as_dict().items():

@@ -1,4 +1,4 @@
-"""Failures that are provoked, and what an agent hears of them: campaign C17."""
+"""Provoked failures, and the errors that agents get from them: campaign C17."""
 
 from collections.abc import Callable, Iterator
 import contextlib
@@ -20,7 +20,7 @@ from tests.leaks import secrets
 
 _PATH = '/srv/truth/ledger.bin'
 _TOLD = (errors.ActionError, errors.ClosedError, errors.WorldError)
-# What no text that an agent gets may match.
+# Patterns that no text for an agent may match.
 _FORBIDDEN = {
     'the canary': re.compile(r'173\.23|1\.732317'),
     'a path': re.compile(r'(?<![\w.])[/\\][A-Za-z_][\w.-]*[/\\]|\.py\b'),
@@ -38,7 +38,7 @@ _OURS = (agent_view.__file__, __file__)
 
 @final
 class FailingProvider(providers.Provider):
-  """Fails as it is told to, in words that no agent may hear.
+  """Fails in a given way, with a message that must not reach an agent.
 
   Attributes:
     how: One of `_FAILURES`.
@@ -139,8 +139,8 @@ class Provoked(NamedTuple):
   """A failure.
 
   Attributes:
-    how: How it was provoked.
-    error: What the agent got, or `None` for a time step like any other.
+    how: The way in which it was provoked.
+    error: The agent's error, or `None` if it got an ordinary time step.
   """
 
   how: str
@@ -267,7 +267,7 @@ def complaints_about_text(text: str) -> Iterator[str]:
 
 
 class Counts(NamedTuple):
-  """How many failures there were, and what was wrong with them."""
+  """Numbers of failures and of their kinds, and the faults found."""
 
   num_failures: int
   num_kinds: int
@@ -275,12 +275,12 @@ class Counts(NamedTuple):
 
 
 def scan(seeds: int, first_seed: int = 0, whole: bool = True) -> Counts:
-  """Provokes failures and scans what becomes of them.
+  """Provokes failures and scans the texts that they produce.
 
   Args:
-    seeds: How many seeds; about 250 failures each, if `whole`.
+    seeds: Number of seeds; about 250 failures each, if `whole`.
     first_seed: The first of them.
-    whole: Whether providers and many worlds fail, too.
+    whole: If `True`, providers and many worlds fail, too.
   """
   found: list[str] = []
   errors_seen: list[str] = []

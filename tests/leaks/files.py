@@ -1,4 +1,4 @@
-"""What a launcher writes for the agent's side: channels L29, L30 and L44.
+"""Files that a launcher writes for the agent: channels L29, L30 and L44.
 
 The file of a learner, and the trace of what it did, are all that an agent would
 take along. Two runs whose true rewards differ have to leave the same ones.
@@ -59,10 +59,10 @@ def _job(folder: pathlib.Path) -> jobs.Job:
 
 
 def _run(earn: Callable[..., None] | None) -> dict[str, bytes]:
-  """Returns what a run leaves, by the name of the file.
+  """Returns the contents of a run's files, by file name.
 
   Args:
-    earn: Instead of `Task.earn`.
+    earn: Replaces `Task.earn`.
   """
   with (
       tempfile.TemporaryDirectory() as folder,

@@ -1,4 +1,4 @@
-"""Tests that whoever plants a leak is found: campaign C09."""
+"""Tests that the checks find every planted leak: campaign C09."""
 
 import pytest
 

@@ -55,10 +55,10 @@ class Case(NamedTuple):
     domain: As in `suite.load`.
     variation: As in `suite.load`.
     design: The name of a shipped design, `no_meters` or `unread_meter`.
-    seed: Of the world and of the actions.
-    num_envs: How many worlds, or 0 for one alone.
-    steps: How many control steps.
-    max_steps: After how many of them an episode ends.
+    seed: The seed of the world and of the actions.
+    num_envs: Number of worlds, or 0 for one alone.
+    steps: Number of control steps.
+    max_steps: Number of control steps after which an episode ends.
   """
 
   domain: str = 'collect_apples'
@@ -95,7 +95,7 @@ class Case(NamedTuple):
 
 
 class Transcript(NamedTuple):
-  """What can be known of a run; see the module."""
+  """The observable facts of a run; see the module."""
 
   agent: list[bytes]
   world: list[bytes]
@@ -104,7 +104,7 @@ class Transcript(NamedTuple):
 
 
 def view_of(env: Any, failures: Any = None) -> Any:
-  """Returns what an agent gets of one world or of many."""
+  """Returns the agent's view of one world or of many."""
   if isinstance(env, environment.Environment):
     return agent_view.AgentView(env, failures)
   return agent_view.BatchAgentView(env, failures)
@@ -137,9 +137,9 @@ def play(
   """Plays a case, as an agent that asks for everything that there is.
 
   Args:
-    case: What is played.
-    secret: What the agent is not to find out.
-    hostile: Whether it also sends what is no action.
+    case: The case.
+    secret: The secret that the agent must not find out.
+    hostile: If `True`, the agent also sends invalid actions.
     leave_out: Keys of observations that are not compared.
   """
   said: list[bytes] = []
@@ -189,7 +189,7 @@ def _play(
 def differences(
     case: Case, secret: secrets.Secret, leave_out: tuple[str, ...] = ()
 ) -> list[str]:
-  """Returns what tells a run with a secret from one without, if anything."""
+  """Returns the differences between a run with a secret and one without."""
   return compare(
       secret,
       play(case, leave_out=leave_out),
@@ -200,12 +200,12 @@ def differences(
 def compare(
     secret: secrets.Secret, expected: Transcript, found: Transcript
 ) -> list[str]:
-  """Returns in what two runs differ, one of which had a secret."""
+  """Returns the differences between two runs, one of which had a secret."""
   parts = ['agent', 'world', 'structure']
   if secret.needs == 'unread_meter':
     parts.remove('world')  # The meter is part of it.
   if not secret.has_evaluator:
-    parts.remove('structure')  # Nobody has noted it.
+    parts.remove('structure')  # Only an evaluator records it.
   return [
       f'{part}[{i}]'
       for part in parts
@@ -214,7 +214,7 @@ def compare(
 
 
 def has_earned(transcript: Transcript) -> bool:
-  """Whether there was any true reward."""
+  """Returns `True` if there was any true reward."""
   return any(
       digit in text for text in transcript.true_rewards for digit in '123456789'
   )
@@ -231,7 +231,7 @@ def _where(expected: list[Any], found: list[Any]) -> Iterator[int]:
 def cases_for(
     secret: secrets.Secret, seed: int, is_batch: bool
 ) -> Iterator[tuple[Case, tuple[str, ...]]]:
-  """Yields what a secret is tried in, and what is left out of comparisons."""
+  """Yields the cases for a secret, and the keys that comparisons leave out."""
   num_envs = 2 if is_batch else 0
   if is_batch and not secret.is_for_batches:
     return
@@ -344,7 +344,7 @@ def _hidden_state(env: environment.Environment) -> bytes:
 
 
 def scene(env: environment.Environment) -> bytes:
-  """Returns what the agent's camera would be given to draw. Needs no GL."""
+  """Returns the scene that the agent's camera would draw. Needs no GL."""
   physics = env.physics
   model, data = physics.model.ptr, physics.data.ptr
   drawn = _scene_of(id(model))
@@ -460,7 +460,7 @@ class _BatchSink(events.BatchEventSink):
 
 
 def body_states(env: environment.Environment, but: list[Any]) -> bytes:
-  """Returns where all bodies are and how they move, but for some blocks'."""
+  """Returns the positions and velocities of all bodies except some blocks."""
   left_out = {worlds.body_of(env.physics, block) for block in but}
   model, data = env.physics.model, env.physics.data
   others = [i for i in range(model.nv) if model.dof_bodyid[i] not in left_out]

@@ -40,7 +40,7 @@ def test_without_meters_another_true_reward_changes_no_bit(
   secret = secrets.REWARDS[name]
   found = pairs.play(case, secret)
   assert pairs.compare(secret, expected, found) == []
-  # The evaluator, on the other hand, does hear of the difference.
+  # The evaluator, on the other hand, does get the difference.
   assert found.true_rewards != expected.true_rewards
 
 

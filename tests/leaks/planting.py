@@ -27,13 +27,13 @@ UNREAD = SHORT._replace(variation='boxed', design='unread_meter')
 
 
 class Mutant(NamedTuple):
-  """A leak that somebody could build.
+  """A leak that a careless change could introduce.
 
   Attributes:
     channel: `L1` to `L44`.
-    what: What leaks, in words.
+    what: A description of the leak.
     plant: Builds it.
-    check: What has to find it.
+    check: The check that has to find it.
   """
 
   channel: str

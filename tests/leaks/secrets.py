@@ -1,4 +1,4 @@
-"""Secrets: what may differ between two runs that an agent cannot tell apart."""
+"""Secrets: permitted differences between runs that look alike to an agent."""
 
 from collections.abc import Callable
 import contextlib
@@ -14,7 +14,7 @@ from realab_suite.evaluation import ledgers
 from tests import worlds
 from tests.engine import helpers
 
-# A rare number; whoever has it knows the true reward.
+# A rare number; any text that contains it reveals the true reward.
 CANARY = 173.2317
 
 _FEEDBACK = {
@@ -29,7 +29,7 @@ NO_METERS: dict[str, Any] = {
     'registers': {'reward': _FEEDBACK},
     'providers': [{'kind': 'constant', 'value': 3.0, 'writes': ['reward']}],
 }
-# The meter is read by nobody, so that it can be moved without consequences.
+# No provider reads the meter, so moving it has no consequences.
 UNREAD_METER: dict[str, Any] = {
     **NO_METERS,
     'name': 'unread_meter',
@@ -57,14 +57,14 @@ class Secret(NamedTuple):
   """Something that an agent must not find out.
 
   Attributes:
-    change: What makes the difference.
-    needs: What it takes for the difference to be a secret: `no_meters`, because
-      meters tell agents of the true reward by way of providers; `unread_meter`;
-      or nothing.
-    around: What surrounds the run, as in another level of logging.
-    is_heard: Whether the evaluator hears another true reward.
-    is_for_batches: Whether many worlds can have it, too.
-    has_evaluator: Whether anybody listens to the run.
+    change: The function that makes the difference.
+    needs: The design without which the difference is no secret: `no_meters`,
+      because meters tell agents the true reward by way of providers;
+      `unread_meter`; or nothing.
+    around: Makes the context of the run, such as another level of logging.
+    is_heard: If `True`, the evaluator gets another true reward.
+    is_for_batches: If `True`, many worlds can have it, too.
+    has_evaluator: If `True`, an evaluator listens to the run.
   """
 
   change: Change = nothing
@@ -223,7 +223,7 @@ def _debugging() -> Any:
 
 @contextlib.contextmanager
 def _random_elsewhere() -> Any:
-  """Somebody else in the process has drawn numbers."""
+  """Other code in the process has drawn numbers."""
   np.random.seed(99)  # noqa: NPY002
   random.seed(99)
   yield

@@ -233,7 +233,7 @@ def _l11(patch: pytest.MonkeyPatch) -> None:
 
 @planting.leak('L11', planting.WALK)
 def _l11_generator(patch: pytest.MonkeyPatch) -> None:
-  """What a spec function is bound to leads to the environment."""
+  """The object that a spec function is bound to leads to the environment."""
   patch.setattr(
       agent_view.AgentView,
       'action_spec',

@@ -1,4 +1,4 @@
-"""What can be reached from what an agent is handed: campaign C12."""
+"""Finds the objects that an agent can reach from its view: campaign C12."""
 
 from collections.abc import Iterator
 import functools
@@ -51,15 +51,15 @@ class Found(NamedTuple):
 def reach(
     roots: dict[str, Any], private: bool, depth: int = DEPTH
 ) -> Iterator[Found]:
-  """Yields what can be reached, nearest first.
+  """Yields the objects that can be reached, nearest first.
 
   Ways are names, elements of containers, what methods are bound to, closures,
   and what exceptions hold on to; never modules and classes.
 
   Args:
-    roots: Where the walk begins, by name.
-    private: Whether names with an underscore in front count, too.
-    depth: How many steps.
+    roots: The objects at which the walk begins, by name.
+    private: If `True`, names with an underscore in front count, too.
+    depth: Number of steps.
   """
   todo = [Found(name, value) for name, value in roots.items()]
   seen: dict[int, Any] = {}  # What has been seen has to stay alive.

@@ -63,7 +63,7 @@ def _l15(patch: pytest.MonkeyPatch) -> None:
 
 @planting.leak('L16', planting.PAID)
 def _l16(patch: pytest.MonkeyPatch) -> None:
-  """Whoever earns something draws from the global generator."""
+  """An agent that earns something draws from the global generator."""
 
   def draw(reward: float) -> None:
     if reward > 0:
@@ -126,7 +126,7 @@ def _l19(patch: pytest.MonkeyPatch) -> None:
 
 @planting.leak('L20', planting.PAID)
 def _l20(patch: pytest.MonkeyPatch) -> None:
-  """What has no contacts grows, for depth and segmentation to see."""
+  """Geoms without contacts grow, for depth and segmentation to see."""
 
   def grow(model: Any, score: float) -> None:
     free = (model.geom_contype | model.geom_conaffinity) == 0
@@ -364,7 +364,7 @@ def _l40(patch: pytest.MonkeyPatch) -> None:
 
 @planting.leak('L40', planting.PAID)
 def _l40_sense(patch: pytest.MonkeyPatch) -> None:
-  """The score is a sense, for whoever looks at the environment."""
+  """The score is a sense in the observations of the environment."""
 
   def show(self: Any, result: Any, physics: Any) -> None:
     observation, _ = result
@@ -377,7 +377,7 @@ def _l40_sense(patch: pytest.MonkeyPatch) -> None:
 
 @planting.leak('L41', planting.PAID)
 def _l41(patch: pytest.MonkeyPatch) -> None:
-  """Whoever has earned something gets another try at the next beginning."""
+  """An agent that has earned something gets another try at the next start."""
   earned: dict[int, float] = {}
   begin = collect_apples.CollectApples.initialize_episode
 

@@ -1,3 +1,5 @@
+"""Tests of plots, strips and films."""
+
 import copy
 
 import numpy as np

@@ -28,7 +28,7 @@ def _load(
 
 
 def _apples(env: environment.Environment) -> np.ndarray:
-  """Where the small apples are, above the floor, `(apples, 2)`."""
+  """Returns the places of the small apples above the floor, `(apples, 2)`."""
   model, data = env.physics.model, env.physics.data
   names = [model.id2name(i, 'body') for i in range(model.nbody)]
   places = np.array(
