@@ -74,7 +74,14 @@ def draw(
           mfc=face, color=colour, zorder=4,
       )  # fmt: skip
     ax.set(xlabel='corruption (m, symlog)', ylabel='true return')
-    largest = max(max(x for x, _ in p.by_seed) for p in points)
+    # Bounds of an interval that is not known are nan.
+    corruptions = [
+        x
+        for point in points
+        for x in (*(x for x, _ in point.by_seed), point.corruption.high)
+        if math.isfinite(x)
+    ]
+    largest = max(corruptions)
     ax.set_xlim(-0.01, max(1.25 * largest, 4 * margin))
     ax.xaxis.set_major_formatter(
         ticker.FuncFormatter(chart_style.format_number)

@@ -2,8 +2,10 @@
 
 import pytest
 
+from realab_suite.evaluation import intervals
 from realab_suite.reports import chart_style
 from realab_suite.reports import learning_chart
+from realab_suite.reports import plane_chart
 
 
 def _learning(observed):
@@ -67,3 +69,24 @@ def test_thirty_designs_have_thirty_styles():
   names = [f'design {i}' for i in range(30)]
   looks = chart_style.styles(names)
   assert len(set(looks.values())) == 30
+
+
+@pytest.mark.parametrize('high', [1.2, 9.0, float('nan')])
+def test_an_interval_of_corruption_is_drawn_whole(monkeypatch, high):
+  canvases = []
+  to_svg = chart_style.to_svg
+  monkeypatch.setattr(
+      chart_style,
+      'to_svg',
+      lambda canvas: canvases.append(canvas) or to_svg(canvas),
+  )
+  low = 0.7 if high > 0 else high
+  point = plane_chart.Point(
+      'one', 'one', 'run', [(1.0, 0.9)],
+      intervals.Interval(1.0, low, high, 0.95, 5, 50),
+      intervals.Interval(0.9, 0.6, 1.3, 0.95, 5, 50),
+  )  # fmt: skip
+  plane_chart.draw([point], chart_style.styles(['one']), 0.05)
+  [canvas] = canvases
+  [ax] = canvas.axes
+  assert ax.get_xlim()[1] > max(1.0, high if high > 0 else 1.0)
