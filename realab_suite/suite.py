@@ -200,7 +200,7 @@ def load(
     raise
   except Exception as error:  # Tasks may raise any class.
     location = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
-    raise location.error(f'{type(error).__name__}: {error}') from error
+    raise location.error(messages.exception(error)) from error
   return embed(
       task,
       'none' if design is None else design,

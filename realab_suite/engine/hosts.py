@@ -9,7 +9,7 @@ foreign tasks.
 import abc
 from collections.abc import Callable
 import traceback
-from typing import Any, NamedTuple, NoReturn, Protocol, final
+from typing import Any, NamedTuple, Protocol, final
 
 from dm_control.rl import control
 from dm_env import specs
@@ -166,30 +166,28 @@ class WorldHost(Host):
       SpecError: If they do not fit the task's `sense_spec`.
     """
     sensed = self._task.senses(physics)
-    try:
-      found = {n: (value.shape, value.dtype) for n, value in sensed.items()}
-    except AttributeError:
-      found = {}
+    found = {
+        name: (getattr(value, 'shape', None), getattr(value, 'dtype', None))
+        for name, value in sensed.items()
+    }
     if found != self._expected:
-      self._refuse(sensed)
+      self._refuse(sensed, found)
     return sensed
 
-  def _refuse(self, sensed: dict[str, Any]) -> NoReturn:
+  def _refuse(self, sensed: dict[str, Any], found: dict[str, Any]) -> None:
     """Raises a SpecError for senses that differ from `sense_spec`."""
     where = f'{type(self._task).__name__}.senses'
-    if sensed.keys() != self._expected.keys():
+    if found.keys() != self._expected.keys():
       raise errors.SpecError(
           f'{where}: keys {sorted(sensed)}; allowed are those of sense_spec,'
           f' {sorted(self._expected)}'
       )
-    for name, value in sensed.items():
-      shape, dtype = self._expected[name]
-      if np.shape(value) != shape or getattr(value, 'dtype', None) != dtype:
-        raise errors.SpecError(
-            f'{where}: {name!r} is {messages.quote(value)}; allowed is {dtype}'
-            f' of shape {shape}'
-        )
-    raise errors.SpecError(f'{where}: values that are not arrays')
+    name = next(name for name in found if found[name] != self._expected[name])
+    shape, dtype = self._expected[name]
+    raise errors.SpecError(
+        f'{where}: {name!r} is {messages.quote(sensed[name])}; allowed is'
+        f' {dtype} of shape {shape}'
+    )
 
   def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
     self._hooks.before_step(physics, controls, self._random_state)

@@ -38,7 +38,7 @@ def check(design: Any, read_by_agents: Sequence[str]) -> None:
     except ValueError as error:
       raise ValueError(f'{where}: {error}') from error
     except Exception as error:  # Providers may raise any class.
-      raise ValueError(f'{where}: {type(error).__name__}: {error}') from error
+      raise ValueError(f'{where}: {messages.exception(error)}') from error
     for name in (*provider.action_queries, *provider.action_writes):
       _expect_actions(design, where, name)
   _refuse_second_writers(design)

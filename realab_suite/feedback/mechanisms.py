@@ -410,7 +410,7 @@ def _make_register(
   except errors.SpecError as error:
     raise location.error(str(error)) from error
   except Exception as error:  # Register kinds may raise any class.
-    raise location.error(f'{type(error).__name__}: {error}') from error
+    raise location.error(messages.exception(error)) from error
 
 
 def _find_place(

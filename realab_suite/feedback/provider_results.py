@@ -57,8 +57,8 @@ def _checked_value(name: str, value: Any, shape: tuple[int, ...]) -> Any:
     number = np.asarray(value)
   except Exception as error:  # Objects may raise any class.
     raise errors.FeedbackProviderError(
-        f'wrote {messages.quote(value)} to {name!r}: {type(error).__name__}:'
-        f' {error}'
+        f'wrote {messages.quote(value)} to {name!r}:'
+        f' {messages.exception(error)}'
     ) from error
   if number.dtype.kind not in 'iuf' or np.ma.isMaskedArray(value):
     raise errors.FeedbackProviderError(

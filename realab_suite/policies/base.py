@@ -119,7 +119,7 @@ def _make(
   except Exception as error:  # A factory may raise any error.
     raise errors.SpecError(
         f'{what} {name!r} with options {messages.quote(dict(options))}:'
-        f' {type(error).__name__}: {error}'
+        f' {messages.exception(error)}'
     ) from error
 
 

@@ -27,6 +27,15 @@ def test_scalars_and_arrays_give_the_same_bits() -> None:
     assert one.tobytes() == expected.tobytes()
 
 
+@pytest.mark.parametrize('value', [1.0, -0.0, np.nan, np.inf, -np.inf])
+def test_finite_values_of_one_world_and_of_many(value) -> None:
+  expected = value in (1.0, 0.0)
+  for kind in (float, np.float64, np.array):
+    assert axes.is_finite(kind(value)) == expected
+  many = axes.is_finite(np.array([0.0, value]))
+  np.testing.assert_array_equal(many, [True, expected])
+
+
 @pytest.mark.parametrize(
     ('condition', 'anywhere', 'everywhere'),
     [
