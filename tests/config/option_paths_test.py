@@ -161,7 +161,8 @@ def test_a_path_is_confined_where_a_file_names_it(
 def test_an_absolute_path_within_the_directory_is_accepted():
   pathlib.Path('sub', 'mine.txt').touch()
   path = os.path.abspath('sub/mine.txt')
-  specs.load(_file(_design(_demonstrated('test_reader', file=path))))
+  design = specs.load(_file(_design(_demonstrated('test_reader', file=path))))
+  assert design.to_mapping()['providers'][0]['options']['file'] == path
 
 
 @pytest.mark.parametrize(
@@ -220,7 +221,8 @@ def test_options_that_are_not_paths_may_contain_any_text():
       _demonstrated('test_reader', model={'label': label}),
       {**_READING, 'label': label, **teacher},
   ):
-    specs.load(_file(_design(provider)))
+    [loaded] = specs.load(_file(_design(provider))).to_mapping()['providers']
+    assert label in json.dumps(loaded)
 
 
 # Overrides.

@@ -100,8 +100,10 @@ def test_every_action_in_the_spec_is_accepted_in_a_batch(
   )  # fmt: skip
   batch.reset()
   found = _actions(batch.action_spec())[-3::-_STRIDE]
+  assert len(found) >= 4
   for first in range(0, len(found) - 3, 4):
-    batch.step(np.stack(found[first : first + 4]))
+    time_step = batch.step(np.stack(found[first : first + 4]))
+    assert (time_step.step_type == 1).all()
 
 
 @pytest.mark.parametrize(

@@ -315,7 +315,9 @@ def test_registers_may_touch():
       {'place': [0.0, 2.0], 'range': [0, 5]},
       {'place': [0.0, 2.2], 'range': [0, 5]},
   )
-  suite.load('collect_apples', 'standard', design=side_by_side).close()
+  assert not _problem(
+      suite.load, 'collect_apples', 'standard', design=side_by_side
+  )
 
 
 # ---- Where the avatar begins -------------------------------------------------
@@ -453,4 +455,10 @@ def test_the_state_is_reset_when_all_is_checked():
 )
 def test_no_value_beyond_the_range_is_tried(low, high):
   register = {'range': [low, high], 'initial': high, 'on_overflow': 'error'}
-  _embed(_room_with(), [0.0, 2.0], **register)
+  env = _embed(_room_with(), [0.0, 2.0], **register)
+  [reading] = [
+      value
+      for name, value in env.reset().observation.items()
+      if name.startswith('registers/')
+  ]
+  assert reading == pytest.approx(high)

@@ -267,5 +267,7 @@ def test_other_solvers_and_designs_without_meters_are_accepted(
 ):
   design = designs.changed(*_APART, *overrides)
   env = suite.embed(_point_task({'solver': solver}), design)
-  env.reset()
+  time_step = env.reset()
+  assert time_step.first()
+  assert [n for n in time_step.observation if n.startswith('registers/')]
   env.close()

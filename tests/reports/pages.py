@@ -15,7 +15,7 @@ from realab_suite.reports import learning_chart
 from realab_suite.reports import map_chart
 from realab_suite.reports import plane_chart
 
-NO_CLIPS = 'nobody wants any'
+NO_CLIPS = 'not requested'
 
 
 def quiet(line):
