@@ -19,6 +19,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import forking
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
+from realab_suite.entities import block_kinds
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
@@ -313,6 +314,7 @@ def embed(
           ' allowed is a function of the physics'
       )
   mechanism = mechanisms.FeedbackMechanism(specs.load(design, overrides))
+  timestep = task.physics_timestep
   mechanism.attach_to(task.root_entity)
   try:
     return _connected(task, mechanism, seed, world, max_steps, measurements)
@@ -320,6 +322,7 @@ def embed(
     # Allows embedding a corrected design in the same task.
     if isinstance(task, base.Task):
       task.avatar.forget(_blocks_of(mechanism))
+      task.physics_timestep = timestep
     mechanism.detach_from_root()
     raise
 
@@ -341,7 +344,12 @@ def _connected(
       }
   )
   if isinstance(task, base.Task):
-    task.avatar.make_graspable(_blocks_of(mechanism))
+    blocks = _blocks_of(mechanism)
+    task.avatar.make_graspable(blocks)
+    task.physics_timestep = min(
+        task.physics_timestep,
+        block_kinds.timestep_for(block.half_size for block in blocks),
+    )
   env = environment.Environment(
       task, mechanism, seed=seed, world=world, max_steps=max_steps
   )

@@ -18,7 +18,8 @@ def compile_world(
 
 
 def step(physics: mjcf.Physics, steps: int = 1) -> None:
-  """Steps a world from the state as it is."""
+  """Steps a world from the state as it is, for `steps` times 10 ms."""
+  steps = max(1, round(0.01 * steps / physics.timestep()))
   if isinstance(physics, single_physics.ThinPhysics):
     physics.advance(steps)
     return
@@ -84,7 +85,7 @@ def shove(
 
 
 def act(avatar: Any, physics: Any, steps: int, **commands: float) -> None:
-  """Lets an avatar act for some steps; `forward=1.0` and so on."""
+  """Lets an avatar act for `steps` times 10 ms; `forward=1.0` and so on."""
   names = avatar.action_spec.name.split('\t')
   action = np.zeros(len(names))
   for name, value in commands.items():

@@ -425,7 +425,6 @@ class BatchEnvironment:
 
   def _observe(self) -> list[Any]:
     """Updates the observation and returns the reads of registers for it."""
-    self._physics.refresh()
     self._observation, reads = self._observer.observe(self._physics)
     return list(reads)
 

@@ -21,8 +21,14 @@ from realab_suite.entities import cameras
 from realab_suite.entities import protocols
 from realab_suite.entities import rays
 
-# Positions, velocities and what derives from them, as in `mj_step1`.
-_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
+# Positions and what derives from them.
+_POSITIONS = int(mujoco.mjtStage.mjSTAGE_POS)
+# What the poses of bodies, geoms and sites do not depend on.
+_NEEDLESS = (
+    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+)
 
 # State field that contains each bound attribute.
 _STATE_FIELDS = {
@@ -79,12 +85,12 @@ class BatchPhysics:
     self._batch = mujoco_batch.Batch(
         self._model.ptr, num_envs, num_threads, persistent=sleep
     )
-    # Casting rays in a batch would change the data that it keeps between steps,
-    # so another batch casts them in a copy of the state. No body sleeps in that
-    # batch, so all geoms are at their present positions.
-    self._ray_batch = mujoco_batch.Batch(
-        template.model.ptr, num_envs, num_threads
-    )
+    # Another batch computes poses and casts rays in a copy of the state. It
+    # ignores contacts and constraints, which would take several times as long,
+    # and no body sleeps in it, so all geoms are at their present positions.
+    still = copy.copy(template.model)
+    still.opt.disableflags |= int(_NEEDLESS)
+    self._poses = mujoco_batch.Batch(still.ptr, num_envs, num_threads)
     self._data = _Userdata(self._batch.bind('userdata'))
     self._bindings: dict[Any, _BatchBinding] = {}
     self._is_dirty = True
@@ -130,9 +136,20 @@ class BatchPhysics:
     self._is_dirty = True
 
   def forward(self) -> None:
-    """Updates the quantities derived from positions and velocities."""
-    self._batch.forward(stage=_STAGE)
+    """Updates the poses of bodies, geoms and sites."""
+    self._poses.state[:] = self._batch.state
+    self._poses.forward(stage=_POSITIONS)
     self._is_dirty = False
+
+  def check(self) -> None:
+    """Checks the positions and velocities that the last substep resulted in.
+
+    MuJoCo resets worlds that have failed; see `has_diverged`.
+    """
+    for values in (self._batch.bind('qpos'), self._batch.bind('qvel')):
+      # False for NaN.
+      if not (np.abs(values) <= mujoco.mjMAXVAL).all():
+        self._batch.forward(stage=_POSITIONS)
 
   def refresh(self) -> None:
     """Calls `forward` if the state has changed since the last call."""
@@ -177,8 +194,8 @@ class BatchPhysics:
       self, origin: np.ndarray, directions: np.ndarray, excluded_body: int
   ) -> tuple[np.ndarray, np.ndarray]:
     """Casts rays in every world; see `entities.rays.cast`."""
-    self._ray_batch.state[:] = self._batch.state
-    distances, geoms = self._ray_batch.ray(
+    self.refresh()
+    distances, geoms = self._poses.ray(
         origin[:, np.newaxis, :], directions, bodyexclude=excluded_body
     )
     return distances, geoms
@@ -245,7 +262,8 @@ class BatchPhysics:
       index = np.asarray(index)
       if np.array_equal(index, np.arange(index[0], index[0] + len(index))):
         index = slice(int(index[0]), int(index[0]) + len(index))
-    return self._batch.bind(field), index
+    batch = self._batch if name in _STATE_FIELDS else self._poses
+    return batch.bind(field), index
 
 
 @rays.cast.register

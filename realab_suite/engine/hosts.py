@@ -52,6 +52,16 @@ class SteppedPhysics(protocols.Physics, Protocol):
   def refresh(self) -> None:
     """Updates the quantities derived from positions and velocities."""
 
+  def check(self) -> None:
+    """Checks the positions and velocities that the last substep resulted in.
+
+    MuJoCo would check them at the beginning of the next one, so a failure would
+    be detected a control step late.
+
+    Raises:
+      PhysicsError: If the physics of a single world has failed.
+    """
+
 
 class Host(abc.ABC):
   """Interface between the control step and a task."""
@@ -214,9 +224,7 @@ class WorldHost(Host):
       self, physics: SteppedPhysics, was_over: Any, is_ending: Any
   ) -> Ending:
     self._hooks.after_step(physics, self._random_state)
-    # MuJoCo checks the result of the last substep when it updates derived
-    # quantities. Without this update, a failure would be detected a step late.
-    physics.refresh()
+    physics.check()
     reward, failure = true_reward(
         lambda: self._per_world(self._task.get_reward(physics), np.float64),
         self._unknown_reward,

@@ -207,7 +207,7 @@ def _reachable_poses(physics: mjcf.Physics, named: _Registers) -> _Paths:
 def _trace(
     physics: mjcf.Physics, named: _Registers, fractions: np.ndarray
 ) -> np.ndarray:
-  """Writes values to all registers and returns the resulting poses of geoms.
+  """Poses all registers for values and returns the resulting poses of geoms.
 
   Args:
     physics: Physics of one world.
@@ -223,7 +223,7 @@ def _trace(
     for register in named.values():
       spec = register.value_spec
       value = spec.minimum + fraction * (spec.maximum - spec.minimum)
-      register.write(physics, np.clip(value, spec.minimum, spec.maximum))
+      register.pose(physics, np.clip(value, spec.minimum, spec.maximum))
     mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
     matrices = physics.data.geom_xmat
     angles = np.arctan2(matrices[:, 3], matrices[:, 0])

@@ -11,6 +11,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import appearance
+from realab_suite.entities import surroundings
 
 _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
@@ -23,6 +24,8 @@ _UNSEEN = {'rgba': (0, 0, 0, 0), 'user': [appearance.code('nothing')]}
 # wall would leave it by the shortest way, which is down.
 _DEPTH = 0.5
 _CAMERA_HEIGHT = 30.0
+# Width of the space around the rooms in which no block may be written, in m.
+_MARGIN = 20.0
 
 
 @final
@@ -99,7 +102,7 @@ class RoomArena(composer.Arena):
     super()._build(name)
     self._places: dict[str, Place] = {}
     root = self._mjcf_root
-    root.option.timestep = 0.01
+    root.option.timestep = 0.02
     root.option.integrator = 'implicitfast'
     # A solver without islands couples bodies that are far apart. The noslip
     # pass, which Composer turns on, has no islands.
@@ -135,6 +138,8 @@ class RoomArena(composer.Arena):
     self._walls: list[mjcf.Element] = []
     self._build_walls()
     self._build_guards()
+    for i, rectangle in enumerate(self._outside()):
+      self._mark_outside(i, rectangle)
     low, high = np.array(self.extent.low), np.array(self.extent.high)
     middle, half = (low + high) / 2, (high - low) / 2 + 0.5
     root.worldbody.add(
@@ -163,6 +168,19 @@ class RoomArena(composer.Arena):
     world.add(
         'geom', name='lid', type='plane', size=(20, 20, 0.1),
         pos=(0, 0, _LID_HEIGHT), zaxis=(0, 0, -1), **_UNSEEN,
+    )  # fmt: skip
+
+  @abc.abstractmethod
+  def _outside(self) -> list[Rectangle]:
+    """Returns rectangles that together cover everything outside the rooms."""
+
+  def _mark_outside(self, number: int, rectangle: Rectangle) -> None:
+    """Marks a rectangle in which no write may put a block."""
+    low, high = np.array(rectangle.low), np.array(rectangle.high)
+    self._mjcf_root.worldbody.add(
+        'site', name=f'{surroundings.OUTSIDE}{number}', type='box', group=4,
+        size=(*(high - low) / 2, _MARGIN), pos=(*(low + high) / 2, 0.0),
+        rgba=(0, 0, 0, 0),
     )  # fmt: skip
 
   @property
@@ -263,6 +281,18 @@ class RoomArena(composer.Arena):
         self._add_wall(f'{prefix}{side}_2', far, end)
 
 
+def _around(room: Rectangle) -> list[Rectangle]:
+  """Returns the rectangles around a room and its walls."""
+  (x0, y0), (x1, y1) = room.low, room.high
+  t, far = _WALL_THICKNESS / 2, _MARGIN
+  return [
+      Rectangle((x0 - far, y0 - far), (x1 + far, y0 - t)),
+      Rectangle((x0 - far, y1 + t), (x1 + far, y1 + far)),
+      Rectangle((x0 - far, y0 - far), (x0 - t, y1 + far)),
+      Rectangle((x1 + t, y0 - far), (x1 + far, y1 + far)),
+  ]
+
+
 def _places_in(room: Rectangle) -> dict[str, Place]:
   """Returns the places of any room: its centre, its sides and its corners."""
   (x0, y0), (x1, y1) = room.low, room.high
@@ -301,6 +331,9 @@ class OpenRoom(RoomArena):
         self._room,
         dict.fromkeys(('south', 'north', 'west', 'east'), True),
     )
+
+  def _outside(self) -> list[Rectangle]:
+    return _around(self._room)
 
   @property
   def room(self) -> Rectangle:
@@ -358,6 +391,18 @@ class TwoRooms(RoomArena):
         self._side_room,
         {'west': True, 'east': True, 'north': True},
     )
+
+  def _outside(self) -> list[Rectangle]:
+    # The space beside the small room is inside the extent of both.
+    (west, _), (east, north) = self.extent.low, self.extent.high
+    (left, _), (right, _) = self._side_room.low, self._side_room.high
+    t = _WALL_THICKNESS / 2
+    south = self._room.high[1] + t
+    return [
+        *_around(self.extent),
+        Rectangle((west - t, south), (left - t, north + t)),
+        Rectangle((right + t, south), (east + t, north + t)),
+    ]
 
   @property
   def room(self) -> Rectangle:

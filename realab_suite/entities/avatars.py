@@ -12,6 +12,7 @@ import numpy as np
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
+from realab_suite.entities import grasps
 from realab_suite.entities import protocols
 from realab_suite.entities import rays
 
@@ -39,8 +40,9 @@ _FORCE = 600.0
 _HAND_DISTANCE = 0.45
 # Largest distance from the hand to the centre of a block to grasp, in m.
 _REACH = 0.4
-# Distance at which the hand loses a held block, in m. A block that is stuck
-# behind the end of a wall stays there when the avatar continues to walk.
+# Distance at which the hand loses a held block, in m, unless a write has moved
+# the block. A block that is stuck behind the end of a wall stays there when the
+# avatar continues to walk.
 _SLIPS = 0.6
 _THROW_SPEED = 5.0
 _THROW_LIFT = 2.0
@@ -53,9 +55,6 @@ _CONTACT: dict[str, Any] = {
     'solref': (0.08, 1.0),
     'friction': (0.0, 0.01, 0.001),
 }
-# A grasped block comes to the hand in about 0.05 s. The hand is weaker than
-# walls: with MuJoCo's default of 0.95 it pulled a block of 1 kg through one.
-_GRASP = {'solref': (0.05, 1.0), 'solimp': (0.7, 0.7, 0.001)}
 
 
 @final
@@ -165,7 +164,8 @@ class Avatar(composer.Entity):
         self._body.add('site', name='rays', pos=(0, 0, _RAY_HEIGHT), group=4),
     )
     self._blocks: list[block_kinds.JointedBlock] = []
-    self._grasps: list[mjcf.Element] = []
+    self._grasps: list[grasps.Grasp] = []
+    self._constraints: tuple[mjcf.Element, ...] = ()
     self._pairs: list[mjcf.Element] = []
 
   def _add_actuators(self, speed: float, turn_rate: float) -> None:
@@ -250,15 +250,11 @@ class Avatar(composer.Entity):
         self._pairs.append(pair)
       if not isinstance(block, block_kinds.JointedBlock):
         continue
-      # Connected by two sites, a held block can turn. A weld would lock the yaw
-      # of an avatar while the block that it holds cannot turn.
-      grasp = root.equality.add(
-          'connect', site1=self._hand, site2=block.site, active='false',
-          **_GRASP
-      )  # fmt: skip
+      grasp = grasps.Grasp(self._hand, block.site, self._hand_position)
       block.grasps.append(grasp)
       self._grasps.append(grasp)
       self._blocks.append(block)
+    self._constraints = grasps.constraints_of(self._grasps)
 
   def forget(self, blocks: Sequence[block_kinds.Block]) -> None:
     """Undoes `make_graspable` for the given blocks."""
@@ -272,6 +268,7 @@ class Avatar(composer.Entity):
       self._blocks.pop(i)
       block.grasps.remove(grasp)
       grasp.remove()
+    self._constraints = grasps.constraints_of(self._grasps)
 
   def place(
       self, physics: protocols.Physics, position: Any, heading: Any
@@ -352,23 +349,22 @@ class Avatar(composer.Entity):
     body[..., 5] = cos
     body[..., 6] = sin
     body[..., 7:8] = physics.bind(self._pitch).qpos
-    body[..., 8] = self._held(physics).any(axis=-1)
+    body[..., 8] = 0.0
+    if self._constraints:
+      active = np.asarray(physics.bind(self._constraints).active)
+      body[..., 8] = active.any(axis=-1)
     return body
-
-  def _held(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns True for each block that the hand holds, `(..., blocks)` bool."""
-    if not self._grasps:
-      return np.zeros((*self.angle(physics).shape, 1), bool)
-    return np.asarray(physics.bind(self._grasps).active).astype(bool)
 
   def _use_hand(
       self, physics: protocols.Physics, grasp: np.ndarray, throw: np.ndarray
   ) -> None:
     """Grasps, releases and throws blocks; `grasp` and `throw` are `(...)`."""
-    held = self._held(physics)
-    is_empty = not np.count_nonzero(held)
+    constraints = physics.bind(self._constraints)
+    active = np.asarray(constraints.active)
+    is_empty = not np.count_nonzero(active)
     if is_empty and not axes.anywhere(grasp >= 0.5):
       return  # The most frequent case: no block to throw or to release.
+    held = grasps.held(active)
     hand = physics.bind(self._hand).xpos
     sites = [block.site for block in self._blocks]
     offsets = physics.bind(sites).xpos - hand[..., np.newaxis, :]
@@ -387,7 +383,10 @@ class Avatar(composer.Entity):
         & nearest
         & is_in_reach
     )
-    held &= distances <= _SLIPS
+    for i, block in enumerate(self._blocks):
+      is_written = block.written_slot.get(physics) > 0
+      held[..., i] &= (distances[..., i] <= _SLIPS) | is_written
+      block.written_slot.set(physics, 0.0)
     throws = (np.asarray(throw) >= 0.5)[..., np.newaxis]
     drops = (np.asarray(grasp) <= -0.5)[..., np.newaxis] | throws
     if (thrown := held & throws).any():
@@ -396,4 +395,24 @@ class Avatar(composer.Entity):
       velocity = np.concatenate([_THROW_SPEED * direction, lift], axis=-1)
       for i, block in enumerate(self._blocks):
         block.launch(physics, velocity, thrown[..., i])
-    physics.bind(self._grasps).active = np.where(drops, False, held | takes)
+    elif (released := held & drops).any():
+      velocity = self._hand_velocity(physics)
+      for i, block in enumerate(self._blocks):
+        block.slow_down(physics, velocity, released[..., i])
+    constraints.active = grasps.active((held | takes) & ~drops, distances)
+
+  def _hand_position(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the position of the hand, `(..., 2)`, from the state alone."""
+    angle = axes.component(physics.bind(self._yaw).qpos, 0)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return physics.bind(self._slides).qpos + _HAND_DISTANCE * direction
+
+  def _hand_velocity(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the velocity of the hand in the world frame, `(..., 3)`."""
+    angle = axes.component(physics.bind(self._yaw).qpos, 0)
+    turning = _HAND_DISTANCE * axes.component(physics.bind(self._yaw).qvel, 0)
+    walking = physics.bind(self._slides).qvel
+    velocity = np.zeros((*walking.shape[:-1], 3))
+    velocity[..., 0] = walking[..., 0] - turning * np.sin(angle)
+    velocity[..., 1] = walking[..., 1] + turning * np.cos(angle)
+    return velocity

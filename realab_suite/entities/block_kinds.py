@@ -7,7 +7,7 @@ register) only by writes.
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, final
 
 from dm_control import composer
@@ -15,13 +15,21 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite.entities import axes
+from realab_suite.entities import grasps
 from realab_suite.entities import moving
 from realab_suite.entities import protocols
+from realab_suite.entities import state
+from realab_suite.entities import surroundings
 
 # Smallest edge length of a block in a design, in m. A thrown block lands at up
 # to 2.8 m/s, which is 28 mm in a substep of 10 ms. The centre of a block with
 # less than twice that edge length would be below the floor after the substep.
 LEAST_SIZE = 0.06
+# Substeps, in s, and the half edge lengths, in m, of blocks for which the long
+# one is reliable. With the long one, blocks of 6 cm were pushed into the floor
+# of a corner, and cubes of more than 0.5 m left other ones at up to 3.3 m/s.
+_SUBSTEP, _SHORT_SUBSTEP = 0.02, 0.01
+_USUAL_SIZES = (0.05, 0.2)
 # Contacts between blocks are soft, so that a block that is written into another
 # one pushes it away slowly: at 1.3 m/s at most, compared with 9.8 m/s at
 # MuJoCo's default stiffness. In contacts with other geoms, the stiffness of the
@@ -60,12 +68,22 @@ def softness(half_size: float) -> float:
   return max(1.0, half_size / _USUAL_HALF_SIZE)
 
 
+def timestep_for(half_sizes: Iterable[float]) -> float:
+  """Returns the duration of a substep of the physics, in s.
+
+  Args:
+    half_sizes: Half the edge length of each block in the world, in m.
+  """
+  low, high = _USUAL_SIZES
+  is_usual = all(low <= half_size <= high for half_size in half_sizes)
+  return _SUBSTEP if is_usual else _SHORT_SUBSTEP
+
+
 class Block(abc.ABC):
   """Base class for the blocks of registers."""
 
   def __init__(self, half_size: float) -> None:
     self._half_size = half_size
-    self._grasps: list[mjcf.Element] = []
 
   @property
   def half_size(self) -> float:
@@ -81,11 +99,6 @@ class Block(abc.ABC):
   @abc.abstractmethod
   def rest_height(self) -> float:
     """Height of the centre of a block that rests on the floor, in m."""
-
-  @property
-  def grasps(self) -> list[mjcf.Element]:
-    """Equality constraints by which hands can hold the block."""
-    return self._grasps
 
   @abc.abstractmethod
   def position(self, physics: protocols.Physics) -> np.ndarray:
@@ -111,14 +124,6 @@ class Block(abc.ABC):
       heading: Angle about the vertical, `(...)`, in rad; `None` for 0.
     """
 
-  def let_go(self, physics: protocols.Physics) -> None:
-    """Releases the block from every hand.
-
-    Otherwise a teleport of the block would pull the hand along.
-    """
-    if self._grasps:
-      physics.bind(self._grasps).active = 0
-
 
 class JointedBlock(Block):
   """Base class for blocks with joints of their own in the register's model.
@@ -130,6 +135,7 @@ class JointedBlock(Block):
 
   # Joints that translate the block, in the order of the axes.
   _slides: tuple[mjcf.Element, ...]
+  _joints: tuple[mjcf.Element, ...]
 
   def __init__(
       self,
@@ -151,6 +157,7 @@ class JointedBlock(Block):
       style: Geom attributes; see `appearance.geom_style`.
     """
     super().__init__(half_size)
+    self._grasps: list[grasps.Grasp] = []
     self._rest = np.array([*position, self.rest_height])
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
     self._geom = self._body.add(
@@ -162,10 +169,19 @@ class JointedBlock(Block):
         pos=[0.0, 0.0, self._grip_offset],
     )  # fmt: skip
 
+    self._surroundings = surroundings.Surroundings(
+        self._body, self._rest, half_size
+    )
+    self._written_slot = state.Slot(mjcf_model, f'{name}_written')
+
   @property
   @abc.abstractmethod
   def _grip_offset(self) -> float:
     """Height of the grip above the centre of the block, in m."""
+
+  @abc.abstractmethod
+  def _orientation(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the orientation as a quaternion, `(..., 4)`."""
 
   @property
   def body(self) -> mjcf.Element:
@@ -180,9 +196,109 @@ class JointedBlock(Block):
     """Site that a hand grasps."""
     return self._site
 
+  @property
+  def grasps(self) -> list[grasps.Grasp]:
+    """Grasps by which hands can hold the block."""
+    return self._grasps
+
+  @property
+  def surroundings(self) -> surroundings.Surroundings:
+    """Frame of the register, and obstacles."""
+    return self._surroundings
+
+  @property
+  def written_slot(self) -> state.Slot:
+    """Slot that is 1 after a write while the block was held.
+
+    A hand does not lose a block that a write has moved away from it.
+    """
+    return self._written_slot
+
   def along(self, physics: protocols.Physics) -> np.ndarray:
     moved = physics.bind(self._slides).qpos
     return self._rest[0] + axes.component(moved, 0)
+
+  def slide(
+      self,
+      physics: protocols.Physics,
+      along: np.ndarray,
+  ) -> np.ndarray:
+    """Sets the x coordinate in the register's frame, and nothing else.
+
+    The block keeps its other coordinates, its orientation and its velocity, and
+    a hand that holds it keeps hold. If the block would be inside an immovable
+    object, it gets the nearest free coordinate.
+
+    Args:
+      physics: One world or a batch of worlds.
+      along: Coordinate, `(...)`, in m.
+
+    Returns:
+      Coordinate that the block got, `(...)`, in m; `along` itself if no block
+      was in the way of an obstacle.
+    """
+    position = self.position(physics)
+    is_far = self._surroundings.are_far(physics, position)
+    position[..., 0] = along
+    if not axes.everywhere(is_far):
+      along = self._free(physics, position, is_far)
+      position[..., 0] = along
+    physics.bind(self._slides[0]).qpos = np.subtract(along, self._rest[0])[
+        ..., np.newaxis
+    ]
+    self._adapt_grasps(physics, position)
+    return along
+
+  @abc.abstractmethod
+  def turn(self, physics: protocols.Physics, heading: np.ndarray) -> None:
+    """Sets the angle about the vertical, and nothing else.
+
+    Args:
+      physics: One world or a batch of worlds.
+      heading: Angle about the vertical, `(...)`, in rad.
+    """
+
+  def _free(
+      self, physics: protocols.Physics, position: np.ndarray, is_far: Any
+  ) -> np.ndarray:
+    """Returns the free x coordinates nearest to those of `position`, `(...)`.
+
+    Args:
+      physics: One world or a batch of worlds.
+      position: Wanted position in the register's frame, `(..., 3)`, in m.
+      is_far: True where no obstacle is near, `(...)` bool.
+    """
+    along = np.array(position[..., 0])
+    orientation = self._orientation(physics)
+    for world in np.argwhere(~np.asarray(is_far)):
+      index = tuple(world)
+      along[index] = self._surroundings.nearest_free(
+          position[index], surroundings.matrix(orientation[index])
+      )
+    return along[()]
+
+  def _adapt_grasps(
+      self, physics: protocols.Physics, position: np.ndarray
+  ) -> None:
+    """Tells the hands that a write has moved the block.
+
+    Args:
+      physics: One world or a batch of worlds.
+      position: Position in the register's frame, `(..., 3)`, in m.
+    """
+    for grasp in self._grasps:
+      if grasp.is_anywhere_held(physics):
+        place = self._surroundings.in_world(physics, position)[..., :2]
+        grasp.adapt(physics, place)
+        self._written_slot.set(physics, 1.0)
+
+  def _let_go(self, physics: protocols.Physics) -> None:
+    """Releases the block from every hand.
+
+    Otherwise a teleport of the block would pull the hand along.
+    """
+    for grasp in self._grasps:
+      grasp.release(physics)
 
   def launch(
       self, physics: protocols.Physics, velocity: np.ndarray, where: Any
@@ -194,21 +310,34 @@ class JointedBlock(Block):
       velocity: Velocity in the world frame, `(..., 3)`, in m/s.
       where: True for each world in which to set it, `(...)` bool.
     """
-    slides = self._slides
-    # The slides are parallel to the axes of the register, not of the world.
-    frame = mjcf.get_attachment_frame(self._body.root)
-    if frame is not None:
-      velocity = np.einsum(
-          '...ji,...j->...i',
-          np.reshape(physics.bind(frame).xmat, (*velocity.shape[:-1], 3, 3)),
-          velocity,
-      )
-    bound = physics.bind(slides)
-    bound.qvel = np.where(
-        np.asarray(where)[..., np.newaxis],
-        velocity[..., : len(slides)],
-        bound.qvel,
+    slides = physics.bind(self._slides)
+    velocity = self._in_frame(physics, velocity)
+    slides.qvel = np.where(
+        np.asarray(where)[..., np.newaxis], velocity, slides.qvel
     )
+
+  def slow_down(
+      self, physics: protocols.Physics, velocity: np.ndarray, where: Any
+  ) -> None:
+    """Sets the velocity of the block in worlds in which it is faster.
+
+    Args:
+      physics: One world or a batch of worlds.
+      velocity: Velocity in the world frame, `(..., 3)`, in m/s.
+      where: True for each world in which to slow down, `(...)` bool.
+    """
+    slides = physics.bind(self._slides)
+    wanted = self._in_frame(physics, velocity)
+    is_faster = (slides.qvel**2).sum(axis=-1) > (wanted**2).sum(axis=-1)
+    is_slowed = np.asarray(where & is_faster)[..., np.newaxis]
+    slides.qvel = np.where(is_slowed, wanted, slides.qvel)
+
+  def _in_frame(
+      self, physics: protocols.Physics, velocity: np.ndarray
+  ) -> np.ndarray:
+    """Returns velocities of the slides, which are parallel to the register."""
+    velocity = self._surroundings.in_frame(physics, velocity)
+    return velocity[..., : len(self._slides)]
 
 
 @final
@@ -241,10 +370,18 @@ class FreeBlock(JointedBlock):
   def heading(self, physics: protocols.Physics) -> np.ndarray:
     return _heading(physics.bind(self._rotation).qpos)
 
+  def _orientation(self, physics: protocols.Physics) -> np.ndarray:
+    return np.asarray(physics.bind(self._rotation).qpos)
+
+  def turn(self, physics: protocols.Physics, heading: np.ndarray) -> None:
+    quaternion = self._orientation(physics)
+    turned = _product(_quaternion(heading - _heading(quaternion)), quaternion)
+    physics.bind(self._rotation).qpos = turned
+
   def put(
       self, physics: protocols.Physics, position: Any, heading: Any = None
   ) -> None:
-    self.let_go(physics)
+    self._let_go(physics)
     physics.bind(self._slides).qpos = np.subtract(position, self._rest)
     physics.bind(self._rotation).qpos = _quaternion(heading)
     physics.bind(self._joints).qvel = 0.0
@@ -292,10 +429,16 @@ class PlanarBlock(JointedBlock):
     angle = axes.component(physics.bind(self._hinge).qpos, 0)
     return np.arctan2(np.sin(angle), np.cos(angle))
 
+  def _orientation(self, physics: protocols.Physics) -> np.ndarray:
+    return _quaternion(self.heading(physics))
+
+  def turn(self, physics: protocols.Physics, heading: np.ndarray) -> None:
+    physics.bind(self._hinge).qpos = np.asarray(heading)[..., np.newaxis]
+
   def put(
       self, physics: protocols.Physics, position: Any, heading: Any = None
   ) -> None:
-    self.let_go(physics)
+    self._let_go(physics)
     position = np.asarray(position)
     physics.bind(self._slides).qpos = position[..., :2] - self._rest[:2]
     physics.bind(self._hinge).qpos = (
@@ -415,9 +558,34 @@ def _rotate(vector: np.ndarray, angle: float) -> np.ndarray:
 
 
 def _heading(quaternion: np.ndarray) -> np.ndarray:
-  """Returns the angles of quaternions, `(..., 4)`, about the vertical."""
-  w, x, y, z = (axes.component(quaternion, i) for i in range(4))
-  return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+  """Returns the angles of quaternions, `(..., 4)`, about the vertical.
+
+  It is the twist about the vertical axis. A rotation about that axis changes it
+  by the angle of the rotation, however the block is tilted.
+  """
+  w, z = axes.component(quaternion, 0), axes.component(quaternion, 3)
+  angle = 2.0 * np.arctan2(z, w)
+  return np.arctan2(np.sin(angle), np.cos(angle))
+
+
+def _product(turn: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+  """Returns quaternions, `(..., 4)`, turned about the vertical.
+
+  Args:
+    turn: Quaternions of rotations about the vertical, `(..., 4)`.
+    quaternion: Quaternions to turn, `(..., 4)`.
+  """
+  cos, sin = turn[..., 0], turn[..., 3]
+  w, x, y, z = (quaternion[..., i] for i in range(4))
+  return np.stack(
+      [
+          cos * w - sin * z,
+          cos * x - sin * y,
+          cos * y + sin * x,
+          cos * z + sin * w,
+      ],
+      axis=-1,
+  )
 
 
 def _quaternion(angle: Any) -> np.ndarray:

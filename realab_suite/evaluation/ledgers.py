@@ -173,7 +173,7 @@ def _columns(entries: list[registers.Record]) -> tuple[np.ndarray, ...]:
       np.array([entry[1] for entry in entries]),
       np.array([entry.step for entry in entries]),
       # A write has one number less than a read; pad it.
-      np.array([(*entry[3:], 0.0)[:3] for entry in entries]),
+      np.array([(*entry[3:], 0.0)[:4] for entry in entries]),
   )
 
 
@@ -182,7 +182,7 @@ def _entries(
 ) -> list[registers.Record]:
   """Returns the entries of columns; the inverse of `_columns`."""
   return [
-      registers.Write(register, party, step, *numbers[:2])
+      registers.Write(register, party, step, *numbers[:3])
       if is_write
       else registers.Read(register, party, step, *numbers)
       for is_write, party, step, numbers in zip(

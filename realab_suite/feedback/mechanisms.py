@@ -161,7 +161,14 @@ class FeedbackMechanism(composer.Entity):
       applied = register.applied(physics)
       step = np.zeros(np.shape(applied), int)[()]
       writes.append(
-          records.Write(name, records.INITIAL, step, applied, applied)
+          records.Write(
+              name,
+              records.INITIAL,
+              step,
+              applied,
+              applied,
+              register.obstruction(physics),
+          )
       )
     return writes
 
@@ -188,7 +195,14 @@ class FeedbackMechanism(composer.Entity):
       requested = axes.component(values, i)
       applied = register.write(physics, requested)
       writes.append(
-          records.Write(register.name, records.AGENT, step, requested, applied)
+          records.Write(
+              register.name,
+              records.AGENT,
+              step,
+              requested,
+              applied,
+              register.obstruction(physics),
+          )
       )
     return writes
 
@@ -223,7 +237,10 @@ class FeedbackMechanism(composer.Entity):
             ' store the measured value',
             error.world,
         ) from error
-      writes.append(records.Write(name, writer, step, measured, applied))
+      obstruction = meter.register.obstruction(physics)
+      writes.append(
+          records.Write(name, writer, step, measured, applied, obstruction)
+      )
     return writes
 
   def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
@@ -315,7 +332,10 @@ class FeedbackMechanism(composer.Entity):
           raise errors.RegisterValueError(
               f'{_where(writer, step, error.world)}: {error}', error.world
           ) from error
-        log.append(records.Write(name, writer, step, value, applied))
+        obstruction = register.obstruction(physics)
+        log.append(
+            records.Write(name, writer, step, value, applied, obstruction)
+        )
       next_states.append(next_state)
     return log, next_states
 
@@ -401,6 +421,7 @@ def _make_register(
       channel=design.channel_of(name),
       dof=spec.dof or design.dof,
       on_overflow=spec.on_overflow,
+      write=spec.write,
       block_size=spec.block_size,
       mass=spec.mass,
   )

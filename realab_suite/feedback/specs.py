@@ -79,6 +79,8 @@ class RegisterSpec(validation.Spec):
     initial: Value at the start of an episode.
     on_overflow: `saturate` to saturate a value out of range, `error` to refuse
       it.
+    write: `axis` for writes that set only the coordinate that carries the
+      value, `pose` for writes that restore the whole pose of the block.
     channel: Channel of the register; `None` for `embedded`. A welded or secure
       design overrides it.
     dof: Degrees of freedom of the blocks; `None` for those of the design.
@@ -95,6 +97,7 @@ class RegisterSpec(validation.Spec):
   scale: Annotated[float, pydantic.Field(ge=1e-6, le=10)] = 0.1
   initial: Value = 0.0
   on_overflow: Literal['saturate', 'error'] = 'saturate'
+  write: Literal['axis', 'pose'] = 'axis'
   channel: Channel | None = None
   dof: Dof | None = None
   block_size: Size = 0.2

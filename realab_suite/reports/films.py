@@ -91,7 +91,7 @@ class Film:
 
   def add(self, physics: protocols.Physics, track: tracking.Track) -> None:
     """Adds a frame; `tracking.Tracker` calls this."""
-    del physics  # The cameras refer to it.
+    physics.refresh()  # The cameras read its data, which may be out of date.
     picture = np.concatenate([c.render() for c in self._cameras], axis=1)
     strip = draw_strip(self._title, track, picture.shape[1])
     self._file.write_frame(np.concatenate([picture, strip], axis=0))

@@ -8,6 +8,7 @@ from campaigns import bulldozers_campaign
 from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
 from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from tests import worlds
@@ -175,8 +176,9 @@ def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
     for guard in worlds.guards(arena):
       guard.remove()
   register.attach_to(arena, (0.0, 0.0))
-  physics = worlds.compile_world(arena)
   (block,) = register.blocks
+  arena.mjcf_model.option.timestep = block_kinds.timestep_for([block.half_size])
+  physics = worlds.compile_world(arena)
   starts = [(0.0, 0.0), (2.5, -2.5)]
   if 'side_room' in arena.places:
     starts.append(arena.places['side_room'].position)

@@ -192,6 +192,7 @@ def test_only_free_blocks_leave_the_floor():
   for dof in registers.DOFS:
     world = avatar_worlds.make(dof=dof)
     world.grasp()
+    world.act(50)
     heights[dof] = world.block[2]
   assert heights['free'] == pytest.approx(avatar_worlds.GRIP_HEIGHT, abs=0.01)
   assert heights['planar'] < 0.11

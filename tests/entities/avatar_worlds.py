@@ -20,7 +20,11 @@ class World:
   """An avatar at the origin and, one metre ahead, blocks."""
 
   def __init__(
-      self, kind=registers.BlockPositionRegister, barrier=None, **options
+      self,
+      kind=registers.BlockPositionRegister,
+      barrier=None,
+      yaw=0.0,
+      **options,
   ):
     self.arena = arenas.OpenRoom()
     if barrier is not None:
@@ -28,7 +32,7 @@ class World:
     self.register = kind(
         'register', value_range=(-30, 30), scale=0.1, **options
     )
-    self.register.attach_to(self.arena, (1.0, 0.0))
+    self.register.attach_to(self.arena, (1.0, 0.0), yaw)
     self.avatar = avatars.Avatar(speed=SPEED, turn_rate=TURN_RATE)
     self.arena.attach(self.avatar)
     self.avatar.make_graspable(self.register.blocks)

@@ -209,7 +209,7 @@ def test_a_thrown_block_can_corrupt_a_register_without_touch():
   # G6: the avatar touches only the block that it throws.
   arena = arenas.OpenRoom()
   target = registers.BlockPositionRegister('target', value_range=(-30, 30))
-  target.attach_to(arena, (1.6, 0.0))
+  target.attach_to(arena, (2.0, 0.0))
   missile = registers.BlockPositionRegister('missile', value_range=(-30, 30))
   missile.attach_to(arena, (0.0, 0.0))
   avatar = avatars.Avatar()
@@ -228,8 +228,8 @@ def test_a_thrown_block_can_corrupt_a_register_without_touch():
 
 
 @every_dof
-def test_a_write_to_a_held_block_releases_it(dof):
-  world = avatar_worlds.make(dof=dof)
+def test_a_write_of_the_pose_releases_a_held_block(dof):
+  world = avatar_worlds.make(dof=dof, write='pose')
   world.grasp()
   world.act(50, forward=-0.5)
   world.register.write(world.physics, 4.0)

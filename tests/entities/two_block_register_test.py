@@ -14,10 +14,15 @@ _ROUNDING = 1e-12
 class _World:
   """A two-block register, and hands that move its blocks as they please."""
 
-  def __init__(self, channel='embedded', dof='free', yaw=0.0):
+  def __init__(self, channel='embedded', dof='free', yaw=0.0, write='axis'):
     arena = arenas.OpenRoom()
     self.register = registers.TwoBlockRegister(
-        'reward', value_range=(-10, 10), scale=_SCALE, channel=channel, dof=dof
+        'reward',
+        value_range=(-10, 10),
+        scale=_SCALE,
+        channel=channel,
+        dof=dof,
+        write=write,
     )
     self.register.attach_to(arena, (0.3, -0.4), yaw)
     self.physics = worlds.compile_world(arena)
@@ -176,8 +181,8 @@ def test_the_yaw_is_the_axis_of_the_value(channel, yaw):
 
 
 @pytest.mark.parametrize('dof', registers.DOFS)
-def test_a_write_restores_the_whole_pose(dof):
-  world = _World(dof=dof)
+def test_a_write_of_the_pose_restores_all_of_it(dof):
+  world = _World(dof=dof, write='pose')
   world.write(1.0)
   place = np.array(world.offset.position(world.physics))
   worlds.shove(world.physics, world.offset, (60, 50, 40), (3, 2, 1), steps=30)

@@ -4,6 +4,7 @@ from realab_suite.entities.registers.base import CHANNELS
 from realab_suite.entities.registers.base import DOFS
 from realab_suite.entities.registers.base import OVERFLOWS
 from realab_suite.entities.registers.base import Register
+from realab_suite.entities.registers.base import WRITES
 from realab_suite.entities.registers.block_orientation import (
     BlockOrientationRegister,
 )
@@ -24,6 +25,7 @@ __all__ = [
     'EVALUATOR',
     'INITIAL',
     'OVERFLOWS',
+    'WRITES',
     'BlockOrientationRegister',
     'BlockPositionRegister',
     'Read',

@@ -29,6 +29,9 @@ from realab_suite.entities.registers import records
 CHANNELS = ('embedded', 'welded', 'secure')
 DOFS = ('free', 'planar')
 OVERFLOWS = ('saturate', 'error')
+# axis: a write sets only the coordinate that carries the value.
+# pose: a write restores the whole pose of the written blocks.
+WRITES = ('axis', 'pose')
 
 
 @final
@@ -48,9 +51,10 @@ class Register(composer.Entity):
   as well as in the environments of this package.
 
   A subclass builds its blocks in `_build_blocks`, moves them to represent a
-  value in `_put` and computes the represented value in `_read_blocks`. If a
-  write does not restore the poses of all blocks, the subclass returns the
-  resulting permanent corruption in `_permanent`.
+  value in `_put` and `_shift`, and computes the represented value in
+  `_read_blocks`. If a write does not restore the coordinates that carry the
+  value of all blocks, the subclass returns the resulting permanent corruption
+  in `_permanent`.
   """
 
   def _build(
@@ -64,6 +68,7 @@ class Register(composer.Entity):
       channel: str = 'embedded',
       dof: str = 'free',
       on_overflow: str = 'saturate',
+      write: str = 'axis',
       block_size: float = 0.2,
       mass: float = 1.0,
   ) -> None:
@@ -80,13 +85,27 @@ class Register(composer.Entity):
       dof: One of `DOFS`: degrees of freedom of blocks that can be pushed.
       on_overflow: One of `OVERFLOWS`: `saturate` to saturate a value out of
         range, `error` to refuse it.
+      write: One of `WRITES`. `axis` for writes that set only the coordinate that
+        carries the value, so that an agent can carry or throw a block that is
+        written in each step; `pose` for writes that restore the whole pose,
+        upright and at rest, and release the block from every hand.
       block_size: Edge length of each block, in m.
       mass: Mass of each block, in kg.
 
     Raises:
       SpecError: If an argument has a value that is not allowed.
     """
-    _check(name, value_range, scale, initial, role, channel, dof, on_overflow)
+    _check(
+        name,
+        value_range,
+        scale,
+        initial,
+        role,
+        channel,
+        dof,
+        on_overflow,
+        write,
+    )
     # Not the name of the model, which changes if the register is attached to a
     # model that has another one of that name.
     self._name = name
@@ -97,12 +116,14 @@ class Register(composer.Entity):
     self._channel = channel
     self._dof = dof
     self._on_overflow = on_overflow
+    self._write = write
     self._block_size = block_size
     self._mass = mass
     self._spread = np.zeros(2)
     self._mjcf_root = mjcf.RootElement(model=name)
     self._applied_slot = state.Slot(self._mjcf_root, 'applied')
     self._stored_slot = state.Slot(self._mjcf_root, 'stored')
+    self._obstruction_slot = state.Slot(self._mjcf_root, 'obstruction')
     self._origin_slot = state.Slot(self._mjcf_root, 'origin', 3)
     self._blocks = self._build_blocks()
 
@@ -118,7 +139,26 @@ class Register(composer.Entity):
 
   @abc.abstractmethod
   def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
-    """Moves the blocks so that they represent `value`, `(...)`."""
+    """Moves the blocks to the undisturbed poses that represent `value`, `(...)`.
+
+    Episodes begin with these poses.
+    """
+
+  def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
+    """Changes only the coordinates that carry the value, as a write does.
+
+    Without this method, each write restores the poses of the blocks.
+
+    Args:
+      physics: One world or a batch of worlds.
+      value: Value to represent, `(...)`.
+
+    Returns:
+      Value that the blocks got, `(...)`: `value`, unless something immovable is
+      in the way.
+    """
+    self._put(physics, value)
+    return value
 
   @abc.abstractmethod
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
@@ -200,9 +240,12 @@ class Register(composer.Entity):
     frame.pos = [*position, 0.0]
     if yaw:
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+    reach = np.array([self._low, self._high]) * self._scale
     for block in self._blocks:
       if isinstance(block, block_kinds.MocapBlock):
         block.attach_to(root, position, yaw)
+      else:
+        block.surroundings.limit(reach[0] - spread[0], reach[1] + spread[0])
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
@@ -226,7 +269,7 @@ class Register(composer.Entity):
   def settle(
       self, physics: protocols.Physics, displacement: np.ndarray
   ) -> None:
-    """Sets the origin that writes are relative to, and writes `initial`.
+    """Sets the origin that writes are relative to, and applies `initial`.
 
     Args:
       physics: One world or a batch of worlds.
@@ -239,15 +282,31 @@ class Register(composer.Entity):
       origin[..., :2] += displacement
       first.put(physics, origin)
     self._origin_slot.set(physics, origin)
-    self.write(physics, np.full(origin.shape[:-1], self._initial))
+    self.pose(physics, np.full(origin.shape[:-1], self._initial))
+
+  def pose(self, physics: protocols.Physics, value: Any) -> None:
+    """Moves the blocks to the undisturbed poses that represent a value.
+
+    Unlike `write`, this restores the whole pose of the blocks, and obstacles
+    have no influence.
+
+    Args:
+      physics: One world or a batch of worlds.
+      value: Value within the range, `(...)`, in the register's units.
+    """
+    value = np.asarray(value, np.float64)[()]
+    self._put(physics, value)
+    self._store(physics, value, 0.0)
 
   def write(self, physics: protocols.Physics, value: Any) -> np.ndarray:
     """Moves the blocks so that they represent a value.
 
-    A write teleports the written blocks, upright and at rest, and releases them
-    from every hand. It restores their whole pose, not only the coordinate that
-    carries the value. Otherwise a block that was carried beside a wall would be
-    written into the wall.
+    A write changes the coordinate along the register's axis (the angle about
+    the vertical for an orientation) and nothing else: other coordinates,
+    velocities and the grip of a hand stay as they are. If a block would be
+    inside an immovable object, it gets the nearest free coordinate; see
+    `obstruction`. If the register was built with `write='pose'`, a write
+    restores the whole pose instead, at rest, and releases the block.
 
     Args:
       physics: One world or a batch of worlds.
@@ -264,11 +323,24 @@ class Register(composer.Entity):
     value = np.asarray(value, np.float64)[()]
     fits = (value >= self._low) & (value <= self._high)  # False for NaN.
     applied = value if axes.everywhere(fits) else self._saturate(value, fits)
-    self._put(physics, applied)
+    # Nothing can move a welded block away from its axis.
+    if self._write == 'pose' or self._channel == 'welded':
+      self._put(physics, applied)
+      placed = applied
+    else:
+      placed = self._shift(physics, applied)
+    is_placed = placed is applied or self._channel == 'secure'
+    self._store(physics, applied, 0.0 if is_placed else placed - applied)
+    return applied
+
+  def _store(
+      self, physics: protocols.Physics, applied: np.ndarray, obstruction: Any
+  ) -> None:
+    """Stores the result of a write."""
     self._applied_slot.set(physics, applied)
+    self._obstruction_slot.set(physics, obstruction)
     if self._channel == 'secure':
       self._stored_slot.set(physics, applied)
-    return applied
 
   def _saturate(self, value: np.ndarray, fits: np.ndarray) -> np.ndarray:
     """Returns the values, saturated to the range of the register.
@@ -313,6 +385,18 @@ class Register(composer.Entity):
     """
     return self._applied_slot.copy(physics)
 
+  def obstruction(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the obstruction of the last write, `(...)`.
+
+    It is the value that the blocks got minus the applied value. It differs from
+    0 if something immovable was in the way of a block, for instance because an
+    agent has carried the block beside a wall.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
+    return self._obstruction_slot.copy(physics)
+
   def keep(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the value to write so that the register keeps its value, `(...)`.
 
@@ -344,12 +428,39 @@ class Register(composer.Entity):
       permanent = np.zeros_like(reading)
     else:
       permanent = self._permanent(physics)
-    temporary = reading - self._applied_slot.get(physics) - permanent
-    return records.Read(self._name, reader, step, reading, permanent, temporary)
+    obstruction = self.obstruction(physics)
+    temporary = (
+        reading - self._applied_slot.get(physics) - obstruction - permanent
+    )
+    return records.Read(
+        self._name, reader, step, reading, obstruction, permanent, temporary
+    )
 
   def _origin(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the start position of the first block, `(..., 3)`, in m."""
     return self._origin_slot.get(physics)
+
+  def _slide(
+      self,
+      physics: protocols.Physics,
+      block: block_kinds.Block,
+      start: np.ndarray,
+      value: np.ndarray,
+  ) -> np.ndarray:
+    """Sets the coordinate of a block along the axis, for `_shift`.
+
+    Args:
+      physics: One world or a batch of worlds.
+      block: Block with joints.
+      start: Coordinate that represents 0, `(...)`, in m.
+      value: Value to represent, `(...)`.
+
+    Returns:
+      Value that the block got, `(...)`.
+    """
+    along = start + value * self._scale
+    placed = block.slide(physics, along)
+    return value if placed is along else (placed - start) / self._scale
 
   def _add_block(
       self, name: str, class_name: str, position: Sequence[float]
@@ -387,6 +498,7 @@ def _check(
     channel: str,
     dof: str,
     on_overflow: str,
+    write: str,
 ) -> None:
   """Checks the arguments of `Register`.
 
@@ -398,6 +510,7 @@ def _check(
       ('channel', channel, CHANNELS),
       ('dof', dof, DOFS),
       ('on_overflow', on_overflow, OVERFLOWS),
+      ('write', write, WRITES),
   )
   for argument, value, choices in allowed:
     if value not in choices:

@@ -39,5 +39,9 @@ class BlockOrientationRegister(base.Register):
     position[..., 2] = self._block.rest_height
     self._block.put(physics, position, heading=value * self._scale)
 
+  def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
+    self._block.turn(physics, value * self._scale)
+    return value
+
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale

@@ -29,6 +29,10 @@ class BlockPositionRegister(base.Register):
     position[..., 2] = self._block.rest_height
     self._block.put(physics, position)
 
+  def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
+    start = axes.component(self._origin(physics), 0)
+    return self._slide(physics, self._block, start, value)
+
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     started = axes.component(self._origin(physics), 0)
     return (self._block.along(physics) - started) / self._scale

@@ -23,6 +23,8 @@ class Write(NamedTuple):
     step: Control step of the write, `(...)`, int; the reset is step 0.
     requested: Requested value.
     applied: Applied value: `requested`, saturated to the range of the register.
+    obstruction: Value that the blocks got, minus `applied`: not 0 if something
+      immovable was in the way of a block.
   """
 
   register: str
@@ -30,19 +32,22 @@ class Write(NamedTuple):
   step: Any
   requested: Any
   applied: Any
+  obstruction: Any
 
 
 @final
 class Read(NamedTuple):
   """A value read from a register, with the parts of its corruption.
 
-  The reading minus the last applied value is `permanent + temporary`.
+  The reading minus the last applied value is the corruption, `obstruction +
+  permanent + temporary`.
 
   Attributes:
     register: Name of the register.
     reader: `AGENT`, `EVALUATOR` or a provider.
     step: Control step of the read, `(...)`, int; the reset is step 0.
     reading: Value that was read.
+    obstruction: Part of the corruption that the last write had.
     permanent: Part of the corruption that the next write does not repair.
     temporary: Part of the corruption that the next write repairs.
   """
@@ -51,6 +56,7 @@ class Read(NamedTuple):
   reader: str
   step: Any
   reading: Any
+  obstruction: Any
   permanent: Any
   temporary: Any
 

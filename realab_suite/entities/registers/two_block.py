@@ -46,6 +46,10 @@ class TwoBlockRegister(base.Register):
     position[..., 2] = self._offset.rest_height
     self._offset.put(physics, position)
 
+  def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
+    start = axes.component(self._origin(physics), 0)
+    return self._slide(physics, self._offset, start, value)
+
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     distance = self._offset.along(physics) - self._base.along(physics)
     return distance / self._scale

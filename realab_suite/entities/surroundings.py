@@ -1,0 +1,294 @@
+"""Surroundings of blocks: the immovable objects that writes must avoid.
+
+An agent can carry a block beside a wall. A write that changes only one
+coordinate could then put the block into the wall, or beyond it. Instead, the
+block is put at the nearest free coordinate.
+"""
+
+from typing import Any, Self, final
+
+from dm_control import mjcf
+import mujoco
+import numpy as np
+
+from realab_suite.entities import axes
+from realab_suite.entities import protocols
+
+# Prefix of the names of box sites in which no block may be written: the space
+# outside of rooms.
+OUTSIDE = 'outside.'
+# A block is in an obstacle if this fraction of its half edge length is inside.
+# Contacts push blocks out that are less deep inside, which is no obstruction:
+# blocks that were pushed against a wall are slightly inside.
+_TOLERANCE = 0.5
+# Beyond all worlds, in m.
+_FAR = 1e6
+_PARALLEL = 1e-9
+# Distance to an obstacle at which blocks are put, in m.
+_GAP = 1e-6
+# MuJoCo computes no bounding boxes of planes. Height fields are the ground.
+_IGNORED_TYPES = (
+    mujoco.mjtGeom.mjGEOM_PLANE,
+    mujoco.mjtGeom.mjGEOM_HFIELD,
+    mujoco.mjtGeom.mjGEOM_SDF,
+)
+
+
+@final
+class Boxes:
+  """Oriented bounding boxes of obstacles, in the frame of a register.
+
+  Attributes:
+    centres: `(boxes, 3)`, in m.
+    rotations: Axes of the boxes, as columns, `(boxes, 3, 3)`.
+    halves: Half edge lengths, `(boxes, 3)`, in m.
+    low: Smallest coordinates of each box, `(boxes, 3)`, in m.
+    high: Largest coordinates of each box, `(boxes, 3)`, in m.
+  """
+
+  def __init__(
+      self, centres: np.ndarray, rotations: np.ndarray, halves: np.ndarray
+  ) -> None:
+    self.centres = centres
+    self.rotations = rotations
+    self.halves = halves
+    extent = np.einsum('bij,bj->bi', np.abs(rotations), halves)
+    self.low = centres - extent
+    self.high = centres + extent
+
+  @classmethod
+  def none(cls) -> Self:
+    """Returns no boxes."""
+    return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+
+  def taken(
+      self, position: np.ndarray, rotation: np.ndarray, half_size: float
+  ) -> np.ndarray:
+    """Returns the x coordinates that a cube cannot have, one interval per box.
+
+    Args:
+      position: Centre of the cube, `(3,)`, in m; its x coordinate is ignored.
+      rotation: Axes of the cube, as columns, `(3, 3)`.
+      half_size: Half the edge length of the cube, in m.
+
+    Returns:
+      `(boxes, 2)`; from is not less than to if the cube is beside the box.
+    """
+    number = len(self.centres)
+    cube = np.broadcast_to(rotation, (number, 3, 3))
+    crosses = np.cross(
+        self.rotations.transpose(0, 2, 1)[:, :, np.newaxis],
+        cube.transpose(0, 2, 1)[:, np.newaxis],
+    ).reshape(number, 9, 3)
+    # Two boxes are apart if their shadows on one of these axes are.
+    separators = np.concatenate(
+        [self.rotations.transpose(0, 2, 1), cube.transpose(0, 2, 1), crosses],
+        axis=1,
+    )
+    reach = half_size * np.abs(separators @ rotation).sum(axis=-1)
+    reach += np.einsum(
+        'bsj,bj->bs', np.abs(separators @ self.rotations), self.halves
+    )
+    offset = self.centres.copy()
+    offset[:, 1:] -= position[1:]
+    middle = np.einsum('bsi,bi->bs', separators, offset)
+    slope = separators[..., 0]
+    is_flat = np.abs(slope) < _PARALLEL
+    steep = np.where(is_flat, 1.0, slope)
+    ends = np.stack([(middle - reach) / steep, (middle + reach) / steep], -1)
+    ends.sort(axis=-1)
+    ends[is_flat] = -_FAR, _FAR
+    # Parallel edges have no cross product, which separates nothing.
+    is_apart = is_flat & (np.abs(middle) >= reach) & (reach > _PARALLEL)
+    ends[is_apart] = _FAR, -_FAR
+    return np.stack(
+        [ends[..., 0].max(axis=1), ends[..., 1].min(axis=1)], axis=-1
+    )
+
+
+@final
+class Surroundings:
+  """Frame and obstacles of a block, as found in the compiled model."""
+
+  def __init__(
+      self, body: mjcf.Element, rest: np.ndarray, half_size: float
+  ) -> None:
+    """Initializes the surroundings of a block.
+
+    Args:
+      body: Body of the block, a child of the frame of its register.
+      rest: Position of the block at rest in that frame, `(3,)`, in m.
+      half_size: Half the edge length of the block, in m.
+    """
+    self._body = body
+    self._rest = rest
+    self._half_size = half_size * (1.0 - _TOLERANCE)
+    self._radius = np.sqrt(3.0) * self._half_size
+    self._model: Any = None
+    self._boxes = Boxes.none()
+    self._corridor = np.zeros((2, 2))
+    self._origin = np.zeros(3)
+    self._rotation = np.eye(3)
+    self._reach = -_FAR, _FAR
+
+  def limit(self, low: float, high: float) -> None:
+    """Sets the smallest and largest x coordinate that are written, in m."""
+    self._reach = low, high
+    self._model = None
+
+  def are_far(self, physics: protocols.Physics, position: Any) -> Any:
+    """Returns True if no obstacle is near, whatever value is written.
+
+    This test is fast, and true for most blocks that nobody has moved.
+
+    Args:
+      physics: One world or a batch of worlds.
+      position: Position in the frame of the register, `(..., 3)`, in m.
+
+    Returns:
+      `(...)` bool.
+    """
+    if physics.model is not self._model:
+      self._resolve(physics)
+    (right, floor), (left, ceiling) = self._corridor
+    y, z = axes.component(position, 1), axes.component(position, 2)
+    return (right < y) & (y < left) & (floor < z) & (z < ceiling)
+
+  def nearest_free(self, position: np.ndarray, rotation: np.ndarray) -> float:
+    """Returns the free x coordinate that is nearest to a wanted one, in m.
+
+    Call `are_far` first, which finds the obstacles of a new model.
+
+    Args:
+      position: Wanted position of a block in one world, `(3,)`, in m.
+      rotation: Axes of the block, as columns, `(3, 3)`.
+    """
+    along = float(position[0])
+    low, high = self._boxes.low - self._radius, self._boxes.high + self._radius
+    beside = (low[:, 1:] < position[1:]) & (position[1:] < high[:, 1:])
+    is_near = beside.all(axis=1)
+    if not (is_near & (low[:, 0] < along) & (along < high[:, 0])).any():
+      return along
+    taken = self._boxes.taken(position, rotation, self._half_size)[is_near]
+    if not _is_taken(along, taken):
+      return along
+    ends = [*(taken[:, 0] - _GAP), *(taken[:, 1] + _GAP)]
+    free = [end for end in ends if not _is_taken(end, taken)]
+    return float(min(free, key=lambda end: abs(end - along), default=along))
+
+  def in_world(
+      self, physics: protocols.Physics, position: np.ndarray
+  ) -> np.ndarray:
+    """Returns a position in the frame of the world, `(..., 3)`, in m.
+
+    If the frame of the register can move, the result is far from everything.
+
+    Args:
+      physics: One world or a batch of worlds.
+      position: Position in the frame of the register, `(..., 3)`, in m.
+    """
+    if physics.model is not self._model:
+      self._resolve(physics)
+    return self._origin + position @ self._rotation.T
+
+  def in_frame(
+      self, physics: protocols.Physics, vector: np.ndarray
+  ) -> np.ndarray:
+    """Returns a vector of the world in the frame of the register, `(..., 3)`.
+
+    Args:
+      physics: One world or a batch of worlds.
+      vector: Vector, `(..., 3)`.
+    """
+    if physics.model is not self._model:
+      self._resolve(physics)
+    return vector @ self._rotation
+
+  def _resolve(self, physics: protocols.Physics) -> None:
+    """Finds frame and obstacles in a compiled model, and caches them."""
+    model = physics.model
+    body = int(physics.bind(self._body).element_id)
+    frame = int(model.body_parentid[body])
+    self._boxes = boxes_of(model, frame)
+    self._origin, self._rotation = _pose_of(model, frame)
+    if model.body_weldid[frame] != 0:
+      self._origin = np.full(3, _FAR)
+    low, high = self._boxes.low - self._radius, self._boxes.high + self._radius
+    # The corridor has to be free only where blocks are written.
+    is_ahead = (low[:, 0] < self._reach[1]) & (high[:, 0] > self._reach[0])
+    low, high = low[is_ahead, 1:], high[is_ahead, 1:]
+    self._corridor = np.array([[-np.inf] * 2, [np.inf] * 2])
+    for box_low, box_high in zip(low, high, strict=True):
+      # The placement check grants that each box is on some side of the block.
+      gaps = np.stack([self._rest[1:] - box_high, box_low - self._rest[1:]])
+      side, axis = np.unravel_index(gaps.argmax(), gaps.shape)
+      if side == 0:
+        bound = max(self._corridor[0, axis], box_high[axis])
+      else:
+        bound = min(self._corridor[1, axis], box_low[axis])
+      self._corridor[side, axis] = bound
+    self._model = model
+
+
+def _is_taken(along: float, taken: np.ndarray) -> bool:
+  return bool(((taken[:, 0] < along) & (along < taken[:, 1])).any())
+
+
+def boxes_of(model: Any, frame: int) -> Boxes:
+  """Returns the boxes of immovable, solid geoms in the frame of a body.
+
+  Args:
+    model: Compiled model, as `physics.model`.
+    frame: Index of the body. If it can move, the result is empty.
+  """
+  if model.body_weldid[frame] != 0:
+    return Boxes.none()
+  is_static = model.body_weldid == 0  # Of a mocap body, its own index.
+  solid = (model.geom_contype | model.geom_conaffinity) != 0
+  solid &= is_static[model.geom_bodyid]
+  solid &= ~np.isin(model.geom_type, _IGNORED_TYPES)
+  geoms = np.flatnonzero(solid)
+  sites = [
+      site
+      for site in range(model.nsite)
+      if model.id2name(site, 'site').startswith(OUTSIDE)
+  ]
+  bodies = [*model.geom_bodyid[geoms], *model.site_bodyid[sites]]
+  boxes = model.geom_aabb[geoms]
+  positions = np.concatenate([model.geom_pos[geoms], model.site_pos[sites]])
+  quaternions = np.concatenate([model.geom_quat[geoms], model.site_quat[sites]])
+  middles = np.concatenate([boxes[:, :3], np.zeros((len(sites), 3))])
+  halves = np.concatenate([boxes[:, 3:], model.site_size[sites]])
+  origin, turned = _pose_of(model, frame)
+  centres, rotations = [], []
+  for body, position, quaternion, middle in zip(
+      bodies, positions, quaternions, middles, strict=True
+  ):
+    place, rotation = _pose_of(model, body)
+    axes_of_box = rotation @ matrix(quaternion)
+    centre = place + rotation @ position + axes_of_box @ middle
+    centres.append(turned.T @ (centre - origin))
+    rotations.append(turned.T @ axes_of_box)
+  return Boxes(
+      np.reshape(centres, (-1, 3)),
+      np.reshape(rotations, (-1, 3, 3)),
+      np.reshape(halves, (-1, 3)),
+  )
+
+
+def _pose_of(model: Any, body: int) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the position and the rotation of an immovable body."""
+  position, rotation = np.zeros(3), np.eye(3)
+  while body:
+    turn = matrix(model.body_quat[body])
+    position = model.body_pos[body] + turn @ position
+    rotation = turn @ rotation
+    body = int(model.body_parentid[body])
+  return position, rotation
+
+
+def matrix(quaternion: np.ndarray) -> np.ndarray:
+  """Returns the rotation matrix, `(3, 3)`, of a quaternion, `(4,)`."""
+  result = np.empty(9)
+  mujoco.mju_quat2Mat(result, np.asarray(quaternion, np.float64))
+  return result.reshape(3, 3)
