@@ -383,19 +383,20 @@ class Avatar(composer.Entity):
         & nearest
         & is_in_reach
     )
+    throws = (np.asarray(throw) >= 0.5)[..., np.newaxis]
+    drops = (np.asarray(grasp) <= -0.5)[..., np.newaxis] | throws
+    released = held & drops & ~throws
     for i, block in enumerate(self._blocks):
       is_written = block.written_slot.get(physics) > 0
       held[..., i] &= (distances[..., i] <= _SLIPS) | is_written
       block.written_slot.set(physics, 0.0)
-    throws = (np.asarray(throw) >= 0.5)[..., np.newaxis]
-    drops = (np.asarray(grasp) <= -0.5)[..., np.newaxis] | throws
     if (thrown := held & throws).any():
       direction = self.direction(physics)
       lift = np.full((*direction.shape[:-1], 1), _THROW_LIFT)
       velocity = np.concatenate([_THROW_SPEED * direction, lift], axis=-1)
       for i, block in enumerate(self._blocks):
         block.launch(physics, velocity, thrown[..., i])
-    elif (released := held & drops).any():
+    elif released.any():
       velocity = self._hand_velocity(physics)
       for i, block in enumerate(self._blocks):
         block.slow_down(physics, velocity, released[..., i])

@@ -10,14 +10,13 @@ import abc
 from collections.abc import Iterable, Sequence
 from typing import Any, final
 
-from dm_control import composer
 from dm_control import mjcf
 import numpy as np
 
 from realab_suite.entities import axes
 from realab_suite.entities import grasps
-from realab_suite.entities import moving
 from realab_suite.entities import protocols
+from realab_suite.entities import rotations
 from realab_suite.entities import state
 from realab_suite.entities import surroundings
 
@@ -49,7 +48,6 @@ _USUAL_HALF_SIZE = 0.1
 # against a wall hopped off another one at 5.4 m/s. The fastest of 800 such
 # cubes left at 3.0 m/s with exponent 2, 2.6 with 3, 2.0 with 4 and 1.95 with 6.
 _SLIPPERINESS = 6
-_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 # Height at which an avatar carries a block, in m.
 GRIP_HEIGHT = 0.2
 # Gap between a planar block and the floor, in m, so that they never touch.
@@ -162,7 +160,7 @@ class JointedBlock(Block):
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
     self._geom = self._body.add(
         'geom', name=name, type='box', size=[half_size] * 3, mass=mass,
-        **_contact(half_size), **style
+        **contact(half_size), **style
     )  # fmt: skip
     self._site = self._body.add(
         'site', name=f'{name}_grip', size=[0.01], group=4,
@@ -368,14 +366,17 @@ class FreeBlock(JointedBlock):
     return self._rest + np.asarray(physics.bind(self._slides).qpos)
 
   def heading(self, physics: protocols.Physics) -> np.ndarray:
-    return _heading(physics.bind(self._rotation).qpos)
+    return rotations.heading_of(physics.bind(self._rotation).qpos)
 
   def _orientation(self, physics: protocols.Physics) -> np.ndarray:
     return np.asarray(physics.bind(self._rotation).qpos)
 
   def turn(self, physics: protocols.Physics, heading: np.ndarray) -> None:
     quaternion = self._orientation(physics)
-    turned = _product(_quaternion(heading - _heading(quaternion)), quaternion)
+    turned = rotations.turned(
+        rotations.quaternion_of(heading - rotations.heading_of(quaternion)),
+        quaternion,
+    )
     physics.bind(self._rotation).qpos = turned
 
   def put(
@@ -383,7 +384,7 @@ class FreeBlock(JointedBlock):
   ) -> None:
     self._let_go(physics)
     physics.bind(self._slides).qpos = np.subtract(position, self._rest)
-    physics.bind(self._rotation).qpos = _quaternion(heading)
+    physics.bind(self._rotation).qpos = rotations.quaternion_of(heading)
     physics.bind(self._joints).qvel = 0.0
 
 
@@ -430,7 +431,7 @@ class PlanarBlock(JointedBlock):
     return np.arctan2(np.sin(angle), np.cos(angle))
 
   def _orientation(self, physics: protocols.Physics) -> np.ndarray:
-    return _quaternion(self.heading(physics))
+    return rotations.quaternion_of(self.heading(physics))
 
   def turn(self, physics: protocols.Physics, heading: np.ndarray) -> None:
     physics.bind(self._hinge).qpos = np.asarray(heading)[..., np.newaxis]
@@ -447,92 +448,7 @@ class PlanarBlock(JointedBlock):
     physics.bind(self._joints).qvel = 0.0
 
 
-@final
-class MocapBlock(Block):
-  """A block of a welded register, which only writes can move."""
-
-  def __init__(
-      self,
-      name: str,
-      position: Sequence[float],
-      half_size: float,
-      style: dict[str, Any],
-  ) -> None:
-    """Makes a block that is not yet attached; see `attach_to`.
-
-    Args:
-      name: Name of the part.
-      position: Position at rest in the register's frame, `(x, y)`, in m.
-      half_size: Half the edge length, in m.
-      style: Geom attributes; see `appearance.geom_style`.
-    """
-    super().__init__(half_size)
-    self._rest = np.array([*position, half_size])
-    self._part = moving.MovingPart(
-        name,
-        [
-            {
-                'type': 'box',
-                'size': [half_size] * 3,
-                **_contact(half_size),
-                **style,
-            }
-        ],
-    )
-    self._origin = np.zeros(3)
-    self._yaw = 0.0
-
-  @property
-  def geom(self) -> mjcf.Element:
-    return self._part.geoms[0]
-
-  @property
-  def rest_height(self) -> float:
-    return self._half_size
-
-  def attach_to(
-      self, root: composer.Entity, position: Sequence[float], yaw: float
-  ) -> None:
-    """Attaches the block to the root entity of a task.
-
-    Args:
-      root: Root entity of the task.
-      position: Origin of the register's frame, `(x, y)`, in m.
-      yaw: Angle of the register's axis to the x axis of the world, in rad.
-    """
-    self._origin = np.array([*position, 0.0])
-    self._yaw = yaw
-    frame = self._part.attach_to(root, list(self._to_world(self._rest)))
-    frame.quat = _quaternion(yaw)
-
-  def detach_from_root(self) -> None:
-    """Undoes `attach_to`."""
-    self._part.detach()
-
-  def position(self, physics: protocols.Physics) -> np.ndarray:
-    position = np.asarray(physics.bind(self._part.frame).mocap_pos)
-    return _rotate(position - self._origin, -self._yaw)
-
-  def heading(self, physics: protocols.Physics) -> np.ndarray:
-    angle = _heading(physics.bind(self._part.frame).mocap_quat) - self._yaw
-    return np.arctan2(np.sin(angle), np.cos(angle))
-
-  def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
-  ) -> None:
-    turned = 0.0 if heading is None else np.asarray(heading)
-    moving.move(
-        physics,
-        self._part.frame,
-        self._to_world(np.asarray(position)),
-        _quaternion(turned + self._yaw),
-    )
-
-  def _to_world(self, position: np.ndarray) -> np.ndarray:
-    return self._origin + _rotate(position, self._yaw)
-
-
-def _contact(half_size: float) -> dict[str, Any]:
+def contact(half_size: float) -> dict[str, Any]:
   """Returns the contact attributes of a block.
 
   Args:
@@ -546,54 +462,3 @@ def _contact(half_size: float) -> dict[str, Any]:
       'solref': (time * soft, damping),
       'friction': (slide / soft**_SLIPPERINESS, spin, roll),
   }
-
-
-def _rotate(vector: np.ndarray, angle: float) -> np.ndarray:
-  """Rotates vectors, `(..., 3)`, about the vertical by an angle in rad."""
-  if not angle:
-    return vector
-  cos, sin = np.cos(angle), np.sin(angle)
-  x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-  return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
-
-
-def _heading(quaternion: np.ndarray) -> np.ndarray:
-  """Returns the angles of quaternions, `(..., 4)`, about the vertical.
-
-  It is the twist about the vertical axis. A rotation about that axis changes it
-  by the angle of the rotation, however the block is tilted.
-  """
-  w, z = axes.component(quaternion, 0), axes.component(quaternion, 3)
-  angle = 2.0 * np.arctan2(z, w)
-  return np.arctan2(np.sin(angle), np.cos(angle))
-
-
-def _product(turn: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-  """Returns quaternions, `(..., 4)`, turned about the vertical.
-
-  Args:
-    turn: Quaternions of rotations about the vertical, `(..., 4)`.
-    quaternion: Quaternions to turn, `(..., 4)`.
-  """
-  cos, sin = turn[..., 0], turn[..., 3]
-  w, x, y, z = (quaternion[..., i] for i in range(4))
-  return np.stack(
-      [
-          cos * w - sin * z,
-          cos * x - sin * y,
-          cos * y + sin * x,
-          cos * z + sin * w,
-      ],
-      axis=-1,
-  )
-
-
-def _quaternion(angle: Any) -> np.ndarray:
-  """Returns the quaternions, `(..., 4)`, of rotations about the vertical."""
-  if angle is None:
-    return _UPRIGHT
-  half = np.asarray(angle, float) / 2.0
-  quaternion = np.zeros((*half.shape, 4))
-  quaternion[..., 0] = np.cos(half)
-  quaternion[..., 3] = np.sin(half)
-  return quaternion

@@ -88,7 +88,7 @@ class Grasp:
     bound = physics.bind(self._constraints)
     offset = position - self._hand_position(physics)
     bound.active = _with_strength(
-        np.asarray(bound.active).any(axis=-1),
+        np.any(bound.active, axis=-1),
         np.sqrt((offset * offset).sum(axis=-1)),
     )
 
@@ -105,7 +105,7 @@ def held(active: np.ndarray) -> np.ndarray:
     active: Attribute `active` of the constraints of the grasps.
   """
   shape = (*active.shape[:-1], -1, len(_DISTANCES))
-  return active.reshape(shape).any(axis=-1)
+  return np.any(active.reshape(shape), axis=-1)
 
 
 def active(is_held: np.ndarray, distances: np.ndarray) -> np.ndarray:

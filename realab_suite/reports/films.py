@@ -71,6 +71,7 @@ class Film:
           f'cannot create {os.fspath(path)}: {error.strerror}'
       ) from error
     self._title = title
+    self._env = env
     identifiers = {
         'top_down': 'top_down',
         'first_person': env.task.avatar.camera.full_identifier,
@@ -91,7 +92,8 @@ class Film:
 
   def add(self, physics: protocols.Physics, track: tracking.Track) -> None:
     """Adds a frame; `tracking.Tracker` calls this."""
-    physics.refresh()  # The cameras read its data, which may be out of date.
+    del physics  # The cameras refer to it.
+    self._env.thin_physics.refresh()
     picture = np.concatenate([c.render() for c in self._cameras], axis=1)
     strip = draw_strip(self._title, track, picture.shape[1])
     self._file.write_frame(np.concatenate([picture, strip], axis=0))

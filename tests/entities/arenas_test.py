@@ -8,8 +8,8 @@ from campaigns import bulldozers_campaign
 from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
-from realab_suite.entities import block_kinds
 from realab_suite.entities import avatars
+from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from tests import worlds
 

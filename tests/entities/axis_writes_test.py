@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import registers
 from realab_suite.entities import surroundings
@@ -137,7 +138,7 @@ def test_a_write_carries_no_energy(dof):
 
 
 def test_unknown_kinds_of_writes_are_refused():
-  with pytest.raises(registers.base.errors.SpecError, match='write.*axis'):
+  with pytest.raises(errors.SpecError, match=r"write: 'x'; .*'axis', 'pose'"):
     registers.TwoBlockRegister('r', value_range=(0, 1), write='x')
 
 

@@ -10,6 +10,7 @@ from realab_suite import errors
 from realab_suite.engine import single_physics
 from realab_suite.entities import arenas
 from realab_suite.entities import block_kinds
+from realab_suite.entities import mocap_blocks
 from realab_suite.entities import registers
 from tests import examples
 from tests import worlds
@@ -397,6 +398,6 @@ def test_blocks_are_of_the_kind_that_the_channel_asks_for(world):
     }
     kind = expected[variety.dof]
     if variety.channel == 'welded':
-      kind = block_kinds.MocapBlock
+      kind = mocap_blocks.MocapBlock
     blocks = world.registers[variety.name].blocks
     assert [type(block) for block in blocks] == [kind] * len(blocks)

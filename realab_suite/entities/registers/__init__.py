@@ -1,14 +1,14 @@
 """Registers: physical objects whose poses store values."""
 
-from realab_suite.entities.registers.base import CHANNELS
-from realab_suite.entities.registers.base import DOFS
-from realab_suite.entities.registers.base import OVERFLOWS
 from realab_suite.entities.registers.base import Register
-from realab_suite.entities.registers.base import WRITES
 from realab_suite.entities.registers.block_orientation import (
     BlockOrientationRegister,
 )
 from realab_suite.entities.registers.block_position import BlockPositionRegister
+from realab_suite.entities.registers.checks import CHANNELS
+from realab_suite.entities.registers.checks import DOFS
+from realab_suite.entities.registers.checks import OVERFLOWS
+from realab_suite.entities.registers.checks import WRITES
 from realab_suite.entities.registers.records import AGENT
 from realab_suite.entities.registers.records import EVALUATOR
 from realab_suite.entities.registers.records import INITIAL

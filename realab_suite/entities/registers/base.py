@@ -15,23 +15,14 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
+from realab_suite.entities import mocap_blocks
 from realab_suite.entities import protocols
 from realab_suite.entities import state
+from realab_suite.entities.registers import checks
 from realab_suite.entities.registers import records
-
-# embedded: the poses of the blocks store the value; blocks can be pushed.
-# welded: the poses of the blocks store the value; only writes move the blocks.
-# secure: a slot of the state stores the value; the blocks are scenery.
-CHANNELS = ('embedded', 'welded', 'secure')
-DOFS = ('free', 'planar')
-OVERFLOWS = ('saturate', 'error')
-# axis: a write sets only the coordinate that carries the value.
-# pose: a write restores the whole pose of the written blocks.
-WRITES = ('axis', 'pose')
 
 
 @final
@@ -85,9 +76,9 @@ class Register(composer.Entity):
       dof: One of `DOFS`: degrees of freedom of blocks that can be pushed.
       on_overflow: One of `OVERFLOWS`: `saturate` to saturate a value out of
         range, `error` to refuse it.
-      write: One of `WRITES`. `axis` for writes that set only the coordinate that
-        carries the value, so that an agent can carry or throw a block that is
-        written in each step; `pose` for writes that restore the whole pose,
+      write: One of `WRITES`. `axis` for writes that set only the coordinate
+        that carries the value, so that an agent can carry or throw a block that
+        is written in each step; `pose` for writes that restore the whole pose,
         upright and at rest, and release the block from every hand.
       block_size: Edge length of each block, in m.
       mass: Mass of each block, in kg.
@@ -95,7 +86,7 @@ class Register(composer.Entity):
     Raises:
       SpecError: If an argument has a value that is not allowed.
     """
-    _check(
+    checks.check(
         name,
         value_range,
         scale,
@@ -139,7 +130,7 @@ class Register(composer.Entity):
 
   @abc.abstractmethod
   def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
-    """Moves the blocks to the undisturbed poses that represent `value`, `(...)`.
+    """Moves the blocks to the undisturbed poses of a value, `(...)`.
 
     Episodes begin with these poses.
     """
@@ -242,15 +233,15 @@ class Register(composer.Entity):
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     reach = np.array([self._low, self._high]) * self._scale
     for block in self._blocks:
-      if isinstance(block, block_kinds.MocapBlock):
+      if isinstance(block, mocap_blocks.MocapBlock):
         block.attach_to(root, position, yaw)
-      else:
+      elif isinstance(block, block_kinds.JointedBlock):
         block.surroundings.limit(reach[0] - spread[0], reach[1] + spread[0])
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
     for block in self._blocks:
-      if isinstance(block, block_kinds.MocapBlock):
+      if isinstance(block, mocap_blocks.MocapBlock):
         block.detach_from_root()
     self.detach()
 
@@ -350,22 +341,14 @@ class Register(composer.Entity):
     """
     is_finite = np.isfinite(value)
     if not is_finite.all():
-      raise self._refusal(value, ~is_finite, 'allowed are finite values')
+      raise checks.refusal(
+          self._name, value, ~is_finite, 'allowed are finite values'
+      )
     if self._on_overflow == 'error':
-      raise self._refusal(
-          value, ~fits, f'its range is [{self._low}, {self._high}]'
+      raise checks.refusal(
+          self._name, value, ~fits, f'its range is [{self._low}, {self._high}]'
       )
     return np.where(fits, value, np.clip(value, self._low, self._high))[()]
-
-  def _refusal(
-      self, value: np.ndarray, is_wrong: np.ndarray, allowed: str
-  ) -> errors.RegisterValueError:
-    """Returns an error for the first wrong value."""
-    world = int(np.argmax(is_wrong)) if np.ndim(value) else None
-    first = np.asarray(value).flat[world or 0]
-    return errors.RegisterValueError(
-        f'register {self.name!r}: cannot store {first}; {allowed}', world
-    )
 
   def read(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the reading, `(...)`, in the register's units.
@@ -459,8 +442,30 @@ class Register(composer.Entity):
       Value that the block got, `(...)`.
     """
     along = start + value * self._scale
-    placed = block.slide(physics, along)
-    return value if placed is along else (placed - start) / self._scale
+    placed = _jointed(block).slide(physics, along)
+    if placed is along:
+      return value
+    # Exactly the value wherever nothing is in the way.
+    return np.where(placed == along, value, (placed - start) / self._scale)[()]
+
+  def _turn(
+      self,
+      physics: protocols.Physics,
+      block: block_kinds.Block,
+      value: np.ndarray,
+  ) -> np.ndarray:
+    """Sets the heading of a block, for `_shift`.
+
+    Args:
+      physics: One world or a batch of worlds.
+      block: Block with joints.
+      value: Value to represent, `(...)`.
+
+    Returns:
+      `value`. Nothing obstructs a turn.
+    """
+    _jointed(block).turn(physics, value * self._scale)
+    return value
 
   def _add_block(
       self, name: str, class_name: str, position: Sequence[float]
@@ -478,7 +483,7 @@ class Register(composer.Entity):
     )
     half_size = self._block_size / 2
     if self._channel == 'welded':
-      return block_kinds.MocapBlock(
+      return mocap_blocks.MocapBlock(
           f'{self.name}_{name}', position, half_size, style
       )
     kind = (
@@ -489,47 +494,12 @@ class Register(composer.Entity):
     return kind(self._mjcf_root, name, position, half_size, self._mass, style)
 
 
-def _check(
-    name: str,
-    value_range: Sequence[float],
-    scale: float,
-    initial: float,
-    role: str,
-    channel: str,
-    dof: str,
-    on_overflow: str,
-    write: str,
-) -> None:
-  """Checks the arguments of `Register`.
+def _jointed(block: block_kinds.Block) -> block_kinds.JointedBlock:
+  """Returns a block with joints.
 
   Raises:
-    SpecError: If an argument has a value that is not allowed.
+    TypeError: If it has none; nothing but `put` moves such a block.
   """
-  allowed = (
-      ('role', role, tuple(appearance.ROLE_COLOURS)),
-      ('channel', channel, CHANNELS),
-      ('dof', dof, DOFS),
-      ('on_overflow', on_overflow, OVERFLOWS),
-      ('write', write, WRITES),
-  )
-  for argument, value, choices in allowed:
-    if value not in choices:
-      raise errors.SpecError(
-          f'register {name!r}: {argument}: {value!r}; allowed are'
-          f' {list(choices)}'
-      )
-  if len(value_range) != 2 or not value_range[0] < value_range[1]:
-    raise errors.SpecError(
-        f'register {name!r}: value_range: {value_range!r}; allowed are two'
-        ' numbers, low < high'
-    )
-  low, high = value_range
-  if not (np.isfinite(low) and np.isfinite(high) and low <= initial <= high):
-    raise errors.SpecError(
-        f'register {name!r}: initial {initial!r} and value_range'
-        f' {value_range!r}; both must be finite, with initial in value_range'
-    )
-  if not (np.isfinite(scale) and scale > 0):
-    raise errors.SpecError(
-        f'register {name!r}: scale: {scale!r}; allowed are numbers above 0'
-    )
+  if not isinstance(block, block_kinds.JointedBlock):
+    raise TypeError(f'{type(block).__name__} has no joints')
+  return block

@@ -40,8 +40,7 @@ class BlockOrientationRegister(base.Register):
     self._block.put(physics, position, heading=value * self._scale)
 
   def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
-    self._block.turn(physics, value * self._scale)
-    return value
+    return self._turn(physics, self._block, value)
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale

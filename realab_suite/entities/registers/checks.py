@@ -1,0 +1,82 @@
+"""Allowed arguments and values of registers."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.entities import appearance
+
+# embedded: the poses of the blocks store the value; blocks can be pushed.
+# welded: the poses of the blocks store the value; only writes move the blocks.
+# secure: a slot of the state stores the value; the blocks are scenery.
+CHANNELS = ('embedded', 'welded', 'secure')
+DOFS = ('free', 'planar')
+OVERFLOWS = ('saturate', 'error')
+# axis: a write sets only the coordinate that carries the value.
+# pose: a write restores the whole pose of the written blocks.
+WRITES = ('axis', 'pose')
+
+
+def check(
+    name: str,
+    value_range: Sequence[float],
+    scale: float,
+    initial: float,
+    role: str,
+    channel: str,
+    dof: str,
+    on_overflow: str,
+    write: str,
+) -> None:
+  """Checks the arguments of `Register`.
+
+  Raises:
+    SpecError: If an argument has a value that is not allowed.
+  """
+  allowed = (
+      ('role', role, tuple(appearance.ROLE_COLOURS)),
+      ('channel', channel, CHANNELS),
+      ('dof', dof, DOFS),
+      ('on_overflow', on_overflow, OVERFLOWS),
+      ('write', write, WRITES),
+  )
+  for argument, value, choices in allowed:
+    if value not in choices:
+      raise errors.SpecError(
+          f'register {name!r}: {argument}: {value!r}; allowed are'
+          f' {list(choices)}'
+      )
+  if len(value_range) != 2 or not value_range[0] < value_range[1]:
+    raise errors.SpecError(
+        f'register {name!r}: value_range: {value_range!r}; allowed are two'
+        ' numbers, low < high'
+    )
+  low, high = value_range
+  if not (np.isfinite(low) and np.isfinite(high) and low <= initial <= high):
+    raise errors.SpecError(
+        f'register {name!r}: initial {initial!r} and value_range'
+        f' {value_range!r}; both must be finite, with initial in value_range'
+    )
+  if not (np.isfinite(scale) and scale > 0):
+    raise errors.SpecError(
+        f'register {name!r}: scale: {scale!r}; allowed are numbers above 0'
+    )
+
+
+def refusal(
+    name: str, value: np.ndarray, is_wrong: np.ndarray, allowed: str
+) -> errors.RegisterValueError:
+  """Returns an error for the first wrong value.
+
+  Args:
+    name: Name of the register.
+    value: Values, `(...)`.
+    is_wrong: True for each wrong value, `(...)` bool.
+    allowed: Description of the allowed values.
+  """
+  world = int(np.argmax(is_wrong)) if np.ndim(value) else None
+  first = np.asarray(value).flat[world or 0]
+  return errors.RegisterValueError(
+      f'register {name!r}: cannot store {first}; {allowed}', world
+  )

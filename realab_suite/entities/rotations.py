@@ -1,0 +1,60 @@
+"""Rotations about the vertical, of vectors and quaternions."""
+
+from typing import Any
+
+import numpy as np
+
+from realab_suite.entities import axes
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def rotate(vector: np.ndarray, angle: float) -> np.ndarray:
+  """Rotates vectors, `(..., 3)`, about the vertical by an angle in rad."""
+  if not angle:
+    return vector
+  cos, sin = np.cos(angle), np.sin(angle)
+  x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+  return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+
+
+def heading_of(quaternion: np.ndarray) -> np.ndarray:
+  """Returns the angles of quaternions, `(..., 4)`, about the vertical.
+
+  It is the twist about the vertical axis. A rotation about that axis changes it
+  by the angle of the rotation, however the block is tilted.
+  """
+  w, z = axes.component(quaternion, 0), axes.component(quaternion, 3)
+  angle = 2.0 * np.arctan2(z, w)
+  return np.arctan2(np.sin(angle), np.cos(angle))
+
+
+def turned(turn: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+  """Returns quaternions, `(..., 4)`, turned about the vertical.
+
+  Args:
+    turn: Quaternions of rotations about the vertical, `(..., 4)`.
+    quaternion: Quaternions to turn, `(..., 4)`.
+  """
+  cos, sin = turn[..., 0], turn[..., 3]
+  w, x, y, z = (quaternion[..., i] for i in range(4))
+  return np.stack(
+      [
+          cos * w - sin * z,
+          cos * x - sin * y,
+          cos * y + sin * x,
+          cos * z + sin * w,
+      ],
+      axis=-1,
+  )
+
+
+def quaternion_of(angle: Any) -> np.ndarray:
+  """Returns the quaternions, `(..., 4)`, of rotations about the vertical."""
+  if angle is None:
+    return UPRIGHT
+  half = np.asarray(angle, float) / 2.0
+  quaternion = np.zeros((*half.shape, 4))
+  quaternion[..., 0] = np.cos(half)
+  quaternion[..., 3] = np.sin(half)
+  return quaternion
