@@ -28,7 +28,7 @@ LEAST_SIZE = 0.06
 # one is reliable. With the long one, blocks of 6 cm were pushed into the floor
 # of a corner, and cubes of more than 0.5 m left other ones at up to 3.3 m/s.
 _SUBSTEP, _SHORT_SUBSTEP = 0.02, 0.01
-_USUAL_SIZES = (0.05, 0.2)
+_USUAL_SIZES = (0.075, 0.2)
 # Contacts between blocks are soft, so that a block that is written into another
 # one pushes it away slowly: at 1.3 m/s at most, compared with 9.8 m/s at
 # MuJoCo's default stiffness. In contacts with other geoms, the stiffness of the

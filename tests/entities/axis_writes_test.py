@@ -96,14 +96,19 @@ def test_a_held_block_can_be_written_and_carried(kind, dof):
       assert abs(read.temporary) > 1e-3
       assert read.temporary == pytest.approx(moved, abs=1e-9)
       assert float(read.obstruction) == 0.0
-  # Let go of at rest, and clear of the avatar, it stays where it is written.
+  # Let go of at rest, and clear of the avatar, it stays where it is written. A
+  # free block still has to fall.
   register.write(physics, 12.0)
   world.act(100)
-  world.act(6, grasp=-1.0)
-  register.write(physics, 12.0)
-  worlds.step(physics, 4)
+  left = []
+  for _ in range(6):
+    world.act(6, grasp=-1.0)
+    register.write(physics, 12.0)
+    worlds.step(physics, 4)
+    left.append(abs(float(register.inspect(physics).temporary)))
   assert not world.holding
-  assert abs(register.inspect(physics).temporary) < 0.01
+  assert left[0] < (1e-6 if dof == 'planar' else 0.3)
+  assert left[-1] < (1e-6 if dof == 'planar' else 1e-2)
 
 
 @every_dof
