@@ -24,8 +24,6 @@ _UNSEEN = {'rgba': (0, 0, 0, 0), 'user': [appearance.code('nothing')]}
 # wall would leave it by the shortest way, which is down.
 _DEPTH = 0.5
 _CAMERA_HEIGHT = 30.0
-# Width of the space around the rooms in which no block may be written, in m.
-_MARGIN = 20.0
 
 
 @final
@@ -179,7 +177,7 @@ class RoomArena(composer.Arena):
     low, high = np.array(rectangle.low), np.array(rectangle.high)
     self._mjcf_root.worldbody.add(
         'site', name=f'{surroundings.OUTSIDE}{number}', type='box', group=4,
-        size=(*(high - low) / 2, _MARGIN), pos=(*(low + high) / 2, 0.0),
+        size=(*(high - low) / 2, surroundings.ENDLESS), pos=(*(low + high) / 2, 0.0),
         rgba=(0, 0, 0, 0),
     )  # fmt: skip
 
@@ -284,7 +282,7 @@ class RoomArena(composer.Arena):
 def _around(room: Rectangle) -> list[Rectangle]:
   """Returns the rectangles around a room and its walls."""
   (x0, y0), (x1, y1) = room.low, room.high
-  t, far = _WALL_THICKNESS / 2, _MARGIN
+  t, far = _WALL_THICKNESS / 2, surroundings.ENDLESS
   return [
       Rectangle((x0 - far, y0 - far), (x1 + far, y0 - t)),
       Rectangle((x0 - far, y1 + t), (x1 + far, y1 + far)),

@@ -236,11 +236,9 @@ class JointedBlock(Block):
       was in the way of an obstacle.
     """
     position = self.position(physics)
-    is_far = self._surroundings.are_far(physics, position)
+    if not axes.everywhere(self._surroundings.are_far(physics, position)):
+      along = self._free(physics, position, along)
     position[..., 0] = along
-    if not axes.everywhere(is_far):
-      along = self._free(physics, position, is_far)
-      position[..., 0] = along
     physics.bind(self._slides[0]).qpos = np.subtract(along, self._rest[0])[
         ..., np.newaxis
     ]
@@ -257,23 +255,29 @@ class JointedBlock(Block):
     """
 
   def _free(
-      self, physics: protocols.Physics, position: np.ndarray, is_far: Any
+      self,
+      physics: protocols.Physics,
+      position: np.ndarray,
+      along: np.ndarray,
   ) -> np.ndarray:
-    """Returns the free x coordinates nearest to those of `position`, `(...)`.
+    """Returns the free x coordinates nearest to wanted ones, `(...)`, in m.
 
     Args:
       physics: One world or a batch of worlds.
-      position: Wanted position in the register's frame, `(..., 3)`, in m.
-      is_far: True where no obstacle is near, `(...)` bool.
+      position: Present position in the register's frame, `(..., 3)`, in m.
+      along: Wanted x coordinate, `(...)`, in m.
     """
-    along = np.array(position[..., 0])
+    free = np.array(np.broadcast_to(along, position.shape[:-1]))
     orientation = self._orientation(physics)
+    is_far = self._surroundings.are_far(physics, position)
     for world in np.argwhere(~np.asarray(is_far)):
       index = tuple(world)
-      along[index] = self._surroundings.nearest_free(
-          position[index], surroundings.matrix(orientation[index])
+      free[index] = self._surroundings.nearest_free(
+          np.array([free[index], *position[index][1:]]),
+          surroundings.matrix(orientation[index]),
+          float(position[index][0]),
       )
-    return along[()]
+    return free[()]
 
   def _adapt_grasps(
       self, physics: protocols.Physics, position: np.ndarray
@@ -287,8 +291,9 @@ class JointedBlock(Block):
     for grasp in self._grasps:
       if grasp.is_anywhere_held(physics):
         place = self._surroundings.in_world(physics, position)[..., :2]
-        grasp.adapt(physics, place)
-        self._written_slot.set(physics, 1.0)
+        is_held = grasp.adapt(physics, place)
+        was_written = self._written_slot.get(physics) > 0
+        self._written_slot.set(physics, is_held | was_written)
 
   def _let_go(self, physics: protocols.Physics) -> None:
     """Releases the block from every hand.

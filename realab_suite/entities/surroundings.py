@@ -17,12 +17,14 @@ from realab_suite.entities import protocols
 # Prefix of the names of box sites in which no block may be written: the space
 # outside of rooms.
 OUTSIDE = 'outside.'
+# Width of such a box that extends beyond all worlds, in m.
+ENDLESS = 1e4
 # A block is in an obstacle if this fraction of its half edge length is inside.
 # Contacts push blocks out that are less deep inside, which is no obstruction:
 # blocks that were pushed against a wall are slightly inside.
 _TOLERANCE = 0.5
 # Beyond all worlds, in m.
-_FAR = 1e6
+_FAR = 1e3
 _PARALLEL = 1e-9
 # Distance to an obstacle at which blocks are put, in m.
 _GAP = 1e-6
@@ -97,10 +99,10 @@ class Boxes:
     steep = np.where(is_flat, 1.0, slope)
     ends = np.stack([(middle - reach) / steep, (middle + reach) / steep], -1)
     ends.sort(axis=-1)
-    ends[is_flat] = -_FAR, _FAR
+    ends[is_flat] = -np.inf, np.inf
     # Parallel edges have no cross product, which separates nothing.
     is_apart = is_flat & (np.abs(middle) >= reach) & (reach > _PARALLEL)
-    ends[is_apart] = _FAR, -_FAR
+    ends[is_apart] = np.inf, -np.inf
     return np.stack(
         [ends[..., 0].max(axis=1), ends[..., 1].min(axis=1)], axis=-1
     )
@@ -129,7 +131,7 @@ class Surroundings:
     self._corridor = np.zeros((2, 2))
     self._origin = np.zeros(3)
     self._rotation = np.eye(3)
-    self._reach = -_FAR, _FAR
+    self._reach = -np.inf, np.inf
 
   def limit(self, low: float, high: float) -> None:
     """Sets the smallest and largest x coordinate that are written, in m."""
@@ -154,14 +156,19 @@ class Surroundings:
     y, z = axes.component(position, 1), axes.component(position, 2)
     return (right < y) & (y < left) & (floor < z) & (z < ceiling)
 
-  def nearest_free(self, position: np.ndarray, rotation: np.ndarray) -> float:
+  def nearest_free(
+      self, position: np.ndarray, rotation: np.ndarray, before: float
+  ) -> float:
     """Returns the free x coordinate that is nearest to a wanted one, in m.
 
-    Call `are_far` first, which finds the obstacles of a new model.
+    An obstacle that the block is inside already does not count; contacts push
+    the block out of it. Call `are_far` first, which finds the obstacles of a
+    new model.
 
     Args:
       position: Wanted position of a block in one world, `(3,)`, in m.
       rotation: Axes of the block, as columns, `(3, 3)`.
+      before: Present x coordinate of the block, in m.
     """
     along = float(position[0])
     low, high = self._boxes.low - self._radius, self._boxes.high + self._radius
@@ -170,10 +177,13 @@ class Surroundings:
     if not (is_near & (low[:, 0] < along) & (along < high[:, 0])).any():
       return along
     taken = self._boxes.taken(position, rotation, self._half_size)[is_near]
+    taken = taken[(before <= taken[:, 0]) | (taken[:, 1] <= before)]
     if not _is_taken(along, taken):
       return along
     ends = [*(taken[:, 0] - _GAP), *(taken[:, 1] + _GAP)]
-    free = [end for end in ends if not _is_taken(end, taken)]
+    free = [
+        end for end in ends if abs(end) < _FAR and not _is_taken(end, taken)
+    ]
     return float(min(free, key=lambda end: abs(end - along), default=along))
 
   def in_world(

@@ -22,7 +22,7 @@ class CollectApples(base.Task):
   Only the time limit ends an episode.
   """
 
-  DYNAMICS_VERSION = 1
+  DYNAMICS_VERSION = 2
 
   def __init__(
       self,

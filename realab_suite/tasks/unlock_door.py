@@ -32,7 +32,7 @@ _PAD_RADIUS = 0.8
 class UnlockDoor(base.Task):
   """A large room with apples and a pad, and a small room with a large apple."""
 
-  DYNAMICS_VERSION = 1
+  DYNAMICS_VERSION = 2
 
   def __init__(
       self,
