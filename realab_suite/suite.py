@@ -7,6 +7,7 @@ from importlib import resources
 from typing import Any
 
 from dm_control import composer
+from dm_control import mjcf
 import mujoco
 import numpy as np
 
@@ -19,6 +20,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import forking
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
+from realab_suite.entities import measurables
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
@@ -292,7 +294,8 @@ def embed(
       ends episodes.
     world: Index of the world in a batch; random streams differ between worlds.
     measurements: Functions of the physics that meters can measure, by name, in
-      addition to `score`, the true return so far.
+      addition to those of the task. None may replace a function of the task or
+      `score`, the true return so far.
     overrides: Same as in `load`.
 
   Raises:
@@ -333,13 +336,7 @@ def _connected(
     measurements: Mapping[str, Callable[[Any], Any]],
 ) -> environment.Environment:
   """Returns the environment of a task with an attached mechanism."""
-  mechanism.connect(
-      {
-          'score': mechanism.score,
-          **(task.measurements if isinstance(task, base.Task) else {}),
-          **measurements,
-      }
-  )
+  _connect_meters(task, mechanism, measurements)
   if isinstance(task, base.Task):
     task.avatar.make_graspable(_blocks_of(mechanism))
   env = environment.Environment(
@@ -352,6 +349,39 @@ def _connected(
       placement.check_start(env.physics, task, mechanism)
     stack.pop_all()
   return env
+
+
+def _connect_meters(
+    task: composer.Task,
+    mechanism: mechanisms.FeedbackMechanism,
+    added: Mapping[str, Callable[[Any], Any]],
+) -> None:
+  """Connects the meters of a mechanism to a task.
+
+  Raises:
+    SpecError: If a meter measures what this world does not offer, or if an
+      added measurement has the name of another one.
+  """
+  functions: dict[str, Callable[[Any], Any]] = {'score': mechanism.score}
+  if isinstance(task, base.Task):
+    functions |= task.measurements
+    parts = task.measurables
+  else:
+    parts = measurables.in_world(task.root_entity)
+  for name in added:
+    if name in functions:
+      raise errors.SpecError(
+          f'measurements: {name!r} is measured by the task; allowed are names'
+          f' other than {sorted(functions)}'
+      )
+
+  def find_body(name: str) -> mjcf.Element | None:
+    if isinstance(task, base.Task):
+      return None  # It declares its parts.
+    root = task.root_entity.mjcf_model
+    return root.find('body', name) or root.find('attachment_frame', name)
+
+  mechanism.connect({**functions, **added}, parts, find_body)
 
 
 def _keywords(argument: str, value: Any) -> dict[str, Any]:

@@ -43,6 +43,8 @@ _DERIVED_FIELDS = {
     ('mocap_body', 'xmat'): 'xmat',
     ('site', 'xmat'): 'site_xmat',
     ('geom', 'xmat'): 'geom_xmat',
+    ('body', 'cvel'): 'cvel',
+    ('body', 'subtree_com'): 'subtree_com',
 }
 
 
@@ -85,7 +87,7 @@ class BatchPhysics:
     self._ray_batch = mujoco_batch.Batch(
         template.model.ptr, num_envs, num_threads
     )
-    self._data = _Userdata(self._batch.bind('userdata'))
+    self._data = _Data(self._batch.bind('userdata'), self._batch.bind('time'))
     self._bindings: dict[Any, _BatchBinding] = {}
     self._is_dirty = True
     self._worlds = [_WorldView(self, i) for i in range(num_envs)]
@@ -101,8 +103,8 @@ class BatchPhysics:
     return self._model
 
   @property
-  def data(self) -> '_Userdata':
-    """Object with the attribute `userdata`, `(worlds, slots)`, live."""
+  def data(self) -> '_Data':
+    """Object with `userdata`, `(worlds, slots)`, live, and `time`."""
     return self._data
 
   @property
@@ -266,11 +268,17 @@ def _(
 
 
 @final
-class _Userdata:
+class _Data:
   """The part of `physics.data` that entities use."""
 
-  def __init__(self, userdata: np.ndarray) -> None:
+  def __init__(self, userdata: np.ndarray, time: np.ndarray) -> None:
     self.userdata = userdata
+    self.times = time
+
+  @property
+  def time(self) -> np.ndarray:
+    """Time since the start of the episode, `(...)`, in s."""
+    return np.array(self.times)[()]
 
 
 @final
@@ -280,7 +288,8 @@ class _WorldView:
   def __init__(self, physics: BatchPhysics, index: int) -> None:
     self._physics = physics
     self._index = index
-    self._data = _Userdata(physics.data.userdata[index])
+    data = physics.data
+    self._data = _Data(data.userdata[index], data.times[index, ...])
     self._bindings: dict[Any, _WorldBinding] = {}
 
   @property
@@ -288,7 +297,7 @@ class _WorldView:
     return self._physics.model
 
   @property
-  def data(self) -> _Userdata:
+  def data(self) -> _Data:
     return self._data
 
   def bind(self, mjcf_elements: Any) -> '_WorldBinding':
@@ -329,6 +338,8 @@ class _Binding(abc.ABC):
   active = _attribute('active')
   xpos = _attribute('xpos')
   xmat = _attribute('xmat')
+  cvel = _attribute('cvel')
+  subtree_com = _attribute('subtree_com')
 
   def __init__(self, binding: Any) -> None:
     self._binding = binding

@@ -208,6 +208,8 @@ class _ThinBinding(mjcf_physics.Binding):
   active = _state_property('active')
   xpos = _derived_property('xpos')
   xmat = _derived_property('xmat')
+  cvel = _derived_property('cvel')
+  subtree_com = _derived_property('subtree_com')
 
   def __init__(self, physics: ThinPhysics, namespace: str, names: Any) -> None:
     object.__setattr__(self, '_reads', {})

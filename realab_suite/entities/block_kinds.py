@@ -74,6 +74,11 @@ class Block(abc.ABC):
 
   @property
   @abc.abstractmethod
+  def body(self) -> mjcf.Element | None:
+    """Body of the cube; `None` for a mocap block before `attach_to`."""
+
+  @property
+  @abc.abstractmethod
   def geom(self) -> mjcf.Element:
     """Geom of the cube."""
 
@@ -338,6 +343,10 @@ class MocapBlock(Block):
     )
     self._origin = np.zeros(3)
     self._yaw = 0.0
+
+  @property
+  def body(self) -> mjcf.Element | None:
+    return self._part.frame
 
   @property
   def geom(self) -> mjcf.Element:

@@ -324,6 +324,35 @@ class Register(composer.Entity):
     """
     return np.clip(self.applied(physics), self._low, self._high)[()]
 
+  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the distance by which the blocks have moved, `(...)`, in m.
+
+    It is the largest distance of a block from the position that the reset and
+    the last write gave it, in any direction, and is computed from the blocks
+    even if the register is secure. In this base class, it is the displacement
+    that the blocks represent: enough for a block that moves along an axis.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
+    wrong = self._read_blocks(physics) - self._applied_slot.get(physics)
+    return np.abs(wrong) * self._scale
+
+  def _farthest(
+      self, physics: protocols.Physics, places: Sequence[np.ndarray]
+  ) -> np.ndarray:
+    """Returns the largest distance of a block from its place, `(...)`, in m.
+
+    Args:
+      physics: One world or a batch of worlds.
+      places: Position of each block in the register's frame, `(..., 3)`, in m.
+    """
+    moved = [
+        np.linalg.norm(block.position(physics) - place, axis=-1)
+        for block, place in zip(self._blocks, places, strict=True)
+    ]
+    return np.max(moved, axis=0)
+
   def inspect(
       self,
       physics: protocols.Physics,
