@@ -287,6 +287,14 @@ class PlanarBlock(JointedBlock):
     # A grip at another height would pull in a direction without a joint.
     return GRIP_HEIGHT - self.rest_height
 
+  def stand_at(self, height: float) -> None:
+    """Adapts the grip, which is at the height of the hand, to a surface.
+
+    Args:
+      height: Height of the surface that the register stands on, in m.
+    """
+    self._site.pos = [0.0, 0.0, self._grip_offset - height]
+
   def position(self, physics: protocols.Physics) -> np.ndarray:
     moved = np.asarray(physics.bind(self._slides).qpos)
     planar = self._rest[:2] + moved
@@ -363,10 +371,10 @@ class MocapBlock(Block):
 
     Args:
       root: Root entity of the task.
-      position: Origin of the register's frame, `(x, y)`, in m.
+      position: Origin of the register's frame, `(x, y, z)`, in m.
       yaw: Angle of the register's axis to the x axis of the world, in rad.
     """
-    self._origin = np.array([*position, 0.0])
+    self._origin = np.array(position, float)
     self._yaw = yaw
     frame = self._part.attach_to(root, list(self._to_world(self._rest)))
     frame.quat = _quaternion(yaw)

@@ -117,7 +117,7 @@ class FeedbackMechanism(composer.Entity):
     root.attach(self)
     for name, place in places.items():
       self._registers[name].attach_to(
-          root, place.position, place.yaw, place.spread
+          root, (*place.position, place.height), place.yaw, place.spread
       )
 
   def detach_from_root(self) -> None:
@@ -445,7 +445,8 @@ def _find_place(
     SpecError: If the world has no place of this name.
   """
   if isinstance(place, specs.PlaceSpec):
-    return arenas.Place(place.position, place.yaw, place.spread)
+    x, y, height = (*place.position, 0.0)[:3]
+    return arenas.Place((x, y), place.yaw, place.spread, height)
   if place not in named_places:
     raise errors.SpecError(
         f'registers.{name}.place: this world has no place {place!r}; allowed'

@@ -46,14 +46,16 @@ class PlaceSpec(validation.Spec):
   """A place for a register, given by coordinates.
 
   Attributes:
-    position: `(x, y)`, in m.
+    position: `(x, y)`, or `(x, y, z)` for a register on a surface of the height
+      z, in m.
     yaw: Angle of the register's axis to the x axis, in rad.
     spread: Half-widths of the region around `position` from which each episode
       draws the start position of the register, in m.
   """
 
   position: Annotated[
-      tuple[Coordinate, Coordinate], pydantic.Field(strict=False)
+      tuple[Coordinate, ...],
+      pydantic.Field(strict=False, min_length=2, max_length=3),
   ]
   yaw: Finite = 0.0
   spread: Annotated[
@@ -63,6 +65,13 @@ class PlaceSpec(validation.Spec):
       ],
       pydantic.Field(strict=False),
   ] = (0.0, 0.0)
+
+  @pydantic.field_validator('position')
+  @classmethod
+  def _above_the_floor(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+    if value[2:] < (0.0,) * len(value[2:]):
+      raise ValueError('z must be at least 0, the height of the floor')
+    return value
 
 
 @final
@@ -112,7 +121,7 @@ class RegisterSpec(validation.Spec):
   @pydantic.field_validator('place', mode='before')
   @classmethod
   def _coordinates(cls, place: Any) -> Any:
-    """Accepts `[x, y]` for a place without yaw or spread."""
+    """Accepts `[x, y]` and `[x, y, z]` for a place without yaw or spread."""
     if isinstance(place, list | tuple):
       return {'position': place}
     return place

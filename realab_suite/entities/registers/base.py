@@ -188,7 +188,8 @@ class Register(composer.Entity):
 
     Args:
       root: Root entity of the task, usually its arena.
-      position: Position of the register, `(x, y)`, in m.
+      position: Position of the register, `(x, y)`, or `(x, y, z)` for a register
+        on a surface of the height z, such as a table, in m.
       yaw: Angle of the register's axis, which carries the value, to the x axis
         of the world, in rad.
       spread: Half-widths of the region around `position` from which each
@@ -197,12 +198,15 @@ class Register(composer.Entity):
     """
     self._spread = np.array(spread, float)
     frame = root.attach(self)
-    frame.pos = [*position, 0.0]
+    x, y, height = (*position, 0.0)[:3]
+    frame.pos = [x, y, height]
     if yaw:
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     for block in self._blocks:
       if isinstance(block, block_kinds.MocapBlock):
-        block.attach_to(root, position, yaw)
+        block.attach_to(root, (x, y, height), yaw)
+      elif isinstance(block, block_kinds.PlanarBlock):
+        block.stand_at(height)
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
