@@ -337,8 +337,8 @@ def _check_extent(
     return
   if (top := space.bounds(sweep)[1][2]) > root.ceiling:
     raise errors.SpecError(
-        f'register {name!r} would reach a height of {top:.3g} m; allowed in this'
-        f' arena are at most {root.ceiling:g} m'
+        f'register {name!r} would reach a height of {top:.3g} m; allowed in'
+        f' this arena are at most {root.ceiling:g} m'
     )
   for axis in range(2):
     for side in (-1.0, 1.0):

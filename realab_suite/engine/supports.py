@@ -61,9 +61,7 @@ class Surfaces:
     missing = min(unsupported, key=len, default=list(points))
     if not missing:
       return None
-    return min(
-        poses, key=lambda pose: np.linalg.norm(pose.centre - missing[0])
-    )
+    return min(poses, key=lambda pose: np.linalg.norm(pose.centre - missing[0]))
 
   def _is_over(self, geom: int, point: np.ndarray, half: float) -> bool:
     """Returns True if a geom is close under a block with its centre here."""

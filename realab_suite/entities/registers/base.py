@@ -188,8 +188,8 @@ class Register(composer.Entity):
 
     Args:
       root: Root entity of the task, usually its arena.
-      position: Position of the register, `(x, y)`, or `(x, y, z)` for a register
-        on a surface of the height z, such as a table, in m.
+      position: Position of the register, `(x, y)`, in m; or `(x, y, z)` for a
+        register on a surface of the height z, such as a table.
       yaw: Angle of the register's axis, which carries the value, to the x axis
         of the world, in rad.
       spread: Half-widths of the region around `position` from which each
