@@ -15,6 +15,8 @@ import numpy as np
 
 from realab_suite.entities import protocols
 
+_WITHOUT_DISTANCES = ('plane', 'hfield', 'sdf')
+
 
 @final
 @dataclasses.dataclass(frozen=True)
@@ -41,15 +43,17 @@ class Measurable:
 
   @property
   def geoms(self) -> tuple[mjcf.Element, ...]:
-    """Geoms of the bodies and of their children, except geoms without contacts.
+    """Geoms of the bodies and of their children with surfaces to touch.
 
-    A geom is without contacts if its own `contype` and `conaffinity` are 0.
+    Geoms whose own `contype` and `conaffinity` are 0 collide with nothing.
+    MuJoCo computes no distances of planes, height fields and SDFs.
     """
     return tuple(
         geom
         for body in self.bodies
         for geom in body.find_all('geom')
-        if geom.contype != 0 or geom.conaffinity != 0
+        if geom.type not in _WITHOUT_DISTANCES
+        and (geom.contype != 0 or geom.conaffinity != 0)
     )
 
   def positions(self, physics: protocols.Physics) -> np.ndarray:
