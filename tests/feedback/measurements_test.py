@@ -1,6 +1,7 @@
 """Meters measure the true state of the world, with options (M1, M3, M5)."""
 
 import copy
+import json
 from typing import Any, Literal, final
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.config import option_types
 from realab_suite.entities import measurables
 from realab_suite.entities import registers
 from realab_suite.feedback import measurements
@@ -417,6 +419,26 @@ def test_a_registered_measurement_is_usable_by_its_kind(num_envs: int | None):
       suite.load(*_TASK, design=wrong)
   with pytest.raises(errors.SpecError, match=r'measures.kind: must be one of'):
     suite.load(*_TASK, design=design)
+
+
+@final
+class _Listed(measurements.Measurement):
+  """Reads a number from a file."""
+
+  kind: Literal['test_listed'] = 'test_listed'
+  file: option_types.FilePath
+
+  def connect(self, world: measurements.World) -> measurements.Measure:
+    raise AssertionError('the file is opened')
+
+
+def test_a_file_design_may_not_name_files_elsewhere(tmp_path: Any):
+  with helpers.registered(measurements.MEASUREMENTS, 'test_listed', _Listed):
+    path = tmp_path / 'design.yaml'
+    design = _design({'kind': 'test_listed', 'file': '/etc/passwd'})
+    path.write_text(json.dumps(design))
+    with pytest.raises(errors.SpecError, match=r'measures.file: .*outside'):
+      specs.load(path)
 
 
 def test_a_task_may_declare_parts_of_its_own():
