@@ -7,7 +7,6 @@ from importlib import resources
 from typing import Any
 
 from dm_control import composer
-from dm_control import mjcf
 import mujoco
 import numpy as np
 
@@ -367,21 +366,18 @@ def _connect_meters(
     functions |= task.measurements
     parts = task.measurables
   else:
-    parts = measurables.in_world(task.root_entity)
+    root = task.root_entity
+    parts = {
+        **measurables.bodies_in_world(root),
+        **measurables.in_world(root),
+    }
   for name in added:
     if name in functions:
       raise errors.SpecError(
           f'measurements: {name!r} is measured by the task; allowed are names'
           f' other than {sorted(functions)}'
       )
-
-  def find_body(name: str) -> mjcf.Element | None:
-    if isinstance(task, base.Task):
-      return None  # It declares its parts.
-    root = task.root_entity.mjcf_model
-    return root.find('body', name) or root.find('attachment_frame', name)
-
-  mechanism.connect({**functions, **added}, parts, find_body)
+  mechanism.connect({**functions, **added}, parts)
 
 
 def _keywords(argument: str, value: Any) -> dict[str, Any]:

@@ -90,6 +90,23 @@ def in_world(root: composer.Entity) -> dict[str, Measurable]:
   }
 
 
+def bodies_in_world(root: composer.Entity) -> dict[str, Measurable]:
+  """Returns all bodies with names, by their full MJCF identifiers.
+
+  The body of an attached entity has an identifier such as `walker/`.
+
+  Args:
+    root: Root entity of a task.
+  """
+  found = root.mjcf_model.find_all('body')
+  found += root.mjcf_model.find_all('attachment_frame')
+  return {
+      body.full_identifier: Measurable((body,))
+      for body in found
+      if body.full_identifier
+  }
+
+
 def _speed(physics: protocols.Physics, body: mjcf.Element) -> np.ndarray:
   bound = physics.bind(body)
   if _is_mocap(body):

@@ -130,15 +130,12 @@ class FeedbackMechanism(composer.Entity):
       self,
       functions: Mapping[str, measurements.Measure],
       parts: Mapping[str, measurables.Measurable] = _NO_PARTS,
-      find_body: Callable[[str], mjcf.Element | None] = lambda name: None,
   ) -> None:
     """Connects the meters to a world.
 
     Args:
       functions: Functions of the physics that meters can measure, by name.
       parts: Parts of the world that meters can measure, by name.
-      find_body: Function that returns the body with a full MJCF identifier, or
-        `None` if there is none.
 
     Raises:
       SpecError: If a meter of the design measures anything else.
@@ -151,7 +148,6 @@ class FeedbackMechanism(composer.Entity):
           functions,
           parts,
           self._registers,
-          find_body,
       )
       title, measure = measurements.connect(spec.measures, world)
       meter = meters.Meter(measure, self._registers[spec.writes])

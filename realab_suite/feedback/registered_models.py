@@ -47,6 +47,8 @@ class ModelIn:
     def validate(value: Any, validate_model: Any) -> Any:
       if isinstance(value, str):
         return name.validate_python(value)
+      if not isinstance(value, Mapping | pydantic.BaseModel):
+        raise ValueError('must be a name, or a mapping with a kind')
       return validate_model(value)
 
     return core_schema.no_info_wrap_validator_function(validate, schema)

@@ -4,6 +4,10 @@ import copy
 import json
 from typing import Any, Literal, final
 
+from dm_control.locomotion.arenas import floors
+from dm_control.locomotion.tasks import go_to_target
+from dm_control.locomotion.walkers import jumping_ball
+import mujoco
 import numpy as np
 import pytest
 
@@ -318,6 +322,7 @@ _REFUSED = {
     'no such kind': (
         {'kind': 'distanse'}, r"kind: must be one of .*'distance'",
     ),
+    'neither': (7, r'measures: must be a name, or a mapping .*, got 7'),
     'no kind': ({'of': 'pad'}, r'meters\[0\].measures.kind: required key'),
     'unknown option': (
         {'kind': 'distance', 'from': 'avatar', 'two': 'pad'},
@@ -519,5 +524,27 @@ def test_bodies_of_foreign_tasks_are_named_by_their_identifiers():
       assert measured == pytest.approx(min(away), abs=0.01)
     env.close()
   design['meters'][0]['measures'] = {'kind': 'speed', 'of': 'bed'}
-  with pytest.raises(errors.SpecError, match=r"measures.of: 'bed'.*'score'\]"):
+  with pytest.raises(errors.SpecError, match=r"measures.of: 'bed'.*'bead'"):
     helpers.embed(helpers.PointTask(), design)
+
+
+def test_attached_entities_of_foreign_tasks_have_positions_and_speeds():
+  design = copy.deepcopy(helpers.SCORED)
+  for name in ('walker/', 'walker/head_body'):
+    design['meters'][0]['measures'] = {'kind': 'speed', 'of': name}
+    task = go_to_target.GoToTarget(
+        jumping_ball.RollingBallWithHead(), floors.Floor(size=(8.0, 8.0))
+    )
+    env, _ = helpers.embed(task, design)
+    env.reset()
+    for _ in range(4):
+      env.step(np.ones(env.action_spec().shape))
+    measured = _measured(env)
+    velocity = np.zeros(6)
+    mujoco.mj_objectVelocity(
+        env.physics.model.ptr, env.physics.data.ptr,
+        mujoco.mjtObj.mjOBJ_XBODY, env.physics.model.name2id(name, 'body'),
+        velocity, 0,
+    )  # fmt: skip
+    assert measured == pytest.approx(np.linalg.norm(velocity[3:])) != 0.0
+    env.close()

@@ -7,7 +7,6 @@ import json
 import re
 from typing import Annotated, Any, final
 
-from dm_control import mjcf
 import numpy as np
 import pydantic
 
@@ -38,17 +37,15 @@ class World:
   Attributes:
     location: Location of the measurement in the design, for messages.
     functions: Functions of the physics that the task offers, by name.
-    parts: Parts that the task and its entities declare, by name.
+    parts: Parts that the task and its entities declare, by name. In a foreign
+      task, also all bodies, by their full MJCF identifiers.
     registers: Registers of the design, by name.
-    find_body: Function that returns the body with a full MJCF identifier, or
-      `None`; for foreign tasks, which declare no parts.
   """
 
   location: messages.Location
   functions: Mapping[str, Measure]
   parts: Mapping[str, measurables.Measurable]
   registers: Mapping[str, _Register]
-  find_body: Callable[[str], mjcf.Element | None]
 
   def part(self, field: str, name: str) -> measurables.Measurable:
     """Returns a part of the world; the blocks of a register are a group.
@@ -73,8 +70,6 @@ class World:
       )
     if name in self.parts:
       return self.parts[name]
-    if (body := self.find_body(name)) is not None:
-      return measurables.Measurable((body,))
     raise self.unknown(field, name, [*self.registers, *self.parts])
 
   def body(self, field: str, name: str) -> measurables.Measurable:
