@@ -336,3 +336,26 @@ def test_a_register_on_a_surface_of_a_foreign_task(channel: str):
   assert reading == pytest.approx(0.0, abs=1e-6)
   assert _heights(env) == pytest.approx(1.15, abs=0.005)
   env.close()
+
+
+@pytest.mark.parametrize(
+    ('dof', 'channel'),
+    [('free', 'embedded'), ('planar', 'secure'), ('free', 'welded')],
+)
+def test_a_register_is_attached_at_a_height_in_plain_composer(
+    dof: str, channel: str
+):
+  arena = arenas.OpenRoom()
+  arena.add_table('table', (1.0, 0.5), (2.0, 1.5), 0.7)
+  register = registers.TwoBlockRegister(
+      'high', value_range=(-1.0, 5.0), dof=dof, channel=channel
+  )
+  register.attach_to(arena, (1.0, 0.5, 0.7), yaw=0.7)
+  physics = worlds.compile_world(arena)
+  worlds.start_episode(physics, register)
+  register.write(physics, 4.0)
+  worlds.step(physics, 100)
+  assert register.read(physics) == pytest.approx(4.0, abs=1e-9)
+  base, offset = (worlds.world_position(physics, b) for b in register.blocks)
+  assert base == pytest.approx((1.0, 0.5, 0.8), abs=0.005)
+  assert offset[2] == pytest.approx(0.8, abs=0.005)
