@@ -1,41 +1,21 @@
 """Meters measure the true state of the world, with options (M1, M3, M5)."""
 
-import copy
-import json
-from typing import Any, Literal, final
+from typing import Any
 
-from dm_control.locomotion.arenas import floors
-from dm_control.locomotion.tasks import go_to_target
-from dm_control.locomotion.walkers import jumping_ball
-import mujoco
 import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.config import option_types
 from realab_suite.entities import measurables
 from realab_suite.entities import registers
 from realab_suite.feedback import measurements
 from realab_suite.feedback import specs
-from realab_suite.tasks import collect_apples
-from realab_suite.tasks import unlock_door
-from tests import worlds
 from tests.engine import helpers
 from tests.feedback import designs
+from tests.feedback import metered
 
-_TASK = 'unlock_door', 'standard'
 _NUM_STEPS = 8
-
-
-def _design(measures: Any, **register: Any) -> dict[str, Any]:
-  design: dict[str, Any] = copy.deepcopy(designs.SCORED)
-  design['registers']['reward'].update(register)
-  design['registers']['score']['range'] = [-200, 200]
-  # Far values do not fit into the room, and saturate; requests do not.
-  design['registers']['score']['scale'] = 1e-3
-  design['meters'][0]['measures'] = measures
-  return design
 
 
 def _actions(num_envs: int) -> np.ndarray:
@@ -44,12 +24,6 @@ def _actions(num_envs: int) -> np.ndarray:
   actions[:, :, 0] = 1.0
   actions[4:, :, 2] = 0.3
   return actions
-
-
-def _measured(env: Any) -> Any:
-  """Returns what the meter measures now, `(...)`."""
-  (write,) = env.mechanism.update_meters(env.physics)
-  return write.requested
 
 
 def _start(env: Any, world: int | None) -> None:
@@ -67,7 +41,7 @@ def _play(env: Any, world: int | None = None) -> list[Any]:
   measured = []
   for actions in _actions(3):
     env.step(actions if world is None else actions[world])
-    measured.append(_measured(env))
+    measured.append(metered.measure(env))
   return measured
 
 
@@ -135,15 +109,17 @@ _KINDS: dict[str, tuple[Any, Any]] = {
 @pytest.mark.parametrize('name', _KINDS)
 def test_a_meter_measures_what_mujoco_has_in_one_world_and_in_many(name: str):
   measures, truth = _KINDS[name]
-  design = _design(measures, dof=('free', 'planar')[len(name) % 2])
-  batch = suite.load_batch(*_TASK, {'random': 3}, num_envs=3, design=design)
+  design = metered.design(measures, dof=('free', 'planar')[len(name) % 2])
+  batch = suite.load_batch(
+      *metered.TASK, {'random': 3}, num_envs=3, design=design
+  )
   in_batch = _play(batch)
   batch.close()
-  env = suite.load(*_TASK, {'random': 3}, {'world': 2}, design=design)
+  env = suite.load(*metered.TASK, {'random': 3}, {'world': 2}, design=design)
   _start(env, 2)
   for actions, found in zip(_actions(3), in_batch, strict=True):
     env.step(actions[2])
-    measured = _measured(env)
+    measured = metered.measure(env)
     assert measured == pytest.approx(truth(env), abs=1e-9)
     assert found[2] == measured
   env.close()
@@ -164,56 +140,60 @@ def test_a_block_that_moved_in_any_direction_is_detected(
     kind: str, channel: str
 ):
   measures = {'kind': 'register_moved', 'of': 'reward', 'tolerance': 0.05}
-  design = _design(measures, kind=kind, channel=channel)
-  env = suite.load(*_TASK, {'random': 3}, design=design)
+  design = metered.design(measures, kind=kind, channel=channel)
+  env = suite.load(*metered.TASK, {'random': 3}, design=design)
   env.reset()
   register = env.mechanism.registers['reward']
   register.write(env.physics, 1.5)
-  assert _measured(env) == 0.0
+  assert metered.measure(env) == 0.0
   for block in register.blocks:
     before = np.array(block.position(env.physics))
     heading = block.heading(env.physics)
     for axis in np.eye(3):
       for amount, expected in ((0.04, 0.0), (0.06, 1.0), (0.0, 0.0)):
         block.put(env.physics, before + amount * axis, heading)
-        assert _measured(env) == expected
+        assert metered.measure(env) == expected
   if kind == 'block_orientation':
     # The sides of the block are 0.1 m from its centre.
     for angle, expected in ((0.4, 0.0), (0.6, 1.0)):
       block.put(env.physics, before, heading + angle)
-      assert _measured(env) == expected
+      assert metered.measure(env) == expected
   env.close()
 
 
 def test_a_register_that_moved_is_detected_in_the_worlds_in_which_it_did():
-  design = _design({'kind': 'register_moved', 'of': 'reward'}, dof='planar')
-  batch = suite.load_batch(*_TASK, {'random': 3}, num_envs=2, design=design)
+  design = metered.design(
+      {'kind': 'register_moved', 'of': 'reward'}, dof='planar'
+  )
+  batch = suite.load_batch(
+      *metered.TASK, {'random': 3}, num_envs=2, design=design
+  )
   batch.reset()
   base = batch.mechanism.registers['reward'].blocks[0]
   moved = np.array(base.position(batch.physics))
   moved[1, 0] += 0.02
   base.put(batch.physics, moved)
-  np.testing.assert_array_equal(_measured(batch), [0.0, 1.0])
+  np.testing.assert_array_equal(metered.measure(batch), [0.0, 1.0])
   batch.close()
 
 
 @pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
 def test_a_register_has_the_speed_of_its_fastest_block(channel: str):
-  design = _design({'kind': 'speed', 'of': 'reward'}, channel=channel)
+  design = metered.design({'kind': 'speed', 'of': 'reward'}, channel=channel)
   place = {'position': [1.4, -2.2], 'yaw': 0.7}
   design['registers']['reward']['place'] = place
-  env = suite.load(*_TASK, {'random': 3}, design=design)
+  env = suite.load(*metered.TASK, {'random': 3}, design=design)
   env.reset()
-  assert _measured(env) == pytest.approx(0.0, abs=0.01)
+  assert metered.measure(env) == pytest.approx(0.0, abs=0.01)
   if channel != 'welded':
     _, offset = env.mechanism.registers['reward'].blocks
     offset.launch(env.physics, np.array([0.0, 3.0, 4.0]), True)
-    assert _measured(env) == pytest.approx(5.0)
+    assert metered.measure(env) == pytest.approx(5.0)
   env.close()
 
 
 def test_collected_objects_are_counted_by_kind():
-  design = _design({'kind': 'collected', 'of': 'apples'})
+  design = metered.design({'kind': 'collected', 'of': 'apples'})
   env = suite.load('collect_apples', 'standard', {'random': 3}, design=design)
   env.reset()
   for eaten in range(1, 4):
@@ -226,18 +206,18 @@ def test_collected_objects_are_counted_by_kind():
     place = apples.measurable.positions(env.physics)[left][0]
     # The next apple alone, not its neighbours within reach.
     apples.eat(env.physics, place[:2], 1e-6)
-    assert _measured(env) == eaten
+    assert metered.measure(env) == eaten
   env.close()
 
 
 def test_eaten_apples_are_no_longer_near():
   measures = {'kind': 'distance', 'from': 'avatar', 'to': 'apples'}
   for absent in (100.0, 7.0):
-    design = _design({**measures, 'absent': absent})
+    design = metered.design({**measures, 'absent': absent})
     env = suite.load('collect_apples', 'standard', {'random': 3}, design=design)
     env.reset()
     here = env.task.avatar.position(env.physics)
-    near = _measured(env)
+    near = metered.measure(env)
     apples = measurables.in_world(env.task.root_entity)['apples']
     (group,) = [
         e
@@ -245,16 +225,16 @@ def test_eaten_apples_are_no_longer_near():
         if e.mjcf_model.model == 'apples'
     ]
     group.eat(env.physics, here, near + 1e-6)
-    assert near < _measured(env) < absent
+    assert near < metered.measure(env) < absent
     group.eat(env.physics, here, 50.0)
-    assert _measured(env) == absent
+    assert metered.measure(env) == absent
     assert not apples.is_present(env.physics).any()
     env.close()
 
 
 def test_all_meters_measure_before_one_writes():
   # The second meter measures a block that the first meter's write moves.
-  design = _design({'kind': 'time'}, place='station_3')
+  design = metered.design({'kind': 'time'}, place='station_3')
   design['registers']['score'].update(scale=0.1, range=[0, 20])
   design['registers']['x'] = {
       **designs.SCORE, 'place': 'station_4', 'range': [-5, 5], 'scale': 0.1,
@@ -262,7 +242,7 @@ def test_all_meters_measure_before_one_writes():
   at = {'kind': 'position', 'of': 'score', 'axis': 'x'}
   design['registers']['score']['kind'] = 'block_position'
   design['meters'].append({'measures': at, 'writes': 'x'})
-  env = suite.load(*_TASK, {'random': 3}, design=design)
+  env = suite.load(*metered.TASK, {'random': 3}, design=design)
   env.reset()
   env.step(np.zeros(6))
   before = _centre(env, 'score/block')[0]
@@ -287,7 +267,9 @@ def test_each_meter_has_a_readable_name_of_its_own():
   ]
   names = []
   for measures in measured:
-    env = suite.load(*_TASK, {'random': 3}, design=_design(measures))
+    env = suite.load(
+        *metered.TASK, {'random': 3}, design=metered.design(measures)
+    )
     sink = helpers.RecordingSink()
     env.add_sink(sink)
     env.reset()
@@ -305,7 +287,7 @@ def test_each_meter_has_a_readable_name_of_its_own():
 
 def test_a_design_with_measurements_round_trips():
   for measures in ('score', *(m for m, _ in _KINDS.values())):
-    spec = specs.load(_design(measures))
+    spec = specs.load(metered.design(measures))
     data = spec.to_mapping()
     assert specs.load(data) == spec
     assert specs.load(data).digest() == spec.digest()
@@ -373,178 +355,14 @@ def test_a_wrong_measurement_is_refused_with_what_is_allowed(
     measures: Any, text: str
 ):
   with pytest.raises(errors.SpecError, match=text) as caught:
-    suite.load(*_TASK, design=_design(measures))
+    suite.load(*metered.TASK, design=metered.design(measures))
   assert '\n' not in str(caught.value)
 
 
 def test_a_name_with_two_meanings_is_refused():
-  design = _design({'kind': 'speed', 'of': 'pad'})
+  design = metered.design({'kind': 'speed', 'of': 'pad'})
   design['registers']['pad'] = design['registers'].pop('reward')
   design['providers'][0]['writes'] = ['pad']
   design['learner']['reward'] = 'pad'
   with pytest.raises(errors.SpecError, match="'pad' is a register and a part"):
-    suite.load(*_TASK, design=design)
-
-
-# Measurements of one's own.
-
-
-@final
-class _Height(measurements.Measurement):
-  """The height of a part, times a factor."""
-
-  kind: Literal['test_height'] = 'test_height'
-  of: str
-  factor: float = 1.0
-
-  def connect(self, world: measurements.World) -> measurements.Measure:
-    if self.factor == 0.0:
-      raise ZeroDivisionError('no factor')
-    part = world.body('of', self.of)
-    return lambda physics: self.factor * part.positions(physics)[..., 0, 2]
-
-
-@pytest.mark.parametrize('num_envs', [None, 2])
-def test_a_registered_measurement_is_usable_by_its_kind(num_envs: int | None):
-  measures = {'kind': 'test_height', 'of': 'reward', 'factor': 10.0}
-  with helpers.registered(measurements.MEASUREMENTS, 'test_height', _Height):
-    design = _design(measures, dof='planar', block_size=0.3)
-    if num_envs is None:
-      env: Any = suite.load(*_TASK, {'random': 1}, design=design)
-    else:
-      env = suite.load_batch(
-          *_TASK, {'random': 1}, num_envs=num_envs, design=design
-      )
-    env.reset()
-    np.testing.assert_allclose(_measured(env), 1.54)
-    assert np.shape(_measured(env)) == (() if num_envs is None else (2,))
-    env.close()
-    wrong = _design({**measures, 'factor': 0.0})
-    with pytest.raises(errors.SpecError, match=r'measures: ZeroDivisionError'):
-      suite.load(*_TASK, design=wrong)
-  with pytest.raises(errors.SpecError, match=r'measures.kind: must be one of'):
-    suite.load(*_TASK, design=design)
-
-
-@final
-class _Listed(measurements.Measurement):
-  """Reads a number from a file."""
-
-  kind: Literal['test_listed'] = 'test_listed'
-  file: option_types.FilePath
-
-  def connect(self, world: measurements.World) -> measurements.Measure:
-    raise AssertionError('the file is opened')
-
-
-def test_a_file_design_may_not_name_files_elsewhere(tmp_path: Any):
-  with helpers.registered(measurements.MEASUREMENTS, 'test_listed', _Listed):
-    path = tmp_path / 'design.yaml'
-    design = _design({'kind': 'test_listed', 'file': '/etc/passwd'})
-    path.write_text(json.dumps(design))
-    with pytest.raises(errors.SpecError, match=r'measures.file: .*outside'):
-      specs.load(path)
-
-
-def test_a_task_may_declare_parts_of_its_own():
-
-  class Furnished(collect_apples.CollectApples):
-    """Has a ball that rolls."""
-
-    def __init__(self) -> None:
-      super().__init__()
-      body = self._arena.mjcf_model.worldbody.add(
-          'body', name='ball', pos=(1, 2, 0.2)
-      )
-      body.add('geom', type='sphere', size=(0.2,), mass=1.0)
-      self.joints = [
-          body.add('joint', type='slide', axis=axis) for axis in np.eye(3)[:2]
-      ]
-      self._ball = body
-
-    @property
-    def measurables(self) -> Any:
-      ball = measurables.Measurable((self._ball,))
-      return {**super().measurables, 'ball': ball}
-
-  measures = {'kind': 'speed', 'of': 'ball'}
-  env = suite.embed(Furnished(), _design(measures), random=1)
-  env.reset()
-  env.physics.bind(env.task.joints).qvel = [0.3, 0.4]
-  assert _measured(env) == pytest.approx(0.5)
-  env.close()
-
-
-# Functions of `suite.embed`.
-
-
-def test_a_function_may_not_replace_one_of_the_task():
-  for name, task in (
-      ('score', helpers.PointTask()),
-      ('score', collect_apples.CollectApples()),
-      ('door_unlocked', unlock_door.UnlockDoor()),
-  ):
-    with pytest.raises(errors.SpecError, match=f"measurements: '{name}' is me"):
-      suite.embed(task, 'none', measurements={name: lambda physics: 1.0})
-
-
-def test_a_function_has_precedence_over_a_kind_without_options():
-  for measures, expected in (('time', 7.0), ({'kind': 'time'}, 0.0)):
-    env = suite.embed(
-        collect_apples.CollectApples(), _design(measures), random=1,
-        measurements={'time': lambda physics: 7.0},
-    )  # fmt: skip
-    env.reset()
-    assert _measured(env) == expected
-    env.close()
-
-
-def test_bodies_of_foreign_tasks_are_named_by_their_identifiers():
-  design = copy.deepcopy(helpers.SCORED)
-  for measures, truth in (
-      ({'kind': 'position', 'of': 'bead', 'axis': 'x'}, 'x'),
-      ({'kind': 'speed', 'of': 'bead'}, 'speed'),
-      ({'kind': 'distance', 'from': 'bead', 'to': 'score'}, None),
-  ):
-    design['meters'][0]['measures'] = measures
-    env, _ = helpers.embed(helpers.PointTask(), design)
-    env.reset()
-    for _ in range(4):
-      env.step([1.0])
-    joint = env.physics.bind(env.task.joint)
-    measured = _measured(env)
-    if truth == 'x':
-      assert measured == pytest.approx(float(joint.qpos[0]))
-    elif truth == 'speed':
-      assert measured == pytest.approx(abs(float(joint.qvel[0]))) != 0.0
-    else:
-      blocks = env.mechanism.registers['score'].blocks
-      centres = [worlds.world_position(env.physics, b) for b in blocks]
-      away = [np.hypot(x - float(joint.qpos[0]), y) for x, y, _ in centres]
-      assert measured == pytest.approx(min(away), abs=0.01)
-    env.close()
-  design['meters'][0]['measures'] = {'kind': 'speed', 'of': 'bed'}
-  with pytest.raises(errors.SpecError, match=r"measures.of: 'bed'.*'bead'"):
-    helpers.embed(helpers.PointTask(), design)
-
-
-def test_attached_entities_of_foreign_tasks_have_positions_and_speeds():
-  design = copy.deepcopy(helpers.SCORED)
-  for name in ('walker/', 'walker/head_body'):
-    design['meters'][0]['measures'] = {'kind': 'speed', 'of': name}
-    task = go_to_target.GoToTarget(
-        jumping_ball.RollingBallWithHead(), floors.Floor(size=(8.0, 8.0))
-    )
-    env, _ = helpers.embed(task, design)
-    env.reset()
-    for _ in range(4):
-      env.step(np.ones(env.action_spec().shape))
-    measured = _measured(env)
-    velocity = np.zeros(6)
-    mujoco.mj_objectVelocity(
-        env.physics.model.ptr, env.physics.data.ptr,
-        mujoco.mjtObj.mjOBJ_XBODY, env.physics.model.name2id(name, 'body'),
-        velocity, 0,
-    )  # fmt: skip
-    assert measured == pytest.approx(np.linalg.norm(velocity[3:])) != 0.0
-    env.close()
+    suite.load(*metered.TASK, design=design)
