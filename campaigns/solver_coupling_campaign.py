@@ -135,8 +135,8 @@ def play(
       secrets.UNREAD_METER,
       random=world.seed,
       max_steps=STEPS + 1,
-      measurements={'score': measure},
-      overrides=(f'dof={world.dof}',),
+      measurements={'measured': measure},
+      overrides=(f'dof={world.dof}', 'meters.0.measures=measured'),
   )
   time_step = env.reset()
   for name, value in world.options:

@@ -20,6 +20,7 @@ from realab_suite.engine import forking
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
 from realab_suite.entities import block_kinds
+from realab_suite.entities import measurables
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
@@ -293,7 +294,8 @@ def embed(
       ends episodes.
     world: Index of the world in a batch; random streams differ between worlds.
     measurements: Functions of the physics that meters can measure, by name, in
-      addition to `score`, the true return so far.
+      addition to those of the task. None may replace a function of the task or
+      `score`, the true return so far.
     overrides: Same as in `load`.
 
   Raises:
@@ -336,13 +338,7 @@ def _connected(
     measurements: Mapping[str, Callable[[Any], Any]],
 ) -> environment.Environment:
   """Returns the environment of a task with an attached mechanism."""
-  mechanism.connect(
-      {
-          'score': mechanism.score,
-          **(task.measurements if isinstance(task, base.Task) else {}),
-          **measurements,
-      }
-  )
+  _connect_meters(task, mechanism, measurements)
   if isinstance(task, base.Task):
     blocks = _blocks_of(mechanism)
     task.avatar.make_graspable(blocks)
@@ -360,6 +356,36 @@ def _connected(
       placement.check_start(env.physics, task, mechanism)
     stack.pop_all()
   return env
+
+
+def _connect_meters(
+    task: composer.Task,
+    mechanism: mechanisms.FeedbackMechanism,
+    added: Mapping[str, Callable[[Any], Any]],
+) -> None:
+  """Connects the meters of a mechanism to a task.
+
+  Raises:
+    SpecError: If a meter measures what this world does not offer, or if an
+      added measurement has the name of another one.
+  """
+  functions: dict[str, Callable[[Any], Any]] = {'score': mechanism.score}
+  if isinstance(task, base.Task):
+    functions |= task.measurements
+    parts = task.measurables
+  else:
+    root = task.root_entity
+    parts = {
+        **measurables.bodies_in_world(root),
+        **measurables.in_world(root),
+    }
+  for name in added:
+    if name in functions:
+      raise errors.SpecError(
+          f'measurements: {name!r} is measured by the task; allowed are names'
+          f' other than {sorted(functions)}'
+      )
+  mechanism.connect({**functions, **added}, parts)
 
 
 def _keywords(argument: str, value: Any) -> dict[str, Any]:

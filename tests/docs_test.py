@@ -10,6 +10,7 @@ import yaml
 from realab_suite import suite
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import probes
+from realab_suite.feedback import measurements
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 
@@ -40,6 +41,7 @@ def registries():
   before = [
       (registry, dict(registry))
       for registry in (
+          measurements.MEASUREMENTS._entries,
           providers.PROVIDERS._entries,
           register_kinds.REGISTER_KINDS._entries,
           suite._TASKS,

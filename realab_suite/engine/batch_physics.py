@@ -21,8 +21,9 @@ from realab_suite.entities import cameras
 from realab_suite.entities import protocols
 from realab_suite.entities import rays
 
-# Positions and what derives from them.
+# Positions and what derives from them, and what derives from velocities, too.
 _POSITIONS = int(mujoco.mjtStage.mjSTAGE_POS)
+_VELOCITIES = int(mujoco.mjtStage.mjSTAGE_VEL)
 # What the poses of bodies, geoms and sites do not depend on.
 _NEEDLESS = (
     mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -49,6 +50,8 @@ _DERIVED_FIELDS = {
     ('mocap_body', 'xmat'): 'xmat',
     ('site', 'xmat'): 'site_xmat',
     ('geom', 'xmat'): 'geom_xmat',
+    ('body', 'cvel'): 'cvel',
+    ('body', 'subtree_com'): 'subtree_com',
 }
 
 
@@ -91,9 +94,10 @@ class BatchPhysics:
     still = copy.copy(template.model)
     still.opt.disableflags |= int(_NEEDLESS)
     self._poses = mujoco_batch.Batch(still.ptr, num_envs, num_threads)
-    self._data = _Userdata(self._batch.bind('userdata'))
+    self._data = _Data(self._batch.bind('userdata'), self._batch.bind('time'))
     self._bindings: dict[Any, _BatchBinding] = {}
     self._is_dirty = True
+    self._stage = _POSITIONS
     self._worlds = [_WorldView(self, i) for i in range(num_envs)]
 
   @property
@@ -107,8 +111,8 @@ class BatchPhysics:
     return self._model
 
   @property
-  def data(self) -> '_Userdata':
-    """Object with the attribute `userdata`, `(worlds, slots)`, live."""
+  def data(self) -> '_Data':
+    """Object with `userdata`, `(worlds, slots)`, live, and `time`."""
     return self._data
 
   @property
@@ -138,7 +142,7 @@ class BatchPhysics:
   def forward(self) -> None:
     """Updates the poses of bodies, geoms and sites."""
     self._poses.state[:] = self._batch.state
-    self._poses.forward(stage=_POSITIONS)
+    self._poses.forward(stage=self._stage)
     self._is_dirty = False
 
   def check(self) -> None:
@@ -258,6 +262,8 @@ class BatchPhysics:
       field = _DERIVED_FIELDS[binding._namespace, name]
       # A derived field is filled from the next call of `forward` on.
       self._is_dirty = True
+      if name == 'cvel':
+        self._stage = _VELOCITIES
     if not isinstance(index, int | np.integer | slice):
       index = np.asarray(index)
       if np.array_equal(index, np.arange(index[0], index[0] + len(index))):
@@ -284,11 +290,17 @@ def _(
 
 
 @final
-class _Userdata:
+class _Data:
   """The part of `physics.data` that entities use."""
 
-  def __init__(self, userdata: np.ndarray) -> None:
+  def __init__(self, userdata: np.ndarray, time: np.ndarray) -> None:
     self.userdata = userdata
+    self.times = time
+
+  @property
+  def time(self) -> np.ndarray:
+    """Time since the start of the episode, `(...)`, in s."""
+    return np.array(self.times)[()]
 
 
 @final
@@ -298,7 +310,8 @@ class _WorldView:
   def __init__(self, physics: BatchPhysics, index: int) -> None:
     self._physics = physics
     self._index = index
-    self._data = _Userdata(physics.data.userdata[index])
+    data = physics.data
+    self._data = _Data(data.userdata[index], data.times[index, ...])
     self._bindings: dict[Any, _WorldBinding] = {}
 
   @property
@@ -306,7 +319,7 @@ class _WorldView:
     return self._physics.model
 
   @property
-  def data(self) -> _Userdata:
+  def data(self) -> _Data:
     return self._data
 
   def bind(self, mjcf_elements: Any) -> '_WorldBinding':
@@ -347,6 +360,8 @@ class _Binding(abc.ABC):
   active = _attribute('active')
   xpos = _attribute('xpos')
   xmat = _attribute('xmat')
+  cvel = _attribute('cvel')
+  subtree_com = _attribute('subtree_com')
 
   def __init__(self, binding: Any) -> None:
     self._binding = binding

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import supports
 from realab_suite.engine import swept_volumes
 from realab_suite.entities import arenas
 from realab_suite.entities import moving
@@ -54,19 +55,26 @@ def check(
     mechanism: Registers, meters and providers.
 
   Raises:
-    SpecError: If a block could leave the arena, or overlap an immovable object
-      or another register; or if the solver lets meters affect bodies that they
-      do not touch.
+    SpecError: If a block could leave the arena, overlap an immovable object or
+      another register, or be above the floor with nothing under it; or if the
+      solver lets meters affect bodies that they do not touch.
   """
   _check_solver(physics, mechanism)
   space = swept_volumes.Space(physics.model.ptr)
   paths = _reachable_poses(physics, mechanism.registers)
   obstacles = _SweepIndex(space)
   obstacles.add('', _obstacles(physics, root, paths))
+  surfaces = supports.Surfaces(physics)
   blocks = _SweepIndex(space)
   for name, path in paths.items():
     for sweep in path:
-      _check_extent(name, sweep, root)
+      _check_extent(name, sweep, root, space)
+      if (pose := surfaces.find_unsupported(sweep)) is not None:
+        raise errors.SpecError(
+            f'{_describe(name, pose)} and a height of {pose.centre[2]:.3g} m,'
+            ' with nothing under its centre that stays in place; place it on'
+            ' one table or shelf for all of its range, or on the floor'
+        )
       for _, obstacle in obstacles.near(sweep):
         if (found := space.meet(sweep, obstacle)) is not None:
           pose, distance = found
@@ -319,11 +327,19 @@ def _travels(
 
 
 def _check_extent(
-    name: str, sweep: swept_volumes.Sweep, root: composer.Entity
+    name: str,
+    sweep: swept_volumes.Sweep,
+    root: composer.Entity,
+    space: swept_volumes.Space,
 ) -> None:
-  """Refuses a block whose centre can leave the arena."""
+  """Refuses a block whose centre can leave the arena, or that is too high."""
   if not isinstance(root, arenas.RoomArena):
     return
+  if (top := space.bounds(sweep)[1][2]) > root.ceiling:
+    raise errors.SpecError(
+        f'register {name!r} would reach a height of {top:.3g} m; allowed in'
+        f' this arena are at most {root.ceiling:g} m'
+    )
   for axis in range(2):
     for side in (-1.0, 1.0):
       ahead = side * sweep.motions[:, axis]

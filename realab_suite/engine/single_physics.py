@@ -216,6 +216,16 @@ def _pose_property(name: str) -> property:
   return property(get)
 
 
+def _derived_property(name: str) -> property:
+  """Returns a property for an attribute that is updated when it is read."""
+
+  def get(self: '_ThinBinding') -> np.ndarray:
+    self._physics.refresh()
+    return self._read(name)
+
+  return property(get)
+
+
 @final
 class _ThinBinding(mjcf_physics.Binding):
   """A binding with fast access to the attributes that entities use.
@@ -236,6 +246,8 @@ class _ThinBinding(mjcf_physics.Binding):
   active = _state_property('active')
   xpos = _pose_property('xpos')
   xmat = _pose_property('xmat')
+  cvel = _derived_property('cvel')
+  subtree_com = _derived_property('subtree_com')
 
   def __init__(self, physics: ThinPhysics, namespace: str, names: Any) -> None:
     object.__setattr__(self, '_reads', {})

@@ -9,6 +9,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import appearance
+from realab_suite.entities import measurables
 from realab_suite.entities import moving
 from realab_suite.entities import protocols
 from realab_suite.entities import state
@@ -19,7 +20,7 @@ _GONE = -5.0
 
 
 @final
-class Apples(composer.Entity):
+class Apples(measurables.MeasurableEntity):
   """A group of apples of one size.
 
   Nothing collides with an apple. An eaten apple is gone until the next episode.
@@ -67,6 +68,14 @@ class Apples(composer.Entity):
   def frames(self) -> tuple[mjcf.Element, ...]:
     """Mocap bodies of the apples."""
     return self._frames
+
+  @property
+  def measurable(self) -> measurables.Measurable:
+    return measurables.Measurable(
+        self._frames,
+        is_present=lambda physics: self._eaten.get(physics) == 0.0,
+        num_collected=self.num_eaten,
+    )
 
   @property
   def number(self) -> int:

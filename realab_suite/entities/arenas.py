@@ -36,21 +36,25 @@ class Place:
     yaw: Angle of the register's axis to the x axis, in rad.
     spread: Half-widths of the region around `position`, along the register's
       axis and across it, in m. Each episode draws a position from the region.
+    height: Height of the surface that the register stands on, in m.
   """
 
   position: tuple[float, float]
   yaw: float = 0.0
   spread: tuple[float, float] = (0.0, 0.0)
+  height: float = 0.0
 
   def __post_init__(self) -> None:
     """Checks the numbers.
 
     Raises:
-      SpecError: If a number is missing or not finite, or if a half-width is
-        negative.
+      SpecError: If a number is missing or not finite, or if a half-width or
+        the height is negative.
     """
     try:
-      numbers = np.array([*self.position, self.yaw, *self.spread], float)
+      numbers = np.array(
+          [*self.position, self.yaw, *self.spread, self.height], float
+      )
       is_valid = len(self.position) == len(self.spread) == 2
       is_valid &= bool(np.isfinite(numbers).all() and (numbers[3:] >= 0).all())
     except (TypeError, ValueError):
@@ -58,7 +62,8 @@ class Place:
     if not is_valid:
       raise errors.SpecError(
           f'{self!r:.160}; allowed are finite numbers, two for the position,'
-          ' one for the yaw, and two of at least 0 for the spread'
+          ' one for the yaw, two of at least 0 for the spread, and one of at'
+          ' least 0 for the height'
       )
 
 
@@ -113,6 +118,8 @@ class RoomArena(composer.Arena):
         specular=(0.05, 0.05, 0.05),
     )  # fmt: skip
     root.visual.map.znear = 0.001
+    # Clipping planes scale with the extent, and sites outside the room count.
+    root.statistic.extent = 17.0
     root.asset.add(
         'texture', name='sky', type='skybox', builtin='gradient',
         rgb1=(0.75, 0.86, 0.95), rgb2=(0.95, 0.97, 1.0), width=64, height=64,
@@ -182,6 +189,11 @@ class RoomArena(composer.Arena):
     )  # fmt: skip
 
   @property
+  def ceiling(self) -> float:
+    """Height above which no block can be, in m."""
+    return _LID_HEIGHT
+
+  @property
   @abc.abstractmethod
   def room(self) -> Rectangle:
     """Main room, between the inner faces of its walls."""
@@ -224,6 +236,40 @@ class RoomArena(composer.Arena):
       end: Other end of its centre line, `(x, y)`, in m.
     """
     self._add_box(name, 'barrier', start, end, _BARRIER_HEIGHT)
+
+  def add_table(
+      self,
+      name: str,
+      position: Sequence[float],
+      size: Sequence[float],
+      height: float,
+  ) -> None:
+    """Adds a table, and a place of its name in the middle of its top.
+
+    A table is a box on the floor that nothing can push. Rays report it as a
+    barrier.
+
+    Args:
+      name: Name of the geom and of the place.
+      position: Centre, `(x, y)`, in m.
+      size: Lengths along x and y, in m.
+      height: Height of the top, in m; at most that of a wall.
+
+    Raises:
+      SpecError: If a length is not allowed, or if there is a place of the name.
+    """
+    if not (min(size) > 0 and 0 < height <= _WALL_HEIGHT):
+      raise errors.SpecError(
+          f'table {name!r}: size {tuple(size)} and height {height}; allowed are'
+          f' lengths above 0, and heights above 0 up to {_WALL_HEIGHT}'
+      )
+    x, y = position
+    self.offer({name: Place((x, y), height=height)})
+    self._mjcf_root.worldbody.add(
+        'geom', name=name, type='box',
+        size=(size[0] / 2, size[1] / 2, (height + _DEPTH) / 2),
+        pos=(x, y, (height - _DEPTH) / 2), **appearance.geom_style('barrier'),
+    )  # fmt: skip
 
   def _add_wall(
       self, name: str, start: Sequence[float], end: Sequence[float]

@@ -13,6 +13,7 @@ from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import grasps
+from realab_suite.entities import measurables
 from realab_suite.entities import protocols
 from realab_suite.entities import rays
 
@@ -94,7 +95,7 @@ class AvatarObservables(composer.Observables):
 
 
 @final
-class Avatar(composer.Entity):
+class Avatar(measurables.MeasurableEntity):
   """A cylinder that walks, strafes, turns, looks, pushes, carries and throws.
 
   The avatar moves in the plane of the floor. Attach it at the origin of an
@@ -200,6 +201,10 @@ class Avatar(composer.Entity):
   @property
   def body(self) -> mjcf.Element:
     return self._body
+
+  @property
+  def measurable(self) -> measurables.Measurable:
+    return measurables.Measurable((self._body,))
 
   @property
   def camera(self) -> mjcf.Element:

@@ -90,6 +90,11 @@ class Block(abc.ABC):
 
   @property
   @abc.abstractmethod
+  def body(self) -> mjcf.Element | None:
+    """Body of the cube; `None` for a mocap block before `attach_to`."""
+
+  @property
+  @abc.abstractmethod
   def geom(self) -> mjcf.Element:
     """Geom of the cube."""
 
@@ -424,6 +429,14 @@ class PlanarBlock(JointedBlock):
   def _grip_offset(self) -> float:
     # A grip at another height would pull in a direction without a joint.
     return GRIP_HEIGHT - self.rest_height
+
+  def stand_at(self, height: float) -> None:
+    """Adapts the grip, which is at the height of the hand, to a surface.
+
+    Args:
+      height: Height of the surface that the register stands on, in m.
+    """
+    self._site.pos = [0.0, 0.0, self._grip_offset - height]
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
     moved = np.asarray(physics.bind(self._slides).qpos)

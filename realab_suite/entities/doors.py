@@ -9,6 +9,7 @@ import numpy as np
 
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
+from realab_suite.entities import measurables
 from realab_suite.entities import moving
 from realab_suite.entities import protocols
 
@@ -20,7 +21,7 @@ _BEYOND = 1.02
 
 
 @final
-class SlidingDoor(composer.Entity):
+class SlidingDoor(measurables.MeasurableEntity):
   """A door that slides open along the x axis.
 
   Contacts cannot move the door. Its pose is its only state.
@@ -54,6 +55,10 @@ class SlidingDoor(composer.Entity):
   @property
   def mjcf_model(self) -> mjcf.RootElement:
     return self._mjcf_root
+
+  @property
+  def measurable(self) -> measurables.Measurable:
+    return measurables.Measurable((self._leaf.frame,))
 
   def attach_to(self, root: composer.Entity, position: Sequence[float]) -> None:
     """Attaches the door to the root entity of a task, closed.

@@ -36,6 +36,21 @@ class Meter:
     """Meter register that the meter writes."""
     return self._register
 
+  def measure(
+      self, physics: protocols.Physics, idle: np.ndarray | None = None
+  ) -> np.ndarray:
+    """Returns the value to write, `(...)`, in the register's units.
+
+    Args:
+      physics: One world or a batch of worlds.
+      idle: True for each world whose register keeps its value, `(...)` bool;
+        `None` for no world.
+    """
+    measured = np.array(self._measurement(physics), np.float64)[()]
+    if idle is not None:
+      measured = np.where(idle, self._register.keep(physics), measured)
+    return measured
+
   def update(
       self, physics: protocols.Physics, idle: np.ndarray | None = None
   ) -> tuple[np.ndarray, np.ndarray]:
@@ -43,8 +58,7 @@ class Meter:
 
     Args:
       physics: One world or a batch of worlds.
-      idle: True for each world whose register keeps its value, `(...)` bool;
-        `None` for no world.
+      idle: See `measure`.
 
     Returns:
       Measured value and applied value, each `(...)`, in the register's units.
@@ -52,7 +66,5 @@ class Meter:
     Raises:
       RegisterValueError: If the register cannot store a measured value.
     """
-    measured = np.array(self._measurement(physics), np.float64)[()]
-    if idle is not None:
-      measured = np.where(idle, self._register.keep(physics), measured)
+    measured = self.measure(physics, idle)
     return measured, self._register.write(physics, measured)

@@ -49,6 +49,10 @@ class MocapBlock(block_kinds.Block):
     self._yaw = 0.0
 
   @property
+  def body(self) -> mjcf.Element | None:
+    return self._part.frame
+
+  @property
   def geom(self) -> mjcf.Element:
     return self._part.geoms[0]
 
@@ -63,10 +67,10 @@ class MocapBlock(block_kinds.Block):
 
     Args:
       root: Root entity of the task.
-      position: Origin of the register's frame, `(x, y)`, in m.
+      position: Origin of the register's frame, `(x, y, z)`, in m.
       yaw: Angle of the register's axis to the x axis of the world, in rad.
     """
-    self._origin = np.array([*position, 0.0])
+    self._origin = np.array(position, float)
     self._yaw = yaw
     frame = self._part.attach_to(root, list(self._to_world(self._rest)))
     frame.quat = rotations.quaternion_of(yaw)

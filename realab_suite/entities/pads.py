@@ -8,6 +8,7 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite.entities import appearance
+from realab_suite.entities import measurables
 from realab_suite.entities import moving
 from realab_suite.entities import protocols
 from realab_suite.entities import state
@@ -19,7 +20,7 @@ _STUB = 0.3
 
 
 @final
-class PressurePad(composer.Entity):
+class PressurePad(measurables.MeasurableEntity):
   """A plate around a solid post, which sinks when the pad is pressed.
 
   The lower part of the post, which rays hit, is orange, and the upper part is
@@ -70,6 +71,10 @@ class PressurePad(composer.Entity):
   def frames(self) -> tuple[mjcf.Element, ...]:
     """Mocap body of the post."""
     return (self._post.frame,)
+
+  @property
+  def measurable(self) -> measurables.Measurable:
+    return measurables.Measurable(self.frames)
 
   def attach_to(self, root: composer.Entity, position: Sequence[float]) -> None:
     """Attaches the pad to the root entity of a task.

@@ -47,6 +47,18 @@ class Binding(Protocol):
     """Rotation matrices in the world frame, `(..., 9)`."""
 
   @property
+  def cvel(self) -> Any:
+    """Velocities of bodies, `(..., 6)`: turning, in rad/s, and moving, in m/s.
+
+    They are velocities at `subtree_com` of the child of the world that a body
+    belongs to.
+    """
+
+  @property
+  def subtree_com(self) -> Any:
+    """Centres of mass of bodies and their children, `(..., 3)`, in m."""
+
+  @property
   def element_id(self) -> Any:
     """Indices of the elements in the compiled model; the same in all worlds."""
 
@@ -60,6 +72,10 @@ class Data(Protocol):
 
     The shape is `(nuserdata,)`, or `(worlds, nuserdata)` for a batch.
     """
+
+  @property
+  def time(self) -> Any:
+    """Time since the start of the episode, `(...)`, in s."""
 
 
 class Physics(Protocol):

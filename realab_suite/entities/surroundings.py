@@ -17,14 +17,15 @@ from realab_suite.entities import protocols
 # Prefix of the names of box sites in which no block may be written: the space
 # outside of rooms.
 OUTSIDE = 'outside.'
-# Width of such a box that extends beyond all worlds, in m.
-ENDLESS = 1e4
+# Width of such a box at the outside of a room, in m. Places beyond it are never
+# the nearest free ones.
+ENDLESS = 20.0
 # A block is in an obstacle if this fraction of its half edge length is inside.
 # Contacts push blocks out that are less deep inside, which is no obstruction:
 # blocks that were pushed against a wall are slightly inside.
 _TOLERANCE = 0.5
-# Beyond all worlds, in m.
-_FAR = 1e3
+# Far from everything in a room, in m.
+_FAR = ENDLESS
 _PARALLEL = 1e-9
 # Distance to an obstacle at which blocks are put, in m.
 _GAP = 1e-6

@@ -17,15 +17,19 @@ from realab_suite import errors
 from realab_suite.config import messages
 from realab_suite.entities import arenas
 from realab_suite.entities import axes
+from realab_suite.entities import measurables
 from realab_suite.entities import meters
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import records
+from realab_suite.feedback import measurements
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
+
+_NO_PARTS: Mapping[str, measurables.Measurable] = {}
 
 Guard = Callable[[], contextlib.AbstractContextManager[None]]
 
@@ -113,7 +117,7 @@ class FeedbackMechanism(composer.Entity):
     root.attach(self)
     for name, place in places.items():
       self._registers[name].attach_to(
-          root, place.position, place.yaw, place.spread
+          root, (*place.position, place.height), place.yaw, place.spread
       )
 
   def detach_from_root(self) -> None:
@@ -123,27 +127,31 @@ class FeedbackMechanism(composer.Entity):
     self.detach()
 
   def connect(
-      self, measurements: Mapping[str, Callable[[Any], np.ndarray]]
+      self,
+      functions: Mapping[str, measurements.Measure],
+      parts: Mapping[str, measurables.Measurable] = _NO_PARTS,
   ) -> None:
-    """Connects the meters to measurements.
+    """Connects the meters to a world.
 
     Args:
-      measurements: Functions of the physics that meters can measure, by name.
+      functions: Functions of the physics that meters can measure, by name.
+      parts: Parts of the world that meters can measure, by name.
 
     Raises:
-      SpecError: If a meter of the design names another measurement.
+      SpecError: If a meter of the design measures anything else.
     """
     for i, spec in enumerate(self._design.meters):
-      if spec.measures not in measurements:
-        raise errors.SpecError(
-            f'design {self._design.name!r}: meters[{i}].measures:'
-            f' {spec.measures!r} cannot be measured in this world; allowed are'
-            f' {sorted(measurements)}'
-        )
-      meter = meters.Meter(
-          measurements[spec.measures], self._registers[spec.writes]
+      world = measurements.World(
+          messages.Location(
+              f'design {self._design.name!r}', ('meters', i, 'measures')
+          ),
+          functions,
+          parts,
+          self._registers,
       )
-      self._meters.append((f'meter:{spec.measures}', meter))
+      title, measure = measurements.connect(spec.measures, world)
+      meter = meters.Meter(measure, self._registers[spec.writes])
+      self._meters.append((f'meter:{title}', meter))
 
   def guard_providers(self, guard: Guard) -> None:
     """Sets the context manager in which each call of a provider runs.
@@ -209,7 +217,10 @@ class FeedbackMechanism(composer.Entity):
   def update_meters(
       self, physics: protocols.Physics, idle: np.ndarray | None = None
   ) -> list[records.Write]:
-    """Measures with every meter and writes the meter registers.
+    """Measures with every meter, then writes the meter registers.
+
+    A write moves blocks, which other meters may measure. All meters therefore
+    measure first.
 
     Args:
       physics: One world or a batch of worlds.
@@ -226,11 +237,12 @@ class FeedbackMechanism(composer.Entity):
     if not self._meters:
       return []
     step = self._this_step(physics)
+    values = [meter.measure(physics, idle) for _, meter in self._meters]
     writes = []
-    for writer, meter in self._meters:
+    for (writer, meter), measured in zip(self._meters, values, strict=True):
       name = meter.register.name
       try:
-        measured, applied = meter.update(physics, idle)
+        applied = meter.register.write(physics, measured)
       except errors.RegisterValueError as error:
         raise errors.RegisterValueError(
             f'{_where(writer, step, error.world)}: register {name!r} cannot'
@@ -450,7 +462,8 @@ def _find_place(
     SpecError: If the world has no place of this name.
   """
   if isinstance(place, specs.PlaceSpec):
-    return arenas.Place(place.position, place.yaw, place.spread)
+    x, y, height = (*place.position, 0.0)[:3]
+    return arenas.Place((x, y), place.yaw, place.spread, height)
   if place not in named_places:
     raise errors.SpecError(
         f'registers.{name}.place: this world has no place {place!r}; allowed'

@@ -1,9 +1,7 @@
 """Specs of agent designs, and how to load them (paper, section 3.2)."""
 
 from collections.abc import Mapping, Sequence
-import functools
 from importlib import resources
-import operator
 import os
 from typing import Annotated, Any, Literal, final
 
@@ -17,8 +15,10 @@ from realab_suite.config import validation
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from realab_suite.feedback import consistency
+from realab_suite.feedback import measurements
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
+from realab_suite.feedback import registered_models
 from realab_suite.policies import action_sets
 
 _NAME = r'^[a-z][a-z0-9_]{0,63}$'
@@ -46,14 +46,16 @@ class PlaceSpec(validation.Spec):
   """A place for a register, given by coordinates.
 
   Attributes:
-    position: `(x, y)`, in m.
+    position: `(x, y)`, or `(x, y, z)` for a register on a surface of the height
+      z, in m.
     yaw: Angle of the register's axis to the x axis, in rad.
     spread: Half-widths of the region around `position` from which each episode
       draws the start position of the register, in m.
   """
 
   position: Annotated[
-      tuple[Coordinate, Coordinate], pydantic.Field(strict=False)
+      tuple[Coordinate, ...],
+      pydantic.Field(strict=False, min_length=2, max_length=3),
   ]
   yaw: Finite = 0.0
   spread: Annotated[
@@ -63,6 +65,13 @@ class PlaceSpec(validation.Spec):
       ],
       pydantic.Field(strict=False),
   ] = (0.0, 0.0)
+
+  @pydantic.field_validator('position')
+  @classmethod
+  def _above_the_floor(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+    if value[2:] < (0.0,) * len(value[2:]):
+      raise ValueError('z must be at least 0, the height of the floor')
+    return value
 
 
 @final
@@ -115,7 +124,7 @@ class RegisterSpec(validation.Spec):
   @pydantic.field_validator('place', mode='before')
   @classmethod
   def _coordinates(cls, place: Any) -> Any:
-    """Accepts `[x, y]` for a place without yaw or spread."""
+    """Accepts `[x, y]` and `[x, y, z]` for a place without yaw or spread."""
     if isinstance(place, list | tuple):
       return {'position': place}
     return place
@@ -137,12 +146,22 @@ class MeterSpec(validation.Spec):
   """Spec of a meter.
 
   Attributes:
-    measures: Name of a measurement of the world.
+    measures: Measurement, with its kind and options; or the name of a function
+      that the task offers, or of a kind that needs no options.
     writes: Name of a register with role `meter`.
   """
 
-  measures: Name
+  measures: Annotated[
+      Name | measurements.Measurement,
+      registered_models.ModelIn(measurements.MEASUREMENTS, or_name=Name),
+  ]
   writes: Name
+
+  @pydantic.field_serializer('measures')
+  def _dump_measures(self, value: str | measurements.Measurement) -> Any:
+    if isinstance(value, str):
+      return value
+    return value.model_dump(mode='json', by_alias=True)
 
 
 @final
@@ -222,29 +241,11 @@ class LearnerSpec(validation.Spec):
   kind: Name
 
 
-@final
-class _AnyProvider:
-  """Pydantic type that validates a provider as the class of its `kind`."""
-
-  @classmethod
-  def members(
-      cls, siblings: Mapping[str, Any] | None = None
-  ) -> list[type[providers.Provider]]:
-    """Returns the classes that are registered now."""
-    del siblings
-    return [providers.PROVIDERS.get(kind) for kind in providers.PROVIDERS]
-
-  @classmethod
-  def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
-    del source
-    union = functools.reduce(operator.or_, cls.members())
-    return handler.generate_schema(
-        Annotated[union, pydantic.Field(discriminator='kind')]
-    )
-
-
 # Inside the class below, `providers` is the name of a field.
 _Provider = providers.Provider
+_AnyProvider = Annotated[
+    _Provider, registered_models.ModelIn(providers.PROVIDERS)
+]
 
 
 @final
@@ -280,7 +281,7 @@ class DesignSpec(validation.Spec):
   )
   meters: Annotated[tuple[MeterSpec, ...], pydantic.Field(strict=False)] = ()
   providers: Annotated[
-      tuple[Annotated[_Provider, _AnyProvider], ...],
+      tuple[_AnyProvider, ...],
       pydantic.Field(strict=False),
   ] = ()
   schedule: ScheduleSpec | Literal['cfmdp'] | None = None
@@ -369,7 +370,7 @@ class DesignSpec(validation.Spec):
 
 Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec
 
-_validated_kinds: list[type[_Provider]] = []
+_validated_kinds: list[type[pydantic.BaseModel]] = []
 
 
 def load(
@@ -444,9 +445,14 @@ def json_schema() -> dict[str, Any]:
 
 
 def _update_validator() -> None:
-  """Rebuilds the validator if the registered providers have changed."""
-  kinds = _AnyProvider.members()
+  """Rebuilds the validator if the registered classes have changed."""
+  kinds = [
+      names.get(kind)
+      for names in (providers.PROVIDERS, measurements.MEASUREMENTS)
+      for kind in names
+  ]
   if _validated_kinds != kinds:
+    MeterSpec.model_rebuild(force=True)
     DesignSpec.model_rebuild(force=True)
     _validated_kinds[:] = kinds
 

@@ -16,6 +16,7 @@ from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
 from realab_suite.entities import cameras
+from realab_suite.entities import measurables
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 
@@ -153,6 +154,15 @@ class Task(composer.Task):
     Each returns values of shape `(...)`.
     """
     return {'score': self.score}
+
+  @property
+  def measurables(self) -> Mapping[str, measurables.Measurable]:
+    """Parts of the world that meters can measure, by name.
+
+    They are those that the entities of the task declare. A subclass can add
+    others, such as a body of its own.
+    """
+    return measurables.in_world(self._arena)
 
   @property
   @abc.abstractmethod

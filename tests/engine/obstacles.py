@@ -70,10 +70,22 @@ def _registers(draw: Any) -> dict[str, Any]:
   }
 
 
-rooms = st.tuples(
-    st.lists(_obstacles, min_size=1, max_size=3),
-    st.lists(_registers(), min_size=1, max_size=2),
-)
+@st.composite
+def _rooms(draw: Any) -> tuple[list[Obstacle], list[dict[str, Any]]]:
+  obstacles = draw(st.lists(_obstacles, min_size=1, max_size=3))
+  registers = draw(st.lists(_registers(), min_size=1, max_size=2))
+  table = obstacles[0]
+  if draw(st.booleans()) and table.shape in ('box', 'cylinder'):
+    # A register near the middle of the top of the first obstacle.
+    x, y = table.position
+    registers[0]['place'] |= {
+        'position': [x, y, 2 * table.size[-1]],
+        'spread': [draw(st.just(0.0) | _floats(0.0, 0.4)), 0.0],
+    }
+  return obstacles, registers
+
+
+rooms = _rooms()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +132,7 @@ class Room:
               x - extent.low[0], y - extent.low[1],
               extent.high[0] - x, extent.high[1] - y,
           ))  # fmt: skip
+      found = max(found, self._unsupported(blocks))
       for one, other in pairs:
         distance = mujoco.mj_geomDistance(
             physics.model.ptr, physics.data.ptr, one, other, 0.1, None
@@ -141,6 +154,22 @@ class Room:
             )
             found = max(found, -distance)
     return found
+
+  def _unsupported(self, blocks: list[list[int]]) -> float:
+    """Returns 1 if a block above the floor has nothing under its centre."""
+    model, data = self.env.physics.model, self.env.physics.data
+    for geom in itertools.chain(*blocks):
+      half, centre = model.geom_size[geom][2], np.array(data.geom_xpos[geom])
+      if centre[2] - half < 0.02:
+        continue
+      below, hit = np.array([0.0, 0.0, -1.0]), np.array([-1], np.int32)
+      distance = mujoco.mj_ray(
+          model.ptr, data.ptr, centre, below, None, 1,
+          model.geom_bodyid[geom], hit, None,
+      )  # fmt: skip
+      if not half - 2e-3 < distance < half + 0.02:
+        return 1.0
+    return 0.0
 
   def _ids(self, blocks: Any) -> list[int]:
     return [int(self.env.physics.bind(b.geom).element_id) for b in blocks]

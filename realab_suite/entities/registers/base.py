@@ -219,7 +219,8 @@ class Register(composer.Entity):
 
     Args:
       root: Root entity of the task, usually its arena.
-      position: Position of the register, `(x, y)`, in m.
+      position: Position of the register, `(x, y)`, in m; or `(x, y, z)` for a
+        register on a surface of the height z, such as a table.
       yaw: Angle of the register's axis, which carries the value, to the x axis
         of the world, in rad.
       spread: Half-widths of the region around `position` from which each
@@ -228,15 +229,18 @@ class Register(composer.Entity):
     """
     self._spread = np.array(spread, float)
     frame = root.attach(self)
-    frame.pos = [*position, 0.0]
+    x, y, height = (*position, 0.0)[:3]
+    frame.pos = [x, y, height]
     if yaw:
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     reach = np.array([self._low, self._high]) * self._scale
     for block in self._blocks:
       if isinstance(block, mocap_blocks.MocapBlock):
-        block.attach_to(root, position, yaw)
+        block.attach_to(root, (x, y, height), yaw)
       elif isinstance(block, block_kinds.JointedBlock):
         block.surroundings.limit(reach[0] - spread[0], reach[1] + spread[0])
+      if isinstance(block, block_kinds.PlanarBlock):
+        block.stand_at(height)
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
@@ -390,6 +394,35 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
     """
     return np.clip(self.applied(physics), self._low, self._high)[()]
+
+  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the distance by which the blocks have moved, `(...)`, in m.
+
+    It is the largest distance of a block from the position that the reset and
+    the last write gave it, in any direction, and is computed from the blocks
+    even if the register is secure. In this base class, it is the displacement
+    that the blocks represent: enough for a block that moves along an axis.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
+    wrong = self._read_blocks(physics) - self._applied_slot.get(physics)
+    return np.abs(wrong) * self._scale
+
+  def _farthest(
+      self, physics: protocols.Physics, places: Sequence[np.ndarray]
+  ) -> np.ndarray:
+    """Returns the largest distance of a block from its place, `(...)`, in m.
+
+    Args:
+      physics: One world or a batch of worlds.
+      places: Position of each block in the register's frame, `(..., 3)`, in m.
+    """
+    moved = [
+        np.linalg.norm(block.position(physics) - place, axis=-1)
+        for block, place in zip(self._blocks, places, strict=True)
+    ]
+    return np.max(moved, axis=0)
 
   def inspect(
       self,

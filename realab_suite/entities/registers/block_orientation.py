@@ -44,3 +44,9 @@ class BlockOrientationRegister(base.Register):
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale
+
+  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+    turned = self._block.heading(physics) - self.applied(physics) * self._scale
+    moved = self._farthest(physics, [self._origin(physics)])
+    # A turned block moves its sides.
+    return np.maximum(moved, np.abs(turned) * self._block.half_size)

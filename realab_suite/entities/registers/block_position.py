@@ -36,3 +36,9 @@ class BlockPositionRegister(base.Register):
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     started = axes.component(self._origin(physics), 0)
     return (self._block.along(physics) - started) / self._scale
+
+  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+    place = np.array(self._origin(physics))
+    along = self.applied(physics) * self._scale
+    place[..., 0] = axes.component(place, 0) + along
+    return self._farthest(physics, [place])

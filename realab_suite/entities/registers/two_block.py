@@ -57,3 +57,11 @@ class TwoBlockRegister(base.Register):
   def _permanent(self, physics: protocols.Physics) -> np.ndarray:
     started = axes.component(self._origin(physics), 0)
     return (started - self._base.along(physics)) / self._scale
+
+  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+    origin = self._origin(physics)
+    offset = origin + self._from_origin
+    along = self.applied(physics) * self._scale
+    offset[..., 0] = axes.component(offset, 0) + along
+    offset[..., 2] = self._offset.rest_height
+    return self._farthest(physics, [origin, offset])

@@ -1,0 +1,361 @@
+"""Registers stand on tables, and nowhere in the air (F13)."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.entities import appearance
+from realab_suite.entities import arenas
+from realab_suite.entities import doors
+from realab_suite.entities import registers
+from realab_suite.tasks import collect_apples
+from tests import worlds
+from tests.engine import helpers
+
+_HEIGHT = 0.4
+_CENTRE = (0.0, 2.2)
+
+
+class _Furnished(collect_apples.CollectApples):
+  """Has a table of 1.0 m by 0.6 m."""
+
+  def __init__(self) -> None:
+    super().__init__()
+    self._arena.add_table('table', _CENTRE, (1.0, 0.6), _HEIGHT)
+
+
+def _design(place: Any = 'table', **register: Any) -> dict[str, Any]:
+  register = {
+      'kind': 'block_position', 'range': [0, 1], 'scale': 0.1,
+      'role': 'feedback', 'place': place, **register,
+  }  # fmt: skip
+  return {'schema': 1, 'name': 'high', 'registers': {'r': register}}
+
+
+def _embed(place: Any = 'table', task: Any = None, **register: Any) -> Any:
+  return suite.embed(
+      task or _Furnished(), _design(place, **register), random=1, max_steps=None
+  )
+
+
+def _heights(env: Any) -> np.ndarray:
+  """Returns the heights of the blocks, `(..., blocks)`."""
+  blocks = env.mechanism.registers['r'].blocks
+  geoms = tuple(block.geom for block in blocks)
+  return np.array(env.physics.bind(geoms).xpos)[..., 2]
+
+
+# Kind, channel and freedom, each of them with others.
+_VARIETIES = pytest.mark.parametrize(
+    ('kind', 'channel', 'dof', 'yaw'),
+    [
+        ('two_block', 'embedded', 'free', 0.0),
+        ('two_block', 'secure', 'planar', 0.1),
+        ('two_block', 'welded', 'free', 0.1),
+        ('block_position', 'embedded', 'planar', 0.3),
+        ('block_position', 'secure', 'free', 0.0),
+        ('block_orientation', 'embedded', 'free', 0.3),
+        ('block_orientation', 'welded', 'planar', 0.0),
+    ],
+)
+
+
+@_VARIETIES
+def test_a_register_on_a_table_stores_values_and_stays_there(
+    kind: str, channel: str, dof: str, yaw: float, monkeypatch: Any
+):
+  monkeypatch.setitem(suite._TASKS, ('test', 'table'), (_Furnished, ()))
+  place = {'position': [-0.2, 2.1, _HEIGHT], 'yaw': yaw, 'spread': [0.1, 0.05]}
+  design = _design(place, kind=kind, channel=channel, dof=dof, range=[-1, 3])
+  design['providers'] = [{'kind': 'constant', 'value': 2.5, 'writes': ['r']}]
+  env = suite.load('test', 'table', {'random': 4}, {'world': 1}, design=design)
+  batch = suite.load_batch('test', 'table', {'random': 4}, num_envs=2,
+                           design=design)  # fmt: skip
+  env.reset()
+  batch.reset()
+  for _ in range(12):
+    time_step = env.step(np.zeros(6))
+    in_batch = batch.step(np.zeros((2, 6)))
+    reading = time_step.observation['registers/r']
+    assert reading == pytest.approx(2.5, abs=1e-9)
+    assert in_batch.observation['registers/r'][1] == reading
+  assert _heights(env) == pytest.approx(_HEIGHT + 0.1, abs=0.005)
+  np.testing.assert_array_equal(_heights(batch)[1], _heights(env))
+  register = env.mechanism.registers['r']
+  assert register.displacement(env.physics) < 0.005
+  # Two episodes begin at two positions of the region.
+  starts = [np.array(env.physics.bind(register.blocks[0].geom).xpos)]
+  env.reset()
+  starts.append(np.array(env.physics.bind(register.blocks[0].geom).xpos))
+  assert starts[0][2] == pytest.approx(starts[1][2], abs=0.005)
+  assert not np.allclose(*starts, atol=1e-3)
+  env.close()
+  batch.close()
+
+
+def _problem(place: Any, task: Any = None, **register: Any) -> str:
+  """Returns the message of an error in the design, or '' if there is none."""
+  try:
+    _embed(place, task, **register).close()
+  except errors.SpecError as error:
+    return str(error)
+  return ''
+
+
+@pytest.mark.parametrize(
+    ('place', 'is_refused'),
+    [
+        # The table ends at 0.5 m from its centre, and a value adds 0.1 m.
+        ([0.39, 2.2, _HEIGHT], False),
+        ([0.41, 2.2, _HEIGHT], True),
+        ([0.0, 2.49, _HEIGHT], False),
+        ([0.0, 2.51, _HEIGHT], True),
+        ([0.0, 2.2, _HEIGHT + 0.1], True),
+        ([-1.5, 2.2, _HEIGHT], True),
+        ({'position': [0, 2.2, _HEIGHT], 'spread': [0.39, 0.29]}, False),
+        ({'position': [0, 2.2, _HEIGHT], 'spread': [0.39, 0.31]}, True),
+        ({'position': [0, 2.2, _HEIGHT], 'spread': [0.41, 0.29]}, True),
+        # A corner of the region, turned.
+        (
+            {
+                'position': [0, 2.2, _HEIGHT],
+                'spread': [0.2, 0.2],
+                'yaw': 0.78,
+            },
+            True,
+        ),
+    ],
+)
+def test_every_block_stands_on_the_table_in_all_of_its_range(
+    place: Any, is_refused: bool
+):
+  problem = _problem(place)
+  assert ('nothing under' in problem) == bool(problem) == is_refused
+  assert problem.startswith("register 'r' at value ") == is_refused
+
+
+@pytest.mark.parametrize(
+    ('dof', 'channel'),
+    [('planar', 'embedded'), ('planar', 'secure'), ('free', 'welded')],
+)
+def test_twins_are_accepted_or_refused_alike(dof: str, channel: str):
+  for x, is_refused in ((0.39, False), (0.41, True)):
+    problem = _problem([x, 2.2, _HEIGHT], dof=dof, channel=channel)
+    assert bool(problem) == is_refused
+
+
+def test_a_gap_between_tables_a_door_and_scenery_carry_no_register():
+  def build(*parts: Any) -> Any:
+    task = collect_apples.CollectApples()
+    for part in parts:
+      part(task.root_entity)
+    return task
+
+  def two_tables(root: arenas.RoomArena) -> None:
+    root.add_table('west', (-0.5, 2.2), (0.8, 0.6), _HEIGHT)
+    root.add_table('east', (0.5, 2.2), (0.8, 0.6), _HEIGHT)
+
+  def door(root: arenas.RoomArena) -> None:
+    doors.SlidingDoor(width=1.0).attach_to(root, (0.0, 2.2))
+
+  def scenery(root: arenas.RoomArena) -> None:
+    root.mjcf_model.worldbody.add(
+        'geom', type='box', size=(1, 1, 0.2), pos=(0, 2.2, 0.2), contype=0,
+        conaffinity=0,
+    )  # fmt: skip
+
+  def pillar(root: arenas.RoomArena) -> None:
+    root.mjcf_model.worldbody.add(
+        'geom', type='cylinder', size=(0.2, 0.2), pos=(0, 2.2, 0.2)
+    )
+
+  for part, x, height, range_, is_refused in (
+      (two_tables, -0.5, _HEIGHT, [0, 3], False),
+      (two_tables, -0.5, _HEIGHT, [0, 10], True),
+      (two_tables, 0.5, _HEIGHT, [0, 3], False),
+      (door, 0.0, 1.0, [0, 1], True),
+      (scenery, 0.0, _HEIGHT, [0, 1], True),
+      (pillar, 0.0, _HEIGHT, [0, 1], False),
+      (pillar, 0.0, _HEIGHT, [0, 3], True),
+  ):
+    problem = _problem([x, 2.2, height], build(part), range=range_)
+    assert ('nothing under' in problem) == bool(problem) == is_refused, part
+
+
+def test_registers_overlap_only_at_the_same_height():
+  assert "inside 'table'" in _problem([0, 2.2])
+  assert "inside 'table'" in _problem([0, 2.2, _HEIGHT - 0.05])
+  design = _design(block_size=0.1, range=[0, 0.5])
+  below = {**design['registers']['r'], 'place': [0, 1.8]}
+  for other, is_refused in ((below, False), (design['registers']['r'], True)):
+    both = {**design, 'registers': {**design['registers'], 'other': other}}
+    if is_refused:
+      with pytest.raises(errors.SpecError, match="in each other's way"):
+        suite.embed(_Furnished(), both)
+    else:
+      suite.embed(_Furnished(), both).close()
+
+
+def test_a_register_below_the_floor_or_above_the_ceiling_is_refused():
+  assert 'registers.r.place.position: z must be' in _problem([0, 2.2, -0.1])
+  task = _Furnished()
+  task.root_entity.mjcf_model.worldbody.add(
+      'geom', type='box', size=(1, 1, 0.05), pos=(0, 0, 2.8)
+  )
+  assert 'at most 3 m' in _problem([0, 0, 2.85], task)
+
+
+@pytest.mark.parametrize('dof', registers.DOFS)
+def test_a_place_with_a_height_equals_its_coordinates(dof: str):
+  task = _Furnished()
+  spot = arenas.Place((0.1, 2.2), 0.2, (0.1, 0.1), _HEIGHT)
+  task.root_entity.offer({'spot': spot})
+  numbers = {'position': [0.1, 2.2, _HEIGHT], 'yaw': 0.2, 'spread': [0.1, 0.1]}
+  poses = []
+  for env in (_embed('spot', task, dof=dof), _embed(numbers, dof=dof)):
+    env.reset()
+    (block,) = env.mechanism.registers['r'].blocks
+    poses.append(np.array(env.physics.bind(block.geom).xpos))
+    env.close()
+  np.testing.assert_array_equal(*poses)
+
+
+@pytest.mark.parametrize(('dof', 'falls'), [('free', True), ('planar', False)])
+def test_a_free_block_that_is_pushed_off_the_table_falls(dof: str, falls: bool):
+  env = _embed(dof=dof)
+  env.reset()
+  (block,) = env.mechanism.registers['r'].blocks
+  worlds.shove(env.physics, block, (0.0, -20.0, 0.0), steps=30)
+  worlds.step(env.physics, 150)
+  x, y, z = worlds.world_position(env.physics, block)
+  assert y < _CENTRE[1] - 0.4
+  assert abs(x) < 0.01
+  assert z == pytest.approx(0.1 if falls else _HEIGHT + 0.104, abs=0.005)
+  register = env.mechanism.registers['r']
+  assert register.displacement(env.physics) > 0.4
+  env.close()
+
+
+@pytest.mark.parametrize(
+    ('dof', 'carried', 'put'),
+    [('free', 0.2, 0.1), ('planar', _HEIGHT + 0.104, _HEIGHT + 0.104)],
+)
+def test_an_avatar_takes_a_block_from_a_table(
+    dof: str, carried: float, put: float
+):
+  env = _embed({'position': [-0.3, 2.2, _HEIGHT]}, dof=dof)
+  env.reset()
+  avatar = env.task.avatar
+  avatar.place(env.physics, np.array([-0.8, 2.2]), 0.0)
+  (block,) = env.mechanism.registers['r'].blocks
+
+  def act(steps: int, **commands: float) -> Any:
+    action = np.zeros(6)
+    names = env.action_spec().name.split('\t')
+    for name, value in commands.items():
+      action[names.index(name)] = value
+    for _ in range(steps):
+      time_step = env.step(action)
+    return time_step.observation
+
+  act(2, grasp=1.0)
+  observation = act(10, forward=-1.0)
+  assert observation['senses/holding'] == 1.0
+  x, y, z = worlds.world_position(env.physics, block)
+  hand = avatar.position(env.physics) + np.array([0.45, 0.0])
+  assert np.hypot(x - hand[0], y - hand[1]) < 0.06
+  assert z == pytest.approx(carried, abs=0.02)
+  # A grip at another height would pull in a direction without a joint.
+  grip = env.physics.bind(block.site).xpos[2]
+  assert grip == pytest.approx(0.2, abs=0.02)
+  act(5)
+  before = worlds.world_position(env.physics, block)
+  act(1, grasp=-1.0)
+  after = worlds.world_position(env.physics, block)
+  np.testing.assert_allclose(after[:2], before[:2], atol=0.02)
+  act(8)
+  z = worlds.world_position(env.physics, block)[2]
+  assert z == pytest.approx(put, abs=0.005)
+  env.close()
+
+
+def test_rays_show_the_table_and_not_the_register_on_it():
+  env = _embed()
+  env.reset()
+  env.task.avatar.place(env.physics, np.array([-1.5, 2.2]), 0.0)
+  observation = env.step(np.zeros(6)).observation
+  middle = len(observation['senses/ray_classes']) // 2
+  seen = observation['senses/ray_classes'][middle - 1 : middle + 1]
+  distances = observation['senses/ray_distances'][middle - 1 : middle + 1]
+  assert (seen == appearance.code('barrier')).all()
+  np.testing.assert_allclose(distances, 1.0, atol=0.05)
+  assert (
+      appearance.code('offset_block') not in observation['senses/ray_classes']
+  )
+  env.close()
+
+
+@pytest.mark.parametrize(
+    ('name', 'size', 'height'),
+    [('t', (1, 0), 0.4), ('t', (1, 1), 0.0), ('t', (1, 1), 1.1),
+     ('centre', (1, 1), 0.4)],
+)  # fmt: skip
+def test_a_wrong_table_is_refused_and_not_added(
+    name: str, size: Any, height: float
+):
+  arena = arenas.OpenRoom()
+  before = len(arena.mjcf_model.find_all('geom'))
+  with pytest.raises(errors.SpecError, match=f"'{name}'"):
+    arena.add_table(name, (0, 0), size, height)
+  assert len(arena.mjcf_model.find_all('geom')) == before
+
+
+@pytest.mark.parametrize('height', [-0.1, np.nan, None])
+def test_a_place_needs_a_height_of_at_least_zero(height: Any):
+  with pytest.raises(errors.SpecError, match='at least 0 for the height'):
+    arenas.Place((0.0, 0.0), height=height)
+
+
+@pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
+def test_a_register_on_a_surface_of_a_foreign_task(channel: str):
+  def build() -> Any:
+    task = helpers.PointTask()
+    task.root_entity.mjcf_model.worldbody.add(
+        'geom', name='shelf', type='box', size=(0.5, 0.5, 0.05), pos=(3, 0, 1)
+    )
+    return task
+
+  assert 'nothing under' in _problem([0, 2, 1.05], build(), channel=channel)
+  env = _embed([3, 0, 1.05], build(), channel=channel)
+  env.reset()
+  for _ in range(5):
+    reading = env.step([0.0]).observation['registers/r']
+  assert reading == pytest.approx(0.0, abs=1e-6)
+  assert _heights(env) == pytest.approx(1.15, abs=0.005)
+  env.close()
+
+
+@pytest.mark.parametrize(
+    ('dof', 'channel'),
+    [('free', 'embedded'), ('planar', 'secure'), ('free', 'welded')],
+)
+def test_a_register_is_attached_at_a_height_in_plain_composer(
+    dof: str, channel: str
+):
+  arena = arenas.OpenRoom()
+  arena.add_table('table', (1.0, 0.5), (2.0, 1.5), 0.7)
+  register = registers.TwoBlockRegister(
+      'high', value_range=(-1.0, 5.0), dof=dof, channel=channel
+  )
+  register.attach_to(arena, (1.0, 0.5, 0.7), yaw=0.7)
+  physics = worlds.compile_world(arena)
+  worlds.start_episode(physics, register)
+  register.write(physics, 4.0)
+  worlds.step(physics, 100)
+  assert register.read(physics) == pytest.approx(4.0, abs=1e-9)
+  base, offset = (worlds.world_position(physics, b) for b in register.blocks)
+  assert base == pytest.approx((1.0, 0.5, 0.8), abs=0.005)
+  assert offset[2] == pytest.approx(0.8, abs=0.005)

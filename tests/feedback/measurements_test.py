@@ -1,0 +1,368 @@
+"""Meters measure the true state of the world, with options (M1, M3, M5)."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.entities import measurables
+from realab_suite.entities import registers
+from realab_suite.feedback import measurements
+from realab_suite.feedback import specs
+from tests.engine import helpers
+from tests.feedback import designs
+from tests.feedback import metered
+
+_NUM_STEPS = 8
+
+
+def _actions(num_envs: int) -> np.ndarray:
+  """Returns actions that walk to the register `reward` and beyond."""
+  actions = np.zeros((_NUM_STEPS, num_envs, 6))
+  actions[:, :, 0] = 1.0
+  actions[4:, :, 2] = 0.3
+  return actions
+
+
+def _start(env: Any, world: int | None) -> None:
+  """Puts the avatar in front of the register, at another place per world."""
+  env.reset()
+  starts = np.array([[0.85, -2.2], [1.0, -2.1], [0.5, -2.3]])
+  headings = np.array([0.0, 0.1, -0.1])
+  which = slice(None) if world is None else world
+  env.task.avatar.place(env.physics, starts[which], headings[which])
+
+
+def _play(env: Any, world: int | None = None) -> list[Any]:
+  """Returns what the meter measures after each step."""
+  _start(env, world)
+  measured = []
+  for actions in _actions(3):
+    env.step(actions if world is None else actions[world])
+    measured.append(metered.measure(env))
+  return measured
+
+
+def _centre(env: Any, name: str) -> np.ndarray:
+  """Returns the true position of a body, by its MJCF name."""
+  return np.array(env.physics.named.data.xpos[name])
+
+
+def _nearest(env: Any, start: str, ends: list[str], axes: int = 2) -> float:
+  here = _centre(env, start)[:axes]
+  found = [_centre(env, end) for end in ends]
+  # Eaten apples are far below the floor.
+  return min(np.linalg.norm(here - p[:axes]) for p in found if p[2] > -1)
+
+
+def _touches(env: Any) -> float:
+  """Returns 1 if MuJoCo has a contact of the avatar with a block."""
+  data = env.physics.data
+  found = 0.0
+  for i in range(data.ncon):
+    names = {env.physics.model.id2name(g, 'geom') for g in data.contact[i].geom}
+    if 'avatar/torso' in names and any('reward/' in n for n in names):
+      found = float(data.contact[i].dist <= 0.005) or found
+  return found
+
+
+_BLOCKS = ['reward/base', 'reward/offset']
+_TORSO = 'avatar/torso'
+# Measurement, and the same from MuJoCo's own data.
+_KINDS: dict[str, tuple[Any, Any]] = {
+    'distance': (
+        {'kind': 'distance', 'from': 'avatar', 'to': 'pad'},
+        lambda env: _nearest(env, _TORSO, ['pad_post/']),
+    ),
+    'distance to the nearest apple': (
+        {'kind': 'distance', 'from': 'avatar', 'to': 'apples'},
+        lambda env: _nearest(env, _TORSO, [f'apples_{i}/' for i in range(8)]),
+    ),
+    'distance in space': (
+        {'kind': 'distance', 'from': 'reward', 'to': 'avatar', 'axes': 'xyz'},
+        lambda env: _nearest(env, _TORSO, _BLOCKS, 3),
+    ),
+    'position': (
+        {'kind': 'position', 'of': 'reward', 'axis': 'x'},
+        lambda env: _centre(env, 'reward/base')[0],
+    ),
+    'position of a door': (
+        {'kind': 'position', 'of': 'door', 'axis': 'z'},
+        lambda env: _centre(env, 'door_leaf/')[2],
+    ),
+    'speed': (
+        {'kind': 'speed', 'of': 'avatar'},
+        lambda env: np.hypot(
+            *[env.physics.named.data.qvel[f'avatar/{a}'][0] for a in 'xy']
+        ),
+    ),
+    'contacts': (
+        {'kind': 'contacts', 'of': 'reward', 'with': 'avatar'}, _touches
+    ),
+    'time': ({'kind': 'time'}, lambda env: env.physics.data.time),
+    'time by name': ('time', lambda env: env.physics.data.time),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', _KINDS)
+def test_a_meter_measures_what_mujoco_has_in_one_world_and_in_many(name: str):
+  measures, truth = _KINDS[name]
+  design = metered.design(measures, dof=('free', 'planar')[len(name) % 2])
+  batch = suite.load_batch(
+      *metered.TASK, {'random': 3}, num_envs=3, design=design
+  )
+  in_batch = _play(batch)
+  batch.close()
+  env = suite.load(*metered.TASK, {'random': 3}, {'world': 2}, design=design)
+  _start(env, 2)
+  for actions, found in zip(_actions(3), in_batch, strict=True):
+    env.step(actions[2])
+    measured = metered.measure(env)
+    assert measured == pytest.approx(truth(env), abs=1e-9)
+    assert found[2] == measured
+  env.close()
+  assert np.ptp(in_batch) > 0 or 'door' in str(measures)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'channel'),
+    [
+        ('two_block', 'embedded'),
+        ('two_block', 'secure'),
+        ('block_position', 'welded'),
+        ('block_orientation', 'embedded'),
+        ('block_orientation', 'secure'),
+    ],
+)
+def test_a_block_that_moved_in_any_direction_is_detected(
+    kind: str, channel: str
+):
+  measures = {'kind': 'register_moved', 'of': 'reward', 'tolerance': 0.05}
+  design = metered.design(measures, kind=kind, channel=channel)
+  env = suite.load(*metered.TASK, {'random': 3}, design=design)
+  env.reset()
+  register = env.mechanism.registers['reward']
+  register.write(env.physics, 1.5)
+  assert metered.measure(env) == 0.0
+  for block in register.blocks:
+    before = np.array(block.position(env.physics))
+    heading = block.heading(env.physics)
+    for axis in np.eye(3):
+      for amount, expected in ((0.04, 0.0), (0.06, 1.0), (0.0, 0.0)):
+        block.put(env.physics, before + amount * axis, heading)
+        assert metered.measure(env) == expected
+  if kind == 'block_orientation':
+    # The sides of the block are 0.1 m from its centre.
+    for angle, expected in ((0.4, 0.0), (0.6, 1.0)):
+      block.put(env.physics, before, heading + angle)
+      assert metered.measure(env) == expected
+  env.close()
+
+
+def test_a_register_that_moved_is_detected_in_the_worlds_in_which_it_did():
+  design = metered.design(
+      {'kind': 'register_moved', 'of': 'reward'}, dof='planar'
+  )
+  batch = suite.load_batch(
+      *metered.TASK, {'random': 3}, num_envs=2, design=design
+  )
+  batch.reset()
+  base = batch.mechanism.registers['reward'].blocks[0]
+  moved = np.array(base.position(batch.physics))
+  moved[1, 0] += 0.02
+  base.put(batch.physics, moved)
+  np.testing.assert_array_equal(metered.measure(batch), [0.0, 1.0])
+  batch.close()
+
+
+@pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
+def test_a_register_has_the_speed_of_its_fastest_block(channel: str):
+  design = metered.design({'kind': 'speed', 'of': 'reward'}, channel=channel)
+  place = {'position': [1.4, -2.2], 'yaw': 0.7}
+  design['registers']['reward']['place'] = place
+  env = suite.load(*metered.TASK, {'random': 3}, design=design)
+  env.reset()
+  assert metered.measure(env) == pytest.approx(0.0, abs=0.01)
+  if channel != 'welded':
+    _, offset = env.mechanism.registers['reward'].blocks
+    offset.launch(env.physics, np.array([0.0, 3.0, 4.0]), True)
+    assert metered.measure(env) == pytest.approx(5.0)
+  env.close()
+
+
+def test_collected_objects_are_counted_by_kind():
+  design = metered.design({'kind': 'collected', 'of': 'apples'})
+  env = suite.load('collect_apples', 'standard', {'random': 3}, design=design)
+  env.reset()
+  for eaten in range(1, 4):
+    (apples,) = [
+        e
+        for e in env.task.root_entity.iter_entities()
+        if e.mjcf_model.model == 'apples'
+    ]
+    left = apples.measurable.is_present(env.physics)
+    place = apples.measurable.positions(env.physics)[left][0]
+    # The next apple alone, not its neighbours within reach.
+    apples.eat(env.physics, place[:2], 1e-6)
+    assert metered.measure(env) == eaten
+  env.close()
+
+
+def test_eaten_apples_are_no_longer_near():
+  measures = {'kind': 'distance', 'from': 'avatar', 'to': 'apples'}
+  for absent in (100.0, 7.0):
+    design = metered.design({**measures, 'absent': absent})
+    env = suite.load('collect_apples', 'standard', {'random': 3}, design=design)
+    env.reset()
+    here = env.task.avatar.position(env.physics)
+    near = metered.measure(env)
+    apples = measurables.in_world(env.task.root_entity)['apples']
+    (group,) = [
+        e
+        for e in env.task.root_entity.iter_entities()
+        if e.mjcf_model.model == 'apples'
+    ]
+    group.eat(env.physics, here, near + 1e-6)
+    assert near < metered.measure(env) < absent
+    group.eat(env.physics, here, 50.0)
+    assert metered.measure(env) == absent
+    assert not apples.is_present(env.physics).any()
+    env.close()
+
+
+def test_all_meters_measure_before_one_writes():
+  # The second meter measures a block that the first meter's write moves.
+  design = metered.design({'kind': 'time'}, place='station_3')
+  design['registers']['score'].update(scale=0.1, range=[0, 20])
+  design['registers']['x'] = {
+      **designs.SCORE, 'place': 'station_4', 'range': [-5, 5], 'scale': 0.1,
+  }  # fmt: skip
+  at = {'kind': 'position', 'of': 'score', 'axis': 'x'}
+  design['registers']['score']['kind'] = 'block_position'
+  design['meters'].append({'measures': at, 'writes': 'x'})
+  env = suite.load(*metered.TASK, {'random': 3}, design=design)
+  env.reset()
+  env.step(np.zeros(6))
+  before = _centre(env, 'score/block')[0]
+  first, second = env.mechanism.update_meters(env.physics)
+  assert first.writer == 'meter:time'
+  assert second.requested == before
+  env.physics.forward()
+  assert _centre(env, 'score/block')[0] > before + 0.002
+  env.close()
+
+
+# Names in the ledger, and the forms of a measurement.
+
+
+def test_each_meter_has_a_readable_name_of_its_own():
+  measured = [
+      'score',
+      {'kind': 'score'},
+      {'kind': 'distance', 'from': 'avatar', 'to': 'pad'},
+      {'kind': 'distance', 'from': 'avatar', 'to': 'pad', 'axes': 'xyz'},
+      {'kind': 'contacts', 'of': 'reward', 'with': 'avatar', 'within': 0.01},
+  ]
+  names = []
+  for measures in measured:
+    env = suite.load(
+        *metered.TASK, {'random': 3}, design=metered.design(measures)
+    )
+    sink = helpers.RecordingSink()
+    env.add_sink(sink)
+    env.reset()
+    env.step(np.zeros(6))
+    names.append(sink.records(registers.Write, 'score')[0].writer)
+    env.close()
+  assert names == [
+      'meter:score',
+      'meter:score',
+      'meter:distance(from=avatar, to=pad)',
+      'meter:distance(from=avatar, to=pad, axes=xyz)',
+      'meter:contacts(of=reward, with=avatar, within=0.01)',
+  ]
+
+
+def test_a_design_with_measurements_round_trips():
+  for measures in ('score', *(m for m, _ in _KINDS.values())):
+    spec = specs.load(metered.design(measures))
+    data = spec.to_mapping()
+    assert specs.load(data) == spec
+    assert specs.load(data).digest() == spec.digest()
+    given, (meter,) = measures, data['meters']
+    if isinstance(given, str):
+      assert meter['measures'] == given
+    else:
+      assert given.items() <= meter['measures'].items()
+  text = str(specs.json_schema())
+  assert all(kind in text for kind in measurements.MEASUREMENTS)
+
+
+_REFUSED = {
+    'no such kind': (
+        {'kind': 'distanse'}, r"kind: must be one of .*'distance'",
+    ),
+    'neither': (7, r'measures: must be a name, or a mapping .*, got 7'),
+    'no kind': ({'of': 'pad'}, r'meters\[0\].measures.kind: required key'),
+    'unknown option': (
+        {'kind': 'distance', 'from': 'avatar', 'two': 'pad'},
+        r"measures: unknown key 'two'; .*allowed: kind, from, to",
+    ),
+    'wrong value': (
+        {'kind': 'position', 'of': 'pad', 'axis': 'w'},
+        r"measures.axis: must be 'x', 'y' or 'z', got 'w'",
+    ),
+    'not finite': (
+        {'kind': 'contacts', 'of': 'a', 'with': 'b', 'within': np.nan},
+        r'measures.within: ',
+    ),
+    'needs options': ('distance', r"'distance' needs the options \['from', 't"),
+    'no such name': (
+        {'kind': 'distance', 'from': 'avatar', 'to': 'pda'},
+        r"meters\[0\].measures.to: 'pda' .*allowed are \['apples', 'avatar'.*"
+        r"'reward', 'score'\]",
+    ),
+    'to itself': (
+        {'kind': 'distance', 'from': 'pad', 'to': 'pad'}, 'measures.to',
+    ),
+    'a group': (
+        {'kind': 'position', 'of': 'apples', 'axis': 'x'},
+        r"measures.of: 'apples' has 8 bodies; allowed .*'avatar'",
+    ),
+    'no velocity': (
+        {'kind': 'speed', 'of': 'door'},
+        r"measures.of: 'door' .* allowed are \['avatar', 'reward', 'score'\]",
+    ),
+    'nothing to touch': (
+        {'kind': 'contacts', 'of': 'avatar', 'with': 'apples'},
+        r"measures.with: .*'apples'; allowed are \['avatar', 'door'",
+    ),
+    'not collected': (
+        {'kind': 'collected', 'of': 'pad'},
+        r"measures.of: 'pad' .*allowed are \['apples', 'large_apple'\]",
+    ),
+    'no register': (
+        {'kind': 'register_moved', 'of': 'pad'},
+        r"measures.of: 'pad' .*allowed are \['reward', 'score'\]",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(('measures', 'text'), _REFUSED.values(), ids=_REFUSED)
+def test_a_wrong_measurement_is_refused_with_what_is_allowed(
+    measures: Any, text: str
+):
+  with pytest.raises(errors.SpecError, match=text) as caught:
+    suite.load(*metered.TASK, design=metered.design(measures))
+  assert '\n' not in str(caught.value)
+
+
+def test_a_name_with_two_meanings_is_refused():
+  design = metered.design({'kind': 'speed', 'of': 'pad'})
+  design['registers']['pad'] = design['registers'].pop('reward')
+  design['providers'][0]['writes'] = ['pad']
+  design['learner']['reward'] = 'pad'
+  with pytest.raises(errors.SpecError, match="'pad' is a register and a part"):
+    suite.load(*metered.TASK, design=design)
