@@ -101,7 +101,11 @@ class Block(abc.ABC):
 
   @abc.abstractmethod
   def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
   ) -> None:
     """Teleports the block to a pose, upright and at rest, and releases it.
 
@@ -109,15 +113,20 @@ class Block(abc.ABC):
       physics: One world or a batch of worlds.
       position: Centre in the register's frame, `(..., 3)`, in m.
       heading: Angle about the vertical, `(...)`, in rad; `None` for 0.
+      where: Worlds in which to do so, `(...)` bool; `None` for all worlds.
     """
 
-  def let_go(self, physics: protocols.Physics) -> None:
+  def let_go(self, physics: protocols.Physics, where: axes.Mask = None) -> None:
     """Releases the block from every hand.
 
     Otherwise a teleport of the block would pull the hand along.
+
+    Args:
+      physics: One world or a batch of worlds.
+      where: As in `put`.
     """
     if self._grasps:
-      physics.bind(self._grasps).active = 0
+      axes.assign(physics.bind(self._grasps), 'active', 0, where)
 
 
 class JointedBlock(Block):
@@ -242,12 +251,17 @@ class FreeBlock(JointedBlock):
     return _heading(physics.bind(self._rotation).qpos)
 
   def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
   ) -> None:
-    self.let_go(physics)
-    physics.bind(self._slides).qpos = np.subtract(position, self._rest)
-    physics.bind(self._rotation).qpos = _quaternion(heading)
-    physics.bind(self._joints).qvel = 0.0
+    self.let_go(physics, where)
+    moved, turned = np.subtract(position, self._rest), _quaternion(heading)
+    axes.assign(physics.bind(self._slides), 'qpos', moved, where)
+    axes.assign(physics.bind(self._rotation), 'qpos', turned, where)
+    axes.assign(physics.bind(self._joints), 'qvel', 0.0, where)
 
 
 @final
@@ -293,15 +307,18 @@ class PlanarBlock(JointedBlock):
     return np.arctan2(np.sin(angle), np.cos(angle))
 
   def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
   ) -> None:
-    self.let_go(physics)
-    position = np.asarray(position)
-    physics.bind(self._slides).qpos = position[..., :2] - self._rest[:2]
-    physics.bind(self._hinge).qpos = (
-        0.0 if heading is None else np.asarray(heading)[..., np.newaxis]
-    )
-    physics.bind(self._joints).qvel = 0.0
+    self.let_go(physics, where)
+    moved = np.asarray(position)[..., :2] - self._rest[:2]
+    angle = 0.0 if heading is None else np.asarray(heading)[..., np.newaxis]
+    axes.assign(physics.bind(self._slides), 'qpos', moved, where)
+    axes.assign(physics.bind(self._hinge), 'qpos', angle, where)
+    axes.assign(physics.bind(self._joints), 'qvel', 0.0, where)
 
 
 @final
@@ -375,7 +392,11 @@ class MocapBlock(Block):
     return np.arctan2(np.sin(angle), np.cos(angle))
 
   def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
   ) -> None:
     turned = 0.0 if heading is None else np.asarray(heading)
     moving.move(
@@ -383,6 +404,7 @@ class MocapBlock(Block):
         self._part.frame,
         self._to_world(np.asarray(position)),
         _quaternion(turned + self._yaw),
+        where,
     )
 
   def _to_world(self, position: np.ndarray) -> np.ndarray:

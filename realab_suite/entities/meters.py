@@ -5,6 +5,7 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite.entities import axes
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
@@ -37,14 +38,14 @@ class Meter:
     return self._register
 
   def update(
-      self, physics: protocols.Physics, idle: np.ndarray | None = None
+      self, physics: protocols.Physics, where: axes.Mask = None
   ) -> tuple[np.ndarray, np.ndarray]:
     """Measures once and writes the measured value to the register.
 
     Args:
       physics: One world or a batch of worlds.
-      idle: True for each world whose register keeps its value, `(...)` bool;
-        `None` for no world.
+      where: Worlds whose register is written, `(...)` bool; `None` for all
+        worlds.
 
     Returns:
       Measured value and applied value, each `(...)`, in the register's units.
@@ -53,6 +54,4 @@ class Meter:
       RegisterValueError: If the register cannot store a measured value.
     """
     measured = np.array(self._measurement(physics), np.float64)[()]
-    if idle is not None:
-      measured = np.where(idle, self._register.keep(physics), measured)
-    return measured, self._register.write(physics, measured)
+    return measured, self._register.write(physics, measured, where)

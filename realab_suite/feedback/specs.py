@@ -19,6 +19,7 @@ from realab_suite.entities import registers
 from realab_suite.feedback import consistency
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
+from realab_suite.feedback import thresholds
 from realab_suite.policies import action_sets
 
 _NAME = r'^[a-z][a-z0-9_]{0,63}$'
@@ -30,15 +31,16 @@ Value = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
 Size = Annotated[float, pydantic.Field(ge=block_kinds.LEAST_SIZE, le=1.0)]
 Channel = Literal['embedded', 'welded', 'secure']
 Dof = Literal['free', 'planar']
-Role = Literal['feedback', 'meter', 'query', 'signal']
+Role = Literal['feedback', 'meter', 'query', 'signal', 'memory']
 
 # Largest number of registers of a design. A hundred two-block registers load in
 # a second and take 10 ms for a control step; both times are linear in the
 # number. MuJoCo reserves 160 MB for their contacts, quadratic in the number.
 MAX_REGISTERS = 100
 
-# Roles of the registers that the agent reads.
+# Roles of the registers that the agent reads, and that providers may write.
 READ_BY_AGENTS = ('feedback', 'signal')
+WRITTEN_BY_PROVIDERS = (*READ_BY_AGENTS, 'memory')
 
 
 @final
@@ -72,7 +74,8 @@ class RegisterSpec(validation.Spec):
   Attributes:
     kind: Name of a registered register kind.
     role: Role of the register. Agents read `feedback` and `signal` registers
-      and write `query` registers. Only providers read `meter` registers.
+      and write `query` registers. Only providers read `meter` registers. Only
+      providers read and write `memory` registers.
     place: Name of a place of the world, or coordinates.
     range: Lowest and highest value that can be stored.
     scale: Length in m (angle in rad for an orientation) per unit of value.
@@ -84,6 +87,9 @@ class RegisterSpec(validation.Spec):
     dof: Degrees of freedom of the blocks; `None` for those of the design.
     block_size: Edge length of each block, in m.
     mass: Mass of each block, in kg.
+    ends_episode: Threshold of a `signal` register: the episode ends with the
+      first control step after which the agent's reading crosses it. `None` if
+      the register does not end episodes.
     options: Further keyword arguments of a user-defined register kind.
   """
 
@@ -99,6 +105,7 @@ class RegisterSpec(validation.Spec):
   dof: Dof | None = None
   block_size: Size = 0.2
   mass: Annotated[float, pydantic.Field(ge=0.01, le=100)] = 1.0
+  ends_episode: thresholds.ThresholdSpec | None = None
   options: Annotated[
       dict[str, Any],
       option_types.OptionsOf(
@@ -125,6 +132,17 @@ class RegisterSpec(validation.Spec):
     if not low <= self.initial <= high:
       raise ValueError(
           f'initial {self.initial} must be in range {list(self.range)}'
+      )
+    if self.ends_episode is None:
+      return self
+    if self.role != 'signal':
+      raise ValueError(
+          f"ends_episode: the role is {self.role!r}; allowed is 'signal'"
+      )
+    if not any(map(self.ends_episode.is_crossed, self.range)):
+      raise ValueError(
+          f'ends_episode: no value in range {list(self.range)} crosses'
+          f' {self.ends_episode}; allowed are thresholds that one crosses'
       )
     return self
 
@@ -305,7 +323,7 @@ class DesignSpec(validation.Spec):
           f'registers: {len(self.registers)} are given; allowed are at most'
           f' {MAX_REGISTERS}'
       )
-    consistency.check(self, READ_BY_AGENTS)
+    consistency.check(self, WRITTEN_BY_PROVIDERS)
     return self
 
   def names(self, *roles: str) -> list[str]:

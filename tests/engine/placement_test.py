@@ -370,11 +370,11 @@ class _Circling(registers.Register):
     self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
     return [self._block]
 
-  def _put(self, physics, value):
+  def _put(self, physics, value, where=None):
     position = np.array(self._origin(physics))
     position[..., 0] += 0.5 * np.cos(value)
     position[..., 1] += 0.5 * np.sin(value)
-    self._block.put(physics, position, heading=value)
+    self._block.put(physics, position, heading=value, where=where)
 
   def _read_blocks(self, physics):
     return self._block.heading(physics)

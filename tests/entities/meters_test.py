@@ -55,16 +55,6 @@ def test_a_meter_writes_its_measurement_on_update(world):
   assert (measured, applied) == (3.5, 3.5)
 
 
-def test_an_idle_meter_keeps_a_value_in_range():
-  world = _World(initial=2.0, on_overflow='error', value_range=(1, 10))
-  assert world.meter.update(world.physics, np.array(True)) == (2.0, 2.0)
-  # As MuJoCo leaves it when the physics have failed.
-  world.physics.data.userdata[:] = 0.0
-  assert world.meter.update(world.physics, np.array(True)) == (1.0, 1.0)
-  with pytest.raises(errors.RegisterValueError):
-    world.meter.update(world.physics, np.array(False))
-
-
 def test_a_measurement_may_be_any_number():
   world = _World()
   meter = meters.Meter(lambda physics: 2, world.register)

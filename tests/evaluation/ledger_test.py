@@ -87,7 +87,7 @@ def test_an_entry_copies_numbers_out_of_arrays():
   write, read, reward = _write(1.0), _read(2.0, 3.0, 4.0), np.array(5.0)
   ledger.episode_started(_start(write, read), None)
   ledger.step_ended(events.Step([], reward), None)
-  for array in (*write[3:], *read[3:], reward):
+  for array in (*write[3:-1], *read[3:-1], reward):
     array[...] = -1.0
   assert ledger.last.entries['reward'] == [
       ('reward', 'providers[0]:constant', 1, 1.0, 1.0),

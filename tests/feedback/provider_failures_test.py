@@ -48,8 +48,6 @@ _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
     'returns no state': (lambda o, r, s: {'reward': 1.0}, f'{_FIRST} at step'),
     'returns no mapping': (lambda o, r, s: (1.0, s),
         rf"{_FIRST} .*returned writes 1.0; it declares writes to \['reward'\]"),
-    'writes nothing': (lambda o, r, s: ({}, s),
-        rf"{_FIRST} .*returned writes \[\]; it declares writes to \['rewar"),
     'writes another register': (lambda o, r, s: ({'clock': 1.0}, s),
         rf"{_FIRST} .*returned writes \['clock'\]; it declares writes to"),
     'writes one too many': (lambda o, r, s: ({'reward': 1, 'clock': 1}, s),

@@ -117,8 +117,19 @@ class Register(composer.Entity):
     """
 
   @abc.abstractmethod
-  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
-    """Moves the blocks so that they represent `value`, `(...)`."""
+  def _put(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
+    """Moves the blocks so that they represent `value`, `(...)`.
+
+    Args:
+      physics: One world or a batch of worlds.
+      value: Value in the register's units, `(...)`.
+      where: Worlds in which to move them, `(...)` bool; `None` for all worlds.
+    """
 
   @abc.abstractmethod
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
@@ -142,7 +153,7 @@ class Register(composer.Entity):
 
   @property
   def role(self) -> str:
-    """Role of the register: `feedback`, `meter`, `query` or `signal`."""
+    """Role of the register, a key of `appearance.ROLE_COLOURS`."""
     return self._role
 
   @property
@@ -241,7 +252,9 @@ class Register(composer.Entity):
     self._origin_slot.set(physics, origin)
     self.write(physics, np.full(origin.shape[:-1], self._initial))
 
-  def write(self, physics: protocols.Physics, value: Any) -> np.ndarray:
+  def write(
+      self, physics: protocols.Physics, value: Any, where: axes.Mask = None
+  ) -> np.ndarray:
     """Moves the blocks so that they represent a value.
 
     A write teleports the written blocks, upright and at rest, and releases them
@@ -251,22 +264,28 @@ class Register(composer.Entity):
 
     Args:
       physics: One world or a batch of worlds.
-      value: Requested value, `(...)`, in the register's units.
+      value: Requested value, `(...)`, in the register's units. Values of worlds
+        that are not written are ignored.
+      where: Worlds in which the register is written, `(...)` bool; `None` for
+        all worlds. In the other worlds, nothing changes.
 
     Returns:
-      Applied value, `(...)`: `value`, or the nearest bound of `value_spec`. The
-      difference is saturation, never corruption.
+      Applied value of the last write, `(...)`: `value`, or the nearest bound of
+      `value_spec`. The difference is saturation, never corruption.
 
     Raises:
       RegisterValueError: If a value is not finite, or if it is out of range and
         the register does not saturate. Nothing is written.
     """
     value = np.asarray(value, np.float64)[()]
+    if where is not None:  # An ignored value must not be refused.
+      value = np.where(where, value, self._initial)
     fits = (value >= self._low) & (value <= self._high)  # False for NaN.
     applied = value if axes.everywhere(fits) else self._saturate(value, fits)
-    self._put(physics, applied)
+    self._put(physics, applied, where)
+    applied = axes.merge(where, applied, self._applied_slot.get(physics))
     self._applied_slot.set(physics, applied)
-    if self._channel == 'secure':
+    if self._channel == 'secure':  # Nothing but writes changes the slot.
       self._stored_slot.set(physics, applied)
     return applied
 
@@ -312,17 +331,6 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
     """
     return self._applied_slot.copy(physics)
-
-  def keep(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the value to write so that the register keeps its value, `(...)`.
-
-    The result is clipped to the range of the register, because the value may be
-    out of range after the physics has failed.
-
-    Args:
-      physics: One world or a batch of worlds.
-    """
-    return np.clip(self.applied(physics), self._low, self._high)[()]
 
   def inspect(
       self,
