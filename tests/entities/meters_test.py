@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import meters
 from realab_suite.entities import registers

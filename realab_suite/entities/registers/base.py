@@ -283,11 +283,10 @@ class Register(composer.Entity):
     fits = (value >= self._low) & (value <= self._high)  # False for NaN.
     applied = value if axes.everywhere(fits) else self._saturate(value, fits)
     self._put(physics, applied, where)
-    applied = axes.merge(where, applied, self._applied_slot.get(physics))
-    self._applied_slot.set(physics, applied)
-    if self._channel == 'secure':  # Nothing but writes changes the slot.
-      self._stored_slot.set(physics, applied)
-    return applied
+    self._applied_slot.set(physics, applied, where)
+    if self._channel == 'secure':
+      self._stored_slot.set(physics, applied, where)
+    return axes.merge(where, applied, self._applied_slot.get(physics))
 
   def _saturate(self, value: np.ndarray, fits: np.ndarray) -> np.ndarray:
     """Returns the values, saturated to the range of the register.
