@@ -141,8 +141,8 @@ class RegisterSpec(validation.Spec):
       )
     if not any(map(self.ends_episode.is_crossed, self.range)):
       raise ValueError(
-          f'ends_episode: no value in range {list(self.range)} crosses'
-          f' {self.ends_episode}; allowed are thresholds that one crosses'
+          f'ends_episode: no value in range {list(self.range)} is'
+          f' {self.ends_episode.text}; allowed are thresholds inside the range'
       )
     return self
 

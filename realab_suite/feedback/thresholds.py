@@ -27,6 +27,13 @@ class ThresholdSpec(validation.Spec):
       raise ValueError('exactly one of above and below must be given')
     return self
 
+  @property
+  def text(self) -> str:
+    """The threshold in words, such as `above 1.0`."""
+    if self.above is not None:
+      return f'above {self.above}'
+    return f'below {self.below}'
+
   def is_crossed(self, reading: Any) -> Any:
     """Returns True where a reading, `(...)`, crosses the threshold."""
     if self.above is not None:
