@@ -98,6 +98,14 @@ def _ends(env: Any, steps: int, num_envs: int = 0) -> list[Any]:
   return [*last, *ends]
 
 
+def _push(env: Any, worlds: Any, distance: float) -> None:
+  """Moves the base block of the signal along its axis in some worlds."""
+  base = env.mechanism.registers['stop'].blocks[0]
+  position = np.array(base.position(env.physics))
+  position[..., 0][worlds] += distance
+  base.put(env.physics, position)
+
+
 _EITHER = pytest.mark.parametrize('num_envs', [0, 3], ids=['one', 'batch'])
 
 
@@ -138,15 +146,9 @@ def test_a_signal_at_the_reset_ends_the_first_control_step(num_envs):
 def test_the_reading_counts_and_not_the_value_that_was_written(num_envs):
   env = _load(_design(), num_envs)
   _play(env, 2, num_envs)  # The reset and step 1.
-  base = env.mechanism.registers['stop'].blocks[0]
-
-  def push(distance: float, world: int) -> None:
-    position = np.array(base.position(env.physics))
-    position[..., 0][world if num_envs else ()] += distance
-    base.put(env.physics, position)
-
-  push(0.4, 0)  # All readings are 4 too low in world 0.
-  push(-0.4, 1) if num_envs else None
+  _push(env, 0 if num_envs else (), 0.4)  # Readings are 4 too low there.
+  if num_envs:
+    _push(env, 1, -0.4)
   first, *others = _play(env, 5, num_envs)
   ended = np.array([s.step_type == _LAST for s in (first, *others)])
   # World 0 does not hear the alarm, and world 1 has heard one before it.
@@ -159,6 +161,25 @@ def test_the_reading_counts_and_not_the_value_that_was_written(num_envs):
     assert not ended.any()
     readings = [step.observation['registers/stop'] for step in others]
   assert readings == pytest.approx([1.0] * 4, abs=1e-6)
+  env.close()
+
+
+def test_providers_do_not_write_in_a_world_whose_episode_has_ended():
+  design = _design()
+  design['registers']['reward'] = {
+      **design['registers']['stop'], 'role': 'feedback', 'place': [-2, 2],
+      'ends_episode': None, 'on_overflow': 'error',
+  }  # fmt: skip
+  # Step 4 of an episode would raise an exception.
+  design['providers'].append(
+      {'kind': 'test_alarm', 'writes': ['reward'], 'value': 99.0, 'start': 4}
+  )
+  env = _load(design, 3)
+  _play(env, 2, 3)
+  _push(env, [0, 2], -0.4)
+  # World 1 ends last, and ignores a step in which the others are behind it.
+  types = [step.step_type.tolist() for step in _play(env, 3, 3)]
+  assert types == [[2, 1, 2], [0, 2, 0], [1, 0, 1]]
   env.close()
 
 
