@@ -66,6 +66,11 @@ def test_a_region_is_kept_from_the_start_of_the_avatar(
   assert _begins_in_a_block(place) == is_in_the_way
 
 
+def test_a_region_may_be_so_small_that_its_square_is_0():
+  place = {'position': [0.0, 0.0], 'spread': [0.0, 1.7e-291]}
+  assert not _begins_in_a_block(place)
+
+
 # ---- Every place of a region -------------------------------------------------
 
 
