@@ -212,6 +212,7 @@ class FeedbackMechanism(composer.Entity):
     if not self._meters:
       return []
     step = self._this_step(physics)
+    where = axes.both(where, None)
     writes = []
     for writer, meter in self._meters:
       name = meter.register.name
@@ -320,10 +321,11 @@ class FeedbackMechanism(composer.Entity):
             f'{_where(writer, step)} {error}'
         ) from error
       log += reads
+      may_write = axes.both(where, acts)
       for name in provider.writes:
         if name not in values:
           continue
-        mask = axes.both(values[name].where, axes.both(where, acts))
+        mask = axes.both(values[name].where, may_write)
         if axes.nowhere(mask):
           continue
         value = values[name].value

@@ -38,7 +38,7 @@ Role = Literal['feedback', 'meter', 'query', 'signal', 'memory']
 # number. MuJoCo reserves 160 MB for their contacts, quadratic in the number.
 MAX_REGISTERS = 100
 
-# Roles of the registers that the agent reads, and that providers may write.
+# Roles of registers that the agent reads, and of those that providers write.
 READ_BY_AGENTS = ('feedback', 'signal')
 WRITTEN_BY_PROVIDERS = (*READ_BY_AGENTS, 'memory')
 
@@ -139,10 +139,10 @@ class RegisterSpec(validation.Spec):
       raise ValueError(
           f"ends_episode: the role is {self.role!r}; allowed is 'signal'"
       )
-    if not any(map(self.ends_episode.is_crossed, self.range)):
+    if len(set(map(self.ends_episode.is_crossed, self.range))) == 1:
       raise ValueError(
-          f'ends_episode: no value in range {list(self.range)} is'
-          f' {self.ends_episode.text}; allowed are thresholds inside the range'
+          f'ends_episode: all or no values in range {list(self.range)} are'
+          f' {self.ends_episode.text}; allowed are those between values'
       )
     return self
 

@@ -76,6 +76,9 @@ _WRONG = {
     'providers.0.writes=[score]':
         "providers[0].writes: register 'score' has role 'meter'; allowed are"
         " ['feedback', 'signal', 'memory']",
+    'providers.0.every=0':
+        'providers[0].every: must be greater than or equal to 1, got 0',
+    'providers.0.every=1.5': 'providers[0].every: must be a valid integer',
     'providers.0.kind=diference':
         "providers[0].kind: must be one of 'constant', 'demonstration',",
     'providers.0={writes: [reward]}':
