@@ -68,7 +68,8 @@ def test_a_region_is_kept_from_the_start_of_the_avatar(
 
 def test_a_region_may_be_so_small_that_its_square_is_0():
   place = {'position': [0.0, 0.0], 'spread': [0.0, 1.7e-291]}
-  assert not _begins_in_a_block(place)
+  with pytest.raises(errors.SpecError, match='where the avatar begins'):
+    suite.load('collect_apples', 'far', design=_design(place, kind='two_block'))
 
 
 # ---- Every place of a region -------------------------------------------------
