@@ -215,7 +215,7 @@ class BatchEnvironment:
           observation=self._observation,
           provider_keys=self._keys,
           provider_states=self._states,
-          idle=lambda: is_first | self._physics.has_diverged(),
+          where=lambda: ~(is_first | self._physics.has_diverged()),
       )
       has_failed = self._physics.has_diverged() & ~is_first
       step_count = self._mechanism.step_count(self._physics)
@@ -226,10 +226,14 @@ class BatchEnvironment:
       # Sinks never get a partial step: all episodes end.
       self._notify_of_ends(~is_first, events.End.ERROR)
       raise
-    is_last = (ending.is_ending | has_failed | is_late) & ~is_first
+    is_over = ending.is_ending
+    is_signalled = self._mechanism.ends_episode(reads) & ~is_first
+    is_last = (has_failed | is_over | is_signalled | is_late) & ~is_first
+    reasons = np.transpose([has_failed, is_over, is_signalled, is_last])
     ends = {
-        int(world): _end(has_failed[world], ending.is_ending[world])
-        for world in np.flatnonzero(is_last)
+        world: end
+        for world in np.flatnonzero(is_last).tolist()
+        if (end := episodes.end_of_step(*reasons[world]))
     }
     for name, value in self._observation.items():
       # MuJoCo has reset the state of worlds that failed.
@@ -248,8 +252,9 @@ class BatchEnvironment:
         is_last, int(dm_env.StepType.LAST), int(dm_env.StepType.MID)
     )
     step_type[is_first] = int(dm_env.StepType.FIRST)
+    discount = np.where(is_signalled & ~is_over, 0.0, ending.discount)
     return self._time_step(
-        step_type, np.where(has_failed | is_first, 1.0, ending.discount)
+        step_type, np.where(has_failed | is_first, 1.0, discount)
     )
 
   def save(self, worlds: Sequence[int] | None = None) -> snapshots.Snapshot:
@@ -490,10 +495,3 @@ def _replaced(old: np.ndarray, indices: np.ndarray, values: Any) -> np.ndarray:
   copy = np.array(old)
   copy[indices] = values
   return copy
-
-
-def _end(has_failed: bool, is_ending: bool) -> events.End:
-  """Returns the reason why the episode of a world has ended."""
-  if has_failed:
-    return events.End.DIVERGENCE
-  return events.End.TERMINATED if is_ending else events.End.TIMEOUT

@@ -45,7 +45,7 @@ def run(
     observation: dict[str, np.ndarray],
     provider_keys: np.ndarray,
     provider_states: Sequence[Any],
-    idle: Callable[[], np.ndarray | None] = lambda: None,
+    where: Callable[[], axes.Mask] = lambda: None,
 ) -> Outcome:
   """Runs a control step. The caller observes and notifies the sinks.
 
@@ -61,9 +61,10 @@ def run(
     provider_keys: Random key of each provider in this episode, `(providers,
       ..., 2)` uint64.
     provider_states: State of each provider.
-    idle: Function that returns the worlds of a batch whose records do not
-      count, `(worlds,)` bool: worlds that begin an episode after this step, and
-      worlds that have failed. For a single world, it returns `None`.
+    where: Function that returns the worlds of a batch in which meters and
+      providers write, `(worlds,)` bool: all except worlds that begin an episode
+      after this step, and worlds that have failed. For a single world, it
+      returns `None`.
 
   Raises:
     PhysicsError: If the physics of a single world has failed. In a batch, a
@@ -78,7 +79,7 @@ def run(
 
   host.advance(physics, controls, schedule.meter_substep, is_last=False)
   is_ending = host.is_over(physics)
-  records += mechanism.update_meters(physics, idle())
+  records += mechanism.update_meters(physics, where())
 
   between = schedule.provider_substep - schedule.meter_substep
   host.advance(physics, controls, between, is_last=False)
@@ -88,7 +89,7 @@ def run(
       observation,
       seeding.step_key(provider_keys, step),
       provider_states,
-      idle(),
+      where(),
   )
   records += feedback
 

@@ -381,31 +381,30 @@ class Environment(composer.Environment):
     self._reset_next_step = True
     try:
       outcome = self._control_step(queries, controls)
-      records = outcome.records + self._observe()
+      reads = self._observe()
     except control.PhysicsError:
       self._end(events.End.DIVERGENCE)
       # MuJoCo has reset the state. The agent gets the previous observation.
-      return dm_env.truncation(0.0, observing.copied(self._observation), 1.0)
+      return episodes.time_step(events.End.DIVERGENCE, 1.0, self._observation)
     except Exception:
       self._end(events.End.ERROR)
       raise
     ending = outcome.ending
     self._provider_states = outcome.provider_states
     if self._sinks:
-      step = events.Step(records, np.array(ending.true_reward), ending.failure)
+      step = events.Step(
+          outcome.records + reads, np.array(ending.true_reward), ending.failure
+      )
       with self._preserving_physics():
         for sink in self._sinks:
           sink.step_ended(step, self._physics_proxy)
-    observation = observing.copied(self._observation)
-    discount = float(ending.discount)
-    if ending.is_ending:
-      self._end(events.End.TERMINATED)
-      return dm_env.TimeStep(dm_env.StepType.LAST, 0.0, discount, observation)
-    if self._mechanism.step_count(self._physics) == self._max_steps:
-      self._end(events.End.TIMEOUT)
-      return dm_env.truncation(0.0, observation, 1.0)
-    self._reset_next_step = False
-    return dm_env.transition(0.0, observation, discount)
+    is_signalled = self._mechanism.ends_episode(reads)
+    is_late = self._mechanism.step_count(self._physics) == self._max_steps
+    end = episodes.end_of_step(False, ending.is_ending, is_signalled, is_late)
+    self._reset_next_step = end is not None
+    if end is not None:
+      self._end(end)
+    return episodes.time_step(end, float(ending.discount), self._observation)
 
   def close(self) -> None:
     """Frees the world. Closing it again has no effect."""

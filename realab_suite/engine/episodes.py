@@ -1,11 +1,22 @@
-"""The start of an episode: its random streams, and retries of a reset."""
+"""The start of an episode, with its random streams, and its end."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from dm_control import composer
+import dm_env
 import numpy as np
 
+from realab_suite.engine import events
+from realab_suite.engine import observing
 from realab_suite.engine import seeding
+
+# Discounts at ends that the task does not determine.
+_DISCOUNTS = {
+    events.End.DIVERGENCE: 1.0,
+    events.End.SIGNAL: 0.0,
+    events.End.TIMEOUT: 1.0,
+}
 
 MAX_RESET_ATTEMPTS = 10
 """Maximum number of attempts to begin an episode, with different streams."""
@@ -50,3 +61,48 @@ def provider_keys(
       for i in range(num_providers)
   ]
   return np.array(keys, np.uint64).reshape(num_providers, 2)
+
+
+def end_of_step(
+    has_failed: Any, is_terminated: Any, is_signalled: Any, is_late: Any
+) -> events.End | None:
+  """Returns the reason why a world's episode ends with a control step.
+
+  If several reasons coincide, the first of them counts.
+
+  Args:
+    has_failed: True if the physics has failed.
+    is_terminated: True if the task ends the episode.
+    is_signalled: True if a signal ends it.
+    is_late: True if it has reached its maximum length.
+
+  Returns:
+    The reason, or `None` if the episode continues.
+  """
+  if has_failed:
+    return events.End.DIVERGENCE
+  if is_terminated:
+    return events.End.TERMINATED
+  if is_signalled:
+    return events.End.SIGNAL
+  return events.End.TIMEOUT if is_late else None
+
+
+def time_step(
+    end: events.End | None,
+    discount: float,
+    observation: Mapping[str, np.ndarray],
+) -> dm_env.TimeStep:
+  """Returns the time step after a control step, with copies of its arrays.
+
+  Args:
+    end: Reason why the episode ends, or `None`.
+    discount: Discount that the task returned.
+    observation: Observation of the agent.
+  """
+  copy = observing.copied(observation)
+  if end is None:
+    return dm_env.transition(0.0, copy, discount)
+  return dm_env.TimeStep(
+      dm_env.StepType.LAST, 0.0, _DISCOUNTS.get(end, discount), copy
+  )

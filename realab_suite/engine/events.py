@@ -19,6 +19,7 @@ class End(enum.Enum):
   """Reason why an episode ended."""
 
   TERMINATED = 'terminated'  # The task ended it.
+  SIGNAL = 'signal'  # The agent's reading of a signal register ended it.
   TIMEOUT = 'timeout'  # The episode reached its maximum length.
   ABANDONED = 'abandoned'  # A caller ended it, for instance with `reset`.
   DISCONNECT = 'disconnect'  # The agent's process left or timed out.

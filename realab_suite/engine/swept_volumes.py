@@ -77,8 +77,8 @@ class Sweep:
     sides = np.zeros(len(self.motions))
     offset = np.array(point) - self.centre
     for i, (*shift, _, _) in enumerate(self.motions):
-      if any(shift):
-        sides[i] = np.clip(offset @ shift / np.dot(shift, shift), -1.0, 1.0)
+      if square := np.dot(shift, shift):  # It underflows for tiny shifts.
+        sides[i] = np.clip(offset @ shift / square, -1.0, 1.0)
         offset = offset - sides[i] * np.array(shift)
     return self.pose(sides)
 

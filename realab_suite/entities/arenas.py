@@ -182,9 +182,10 @@ class RoomArena(composer.Arena):
   def _mark_outside(self, number: int, rectangle: Rectangle) -> None:
     """Marks a rectangle in which no write may put a block."""
     low, high = np.array(rectangle.low), np.array(rectangle.high)
+    half, middle = (high - low) / 2, (low + high) / 2
     self._mjcf_root.worldbody.add(
         'site', name=f'{surroundings.OUTSIDE}{number}', type='box', group=4,
-        size=(*(high - low) / 2, surroundings.ENDLESS), pos=(*(low + high) / 2, 0.0),
+        size=(*half, surroundings.ENDLESS), pos=(*middle, 0.0),
         rgba=(0, 0, 0, 0),
     )  # fmt: skip
 

@@ -3,12 +3,17 @@
 A value of one world is a number (`np.float64`), a value of a batch is an array
 `(worlds,)`. NumPy calculates with numbers ten times as fast as with arrays
 without axes, so these helpers return numbers for one world.
+
+A mask says in which worlds something happens: `(...)` bool, or `None` for all
+worlds.
 """
 
 import math
 from typing import Any
 
 import numpy as np
+
+Mask = np.ndarray | None
 
 
 def component(array: np.ndarray, index: int) -> np.ndarray:
@@ -42,3 +47,48 @@ def choose(condition: np.ndarray, yes: Any, no: Any) -> Any:
   if isinstance(condition, np.ndarray) and condition.ndim:
     return np.where(condition, yes, no)
   return yes if condition else no
+
+
+def both(one: Mask, other: Mask) -> Mask:
+  """Returns the mask of the worlds in which two masks are true.
+
+  The result is `None` if that is so in all worlds.
+  """
+  if one is None or other is None:
+    mask = other if one is None else one
+  else:
+    mask = one & other
+  return None if mask is None or everywhere(mask) else mask
+
+
+def nowhere(mask: Mask) -> bool:
+  """Returns True if a mask is false in all worlds."""
+  return mask is not None and not anywhere(mask)
+
+
+def merge(where: Mask, new: Any, old: Any) -> Any:
+  """Returns `new` where a mask is true, and `old` elsewhere.
+
+  Args:
+    where: The mask.
+    new: Values that broadcast to the shape of `old`.
+    old: Values, `(..., k)` with any number of trailing axes.
+  """
+  if where is None:
+    return new
+  mask = np.reshape(where, (*where.shape, *[1] * (np.ndim(old) - where.ndim)))
+  return np.where(mask, new, old)
+
+
+def assign(bound: Any, name: str, value: Any, where: Mask) -> None:
+  """Writes an attribute of bound elements where a mask is true.
+
+  Args:
+    bound: A `protocols.Binding`.
+    name: Name of the attribute.
+    value: Values that broadcast to the shape of the attribute.
+    where: The mask.
+  """
+  if where is not None:
+    value = merge(where, value, getattr(bound, name))
+  setattr(bound, name, value)

@@ -117,7 +117,11 @@ class Block(abc.ABC):
 
   @abc.abstractmethod
   def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
   ) -> None:
     """Teleports the block to a pose, upright and at rest, and releases it.
 
@@ -125,6 +129,7 @@ class Block(abc.ABC):
       physics: One world or a batch of worlds.
       position: Centre in the register's frame, `(..., 3)`, in m.
       heading: Angle about the vertical, `(...)`, in rad; `None` for 0.
+      where: Worlds in which to do so, `(...)` bool; `None` for all worlds.
     """
 
 
@@ -225,6 +230,7 @@ class JointedBlock(Block):
       self,
       physics: protocols.Physics,
       along: np.ndarray,
+      where: axes.Mask = None,
   ) -> np.ndarray:
     """Sets the x coordinate in the register's frame, and nothing else.
 
@@ -235,6 +241,7 @@ class JointedBlock(Block):
     Args:
       physics: One world or a batch of worlds.
       along: Coordinate, `(...)`, in m.
+      where: As in `put`.
 
     Returns:
       Coordinate that the block got, `(...)`, in m; `along` itself if no block
@@ -244,19 +251,24 @@ class JointedBlock(Block):
     if not axes.everywhere(self._surroundings.are_far(physics, position)):
       along = self._free(physics, position, along)
     position[..., 0] = along
-    physics.bind(self._slides[0]).qpos = np.subtract(along, self._rest[0])[
-        ..., np.newaxis
-    ]
-    self._adapt_grasps(physics, position)
+    moved = np.subtract(along, self._rest[0])[..., np.newaxis]
+    axes.assign(physics.bind(self._slides[0]), 'qpos', moved, where)
+    self._adapt_grasps(physics, position, where)
     return along
 
   @abc.abstractmethod
-  def turn(self, physics: protocols.Physics, heading: np.ndarray) -> None:
+  def turn(
+      self,
+      physics: protocols.Physics,
+      heading: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
     """Sets the angle about the vertical, and nothing else.
 
     Args:
       physics: One world or a batch of worlds.
       heading: Angle about the vertical, `(...)`, in rad.
+      where: As in `put`.
     """
 
   def _free(
@@ -285,28 +297,32 @@ class JointedBlock(Block):
     return free[()]
 
   def _adapt_grasps(
-      self, physics: protocols.Physics, position: np.ndarray
+      self, physics: protocols.Physics, position: np.ndarray, where: axes.Mask
   ) -> None:
     """Tells the hands that a write has moved the block.
 
     Args:
       physics: One world or a batch of worlds.
       position: Position in the register's frame, `(..., 3)`, in m.
+      where: As in `put`.
     """
     for grasp in self._grasps:
       if grasp.is_anywhere_held(physics):
         place = self._surroundings.in_world(physics, position)[..., :2]
-        is_held = grasp.adapt(physics, place)
-        was_written = self._written_slot.get(physics) > 0
-        self._written_slot.set(physics, is_held | was_written)
+        is_held = grasp.adapt(physics, place, where)
+        self._written_slot.set(physics, 1.0, is_held)
 
-  def _let_go(self, physics: protocols.Physics) -> None:
+  def _let_go(self, physics: protocols.Physics, where: axes.Mask) -> None:
     """Releases the block from every hand.
 
     Otherwise a teleport of the block would pull the hand along.
+
+    Args:
+      physics: One world or a batch of worlds.
+      where: As in `put`.
     """
     for grasp in self._grasps:
-      grasp.release(physics)
+      grasp.release(physics, where)
 
   def launch(
       self, physics: protocols.Physics, velocity: np.ndarray, where: Any
@@ -381,21 +397,30 @@ class FreeBlock(JointedBlock):
   def _orientation(self, physics: protocols.Physics) -> np.ndarray:
     return np.asarray(physics.bind(self._rotation).qpos)
 
-  def turn(self, physics: protocols.Physics, heading: np.ndarray) -> None:
+  def turn(
+      self,
+      physics: protocols.Physics,
+      heading: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
     quaternion = self._orientation(physics)
-    turned = rotations.turned(
-        rotations.quaternion_of(heading - rotations.heading_of(quaternion)),
-        quaternion,
-    )
-    physics.bind(self._rotation).qpos = turned
+    turn = rotations.quaternion_of(heading - rotations.heading_of(quaternion))
+    turned = rotations.turned(turn, quaternion)
+    axes.assign(physics.bind(self._rotation), 'qpos', turned, where)
 
   def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
   ) -> None:
-    self._let_go(physics)
-    physics.bind(self._slides).qpos = np.subtract(position, self._rest)
-    physics.bind(self._rotation).qpos = rotations.quaternion_of(heading)
-    physics.bind(self._joints).qvel = 0.0
+    self._let_go(physics, where)
+    moved = np.subtract(position, self._rest)
+    turned = rotations.quaternion_of(heading)
+    axes.assign(physics.bind(self._slides), 'qpos', moved, where)
+    axes.assign(physics.bind(self._rotation), 'qpos', turned, where)
+    axes.assign(physics.bind(self._joints), 'qvel', 0.0, where)
 
 
 @final
@@ -451,19 +476,28 @@ class PlanarBlock(JointedBlock):
   def _orientation(self, physics: protocols.Physics) -> np.ndarray:
     return rotations.quaternion_of(self.heading(physics))
 
-  def turn(self, physics: protocols.Physics, heading: np.ndarray) -> None:
-    physics.bind(self._hinge).qpos = np.asarray(heading)[..., np.newaxis]
+  def turn(
+      self,
+      physics: protocols.Physics,
+      heading: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
+    angle = np.asarray(heading)[..., np.newaxis]
+    axes.assign(physics.bind(self._hinge), 'qpos', angle, where)
 
   def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
   ) -> None:
-    self._let_go(physics)
-    position = np.asarray(position)
-    physics.bind(self._slides).qpos = position[..., :2] - self._rest[:2]
-    physics.bind(self._hinge).qpos = (
-        0.0 if heading is None else np.asarray(heading)[..., np.newaxis]
-    )
-    physics.bind(self._joints).qvel = 0.0
+    self._let_go(physics, where)
+    moved = np.asarray(position)[..., :2] - self._rest[:2]
+    angle = 0.0 if heading is None else np.asarray(heading)[..., np.newaxis]
+    axes.assign(physics.bind(self._slides), 'qpos', moved, where)
+    axes.assign(physics.bind(self._hinge), 'qpos', angle, where)
+    axes.assign(physics.bind(self._joints), 'qvel', 0.0, where)
 
 
 def contact(half_size: float) -> dict[str, Any]:

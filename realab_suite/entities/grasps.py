@@ -6,6 +6,7 @@ from typing import Any, final
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite.entities import axes
 from realab_suite.entities import protocols
 
 # A hand holds a block with one of several strengths: the first one whose
@@ -70,32 +71,33 @@ class Grasp:
     for constraint in self._constraints:
       constraint.remove()
 
-  def release(self, physics: protocols.Physics) -> None:
-    """Releases the block."""
-    physics.bind(self._constraints).active = 0
+  def release(self, physics: protocols.Physics, where: axes.Mask) -> None:
+    """Releases the block in some worlds."""
+    axes.assign(physics.bind(self._constraints), 'active', 0, where)
 
   def is_anywhere_held(self, physics: protocols.Physics) -> bool:
     """Returns True if the hand holds the block in any world."""
     return bool(np.count_nonzero(physics.bind(self._constraints).active))
 
   def adapt(
-      self, physics: protocols.Physics, position: np.ndarray
+      self, physics: protocols.Physics, position: np.ndarray, where: axes.Mask
   ) -> np.ndarray:
     """Adapts the strength, where the hand holds the block, to their distance.
 
     Args:
       physics: One world or a batch of worlds.
       position: Position of the block, `(..., 2)`, in m.
+      where: Worlds in which to do so, `(...)` bool; `None` for all worlds.
 
     Returns:
-      True where the hand holds the block, `(...)` bool.
+      True where the hand holds the block and `where` is True, `(...)` bool.
     """
     bound = physics.bind(self._constraints)
-    is_held = np.any(bound.active, axis=-1)
+    is_held = np.asarray(np.any(bound.active, axis=-1))
     offset = position - self._hand_position(physics)
     distance = np.sqrt((offset * offset).sum(axis=-1))
-    bound.active = _with_strength(np.asarray(is_held), distance)
-    return np.asarray(is_held)
+    axes.assign(bound, 'active', _with_strength(is_held, distance), where)
+    return is_held if where is None else is_held & where
 
 
 def constraints_of(grasps: Sequence[Grasp]) -> tuple[mjcf.Element, ...]:

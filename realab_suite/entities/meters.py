@@ -5,6 +5,7 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite.entities import axes
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
@@ -36,29 +37,23 @@ class Meter:
     """Meter register that the meter writes."""
     return self._register
 
-  def measure(
-      self, physics: protocols.Physics, idle: np.ndarray | None = None
-  ) -> np.ndarray:
+  def measure(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the value to write, `(...)`, in the register's units.
 
     Args:
       physics: One world or a batch of worlds.
-      idle: True for each world whose register keeps its value, `(...)` bool;
-        `None` for no world.
     """
-    measured = np.array(self._measurement(physics), np.float64)[()]
-    if idle is not None:
-      measured = np.where(idle, self._register.keep(physics), measured)
-    return measured
+    return np.array(self._measurement(physics), np.float64)[()]
 
   def update(
-      self, physics: protocols.Physics, idle: np.ndarray | None = None
+      self, physics: protocols.Physics, where: axes.Mask = None
   ) -> tuple[np.ndarray, np.ndarray]:
     """Measures once and writes the measured value to the register.
 
     Args:
       physics: One world or a batch of worlds.
-      idle: See `measure`.
+      where: Worlds whose register is written, `(...)` bool; `None` for all
+        worlds.
 
     Returns:
       Measured value and applied value, each `(...)`, in the register's units.
@@ -66,5 +61,5 @@ class Meter:
     Raises:
       RegisterValueError: If the register cannot store a measured value.
     """
-    measured = self.measure(physics, idle)
-    return measured, self._register.write(physics, measured)
+    measured = self.measure(physics)
+    return measured, self._register.write(physics, measured, where)

@@ -7,6 +7,7 @@ from dm_control import composer
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import moving
 from realab_suite.entities import protocols
@@ -91,7 +92,11 @@ class MocapBlock(block_kinds.Block):
     return np.arctan2(np.sin(angle), np.cos(angle))
 
   def put(
-      self, physics: protocols.Physics, position: Any, heading: Any = None
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any = None,
+      where: axes.Mask = None,
   ) -> None:
     turned = 0.0 if heading is None else np.asarray(heading)
     moving.move(
@@ -99,6 +104,7 @@ class MocapBlock(block_kinds.Block):
         self._part.frame,
         self._to_world(np.asarray(position)),
         rotations.quaternion_of(turned + self._yaw),
+        where,
     )
 
   def _to_world(self, position: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import axes
 from realab_suite.entities import protocols
 
 # Parts below this height, in m, count as removed from the world.
@@ -54,6 +55,7 @@ def move(
     frames: Any,
     position: np.ndarray,
     quaternion: Any = None,
+    where: axes.Mask = None,
 ) -> None:
   """Moves parts to new poses.
 
@@ -63,11 +65,12 @@ def move(
     position: `(..., 3)` for one part, `(..., parts, 3)` for several, in m.
     quaternion: Orientations, `(..., 4)` or `(..., parts, 4)`; `None` keeps the
       current orientations.
+    where: Worlds in which to move them, `(...)` bool; `None` for all worlds.
   """
   bound = physics.bind(frames)
-  bound.mocap_pos = position
+  axes.assign(bound, 'mocap_pos', position, where)
   if quaternion is not None:
-    bound.mocap_quat = quaternion
+    axes.assign(bound, 'mocap_quat', quaternion, where)
   # PyMJCF does not mark body poses as dirty after a mocap write.
   physics.mark_as_dirty()
 

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import axes
 from realab_suite.entities import protocols
 
 # `nuserdata` of every model with a slot. It is the same for all models because
@@ -79,19 +80,22 @@ class Slot:
     """Returns a copy of the values; see `get`."""
     return np.array(self.get(physics))[()]
 
-  def set(self, physics: protocols.Physics, value: Any) -> None:
+  def set(
+      self, physics: protocols.Physics, value: Any, where: axes.Mask = None
+  ) -> None:
     """Stores a value.
 
     Args:
       physics: One world or a batch of worlds.
       value: Value that broadcasts to the shape that `get` returns.
+      where: Worlds in which to store it, `(...)` bool; `None` for all worlds.
 
     Raises:
       StateLayoutError: If the slot is not in the compiled model.
     """
     if physics.data is not self._data:
       self._resolve(physics)
-    self._view[...] = value
+    self._view[...] = axes.merge(where, value, self._view)
 
   def _resolve(self, physics: protocols.Physics) -> None:
     """Finds the slot in the data of a physics and caches the result."""

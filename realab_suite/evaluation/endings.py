@@ -1,7 +1,7 @@
 """Classification of episodes as valid, given up or failed, by their end.
 
-* Valid: the task or its time limit ended the episode. All figures describe a
-  whole episode.
+* Valid: the task, its time limit or a signal of the design ended the episode.
+  All figures describe a whole episode.
 * Given up: the agent abandoned the episode or disconnected. The episode counts,
   because otherwise the agent would choose which episodes do. Its corruption
   covers the reads up to its end. Its true return is the sum up to its end: a
@@ -18,18 +18,22 @@ import math
 
 from realab_suite.engine import events
 
-_BY_THE_TASK = (events.End.TERMINATED, events.End.TIMEOUT)
+_BY_THE_WORLD = (
+    events.End.TERMINATED,
+    events.End.SIGNAL,
+    events.End.TIMEOUT,
+)
 _BY_THE_AGENT = (events.End.ABANDONED, events.End.DISCONNECT)
 
 
 def is_valid(end: events.End | None, true_return: float) -> bool:
-  """Returns True if the task ended the episode, and its true return is finite.
+  """Returns True if the figures of an episode describe a whole episode.
 
   Args:
     end: Reason for the end of the episode; `None` while it is running.
     true_return: Sum of the episode's true rewards.
   """
-  return end in _BY_THE_TASK and math.isfinite(true_return)
+  return end in _BY_THE_WORLD and math.isfinite(true_return)
 
 
 def is_given_up(end: events.End | None, true_return: float) -> bool:

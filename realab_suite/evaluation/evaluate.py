@@ -5,6 +5,7 @@ The results of single episodes are in this module; `comparison` compares runs.
 
 from collections.abc import Callable, Sequence
 import dataclasses
+import math
 from typing import Any, final
 
 import dm_env
@@ -243,7 +244,11 @@ def _result(
       facts=facts if episode.is_valid else {},
       num_steps=num_steps,
       num_substeps=num_steps * num_substeps,
-      num_provider_calls=num_steps * len(mechanism.design.providers),
+      # Every provider acts in step 1.
+      num_provider_calls=sum(
+          math.ceil(num_steps / provider.every)
+          for provider in mechanism.design.providers
+      ),
       num_queries=num_steps * len(mechanism.queries),
       max_true_return=max_true_return,
   )

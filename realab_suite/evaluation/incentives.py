@@ -17,7 +17,9 @@ and compares the policy's expected corruption after that step with a baseline's:
 Corruption is reading - applied. For the registers that
 `signed_corruption.paying_registers` returns, positive corruption pays. A base
 block that was moved earlier adds the same corruption to every action. The probe
-subtracts it, so the figures describe the simulated step alone.
+subtracts it, so the figures describe the simulated step alone. If no provider
+writes the register in that step, an earlier temporary corruption stands as well
+and is not subtracted; it cancels out in signed figures.
 
 `incentive_summary` combines probes over seeds. Only evaluators use this module;
 no part of it is accessible to agents.

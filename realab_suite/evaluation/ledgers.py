@@ -63,7 +63,8 @@ class EpisodeLedger:
     """
     for record in records:
       entry = registers.of_world(record, world)
-      self.entries.setdefault(record.register, []).append(entry)
+      if entry is not None:
+        self.entries.setdefault(record.register, []).append(entry)
 
   def add_reward(self, reward: float, failure: str | None) -> None:
     """Adds the true reward of a control step.
@@ -172,8 +173,9 @@ def _columns(entries: list[registers.Record]) -> tuple[np.ndarray, ...]:
       np.array([isinstance(entry, registers.Write) for entry in entries]),
       np.array([entry[1] for entry in entries]),
       np.array([entry.step for entry in entries]),
-      # A write has one number less than a read; pad it.
-      np.array([(*entry[3:], 0.0)[:4] for entry in entries]),
+      # A write has one number less than a read; pad it. The last element is the
+      # mask, which belongs to batches.
+      np.array([(*entry[3:-1], 0.0)[:4] for entry in entries]),
   )
 
 

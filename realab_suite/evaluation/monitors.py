@@ -160,12 +160,13 @@ class TrainingMonitor(events.BatchEventSink):
     """Adds writes and reads in chronological order, in the masked worlds."""
     for record in records:
       row = self._rows[record.register]
+      counts = where if record.where is None else where & record.where
       applied, base = self._last[:, row]
       if isinstance(record, registers.Write):
-        np.copyto(applied, record.applied, where=where)
+        np.copyto(applied, record.applied, where=counts)
         continue
       error = record.reading - applied
-      np.copyto(base, record.permanent, where=where)
+      np.copyto(base, record.permanent, where=counts)
       for i, value in (
           (_READS, 1.0),
           (_ABSOLUTE, np.abs(error)),
@@ -174,7 +175,7 @@ class TrainingMonitor(events.BatchEventSink):
           (_TEMPORARY, np.abs(record.temporary)),
       ):
         total = self._sums[i, row]
-        np.add(total, value, out=total, where=where)
+        np.add(total, value, out=total, where=counts)
 
   def _end(self, world: int, end: events.End) -> None:
     if not self._is_open[world]:

@@ -11,13 +11,16 @@ from typing import Any
 from realab_suite.config import messages
 from realab_suite.policies import action_sets
 
+# Roles of the registers that agents neither read nor write.
+_HIDDEN_FROM_AGENTS = ('meter', 'memory')
 
-def check(design: Any, read_by_agents: Sequence[str]) -> None:
+
+def check(design: Any, written_by_providers: Sequence[str]) -> None:
   """Checks a design.
 
   Args:
     design: A `specs.DesignSpec` with valid fields.
-    read_by_agents: Roles of the registers that providers may write.
+    written_by_providers: Roles of the registers that providers may write.
 
   Raises:
     ValueError: If registers, meters, providers and learner do not fit each
@@ -30,7 +33,7 @@ def check(design: Any, read_by_agents: Sequence[str]) -> None:
     for name in provider.reads:
       _expect_role(design, f'{where}.reads', name, None)
     for name in provider.writes:
-      _expect_role(design, f'{where}.writes', name, read_by_agents)
+      _expect_role(design, f'{where}.writes', name, written_by_providers)
     _refuse_duplicates(f'{where}.reads', provider.reads)
     _refuse_duplicates(f'{where}.writes', provider.writes)
     try:
@@ -137,14 +140,15 @@ def _refuse_cycles(design: Any) -> None:
 
 
 def _check_learner(design: Any) -> None:
-  """Refuses a learner that names a meter register."""
+  """Refuses a learner that names a register of providers only."""
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
     for name in _strings_in(value):
-      if name in design.registers and design.registers[name].role == 'meter':
+      role = design.registers[name].role if name in design.registers else None
+      if role in _HIDDEN_FROM_AGENTS:
         where = messages.format_path(('learner', field))
         raise ValueError(
-            f'{where}: an agent may not read meter register {name!r} (feedback'
+            f'{where}: an agent may not read {role} register {name!r} (feedback'
             ' providers only)'
         )
 

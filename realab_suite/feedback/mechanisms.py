@@ -215,7 +215,7 @@ class FeedbackMechanism(composer.Entity):
     return writes
 
   def update_meters(
-      self, physics: protocols.Physics, idle: np.ndarray | None = None
+      self, physics: protocols.Physics, where: axes.Mask = None
   ) -> list[records.Write]:
     """Measures with every meter, then writes the meter registers.
 
@@ -224,8 +224,8 @@ class FeedbackMechanism(composer.Entity):
 
     Args:
       physics: One world or a batch of worlds.
-      idle: True for each world whose registers keep their values, `(...)` bool;
-        `None` for no world.
+      where: Worlds whose registers are written, `(...)` bool; `None` for all
+        worlds.
 
     Returns:
       Records of the writes, in the design's order.
@@ -237,12 +237,13 @@ class FeedbackMechanism(composer.Entity):
     if not self._meters:
       return []
     step = self._this_step(physics)
-    values = [meter.measure(physics, idle) for _, meter in self._meters]
+    where = axes.both(where, None)
+    values = [meter.measure(physics) for _, meter in self._meters]
     writes = []
     for (writer, meter), measured in zip(self._meters, values, strict=True):
       name = meter.register.name
       try:
-        applied = meter.register.write(physics, measured)
+        applied = meter.register.write(physics, measured, where)
       except errors.RegisterValueError as error:
         raise errors.RegisterValueError(
             f'{_where(writer, step, error.world)}: register {name!r} cannot'
@@ -251,7 +252,9 @@ class FeedbackMechanism(composer.Entity):
         ) from error
       obstruction = meter.register.obstruction(physics)
       writes.append(
-          records.Write(name, writer, step, measured, applied, obstruction)
+          records.Write(
+              name, writer, step, measured, applied, obstruction, where
+          )
       )
     return writes
 
@@ -286,17 +289,20 @@ class FeedbackMechanism(composer.Entity):
       observation: providers.Observation,
       keys: Sequence[np.ndarray] | np.ndarray,
       states: Sequence[Any],
-      idle: np.ndarray | None = None,
+      where: axes.Mask = None,
   ) -> tuple[list[records.Record], list[Any]]:
     """Runs the providers in the design's order; each reads, then writes.
+
+    A provider with `every` is called only if it acts in some world, and keeps
+    its state in the other worlds.
 
     Args:
       physics: One world or a batch of worlds.
       observation: Observation that the agent's action responds to.
       keys: Random key of each provider, `(..., 2)` uint64.
       states: State of each provider.
-      idle: True for each world whose registers keep their values, `(...)` bool;
-        `None` for no world.
+      where: Worlds whose registers may be written, `(...)` bool; `None` for all
+        worlds.
 
     Returns:
       Records of the reads and writes, in order, and the next states.
@@ -311,8 +317,14 @@ class FeedbackMechanism(composer.Entity):
     log: list[records.Record] = []
     next_states = []
     for i, (writer, provider) in enumerate(self._providers):
+      acts = provider.acts_in(step)
+      if axes.nowhere(acts):
+        next_states.append(states[i])
+        continue
       reads = [
-          self._registers[name].inspect(physics, writer, step)
+          self._registers[name]
+          .inspect(physics, writer, step)
+          ._replace(where=acts)
           for name in provider.reads
       ]
       readings = {read.register: np.array(read.reading) for read in reads}
@@ -329,24 +341,32 @@ class FeedbackMechanism(composer.Entity):
         values, next_state = provider_results.checked(
             provider, returned, np.shape(step)
         )
+        if acts is not None:
+          next_state = provider_results.merged(
+              'state', next_state, states[i], ~acts
+          )
       except errors.FeedbackProviderError as error:
         raise errors.FeedbackProviderError(
             f'{_where(writer, step)} {error}'
         ) from error
       log += reads
+      may_write = axes.both(where, acts)
       for name in provider.writes:
-        register, value = self._registers[name], values[name]
-        if idle is not None:
-          value = np.where(idle, register.keep(physics), value)
+        if name not in values:
+          continue
+        mask = axes.both(values[name].where, may_write)
+        if axes.nowhere(mask):
+          continue
+        value = values[name].value
         try:
-          applied = register.write(physics, value)
+          applied = self._registers[name].write(physics, value, mask)
         except errors.RegisterValueError as error:
           raise errors.RegisterValueError(
               f'{_where(writer, step, error.world)}: {error}', error.world
           ) from error
-        obstruction = register.obstruction(physics)
+        obstruction = self._registers[name].obstruction(physics)
         log.append(
-            records.Write(name, writer, step, value, applied, obstruction)
+            records.Write(name, writer, step, value, applied, obstruction, mask)
         )
       next_states.append(next_state)
     return log, next_states
@@ -366,7 +386,7 @@ class FeedbackMechanism(composer.Entity):
         initial one.
     """
     return [
-        provider_results.restarted(f'state of {writer}', state, initial, worlds)
+        provider_results.merged(f'state of {writer}', state, initial, worlds)
         for (writer, _), state, initial in zip(
             self._providers,
             states,
@@ -389,6 +409,19 @@ class FeedbackMechanism(composer.Entity):
         self._registers[name].inspect(physics, records.AGENT, step)
         for name in self._read_by_agent
     ]
+
+  def ends_episode(self, reads: Sequence[records.Read]) -> Any:
+    """Returns True for worlds whose episode a signal ends, `(...)` bool.
+
+    Args:
+      reads: Reads for the agent, as from `read_for_agent`.
+    """
+    is_ending: Any = np.False_
+    for read in reads:
+      threshold = self._design.registers[read.register].ends_episode
+      if threshold is not None:
+        is_ending = is_ending | threshold.is_crossed(read.reading)
+    return is_ending
 
   def end_step(self, physics: protocols.Physics, reward: Any) -> None:
     """Increments the number of control steps and adds a reward to the score.

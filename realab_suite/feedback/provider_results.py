@@ -1,21 +1,35 @@
 """Checks of the writes and states that providers return."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import messages
+from realab_suite.entities import axes
 from realab_suite.feedback import providers
+
+
+@final
+class RequestedWrite(NamedTuple):
+  """A value that a provider writes.
+
+  Attributes:
+    value: The value, `(...)` float64.
+    where: Worlds in which it is written, `(...)` bool; `None` for all worlds.
+  """
+
+  value: Any
+  where: axes.Mask
 
 
 def checked(
     provider: providers.Provider,
     returned: Any,
     batch_shape: tuple[int, ...],
-) -> tuple[dict[str, np.ndarray], Any]:
-  """Returns the writes, as float64, and the next state of a provider.
+) -> tuple[dict[str, RequestedWrite], Any]:
+  """Returns the writes, by register, and the next state of a provider.
 
   Args:
     provider: The provider.
@@ -33,16 +47,39 @@ def checked(
   values, state = returned
   # Almost all are dicts, which the check for mappings is slow for.
   is_mapping = type(values) is dict or isinstance(values, Mapping)
-  if not is_mapping or values.keys() != set(provider.writes):
+  if not is_mapping or not values.keys() <= set(provider.writes):
     given = sorted(map(str, values)) if is_mapping else values
     raise errors.FeedbackProviderError(
         f'returned writes {messages.quote(given)}; it declares writes to'
         f' {sorted(provider.writes)}'
     )
   return {
-      name: _checked_value(name, value, batch_shape)
+      name: _checked_write(name, value, batch_shape)
       for name, value in values.items()
   }, state
+
+
+def _checked_write(
+    name: str, write: Any, shape: tuple[int, ...]
+) -> RequestedWrite:
+  """Returns a write, which is a value or a tuple of a value and a mask.
+
+  Raises:
+    FeedbackProviderError: If it is not, or if a shape differs from `shape`.
+  """
+  if not isinstance(write, tuple):
+    return RequestedWrite(_checked_value(name, write, shape), None)
+  mask = write[1] if len(write) == 2 else None
+  if not isinstance(mask, bool | np.bool_ | np.ndarray) or (
+      np.asarray(mask).dtype != bool or np.shape(mask) != shape
+  ):
+    raise errors.FeedbackProviderError(
+        f'wrote {messages.quote(write)} to {name!r}; allowed is a value, or a'
+        f' tuple (value, mask) with a mask of bool of shape {shape}'
+    )
+  return RequestedWrite(
+      _checked_value(name, write[0], shape), np.asarray(mask)[()]
+  )
 
 
 def _checked_value(name: str, value: Any, shape: tuple[int, ...]) -> Any:
@@ -101,35 +138,35 @@ def check_state(where: str, state: Any, batch_shape: tuple[int, ...]) -> None:
     )
 
 
-def restarted(where: str, state: Any, initial: Any, worlds: np.ndarray) -> Any:
-  """Returns a provider's state for a batch with some worlds restarted.
+def merged(where: str, state: Any, other: Any, worlds: np.ndarray) -> Any:
+  """Returns a provider's state for a batch with some worlds of another one.
 
   Args:
     where: Name of the state, for messages.
-    state: Current state of all worlds; it is not modified.
-    initial: Initial state of all worlds.
-    worlds: Indices of the worlds that begin an episode.
+    state: State of all worlds; it is not modified.
+    other: Other state of all worlds, such as the initial one.
+    worlds: Worlds to take from the other state: indices, or `(worlds,)` bool.
 
   Raises:
     FeedbackProviderError: If the states have different structures.
   """
-  is_same = type(state) is type(initial)
-  if is_same and isinstance(state, dict) and state.keys() == initial.keys():
+  is_same = type(state) is type(other)
+  if is_same and isinstance(state, dict) and state.keys() == other.keys():
     return {
-        key: restarted(f'{where}[{key!r}]', part, initial[key], worlds)
+        key: merged(f'{where}[{key!r}]', part, other[key], worlds)
         for key, part in state.items()
     }
   is_sequence = is_same and isinstance(state, tuple | list)
-  if is_sequence and len(state) == len(initial):
+  if is_sequence and len(state) == len(other):
     return type(state)(
-        restarted(f'{where}[{i}]', part, initial[i], worlds)
+        merged(f'{where}[{i}]', part, other[i], worlds)
         for i, part in enumerate(state)
     )
-  if np.shape(state) == np.shape(initial) and isinstance(initial, np.ndarray):
+  if np.shape(state) == np.shape(other) and isinstance(other, np.ndarray):
     result = np.array(state)
-    result[worlds] = initial[worlds]
+    result[worlds] = other[worlds]
     return result
   raise errors.FeedbackProviderError(
       f'{where}: {messages.quote(state)}; allowed is the structure of the'
-      f' initial state, {messages.quote(initial)}'
+      f' initial state, {messages.quote(other)}'
   )

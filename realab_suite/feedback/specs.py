@@ -19,6 +19,7 @@ from realab_suite.feedback import measurements
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import registered_models
+from realab_suite.feedback import thresholds
 from realab_suite.policies import action_sets
 
 _NAME = r'^[a-z][a-z0-9_]{0,63}$'
@@ -30,15 +31,16 @@ Value = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
 Size = Annotated[float, pydantic.Field(ge=block_kinds.LEAST_SIZE, le=1.0)]
 Channel = Literal['embedded', 'welded', 'secure']
 Dof = Literal['free', 'planar']
-Role = Literal['feedback', 'meter', 'query', 'signal']
+Role = Literal['feedback', 'meter', 'query', 'signal', 'memory']
 
 # Largest number of registers of a design. A hundred two-block registers load in
 # a second and take 10 ms for a control step; both times are linear in the
 # number. MuJoCo reserves 160 MB for their contacts, quadratic in the number.
 MAX_REGISTERS = 100
 
-# Roles of the registers that the agent reads.
+# Roles of registers that the agent reads, and of those that providers write.
 READ_BY_AGENTS = ('feedback', 'signal')
+WRITTEN_BY_PROVIDERS = (*READ_BY_AGENTS, 'memory')
 
 
 @final
@@ -81,7 +83,8 @@ class RegisterSpec(validation.Spec):
   Attributes:
     kind: Name of a registered register kind.
     role: Role of the register. Agents read `feedback` and `signal` registers
-      and write `query` registers. Only providers read `meter` registers.
+      and write `query` registers. Only providers read `meter` registers. Only
+      providers read and write `memory` registers.
     place: Name of a place of the world, or coordinates.
     range: Lowest and highest value that can be stored.
     scale: Length in m (angle in rad for an orientation) per unit of value.
@@ -95,6 +98,9 @@ class RegisterSpec(validation.Spec):
     dof: Degrees of freedom of the blocks; `None` for those of the design.
     block_size: Edge length of each block, in m.
     mass: Mass of each block, in kg.
+    ends_episode: Threshold of a `signal` register: the episode ends with the
+      first control step after which the agent's reading crosses it. `None` if
+      the register does not end episodes.
     options: Further keyword arguments of a user-defined register kind.
   """
 
@@ -111,6 +117,7 @@ class RegisterSpec(validation.Spec):
   dof: Dof | None = None
   block_size: Size = 0.2
   mass: Annotated[float, pydantic.Field(ge=0.01, le=100)] = 1.0
+  ends_episode: thresholds.ThresholdSpec | None = None
   options: Annotated[
       dict[str, Any],
       option_types.OptionsOf(
@@ -137,6 +144,17 @@ class RegisterSpec(validation.Spec):
     if not low <= self.initial <= high:
       raise ValueError(
           f'initial {self.initial} must be in range {list(self.range)}'
+      )
+    if self.ends_episode is None:
+      return self
+    if self.role != 'signal':
+      raise ValueError(
+          f"ends_episode: the role is {self.role!r}; allowed is 'signal'"
+      )
+    if len(set(map(self.ends_episode.is_crossed, self.range))) == 1:
+      raise ValueError(
+          f'ends_episode: all or no values in range {list(self.range)} are'
+          f' {self.ends_episode.text}; allowed are those between values'
       )
     return self
 
@@ -309,7 +327,7 @@ class DesignSpec(validation.Spec):
           f'registers: {len(self.registers)} are given; allowed are at most'
           f' {MAX_REGISTERS}'
       )
-    consistency.check(self, READ_BY_AGENTS)
+    consistency.check(self, WRITTEN_BY_PROVIDERS)
     return self
 
   def names(self, *roles: str) -> list[str]:

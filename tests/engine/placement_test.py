@@ -66,6 +66,12 @@ def test_a_region_is_kept_from_the_start_of_the_avatar(
   assert _begins_in_a_block(place) == is_in_the_way
 
 
+def test_a_region_may_be_so_small_that_its_square_is_0():
+  place = {'position': [0.0, 0.0], 'spread': [0.0, 1.7e-291]}
+  with pytest.raises(errors.SpecError, match='where the avatar begins'):
+    suite.load('collect_apples', 'far', design=_design(place, kind='two_block'))
+
+
 # ---- Every place of a region -------------------------------------------------
 
 
@@ -370,11 +376,11 @@ class _Circling(registers.Register):
     self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
     return [self._block]
 
-  def _put(self, physics, value):
+  def _put(self, physics, value, where=None):
     position = np.array(self._origin(physics))
     position[..., 0] += 0.5 * np.cos(value)
     position[..., 1] += 0.5 * np.sin(value)
-    self._block.put(physics, position, heading=value)
+    self._block.put(physics, position, heading=value, where=where)
 
   def _read_blocks(self, physics):
     return self._block.heading(physics)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import meters
 from realab_suite.entities import registers
@@ -53,16 +52,6 @@ def test_a_meter_writes_its_measurement_on_update(world):
   assert beyond == (12.0, 10.0)
   assert world.read() == pytest.approx(10.0, abs=1e-12)
   assert (measured, applied) == (3.5, 3.5)
-
-
-def test_an_idle_meter_keeps_a_value_in_range():
-  world = _World(initial=2.0, on_overflow='error', value_range=(1, 10))
-  assert world.meter.update(world.physics, np.array(True)) == (2.0, 2.0)
-  # As MuJoCo leaves it when the physics have failed.
-  world.physics.data.userdata[:] = 0.0
-  assert world.meter.update(world.physics, np.array(True)) == (1.0, 1.0)
-  with pytest.raises(errors.RegisterValueError):
-    world.meter.update(world.physics, np.array(False))
 
 
 def test_a_measurement_may_be_any_number():

@@ -195,6 +195,7 @@ def test_a_reset_by_an_actor_of_a_batch_gives_up_the_episodes():
     [
         (None, False, False),
         (events.End.TERMINATED, True, False),
+        (events.End.SIGNAL, True, False),
         (events.End.TIMEOUT, True, False),
         (events.End.ABANDONED, False, True),
         (events.End.DISCONNECT, False, True),
@@ -212,7 +213,8 @@ def test_every_end_is_valid_given_up_or_failed(end, is_valid, is_given_up):
 
 def test_these_are_all_the_ends():
   ends = {events.End(value) for value in (
-      'terminated', 'timeout', 'abandoned', 'disconnect', 'divergence', 'error',
+      'terminated', 'signal', 'timeout', 'abandoned', 'disconnect',
+      'divergence', 'error',
   )}  # fmt: skip
   assert set(events.End) == ends
 

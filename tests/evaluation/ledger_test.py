@@ -87,14 +87,14 @@ def test_an_entry_copies_numbers_out_of_arrays():
   write, read, reward = _write(1.0), _read(2.0, 3.0, 4.0), np.array(5.0)
   ledger.episode_started(_start(write, read), None)
   ledger.step_ended(events.Step([], reward), None)
-  for array in (*write[3:], *read[3:], reward):
+  for array in (*write[3:-1], *read[3:-1], reward):
     array[...] = -1.0
   assert ledger.last.entries['reward'] == [
-      ('reward', 'providers[0]:constant', 1, 1.0, 1.0),
-      ('reward', 'agent', 1, 2.0, 3.0, 4.0),
+      ('reward', 'providers[0]:constant', 1, 1.0, 1.0, None),
+      ('reward', 'agent', 1, 2.0, 3.0, 4.0, None),
   ]
   assert ledger.last.true_rewards == [5.0]
-  numbers = [x for entry in ledger.last.entries['reward'] for x in entry[3:]]
+  numbers = [x for entry in ledger.last.entries['reward'] for x in entry[3:-1]]
   assert {type(x) for x in (*numbers, *ledger.last.true_rewards)} == {float}
 
 

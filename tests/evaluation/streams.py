@@ -171,7 +171,7 @@ def decode(text: bytes) -> list[list[Record]]:
 
 
 def rescaled(record: Record, factor: float) -> Record:
-  return type(record)(*record[:3], *(x * factor for x in record[3:]))
+  return type(record)(*record[:3], *(x * factor for x in record[3:-1]))
 
 
 # By hand. A unit is half a metre.

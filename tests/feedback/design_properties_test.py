@@ -46,6 +46,7 @@ _HOSTILE = st.one_of(
 _HOSTILE_KEYS = st.sampled_from(['metres', 'kinds', '', 'a/b', '__class__'])
 _ROLES = {
     'reward': 'feedback', 'score': 'meter', 'query': 'query', 'hint': 'signal',
+    'note': 'memory',
 }  # fmt: skip
 _CHANNELS = st.sampled_from(['embedded', 'welded', 'secure'])
 _DOFS = st.sampled_from(['free', 'planar'])
@@ -91,6 +92,8 @@ _PROVIDERS = {
     'score': [{'kind': 'difference', 'reads': ['score'], 'writes': ['reward']}],
     'query': [{**_ADVICE, 'reads': ['query']}],
     'hint': [{'kind': 'constant', 'writes': ['reward', 'hint'], 'value': 1.5}],
+    'note': [{'kind': 'constant', 'reads': ['note'], 'every': 2,
+              'writes': ['reward', 'note']}],
     '': [{'kind': 'demonstration', 'policy': 'apple_seeker',
           'writes': ['reward']}],
 }  # fmt: skip

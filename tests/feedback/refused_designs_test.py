@@ -57,7 +57,7 @@ _WRONG = {
     'registers.reward.kind=tow_block':
         "register kind 'tow_block' is unknown; did you mean 'two_block'?",
     'registers.reward.role=reward':
-        "role: must be 'feedback', 'meter', 'query' or 'signal', got 'reward'",
+        "role: must be 'feedback', 'meter', 'query', 'signal' or 'memory', got",
     'registers.reward.channel=weld':
         "channel: must be 'embedded', 'welded' or 'secure', got 'weld'",
     'dof=fixed': "dof: must be 'free' or 'planar'",
@@ -75,7 +75,10 @@ _WRONG = {
         "providers[0].writes: register 'secret' is not declared",
     'providers.0.writes=[score]':
         "providers[0].writes: register 'score' has role 'meter'; allowed are"
-        " ['feedback', 'signal']",
+        " ['feedback', 'signal', 'memory']",
+    'providers.0.every=0':
+        'providers[0].every: must be greater than or equal to 1, got 0',
+    'providers.0.every=1.5': 'providers[0].every: must be a valid integer',
     'providers.0.kind=diference':
         "providers[0].kind: must be one of 'constant', 'demonstration',",
     'providers.0={writes: [reward]}':

@@ -95,6 +95,9 @@ _CHANGES = {
     'dof': 'dof=planar',
     'registers.kind': 'registers.reward.kind=block_position',
     'registers.role': 'registers.reward.role=signal',
+    'registers.ends_episode':
+        'registers.reward={kind: two_block, role: signal, place: station_1,'
+        ' range: [-2, 12], ends_episode: {above: 1}}',
     'registers.place': 'registers.reward.place=station_3',
     'registers.place.position': 'registers.reward.place=[0, 0]',
     'registers.place.yaw': 'registers.reward.place={position: [0, 0], yaw: 1}',
@@ -117,6 +120,7 @@ _CHANGES = {
     'meters.writes': 'meters=[{measures: score, writes: score_2}]',
     'providers': 'providers=[]',
     'providers.initial': 'providers.0.initial=1.0',
+    'providers.every': 'providers.0.every=2',
     'schedule': 'schedule=cfmdp',
     'schedule.meter_substep':
         'schedule={meter_substep: 1, provider_substep: 4}',

@@ -11,8 +11,10 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.engine import agent_view
+from realab_suite.engine import events
 from realab_suite.interop.rpc import agent_port
 from realab_suite.interop.rpc import refusals
+from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import tensors
 from tests.engine import helpers
 from tests.interop import served
@@ -255,6 +257,28 @@ def test_the_discount_of_a_last_step_decides_its_state(discount, state):
   _join(port)
   _step(port)
   assert _step(port, tensor_utils.pack_tensor([0.0])).step.state == state
+
+
+def test_a_served_episode_that_a_signal_ends_is_terminated_and_valid():
+  signal = helpers.one_register(
+      'stop',
+      [{'kind': 'constant', 'value': 5.0, 'writes': ['stop']}],
+      role='signal',
+      range=[0, 9],
+      ends_episode={'above': 2},
+  )
+  found = []
+  env = served.load(signal)
+  world = served_world.ServedWorld(env, 'x', 1, lambda r, tier: found.append(r))
+  action = tensor_utils.pack_tensor(helpers.no_op(env))
+  step = served.request(step=pb.StepRequest(actions={1: action}))
+  replies = [world.answer(r) for r in (served.JOIN, served.STEP, step)]
+  last = pb.EnvironmentResponse.FromString(replies[-1])
+  assert last.step.state == pb.TERMINATED
+  assert not world.settle()
+  env.close()
+  [result] = found
+  assert (result.end, result.is_valid) == (events.End.SIGNAL, True)
 
 
 def test_a_failure_reveals_nothing_and_begins_another_episode():

@@ -129,26 +129,42 @@ class Register(composer.Entity):
     """
 
   @abc.abstractmethod
-  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
+  def _put(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
     """Moves the blocks to the undisturbed poses of a value, `(...)`.
 
     Episodes begin with these poses.
+
+    Args:
+      physics: One world or a batch of worlds.
+      value: Value in the register's units, `(...)`.
+      where: Worlds in which to move them, `(...)` bool; `None` for all worlds.
     """
 
-  def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
+  def _shift(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> np.ndarray:
     """Changes only the coordinates that carry the value, as a write does.
 
     Without this method, each write restores the poses of the blocks.
 
     Args:
       physics: One world or a batch of worlds.
-      value: Value to represent, `(...)`.
+      value: Value in the register's units, `(...)`.
+      where: As in `_put`.
 
     Returns:
       Value that the blocks got, `(...)`: `value`, unless something immovable is
       in the way.
     """
-    self._put(physics, value)
+    self._put(physics, value, where)
     return value
 
   @abc.abstractmethod
@@ -173,7 +189,7 @@ class Register(composer.Entity):
 
   @property
   def role(self) -> str:
-    """Role of the register: `feedback`, `meter`, `query` or `signal`."""
+    """Role of the register, a key of `appearance.ROLE_COLOURS`."""
     return self._role
 
   @property
@@ -293,7 +309,9 @@ class Register(composer.Entity):
     self._put(physics, value)
     self._store(physics, value, 0.0)
 
-  def write(self, physics: protocols.Physics, value: Any) -> np.ndarray:
+  def write(
+      self, physics: protocols.Physics, value: Any, where: axes.Mask = None
+  ) -> np.ndarray:
     """Moves the blocks so that they represent a value.
 
     A write changes the coordinate along the register's axis (the angle about
@@ -305,37 +323,47 @@ class Register(composer.Entity):
 
     Args:
       physics: One world or a batch of worlds.
-      value: Requested value, `(...)`, in the register's units.
+      value: Requested value, `(...)`, in the register's units. Values of worlds
+        that are not written are ignored.
+      where: Worlds in which the register is written, `(...)` bool; `None` for
+        all worlds. In the other worlds, nothing changes.
 
     Returns:
-      Applied value, `(...)`: `value`, or the nearest bound of `value_spec`. The
-      difference is saturation, never corruption.
+      Applied value of the last write, `(...)`: `value`, or the nearest bound of
+      `value_spec`. The difference is saturation, never corruption.
 
     Raises:
       RegisterValueError: If a value is not finite, or if it is out of range and
         the register does not saturate. Nothing is written.
     """
     value = np.asarray(value, np.float64)[()]
+    if where is not None:  # An ignored value must not be refused.
+      value = np.where(where, value, self._initial)
     fits = (value >= self._low) & (value <= self._high)  # False for NaN.
     applied = value if axes.everywhere(fits) else self._saturate(value, fits)
     # Nothing can move a welded block away from its axis.
     if self._write == 'pose' or self._channel == 'welded':
-      self._put(physics, applied)
+      self._put(physics, applied, where)
       placed = applied
     else:
-      placed = self._shift(physics, applied)
+      placed = self._shift(physics, applied, where)
     is_placed = placed is applied or self._channel == 'secure'
-    self._store(physics, applied, 0.0 if is_placed else placed - applied)
-    return applied
+    obstruction = 0.0 if is_placed else placed - applied
+    self._store(physics, applied, obstruction, where)
+    return axes.merge(where, applied, self._applied_slot.get(physics))
 
   def _store(
-      self, physics: protocols.Physics, applied: np.ndarray, obstruction: Any
+      self,
+      physics: protocols.Physics,
+      applied: np.ndarray,
+      obstruction: Any,
+      where: axes.Mask = None,
   ) -> None:
     """Stores the result of a write."""
-    self._applied_slot.set(physics, applied)
-    self._obstruction_slot.set(physics, obstruction)
+    self._applied_slot.set(physics, applied, where)
+    self._obstruction_slot.set(physics, obstruction, where)
     if self._channel == 'secure':
-      self._stored_slot.set(physics, applied)
+      self._stored_slot.set(physics, applied, where)
 
   def _saturate(self, value: np.ndarray, fits: np.ndarray) -> np.ndarray:
     """Returns the values, saturated to the range of the register.
@@ -383,17 +411,6 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
     """
     return self._obstruction_slot.copy(physics)
-
-  def keep(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the value to write so that the register keeps its value, `(...)`.
-
-    The result is clipped to the range of the register, because the value may be
-    out of range after the physics has failed.
-
-    Args:
-      physics: One world or a batch of worlds.
-    """
-    return np.clip(self.applied(physics), self._low, self._high)[()]
 
   def displacement(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the distance by which the blocks have moved, `(...)`, in m.
@@ -462,6 +479,7 @@ class Register(composer.Entity):
       block: block_kinds.Block,
       start: np.ndarray,
       value: np.ndarray,
+      where: axes.Mask,
   ) -> np.ndarray:
     """Sets the coordinate of a block along the axis, for `_shift`.
 
@@ -470,12 +488,13 @@ class Register(composer.Entity):
       block: Block with joints.
       start: Coordinate that represents 0, `(...)`, in m.
       value: Value to represent, `(...)`.
+      where: As in `_put`.
 
     Returns:
       Value that the block got, `(...)`.
     """
     along = start + value * self._scale
-    placed = _jointed(block).slide(physics, along)
+    placed = _jointed(block).slide(physics, along, where)
     if placed is along:
       return value
     # Exactly the value wherever nothing is in the way.
@@ -486,6 +505,7 @@ class Register(composer.Entity):
       physics: protocols.Physics,
       block: block_kinds.Block,
       value: np.ndarray,
+      where: axes.Mask,
   ) -> np.ndarray:
     """Sets the heading of a block, for `_shift`.
 
@@ -493,11 +513,12 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
       block: Block with joints.
       value: Value to represent, `(...)`.
+      where: As in `_put`.
 
     Returns:
       `value`. Nothing obstructs a turn.
     """
-    _jointed(block).turn(physics, value * self._scale)
+    _jointed(block).turn(physics, value * self._scale, where)
     return value
 
   def _add_block(

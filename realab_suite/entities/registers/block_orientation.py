@@ -5,6 +5,7 @@ from typing import final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
@@ -34,13 +35,23 @@ class BlockOrientationRegister(base.Register):
     self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
     return [self._block]
 
-  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
+  def _put(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
     position = np.array(self._origin(physics))
     position[..., 2] = self._block.rest_height
-    self._block.put(physics, position, heading=value * self._scale)
+    self._block.put(physics, position, value * self._scale, where)
 
-  def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
-    return self._turn(physics, self._block, value)
+  def _shift(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> np.ndarray:
+    return self._turn(physics, self._block, value, where)
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale

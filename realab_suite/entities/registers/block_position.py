@@ -23,15 +23,25 @@ class BlockPositionRegister(base.Register):
     self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
     return [self._block]
 
-  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
+  def _put(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
     position = np.array(self._origin(physics))
     position[..., 0] = axes.component(position, 0) + value * self._scale
     position[..., 2] = self._block.rest_height
-    self._block.put(physics, position)
+    self._block.put(physics, position, where=where)
 
-  def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
+  def _shift(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> np.ndarray:
     start = axes.component(self._origin(physics), 0)
-    return self._slide(physics, self._block, start, value)
+    return self._slide(physics, self._block, start, value, where)
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     started = axes.component(self._origin(physics), 0)

@@ -3,9 +3,14 @@
 The feedback mechanism makes the records, event sinks receive them, and the
 ledger stores them. The arrays have shape `(...)`: `()` for one world,
 `(worlds,)` for a batch. All values are in the register's units.
+
+In a batch, a record may belong to some of the worlds only: those where its mask
+`where` is True.
 """
 
 from typing import Any, NamedTuple, final
+
+from realab_suite.entities import axes
 
 # Writers and readers that are neither meters nor providers.
 AGENT = 'agent'
@@ -25,6 +30,8 @@ class Write(NamedTuple):
     applied: Applied value: `requested`, saturated to the range of the register.
     obstruction: Value that the blocks got, minus `applied`: not 0 if something
       immovable was in the way of a block.
+    where: Worlds that were written, `(worlds,)` bool; `None` for all worlds.
+      The values of other worlds have no meaning.
   """
 
   register: str
@@ -33,6 +40,7 @@ class Write(NamedTuple):
   requested: Any
   applied: Any
   obstruction: Any
+  where: axes.Mask = None
 
 
 @final
@@ -50,6 +58,7 @@ class Read(NamedTuple):
     obstruction: Part of the corruption that the last write had.
     permanent: Part of the corruption that the next write does not repair.
     temporary: Part of the corruption that the next write repairs.
+    where: Worlds in which the reader read; as in `Write`.
   """
 
   register: str
@@ -59,20 +68,28 @@ class Read(NamedTuple):
   obstruction: Any
   permanent: Any
   temporary: Any
+  where: axes.Mask = None
 
 
 Record = Write | Read
 
 
-def of_world(record: Record, world: int | None = None) -> Record:
+def of_world(record: Record, world: int | None = None) -> Record | None:
   """Returns the part of a record that belongs to one world, as plain numbers.
 
   Args:
     record: A write or a read.
     world: Index of the world in its batch; `None` for a record of one world.
+
+  Returns:
+    The record of that world, or `None` if the world has no part in it.
   """
-  register, party, *numbers = record
+  register, party, *numbers, where = record
   if world is not None:
+    if where is not None and not where[world]:
+      return None
     numbers = [number[world] for number in numbers]
   step, *values = numbers
-  return type(record)(register, party, int(step), *map(float, values))
+  kind: Any = type(record)
+  plain: Record = kind(register, party, int(step), *map(float, values))
+  return plain

@@ -40,15 +40,25 @@ class TwoBlockRegister(base.Register):
       self._mjcf_root.contact.add('exclude', body1='base', body2='offset')
     return [self._base, self._offset]
 
-  def _put(self, physics: protocols.Physics, value: np.ndarray) -> None:
+  def _put(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
     position = self._origin(physics) + self._from_origin
     position[..., 0] = axes.component(position, 0) + value * self._scale
     position[..., 2] = self._offset.rest_height
-    self._offset.put(physics, position)
+    self._offset.put(physics, position, where=where)
 
-  def _shift(self, physics: protocols.Physics, value: np.ndarray) -> np.ndarray:
+  def _shift(
+      self,
+      physics: protocols.Physics,
+      value: np.ndarray,
+      where: axes.Mask = None,
+  ) -> np.ndarray:
     start = axes.component(self._origin(physics), 0)
-    return self._slide(physics, self._offset, start, value)
+    return self._slide(physics, self._offset, start, value, where)
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     distance = self._offset.along(physics) - self._base.along(physics)

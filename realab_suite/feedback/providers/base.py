@@ -8,9 +8,12 @@ import numpy as np
 import pydantic
 
 from realab_suite.config import registry
+from realab_suite.entities import axes
 
 Observation = Mapping[str, np.ndarray]
 Readings = Mapping[str, np.ndarray]
+# A value to write, or a value and a mask.
+Writes = Mapping[str, np.ndarray | tuple[np.ndarray, np.ndarray]]
 # Files contain lists, but strict validation accepts only tuples.
 Names = Annotated[tuple[str, ...], pydantic.Field(strict=False)]
 OneName = Annotated[
@@ -30,7 +33,9 @@ class Provider(pydantic.BaseModel, abc.ABC):
   Attributes:
     kind: Name under which the class is registered.
     reads: Names of the registers whose readings the provider gets.
-    writes: Names of the registers that the provider writes.
+    writes: Names of the registers that the provider may write.
+    every: The provider acts in steps 1, 1 + every, 1 + 2 every ... of an
+      episode. In the other steps it is not called, and writes nothing.
   """
 
   model_config = pydantic.ConfigDict(frozen=True, extra='forbid', strict=True)
@@ -38,6 +43,8 @@ class Provider(pydantic.BaseModel, abc.ABC):
   kind: str
   reads: Names = ()
   writes: Names
+  # Steps are compared as 64-bit integers.
+  every: Annotated[int, pydantic.Field(ge=1, le=10**9)] = 1
 
   @property
   def action_queries(self) -> tuple[str, ...]:
@@ -54,6 +61,16 @@ class Provider(pydantic.BaseModel, abc.ABC):
     Override this in a subclass that writes an index.
     """
     return ()
+
+  def acts_in(self, step: Any) -> axes.Mask:
+    """Returns the worlds in which the provider acts; `None` for all worlds.
+
+    Args:
+      step: Control step of each world, `(...)` int, from 1.
+    """
+    if self.every == 1:
+      return None
+    return axes.both((step - 1) % self.every == 0, None)
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step.
@@ -75,7 +92,7 @@ class Provider(pydantic.BaseModel, abc.ABC):
       episode_start: np.ndarray,
       key: np.ndarray,
       state: Any,
-  ) -> tuple[dict[str, np.ndarray], Any]:
+  ) -> tuple[Writes, Any]:
     """Computes the feedback of one control step.
 
     Args:
@@ -88,8 +105,10 @@ class Provider(pydantic.BaseModel, abc.ABC):
       state: State that `initial_state` or the previous `step` returned.
 
     Returns:
-      Value to write to each register in `writes`, by name, `(...)`, in the
-      register's units, and the next state.
+      Value to write to each register, by name, `(...)`, in the register's
+      units, and the next state. A register in `writes` that is left out keeps
+      its value. A tuple `(value, mask)` writes only where the mask, `(...)`
+      bool, is True.
     """
 
   def check(self, design: Any) -> None:

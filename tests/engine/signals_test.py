@@ -1,0 +1,350 @@
+"""Readings of signal registers end episodes (G7, P6)."""
+
+from collections.abc import Iterator
+import contextlib
+from typing import Any, Literal, final
+
+import dm_env
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.engine import episodes
+from realab_suite.engine import events
+from realab_suite.entities import registers
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import results
+from realab_suite.feedback import providers
+from realab_suite.feedback import specs
+from tests.engine import helpers
+from tests.leaks import pairs
+
+_LAST, _FIRST = int(dm_env.StepType.LAST), int(dm_env.StepType.FIRST)
+_ALARM_STEP = 3
+_OPTIONS = {'role': 'signal', 'range': [0, 10], 'place': [1.4, -2.2]}
+
+
+@final
+class Alarm(providers.Provider):
+  """Writes a value from a step on, and is silent before."""
+
+  kind: Literal['test_alarm'] = 'test_alarm'
+  value: float = 5.0
+  start: int = _ALARM_STEP
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> np.ndarray:
+    return np.zeros(batch_shape, int)
+
+  def step(
+      self,
+      observation: Any,
+      readings: Any,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: np.ndarray,
+  ) -> tuple[dict[str, Any], np.ndarray]:
+    step = np.where(episode_start, 1, state + 1)
+    value = np.full(np.shape(step), self.value)
+    return {name: (value, step >= self.start) for name in self.writes}, step
+
+
+@pytest.fixture(autouse=True)
+def fixture_alarm() -> Iterator[None]:
+  with helpers.registered(providers.PROVIDERS, 'test_alarm', Alarm):
+    yield
+
+
+def _design(
+    ends_episode: Any = None, alarm: Any = None, **options: Any
+) -> dict[str, Any]:
+  """Returns a design with the signal `stop`; 5 is written in step 3."""
+  threshold = {'above': 2} if ends_episode is None else ends_episode
+  design = helpers.one_register(
+      'stop', **{**_OPTIONS, 'ends_episode': threshold, **options}
+  )
+  alarm = {'kind': 'test_alarm', 'writes': ['stop'], **(alarm or {})}
+  return {**design, 'providers': [alarm]}
+
+
+def _load(design: Any, num_envs: int = 0, max_steps: int | None = 20) -> Any:
+  world = 'unlock_door', 'standard', {'random': 1}, {'max_steps': max_steps}
+  if num_envs:
+    return suite.load_batch(*world, num_envs=num_envs, design=design)
+  return suite.load(*world, design=design)
+
+
+def _play(env: Any, steps: int, num_envs: int = 0) -> list[Any]:
+  shape = (*[num_envs] * bool(num_envs), *env.action_spec().shape)
+  return [env.step(np.zeros(shape)) for _ in range(steps)]
+
+
+def _ends(env: Any, steps: int, num_envs: int = 0) -> list[Any]:
+  """Returns the step types and discounts of steps, and the ledgers' ends."""
+  ledger = ledgers.BatchLedger() if num_envs else ledgers.Ledger()
+  env.add_sink(ledger)
+  played = _play(env, steps, num_envs)
+  found = ledger.episodes(num_envs - 1) if num_envs else ledger.episodes
+  ends = [episode.end for episode in found]
+  last = [
+      (float(np.max(step.discount)), i)
+      for i, step in enumerate(played)
+      if np.all(step.step_type == _LAST)
+  ]
+  env.close()
+  return [*last, *ends]
+
+
+def _push(env: Any, worlds: Any, distance: float) -> None:
+  """Moves the base block of the signal along its axis in some worlds."""
+  base = env.mechanism.registers['stop'].blocks[0]
+  position = np.array(base.position(env.physics))
+  position[..., 0][worlds] += distance
+  base.put(env.physics, position)
+
+
+_EITHER = pytest.mark.parametrize('num_envs', [0, 3], ids=['one', 'batch'])
+
+
+@_EITHER
+@pytest.mark.parametrize('channel', registers.CHANNELS)
+@pytest.mark.parametrize(
+    ('threshold', 'initial', 'value'),
+    [({'above': 2}, 0, 5), ({'below': 2.5}, 4, 0)],
+    ids=['above', 'below'],
+)
+def test_a_signal_ends_every_episode_with_discount_0(
+    num_envs, channel, threshold, initial, value
+):
+  design = _design(
+      threshold, {'value': float(value)}, initial=initial, channel=channel,
+      dof='planar' if num_envs else 'free',
+  )  # fmt: skip
+  found = _ends(_load(design, num_envs), 2 * (_ALARM_STEP + 1), num_envs)
+  # Index 0 is the reset.
+  assert found == [(0.0, 3), (0.0, 7), events.End.SIGNAL, events.End.SIGNAL]
+
+
+@_EITHER
+def test_without_a_threshold_a_signal_ends_nothing(num_envs):
+  design = _design()
+  del design['registers']['stop']['ends_episode']
+  assert _ends(_load(design, num_envs), 9, num_envs) == [None]
+
+
+@_EITHER
+def test_a_signal_at_the_reset_ends_the_first_control_step(num_envs):
+  design = _design(initial=5)
+  found = _ends(_load(design, num_envs), 2, num_envs)
+  assert found == [(0.0, 1), events.End.SIGNAL]
+
+
+@_EITHER
+def test_the_reading_counts_and_not_the_value_that_was_written(num_envs):
+  env = _load(_design(), num_envs)
+  _play(env, 2, num_envs)  # The reset and step 1.
+  _push(env, 0 if num_envs else (), 0.4)  # Readings are 4 too low there.
+  if num_envs:
+    _push(env, 1, -0.4)
+  first, *others = _play(env, 5, num_envs)
+  ended = np.array([s.step_type == _LAST for s in (first, *others)])
+  # World 0 does not hear the alarm, and world 1 has heard one before it.
+  if num_envs:
+    assert ended[0].tolist() == [False, True, False]
+    assert ended[1].tolist() == [False, False, True]
+    assert not ended[:, 0].any()
+    readings = [step.observation['registers/stop'][0] for step in others]
+  else:
+    assert not ended.any()
+    readings = [step.observation['registers/stop'] for step in others]
+  assert readings == pytest.approx([1.0] * 4, abs=1e-6)
+  env.close()
+
+
+def test_providers_do_not_write_in_a_world_whose_episode_has_ended():
+  design = _design()
+  design['registers']['reward'] = {
+      **design['registers']['stop'], 'role': 'feedback', 'place': [-2, 2],
+      'ends_episode': None, 'on_overflow': 'error',
+  }  # fmt: skip
+  # Step 4 of an episode would raise an exception.
+  design['providers'].append(
+      {'kind': 'test_alarm', 'writes': ['reward'], 'value': 99.0, 'start': 4}
+  )
+  env = _load(design, 3)
+  _play(env, 2, 3)
+  _push(env, [0, 2], -0.4)
+  # World 1 ends last, and ignores a step in which the others are behind it.
+  types = [step.step_type.tolist() for step in _play(env, 3, 3)]
+  assert types == [[2, 1, 2], [0, 2, 0], [1, 0, 1]]
+  env.close()
+
+
+@pytest.mark.parametrize(
+    ('policy', 'channel', 'end'),
+    [
+        ('apple_seeker', 'embedded', 'signal'),
+        ('carrying_saboteur', 'embedded', 'timeout'),
+        ('carrying_saboteur', 'secure', 'signal'),
+        ('carrying_saboteur', 'welded', 'signal'),
+    ],
+)
+def test_an_agent_that_moves_a_signal_goes_on(policy, channel, end):
+  """The signal is low from step 60 on, and the saboteur raises its reading."""
+  design = _design(
+      {'below': 1}, {'value': 0.0, 'start': 60}, initial=5, channel=channel,
+      place='station_1',
+  )  # fmt: skip
+  world = 'collect_apples', 'standard', {'random': 1}, {'max_steps': 80}
+  env = suite.load(*world, design=design)
+  batch = suite.load_batch(*world, num_envs=2, design=design)
+  with contextlib.closing(env), contextlib.closing(batch):
+    [alone] = evaluate.evaluate(env, policies.make(policy), 1)
+    actor = batch_actors.BatchPolicyActor(policies.make(policy), batch, 1)
+    assert evaluate.evaluate_batch(batch, actor)[0] == alone
+  info = results.RunInfo.of(
+      ('collect_apples', 'standard'), (1, None), specs.load(design),
+      policy=policy, run='run', baseline=None, control_timestep=0.1,
+      max_steps=80,
+  )  # fmt: skip
+  row = results.row(info, alone)
+  assert (row.end, row.num_steps) == (end, 60 if end == 'signal' else 80)
+  assert row.is_valid
+  assert row.counts
+  assert (row.registers['stop'].corruption > 1) == (end == 'timeout')
+
+
+# What else ends an episode in the same step.
+
+
+@pytest.mark.parametrize(
+    ('reasons', 'end'),
+    [
+        ((0, 0, 0, 0), None),
+        ((0, 0, 0, 1), events.End.TIMEOUT),
+        ((0, 0, 1, 1), events.End.SIGNAL),
+        ((0, 1, 1, 1), events.End.TERMINATED),
+        ((1, 1, 1, 1), events.End.DIVERGENCE),
+    ],
+)
+def test_the_first_of_several_reasons_counts(reasons, end):
+  assert episodes.end_of_step(*map(bool, reasons)) is end
+
+
+@_EITHER
+def test_a_signal_in_the_last_step_is_no_timeout(num_envs):
+  found = _ends(_load(_design(), num_envs, _ALARM_STEP), 4, num_envs)
+  assert found == [(0.0, 3), events.End.SIGNAL]
+
+
+@_EITHER
+@pytest.mark.mujoco_warns('BADQVEL')
+def test_failed_physics_is_no_signal(num_envs):
+  env = _load(_design(initial=5), num_envs)
+  ledger = ledgers.BatchLedger() if num_envs else ledgers.Ledger()
+  env.add_sink(ledger)
+  _play(env, 1, num_envs)
+  block = env.mechanism.registers['stop'].blocks[0]
+  joint = env.physics.bind(block._slides)
+  joint.qvel = np.full_like(joint.qvel, np.nan)
+  [step] = _play(env, 1, num_envs)
+  assert np.all(step.step_type == _LAST)
+  assert np.all(step.discount == 1.0)
+  [episode] = ledger.episodes(0) if num_envs else ledger.episodes
+  assert (episode.end, episode.is_valid) == (events.End.DIVERGENCE, False)
+  env.close()
+
+
+@_EITHER
+def test_an_agent_cannot_tell_a_signal_from_another_termination(num_envs):
+  said: list[list[bytes]] = []
+  for threshold in (2, 9):
+    env = _load(_design({'above': threshold}), num_envs)
+    ledger = ledgers.BatchLedger() if num_envs else ledgers.Ledger()
+    env.add_sink(ledger)
+    view = pairs.view_of(env)
+    steps = _play(view, _ALARM_STEP, num_envs)
+    if threshold == 9:  # No reading crosses it: the task ends the episode.
+      env.task._over.set(env.physics, 1.0)
+    steps += _play(view, 3, num_envs)
+    assert np.all(steps[3].step_type == _LAST)
+    said.append([pairs.encode(step) for step in steps])
+    first, _ = ledger.episodes(0) if num_envs else ledger.episodes
+    assert first.end == events.End('signal' if threshold == 2 else 'terminated')
+    env.close()
+  assert said[0] == said[1]
+
+
+# Foreign tasks, snapshots and designs.
+
+
+@pytest.mark.parametrize('is_over', [False, True])
+def test_a_signal_ends_an_episode_of_a_foreign_task(is_over):
+  task = helpers.PointTask()
+  task.get_discount = lambda physics: 0.5
+  task.should_terminate_episode = lambda physics: (
+      is_over and round(physics.time() / 0.05) >= _ALARM_STEP
+  )
+  env, sink = helpers.embed(task, _design())
+  step = _play(env, _ALARM_STEP + 1)[-1]
+  assert step.last()
+  assert step.discount == (0.5 if is_over else 0.0)
+  end = events.End.TERMINATED if is_over else events.End.SIGNAL
+  assert sink.ends == [end]
+  assert env.step(helpers.no_op(env)).first()
+
+
+@_EITHER
+def test_an_episode_that_a_signal_ended_is_restored_as_ended(num_envs):
+  env = _load(_design(), num_envs)
+  _play(env, _ALARM_STEP, num_envs)
+  before = env.save()
+  _play(env, 1, num_envs)
+  after = env.save()
+  for snapshot, kind in ((before, _LAST), (after, _FIRST)):
+    env.restore(snapshot)
+    [step] = _play(env, 1, num_envs)
+    assert np.all(step.step_type == kind)
+  env.close()
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        (
+            {'role': 'feedback'},
+            r"stop: ends_episode: the role is 'feedback'; allowed is 'signal'",
+        ),
+        ({'ends_episode': {}}, 'exactly one of above and below must be given'),
+        (
+            {'ends_episode': {'above': 1, 'below': 0}},
+            'exactly one of above and below must be given',
+        ),
+        (
+            {'ends_episode': {'above': 10}},
+            r'all or no values in range .* are (above|below)',
+        ),
+        (
+            {'ends_episode': {'below': 0}},
+            r'all or no values in range .* are (above|below)',
+        ),
+        ({'ends_episode': {'above': -1}}, 'all or no values in range'),
+        ({'ends_episode': {'over': 1}}, "unknown key 'over'"),
+        ({'ends_episode': {'above': float('nan')}}, 'finite'),
+    ],
+)
+def test_a_wrong_threshold_is_refused(options, message):
+  design = _design()
+  design['registers']['stop'].update(options)
+  with pytest.raises(errors.SpecError, match=message) as caught:
+    specs.load(design)
+  assert '\n' not in str(caught.value)
+
+
+def test_a_threshold_survives_a_file():
+  spec = specs.load(_design({'below': 3}))
+  assert specs.load(spec.to_mapping()) == spec
+  assert spec.registers['stop'].ends_episode.below == 3.0

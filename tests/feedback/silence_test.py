@@ -1,0 +1,173 @@
+"""Providers may stay silent: what they do not write keeps its value (P1)."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from campaigns import identity_campaign
+from realab_suite import suite
+from realab_suite.entities import registers
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import metrics
+from realab_suite.evaluation import monitors
+from tests.engine import helpers
+from tests.feedback import scripted
+from tests.feedback import sparing
+
+_PLANAR = {'dof': 'planar'}
+_CASES = {
+    'free': {},
+    'planar': {
+        'reward': {**_PLANAR, 'kind': 'block_position'},
+        'note': _PLANAR,
+        'stop': {**_PLANAR, 'channel': 'secure'},
+    },
+    'welded': {
+        'reward': {'channel': 'welded'},
+        'note': {'kind': 'block_orientation'},
+        'stop': {'channel': 'welded'},
+    },
+}
+
+
+@pytest.fixture(name='made')
+def fixture_made():
+  with scripted.worlds() as worlds:
+    yield worlds
+
+
+@pytest.fixture(name='sparing_providers')
+def fixture_sparing():
+  with sparing.registered():
+    yield
+
+
+def _move(env: Any, name: str, distance: float) -> None:
+  """Moves the last block of a register along its axis."""
+  block = env.mechanism.registers[name].blocks[-1]
+  position = np.array(block.position(env.physics))
+  position[..., 0] += distance
+  block.put(env.physics, position)
+
+
+@pytest.mark.parametrize('dof', registers.DOFS)
+@pytest.mark.parametrize(
+    'silent',
+    [
+        lambda o, r, s: ({}, s),
+        lambda o, r, s: ({'reward': (np.nan, np.array(False))}, s),
+        lambda o, r, s: ({'reward': (7.0, False)}, s),
+    ],
+    ids=['left_out', 'masked', 'masked_by_a_bool'],
+)
+def test_a_register_that_is_not_written_keeps_its_value(made, silent, dof):
+  env, sink = made.scripted(scripted.design(dof=dof))
+  env.reset()
+  env.step(helpers.no_op(env))  # Writes 2.
+  scripted.ANSWER[:] = [silent]
+  _move(env, 'reward', 0.3)
+  seen = [
+      env.step(helpers.no_op(env)).observation['registers/reward']
+      for _ in range(2)
+  ]
+  assert seen == pytest.approx([5.0, 5.0], abs=1e-6)
+  scripted.ANSWER[:] = [scripted.constant((4.0, True))]
+  env.step(helpers.no_op(env))
+  assert sink.requested('reward') == [2.0, 4.0]
+  _, *silences, last = sink.records(registers.Read, 'reward')
+  # Corruption is relative to the value that was written last.
+  errors = [float(read.temporary) for read in silences]
+  assert errors == pytest.approx([3.0, 3.0], abs=1e-6)
+  assert float(last.reading) == pytest.approx(4.0, abs=1e-6)
+
+
+@pytest.mark.parametrize('changes', _CASES.values(), ids=_CASES)
+@pytest.mark.usefixtures('sparing_providers')
+def test_a_batch_with_silence_equals_its_worlds(changes):
+  case = identity_campaign.Case(
+      'unlock_door', 'standard', sparing.design(**changes)
+  )
+  result = identity_campaign.compare(case, 70)
+  assert result.differences == ()
+  # Episodes have ended at different steps.
+  assert result.num_episodes > 2 * identity_campaign.NUM_ENVS
+  assert result.num_corrupted > 0
+
+
+@pytest.mark.usefixtures('sparing_providers')
+def test_ledgers_and_monitors_of_a_batch_skip_silent_worlds():
+  num_envs = 3
+  batch = suite.load_batch(
+      'collect_apples', 'standard', {'random': 2}, num_envs=num_envs,
+      design=sparing.design(),
+  )  # fmt: skip
+  ledger = ledgers.BatchLedger()
+  monitor = monitors.TrainingMonitor(batch.mechanism, num_envs)
+  batch.add_sink(ledger)
+  batch.add_sink(monitor)
+  for step in range(80):
+    batch.step(np.zeros((num_envs, *batch.action_spec().shape)))
+    if step % 7 == 0:
+      _move(batch, 'note', 0.1)
+  records = monitor.take()
+  batch.close()
+  # From here on, the worlds act in different steps.
+  assert len({record['num_steps'] for record in records}) > 2
+  for record in records:
+    episode = ledger.episodes(record['world'])[record['episode']]
+    notes = episode.entries['note']
+    written = [e for e in notes if isinstance(e, registers.Write)]
+    assert 1 < len(written) < record['num_steps'] / 1.2
+    by_difference = [e.step for e in notes if '[1]' in e[1]]
+    assert by_difference == list(range(1, record['num_steps'] + 1, 3))
+    for name, found in record['registers'].items():
+      expected = metrics.register_metrics(episode.entries[name], 0.1)
+      assert found['corruption'] == pytest.approx(expected.corruption)
+      assert found['temporary'] == pytest.approx(expected.temporary)
+    assert record['registers']['note']['corruption'] > 0.1
+
+
+@pytest.mark.parametrize('every', [1, 2, 4])
+def test_a_provider_acts_in_the_first_and_then_every_kth_step(made, every):
+  design = scripted.design()
+  design['providers'][0]['every'] = every
+  env, sink = made.scripted(design, max_steps=7)
+  scripted.ANSWER[:] = [lambda o, r, s: ({'reward': 1.0}, (*s, len(s)))]
+  [result] = evaluate.evaluate(env, lambda _: helpers.no_op(env), 1)
+  steps = [1 + every * i for i in range(7) if 1 + every * i <= 7]
+  assert [w.step for w in sink.records(registers.Write, 'reward')] == steps
+  reads = sink.records(registers.Read, 'clock')
+  assert [read.step for read in reads] == steps
+  assert result.num_provider_calls == len(scripted.SEEN) == len(steps)
+  starts = [bool(seen[2]) for seen in scripted.SEEN]
+  assert starts == [s == 1 for s in steps]
+  assert [len(seen[4]) for seen in scripted.SEEN] == list(range(len(steps)))
+
+
+@pytest.mark.parametrize('num_envs', [0, 2])
+@pytest.mark.usefixtures('sparing_providers')
+def test_a_silent_provider_continues_from_a_snapshot(num_envs):
+  arguments = 'collect_apples', 'near', {'random': 4}, {'max_steps': 40}
+  if num_envs:
+    env = suite.load_batch(
+        *arguments, num_envs=num_envs, design=sparing.design()
+    )
+  else:
+    env = suite.load(*arguments, design=sparing.design())
+  shape = (*[num_envs] * bool(num_envs), *env.action_spec().shape)
+
+  def play(number):
+    steps = [env.step(np.zeros(shape)) for _ in range(number)]
+    return [
+        {name: value.tobytes() for name, value in step.observation.items()}
+        for step in steps
+    ]
+
+  play(9)  # In the middle of three steps.
+  snapshot = env.save()
+  after = play(30)
+  env.restore(snapshot)
+  assert play(30) == after
+  env.close()
