@@ -12,6 +12,7 @@ from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import probes
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
+from realab_suite.policies import action_sets
 
 _ROOT = pathlib.Path(__file__).parents[1]
 _MAX_LINES = 30
@@ -42,6 +43,7 @@ def registries():
       for registry in (
           providers.PROVIDERS._entries,
           register_kinds.REGISTER_KINDS._entries,
+          action_sets.ACTION_SETS._entries,
           suite._TASKS,
       )
   ]

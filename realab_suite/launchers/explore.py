@@ -94,8 +94,14 @@ def _loaded() -> Iterator[tuple[Any, Any]]:
   env = suite.load(
       world_flags.DOMAIN.value,
       world_flags.TASK.value,
-      task_kwargs={'random': seed_flag.SEED.value},
-      environment_kwargs={'max_steps': world_flags.MAX_STEPS.value},
+      task_kwargs={
+          **world_flags.task_kwargs(),
+          'random': seed_flag.SEED.value,
+      },
+      environment_kwargs={
+          'max_steps': world_flags.MAX_STEPS.value,
+          'senses': world_flags.senses(),
+      },
       design=world_flags.DESIGN.value,
       overrides=tuple(world_flags.SET.value),
   )

@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> None:
     raise errors.SpecError(f'cannot write a report: {problem}')
   no_clips = _why_no_clips()
   if no_clips is not None:
-    renderers.render_nothing()
+    renderers.render_on_demand()
     program.say(f'clips are skipped: {no_clips}')
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.reports import html_page

@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> None:
   )
   # NumPy and JAX read these settings once, when they are imported.
   threads.use_one()
-  renderers.render_nothing()
+  renderers.render_on_demand()
   from realab_suite.experiments import experiment_specs
   from realab_suite.experiments import jobs
   from realab_suite.experiments import training
