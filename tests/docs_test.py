@@ -63,6 +63,15 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
   assert capsys.readouterr().out
 
 
+@pytest.mark.camera
+def test_python_blocks_of_the_page_on_senses_run_in_order(registries, capsys):
+  names = {'__name__': 'page'}
+  for block in _python_blocks(_ROOT / 'docs/senses.md'):
+    assert len(block.splitlines()) < _MAX_LINES, block
+    exec(compile(block, 'docs/senses.md', 'exec'), names)
+  assert "'senses/camera': (4, 32, 32, 3)" in capsys.readouterr().out
+
+
 def test_every_block_of_your_own_has_under_thirty_lines():
   blocks = _python_blocks(_ROOT / 'docs/your_own.md')
   assert len(blocks) >= 5
