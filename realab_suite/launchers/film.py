@@ -17,21 +17,22 @@ from realab_suite.experiments import requirements
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 from realab_suite.launchers.flags import imports_flag
+from realab_suite.launchers.flags import input_flag
+from realab_suite.launchers.flags import run_flag
+from realab_suite.launchers.flags import video_flag
 
 flags.adopt_module_key_flags(imports_flag)
-_INPUT = flags.DEFINE_string(
-    'input', None, 'Folder of a sweep: the --output folder of that program.'
-)
-_RUN = flags.DEFINE_string('run', None, 'Run to film, such as "reward".')
-_VIDEO = flags.DEFINE_string('video', None, 'New .mp4 file to write.')
+flags.adopt_module_key_flags(input_flag)
+flags.adopt_module_key_flags(run_flag)
+flags.adopt_module_key_flags(video_flag)
 
 
 def main(argv: Sequence[str]) -> None:
   """Films the valid episode of median corruption."""
   del argv
-  folder = pathlib.Path(program.required(_INPUT))
-  name = program.required(_RUN, '; name a run of the sweep')
-  path = program.required(_VIDEO, '; name a new .mp4 file')
+  folder = pathlib.Path(program.required(input_flag.INPUT))
+  name = program.required(run_flag.RUN, '; name a run of the sweep')
+  path = program.required(video_flag.VIDEO, '; name a new .mp4 file')
   problem = (
       requirements.missing('imageio', 'av', 'PIL')
       or renderers.choose_renderer()
