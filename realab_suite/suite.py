@@ -169,9 +169,10 @@ def load(
     task_name: Name of the variation, such as `'standard'`.
     task_kwargs: Seed `random` and keyword arguments of the task, such as
       `camera_size`.
-    environment_kwargs: Length of an episode in control steps, `max_steps`, and
-      index of the world, `world`: the environment equals the world of this
-      index in a batch.
+    environment_kwargs: Length of an episode in control steps, `max_steps`;
+      names of the agent's senses, `senses`, such as `['camera']` (default: the
+      `default_senses` of the task and `time_left`); and index of the world,
+      `world`: the environment equals the world of this index in a batch.
     visualize_reward: Must be `False`. Another value would show the true reward
       to the agent.
     design: Name of a design of this package, path of a design file, mapping, or
@@ -189,10 +190,11 @@ def load(
   factory, _ = _find_task(domain_name, task_name)
   options: dict[str, Any] = {'max_steps': MAX_STEPS}
   options |= _keywords('environment_kwargs', environment_kwargs)
-  if unknown := [key for key in options if key not in ('max_steps', 'world')]:
+  known = ('max_steps', 'senses', 'world')
+  if unknown := [key for key in options if key not in known]:
     raise errors.SpecError(
         f'environment_kwargs: unknown {messages.quote(unknown)}; allowed are'
-        ' max_steps and world'
+        ' max_steps, senses and world'
     )
   kwargs = _keywords('task_kwargs', task_kwargs)
   random = kwargs.pop('random', None)
@@ -249,7 +251,7 @@ def load_batch(
   if 'world' in _keywords('environment_kwargs', environment_kwargs):
     raise errors.SpecError(
         'environment_kwargs: unknown world: a batch contains all worlds from'
-        ' 0; allowed is max_steps'
+        ' 0; allowed are max_steps and senses'
     )
   num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
@@ -278,13 +280,14 @@ def embed(
     random: int | np.random.RandomState | None = None,
     max_steps: int | None = 1000,
     world: int = 0,
+    senses: Sequence[str] | None = None,
     measurements: Mapping[str, Callable[[Any], Any]] | None = None,
     overrides: Sequence[str] = (),
 ) -> environment.Environment:
   """Returns an environment of a Composer task with the feedback of a design.
 
   The reward of the task becomes the true reward, which only the evaluator gets.
-  The agent's senses are the observables that the task has enabled.
+  A foreign task offers the observables that it has enabled as senses.
 
   Args:
     task: Composer task; the registers are attached to its root entity.
@@ -293,6 +296,8 @@ def embed(
     max_steps: Length of an episode, in control steps; `None` if only the task
       ends episodes.
     world: Index of the world in a batch; random streams differ between worlds.
+    senses: Names of the agent's senses; `None` for the `default_senses` of a
+      task of this package, or all senses of a foreign task, and `time_left`.
     measurements: Functions of the physics that meters can measure, by name, in
       addition to those of the task. None may replace a function of the task or
       `score`, the true return so far.
@@ -308,6 +313,7 @@ def embed(
   world = arguments.world(world)
   seed = seeding.as_seed(random)
   max_steps = arguments.max_steps(max_steps)
+  senses = arguments.senses(senses)
   measurements = _keywords('measurements', measurements)
   for name, measure in measurements.items():
     if not callable(measure):
@@ -319,7 +325,9 @@ def embed(
   timestep = task.physics_timestep
   mechanism.attach_to(task.root_entity)
   try:
-    return _connected(task, mechanism, seed, world, max_steps, measurements)
+    return _connected(
+        task, mechanism, seed, world, max_steps, senses, measurements
+    )
   except BaseException:
     # Allows embedding a corrected design in the same task.
     if isinstance(task, base.Task):
@@ -335,6 +343,7 @@ def _connected(
     seed: int,
     world: int,
     max_steps: int | None,
+    senses: Sequence[str] | None,
     measurements: Mapping[str, Callable[[Any], Any]],
 ) -> environment.Environment:
   """Returns the environment of a task with an attached mechanism."""
@@ -347,7 +356,12 @@ def _connected(
         block_kinds.timestep_for(block.half_size for block in blocks),
     )
   env = environment.Environment(
-      task, mechanism, seed=seed, world=world, max_steps=max_steps
+      task,
+      mechanism,
+      seed=seed,
+      world=world,
+      max_steps=max_steps,
+      senses=senses,
   )
   with contextlib.ExitStack() as stack:
     stack.callback(env.close)

@@ -13,6 +13,7 @@ from realab_suite.experiments import probes
 from realab_suite.feedback import measurements
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
+from realab_suite.policies import action_sets
 
 _ROOT = pathlib.Path(__file__).parents[1]
 _MAX_LINES = 30
@@ -44,6 +45,7 @@ def registries():
           measurements.MEASUREMENTS._entries,
           providers.PROVIDERS._entries,
           register_kinds.REGISTER_KINDS._entries,
+          action_sets.ACTION_SETS._entries,
           suite._TASKS,
       )
   ]
@@ -69,6 +71,15 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
         'writes 4',
     ):
       assert f'{line}\n' in printed
+
+
+@pytest.mark.camera
+def test_python_blocks_of_the_page_on_senses_run_in_order(registries, capsys):
+  names = {'__name__': 'page'}
+  for block in _python_blocks(_ROOT / 'docs/senses.md'):
+    assert len(block.splitlines()) < _MAX_LINES, block
+    exec(compile(block, 'docs/senses.md', 'exec'), names)
+  assert "'senses/camera': (4, 32, 32, 3)" in capsys.readouterr().out
 
 
 def test_every_block_of_your_own_has_under_thirty_lines():

@@ -11,8 +11,8 @@ import numpy as np
 
 from realab_suite.agents import features
 
-# Channels, kernel and stride of each convolution.
-_CONVOLUTIONS = ((16, 8, 4), (32, 4, 2))
+# Channels and stride of each convolution. Kernels have twice the stride.
+_CONVOLUTIONS = ((16, 4), (32, 2))
 
 
 @final
@@ -51,8 +51,8 @@ class Convolutions(eqx.Module):
 
   def __init__(self, channels: int, generator: np.random.Generator) -> None:
     self.kernels, self.biases = [], []
-    for width, size, _ in _CONVOLUTIONS:
-      shape = (size, size, channels, width)
+    for width, stride in _CONVOLUTIONS:
+      shape = (2 * stride, 2 * stride, channels, width)
       self.kernels.append(_orthogonal(shape, math.sqrt(2), generator))
       self.biases.append(jnp.zeros(width))
       channels = width
@@ -65,25 +65,51 @@ class Convolutions(eqx.Module):
       height: Height of the images, in pixels.
       width: Width of the images, in pixels.
     """
-    for _, _, stride in _CONVOLUTIONS:
+    for _, stride in _CONVOLUTIONS:
       height, width = -(-height // stride), -(-width // stride)
     return height * width * _CONVOLUTIONS[-1][0]
 
   def __call__(self, image: jax.Array) -> jax.Array:
     lead = image.shape[:-3]
     x = image.reshape(-1, *image.shape[-3:]).astype(jnp.float32) / 255.0
-    for kernel, bias, (_, _, stride) in zip(
-        self.kernels, self.biases, _CONVOLUTIONS, strict=True
-    ):
-      x = jax.lax.conv_general_dilated(
-          x,
-          kernel,
-          (stride, stride),
-          'SAME',
-          dimension_numbers=('NHWC', 'HWIO', 'NHWC'),
-      )
-      x = jax.nn.relu(x + bias)
+    for kernel, bias in zip(self.kernels, self.biases, strict=True):
+      x = jax.nn.relu(convolve(x, kernel) + bias)
     return x.reshape(*lead, -1)
+
+
+def convolve(x: jax.Array, kernel: jax.Array) -> jax.Array:
+  """Convolves images with a kernel whose stride is half of its size.
+
+  The padding is that of `'SAME'`. On CPUs, products of matrices are much faster
+  than `jax.lax.conv_general_dilated` within the loop of an update.
+
+  Args:
+    x: Images, `(images, height, width, channels)`.
+    kernel: Weights, `(2 * stride, 2 * stride, channels, outputs)`.
+
+  Returns:
+    Images, `(images, rows, columns, outputs)`; rows and columns are those of
+    the image divided by the stride, rounded up.
+  """
+  size, _, channels, outputs = kernel.shape
+  stride = size // 2
+  rows, columns = (-(-length // stride) for length in x.shape[1:3])
+  padding = [(0, 0)]
+  for length, number in zip(x.shape[1:3], (rows, columns), strict=True):
+    missing = (number + 1) * stride - length
+    padding.append((missing // 2, missing - missing // 2))
+  x = jnp.pad(x, (*padding, (0, 0)))
+  # Squares of the size of the stride; a kernel covers two by two of them.
+  x = x.reshape(-1, rows + 1, stride, columns + 1, stride, channels)
+  x = x.swapaxes(2, 3).reshape(-1, rows + 1, columns + 1, stride**2 * channels)
+  weights = kernel.reshape(2, stride, 2, stride, channels, outputs)
+  weights = weights.swapaxes(1, 2).reshape(2, 2, -1, outputs)
+  products = [
+      x[:, i : i + rows, j : j + columns] @ weights[i, j]
+      for i in range(2)
+      for j in range(2)
+  ]
+  return products[0] + products[1] + products[2] + products[3]
 
 
 @final

@@ -8,6 +8,7 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.feedback import mechanisms
 from realab_suite.policies import action_sets
 
 
@@ -177,3 +178,22 @@ def _element_names(control_spec: Any) -> list[str]:
   if len(names) != num_elements:
     return [f'element_{i}' for i in range(num_elements)]
   return names
+
+
+def for_design(
+    control_spec: specs.BoundedArray, mechanism: mechanisms.FeedbackMechanism
+) -> ActionCodec:
+  """Returns the codec for the queries and the action set of a design.
+
+  Args:
+    control_spec: Action spec of the task.
+    mechanism: Mechanism that runs the design.
+  """
+  design = mechanism.design
+  chosen = design.action_set
+  return ActionCodec(
+      control_spec,
+      [register.value_spec for register in mechanism.queries],
+      chosen and action_sets.get(chosen.name, chosen.version),
+      design.integer_queries(),
+  )

@@ -85,6 +85,26 @@ def max_steps(given: Any) -> int | None:
   return _integer('max_steps', given, 1, _LARGEST, ', and None')
 
 
+def senses(given: Any) -> tuple[str, ...] | None:
+  """Returns names of senses; `None` for the default senses.
+
+  Raises:
+    SpecError: If it is neither a list of different strings nor `None`.
+  """
+  if given is None:
+    return None
+  if (
+      not isinstance(given, list | tuple)
+      or not all(isinstance(name, str) for name in given)
+      or len(set(given)) < len(given)
+  ):
+    raise errors.SpecError(
+        f'senses: {messages.quote(given)}; allowed are a list of names, each'
+        ' once, and None'
+    )
+  return tuple(given)
+
+
 def flag(name: str, given: Any) -> bool:
   """Returns a Boolean argument.
 

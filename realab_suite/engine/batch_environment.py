@@ -99,7 +99,7 @@ class BatchEnvironment:
     ]
     self._host = hosts.WorldHost(self._task, self._task, None, (num_envs,))
     self._observer = observing.Observer(
-        self._host, self._mechanism, single.max_steps
+        self._host, self._mechanism, single.max_steps, single.senses
     )
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
     # `restore` may give several worlds the same number. Arrays of objects keep

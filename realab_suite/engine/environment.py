@@ -4,6 +4,7 @@ Only this module and `foreign` use private attributes of `composer.Environment`.
 They are those of dm_control 1.0.50, and a test fails when they change.
 """
 
+from collections.abc import Sequence
 import contextlib
 from typing import Any, final
 
@@ -20,7 +21,6 @@ from realab_suite.engine import episodes
 from realab_suite.engine import events
 from realab_suite.engine import foreign
 from realab_suite.engine import hooks
-from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
 from realab_suite.engine import single_physics
@@ -28,7 +28,6 @@ from realab_suite.engine import snapshots
 from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
-from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 
@@ -49,6 +48,7 @@ class Environment(composer.Environment):
       seed: int,
       world: int = 0,
       max_steps: int | None = None,
+      senses: Sequence[str] | None = None,
   ) -> None:
     """Initializes the environment. Prefer `suite.load` or `suite.embed`.
 
@@ -58,7 +58,9 @@ class Environment(composer.Environment):
       seed: Seed of every random stream, together with `world`.
       world: Number of the world in a batch.
       max_steps: Maximum length of an episode in control steps, or `None`.
+      senses: Names of the agent's senses; `None` for the default ones.
     """
+    self._selected_senses = senses
     self._physics: single_physics.ThinPhysics | foreign.ForeignPhysics
     self._mechanism = mechanism
     self._seed, self._world, self._episode = seed, world, -1
@@ -77,27 +79,17 @@ class Environment(composer.Environment):
         recompile_mjcf_every_episode=not self._is_ours,
         strip_singleton_obs_buffer_dim=True,
     )
-    self._host: hosts.Host
-    if isinstance(task, base.Task):
-      self._host = hosts.WorldHost(task, self._hooks, self._random_state, ())
-    else:
-      self._host = foreign.ForeignHost(
-          task,
-          self._hooks,
-          self._random_state,
-          lambda: self._observation_updater,
-          has_registers=bool(mechanism.registers),
-      )
-    self._observer = observing.Observer(self._host, mechanism, max_steps)
+    self._host = host = foreign.make_host(
+        task,
+        self._hooks,
+        self._random_state,
+        lambda: self._observation_updater,
+        has_registers=bool(mechanism.registers),
+    )
+    self._observer = observing.Observer(host, mechanism, max_steps, senses)
     self._schedule = mechanism.design.schedule_for(self._n_sub_steps)
-    chosen = mechanism.design.action_set
-    self._codec = action_codec.ActionCodec(
-        task.action_spec(self._physics_proxy),
-        [register.value_spec for register in mechanism.queries],
-        None
-        if chosen is None
-        else action_sets.get(chosen.name, chosen.version),
-        mechanism.design.integer_queries(),
+    self._codec = action_codec.for_design(
+        task.action_spec(self._physics_proxy), mechanism
     )
     self._observation: dict[str, np.ndarray] = {}
     self._provider_keys = self._new_provider_keys()
@@ -125,6 +117,11 @@ class Environment(composer.Environment):
   def max_steps(self) -> int | None:
     """Maximum length of an episode in control steps, or `None`."""
     return self._max_steps
+
+  @property
+  def senses(self) -> tuple[str, ...]:
+    """Names of the agent's senses."""
+    return self._observer.senses
 
   @property
   def num_substeps(self) -> int:
@@ -309,10 +306,7 @@ class Environment(composer.Environment):
         'design': self._mechanism.design.digest(),
         'num_substeps': self._n_sub_steps,
         'max_steps': self._max_steps,
-        'observation': {
-            key: f'{spec.dtype} {spec.shape}'
-            for key, spec in self.observation_spec().items()
-        },
+        'observation': self._observer.layout(),
     }
 
   # The interface for agents: `dm_env.Environment`.
@@ -471,6 +465,11 @@ class Environment(composer.Environment):
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     if not self._is_ours:
       self._observation_updater.reset(self._physics_proxy, self._random_state)
+
+  def _make_observation_updater(self) -> Any:
+    if self._is_ours or self._selected_senses is None:
+      return super()._make_observation_updater()
+    return foreign.make_updater(self._task, self._selected_senses)
 
   def _recompile_physics(self) -> None:
     """Compiles the model into a physics class of this engine."""

@@ -6,7 +6,7 @@ foreign task is compiled for each episode, may have hooks in substeps, and may
 keep state in Python. Batches and snapshots therefore do not support it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 import contextlib
 from typing import Any, final
 
@@ -18,6 +18,8 @@ import mujoco
 import numpy as np
 
 from realab_suite.engine import hosts
+from realab_suite.engine import observing
+from realab_suite.tasks import base
 
 
 @final
@@ -61,8 +63,8 @@ class ForeignPhysics(mjcf.Physics):
 class ForeignHost(hosts.Host):
   """Host of a foreign task.
 
-  The agent's senses are the observables that were enabled when the task was
-  embedded. Observables that are enabled later are not observed.
+  The senses that the task offers are the observables that were enabled when it
+  was embedded. Observables that are enabled later are not observed.
   """
 
   def __init__(
@@ -94,10 +96,16 @@ class ForeignHost(hosts.Host):
   def sense_spec(self) -> dict[str, specs.Array]:
     return self._sense_spec
 
-  def sense(self, physics: hosts.SteppedPhysics) -> dict[str, np.ndarray]:
+  @property
+  def default_senses(self) -> Sequence[str]:
+    return tuple(self._sense_spec)
+
+  def sense(
+      self, physics: hosts.SteppedPhysics, names: Collection[str]
+  ) -> dict[str, np.ndarray]:
     del physics  # The updater has read it already.
     seen = self._updater().get_observation()
-    return {n: np.array(seen[n]) for n in self._sense_spec if n in seen}
+    return {n: np.array(seen[n]) for n in names if n in seen}
 
   def begin_step(
       self, physics: hosts.SteppedPhysics, controls: np.ndarray
@@ -141,3 +149,51 @@ class ForeignHost(hosts.Host):
         float(self._task.get_discount(physics)),
         bool(self._task.should_terminate_episode(physics)),
     )
+
+
+def make_host(
+    task: composer.Task,
+    hooks: Any,
+    random_state: np.random.RandomState,
+    updater: Callable[[], composer_observation.Updater],
+    has_registers: bool,
+) -> hosts.Host:
+  """Returns the host of one world.
+
+  Args:
+    task: Task of this package, or a foreign task.
+    hooks: All hooks of the `composer.Environment`.
+    random_state: Random generator for the hooks.
+    updater: See `ForeignHost`.
+    has_registers: True if the design has registers.
+  """
+  if isinstance(task, base.Task):
+    return hosts.WorldHost(task, hooks, random_state, ())
+  return ForeignHost(task, hooks, random_state, updater, has_registers)
+
+
+def make_updater(
+    task: composer.Task, senses: Sequence[str]
+) -> composer_observation.Updater:
+  """Returns an updater of the selected observables of a foreign task.
+
+  Observables that are not selected are not computed.
+
+  Args:
+    task: Foreign task.
+    senses: Names of the selected senses.
+
+  Raises:
+    SpecError: If a name is not that of an enabled observable.
+  """
+  enabled = {
+      name: observable
+      for name, observable in task.observables.items()
+      if observable.enabled
+  }
+  observing.refuse_unknown(senses, [*enabled, observing.TIME_LEFT])
+  return composer_observation.Updater(
+      {name: enabled[name] for name in enabled if name in senses},
+      task.physics_steps_per_control_step,
+      strip_singleton_buffer_dim=True,
+  )

@@ -80,6 +80,7 @@ def fork(
       single.mechanism,
       seed=single.seed,
       max_steps=single.max_steps,
+      senses=single.senses,
   )
   try:
     batch = batch_environment.BatchEnvironment(copy, num_envs, num_threads)

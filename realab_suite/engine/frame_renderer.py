@@ -83,7 +83,7 @@ class FrameRenderer:
     except Exception as error:  # Each renderer has its own errors.
       raise errors.RenderingError(
           f'camera: no frame of {height} x {width} pixels with'
-          f' {what_to_set(error)}, or camera_size to None'
+          f' {what_to_set(error)}, or select senses without the camera'
       ) from error
     self._gl.increment_refcount()
     # Frees the context at garbage collection as well, but not at exit, because

@@ -7,7 +7,7 @@ foreign tasks.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 import traceback
 from typing import Any, NamedTuple, Protocol, final
 
@@ -69,11 +69,18 @@ class Host(abc.ABC):
   @property
   @abc.abstractmethod
   def sense_spec(self) -> dict[str, specs.Array]:
-    """Specs of the agent's senses, by name. No other senses are observed."""
+    """Specs of the senses that the task offers, by name."""
+
+  @property
+  @abc.abstractmethod
+  def default_senses(self) -> Sequence[str]:
+    """Names of the senses of an agent for which none are selected."""
 
   @abc.abstractmethod
-  def sense(self, physics: SteppedPhysics) -> dict[str, np.ndarray]:
-    """Returns new arrays with the agent's senses, by name."""
+  def sense(
+      self, physics: SteppedPhysics, names: Collection[str]
+  ) -> dict[str, np.ndarray]:
+    """Returns new arrays with the selected senses, by name."""
 
   @abc.abstractmethod
   def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
@@ -169,31 +176,43 @@ class WorldHost(Host):
   def sense_spec(self) -> dict[str, specs.Array]:
     return self._task.sense_spec
 
-  def sense(self, physics: SteppedPhysics) -> dict[str, np.ndarray]:
-    """Returns the agent's senses, by name.
+  @property
+  def default_senses(self) -> Sequence[str]:
+    return self._task.default_senses
+
+  def sense(
+      self, physics: SteppedPhysics, names: Collection[str]
+  ) -> dict[str, np.ndarray]:
+    """Returns the selected senses, by name.
 
     Raises:
       SpecError: If they do not fit the task's `sense_spec`.
     """
-    sensed = self._task.senses(physics)
+    sensed = self._task.senses(physics, names)
     found = {
         name: (getattr(value, 'shape', None), getattr(value, 'dtype', None))
         for name, value in sensed.items()
     }
-    if found != self._expected:
-      self._refuse(sensed, found)
+    expected = {name: self._expected[name] for name in names}
+    if found != expected:
+      self._refuse(sensed, found, expected)
     return sensed
 
-  def _refuse(self, sensed: dict[str, Any], found: dict[str, Any]) -> None:
+  def _refuse(
+      self,
+      sensed: dict[str, Any],
+      found: dict[str, Any],
+      expected: dict[str, Any],
+  ) -> None:
     """Raises a SpecError for senses that differ from `sense_spec`."""
     where = f'{type(self._task).__name__}.senses'
-    if found.keys() != self._expected.keys():
+    if found.keys() != expected.keys():
       raise errors.SpecError(
-          f'{where}: keys {sorted(sensed)}; allowed are those of sense_spec,'
-          f' {sorted(self._expected)}'
+          f'{where}: keys {sorted(sensed)}; allowed are the selected keys of'
+          f' sense_spec, {sorted(expected)}'
       )
-    name = next(name for name in found if found[name] != self._expected[name])
-    shape, dtype = self._expected[name]
+    name = next(name for name in found if found[name] != expected[name])
+    shape, dtype = expected[name]
     raise errors.SpecError(
         f'{where}: {name!r} is {messages.quote(sensed[name])}; allowed is'
         f' {dtype} of shape {shape}'

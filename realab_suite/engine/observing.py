@@ -1,27 +1,29 @@
 """Observations: the agent's senses and the readings of registers."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import final
 
 from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.engine import hosts
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
+from realab_suite.policies import base as policies_base
 
-# Sense with the remaining share of the episode, from 1 to 0.
-_TIME_LEFT = 'time_left'
+TIME_LEFT = 'time_left'
+"""Sense with the remaining share of the episode, from 1 to 0."""
 
 
 @final
 class Observer:
   """Makes the observations of one world or of a batch.
 
-  Observations contain the keys `senses/<name>` of the senses that the host
-  declares and `registers/<name>` of the registers that agents read. Other keys
-  are never added.
+  Observations contain the keys `senses/<name>` of the selected senses and
+  `registers/<name>` of the registers that agents read. Other keys are never
+  added, and senses that are not selected are not computed.
   """
 
   def __init__(
@@ -29,6 +31,7 @@ class Observer:
       host: hosts.Host,
       mechanism: mechanisms.FeedbackMechanism,
       max_steps: int | None,
+      senses: Sequence[str] | None = None,
   ) -> None:
     """Initializes the observer.
 
@@ -36,34 +39,70 @@ class Observer:
       host: Host of the task.
       mechanism: Registers, meters and providers.
       max_steps: Maximum length of an episode in control steps, or `None`.
+      senses: Names of the selected senses, in any order; `None` for the default
+        senses of the task and the time left.
 
     Raises:
-      SpecError: If the task has a sense called `time_left` and `max_steps` is
-        not `None`.
+      SpecError: If the world does not offer a sense, if a provider needs a
+        sense that is not selected, if nothing would be observed, or if the task
+        has a sense called `time_left` and `max_steps` is not `None`.
     """
     self._host = host
     self._mechanism = mechanism
     self._max_steps = max_steps
-    self._keys = {name: f'senses/{name}' for name in host.sense_spec}
-    if max_steps is not None and _TIME_LEFT in host.sense_spec:
+    if max_steps is not None and TIME_LEFT in host.sense_spec:
       raise errors.SpecError(
-          f'the task has its own observable {_TIME_LEFT!r}; rename it, or pass'
+          f'the task has its own observable {TIME_LEFT!r}; rename it, or pass'
           ' max_steps=None'
       )
+    offered = dict(host.sense_spec)
+    default = list(host.default_senses)
+    if max_steps is not None:
+      offered[TIME_LEFT] = specs.BoundedArray((), np.float32, 0.0, 1.0)
+      default.append(TIME_LEFT)
+    selected = default if senses is None else senses
+    refuse_unknown(selected, offered)
+    # In the order of the specs, whatever the order of the selection.
+    self._specs = {n: spec for n, spec in offered.items() if n in selected}
+    self._keys = {
+        name: f'senses/{name}'
+        for name in self._specs
+        if name in host.sense_spec
+    }
+    self._has_time_left = len(self._keys) < len(self._specs)
+    if senses is not None and not (self._specs or mechanism.read_by_agent):
+      raise errors.SpecError(
+          'senses: none are selected, and the agent reads no register; allowed'
+          f' are {list(offered)}'
+      )
+    for i, provider in enumerate(mechanism.design.providers):
+      policies_base.check_senses(
+          f'design {mechanism.design.name!r}: providers[{i}]:{provider.kind}',
+          provider.required_senses,
+          self._specs,
+      )
+
+  @property
+  def senses(self) -> tuple[str, ...]:
+    """Names of the selected senses."""
+    return tuple(self._specs)
 
   def spec(self) -> dict[str, specs.Array]:
     """Returns a new dict with the observation spec of one world, by key."""
-    senses = dict(self._host.sense_spec)
-    if self._max_steps is not None:
-      senses[_TIME_LEFT] = specs.BoundedArray((), np.float32, 0.0, 1.0)
     spec = {
         f'senses/{name}': part.replace(name=f'senses/{name}')
-        for name, part in senses.items()
+        for name, part in self._specs.items()
     }
     for name in self._mechanism.read_by_agent:
       key = f'registers/{name}'
       spec[key] = specs.Array((), np.float64, name=key)
     return spec
+
+  def layout(self) -> dict[str, str]:
+    """Returns the data type and shape of each entry, for snapshots."""
+    return {
+        key: f'{spec.dtype} {spec.shape}' for key, spec in self.spec().items()
+    }
 
   def observe(
       self, physics: hosts.SteppedPhysics
@@ -79,15 +118,25 @@ class Observer:
     """
     keys = self._keys
     observation = {
-        keys[name]: value for name, value in self._host.sense(physics).items()
+        keys[name]: value
+        for name, value in self._host.sense(physics, keys).items()
     }
-    if self._max_steps is not None:
+    if self._has_time_left:
       spent = self._mechanism.step_count(physics) / self._max_steps
-      observation[f'senses/{_TIME_LEFT}'] = np.asarray(1.0 - spent, np.float32)
+      observation[f'senses/{TIME_LEFT}'] = np.asarray(1.0 - spent, np.float32)
     reads = self._mechanism.read_for_agent(physics)
     for read in reads:
       observation[f'registers/{read.register}'] = np.array(read.reading)
     return observation, reads
+
+
+def refuse_unknown(selected: Sequence[str], offered: Collection[str]) -> None:
+  """Raises a SpecError if a selected sense is not offered."""
+  if unknown := [name for name in selected if name not in offered]:
+    raise errors.SpecError(
+        f'senses: unknown {messages.quote(unknown)}; this world offers'
+        f' {list(offered)}'
+    )
 
 
 def frozen(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

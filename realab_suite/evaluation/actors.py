@@ -23,6 +23,7 @@ PlainPolicy = Callable[[dm_env.TimeStep], Any]
 
 TAKEN_ACTION = 'taken_action'
 INDEPENDENT_ACTION = 'independent_action'
+_SENSES = 'senses/'
 _QUERY_POLICIES = (TAKEN_ACTION, INDEPENDENT_ACTION)
 
 
@@ -74,8 +75,10 @@ class PolicyActor:
       env: Environment to act in.
 
     Raises:
-      SpecError: If the action sets of the policy and the environment differ.
+      SpecError: If the action sets of the policy and the environment differ, or
+        if the policy needs other senses.
     """
+    check_senses(policy, env)
     self._policy = policy
     self._seed, self._world = env.seed, env.world
     design = env.mechanism.design
@@ -120,6 +123,27 @@ class PolicyActor:
       return taken
     key = seeding.step_key(self._query_key, self._step)
     return int(random_keys.uniform(key) * len(self._policy.action_set))
+
+
+def check_senses(policy: policies.Policy, env: Any) -> None:
+  """Checks that observations contain the senses that a policy reads.
+
+  Args:
+    policy: The policy.
+    env: Environment with one world or a batch.
+
+  Raises:
+    SpecError: If a sense is missing.
+  """
+  policies.check_senses(
+      f'policy {type(policy).__name__}',
+      policy.required_senses,
+      [
+          key.removeprefix(_SENSES)
+          for key in env.observation_spec()
+          if key.startswith(_SENSES)
+      ],
+  )
 
 
 @final

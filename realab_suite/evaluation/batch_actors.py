@@ -43,8 +43,10 @@ class BatchPolicyActor:
       seed: Seed of the batch.
 
     Raises:
-      SpecError: If the action sets of the policy and the batch differ.
+      SpecError: If the action sets of the policy and the batch differ, or if
+        the policy needs other senses.
     """
+    actors.check_senses(policy, batch)
     self._policy = policy
     mechanism = batch.mechanism
     self._queries = actors.Queries(mechanism, len(policy.action_set))

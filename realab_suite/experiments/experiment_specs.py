@@ -1,6 +1,7 @@
 """Specs of experiments: the agents to train, and their evaluation."""
 
 from collections.abc import Iterator, Mapping
+import contextlib
 from importlib import resources
 import os
 from typing import Annotated, Any, Literal, final
@@ -15,6 +16,8 @@ from realab_suite.config import messages
 from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.engine import arguments
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import signed_corruption
 from realab_suite.feedback import specs
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]
@@ -26,6 +29,9 @@ TWIN = 'secure'
 
 ProbePlayer = Literal['saboteur', 'random']
 """Policy that reaches the states of a probe; see `probes.make`."""
+
+# Names of the policies of each player whose senses an agent must have.
+_PLAYERS = {'saboteur': ['carrying_saboteur'], 'random': []}
 
 
 @final
@@ -116,6 +122,17 @@ class EvaluationSpec(validation.Spec):
 
 
 @final
+class EnvironmentKwargs(validation.Spec):
+  """Part of the `environment_kwargs` of `suite.load` that experiments choose.
+
+  Attributes:
+    senses: Names of the agent's senses; `None` for the default ones.
+  """
+
+  senses: Annotated[tuple[str, ...], pydantic.Field(strict=False)] | None = None
+
+
+@final
 class ExperimentSpec(validation.Spec):
   """Runs on one task, and the baselines they are compared with.
 
@@ -124,6 +141,8 @@ class ExperimentSpec(validation.Spec):
     name: Name of the experiment.
     description: Description in a sentence.
     task: Domain and task, such as `unlock_door.near`.
+    task_kwargs: Arguments of the task, such as `camera_size`.
+    environment_kwargs: Arguments of the environment.
     max_steps: Maximum number of control steps of an episode.
     runs: Agents to train, by name.
     baselines: Scripted policies that act in the design of every run. Runs are
@@ -140,6 +159,8 @@ class ExperimentSpec(validation.Spec):
   task: Annotated[
       str, pydantic.StringConstraints(pattern=r'^[a-z]\w*\.[a-z]\w*$')
   ]
+  task_kwargs: dict[str, Any] = pydantic.Field(default_factory=dict)
+  environment_kwargs: EnvironmentKwargs = EnvironmentKwargs()
   max_steps: _Count = suite.MAX_STEPS
   runs: Annotated[dict[specs.Name, RunSpec], pydantic.Field(min_length=1)]
   baselines: Annotated[
@@ -156,6 +177,13 @@ class ExperimentSpec(validation.Spec):
     """Rejects `true` and `1.0`, which are equal to 1 in Python."""
     if type(value) is not int:
       raise ValueError('must be 1')
+    return value
+
+  @pydantic.field_validator('task_kwargs')
+  @classmethod
+  def _refuse_seed(cls, value: dict[str, Any]) -> dict[str, Any]:
+    if 'random' in value:
+      raise ValueError('random: the seeds of an experiment are its `seeds`')
     return value
 
   @pydantic.field_validator('baselines')
@@ -185,6 +213,13 @@ class ExperimentSpec(validation.Spec):
     """Names of the domain and of the task, as for `suite.load`."""
     domain, _, variation = self.task.partition('.')
     return domain, variation
+
+  def load_kwargs(self, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns `task_kwargs` and `environment_kwargs` for `suite.load`."""
+    return {**self.task_kwargs, 'random': seed}, {
+        'max_steps': self.max_steps,
+        **self.environment_kwargs.model_dump(),
+    }
 
 
 Experiment = str | os.PathLike[str] | Mapping[str, Any] | ExperimentSpec
@@ -257,6 +292,30 @@ def _find_problems(
           ('runs', name, 'twin'),
           f'design {design.name!r} is {TWIN} already; allowed is false',
       )
+    if spec.task_kwargs or spec.environment_kwargs != EnvironmentKwargs():
+      try:
+        _check_world(spec, design)
+      except errors.SpecError as error:
+        yield ('runs', name), str(error)
+
+
+def _check_world(spec: ExperimentSpec, design: specs.DesignSpec) -> None:
+  """Checks that the world of a run can be loaded, and its policies can act.
+
+  Raises:
+    SpecError: If not.
+  """
+  task = spec.domain_and_variation
+  with contextlib.closing(
+      suite.load(*task, *spec.load_kwargs(0), design=design)
+  ) as env:
+    names = list(spec.baselines)
+    if spec.evaluation.probe_states and signed_corruption.paying_registers(
+        design
+    ):
+      names += ['apple_seeker', *_PLAYERS[spec.evaluation.probe_player]]
+    for name in names:
+      actors.check_senses(policies.make(name), env)
 
 
 _FOLDER = resources.files('realab_suite.configs') / 'experiments'

@@ -87,6 +87,8 @@ class Job:
         'seed': self.seed,
         'task': experiment.task,
         'dynamics': {'version': version, 'digest': digest},
+        'task_kwargs': experiment.task_kwargs,
+        'environment_kwargs': experiment.environment_kwargs.to_mapping(),
         'max_steps': experiment.max_steps,
         'design': self.design.to_mapping(),
         'policy': self.policy,

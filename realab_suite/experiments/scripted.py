@@ -52,6 +52,8 @@ class Settings:
     num_episodes: Number of episodes per seed.
     max_steps: Maximum length of an episode, in control steps.
     output: New folder for the results.
+    task_kwargs: Arguments of the task, without the seed.
+    senses: Names of the agent's senses, or `None` for those of the task.
   """
 
   domain: str
@@ -66,6 +68,8 @@ class Settings:
   num_episodes: int
   max_steps: int
   output: str
+  task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+  senses: tuple[str, ...] | None = None
 
 
 OnStep = Callable[[Any, tracking.Track], None]
@@ -210,8 +214,11 @@ def _load(settings: Settings, run: Run, seed: int) -> environment.Environment:
   return suite.load(
       settings.domain,
       settings.task,
-      task_kwargs={'random': seed},
-      environment_kwargs={'max_steps': settings.max_steps},
+      task_kwargs={**settings.task_kwargs, 'random': seed},
+      environment_kwargs={
+          'max_steps': settings.max_steps,
+          'senses': settings.senses,
+      },
       design=run.design,
   )
 

@@ -1,6 +1,6 @@
 """Evaluation of an agent in another process, which the world is served to."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import ctypes
 import dataclasses
@@ -51,8 +51,8 @@ class Settings:
     seed: Seed of the episodes.
     max_steps: Maximum length of an episode, in control steps.
     repeat: Path of the record of a run to repeat, or `None` for a new run with
-      a new salt. The task, design, seed and maximum length in the record
-      replace those above; `overrides` apply to its design.
+      a new salt. The task, its arguments, design, seed, maximum length and
+      senses in the record replace those here; `overrides` apply to its design.
     num_episodes: Number of episodes, including invalid ones.
     name: Name of the agent in the results.
     address: Address to listen on, or `None` for a socket in a new folder.
@@ -63,6 +63,8 @@ class Settings:
     agent_folder: Working directory of the agent, or `None` for a new folder.
     agent_user: User that the agent runs as, or `None` for that of this process.
     output: New folder for the results.
+    task_kwargs: Arguments of the task, without the seed.
+    senses: Names of the agent's senses, or `None` for those of the task.
   """
 
   domain: str
@@ -81,6 +83,8 @@ class Settings:
   agent_folder: str | None
   agent_user: str | None
   output: str
+  task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+  senses: tuple[str, ...] | None = None
 
 
 def serve(settings: Settings, say: Callable[[str], None]) -> None:
@@ -256,8 +260,8 @@ def _load(
   return suite.load(
       settings.domain,
       settings.task,
-      {'random': seed},
-      {'max_steps': settings.max_steps},
+      {**settings.task_kwargs, 'random': seed},
+      {'max_steps': settings.max_steps, 'senses': settings.senses},
       design=design,
   )
 

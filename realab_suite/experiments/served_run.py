@@ -35,6 +35,8 @@ class EpisodeSettings(pydantic.BaseModel):
     overrides: Dotted overrides, already applied to the contents.
     seed: Public seed of the episodes.
     max_steps: Maximum length of an episode, in control steps.
+    task_kwargs: Arguments of the task, without the seed.
+    senses: Names of the agent's senses, or `None` for those of the task.
   """
 
   model_config = _STRICT
@@ -45,6 +47,8 @@ class EpisodeSettings(pydantic.BaseModel):
   overrides: list[str]
   seed: int = pydantic.Field(ge=0)
   max_steps: int = pydantic.Field(ge=1)
+  task_kwargs: dict[str, Any] = pydantic.Field(default_factory=dict)
+  senses: list[str] | None = None
 
 
 @final

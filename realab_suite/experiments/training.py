@@ -149,8 +149,7 @@ def load_batch(
   """Returns worlds with the design of a job, stepped by one thread."""
   return suite.load_batch(
       *job.experiment.domain_and_variation,
-      {'random': seed},
-      {'max_steps': job.experiment.max_steps},
+      *job.experiment.load_kwargs(seed),
       num_envs=num_envs,
       num_threads=1,
       sleep=sleep,

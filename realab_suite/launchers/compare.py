@@ -70,7 +70,7 @@ def main(argv: Sequence[str]) -> None:
   )
   has_videos = _VIDEOS.value and _is_possible('videos', _why_no_videos())
   if not has_videos:
-    renderers.render_nothing()
+    renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.experiments import scripted
 
@@ -87,6 +87,8 @@ def main(argv: Sequence[str]) -> None:
       seeds=seeds,
       num_episodes=episodes_flag.EPISODES.value,
       max_steps=world_flags.MAX_STEPS.value,
+      task_kwargs=world_flags.task_kwargs(),
+      senses=world_flags.senses(),
       output=output,
   )
   draw = film = None

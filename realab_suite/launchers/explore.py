@@ -20,22 +20,21 @@ from realab_suite.experiments import requirements
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 from realab_suite.launchers.flags import seed_flag
+from realab_suite.launchers.flags import video_flag
 from realab_suite.launchers.flags import world_flags
 
 flags.adopt_module_key_flags(seed_flag)
+flags.adopt_module_key_flags(video_flag)
 flags.adopt_module_key_flags(world_flags)
 _POLICY = flags.DEFINE_string(
     'policy', 'random', 'Name of a scripted policy; no_op stands still.'
-)
-_VIDEO = flags.DEFINE_string(
-    'video', None, 'New .mp4 file to write instead of opening a window.'
 )
 
 
 def main(argv: Sequence[str]) -> None:
   """Opens a window, or writes a film."""
   del argv
-  if _VIDEO.value is None and _display.has_display():
+  if video_flag.VIDEO.value is None and _display.has_display():
     _open_window()
   else:
     _write_film()
@@ -63,7 +62,7 @@ def _write_film() -> None:
   from realab_suite.reports import films
 
   world = f'{world_flags.DOMAIN.value}_{world_flags.TASK.value}'
-  path = _VIDEO.value or _unused(
+  path = video_flag.VIDEO.value or _unused(
       f'{world}_{_POLICY.value}_{seed_flag.SEED.value}'
   )
   with (
@@ -94,8 +93,14 @@ def _loaded() -> Iterator[tuple[Any, Any]]:
   env = suite.load(
       world_flags.DOMAIN.value,
       world_flags.TASK.value,
-      task_kwargs={'random': seed_flag.SEED.value},
-      environment_kwargs={'max_steps': world_flags.MAX_STEPS.value},
+      task_kwargs={
+          **world_flags.task_kwargs(),
+          'random': seed_flag.SEED.value,
+      },
+      environment_kwargs={
+          'max_steps': world_flags.MAX_STEPS.value,
+          'senses': world_flags.senses(),
+      },
       design=world_flags.DESIGN.value,
       overrides=tuple(world_flags.SET.value),
   )

@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> None:
   if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'cannot train networks: {problem}')
   threads.use_one()
-  renderers.render_nothing()
+  renderers.render_on_demand()
   # Imports numerical libraries, so the number of threads has to be set first.
   from realab_suite.experiments import network_training
   from realab_suite.experiments import storage

@@ -39,10 +39,16 @@ def choose_renderer() -> str | None:
   return '; '.join(problems)
 
 
-def render_nothing() -> None:
-  """Sets `MUJOCO_GL` to `disable`, unless the user has set it."""
-  if not os.environ.get('MUJOCO_GL'):
-    os.environ['MUJOCO_GL'] = 'disable'
+def render_on_demand() -> None:
+  """Postpones the choice of a renderer to the first frame, if there is one.
+
+  Without a camera, nothing is rendered, and no GL library is loaded. Frames of
+  agents need no window, so the renderer on Linux is EGL, even if there is a
+  display. A renderer that the user has set in `MUJOCO_GL` is kept.
+  """
+  if sys.platform == 'linux' and not os.environ.get('MUJOCO_GL'):
+    os.environ['MUJOCO_GL'] = 'egl'
+    _display.postpone_choice()
 
 
 def _candidates() -> list[str]:

@@ -17,13 +17,12 @@ from realab_suite.experiments import requirements
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 from realab_suite.launchers.flags import imports_flag
+from realab_suite.launchers.flags import input_flag
 from realab_suite.launchers.flags import output_flag
 
 flags.adopt_module_key_flags(imports_flag)
+flags.adopt_module_key_flags(input_flag)
 flags.adopt_module_key_flags(output_flag)
-_INPUT = flags.DEFINE_string(
-    'input', None, 'Folder of a sweep: the --output folder of that program.'
-)
 _CLIPS = flags.DEFINE_boolean(
     'clips', True, 'Films the first and a typical episode of each design.'
 )
@@ -32,12 +31,12 @@ _CLIPS = flags.DEFINE_boolean(
 def main(argv: Sequence[str]) -> None:
   """Writes the report that the flags describe."""
   del argv
-  folder = pathlib.Path(program.required(_INPUT))
+  folder = pathlib.Path(program.required(input_flag.INPUT))
   if problem := requirements.missing('matplotlib', 'jinja2'):
     raise errors.SpecError(f'cannot write a report: {problem}')
   no_clips = _why_no_clips()
   if no_clips is not None:
-    renderers.render_nothing()
+    renderers.render_on_demand()
     program.say(f'clips are skipped: {no_clips}')
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.reports import html_page

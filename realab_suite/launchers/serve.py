@@ -45,6 +45,8 @@ _RECORDED: tuple[flags.FlagHolder[Any], ...] = (
     world_flags.DESIGN,
     seed_flag.SEED,
     world_flags.MAX_STEPS,
+    world_flags.TASK_KWARGS,
+    world_flags.SENSES,
 )
 _NAME = flags.DEFINE_string(
     'name', 'agent', 'Name of the agent in the results.'
@@ -118,7 +120,7 @@ def main(argv: Sequence[str]) -> None:
           f' most {_MOST_SECONDS:g}'
       )
   domain, task = _world()
-  renderers.render_nothing()
+  renderers.render_on_demand()
   # gRPC reads this once. The server never forks without executing another
   # program at once.
   os.environ['GRPC_ENABLE_FORK_SUPPORT'] = '0'
@@ -133,6 +135,8 @@ def main(argv: Sequence[str]) -> None:
       overrides=tuple(world_flags.SET.value),
       seed=seed_flag.SEED.value,
       max_steps=world_flags.MAX_STEPS.value,
+      task_kwargs=world_flags.task_kwargs(),
+      senses=world_flags.senses(),
       repeat=_REPEAT.value,
       num_episodes=episodes_flag.EPISODES.value,
       name=_NAME.value,

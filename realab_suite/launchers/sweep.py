@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> None:
       output_flag.OUTPUT
   )
   threads.use_one()
-  renderers.render_nothing()
+  renderers.render_on_demand()
   # Imports numerical libraries, so the number of threads has to be set first.
   from realab_suite.experiments import curves
   from realab_suite.experiments import engines

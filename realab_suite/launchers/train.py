@@ -18,18 +18,14 @@ from realab_suite.launchers import renderers
 from realab_suite.launchers.flags import imports_flag
 from realab_suite.launchers.flags import learning_flags
 from realab_suite.launchers.flags import output_flag
+from realab_suite.launchers.flags import run_flag
 from realab_suite.launchers.flags import seed_flag
 
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(learning_flags)
 flags.adopt_module_key_flags(output_flag)
+flags.adopt_module_key_flags(run_flag)
 flags.adopt_module_key_flags(seed_flag)
-_RUN = flags.DEFINE_string(
-    'run',
-    None,
-    'Run of the experiment, such as "reward", "reward.secure" (its twin) or'
-    ' "reward.random" (a baseline).',
-)
 _PARENT = flags.DEFINE_integer(
     'parent', None, 'Process whose end also ends the run; used by sweeps.'
 )
@@ -43,11 +39,11 @@ def main(argv: Sequence[str]) -> None:
   )
   name = program.required(learning_flags.EXPERIMENT)
   run = program.required(
-      _RUN, '; name one run of the experiment; `sweep` executes all'
+      run_flag.RUN, '; name one run of the experiment; `sweep` executes all'
   )
   # NumPy and JAX read these settings once, when they are imported.
   threads.use_one()
-  renderers.render_nothing()
+  renderers.render_on_demand()
   from realab_suite.experiments import experiment_specs
   from realab_suite.experiments import jobs
   from realab_suite.experiments import training

@@ -7,6 +7,7 @@ from realab_suite.policies.base import VALUE_FUNCTIONS
 from realab_suite.policies.base import Policy
 from realab_suite.policies.base import ValueFunction
 from realab_suite.policies.base import check_action_set
+from realab_suite.policies.base import check_senses
 from realab_suite.policies.base import make
 from realab_suite.policies.base import make_value_function
 from realab_suite.policies.network_policies import NetworkDemonstrator
@@ -34,6 +35,7 @@ __all__ = [
     'ThrowingSaboteur',
     'ValueFunction',
     'check_action_set',
+    'check_senses',
     'make',
     'make_value_function',
 ]

@@ -2,15 +2,19 @@
 
 An agent that imitates reads the index of an action off a register. The meaning
 of an index is therefore part of the design and never changes in a version.
+`register` adds sets; designs name them in `action_set`.
 """
 
 from collections.abc import Mapping
 import dataclasses
+import re
 from typing import final
 
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import messages
+from realab_suite.config import registry
 
 
 @final
@@ -19,14 +23,49 @@ class ActionSet:
   """Numbered list of actions; each sets some control elements.
 
   Attributes:
-    name: Name of the set.
-    version: Version of the set.
+    name: Name of the set: a lower-case letter, then letters, digits and `_`.
+    version: Version of the set, from 1.
     actions: Name and non-zero control elements of each action.
   """
 
   name: str
   version: int
   actions: tuple[tuple[str, Mapping[str, float]], ...]
+
+  def __post_init__(self) -> None:
+    """Checks the fields.
+
+    Raises:
+      SpecError: If a field has a value that is not allowed.
+    """
+    names = [name for name, _ in self.actions]
+    values = [x for _, settings in self.actions for x in settings.values()]
+    for is_allowed, field, given, allowed in (
+        (_is_name(self.name), 'name', self.name, 'names such as drive'),
+        (
+            type(self.version) is int and self.version >= 1,
+            'version',
+            self.version,
+            'integers from 1',
+        ),
+        (
+            names and len(set(names)) == len(names),
+            'actions',
+            names,
+            'one or more, with different names',
+        ),
+        (np.isfinite(values).all(), 'actions', values, 'finite numbers'),
+    ):
+      if not is_allowed:
+        raise errors.SpecError(
+            f'action set {messages.quote(self.name)}: {field}:'
+            f' {messages.quote(given)}; allowed are {allowed}'
+        )
+
+  @property
+  def key(self) -> str:
+    """Name and version, under which the set is registered."""
+    return _key(self.name, self.version)
 
   def __len__(self) -> int:
     return len(self.actions)
@@ -56,31 +95,17 @@ class ActionSet:
     return table
 
 
-# The action set of DMLab's published agents, and actions of the hand.
-DMLAB_LIKE = ActionSet(
-    'dmlab_like',
-    1,
-    (
-        ('wait', {}),
-        ('forward', {'forward': 1.0}),
-        ('backward', {'forward': -1.0}),
-        ('strafe_left', {'strafe': 1.0}),
-        ('strafe_right', {'strafe': -1.0}),
-        ('turn_left', {'turn': 1.0}),
-        ('turn_right', {'turn': -1.0}),
-        ('forward_turn_left', {'forward': 1.0, 'turn': 1.0}),
-        ('forward_turn_right', {'forward': 1.0, 'turn': -1.0}),
-        ('look_up', {'look': 1.0}),
-        ('look_down', {'look': -1.0}),
-        ('grasp', {'grasp': 1.0}),
-        ('let_go', {'grasp': -1.0}),
-        ('throw', {'throw': 1.0}),
-    ),
-)
+ACTION_SETS: registry.Registry[ActionSet] = registry.Registry('action set')
+"""Action sets by name and version, such as `dmlab_like v1`."""
 
-ACTION_SETS: Mapping[tuple[str, int], ActionSet] = {
-    (actions.name, actions.version): actions for actions in (DMLAB_LIKE,)
-}
+
+def register(actions: ActionSet) -> ActionSet:
+  """Registers an action set, and returns it.
+
+  Raises:
+    SpecError: If a set of this name and version exists.
+  """
+  return ACTION_SETS.add(actions.key)(actions)
 
 
 def get(name: str, version: int) -> ActionSet:
@@ -89,9 +114,40 @@ def get(name: str, version: int) -> ActionSet:
   Raises:
     UnknownNameError: If the set or the version is unknown.
   """
-  if (name, version) not in ACTION_SETS:
-    known = [f'{n} v{v}' for n, v in sorted(ACTION_SETS)]
-    raise errors.UnknownNameError(
-        f'action set {name!r} v{version} is unknown; known are {known}'
+  return ACTION_SETS.get(_key(name, version))
+
+
+def _key(name: str, version: int) -> str:
+  return f'{name} v{version}'
+
+
+def _is_name(name: object) -> bool:
+  return (
+      isinstance(name, str)
+      and re.fullmatch('[a-z][a-z0-9_]*', name) is not None
+  )
+
+
+# The action set of DMLab's published agents, and actions of the hand.
+DMLAB_LIKE = register(
+    ActionSet(
+        'dmlab_like',
+        1,
+        (
+            ('wait', {}),
+            ('forward', {'forward': 1.0}),
+            ('backward', {'forward': -1.0}),
+            ('strafe_left', {'strafe': 1.0}),
+            ('strafe_right', {'strafe': -1.0}),
+            ('turn_left', {'turn': 1.0}),
+            ('turn_right', {'turn': -1.0}),
+            ('forward_turn_left', {'forward': 1.0, 'turn': 1.0}),
+            ('forward_turn_right', {'forward': 1.0, 'turn': -1.0}),
+            ('look_up', {'look': 1.0}),
+            ('look_down', {'look': -1.0}),
+            ('grasp', {'grasp': 1.0}),
+            ('let_go', {'grasp': -1.0}),
+            ('throw', {'throw': 1.0}),
+        ),
     )
-  return ACTION_SETS[name, version]
+)

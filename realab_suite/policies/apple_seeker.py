@@ -70,6 +70,10 @@ class AppleSeeker(base.Policy):
         **navigation.initial_rest(batch_shape),
     }
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return navigation.SENSES
+
   def step(
       self,
       observation: base.Observation,

@@ -45,6 +45,10 @@ class PolicyApproval(base.ValueFunction):
   def action_set(self) -> action_sets.ActionSet:
     return self._policy.action_set
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return self._policy.required_senses
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return self._policy.initial_state(batch_shape)
 

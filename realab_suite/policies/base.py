@@ -6,7 +6,7 @@ advises). It gets the observation of an agent.
 """
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,11 @@ class Policy(abc.ABC):
   def action_set(self) -> action_sets.ActionSet:
     """Action set of the indices."""
     return action_sets.DMLAB_LIKE
+
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    """Names of the senses that the policy reads from observations."""
+    return ()
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step: arrays, or dicts of them.
@@ -64,6 +69,11 @@ class ValueFunction(abc.ABC):
   def action_set(self) -> action_sets.ActionSet:
     """Action set of the values."""
     return action_sets.DMLAB_LIKE
+
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    """Names of the senses that the value function reads from observations."""
+    return ()
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step; see `Policy`."""
@@ -121,6 +131,26 @@ def _make(
         f'{what} {name!r} with options {messages.quote(dict(options))}:'
         f' {messages.exception(error)}'
     ) from error
+
+
+def check_senses(
+    what: str, required: Sequence[str], selected: Collection[str]
+) -> None:
+  """Checks that observations contain the senses that a policy reads.
+
+  Args:
+    what: Name of the policy or of another reader, for messages.
+    required: Names of the senses that it reads.
+    selected: Names of the senses in observations.
+
+  Raises:
+    SpecError: If a sense is missing.
+  """
+  if missing := [name for name in required if name not in selected]:
+    raise errors.SpecError(
+        f'{what} needs the senses {missing}, which are not selected; selected'
+        f' are {list(selected)}'
+    )
 
 
 def check_action_set(

@@ -14,6 +14,9 @@ from realab_suite.entities import appearance
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 
+SENSES = ('ray_distances', 'ray_classes', 'velocity', 'position', 'heading')
+"""Names of the senses that `view` reads."""
+
 _FIELD_OF_VIEW = np.radians(160.0)
 # Distance between the middle of the avatar and obstacles, metres. The radius of
 # the avatar is 0.25. Blocks get a wider berth, because they can be pushed.

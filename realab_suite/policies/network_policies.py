@@ -18,6 +18,7 @@ from realab_suite.policies import network_files
 
 # Distance at which the feature of a ray's hit falls to 1 / e, metres.
 _RAY_SCALE = 2.0
+_SENSES = 'senses/'
 
 
 @base.POLICIES.add('network_demonstrator')
@@ -48,6 +49,10 @@ class NetworkDemonstrator(base.Policy):
   @property
   def action_set(self) -> action_sets.ActionSet:
     return self._network.header.actions()
+
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return _senses(self._network)
 
   def step(
       self,
@@ -85,6 +90,10 @@ class NetworkValues(base.ValueFunction):
   def action_set(self) -> action_sets.ActionSet:
     return self._network.header.actions()
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return _senses(self._network)
+
   def step(
       self,
       observation: base.Observation,
@@ -99,6 +108,18 @@ class NetworkValues(base.ValueFunction):
     # With equal outputs, all actions have the best value.
     spread = np.where(high > low, high - low, np.inf)
     return (1.0 - 2.0 * (high - values) / spread).astype(float), state
+
+
+def _senses(network: network_files.Network) -> tuple[str, ...]:
+  """Returns the names of the senses that are inputs of a network."""
+  keys = [
+      key
+      for feature in network.header.features
+      for key in (feature.name, feature.partner)
+  ]
+  return tuple(
+      key.removeprefix(_SENSES) for key in keys if key.startswith(_SENSES)
+  )
 
 
 def outputs(

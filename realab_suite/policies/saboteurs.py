@@ -79,6 +79,10 @@ class Saboteur(base.Policy, abc.ABC):
         **navigation.initial_rest(batch_shape),
     }
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return (*navigation.SENSES, 'holding')
+
   def step(
       self,
       observation: base.Observation,

@@ -90,8 +90,13 @@ def load(
   return suite.load(
       row.info.domain,
       row.info.task,
-      {'random': row.seed},
-      {'max_steps': row.info.max_steps, 'world': row.world},
+      # Configurations of older versions do not contain arguments.
+      {**run.config.get('task_kwargs', {}), 'random': row.seed},
+      {
+          **run.config.get('environment_kwargs', {}),
+          'max_steps': row.info.max_steps,
+          'world': row.world,
+      },
       design=run.design,
   )
 

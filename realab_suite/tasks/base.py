@@ -4,7 +4,7 @@ Contains no feedback; designs define it.
 """
 
 import abc
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 import dataclasses
 from typing import Any, final
 
@@ -29,8 +29,12 @@ _FOOTPRINT = np.add(((-0.5, 2.3), (-0.35, 0.6)), (-0.15, 0.15))
 _START_SPREAD = 0.4
 # Smallest distance between the centres of apples, in m.
 _SEPARATION = 0.7
+# Height and width of the egocentric image without `camera_size`, in pixels.
+_CAMERA_SIZE = (64, 64)
 _MAX_TRIES = 16
 _TRIES_AT_ONCE = 32
+# Senses of one cast of rays.
+_RAYS = frozenset({'ray_distances', 'ray_classes'})
 
 
 @final
@@ -113,15 +117,18 @@ class Task(composer.Task):
     Args:
       arena: Root entity of the task.
       variation: Layout of the task.
-      camera_size: Height and width of the egocentric image, in pixels; `None`
-        for an agent without a camera.
+      camera_size: Height and width of the egocentric image, in pixels. The
+        camera is then a default sense. `None` for 64 x 64 pixels if the sense
+        `camera` is selected.
 
     Raises:
       SpecError: If `camera_size` has a value that is not allowed.
     """
     self._arena = arena
     self._variation = variation
-    self._camera_size = _checked_size(camera_size)
+    size = _checked_size(camera_size)
+    self._has_camera_by_default = size is not None
+    self._camera_size = size or _CAMERA_SIZE
     arena.offer(
         {name: arenas.Place(xy) for name, xy in variation.stations.items()}
     )
@@ -143,8 +150,8 @@ class Task(composer.Task):
     return self._avatar
 
   @property
-  def camera_size(self) -> tuple[int, int] | None:
-    """Height and width of the egocentric image, in pixels, or `None`."""
+  def camera_size(self) -> tuple[int, int]:
+    """Height and width of the egocentric image, in pixels."""
     return self._camera_size
 
   @property
@@ -223,10 +230,10 @@ class Task(composer.Task):
 
   @property
   def sense_spec(self) -> dict[str, specs.Array]:
-    """Specs of the agent's senses, by name, for one world."""
+    """Specs of the senses that this world offers, by name, for one world."""
     avatar = self._avatar
     rays = (len(avatar.rays.angles),)
-    spec = {
+    return {
         'ray_distances': specs.BoundedArray(
             rays, np.float32, 0.0, avatar.rays.max_distance
         ),
@@ -238,32 +245,43 @@ class Task(composer.Task):
         'heading': specs.BoundedArray((2,), np.float32, -1.0, 1.0),
         'pitch': specs.Array((1,), np.float32),
         'holding': specs.BoundedArray((1,), np.float32, 0.0, 1.0),
+        'camera': specs.BoundedArray((*self._camera_size, 3), np.uint8, 0, 255),
     }
-    if self._camera_size is not None:
-      spec['camera'] = specs.BoundedArray(
-          (*self._camera_size, 3), np.uint8, 0, 255
-      )
-    return spec
 
-  def senses(self, physics: protocols.Physics) -> dict[str, np.ndarray]:
-    """Returns the agent's senses, by name.
+  @property
+  def default_senses(self) -> tuple[str, ...]:
+    """Names of the senses of an agent for which none are selected."""
+    return tuple(
+        name
+        for name in self.sense_spec
+        if name != 'camera' or self._has_camera_by_default
+    )
+
+  def senses(
+      self, physics: protocols.Physics, names: Collection[str]
+  ) -> dict[str, np.ndarray]:
+    """Returns the selected senses, by name. No other senses are computed.
 
     Args:
       physics: One world or a batch of worlds.
+      names: Names of the selected senses, keys of `sense_spec`.
 
     Returns:
       New arrays that match `sense_spec`, with leading axes `(...)`.
     """
     avatar = self._avatar
-    distances, classes = avatar.rays.sense(physics)
-    body = avatar.proprioception(physics).astype(np.float32)
-    senses = {'ray_distances': distances, 'ray_classes': classes}
-    for name, part in avatars.PROPRIOCEPTION.items():
-      senses[name] = body[..., part]
-    if self._camera_size is not None:
+    senses: dict[str, np.ndarray] = {}
+    if not _RAYS.isdisjoint(names):
+      distances, classes = avatar.rays.sense(physics)
+      senses |= {'ray_distances': distances, 'ray_classes': classes}
+    if not avatars.PROPRIOCEPTION.keys().isdisjoint(names):
+      body = avatar.proprioception(physics).astype(np.float32)
+      for name, part in avatars.PROPRIOCEPTION.items():
+        senses[name] = body[..., part]
+    if 'camera' in names:
       height, width = self._camera_size
       senses['camera'] = cameras.render(physics, avatar.camera, height, width)
-    return senses
+    return {name: value for name, value in senses.items() if name in names}
 
   @property
   def start(self) -> arenas.Rectangle:

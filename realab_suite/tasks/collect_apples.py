@@ -33,8 +33,8 @@ class CollectApples(base.Task):
 
     Args:
       variation: A key of `base.VARIATIONS`.
-      camera_size: Height and width of the egocentric image, in pixels; `None`
-        for an agent without a camera.
+      camera_size: Height and width of the egocentric image, in pixels, or
+        `None`; see `base.Task`.
 
     Raises:
       SpecError: If `camera_size` has a value that is not allowed.

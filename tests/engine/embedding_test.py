@@ -162,8 +162,8 @@ class _Sensing(collect_apples.CollectApples):
 
   change: Any = None
 
-  def senses(self, physics: Any) -> dict[str, np.ndarray]:
-    senses = super().senses(physics)
+  def senses(self, physics: Any, names: Any) -> dict[str, np.ndarray]:
+    senses = super().senses(physics, names)
     if self.change is not None:
       self.change(senses)
     return senses

@@ -161,6 +161,7 @@ def test_a_sense_that_is_called_like_one_of_ours_is_refused():
 # composer/environment.py before changing the list.
 _PRIVATE_OF_DM_CONTROL_1_0_50 = {
     '_hooks',
+    '_make_observation_updater',
     '_n_sub_steps',
     '_observation_updater',
     '_physics',

@@ -91,8 +91,10 @@ def _differences(steps: int = 10) -> str:
 def test_a_sense_of_one_world_that_differs_is_noticed(monkeypatch):
   senses = base.Task.senses
 
-  def sense_carelessly(task: Any, physics: Any) -> dict[str, np.ndarray]:
-    sensed = senses(task, physics)
+  def sense_carelessly(
+      task: Any, physics: Any, names: Any
+  ) -> dict[str, np.ndarray]:
+    sensed = senses(task, physics, names)
     if isinstance(physics, batch_physics.BatchPhysics):
       position = sensed['position'].copy()
       position[1] = np.nextafter(position[1], np.inf, dtype=position.dtype)

@@ -112,7 +112,7 @@ def test_a_restore_updates_derived_quantities():
   env, snapshot = snapshot_campaign.saved(_REWARD, 40)
   names = ('xpos', 'xmat', 'geom_xpos', 'site_xpos', 'subtree_com', 'cvel')
   expected = {n: np.array(getattr(env.physics.data, n)) for n in names}
-  senses = env.task.senses(env.physics)
+  senses = env.task.senses(env.physics, env.senses)
   other = _REWARD.load(seed=8)
   other.reset()
   snapshot_campaign.play(other, 11, seed=5)
@@ -122,7 +122,7 @@ def test_a_restore_updates_derived_quantities():
     np.testing.assert_array_equal(
         getattr(other.physics.data, name), expected[name], err_msg=name
     )
-  for name, value in other.task.senses(other.physics).items():
+  for name, value in other.task.senses(other.physics, other.senses).items():
     np.testing.assert_array_equal(value, senses[name], err_msg=name)
 
 

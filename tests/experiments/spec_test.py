@@ -59,6 +59,10 @@ def _run(design='instantaneous_reward', **options):
   return {'runs': {'a': {'design': design, **options}}}
 
 
+def _sees(*senses):
+  return {'environment_kwargs': {'senses': list(senses)}}
+
+
 @pytest.mark.parametrize(
     ('changes', 'complaint'),
     [
@@ -107,6 +111,34 @@ def _run(design='instantaneous_reward', **options):
         (
             {'evaluation': {'actions': 'best'}},
             "evaluation.actions: must be 'sampled' or 'greedy'",
+        ),
+        ({'task_kwargs': {'random': 1}}, 'task_kwargs: random: the seeds of'),
+        (
+            {'task_kwargs': {'camera_size': [0, 8]}},
+            'runs.reward: camera_size: [0, 8]; allowed are (height, width)',
+        ),
+        (
+            {'task_kwargs': {'size': 8}},
+            'runs.reward: task_kwargs of unlock_door.near: TypeError: ',
+        ),
+        (
+            {'environment_kwargs': {'max_steps': 8}},
+            "environment_kwargs: unknown key 'max_steps'",
+        ),
+        (_sees('nose'), "runs.reward: senses: unknown ['nose']; this world"),
+        (_sees('holding', 'holding'), 'allowed are a list of names, each once'),
+        (
+            {**_sees('camera'), **_run('online_imitation')},
+            "runs.a: design 'online_imitation': providers[0]:demonstration"
+            ' needs the senses',
+        ),
+        (
+            {**_sees('camera'), 'baselines': ['random', 'apple_seeker']},
+            'runs.reward: policy AppleSeeker needs the senses',
+        ),
+        (
+            {**_sees('camera'), 'evaluation': {'probe_states': 5}},
+            'runs.reward: policy AppleSeeker needs the senses',
         ),
     ],
 )
@@ -202,6 +234,8 @@ def test_the_error_on_an_unknown_run_lists_the_known_ones():
     [
         {'max_steps': 9},
         {'task': 'unlock_door.far'},
+        {'task_kwargs': {'camera_size': [8, 8]}},
+        {'environment_kwargs': {'senses': ['pitch', 'holding']}},
         {'training': {'num_envs': 9}},
         {'evaluation': {'episodes': 9}},
         {'runs': {'reward': {'design': 'instantaneous_reward',

@@ -93,10 +93,10 @@ _WRONG = {
     'providers.0={kind: demonstration, policy: no_op, writes: [reward]}':
         'demonstration uses action set dmlab_like v1; the design has None',
     'action_set={name: dmlab, version: 1}':
-        "action_set: action set 'dmlab' v1 is unknown; known are"
-        " ['dmlab_like v1']",
+        "action_set: action set 'dmlab v1' is unknown; did you mean"
+        " 'dmlab_like v1'?; known are ['dmlab_like v1']",
     'action_set={name: dmlab_like, version: 9}':
-        "action set 'dmlab_like' v9 is unknown",
+        "action set 'dmlab_like v9' is unknown",
     'schedule={meter_substep: 5, provider_substep: 3}':
         'meter_substep 5 must not come after provider_substep 3',
     'schedule={meter_substep: -1, provider_substep: 3}':

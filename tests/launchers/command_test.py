@@ -22,6 +22,7 @@ from realab_suite.experiments import requirements
 from realab_suite.experiments import scripted
 from realab_suite.launchers import compare
 from realab_suite.launchers import explore
+from realab_suite.launchers import film
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
@@ -293,6 +294,31 @@ def test_a_renderer_that_does_not_work_is_refused_in_one_line(monkeypatch):
   assert problem.startswith('crayons: ')
   assert len(problem.splitlines()) == 1
   assert os.environ['MUJOCO_GL'] == 'disable'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'complaint'),
+    [
+        ([], '--input: missing'),
+        (['--input=a'], '--run: missing'),
+        (['--input=a', '--run=b'], '--video: missing'),
+        (['--input=a', '--run=b', '--video=c.mp4'], 'cannot make a film: disa'),
+    ],
+)
+def test_a_film_needs_a_run_and_a_renderer(monkeypatch, arguments, complaint):
+  monkeypatch.setenv('MUJOCO_GL', 'disable')
+  assert complaint in in_process.complaint(film, *arguments)
+
+
+@pytest.mark.parametrize('given', ['', 'osmesa', 'disable'])
+def test_a_renderer_is_chosen_at_the_first_frame(monkeypatch, given):
+  monkeypatch.setenv('MUJOCO_GL', given)
+  postponed = []
+  monkeypatch.setattr(_display, 'postpone_choice', lambda: postponed.append(1))
+  renderers.render_on_demand()
+  is_ours = not given and sys.platform == 'linux'
+  assert os.environ['MUJOCO_GL'] == ('egl' if is_ours else given)
+  assert len(postponed) == is_ours
 
 
 def test_a_renderer_that_works_is_chosen(monkeypatch):

@@ -106,6 +106,6 @@ def _check(env: environment.Environment, is_visible: bool) -> None:
 
   def draw_for_agent() -> np.ndarray:
     env.physics.forward()
-    return env.task.senses(env.physics)['camera']
+    return env.task.senses(env.physics, ['camera'])['camera']
 
   assert (_changes(env, draw_for_agent) > 0) == is_visible

@@ -200,7 +200,7 @@ def _l23(patch: pytest.MonkeyPatch) -> None:
 def _l24(patch: pytest.MonkeyPatch) -> None:
   """The agent senses the centre of mass of everything."""
 
-  def sense(self: Any, result: Any, physics: Any) -> None:
+  def sense(self: Any, result: Any, physics: Any, names: Any) -> None:
     centre = np.asarray(physics.data.subtree_com)[0]
     result['position'] = result['position'] + centre[:2].astype(np.float32)
 

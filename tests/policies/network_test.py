@@ -310,7 +310,7 @@ def test_an_archive_of_something_else_is_refused(tmp_path):
     ('change', 'complaint'),
     [
         (lambda h: h['reached'][0].update(mean=18.0), 'damaged'),
-        (lambda h: h.update(action_set_version=2), r"^net.npz: .*like' v2"),
+        (lambda h: h.update(action_set_version=2), r"^net.npz: .*like v2'"),
     ],
 )
 def test_a_changed_header_is_refused(shipped, change, complaint):

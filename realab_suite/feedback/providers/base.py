@@ -72,6 +72,15 @@ class Provider(pydantic.BaseModel, abc.ABC):
       return None
     return axes.both((step - 1) % self.every == 0, None)
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    """Names of the senses that the provider reads from observations.
+
+    The agent must have these senses. Override this in a subclass that reads
+    senses.
+    """
+    return ()
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step.
 

@@ -42,6 +42,10 @@ class Demonstration(base.Provider):
   def check(self, design: Any) -> None:
     policies.check_action_set(self.demonstrator.action_set, design, self.kind)
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return self.demonstrator.required_senses
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return self.demonstrator.initial_state(batch_shape)
 

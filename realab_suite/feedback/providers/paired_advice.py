@@ -58,6 +58,10 @@ class PairedAdvice(base.Provider):
             f' {design.registers[query].role!r}; allowed is query'
         )
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return self.adviser.required_senses
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return self.adviser.initial_state(batch_shape)
 

@@ -67,6 +67,10 @@ class ValueAdvice(base.Provider):
           ' is 0, or another learner'
       )
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return self.adviser.required_senses
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     num_actions = len(self.adviser.action_set)
     return (

@@ -1,0 +1,163 @@
+"""Tests that arguments of tasks and environments reach all parts of a run."""
+
+import types
+from unittest import mock
+
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.evaluation import results
+from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import jobs
+from realab_suite.experiments import scripted
+from realab_suite.experiments import served_evaluation
+from realab_suite.experiments import training
+from realab_suite.launchers import compare
+from realab_suite.reports import replays
+from tests.experiments import fake_learner
+from tests.experiments import small
+from tests.launchers import in_process
+
+_SENSES = ('ray_distances', 'ray_classes', 'velocity', 'position', 'heading',
+           'holding')  # fmt: skip
+_EXPERIMENT = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'task_kwargs': {'camera_size': [12, 16]},
+    'max_steps': 8,
+    'runs': {
+        'reward': {
+            'design': 'instantaneous_reward',
+            'overrides': [
+                'dof=planar', 'action_set={name: dmlab_like, version: 1}',
+            ],
+            'learner': {'steps_per_update': 4, 'minibatch': 8},
+        },
+    },
+    'baselines': ['random'],
+    'seeds': [3],
+    'training': {'num_envs': 2, 'steps': 24, 'checkpoint_every': 12},
+    'evaluation': {'episodes': 2},
+}  # fmt: skip
+
+
+def _plan(senses, **changes):
+  experiment = {
+      **_EXPERIMENT,
+      'environment_kwargs': {'senses': list(senses)},
+      **changes,
+  }
+  return jobs.plan(experiment_specs.load(experiment))
+
+
+def _replay(job, path):
+  """Returns the environment in which the first episode of a job is replayed."""
+  run = types.SimpleNamespace(config=jobs.read_config(path), design=job.design)
+  row = next(iter(results.read_rows(path / training.EPISODES)))
+  return replays.load(run, row)
+
+
+def test_arguments_reach_training_evaluation_baselines_probes_and_replays(
+    tmp_path, monkeypatch
+):
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+  real, num_loaded = suite.load_batch, []
+
+  def load_batch(*arguments, **options):
+    batch = real(*arguments, **options)
+    assert batch.original.senses == _SENSES
+    assert batch.task.camera_size == (12, 16)
+    assert batch.original.max_steps == 8
+    num_loaded.append(batch.num_envs)
+    return batch
+
+  planned = _plan(_SENSES, evaluation={'episodes': 2, 'probe_states': 1})
+  options = training.Options(lambda line: None)
+  with mock.patch.object(suite, 'load_batch', load_batch):
+    paths = [training.run(job, tmp_path, options) for job in planned]
+  # A baseline; training, evaluation and the probe of a learner.
+  assert len(num_loaded) == 4
+  for job, path in zip(planned, paths, strict=True):
+    env = _replay(job, path)
+    assert (env.senses, env.task.camera_size) == (_SENSES, (12, 16))
+
+
+@pytest.mark.camera
+def test_a_learner_that_has_only_a_camera_is_trained_and_evaluated(tmp_path):
+  job = _plan(['camera'])[-1]
+  seen = []
+  make_learner = training.make_learner
+
+  def make(job, batch):
+    seen.append(batch.observation_spec())
+    return make_learner(job, batch)
+
+  with mock.patch.object(training, 'make_learner', make):
+    path = training.run(job, tmp_path, training.Options(lambda line: None))
+  assert seen[0].keys() == {'senses/camera', 'registers/reward'}
+  assert seen[0]['senses/camera'].shape == (12, 16, 3)
+  assert len(list(results.read_rows(path / training.EPISODES))) == 2
+  env = _replay(job, path)
+  assert env.reset().observation['senses/camera'].any()
+
+
+@pytest.mark.camera
+def test_scripted_policies_are_compared_with_a_camera(tmp_path):
+  settings = small.settings(
+      tmp_path / 'new', policies=('random',), senses=('camera',),
+      task_kwargs={'camera_size': [8, 8]}, seeds=(3,),
+  )  # fmt: skip
+  with mock.patch.object(suite, 'load', side_effect=suite.load) as load:
+    scripted.run(settings, lambda line: None)
+  for call in load.call_args_list:
+    assert call.kwargs['environment_kwargs']['senses'] == ('camera',)
+  described = small.description(tmp_path / 'new')['settings']
+  assert described['senses'] == ['camera']
+  assert described['task_kwargs'] == {'camera_size': [8, 8]}
+
+
+def test_a_policy_without_its_senses_is_refused_before_anything_is_written(
+    tmp_path,
+):
+  settings = small.settings(
+      tmp_path / 'new', policies=('random', 'apple_seeker'), senses=('pitch',)
+  )
+  with pytest.raises(errors.SpecError, match='AppleSeeker needs the senses'):
+    scripted.run(settings, lambda line: None)
+  assert not (tmp_path / 'new').exists()
+
+
+def test_a_served_world_has_the_senses_of_its_settings_and_of_its_record(
+    tmp_path,
+):
+  given = {
+      'senses': ['holding', 'camera'],
+      'task_kwargs': {'camera_size': [4, 6]},
+  }
+  record = small.write_served_run(tmp_path, **given)
+  names = served_evaluation.Settings.__dataclass_fields__
+  blank = served_evaluation.Settings(**dict.fromkeys(names))
+  for changes in ({'repeat': str(record), 'overrides': ()},):
+    settings = blank.__class__(**{**vars(blank), **changes})
+    env = served_evaluation._load(*served_evaluation._chosen(settings))
+    assert env.senses == ('holding', 'camera')
+    assert env.observation_spec()['senses/camera'].shape == (4, 6, 3)
+
+
+@pytest.mark.parametrize(
+    ('argument', 'complaint'),
+    [
+        ('--senses=nose', "senses: unknown ['nose']; this world offers"),
+        ('--task_kwargs=[]', '--task_kwargs: expected a mapping'),
+        ('--task_kwargs={random: 1}', '--task_kwargs: random: seeds have'),
+        ('--task_kwargs={camera_size: 5}', 'camera_size: 5; allowed are'),
+    ],
+)
+def test_wrong_arguments_of_programs_are_refused_in_one_line(
+    tmp_path, argument, complaint
+):
+  output = f'--output={tmp_path / "new"}'
+  arguments = (argument, '--policies=random', output, '--novideos')
+  assert complaint in in_process.complaint(compare, *arguments)

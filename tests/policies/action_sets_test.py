@@ -1,0 +1,131 @@
+"""Tests of the registry of action sets, and of own sets in worlds."""
+
+import dm_env
+import numpy as np
+import pytest
+
+from realab_suite import agents
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.evaluation import actors
+from realab_suite.policies import action_sets
+
+_ACTIONS = (
+    ('grasp', {'grasp': 1.0}),
+    ('spin', {'turn': -1.0, 'forward': 0.5}),
+    ('go', {'forward': 1.0}),
+)
+
+
+@pytest.fixture(autouse=True)
+def fixture_registry():
+  before = dict(action_sets.ACTION_SETS._entries)
+  yield
+  action_sets.ACTION_SETS._entries.clear()
+  action_sets.ACTION_SETS._entries.update(before)
+
+
+def _drive(version=1, actions=_ACTIONS, name='drive'):
+  return action_sets.ActionSet(name, version, actions)
+
+
+def _load(version, num_envs=0, design='instantaneous_reward'):
+  overrides = [f'action_set={{name: drive, version: {version}}}']
+  options = {'design': design, 'overrides': overrides}
+  if num_envs:
+    options['num_envs'] = num_envs
+    return suite.load_batch('unlock_door', 'near', {'random': 1}, **options)
+  return suite.load('unlock_door', 'near', {'random': 1}, **options)
+
+
+def test_versions_of_an_own_set_act_side_by_side():
+  first = action_sets.register(_drive())
+  action_sets.register(_drive(2, _ACTIONS[::-1]))
+  assert action_sets.get('drive', 1) is first
+  old, new = _load(1), _load(2)
+  plain = suite.load(
+      'unlock_door', 'near', {'random': 1}, design='instantaneous_reward'
+  )
+  batch = _load(2, num_envs=2)
+  for env in (old, new, plain, batch):
+    env.reset()
+  for i in (1, 0, 2, 2):
+    controls = np.zeros(6)
+    for element, value in _ACTIONS[i][1].items():
+      names = plain.action_spec().name.split('\t')
+      controls[[n.rpartition('/')[2] for n in names].index(element)] = value
+    expected = plain.step(controls).observation
+    index = np.int32(i)
+    for found in (old.step(index), new.step(2 - index)):
+      for key, value in expected.items():
+        assert found.observation[key].tobytes() == value.tobytes()
+    both = batch.step(np.array([2 - i, 2 - i], np.int32)).observation
+    assert both['senses/position'][0].tobytes() == (
+        expected['senses/position'].tobytes()
+    )
+
+
+def test_a_learner_acts_with_an_own_set():
+  action_sets.register(_drive())
+  batch = _load(1, num_envs=2)
+  learner = agents.make(
+      batch.mechanism.design.learner, batch.observation_spec(),
+      batch.action_spec(), num_envs=2, seed=0,
+  )  # fmt: skip
+  time_step = batch.reset()
+  for _ in range(3):
+    actions = learner.step(time_step)
+    assert set(actions.tolist()) <= {0, 1, 2}
+    time_step = batch.step(actions)
+  assert learner.probabilities(time_step.observation).shape == (2, 3)
+
+
+class _Turner(policies.Policy):
+  """Takes the action 1 of the set `drive`."""
+
+  @property
+  def action_set(self):
+    return action_sets.get('drive', 1)
+
+  def step(self, observation, episode_start, key, state):
+    return np.ones(np.shape(episode_start), int), state
+
+
+def test_policies_and_providers_act_in_their_own_set_only():
+  action_sets.register(_drive())
+  env = _load(1)
+  assert actors.make(_Turner(), env).act(dm_env.restart({})) == 1
+  with pytest.raises(errors.SpecError, match='dmlab_like v1, the design uses'):
+    actors.make(policies.make('random'), env)
+  with pytest.raises(errors.SpecError, match='uses action set dmlab_like v1'):
+    _load(1, design='value_advice')
+
+
+def test_a_set_is_registered_once():
+  action_sets.register(_drive())
+  with pytest.raises(errors.SpecError, match="'drive v1' is registered"):
+    action_sets.register(_drive(actions=_ACTIONS[:1]))
+  with pytest.raises(errors.UnknownNameError, match="'drive v3' is unknown"):
+    action_sets.get('drive', 3)
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        ({'name': 'Drive'}, "name: 'Drive'; allowed are names"),
+        ({'name': 'a/v1'}, 'allowed are names'),
+        ({'name': 3}, 'allowed are names'),
+        ({'version': 0}, 'version: 0; allowed are integers from 1'),
+        ({'version': True}, 'allowed are integers from 1'),
+        ({'actions': ()}, 'actions: []; allowed are one or more'),
+        ({'actions': _ACTIONS[:1] * 2}, "actions: ['grasp', 'grasp']"),
+        ({'actions': (('go', {'forward': np.nan}),)}, 'allowed are finite'),
+    ],
+)
+def test_a_wrong_set_is_refused_in_one_line(change, complaint):
+  with pytest.raises(errors.SpecError) as raised:
+    _drive(**change)
+  [line] = str(raised.value).splitlines()
+  assert line.startswith('action set ')
+  assert complaint in line
