@@ -11,6 +11,7 @@ import numpy as np
 
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
+from realab_suite.entities import block_contacts
 from realab_suite.entities import block_kinds
 from realab_suite.entities import grasps
 from realab_suite.entities import measurables
@@ -244,7 +245,7 @@ class Avatar(measurables.MeasurableEntity):
     """
     root = self._mjcf_root.root_model
     for block in blocks:
-      if (softness := block_kinds.softness(block.half_size)) > 1.0:
+      if (softness := block_contacts.softness(block.half_size)) > 1.0:
         time, damping = _CONTACT['solref']
         slip, spin, roll = _CONTACT['friction']
         pair = root.contact.add(

@@ -14,6 +14,7 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite.entities import axes
+from realab_suite.entities import block_contacts
 from realab_suite.entities import grasps
 from realab_suite.entities import protocols
 from realab_suite.entities import rotations
@@ -29,25 +30,6 @@ LEAST_SIZE = 0.06
 # of a corner, and cubes of more than 0.5 m left other ones at up to 3.3 m/s.
 _SUBSTEP, _SHORT_SUBSTEP = 0.02, 0.01
 _USUAL_SIZES = (0.075, 0.2)
-# Contacts between blocks are soft, so that a block that is written into another
-# one pushes it away slowly: at 1.3 m/s at most, compared with 9.8 m/s at
-# MuJoCo's default stiffness. In contacts with other geoms, the stiffness of the
-# other geom counts, because a block on a soft floor settles so slowly after a
-# write that its value drifts (by 3e-8 m instead of 2e-15 m).
-_CONTACT: dict[str, Any] = {
-    'friction': (0.8, 0.01, 0.001),
-    'solref': (0.06, 1.0),
-    'solmix': 1e-4,
-}
-# Bodies can penetrate a large block more deeply and would then be pushed out
-# faster: at up to 2.6 m/s by a cube of 0.4 m. Above this half edge length, in
-# m, contacts of a block become softer as its size increases.
-_USUAL_HALF_SIZE = 0.1
-# Exponent by which the friction of large blocks decreases with their softness.
-# MuJoCo's contacts turn sliding into hopping: a cube of 1 m that was squeezed
-# against a wall hopped off another one at 5.4 m/s. The fastest of 800 such
-# cubes left at 3.0 m/s with exponent 2, 2.6 with 3, 2.0 with 4 and 1.95 with 6.
-_SLIPPERINESS = 6
 # Height at which an avatar carries a block, in m.
 GRIP_HEIGHT = 0.2
 # Gap between a planar block and the floor, in m, so that they never touch.
@@ -55,15 +37,6 @@ _HOVER = 0.004
 # Friction loss of the joints of a planar block, in N, in place of contact with
 # the floor.
 _PLANAR_FRICTION = 6.0
-
-
-def softness(half_size: float) -> float:
-  """Returns the factor by which contacts of a block are softened, at least 1.
-
-  Args:
-    half_size: Half the edge length of the block, in m.
-  """
-  return max(1.0, half_size / _USUAL_HALF_SIZE)
 
 
 def timestep_for(half_sizes: Iterable[float]) -> float:
@@ -170,7 +143,7 @@ class JointedBlock(Block):
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
     self._geom = self._body.add(
         'geom', name=name, type='box', size=[half_size] * 3, mass=mass,
-        **contact(half_size), **style
+        **block_contacts.attributes(half_size), **style
     )  # fmt: skip
     self._site = self._body.add(
         'site', name=f'{name}_grip', size=[0.01], group=4,
@@ -498,19 +471,3 @@ class PlanarBlock(JointedBlock):
     axes.assign(physics.bind(self._slides), 'qpos', moved, where)
     axes.assign(physics.bind(self._hinge), 'qpos', angle, where)
     axes.assign(physics.bind(self._joints), 'qvel', 0.0, where)
-
-
-def contact(half_size: float) -> dict[str, Any]:
-  """Returns the contact attributes of a block.
-
-  Args:
-    half_size: Half the edge length, in m.
-  """
-  soft = softness(half_size)
-  time, damping = _CONTACT['solref']
-  slide, spin, roll = _CONTACT['friction']
-  return {
-      **_CONTACT,
-      'solref': (time * soft, damping),
-      'friction': (slide / soft**_SLIPPERINESS, spin, roll),
-  }

@@ -8,6 +8,7 @@ from dm_control import mjcf
 import numpy as np
 
 from realab_suite.entities import axes
+from realab_suite.entities import block_contacts
 from realab_suite.entities import block_kinds
 from realab_suite.entities import moving
 from realab_suite.entities import protocols
@@ -41,7 +42,7 @@ class MocapBlock(block_kinds.Block):
             {
                 'type': 'box',
                 'size': [half_size] * 3,
-                **block_kinds.contact(half_size),
+                **block_contacts.attributes(half_size),
                 **style,
             }
         ],

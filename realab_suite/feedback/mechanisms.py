@@ -23,10 +23,10 @@ from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import records
+from realab_suite.feedback import assembly
 from realab_suite.feedback import measurements
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
-from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
 
 _NO_PARTS: Mapping[str, measurables.Measurable] = {}
@@ -56,7 +56,7 @@ class FeedbackMechanism(composer.Entity):
     self._step_count = state.Slot(self._mjcf_root, 'step_count')
     self._score = state.Slot(self._mjcf_root, 'score')
     self._registers = {
-        name: _make_register(name, spec, design)
+        name: assembly.make_register(name, spec, design)
         for name, spec in design.registers.items()
     }
     self._queries = [self._registers[name] for name in design.names('query')]
@@ -111,7 +111,7 @@ class FeedbackMechanism(composer.Entity):
         )
     named_places = root.places if isinstance(root, arenas.RoomArena) else {}
     places = {
-        name: _find_place(name, spec.place, named_places)
+        name: assembly.find_place(name, spec.place, named_places)
         for name, spec in self._design.registers.items()
     }
     root.attach(self)
@@ -452,57 +452,6 @@ class FeedbackMechanism(composer.Entity):
   def _this_step(self, physics: protocols.Physics) -> Any:
     """Returns the number of the current control step, from 1, `(...)` int."""
     return self._whole_steps(physics) + 1
-
-
-def _make_register(
-    name: str, spec: specs.RegisterSpec, design: specs.DesignSpec
-) -> base.Register:
-  kind = register_kinds.REGISTER_KINDS.get(spec.kind)
-  common = dict(
-      value_range=spec.range,
-      scale=spec.scale,
-      initial=spec.initial,
-      role=spec.role,
-      channel=design.channel_of(name),
-      dof=spec.dof or design.dof,
-      on_overflow=spec.on_overflow,
-      write=spec.write,
-      block_size=spec.block_size,
-      mass=spec.mass,
-  )
-  location = messages.Location(f'design {design.name!r}', ('registers', name))
-  try:
-    return kind(name, **common, **spec.options)
-  except errors.SpecError as error:
-    raise location.error(str(error)) from error
-  except Exception as error:  # Register kinds may raise any class.
-    raise location.error(messages.exception(error)) from error
-
-
-def _find_place(
-    name: str,
-    place: str | specs.PlaceSpec,
-    named_places: Mapping[str, arenas.Place],
-) -> arenas.Place:
-  """Returns the place of a register.
-
-  Args:
-    name: Name of the register, for messages.
-    place: Name of a place, or coordinates.
-    named_places: Places of the world, by name.
-
-  Raises:
-    SpecError: If the world has no place of this name.
-  """
-  if isinstance(place, specs.PlaceSpec):
-    x, y, height = (*place.position, 0.0)[:3]
-    return arenas.Place((x, y), place.yaw, place.spread, height)
-  if place not in named_places:
-    raise errors.SpecError(
-        f'registers.{name}.place: this world has no place {place!r}; allowed'
-        f' are {sorted(named_places) or "coordinates"}'
-    )
-  return named_places[place]
 
 
 def _where(writer: str, step: Any, world: int | None = None) -> str:

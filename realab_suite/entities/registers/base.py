@@ -426,21 +426,6 @@ class Register(composer.Entity):
     wrong = self._read_blocks(physics) - self._applied_slot.get(physics)
     return np.abs(wrong) * self._scale
 
-  def _farthest(
-      self, physics: protocols.Physics, places: Sequence[np.ndarray]
-  ) -> np.ndarray:
-    """Returns the largest distance of a block from its place, `(...)`, in m.
-
-    Args:
-      physics: One world or a batch of worlds.
-      places: Position of each block in the register's frame, `(..., 3)`, in m.
-    """
-    moved = [
-        np.linalg.norm(block.position(physics) - place, axis=-1)
-        for block, place in zip(self._blocks, places, strict=True)
-    ]
-    return np.max(moved, axis=0)
-
   def inspect(
       self,
       physics: protocols.Physics,
@@ -473,54 +458,6 @@ class Register(composer.Entity):
     """Returns the start position of the first block, `(..., 3)`, in m."""
     return self._origin_slot.get(physics)
 
-  def _slide(
-      self,
-      physics: protocols.Physics,
-      block: block_kinds.Block,
-      start: np.ndarray,
-      value: np.ndarray,
-      where: axes.Mask,
-  ) -> np.ndarray:
-    """Sets the coordinate of a block along the axis, for `_shift`.
-
-    Args:
-      physics: One world or a batch of worlds.
-      block: Block with joints.
-      start: Coordinate that represents 0, `(...)`, in m.
-      value: Value to represent, `(...)`.
-      where: As in `_put`.
-
-    Returns:
-      Value that the block got, `(...)`.
-    """
-    along = start + value * self._scale
-    placed = _jointed(block).slide(physics, along, where)
-    if placed is along:
-      return value
-    # Exactly the value wherever nothing is in the way.
-    return np.where(placed == along, value, (placed - start) / self._scale)[()]
-
-  def _turn(
-      self,
-      physics: protocols.Physics,
-      block: block_kinds.Block,
-      value: np.ndarray,
-      where: axes.Mask,
-  ) -> np.ndarray:
-    """Sets the heading of a block, for `_shift`.
-
-    Args:
-      physics: One world or a batch of worlds.
-      block: Block with joints.
-      value: Value to represent, `(...)`.
-      where: As in `_put`.
-
-    Returns:
-      `value`. Nothing obstructs a turn.
-    """
-    _jointed(block).turn(physics, value * self._scale, where)
-    return value
-
   def _add_block(
       self, name: str, class_name: str, position: Sequence[float]
   ) -> block_kinds.Block:
@@ -546,14 +483,3 @@ class Register(composer.Entity):
         else block_kinds.PlanarBlock
     )
     return kind(self._mjcf_root, name, position, half_size, self._mass, style)
-
-
-def _jointed(block: block_kinds.Block) -> block_kinds.JointedBlock:
-  """Returns a block with joints.
-
-  Raises:
-    TypeError: If it has none; nothing but `put` moves such a block.
-  """
-  if not isinstance(block, block_kinds.JointedBlock):
-    raise TypeError(f'{type(block).__name__} has no joints')
-  return block

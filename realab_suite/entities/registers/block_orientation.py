@@ -9,6 +9,7 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
+from realab_suite.entities.registers import moves
 
 # Largest heading that represents a value, in rad. Headings are equal modulo a
 # full turn. The range ends before half a turn, so that a small push at either
@@ -51,13 +52,14 @@ class BlockOrientationRegister(base.Register):
       value: np.ndarray,
       where: axes.Mask = None,
   ) -> np.ndarray:
-    return self._turn(physics, self._block, value, where)
+    moves.turn(physics, self._block, value * self._scale, where)
+    return value
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale
 
   def displacement(self, physics: protocols.Physics) -> np.ndarray:
     turned = self._block.heading(physics) - self.applied(physics) * self._scale
-    moved = self._farthest(physics, [self._origin(physics)])
+    moved = moves.farthest(physics, self._blocks, [self._origin(physics)])
     # A turned block moves its sides.
     return np.maximum(moved, np.abs(turned) * self._block.half_size)

@@ -8,6 +8,7 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
+from realab_suite.entities.registers import moves
 
 
 @final
@@ -41,7 +42,7 @@ class BlockPositionRegister(base.Register):
       where: axes.Mask = None,
   ) -> np.ndarray:
     start = axes.component(self._origin(physics), 0)
-    return self._slide(physics, self._block, start, value, where)
+    return moves.slide(physics, self._block, start, value, self._scale, where)
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     started = axes.component(self._origin(physics), 0)
@@ -51,4 +52,4 @@ class BlockPositionRegister(base.Register):
     place = np.array(self._origin(physics))
     along = self.applied(physics) * self._scale
     place[..., 0] = axes.component(place, 0) + along
-    return self._farthest(physics, [place])
+    return moves.farthest(physics, self._blocks, [place])

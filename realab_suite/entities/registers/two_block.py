@@ -8,6 +8,7 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
+from realab_suite.entities.registers import moves
 
 # Gap between the paths of the two blocks, in m, so that both blocks are visible
 # at a value of 0.
@@ -58,7 +59,7 @@ class TwoBlockRegister(base.Register):
       where: axes.Mask = None,
   ) -> np.ndarray:
     start = axes.component(self._origin(physics), 0)
-    return self._slide(physics, self._offset, start, value, where)
+    return moves.slide(physics, self._offset, start, value, self._scale, where)
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     distance = self._offset.along(physics) - self._base.along(physics)
@@ -74,4 +75,4 @@ class TwoBlockRegister(base.Register):
     along = self.applied(physics) * self._scale
     offset[..., 0] = axes.component(offset, 0) + along
     offset[..., 2] = self._offset.rest_height
-    return self._farthest(physics, [origin, offset])
+    return moves.farthest(physics, self._blocks, [origin, offset])

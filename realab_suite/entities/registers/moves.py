@@ -1,0 +1,85 @@
+"""Moves of the blocks of registers."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from realab_suite.entities import axes
+from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
+
+
+def slide(
+    physics: protocols.Physics,
+    block: block_kinds.Block,
+    start: np.ndarray,
+    value: np.ndarray,
+    scale: float,
+    where: axes.Mask,
+) -> np.ndarray:
+  """Sets the coordinate of a block along the axis of its register.
+
+  Args:
+    physics: One world or a batch of worlds.
+    block: Block with joints.
+    start: Coordinate that represents 0, `(...)`, in m.
+    value: Value to represent, `(...)`.
+    scale: Length per unit of value, in m.
+    where: Worlds in which to move it, `(...)` bool; `None` for all worlds.
+
+  Returns:
+    Value that the block got, `(...)`: exactly `value` wherever nothing
+    immovable is in the way.
+  """
+  along = start + value * scale
+  placed = _jointed(block).slide(physics, along, where)
+  if placed is along:
+    return value
+  return np.where(placed == along, value, (placed - start) / scale)[()]
+
+
+def turn(
+    physics: protocols.Physics,
+    block: block_kinds.Block,
+    heading: np.ndarray,
+    where: axes.Mask,
+) -> None:
+  """Sets the heading of a block. Nothing obstructs a turn.
+
+  Args:
+    physics: One world or a batch of worlds.
+    block: Block with joints.
+    heading: Angle about the vertical, `(...)`, in rad.
+    where: As in `slide`.
+  """
+  _jointed(block).turn(physics, heading, where)
+
+
+def farthest(
+    physics: protocols.Physics,
+    blocks: Sequence[block_kinds.Block],
+    places: Sequence[np.ndarray],
+) -> np.ndarray:
+  """Returns the largest distance of a block from its place, `(...)`, in m.
+
+  Args:
+    physics: One world or a batch of worlds.
+    blocks: Blocks of a register.
+    places: Position of each block in the register's frame, `(..., 3)`, in m.
+  """
+  moved = [
+      np.linalg.norm(block.position(physics) - place, axis=-1)
+      for block, place in zip(blocks, places, strict=True)
+  ]
+  return np.max(moved, axis=0)
+
+
+def _jointed(block: block_kinds.Block) -> block_kinds.JointedBlock:
+  """Returns a block with joints.
+
+  Raises:
+    TypeError: If it has none; nothing but `put` moves such a block.
+  """
+  if not isinstance(block, block_kinds.JointedBlock):
+    raise TypeError(f'{type(block).__name__} has no joints')
+  return block

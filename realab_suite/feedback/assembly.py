@@ -1,0 +1,71 @@
+"""Registers and their places, as a design specifies them."""
+
+from collections.abc import Mapping
+
+from realab_suite import errors
+from realab_suite.config import messages
+from realab_suite.entities import arenas
+from realab_suite.entities.registers import base
+from realab_suite.feedback import register_kinds
+from realab_suite.feedback import specs
+
+
+def make_register(
+    name: str, spec: specs.RegisterSpec, design: specs.DesignSpec
+) -> base.Register:
+  """Makes a register of a design.
+
+  Args:
+    name: Name of the register.
+    spec: Its spec.
+    design: Design that contains the register.
+
+  Raises:
+    SpecError: If the register kind refuses its arguments.
+  """
+  kind = register_kinds.REGISTER_KINDS.get(spec.kind)
+  common = dict(
+      value_range=spec.range,
+      scale=spec.scale,
+      initial=spec.initial,
+      role=spec.role,
+      channel=design.channel_of(name),
+      dof=spec.dof or design.dof,
+      on_overflow=spec.on_overflow,
+      write=spec.write,
+      block_size=spec.block_size,
+      mass=spec.mass,
+  )
+  location = messages.Location(f'design {design.name!r}', ('registers', name))
+  try:
+    return kind(name, **common, **spec.options)
+  except errors.SpecError as error:
+    raise location.error(str(error)) from error
+  except Exception as error:  # Register kinds may raise any class.
+    raise location.error(messages.exception(error)) from error
+
+
+def find_place(
+    name: str,
+    place: str | specs.PlaceSpec,
+    named_places: Mapping[str, arenas.Place],
+) -> arenas.Place:
+  """Returns the place of a register.
+
+  Args:
+    name: Name of the register, for messages.
+    place: Name of a place, or coordinates.
+    named_places: Places of the world, by name.
+
+  Raises:
+    SpecError: If the world has no place of this name.
+  """
+  if isinstance(place, specs.PlaceSpec):
+    x, y, height = (*place.position, 0.0)[:3]
+    return arenas.Place((x, y), place.yaw, place.spread, height)
+  if place not in named_places:
+    raise errors.SpecError(
+        f'registers.{name}.place: this world has no place {place!r}; allowed'
+        f' are {sorted(named_places) or "coordinates"}'
+    )
+  return named_places[place]
