@@ -174,7 +174,7 @@ def test_a_block_written_into_a_barrier_gets_the_nearest_free_place(dof, yaw):
   for x, y in [(-0.5, 2.0), (-1.95, 2.05), (0.9, 1.95), (0.0, 1.0), (0.0, 2.2)]:
     along, aside = turn @ [x, y]
     # In the same room, clear of the barrier.
-    from_here = 2.4 if x < 0 and yaw < 1 else -3.4
+    from_here = 3.4 if x < 0 and yaw < 1 else -3.4
     start = np.array([along + from_here, aside, 0.1])
     block.put(physics, start)
     value = float(along) / _SCALE
