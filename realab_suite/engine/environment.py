@@ -144,6 +144,13 @@ class Environment(composer.Environment):
     return self._has_extra_hooks
 
   @property
+  def physics(self) -> Any:
+    """Physics of the world, with derived quantities that are up to date."""
+    if isinstance(self._physics, single_physics.ThinPhysics):
+      self._physics.refresh()
+    return super().physics
+
+  @property
   def thin_physics(self) -> single_physics.ThinPhysics:
     """Physics of a task of this package, which is compiled once.
 
@@ -414,9 +421,6 @@ class Environment(composer.Environment):
         ' environment where it is used'
     )
 
-  def __deepcopy__(self, memo: Any) -> Any:
-    return self.__reduce__()
-
   def _control_step(
       self, queries: np.ndarray, controls: np.ndarray
   ) -> control_step.Outcome:
@@ -445,8 +449,6 @@ class Environment(composer.Environment):
     if isinstance(self._physics, foreign.ForeignPhysics) and self._sinks:
       return self._physics.unchanged()
     return contextlib.nullcontext()
-
-  # Episodes.
 
   def _new_provider_keys(self) -> np.ndarray:
     return episodes.provider_keys(

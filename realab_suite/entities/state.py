@@ -78,7 +78,8 @@ class Slot:
 
   def copy(self, physics: protocols.Physics) -> np.ndarray:
     """Returns a copy of the values; see `get`."""
-    return np.array(self.get(physics))[()]
+    value = self.get(physics)
+    return value.copy() if value.ndim else value  # A number cannot change.
 
   def set(
       self, physics: protocols.Physics, value: Any, where: axes.Mask = None

@@ -350,7 +350,7 @@ class Register(composer.Entity):
     is_placed = placed is applied or self._channel == 'secure'
     obstruction = 0.0 if is_placed else placed - applied
     self._store(physics, applied, obstruction, where)
-    return axes.merge(where, applied, self._applied_slot.get(physics))
+    return applied if where is None else self.applied(physics)
 
   def _store(
       self,
