@@ -8,10 +8,10 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import snapshots
-from realab_suite.entities.registers import base
+from realab_suite.entities import registers
 
 _NUM_ENVS = 3
-_DOFS = pytest.mark.parametrize('dof', base.DOFS)
+_DOFS = pytest.mark.parametrize('dof', registers.DOFS)
 # Substeps after which whatever rests is asleep.
 _A_WHILE = 60
 
