@@ -396,7 +396,8 @@ class Avatar(composer.Entity):
       velocity = np.concatenate([_THROW_SPEED * direction, lift], axis=-1)
       for i, block in enumerate(self._blocks):
         block.launch(physics, velocity, thrown[..., i])
-    elif released.any():
+    # In a batch, hands can throw in some worlds and release in others.
+    if released.any():
       velocity = self._hand_velocity(physics)
       for i, block in enumerate(self._blocks):
         block.slow_down(physics, velocity, released[..., i])

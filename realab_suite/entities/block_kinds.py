@@ -287,8 +287,10 @@ class JointedBlock(Block):
     for grasp in self._grasps:
       if grasp.is_anywhere_held(physics):
         place = self._surroundings.in_world(physics, position)[..., :2]
-        grasp.adapt(physics, place)
-        self._written_slot.set(physics, 1.0)
+        is_held = grasp.adapt(physics, place)
+        # Not in other worlds of a batch, which must not depend on this one.
+        was_held = self._written_slot.get(physics) > 0
+        self._written_slot.set(physics, is_held | was_held)
 
   def _let_go(self, physics: protocols.Physics) -> None:
     """Releases the block from every hand.
@@ -297,6 +299,8 @@ class JointedBlock(Block):
     """
     for grasp in self._grasps:
       grasp.release(physics)
+    if self._grasps:
+      self._written_slot.set(physics, 0.0)
 
   def launch(
       self, physics: protocols.Physics, velocity: np.ndarray, where: Any

@@ -78,19 +78,25 @@ class Grasp:
     """Returns True if the hand holds the block in any world."""
     return bool(np.count_nonzero(physics.bind(self._constraints).active))
 
-  def adapt(self, physics: protocols.Physics, position: np.ndarray) -> None:
+  def adapt(
+      self, physics: protocols.Physics, position: np.ndarray
+  ) -> np.ndarray:
     """Adapts the strength, where the hand holds the block, to their distance.
 
     Args:
       physics: One world or a batch of worlds.
       position: Position of the block, `(..., 2)`, in m.
+
+    Returns:
+      True where the hand holds the block, `(...)` bool.
     """
     bound = physics.bind(self._constraints)
+    is_held = np.any(bound.active, axis=-1)
     offset = position - self._hand_position(physics)
     bound.active = _with_strength(
-        np.any(bound.active, axis=-1),
-        np.sqrt((offset * offset).sum(axis=-1)),
+        is_held, np.sqrt((offset * offset).sum(axis=-1))
     )
+    return is_held
 
 
 def constraints_of(grasps: Sequence[Grasp]) -> tuple[mjcf.Element, ...]:
