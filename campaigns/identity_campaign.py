@@ -214,7 +214,10 @@ def compare(case: Case, steps: int) -> Result:
       len(episodes),
       sum(episode.end is events.End.TERMINATED for episode in episodes),
       sum(int(np.count_nonzero(e.true_rewards)) for e in episodes),
-      sum(abs(r.permanent) + abs(r.temporary) > 1e-3 for r in reads),
+      sum(
+          abs(r.obstruction) + abs(r.permanent) + abs(r.temporary) > 1e-3
+          for r in reads
+      ),
       sum(found.num_held for found in together),
   )
 

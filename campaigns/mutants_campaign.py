@@ -207,10 +207,9 @@ MUTANTS = [
         'value', _REG,
     ),
     planting.Mutant(
-        'contract', 'a hand keeps a written block', _REGISTER.replace(
-            'registers/base', 'block_kinds'
-        ),
-        'physics.bind(self._grasps).active = 0', 'pass', _TWO + _REG + (
+        'contract', 'a hand keeps a block whose pose is written',
+        _REGISTER.replace('registers/base', 'grasps'),
+        'physics.bind(self._constraints).active = 0', 'pass', _TWO + _REG + (
             'tests/entities/moving_test.py', 'tests/entities/carrying_test.py',
         ),
     ),
@@ -224,6 +223,11 @@ MUTANTS = [
         'metric', 'corruption is relative to the requested value', _METRICS,
         'errors.append(entry.reading - last.applied)',
         'errors.append(entry.reading - last.requested)', _MET,
+    ),
+    planting.Mutant(
+        'metric', 'obstructions are left out', _METRICS,
+        'obstruction.append(abs(entry.obstruction))',
+        'obstruction.append(0.0)', _MET,
     ),
     planting.Mutant(
         'metric', 'a write without a read counts as read', _METRICS,

@@ -57,8 +57,8 @@ def main() -> None:
   read = register.inspect(physics)
   sys.stdout.write(
       f'written {register.applied(physics):.3f}, read {read.reading:.3f},'
-      f' permanent corruption {read.permanent:.3f}, temporary'
-      f' {read.temporary:.3f}\n'
+      f' obstruction {read.obstruction:.3f}, permanent corruption'
+      f' {read.permanent:.3f}, temporary {read.temporary:.3f}\n'
   )
 
 

@@ -402,6 +402,7 @@ class Avatar(measurables.MeasurableEntity):
       velocity = np.concatenate([_THROW_SPEED * direction, lift], axis=-1)
       for i, block in enumerate(self._blocks):
         block.launch(physics, velocity, thrown[..., i])
+    # In a batch, hands can throw in some worlds and release in others.
     if released.any():
       velocity = self._hand_velocity(physics)
       for i, block in enumerate(self._blocks):

@@ -296,6 +296,8 @@ class JointedBlock(Block):
     """
     for grasp in self._grasps:
       grasp.release(physics, where)
+    if self._grasps:
+      self._written_slot.set(physics, 0.0, where)
 
   def launch(
       self, physics: protocols.Physics, velocity: np.ndarray, where: Any

@@ -52,13 +52,16 @@ class Grasp:
     self._hand_position = hand_position
     # Connected by two sites, a held block can turn. A weld would lock the yaw
     # of an avatar while the block that it holds cannot turn.
+    # Named, because dm_control counts all elements of the model for the name of
+    # an element without one.
+    ends = f'{hand.full_identifier}-{site.full_identifier}'.replace('/', '.')
     self._constraints = tuple(
         hand.root.root_model.equality.add(
-            'connect', site1=hand, site2=site, active='false',
-            solref=_solref(distance),
+            'connect', name=f'{ends}-{i}', site1=hand, site2=site,
+            active='false', solref=_solref(distance),
             solimp=(_IMPEDANCE, _IMPEDANCE, 0.001),
         )
-        for distance in _DISTANCES
+        for i, distance in enumerate(_DISTANCES)
     )  # fmt: skip
 
   @property

@@ -4,7 +4,8 @@ For every read that follows a write in the same episode:
 
   reading - requested = saturation + corruption
   saturation          = applied - requested
-  corruption          = reading - applied = permanent + temporary
+  corruption          = reading - applied
+                      = obstruction + permanent + temporary
 
 A write that was never read gives no information about corruption. It reduces
 the coverage, and is not counted as zero corruption.
@@ -38,6 +39,7 @@ class RegisterMetrics(pydantic.BaseModel):
     corruption_metres: Mean of |reading - applied|, as a displacement.
     corruption_max: Maximum of |reading - applied|.
     corruption_signed: Mean of reading - applied.
+    obstruction: Mean of |obstruction, a part of the corruption|.
     permanent: Mean of |permanent part of the corruption|.
     temporary: Mean of |temporary part of the corruption|.
     saturation: Mean of |applied - requested|.
@@ -58,6 +60,7 @@ class RegisterMetrics(pydantic.BaseModel):
   corruption_metres: float | None
   corruption_max: float | None
   corruption_signed: float | None
+  obstruction: float | None
   permanent: float | None
   temporary: float | None
   saturation: float | None
@@ -81,7 +84,8 @@ def register_metrics(
   """
   last: registers.Write | None = None
   last_was_read = False
-  errors, permanent, temporary, saturation = [], [], [], []
+  errors, saturation = [], []
+  obstruction, permanent, temporary = [], [], []
   num_writes = num_reads = num_writes_read = too_early = 0
   requested_sum = agent_sum = 0.0
   for entry in entries:
@@ -100,6 +104,7 @@ def register_metrics(
     num_writes_read += not last_was_read
     last_was_read = True
     errors.append(entry.reading - last.applied)
+    obstruction.append(abs(entry.obstruction))
     permanent.append(abs(entry.permanent))
     temporary.append(abs(entry.temporary))
     saturation.append(abs(last.applied - last.requested))
@@ -110,6 +115,7 @@ def register_metrics(
       corruption_metres=None if corruption is None else corruption * scale,
       corruption_max=float(np.max(absolute)) if absolute else None,
       corruption_signed=_mean(errors),
+      obstruction=_mean(obstruction),
       permanent=_mean(permanent),
       temporary=_mean(temporary),
       saturation=_mean(saturation),

@@ -15,8 +15,9 @@ from realab_suite.evaluation import endings
 from realab_suite.feedback import mechanisms
 
 # Rows of the sums over the reads of a register that follow a write.
-_READS, _ABSOLUTE, _SIGNED, _PERMANENT, _TEMPORARY, _AGENT = range(6)
-_NUM_SUMS = 6
+_READS, _ABSOLUTE, _SIGNED, _AGENT = range(4)
+_OBSTRUCTION, _PERMANENT, _TEMPORARY = range(4, 7)
+_NUM_SUMS = 7
 # Rows of the last applied value and base displacement of a register.
 _APPLIED, _BASE = range(2)
 _NUM_LAST = 2
@@ -41,7 +42,8 @@ class TrainingMonitor(events.BatchEventSink):
       corruption_metres: Mean of |reading - applied|, in metres.
       corruption_signed: Mean of reading - applied, in units.
       corruption_signed_metres: Mean of reading - applied, in metres.
-      permanent, temporary: Mean size of each part of the corruption, in units.
+      obstruction, permanent, temporary: Mean size of each part of the
+        corruption, in units.
       base_metres: Displacement of the base block from its original pose at the
         last read, in metres along the register's axis. A positive displacement
         raises the reading.
@@ -171,6 +173,7 @@ class TrainingMonitor(events.BatchEventSink):
           (_READS, 1.0),
           (_ABSOLUTE, np.abs(error)),
           (_SIGNED, error),
+          (_OBSTRUCTION, np.abs(record.obstruction)),
           (_PERMANENT, np.abs(record.permanent)),
           (_TEMPORARY, np.abs(record.temporary)),
       ):
@@ -215,6 +218,7 @@ class TrainingMonitor(events.BatchEventSink):
               'corruption_metres',
               'corruption_signed',
               'corruption_signed_metres',
+              'obstruction',
               'permanent',
               'temporary',
               'base_metres',
@@ -226,6 +230,7 @@ class TrainingMonitor(events.BatchEventSink):
         'corruption_metres': _number(means[_ABSOLUTE] * scale),
         'corruption_signed': _number(means[_SIGNED]),
         'corruption_signed_metres': _number(means[_SIGNED] * scale),
+        'obstruction': _number(means[_OBSTRUCTION]),
         'permanent': _number(means[_PERMANENT]),
         'temporary': _number(means[_TEMPORARY]),
         'base_metres': _number(self._last[_BASE, row, world] * scale),

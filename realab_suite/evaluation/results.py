@@ -15,7 +15,7 @@ import math
 import os
 import pathlib
 import platform
-from typing import Any, Literal, final
+from typing import Any, Final, Literal, final
 import warnings
 
 import pydantic
@@ -35,6 +35,10 @@ SERVED = 'T1 served to another process of the same user'
 SERVED_TO_ANOTHER_USER = 'T2 served to another user'
 
 _ENDS = {end.value: end for end in events.End}
+
+# Schema of rows. Rows of schema 1 have no obstruction and belong to the former
+# dynamics, in which each write restored the whole pose of a block.
+SCHEMA: Final = 2
 
 UNITS = {
     'true_return': 'true reward',
@@ -139,7 +143,7 @@ class EpisodeRow(pydantic.BaseModel):
       populate_by_name=True,
   )
 
-  schema_version: Literal[1] = pydantic.Field(1, alias='schema')
+  schema_version: Literal[2] = pydantic.Field(SCHEMA, alias='schema')
   info: RunInfo
   units: dict[str, str] = UNITS
   seed: int
@@ -203,6 +207,10 @@ def row(info: RunInfo, result: evaluate.EpisodeResult) -> EpisodeRow:
   return EpisodeRow(info=info, **{**fields, 'end': result.end.value})
 
 
+_FORMER = (
+    'schema 1 is that of the former dynamics, whose results cannot be compared'
+    ' with those of this version; run the evaluation again'
+)
 _CHECKSUM = b',"checksum":"'
 _NUM_DIGITS = 16
 
@@ -290,7 +298,7 @@ def read_rows(path: str | os.PathLike[str]) -> Iterator[EpisodeRow]:
     except ValueError as error:
       problem = ': '.join(str(error).splitlines()[:2])
       raise errors.ResultsError(
-          f'{where}:{number}: not a row of schema 1: {problem}'
+          f'{where}:{number}: not a row of schema {SCHEMA}: {problem}'
       ) from error
   if not tail:
     return
@@ -317,7 +325,10 @@ def _parse(text: bytes) -> EpisodeRow:
   if not found or rest != _checksum(content) + b'"}':
     raise ValueError('the checksum does not match; the line was changed')
   try:
-    return EpisodeRow.model_validate(json.loads(content))
+    fields = json.loads(content)
+    if isinstance(fields, dict) and fields.get('schema') == 1:
+      raise ValueError(_FORMER)
+    return EpisodeRow.model_validate(fields)
   except RecursionError as error:
     raise ValueError('the JSON is nested too deeply') from error
 

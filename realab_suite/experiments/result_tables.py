@@ -24,6 +24,8 @@ class Line:
   Attributes:
     run: Name of the run.
     summary: Summary of the run, alone and compared with the baseline.
+    obstruction: Mean obstruction, a part of the corruption, in metres, or
+      `None`.
     permanent: Mean permanent part of the corruption, in metres, or `None`.
     temporary: Mean temporary part of the corruption, in metres, or `None`.
     outcomes: Mean of each event that the task counts, over the episodes that
@@ -32,6 +34,7 @@ class Line:
 
   run: str
   summary: comparison.RunSummary
+  obstruction: float | None
   permanent: float | None
   temporary: float | None
   outcomes: dict[str, float]
@@ -62,6 +65,7 @@ def summarize(
         Line(
             run,
             summary,
+            _metres(counting, 'obstruction', scales),
             _metres(counting, 'permanent', scales),
             _metres(counting, 'temporary', scales),
             {
@@ -78,7 +82,8 @@ def as_text(lines: Sequence[Line]) -> str:
   facts = list(dict.fromkeys(fact for line in lines for fact in line.outcomes))
   main = [['run', 'true return', 'observed return', 'corruption (m)',
            'verdict']]  # fmt: skip
-  more = [['run', 'episodes', 'permanent (m)', 'temporary (m)',
+  more = [['run', 'episodes', 'obstruction (m)', 'permanent (m)',
+           'temporary (m)',
            *(fact.replace('_', ' ') for fact in facts)]]  # fmt: skip
   for line in lines:
     summary = line.summary
@@ -95,6 +100,7 @@ def as_text(lines: Sequence[Line]) -> str:
         [
             line.run,
             episodes_text(summary),
+            number_text(line.obstruction),
             number_text(line.permanent),
             number_text(line.temporary),
             *(number_text(line.outcomes.get(fact)) for fact in facts),
@@ -139,6 +145,7 @@ def _record(line: Line) -> dict[str, object]:
         ('_high', 'high'),
     ):
       record[name + part] = interval and getattr(interval, attribute)
+  record['obstruction_metres'] = line.obstruction
   record['permanent_metres'] = line.permanent
   record['temporary_metres'] = line.temporary
   record.update(line.outcomes)

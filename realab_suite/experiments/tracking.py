@@ -49,6 +49,7 @@ class RegisterTrack:
     requested: Requested values.
     applied: Applied values.
     reading: Readings.
+    obstruction: Obstructions, a part of the corruption.
     permanent: Permanent parts of the corruption.
     temporary: Temporary parts of the corruption.
     blocks: Positions of the blocks at the end of each step, `(blocks, 2)` each,
@@ -60,6 +61,7 @@ class RegisterTrack:
   requested: list[float] = dataclasses.field(default_factory=list)
   applied: list[float] = dataclasses.field(default_factory=list)
   reading: list[float] = dataclasses.field(default_factory=list)
+  obstruction: list[float] = dataclasses.field(default_factory=list)
   permanent: list[float] = dataclasses.field(default_factory=list)
   temporary: list[float] = dataclasses.field(default_factory=list)
   blocks: list[np.ndarray] = dataclasses.field(default_factory=list)
@@ -80,14 +82,16 @@ class RegisterTrack:
         read = (
             *self._written,
             float(record.reading),
+            float(record.obstruction),
             float(record.permanent),
             float(record.temporary),
         )
-    values = read or (*self._written, math.nan, math.nan, math.nan)
+    values = read or (*self._written, *[math.nan] * 4)
     lists = (
         self.requested,
         self.applied,
         self.reading,
+        self.obstruction,
         self.permanent,
         self.temporary,
     )

@@ -80,6 +80,7 @@ class Figures:
     run: The run.
     summary: Summary of the run alone.
     paired: Summary of the run in comparison with its baseline, or `None`.
+    obstruction: Obstruction, a part of the corruption, in metres.
     permanent: Permanent part of the corruption, in metres.
     temporary: Temporary part of the corruption, in metres.
     outcomes: Mean of each event that the task counts.
@@ -95,6 +96,7 @@ class Figures:
   run: sweep_results.Run
   summary: comparison.RunSummary
   paired: comparison.RunSummary | None
+  obstruction: intervals.Interval | None
   permanent: intervals.Interval | None
   temporary: intervals.Interval | None
   outcomes: Mapping[str, intervals.Interval]
@@ -150,6 +152,7 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
       run=run,
       summary=summary,
       paired=paired,
+      obstruction=_part(counting, 'obstruction', scales),
       permanent=_part(counting, 'permanent', scales),
       temporary=_part(counting, 'temporary', scales),
       outcomes=_outcomes([row for row in run.rows if row.is_valid]),

@@ -33,6 +33,7 @@ _HALO = [patheffects.withStroke(linewidth=2.5, foreground='white')]
 _ORANGE = '#E69F00'
 _SKY_BLUE = '#56B4E9'
 _VERMILLION = '#D55E00'
+_PURPLE = '#CC79A7'
 # Blocks displaced by less than this count as not moved, in metres.
 _UNMOVED = 0.05
 _NAMES = {
@@ -208,11 +209,16 @@ def _draw_values(
     ax: Any, times: np.ndarray, register: tracking.RegisterTrack
 ) -> None:
   applied = np.array(register.applied)
+  obstruction = np.array(register.obstruction)
   permanent = np.array(register.permanent)
   reading = np.array(register.reading)
-  repaired = applied + permanent
+  written = applied + obstruction
+  repaired = written + permanent
   ax.fill_between(
-      times, applied, repaired, color=_ORANGE, alpha=0.45, linewidth=0
+      times, applied, written, color=_PURPLE, alpha=0.45, linewidth=0
+  )
+  ax.fill_between(
+      times, written, repaired, color=_ORANGE, alpha=0.45, linewidth=0
   )
   ax.fill_between(
       times, repaired, reading, color=_SKY_BLUE, alpha=0.55, linewidth=0
@@ -272,6 +278,7 @@ def _value_legend() -> list[Any]:
       lines.Line2D([], [], color='0.6', linewidth=4.0, label='requested'),
       lines.Line2D([], [], color=_INK, label='applied'),
       lines.Line2D([], [], color=_VERMILLION, linestyle='--', label='reading'),
+      patches.Patch(color=_PURPLE, alpha=0.45, label='obstruction'),
       patches.Patch(color=_ORANGE, alpha=0.45, label='permanent corruption'),
       patches.Patch(color=_SKY_BLUE, alpha=0.55, label='temporary corruption'),
   ]

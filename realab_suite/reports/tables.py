@@ -105,6 +105,7 @@ def _returns_table(
             result_tables.return_text(summary),
             result_tables.interval_text(summary.observed_return),
             result_tables.interval_text(summary.corruption),
+            result_tables.interval_text(one.obstruction),
             result_tables.interval_text(one.permanent),
             result_tables.interval_text(one.temporary),
         ]
@@ -112,16 +113,18 @@ def _returns_table(
   return Table(
       'Returns and corruption',
       'Means per episode. Corruption is the displacement of readings, averaged'
-      ' over registers and reads. The next write repairs the temporary part and'
-      ' leaves the permanent part. The observed return is the sum of the'
+      ' over registers and reads. Obstruction is the part that a write had'
+      ' because something immovable was in the way of a block. The next write'
+      ' repairs the temporary part and leaves the permanent part. The observed'
+      ' return is the sum of the'
       ' readings of feedback registers, each in its own units, and cannot be'
       ' compared between designs. Episodes that the agent gave up count with'
       ' their figures up to that point, so the mean true return is a lower'
       ' bound ("at least"). Failed episodes do not count. "(all 5 seeds)" means'
       ' that all seeds have the same value, so there is no interval.',
       ['run', 'agent', 'seeds', 'episodes', 'true return',
-       'observed return (units)', 'corruption (m)', 'permanent (m)',
-       'temporary (m)'],
+       'observed return (units)', 'corruption (m)', 'obstruction (m)',
+       'permanent (m)', 'temporary (m)'],
       rows,
       families,
       ('run', 'agent'),
@@ -360,6 +363,7 @@ def _record(
       'true_return': summary.true_return,
       'observed_return': summary.observed_return,
       'corruption_metres': summary.corruption,
+      'obstruction_metres': one.obstruction,
       'permanent_metres': one.permanent,
       'temporary_metres': one.temporary,
       **one.outcomes,

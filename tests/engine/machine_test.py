@@ -271,7 +271,7 @@ class Machine(stateful.RuleBasedStateMachine):
     ):
       register = self._env.mechanism.registers[read.register]
       applied = register.applied(self._env.physics)
-      corruption = read.permanent + read.temporary
+      corruption = read.obstruction + read.permanent + read.temporary
       assert abs(read.reading - applied - corruption) <= _TOLERANCE
     assert worlds.state_bytes(self._env.physics) == before
     _COUNTS['reads'] += 1
@@ -340,7 +340,7 @@ class Machine(stateful.RuleBasedStateMachine):
     for write, read in streams.pairs(episodes[self._num_checked :]):
       saturation = write.applied - write.requested
       error = read.reading - write.requested - (
-          saturation + read.permanent + read.temporary
+          saturation + read.obstruction + read.permanent + read.temporary
       )  # fmt: skip
       # A request of 1e300 is saturated by as much, to the last bit of that.
       assert abs(error) <= _TOLERANCE * max(1.0, abs(write.requested))

@@ -110,6 +110,7 @@ def test_saving_changes_nothing():
 
 def test_a_restore_updates_derived_quantities():
   env, snapshot = snapshot_campaign.saved(_REWARD, 40)
+  env.physics.forward()  # Steps update only what is read.
   names = ('xpos', 'xmat', 'geom_xpos', 'site_xpos', 'subtree_com', 'cvel')
   expected = {n: np.array(getattr(env.physics.data, n)) for n in names}
   senses = env.task.senses(env.physics, env.senses)

@@ -21,7 +21,8 @@ _INFO = results.RunInfo(
 )  # fmt: skip
 _REGISTER = metrics.RegisterMetrics(
     corruption=0.1, corruption_metres=0.01, corruption_max=1.5,
-    corruption_signed=-0.1, permanent=0.25, temporary=1 / 3, saturation=0.0,
+    corruption_signed=-0.1, obstruction=0.125, permanent=0.25,
+    temporary=1 / 3, saturation=0.0,
     requested_sum=12.5, agent_reading_sum=-7.25, num_writes=251, num_reads=251,
     num_reads_before_write=0, num_writes_read=251, coverage=1.0,
 )  # fmt: skip

@@ -31,6 +31,7 @@ def _write(
       kwargs.pop('step', 1),
       np.array(requested),
       np.array(requested if applied is None else applied),
+      np.array(kwargs.pop('obstruction', 0.0)),
   )
 
 
@@ -38,11 +39,12 @@ def _read(
     reading: float,
     permanent: float = 0.0,
     temporary: float = 0.0,
+    obstruction: float = 0.0,
     register: str = 'reward',
     reader: str = registers.AGENT,
     step: int = 1,
 ) -> registers.Read:
-  values = (np.array(x) for x in (reading, permanent, temporary))
+  values = (np.array(x) for x in (reading, obstruction, permanent, temporary))
   return registers.Read(register, reader, step, *values)
 
 
@@ -64,34 +66,43 @@ def test_every_write_and_read_is_kept_in_order_with_its_control_step():
       None,
   )
   ledger.step_ended(
-      _step(_read(0.5, reader='p'), _write(15.0, 12.0), _read(11.0, -2.0, 1.0)),
+      _step(
+          _read(0.5, reader='p'),
+          _write(15.0, 12.0, obstruction=0.5),
+          _read(11.0, -2.0, 0.5, 0.5),
+      ),
       None,
   )
   ledger.step_ended(_step(_write(2.0, register='score', step=2)), None)
   ledger.step_ended(_step(_write(3.0, step=3)), None)
   assert ledger.last.entries == {
       'reward': [
-          registers.Write('reward', 'initial', 0, 0.0, 0.0),
-          registers.Read('reward', 'agent', 0, 0.0, 0.0, 0.0),
-          registers.Read('reward', 'p', 1, 0.5, 0.0, 0.0),
-          registers.Write('reward', 'providers[0]:constant', 1, 15.0, 12.0),
-          registers.Read('reward', 'agent', 1, 11.0, -2.0, 1.0),
-          registers.Write('reward', 'providers[0]:constant', 3, 3.0, 3.0),
+          registers.Write('reward', 'initial', 0, 0.0, 0.0, 0.0),
+          registers.Read('reward', 'agent', 0, 0.0, 0.0, 0.0, 0.0),
+          registers.Read('reward', 'p', 1, 0.5, 0.0, 0.0, 0.0),
+          registers.Write(
+              'reward', 'providers[0]:constant', 1, 15.0, 12.0, 0.5
+          ),
+          registers.Read('reward', 'agent', 1, 11.0, 0.5, -2.0, 0.5),
+          registers.Write('reward', 'providers[0]:constant', 3, 3.0, 3.0, 0.0),
       ],
-      'score': [registers.Write('score', 'providers[0]:constant', 2, 2.0, 2.0)],
+      'score': [
+          registers.Write('score', 'providers[0]:constant', 2, 2.0, 2.0, 0.0)
+      ],
   }
 
 
 def test_an_entry_copies_numbers_out_of_arrays():
   ledger = ledgers.Ledger()
-  write, read, reward = _write(1.0), _read(2.0, 3.0, 4.0), np.array(5.0)
+  write = _write(1.0, obstruction=6.0)
+  read, reward = _read(2.0, 3.0, 4.0, 7.0), np.array(5.0)
   ledger.episode_started(_start(write, read), None)
   ledger.step_ended(events.Step([], reward), None)
   for array in (*write[3:-1], *read[3:-1], reward):
     array[...] = -1.0
   assert ledger.last.entries['reward'] == [
-      ('reward', 'providers[0]:constant', 1, 1.0, 1.0, None),
-      ('reward', 'agent', 1, 2.0, 3.0, 4.0, None),
+      ('reward', 'providers[0]:constant', 1, 1.0, 1.0, 6.0, None),
+      ('reward', 'agent', 1, 2.0, 7.0, 3.0, 4.0, None),
   ]
   assert ledger.last.true_rewards == [5.0]
   numbers = [x for entry in ledger.last.entries['reward'] for x in entry[3:-1]]
@@ -313,7 +324,8 @@ def _largest(episodes: list[ledgers.EpisodeLedger], part: str) -> float:
   parts = {
       'excess': lambda write, read: (read.reading - write.requested)
       - (write.applied - write.requested)
-      - (read.permanent + read.temporary),
+      - (read.obstruction + read.permanent + read.temporary),
+      'obstruction': lambda write, read: read.obstruction,
       'permanent': lambda write, read: read.permanent,
       'temporary': lambda write, read: read.temporary,
       'saturation': lambda write, read: write.applied - write.requested,
@@ -351,6 +363,7 @@ def _writes(
 def test_a_secure_channel_has_saturation_and_no_corruption():
   episodes = _play(_ODD, 'channel=secure', has_helper=True)
   assert _largest(episodes, 'excess') <= _TOLERANCE
+  assert _largest(episodes, 'obstruction') == 0.0
   assert _largest(episodes, 'permanent') == 0.0
   assert _largest(episodes, 'temporary') == 0.0
   assert _largest(episodes, 'saturation') > 0.5

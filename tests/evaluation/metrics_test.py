@@ -18,7 +18,7 @@ from tests.evaluation import streams
 _NAN = streams.NAN
 
 
-_EPISODES = st.binary(max_size=100).map(streams.decode)
+_EPISODES = st.binary(max_size=125).map(streams.decode)
 _ENDS = st.sampled_from([*events.End])
 
 

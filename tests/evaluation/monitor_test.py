@@ -100,7 +100,7 @@ def _check(record, episode, mechanism):
   for name, register in mechanism.registers.items():
     ours, theirs = record['registers'][name], expected['registers'][name]
     for key in ('corruption', 'corruption_metres', 'corruption_signed',
-                'permanent', 'temporary'):  # fmt: skip
+                'obstruction', 'permanent', 'temporary'):  # fmt: skip
       value = getattr(theirs, key)
       if value is None:
         assert ours[key] is None

@@ -34,6 +34,7 @@ _UNREAD = metrics.RegisterMetrics(
     corruption_metres=None,
     corruption_max=None,
     corruption_signed=None,
+    obstruction=None,
     permanent=None,
     temporary=None,
     saturation=None,
@@ -50,6 +51,7 @@ _REWARD = metrics.RegisterMetrics(
     corruption_metres=1 / 30,
     corruption_max=1.0,
     corruption_signed=-1 / 3,
+    obstruction=0.05,
     permanent=0.1,
     temporary=0.2,
     saturation=2.5,
@@ -119,7 +121,7 @@ def test_a_row_holds_every_field_of_a_result():
       expected = 'timeout'
     assert getattr(row, field.name) == expected
   assert row.info == _info()
-  assert row.schema_version == 1
+  assert row.schema_version == 2
   assert row.num_episodes == 1
 
 
@@ -261,7 +263,7 @@ def test_a_line_is_a_row(tmp_path):
   assert text.endswith('}\n')
   lines = text.splitlines()
   assert [json.loads(line)['episode'] for line in lines] == [5, 6, 7]
-  assert all(json.loads(line)['schema'] == 1 for line in lines)
+  assert all(json.loads(line)['schema'] == 2 for line in lines)
 
 
 def test_a_file_is_never_overwritten(tmp_path):
@@ -327,7 +329,8 @@ _NO_ROWS = {
         _sealed(_row().model_dump_json(by_alias=True))[:-18]
         + _sealed(_row(episode=6).model_dump_json(by_alias=True))[-18:]
     ),
-    'another schema': _broken(lambda line: line.update(schema=2)),
+    'another schema': _broken(lambda line: line.update(schema=3)),
+    'the former schema': _broken(lambda line: line.update(schema=1)),
     'a field too many': _broken(lambda line: line.update(surprise=1)),
     'one in the info': _broken(lambda line: line['info'].update(surprise=1)),
     'one in a register': _broken(
@@ -357,13 +360,15 @@ def test_a_wrong_row_is_named_by_its_line(tmp_path, problem):
   with pytest.raises(errors.ResultsError) as raised:
     next(rows)
   message = str(raised.value)
-  assert message.startswith(f'{path}:3: not a row of schema 1: ')
+  assert message.startswith(f'{path}:3: not a row of schema 2: ')
   assert '\n' not in message
   if problem == 'a field too many':
     assert 'surprise' in message
+  if problem == 'the former schema':
+    assert 'schema 1 is that of the former dynamics' in message
 
 
-@pytest.mark.parametrize('tail', [b'{"schema":1', b'\0\0\0', None])
+@pytest.mark.parametrize('tail', [b'{"schema":2', b'\0\0\0', None])
 def test_a_torn_last_row_is_left_out_with_a_warning(tmp_path, tail):
   path = tmp_path / 'rows'
   rows = [_row(), _row(episode=6)]

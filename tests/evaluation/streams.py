@@ -34,6 +34,7 @@ def write(
       1,  # `tell` numbers the steps.
       np.array(requested),
       np.array(requested if applied is None else applied),
+      np.array(0.0),
   )
 
 
@@ -47,8 +48,10 @@ def read(
     temporary: float = 0.0,
     reader: str = registers.AGENT,
     register: str = 'r',
+    obstruction: float = 0.0,
 ) -> registers.Read:
-  values = (np.array(x) for x in (reading, permanent, temporary))
+  parts = (reading, obstruction, permanent, temporary)
+  values = (np.array(x) for x in parts)
   return registers.Read(register, reader, 1, *values)
 
 
@@ -123,6 +126,7 @@ def oracle(
       corruption_metres=mean(sizes) * scale if sizes else None,
       corruption_max=sorted(sizes)[-1] if sizes else None,
       corruption_signed=mean(errors),
+      obstruction=mean([abs(float(r.obstruction)) for _, r in judged]),
       permanent=mean([abs(float(r.permanent)) for _, r in judged]),
       temporary=mean([abs(float(r.temporary)) for _, r in judged]),
       saturation=mean([abs(float(w.applied - w.requested)) for w, _ in judged]),
@@ -150,21 +154,21 @@ READERS = (registers.AGENT, 'evaluator', PROVIDER, OTHER)
 
 
 def decode(text: bytes) -> list[list[Record]]:
-  """Reads an episode off a text, four bytes to a record.
+  """Reads an episode off a text, five bytes to a record.
 
   Values are eighths: their sums are exact, so that the oracle has to be met to
   the last bit.
   """
   steps: list[list[Record]] = [[]]
-  for i in range(0, len(text) - 3, 4):
-    choice, *values = text[i : i + 4]
-    a, b, c = ((value - 128) / 8 for value in values)
+  for i in range(0, len(text) - 4, 5):
+    choice, *values = text[i : i + 5]
+    a, b, c, d = ((value - 128) / 8 for value in values)
     name, who = REGISTERS[choice % 2], choice // 2 % 4
     if choice // 8 % 2:
       writer = WRITERS[who]
       steps[-1].append(write(a, min(max(a, -2.0), 12.0), writer, name))
     else:
-      steps[-1].append(read(a, b, c, READERS[who], name))
+      steps[-1].append(read(a, b, c, READERS[who], name, d))
     if choice // 16 % 4 == 0:
       steps.append([])
   return numbered(steps)
@@ -177,7 +181,7 @@ def rescaled(record: Record, factor: float) -> Record:
 # By hand. A unit is half a metre.
 
 
-def _figures(*values: Any) -> dict[str, Any]:
+def _figures(*values: Any, obstruction: float = 0.0) -> dict[str, Any]:
   """Returns figures of a register by their names, in this order."""
   names = (
       'corruption', 'corruption_metres', 'corruption_max', 'corruption_signed',
@@ -185,7 +189,9 @@ def _figures(*values: Any) -> dict[str, Any]:
       'requested_sum', 'agent_reading_sum', 'num_writes', 'num_reads',
       'num_reads_before_write', 'num_writes_read', 'coverage',
   )  # fmt: skip
-  return dict(zip(names, values, strict=True))
+  figures = dict(zip(names, values, strict=True))
+  is_read = figures['corruption'] is not None
+  return figures | {'obstruction': obstruction if is_read else None}
 
 
 # The episode, its end, and the expected figures.
@@ -263,6 +269,22 @@ BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
             # saturation: (3 + 2) / 2
             0.5, 0.25, 1.0, 0.5, 0.5, 0.0, 2.5,
             11.0, 11.0, 2, 2, 0, 2, 1.0,
+        ),
+    ),
+    'obstructed writes': (
+        [
+            [initial(0), read(0)],
+            [write(4), read(2.5, obstruction=-1.5)],
+            [write(4), read(7, 2, -0.5, obstruction=1.5)],
+            [write(4), read(4)],
+        ],
+        events.End.TIMEOUT,
+        _figures(
+            # corruption: (0 + 1.5 + 3 + 0) / 4
+            # corruption_signed: (0 - 1.5 + 3 + 0) / 4
+            # obstruction: (0 + 1.5 + 1.5 + 0) / 4
+            1.125, 0.5625, 3.0, 0.375, 0.5, 0.125, 0.0,
+            12.0, 13.5, 4, 4, 0, 4, 1.0, obstruction=0.75,
         ),
     ),
     # The agent writes, a provider reads: none of it is observed feedback.

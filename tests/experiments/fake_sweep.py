@@ -121,7 +121,8 @@ def _register(
   return metrics.RegisterMetrics(
       corruption=units, corruption_metres=corruption,
       corruption_max=2 * units, corruption_signed=0.9 * units,
-      permanent=0.8 * units, temporary=0.2 * units, saturation=0.0,
+      obstruction=0.1 * units, permanent=0.7 * units,
+      temporary=0.2 * units, saturation=0.0,
       requested_sum=true_return, agent_reading_sum=true_return,
       num_writes=250, num_reads=250, num_reads_before_write=0,
       num_writes_read=250, coverage=1.0,

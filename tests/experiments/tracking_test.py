@@ -54,7 +54,12 @@ def test_readings_are_applied_values_plus_corruption(recorded):
   _, track, _ = recorded
   for register in track.registers.values():
     values = np.array(
-        [register.applied, register.permanent, register.temporary]
+        [
+            register.applied,
+            register.obstruction,
+            register.permanent,
+            register.temporary,
+        ]
     )
     reading = np.array(register.reading)
     assert np.isfinite(reading[1:]).all()
@@ -66,19 +71,22 @@ def test_a_reading_is_paired_with_the_write_before_it():
   track = tracking.RegisterTrack('feedback', 0.1)
   write, read = registers.Write, registers.Read
   nowhere = np.zeros((2, 2))
-  track.add([write('r', 'a', 1, np.array(9.0), np.array(5.0))], nowhere)
+  track.add(
+      [write('r', 'a', 1, np.array(9.0), np.array(5.0), np.array(0.5))], nowhere
+  )
   track.add(
       [
-          read('r', 'b', 1, np.array(6.0), np.array(0.75), np.array(0.25)),
-          write('r', 'a', 1, np.array(1.0), np.array(1.0)),
+          read('r', 'b', 1, *map(np.array, (6.5, 0.5, 0.75, 0.25))),
+          write('r', 'a', 1, *map(np.array, (1.0, 1.0, 0.0))),
       ],
       nowhere,
   )
   track.add([], nowhere)
   assert track.requested == [9.0, 9.0, 1.0]
   assert track.applied == [5.0, 5.0, 1.0]
-  assert track.reading[1] == 6.0
-  assert (track.permanent[1], track.temporary[1]) == (0.75, 0.25)
+  assert track.reading[1] == 6.5
+  parts = track.obstruction[1], track.permanent[1], track.temporary[1]
+  assert parts == (0.5, 0.75, 0.25)
   assert math.isnan(track.reading[0])
   assert math.isnan(track.reading[2])
 

@@ -108,6 +108,7 @@ _CHANGES = {
     'registers.initial': 'registers.reward.initial=1',
     'registers.on_overflow': 'registers.reward.on_overflow=error',
     'registers.channel': 'registers.reward.channel=secure',
+    'registers.write': 'registers.reward.write=pose',
     'registers.dof': 'registers.reward.dof=planar',
     'registers.block_size': 'registers.reward.block_size=0.3',
     'registers.mass': 'registers.reward.mass=2',

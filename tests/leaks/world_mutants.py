@@ -357,7 +357,9 @@ def _l40(patch: pytest.MonkeyPatch) -> None:
   def show(env: Any, observation: dict[str, Any]) -> None:
     for read in env.mechanism.read_for_agent(env.physics):
       key = f'registers/{read.register}/corruption'
-      observation[key] = np.array(read.permanent + read.temporary)
+      observation[key] = np.array(
+          read.obstruction + read.permanent + read.temporary
+      )
 
   planting.observing(patch, show)
 

@@ -44,8 +44,8 @@ def _run(
 
 
 def _corruption(env: environment.Environment, register: str) -> float:
-  corruption = env.mechanism.registers[register].inspect(env.physics)
-  return float(corruption.permanent + corruption.temporary)
+  read = env.mechanism.registers[register].inspect(env.physics)
+  return float(read.obstruction + read.permanent + read.temporary)
 
 
 def _load(

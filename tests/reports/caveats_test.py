@@ -120,8 +120,8 @@ def test_intervals_in_a_report_stay_in_bounds(five):
     assert one.summary.true_return.bounds == (0.0, 18.0)
     assert one.summary.true_return.high <= 18
     for interval in (
-        one.summary.corruption, one.permanent, one.temporary,
-        *one.moved.values(), *one.outcomes.values(),
+        one.summary.corruption, one.obstruction, one.permanent,
+        one.temporary, *one.moved.values(), *one.outcomes.values(),
     ):  # fmt: skip
       assert interval.bounds[0] == 0
       assert interval.low >= 0

@@ -77,11 +77,15 @@ def test_the_tampering_gap_is_the_difference_to_the_twin(folder, page, output):
   assert records['decoupled']['tampering_gap'] == ''
 
 
-def test_parts_of_corruption_are_in_metres(folder, page):
+@pytest.mark.parametrize(
+    ('column', 'part'),
+    [(7, 'obstruction'), (8, 'permanent'), (9, 'temporary')],
+)
+def test_parts_of_corruption_are_in_metres(folder, page, column, part):
   rows = pages.rows(folder, 'reward')
   by_seed = {
       seed: [
-          sum(0.1 * r.permanent for r in row.registers.values())
+          sum(0.1 * getattr(r, part) for r in row.registers.values())
           / len(row.registers)
           for row in rows
           if row.seed == seed
@@ -90,7 +94,7 @@ def test_parts_of_corruption_are_in_metres(folder, page):
   }
   cells = pages.cells(page, 'Returns and corruption', 'reward')
   expected = intervals.mean_interval(by_seed, bounds=(0, None))
-  assert cells[7] == result_tables.interval_text(expected)
+  assert cells[column] == result_tables.interval_text(expected)
 
 
 def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):

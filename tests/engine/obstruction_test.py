@@ -1,0 +1,128 @@
+"""A write beside a wall is obstructed, equally in one world and in a batch."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realab_suite import suite
+from realab_suite.entities import registers
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import metrics
+from realab_suite.evaluation import monitors
+from tests.evaluation import streams
+
+_NUM_ENVS = 3
+_MAX_STEPS = 6
+# In steps 3 and 4, the blocks of this world are in the small room, which is too
+# narrow for the value.
+_OBSTRUCTED = 1
+_STEPS = (3, 4)
+_VALUE = 11.0
+# Start of the registers; the small room extends from -1.3 to 1.3 m, and a block
+# may be inside its wall by half its half edge length, free blocks a bit less.
+_START = 1.0, 3.0
+_OBSTRUCTION = (1.3 - 0.05 - _START[0]) / 0.1 - _VALUE
+
+
+def _design(dof: str) -> dict[str, Any]:
+  kinds = {'reward': 'two_block', 'bonus': 'block_position'}
+  return {
+      'schema': 1,
+      'name': 'obstructed',
+      'dof': dof,
+      'registers': {
+          name: {
+              'kind': kind,
+              'role': 'feedback',
+              'place': [_START[0], _START[1] - i],
+              'range': [-2, 12],
+          }
+          for i, (name, kind) in enumerate(kinds.items())
+      },
+      'providers': [
+          {'kind': 'constant', 'value': _VALUE, 'writes': [name]}
+          for name in kinds
+      ],
+  }
+
+
+def _move(env: Any, distance: Any) -> None:
+  """Moves the written blocks away from their axis, `(...)`, in m."""
+  for register in env.mechanism.registers.values():
+    block = register.blocks[-1]
+    position = np.array(block.position(env.physics))
+    position[..., 0] = -0.5
+    position[..., 1] += distance
+    position[..., 2] = block.rest_height
+    block.put(env.physics, position)
+
+
+def _play(env: Any, distance: Any) -> None:
+  """Plays an episode in which the base of the reward moves as well."""
+  env.reset()
+  for step in range(1, _MAX_STEPS + 1):
+    if step == _STEPS[0]:
+      _move(env, distance)
+    if step == _STEPS[-1] + 1:
+      _move(env, -distance)
+    if step == _STEPS[-1]:
+      base = env.mechanism.registers['reward'].blocks[0]
+      position = np.array(base.position(env.physics))
+      position[..., 0] -= 0.2
+      base.put(env.physics, position)
+    shape = np.shape(distance) + env.action_spec().shape
+    env.step(np.zeros(shape, env.action_spec().dtype))
+  env.close()
+
+
+def _load(load: Any, dof: str, **options: Any) -> Any:
+  world = {'world': options.pop('world')} if 'world' in options else {}
+  return load(
+      'unlock_door',
+      'near',
+      {'random': 3},
+      {'max_steps': _MAX_STEPS, **world},
+      design=_design(dof),
+      **options,
+  )
+
+
+@pytest.mark.parametrize('dof', registers.DOFS)
+def test_an_obstructed_write_is_a_part_of_the_corruption(dof):
+  batch = _load(suite.load_batch, dof, num_envs=_NUM_ENVS, num_threads=1)
+  together = ledgers.BatchLedger()
+  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
+  batch.add_sink(together)
+  batch.add_sink(monitor)
+  distances = np.zeros(_NUM_ENVS)
+  distances[_OBSTRUCTED] = 2.5
+  _play(batch, distances)
+  figures = {record['world']: record for record in monitor.take()}
+  for world in range(_NUM_ENVS):
+    env, ledger = _load(suite.load, dof, world=world), ledgers.Ledger()
+    env.add_sink(ledger)
+    _play(env, np.float64(distances[world]))
+    [episode] = ledger.episodes
+    assert episode.entries == together.episodes(world)[0].entries
+    _check_parts(episode, is_obstructed=world == _OBSTRUCTED)
+    for name, register in env.mechanism.registers.items():
+      found = metrics.register_metrics(episode.entries[name], register.scale)
+      theirs = figures[world]['registers'][name]['obstruction']
+      assert theirs == pytest.approx(found.obstruction, abs=1e-9)
+      # Of the reads at the reset and after each step.
+      share = len(_STEPS) / (_MAX_STEPS + 1) * (world == _OBSTRUCTED)
+      expected = share * abs(_OBSTRUCTION)
+      assert found.obstruction == pytest.approx(expected, abs=0.1)
+
+
+def _check_parts(episode: ledgers.EpisodeLedger, is_obstructed: bool) -> None:
+  for write, read in streams.pairs([episode]):
+    corruption = read.obstruction + read.permanent + read.temporary
+    assert read.reading - write.applied == pytest.approx(corruption, abs=1e-9)
+    assert read.obstruction == write.obstruction
+    expected = _OBSTRUCTION * (is_obstructed and read.step in _STEPS)
+    assert read.obstruction == pytest.approx(expected, abs=0.1)
+    if read.register == 'reward' and read.step >= _STEPS[-1]:
+      assert read.permanent == pytest.approx(2.0, abs=0.1)
+    assert write.requested == write.applied
