@@ -3,8 +3,8 @@
 `python -m benchmarks.batch` steps 256 worlds of Unlock Door with two free
 two-block registers, rays, a ledger and random actions that use the hand, on all
 processors. MuJoCo's `Batch` replays the steps from a copy of the state: the
-same substeps, the same writes as assignments to whole arrays, one update of
-derived quantities, and the same rays cast by a second `Batch`. Both have to end
+same substeps, the same writes as assignments to whole arrays, and one update of
+poses and the same rays by a second `Batch` without contacts. Both have to end
 in the same state, bit for bit, in every round.
 
 The stock contestant is a `composer.Environment` of dm_control with the same
@@ -23,6 +23,7 @@ registers and apples.
 
 from collections.abc import Mapping, Sequence
 import contextlib
+import copy
 import dataclasses
 import functools
 import time
@@ -66,7 +67,7 @@ _RESET_TARGET_MS = 0.2
 # Fields that a world may write between substeps besides blocks and controls: of
 # the door, eaten apples, the grip of the hand, and thrown blocks.
 _OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')
-_STAGE = int(mujoco.mjtStage.mjSTAGE_VEL)
+_STAGE = int(mujoco.mjtStage.mjSTAGE_POS)
 
 Phase = tuple[list[tuple[np.ndarray, np.ndarray]], int]
 """Writes, each a view and its new value, and the number of substeps after."""
@@ -82,7 +83,7 @@ class RawSteps:
 
   Attributes:
     batch: Batch that steps the worlds; the views in `steps` are of its arrays.
-    ray_batch: Batch that casts the rays.
+    ray_batch: Batch without contacts and constraints, for poses and rays.
     start: State before the first step.
     steps: Phases of each control step.
     rays: Rays at the end of each control step.
@@ -106,8 +107,8 @@ class RawSteps:
         for view, value in writes:
           view[:] = value
         batch.step(nstep=num_substeps)
-      batch.forward(stage=_STAGE)
       ray_batch.state[:] = batch.state
+      ray_batch.forward(stage=_STAGE)
       ray_batch.ray(origins, directions, bodyexclude=carrier)
     return (time.perf_counter() - began) / len(self.steps)
 
@@ -202,8 +203,11 @@ def _record(
   env.reset()
   physics = env.physics
   model, true = physics.model.ptr, physics._batch
+  still = copy.copy(physics.model)
+  still.opt.disableflags = physics._poses.model.opt.disableflags
   raw, ray_batch = (
-      mujoco_batch.Batch(model, env.num_envs, true.nthread) for _ in range(2)
+      mujoco_batch.Batch(each, env.num_envs, true.nthread)
+      for each in (model, still.ptr)
   )
   start = true.state.copy()
   raw.state[:] = start
@@ -287,7 +291,7 @@ def _break_down_step(
   task, mechanism, physics = env.task, env.mechanism, env.physics
   parts = (
       ('substeps', physics, 'advance'),
-      ('derived quantities', physics, 'forward'),
+      ('poses', physics, 'forward'),
       ('motors and hand', task.avatar, 'apply_action'),
       ('events of the world', task, 'latch_events'),
       ('meters', mechanism, 'update_meters'),

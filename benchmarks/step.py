@@ -64,7 +64,7 @@ class RawEpisode:
         for view, value in writes:
           view[:] = value
         mujoco.mj_step(model, data, num_substeps)
-      mujoco.mj_step1(model, data)
+      mujoco.mj_kinematics(model, data)
     return (time.perf_counter() - began) / len(self.steps)
 
 
@@ -203,7 +203,7 @@ def _break_down(
   task, mechanism = env.task, env.mechanism
   parts = (
       ('substeps', env.physics, 'advance'),
-      ('derived quantities', env.physics, 'forward'),
+      ('poses', env.physics, 'update_poses'),
       ('motors and hand', task.avatar, 'apply_action'),
       ('events of the world', task, 'latch_events'),
       ('meters', mechanism, 'update_meters'),

@@ -72,10 +72,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'finding 4: a divergence has discount 0',
-        _ENVIRONMENT,
-        'dm_env.truncation(0.0, observing.copied(self._observation), 1.0)',
-        'dm_env.truncation(0.0, observing.copied(self._observation), 0.0)',
-        _ENV,
+        _EPISODES, 'events.End.DIVERGENCE: 1.0,',
+        'events.End.DIVERGENCE: 0.0,', _ENV,
     ),
     planting.Mutant(
         'contract', 'finding 4: a divergence is an ordinary end',
@@ -161,8 +159,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'an episode is one step too long', _ENVIRONMENT,
-        'if self._mechanism.step_count(self._physics) == self._max_steps:',
-        'if self._mechanism.step_count(self._physics) - 1 == self._max_steps:',
+        'self._mechanism.step_count(self._physics) == self._max_steps',
+        'self._mechanism.step_count(self._physics) - 1 == self._max_steps',
         _ENV,
     ),
     planting.Mutant(
@@ -178,7 +176,7 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'meters do not measure', _CONTROL_STEP,
-        '''  records += mechanism.update_meters(physics, idle())
+        '''  records += mechanism.update_meters(physics, where())
 ''', '', _MECH,
     ),
     planting.Mutant(
@@ -209,7 +207,9 @@ MUTANTS = [
     planting.Mutant(
         'contract', 'a hand keeps a block whose pose is written',
         _REGISTER.replace('registers/base', 'grasps'),
-        'physics.bind(self._constraints).active = 0', 'pass', _TWO + _REG + (
+        "axes.assign(physics.bind(self._constraints), 'active', 0, where)",
+        'pass',
+        _TWO + _REG + (
             'tests/entities/moving_test.py', 'tests/entities/carrying_test.py',
         ),
     ),
@@ -286,13 +286,13 @@ MUTANTS = [
     ),
     planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,
-        'return end in _BY_THE_TASK and math.isfinite(true_return)',
+        'return end in _BY_THE_WORLD and math.isfinite(true_return)',
         'return end is not None and math.isfinite(true_return)', _LED,
     ),
     planting.Mutant(
         'metric', 'an episode without a true return is valid', _ENDINGS,
-        'return end in _BY_THE_TASK and math.isfinite(true_return)',
-        'return end in _BY_THE_TASK', _LED,
+        'return end in _BY_THE_WORLD and math.isfinite(true_return)',
+        'return end in _BY_THE_WORLD', _LED,
     ),
     planting.Mutant(
         'metric', 'an episode that the agent gives up is left out', _ENDINGS,

@@ -145,9 +145,9 @@ class Environment(composer.Environment):
 
   @property
   def physics(self) -> Any:
-    """Physics of the world, with derived quantities that are up to date."""
+    """Physics of the world, in which poses are up to date."""
     if isinstance(self._physics, single_physics.ThinPhysics):
-      self._physics.refresh()
+      self._physics.update_poses()
     return super().physics
 
   @property

@@ -333,6 +333,7 @@ def of_exception(error: BaseException) -> bytes:
 def _hidden_state(env: environment.Environment) -> bytes:
   """Returns where everything is, and what cameras draw."""
   physics = env.physics
+  physics.forward()  # Cameras draw derived quantities.
   data = physics.data
   parts = [
       np.asarray(getattr(data, name)).tobytes()

@@ -8,7 +8,6 @@ from typing import Any
 import warnings
 
 from dm_control import composer
-import dm_env
 import mujoco
 import numpy as np
 import pytest
@@ -412,13 +411,8 @@ def _l42(patch: pytest.MonkeyPatch) -> None:
 @planting.leak('L43', planting.DIVERGENCE)
 def _l43_discount(patch: pytest.MonkeyPatch) -> None:
   """An episode whose physics failed ends with discount 0."""
-  patch.setattr(
-      environment.dm_env,
-      'truncation',
-      lambda reward, observation, discount: dm_env.termination(
-          reward, observation
-      ),
-  )
+  discounts = environment.episodes._DISCOUNTS
+  patch.setitem(discounts, environment.events.End.DIVERGENCE, 0.0)
 
 
 @planting.leak('L43', planting.DIVERGENCE)
