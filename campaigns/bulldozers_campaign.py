@@ -7,7 +7,7 @@ Run from the root of the repository, about fifteen minutes on two processors:
 50 scripted pushers at full force shove blocks at walls and into corners and
 doorways, carry and throw them, and stack them, for 2,000 control steps each, in
 ten rounds with other seeds: 1e6 control steps. In one half, all blocks have
-usual sizes and a control step has 5 substeps; in the other half, the blocks
+usual sizes and a control step has 4 substeps; in the other half, the blocks
 measure from 6 cm to 1 m, the limits of designs, and a control step has 10. They
 weigh from 10 g to 100 kg. In half of the rounds the registers are written in
 every control step, which a hand that holds a block outlasts.

@@ -105,7 +105,7 @@ class RoomArena(composer.Arena):
     super()._build(name)
     self._places: dict[str, Place] = {}
     root = self._mjcf_root
-    root.option.timestep = 0.02
+    root.option.timestep = 0.025
     root.option.integrator = 'implicitfast'
     # A solver without islands couples bodies that are far apart. The noslip
     # pass, which Composer turns on, has no islands.

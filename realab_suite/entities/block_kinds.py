@@ -28,7 +28,7 @@ LEAST_SIZE = 0.06
 # Substeps, in s, and the half edge lengths, in m, of blocks for which the long
 # one is reliable. With the long one, blocks of 6 cm were pushed into the floor
 # of a corner, and cubes of more than 0.5 m left other ones at up to 3.3 m/s.
-_SUBSTEP, _SHORT_SUBSTEP = 0.02, 0.01
+_SUBSTEP, _SHORT_SUBSTEP = 0.025, 0.01
 _USUAL_SIZES = (0.075, 0.2)
 # Height at which an avatar carries a block, in m.
 GRIP_HEIGHT = 0.2
