@@ -70,14 +70,14 @@ DESIGN: dict[str, Any] = {
         'fixed': _register([0.3, -3.3], channel='welded', range=[0, 5]),
     },
 }  # fmt: skip
-# Blocks of 0.2 to 0.4 m, for which the physics takes long substeps.
+# Blocks of 0.15 to 0.4 m, for which the physics takes long substeps.
 _USUAL = ('usual', 'planar', 'large', 'turned', 'fixed')
 USUAL_DESIGN = DESIGN | {
     'registers': {
         **{name: DESIGN['registers'][name] for name in _USUAL},
-        'light': _register([1.8, -2.0], block_size=0.15, mass=0.01),
+        'light': _register([1.8, -2.0], block_size=0.15, mass=0.1),
         'light_planar': _register(
-            [1.8, -2.8], block_size=0.15, mass=0.01, dof='planar'
+            [1.8, -2.8], block_size=0.15, mass=0.1, dof='planar'
         ),
         'dense': _register([1.8, 2.6], block_size=0.15, mass=100.0),
     }

@@ -134,7 +134,7 @@ def make_world(
   avatar.make_graspable([*written.blocks, *other.blocks])
   apple = apple_group.Apples(number=1)
   apple.attach_to(arena)
-  arena.mjcf_model.option.timestep = block_kinds.timestep_for([size / 2])
+  arena.mjcf_model.option.timestep = block_kinds.timestep_for(written.blocks)
   physics = worlds.compile_world(arena, single_physics.ThinPhysics)
   return World(physics, written, other, avatar, apple, size, place)
 

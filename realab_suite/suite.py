@@ -352,8 +352,7 @@ def _connected(
     blocks = _blocks_of(mechanism)
     task.avatar.make_graspable(blocks)
     task.physics_timestep = min(
-        task.physics_timestep,
-        block_kinds.timestep_for(block.half_size for block in blocks),
+        task.physics_timestep, block_kinds.timestep_for(blocks)
     )
   env = environment.Environment(
       task,

@@ -25,11 +25,13 @@ from realab_suite.entities import surroundings
 # to 2.8 m/s, which is 28 mm in a substep of 10 ms. The centre of a block with
 # less than twice that edge length would be below the floor after the substep.
 LEAST_SIZE = 0.06
-# Substeps, in s, and the half edge lengths, in m, of blocks for which the long
-# one is reliable. With the long one, blocks of 6 cm were pushed into the floor
-# of a corner, and cubes of more than 0.5 m left other ones at up to 3.3 m/s.
+# Substeps, in s, and the half edge lengths, in m, and masses, in kg, of blocks
+# for which the long one is reliable. With long ones, blocks of 6 cm or of 10 g
+# were pushed into the floor, and cubes of more than 0.5 m left other ones at up
+# to 3.3 m/s.
 _SUBSTEP, _SHORT_SUBSTEP = 0.025, 0.01
 _USUAL_SIZES = (0.075, 0.2)
+_USUAL_MASS = 0.1
 # Height at which an avatar carries a block, in m.
 GRIP_HEIGHT = 0.2
 # Gap between a planar block and the floor, in m, so that they never touch.
@@ -39,14 +41,19 @@ _HOVER = 0.004
 _PLANAR_FRICTION = 6.0
 
 
-def timestep_for(half_sizes: Iterable[float]) -> float:
+def timestep_for(blocks: Iterable['Block']) -> float:
   """Returns the duration of a substep of the physics, in s.
 
   Args:
-    half_sizes: Half the edge length of each block in the world, in m.
+    blocks: All blocks in the world.
   """
   low, high = _USUAL_SIZES
-  is_usual = all(low <= half_size <= high for half_size in half_sizes)
+  is_usual = all(
+      low <= block.half_size <= high
+      # A mocap block has no mass.
+      and (block.geom.mass is None or block.geom.mass >= _USUAL_MASS)
+      for block in blocks
+  )
   return _SUBSTEP if is_usual else _SHORT_SUBSTEP
 
 

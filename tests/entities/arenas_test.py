@@ -177,7 +177,7 @@ def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
       guard.remove()
   register.attach_to(arena, (0.0, 0.0))
   (block,) = register.blocks
-  arena.mjcf_model.option.timestep = block_kinds.timestep_for([block.half_size])
+  arena.mjcf_model.option.timestep = block_kinds.timestep_for([block])
   physics = worlds.compile_world(arena)
   starts = [(0.0, 0.0), (2.5, -2.5)]
   if 'side_room' in arena.places:

@@ -95,7 +95,7 @@ def test_a_block_that_is_stuck_stays_behind(dof, size, mass, keeps_hold):
   world.grasp()
   for _ in range(10):
     world.act(10, strafe=1.0)
-    assert world.block[1] < 0.4 - size / 2 + 0.03
+    assert world.block[1] < 0.4 - size / 2 + 0.04
   assert world.avatar.position(world.physics)[1] > 0.7
   # It swings round a usual block, and loses a light one.
   assert world.holding is keeps_hold

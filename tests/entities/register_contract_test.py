@@ -236,9 +236,10 @@ def test_corruption_is_reading_minus_applied_value(world, variety):
       _shove_everything(world, random_state, register)
       error = register.read(world.physics) - register.applied(world.physics)
       corruption = register.inspect(world.physics)
-      assert error == pytest.approx(
-          corruption.permanent + corruption.temporary, abs=1e-9
-      )
+      parts = (
+          corruption.obstruction, corruption.permanent, corruption.temporary
+      )  # fmt: skip
+      assert error == pytest.approx(sum(parts), abs=1e-9)
 
 
 @register_worlds.every_variety

@@ -90,11 +90,11 @@ def _brief(record: Any) -> tuple[Any, ...]:
 @pytest.mark.parametrize(
     ('schedule', 'meter', 'provider'),
     [
-        (None, 1, 3),
+        (None, 1, 2),
         ('cfmdp', 0, 0),
-        ({'meter_substep': 0, 'provider_substep': 4}, 0, 4),
+        ({'meter_substep': 0, 'provider_substep': 3}, 0, 3),
         ({'meter_substep': 2, 'provider_substep': 2}, 2, 2),
-        ({'meter_substep': 4, 'provider_substep': 4}, 4, 4),
+        ({'meter_substep': 3, 'provider_substep': 3}, 3, 3),
     ],
 )
 def test_meters_and_providers_act_in_order_in_their_substeps(
@@ -111,7 +111,7 @@ def test_meters_and_providers_act_in_order_in_their_substeps(
   began = env.physics.time()
   trace = _trace(env)
   env.step(_query(env, 4.0))
-  assert env.num_substeps == 5
+  assert env.num_substeps == 4
   assert round(env.physics.time() - began, 9) == 0.1
   assert trace == [
       (0, 'write', 'query'),
@@ -119,9 +119,9 @@ def test_meters_and_providers_act_in_order_in_their_substeps(
       (provider, 'read', 'clock'),
       (provider, 'read', 'query'),
       (provider, 'write', 'reward'),
-      (5, 'read', 'reward'),
+      (4, 'read', 'reward'),
   ]
-  np.testing.assert_allclose(measured_at, [began + meter * 0.02])
+  np.testing.assert_allclose(measured_at, [began + meter * 0.025])
   (step,) = sink.steps
   assert [_brief(record) for record in step.records] == [
       ('write', 'query', 'agent', 4.0, 4.0),
@@ -252,7 +252,7 @@ def test_providers_read_the_positions_of_blocks(made: scripted.Worlds):
     _move(env, 'query', 0, -0.1)
 
   # The meter has written by then; the provider is next.
-  _once_at(env, 3, disturb)
+  _once_at(env, 2, disturb)
   env.step(_query(env, 4.0))
   readings = {name: float(value) for name, value in scripted.SEEN[0][1].items()}
   assert readings == pytest.approx({'clock': 9.0, 'query': 5.0}, abs=1e-6)
@@ -314,13 +314,13 @@ def test_a_lifted_block_keeps_its_height_in_a_write(made: scripted.Worlds):
     ('register', 'block', 'distance', 'substep', 'requested', 'read'),
     [
         # The base of the meter: a spike.
-        ('score', 0, -0.5, 11, [0, 0, 5, 0, 0, 0], [0, 0, 5, 0, 0, 0]),
+        ('score', 0, -0.5, 9, [0, 0, 5, 0, 0, 0], [0, 0, 5, 0, 0, 0]),
         # Its offset: a spike and the opposite.
-        ('score', 1, 0.1, 13, [0, 0, 1, -1, 0, 0], [0, 0, 1, -1, 0, 0]),
+        ('score', 1, 0.1, 10, [0, 0, 1, -1, 0, 0], [0, 0, 1, -1, 0, 0]),
         # The base of the feedback register: a constant error.
-        ('reward', 0, -0.3, 11, [0] * 6, [0, 0, 3, 3, 3, 3]),
+        ('reward', 0, -0.3, 9, [0] * 6, [0, 0, 3, 3, 3, 3]),
         # Its offset: one reading.
-        ('reward', 1, 0.2, 15, [0] * 6, [0, 0, 2, 0, 0, 0]),
+        ('reward', 1, 0.2, 12, [0] * 6, [0, 0, 2, 0, 0, 0]),
     ],
 )
 def test_moving_a_block_corrupts_the_reward(

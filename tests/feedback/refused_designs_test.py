@@ -143,7 +143,7 @@ _DOES_NOT_FIT = {
     'registers.reward.kind=block_orientation & registers.reward.scale=1':
         "register 'reward': range [-2.0, 12.0] at scale 1.0 turns the block",
     'schedule={meter_substep: 3, provider_substep: 10}':
-        'schedule.provider_substep: 10 must be less than the 5 substeps of a'
+        'schedule.provider_substep: 10 must be less than the 4 substeps of a'
         ' control step',
 }  # fmt: skip
 
