@@ -20,10 +20,11 @@ OUTSIDE = 'outside.'
 # Width of such a box at the outside of a room, in m. Places beyond it are never
 # the nearest free ones.
 ENDLESS = 20.0
-# A block is in an obstacle if this fraction of its half edge length is inside.
-# Contacts push blocks out that are less deep inside, which is no obstruction:
-# blocks that were pushed against a wall are slightly inside.
-_TOLERANCE = 0.5
+# A block is in an obstacle if this fraction of its half edge length is inside,
+# or this depth, in m. Contacts push blocks out that are less deep inside, which
+# is no obstruction: blocks that were pushed against a wall are slightly inside.
+# From a quarter of its edge length inside, a cube of 1 m left at 15 m/s.
+_TOLERANCE, _DEEPEST = 0.5, 0.05
 # Far from everything in a room, in m.
 _FAR = ENDLESS
 _PARALLEL = 1e-9
@@ -145,7 +146,7 @@ class Surroundings:
     """
     self._body = body
     self._rest = rest
-    self._half_size = half_size * (1.0 - _TOLERANCE)
+    self._half_size = half_size - min(half_size * _TOLERANCE, _DEEPEST)
     self._radius = np.sqrt(3.0) * self._half_size
     self._model: Any = None
     self._boxes = Boxes.none()

@@ -164,3 +164,31 @@ def test_round_things_beside_a_register_do_not_obstruct_it(geom, turned):
     assert float(register.obstruction(env.physics)) == 0.0
     assert float(register.read(env.physics)) == pytest.approx(value, abs=1e-9)
     register.pose(env.physics, 0.0)
+
+
+@pytest.mark.parametrize('size', [0.2, 0.4])
+def test_an_obstructed_block_leaves_the_wall_slowly(size):
+  reward = {
+      'kind': 'block_position',
+      'role': 'feedback',
+      'place': [-2.3, -2.6],
+      'range': [0, 35],
+      'block_size': size,
+  }
+  design = {'schema': 1, 'name': 'large', 'registers': {'reward': reward}}
+  env = suite.load('unlock_door', 'standard', {'random': 1}, design=design)
+  env.reset()
+  register = env.mechanism.registers['reward']
+  block = register.blocks[0]
+  random = np.random.default_rng(0)
+  for _ in range(40):
+    # In the small room, which is too narrow for either value.
+    position = np.array(block.position(env.physics))
+    position[:] = 2.3 + random.uniform(-0.6, 0.6), 8.1, block.rest_height
+    block.put(env.physics, position, random.choice([0.0, np.pi / 4, 0.5]))
+    for value in random.choice([0.0, 35.0], size=4):
+      register.write(env.physics, value)
+      for _ in range(5):
+        env.physics.advance(1)
+        velocity = env.physics.bind(block.body.joint[:3]).qvel
+        assert np.linalg.norm(velocity) < 2.0
