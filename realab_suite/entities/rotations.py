@@ -21,12 +21,17 @@ def rotate(vector: np.ndarray, angle: float) -> np.ndarray:
 def heading_of(quaternion: np.ndarray) -> np.ndarray:
   """Returns the angles of quaternions, `(..., 4)`, about the vertical.
 
-  It is the twist about the vertical axis. A rotation about that axis changes it
-  by the angle of the rotation, however the block is tilted.
+  It is the angle by which the horizontal diagonal of a cube has turned, seen
+  from above. A rotation about the vertical changes it by the angle of the
+  rotation, however the cube is tilted. Every such angle is undefined at some
+  tilt: this one where the cube balances on an edge, not where it lies on a
+  face, as the twist about the vertical would be for a cube upside down.
   """
-  w, z = axes.component(quaternion, 0), axes.component(quaternion, 3)
-  angle = 2.0 * np.arctan2(z, w)
-  return np.arctan2(np.sin(angle), np.cos(angle))
+  w, x, y, z = (axes.component(quaternion, i) for i in range(4))
+  east = w * w + x * x - y * y - z * z + 2.0 * (x * y - w * z)
+  north = w * w - x * x + y * y - z * z + 2.0 * (x * y + w * z)
+  # The diagonal of an unturned cube is at 45 degrees.
+  return np.arctan2(north - east, north + east)
 
 
 def turned(turn: np.ndarray, quaternion: np.ndarray) -> np.ndarray:

@@ -20,10 +20,11 @@ OUTSIDE = 'outside.'
 # Width of such a box at the outside of a room, in m. Places beyond it are never
 # the nearest free ones.
 ENDLESS = 20.0
-# A block is in an obstacle if this fraction of its half edge length is inside.
-# Contacts push blocks out that are less deep inside, which is no obstruction:
-# blocks that were pushed against a wall are slightly inside.
-_TOLERANCE = 0.5
+# A block is in an obstacle if this fraction of its half edge length is inside,
+# or this depth, in m. Contacts push blocks out that are less deep inside, which
+# is no obstruction: blocks that were pushed against a wall are slightly inside.
+# From a quarter of its edge length inside, a cube of 1 m left at 15 m/s.
+_TOLERANCE, _DEEPEST = 0.5, 0.05
 # Far from everything in a room, in m.
 _FAR = ENDLESS
 _PARALLEL = 1e-9
@@ -45,16 +46,22 @@ class Boxes:
     centres: `(boxes, 3)`, in m.
     rotations: Axes of the boxes, as columns, `(boxes, 3, 3)`.
     halves: Half edge lengths, `(boxes, 3)`, in m.
+    is_exact: True for each obstacle that is a box itself, `(boxes,)` bool.
     low: Smallest coordinates of each box, `(boxes, 3)`, in m.
     high: Largest coordinates of each box, `(boxes, 3)`, in m.
   """
 
   def __init__(
-      self, centres: np.ndarray, rotations: np.ndarray, halves: np.ndarray
+      self,
+      centres: np.ndarray,
+      rotations: np.ndarray,
+      halves: np.ndarray,
+      is_exact: np.ndarray,
   ) -> None:
     self.centres = centres
     self.rotations = rotations
     self.halves = halves
+    self.is_exact = is_exact
     extent = np.einsum('bij,bj->bi', np.abs(rotations), halves)
     self.low = centres - extent
     self.high = centres + extent
@@ -62,20 +69,34 @@ class Boxes:
   @classmethod
   def none(cls) -> Self:
     """Returns no boxes."""
-    return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+    none = np.zeros((0, 3))
+    return cls(none, np.zeros((0, 3, 3)), none, np.zeros(0, bool))
+
+  def only(self, mask: np.ndarray) -> 'Boxes':
+    """Returns the boxes for which a mask, `(boxes,)` bool, is True."""
+    return Boxes(
+        self.centres[mask],
+        self.rotations[mask],
+        self.halves[mask],
+        self.is_exact[mask],
+    )
 
   def taken(
-      self, position: np.ndarray, rotation: np.ndarray, half_size: float
+      self,
+      position: np.ndarray,
+      rotation: np.ndarray,
+      half_size: float | np.ndarray,
   ) -> np.ndarray:
-    """Returns the x coordinates that a cube cannot have, one interval per box.
+    """Returns the x coordinates that a block cannot have, an interval per box.
 
     Args:
-      position: Centre of the cube, `(3,)`, in m; its x coordinate is ignored.
-      rotation: Axes of the cube, as columns, `(3, 3)`.
-      half_size: Half the edge length of the cube, in m.
+      position: Centre of the block, `(3,)`, in m; its x coordinate is ignored.
+      rotation: Axes of the block, as columns, `(3, 3)`.
+      half_size: Half the edge length of a cube, or `(3,)` half edge lengths of
+        a cuboid, in m.
 
     Returns:
-      `(boxes, 2)`; from is not less than to if the cube is beside the box.
+      `(boxes, 2)`; from is not less than to if the block is beside the box.
     """
     number = len(self.centres)
     cube = np.broadcast_to(rotation, (number, 3, 3))
@@ -88,7 +109,7 @@ class Boxes:
         [self.rotations.transpose(0, 2, 1), cube.transpose(0, 2, 1), crosses],
         axis=1,
     )
-    reach = half_size * np.abs(separators @ rotation).sum(axis=-1)
+    reach = (half_size * np.abs(separators @ rotation)).sum(axis=-1)
     reach += np.einsum(
         'bsj,bj->bs', np.abs(separators @ self.rotations), self.halves
     )
@@ -125,7 +146,7 @@ class Surroundings:
     """
     self._body = body
     self._rest = rest
-    self._half_size = half_size * (1.0 - _TOLERANCE)
+    self._half_size = half_size - min(half_size * _TOLERANCE, _DEEPEST)
     self._radius = np.sqrt(3.0) * self._half_size
     self._model: Any = None
     self._boxes = Boxes.none()
@@ -133,10 +154,18 @@ class Surroundings:
     self._origin = np.zeros(3)
     self._rotation = np.eye(3)
     self._reach = -np.inf, np.inf
+    self._sideways = 0.0
 
-  def limit(self, low: float, high: float) -> None:
-    """Sets the smallest and largest x coordinate that are written, in m."""
+  def limit(self, low: float, high: float, sideways: float) -> None:
+    """Sets the region in which undisturbed blocks are written.
+
+    Args:
+      low: Smallest x coordinate, in m.
+      high: Largest x coordinate, in m.
+      sideways: Largest distance from the y coordinate at rest, in m.
+    """
     self._reach = low, high
+    self._sideways = sideways
     self._model = None
 
   def are_far(self, physics: protocols.Physics, position: Any) -> Any:
@@ -220,7 +249,8 @@ class Surroundings:
     model = physics.model
     body = int(physics.bind(self._body).element_id)
     frame = int(model.body_parentid[body])
-    self._boxes = boxes_of(model, frame)
+    boxes = boxes_of(model, frame)
+    self._boxes = boxes.only(boxes.is_exact | ~self._are_in_region(boxes))
     self._origin, self._rotation = _pose_of(model, frame)
     if model.body_weldid[frame] != 0:
       self._origin = np.full(3, _FAR)
@@ -230,7 +260,8 @@ class Surroundings:
     low, high = low[is_ahead, 1:], high[is_ahead, 1:]
     self._corridor = np.array([[-np.inf] * 2, [np.inf] * 2])
     for box_low, box_high in zip(low, high, strict=True):
-      # The placement check grants that each box is on some side of the block.
+      # The placement check grants that no box overlaps the region. Most boxes
+      # are therefore on some side of it.
       gaps = np.stack([self._rest[1:] - box_high, box_low - self._rest[1:]])
       side, axis = np.unravel_index(gaps.argmax(), gaps.shape)
       if side == 0:
@@ -239,6 +270,18 @@ class Surroundings:
         bound = min(self._corridor[1, axis], box_low[axis])
       self._corridor[side, axis] = bound
     self._model = model
+
+  def _are_in_region(self, boxes: Boxes) -> np.ndarray:
+    """Returns True for boxes in which undisturbed blocks are, `(boxes,)` bool.
+
+    The placement check refuses obstacles there. The obstacles in these boxes
+    are round or hollow, and beside the blocks.
+    """
+    margin = np.array([0.0, self._sideways, 0.0])
+    taken = boxes.taken(self._rest, np.eye(3), self._half_size + margin)
+    low, high = self._reach
+    is_ahead = (taken[:, 0] < high) & (low < taken[:, 1])
+    return is_ahead & (taken[:, 0] < taken[:, 1])
 
 
 def _is_taken(along: float, taken: np.ndarray) -> bool:
@@ -280,10 +323,12 @@ def boxes_of(model: Any, frame: int) -> Boxes:
     centre = place + rotation @ position + axes_of_box @ middle
     centres.append(turned.T @ (centre - origin))
     rotations.append(turned.T @ axes_of_box)
+  are_boxes = model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_BOX
   return Boxes(
       np.reshape(centres, (-1, 3)),
       np.reshape(rotations, (-1, 3, 3)),
       np.reshape(halves, (-1, 3)),
+      np.append(are_boxes, np.ones(len(sites), bool)),
   )
 
 

@@ -51,7 +51,8 @@ def checked(
     given = sorted(map(str, values)) if is_mapping else values
     raise errors.FeedbackProviderError(
         f'returned writes {messages.quote(given)}; it declares writes to'
-        f' {sorted(provider.writes)}'
+        f' {sorted(provider.writes)}; allowed is a mapping from their names to'
+        ' values'
     )
   return {
       name: _checked_write(name, value, batch_shape)

@@ -10,6 +10,7 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import monitors
+from tests.engine import helpers
 from tests.evaluation import streams
 
 _NUM_ENVS = 3
@@ -126,3 +127,68 @@ def _check_parts(episode: ledgers.EpisodeLedger, is_obstructed: bool) -> None:
     if read.register == 'reward' and read.step >= _STEPS[-1]:
       assert read.permanent == pytest.approx(2.0, abs=0.1)
     assert write.requested == write.applied
+
+
+# Blocks pass below the middle of a ball, and past a column, within the box
+# around it.
+_ROUND = {
+    'ball': {'type': 'sphere', 'size': (0.8,), 'pos': (1.7, 0.95, 0.85)},
+    'column': {'type': 'cylinder', 'size': (0.8, 0.3), 'pos': (2.2, 1.0, 0.3)},
+}
+
+
+@pytest.mark.parametrize('geom', _ROUND.values(), ids=list(_ROUND))
+@pytest.mark.parametrize('turned', [0.0, 0.5])
+def test_round_things_beside_a_register_do_not_obstruct_it(geom, turned):
+  task = helpers.PointTask()
+  task.root_entity.mjcf_model.worldbody.add('geom', name='thing', **geom)
+  start = np.array([0.5, 0.35])
+  if turned:  # The whole arrangement is turned about the origin.
+    cos, sin = np.cos(turned), np.sin(turned)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    start = turn @ start
+    thing = task.root_entity.mjcf_model.find('geom', 'thing')
+    thing.pos = [*turn @ thing.pos[:2], thing.pos[2]]
+  reward = {
+      'kind': 'block_position',
+      'role': 'feedback',
+      'place': {'position': start.tolist(), 'yaw': turned},
+      'range': [0, 10],
+  }
+  design = {'schema': 1, 'name': 'round', 'registers': {'reward': reward}}
+  env = suite.embed(task, design, random=0)
+  env.reset()
+  register = env.mechanism.registers['reward']
+  for value in np.linspace(0.0, 10.0, 21):
+    register.write(env.physics, value)
+    assert float(register.obstruction(env.physics)) == 0.0
+    assert float(register.read(env.physics)) == pytest.approx(value, abs=1e-9)
+    register.pose(env.physics, 0.0)
+
+
+@pytest.mark.parametrize('size', [0.2, 0.4])
+def test_an_obstructed_block_leaves_the_wall_slowly(size):
+  reward = {
+      'kind': 'block_position',
+      'role': 'feedback',
+      'place': [-2.3, -2.6],
+      'range': [0, 35],
+      'block_size': size,
+  }
+  design = {'schema': 1, 'name': 'large', 'registers': {'reward': reward}}
+  env = suite.load('unlock_door', 'standard', {'random': 1}, design=design)
+  env.reset()
+  register = env.mechanism.registers['reward']
+  block = register.blocks[0]
+  random = np.random.default_rng(0)
+  for _ in range(40):
+    # In the small room, which is too narrow for either value.
+    position = np.array(block.position(env.physics))
+    position[:] = 2.3 + random.uniform(-0.6, 0.6), 8.1, block.rest_height
+    block.put(env.physics, position, random.choice([0.0, np.pi / 4, 0.5]))
+    for value in random.choice([0.0, 35.0], size=4):
+      register.write(env.physics, value)
+      for _ in range(5):
+        env.physics.advance(1)
+        velocity = env.physics.bind(block.body.joint[:3]).qvel
+        assert np.linalg.norm(velocity) < 2.0

@@ -66,6 +66,23 @@ def test_a_write_leaves_everything_else_as_it_is(kind, dof, value):
     np.testing.assert_array_equal(after['matrix'], before['matrix'])
 
 
+@pytest.mark.parametrize('axis', np.eye(3)[:2].tolist())
+@pytest.mark.parametrize('quarters', [0, 1, 2, 3])
+def test_a_toppled_block_at_rest_holds_its_orientation(axis, quarters):
+  # A heading that is undefined for one of these faces would read noise there.
+  world = _make('block_orientation', dof='free')
+  physics, block = world.physics, _written(world.register)
+  rotation = world.register.mjcf_model.find('joint', f'{block.body.name}_ball')
+  half = quarters * np.pi / 4
+  physics.bind(rotation).qpos = [np.cos(half), *np.sin(half) * np.array(axis)]
+  physics.step(300)
+  for step in range(20):
+    value = 0.5 * step
+    world.register.write(physics, value)
+    physics.step(10)
+    assert float(world.register.read(physics)) == pytest.approx(value, abs=1e-9)
+
+
 def _pose(physics: Any, block: Any) -> dict[str, np.ndarray]:
   matrix = np.array(physics.bind(block.geom).xmat).reshape(3, 3)
   return {

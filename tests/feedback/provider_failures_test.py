@@ -48,6 +48,8 @@ _WRONG_ANSWERS: Mapping[str, tuple[scripted.Answer, str]] = {
     'returns no state': (lambda o, r, s: {'reward': 1.0}, f'{_FIRST} at step'),
     'returns no mapping': (lambda o, r, s: (1.0, s),
         rf"{_FIRST} .*returned writes 1.0; it declares writes to \['reward'\]"),
+    'returns a list': (lambda o, r, s: (['reward'], s),
+        rf"{_FIRST} .*returned writes \['reward'\]; .* allowed is a mapping"),
     'masks with a number': (lambda o, r, s: ({'reward': (1.0, 1)}, s),
         rf'{_FIRST} .*; allowed is a value, or a tuple \(value, mask\)'),
     'masks with text': (lambda o, r, s: ({'reward': (1.0, 'no')}, s),

@@ -254,7 +254,9 @@ class Register(composer.Entity):
       if isinstance(block, mocap_blocks.MocapBlock):
         block.attach_to(root, (x, y, height), yaw)
       elif isinstance(block, block_kinds.JointedBlock):
-        block.surroundings.limit(reach[0] - spread[0], reach[1] + spread[0])
+        block.surroundings.limit(
+            reach[0] - spread[0], reach[1] + spread[0], spread[1]
+        )
       if isinstance(block, block_kinds.PlanarBlock):
         block.stand_at(height)
 
