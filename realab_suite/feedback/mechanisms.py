@@ -201,17 +201,7 @@ class FeedbackMechanism(composer.Entity):
     writes = []
     for i, register in enumerate(self.queries):
       requested = axes.component(values, i)
-      applied = register.write(physics, requested)
-      writes.append(
-          records.Write(
-              register.name,
-              records.AGENT,
-              step,
-              requested,
-              applied,
-              register.obstruction(physics),
-          )
-      )
+      writes.append(_write(physics, register, records.AGENT, step, requested))
     return writes
 
   def update_meters(
@@ -241,21 +231,16 @@ class FeedbackMechanism(composer.Entity):
     values = [meter.measure(physics) for _, meter in self._meters]
     writes = []
     for (writer, meter), measured in zip(self._meters, values, strict=True):
-      name = meter.register.name
+      register = meter.register
       try:
-        applied = meter.register.write(physics, measured, where)
+        write = _write(physics, register, writer, step, measured, where)
       except errors.RegisterValueError as error:
         raise errors.RegisterValueError(
-            f'{_where(writer, step, error.world)}: register {name!r} cannot'
-            ' store the measured value',
+            f'{_where(writer, step, error.world)}: register'
+            f' {register.name!r} cannot store the measured value',
             error.world,
         ) from error
-      obstruction = meter.register.obstruction(physics)
-      writes.append(
-          records.Write(
-              name, writer, step, measured, applied, obstruction, where
-          )
-      )
+      writes.append(write)
     return writes
 
   def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
@@ -359,15 +344,14 @@ class FeedbackMechanism(composer.Entity):
           continue
         value = values[name].value
         try:
-          applied = self._registers[name].write(physics, value, mask)
+          write = _write(
+              physics, self._registers[name], writer, step, value, mask
+          )
         except errors.RegisterValueError as error:
           raise errors.RegisterValueError(
               f'{_where(writer, step, error.world)}: {error}', error.world
           ) from error
-        obstruction = self._registers[name].obstruction(physics)
-        log.append(
-            records.Write(name, writer, step, value, applied, obstruction, mask)
-        )
+        log.append(write)
       next_states.append(next_state)
     return log, next_states
 
@@ -452,6 +436,34 @@ class FeedbackMechanism(composer.Entity):
   def _this_step(self, physics: protocols.Physics) -> Any:
     """Returns the number of the current control step, from 1, `(...)` int."""
     return self._whole_steps(physics) + 1
+
+
+def _write(
+    physics: protocols.Physics,
+    register: base.Register,
+    writer: str,
+    step: Any,
+    value: Any,
+    where: axes.Mask = None,
+) -> records.Write:
+  """Writes a value to a register and returns the record of the write.
+
+  Args:
+    physics: One world or a batch of worlds.
+    register: The register.
+    writer: Name of the writer, for the record.
+    step: Control step, `(...)` int, for the record.
+    value: Requested value, `(...)`.
+    where: Worlds in which to write it, `(...)` bool; `None` for all worlds.
+
+  Raises:
+    RegisterValueError: If the register cannot store the value.
+  """
+  applied = register.write(physics, value, where)
+  obstruction = register.obstruction(physics)
+  return records.Write(
+      register.name, writer, step, value, applied, obstruction, where
+  )
 
 
 def _where(writer: str, step: Any, world: int | None = None) -> str:
