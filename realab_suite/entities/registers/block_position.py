@@ -30,10 +30,7 @@ class BlockPositionRegister(base.Register):
       value: np.ndarray,
       where: axes.Mask = None,
   ) -> None:
-    position = np.array(self._origin(physics))
-    position[..., 0] = axes.component(position, 0) + value * self._scale
-    position[..., 2] = self._block.rest_height
-    self._block.put(physics, position, where=where)
+    self._block.put(physics, self._position(physics, value), where=where)
 
   def _shift(
       self,
@@ -49,7 +46,13 @@ class BlockPositionRegister(base.Register):
     return (self._block.along(physics) - started) / self._scale
 
   def displacement(self, physics: protocols.Physics) -> np.ndarray:
-    place = np.array(self._origin(physics))
-    along = self.applied(physics) * self._scale
-    place[..., 0] = axes.component(place, 0) + along
+    place = self._position(physics, self.applied(physics))
     return moves.farthest(physics, self._blocks, [place])
+
+  def _position(
+      self, physics: protocols.Physics, value: np.ndarray
+  ) -> np.ndarray:
+    """Returns the undisturbed position of the block, `(..., 3)`, in m."""
+    return moves.undisturbed(
+        self._origin(physics), value * self._scale, self._block.rest_height
+    )

@@ -38,6 +38,22 @@ def slide(
   return np.where(placed == along, value, (placed - start) / scale)[()]
 
 
+def undisturbed(
+    start: np.ndarray, along: np.ndarray, height: float
+) -> np.ndarray:
+  """Returns the undisturbed position of a block, `(..., 3)`, in m.
+
+  Args:
+    start: Position that represents 0, `(..., 3)`, in m.
+    along: Displacement along the axis, `(...)`, in m.
+    height: Height of the centre of a block at rest, in m.
+  """
+  position = np.array(start)
+  position[..., 0] = axes.component(position, 0) + along
+  position[..., 2] = height
+  return position
+
+
 def turn(
     physics: protocols.Physics,
     block: block_kinds.Block,

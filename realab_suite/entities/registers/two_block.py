@@ -47,9 +47,7 @@ class TwoBlockRegister(base.Register):
       value: np.ndarray,
       where: axes.Mask = None,
   ) -> None:
-    position = self._origin(physics) + self._from_origin
-    position[..., 0] = axes.component(position, 0) + value * self._scale
-    position[..., 2] = self._offset.rest_height
+    position = self._offset_position(physics, value)
     self._offset.put(physics, position, where=where)
 
   def _shift(
@@ -70,9 +68,17 @@ class TwoBlockRegister(base.Register):
     return (started - self._base.along(physics)) / self._scale
 
   def displacement(self, physics: protocols.Physics) -> np.ndarray:
-    origin = self._origin(physics)
-    offset = origin + self._from_origin
-    along = self.applied(physics) * self._scale
-    offset[..., 0] = axes.component(offset, 0) + along
-    offset[..., 2] = self._offset.rest_height
-    return moves.farthest(physics, self._blocks, [origin, offset])
+    places = [
+        self._origin(physics),
+        self._offset_position(physics, self.applied(physics)),
+    ]
+    return moves.farthest(physics, self._blocks, places)
+
+  def _offset_position(
+      self, physics: protocols.Physics, value: np.ndarray
+  ) -> np.ndarray:
+    """Returns the undisturbed position of the offset block, `(..., 3)`."""
+    start = self._origin(physics) + self._from_origin
+    return moves.undisturbed(
+        start, value * self._scale, self._offset.rest_height
+    )
