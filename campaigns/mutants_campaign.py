@@ -21,6 +21,7 @@ from tests.leaks import mutants as leaks
 
 _ENVIRONMENT = 'engine/environment.py'
 _CONTROL_STEP = 'engine/control_step.py'
+_HANDS = 'tests/entities/moving_test.py', 'tests/entities/carrying_test.py'
 _EPISODES = 'engine/episodes.py'
 _HOSTS = 'engine/hosts.py'
 _OBSERVING = 'engine/observing.py'
@@ -205,13 +206,9 @@ MUTANTS = [
         'value', _REG,
     ),
     planting.Mutant(
-        'contract', 'a hand keeps a block whose pose is written',
-        _REGISTER.replace('registers/base', 'grasps'),
+        'contract', 'a pose is written to a held block', 'entities/grasps.py',
         "axes.assign(physics.bind(self._constraints), 'active', 0, where)",
-        'pass',
-        _TWO + _REG + (
-            'tests/entities/moving_test.py', 'tests/entities/carrying_test.py',
-        ),
+        'pass', (*_TWO, *_REG, *_HANDS),
     ),
     planting.Mutant(
         'contract', 'solvers that couple are accepted', 'engine/placement.py',

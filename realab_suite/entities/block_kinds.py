@@ -156,7 +156,6 @@ class JointedBlock(Block):
         'site', name=f'{name}_grip', size=[0.01], group=4,
         pos=[0.0, 0.0, self._grip_offset],
     )  # fmt: skip
-
     self._surroundings = surroundings.Surroundings(
         self._body, self._rest, half_size
     )
@@ -224,8 +223,8 @@ class JointedBlock(Block):
       where: As in `put`.
 
     Returns:
-      Coordinate that the block got, `(...)`, in m; `along` itself if no block
-      was in the way of an obstacle.
+      Coordinate that the block got, `(...)`, in m; `along` itself if nothing
+      was in the way.
     """
     position = self.position(physics)
     if not axes.everywhere(self._surroundings.are_far(physics, position)):

@@ -25,8 +25,6 @@ ENDLESS = 20.0
 # is no obstruction: blocks that were pushed against a wall are slightly inside.
 # From a quarter of its edge length inside, a cube of 1 m left at 15 m/s.
 _TOLERANCE, _DEEPEST = 0.5, 0.05
-# Far from everything in a room, in m.
-_FAR = ENDLESS
 _PARALLEL = 1e-9
 # Distance to an obstacle at which blocks are put, in m.
 _GAP = 1e-6
@@ -171,7 +169,7 @@ class Surroundings:
   def are_far(self, physics: protocols.Physics, position: Any) -> Any:
     """Returns True if no obstacle is near, whatever value is written.
 
-    This test is fast, and true for most blocks that nobody has moved.
+    This test is fast, and returns True for most undisturbed blocks.
 
     Args:
       physics: One world or a batch of worlds.
@@ -212,7 +210,7 @@ class Surroundings:
       return along
     ends = [*(taken[:, 0] - _GAP), *(taken[:, 1] + _GAP)]
     free = [
-        end for end in ends if abs(end) < _FAR and not _is_taken(end, taken)
+        end for end in ends if abs(end) < ENDLESS and not _is_taken(end, taken)
     ]
     return float(min(free, key=lambda end: abs(end - along), default=along))
 
@@ -253,15 +251,15 @@ class Surroundings:
     self._boxes = boxes.only(boxes.is_exact | ~self._are_in_region(boxes))
     self._origin, self._rotation = _pose_of(model, frame)
     if model.body_weldid[frame] != 0:
-      self._origin = np.full(3, _FAR)
+      self._origin = np.full(3, ENDLESS)
     low, high = self._boxes.low - self._radius, self._boxes.high + self._radius
     # The corridor has to be free only where blocks are written.
     is_ahead = (low[:, 0] < self._reach[1]) & (high[:, 0] > self._reach[0])
     low, high = low[is_ahead, 1:], high[is_ahead, 1:]
     self._corridor = np.array([[-np.inf] * 2, [np.inf] * 2])
     for box_low, box_high in zip(low, high, strict=True):
-      # The placement check grants that no box overlaps the region. Most boxes
-      # are therefore on some side of it.
+      # The placement check refuses boxes in the region, so most boxes are on
+      # one side of it.
       gaps = np.stack([self._rest[1:] - box_high, box_low - self._rest[1:]])
       side, axis = np.unravel_index(gaps.argmax(), gaps.shape)
       if side == 0:

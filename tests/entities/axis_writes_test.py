@@ -219,7 +219,7 @@ def test_a_block_written_into_a_barrier_gets_the_nearest_free_place(dof, yaw):
 
 
 def _depth(physics: Any, block: Any) -> float:
-  """Returns how deep a block is inside walls and barriers, in m."""
+  """Returns the depth of a block in walls and barriers, in m."""
   mujoco.mj_forward(physics.model.ptr, physics.data.ptr)
   geom = int(physics.bind(block.geom).element_id)
   deepest = 0.0

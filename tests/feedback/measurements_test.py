@@ -36,7 +36,7 @@ def _start(env: Any, world: int | None) -> None:
 
 
 def _play(env: Any, world: int | None = None) -> list[Any]:
-  """Returns what the meter measures after each step."""
+  """Returns the measurement of the meter after each step."""
   _start(env, world)
   measured = []
   for actions in _actions(3):

@@ -20,6 +20,6 @@ def design(measures: Any, **register: Any) -> dict[str, Any]:
 
 
 def measure(env: Any) -> Any:
-  """Returns what the meter measures now, `(...)`."""
+  """Returns the present measurement of the meter, `(...)`."""
   (write,) = env.mechanism.update_meters(env.physics)
   return write.requested
