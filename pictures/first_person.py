@@ -92,13 +92,12 @@ def world() -> environment.Environment:
 
 def labels(env: environment.Environment, view: views.View) -> list[Label]:
   """Returns the labels, with anchors in the middle of visible objects."""
-  seen = view.pixels()
   kinds = appearance.class_of_geoms(env.physics.model)
 
   def anchors(kind: str) -> np.ndarray:
     """Returns the middles of the visible geoms of a class, `(geoms, 2)`."""
     geoms = np.flatnonzero(kinds == appearance.code(kind))
-    visible = [seen[geom] for geom in geoms.tolist() if geom in seen]
+    visible = view.pixels(geoms.tolist())
     return np.array([np.median(pixels, axis=0) for pixels in visible])
 
   apples = anchors('apple')

@@ -1,5 +1,6 @@
 """Views of a world for people: smooth frames, and places of objects in them."""
 
+from collections.abc import Iterable
 import dataclasses
 from typing import Any, final
 
@@ -82,22 +83,21 @@ class View:
     picture = Image.fromarray(self._camera.render())
     return picture.resize(self._size, Image.Resampling.LANCZOS)
 
-  def pixels(self) -> dict[int, np.ndarray]:
-    """Returns the visible pixels of each geom in the frame.
+  def pixels(self, geoms: Iterable[int]) -> list[np.ndarray]:
+    """Returns the visible pixels of geoms in the frame.
+
+    Args:
+      geoms: Numbers of geoms.
 
     Returns:
-      By the number of the geom, `(pixels, 2)`, as `(x, y)`. Geoms of which less
-      than `_FEWEST` pixels are visible are left out.
+      `(pixels, 2)` each, as `(x, y)`. Geoms of which less than `_FEWEST` pixels
+      are visible are left out.
     """
     self._env.thin_physics.refresh()
     numbers, kinds = np.moveaxis(self._camera.render(segmentation=True), -1, 0)
     numbers = np.where(kinds == mujoco.mjtObj.mjOBJ_GEOM, numbers, -1)
-    seen = {
-        int(number): np.argwhere(numbers == number)[:, ::-1] / _FINER
-        for number in np.unique(numbers[numbers >= 0])
-    }
-    fewest = _FEWEST * _FINER**2
-    return {n: pixels for n, pixels in seen.items() if len(pixels) >= fewest}
+    seen = [np.argwhere(numbers == geom)[:, ::-1] / _FINER for geom in geoms]
+    return [pixels for pixels in seen if len(pixels) >= _FEWEST * _FINER**2]
 
   def place_of(self, point: Any) -> tuple[float, float]:
     """Returns the pixel of a point in a frame of a camera with a pose.
