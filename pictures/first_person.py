@@ -29,6 +29,7 @@ _HALO = [patheffects.withStroke(linewidth=3.5, foreground='white')]
 _POSITION = (1.35, -0.62)
 _HEADING = 2.1
 _PITCH = -0.18
+_KINDS = ('apple', 'pressed_pad', 'door', 'base_block', 'offset_block')
 # Middle of the label of the apples, and the largest distance of an apple that
 # it names, in shares of the width.
 _APPLES = 0.24
@@ -93,11 +94,13 @@ def world() -> environment.Environment:
 def labels(env: environment.Environment, view: views.View) -> list[Label]:
   """Returns the labels, with anchors in the middle of visible objects."""
   kinds = appearance.class_of_geoms(env.physics.model)
+  named = np.isin(kinds, [appearance.code(kind) for kind in _KINDS])
+  seen = view.pixels(np.flatnonzero(named).tolist())
 
   def anchors(kind: str) -> np.ndarray:
     """Returns the middles of the visible geoms of a class, `(geoms, 2)`."""
-    geoms = np.flatnonzero(kinds == appearance.code(kind))
-    visible = view.pixels(geoms.tolist())
+    code = appearance.code(kind)
+    visible = [seen[geom] for geom in seen if kinds[geom] == code]
     return np.array([np.median(pixels, axis=0) for pixels in visible])
 
   apples = anchors('apple')

@@ -83,21 +83,22 @@ class View:
     picture = Image.fromarray(self._camera.render())
     return picture.resize(self._size, Image.Resampling.LANCZOS)
 
-  def pixels(self, geoms: Iterable[int]) -> list[np.ndarray]:
+  def pixels(self, geoms: Iterable[int]) -> dict[int, np.ndarray]:
     """Returns the visible pixels of geoms in the frame.
 
     Args:
       geoms: Numbers of geoms.
 
     Returns:
-      `(pixels, 2)` each, as `(x, y)`. Geoms of which less than `_FEWEST` pixels
-      are visible are left out.
+      By the number of the geom, `(pixels, 2)`, as `(x, y)`. Geoms of which less
+      than `_FEWEST` pixels are visible are left out.
     """
     self._env.thin_physics.refresh()
     numbers, kinds = np.moveaxis(self._camera.render(segmentation=True), -1, 0)
     numbers = np.where(kinds == mujoco.mjtObj.mjOBJ_GEOM, numbers, -1)
-    seen = [np.argwhere(numbers == geom)[:, ::-1] / _FINER for geom in geoms]
-    return [pixels for pixels in seen if len(pixels) >= _FEWEST * _FINER**2]
+    seen = {g: np.argwhere(numbers == g)[:, ::-1] / _FINER for g in geoms}
+    fewest = _FEWEST * _FINER**2
+    return {g: pixels for g, pixels in seen.items() if len(pixels) >= fewest}
 
   def place_of(self, point: Any) -> tuple[float, float]:
     """Returns the pixel of a point in a frame of a camera with a pose.

@@ -121,7 +121,7 @@ def test_the_place_of_a_point_is_where_a_camera_sees_it():
   block = env.physics.bind(env.mechanism.registers['score'].blocks[0].geom)
   pose = views.Pose((-2.0, -3.0, 0.0), 5.0, 30.0, -50.0)
   view = views.View(env, (320, 240), pose)
-  [seen] = view.pixels([int(block.element_id)])
+  [seen] = view.pixels([int(block.element_id)]).values()
   middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
   np.testing.assert_allclose(view.place_of(block.xpos), middle, atol=2.0)
   env.close()
