@@ -74,6 +74,26 @@ def indices(given: Any, num_envs: int) -> np.ndarray:
   return np.array(given)
 
 
+def sources(given: Any, number: int, has_begun: np.ndarray) -> np.ndarray:
+  """Returns the indices of worlds to branch from.
+
+  Args:
+    given: Indices; the same one may occur several times.
+    number: Number of branches.
+    has_begun: True for the worlds that have begun an episode, `(worlds,)`.
+
+  Raises:
+    SpecError: If it is anything else, or a world has not begun an episode.
+  """
+  found = np.array([indices([index], len(has_begun))[0] for index in given])
+  if len(found) != number or not has_begun[found].all():
+    raise errors.SpecError(
+        f'sources: {messages.quote(given)}; allowed are {number} indices of'
+        ' worlds that have begun an episode'
+    )
+  return found
+
+
 def max_steps(given: Any) -> int | None:
   """Returns the number of control steps per episode; `None` for no limit.
 
