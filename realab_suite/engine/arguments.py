@@ -11,6 +11,9 @@ from realab_suite.config import messages
 MAX_ENVS = 2**16
 """Largest number of worlds; more do not fit into the memory of one machine."""
 
+Indices = Sequence[int] | np.ndarray
+"""Indices of worlds in a batch."""
+
 _MAX_THREADS = 1024
 # Numbers in result rows have 64 bits.
 _LARGEST = 2**63 - 1
@@ -85,7 +88,8 @@ def sources(given: Any, number: int, has_begun: np.ndarray) -> np.ndarray:
   Raises:
     SpecError: If it is anything else, or a world has not begun an episode.
   """
-  found = np.array([indices([index], len(has_begun))[0] for index in given])
+  indices(list(dict.fromkeys(given)), len(has_begun))
+  found = np.array(given)
   if len(found) != number or not has_begun[found].all():
     raise errors.SpecError(
         f'sources: {messages.quote(given)}; allowed are {number} indices of'

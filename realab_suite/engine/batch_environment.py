@@ -316,7 +316,9 @@ class BatchEnvironment:
     saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
     self._put(saved, indices)
 
-  def branch(self, sources: Sequence[int], worlds: Sequence[int]) -> None:
+  def branch(
+      self, sources: arguments.Indices, worlds: arguments.Indices
+  ) -> None:
     """Sets worlds to the present states of other worlds, bit for bit.
 
     This is like `restore`, without the cost of a snapshot. Where the episode of

@@ -75,7 +75,7 @@ def test_wrong_branches_are_refused():
   with pytest.raises(errors.SpecError, match=r'sources: \[0\]; allowed are 1'):
     batch.branch([0], [1])
   batch.reset()
-  with pytest.raises(errors.SpecError, match='sources: .* allowed are 2'):
+  with pytest.raises(errors.SpecError, match=r'sources: .* allowed are 2'):
     batch.branch([0], [1, 2])
   with pytest.raises(errors.SpecError, match=r'worlds: \[3\]; allowed'):
     batch.branch([3], [1])
