@@ -321,9 +321,8 @@ class BatchEnvironment:
   ) -> None:
     """Sets worlds to the present states of other worlds, bit for bit.
 
-    This is like `restore`, without the cost of a snapshot. Where the episode of
-    a source has ended, its branch continues the physics of that episode instead
-    of beginning the next one. Worlds can be their own sources.
+    This is a faster `restore`. Where the episode of a source has ended, its
+    branch continues that physics instead of beginning the next episode.
 
     Args:
       sources: Index of the source of each world.
