@@ -21,7 +21,8 @@ class Disturbed(base.Task):
     super().__init__(arenas.OpenRoom(), base.variation('standard'))
     model = self._arena.mjcf_model
     self._joint: Any = None
-    if disturbance == 'ball':
+    self._is_impatient = disturbance == 'ball, impatient'
+    if disturbance.startswith('ball'):
       body = model.worldbody.add('body', name='ball', pos=(0.2, -2.2, 0.2))
       body.add('geom', type='sphere', size=(0.2,), mass=20.0)
       self._joint = body.add('freejoint')
@@ -46,6 +47,12 @@ class Disturbed(base.Task):
     if self._joint is not None:
       speed = random_state.uniform(2.0, 3.0)
       physics.bind((self._joint,)).qvel = [speed, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+  def should_terminate_episode(self, physics: Any) -> Any:
+    """Ends episodes of avatars that do not turn, in one of the worlds."""
+    rate = self._avatar.velocity(physics)[..., 2]
+    is_late = np.asarray(physics.data.time) > 0.95
+    return is_late & (np.abs(rate) < 1.0) & self._is_impatient
 
   def latch_events(self, physics: Any) -> None:
     pass
