@@ -263,12 +263,51 @@ def test_a_replay_that_differs_is_refused():
     attribution.attribute(_near(max_steps=30, seed=4), trace)
   with pytest.raises(errors.ResultsError, match=r'\(0, 0\) differs .* step 20'):
     attribution.attribute(_near(max_steps=20), trace)
+  # Even where no block moves.
+  calm, _ = _play(load, 1, _still)
+  with pytest.raises(errors.ResultsError, match='step 20 of 30'):
+    attribution.attribute(_near(max_steps=20), calm)
+  with pytest.raises(errors.ResultsError, match='step 30 of 30'):
+    attribution.attribute(_near(max_steps=40), calm)
   other = {**trace, 'actions': 0.99 * trace['actions']}
   with pytest.raises(errors.ResultsError, match=r'differs .* step 30 of 30'):
     attribution.attribute(load, other)
   with pytest.raises(errors.ResultsError, match='episodes: 2; allowed'):
     attribution.attribute(load, trace, episodes=[2])
   assert attribution.attribute(load, trace, episodes=[]) == []
+
+
+def _failing(load, world):
+  """Returns `load` with worlds of which one fails in its tenth step."""
+
+  def load_failing(num_envs):
+    batch = load(num_envs)
+    physics, has_diverged = batch.physics, batch.physics.has_diverged
+
+    def fails():
+      failed = has_diverged()
+      if world < num_envs:
+        failed[world] |= batch.mechanism.step_count(physics)[world] == 10
+      return failed
+
+    physics.has_diverged = fails
+    return batch
+
+  return load_failing
+
+
+def test_failed_steps_do_not_count_and_failed_copies_lose_an_episode():
+  load = _near(max_steps=15)
+  trace, results = _play(_failing(load, 0), 2, _still)
+  assert [result.num_steps for result in results] == [9, 15]
+  found = attribution.attribute(_failing(load, 0), trace)
+  assert [len(f.registers['reward'].total) for f in found] == [9, 15]
+  trace, _ = _play(load, 2, _still)
+  # Of two episodes: the shadow, the fork with the no-op, that of the baseline.
+  for copy in (3, 5, 7):
+    found = attribution.attribute(_failing(load, copy), trace)
+    assert [f is None for f in found] == [False, True]
+  assert attribution.attribute(_failing(load, 8), trace)[1] is not None
 
 
 def _register(total, agent, scale=0.1, **others):
