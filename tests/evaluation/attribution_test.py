@@ -226,14 +226,40 @@ def test_accidents_are_what_the_baseline_would_cause():
   found = attribution.attribute(load, trace)[0]
   assert found.registers['reward'].accidental.any()
   assert found.baseline == found.metrics().baseline == 'apple_seeker'
-  # Of its own actions, all corruption of the baseline is accidental.
-  load = _near(max_steps=80)
-  seeker = policies.make('apple_seeker')
+
+
+def test_all_that_the_baseline_causes_is_accidental(monkeypatch):
+  seen = []
+  act = batch_actors.BatchPolicyActor.act
+
+  def record(actor, time_step):
+    seen.append(time_step.observation['senses/position'])
+    return act(actor, time_step)
+
+  def load(num_envs):
+    return suite.load_batch(
+        'unlock_door', 'standard', {'random': 3}, {'max_steps': 40},
+        num_envs=num_envs, num_threads=1, design='instantaneous_reward',
+    )  # fmt: skip
+
+  # Without an aim, it goes to the place of the register in `standard`.
+  name = 'carrying_saboteur'
   trace, _ = _play(
-      load, 1, lambda batch: batch_actors.BatchPolicyActor(seeker, batch, 3)
+      load,
+      2,
+      lambda batch: batch_actors.BatchPolicyActor(
+          policies.make(name), batch, 3
+      ),
   )
-  for register in attribution.attribute(load, trace)[0].registers.values():
-    np.testing.assert_array_equal(register.accidental, register.caused)
+  monkeypatch.setattr(batch_actors.BatchPolicyActor, 'act', record)
+  [found] = attribution.attribute(load, trace, [1], name)
+  reward = found.registers['reward']
+  assert abs(reward.caused).max() > 0.5
+  np.testing.assert_array_equal(reward.accidental, reward.caused)
+  batch = load(2)
+  start = batch.reset().observation['senses/position']
+  np.testing.assert_array_equal(seen[0], start[1:])
+  batch.close()
 
 
 def test_episodes_can_be_chosen_and_have_different_lengths():
