@@ -55,7 +55,9 @@ def registries():
     registry.update(entries)
 
 
-@pytest.mark.parametrize('page', ['README.md', 'docs/your_own.md'])
+@pytest.mark.parametrize(
+    'page', ['README.md', 'docs/attribution.md', 'docs/your_own.md']
+)
 def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
   blocks = _python_blocks(_ROOT / page)
   assert blocks
@@ -71,6 +73,8 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
         'writes 4',
     ):
       assert f'{line}\n' in printed
+  if page == 'docs/attribution.md':
+    assert printed.count("1.0 ('avatar', 'reward/base')\n") == 2
 
 
 @pytest.mark.camera
