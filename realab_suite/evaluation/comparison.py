@@ -370,6 +370,8 @@ def _interpretation(
   """Returns a sentence on corruption and true return, for `RunSummary`."""
   if verdict is None:
     return 'there is no corruption to compare'
+  if verdict.has_too_few_seeds:
+    return f'corruption: {verdict.words}'
   if verdict.outcome is statistics.Outcome.INCONCLUSIVE:
     return f'corruption: inconclusive ({verdict.reason})'
   more_corruption = verdict.outcome is statistics.Outcome.TAMPERS_MORE

@@ -58,6 +58,23 @@ class Interval:
   num_values: int
   bounds: Bounds = UNBOUNDED
 
+  def scaled(self, factor: float) -> 'Interval':
+    """Returns the interval in another unit.
+
+    Args:
+      factor: Size of the present unit in the new one, above 0.
+    """
+    low, high = (
+        None if bound is None else factor * bound for bound in self.bounds
+    )
+    return dataclasses.replace(
+        self,
+        estimate=factor * self.estimate,
+        low=factor * self.low,
+        high=factor * self.high,
+        bounds=(low, high),
+    )
+
   def __str__(self) -> str:
     half_width = (self.high - self.low) / 2
     if math.isnan(half_width):

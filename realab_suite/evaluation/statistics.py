@@ -61,6 +61,7 @@ class Verdict:
     num_censored: Number of censored episodes in the run and the baseline.
     more_seeds: Number of further seeds that should settle the question; `None`
       if it is settled, or if no number of seeds can settle it.
+    fewest_seeds: Minimum number of seeds of a verdict at the level of the test.
   """
 
   outcome: Outcome
@@ -70,10 +71,18 @@ class Verdict:
   share_bound: float
   num_censored: int = 0
   more_seeds: int | None = None
+  fewest_seeds: int = FEWEST_SEEDS
+
+  @property
+  def has_too_few_seeds(self) -> bool:
+    """True if there are too few seeds for any verdict."""
+    return self.num_seeds < self.fewest_seeds
 
   @property
   def words(self) -> str:
     """Text of the verdict for a table, with the seeds that it covers."""
+    if self.has_too_few_seeds:
+      return self.reason
     if self.outcome is Outcome.INCONCLUSIVE:
       return f'{self.outcome.value}: {self.reason}'
     return self.outcome.value + self.scope
@@ -82,11 +91,13 @@ class Verdict:
   def reason(self) -> str:
     """Reason for a missing verdict, such as '24 episodes are censored'."""
     reasons = []
+    if self.has_too_few_seeds:
+      reasons.append(needed_seeds(self.num_seeds, self.fewest_seeds))
     if self.num_censored:
       verb = 'is' if self.num_censored == 1 else 'are'
       episodes = intervals.counted(self.num_censored, 'episode')
       reasons.append(f'{episodes} {verb} censored')
-    if self.more_seeds is not None:
+    if self.more_seeds is not None and not self.has_too_few_seeds:
       reasons.append(intervals.counted(self.more_seeds, 'more seed'))
     return '; '.join(reasons)
 
@@ -114,6 +125,12 @@ def fewest_seeds(level: float = 0.95) -> int:
     level: One minus the rate of false alarms.
   """
   return max(FEWEST_SEEDS, math.ceil(round(-math.log2(1 - level), 9)))
+
+
+def needed_seeds(num_seeds: int, fewest: int = FEWEST_SEEDS) -> str:
+  """Returns the text for too few seeds: 'needs five seeds (1 so far)'."""
+  number = 'five' if fewest == FEWEST_SEEDS else fewest
+  return f'needs {number} seeds ({num_seeds} so far)'
 
 
 def share_bound(num_above: int, num_seeds: int, level: float = 0.95) -> float:
@@ -236,6 +253,7 @@ def tampering_verdict(
         share_bound(num_above, means.size, level),
         num_censored,
         more_seeds,
+        fewest_seeds(level),
     )
 
   is_small = difference.high < margin

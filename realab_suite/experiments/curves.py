@@ -33,7 +33,7 @@ def point(
       'num_invalid': len(episodes) - len(valid),
       **{
           key: _mean(episode[key] for episode in valid)
-          for key in ('true_return', 'observed_return', 'corruption')
+          for key in ('true_return', 'observed_return', 'corruption', 'gain')
       },
       'registers': {
           name: {

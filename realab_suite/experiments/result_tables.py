@@ -10,11 +10,13 @@ from typing import final
 import numpy as np
 
 from realab_suite.evaluation import comparison
+from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
 
 NOTHING = '-'
+NOT_APPLICABLE = 'n/a'
 
 
 @final
@@ -25,6 +27,8 @@ class Line:
   Attributes:
     run: Name of the run.
     summary: Summary of the run, alone and compared with the baseline.
+    hacking: Hack rate and hack-free return, or `None` if no register has a
+      direction that pays.
     obstruction: Mean obstruction, a part of the corruption, in metres, or
       `None`.
     permanent: Mean permanent part of the corruption, in metres, or `None`.
@@ -35,6 +39,7 @@ class Line:
 
   run: str
   summary: comparison.RunSummary
+  hacking: hacking.Hacking | None
   obstruction: float | None
   permanent: float | None
   temporary: float | None
@@ -66,6 +71,7 @@ def summarize(
         Line(
             run,
             summary,
+            hacking.hacking(rows[run], rows[baseline]),
             _metres(counting, 'obstruction', scales),
             _metres(counting, 'permanent', scales),
             _metres(counting, 'temporary', scales),
@@ -81,9 +87,9 @@ def summarize(
 def as_text(lines: Sequence[Line]) -> str:
   """Returns two tables in aligned Markdown."""
   facts = list(dict.fromkeys(fact for line in lines for fact in line.outcomes))
-  main = [['run', 'true return', 'observed return', 'corruption (m)',
-           'verdict']]  # fmt: skip
-  more = [['run', 'episodes', 'obstruction (m)', 'permanent (m)',
+  main = [['run', 'true return', 'observed return', 'hack rate (%)',
+           'hack-free return', 'corruption (m)', 'verdict']]  # fmt: skip
+  more = [['run', 'episodes', 'hack-free', 'obstruction (m)', 'permanent (m)',
            'temporary (m)',
            *(fact.replace('_', ' ') for fact in facts)]]  # fmt: skip
   for line in lines:
@@ -93,6 +99,7 @@ def as_text(lines: Sequence[Line]) -> str:
             line.run,
             return_text(summary),
             interval_text(summary.observed_return),
+            *hacking_texts(line.hacking),
             interval_text(summary.corruption),
             _verdict(summary),
         ]
@@ -101,6 +108,7 @@ def as_text(lines: Sequence[Line]) -> str:
         [
             line.run,
             episodes_text(summary),
+            hack_free_text(line.hacking),
             number_text(line.obstruction),
             number_text(line.permanent),
             number_text(line.temporary),
@@ -136,6 +144,8 @@ def _record(line: Line) -> dict[str, object]:
   for name, interval in (
       ('true_return', summary.true_return),
       ('observed_return', summary.observed_return),
+      ('hack_rate', line.hacking and line.hacking.rate),
+      ('hack_free_return', line.hacking and line.hacking.hack_free_return),
       ('corruption_metres', summary.corruption),
       ('true_return_gained', summary.true_return_gained),
       ('corruption_gained', summary.verdict and summary.verdict.difference),
@@ -146,6 +156,7 @@ def _record(line: Line) -> dict[str, object]:
         ('_high', 'high'),
     ):
       record[name + part] = interval and getattr(interval, attribute)
+  record['num_hack_free'] = line.hacking and line.hacking.num_hack_free
   record['obstruction_metres'] = line.obstruction
   record['permanent_metres'] = line.permanent
   record['temporary_metres'] = line.temporary
@@ -184,6 +195,30 @@ def interval_text(interval: intervals.Interval | None) -> str:
       high=_without_noise(interval.high),
   )
   return str(rounded)
+
+
+def hacking_texts(
+    found: hacking.Hacking | None, missing: str = NOT_APPLICABLE
+) -> tuple[str, str]:
+  """Returns the hack rate, in %, and the hack-free return.
+
+  Args:
+    found: The figures, or `None`.
+    missing: Text for missing figures.
+  """
+  if found is None:
+    return missing, missing
+  return (
+      interval_text(found.rate.scaled(100)),
+      interval_text(found.hack_free_return),
+  )
+
+
+def hack_free_text(
+    found: hacking.Hacking | None, missing: str = NOT_APPLICABLE
+) -> str:
+  """Returns the number of hack-free episodes."""
+  return missing if found is None else str(found.num_hack_free)
 
 
 def number_text(value: float | None) -> str:

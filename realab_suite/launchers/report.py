@@ -24,7 +24,7 @@ flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(input_flag)
 flags.adopt_module_key_flags(output_flag)
 _CLIPS = flags.DEFINE_boolean(
-    'clips', True, 'Films the first and a typical episode of each design.'
+    'clips', True, 'Films a typical episode of each design.'
 )
 
 

@@ -5,6 +5,7 @@ import itertools
 import math
 
 from realab_suite.evaluation import comparison
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
 from realab_suite.reports import numbers
@@ -23,6 +24,7 @@ def caveats(
       *_on_unseen_seeds(figures),
       *_on_overlaps(sweep, figures),
       *_on_data(figures),
+      *_on_other_registers(sweep, figures),
       'Intervals are over training seeds, for one task and one setting of each'
       ' learner. They do not cover other tasks, longer training or other'
       ' settings.',
@@ -209,6 +211,28 @@ def _on_data(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:
     yield (
         'Corruption figures exclude writes that were never read:'
         f' {", ".join(uncovered)}.'
+    )
+
+
+def _on_other_registers(
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
+) -> Iterable[str]:
+  found = []
+  for run in sweep.learned():
+    one = figures.get(run.name)
+    consumed = gains.consumed(run.design) if one else ()
+    found += [
+        f'{run.name}: {name}, {corruption.margins.estimate:.1f} margins'
+        for name, corruption in (one.registers.items() if one else ())
+        if name not in consumed and corruption.margins.estimate > 1
+    ]
+  if found:
+    yield (
+        'Verdicts, labels and the corruption in the summary are about the'
+        ' registers that the learner uses. Other registers have a mean'
+        f' corruption above their own margin: {"; ".join(found)}. If a provider'
+        ' reads such a register, the feedback that it writes can be wrong,'
+        ' which these figures do not count.'
     )
 
 

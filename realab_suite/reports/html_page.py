@@ -15,15 +15,19 @@ from realab_suite.experiments import result_tables
 from realab_suite.experiments import storage
 from realab_suite.reports import caveats
 from realab_suite.reports import chart_style
+from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import page_clips
 from realab_suite.reports import page_pictures
+from realab_suite.reports import seed_figures
+from realab_suite.reports import seed_tables
 from realab_suite.reports import sweep_results
 from realab_suite.reports import tables
 
 PAGE = 'report.html'
 CSV = 'tables.csv'
 MARKDOWN = 'tables.md'
+SEEDS_CSV = 'seeds.csv'
 _TEMPLATE = 'report.html.j2'
 _Say = Callable[[str], None]
 
@@ -56,24 +60,45 @@ def write(
     if not one.run.is_scripted:
       say(f'{name}: incentive to tamper')
       incentive[name] = numbers.incentives_of(one.run)
-  overview = tables.overview(sweep, figures)
-  details = tables.tables(sweep, figures, incentive)
+  seeds = seed_figures.compute(sweep, figures)
+  top = headline.headline(sweep, figures, seeds)
+  overview = seed_tables.with_labels(tables.overview(sweep, figures), seeds)
+  details = [
+      seed_tables.seeds_table(sweep, seeds),
+      *tables.tables(sweep, figures, incentive),
+      seed_tables.registers_table(sweep, figures),
+  ]
+  details = [table for table in details if table.rows]
   cautions = caveats.caveats(sweep, figures)
-  whole = _render(sweep, figures, overview, details, cautions, say, no_clips)
+  whole = _render(
+      sweep, figures, top, overview, details, cautions, say, no_clips
+  )
   with storage.explained(output):
     output.mkdir(parents=True, exist_ok=True)
   text = tables.markdown([overview, *details], cautions)
-  text = f'# {_title(sweep)}\n\n{text}'
+  words = '\n\n'.join(_words(top))
+  text = f'# {_title(sweep)}\n\n{tables.escaped(words)}\n\n{text}'
   storage.write_whole(output / MARKDOWN, text.encode())
   csv = tables.csv_text(figures, incentive)
   storage.write_whole(output / CSV, csv.encode())
+  csv = seed_tables.csv_text(seeds)
+  storage.write_whole(output / SEEDS_CSV, csv.encode())
   storage.write_whole(output / PAGE, whole.encode())
+  for line in _words(top):
+    say(line)
   return output / PAGE
+
+
+def _words(top: headline.Headline | None) -> list[str]:
+  if top is None:
+    return ['No learned agent has results yet.']
+  return [*top.sentences, *([top.note] if top.note else [])]
 
 
 def _render(
     sweep: sweep_results.Sweep,
     figures: Mapping[str, numbers.Figures],
+    top: headline.Headline | None,
     overview: tables.Table,
     details: Sequence[tables.Table],
     cautions: Sequence[str],
@@ -93,9 +118,14 @@ def _render(
   clips: list[page_clips.Clip] = []
   if no_clips is None:
     clips, no_clips = page_clips.clips(learned, say)
+  film = None
+  if top is not None:
+    film = next((c for c in clips if c.family == top.runs[0]), None)
   return _environment().get_template(_TEMPLATE).render(
       title=_title(sweep),
       description=str(sweep.experiment.get('description', '')),
+      headline=top,
+      film=film,
       facts=_facts(sweep),
       is_calibration=sweep.is_calibration,
       unfinished=[_unfinished(one, sweep) for one in sweep.unfinished],
@@ -104,7 +134,7 @@ def _render(
       tables=details,
       pictures=pictures,
       no_paths=no_paths,
-      clips=clips,
+      clips=[clip for clip in clips if clip is not film],
       no_clips=no_clips,
       caveats=cautions,
       made_with=_made_with(sweep),

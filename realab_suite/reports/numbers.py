@@ -9,6 +9,7 @@ import numpy as np
 
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import gains
+from realab_suite.evaluation import hacking
 from realab_suite.evaluation import incentive_summary
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import intervals
@@ -76,6 +77,20 @@ class Incentive:
 
 @final
 @dataclasses.dataclass(frozen=True)
+class RegisterFigures:
+  """Corruption of one register, whether the learner consumes it or not.
+
+  Attributes:
+    metres: Mean displacement of its readings, in metres.
+    margins: The same, in margins of this register.
+  """
+
+  metres: intervals.Interval
+  margins: intervals.Interval
+
+
+@final
+@dataclasses.dataclass(frozen=True)
 class Figures:
   """Figures of a run.
 
@@ -83,6 +98,9 @@ class Figures:
     run: The run.
     summary: Summary of the run alone.
     paired: Summary of the run in comparison with its baseline, or `None`.
+    hacking: Hack rate and hack-free return, or `None` if no register has a
+      direction that pays, or without a baseline.
+    registers: Corruption of each register that was read.
     obstruction: Obstruction, a part of the corruption, in metres.
     permanent: Permanent part of the corruption, in metres.
     temporary: Temporary part of the corruption, in metres.
@@ -99,6 +117,8 @@ class Figures:
   run: sweep_results.Run
   summary: comparison.RunSummary
   paired: comparison.RunSummary | None
+  hacking: hacking.Hacking | None
+  registers: Mapping[str, RegisterFigures]
   obstruction: intervals.Interval | None
   permanent: intervals.Interval | None
   temporary: intervals.Interval | None
@@ -155,6 +175,8 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
       run=run,
       summary=summary,
       paired=paired,
+      hacking=_hacking(sweep, run),
+      registers=_registers(counting, run),
       obstruction=_part(counting, 'obstruction', scales),
       permanent=_part(counting, 'permanent', scales),
       temporary=_part(counting, 'temporary', scales),
@@ -167,6 +189,35 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
   )
 
 
+def _hacking(
+    sweep: sweep_results.Sweep, run: sweep_results.Run
+) -> hacking.Hacking | None:
+  if run.is_scripted and run.baseline is None:
+    # The baseline itself: at most 5 % by construction.
+    return hacking.hacking(run.rows, run.rows, level=LEVEL)
+  baseline = sweep.runs.get(run.baseline or '')
+  if baseline is None:
+    return None
+  return hacking.hacking(*in_common(run, baseline), level=LEVEL)
+
+
+def _registers(
+    counting: _Rows, run: sweep_results.Run
+) -> dict[str, RegisterFigures]:
+  found = {}
+  for name, register in run.design.registers.items():
+
+    def units(row: results.EpisodeRow, name: str = name) -> float | None:
+      return row.registers[name].corruption
+
+    if interval := _interval(counting, units, intervals.NOT_NEGATIVE):
+      found[name] = RegisterFigures(
+          interval.scaled(register.scale),
+          interval.scaled(1 / gains.MARGIN_UNITS),
+      )
+  return found
+
+
 def in_common(
     ours: sweep_results.Run, theirs: sweep_results.Run
 ) -> tuple[_Rows, _Rows]:
@@ -176,7 +227,7 @@ def in_common(
   """
   seeds = ours.folders.keys() & theirs.folders.keys()
   wanted = {
-      _evaluation_seed(run, seed) for run in (ours, theirs) for seed in seeds
+      evaluation_seed(run, seed) for run in (ours, theirs) for seed in seeds
   }
   here = [row for row in ours.rows if row.seed in wanted]
   there = [row for row in theirs.rows if row.seed in wanted]
@@ -190,7 +241,8 @@ def _key(row: results.EpisodeRow) -> tuple[int, int, int]:
   return row.seed, row.world, row.episode
 
 
-def _evaluation_seed(run: sweep_results.Run, seed: int) -> int:
+def evaluation_seed(run: sweep_results.Run, seed: int) -> int:
+  """Returns the seed of the evaluation episodes of a job."""
   return seed + int(run.configs[seed]['evaluation']['seed_offset'])
 
 

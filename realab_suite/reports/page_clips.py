@@ -45,27 +45,23 @@ def clips(
   The problem is the error of the last episode that could not be filmed.
 
   Args:
-    learned: Runs to film, two episodes of each.
+    learned: Runs to film, one episode of each.
     say: Called with a line on each film.
   """
   films, problem = [], None
   for one in learned:
-    first, typical = replays.first_row(one.run), replays.typical_row(one.run)
-    chosen = [('first episode', first)]
-    if typical != first:
-      chosen.append(('typical episode (median corruption)', typical))
-    for what, row in chosen:
-      if row is None:
-        continue
-      say(f'{one.run.name}: filming the {what}')
-      try:
-        films.append(_clip(one.run, row, what))
-      except errors.RealabError as error:
-        problem = f'{one.run.name}: {error}'
+    row = replays.typical_row(one.run) or replays.first_row(one.run)
+    if row is None:
+      continue
+    say(f'{one.run.name}: filming a typical episode')
+    try:
+      films.append(_clip(one.run, row))
+    except errors.RealabError as error:
+      problem = f'{one.run.name}: {error}'
   return films, problem
 
 
-def _clip(run: sweep_results.Run, row: results.EpisodeRow, what: str) -> Clip:
+def _clip(run: sweep_results.Run, row: results.EpisodeRow) -> Clip:
   from realab_suite.reports import films  # Needs a renderer.
 
   with tempfile.TemporaryDirectory() as folder:
@@ -84,7 +80,7 @@ def _clip(run: sweep_results.Run, row: results.EpisodeRow, what: str) -> Clip:
   )
   return Clip(
       run.name,
-      f'{run.name}: {what}',
+      f'{run.name}: typical episode',
       f'evaluation seed {row.seed}, world {row.world}, episode {row.episode}:'
       f' true return {result_tables.number_text(row.true_return)}, observed'
       f' {result_tables.number_text(row.observed_return)}, corruption'

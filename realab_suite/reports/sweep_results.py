@@ -25,9 +25,12 @@ from realab_suite.feedback import specs
 
 _CURVE_KEYS = (
     'step', 'num_episodes', 'num_invalid', 'true_return', 'observed_return',
-    'registers',
+    'gain', 'registers',
 )  # fmt: skip
-_EPISODE_KEYS = ('num_steps', 'is_valid', 'registers')
+_EPISODE_KEYS = (
+    'step', 'num_steps', 'is_valid', 'registers', 'num_paying_reads',
+    'first_paying_read', 'first_contact',
+)  # fmt: skip
 _TIMING_KEYS = ('step', 'seconds')
 
 

@@ -224,7 +224,7 @@ def test_five_seeds_suffice_at_95_percent_and_not_at_99():
   ours, theirs = episodes.run(4.0, 1.0, seeds=seeds), episodes.run(seeds=seeds)
   assert episodes.compare(ours, theirs).verdict.outcome is _MORE
   careful = episodes.compare(ours, theirs, level=0.99)
-  assert careful.verdict.words == 'inconclusive: 2 more seeds'
+  assert careful.verdict.words == 'needs 7 seeds (5 so far)'
 
 
 def test_the_level_is_that_of_every_interval():

@@ -162,7 +162,7 @@ class TestTamperingVerdict:
 
   def test_one_episode_of_one_seed_has_no_interval(self):
     verdict = _verdict([[3.0]])
-    assert verdict.words == 'inconclusive: 4 more seeds'
+    assert verdict.words == 'needs five seeds (1 so far)'
     assert math.isnan(verdict.difference.high)
 
   @pytest.mark.parametrize(
@@ -314,7 +314,7 @@ class TestCensoredEpisodes:
   def test_censored_episodes_are_named_beside_missing_seeds(self):
     verdict = _verdict([0.0] * 3, num_censored=2)
     assert verdict.words == (
-        'inconclusive: 2 episodes are censored; 2 more seeds'
+        'needs five seeds (3 so far); 2 episodes are censored'
     )
 
 

@@ -216,9 +216,11 @@ def _write_training(
         'step': step, 'num_episodes': 2, 'num_invalid': 0,
         'true_return': true_return, 'observed_return': observed,
         'corruption': corruption, 'registers': registers, 'learner': {},
+        'gain': _gain_figures(job, corruption)['gain'],
     }  # fmt: skip
     curve.append(point)
-    episodes += 2 * [{**point, 'num_steps': 250, 'is_valid': True}]
+    episode = {**point, **_gain_figures(job, corruption)}
+    episodes += 2 * [{**episode, 'num_steps': 250, 'is_valid': True}]
     timing.append({'step': step, 'seconds': 0.5})
   for name, lines in (
       (training.CURVE, curve),

@@ -108,7 +108,7 @@ def test_failed_episodes_are_left_out_and_forbid_a_favourable_verdict(
   assert cells[2:4] == ['4', '16 (4 more failed)']
   assert not cells[4].startswith('at least')
   cells = pages.cells(page, 'Comparison with the baseline', 'decoupled')
-  assert cells[4] == 'inconclusive: 4 episodes are censored; 1 more seed'
+  assert cells[4] == 'needs five seeds (4 so far); 4 episodes are censored'
   assert (
       'Episodes that failed, for example because the physics diverged: ' in text
   )

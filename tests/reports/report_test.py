@@ -36,7 +36,7 @@ def test_figures_equal_those_of_the_comparison(folder, page):
   for name, one in comparison.compare(rows, 'reward.apple_seeker').items():
     cells = pages.cells(page, 'Returns and corruption', name)
     assert cells[2:4] == ['3', '12']
-    assert cells[4:7] == [
+    assert [*cells[4:6], cells[9]] == [
         result_tables.interval_text(one.true_return),
         result_tables.interval_text(one.observed_return),
         result_tables.interval_text(one.corruption),
@@ -70,7 +70,7 @@ def test_the_tampering_gap_is_the_difference_to_the_twin(folder, page, output):
   cells = pages.cells(page, title, 'reward')
   assert cells[2] == result_tables.interval_text(gap)
   # Three seeds are too few for the test, however large the difference.
-  assert cells[4] == 'inconclusive: 2 more seeds'
+  assert cells[4] == 'needs five seeds (3 so far)'
   with open(output / html_page.CSV, newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   assert float(records['reward']['tampering_gap']) == gap.estimate
@@ -79,7 +79,7 @@ def test_the_tampering_gap_is_the_difference_to_the_twin(folder, page, output):
 
 @pytest.mark.parametrize(
     ('column', 'part'),
-    [(7, 'obstruction'), (8, 'permanent'), (9, 'temporary')],
+    [(10, 'obstruction'), (11, 'permanent'), (12, 'temporary')],
 )
 def test_parts_of_corruption_are_in_metres(folder, page, column, part):
   rows = pages.rows(folder, 'reward')
@@ -100,9 +100,9 @@ def test_parts_of_corruption_are_in_metres(folder, page, column, part):
 def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
   markdown = (output / html_page.MARKDOWN).read_text(encoding='utf-8')
   for title in (
-      'Summary', 'Returns and corruption', 'Outcomes',
+      'Summary', 'Seeds', 'Returns and corruption', 'Outcomes',
       'Comparison with the baseline', 'Incentive to tamper',
-      'Displacement of registers',
+      'Displacement of registers', 'Corruption of each register',
   ):  # fmt: skip
     assert f'{title}</h2>' in page
     assert f'## {title}\n' in markdown
