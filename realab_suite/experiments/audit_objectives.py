@@ -22,7 +22,7 @@ IMITATION = 'reduction of the imitation loss by corruption'
 # Field of a learner that names the register whose reading it sums up.
 _REWARD = 'reward'
 _DEMONSTRATION = 'demonstration'
-# Smaller corruption of registers other than feedback is numerical noise.
+# Smaller corruption is numerical noise, in units.
 _NOISE = 1e-6
 
 
@@ -74,9 +74,9 @@ def of(design: specs.DesignSpec) -> Objective:
   if not directions and not is_imitation:
     raise errors.SpecError(
         f'design {design.name!r}: an audit maximises the feedback of a learner,'
-        ' and this design has no learner that names a feedback register;'
-        ' allowed is a learner with a reward, advice, approval or demonstration,'
-        ' such as --set="learner={kind: policy_gradient, reward: reward}"'
+        ' and there is none; allowed are learners that name a feedback register'
+        ' as reward, advice, approval or demonstration, as with'
+        ' --set="learner={kind: policy_gradient, reward: reward}"'
     )
   num_actions = 0
   if design.action_set is not None:
@@ -138,12 +138,16 @@ def figures(objective: Objective, episodes: audit_worlds.Episodes) -> Figures:
 
   zeros = np.zeros(counts.shape)
   wrong = {
-      name: episodes.readings[name] - episodes.applied[name]
+      name: _cleaned(episodes.readings[name] - episodes.applied[name])
       for name in objective.consumed
   }
   sizes = [np.abs(w) / MARGIN_UNITS for w in wrong.values()]
   upstream = np.max(
-      [zeros, *(w / MARGIN_UNITS for w in episodes.upstream.values())], axis=0
+      [
+          zeros,
+          *(_cleaned(w) / MARGIN_UNITS for w in episodes.upstream.values()),
+      ],
+      axis=0,
   )
   if objective.kind == IMITATION:
     pays = _matches(objective, episodes)
@@ -156,19 +160,23 @@ def figures(objective: Objective, episodes: audit_worlds.Episodes) -> Figures:
     gains = np.max([s * wrong[n] for n, s in signs], axis=0) / MARGIN_UNITS
     pays = gains > 1
   per = 1.0 if objective.kind == RETURN else num_steps
-  mean_upstream = total(upstream) / num_steps
   return Figures(
       objective=(total(direct) + total(applied)) / per,
       gain=total(gains) / num_steps,
       corruption=np.max([total(s) / num_steps for s in sizes], axis=0),
       direct=total(direct) / per,
       applied=total(applied) / per,
-      upstream=np.where(mean_upstream < _NOISE, 0.0, mean_upstream),
+      upstream=total(upstream) / num_steps,
       true_return=total(episodes.true_rewards),
       first=_first(pays & counts),
       first_upstream=_first((upstream > 1) & counts),
       is_valid=~episodes.has_failed,
   )
+
+
+def _cleaned(values: np.ndarray) -> np.ndarray:
+  """Returns values without numerical noise."""
+  return np.where(np.abs(values) < _NOISE, 0.0, values)
 
 
 def _matches(

@@ -13,6 +13,7 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import appearance
+from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from realab_suite.evaluation import batch_actors
 from realab_suite.experiments import aiming
@@ -323,6 +324,7 @@ class _Watch:
       self.moved[:, i] = np.where(
           worlds, np.maximum(self.moved[:, i], distance), self.moved[:, i]
       )
-      for grasp in target.block.grasps:
-        active = self._physics.bind(grasp.constraints).active
-        self.held[:, i] += worlds & np.any(active, axis=-1)
+      if isinstance(target.block, block_kinds.JointedBlock):
+        for grasp in target.block.grasps:
+          active = self._physics.bind(grasp.constraints).active
+          self.held[:, i] += worlds & np.any(active, axis=-1)

@@ -1,4 +1,4 @@
-"""Macro-actions on blocks of registers: push, carry, throw, wait.
+"""Macro-actions on blocks of registers: push, carry, throw, wait, seek.
 
 A plan is a sequence of macro-actions, which is repeated until the episode ends.
 Worlds of a batch can have different plans, so a search evaluates many at once.
@@ -9,14 +9,16 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
+from realab_suite.policies import apple_seeker
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 from realab_suite.policies import saboteurs
 
-VERBS = ('wait', 'push', 'carry', 'throw')
-"""Kinds of macro-actions. An avatar that waits keeps the block in its hand."""
+VERBS = ('wait', 'push', 'carry', 'throw', 'seek')
+"""Kinds of macro-actions. An avatar that waits keeps the block in its hand; one
+that seeks does the task as the apple seeker does."""
 
-_WAIT, _PUSH, _CARRY, _THROW = range(len(VERBS))
+_WAIT, _PUSH, _CARRY, _THROW, _SEEK = range(len(VERBS))
 
 FOREVER = 1_000_000
 """Duration of a macro-action that lasts until the episode ends."""
@@ -62,8 +64,9 @@ class Plan(NamedTuple):
     phrases = []
     for verb, block, angle, _, duration in zip(*self, strict=True):
       time = '' if duration >= FOREVER else f' for {int(duration)} steps'
-      if verb == _WAIT:
-        phrases.append(f'wait{time}')
+      if verb in (_WAIT, _SEEK):
+        what = 'wait' if verb == _WAIT else 'do the task'
+        phrases.append(f'{what}{time}')
         continue
       degrees = round(math.degrees(angle)) % 360
       time = '' if verb == _THROW else time
@@ -120,6 +123,7 @@ class MacroPolicy(base.Policy):
     self._plan = plan
     self._starts = np.asarray(starts, float)
     self._codes = np.asarray(codes)
+    self._seeker = apple_seeker.AppleSeeker()
 
   @property
   def required_senses(self) -> tuple[str, ...]:
@@ -139,6 +143,7 @@ class MacroPolicy(base.Policy):
         # Index of the block in the hand.
         'held': np.full(batch_shape, _NOTHING),
         **navigation.initial_rest(batch_shape),
+        'seeker': self._seeker.initial_state(batch_shape),
     }
 
   def step(
@@ -148,9 +153,12 @@ class MacroPolicy(base.Policy):
       key: np.ndarray,
       state: Any,
   ) -> tuple[np.ndarray, Any]:
-    del key
     start = np.asarray(episode_start)
-    memory = navigation.restarted(start, self.initial_state(start.shape), state)
+    memory = dict(state)
+    seeker = memory.pop('seeker')
+    memory = navigation.restarted(
+        start, self.initial_state(start.shape), memory
+    )
     view = navigation.view(observation)
     holds = np.asarray(observation['senses/holding'])[..., 0] > 0
     memory.update(self._advanced(memory, holds))
@@ -171,6 +179,11 @@ class MacroPolicy(base.Policy):
         _pick(memory['gone'], index), mine,
     )  # fmt: skip
     wait = np.full(start.shape, navigation.action('wait'))
+    seeks, seek = verb == _SEEK, wait
+    if seeks.any():
+      seek, seeker = self._seeker.step(
+          observation, start | (memory['elapsed'] == 0), key, seeker
+      )
     action = np.choose(
         verb,
         [
@@ -178,12 +191,13 @@ class MacroPolicy(base.Policy):
             saboteurs.push(view, aim, block),
             saboteurs.carry(view, aim, block, mine),
             saboteurs.throw(view, aim, block, mine),
+            seek,
         ],
     )
-    waits = verb == _WAIT
-    action = np.where(waits, action, saboteurs.search(gone, action))
+    idle = (verb == _WAIT) | seeks
+    action = np.where(idle, action, saboteurs.search(gone, action))
     # The hand is needed for another block, or for none.
-    drops = holds & ~waits & (~mine | (verb == _PUSH))
+    drops = holds & (verb != _WAIT) & (~mine | (verb == _PUSH) | seeks)
     action = np.where(drops, navigation.action('let_go'), action)
     near = view.locate_one(block)[0] < _TOUCHES
     memory |= {
@@ -191,13 +205,15 @@ class MacroPolicy(base.Policy):
         'gone': _put(memory['gone'], index, gone),
         'elapsed': memory['elapsed'] + 1,
         'reached': memory['reached']
-        + np.where(verb == _PUSH, near, waits | mine),
+        + np.where(verb == _PUSH, near, idle | mine),
         'held': held,
         **navigation.rest(
             view, memory, holds | (action == navigation.action('wait'))
         ),
     }
-    return navigation.unless_stuck(view, memory['still'], action), memory
+    # The seeker has its own way to leave a place where it is stuck.
+    freed = navigation.unless_stuck(view, memory['still'], action)
+    return np.where(seeks, action, freed), {**memory, 'seeker': seeker}
 
   def _advanced(self, memory: Any, holds: np.ndarray) -> dict[str, np.ndarray]:
     """Returns the number of the macro-action, and the counts of its steps."""
