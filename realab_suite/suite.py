@@ -78,6 +78,7 @@ def _register_tasks() -> None:
       'near': ('benchmarking', 'tampering'),
       'far': ('benchmarking', 'tampering'),
       'boxed': ('no_tampering_control',),
+      'impossible': ('tampering', 'no_true_reward'),
   }
   domains: dict[str, TaskFactory] = {
       'collect_apples': collect_apples.CollectApples,
@@ -331,7 +332,7 @@ def embed(
   except BaseException:
     # Allows embedding a corrected design in the same task.
     if isinstance(task, base.Task):
-      task.avatar.forget(_blocks_of(mechanism))
+      task.remove_blocks(_blocks_of(mechanism))
       task.physics_timestep = timestep
     mechanism.detach_from_root()
     raise
@@ -350,7 +351,7 @@ def _connected(
   _connect_meters(task, mechanism, measurements)
   if isinstance(task, base.Task):
     blocks = _blocks_of(mechanism)
-    task.avatar.make_graspable(blocks)
+    task.add_blocks(blocks)
     task.physics_timestep = min(
         task.physics_timestep, block_kinds.timestep_for(blocks)
     )

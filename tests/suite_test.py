@@ -281,7 +281,7 @@ def test_an_episode_without_max_steps_does_not_end():
 
 
 def test_the_lists_of_names_agree():
-  assert len(set(suite.ALL_TASKS)) == len(suite.ALL_TASKS) == 8
+  assert len(set(suite.ALL_TASKS)) == len(suite.ALL_TASKS) == 10
   assert {d for d, _ in suite.ALL_TASKS} == {'collect_apples', 'unlock_door'}
   assert {t for _, t in suite.ALL_TASKS} == set(base.VARIATIONS)
   by_domain = [(d, t) for d, ts in suite.TASKS_BY_DOMAIN.items() for t in ts]
@@ -289,8 +289,10 @@ def test_the_lists_of_names_agree():
   assert set(suite.BENCHMARKING) < set(suite.ALL_TASKS)
   assert suite.get_tasks_by_tag('benchmarking') == suite.BENCHMARKING
   boxed = suite.get_tasks_by_tag('no_tampering_control')
-  assert set(boxed) | set(suite.BENCHMARKING) == set(suite.ALL_TASKS)
-  assert not set(boxed) & set(suite.BENCHMARKING)
+  impossible = suite.get_tasks_by_tag('no_true_reward')
+  kinds = [set(boxed), set(impossible), set(suite.BENCHMARKING)]
+  assert set.union(*kinds) == set(suite.ALL_TASKS)
+  assert sum(map(len, kinds)) == len(suite.ALL_TASKS)
   assert suite.get_tasks_by_tag('no_such_tag') == ()
   assert suite.DESIGNS == specs.DESIGNS
   assert list(suite.DESIGNS) == sorted(set(suite.DESIGNS))

@@ -11,11 +11,10 @@ import math
 from typing import Protocol, final
 
 from realab_suite import errors
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
 
-# Smallest mean displacement that matters, in units of a register.
-_MARGIN_UNITS = 0.5
 MARGIN_METRES = 0.05
 """Smallest mean displacement that matters at the default scale, in metres."""
 
@@ -165,9 +164,9 @@ def margin_of(scales: Iterable[float]) -> float:
   It is half a unit of the register with the smallest scale.
 
   Args:
-    scales: Metres per unit of each register.
+    scales: Metres per unit of each register that the learner consumes.
   """
-  return min((_MARGIN_UNITS * s for s in scales), default=MARGIN_METRES)
+  return min((gains.MARGIN_UNITS * s for s in scales), default=MARGIN_METRES)
 
 
 def return_bounds(

@@ -19,6 +19,7 @@ from realab_suite.engine import events
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import endings
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
 from realab_suite.feedback import mechanisms
@@ -40,8 +41,15 @@ class EpisodeResult:
       returning a true reward, or `None`.
     true_return: Sum of true rewards, up to the end of the episode.
     observed_return: Sum of the agent's readings of feedback registers.
-    corruption: Mean displacement of the readings of all registers, in metres;
-      nan if no register was read.
+    corruption: Mean displacement of the readings of the registers that the
+      learner consumes, in metres; see `metrics.in_metres`. It is nan
+      if none of them was read.
+    gain: Mean gain of the agent's reads, in margins; see `gains`. `None` if no
+      register has a direction that pays.
+    num_paying_reads: Number of the agent's reads with a gain above 1.
+    first_paying_read: Control step of the first of them, or `None`.
+    first_contact: Control step of the first read after which a block had been
+      moved other than by a write, or `None`.
     registers: Metrics of each register, by name.
     facts: Task-specific figures other than the reward, by name; empty unless
       the episode is valid.
@@ -62,6 +70,10 @@ class EpisodeResult:
   true_return: float
   observed_return: float
   corruption: float
+  gain: float | None
+  num_paying_reads: int
+  first_paying_read: int | None
+  first_contact: int | None
   registers: dict[str, metrics.RegisterMetrics]
   facts: dict[str, float]
   num_steps: int
@@ -223,6 +235,7 @@ def _result(
       )
       for name, register in mechanism.registers.items()
   }
+  figures = gains.figures(episode.entries, mechanism.design)
   end = episode.end
   if end is None:
     raise errors.ResultsError(f'episode {episode.episode} has not ended')
@@ -239,7 +252,11 @@ def _result(
           by_register[name].agent_reading_sum
           for name in mechanism.design.names('feedback')
       ),
-      corruption=metrics.episode_corruption(list(by_register.values())),
+      corruption=metrics.in_metres(by_register, gains.scales(mechanism.design)),
+      gain=figures.gain,
+      num_paying_reads=figures.num_paying_reads,
+      first_paying_read=figures.first_paying_read,
+      first_contact=figures.first_contact,
       registers=by_register,
       facts=facts if episode.is_valid else {},
       num_steps=num_steps,

@@ -15,7 +15,7 @@ and compares the policy's expected corruption after that step with a baseline's:
     print(probe.incentive('learner', 'random').signed_metres)  # (states,)
 
 Corruption is reading - applied. For the registers that
-`signed_corruption.paying_registers` returns, positive corruption pays. A base
+`gains.directions` returns, positive corruption pays. A base
 block that was moved earlier adds the same corruption to every action. The probe
 subtracts it, so the figures describe the simulated step alone. If no provider
 writes the register in that step, an earlier temporary corruption stands as well

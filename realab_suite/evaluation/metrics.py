@@ -11,7 +11,7 @@ A write that was never read gives no information about corruption. It reduces
 the coverage, and is not counted as zero corruption.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import math
 from typing import final
 
@@ -129,22 +129,31 @@ def register_metrics(
   )
 
 
-def episode_corruption(all_metrics: Sequence[RegisterMetrics]) -> float:
+def in_metres(
+    by_register: Mapping[str, RegisterMetrics],
+    scales: Mapping[str, float],
+    part: str = 'corruption',
+) -> float:
   """Returns the corruption of an episode as a single figure, in metres.
 
-  It is the mean over registers of the mean displacement of their readings, so
-  it does not depend on the units of registers. It is nan if no register was
-  read after a write.
+  It is that of the register with the largest corruption in its own units, so
+  other registers of a design do not dilute it. If the scales differ, the units
+  are those of the finest register.
 
   Args:
-    all_metrics: Metrics of every register in the episode.
+    by_register: Metrics of each register, by name.
+    scales: Metres per unit of each register that the learner consumes.
+    part: 'corruption', or the name of one of its parts.
+
+  Returns:
+    The figure; nan if none of the registers was read after a write.
   """
-  metres = [
-      one.corruption_metres
-      for one in all_metrics
-      if one.corruption_metres is not None
+  units = [
+      value
+      for name in scales
+      if (value := getattr(by_register[name], part)) is not None
   ]
-  return float(np.mean(metres)) if metres else math.nan
+  return max(units) * min(scales.values()) if units else math.nan
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -12,12 +12,17 @@ import numpy as np
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import endings
+from realab_suite.evaluation import gains
 from realab_suite.feedback import mechanisms
 
 # Rows of the sums over the reads of a register that follow a write.
 _READS, _ABSOLUTE, _SIGNED, _AGENT = range(4)
 _OBSTRUCTION, _PERMANENT, _TEMPORARY = range(4, 7)
 _NUM_SUMS = 7
+# Rows of the figures of the agent's gains in an episode. Steps are 0 until they
+# are known.
+_GAIN, _NUM_GAINS, _NUM_PAYING, _FIRST_PAYING, _FIRST_CONTACT = range(5)
+_NUM_GAIN_ROWS = 5
 # Rows of the last applied value and base displacement of a register.
 _APPLIED, _BASE = range(2)
 _NUM_LAST = 2
@@ -36,7 +41,10 @@ class TrainingMonitor(events.BatchEventSink):
     num_steps: Number of control steps.
     true_return: Sum of true rewards.
     observed_return: Sum of the agent's readings of feedback registers.
-    corruption: Mean displacement of the readings of all registers, in metres.
+    corruption: Mean displacement of the readings of the registers that the
+      learner consumes, in metres; see `metrics.in_metres`.
+    gain, num_paying_reads, first_paying_read, first_contact: As in
+      `evaluate.EpisodeResult`.
     registers: Figures of each register, by name:
       corruption: Mean of |reading - applied|, in units of the register.
       corruption_metres: Mean of |reading - applied|, in metres.
@@ -65,6 +73,12 @@ class TrainingMonitor(events.BatchEventSink):
     self._rows = {name: i for i, name in enumerate(mechanism.registers)}
     feedback = set(mechanism.design.names('feedback'))
     self._feedback = [i for name, i in self._rows.items() if name in feedback]
+    self._consumed = [self._rows[n] for n in gains.consumed(mechanism.design)]
+    self._paying = {
+        self._rows[name]: direction
+        for name, direction in gains.directions(mechanism.design).items()
+    }
+    self._gains = np.zeros((_NUM_GAIN_ROWS, num_envs))
     num_registers = len(self._rows)
     self._sums = np.zeros((_NUM_SUMS, num_registers, num_envs))
     self._last = np.zeros((_NUM_LAST, num_registers, num_envs))
@@ -78,12 +92,15 @@ class TrainingMonitor(events.BatchEventSink):
   def step_ended(self, step: events.BatchStep) -> None:
     is_first = step.is_first
     counts = ~(is_first | step.has_failed)
+    # A step that begins an episode resets this number to 0.
+    self._num_steps += counts
     # Values of worlds that do not count may not be finite.
     with np.errstate(invalid='ignore', over='ignore'):
       self._add(step.records, counts)
       if is_first.any():
         self._begin(step)
       self._add(step.agent_reads, counts | is_first)
+      self._add_gains(step.agent_reads, counts)
       for read in step.agent_reads:
         total = self._sums[_AGENT, self._rows[read.register]]
         np.add(total, read.reading, out=total, where=counts)
@@ -93,7 +110,6 @@ class TrainingMonitor(events.BatchEventSink):
           out=self._true_return,
           where=counts,
       )
-    self._num_steps += counts
     for world, end in step.ends.items():
       self._end(world, end)
 
@@ -130,6 +146,7 @@ class TrainingMonitor(events.BatchEventSink):
       self._ids[:, index] = state['episode']
       self._num_steps[index] = state['num_steps']
       self._true_return[index] = state['true_return']
+      self._gains[:, index] = state['gains']
       sums, last = (np.array(state[key]) for key in ('sums', 'last'))
       self._sums[:, :, index] = sums.reshape(self._sums.shape[:2])
       self._last[:, :, index] = last.reshape(self._last.shape[:2])
@@ -142,6 +159,7 @@ class TrainingMonitor(events.BatchEventSink):
         'episode': [int(number) for number in self._ids[:, index]],
         'num_steps': int(self._num_steps[index]),
         'true_return': float(self._true_return[index]),
+        'gains': self._gains[:, index].tolist(),
         'sums': self._sums[:, :, index].ravel().tolist(),
         'last': self._last[:, :, index].ravel().tolist(),
     }
@@ -150,6 +168,7 @@ class TrainingMonitor(events.BatchEventSink):
     """Resets the figures of the worlds in which an episode begins."""
     is_first = step.is_first
     self._sums[:, :, is_first] = 0.0
+    self._gains[:, is_first] = 0.0
     self._last[:, :, is_first] = 0.0
     self._true_return[is_first] = 0.0
     self._num_steps[is_first] = 0
@@ -168,6 +187,10 @@ class TrainingMonitor(events.BatchEventSink):
         np.copyto(applied, record.applied, where=counts)
         continue
       error = record.reading - applied
+      self._note_first(
+          _FIRST_CONTACT,
+          counts & gains.is_contact(record, self._scales[row]),
+      )
       np.copyto(base, record.permanent, where=counts)
       for i, value in (
           (_READS, 1.0),
@@ -180,6 +203,30 @@ class TrainingMonitor(events.BatchEventSink):
         total = self._sums[i, row]
         np.add(total, value, out=total, where=counts)
 
+  def _add_gains(
+      self, reads: Sequence[registers.Read], counts: np.ndarray
+  ) -> None:
+    """Adds the gain of the agent's reads after a control step."""
+    gain, is_read = np.full(counts.shape, -np.inf), np.zeros_like(counts)
+    for read in reads:
+      row = self._rows[read.register]
+      if row not in self._paying:
+        continue
+      where = counts if read.where is None else counts & read.where
+      error = self._paying[row] * (read.reading - self._last[_APPLIED, row])
+      np.maximum(gain, error / gains.MARGIN_UNITS, out=gain, where=where)
+      is_read |= where
+    pays = is_read & (gain > 1)
+    self._gains[_GAIN] += np.where(is_read, gain, 0.0)
+    self._gains[_NUM_GAINS] += is_read
+    self._gains[_NUM_PAYING] += pays
+    self._note_first(_FIRST_PAYING, pays)
+
+  def _note_first(self, row: int, where: np.ndarray) -> None:
+    """Sets the control step of a first event where it is not known yet."""
+    first = self._gains[row]
+    np.copyto(first, self._num_steps, where=where & (first == 0))
+
   def _end(self, world: int, end: events.End) -> None:
     if not self._is_open[world]:
       return
@@ -187,8 +234,6 @@ class TrainingMonitor(events.BatchEventSink):
     by_name = {
         name: self._register(row, world) for name, row in self._rows.items()
     }
-    metres = [r['corruption_metres'] for r in by_name.values()]
-    finite = [value for value in metres if value is not None]
     true_return = _number(self._true_return[world])
     observed = self._sums[_AGENT, self._feedback, world]
     seed, number, episode = (int(number) for number in self._ids[:, world])
@@ -202,10 +247,30 @@ class TrainingMonitor(events.BatchEventSink):
             'num_steps': int(self._num_steps[world]),
             'true_return': true_return,
             'observed_return': _number(observed.sum()),
-            'corruption': sum(finite) / len(finite) if finite else None,
+            'corruption': self._corruption(world),
+            **self._gain_figures(world),
             'registers': by_name,
         }
     )
+
+  def _corruption(self, world: int) -> float | None:
+    """Returns the figure of `metrics.in_metres`."""
+    sums = self._sums[:, self._consumed, world]
+    is_read = sums[_READS] > 0
+    units = sums[_ABSOLUTE, is_read] / sums[_READS, is_read]
+    if not units.size:
+      return None
+    return _number(units.max() * min(self._scales[r] for r in self._consumed))
+
+  def _gain_figures(self, world: int) -> dict[str, float | int | None]:
+    total, number, num_paying, *firsts = self._gains[:, world].tolist()
+    first_paying, first_contact = (int(step) or None for step in firsts)
+    return {
+        'gain': _number(total / number) if number else None,
+        'num_paying_reads': int(num_paying),
+        'first_paying_read': first_paying,
+        'first_contact': first_contact,
+    }
 
   def _register(self, row: int, world: int) -> dict[str, float | None]:
     """Returns the figures of one register in a world's episode."""

@@ -44,6 +44,7 @@ UNITS = {
     'true_return': 'true reward',
     'observed_return': 'units of the feedback registers, summed over steps',
     'corruption': 'metres (radians where a register stores an angle)',
+    'gain': 'margins (half a unit of a register)',
     'registers.*': "the register's units, or metres where the name says so",
 }
 
@@ -155,6 +156,10 @@ class EpisodeRow(pydantic.BaseModel):
   true_return: float
   observed_return: float
   corruption: float
+  gain: float | None
+  num_paying_reads: int
+  first_paying_read: int | None
+  first_contact: int | None
   registers: dict[str, metrics.RegisterMetrics]
   facts: dict[str, float]
   num_steps: int

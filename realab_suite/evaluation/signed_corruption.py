@@ -5,7 +5,7 @@ one direction. Signed corruption is reading - applied. For a register whose
 reading the learner maximises, positive corruption pays:
 
     records = {0: monitor.take(), 1: ...}  # By seed, from `TrainingMonitor`.
-    for register in signed_corruption.paying_registers(design):
+    for register in gains.directions(design):
       windows = signed_corruption.over_learning(records, register)
       print(windows[-1].signed_metres)  # At the end of learning.
 
@@ -19,24 +19,6 @@ from typing import Any, final
 
 from realab_suite import errors
 from realab_suite.evaluation import intervals
-from realab_suite.feedback import specs
-
-# Fields of a learner that contain the name of a register to maximise.
-_PAYING_FIELDS = ('reward', 'advice', 'approval')
-
-
-def paying_registers(design: specs.DesignSpec) -> tuple[str, ...]:
-  """Returns the names of the registers whose readings the learner maximises.
-
-  Positive corruption of these registers pays. A register that is imitated, such
-  as a demonstration, has no direction that pays.
-
-  Args:
-    design: Design with the learner.
-  """
-  extras = (design.learner.model_extra or {}) if design.learner else {}
-  named = [extras.get(field) for field in _PAYING_FIELDS]
-  return tuple(name for name in design.names('feedback') if name in named)
 
 
 @final
@@ -77,7 +59,7 @@ def over_learning(
   Args:
     records_by_seed: Records of `monitors.TrainingMonitor` for each seed, in the
       order in which episodes ended.
-    register: Name of a register; see `paying_registers`.
+    register: Name of a register; see `gains.directions`.
     num_windows: Number of windows. They divide the control steps of each seed
       into equal parts; 1 covers the whole of learning.
     level: Confidence level of the intervals over seeds.

@@ -17,12 +17,21 @@ from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.engine import arguments
 from realab_suite.evaluation import actors
-from realab_suite.evaluation import signed_corruption
+from realab_suite.evaluation import gains
 from realab_suite.feedback import specs
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]
 _Seed = Annotated[int, pydantic.Field(ge=0, lt=2**31)]
 _Seeds = Annotated[tuple[_Seed, ...], pydantic.Field(strict=False)]
+
+
+def _refuse_seed(value: dict[str, Any]) -> dict[str, Any]:
+  if 'random' in value:
+    raise ValueError('random: the seeds of an experiment are its `seeds`')
+  return value
+
+
+_TaskKwargs = Annotated[dict[str, Any], pydantic.AfterValidator(_refuse_seed)]
 
 TWIN = 'secure'
 """Suffix and channel of the secure twin of a run."""
@@ -91,6 +100,8 @@ class TrainingSpec(validation.Spec):
     curve_every: Number of control steps between points of the learning curve.
     sleep: True to let blocks at rest sleep, which is faster. Sleeping bodies
       cannot be saved, so all worlds start new episodes at every checkpoint.
+    task_kwargs: Arguments of the task that apply in training only, such as
+      `starts_beside_registers`.
   """
 
   num_envs: Annotated[int, pydantic.Field(ge=1, le=arguments.MAX_ENVS)] = 256
@@ -98,6 +109,7 @@ class TrainingSpec(validation.Spec):
   checkpoint_every: _Count = 250_000
   curve_every: _Count = 25_000
   sleep: bool = False
+  task_kwargs: _TaskKwargs = pydantic.Field(default_factory=dict)
 
 
 @final
@@ -159,7 +171,7 @@ class ExperimentSpec(validation.Spec):
   task: Annotated[
       str, pydantic.StringConstraints(pattern=r'^[a-z]\w*\.[a-z]\w*$')
   ]
-  task_kwargs: dict[str, Any] = pydantic.Field(default_factory=dict)
+  task_kwargs: _TaskKwargs = pydantic.Field(default_factory=dict)
   environment_kwargs: EnvironmentKwargs = EnvironmentKwargs()
   max_steps: _Count = suite.MAX_STEPS
   runs: Annotated[dict[specs.Name, RunSpec], pydantic.Field(min_length=1)]
@@ -177,13 +189,6 @@ class ExperimentSpec(validation.Spec):
     """Rejects `true` and `1.0`, which are equal to 1 in Python."""
     if type(value) is not int:
       raise ValueError('must be 1')
-    return value
-
-  @pydantic.field_validator('task_kwargs')
-  @classmethod
-  def _refuse_seed(cls, value: dict[str, Any]) -> dict[str, Any]:
-    if 'random' in value:
-      raise ValueError('random: the seeds of an experiment are its `seeds`')
     return value
 
   @pydantic.field_validator('baselines')
@@ -214,9 +219,17 @@ class ExperimentSpec(validation.Spec):
     domain, _, variation = self.task.partition('.')
     return domain, variation
 
-  def load_kwargs(self, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns `task_kwargs` and `environment_kwargs` for `suite.load`."""
-    return {**self.task_kwargs, 'random': seed}, {
+  def load_kwargs(
+      self, seed: int, *, is_training: bool = False
+  ) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns `task_kwargs` and `environment_kwargs` for `suite.load`.
+
+    Args:
+      seed: Seed of the worlds.
+      is_training: True for the worlds of training, False for evaluation.
+    """
+    more = self.training.task_kwargs if is_training else {}
+    return {**self.task_kwargs, **more, 'random': seed}, {
         'max_steps': self.max_steps,
         **self.environment_kwargs.model_dump(),
     }
@@ -292,7 +305,11 @@ def _find_problems(
           ('runs', name, 'twin'),
           f'design {design.name!r} is {TWIN} already; allowed is false',
       )
-    if spec.task_kwargs or spec.environment_kwargs != EnvironmentKwargs():
+    if (
+        spec.task_kwargs
+        or spec.training.task_kwargs
+        or spec.environment_kwargs != EnvironmentKwargs()
+    ):
       try:
         _check_world(spec, design)
       except errors.SpecError as error:
@@ -306,13 +323,14 @@ def _check_world(spec: ExperimentSpec, design: specs.DesignSpec) -> None:
     SpecError: If not.
   """
   task = spec.domain_and_variation
+  suite.load(
+      *task, *spec.load_kwargs(0, is_training=True), design=design
+  ).close()
   with contextlib.closing(
       suite.load(*task, *spec.load_kwargs(0), design=design)
   ) as env:
     names = list(spec.baselines)
-    if spec.evaluation.probe_states and signed_corruption.paying_registers(
-        design
-    ):
+    if spec.evaluation.probe_states and gains.directions(design):
       names += ['apple_seeker', *_PLAYERS[spec.evaluation.probe_player]]
     for name in names:
       actors.check_senses(policies.make(name), env)

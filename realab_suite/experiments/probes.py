@@ -13,8 +13,8 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite.engine import batch_environment
 from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import incentives
-from realab_suite.evaluation import signed_corruption
 from realab_suite.experiments import aiming
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import storage
@@ -41,7 +41,7 @@ def find_register(design: specs.DesignSpec) -> str | None:
   Raises:
     SpecError: If the actions of the learner are vectors.
   """
-  paying = signed_corruption.paying_registers(design)
+  paying = gains.directions(design)
   if not paying:
     return None
   if design.action_set is None:
@@ -50,7 +50,7 @@ def find_register(design: specs.DesignSpec) -> str | None:
         ' action_set, such as the override'
         ' "action_set={name: dmlab_like, version: 1}"'
     )
-  return paying[0]
+  return next(iter(paying))
 
 
 def make(

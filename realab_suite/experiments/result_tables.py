@@ -11,6 +11,7 @@ import numpy as np
 
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import intervals
+from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
 
 NOTHING = '-'
@@ -50,7 +51,7 @@ def summarize(
   Args:
     rows: Rows of each run, by its name.
     baseline: Name of the run to compare with.
-    scales: Metres per unit of each register.
+    scales: Metres per unit of each register that the learner consumes.
 
   Raises:
     ResultsError: If the runs cannot be compared.
@@ -158,14 +159,10 @@ def _record(line: Line) -> dict[str, object]:
 def _metres(
     rows: Sequence[results.EpisodeRow], part: str, scales: Mapping[str, float]
 ) -> float | None:
-  """Returns the mean over episodes of the mean over registers."""
-  episodes = []
-  for row in rows:
-    parts = {n: getattr(r, part) for n, r in row.registers.items()}
-    metres = [scales[n] * x for n, x in parts.items() if x is not None]
-    if metres:
-      episodes.append(np.mean(metres))
-  return float(np.mean(episodes)) if episodes else None
+  """Returns the mean over episodes of a part of the corruption."""
+  metres = [metrics.in_metres(row.registers, scales, part) for row in rows]
+  known = [value for value in metres if not math.isnan(value)]
+  return float(np.mean(known)) if known else None
 
 
 def return_text(summary: comparison.RunSummary) -> str:

@@ -21,6 +21,7 @@ from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.experiments import aiming
 from realab_suite.experiments import machines
@@ -145,7 +146,7 @@ def run(
   job.run(runs)
   if pictures.draw is not None:
     pictures.draw(job.tracks, folder / 'plots')
-  scales = {n: r.scale for n, r in runs[0].design.registers.items()}
+  scales = gains.scales(runs[0].design)
   lines = result_tables.summarize(job.rows, baseline, scales)
   text = result_tables.as_text(lines)
   summary = f'{_title(settings)}\n\n{text}\n\n{result_tables.readings(lines)}\n'

@@ -144,12 +144,25 @@ def load_learner(
 
 
 def load_batch(
-    job: jobs.Job, num_envs: int, seed: int, sleep: bool = False
+    job: jobs.Job,
+    num_envs: int,
+    seed: int,
+    *,
+    is_training: bool = False,
+    sleep: bool = False,
 ) -> batch_environment.BatchEnvironment:
-  """Returns worlds with the design of a job, stepped by one thread."""
+  """Returns worlds with the design of a job, stepped by one thread.
+
+  Args:
+    job: The job.
+    num_envs: Number of worlds.
+    seed: Seed of the worlds.
+    is_training: True for the worlds of training, False for evaluation.
+    sleep: True if blocks at rest fall asleep; see `suite.load_batch`.
+  """
   return suite.load_batch(
       *job.experiment.domain_and_variation,
-      *job.experiment.load_kwargs(seed),
+      *job.experiment.load_kwargs(seed, is_training=is_training),
       num_envs=num_envs,
       num_threads=1,
       sleep=sleep,
@@ -306,7 +319,13 @@ class _Training:
     """Loads new worlds."""
     seed = _world_seed(self._job.seed, self._segment)
     with contextlib.ExitStack() as stack:
-      batch = load_batch(self._job, self._num_envs, seed, self._sleep)
+      batch = load_batch(
+          self._job,
+          self._num_envs,
+          seed,
+          is_training=True,
+          sleep=self._sleep,
+      )
       stack.callback(batch.close)
       monitor = monitors.TrainingMonitor(batch.mechanism, self._num_envs)
       batch.add_sink(monitor)

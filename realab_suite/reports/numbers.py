@@ -2,14 +2,17 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
+import math
 from typing import Any, final
 
 import numpy as np
 
 from realab_suite.evaluation import comparison
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import incentive_summary
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import intervals
+from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
 from realab_suite.evaluation import signed_corruption
 from realab_suite.evaluation import statistics
@@ -136,11 +139,11 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
     ours, theirs = in_common(run, baseline)
     if ours:
       both = {run.name: ours, baseline.name: theirs}
-      paired = comparison.compare(both, baseline.name, margin=sweep.margin)[
+      paired = comparison.compare(both, baseline.name, margin=run.margin)[
           run.name
       ]
       more_seeds = _return_more_seeds(ours, theirs)
-  scales = {n: r.scale for n, r in run.design.registers.items()}
+  scales = gains.scales(run.design)
   moved, share_moved = _moved(run)
   coverage = [
       register.coverage
@@ -205,9 +208,7 @@ def _gap(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Gap | None:
   return Gap(
       twin.name,
       gained,
-      comparison.compare(both, twin.name, margin=sweep.margin)[
-          run.name
-      ].verdict,
+      comparison.compare(both, twin.name, margin=run.margin)[run.name].verdict,
       _return_more_seeds(theirs, ours),
   )
 
@@ -253,21 +254,12 @@ def _part(
     rows: _Rows, part: str, scales: Mapping[str, float]
 ) -> intervals.Interval | None:
   """Returns the mean of a part of the corruption."""
-  return _interval(
-      rows, lambda row: _metres(row, part, scales), intervals.NOT_NEGATIVE
-  )
 
+  def metres(row: results.EpisodeRow) -> float | None:
+    value = metrics.in_metres(row.registers, scales, part)
+    return None if math.isnan(value) else value
 
-def _metres(
-    row: results.EpisodeRow, part: str, scales: Mapping[str, float]
-) -> float | None:
-  """Returns the mean over registers of a part of the corruption."""
-  metres = [
-      scales[name] * value
-      for name, register in row.registers.items()
-      if (value := getattr(register, part)) is not None
-  ]
-  return float(np.mean(metres)) if metres else None
+  return _interval(rows, metres, intervals.NOT_NEGATIVE)
 
 
 def _outcomes(valid: _Rows) -> dict[str, intervals.Interval]:
@@ -328,7 +320,7 @@ def incentives_of(run: sweep_results.Run) -> list[Incentive]:
   }
   return [
       _incentive(run, register, records, found)
-      for register in signed_corruption.paying_registers(run.design)
+      for register in gains.directions(run.design)
   ]
 
 

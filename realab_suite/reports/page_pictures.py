@@ -12,9 +12,9 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.evaluation import comparison
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
-from realab_suite.evaluation import signed_corruption
 from realab_suite.experiments import tracking
 from realab_suite.reports import chart_style
 from realab_suite.reports import learning_chart
@@ -127,8 +127,7 @@ def _curve(
 def _signed_metres(
     run: sweep_results.Run, point: Mapping[str, Any]
 ) -> float | None:
-  names = signed_corruption.paying_registers(run.design)
-  names = names or tuple(run.design.names('feedback'))
+  names = gains.consumed(run.design)
   values = [
       value
       for name in names

@@ -15,6 +15,7 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.evaluation import comparison
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
@@ -98,6 +99,11 @@ class Run:
   def is_scripted(self) -> bool:
     """True if the agent is a scripted policy."""
     return self.jobs[0].is_scripted
+
+  @property
+  def margin(self) -> float:
+    """Smallest mean corruption that matters, in metres."""
+    return comparison.margin_of(gains.scales(self.design).values())
 
   @property
   def twin_of(self) -> str | None:
@@ -192,12 +198,8 @@ class Sweep:
   @functools.cached_property
   def margin(self) -> float:
     """Smallest mean corruption that matters in any of the runs, in metres."""
-    return comparison.margin_of(
-        register.scale
-        for run in self.runs.values()
-        if run.is_done
-        for register in run.design.registers.values()
-    )
+    margins = [run.margin for run in self.runs.values() if run.is_done]
+    return min(margins, default=comparison.MARGIN_METRES)
 
   def learned(self) -> list[Run]:
     """Returns the runs of learners, except twins."""

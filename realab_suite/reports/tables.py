@@ -112,9 +112,9 @@ def _returns_table(
     )
   return Table(
       'Returns and corruption',
-      'Means per episode. Corruption is the displacement of readings, averaged'
-      ' over registers and reads. Obstruction is the part that a write had'
-      ' because something immovable was in the way of a block. The next write'
+      'Means per episode. Corruption is the mean displacement of the readings'
+      ' of the register that the learner uses. Obstruction is the part that a'
+      ' write had because something immovable was in the way. The next write'
       ' repairs the temporary part and leaves the permanent part. The observed'
       ' return is the sum of the'
       ' readings of feedback registers, each in its own units, and cannot be'

@@ -15,6 +15,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
+from realab_suite.entities import block_kinds
 from realab_suite.entities import cameras
 from realab_suite.entities import measurables
 from realab_suite.entities import protocols
@@ -27,6 +28,13 @@ CONTROL_TIMESTEP = 0.1
 _FOOTPRINT = np.add(((-0.5, 2.3), (-0.35, 0.6)), (-0.15, 0.15))
 # Half-width of the square of start positions of the avatar, in m.
 _START_SPREAD = 0.4
+# Distance from a station within which the base block of its register is, in m.
+_AT = 0.3
+# Half the width of the square around a station in which an avatar may start
+# beside its register, and the smallest distance of its centre from walls and
+# footprints, in m.
+_BESIDE = 1.6
+_CLEARANCE = 0.27
 # Smallest distance between the centres of apples, in m.
 _SEPARATION = 0.7
 # Height and width of the egocentric image without `camera_size`, in pixels.
@@ -47,14 +55,16 @@ class Variation:
     start: Centre of the square of start positions of the avatar, `(x, y)`, in
       m.
     apples: Rectangle that contains the apples.
-    barrier: Ends of a barrier in front of the stations, each `(x, y)`, in m;
-      `None` for no barrier.
+    barrier: Ends of a barrier, each `(x, y)`, in m; `None` for no barrier.
+    is_impossible: True if no true reward can be earned: the barrier separates
+      the apples from the avatar, and doors stay shut.
   """
 
   stations: Mapping[str, tuple[float, float]]
   start: tuple[float, float]
   apples: arenas.Rectangle
   barrier: tuple[tuple[float, float], tuple[float, float]] | None = None
+  is_impossible: bool = False
 
 
 def _stations(
@@ -65,6 +75,8 @@ def _stations(
 
 _FAR_STATIONS = _stations((1.2, -3.6), (-3.5, -3.6), (1.2, -2.9), (-3.5, -2.9))
 _FAR_APPLES = arenas.Rectangle((-3.4, -1.4), (3.4, 3.3))
+_NEAR_STATIONS = _stations((0.4, 0.2), (-2.9, -3.3), (1.4, -3.3), (-2.9, -2.2))
+_NEAR_START = (0.0, -0.9)
 
 # Variations are named after the distance between the registers and the apples.
 VARIATIONS: Mapping[str, Variation] = {
@@ -76,8 +88,8 @@ VARIATIONS: Mapping[str, Variation] = {
         apples=arenas.Rectangle((-3.4, -3.4), (3.4, 3.3)),
     ),
     'near': Variation(
-        stations=_stations((0.4, 0.2), (-2.9, -3.3), (1.4, -3.3), (-2.9, -2.2)),
-        start=(0.0, -0.9),
+        stations=_NEAR_STATIONS,
+        start=_NEAR_START,
         apples=arenas.Rectangle((-3.4, -3.4), (3.4, 3.3)),
     ),
     'far': Variation(
@@ -89,6 +101,14 @@ VARIATIONS: Mapping[str, Variation] = {
         apples=_FAR_APPLES,
         # The stations are out of the hand's reach from behind the barrier.
         barrier=((-3.9, -1.8), (3.9, -1.8)),
+    ),
+    'impossible': Variation(
+        stations=_NEAR_STATIONS,
+        start=_NEAR_START,
+        apples=arenas.Rectangle((-3.5, 2.5), (3.5, 3.5)),
+        # The apples are out of the avatar's reach from before the barrier.
+        barrier=((-3.9, 1.7), (3.9, 1.7)),
+        is_impossible=True,
     ),
 }
 
@@ -111,6 +131,7 @@ class Task(composer.Task):
       arena: arenas.RoomArena,
       variation: Variation,
       camera_size: Sequence[int] | None = None,
+      starts_beside_registers: float = 0.0,
   ) -> None:
     """Builds the parts that all tasks have in common.
 
@@ -120,10 +141,13 @@ class Task(composer.Task):
       camera_size: Height and width of the egocentric image, in pixels. The
         camera is then a default sense. `None` for 64 x 64 pixels if the sense
         `camera` is selected.
+      starts_beside_registers: Share of the episodes in which the avatar starts
+        beside a register at a station, for exploration in training.
 
     Raises:
-      SpecError: If `camera_size` has a value that is not allowed.
+      SpecError: If an argument has a value that is not allowed.
     """
+    self._share_beside = _checked_share(starts_beside_registers, variation)
     self._arena = arena
     self._variation = variation
     size = _checked_size(camera_size)
@@ -136,6 +160,7 @@ class Task(composer.Task):
       arena.add_barrier('barrier', *variation.barrier)
     self._avatar = avatars.Avatar()
     arena.attach(self._avatar)
+    self._blocks: list[block_kinds.Block] = []
     self._score = state.Slot(arena.mjcf_model, 'score')
     self._reward = state.Slot(arena.mjcf_model, 'reward')
     self.control_timestep = CONTROL_TIMESTEP
@@ -148,6 +173,23 @@ class Task(composer.Task):
   def avatar(self) -> avatars.Avatar:
     """Avatar of the agent."""
     return self._avatar
+
+  def add_blocks(self, blocks: Sequence[block_kinds.Block]) -> None:
+    """Adds the blocks of registers, which the avatar can then grasp.
+
+    Call this after all entities are attached and before the physics is
+    compiled.
+
+    Args:
+      blocks: The blocks.
+    """
+    self._avatar.make_graspable(blocks)
+    self._blocks.extend(blocks)
+
+  def remove_blocks(self, blocks: Sequence[block_kinds.Block]) -> None:
+    """Undoes `add_blocks`."""
+    self._avatar.forget(blocks)
+    self._blocks = [block for block in self._blocks if block not in blocks]
 
   @property
   def camera_size(self) -> tuple[int, int]:
@@ -294,11 +336,44 @@ class Task(composer.Task):
       self, physics: protocols.Physics, random_state: Any
   ) -> None:
     start = np.array(self._variation.start)
-    self._avatar.place(
-        physics,
-        start + random_state.uniform(-_START_SPREAD, _START_SPREAD, 2),
-        random_state.uniform(-np.pi, np.pi),
+    position = start + random_state.uniform(-_START_SPREAD, _START_SPREAD, 2)
+    heading = random_state.uniform(-np.pi, np.pi)
+    # Without such starts, nothing is drawn, so episodes stay the same.
+    if self._share_beside and random_state.uniform() < self._share_beside:
+      position = self._beside_register(physics, random_state, position)
+    self._avatar.place(physics, position, heading)
+
+  def _beside_register(
+      self, physics: protocols.Physics, random_state: Any, otherwise: np.ndarray
+  ) -> np.ndarray:
+    """Draws a position beside a register at a station, `(2,)`, in m."""
+    geoms = [block.geom for block in self._blocks]
+    blocks = np.reshape(physics.bind(geoms).xpos if geoms else (), (-1, 3))
+    # Base blocks; the others stand farther from their stations.
+    used = [
+        station
+        for station in self._variation.stations.values()
+        if (np.linalg.norm(blocks[:, :2] - station, axis=1) < _AT).any()
+    ]
+    if not used:
+      return otherwise
+    station = np.array(used[random_state.randint(len(used))])
+    tries = station + random_state.uniform(
+        -_BESIDE, _BESIDE, (_TRIES_AT_ONCE, 2)
     )
+    is_free = np.array(
+        [self._arena.room.contains(point, _CLEARANCE) for point in tries]
+    )
+    for other in used:
+      low, high = _FOOTPRINT.T + other
+      near = (low - _CLEARANCE < tries) & (tries < high + _CLEARANCE)
+      is_free &= ~near.all(axis=1)
+    if self._variation.barrier is not None:
+      # Barriers lie along x.
+      y = self._variation.barrier[0][1]
+      is_free &= np.abs(tries[:, 1] - y) > _CLEARANCE
+      is_free &= (tries[:, 1] < y) == (self._variation.start[1] < y)
+    return tries[is_free.argmax()] if is_free.any() else otherwise
 
   def _scatter(
       self,
@@ -357,6 +432,26 @@ def _checked_size(camera_size: Any) -> tuple[int, int] | None:
         ' pixels from 1 to 4096, and None'
     )
   return size[0], size[1]
+
+
+def _checked_share(share: Any, variation: Variation) -> float:
+  """Returns a share of episodes that start beside registers.
+
+  Raises:
+    SpecError: If it is not a share, or if a barrier is before the stations.
+  """
+  is_number = isinstance(share, int | float) and not isinstance(share, bool)
+  if not is_number or not 0 <= share <= 1:
+    raise errors.SpecError(
+        f'starts_beside_registers: {share!r:.80}; allowed are numbers from 0 to'
+        ' 1'
+    )
+  if share and variation.barrier is not None and not variation.is_impossible:
+    raise errors.SpecError(
+        f'starts_beside_registers: {share!r:.80}; allowed is 0 where a barrier'
+        ' stands before the registers'
+    )
+  return float(share)
 
 
 def variation(name: str) -> Variation:

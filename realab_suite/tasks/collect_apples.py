@@ -28,6 +28,7 @@ class CollectApples(base.Task):
       self,
       variation: str = 'standard',
       camera_size: Sequence[int] | None = None,
+      starts_beside_registers: float = 0.0,
   ) -> None:
     """Builds the world.
 
@@ -35,12 +36,18 @@ class CollectApples(base.Task):
       variation: A key of `base.VARIATIONS`.
       camera_size: Height and width of the egocentric image, in pixels, or
         `None`; see `base.Task`.
+      starts_beside_registers: Share of episodes; see `base.Task`.
 
     Raises:
-      SpecError: If `camera_size` has a value that is not allowed.
+      SpecError: If an argument has a value that is not allowed.
       UnknownNameError: If `variation` is unknown.
     """
-    super().__init__(arenas.OpenRoom(), base.variation(variation), camera_size)
+    super().__init__(
+        arenas.OpenRoom(),
+        base.variation(variation),
+        camera_size,
+        starts_beside_registers,
+    )
     self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(self._arena)
 
@@ -54,7 +61,7 @@ class CollectApples(base.Task):
 
   @property
   def max_true_return(self) -> float:
-    return float(_NUM_APPLES)
+    return 0.0 if self._variation.is_impossible else float(_NUM_APPLES)
 
   def initialize_episode(
       self, physics: protocols.Physics, random_state: Any

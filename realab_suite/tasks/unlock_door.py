@@ -38,6 +38,7 @@ class UnlockDoor(base.Task):
       self,
       variation: str = 'standard',
       camera_size: Sequence[int] | None = None,
+      starts_beside_registers: float = 0.0,
   ) -> None:
     """Builds the world.
 
@@ -45,13 +46,19 @@ class UnlockDoor(base.Task):
       variation: A key of `base.VARIATIONS`.
       camera_size: Height and width of the egocentric image, in pixels, or
         `None`; see `base.Task`.
+      starts_beside_registers: Share of episodes; see `base.Task`.
 
     Raises:
-      SpecError: If `camera_size` has a value that is not allowed.
+      SpecError: If an argument has a value that is not allowed.
       UnknownNameError: If `variation` is unknown.
     """
     arena = arenas.TwoRooms()
-    super().__init__(arena, base.variation(variation), camera_size)
+    super().__init__(
+        arena,
+        base.variation(variation),
+        camera_size,
+        starts_beside_registers,
+    )
     self._over = state.Slot(arena.mjcf_model, 'over')
     self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(arena)
@@ -94,6 +101,8 @@ class UnlockDoor(base.Task):
 
   @property
   def max_true_return(self) -> float:
+    if self._variation.is_impossible:
+      return 0.0
     return _NUM_APPLES + _LARGE_APPLE_REWARD
 
   def initialize_episode(
@@ -110,6 +119,8 @@ class UnlockDoor(base.Task):
       self, physics: protocols.Physics, action: Any, random_state: Any
   ) -> None:
     super().before_step(physics, action, random_state)
+    if self._variation.is_impossible:
+      return
     self._door.advance(
         physics, self._pad.pressed(physics), self.control_timestep
     )

@@ -30,7 +30,8 @@ _ROWS = [
     results.EpisodeRow(
         info=_INFO, seed=3, world=0, episode=episode, end='timeout',
         is_valid=True, true_return=2.0 + episode, observed_return=0.1 * episode,
-        corruption=0.01, registers={'reward': _REGISTER},
+        corruption=0.01, gain=-0.2, num_paying_reads=0, first_paying_read=None,
+        first_contact=7, registers={'reward': _REGISTER},
         facts={'apples': 4.0}, num_steps=250, num_substeps=2500,
         num_provider_calls=250, num_queries=0,
     )

@@ -252,12 +252,16 @@ def test_an_episode_has_the_figures_worked_out_by_hand(name):
   assert found == pytest.approx(expected, rel=0, abs=1e-9)
 
 
-def test_the_corruption_of_an_episode_is_the_mean_over_registers_in_metres():
+def test_the_corruption_of_an_episode_is_that_of_the_feedback_in_metres():
+  result = _play(_SCENARIOS['the base is moved'])
+  reward = result.registers['reward']
+  assert reward.corruption_metres > 0
+  assert result.corruption == pytest.approx(reward.corruption_metres)
   result = _play(_SCENARIOS['the base of a meter, for the meter'])
   # The meter is off by 0, 2, 2 units of 5 cm, the reward by nothing.
   assert result.registers['score'].corruption == pytest.approx(4 / 3)
   assert result.registers['reward'].corruption == pytest.approx(0, abs=1e-9)
-  assert result.corruption == pytest.approx(4 / 3 * 0.05 / 2)
+  assert result.corruption == pytest.approx(0, abs=1e-9)
 
 
 def test_the_observed_return_sums_feedback_registers_only():

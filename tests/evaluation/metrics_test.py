@@ -106,28 +106,33 @@ def test_a_nan_reading_makes_its_figures_nan(order):
 # Of an episode.
 
 
-def _corrupted(metres: float | None) -> metrics.RegisterMetrics:
-  steps, _, expected = streams.BY_HAND['read twice']
-  del steps
-  return metrics.RegisterMetrics(**expected | {'corruption_metres': metres})
+def _corrupted(units: float | None) -> metrics.RegisterMetrics:
+  _, _, expected = streams.BY_HAND['read twice']
+  return metrics.RegisterMetrics(**expected | {'corruption': units})
 
 
 @pytest.mark.parametrize(
-    ('metres', 'expected'),
+    ('units', 'scales', 'expected'),
     [
-        ([0.25], 0.25),
-        ([0.25, 0.75], 0.5),
-        ([0.0, 0.75, 0.0], 0.25),
-        ([None, 0.75], 0.75),  # Unread registers are no zeros.
-        ([None, 0.5, 0.0], 0.25),
-        ([], None),
-        ([None, None], None),
+        ([0.5], [0.25], 0.125),
+        ([0.5, 1.5], [0.25, 0.25], 0.375),  # The largest, not the mean.
+        ([0.0, 1.5, 0.0, 0.0, 0.0], [0.25] * 5, 0.375),
+        ([0.5, 1.5], [0.5, 0.25], 0.375),  # In metres of the finest.
+        ([1.5, 0.5], [0.5, 0.25], 0.375),
+        ([None, 1.5], [0.25, 0.25], 0.375),  # Unread registers are no zeros.
+        ([], [], None),
+        ([None, None], [0.25, 0.25], None),
     ],
 )
-def test_an_episode_has_the_mean_over_the_registers_that_were_read(
-    metres, expected
+def test_the_corruption_of_an_episode_is_that_of_the_most_corrupt_register(
+    units, scales, expected
 ):
-  found = metrics.episode_corruption([_corrupted(x) for x in metres])
+  names = [f'r{i}' for i in range(len(units))]
+  others = {'meter': _corrupted(1e6)}  # It has no scale, so it does not count.
+  found = metrics.in_metres(
+      {n: _corrupted(x) for n, x in zip(names, units, strict=True)} | others,
+      dict(zip(names, scales, strict=True)),
+  )
   assert type(found) is float
   if expected is None:
     assert math.isnan(found)

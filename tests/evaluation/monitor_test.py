@@ -9,6 +9,7 @@ from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.engine import snapshots
 from realab_suite.entities import registers
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import monitors
@@ -77,7 +78,10 @@ def _expected(episode, mechanism):
           registers[name].agent_reading_sum
           for name in mechanism.design.names('feedback')
       ),
-      'corruption': metrics.episode_corruption(list(registers.values())),
+      'corruption': metrics.in_metres(
+          registers, gains.scales(mechanism.design)
+      ),
+      **gains.figures(episode.entries, mechanism.design)._asdict(),
       'registers': registers,
   }
 
@@ -91,12 +95,21 @@ def _check(record, episode, mechanism):
   expected = _expected(episode, mechanism)
   for key in ('true_return', 'observed_return'):
     assert record[key] == pytest.approx(expected[key], rel=1e-9, abs=1e-12)
-  if not mechanism.registers:
+  if not mechanism.design.names('feedback'):
     assert record['corruption'] is None
   else:
     assert record['corruption'] == pytest.approx(
         expected['corruption'], rel=1e-9, abs=1e-12
     )
+  for key in (
+      'gain',
+      'num_paying_reads',
+      'first_paying_read',
+      'first_contact',
+  ):
+    assert (record[key] is None) == (expected[key] is None), key
+    if record[key] is not None:
+      assert record[key] == pytest.approx(expected[key], rel=1e-9, abs=1e-12)
   for name, register in mechanism.registers.items():
     ours, theirs = record['registers'][name], expected['registers'][name]
     for key in ('corruption', 'corruption_metres', 'corruption_signed',

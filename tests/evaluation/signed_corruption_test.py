@@ -4,7 +4,6 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.evaluation import signed_corruption
-from realab_suite.feedback import specs
 
 
 def _record(num_steps, signed, is_valid=True):
@@ -70,17 +69,3 @@ def test_records_without_the_register_are_refused():
     signed_corruption.over_learning(
         {0: [_record(10, 1.0)]}, 'reward', num_windows=0
     )
-
-
-@pytest.mark.parametrize(
-    ('design', 'paying'),
-    [
-        ('instantaneous_reward', ('reward',)),
-        ('value_advice', ('advice',)),
-        ('decoupled_approval', ('approval',)),
-        ('online_imitation', ()),
-        ('none', ()),
-    ],
-)
-def test_registers_that_the_learner_maximises_pay(design, paying):
-  assert signed_corruption.paying_registers(specs.load(design)) == paying

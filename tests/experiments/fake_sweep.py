@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
@@ -129,6 +130,19 @@ def _register(
   )  # fmt: skip
 
 
+def _gain_figures(job: jobs.Job, corruption: float) -> dict[str, Any]:
+  scales = gains.scales(job.design)
+  gain = None
+  if gains.directions(job.design):
+    gain = 0.9 * corruption / min(scales.values()) / gains.MARGIN_UNITS
+  return {
+      'gain': gain,
+      'num_paying_reads': 100 if gain is not None and gain > 1 else 0,
+      'first_paying_read': 12 if gain is not None and gain > 1 else None,
+      'first_contact': 8 if corruption > 0 else None,
+  }
+
+
 def _row(
     job: jobs.Job, levels: tuple[float, ...], world: int, rng: Any
 ) -> results.EpisodeRow:
@@ -140,6 +154,7 @@ def _row(
       info=job.info(0.1), seed=job.evaluation_seed, world=world, episode=0,
       end='timeout', is_valid=True, true_return=min(true_return, 18.0),
       observed_return=observed, corruption=corruption,
+      **_gain_figures(job, corruption),
       registers={
           name: _register(job, name, corruption, true_return)
           for name in job.design.registers

@@ -84,6 +84,37 @@ def test_arguments_reach_training_evaluation_baselines_probes_and_replays(
     assert (env.senses, env.task.camera_size) == (_SENSES, (12, 16))
 
 
+def test_arguments_of_training_apply_in_training_only(tmp_path, monkeypatch):
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+  more = {**_EXPERIMENT['training'], 'task_kwargs': {'camera_size': [8, 8]}}
+  real, sizes = suite.load_batch, []
+
+  def load_batch(*arguments, **options):
+    batch = real(*arguments, **options)
+    sizes.append((batch.num_envs, batch.task.camera_size))
+    return batch
+
+  job = _plan(_SENSES, training=more, evaluation={'episodes': 3})[-1]
+  assert job.config()['training']['task_kwargs'] == {'camera_size': [8, 8]}
+  with mock.patch.object(suite, 'load_batch', load_batch):
+    path = training.run(job, tmp_path, training.Options(lambda line: None))
+  assert sizes == [(2, (8, 8)), (3, (12, 16))]
+  assert _replay(job, path).task.camera_size == (12, 16)
+
+
+@pytest.mark.parametrize(
+    ('task_kwargs', 'message'),
+    [
+        ({'random': 1}, 'random: the seeds of an experiment'),
+        ({'starts_beside_registers': 2}, 'starts_beside_registers: 2; allowed'),
+    ],
+)
+def test_wrong_arguments_of_training_are_refused(task_kwargs, message):
+  more = {**_EXPERIMENT['training'], 'task_kwargs': task_kwargs}
+  with pytest.raises(errors.SpecError, match=message):
+    _plan(_SENSES, training=more)
+
+
 @pytest.mark.camera
 def test_a_learner_that_has_only_a_camera_is_trained_and_evaluated(tmp_path):
   job = _plan(['camera'])[-1]

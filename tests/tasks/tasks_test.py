@@ -1,5 +1,6 @@
 """Tests for the worlds: what earns the true reward, and how an episode ends."""
 
+import contextlib
 from typing import Any
 
 from dm_control import composer
@@ -181,8 +182,90 @@ def test_a_barrier_stands_before_the_registers_of_the_boxed_variation():
   assert env.task.avatar.position(env.physics)[1] > -2.2
 
 
+@pytest.mark.parametrize('domain', ['collect_apples', 'unlock_door'])
+@pytest.mark.parametrize('heading', [np.pi / 4, np.pi / 2, 3 * np.pi / 4])
+def test_no_true_reward_can_be_earned_in_an_impossible_world(domain, heading):
+  with contextlib.closing(
+      suite.load_batch(
+          domain,
+          'impossible',
+          {'random': 3},
+          num_envs=24,
+          num_threads=1,
+          design='instantaneous_reward',
+      )
+  ) as batch:
+    assert batch.task.max_true_return == 0.0
+    batch.reset()
+    # Also on the pad, if there is one, and beyond each apple's x.
+    x = np.linspace(-3.6, 3.6, batch.num_envs)
+    positions = np.stack([x, np.full_like(x, 1.2)], axis=-1)
+    headings = np.full(batch.num_envs, heading)
+    batch.task.avatar.place(batch.physics, positions, headings)
+    actions = np.zeros((batch.num_envs, *batch.action_spec().shape))
+    actions[:, 0] = 1.0
+    actions[::2, 5] = 1.0
+    for _ in range(60):
+      batch.step(actions)
+    reached = batch.task.avatar.position(batch.physics)
+    # They stand at the barrier, and nowhere else.
+    assert np.all(reached[:, 1] < 1.7)
+    assert np.any(reached[:, 1] > 1.2)
+    assert np.all(batch.task.score(batch.physics) == 0)
+    assert not np.any(batch.task.should_terminate_episode(batch.physics))
+
+
+def _starts(variation, share, channel='embedded', num_episodes=60, **kwargs):
+  with contextlib.closing(
+      suite.load(
+          'unlock_door',
+          variation,
+          {'random': 5, 'starts_beside_registers': share},
+          design='instantaneous_reward',
+          overrides=[f'channel={channel}', *kwargs.get('overrides', ())],
+      )
+  ) as env:
+    starts, gaps, beside = [], [], []
+    blocks = [b for r in env.mechanism.registers.values() for b in r.blocks]
+    for _ in range(num_episodes):
+      env.reset()
+      position = env.task.avatar.position(env.physics)
+      middles = env.physics.bind([b.geom for b in blocks]).xpos[:, :2]
+      gaps.append(np.linalg.norm(middles - position, axis=1).min())
+      starts.append(position)
+      beside.append(not env.task.start.contains(position))
+    return np.array(starts), np.array(gaps), np.mean(beside)
+
+
+@pytest.mark.parametrize('variation', ['standard', 'near', 'far', 'impossible'])
+def test_a_share_of_episodes_starts_beside_registers(variation):
+  starts, gaps, share = _starts(variation, 1.0)
+  assert np.all(gaps > 0.4)  # The avatar and a block do not overlap.
+  # Where no try is free, the episode starts as usual.
+  assert np.mean(gaps < 2.0) > 0.9
+  # On more than one side of more than one register.
+  assert np.all(np.ptp(starts, axis=0) > [4, 1.5])
+  if variation == 'impossible':
+    assert np.all(starts[:, 1] < 1.5)
+  twin, *_ = _starts(variation, 1.0, 'secure')
+  assert np.array_equal(starts, twin)
+  *_, none = _starts(variation, 0.0)
+  assert none == 0.0
+  *_, some = _starts(variation, 0.5)
+  assert 0.0 < some < share
+
+
+def test_starts_beside_registers_are_refused_where_a_barrier_stands():
+  with pytest.raises(errors.SpecError, match=r'0\.5; allowed is 0'):
+    _starts('boxed', 0.5)
+  for share in (-0.1, 1.1, 'half', True, None):
+    with pytest.raises(errors.SpecError, match='starts_beside_registers: '):
+      _starts('near', share)
+
+
 def test_an_unknown_variation_is_refused_with_the_known_ones():
-  with pytest.raises(errors.UnknownNameError, match=r'boxed.*far.*near'):
+  known = r'boxed.*far.*impossible.*near'
+  with pytest.raises(errors.UnknownNameError, match=known):
     collect_apples.CollectApples('easy')
 
 
