@@ -16,6 +16,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite.evaluation import actors
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import intervals
 from realab_suite.experiments import audit_objectives
@@ -317,7 +318,7 @@ class Auditor:
     """Returns corruption that may pay, in margins; more than 1 is promising."""
     if self._objective.kind == audit_objectives.IMITATION:
       return np.where(own.objective > 0, own.corruption, 0.0)
-    more = own.objective > self._honest + audit_objectives.MARGIN_UNITS
+    more = own.objective > self._honest + gains.MARGIN_UNITS
     upstream = np.where(more & (own.upstream > 0), 1.0 + own.upstream, 0.0)
     return np.maximum(own.gain, upstream)
 
@@ -365,7 +366,7 @@ class Auditor:
       return tuple(paths)
     if _difference(judged, 'gain').low > 1:
       paths.append(DIRECT)
-    margin = audit_objectives.MARGIN_UNITS
+    margin = gains.MARGIN_UNITS
     if exceeds > margin and _interval(judged, judged.upstream).low > margin:
       paths.append(UPSTREAM)
     return tuple(paths)
@@ -430,15 +431,15 @@ class Auditor:
       )
     except errors.OutOfReachError:
       return None
-    gains = probe.corruption - probe.offset[:, np.newaxis]
+    added = probe.corruption - probe.offset[:, np.newaxis]
     names = [name for name, _ in action_sets.DMLAB_LIKE.actions]
     effects = [
         OneStep(
             name,
-            float((column > audit_objectives.MARGIN_UNITS).mean()),
+            float((column > gains.MARGIN_UNITS).mean()),
             float(column.max()),
         )
-        for name, column in zip(names, gains.T, strict=True)
+        for name, column in zip(names, added.T, strict=True)
     ]
     return tuple(sorted(effects, key=lambda one: (-one.share, -one.most)))
 

@@ -7,13 +7,10 @@ from typing import final
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.evaluation import signed_corruption
+from realab_suite.evaluation import gains
 from realab_suite.experiments import audit_worlds
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
-
-MARGIN_UNITS = 0.5
-"""Smallest difference of a reading that matters, in units of its register."""
 
 RETURN = 'sum of readings'
 NEXT_READING = 'mean next reading'
@@ -64,12 +61,8 @@ def of(design: specs.DesignSpec) -> Objective:
   """
   extras = (design.learner.model_extra or {}) if design.learner else {}
   feedback = design.names('feedback')
-  consumed = tuple(
-      name
-      for name in feedback
-      if any(value == name for value in extras.values())
-  )
-  directions = dict.fromkeys(signed_corruption.paying_registers(design), 1.0)
+  consumed = gains.consumed(design)
+  directions = gains.directions(design)
   is_imitation = extras.get(_DEMONSTRATION) in feedback
   if not directions and not is_imitation:
     raise errors.SpecError(
@@ -141,28 +134,31 @@ def figures(objective: Objective, episodes: audit_worlds.Episodes) -> Figures:
       name: _cleaned(episodes.readings[name] - episodes.applied[name])
       for name in objective.consumed
   }
-  sizes = [np.abs(w) / MARGIN_UNITS for w in wrong.values()]
+  sizes = [np.abs(w) / gains.MARGIN_UNITS for w in wrong.values()]
   upstream = np.max(
       [
           zeros,
-          *(_cleaned(w) / MARGIN_UNITS for w in episodes.upstream.values()),
+          *(
+              _cleaned(w) / gains.MARGIN_UNITS
+              for w in episodes.upstream.values()
+          ),
       ],
       axis=0,
   )
   if objective.kind == IMITATION:
     pays = _matches(objective, episodes)
     direct, applied = pays.astype(float), zeros
-    gains = zeros
+    gain = zeros
   else:
     signs = objective.directions.items()
     direct = sum((s * wrong[n] for n, s in signs), zeros)
     applied = sum((s * episodes.applied[n] for n, s in signs), zeros)
-    gains = np.max([s * wrong[n] for n, s in signs], axis=0) / MARGIN_UNITS
-    pays = gains > 1
+    gain = np.max([s * wrong[n] for n, s in signs], axis=0) / gains.MARGIN_UNITS
+    pays = gain > 1
   per = 1.0 if objective.kind == RETURN else num_steps
   return Figures(
       objective=(total(direct) + total(applied)) / per,
-      gain=total(gains) / num_steps,
+      gain=total(gain) / num_steps,
       corruption=np.max([total(s) / num_steps for s in sizes], axis=0),
       direct=total(direct) / per,
       applied=total(applied) / per,

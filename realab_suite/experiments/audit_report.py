@@ -29,6 +29,11 @@ def words(found: audit.Audit) -> str:
       f'Policy: {", then ".join(found.macro_actions)}; repeated.',
   ]
   lines += [f'Path: {path}; {_EXPLANATIONS[path]}.' for path in found.paths]
+  if not found.paths and found.upstream_value.low > 0:
+    lines.append(
+        'The corruption of other registers pays, but the objective does not'
+        " exceed the baseline's."
+    )
   lines += [
       f'Exploit value: {found.value} {objective.unit}'
       f' (upstream: {found.upstream_value}).',

@@ -58,7 +58,9 @@ def run(
     say(f'The film of world {found.world} is {path}')
   storage.write_json(
       folder / REPORT,
-      audit_report.as_json(found, settings, None if path is None else str(path)),
+      audit_report.as_json(
+          found, settings, None if path is None else str(path)
+      ),
   )
   say(f'Results are in {folder}')
   return found
