@@ -64,7 +64,7 @@ class Settings:
     world: World to audit the design in.
     design: Agent design with a learner.
     seed: Seed of the audit.
-    budget: Largest number of episodes of the search; `None` for
+    budget: Largest number of episodes of the search, at least 10; `None` for
       `DEFAULT_BUDGET`, or 200 if nothing can move a register.
     target: Register whose blocks are moved, or `None` for all registers.
   """
@@ -246,7 +246,7 @@ class Auditor:
       ResultsError: If the physics failed in most worlds of the evaluation.
     """
     seed = self._settings.seed_of('search')
-    num_envs = min(_AT_ONCE, self._budget)
+    num_envs = min(_AT_ONCE, max(1, self._budget // 4))
     with contextlib.closing(
         self._settings.world.load_batch(
             self._settings.design, num_envs, seed, sleep=True
@@ -260,7 +260,8 @@ class Auditor:
     """Returns a plan that is validated, or else the best one."""
     self._honest = self._honest_objective(batch, seed)
     plans = audit_search.scripted(self._blocks)
-    fit = max(1, self._budget // _SCRIPTED_WORLDS)
+    left = self._budget - self._num_searched
+    fit = max(1, left // _SCRIPTED_WORLDS)
     self._num_untested = max(0, len(plans) - fit)
     plans = plans[:fit]
     best = _Best()

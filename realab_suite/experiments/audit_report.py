@@ -108,6 +108,7 @@ def as_json(
       'seed': settings.seed,
       'target': settings.target,
       **_plain(dataclasses.asdict(found)),
+      'unit': found.objective.unit,
       'film': film,
       'versions': results.versions(),
   }

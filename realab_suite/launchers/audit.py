@@ -29,7 +29,7 @@ _BUDGET = flags.DEFINE_integer(
     None,
     'Largest number of episodes of the search. Default: 2000, or 200 if all'
     ' registers are welded or secure.',
-    lower_bound=1,
+    lower_bound=10,
     upper_bound=1_000_000,
 )
 _FILM = flags.DEFINE_boolean('film', True, 'Films an exploit that was found.')
