@@ -271,15 +271,8 @@ MUTANTS = [
         'return float(np.nanmean(values)) if values else None', _MET,
     ),
     planting.Mutant(
-        'metric', 'unread registers are zeros in the mean of an episode',
-        _METRICS,
-        '''      one.corruption_metres
-      for one in all_metrics
-      if one.corruption_metres is not None
-''',
-        '''      one.corruption_metres or 0.0
-      for one in all_metrics
-''', _MET,
+        'metric', 'other registers dilute the corruption of an episode',
+        _METRICS, 'max(units)', '(sum(units) / len(units))', _MET,
     ),
     planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,

@@ -168,7 +168,8 @@ def test_files_and_folders_in_pages_exist():
 
 def test_programs_in_pages_exist():
   programs = _mentions(
-      r'python -m ((?:benchmarks|campaigns|realab_suite|tests)\.[a-z_.]+)'
+      r'python -m ('
+      r'(?:benchmarks|campaigns|pictures|realab_suite|tests)\.[a-z_.]+)'
   )
   assert programs
   for page, module in programs:

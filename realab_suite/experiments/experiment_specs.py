@@ -53,6 +53,8 @@ class RunSpec(validation.Spec):
     learner: Fields that replace those of the learner in the design.
     twin: True to train the secure twin of the design as well.
     steps: Number of control steps, or `None` for that of the experiment.
+    num_seeds: Number of seeds, the first ones of the experiment; `None` for all
+      of them.
   """
 
   design: option_types.FilePath
@@ -60,6 +62,7 @@ class RunSpec(validation.Spec):
   learner: dict[str, Any] = pydantic.Field(default_factory=dict)
   twin: bool = False
   steps: _Count | None = None
+  num_seeds: _Count | None = None
 
   def load(self, *, is_confined: bool = False) -> specs.DesignSpec:
     """Returns the design with the changes of this run.
@@ -218,6 +221,17 @@ class ExperimentSpec(validation.Spec):
     """Names of the domain and of the task, as for `suite.load`."""
     domain, _, variation = self.task.partition('.')
     return domain, variation
+
+  def on_task(self, task: str) -> 'ExperimentSpec':
+    """Returns the same experiment on another task.
+
+    Args:
+      task: Domain and task, such as `unlock_door.far`.
+
+    Raises:
+      SpecError: If the experiment cannot be run on this task.
+    """
+    return load({**self.to_mapping(), 'task': task})
 
   def load_kwargs(
       self, seed: int, *, is_training: bool = False

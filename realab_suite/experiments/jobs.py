@@ -8,6 +8,7 @@ its results depend on, and a hash of it is part of the name of its folder.
 from collections.abc import Mapping, Sequence
 import dataclasses
 from importlib import metadata
+import math
 import pathlib
 from typing import Any, final
 
@@ -63,9 +64,8 @@ class Job:
   @property
   def training(self) -> experiment_specs.TrainingSpec:
     """Settings of training, for a learner."""
-    name, _, _ = self.run.partition('.')
     training = self.experiment.training
-    steps = self.experiment.runs[name].steps
+    steps = _spec(self.experiment, self.run).steps
     if steps is None:
       return training
     return training.model_copy(update={'steps': steps})
@@ -190,10 +190,19 @@ def plan(
   dynamics = suite.dynamics(*experiment.domain_and_variation)
   return [
       Job(run, seed, policy, design, baseline, twin_of, dynamics, experiment)
-      for seed in (experiment.seeds if seeds is None else seeds)
+      for i, seed in enumerate(experiment.seeds if seeds is None else seeds)
       for run, policy, design, baseline, twin_of in variants
       if not only or run in only
+      if i < (_spec(experiment, run).num_seeds or math.inf)
   ]
+
+
+def _spec(
+    experiment: experiment_specs.ExperimentSpec, run: str
+) -> experiment_specs.RunSpec:
+  """Returns the spec of a run, of its twin or of its baseline."""
+  name, _, _ = run.partition('.')
+  return experiment.runs[name]
 
 
 _Variant = tuple[str, str | None, specs.DesignSpec, str | None, str | None]

@@ -23,6 +23,12 @@ from realab_suite.launchers.flags import output_flag
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(learning_flags)
 flags.adopt_module_key_flags(output_flag)
+_TASK = flags.DEFINE_string(
+    'task',
+    None,
+    'Task to run the experiment on instead of its own, such as'
+    ' unlock_door.far. Use a separate folder for each task.',
+)
 _RUNS = flags.DEFINE_list(
     'runs', [], 'Runs to execute, such as "reward,reward.secure". Default: all.'
 )
@@ -64,6 +70,8 @@ def main(argv: Sequence[str]) -> None:
 
   imports_flag.load()
   experiment = experiment_specs.load(name)
+  if _TASK.value is not None:
+    experiment = experiment.on_task(_TASK.value)
   if learning_flags.TENSORBOARD.value:
     curves.check_tensorboard()
   arguments = imports_flag.arguments()

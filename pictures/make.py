@@ -1,0 +1,54 @@
+r"""Makes the pictures of the README and the docs.
+
+  python -m realab_suite.launchers.sweep --experiment=quick \
+    --output=results/quick
+  python -m pictures.make --input=results/quick --output=docs/images
+
+Without `--input`, the animated picture is left out, because it shows trained
+agents. The same versions and results give the same pictures.
+"""
+
+from collections.abc import Sequence
+import pathlib
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.experiments import requirements
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+from realab_suite.launchers.flags import input_flag
+from realab_suite.launchers.flags import output_flag
+
+flags.adopt_module_key_flags(input_flag)
+flags.adopt_module_key_flags(output_flag)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Writes the pictures; existing ones are replaced."""
+  del argv
+  folder = pathlib.Path(program.required(output_flag.OUTPUT))
+  problem = (
+      requirements.missing('matplotlib', 'PIL') or renderers.choose_renderer()
+  )
+  if problem is not None:
+    raise errors.ResultsError(f'cannot make pictures: {problem}')
+  # These import dm_control, so a renderer has to be chosen first.
+  from pictures import carrying
+  from pictures import first_person
+  from pictures import tampering
+
+  folder.mkdir(parents=True, exist_ok=True)
+  first_person.draw(folder / 'first_person.png')
+  carrying.draw(folder / 'carrying.png')
+  if input_flag.INPUT.value is None:
+    program.say('tampering.gif is left out: --input names no sweep')
+  else:
+    tampering.draw(
+        folder / 'tampering.gif', pathlib.Path(input_flag.INPUT.value)
+    )
+  program.say(f'The pictures are in {folder}')
+
+
+if __name__ == '__main__':
+  program.start(main)
