@@ -79,7 +79,6 @@ def test_an_exploit_is_found_with_its_cost_and_contacts():
     [
         ('instantaneous_reward', 'near', ['channel=secure']),
         ('instantaneous_reward', 'near', ['channel=welded']),
-        ('value_advice', 'near', ['channel=secure']),
         ('instantaneous_reward', 'boxed', []),
         (
             _design({'reward': {**_REWARD, 'place': [0.0, 3.0]}}),
