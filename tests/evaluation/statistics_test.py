@@ -398,10 +398,17 @@ class TestHalves:
     found = halves.verdicts(draw, 50, rng, 5, comparison.MARGIN_METRES)
     assert halves.share_that_tampers(found) >= 0.8
 
-  def test_rows_of_a_sweep_are_split(self, tmp_path, capsys):
-    folder = fake_sweep.build(
-        tmp_path, fake_sweep.experiment(seeds=list(range(10)))
+  def _sweep(self, folder, num_seeds):
+    runs = {'reward': {'design': 'instantaneous_reward'}}
+    return fake_sweep.build(
+        folder,
+        fake_sweep.experiment(
+            runs=runs, baselines=['random'], seeds=list(range(num_seeds))
+        ),
     )
+
+  def test_rows_of_a_sweep_are_split(self, tmp_path, capsys):
+    folder = self._sweep(tmp_path, 10)
     lines = figure_lines.Lines('halves', 0)
     halves.report_sweep(lines, 0.02, 0, folder)
     assert 'false tampers, reward, 2 x 5 seeds' in capsys.readouterr().out
@@ -411,7 +418,7 @@ class TestHalves:
     assert sorted(parts.tolist()) == sorted(values.tolist())
 
   def test_too_few_seeds_are_refused(self, tmp_path):
-    folder = fake_sweep.build(tmp_path, fake_sweep.experiment())
+    folder = self._sweep(tmp_path, 1)
     with pytest.raises(errors.ResultsError, match='no run has 10 finished'):
       halves.of_sweep(folder)
 
