@@ -264,7 +264,7 @@ class Auditor:
     fit = max(1, left // _SCRIPTED_WORLDS)
     self._num_untested = max(0, len(plans) - fit)
     plans = plans[:fit]
-    best = _Best()
+    best = audit_search.Best()
     scores = self._try(batch, plans, _SCRIPTED_WORLDS, seed, best)
     if (found := self._validated(best)) is not None:
       return found
@@ -295,7 +295,7 @@ class Auditor:
       plans: Sequence[macros.Plan],
       num_worlds: int,
       seed: int,
-      best: '_Best',
+      best: audit_search.Best,
   ) -> np.ndarray:
     """Plays plans and returns the mean objective of each, `(plans,)`."""
     tries = [plan for plan in plans for _ in range(num_worlds)]
@@ -323,7 +323,7 @@ class Auditor:
     upstream = np.where(more & (own.upstream > 0), 1.0 + own.upstream, 0.0)
     return np.maximum(own.gain, upstream)
 
-  def _validated(self, best: '_Best') -> macros.Plan | None:
+  def _validated(self, best: audit_search.Best) -> macros.Plan | None:
     """Returns a promising plan that is an exploit on validation seeds."""
     for plan in best.take(_NUM_VALIDATED):
       self._num_validated += 1
@@ -443,49 +443,6 @@ class Auditor:
         for name, column in zip(names, added.T, strict=True)
     ]
     return tuple(sorted(effects, key=lambda one: (-one.share, -one.most)))
-
-
-@final
-class _Best:
-  """The best plans of a search so far, and the promising ones among them."""
-
-  def __init__(self) -> None:
-    self._untried: list[tuple[float, int, macros.Plan]] = []
-    self._number = 0
-    self._most: tuple[float, float] | None = None
-    self._plan: macros.Plan | None = None
-
-  @property
-  def plan(self) -> macros.Plan:
-    """The plan with the largest promise, then the largest score."""
-    if self._plan is None:
-      raise errors.ResultsError('the search has tried no plan')
-    return self._plan
-
-  def add(
-      self,
-      plans: Sequence[macros.Plan],
-      scores: np.ndarray,
-      promises: np.ndarray,
-  ) -> None:
-    for plan, score, promise in zip(
-        plans, scores.tolist(), promises.tolist(), strict=True
-    ):
-      self._number += 1
-      if self._most is None or (promise, score) > self._most:
-        self._most, self._plan = (promise, score), plan
-      if promise > 1:
-        self._untried.append((-score, self._number, plan))
-
-  def take(self, number: int) -> list[macros.Plan]:
-    """Returns the promising plans with the largest scores, and drops all."""
-    taken = [plan for _, _, plan in sorted(self._untried, key=_rank)[:number]]
-    self._untried.clear()
-    return taken
-
-
-def _rank(entry: tuple[float, int, macros.Plan]) -> tuple[float, int]:
-  return entry[:2]
 
 
 def _all_in(design: specs.DesignSpec, channels: Sequence[str]) -> bool:

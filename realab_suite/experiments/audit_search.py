@@ -5,6 +5,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.experiments import audit_worlds
 from realab_suite.policies import macros
 
@@ -125,3 +126,47 @@ def _mixed(
       _KEPT * old.mean + (1 - _KEPT) * mean,
       np.maximum(_KEPT * old.deviation + (1 - _KEPT) * deviation, least),
   )
+
+
+@final
+class Best:
+  """The best plans of a search so far, and the promising ones among them."""
+
+  def __init__(self) -> None:
+    self._untried: list[tuple[float, int, macros.Plan]] = []
+    self._number = 0
+    self._most: tuple[float, float] | None = None
+    self._plan: macros.Plan | None = None
+
+  @property
+  def plan(self) -> macros.Plan:
+    """The plan with the largest promise, then the largest score."""
+    if self._plan is None:
+      raise errors.ResultsError('the search has tried no plan')
+    return self._plan
+
+  def add(
+      self,
+      plans: Sequence[macros.Plan],
+      scores: np.ndarray,
+      promises: np.ndarray,
+  ) -> None:
+    """Adds plans with their scores and promises, `(plans,)` each."""
+    for plan, score, promise in zip(
+        plans, scores.tolist(), promises.tolist(), strict=True
+    ):
+      self._number += 1
+      if self._most is None or (promise, score) > self._most:
+        self._most, self._plan = (promise, score), plan
+      if promise > 1:
+        self._untried.append((-score, self._number, plan))
+
+  def take(self, number: int) -> list[macros.Plan]:
+    """Returns the promising plans with the largest scores, and drops all."""
+    taken = [plan for _, _, plan in sorted(self._untried, key=_rank)[:number]]
+    self._untried.clear()
+    return taken
+
+
+def _rank(entry: tuple[float, int, macros.Plan]) -> tuple[float, int]:
+  return entry[:2]
