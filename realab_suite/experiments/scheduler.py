@@ -24,6 +24,7 @@ from realab_suite.experiments import training
 EXPERIMENT = 'experiment.yaml'
 SWEEP = 'sweep.json'
 LOGS = 'logs'
+AUDITS = 'audits'
 _MODULE = 'realab_suite.launchers.train'
 _POLL_SECONDS = 0.2
 # Fields that may change between sweeps in one folder.
@@ -83,22 +84,8 @@ def _describe(
   Raises:
     ResultsError: If the folder belongs to another experiment.
   """
-  requested = {**experiment.to_mapping(), 'calibration': calibration}
   if (output / EXPERIMENT).exists():
-    existing = {
-        **loading.read_mapping(output / EXPERIMENT),
-        'calibration': read_description(output)['calibration'],
-    }
-    fixed = [
-        {key: value for key, value in one.items() if key not in _FREE_FIELDS}
-        for one in (existing, json.loads(json.dumps(requested)))
-    ]
-    if fixed[0] != fixed[1]:
-      differing = storage.difference(fixed[0], fixed[1])
-      raise errors.ResultsError(
-          f'folder {output} belongs to another experiment: {differing}; name'
-          ' another folder'
-      )
+    check_experiment(output, experiment.to_mapping(), calibration)
   text = yaml.safe_dump(experiment.to_mapping(), sort_keys=False)
   description = {
       'schema': 1,
@@ -122,6 +109,36 @@ def _describe(
   }
   storage.write_sealed(output / SWEEP, description)
   storage.write_whole(output / EXPERIMENT, text.encode())
+
+
+def check_experiment(
+    folder: pathlib.Path, experiment: Mapping[str, Any], calibration: bool
+) -> None:
+  """Checks that a folder with a sweep may take jobs of an experiment.
+
+  Args:
+    folder: Folder of the sweep.
+    experiment: Contents of an experiment file.
+    calibration: True if the jobs use the calibration seeds.
+
+  Raises:
+    ResultsError: If the folder belongs to another experiment.
+  """
+  requested = {**experiment, 'calibration': calibration}
+  existing = {
+      **loading.read_mapping(folder / EXPERIMENT),
+      'calibration': read_description(folder)['calibration'],
+  }
+  fixed = [
+      {key: value for key, value in one.items() if key not in _FREE_FIELDS}
+      for one in (existing, json.loads(json.dumps(requested)))
+  ]
+  if fixed[0] != fixed[1]:
+    differing = storage.difference(fixed[0], fixed[1])
+    raise errors.ResultsError(
+        f'folder {folder} belongs to another experiment: {differing}; name'
+        ' another folder'
+    )
 
 
 def read_description(folder: pathlib.Path) -> dict[str, Any]:

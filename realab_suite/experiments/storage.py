@@ -17,6 +17,8 @@ from realab_suite.config import validation
 
 CONFIG = 'config.json'
 DONE = 'done.json'
+LEFT_OUT = 'left_out.json'
+LEARNER = 'learner.bin'
 _LOCK = 'lock'
 _CHECKPOINTS = 'checkpoints'
 _SUFFIX = '.ckpt'
@@ -157,11 +159,15 @@ def is_done(path: pathlib.Path) -> bool:
   """Returns True if the run of a folder has finished.
 
   Raises:
-    ResultsError: If a result was changed or removed after that.
+    ResultsError: If a result was changed or removed after that. Only results
+      that `left_out` lists may be missing.
   """
   if not (path / DONE).exists():
     return False
-  for name, digest in _read_done(path / DONE).items():
+  missing = left_out(path)
+  for name, digest in read_done(path / DONE).items():
+    if missing.get(name) == digest and not os.path.lexists(path / name):
+      continue
     if _digest(path / name) != digest:
       raise errors.ResultsError(
           f'{path / name}: changed since the run finished; remove {path} to run'
@@ -205,8 +211,12 @@ def read_sealed(path: pathlib.Path, advice: str) -> dict[str, Any]:
   return sealed
 
 
-def _read_done(path: pathlib.Path) -> dict[str, str]:
-  """Returns the SHA-256 of each result, by the name of its file."""
+def read_done(path: pathlib.Path) -> dict[str, str]:
+  """Returns the SHA-256 of each result, by the name of its file.
+
+  Raises:
+    ResultsError: If the file cannot be read or is damaged.
+  """
   advice = f'remove {path.parent} to run it again'
   files: dict[str, str] = read_sealed(path, advice).get('files', {})
   for name in files:
@@ -216,6 +226,40 @@ def _read_done(path: pathlib.Path) -> dict[str, str]:
           f'{path}: {name!r:.80} is not a file of a run; {advice}'
       )
   return files
+
+
+def left_out(path: pathlib.Path) -> dict[str, str]:
+  """Returns the SHA-256 of each result that a packed sweep left out.
+
+  Raises:
+    ResultsError: If the list is damaged or has a result other than the learner.
+  """
+  if not os.path.lexists(path / LEFT_OUT):
+    return {}
+  advice = f'remove {path} to run it again'
+  files = read_sealed(path / LEFT_OUT, advice).get('files')
+  if not isinstance(files, dict) or list(files) != [LEARNER]:
+    raise errors.ResultsError(
+        f'{path / LEFT_OUT}: files is {files!r:.80}; allowed is {LEARNER};'
+        f' {advice}'
+    )
+  return files
+
+
+def result_path(path: pathlib.Path, name: str) -> pathlib.Path:
+  """Returns the path of a result in the folder of a run.
+
+  Raises:
+    ResultsError: If it was left out of a packed sweep, and is still missing.
+  """
+  file = path / name
+  if name in left_out(path) and not os.path.lexists(file):
+    raise errors.ResultsError(
+        f'{file}: left out when the sweep was packed; copy it from the folder'
+        ' of that sweep, unpack a sweep that was packed with --learners, or run'
+        ' the job again in another folder'
+    )
+  return file
 
 
 @final

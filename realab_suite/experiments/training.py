@@ -41,7 +41,7 @@ EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
 TIMING = 'timing.jsonl'
 TRAINING_EPISODES = 'training_episodes.jsonl'
-LEARNER = 'learner.bin'
+LEARNER = storage.LEARNER
 TRACE = 'trace.bin'
 TENSORBOARD = 'tensorboard'
 _CHECKPOINT = 'checkpoint'
@@ -136,7 +136,7 @@ def load_learner(
   Raises:
     ResultsError: If the learner is missing, damaged or belongs to another job.
   """
-  file = path / LEARNER
+  file = storage.result_path(path, LEARNER)
   state = storage.read_archive(file, header(job.digest(), LEARNER))
   learner = make_learner(job, batch)
   with storage.naming(file):

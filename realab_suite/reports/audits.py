@@ -5,13 +5,12 @@ in the folder of the sweep, it tells whether the design of a run is exploitable.
 """
 
 import pathlib
-from typing import Final
 
 from realab_suite import errors
+from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.reports import sweep_results
 
-FOLDER: Final = 'audits'
 _IS_EXPLOITABLE = {'EXPLOITABLE': True, 'RESISTED WITHIN BUDGET': False}
 
 
@@ -32,7 +31,7 @@ def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:
   """
   if run.design.channel == 'secure':
     return False
-  path = folder / FOLDER / f'{run.name}.json'
+  path = folder / scheduler.AUDITS / f'{run.name}.json'
   if not path.exists():
     return None
   content = storage.read_json(path)

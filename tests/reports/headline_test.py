@@ -10,8 +10,8 @@ from realab_suite import errors
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import results
 from realab_suite.experiments import result_tables
+from realab_suite.experiments import scheduler
 from realab_suite.experiments import training
-from realab_suite.reports import audits
 from realab_suite.reports import headline
 from realab_suite.reports import html_page
 from realab_suite.reports import numbers
@@ -34,7 +34,7 @@ def fixture_one_seed(tmp_path_factory):
 
 
 def _audit(folder, run, verdict):
-  path = folder / audits.FOLDER
+  path = folder / scheduler.AUDITS
   path.mkdir(exist_ok=True)
   (path / f'{run}.json').write_text(json.dumps({'verdict': verdict}))
 

@@ -6,5 +6,5 @@ OUTPUT = flags.DEFINE_string(
     'output',
     None,
     'Folder to write into; required, except by `report`, whose default is the'
-    ' folder of the sweep.',
+    ' folder of the sweep. For `pack`, a .zip file.',
 )

@@ -1,0 +1,40 @@
+r"""Unpacks the jobs of a packed sweep into the folder of a sweep.
+
+  python -m realab_suite.launchers.unpack --input=docs/results/paper.zip \
+    --output=results/paper
+
+The folder is new, or that of a sweep of the same experiment, which gets the
+jobs that it lacks. Every file is verified before anything is written.
+"""
+
+from collections.abc import Sequence
+import pathlib
+
+from absl import flags
+
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+from realab_suite.launchers.flags import input_flag
+from realab_suite.launchers.flags import output_flag
+
+flags.adopt_module_key_flags(input_flag)
+flags.adopt_module_key_flags(output_flag)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Unpacks the file that the flags name."""
+  del argv
+  path = pathlib.Path(program.required(input_flag.INPUT))
+  output = pathlib.Path(program.required(output_flag.OUTPUT))
+  renderers.render_on_demand()
+  # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite.experiments import packing
+
+  num_new, num_there = packing.unpack(path, output)
+  program.say(
+      f'{num_new} jobs were added to {output}; {num_there} were there already'
+  )
+
+
+if __name__ == '__main__':
+  program.start(main)

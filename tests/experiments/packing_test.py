@@ -1,0 +1,368 @@
+"""Tests of packed sweeps."""
+
+import io
+import json
+import pathlib
+import shutil
+import stat
+import zipfile
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import jobs
+from realab_suite.experiments import packing
+from realab_suite.experiments import scheduler
+from realab_suite.experiments import storage
+from realab_suite.experiments import training
+from realab_suite.launchers import pack
+from realab_suite.launchers import unpack
+from realab_suite.reports import html_page
+from realab_suite.reports import sweep_results
+from tests.experiments import finished_jobs_test
+from tests.experiments import fake_sweep
+from tests.launchers import in_process
+
+_UNFINISHED = ('decoupled', 1)
+
+
+def _experiment() -> experiment_specs.ExperimentSpec:
+  return fake_sweep.experiment(seeds=[0, 1], baselines=['random'])
+
+
+def _job(run: str, seed: int) -> jobs.Job:
+  [job] = jobs.plan(_experiment(), [seed], [run])
+  return job
+
+
+@pytest.fixture(scope='module', name='built')
+def _built(tmp_path_factory):
+  folder = tmp_path_factory.mktemp('built') / 'sweep'
+  fake_sweep.build(folder, _experiment(), (_UNFINISHED,))
+  (folder / scheduler.AUDITS).mkdir()
+  audit = folder / scheduler.AUDITS / 'reward.json'
+  audit.write_text('{"verdict": "EXPLOITABLE"}')
+  (folder / scheduler.LOGS).mkdir()
+  (folder / scheduler.LOGS / 'a.log').write_text('a line')
+  return folder
+
+
+@pytest.fixture(scope='module', name='packed')
+def _packed(built, tmp_path_factory):
+  path = tmp_path_factory.mktemp('packed') / 'sweep.zip'
+  assert packing.pack(built, path) == (9, 1)
+  return path
+
+
+def _files(folder: pathlib.Path) -> dict[str, bytes]:
+  return {
+      str(path.relative_to(folder)): path.read_bytes()
+      for path in sorted(folder.rglob('*'))
+      if path.is_file() and path.name != 'lock'
+  }
+
+
+def _left(folder: pathlib.Path) -> set[str]:
+  return {path.name for path in folder.iterdir()}
+
+
+def test_an_unpacked_sweep_has_the_verified_files_and_no_others(
+    built, packed, tmp_path
+):
+  output = tmp_path / 'new' / 'sweep'
+  assert packing.unpack(packed, output) == (9, 0)
+  there, before = _files(output), _files(built)
+  added = {name for name in there if name.endswith(storage.LEFT_OUT)}
+  assert len(added) == 5  # One for each finished learner.
+  expected = {
+      name
+      for name in before
+      if not name.startswith((scheduler.LOGS, _job(*_UNFINISHED).folder()))
+      and pathlib.Path(name).name not in (training.LEARNER, training.TIMING)
+  }
+  assert there.keys() - added == expected
+  assert all(there[name] == before[name] for name in expected)
+  assert _left(output.parent) == {'sweep'}
+
+
+def test_packing_again_gives_the_same_bytes_also_after_unpacking(
+    built, packed, tmp_path
+):
+  packing.unpack(packed, tmp_path / 'sweep')
+  for i, folder in enumerate((built, tmp_path / 'sweep')):
+    packing.pack(folder, tmp_path / f'{i}.zip')
+    assert (tmp_path / f'{i}.zip').read_bytes() == packed.read_bytes()
+
+
+def test_the_tables_of_a_report_are_the_same_byte_for_byte(
+    built, packed, tmp_path
+):
+  packing.unpack(packed, tmp_path / 'sweep')
+  for folder, name in ((built, 'before'), (tmp_path / 'sweep', 'after')):
+    html_page.write(folder, tmp_path / name, lambda line: None, 'no clips')
+  for name in (html_page.CSV, html_page.MARKDOWN, 'seeds.csv'):
+    before, after = (tmp_path / one / name for one in ('before', 'after'))
+    assert before.read_bytes() == after.read_bytes()
+
+
+def test_a_sweep_continues_without_the_jobs_that_are_there(
+    packed, tmp_path, monkeypatch
+):
+  monkeypatch.setattr(scheduler, '_POLL_SECONDS', 0.0)
+  packing.unpack(packed, tmp_path / 'sweep')
+  engine = finished_jobs_test._Idle()
+  with pytest.raises(errors.ResultsError, match='1 of 10 jobs failed: decoup'):
+    scheduler.sweep(
+        _experiment(), tmp_path / 'sweep', engine, lambda line: None
+    )
+  [command] = engine.commands
+  assert {'--run=decoupled', '--seed=1'} <= {*command}
+
+
+def test_a_missing_learner_is_refused_except_if_it_was_left_out(
+    built, packed, tmp_path
+):
+  packing.unpack(packed, tmp_path / 'sweep')
+  job = _job('reward', 0)
+  folder = tmp_path / 'sweep' / job.folder()
+  with pytest.raises(errors.ResultsError, match=r'learner\.bin: left out .*--'):
+    training.load_learner(job, folder, None)
+  with pytest.raises(errors.ResultsError, match=r'learner\.bin: left out'):
+    packing.pack(tmp_path / 'sweep', tmp_path / 'x.zip', learners=True)
+  learner = folder / training.LEARNER
+  learner.write_bytes(b'another one')
+  with pytest.raises(errors.ResultsError, match='changed since the run'):
+    jobs.is_done(folder)
+  shutil.copy(built / job.folder() / training.LEARNER, learner)
+  assert jobs.is_done(folder)
+  learner.unlink()
+  (folder / storage.LEFT_OUT).unlink()
+  with pytest.raises(errors.ResultsError, match=r'learner\.bin: No such file'):
+    jobs.is_done(folder)
+
+
+@pytest.mark.parametrize(
+    'files', [{'trace.bin': '0'}, {}, None, {'learner.bin': '0', 'x': '1'}]
+)
+def test_nothing_but_the_learner_can_be_left_out(tmp_path, files):
+  storage.write_done(tmp_path, {'files': {}})
+  storage.write_sealed(tmp_path / storage.LEFT_OUT, {'files': files})
+  with pytest.raises(errors.ResultsError, match=r'allowed is learner\.bin'):
+    storage.is_done(tmp_path)
+
+
+def test_learners_are_packed_on_request(built, tmp_path):
+  packing.pack(built, tmp_path / 'all.zip', learners=True)
+  packing.unpack(tmp_path / 'all.zip', tmp_path / 'sweep')
+  folder = tmp_path / 'sweep' / _job('reward', 0).folder()
+  assert (folder / training.LEARNER).exists()
+  assert not (folder / storage.LEFT_OUT).exists()
+
+
+def test_only_missing_jobs_are_added_to_a_folder(built, packed, tmp_path):
+  output = tmp_path / 'sweep'
+  packing.unpack(packed, output)
+  before = _files(output)
+  assert packing.unpack(packed, output) == (0, 9)
+  assert _files(output) == before
+  shutil.rmtree(output / _job('reward', 1).folder())
+  (output / scheduler.AUDITS / 'reward.json').write_text('mine')
+  assert packing.unpack(packed, output) == (1, 8)
+  before[f'{scheduler.AUDITS}/reward.json'] = b'mine'
+  assert _files(output) == before
+  assert len(sweep_results.load(output).runs['reward'].folders) == 2
+
+
+def test_a_folder_with_anything_else_is_refused_and_stays(
+    built, packed, tmp_path
+):
+  mine = tmp_path / 'mine'
+  mine.mkdir()
+  (mine / 'a').write_text('text')
+  other = fake_sweep.build(
+      tmp_path / 'other', fake_sweep.experiment(max_steps=9, seeds=[0])
+  )
+  fewer = fake_sweep.build(
+      tmp_path / 'fewer', fake_sweep.experiment(seeds=[0], baselines=['random'])
+  )
+  unfinished = pathlib.Path(shutil.copytree(built, tmp_path / 'unfinished'))
+  (unfinished / _job('reward', 0).folder() / storage.DONE).unlink()
+  for folder, problem in (
+      (mine, 'not empty, and not the folder of a sweep'),
+      (other, 'belongs to another experiment: max_steps'),
+      (fewer, 'has no job reward.random-1-'),
+      (unfinished, 'an unfinished job'),
+      (mine / 'a', 'Not a directory'),
+  ):
+    before = _files(folder)
+    with pytest.raises(errors.ResultsError, match=problem):
+      packing.unpack(packed, folder)
+    assert _files(folder) == before
+  assert not list(tmp_path.rglob('.unpacking*'))
+
+
+_EPISODES = f'/{training.EPISODES}'
+
+
+def _forged(packed: pathlib.Path, path: pathlib.Path, how: str) -> None:
+  """Writes a packed sweep with one thing changed."""
+  with zipfile.ZipFile(packed) as source:
+    members = {one: source.read(one) for one in source.infolist()}
+  manifest = json.loads(members.popitem()[1])
+  [rows, *_] = [m for m in members if m.filename.endswith(_EPISODES)]
+  extra = {
+      'parent': '../x', 'absolute': '/x', 'deep': 'a/b/c', 'hidden': '.x',
+      'folder': 'x/', 'backslash': 'a\\b', 'twice': rows.filename,
+      'unlisted': 'x', 'stranger': 'x', 'in a job': 'x',
+  }  # fmt: skip
+  info = zipfile.ZipInfo(extra.get(how, 'x'))
+  info.external_attr = rows.external_attr
+  info.compress_type = zipfile.ZIP_LZMA
+  if how == 'link':
+    info.external_attr = (stat.S_IFLNK | 0o777) << 16
+  if how == 'stored':
+    info.compress_type = zipfile.ZIP_STORED
+  if how == 'in a job':
+    info.filename = rows.filename.replace(training.EPISODES, 'lock')
+  if how == 'missing':
+    del members[rows]
+  elif how == 'no done':
+    name = rows.filename.replace(training.EPISODES, storage.DONE)
+    [done] = [one for one in members if one.filename == name]
+    del members[done], manifest['files'][name]
+  elif how == 'changed':
+    members[rows] += b'{}\n'
+  elif how == 'forged digest':
+    members[rows] += b'{}\n'
+    manifest['files'][rows.filename] = packing.hashlib.sha256(
+        members[rows]
+    ).hexdigest()
+  elif how == 'schema':
+    manifest['schema'] = 2
+  elif how == 'no digests':
+    manifest['files'] = [1]
+  elif how == 'no learner':
+    manifest['left_out'] = {}
+  else:
+    members[info] = b''
+  if how in ('stranger', 'in a job'):
+    digest = packing.hashlib.sha256(b'').hexdigest()
+    manifest['files'][info.filename] = digest
+  with zipfile.ZipFile(path, 'w') as target:
+    for member, data in members.items():
+      target.writestr(member, data)
+    packing._add(target, packing.MANIFEST, json.dumps(manifest).encode())
+
+
+@pytest.mark.filterwarnings('ignore:Duplicate name')
+@pytest.mark.parametrize(
+    ('how', 'problem'),
+    [
+        ('parent', "'../x' is not the name of"),
+        ('absolute', "'/x' is not the name of"),
+        ('deep', "'a/b/c' is not the name of"),
+        ('hidden', "'.x' is not the name of"),
+        ('folder', "'x/' is not the name of"),
+        ('backslash', 'is not the name of'),
+        ('twice', 'is there twice'),
+        ('unlisted', "'x' is not in the manifest"),
+        ('stranger', "'x' does not belong to a job"),
+        ('in a job', "lock' does not belong to a job"),
+        ('link', "'x' is not a regular file"),
+        ('stored', "'x' is not compressed"),
+        ('missing', "episodes.jsonl' is missing"),
+        ('no done', "done.json' is missing"),
+        ('changed', "episodes.jsonl' changed since the sweep was packed"),
+        ('forged digest', 'episodes.jsonl: changed since the run finished'),
+        ('schema', 'schema is 2; allowed is 1'),
+        ('no digests', "'manifest.json' has no SHA-256"),
+        ('no learner', 'learner.bin: No such file'),
+    ],
+)
+def test_a_forged_file_is_refused_and_nothing_is_written(
+    packed, tmp_path, how, problem
+):
+  path, work = tmp_path / 'forged.zip', tmp_path / 'work'
+  work.mkdir()
+  _forged(packed, path, how)
+  with pytest.raises(errors.ResultsError) as raised:
+    packing.unpack(path, work / 'sweep')
+  assert problem in str(raised.value)
+  assert str(raised.value).startswith(f'{path}: ')
+  assert not _left(work)
+
+
+def test_oversized_members_are_refused(packed, tmp_path, monkeypatch, built):
+  monkeypatch.setattr(packing, '_MAX_MEMBER_BYTES', 1000)
+  with pytest.raises(errors.ResultsError, match=r'has \d+ bytes; allowed are'):
+    packing.unpack(packed, tmp_path / 'sweep')
+  with pytest.raises(errors.ResultsError, match=r'has \d+ bytes; allowed are'):
+    packing.pack(built, tmp_path / 'sweep.zip')
+  monkeypatch.undo()
+  monkeypatch.setattr(packing, '_MAX_BYTES', 100_000)
+  with pytest.raises(errors.ResultsError, match='has more than 100000 bytes'):
+    packing.unpack(packed, tmp_path / 'sweep')
+  assert not _left(tmp_path)
+
+
+def test_damage_anywhere_is_refused_or_changes_no_file(packed, tmp_path):
+  data = packed.read_bytes()
+  packing.unpack(packed, tmp_path / 'whole')
+  whole = _files(tmp_path / 'whole')
+  refused = 0
+  for i in range(60):
+    place = i * (len(data) - 1) // 59
+    kept = data[:place] if i % 3 == 0 else data
+    flipped = bytearray(kept) or bytearray(b'x')
+    if i % 3:
+      flipped[place] ^= 1 << i % 8
+    (tmp_path / 'damaged.zip').write_bytes(flipped)
+    output = tmp_path / str(i)
+    try:
+      packing.unpack(tmp_path / 'damaged.zip', output)
+    except errors.ResultsError as error:
+      assert '\n' not in str(error)
+      assert not output.exists()
+      refused += 1
+    else:
+      assert _files(output) == whole
+  assert refused >= 50
+
+
+def test_a_file_that_is_no_packed_sweep_is_refused(tmp_path):
+  empty = io.BytesIO()
+  zipfile.ZipFile(empty, 'w').close()
+  for data in (b'', b'text', empty.getvalue()):
+    (tmp_path / 'file.zip').write_bytes(data)
+    with pytest.raises(errors.ResultsError, match='not a packed sweep'):
+      packing.unpack(tmp_path / 'file.zip', tmp_path / 'sweep')
+
+
+def test_the_launchers_pack_and_unpack(built, packed, tmp_path):
+  path, output = tmp_path / 'sweep.zip', tmp_path / 'sweep'
+  ended = in_process.run(pack, f'--input={built}', f'--output={path}')
+  assert (ended.status, ended.stderr) == (0, '')
+  assert ended.stdout == f'9 finished jobs are in {path}; 1 are unfinished\n'
+  assert path.read_bytes() == packed.read_bytes()
+  ended = in_process.run(unpack, f'--input={path}', f'--output={output}')
+  assert ended.stdout == (
+      f'9 jobs were added to {output}; 0 were there already\n'
+  )
+  for module, source, target, problem in (
+      (pack, tmp_path, path, 'sweep.json: No such file'),
+      (pack, built, tmp_path / 'sweep.tar', 'allowed are names with .zip'),
+      (unpack, tmp_path / 'none', output, 'none: No such file'),
+  ):
+    assert problem in in_process.complaint(
+        module, f'--input={source}', f'--output={target}'
+    )
+
+
+def test_a_sweep_without_finished_jobs_is_not_packed(tmp_path):
+  one = fake_sweep.experiment(seeds=[0], baselines=[], runs={
+      'decoupled': fake_sweep.EXPERIMENT['runs']['decoupled']
+  })
+  fake_sweep.build(tmp_path / 'sweep', one, (('decoupled', 0),))
+  with pytest.raises(errors.ResultsError, match='no job has finished yet'):
+    packing.pack(tmp_path / 'sweep', tmp_path / 'sweep.zip')
