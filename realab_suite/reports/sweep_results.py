@@ -140,8 +140,15 @@ class Run:
 
   @functools.cached_property
   def timing(self) -> dict[int, list[dict[str, Any]]]:
-    """Training time of each seed; empty for a scripted policy."""
-    return self._lines(training.TIMING, _TIMING_KEYS)
+    """Training time of each seed.
+
+    Empty for a scripted policy, and without the seeds of a packed sweep.
+    """
+    return {
+        seed: read_lines(path / training.TIMING, _TIMING_KEYS)
+        for seed, path in self.folders.items()
+        if (path / training.TIMING).exists()
+    }
 
   def training_episodes(self) -> dict[int, list[dict[str, Any]]]:
     """Returns the record of each training episode, by seed."""
