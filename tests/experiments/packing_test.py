@@ -24,11 +24,12 @@ from tests.experiments import fake_sweep
 from tests.experiments import finished_jobs_test
 from tests.launchers import in_process
 
-_UNFINISHED = ('decoupled', 1)
+_UNFINISHED = ('reward.random', 1)
+_RUNS = {'reward': {'design': 'instantaneous_reward'}}
 
 
 def _experiment() -> experiment_specs.ExperimentSpec:
-  return fake_sweep.experiment(seeds=[0, 1], baselines=['random'])
+  return fake_sweep.experiment(seeds=[0, 1], baselines=['random'], runs=_RUNS)
 
 
 def _job(run: str, seed: int) -> jobs.Job:
@@ -51,7 +52,7 @@ def _built(tmp_path_factory):
 @pytest.fixture(scope='module', name='packed')
 def _packed(built, tmp_path_factory):
   path = tmp_path_factory.mktemp('packed') / 'sweep.zip'
-  assert packing.pack(built, path) == (9, 1)
+  assert packing.pack(built, path) == (3, 1)
   return path
 
 
@@ -71,10 +72,10 @@ def test_an_unpacked_sweep_has_the_verified_files_and_no_others(
     built, packed, tmp_path
 ):
   output = tmp_path / 'new' / 'sweep'
-  assert packing.unpack(packed, output) == (9, 0)
+  assert packing.unpack(packed, output) == (3, 0)
   there, before = _files(output), _files(built)
   added = {name for name in there if name.endswith(storage.LEFT_OUT)}
-  assert len(added) == 5  # One for each finished learner.
+  assert len(added) == 2  # One for each finished learner.
   expected = {
       name
       for name in before
@@ -112,12 +113,14 @@ def test_a_sweep_continues_without_the_jobs_that_are_there(
   monkeypatch.setattr(scheduler, '_POLL_SECONDS', 0.0)
   packing.unpack(packed, tmp_path / 'sweep')
   engine = finished_jobs_test._Idle()
-  with pytest.raises(errors.ResultsError, match='1 of 10 jobs failed: decoup'):
+  with pytest.raises(
+      errors.ResultsError, match='1 of 4 jobs failed: reward.random'
+  ):
     scheduler.sweep(
         _experiment(), tmp_path / 'sweep', engine, lambda line: None
     )
   [command] = engine.commands
-  assert {'--run=decoupled', '--seed=1'} <= {*command}
+  assert {'--run=reward.random', '--seed=1'} <= {*command}
 
 
 def test_a_missing_learner_is_refused_except_if_it_was_left_out(
@@ -164,11 +167,11 @@ def test_only_missing_jobs_are_added_to_a_folder(built, packed, tmp_path):
   output = tmp_path / 'sweep'
   packing.unpack(packed, output)
   before = _files(output)
-  assert packing.unpack(packed, output) == (0, 9)
+  assert packing.unpack(packed, output) == (0, 3)
   assert _files(output) == before
   shutil.rmtree(output / _job('reward', 1).folder())
   (output / scheduler.AUDITS / 'reward.json').write_text('mine')
-  assert packing.unpack(packed, output) == (1, 8)
+  assert packing.unpack(packed, output) == (1, 2)
   before[f'{scheduler.AUDITS}/reward.json'] = b'mine'
   assert _files(output) == before
   assert len(sweep_results.load(output).runs['reward'].folders) == 2
@@ -181,17 +184,19 @@ def test_a_folder_with_anything_else_is_refused_and_stays(
   mine.mkdir()
   (mine / 'a').write_text('text')
   other = fake_sweep.build(
-      tmp_path / 'other', fake_sweep.experiment(max_steps=9, seeds=[0])
+      tmp_path / 'other',
+      fake_sweep.experiment(max_steps=9, seeds=[0], runs=_RUNS),
   )
   fewer = fake_sweep.build(
-      tmp_path / 'fewer', fake_sweep.experiment(seeds=[0], baselines=['random'])
+      tmp_path / 'fewer',
+      fake_sweep.experiment(seeds=[0], baselines=['random'], runs=_RUNS),
   )
   unfinished = pathlib.Path(shutil.copytree(built, tmp_path / 'unfinished'))
   (unfinished / _job('reward', 0).folder() / storage.DONE).unlink()
   for folder, problem in (
       (mine, 'not empty, and not the folder of a sweep'),
       (other, 'belongs to another experiment: max_steps'),
-      (fewer, 'has no job reward.random-1-'),
+      (fewer, 'has no job reward-1-'),
       (unfinished, 'an unfinished job'),
       (mine / 'a', 'Not a directory'),
   ):
@@ -342,11 +347,11 @@ def test_the_launchers_pack_and_unpack(built, packed, tmp_path):
   path, output = tmp_path / 'sweep.zip', tmp_path / 'sweep'
   ended = in_process.run(pack, f'--input={built}', f'--output={path}')
   assert (ended.status, ended.stderr) == (0, '')
-  assert ended.stdout == f'9 finished jobs are in {path}; 1 are unfinished\n'
+  assert ended.stdout == f'3 finished jobs are in {path}; 1 are unfinished\n'
   assert path.read_bytes() == packed.read_bytes()
   ended = in_process.run(unpack, f'--input={path}', f'--output={output}')
   assert ended.stdout == (
-      f'9 jobs were added to {output}; 0 were there already\n'
+      f'3 jobs were added to {output}; 0 were there already\n'
   )
   for module, source, target, problem in (
       (pack, tmp_path, path, 'sweep.json: No such file'),
