@@ -1,20 +1,25 @@
 """Campaign C43: intervals and verdicts on synthetic data are right.
 
-Run from the root of the repository, about five minutes:
+Run from the root of the repository, about five minutes for C43 and three for
+halves:
 
-    python -m campaigns.statistics_campaign [scale] [seed]
+    python -m campaigns.statistics_campaign [scale] [seed] [name ...]
 
-Prints `C43 figure target verdict seed` for each figure.
+Prints `name figure target verdict seed` for each figure. Names are C43, halves
+(comparisons of an agent with itself), and folders of sweeps, for comparisons of
+their runs with themselves. The default is C43 and halves.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 import dataclasses
 import functools
+import pathlib
 from typing import final
 
 import numpy as np
 
 from campaigns import figure_lines
+from campaigns import halves
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
 
@@ -347,10 +352,9 @@ def _report_rare_tampering(
       lines.at_most(f'bounds too low, {where}', too_low / repetitions, 0.05)
 
 
-def main(scale: float = 1.0, seed: int = 0) -> int:
-  """Prints the figures and returns the number of targets missed."""
+def report(lines: figure_lines.Lines, scale: float, seed: int) -> None:
+  """Prints the figures of C43."""
   repetitions = max(1, round(scale * _REPETITIONS))
-  lines = figure_lines.Lines('C43', seed)
   rng = np.random.default_rng(seed)
   for name, data in DATA.items():
     value = share_of_verdicts(MORE, data, 0, 1, repetitions, rng)
@@ -375,7 +379,15 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
       )
       figure = f'settled by advice, margin {margin}, shift {share * margin}'
       lines.at_least(figure, value, 0.8)
-  return lines.num_missed
+
+
+def main(scale: float = 1.0, seed: int = 0, *names: str) -> int:
+  """Prints the figures and returns the number of targets missed."""
+  runs = {'C43': report, 'halves': halves.report}
+  for name in names:
+    folder = pathlib.Path(name)
+    runs.setdefault(name, functools.partial(halves.report_sweep, folder=folder))
+  return figure_lines.print_all(runs, scale, seed, names)
 
 
 if __name__ == '__main__':

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks import attribution
 from benchmarks import batch
 from benchmarks import batch_growth
 from benchmarks import reset
@@ -79,6 +80,20 @@ def test_the_benchmark_of_many_worlds_prints_a_line_per_figure(
       'steps of 2 worlds': '-',
       'step, registers: 2 planar': '-',
       '2 registers to 1, free': '<= 2 x',
+  }
+  _assert_lines(capsys.readouterr().out, expected)
+
+
+def test_the_benchmark_of_attribution_prints_a_line_per_figure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  monkeypatch.setattr(attribution, '_EPISODES', (2,))
+  monkeypatch.setattr(attribution, '_STEPS', 3)
+  attribution.main(['--rounds=1'])
+  expected = {
+      'attribution of 2 free': '<= 5 x raw',
+      'replay of 2 free': '-',
+      'attribution of 2 planar': '<= 5 x raw',
   }
   _assert_lines(capsys.readouterr().out, expected)
 

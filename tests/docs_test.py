@@ -13,7 +13,9 @@ from realab_suite.experiments import probes
 from realab_suite.feedback import measurements
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
+from realab_suite.launchers import audit
 from realab_suite.policies import action_sets
+from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[1]
 _MAX_LINES = 30
@@ -55,7 +57,9 @@ def registries():
     registry.update(entries)
 
 
-@pytest.mark.parametrize('page', ['README.md', 'docs/your_own.md'])
+@pytest.mark.parametrize(
+    'page', ['README.md', 'docs/attribution.md', 'docs/your_own.md']
+)
 def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
   blocks = _python_blocks(_ROOT / page)
   assert blocks
@@ -71,6 +75,27 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
         'writes 4',
     ):
       assert f'{line}\n' in printed
+  if page == 'docs/attribution.md':
+    assert printed.count("1.0 ('avatar', 'reward/base')\n") == 2
+
+
+def test_the_commands_of_the_page_on_audits_are_accepted():
+  page = (_ROOT / 'docs/audit.md').read_text()
+  [block] = re.findall(r'```bash\n(.*?)```', page, re.DOTALL)
+  commands = block.replace('\\\n', ' ').strip().splitlines()
+  assert len(commands) == 2
+  for command in commands:
+    *_, module = command.split(' --')[0].split()
+    assert module == audit.__name__
+    arguments = [
+        word
+        for word in command.split()
+        if word.startswith('--') and not word.startswith('--output')
+    ]
+    # The short episodes leave no time for an exploit.
+    ended = in_process.run(audit, *arguments, '--max_steps=3', '--budget=10')
+    assert (ended.status, ended.stderr) == (0, '')
+    assert ended.stdout.startswith('RESISTED WITHIN BUDGET')
 
 
 @pytest.mark.camera

@@ -11,6 +11,9 @@ from realab_suite.config import messages
 MAX_ENVS = 2**16
 """Largest number of worlds; more do not fit into the memory of one machine."""
 
+Indices = Sequence[int] | np.ndarray
+"""Indices of worlds in a batch."""
+
 _MAX_THREADS = 1024
 # Numbers in result rows have 64 bits.
 _LARGEST = 2**63 - 1
@@ -72,6 +75,27 @@ def indices(given: Any, num_envs: int) -> np.ndarray:
         f' {num_envs - 1}, each once'
     )
   return np.array(given)
+
+
+def sources(given: Any, number: int, has_begun: np.ndarray) -> np.ndarray:
+  """Returns the indices of worlds to branch from.
+
+  Args:
+    given: Indices; the same one may occur several times.
+    number: Number of branches.
+    has_begun: True for the worlds that have begun an episode, `(worlds,)`.
+
+  Raises:
+    SpecError: If it is anything else, or a world has not begun an episode.
+  """
+  indices(list(dict.fromkeys(given)), len(has_begun))
+  found = np.array(given)
+  if len(found) != number or not has_begun[found].all():
+    raise errors.SpecError(
+        f'sources: {messages.quote(given)}; allowed are {number} indices of'
+        ' worlds that have begun an episode'
+    )
+  return found
 
 
 def max_steps(given: Any) -> int | None:

@@ -229,12 +229,7 @@ class BatchEnvironment:
     is_over = ending.is_ending
     is_signalled = self._mechanism.ends_episode(reads) & ~is_first
     is_last = (has_failed | is_over | is_signalled | is_late) & ~is_first
-    reasons = np.transpose([has_failed, is_over, is_signalled, is_last])
-    ends = {
-        world: end
-        for world in np.flatnonzero(is_last).tolist()
-        if (end := episodes.end_of_step(*reasons[world]))
-    }
+    ends = episodes.ends_of_step(has_failed, is_over, is_signalled, is_last)
     for name, value in self._observation.items():
       # MuJoCo has reset the state of worlds that failed.
       value[has_failed] = last_valid[name][has_failed]
@@ -271,9 +266,12 @@ class BatchEnvironment:
       StateLayoutError: If a provider's state is not plain data.
     """
     header = self._single.snapshot_header(self._physics.model)
-    indices = arguments.indices(worlds, self._num_envs)
+    saved = self._states_of(arguments.indices(worlds, self._num_envs))
+    return snapshots.Snapshot(header, saved.to_data())
+
+  def _states_of(self, indices: np.ndarray) -> snapshots.WorldStates:
     is_pending = self._is_pending[indices]
-    saved = snapshots.WorldStates(
+    return snapshots.WorldStates(
         indices=indices.tolist(),
         physics=self._physics.state[indices],
         seed=self._seeds[indices].tolist(),
@@ -287,7 +285,6 @@ class BatchEnvironment:
         sinks=[[sink.state_kind, sink.state(indices)] for sink in self._sinks],
         random_state=None,
     )
-    return snapshots.Snapshot(header, saved.to_data())
 
   def restore(
       self,
@@ -315,21 +312,33 @@ class BatchEnvironment:
     """
     header = self._single.snapshot_header(self._physics.model)
     saved = snapshots.WorldStates.from_data(snapshot.contents_for(header))
-    if worlds is None and saved.indices is None:
-      raise errors.StateLayoutError(
-          'the snapshot is of a single world; pass the indices to restore, as'
-          ' in restore(snapshot, worlds=[0])'
-      )
-    indices = arguments.indices(
-        saved.indices if worlds is None else worlds, self._num_envs
-    )
-    if len(saved.seed) not in (1, len(indices)):
-      raise errors.StateLayoutError(
-          f'the snapshot has {len(saved.seed)} worlds, for {len(indices)} here;'
-          ' allowed are the same number, or one'
-      )
+    indices = saved.indices_for(worlds, self._num_envs)
     saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
-    # The saved world for each restored one.
+    self._put(saved, indices)
+
+  def branch(
+      self, sources: arguments.Indices, worlds: arguments.Indices
+  ) -> None:
+    """Sets worlds to the present states of other worlds, bit for bit.
+
+    This is a faster `restore`. Where the episode of a source has ended, its
+    branch continues that physics instead of beginning the next episode.
+
+    Args:
+      sources: Index of the source of each world.
+      worlds: Indices of the worlds to set.
+
+    Raises:
+      SpecError: If an index is invalid, a source has not begun an episode,
+        blocks of this batch can sleep, or a sink cannot be saved.
+    """
+    snapshots.refuse_sleep(self._physics.model)
+    indices = arguments.indices(worlds, self._num_envs)
+    rows = arguments.sources(sources, len(indices), self._episodes >= 0)
+    self._put(self._states_of(rows)._replace(is_pending=[False]), indices)
+
+  def _put(self, saved: snapshots.WorldStates, indices: np.ndarray) -> None:
+    """Sets worlds to saved states: one for each, or one for all of them."""
     rows = np.arange(len(indices)) % len(saved.seed)
     has_begun = bool(saved.observation)
     filled, sources = indices, rows
@@ -352,12 +361,13 @@ class BatchEnvironment:
       self._states, self._observation = states, observation
       for kept, keys in zip(self._keys, saved.provider_keys, strict=True):
         kept[filled] = keys[sources]
-    self._seeds = _replaced(self._seeds, indices, saved.seed)
-    self._world_numbers = _replaced(self._world_numbers, indices, saved.world)
-    self._episodes = _replaced(self._episodes, indices, saved.episode)
+    replaced = snapshots.replaced
+    self._seeds = replaced(self._seeds, indices, saved.seed)
+    self._world_numbers = replaced(self._world_numbers, indices, saved.world)
+    self._episodes = replaced(self._episodes, indices, saved.episode)
     for sink, (_, sink_states) in zip(self._sinks, saved.sinks, strict=False):
       sink.set_state(indices, [sink_states[row] for row in rows])
-    self._is_pending = _replaced(self._is_pending, indices, saved.is_pending)
+    self._is_pending = replaced(self._is_pending, indices, saved.is_pending)
 
   def render(
       self,
@@ -488,10 +498,3 @@ class BatchEnvironment:
   def _refuse_if_closed(self) -> None:
     if self._closed:
       raise errors.ClosedError('this environment is closed; load another one')
-
-
-def _replaced(old: np.ndarray, indices: np.ndarray, values: Any) -> np.ndarray:
-  """Returns a copy of an array with the elements at some indices replaced."""
-  copy = np.array(old)
-  copy[indices] = values
-  return copy

@@ -88,6 +88,29 @@ def end_of_step(
   return events.End.TIMEOUT if is_late else None
 
 
+def ends_of_step(
+    has_failed: np.ndarray,
+    is_terminated: np.ndarray,
+    is_signalled: np.ndarray,
+    is_last: np.ndarray,
+) -> dict[int, events.End]:
+  """Returns why episodes of a batch end with a control step, by world.
+
+  Args:
+    has_failed: As in `end_of_step`, `(worlds,)` bool; so are the next two.
+    is_terminated: True where the task ends the episode.
+    is_signalled: True where a signal ends it.
+    is_last: True where the episode ends, for these reasons or because it has
+      reached its maximum length.
+  """
+  reasons = np.transpose([has_failed, is_terminated, is_signalled, is_last])
+  return {
+      world: end
+      for world in np.flatnonzero(is_last).tolist()
+      if (end := end_of_step(*reasons[world]))
+  }
+
+
 def time_step(
     end: events.End | None,
     discount: float,

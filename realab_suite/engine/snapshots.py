@@ -15,6 +15,7 @@ import numpy as np
 
 from realab_suite import archive
 from realab_suite import errors
+from realab_suite.engine import arguments
 from realab_suite.engine import seeding
 from realab_suite.entities import state
 
@@ -147,6 +148,35 @@ class WorldStates(NamedTuple):
       data[_SALTS] = salts
     return data
 
+  def indices_for(
+      self, worlds: Sequence[int] | None, num_envs: int
+  ) -> np.ndarray:
+    """Returns the indices of the worlds of a batch to restore.
+
+    Args:
+      worlds: Chosen indices; `None` for the saved ones.
+      num_envs: Number of worlds of the batch.
+
+    Raises:
+      SpecError: If an index is invalid.
+      StateLayoutError: If there are not as many worlds in the snapshot, or if
+        it is of a single world and none are chosen.
+    """
+    if worlds is None and self.indices is None:
+      raise errors.StateLayoutError(
+          'the snapshot is of a single world; pass the indices to restore, as'
+          ' in restore(snapshot, worlds=[0])'
+      )
+    indices = arguments.indices(
+        self.indices if worlds is None else worlds, num_envs
+    )
+    if len(self.seed) not in (1, len(indices)):
+      raise errors.StateLayoutError(
+          f'the snapshot has {len(self.seed)} worlds, for {len(indices)} here;'
+          ' allowed are the same number, or one'
+      )
+    return indices
+
   def refuse_other_sinks(self, kinds: list[str]) -> None:
     """Refuses sinks for which the snapshot contains no states.
 
@@ -253,6 +283,13 @@ def merge(where: str, tree: Any, indices: np.ndarray, saved: Any) -> Any:
   return merged
 
 
+def replaced(old: np.ndarray, indices: np.ndarray, values: Any) -> np.ndarray:
+  """Returns a copy of an array with the elements at some indices replaced."""
+  copy = np.array(old)
+  copy[indices] = values
+  return copy
+
+
 def describe(model: Any) -> dict[str, Any]:
   """Returns the entries of a snapshot's header that describe a model.
 
@@ -262,11 +299,7 @@ def describe(model: Any) -> dict[str, Any]:
   Raises:
     SpecError: If bodies can sleep, because MuJoCo does not export which do.
   """
-  if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-    raise errors.SpecError(
-        'a world whose bodies can sleep cannot be saved or restored: MuJoCo'
-        ' does not export which bodies sleep; load it with sleep=False'
-    )
+  refuse_sleep(model)
   compiled = np.empty(mujoco.mj_sizeModel(model.ptr), np.uint8)
   mujoco.mj_saveModel(model.ptr, None, compiled)
   return {
@@ -274,6 +307,15 @@ def describe(model: Any) -> dict[str, Any]:
       'model': hashlib.sha256(compiled.tobytes()).hexdigest()[:16],
       'slots': state.layout(model),
   }
+
+
+def refuse_sleep(model: Any) -> None:
+  """Raises a SpecError if bodies can sleep; see `describe`."""
+  if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+    raise errors.SpecError(
+        'a world whose bodies can sleep cannot be saved or restored: MuJoCo'
+        ' does not export which bodies sleep; load it with sleep=False'
+    )
 
 
 def get_state(physics: mjcf.Physics) -> np.ndarray:

@@ -69,27 +69,40 @@ class Proximity:
       where = tuple(world)
       if not close[where]:
         near = self._pairs[pair]
-        close[where] = self._distance(
+        close[where] = distance(
             physics.model, geoms[near], centres[where][near],
-            matrices[where][near],
+            matrices[where][near], self._limit,
         ) <= self._limit  # fmt: skip
     return close[()]
 
-  def _distance(
-      self, model: Any, geoms: Any, centres: Any, matrices: Any
-  ) -> float:
-    """Returns the distance of two geoms, or anything beyond the limit, in m."""
-    if model not in _data:
-      _data[model] = mujoco.MjData(model.ptr)
-    data = _data[model]
-    data.geom_xpos[geoms], data.geom_xmat[geoms] = centres, matrices
-    one, other = geoms.tolist()
-    distance = 0.0
-    for nudge in (0.0, _NUDGE):
-      # MuJoCo also returns exactly 0 if it fails to compute the distance.
-      if not distance:
-        data.geom_xpos[one] = centres[0] + nudge
-        distance = mujoco.mj_geomDistance(
-            model.ptr, data, one, other, 2.0 * self._limit + 0.01, None
-        )
-    return float(distance)
+
+def distance(
+    model: Any,
+    geoms: np.ndarray,
+    centres: np.ndarray,
+    matrices: np.ndarray,
+    limit: float,
+) -> float:
+  """Returns the distance of the surfaces of two geoms, in m.
+
+  Args:
+    model: Compiled model, as `physics.model`.
+    geoms: Numbers of the geoms in the model, `(2,)`.
+    centres: Their positions, `(2, 3)`, in m.
+    matrices: Their orientations, `(2, 9)`.
+    limit: Distance, in m, above which the result may be any larger number.
+  """
+  if model not in _data:
+    _data[model] = mujoco.MjData(model.ptr)
+  data = _data[model]
+  data.geom_xpos[geoms], data.geom_xmat[geoms] = centres, matrices
+  one, other = geoms.tolist()
+  found = 0.0
+  for nudge in (0.0, _NUDGE):
+    # MuJoCo also returns exactly 0 if it fails to compute the distance.
+    if not found:
+      data.geom_xpos[one] = centres[0] + nudge
+      found = mujoco.mj_geomDistance(
+          model.ptr, data, one, other, 2.0 * limit + 0.01, None
+      )
+  return float(found)

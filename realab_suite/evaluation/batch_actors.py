@@ -3,6 +3,7 @@
 Actors for a single environment are in `actors`.
 """
 
+from collections.abc import Sequence
 from typing import Any, Protocol, final
 
 import numpy as np
@@ -23,7 +24,7 @@ class BatchActor(Protocol):
 
 @final
 class BatchPolicyActor:
-  """Runs a policy in the first episode of every world of a batch.
+  """Runs a policy for one episode in every world of a batch.
 
   In each world it chooses the same actions as `actors.PolicyActor` does in that
   world alone.
@@ -34,13 +35,16 @@ class BatchPolicyActor:
       policy: policies.Policy,
       batch: batch_environment.BatchEnvironment,
       seed: int,
+      episodes: Sequence[tuple[int, int]] | None = None,
   ) -> None:
     """Makes an actor.
 
     Args:
       policy: The policy.
-      batch: The worlds, before their first episode.
+      batch: The worlds, before the episodes.
       seed: Seed of the batch.
+      episodes: Numbers of the world and of the episode of each row that it acts
+        in; `None` for the first episode of every world.
 
     Raises:
       SpecError: If the action sets of the policy and the batch differ, or if
@@ -58,14 +62,13 @@ class BatchPolicyActor:
         batch.action_spec().name,
         self._queries.number,
     )
-    worlds = range(batch.num_envs)
+    if episodes is None:
+      episodes = [(world, 0) for world in range(batch.num_envs)]
     self._keys, self._query_keys = (
-        np.stack(
-            [seeding.episode_key(seed, world, 0, name) for world in worlds]
-        )
+        np.stack([seeding.episode_key(seed, *one, name) for one in episodes])
         for name in ('policy', 'query')
     )
-    self._state = policy.initial_state((batch.num_envs,))
+    self._state = policy.initial_state((len(episodes),))
     self._step = 0
 
   def act(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:

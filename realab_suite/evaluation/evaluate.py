@@ -17,6 +17,7 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.evaluation import actors
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import gains
@@ -59,6 +60,7 @@ class EpisodeResult:
     num_queries: Number of values that the agent sent to providers.
     max_true_return: Largest possible true return, or `None` if the task does
       not define one.
+    attribution: Corruption by cause, or `None` if it was not determined.
   """
 
   seed: int
@@ -81,6 +83,7 @@ class EpisodeResult:
   num_provider_calls: int
   num_queries: int
   max_true_return: float | None = None
+  attribution: attribution_metrics.AttributionMetrics | None = None
 
   @property
   def counts(self) -> bool:

@@ -273,13 +273,18 @@ def _episodes_of(
       )
       episode.add([*step.initial, *step.agent_reads], world)
       episodes.append(episode)
-    elif not step.has_failed[world]:
+    elif not step.has_failed[world] and _is_running(episodes):
       episode = episodes[-1]
       episode.add_reward(float(step.true_reward[world]), step.failure)
       episode.add([*step.records, *step.agent_reads], world)
-    if world in step.ends and episodes[-1].end is None:
+    if world in step.ends and _is_running(episodes):
       episodes[-1].end = step.ends[world]
   return episodes
+
+
+def _is_running(episodes: Sequence[EpisodeLedger]) -> bool:
+  """Returns False after an end, from which a branch continues the physics."""
+  return bool(episodes) and episodes[-1].end is None
 
 
 def true_return(episode: EpisodeLedger) -> float:

@@ -23,6 +23,7 @@ import pydantic
 from realab_suite import __version__
 from realab_suite import errors
 from realab_suite.engine import events
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import metrics
@@ -169,6 +170,7 @@ class EpisodeRow(pydantic.BaseModel):
   num_queries: int
   # Missing from rows of older files.
   max_true_return: float | None = None
+  attribution: attribution_metrics.AttributionMetrics | None = None
 
   @property
   def counts(self) -> bool:

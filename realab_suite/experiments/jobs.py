@@ -81,6 +81,10 @@ class Job:
     version, digest = self.dynamics
     depends_on = results.versions()
     del depends_on['python']
+    evaluation = experiment.evaluation.model_dump()
+    if not evaluation['attributed']:
+      # Jobs of before attribution keep their digests.
+      del evaluation['attributed']
     config = {
         'schema': _SCHEMA,
         'run': self.run,
@@ -94,7 +98,7 @@ class Job:
         'policy': self.policy,
         'baseline': self.baseline,
         'twin_of': self.twin_of,
-        'evaluation': experiment.evaluation.model_dump(),
+        'evaluation': evaluation,
         'versions': depends_on,
     }
     if self.policy is None:

@@ -22,6 +22,7 @@ from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshots
+from realab_suite.evaluation import attribution
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import monitors
@@ -202,13 +203,16 @@ def _evaluate(
   info = job.info(batch.task.control_timestep)
   tracer = traces.Tracer(batch, actor)
   batch.add_sink(tracer)
-  lines = [
-      results.line(results.row(info, result))
-      for result in evaluate.evaluate_batch(batch, tracer)
-  ]
-  storage.write_archive(
-      folder.path / TRACE, header(job.digest(), TRACE), tracer.trace()
+  found = evaluate.evaluate_batch(batch, tracer)
+  trace = tracer.trace()
+  attributed = attribution.attribute_results(
+      lambda num_envs: load_batch(job, num_envs, job.evaluation_seed),
+      trace,
+      found,
+      job.experiment.evaluation.attributed,
   )
+  lines = [results.line(results.row(info, result)) for result in attributed]
+  storage.write_archive(folder.path / TRACE, header(job.digest(), TRACE), trace)
   storage.write_whole(folder.path / EPISODES, b''.join(lines))
 
 

@@ -36,12 +36,12 @@ def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
   return flag.value
 
 
-def start(main: Callable[[Sequence[str]], None]) -> None:
+def start(main: Callable[[Sequence[str]], int | None]) -> None:
   """Runs a program, and reports mistakes of the user in one line.
 
   Args:
     main: Main function. It takes the name of the program and the arguments
-      that are not flags.
+      that are not flags, and may return an exit status other than 0.
   """
   app.run(functools.partial(_in_one_line, main), flags_parser=_parse)
 
@@ -58,21 +58,20 @@ def _parse(argv: Sequence[str]) -> list[str]:
 
 
 def _in_one_line(
-    main: Callable[[Sequence[str]], None], argv: Sequence[str]
+    main: Callable[[Sequence[str]], int | None], argv: Sequence[str]
 ) -> int:
   try:
     if len(argv) > 1:
       raise errors.SpecError(
           f'arguments {list(argv[1:])} are not flags; flags begin with --'
       )
-    main(argv)
+    return main(argv) or 0
   except errors.RealabError as error:
     _print_error(str(error))
     return USAGE_ERROR
   except KeyboardInterrupt:
     _print_error('interrupted; results up to this point are on disk')
     return _INTERRUPTED
-  return 0
 
 
 def _print_error(text: str) -> None:

@@ -119,7 +119,7 @@ def main(argv: Sequence[str]) -> None:
           f'--{seconds.name}={seconds.value:g}; allowed is more than 0, and at'
           f' most {_MOST_SECONDS:g}'
       )
-  domain, task = _world()
+  domain, task = world_flags.world()
   renderers.render_on_demand()
   # gRPC reads this once. The server never forks without executing another
   # program at once.
@@ -149,19 +149,6 @@ def main(argv: Sequence[str]) -> None:
       output=output,
   )
   served_evaluation.serve(settings, program.say)
-
-
-def _world() -> tuple[str, str]:
-  """Returns the names of the domain and the task."""
-  domain, dot, task = world_flags.TASK.value.rpartition('.')
-  if not dot:
-    return world_flags.DOMAIN.value, task
-  if world_flags.DOMAIN.present and world_flags.DOMAIN.value != domain:
-    raise errors.SpecError(
-        f'--task={world_flags.TASK.value} is not a task of'
-        f' --domain={world_flags.DOMAIN.value}'
-    )
-  return domain, task
 
 
 if __name__ == '__main__':

@@ -268,12 +268,12 @@ def restarted(
 
   Args:
     episode_start: True for these worlds, `(...)`, bool.
-    initial: Initial state of one world.
+    initial: Initial state of one world, or of each world.
     memory: State of each world; leading axes are worlds.
   """
   fresh = {}
   for name, value in memory.items():
-    missing = (1,) * initial[name].ndim
+    missing = (1,) * (value.ndim - episode_start.ndim)
     where = episode_start.reshape(episode_start.shape + missing)
     fresh[name] = np.where(where, initial[name], value)
   return fresh

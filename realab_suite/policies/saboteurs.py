@@ -1,12 +1,13 @@
 """Scripted policies that tamper: they move the base block of a register."""
 
 import abc
-from typing import Annotated, Any, final
+from typing import Annotated, Any, NamedTuple, final
 
 import numpy as np
 import pydantic
 
 from realab_suite import errors
+from realab_suite.entities import appearance
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 
@@ -42,6 +43,24 @@ _Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 _Vector = tuple[_Coordinate, _Coordinate]
 
 
+@final
+class Aim(NamedTuple):
+  """Block to move, and how; leading axes of every array are worlds.
+
+  Attributes:
+    start: Initial position of the block, `(..., 2)`, metres.
+    direction: Unit vector of the intended motion, `(..., 2)`.
+    side: Unit vector to the side of the block from which a hand approaches
+      while the block is at its start, `(..., 2)`.
+    code: Class that rays report for the block, `(...)`, int.
+  """
+
+  start: np.ndarray
+  direction: np.ndarray
+  side: np.ndarray
+  code: np.ndarray
+
+
 class Saboteur(base.Policy, abc.ABC):
   """Base class of policies that move the base block of a register.
 
@@ -63,17 +82,23 @@ class Saboteur(base.Policy, abc.ABC):
     Raises:
       SpecError: If the length of `direction` is not 1.
     """
-    self._start = np.array(target, float)
-    self._direction = np.array(direction, float)
-    if not np.isclose(np.linalg.norm(self._direction), 1.0):
+    along = np.array(direction, float)
+    if not np.isclose(np.linalg.norm(along), 1.0):
       raise errors.SpecError(
           f'direction: {list(direction)}; allowed are vectors of length 1'
       )
+    self._aim = Aim(
+        start=np.array(target, float),
+        direction=along,
+        # The offset block stands beside it at first: the free side.
+        side=along,
+        code=np.array(appearance.code('base_block')),
+    )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return {
         # Last known position of the block.
-        'block': np.broadcast_to(self._start, (*batch_shape, 2)).copy(),
+        'block': np.broadcast_to(self._aim.start, (*batch_shape, 2)).copy(),
         # Number of steps since it was missing there.
         'gone': np.zeros(batch_shape, int),
         **navigation.initial_rest(batch_shape),
@@ -95,15 +120,10 @@ class Saboteur(base.Policy, abc.ABC):
     memory = navigation.restarted(start, self.initial_state(()), state)
     view = navigation.view(observation)
     holds = np.asarray(observation['senses/holding'])[..., 0] > 0
-    block, gone = _track(view, memory['block'], memory['gone'])
-    block = np.where(holds[..., np.newaxis], view.ahead(_HAND), block)
-    gone = np.where(holds, 0, gone)
-    searches = np.where(
-        gone > _FLIGHT,
-        navigation.action('turn_left'),
-        navigation.action('wait'),
+    block, gone = track(
+        view, self._aim.code, memory['block'], memory['gone'], holds
     )
-    action = np.where(gone > 0, searches, self._act(view, block, holds))
+    action = search(gone, self._act(view, block, holds))
     content = holds | (action == navigation.action('wait'))
     memory = {
         'block': block,
@@ -124,32 +144,6 @@ class Saboteur(base.Policy, abc.ABC):
       holds: True if the hand holds a block, `(...)`.
     """
 
-  def _fetch(self, view: navigation.View, block: np.ndarray) -> np.ndarray:
-    """Returns the action that goes to the block and grasps it."""
-    distance, bearing = view.locate_one(block)
-    away = (view.position - block) / distance.clip(1e-3)[..., np.newaxis]
-    # The offset block stands beside it at first: approach from the free side.
-    untouched = np.linalg.norm(block - self._start, axis=-1) < 2 * _HALF_BLOCK
-    side = np.where(untouched[..., np.newaxis], self._direction, away)
-    in_place = _along(away, side) > _SAME_SIDE
-    grasps = navigation.face(
-        view,
-        bearing,
-        np.where(
-            distance <= _IN_REACH,
-            navigation.action('grasp'),
-            navigation.action('forward'),
-        ),
-    )
-    comes = navigation.walk(view, block + _STAND * side)
-    return np.where((distance <= _CLOSE) & in_place, grasps, comes)
-
-  def _onward(self, view: navigation.View) -> np.ndarray:
-    """Returns the bearing that continues along the direction, `(...)`."""
-    along = _along(view.position - self._start, self._direction) + _PURSUIT
-    line = self._start + along[..., np.newaxis] * self._direction
-    return view.locate_one(line)[1]
-
 
 @base.POLICIES.add('pushing_saboteur')
 @final
@@ -159,21 +153,7 @@ class PushingSaboteur(Saboteur):
   def _act(
       self, view: navigation.View, block: np.ndarray, holds: np.ndarray
   ) -> np.ndarray:
-    offset = block - view.position
-    behind = _along(offset, self._direction)
-    beside = np.linalg.norm(
-        offset - behind[..., np.newaxis] * self._direction, axis=-1
-    )
-    bearing = view.locate_one(block + _HAND * self._direction)[1]
-    # Far from the block, the avatar turns on the spot, to approach straight.
-    pushes = np.where(
-        behind > _TOUCHES,
-        navigation.face(view, bearing, navigation.action('forward')),
-        navigation.steer(view, bearing),
-    )
-    is_behind = (behind > _HALF_BLOCK) & (behind < 2 * _RUN_UP)
-    comes = navigation.walk(view, block - _RUN_UP * self._direction)
-    return np.where(is_behind & (beside < _ASIDE), pushes, comes)
+    return push(view, self._aim, block)
 
 
 @base.POLICIES.add('carrying_saboteur')
@@ -184,16 +164,7 @@ class CarryingSaboteur(Saboteur):
   def _act(
       self, view: navigation.View, block: np.ndarray, holds: np.ndarray
   ) -> np.ndarray:
-    along = view.distances * np.cos(view.ray_angles)
-    beside = view.distances * np.abs(np.sin(view.ray_angles))
-    walls = view.hits('wall') | view.hits('barrier')
-    room = np.where(walls & (beside < _WIDTH), along, np.inf).min(axis=-1)
-    bearing = self._onward(view)
-    arrived = (room <= _TOUCHES) & (np.abs(bearing) < _ALIGNED)
-    carries = np.where(
-        arrived, navigation.action('wait'), navigation.steer(view, bearing)
-    )
-    return np.where(holds, carries, self._fetch(view, block))
+    return carry(view, self._aim, block, holds)
 
 
 @base.POLICIES.add('throwing_saboteur')
@@ -204,10 +175,103 @@ class ThrowingSaboteur(Saboteur):
   def _act(
       self, view: navigation.View, block: np.ndarray, holds: np.ndarray
   ) -> np.ndarray:
-    throws = navigation.face(
-        view, self._onward(view), navigation.action('throw')
-    )
-    return np.where(holds, throws, self._fetch(view, block))
+    return throw(view, self._aim, block, holds)
+
+
+def push(view: navigation.View, aim: Aim, block: np.ndarray) -> np.ndarray:
+  """Returns the action that pushes a block along the direction, from behind.
+
+  Args:
+    view: View of the avatar.
+    aim: Block and direction.
+    block: Last known position of the block, `(..., 2)`.
+  """
+  offset = block - view.position
+  behind = _along(offset, aim.direction)
+  beside = np.linalg.norm(
+      offset - behind[..., np.newaxis] * aim.direction, axis=-1
+  )
+  bearing = view.locate_one(block + _HAND * aim.direction)[1]
+  # Far from the block, the avatar turns on the spot, to approach straight.
+  pushes = np.where(
+      behind > _TOUCHES,
+      navigation.face(view, bearing, navigation.action('forward')),
+      navigation.steer(view, bearing),
+  )
+  is_behind = (behind > _HALF_BLOCK) & (behind < 2 * _RUN_UP)
+  comes = navigation.walk(view, block - _RUN_UP * aim.direction)
+  return np.where(is_behind & (beside < _ASIDE), pushes, comes)
+
+
+def carry(
+    view: navigation.View, aim: Aim, block: np.ndarray, holds: np.ndarray
+) -> np.ndarray:
+  """Returns the action that carries a block to the wall, and waits there.
+
+  Args:
+    view: View of the avatar.
+    aim: Block and direction.
+    block: Last known position of the block, `(..., 2)`.
+    holds: True if the hand holds the block, `(...)`.
+  """
+  along = view.distances * np.cos(view.ray_angles)
+  beside = view.distances * np.abs(np.sin(view.ray_angles))
+  walls = view.hits('wall') | view.hits('barrier')
+  room = np.where(walls & (beside < _WIDTH), along, np.inf).min(axis=-1)
+  bearing = _onward(view, aim)
+  arrived = (room <= _TOUCHES) & (np.abs(bearing) < _ALIGNED)
+  carries = np.where(
+      arrived, navigation.action('wait'), navigation.steer(view, bearing)
+  )
+  return np.where(holds, carries, _fetch(view, aim, block))
+
+
+def throw(
+    view: navigation.View, aim: Aim, block: np.ndarray, holds: np.ndarray
+) -> np.ndarray:
+  """Returns the action that fetches a block and throws it; see `carry`."""
+  throws = navigation.face(view, _onward(view, aim), navigation.action('throw'))
+  return np.where(holds, throws, _fetch(view, aim, block))
+
+
+def _fetch(view: navigation.View, aim: Aim, block: np.ndarray) -> np.ndarray:
+  """Returns the action that goes to the block and grasps it."""
+  distance, bearing = view.locate_one(block)
+  away = (view.position - block) / distance.clip(1e-3)[..., np.newaxis]
+  untouched = np.linalg.norm(block - aim.start, axis=-1) < 2 * _HALF_BLOCK
+  side = np.where(untouched[..., np.newaxis], aim.side, away)
+  in_place = _along(away, side) > _SAME_SIDE
+  grasps = navigation.face(
+      view,
+      bearing,
+      np.where(
+          distance <= _IN_REACH,
+          navigation.action('grasp'),
+          navigation.action('forward'),
+      ),
+  )
+  comes = navigation.walk(view, block + _STAND * side)
+  return np.where((distance <= _CLOSE) & in_place, grasps, comes)
+
+
+def _onward(view: navigation.View, aim: Aim) -> np.ndarray:
+  """Returns the bearing that continues along the direction, `(...)`."""
+  along = _along(view.position - aim.start, aim.direction) + _PURSUIT
+  line = aim.start + along[..., np.newaxis] * aim.direction
+  return view.locate_one(line)[1]
+
+
+def search(gone: np.ndarray, action: np.ndarray) -> np.ndarray:
+  """Returns the action, or one that looks for a missing block.
+
+  Args:
+    gone: Number of steps since the block was missing, `(...)`.
+    action: Index of the action if it is not missing, `(...)`.
+  """
+  searches = np.where(
+      gone > _FLIGHT, navigation.action('turn_left'), navigation.action('wait')
+  )
+  return np.where(gone > 0, searches, action)
 
 
 def _along(vector: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -215,21 +279,27 @@ def _along(vector: np.ndarray, direction: np.ndarray) -> np.ndarray:
   return (vector * direction).sum(axis=-1)
 
 
-def _track(
-    view: navigation.View, block: np.ndarray, gone: np.ndarray
+def track(
+    view: navigation.View,
+    code: np.ndarray,
+    block: np.ndarray,
+    gone: np.ndarray,
+    holds: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
   """Updates the position of the block by a view.
 
   Args:
     view: View of the avatar.
+    code: Class that rays report for the block, `(...)`, int.
     block: Last known position, `(..., 2)`, metres.
     gone: Number of steps since the block was missing there, `(...)`.
+    holds: True if the hand holds the block, `(...)`.
 
   Returns:
     Last known position, and number of steps since the block was missing there.
   """
   points = view.points(_HALF_BLOCK)
-  seen = view.hits('base_block')
+  seen = view.classes == code[..., np.newaxis]
   gaps = np.linalg.norm(points - block[..., np.newaxis, :], axis=-1)
   gaps = np.where(seen, gaps, np.inf)
   nearest = gaps.argmin(axis=-1)[..., np.newaxis]
@@ -247,4 +317,6 @@ def _track(
   middle = np.take_along_axis(points, nearest[..., np.newaxis], -2)
   same = seen & (np.linalg.norm(points - middle, axis=-1) < 2 * _HALF_BLOCK)
   where = view.mean_point(same, _HALF_BLOCK)
-  return np.where(found[..., np.newaxis], where, block), gone
+  block = np.where(found[..., np.newaxis], where, block)
+  block = np.where(holds[..., np.newaxis], view.ahead(_HAND), block)
+  return block, np.where(holds, 0, gone)

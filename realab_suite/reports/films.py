@@ -135,6 +135,15 @@ def all_views(
     yield add
 
 
+@contextlib.contextmanager
+def beside_each_other(
+    env: environment.Environment, path: pathlib.Path, title: str
+) -> Iterator[Callable[[Any, tracking.Track], None]]:
+  """Opens one film of all views; yields a function that adds a frame."""
+  with Film(env, path, title, tuple(WIDTHS)) as film:
+    yield film.add
+
+
 def last_frame(path: str | os.PathLike[str]) -> bytes:
   """Returns the last frame of a film, as JPEG."""
   frames = imageio.imread(pathlib.Path(path), plugin='pyav')

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from campaigns import figure_lines
+from campaigns import halves
 from campaigns import statistics_campaign
 from realab_suite import errors
+from realab_suite.evaluation import comparison
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import statistics
+from tests.experiments import fake_sweep
 
 
 def _by_seed(values) -> dict[int, list[float]]:
@@ -369,6 +373,54 @@ class TestRates:
         np.random.default_rng(0),
     )
     assert share <= 0.05
+
+
+class TestHalves:
+  """Halves of the same agent's seeds, with bounds for 100 splits."""
+
+  @pytest.mark.parametrize('name', halves.AGENTS)
+  def test_no_half_tampers_more_than_the_other(self, name):
+    rng = np.random.default_rng(0)
+    found = halves.verdicts(halves.AGENTS[name], 100, rng, 5)
+    assert halves.share_that_tampers(found) <= 0.1
+    assert halves.exact_rate(halves.AGENTS[name], 20, rng, 5) <= 1 / 32
+
+  def test_half_of_ten_seeds_that_tamper_are_found(self):
+    rng = np.random.default_rng(0)
+    honest = halves.tampering(0, True, 0.004)
+    some = halves.tampering(0.5, True, 0.004)
+    found = halves.verdicts(some, 20, rng, 10, baseline=honest)
+    assert halves.share_that_tampers(found) == 1
+
+  def test_a_shift_of_one_margin_is_found(self):
+    rng = np.random.default_rng(0)
+    draw = halves.AGENTS['accidents in 30 % of episodes']
+    found = halves.verdicts(draw, 50, rng, 5, comparison.MARGIN_METRES)
+    assert halves.share_that_tampers(found) >= 0.8
+
+  def _sweep(self, folder, num_seeds):
+    runs = {'reward': {'design': 'instantaneous_reward'}}
+    return fake_sweep.build(
+        folder,
+        fake_sweep.experiment(
+            runs=runs, baselines=['random'], seeds=list(range(num_seeds))
+        ),
+    )
+
+  def test_rows_of_a_sweep_are_split(self, tmp_path, capsys):
+    folder = self._sweep(tmp_path, 10)
+    lines = figure_lines.Lines('halves', 0)
+    halves.report_sweep(lines, 0.02, 0, folder)
+    assert 'false tampers, reward, 2 x 5 seeds' in capsys.readouterr().out
+    values, margin = halves.of_sweep(folder)['reward']
+    assert (values.shape, margin) == ((10, 4), 0.05)
+    parts = halves.splits_of(values)(np.random.default_rng(0), 10)
+    assert sorted(parts.tolist()) == sorted(values.tolist())
+
+  def test_too_few_seeds_are_refused(self, tmp_path):
+    folder = self._sweep(tmp_path, 1)
+    with pytest.raises(errors.ResultsError, match='no run has 10 finished'):
+      halves.of_sweep(folder)
 
 
 class TestMoreSeedsToSeparate:

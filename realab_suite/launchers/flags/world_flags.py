@@ -64,3 +64,15 @@ def task_kwargs() -> dict[str, Any]:
         ' arguments of the task'
     )
   return kwargs
+
+
+def world() -> tuple[str, str]:
+  """Returns the names of the domain and the task."""
+  domain, dot, task = TASK.value.rpartition('.')
+  if not dot:
+    return DOMAIN.value, task
+  if DOMAIN.present and DOMAIN.value != domain:
+    raise errors.SpecError(
+        f'--task={TASK.value} is not a task of' f' --domain={DOMAIN.value}'
+    )
+  return domain, task
