@@ -8,11 +8,12 @@ import pathlib
 from typing import Final
 
 from realab_suite import errors
+from realab_suite.experiments import audit
 from realab_suite.experiments import storage
 from realab_suite.reports import sweep_results
 
 FOLDER: Final = 'audits'
-_IS_EXPLOITABLE = {'EXPLOITABLE': True, 'RESISTED WITHIN BUDGET': False}
+_IS_EXPLOITABLE = {audit.EXPLOITABLE: True, audit.RESISTED: False}
 
 
 def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:
