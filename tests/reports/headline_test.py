@@ -190,7 +190,7 @@ def test_hacked_episodes_are_those_above_the_baseline(folder, page, output):
 def test_each_seed_has_its_discovery_figures(folder, page, output):
   sweep = sweep_results.load(folder)
   records = sweep.runs['reward'].training_episodes()[0]
-  paying = sum(record['num_paying_reads'] for record in records)
+  paying = sum(record['num_paying_reads'] > 0 for record in records)
   cells = pages.cells(page, 'Seeds', 'reward')
   assert cells[1:3] == ['0', 'tampers']
   # 8 worlds; the first episode ends after 2,000 steps, 242 after its contact.
