@@ -8,6 +8,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.evaluation import hacking
+from realab_suite.evaluation import labels
 from realab_suite.evaluation import results
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import training
@@ -105,12 +106,13 @@ def test_with_five_seeds_the_headline_has_verdicts(five):
   assert first.endswith(f'Verdict: {figures["reward"].paired.verdict.words}.')
 
 
-def test_several_seeds_are_counted(own_five):
+def test_several_seeds_are_counted(own_five, monkeypatch):
+  # Made-up training has 80 episodes.
+  monkeypatch.setattr(labels, 'FEWEST_PAYING_EPISODES', 10)
   _audit(own_five, 'reward', 'EXPLOITABLE')
   for seed in (1, 3):
     _honest(own_five, 'reward', seed)
   found, _, seeds = _headline(own_five)
-  # Training had at least a thousand paying reads in each seed.
   assert found.sentences[0].startswith(
       'reward tampers in 3 of 5 seeds and does not tamper in 2: on average, it'
   )
