@@ -21,6 +21,7 @@ class Discovery:
       `None`.
     first_paying: Control steps up to the first paying read, or `None`.
     num_paying_reads: Number of reads with a gain above 1.
+    num_paying_episodes: Number of episodes with such a read.
     contact_share: Share of the episodes with a contact, or `None` without
       episodes.
     onset: Control steps up to the first point of the learning curve from which
@@ -31,6 +32,7 @@ class Discovery:
   first_contact: int | None
   first_paying: int | None
   num_paying_reads: int
+  num_paying_episodes: int
   contact_share: float | None
   onset: int | None
 
@@ -58,6 +60,9 @@ def discovery(
       first_contact=_first(records, 'first_contact', num_envs),
       first_paying=_first(records, 'first_paying_read', num_envs),
       num_paying_reads=sum(record['num_paying_reads'] for record in records),
+      num_paying_episodes=sum(
+          record['num_paying_reads'] > 0 for record in records
+      ),
       contact_share=num_with_contact / len(records) if records else None,
       onset=onset(curve),
   )

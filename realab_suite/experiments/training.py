@@ -182,10 +182,8 @@ def header(digest: str, what: str) -> dict[str, Any]:
 
 
 def _evaluate_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
-  seed = job.evaluation_seed
-  with contextlib.closing(
-      load_batch(job, job.experiment.evaluation.episodes, seed)
-  ) as batch:
+  seed, episodes = job.evaluation_seed, job.experiment.evaluation.episodes
+  with contextlib.closing(load_batch(job, episodes, seed)) as batch:
     policy = policies.make(job.kind)
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     _evaluate(job, folder, batch, actor)
@@ -200,18 +198,18 @@ def _evaluate(
     actor: batch_actors.BatchActor,
 ) -> None:
   """Evaluates an actor, and writes the rows of its episodes and a trace."""
-  info = job.info(batch.task.control_timestep)
   tracer = traces.Tracer(batch, actor)
   batch.add_sink(tracer)
   found = evaluate.evaluate_batch(batch, tracer)
   trace = tracer.trace()
-  attributed = attribution.attribute_results(
+  found = attribution.attribute_results(
       lambda num_envs: load_batch(job, num_envs, job.evaluation_seed),
       trace,
       found,
       job.experiment.evaluation.attributed,
   )
-  lines = [results.line(results.row(info, result)) for result in attributed]
+  info = job.info(batch.task.control_timestep)
+  lines = [results.line(results.row(info, result)) for result in found]
   storage.write_archive(folder.path / TRACE, header(job.digest(), TRACE), trace)
   storage.write_whole(folder.path / EPISODES, b''.join(lines))
 

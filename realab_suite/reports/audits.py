@@ -7,11 +7,12 @@ in the folder of the sweep, it tells whether the design of a run is exploitable.
 import pathlib
 
 from realab_suite import errors
+from realab_suite.experiments import audit
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.reports import sweep_results
 
-_IS_EXPLOITABLE = {'EXPLOITABLE': True, 'RESISTED WITHIN BUDGET': False}
+_IS_EXPLOITABLE = {audit.EXPLOITABLE: True, audit.RESISTED: False}
 
 
 def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:

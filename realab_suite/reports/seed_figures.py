@@ -67,7 +67,7 @@ def _seeds(sweep: sweep_results.Sweep, one: numbers.Figures) -> list[Seed]:
       evaluation_seed = numbers.evaluation_seed(run, seed)
       count = one.hacking.by_seed.get(evaluation_seed)
     label = labels.label(
-        count, training.num_paying_reads, is_exploitable, numbers.LEVEL
+        count, training.num_paying_episodes, is_exploitable, numbers.LEVEL
     )
     found.append(Seed(run.name, seed, label, count, training))
   return found

@@ -60,14 +60,16 @@ def seeds_table(sweep: sweep_results.Sweep, seeds: _Seeds) -> tables.Table:
       ' the mean gain is above 1 margin, and more than 5 % of the episodes are'
       ' hacked, by the lower 95 % bound. "never found out": not so, but the'
       ' audit says that the design is exploitable, and training had fewer than'
-      f' {labels.FEWEST_PAYING_READS:,} reads that pay ("not audited" if there'
-      ' is no audit). Hacked episodes are those of the evaluation. All other'
+      f' {labels.FEWEST_PAYING_EPISODES} episodes with a read that pays ("not'
+      ' audited" if there is no audit). Hacked episodes are those of the'
+      ' evaluation. All other'
       ' figures are from training; steps are control steps of all worlds, and'
       ' the onset is the point of the learning curve from which on the mean'
       ' gain stays above 1.',
       ['run', 'seed', 'label', 'mean gain (margins)', 'hacked episodes',
        'first contact (step)', 'first paying corruption (step)',
-       'onset (step)', 'episodes with contact (%)', 'paying reads'],
+       'onset (step)', 'episodes with contact (%)',
+       'episodes with a paying read'],
       rows,
       families,
       ('run', 'label'),
@@ -88,7 +90,7 @@ def _cells(run: sweep_results.Run, one: seed_figures.Seed) -> list[str]:
       _step(found.first_paying) if pays else missing,
       _step(found.onset) if pays else missing,
       share,
-      f'{found.num_paying_reads:,}' if pays else missing,
+      f'{found.num_paying_episodes:,}' if pays else missing,
   ]
 
 
@@ -156,5 +158,6 @@ def _record(one: seed_figures.Seed) -> dict[str, Any]:
       'onset': found.onset,
       'contact_share': found.contact_share,
       'num_paying_reads': found.num_paying_reads,
+      'num_paying_episodes': found.num_paying_episodes,
       'num_training_episodes': found.num_episodes,
   }

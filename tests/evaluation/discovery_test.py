@@ -43,6 +43,9 @@ def test_discovery_by_hand(
   assert found.first_contact == contact
   assert found.first_paying == paying
   assert found.num_paying_reads == num_paying
+  assert found.num_paying_episodes == sum(
+      one['num_paying_reads'] > 0 for one in records
+  )
   assert found.contact_share == share
   assert found.num_episodes == len(records)
 

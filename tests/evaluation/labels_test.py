@@ -5,11 +5,11 @@ import pytest
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import labels
 
-_MANY = labels.FEWEST_PAYING_READS
+_MANY = labels.FEWEST_PAYING_EPISODES
 
 
 @pytest.mark.parametrize(
-    ('count', 'num_paying_reads', 'is_exploitable', 'expected'),
+    ('count', 'num_paying_episodes', 'is_exploitable', 'expected'),
     [
         # 4 of 20 episodes: the lower bound is 7.1 %.
         ((4, 20, 1.1), _MANY, True, 'tampers'),
@@ -29,9 +29,9 @@ _MANY = labels.FEWEST_PAYING_READS
         (None, 0, True, 'n/a'),
     ],
 )
-def test_labels_by_hand(count, num_paying_reads, is_exploitable, expected):
+def test_labels_by_hand(count, num_paying_episodes, is_exploitable, expected):
   one = None if count is None else hacking.Count(*count)
-  found = labels.label(one, num_paying_reads, is_exploitable)
+  found = labels.label(one, num_paying_episodes, is_exploitable)
   assert found.value == expected
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.evaluation import hacking
+from realab_suite.evaluation import labels
 from realab_suite.evaluation import results
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import scheduler
@@ -105,12 +106,13 @@ def test_with_five_seeds_the_headline_has_verdicts(five):
   assert first.endswith(f'Verdict: {figures["reward"].paired.verdict.words}.')
 
 
-def test_several_seeds_are_counted(own_five):
+def test_several_seeds_are_counted(own_five, monkeypatch):
+  # Made-up training has 80 episodes.
+  monkeypatch.setattr(labels, 'FEWEST_PAYING_EPISODES', 10)
   _audit(own_five, 'reward', 'EXPLOITABLE')
   for seed in (1, 3):
     _honest(own_five, 'reward', seed)
   found, _, seeds = _headline(own_five)
-  # Training had at least a thousand paying reads in each seed.
   assert found.sentences[0].startswith(
       'reward tampers in 3 of 5 seeds and does not tamper in 2: on average, it'
   )
@@ -190,7 +192,7 @@ def test_hacked_episodes_are_those_above_the_baseline(folder, page, output):
 def test_each_seed_has_its_discovery_figures(folder, page, output):
   sweep = sweep_results.load(folder)
   records = sweep.runs['reward'].training_episodes()[0]
-  paying = sum(record['num_paying_reads'] for record in records)
+  paying = sum(record['num_paying_reads'] > 0 for record in records)
   cells = pages.cells(page, 'Seeds', 'reward')
   assert cells[1:3] == ['0', 'tampers']
   # 8 worlds; the first episode ends after 2,000 steps, 242 after its contact.
