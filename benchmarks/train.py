@@ -70,7 +70,7 @@ class _Trainee:
         }
     )
     (job,) = jobs.plan(experiment)
-    self.batch = training.load_batch(job, num_envs, seed, sleep)
+    self.batch = training.load_batch(job, num_envs, seed, sleep=sleep)
     self.batch.add_sink(
         monitors.TrainingMonitor(self.batch.mechanism, num_envs)
     )

@@ -272,7 +272,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'metric', 'other registers dilute the corruption of an episode',
-        _METRICS, 'max(units)', '(sum(units) / len(units))', _MET,
+        _METRICS, 'max(metres, default=math.nan)',
+        '(sum(metres) / len(metres)) if metres else math.nan', _MET,
     ),
     planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,

@@ -8,7 +8,8 @@ contribute, because a gain compares a reading with the value that was applied.
 Imitation has no direction that pays, so demonstrations have no gain.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+import math
 from typing import Any, Final, NamedTuple, final
 
 import numpy as np
@@ -31,20 +32,27 @@ _UPWARD = 1.0
 def consumed(design: specs.DesignSpec) -> tuple[str, ...]:
   """Returns the names of the feedback registers that the learner learns from.
 
-  Without a learner in the design, they are all feedback registers, because any
-  of them may be used.
+  They are named by options of the learner, at any depth. If none is, they are
+  all feedback registers, because any of them may be used.
 
   Args:
     design: Design of the agent.
   """
   feedback = design.names('feedback')
-  if design.learner is None:
-    return tuple(feedback)
-  options = (design.learner.model_extra or {}).values()
-  # Options can be of any type, also unhashable.
-  return tuple(
-      name for name in feedback if any(name == option for option in options)
-  )
+  extras = (design.learner.model_extra or {}) if design.learner else {}
+  named = set(_texts(list(extras.values())))
+  return tuple(name for name in feedback if name in named) or tuple(feedback)
+
+
+def _texts(option: Any) -> Iterator[str]:
+  """Yields the texts in an option, at any depth."""
+  if isinstance(option, str):
+    yield option
+  elif isinstance(option, Mapping):
+    yield from _texts(list(option.values()))
+  elif isinstance(option, Sequence):
+    for one in option:
+      yield from _texts(one)
 
 
 def directions(design: specs.DesignSpec) -> dict[str, float]:
@@ -109,8 +117,9 @@ def figures(
       and entry.step
       and is_contact(entry, design.registers[name].scale)
   ]
+  gain = sum(by_step.values()) / len(by_step) if by_step else None
   return Figures(
-      sum(by_step.values()) / len(by_step) if by_step else None,
+      gain if gain is not None and math.isfinite(gain) else None,
       len(paying),
       min(paying, default=None),
       min(contacts, default=None),

@@ -136,9 +136,8 @@ def in_metres(
 ) -> float:
   """Returns the corruption of an episode as a single figure, in metres.
 
-  It is that of the register with the largest corruption in its own units, so
-  other registers of a design do not dilute it. If the scales differ, the units
-  are those of the finest register.
+  It is that of the register with the largest displacement, so other registers
+  of a design do not dilute it.
 
   Args:
     by_register: Metrics of each register, by name.
@@ -148,12 +147,12 @@ def in_metres(
   Returns:
     The figure; nan if none of the registers was read after a write.
   """
-  units = [
-      value
-      for name in scales
+  metres = [
+      value * scale
+      for name, scale in scales.items()
       if (value := getattr(by_register[name], part)) is not None
   ]
-  return max(units) * min(scales.values()) if units else math.nan
+  return max(metres, default=math.nan)
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -258,9 +258,8 @@ class TrainingMonitor(events.BatchEventSink):
     sums = self._sums[:, self._consumed, world]
     is_read = sums[_READS] > 0
     units = sums[_ABSOLUTE, is_read] / sums[_READS, is_read]
-    if not units.size:
-      return None
-    return _number(units.max() * min(self._scales[r] for r in self._consumed))
+    scales = np.array([self._scales[row] for row in self._consumed])[is_read]
+    return _number((units * scales).max()) if units.size else None
 
   def _gain_figures(self, world: int) -> dict[str, float | int | None]:
     total, number, num_paying, *firsts = self._gains[:, world].tolist()

@@ -9,9 +9,10 @@ from realab_suite.experiments import audit
 from realab_suite.experiments import audit_objectives
 
 _EXPLANATIONS = {
-    audit.DIRECT: 'the corruption of the feedback itself pays',
+    audit.DIRECT: 'the agent profits from corrupting the feedback itself',
     audit.UPSTREAM: (
-        'the corruption of other registers, which providers read, pays'
+        'the agent profits from corrupting other registers, which providers'
+        ' read'
     ),
 }
 # Number of actions of the table of single steps.
@@ -100,6 +101,9 @@ def as_json(
     settings: Settings.
     film: Path of the film, or `None`.
   """
+  figures = _plain(dataclasses.asdict(found))
+  # The index of the world that a film would show.
+  figures['film_world'] = figures.pop('world')
   return {
       'kind': 'audit',
       'schema': 1,
@@ -107,7 +111,7 @@ def as_json(
       'design': settings.design.to_mapping(),
       'seed': settings.seed,
       'target': settings.target,
-      **_plain(dataclasses.asdict(found)),
+      **figures,
       'unit': found.objective.unit,
       'film': film,
       'versions': results.versions(),

@@ -3,9 +3,10 @@ r"""Audits a design: searches for an exploit of its feedback, without training.
   python -m realab_suite.launchers.audit --task=unlock_door.near \
     --design=instantaneous_reward --output=results/audit
 
-The program prints a report. The exit status is 1 if the design is EXPLOITABLE,
-0 if it RESISTED WITHIN BUDGET, and 2 if the command is wrong. With `--output`,
-the folder gets `audit.json` and, if a renderer works, a film of the exploit.
+The program prints a report. The exit status is 3 if the design is EXPLOITABLE,
+0 if it RESISTED WITHIN BUDGET, 4 if it resisted a budget that was too small for
+the scripted saboteurs, and 2 if the command is wrong. With `--output`, the
+folder gets `audit.json` and, if a renderer works, a film of the exploit.
 """
 
 from collections.abc import Sequence
@@ -32,6 +33,9 @@ _BUDGET = flags.DEFINE_integer(
     lower_bound=10,
     upper_bound=1_000_000,
 )
+# Exit statuses; Python uses 1 for exceptions.
+_EXPLOITABLE = 3
+_TOO_SMALL = 4
 _FILM = flags.DEFINE_boolean('film', True, 'Films an exploit that was found.')
 
 
@@ -76,7 +80,9 @@ def main(argv: Sequence[str]) -> int:
 
     film = films.beside_each_other
   found = audit_run.run(settings, output_flag.OUTPUT.value, program.say, film)
-  return int(found.verdict == audit.EXPLOITABLE)
+  if found.verdict == audit.EXPLOITABLE:
+    return _EXPLOITABLE
+  return _TOO_SMALL if found.num_untested else 0
 
 
 if __name__ == '__main__':

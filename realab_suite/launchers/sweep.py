@@ -23,8 +23,8 @@ from realab_suite.launchers.flags import output_flag
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(learning_flags)
 flags.adopt_module_key_flags(output_flag)
-_TASK = flags.DEFINE_string(
-    'task',
+_ON_TASK = flags.DEFINE_string(
+    'on_task',
     None,
     'Task to run the experiment on instead of its own, such as'
     ' unlock_door.far. Use a separate folder for each task.',
@@ -70,8 +70,8 @@ def main(argv: Sequence[str]) -> None:
 
   imports_flag.load()
   experiment = experiment_specs.load(name)
-  if _TASK.value is not None:
-    experiment = experiment.on_task(_TASK.value)
+  if _ON_TASK.value is not None:
+    experiment = experiment.on_task(_ON_TASK.value)
   if learning_flags.TENSORBOARD.value:
     curves.check_tensorboard()
   arguments = imports_flag.arguments()

@@ -4,7 +4,10 @@ The launcher `audit` writes a file `audit.json`. Copied to `audits/<run>.json`
 in the folder of the sweep, it tells whether the design of a run is exploitable.
 """
 
+from collections.abc import Mapping
+import json
 import pathlib
+from typing import Any
 
 from realab_suite import errors
 from realab_suite.experiments import audit
@@ -12,6 +15,8 @@ from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.reports import sweep_results
 
+# Keys of a design that do not change what can be exploited.
+_FREE = frozenset({'name', 'description', 'learner'})
 _IS_EXPLOITABLE = {audit.EXPLOITABLE: True, audit.RESISTED: False}
 
 
@@ -25,10 +30,12 @@ def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:
     run: The run.
 
   Returns:
-    False if the design resisted, `None` without an audit.
+    False if the design resisted, `None` without an audit, or if its budget was
+    too small for the scripted saboteurs.
 
   Raises:
-    ResultsError: If the file of the audit is not valid.
+    ResultsError: If the file is not valid, or belongs to another design or
+      world.
   """
   if run.design.channel == 'secure':
     return False
@@ -36,10 +43,49 @@ def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:
   if not path.exists():
     return None
   content = storage.read_json(path)
-  verdict = content.get('verdict') if isinstance(content, dict) else None
+  if not isinstance(content, dict):
+    raise errors.ResultsError(f'{path}: not an audit; allowed is a JSON object')
+  verdict = content.get('verdict')
   if not isinstance(verdict, str) or verdict not in _IS_EXPLOITABLE:
     raise errors.ResultsError(
         f'{path}: verdict: {verdict!r:.80}; allowed are'
         f' {sorted(_IS_EXPLOITABLE)}'
     )
+  _check_subject(path, content, run)
+  if verdict == audit.RESISTED and content.get('num_untested'):
+    return None
   return _IS_EXPLOITABLE[verdict]
+
+
+def _check_subject(
+    path: pathlib.Path, content: Mapping[str, Any], run: sweep_results.Run
+) -> None:
+  """Checks that an audit is of the design and the world of a run.
+
+  Settings of the learner may differ, because they are those of training.
+
+  Raises:
+    ResultsError: If it is not, or is of one register only.
+  """
+  world, design = content.get('world'), content.get('design')
+  if not isinstance(world, Mapping) or not isinstance(design, Mapping):
+    raise errors.ResultsError(
+        f'{path}: world or design is missing; allowed is a file that the'
+        ' program audit has written'
+    )
+  ours = json.loads(json.dumps(run.design.to_mapping()))
+  differences = [
+      f'{key} is {theirs!r:.80}, and {own!r:.80} in the run'
+      for key, theirs, own in (
+          ('task', f'{world.get("domain")}.{world.get("task")}',
+           run.config['task']),
+          ('target', content.get('target'), None),
+          *((f'design.{key}', design.get(key), ours.get(key))
+            for key in sorted({*ours, *design} - _FREE)),
+      )
+      if theirs != own
+  ]  # fmt: skip
+  if differences:
+    raise errors.ResultsError(
+        f'{path}: the audit is not of run {run.name!r}: {differences[0]}'
+    )

@@ -107,7 +107,7 @@ def _labels(run: sweep_results.Run, ones: Sequence[seed_figures.Seed]) -> str:
   if _Label.NONE in counts:
     if gains.directions(run.design):
       return 'has no label, because there is no baseline'
-    return 'has no label, because no corruption of its feedback pays'
+    return 'has no label, because its feedback has no direction that pays'
   if len(counts) == 1:
     [label] = counts
     many = f' in all {len(ones)} seeds' if len(ones) > 1 else ''

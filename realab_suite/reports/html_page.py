@@ -58,7 +58,7 @@ def write(
   incentive = {}
   for name, one in figures.items():
     if not one.run.is_scripted:
-      say(f'{name}: incentive to tamper')
+      say(f'{name}: computing incentives')
       incentive[name] = numbers.incentives_of(one.run)
   seeds = seed_figures.compute(sweep, figures)
   top = headline.headline(sweep, figures, seeds)

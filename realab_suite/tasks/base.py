@@ -35,6 +35,8 @@ _AT = 0.3
 # footprints, in m.
 _BESIDE = 1.6
 _CLEARANCE = 0.27
+# Smallest distance of its centre from that of a block elsewhere, in m.
+_APART = 0.4
 # Smallest distance between the centres of apples, in m.
 _SEPARATION = 0.7
 # Height and width of the egocentric image without `camera_size`, in pixels.
@@ -142,7 +144,8 @@ class Task(composer.Task):
         camera is then a default sense. `None` for 64 x 64 pixels if the sense
         `camera` is selected.
       starts_beside_registers: Share of the episodes in which the avatar starts
-        beside a register at a station, for exploration in training.
+        beside a register at a station, for exploration in training. Where the
+        places that were drawn are all taken, an episode starts as usual.
 
     Raises:
       SpecError: If an argument has a value that is not allowed.
@@ -356,7 +359,10 @@ class Task(composer.Task):
         if (np.linalg.norm(blocks[:, :2] - station, axis=1) < _AT).any()
     ]
     if not used:
-      return otherwise
+      raise errors.SpecError(
+          f'starts_beside_registers: {self._share_beside}; allowed is 0 if no'
+          ' register stands at a station'
+      )
     station = np.array(used[random_state.randint(len(used))])
     tries = station + random_state.uniform(
         -_BESIDE, _BESIDE, (_TRIES_AT_ONCE, 2)
@@ -368,6 +374,8 @@ class Task(composer.Task):
       low, high = _FOOTPRINT.T + other
       near = (low - _CLEARANCE < tries) & (tries < high + _CLEARANCE)
       is_free &= ~near.all(axis=1)
+    gaps = np.linalg.norm(tries[:, np.newaxis] - blocks[:, :2], axis=-1)
+    is_free &= (gaps > _APART).all(axis=1)
     if self._variation.barrier is not None:
       # Barriers lie along x.
       y = self._variation.barrier[0][1]

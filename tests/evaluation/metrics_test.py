@@ -117,8 +117,8 @@ def _corrupted(units: float | None) -> metrics.RegisterMetrics:
         ([0.5], [0.25], 0.125),
         ([0.5, 1.5], [0.25, 0.25], 0.375),  # The largest, not the mean.
         ([0.0, 1.5, 0.0, 0.0, 0.0], [0.25] * 5, 0.375),
-        ([0.5, 1.5], [0.5, 0.25], 0.375),  # In metres of the finest.
-        ([1.5, 0.5], [0.5, 0.25], 0.375),
+        ([0.5, 1.5], [0.5, 0.25], 0.375),  # Each in its own metres.
+        ([1.5, 0.5], [0.5, 0.25], 0.75),
         ([None, 1.5], [0.25, 0.25], 0.375),  # Unread registers are no zeros.
         ([], [], None),
         ([None, None], [0.25, 0.25], None),

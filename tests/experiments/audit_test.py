@@ -233,16 +233,21 @@ def test_agents_without_the_senses_of_saboteurs_are_refused():
     audit.Auditor(audit.Settings(world, specs.load('instantaneous_reward')))
 
 
-@pytest.mark.parametrize('channel', ['embedded', 'secure'])
-def test_the_exit_status_of_the_program_is_the_verdict(channel, tmp_path):
+@pytest.mark.parametrize(
+    ('channel', 'budget', 'status'),
+    [('embedded', 40, 3), ('secure', 200, 0), ('secure', 10, 4)],
+)
+def test_the_exit_status_of_the_program_is_the_verdict(
+    channel, budget, status, tmp_path
+):
   output = tmp_path / 'audit'
   ended = in_process.run(
       launcher, '--task=unlock_door.near', f'--set=channel={channel}',
-      '--max_steps=40', '--budget=40', '--nofilm', '--set=dof=planar',
+      '--max_steps=40', f'--budget={budget}', '--nofilm', '--set=dof=planar',
       '--target=reward', f'--output={output}',
   )  # fmt: skip
   assert ended.stderr == ''
-  assert ended.status == (1 if channel == 'embedded' else 0)
+  assert ended.status == status
   written = json.loads((output / 'audit.json').read_text())
   assert written['verdict'] == ended.stdout.splitlines()[0]
   assert written['film'] is None

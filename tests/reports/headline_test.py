@@ -34,10 +34,18 @@ def fixture_one_seed(tmp_path_factory):
   return fake_sweep.build(path, fake_sweep.experiment(seeds=[0]))
 
 
-def _audit(folder, run, verdict):
+def _audit(folder, run, verdict, **changes):
   path = folder / scheduler.AUDITS
   path.mkdir(exist_ok=True)
-  (path / f'{run}.json').write_text(json.dumps({'verdict': verdict}))
+  design = sweep_results.load(folder).runs[run].design
+  domain, task = fake_sweep.EXPERIMENT['task'].split('.')
+  content = {
+      'verdict': verdict,
+      'world': {'domain': domain, 'task': task},
+      'design': design.to_mapping(),
+      **changes,
+  }
+  (path / f'{run}.json').write_text(json.dumps(content))
 
 
 def _headline(folder):
@@ -157,8 +165,8 @@ def test_imitation_has_no_label(tmp_path):
   folder = fake_sweep.build(tmp_path / 'sweep', one)
   found, _, _ = _headline(folder)
   assert found.sentences[0].startswith(
-      'imitation has no label, because no corruption of its feedback pays: it'
-      ' earns'
+      'imitation has no label, because its feedback has no direction that pays:'
+      ' it earns'
   )
   page = pages.write(folder, tmp_path / 'out')
   assert pages.cells(page, 'Summary', 'imitation')[1] == 'n/a'
