@@ -94,7 +94,7 @@ def test_the_commands_of_the_page_on_audits_are_accepted():
     ]
     # The short episodes leave no time for an exploit.
     ended = in_process.run(audit, *arguments, '--max_steps=3', '--budget=10')
-    assert (ended.status, ended.stderr) == (0, '')
+    assert (ended.status, ended.stderr) == (4, '')
     assert ended.stdout.startswith('RESISTED WITHIN BUDGET')
 
 
