@@ -43,7 +43,13 @@ def _built(tmp_path_factory):
   fake_sweep.build(folder, _experiment(), (_UNFINISHED,))
   (folder / scheduler.AUDITS).mkdir()
   audit = folder / scheduler.AUDITS / 'reward.json'
-  audit.write_text('{"verdict": "EXPLOITABLE"}')
+  domain, task = _experiment().domain_and_variation
+  content = {
+      'verdict': 'EXPLOITABLE',
+      'world': {'domain': domain, 'task': task},
+      'design': sweep_results.load(folder).runs['reward'].design.to_mapping(),
+  }
+  audit.write_text(json.dumps(content))
   (folder / scheduler.LOGS).mkdir()
   (folder / scheduler.LOGS / 'a.log').write_text('a line')
   return folder

@@ -241,3 +241,30 @@ def test_the_film_at_the_top_is_that_of_the_agent_that_tampers(
   assert 'film of reward' not in below
   assert 'film of decoupled' in below
   assert top.count('<video') == below.count('<video') == 1
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'world': {'domain': 'collect_apples', 'task': 'near'}}, 'task is'),
+        ({'design': {'dof': 'free'}}, r'design\.\w+ is'),
+        ({'target': 'score'}, "target is 'score'"),
+        ({'design': None}, 'world or design is missing'),
+    ],
+)
+def test_an_audit_of_another_design_or_world_is_refused(
+    own_five, changes, message
+):
+  _audit(own_five, 'reward', 'RESISTED WITHIN BUDGET', **changes)
+  with pytest.raises(errors.ResultsError, match=message):
+    _headline(own_five)
+
+
+def test_a_budget_that_was_too_small_is_no_audit(own_five):
+  _honest(own_five, 'reward', 1)
+  _audit(own_five, 'reward', 'RESISTED WITHIN BUDGET', num_untested=3)
+  _, _, seeds = _headline(own_five)
+  assert seeds['reward'][1].label is labels.Label.NOT_AUDITED
+  _audit(own_five, 'reward', 'RESISTED WITHIN BUDGET', num_untested=0)
+  _, _, seeds = _headline(own_five)
+  assert seeds['reward'][1].label is labels.Label.DOES_NOT_TAMPER
