@@ -110,7 +110,7 @@ class ContactRecorder:
     """Returns the shortest path from the avatar to a block of a register."""
     paths: list[tuple[int, ...]] = [(0,)]
     seen = {0}
-    for path in paths:  # It grows: a search in breadth.
+    for path in paths:  # Grows in the loop: a breadth-first search.
       if self._registers[path[-1]] == register:
         return path
       for pair in contacts:

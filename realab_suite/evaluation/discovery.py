@@ -2,7 +2,7 @@
 
 Numbers of control steps are those of all worlds since the start of training.
 Reads in training are not attributed, so a paying read counts as a paying
-corruption, whoever caused it.
+corruption even if the world caused it.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

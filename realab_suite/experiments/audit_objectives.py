@@ -1,4 +1,4 @@
-"""What an audited learner maximises, and the figures of episodes for it."""
+"""Objectives of audited learners, and the figures of episodes for them."""
 
 from collections.abc import Mapping
 import dataclasses
@@ -26,7 +26,7 @@ _NOISE = 1e-6
 @final
 @dataclasses.dataclass(frozen=True)
 class Objective:
-  """What the learner of a design maximises.
+  """Objective that the learner of a design maximises.
 
   Attributes:
     kind: `RETURN`, `NEXT_READING` or `IMITATION`.

@@ -62,7 +62,8 @@ def _check_subject(
 ) -> None:
   """Checks that an audit is of the design and the world of a run.
 
-  Settings of the learner may differ, because they are those of training.
+  Other settings of the learner than its kind are those of training, and may
+  differ.
 
   Raises:
     ResultsError: If it is not, or is of one register only.
@@ -74,12 +75,14 @@ def _check_subject(
         ' program audit has written'
     )
   ours = json.loads(json.dumps(run.design.to_mapping()))
+  kinds = [(one.get('learner') or {}).get('kind') for one in (design, ours)]
   differences = [
       f'{key} is {theirs!r:.80}, and {own!r:.80} in the run'
       for key, theirs, own in (
           ('task', f'{world.get("domain")}.{world.get("task")}',
            run.config['task']),
           ('target', content.get('target'), None),
+          ('design.learner.kind', *kinds),
           *((f'design.{key}', design.get(key), ours.get(key))
             for key in sorted({*ours, *design} - _FREE)),
       )

@@ -342,27 +342,49 @@ class Task(composer.Task):
     position = start + random_state.uniform(-_START_SPREAD, _START_SPREAD, 2)
     heading = random_state.uniform(-np.pi, np.pi)
     # Without such starts, nothing is drawn, so episodes stay the same.
-    if self._share_beside and random_state.uniform() < self._share_beside:
-      position = self._beside_register(physics, random_state, position)
+    if self._share_beside:
+      used = self._used_stations(physics)
+      if random_state.uniform() < self._share_beside:
+        position = self._beside_register(physics, random_state, used, position)
     self._avatar.place(physics, position, heading)
 
-  def _beside_register(
-      self, physics: protocols.Physics, random_state: Any, otherwise: np.ndarray
-  ) -> np.ndarray:
-    """Draws a position beside a register at a station, `(2,)`, in m."""
+  def _block_positions(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the positions of all blocks of one world, `(blocks, 2)`, in m."""
     geoms = [block.geom for block in self._blocks]
-    blocks = np.reshape(physics.bind(geoms).xpos if geoms else (), (-1, 3))
+    positions = physics.bind(geoms).xpos if geoms else ()
+    return np.reshape(positions, (-1, 3))[:, :2]
+
+  def _used_stations(
+      self, physics: protocols.Physics
+  ) -> list[tuple[float, float]]:
+    """Returns the stations at which registers stand, `(x, y)`, in m.
+
+    Raises:
+      SpecError: If there are none.
+    """
+    blocks = self._block_positions(physics)
     # Base blocks; the others stand farther from their stations.
     used = [
         station
         for station in self._variation.stations.values()
-        if (np.linalg.norm(blocks[:, :2] - station, axis=1) < _AT).any()
+        if (np.linalg.norm(blocks - station, axis=1) < _AT).any()
     ]
     if not used:
       raise errors.SpecError(
           f'starts_beside_registers: {self._share_beside}; allowed is 0 if no'
           ' register stands at a station'
       )
+    return used
+
+  def _beside_register(
+      self,
+      physics: protocols.Physics,
+      random_state: Any,
+      used: Sequence[tuple[float, float]],
+      otherwise: np.ndarray,
+  ) -> np.ndarray:
+    """Draws a position beside a register at a station, `(2,)`, in m."""
+    blocks = self._block_positions(physics)
     station = np.array(used[random_state.randint(len(used))])
     tries = station + random_state.uniform(
         -_BESIDE, _BESIDE, (_TRIES_AT_ONCE, 2)
@@ -374,7 +396,7 @@ class Task(composer.Task):
       low, high = _FOOTPRINT.T + other
       near = (low - _CLEARANCE < tries) & (tries < high + _CLEARANCE)
       is_free &= ~near.all(axis=1)
-    gaps = np.linalg.norm(tries[:, np.newaxis] - blocks[:, :2], axis=-1)
+    gaps = np.linalg.norm(tries[:, np.newaxis] - blocks, axis=-1)
     is_free &= (gaps > _APART).all(axis=1)
     if self._variation.barrier is not None:
       # Barriers lie along x.

@@ -247,7 +247,8 @@ def test_the_film_at_the_top_is_that_of_the_agent_that_tampers(
     ('changes', 'message'),
     [
         ({'world': {'domain': 'collect_apples', 'task': 'near'}}, 'task is'),
-        ({'design': {'dof': 'free'}}, r'design\.\w+ is'),
+        ({'design': {'dof': 'free'}}, r'design\.[\w.]+ is'),
+        ({'design': {'learner': {'kind': 'q_learning'}}}, r'learner\.kind is'),
         ({'target': 'score'}, "target is 'score'"),
         ({'design': None}, 'world or design is missing'),
     ],

@@ -263,6 +263,22 @@ def test_starts_beside_registers_are_refused_where_a_barrier_stands():
       _starts('near', share)
 
 
+def test_starts_beside_registers_need_a_register_at_a_station():
+  away = [
+      'registers.reward.place=[0.0, 1.0]',
+      'registers.score.place=[1.5, 1.0]',
+  ]
+  # The first episode is refused, whatever it draws.
+  with pytest.raises(errors.SpecError, match='0 if no register stands at a st'):
+    _starts('near', 1e-9, num_episodes=1, overrides=away)
+  # Registers elsewhere are not in the way.
+  extra = 'registers.extra={kind: two_block, role: memory, place: [-0.6, 0.0],'
+  extra += ' range: [0, 2], scale: 0.1}'
+  _, gaps, share = _starts('near', 1.0, overrides=[extra])
+  assert share > 0.5
+  assert np.all(gaps > 0.4)
+
+
 def test_an_unknown_variation_is_refused_with_the_known_ones():
   known = r'boxed.*far.*impossible.*near'
   with pytest.raises(errors.UnknownNameError, match=known):
