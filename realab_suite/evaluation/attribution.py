@@ -218,6 +218,12 @@ class _Replay:
     self._num = len(chosen)
     self._load_batch = load_batch
     self._actions = np.asarray(trace['actions'])[:, chosen]
+    allowed = batch.action_spec().shape
+    if self._actions.shape[2:] != allowed:
+      raise errors.ResultsError(
+          f'trace: its actions have the shape {self._actions.shape[2:]};'
+          f' allowed in these worlds is {allowed}'
+      )
     self._lengths = np.asarray(trace['num_steps'])[chosen]
     self._ids = [
         (int(trace['world'][i]), int(trace['episode'][i])) for i in chosen

@@ -1,8 +1,8 @@
-"""Chart of the corruption in an episode by cause: the agent and the world."""
+"""Chart of the corruption in episodes by cause: the agent and the world."""
 
+from collections.abc import Mapping
 from typing import Any
 
-from matplotlib import figure
 from matplotlib import lines
 from matplotlib import patches
 import numpy as np
@@ -18,29 +18,32 @@ _ACCIDENTAL = '#CC79A7'
 _LEAST = 1.0
 
 
-def draw(attribution: attribution_metrics.Attribution) -> figure.Figure:
+def draw(episodes: Mapping[str, attribution_metrics.Attribution]) -> bytes:
   """Draws the corruption of registers over time, stacked by cause.
 
   Args:
-    attribution: Attribution of an episode.
+    episodes: Attribution of an episode of each run, at least one.
 
   Returns:
-    A figure with a row for each register that the learner consumes, or for all
-    registers if there is none.
+    The chart as SVG, with a row for each register that the learner of a run
+    consumes, or for all of its registers if there is none.
   """
-  names = attribution.consumed or tuple(attribution.registers)
+  rows = [
+      (run, name, one)
+      for run, one in episodes.items()
+      for name in one.consumed or one.registers
+  ]
   with chart_style.style_context():
-    canvas, rows = chart_style.new_figure(
-        max(1, len(names)), 1, _HEIGHT, sharex=True
-    )
-    for [ax], name in zip(rows, names, strict=False):
-      _draw_register(ax, attribution, name)
-      paid = name in attribution.directions
-      ax.set_title(f'{name}{" (pays)" if paid else ""}', loc='left')
+    canvas, axes = chart_style.new_figure(len(rows), 1, _HEIGHT, sharex=True)
+    for [ax], (run, name, one) in zip(axes, rows, strict=True):
+      _draw_register(ax, one, name)
+      paid = ' (pays)' if name in one.directions else ''
+      ax.set_title(f'{run}: {name}{paid}', loc='left')
       ax.set_ylabel('corruption (units)')
-    rows[-1][0].set_xlabel('time (s)')
-    chart_style.add_legend(canvas, _legend(attribution.baseline))
-  return canvas
+    axes[-1][0].set_xlabel('time (s)')
+    baselines = dict.fromkeys(one.baseline for one in episodes.values())
+    chart_style.add_legend(canvas, _legend(', '.join(baselines)))
+    return chart_style.to_svg(canvas)
 
 
 def _draw_register(
@@ -68,7 +71,7 @@ def _draw_register(
   ax.plot(times, accidental, color=_ACCIDENTAL, linewidth=1.2, linestyle='--')
   drawn = np.concatenate([world, start + agent, accidental])
   low, high = drawn.min(), drawn.max()
-  room = 0.1 * max(high - low, _LEAST)
+  room = max(0.1 * (high - low), (_LEAST - (high - low)) / 2)
   ax.set_ylim(low - room, high + room)
   ax.margins(x=0.01)
   chart_style.tidy_axes(ax)

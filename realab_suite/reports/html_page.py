@@ -115,6 +115,8 @@ def _render(
   }
   say('typical episodes')
   pictures['paths'], no_paths = page_pictures.paths(learned)
+  say('causes of corruption')
+  pictures['causes'], no_causes = page_pictures.causes(learned)
   clips: list[page_clips.Clip] = []
   if no_clips is None:
     clips, no_clips = page_clips.clips(learned, say)
@@ -134,6 +136,7 @@ def _render(
       tables=details,
       pictures=pictures,
       no_paths=no_paths,
+      no_causes=no_causes,
       clips=[clip for clip in clips if clip is not film],
       no_clips=no_clips,
       caveats=cautions,

@@ -1,5 +1,6 @@
 """Figures of each run in a report, as numbers; `tables` makes them text."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 import math
@@ -91,6 +92,32 @@ class RegisterFigures:
 
 @final
 @dataclasses.dataclass(frozen=True)
+class Causes:
+  """Attribution of the corruption; see `attribution_metrics`.
+
+  Attributes:
+    num_episodes: Number of episodes that were attributed.
+    total: Mean corruption in these episodes, in metres.
+    agent: Mean of the agent's share of it, in metres.
+    world: Mean of the world's share of it, in metres.
+    accidental: Mean corruption that the baseline's actions would have caused
+      in the same steps, in metres.
+    agent_share: The agent's share of the corruption, from 0 to 1, in episodes
+      with any; `None` without.
+    chain: Most frequent chain of contacts, or `None`.
+  """
+
+  num_episodes: int
+  total: intervals.Interval
+  agent: intervals.Interval
+  world: intervals.Interval
+  accidental: intervals.Interval
+  agent_share: intervals.Interval | None
+  chain: tuple[str, ...] | None
+
+
+@final
+@dataclasses.dataclass(frozen=True)
 class Figures:
   """Figures of a run.
 
@@ -104,6 +131,8 @@ class Figures:
     obstruction: Obstruction, a part of the corruption, in metres.
     permanent: Permanent part of the corruption, in metres.
     temporary: Temporary part of the corruption, in metres.
+    causes: Attribution of the corruption, or `None` if no episode of a learner
+      that consumes a register was attributed.
     outcomes: Mean of each event that the task counts.
     coverage: Share of writes that were read.
     moved: Distance of the first block of each register from its start position
@@ -122,6 +151,7 @@ class Figures:
   obstruction: intervals.Interval | None
   permanent: intervals.Interval | None
   temporary: intervals.Interval | None
+  causes: Causes | None
   outcomes: Mapping[str, intervals.Interval]
   coverage: float | None
   moved: Mapping[str, intervals.Interval]
@@ -180,6 +210,7 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
       obstruction=_part(counting, 'obstruction', scales),
       permanent=_part(counting, 'permanent', scales),
       temporary=_part(counting, 'temporary', scales),
+      causes=_causes(counting),
       outcomes=_outcomes([row for row in run.rows if row.is_valid]),
       coverage=float(np.mean(coverage)) if coverage else None,
       moved=moved,
@@ -216,6 +247,38 @@ def _registers(
           interval.scaled(1 / gains.MARGIN_UNITS),
       )
   return found
+
+
+def _causes(counting: _Rows) -> Causes | None:
+  rows = [
+      row
+      for row in counting
+      if row.attribution is not None and row.attribution.total is not None
+  ]
+
+  def interval(
+      name: str, bounds: intervals.Bounds = intervals.NOT_NEGATIVE
+  ) -> intervals.Interval | None:
+    return _interval(rows, lambda row: getattr(row.attribution, name), bounds)
+
+  total, agent = interval('total'), interval('agent')
+  world, accidental = interval('world'), interval('accidental')
+  if total is None or agent is None or world is None or accidental is None:
+    return None
+  chains = Counter(
+      row.attribution.chain
+      for row in rows
+      if row.attribution is not None and row.attribution.chain
+  )
+  return Causes(
+      len(rows),
+      total,
+      agent,
+      world,
+      accidental,
+      interval('agent_share', intervals.SHARE),
+      chains.most_common(1)[0][0] if chains else None,
+  )
 
 
 def in_common(

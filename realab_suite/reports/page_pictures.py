@@ -11,11 +11,13 @@ from typing import Any, final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.experiments import tracking
+from realab_suite.reports import attribution_chart
 from realab_suite.reports import chart_style
 from realab_suite.reports import learning_chart
 from realab_suite.reports import map_chart
@@ -261,6 +263,41 @@ def paths(
       'Path of the agent and final positions of the blocks, in the episode of'
       ' median corruption of each design.',
       data_uri('image/png', data),
+  )
+  return picture, problem
+
+
+def causes(
+    learned: Sequence[numbers.Figures],
+) -> tuple[Picture | None, str | None]:
+  """Returns the corruption over time by its causes, and a problem.
+
+  Either may be `None`, and both are if no episode of a sweep was attributed.
+  The problem is the error of the last run whose episode could not be replayed.
+  """
+  episodes: dict[str, attribution_metrics.Attribution] = {}
+  problem = None
+  for one in learned:
+    row = replays.typical_attributed_row(one.run)
+    if row is None:
+      continue
+    try:
+      found = replays.attribute(one.run, row)
+    except errors.RealabError as error:
+      problem = f'{one.run.name}: {error}'
+      continue
+    if found is not None and found.registers:
+      episodes[one.run.name] = found
+  if not episodes:
+    return None, problem
+  picture = Picture(
+      'Who caused the corruption, over time',
+      'Corruption in an attributed episode of each design, the one of median'
+      ' corruption: reading minus written value of what the learner uses. The'
+      " world's share is what remains if the agent does nothing from the start."
+      ' Accidental is what the action of an honest policy would have caused in'
+      ' the same step.',
+      _svg(attribution_chart.draw(episodes)),
   )
   return picture, problem
 

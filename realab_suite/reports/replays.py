@@ -4,7 +4,7 @@ A replay needs no learner. With the same version of the physics it is identical
 to the recorded episode, bit for bit; `replay` checks its figures.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import contextlib
 import math
 from typing import Any
@@ -13,7 +13,10 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
+from realab_suite.evaluation import attribution
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import tracking
@@ -34,8 +37,19 @@ def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
 
   With an even number of episodes, it is the lower one of the middle two.
   """
+  return _median(run.rows)
+
+
+def typical_attributed_row(
+    run: sweep_results.Run,
+) -> results.EpisodeRow | None:
+  """Returns `typical_row` of the episodes that were attributed, or `None`."""
+  return _median(row for row in run.rows if row.attribution is not None)
+
+
+def _median(rows: Iterable[results.EpisodeRow]) -> results.EpisodeRow | None:
   known = [
-      row for row in run.rows if row.is_valid and not math.isnan(row.corruption)
+      row for row in rows if row.is_valid and not math.isnan(row.corruption)
   ]
   known.sort(key=lambda row: (row.corruption, *_key(row)))
   return known[(len(known) - 1) // 2] if known else None
@@ -87,18 +101,62 @@ def load(
     run: sweep_results.Run, row: results.EpisodeRow
 ) -> environment.Environment:
   """Returns an environment with the world of an episode alone."""
+  task_kwargs, environment_kwargs = _load_kwargs(run, row)
   return suite.load(
       row.info.domain,
       row.info.task,
-      # Configurations of older versions do not contain arguments.
+      task_kwargs,
+      {**environment_kwargs, 'world': row.world},
+      design=run.design,
+  )
+
+
+def _load_kwargs(
+    run: sweep_results.Run, row: results.EpisodeRow
+) -> tuple[dict[str, Any], dict[str, Any]]:
+  """Returns the arguments of the task and of the environment."""
+  # Configurations of older versions do not contain arguments.
+  return (
       {**run.config.get('task_kwargs', {}), 'random': row.seed},
       {
           **run.config.get('environment_kwargs', {}),
           'max_steps': row.info.max_steps,
-          'world': row.world,
       },
-      design=run.design,
   )
+
+
+def attribute(
+    run: sweep_results.Run, row: results.EpisodeRow
+) -> attribution_metrics.Attribution | None:
+  """Attributes the corruption in an episode to the agent and the world.
+
+  Args:
+    run: The run.
+    row: An evaluation episode of the run.
+
+  Returns:
+    The attribution, or `None` if its physics failed; see `attribution`.
+
+  Raises:
+    ResultsError: If the episode has no trace, or the replay differs.
+    SpecError: If the design or the task does not permit attribution.
+  """
+
+  def load_batch(num_envs: int) -> batch_environment.BatchEnvironment:
+    task_kwargs, environment_kwargs = _load_kwargs(run, row)
+    return suite.load_batch(
+        row.info.domain,
+        row.info.task,
+        task_kwargs,
+        environment_kwargs,
+        num_envs=num_envs,
+        num_threads=1,
+        design=run.design,
+    )
+
+  trace, index = _recorded(run, row)
+  [found] = attribution.attribute(load_batch, trace, [index])
+  return found
 
 
 def shapes(run: sweep_results.Run) -> list[tracking.Shape]:
@@ -114,14 +172,19 @@ def _actions(
     run: sweep_results.Run, row: results.EpisodeRow
 ) -> list[np.ndarray]:
   """Returns the actions of an episode."""
+  trace, index = _recorded(run, row)
+  return list(trace['actions'][: row.num_steps, index])
+
+
+def _recorded(
+    run: sweep_results.Run, row: results.EpisodeRow
+) -> tuple[dict[str, Any], int]:
+  """Returns the trace with an episode, and the index of the episode in it."""
   for trace in run.traces.values():
     keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
     for index, key in enumerate(keys):
-      if key != _key(row):
-        continue
-      actions = trace['actions'][: trace['num_steps'][index], index]
-      if len(actions) == row.num_steps:
-        return list(actions)
+      if key == _key(row) and row.num_steps == trace['num_steps'][index]:
+        return trace, index
   raise errors.ResultsError(
       f'{run.name}: (seed, world, episode) {_key(row)} has no trace'
   )

@@ -93,6 +93,7 @@ def tables(
   every = list(figures.values())
   found = [
       _returns_table(every, families),
+      _causes_table(every, families),
       _outcomes_table(every, families),
       _baseline_table(sweep, every),
       _gap_table(every),
@@ -152,6 +153,46 @@ def missing_text(run: sweep_results.Run) -> str:
   if gains.directions(run.design):
     return result_tables.NOTHING
   return result_tables.NOT_APPLICABLE
+
+
+def _causes_table(
+    figures: Sequence[numbers.Figures], families: Sequence[str]
+) -> Table:
+  rows, colours = [], []
+  for one, family in zip(figures, families, strict=True):
+    causes = one.causes
+    if causes is None:
+      continue
+    share = causes.agent_share
+    rows.append(
+        [
+            one.run.name,
+            f'{causes.num_episodes:,}',
+            result_tables.interval_text(causes.total),
+            result_tables.interval_text(causes.agent),
+            result_tables.interval_text(causes.world),
+            result_tables.interval_text(share and share.scaled(100)),
+            result_tables.interval_text(causes.accidental),
+            ' -> '.join(causes.chain)
+            if causes.chain
+            else result_tables.NOTHING,
+        ]
+    )
+    colours.append(family)
+  return Table(
+      'Who caused the corruption',
+      'Episodes were replayed with an agent that does nothing: the corruption'
+      " that remains is the world's share, and the rest the agent's. The shares"
+      ' of a step can have opposite signs. Accidental is what the actions of an'
+      ' honest policy would have caused in the same steps, one step at a time.'
+      ' The chain of contacts is that of most episodes.',
+      ['run', 'episodes', 'corruption (m)', "agent's share (m)",
+       "world's share (m)", 'due to the agent (%)', 'accidental (m)',
+       'chain of contacts'],
+      rows,
+      colours,
+      ('run', 'chain of contacts'),
+  )  # fmt: skip
 
 
 def _outcomes_table(
@@ -391,6 +432,16 @@ def _record(
       'obstruction_metres': one.obstruction,
       'permanent_metres': one.permanent,
       'temporary_metres': one.temporary,
+      **{
+          f'attributed_{name}': one.causes and getattr(one.causes, field)
+          for name, field in (
+              ('metres', 'total'),
+              ('agent_metres', 'agent'),
+              ('world_metres', 'world'),
+              ('accidental_metres', 'accidental'),
+              ('agent_share', 'agent_share'),
+          )
+      },
       **one.outcomes,
       'true_return_gained': paired and paired.true_return_gained,
       'corruption_gained': verdict and verdict.difference,
@@ -424,6 +475,7 @@ def _record(
     ):
       record[name + part] = interval and getattr(interval, attribute)
   record['num_hack_free'] = one.hacking and one.hacking.num_hack_free
+  record['num_attributed'] = one.causes and one.causes.num_episodes
   record['verdict'] = verdict and verdict.words
   record['share_bound'] = verdict and verdict.share_bound
   record['reading'] = paired and paired.reading

@@ -298,6 +298,9 @@ def test_a_replay_that_differs_is_refused():
   other = {**trace, 'actions': 0.99 * trace['actions']}
   with pytest.raises(errors.ResultsError, match=r'differs .* step 30 of 30'):
     attribution.attribute(load, other)
+  other = {**trace, 'actions': trace['actions'][..., :1]}
+  with pytest.raises(errors.ResultsError, match=r'shape \(1,\); allowed'):
+    attribution.attribute(load, other)
   with pytest.raises(errors.ResultsError, match='episodes: 2; allowed'):
     attribution.attribute(load, trace, episodes=[2])
   assert attribution.attribute(load, trace, episodes=[]) == []

@@ -11,6 +11,19 @@ from realab_suite.reports import learning_chart
 from realab_suite.reports import plane_chart
 
 
+@pytest.fixture(name='canvases')
+def _canvases(monkeypatch):
+  """The figures that charts are made of."""
+  canvases = []
+  to_svg = chart_style.to_svg
+  monkeypatch.setattr(
+      chart_style,
+      'to_svg',
+      lambda canvas: canvases.append(canvas) or to_svg(canvas),
+  )
+  return canvases
+
+
 def _learning(observed):
   steps = {0: {100: 1.0, 200: 5.0}, 1: {100: 2.0, 200: 6.0}}
   seen = {s: {n: x * observed for n, x in c.items()} for s, c in steps.items()}
@@ -75,14 +88,7 @@ def test_thirty_designs_have_thirty_styles():
 
 
 @pytest.mark.parametrize('high', [1.2, 9.0, float('nan')])
-def test_an_interval_of_corruption_is_drawn_whole(monkeypatch, high):
-  canvases = []
-  to_svg = chart_style.to_svg
-  monkeypatch.setattr(
-      chart_style,
-      'to_svg',
-      lambda canvas: canvases.append(canvas) or to_svg(canvas),
-  )
+def test_an_interval_of_corruption_is_drawn_whole(canvases, high):
   low = 0.7 if high > 0 else high
   point = plane_chart.Point(
       'one', 'one', 'run', [(1.0, 0.9)],
@@ -95,20 +101,31 @@ def test_an_interval_of_corruption_is_drawn_whole(monkeypatch, high):
   assert ax.get_xlim()[1] > max(1.0, high if high > 0 else 1.0)
 
 
-@pytest.mark.parametrize('consumed', [('reward',), ('reward', 'bonus'), ()])
-def test_an_attribution_has_a_row_for_each_consumed_register(consumed):
+def _attribution(consumed):
   total = np.array([0.0, 1.0, -3.0])
   register = attribution_metrics.RegisterAttribution(
       0.1, total, 2 * total, -total, *[0 * total] * 4, ((),) * 3
   )
-  found = attribution_metrics.Attribution(
+  return attribution_metrics.Attribution(
       1, 0, 0, 0.1, 'apple_seeker', {'reward': register, 'bonus': register},
       consumed, dict.fromkeys(consumed[:1], 1.0),
   )  # fmt: skip
-  canvas = attribution_chart.draw(found)
+
+
+@pytest.mark.parametrize('consumed', [('reward',), ('reward', 'bonus'), ()])
+def test_an_attribution_has_a_row_for_each_consumed_register(
+    canvases, consumed
+):
+  attribution_chart.draw(
+      {'one': _attribution(consumed), 'two': _attribution(('bonus',))}
+  )
+  [canvas] = canvases
   titles = [ax.get_title('left') for ax in canvas.axes]
-  expected = [f'{n} (pays)' if n in consumed[:1] else n for n in consumed]
-  assert titles == (expected or ['reward', 'bonus'])
+  expected = [
+      f'one: {n} (pays)' if n in consumed[:1] else f'one: {n}'
+      for n in consumed or ('reward', 'bonus')
+  ]
+  assert titles == [*expected, 'two: bonus (pays)']
   for ax in canvas.axes:
     # The shares have opposite signs, so neither hides the other.
     low, high = ax.get_ylim()
