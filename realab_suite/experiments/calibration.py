@@ -4,7 +4,6 @@ A register that pays is put at every place of a coarse grid, and random actions
 are taken for one episode in each world of a batch.
 """
 
-from collections.abc import Callable, Mapping
 import contextlib
 import dataclasses
 import math
@@ -14,11 +13,11 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import policies
-from realab_suite import suite
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import monitors
 from realab_suite.evaluation import statistics
+from realab_suite.experiments import audit_worlds
 from realab_suite.feedback import specs
 
 _LEVEL = 0.95
@@ -30,28 +29,20 @@ class Settings:
   """Settings of a calibration.
 
   Attributes:
-    domain: Domain of the task.
-    task: Name of the task in its domain.
-    design: Agent design, by name or path.
-    overrides: Dotted overrides of the design.
+    world: The world.
+    design: Agent design.
     target: Register to place, or `None` for the first one that pays.
     spacing: Distance between adjacent places of the grid, in metres.
     num_envs: Number of worlds, and so of episodes of each place.
-    max_steps: Length of an episode, in control steps.
     seed: Seed of the worlds and of the actions.
-    task_kwargs: Arguments of the task, without the seed.
   """
 
-  domain: str
-  task: str
-  design: str
-  overrides: tuple[str, ...] = ()
+  world: audit_worlds.World
+  design: specs.DesignSpec
   target: str | None = None
   spacing: float = 1.0
   num_envs: int = 128
-  max_steps: int = suite.MAX_STEPS
   seed: int = 0
-  task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 @final
@@ -158,13 +149,10 @@ def measure(settings: Settings) -> Calibration:
   target, places = _places(settings)
   trials, num_refused = [], 0
   for place in places:
+    design = specs.load(settings.design, [f'registers.{target}.place={place}'])
     try:
-      batch = _load(
-          suite.load_batch,
-          settings,
-          f'registers.{target}.place={place}',
-          num_envs=settings.num_envs,
-          sleep=True,
+      batch = settings.world.load_batch(
+          design, settings.num_envs, settings.seed, sleep=True
       )
     except errors.SpecError:
       # The design is valid, because `_places` has loaded it.
@@ -175,24 +163,12 @@ def measure(settings: Settings) -> Calibration:
   return Calibration(target, tuple(trials), num_refused)
 
 
-def _load(
-    loader: Callable[..., Any], settings: Settings, *more: str, **options: Any
-) -> Any:
-  return loader(
-      settings.domain,
-      settings.task,
-      {**settings.task_kwargs, 'random': settings.seed},
-      {'max_steps': settings.max_steps},
-      design=settings.design,
-      overrides=(*settings.overrides, *more),
-      **options,
-  )
-
-
 def _places(settings: Settings) -> tuple[str, list[str]]:
   """Returns the register to place, and all places to try."""
-  with contextlib.closing(_load(suite.load, settings)) as env:
-    design, arena = env.mechanism.design, env.task.root_entity
+  design = settings.design
+  env = settings.world.load(design, settings.seed, 0)
+  with contextlib.closing(env):
+    arena = env.task.root_entity
   paying = list(gains.directions(design))
   target = settings.target or next(iter(paying), None)
   if target not in paying:

@@ -1,6 +1,6 @@
 r"""Places the register that pays for a requested time to the first corruption.
 
-  python -m realab_suite.launchers.calibrate --domain=unlock_door --task=near \
+  python -m realab_suite.launchers.calibrate --task=unlock_door.near \
     --design=instantaneous_reward --steps=20000
 
 The register is put at every named place and on a grid. Random actions measure
@@ -15,8 +15,10 @@ from absl import flags
 
 from realab_suite import errors
 from realab_suite.evaluation import intervals
+from realab_suite.experiments import audit_worlds
 from realab_suite.experiments import calibration
 from realab_suite.experiments import result_tables
+from realab_suite.feedback import specs
 from realab_suite.launchers import program
 from realab_suite.launchers.flags import imports_flag
 from realab_suite.launchers.flags import seed_flag
@@ -47,17 +49,20 @@ def main(argv: Sequence[str]) -> None:
       _STEPS, '; give the control steps to the first paying corruption'
   )
   imports_flag.load()
+  domain, task = world_flags.world()
   settings = calibration.Settings(
-      domain=world_flags.DOMAIN.value,
-      task=world_flags.TASK.value,
-      design=world_flags.DESIGN.value,
-      overrides=tuple(world_flags.SET.value),
+      world=audit_worlds.World(
+          domain,
+          task,
+          world_flags.MAX_STEPS.value,
+          world_flags.task_kwargs(),
+          world_flags.senses(),
+      ),
+      design=specs.load(world_flags.DESIGN.value, world_flags.SET.value),
       target=world_flags.TARGET.value,
       spacing=_SPACING.value,
       num_envs=_NUM_ENVS.value,
-      max_steps=world_flags.MAX_STEPS.value,
       seed=seed_flag.SEED.value,
-      task_kwargs=world_flags.task_kwargs(),
   )
   found = calibration.measure(settings)
   if not found.trials:

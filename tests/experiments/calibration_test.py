@@ -5,7 +5,9 @@ import math
 import pytest
 
 from realab_suite import errors
+from realab_suite.experiments import audit_worlds
 from realab_suite.experiments import calibration
+from realab_suite.feedback import specs
 from realab_suite.launchers import calibrate
 from tests.launchers import in_process
 
@@ -72,7 +74,9 @@ def test_the_table_has_feasible_places_and_the_closest(monkeypatch):
 
 def test_named_places_and_a_grid_are_tried():
   settings = calibration.Settings(
-      'unlock_door', 'far', 'value_advice', ('dof=planar',), spacing=4.0
+      audit_worlds.World('unlock_door', 'far'),
+      specs.load('value_advice', ['dof=planar']),
+      spacing=4.0,
   )
   target, places = calibration._places(settings)
   assert target == 'advice'
@@ -92,7 +96,29 @@ def test_a_wrong_command_is_refused(arguments, complaint):
   assert complaint in in_process.complaint(calibrate, *arguments)
 
 
-def test_a_wrong_design_is_not_a_refused_place():
-  settings = calibration.Settings('unlock_door', 'near', 'nothing')
-  with pytest.raises(errors.SpecError, match='nothing'):
-    calibration.measure(settings)
+@pytest.mark.parametrize('argument', ['--design=nothing', '--senses=smell'])
+def test_a_wrong_name_is_not_a_refused_place(argument):
+  name = argument.rpartition('=')[2]
+  complaint = in_process.complaint(calibrate, '--steps=9', argument)
+  assert name in complaint
+  assert 'places' not in complaint
+
+
+def test_the_world_is_that_of_the_flags(monkeypatch):
+  seen = []
+
+  def measure(settings):
+    seen.append(settings)
+    raise errors.SpecError('enough')
+
+  monkeypatch.setattr(calibration, 'measure', measure)
+  in_process.complaint(
+      calibrate, '--steps=9', '--task=collect_apples.far', '--max_steps=7',
+      '--senses=camera', '--task_kwargs={starts_beside_registers: 0.1}',
+      '--set=dof=planar',
+  )  # fmt: skip
+  [settings] = seen
+  assert settings.world == audit_worlds.World(
+      'collect_apples', 'far', 7, {'starts_beside_registers': 0.1}, ('camera',)
+  )
+  assert settings.design.dof == 'planar'
