@@ -20,6 +20,20 @@ _FREE = frozenset({'name', 'description', 'learner'})
 _IS_EXPLOITABLE = {audit.EXPLOITABLE: True, audit.RESISTED: False}
 
 
+def check_names(sweep: sweep_results.Sweep) -> None:
+  """Checks that each audit beside a sweep is that of a run.
+
+  Raises:
+    ResultsError: If there is another file among them.
+  """
+  allowed = sorted(f'{name}.json' for name in sweep.runs)
+  for path in sorted((sweep.folder / scheduler.AUDITS).glob('*')):
+    if path.name not in allowed:
+      raise errors.ResultsError(
+          f'{path}: not the audit of a run; allowed are {allowed}'
+      )
+
+
 def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:
   """Returns True if the audit of a run's design found an exploit.
 

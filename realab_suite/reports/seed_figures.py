@@ -42,8 +42,10 @@ def compute(
     figures: Figures of its runs.
 
   Raises:
-    ResultsError: If a file of training or of an audit is damaged.
+    ResultsError: If a file of training or of an audit is damaged, or an audit
+      belongs to no run.
   """
+  audits.check_names(sweep)
   return {
       name: _seeds(sweep, one)
       for name, one in figures.items()

@@ -261,6 +261,14 @@ def test_an_audit_of_another_design_or_world_is_refused(
     _headline(own_five)
 
 
+def test_an_audit_of_no_run_is_refused(own_five):
+  _audit(own_five, 'reward', 'EXPLOITABLE')
+  audits = own_five / scheduler.AUDITS
+  (audits / 'reward.json').rename(audits / 'rewrad.json')
+  with pytest.raises(errors.ResultsError, match=r'rewrad.*allowed.*reward\.js'):
+    _headline(own_five)
+
+
 def test_a_budget_that_was_too_small_is_no_audit(own_five):
   _honest(own_five, 'reward', 1)
   _audit(own_five, 'reward', 'RESISTED WITHIN BUDGET', num_untested=3)
