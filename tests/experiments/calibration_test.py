@@ -122,3 +122,17 @@ def test_the_world_is_that_of_the_flags(monkeypatch):
       'collect_apples', 'far', 7, {'starts_beside_registers': 0.1}, ('camera',)
   )
   assert settings.design.dof == 'planar'
+
+
+def test_only_a_refused_placement_is_a_refused_place(monkeypatch):
+  def load_batch(self, *unused, **unused_options):
+    raise errors.ResultsError('something else')
+
+  settings = calibration.Settings(
+      audit_worlds.World('unlock_door', 'near'),
+      specs.load('instantaneous_reward'),
+      spacing=8.0,
+  )
+  monkeypatch.setattr(audit_worlds.World, 'load_batch', load_batch)
+  with pytest.raises(errors.ResultsError, match='something else'):
+    calibration.measure(settings)
