@@ -10,12 +10,13 @@ INSTALL = $(PY) -m pip install -qq --disable-pip-version-check \
 WORKERS = 2
 DEMO := results/demo-$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: help demo test lint format clean
+.PHONY: help demo test lint docs format clean
 
 help:
 	@echo 'make demo    train agents in Unlock Door and report which tamper'
 	@echo 'make test    run lint, type checks and tests, as before every merge'
 	@echo 'make lint    run lint and type checks only'
+	@echo 'make docs    build the site in build/site'
 	@echo 'make format  format the code and apply the fixes of the linter'
 	@echo 'make clean   remove .venv, builds and caches, but not results/'
 
@@ -30,6 +31,11 @@ lint: .venv/dev
 	$(PY) -m ruff check -q .
 	$(PY) -m pyink --check -q .
 	$(PY) -m mypy
+
+docs: .venv/dev
+	$(INSTALL) -e '.[docs]'
+	$(PY) -m sphinx -j auto -W --keep-going -q -c docs/site . build/site
+	@echo 'The site is build/site/docs/site/index.html'
 
 format: .venv/dev
 	$(PY) -m ruff check -q --fix .

@@ -37,10 +37,12 @@ def main(argv: Sequence[str]) -> None:
   from pictures import carrying
   from pictures import first_person
   from pictures import tampering
+  from pictures import worlds
 
   folder.mkdir(parents=True, exist_ok=True)
   first_person.draw(folder / 'first_person.png')
   carrying.draw(folder / 'carrying.png')
+  worlds.draw(folder / 'worlds')
   if input_flag.INPUT.value is None:
     program.say('tampering.gif is left out: --input names no sweep')
   else:

@@ -232,8 +232,8 @@ class AgentView(_View, dm_env.Environment):
 class BatchAgentView(_View):
   """The interface of a batch for an agent in the same process.
 
-  It is like `AgentView`, but time steps are `BatchTimeStep`s, and actions have
-  a leading axis of worlds.
+  It is like `AgentView`, but its time steps have the class `BatchTimeStep`, and
+  actions have a leading axis of worlds.
   """
 
   __slots__ = ()

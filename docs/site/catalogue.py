@@ -1,0 +1,223 @@
+"""Extension of Sphinx: pages of worlds, designs and modules from the code.
+
+The tables of a page come from the world or the design itself, so they belong to
+the code beside them.
+"""
+
+from collections.abc import Iterable, Sequence
+import contextlib
+import inspect
+import pathlib
+import pkgutil
+from typing import Any
+
+import numpy as np
+
+import realab_suite
+from realab_suite import suite
+from realab_suite.feedback import specs
+from realab_suite.policies import action_sets
+from realab_suite.tasks import base
+
+_FOLDER = pathlib.Path('build', 'catalogue')
+# Relative to the folders `worlds` and `designs`.
+_ROOT = '../../..'
+# Packages without an interface for users.
+_INTERNAL = ('launchers', 'reports')
+_READERS = {
+    'feedback': ('its provider', 'the agent, and providers that name it'),
+    'meter': ('its meter', 'providers that name it'),
+    'query': ('the agent, by its query', 'providers that name it'),
+    'memory': ('its provider', 'providers that name it'),
+}
+
+
+def setup(app: Any) -> dict[str, bool]:
+  """Connects the extension."""
+  app.connect('builder-inited', _write_all)
+  # Before napoleon, which has the usual priority of 500.
+  app.connect('autodoc-process-docstring', _mark_code, priority=400)
+  return {'parallel_read_safe': True}
+
+
+def _write_all(app: Any) -> None:
+  root = pathlib.Path(app.srcdir) / _FOLDER
+  for domain, task in suite.ALL_TASKS:
+    name = f'{domain}.{task}'
+    _write(root / 'worlds' / f'{name}.md', _world(domain, task))
+  for name in suite.DESIGNS:
+    _write(root / 'designs' / f'{name}.md', _design(name))
+  for name in _modules():
+    _write(root / 'api' / f'{name}.rst', _module(name))
+
+
+def _mark_code(
+    app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]
+) -> None:
+  """Makes an indented block after a colon a literal block, as in Markdown."""
+  del app, what, name, obj, options
+  for i, line in enumerate(lines[:-2]):
+    indent = len(line) - len(line.lstrip())
+    block = lines[i + 2]
+    is_block = block.strip() and block.startswith(' ' * (indent + 2))
+    if line.endswith(':') and not lines[i + 1].strip() and is_block:
+      lines[i] = f'{line}:'
+
+
+def _write(path: pathlib.Path, text: str) -> None:
+  """Writes a page if it has changed, so that Sphinx builds it again."""
+  path.parent.mkdir(parents=True, exist_ok=True)
+  if not path.exists() or path.read_text(encoding='utf-8') != text:
+    path.write_text(text, encoding='utf-8')
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+  lines = [header, ['---'] * len(header), *rows]
+  return '\n'.join(f'| {" | ".join(map(str, line))} |' for line in lines)
+
+
+def _world(domain: str, task: str) -> str:
+  env = suite.load(domain, task, {'random': 0})
+  with contextlib.closing(env):
+    kind = type(env.task)
+    layout = base.VARIATIONS[task]
+    summary = inspect.getdoc(inspect.getmodule(kind)) or ''
+    observations = [
+        (
+            f'`{key}`',
+            ' x '.join(map(str, spec.shape)) or 'one number',
+            spec.dtype,
+            _range(spec),
+            'the agent; a provider that requires this sense',
+        )
+        for key, spec in env.observation_spec().items()
+    ]
+    spec = env.action_spec()
+    actions = [
+        (i, f'`{name}`', f'{low:g} to {high:g}')
+        for i, (name, low, high) in enumerate(
+            zip(spec.name.split('\t'), spec.minimum, spec.maximum, strict=True)
+        )
+    ]
+    places = [
+        (f'`{name}`', f'({place.position[0]:g}, {place.position[1]:g})')
+        for name, place in env.task.root_entity.places.items()
+    ]
+    measurements = ', '.join(f'`{name}`' for name in env.task.measurements)
+    greatest = env.task.max_true_return
+  barrier = ''
+  if layout.barrier is not None:
+    ends = ' to '.join(f'({x:g}, {y:g})' for x, y in layout.barrier)
+    barrier = f' A barrier leads from {ends}.'
+  if layout.is_impossible:
+    barrier += ' No true reward can be earned.'
+  return f"""# {domain}.{task}
+
+{summary}
+
+![The room from above]({_ROOT}/docs/images/worlds/{domain}.{task}.png)
+
+```python
+env = suite.load('{domain}', '{task}', design='instantaneous_reward')
+```
+
+The avatar starts near ({layout.start[0]:g}, {layout.start[1]:g}), in m, and the
+largest possible true return is {greatest:g}.{barrier}
+
+## Observations
+
+{_table(['key', 'shape', 'type', 'range', 'who may read it'], observations)}
+
+[Senses](../../../docs/senses.md) has the content and unit of each. A design
+adds the readings of its feedback registers, in units of each register.
+
+## Actions
+
+{_table(['element', 'name', 'range'], actions)}
+
+Designs with an action set have a list of discrete actions instead.
+
+## Places for registers
+
+{_table(['name', 'position (m)'], places)}
+
+## Measurements
+
+Meters, and nothing else, may read the true state: {measurements}.
+[Designs of your own](../../../docs/your_own.md) explains measurements with
+options.
+"""
+
+
+def _range(spec: Any) -> str:
+  if not hasattr(spec, 'minimum'):
+    return 'unbounded'
+  return f'{np.min(spec.minimum):g} to {np.max(spec.maximum):g}'
+
+
+def _listed(names: Iterable[str]) -> str:
+  return ', '.join(f'`{name}`' for name in names) or '-'
+
+
+def _design(name: str) -> str:
+  design = specs.load(name)
+  registers = [
+      (
+          f'`{key}`',
+          one.role,
+          one.kind,
+          f'`{one.place}`',
+          f'{one.range[0]:g} to {one.range[1]:g}',
+          f'{one.scale:g}',
+          *_READERS[one.role],
+      )
+      for key, one in design.registers.items()
+  ]
+  parts = [f'# {name}', design.description]
+  if registers:
+    header = ['register', 'role', 'kind', 'place', 'range (units)',
+              'm per unit', 'written by', 'read by']  # fmt: skip
+    parts += ['## Registers', _table(header, registers)]
+  if design.providers:
+    parts.append('## Providers')
+    rows = [
+        (f'`{one.kind}`', _listed(one.reads), _listed(one.writes))
+        for one in design.providers
+    ]
+    parts.append(_table(['kind', 'reads', 'writes'], rows))
+  if design.action_set is not None:
+    chosen = action_sets.get(design.action_set.name, design.action_set.version)
+    rows = [
+        (i, action, ', '.join(f'{k} {v:g}' for k, v in elements.items()) or '-')
+        for i, (action, elements) in enumerate(chosen.actions)
+    ]
+    parts += [
+        f'## Actions: {chosen.name}, version {chosen.version}',
+        _table(['index', 'action', 'controls'], rows),
+    ]
+  file = pathlib.Path(suite.__file__).parents[1] / 'configs' / 'designs'
+  whole = (file / f'{name}.yaml').read_text(encoding='utf-8')
+  parts += ['## File', f'```yaml\n{whole}```']
+  return '\n\n'.join(parts) + '\n'
+
+
+def _modules() -> list[str]:
+  found = pkgutil.walk_packages(realab_suite.__path__, 'realab_suite.')
+  names = [
+      one.name
+      for one in found
+      if not any(
+          part.startswith('_') or part in _INTERNAL
+          for part in one.name.split('.')
+      )
+  ]
+  return ['realab_suite', *names]
+
+
+def _module(name: str) -> str:
+  title = name.replace('_', '\\_')
+  return f"""{title}
+{'=' * len(title)}
+
+.. automodule:: {name}
+"""

@@ -1,0 +1,53 @@
+"""Configuration of the site: pages in Markdown, and an API reference.
+
+Run from the root of the repository, whose files are the sources:
+
+  python -m sphinx -W -c docs/site . build/site
+"""
+
+import pathlib
+import sys
+
+_ROOT = pathlib.Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(_ROOT), str(_ROOT / 'docs' / 'site')]
+
+project = 'realab_suite'
+author = 'The realab_suite authors'
+extensions = [
+    'myst_parser',
+    'sphinx.ext.autodoc',
+    'sphinx.ext.napoleon',
+    'catalogue',
+]
+root_doc = 'docs/site/index'
+# `catalogue` writes the pages in `build`.
+include_patterns = [
+    'README.md',
+    'GLOSSARY.md',
+    'CHANGELOG.md',
+    'CONTRIBUTING.md',
+    'benchmarks/README.md',
+    'docs/*.md',
+    'docs/site/*.md',
+    'build/catalogue/**.md',
+    'build/catalogue/**.rst',
+]
+source_suffix = {'.md': 'markdown', '.rst': 'restructuredtext'}
+myst_heading_anchors = 4
+# The default language of code blocks without one.
+highlight_language = 'none'
+html_theme = 'furo'
+html_title = 'realab_suite'
+html_copy_source = False
+# Docstrings use single backticks for code.
+default_role = 'code'
+autodoc_member_order = 'bysource'
+autodoc_typehints = 'signature'
+autodoc_default_options = {'members': True, 'show-inheritance': True}
+# Docstrings of dm_control are in another markup.
+autodoc_inherit_docstrings = False
+napoleon_use_ivar = True
+napoleon_numpy_docstring = False
+python_use_unqualified_type_names = True
+# Words such as `seed` in lists of fields are no references.
+suppress_warnings = ['ref.python']
