@@ -5,13 +5,14 @@ their order is that of attachment. The hooks of one task wrapper therefore run
 the phases of `control_step`, at the substeps that the schedule names.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
 from typing import Any, final
 
 from dm_control import composer
-from dm_control import mjcf
 from dm_control.composer import observation as composer_observation
 from dm_control.composer.observation import observable
+from dm_control.rl import control
 from dm_env import specs
 import numpy as np
 
@@ -94,7 +95,8 @@ class PlainTask(composer.Task):
     self._is_begun = self._has_failed_attempt = False
     self._is_open = False
     self._due = _NOTHING
-    self._step: control_step.ControlStep | None = None
+    # The step that is running, a `control_step.ControlStep`.
+    self._step: Any = None
     self._num_done = 0
     self._queries = self._controls = np.zeros(0)
     self._observation: dict[str, np.ndarray] = {}
@@ -141,7 +143,7 @@ class PlainTask(composer.Task):
   def physics_steps_per_control_step(self) -> int:
     return self._num_substeps
 
-  def action_spec(self, physics: mjcf.Physics) -> specs.Array:
+  def action_spec(self, physics: Any) -> specs.Array:
     del physics  # The codec knows the actuators.
     return self._codec.spec
 
@@ -155,7 +157,7 @@ class PlainTask(composer.Task):
     self._begin_attempt(random_state)
     self._attempted(lambda: self._task.initialize_episode_mjcf(random_state))
 
-  def after_compile(self, physics: mjcf.Physics, random_state: Any) -> None:
+  def after_compile(self, physics: Any, random_state: Any) -> None:
     """Prepares the observables of a newly compiled model.
 
     Raises:
@@ -176,7 +178,7 @@ class PlainTask(composer.Task):
     self._updater = self._make_updater()
     self._due = _COMPILED
 
-  def initialize_episode(self, physics: mjcf.Physics, random_state: Any) -> None:
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
     if not self._is_begun:
       self._begin_attempt(random_state)
     self._is_begun = False
@@ -191,11 +193,10 @@ class PlainTask(composer.Task):
         len(self._mechanism.design.providers),
     )
     self._states = self._mechanism.initial_states(())
-    self._step = None
     self._due = _RESET
 
   def before_step(
-      self, physics: mjcf.Physics, action: Any, random_state: Any
+      self, physics: Any, action: Any, random_state: Any
   ) -> None:
     """Checks an action and passes its controls to the task.
 
@@ -214,22 +215,19 @@ class PlainTask(composer.Task):
     self._task.before_step(physics, controls, random_state)
 
   def before_substep(
-      self, physics: mjcf.Physics, action: Any, random_state: Any
+      self, physics: Any, action: Any, random_state: Any
   ) -> None:
     """Runs the phases of the control step that precede this substep."""
     del action  # Contains the queries as well.
-    try:
+    with self._closing_on_failure():
       self._run_phases(physics)
-    except Exception:
-      self._close_episode(events.End.ERROR)
-      raise
     self._task.before_substep(physics, self._controls, random_state)
 
-  def after_substep(self, physics: mjcf.Physics, random_state: Any) -> None:
+  def after_substep(self, physics: Any, random_state: Any) -> None:
     self._task.after_substep(physics, random_state)
     self._num_done += 1
 
-  def after_step(self, physics: mjcf.Physics, random_state: Any) -> None:
+  def after_step(self, physics: Any, random_state: Any) -> None:
     """Passes the hook to the task; the next observation ends the step.
 
     Raises:
@@ -240,16 +238,16 @@ class PlainTask(composer.Task):
     self._task.after_step(physics, random_state)
     self._due = _STEPPED
 
-  def get_reward(self, physics: mjcf.Physics) -> float:
+  def get_reward(self, physics: Any) -> float:
     """Returns 0.0. Only event sinks get the true reward."""
     self._observe(physics)  # Without observables, nothing else has done it.
     return 0.0
 
-  def get_discount(self, physics: mjcf.Physics) -> float:
+  def get_discount(self, physics: Any) -> float:
     del physics
     return self._discount
 
-  def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
+  def should_terminate_episode(self, physics: Any) -> bool:
     del physics
     return self._end is not None
 
@@ -265,7 +263,11 @@ class PlainTask(composer.Task):
 
   def _begin_attempt(self, random_state: np.random.RandomState) -> None:
     """Begins an episode, or another attempt to begin the same episode."""
-    self._close_episode(events.End.ABANDONED)
+    # A step that did not end has failed, in the physics or in the task.
+    self._close_episode(
+        events.End.ABANDONED if self._step is None else events.End.ERROR
+    )
+    self._step = None
     self._is_begun = True
     is_retry = self._has_failed_attempt
     self._attempt = self._attempt + 1 if is_retry else 0
@@ -289,7 +291,7 @@ class PlainTask(composer.Task):
       self._is_begun, self._has_failed_attempt = False, True
       raise
 
-  def _run_phases(self, physics: mjcf.Physics) -> None:
+  def _run_phases(self, physics: Any) -> None:
     """Runs the phases at the present substep."""
     now, step = self._num_done, self._step
     if now == 0:
@@ -310,7 +312,7 @@ class PlainTask(composer.Task):
     if self._refreshes:
       foreign.refresh(physics)
 
-  def _observe(self, physics: mjcf.Physics) -> Mapping[str, np.ndarray]:
+  def _observe(self, physics: Any) -> Mapping[str, np.ndarray]:
     """Returns the observation, which the first call after a change makes."""
     due, self._due = self._due, _NOTHING
     if due == _COMPILED:
@@ -326,7 +328,7 @@ class PlainTask(composer.Task):
       self._finish_step(physics)
     return self._observation
 
-  def _start_episode(self, physics: mjcf.Physics) -> None:
+  def _start_episode(self, physics: Any) -> None:
     """Makes the first observation of an episode and notifies the sinks."""
     records: list[Any] = [*self._mechanism.initial_writes(physics)]
     observation, reads = self._observer.observe(physics)
@@ -336,19 +338,16 @@ class PlainTask(composer.Task):
     self._tell(physics, lambda sink: sink.episode_started(start, physics))
     self._end, self._is_open = None, True
 
-  def _finish_step(self, physics: mjcf.Physics) -> None:
+  def _finish_step(self, physics: Any) -> None:
     """Ends a control step, makes its observation and notifies the sinks."""
     if self._num_done != self._num_substeps:
       self._end_early(physics)
       return
-    try:
+    with self._closing_on_failure():
       if not self._is_ours:
         self._updater.update()
       outcome = self._step.end()
       observation, reads = self._observer.observe(physics)
-    except Exception:
-      self._close_episode(events.End.ERROR)
-      raise
     self._step = None
     self._observation = observing.frozen(observation)
     self._states = outcome.provider_states
@@ -369,7 +368,7 @@ class PlainTask(composer.Task):
     if self._end is not None:
       self._close_episode(self._end)
 
-  def _end_early(self, physics: mjcf.Physics) -> None:
+  def _end_early(self, physics: Any) -> None:
     """Ends an episode whose physics failed; the observation stays the last.
 
     Raises:
@@ -384,13 +383,25 @@ class PlainTask(composer.Task):
     self._close_episode(events.End.DIVERGENCE)
 
   def _tell(
-      self, physics: mjcf.Physics, notify: Callable[[events.EventSink], None]
+      self, physics: Any, notify: Callable[[events.EventSink], None]
   ) -> None:
     """Notifies the sinks, which may read the physics."""
     if self._sinks:
       with foreign.unchanged(physics):
         for sink in self._sinks:
           notify(sink)
+
+  @contextlib.contextmanager
+  def _closing_on_failure(self) -> Iterator[None]:
+    """Returns a context in which an exception ends the episode."""
+    try:
+      yield
+    except control.PhysicsError:
+      self._close_episode(events.End.DIVERGENCE)
+      raise
+    except Exception:
+      self._close_episode(events.End.ERROR)
+      raise
 
   def _close_episode(self, end: events.End) -> None:
     """Notifies the sinks of the end of the episode, if there is one."""
@@ -407,7 +418,7 @@ class _Part(observable.Observable):
   def __init__(
       self,
       spec: specs.Array,
-      observe: Callable[[mjcf.Physics], Mapping[str, np.ndarray]],
+      observe: Callable[[Any], Mapping[str, np.ndarray]],
   ) -> None:
     """Initializes the observable.
 
@@ -424,5 +435,5 @@ class _Part(observable.Observable):
   def array_spec(self) -> specs.Array:
     return self._spec
 
-  def _callable(self, physics: mjcf.Physics) -> Callable[[], np.ndarray]:
+  def _callable(self, physics: Any) -> Callable[[], np.ndarray]:
     return lambda: self._observe(physics)[self._spec.name]
