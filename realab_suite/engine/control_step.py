@@ -99,9 +99,7 @@ class ControlStep:
 
   def end(self) -> Outcome:
     """Ends the step, after the last substep and the hooks that follow it."""
-    ending = self._host.end_step(
-        self._physics, self._was_over, self._is_ending
-    )
+    ending = self._host.end_step(self._physics, self._was_over, self._is_ending)
     reward = ending.true_reward
     self._mechanism.end_step(
         self._physics, axes.choose(axes.is_finite(reward), reward, 0.0)

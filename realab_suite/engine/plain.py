@@ -170,9 +170,7 @@ class PlainTask(composer.Task):
           ' True, as in suite.embed'
       )
     if self._episode < 0:
-      seeding.reseed(
-          random_state, self._seed, self._world, 0, 'construction'
-      )
+      seeding.reseed(random_state, self._seed, self._world, 0, 'construction')
     self._task.after_compile(physics, random_state)
     self._random_state = random_state
     self._updater = self._make_updater()
@@ -195,9 +193,7 @@ class PlainTask(composer.Task):
     self._states = self._mechanism.initial_states(())
     self._due = _RESET
 
-  def before_step(
-      self, physics: Any, action: Any, random_state: Any
-  ) -> None:
+  def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
     """Checks an action and passes its controls to the task.
 
     Raises:
