@@ -27,7 +27,7 @@ from realab_suite import suite
 env = suite.load('unlock_door', 'near', {'random': 0},
                  design='instantaneous_reward')
 env.reset()
-env.step(0)
+env.step(0.0 * env.action_spec().minimum)
 """
 _RENDERING_REMEDY = (
     'without a display, install EGL (Debian, Ubuntu: sudo apt install libegl1'

@@ -224,11 +224,7 @@ class PlainTask(composer.Task):
     self._num_done += 1
 
   def after_step(self, physics: Any, random_state: Any) -> None:
-    """Passes the hook to the task; the next observation ends the step.
-
-    Raises:
-      SpecError: If the environment has another number of substeps.
-    """
+    """Passes the hook to the task. The observation then ends the step."""
     if self._is_ours and not physics.legacy_step:
       foreign.refresh(physics)
     self._task.after_step(physics, random_state)

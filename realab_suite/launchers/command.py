@@ -64,11 +64,13 @@ def main() -> int:
 
 def _usage() -> str:
   lines = [f'  {name:14} {purpose}' for name, purpose in COMMANDS.items()]
-  return '\n'.join((
-      'usage: realab COMMAND [--flag=value ...]',
-      *lines,
-      "`realab COMMAND --help` lists the command's flags.\n",
-  ))
+  return '\n'.join(
+      (
+          'usage: realab COMMAND [--flag=value ...]',
+          *lines,
+          "`realab COMMAND --help` lists the command's flags.\n",
+      )
+  )
 
 
 def _refuse(problem: str) -> int:

@@ -60,10 +60,12 @@ def test_there_is_a_subcommand_for_every_launcher():
 def test_a_subcommand_runs_its_launcher_with_its_flags(realab):
   status, started = realab('sweep', '--experiment=quick', '--output=x')
   assert status == 0
-  assert started == [(
-      'realab_suite.launchers.sweep',
-      ['sweep', '--experiment=quick', '--output=x'],
-  )]
+  assert started == [
+      (
+          'realab_suite.launchers.sweep',
+          ['sweep', '--experiment=quick', '--output=x'],
+      )
+  ]
   _, started = realab('doctor')
   assert started[-1] == ('realab_suite.doctor', ['doctor'])
 
@@ -159,7 +161,9 @@ def test_a_bad_installation(monkeypatch, capsys):
   )
   assert doctor.main() == 1
   shown = capsys.readouterr().out
-  assert '--  core       cannot step a world: ImportError: no libmujoco' in shown
+  assert (
+      '--  core       cannot step a world: ImportError: no libmujoco' in shown
+  )
   assert '--  rendering  no camera works: egl: ImportError' in shown
   assert 'apt install libegl1' in shown
   assert '--  tb         no_such_module not installed, for curves\n' in shown
@@ -170,7 +174,9 @@ def test_missing_extras_and_cameras_are_no_failure(monkeypatch, capsys):
   _processes(monkeypatch, 0)
   monkeypatch.setattr(renderers, 'choose_renderer', lambda: 'egl: broken')
   monkeypatch.setattr(
-      requirements, 'missing', lambda *_, extra: f'x not installed; run: {extra}'
+      requirements,
+      'missing',
+      lambda *_, extra: f'x not installed; run: {extra}',
   )
   assert doctor.main() == 0
   assert capsys.readouterr().out.count('to repair') == 1 + len(doctor.EXTRAS)
