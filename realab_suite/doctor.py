@@ -14,12 +14,18 @@ import subprocess
 import sys
 from typing import NamedTuple, final
 
-import realab_suite
 from realab_suite.experiments import requirements
 from realab_suite.launchers import renderers
 
 # Packages whose versions decide what happens.
-_PACKAGES = ('dm-control', 'mujoco', 'dm-env', 'numpy', 'pydantic')
+_PACKAGES = (
+    'realab-suite',
+    'dm-control',
+    'mujoco',
+    'dm-env',
+    'numpy',
+    'pydantic',
+)
 # Enough time to import everything on a slow machine under load.
 _PATIENCE_SECONDS = 300
 _STEPS_A_WORLD = """
@@ -86,8 +92,7 @@ class Finding(NamedTuple):
 
 def versions() -> str:
   """Returns the versions of this package, Python and the main packages."""
-  found = [f'realab_suite {realab_suite.__version__}']
-  found.append(f'Python {platform.python_version()}')
+  found = [f'Python {platform.python_version()}']
   for name in _PACKAGES:
     try:
       found.append(f'{name} {metadata.version(name)}')
