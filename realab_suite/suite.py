@@ -18,6 +18,7 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import forking
 from realab_suite.engine import placement
+from realab_suite.engine import plain
 from realab_suite.engine import seeding
 from realab_suite.entities import block_kinds
 from realab_suite.entities import measurables
@@ -336,6 +337,24 @@ def embed(
       task.physics_timestep = timestep
     mechanism.detach_from_root()
     raise
+
+
+def plain_task(
+    task: composer.Task, design: specs.Design, **options: Any
+) -> plain.PlainTask:
+  """Returns a task with the feedback of a design, for `composer.Environment`.
+
+  `docs/composer.md` describes its use.
+
+  Args:
+    task: Composer task; the registers are attached to its root entity.
+    design: Same as in `embed`.
+    **options: Same as in `embed`.
+
+  Raises:
+    SpecError: If the design is wrong or does not fit the task.
+  """
+  return plain.PlainTask(embed(task, design, **options))
 
 
 def _connected(

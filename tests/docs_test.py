@@ -58,7 +58,13 @@ def registries():
 
 
 @pytest.mark.parametrize(
-    'page', ['README.md', 'docs/attribution.md', 'docs/your_own.md']
+    'page',
+    [
+        'README.md',
+        'docs/attribution.md',
+        'docs/composer.md',
+        'docs/your_own.md',
+    ],
 )
 def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
   blocks = _python_blocks(_ROOT / page)

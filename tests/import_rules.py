@@ -55,6 +55,8 @@ _MAY_IMPORT = {
     'launchers': (
         *_BELOW_SUITE, 'suite', 'agents', 'interop', 'experiments', 'reports',
     ),
+    # Finds out which of them work.
+    'doctor': ('experiments', 'launchers'),
     # The old name of a command, which imports nothing.
     'explore': (),
 }  # fmt: skip

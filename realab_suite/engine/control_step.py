@@ -1,8 +1,8 @@
 """The control step, for one world and for a batch.
 
 `run` implements the list in `docs/architecture.md`. The leading axes of all
-arrays are worlds: `()` for one world, `(worlds,)` for a batch. This module
-keeps no state and does not notify event sinks.
+arrays are worlds: `()` for one world, `(worlds,)` for a batch. This module does
+not notify event sinks.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,6 +31,80 @@ class Outcome(NamedTuple):
   records: list[registers.Record]
   ending: hosts.Ending
   provider_states: list[Any]
+
+
+@final
+class ControlStep:
+  """The phases of one control step, between which the physics runs.
+
+  The caller calls the methods once each and in their order. `run` runs the
+  physics between them; in a plain Composer environment, Composer does.
+  """
+
+  def __init__(
+      self,
+      physics: hosts.SteppedPhysics,
+      host: hosts.Host,
+      mechanism: mechanisms.FeedbackMechanism,
+  ) -> None:
+    """Begins a control step, before anything has changed.
+
+    Args:
+      physics: Physics of one world or of a batch.
+      host: Host of the task.
+      mechanism: Registers, meters and providers.
+    """
+    self._physics = physics
+    self._host = host
+    self._mechanism = mechanism
+    self._was_over = host.is_over(physics)
+    self._is_ending: Any = False
+    self._records: list[registers.Record] = []
+    self._next_states: list[Any] = []
+
+  def write_queries(self, queries: np.ndarray) -> None:
+    """Writes the agent's queries, `(..., queries)`, after `before_step`."""
+    self._records += self._mechanism.write_queries(self._physics, queries)
+
+  def update_meters(self, where: axes.Mask = None) -> None:
+    """Measures and writes the meter registers, after `meter_substep` substeps.
+
+    Args:
+      where: Worlds in which meters write; `None` for all worlds.
+    """
+    self._is_ending = self._host.is_over(self._physics)
+    self._records += self._mechanism.update_meters(self._physics, where)
+
+  def update_providers(
+      self,
+      observation: dict[str, np.ndarray],
+      keys: np.ndarray,
+      states: Sequence[Any],
+      where: axes.Mask = None,
+  ) -> None:
+    """Runs the providers, after `provider_substep` substeps.
+
+    Args:
+      observation: Observation that the action responds to, by name.
+      keys: Random key of each provider in this episode, `(providers, ..., 2)`
+        uint64.
+      states: State of each provider.
+      where: Worlds in which providers write; `None` for all worlds.
+    """
+    step = self._mechanism.step_count(self._physics)
+    feedback, self._next_states = self._mechanism.update_providers(
+        self._physics, observation, seeding.step_key(keys, step), states, where
+    )
+    self._records += feedback
+
+  def end(self) -> Outcome:
+    """Ends the step, after the last substep and the hooks that follow it."""
+    ending = self._host.end_step(self._physics, self._was_over, self._is_ending)
+    reward = ending.true_reward
+    self._mechanism.end_step(
+        self._physics, axes.choose(axes.is_finite(reward), reward, 0.0)
+    )
+    return Outcome(self._records, ending, self._next_states)
 
 
 def run(
@@ -72,30 +146,17 @@ def run(
     FeedbackProviderError: If a provider failed.
     RegisterValueError: If a written value cannot be stored.
   """
-  was_over = host.is_over(physics)
+  step = ControlStep(physics, host, mechanism)
   host.begin_step(physics, controls)
-  records: list[registers.Record] = []
-  records += mechanism.write_queries(physics, queries)
+  step.write_queries(queries)
 
   host.advance(physics, controls, schedule.meter_substep, is_last=False)
-  is_ending = host.is_over(physics)
-  records += mechanism.update_meters(physics, where())
+  step.update_meters(where())
 
   between = schedule.provider_substep - schedule.meter_substep
   host.advance(physics, controls, between, is_last=False)
-  step = mechanism.step_count(physics)
-  feedback, next_states = mechanism.update_providers(
-      physics,
-      observation,
-      seeding.step_key(provider_keys, step),
-      provider_states,
-      where(),
-  )
-  records += feedback
+  step.update_providers(observation, provider_keys, provider_states, where())
 
   rest = num_substeps - schedule.provider_substep
   host.advance(physics, controls, rest, is_last=True)
-  ending = host.end_step(physics, was_over, is_ending)
-  reward = ending.true_reward
-  mechanism.end_step(physics, axes.choose(axes.is_finite(reward), reward, 0.0))
-  return Outcome(records, ending, next_states)
+  return step.end()

@@ -447,7 +447,7 @@ class Environment(composer.Environment):
   def _preserving_physics(self) -> contextlib.AbstractContextManager[None]:
     """Returns a context in which sinks may read the physics."""
     if isinstance(self._physics, foreign.ForeignPhysics) and self._sinks:
-      return self._physics.unchanged()
+      return foreign.unchanged(self._physics)
     return contextlib.nullcontext()
 
   def _new_provider_keys(self) -> np.ndarray:

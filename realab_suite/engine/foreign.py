@@ -27,14 +27,8 @@ class ForeignPhysics(mjcf.Physics):
   """`mjcf.Physics` with the methods that the engine calls."""
 
   def refresh(self) -> None:
-    """Updates the quantities derived from positions and velocities.
-
-    Composer begins a step with the derived quantities of the previous step,
-    which are wrong after a write to a register. Unlike `forward`, this method
-    does not change accelerations and the solver's warm start.
-    """
-    with self.check_invalid_state():
-      mujoco.mj_step1(self.model.ptr, self.data.ptr)
+    """Updates the quantities derived from positions and velocities."""
+    refresh(self)
 
   def check(self) -> None:
     """Does nothing, because `step` checks its result."""
@@ -43,20 +37,42 @@ class ForeignPhysics(mjcf.Physics):
     """Runs substeps in the same way as Composer."""
     self.step(num_substeps)
 
-  @contextlib.contextmanager
-  def unchanged(self) -> Iterator[None]:
-    """Returns a context in which reads do not change later steps.
 
-    Reading a bound attribute after a write recomputes all derived quantities
-    and replaces the solver's warm start. The context restores it.
-    """
-    is_dirty = self.is_dirty
-    warm_start = np.array(self.data.qacc_warmstart)
-    try:
-      yield
-    finally:
-      self.data.qacc_warmstart[:] = warm_start
-      self._dirty = is_dirty
+@contextlib.contextmanager
+def unchanged(physics: mjcf.Physics) -> Iterator[None]:
+  """Returns a context in which reads do not change later steps.
+
+  Reading a bound attribute after a write recomputes all derived quantities and
+  replaces the solver's warm start. The context restores it.
+
+  Args:
+    physics: Physics of a foreign task.
+  """
+  is_dirty = physics.is_dirty
+  warm_start = np.array(physics.data.qacc_warmstart)
+  try:
+    yield
+  finally:
+    physics.data.qacc_warmstart[:] = warm_start
+    if is_dirty:
+      physics.mark_as_dirty()
+
+
+def refresh(physics: mjcf.Physics) -> None:
+  """Updates the quantities derived from positions and velocities.
+
+  Composer begins a step with the derived quantities of the previous step, which
+  are wrong after a write to a register. Unlike `physics.forward`, this function
+  does not change accelerations and the solver's warm start.
+
+  Args:
+    physics: Physics of one world.
+
+  Raises:
+    PhysicsError: If MuJoCo issued a warning.
+  """
+  with physics.check_invalid_state():
+    mujoco.mj_step1(physics.model.ptr, physics.data.ptr)
 
 
 @final
@@ -129,6 +145,9 @@ class ForeignHost(hosts.Host):
       # The update of the last substep comes after `after_step`.
       if not (is_last and i == num_substeps - 1):
         self._updater().update()
+    if is_last:
+      self._hooks.after_step(physics, self._random_state)
+      self._updater().update()
 
   def is_over(self, physics: hosts.SteppedPhysics) -> bool:
     del physics  # Composer checks only at the end of a step.
@@ -138,8 +157,6 @@ class ForeignHost(hosts.Host):
       self, physics: hosts.SteppedPhysics, was_over: Any, is_ending: Any
   ) -> hosts.Ending:
     del was_over, is_ending
-    self._hooks.after_step(physics, self._random_state)
-    self._updater().update()
     reward, failure = hosts.true_reward(
         lambda: float(self._task.get_reward(physics)), np.nan
     )

@@ -84,7 +84,10 @@ class Host(abc.ABC):
 
   @abc.abstractmethod
   def begin_step(self, physics: SteppedPhysics, controls: np.ndarray) -> None:
-    """Passes the controls of a step, `(..., controls)`, to the task."""
+    """Passes the controls of a step, `(..., controls)`, to the task.
+
+    In a plain Composer environment, this method and `advance` are not called.
+    """
 
   @abc.abstractmethod
   def advance(
@@ -94,12 +97,12 @@ class Host(abc.ABC):
       num_substeps: int,
       is_last: bool,
   ) -> None:
-    """Runs substeps of the physics.
+    """Runs substeps of the physics, and the hooks after the last substep.
 
     Args:
       physics: Physics of one world or of a batch.
       controls: Controls of this step, `(..., controls)`.
-      num_substeps: Number of substeps; may be 0.
+      num_substeps: Number of substeps; may be 0, unless they are the last.
       is_last: True if these are the last substeps of the control step.
     """
 
@@ -115,7 +118,7 @@ class Host(abc.ABC):
   def end_step(
       self, physics: SteppedPhysics, was_over: Any, is_ending: Any
   ) -> Ending:
-    """Ends a control step.
+    """Returns the result of a control step, after its last substep.
 
     Args:
       physics: Physics of one world or of a batch.
@@ -231,7 +234,10 @@ class WorldHost(Host):
     del controls
     if num_substeps:
       physics.advance(num_substeps)
-    if num_substeps and not is_last:  # `after_step` latches the last events.
+    if is_last:
+      self._hooks.after_step(physics, self._random_state)
+      physics.check()
+    elif num_substeps:  # `after_step` latches the last events.
       self._task.latch_events(physics)
 
   def is_over(self, physics: SteppedPhysics) -> Any:
@@ -242,8 +248,6 @@ class WorldHost(Host):
   def end_step(
       self, physics: SteppedPhysics, was_over: Any, is_ending: Any
   ) -> Ending:
-    self._hooks.after_step(physics, self._random_state)
-    physics.check()
     reward, failure = true_reward(
         lambda: self._per_world(self._task.get_reward(physics), np.float64),
         self._unknown_reward,

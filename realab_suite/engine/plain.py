@@ -1,0 +1,431 @@
+"""A task that runs a design in a plain `composer.Environment`.
+
+Composer's hooks of entities get neither the action nor the observation, and
+their order is that of attachment. The hooks of one task wrapper therefore run
+the phases of `control_step`, at the substeps that the schedule names.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
+from typing import Any, final
+
+from dm_control import composer
+from dm_control.composer import observation as composer_observation
+from dm_control.composer.observation import observable
+from dm_control.rl import control
+from dm_env import specs
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import control_step
+from realab_suite.engine import environment
+from realab_suite.engine import episodes
+from realab_suite.engine import events
+from realab_suite.engine import foreign
+from realab_suite.engine import observing
+from realab_suite.engine import seeding
+from realab_suite.entities import state
+from realab_suite.feedback import mechanisms
+from realab_suite.tasks import base
+
+# What an update of observables has to do first.
+_NOTHING, _COMPILED, _RESET, _STEPPED = range(4)
+
+
+@final
+class PlainTask(composer.Task):
+  """A Composer task with the feedback of a design, for any environment of it.
+
+  Time steps equal those of `environment.Environment` bit for bit, except as
+  `docs/composer.md` says: the observations are `senses/<name>` and
+  `registers/<name>`, and the reward is 0.0. Every episode reseeds the random
+  generator of the environment.
+
+  One environment at a time may step it.
+  """
+
+  def __init__(self, env: environment.Environment) -> None:
+    """Wraps the task of an environment, which must not be used afterwards.
+
+    Args:
+      env: New environment of this package, with the task and its registers. It
+        is closed.
+    """
+    self._task = env.task
+    self._mechanism = env.mechanism
+    self._seed, self._world, self._max_steps = (
+        env.seed,
+        env.world,
+        env.max_steps,
+    )
+    self._codec, self._schedule = env.codec, env.schedule
+    self._num_substeps = env.num_substeps
+    self._senses = env.senses
+    self._is_ours = isinstance(env.task, base.Task)
+    self._refreshes = self._is_ours or bool(env.mechanism.registers)
+    self._starts = {
+        0,
+        self._schedule.meter_substep,
+        self._schedule.provider_substep,
+    }
+    self._random_state = seeding.random_state(
+        env.seed, env.world, 0, 'construction'
+    )
+    self._updater = self._make_updater()
+    self._updater.reset(env.physics, self._random_state)
+    self._host = foreign.make_host(
+        env.task,
+        env.task,
+        self._random_state,
+        lambda: self._updater,
+        bool(env.mechanism.registers),
+    )
+    self._observer = observing.Observer(
+        self._host, self._mechanism, self._max_steps, self._senses or None
+    )
+    self._observables = {
+        key: _Part(spec, self._observe)
+        for key, spec in self._observer.spec().items()
+    }
+    env.close()
+    state.make_room(env.task.root_entity.mjcf_model)
+
+    self._sinks: list[events.EventSink] = []
+    self._episode, self._attempt = -1, 0
+    self._is_begun = self._has_failed_attempt = False
+    self._is_open = False
+    self._due = _NOTHING
+    # The step that is running, a `control_step.ControlStep`.
+    self._step: Any = None
+    self._num_done = 0
+    self._queries = self._controls = np.zeros(0)
+    self._observation: dict[str, np.ndarray] = {}
+    self._keys = np.zeros(0)
+    self._states: list[Any] = []
+    self._end: events.End | None = None
+    self._discount = 1.0
+
+  @property
+  def task(self) -> composer.Task:
+    """The wrapped task, which returns the true reward."""
+    return self._task
+
+  @property
+  def mechanism(self) -> mechanisms.FeedbackMechanism:
+    """Registers, meters and providers."""
+    return self._mechanism
+
+  def add_sink(self, sink: events.EventSink) -> None:
+    """Notifies a sink of all episodes that begin from now on."""
+    self._close_episode(events.End.ABANDONED)
+    self._sinks.append(sink)
+
+  # The interface of a Composer task.
+
+  @property
+  def root_entity(self) -> composer.Entity:
+    return self._task.root_entity
+
+  @property
+  def observables(self) -> Mapping[str, observable.Observable]:
+    """Senses and readings, as in `environment.Environment`; no others."""
+    return self._observables
+
+  @property
+  def control_timestep(self) -> float:
+    return self._task.control_timestep
+
+  @property
+  def physics_timestep(self) -> float:
+    return self._task.physics_timestep
+
+  @property
+  def physics_steps_per_control_step(self) -> int:
+    return self._num_substeps
+
+  def action_spec(self, physics: Any) -> specs.Array:
+    del physics  # The codec knows the actuators.
+    return self._codec.spec
+
+  def get_reward_spec(self) -> specs.BoundedArray:
+    return specs.BoundedArray((), np.float64, 0.0, 0.0, name='reward')
+
+  def get_discount_spec(self) -> specs.BoundedArray:
+    return specs.BoundedArray((), np.float64, 0.0, 1.0, name='discount')
+
+  def initialize_episode_mjcf(self, random_state: Any) -> None:
+    self._begin_attempt(random_state)
+    self._attempted(lambda: self._task.initialize_episode_mjcf(random_state))
+
+  def after_compile(self, physics: Any, random_state: Any) -> None:
+    """Prepares the observables of a newly compiled model.
+
+    Raises:
+      SpecError: If the environment has `legacy_step=False` and the task is a
+        foreign task.
+    """
+    if not (self._is_ours or physics.legacy_step):
+      raise errors.SpecError(
+          f'legacy_step: False; allowed for {type(self._task).__name__} is'
+          ' True, as in suite.embed'
+      )
+    if self._episode < 0:
+      seeding.reseed(random_state, self._seed, self._world, 0, 'construction')
+    self._task.after_compile(physics, random_state)
+    self._random_state = random_state
+    self._updater = self._make_updater()
+    self._due = _COMPILED
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    if not self._is_begun:
+      self._begin_attempt(random_state)
+    self._is_begun = False
+    self._attempted(
+        lambda: self._task.initialize_episode(physics, random_state)
+    )
+    self._random_state = random_state
+    self._keys = episodes.provider_keys(
+        self._seed,
+        self._world,
+        self._episode,
+        len(self._mechanism.design.providers),
+    )
+    self._states = self._mechanism.initial_states(())
+    self._due = _RESET
+
+  def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+    """Checks an action and passes its controls to the task.
+
+    Raises:
+      ActionError: If the action violates `action_spec`. Nothing has changed.
+      EpisodeError: If the last step failed.
+    """
+    queries, controls = self._codec.decode(action)
+    if self._step is not None or not self._is_open:
+      raise errors.EpisodeError(
+          'step: the last step or reset failed; call reset'
+      )
+    self._queries, self._controls = queries, controls
+    self._step = control_step.ControlStep(physics, self._host, self._mechanism)
+    self._num_done = 0
+    self._task.before_step(physics, controls, random_state)
+
+  def before_substep(
+      self, physics: Any, action: Any, random_state: Any
+  ) -> None:
+    """Runs the phases of the control step that precede this substep."""
+    del action  # Contains the queries as well.
+    with self._closing_on_failure():
+      self._run_phases(physics)
+    self._task.before_substep(physics, self._controls, random_state)
+
+  def after_substep(self, physics: Any, random_state: Any) -> None:
+    self._task.after_substep(physics, random_state)
+    self._num_done += 1
+
+  def after_step(self, physics: Any, random_state: Any) -> None:
+    """Passes the hook to the task. The observation then ends the step."""
+    if self._is_ours and not physics.legacy_step:
+      foreign.refresh(physics)
+    self._task.after_step(physics, random_state)
+    self._due = _STEPPED
+
+  def get_reward(self, physics: Any) -> float:
+    """Returns 0.0. Only event sinks get the true reward."""
+    self._observe(physics)  # Without observables, nothing else has done it.
+    return 0.0
+
+  def get_discount(self, physics: Any) -> float:
+    del physics
+    return self._discount
+
+  def should_terminate_episode(self, physics: Any) -> bool:
+    del physics
+    return self._end is not None
+
+  def _make_updater(self) -> composer_observation.Updater:
+    """Returns an updater of the selected observables of a foreign task.
+
+    The observables of this task are what it returns, so that providers observe
+    what agents do, and noise is drawn once.
+    """
+    if self._is_ours:
+      return composer_observation.Updater({})
+    return foreign.make_updater(self._task, self._senses)
+
+  def _begin_attempt(self, random_state: np.random.RandomState) -> None:
+    """Begins an episode, or another attempt to begin the same episode."""
+    # A step that did not end has failed, in the physics or in the task.
+    self._close_episode(
+        events.End.ABANDONED if self._step is None else events.End.ERROR
+    )
+    self._step = None
+    self._is_begun = True
+    is_retry = self._has_failed_attempt
+    self._attempt = self._attempt + 1 if is_retry else 0
+    if self._attempt == episodes.MAX_RESET_ATTEMPTS:
+      is_retry, self._attempt = False, 0
+    self._episode += not is_retry
+    self._has_failed_attempt = False
+    seeding.reseed(
+        random_state,
+        self._seed,
+        self._world,
+        self._episode,
+        f'reset/{self._attempt}',
+    )
+
+  def _attempted(self, initialize: Callable[[], None]) -> None:
+    """Calls a hook of the task and notes whether it fails to initialize."""
+    try:
+      initialize()
+    except composer.EpisodeInitializationError:
+      self._is_begun, self._has_failed_attempt = False, True
+      raise
+
+  def _run_phases(self, physics: Any) -> None:
+    """Runs the phases at the present substep."""
+    now, step = self._num_done, self._step
+    if now == 0:
+      self._updater.prepare_for_next_control_step()
+      step.write_queries(self._queries)
+    elif not self._is_ours:
+      self._updater.update()
+    if now not in self._starts:
+      return
+    if now and self._is_ours:
+      if not physics.legacy_step:  # Poses are those before the last substep.
+        foreign.refresh(physics)
+      self._task.latch_events(physics)
+    if now == self._schedule.meter_substep:
+      step.update_meters()
+    if now == self._schedule.provider_substep:
+      step.update_providers(self._observation, self._keys, self._states)
+    if self._refreshes:
+      foreign.refresh(physics)
+
+  def _observe(self, physics: Any) -> Mapping[str, np.ndarray]:
+    """Returns the observation, which the first call after a change makes."""
+    due, self._due = self._due, _NOTHING
+    if due == _COMPILED:
+      self._updater.reset(physics, self._random_state)
+      self._observation = {
+          key: np.zeros(spec.shape, spec.dtype)
+          for key, spec in self._observer.spec().items()
+      }
+    elif due == _RESET:
+      self._updater.reset(physics, self._random_state)
+      self._start_episode(physics)
+    elif due == _STEPPED:
+      self._finish_step(physics)
+    return self._observation
+
+  def _start_episode(self, physics: Any) -> None:
+    """Makes the first observation of an episode and notifies the sinks."""
+    records: list[Any] = [*self._mechanism.initial_writes(physics)]
+    observation, reads = self._observer.observe(physics)
+    self._observation = observing.frozen(observation)
+    records += reads
+    start = events.Start(self._seed, self._world, self._episode, records)
+    self._tell(physics, lambda sink: sink.episode_started(start, physics))
+    self._end, self._is_open = None, True
+
+  def _finish_step(self, physics: Any) -> None:
+    """Ends a control step, makes its observation and notifies the sinks."""
+    if self._num_done != self._num_substeps:
+      self._end_early(physics)
+      return
+    with self._closing_on_failure():
+      if not self._is_ours:
+        self._updater.update()
+      outcome = self._step.end()
+      observation, reads = self._observer.observe(physics)
+    self._step = None
+    self._observation = observing.frozen(observation)
+    self._states = outcome.provider_states
+    ending = outcome.ending
+    step = events.Step(
+        [*outcome.records, *reads], np.array(ending.true_reward), ending.failure
+    )
+    self._tell(physics, lambda sink: sink.step_ended(step, physics))
+    self._end = episodes.end_of_step(
+        False,
+        ending.is_ending,
+        self._mechanism.ends_episode(reads),
+        self._mechanism.step_count(physics) == self._max_steps,
+    )
+    self._discount = episodes.time_step(
+        self._end, float(ending.discount), {}
+    ).discount
+    if self._end is not None:
+      self._close_episode(self._end)
+
+  def _end_early(self, physics: Any) -> None:
+    """Ends an episode whose physics failed; the observation stays the last.
+
+    Raises:
+      SpecError: If the physics did not fail.
+    """
+    if not physics.data.ptr.warning.number.any():
+      raise errors.SpecError(
+          f'n_sub_steps: {self._num_done}; allowed is {self._num_substeps}, the'
+          ' number that the task and its registers need'
+      )
+    self._step = None
+    self._close_episode(events.End.DIVERGENCE)
+
+  def _tell(
+      self, physics: Any, notify: Callable[[events.EventSink], None]
+  ) -> None:
+    """Notifies the sinks, which may read the physics."""
+    if self._sinks:
+      with foreign.unchanged(physics):
+        for sink in self._sinks:
+          notify(sink)
+
+  @contextlib.contextmanager
+  def _closing_on_failure(self) -> Iterator[None]:
+    """Returns a context in which an exception ends the episode."""
+    try:
+      yield
+    except control.PhysicsError:
+      self._close_episode(events.End.DIVERGENCE)
+      raise
+    except Exception:
+      self._close_episode(events.End.ERROR)
+      raise
+
+  def _close_episode(self, end: events.End) -> None:
+    """Notifies the sinks of the end of the episode, if there is one."""
+    if self._is_open:
+      self._is_open = False
+      for sink in self._sinks:
+        sink.episode_ended(end)
+
+
+@final
+class _Part(observable.Observable):
+  """Part of an observation."""
+
+  def __init__(
+      self,
+      spec: specs.Array,
+      observe: Callable[[Any], Mapping[str, np.ndarray]],
+  ) -> None:
+    """Initializes the observable.
+
+    Args:
+      spec: Spec of the part, whose name is the key.
+      observe: Function that returns the observation.
+    """
+    super().__init__(1, None, None, None, None)
+    self._spec = spec
+    self._observe = observe
+    self.enabled = True
+
+  @property
+  def array_spec(self) -> specs.Array:
+    return self._spec
+
+  def _callable(self, physics: Any) -> Callable[[], np.ndarray]:
+    return lambda: self._observe(physics)[self._spec.name]

@@ -1,0 +1,94 @@
+"""The command `realab`, whose subcommands are the launchers.
+
+  realab sweep --experiment=quick --output=results/quick
+
+is short for `python -m realab_suite.launchers.sweep` with the same flags.
+"""
+
+from collections.abc import Mapping
+import datetime
+import difflib
+import runpy
+import subprocess
+import sys
+
+from realab_suite.launchers import program
+
+_LAUNCHERS = 'realab_suite.launchers.'
+COMMANDS: Mapping[str, str] = {
+    'demo': 'train agents in Unlock Door for minutes, and report on them',
+    'doctor': 'say what works in this installation',
+    'audit': 'search for an exploit of a design, without training',
+    'calibrate': 'place a register by the time to its first corruption',
+    'compare': 'compare scripted policies',
+    'explore': 'look at a world',
+    'film': 'film an episode of a learner',
+    'make_networks': 'train the networks of demonstrators and advisers',
+    'pack': 'pack the finished jobs of a sweep into a file',
+    'report': 'write the report of a sweep',
+    'serve': 'serve a world to an agent in another process',
+    'sweep': 'run all jobs of an experiment',
+    'train': 'run one job',
+    'unpack': 'unpack a packed sweep',
+}
+"""Subcommands with their purposes."""
+
+
+def main() -> int:
+  """Runs the subcommand that the command line names.
+
+  Returns:
+    The exit status; launchers end the process with theirs.
+  """
+  _, *arguments = sys.argv
+  if not arguments or arguments[0] in ('help', '-h', '--help'):
+    sys.stdout.write(_usage())
+    return 0 if arguments else program.USAGE_ERROR
+  name, *rest = arguments
+  if name not in COMMANDS:
+    near = difflib.get_close_matches(name, COMMANDS, 1)
+    meant = f' (did you mean {near[0]!r}?)' if near else ''
+    return _refuse(
+        f'command {name!r:.80} is unknown{meant}; known are {list(COMMANDS)}'
+    )
+  if name in ('demo', 'doctor') and rest:
+    return _refuse(f'{name}: arguments {rest}; allowed are none')
+  if name == 'demo':
+    return _demo()
+  module = 'realab_suite.doctor' if name == 'doctor' else _LAUNCHERS + name
+  # As `python -m` does, so that --help and the start of processes work.
+  sys.argv = [name, *rest]
+  runpy.run_module(module, run_name='__main__', alter_sys=True)
+  return 0
+
+
+def _usage() -> str:
+  lines = [f'  {name:14} {purpose}' for name, purpose in COMMANDS.items()]
+  return '\n'.join(
+      (
+          'usage: realab COMMAND [--flag=value ...]',
+          *lines,
+          "`realab COMMAND --help` lists the command's flags.\n",
+      )
+  )
+
+
+def _refuse(problem: str) -> int:
+  sys.stderr.write(f'error: {problem}\n')
+  return program.USAGE_ERROR
+
+
+def _demo() -> int:
+  """Does what `make demo` does, in the packages that are installed."""
+  now = datetime.datetime.now().astimezone()
+  output = f'results/demo-{now:%Y%m%d-%H%M%S}'
+  for name, flags in (
+      ('sweep', ('--experiment=quick', f'--output={output}')),
+      ('report', (f'--input={output}',)),
+  ):
+    ran = subprocess.run(
+        [sys.executable, '-m', _LAUNCHERS + name, *flags], check=False
+    )
+    if ran.returncode:
+      return ran.returncode
+  return 0

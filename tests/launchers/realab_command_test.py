@@ -1,0 +1,187 @@
+"""Tests of the command `realab` and of the doctor."""
+
+import configparser
+import importlib
+import pathlib
+import re
+import runpy
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from realab_suite import doctor
+from realab_suite.experiments import requirements
+from realab_suite.launchers import command
+from realab_suite.launchers import renderers
+
+_ROOT = pathlib.Path(__file__).parents[2]
+
+
+def _setup_cfg() -> configparser.ConfigParser:
+  parser = configparser.ConfigParser()
+  parser.read(_ROOT / 'setup.cfg')
+  return parser
+
+
+@pytest.fixture
+def realab(monkeypatch):
+  """Returns a function that runs the command, up to the launcher."""
+  started: list[Any] = []
+  monkeypatch.setattr(
+      runpy, 'run_module', lambda name, **_: started.append((name, sys.argv))
+  )
+
+  def run(*arguments: str) -> tuple[int, list[Any]]:
+    monkeypatch.setattr(sys, 'argv', ['realab', *arguments])
+    return command.main(), started
+
+  return run
+
+
+def test_the_command_is_installed():
+  scripts = _setup_cfg()['options.entry_points']['console_scripts']
+  name, _, target = scripts.strip().partition(' = ')
+  module, _, function = target.partition(':')
+  assert name == 'realab'
+  assert getattr(importlib.import_module(module), function) is command.main
+
+
+def test_there_is_a_subcommand_for_every_launcher():
+  folder = pathlib.Path(command.__file__).parent
+  launchers = {
+      path.stem
+      for path in folder.glob('*.py')
+      if 'program.start(main)' in path.read_text()
+  }
+  assert set(command.COMMANDS) == launchers | {'demo', 'doctor'}
+
+
+def test_a_subcommand_runs_its_launcher_with_its_flags(realab):
+  status, started = realab('sweep', '--experiment=quick', '--output=x')
+  assert status == 0
+  assert started == [
+      (
+          'realab_suite.launchers.sweep',
+          ['sweep', '--experiment=quick', '--output=x'],
+      )
+  ]
+  _, started = realab('doctor')
+  assert started[-1] == ('realab_suite.doctor', ['doctor'])
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['repot'], "command 'repot' is unknown (did you mean 'report'?); "),
+        (['--experiment=quick'], "command '--experiment=quick' is unknown; kn"),
+        (['demo', '--seed=1'], "demo: arguments ['--seed=1']; allowed are no"),
+    ],
+)
+def test_mistakes_are_reported_in_one_line(realab, capsys, arguments, message):
+  assert realab(*arguments) == (2, [])
+  out, err = capsys.readouterr()
+  assert out == ''
+  assert err.startswith(f'error: {message}')
+  assert err.count('\n') == 1
+
+
+def test_help_lists_every_subcommand(realab, capsys):
+  assert realab('--help') == (0, [])
+  shown = capsys.readouterr().out
+  assert realab() == (2, [])
+  assert capsys.readouterr().out == shown
+  for name, purpose in command.COMMANDS.items():
+    assert f'  {name:14} {purpose}\n' in shown
+
+
+def test_the_demo_is_that_of_the_makefile(realab, monkeypatch):
+  ran: list[list[str]] = []
+
+  def run(arguments: list[str], check: bool) -> Any:
+    del check
+    ran.append(arguments[1:])
+    return subprocess.CompletedProcess(arguments, 0)
+
+  monkeypatch.setattr(subprocess, 'run', run)
+  assert realab('demo')[0] == 0
+  output = ran[1][2].removeprefix('--input=')
+  recipe = (_ROOT / 'Makefile').read_text().replace('$(DEMO)', output)
+  assert output.startswith('results/demo-')
+  for arguments in ran:
+    assert f'$(PY) {" ".join(arguments)}\n' in recipe
+
+
+def test_a_demo_that_fails_ends_with_the_status_of_its_sweep(
+    realab, monkeypatch
+):
+  monkeypatch.setattr(
+      subprocess,
+      'run',
+      lambda arguments, check: subprocess.CompletedProcess(arguments, 5),
+  )
+  assert realab('demo')[0] == 5
+
+
+# The doctor.
+
+
+def test_the_doctor_knows_every_extra():
+  assert set(doctor.EXTRAS) == set(_setup_cfg()['options.extras_require'])
+
+
+def _processes(monkeypatch: Any, status: int, stderr: str = '') -> None:
+  monkeypatch.setattr(
+      subprocess,
+      'run',
+      lambda arguments, **_: subprocess.CompletedProcess(
+          arguments, status, '', stderr
+      ),
+  )
+
+
+def test_a_good_installation(monkeypatch, capsys):
+  _processes(monkeypatch, 0)
+  monkeypatch.setenv('MUJOCO_GL', 'egl')
+  monkeypatch.setattr(requirements, 'missing', lambda *_, extra: None)
+  assert doctor.main() == 0
+  shown = capsys.readouterr().out
+  assert re.match(r'Python 3\.\d+\.\d+, realab-suite ', shown)
+  assert 'ok  core       works' in shown
+  assert 'ok  rendering  works with MUJOCO_GL=egl\n' in shown
+  assert 'ok  agents     installed, for learners\n' in shown
+  assert 'to repair' not in shown
+
+
+def test_a_bad_installation(monkeypatch, capsys):
+  _processes(monkeypatch, 1, 'Traceback\nImportError: no libmujoco\n')
+  monkeypatch.setenv('MUJOCO_GL', 'egl')
+  monkeypatch.setitem(
+      doctor.EXTRAS, 'tb', doctor.Extra(('no_such_module',), 'curves')
+  )
+  assert doctor.main() == 1
+  shown = capsys.readouterr().out
+  assert (
+      '--  core       cannot step a world: ImportError: no libmujoco' in shown
+  )
+  assert '--  rendering  no camera works: egl: ImportError' in shown
+  assert 'apt install libegl1' in shown
+  assert '--  tb         no_such_module not installed, for curves\n' in shown
+  assert 'to repair: python -m pip install "realab-suite[tb]"\n' in shown
+
+
+def test_missing_extras_and_cameras_are_no_failure(monkeypatch, capsys):
+  _processes(monkeypatch, 0)
+  monkeypatch.setattr(renderers, 'choose_renderer', lambda: 'egl: broken')
+  monkeypatch.setattr(
+      requirements,
+      'missing',
+      lambda *_, extra: f'x not installed; run: {extra}',
+  )
+  assert doctor.main() == 0
+  assert capsys.readouterr().out.count('to repair') == 1 + len(doctor.EXTRAS)
+
+
+def test_the_doctors_world_can_be_stepped():
+  exec(compile(doctor._STEPS_A_WORLD, 'doctor', 'exec'), {})
