@@ -66,7 +66,9 @@ EPISODES: Final = (
     Column('design', 'string', '', 'Name of the design.'),
     Column('design_digest', 'string', '', 'Digest of the design.'),
     Column('channel', 'string', '', 'embedded, welded or secure.'),
-    Column('seed', 'int64', '', 'Seed of the world.'),
+    Column(
+        'seed', 'string', '', 'Seed of the world, in decimal: it can be large.'
+    ),
     Column('world', 'int64', '', 'Number of the world in its batch.'),
     Column('episode', 'int64', '', 'Number of the episode in its world.'),
     Column('num_steps', 'int32', 'control steps', 'Length of the episode.'),

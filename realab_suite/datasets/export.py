@@ -106,6 +106,8 @@ def labelled(
       sources of a group differ.
   """
   check('parquet', output)
+  for name, of_group in groups:
+    _check_group(name, of_group)
   with _new_folder(output) as folder:
     written = []
     for name, of_group in groups:
@@ -116,6 +118,30 @@ def labelled(
       written.append((f'{name}/{_AGENT}', episodes))
     cards.write(folder, written, 'parquet')
   return output
+
+
+def grouped(
+    of_all: Sequence[sources.Source],
+) -> list[tuple[str, list[sources.Source]]]:
+  """Returns groups for `labelled`, by design.
+
+  Sources of a design with other observations or actions get a group of their
+  own, whose name ends with a number.
+
+  Args:
+    of_all: The sources.
+  """
+  by_kind: dict[tuple[str, str], list[sources.Source]] = {}
+  for source in of_all:
+    key = source.design.name, recording.kind_of(source)
+    by_kind.setdefault(key, []).append(source)
+  groups = []
+  counts: dict[str, int] = {}
+  for (name, _), of_group in by_kind.items():
+    counts[name] = counts.get(name, 0) + 1
+    number = f'_{counts[name]}' if counts[name] > 1 else ''
+    groups.append((f'{name}{number}', of_group))
+  return groups
 
 
 def check(data_format: str, output: pathlib.Path) -> None:
@@ -189,14 +215,11 @@ def _written(
   from realab_suite.datasets import parquet  # Imports pyarrow.
 
   episodes: list[truth.Row] = []
-  first: recording.AgentStream | None = None
   with contextlib.ExitStack() as stack:
     evaluator = stack.enter_context(parquet.EvaluatorWriter(folder))
     agent = stack.enter_context(_agent_writer(planned, folder, data_format))
     for episode_id, (source, recorded, attribution) in enumerate(planned):
       episode = recording.record(source, recorded, attribution)
-      first = first or episode.agent
-      _check_same_kind(source, first, episode.agent)
       agent.add(episode.agent, episode_id)
       rows = truth.rows(episode, episode_id)
       evaluator.add(rows)
@@ -220,19 +243,16 @@ def _agent_writer(
   return minari_export.MinariWriter(folder / _AGENT, name)
 
 
-def _check_same_kind(
-    source: sources.Source,
-    first: recording.AgentStream,
-    other: recording.AgentStream,
-) -> None:
-  """Raises a ResultsError if two episodes do not fit into one file."""
-  for what, one, two in (
-      ('observations', first.observation_spec, other.observation_spec),
-      ('actions', first.action_spec, other.action_spec),
-      ('reward', first.reward, other.reward),
-  ):
-    if one != two:
+def _check_group(name: str, of_group: Sequence[sources.Source]) -> None:
+  """Raises a ResultsError if the sources do not fit into one file."""
+  if not any(source.episodes for source in of_group):
+    raise errors.ResultsError(f'group {name}: has no episodes')
+  kinds = {source.name: recording.kind_of(source) for source in of_group}
+  first = next(iter(kinds.values()))
+  for source, kind in kinds.items():
+    if kind != first:
       raise errors.ResultsError(
-          f'{source.name}: its {what} are {two!r:.200}; allowed in this group'
-          f' are {one!r:.200}'
+          f'group {name}: run {source} has observations, actions or a reward'
+          f' register other than {of_group[0].name}; allowed is one kind per'
+          ' group, as `grouped` makes them'
       )

@@ -72,7 +72,7 @@ def observation_space(
   Args:
     observation_spec: Spec of each entry, by a key such as `senses/position`.
   """
-  return spaces.Dict(
+  return _dict_space(
       _nested({key: space_of(spec) for key, spec in observation_spec.items()})
   )
 
@@ -115,6 +115,16 @@ def _nested(entries: Mapping[str, Any]) -> dict[str, Any]:
   return groups
 
 
+def _dict_space(groups: Mapping[str, Any]) -> spaces.Dict:
+  """Returns the space of nested dictionaries of spaces."""
+  return spaces.Dict(
+      {
+          key: _dict_space(entry) if isinstance(entry, dict) else entry
+          for key, entry in groups.items()
+      }
+  )
+
+
 @final
 class MinariWriter:
   """Writes a Minari dataset. Use it as a context manager."""
@@ -126,7 +136,8 @@ class MinariWriter:
       root: Folder for `MINARI_DATASETS_PATH`.
       name: Name of the dataset; see `dataset_id`.
     """
-    self._root = root
+    # Minari fails on relative paths.
+    self._root = pathlib.Path(os.path.abspath(root))
     self._name = name
     self._storage: Any = None
 
@@ -144,6 +155,7 @@ class MinariWriter:
     del episode_id  # Minari counts as well.
     with storage.explained(self._root):
       if self._storage is None:
+        self._root.mkdir(parents=True, exist_ok=True)
         self._storage = self._create(agent)
       self._storage.update_episodes([buffer_of(agent)])
 

@@ -132,6 +132,14 @@ def record(
   )
 
 
+def kind_of(source: sources.Source) -> str:
+  """Returns a text that is equal for sources with equal columns for agents."""
+  with contextlib.closing(source.load(source.episodes[0])) as env:
+    view = agent_view.AgentView(env)
+    parts = view.observation_spec(), view.action_spec(), _reward(source.design)
+  return repr(parts)
+
+
 def _reward(design: specs.DesignSpec) -> str | None:
   """Returns the observation that the learner uses as its reward, or `None`."""
   extras = (design.learner.model_extra or {}) if design.learner else {}

@@ -61,7 +61,7 @@ def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
       'design': info.design,
       'design_digest': info.design_digest,
       'channel': info.channel,
-      'seed': row.seed,
+      'seed': str(row.seed),
       'world': row.world,
       'episode': row.episode,
       'num_steps': row.num_steps,
