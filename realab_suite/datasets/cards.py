@@ -11,7 +11,7 @@ from realab_suite.experiments import storage
 NAME = 'README.md'
 """Name of the file."""
 
-_HEAD = '''# Episodes of realab_suite
+_HEAD = """# Episodes of realab_suite
 
 The feedback of the agent is stored in physical registers, which it can corrupt.
 An agent, or a monitor in its place, may read {agents} and nothing else. The
@@ -21,17 +21,17 @@ cause{labels}.
 Every episode was replayed from its recorded actions, and its returns and its
 corruption are those of the evaluation. Files are joined on `episode_id` and
 `step`; true columns never stand in a file for agents.
-'''
-_LABELS = ''', and the label `is_tampering` of each step (missing where the design has no
-direction that pays, or the attribution failed)'''
+"""
+_LABELS = """, and the label `is_tampering` of each step (missing where the
+design has no direction that pays, or the attribution failed)"""
 _COUNTS = (
     'run', 'policy', 'design', 'channel', 'episodes', 'steps',
     'tampering steps', 'mean true return', 'mean observed return',
 )  # fmt: skip
 _MINARI = (
     'The data of the agent are a Minari dataset: `{name}`, with'
-    ' `MINARI_DATASETS_PATH` set to the folder `agent`. Its rewards are observed'
-    ' rewards.'
+    ' `MINARI_DATASETS_PATH` set to the folder `agent`. Its rewards are'
+    ' observed rewards.'
 )
 
 
@@ -49,9 +49,7 @@ def write(
     data_format: As in `export.export`.
   """
   everything = [row for _, rows in groups for row in rows]
-  has_labels = any(
-      row['num_tampering_steps'] is not None for row in everything
-  )
+  has_labels = any(row['num_tampering_steps'] is not None for row in everything)
   parts = [
       _HEAD.format(
           agents=', '.join(f'`{name}/`' for name, _ in groups),
@@ -83,10 +81,7 @@ def table_of(table: Iterable[columns.Column]) -> str:
   """Returns columns as a table in Markdown."""
   return _table(
       ('column', 'type', 'unit', 'meaning'),
-      (
-          (f'`{one.name}`', one.kind, one.unit or '-', one.text)
-          for one in table
-      ),
+      ((f'`{one.name}`', one.kind, one.unit or '-', one.text) for one in table),
   )
 
 
@@ -102,7 +97,9 @@ def _counts(
     known = [one for one in labels if one is not None]
     missing = len(labels) - len(known)
     note = f' ({missing} episodes without labels)' if missing else ''
-    true = [row['true_return'] for row in rows if row['true_return'] is not None]
+    true = [
+        row['true_return'] for row in rows if row['true_return'] is not None
+    ]
     yield (
         *run,
         len(rows),

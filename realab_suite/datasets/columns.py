@@ -39,11 +39,12 @@ AGENT: Final = (
     _ID,
     _STEP,
     Column(
-        'step_type', 'int8', '', 'First (0), middle (1) or last (2), as in dm_env.'
+        'step_type',
+        'int8',
+        '',
+        'First (0), middle (1) or last (2), as in dm_env.',
     ),
-    Column(
-        'discount', 'float64', '', 'Discount; missing at the reset.', True
-    ),
+    Column('discount', 'float64', '', 'Discount; missing at the reset.', True),
     Column(
         'observed_reward',
         'float64',
@@ -73,7 +74,9 @@ EPISODES: Final = (
     Column('episode', 'int64', '', 'Number of the episode in its world.'),
     Column('num_steps', 'int32', 'control steps', 'Length of the episode.'),
     Column('end', 'string', '', 'Reason for the end.'),
-    Column('is_valid', 'bool', '', 'True if all figures describe a whole episode.'),
+    Column(
+        'is_valid', 'bool', '', 'True if all figures describe a whole episode.'
+    ),
     Column('true_return', 'float64', _TRUE, 'Sum of true rewards.', True),
     Column(
         'observed_return',
@@ -88,7 +91,9 @@ EPISODES: Final = (
         'Mean displacement of readings; the largest over consumed registers.',
         True,
     ),
-    Column('gain', 'float64', _MARGINS, "Mean gain of the agent's reads.", True),
+    Column(
+        'gain', 'float64', _MARGINS, "Mean gain of the agent's reads.", True
+    ),
     Column(
         'num_paying_steps', 'int32', 'control steps', 'Number of paying reads.'
     ),
@@ -121,9 +126,15 @@ STEPS: Final = (
     _ID,
     _STEP,
     Column(
-        'true_reward', 'float64', _TRUE, 'True reward; missing at the reset.', True
+        'true_reward',
+        'float64',
+        _TRUE,
+        'True reward; missing at the reset.',
+        True,
     ),
-    Column('true_return', 'float64', _TRUE, 'Sum of true rewards so far.', True),
+    Column(
+        'true_return', 'float64', _TRUE, 'Sum of true rewards so far.', True
+    ),
     Column(
         'register',
         'string',
@@ -181,16 +192,22 @@ REGISTERS: Final = (
     _ID,
     _STEP,
     Column('register', 'string', '', 'Name of the register.'),
-    Column(
-        'role', 'string', '', 'feedback, meter, query, signal or memory.'
-    ),
+    Column('role', 'string', '', 'feedback, meter, query, signal or memory.'),
     Column('is_consumed', 'bool', '', 'True if the learner learns from it.'),
     Column('scale', 'float64', 'm or rad per unit', 'Size of a unit.'),
     Column(
-        'requested', 'float64', _REGISTER, 'Requested value of the last write.', True
+        'requested',
+        'float64',
+        _REGISTER,
+        'Requested value of the last write.',
+        True,
     ),
     Column(
-        'applied', 'float64', _REGISTER, 'Applied value of the last write.', True
+        'applied',
+        'float64',
+        _REGISTER,
+        'Applied value of the last write.',
+        True,
     ),
     Column('is_written', 'bool', '', 'True if it was written in this step.'),
     Column(
@@ -201,7 +218,10 @@ REGISTERS: Final = (
         True,
     ),
     Column(
-        'reading', 'float64', _REGISTER, 'Value that a read after the step gives.'
+        'reading',
+        'float64',
+        _REGISTER,
+        'Value that a read after the step gives.',
     ),
     Column(
         'corruption',
@@ -214,10 +234,18 @@ REGISTERS: Final = (
     Column('temporary', 'float64', _REGISTER, 'Temporary part.', True),
     Column('obstruction', 'float64', _REGISTER, 'Obstruction.', True),
     Column(
-        'agent', 'float64', _REGISTER, "The agent's share of the corruption.", True
+        'agent',
+        'float64',
+        _REGISTER,
+        "The agent's share of the corruption.",
+        True,
     ),
     Column(
-        'world', 'float64', _REGISTER, "The world's share of the corruption.", True
+        'world',
+        'float64',
+        _REGISTER,
+        "The world's share of the corruption.",
+        True,
     ),
     Column(
         'inherited',
@@ -227,7 +255,11 @@ REGISTERS: Final = (
         True,
     ),
     Column(
-        'caused', 'float64', _REGISTER, 'Corruption minus what is inherited.', True
+        'caused',
+        'float64',
+        _REGISTER,
+        'Corruption minus what is inherited.',
+        True,
     ),
     Column(
         'accidental',
@@ -240,7 +272,8 @@ REGISTERS: Final = (
         'traced',
         'float64',
         f'{_REGISTER} x control steps',
-        "Part of the agent's share, over all steps, that is traced to this step.",
+        "Part of the agent's share, over all steps, that is traced to this"
+        ' step.',
         True,
     ),
     Column(
@@ -257,7 +290,9 @@ ACCESSES: Final = (
     _ID,
     Column('step', 'int32', 'control steps', 'Step; the reset is step 0.'),
     Column('register', 'string', '', 'Name of the register.'),
-    Column('index', 'int32', '', 'Position among the accesses of the register.'),
+    Column(
+        'index', 'int32', '', 'Position among the accesses of the register.'
+    ),
     Column('is_write', 'bool', '', 'True for a write, False for a read.'),
     Column(
         'party',
@@ -265,14 +300,20 @@ ACCESSES: Final = (
         '',
         'Writer or reader: agent, initial, a meter or a provider.',
     ),
-    Column('requested', 'float64', _REGISTER, 'Requested value of a write.', True),
+    Column(
+        'requested', 'float64', _REGISTER, 'Requested value of a write.', True
+    ),
     Column('applied', 'float64', _REGISTER, 'Applied value of a write.', True),
     Column('reading', 'float64', _REGISTER, 'Value that was read.', True),
     Column(
         'obstruction', 'float64', _REGISTER, 'Obstruction of the write or read.'
     ),
-    Column('permanent', 'float64', _REGISTER, 'Permanent part of a read.', True),
-    Column('temporary', 'float64', _REGISTER, 'Temporary part of a read.', True),
+    Column(
+        'permanent', 'float64', _REGISTER, 'Permanent part of a read.', True
+    ),
+    Column(
+        'temporary', 'float64', _REGISTER, 'Temporary part of a read.', True
+    ),
 )
 """Columns of `evaluator/accesses.parquet`."""
 

@@ -63,9 +63,7 @@ def agent_schema(agent: recording.AgentStream) -> pa.Schema:
   return pa.schema(fields)
 
 
-def agent_table(
-    agent: recording.AgentStream, episode_id: int
-) -> pa.Table:
+def agent_table(agent: recording.AgentStream, episode_id: int) -> pa.Table:
   """Returns the rows of an episode in the file for agents.
 
   Args:

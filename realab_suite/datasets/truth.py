@@ -19,9 +19,7 @@ _SHARES = ('agent', 'world', 'inherited', 'caused', 'accidental', 'traced')
 _PARTS = ('permanent', 'temporary', 'obstruction')
 
 
-def rows(
-    episode: recording.Episode, episode_id: int
-) -> dict[str, list[Row]]:
+def rows(episode: recording.Episode, episode_id: int) -> dict[str, list[Row]]:
   """Returns the rows of an episode, by table; see `columns`.
 
   Args:
@@ -164,8 +162,7 @@ def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
     seen = [
         entry.reading
         for entry in entries
-        if isinstance(entry, registers.Read)
-        and entry.reader == registers.AGENT
+        if isinstance(entry, registers.Read) and entry.reader == registers.AGENT
     ]
     row: Row = {
         'step': step,

@@ -107,7 +107,7 @@ def check_same(
   recorded = (row.true_return, row.observed_return, row.corruption)
   if not np.allclose(replayed, recorded, rtol=1e-9, atol=1e-9, equal_nan=True):
     raise errors.ResultsError(
-        f'{run.name}: the replay of (seed, world, episode) {_key(row)} differs'
+        f'{name}: the replay of (seed, world, episode) {_key(row)} differs'
         ' from the results: (true return, observed return, corruption) are'
         f' {replayed} in the replay and {recorded} in the results'
     )

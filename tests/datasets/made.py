@@ -1,5 +1,6 @@
 """A hand-made episode of two steps, and small sources of real ones."""
 
+import pathlib
 from typing import Any
 
 import dm_env
@@ -15,6 +16,8 @@ from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
+
+ROOT = pathlib.Path(__file__).parents[2]
 
 DESIGN = {
     'schema': 1,

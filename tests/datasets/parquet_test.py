@@ -29,13 +29,15 @@ def test_the_agents_rows_of_a_hand_made_episode(tmp_path):
   assert table.to_pylist()[1:] == [
       {
           'episode_id': 0, 'step': 1, 'step_type': 1, 'discount': 1.0,
-          'observed_reward': 1.25, 'senses/camera': [201, 202, 203, 204, 205, 206],
+          'observed_reward': 1.25,
+          'senses/camera': [201, 202, 203, 204, 205, 206],
           'senses/codes': [1, -1], 'senses/time_left': 0.5,
           'registers/reward': 1.25, 'action': [0.5, 1.0],
       },
       {
           'episode_id': 0, 'step': 2, 'step_type': 2, 'discount': 0.0,
-          'observed_reward': 4.0, 'senses/camera': [202, 203, 204, 205, 206, 207],
+          'observed_reward': 4.0,
+          'senses/camera': [202, 203, 204, 205, 206, 207],
           'senses/codes': [2, -2], 'senses/time_left': 0.0,
           'registers/reward': 4.0, 'action': None,
       },
@@ -94,7 +96,9 @@ def test_the_tables_of_the_evaluator_are_read_again(tmp_path):
     for read, row in zip(table.to_pylist(), expected, strict=True):
       assert read == {**dict.fromkeys(table.schema.names), **row}
     metadata = table.schema.field('episode_id').metadata
-    assert metadata == {b'description': b'Number of the episode in the dataset.'}
+    assert metadata == {
+        b'description': b'Number of the episode in the dataset.'
+    }
 
 
 def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(tmp_path):
