@@ -247,12 +247,11 @@ def _check_group(name: str, of_group: Sequence[sources.Source]) -> None:
   """Raises a ResultsError if the sources do not fit into one file."""
   if not any(source.episodes for source in of_group):
     raise errors.ResultsError(f'group {name}: has no episodes')
-  kinds = {source.name: recording.kind_of(source) for source in of_group}
-  first = next(iter(kinds.values()))
-  for source, kind in kinds.items():
-    if kind != first:
+  first = recording.kind_of(of_group[0])
+  for source in of_group[1:]:
+    if recording.kind_of(source) != first:
       raise errors.ResultsError(
-          f'group {name}: run {source} has observations, actions or a reward'
-          f' register other than {of_group[0].name}; allowed is one kind per'
-          ' group, as `grouped` makes them'
+          f'group {name}: run {source.name} has observations, actions or a'
+          f' reward register other than {of_group[0].name}; allowed is one kind'
+          ' per group, as `grouped` makes them'
       )

@@ -107,8 +107,14 @@ def test_the_agents_file_does_not_contain_the_truth(folder):
   steps = _read(folder, 'evaluator/steps.parquet').to_pylist()
   found_before = False
   checked = 0
-  for row, true in zip(agent.to_pylist()[1:], steps[1:], strict=True):
-    secrets = (true['true_reward'], true['true_return'])
+  rows = agent.to_pylist()
+  for row, before, true in zip(rows[2:], steps[1:-1], steps[2:], strict=True):
+    # A meter measures before the reward of its step is earned.
+    secrets = [
+        one[name]
+        for one in (before, true)
+        for name in ('true_reward', 'true_return')
+    ]
     leaks = {
         name
         for name, number in _numbers(row)
