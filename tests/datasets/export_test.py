@@ -1,7 +1,6 @@
 """Tests of exports: files, secrecy, and errors that leave nothing behind."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -22,22 +21,18 @@ from tests.datasets import made
 _EVALUATOR = [f'evaluator/{name}.parquet' for name in columns.EVALUATOR]
 
 
-def _reward(step):
-  """Returns a true reward that no agent can guess."""
-  return 0.25 + 0.0625 * math.sin(1.7 * step)
+def _earn(task, physics):
+  """Gives a true reward that no agent can guess, at the ends of steps."""
+  step = np.asarray(physics.data.time) * 10
+  is_end = np.abs(step - np.round(step)) < 0.01
+  task.earn(physics, is_end * (0.25 + 0.0625 * np.sin(1.7 * np.round(step))))
 
 
 @pytest.fixture(name='saboteur', scope='module')
 def fixture_saboteur():
   """Episodes of a saboteur whose true reward differs in every step."""
   with pytest.MonkeyPatch.context() as patch:
-    patch.setattr(
-        unlock_door.UnlockDoor,
-        'get_reward',
-        lambda self, physics: np.vectorize(_reward)(
-            np.round(np.asarray(physics.data.time) * 10)
-        ),
-    )
+    patch.setattr(unlock_door.UnlockDoor, 'latch_events', _earn)
     yield made.source()
 
 

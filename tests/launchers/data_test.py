@@ -31,7 +31,8 @@ def fixture_sweep(tmp_path_factory):
   scheduler._describe(one, planned, False, folder)
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(training, 'make_learner', fake_learner.make)
-    training.run(planned[0], folder, training.Options(lambda line: None))
+    [learned] = [job for job in planned if job.policy is None]
+    training.run(learned, folder, training.Options(lambda line: None))
   return folder
 
 
