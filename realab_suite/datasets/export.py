@@ -217,7 +217,8 @@ def _written(
   episodes: list[truth.Row] = []
   with contextlib.ExitStack() as stack:
     evaluator = stack.enter_context(parquet.EvaluatorWriter(folder))
-    agent = stack.enter_context(_agent_writer(planned, folder, data_format))
+    agent = _agent_writer(planned, folder, data_format)
+    stack.enter_context(agent)
     for episode_id, (source, recorded, attribution) in enumerate(planned):
       episode = recording.record(source, recorded, attribution)
       agent.add(episode.agent, episode_id)

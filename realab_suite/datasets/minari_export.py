@@ -53,10 +53,10 @@ def space_of(spec: dm_env_specs.Array) -> spaces.Space:
   if isinstance(spec, dm_env_specs.DiscreteArray):
     return spaces.Discrete(spec.num_values)
   if not isinstance(spec, dm_env_specs.BoundedArray):
-    low, high = -np.inf, np.inf
+    least, most = -np.inf, np.inf
     if np.issubdtype(spec.dtype, np.integer):
-      low, high = np.iinfo(spec.dtype).min, np.iinfo(spec.dtype).max
-    return spaces.Box(low, high, spec.shape, spec.dtype)
+      least, most = np.iinfo(spec.dtype).min, np.iinfo(spec.dtype).max
+    return spaces.Box(least, most, spec.shape, spec.dtype)
   low, high = (
       np.array(np.broadcast_to(bound, spec.shape), spec.dtype)
       for bound in (spec.minimum, spec.maximum)

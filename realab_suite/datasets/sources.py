@@ -30,18 +30,18 @@ class Recorded(NamedTuple):
   Attributes:
     row: Its result.
     trace: Trace that contains it; see `traces`.
-    index: Index of the episode in the trace.
+    position: Index of the episode in the trace.
   """
 
   row: results.EpisodeRow
   trace: Mapping[str, Any]
-  index: int
+  position: int
 
   @property
   def actions(self) -> Any:
     """Actions, `(steps, *action_spec.shape)`."""
-    num_steps = self.trace['num_steps'][self.index]
-    return self.trace['actions'][:num_steps, self.index]
+    num_steps = self.trace['num_steps'][self.position]
+    return self.trace['actions'][:num_steps, self.position]
 
 
 @final
@@ -88,7 +88,7 @@ class Source:
     while len(found) < len(self.episodes):
       first = self.episodes[len(found)]
       chunk = [
-          one.index
+          one.position
           for one in self.episodes[len(found) : len(found) + _CHUNK]
           if one.trace is first.trace
       ]

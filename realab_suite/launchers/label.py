@@ -89,11 +89,11 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   for policy in scripted_flags.POLICIES.value:
     policies.POLICIES.get(policy)
   overrides = tuple(world_flags.SET.value)
-  channels = [(f'channel={one}',) for one in scripted_flags.CHANNELS.value]
+  changes = [[f'channel={one}'] for one in scripted_flags.CHANNELS.value]
   designs = [
-      specs.load(design, (*overrides, *channel))
+      specs.load(design, (*overrides, *change))
       for design in _DESIGNS.value
-      for channel in channels or [()]
+      for change in changes or [[]]
   ]
   found = []
   for design in designs:
