@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> None:
   output = program.required(
       output_flag.OUTPUT, '; name a folder for the results'
   )
-  seeds = scripted_flags.seeds()
+  seeds = scripted_flags.parse_seeds(scripted_flags.SEEDS.value)
   has_plots = _PLOTS.value and _is_possible(
       'plots', requirements.missing('matplotlib')
   )

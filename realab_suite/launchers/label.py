@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> None:
   output = pathlib.Path(
       program.required(output_flag.OUTPUT, '; name a new folder')
   )
-  seeds = scripted_flags.seeds()
+  seeds = scripted_flags.parse_seeds(scripted_flags.SEEDS.value)
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.datasets import export

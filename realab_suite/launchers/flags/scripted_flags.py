@@ -26,13 +26,12 @@ SEEDS = flags.DEFINE_string(
 )
 
 
-def seeds() -> tuple[int, ...]:
+def parse_seeds(text: str) -> tuple[int, ...]:
   """Returns the seeds that a number or a list of seeds describes.
 
   Raises:
     SpecError: If it is neither.
   """
-  text = SEEDS.value
   is_list = ',' in text
   parts = [part.strip() for part in text.split(',') if part.strip()]
   # At most as many digits as the largest seed: `int` rejects thousands.
