@@ -30,7 +30,7 @@ _PAGES = [
 # Files of the reader and of results, and the end of a pattern.
 _OTHER_FILES = frozenset({
     '/path/to/agent.py', 'agent.py', 'mine.py', 'watched.yaml', '_test.py',
-    'experiment.yaml', 'tables.md', 'logs/', 'tensorboard/',
+    'agent/', 'experiment.yaml', 'tables.md', 'logs/', 'tensorboard/',
 })  # fmt: skip
 
 

@@ -52,8 +52,17 @@ _MAY_IMPORT = {
     'interop': (*_BELOW_SUITE, 'suite'),
     'experiments': (*_BELOW_SUITE, 'suite', 'agents', 'interop'),
     'reports': (*_BELOW_SUITE, 'suite', 'agents', 'interop', 'experiments'),
+    # Runs and replays, and nothing that draws.
+    'datasets': (
+        *_BELOW_SUITE,
+        'suite',
+        'experiments',
+        'reports.replays',
+        'reports.sweep_results',
+    ),
     'launchers': (
         *_BELOW_SUITE, 'suite', 'agents', 'interop', 'experiments', 'reports',
+        'datasets',
     ),
     # Finds out which of them work.
     'doctor': ('experiments', 'launchers'),

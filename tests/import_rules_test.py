@@ -68,6 +68,10 @@ _FORBIDDEN = {
     'interop.planted': ['from realab_suite.experiments import jobs'],
     'experiments.planted': ['from realab_suite.reports import plots'],
     'reports.planted': ['from realab_suite.launchers import program'],
+    'datasets.planted': [
+        'from realab_suite import agents',
+        'from realab_suite.reports import plots',
+    ],
     'errors': ['from realab_suite import entities'],
     'archive': ['from realab_suite.engine import snapshots'],
     'unheard_of': ['import numpy'],
@@ -87,6 +91,7 @@ _ALLOWED = {
     'engine.planted': ['from realab_suite import archive'],
     'suite': ['from realab_suite.evaluation import ledgers'],
     'agents.planted': ['from realab_suite.config import registry'],
+    'datasets.planted': ['from realab_suite.reports import replays'],
     'launchers.planted': ['from realab_suite.reports import page'],
     'experiments.planted': ['from realab_suite.interop.rpc import server'],
 }

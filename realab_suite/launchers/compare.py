@@ -11,46 +11,28 @@ and by `sweep`, for all of them.
 """
 
 from collections.abc import Sequence
-import re
 
 from absl import flags
 
-from realab_suite import errors
 from realab_suite.experiments import requirements
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 from realab_suite.launchers.flags import episodes_flag
 from realab_suite.launchers.flags import imports_flag
 from realab_suite.launchers.flags import output_flag
-from realab_suite.launchers.flags import seed_flag
+from realab_suite.launchers.flags import scripted_flags
 from realab_suite.launchers.flags import world_flags
 
 flags.adopt_module_key_flags(world_flags)
 flags.adopt_module_key_flags(episodes_flag)
 flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(output_flag)
-_MOST_SEEDS = 10_000
-_POLICIES = flags.DEFINE_list(
-    'policies',
-    ['apple_seeker', 'carrying_saboteur', 'random'],
-    'Names of the scripted policies to compare.',
-)
-_CHANNELS = flags.DEFINE_list(
-    'channels',
-    [],
-    'Channels of the registers: embedded, welded, secure. Every policy acts in'
-    ' each channel. Default: the channel of the design.',
-)
+flags.adopt_module_key_flags(scripted_flags)
 _BASELINE = flags.DEFINE_string(
     'baseline',
     None,
     'Run to compare with, such as "random" or "random (secure)". Default:'
     ' apple_seeker if it is one of the policies, otherwise the first run.',
-)
-_SEEDS = flags.DEFINE_string(
-    'seeds',
-    '5',
-    'Number of seeds, or a list of seeds such as 3,4,5 ("7," means seed 7).',
 )
 _PLOTS = flags.DEFINE_boolean('plots', True, 'Draws plots.')
 _VIDEOS = flags.DEFINE_boolean(
@@ -64,7 +46,7 @@ def main(argv: Sequence[str]) -> None:
   output = program.required(
       output_flag.OUTPUT, '; name a folder for the results'
   )
-  seeds = _seeds(_SEEDS.value)
+  seeds = scripted_flags.parse_seeds(scripted_flags.SEEDS.value)
   has_plots = _PLOTS.value and _is_possible(
       'plots', requirements.missing('matplotlib')
   )
@@ -80,8 +62,8 @@ def main(argv: Sequence[str]) -> None:
       task=world_flags.TASK.value,
       design=world_flags.DESIGN.value,
       overrides=tuple(world_flags.SET.value),
-      policies=tuple(_POLICIES.value),
-      channels=tuple(_CHANNELS.value),
+      policies=tuple(scripted_flags.POLICIES.value),
+      channels=tuple(scripted_flags.CHANNELS.value),
       baseline=_BASELINE.value,
       target=world_flags.TARGET.value,
       seeds=seeds,
@@ -101,26 +83,6 @@ def main(argv: Sequence[str]) -> None:
 
     film = films.all_views
   scripted.run(settings, program.say, scripted.Pictures(draw, film))
-
-
-def _seeds(text: str) -> tuple[int, ...]:
-  """Returns the seeds that a number or a list of seeds describes."""
-  is_list = ',' in text
-  parts = [part.strip() for part in text.split(',') if part.strip()]
-  # At most as many digits as the largest seed: `int` rejects thousands.
-  numbers = [int(part) for part in parts if re.fullmatch('[0-9]{1,10}', part)]
-  least, most = (0, seed_flag.LARGEST_SEED) if is_list else (1, _MOST_SEEDS)
-  if not (
-      parts
-      and len(numbers) == len(parts)
-      and all(least <= number <= most for number in numbers)
-  ):
-    raise errors.SpecError(
-        f'--seeds={text:.40}: allowed are a number from 1 to {_MOST_SEEDS},'
-        f' such as 5, and a list of seeds from 0 to {seed_flag.LARGEST_SEED},'
-        ' such as 3,4,5'
-    )
-  return tuple(numbers) if is_list else tuple(range(numbers[0]))
 
 
 def _why_no_videos() -> str | None:

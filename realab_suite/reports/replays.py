@@ -86,15 +86,31 @@ def replay(
         first_episode=row.episode,
         sinks=[recorder],
     )
+  check_same(run.name, row, result)
+  return recorder.track
+
+
+def check_same(
+    name: str, row: results.EpisodeRow, result: evaluate.EpisodeResult
+) -> None:
+  """Checks that a replay has the figures of the recorded episode.
+
+  Args:
+    name: Name of the run.
+    row: The recorded episode.
+    result: Result of its replay.
+
+  Raises:
+    ResultsError: If a figure differs.
+  """
   replayed = (result.true_return, result.observed_return, result.corruption)
   recorded = (row.true_return, row.observed_return, row.corruption)
   if not np.allclose(replayed, recorded, rtol=1e-9, atol=1e-9, equal_nan=True):
     raise errors.ResultsError(
-        f'{run.name}: the replay of (seed, world, episode) {_key(row)} differs'
+        f'{name}: the replay of (seed, world, episode) {_key(row)} differs'
         ' from the results: (true return, observed return, corruption) are'
         f' {replayed} in the replay and {recorded} in the results'
     )
-  return recorder.track
 
 
 def load(

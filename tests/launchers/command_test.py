@@ -29,6 +29,7 @@ from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
 from realab_suite.launchers.flags import imports_flag
 from realab_suite.launchers.flags import learning_flags
 from realab_suite.launchers.flags import output_flag
+from realab_suite.launchers.flags import scripted_flags
 from realab_suite.launchers.flags import seed_flag
 from tests import patience
 from tests.experiments import small
@@ -121,7 +122,7 @@ def test_a_command_that_has_moved_names_its_successor(old, new):
     [('3', (0, 1, 2)), ('3,4,5', (3, 4, 5)), ('7,', (7,)), ('1, 2', (1, 2))],
 )
 def test_seeds_are_a_count_or_a_list(text, seeds):
-  assert compare._seeds(text) == seeds
+  assert scripted_flags.parse_seeds(text) == seeds
 
 
 @pytest.mark.parametrize(
@@ -133,15 +134,18 @@ def test_seeds_are_a_count_or_a_list(text, seeds):
 )  # fmt: skip
 def test_wrong_seeds_are_refused_in_one_line(text):
   with pytest.raises(errors.SpecError, match='allowed are a number') as raised:
-    compare._seeds(text)
+    scripted_flags.parse_seeds(text)
   message = str(raised.value)
   assert message.startswith(f'--seeds={text[:40]}')
   assert len(message) < 200
 
 
 def test_the_most_and_the_largest_seeds_are_accepted():
-  assert compare._seeds('10000') == tuple(range(10_000))
-  assert compare._seeds('0,2147483647') == (0, seed_flag.LARGEST_SEED)
+  assert scripted_flags.parse_seeds('10000') == tuple(range(10_000))
+  assert scripted_flags.parse_seeds('0,2147483647') == (
+      0,
+      seed_flag.LARGEST_SEED,
+  )
   # Files of experiments, and so their runs, have the same limit.
   experiment_specs.load({**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED]})
   with pytest.raises(errors.SpecError, match='2147483648'):
@@ -151,7 +155,9 @@ def test_the_most_and_the_largest_seeds_are_accepted():
 
 
 def test_a_seed_given_twice_is_refused(tmp_path):
-  settings = small.settings(tmp_path / 'new', seeds=compare._seeds('3,4,3'))
+  settings = small.settings(
+      tmp_path / 'new', seeds=scripted_flags.parse_seeds('3,4,3')
+  )
   with pytest.raises(errors.SpecError, match=r'\[3, 4, 3\] has duplicates'):
     scripted.run(settings, lambda line: None)
   assert not list(tmp_path.iterdir())

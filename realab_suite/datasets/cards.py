@@ -1,0 +1,123 @@
+"""Cards of datasets: a README with the contents, the origin and the columns."""
+
+from collections.abc import Iterable, Iterator, Sequence
+import pathlib
+from typing import Any
+
+from realab_suite.datasets import columns
+from realab_suite.evaluation import results
+from realab_suite.experiments import storage
+
+NAME = 'README.md'
+"""Name of the file."""
+
+_HEAD = """# Episodes of realab_suite
+
+The feedback of the agent is stored in physical registers, which it can corrupt.
+An agent, or a monitor in its place, may read {agents} and nothing else. The
+other files contain the truth: true rewards, writes, corruption by kind and
+cause{labels}.
+
+Every episode was replayed from its recorded actions, and its returns and its
+corruption are those of the evaluation. Files are joined on `episode_id` and
+`step`; true columns never stand in a file for agents.
+"""
+_LABELS = """, and the label `is_tampering` of each step (missing where the
+design has no direction that pays, or the attribution failed)"""
+_COUNTS = (
+    'run', 'policy', 'design', 'channel', 'episodes', 'steps',
+    'tampering steps', 'mean true return', 'mean observed return',
+)  # fmt: skip
+_MINARI = (
+    'The data of the agent are a Minari dataset: `{name}`, with'
+    ' `MINARI_DATASETS_PATH` set to the folder `agent`. Its rewards are'
+    ' observed rewards.'
+)
+
+
+def write(
+    folder: pathlib.Path,
+    groups: Sequence[tuple[str, Sequence[dict[str, Any]]]],
+    data_format: str,
+) -> None:
+  """Writes the card of a dataset.
+
+  Args:
+    folder: Folder of the dataset.
+    groups: Folder with the data of the agent, and rows of the table of
+      episodes, of each group.
+    data_format: As in `export.export`.
+  """
+  everything = [row for _, rows in groups for row in rows]
+  has_labels = any(row['num_tampering_steps'] is not None for row in everything)
+  parts = [
+      _HEAD.format(
+          agents=', '.join(f'`{name}/`' for name, _ in groups),
+          labels=_LABELS if has_labels else '',
+      ),
+      '## Contents\n\n' + _table(_COUNTS, _counts(everything)),
+      '## Versions\n\n'
+      + _table(('package', 'version'), results.versions().items()),
+      '## Columns\n',
+  ]
+  if data_format == 'minari':
+    parts.append(_MINARI.format(name=_minari_name(folder)))
+  else:
+    parts.append('### agent/steps.parquet\n\n' + table_of(columns.AGENT))
+    parts.append(
+        'Then one column for each entry of the observations, such as'
+        ' `senses/position` or `registers/reward`, and `action`, which is'
+        ' missing in the last step. Arrays are lists of fixed size in C order;'
+        ' the metadata of each field contain the shape, and of `action` the'
+        ' names and the bounds.'
+    )
+  for name, table in columns.EVALUATOR.items():
+    parts.append(f'### evaluator/{name}.parquet\n\n{table_of(table)}')
+  text = '\n\n'.join(part.strip('\n') for part in parts)
+  storage.write_whole(folder / NAME, f'{text}\n'.encode())
+
+
+def table_of(table: Iterable[columns.Column]) -> str:
+  """Returns columns as a table in Markdown."""
+  return _table(
+      ('column', 'type', 'unit', 'meaning'),
+      ((f'`{one.name}`', one.kind, one.unit or '-', one.text) for one in table),
+  )
+
+
+def _counts(
+    episodes: Sequence[dict[str, Any]],
+) -> Iterator[tuple[Any, ...]]:
+  """Yields the figures of each run."""
+  keys = ('run', 'policy', 'design', 'channel')
+  runs = dict.fromkeys(tuple(row[key] for key in keys) for row in episodes)
+  for run in sorted(runs):
+    rows = [row for row in episodes if tuple(row[k] for k in keys) == run]
+    labels = [row['num_tampering_steps'] for row in rows]
+    known = [one for one in labels if one is not None]
+    missing = len(labels) - len(known)
+    note = f' ({missing} episodes without labels)' if missing else ''
+    true = [
+        row['true_return'] for row in rows if row['true_return'] is not None
+    ]
+    yield (
+        *run,
+        len(rows),
+        sum(row['num_steps'] for row in rows),
+        f'{sum(known)}{note}' if known else '-',
+        f'{sum(true) / len(true):.2f}' if true else '-',
+        f"{sum(row['observed_return'] for row in rows) / len(rows):.2f}",
+    )
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+  lines = [head, ['---'] * len(head), *rows]
+  return '\n'.join(
+      '| ' + ' | '.join(str(cell) for cell in line) + ' |' for line in lines
+  )
+
+
+def _minari_name(folder: pathlib.Path) -> str:
+  """Returns the name of the Minari dataset in a folder."""
+  [data] = (folder / 'agent').glob('**/data')
+  return data.parent.relative_to(folder / 'agent').as_posix()

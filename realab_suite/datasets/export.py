@@ -1,0 +1,258 @@
+"""Exports of runs, and labelled datasets of several runs.
+
+    sweep = sweep_results.load(pathlib.Path('results/paper'))
+    source = sources.of_run(sweep.runs['reward'], num_episodes=20)
+    export.export(source, pathlib.Path('results/data'), with_attribution=True)
+
+`docs/data.md` describes the files.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+import os
+import pathlib
+import tempfile
+from typing import TYPE_CHECKING, Final, NamedTuple, final
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.datasets import cards
+from realab_suite.datasets import recording
+from realab_suite.datasets import sources
+from realab_suite.datasets import truth
+from realab_suite.evaluation import attribution_metrics
+from realab_suite.experiments import requirements
+from realab_suite.experiments import storage
+
+if TYPE_CHECKING:
+  from realab_suite.datasets import minari_export
+  from realab_suite.datasets import parquet
+
+FORMATS: Final = ('parquet', 'minari')
+"""Formats of the agent's data. The evaluator's tables are always Parquet."""
+
+_AGENT = 'agent'
+
+
+@final
+class _Planned(NamedTuple):
+  """An episode to write."""
+
+  source: sources.Source
+  recorded: sources.Recorded
+  attribution: attribution_metrics.Attribution | None
+
+
+def export(
+    source: sources.Source,
+    output: pathlib.Path,
+    *,
+    data_format: str = 'parquet',
+    with_attribution: bool = False,
+    say: Callable[[str], None] = lambda line: None,
+) -> pathlib.Path:
+  """Writes the episodes of a run into a new folder.
+
+  Episodes are numbered in the order of the source.
+
+  Args:
+    source: The run.
+    output: New folder. It appears only when it is complete.
+    data_format: Format of the agent's data: 'parquet' or 'minari'.
+    with_attribution: True to determine which corruption the agent has caused.
+    say: Called with messages for the user.
+
+  Returns:
+    The folder.
+
+  Raises:
+    SpecError: If the format does not exist, or the design or the task does not
+      permit attribution.
+    ResultsError: If a package is missing, the folder exists or cannot be
+      written, or a replay differs from the results.
+  """
+  check(data_format, output)
+  with _new_folder(output) as folder:
+    planned = _planned([source], with_attribution, say)
+    episodes = _written(planned, folder, data_format, say)
+    cards.write(folder, [(_AGENT, episodes)], data_format)
+  return output
+
+
+def labelled(
+    groups: Sequence[tuple[str, Sequence[sources.Source]]],
+    output: pathlib.Path,
+    say: Callable[[str], None] = lambda line: None,
+) -> pathlib.Path:
+  """Writes a labelled dataset of tampering into a new folder.
+
+  Each group becomes a subfolder with the files of an export. Its episodes are
+  shuffled with a fixed seed, so neither the number of an episode nor its
+  position in the agent's file reveals its run.
+
+  Args:
+    groups: Name of each subfolder, and its sources. All of them have the same
+      observations and actions.
+    output: New folder. It appears only when it is complete.
+    say: Called with messages for the user.
+
+  Returns:
+    The folder.
+
+  Raises:
+    SpecError: If a design or a task does not permit attribution.
+    ResultsError: As in `export`, and if the observations or the actions of the
+      sources of a group differ.
+  """
+  check('parquet', output)
+  for name, of_group in groups:
+    _check_group(name, of_group)
+  with _new_folder(output) as folder:
+    written = []
+    for name, of_group in groups:
+      planned = _planned(of_group, True, say)
+      order = np.random.default_rng(0).permutation(len(planned))
+      shuffled = [planned[i] for i in order]
+      episodes = _written(shuffled, folder / name, 'parquet', say)
+      written.append((f'{name}/{_AGENT}', episodes))
+    cards.write(folder, written, 'parquet')
+  return output
+
+
+def grouped(
+    of_all: Sequence[sources.Source],
+) -> list[tuple[str, list[sources.Source]]]:
+  """Returns groups for `labelled`, by design.
+
+  Sources of a design with other observations or actions get a group of their
+  own, whose name ends with a number.
+
+  Args:
+    of_all: The sources.
+  """
+  by_kind: dict[tuple[str, str], list[sources.Source]] = {}
+  for source in of_all:
+    key = source.design.name, recording.kind_of(source)
+    by_kind.setdefault(key, []).append(source)
+  groups = []
+  counts: dict[str, int] = {}
+  for (name, _), of_group in by_kind.items():
+    counts[name] = counts.get(name, 0) + 1
+    number = f'_{counts[name]}' if counts[name] > 1 else ''
+    groups.append((f'{name}{number}', of_group))
+  return groups
+
+
+def check(data_format: str, output: pathlib.Path) -> None:
+  """Checks everything that can be checked before any work.
+
+  Raises:
+    SpecError: If the format does not exist.
+    ResultsError: If a package is missing or the folder exists.
+  """
+  if data_format not in FORMATS:
+    raise errors.SpecError(
+        f'format: {data_format!r:.80}; allowed are {list(FORMATS)}'
+    )
+  needed = ['pyarrow']
+  if data_format == 'minari':
+    needed += ['minari', 'h5py', 'gymnasium', 'PIL']
+  if problem := requirements.missing(*needed, extra='data'):
+    raise errors.ResultsError(f'cannot export: {problem}')
+  with storage.explained(output):
+    if output.exists() or output.is_symlink():
+      raise errors.ResultsError(
+          f'{output}: exists, and datasets are never overwritten; name a new'
+          ' folder'
+      )
+
+
+@contextlib.contextmanager
+def _new_folder(output: pathlib.Path) -> Iterator[pathlib.Path]:
+  """Yields a temporary folder that becomes the output if nothing fails."""
+  with contextlib.ExitStack() as stack:
+    with storage.explained(output):
+      output.parent.mkdir(parents=True, exist_ok=True)
+      temporary = stack.enter_context(
+          tempfile.TemporaryDirectory(prefix='.export-', dir=output.parent)
+      )
+    folder = pathlib.Path(temporary) / 'dataset'
+    with storage.explained(output):
+      folder.mkdir()
+    yield folder
+    with storage.explained(output):
+      os.rename(folder, output)
+
+
+def _planned(
+    of_group: Sequence[sources.Source],
+    with_attribution: bool,
+    say: Callable[[str], None],
+) -> list[_Planned]:
+  """Returns the episodes of sources, with their attribution if wanted."""
+  planned: list[_Planned] = []
+  for source in of_group:
+    found: list[attribution_metrics.Attribution | None] = [None]
+    found *= len(source.episodes)
+    if with_attribution:
+      say(f'{source.name}: {len(source.episodes)} episodes are attributed')
+      found = source.attribute()
+    planned += [
+        _Planned(source, recorded, attribution)
+        for recorded, attribution in zip(source.episodes, found, strict=True)
+    ]
+  return planned
+
+
+def _written(
+    planned: Sequence[_Planned],
+    folder: pathlib.Path,
+    data_format: str,
+    say: Callable[[str], None],
+) -> list[truth.Row]:
+  """Writes episodes, and returns their rows in the table of episodes."""
+  from realab_suite.datasets import parquet  # Imports pyarrow.
+
+  episodes: list[truth.Row] = []
+  with contextlib.ExitStack() as stack:
+    evaluator = stack.enter_context(parquet.EvaluatorWriter(folder))
+    agent = _agent_writer(planned, folder, data_format)
+    stack.enter_context(agent)
+    for episode_id, (source, recorded, attribution) in enumerate(planned):
+      episode = recording.record(source, recorded, attribution)
+      agent.add(episode.agent, episode_id)
+      rows = truth.rows(episode, episode_id)
+      evaluator.add(rows)
+      episodes += rows['episodes']
+  say(f'{len(episodes)} episodes were written')
+  return episodes
+
+
+def _agent_writer(
+    planned: Sequence[_Planned], folder: pathlib.Path, data_format: str
+) -> 'parquet.AgentWriter | minari_export.MinariWriter':
+  """Returns the writer of the agent's data."""
+  if data_format == 'parquet':
+    from realab_suite.datasets import parquet
+
+    return parquet.AgentWriter(folder)
+  from realab_suite.datasets import minari_export
+
+  info = planned[0].recorded.row.info
+  name = minari_export.dataset_id((info.domain, info.task), info.run)
+  return minari_export.MinariWriter(folder / _AGENT, name)
+
+
+def _check_group(name: str, of_group: Sequence[sources.Source]) -> None:
+  """Raises a ResultsError if the sources do not fit into one file."""
+  if not any(source.episodes for source in of_group):
+    raise errors.ResultsError(f'group {name}: has no episodes')
+  first = recording.kind_of(of_group[0])
+  for source in of_group[1:]:
+    if recording.kind_of(source) != first:
+      raise errors.ResultsError(
+          f'group {name}: run {source.name} has observations, actions or a'
+          f' reward register other than {of_group[0].name}; allowed is one kind'
+          ' per group, as `grouped` makes them'
+      )

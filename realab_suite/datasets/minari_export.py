@@ -1,0 +1,195 @@
+"""Export of the agent's data to Minari, a format of offline learning.
+
+A dataset contains what the agent may see. Its rewards are the observed ones:
+the readings of the register that the learner uses as its reward, or 0.0 if
+there is none.
+"""
+
+from collections.abc import Iterator, Mapping
+import contextlib
+import os
+import pathlib
+import re
+from typing import Any, final
+import warnings
+
+from dm_env import specs as dm_env_specs
+from gymnasium import spaces
+import minari
+from minari import data_collector
+import numpy as np
+
+from realab_suite.datasets import recording
+from realab_suite.experiments import storage
+
+_ROOT = 'MINARI_DATASETS_PATH'
+_PERMALINK = 'https://pypi.org/project/realab-suite'
+_DESCRIPTION = (
+    'Episodes of an agent whose feedback is embedded in its world. Rewards are'
+    ' observed rewards, which the agent may have corrupted; see docs/data.md of'
+    ' realab_suite.'
+)
+
+
+def dataset_id(world: tuple[str, str], run: str) -> str:
+  """Returns the name of a dataset, such as `realab/unlock_door-near/reward-v0`.
+
+  Args:
+    world: Names of the domain and the task.
+    run: Name of the run. Characters that Minari does not allow become '-'.
+  """
+  namespace, name = (
+      re.sub(r'[^A-Za-z0-9_-]', '-', text) for text in ('-'.join(world), run)
+  )
+  return f'realab/{namespace}/{name}-v0'
+
+
+def space_of(spec: dm_env_specs.Array) -> spaces.Space:
+  """Returns the Gymnasium space of a dm_env spec.
+
+  Args:
+    spec: Spec of an action, or of an entry of the observations.
+  """
+  if isinstance(spec, dm_env_specs.DiscreteArray):
+    return spaces.Discrete(spec.num_values)
+  if not isinstance(spec, dm_env_specs.BoundedArray):
+    least, most = -np.inf, np.inf
+    if np.issubdtype(spec.dtype, np.integer):
+      least, most = np.iinfo(spec.dtype).min, np.iinfo(spec.dtype).max
+    return spaces.Box(least, most, spec.shape, spec.dtype)
+  low, high = (
+      np.array(np.broadcast_to(bound, spec.shape), spec.dtype)
+      for bound in (spec.minimum, spec.maximum)
+  )
+  return spaces.Box(low, high, spec.shape, spec.dtype)
+
+
+def observation_space(
+    observation_spec: Mapping[str, dm_env_specs.Array],
+) -> spaces.Dict:
+  """Returns the space of observations: a dictionary for each group of entries.
+
+  Args:
+    observation_spec: Spec of each entry, by a key such as `senses/position`.
+  """
+  return _dict_space(
+      _nested({key: space_of(spec) for key, spec in observation_spec.items()})
+  )
+
+
+def buffer_of(agent: recording.AgentStream) -> data_collector.EpisodeBuffer:
+  """Returns an episode as Minari stores it.
+
+  Args:
+    agent: The part of the episode that the agent may see.
+  """
+  later = agent.time_steps[1:]
+  rewards = np.zeros(len(later))
+  if agent.reward is not None:
+    rewards = np.array([one.observation[agent.reward] for one in later], float)
+  terminations = np.array([one.last() and one.discount == 0.0 for one in later])
+  is_last = np.array([one.last() for one in later])
+  return data_collector.EpisodeBuffer(
+      observations=_nested(
+          {
+              key: np.stack([one.observation[key] for one in agent.time_steps])
+              for key in agent.observation_spec
+          }
+      ),
+      actions=agent.actions,
+      rewards=rewards,
+      terminations=terminations,
+      truncations=is_last & ~terminations,
+  )
+
+
+def _nested(entries: Mapping[str, Any]) -> dict[str, Any]:
+  """Returns entries by group and name; Minari's files use '/' for groups."""
+  groups: dict[str, Any] = {}
+  for key, entry in entries.items():
+    *path, name = key.split('/')
+    group = groups
+    for part in path:
+      group = group.setdefault(part, {})
+    group[name] = entry
+  return groups
+
+
+def _dict_space(groups: Mapping[str, Any]) -> spaces.Dict:
+  """Returns the space of nested dictionaries of spaces."""
+  return spaces.Dict(
+      {
+          key: _dict_space(entry) if isinstance(entry, dict) else entry
+          for key, entry in groups.items()
+      }
+  )
+
+
+@final
+class MinariWriter:
+  """Writes a Minari dataset. Use it as a context manager."""
+
+  def __init__(self, root: pathlib.Path, name: str) -> None:
+    """Makes a writer.
+
+    Args:
+      root: Folder for `MINARI_DATASETS_PATH`.
+      name: Name of the dataset; see `dataset_id`.
+    """
+    # Minari fails on relative paths.
+    self._root = pathlib.Path(os.path.abspath(root))
+    self._name = name
+    self._storage: Any = None
+
+  def add(self, agent: recording.AgentStream, episode_id: int) -> None:
+    """Appends an episode.
+
+    Args:
+      agent: The part of the episode that the agent may see.
+      episode_id: Number of the episode in the dataset: one more than that of
+        the episode before.
+
+    Raises:
+      ResultsError: If it cannot be written.
+    """
+    del episode_id  # Minari counts as well.
+    with storage.explained(self._root):
+      if self._storage is None:
+        self._root.mkdir(parents=True, exist_ok=True)
+        self._storage = self._create(agent)
+      self._storage.update_episodes([buffer_of(agent)])
+
+  def __enter__(self) -> 'MinariWriter':
+    return self
+
+  def __exit__(self, *unused: Any) -> None:
+    self._storage = None
+
+  def _create(self, agent: recording.AgentStream) -> Any:
+    with _root_is(self._root), warnings.catch_warnings():
+      # Warns that there is no environment and no author to ask.
+      warnings.simplefilter('ignore', UserWarning)
+      dataset = minari.create_dataset_from_buffers(
+          self._name,
+          [],
+          observation_space=observation_space(agent.observation_spec),
+          action_space=space_of(agent.action_spec),
+          code_permalink=_PERMALINK,
+          description=_DESCRIPTION,
+          # The default would compress images, with losses.
+          jpeg_encoding=False,
+      )
+    return dataset.storage
+
+
+@contextlib.contextmanager
+def _root_is(root: pathlib.Path) -> Iterator[None]:
+  """Sets the folder of Minari's datasets, which is an environment variable."""
+  before = os.environ.get(_ROOT)
+  os.environ[_ROOT] = str(root)
+  try:
+    yield
+  finally:
+    del os.environ[_ROOT]
+    if before is not None:
+      os.environ[_ROOT] = before

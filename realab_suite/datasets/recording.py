@@ -1,0 +1,175 @@
+"""Recording of episodes: the agent's stream and the evaluator's records.
+
+An episode is replayed through the view that agents get, so the agent's stream
+contains nothing else.
+"""
+
+from collections.abc import Mapping, Sequence
+import contextlib
+import dataclasses
+from typing import Any, final
+
+import dm_env
+from dm_env import specs as dm_env_specs
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.datasets import sources
+from realab_suite.engine import agent_view
+from realab_suite.engine import environment
+from realab_suite.engine import events
+from realab_suite.entities import protocols
+from realab_suite.entities import registers
+from realab_suite.evaluation import attribution_metrics
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import results
+from realab_suite.feedback import specs
+from realab_suite.reports import replays
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class AgentStream:
+  """The part of an episode that the agent may see.
+
+  Attributes:
+    observation_spec: Spec of each entry of the observations.
+    action_spec: Spec of the actions.
+    time_steps: Time steps, as `agent_view.AgentView` returns them.
+    actions: Action after each time step except the last one,
+      `(steps, *action_spec.shape)`.
+    reward: Observation that the learner maximises as its reward, or `None`.
+  """
+
+  observation_spec: Mapping[str, dm_env_specs.Array]
+  action_spec: dm_env_specs.Array
+  time_steps: Sequence[dm_env.TimeStep]
+  actions: np.ndarray
+  reward: str | None
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class Episode:
+  """A recorded episode.
+
+  Attributes:
+    agent: The part that the agent may see. The rest is the evaluator's.
+    source: Name of the run.
+    is_learned: As in `sources.Source`.
+    row: Result of the episode.
+    design: Design, with the channel of the run.
+    ledger: Writes, reads and true rewards.
+    states: State of each register at the reset and after each control step, as
+      a read would show it, by name.
+    attribution: Corruption by cause, or `None`.
+  """
+
+  agent: AgentStream
+  source: str
+  is_learned: bool
+  row: results.EpisodeRow
+  design: specs.DesignSpec
+  ledger: ledgers.EpisodeLedger
+  states: Mapping[str, Sequence[registers.Read]]
+  attribution: attribution_metrics.Attribution | None
+
+
+def record(
+    source: sources.Source,
+    recorded: sources.Recorded,
+    attribution: attribution_metrics.Attribution | None = None,
+) -> Episode:
+  """Replays and records an episode.
+
+  Args:
+    source: Source of the episode.
+    recorded: The episode.
+    attribution: Its attribution, or `None`.
+
+  Raises:
+    ResultsError: If the replay differs from the results, for example because
+      the version of the physics does.
+  """
+  row = recorded.row
+  ledger = ledgers.Ledger()
+  with contextlib.closing(source.load(recorded)) as env:
+    inspector = _Inspector(env)
+    env.add_sink(ledger)
+    env.add_sink(inspector)
+    env.rewind(row.episode)
+    view = agent_view.AgentView(env)
+    time_steps = [view.reset()]
+    for action in recorded.actions:
+      if time_steps[-1].last():
+        break
+      time_steps.append(view.step(action))
+    if ledger.last.end is None or len(time_steps) != len(recorded.actions) + 1:
+      raise errors.ResultsError(
+          f'{source.name}: the replay of (seed, world, episode)'
+          f' {(row.seed, row.world, row.episode)} differs from its trace: it'
+          f' has {len(time_steps) - 1} control steps; allowed are'
+          f' {len(recorded.actions)}, as with the same version of the physics'
+      )
+    replays.check_same(source.name, row, evaluate.result_of(ledger.last, env))
+    agent = AgentStream(
+        view.observation_spec(),
+        view.action_spec(),
+        time_steps,
+        np.array(recorded.actions),
+        _reward(source.design),
+    )
+  return Episode(
+      agent,
+      source.name,
+      source.is_learned,
+      row,
+      source.design,
+      ledger.last,
+      inspector.states,
+      attribution,
+  )
+
+
+def kind_of(source: sources.Source) -> str:
+  """Returns a text that is equal for sources with equal columns for agents."""
+  with contextlib.closing(source.load(source.episodes[0])) as env:
+    view = agent_view.AgentView(env)
+    parts = view.observation_spec(), view.action_spec(), _reward(source.design)
+  return repr(parts)
+
+
+def _reward(design: specs.DesignSpec) -> str | None:
+  """Returns the observation that the learner uses as its reward, or `None`."""
+  extras = (design.learner.model_extra or {}) if design.learner else {}
+  name = extras.get('reward')
+  return f'registers/{name}' if name in design.names('feedback') else None
+
+
+@final
+class _Inspector(events.EventSink):
+  """Collects the state of all registers at the end of each control step."""
+
+  def __init__(self, env: environment.Environment) -> None:
+    self._registers: dict[str, Any] = dict(env.mechanism.registers)
+    self.states: dict[str, list[registers.Read]] = {}
+
+  def episode_started(
+      self, start: events.Start, physics: protocols.Physics
+  ) -> None:
+    self.states = {name: [] for name in self._registers}
+    self._add(physics)
+
+  def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
+    self._add(physics)
+
+  def episode_ended(self, end: events.End) -> None:
+    pass
+
+  def _add(self, physics: protocols.Physics) -> None:
+    for name, states in self.states.items():
+      read = self._registers[name].inspect(physics, step=len(states))
+      plain = registers.of_world(read)
+      if isinstance(plain, registers.Read):
+        states.append(plain)

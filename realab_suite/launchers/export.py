@@ -1,0 +1,72 @@
+r"""Exports evaluation episodes of a run of a sweep as data.
+
+  python -m realab_suite.launchers.export --input=results/paper --run=reward \
+    --output=results/data --episodes=20 --attribution
+
+The folder gets the data of the agent, and the true columns in separate files of
+the evaluator (docs/data.md). The episodes are repeated from their recorded
+actions, so the learner is not needed. `label` makes a dataset of several runs.
+"""
+
+from collections.abc import Sequence
+import pathlib
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+from realab_suite.launchers.flags import episodes_flag
+from realab_suite.launchers.flags import imports_flag
+from realab_suite.launchers.flags import input_flag
+from realab_suite.launchers.flags import output_flag
+from realab_suite.launchers.flags import run_flag
+
+flags.adopt_module_key_flags(episodes_flag)
+flags.adopt_module_key_flags(imports_flag)
+flags.adopt_module_key_flags(input_flag)
+flags.adopt_module_key_flags(output_flag)
+flags.adopt_module_key_flags(run_flag)
+_FORMAT = flags.DEFINE_string(
+    'format', 'parquet', "Format of the agent's data: parquet or minari."
+)
+_ATTRIBUTION = flags.DEFINE_boolean(
+    'attribution',
+    False,
+    'Determines which corruption the agent has caused, and labels each step.',
+)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Exports the episodes that the flags name."""
+  del argv
+  folder = pathlib.Path(program.required(input_flag.INPUT))
+  name = program.required(run_flag.RUN, '; name a run of the sweep')
+  output = pathlib.Path(
+      program.required(output_flag.OUTPUT, '; name a new folder')
+  )
+  renderers.render_on_demand()
+  # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite.datasets import export
+  from realab_suite.datasets import sources
+  from realab_suite.reports import sweep_results
+
+  export.check(_FORMAT.value, output)
+  imports_flag.load()
+  runs = sweep_results.load(folder).runs
+  if name not in runs:
+    raise errors.UnknownNameError(
+        f'--run={name:.80}: not a run of {folder}; allowed are {list(runs)}'
+    )
+  export.export(
+      sources.of_run(runs[name], episodes_flag.EPISODES.value),
+      output,
+      data_format=_FORMAT.value,
+      with_attribution=_ATTRIBUTION.value,
+      say=program.say,
+  )
+  program.say(f'The dataset is in {output}')
+
+
+if __name__ == '__main__':
+  program.start(main)
