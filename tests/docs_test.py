@@ -58,9 +58,17 @@ def registries():
 
 
 @pytest.mark.parametrize(
-    'page', ['README.md', 'docs/attribution.md', 'docs/your_own.md']
+    'page',
+    [
+        'README.md',
+        'docs/attribution.md',
+        'docs/gymnasium.md',
+        'docs/your_own.md',
+    ],
 )
 def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
+  if page == 'docs/gymnasium.md':
+    pytest.importorskip('gymnasium')
   blocks = _python_blocks(_ROOT / page)
   assert blocks
   names = {'__name__': 'page'}
