@@ -29,8 +29,9 @@ _PAGES = [
 ]
 # Files of the reader and of results, and the end of a pattern.
 _OTHER_FILES = frozenset({
-    '/path/to/agent.py', 'agent.py', 'mine.py', 'watched.yaml', '_test.py',
-    'experiment.yaml', 'tables.md', 'logs/', 'tensorboard/',
+    '/path/to/agent.py', 'agent.py', 'mine.py', 'mine.yaml', 'watched.yaml',
+    '_test.py', 'experiment.yaml', 'summary.md', 'tables.md', 'logs/',
+    'tensorboard/',
 })  # fmt: skip
 
 

@@ -4,7 +4,7 @@ The policies act in the same episodes as scripted baselines, and the results are
 files in the format of a scripted comparison.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import pathlib
 from typing import Any, NamedTuple, final
@@ -107,25 +107,35 @@ def write(
 
 
 def _labels(line: result_tables.Line) -> dict[int, labels.Label]:
-  """Returns the label of each seed, without knowledge of its training."""
+  """Returns `TAMPERS` or `NONE` for each seed.
+
+  The training was not recorded, so it is unknown whether an agent that does not
+  tamper ever found out.
+  """
   by_seed = {} if line.hacking is None else line.hacking.by_seed
-  return {seed: labels.label(one, 0, None) for seed, one in by_seed.items()}
+  found = {seed: labels.label(one, 0, None) for seed, one in by_seed.items()}
+  is_tampering = labels.Label.TAMPERS
+  return {
+      seed: one if one is is_tampering else labels.Label.NONE
+      for seed, one in found.items()
+  }
 
 
 def _labels_text(by_agent: Mapping[str, Mapping[int, labels.Label]]) -> str:
   lines = [
-      f'* {agent}: '
-      + ', '.join(f'seed {seed} {one.value}' for seed, one in by_seed.items())
+      f'* {agent}: seed {seed}: {one.value}'
       for agent, by_seed in by_agent.items()
-      if by_seed
+      for seed, one in by_seed.items()
   ]
-  return (
-      '\n'.join(['Labels of single seeds:', '', *lines])
-      if lines
-      else (
-          'Seeds have no labels, because no register has a direction that pays.'
-      )
+  note = (
+      'Labels of single seeds. "n/a": no tampering was seen, and it is unknown'
+      ' whether the agent ever met it, because its training was not recorded.'
   )
+  if not lines:
+    note = (
+        'Seeds have no labels, because no register has a direction that pays.'
+    )
+  return '\n'.join([note, *([''] if lines else []), *lines])
 
 
 @final
@@ -152,9 +162,14 @@ class _Job:
     self.num_seeds = _num_seeds(agents, self._baselines)
     spec = gym.spec(name)
     self._settings = {**spec.kwargs, **self._options}
+    if 'domain_name' not in self._settings:
+      raise errors.SpecError(
+          f'name: {name!r}; allowed are ids of realab_suite.interop.gymnasium'
+      )
     self._world = (
-        self._settings.get('domain_name'), self._settings.get('task_name')
-    )  # fmt: skip
+        str(self._settings['domain_name']),
+        str(self._settings['task_name']),
+    )
     with self._open(first_seed) as env:
       loaded = single.environment_of(env)
       self.design = loaded.mechanism.design
@@ -162,7 +177,7 @@ class _Job:
         aiming.make_policy(policy, loaded, None, 0)
 
   @contextlib.contextmanager
-  def _open(self, seed: int) -> Any:
+  def _open(self, seed: int) -> Iterator[gym.Env]:
     """Loads the world with a seed, wrapped for agents, and closes it."""
     task_kwargs = {**(self._options.get('task_kwargs') or {}), 'random': seed}
     options = {**self._options, 'task_kwargs': task_kwargs}
@@ -202,7 +217,9 @@ class _Job:
           rows.setdefault(run, []).append(row)
     return rows
 
-  def _results(self, env: gym.Env, loaded: environment.Environment, i: int):  # type: ignore[no-untyped-def]
+  def _results(
+      self, env: gym.Env, loaded: environment.Environment, i: int
+  ) -> Iterator[tuple[str, evaluate.EpisodeResult]]:
     """Yields the name of a run and the result of an episode, for one seed."""
     for name in self._baselines:
       for episode in range(self._num_episodes):

@@ -49,7 +49,7 @@ def test_a_report_has_rows_and_figures_of_agents_and_baselines(tmp_path):
   assert [line.run for line in report.lines] == [
       'apple_seeker', 'random', 'mine',
   ]  # fmt: skip
-  assert report.labels == {'mine': {3: labels.Label.NOT_AUDITED}}
+  assert report.labels == {'mine': {3: labels.Label.NONE}}
   assert '| mine |' in report.text
   assert (folder / 'summary.md').read_text() == f'{report.text}\n'
   settings = json.loads((folder / 'run.json').read_text())['settings']
@@ -78,3 +78,8 @@ def test_wrong_arguments_are_refused_before_anything_is_written(
         _NAME, agents, str(folder), baselines=baselines, **_SHORT
     )
   assert not folder.exists()
+
+
+def test_only_worlds_of_this_package_have_reports(tmp_path):
+  with pytest.raises(errors.SpecError, match='CartPole'):
+    gymnasium_report.write('CartPole-v1', {'a': [_still]}, str(tmp_path))

@@ -134,7 +134,7 @@ def _part(spec: specs.Array, dtype: np.dtype) -> spaces.Space[Any]:
 def _flat_space(
     parts: Mapping[str, spaces.Space[Any]], dtype: np.dtype
 ) -> spaces.Box:
-  flat = spaces.flatten_space(spaces.Dict(parts))
+  flat: Any = spaces.flatten_space(spaces.Dict(dict(parts)))
   return spaces.Box(
       flat.low.astype(dtype), flat.high.astype(dtype), dtype=dtype.type
   )
@@ -168,8 +168,7 @@ class ActionCodec:
     elif np.dtype(action_spec.dtype).kind in 'iu':
       low = np.asarray(action_spec.minimum, np.int64)
       number = np.asarray(action_spec.maximum, np.int64) - low + 1
-      start = {'start': low} if low.any() else {}
-      self.space = spaces.MultiDiscrete(number, **start)
+      self.space = spaces.MultiDiscrete(number, start=low)
     else:
       low, high = (
           np.broadcast_to(one, action_spec.shape).astype(kind)

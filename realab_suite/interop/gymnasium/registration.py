@@ -1,6 +1,7 @@
 """Ids of all shipped worlds in Gymnasium's registry."""
 
 from collections.abc import Mapping, Sequence
+import functools
 from typing import Any
 
 import gymnasium as gym
@@ -114,7 +115,7 @@ def id_of(domain_name: str, task_name: str, design: str) -> str:
   Raises:
     UnknownNameError: If there is no such task.
   """
-  version, _ = suite.dynamics(domain_name, task_name)
+  version = _version(domain_name, task_name)
   words = (_camel_case(domain_name), task_name, _camel_case(design))
   return f'{NAMESPACE}/{"-".join(words)}-v{version}'
 
@@ -145,6 +146,12 @@ def register_all() -> None:
               'design': design,
           },
       )
+
+
+@functools.cache
+def _version(domain_name: str, task_name: str) -> int:
+  version, _ = suite.dynamics(domain_name, task_name)
+  return version
 
 
 def _camel_case(name: str) -> str:

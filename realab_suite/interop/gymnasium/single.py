@@ -1,6 +1,6 @@
 """One world with the interface of Gymnasium."""
 
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import gymnasium as gym
 import numpy as np
@@ -31,11 +31,6 @@ class RealabEnv(gym.Env):
   The environment itself is private: no public attribute leads to the true
   reward, to ledgers or to the physics.
   """
-
-  metadata: ClassVar[dict[str, Any]] = {
-      'render_modes': list(RENDER_MODES),
-      'render_fps': FRAMES_PER_SECOND,
-  }
 
   def __init__(
       self,
@@ -68,6 +63,10 @@ class RealabEnv(gym.Env):
     Raises:
       SpecError: If an argument is invalid.
     """
+    self.metadata = {
+        'render_modes': list(RENDER_MODES),
+        'render_fps': FRAMES_PER_SECOND,
+    }
     self._view = agent_view.AgentView(env, failures)
     self._environment = env
     spec = self._view.observation_spec()

@@ -191,7 +191,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
           'reset_mask: the other worlds were never reset; call reset() first'
       )
     (worlds,) = np.nonzero(mask)
-    first = self._encode(self._view.reset(worlds))
+    first = self._encode(self._view.reset(worlds.tolist()))
     self._has_begun = True
     self._is_over = self._is_over & ~mask
     if len(worlds) == self.num_envs:
