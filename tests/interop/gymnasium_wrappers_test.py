@@ -118,3 +118,28 @@ def test_frames_for_people():
   frames = envs.render()
   assert env.render().shape == frames[1].shape == (24, 32, 3)
   np.testing.assert_array_equal(frames[0], env.render())
+
+
+def test_scripts_in_the_style_of_cleanrl_run():
+  def make() -> gym.Env:
+    env = _single(0, reward_register='reward')
+    env = gym.wrappers.FlattenObservation(env)
+    env = gym.wrappers.RecordEpisodeStatistics(env)
+    env = gym.wrappers.ClipAction(env)
+    env = gym.wrappers.NormalizeObservation(env)
+    return gym.wrappers.NormalizeReward(env, gamma=0.99)
+
+  one_by_one = gym.vector.SyncVectorEnv([make, make])
+  together = gym.wrappers.vector.RecordEpisodeStatistics(
+      gym.make_vec(
+          _NEAR, num_envs=2, reward_register='reward', flat=True,
+          environment_kwargs={'max_steps': _MAX_STEPS},
+      )
+  )  # fmt: skip
+  for envs in (one_by_one, together):
+    observations, _ = envs.reset(seed=1)
+    assert observations.shape == (2, *envs.single_observation_space.shape)
+    assert np.prod(envs.single_action_space.shape) == 6
+    for _ in range(_MAX_STEPS):
+      *_, infos = envs.step(np.full((2, 6), 0.5, np.float32))
+    assert infos['episode']['l'].tolist() == [_MAX_STEPS] * 2

@@ -122,8 +122,9 @@ def _part(spec: specs.Array, dtype: np.dtype) -> spaces.Space[Any]:
   if kind in 'iu' and is_bounded:
     num_classes = int(np.max(high)) - int(np.min(low)) + 1
     if num_classes <= _MAX_CLASSES:
-      # Of one byte, so that Gymnasium's flattening keeps 32-bit floats.
-      return spaces.MultiDiscrete(np.full(shape, num_classes), dtype=np.int8)
+      # Of 16 bits: Gymnasium's flattening then keeps 32-bit floats, and sums of
+      # the numbers of classes, as in Stable-Baselines3, do not overflow.
+      return spaces.MultiDiscrete(np.full(shape, num_classes), dtype=np.int16)
   low, high = (
       np.broadcast_to(np.clip(one, -_LARGEST, _LARGEST), shape).astype(dtype)
       for one in (low, high)
