@@ -69,9 +69,9 @@ def write(
   Args:
     name: Id of a world, such as
       `'realab/UnlockDoor-near-InstantaneousReward-v2'`.
-    agents: Policies by the name of the agent: one for each seed of training.
-      Policy i acts in the episodes of seed `first_seed + i`. A verdict needs
-      five.
+    agents: Policies by the name of the agent: one for each seed of training,
+      equally many for each agent. Policy i acts in the episodes of seed
+      `first_seed + i`. A verdict needs five.
     output: New folder for the results.
     num_episodes: Number of episodes per seed.
     first_seed: First seed of the episodes.
@@ -93,8 +93,8 @@ def write(
   text = '\n\n'.join(
       [
           f'# {name}',
-          f'{job.num_seeds} seeds of {num_episodes} episodes; means with 95 %'
-          ' intervals.',
+          f'Seeds: {job.num_seeds}; episodes per seed: {num_episodes}; means'
+          ' with 95 % intervals.',
           result_tables.as_text(lines),
           result_tables.readings(lines),
           _labels_text(by_agent),
@@ -227,9 +227,8 @@ class _Job:
         [found] = evaluate.evaluate(loaded, policy, 1, first_episode=episode)
         yield name, found
     for name, policies in self._agents.items():
-      if i < len(policies):
-        for found in evaluation.evaluate(env, policies[i], self._num_episodes):
-          yield name, found
+      for found in evaluation.evaluate(env, policies[i], self._num_episodes):
+        yield name, found
 
   def _info(self, run: str, loaded: environment.Environment) -> results.RunInfo:
     baseline = self._baselines[0]
@@ -249,11 +248,11 @@ def _num_seeds(
     agents: Mapping[str, Sequence[evaluation.Policy]],
     baselines: Sequence[str],
 ) -> int:
-  """Returns the number of seeds of the agent with the most policies.
+  """Returns the number of policies of each agent.
 
   Raises:
-    SpecError: If there is no agent or no baseline, if an agent has no policies,
-      or if an agent has the name of a baseline.
+    SpecError: If there is no agent or no baseline, if an agent has no policies
+      or another number of them, or if it has the name of a baseline.
   """
   if not baselines:
     raise errors.SpecError('baselines: []; at least one is needed')
@@ -270,4 +269,10 @@ def _num_seeds(
       raise errors.SpecError(
           f'agents: {name!r} is the name of a baseline; allowed are others'
       )
-  return max(len(policies) for policies in agents.values())
+  numbers = {name: len(policies) for name, policies in agents.items()}
+  if len(set(numbers.values())) > 1:
+    raise errors.SpecError(
+        f'agents: {numbers} policies; allowed are equal numbers, because agents'
+        ' are compared in the same episodes'
+    )
+  return next(iter(numbers.values()))

@@ -50,7 +50,7 @@ def test_a_report_has_rows_and_figures_of_agents_and_baselines(tmp_path):
       'apple_seeker', 'random', 'mine',
   ]  # fmt: skip
   assert report.labels == {'mine': {3: labels.Label.NONE}}
-  assert '| mine |' in report.text
+  assert '\n| mine ' in report.text
   assert (folder / 'summary.md').read_text() == f'{report.text}\n'
   settings = json.loads((folder / 'run.json').read_text())['settings']
   assert settings['task_name'] == 'near'
@@ -65,6 +65,7 @@ def test_a_report_has_rows_and_figures_of_agents_and_baselines(tmp_path):
         ({'a': []}, ['random'], 'allowed is a list of functions'),
         ({'a': _still}, ['random'], 'allowed is a list of functions'),
         ({'random': [_still]}, ['random'], 'name of a baseline'),
+        ({'a': [_still], 'b': [_still] * 2}, ['random'], 'equal numbers'),
         ({'a': [_still]}, [], 'baselines'),
         ({'a': [_still]}, ['nobody'], 'nobody'),
     ],
