@@ -259,6 +259,15 @@ def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(mode, flat):
   envs.close()
 
 
+def test_the_reading_of_a_first_step_is_no_reward():
+  envs = _make_vec(overrides=['registers.reward.initial=3'])
+  envs.reset(seed=1)
+  for _ in range(_MAX_STEPS + 1):
+    observations, rewards, *_ = envs.step(envs.action_space.sample())
+  np.testing.assert_allclose(observations['registers_reward'], 3.0, atol=1e-4)
+  assert rewards.tolist() == [0.0] * _NUM_ENVS
+
+
 def test_ends_in_a_batch_without_autoreset_need_a_reset():
   envs = _make_vec('Disabled')
   with pytest.raises(gym.error.ResetNeeded):
