@@ -56,7 +56,7 @@ clean:
 .venv/dev: setup.cfg pyproject.toml constraints.txt | .venv/made
 	@echo 'Installing realab_suite and its tools into .venv; this takes about a' \
 	  'minute.'
-	@$(INSTALL) -e '.[agents,report,rpc,dev]'
+	@$(INSTALL) -e '.[agents,report,rpc,gym,dev]'
 	@touch .venv/demo $@
 
 # Debian and Ubuntu ship Python without ensurepip; `venv` then creates an

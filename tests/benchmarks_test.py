@@ -228,3 +228,24 @@ def test_a_stopwatch_attributes_time_to_the_innermost_call(
   watch.watch('outer', outer)()
   assert watch.seconds == {'inner': 20.0, 'outer': 3.0}
   assert watch.calls == {'inner': 2, 'outer': 1}
+
+
+def test_the_benchmark_of_gymnasium_prints_a_line_per_adapter(
+    monkeypatch, capsys
+):
+  pytest.importorskip('gymnasium')
+  from benchmarks import gymnasium_vector
+
+  monkeypatch.setattr(gymnasium_vector, 'NUM_ENVS', 2)
+  monkeypatch.setattr(gymnasium_vector, '_STEPS', 2)
+  gymnasium_vector.main(['--rounds=1'])
+  target = '<= 1.11111 x raw'
+  _assert_lines(
+      capsys.readouterr().out,
+      {
+          'load_batch, 2 worlds': '-',
+          'make_vec, next-step': target,
+          'make_vec, next-step, flat': target,
+          'make_vec, same-step, flat': target,
+      },
+  )

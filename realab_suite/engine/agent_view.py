@@ -6,7 +6,7 @@ hostile code; within one process, nothing can.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, final
 
 import dm_env
@@ -14,7 +14,9 @@ from dm_env import specs as dm_env_specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import environment
 from realab_suite.feedback import specs
 
@@ -99,7 +101,10 @@ class _View(abc.ABC):
       ClosedError: If the view or the environment is closed.
       WorldError: If the world failed.
     """
-    return self.__guard(lambda: self._restate(self.__env.reset()))
+    return self._reset()
+
+  def _reset(self, **options: Any) -> Any:
+    return self.__guard(lambda: self._restate(self.__env.reset(**options)))
 
   def step(self, action: Any) -> Any:
     """Runs one control step.
@@ -236,7 +241,7 @@ class BatchAgentView(_View):
   actions have a leading axis of worlds.
   """
 
-  __slots__ = ()
+  __slots__ = ('__num_envs',)
 
   def __init__(
       self,
@@ -254,12 +259,34 @@ class BatchAgentView(_View):
     """
     _check_kind(batch, batch_environment.BatchEnvironment)
     super().__init__(batch, (batch.num_envs,), failures)
+    self.__num_envs = batch.num_envs
+
+  def reset(
+      self, worlds: Sequence[int] | None = None
+  ) -> batch_time_steps.BatchTimeStep:
+    """Starts the next episodes of worlds and abandons their current ones.
+
+    Args:
+      worlds: Indices of the worlds; `None` for all of them.
+
+    Returns:
+      The first time steps of these worlds, in their order.
+
+    Raises:
+      ClosedError: If the view or the environment is closed.
+      SpecError: If there is no such world.
+      WorldError: If a world failed.
+    """
+    if worlds is not None:
+      worlds = arguments.indices(worlds, self.__num_envs).tolist()
+    time_step: batch_time_steps.BatchTimeStep = self._reset(worlds=worlds)
+    return time_step
 
   def _restate(
-      self, time_step: batch_environment.BatchTimeStep
-  ) -> batch_environment.BatchTimeStep:
-    is_last = time_step.step_type == int(dm_env.StepType.LAST)
-    return batch_environment.BatchTimeStep(
+      self, time_step: batch_time_steps.BatchTimeStep
+  ) -> batch_time_steps.BatchTimeStep:
+    is_last = time_step.last()
+    return batch_time_steps.BatchTimeStep(
         np.array(time_step.step_type),
         np.zeros(len(is_last)),
         np.where(is_last, time_step.discount, 1.0),

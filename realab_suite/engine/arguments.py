@@ -129,6 +129,18 @@ def senses(given: Any) -> tuple[str, ...] | None:
   return tuple(given)
 
 
+def camera(given: Any, mjcf_model: Any) -> str:
+  """Returns the name of a camera of a model.
+
+  Raises:
+    SpecError: If the model has no such camera.
+  """
+  names = [one.full_identifier for one in mjcf_model.find_all('camera')]
+  if given not in names:
+    raise errors.SpecError(f'camera: {given!r}; allowed are {names}')
+  return str(given)
+
+
 def flag(name: str, given: Any) -> bool:
   """Returns a Boolean argument.
 

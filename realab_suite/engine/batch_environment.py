@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 import functools
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
-from dm_control import composer
 import dm_env
 from dm_env import specs
 import numpy as np
@@ -13,6 +12,7 @@ from realab_suite import errors
 from realab_suite.engine import action_codec
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_physics
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import control_step
 from realab_suite.engine import environment
 from realab_suite.engine import episodes
@@ -22,27 +22,10 @@ from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshots
-from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
-
-@final
-class BatchTimeStep(NamedTuple):
-  """Like `dm_env.TimeStep`, with a leading axis of worlds.
-
-  Attributes:
-    step_type: Step type of each world, `(worlds,)` int: 0 is the first step of
-      an episode, 1 a middle step and 2 the last; see `dm_env.StepType`.
-    reward: `(worlds,)`. Always 0.0, because there is no reward channel.
-    discount: Discount of each world, `(worlds,)`; 1.0 in first steps.
-    observation: Arrays of shape `(worlds, ...)`, by name.
-  """
-
-  step_type: np.ndarray
-  reward: np.ndarray
-  discount: np.ndarray
-  observation: dict[str, np.ndarray]
+BatchTimeStep = batch_time_steps.BatchTimeStep
 
 
 @final
@@ -77,11 +60,6 @@ class BatchEnvironment:
     num_envs = arguments.num_envs(num_envs)
     num_threads = arguments.num_threads(num_threads)
     sleep = arguments.flag('sleep', sleep)
-    if not isinstance(single.task, base.Task):
-      raise errors.SpecError(
-          f'{type(single.task).__name__} is compiled for each episode; a batch'
-          ' accepts only tasks of this package'
-      )
     hooks.refuse_in_batch(single.task, single.has_extra_hooks)
     self._single = single
     self._task: base.Task = single.task
@@ -91,12 +69,7 @@ class BatchEnvironment:
     )
     self._num_envs = num_envs
     self._sleep = sleep
-    self._entities = [
-        entity
-        for entity in self._task.root_entity.iter_entities()
-        if type(entity).initialize_episode
-        is not composer.Entity.initialize_episode
-    ]
+    self._entities = hooks.with_start(self._task)
     self._host = hosts.WorldHost(self._task, self._task, None, (num_envs,))
     self._observer = observing.Observer(
         self._host, self._mechanism, single.max_steps, single.senses
@@ -104,7 +77,7 @@ class BatchEnvironment:
     self._random_state = seeding.random_state(single.seed, 0, 0, 'batch')
     # `restore` may give several worlds the same number. Arrays of objects keep
     # large seeds and salts; `np.full` would drop the salt.
-    self._seeds = np.array([single.seed] * num_envs, object)
+    self._seeds = seeding.seeds(single.seed, num_envs)
     self._world_numbers = np.arange(num_envs).astype(object)
     self._episodes = np.full(num_envs, -1)
     self._is_pending = np.ones(num_envs, bool)
@@ -161,6 +134,23 @@ class BatchEnvironment:
     """Undoes `add_sink`."""
     self._sinks.remove(sink)
 
+  def rewind(self, random: int | Sequence[int] | None = None) -> None:
+    """Abandons the current episodes; the next one of every world is the first.
+
+    Args:
+      random: New seed of all worlds, or a seed for each world; `None` for the
+        present seeds.
+
+    Raises:
+      SpecError: If a seed is invalid.
+    """
+    self._refuse_if_closed()
+    if random is not None:
+      self._seeds = seeding.seeds(random, self._num_envs)
+    self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
+    self._episodes = np.full(self._num_envs, -1)
+    self._is_pending = np.ones(self._num_envs, bool)
+
   def action_spec(self) -> specs.Array:
     """Returns the spec of one action; `step` takes `(worlds, *spec.shape)`."""
     return self._single.action_spec()
@@ -169,21 +159,48 @@ class BatchEnvironment:
     """Returns the observation spec of one world."""
     return self._single.observation_spec()
 
-  def reset(self) -> BatchTimeStep:
-    """Starts the next episode of every world and abandons current ones."""
+  def reset(self, worlds: Sequence[int] | None = None) -> BatchTimeStep:
+    """Starts the next episodes of worlds and abandons their current ones.
+
+    Other worlds do not change.
+
+    Args:
+      worlds: Indices of the worlds; `None` for all of them.
+
+    Returns:
+      The first time steps of these worlds, in their order.
+
+    Raises:
+      SpecError: If there is no such world.
+    """
     self._refuse_if_closed()
-    self._notify_of_ends(~self._is_pending, events.End.ABANDONED)
+    indices = arguments.indices(worlds, self._num_envs)
+    is_first = np.isin(np.arange(self._num_envs), indices)
+    was_pending = self._is_pending
+    self._notify_of_ends(is_first & ~was_pending, events.End.ABANDONED)
     # If anything fails here, the next step begins all episodes.
-    self._is_pending = everywhere = np.ones(self._num_envs, bool)
-    self._begin_episodes(everywhere)
-    reads = self._observe()
-    nothing = np.zeros(self._num_envs)
-    self._notify(everywhere, ~everywhere, {}, [], reads, nothing, None)
-    self._is_pending = ~everywhere
-    return self._time_step(
-        np.full(self._num_envs, int(dm_env.StepType.FIRST)),
-        np.ones(self._num_envs),
+    self._is_pending = np.ones(self._num_envs, bool)
+    others = self._observation
+    try:
+      self._begin_episodes(is_first)
+      reads = self._observe()
+    except Exception:
+      self._notify_of_ends(~(is_first | was_pending), events.End.ERROR)
+      raise
+    for name, value in others.items():
+      # MuJoCo has reset the state of worlds that failed.
+      self._observation[name][~is_first] = value[~is_first]
+    self._notify(
+        {},
+        is_first=is_first,
+        has_failed=~is_first,
+        records=[],
+        agent_reads=reads,
+        true_reward=np.zeros(self._num_envs),
     )
+    self._is_pending = was_pending & ~is_first
+    first = np.full(self._num_envs, int(dm_env.StepType.FIRST))
+    return self._time_step(first, np.ones(self._num_envs)).take(indices)
 
   def step(self, actions: Any) -> BatchTimeStep:
     """Runs one control step of every world.
@@ -234,13 +251,13 @@ class BatchEnvironment:
       # MuJoCo has reset the state of worlds that failed.
       value[has_failed] = last_valid[name][has_failed]
     self._notify(
-        is_first,
-        has_failed,
         ends,
-        records,
-        reads,
-        ending.true_reward,
-        ending.failure,
+        is_first=is_first,
+        has_failed=has_failed,
+        records=records,
+        agent_reads=reads,
+        true_reward=ending.true_reward,
+        failure=ending.failure,
     )
     self._is_pending = is_last
     step_type = np.where(
@@ -392,10 +409,7 @@ class BatchEnvironment:
       RenderingError: If no renderer is available, or if it fails at this size.
     """
     self._refuse_if_closed()
-    cameras = self._task.root_entity.mjcf_model.find_all('camera')
-    names = [element.full_identifier for element in cameras]
-    if camera not in names:
-      raise errors.SpecError(f'camera: {camera!r}; allowed are {names}')
+    arguments.camera(camera, self._task.root_entity.mjcf_model)
     indices = arguments.indices(worlds, self._num_envs).tolist()
     return self._physics.render(indices, camera, height, width)
 
@@ -443,31 +457,17 @@ class BatchEnvironment:
     self._observation, reads = self._observer.observe(self._physics)
     return list(reads)
 
-  def _notify(
-      self,
-      is_first: np.ndarray,
-      has_failed: np.ndarray,
-      ends: dict[int, events.End],
-      records: events.Records,
-      reads: Sequence[registers.Read],
-      reward: np.ndarray,
-      failure: str | None,
-  ) -> None:
-    """Notifies the sinks of a control step."""
+  def _notify(self, ends: dict[int, events.End], **others: Any) -> None:
+    """Notifies the sinks of a control step; see `events.BatchStep`."""
     if not self._sinks:
       return
     step = events.BatchStep(
         seed=self._seeds,
         world=self._world_numbers,
         episode=self._episodes.copy(),
-        is_first=is_first,
-        has_failed=has_failed,
         ends=ends,
         initial=self._mechanism.initial_writes(self._physics),
-        records=records,
-        agent_reads=reads,
-        true_reward=reward,
-        failure=failure,
+        **others,
     )
     for sink in self._sinks:
       sink.step_ended(step)

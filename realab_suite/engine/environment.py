@@ -190,15 +190,21 @@ class Environment(composer.Environment):
     """Undoes `add_sink`."""
     self._sinks.remove(sink)
 
-  def rewind(self, episode: int = 0) -> None:
+  def rewind(self, episode: int = 0, random: Any = None) -> None:
     """Abandons the current episode and sets the number of the next one.
 
+    Args:
+      episode: Number of the next episode.
+      random: New seed, or `None` for the present one.
+
     Raises:
-      SpecError: If the number is negative.
+      SpecError: If the number or the seed is invalid.
     """
     self._refuse_if_closed()
     if episode < 0:
       raise errors.SpecError(f'episode: {episode}; allowed are 0 and more')
+    if random is not None:
+      self._seed = seeding.as_seed(random)
     self._abandon()
     self._episode = episode - 1
     self._reset_next_step = True
@@ -277,14 +283,8 @@ class Environment(composer.Environment):
         self._provider_keys, saved.provider_keys, strict=True
     ):
       key[:] = saved_key[0]
-    self._provider_states = (
-        saved.provider_states
-        if saved.indices is None
-        else snapshots.of_world(saved.provider_states)
-    )
-    self._observation = observing.frozen(
-        {key: np.array(value[0]) for key, value in saved.observation.items()}
-    )
+    self._provider_states = saved.provider_states_of_world()
+    self._observation = observing.frozen(saved.observation_of_world())
     for sink, (_, states) in zip(self._sinks, saved.sinks, strict=False):
       sink.set_state(states[0])
     (self._episode_is_open,) = saved.is_open

@@ -53,16 +53,22 @@ def refuse_in_substeps(task: base.Task) -> None:
         )
 
 
-def refuse_in_batch(task: base.Task, has_extra_hooks: bool) -> None:
-  """Refuses step hooks other than those of the task.
+def refuse_in_batch(task: composer.Task, has_extra_hooks: bool) -> None:
+  """Refuses foreign tasks, and step hooks other than those of the task.
 
   Args:
     task: Task of the batch.
     has_extra_hooks: True if hooks were added to the environment.
 
   Raises:
-    SpecError: If there are such hooks, because a batch never calls them.
+    SpecError: If the task is foreign, or if there are such hooks, because a
+      batch never calls them.
   """
+  if not isinstance(task, base.Task):
+    raise errors.SpecError(
+        f'{type(task).__name__} is compiled for each episode; a batch accepts'
+        ' only tasks of this package'
+    )
   if has_extra_hooks:
     raise errors.SpecError(
         'add_extra_hook: a batch never calls extra hooks; allowed is an'
@@ -75,3 +81,13 @@ def refuse_in_batch(task: base.Task, has_extra_hooks: bool) -> None:
             f'{type(entity).__name__}.{hook}: a batch calls the hooks of the'
             ' task only'
         )
+
+
+def with_start(task: base.Task) -> list[composer.Entity]:
+  """Returns the entities of a task that have a hook for starts of episodes."""
+  own = composer.Entity.initialize_episode
+  return [
+      entity
+      for entity in task.root_entity.iter_entities()
+      if type(entity).initialize_episode is not own
+  ]

@@ -6,6 +6,7 @@ that world alone. The k-th episodes of two agents begin in the same state,
 regardless of the lengths of the episodes before.
 """
 
+from collections.abc import Sequence
 import hashlib
 import secrets
 from typing import Any, Self, final
@@ -103,6 +104,28 @@ def as_seed(random: Any) -> int:
       f'random: {messages.quote(random)}; allowed are a non-negative integer, a'
       ' RandomState or None'
   )
+
+
+def seeds(random: Any, num_envs: int) -> np.ndarray:
+  """Returns the seed of each world, `(worlds,)`, objects.
+
+  Args:
+    random: Seed of all worlds, as in `as_seed`, or a sequence with the seed of
+      each world.
+    num_envs: Number of worlds.
+
+  Raises:
+    SpecError: If a seed is invalid, or their number is wrong.
+  """
+  if not isinstance(random, Sequence):
+    random = [as_seed(random)] * num_envs
+  if len(random) != num_envs:
+    raise errors.SpecError(
+        f'random: {len(random)} seeds; allowed are one seed, and {num_envs}'
+        ' seeds, one for each world'
+    )
+  # Objects keep large seeds and salts.
+  return np.array([as_seed(one) for one in random], object)
 
 
 def sequence(

@@ -148,6 +148,17 @@ class WorldStates(NamedTuple):
       data[_SALTS] = salts
     return data
 
+  def provider_states_of_world(self) -> list[Any]:
+    """Returns the states of the providers of the only saved world."""
+    if self.indices is None:
+      return self.provider_states
+    states: list[Any] = of_world(self.provider_states)
+    return states
+
+  def observation_of_world(self) -> dict[str, np.ndarray]:
+    """Returns the observation of the only saved world, as copies."""
+    return {key: np.array(v[0]) for key, v in self.observation.items()}
+
   def indices_for(
       self, worlds: Sequence[int] | None, num_envs: int
   ) -> np.ndarray:

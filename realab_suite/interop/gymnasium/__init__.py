@@ -1,0 +1,11 @@
+"""Worlds with the interface of Gymnasium; importing this registers their ids.
+
+import gymnasium as gym
+import realab_suite.interop.gymnasium
+
+env = gym.make('realab/UnlockDoor-near-InstantaneousReward-v2')
+"""
+
+from realab_suite.interop.gymnasium import registration
+
+registration.register_all()

@@ -1,0 +1,261 @@
+"""A batch of worlds with the interface of Gymnasium's vector environments."""
+
+from typing import Any, final
+
+import gymnasium as gym
+from gymnasium.vector import utils
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.config import messages
+from realab_suite.engine import agent_view
+from realab_suite.engine import arguments
+from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
+from realab_suite.interop.gymnasium import codecs
+from realab_suite.interop.gymnasium import single
+
+AutoresetMode = gym.vector.AutoresetMode
+
+
+@final
+class RealabVectorEnv(gym.vector.VectorEnv):
+  """A batch of worlds as a `gymnasium.vector.VectorEnv`.
+
+  World i is bit for bit the `RealabEnv` with `environment_kwargs={'world': i}`
+  and the same seed. Rewards, ends and privacy are as in `RealabEnv`.
+
+  In the mode `SAME_STEP`, `infos` contains `final_obs` and `final_info` of the
+  worlds whose episodes have ended, and otherwise nothing.
+  """
+
+  def __init__(
+      self,
+      batch: batch_environment.BatchEnvironment,
+      *,
+      autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+      reward_register: str | None = None,
+      dtype: codecs.DType = 'float32',
+      flat: bool = False,
+      render_mode: str | None = None,
+      camera_name: str = 'top_down',
+      height: int = 240,
+      width: int = 320,
+      failures: list[Exception] | None = None,
+  ) -> None:
+    """Makes an adapter. Prefer `gymnasium.make_vec`.
+
+    Args:
+      batch: Batch from `suite.load_batch`. `close` closes it.
+      autoreset_mode: Beginning of the next episode of a world: with the next
+        step (`'NextStep'`), with the same step (`'SameStep'`), or with
+        `reset(options={'reset_mask': ...})` (`'Disabled'`).
+      reward_register: As in `RealabEnv`; so are the others.
+      dtype: Type of floats in observations and actions.
+      flat: True for observations that are one vector for each world.
+      render_mode: `'rgb_array'`, or `None`.
+      camera_name: Camera of the frames.
+      height: Height of a frame, in pixels.
+      width: Width of a frame, in pixels.
+      failures: List of the caller, to which exceptions are appended.
+
+    Raises:
+      SpecError: If an argument is invalid.
+    """
+    self._mode = _checked_mode(autoreset_mode)
+    self._view = agent_view.BatchAgentView(batch, failures)
+    self._batch = batch
+    self.num_envs = batch.num_envs
+    spec = self._view.observation_spec()
+    self._reward_key = codecs.reward_key(reward_register, spec)
+    self._observations = codecs.ObservationCodec(spec, dtype, flat)
+    self._actions = codecs.ActionCodec(self._view.action_spec(), dtype)
+    self.single_observation_space = self._observations.space
+    self.single_action_space = self._actions.space
+    self.observation_space = utils.batch_space(
+        self.single_observation_space, self.num_envs
+    )
+    self.action_space = utils.batch_space(
+        self.single_action_space, self.num_envs
+    )
+    self.metadata = {
+        'render_modes': list(single.RENDER_MODES),
+        'render_fps': single.FRAMES_PER_SECOND,
+        'autoreset_mode': self._mode,
+    }
+    self.render_mode = single.checked_render_mode(render_mode)
+    self._frame = (
+        arguments.camera(camera_name, batch.task.root_entity.mjcf_model),
+        height,
+        width,
+    )
+    self._has_begun = False
+    self._is_over = np.zeros(self.num_envs, bool)
+    # Observation of the last step, for a reset of single worlds.
+    self._last: codecs.Observation = {}
+
+  def reset(
+      self,
+      *,
+      seed: Any = None,
+      options: dict[str, Any] | None = None,
+  ) -> tuple[codecs.Observation, dict[str, Any]]:
+    """Starts the next episodes, or the first ones of a seed.
+
+    Args:
+      seed: New seed of all worlds, or a sequence with one for each; `None` for
+        the present ones. With one seed, worlds still differ, because their
+        random streams depend on the index.
+      options: `None`, or a dict. `reset_mask`, `(worlds,)` bool, selects the
+        worlds to reset; `seed` is then `None`.
+
+    Returns:
+      The observations of all worlds and an empty dict.
+
+    Raises:
+      SpecError: If the mask is invalid or is given with a seed.
+    """
+    mask = (options or {}).get('reset_mask')
+    if mask is not None:
+      return self._reset_some(_checked_mask(mask, self.num_envs, seed)), {}
+    super().reset(seed=None if np.ndim(seed) else seed, options=options)
+    if seed is not None:
+      self._batch.rewind(seed)
+    time_step = self._view.reset()
+    self._has_begun = True
+    self._is_over = np.zeros(self.num_envs, bool)
+    return self._remembered(self._encode(time_step)), {}
+
+  def step(self, actions: Any) -> tuple[
+      codecs.Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]
+  ]:  # fmt: skip
+    """Runs one control step of every world.
+
+    Args:
+      actions: Actions, an element of `action_space`.
+
+    Returns:
+      Observations, rewards, terminations, truncations and infos.
+
+    Raises:
+      ActionError: If an action is not in `single_action_space`.
+      ResetNeeded: If the worlds were never reset, or if one has ended in the
+        mode `DISABLED`.
+      WorldError: If a world failed. All episodes are over.
+    """
+    if not self._has_begun or (
+        self._mode is AutoresetMode.DISABLED and self._is_over.any()
+    ):
+      raise gym.error.ResetNeeded(
+          'step: a world has no episode; call reset(), or'
+          " reset(options={'reset_mask': ...}) for single worlds"
+      )
+    decoded = self._actions.decode(actions)
+    try:
+      time_step = self._view.step(decoded)
+    except errors.WorldError:
+      self._has_begun = False
+      raise
+    self._is_over = time_step.last()
+    terminated = self._is_over & (time_step.discount == 0.0)
+    truncated = self._is_over & ~terminated
+    rewards = self._rewards(time_step)
+    observations = self._encode(time_step)
+    infos: dict[str, Any] = {}
+    if self._mode is AutoresetMode.SAME_STEP and self._is_over.any():
+      for world in np.flatnonzero(self._is_over).tolist():
+        final = {'final_obs': _row(observations, world), 'final_info': {}}
+        infos = self._add_info(infos, final, world)
+      self._last = observations
+      observations = self._reset_some(self._is_over)
+    return (
+        self._remembered(observations), rewards, terminated, truncated, infos
+    )  # fmt: skip
+
+  def render(self) -> tuple[np.ndarray, ...] | None:
+    """Returns a frame of each world for people, or `None`."""
+    if self.render_mode is None:
+      return None
+    return tuple(self._batch.render(None, *self._frame))
+
+  def close_extras(self, **kwargs: Any) -> None:
+    """Frees the worlds."""
+    del kwargs
+    self._view.close()
+    self._batch.close()
+
+  def _reset_some(self, mask: np.ndarray) -> codecs.Observation:
+    """Resets the worlds of a mask; returns the observations of all worlds."""
+    if not self._has_begun and not mask.all():
+      raise gym.error.ResetNeeded(
+          'reset_mask: the other worlds were never reset; call reset() first'
+      )
+    (worlds,) = np.nonzero(mask)
+    first = self._encode(self._view.reset(worlds.tolist()))
+    self._has_begun = True
+    self._is_over = self._is_over & ~mask
+    if len(worlds) == self.num_envs:
+      return self._remembered(first)
+    observations = _copied(self._last)
+    if isinstance(observations, dict):
+      for key, value in observations.items():
+        value[worlds] = first[key]
+    else:
+      observations[worlds] = first
+    return self._remembered(observations)
+
+  def _remembered(self, observations: codecs.Observation) -> codecs.Observation:
+    """Keeps a copy of observations if single worlds may be reset later."""
+    if self._mode is AutoresetMode.DISABLED:
+      self._last = _copied(observations)
+    return observations
+
+  def _encode(
+      self, time_step: batch_time_steps.BatchTimeStep
+  ) -> codecs.Observation:
+    lead = (len(time_step.step_type),)
+    return self._observations.encode(time_step.observation, lead)
+
+  def _rewards(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
+    """Returns rewards; the reading in a first step rewards no action."""
+    if self._reward_key is None:
+      return np.zeros(self.num_envs)
+    readings = time_step.observation[self._reward_key]
+    return np.where(time_step.first(), 0.0, readings)
+
+
+def _row(observations: codecs.Observation, world: int) -> Any:
+  if isinstance(observations, dict):
+    return {key: value[world].copy() for key, value in observations.items()}
+  return observations[world].copy()
+
+
+def _copied(observations: codecs.Observation) -> codecs.Observation:
+  if isinstance(observations, dict):
+    return {key: value.copy() for key, value in observations.items()}
+  return observations.copy()
+
+
+def _checked_mode(given: Any) -> AutoresetMode:
+  try:
+    return AutoresetMode(given)
+  except ValueError:
+    allowed = [mode.value for mode in AutoresetMode]
+    raise errors.SpecError(
+        f'autoreset_mode: {messages.quote(given)}; allowed are {allowed}'
+    ) from None
+
+
+def _checked_mask(given: Any, num_envs: int, seed: Any) -> np.ndarray:
+  mask = np.asarray(given)
+  if mask.shape != (num_envs,) or mask.dtype != bool or not mask.any():
+    raise errors.SpecError(
+        f'reset_mask: {messages.quote(given)}; allowed is an array of'
+        f' {num_envs} bools, at least one of them True'
+    )
+  if seed is not None:
+    raise errors.SpecError(
+        f'reset_mask with seed {messages.quote(seed)}; allowed is None, because'
+        ' a seed applies to all worlds'
+    )
+  return mask

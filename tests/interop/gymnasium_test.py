@@ -1,0 +1,332 @@
+"""Worlds with the interface of Gymnasium: ids, spaces, episodes and secrets."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('gymnasium')
+
+import gymnasium as gym
+from gymnasium.utils import env_checker
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.engine import batch_environment
+from realab_suite.engine import environment
+from realab_suite.engine import single_physics
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.feedback import mechanisms
+from realab_suite.interop.gymnasium import evaluation
+from realab_suite.interop.gymnasium import registration
+from realab_suite.interop.gymnasium import single
+from realab_suite.interop.gymnasium import vector
+
+_NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_DISCRETE = {'overrides': ['action_set={name: dmlab_like, version: 1}']}
+_MAX_STEPS = 6
+_SHORT = {'environment_kwargs': {'max_steps': _MAX_STEPS}}
+_NUM_ENVS = 3
+
+
+def _make(name: str = _NEAR, **options: Any) -> Any:
+  return gym.make(name, **{**_SHORT, **options}).unwrapped
+
+
+def _ids() -> list[str]:
+  """Returns an id for each design, in both domains."""
+  tasks = suite.ALL_TASKS
+  return [
+      registration.id_of(*tasks[3 * i % len(tasks)], design)
+      for i, design in enumerate(suite.DESIGNS)
+  ]
+
+
+def test_every_shipped_world_has_an_id_with_every_design():
+  ids = registration.ids()
+  assert len(ids) == len(set(ids)) == len(suite.ALL_TASKS) * len(suite.DESIGNS)
+  assert set(ids) <= set(gym.registry)
+  assert _NEAR in ids
+
+
+def test_an_id_may_name_the_module_that_registers_it():
+  env = gym.make(f'realab_suite.interop.gymnasium:{_NEAR}')
+  assert isinstance(env.unwrapped, single.RealabEnv)
+
+
+@pytest.mark.parametrize('name', _ids())
+def test_the_checker_of_gymnasium_has_no_warnings(name):
+  env_checker.check_env(_make(name), skip_render_check=True)
+
+
+def test_the_checker_has_no_warnings_about_flat_observations():
+  env = _make(flat=True, reward_register='reward', **_DISCRETE)
+  env_checker.check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize(
+    ('name', 'space'),
+    [
+        ('InstantaneousReward', gym.spaces.Box(-1, 1, (6,), np.float32)),
+        ('OnlineImitation', gym.spaces.Discrete(14)),
+        ('ValueAdvice', gym.spaces.MultiDiscrete([14, 14])),
+    ],
+)
+def test_action_spaces(name, space):
+  assert _make(f'realab/UnlockDoor-near-{name}-v2').action_space == space
+
+
+def test_observations_have_no_slashes_no_empty_shapes_and_classes():
+  space = _make().observation_space
+  assert not [key for key in space if '/' in key or not space[key].shape]
+  assert isinstance(space['senses_ray_classes'], gym.spaces.MultiDiscrete)
+  assert space['registers_reward'].dtype == np.float32
+  exact = _make(dtype='float64')
+  assert exact.observation_space['registers_reward'].dtype == np.float64
+  assert exact.action_space.dtype == np.float64
+
+
+def test_a_flat_observation_is_that_of_gymnasiums_wrapper():
+  flat = _make(flat=True)
+  wrapped = gym.wrappers.FlattenObservation(_make())
+  assert flat.observation_space == wrapped.observation_space
+  for env in (flat, wrapped):
+    env.action_space.seed(2)
+  found, expected = (env.reset(seed=3)[0] for env in (flat, wrapped))
+  for _ in range(3):
+    assert found.dtype == expected.dtype == np.float32
+    np.testing.assert_array_equal(found, expected)
+    found, expected = (
+        env.step(env.action_space.sample())[0] for env in (flat, wrapped)
+    )
+
+
+def test_the_reward_is_zero_or_the_reading_of_a_register():
+  silent, paid = _make(), _make(reward_register='reward', dtype='float64')
+  for env in (silent, paid):
+    env.reset(seed=1)
+  for _ in range(_MAX_STEPS):
+    action = np.ones(6)
+    assert silent.step(action.astype(np.float32))[1] == 0.0
+    observation, reward, *_, info = paid.step(action)
+    assert reward == observation['registers_reward'][0]
+    assert info == {}
+
+
+def test_the_time_limit_truncates_and_the_next_step_needs_a_reset():
+  env = _make()
+  with pytest.raises(gym.error.ResetNeeded):
+    env.step(env.action_space.sample())
+  env.reset(seed=1)
+  ends = [env.step(np.zeros(6, np.float32))[2:4] for _ in range(_MAX_STEPS)]
+  assert ends == [(False, False)] * (_MAX_STEPS - 1) + [(False, True)]
+  with pytest.raises(gym.error.ResetNeeded):
+    env.step(env.action_space.sample())
+
+
+def test_an_end_of_the_task_terminates():
+  kwargs = {'random': 1}
+  env = gym.make(_NEAR, dtype='float64', task_kwargs=kwargs).unwrapped
+  other = suite.load(
+      'unlock_door', 'near', kwargs, design='instantaneous_reward'
+  )
+  actor = actors.make(policies.make('apple_seeker'), other)
+  time_step = other.reset()
+  env.reset()
+  while not time_step.last():
+    action = actor.act(time_step)
+    time_step = other.step(action)
+    *_, terminated, truncated, _ = env.step(action)
+  assert time_step.discount == 0.0
+  assert (terminated, truncated) == (True, False)
+
+
+def test_actions_outside_the_space_are_refused():
+  env = _make()
+  env.reset()
+  with pytest.raises(errors.ActionError, match='outside'):
+    env.step(np.full(6, 1.1, np.float32))
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        ({'reward_register': 'score'}, r"allowed are None .*\['reward'\]"),
+        ({'dtype': 'float16'}, "allowed are 'float32' and 'float64'"),
+        ({'render_mode': 'human'}, 'rgb_array'),
+        ({'camera_name': 'nowhere'}, 'camera'),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+  with pytest.raises(errors.SpecError, match=message):
+    registration.make('unlock_door', 'near', 'instantaneous_reward', **options)
+
+
+def _public(thing: Any) -> dict[str, Any]:
+  return {
+      name: getattr(thing, name, None)
+      for name in dir(thing)
+      if not name.startswith('_')
+  }
+
+
+def test_no_public_attribute_leads_to_the_environment():
+  secret = (
+      environment.Environment, batch_environment.BatchEnvironment,
+      single_physics.ThinPhysics, mechanisms.FeedbackMechanism,
+  )  # fmt: skip
+  for env in (_make(), gym.make_vec(_NEAR, num_envs=2)):
+    env.reset(seed=1)
+    for name, value in _public(env).items():
+      for part in (value, *_public(value).values()):
+        assert not isinstance(part, secret), name
+        closure = (
+            inspect.getclosurevars(part) if inspect.isfunction(part) else None
+        )
+        assert closure is None or not closure.nonlocals, name
+
+
+def _make_vec(mode: str = 'NextStep', **options: Any) -> Any:
+  return gym.make_vec(
+      _NEAR, num_envs=_NUM_ENVS, autoreset_mode=mode,
+      reward_register='reward', **{**_SHORT, **options},
+  )  # fmt: skip
+
+
+def _sync(mode: str, **options: Any) -> Any:
+  """Returns the same worlds in Gymnasium's own vector environment."""
+
+  def maker(world: int) -> Any:
+    kwargs = {'max_steps': _MAX_STEPS, 'world': world}
+    return lambda: _make(
+        environment_kwargs=kwargs, reward_register='reward', **options
+    )
+
+  return gym.vector.SyncVectorEnv(
+      [maker(world) for world in range(_NUM_ENVS)],
+      autoreset_mode=gym.vector.AutoresetMode(mode),
+  )
+
+
+def _assert_same(found: Any, expected: Any) -> None:
+  assert env_checker.data_equivalence(found, expected, exact=True)
+
+
+@pytest.mark.parametrize(
+    ('mode', 'flat'),
+    [
+        ('NextStep', True),
+        ('SameStep', False),
+        ('SameStep', True),
+        ('Disabled', False),
+        ('Disabled', True),
+    ],
+)
+def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(mode, flat):
+  envs, sync = _make_vec(mode, flat=flat), _sync(mode, flat=flat)
+  assert envs.single_observation_space == sync.single_observation_space
+  assert envs.observation_space == sync.observation_space
+  assert envs.action_space == sync.action_space
+  assert envs.metadata['autoreset_mode'] == sync.metadata['autoreset_mode']
+  _assert_same(envs.reset(seed=5), sync.reset(seed=[5] * _NUM_ENVS))
+  envs.action_space.seed(1)
+  is_over = np.zeros(_NUM_ENVS, bool)
+  for i in range(2 * _MAX_STEPS + 3):
+    if mode == 'Disabled' and (is_over.any() or i == 2):
+      # World 1 is reset in mid-episode, so that the worlds get out of step.
+      mask = is_over | (np.arange(_NUM_ENVS) == 1)
+      _assert_same(
+          envs.reset(options={'reset_mask': mask}),
+          sync.reset(options={'reset_mask': mask}),
+      )
+    actions = envs.action_space.sample()
+    found, expected = envs.step(actions), sync.step(actions)
+    _assert_same(found[:4], expected[:4])
+    final = expected[4].pop('final_info', None), expected[4].pop(
+        '_final_info', None
+    )
+    infos = dict(found[4])
+    assert ('final_info' in infos) == (final[0] is not None)
+    infos.pop('final_info', None)
+    infos.pop('_final_info', None)
+    assert infos.keys() == expected[4].keys()
+    for key, value in expected[4].items():
+      _assert_same(list(infos[key]), list(value))
+    is_over = found[2] | found[3]
+  envs.close()
+
+
+def test_the_reading_of_a_first_step_is_no_reward():
+  envs = _make_vec(overrides=['registers.reward.initial=3'])
+  envs.reset(seed=1)
+  for _ in range(_MAX_STEPS + 1):
+    observations, rewards, *_ = envs.step(envs.action_space.sample())
+  np.testing.assert_allclose(observations['registers_reward'], 3.0, atol=1e-4)
+  assert rewards.tolist() == [0.0] * _NUM_ENVS
+
+
+def test_ends_in_a_batch_without_autoreset_need_a_reset():
+  envs = _make_vec('Disabled')
+  with pytest.raises(gym.error.ResetNeeded):
+    envs.step(envs.action_space.sample())
+  envs.reset(seed=1)
+  for _ in range(_MAX_STEPS):
+    envs.step(envs.action_space.sample())
+  with pytest.raises(gym.error.ResetNeeded, match='reset_mask'):
+    envs.step(envs.action_space.sample())
+
+
+@pytest.mark.parametrize(
+    'mask', [[True], np.zeros(_NUM_ENVS, bool), np.ones(_NUM_ENVS)]
+)
+def test_wrong_masks_are_refused(mask):
+  envs = _make_vec('Disabled')
+  envs.reset()
+  with pytest.raises(errors.SpecError, match='reset_mask'):
+    envs.reset(options={'reset_mask': mask})
+
+
+def test_an_unknown_autoreset_mode_is_refused():
+  with pytest.raises(errors.SpecError, match='SameStep'):
+    registration.make_vector(
+        2, 'unlock_door', 'near', autoreset_mode='sometimes'
+    )
+
+
+def test_a_batch_takes_seeds_of_single_worlds():
+  envs = _make_vec()
+  first, _ = envs.reset(seed=[7, 8, 9])
+  expected, _ = _sync('NextStep').reset(seed=[7, 8, 9])
+  _assert_same(first, expected)
+  assert isinstance(envs, vector.RealabVectorEnv)
+
+
+def test_an_evaluation_is_that_of_the_evaluator():
+  action = np.array([1.0, 0.0, 0.5, 0.0, 1.0, 0.0], np.float32)
+  env = gym.make(_NEAR, task_kwargs={'random': 3}, **_SHORT)
+  env = gym.wrappers.FlattenObservation(env)
+  found = evaluation.evaluate(env, lambda _: action, 2, first_episode=1)
+  other = suite.load(
+      'unlock_door', 'near', {'random': 3}, {'max_steps': _MAX_STEPS},
+      design='instantaneous_reward',
+  )  # fmt: skip
+  expected = evaluate.evaluate(other, lambda _: action, 2, first_episode=1)
+  assert found == expected
+  assert found[0].is_valid
+
+
+def test_an_episode_that_a_wrapper_ends_is_given_up():
+  env = gym.wrappers.TimeLimit(_make(), 2)
+  [result] = evaluation.evaluate(env, lambda _: np.zeros(6, np.float32), 1)
+  assert (result.end.value, result.num_steps) == ('abandoned', 2)
+
+
+def test_only_worlds_of_this_package_can_be_evaluated():
+  env = gym.make('CartPole-v1')
+  with pytest.raises(errors.ResultsError, match='CartPole'):
+    evaluation.evaluate(env, lambda _: 0, 1)
+  with pytest.raises(errors.ResultsError, match='num_episodes'):
+    evaluation.evaluate(_make(), lambda _: 0, 0)
