@@ -63,7 +63,16 @@ EXTRAS: Mapping[str, Extra] = {
     ),
     'tb': Extra(('tensorboardX',), 'learning curves for TensorBoard'),
     'rpc': Extra(('dm_env_rpc', 'grpc'), 'worlds for other processes'),
+    'gym': Extra(('gymnasium',), 'the interface of Gymnasium'),
+    'sb3': Extra(('stable_baselines3',), 'training with Stable-Baselines3'),
+    'data': Extra(
+        ('pyarrow', 'minari', 'gymnasium', 'h5py', 'PIL'),
+        'exports to Parquet and Minari',
+    ),
     'cluster': Extra(('ray', 'submitit'), 'sweeps on a cluster'),
+    'docs': Extra(
+        ('sphinx', 'furo', 'myst_parser'), 'the site of the documentation'
+    ),
     'dev': Extra(
         ('pytest', 'xdist', 'hypothesis', 'ruff', 'pyink', 'mypy'),
         'tests of this package',
