@@ -7,6 +7,7 @@ from importlib import resources
 from typing import Any
 
 from dm_control import composer
+from dm_control.rl import control
 import mujoco
 import numpy as np
 
@@ -15,6 +16,7 @@ from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
+from realab_suite.engine import control_tasks
 from realab_suite.engine import environment
 from realab_suite.engine import forking
 from realab_suite.engine import placement
@@ -275,7 +277,7 @@ def load_batch(
 
 
 def embed(
-    task: composer.Task,
+    task: composer.Task | control.Environment,
     design: specs.Design,
     *,
     random: int | np.random.RandomState | None = None,
@@ -307,9 +309,12 @@ def embed(
   Raises:
     SpecError: If the design is wrong or does not fit the task.
   """
+  if isinstance(task, control.Environment):
+    task = control_tasks.ControlTask(task)
   if not isinstance(task, composer.Task):
     raise errors.SpecError(
-        f'task: {messages.quote(task)}; allowed are Composer tasks'
+        f'task: {messages.quote(task)}; allowed are Composer tasks, and tasks'
+        ' of dm_control.suite as its load function returns them'
     )
   world = arguments.world(world)
   seed = seeding.as_seed(random)

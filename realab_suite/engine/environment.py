@@ -76,7 +76,7 @@ class Environment(composer.Environment):
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
-        recompile_mjcf_every_episode=not self._is_ours,
+        recompile_mjcf_every_episode=foreign.is_recompiled(task),
         strip_singleton_obs_buffer_dim=True,
     )
     self._host = host = foreign.make_host(

@@ -17,6 +17,7 @@ from dm_env import specs
 import mujoco
 import numpy as np
 
+from realab_suite.engine import control_tasks
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.tasks import base
@@ -149,6 +150,11 @@ class ForeignHost(hosts.Host):
         float(self._task.get_discount(physics)),
         bool(self._task.should_terminate_episode(physics)),
     )
+
+
+def is_recompiled(task: composer.Task) -> bool:
+  """Returns True if the model of a task may change between episodes."""
+  return not isinstance(task, base.Task | control_tasks.ControlTask)
 
 
 def make_host(
