@@ -16,6 +16,7 @@ from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
+from realab_suite.engine import control_sources
 from realab_suite.engine import control_tasks
 from realab_suite.engine import environment
 from realab_suite.engine import forking
@@ -37,6 +38,9 @@ DESIGNS = specs.DESIGNS
 
 fork = forking.fork
 """Makes a batch of worlds that all continue from the state of one world."""
+
+CONTROL_SUITE = 'dm_control/'
+"""Prefix of the domains of `dm_control.suite`, as in `dm_control/quadruped`."""
 
 TaskFactory = Callable[..., base.Task]
 
@@ -107,6 +111,13 @@ def _find_task(
         f' are {known}'
     )
   return _TASKS[domain_name, task_name]
+
+
+def _control_name(domain_name: Any) -> str | None:
+  """Returns the name of a domain in `dm_control.suite`, or `None`."""
+  if isinstance(domain_name, str) and domain_name.startswith(CONTROL_SUITE):
+    return domain_name.removeprefix(CONTROL_SUITE)
+  return None
 
 
 def _format(name: Any) -> str:
@@ -190,8 +201,13 @@ def load(
         f'visualize_reward={messages.quote(visualize_reward)} would show the'
         ' true reward to the agent; allowed is False'
     )
-  factory, _ = _find_task(domain_name, task_name)
-  options: dict[str, Any] = {'max_steps': MAX_STEPS}
+  factory: Callable[..., Any]
+  options: dict[str, Any] = {}
+  if control_name := _control_name(domain_name):
+    factory = functools.partial(control_sources.load, control_name, task_name)
+  else:
+    factory, _ = _find_task(domain_name, task_name)
+    options['max_steps'] = MAX_STEPS
   options |= _keywords('environment_kwargs', environment_kwargs)
   known = ('max_steps', 'senses', 'world')
   if unknown := [key for key in options if key not in known]:
@@ -256,6 +272,12 @@ def load_batch(
         'environment_kwargs: unknown world: a batch contains all worlds from'
         ' 0; allowed are max_steps and senses'
     )
+  if _control_name(domain_name):
+    raise errors.SpecError(
+        f'{_format(domain_name)}: a batch steps many states of one model, but'
+        ' this task computes in Python and may change its model; load single'
+        " environments, with environment_kwargs={'world': i} for world i"
+    )
   num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
   sleep = arguments.flag('sleep', sleep)
@@ -315,6 +337,11 @@ def embed(
     raise errors.SpecError(
         f'task: {messages.quote(task)}; allowed are Composer tasks, and tasks'
         ' of dm_control.suite as its load function returns them'
+    )
+  if isinstance(task.observables, list | tuple):
+    raise errors.SpecError(
+        f'task: {type(task).__name__} has {len(task.observables)} agents;'
+        ' allowed are tasks with one agent'
     )
   world = arguments.world(world)
   seed = seeding.as_seed(random)

@@ -79,8 +79,8 @@ class BatchEnvironment:
     sleep = arguments.flag('sleep', sleep)
     if not isinstance(single.task, base.Task):
       raise errors.SpecError(
-          f'{type(single.task).__name__} is compiled for each episode; a batch'
-          ' accepts only tasks of this package'
+          f'{type(single.task).__name__} keeps state in Python; a batch accepts'
+          ' only tasks of this package: step environments with world=i instead'
       )
     hooks.refuse_in_batch(single.task, single.has_extra_hooks)
     self._single = single

@@ -9,14 +9,15 @@ from collections.abc import Iterator, Mapping
 import importlib.util
 import inspect
 from typing import Any, Self, final
+from xml.etree import ElementTree
 
 from dm_control import mjcf
 from dm_control import mujoco as dm_mujoco
 from dm_control.rl import control
-from lxml import etree
 import mujoco
 
 from realab_suite import errors
+from realab_suite.config import messages
 
 # Numbers that two models have in common if one is compiled from the source of
 # the other. Values may differ: tasks change them, and some are drawn at random.
@@ -42,6 +43,31 @@ class _Recorder(dm_mujoco.Physics):
   @classmethod
   def from_xml_string(cls, xml_string: Any, assets: Any = None) -> Self:
     raise _Found(xml_string, assets or {})
+
+
+def load(
+    domain_name: str, task_name: str, **kwargs: Any
+) -> control.Environment:
+  """Loads a task of `dm_control.suite`.
+
+  Args:
+    domain_name: Name of the domain, such as `'quadruped'`.
+    task_name: Name of the task, such as `'fetch'`.
+    **kwargs: Keyword arguments of the task.
+
+  Raises:
+    UnknownNameError: If there is no such task.
+  """
+  # The import takes as long as those of half of this package.
+  from dm_control import suite
+
+  if (domain_name, task_name) not in suite.ALL_TASKS:
+    known = [f'{domain}.{task}' for domain, task in suite.ALL_TASKS]
+    raise errors.UnknownNameError(
+        f'task {messages.quote(task_name)} of {messages.quote(domain_name)} is'
+        f' unknown in dm_control.suite; known are {known}'
+    )
+  return suite.load(domain_name, task_name, task_kwargs={'random': 0, **kwargs})
 
 
 def find(env: control.Environment) -> mjcf.RootElement:
@@ -99,7 +125,7 @@ def _candidates(
 
 def _parsed(xml: Any, assets: Mapping[str, Any]) -> mjcf.RootElement:
   """Returns a source as a PyMJCF model to which registers can be attached."""
-  root = etree.XML(xml)
+  root = ElementTree.fromstring(xml)
   # PyMJCF writes the root class itself.
   for default in root.findall('default[@class]'):
     del default.attrib['class']
@@ -109,4 +135,4 @@ def _parsed(xml: Any, assets: Mapping[str, Any]) -> mjcf.RootElement:
   # They contain no positions of registers.
   for keyframe in root.findall('keyframe'):
     root.remove(keyframe)
-  return mjcf.from_xml_string(etree.tostring(root), assets=dict(assets))
+  return mjcf.from_xml_string(ElementTree.tostring(root), assets=dict(assets))

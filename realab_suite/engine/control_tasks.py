@@ -44,6 +44,9 @@ _MODEL = (
 )  # fmt: skip
 _NO_CONTACTS = mujoco.mjtDisableBit.mjDSBL_CONTACT
 _NO_CONSTRAINTS = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+_NO_GRAVITY = mujoco.mjtDisableBit.mjDSBL_GRAVITY
+# Largest component of the quaternion of a plane that is a floor.
+_UPRIGHT = 1e-6
 _ALL_BITS = 0x7FFFFFFF
 # Differences of rangefinders between both worlds that are not numerical, in m.
 _SEEN = 1e-6
@@ -94,8 +97,7 @@ class ControlTask(composer.Task):
           ' so its episodes cannot be seeded'
       )
     model = control_sources.find(env)
-    # With the noslip pass, meters would affect bodies that they do not touch.
-    model.option.noslip_iterations = 0
+    _prepare(model, self._own.model.ptr)
     self._root = ControlArena(model)
     self.set_timesteps(env.control_timestep(), self._own.timestep())
     self._kinds = np.zeros(0, int)
@@ -141,17 +143,21 @@ class ControlTask(composer.Task):
     _refuse_mismatch(own, joint)
     joint.stat.meaninertia = own.stat.meaninertia
     is_joint = np.arange(joint.ngeom) >= own.ngeom
+    is_block = is_joint & (joint.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
     is_moving = joint.body_weldid[joint.geom_bodyid] != 0
-    self._kinds = np.where(is_joint, 2, np.where(is_moving, 1, 0))
+    self._kinds = np.where(is_block, 2, np.where(is_moving, 1, 0))
     is_solid = (joint.geom_contype | joint.geom_conaffinity) != 0
     # Registers collide with everything that is solid.
-    joint.geom_contype[is_joint & is_solid] = _ALL_BITS
-    joint.geom_conaffinity[is_joint & is_solid] = _ALL_BITS
+    joint.geom_contype[is_block & is_solid] = _ALL_BITS
+    joint.geom_conaffinity[is_block & is_solid] = _ALL_BITS
     if own.opt.disableflags & (_NO_CONTACTS | _NO_CONSTRAINTS):
       # Registers still need contacts; bodies of the task touch only registers.
+      # Planes are endless, and walls are for decoration here.
+      is_wall = joint.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+      is_wall &= np.abs(joint.geom_quat[:, 1:3]).max(axis=1) > _UPRIGHT
       joint.geom_contype[~is_joint] = 0
-      joint.geom_conaffinity[~is_joint & is_solid] = 1
-      joint.opt.disableflags &= ~(_NO_CONTACTS | _NO_CONSTRAINTS)
+      joint.geom_conaffinity[~is_joint] = (is_solid & ~is_wall)[~is_joint]
+    joint.opt.disableflags &= ~(_NO_CONTACTS | _NO_CONSTRAINTS | _NO_GRAVITY)
     self._push_model(joint)
 
   def initialize_episode(self, physics: Any, random_state: Any) -> None:
@@ -217,6 +223,8 @@ class ControlTask(composer.Task):
       values = getattr(own, name)
       getattr(joint, name)[: len(values)] = values
     joint.body_subtreemass[0] = world_mass
+    if own.opt.disableflags & _NO_GRAVITY:
+      joint.body_gravcomp[: own.nbody] = 1.0
     if own.opt.disableflags & _NO_CONSTRAINTS:
       # Constraints are enabled for registers only.
       joint.jnt_limited[: own.njnt] = 0
@@ -244,7 +252,7 @@ class ControlTask(composer.Task):
       values[:] = getattr(joint, name)[: len(values)]
 
   def _see_registers(self, physics: Any) -> None:
-    """Copies what rangefinders measure, which may be the distance of a block."""
+    """Copies the distances of registers that rangefinders measure."""
     model = self._own.model.ptr
     is_ray = model.sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER
     for i in np.flatnonzero(is_ray).tolist():
@@ -252,6 +260,30 @@ class ControlTask(composer.Task):
       at = model.sensor_adr[i]
       if abs(joint[at] - own[at]) > _SEEN:
         own[at] = joint[at]
+
+
+def _prepare(model: mjcf.RootElement, own: mujoco.MjModel) -> None:
+  """Changes the source of a task so that registers can be added.
+
+  Args:
+    model: Source of the task.
+    own: Compiled model of the task.
+  """
+  # With the noslip pass, meters would affect bodies that they do not touch.
+  model.option.noslip_iterations = 0
+  if own.opt.disableflags & _NO_GRAVITY:
+    # Registers have weight, and bodies of the task still have none.
+    for body in model.find_all('body'):
+      body.gravcomp = 1.0
+  is_floor = own.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+  is_floor &= np.abs(own.geom_quat[:, 1:3]).max(axis=1) <= _UPRIGHT
+  if not (is_floor & (own.geom_pos[:, 2] == 0.0)).any():
+    # Registers stand at the height 0. As a part of the last body, this floor is
+    # after the geoms of the task.
+    body = model.worldbody.add('body', name='floor_of_registers')
+    body.add(
+        'geom', type='plane', size=(1, 1, 1), group=4, contype=0, conaffinity=1
+    )
 
 
 @functools.cache

@@ -17,9 +17,13 @@ from dm_env import specs
 import mujoco
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.engine import control_tasks
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
+from realab_suite.engine import placement
+from realab_suite.engine import swept_volumes
+from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
 
@@ -155,6 +159,64 @@ class ForeignHost(hosts.Host):
 def is_recompiled(task: composer.Task) -> bool:
   """Returns True if the model of a task may change between episodes."""
   return not isinstance(task, base.Task | control_tasks.ControlTask)
+
+
+def check_places(
+    physics: mjcf.Physics,
+    task: composer.Task,
+    mechanism: mechanisms.FeedbackMechanism,
+) -> None:
+  """Checks the places of registers in an arena that was generated anew.
+
+  Args:
+    physics: Physics of the new model; its state is reset.
+    task: Foreign task.
+    mechanism: Registers, meters and providers.
+
+  Raises:
+    EpisodeInitializationError: If a register would be inside a wall. The next
+      attempt generates another arena.
+  """
+  if not mechanism.registers:
+    return
+  try:
+    placement.check(physics, task.root_entity, mechanism)
+  except errors.SpecError as error:
+    raise composer.EpisodeInitializationError(
+        f'design {mechanism.design.name!r}: {error}'
+    ) from error
+
+
+def check_start(
+    physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
+) -> None:
+  """Checks that no episode begins with something inside a register.
+
+  Args:
+    physics: Physics at the start of an episode.
+    mechanism: Registers, meters and providers.
+
+  Raises:
+    EpisodeInitializationError: If something is. The next attempt draws other
+      positions.
+  """
+  owners = {
+      int(physics.bind(block.geom).element_id): name
+      for name, register in mechanism.registers.items()
+      for block in register.blocks
+  }
+  model, contacts = physics.model, physics.data.ptr.contact
+  for (one, other), depth in zip(contacts.geom, -contacts.dist, strict=True):
+    block, body = (one, other) if one in owners else (other, one)
+    if block not in owners or body in owners:
+      continue
+    if depth > swept_volumes.TOLERANCE:
+      name = model.id2name(int(body), 'geom') or f'geom {body}'
+      raise composer.EpisodeInitializationError(
+          f'design {mechanism.design.name!r}: register {owners[block]!r} would'
+          f' be {depth:.2g} m inside {name!r} when the episode begins; place it'
+          ' elsewhere'
+      )
 
 
 def make_host(
