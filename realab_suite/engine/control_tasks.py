@@ -118,6 +118,11 @@ class ControlTask(composer.Task):
     return self._root
 
   @property
+  def own_physics(self) -> Any:
+    """Physics of the task, without registers."""
+    return self._own
+
+  @property
   def task_observables(self) -> dict[str, observable.Observable]:
     return self._observables
 

@@ -29,7 +29,38 @@ from realab_suite.tasks import base
 
 @final
 class ForeignPhysics(mjcf.Physics):
-  """`mjcf.Physics` with the methods that the engine calls."""
+  """`mjcf.Physics` with the methods that the engine calls.
+
+  Composer recomputes accelerations, and the sensors that measure them, when a
+  bound attribute is read after a write. A write to a register must not cause
+  this, because the task would then observe other values. The registers are
+  therefore read and written between `pause` and `resume`.
+  """
+
+  _is_paused = False
+  _was_dirty = False
+
+  def pause(self) -> None:
+    """Ends a part of the task's control step."""
+    self._is_paused, self._was_dirty = True, self._dirty
+
+  def resume(self) -> None:
+    """Continues the task's control step after writes to registers."""
+    if self._is_paused:
+      self.refresh()
+      self._is_paused, self._dirty = False, self._was_dirty
+
+  def forward(self) -> None:
+    """Updates derived quantities; between `pause` and `resume`, only poses."""
+    if self._is_paused:
+      self.refresh()
+    else:
+      super().forward()
+
+  def reset(self, keyframe_id: int | None = None) -> None:
+    """Resets the state, also after an exception in a pause."""
+    self._is_paused = False
+    super().reset(keyframe_id)
 
   def refresh(self) -> None:
     """Updates the quantities derived from positions and velocities.
@@ -40,6 +71,7 @@ class ForeignPhysics(mjcf.Physics):
     """
     with self.check_invalid_state():
       mujoco.mj_step1(self.model.ptr, self.data.ptr)
+    self._dirty = False
 
   def check(self) -> None:
     """Does nothing, because `step` checks its result."""
@@ -117,6 +149,7 @@ class ForeignHost(hosts.Host):
   ) -> None:
     self._hooks.before_step(physics, controls, self._random_state)
     self._updater().prepare_for_next_control_step()
+    self._pause(physics)
 
   def advance(
       self,
@@ -125,8 +158,9 @@ class ForeignHost(hosts.Host):
       num_substeps: int,
       is_last: bool,
   ) -> None:
-    if self._has_registers and num_substeps:
-      physics.refresh()
+    if not num_substeps:
+      return
+    _foreign(physics).resume()
     for i in range(num_substeps):
       self._hooks.before_substep(physics, controls, self._random_state)
       physics.advance(1)
@@ -134,6 +168,11 @@ class ForeignHost(hosts.Host):
       # The update of the last substep comes after `after_step`.
       if not (is_last and i == num_substeps - 1):
         self._updater().update()
+    self._pause(physics)
+
+  def _pause(self, physics: hosts.SteppedPhysics) -> None:
+    if self._has_registers:
+      _foreign(physics).pause()
 
   def is_over(self, physics: hosts.SteppedPhysics) -> bool:
     del physics  # Composer checks only at the end of a step.
@@ -143,6 +182,7 @@ class ForeignHost(hosts.Host):
       self, physics: hosts.SteppedPhysics, was_over: Any, is_ending: Any
   ) -> hosts.Ending:
     del was_over, is_ending
+    _foreign(physics).resume()
     self._hooks.after_step(physics, self._random_state)
     self._updater().update()
     reward, failure = hosts.true_reward(
@@ -154,6 +194,10 @@ class ForeignHost(hosts.Host):
         float(self._task.get_discount(physics)),
         bool(self._task.should_terminate_episode(physics)),
     )
+
+
+def _foreign(physics: Any) -> ForeignPhysics:
+  return physics
 
 
 def is_recompiled(task: composer.Task) -> bool:
