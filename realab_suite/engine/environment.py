@@ -462,7 +462,7 @@ class Environment(composer.Environment):
       self._hooks.initialize_episode_mjcf(self._random_state)
       self._recompile_physics_and_update_observables()
       foreign.check_places(self._physics, self._task, self._mechanism)
-    with self._physics.reset_context():
+    with foreign.initializing(self._physics, self._mechanism):
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     if not self._is_ours:
       foreign.check_start(self._physics, self._mechanism)

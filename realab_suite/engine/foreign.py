@@ -205,6 +205,44 @@ def is_recompiled(task: composer.Task) -> bool:
   return not isinstance(task, base.Task | control_tasks.ControlTask)
 
 
+@contextlib.contextmanager
+def initializing(
+    physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
+) -> Iterator[None]:
+  """Returns the context in which an episode is initialized.
+
+  Foreign tasks look for positions without any contacts. In the context, blocks
+  of registers therefore touch nothing, not even the floor they stand on.
+
+  Args:
+    physics: Physics of one world.
+    mechanism: Registers, meters and providers.
+  """
+  with physics.reset_context():
+    if not isinstance(physics, ForeignPhysics):
+      yield
+      return
+    geoms = [physics.bind(geom).element_id for geom in _geoms(mechanism)]
+    masks = physics.model.geom_contype, physics.model.geom_conaffinity
+    before = [mask[geoms].copy() for mask in masks]
+    try:
+      for mask in masks:
+        mask[geoms] = 0
+      yield
+    finally:
+      for mask, values in zip(masks, before, strict=True):
+        mask[geoms] = values
+
+
+def _geoms(mechanism: mechanisms.FeedbackMechanism) -> dict[Any, str]:
+  """Returns the names of registers by the geoms of their blocks."""
+  return {
+      block.geom: name
+      for name, register in mechanism.registers.items()
+      for block in register.blocks
+  }
+
+
 def check_places(
     physics: mjcf.Physics,
     task: composer.Task,
@@ -245,9 +283,8 @@ def check_start(
       positions.
   """
   owners = {
-      int(physics.bind(block.geom).element_id): name
-      for name, register in mechanism.registers.items()
-      for block in register.blocks
+      int(physics.bind(geom).element_id): name
+      for geom, name in _geoms(mechanism).items()
   }
   model, contacts = physics.model, physics.data.ptr.contact
   for (one, other), depth in zip(contacts.geom, -contacts.dist, strict=True):

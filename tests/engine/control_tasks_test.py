@@ -127,6 +127,12 @@ def test_a_task_beside_registers_equals_the_original_bit_for_bit(
   env.close()
 
 
+def test_the_table_of_the_documentation_lists_the_tested_tasks():
+  rows = helpers.rows_of_page('embedding.md', 'equal, bit for bit', 3)
+  found = {row[0]: row[1].split(', ') for row in rows if row[0] in _TASKS}
+  assert found == _TASKS
+
+
 @pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
 def test_a_body_that_touches_a_register_is_stopped_by_it(channel: str):
   """A pendulum, which has no contacts of its own, swings against a block."""

@@ -311,6 +311,17 @@ def test_what_a_task_observes_does_not_depend_on_registers_nearby(name: str):
       )
 
 
+def test_the_table_of_the_documentation_lists_the_tested_tasks():
+  rows = [
+      row
+      for row in helpers.rows_of_page('embedding.md', 'equal, bit for bit', 3)
+      if row[1] == 'equal, bit for bit'
+  ]
+  assert [row[0] for row in rows] == list(_TASKS)
+  tested = {row[0] for row in rows if row[2] == 'within 1e-3'}
+  assert tested == set(_TASKS) - _WITHOUT_REGISTERS
+
+
 def test_a_task_with_several_agents_is_refused():
   with pytest.raises(errors.SpecError, match='has 2 agents'):
     suite.embed(soccer.load(team_size=1).task, 'none')
