@@ -22,6 +22,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import forking
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
+from realab_suite.entities import avatars
 from realab_suite.entities import block_kinds
 from realab_suite.entities import measurables
 from realab_suite.feedback import mechanisms
@@ -366,6 +367,9 @@ def embed(
     if isinstance(task, base.Task):
       task.remove_blocks(_blocks_of(mechanism))
       task.physics_timestep = timestep
+    else:
+      for avatar in _avatars_of(task):
+        avatar.forget(_blocks_of(mechanism))
     mechanism.detach_from_root()
     raise
 
@@ -387,6 +391,9 @@ def _connected(
     task.physics_timestep = min(
         task.physics_timestep, block_kinds.timestep_for(blocks)
     )
+  else:
+    for avatar in _avatars_of(task):
+      avatar.make_graspable(_blocks_of(mechanism))
   env = environment.Environment(
       task,
       mechanism,
@@ -458,3 +465,9 @@ def _keywords(argument: str, value: Any) -> dict[str, Any]:
 
 def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
   return [b for r in mechanism.registers.values() for b in r.blocks]
+
+
+def _avatars_of(task: composer.Task) -> list[avatars.Avatar]:
+  """Returns this package's avatars in the world of a foreign task."""
+  entities = task.root_entity.iter_entities()
+  return [one for one in entities if isinstance(one, avatars.Avatar)]

@@ -291,6 +291,8 @@ def check_start(
     block, body = (one, other) if one in owners else (other, one)
     if block not in owners or body in owners:
       continue
+    if model.geom_type[body] == mujoco.mjtGeom.mjGEOM_HFIELD:
+      continue  # Uneven ground, which lifts a block.
     if depth > swept_volumes.TOLERANCE:
       name = model.id2name(int(body), 'geom') or f'geom {body}'
       raise composer.EpisodeInitializationError(
