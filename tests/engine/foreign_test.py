@@ -354,7 +354,9 @@ class _Curious(events.EventSink):
 def test_a_sink_that_looks_changes_nothing(name: str, with_register: bool):
   design: Any = {'schema': 1, 'name': 'd'}
   if with_register:
-    design['registers'] = {'r': _REGISTER}
+    place, scale = _PLACES.get(name, ([3.0, 3.0], 0.1))
+    register = _REGISTER | {'place': place, 'scale': scale}
+    design['registers'] = {'r': register}
     design['providers'] = [{'kind': 'constant', 'writes': ['r'], 'value': 1.0}]
 
   def play(is_watched: bool) -> list[bytes]:
