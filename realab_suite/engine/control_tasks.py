@@ -157,11 +157,11 @@ class ControlTask(composer.Task):
     joint.geom_conaffinity[is_block & is_solid] = _ALL_BITS
     if own.opt.disableflags & (_NO_CONTACTS | _NO_CONSTRAINTS):
       # Registers still need contacts; bodies of the task touch only registers.
-      # Planes are endless, and walls are for decoration here.
-      is_wall = joint.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-      is_wall &= np.abs(joint.geom_quat[:, 1:3]).max(axis=1) > _UPRIGHT
+      # Everything else is for decoration here: targets, and walls, which are
+      # endless planes.
+      is_solid &= is_moving | _are_floors(joint)
       joint.geom_contype[~is_joint] = 0
-      joint.geom_conaffinity[~is_joint] = (is_solid & ~is_wall)[~is_joint]
+      joint.geom_conaffinity[~is_joint] = is_solid[~is_joint]
     joint.opt.disableflags &= ~(_NO_CONTACTS | _NO_CONSTRAINTS | _NO_GRAVITY)
     self._push_model(joint)
 
@@ -280,15 +280,19 @@ def _prepare(model: mjcf.RootElement, own: mujoco.MjModel) -> None:
     # Registers have weight, and bodies of the task still have none.
     for body in model.find_all('body'):
       body.gravcomp = 1.0
-  is_floor = own.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-  is_floor &= np.abs(own.geom_quat[:, 1:3]).max(axis=1) <= _UPRIGHT
-  if not (is_floor & (own.geom_pos[:, 2] == 0.0)).any():
+  if not (_are_floors(own) & (own.geom_pos[:, 2] == 0.0)).any():
     # Registers stand at the height 0. As a part of the last body, this floor is
     # after the geoms of the task.
     body = model.worldbody.add('body', name='floor_of_registers')
     body.add(
         'geom', type='plane', size=(1, 1, 1), group=4, contype=0, conaffinity=1
     )
+
+
+def _are_floors(model: mujoco.MjModel) -> np.ndarray:
+  """Returns True for each geom that is a plane facing up, `(geoms,)` bool."""
+  is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+  return is_plane & (np.abs(model.geom_quat[:, 1:3]).max(axis=1) <= _UPRIGHT)
 
 
 @functools.cache
