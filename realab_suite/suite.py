@@ -7,6 +7,7 @@ from importlib import resources
 from typing import Any
 
 from dm_control import composer
+from dm_control.rl import control
 import mujoco
 import numpy as np
 
@@ -15,11 +16,14 @@ from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
+from realab_suite.engine import control_sources
+from realab_suite.engine import control_tasks
 from realab_suite.engine import environment
 from realab_suite.engine import forking
 from realab_suite.engine import placement
 from realab_suite.engine import plain
 from realab_suite.engine import seeding
+from realab_suite.entities import avatars
 from realab_suite.entities import block_kinds
 from realab_suite.entities import measurables
 from realab_suite.feedback import mechanisms
@@ -36,6 +40,9 @@ DESIGNS = specs.DESIGNS
 
 fork = forking.fork
 """Makes a batch of worlds that all continue from the state of one world."""
+
+CONTROL_SUITE = 'dm_control/'
+"""Prefix of the domains of `dm_control.suite`, as in `dm_control/quadruped`."""
 
 TaskFactory = Callable[..., base.Task]
 
@@ -106,6 +113,13 @@ def _find_task(
         f' are {known}'
     )
   return _TASKS[domain_name, task_name]
+
+
+def _control_name(domain_name: Any) -> str | None:
+  """Returns the name of a domain in `dm_control.suite`, or `None`."""
+  if isinstance(domain_name, str) and domain_name.startswith(CONTROL_SUITE):
+    return domain_name.removeprefix(CONTROL_SUITE)
+  return None
 
 
 def _format(name: Any) -> str:
@@ -194,8 +208,13 @@ def load(
         f'visualize_reward={messages.quote(visualize_reward)} would show the'
         ' true reward to the agent; allowed is False'
     )
-  factory, _ = _find_task(domain_name, task_name)
-  options: dict[str, Any] = {'max_steps': MAX_STEPS}
+  factory: Callable[..., Any]
+  options: dict[str, Any] = {}
+  if control_name := _control_name(domain_name):
+    factory = functools.partial(control_sources.load, control_name, task_name)
+  else:
+    factory, _ = _find_task(domain_name, task_name)
+    options['max_steps'] = MAX_STEPS
   options |= _keywords('environment_kwargs', environment_kwargs)
   known = ('max_steps', 'senses', 'world')
   if unknown := [key for key in options if key not in known]:
@@ -260,6 +279,12 @@ def load_batch(
         'environment_kwargs: unknown world: a batch contains all worlds from'
         ' 0; allowed are max_steps and senses'
     )
+  if _control_name(domain_name):
+    raise errors.SpecError(
+        f'{_format(domain_name)}: a batch steps many states of one model, but'
+        ' this task computes in Python and may change its model; load single'
+        " environments, with environment_kwargs={'world': i} for world i"
+    )
   num_envs = arguments.num_envs(num_envs)
   num_threads = arguments.num_threads(num_threads)
   sleep = arguments.flag('sleep', sleep)
@@ -281,7 +306,7 @@ def load_batch(
 
 
 def embed(
-    task: composer.Task,
+    task: composer.Task | control.Environment,
     design: specs.Design,
     *,
     random: int | np.random.RandomState | None = None,
@@ -313,9 +338,17 @@ def embed(
   Raises:
     SpecError: If the design is wrong or does not fit the task.
   """
+  if isinstance(task, control.Environment):
+    task = control_tasks.ControlTask(task)
   if not isinstance(task, composer.Task):
     raise errors.SpecError(
-        f'task: {messages.quote(task)}; allowed are Composer tasks'
+        f'task: {messages.quote(task)}; allowed are Composer tasks, and tasks'
+        ' of dm_control.suite as its load function returns them'
+    )
+  if isinstance(task.observables, list | tuple):
+    raise errors.SpecError(
+        f'task: {type(task).__name__} has {len(task.observables)} agents;'
+        ' allowed are tasks with one agent'
     )
   world = arguments.world(world)
   seed = seeding.as_seed(random)
@@ -340,6 +373,9 @@ def embed(
     if isinstance(task, base.Task):
       task.remove_blocks(_blocks_of(mechanism))
       task.physics_timestep = timestep
+    else:
+      for avatar in _avatars_of(task):
+        avatar.forget(_blocks_of(mechanism))
     mechanism.detach_from_root()
     raise
 
@@ -379,6 +415,9 @@ def _connected(
     task.physics_timestep = min(
         task.physics_timestep, block_kinds.timestep_for(blocks)
     )
+  else:
+    for avatar in _avatars_of(task):
+      avatar.make_graspable(_blocks_of(mechanism))
   env = environment.Environment(
       task,
       mechanism,
@@ -450,3 +489,9 @@ def _keywords(argument: str, value: Any) -> dict[str, Any]:
 
 def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
   return [b for r in mechanism.registers.values() for b in r.blocks]
+
+
+def _avatars_of(task: composer.Task) -> list[avatars.Avatar]:
+  """Returns this package's avatars in the world of a foreign task."""
+  entities = task.root_entity.iter_entities()
+  return [one for one in entities if isinstance(one, avatars.Avatar)]

@@ -68,15 +68,14 @@ class Environment(composer.Environment):
     self._sinks: list[events.EventSink] = []
     self._closed = False
     self._has_extra_hooks = False
-    # Tasks of this package are compiled once and have no hooks in substeps.
-    # Foreign tasks are stepped as in Composer.
+    # Tasks of this package have no hooks in substeps.
     self._is_ours = isinstance(task, base.Task)
     if isinstance(task, base.Task):
       hooks.refuse_in_substeps(task)
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
-        recompile_mjcf_every_episode=not self._is_ours,
+        recompile_mjcf_every_episode=foreign.is_recompiled(task),
         strip_singleton_obs_buffer_dim=True,
     )
     self._host = host = foreign.make_host(
@@ -458,14 +457,15 @@ class Environment(composer.Environment):
         len(self._mechanism.design.providers),
     )
 
-  def _initialize_episode(self, attempt: int) -> None:
-    del attempt  # Every attempt resets the physics.
+  def _initialize_episode(self, unused_attempt: int) -> None:
     if self._recompile_mjcf_every_episode:
       self._hooks.initialize_episode_mjcf(self._random_state)
       self._recompile_physics_and_update_observables()
-    with self._physics.reset_context():
+      foreign.check_places(self._physics, self._task, self._mechanism)
+    with foreign.initializing(self._physics, self._mechanism):
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     if not self._is_ours:
+      foreign.check_start(self._physics, self._mechanism)
       self._observation_updater.reset(self._physics_proxy, self._random_state)
 
   def _make_observation_updater(self) -> Any:

@@ -17,18 +17,55 @@ from dm_env import specs
 import mujoco
 import numpy as np
 
+from realab_suite import errors
+from realab_suite.engine import control_tasks
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
+from realab_suite.engine import placement
+from realab_suite.engine import swept_volumes
+from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
 
 @final
 class ForeignPhysics(mjcf.Physics):
-  """`mjcf.Physics` with the methods that the engine calls."""
+  """`mjcf.Physics` with the methods that the engine calls.
+
+  Composer recomputes accelerations, and the sensors that measure them, when a
+  bound attribute is read after a write. A write to a register must not cause
+  this, because the task would then observe other values. The registers are
+  therefore read and written between `pause` and `resume`.
+  """
+
+  _is_paused = False
+  _was_dirty = False
+
+  def pause(self) -> None:
+    """Ends a part of the task's control step."""
+    self._is_paused, self._was_dirty = True, self._dirty
+
+  def resume(self) -> None:
+    """Continues the task's control step after writes to registers."""
+    if self._is_paused:
+      self.refresh()
+      self._is_paused, self._dirty = False, self._was_dirty
+
+  def forward(self) -> None:
+    """Updates derived quantities; between `pause` and `resume`, only poses."""
+    if self._is_paused:
+      self.refresh()
+    else:
+      super().forward()
+
+  def reset(self, keyframe_id: int | None = None) -> None:
+    """Resets the state, also after an exception in a pause."""
+    self._is_paused = False
+    super().reset(keyframe_id)
 
   def refresh(self) -> None:
     """Updates the quantities derived from positions and velocities."""
     refresh(self)
+    self._dirty = False
 
   def check(self) -> None:
     """Does nothing, because `step` checks its result."""
@@ -128,6 +165,7 @@ class ForeignHost(hosts.Host):
   ) -> None:
     self._hooks.before_step(physics, controls, self._random_state)
     self._updater().prepare_for_next_control_step()
+    self._pause(physics)
 
   def advance(
       self,
@@ -136,8 +174,9 @@ class ForeignHost(hosts.Host):
       num_substeps: int,
       is_last: bool,
   ) -> None:
-    if self._has_registers and num_substeps:
-      physics.refresh()
+    if not num_substeps:
+      return
+    _foreign(physics).resume()
     for i in range(num_substeps):
       self._hooks.before_substep(physics, controls, self._random_state)
       physics.advance(1)
@@ -148,6 +187,12 @@ class ForeignHost(hosts.Host):
     if is_last:
       self._hooks.after_step(physics, self._random_state)
       self._updater().update()
+    else:
+      self._pause(physics)
+
+  def _pause(self, physics: hosts.SteppedPhysics) -> None:
+    if self._has_registers:
+      _foreign(physics).pause()
 
   def is_over(self, physics: hosts.SteppedPhysics) -> bool:
     del physics  # Composer checks only at the end of a step.
@@ -166,6 +211,112 @@ class ForeignHost(hosts.Host):
         float(self._task.get_discount(physics)),
         bool(self._task.should_terminate_episode(physics)),
     )
+
+
+def _foreign(physics: Any) -> ForeignPhysics:
+  return physics
+
+
+def is_recompiled(task: composer.Task) -> bool:
+  """Returns True if the model of a task may change between episodes."""
+  return not isinstance(task, base.Task | control_tasks.ControlTask)
+
+
+@contextlib.contextmanager
+def initializing(
+    physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
+) -> Iterator[None]:
+  """Returns the context in which an episode is initialized.
+
+  Foreign tasks look for positions without any contacts. In the context, blocks
+  of registers therefore touch nothing, not even the floor they stand on.
+
+  Args:
+    physics: Physics of one world.
+    mechanism: Registers, meters and providers.
+  """
+  with physics.reset_context():
+    if not isinstance(physics, ForeignPhysics):
+      yield
+      return
+    geoms = [physics.bind(geom).element_id for geom in _geoms(mechanism)]
+    masks = physics.model.geom_contype, physics.model.geom_conaffinity
+    before = [mask[geoms].copy() for mask in masks]
+    try:
+      for mask in masks:
+        mask[geoms] = 0
+      yield
+    finally:
+      for mask, values in zip(masks, before, strict=True):
+        mask[geoms] = values
+
+
+def _geoms(mechanism: mechanisms.FeedbackMechanism) -> dict[Any, str]:
+  """Returns the names of registers by the geoms of their blocks."""
+  return {
+      block.geom: name
+      for name, register in mechanism.registers.items()
+      for block in register.blocks
+  }
+
+
+def check_places(
+    physics: mjcf.Physics,
+    task: composer.Task,
+    mechanism: mechanisms.FeedbackMechanism,
+) -> None:
+  """Checks the places of registers in an arena that was generated anew.
+
+  Args:
+    physics: Physics of the new model; its state is reset.
+    task: Foreign task.
+    mechanism: Registers, meters and providers.
+
+  Raises:
+    EpisodeInitializationError: If a register would be inside a wall. The next
+      attempt generates another arena.
+  """
+  if not mechanism.registers:
+    return
+  try:
+    placement.check(physics, task.root_entity, mechanism)
+  except errors.SpecError as error:
+    raise composer.EpisodeInitializationError(
+        f'design {mechanism.design.name!r}: {error}'
+    ) from error
+
+
+def check_start(
+    physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
+) -> None:
+  """Checks that no episode begins with something inside a register.
+
+  Args:
+    physics: Physics at the start of an episode.
+    mechanism: Registers, meters and providers.
+
+  Raises:
+    EpisodeInitializationError: If something is. The next attempt draws other
+      positions.
+  """
+  owners = {
+      int(physics.bind(geom).element_id): name
+      for geom, name in _geoms(mechanism).items()
+  }
+  model, contacts = physics.model, physics.data.ptr.contact
+  for (one, other), depth in zip(contacts.geom, -contacts.dist, strict=True):
+    block, body = (one, other) if one in owners else (other, one)
+    if block not in owners or body in owners:
+      continue
+    if model.geom_type[body] == mujoco.mjtGeom.mjGEOM_HFIELD:
+      continue  # Uneven ground, which lifts a block.
+    if depth > swept_volumes.TOLERANCE:
+      name = model.id2name(int(body), 'geom') or f'geom {body}'
+      raise composer.EpisodeInitializationError(
+          f'design {mechanism.design.name!r}: register {owners[block]!r} would'
+          f' be {depth:.2g} m inside {name!r} when the episode begins; place it'
+          ' elsewhere'
+      )
 
 
 def make_host(

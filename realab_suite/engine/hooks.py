@@ -66,8 +66,8 @@ def refuse_in_batch(task: composer.Task, has_extra_hooks: bool) -> None:
   """
   if not isinstance(task, base.Task):
     raise errors.SpecError(
-        f'{type(task).__name__} is compiled for each episode; a batch accepts'
-        ' only tasks of this package'
+        f'{type(task).__name__} keeps state in Python; a batch accepts only'
+        ' tasks of this package: step environments with world=i instead'
     )
   if has_extra_hooks:
     raise errors.SpecError(

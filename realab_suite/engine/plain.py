@@ -62,7 +62,6 @@ class PlainTask(composer.Task):
     self._num_substeps = env.num_substeps
     self._senses = env.senses
     self._is_ours = isinstance(env.task, base.Task)
-    self._refreshes = self._is_ours or bool(env.mechanism.registers)
     self._starts = {
         0,
         self._schedule.meter_substep,
@@ -169,6 +168,10 @@ class PlainTask(composer.Task):
           f'legacy_step: False; allowed for {type(self._task).__name__} is'
           ' True, as in suite.embed'
       )
+    if not self._is_ours:
+      # Composer chooses the class, whose attributes are the same. This one
+      # keeps the sensors of the task as they are while registers are written.
+      physics.__class__ = foreign.ForeignPhysics
     if self._episode < 0:
       seeding.reseed(random_state, self._seed, self._world, 0, 'construction')
     self._task.after_compile(physics, random_state)
@@ -288,7 +291,6 @@ class PlainTask(composer.Task):
     now, step = self._num_done, self._step
     if now == 0:
       self._updater.prepare_for_next_control_step()
-      step.write_queries(self._queries)
     elif not self._is_ours:
       self._updater.update()
     if now not in self._starts:
@@ -297,12 +299,18 @@ class PlainTask(composer.Task):
       if not physics.legacy_step:  # Poses are those before the last substep.
         foreign.refresh(physics)
       self._task.latch_events(physics)
+    if not self._is_ours and self._mechanism.registers:
+      physics.pause()
+    if now == 0:
+      step.write_queries(self._queries)
     if now == self._schedule.meter_substep:
       step.update_meters()
     if now == self._schedule.provider_substep:
       step.update_providers(self._observation, self._keys, self._states)
-    if self._refreshes:
+    if self._is_ours:
       foreign.refresh(physics)
+    else:
+      physics.resume()
 
   def _observe(self, physics: Any) -> Mapping[str, np.ndarray]:
     """Returns the observation, which the first call after a change makes."""

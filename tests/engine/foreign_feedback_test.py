@@ -14,6 +14,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.engine import environment
+from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from tests.engine import helpers
 
@@ -152,6 +153,65 @@ def test_a_sense_that_is_called_like_one_of_ours_is_refused():
   with pytest.raises(errors.RealabError, match='time_left'):
     helpers.embed(Clashing(), max_steps=5)
   helpers.embed(Clashing(), max_steps=None)  # Nothing clashes.
+
+
+class _WithAvatar(composer.Task):
+  """A task of another package that uses the avatar of this one."""
+
+  def __init__(self) -> None:
+    self._arena = floors.Floor(size=(8.0, 8.0))
+    self.avatar = avatars.Avatar()
+    self._arena.attach(self.avatar)
+    self.set_timesteps(control_timestep=0.1, physics_timestep=0.01)
+
+  @property
+  def root_entity(self) -> composer.Entity:
+    return self._arena
+
+  def action_spec(self, physics: Any) -> Any:
+    return self.avatar.action_spec
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    self.avatar.place(physics, (0.0, 0.0), 0.0)
+
+  def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
+    self.avatar.apply_action(physics, action)
+
+  def get_reward(self, physics: Any) -> float:
+    return 0.0
+
+
+@pytest.mark.parametrize('grasp', [0.0, 1.0])
+def test_the_avatar_carries_a_register_in_the_arena_of_another_package(
+    grasp: float,
+):
+  register = {
+      'kind': 'block_position', 'role': 'feedback', 'place': [0.7, 0.0],
+      'range': [-20, 20], 'dof': 'planar',
+  }  # fmt: skip
+  design = {
+      'schema': 1,
+      'name': 'd',
+      'registers': {'r': register},
+      'providers': [
+          {'kind': 'constant', 'writes': ['r'], 'value': 0.0, 'every': 1000}
+      ],
+  }
+  task = _WithAvatar()
+  # A design that is refused leaves nothing in the hand.
+  with pytest.raises(errors.SpecError):
+    helpers.embed(task, design | {'schedule': {'meter_substep': 90}})
+  env, _ = helpers.embed(task, design, max_steps=None)
+  env.reset()
+  names = env.action_spec().name.split('\t')
+  for forward in [0.0] * 3 + [-1.0] * 15:
+    action = np.zeros(len(names))
+    action[[n.endswith('forward') for n in names]] = forward
+    action[[n.endswith('grasp') for n in names]] = grasp
+    time_step = env.step(action)
+  moved = float(time_step.observation['registers/r']) * 0.1
+  np.testing.assert_equal(moved < -0.3, bool(grasp))
+  assert grasp or abs(moved) < 1e-3
 
 
 # What this package takes from the inside of dm_control.

@@ -9,6 +9,7 @@ from dm_control import manipulation
 from dm_control.composer.variation import distributions
 from dm_control.locomotion import arenas
 from dm_control.locomotion import props
+from dm_control.locomotion import soccer
 from dm_control.locomotion import tasks
 from dm_control.locomotion import walkers
 from dm_control.manipulation.shared import registry
@@ -16,6 +17,7 @@ import dm_env
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.engine import seeding
@@ -149,6 +151,15 @@ _TASKS: dict[str, Callable[[], composer.Task]] = {
     'reach a brick': _manipulation('reach_duplo_features'),
     'lift a brick': _manipulation('lift_brick_features'),
     'stack bricks': _manipulation('stack_2_bricks_features'),
+    'place a brick': _manipulation('place_brick_features'),
+    'place in a cradle': _manipulation('place_cradle_features'),
+    'lift a large box': _manipulation('lift_large_box_features'),
+    'reassemble bricks': _manipulation(
+        'reassemble_3_bricks_fixed_order_features'
+    ),
+    'stack on a movable base': _manipulation(
+        'stack_2_bricks_moveable_base_features'
+    ),
     'a bead on a wire': helpers.PointTask,
 }
 
@@ -239,6 +250,83 @@ def test_episodes_that_the_task_ends_end_as_in_composer(name: str):
   assert 2 in seen
 
 
+def _small_actions(env: Any, number: int) -> list[np.ndarray]:
+  spec = env.action_spec()
+  generator = np.random.default_rng(0)
+  low, high = np.maximum(spec.minimum, -1), np.minimum(spec.maximum, 1)
+  return [generator.uniform(low, high) for _ in range(number)]
+
+
+# Places of registers at which nothing touches them, where [3, 3] is none, and
+# scales at which their values fit there. The first cell of a maze is free.
+_PLACES = {
+    'walls corridor': ([4.0, 2.0], 0.05),
+    'humanoid in a corridor': ([4.0, 2.0], 0.05),
+    'single goal maze': ([0.0, 0.0], 0.01),
+    'single goal maze that respawns': ([0.0, 0.0], 0.01),
+}
+# Registers cannot stand here for all values: the large target is in the way, or
+# the arena has gaps or walls all over.
+_WITHOUT_REGISTERS = {
+    'single goal maze that ends at once', 'gaps corridor', 'many goals maze',
+    'heterogeneous goals maze',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    'name', [name for name in _TASKS if name not in _WITHOUT_REGISTERS]
+)
+def test_what_a_task_observes_does_not_depend_on_registers_nearby(name: str):
+  place, scale = _PLACES.get(name, ([3.0, 3.0], 0.1))
+  register = _REGISTER | {'place': place, 'scale': scale}
+  design: Any = {
+      'schema': 1,
+      'name': 'd',
+      'registers': {'r': register},
+      'providers': [{'kind': 'constant', 'writes': ['r'], 'value': 1.0}],
+  }
+  found: list[list[Any]] = []
+  for with_register in (False, True):
+    env = suite.embed(
+        _make(name),
+        design if with_register else 'none',
+        random=_SEED,
+        max_steps=None,
+    )
+    ledger = ledgers.Ledger()
+    env.add_sink(ledger)
+    actions = _small_actions(env, 6)
+    time_steps = [_lucky(env.reset)]
+    time_steps += [
+        _lucky(functools.partial(env.step, action)) for action in actions
+    ]
+    found.append([t.observation for t in time_steps])
+    rewards = ledger.last.true_rewards
+    found[-1].append({'senses/reward': np.array(rewards)})
+    env.close()
+  for bare, beside in zip(*found, strict=True):
+    for key, value in bare.items():
+      np.testing.assert_allclose(
+          beside[key], value, rtol=1e-3, atol=1e-3, err_msg=key
+      )
+
+
+def test_the_table_of_the_documentation_lists_the_tested_tasks():
+  rows = [
+      row
+      for row in helpers.rows_of_page('embedding.md', 'equal, bit for bit', 3)
+      if row[1] == 'equal, bit for bit'
+  ]
+  assert [row[0] for row in rows] == list(_TASKS)
+  tested = {row[0] for row in rows if row[2] == 'within 1e-3'}
+  assert tested == set(_TASKS) - _WITHOUT_REGISTERS
+
+
+def test_a_task_with_several_agents_is_refused():
+  with pytest.raises(errors.SpecError, match='has 2 agents'):
+    suite.embed(soccer.load(team_size=1).task, 'none')
+
+
 class _Curious(events.EventSink):
   """Reads what derives from the state, at every opportunity."""
 
@@ -266,7 +354,9 @@ class _Curious(events.EventSink):
 def test_a_sink_that_looks_changes_nothing(name: str, with_register: bool):
   design: Any = {'schema': 1, 'name': 'd'}
   if with_register:
-    design['registers'] = {'r': _REGISTER}
+    place, scale = _PLACES.get(name, ([3.0, 3.0], 0.1))
+    register = _REGISTER | {'place': place, 'scale': scale}
+    design['registers'] = {'r': register}
     design['providers'] = [{'kind': 'constant', 'writes': ['r'], 'value': 1.0}]
 
   def play(is_watched: bool) -> list[bytes]:
