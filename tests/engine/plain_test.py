@@ -208,9 +208,15 @@ def test_a_task_of_dm_control_gives_the_same_bytes(design, steps):
   assert pair.corruptions().max() > 1.0
 
 
-def test_stepping_from_old_derived_quantities_is_noticed():
+def test_stepping_from_old_derived_quantities_is_noticed(monkeypatch):
   pair = _rolling(_ASKED)
-  pair.task._refreshes = False
+  after_compile = pair.task.after_compile
+
+  def spoil(physics, random_state):
+    after_compile(physics, random_state)
+    physics.resume = lambda: None
+
+  monkeypatch.setattr(pair.task, 'after_compile', spoil)
   with pytest.raises(AssertionError):
     pair.play(_roller(pair), 45)
 
