@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import math
 import pathlib
-import queue
 import time
 from typing import Any, final
 
@@ -258,11 +257,8 @@ class _Session:
 
   def _receive(self, timeout: float) -> None:
     """Processes the messages that arrive within a time, in seconds."""
-    try:
-      content = self._server.messages.get(timeout=timeout).content
-    except queue.Empty:
-      return
-    match content:
+    message = self._server.receive(timeout)
+    match None if message is None else message.content:
       case {'type': 'down', 'code': str(code)}:
         self._keys.press(code)
       case {'type': 'up', 'code': str(code)}:

@@ -7,7 +7,6 @@ are logged as a dataset, which the source `recorded` replays.
 from collections import deque
 import json
 import pathlib
-import queue
 import time
 from typing import Any, final
 
@@ -59,20 +58,21 @@ class Supervision:
     self._env, self._server = env, server
     self._path = folder / ANSWERS
     self._period = 1.0 / rate
-    people = [
-        provider
-        for provider in env.mechanism.design.providers
-        if isinstance(provider, person.Person)
-        and isinstance(provider.source, answer_sources.Live)
-    ]
+    people, sources = [], []
+    for provider in env.mechanism.design.providers:
+      if isinstance(provider, person.Person):
+        source = provider.source
+        if isinstance(source, answer_sources.Live):
+          people.append(provider)
+          sources.append(source)
     if not people:
       raise errors.SpecError(
           f'design {env.mechanism.design.name!r}: no provider of kind person'
           ' with the live source of answers; allowed is a design with one'
       )
     self._clip = max(one.clip for one in people)
-    for one in people:
-      one.source.connect(self._ask)
+    for source in sources:
+      source.connect(self._ask)
     self._asks = [one.asks for one in people]
     self._view = views.first_person(env)
     self._pictures: deque[bytes] = deque(maxlen=2 * self._clip)
@@ -122,7 +122,8 @@ class Supervision:
     while not (self._is_running and self._server.is_connected):
       self._receive(_PATIENCE)
       self._deadline = time.monotonic()
-    while (left := self._deadline - time.monotonic()) > 0:
+    # An answer starts the next step at once, and later steps stay on time.
+    while not self._given and (left := self._deadline - time.monotonic()) > 0:
       self._receive(left)
     self._deadline = max(self._deadline, time.monotonic()) + self._period
 
@@ -168,9 +169,11 @@ class Supervision:
       ):
         for picture in clip:
           self._server.send_picture(view, picture)
+    self._drain()
+    if question.waits:
+      self._given.pop(asks, None)  # It belongs to an earlier question.
     if asks != answer_sources.STOP:
       self._server.send(content)
-    self._drain()
     while (
         question.waits
         and asks not in self._given
@@ -203,15 +206,14 @@ class Supervision:
 
   def _drain(self) -> None:
     """Processes the messages that have arrived."""
-    while not self._server.messages.empty():
-      self._receive(0.0)
+    while self._receive(0.0):
+      pass
 
-  def _receive(self, timeout: float) -> None:
-    """Processes a message, if one arrives within a time in seconds."""
-    try:
-      message = self._server.messages.get(timeout=max(timeout, 1e-4))
-    except queue.Empty:
-      return
+  def _receive(self, timeout: float) -> bool:
+    """Processes a message; returns False if none arrives in `timeout` s."""
+    message = self._server.receive(timeout)
+    if message is None:
+      return False
     match message.content:
       case {'type': 'run' | 'pause' as kind}:
         self._is_running = kind == 'run'
@@ -224,6 +226,7 @@ class Supervision:
           'time': int(clicked) | float(clicked),
       } if asks in self._asks and 0 <= _rank(asks, value):
         self._given[asks] = float(value), clicked / 1e3
+    return True
 
   def _save(self) -> None:
     """Appends the answers of an episode to the log."""

@@ -1,4 +1,4 @@
-"""Tests of a person as feedback provider, with simulated and recorded answers."""
+"""Tests of a person as feedback provider, simulated or recorded."""
 
 import json
 
@@ -102,7 +102,8 @@ def test_recorded_answers_repeat_an_episode(tmp_path):
   [live] = evaluate.evaluate(env, policies.make('random'), 1)
   file = tmp_path / 'answers.jsonl'
   file.write_text('\n'.join(log))
-  design = supervised_designs.design('approval', 'recorded', {'file': str(file)})
+  options = {'file': str(file)}
+  design = supervised_designs.design('approval', 'recorded', options)
   again = _evaluate('random', design, 30)
   assert len(log) == 10
   assert again.observed_return == live.observed_return

@@ -41,7 +41,9 @@ class Person(base.Provider):
   writes: base.OneName
   clip: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 10
   waits: bool = False
-  answers: Annotated[str, option_types.NameIn(answer_sources.ANSWERS)] = 'simulated'
+  answers: Annotated[str, option_types.NameIn(answer_sources.ANSWERS)] = (
+      'simulated'
+  )
   options: Annotated[
       dict[str, Any], option_types.OptionsOf(answer_sources.ANSWERS, 'answers')
   ] = pydantic.Field(default_factory=dict)

@@ -75,7 +75,8 @@ class PageServer:
     self._token = secrets.token_urlsafe(16)
     self._connection: websocket_server.ServerConnection | None = None
     self._is_connected = threading.Event()
-    self.messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    self._is_closed = False
+    self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
     try:
       self._server = websocket_server.serve(
           self._handle,
@@ -107,6 +108,25 @@ class PageServer:
     """True while a page is connected."""
     return self._is_connected.is_set()
 
+  def receive(self, timeout: float) -> Message | None:
+    """Returns the next message, or `None` without one within a time.
+
+    Args:
+      timeout: The time, in seconds.
+
+    Raises:
+      ResultsError: If the server is closed.
+    """
+    if self._is_closed:
+      raise errors.ResultsError(
+          'the page was closed before the last episode ended; episodes up to'
+          ' then are on disk'
+      )
+    try:
+      return self._messages.get(timeout=max(timeout, 0.0))
+    except queue.Empty:
+      return None
+
   def send(self, content: dict[str, Any]) -> None:
     """Sends a message to the page, if there is one."""
     self._send(json.dumps(content, allow_nan=False))
@@ -122,6 +142,7 @@ class PageServer:
 
   def close(self) -> None:
     """Stops to serve."""
+    self._is_closed = True
     connection = self._connection
     if connection is not None:
       connection.close()
@@ -183,7 +204,7 @@ class PageServer:
         except ValueError:
           continue
         if isinstance(content, dict):
-          self.messages.put(Message(arrival, content))
+          self._messages.put(Message(arrival, content))
     finally:
       if self._connection is connection:
         self._connection = None
