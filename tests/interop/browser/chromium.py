@@ -13,7 +13,7 @@ _ARGUMENTS = (
     '--disable-background-networking', '--disable-component-update',
     '--disable-sync',
 )  # fmt: skip
-_PATIENCE_MS = 120_000
+_PATIENCE_MS = 60_000
 
 
 def needed():

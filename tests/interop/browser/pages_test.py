@@ -68,29 +68,32 @@ def test_a_replay_opens_offline_and_its_timeline_moves_the_scene(tmp_path):
   file.write_text(text, encoding='utf-8')
   assert result.num_steps == 250
   assert len(text.encode()) < 5e6
-  with chromium.page(900, 720) as (page, requests):
+  with chromium.page(760, 600) as (page, requests):
     page.goto(file.as_uri())
     page.wait_for_selector('#root input')
+    _wait_for(page, lambda step: step >= 5)
     box = page.locator('#realab svg').first.bounding_box()
     page.mouse.click(box['x'] + 0.2 * box['width'], box['y'] + 10)
-    page.wait_for_function(
-        "document.getElementById('realab-clock').textContent"
-        ".startsWith('step 50 of 250')"
-    )
-    page.wait_for_timeout(5000)
+    _wait_for(page, lambda step: step == 50)
     _save(page, 'replay')
     page.click('text=First person')
     page.wait_for_function("location.hash.startsWith('#first')")
     page.wait_for_selector('#root input')
-    page.wait_for_function(
-        "document.getElementById('realab-clock').textContent"
-        ".startsWith('step 50 of 250')"
-    )
-    page.wait_for_timeout(5000)
+    _wait_for(page, lambda step: step == 50)
     _save(page, 'replay_first_person')
   assert all(
       one.startswith(('file:', 'data:', 'blob:')) for one in requests
   )
+
+
+def _wait_for(page, is_right):
+  """Waits until the time line of a replay is at a step."""
+  for _ in range(600):
+    text = page.locator('#realab-clock').text_content()
+    if text.startswith('step ') and is_right(int(text.split()[1])):
+      return
+    page.wait_for_timeout(100)
+  raise AssertionError(f'the time line is at {text!r}')
 
 
 def _settings(**changes):
@@ -104,7 +107,7 @@ def _settings(**changes):
           'seed': 1,
           'num_episodes': 1,
           'max_steps': 60,
-          'rate': 1000.0,
+          'rate': 20.0,
           'task_kwargs': {},
           'output': None,
           **changes,
