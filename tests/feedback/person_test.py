@@ -47,9 +47,7 @@ def test_a_person_stops_an_agent_that_does_nothing_good():
 
 def _simulate(steps, **options):
   source = answer_sources.Simulated(**{**_EXACT, **options})
-  env = suite.load(
-      'unlock_door', 'near', {'random': 1}, design='value_advice'
-  )
+  env = suite.load('unlock_door', 'near', {'random': 1}, design='value_advice')
   observation = env.reset().observation
   state = source.initial_state(())
   found = []

@@ -34,8 +34,9 @@ def fixture_chromium():
   chromium.needed()
 
 
-def _save(page, name):
+def _save(page, name, seconds=0.0):
   if folder := os.environ.get('SCREENSHOTS'):
+    page.wait_for_timeout(1000 * seconds)
     page.screenshot(path=pathlib.Path(folder) / f'{name}.png')
 
 
@@ -75,15 +76,13 @@ def test_a_replay_opens_offline_and_its_timeline_moves_the_scene(tmp_path):
     box = page.locator('#realab svg').first.bounding_box()
     page.mouse.click(box['x'] + 0.2 * box['width'], box['y'] + 10)
     _wait_for(page, lambda step: step == 50)
-    _save(page, 'replay')
+    _save(page, 'replay', 12.0)
     page.click('text=First person')
     page.wait_for_function("location.hash.startsWith('#first')")
     page.wait_for_selector('#root input')
     _wait_for(page, lambda step: step == 50)
-    _save(page, 'replay_first_person')
-  assert all(
-      one.startswith(('file:', 'data:', 'blob:')) for one in requests
-  )
+    _save(page, 'replay_first_person', 12.0)
+  assert all(one.startswith(('file:', 'data:', 'blob:')) for one in requests)
 
 
 def _wait_for(page, is_right):

@@ -8,11 +8,11 @@ import pytest
 
 pytest.importorskip('websockets')
 
-from websockets import exceptions  # noqa: E402 - after the check.
-from websockets.sync import client  # noqa: E402
+from websockets import exceptions
+from websockets.sync import client
 
-from realab_suite import errors  # noqa: E402
-from realab_suite.interop.browser import servers  # noqa: E402
+from realab_suite import errors
+from realab_suite.interop.browser import servers
 
 
 @pytest.fixture(name='server')
