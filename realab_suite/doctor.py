@@ -69,6 +69,10 @@ EXTRAS: Mapping[str, Extra] = {
         ('pyarrow', 'minari', 'gymnasium', 'h5py', 'PIL'),
         'exports to Parquet and Minari',
     ),
+    'browser': Extra(
+        ('viser', 'mjviser', 'websockets', 'PIL'),
+        'replays in 3D and pages for people',
+    ),
     'cluster': Extra(('ray', 'submitit'), 'sweeps on a cluster'),
     'docs': Extra(
         ('sphinx', 'furo', 'myst_parser'), 'the site of the documentation'

@@ -5,6 +5,7 @@ The pictures and films are made by `page_pictures` and `page_clips`.
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
+import os
 import pathlib
 
 import jinja2
@@ -71,7 +72,7 @@ def write(
   details = [table for table in details if table.rows]
   cautions = caveats.caveats(sweep, figures)
   whole = _render(
-      sweep, figures, top, overview, details, cautions, say, no_clips
+      sweep, figures, top, overview, details, cautions, say, no_clips, output
   )
   with storage.explained(output):
     output.mkdir(parents=True, exist_ok=True)
@@ -104,6 +105,7 @@ def _render(
     cautions: Sequence[str],
     say: _Say,
     no_clips: str | None,
+    output: pathlib.Path,
 ) -> str:
   """Returns the page; the same inputs give the same text."""
   styles = chart_style.styles([run.name for run in sweep.learned()])
@@ -139,6 +141,7 @@ def _render(
       no_causes=no_causes,
       clips=[clip for clip in clips if clip is not film],
       no_clips=no_clips,
+      replays=_replays(sweep, output),
       caveats=cautions,
       made_with=_made_with(sweep),
       speeds=_speeds(sweep),
@@ -146,6 +149,18 @@ def _render(
       designs=_designs(sweep),
       colours={name: style.colour for name, style in styles.items()},
   )  # fmt: skip
+
+
+def _replays(
+    sweep: sweep_results.Sweep, output: pathlib.Path
+) -> list[tuple[str, str]]:
+  """Returns the names and relative addresses of the replays of a sweep."""
+  folder = sweep.folder / sweep_results.REPLAYS
+  relative = os.path.relpath(folder.resolve(), output.resolve())
+  return [
+      (path.stem, f'{pathlib.PurePath(relative, path.name).as_posix()}')
+      for path in sorted(folder.glob('*.html'))
+  ]
 
 
 def _environment() -> jinja2.Environment:

@@ -23,6 +23,9 @@ from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.feedback import specs
 
+REPLAYS = 'replays'
+"""Folder of the pages with replays, in the folder of a sweep."""
+
 _CURVE_KEYS = (
     'step', 'num_episodes', 'num_invalid', 'true_return', 'observed_return',
     'gain', 'registers',

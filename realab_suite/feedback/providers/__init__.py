@@ -7,6 +7,7 @@ from realab_suite.feedback.providers.constant import Constant
 from realab_suite.feedback.providers.demonstration import Demonstration
 from realab_suite.feedback.providers.difference import Difference
 from realab_suite.feedback.providers.paired_advice import PairedAdvice
+from realab_suite.feedback.providers.person import Person
 from realab_suite.feedback.providers.value_advice import ValueAdvice
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     'Difference',
     'Observation',
     'PairedAdvice',
+    'Person',
     'Provider',
     'ValueAdvice',
 ]

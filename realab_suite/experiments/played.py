@@ -1,0 +1,270 @@
+"""Episodes that a person plays in a browser, with the summary of any agent.
+
+The person acts by keyboard and sees the view of the avatar, as well as the
+observed and the true return. The actions are those of `dmlab_like`.
+"""
+
+from collections.abc import Callable, Mapping
+import contextlib
+import dataclasses
+import math
+import pathlib
+import time
+from typing import Any, final
+
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.engine import environment
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import results
+from realab_suite.experiments import machines
+from realab_suite.experiments import result_tables
+from realab_suite.experiments import scripted
+from realab_suite.experiments import storage
+from realab_suite.experiments import tracking
+from realab_suite.feedback import specs
+from realab_suite.interop.browser import keyboards
+from realab_suite.interop.browser import servers
+from realab_suite.interop.browser import views
+from realab_suite.policies import action_sets
+
+PERSON = 'person'
+"""Name of the run of the person."""
+
+_BASELINE = 'apple_seeker'
+# Time between two looks whether the page is back, in seconds.
+_PATIENCE = 0.2
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Settings:
+  """Settings of episodes to play.
+
+  Attributes:
+    domain: Domain of the task.
+    task: Name of the task in its domain.
+    design: The design.
+    seed: Seed of the episodes.
+    num_episodes: Number of episodes.
+    max_steps: Maximum length of an episode, in control steps.
+    rate: Largest number of control steps per second.
+    task_kwargs: Arguments of the task, without the seed.
+    output: New folder for the results, or `None`.
+  """
+
+  domain: str
+  task: str
+  design: specs.DesignSpec
+  seed: int
+  num_episodes: int
+  max_steps: int
+  rate: float
+  task_kwargs: Mapping[str, Any]
+  output: str | None
+
+
+def play(
+    settings: Settings,
+    server: servers.PageServer,
+    say: Callable[[str], None],
+) -> list[result_tables.Line]:
+  """Plays episodes, and compares them with those of a scripted policy.
+
+  Args:
+    settings: Settings of the episodes.
+    server: Server of the page `play`.
+    say: Called with messages for the user.
+
+  Returns:
+    The summary of the person and of the baseline.
+
+  Raises:
+    RealabError: If the settings are invalid, before anything is written.
+  """
+  with contextlib.ExitStack() as stack:
+    env = stack.enter_context(contextlib.closing(_load(settings)))
+    session = _Session(env, server, settings)
+    stack.callback(session.close)
+    keyboard = keyboards.Keyboard(session.take)
+    baseline = policies.make(_BASELINE)
+    for policy in (keyboard, baseline):
+      actors.make(policy, env)  # Raises errors before anything is written.
+    writer = None
+    if settings.output is not None:
+      folder = _describe(settings)
+      path = folder / 'episodes.jsonl'
+      writer = stack.enter_context(results.RowWriter(path))
+    rows: dict[str, list[results.EpisodeRow]] = {PERSON: [], _BASELINE: []}
+    for name, policy in ((PERSON, keyboard), (_BASELINE, baseline)):
+      if name == _BASELINE:
+        server.send({'type': 'working', 'text': 'The baseline acts'})
+      for episode in range(settings.num_episodes):
+        sinks = []
+        if name == PERSON:
+          sinks.append(tracking.Tracker(env, session.on_step))
+        [result] = evaluate.evaluate(
+            env, policy, 1, first_episode=episode, sinks=sinks
+        )
+        row = results.row(_info(settings, name, env), result)
+        rows[name].append(row)
+        if writer is not None:
+          writer.write(row)
+    scales = gains.scales(settings.design)
+    lines = result_tables.summarize(rows, _BASELINE, scales)
+    text = f'{result_tables.as_text(lines)}\n\n{result_tables.readings(lines)}'
+    server.send({'type': 'summary', 'text': text})
+    say(f'{text}\n\n{session.speed()}')
+    if settings.output is not None:
+      storage.write_whole(folder / 'summary.md', f'{text}\n'.encode())
+  return lines
+
+
+def _load(settings: Settings) -> environment.Environment:
+  return suite.load(
+      settings.domain,
+      settings.task,
+      task_kwargs={**settings.task_kwargs, 'random': settings.seed},
+      environment_kwargs={'max_steps': settings.max_steps},
+      design=settings.design,
+  )
+
+
+def _describe(settings: Settings) -> pathlib.Path:
+  """Creates the folder of the results, with a description; returns it."""
+  folder = scripted.make_folder(str(settings.output))
+  described = dataclasses.asdict(settings)
+  described['design'] = settings.design.to_mapping()
+  described['machine'] = machines.here()
+  described['versions'] = results.versions()
+  storage.write_json(folder / 'run.json', described)
+  return folder
+
+
+def _info(
+    settings: Settings, name: str, env: environment.Environment
+) -> results.RunInfo:
+  world = (settings.domain, settings.task)
+  return results.RunInfo.of(
+      world,
+      suite.dynamics(*world),
+      settings.design,
+      policy=name,
+      run=name,
+      baseline=None if name == _BASELINE else _BASELINE,
+      control_timestep=env.control_timestep(),
+      max_steps=env.max_steps,
+  )
+
+
+def state(
+    track: tracking.Track, title: str, action: str | None
+) -> dict[str, Any]:
+  """Returns what the page of a person shows, as plain data without NaN.
+
+  Args:
+    track: Track of the episode so far.
+    title: Title of the page.
+    action: Name of the last action, or `None`.
+  """
+  registers = []
+  for name, register in track.registers.items():
+    written, read = register.applied[-1], register.reading[-1]
+    registers.append(
+        {
+            'name': name,
+            'role': register.role,
+            'written': _known(written),
+            'read': _known(read),
+            'corruption': _known(read - written),
+        }
+    )
+  return {
+      'type': 'state',
+      'title': title,
+      'episode': track.episode,
+      'step': track.num_steps,
+      'max_steps': track.max_steps,
+      'time': float(track.times[-1]),
+      'action': action,
+      'true_return': track.true_return,
+      'observed_return': track.observed_return,
+      'registers': registers,
+  }
+
+
+def _known(value: float) -> float | None:
+  return value if math.isfinite(value) else None
+
+
+@final
+class _Session:
+  """Shows episodes in the page, and paces them."""
+
+  def __init__(
+      self,
+      env: environment.Environment,
+      server: servers.PageServer,
+      settings: Settings,
+  ) -> None:
+    self._server = server
+    self._view = views.first_person(env)
+    self._keys = keyboards.Keys()
+    self._period = 1.0 / settings.rate
+    self._title = f'{settings.domain}.{settings.task}, {settings.design.name}'
+    self._is_running = False
+    self._deadline = 0.0
+    self._action: str | None = None
+    self._num_steps, self._seconds = 0, 0.0
+
+  def take(self) -> list[str]:
+    """Returns the keys of a control step."""
+    keys = self._keys.take()
+    actions = action_sets.DMLAB_LIKE.actions
+    self._action = actions[keyboards.action(keys)][0]
+    return keys
+
+  def on_step(self, unused_physics: Any, track: tracking.Track) -> None:
+    """Shows a control step, and waits for the next one."""
+    if not track.num_steps:
+      self._action = None
+    self._server.send(state(track, self._title, self._action))
+    self._server.send_picture(0, self._view.draw())
+    while not (self._is_running and self._server.is_connected):
+      self._receive(_PATIENCE)
+      if self._is_running and self._server.is_connected:
+        self._server.send(state(track, self._title, self._action))
+        self._server.send_picture(0, self._view.draw())
+        self._deadline = time.monotonic() + self._period
+    while (left := self._deadline - time.monotonic()) > 0:
+      self._receive(left)
+    now = time.monotonic()
+    if track.num_steps:
+      self._num_steps += 1
+      self._seconds += now - self._deadline + self._period
+    self._deadline = max(self._deadline, now) + self._period
+
+  def speed(self) -> str:
+    """Returns the measured speed, as a sentence."""
+    rate = self._num_steps / max(self._seconds, 1e-9)
+    return f'The person acted in {rate:.1f} control steps per second.'
+
+  def close(self) -> None:
+    """Frees the graphics resources."""
+    self._view.close()
+
+  def _receive(self, timeout: float) -> None:
+    """Processes the messages that arrive within a time, in seconds."""
+    message = self._server.receive(timeout)
+    match None if message is None else message.content:
+      case {'type': 'down', 'code': str(code)}:
+        self._keys.press(code)
+      case {'type': 'up', 'code': str(code)}:
+        self._keys.release(code)
+      case {'type': 'blur'}:
+        self._keys.release_all()
+      case {'type': 'run' | 'pause' as kind}:
+        self._keys.release_all()
+        self._is_running = kind == 'run'

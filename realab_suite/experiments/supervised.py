@@ -1,0 +1,262 @@
+"""Episodes in which a person provides the feedback, in a browser.
+
+The page shows the view of the agent and has one button for each answer. Answers
+are logged as a dataset, which the source `recorded` replays.
+"""
+
+from collections import deque
+import json
+import pathlib
+import time
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import environment
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.experiments import storage
+from realab_suite.experiments import tracking
+from realab_suite.feedback.providers import answer_sources
+from realab_suite.feedback.providers import person
+from realab_suite.interop.browser import servers
+from realab_suite.interop.browser import views
+from realab_suite.policies import action_sets
+
+ANSWERS = 'answers.jsonl'
+"""Name of the file of answers."""
+
+_PATIENCE = 0.2
+# Numbers of the pictures in the page: the view, and both clips.
+_VIEW, _CLIPS = 0, (1, 2)
+
+
+@final
+class Supervision:
+  """Shows episodes in the page, asks for answers and logs them."""
+
+  def __init__(
+      self,
+      env: environment.Environment,
+      server: servers.PageServer,
+      folder: pathlib.Path,
+      rate: float,
+  ) -> None:
+    """Connects the persons of a design to a page.
+
+    Args:
+      env: Environment whose design has providers of kind `person` with the
+        source `live`.
+      server: Server of the page `supervise`.
+      folder: Folder of the answers.
+      rate: Largest number of control steps per second.
+
+    Raises:
+      SpecError: If the design has no such provider.
+    """
+    self._env, self._server = env, server
+    self._path = folder / ANSWERS
+    self._period = 1.0 / rate
+    people, sources = [], []
+    for provider in env.mechanism.design.providers:
+      if isinstance(provider, person.Person):
+        source = provider.source
+        if isinstance(source, answer_sources.Live):
+          people.append(provider)
+          sources.append(source)
+    if not people:
+      raise errors.SpecError(
+          f'design {env.mechanism.design.name!r}: no provider of kind person'
+          ' with the live source of answers; allowed is a design with one'
+      )
+    self._clip = max(one.clip for one in people)
+    for source in sources:
+      source.connect(self._ask)
+    self._asks = [one.asks for one in people]
+    self._view = views.first_person(env)
+    self._pictures: deque[bytes] = deque(maxlen=2 * self._clip)
+    self._is_running = False
+    self._deadline = 0.0
+    self._given: dict[str, tuple[float, float]] = {}
+    self._written: list[float] = []
+    self._log: list[dict[str, Any]] = []
+    self._track: tracking.Track | None = None
+    self.delays: list[float] = []
+
+  def run(self, policy: Any, episode: int) -> evaluate.EpisodeResult:
+    """Runs a supervised episode.
+
+    Args:
+      policy: Policy of the agent.
+      episode: Number of the episode.
+    """
+    actor = actors.make(policy, self._env)
+    del actor  # Raises errors before the page shows an episode.
+    [result] = evaluate.evaluate(
+        self._env,
+        policy,
+        1,
+        first_episode=episode,
+        sinks=[tracking.Tracker(self._env, self._on_step)],
+    )
+    self._save()
+    return result
+
+  def finish(self, text: str) -> None:
+    """Shows a text after the last episode, and frees the resources."""
+    self._server.send({'type': 'summary', 'text': text})
+    self._view.close()
+
+  def _on_step(self, unused_physics: Any, track: tracking.Track) -> None:
+    """Shows a control step, and waits for the next one."""
+    now = time.time()
+    # The answers of this step have been written to their registers.
+    self.delays.extend(now - clicked for clicked in self._written)
+    self._written.clear()
+    if not track.num_steps:
+      self._pictures.clear()
+    self._track = track
+    self._pictures.append(self._view.draw())
+    self._show()
+    while not (self._is_running and self._server.is_connected):
+      self._receive(_PATIENCE)
+      self._deadline = time.monotonic()
+    # An answer starts the next step at once, and later steps stay on time.
+    while not self._given and (left := self._deadline - time.monotonic()) > 0:
+      self._receive(left)
+    self._deadline = max(self._deadline, time.monotonic()) + self._period
+
+  def _show(self) -> None:
+    """Shows the present state, without returns: people do not know them."""
+    track = self._track
+    if track is None:
+      return
+    self._server.send(
+        {
+            'type': 'step',
+            'asks': self._asks,
+            'episode': track.episode,
+            'step': track.num_steps,
+            'max_steps': track.max_steps,
+            'time': float(track.times[-1]),
+        }
+    )
+    self._server.send_picture(_VIEW, self._pictures[-1])
+
+  def _ask(self, question: answer_sources.Question) -> float | None:
+    """Returns the person's answer to a question, or `None`."""
+    asks = question.asks
+    if not bool(question.is_asked):
+      return None
+    content: dict[str, Any] = {
+        'type': 'question',
+        'asks': asks,
+        'waits': question.waits,
+        'action': None,
+    }
+    actions = action_sets.DMLAB_LIKE.actions
+    if question.query is not None and asks == answer_sources.APPROVAL:
+      content['action'] = actions[int(question.query)][0]
+    if asks == answer_sources.CORRECTION:
+      content['actions'] = [name for name, _ in actions]
+    if asks == answer_sources.COMPARISON:
+      pictures = list(self._pictures)
+      middle = len(pictures) // 2
+      self._server.send({'type': 'clips'})
+      for view, clip in zip(
+          _CLIPS, (pictures[:middle], pictures[middle:]), strict=True
+      ):
+        for picture in clip:
+          self._server.send_picture(view, picture)
+    self._drain()
+    if question.waits:
+      self._given.pop(asks, None)  # It belongs to an earlier question.
+    if asks != answer_sources.STOP:
+      self._server.send(content)
+    while (
+        question.waits
+        and asks not in self._given
+        and answer_sources.STOP not in self._given
+    ):
+      if not self._server.is_connected and self._server.wait(_PATIENCE):
+        self._show()
+        self._server.send(content)
+      self._receive(_PATIENCE)
+    answer = self._given.pop(asks, None)
+    if answer is None:
+      return None
+    value, clicked = answer
+    self._written.append(clicked)
+    env, track = self._env, self._track
+    self._log.append(
+        {
+            'seed': env.seed,
+            'world': env.world,
+            'episode': 0 if track is None else track.episode,
+            'step': 1 if track is None else track.num_steps + 1,
+            'asks': asks,
+            'value': value,
+            'action': None if question.query is None else int(question.query),
+            'key': np.asarray(question.key).tolist(),
+            'time': clicked,
+        }
+    )
+    return value
+
+  def _drain(self) -> None:
+    """Processes the messages that have arrived."""
+    while self._receive(0.0):
+      pass
+
+  def _receive(self, timeout: float) -> bool:
+    """Processes a message; returns False if none arrives in `timeout` s."""
+    message = self._server.receive(timeout)
+    if message is None:
+      return False
+    match message.content:
+      case {'type': 'run' | 'pause' as kind}:
+        self._is_running = kind == 'run'
+      case {'type': 'hello'}:
+        self._show()
+      case {
+          'type': 'answer',
+          'asks': str(asks),
+          'value': int(value),
+          'time': int(clicked) | float(clicked),
+      } if asks in self._asks and 0 <= _rank(asks, value):
+        self._given[asks] = float(value), clicked / 1e3
+    return True
+
+  def _save(self) -> None:
+    """Appends the answers of an episode to the log."""
+    with storage.explained(self._path):
+      with open(self._path, 'a', encoding='utf-8') as file:
+        file.writelines(json.dumps(one) + '\n' for one in self._log)
+    self._log.clear()
+
+
+def _rank(asks: str, value: int) -> int:
+  """Returns the position of a value among those allowed, or -1."""
+  allowed = {
+      answer_sources.APPROVAL: [-1, 1],
+      answer_sources.COMPARISON: [-1, 1],
+      answer_sources.STOP: [1],
+      answer_sources.CORRECTION: list(range(len(action_sets.DMLAB_LIKE))),
+  }[asks]
+  return allowed.index(value) if value in allowed else -1
+
+
+def delays_text(delays: list[float]) -> str:
+  """Returns the delays of answers as a sentence.
+
+  Args:
+    delays: Time from each click to its write, in seconds.
+  """
+  if not delays:
+    return 'There were no answers.'
+  median, late = 1e3 * np.percentile(delays, [50, 95])
+  return (
+      f'{len(delays)} answers; from click to write {median:.0f} ms (median) and'
+      f' {late:.0f} ms (95 %).'
+  )

@@ -1,0 +1,58 @@
+"""Designs in which a person provides the feedback."""
+
+from typing import Any
+
+_SIZES: dict[str, Any] = {'kind': 'two_block', 'scale': 0.1}
+
+
+def design(
+    asks: str,
+    source: str = 'simulated',
+    options: dict[str, Any] | None = None,
+    *,
+    waits: bool = False,
+    every: int = 1,
+    clip: int = 10,
+) -> dict[str, Any]:
+  """Returns a design, as a mapping, in which a person answers.
+
+  The person can stop the episode as well, through a signal register.
+
+  Args:
+    asks: Kind of the question: approval, correction or comparison.
+    source: Source of the answers.
+    options: Options of the source.
+    waits: True if the episode waits for answers.
+    every: Control steps between two questions.
+    clip: Length of the clips of a comparison, in control steps.
+  """
+  person = {
+      'kind': 'person', 'answers': source, 'options': options or {},
+  }  # fmt: skip
+  registers = {
+      'feedback': {
+          **_SIZES, 'role': 'feedback', 'place': 'station_1',
+          'range': [0, 13] if asks == 'correction' else [-2, 2],
+      },
+      'query': {
+          **_SIZES, 'role': 'query', 'place': 'station_2', 'range': [0, 13],
+      },
+      'stop': {
+          **_SIZES, 'role': 'signal', 'place': 'station_3', 'range': [0, 2],
+          'ends_episode': {'above': 0.5},
+      },
+  }  # fmt: skip
+  question = {
+      **person, 'asks': asks, 'writes': ['feedback'], 'waits': waits,
+      'clip': clip,
+      'every': 1 if asks == 'comparison' else every,
+      'reads': [] if asks == 'correction' else ['query'],
+  }  # fmt: skip
+  stop = {**person, 'asks': 'stop', 'reads': ['query'], 'writes': ['stop']}
+  return {
+      'schema': 1,
+      'name': f'person_{asks}',
+      'action_set': {'name': 'dmlab_like', 'version': 1},
+      'registers': registers,
+      'providers': [question, stop],
+  }

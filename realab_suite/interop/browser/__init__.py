@@ -1,0 +1,1 @@
+"""Worlds in a browser: 3D recordings, and pages for people."""

@@ -1,0 +1,191 @@
+"""Pages that replay evaluation episodes in 3D, each in one file.
+
+The pages load nothing, and open in a browser without a network connection.
+"""
+
+from collections.abc import Callable
+import contextlib
+import json
+import math
+import pathlib
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite.engine import environment
+from realab_suite.entities import block_kinds
+from realab_suite.entities import grasps
+from realab_suite.evaluation import results
+from realab_suite.experiments import result_tables
+from realab_suite.experiments import storage
+from realab_suite.experiments import tracking
+from realab_suite.interop.browser import recordings
+from realab_suite.reports import replays
+from realab_suite.reports import sweep_results
+
+_PARTS = ('obstruction', 'permanent', 'temporary')
+
+
+def name(row: results.EpisodeRow) -> str:
+  """Returns the file name of the page of an episode."""
+  run = ''.join(c if c.isalnum() or c in '._-' else '_' for c in row.info.run)
+  return f'{run}-seed{row.seed}-world{row.world}-episode{row.episode}.html'
+
+
+def write(
+    run: sweep_results.Run, row: results.EpisodeRow, folder: pathlib.Path
+) -> pathlib.Path:
+  """Replays an episode and writes its page, over an existing one.
+
+  Args:
+    run: The run.
+    row: An evaluation episode of the run.
+    folder: Folder of the page; it is created if it does not exist.
+
+  Returns:
+    The path of the page.
+
+  Raises:
+    ResultsError: If the episode has no trace, the replay differs, or the page
+      cannot be written.
+  """
+  recorders: list[_Recorder] = []
+
+  def start(
+      env: environment.Environment, stack: contextlib.ExitStack
+  ) -> Callable[[Any, tracking.Track], None]:
+    recorders.append(stack.enter_context(contextlib.closing(_Recorder(env))))
+    return recorders[0].add
+
+  track = replays.replay(run, row, start)
+  [recorder] = recorders
+  data = timeline(track, recorder.contacts)
+  data['title'] = f'{row.info.run}: {row.info.domain}.{row.info.task}'
+  corruption = None if math.isnan(row.corruption) else row.corruption
+  data['note'] = (
+      f'seed {row.seed}, world {row.world}, episode {row.episode};'
+      f' true return {result_tables.number_text(row.true_return)}, observed'
+      f' {result_tables.number_text(row.observed_return)}, corruption'
+      f' {result_tables.number_text(corruption)} m; ended by {row.end}'
+  )
+  page = recorder.page(json.dumps(data, allow_nan=False))
+  with storage.explained(folder):
+    folder.mkdir(parents=True, exist_ok=True)
+  path = folder / name(row)
+  storage.write_whole(path, page.encode())
+  return path
+
+
+def timeline(
+    track: tracking.Track, contacts: dict[str, list[tuple[int, str]]]
+) -> dict[str, Any]:
+  """Returns the data of a time line, as plain data without NaN.
+
+  Args:
+    track: Track of the episode.
+    contacts: Steps and kinds of the contacts of each block, by its name.
+  """
+  readings = [r.reading[1:] for r in track.feedback.values()]
+  observed = np.sum(readings, axis=0) if readings else np.zeros(track.num_steps)
+  return {
+      'timestep': track.timestep,
+      'true_return': _rounded(np.cumsum([0.0, *track.true_rewards])),
+      'observed_return': _rounded(np.cumsum([0.0, *observed])),
+      'registers': {
+          name: {
+              'role': register.role,
+              'applied': _rounded(register.applied),
+              'reading': _rounded(register.reading),
+              **{part: _rounded(getattr(register, part)) for part in _PARTS},
+          }
+          for name, register in track.registers.items()
+      },
+      'contacts': [
+          {'block': block, 'steps': steps} for block, steps in contacts.items()
+      ],
+  }
+
+
+def _rounded(values: Any) -> list[float | None]:
+  """Returns numbers with six digits, and `None` for NaN."""
+  return [
+      float(f'{value:.6g}') if math.isfinite(value) else None
+      for value in map(float, values)
+  ]
+
+
+@final
+class _Recorder:
+  """Records the scene of an episode, and the contacts of its blocks."""
+
+  def __init__(self, env: environment.Environment) -> None:
+    self._env = env
+    self._scene: recordings.Recording | None = None
+    self.contacts: dict[str, list[tuple[int, str]]] = {}
+
+  def add(self, unused_physics: Any, track: tracking.Track) -> None:
+    """Records the start of the episode, or a control step."""
+    if self._scene is None:
+      self._scene = recordings.Recording(self._env)
+    self._scene.add()
+    for block, kind in contacts(self._env).items():
+      steps = self.contacts.setdefault(block, [])
+      if kind is not None and track.num_steps:
+        steps.append((track.num_steps, kind))
+
+  def page(self, data: str) -> str:
+    """Returns the page, with the data of its time line as JSON."""
+    if self._scene is None:
+      self._scene = recordings.Recording(self._env)
+    return recordings.with_timeline(self._scene.page(), data)
+
+  def close(self) -> None:
+    """Ends the recording of the scene."""
+    if self._scene is not None:
+      self._scene.close()
+
+
+def contacts(env: environment.Environment) -> dict[str, str | None]:
+  """Returns the contact of each block that can be pushed, by its name.
+
+  Args:
+    env: Environment with a task of this package, in the middle of an episode.
+
+  Returns:
+    `held` by the avatar's hand, `touched` by the avatar, `hit` by a block of
+    another register, or `None`.
+  """
+  physics = env.thin_physics
+  touching = np.asarray(physics.data.ptr.contact.geom).reshape(-1, 2)
+  torso = env.task.avatar.mjcf_model.find_all('geom')
+  avatar = set(np.ravel(physics.bind(torso).element_id).tolist())
+  blocks = {
+      f'{register_name}/{block.body.name}': block
+      for register_name, register in env.mechanism.registers.items()
+      for block in register.blocks
+      if isinstance(block, block_kinds.JointedBlock)
+  }
+  ids = {
+      block_name: int(np.ravel(physics.bind(block.geom).element_id)[0])
+      for block_name, block in blocks.items()
+  }
+  found: dict[str, str | None] = {}
+  for block_name, block in blocks.items():
+    own = ids[block_name]
+    pairs = touching[(touching == own).any(axis=1)]
+    others = set(pairs[pairs != own].tolist())
+    constraints = [c for grasp in block.grasps for c in grasp.constraints]
+    is_held = (
+        bool(constraints)
+        and grasps.held(np.asarray(physics.bind(constraints).active)).any()
+    )
+    found[block_name] = (
+        'held'
+        if is_held
+        else 'touched'
+        if others & avatar
+        else 'hit'
+        if others & set(ids.values())
+        else None
+    )
+  return found

@@ -1,0 +1,78 @@
+"""Tests of the server of a page for one person."""
+
+import time
+from urllib import error
+from urllib import request
+
+import pytest
+
+pytest.importorskip('websockets')
+
+from websockets import exceptions
+from websockets.sync import client
+
+from realab_suite import errors
+from realab_suite.interop.browser import servers
+
+
+@pytest.fixture(name='server')
+def fixture_server():
+  with servers.PageServer('play') as server:
+    yield server
+
+
+def _connect(server, origin=None, path='/socket'):
+  base, token = server.url.split('/?')
+  return client.connect(
+      f'{base.replace("http", "ws")}{path}?{token}', origin=origin or base
+  )
+
+
+def _status(url):
+  try:
+    with request.urlopen(url, timeout=20) as answer:
+      return answer.status
+  except error.HTTPError as refusal:
+    return refusal.code
+
+
+def test_the_page_needs_the_token(server):
+  base, token = server.url.split('?')
+  assert _status(server.url) == 200
+  assert _status(base) == 403
+  assert _status(f'{base}?{token}x') == 403
+  assert _status(f'{base}other?{token}') == 404
+
+
+def test_the_address_is_local_and_the_page_may_load_nothing(server):
+  assert server.url.startswith('http://127.0.0.1:')
+  with request.urlopen(server.url, timeout=20) as answer:
+    policy = answer.headers['Content-Security-Policy']
+    page = answer.read().decode()
+  assert "default-src 'none'" in policy
+  assert 'https:' not in page
+
+
+def test_a_page_of_another_address_cannot_connect(server):
+  with pytest.raises(exceptions.InvalidStatus, match='403'):
+    _connect(server, origin='http://elsewhere.example')
+
+
+def test_messages_go_both_ways_and_others_are_dropped(server):
+  with _connect(server) as socket:
+    assert server.wait(20)
+    for text in ('not json', '[1]', '{"type": "run"}'):
+      socket.send(text)
+    message = server.receive(20)
+    assert message.content == {'type': 'run'}
+    assert message.time <= time.monotonic()
+    server.send({'type': 'state'})
+    assert socket.recv(timeout=20) == '{"type": "state"}'
+    server.send_picture(2, b'jpeg')
+    assert socket.recv(timeout=20) == b'\x02jpeg'
+
+
+def test_a_port_in_use_is_refused(server):
+  port = int(server.url.split(':')[2].split('/')[0])
+  with pytest.raises(errors.SpecError, match='cannot serve a page'):
+    servers.PageServer('play', port=port)
