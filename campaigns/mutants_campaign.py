@@ -177,12 +177,12 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'meters do not measure', _CONTROL_STEP,
-        '''  records += mechanism.update_meters(physics, where())
+        '''  step.update_meters(where())
 ''', '', _MECH,
     ),
     planting.Mutant(
         'contract', 'queries are not written', _CONTROL_STEP,
-        '''  records += mechanism.write_queries(physics, queries)
+        '''  step.write_queries(queries)
 ''', '', _MECH,
     ),
     planting.Mutant(

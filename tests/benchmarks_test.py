@@ -239,7 +239,7 @@ def test_the_benchmark_of_gymnasium_prints_a_line_per_adapter(
   monkeypatch.setattr(gymnasium_vector, 'NUM_ENVS', 2)
   monkeypatch.setattr(gymnasium_vector, '_STEPS', 2)
   gymnasium_vector.main(['--rounds=1'])
-  target = '<= 1.11111 x raw'
+  target = '<= 1.1 x raw'
   _assert_lines(
       capsys.readouterr().out,
       {
