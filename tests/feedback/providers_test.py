@@ -61,7 +61,10 @@ _CASES: list[tuple[str, dict[str, Any]]] = [
     *(('value_advice', {**_ADVICE, 'value_function': f, 'query_delay': 1})
         for f in ('test_counting', *policies.VALUE_FUNCTIONS)),
     ('paired_advice', {**_REWARD, 'value_function': 'apple_seeker_approval',
-        'reads': ('query', 'score')})
+        'reads': ('query', 'score')}),
+    ('person', {**_ADVICE, 'asks': 'approval'}),
+    ('person', {**_ADVICE, 'asks': 'comparison', 'clip': 1, 'waits': True}),
+    ('person', {**_REWARD, 'asks': 'correction'}),
 ]  # fmt: skip
 _IDS = ['-'.join(map(str, [k, *f.values()])) for k, f in _CASES]
 
@@ -113,6 +116,11 @@ def _leaves(tree: Any) -> list[np.ndarray]:
   return [np.asarray(tree)]
 
 
+def _parts(write: Any) -> tuple[Any, Any]:
+  """Returns the value of a write, and whether the provider speaks."""
+  return write if isinstance(write, tuple) else (write, np.array(True))
+
+
 def _bytes(tree: Any) -> list[tuple[Any, ...]]:
   return [(leaf.shape, leaf.tobytes()) for leaf in _leaves(tree)]
 
@@ -160,10 +168,13 @@ class TestContract:
         )
         assert set(alone) == set(fields['writes'])
         for name in alone:
-          assert together[name].shape == (3,)
-          assert together[name][world] == alone[name]
-          assert np.asarray(alone[name]).dtype.kind == 'f'
-          assert np.isfinite(alone[name])
+          values, speaks = _parts(together[name])
+          value, is_spoken = _parts(alone[name])
+          assert np.shape(values) == (3,)
+          assert values[world] == value
+          assert np.broadcast_to(speaks, 3)[world] == is_spoken
+          assert np.asarray(value).dtype.kind == 'f'
+          assert np.isfinite(value)
 
   def test_an_episode_does_not_depend_on_the_one_before(
       self, kind: str, fields: dict[str, Any]
@@ -280,8 +291,8 @@ def test_paired_advice_writes_the_difference_of_two_values(
 
 def test_providers_declare_the_reads_that_are_actions():
   for kind, fields in _CASES:
-    queries = kind in ('value_advice', 'paired_advice')
-    expected = fields['reads'] if queries else ()
+    queries = kind in ('value_advice', 'paired_advice', 'person')
+    expected = fields.get('reads', ()) if queries else ()
     assert _make(kind, **fields).action_queries == expected
 
 

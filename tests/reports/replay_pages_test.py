@@ -7,6 +7,8 @@ import re
 import numpy as np
 import pytest
 
+pytest.importorskip('mjviser')
+
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import evaluate

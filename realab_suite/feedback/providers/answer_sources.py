@@ -137,6 +137,7 @@ class Simulated(Source):
     }
 
   def answer(self, question: Question, state: Any) -> Answer:
+    state = self._rested(question.episode_start, state)
     values, adviser = self._adviser.step(
         question.observation, question.episode_start, question.key,
         state['adviser'],
@@ -173,6 +174,18 @@ class Simulated(Source):
             'answered': state['answered'] + speaks,
         },
     )
+
+  def _rested(self, episode_start: np.ndarray, state: Any) -> dict[str, Any]:
+    """Returns the state without what an earlier episode has left."""
+    fresh = self.initial_state(np.shape(episode_start))
+    fresh['sums'], fresh['adviser'] = (
+        np.where(episode_start[..., np.newaxis], 0.0, state['sums']),
+        # The adviser gets the start of the episode itself.
+        state['adviser'],
+    )
+    for name in ('streak', 'left', 'pending', 'answered'):
+      fresh[name] = np.where(episode_start, fresh[name], state[name])
+    return fresh
 
   def _truth(
       self, question: Question, values: np.ndarray, state: Any

@@ -1,6 +1,6 @@
 """Tests of the pages in headless Chromium, with real keys and clicks.
 
-    python -m pytest tests/interop/browser
+    python -m pytest tests/interop/browser/pages_in_chromium.py
 
 runs them where Chromium, playwright and the extra `browser` are installed.
 With SCREENSHOTS set to a folder, they save pictures of the pages there.
