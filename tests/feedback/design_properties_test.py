@@ -253,10 +253,15 @@ _STRANGE = {
 )
 def test_a_refusal_names_the_key_and_the_value(kind: str, load: Any):
   strange = itertools.cycle(_STRANGE.items())
-  num_refused = 0
+  num_refused, seen = 0, set()
   for path in sorted((_CONFIGS / kind).glob('*.yaml')):
     data = yaml.safe_load(path.read_text())
     for keys in _leaves(data):
+      # Runs have the same keys, whatever their names and files.
+      place = (kind, *keys[:1], *keys[2 if keys[0] == 'runs' else 1 :])
+      if kind == 'experiments' and place in seen:
+        continue
+      seen.add(place)
       value, shown = next(strange)
       changed = copy.deepcopy(data)
       node = changed
@@ -272,7 +277,7 @@ def test_a_refusal_names_the_key_and_the_value(kind: str, load: Any):
       # A message quotes an override.
       if owner != 'overrides':
         assert owner in refusal, (path.name, keys)
-  assert num_refused >= 80
+  assert num_refused >= (80 if kind == 'designs' else 20)
 
 
 def _refusal(load: Any, source: Any) -> str:
