@@ -46,6 +46,14 @@ autodoc_typehints = 'signature'
 autodoc_default_options = {'members': True, 'show-inheritance': True}
 # Docstrings of dm_control are in another markup.
 autodoc_inherit_docstrings = False
+# Packages of extras that the site does without.
+autodoc_mock_imports = [
+    'minari',
+    'mjviser',
+    'pyarrow',
+    'stable_baselines3',
+    'viser',
+]
 napoleon_use_ivar = True
 napoleon_numpy_docstring = False
 python_use_unqualified_type_names = True
