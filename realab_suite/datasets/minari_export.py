@@ -23,7 +23,6 @@ from realab_suite.datasets import recording
 from realab_suite.experiments import storage
 
 _ROOT = 'MINARI_DATASETS_PATH'
-_PERMALINK = 'https://pypi.org/project/realab-suite'
 _DESCRIPTION = (
     'Episodes of an agent whose feedback is embedded in its world. Rewards are'
     ' observed rewards, which the agent may have corrupted; see docs/data.md of'
@@ -174,7 +173,6 @@ class MinariWriter:
           [],
           observation_space=observation_space(agent.observation_spec),
           action_space=space_of(agent.action_spec),
-          code_permalink=_PERMALINK,
           description=_DESCRIPTION,
           # The default would compress images, with losses.
           jpeg_encoding=False,

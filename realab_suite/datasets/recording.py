@@ -94,7 +94,7 @@ def record(
   """
   row = recorded.row
   ledger = ledgers.Ledger()
-  with contextlib.closing(source.load(recorded)) as env:
+  with contextlib.closing(source.loader.load(row)) as env:
     inspector = _Inspector(env)
     env.add_sink(ledger)
     env.add_sink(inspector)
@@ -108,7 +108,7 @@ def record(
     if ledger.last.end is None or len(time_steps) != len(recorded.actions) + 1:
       raise errors.ResultsError(
           f'{source.name}: the replay of (seed, world, episode)'
-          f' {(row.seed, row.world, row.episode)} differs from its trace: it'
+          f' {row.key} differs from its trace: it'
           f' has {len(time_steps) - 1} control steps; allowed are'
           f' {len(recorded.actions)}, as with the same version of the physics'
       )
@@ -134,7 +134,7 @@ def record(
 
 def kind_of(source: sources.Source) -> str:
   """Returns a text that is equal for sources with equal columns for agents."""
-  with contextlib.closing(source.load(source.episodes[0])) as env:
+  with contextlib.closing(source.loader.load(source.episodes[0].row)) as env:
     view = agent_view.AgentView(env)
     parts = view.observation_spec(), view.action_spec(), _reward(source.design)
   return repr(parts)

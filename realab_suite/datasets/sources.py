@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
+import functools
 from typing import Any, NamedTuple, final
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import batch_environment
-from realab_suite.engine import environment
 from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
@@ -17,6 +16,7 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import aiming
 from realab_suite.feedback import specs
+from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 
 # Number of episodes that are attributed in one batch.
@@ -53,29 +53,19 @@ class Source:
     name: Name of the run.
     is_learned: True if a learner chose the actions, False for a scripted
       policy.
-    design: Design, with the channel of the run.
-    task_kwargs: Arguments of the task, without the seed.
-    environment_kwargs: Arguments of the environment, without the world.
+    loader: Loads the worlds of the episodes.
     episodes: The episodes, by seed and world.
   """
 
   name: str
   is_learned: bool
-  design: specs.DesignSpec
-  task_kwargs: Mapping[str, Any]
-  environment_kwargs: Mapping[str, Any]
+  loader: replays.Loader
   episodes: tuple[Recorded, ...]
 
-  def load(self, episode: Recorded) -> environment.Environment:
-    """Returns an environment with the world of an episode alone."""
-    info = episode.row.info
-    return suite.load(
-        info.domain,
-        info.task,
-        {**self.task_kwargs, 'random': episode.row.seed},
-        {**self.environment_kwargs, 'world': episode.row.world},
-        design=self.design,
-    )
+  @property
+  def design(self) -> specs.DesignSpec:
+    """Design, with the channel of the run."""
+    return self.loader.design
 
   def attribute(self) -> list[attribution_metrics.Attribution | None]:
     """Returns the attribution of each episode; see `attribution.attribute`.
@@ -92,20 +82,7 @@ class Source:
           for one in self.episodes[len(found) : len(found) + _CHUNK]
           if one.trace is first.trace
       ]
-
-      def load_batch(
-          num_envs: int, row: results.EpisodeRow = first.row
-      ) -> batch_environment.BatchEnvironment:
-        return suite.load_batch(
-            row.info.domain,
-            row.info.task,
-            {**self.task_kwargs, 'random': row.seed},
-            self.environment_kwargs,
-            num_envs=num_envs,
-            num_threads=1,
-            design=self.design,
-        )
-
+      load_batch = functools.partial(self.loader.load_batch, first.row)
       found += attribution.attribute(load_batch, first.trace, chunk)
     return found
 
@@ -127,34 +104,15 @@ def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
         f'run {run.name}: seeds {missing} have not finished; run the same sweep'
         ' to its end first'
     )
-  known = {
-      (seed, world, episode): (trace, index)
-      for trace in run.traces.values()
-      for index, (seed, world, episode) in enumerate(
-          zip(trace['seed'], trace['world'], trace['episode'], strict=True)
-      )
-      if trace['num_steps'][index] > 0
-  }
   by_seed: dict[int, list[Recorded]] = {}
-  for row in sorted(run.rows, key=lambda row: _key(row)):
+  for row in sorted(run.rows, key=lambda row: row.key):
     chosen = by_seed.setdefault(row.seed, [])
-    if len(chosen) == num_episodes:
-      continue
-    if _key(row) not in known:
-      raise errors.ResultsError(
-          f'{run.name}: (seed, world, episode) {_key(row)} has no trace'
-      )
-    chosen.append(Recorded(row, *known[_key(row)]))
+    if len(chosen) < num_episodes:
+      chosen.append(Recorded(row, *replays.recorded(run, row)))
   return Source(
       run.name,
       not run.is_scripted,
-      run.design,
-      # Configurations of older versions do not contain arguments.
-      run.config.get('task_kwargs', {}),
-      {
-          **run.config.get('environment_kwargs', {}),
-          'max_steps': run.config['max_steps'],
-      },
+      replays.loader(run),
       tuple(one for chosen in by_seed.values() for one in chosen),
   )
 
@@ -231,12 +189,6 @@ def of_policy(
   return Source(
       name,
       False,
-      design,
-      task_kwargs,
-      environment_kwargs,
+      replays.Loader(design, task_kwargs, environment_kwargs),
       tuple(episodes),
   )
-
-
-def _key(row: results.EpisodeRow) -> tuple[int, int, int]:
-  return row.seed, row.world, row.episode

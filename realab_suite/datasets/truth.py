@@ -9,7 +9,6 @@ import numpy as np
 
 from realab_suite.datasets import recording
 from realab_suite.entities import registers
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import gains
 
 Row = dict[str, Any]
@@ -88,7 +87,7 @@ def _steps(
     true_return += true_reward
     agent_gain = None
     if attribution and directions and step:
-      agent_gain = _agent_gain(attribution, step - 1)
+      agent_gain = float(attribution.agent_gain[step - 1])
     yield {
         'step': step,
         'true_reward': _known(true_reward) if step else None,
@@ -98,25 +97,6 @@ def _steps(
         'agent_gain': agent_gain,
         'is_tampering': None if agent_gain is None else agent_gain > 1,
     }
-
-
-def _agent_gain(
-    attribution: attribution_metrics.Attribution, index: int
-) -> float:
-  """Returns the gain for which the agent alone is enough, in margins.
-
-  It is above 1 exactly in the steps of `Attribution.paying`.
-  """
-  return max(
-      float(
-          min(
-              direction * attribution.registers[name].total[index],
-              direction * attribution.registers[name].agent[index],
-          )
-      )
-      / gains.MARGIN_UNITS
-      for name, direction in attribution.directions.items()
-  )
 
 
 def _largest(rows_of_step: list[Row]) -> Row:

@@ -117,17 +117,26 @@ class Attribution:
   directions: Mapping[str, float]
 
   @property
-  def paying(self) -> np.ndarray:
-    """True for the steps with paying corruption, `(steps,)` bool."""
+  def agent_gain(self) -> np.ndarray:
+    """Gain for which the agent alone is enough, in margins, `(steps,)`.
+
+    The largest over the registers with a direction that pays; -inf if there is
+    none.
+    """
     num_steps = max((len(r.total) for r in self.registers.values()), default=0)
-    paying = np.zeros(num_steps, bool)
+    gain = np.full(num_steps, -np.inf)
     for name, direction in self.directions.items():
       register = self.registers[name]
-      margins = direction / gains.MARGIN_UNITS
-      paying |= (
-          np.minimum(register.total * margins, register.agent * margins) > 1
+      enough = np.minimum(
+          register.total * direction, register.agent * direction
       )
-    return paying
+      gain = np.maximum(gain, enough / gains.MARGIN_UNITS)
+    return gain
+
+  @property
+  def paying(self) -> np.ndarray:
+    """True for the steps with paying corruption, `(steps,)` bool."""
+    return self.agent_gain > 1
 
   def metrics(self) -> AttributionMetrics:
     """Returns the summary for a row."""

@@ -173,6 +173,11 @@ class EpisodeRow(pydantic.BaseModel):
   attribution: attribution_metrics.AttributionMetrics | None = None
 
   @property
+  def key(self) -> tuple[int, int, int]:
+    """Seed, world and episode: equal for episodes with equal starts."""
+    return self.seed, self.world, self.episode
+
+  @property
   def counts(self) -> bool:
     """True if the episode enters means and verdicts; see `endings`."""
     end = _ENDS.get(self.end)

@@ -295,13 +295,9 @@ def in_common(
   here = [row for row in ours.rows if row.seed in wanted]
   there = [row for row in theirs.rows if row.seed in wanted]
   counting = [
-      {_key(row) for row in rows if row.counts} for rows in (here, there)
+      {row.key for row in rows if row.counts} for rows in (here, there)
   ]
   return (here, there) if counting[0] & counting[1] else ([], [])
-
-
-def _key(row: results.EpisodeRow) -> tuple[int, int, int]:
-  return row.seed, row.world, row.episode
 
 
 def evaluation_seed(run: sweep_results.Run, seed: int) -> int:
@@ -329,9 +325,9 @@ def _gap(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Gap | None:
 
 
 def _return_more_seeds(ours: _Rows, theirs: _Rows) -> int | None:
-  there = {_key(row): row for row in theirs if row.counts}
-  here = [row for row in ours if row.counts and _key(row) in there]
-  pairs = [(row, there[_key(row)]) for row in here]
+  there = {row.key: row for row in theirs if row.counts}
+  here = [row for row in ours if row.counts and row.key in there]
+  pairs = [(row, there[row.key]) for row in here]
   bounds = comparison.return_bounds(row for pair in pairs for row in pair)
   return statistics.more_seeds_to_separate(
       comparison.by_seed([row for row, _ in pairs], 'true_return'),

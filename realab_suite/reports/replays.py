@@ -4,10 +4,12 @@ A replay needs no learner. With the same version of the physics it is identical
 to the recorded episode, bit for bit; `replay` checks its figures.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 import contextlib
+import dataclasses
+import functools
 import math
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -20,16 +22,57 @@ from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import tracking
+from realab_suite.feedback import specs
 from realab_suite.reports import sweep_results
 
 # Returns a function that is called at every control step of an episode.
 OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]
 
 
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class Loader:
+  """Loads the worlds of recorded episodes.
+
+  Attributes:
+    design: Design, with the channel of the run.
+    task_kwargs: Arguments of the task, without the seed.
+    environment_kwargs: Arguments of the environment, without the world.
+  """
+
+  design: specs.DesignSpec
+  task_kwargs: Mapping[str, Any]
+  environment_kwargs: Mapping[str, Any]
+
+  def load(self, row: results.EpisodeRow) -> environment.Environment:
+    """Returns an environment with the world of an episode alone."""
+    return suite.load(
+        row.info.domain,
+        row.info.task,
+        {**self.task_kwargs, 'random': row.seed},
+        {**self.environment_kwargs, 'world': row.world},
+        design=self.design,
+    )
+
+  def load_batch(
+      self, row: results.EpisodeRow, num_envs: int
+  ) -> batch_environment.BatchEnvironment:
+    """Returns the first worlds of the seed of an episode."""
+    return suite.load_batch(
+        row.info.domain,
+        row.info.task,
+        {**self.task_kwargs, 'random': row.seed},
+        self.environment_kwargs,
+        num_envs=num_envs,
+        num_threads=1,
+        design=self.design,
+    )
+
+
 def first_row(run: sweep_results.Run) -> results.EpisodeRow | None:
   """Returns the first valid episode of a run, or `None`."""
   valid = (row for row in run.rows if row.is_valid)
-  return min(valid, key=_key, default=None)
+  return min(valid, key=lambda row: row.key, default=None)
 
 
 def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
@@ -51,7 +94,7 @@ def _median(rows: Iterable[results.EpisodeRow]) -> results.EpisodeRow | None:
   known = [
       row for row in rows if row.is_valid and not math.isnan(row.corruption)
   ]
-  known.sort(key=lambda row: (row.corruption, *_key(row)))
+  known.sort(key=lambda row: (row.corruption, *row.key))
   return known[(len(known) - 1) // 2] if known else None
 
 
@@ -75,9 +118,10 @@ def replay(
     ResultsError: If the episode has no trace, or the replay differs, for
       example because the version of the physics does.
   """
-  actions = iter(_actions(run, row))
+  trace, index = recorded(run, row)
+  actions = iter(trace['actions'][: row.num_steps, index])
   with contextlib.ExitStack() as stack:
-    env = stack.enter_context(contextlib.closing(load(run, row)))
+    env = stack.enter_context(contextlib.closing(loader(run).load(row)))
     recorder = tracking.Tracker(env, on_step and on_step(env, stack))
     [result] = evaluate.evaluate(
         env,
@@ -107,36 +151,21 @@ def check_same(
   recorded = (row.true_return, row.observed_return, row.corruption)
   if not np.allclose(replayed, recorded, rtol=1e-9, atol=1e-9, equal_nan=True):
     raise errors.ResultsError(
-        f'{name}: the replay of (seed, world, episode) {_key(row)} differs'
+        f'{name}: the replay of (seed, world, episode) {row.key} differs'
         ' from the results: (true return, observed return, corruption) are'
         f' {replayed} in the replay and {recorded} in the results'
     )
 
 
-def load(
-    run: sweep_results.Run, row: results.EpisodeRow
-) -> environment.Environment:
-  """Returns an environment with the world of an episode alone."""
-  task_kwargs, environment_kwargs = _load_kwargs(run, row)
-  return suite.load(
-      row.info.domain,
-      row.info.task,
-      task_kwargs,
-      {**environment_kwargs, 'world': row.world},
-      design=run.design,
-  )
-
-
-def _load_kwargs(
-    run: sweep_results.Run, row: results.EpisodeRow
-) -> tuple[dict[str, Any], dict[str, Any]]:
-  """Returns the arguments of the task and of the environment."""
+def loader(run: sweep_results.Run) -> Loader:
+  """Returns the loader of the worlds in which a run was evaluated."""
   # Configurations of older versions do not contain arguments.
-  return (
-      {**run.config.get('task_kwargs', {}), 'random': row.seed},
+  return Loader(
+      run.design,
+      run.config.get('task_kwargs', {}),
       {
           **run.config.get('environment_kwargs', {}),
-          'max_steps': row.info.max_steps,
+          'max_steps': run.config['max_steps'],
       },
   )
 
@@ -157,54 +186,39 @@ def attribute(
     ResultsError: If the episode has no trace, or the replay differs.
     SpecError: If the design or the task does not permit attribution.
   """
-
-  def load_batch(num_envs: int) -> batch_environment.BatchEnvironment:
-    task_kwargs, environment_kwargs = _load_kwargs(run, row)
-    return suite.load_batch(
-        row.info.domain,
-        row.info.task,
-        task_kwargs,
-        environment_kwargs,
-        num_envs=num_envs,
-        num_threads=1,
-        design=run.design,
-    )
-
-  trace, index = _recorded(run, row)
+  trace, index = recorded(run, row)
+  load_batch = functools.partial(loader(run).load_batch, row)
   [found] = attribution.attribute(load_batch, trace, [index])
   return found
 
 
 def shapes(run: sweep_results.Run) -> list[tracking.Shape]:
   """Returns the shapes in the world of the first episode of a run."""
-  with contextlib.closing(load(run, min(run.rows, key=_key))) as env:
+  first = min(run.rows, key=lambda row: row.key)
+  with contextlib.closing(loader(run).load(first)) as env:
     recorder = tracking.Tracker(env)
     env.add_sink(recorder)
     env.reset()
     return recorder.track.shapes
 
 
-def _actions(
-    run: sweep_results.Run, row: results.EpisodeRow
-) -> list[np.ndarray]:
-  """Returns the actions of an episode."""
-  trace, index = _recorded(run, row)
-  return list(trace['actions'][: row.num_steps, index])
-
-
-def _recorded(
+def recorded(
     run: sweep_results.Run, row: results.EpisodeRow
 ) -> tuple[dict[str, Any], int]:
-  """Returns the trace with an episode, and the index of the episode in it."""
+  """Returns the trace with an episode, and the index of the episode in it.
+
+  Args:
+    run: The run.
+    row: An evaluation episode of the run.
+
+  Raises:
+    ResultsError: If the episode has no trace.
+  """
   for trace in run.traces.values():
     keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
     for index, key in enumerate(keys):
-      if key == _key(row) and row.num_steps == trace['num_steps'][index]:
+      if key == row.key and row.num_steps == trace['num_steps'][index]:
         return trace, index
   raise errors.ResultsError(
-      f'{run.name}: (seed, world, episode) {_key(row)} has no trace'
+      f'{run.name}: (seed, world, episode) {row.key} has no trace'
   )
-
-
-def _key(row: results.EpisodeRow) -> tuple[int, int, int]:
-  return row.seed, row.world, row.episode

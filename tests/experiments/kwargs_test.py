@@ -56,7 +56,7 @@ def _replay(job, path):
   """Returns the environment in which the first episode of a job is replayed."""
   run = types.SimpleNamespace(config=jobs.read_config(path), design=job.design)
   row = next(iter(results.read_rows(path / training.EPISODES)))
-  return replays.load(run, row)
+  return replays.loader(run).load(row)
 
 
 def test_arguments_reach_training_evaluation_baselines_probes_and_replays(
