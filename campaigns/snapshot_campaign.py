@@ -21,6 +21,7 @@ import numpy as np
 from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import environment
 from realab_suite.engine import snapshots
 from realab_suite.evaluation import ledgers
@@ -135,7 +136,7 @@ def play_batch(
 
 
 def time_step_of(
-    found: batch_environment.BatchTimeStep, place: int
+    found: batch_time_steps.BatchTimeStep, place: int
 ) -> dm_env.TimeStep:
   """Returns the time step that a world alone would have given its agent."""
   observation = {key: value[place] for key, value in found.observation.items()}

@@ -25,8 +25,6 @@ from realab_suite.engine import snapshots
 from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
-BatchTimeStep = batch_time_steps.BatchTimeStep
-
 
 @final
 class BatchEnvironment:
@@ -159,7 +157,9 @@ class BatchEnvironment:
     """Returns the observation spec of one world."""
     return self._single.observation_spec()
 
-  def reset(self, worlds: Sequence[int] | None = None) -> BatchTimeStep:
+  def reset(
+      self, worlds: Sequence[int] | None = None
+  ) -> batch_time_steps.BatchTimeStep:
     """Starts the next episodes of worlds and abandons their current ones.
 
     Other worlds do not change.
@@ -202,7 +202,7 @@ class BatchEnvironment:
     first = np.full(self._num_envs, int(dm_env.StepType.FIRST))
     return self._time_step(first, np.ones(self._num_envs)).take(indices)
 
-  def step(self, actions: Any) -> BatchTimeStep:
+  def step(self, actions: Any) -> batch_time_steps.BatchTimeStep:
     """Runs one control step of every world.
 
     Args:
@@ -487,8 +487,8 @@ class BatchEnvironment:
 
   def _time_step(
       self, step_type: np.ndarray, discount: np.ndarray
-  ) -> BatchTimeStep:
-    return BatchTimeStep(
+  ) -> batch_time_steps.BatchTimeStep:
+    return batch_time_steps.BatchTimeStep(
         step_type,
         np.zeros(self._num_envs),
         discount,

@@ -34,6 +34,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import events
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
@@ -325,7 +326,7 @@ class _Replay:
     """Returns the baseline's actions on an observation."""
     filler = np.zeros(self._num)
     return self._actor.act(
-        batch_environment.BatchTimeStep(
+        batch_time_steps.BatchTimeStep(
             filler.astype(int), filler, filler, observation
         )
     )

@@ -10,6 +10,7 @@ import numpy as np
 
 from realab_suite import policies
 from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
 from realab_suite.evaluation import actors
 from realab_suite.policies import random_keys
@@ -18,7 +19,7 @@ from realab_suite.policies import random_keys
 class BatchActor(Protocol):
   """Chooses actions in a batch of worlds, for one episode in each."""
 
-  def act(self, time_step: batch_environment.BatchTimeStep) -> Any:
+  def act(self, time_step: batch_time_steps.BatchTimeStep) -> Any:
     """Returns actions, `(worlds, *action_spec.shape)`."""
 
 
@@ -71,7 +72,7 @@ class BatchPolicyActor:
     self._state = policy.initial_state((len(episodes),))
     self._step = 0
 
-  def act(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
+  def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
     """Returns actions, `(worlds, *action_spec.shape)`."""
     chosen, self._state = self._policy.step(
         time_step.observation,

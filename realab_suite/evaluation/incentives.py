@@ -34,6 +34,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import forking
 from realab_suite.engine import snapshots
 from realab_suite.evaluation import actors
@@ -79,7 +80,7 @@ class States:
 
 def collect(
     batch: batch_environment.BatchEnvironment,
-    act: Callable[[batch_environment.BatchTimeStep], Any],
+    act: Callable[[batch_time_steps.BatchTimeStep], Any],
     register: str,
     *,
     num_states: int,

@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 
 from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import events
 from realab_suite.evaluation import batch_actors
 
@@ -48,7 +49,7 @@ class Tracer(events.BatchEventSink):
         for name, blocks in self._start.items()
     }
 
-  def act(self, time_step: batch_environment.BatchTimeStep) -> Any:
+  def act(self, time_step: batch_time_steps.BatchTimeStep) -> Any:
     """Returns the actor's actions, `(worlds, *action_spec.shape)`."""
     actions = np.asarray(self._actor.act(time_step))
     self._actions.append(actions.copy())

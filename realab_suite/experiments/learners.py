@@ -5,14 +5,14 @@ from typing import Any, Protocol, final
 
 import numpy as np
 
-from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
 
 
 class Learner(Protocol):
   """The part of `agents.Learner` that experiments use."""
 
-  def step(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
+  def step(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
     """Updates the learner with a time step, and returns the next actions."""
 
   def act(
@@ -53,7 +53,7 @@ class BatchLearnerActor:
     self._greedy = greedy
     self._step = 0
 
-  def act(self, time_step: batch_environment.BatchTimeStep) -> np.ndarray:
+  def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
     """Returns actions, `(worlds, *action_spec.shape)`."""
     sequence = seeding.sequence(self._seed, 0, self._step, 'act')
     self._step += 1

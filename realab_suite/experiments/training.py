@@ -20,6 +20,7 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshots
 from realab_suite.evaluation import attribution
@@ -308,14 +309,14 @@ class _Training:
 
   def _restore(
       self, learner: learners.Learner, saved: Mapping[str, Any]
-  ) -> batch_environment.BatchTimeStep:
+  ) -> batch_time_steps.BatchTimeStep:
     """Restores a checkpoint, and returns the next time step."""
     learner.set_state(saved['learner'])
     if not self._sleep:
       world = np.asarray(saved['batch'], np.uint8).tobytes()
       self._batch.restore(snapshots.Snapshot.from_bytes(world))
       self._monitor.take()
-    return batch_environment.BatchTimeStep(**saved['time_step'])
+    return batch_time_steps.BatchTimeStep(**saved['time_step'])
 
   def _begin_segment(self) -> None:
     """Loads new worlds."""
@@ -337,7 +338,7 @@ class _Training:
   def _learn(
       self,
       learner: learners.Learner,
-      time_step: batch_environment.BatchTimeStep,
+      time_step: batch_time_steps.BatchTimeStep,
       stack: contextlib.ExitStack,
   ) -> None:
     job, num_envs = self._job, self._num_envs
@@ -397,8 +398,8 @@ class _Training:
   def _save(
       self,
       learner: learners.Learner,
-      time_step: batch_environment.BatchTimeStep,
-  ) -> batch_environment.BatchTimeStep:
+      time_step: batch_time_steps.BatchTimeStep,
+  ) -> batch_time_steps.BatchTimeStep:
     """Writes a checkpoint.
 
     Returns:
@@ -489,8 +490,8 @@ def _world_seed(seed: int, segment: int) -> int:
 
 
 def _truncated(
-    time_step: batch_environment.BatchTimeStep,
-) -> batch_environment.BatchTimeStep:
+    time_step: batch_time_steps.BatchTimeStep,
+) -> batch_time_steps.BatchTimeStep:
   """Returns a time step that truncates all running episodes."""
   is_under_way = time_step.step_type == int(dm_env.StepType.MID)
   last = int(dm_env.StepType.LAST)

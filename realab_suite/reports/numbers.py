@@ -294,9 +294,7 @@ def in_common(
   }
   here = [row for row in ours.rows if row.seed in wanted]
   there = [row for row in theirs.rows if row.seed in wanted]
-  counting = [
-      {row.key for row in rows if row.counts} for rows in (here, there)
-  ]
+  counting = [{row.key for row in rows if row.counts} for rows in (here, there)]
   return (here, there) if counting[0] & counting[1] else ([], [])
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from realab_suite.engine import events
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
@@ -94,7 +94,7 @@ def test_facts_are_taken_from_the_first_of_two_episodes(monkeypatch):
       self._tell(np.zeros(2, bool), {i: events.End.TERMINATED for i in last})
       step_type = np.ones(2, int)
       step_type[last] = 2
-      return batch_environment.BatchTimeStep(
+      return batch_time_steps.BatchTimeStep(
           step_type, np.zeros(2), np.ones(2), {}
       )
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from realab_suite.engine import agent_view
-from realab_suite.engine import batch_environment
+from realab_suite.engine import batch_time_steps
 from tests.leaks import pairs
 from tests.leaks import secrets
 
@@ -36,7 +36,7 @@ _OURS = ('realab_suite', 'dm_control', 'mujoco')
 _VIEWS = (
     agent_view.AgentView,
     agent_view.BatchAgentView,
-    batch_environment.BatchTimeStep,
+    batch_time_steps.BatchTimeStep,
 )
 _LEAVES = (str, bytes, int, float, complex, type(None), type, types.ModuleType)
 
