@@ -136,15 +136,16 @@ def test_the_agents_file_does_not_name_its_origin(folder, saboteur):
     assert word.encode() not in data
 
 
+def _without_learner(source, name):
+  """Returns a source with other actions: a learner selects discrete ones."""
+  design = source.design.model_copy(update={'learner': None})
+  loader = dataclasses.replace(source.loader, design=design)
+  return dataclasses.replace(source, name=name, loader=loader)
+
+
 def test_sources_with_other_actions_get_a_group_of_their_own():
   free = made.source('no_op', max_steps=3)
-  discrete = dataclasses.replace(
-      made.source('no_op', max_steps=3), name='discrete'
-  )
-  discrete = dataclasses.replace(
-      discrete,
-      design=discrete.design.model_copy(update={'learner': None}),
-  )
+  discrete = _without_learner(made.source('no_op', max_steps=3), 'discrete')
   groups = export.grouped([free, discrete, free])
   assert [(name, len(of)) for name, of in groups] == [
       ('instantaneous_reward', 2), ('instantaneous_reward_2', 1),
@@ -153,9 +154,7 @@ def test_sources_with_other_actions_get_a_group_of_their_own():
 
 def test_a_group_of_different_kinds_is_refused(tmp_path):
   one = made.source('no_op', max_steps=2)
-  other = dataclasses.replace(
-      one, name='other', design=one.design.model_copy(update={'learner': None})
-  )
+  other = _without_learner(one, 'other')
   with pytest.raises(errors.ResultsError, match='run other has observations'):
     export.labelled([('both', [one, other])], tmp_path / 'new')
   assert not list(tmp_path.iterdir())
@@ -173,7 +172,10 @@ def test_a_replay_that_differs_leaves_no_folder(tmp_path):
 
 def test_a_replay_of_another_length_is_refused():
   source = made.source('no_op', max_steps=3)
-  longer = dataclasses.replace(source, environment_kwargs={'max_steps': 2})
+  shorter = dataclasses.replace(
+      source.loader, environment_kwargs={'max_steps': 2}
+  )
+  longer = dataclasses.replace(source, loader=shorter)
   with pytest.raises(errors.ResultsError, match='has 2 control steps'):
     recording.record(longer, source.episodes[0])
 

@@ -10,8 +10,8 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
 from realab_suite.experiments import supervised_designs
-from realab_suite.feedback import providers
 from realab_suite.feedback.providers import answer_sources
+from tests.engine import helpers
 
 _EXACT = {'latency': 0, 'noise': 0.0, 'fatigue': 0.0}
 
@@ -128,15 +128,24 @@ def test_a_person_who_compares_reads_a_query():
     _evaluate('random', design)
 
 
-def test_a_batch_gets_the_answers_of_single_worlds():
-  design = supervised_designs.design('approval')
-  batch = suite.load_batch(
-      'unlock_door', 'near', {'random': 1}, num_envs=2, design=design
-  )
-  batch.reset()
-  action = np.zeros((2, *batch.action_spec().shape), batch.action_spec().dtype)
-  for _ in range(10):
-    time_step = batch.step(action)
-  read = time_step.observation['registers/feedback']
-  assert read.shape == (2,)
-  assert 'person' in providers.PROVIDERS
+@pytest.mark.parametrize('asks', ['approval', 'correction', 'comparison'])
+def test_a_batch_gets_the_answers_of_single_worlds(asks):
+  design = supervised_designs.design(asks, options={'noise': 0.3})
+  arguments = 'unlock_door', 'near', {'random': 1}
+  kwargs = {'max_steps': 30}
+  batch = suite.load_batch(*arguments, kwargs, num_envs=2, design=design)
+  envs = [
+      suite.load(*arguments, {**kwargs, 'world': world}, design=design)
+      for world in range(2)
+  ]
+  together, alone = batch.reset(), [env.reset() for env in envs]
+  readings = []
+  random = np.random.default_rng(0)
+  for actions in helpers.draw(batch.action_spec(), (45, 2), random):
+    for world, time_step in enumerate(alone):
+      expected = time_step.observation['registers/feedback']
+      assert together.observation['registers/feedback'][world] == expected
+      readings.append(float(expected))
+    together = batch.step(actions)
+    alone = [env.step(actions[world]) for world, env in enumerate(envs)]
+  assert len(set(readings)) > 1
