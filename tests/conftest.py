@@ -9,6 +9,7 @@ default, has few and the same ones in every run; `long` has many random ones.
 """
 
 import functools
+import gc
 import os
 import pathlib
 import subprocess
@@ -50,6 +51,14 @@ mujoco.Physics.from_xml_string(xml).render(8, 8)
 def pytest_configure(config: pytest.Config) -> None:
   """Makes tests fail on warnings that they do not announce."""
   config.pluginmanager.register(gate.Gate(), 'gate')
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+  """Collects garbage less often: worlds leave much of it, which is slow."""
+  del session
+  gc.collect()
+  gc.freeze()
+  gc.set_threshold(100_000, 20, 20)
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
