@@ -240,6 +240,7 @@ def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(mode, flat):
   assert envs.observation_space == sync.observation_space
   assert envs.action_space == sync.action_space
   assert envs.metadata['autoreset_mode'] == sync.metadata['autoreset_mode']
+  assert envs.autoreset_mode == sync.autoreset_mode
   _assert_same(envs.reset(seed=5), sync.reset(seed=[5] * _NUM_ENVS))
   envs.action_space.seed(1)
   is_over = np.zeros(_NUM_ENVS, bool)

@@ -50,11 +50,14 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     Raises:
       SpecError: If an argument is invalid.
     """
-    self._mode = _checked_mode(autoreset_mode)
+    self.autoreset_mode = _checked_mode(autoreset_mode)
     self._batch = batch
     self._view = agent_view.BatchAgentView(batch, failures)
     self._interface = interfaces.Interface(self._view, batch.task, **options)
-    self.metadata = {**self._interface.metadata, 'autoreset_mode': self._mode}
+    self.metadata = {
+        **self._interface.metadata,
+        'autoreset_mode': self.autoreset_mode,
+    }
     self.render_mode = self._interface.render_mode
     self.num_envs = batch.num_envs
     self.single_observation_space = self._interface.observations.space
@@ -120,7 +123,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
       WorldError: If a world failed. All episodes are over.
     """
     if not self._has_begun or (
-        self._mode is AutoresetMode.DISABLED and self._is_over.any()
+        self.autoreset_mode is AutoresetMode.DISABLED and self._is_over.any()
     ):
       raise gym.error.ResetNeeded(
           'step: a world has no episode; call reset(), or'
@@ -138,7 +141,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     rewards = self._rewards(time_step)
     observations = self._encode(time_step)
     infos: dict[str, Any] = {}
-    if self._mode is AutoresetMode.SAME_STEP and self._is_over.any():
+    if self.autoreset_mode is AutoresetMode.SAME_STEP and self._is_over.any():
       for world in np.flatnonzero(self._is_over).tolist():
         final = {'final_obs': _row(observations, world), 'final_info': {}}
         infos = self._add_info(infos, final, world)
@@ -182,7 +185,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
 
   def _remembered(self, observations: codecs.Observation) -> codecs.Observation:
     """Keeps a copy of observations if single worlds may be reset later."""
-    if self._mode is AutoresetMode.DISABLED:
+    if self.autoreset_mode is AutoresetMode.DISABLED:
       self._last = _copied(observations)
     return observations
 
