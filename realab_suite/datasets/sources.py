@@ -15,6 +15,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import aiming
+from realab_suite.experiments import run_infos
 from realab_suite.feedback import specs
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
@@ -154,16 +155,7 @@ def of_policy(
           )
       )
       actor = aiming.make_policy(policy, env, None, 0)
-      info = results.RunInfo.of(
-          world,
-          suite.dynamics(*world),
-          design,
-          policy=policy,
-          run=name,
-          baseline=None,
-          control_timestep=env.control_timestep(),
-          max_steps=env.max_steps,
-      )
+      info = run_infos.of(env, world, policy=policy, run=name, baseline=None)
       batch = stack.enter_context(
           contextlib.closing(
               suite.load_batch(

@@ -126,6 +126,51 @@ def evaluate(
     raise errors.ResultsError(
         f'env: {type(env).__name__}; allowed is an Environment from suite.load'
     )
+  actor = actors.make(policy, env)
+
+  def play(episode: int) -> None:
+    actor.begin(episode)
+    time_step = env.reset()
+    while not time_step.last():
+      time_step = env.step(actor.act(time_step))
+
+  return results_of(
+      env,
+      play,
+      num_episodes,
+      first_episode=first_episode,
+      sinks=sinks,
+      on_episode=on_episode,
+  )
+
+
+def results_of(
+    env: environment.Environment,
+    play: Callable[[int], None],
+    num_episodes: int,
+    *,
+    first_episode: int = 0,
+    sinks: Sequence[events.EventSink] = (),
+    on_episode: Callable[[EpisodeResult], None] | None = None,
+) -> list[EpisodeResult]:
+  """Returns the results of episodes that a function plays.
+
+  Args:
+    env: The environment.
+    play: Function from the number of an episode, that resets `env` and acts
+      until the episode ends.
+    num_episodes: As in `evaluate`; so are the next three.
+    first_episode: Number of the first episode.
+    sinks: Additional event sinks.
+    on_episode: Function that is called with each result.
+
+  Returns:
+    One result per episode in order, including invalid ones.
+
+  Raises:
+    ResultsError: If `num_episodes` is not positive, or `first_episode` is
+      negative.
+  """
   if not isinstance(num_episodes, int) or num_episodes < 1:
     raise errors.ResultsError(
         f'num_episodes: {num_episodes}; allowed are positive integers'
@@ -134,7 +179,6 @@ def evaluate(
     raise errors.ResultsError(
         f'first_episode: {first_episode}; allowed are integers from 0'
     )
-  actor = actors.make(policy, env)
   ledger = ledgers.Ledger()
   all_sinks = (ledger, *sinks)
   for sink in all_sinks:
@@ -143,11 +187,8 @@ def evaluate(
   try:
     env.rewind(first_episode)
     while len(results) < num_episodes:
-      actor.begin(first_episode + len(results))
-      time_step = env.reset()
-      while not time_step.last():
-        time_step = env.step(actor.act(time_step))
-      # There may be several, if the policy itself resets the environment.
+      play(first_episode + len(results))
+      # There may be several, if a policy or a wrapper resets the environment.
       for episode in ledger.episodes[len(results) : num_episodes]:
         result = result_of(episode, env)
         results.append(result)

@@ -23,6 +23,7 @@ from realab_suite.evaluation import results
 from realab_suite.experiments import aiming
 from realab_suite.experiments import machines
 from realab_suite.experiments import result_tables
+from realab_suite.experiments import run_infos
 from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.interop.gymnasium import evaluation
@@ -208,11 +209,19 @@ class _Job:
   ) -> dict[str, list[results.EpisodeRow]]:
     """Runs all episodes, and returns the rows of each run."""
     rows: dict[str, list[results.EpisodeRow]] = {}
+    baseline = self._baselines[0]
     for i in range(self.num_seeds):
       with self._open(self._first_seed + i) as env:
         loaded = single.environment_of(env)
         for run, found in self._results(env, loaded, i):
-          row = results.row(self._info(run, loaded), found)
+          info = run_infos.of(
+              loaded,
+              self._world,
+              policy=run,
+              run=run,
+              baseline=None if run == baseline else baseline,
+          )
+          row = results.row(info, found)
           writer.write(row)
           rows.setdefault(run, []).append(row)
     return rows
@@ -229,19 +238,6 @@ class _Job:
     for name, policies in self._agents.items():
       for found in evaluation.evaluate(env, policies[i], self._num_episodes):
         yield name, found
-
-  def _info(self, run: str, loaded: environment.Environment) -> results.RunInfo:
-    baseline = self._baselines[0]
-    return results.RunInfo.of(
-        self._world,
-        suite.dynamics(*self._world),
-        self.design,
-        policy=run,
-        run=run,
-        baseline=None if run == baseline else baseline,
-        control_timestep=loaded.control_timestep(),
-        max_steps=loaded.max_steps,
-    )
 
 
 def _num_seeds(

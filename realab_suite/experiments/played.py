@@ -21,6 +21,7 @@ from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.experiments import machines
 from realab_suite.experiments import result_tables
+from realab_suite.experiments import run_infos
 from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
@@ -101,6 +102,13 @@ def play(
     for name, policy in ((PERSON, keyboard), (_BASELINE, baseline)):
       if name == _BASELINE:
         server.send({'type': 'working', 'text': 'The baseline acts'})
+      info = run_infos.of(
+          env,
+          (settings.domain, settings.task),
+          policy=name,
+          run=name,
+          baseline=None if name == _BASELINE else _BASELINE,
+      )
       for episode in range(settings.num_episodes):
         sinks = []
         if name == PERSON:
@@ -108,7 +116,7 @@ def play(
         [result] = evaluate.evaluate(
             env, policy, 1, first_episode=episode, sinks=sinks
         )
-        row = results.row(_info(settings, name, env), result)
+        row = results.row(info, result)
         rows[name].append(row)
         if writer is not None:
           writer.write(row)
@@ -141,22 +149,6 @@ def _describe(settings: Settings) -> pathlib.Path:
   described['versions'] = results.versions()
   storage.write_json(folder / 'run.json', described)
   return folder
-
-
-def _info(
-    settings: Settings, name: str, env: environment.Environment
-) -> results.RunInfo:
-  world = (settings.domain, settings.task)
-  return results.RunInfo.of(
-      world,
-      suite.dynamics(*world),
-      settings.design,
-      policy=name,
-      run=name,
-      baseline=None if name == _BASELINE else _BASELINE,
-      control_timestep=env.control_timestep(),
-      max_steps=env.max_steps,
-  )
 
 
 def state(

@@ -26,6 +26,7 @@ from realab_suite.evaluation import results
 from realab_suite.experiments import aiming
 from realab_suite.experiments import machines
 from realab_suite.experiments import result_tables
+from realab_suite.experiments import run_infos
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
@@ -324,7 +325,13 @@ class _Job:
   def _episodes(self, run: Run) -> Iterator[results.EpisodeRow]:
     for seed in self._settings.seeds:
       with contextlib.closing(_load(self._settings, run, seed)) as env:
-        info = self._info(run, env)
+        info = run_infos.of(
+            env,
+            (self._settings.domain, self._settings.task),
+            policy=run.policy,
+            run=run.name,
+            baseline=None if run.name == self._baseline else self._baseline,
+        )
         for episode in range(self._settings.num_episodes):
           yield results.row(info, self._episode(run, env, episode))
 
@@ -355,20 +362,6 @@ class _Job:
     folder = self._folder / 'videos'
     folder.mkdir(exist_ok=True)
     return stack.enter_context(self._pictures.film(env, folder, run.name))
-
-  def _info(self, run: Run, env: environment.Environment) -> results.RunInfo:
-    settings = self._settings
-    world = (settings.domain, settings.task)
-    return results.RunInfo.of(
-        world,
-        suite.dynamics(*world),
-        run.design,
-        policy=run.policy,
-        run=run.name,
-        baseline=None if run.name == self._baseline else self._baseline,
-        control_timestep=env.control_timestep(),
-        max_steps=env.max_steps,
-    )
 
 
 def _means(rows: Sequence[results.EpisodeRow]) -> str:

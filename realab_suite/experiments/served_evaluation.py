@@ -20,6 +20,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
+from realab_suite.experiments import run_infos
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
@@ -126,7 +127,14 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
         results.versions(),
     )
     writer = stack.enter_context(results.RowWriter(output / 'episodes.jsonl'))
-    info = _info(settings, design, env, seed.salt_digest)
+    info = run_infos.of(
+        env,
+        (settings.domain, settings.task),
+        policy=settings.name,
+        run=settings.name,
+        baseline=None,
+        salt_digest=seed.salt_digest,
+    )
     evaluator = _Evaluator(info, writer, say)
     world = served_world.ServedWorld(
         env, address, settings.num_episodes, evaluator.write
@@ -283,26 +291,6 @@ def _make_private_folder(output: str) -> pathlib.Path:
       )
     folder.chmod(0o700)
   return folder
-
-
-def _info(
-    settings: Settings,
-    design: specs.DesignSpec,
-    env: environment.Environment,
-    salt_digest: str,
-) -> results.RunInfo:
-  world = (settings.domain, settings.task)
-  return results.RunInfo.of(
-      world,
-      suite.dynamics(*world),
-      design,
-      policy=settings.name,
-      run=settings.name,
-      baseline=None,
-      control_timestep=env.control_timestep(),
-      max_steps=env.max_steps,
-      salt_digest=salt_digest,
-  )
 
 
 def _check_all_written(

@@ -66,6 +66,7 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite import suite
   from realab_suite.evaluation import results
   from realab_suite.experiments import aiming
+  from realab_suite.experiments import run_infos
   from realab_suite.experiments import scripted
   from realab_suite.experiments import storage
   from realab_suite.experiments import supervised
@@ -106,15 +107,12 @@ def main(argv: Sequence[str]) -> None:
     lines = []
     for episode in range(_EPISODES.value):
       result = supervision.run(policy, episode)
-      info = results.RunInfo.of(
+      info = run_infos.of(
+          env,
           (domain, task),
-          suite.dynamics(domain, task),
-          design,
           policy=_POLICY.value,
           run='supervised',
           baseline=None,
-          control_timestep=env.control_timestep(),
-          max_steps=env.max_steps,
       )
       writer.write(results.row(info, result))
       lines.append(

@@ -67,7 +67,7 @@ def test_a_report_has_rows_and_figures_of_agents_and_baselines(tmp_path):
         ({'random': [_still]}, ['random'], 'name of a baseline'),
         ({'a': [_still], 'b': [_still] * 2}, ['random'], 'equal numbers'),
         ({'a': [_still]}, [], 'baselines'),
-        ({'a': [_still]}, ['nobody'], 'nobody'),
+        ({'a': [_still]}, ['missing'], 'missing'),
     ],
 )
 def test_wrong_arguments_are_refused_before_anything_is_written(

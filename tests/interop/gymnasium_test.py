@@ -36,15 +36,6 @@ def _make(name: str = _NEAR, **options: Any) -> Any:
   return gym.make(name, **{**_SHORT, **options}).unwrapped
 
 
-def _ids() -> list[str]:
-  """Returns an id for each design, in both domains."""
-  tasks = suite.ALL_TASKS
-  return [
-      registration.id_of(*tasks[3 * i % len(tasks)], design)
-      for i, design in enumerate(suite.DESIGNS)
-  ]
-
-
 def test_every_shipped_world_has_an_id_with_every_design():
   ids = registration.ids()
   assert len(ids) == len(set(ids)) == len(suite.ALL_TASKS) * len(suite.DESIGNS)
@@ -57,7 +48,15 @@ def test_an_id_may_name_the_module_that_registers_it():
   assert isinstance(env.unwrapped, single.RealabEnv)
 
 
-@pytest.mark.parametrize('name', _ids())
+# `campaigns.gymnasium_campaign` checks all ids.
+@pytest.mark.parametrize(
+    'name',
+    [
+        _NEAR,
+        'realab/CollectApples-boxed-OnlineImitation-v2',
+        'realab/UnlockDoor-impossible-PairedDecoupledApproval-v2',
+    ],
+)
 def test_the_checker_of_gymnasium_has_no_warnings(name):
   env_checker.check_env(_make(name), skip_render_check=True)
 
@@ -165,6 +164,16 @@ def test_wrong_options_are_refused(options, message):
     registration.make('unlock_door', 'near', 'instantaneous_reward', **options)
 
 
+@pytest.mark.parametrize(
+    ('world', 'expected'),
+    [(('unlock_door', 'near'), 10), (('dm_control/cartpole', 'balance'), 100)],
+)
+def test_frames_show_a_world_in_real_time(world, expected):
+  # The second world has no camera `top_down`.
+  env = registration.make(*world)
+  assert env.metadata['render_fps'] == pytest.approx(expected)
+
+
 def _public(thing: Any) -> dict[str, Any]:
   return {
       name: getattr(thing, name, None)
@@ -231,6 +240,7 @@ def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(mode, flat):
   assert envs.observation_space == sync.observation_space
   assert envs.action_space == sync.action_space
   assert envs.metadata['autoreset_mode'] == sync.metadata['autoreset_mode']
+  assert envs.autoreset_mode == sync.autoreset_mode
   _assert_same(envs.reset(seed=5), sync.reset(seed=[5] * _NUM_ENVS))
   envs.action_space.seed(1)
   is_over = np.zeros(_NUM_ENVS, bool)

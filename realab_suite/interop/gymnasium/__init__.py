@@ -1,9 +1,11 @@
-"""Worlds with the interface of Gymnasium; importing this registers their ids.
+"""Worlds with the interface of Gymnasium.
 
-import gymnasium as gym
-import realab_suite.interop.gymnasium
+Importing this package registers their ids:
 
-env = gym.make('realab/UnlockDoor-near-InstantaneousReward-v2')
+    import gymnasium as gym
+    import realab_suite.interop.gymnasium
+
+    env = gym.make('realab/UnlockDoor-near-InstantaneousReward-v2')
 """
 
 from realab_suite.interop.gymnasium import registration

@@ -5,10 +5,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from realab_suite import errors
 from realab_suite.engine import events
 from realab_suite.evaluation import evaluate as evaluation
-from realab_suite.evaluation import ledgers
 from realab_suite.interop.gymnasium import single
 
 Policy = Callable[[Any], Any]
@@ -47,35 +45,20 @@ def evaluate(
     ResultsError: If `env` is another environment, or a number is invalid.
   """
   environment = single.environment_of(env)
-  if not isinstance(num_episodes, int) or num_episodes < 1:
-    raise errors.ResultsError(
-        f'num_episodes: {num_episodes}; allowed are positive integers'
-    )
-  if first_episode < 0:
-    raise errors.ResultsError(
-        f'first_episode: {first_episode}; allowed are integers from 0'
-    )
-  ledger = ledgers.Ledger()
-  all_sinks = (ledger, *sinks)
-  for sink in all_sinks:
-    environment.add_sink(sink)
-  results: list[evaluation.EpisodeResult] = []
-  try:
-    environment.rewind(first_episode)
-    while len(results) < num_episodes:
-      observation, _ = env.reset()
-      is_over = False
-      while not is_over:
-        observation, _, terminated, truncated, _ = env.step(policy(observation))
-        is_over = bool(terminated or truncated)
-      environment.abandon()  # If a wrapper has ended the episode.
-      # There may be several, if a wrapper itself resets the world.
-      for episode in ledger.episodes[len(results) : num_episodes]:
-        result = evaluation.result_of(episode, environment)
-        results.append(result)
-        if on_episode is not None:
-          on_episode(result)
-  finally:
-    for sink in all_sinks:
-      environment.remove_sink(sink)
-  return results
+
+  def play(unused_episode: int) -> None:
+    observation, _ = env.reset()
+    is_over = False
+    while not is_over:
+      observation, _, terminated, truncated, _ = env.step(policy(observation))
+      is_over = bool(terminated or truncated)
+    environment.abandon()  # If a wrapper has ended the episode.
+
+  return evaluation.results_of(
+      environment,
+      play,
+      num_episodes,
+      first_episode=first_episode,
+      sinks=sinks,
+      on_episode=on_episode,
+  )

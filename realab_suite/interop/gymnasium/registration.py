@@ -1,8 +1,9 @@
 """Ids of all shipped worlds in Gymnasium's registry."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 import functools
-from typing import Any
+import inspect
+from typing import Any, TypeVar
 
 import gymnasium as gym
 
@@ -14,44 +15,29 @@ from realab_suite.interop.gymnasium import vector
 NAMESPACE = 'realab'
 """Namespace of the ids."""
 
+_Adapter = TypeVar('_Adapter', single.RealabEnv, vector.RealabVectorEnv)
+
 
 def make(
     domain_name: str,
     task_name: str,
     design: specs.Design | None = None,
-    *,
-    task_kwargs: Mapping[str, Any] | None = None,
-    environment_kwargs: Mapping[str, Any] | None = None,
-    overrides: Sequence[str] = (),
     **options: Any,
 ) -> single.RealabEnv:
   """Loads a world: the entry point of the registered ids.
 
   Args:
-    domain_name: As in `suite.load`; so are the next five.
+    domain_name: Name of the domain.
     task_name: Name of the variation.
     design: Design, by name, path or contents.
-    task_kwargs: Seed `random` and arguments of the task.
-    environment_kwargs: `max_steps`, `senses` and `world`.
-    overrides: Dotted overrides of the design.
-    **options: Keyword arguments of `RealabEnv`.
+    **options: Other arguments of `suite.load`, and keyword arguments of
+      `RealabEnv`.
 
   Raises:
     SpecError: If an argument is invalid.
   """
-  env = suite.load(
-      domain_name,
-      task_name,
-      task_kwargs,
-      environment_kwargs,
-      design=design,
-      overrides=overrides,
-  )
-  try:
-    return single.RealabEnv(env, **options)
-  except BaseException:
-    env.close()
-    raise
+  world = (domain_name, task_name)
+  return _adapted(single.RealabEnv, suite.load, world, design, options)
 
 
 def make_vector(
@@ -59,46 +45,49 @@ def make_vector(
     domain_name: str,
     task_name: str,
     design: specs.Design | None = None,
-    *,
-    task_kwargs: Mapping[str, Any] | None = None,
-    environment_kwargs: Mapping[str, Any] | None = None,
-    overrides: Sequence[str] = (),
-    num_threads: int = 0,
-    sleep: bool = False,
     **options: Any,
 ) -> vector.RealabVectorEnv:
   """Loads a batch of worlds: the vector entry point of the registered ids.
 
   Args:
     num_envs: Number of worlds.
-    domain_name: As in `suite.load_batch`; so are the next seven.
+    domain_name: Name of the domain.
     task_name: Name of the variation.
     design: Design, by name, path or contents.
-    task_kwargs: Seed `random` and arguments of the task.
-    environment_kwargs: `max_steps` and `senses`.
-    overrides: Dotted overrides of the design.
-    num_threads: Number of threads; 0 for one per processor.
-    sleep: True if blocks at rest sleep.
-    **options: Keyword arguments of `RealabVectorEnv`.
+    **options: Other arguments of `suite.load_batch`, and keyword arguments of
+      `RealabVectorEnv`.
 
   Raises:
     SpecError: If an argument is invalid.
   """
-  batch = suite.load_batch(
-      domain_name,
-      task_name,
-      task_kwargs,
-      environment_kwargs,
-      num_envs=num_envs,
-      num_threads=num_threads,
-      sleep=sleep,
-      design=design,
-      overrides=overrides,
-  )
+  world = (domain_name, task_name)
+  load = functools.partial(suite.load_batch, num_envs=num_envs)
+  return _adapted(vector.RealabVectorEnv, load, world, design, options)
+
+
+def _adapted(
+    adapter: Callable[..., _Adapter],
+    load: Callable[..., Any],
+    world: tuple[str, str],
+    design: specs.Design | None,
+    options: Mapping[str, Any],
+) -> _Adapter:
+  """Loads worlds, and returns them in an adapter.
+
+  Args:
+    adapter: Class of the adapter.
+    load: Function that loads the worlds.
+    world: Names of the domain and the task.
+    design: The design.
+    options: Arguments of `load`, and keyword arguments of the adapter.
+  """
+  of_load = inspect.signature(load).parameters.keys() & options.keys()
+  of_adapter = options.keys() - of_load
+  loaded = load(*world, design=design, **{k: options[k] for k in of_load})
   try:
-    return vector.RealabVectorEnv(batch, **options)
+    return adapter(loaded, **{k: options[k] for k in of_adapter})
   except BaseException:
-    batch.close()
+    loaded.close()
     raise
 
 

@@ -45,8 +45,7 @@ class RealabVecEnv(vec_env.VecEnv):
 
   def reset(self) -> Any:
     """Starts new episodes; returns the observations."""
-    seeds = None if self._seeds[0] is None else self._seeds[0]
-    observations, _ = self._envs.reset(seed=seeds)
+    observations, _ = self._envs.reset(seed=self._seeds[0])
     self._reset_seeds()
     self._reset_options()
     return observations

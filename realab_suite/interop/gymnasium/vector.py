@@ -9,11 +9,10 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.config import messages
 from realab_suite.engine import agent_view
-from realab_suite.engine import arguments
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.interop.gymnasium import codecs
-from realab_suite.interop.gymnasium import single
+from realab_suite.interop.gymnasium import interfaces
 
 AutoresetMode = gym.vector.AutoresetMode
 
@@ -34,14 +33,8 @@ class RealabVectorEnv(gym.vector.VectorEnv):
       batch: batch_environment.BatchEnvironment,
       *,
       autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-      reward_register: str | None = None,
-      dtype: codecs.DType = 'float32',
-      flat: bool = False,
-      render_mode: str | None = None,
-      camera_name: str = 'top_down',
-      height: int = 240,
-      width: int = 320,
       failures: list[Exception] | None = None,
+      **options: Any,
   ) -> None:
     """Makes an adapter. Prefer `gymnasium.make_vec`.
 
@@ -50,44 +43,30 @@ class RealabVectorEnv(gym.vector.VectorEnv):
       autoreset_mode: Beginning of the next episode of a world: with the next
         step (`'NextStep'`), with the same step (`'SameStep'`), or with
         `reset(options={'reset_mask': ...})` (`'Disabled'`).
-      reward_register: As in `RealabEnv`; so are the others.
-      dtype: Type of floats in observations and actions.
-      flat: True for observations that are one vector for each world.
-      render_mode: `'rgb_array'`, or `None`.
-      camera_name: Camera of the frames.
-      height: Height of a frame, in pixels.
-      width: Width of a frame, in pixels.
       failures: List of the caller, to which exceptions are appended.
+      **options: Keyword arguments of `interfaces.Interface`, such as
+        `reward_register`.
 
     Raises:
       SpecError: If an argument is invalid.
     """
-    self._mode = _checked_mode(autoreset_mode)
-    self._view = agent_view.BatchAgentView(batch, failures)
+    self.autoreset_mode = _checked_mode(autoreset_mode)
     self._batch = batch
+    self._view = agent_view.BatchAgentView(batch, failures)
+    self._interface = interfaces.Interface(self._view, batch.task, **options)
+    self.metadata = {
+        **self._interface.metadata,
+        'autoreset_mode': self.autoreset_mode,
+    }
+    self.render_mode = self._interface.render_mode
     self.num_envs = batch.num_envs
-    spec = self._view.observation_spec()
-    self._reward_key = codecs.reward_key(reward_register, spec)
-    self._observations = codecs.ObservationCodec(spec, dtype, flat)
-    self._actions = codecs.ActionCodec(self._view.action_spec(), dtype)
-    self.single_observation_space = self._observations.space
-    self.single_action_space = self._actions.space
+    self.single_observation_space = self._interface.observations.space
+    self.single_action_space = self._interface.actions.space
     self.observation_space = utils.batch_space(
         self.single_observation_space, self.num_envs
     )
     self.action_space = utils.batch_space(
         self.single_action_space, self.num_envs
-    )
-    self.metadata = {
-        'render_modes': list(single.RENDER_MODES),
-        'render_fps': single.FRAMES_PER_SECOND,
-        'autoreset_mode': self._mode,
-    }
-    self.render_mode = single.checked_render_mode(render_mode)
-    self._frame = (
-        arguments.camera(camera_name, batch.task.root_entity.mjcf_model),
-        height,
-        width,
     )
     self._has_begun = False
     self._is_over = np.zeros(self.num_envs, bool)
@@ -144,13 +123,13 @@ class RealabVectorEnv(gym.vector.VectorEnv):
       WorldError: If a world failed. All episodes are over.
     """
     if not self._has_begun or (
-        self._mode is AutoresetMode.DISABLED and self._is_over.any()
+        self.autoreset_mode is AutoresetMode.DISABLED and self._is_over.any()
     ):
       raise gym.error.ResetNeeded(
           'step: a world has no episode; call reset(), or'
           " reset(options={'reset_mask': ...}) for single worlds"
       )
-    decoded = self._actions.decode(actions)
+    decoded = self._interface.actions.decode(actions)
     try:
       time_step = self._view.step(decoded)
     except errors.WorldError:
@@ -162,7 +141,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     rewards = self._rewards(time_step)
     observations = self._encode(time_step)
     infos: dict[str, Any] = {}
-    if self._mode is AutoresetMode.SAME_STEP and self._is_over.any():
+    if self.autoreset_mode is AutoresetMode.SAME_STEP and self._is_over.any():
       for world in np.flatnonzero(self._is_over).tolist():
         final = {'final_obs': _row(observations, world), 'final_info': {}}
         infos = self._add_info(infos, final, world)
@@ -176,7 +155,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     """Returns a frame of each world for people, or `None`."""
     if self.render_mode is None:
       return None
-    return tuple(self._batch.render(None, *self._frame))
+    return tuple(self._batch.render(None, *self._interface.frame))
 
   def close_extras(self, **kwargs: Any) -> None:
     """Frees the worlds."""
@@ -206,7 +185,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
 
   def _remembered(self, observations: codecs.Observation) -> codecs.Observation:
     """Keeps a copy of observations if single worlds may be reset later."""
-    if self._mode is AutoresetMode.DISABLED:
+    if self.autoreset_mode is AutoresetMode.DISABLED:
       self._last = _copied(observations)
     return observations
 
@@ -214,13 +193,14 @@ class RealabVectorEnv(gym.vector.VectorEnv):
       self, time_step: batch_time_steps.BatchTimeStep
   ) -> codecs.Observation:
     lead = (len(time_step.step_type),)
-    return self._observations.encode(time_step.observation, lead)
+    return self._interface.observations.encode(time_step.observation, lead)
 
   def _rewards(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
     """Returns rewards; the reading in a first step rewards no action."""
-    if self._reward_key is None:
+    key = self._interface.reward_key
+    if key is None:
       return np.zeros(self.num_envs)
-    readings = time_step.observation[self._reward_key]
+    readings = time_step.observation[key]
     return np.where(time_step.first(), 0.0, readings)
 
 
