@@ -68,7 +68,7 @@ class Pretender(engines.Engine):
     self._running -= 1
     status = self._statuses.get(_flag(task, 'run'), 0)
     if callable(status):
-      status()
+      status = status()
     if not status:
       experiment = experiment_specs.load(
           pathlib.Path(_flag(task, 'experiment'))
@@ -143,7 +143,59 @@ def test_a_job_lost_by_a_cluster_does_not_stop_the_others(tmp_path):
       errors.ResultsError, match='1 of 2 jobs failed: bad, seed 3: --engine=ray'
   ):
     _sweep(_SMALL, tmp_path, engine)
+  assert engine.commands == [('bad', 3), ('good', 3), *[('bad', 3)] * 3]
+
+
+def _killed_once():
+  """Returns statuses of a job: killed, then finished."""
+  statuses = iter([-9])
+  return lambda: next(statuses, 0)
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_a_killed_job_is_started_again(tmp_path):
+  engine = Pretender(statuses={'bad': _killed_once()})
+  said = _sweep(_SMALL, tmp_path, engine)
+  assert engine.commands == [('bad', 3), ('good', 3), ('bad', 3)]
+  assert said[0] == 'bad, seed 3: killed by signal 9; is started again (1 of 3)'
+  assert said[-1] == f'2 jobs finished; results are in {tmp_path}'
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_a_job_that_is_always_killed_has_failed(tmp_path):
+  engine = Pretender(statuses={'bad': -9})
+  with pytest.raises(errors.ResultsError, match='bad, seed 3: killed by sig'):
+    _sweep(_SMALL, tmp_path, engine)
+  assert engine.commands.count(('bad', 3)) == 4
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_a_job_whose_process_survived_its_worker_is_done_once(
+    tmp_path, monkeypatch
+):
+  [job] = jobs.plan(experiment_specs.load(_SMALL), only=['bad'])
+  survivors = []
+
+  def lose():
+    survivors.append(storage.RunFolder(tmp_path / job.folder(), job.config()))
+    survivors[0].__enter__()
+    raise errors.ResultsError('--engine=ray: a machine is gone')
+
+  engine = Pretender(statuses={'bad': lose})
+  polls = 0
+
+  def sleep(seconds):
+    nonlocal polls
+    polls += 1
+    if polls == 5:
+      survivors[0].finish([], {})
+      survivors[0].__exit__(None, None, None)
+
+  monkeypatch.setattr(scheduler.time, 'sleep', sleep)
+  said = _sweep(_SMALL, tmp_path, engine)
+  assert polls >= 5
   assert engine.commands == [('bad', 3), ('good', 3)]
+  assert said[-1] == f'2 jobs finished; results are in {tmp_path}'
 
 
 @pytest.mark.usefixtures('no_wait')
@@ -365,6 +417,46 @@ def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
   log = tmp_path / 'log'
   assert _wait(engine, engine.start(_command(3), log)) == 3
   assert log.read_text() == 'said\n'
+
+
+def test_a_job_that_left_the_queue_of_slurm_without_a_result_is_lost(
+    tmp_path, monkeypatch
+):
+  fake = types.ModuleType('submitit')
+  fake.AutoExecutor = _FakeExecutor
+  monkeypatch.setitem(sys.modules, 'submitit', fake)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
+  monkeypatch.setattr('shutil.which', lambda name: f'/bin/{name}')
+  monkeypatch.setattr(engines, '_QUEUE_SECONDS', 0.0)
+  # The queue is unknown once, as while the controller is restarting.
+  queues = iter(
+      [(0, '6\n7\n'), (0, '6\n'), (0, '7\n'), (0, ''), (1, ''), (0, '')]
+  )
+
+  def run(command, **unused):
+    assert command[0] == 'squeue'
+    status, text = next(queues)
+    return subprocess.CompletedProcess(command, status, text)
+
+  monkeypatch.setattr(subprocess, 'run', run)
+  engine = engines.Submitit(1)
+  task = types.SimpleNamespace(done=lambda: False, job_id='7')
+  for _ in range(5):
+    assert engine.poll(task) is None
+  with pytest.raises(errors.ResultsError, match='job 7 left the queue of Slu'):
+    engine.poll(task)
+
+
+@pytest.mark.parametrize('name', ['Local', 'execute'])
+def test_a_command_ends_with_the_process_that_runs_it(tmp_path, name):
+  log = tmp_path / 'log'
+  command = [sys.executable, '-c', 'import sys; print(sys.argv[1:])']
+  if name == 'Local':
+    engine = engines.Local(1)
+    _wait(engine, engine.start(command, log))
+  else:
+    engines.execute(command, str(log), str(tmp_path))
+  assert log.read_text().strip() == f"['--parent={os.getpid()}']"
 
 
 def test_a_worker_works_where_the_sweep_does(tmp_path):
