@@ -4,6 +4,7 @@ import abc
 from collections.abc import Callable, Sequence
 import contextlib
 import importlib
+import logging
 import math
 import os
 import pathlib
@@ -140,6 +141,9 @@ class Submitit(Engine):
     del workers  # Slurm determines the number of processors.
     self._submitit = _import('submitit')
     self._queue = _SlurmQueue()
+    # Without accounting, it warns again and again that it may miss the end of
+    # a job; `_SlurmQueue` does not.
+    logging.getLogger('submitit').setLevel(logging.ERROR)
 
   @property
   def capacity(self) -> int:
@@ -159,11 +163,12 @@ class Submitit(Engine):
     with _errors_in_one_line('submitit'):
       if task.done():
         return int(task.result())
-      if self._queue.has_lost(task.job_id):
-        raise RuntimeError(
-            f'job {task.job_id} left the queue of Slurm without a result'
-        )
-      return None
+    if self._queue.has_lost(task.job_id):
+      raise errors.ResultsError(
+          f'--engine=submitit: job {task.job_id} left the queue of Slurm'
+          ' without a result'
+      )
+    return None
 
   def stop(self, tasks: Sequence[Any]) -> None:
     for task in tasks:

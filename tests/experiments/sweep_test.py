@@ -443,7 +443,9 @@ def test_a_job_that_left_the_queue_of_slurm_without_a_result_is_lost(
   task = types.SimpleNamespace(done=lambda: False, job_id='7')
   for _ in range(5):
     assert engine.poll(task) is None
-  with pytest.raises(errors.ResultsError, match='job 7 left the queue of Slu'):
+  with pytest.raises(
+      errors.ResultsError, match='=submitit: job 7 left the queue'
+  ):
     engine.poll(task)
 
 
