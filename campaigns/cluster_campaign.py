@@ -1,6 +1,6 @@
 """Campaign cluster: sweeps on Ray and on Slurm equal those of this machine.
 
-Run from the root of the repository, about five minutes on two processors:
+Run from the root of the repository, ten minutes on two busy processors:
 
     python -m campaigns.cluster_campaign [scale] [seed] [ray] [submitit]
 
