@@ -214,6 +214,7 @@ class _Sweep:
     self._waiting = [_Waiting(job) for job in wanted]
     self._running: list[_Running] = []
     self._failures: list[str] = []
+    self._said: set[str] = set()
     self._num_finished = 0
     self._steps: dict[str, int] = {}
 
@@ -245,9 +246,9 @@ class _Sweep:
     for waiting in list(self._waiting):
       if len(self._running) == self._engine.capacity:
         return
-      # A process may survive its worker for a moment.
-      folder = self._output / waiting.job.folder()
-      if waiting.num_restarts and _is_in_use(folder):
+      if problem := _user(self._output / waiting.job.folder()):
+        # A process may survive its worker, and jobs of a cluster their sweep.
+        self._say_once(f'{_name(waiting.job)}: {problem}')
         continue
       self._waiting.remove(waiting)
       self._start(*waiting)
@@ -298,6 +299,11 @@ class _Sweep:
         problem = _last_line(running.log) or f'exit status {status}'
       self._finish(running.job, running.folder, problem)
 
+  def _say_once(self, line: str) -> None:
+    if line not in self._said:
+      self._said.add(line)
+      self._say(line)
+
   def _restart(self, running: _Running, problem: str) -> None:
     again = _Waiting(running.job, running.num_restarts + 1)
     self._waiting.append(again)
@@ -333,14 +339,14 @@ def _name(job: jobs.Job) -> str:
   return f'{job.run}, seed {job.seed}'
 
 
-def _is_in_use(folder: pathlib.Path) -> bool:
-  """Returns whether a process is writing to the folder of a job."""
-  if folder.exists():
+def _user(folder: pathlib.Path) -> str | None:
+  """Returns a message on the process that runs the job of a folder, if any."""
+  if folder.exists() and not (folder / storage.DONE).exists():
     try:
       os.close(storage.lock(folder))
-    except errors.InUseError:
-      return True
-  return False
+    except errors.InUseError as error:
+      return str(error)
+  return None
 
 
 def _last_step(folder: pathlib.Path) -> int:

@@ -6,7 +6,6 @@ import pathlib
 import signal
 import subprocess
 import sys
-import types
 
 import pytest
 import yaml
@@ -169,32 +168,38 @@ def test_a_job_that_is_always_killed_has_failed(tmp_path):
   assert engine.commands.count(('bad', 3)) == 4
 
 
-@pytest.mark.usefixtures('no_wait')
-def test_a_job_whose_process_survived_its_worker_is_done_once(
-    tmp_path, monkeypatch
+@pytest.mark.parametrize('is_lost', [True, False], ids=['lost', 'left'])
+def test_a_job_whose_process_survived_is_done_once(
+    tmp_path, monkeypatch, is_lost
 ):
+  # The process survives its worker, or an earlier sweep.
   [job] = jobs.plan(experiment_specs.load(_SMALL), only=['bad'])
   survivors = []
 
-  def lose():
+  def begin():
     survivors.append(storage.RunFolder(tmp_path / job.folder(), job.config()))
-    survivors[0].__enter__()
+
+  def lose():
+    begin()
     raise errors.ResultsError('--engine=ray: a machine is gone')
 
+  if not is_lost:
+    begin()
   engine = Pretender(statuses={'bad': lose})
-  polls = 0
+  num_pauses = 0
 
   def sleep(seconds):
-    nonlocal polls
-    polls += 1
-    if polls == 5:
-      survivors[0].finish([], {})
-      survivors[0].__exit__(None, None, None)
+    nonlocal num_pauses
+    num_pauses += 1
+    if num_pauses == 5:
+      with survivors[0] as run:
+        run.finish([], {})
 
   monkeypatch.setattr(scheduler.time, 'sleep', sleep)
   said = _sweep(_SMALL, tmp_path, engine)
-  assert polls >= 5
-  assert engine.commands == [('bad', 3), ('good', 3)]
+  assert num_pauses >= 5
+  assert engine.commands == [*[('bad', 3)] * is_lost, ('good', 3)]
+  assert ' '.join(said).count('bad, seed 3: folder ') == 1
   assert said[-1] == f'2 jobs finished; results are in {tmp_path}'
 
 
@@ -322,166 +327,6 @@ def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
   pid = int((folder / 'lock').read_text())
   with pytest.raises(ProcessLookupError):
     os.kill(pid, 0)
-
-
-# ---- Engines ----------------------------------------------------------------
-
-
-def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
-  monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
-  for name in ('ray', 'submitit'):
-    with pytest.raises(
-        errors.SpecError, match=rf'--engine={name}: .*realab-suite\[cluster\]'
-    ):
-      engines.ENGINES[name](1)
-
-
-def _command(status):
-  return [sys.executable, '-c', f'print("said"); raise SystemExit({status})']
-
-
-def _wait(engine, task):
-  statuses = []
-
-  def has_ended():
-    statuses.append(engine.poll(task))
-    return statuses[-1] is not None
-
-  patience.until(has_ended)
-  return statuses[-1]
-
-
-def test_the_local_engine_returns_the_exit_status(tmp_path):
-  engine = engines.Local(1)
-  log = tmp_path / 'log'
-  for status in (0, 3):
-    assert _wait(engine, engine.start(_command(status), log)) == status
-  assert log.read_text() == 'said\nsaid\n'
-
-
-def test_the_local_engine_stops_running_commands(monkeypatch):
-  monkeypatch.setattr(engines, '_PATIENCE', patience.SECONDS)
-  engine = engines.Local(1)
-  command = [sys.executable, '-c', 'import time; time.sleep(1e6)']
-  task = engine.start(command, pathlib.Path(os.devnull))
-  assert engine.poll(task) is None
-  engine.stop([task])
-  assert engine.poll(task) == -signal.SIGTERM
-
-
-class _FakeRay(types.ModuleType):
-  """As much of ray as the engine needs, done at once."""
-
-  def init(self, **unused):
-    pass
-
-  def remote(self, **unused):
-    def decorate(function):
-      return types.SimpleNamespace(
-          remote=lambda *arguments: lambda: function(*arguments)
-      )
-
-    return decorate
-
-  def wait(self, tasks, timeout):
-    assert timeout == 0
-    return tasks, []
-
-  def get(self, task):
-    return task()
-
-
-class _FakeExecutor:
-
-  def __init__(self, folder):
-    assert pathlib.Path(folder).is_dir()
-
-  def update_parameters(self, *, timeout_min, **unused):
-    assert timeout_min >= 60  # Left alone, it is five.
-
-  def submit(self, function, *arguments):
-    return types.SimpleNamespace(
-        done=lambda: True, result=lambda: function(*arguments)
-    )
-
-
-@pytest.mark.parametrize('name', ['ray', 'submitit'])
-def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
-  fake = _FakeRay('ray')
-  if name == 'submitit':
-    fake = types.ModuleType(name)
-    fake.AutoExecutor = _FakeExecutor
-  monkeypatch.setitem(sys.modules, name, fake)
-  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
-  engine = engines.ENGINES[name](1)
-  log = tmp_path / 'log'
-  assert _wait(engine, engine.start(_command(3), log)) == 3
-  assert log.read_text() == 'said\n'
-
-
-def test_a_job_that_left_the_queue_of_slurm_without_a_result_is_lost(
-    tmp_path, monkeypatch
-):
-  fake = types.ModuleType('submitit')
-  fake.AutoExecutor = _FakeExecutor
-  monkeypatch.setitem(sys.modules, 'submitit', fake)
-  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
-  monkeypatch.setattr('shutil.which', lambda name: f'/bin/{name}')
-  monkeypatch.setattr(engines, '_QUEUE_SECONDS', 0.0)
-  # The queue is unknown once, as while the controller is restarting.
-  queues = iter(
-      [(0, '6\n7\n'), (0, '6\n'), (0, '7\n'), (0, ''), (1, ''), (0, '')]
-  )
-
-  def run(command, **unused):
-    assert command[0] == 'squeue'
-    status, text = next(queues)
-    return subprocess.CompletedProcess(command, status, text)
-
-  monkeypatch.setattr(subprocess, 'run', run)
-  engine = engines.Submitit(1)
-  task = types.SimpleNamespace(done=lambda: False, job_id='7')
-  for _ in range(5):
-    assert engine.poll(task) is None
-  with pytest.raises(
-      errors.ResultsError, match='=submitit: job 7 left the queue'
-  ):
-    engine.poll(task)
-
-
-@pytest.mark.parametrize('name', ['Local', 'execute'])
-def test_a_command_ends_with_the_process_that_runs_it(tmp_path, name):
-  log = tmp_path / 'log'
-  command = [sys.executable, '-c', 'import sys; print(sys.argv[1:])']
-  if name == 'Local':
-    engine = engines.Local(1)
-    _wait(engine, engine.start(command, log))
-  else:
-    engines.execute(command, str(log), str(tmp_path))
-  assert log.read_text().strip() == f"['--parent={os.getpid()}']"
-
-
-def test_a_worker_works_where_the_sweep_does(tmp_path):
-  show = 'import os; print(os.getcwd())'
-  log = tmp_path / 'log'
-  command = [sys.executable, '-c', show]
-  assert not engines.execute(command, str(log), str(tmp_path))
-  assert log.read_text().strip() == str(tmp_path)
-
-
-def test_an_error_of_a_cluster_is_one_line(tmp_path, monkeypatch):
-  fake = _FakeRay('ray')
-
-  def fail(task):
-    raise RuntimeError('a machine\nis gone')
-
-  fake.get = fail
-  monkeypatch.setitem(sys.modules, 'ray', fake)
-  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
-  engine = engines.Ray(1)
-  task = engine.start(_command(0), tmp_path / 'log')
-  with pytest.raises(errors.ResultsError, match='--engine=ray: RuntimeError'):
-    engine.poll(task)
 
 
 # ---- The command line -------------------------------------------------------
