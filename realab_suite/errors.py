@@ -71,6 +71,11 @@ class ResultsError(RealabError, ValueError):
 
 
 @final
+class InUseError(ResultsError):
+  """Another process is writing to a folder."""
+
+
+@final
 class OutOfReachError(ResultsError):
   """No state within reach of a register was found, so it cannot be probed."""
 

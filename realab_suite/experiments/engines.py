@@ -4,11 +4,15 @@ import abc
 from collections.abc import Callable, Sequence
 import contextlib
 import importlib
+import logging
+import math
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from typing import Any, final
 
 from realab_suite import errors
@@ -18,6 +22,8 @@ from realab_suite.experiments import requirements
 _PATIENCE = 10.0
 # Time limit of a Slurm job; the default of submitit is five minutes.
 _MAX_MINUTES = 24 * 60
+# Time between two looks at the queue of Slurm.
+_QUEUE_SECONDS = 10.0
 
 
 class Engine(abc.ABC):
@@ -32,21 +38,28 @@ class Engine(abc.ABC):
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
     """Starts a command, and appends its output to a file.
 
+    Args:
+      command: Command that takes the flag `--parent`: the process whose end
+        also ends the command.
+      log: File for its output.
+
     Returns:
       The task, an argument of `poll` and `stop`.
     """
 
   @abc.abstractmethod
   def poll(self, task: Any) -> int | None:
-    """Returns the exit status of a task, or `None` while it is running."""
+    """Returns the exit status of a task, or `None` while it is running.
+
+    The status is negative if a signal ended the command.
+
+    Raises:
+      ResultsError: If the worker that ran the command was lost.
+    """
 
   @abc.abstractmethod
   def stop(self, tasks: Sequence[Any]) -> None:
     """Ends tasks."""
-
-  def arguments(self) -> list[str]:
-    """Returns arguments to add to all commands."""
-    return []
 
 
 @final
@@ -65,7 +78,7 @@ class Local(Engine):
     with open(log, 'ab') as file:
       # In a new session, only `stop` ends the process, not the terminal.
       return subprocess.Popen(
-          command,
+          [*command, _ends_with_this_process()],
           stdin=subprocess.DEVNULL,
           stdout=file,
           stderr=subprocess.STDOUT,
@@ -85,9 +98,6 @@ class Local(Engine):
       except subprocess.TimeoutExpired:
         task.kill()
         task.wait()
-
-  def arguments(self) -> list[str]:
-    return [f'--parent={os.getpid()}']
 
 
 @final
@@ -130,6 +140,10 @@ class Submitit(Engine):
     """Makes an engine. Without Slurm, submitit runs jobs on this machine."""
     del workers  # Slurm determines the number of processors.
     self._submitit = _import('submitit')
+    self._queue = _SlurmQueue()
+    # Without accounting, it warns again and again that it may miss the end of
+    # a job; `_SlurmQueue` does not.
+    logging.getLogger('submitit').setLevel(logging.ERROR)
 
   @property
   def capacity(self) -> int:
@@ -147,11 +161,57 @@ class Submitit(Engine):
 
   def poll(self, task: Any) -> int | None:
     with _errors_in_one_line('submitit'):
-      return int(task.result()) if task.done() else None
+      if task.done():
+        return int(task.result())
+    if self._queue.has_lost(task.job_id):
+      raise errors.ResultsError(
+          f'--engine=submitit: job {task.job_id} left the queue of Slurm'
+          ' without a result'
+      )
+    return None
 
   def stop(self, tasks: Sequence[Any]) -> None:
     for task in tasks:
       task.cancel()
+
+
+@final
+class _SlurmQueue:
+  """Looks at the queue of Slurm, to notice jobs that ended without a result.
+
+  submitit itself needs a database for accounting to notice them, and up to ten
+  minutes.
+  """
+
+  # The file of a result may arrive a little later than its job ends.
+  _MOST_MISSES = 2
+
+  def __init__(self) -> None:
+    self._exists = shutil.which('squeue') is not None
+    self._read_at = -math.inf
+    self._misses: dict[str, int] = {}
+
+  def has_lost(self, job: str) -> bool:
+    """Returns whether a job was missing twice in succession."""
+    self._misses.setdefault(job, 0)
+    now = time.monotonic()
+    if self._exists and now - self._read_at >= _QUEUE_SECONDS:
+      self._read_at = now
+      self._read()
+    return self._misses[job] >= self._MOST_MISSES
+
+  def _read(self) -> None:
+    ran = subprocess.run(
+        ['squeue', '--me', '--noheader', '--format=%i'],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if ran.returncode:
+      return  # The controller may be restarting.
+    present = set(ran.stdout.split())
+    for job in self._misses:
+      self._misses[job] = 0 if job in present else self._misses[job] + 1
 
 
 ENGINES: dict[str, Callable[[int], Engine]] = {
@@ -165,13 +225,18 @@ def execute(command: Sequence[str], log: str, folder: str) -> int:
   """Runs a command in a folder, and returns its exit status."""
   with open(log, 'ab') as file:
     return subprocess.run(
-        command,
+        [*command, _ends_with_this_process()],
         cwd=folder,
         stdin=subprocess.DEVNULL,
         stdout=file,
         stderr=subprocess.STDOUT,
         check=False,
     ).returncode
+
+
+def _ends_with_this_process() -> str:
+  """Returns the flag for a command that shall not outlive its worker."""
+  return f'--parent={os.getpid()}'
 
 
 def _import(name: str) -> Any:

@@ -27,6 +27,8 @@ LOGS = 'logs'
 AUDITS = 'audits'
 _MODULE = 'realab_suite.launchers.train'
 _POLL_SECONDS = 0.2
+# Number of times that a job is started again after its process was killed.
+_MOST_RESTARTS = 3
 # Fields that may change between sweeps in one folder.
 _FREE_FIELDS = ('description', 'seeds', 'calibration_seeds')
 
@@ -54,7 +56,8 @@ def sweep(
 
   Raises:
     RealabError: If the experiment or the folder is invalid, or if a job fails.
-      A failure does not stop the other jobs.
+      A failure does not stop the other jobs. A job whose process was killed,
+      or whose worker was lost, is started again up to three times.
   """
   seeds = experiment.calibration_seeds if calibration else experiment.seeds
   if not seeds:
@@ -173,6 +176,14 @@ def _advice(folder: pathlib.Path) -> str:
 
 
 @final
+class _Waiting(NamedTuple):
+  """A job that is to be started."""
+
+  job: jobs.Job
+  num_restarts: int = 0
+
+
+@final
 class _Running(NamedTuple):
   """A running job."""
 
@@ -180,6 +191,7 @@ class _Running(NamedTuple):
   folder: pathlib.Path
   log: pathlib.Path
   task: Any
+  num_restarts: int
 
 
 @final
@@ -198,27 +210,28 @@ class _Sweep:
     self._engine = engine
     self._output = output
     self._say = say
-    self._arguments = [*engine.arguments(), *arguments]
+    self._arguments = list(arguments)
+    self._waiting = [_Waiting(job) for job in wanted]
     self._running: list[_Running] = []
     self._failures: list[str] = []
+    self._said: set[str] = set()
     self._num_finished = 0
     self._steps: dict[str, int] = {}
 
   def run(self) -> None:
     """Runs all jobs; see `sweep`."""
-    waiting = list(self._jobs)
-    lengths = [job.training.steps for job in waiting if job.policy is None]
+    lengths = [job.training.steps for job in self._jobs if job.policy is None]
     total = sum(lengths)
     bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
     with bar:
       try:
-        while waiting or self._running:
-          while waiting and len(self._running) < self._engine.capacity:
-            self._start(waiting.pop(0))
+        while self._waiting or self._running:
+          self._start_waiting()
           self._poll()
           bar.update(min(sum(self._steps.values()), total) - bar.n)
           bar.set_postfix_str(self._progress(), refresh=False)
-          time.sleep(_POLL_SECONDS if self._running else 0.0)
+          if self._waiting or self._running:
+            time.sleep(_POLL_SECONDS)
       finally:
         self._engine.stop([running.task for running in self._running])
     if self._failures:
@@ -229,7 +242,18 @@ class _Sweep:
       )
     self._say(f'{len(self._jobs)} jobs finished; results are in {self._output}')
 
-  def _start(self, job: jobs.Job) -> None:
+  def _start_waiting(self) -> None:
+    for waiting in list(self._waiting):
+      if len(self._running) == self._engine.capacity:
+        return
+      if problem := _user(self._output / waiting.job.folder()):
+        # A process may survive its worker, and jobs of a cluster their sweep.
+        self._say_once(f'{_name(waiting.job)}: {problem}')
+        continue
+      self._waiting.remove(waiting)
+      self._start(*waiting)
+
+  def _start(self, job: jobs.Job, num_restarts: int) -> None:
     folder = self._output / job.folder()
     log = self._output / LOGS / f'{folder.name}.log'
     try:
@@ -250,7 +274,7 @@ class _Sweep:
         *self._arguments,
     ]
     task = self._engine.start(command, log)
-    self._running.append(_Running(job, folder, log, task))
+    self._running.append(_Running(job, folder, log, task, num_restarts))
 
   def _poll(self) -> None:
     for running in list(self._running):
@@ -266,15 +290,33 @@ class _Sweep:
         continue
       self._running.remove(running)
       problem = None
-      if status or not (running.folder / storage.DONE).exists():
-        problem = lost or _last_line(running.log) or f'exit status {status}'
+      if status < 0:
+        problem = lost or f'killed by signal {-status}'
+        if running.num_restarts < _MOST_RESTARTS:
+          self._restart(running, problem)
+          continue
+      elif status or not (running.folder / storage.DONE).exists():
+        problem = _last_line(running.log) or f'exit status {status}'
       self._finish(running.job, running.folder, problem)
+
+  def _say_once(self, line: str) -> None:
+    if line not in self._said:
+      self._said.add(line)
+      self._say(line)
+
+  def _restart(self, running: _Running, problem: str) -> None:
+    again = _Waiting(running.job, running.num_restarts + 1)
+    self._waiting.append(again)
+    self._say(
+        f'{_name(running.job)}: {problem}; is started again'
+        f' ({again.num_restarts} of {_MOST_RESTARTS})'
+    )
 
   def _finish(
       self, job: jobs.Job, folder: pathlib.Path, problem: str | None
   ) -> None:
     self._num_finished += 1
-    name = f'{job.run}, seed {job.seed}'
+    name = _name(job)
     if job.policy is None and problem is None:
       self._steps[folder.name] = job.training.steps
     if problem is not None:
@@ -291,6 +333,20 @@ class _Sweep:
       if returns := _last_returns(running.folder):
         parts.append(f'{running.job.run}: {returns}')
     return '; '.join(parts)
+
+
+def _name(job: jobs.Job) -> str:
+  return f'{job.run}, seed {job.seed}'
+
+
+def _user(folder: pathlib.Path) -> str | None:
+  """Returns a message on the process that runs the job of a folder, if any."""
+  if folder.exists() and not (folder / storage.DONE).exists():
+    try:
+      os.close(storage.lock(folder))
+    except errors.InUseError as error:
+      return str(error)
+  return None
 
 
 def _last_step(folder: pathlib.Path) -> int:

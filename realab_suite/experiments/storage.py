@@ -51,7 +51,8 @@ def lock(folder: pathlib.Path) -> int:
   """Locks a folder, and returns the descriptor whose closing unlocks it.
 
   Raises:
-    ResultsError: If another process holds the lock.
+    InUseError: If another process holds the lock.
+    ResultsError: If the folder cannot be written to.
   """
   path = folder / _LOCK
   with explained(path):
@@ -67,7 +68,7 @@ def lock(folder: pathlib.Path) -> int:
     except OSError:
       os.close(descriptor)
       raise
-  raise errors.ResultsError(
+  raise errors.InUseError(
       f'folder {folder} is being written to by process'
       f' {holder or "(unknown)"}; wait until it ends, or stop it'
   )

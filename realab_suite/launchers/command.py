@@ -12,6 +12,7 @@ import runpy
 import subprocess
 import sys
 
+from realab_suite.experiments import requirements
 from realab_suite.launchers import program
 
 _LAUNCHERS = 'realab_suite.launchers.'
@@ -37,6 +38,7 @@ COMMANDS: Mapping[str, str] = {
     'unpack': 'unpack a packed sweep',
 }
 """Subcommands with their purposes."""
+_DEMO_NEEDS = ('jax', 'equinox', 'optax', 'matplotlib', 'jinja2')
 
 
 def main() -> int:
@@ -85,6 +87,9 @@ def _refuse(problem: str) -> int:
 
 def _demo() -> int:
   """Does what `make demo` does, in the packages that are installed."""
+  # Before the jobs, of which only those of learners would fail.
+  if problem := requirements.missing(*_DEMO_NEEDS, extra='agents,report'):
+    return _refuse(f'demo: {problem}')
   now = datetime.datetime.now().astimezone()
   output = f'results/demo-{now:%Y%m%d-%H%M%S}'
   for name, flags in (

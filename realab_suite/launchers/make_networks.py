@@ -40,6 +40,9 @@ def main(argv: Sequence[str]) -> None:
     if path.exists():
       # Designs refer to networks by name, so files must not change.
       raise errors.SpecError(f'{path} already exists; name another folder')
+  # Before the training, which takes minutes.
+  with storage.explained(output):
+    output.mkdir(parents=True, exist_ok=True)
   for name, recipe in network_training.RECIPES.items():
     network = network_training.make(recipe)
     for reached in network.header.reached:
@@ -47,8 +50,6 @@ def main(argv: Sequence[str]) -> None:
           f'{name}: true return {reached.mean:.2f} [{reached.low:.2f},'
           f' {reached.high:.2f}] in {reached.task}'
       )
-    with storage.explained(output):
-      output.mkdir(parents=True, exist_ok=True)
     storage.write_whole(paths[name], network.to_bytes())
     program.say(f'{paths[name]} written')
 

@@ -6,7 +6,6 @@ import pathlib
 import signal
 import subprocess
 import sys
-import types
 
 import pytest
 import yaml
@@ -68,7 +67,7 @@ class Pretender(engines.Engine):
     self._running -= 1
     status = self._statuses.get(_flag(task, 'run'), 0)
     if callable(status):
-      status()
+      status = status()
     if not status:
       experiment = experiment_specs.load(
           pathlib.Path(_flag(task, 'experiment'))
@@ -143,7 +142,65 @@ def test_a_job_lost_by_a_cluster_does_not_stop_the_others(tmp_path):
       errors.ResultsError, match='1 of 2 jobs failed: bad, seed 3: --engine=ray'
   ):
     _sweep(_SMALL, tmp_path, engine)
-  assert engine.commands == [('bad', 3), ('good', 3)]
+  assert engine.commands == [('bad', 3), ('good', 3), *[('bad', 3)] * 3]
+
+
+def _killed_once():
+  """Returns statuses of a job: killed, then finished."""
+  statuses = iter([-9])
+  return lambda: next(statuses, 0)
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_a_killed_job_is_started_again(tmp_path):
+  engine = Pretender(statuses={'bad': _killed_once()})
+  said = _sweep(_SMALL, tmp_path, engine)
+  assert engine.commands == [('bad', 3), ('good', 3), ('bad', 3)]
+  assert said[0] == 'bad, seed 3: killed by signal 9; is started again (1 of 3)'
+  assert said[-1] == f'2 jobs finished; results are in {tmp_path}'
+
+
+@pytest.mark.usefixtures('no_wait')
+def test_a_job_that_is_always_killed_has_failed(tmp_path):
+  engine = Pretender(statuses={'bad': -9})
+  with pytest.raises(errors.ResultsError, match='bad, seed 3: killed by sig'):
+    _sweep(_SMALL, tmp_path, engine)
+  assert engine.commands.count(('bad', 3)) == 4
+
+
+@pytest.mark.parametrize('is_lost', [True, False], ids=['lost', 'left'])
+def test_a_job_whose_process_survived_is_done_once(
+    tmp_path, monkeypatch, is_lost
+):
+  # The process survives its worker, or an earlier sweep.
+  [job] = jobs.plan(experiment_specs.load(_SMALL), only=['bad'])
+  survivors = []
+
+  def begin():
+    survivors.append(storage.RunFolder(tmp_path / job.folder(), job.config()))
+
+  def lose():
+    begin()
+    raise errors.ResultsError('--engine=ray: a machine is gone')
+
+  if not is_lost:
+    begin()
+  engine = Pretender(statuses={'bad': lose})
+  num_pauses = 0
+
+  def sleep(seconds):
+    nonlocal num_pauses
+    num_pauses += 1
+    if num_pauses == 5:
+      with survivors[0] as run:
+        run.finish([], {})
+
+  monkeypatch.setattr(scheduler.time, 'sleep', sleep)
+  said = _sweep(_SMALL, tmp_path, engine)
+  assert num_pauses >= 5
+  assert engine.commands == [*[('bad', 3)] * is_lost, ('good', 3)]
+  assert ' '.join(said).count('bad, seed 3: folder ') == 1
+  assert said[-1] == f'2 jobs finished; results are in {tmp_path}'
 
 
 @pytest.mark.usefixtures('no_wait')
@@ -270,124 +327,6 @@ def test_an_interrupted_sweep_leaves_no_process_behind(tmp_path):
   pid = int((folder / 'lock').read_text())
   with pytest.raises(ProcessLookupError):
     os.kill(pid, 0)
-
-
-# ---- Engines ----------------------------------------------------------------
-
-
-def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
-  monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
-  for name in ('ray', 'submitit'):
-    with pytest.raises(
-        errors.SpecError, match=rf'--engine={name}: .*realab-suite\[cluster\]'
-    ):
-      engines.ENGINES[name](1)
-
-
-def _command(status):
-  return [sys.executable, '-c', f'print("said"); raise SystemExit({status})']
-
-
-def _wait(engine, task):
-  statuses = []
-
-  def has_ended():
-    statuses.append(engine.poll(task))
-    return statuses[-1] is not None
-
-  patience.until(has_ended)
-  return statuses[-1]
-
-
-def test_the_local_engine_returns_the_exit_status(tmp_path):
-  engine = engines.Local(1)
-  log = tmp_path / 'log'
-  for status in (0, 3):
-    assert _wait(engine, engine.start(_command(status), log)) == status
-  assert log.read_text() == 'said\nsaid\n'
-
-
-def test_the_local_engine_stops_running_commands(monkeypatch):
-  monkeypatch.setattr(engines, '_PATIENCE', patience.SECONDS)
-  engine = engines.Local(1)
-  command = [sys.executable, '-c', 'import time; time.sleep(1e6)']
-  task = engine.start(command, pathlib.Path(os.devnull))
-  assert engine.poll(task) is None
-  engine.stop([task])
-  assert engine.poll(task) == -signal.SIGTERM
-
-
-class _FakeRay(types.ModuleType):
-  """As much of ray as the engine needs, done at once."""
-
-  def init(self, **unused):
-    pass
-
-  def remote(self, **unused):
-    def decorate(function):
-      return types.SimpleNamespace(
-          remote=lambda *arguments: lambda: function(*arguments)
-      )
-
-    return decorate
-
-  def wait(self, tasks, timeout):
-    assert timeout == 0
-    return tasks, []
-
-  def get(self, task):
-    return task()
-
-
-class _FakeExecutor:
-
-  def __init__(self, folder):
-    assert pathlib.Path(folder).is_dir()
-
-  def update_parameters(self, *, timeout_min, **unused):
-    assert timeout_min >= 60  # Left alone, it is five.
-
-  def submit(self, function, *arguments):
-    return types.SimpleNamespace(
-        done=lambda: True, result=lambda: function(*arguments)
-    )
-
-
-@pytest.mark.parametrize('name', ['ray', 'submitit'])
-def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
-  fake = _FakeRay('ray')
-  if name == 'submitit':
-    fake = types.ModuleType(name)
-    fake.AutoExecutor = _FakeExecutor
-  monkeypatch.setitem(sys.modules, name, fake)
-  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
-  engine = engines.ENGINES[name](1)
-  log = tmp_path / 'log'
-  assert _wait(engine, engine.start(_command(3), log)) == 3
-  assert log.read_text() == 'said\n'
-
-
-def test_a_worker_works_where_the_sweep_does(tmp_path):
-  show = 'import os; print(os.getcwd())'
-  log = tmp_path / 'log'
-  command = [sys.executable, '-c', show]
-  assert not engines.execute(command, str(log), str(tmp_path))
-  assert log.read_text().strip() == str(tmp_path)
-
-
-def test_an_error_of_a_cluster_is_one_line(tmp_path, monkeypatch):
-  fake = _FakeRay('ray')
-
-  def fail(task):
-    raise RuntimeError('a machine\nis gone')
-
-  fake.get = fail
-  monkeypatch.setitem(sys.modules, 'ray', fake)
-  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
-  engine = engines.Ray(1)
-  task = engine.start(_command(0), tmp_path / 'log')
-  with pytest.raises(errors.ResultsError, match='--engine=ray: RuntimeError'):
-    engine.poll(task)
 
 
 # ---- The command line -------------------------------------------------------

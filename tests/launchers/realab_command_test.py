@@ -2,6 +2,7 @@
 
 import configparser
 import importlib
+import importlib.util
 import pathlib
 import re
 import runpy
@@ -122,6 +123,22 @@ def test_a_demo_that_fails_ends_with_the_status_of_its_sweep(
       lambda arguments, check: subprocess.CompletedProcess(arguments, 5),
   )
   assert realab('demo')[0] == 5
+
+
+def test_a_demo_without_its_extras_is_refused_at_once(
+    realab, monkeypatch, capsys
+):
+  find = importlib.util.find_spec
+  monkeypatch.setattr(
+      'importlib.util.find_spec',
+      lambda name: None if name == 'optax' else find(name),
+  )
+  monkeypatch.delattr(subprocess, 'run')
+  assert realab('demo')[0] == 2
+  assert capsys.readouterr().err == (
+      'error: demo: optax not installed; run: python -m pip install'
+      ' "realab-suite[agents,report]"\n'
+  )
 
 
 # The doctor.
