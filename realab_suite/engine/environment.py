@@ -461,8 +461,7 @@ class Environment(composer.Environment):
     if self._recompile_mjcf_every_episode:
       self._hooks.initialize_episode_mjcf(self._random_state)
       self._recompile_physics_and_update_observables()
-      foreign.check_places(self._physics, self._task, self._mechanism)
-    with foreign.initializing(self._physics, self._mechanism):
+    with foreign.initializing(self._physics, self._task, self._mechanism):
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     if not self._is_ours:
       foreign.check_start(self._physics, self._mechanism)

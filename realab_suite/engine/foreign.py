@@ -2,8 +2,9 @@
 
 With a design without registers, the observations, rewards, discounts and step
 types of a foreign task equal those of `composer.Environment`, bit for bit. A
-foreign task is compiled for each episode, may have hooks in substeps, and may
-keep state in Python. Batches and snapshots therefore do not support it.
+foreign task may have hooks in substeps, may keep state in Python, and is
+compiled for each episode, except a `control_tasks.ControlTask`. Batches and
+snapshots therefore do not support it.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -17,11 +18,10 @@ from dm_env import specs
 import mujoco
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.engine import control_tasks
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
-from realab_suite.engine import placement
+from realab_suite.engine import replacement
 from realab_suite.engine import swept_volumes
 from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
@@ -224,31 +224,44 @@ def is_recompiled(task: composer.Task) -> bool:
 
 @contextlib.contextmanager
 def initializing(
-    physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
+    physics: mjcf.Physics,
+    task: composer.Task,
+    mechanism: mechanisms.FeedbackMechanism,
 ) -> Iterator[None]:
   """Returns the context in which an episode is initialized.
 
-  Foreign tasks look for positions without any contacts. In the context, blocks
-  of registers therefore touch nothing, not even the floor they stand on.
+  Foreign tasks look for positions without any contacts, and for directions
+  without walls. In the context, blocks of registers therefore touch nothing,
+  not even the floor they stand on, and rays pass through them. At the end, the
+  registers of a task that is recompiled are placed where nothing else is.
 
   Args:
     physics: Physics of one world.
+    task: Task of this package, or a foreign task.
     mechanism: Registers, meters and providers.
+
+  Raises:
+    EpisodeInitializationError: If there is no clear place for a register. The
+      next attempt generates another world.
   """
   with physics.reset_context():
     if not isinstance(physics, ForeignPhysics):
       yield
       return
+    model = physics.model
     geoms = [physics.bind(geom).element_id for geom in _geoms(mechanism)]
-    masks = physics.model.geom_contype, physics.model.geom_conaffinity
-    before = [mask[geoms].copy() for mask in masks]
+    # Rays pass through geoms without opacity.
+    values = model.geom_contype, model.geom_conaffinity, model.geom_rgba[:, 3]
+    before = [value[geoms].copy() for value in values]
     try:
-      for mask in masks:
-        mask[geoms] = 0
+      for value in values:
+        value[geoms] = 0
       yield
     finally:
-      for mask, values in zip(masks, before, strict=True):
-        mask[geoms] = values
+      for value, old in zip(values, before, strict=True):
+        value[geoms] = old
+    if is_recompiled(task):
+      replacement.place(physics, mechanism)
 
 
 def _geoms(mechanism: mechanisms.FeedbackMechanism) -> dict[Any, str]:
@@ -258,32 +271,6 @@ def _geoms(mechanism: mechanisms.FeedbackMechanism) -> dict[Any, str]:
       for name, register in mechanism.registers.items()
       for block in register.blocks
   }
-
-
-def check_places(
-    physics: mjcf.Physics,
-    task: composer.Task,
-    mechanism: mechanisms.FeedbackMechanism,
-) -> None:
-  """Checks the places of registers in an arena that was generated anew.
-
-  Args:
-    physics: Physics of the new model; its state is reset.
-    task: Foreign task.
-    mechanism: Registers, meters and providers.
-
-  Raises:
-    EpisodeInitializationError: If a register would be inside a wall. The next
-      attempt generates another arena.
-  """
-  if not mechanism.registers:
-    return
-  try:
-    placement.check(physics, task.root_entity, mechanism)
-  except errors.SpecError as error:
-    raise composer.EpisodeInitializationError(
-        f'design {mechanism.design.name!r}: {error}'
-    ) from error
 
 
 def check_start(

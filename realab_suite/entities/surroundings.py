@@ -143,7 +143,7 @@ class Surroundings:
       half_size: Half the edge length of the block, in m.
     """
     self._body = body
-    self._rest = rest
+    self._home = self._rest = rest
     self._half_size = half_size - min(half_size * _TOLERANCE, _DEEPEST)
     self._radius = np.sqrt(3.0) * self._half_size
     self._model: Any = None
@@ -151,7 +151,7 @@ class Surroundings:
     self._corridor = np.zeros((2, 2))
     self._origin = np.zeros(3)
     self._rotation = np.eye(3)
-    self._reach = -np.inf, np.inf
+    self._limits = self._reach = -np.inf, np.inf
     self._sideways = 0.0
 
   def limit(self, low: float, high: float, sideways: float) -> None:
@@ -162,8 +162,20 @@ class Surroundings:
       high: Largest x coordinate, in m.
       sideways: Largest distance from the y coordinate at rest, in m.
     """
-    self._reach = low, high
+    self._limits = self._reach = low, high
     self._sideways = sideways
+    self._model = None
+
+  def shift(self, displacement: np.ndarray) -> None:
+    """Sets the displacement of that region, for registers that are moved.
+
+    Args:
+      displacement: Displacement in the frame of the register, `(2,)`, in m.
+    """
+    along, aside = displacement
+    self._rest = self._home + np.array([along, aside, 0.0])
+    low, high = self._limits
+    self._reach = low + along, high + along
     self._model = None
 
   def are_far(self, physics: protocols.Physics, position: Any) -> Any:

@@ -107,20 +107,28 @@ def make(name: str, /, **options: Any) -> Policy:
     UnknownNameError: If no policy has this name.
     SpecError: If the policy cannot be made with these options.
   """
-  return _make(POLICIES, 'policy', name, options)
+  return make_registered(POLICIES, 'policy', name, options)
 
 
 def make_value_function(name: str, /, **options: Any) -> ValueFunction:
   """Makes the value function registered as `name`; raises like `make`."""
-  return _make(VALUE_FUNCTIONS, 'value function', name, options)
+  return make_registered(VALUE_FUNCTIONS, 'value function', name, options)
 
 
-def _make(
+def make_registered(
     names: registry.Registry[Callable[..., Any]],
     what: str,
     name: str,
     options: Mapping[str, Any],
 ) -> Any:
+  """Makes an entry of a registry; raises like `make`.
+
+  Args:
+    names: Registry.
+    what: What its entries are, for messages.
+    name: Name of the entry.
+    options: Keyword arguments.
+  """
   factory = names.get(name)
   try:
     return factory(**options)

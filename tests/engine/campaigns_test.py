@@ -8,6 +8,7 @@ import pytest
 
 from campaigns import bulldozers_campaign
 from campaigns import divergence_campaign
+from campaigns import embedding_campaign
 from campaigns import teleports_campaign
 from realab_suite.entities import arenas
 
@@ -102,3 +103,21 @@ def test_failures_of_the_physics_are_flagged_where_there_are_any(
   monkeypatch.setattr(divergence_campaign, '_strike', lambda *unused: None)
   sound = divergence_campaign.run('BADQVEL', 1, 0, in_batch=in_batch)
   assert sound[:4] == (1, 0, 0, 0)
+
+
+# Embedding.
+
+
+@pytest.mark.parametrize('shift', [0, 1])
+def test_the_campaign_detects_that_an_embedded_task_differs(shift):
+  def pair(seed):
+    stock, _, random_state = embedding_campaign.control_pair(
+        'lqr', 'lqr_2_1', seed
+    )
+    _, env, _ = embedding_campaign.control_pair('lqr', 'lqr_2_1', seed + shift)
+    return stock, env, random_state
+
+  played = embedding_campaign.play(pair, num_steps=2, seed=3)
+  assert (played.num_steps, played.num_reads) == (4, 10)
+  assert (played.difference > 0) == bool(shift)
+  assert played.error < 1e-9

@@ -12,31 +12,10 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import seeding
 from realab_suite.evaluation import ledgers
+from tests.engine import embedded
 from tests.engine import helpers
 
 _SEED = 11
-# One task of each domain, and tasks whose models differ from it.
-_TASKS = {
-    'acrobot': ['swingup'],
-    'ball_in_cup': ['catch'],
-    'cartpole': ['swingup', 'two_poles'],
-    'cheetah': ['run'],
-    'dog': ['fetch'],
-    'finger': ['turn_easy'],
-    'fish': ['swim'],
-    'hopper': ['hop'],
-    'humanoid': ['run'],
-    'humanoid_CMU': ['run'],
-    'lqr': ['lqr_2_1'],
-    'manipulator': ['bring_ball'],
-    'pendulum': ['swingup'],
-    'point_mass': ['hard'],
-    'quadruped': ['fetch'],
-    'reacher': ['hard'],
-    'stacker': ['stack_2'],
-    'swimmer': ['swimmer6'],
-    'walker': ['run'],
-}
 _TOTAL_MASS = (
     "compiler attribute 'settotalmass' is deprecated and will be removed in a"
     ' future release: scale the masses and densities in the model, or call'
@@ -45,27 +24,9 @@ _TOTAL_MASS = (
 _MARKS = {'cheetah': pytest.mark.mujoco_warns(_TOTAL_MASS)}
 _NAMES = [
     pytest.param(domain, task, marks=_MARKS.get(domain, ()))
-    for domain, tasks in _TASKS.items()
+    for domain, tasks in embedded.CONTROL_TASKS.items()
     for task in tasks
 ]
-# Worlds with slanted walls, which are endless planes.
-_NARROW = {'manipulator', 'stacker'}
-
-
-def _design(domain: str, **changes: Any) -> dict[str, Any]:
-  """Returns a design whose registers stand beside a task."""
-  if domain in _NARROW:
-    reward = {'place': [-0.25, -1.5], 'scale': 0.03}
-    score = {'place': [0, -2.5], 'scale': 0.005}
-  else:
-    reward, score = {'place': [2, 2]}, {'place': [2, -3], 'scale': 0.05}
-  return helpers.SCORED | {
-      'registers': {
-          name: helpers.SCORED['registers'][name] | place
-          for name, place in {'reward': reward, 'score': score}.items()
-      },
-      **changes,
-  }
 
 
 def _stock(domain: str, task: str) -> tuple[control.Environment, Any]:
@@ -94,7 +55,10 @@ def test_a_task_beside_registers_equals_the_original_bit_for_bit(
 ):
   stock, generator = _stock(domain, task)
   env = suite.load(
-      f'dm_control/{domain}', task, {'random': _SEED}, design=_design(domain)
+      f'dm_control/{domain}',
+      task,
+      {'random': _SEED},
+      design=embedded.control_design(domain),
   )
   ledger, sink = ledgers.Ledger(), helpers.RecordingSink()
   env.add_sink(ledger)
@@ -129,8 +93,12 @@ def test_a_task_beside_registers_equals_the_original_bit_for_bit(
 
 def test_the_table_of_the_documentation_lists_the_tested_tasks():
   rows = helpers.rows_of_page('embedding.md', 'equal, bit for bit', 3)
-  found = {row[0]: row[1].split(', ') for row in rows if row[0] in _TASKS}
-  assert found == _TASKS
+  found = {
+      row[0]: row[1].split(', ')
+      for row in rows
+      if row[0] in embedded.CONTROL_TASKS
+  }
+  assert found == embedded.CONTROL_TASKS
 
 
 @pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
@@ -169,12 +137,15 @@ def test_a_body_that_touches_a_register_is_stopped_by_it(channel: str):
 
 def test_a_loaded_task_gives_the_same_as_its_name():
   by_name = suite.load(
-      'dm_control/reacher', 'easy', {'random': 5}, design=_design('reacher')
+      'dm_control/reacher',
+      'easy',
+      {'random': 5},
+      design=embedded.control_design('reacher'),
   )
   loaded = control_suite.load('reacher', 'easy', task_kwargs={'random': 99})
   loaded.reset()  # It may have been used before.
   loaded.step([0.3, -0.2])
-  env = suite.embed(loaded, _design('reacher'), random=5)
+  env = suite.embed(loaded, embedded.control_design('reacher'), random=5)
   assert env.max_steps == by_name.max_steps == 1000
   for action in [np.zeros(2), *helpers.random_actions(by_name, 5)]:
     expected = helpers.to_bytes(by_name.step(action))
@@ -187,7 +158,7 @@ def test_elements_of_an_action_have_the_names_of_actuators():
 
 
 def test_a_meter_measures_bodies_of_the_task():
-  design = _design('reacher')
+  design = embedded.control_design('reacher')
   meter = {'measures': {'kind': 'distance', 'from': 'finger', 'to': 'arm'}}
   design['meters'] = [meter | {'writes': 'score'}]
   env = suite.load('dm_control/reacher', 'easy', {'random': 5}, design=design)
@@ -200,7 +171,10 @@ def test_a_meter_measures_bodies_of_the_task():
 
 def test_registers_stand_on_the_height_0_where_the_floor_is_below():
   env = suite.load(
-      'dm_control/cartpole', 'two_poles', {'random': 1}, design=_design('x')
+      'dm_control/cartpole',
+      'two_poles',
+      {'random': 1},
+      design=embedded.control_design('x'),
   )
   env.reset()
   block = env.mechanism.registers['reward'].blocks[0]
@@ -243,7 +217,7 @@ def test_a_batch_is_refused_with_the_remedy():
 
 
 def test_a_start_inside_a_register_is_drawn_again_and_at_last_refused():
-  design = _design('point_mass')
+  design = embedded.control_design('point_mass')
   # All over the places where the mass begins.
   design['registers']['reward'] |= {'place': [0, 0, 0], 'block_size': 1.0}
   del design['registers']['score']

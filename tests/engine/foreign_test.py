@@ -5,14 +5,7 @@ import functools
 from typing import Any
 
 from dm_control import composer
-from dm_control import manipulation
-from dm_control.composer.variation import distributions
-from dm_control.locomotion import arenas
-from dm_control.locomotion import props
 from dm_control.locomotion import soccer
-from dm_control.locomotion import tasks
-from dm_control.locomotion import walkers
-from dm_control.manipulation.shared import registry
 import dm_env
 import numpy as np
 import pytest
@@ -22,6 +15,7 @@ from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.engine import seeding
 from realab_suite.evaluation import ledgers
+from tests.engine import embedded
 from tests.engine import helpers
 
 _SEED = 11
@@ -31,148 +25,6 @@ _REGISTER = {
     'place': [3.0, 3.0],
     'range': [-2, 12],
 }
-
-
-def _lucky(call: Callable[[], Any], seed: int = 5) -> Any:
-  """Returns the result of a call, with a seeded global generator."""
-  np.random.seed(seed)  # noqa: NPY002
-  return call()
-
-
-def _maze() -> composer.Arena:
-  return arenas.RandomMazeWithTargets(
-      x_cells=7,
-      y_cells=7,
-      xy_scale=1.0,
-      max_rooms=2,
-      room_min_size=3,
-      room_max_size=3,
-      spawns_per_room=1,
-      targets_per_room=2,
-  )
-
-
-def _single_goal(**kwargs: Any) -> composer.Task:
-  return tasks.RepeatSingleGoalMaze(
-      walkers.JumpingBallWithHead(), _maze(), **kwargs
-  )
-
-
-def _many_goals(kind: Any, **kwargs: Any) -> composer.Task:
-  return kind(
-      walkers.Ant(),
-      _maze(),
-      target_builder=functools.partial(props.TargetSphere, radius=0.2),
-      **kwargs,
-  )
-
-
-def _corridor(arena: composer.Arena, walker: Any, **kwargs: Any) -> Any:
-  return tasks.RunThroughCorridor(
-      walker,
-      arena,
-      walker_spawn_position=(0.5, 0, 0),
-      physics_timestep=0.005,
-      control_timestep=0.03,
-      **kwargs,
-  )
-
-
-def _manipulation(name: str) -> Any:
-  assert name in manipulation.ALL
-  return registry.get_constructor(name)
-
-
-# Tasks by name: walkers of five kinds, arenas that stay and arenas that are
-# generated anew, arms, props, targets, episodes that the task ends.
-_TASKS: dict[str, Callable[[], composer.Task]] = {
-    'go to target': lambda: tasks.GoToTarget(
-        walkers.RollingBallWithHead(), arenas.Floor(size=(8, 8))
-    ),
-    'go to a moving target': lambda: tasks.GoToTarget(
-        walkers.Ant(), arenas.Floor(size=(8, 8)), moving_target=True
-    ),
-    'walls corridor': lambda: _corridor(
-        arenas.WallsCorridor(
-            wall_gap=4.0,
-            wall_width=distributions.Uniform(1, 3),
-            wall_height=2.0,
-            corridor_width=6,
-            corridor_length=20,
-        ),
-        walkers.Ant(),
-    ),
-    'single goal maze that ends at once': lambda: _single_goal(
-        target=props.TargetSphere(radius=4.0, height_above_ground=0.0)
-    ),
-    'gaps corridor': lambda: _corridor(
-        arenas.GapsCorridor(
-            platform_length=distributions.Uniform(0.3, 2.5),
-            gap_length=distributions.Uniform(0.5, 1.5),
-            corridor_width=6,
-            corridor_length=20,
-        ),
-        walkers.JumpingBallWithHead(),
-    ),
-    'humanoid in a corridor': lambda: _corridor(
-        arenas.EmptyCorridor(corridor_width=6, corridor_length=20),
-        walkers.CMUHumanoidPositionControlled(),
-        contact_termination=True,
-    ),
-    'two touch': lambda: tasks.TwoTouch(
-        walkers.Rat(),
-        arenas.Floor(size=(10.0, 10.0)),
-        target_builders=[
-            functools.partial(props.TargetSphereTwoTouch, radius=0.025)
-        ],
-        randomize_spawn_rotation=True,
-        target_type_rewards=[25.0],
-        shuffle_target_builders=False,
-        target_area=(1.5, 1.5),
-        physics_timestep=0.001,
-        control_timestep=0.02,
-    ),
-    'single goal maze': _single_goal,
-    'single goal maze that respawns': lambda: _single_goal(
-        max_repeats=2, regenerate_maze_on_repeat=False
-    ),
-    'many goals maze': lambda: _many_goals(tasks.ManyGoalsMaze),
-    'heterogeneous goals maze': lambda: tasks.ManyHeterogeneousGoalsMaze(
-        walkers.Ant(),
-        _maze(),
-        target_builders=[
-            functools.partial(props.TargetSphere, radius=radius)
-            for radius in (0.1, 0.2)
-        ],
-        target_type_rewards=[30.0, -10.0],
-        target_type_proportions=[1, 1],
-    ),
-    'reach a site': _manipulation('reach_site_features'),
-    'reach a brick': _manipulation('reach_duplo_features'),
-    'lift a brick': _manipulation('lift_brick_features'),
-    'stack bricks': _manipulation('stack_2_bricks_features'),
-    'place a brick': _manipulation('place_brick_features'),
-    'place in a cradle': _manipulation('place_cradle_features'),
-    'lift a large box': _manipulation('lift_large_box_features'),
-    'reassemble bricks': _manipulation(
-        'reassemble_3_bricks_fixed_order_features'
-    ),
-    'stack on a movable base': _manipulation(
-        'stack_2_bricks_moveable_base_features'
-    ),
-    'a bead on a wire': helpers.PointTask,
-}
-
-
-def _without_cameras(task: composer.Task) -> composer.Task:
-  for name, observable in task.observables.items():
-    if 'camera' in name:
-      observable.enabled = False
-  return task
-
-
-def _make(name: str) -> composer.Task:
-  return _without_cameras(_lucky(_TASKS[name]))
 
 
 def _composer(task: composer.Task) -> tuple[composer.Environment, Any]:
@@ -218,12 +70,13 @@ def _assert_identical(
   seen = []
   for episode in range(num_episodes):
     seeding.reseed(random_state, _SEED, 0, episode, 'reset/0')
-    expected, found = _lucky(stock.reset), _lucky(env.reset)
+    expected, found = embedded.lucky(stock.reset), embedded.lucky(env.reset)
     assert _bytes(found, None) == _bytes(expected, None)
     for _ in range(num_steps):
       action = generator.uniform(low, high).astype(spec.dtype)
       expected, found = (
-          _lucky(functools.partial(one.step, action)) for one in (stock, env)
+          embedded.lucky(functools.partial(one.step, action))
+          for one in (stock, env)
       )
       reward = ledger.last.true_rewards[-1]
       assert _bytes(found, reward) == _bytes(expected, expected.reward)
@@ -237,16 +90,20 @@ def _assert_identical(
   return seen
 
 
-@pytest.mark.parametrize('name', _TASKS)
+@pytest.mark.parametrize('name', embedded.COMPOSER_TASKS)
 def test_an_embedded_task_equals_composer_bit_for_bit(name: str):
-  assert _assert_identical(functools.partial(_make, name), num_steps=15)
+  assert _assert_identical(
+      functools.partial(embedded.make_composer, name), num_steps=15
+  )
 
 
 @pytest.mark.parametrize(
     'name', ['humanoid in a corridor', 'single goal maze that ends at once']
 )
 def test_episodes_that_the_task_ends_end_as_in_composer(name: str):
-  seen = _assert_identical(functools.partial(_make, name), num_steps=400)
+  seen = _assert_identical(
+      functools.partial(embedded.make_composer, name), num_steps=400
+  )
   assert 2 in seen
 
 
@@ -265,16 +122,17 @@ _PLACES = {
     'single goal maze': ([0.0, 0.0], 0.01),
     'single goal maze that respawns': ([0.0, 0.0], 0.01),
 }
-# Registers cannot stand here for all values: the large target is in the way, or
-# the arena has gaps or walls all over.
-_WITHOUT_REGISTERS = {
-    'single goal maze that ends at once', 'gaps corridor', 'many goals maze',
-    'heterogeneous goals maze',
-}  # fmt: skip
+# When the task is embedded, its large target is in the way.
+_WITHOUT_REGISTERS = {'single goal maze that ends at once'}
 
 
 @pytest.mark.parametrize(
-    'name', [name for name in _TASKS if name not in _WITHOUT_REGISTERS]
+    'name',
+    [
+        name
+        for name in embedded.COMPOSER_TASKS
+        if name not in _WITHOUT_REGISTERS
+    ],
 )
 def test_what_a_task_observes_does_not_depend_on_registers_nearby(name: str):
   place, scale = _PLACES.get(name, ([3.0, 3.0], 0.1))
@@ -288,7 +146,7 @@ def test_what_a_task_observes_does_not_depend_on_registers_nearby(name: str):
   found: list[list[Any]] = []
   for with_register in (False, True):
     env = suite.embed(
-        _make(name),
+        embedded.make_composer(name),
         design if with_register else 'none',
         random=_SEED,
         max_steps=None,
@@ -296,9 +154,10 @@ def test_what_a_task_observes_does_not_depend_on_registers_nearby(name: str):
     ledger = ledgers.Ledger()
     env.add_sink(ledger)
     actions = _small_actions(env, 6)
-    time_steps = [_lucky(env.reset)]
+    time_steps = [embedded.lucky(env.reset)]
     time_steps += [
-        _lucky(functools.partial(env.step, action)) for action in actions
+        embedded.lucky(functools.partial(env.step, action))
+        for action in actions
     ]
     found.append([t.observation for t in time_steps])
     rewards = ledger.last.true_rewards
@@ -317,9 +176,22 @@ def test_the_table_of_the_documentation_lists_the_tested_tasks():
       for row in helpers.rows_of_page('embedding.md', 'equal, bit for bit', 3)
       if row[1] == 'equal, bit for bit'
   ]
-  assert [row[0] for row in rows] == list(_TASKS)
+  assert [row[0] for row in rows] == list(embedded.COMPOSER_TASKS)
   tested = {row[0] for row in rows if row[2] == 'within 1e-3'}
-  assert tested == set(_TASKS) - _WITHOUT_REGISTERS
+  assert tested == set(embedded.COMPOSER_TASKS) - _WITHOUT_REGISTERS
+
+
+def test_a_batch_is_refused_with_the_remedy():
+  name = ('floor', 'go_to_target')
+  suite.register_task(*name)(lambda: embedded.make_composer('go to target'))
+  try:
+    with pytest.raises(
+        errors.SpecError, match=r'keeps state in Python.*with world=i instead'
+    ):
+      suite.load_batch(*name, num_envs=2)
+    assert suite.load(*name, {'random': 1}, {'world': 1}).reset().first()
+  finally:
+    del suite._TASKS[name]
 
 
 def test_a_task_with_several_agents_is_refused():
@@ -360,12 +232,14 @@ def test_a_sink_that_looks_changes_nothing(name: str, with_register: bool):
     design['providers'] = [{'kind': 'constant', 'writes': ['r'], 'value': 1.0}]
 
   def play(is_watched: bool) -> list[bytes]:
-    env = suite.embed(_make(name), design, random=2, max_steps=None)
+    env = suite.embed(
+        embedded.make_composer(name), design, random=2, max_steps=None
+    )
     if is_watched:
       sink = _Curious(env)
       env.add_sink(sink)
     actions = helpers.random_actions(env, 20)
-    found = [helpers.to_bytes(_lucky(env.reset))]
+    found = [helpers.to_bytes(embedded.lucky(env.reset))]
     found += [helpers.to_bytes(env.step(action)) for action in actions]
     env.close()
     assert not is_watched or sink.num_looks == 21
@@ -383,7 +257,9 @@ def test_a_write_holds_in_a_task_that_composer_steps(channel: str):
       'registers': {'r': _REGISTER},
       'providers': [{'kind': 'constant', 'writes': ['r'], 'value': 7.0}],
   }
-  env = suite.embed(_make('go to target'), design, random=2, max_steps=None)
+  env = suite.embed(
+      embedded.make_composer('go to target'), design, random=2, max_steps=None
+  )
   env.reset()
   for action in helpers.random_actions(env, 20):
     reading = env.step(action).observation['registers/r']
