@@ -36,6 +36,7 @@ def main(argv: Sequence[str]) -> None:
   # These import dm_control, so a renderer has to be chosen first.
   from pictures import carrying
   from pictures import first_person
+  from pictures import reacher
   from pictures import tampering
   from pictures import worlds
 
@@ -43,6 +44,8 @@ def main(argv: Sequence[str]) -> None:
   first_person.draw(folder / 'first_person.png')
   carrying.draw(folder / 'carrying.png')
   worlds.draw(folder / 'worlds')
+  (folder / 'gallery').mkdir(exist_ok=True)
+  reacher.draw(folder / 'gallery' / 'reacher.webp')
   if input_flag.INPUT.value is None:
     program.say('tampering.gif is left out: --input names no sweep')
   else:

@@ -75,7 +75,7 @@ EXTRAS: Mapping[str, Extra] = {
     ),
     'cluster': Extra(('ray', 'submitit'), 'sweeps on a cluster'),
     'docs': Extra(
-        ('sphinx', 'furo', 'myst_parser'), 'the site of the documentation'
+        ('sphinx', 'furo', 'myst_nb'), 'the site of the documentation'
     ),
     'dev': Extra(
         ('pytest', 'xdist', 'hypothesis', 'ruff', 'pyink', 'mypy'),

@@ -7,6 +7,7 @@ import runpy
 import pytest
 import yaml
 
+from pictures import notebooks
 from realab_suite import suite
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import probes
@@ -115,6 +116,26 @@ def test_python_blocks_of_the_page_on_senses_run_in_order(registries, capsys):
     assert len(block.splitlines()) < _MAX_LINES, block
     exec(compile(block, 'docs/senses.md', 'exec'), names)
   assert "'senses/camera': (4, 32, 32, 3)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('name', ['your_own_agent', 'your_own_design'])
+def test_a_notebook_prints_its_stored_output(name, registries, capsys):
+  path = _ROOT / 'docs' / 'notebooks' / f'{name}.ipynb'
+  notebooks.run(path)
+  stored = notebooks.printed(path)
+  assert stored
+  # Figures may differ on other processors.
+  assert len(capsys.readouterr().out.splitlines()) == len(stored.splitlines())
+
+
+@pytest.mark.camera
+def test_the_notebook_with_pictures_prints_its_stored_output(capsys):
+  plt = pytest.importorskip('matplotlib.pyplot')
+  path = _ROOT / 'docs' / 'notebooks' / 'first_steps.ipynb'
+  names = notebooks.run(path)
+  assert len(names['axes'].lines) == 2
+  plt.close('all')
+  assert capsys.readouterr().out == notebooks.printed(path)
 
 
 def test_every_block_of_your_own_has_under_thirty_lines():

@@ -52,3 +52,9 @@ def test_code_in_docstrings_is_marked(catalogue):
   catalogue._mark_code(None, '', '', None, None, lines)
   assert lines[0] == 'Use it::'
   assert lines[4] == 'Args:'
+
+
+def test_absolute_values_in_docstrings_are_escaped(catalogue):
+  lines = ['Mean of |a - b|, in m.', 'Either int | None.']
+  catalogue._mark_bars(None, '', '', None, None, lines)
+  assert lines == ['Mean of \\|a - b\\|, in m.', 'Either int | None.']

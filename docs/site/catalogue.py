@@ -9,6 +9,7 @@ import contextlib
 import inspect
 import pathlib
 import pkgutil
+import re
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ def setup(app: Any) -> dict[str, bool]:
   app.connect('builder-inited', _write_all)
   # Before napoleon, which has the usual priority of 500.
   app.connect('autodoc-process-docstring', _mark_code, priority=400)
+  app.connect('autodoc-process-docstring', _mark_bars, priority=400)
   return {'parallel_read_safe': True}
 
 
@@ -62,6 +64,15 @@ def _mark_code(
     is_block = block.strip() and block.startswith(' ' * (indent + 2))
     if line.endswith(':') and not lines[i + 1].strip() and is_block:
       lines[i] = f'{line}:'
+
+
+def _mark_bars(
+    app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]
+) -> None:
+  """Escapes the bars of absolute values, which are no substitutions."""
+  del app, what, name, obj, options
+  for i, line in enumerate(lines):
+    lines[i] = re.sub(r'\|(?=\S)|(?<=\S)\|', r'\|', line)
 
 
 def _write(path: pathlib.Path, text: str) -> None:

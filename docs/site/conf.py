@@ -1,4 +1,4 @@
-"""Configuration of the site: pages in Markdown, and an API reference.
+"""Configuration of the site: Markdown, notebooks and an API reference.
 
 Run from the root of the repository, whose files are the sources:
 
@@ -14,7 +14,7 @@ sys.path[:0] = [str(_ROOT), str(_ROOT / 'docs' / 'site')]
 project = 'realab_suite'
 author = 'The realab_suite authors'
 extensions = [
-    'myst_parser',
+    'myst_nb',
     'sphinx.ext.autodoc',
     'sphinx.ext.napoleon',
     'catalogue',
@@ -28,11 +28,18 @@ include_patterns = [
     'CONTRIBUTING.md',
     'benchmarks/README.md',
     'docs/*.md',
+    'docs/notebooks/*.ipynb',
     'docs/site/*.md',
     'build/catalogue/**.md',
     'build/catalogue/**.rst',
 ]
-source_suffix = {'.md': 'markdown', '.rst': 'restructuredtext'}
+source_suffix = {
+    '.md': 'myst-nb',
+    '.ipynb': 'myst-nb',
+    '.rst': 'restructuredtext',
+}
+# The pages show the stored outputs of notebooks; tests execute them.
+nb_execution_mode = 'off'
 myst_heading_anchors = 4
 # The default language of code blocks without one.
 highlight_language = 'none'

@@ -32,7 +32,7 @@ def main(argv: Sequence[str]) -> None:
   del argv
   folder = pathlib.Path(program.required(input_flag.INPUT))
   name = program.required(run_flag.RUN, '; name a run of the sweep')
-  path = program.required(video_flag.VIDEO, '; name a new .mp4 file')
+  path = program.required(video_flag.VIDEO, '; name a new .mp4 or .webp file')
   problem = (
       requirements.missing('imageio', 'av', 'PIL')
       or renderers.choose_renderer()

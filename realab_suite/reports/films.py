@@ -28,6 +28,12 @@ HEIGHT = 480
 WIDTHS = {'top_down': 480, 'first_person': 640}
 """Width of each view, in pixels."""
 
+# Codec of each kind of file, and options of its container.
+_CODECS: dict[str, tuple[str, dict[str, str]]] = {
+    '.mp4': ('libx264', {}),
+    # Repeats without end.
+    '.webp': ('libwebp_anim', {'loop': '0'}),
+}
 _BACKGROUND = (24, 28, 36)
 _PLAIN = (235, 238, 242)
 _FAINT = (150, 158, 170)
@@ -43,7 +49,10 @@ _LARGE, _SMALL = 18, 16
 
 @final
 class Film:
-  """An H.264 file with one frame per control step, played in real time."""
+  """A film with one frame per control step, played in real time.
+
+  It is an H.264 film or an animated picture in WebP, which repeats.
+  """
 
   def __init__(
       self,
@@ -56,13 +65,21 @@ class Film:
 
     Args:
       env: Environment to film.
-      path: New file, whose name ends in `.mp4`.
+      path: New file, whose name ends in `.mp4` or `.webp`.
       title: Title in the strip.
       views: Keys of `WIDTHS`, shown side by side.
 
     Raises:
-      ResultsError: If the file exists or cannot be created.
+      ResultsError: If the name has another end, or the file exists or cannot
+        be created.
     """
+    suffix = pathlib.Path(path).suffix
+    if suffix not in _CODECS:
+      raise errors.ResultsError(
+          f'film {os.fspath(path)}: the name ends in {suffix!r}; allowed are'
+          f' {list(_CODECS)}'
+      )
+    codec, options = _CODECS[suffix]
     try:
       # The video library would overwrite an existing file.
       open(path, 'x', encoding='utf-8').close()
@@ -83,10 +100,12 @@ class Film:
           engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
           for view in views
       ]
-      self._file = imageio.imopen(pathlib.Path(path), 'w', plugin='pyav')
+      self._file = imageio.imopen(
+          pathlib.Path(path), 'w', plugin='pyav', options=options
+      )
       stack.callback(self._file.close)
       self._file.init_video_stream(
-          'libx264', fps=1 / env.control_timestep(), pixel_format='yuv420p'
+          codec, fps=1 / env.control_timestep(), pixel_format='yuv420p'
       )
       stack.pop_all()
 

@@ -94,6 +94,12 @@ def test_a_strip_shows_what_was_read(track):
   assert (before != after).any()
 
 
+def test_a_film_of_another_kind_is_refused(tmp_path):
+  with pytest.raises(errors.ResultsError, match=r"'\.gif'; allowed.*webp"):
+    films.Film(None, tmp_path / 'film.gif', 'run')
+  assert not list(tmp_path.iterdir())
+
+
 # In one test, because each that renders is run by a process of its own.
 @pytest.mark.camera
 def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
@@ -112,6 +118,17 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
   view = frames[:, : films.HEIGHT]
   assert np.ptp(view[0]) > 100
   assert np.abs(view[0].astype(int) - view[-1]).max() > 50
+  # An animated picture shows the same, and repeats.
+  with films.Film(env, tmp_path / 'film.webp', 'run', ['top_down']) as film:
+    recorder = tracking.Tracker(env, film.add)
+    env.add_sink(recorder)
+    env.reset()
+    env.step(env.action_spec().minimum)
+  with Image.open(tmp_path / 'film.webp') as animated:
+    assert (animated.n_frames, animated.info['loop']) == (2, 0)
+    animated.load()
+    assert animated.info['duration'] == 100
+    assert animated.size == frames.shape[2:0:-1]
   # A film is never overwritten.
   before = (tmp_path / 'film.mp4').read_bytes()
   with pytest.raises(errors.ResultsError, match='exists'):

@@ -5,5 +5,6 @@ from absl import flags
 VIDEO = flags.DEFINE_string(
     'video',
     None,
-    'New .mp4 file to write. Without it, `explore` opens a window.',
+    'New film to write: an .mp4 file, or a .webp file, an animated picture.'
+    ' Without it, `explore` opens a window.',
 )
