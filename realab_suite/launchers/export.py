@@ -13,7 +13,6 @@ import pathlib
 
 from absl import flags
 
-from realab_suite import errors
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 from realab_suite.launchers.flags import episodes_flag
@@ -53,13 +52,9 @@ def main(argv: Sequence[str]) -> None:
 
   export.check(_FORMAT.value, output)
   imports_flag.load()
-  runs = sweep_results.load(folder).runs
-  if name not in runs:
-    raise errors.UnknownNameError(
-        f'--run={name:.80}: not a run of {folder}; allowed are {list(runs)}'
-    )
+  run = run_flag.find(name, sweep_results.load(folder).runs, folder)
   export.export(
-      sources.of_run(runs[name], episodes_flag.EPISODES.value),
+      sources.of_run(run, episodes_flag.EPISODES.value),
       output,
       data_format=_FORMAT.value,
       with_attribution=_ATTRIBUTION.value,

@@ -45,16 +45,12 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.reports import sweep_results
 
   imports_flag.load()
-  runs = sweep_results.load(folder).runs
-  if name not in runs:
-    raise errors.UnknownNameError(
-        f'--run={name:.80}: not a run of {folder}; allowed are {list(runs)}'
-    )
-  row = replays.typical_row(runs[name])
+  run = run_flag.find(name, sweep_results.load(folder).runs, folder)
+  row = replays.typical_row(run)
   if row is None:
     raise errors.ResultsError(f'{folder}: run {name} has no valid episode yet')
   replays.replay(
-      runs[name],
+      run,
       row,
       lambda env, stack: stack.enter_context(
           films.Film(env, path, name, tuple(films.WIDTHS))

@@ -50,12 +50,7 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.reports import sweep_results
 
   imports_flag.load()
-  runs = sweep_results.load(folder).runs
-  if name not in runs:
-    raise errors.UnknownNameError(
-        f'--run={name:.80}: not a run of {folder}; allowed are {list(runs)}'
-    )
-  run = runs[name]
+  run = run_flag.find(name, sweep_results.load(folder).runs, folder)
   if _EPISODE.value == 'typical':
     typical = replays.typical_row(run) or replays.first_row(run)
     rows = [] if typical is None else [typical]
