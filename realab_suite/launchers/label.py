@@ -33,6 +33,8 @@ flags.adopt_module_key_flags(output_flag)
 flags.adopt_module_key_flags(scripted_flags)
 for name in ('domain', 'task', 'max_steps', 'set'):
   flags.declare_key_flag(name)
+# They come with those flags, and would have no effect.
+_OTHER_WORLD_FLAGS = ('design', 'senses', 'task_kwargs', 'target')
 _DESIGNS = flags.DEFINE_list(
     'designs',
     ['instantaneous_reward', 'value_advice', 'decoupled_approval'],
@@ -47,6 +49,12 @@ def main(argv: Sequence[str]) -> None:
   output = pathlib.Path(
       program.required(output_flag.OUTPUT, '; name a new folder')
   )
+  for name in _OTHER_WORLD_FLAGS:
+    if flags.FLAGS[name].present:
+      raise errors.SpecError(
+          f'--{name}: not a flag of this program; it takes --designs, --domain,'
+          ' --task, --max_steps and --set'
+      )
   seeds = scripted_flags.parse_seeds(scripted_flags.SEEDS.value)
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
