@@ -8,6 +8,7 @@ is short for `python -m realab_suite.launchers.sweep` with the same flags.
 from collections.abc import Mapping
 import datetime
 import difflib
+import os
 import runpy
 import subprocess
 import sys
@@ -63,7 +64,10 @@ def main() -> int:
   if name == 'demo':
     return _demo()
   module = 'realab_suite.doctor' if name == 'doctor' else _LAUNCHERS + name
-  # As `python -m` does, so that --help and the start of processes work.
+  # As `python -m` does, so that --help, --import of modules in the working
+  # directory, and the start of processes work.
+  if not sys.flags.safe_path:
+    sys.path.insert(0, os.getcwd())
   sys.argv = [name, *rest]
   runpy.run_module(module, run_name='__main__', alter_sys=True)
   return 0

@@ -36,6 +36,7 @@ def realab(monkeypatch):
 
   def run(*arguments: str) -> tuple[int, list[Any]]:
     monkeypatch.setattr(sys, 'argv', ['realab', *arguments])
+    monkeypatch.setattr(sys, 'path', list(sys.path))
     return command.main(), started
 
   return run
@@ -57,6 +58,14 @@ def test_there_is_a_subcommand_for_every_launcher():
       if 'program.start(main)' in path.read_text()
   }
   assert set(command.COMMANDS) == launchers | {'demo', 'doctor'}
+
+
+def test_a_subcommand_imports_modules_of_the_working_directory(
+    realab, monkeypatch, tmp_path
+):
+  monkeypatch.chdir(tmp_path)
+  realab('compare', '--import=mine')
+  assert sys.path[0] == str(tmp_path)
 
 
 def test_a_subcommand_runs_its_launcher_with_its_flags(realab):
