@@ -60,7 +60,7 @@ class PageServer:
   """
 
   def __init__(self, page: str, host: str = LOCAL, port: int = 0) -> None:
-    """Starts to serve.
+    """Starts serving.
 
     Args:
       page: Name of a file in `pages`, without `.html`.
@@ -71,7 +71,12 @@ class PageServer:
       SpecError: If the address cannot be used.
     """
     folder = resources.files('realab_suite.interop.browser') / 'pages'
-    self._page = (folder / f'{page}.html').read_bytes()
+    head, body = (
+        (folder / f'{name}.html').read_text(encoding='utf-8')
+        for name in ('head', page)
+    )
+    head = head.replace('@TITLE@', page.capitalize())
+    self._page = (head + body).encode()
     self._token = secrets.token_urlsafe(16)
     self._connection: websocket_server.ServerConnection | None = None
     self._is_connected = threading.Event()
@@ -141,7 +146,7 @@ class PageServer:
     self._send(bytes([view]) + jpeg)
 
   def close(self) -> None:
-    """Stops to serve."""
+    """Stops serving."""
     self._is_closed = True
     connection = self._connection
     if connection is not None:
