@@ -79,6 +79,7 @@ class PageServer:
     self._page = (head + body).encode()
     self._token = secrets.token_urlsafe(16)
     self._connection: websocket_server.ServerConnection | None = None
+    self._lock = threading.Lock()  # Of the connection and its event.
     self._is_connected = threading.Event()
     self._is_closed = False
     self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
@@ -197,10 +198,11 @@ class PageServer:
 
   def _handle(self, connection: websocket_server.ServerConnection) -> None:
     """Receives the messages of a page."""
-    before, self._connection = self._connection, connection
+    with self._lock:
+      before, self._connection = self._connection, connection
+      self._is_connected.set()
     if before is not None:
       before.close()
-    self._is_connected.set()
     try:
       for text in connection:
         arrival = time.monotonic()
@@ -211,6 +213,7 @@ class PageServer:
         if isinstance(content, dict):
           self._messages.put(Message(arrival, content))
     finally:
-      if self._connection is connection:
-        self._connection = None
-        self._is_connected.clear()
+      with self._lock:
+        if self._connection is connection:
+          self._connection = None
+          self._is_connected.clear()
