@@ -35,7 +35,7 @@ PERSON = 'person'
 """Name of the run of the person."""
 
 _BASELINE = 'apple_seeker'
-# Time between two looks whether the page is back, in seconds.
+# Longest wait for a message, in seconds.
 _PATIENCE = 0.2
 
 
@@ -154,7 +154,7 @@ def _describe(settings: Settings) -> pathlib.Path:
 def state(
     track: tracking.Track, title: str, action: str | None
 ) -> dict[str, Any]:
-  """Returns what the page of a person shows, as plain data without NaN.
+  """Returns the state of an episode for the page, as plain data without NaN.
 
   Args:
     track: Track of the episode so far.
@@ -209,6 +209,7 @@ class _Session:
     self._is_running = False
     self._deadline = 0.0
     self._action: str | None = None
+    self._track: tracking.Track | None = None
     self._num_steps, self._seconds = 0, 0.0
 
   def take(self) -> list[str]:
@@ -222,14 +223,11 @@ class _Session:
     """Shows a control step, and waits for the next one."""
     if not track.num_steps:
       self._action = None
-    self._server.send(state(track, self._title, self._action))
-    self._server.send_picture(0, self._view.draw())
+    self._track = track
+    self._show()
     while not (self._is_running and self._server.is_connected):
       self._receive(_PATIENCE)
-      if self._is_running and self._server.is_connected:
-        self._server.send(state(track, self._title, self._action))
-        self._server.send_picture(0, self._view.draw())
-        self._deadline = time.monotonic() + self._period
+      self._deadline = time.monotonic() + self._period
     while (left := self._deadline - time.monotonic()) > 0:
       self._receive(left)
     now = time.monotonic()
@@ -237,6 +235,12 @@ class _Session:
       self._num_steps += 1
       self._seconds += now - self._deadline + self._period
     self._deadline = max(self._deadline, now) + self._period
+
+  def _show(self) -> None:
+    """Shows the present state."""
+    if self._track is not None:
+      self._server.send(state(self._track, self._title, self._action))
+      self._server.send_picture(0, self._view.draw())
 
   def speed(self) -> str:
     """Returns the measured speed, as a sentence."""
@@ -257,6 +261,11 @@ class _Session:
         self._keys.release(code)
       case {'type': 'blur'}:
         self._keys.release_all()
+      case {'type': 'hello'}:
+        # A page that has just been opened waits for a key.
+        self._keys.release_all()
+        self._is_running = False
+        self._show()
       case {'type': 'run' | 'pause' as kind}:
         self._keys.release_all()
         self._is_running = kind == 'run'

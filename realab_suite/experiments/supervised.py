@@ -27,9 +27,13 @@ from realab_suite.policies import action_sets
 ANSWERS = 'answers.jsonl'
 """Name of the file of answers."""
 
+# Longest wait for a message, in seconds.
 _PATIENCE = 0.2
-# Numbers of the pictures in the page: the view, and both clips.
-_VIEW, _CLIPS = 0, (1, 2)
+# Numbers of the pictures in the page: the view, and the earlier clip.
+_VIEW, _FIRST_CLIP = 0, 1
+
+# Pictures of the earlier and of the later clip, or nothing.
+_Clips = tuple[list[bytes], ...]
 
 
 @final
@@ -53,29 +57,36 @@ class Supervision:
       rate: Largest number of control steps per second.
 
     Raises:
-      SpecError: If the design has no such provider.
+      SpecError: If the design has no such provider, or two that ask the same.
     """
     self._env, self._server = env, server
     self._path = folder / ANSWERS
     self._period = 1.0 / rate
-    people, sources = [], []
-    for provider in env.mechanism.design.providers:
+    design = env.mechanism.design
+    self._asks: list[str] = []
+    clip = 1
+    for provider in design.providers:
       if isinstance(provider, person.Person):
         source = provider.source
         if isinstance(source, answer_sources.Live):
-          people.append(provider)
-          sources.append(source)
-    if not people:
+          source.connect(self._ask)
+          self._asks.append(provider.asks)
+          if provider.asks == answer_sources.COMPARISON:
+            clip = provider.clip * provider.every
+    if not self._asks:
       raise errors.SpecError(
-          f'design {env.mechanism.design.name!r}: no provider of kind person'
-          ' with the live source of answers; allowed is a design with one'
+          f'design {design.name!r}: no provider of kind person with the live'
+          ' source of answers; allowed is a design with one'
       )
-    self._clip = max(one.clip for one in people)
-    for source in sources:
-      source.connect(self._ask)
-    self._asks = [one.asks for one in people]
+    if len(set(self._asks)) < len(self._asks):
+      raise errors.SpecError(
+          f'design {design.name!r}: two providers with the live source ask for'
+          f' the same: {self._asks}; allowed is one for each question'
+      )
     self._view = views.first_person(env)
-    self._pictures: deque[bytes] = deque(maxlen=2 * self._clip)
+    # Pictures of the control steps of both clips.
+    self._pictures: deque[bytes] = deque(maxlen=2 * clip)
+    self._question: tuple[dict[str, Any], _Clips] | None = None
     self._is_running = False
     self._deadline = 0.0
     self._given: dict[str, tuple[float, float]] = {}
@@ -91,8 +102,7 @@ class Supervision:
       policy: Policy of the agent.
       episode: Number of the episode.
     """
-    actor = actors.make(policy, self._env)
-    del actor  # Raises errors before the page shows an episode.
+    actors.make(policy, self._env)  # Raises errors before anything is shown.
     [result] = evaluate.evaluate(
         self._env,
         policy,
@@ -104,8 +114,11 @@ class Supervision:
     return result
 
   def finish(self, text: str) -> None:
-    """Shows a text after the last episode, and frees the resources."""
+    """Shows a text after the last episode."""
     self._server.send({'type': 'summary', 'text': text})
+
+  def close(self) -> None:
+    """Frees the graphics resources."""
     self._view.close()
 
   def _on_step(self, unused_physics: Any, track: tracking.Track) -> None:
@@ -114,10 +127,15 @@ class Supervision:
     # The answers of this step have been written to their registers.
     self.delays.extend(now - clicked for clicked in self._written)
     self._written.clear()
+    self._track = track
     if not track.num_steps:
       self._pictures.clear()
-    self._track = track
     self._pictures.append(self._view.draw())
+    if not track.num_steps:
+      # Late answers belong to the episode that has ended.
+      self._drain()
+      self._given.clear()
+      self._question = None
     self._show()
     while not (self._is_running and self._server.is_connected):
       self._receive(_PATIENCE)
@@ -128,7 +146,7 @@ class Supervision:
     self._deadline = max(self._deadline, time.monotonic()) + self._period
 
   def _show(self) -> None:
-    """Shows the present state, without returns: people do not know them."""
+    """Shows the present state, without returns."""
     track = self._track
     if track is None:
       return
@@ -145,47 +163,23 @@ class Supervision:
     self._server.send_picture(_VIEW, self._pictures[-1])
 
   def _ask(self, question: answer_sources.Question) -> float | None:
-    """Returns the person's answer to a question, or `None`."""
+    """Returns the answer to a question or an earlier one, or `None`."""
     asks = question.asks
-    if not bool(question.is_asked):
-      return None
-    content: dict[str, Any] = {
-        'type': 'question',
-        'asks': asks,
-        'waits': question.waits,
-        'action': None,
-    }
-    actions = action_sets.DMLAB_LIKE.actions
-    if question.query is not None and asks == answer_sources.APPROVAL:
-      content['action'] = actions[int(question.query)][0]
-    if asks == answer_sources.CORRECTION:
-      content['actions'] = [name for name, _ in actions]
-    if asks == answer_sources.COMPARISON:
-      pictures = list(self._pictures)
-      middle = len(pictures) // 2
-      self._server.send({'type': 'clips'})
-      for view, clip in zip(
-          _CLIPS, (pictures[:middle], pictures[middle:]), strict=True
-      ):
-        for picture in clip:
-          self._server.send_picture(view, picture)
     self._drain()
     if question.waits:
       self._given.pop(asks, None)  # It belongs to an earlier question.
-    if asks != answer_sources.STOP:
-      self._server.send(content)
-    while (
-        question.waits
-        and asks not in self._given
-        and answer_sources.STOP not in self._given
-    ):
-      if not self._server.is_connected and self._server.wait(_PATIENCE):
-        self._show()
-        self._server.send(content)
-      self._receive(_PATIENCE)
+    if bool(question.is_asked) and asks != answer_sources.STOP:
+      self._open(question)
+      while (
+          question.waits
+          and asks not in self._given
+          and answer_sources.STOP not in self._given
+      ):
+        self._receive(_PATIENCE)
     answer = self._given.pop(asks, None)
     if answer is None:
       return None
+    self._question = None
     value, clicked = answer
     self._written.append(clicked)
     env, track = self._env, self._track
@@ -204,6 +198,40 @@ class Supervision:
     )
     return value
 
+  def _open(self, question: answer_sources.Question) -> None:
+    """Shows a question, which stays open until it is answered."""
+    asks = question.asks
+    content: dict[str, Any] = {
+        'type': 'question',
+        'asks': asks,
+        'waits': question.waits,
+        'action': None,
+    }
+    actions = action_sets.DMLAB_LIKE.actions
+    if question.query is not None and asks == answer_sources.APPROVAL:
+      content['action'] = actions[int(question.query)][0]
+    if asks == answer_sources.CORRECTION:
+      content['actions'] = [name for name, _ in actions]
+    clips: _Clips = ()
+    if asks == answer_sources.COMPARISON:
+      pictures = list(self._pictures)
+      middle = len(pictures) // 2
+      clips = (pictures[:middle], pictures[middle:])
+    self._question = (content, clips)
+    self._show_question()
+
+  def _show_question(self) -> None:
+    """Shows the open question, if there is one."""
+    if self._question is None:
+      return
+    content, clips = self._question
+    if clips:
+      self._server.send({'type': 'clips'})
+    for view, clip in enumerate(clips, start=_FIRST_CLIP):
+      for picture in clip:
+        self._server.send_picture(view, picture)
+    self._server.send(content)
+
   def _drain(self) -> None:
     """Processes the messages that have arrived."""
     while self._receive(0.0):
@@ -218,7 +246,10 @@ class Supervision:
       case {'type': 'run' | 'pause' as kind}:
         self._is_running = kind == 'run'
       case {'type': 'hello'}:
+        # A page that has just been opened shows the button to start.
+        self._is_running = False
         self._show()
+        self._show_question()
       case {
           'type': 'answer',
           'asks': str(asks),

@@ -103,6 +103,7 @@ def main(argv: Sequence[str]) -> None:
     storage.write_json(folder / 'design.json', design.to_mapping())
     writer = stack.enter_context(results.RowWriter(folder / 'episodes.jsonl'))
     supervision = supervised.Supervision(env, server, folder, _RATE.value)
+    stack.callback(supervision.close)
     program.say(f'Open this address in a browser: {server.url}')
     lines = []
     for episode in range(_EPISODES.value):

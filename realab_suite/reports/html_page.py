@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 import os
 import pathlib
+from urllib import parse
 
 import jinja2
 import numpy as np
@@ -158,7 +159,10 @@ def _replays(
   folder = sweep.folder / sweep_results.REPLAYS
   relative = os.path.relpath(folder.resolve(), output.resolve())
   return [
-      (path.stem, f'{pathlib.PurePath(relative, path.name).as_posix()}')
+      (
+          path.stem,
+          parse.quote(pathlib.PurePath(relative, path.name).as_posix()),
+      )
       for path in sorted(folder.glob('*.html'))
   ]
 

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from urllib import parse
 
 import numpy as np
 import pytest
@@ -58,14 +59,15 @@ def test_contacts_name_the_block_that_the_hand_holds():
 
 def test_a_report_links_to_the_replays_beside_it(tmp_path):
   one = fake_sweep.experiment(seeds=[0])
-  folder = fake_sweep.build(tmp_path / 'sweep', one)
+  folder = fake_sweep.build(tmp_path / 'sweep #1', one)
   pages = folder / sweep_results.REPLAYS
   pages.mkdir()
   (pages / 'reward-seed0-world0-episode0.html').write_text('a replay')
   sweep = sweep_results.load(folder)
   [(name, address)] = html_page._replays(sweep, tmp_path / 'report')
   assert name == 'reward-seed0-world0-episode0'
-  linked = tmp_path / 'report' / address
+  path = parse.urlsplit(address).path
+  linked = tmp_path / 'report' / parse.unquote(path)
   linked.parent.mkdir(parents=True, exist_ok=True)
   assert linked.resolve() == pages / 'reward-seed0-world0-episode0.html'
 

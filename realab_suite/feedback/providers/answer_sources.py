@@ -27,7 +27,7 @@ APPROVAL, CORRECTION, COMPARISON, STOP = (
 
 @final
 class Question(NamedTuple):
-  """What a person is asked in a control step of each world.
+  """Question to a person in a control step, in each world.
 
   Attributes:
     asks: Kind of the question.
@@ -176,13 +176,12 @@ class Simulated(Source):
     )
 
   def _rested(self, episode_start: np.ndarray, state: Any) -> dict[str, Any]:
-    """Returns the state without what an earlier episode has left."""
+    """Returns the state, reset where an episode starts."""
     fresh = self.initial_state(np.shape(episode_start))
-    fresh['sums'], fresh['adviser'] = (
-        np.where(episode_start[..., np.newaxis], 0.0, state['sums']),
-        # The adviser gets the start of the episode itself.
-        state['adviser'],
-    )
+    # The adviser gets the start of the episode itself.
+    fresh['adviser'] = state['adviser']
+    starts = episode_start[..., np.newaxis]
+    fresh['sums'] = np.where(starts, fresh['sums'], state['sums'])
     for name in ('streak', 'left', 'pending', 'answered'):
       fresh[name] = np.where(episode_start, fresh[name], state[name])
     return fresh

@@ -60,7 +60,7 @@ class PageServer:
   """
 
   def __init__(self, page: str, host: str = LOCAL, port: int = 0) -> None:
-    """Starts to serve.
+    """Starts serving.
 
     Args:
       page: Name of a file in `pages`, without `.html`.
@@ -71,9 +71,15 @@ class PageServer:
       SpecError: If the address cannot be used.
     """
     folder = resources.files('realab_suite.interop.browser') / 'pages'
-    self._page = (folder / f'{page}.html').read_bytes()
+    head, body = (
+        (folder / f'{name}.html').read_text(encoding='utf-8')
+        for name in ('head', page)
+    )
+    head = head.replace('@TITLE@', page.capitalize())
+    self._page = (head + body).encode()
     self._token = secrets.token_urlsafe(16)
     self._connection: websocket_server.ServerConnection | None = None
+    self._lock = threading.Lock()  # Of the connection and its event.
     self._is_connected = threading.Event()
     self._is_closed = False
     self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
@@ -141,7 +147,7 @@ class PageServer:
     self._send(bytes([view]) + jpeg)
 
   def close(self) -> None:
-    """Stops to serve."""
+    """Stops serving."""
     self._is_closed = True
     connection = self._connection
     if connection is not None:
@@ -192,10 +198,11 @@ class PageServer:
 
   def _handle(self, connection: websocket_server.ServerConnection) -> None:
     """Receives the messages of a page."""
-    before, self._connection = self._connection, connection
+    with self._lock:
+      before, self._connection = self._connection, connection
+      self._is_connected.set()
     if before is not None:
       before.close()
-    self._is_connected.set()
     try:
       for text in connection:
         arrival = time.monotonic()
@@ -206,6 +213,7 @@ class PageServer:
         if isinstance(content, dict):
           self._messages.put(Message(arrival, content))
     finally:
-      if self._connection is connection:
-        self._connection = None
-        self._is_connected.clear()
+      with self._lock:
+        if self._connection is connection:
+          self._connection = None
+          self._is_connected.clear()

@@ -6,6 +6,8 @@ import shutil
 
 import pytest
 
+from tests import patience
+
 # Software rendering, and no connections of the browser's own.
 _ARGUMENTS = (
     '--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader',
@@ -13,7 +15,6 @@ _ARGUMENTS = (
     '--disable-background-networking', '--disable-component-update',
     '--disable-sync',
 )  # fmt: skip
-_PATIENCE_MS = 60_000
 
 
 def needed():
@@ -25,8 +26,14 @@ def needed():
 
 
 @contextlib.contextmanager
-def page(width=1040, height=720):
-  """Yields a page, and a list of the addresses that it has requested."""
+def page(width=1040, height=720, offline=False):
+  """Yields a page, and a list of the addresses that it has requested.
+
+  Args:
+    width: Width of the window, in pixels.
+    height: Height of the window, in pixels.
+    offline: True for a browser without a network.
+  """
   from playwright import sync_api
 
   with sync_api.sync_playwright() as playwright:
@@ -34,8 +41,10 @@ def page(width=1040, height=720):
         executable_path=_executable(), args=list(_ARGUMENTS)
     )
     try:
-      one = browser.new_page(viewport={'width': width, 'height': height})
-      one.set_default_timeout(_PATIENCE_MS)
+      one = browser.new_page(
+          viewport={'width': width, 'height': height}, offline=offline
+      )
+      one.set_default_timeout(1000 * patience.SECONDS)
       problems, requests = [], []
       one.on('pageerror', lambda problem: problems.append(problem))
       one.on('request', lambda request: requests.append(request.url))

@@ -20,6 +20,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.experiments import supervised_designs
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
+from tests import patience
 from tests.interop.browser import chromium
 
 pytestmark = [
@@ -34,10 +35,11 @@ def fixture_chromium():
   chromium.needed()
 
 
-def _save(page, name, seconds=0.0):
+def _save(page, name):
   if folder := os.environ.get('SCREENSHOTS'):
-    page.wait_for_timeout(1000 * seconds)
-    page.screenshot(path=pathlib.Path(folder) / f'{name}.png')
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    page.screenshot(path=folder / f'{name}.png')
 
 
 def test_a_replay_opens_offline_and_its_timeline_moves_the_scene(tmp_path):
@@ -69,30 +71,36 @@ def test_a_replay_opens_offline_and_its_timeline_moves_the_scene(tmp_path):
   file.write_text(text, encoding='utf-8')
   assert result.num_steps == 250
   assert len(text.encode()) < 5e6
-  with chromium.page(760, 600) as (page, requests):
+  with chromium.page(760, 640, offline=True) as (page, requests):
     page.goto(file.as_uri())
     page.wait_for_selector('#root input')
-    _wait_for(page, lambda step: step >= 5)
+    patience.until(lambda: _step(page) >= 5)
     box = page.locator('#realab svg').first.bounding_box()
     page.mouse.click(box['x'] + 0.2 * box['width'], box['y'] + 10)
-    _wait_for(page, lambda step: step == 50)
-    _save(page, 'replay', 12.0)
+    patience.until(lambda: _step(page) == 50)
+    _save_scene(page, 'replay')
     page.click('text=First person')
-    page.wait_for_function("location.hash.startsWith('#first')")
+    page.wait_for_function("location.hash === '#first@5.0'")
     page.wait_for_selector('#root input')
-    _wait_for(page, lambda step: step == 50)
-    _save(page, 'replay_first_person', 12.0)
+    patience.until(lambda: _step(page) == 50)
+    _save_scene(page, 'replay_first_person')
   assert all(one.startswith(('file:', 'data:', 'blob:')) for one in requests)
 
 
-def _wait_for(page, is_right):
-  """Waits until the time line of a replay is at a step."""
-  for _ in range(600):
-    text = page.locator('#realab-clock').text_content()
-    if text.startswith('step ') and is_right(int(text.split()[1])):
-      return
-    page.wait_for_timeout(100)
-  raise AssertionError(f'the time line is at {text!r}')
+def _save_scene(page, name):
+  """Saves a picture of a replay whose player is paused and has drawn."""
+  if os.environ.get('SCREENSHOTS'):
+    page.evaluate(
+        '() => new Promise((done) => requestAnimationFrame(() =>'
+        ' requestAnimationFrame(done)))'
+    )
+    _save(page, name)
+
+
+def _step(page):
+  """Returns the step that the time line of a replay shows, or -1."""
+  words = page.locator('#realab-clock').text_content().split()
+  return int(words[1]) if words else -1
 
 
 def _settings(**changes):
@@ -133,7 +141,7 @@ def test_a_person_plays_and_gets_the_summary_of_any_agent(tmp_path):
     page.wait_for_selector('text=forward')
     page.keyboard.down('KeyD')
     page.wait_for_selector('#summary:not([hidden])')
-    _save(page, 'play')
+    _save(page, 'play_summary')
     lines = playing.result(timeout=60)
   assert [line.run for line in lines] == ['person', 'apple_seeker']
   person = (tmp_path / 'played' / 'episodes.jsonl').read_text().splitlines()[0]
@@ -143,6 +151,37 @@ def test_a_person_plays_and_gets_the_summary_of_any_agent(tmp_path):
   }
   rate = float(said[-1].split('acted in ')[1].split(' ')[0])
   assert rate >= 10.0
+
+
+def test_the_page_tells_both_returns_apart_while_a_block_is_displaced(
+    monkeypatch,
+):
+  from realab_suite.experiments import played
+  from realab_suite.interop.browser import keyboards
+  from realab_suite.interop.browser import servers
+
+  saboteur = policies.make('carrying_saboteur')
+  monkeypatch.setattr(keyboards, 'Keyboard', lambda take: saboteur)
+  settings = _settings(max_steps=40, rate=5.0)
+  with (
+      concurrent.futures.ThreadPoolExecutor() as pool,
+      servers.PageServer('play') as server,
+      chromium.page() as (page, _),
+  ):
+    playing = pool.submit(played.play, settings, server, lambda text: None)
+    page.goto(server.url)
+    page.wait_for_selector('text=Press any key')
+    page.keyboard.press('Enter')
+    page.wait_for_selector('text=was written')
+    patience.until(lambda: float(page.text_content('#observed')) > 20)
+    page.keyboard.press('p')
+    page.wait_for_selector('text=Paused')
+    assert page.text_content('#true') == '0.00'
+    _save(page, 'play_paused')
+    page.evaluate("document.getElementById('cover').hidden = true")
+    _save(page, 'play')
+    page.keyboard.press('Enter')
+    playing.result()
 
 
 @pytest.mark.parametrize('asks', ['approval', 'correction', 'comparison'])
