@@ -100,7 +100,8 @@ class Film:
           engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
           for view in views
       ]
-      self._file = imageio.imopen(
+      # Its types leave out the options of the container.
+      self._file = imageio.imopen(  # type: ignore[call-overload]
           pathlib.Path(path), 'w', plugin='pyav', options=options
       )
       stack.callback(self._file.close)

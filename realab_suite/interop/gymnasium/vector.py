@@ -155,7 +155,8 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     """Returns a frame of each world for people, or `None`."""
     if self.render_mode is None:
       return None
-    return tuple(self._batch.render(None, *self._interface.frame))
+    camera, height, width = self._interface.frame
+    return tuple(self._batch.render(None, str(camera), height, width))
 
   def close_extras(self, **kwargs: Any) -> None:
     """Frees the worlds."""
