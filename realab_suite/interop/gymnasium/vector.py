@@ -155,7 +155,9 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     """Returns a frame of each world for people, or `None`."""
     if self.render_mode is None:
       return None
-    return tuple(self._batch.render(None, *self._interface.frame))
+    camera, height, width = self._interface.frame
+    # A batch has no free camera, and refuses its number.
+    return tuple(self._batch.render(None, str(camera), height, width))
 
   def close_extras(self, **kwargs: Any) -> None:
     """Frees the worlds."""
