@@ -1,6 +1,7 @@
-"""PPO of Stable-Baselines3 that learns from the reading of a reward register.
+"""Stable-Baselines3 learns from the reading of a reward register.
 
   python examples/train_with_sb3.py --steps=400000 --output=results/ppo
+  python examples/train_with_sb3.py --algorithm=dqn --output=results/dqn
 
 The agent gets readings only. After training, the report in the output folder
 shows its true return, its corruption, and a label for each seed of training.
@@ -13,7 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3 import PPO
+import stable_baselines3
 from stable_baselines3.common import vec_env
 
 from realab_suite.experiments import gymnasium_report
@@ -25,9 +26,32 @@ _OPTIONS: dict[str, Any] = {
     'reward_register': 'reward',
     'flat': True,
 }
+_PPO: dict[str, Any] = {
+    'learning_rate': 1e-3,
+    'n_steps': 128,
+    'batch_size': 1024,
+    'n_epochs': 6,
+    'ent_coef': 0.01,
+}
+_DQN: dict[str, Any] = {
+    'learning_rate': 5e-4,
+    'buffer_size': 200_000,
+    'learning_starts': 10_000,
+    'batch_size': 256,
+    'train_freq': 4,
+    'gradient_steps': 8,
+    'target_update_interval': 4_000,
+    'exploration_fraction': 0.4,
+}
+_ALGORITHMS = {
+    'ppo': (stable_baselines3.PPO, _PPO),
+    'dqn': (stable_baselines3.DQN, _DQN),
+}
 
 
-def train(seed: int, steps: int, num_envs: int) -> Callable[[Any], Any]:
+def train(
+    algorithm: str, seed: int, steps: int, num_envs: int
+) -> Callable[[Any], Any]:
   """Returns a trained policy: a function from an observation to an action."""
   envs = gym.make_vec(
       _WORLD,
@@ -40,17 +64,9 @@ def train(seed: int, steps: int, num_envs: int) -> Callable[[Any], Any]:
   normalized = vec_env.VecNormalize(
       vec_env.VecMonitor(sb3.RealabVecEnv(envs.unwrapped))
   )
-  model = PPO(
-      'MlpPolicy',
-      normalized,
-      learning_rate=1e-3,
-      n_steps=128,
-      batch_size=min(1024, 128 * num_envs),
-      n_epochs=6,
-      ent_coef=0.01,
-      seed=seed,
-      device='cpu',
-      verbose=1,
+  learner, settings = _ALGORITHMS[algorithm]
+  model = learner(
+      'MlpPolicy', normalized, seed=seed, device='cpu', verbose=1, **settings
   )
   model.learn(steps)
   normalized.close()
@@ -65,6 +81,7 @@ def train(seed: int, steps: int, num_envs: int) -> Callable[[Any], Any]:
 def main(arguments: Sequence[str] | None = None) -> None:
   """Trains one policy per seed, and writes the report on all of them."""
   parser = argparse.ArgumentParser(description=__doc__)
+  parser.add_argument('--algorithm', choices=_ALGORITHMS, default='ppo')
   parser.add_argument('--steps', type=int, default=400_000)
   parser.add_argument('--num_envs', type=int, default=64)
   parser.add_argument('--seeds', type=int, default=1)
@@ -72,12 +89,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
   parser.add_argument('--output', required=True)
   given = parser.parse_args(arguments)
   trained = [
-      train(seed, given.steps, given.num_envs) for seed in range(given.seeds)
+      train(given.algorithm, seed, given.steps, given.num_envs)
+      for seed in range(given.seeds)
   ]
   report = gymnasium_report.write(
-      _WORLD, {'ppo': trained}, given.output, num_episodes=given.episodes,
+      _WORLD,
+      {given.algorithm: trained},
+      given.output,
+      num_episodes=given.episodes,
       **_OPTIONS,
-  )  # fmt: skip
+  )
   print(report.text)
 
 

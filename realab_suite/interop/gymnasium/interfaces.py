@@ -55,7 +55,7 @@ class Interface:
       flat: True for observations that are one vector for each world.
       render_mode: `'rgb_array'`, or `None`. Frames are for people.
       camera_name: Camera of the frames; `None` for `'top_down'`, or a free
-        camera in a world without it.
+        camera in a single world without it.
       height: Height of a frame, in pixels.
       width: Width of a frame, in pixels.
 

@@ -156,6 +156,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     if self.render_mode is None:
       return None
     camera, height, width = self._interface.frame
+    # A batch has no free camera, and refuses its number.
     return tuple(self._batch.render(None, str(camera), height, width))
 
   def close_extras(self, **kwargs: Any) -> None:
