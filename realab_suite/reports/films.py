@@ -12,6 +12,7 @@ from typing import Any, final
 
 from dm_control.mujoco import engine
 from imageio import v3 as imageio
+from imageio.plugins import pyav
 import numpy as np
 from PIL import Image
 from PIL import ImageDraw
@@ -101,7 +102,7 @@ class Film:
           for view in views
       ]
       self._file = imageio.imopen(
-          pathlib.Path(path), 'w', plugin='pyav', options=options
+          pathlib.Path(path), 'w', plugin=pyav.PyAVPlugin, options=options
       )
       stack.callback(self._file.close)
       self._file.init_video_stream(
