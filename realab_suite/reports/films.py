@@ -12,6 +12,7 @@ from typing import Any, final
 
 from dm_control.mujoco import engine
 from imageio import v3 as imageio
+from imageio.plugins import pyav
 import numpy as np
 from PIL import Image
 from PIL import ImageDraw
@@ -100,9 +101,8 @@ class Film:
           engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
           for view in views
       ]
-      # Its types leave out the options of the container.
-      self._file = imageio.imopen(  # type: ignore[call-overload]
-          pathlib.Path(path), 'w', plugin='pyav', options=options
+      self._file = imageio.imopen(
+          pathlib.Path(path), 'w', plugin=pyav.PyAVPlugin, options=options
       )
       stack.callback(self._file.close)
       self._file.init_video_stream(
