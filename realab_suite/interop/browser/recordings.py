@@ -70,6 +70,9 @@ class Recording:
       self._server = viser.ViserServer(servers.LOCAL, port=0, verbose=False)
     self._scene = mjviser.ViserMujocoScene(self._server, model, num_envs=1)
     self._scene.camera_tracking_enabled = False
+    # Shadows need most of the draw calls of a frame, which takes seconds
+    # without a graphics processor.
+    self._server.scene.configure_default_lights(cast_shadow=False)
     centre, size = _floor(self._server, model, physics.data.ptr)
     self._free = self._server.get_scene_serializer()
     self._first_person = self._server.get_scene_serializer()
