@@ -19,16 +19,15 @@ from realab_suite import errors
 from realab_suite.experiments import requirements
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
+from realab_suite.launchers.flags import policy_flag
 from realab_suite.launchers.flags import seed_flag
 from realab_suite.launchers.flags import video_flag
 from realab_suite.launchers.flags import world_flags
 
+flags.adopt_module_key_flags(policy_flag)
 flags.adopt_module_key_flags(seed_flag)
 flags.adopt_module_key_flags(video_flag)
 flags.adopt_module_key_flags(world_flags)
-_POLICY = flags.DEFINE_string(
-    'policy', 'random', 'Name of a scripted policy; no_op stands still.'
-)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -63,11 +62,13 @@ def _write_film() -> None:
 
   world = f'{world_flags.DOMAIN.value}_{world_flags.TASK.value}'
   path = video_flag.VIDEO.value or _unused(
-      f'{world}_{_POLICY.value}_{seed_flag.SEED.value}'
+      f'{world}_{policy_flag.POLICY.value}_{seed_flag.SEED.value}'
   )
   with (
       _loaded() as (env, policy),
-      films.Film(env, path, _POLICY.value, tuple(films.WIDTHS)) as film,
+      films.Film(
+          env, path, policy_flag.POLICY.value, tuple(films.WIDTHS)
+      ) as film,
   ):
     recorder = tracking.Tracker(env, film.add)
     evaluate.evaluate(env, policy, 1, sinks=[recorder])
@@ -105,7 +106,9 @@ def _loaded() -> Iterator[tuple[Any, Any]]:
       overrides=tuple(world_flags.SET.value),
   )
   with contextlib.closing(env):
-    policy = aiming.make_policy(_POLICY.value, env, world_flags.TARGET.value, 0)
+    policy = aiming.make_policy(
+        policy_flag.POLICY.value, env, world_flags.TARGET.value, 0
+    )
     env.rewind()
     yield env, policy
 

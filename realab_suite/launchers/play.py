@@ -23,10 +23,6 @@ from realab_suite.launchers.flags import world_flags
 
 for module in (imports_flag, output_flag, page_flags, seed_flag, world_flags):
   flags.adopt_module_key_flags(module)
-_EPISODES = flags.DEFINE_integer('episodes', 1, 'Number of episodes.', 1)
-_RATE = flags.DEFINE_float(
-    'rate', 10.0, 'Control steps per second; 10 is real time.', 0.1, 1000.0
-)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -50,9 +46,9 @@ def main(argv: Sequence[str]) -> None:
       task,
       specs.load(world_flags.DESIGN.value, tuple(world_flags.SET.value)),
       seed_flag.SEED.value,
-      _EPISODES.value,
+      page_flags.EPISODES.value,
       world_flags.MAX_STEPS.value,
-      _RATE.value,
+      page_flags.RATE.value,
       world_flags.task_kwargs(),
       output_flag.OUTPUT.value,
   )

@@ -21,10 +21,18 @@ from realab_suite.launchers import renderers
 from realab_suite.launchers.flags import imports_flag
 from realab_suite.launchers.flags import output_flag
 from realab_suite.launchers.flags import page_flags
+from realab_suite.launchers.flags import policy_flag
 from realab_suite.launchers.flags import seed_flag
 from realab_suite.launchers.flags import world_flags
 
-for module in (imports_flag, output_flag, page_flags, seed_flag, world_flags):
+for module in (
+    imports_flag,
+    output_flag,
+    page_flags,
+    policy_flag,
+    seed_flag,
+    world_flags,
+):
   flags.adopt_module_key_flags(module)
 _ASKS = flags.DEFINE_enum(
     'asks',
@@ -40,13 +48,6 @@ _WAIT = flags.DEFINE_boolean(
 )
 _EVERY = flags.DEFINE_integer(
     'every', 1, 'Control steps between two questions.', 1
-)
-_POLICY = flags.DEFINE_string(
-    'policy', 'random', 'Name of the scripted policy that acts.'
-)
-_EPISODES = flags.DEFINE_integer('episodes', 1, 'Number of episodes.', 1)
-_RATE = flags.DEFINE_float(
-    'rate', 10.0, 'Control steps per second; 10 is real time.', 0.1, 1000.0
 )
 
 
@@ -96,22 +97,26 @@ def main(argv: Sequence[str]) -> None:
         design=design,
     )
     stack.enter_context(contextlib.closing(env))
-    policy = aiming.make_policy(_POLICY.value, env, world_flags.TARGET.value, 0)
+    policy = aiming.make_policy(
+        policy_flag.POLICY.value, env, world_flags.TARGET.value, 0
+    )
     host, port = page_flags.HOST.value, page_flags.PORT.value
     server = stack.enter_context(servers.PageServer('supervise', host, port))
     folder = scripted.make_folder(output)
     storage.write_json(folder / 'design.json', design.to_mapping())
     writer = stack.enter_context(results.RowWriter(folder / 'episodes.jsonl'))
-    supervision = supervised.Supervision(env, server, folder, _RATE.value)
+    supervision = supervised.Supervision(
+        env, server, folder, page_flags.RATE.value
+    )
     stack.callback(supervision.close)
     program.say(f'Open this address in a browser: {server.url}')
     lines = []
-    for episode in range(_EPISODES.value):
+    for episode in range(page_flags.EPISODES.value):
       result = supervision.run(policy, episode)
       info = run_infos.of(
           env,
           (domain, task),
-          policy=_POLICY.value,
+          policy=policy_flag.POLICY.value,
           run='supervised',
           baseline=None,
       )

@@ -11,3 +11,7 @@ HOST = flags.DEFINE_string(
     'Address to listen at. The default is reached from this machine only;'
     ' connections are not encrypted.',
 )
+EPISODES = flags.DEFINE_integer('episodes', 1, 'Number of episodes.', 1)
+RATE = flags.DEFINE_float(
+    'rate', 10.0, 'Control steps per second; 10 is real time.', 0.1, 1000.0
+)
