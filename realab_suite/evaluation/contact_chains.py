@@ -6,7 +6,7 @@ start and at the end of a control step, as in `entities.proximity`.
 
 from collections.abc import Sequence
 import itertools
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -22,6 +22,22 @@ _TOUCH = 0.005
 
 Chain = tuple[str, ...]
 """Names of the avatar and of the blocks that it moved, as `reward/base`."""
+
+
+@final
+class _Candidates(NamedTuple):
+  """Pairs of bodies that may be in contact in a control step.
+
+  Attributes:
+    near: True if their bounding spheres touch at the start or at the end of the
+      step, `(2, worlds, pairs)`.
+    is_held: True if the hand holds the block, `(worlds, pairs)`.
+    limits: Distance up to which they touch, `(worlds, pairs)`, in m.
+  """
+
+  near: np.ndarray
+  is_held: np.ndarray
+  limits: np.ndarray
 
 
 @final
@@ -71,6 +87,7 @@ class ContactRecorder:
     self._centres: list[np.ndarray] = []
     self._matrices: list[np.ndarray] = []
     self._held: list[np.ndarray] = []
+    self._found: dict[tuple[int, bool], _Candidates] = {}
 
   def record(self) -> None:
     """Records the present poses: first those of the start, then each step's."""
@@ -131,25 +148,38 @@ class ContactRecorder:
       step: Index of the control step.
       is_swept: True to count pairs that may have met in between as well.
     """
-    ends = [step, step + 1]
-    centres = np.stack([self._centres[i][world] for i in ends])
-    held = self._held[step][world] | self._held[step + 1][world]
-    one, other = self._pairs.T
-    offsets = centres[:, one] - centres[:, other]
-    limits = np.full(len(self._pairs), _TOUCH)
-    if is_swept:
-      limits += np.linalg.norm(offsets[1] - offsets[0], axis=-1)
-    reach = self._radii[one] + self._radii[other] + limits
-    near = np.linalg.norm(offsets, axis=-1) <= reach
-    is_held = (one == 0) & held[other]
-    touching = is_held.copy()
-    for i in np.flatnonzero(near.any(axis=0) & ~is_held):
+    near, is_held, limits = self._candidates(step, is_swept)
+    touching = is_held[world].copy()
+    for i in np.flatnonzero(near[:, world].any(axis=0) & ~touching):
+      limit = limits[world, i]
       touching[i] = any(
-          self._distance(world, at, self._pairs[i], limits[i]) <= limits[i]
-          for at, is_near in zip(ends, near[:, i], strict=True)
-          if is_near
+          self._distance(world, step + int(end), self._pairs[i], limit) <= limit
+          for end in np.flatnonzero(near[:, world, i])
       )
     return [(int(a), int(b)) for a, b in self._pairs[touching]]
+
+  def _candidates(self, step: int, is_swept: bool) -> _Candidates:
+    """Returns the pairs that may be in contact, computed once for all worlds.
+
+    Args:
+      step: Index of the control step.
+      is_swept: As in `_contacts`.
+    """
+    if (step, is_swept) not in self._found:
+      centres = np.stack(self._centres[step : step + 2])
+      held = self._held[step] | self._held[step + 1]
+      one, other = self._pairs.T
+      offsets = centres[:, :, one] - centres[:, :, other]
+      limits = np.full(offsets.shape[1:3], _TOUCH)
+      if is_swept:
+        limits += np.linalg.norm(offsets[1] - offsets[0], axis=-1)
+      reach = self._radii[one] + self._radii[other] + limits
+      self._found[step, is_swept] = _Candidates(
+          np.linalg.norm(offsets, axis=-1) <= reach,
+          (one == 0) & held[:, other],
+          limits,
+      )
+    return self._found[step, is_swept]
 
   def _distance(self, world: int, at: int, pair: Any, limit: float) -> float:
     return proximity.distance(
