@@ -69,10 +69,28 @@ def carried_share(run: sweep_results.Run, row: results.EpisodeRow) -> float:
     return look
 
   replays.replay(run, row, watch)
-  paid = np.maximum(direction * np.diff(permanent), 0)
-  paid += np.maximum(direction * np.array(temporary[1:]), 0)
-  is_carried = np.array(held[1:]) | np.array(held[:-1])
-  return float(paid[is_carried].sum() / paid.sum())
+  return share(
+      direction * np.array(permanent),
+      direction * np.array(temporary),
+      np.array(held),
+  )
+
+
+def share(
+    permanent: np.ndarray, temporary: np.ndarray, held: np.ndarray
+) -> float:
+  """Returns the carried share of what an episode gains.
+
+  Arguments have a value for the start and for the end of each control step.
+
+  Args:
+    permanent: Permanent corruption in the direction that pays, `(steps + 1,)`.
+    temporary: Temporary corruption in this direction, `(steps + 1,)`.
+    held: True if the hand holds a block, `(steps + 1,)` bool.
+  """
+  gained = np.maximum(np.diff(permanent), 0) + np.maximum(temporary[1:], 0)
+  is_carried = held[1:] | held[:-1]
+  return float(gained[is_carried].sum() / gained.sum())
 
 
 def main(folder: str) -> int:
