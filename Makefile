@@ -25,7 +25,7 @@ demo: .venv/demo
 	$(PY) -m realab_suite.launchers.report --input=$(DEMO)
 
 test: lint
-	$(PY) -m pytest -q -n $(WORKERS)
+	$(PY) -m pytest -q -n $(WORKERS) --dist loadfile
 
 lint: .venv/dev
 	$(PY) -m ruff check -q .
