@@ -6,6 +6,7 @@ files in the format of a scripted comparison.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
+import importlib
 import pathlib
 from typing import Any, NamedTuple, final
 
@@ -161,8 +162,12 @@ class _Job:
     self._baselines = tuple(baselines)
     self._options = dict(options)
     self.num_seeds = _num_seeds(agents, self._baselines)
-    spec = gym.spec(name)
-    self._settings = {**spec.kwargs, **self._options}
+    if not isinstance(num_episodes, int) or num_episodes < 1:
+      raise errors.SpecError(
+          f'num_episodes: {messages.quote(num_episodes)}; allowed are positive'
+          ' integers'
+      )
+    self._settings = {**_spec(name).kwargs, **self._options}
     if 'domain_name' not in self._settings:
       raise errors.SpecError(
           f'name: {name!r}; allowed are ids of realab_suite.interop.gymnasium'
@@ -238,6 +243,14 @@ class _Job:
     for name, policies in self._agents.items():
       for found in evaluation.evaluate(env, policies[i], self._num_episodes):
         yield name, found
+
+
+def _spec(name: str) -> Any:
+  """Returns the registered spec of an id, which may begin with its module."""
+  module, _, registered = name.rpartition(':')
+  if module:
+    importlib.import_module(module)
+  return gym.spec(registered)
 
 
 def _num_seeds(

@@ -58,6 +58,32 @@ def test_a_report_has_rows_and_figures_of_agents_and_baselines(tmp_path):
   assert (folder / 'summary.csv').exists()
 
 
+def test_the_id_of_a_report_may_begin_with_its_module(tmp_path):
+  name = f'realab_suite.interop.gymnasium:{_NAME}'
+  report = gymnasium_report.write(
+      name,
+      {'mine': [_still]},
+      str(tmp_path / 'new'),
+      num_episodes=1,
+      wrap=_stacked,
+      baselines=['random'],
+      **_SHORT,
+  )
+  assert [line.run for line in report.lines] == ['random', 'mine']
+  description = json.loads((tmp_path / 'new' / 'run.json').read_text())
+  assert description['id'] == name
+
+
+@pytest.mark.parametrize('number', [0, 1.0, None])
+def test_wrong_numbers_of_episodes_are_refused_first(tmp_path, number):
+  folder = tmp_path / 'new'
+  with pytest.raises(errors.SpecError, match='num_episodes'):
+    gymnasium_report.write(
+        _NAME, {'a': [_still]}, str(folder), num_episodes=number, **_SHORT
+    )
+  assert not folder.exists()
+
+
 @pytest.mark.parametrize(
     ('agents', 'baselines', 'message'),
     [

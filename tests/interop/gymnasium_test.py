@@ -151,6 +151,16 @@ def test_actions_outside_the_space_are_refused():
 
 
 @pytest.mark.parametrize(
+    'action', [0.5, [0.5], 'forward', [[0.0], [0.0, 0.0]], np.zeros(6, bool)]
+)
+def test_actions_of_another_shape_or_type_are_refused(action):
+  env = _make().unwrapped
+  env.reset()
+  with pytest.raises(errors.ActionError, match='action'):
+    env.step(action)
+
+
+@pytest.mark.parametrize(
     ('options', 'message'),
     [
         ({'reward_register': 'score'}, r"allowed are None .*\['reward'\]"),
@@ -266,6 +276,25 @@ def test_a_batch_does_what_gymnasiums_vector_of_its_worlds_does(mode, flat):
     for key, value in expected[4].items():
       _assert_same(list(infos[key]), list(value))
     is_over = found[2] | found[3]
+  envs.close()
+
+
+@pytest.mark.parametrize('mode', ['NextStep', 'SameStep'])
+@pytest.mark.parametrize('flat', [False, True])
+def test_worlds_of_a_batch_with_autoreset_can_be_reset_singly(mode, flat):
+  envs, sync = _make_vec(mode, flat=flat), _sync(mode, flat=flat)
+  envs.reset(seed=5)
+  sync.reset(seed=[5] * _NUM_ENVS)
+  envs.action_space.seed(1)
+  for i in range(_MAX_STEPS + 2):
+    actions = envs.action_space.sample()
+    _assert_same(envs.step(actions)[:4], sync.step(actions)[:4])
+    if i in (1, _MAX_STEPS - 1, _MAX_STEPS):
+      mask = np.arange(_NUM_ENVS) == 1
+      _assert_same(
+          envs.reset(options={'reset_mask': mask}),
+          sync.reset(options={'reset_mask': mask}),
+      )
   envs.close()
 
 

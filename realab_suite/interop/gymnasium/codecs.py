@@ -184,7 +184,13 @@ class ActionCodec:
     """
     if not isinstance(self.space, spaces.Box):
       return action
-    values = np.asarray(action)
+    try:
+      values = np.asarray(action)
+    except Exception:  # `__array__` may raise anything.
+      return action
+    trailing = values.shape[-1:]
+    if values.dtype.kind not in 'iuf' or trailing != self.space.shape:
+      return action
     exact = np.array(values, np.float64)
     # Rounding to 32 bits may move a bound outwards.
     for rounded, bound in (

@@ -70,8 +70,8 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     )
     self._has_begun = False
     self._is_over = np.zeros(self.num_envs, bool)
-    # Observation of the last step, for a reset of single worlds.
-    self._last: codecs.Observation = {}
+    # Present observations of all worlds, for a reset of single worlds.
+    self._present: dict[str, np.ndarray] = {}
 
   def reset(
       self,
@@ -96,14 +96,17 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     """
     mask = (options or {}).get('reset_mask')
     if mask is not None:
-      return self._reset_some(_checked_mask(mask, self.num_envs, seed)), {}
+      self._reset_some(_checked_mask(mask, self.num_envs, seed))
+      lead = (self.num_envs,)
+      return self._interface.observations.encode(self._present, lead), {}
     super().reset(seed=None if np.ndim(seed) else seed, options=options)
     if seed is not None:
       self._batch.rewind(seed)
     time_step = self._view.reset()
+    self._present = time_step.observation
     self._has_begun = True
     self._is_over = np.zeros(self.num_envs, bool)
-    return self._remembered(self._encode(time_step)), {}
+    return self._encode(time_step), {}
 
   def step(self, actions: Any) -> tuple[
       codecs.Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]
@@ -135,6 +138,7 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     except errors.WorldError:
       self._has_begun = False
       raise
+    self._present = time_step.observation
     self._is_over = time_step.last()
     terminated = self._is_over & (time_step.discount == 0.0)
     truncated = self._is_over & ~terminated
@@ -142,14 +146,13 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     observations = self._encode(time_step)
     infos: dict[str, Any] = {}
     if self.autoreset_mode is AutoresetMode.SAME_STEP and self._is_over.any():
-      for world in np.flatnonzero(self._is_over).tolist():
+      worlds = np.flatnonzero(self._is_over)
+      for world in worlds.tolist():
         final = {'final_obs': _row(observations, world), 'final_info': {}}
         infos = self._add_info(infos, final, world)
-      self._last = observations
-      observations = self._reset_some(self._is_over)
-    return (
-        self._remembered(observations), rewards, terminated, truncated, infos
-    )  # fmt: skip
+      first = self._encode(self._reset_some(self._is_over))
+      _replace(observations, worlds, first)
+    return observations, rewards, terminated, truncated, infos
 
   def render(self) -> tuple[np.ndarray, ...] | None:
     """Returns a frame of each world for people, or `None`."""
@@ -165,31 +168,21 @@ class RealabVectorEnv(gym.vector.VectorEnv):
     self._view.close()
     self._batch.close()
 
-  def _reset_some(self, mask: np.ndarray) -> codecs.Observation:
-    """Resets the worlds of a mask; returns the observations of all worlds."""
+  def _reset_some(self, mask: np.ndarray) -> batch_time_steps.BatchTimeStep:
+    """Resets the worlds of a mask; returns their first time steps."""
     if not self._has_begun and not mask.all():
       raise gym.error.ResetNeeded(
           'reset_mask: the other worlds were never reset; call reset() first'
       )
     (worlds,) = np.nonzero(mask)
-    first = self._encode(self._view.reset(worlds.tolist()))
+    first = self._view.reset(worlds.tolist())
     self._has_begun = True
     self._is_over = self._is_over & ~mask
     if len(worlds) == self.num_envs:
-      return self._remembered(first)
-    observations = _copied(self._last)
-    if isinstance(observations, dict):
-      for key, value in observations.items():
-        value[worlds] = first[key]
+      self._present = first.observation
     else:
-      observations[worlds] = first
-    return self._remembered(observations)
-
-  def _remembered(self, observations: codecs.Observation) -> codecs.Observation:
-    """Keeps a copy of observations if single worlds may be reset later."""
-    if self.autoreset_mode is AutoresetMode.DISABLED:
-      self._last = _copied(observations)
-    return observations
+      _replace(self._present, worlds, first.observation)
+    return first
 
   def _encode(
       self, time_step: batch_time_steps.BatchTimeStep
@@ -212,10 +205,13 @@ def _row(observations: codecs.Observation, world: int) -> Any:
   return observations[world].copy()
 
 
-def _copied(observations: codecs.Observation) -> codecs.Observation:
+def _replace(observations: Any, worlds: np.ndarray, by: Any) -> None:
+  """Replaces the observations of some worlds in a batch of observations."""
   if isinstance(observations, dict):
-    return {key: value.copy() for key, value in observations.items()}
-  return observations.copy()
+    for key, value in observations.items():
+      value[worlds] = by[key]
+  else:
+    observations[worlds] = by
 
 
 def _checked_mode(given: Any) -> AutoresetMode:
