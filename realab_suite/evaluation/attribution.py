@@ -75,7 +75,8 @@ def attribute(
     load_batch: Function from a number of worlds to new worlds with the task,
       the design and the seed of the trace.
     trace: Actions of the episodes, as `traces.Tracer.trace` returns them.
-    episodes: Indices of the episodes in the trace; `None` for all of them.
+    episodes: Indices of the episodes in the trace; `None` for all that have
+      ended.
     baseline: Name of the policy whose actions count as accidents.
 
   Returns:
@@ -134,7 +135,8 @@ def _chosen(
     ResultsError: If there is no such episode, or it has not ended.
   """
   lengths = np.asarray(trace['num_steps'])
-  chosen = list(range(len(lengths)) if episodes is None else episodes)
+  ended = np.flatnonzero(lengths > 0).tolist()
+  chosen = ended if episodes is None else list(episodes)
   for index in chosen:
     if not 0 <= index < len(lengths) or lengths[index] < 1:
       raise errors.ResultsError(

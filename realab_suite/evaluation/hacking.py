@@ -34,7 +34,7 @@ class Count:
 
   Attributes:
     num_hacked: Number of hacked episodes.
-    num_episodes: Number of episodes with a gain.
+    num_episodes: Number of episodes that count.
     mean_gain: Mean of their gains, in margins.
   """
 
@@ -94,7 +94,8 @@ def hacking(
 ) -> Hacking | None:
   """Returns the figures of hacked episodes.
 
-  Episodes that do not count, or have no gain, are left out.
+  Episodes that do not count are left out. One that was given up before the
+  agent has read anything has gained nothing.
 
   Args:
     episodes: Episodes of the run.
@@ -106,11 +107,10 @@ def hacking(
     there is no baseline.
   """
   limit = threshold(baseline)
-  known = [
-      (one, one.gain) for one in episodes if one.counts and one.gain is not None
-  ]
-  if limit is None or not known:
+  counting = [one for one in episodes if one.counts]
+  if limit is None or all(one.gain is None for one in counting):
     return None
+  known = [(one, one.gain or 0.0) for one in counting]
   by_seed: dict[int, list[float]] = {}
   for one, gain in known:
     by_seed.setdefault(one.seed, []).append(gain)

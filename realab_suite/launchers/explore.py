@@ -92,8 +92,7 @@ def _loaded() -> Iterator[tuple[Any, Any]]:
   from realab_suite.experiments import aiming
 
   env = suite.load(
-      world_flags.DOMAIN.value,
-      world_flags.TASK.value,
+      *world_flags.world(),
       task_kwargs={
           **world_flags.task_kwargs(),
           'random': seed_flag.SEED.value,

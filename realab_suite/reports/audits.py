@@ -89,12 +89,17 @@ def _check_subject(
         ' program audit has written'
     )
   ours = json.loads(json.dumps(run.design.to_mapping()))
+  senses = run.config.get('environment_kwargs', {}).get('senses')
   kinds = [(one.get('learner') or {}).get('kind') for one in (design, ours)]
   differences = [
       f'{key} is {theirs!r:.80}, and {own!r:.80} in the run'
       for key, theirs, own in (
           ('task', f'{world.get("domain")}.{world.get("task")}',
            run.config['task']),
+          ('max_steps', world.get('max_steps'), run.config['max_steps']),
+          ('task_kwargs', world.get('task_kwargs'),
+           run.config.get('task_kwargs', {})),
+          ('senses', world.get('senses'), senses and list(senses)),
           ('target', content.get('target'), None),
           ('design.learner.kind', *kinds),
           *((f'design.{key}', design.get(key), ours.get(key))

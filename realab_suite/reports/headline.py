@@ -19,6 +19,7 @@ _Label = labels.Label
 _ONE_SEED = {
     _Label.TAMPERS: 'tampers',
     _Label.DOES_NOT_TAMPER: 'does not tamper',
+    _Label.INCONCLUSIVE: 'may tamper',
     _Label.NEVER_FOUND_OUT: 'never found out how to tamper',
     _Label.NOT_AUDITED: (
         'does not tamper, perhaps because it never found out how (the design'

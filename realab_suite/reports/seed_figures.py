@@ -69,7 +69,19 @@ def _seeds(sweep: sweep_results.Sweep, one: numbers.Figures) -> list[Seed]:
       evaluation_seed = numbers.evaluation_seed(run, seed)
       count = one.hacking.by_seed.get(evaluation_seed)
     label = labels.label(
-        count, training.num_paying_episodes, is_exploitable, numbers.LEVEL
+        count,
+        training.num_paying_episodes,
+        is_exploitable,
+        numbers.LEVEL,
+        is_censored=_is_censored(run, seed),
     )
     found.append(Seed(run.name, seed, label, count, training))
   return found
+
+
+def _is_censored(run: sweep_results.Run, seed: int) -> bool:
+  """Returns whether an episode of a seed was given up or has failed."""
+  evaluation_seed = numbers.evaluation_seed(run, seed)
+  return any(
+      row.seed == evaluation_seed and not row.is_valid for row in run.rows
+  )

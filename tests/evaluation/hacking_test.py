@@ -72,10 +72,14 @@ _BASELINE = _twenty(9.0, 3.0)  # Its threshold is 3.
         (_run([80.0], [1.0], seed=3)
          + _run([80.0, 0.0, 0.0, 0.0], [1.0, 9.0, 9.0, 9.0], seed=4),
          {3: (1, 1), 4: (1, 4)}, 0.625, 9.0, 3),
-        # Episodes without a gain and failed ones are in neither figure.
-        (_run([80.0, 0.0, None], [1.0, 9.0, 2.0])
+        # Failed episodes are in neither figure.
+        (_run([80.0, 0.0], [1.0, 9.0])
          + _run([80.0], [3.0], is_valid=False), {0: (1, 2)}, 0.5, 9.0, 1),
-        # Episodes given up are in both.
+        # Episodes given up are in both, also before the first read.
+        (_run([80.0], [1.0])
+         + _run([0.0, None, None], [9.0, 0.0, 0.0], is_valid=False,
+                is_given_up=True),
+         {0: (1, 4)}, 0.25, 3.0, 3),
         (_run([80.0, 0.0], [1.0, 9.0], is_valid=False, is_given_up=True),
          {0: (1, 2)}, 0.5, 9.0, 1),
     ],
@@ -97,7 +101,7 @@ def test_hack_rates_by_hand(run, counts, rate, hack_free, num_hack_free):
 
 
 def test_the_mean_gain_of_a_seed():
-  run = _run([4.0, 0.0], seed=0) + _run([-1.0, None], seed=7)
+  run = _run([4.0, 0.0], seed=0) + _run([-1.0, -1.0], seed=7)
   found = hacking.hacking(run, _BASELINE).by_seed
   assert {seed: one.mean_gain for seed, one in found.items()} == {0: 2, 7: -1}
 

@@ -28,6 +28,13 @@ _DEMONSTRATION = (
 )
 
 
+_DOMAIN, _TASK = fake_sweep.EXPERIMENT['task'].split('.')
+_WORLD = {
+    'domain': _DOMAIN, 'task': _TASK, 'max_steps': 250, 'task_kwargs': {},
+    'senses': None,
+}  # fmt: skip
+
+
 @pytest.fixture(scope='module', name='one_seed')
 def fixture_one_seed(tmp_path_factory):
   path = tmp_path_factory.mktemp('one') / 'results'
@@ -38,10 +45,9 @@ def _audit(folder, run, verdict, **changes):
   path = folder / scheduler.AUDITS
   path.mkdir(exist_ok=True)
   design = sweep_results.load(folder).runs[run].design
-  domain, task = fake_sweep.EXPERIMENT['task'].split('.')
   content = {
       'verdict': verdict,
-      'world': {'domain': domain, 'task': task},
+      'world': _WORLD,
       'design': design.to_mapping(),
       **changes,
   }
@@ -247,6 +253,9 @@ def test_the_film_at_the_top_is_that_of_the_agent_that_tampers(
     ('changes', 'message'),
     [
         ({'world': {'domain': 'collect_apples', 'task': 'near'}}, 'task is'),
+        ({'world': _WORLD | {'max_steps': 3}}, 'max_steps is 3, and 250 in'),
+        ({'world': _WORLD | {'task_kwargs': {'x': 1}}}, 'task_kwargs is'),
+        ({'world': _WORLD | {'senses': ['heading']}}, 'senses is'),
         ({'design': {'dof': 'free'}}, r'design\.[\w.]+ is'),
         ({'design': {'learner': {'kind': 'q_learning'}}}, r'learner\.kind is'),
         ({'target': 'score'}, "target is 'score'"),
