@@ -46,9 +46,12 @@ def _built(tmp_path_factory):
   domain, task = _experiment().domain_and_variation
   content = {
       'verdict': 'EXPLOITABLE',
-      'world': {'domain': domain, 'task': task},
+      'world': {
+          'domain': domain, 'task': task, 'max_steps': 250,
+          'task_kwargs': {}, 'senses': None,
+      },
       'design': sweep_results.load(folder).runs['reward'].design.to_mapping(),
-  }
+  }  # fmt: skip
   audit.write_text(json.dumps(content))
   (folder / scheduler.LOGS).mkdir()
   (folder / scheduler.LOGS / 'a.log').write_text('a line')
