@@ -81,13 +81,14 @@ def _steps(
   directions = gains.directions(episode.design)
   found = gains.of_reads(episode.ledger.entries, directions)
   attribution = episode.attribution
+  agent_gains = attribution.agent_gain if attribution and directions else None
   true_return = 0.0
   true_rewards = [0.0, *episode.ledger.true_rewards]
   for step, true_reward in enumerate(true_rewards):
     true_return += true_reward
     agent_gain = None
-    if attribution and directions and step:
-      agent_gain = float(attribution.agent_gain[step - 1])
+    if agent_gains is not None and step:
+      agent_gain = float(agent_gains[step - 1])
     yield {
         'step': step,
         'true_reward': _known(true_reward) if step else None,

@@ -60,7 +60,7 @@ def _write_film() -> None:
   from realab_suite.experiments import tracking
   from realab_suite.reports import films
 
-  world = f'{world_flags.DOMAIN.value}_{world_flags.TASK.value}'
+  world = '_'.join(world_flags.world())
   path = video_flag.VIDEO.value or _unused(
       f'{world}_{policy_flag.POLICY.value}_{seed_flag.SEED.value}'
   )

@@ -381,3 +381,7 @@ def test_the_summary_by_hand():
   nothing = dataclasses.replace(found, consumed=(), directions={}).metrics()
   assert (nothing.total, nothing.agent_share, nothing.chain) == (None,) * 3
   assert (nothing.num_paying, nothing.first_paying) == (0, None)
+
+
+def test_without_indices_the_episodes_that_have_ended_are_chosen():
+  assert attribution._chosen({'num_steps': [3, -1, 2]}, None) == [0, 2]

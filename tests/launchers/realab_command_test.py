@@ -15,7 +15,9 @@ import pytest
 from realab_suite import doctor
 from realab_suite.experiments import requirements
 from realab_suite.launchers import command
+from realab_suite.launchers import play
 from realab_suite.launchers import renderers
+from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]
 
@@ -150,6 +152,11 @@ def test_a_demo_without_its_extras_is_refused_at_once(
   )
 
 
+def test_pages_need_an_address():
+  message = in_process.complaint(play, '--host=')
+  assert '127.0.0.1' in message
+
+
 # The doctor.
 
 
@@ -210,4 +217,6 @@ def test_missing_extras_and_cameras_are_no_failure(monkeypatch, capsys):
 
 
 def test_the_doctors_world_can_be_stepped():
-  exec(compile(doctor._STEPS_A_WORLD, 'doctor', 'exec'), {})
+  names: dict[str, Any] = {}
+  exec(compile(doctor._STEPS_A_WORLD, 'doctor', 'exec'), names)
+  assert names['env'].physics.time() > 0
