@@ -26,6 +26,7 @@ from realab_suite.launchers import film
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
 from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
+from realab_suite.launchers import train  # noqa: F401 - defines --parent.
 from realab_suite.launchers.flags import imports_flag
 from realab_suite.launchers.flags import learning_flags
 from realab_suite.launchers.flags import output_flag
