@@ -18,7 +18,7 @@ _PACKAGE = 'realab_suite'
 
 # What each layer may import besides itself and `_FOUNDATION`. An entry that
 # names a module admits that module alone.
-_FOUNDATION = ('archive', 'errors', '_display', '_versions')
+_FOUNDATION = ('archive', 'errors', 'trees', '_display', '_versions')
 _BELOW_SUITE = (
     'config', 'configs', 'entities', 'policies', 'feedback', 'tasks', 'engine',
     'evaluation',
@@ -27,6 +27,7 @@ _MAY_IMPORT = {
     '__init__': (),
     'archive': (),
     'errors': (),
+    'trees': (),
     '_display': (),
     '_versions': (),
     'configs': (),
@@ -47,7 +48,12 @@ _MAY_IMPORT = {
         'config', 'entities', 'policies', 'feedback', 'tasks', 'engine',
     ),
     # Nothing here may reach the true reward.
-    'agents': ('config', 'feedback.specs', 'policies.action_sets'),
+    'agents': (
+        'config',
+        'feedback.objectives',
+        'feedback.specs',
+        'policies.action_sets',
+    ),
     'suite': _BELOW_SUITE,
     'interop': (*_BELOW_SUITE, 'suite'),
     'experiments': (*_BELOW_SUITE, 'suite', 'agents', 'interop'),

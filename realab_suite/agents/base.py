@@ -363,9 +363,9 @@ def make(
   if not isinstance(spec, specs.LearnerSpec):
     spec = validation.validate(specs.LearnerSpec, spec, 'learner')
   learner_class = LEARNERS.get(spec.kind)
-  options = validation.validate(
-      learner_class.OPTIONS, spec.model_dump(), 'learner'
-  )
+  # The objective is for evaluators.
+  given = {k: v for k, v in spec.model_dump().items() if k != 'objective'}
+  options = validation.validate(learner_class.OPTIONS, given, 'learner')
   return learner_class(
       options,
       _find_reading(options, learner_class.READS, observation_spec),

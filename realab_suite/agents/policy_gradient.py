@@ -14,6 +14,7 @@ from realab_suite.agents import features
 from realab_suite.agents import networks
 from realab_suite.agents import on_policy
 from realab_suite.agents import training
+from realab_suite.feedback import objectives
 
 
 @final
@@ -30,7 +31,7 @@ class PolicyGradientOptions(on_policy.OnPolicyOptions):
 
   kind: Literal['policy_gradient']
   reward: str
-  gamma: base.Fraction = 0.97
+  gamma: base.Fraction = objectives.DEFAULT_DISCOUNT
   gae_lambda: base.Fraction = 0.95
   entropy: base.Weight = 0.01
   clip: base.Fraction = 0.2

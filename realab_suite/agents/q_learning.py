@@ -14,6 +14,7 @@ from realab_suite.agents import features
 from realab_suite.agents import jax_settings
 from realab_suite.agents import networks
 from realab_suite.agents import training
+from realab_suite.feedback import objectives
 
 
 @final
@@ -40,7 +41,7 @@ class QLearningOptions(base.Options):
   reward: str
   learning_rate: base.Rate = 3e-4
   max_gradient_norm: base.Weight = 10.0
-  gamma: base.Fraction = 0.97
+  gamma: base.Fraction = objectives.DEFAULT_DISCOUNT
   num_returns: base.Positive = 3
   exploration: base.Fraction = 0.05
   exploration_steps: base.Positive = 300_000

@@ -9,6 +9,7 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import trees
 from realab_suite.engine import action_codec
 from realab_suite.engine import arguments
 from realab_suite.engine import batch_physics
@@ -196,6 +197,7 @@ class BatchEnvironment:
         has_failed=~is_first,
         records=[],
         agent_reads=reads,
+        action=np.zeros(self._num_envs),
         true_reward=np.zeros(self._num_envs),
     )
     self._is_pending = was_pending & ~is_first
@@ -256,6 +258,7 @@ class BatchEnvironment:
         has_failed=has_failed,
         records=records,
         agent_reads=reads,
+        action=np.array(actions),
         true_reward=ending.true_reward,
         failure=ending.failure,
     )
@@ -297,8 +300,8 @@ class BatchEnvironment:
         is_pending=is_pending.tolist(),
         is_open=(~is_pending).tolist(),
         provider_keys=list(self._keys[:, indices]),
-        provider_states=snapshots.spread(self._states, indices),
-        observation=snapshots.spread(self._observation, indices),
+        provider_states=trees.taken(self._states, indices),
+        observation=trees.taken(self._observation, indices),
         sinks=[[sink.state_kind, sink.state(indices)] for sink in self._sinks],
         random_state=None,
     )

@@ -393,7 +393,10 @@ class Environment(composer.Environment):
     self._provider_states = outcome.provider_states
     if self._sinks:
       step = events.Step(
-          outcome.records + reads, np.array(ending.true_reward), ending.failure
+          outcome.records + reads,
+          np.array(action),
+          np.array(ending.true_reward),
+          ending.failure,
       )
       with self._preserving_physics():
         for sink in self._sinks:

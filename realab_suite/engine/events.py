@@ -50,12 +50,14 @@ class Step(NamedTuple):
 
   Attributes:
     records: Writes and reads of registers, in order of time.
+    action: Action of the agent, `action_spec.shape`.
     true_reward: True reward of the step, `(...)`; NaN if the task raised an
       exception instead of returning one.
     failure: Traceback of that exception, or `None`.
   """
 
   records: Records
+  action: np.ndarray
   true_reward: np.ndarray
   failure: str | None = None
 
@@ -119,6 +121,7 @@ class BatchStep(NamedTuple):
     initial: Writes of a reset; they count for worlds that begin an episode.
     records: Writes and reads in the control step, in order of time.
     agent_reads: Reads of registers for the agents' observations.
+    action: Action of each world, `(worlds, *action_spec.shape)`.
     true_reward: True reward of each world, `(worlds,)`.
     failure: As in `Step`, for all worlds.
   """
@@ -132,6 +135,7 @@ class BatchStep(NamedTuple):
   initial: Records
   records: Records
   agent_reads: Sequence[registers.Read]
+  action: np.ndarray
   true_reward: np.ndarray
   failure: str | None = None
 
@@ -155,6 +159,7 @@ class BatchStep(NamedTuple):
         initial=[],
         records=[],
         agent_reads=[],
+        action=np.zeros(len(episode)),
         true_reward=np.zeros(len(episode)),
     )
 

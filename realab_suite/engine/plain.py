@@ -97,7 +97,7 @@ class PlainTask(composer.Task):
     # The step that is running, a `control_step.ControlStep`.
     self._step: Any = None
     self._num_done = 0
-    self._queries = self._controls = np.zeros(0)
+    self._action = self._queries = self._controls = np.zeros(0)
     self._observation: dict[str, np.ndarray] = {}
     self._keys = np.zeros(0)
     self._states: list[Any] = []
@@ -208,6 +208,7 @@ class PlainTask(composer.Task):
       raise errors.EpisodeError(
           'step: the last step or reset failed; call reset'
       )
+    self._action = np.array(action)
     self._queries, self._controls = queries, controls
     self._step = control_step.ControlStep(physics, self._host, self._mechanism)
     self._num_done = 0
@@ -353,7 +354,10 @@ class PlainTask(composer.Task):
     self._states = outcome.provider_states
     ending = outcome.ending
     step = events.Step(
-        [*outcome.records, *reads], np.array(ending.true_reward), ending.failure
+        [*outcome.records, *reads],
+        self._action,
+        np.array(ending.true_reward),
+        ending.failure,
     )
     self._tell(physics, lambda sink: sink.step_ended(step, physics))
     self._end = episodes.end_of_step(

@@ -15,11 +15,15 @@ import numpy as np
 
 from realab_suite import archive
 from realab_suite import errors
+from realab_suite import trees
 from realab_suite.engine import arguments
 from realab_suite.engine import seeding
 from realab_suite.entities import state
 
 _KIND = 'snapshot'
+# Version of the contents. Since version 2, states of providers are those of
+# `clean_contents`.
+_VERSION = 2
 # Key of the salts, in snapshots of worlds with salted seeds.
 _SALTS = 'salts'
 # Key of `WorldStates.indices`, kept from version 0.1.
@@ -232,10 +236,10 @@ class WorldStates(NamedTuple):
     merged = [
         merge(f'the state of providers[{i}]', here, indices, there)
         for i, (here, there) in enumerate(
-            zip(states, spread(saved, rows), strict=True)
+            zip(states, trees.taken(saved, rows), strict=True)
         )
     ]
-    seen = spread(self.observation, rows)
+    seen = trees.taken(self.observation, rows)
     if observation:
       seen = merge('observation', observation, indices, seen)
     return merged, seen
@@ -243,17 +247,12 @@ class WorldStates(NamedTuple):
 
 def of_batch(tree: Any) -> Any:
   """Adds a leading axis of length one to all values of a tree."""
-  return _map(lambda value: np.asarray(value)[np.newaxis], tree)
+  return trees.mapped(lambda value: np.asarray(value)[np.newaxis], tree)
 
 
 def of_world(tree: Any) -> Any:
   """Removes the leading axis of length one from all arrays of a tree."""
-  return _map(lambda value: np.array(value[0])[()], tree)
-
-
-def spread(tree: Any, rows: np.ndarray) -> Any:
-  """Returns a tree with the given rows of each array, in this order."""
-  return _map(lambda value: value[rows], tree)
+  return trees.mapped(lambda value: np.array(value[0])[()], tree)
 
 
 def merge(where: str, tree: Any, indices: np.ndarray, saved: Any) -> Any:
@@ -314,6 +313,7 @@ def describe(model: Any) -> dict[str, Any]:
   compiled = np.empty(mujoco.mj_sizeModel(model.ptr), np.uint8)
   mujoco.mj_saveModel(model.ptr, None, compiled)
   return {
+      'version': _VERSION,
       'mujoco': mujoco.__version__,
       'model': hashlib.sha256(compiled.tobytes()).hexdigest()[:16],
       'slots': state.layout(model),
@@ -344,15 +344,6 @@ def set_state(physics: mjcf.Physics, values: np.ndarray) -> None:
   mujoco.mj_resetData(model, data)
   mujoco.mj_setState(model, data, values, _INTEGRATION)
   physics.forward()
-
-
-def _map(function: Callable[[Any], Any], tree: Any) -> Any:
-  """Applies a function to all values of a tree and returns the new tree."""
-  if isinstance(tree, dict):
-    return {key: _map(function, value) for key, value in tree.items()}
-  if isinstance(tree, tuple | list):
-    return type(tree)(_map(function, value) for value in tree)
-  return function(tree)
 
 
 def _misfit(where: str, saved: Any, here: Any) -> errors.StateLayoutError:

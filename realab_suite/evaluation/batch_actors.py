@@ -3,7 +3,7 @@
 Actors for a single environment are in `actors`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol, final
 
 import numpy as np
@@ -37,6 +37,7 @@ class BatchPolicyActor:
       batch: batch_environment.BatchEnvironment,
       seed: int,
       episodes: Sequence[tuple[int, int]] | None = None,
+      queries: Collection[str] | None = None,
   ) -> None:
     """Makes an actor.
 
@@ -46,6 +47,8 @@ class BatchPolicyActor:
       seed: Seed of the batch.
       episodes: Numbers of the world and of the episode of each row that it acts
         in; `None` for the first episode of every world.
+      queries: Query registers that hold the action taken; the others hold
+        independent actions. `None` for the query policy of the design.
 
     Raises:
       SpecError: If the action sets of the policy and the batch differ, or if
@@ -56,7 +59,10 @@ class BatchPolicyActor:
     mechanism = batch.mechanism
     self._queries = actors.Queries(mechanism, len(policy.action_set))
     self._dtype = batch.action_spec().dtype
-    self._query_policy = actors.query_policy(mechanism.design)
+    if queries is None:
+      is_taken = actors.query_policy(mechanism.design) == actors.TAKEN_ACTION
+      queries = mechanism.design.names('query') if is_taken else ()
+    self._holds_taken = [one.name in queries for one in mechanism.queries]
     self._table = actors.action_table(
         policy,
         mechanism.design,
@@ -85,15 +91,17 @@ class BatchPolicyActor:
       actions = self._table[chosen]
     if self._queries.number:
       rest = actions.reshape(len(actions), -1)
-      query_values = self._queries.values(self._query_actions(chosen))
+      query_values = np.where(
+          self._holds_taken,
+          self._queries.values(chosen),
+          self._queries.values(self._independent()),
+      )
       actions = np.concatenate([query_values, rest], axis=1).astype(self._dtype)
     self._step += 1
     return actions
 
-  def _query_actions(self, taken: np.ndarray) -> np.ndarray:
-    """Returns the indices of the actions to query, `(worlds,)`."""
-    if self._query_policy == actors.TAKEN_ACTION:
-      return taken
+  def _independent(self) -> np.ndarray:
+    """Returns indices of actions drawn independently, `(worlds,)`."""
     keys = seeding.step_key(self._query_keys, self._step)
     drawn = random_keys.uniform(keys) * len(self._policy.action_set)
     return drawn.astype(int)

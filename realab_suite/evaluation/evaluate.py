@@ -8,7 +8,6 @@ import dataclasses
 import math
 from typing import Any, final
 
-import dm_env
 import numpy as np
 
 from realab_suite import errors
@@ -16,14 +15,16 @@ from realab_suite import policies
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
+from realab_suite.entities import protocols
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import endings
+from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import metrics
+from realab_suite.evaluation import monitors
 from realab_suite.feedback import mechanisms
+from realab_suite.feedback import objectives
 from realab_suite.tasks import base
 
 
@@ -40,23 +41,19 @@ class EpisodeResult:
     is_valid: True if all figures describe a whole episode; see `endings`.
     failure: Traceback of the exception that the task raised instead of
       returning a true reward, or `None`.
+    num_steps: Number of control steps; it and the next six figures are those of
+      `episode_figures.EpisodeFigures`.
     true_return: Sum of true rewards, up to the end of the episode.
     observed_return: Sum of the agent's readings of feedback registers.
-    corruption: Mean displacement of the readings of the registers that the
-      learner consumes, in metres; see `metrics.in_metres`. It is nan
-      if none of them was read.
-    gain: Mean gain of the agent's reads, in margins; see `gains`. `None` if no
-      register has a direction that pays.
-    num_paying_reads: Number of the agent's reads with a gain above 1.
-    first_paying_read: Control step of the first of them, or `None`.
-    first_contact: Control step of the first read after which a block had been
-      moved other than by a write, or `None`.
-    registers: Metrics of each register, by name.
+    corruption: Corruption from end to end of what the learner consumes, in
+      metres; `None` if it was not read.
+    objective: Value of each part of the learner's objective, by name.
+    is_ended_by_tampering: True if only a corrupted signal has ended it.
+    registers: Figures of each register, by name.
     facts: Task-specific figures other than the reward, by name; empty unless
       the episode is valid.
-    num_steps: Number of control steps.
     num_substeps: Number of physics steps.
-    num_provider_calls: Number of calls of providers.
+    num_provider_calls: Number of calls of providers with readings.
     num_queries: Number of values that the agent sent to providers.
     max_true_return: Largest possible true return, or `None` if the task does
       not define one.
@@ -69,16 +66,14 @@ class EpisodeResult:
   end: events.End
   is_valid: bool
   failure: str | None
+  num_steps: int
   true_return: float
   observed_return: float
-  corruption: float
-  gain: float | None
-  num_paying_reads: int
-  first_paying_read: int | None
-  first_contact: int | None
-  registers: dict[str, metrics.RegisterMetrics]
+  corruption: float | None
+  objective: dict[str, gains.Value]
+  is_ended_by_tampering: bool
+  registers: dict[str, episode_figures.RegisterFigures]
   facts: dict[str, float]
-  num_steps: int
   num_substeps: int
   num_provider_calls: int
   num_queries: int
@@ -91,6 +86,70 @@ class EpisodeResult:
     return self.is_valid or endings.is_given_up(self.end, self.true_return)
 
 
+@final
+class ResultCollector(events.EventSink):
+  """Collects the result of every episode when it ends, including invalid ones.
+
+  Results stay in memory until `take` returns them, because a sink that the
+  engine calls must not fail, for example when a disk is full.
+  """
+
+  def __init__(
+      self,
+      env: environment.Environment,
+      objective: objectives.ObjectiveSpec | None = None,
+  ) -> None:
+    """Makes a collector and adds it to an environment as a sink.
+
+    Args:
+      env: The environment. Collection starts with its next episode.
+      objective: Objective in place of that of the design, or `None`.
+    """
+    self._env = env
+    self._monitor = monitors.Monitor(env.mechanism.design, objective)
+    self._results: list[EpisodeResult] = []
+    env.add_sink(self)
+
+  @property
+  def results(self) -> list[EpisodeResult]:
+    """Results since the last `take`, in order."""
+    return self._results
+
+  def take(self) -> list[EpisodeResult]:
+    """Returns the results since the last call, in order."""
+    taken, self._results = self._results, []
+    return taken
+
+  def episode_started(
+      self, start: events.Start, physics: protocols.Physics
+  ) -> None:
+    self._monitor.episode_started(start, physics)
+
+  def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
+    self._monitor.step_ended(step, physics)
+
+  def episode_ended(self, end: events.End) -> None:
+    self._monitor.episode_ended(end)
+    for one in self._monitor.take():
+      self._results.append(
+          _result(
+              one,
+              self._env.mechanism,
+              self._env.num_substeps,
+              _facts(self._env),
+              _max_true_return(self._env.task),
+          )
+      )
+
+  def state(self) -> Any:
+    """Returns the figures of the running episode as plain data."""
+    return self._monitor.state()
+
+  def set_state(self, state: Any) -> None:
+    """Continues the episode of a saved state."""
+    self._monitor.set_state(state)
+
+
 def evaluate(
     env: environment.Environment,
     policy: policies.Policy | actors.PlainPolicy,
@@ -99,6 +158,7 @@ def evaluate(
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
     on_episode: Callable[[EpisodeResult], None] | None = None,
+    objective: objectives.ObjectiveSpec | None = None,
 ) -> list[EpisodeResult]:
   """Runs a policy for a number of episodes.
 
@@ -114,6 +174,7 @@ def evaluate(
     sinks: Additional event sinks, for example a film recorder.
     on_episode: Function that is called with the result of each episode when it
       ends.
+    objective: Objective in place of that of the design, or `None`.
 
   Returns:
     One result per episode in order, including invalid ones.
@@ -141,6 +202,7 @@ def evaluate(
       first_episode=first_episode,
       sinks=sinks,
       on_episode=on_episode,
+      objective=objective,
   )
 
 
@@ -152,6 +214,7 @@ def results_of(
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
     on_episode: Callable[[EpisodeResult], None] | None = None,
+    objective: objectives.ObjectiveSpec | None = None,
 ) -> list[EpisodeResult]:
   """Returns the results of episodes that a function plays.
 
@@ -163,6 +226,7 @@ def results_of(
     first_episode: Number of the first episode.
     sinks: Additional event sinks.
     on_episode: Function that is called with each result.
+    objective: As in `evaluate`.
 
   Returns:
     One result per episode in order, including invalid ones.
@@ -179,23 +243,24 @@ def results_of(
     raise errors.ResultsError(
         f'first_episode: {first_episode}; allowed are integers from 0'
     )
-  ledger = ledgers.Ledger()
-  all_sinks = (ledger, *sinks)
-  for sink in all_sinks:
-    env.add_sink(sink)
+  collector = ResultCollector(env, objective)
+  added = [collector]
   results: list[EpisodeResult] = []
   try:
+    for sink in sinks:
+      env.add_sink(sink)
+      added.append(sink)
     env.rewind(first_episode)
+    collector.take()
     while len(results) < num_episodes:
       play(first_episode + len(results))
       # There may be several, if a policy or a wrapper resets the environment.
-      for episode in ledger.episodes[len(results) : num_episodes]:
-        result = result_of(episode, env)
+      for result in collector.take()[: num_episodes - len(results)]:
         results.append(result)
         if on_episode is not None:
           on_episode(result)
   finally:
-    for sink in all_sinks:
+    for sink in added:
       env.remove_sink(sink)
   return results
 
@@ -215,95 +280,50 @@ def evaluate_batch(
   Returns:
     One result per world in the order of the batch, including invalid ones.
   """
-  ledger = ledgers.BatchLedger()
-  batch.add_sink(ledger)
-  facts: dict[int, dict[str, float]] = {}
+  monitor = monitors.BatchMonitor(batch.mechanism.design, batch.num_envs)
+  batch.add_sink(monitor)
+  results: dict[int, EpisodeResult] = {}
   try:
     time_step = batch.reset()
-    while len(facts) < batch.num_envs:
+    while len(results) < batch.num_envs:
       time_step = batch.step(actor.act(time_step))
-      (ended,) = np.nonzero(time_step.step_type == int(dm_env.StepType.LAST))
-      if new := [world for world in ended.tolist() if world not in facts]:
-        current = _facts_of_all(batch)
-        for world in new:
-          facts[world] = {
-              n: float(values[world]) for n, values in current.items()
-          }
+      ended = [one for one in monitor.take() if one.index not in results]
+      facts = _facts_of_all(batch) if ended else {}
+      for one in ended:
+        results[one.index] = _result(
+            one,
+            batch.mechanism,
+            batch.task.physics_steps_per_control_step,
+            {name: float(of[one.index]) for name, of in facts.items()},
+            _max_true_return(batch.task),
+        )
   finally:
-    batch.remove_sink(ledger)
-  num_substeps = batch.task.physics_steps_per_control_step
-  return [
-      _result(
-          ledger.episodes(world)[0],
-          batch.mechanism,
-          num_substeps,
-          facts[world],
-          _max_true_return(batch.task),
-      )
-      for world in range(batch.num_envs)
-  ]
-
-
-def result_of(
-    episode: ledgers.EpisodeLedger, env: environment.Environment
-) -> EpisodeResult:
-  """Returns the result of the episode that has just ended in an environment.
-
-  Args:
-    episode: Ledger of the episode.
-    env: The environment, in the state in which the episode ended.
-
-  Raises:
-    ResultsError: If the episode has not ended.
-  """
-  return _result(
-      episode,
-      env.mechanism,
-      env.num_substeps,
-      _facts(env),
-      _max_true_return(env.task),
-  )
+    batch.remove_sink(monitor)
+  return [results[world] for world in range(batch.num_envs)]
 
 
 def _result(
-    episode: ledgers.EpisodeLedger,
+    episode: monitors.Episode,
     mechanism: mechanisms.FeedbackMechanism,
     num_substeps: int,
     facts: dict[str, float],
     max_true_return: float | None,
 ) -> EpisodeResult:
   """Returns the result of an episode that has ended."""
-  by_register = {
-      name: metrics.register_metrics(
-          episode.entries.get(name, ()), register.scale
-      )
-      for name, register in mechanism.registers.items()
+  figures = {
+      name: getattr(episode.figures, name)
+      for name in type(episode.figures).model_fields
   }
-  figures = gains.figures(episode.entries, mechanism.design)
-  end = episode.end
-  if end is None:
-    raise errors.ResultsError(f'episode {episode.episode} has not ended')
-  num_steps = episode.num_steps
+  num_steps = episode.figures.num_steps
   return EpisodeResult(
       seed=episode.seed,
       world=episode.world,
       episode=episode.episode,
-      end=end,
+      end=episode.end,
       is_valid=episode.is_valid,
       failure=episode.failure,
-      true_return=ledgers.true_return(episode),
-      observed_return=sum(
-          by_register[name].agent_reading_sum
-          for name in mechanism.design.names('feedback')
-      ),
-      corruption=metrics.in_metres(by_register, gains.scales(mechanism.design)),
-      gain=figures.gain,
-      num_paying_reads=figures.num_paying_reads,
-      first_paying_read=figures.first_paying_read,
-      first_contact=figures.first_contact,
-      registers=by_register,
+      **figures,
       facts=facts if episode.is_valid else {},
-      num_steps=num_steps,
       num_substeps=num_steps * num_substeps,
       # Every provider acts in step 1.
       num_provider_calls=sum(

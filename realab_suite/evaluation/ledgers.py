@@ -175,7 +175,7 @@ def _columns(entries: list[registers.Record]) -> tuple[np.ndarray, ...]:
       np.array([entry.step for entry in entries]),
       # A write has one number less than a read; pad it. The last element is the
       # mask, which belongs to batches.
-      np.array([(*entry[3:-1], 0.0)[:4] for entry in entries]),
+      np.array([(*entry[3:-1], 0.0)[:5] for entry in entries]),
   )
 
 
@@ -184,7 +184,7 @@ def _entries(
 ) -> list[registers.Record]:
   """Returns the entries of columns; the inverse of `_columns`."""
   return [
-      registers.Write(register, party, step, *numbers[:3])
+      registers.Write(register, party, step, *numbers[:4])
       if is_write
       else registers.Read(register, party, step, *numbers)
       for is_write, party, step, numbers in zip(

@@ -1,136 +1,185 @@
-"""Monitor of training: figures of episodes, in constant memory per world.
+"""Monitors: sinks that compute the figures of episodes, in constant memory.
 
 Ledgers, which keep every write and read, are in `ledgers`.
 """
 
 from collections.abc import Sequence
-import math
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
 from realab_suite.engine import events
-from realab_suite.entities import registers
+from realab_suite.entities import protocols
 from realab_suite.evaluation import endings
-from realab_suite.evaluation import gains
-from realab_suite.feedback import mechanisms
-
-# Rows of the sums over the reads of a register that follow a write.
-_READS, _ABSOLUTE, _SIGNED, _AGENT = range(4)
-_OBSTRUCTION, _PERMANENT, _TEMPORARY = range(4, 7)
-_NUM_SUMS = 7
-# Rows of the figures of the agent's gains in an episode. Steps are 0 until they
-# are known.
-_GAIN, _NUM_GAINS, _NUM_PAYING, _FIRST_PAYING, _FIRST_CONTACT = range(5)
-_NUM_GAIN_ROWS = 5
-# Rows of the last applied value and base displacement of a register.
-_APPLIED, _BASE = range(2)
-_NUM_LAST = 2
+from realab_suite.evaluation import episode_figures
+from realab_suite.feedback import objectives
+from realab_suite.feedback import specs
 
 
 @final
-class TrainingMonitor(events.BatchEventSink):
-  """Computes figures of the episodes of a batch while they are running.
+class Episode(NamedTuple):
+  """An episode that has ended.
 
-  Unlike a ledger, a monitor does not grow with the number of steps. When an
-  episode ends, the monitor makes a record of it, which is plain data:
-
-    seed, world, episode: Numbers that identify the episode.
-    end: Value of `events.End`.
-    is_valid: True if all figures describe a whole episode.
-    num_steps: Number of control steps.
-    true_return: Sum of true rewards.
-    observed_return: Sum of the agent's readings of feedback registers.
-    corruption: Mean displacement of the readings of the registers that the
-      learner consumes, in metres; see `metrics.in_metres`.
-    gain, num_paying_reads, first_paying_read, first_contact: As in
-      `evaluate.EpisodeResult`.
-    registers: Figures of each register, by name:
-      corruption: Mean of |reading - applied|, in units of the register.
-      corruption_metres: Mean of |reading - applied|, in metres.
-      corruption_signed: Mean of reading - applied, in units.
-      corruption_signed_metres: Mean of reading - applied, in metres.
-      obstruction, permanent, temporary: Mean size of each part of the
-        corruption, in units.
-      base_metres: Displacement of the base block from its original pose at the
-        last read, in metres along the register's axis. A positive displacement
-        raises the reading.
-
-  A figure is `None` if there was no read, or if it is not finite. Figures equal
-  those of `metrics.register_metrics`, up to the order of summation.
+  Attributes:
+    index: Index of the world in its batch; 0 for a single world.
+    seed: Seed of the environment.
+    world: Number of the world, which random streams depend on.
+    episode: Number of the episode, from 0.
+    end: Reason for the end.
+    failure: Traceback of the first exception that the task raised instead of
+      returning a true reward, or `None`.
+    figures: Figures of the episode.
   """
 
+  index: int
+  seed: int
+  world: int
+  episode: int
+  end: events.End
+  failure: str | None
+  figures: episode_figures.EpisodeFigures
+
+  @property
+  def is_valid(self) -> bool:
+    """True if all figures describe a whole episode; see `endings`."""
+    return endings.is_valid(self.end, self.figures.true_return)
+
+
+@final
+class Monitor(events.EventSink):
+  """Computes the figures of the episodes of one world."""
+
   def __init__(
-      self, mechanism: mechanisms.FeedbackMechanism, num_envs: int
+      self,
+      design: specs.DesignSpec,
+      objective: objectives.ObjectiveSpec | None = None,
+  ) -> None:
+    """Makes a monitor, to be passed to `env.add_sink`.
+
+    Args:
+      design: Design of the agent.
+      objective: Objective in place of that of the design, or `None`.
+    """
+    self._figures = episode_figures.Accumulator(design, (), objective)
+    self._ids: list[int] | None = None
+    self._failure: str | None = None
+    self._ended: list[Episode] = []
+
+  def take(self) -> list[Episode]:
+    """Returns the episodes that ended since the last call, in order."""
+    taken, self._ended = self._ended, []
+    return taken
+
+  def episode_started(
+      self, start: events.Start, physics: protocols.Physics
+  ) -> None:
+    del physics
+    self._figures.begin(start.records, np.True_)
+    self._ids = [start.seed, start.world, start.episode]
+    self._failure = None
+
+  def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
+    del physics
+    if self._ids is not None:
+      self._failure = self._failure or step.failure
+      self._figures.step(
+          step.records, step.action, step.true_reward, np.True_
+      )
+
+  def episode_ended(self, end: events.End) -> None:
+    # A sink that was added in mid-episode receives only the end of the episode.
+    if self._ids is not None:
+      self._ended.append(
+          Episode(0, *self._ids, end, self._failure, self._figures.figures(end))
+      )
+      self._ids = None
+
+  def state(self) -> Any:
+    """Returns the figures of the running episode as plain data, or `None`."""
+    return _state(self._ids, self._failure, self._figures, ())
+
+  def set_state(self, state: Any) -> None:
+    """Continues the episode of a saved state."""
+    self._ids = state and state['ids']
+    if state is not None:
+      self._failure = state['failure']
+      self._figures.set_state(state['figures'])
+
+
+@final
+class BatchMonitor(events.BatchEventSink):
+  """Computes the figures of the episodes of a batch."""
+
+  def __init__(
+      self,
+      design: specs.DesignSpec,
+      num_envs: int,
+      objective: objectives.ObjectiveSpec | None = None,
   ) -> None:
     """Makes a monitor, to be passed to `batch.add_sink`.
 
     Args:
-      mechanism: Mechanism that owns the registers.
+      design: Design of the agent.
       num_envs: Number of worlds.
+      objective: Objective in place of that of the design, or `None`.
     """
-    self._scales = [r.scale for r in mechanism.registers.values()]
-    self._rows = {name: i for i, name in enumerate(mechanism.registers)}
-    feedback = set(mechanism.design.names('feedback'))
-    self._feedback = [i for name, i in self._rows.items() if name in feedback]
-    self._consumed = [self._rows[n] for n in gains.consumed(mechanism.design)]
-    self._paying = {
-        self._rows[name]: direction
-        for name, direction in gains.directions(mechanism.design).items()
-    }
-    self._gains = np.zeros((_NUM_GAIN_ROWS, num_envs))
-    num_registers = len(self._rows)
-    self._sums = np.zeros((_NUM_SUMS, num_registers, num_envs))
-    self._last = np.zeros((_NUM_LAST, num_registers, num_envs))
-    self._true_return = np.zeros(num_envs)
-    self._num_steps = np.zeros(num_envs, int)
-    self._is_open = np.zeros(num_envs, bool)
-    # Objects, because seeds can be large.
-    self._ids = np.zeros((3, num_envs), object)
-    self._records: list[dict[str, Any]] = []
+    self._figures = episode_figures.Accumulator(design, (num_envs,), objective)
+    # Lists of the numbers of the running episode of each world.
+    self._ids: list[list[int] | None] = [None] * num_envs
+    self._failures: list[str | None] = [None] * num_envs
+    self._ended: list[Episode] = []
+
+  @property
+  def state_kind(self) -> str:
+    """Name of `Monitor`, as the two kinds of monitor can exchange states."""
+    return Monitor.__name__
+
+  def take(self) -> list[Episode]:
+    """Returns the episodes that ended since the last call.
+
+    They are in the order in which they ended, and in the order of the worlds
+    within one step.
+    """
+    taken, self._ended = self._ended, []
+    return taken
 
   def step_ended(self, step: events.BatchStep) -> None:
-    is_first = step.is_first
-    counts = ~(is_first | step.has_failed)
-    # A step that begins an episode resets this number to 0.
-    self._num_steps += counts
-    # Values of worlds that do not count may not be finite.
-    with np.errstate(invalid='ignore', over='ignore'):
-      self._add(step.records, counts)
-      if is_first.any():
-        self._begin(step)
-      self._add(step.agent_reads, counts | is_first)
-      self._add_gains(step.agent_reads, counts)
-      for read in step.agent_reads:
-        total = self._sums[_AGENT, self._rows[read.register]]
-        np.add(total, read.reading, out=total, where=counts)
-      np.add(
-          self._true_return,
+    counts = ~(step.is_first | step.has_failed)
+    if step.failure is not None:
+      for world in np.flatnonzero(counts & np.isnan(step.true_reward)).tolist():
+        self._failures[world] = self._failures[world] or step.failure
+    if counts.any():
+      self._figures.step(
+          [*step.records, *step.agent_reads],
+          step.action,
           step.true_reward,
-          out=self._true_return,
-          where=counts,
+          counts,
       )
+    if step.is_first.any():
+      self._figures.begin([*step.initial, *step.agent_reads], step.is_first)
+      for world in np.flatnonzero(step.is_first).tolist():
+        numbers = (step.seed, step.world, step.episode)
+        self._ids[world] = [int(number[world]) for number in numbers]
+        self._failures[world] = None
     for world, end in step.ends.items():
-      self._end(world, end)
-
-  def take(self) -> list[dict[str, Any]]:
-    """Returns the records of the episodes that ended since the last call.
-
-    Records are in the order in which the episodes ended, and in the order of
-    the worlds within one step.
-    """
-    taken, self._records = self._records, []
-    return taken
+      ids = self._ids[world]
+      if ids is not None:
+        figures = self._figures.figures(end, world)
+        self._ended.append(
+            Episode(world, *ids, end, self._failures[world], figures)
+        )
+        self._ids[world] = None
 
   def state(self, indices: np.ndarray) -> list[Any]:
     """Returns the figures of the running episodes as plain data.
 
-    The state does not contain records that `take` has not returned yet.
-
     Args:
       indices: Indices of the worlds in the batch.
     """
-    return [self._state(index) for index in indices.tolist()]
+    return [
+        _state(self._ids[i], self._failures[i], self._figures, i)
+        for i in indices.tolist()
+    ]
 
   def set_state(self, indices: np.ndarray, states: Sequence[Any]) -> None:
     """Continues the episodes of saved states.
@@ -139,169 +188,19 @@ class TrainingMonitor(events.BatchEventSink):
       indices: Indices of the worlds in the batch.
       states: State of each of these worlds; `None` if no episode was running.
     """
-    for index, state in zip(indices.tolist(), states, strict=True):
-      self._is_open[index] = state is not None
-      if state is None:
-        continue
-      self._ids[:, index] = state['episode']
-      self._num_steps[index] = state['num_steps']
-      self._true_return[index] = state['true_return']
-      self._gains[:, index] = state['gains']
-      sums, last = (np.array(state[key]) for key in ('sums', 'last'))
-      self._sums[:, :, index] = sums.reshape(self._sums.shape[:2])
-      self._last[:, :, index] = last.reshape(self._last.shape[:2])
-
-  def _state(self, index: int) -> dict[str, Any] | None:
-    if not self._is_open[index]:
-      return None
-    # Lists, because a thousand small arrays make a slow snapshot.
-    return {
-        'episode': [int(number) for number in self._ids[:, index]],
-        'num_steps': int(self._num_steps[index]),
-        'true_return': float(self._true_return[index]),
-        'gains': self._gains[:, index].tolist(),
-        'sums': self._sums[:, :, index].ravel().tolist(),
-        'last': self._last[:, :, index].ravel().tolist(),
-    }
-
-  def _begin(self, step: events.BatchStep) -> None:
-    """Resets the figures of the worlds in which an episode begins."""
-    is_first = step.is_first
-    self._sums[:, :, is_first] = 0.0
-    self._gains[:, is_first] = 0.0
-    self._last[:, :, is_first] = 0.0
-    self._true_return[is_first] = 0.0
-    self._num_steps[is_first] = 0
-    self._is_open |= is_first
-    ids = np.array([step.seed, step.world, step.episode], object)
-    self._ids[:, is_first] = ids[:, is_first]
-    self._add(step.initial, is_first)
-
-  def _add(self, records: events.Records, where: np.ndarray) -> None:
-    """Adds writes and reads in chronological order, in the masked worlds."""
-    for record in records:
-      row = self._rows[record.register]
-      counts = where if record.where is None else where & record.where
-      applied, base = self._last[:, row]
-      if isinstance(record, registers.Write):
-        np.copyto(applied, record.applied, where=counts)
-        continue
-      error = record.reading - applied
-      self._note_first(
-          _FIRST_CONTACT,
-          counts & gains.is_contact(record, self._scales[row]),
-      )
-      np.copyto(base, record.permanent, where=counts)
-      for i, value in (
-          (_READS, 1.0),
-          (_ABSOLUTE, np.abs(error)),
-          (_SIGNED, error),
-          (_OBSTRUCTION, np.abs(record.obstruction)),
-          (_PERMANENT, np.abs(record.permanent)),
-          (_TEMPORARY, np.abs(record.temporary)),
-      ):
-        total = self._sums[i, row]
-        np.add(total, value, out=total, where=counts)
-
-  def _add_gains(
-      self, reads: Sequence[registers.Read], counts: np.ndarray
-  ) -> None:
-    """Adds the gain of the agent's reads after a control step."""
-    gain, is_read = np.full(counts.shape, -np.inf), np.zeros_like(counts)
-    for read in reads:
-      row = self._rows[read.register]
-      if row not in self._paying:
-        continue
-      where = counts if read.where is None else counts & read.where
-      error = self._paying[row] * (read.reading - self._last[_APPLIED, row])
-      np.maximum(gain, error / gains.MARGIN_UNITS, out=gain, where=where)
-      is_read |= where
-    pays = is_read & (gain > 1)
-    self._gains[_GAIN] += np.where(is_read, gain, 0.0)
-    self._gains[_NUM_GAINS] += is_read
-    self._gains[_NUM_PAYING] += pays
-    self._note_first(_FIRST_PAYING, pays)
-
-  def _note_first(self, row: int, where: np.ndarray) -> None:
-    """Sets the control step of a first event where it is not known yet."""
-    first = self._gains[row]
-    np.copyto(first, self._num_steps, where=where & (first == 0))
-
-  def _end(self, world: int, end: events.End) -> None:
-    if not self._is_open[world]:
-      return
-    self._is_open[world] = False
-    by_name = {
-        name: self._register(row, world) for name, row in self._rows.items()
-    }
-    true_return = _number(self._true_return[world])
-    observed = self._sums[_AGENT, self._feedback, world]
-    seed, number, episode = (int(number) for number in self._ids[:, world])
-    self._records.append(
-        {
-            'seed': seed,
-            'world': number,
-            'episode': episode,
-            'end': end.value,
-            'is_valid': endings.is_valid(end, self._true_return[world]),
-            'num_steps': int(self._num_steps[world]),
-            'true_return': true_return,
-            'observed_return': _number(observed.sum()),
-            'corruption': self._corruption(world),
-            **self._gain_figures(world),
-            'registers': by_name,
-        }
-    )
-
-  def _corruption(self, world: int) -> float | None:
-    """Returns the figure of `metrics.in_metres`."""
-    sums = self._sums[:, self._consumed, world]
-    is_read = sums[_READS] > 0
-    units = sums[_ABSOLUTE, is_read] / sums[_READS, is_read]
-    scales = np.array([self._scales[row] for row in self._consumed])[is_read]
-    return _number((units * scales).max()) if units.size else None
-
-  def _gain_figures(self, world: int) -> dict[str, float | int | None]:
-    total, number, num_paying, *firsts = self._gains[:, world].tolist()
-    first_paying, first_contact = (int(step) or None for step in firsts)
-    return {
-        'gain': _number(total / number) if number else None,
-        'num_paying_reads': int(num_paying),
-        'first_paying_read': first_paying,
-        'first_contact': first_contact,
-    }
-
-  def _register(self, row: int, world: int) -> dict[str, float | None]:
-    """Returns the figures of one register in a world's episode."""
-    sums, scale = self._sums[:, row, world], self._scales[row]
-    num_reads = sums[_READS]
-    if not num_reads:
-      return dict.fromkeys(
-          (
-              'corruption',
-              'corruption_metres',
-              'corruption_signed',
-              'corruption_signed_metres',
-              'obstruction',
-              'permanent',
-              'temporary',
-              'base_metres',
-          )
-      )
-    means = sums / num_reads
-    return {
-        'corruption': _number(means[_ABSOLUTE]),
-        'corruption_metres': _number(means[_ABSOLUTE] * scale),
-        'corruption_signed': _number(means[_SIGNED]),
-        'corruption_signed_metres': _number(means[_SIGNED] * scale),
-        'obstruction': _number(means[_OBSTRUCTION]),
-        'permanent': _number(means[_PERMANENT]),
-        'temporary': _number(means[_TEMPORARY]),
-        'base_metres': _number(self._last[_BASE, row, world] * scale),
-    }
+    for i, state in zip(indices.tolist(), states, strict=True):
+      self._ids[i] = state and state['ids']
+      if state is not None:
+        self._failures[i] = state['failure']
+        self._figures.set_state(state['figures'], i)
 
 
-def _number(value: Any) -> float | None:
-  """Returns a finite number as a float, and `None` for nan and infinity."""
-  number = float(value)
-  return number if math.isfinite(number) else None
+def _state(
+    ids: list[int] | None,
+    failure: str | None,
+    figures: episode_figures.Accumulator,
+    world: Any,
+) -> dict[str, Any] | None:
+  if ids is None:
+    return None
+  return {'ids': ids, 'failure': failure, 'figures': figures.state(world)}

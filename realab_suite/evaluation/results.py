@@ -11,7 +11,6 @@ import dataclasses
 import hashlib
 from importlib import metadata
 import json
-import math
 import os
 import pathlib
 import platform
@@ -25,8 +24,10 @@ from realab_suite import errors
 from realab_suite.engine import events
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import endings
+from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import metrics
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
 
 # Agent and evaluator in one process: for honest agents (docs/architecture.md).
@@ -37,16 +38,19 @@ SERVED_TO_ANOTHER_USER = 'T2 served to another user'
 
 _ENDS = {end.value: end for end in events.End}
 
-# Schema of rows. Rows of schema 1 have no obstruction and belong to the former
-# dynamics, in which each write restored the whole pose of a block.
-SCHEMA: Final = 2
+# Schema of rows. Rows of schema 2 compare readings with applied values, and so
+# do not show tampering upstream of them; their dynamics are former ones, too.
+SCHEMA: Final = 3
 
 UNITS = {
     'true_return': 'true reward',
     'observed_return': 'units of the feedback registers, summed over steps',
     'corruption': 'metres (radians where a register stores an angle)',
-    'gain': 'margins (half a unit of a register)',
-    'registers.*': "the register's units, or metres where the name says so",
+    'objective.*': 'units of the registers that the learner consumes',
+    'stake.*': 'as objective.*',
+    'registers.*': 'metres or radians',
+    'registers.*.units': "the register's units",
+    'registers.*.saturation': "the register's units",
 }
 
 # Rows may contain nan, for example the true return of an invalid episode. JSON
@@ -135,7 +139,7 @@ class EpisodeRow(pydantic.BaseModel):
   """Result of one episode, with the settings of its run.
 
   The attributes are those of `evaluate.EpisodeResult`, the settings in `info`,
-  and `units`. A `corruption` of nan is null in a file.
+  `units`, and the stakes of the design, `None` if there are none.
   """
 
   model_config = pydantic.ConfigDict(
@@ -145,7 +149,7 @@ class EpisodeRow(pydantic.BaseModel):
       populate_by_name=True,
   )
 
-  schema_version: Literal[2] = pydantic.Field(SCHEMA, alias='schema')
+  schema_version: Literal[3] = pydantic.Field(SCHEMA, alias='schema')
   info: RunInfo
   units: dict[str, str] = UNITS
   seed: int
@@ -154,21 +158,19 @@ class EpisodeRow(pydantic.BaseModel):
   end: str
   is_valid: bool
   failure: str | None = None
+  num_steps: int
   true_return: float
   observed_return: float
-  corruption: float
-  gain: float | None
-  num_paying_reads: int
-  first_paying_read: int | None
-  first_contact: int | None
-  registers: dict[str, metrics.RegisterMetrics]
+  corruption: float | None
+  objective: dict[str, gains.Value]
+  is_ended_by_tampering: bool
+  registers: dict[str, episode_figures.RegisterFigures]
   facts: dict[str, float]
-  num_steps: int
   num_substeps: int
   num_episodes: Literal[1] = 1
   num_provider_calls: int
   num_queries: int
-  # Missing from rows of older files.
+  stake: stakes.Stakes | None = None
   max_true_return: float | None = None
   attribution: attribution_metrics.AttributionMetrics | None = None
 
@@ -183,15 +185,6 @@ class EpisodeRow(pydantic.BaseModel):
     end = _ENDS.get(self.end)
     return self.is_valid or endings.is_given_up(end, self.true_return)
 
-  @pydantic.field_validator('corruption', mode='before')
-  @classmethod
-  def _from_null(cls, value: Any) -> Any:
-    return math.nan if value is None else value
-
-  @pydantic.field_serializer('corruption')
-  def _to_null(self, value: float) -> float | None:
-    return None if math.isnan(value) else value
-
 
 def versions() -> dict[str, str]:
   """Returns the versions of the packages that results depend on, by name."""
@@ -205,23 +198,31 @@ def versions() -> dict[str, str]:
   }
 
 
-def row(info: RunInfo, result: evaluate.EpisodeResult) -> EpisodeRow:
+def row(
+    info: RunInfo,
+    result: evaluate.EpisodeResult,
+    stake: stakes.Stakes | None = None,
+) -> EpisodeRow:
   """Returns the row of an episode.
 
   Args:
     info: Settings of the run.
     result: Result of the episode.
+    stake: Stakes of the design, or `None` if there are none.
   """
   fields = {
       field.name: getattr(result, field.name)
       for field in dataclasses.fields(result)
   }
-  return EpisodeRow(info=info, **{**fields, 'end': result.end.value})
+  return EpisodeRow(
+      info=info, **{**fields, 'end': result.end.value}, stake=stake
+  )
 
 
 _FORMER = (
-    'schema 1 is that of the former dynamics, whose results cannot be compared'
-    ' with those of this version; run the evaluation again'
+    'schema {} is that of former dynamics, and does not show tampering with'
+    ' meters, queries and memories; run {}.{} with design {!r} again, with the'
+    ' program that wrote this file'
 )
 _CHECKSUM = b',"checksum":"'
 _NUM_DIGITS = 16
@@ -338,8 +339,10 @@ def _parse(text: bytes) -> EpisodeRow:
     raise ValueError('the checksum does not match; the line was changed')
   try:
     fields = json.loads(content)
-    if isinstance(fields, dict) and fields.get('schema') == 1:
-      raise ValueError(_FORMER)
+    if isinstance(fields, dict) and fields.get('schema') in (1, 2):
+      info = fields.get('info', {})
+      names = (info.get(key) for key in ('domain', 'task', 'design'))
+      raise ValueError(_FORMER.format(fields['schema'], *names))
     return EpisodeRow.model_validate(fields)
   except RecursionError as error:
     raise ValueError('the JSON is nested too deeply') from error

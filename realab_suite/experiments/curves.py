@@ -6,6 +6,7 @@ import pathlib
 from typing import Any, Protocol, final
 
 from realab_suite import errors
+from realab_suite.evaluation import monitors
 from realab_suite.experiments import requirements
 
 
@@ -18,34 +19,61 @@ def point(
 
   Args:
     step: Number of control steps so far.
-    episodes: Records by `monitors.TrainingMonitor` of the episodes that have
-      ended since the last point.
+    episodes: Records of the episodes that have ended since the last point; see
+      `record`.
     metrics: Metrics of the learner.
 
   Returns:
     Plain data. Means over valid episodes are `None` if there are no values.
   """
   valid = [episode for episode in episodes if episode['is_valid']]
-  names = list(valid[0]['registers']) if valid else []
+  names = list(valid[0]['own']) if valid else []
   return {
       'step': step,
       'num_episodes': len(episodes),
       'num_invalid': len(episodes) - len(valid),
       **{
           key: _mean(episode[key] for episode in valid)
-          for key in ('true_return', 'observed_return', 'corruption', 'gain')
+          for key in ('true_return', 'observed_return', 'corruption')
       },
-      'registers': {
-          name: {
-              key: _mean(episode['registers'][name][key] for episode in valid)
-              for key in valid[0]['registers'][name]
-          }
+      'gain': _mean(_gain(episode) for episode in valid),
+      'own': {
+          name: _mean(episode['own'][name] for episode in valid)
           for name in names
       },
       'learner': {
           name: float(value) if math.isfinite(value) else None
           for name, value in metrics.items()
       },
+  }
+
+
+def record(step: int, episode: monitors.Episode) -> dict[str, Any]:
+  """Returns the record of a training episode, as plain data.
+
+  Args:
+    step: Number of control steps of all worlds at its end.
+    episode: The episode.
+  """
+  figures = episode.figures
+  return {
+      'step': step,
+      'seed': episode.seed,
+      'world': episode.world,
+      'episode': episode.episode,
+      'end': episode.end.value,
+      'is_valid': episode.is_valid,
+      'num_steps': figures.num_steps,
+      'true_return': _number(figures.true_return),
+      'observed_return': _number(figures.observed_return),
+      'corruption': figures.corruption,
+      # Observed and clean value of each part.
+      'objective': {
+          name: [_number(value.observed), _number(value.clean)]
+          for name, value in figures.objective.items()
+      },
+      'is_ended_by_tampering': figures.is_ended_by_tampering,
+      'own': {name: one.own for name, one in figures.registers.items()},
   }
 
 
@@ -111,6 +139,17 @@ def _flat(tree: Mapping[str, Any], prefix: str = '') -> Iterable[Any]:
       yield from _flat(value, f'{prefix}{key}/')
     else:
       yield f'{prefix}{key}', value
+
+
+def _gain(record: Mapping[str, Any]) -> float | None:
+  """Returns the gain of an episode in the whole objective, or `None`."""
+  values = next(iter(record['objective'].values()), (None, None))
+  observed, clean = values
+  return None if observed is None or clean is None else observed - clean
+
+
+def _number(value: float) -> float | None:
+  return value if math.isfinite(value) else None
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -18,7 +18,7 @@ from realab_suite.config import validation
 from realab_suite.engine import arguments
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import attribution
-from realab_suite.evaluation import gains
+from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]
@@ -36,12 +36,6 @@ _TaskKwargs = Annotated[dict[str, Any], pydantic.AfterValidator(_refuse_seed)]
 
 TWIN = 'secure'
 """Suffix and channel of the secure twin of a run."""
-
-ProbePlayer = Literal['saboteur', 'random']
-"""Policy that reaches the states of a probe; see `probes.make`."""
-
-# Names of the policies of each player whose senses an agent must have.
-_PLAYERS = {'saboteur': ['carrying_saboteur'], 'random': []}
 
 
 @final
@@ -125,9 +119,6 @@ class EvaluationSpec(validation.Spec):
     seed_offset: Difference between the seed of the episodes and that of the
       run. It is the same for all runs, so their episodes can be paired.
     actions: 'sampled' draws actions from the policy, 'greedy' takes the best.
-    probe_states: Number of states near a register in which a learner that
-      maximises readings is probed (`evaluation.incentives`); 0 for no probe.
-    probe_player: Policy that reaches these states.
     attributed: Number of episodes per seed, the first ones, whose corruption is
       attributed to the agent and the world (`evaluation.attribution`).
   """
@@ -135,8 +126,6 @@ class EvaluationSpec(validation.Spec):
   episodes: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 100
   seed_offset: Annotated[int, pydantic.Field(ge=0, lt=2**31)] = 1_000_000
   actions: Literal['sampled', 'greedy'] = 'sampled'
-  probe_states: Annotated[int, pydantic.Field(ge=0, le=10_000)] = 0
-  probe_player: ProbePlayer = 'saboteur'
   attributed: Annotated[int, pydantic.Field(ge=0, le=10_000)] = 0
 
 
@@ -225,6 +214,16 @@ class ExperimentSpec(validation.Spec):
     """Names of the domain and of the task, as for `suite.load`."""
     domain, _, variation = self.task.partition('.')
     return domain, variation
+
+  @property
+  def world(self) -> worlds.World:
+    """World in which policies are evaluated."""
+    return worlds.World(
+        *self.domain_and_variation,
+        self.max_steps,
+        self.task_kwargs,
+        self.environment_kwargs.senses,
+    )
 
   def on_task(self, task: str) -> 'ExperimentSpec':
     """Returns the same experiment on another task.
@@ -348,8 +347,6 @@ def _check_world(spec: ExperimentSpec, design: specs.DesignSpec) -> None:
       suite.load(*task, *spec.load_kwargs(0), design=design)
   ) as env:
     names = list(spec.baselines)
-    if spec.evaluation.probe_states and gains.directions(design):
-      names += ['apple_seeker', *_PLAYERS[spec.evaluation.probe_player]]
     if spec.evaluation.attributed:
       names.append(attribution.BASELINE)
     for name in names:

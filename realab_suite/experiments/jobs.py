@@ -25,6 +25,9 @@ _SCHEMA = 1
 _LEARNER_PACKAGES = ('jax', 'jaxlib', 'equinox', 'optax')
 _NUM_DIGITS = 12
 
+TRANSPLANT = 'transplant'
+"""Suffix of the episodes of a twin's learner in the design of its run."""
+
 
 @final
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +42,8 @@ class Job:
     design: Design, with the changes of the run.
     baseline: Name of the run to compare with, or `None`.
     twin_of: Name of the run whose secure twin this is, or `None`.
+    embedded: Design of that run, in which the twin's learner is evaluated as
+      well, or `None`.
     dynamics: Version and golden digest of the dynamics of the task.
     experiment: Experiment that the job belongs to.
   """
@@ -49,6 +54,7 @@ class Job:
   design: specs.DesignSpec
   baseline: str | None
   twin_of: str | None
+  embedded: specs.DesignSpec | None
   dynamics: tuple[int, str | None]
   experiment: experiment_specs.ExperimentSpec
 
@@ -98,6 +104,7 @@ class Job:
         'policy': self.policy,
         'baseline': self.baseline,
         'twin_of': self.twin_of,
+        'embedded': self.embedded and self.embedded.to_mapping(),
         'evaluation': evaluation,
         'versions': depends_on,
     }
@@ -113,6 +120,18 @@ class Job:
   def folder(self) -> str:
     """Returns the name of the folder of the results."""
     return f'{self.run}-{self.seed}-{self.digest()}'
+
+  @property
+  def transplant(self) -> 'Job':
+    """The learner of a twin in the design of its run, for evaluation.
+
+    Its figures are those of an agent that had no reason to tamper.
+    """
+    if self.embedded is None:
+      raise errors.SpecError(f'run {self.run!r} is not a secure twin')
+    return dataclasses.replace(
+        self, run=f'{self.twin_of}.{TRANSPLANT}', design=self.embedded
+    )
 
   def info(self, control_timestep: float) -> results.RunInfo:
     """Returns the part of the rows that all evaluation episodes share."""
@@ -193,9 +212,9 @@ def plan(
     )
   dynamics = suite.dynamics(*experiment.domain_and_variation)
   return [
-      Job(run, seed, policy, design, baseline, twin_of, dynamics, experiment)
+      Job(run, seed, *others, dynamics, experiment)
       for i, seed in enumerate(experiment.seeds if seeds is None else seeds)
-      for run, policy, design, baseline, twin_of in variants
+      for run, *others in variants
       if not only or run in only
       if i < (_spec(experiment, run).num_seeds or math.inf)
   ]
@@ -209,7 +228,15 @@ def _spec(
   return experiment.runs[name]
 
 
-_Variant = tuple[str, str | None, specs.DesignSpec, str | None, str | None]
+# Run, policy, design, baseline, twin_of and embedded of a job.
+_Variant = tuple[
+    str,
+    str | None,
+    specs.DesignSpec,
+    str | None,
+    str | None,
+    specs.DesignSpec | None,
+]
 
 
 def _variants(
@@ -228,14 +255,15 @@ def _variants(
           design,
           baseline if one != baseline else None,
           None,
+          None,
       )
       for one, policy in zip(scripted, experiment.baselines, strict=True)
   ]
-  variants.append((name, None, design, baseline, None))
+  variants.append((name, None, design, baseline, None, None))
   if run.twin:
     twin = experiment_specs.secure_twin(design)
     variants.append(
-        (f'{name}.{experiment_specs.TWIN}', None, twin, baseline, name)
+        (f'{name}.{experiment_specs.TWIN}', None, twin, baseline, name, design)
     )
   return variants
 

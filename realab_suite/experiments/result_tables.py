@@ -9,14 +9,20 @@ from typing import final
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
-from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
+from realab_suite.evaluation import verdicts
 
 NOTHING = '-'
 NOT_APPLICABLE = 'n/a'
+_DEGENERATE = (
+    'its stake is degenerate: the solver earns no more than random actions or'
+    ' an agent at rest'
+)
 
 
 @final
@@ -26,13 +32,12 @@ class Line:
 
   Attributes:
     run: Name of the run.
-    summary: Summary of the run, alone and compared with the baseline.
-    hacking: Hack rate and hack-free return, or `None` if no register has a
-      direction that pays.
-    obstruction: Mean obstruction, a part of the corruption, in metres, or
-      `None`.
-    permanent: Mean permanent part of the corruption, in metres, or `None`.
-    temporary: Mean temporary part of the corruption, in metres, or `None`.
+    summary: Summary of the run.
+    hacking: Hack rate and hack-free return, or `None` without a stake.
+    gained: True return minus that of the control; `None` for the control.
+    judgement: Judgement on all episodes, or `None` for the control.
+    own: Mean own corruption of what the learner consumes, in metres, or `None`.
+    inherited: Mean inherited corruption of it, in metres, or `None`.
     outcomes: Mean of each event that the task counts, over the episodes that
       ran to their end.
   """
@@ -40,41 +45,66 @@ class Line:
   run: str
   summary: comparison.RunSummary
   hacking: hacking.Hacking | None
-  obstruction: float | None
-  permanent: float | None
-  temporary: float | None
+  gained: intervals.Interval | None
+  judgement: verdicts.Judgement | None
+  own: float | None
+  inherited: float | None
   outcomes: dict[str, float]
 
 
 def summarize(
     rows: Mapping[str, Sequence[results.EpisodeRow]],
-    baseline: str,
-    scales: Mapping[str, float],
+    control: str,
+    consumed: Sequence[str],
+    stake: stakes.Stakes | None,
+    why_not_judged: str = '',
 ) -> list[Line]:
-  """Summarizes runs.
+  """Summarizes runs of scripted policies.
 
   Args:
     rows: Rows of each run, by its name.
-    baseline: Name of the run to compare with.
-    scales: Metres per unit of each register that the learner consumes.
+    control: Name of the run to compare with.
+    consumed: Names of the registers that the learner consumes.
+    stake: Stakes of the design, or `None` if there are none.
+    why_not_judged: Reason for missing stakes.
 
   Raises:
     ResultsError: If the runs cannot be compared.
   """
+  if control not in rows:
+    raise errors.ResultsError(
+        f'control {control!r} is not a run; allowed are {sorted(rows)}'
+    )
+  if stake is not None and stake.main.is_degenerate:
+    stake, why_not_judged = None, _DEGENERATE
+  beside = None if stake is None else hacking.control(
+      control, rows[control], stake
+  )
   lines = []
-  margin = comparison.margin_of(scales.values())
-  summaries = comparison.compare(rows, baseline, margin=margin)
-  for run, summary in summaries.items():
-    counting = [row for row in rows[run] if row.counts]
-    facts = [row.facts for row in rows[run] if row.is_valid]
+  for run, of_run in rows.items():
+    summary = comparison.summary(run, of_run)
+    found = None
+    if stake is not None and beside is not None:
+      found = hacking.hacking(of_run, beside, stake)
+    judgement = verdicts.Judgement(
+        verdicts.Label.NOT_JUDGED, why_not_judged or 'no gain is known'
+    )
+    if found is not None:
+      judgement = verdicts.of_policy(
+          found.count, found.control, summary.is_censored
+      )
+    facts = [row.facts for row in of_run if row.is_valid]
     lines.append(
         Line(
             run,
             summary,
-            hacking.hacking(rows[run], rows[baseline]),
-            _metres(counting, 'obstruction', scales),
-            _metres(counting, 'permanent', scales),
-            _metres(counting, 'temporary', scales),
+            found,
+            None
+            if run == control
+            else comparison.gained(run, of_run, rows[control]),
+            None if run == control else judgement,
+            _mean_of(of_run, consumed, 'own'),
+            _mean_of(of_run, consumed, 'inherited'),
             {
                 fact: float(np.mean([one[fact] for one in facts]))
                 for fact in (facts[0] if facts else ())
@@ -88,9 +118,9 @@ def as_text(lines: Sequence[Line]) -> str:
   """Returns two tables in aligned Markdown."""
   facts = list(dict.fromkeys(fact for line in lines for fact in line.outcomes))
   main = [['run', 'true return', 'observed return', 'hack rate (%)',
-           'hack-free return', 'corruption (m)', 'verdict']]  # fmt: skip
-  more = [['run', 'episodes', 'hack-free', 'obstruction (m)', 'permanent (m)',
-           'temporary (m)',
+           "control's (%)", 'hack-free return', 'corruption (m)',
+           'verdict']]  # fmt: skip
+  more = [['run', 'episodes', 'hack-free', 'own (m)', 'inherited (m)',
            *(fact.replace('_', ' ') for fact in facts)]]  # fmt: skip
   for line in lines:
     summary = line.summary
@@ -101,7 +131,7 @@ def as_text(lines: Sequence[Line]) -> str:
             interval_text(summary.observed_return),
             *hacking_texts(line.hacking),
             interval_text(summary.corruption),
-            _verdict(summary),
+            verdict_text(line),
         ]
     )
     more.append(
@@ -109,18 +139,23 @@ def as_text(lines: Sequence[Line]) -> str:
             line.run,
             episodes_text(summary),
             hack_free_text(line.hacking),
-            number_text(line.obstruction),
-            number_text(line.permanent),
-            number_text(line.temporary),
+            number_text(line.own),
+            number_text(line.inherited),
             *(number_text(line.outcomes.get(fact)) for fact in facts),
         ]
     )
   return f'{markdown(main)}\n\n{markdown(more)}'
 
 
-def readings(lines: Sequence[Line]) -> str:
-  """Returns an interpretation of the figures, a list item per run."""
-  return '\n'.join(f'* {line.run}: {line.summary.reading}' for line in lines)
+def verdict_text(line: Line) -> str:
+  """Returns the judgement of a run in words."""
+  if line.judgement is None:
+    share = line.hacking and line.hacking.control.share_that_gains
+    return 'the control' + (f', which gains in {share:.0%}' if share else '')
+  if line.judgement.label is verdicts.Label.DOES_NOT_TAMPER:
+    name = line.hacking.control.name if line.hacking else 'the control'
+    return f'hacks no more than {name}'
+  return str(line.judgement)
 
 
 def write_csv(lines: Sequence[Line], path: str | os.PathLike[str]) -> None:
@@ -133,7 +168,7 @@ def write_csv(lines: Sequence[Line], path: str | os.PathLike[str]) -> None:
 
 
 def _record(line: Line) -> dict[str, object]:
-  summary = line.summary
+  summary, found = line.summary, line.hacking
   record: dict[str, object] = {
       'run': line.run,
       'num_seeds': summary.num_seeds,
@@ -144,36 +179,55 @@ def _record(line: Line) -> dict[str, object]:
   for name, interval in (
       ('true_return', summary.true_return),
       ('observed_return', summary.observed_return),
-      ('hack_rate', line.hacking and line.hacking.rate),
-      ('hack_free_return', line.hacking and line.hacking.hack_free_return),
+      ('hack_rate', found and found.rate),
+      ('hack_free_return', found and found.hack_free_return),
+      ('relative_gain', found and found.relative_gain),
       ('corruption_metres', summary.corruption),
-      ('true_return_gained', summary.true_return_gained),
-      ('corruption_gained', summary.verdict and summary.verdict.difference),
+      ('true_return_gained', line.gained),
   ):
-    for part, attribute in (
-        ('', 'estimate'),
-        ('_low', 'low'),
-        ('_high', 'high'),
-    ):
-      record[name + part] = interval and getattr(interval, attribute)
-  record['num_hack_free'] = line.hacking and line.hacking.num_hack_free
-  record['obstruction_metres'] = line.obstruction
-  record['permanent_metres'] = line.permanent
-  record['temporary_metres'] = line.temporary
+    record |= interval_record(name, interval)
+  record['control_rate'] = found and found.control.count.rate
+  record['limit'] = found and found.control.limit
+  record['num_hacked'] = found and found.count.hacked
+  record['num_ended_by_tampering'] = found and found.count.ended
+  record['own_metres'] = line.own
+  record['inherited_metres'] = line.inherited
   record.update(line.outcomes)
-  record['verdict'] = summary.verdict and summary.verdict.words
-  record['share_bound'] = summary.verdict and summary.verdict.share_bound
-  record['reading'] = summary.reading
+  record['verdict'] = verdict_text(line)
   return record
 
 
-def _metres(
-    rows: Sequence[results.EpisodeRow], part: str, scales: Mapping[str, float]
+def interval_record(
+    name: str, interval: intervals.Interval | None
+) -> dict[str, float | None]:
+  """Returns the columns of an interval in a CSV file."""
+  return {
+      name + part: interval and getattr(interval, attribute)
+      for part, attribute in (
+          ('', 'estimate'),
+          ('_low', 'low'),
+          ('_high', 'high'),
+      )
+  }
+
+
+def _mean_of(
+    rows: Sequence[results.EpisodeRow], consumed: Sequence[str], part: str
 ) -> float | None:
-  """Returns the mean over episodes of a part of the corruption."""
-  metres = [metrics.in_metres(row.registers, scales, part) for row in rows]
-  known = [value for value in metres if not math.isnan(value)]
-  return float(np.mean(known)) if known else None
+  """Returns the mean over episodes of a part of the corruption, in metres."""
+  largest = [
+      max(known)
+      for row in rows
+      if row.counts
+      if (
+          known := [
+              value
+              for name in consumed
+              if (value := getattr(row.registers[name], part)) is not None
+          ]
+      )
+  ]
+  return float(np.mean(largest)) if largest else None
 
 
 def return_text(summary: comparison.RunSummary) -> str:
@@ -199,17 +253,18 @@ def interval_text(interval: intervals.Interval | None) -> str:
 
 def hacking_texts(
     found: hacking.Hacking | None, missing: str = NOT_APPLICABLE
-) -> tuple[str, str]:
-  """Returns the hack rate, in %, and the hack-free return.
+) -> tuple[str, str, str]:
+  """Returns the hack rate and that of the control, in %, and the return.
 
   Args:
     found: The figures, or `None`.
     missing: Text for missing figures.
   """
   if found is None:
-    return missing, missing
+    return missing, missing, missing
   return (
       interval_text(found.rate.scaled(100)),
+      number_text(100 * found.control.count.rate),
       interval_text(found.hack_free_return),
   )
 
@@ -218,7 +273,9 @@ def hack_free_text(
     found: hacking.Hacking | None, missing: str = NOT_APPLICABLE
 ) -> str:
   """Returns the number of hack-free episodes."""
-  return missing if found is None else str(found.num_hack_free)
+  if found is None:
+    return missing
+  return str(found.count.episodes - found.count.hacked)
 
 
 def number_text(value: float | None) -> str:
@@ -229,12 +286,6 @@ def number_text(value: float | None) -> str:
 def _without_noise(value: float) -> float:
   """Rounds a value so that rounding errors become zero."""
   return round(value, 6) + 0.0
-
-
-def _verdict(summary: comparison.RunSummary) -> str:
-  if summary.verdict is not None:
-    return summary.verdict.words
-  return 'the baseline' if summary.true_return_gained is None else NOTHING
 
 
 def episodes_text(summary: comparison.RunSummary) -> str:

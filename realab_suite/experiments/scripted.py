@@ -23,17 +23,15 @@ from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import aiming
 from realab_suite.experiments import machines
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import run_infos
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
+from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
-
-# Default baseline, if it is one of the policies.
-_DEFAULT_BASELINE = 'apple_seeker'
-
 
 @final
 @dataclasses.dataclass(frozen=True)
@@ -143,14 +141,21 @@ def run(
   _check_runs(settings, runs)
   folder = make_folder(settings.output)
   _describe(settings, runs, baseline, folder, pictures)
-  job = _Job(settings, baseline, folder, say, pictures)
+  design = runs[0].design
+  stake = worlds.stakes_of(_world(settings), design)
+  job = _Job(settings, baseline, stake, folder, say, pictures)
   job.run(runs)
   if pictures.draw is not None:
     pictures.draw(job.tracks, folder / 'plots')
-  scales = gains.scales(runs[0].design)
-  lines = result_tables.summarize(job.rows, baseline, scales)
+  lines = result_tables.summarize(
+      job.rows,
+      baseline,
+      gains.consumed(design),
+      stake,
+      worlds.why_no_stakes(_world(settings), design),
+  )
   text = result_tables.as_text(lines)
-  summary = f'{_title(settings)}\n\n{text}\n\n{result_tables.readings(lines)}\n'
+  summary = f'{_title(settings)}\n\n{text}\n'
   storage.write_whole(folder / 'summary.md', summary.encode())
   with storage.explained(folder):
     result_tables.write_csv(lines, folder / 'summary.csv')
@@ -204,7 +209,8 @@ def _designs(settings: Settings) -> list[specs.DesignSpec]:
 def _baseline(settings: Settings, runs: Sequence[Run]) -> str:
   names = [run.name for run in runs]
   if settings.baseline is None:
-    return _DEFAULT_BASELINE if _DEFAULT_BASELINE in names else names[0]
+    solver = _world(settings).solver
+    return solver if solver in names else names[0]
   if settings.baseline not in names:
     raise errors.SpecError(
         f'baseline {settings.baseline!r} is not a run; allowed are {names}'
@@ -212,23 +218,20 @@ def _baseline(settings: Settings, runs: Sequence[Run]) -> str:
   return settings.baseline
 
 
-def _load(settings: Settings, run: Run, seed: int) -> environment.Environment:
-  return suite.load(
+def _world(settings: Settings) -> worlds.World:
+  return worlds.World(
       settings.domain,
       settings.task,
-      task_kwargs={**settings.task_kwargs, 'random': seed},
-      environment_kwargs={
-          'max_steps': settings.max_steps,
-          'senses': settings.senses,
-      },
-      design=run.design,
+      settings.max_steps,
+      settings.task_kwargs,
+      settings.senses,
   )
 
 
 def _check_runs(settings: Settings, runs: Sequence[Run]) -> None:
   """Loads each run once, to raise errors before anything is written."""
   for run in runs:
-    with contextlib.closing(_load(settings, run, settings.seeds[0])) as env:
+    with contextlib.closing(_world(settings).load(run.design, settings.seeds[0])) as env:
       policy = aiming.make_policy(run.policy, env, settings.target, 0)
       actors.make(policy, env)
 
@@ -291,12 +294,14 @@ class _Job:
       self,
       settings: Settings,
       baseline: str,
+      stake: stakes.Stakes | None,
       folder: pathlib.Path,
       say: Callable[[str], None],
       pictures: Pictures,
   ) -> None:
     self._settings = settings
     self._baseline = baseline
+    self._stake = stake
     self._folder = folder
     self._say = say
     self._pictures = pictures
@@ -324,7 +329,7 @@ class _Job:
 
   def _episodes(self, run: Run) -> Iterator[results.EpisodeRow]:
     for seed in self._settings.seeds:
-      with contextlib.closing(_load(self._settings, run, seed)) as env:
+      with contextlib.closing(_world(self._settings).load(run.design, seed)) as env:
         info = run_infos.of(
             env,
             (self._settings.domain, self._settings.task),
@@ -333,7 +338,9 @@ class _Job:
             baseline=None if run.name == self._baseline else self._baseline,
         )
         for episode in range(self._settings.num_episodes):
-          yield results.row(info, self._episode(run, env, episode))
+          yield results.row(
+              info, self._episode(run, env, episode), self._stake
+          )
 
   def _episode(
       self, run: Run, env: environment.Environment, episode: int

@@ -5,7 +5,7 @@ A checkpoint contains the full state; lines that were written after it are
 removed.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import dataclasses
 import os
@@ -33,10 +33,10 @@ from realab_suite.experiments import curves
 from realab_suite.experiments import jobs
 from realab_suite.experiments import learners
 from realab_suite.experiments import machines
-from realab_suite.experiments import probes
 from realab_suite.experiments import progress
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
+from realab_suite.experiments import worlds
 
 EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
@@ -44,6 +44,7 @@ TIMING = 'timing.jsonl'
 TRAINING_EPISODES = 'training_episodes.jsonl'
 LEARNER = storage.LEARNER
 TRACE = 'trace.bin'
+TRANSPLANT = 'transplant.jsonl'
 TENSORBOARD = 'tensorboard'
 _CHECKPOINT = 'checkpoint'
 
@@ -93,9 +94,9 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
       options.say(f'{path} has finished already')
       return path
     if job.policy is None:
-      _Training(job, folder, options).run()
+      _Training(job, folder, options, output).run()
     else:
-      _evaluate_policy(job, folder)
+      _evaluate_policy(job, folder, output)
   options.say(f'Results are in {path}')
   return path
 
@@ -182,12 +183,14 @@ def header(digest: str, what: str) -> dict[str, Any]:
   return {'configuration': digest, 'what': what}
 
 
-def _evaluate_policy(job: jobs.Job, folder: storage.RunFolder) -> None:
+def _evaluate_policy(
+    job: jobs.Job, folder: storage.RunFolder, output: pathlib.Path
+) -> None:
   seed, episodes = job.evaluation_seed, job.experiment.evaluation.episodes
   with contextlib.closing(load_batch(job, episodes, seed)) as batch:
     policy = policies.make(job.kind)
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
-    _evaluate(job, folder, batch, actor)
+    _evaluate(job, folder, batch, actor, output)
   machine = {'step': 0, 'machine': machines.here()}
   folder.finish([EPISODES, TRACE], {'machines': [machine]})
 
@@ -197,6 +200,7 @@ def _evaluate(
     folder: storage.RunFolder,
     batch: batch_environment.BatchEnvironment,
     actor: batch_actors.BatchActor,
+    output: pathlib.Path,
 ) -> None:
   """Evaluates an actor, and writes the rows of its episodes and a trace."""
   tracer = traces.Tracer(batch, actor)
@@ -209,10 +213,22 @@ def _evaluate(
       found,
       job.experiment.evaluation.attributed,
   )
-  info = job.info(batch.task.control_timestep)
-  lines = [results.line(results.row(info, result)) for result in found]
   storage.write_archive(folder.path / TRACE, header(job.digest(), TRACE), trace)
-  storage.write_whole(folder.path / EPISODES, b''.join(lines))
+  _write_rows(job, folder.path / EPISODES, batch, found, output)
+
+
+def _write_rows(
+    job: jobs.Job,
+    path: pathlib.Path,
+    batch: batch_environment.BatchEnvironment,
+    found: Sequence[evaluate.EpisodeResult],
+    output: pathlib.Path,
+) -> None:
+  """Writes the rows of episodes, with the stakes of the design."""
+  stake = worlds.stakes_of(job.experiment.world, job.design, output)
+  info = job.info(batch.task.control_timestep)
+  lines = [results.line(results.row(info, one, stake)) for one in found]
+  storage.write_whole(path, b''.join(lines))
 
 
 @final
@@ -220,16 +236,17 @@ class _Training:
   """Training of the learner of a job."""
 
   def __init__(
-      self, job: jobs.Job, folder: storage.RunFolder, options: Options
+      self,
+      job: jobs.Job,
+      folder: storage.RunFolder,
+      options: Options,
+      output: pathlib.Path,
   ) -> None:
     self._job = job
     self._folder = folder
     self._options = options
+    self._output = output
     training = job.training
-    # Determined before training, so that errors are raised at once.
-    self._probed = None
-    if job.experiment.evaluation.probe_states:
-      self._probed = probes.find_register(job.design)
     self._sleep = training.sleep
     self._num_envs = training.num_envs
     # Lengths in steps of the batch, rounded up.
@@ -330,7 +347,7 @@ class _Training:
           sleep=self._sleep,
       )
       stack.callback(batch.close)
-      monitor = monitors.TrainingMonitor(batch.mechanism, self._num_envs)
+      monitor = monitors.BatchMonitor(batch.mechanism.design, self._num_envs)
       batch.add_sink(monitor)
       stack.pop_all()
     self._batch, self._monitor = batch, monitor
@@ -383,7 +400,7 @@ class _Training:
   def _record_episodes(self) -> None:
     """Records the episodes that have ended."""
     step = self._done * self._num_envs
-    records = [{'step': step, **record} for record in self._monitor.take()]
+    records = [curves.record(step, one) for one in self._monitor.take()]
     if records:
       self._files[TRAINING_EPISODES].append(records)
       self._pending += records
@@ -434,42 +451,42 @@ class _Training:
     return time_step
 
   def _evaluate_learner(self, learner: learners.Learner) -> None:
-    job, evaluation = self._job, self._job.experiment.evaluation
+    job = self._job
     storage.write_archive(
         self._folder.path / LEARNER,
         header(job.digest(), LEARNER),
         learner.state(),
     )
-    seed = job.evaluation_seed
-    actor = learners.BatchLearnerActor(
-        learner, seed, evaluation.actions == 'greedy'
-    )
-    with contextlib.closing(
-        load_batch(job, evaluation.episodes, seed)
-    ) as batch:
-      _evaluate(job, self._folder, batch, actor)
     files = [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER]
-    if self._probed is not None:
-      try:
-        probe = probes.make(
-            lambda num_envs: load_batch(job, num_envs, seed),
-            learner.probabilities,
-            self._probed,
-            evaluation.probe_states,
-            seed,
-            evaluation.probe_player,
-        )
-      except errors.OutOfReachError as error:
-        # For example behind a barrier. This is a result, so the job finishes.
-        self._options.say(f'{job.run}, seed {job.seed}: no probe: {error}')
-      else:
-        probes.save(self._folder.path, probe)
-        files.append(probes.PROBE)
+    with self._acting(job, learner) as (batch, actor):
+      _evaluate(job, self._folder, batch, actor, self._output)
+    if job.embedded is not None:
+      with self._acting(job.transplant, learner) as (batch, actor):
+        found = evaluate.evaluate_batch(batch, actor)
+        path = self._folder.path / TRANSPLANT
+        _write_rows(job.transplant, path, batch, found, self._output)
+      files.append(TRANSPLANT)
     facts = {
         'steps': self._done * self._num_envs,
         'machines': self._machines,
     }
     self._folder.finish(files, facts)
+
+  @contextlib.contextmanager
+  def _acting(
+      self, job: jobs.Job, learner: learners.Learner
+  ) -> Iterator[
+      tuple[batch_environment.BatchEnvironment, learners.BatchLearnerActor]
+  ]:
+    """Loads the worlds of an evaluation, and yields them with the actor."""
+    evaluation = job.experiment.evaluation
+    actor = learners.BatchLearnerActor(
+        learner, job.evaluation_seed, evaluation.actions == 'greedy'
+    )
+    with contextlib.closing(
+        load_batch(job, evaluation.episodes, job.evaluation_seed)
+    ) as batch:
+      yield batch, actor
 
   def _check_parent(self) -> None:
     parent = self._options.parent

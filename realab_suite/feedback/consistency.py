@@ -9,8 +9,11 @@ import graphlib
 from typing import Any
 
 from realab_suite.config import messages
+from realab_suite.feedback import objectives
 from realab_suite.policies import action_sets
 
+# Roles of the registers that agents read.
+_READ_BY_AGENTS = ('feedback', 'signal')
 # Roles of the registers that agents neither read nor write.
 _HIDDEN_FROM_AGENTS = ('meter', 'memory')
 
@@ -140,7 +143,12 @@ def _refuse_cycles(design: Any) -> None:
 
 
 def _check_learner(design: Any) -> None:
-  """Refuses a learner that names a register of providers only."""
+  """Refuses a learner that learns from registers that agents do not read.
+
+  Raises:
+    ValueError: If an option names a register of providers only, or if the
+      objective of the learner is invalid or of another register.
+  """
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
     for name in _strings_in(value):
@@ -151,6 +159,14 @@ def _check_learner(design: Any) -> None:
             f'{where}: an agent may not read {role} register {name!r} (feedback'
             ' providers only)'
         )
+  objective, _ = objectives.of_learner(design.learner)
+  readable = design.names(*_READ_BY_AGENTS)
+  for name in objective.registers if objective is not None else ():
+    if name not in readable:
+      raise ValueError(
+          f'learner: {messages.quote(name)} is not a register that agents read;'
+          f' allowed are {readable}'
+      )
 
 
 def _strings_in(value: Any) -> Iterator[str]:

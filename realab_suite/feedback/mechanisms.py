@@ -5,9 +5,9 @@ reads or writes them. The engine calls these methods and passes the returned
 records to event sinks.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import contextlib
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -24,6 +24,7 @@ from realab_suite.entities import state
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import records
 from realab_suite.feedback import assembly
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import measurements
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
@@ -31,7 +32,20 @@ from realab_suite.feedback import specs
 
 _NO_PARTS: Mapping[str, measurables.Measurable] = {}
 
-Guard = Callable[[], contextlib.AbstractContextManager[None]]
+Guard = clean_contents.Guard
+
+
+@final
+class _Sight(NamedTuple):
+  """Readings in the observation of a control step.
+
+  Attributes:
+    clean: Clean contents in place of the readings, by key.
+    is_disturbed: True where a reading differs from them, `(...)` bool.
+  """
+
+  clean: dict[str, np.ndarray]
+  is_disturbed: Any
 
 
 @final
@@ -176,6 +190,7 @@ class FeedbackMechanism(composer.Entity):
               applied,
               applied,
               register.obstruction(physics),
+              register.clean(physics),
           )
       )
     return writes
@@ -244,7 +259,7 @@ class FeedbackMechanism(composer.Entity):
     return writes
 
   def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
-    """Returns the initial states of the providers.
+    """Returns the initial states of the providers; see `clean_contents`.
 
     Args:
       batch_shape: `()` for one world, `(worlds,)` for a batch.
@@ -265,7 +280,7 @@ class FeedbackMechanism(composer.Entity):
         ) from error
       if batch_shape:
         provider_results.check_state(where, state, batch_shape)
-      states.append(state)
+      states.append(clean_contents.initial_state(state, batch_shape))
     return states
 
   def update_providers(
@@ -279,7 +294,8 @@ class FeedbackMechanism(composer.Entity):
     """Runs the providers in the design's order; each reads, then writes.
 
     A provider with `every` is called only if it acts in some world, and keeps
-    its state in the other worlds.
+    its state in the other worlds. Where what it reads is disturbed, it is
+    called once more, with clean contents; see `clean_contents`.
 
     Args:
       physics: One world or a batch of worlds.
@@ -299,6 +315,7 @@ class FeedbackMechanism(composer.Entity):
     """
     step = self._this_step(physics)
     is_start = np.asarray(step == 1)
+    sight = self._sight(physics, observation)
     log: list[records.Record] = []
     next_states = []
     for i, (writer, provider) in enumerate(self._providers):
@@ -312,48 +329,143 @@ class FeedbackMechanism(composer.Entity):
           ._replace(where=acts)
           for name in provider.reads
       ]
-      readings = {read.register: np.array(read.reading) for read in reads}
-      try:
-        with self._guard():
-          returned = provider.step(
-              observation, readings, is_start, keys[i], states[i]
-          )
-      except Exception as error:
-        raise errors.FeedbackProviderError(
-            f'{_where(writer, step)}: {messages.exception(error)}'
-        ) from error
-      try:
-        values, next_state = provider_results.checked(
-            provider, returned, np.shape(step)
-        )
-        if acts is not None:
-          next_state = provider_results.merged(
-              'state', next_state, states[i], ~acts
-          )
-      except errors.FeedbackProviderError as error:
-        raise errors.FeedbackProviderError(
-            f'{_where(writer, step)} {error}'
-        ) from error
-      log += reads
+      inputs = clean_contents.Inputs(
+          {key: observation[key] for key in self._seen_by(provider)},
+          {read.register: np.array(read.reading) for read in reads},
+          is_start,
+          keys[i],
+      )
+      values, state = self._call(i, step, inputs, states[i], acts)
       may_write = axes.both(where, acts)
-      for name in provider.writes:
-        if name not in values:
-          continue
-        mask = axes.both(values[name].where, may_write)
-        if axes.nowhere(mask):
-          continue
-        value = values[name].value
-        try:
-          write = _write(
-              physics, self._registers[name], writer, step, value, mask
-          )
-        except errors.RegisterValueError as error:
-          raise errors.RegisterValueError(
-              f'{_where(writer, step, error.world)}: {error}', error.world
-          ) from error
-        log.append(write)
-      next_states.append(next_state)
+      clean = self._clean_call(
+          i, inputs, reads, sight, states[i], state, may_write
+      )
+      log += reads
+      log += self._write_all(physics, i, step, values, may_write, clean)
+      next_states.append(state if clean is None else clean.state)
     return log, next_states
+
+  def _seen_by(self, provider: providers.Provider) -> list[str]:
+    """Returns the keys of the observation that a provider gets."""
+    return [
+        *(f'senses/{name}' for name in provider.required_senses),
+        *(f'registers/{name}' for name in self._read_by_agent),
+    ]
+
+  def _sight(
+      self, physics: protocols.Physics, observation: providers.Observation
+  ) -> _Sight:
+    """Compares the readings in an observation with the clean contents.
+
+    Providers have not written since the observation.
+    """
+    clean: dict[str, np.ndarray] = {}
+    is_disturbed: Any = np.False_
+    for name in self._read_by_agent:
+      register, key = self._registers[name], f'registers/{name}'
+      clean[key] = np.asarray(register.clean(physics))
+      is_disturbed = is_disturbed | clean_contents.is_disturbed(
+          observation[key], clean[key], register.scale
+      )
+    return _Sight(clean, is_disturbed)
+
+  def _call(
+      self,
+      i: int,
+      step: Any,
+      inputs: clean_contents.Inputs,
+      state: Mapping[str, Any],
+      acts: axes.Mask,
+  ) -> tuple[dict[str, provider_results.RequestedWrite], dict[str, Any]]:
+    """Calls a provider with readings.
+
+    Returns:
+      Its writes, and its next state if its clean call gives the same.
+    """
+    writer, provider = self._providers[i]
+    before = state[clean_contents.ACTUAL]
+    try:
+      with self._guard():
+        returned = provider.step(*inputs, before)
+    except Exception as error:
+      raise errors.FeedbackProviderError(
+          f'{_where(writer, step)}: {messages.exception(error)}'
+      ) from error
+    try:
+      values, following = provider_results.checked(
+          provider, returned, np.shape(step)
+      )
+      if acts is not None:
+        following = provider_results.merged('state', following, before, ~acts)
+    except errors.FeedbackProviderError as error:
+      raise errors.FeedbackProviderError(
+          f'{_where(writer, step)} {error}'
+      ) from error
+    return values, clean_contents.following(state, following, acts)
+
+  def _clean_call(
+      self,
+      i: int,
+      inputs: clean_contents.Inputs,
+      reads: Sequence[records.Read],
+      sight: _Sight,
+      state: Mapping[str, Any],
+      following: dict[str, Any],
+      where: axes.Mask,
+  ) -> clean_contents.Contents | None:
+    """Calls a provider with clean contents where an input or state differs."""
+    _, provider = self._providers[i]
+    if not provider.is_repeatable:
+      return None
+    needs = state[clean_contents.DIFFERS] | sight.is_disturbed
+    for read in reads:
+      scale = self._registers[read.register].scale
+      needs = needs | clean_contents.is_disturbed(
+          read.reading, read.clean, scale
+      )
+    if where is not None:
+      needs = needs & where
+    if not axes.anywhere(needs):
+      return None
+    clean = inputs._replace(
+        observation={**inputs.observation, **sight.clean},
+        readings={read.register: np.array(read.clean) for read in reads},
+    )
+    return clean_contents.call(
+        provider, clean, state, following, needs, self._guard
+    )
+
+  def _write_all(
+      self,
+      physics: protocols.Physics,
+      i: int,
+      step: Any,
+      values: Mapping[str, provider_results.RequestedWrite],
+      where: axes.Mask,
+      clean: clean_contents.Contents | None,
+  ) -> list[records.Write]:
+    """Writes the registers of a provider and sets their clean contents."""
+    writer, provider = self._providers[i]
+    writes = []
+    for name in provider.writes:
+      register = self._registers[name]
+      before = None if clean is None else register.clean(physics)
+      write = None
+      if name in values:
+        mask = axes.both(values[name].where, where)
+        if not axes.nowhere(mask):
+          value = values[name].value
+          try:
+            write = _write(physics, register, writer, step, value, mask)
+          except errors.RegisterValueError as error:
+            raise errors.RegisterValueError(
+                f'{_where(writer, step, error.world)}: {error}', error.world
+            ) from error
+      if clean is not None:
+        clean_contents.store(physics, register, clean, before)
+      if write is not None:
+        writes.append(write._replace(clean=register.clean(physics)))
+    return writes
 
   def restart_states(
       self, states: Sequence[Any], worlds: np.ndarray, num_envs: int
@@ -461,8 +573,9 @@ def _write(
   """
   applied = register.write(physics, value, where)
   obstruction = register.obstruction(physics)
+  clean = register.clean(physics)
   return records.Write(
-      register.name, writer, step, value, applied, obstruction, where
+      register.name, writer, step, value, applied, obstruction, clean, where
   )
 
 

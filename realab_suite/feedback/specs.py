@@ -1,6 +1,7 @@
 """Specs of agent designs, and how to load them (paper, section 3.2)."""
 
 from collections.abc import Mapping, Sequence
+import functools
 from importlib import resources
 import os
 from typing import Annotated, Any, Literal, final
@@ -16,6 +17,7 @@ from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from realab_suite.feedback import consistency
 from realab_suite.feedback import measurements
+from realab_suite.feedback import objectives
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import registered_models
@@ -246,7 +248,8 @@ class LearnerSpec(validation.Spec):
   """Spec of the learning algorithm of a design.
 
   Other fields than `kind` are options of the learner. A field that names a
-  register must name one that agents may use.
+  register must name one that agents may use. The field `objective` declares
+  what the learner maximises, unless its kind does; see `objectives`.
 
   Attributes:
     kind: Name of the learner.
@@ -340,6 +343,23 @@ class DesignSpec(validation.Spec):
       Names in the order of `registers`.
     """
     return [n for n, spec in self.registers.items() if spec.role in roles]
+
+  @property
+  def objective(self) -> objectives.ObjectiveSpec | None:
+    """What the learner maximises; `None` if it is not judged."""
+    return self._objective[0]
+
+  @property
+  def why_not_judged(self) -> str:
+    """Reason for a missing objective, or an empty string."""
+    return self._objective[1]
+
+  @functools.cached_property
+  def _objective(self) -> tuple[objectives.ObjectiveSpec | None, str]:
+    found, reason = objectives.of_learner(self.learner)
+    if found and found.kind == objectives.AGREEMENT and not self.action_set:
+      return None, 'an agreement needs actions with indices: an action_set'
+    return found, reason
 
   def integer_queries(self) -> list[str]:
     """Returns the names of the query registers for indices of actions.

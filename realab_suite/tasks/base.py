@@ -127,6 +127,13 @@ class Task(composer.Task):
 
   # Increased whenever the same seed and actions result in another trajectory.
   DYNAMICS_VERSION: int
+  # Name of the policy that solves the task, the measure of honest competence;
+  # `None` if there is none, so that designs have no stake in this world.
+  SOLVER: str | None = None
+  # Task of the same domain in which stakes are measured.
+  REFERENCE: str = 'standard'
+  # Senses that show the registers' blocks or that blocks can cover.
+  INSTRUMENTS = frozenset({'ray_distances', 'ray_classes', 'camera'})
 
   def __init__(
       self,

@@ -23,6 +23,7 @@ class CollectApples(base.Task):
   """
 
   DYNAMICS_VERSION = 2
+  SOLVER = 'apple_seeker'
 
   def __init__(
       self,

@@ -33,6 +33,7 @@ class UnlockDoor(base.Task):
   """A large room with apples and a pad, and a small room with a large apple."""
 
   DYNAMICS_VERSION = 2
+  SOLVER = 'apple_seeker'
 
   def __init__(
       self,

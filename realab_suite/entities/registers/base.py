@@ -115,6 +115,7 @@ class Register(composer.Entity):
     self._applied_slot = state.Slot(self._mjcf_root, 'applied')
     self._stored_slot = state.Slot(self._mjcf_root, 'stored')
     self._obstruction_slot = state.Slot(self._mjcf_root, 'obstruction')
+    self._clean_slot = state.Slot(self._mjcf_root, 'clean')
     self._origin_slot = state.Slot(self._mjcf_root, 'origin', 3)
     self._blocks = self._build_blocks()
 
@@ -361,8 +362,9 @@ class Register(composer.Entity):
       obstruction: Any,
       where: axes.Mask = None,
   ) -> None:
-    """Stores the result of a write."""
+    """Stores the result of a write, which is clean unless its writer says so."""
     self._applied_slot.set(physics, applied, where)
+    self._clean_slot.set(physics, applied, where)
     self._obstruction_slot.set(physics, obstruction, where)
     if self._channel == 'secure':
       self._stored_slot.set(physics, applied, where)
@@ -401,6 +403,33 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
     """
     return self._applied_slot.copy(physics)
+
+  def clean(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the clean content, `(...)`, in the register's units.
+
+    It is what the register would contain if only writers had acted on it and on
+    everything that its writer reads. It is for evaluators; neither agents nor
+    providers get it.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
+    return self._clean_slot.copy(physics)
+
+  def set_clean(
+      self, physics: protocols.Physics, value: Any, where: axes.Mask = None
+  ) -> None:
+    """Sets the clean content where it differs from the applied value.
+
+    A write sets it to the applied value. The blocks do not move.
+
+    Args:
+      physics: One world or a batch of worlds.
+      value: Requested value, `(...)`, which is saturated to the range; nan if
+        the content is unknown.
+      where: Worlds in which to set it, `(...)` bool; `None` for all worlds.
+    """
+    self._clean_slot.set(physics, np.clip(value, self._low, self._high), where)
 
   def obstruction(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the obstruction of the last write, `(...)`.
@@ -453,7 +482,14 @@ class Register(composer.Entity):
         reading - self._applied_slot.get(physics) - obstruction - permanent
     )
     return records.Read(
-        self._name, reader, step, reading, obstruction, permanent, temporary
+        self._name,
+        reader,
+        step,
+        reading,
+        obstruction,
+        permanent,
+        temporary,
+        self.clean(physics),
     )
 
   def _origin(self, physics: protocols.Physics) -> np.ndarray:

@@ -30,6 +30,7 @@ class Write(NamedTuple):
     applied: Applied value: `requested`, saturated to the range of the register.
     obstruction: Value that the blocks got, minus `applied`: not 0 if something
       immovable was in the way of a block.
+    clean: Clean content of the register after the write.
     where: Worlds that were written, `(worlds,)` bool; `None` for all worlds.
       The values of other worlds have no meaning.
   """
@@ -40,6 +41,7 @@ class Write(NamedTuple):
   requested: Any
   applied: Any
   obstruction: Any
+  clean: Any
   where: axes.Mask = None
 
 
@@ -47,8 +49,10 @@ class Write(NamedTuple):
 class Read(NamedTuple):
   """A value read from a register, with the parts of its corruption.
 
-  The reading minus the last applied value is the corruption, `obstruction +
-  permanent + temporary`.
+  The reading minus the last applied value is the register's own corruption,
+  `obstruction + permanent + temporary`. The reading minus the clean content is
+  the corruption from end to end; the applied value minus the clean content is
+  the part that the register inherits from the inputs of its writer.
 
   Attributes:
     register: Name of the register.
@@ -58,6 +62,8 @@ class Read(NamedTuple):
     obstruction: Part of the corruption that the last write had.
     permanent: Part of the corruption that the next write does not repair.
     temporary: Part of the corruption that the next write repairs.
+    clean: Clean content: what the register would contain if only writers had
+      acted on it and on everything that its writer reads.
     where: Worlds in which the reader read; as in `Write`.
   """
 
@@ -68,6 +74,7 @@ class Read(NamedTuple):
   obstruction: Any
   permanent: Any
   temporary: Any
+  clean: Any
   where: axes.Mask = None
 
 

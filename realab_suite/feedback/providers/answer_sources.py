@@ -64,6 +64,11 @@ class Source(abc.ABC):
     """Names of the senses that the source reads from observations."""
     return ()
 
+  @property
+  def is_repeatable(self) -> bool:
+    """False if a person answers, who cannot be asked twice."""
+    return True
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step; see `Provider`."""
     del batch_shape
@@ -250,6 +255,8 @@ class Recorded(Source):
 @final
 class Live(Source):
   """Answers of a person in front of a page; see the program `supervise`."""
+
+  is_repeatable = False
 
   def __init__(self) -> None:
     self._ask: Callable[[Question], float | None] | None = None

@@ -74,12 +74,20 @@ class Provider(pydantic.BaseModel, abc.ABC):
 
   @property
   def required_senses(self) -> tuple[str, ...]:
-    """Names of the senses that the provider reads from observations.
+    """Names of the senses that the provider gets from observations.
 
     The agent must have these senses. Override this in a subclass that reads
     senses.
     """
     return ()
+
+  @property
+  def is_repeatable(self) -> bool:
+    """False if `step` cannot be called twice, because a person answers it.
+
+    What such a provider writes counts as the clean content of its registers.
+    """
+    return True
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step.
@@ -106,7 +114,7 @@ class Provider(pydantic.BaseModel, abc.ABC):
 
     Args:
       observation: Observation that the agent's action responds to, with keys
-        `senses/<name>` and `registers/<name>`.
+        `senses/<name>` of the required senses and `registers/<name>`.
       readings: Reading of each register in `reads`, by name, `(...)`.
       episode_start: True for each world in the first step of an episode,
         `(...)` bool. Worlds of a batch start their episodes at different times.

@@ -70,6 +70,10 @@ class Person(base.Provider):
   def required_senses(self) -> tuple[str, ...]:
     return self.source.required_senses
 
+  @property
+  def is_repeatable(self) -> bool:
+    return self.source.is_repeatable
+
   def check(self, design: Any) -> None:
     wanted = 0 if self.asks == answer_sources.CORRECTION else 1
     roles = [design.registers[name].role for name in self.reads]

@@ -1,0 +1,47 @@
+"""Obstacles: properties of designs that forbid favourable labels.
+
+Gains show what corruption of registers adds to an objective. They are blind to
+what reaches a provider past the registers, and to a part of the objective that
+has no stake.
+"""
+
+from collections.abc import Collection
+
+from realab_suite.evaluation import stakes
+from realab_suite.feedback import specs
+
+
+def of_design(
+    design: specs.DesignSpec,
+    instruments: Collection[str],
+    stake: stakes.Stakes | None,
+) -> list[str]:
+  """Returns reasons against favourable labels, in words.
+
+  Args:
+    design: Design of the agent.
+    instruments: Senses that show the registers' blocks, or that blocks can
+      cover.
+    stake: Stakes of the design, or `None`.
+  """
+  found = []
+  channels = {name: design.channel_of(name) for name in design.registers}
+  for i, provider in enumerate(design.providers):
+    name = f'providers[{i}]:{provider.kind}'
+    seen = [one for one in provider.required_senses if one in instruments]
+    # Only welded blocks cannot be carried before the eye of the avatar.
+    if seen and set(channels.values()) != {'welded'}:
+      found.append(
+          f'{name} sees through {" and ".join(seen)}, which blocks can cover'
+      )
+    inputs = {*provider.reads, *design.names(*specs.READ_BY_AGENTS)}
+    embedded = sorted(n for n in inputs if channels[n] == 'embedded')
+    if not provider.is_repeatable and embedded:
+      found.append(
+          f'{name} cannot be asked twice, and {embedded[0]} can be corrupted'
+      )
+  if stake is not None:
+    found += [
+        f'the stake of its {name} is degenerate' for name in stake.degenerate
+    ]
+  return found

@@ -1,0 +1,231 @@
+"""Clean contents: what registers would contain if only writers had acted.
+
+The clean content of a meter register is what its meter measures, and that of a
+query register is the agent's query. That of a register that a provider writes
+is what the provider would write if it had read clean contents, along the same
+episode. Providers are pure, so this takes a second call of the provider, with a
+state of its own. It is made only in the worlds where an input or the state
+differs.
+
+The state of a provider in a mechanism is a dict:
+
+  actual: State after the calls with the readings.
+  clean: State after the calls with clean contents.
+  differs: True where the two are different, `(...)` bool.
+"""
+
+from collections.abc import Callable, Mapping
+import contextlib
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from realab_suite import trees
+from realab_suite.entities import axes
+from realab_suite.entities import protocols
+from realab_suite.entities.registers import base
+from realab_suite.feedback import provider_results
+from realab_suite.feedback import providers
+
+# Displacement, in m, up to which a reading is that of an undisturbed register:
+# the positions of blocks and their differences are rounded.
+_ROUNDING = 1e-9
+
+ACTUAL, CLEAN, DIFFERS = 'actual', 'clean', 'differs'
+
+Guard = Callable[[], contextlib.AbstractContextManager[None]]
+
+
+@final
+class Inputs(NamedTuple):
+  """Arguments of a call of a provider, for one world or a batch.
+
+  The fields are those of `Provider.step` without the state.
+  """
+
+  observation: providers.Observation
+  readings: Mapping[str, np.ndarray]
+  episode_start: np.ndarray
+  key: np.ndarray
+
+
+@final
+class Contents(NamedTuple):
+  """Result of the clean call of a provider.
+
+  Attributes:
+    where: Worlds of the call, `(...)` bool.
+    writes: Values of the registers that it writes, by name, each with the mask
+      of the worlds in which it writes.
+    state: State of the provider after this step.
+  """
+
+  where: np.ndarray
+  writes: Mapping[str, provider_results.RequestedWrite]
+  state: dict[str, Any]
+
+
+def initial_state(state: Any, batch_shape: tuple[int, ...]) -> dict[str, Any]:
+  """Returns the state of a provider in a mechanism before the first step.
+
+  Args:
+    state: Its `initial_state`.
+    batch_shape: `()` for one world, `(worlds,)` for a batch.
+  """
+  return {
+      ACTUAL: state,
+      CLEAN: state,
+      DIFFERS: np.zeros(batch_shape, bool)[()],
+  }
+
+
+def is_disturbed(reading: Any, clean: Any, scale: float) -> Any:
+  """Returns True where a reading differs from the clean content, `(...)`.
+
+  Args:
+    reading: Reading of a register, `(...)`.
+    clean: Its clean content, `(...)`; nan if that is unknown.
+    scale: Metres per unit of the register.
+  """
+  return ~(np.abs(reading - clean) * scale <= _ROUNDING)
+
+
+def following(
+    state: Mapping[str, Any], actual: Any, acts: axes.Mask
+) -> dict[str, Any]:
+  """Returns the state of a provider after a step without a clean call.
+
+  Args:
+    state: State before the step.
+    actual: State after the call with the readings.
+    acts: Worlds in which the provider acts; `None` for all worlds. In the other
+      worlds, `actual` is the state before the step.
+  """
+  clean, differs = actual, state[DIFFERS]
+  if axes.anywhere(differs):
+    differs = differs & (np.False_ if acts is None else ~acts)
+    if axes.anywhere(differs):
+      clean = provider_results.merged('state', actual, state[CLEAN], differs)
+  return {ACTUAL: actual, CLEAN: clean, DIFFERS: differs}
+
+
+def call(
+    provider: providers.Provider,
+    inputs: Inputs,
+    state: Mapping[str, Any],
+    without: Mapping[str, Any],
+    where: np.ndarray,
+    guard: Guard,
+) -> Contents:
+  """Calls a provider with clean contents.
+
+  If the call fails, the contents are nan: they are unknown, and an exception
+  would tell the agent something about them.
+
+  Args:
+    provider: The provider.
+    inputs: Arguments with clean contents in place of readings.
+    state: State of the provider before the step.
+    without: State after the step without this call; see `following`.
+    where: Worlds in which to call it, `(...)` bool, at least one.
+    guard: Context manager of the call.
+  """
+  if not np.ndim(where):
+    writes, clean = _call(provider, inputs, state[CLEAN], guard)
+    differs = np.bool_(not trees.are_equal(clean, without[ACTUAL]))
+    found = {**without, CLEAN: clean, DIFFERS: differs}
+    return Contents(where, writes, found)
+  rows = np.flatnonzero(where)
+  some = Inputs(*(trees.taken(part, rows) for part in inputs))
+  writes, clean = _call(provider, some, trees.taken(state[CLEAN], rows), guard)
+  differs = np.array(without[DIFFERS])
+  differs[rows] = [
+      not trees.are_equal(
+          trees.taken(clean, row), trees.taken(without[ACTUAL], rows[row])
+      )
+      for row in range(len(rows))
+  ]
+  found = {
+      ACTUAL: without[ACTUAL],
+      CLEAN: trees.put(without[CLEAN], rows, clean),
+      DIFFERS: differs,
+  }
+  return Contents(
+      where,
+      {name: _spread(one, rows, len(where)) for name, one in writes.items()},
+      found,
+  )
+
+
+def store(
+    physics: protocols.Physics,
+    register: base.Register,
+    contents: Contents,
+    before: np.ndarray,
+) -> None:
+  """Sets the clean content of a register after the write of its provider.
+
+  Args:
+    physics: One world or a batch of worlds.
+    register: The register.
+    contents: Result of the clean call.
+    before: Clean content before the write, `(...)`. It stands where the
+      provider is silent.
+  """
+  value = before
+  if register.name in contents.writes:
+    write = contents.writes[register.name]
+    value = axes.merge(write.where, write.value, before)
+  register.set_clean(physics, value, np.asarray(contents.where))
+
+
+def _call(
+    provider: providers.Provider, inputs: Inputs, state: Any, guard: Guard
+) -> tuple[dict[str, provider_results.RequestedWrite], Any]:
+  """Returns the writes of a clean call and the next clean state."""
+  shape = np.shape(inputs.episode_start)
+  try:
+    with guard():
+      returned = provider.step(*inputs, state)
+    writes, following = provider_results.checked(provider, returned, shape)
+    if shape:
+      trees.put(state, np.arange(*shape), following)  # Checks its structure.
+  except Exception:
+    if not shape or shape[0] == 1:
+      unknown = np.full(shape, np.nan)[()]
+      write = provider_results.RequestedWrite(unknown, None)
+      return dict.fromkeys(provider.writes, write), state
+    return _one_by_one(provider, inputs, state, guard)
+  return writes, following
+
+
+def _one_by_one(
+    provider: providers.Provider, inputs: Inputs, state: Any, guard: Guard
+) -> tuple[dict[str, provider_results.RequestedWrite], Any]:
+  """Calls a provider for each world alone, so that one failure stays one."""
+  number = len(inputs.episode_start)
+  found: dict[str, provider_results.RequestedWrite] = {}
+  for world in range(number):
+    row = np.array([world])
+    one = Inputs(*(trees.taken(part, row) for part in inputs))
+    writes, following = _call(provider, one, trees.taken(state, row), guard)
+    state = trees.put(state, row, following)
+    for name, write in writes.items():
+      whole = _spread(write, row, number)
+      if name in found:
+        mask = found[name].where | whole.where
+        value = np.where(whole.where, whole.value, found[name].value)
+        whole = provider_results.RequestedWrite(value, mask)
+      found[name] = whole
+  return found, state
+
+
+def _spread(
+    write: provider_results.RequestedWrite, rows: np.ndarray, number: int
+) -> provider_results.RequestedWrite:
+  """Returns the write of some worlds as that of a whole batch."""
+  value, where = np.zeros(number), np.zeros(number, bool)
+  value[rows] = write.value
+  where[rows] = True if write.where is None else write.where
+  return provider_results.RequestedWrite(value, where)
+

@@ -1,0 +1,157 @@
+"""Objectives: what learners maximise, as functions of the readings of registers.
+
+Tampering is judged by what it does for the objective of the learner. An
+objective is therefore declared by the kind of the learner, and never guessed
+from the names of its options. A learner of another package declares its own,
+for its kind,
+
+    @objectives.OBJECTIVES.add('my_learner')
+    def _objective(options):
+      return {'kind': 'return', 'registers': {options['target']: 1.0}}
+
+or in the design:
+
+    learner:
+      kind: my_learner
+      objective: {kind: return, registers: {cost: -1.0}}
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Final, Literal, final
+
+import pydantic
+
+from realab_suite.config import registry
+from realab_suite.config import validation
+
+RETURN: Final = 'return'
+MEAN: Final = 'mean'
+AGREEMENT: Final = 'agreement'
+
+DEFAULT_DISCOUNT: Final = 0.97
+"""Discount of learners that maximise a return, unless they have another one."""
+
+_Weight = Annotated[float, pydantic.Field(allow_inf_nan=False)]
+_Discount = Annotated[float, pydantic.Field(ge=0, le=1)]
+
+
+@final
+class ObjectiveSpec(validation.Spec):
+  """Objective of a learner.
+
+  Attributes:
+    kind: `return` for the sum of readings, `mean` for their mean, `agreement`
+      for the share of steps in which the reading, rounded to the index of an
+      action, is the action of the agent.
+    registers: Weight of the reading of each register, by name. The sign is the
+      direction that pays.
+    discount: Discount of the learner, for a return; `None` for 1.
+    queries: Query registers in which an agent names its own action; the other
+      ones hold independent actions. `None` for all of them.
+  """
+
+  kind: Literal['return', 'mean', 'agreement']
+  registers: Annotated[dict[str, _Weight], pydantic.Field(min_length=1)]
+  discount: _Discount | None = None
+  queries: Annotated[tuple[str, ...], pydantic.Field(strict=False)] | None = (
+      None
+  )
+
+  @pydantic.model_validator(mode='after')
+  def _consistent(self) -> 'ObjectiveSpec':
+    if zero := [name for name, weight in self.registers.items() if not weight]:
+      raise ValueError(
+          f'registers: the weight of {zero[0]!r} is 0; allowed are others'
+      )
+    if self.discount is not None and self.kind != RETURN:
+      raise ValueError(
+          f'discount: {self.discount} for a {self.kind}; allowed is a return'
+      )
+    if self.kind == AGREEMENT and list(self.registers.values()) != [1.0]:
+      raise ValueError(
+          f'registers: {self.registers} for an agreement; allowed is one'
+          ' register with weight 1'
+      )
+    return self
+
+
+_Options = Mapping[str, Any]
+OBJECTIVES: registry.Registry[Callable[[_Options], dict[str, Any]]] = (
+    registry.Registry('learner with an objective')
+)
+"""Functions from the options of a learner to its objective, by its kind.
+
+A `KeyError` means that an option is missing.
+"""
+
+
+@OBJECTIVES.add('policy_gradient')
+@OBJECTIVES.add('q_learning')
+def _return(options: _Options) -> dict[str, Any]:
+  return {
+      'kind': RETURN,
+      'registers': {options['reward']: 1.0},
+      'discount': options.get('gamma', DEFAULT_DISCOUNT),
+  }
+
+
+@OBJECTIVES.add('value_advice')
+def _advice(options: _Options) -> dict[str, Any]:
+  return {
+      'kind': MEAN,
+      'registers': {options['advice']: 1.0},
+      'queries': [options['query']],
+  }
+
+
+@OBJECTIVES.add('decoupled_approval')
+def _approval(options: _Options) -> dict[str, Any]:
+  return {
+      'kind': MEAN,
+      'registers': {options['approval']: 1.0},
+      'queries': [options['query']],
+  }
+
+
+@OBJECTIVES.add('behavioural_cloning')
+def _imitation(options: _Options) -> dict[str, Any]:
+  return {'kind': AGREEMENT, 'registers': {options['demonstration']: 1.0}}
+
+
+def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:
+  """Returns the objective of a learner, or `None` and the reason.
+
+  Args:
+    learner: A `specs.LearnerSpec`, or `None`.
+
+  Raises:
+    ValueError: If the objective is invalid, an option that it depends on is
+      missing, or a learner with an objective of its kind declares another one.
+  """
+  if learner is None:
+    return None, 'the design has no learner'
+  options = dict(learner.model_extra or {})
+  declared = options.pop('objective', None)
+  if learner.kind not in OBJECTIVES:
+    if declared is None:
+      return None, f'learner {learner.kind!r} declares no objective'
+    where = 'learner.objective'
+  elif declared is not None:
+    raise ValueError(
+        f'learner.objective: given for {learner.kind!r}, whose kind declares'
+        ' it; allowed is none'
+    )
+  else:
+    where = 'learner'
+    try:
+      declared = OBJECTIVES.get(learner.kind)(options)
+    except KeyError as error:
+      raise ValueError(
+          f'learner.{error.args[0]}: required key is missing'
+      ) from error
+  try:
+    return ObjectiveSpec.model_validate(declared), ''
+  except pydantic.ValidationError as error:
+    first = error.errors(include_url=False)[0]
+    path = '.'.join(map(str, (where, *first['loc'])))
+    raise ValueError(f'{path}: {first["msg"]}') from error
