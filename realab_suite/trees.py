@@ -19,7 +19,7 @@ def mapped(function: Callable[[Any], Any], tree: Any) -> Any:
   return function(tree)
 
 
-def taken(tree: Any, rows: np.ndarray) -> Any:
+def taken(tree: Any, rows: np.ndarray | int) -> Any:
   """Returns a tree with the given rows of each array, in this order."""
   return mapped(lambda value: value[rows], tree)
 

@@ -5,7 +5,7 @@ it. The rest consists of numbers, strings and arrays in nested containers.
 `archive.py` converts them to bytes.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import hashlib
 from typing import Any, NamedTuple, Self, final
 

@@ -4,7 +4,7 @@
 about tampering.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 import dataclasses
 import math
 from typing import Protocol, final
@@ -260,4 +260,3 @@ def _mean(
 ) -> intervals.Interval:
   values = by_seed(episodes, attribute)
   return intervals.mean_interval(values, bounds=bounds, level=level)
-

@@ -314,4 +314,3 @@ def _number(value: Any) -> float | None:
   """Returns a finite number, and `None` for nan and infinity."""
   number = float(value)
   return number if math.isfinite(number) else None
-

@@ -244,7 +244,7 @@ def results_of(
         f'first_episode: {first_episode}; allowed are integers from 0'
     )
   collector = ResultCollector(env, objective)
-  added = [collector]
+  added: list[events.EventSink] = [collector]
   results: list[EpisodeResult] = []
   try:
     for sink in sinks:

@@ -223,9 +223,7 @@ def hacking(
   free = [one for one in counting if not count([one], stake, limit).hacked]
   return Hacking(
       control=beside,
-      rate=intervals.mean_interval(
-          hacked, bounds=intervals.SHARE, level=level
-      ),
+      rate=intervals.mean_interval(hacked, bounds=intervals.SHARE, level=level),
       hack_free_return=(
           intervals.mean_interval(
               comparison.by_seed(free, 'true_return'),

@@ -4,7 +4,8 @@ Ledgers, which keep every write and read, are in `ledgers`.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, final
+import dataclasses
+from typing import Any, final
 
 import numpy as np
 
@@ -17,7 +18,8 @@ from realab_suite.feedback import specs
 
 
 @final
-class Episode(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Episode:
   """An episode that has ended.
 
   Attributes:
@@ -82,15 +84,13 @@ class Monitor(events.EventSink):
     del physics
     if self._ids is not None:
       self._failure = self._failure or step.failure
-      self._figures.step(
-          step.records, step.action, step.true_reward, np.True_
-      )
+      self._figures.step(step.records, step.action, step.true_reward, np.True_)
 
   def episode_ended(self, end: events.End) -> None:
     # A sink that was added in mid-episode receives only the end of the episode.
     if self._ids is not None:
       self._ended.append(
-          Episode(0, *self._ids, end, self._failure, self._figures.figures(end))
+          _episode(0, self._ids, end, self._failure, self._figures, ())
       )
       self._ids = None
 
@@ -164,9 +164,10 @@ class BatchMonitor(events.BatchEventSink):
     for world, end in step.ends.items():
       ids = self._ids[world]
       if ids is not None:
-        figures = self._figures.figures(end, world)
         self._ended.append(
-            Episode(world, *ids, end, self._failures[world], figures)
+            _episode(
+                world, ids, end, self._failures[world], self._figures, world
+            )
         )
         self._ids[world] = None
 
@@ -193,6 +194,19 @@ class BatchMonitor(events.BatchEventSink):
       if state is not None:
         self._failures[i] = state['failure']
         self._figures.set_state(state['figures'], i)
+
+
+def _episode(
+    index: int,
+    ids: Sequence[int],
+    end: events.End,
+    failure: str | None,
+    figures: episode_figures.Accumulator,
+    row: Any,
+) -> Episode:
+  seed, world, episode = ids
+  found = figures.figures(end, row)
+  return Episode(index, seed, world, episode, end, failure, found)
 
 
 def _state(

@@ -66,9 +66,7 @@ class Stake(pydantic.BaseModel):
   @property
   def is_degenerate(self) -> bool:
     """True if the solver does not clearly earn more than no competence."""
-    return not (
-        self.estimate > 0 and self.low > _LEAST_SHARE * self.estimate
-    )
+    return not (self.estimate > 0 and self.low > _LEAST_SHARE * self.estimate)
 
 
 @final
@@ -162,11 +160,12 @@ def measure(
         f'design {design.name!r} has no stake: {design.why_not_judged}'
     )
   twin = specs.load(design, ['channel=secure'])
+  queries = design.objective.queries
 
   def play(name: str) -> list[evaluate.EpisodeResult]:
     with contextlib.closing(load_batch(twin, NUM_EPISODES, SEED)) as batch:
       actor = batch_actors.BatchPolicyActor(
-          policies.make(name), batch, SEED, queries=design.objective.queries
+          policies.make(name), batch, SEED, queries=queries
       )
       return evaluate.evaluate_batch(batch, actor)
 

@@ -301,9 +301,7 @@ def is_larger(values: Sequence[float], others: Sequence[float]) -> bool:
     return False
   if len({*values}) == len({*others}) == 1:
     return values[0] > others[0]
-  test = stats.ttest_ind(
-      values, others, equal_var=False, alternative='greater'
-  )
+  test = stats.ttest_ind(values, others, equal_var=False, alternative='greater')
   return bool(test.pvalue < 1 - _LEVEL)
 
 

@@ -212,12 +212,15 @@ def plan(
     )
   dynamics = suite.dynamics(*experiment.domain_and_variation)
   return [
-      Job(run, seed, *others, dynamics, experiment)
+      Job(
+          run, seed, policy, design, baseline, twin_of, embedded, dynamics,
+          experiment,
+      )
       for i, seed in enumerate(experiment.seeds if seeds is None else seeds)
-      for run, *others in variants
+      for run, policy, design, baseline, twin_of, embedded in variants
       if not only or run in only
       if i < (_spec(experiment, run).num_seeds or math.inf)
-  ]
+  ]  # fmt: skip
 
 
 def _spec(

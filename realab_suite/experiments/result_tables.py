@@ -77,8 +77,8 @@ def summarize(
     )
   if stake is not None and stake.main.is_degenerate:
     stake, why_not_judged = None, _DEGENERATE
-  beside = None if stake is None else hacking.control(
-      control, rows[control], stake
+  beside = (
+      None if stake is None else hacking.control(control, rows[control], stake)
   )
   lines = []
   for run, of_run in rows.items():

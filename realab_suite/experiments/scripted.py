@@ -33,6 +33,7 @@ from realab_suite.experiments import tracking
 from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 
+
 @final
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -231,7 +232,9 @@ def _world(settings: Settings) -> worlds.World:
 def _check_runs(settings: Settings, runs: Sequence[Run]) -> None:
   """Loads each run once, to raise errors before anything is written."""
   for run in runs:
-    with contextlib.closing(_world(settings).load(run.design, settings.seeds[0])) as env:
+    with contextlib.closing(
+        _world(settings).load(run.design, settings.seeds[0])
+    ) as env:
       policy = aiming.make_policy(run.policy, env, settings.target, 0)
       actors.make(policy, env)
 
@@ -329,7 +332,9 @@ class _Job:
 
   def _episodes(self, run: Run) -> Iterator[results.EpisodeRow]:
     for seed in self._settings.seeds:
-      with contextlib.closing(_world(self._settings).load(run.design, seed)) as env:
+      with contextlib.closing(
+          _world(self._settings).load(run.design, seed)
+      ) as env:
         info = run_infos.of(
             env,
             (self._settings.domain, self._settings.task),
@@ -338,9 +343,7 @@ class _Job:
             baseline=None if run.name == self._baseline else self._baseline,
         )
         for episode in range(self._settings.num_episodes):
-          yield results.row(
-              info, self._episode(run, env, episode), self._stake
-          )
+          yield results.row(info, self._episode(run, env, episode), self._stake)
 
   def _episode(
       self, run: Run, env: environment.Environment, episode: int

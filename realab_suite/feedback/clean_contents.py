@@ -132,7 +132,7 @@ def call(
   """
   if not np.ndim(where):
     writes, clean = _call(provider, inputs, state[CLEAN], guard)
-    differs = np.bool_(not trees.are_equal(clean, without[ACTUAL]))
+    differs: Any = np.bool_(not trees.are_equal(clean, without[ACTUAL]))
     found = {**without, CLEAN: clean, DIFFERS: differs}
     return Contents(where, writes, found)
   rows = np.flatnonzero(where)
@@ -161,7 +161,7 @@ def store(
     physics: protocols.Physics,
     register: base.Register,
     contents: Contents,
-    before: np.ndarray,
+    before: Any,
 ) -> None:
   """Sets the clean content of a register after the write of its provider.
 
@@ -204,20 +204,21 @@ def _one_by_one(
 ) -> tuple[dict[str, provider_results.RequestedWrite], Any]:
   """Calls a provider for each world alone, so that one failure stays one."""
   number = len(inputs.episode_start)
-  found: dict[str, provider_results.RequestedWrite] = {}
+  found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
   for world in range(number):
     row = np.array([world])
     one = Inputs(*(trees.taken(part, row) for part in inputs))
     writes, following = _call(provider, one, trees.taken(state, row), guard)
     state = trees.put(state, row, following)
     for name, write in writes.items():
-      whole = _spread(write, row, number)
-      if name in found:
-        mask = found[name].where | whole.where
-        value = np.where(whole.where, whole.value, found[name].value)
-        whole = provider_results.RequestedWrite(value, mask)
-      found[name] = whole
-  return found, state
+      nothing = np.zeros(number), np.zeros(number, bool)
+      value, where = found.setdefault(name, nothing)
+      value[world] = write.value[0]
+      where[world] = write.where is None or write.where[0]
+  return {
+      name: provider_results.RequestedWrite(*pair)
+      for name, pair in found.items()
+  }, state
 
 
 def _spread(
@@ -228,4 +229,3 @@ def _spread(
   value[rows] = write.value
   where[rows] = True if write.where is None else write.where
   return provider_results.RequestedWrite(value, where)
-

@@ -449,7 +449,7 @@ class FeedbackMechanism(composer.Entity):
     writes = []
     for name in provider.writes:
       register = self._registers[name]
-      before = None if clean is None else register.clean(physics)
+      before = register.clean(physics)
       write = None
       if name in values:
         mask = axes.both(values[name].where, where)

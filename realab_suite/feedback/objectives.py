@@ -1,4 +1,4 @@
-"""Objectives: what learners maximise, as functions of the readings of registers.
+"""Objectives: what learners maximise, as functions of readings.
 
 Tampering is judged by what it does for the objective of the learner. An
 objective is therefore declared by the kind of the learner, and never guessed

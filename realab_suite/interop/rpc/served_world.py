@@ -11,7 +11,6 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import result_collector
 from realab_suite.evaluation import results
 from realab_suite.interop.rpc import agent_port
 from realab_suite.interop.rpc import agent_server
@@ -48,7 +47,7 @@ class ServedWorld(agent_server.Service):
     self._num_left = num_episodes
     self._on_episode = on_episode
     self._failures: list[Exception] = []
-    self._collector = result_collector.ResultCollector(env)
+    self._collector = evaluate.ResultCollector(env)
     self._port = agent_port.AgentPort(
         agent_view.AgentView(env, self._failures), env.abandon
     )
