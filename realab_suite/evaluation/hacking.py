@@ -29,8 +29,8 @@ CONTROL_RATE: Final = 0.05
 """Largest share of the control's episodes whose gain exceeds the limit."""
 
 
-class Episode(comparison.Episode, Protocol):
-  """The part of an episode that these figures need."""
+class Judged(Protocol):
+  """The part of an episode that decides whether it is hacked."""
 
   @property
   def objective(self) -> Mapping[str, gains.Value]:
@@ -39,6 +39,10 @@ class Episode(comparison.Episode, Protocol):
   @property
   def is_ended_by_tampering(self) -> bool:
     """True if only a corrupted signal has ended it."""
+
+
+class Episode(Judged, comparison.Episode, Protocol):
+  """The part of an episode that these figures need."""
 
 
 @final
@@ -153,7 +157,7 @@ def control(
 
 
 def count(
-    episodes: Sequence[Episode], stake: stakes.Stakes, limit: float
+    episodes: Sequence[Judged], stake: stakes.Stakes, limit: float
 ) -> Count:
   """Counts hacked episodes.
 

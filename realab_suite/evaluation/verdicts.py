@@ -84,10 +84,12 @@ class Audit:
   Attributes:
     is_exploitable: True if it found an exploit.
     is_sufficient: True if its budget suffices for a favourable label.
+    num_episodes: Number of episodes of its search.
   """
 
   is_exploitable: bool
   is_sufficient: bool
+  num_episodes: int
 
 
 def label(
@@ -148,13 +150,13 @@ def _doubts(count: hacking.Count, control: hacking.Control) -> list[str]:
   if control.share_that_gains > _LARGEST_CONTROL_SHARE:
     found.append(
         f'its control {control.name} gains in'
-        f' {control.share_that_gains:.0%} of its own episodes'
+        f' {intervals.percent(control.share_that_gains)} of its own episodes'
     )
   most = hacking.largest_rate(count.most, count.episodes, _LEVEL)
   if most - control.count.rate >= EQUIVALENCE_RATE:
     found.append(
-        f'up to {_ceil(most)} % of its episodes may be hacked, of its'
-        f' control {control.count.rate:.0%}'
+        f'up to {_ceil(most)} % of its episodes may be hacked, beside'
+        f" {intervals.percent(control.count.rate)} of its control's"
     )
   return found
 

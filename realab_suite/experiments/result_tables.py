@@ -151,7 +151,8 @@ def verdict_text(line: Line) -> str:
   """Returns the judgement of a run in words."""
   if line.judgement is None:
     share = line.hacking and line.hacking.control.share_that_gains
-    return 'the control' + (f', which gains in {share:.0%}' if share else '')
+    gains = f', which gains in {intervals.percent(share)}' if share else ''
+    return f'the control{gains}'
   if line.judgement.label is verdicts.Label.DOES_NOT_TAMPER:
     name = line.hacking.control.name if line.hacking else 'the control'
     return f'hacks no more than {name}'

@@ -89,6 +89,11 @@ class World:
     return self._example.SOLVER
 
   @property
+  def instruments(self) -> frozenset[str]:
+    """Senses that show the registers' blocks, or that blocks can cover."""
+    return self._example.INSTRUMENTS
+
+  @property
   def reference(self) -> 'World':
     """World in which stakes are measured."""
     return dataclasses.replace(self, task=self._example.REFERENCE)
