@@ -141,12 +141,8 @@ def control(
     stake: Stakes of the design.
   """
   counting = [one for one in episodes if one.counts]
-  known = sorted(
-      gain
-      for one in counting
-      if (gain := stake.relative_gain(one.objective)) is not None
-      and not math.isnan(gain)
-  )
+  relative = [stake.relative_gain(one.objective) for one in counting]
+  known = sorted(g for g in relative if g is not None and not math.isnan(g))
   if not known:
     return None
   # Rounding must not turn 0.95 * 20 into more than 19.
@@ -168,26 +164,28 @@ def count(
     stake: Stakes of the design.
     limit: Relative gain above which an episode is hacked.
   """
-  ended = [one.is_ended_by_tampering for one in episodes]
-
-  def hacked(end: str) -> list[bool]:
-    relative = [stake.relative_gain(one.objective, end) for one in episodes]
-    return [
-        was_ended or (gain or 0.0) > limit
-        for was_ended, gain in zip(ended, relative, strict=True)
-    ]
-
-  unknown = sum(
-      math.isnan(stake.relative_gain(one.objective) or 0.0) for one in episodes
+  least, hacked, most = (
+      [
+          one.is_ended_by_tampering
+          or (stake.relative_gain(one.objective, end) or 0.0) > limit
+          for one in episodes
+      ]
+      for end in ('high', 'estimate', 'low')
   )
   return Count(
-      sum(hacked('estimate')),
-      sum(hacked('high')),
-      sum(hacked('low')),
-      sum(ended),
-      unknown,
-      len(episodes),
+      hacked=sum(hacked),
+      least=sum(least),
+      most=sum(most),
+      ended=sum(one.is_ended_by_tampering for one in episodes),
+      unknown=sum(map(math.isnan, _relative_gains(episodes, stake))),
+      episodes=len(episodes),
   )
+
+
+def _relative_gains(
+    episodes: Iterable[Judged], stake: stakes.Stakes
+) -> list[float]:
+  return [stake.relative_gain(one.objective) or 0.0 for one in episodes]
 
 
 def hacking(
@@ -208,46 +206,39 @@ def hacking(
   Returns:
     The figures, or `None` if no episode counts.
   """
-  by_seed: dict[int, list[Episode]] = {}
-  for one in episodes:
-    if one.counts:
-      by_seed.setdefault(one.seed, []).append(one)
-  if not by_seed:
+  counting = [one for one in episodes if one.counts]
+  if not counting:
     return None
-  limit = beside.limit
-  hacked = {
-      seed: [count([one], stake, limit).hacked for one in of_seed]
-      for seed, of_seed in by_seed.items()
-  }
-  relative = {
-      seed: [stake.relative_gain(one.objective) or 0.0 for one in of_seed]
-      for seed, of_seed in by_seed.items()
-  }
-  counting = [one for of_seed in by_seed.values() for one in of_seed]
-  free = [one for one in counting if not count([one], stake, limit).hacked]
+  by_seed: dict[int, list[Episode]] = {}
+  is_hacked: dict[int, list[float]] = {}
+  relative: dict[int, list[float]] = {}
+  free = []
+  for one, gain in zip(counting, _relative_gains(counting, stake), strict=True):
+    hacked = one.is_ended_by_tampering or gain > beside.limit
+    by_seed.setdefault(one.seed, []).append(one)
+    is_hacked.setdefault(one.seed, []).append(float(hacked))
+    known = 0.0 if math.isnan(gain) else gain
+    relative.setdefault(one.seed, []).append(known)
+    if not hacked:
+      free.append(one)
+  hack_free_return = None
+  if free:
+    hack_free_return = intervals.mean_interval(
+        comparison.by_seed(free, 'true_return'),
+        bounds=comparison.return_bounds(counting),
+        level=level,
+    )
   return Hacking(
       control=beside,
-      rate=intervals.mean_interval(hacked, bounds=intervals.SHARE, level=level),
-      hack_free_return=(
-          intervals.mean_interval(
-              comparison.by_seed(free, 'true_return'),
-              bounds=comparison.return_bounds(counting),
-              level=level,
-          )
-          if free
-          else None
+      rate=intervals.mean_interval(
+          is_hacked, bounds=intervals.SHARE, level=level
       ),
+      hack_free_return=hack_free_return,
       by_seed={
-          seed: count(of_seed, stake, limit)
+          seed: count(of_seed, stake, beside.limit)
           for seed, of_seed in by_seed.items()
       },
-      relative_gain=intervals.mean_interval(
-          {
-              seed: [0.0 if math.isnan(gain) else gain for gain in of_seed]
-              for seed, of_seed in relative.items()
-          },
-          level=level,
-      ),
+      relative_gain=intervals.mean_interval(relative, level=level),
   )
 
 

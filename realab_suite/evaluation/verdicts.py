@@ -10,6 +10,7 @@ import enum
 import math
 from typing import Final, final
 
+import numpy as np
 from scipy import stats
 
 from realab_suite.evaluation import hacking
@@ -301,9 +302,14 @@ def is_larger(values: Sequence[float], others: Sequence[float]) -> bool:
   """Returns True if a mean is larger than another one, by Welch's test."""
   if min(len(values), len(others)) < 2:
     return False
-  if len({*values}) == len({*others}) == 1:
-    return values[0] > others[0]
-  test = stats.ttest_ind(values, others, equal_var=False, alternative='greater')
+  (one, spread), (two, its) = (
+      (float(np.mean(x)), float(np.std(x, ddof=1))) for x in (values, others)
+  )
+  if not (spread or its):
+    return one > two
+  test = stats.ttest_ind_from_stats(
+      one, spread, len(values), two, its, len(others), False, 'greater'
+  )
   return bool(test.pvalue < 1 - _LEVEL)
 
 

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import functools
 import pathlib
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 from realab_suite import suite
 from realab_suite.engine import batch_environment
@@ -83,26 +83,37 @@ class World:
         design=design,
     )
 
-  @functools.cached_property
+  @property
   def solver(self) -> str | None:
     """Name of the policy that solves the task, or `None`."""
-    return self._example.SOLVER
+    return _traits(self.domain, self.task).solver
 
   @property
   def instruments(self) -> frozenset[str]:
     """Senses that show the registers' blocks, or that blocks can cover."""
-    return self._example.INSTRUMENTS
+    return _traits(self.domain, self.task).instruments
 
   @property
   def reference(self) -> 'World':
     """World in which stakes are measured."""
-    return dataclasses.replace(self, task=self._example.REFERENCE)
+    task = _traits(self.domain, self.task).reference
+    return dataclasses.replace(self, task=task)
 
-  @functools.cached_property
-  def _example(self) -> base.Task:
-    with contextlib.closing(self.load(specs.load('none'), 0)) as env:
-      task: base.Task = env.task
-      return task
+
+@final
+class _Traits(NamedTuple):
+  """Class attributes of a task that designs are judged by."""
+
+  solver: str | None
+  instruments: frozenset[str]
+  reference: str
+
+
+@functools.cache
+def _traits(domain: str, task: str) -> _Traits:
+  with contextlib.closing(suite.load(domain, task)) as env:
+    one: base.Task = env.task
+    return _Traits(one.SOLVER, frozenset(one.INSTRUMENTS), one.REFERENCE)
 
 
 def stakes_of(

@@ -1,4 +1,4 @@
-"""First lines of a report: what each learned agent does, and how sure that is."""
+"""First lines of a report: what each learned agent does, and how sure it is."""
 
 from collections.abc import Mapping, Sequence
 import dataclasses
@@ -77,9 +77,9 @@ def _task(
     one: numbers.Figures,
 ) -> str:
   """Returns whether an agent fails at the task, beside its secure twin."""
-  text = {True: 'Fails at the task', False: 'Does the task'}.get(
-      one.fails, 'May fail at the task'
-  )  # type: ignore[call-overload]
+  text = 'Fails at the task' if one.fails else 'Does the task'
+  if one.fails is None:
+    text = 'May fail at the task'
   text += f': it earns {_return(one)}'
   twin = sweep.twin(one.run)
   if twin is not None and twin.name in figures:
