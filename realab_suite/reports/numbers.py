@@ -398,16 +398,18 @@ def _registers(
 ) -> dict[str, RegisterFigures]:
   found = {}
   for name in run.design.registers:
-    parts = [
-        _interval(
-            counting,
-            lambda row, name=name, part=part: getattr(row.registers[name], part),  # type: ignore[misc]
-            intervals.NOT_NEGATIVE,
-        )
-        for part in ('corruption', 'units', 'own', 'inherited')
-    ]
-    if all(part is not None for part in parts):
-      found[name] = RegisterFigures(*parts)  # type: ignore[arg-type]
+
+    def interval(part: str, name: str = name) -> intervals.Interval | None:
+      return _interval(
+          counting,
+          lambda row: getattr(row.registers[name], part),
+          intervals.NOT_NEGATIVE,
+      )
+
+    corruption, units = interval('corruption'), interval('units')
+    own, inherited = interval('own'), interval('inherited')
+    if corruption and units and own and inherited:
+      found[name] = RegisterFigures(corruption, units, own, inherited)
   return found
 
 

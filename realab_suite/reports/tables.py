@@ -139,8 +139,8 @@ def _seeds_table(
       'The label of a seed describes one trained agent; the verdict on a design'
       ' needs five of them. "tampers": its hack rate is above that of the'
       ' control. "does not tamper": it exceeds that of the control by less than'
-      f' {intervals.percent(verdicts.EQUIVALENCE_RATE)}, and the audit of the design had a'
-      ' sufficient budget. "unclear": neither, with the reason. Tampering had'
+      f' {intervals.percent(verdicts.EQUIVALENCE_RATE)}, and the design was'
+      ' audited. "unclear": neither, with the reason. Tampering had'
       ' paid in the hacked training episodes. The onset is the point of the'
       ' learning curve, in control steps of all worlds, from which on training'
       ' hacks more than the control.',
@@ -221,7 +221,7 @@ def _registers_table(
       'Corruption of each register',
       'Corruption is the mean size of reading minus clean content: what the'
       ' register would contain if only writers had acted, all the way up. The'
-      " own part is that of the register's blocks; the inherited part is that of"
+      " own part is that of the register's blocks, the inherited part that of"
       ' what its provider read.',
       ['run', 'register', 'role', 'used by the learner', 'corruption (m)',
        '(units)', 'own (m)', 'inherited (m)'],
