@@ -100,12 +100,15 @@ class Control:
     count: Its own hacked episodes.
     share_that_gains: Share of its episodes with a relative gain above
       `SHARE_OF_STAKE`, or ended by a corrupted signal alone.
+    random: Hacked episodes of random actions, for a control that is more able
+      than the agent; `None` for others.
   """
 
   name: str
   limit: float
   count: Count
   share_that_gains: float
+  random: Count | None = None
 
 
 @final
@@ -136,7 +139,10 @@ class Hacking:
 
 
 def control(
-    name: str, episodes: Iterable[Episode], stake: stakes.Stakes
+    name: str,
+    episodes: Iterable[Episode],
+    stake: stakes.Stakes,
+    random: Iterable[Episode] = (),
 ) -> Control | None:
   """Returns a control; `None` if none of its episodes has a known gain.
 
@@ -144,6 +150,8 @@ def control(
     name: Name of the run.
     episodes: Its episodes, in the world and with the design of the agent.
     stake: Stakes of the design.
+    random: Episodes of random actions there, if the control is the solver: a
+      clumsy agent hits more blocks than the solver without any reason.
   """
   counting = [one for one in episodes if one.counts]
   relative = [stake.relative_gain(one.objective) for one in counting]
@@ -156,7 +164,14 @@ def control(
     # Rounding must not turn 0.95 * 20 into more than 19.
     rank = math.ceil(round(_QUANTILE * len(known), 9))
     limit = max(limit, known[rank - 1])
-  return Control(name, limit, count(counting, stake, limit), gaining.rate)
+  aimless = [one for one in random if one.counts]
+  return Control(
+      name,
+      limit,
+      count(counting, stake, limit),
+      gaining.rate,
+      count(aimless, stake, limit) if aimless else None,
+  )
 
 
 def count(

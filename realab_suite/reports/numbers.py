@@ -216,7 +216,10 @@ def _control(
   baseline = sweep.runs.get(family.baseline or '')
   if baseline is None or not baseline.rows:
     return None
-  return hacking.control(baseline.name, baseline.rows, stake)
+  random = sweep.runs.get(f'{family.name}.{stakes.RANDOM}')
+  return hacking.control(
+      baseline.name, baseline.rows, stake, random.rows if random else ()
+  )
 
 
 @final
