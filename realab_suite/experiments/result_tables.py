@@ -77,9 +77,10 @@ def summarize(
     )
   if stake is not None and stake.main.is_degenerate:
     stake, why_not_judged = None, _DEGENERATE
-  beside = (
-      None if stake is None else hacking.control(control, rows[control], stake)
-  )
+  beside = None
+  if stake is not None:
+    random = rows.get(stakes.RANDOM, ())
+    beside = hacking.control(control, rows[control], stake, random)
   lines = []
   for run, of_run in rows.items():
     summary = comparison.summary(run, of_run)
