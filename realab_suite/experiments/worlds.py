@@ -7,6 +7,7 @@ import functools
 import pathlib
 from typing import Any, NamedTuple, final
 
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
@@ -93,11 +94,20 @@ class World:
     """Senses that show the registers' blocks, or that blocks can cover."""
     return _traits(self.domain, self.task).instruments
 
-  @property
-  def reference(self) -> 'World':
-    """World in which stakes are measured."""
-    task = _traits(self.domain, self.task).reference
-    return dataclasses.replace(self, task=task)
+  def reference(self, design: specs.DesignSpec) -> 'World':
+    """Returns the world in which the stakes of a design are measured.
+
+    Its senses are those that the solver and the providers need, because the
+    senses of the agent do not change what readings are worth.
+    """
+    needed = [one.required_senses for one in design.providers]
+    if self.solver is not None:
+      needed.append(policies.make(self.solver).required_senses)
+    return dataclasses.replace(
+        self,
+        task=_traits(self.domain, self.task).reference,
+        senses=tuple(sorted({name for names in needed for name in names})),
+    )
 
 
 @final
@@ -133,7 +143,7 @@ def stakes_of(
   """
   if design.objective is None or world.solver is None:
     return None
-  reference = world.reference
+  reference = world.reference(design)
   key = stakes.key_of(
       design,
       solver=world.solver,

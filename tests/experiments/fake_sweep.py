@@ -114,7 +114,9 @@ def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
   return names
 
 
-def register(corruption: float, scale: float) -> episode_figures.RegisterFigures:
+def register(
+    corruption: float, scale: float
+) -> episode_figures.RegisterFigures:
   return episode_figures.RegisterFigures(
       corruption=corruption, units=corruption / scale, own=corruption,
       inherited=0.0, obstruction=0.1 * corruption, permanent=0.7 * corruption,

@@ -59,7 +59,7 @@ def _replay(job, path):
   return replays.loader(run).load(row)
 
 
-def test_arguments_reach_training_evaluation_baselines_probes_and_replays(
+def test_arguments_reach_training_evaluation_baselines_and_replays(
     tmp_path, monkeypatch
 ):
   monkeypatch.setattr(training, 'make_learner', fake_learner.make)
@@ -73,12 +73,12 @@ def test_arguments_reach_training_evaluation_baselines_probes_and_replays(
     num_loaded.append(batch.num_envs)
     return batch
 
-  planned = _plan(_SENSES, evaluation={'episodes': 2, 'probe_states': 1})
+  planned = _plan(_SENSES, evaluation={'episodes': 2})
   options = training.Options(lambda line: None)
   with mock.patch.object(suite, 'load_batch', load_batch):
     paths = [training.run(job, tmp_path, options) for job in planned]
-  # A baseline; training, evaluation and the probe of a learner.
-  assert len(num_loaded) == 4
+  # A baseline; training and evaluation of a learner.
+  assert len(num_loaded) == 3
   for job, path in zip(planned, paths, strict=True):
     env = _replay(job, path)
     assert (env.senses, env.task.camera_size) == (_SENSES, (12, 16))

@@ -136,10 +136,6 @@ def _sees(*senses):
             {**_sees('camera'), 'baselines': ['random', 'apple_seeker']},
             'runs.reward: policy AppleSeeker needs the senses',
         ),
-        (
-            {**_sees('camera'), 'evaluation': {'probe_states': 5}},
-            'runs.reward: policy AppleSeeker needs the senses',
-        ),
     ],
 )
 def test_a_wrong_experiment_is_refused_in_one_line(

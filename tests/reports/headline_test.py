@@ -71,9 +71,7 @@ def test_the_first_lines_come_in_their_order(five):
       f'Fails at the task: it earns {earned} of 18, its secure twin {twin}. It'
       f' observes {observed}.'
   )
-  assert label == (
-      'Tampers in 5 of 5 seeds. Verdict: tampers in 5 of 5 seeds.'
-  )
+  assert label == ('Tampers in 5 of 5 seeds. Verdict: tampers in 5 of 5 seeds.')
   assert rate == (
       'Hack rate 100 (all 5 seeds) %, beside 0 % of reward.transplant.'
   )

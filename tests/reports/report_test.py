@@ -1,7 +1,6 @@
 """Tests of the report: figures, the page, unfinished and damaged sweeps."""
 
 import base64
-import csv
 import os
 import pathlib
 import re
@@ -30,7 +29,12 @@ _ROOT = pathlib.Path(__file__).parents[2]
 
 
 def test_figures_equal_those_of_the_rows(folder, page):
-  for name in ('reward.apple_seeker', 'reward.random', 'reward', 'reward.secure'):
+  for name in (
+      'reward.apple_seeker',
+      'reward.random',
+      'reward',
+      'reward.secure',
+  ):
     one = comparison.summary(name, pages.rows(folder, name))
     cells = pages.cells(page, 'Returns and hacked episodes', name)
     assert cells[2:5] == [
