@@ -440,7 +440,7 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(
       write = storage.JsonLines.append
 
       def append(self, records):
-        if self._path.name == training.CURVE and self._file.tell() > 2000:
+        if self._path.name == training.CURVE and self._file.tell() > 1000:
           self._file.write(b'{"st')
           with storage.explained(self._path):
             raise full
