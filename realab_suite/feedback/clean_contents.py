@@ -87,7 +87,9 @@ def is_disturbed(reading: Any, clean: Any, scale: float) -> Any:
     clean: Its clean content, `(...)`; nan if that is unknown.
     scale: Metres per unit of the register.
   """
-  return ~(np.abs(reading - clean) * scale <= _ROUNDING)
+  # False for nan, so it is the opposite that is asked.
+  is_same = abs(reading - clean) * scale <= _ROUNDING
+  return ~is_same if np.ndim(is_same) else not is_same
 
 
 def following(
@@ -139,12 +141,7 @@ def call(
   some = Inputs(*(trees.taken(part, rows) for part in inputs))
   writes, clean = _call(provider, some, trees.taken(state[CLEAN], rows), guard)
   differs = np.array(without[DIFFERS])
-  differs[rows] = [
-      not trees.are_equal(
-          trees.taken(clean, row), trees.taken(without[ACTUAL], rows[row])
-      )
-      for row in range(len(rows))
-  ]
+  differs[rows] = trees.differing(clean, trees.taken(without[ACTUAL], rows))
   found = {
       ACTUAL: without[ACTUAL],
       CLEAN: trees.put(without[CLEAN], rows, clean),
