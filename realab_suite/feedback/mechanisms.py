@@ -432,7 +432,7 @@ class FeedbackMechanism(composer.Entity):
       return None
     seen = {key: np.asarray(value) for key, value in sight.clean.items()}
     clean = clean_contents.Inputs(
-        inputs.observation | seen,
+        {**inputs.observation, **seen},
         {read.register: np.array(read.clean) for read in reads},
         inputs.episode_start,
         inputs.key,
