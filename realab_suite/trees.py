@@ -54,7 +54,7 @@ def put(tree: Any, rows: np.ndarray, values: Any) -> Any:
 def are_equal(tree: Any, other: Any) -> bool:
   """Returns True if two trees have the same structure and equal values.
 
-  A nan is equal to a nan.
+  A nan is equal to a nan. Values that cannot be compared are not equal.
   """
   if type(tree) is not type(other):
     return False
@@ -68,4 +68,7 @@ def are_equal(tree: Any, other: Any) -> bool:
     return tree.dtype == other.dtype and np.array_equal(
         tree, other, equal_nan=tree.dtype.kind in 'fc'
     )
-  return bool(tree == other)
+  try:
+    return bool(tree == other)
+  except Exception:  # Objects may raise any class.
+    return False
