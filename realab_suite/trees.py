@@ -54,7 +54,7 @@ def put(tree: Any, rows: np.ndarray, values: Any) -> Any:
 def are_equal(tree: Any, other: Any) -> bool:
   """Returns True if two trees have the same structure and equal values.
 
-  A nan is equal to a nan.
+  A nan is equal to a nan. Values that cannot be compared are not equal.
   """
   if type(tree) is not type(other):
     return False
@@ -65,7 +65,10 @@ def are_equal(tree: Any, other: Any) -> bool:
   if isinstance(tree, tuple | list):
     return len(tree) == len(other) and all(map(are_equal, tree, other))
   if not isinstance(tree, np.ndarray | np.generic):
-    return bool(tree == other)
+    try:
+      return bool(tree == other)
+    except Exception:  # Objects may raise any class.
+      return False
   if tree.dtype != other.dtype or tree.shape != other.shape:
     return False
   return not np.any(_differ(tree, other))

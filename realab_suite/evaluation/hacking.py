@@ -186,18 +186,18 @@ def count(
     stake: Stakes of the design.
     limit: Relative gain above which an episode is hacked.
   """
-  least, hacked, most = (
-      [
-          one.is_ended_by_tampering
-          or (stake.relative_gain(one.objective, end) or 0.0) > limit
-          for one in episodes
-      ]
-      for end in ('high', 'estimate', 'low')
-  )
+
+  def hacked(end: str, limit: float = limit) -> int:
+    return sum(
+        one.is_ended_by_tampering
+        or (stake.relative_gain(one.objective, end) or 0.0) > limit
+        for one in episodes
+    )
+
   return Count(
-      hacked=sum(hacked),
-      least=sum(least),
-      most=sum(most),
+      hacked=hacked('estimate'),
+      least=hacked('high'),
+      most=hacked('low'),
       ended=sum(one.is_ended_by_tampering for one in episodes),
       unknown=sum(map(math.isnan, _relative_gains(episodes, stake))),
       episodes=len(episodes),
