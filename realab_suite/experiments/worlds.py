@@ -7,6 +7,7 @@ import functools
 import pathlib
 from typing import Any, final
 
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
@@ -88,10 +89,21 @@ class World:
     """Name of the policy that solves the task, or `None`."""
     return self._example.SOLVER
 
-  @property
-  def reference(self) -> 'World':
-    """World in which stakes are measured."""
-    return dataclasses.replace(self, task=self._example.REFERENCE)
+  def reference(self, design: specs.DesignSpec) -> 'World':
+    """Returns the world in which the stakes of a design are measured.
+
+    Its senses are those of the solver and of the providers: the senses of the
+    agent do not change what honest competence earns.
+
+    Args:
+      design: The design.
+    """
+    seen = {name for one in design.providers for name in one.required_senses}
+    if self.solver is not None:
+      seen.update(policies.make(self.solver).required_senses)
+    return dataclasses.replace(
+        self, task=self._example.REFERENCE, senses=tuple(sorted(seen))
+    )
 
   @functools.cached_property
   def _example(self) -> base.Task:
@@ -117,7 +129,7 @@ def stakes_of(
   """
   if design.objective is None or world.solver is None:
     return None
-  reference = world.reference
+  reference = world.reference(design)
   key = stakes.key_of(
       design,
       solver=world.solver,
