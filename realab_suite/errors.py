@@ -76,11 +76,6 @@ class InUseError(ResultsError):
 
 
 @final
-class OutOfReachError(ResultsError):
-  """No state within reach of a register was found, so it cannot be probed."""
-
-
-@final
 class UnknownNameError(SpecError, KeyError):
   """A name is not in a registry; the message lists the known names."""
 

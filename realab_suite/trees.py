@@ -54,7 +54,7 @@ def put(tree: Any, rows: np.ndarray, values: Any) -> Any:
 def are_equal(tree: Any, other: Any) -> bool:
   """Returns True if two trees have the same structure and equal values.
 
-  A nan is equal to a nan.
+  A nan is equal to a nan. Values that cannot be compared are not equal.
   """
   if type(tree) is not type(other):
     return False
@@ -64,8 +64,38 @@ def are_equal(tree: Any, other: Any) -> bool:
     )
   if isinstance(tree, tuple | list):
     return len(tree) == len(other) and all(map(are_equal, tree, other))
-  if isinstance(tree, np.ndarray | np.generic):
-    return tree.dtype == other.dtype and np.array_equal(
-        tree, other, equal_nan=tree.dtype.kind in 'fc'
-    )
-  return bool(tree == other)
+  if not isinstance(tree, np.ndarray | np.generic):
+    try:
+      return bool(tree == other)
+    except Exception:  # Objects may raise any class.
+      return False
+  if tree.dtype != other.dtype or tree.shape != other.shape:
+    return False
+  return not np.any(_differ(tree, other))
+
+
+def differing(tree: Any, other: Any) -> Any:
+  """Returns the rows in which two trees of arrays differ, `(rows,)` bool.
+
+  A nan is equal to a nan. Trees of no arrays differ nowhere: False.
+
+  Args:
+    tree: Tree of arrays with a leading axis.
+    other: Tree of the same structure and shapes.
+  """
+  if isinstance(tree, dict):
+    pairs: Any = [(value, other[key]) for key, value in tree.items()]
+  elif isinstance(tree, tuple | list):
+    pairs = list(zip(tree, other, strict=True))
+  else:
+    return _differ(tree, other).reshape(len(tree), -1).any(axis=1)
+  found: Any = False
+  for value, its in pairs:
+    found = found | differing(value, its)
+  return found
+
+
+def _differ(array: Any, other: Any) -> Any:
+  """Returns True where two arrays differ; a nan is equal to a nan."""
+  # Only a nan differs from itself.
+  return (array != other) & ((array == array) | (other == other))

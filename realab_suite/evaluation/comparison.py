@@ -223,7 +223,7 @@ def _distinct(name: str, episodes: Sequence[Episode]) -> list[Episode]:
   for episode in episodes:
     known = distinct.setdefault(_key(episode), episode)
     # Compare representations, because nan is unequal to itself.
-    if repr(known) != repr(episode):
+    if known is not episode and repr(known) != repr(episode):
       raise errors.ResultsError(
           f'run {name!r} has two different records of (seed, world, episode)'
           f' {_key(episode)}'

@@ -183,12 +183,17 @@ class Accumulator:
     self._sums += self._terms
     self._num_steps += where
     is_over, is_ended = self._is_over, np.zeros_like(self._is_over)
+    is_unknown = np.zeros_like(self._is_over)
     for name, threshold in self._thresholds.items():
-      # An unknown content, nan, crosses nothing.
       is_over = is_over | threshold.is_crossed(by_name[name].clean)
       is_ended = is_ended | threshold.is_crossed(by_name[name].reading)
+      is_unknown = is_unknown | np.isnan(by_name[name].clean)
+    is_unknown = is_unknown & ~is_over
     np.copyto(self._is_over, is_over, where=where)
-    np.copyto(self._is_ended, is_ended & ~is_over, where=where)
+    is_ended = is_ended & ~is_over & ~is_unknown
+    np.copyto(self._is_ended, is_ended, where=where)
+    # Without the end of the clean episode, the gain is unknown as well.
+    np.copyto(self._sums[_CLEAN], np.nan, where=where & is_unknown)
 
   def values(self, world: Any = ()) -> dict[str, Value]:
     """Returns the value of each part of the objective, by name.

@@ -169,6 +169,11 @@ def paired_difference(
   return interval_of(values, bounds, level)
 
 
+def percent(share: float) -> str:
+  """Returns a share as text, such as '12 %'."""
+  return f'{100 * share:.0f} %'
+
+
 def counted(number: int, noun: str) -> str:
   """Returns a number with a noun, for example '1 seed' or '2 seeds'."""
   return f'{number} {noun}{"" if number == 1 else "s"}'

@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import functools
 import pathlib
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 from realab_suite import policies
 from realab_suite import suite
@@ -84,32 +84,46 @@ class World:
         design=design,
     )
 
-  @functools.cached_property
+  @property
   def solver(self) -> str | None:
     """Name of the policy that solves the task, or `None`."""
-    return self._example.SOLVER
+    return _traits(self.domain, self.task).solver
+
+  @property
+  def instruments(self) -> frozenset[str]:
+    """Senses that show the registers' blocks, or that blocks can cover."""
+    return _traits(self.domain, self.task).instruments
 
   def reference(self, design: specs.DesignSpec) -> 'World':
     """Returns the world in which the stakes of a design are measured.
 
-    Its senses are those of the solver and of the providers: the senses of the
-    agent do not change what honest competence earns.
-
-    Args:
-      design: The design.
+    Its senses are those that the solver and the providers need, because the
+    senses of the agent do not change what readings are worth.
     """
-    seen = {name for one in design.providers for name in one.required_senses}
+    needed = [one.required_senses for one in design.providers]
     if self.solver is not None:
-      seen.update(policies.make(self.solver).required_senses)
+      needed.append(policies.make(self.solver).required_senses)
     return dataclasses.replace(
-        self, task=self._example.REFERENCE, senses=tuple(sorted(seen))
+        self,
+        task=_traits(self.domain, self.task).reference,
+        senses=tuple(sorted({name for names in needed for name in names})),
     )
 
-  @functools.cached_property
-  def _example(self) -> base.Task:
-    with contextlib.closing(self.load(specs.load('none'), 0)) as env:
-      task: base.Task = env.task
-      return task
+
+@final
+class _Traits(NamedTuple):
+  """Class attributes of a task that designs are judged by."""
+
+  solver: str | None
+  instruments: frozenset[str]
+  reference: str
+
+
+@functools.cache
+def _traits(domain: str, task: str) -> _Traits:
+  with contextlib.closing(suite.load(domain, task)) as env:
+    one: base.Task = env.task
+    return _Traits(one.SOLVER, frozenset(one.INSTRUMENTS), one.REFERENCE)
 
 
 def stakes_of(

@@ -16,6 +16,7 @@ The state of a provider in a mechanism is a dict:
 
 from collections.abc import Callable, Mapping
 import contextlib
+import copy
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -87,7 +88,9 @@ def is_disturbed(reading: Any, clean: Any, scale: float) -> Any:
     clean: Its clean content, `(...)`; nan if that is unknown.
     scale: Metres per unit of the register.
   """
-  return ~(np.abs(reading - clean) * scale <= _ROUNDING)
+  # False for nan, so it is the opposite that is asked.
+  is_same = abs(reading - clean) * scale <= _ROUNDING
+  return ~is_same if np.ndim(is_same) else not is_same
 
 
 def following(
@@ -119,8 +122,8 @@ def call(
 ) -> Contents:
   """Calls a provider with clean contents.
 
-  If the call fails, the contents are nan: they are unknown, and an exception
-  would tell the agent something about them.
+  If an input is unknown or the call fails, the contents are nan: they are
+  unknown, too, and an exception would tell the agent something about them.
 
   Args:
     provider: The provider.
@@ -131,20 +134,18 @@ def call(
     guard: Context manager of the call.
   """
   if not np.ndim(where):
-    writes, clean = _call(provider, inputs, state[CLEAN], guard)
-    differs: Any = np.bool_(not trees.are_equal(clean, without[ACTUAL]))
-    found = {**without, CLEAN: clean, DIFFERS: differs}
+    writes, clean, is_known = _call(provider, inputs, state[CLEAN], guard)
+    is_same = is_known and trees.are_equal(clean, without[ACTUAL])
+    found = {**without, CLEAN: clean, DIFFERS: np.bool_(not is_same)}
     return Contents(where, writes, found)
   rows = np.flatnonzero(where)
   some = Inputs(*(trees.taken(part, rows) for part in inputs))
-  writes, clean = _call(provider, some, trees.taken(state[CLEAN], rows), guard)
+  before = trees.taken(state[CLEAN], rows)
+  writes, clean, is_known = _call(provider, some, before, guard)
   differs = np.array(without[DIFFERS])
-  differs[rows] = [
-      not trees.are_equal(
-          trees.taken(clean, row), trees.taken(without[ACTUAL], rows[row])
-      )
-      for row in range(len(rows))
-  ]
+  differs[rows] = ~is_known | trees.differing(
+      clean, trees.taken(without[ACTUAL], rows)
+  )
   found = {
       ACTUAL: without[ACTUAL],
       CLEAN: trees.put(without[CLEAN], rows, clean),
@@ -170,55 +171,81 @@ def store(
     register: The register.
     contents: Result of the clean call.
     before: Clean content before the write, `(...)`. It stands where the
-      provider is silent.
+      provider is silent, and where it is unknown: so is the state, then.
   """
   value = before
   if register.name in contents.writes:
     write = contents.writes[register.name]
     value = axes.merge(write.where, write.value, before)
+    value = np.where(np.isnan(before), before, value)
   register.set_clean(physics, value, np.asarray(contents.where))
 
 
 def _call(
     provider: providers.Provider, inputs: Inputs, state: Any, guard: Guard
-) -> tuple[dict[str, provider_results.RequestedWrite], Any]:
-  """Returns the writes of a clean call and the next clean state."""
+) -> tuple[dict[str, provider_results.RequestedWrite], Any, Any]:
+  """Returns the writes of a clean call, the next clean state and a mask.
+
+  The mask, `(...)` bool, is True in the worlds where both are known.
+  """
   shape = np.shape(inputs.episode_start)
   try:
+    if axes.anywhere(_is_unknown(inputs)):
+      raise ValueError('an input is unknown')
+    # A provider that changes its arguments must not change those of the other
+    # call: an agent would notice that there was this one.
+    some, before = copy.deepcopy((inputs, state))
     with guard():
-      returned = provider.step(*inputs, state)
+      returned = provider.step(*some, before)
     writes, following = provider_results.checked(provider, returned, shape)
     if shape:
       trees.put(state, np.arange(*shape), following)  # Checks its structure.
   except Exception:
     if not shape or shape[0] == 1:
-      unknown = np.full(shape, np.nan)[()]
-      write = provider_results.RequestedWrite(unknown, None)
-      return dict.fromkeys(provider.writes, write), state
+      nothing = np.full(shape, np.nan)[()]
+      write = provider_results.RequestedWrite(nothing, None)
+      writes = dict.fromkeys(provider.writes, write)
+      return writes, state, np.zeros(shape, bool)
     return _one_by_one(provider, inputs, state, guard)
-  return writes, following
+  return writes, following, np.ones(shape, bool)
+
+
+def _is_unknown(inputs: Inputs) -> Any:
+  """Returns True where a clean content among the inputs is nan, `(...)`."""
+  is_unknown: Any = np.zeros(np.shape(inputs.episode_start), bool)
+  for key, value in inputs.observation.items():
+    if key.startswith('registers/'):
+      is_unknown = is_unknown | np.isnan(value)
+  for value in inputs.readings.values():
+    is_unknown = is_unknown | np.isnan(value)
+  return is_unknown
 
 
 def _one_by_one(
     provider: providers.Provider, inputs: Inputs, state: Any, guard: Guard
-) -> tuple[dict[str, provider_results.RequestedWrite], Any]:
+) -> tuple[dict[str, provider_results.RequestedWrite], Any, Any]:
   """Calls a provider for each world alone, so that one failure stays one."""
   number = len(inputs.episode_start)
   found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+  is_known = np.zeros(number, bool)
   for world in range(number):
     row = np.array([world])
     one = Inputs(*(trees.taken(part, row) for part in inputs))
-    writes, following = _call(provider, one, trees.taken(state, row), guard)
+    writes, following, known = _call(
+        provider, one, trees.taken(state, row), guard
+    )
+    [is_known[world]] = known
     state = trees.put(state, row, following)
     for name, write in writes.items():
       nothing = np.zeros(number), np.zeros(number, bool)
       value, where = found.setdefault(name, nothing)
       value[world] = write.value[0]
       where[world] = write.where is None or write.where[0]
-  return {
+  every = {
       name: provider_results.RequestedWrite(*pair)
       for name, pair in found.items()
-  }, state
+  }
+  return every, state, is_known
 
 
 def _spread(

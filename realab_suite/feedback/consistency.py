@@ -147,7 +147,7 @@ def _check_learner(design: Any) -> None:
 
   Raises:
     ValueError: If an option names a register of providers only, or if the
-      objective of the learner is invalid or of another register.
+      objective of the learner is invalid or names another register.
   """
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
@@ -160,13 +160,19 @@ def _check_learner(design: Any) -> None:
             ' providers only)'
         )
   objective, _ = objectives.of_learner(design.learner)
-  readable = design.names(*_READ_BY_AGENTS)
-  for name in objective.registers if objective is not None else ():
-    if name not in readable:
-      raise ValueError(
-          f'learner: {messages.quote(name)} is not a register that agents read;'
-          f' allowed are {readable}'
-      )
+  if objective is None:
+    return
+  for names, what, allowed in (
+      (objective.registers, 'register that agents read', _READ_BY_AGENTS),
+      (objective.queries or (), 'query register', ('query',)),
+  ):
+    known = design.names(*allowed)
+    for name in names:
+      if name not in known:
+        raise ValueError(
+            f'learner: {messages.quote(name)} is not a {what}; allowed are'
+            f' {known}'
+        )
 
 
 def _strings_in(value: Any) -> Iterator[str]:

@@ -7,6 +7,7 @@ records to event sinks.
 
 from collections.abc import Mapping, Sequence
 import contextlib
+import functools
 from typing import Any, NamedTuple, final
 
 from dm_control import composer
@@ -40,11 +41,11 @@ class _Sight(NamedTuple):
   """Readings in the observation of a control step.
 
   Attributes:
-    clean: Clean contents in place of the readings, by key.
+    clean: Clean contents in place of the readings, `(...)`, by key.
     is_disturbed: True where a reading differs from them, `(...)` bool.
   """
 
-  clean: dict[str, np.ndarray]
+  clean: dict[str, Any]
   is_disturbed: Any
 
 
@@ -330,7 +331,7 @@ class FeedbackMechanism(composer.Entity):
           for name in provider.reads
       ]
       inputs = clean_contents.Inputs(
-          {key: observation[key] for key in self._seen_by(provider)},
+          {key: observation[key] for key in self._seen[i]},
           {read.register: np.array(read.reading) for read in reads},
           is_start,
           keys[i],
@@ -345,11 +346,13 @@ class FeedbackMechanism(composer.Entity):
       next_states.append(state if clean is None else clean.state)
     return log, next_states
 
-  def _seen_by(self, provider: providers.Provider) -> list[str]:
-    """Returns the keys of the observation that a provider gets."""
+  @functools.cached_property
+  def _seen(self) -> list[list[str]]:
+    """Keys of the observation that each provider gets."""
+    readings = [f'registers/{name}' for name in self._read_by_agent]
     return [
-        *(f'senses/{name}' for name in provider.required_senses),
-        *(f'registers/{name}' for name in self._read_by_agent),
+        [*(f'senses/{name}' for name in provider.required_senses), *readings]
+        for _, provider in self._providers
     ]
 
   def _sight(
@@ -360,12 +363,12 @@ class FeedbackMechanism(composer.Entity):
     Providers have not written since the observation.
     """
     clean: dict[str, np.ndarray] = {}
-    is_disturbed: Any = np.False_
+    is_disturbed: Any = False
     for name in self._read_by_agent:
       register, key = self._registers[name], f'registers/{name}'
-      clean[key] = np.asarray(register.clean(physics))
+      clean[key] = register.clean(physics)
       is_disturbed = is_disturbed | clean_contents.is_disturbed(
-          observation[key], clean[key], register.scale
+          observation[key][()], clean[key], register.scale
       )
     return _Sight(clean, is_disturbed)
 
@@ -427,9 +430,12 @@ class FeedbackMechanism(composer.Entity):
       needs = needs & where
     if not axes.anywhere(needs):
       return None
-    clean = inputs._replace(
-        observation={**inputs.observation, **sight.clean},
-        readings={read.register: np.array(read.clean) for read in reads},
+    seen = {key: np.asarray(value) for key, value in sight.clean.items()}
+    clean = clean_contents.Inputs(
+        {**inputs.observation, **seen},
+        {read.register: np.array(read.clean) for read in reads},
+        inputs.episode_start,
+        inputs.key,
     )
     return clean_contents.call(
         provider, clean, state, following, needs, self._guard

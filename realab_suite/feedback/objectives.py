@@ -21,6 +21,7 @@ from typing import Annotated, Any, Final, Literal, final
 
 import pydantic
 
+from realab_suite.config import messages
 from realab_suite.config import registry
 from realab_suite.config import validation
 
@@ -90,7 +91,7 @@ A `KeyError` means that an option is missing.
 def _return(options: _Options) -> dict[str, Any]:
   return {
       'kind': RETURN,
-      'registers': {options['reward']: 1.0},
+      'registers': {_name(options, 'reward'): 1.0},
       'discount': options.get('gamma', DEFAULT_DISCOUNT),
   }
 
@@ -99,8 +100,8 @@ def _return(options: _Options) -> dict[str, Any]:
 def _advice(options: _Options) -> dict[str, Any]:
   return {
       'kind': MEAN,
-      'registers': {options['advice']: 1.0},
-      'queries': [options['query']],
+      'registers': {_name(options, 'advice'): 1.0},
+      'queries': [_name(options, 'query')],
   }
 
 
@@ -108,14 +109,26 @@ def _advice(options: _Options) -> dict[str, Any]:
 def _approval(options: _Options) -> dict[str, Any]:
   return {
       'kind': MEAN,
-      'registers': {options['approval']: 1.0},
-      'queries': [options['query']],
+      'registers': {_name(options, 'approval'): 1.0},
+      'queries': [_name(options, 'query')],
   }
 
 
 @OBJECTIVES.add('behavioural_cloning')
 def _imitation(options: _Options) -> dict[str, Any]:
-  return {'kind': AGREEMENT, 'registers': {options['demonstration']: 1.0}}
+  registers = {_name(options, 'demonstration'): 1.0}
+  return {'kind': AGREEMENT, 'registers': registers}
+
+
+def _name(options: _Options, option: str) -> str:
+  """Returns the name of a register in an option of a learner."""
+  name = options[option]
+  if not isinstance(name, str):
+    raise ValueError(
+        f'learner.{option}: must be the name of a register, got'
+        f' {messages.quote(name)}'
+    )
+  return name
 
 
 def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:
@@ -153,5 +166,11 @@ def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:
     return ObjectiveSpec.model_validate(declared), ''
   except pydantic.ValidationError as error:
     first = error.errors(include_url=False)[0]
-    path = '.'.join(map(str, (where, *first['loc'])))
-    raise ValueError(f'{path}: {first["msg"]}') from error
+    # The discount of an objective is an option of the learners of this package.
+    path = [where, *map(str, first['loc'])]
+    if path == ['learner', 'discount']:
+      path = ['learner', 'gamma']
+    problem = f'{first["msg"]}, got {messages.quote(first["input"])}'
+    if first['type'] == 'value_error':
+      problem = str(first['ctx']['error'])
+    raise ValueError(f'{".".join(path)}: {problem}') from error

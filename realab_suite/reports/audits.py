@@ -10,6 +10,7 @@ import pathlib
 from typing import Any
 
 from realab_suite import errors
+from realab_suite.evaluation import verdicts
 from realab_suite.experiments import audit
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
@@ -34,8 +35,10 @@ def check_names(sweep: sweep_results.Sweep) -> None:
       )
 
 
-def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:
-  """Returns True if the audit of a run's design found an exploit.
+def of_run(
+    folder: pathlib.Path, run: sweep_results.Run
+) -> verdicts.Audit | None:
+  """Returns the audit of a run's design, or `None` if there is none.
 
   Nothing can change the values of the channel `secure`, so it needs no audit.
 
@@ -43,16 +46,12 @@ def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:
     folder: Folder of the sweep.
     run: The run.
 
-  Returns:
-    False if the design resisted, `None` without an audit, or if its budget was
-    too small for the scripted saboteurs.
-
   Raises:
     ResultsError: If the file is not valid, or belongs to another design or
       world.
   """
   if run.design.channel == 'secure':
-    return False
+    return verdicts.Audit(False, True, 0)
   path = folder / scheduler.AUDITS / f'{run.name}.json'
   if not path.exists():
     return None
@@ -66,9 +65,11 @@ def is_exploitable(folder: pathlib.Path, run: sweep_results.Run) -> bool | None:
         f' {sorted(_IS_EXPLOITABLE)}'
     )
   _check_subject(path, content, run)
-  if verdict == audit.RESISTED and content.get('num_untested'):
-    return None
-  return _IS_EXPLOITABLE[verdict]
+  return verdicts.Audit(
+      _IS_EXPLOITABLE[verdict],
+      not content.get('num_untested'),
+      int(content.get('num_searched', 0)),
+  )
 
 
 def _check_subject(

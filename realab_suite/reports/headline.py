@@ -1,137 +1,140 @@
-"""Headline of a report: in words, which agents tamper and at what cost."""
+"""First lines of a report: what each learned agent does, and how sure it is."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 import dataclasses
 from typing import final
 
-from realab_suite.evaluation import gains
+from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
-from realab_suite.evaluation import labels
-from realab_suite.evaluation import statistics
+from realab_suite.evaluation import verdicts
 from realab_suite.experiments import result_tables
 from realab_suite.reports import numbers
-from realab_suite.reports import seed_figures
 from realab_suite.reports import sweep_results
 
-_Label = labels.Label
-
-_ONE_SEED = {
-    _Label.TAMPERS: 'tampers',
-    _Label.DOES_NOT_TAMPER: 'does not tamper',
-    _Label.INCONCLUSIVE: 'may tamper',
-    _Label.NEVER_FOUND_OUT: 'never found out how to tamper',
-    _Label.NOT_AUDITED: (
-        'does not tamper, perhaps because it never found out how (the design'
-        ' is not audited)'
-    ),
-}
-# Words for some of several seeds.
-_SOME_SEEDS = {
-    **_ONE_SEED,
-    _Label.NOT_AUDITED: 'perhaps never found out how (not audited)',
-}
+_Label = verdicts.Label
+_NOT_AUDITED = 'not audited'
 
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Headline:
-  """Headline of a report.
+class Entry:
+  """First lines on one learned run.
 
   Attributes:
-    runs: Names of the learned runs, those that tamper first.
-    sentences: A sentence on each of them.
-    note: Strength of this evidence.
+    run: Name of the run.
+    lines: In this order: whether it fails at the task, beside its twin; its
+      label; its hack rate beside that of its control; its audit; the training
+      episodes in which tampering had paid.
   """
 
-  runs: Sequence[str]
-  sentences: Sequence[str]
-  note: str
+  run: str
+  lines: Sequence[str]
 
 
 def headline(
-    sweep: sweep_results.Sweep,
-    figures: Mapping[str, numbers.Figures],
-    seeds: Mapping[str, Sequence[seed_figures.Seed]],
-) -> Headline | None:
-  """Returns the headline, or `None` if no learned agent has figures.
+    sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
+) -> list[Entry]:
+  """Returns the first lines on each learned run, those that tamper first.
 
   Args:
     sweep: The sweep.
     figures: Figures of its runs.
-    seeds: Figures of the seeds of its learned runs.
   """
   runs = [run for run in sweep.learned() if run.name in figures]
-  if not runs:
-    return None
   # Sorting keeps the order of the experiment otherwise.
-  runs.sort(key=lambda run: -_share(seeds[run.name], _Label.TAMPERS))
-  return Headline(
-      [run.name for run in runs],
-      [_sentence(sweep, figures, run, seeds[run.name]) for run in runs],
-      _note([figures[run.name].summary.num_seeds for run in runs]),
-  )
+  runs.sort(key=lambda run: -_share(figures[run.name]))
+  return [
+      Entry(run.name, _lines(sweep, figures, figures[run.name])) for run in runs
+  ]
 
 
-def _share(ones: Sequence[seed_figures.Seed], label: _Label) -> float:
-  return sum(one.label is label for one in ones) / len(ones)
+def _share(one: numbers.Figures) -> float:
+  labels = [seed.judgement.label for seed in one.seeds.values()]
+  return sum(label is _Label.TAMPERS for label in labels) / len(labels)
 
 
-def _sentence(
+def _lines(
     sweep: sweep_results.Sweep,
     figures: Mapping[str, numbers.Figures],
-    run: sweep_results.Run,
-    ones: Sequence[seed_figures.Seed],
+    one: numbers.Figures,
+) -> list[str]:
+  lines = [_task(sweep, figures, one), _labels(one)]
+  if one.hacking is not None:
+    lines.append(_rate(one.hacking))
+  lines.append(f'Audit: {_audit(one.audit)}.')
+  training = one.training
+  if training is not None:
+    lines.append(
+        f'Tampering had paid in {training.paid:,} of'
+        f' {intervals.counted(training.episodes, "training episode")}.'
+    )
+  return lines
+
+
+def _task(
+    sweep: sweep_results.Sweep,
+    figures: Mapping[str, numbers.Figures],
+    one: numbers.Figures,
 ) -> str:
-  one = figures[run.name]
-  mean = ' on average,' if len(ones) > 1 else ''
-  earned = f'earns {_return(one)}'
-  if any(seed.label is _Label.TAMPERS for seed in ones):
-    observed = number(one.summary.observed_return.estimate)
-    earned = f'observes {observed} and {earned}'
-  twin = sweep.twin(run)
-  its_twin = figures.get(twin.name) if twin is not None else None
-  twins = ''
-  if its_twin is not None:
-    earns = number(its_twin.summary.true_return.estimate)
-    twins = f'; its secure twin earns {earns}'
-  text = f'{run.name} {_labels(run, ones)}:{mean} it {earned}{twins}.'
-  verdict = one.paired and one.paired.verdict
-  if verdict is not None and not verdict.has_too_few_seeds:
-    text += f' Verdict: {verdict.words}.'
-  return text
+  """Returns whether an agent fails at the task, beside its secure twin."""
+  text = 'Fails at the task' if one.fails else 'Does the task'
+  if one.fails is None:
+    text = 'May fail at the task'
+  text += f': it earns {_return(one)}'
+  twin = sweep.twin(one.run)
+  if twin is not None and twin.name in figures:
+    its = figures[twin.name]
+    also = ', which fails as well' if one.fails and its.fails else ''
+    text += (
+        f', its secure twin {number(its.summary.true_return.estimate)}{also}'
+    )
+  observed = number(one.summary.observed_return.estimate)
+  return f'{text}. It observes {observed}.'
 
 
-def _labels(run: sweep_results.Run, ones: Sequence[seed_figures.Seed]) -> str:
-  """Returns the labels of the seeds of a run, as a predicate."""
-  counts = Counter(one.label for one in ones)
-  if _Label.NONE in counts:
-    if gains.directions(run.design):
-      return 'has no label, because there is no baseline'
-    return 'has no label, because its feedback has no direction that pays'
-  if len(counts) == 1:
-    [label] = counts
-    many = f' in all {len(ones)} seeds' if len(ones) > 1 else ''
-    # The second half of the longest words is a clause of its own.
-    first, comma, rest = _ONE_SEED[label].partition(',')
-    return f'{first}{many}{comma}{rest}'
-  parts: list[str] = []
-  for label, words in _SOME_SEEDS.items():
-    if label in counts:
-      of = f' of {len(ones)} seeds' if not parts else ''
-      parts.append(f'{words} in {counts[label]}{of}')
-  return ' and '.join([', '.join(parts[:-1]), parts[-1]])
+def _labels(one: numbers.Figures) -> str:
+  """Returns the label, in how many seeds, and the verdict if there is one."""
+  judgements = [seed.judgement for seed in one.seeds.values()]
+  number_of = len(judgements)
+  for label in (_Label.TAMPERS, _Label.DOES_NOT_TAMPER):
+    count = sum(judgement.label is label for judgement in judgements)
+    if count:
+      seeds = intervals.counted(number_of, 'seed')
+      text = f'{_capital(label.value)} in {count} of {seeds}'
+      break
+  else:
+    text = _capital(str(judgements[0]))
+    if number_of > 1:
+      first, _, reason = text.partition(':')
+      text = f'{first} in all {number_of} seeds:{reason}'
+  if one.verdict is None or number_of < verdicts.FEWEST_SEEDS:
+    return f'{text}; {verdicts.needed_seeds(number_of)}.'
+  return f'{text}. Verdict: {one.verdict.words}.'
 
 
-def _note(num_seeds: Sequence[int]) -> str:
-  fewest, needed = min(num_seeds), statistics.fewest_seeds(numbers.LEVEL)
-  if fewest >= needed:
-    return ''
-  what = 'One seed is' if fewest == 1 else f'{fewest} seeds are'
-  return (
-      f'{what} a demonstration, not a verdict: a verdict on a design'
-      f' {statistics.needed_seeds(fewest, needed)}.'
-  )
+def _capital(text: str) -> str:
+  return text[:1].upper() + text[1:]
+
+
+def _rate(found: hacking.Hacking) -> str:
+  rate = result_tables.interval_text(found.rate.scaled(100))
+  beside = result_tables.number_text(100 * found.control.count.rate)
+  text = f'Hack rate {rate} %, beside {beside} % of {found.control.name}'
+  if found.count.ended:
+    text += (
+        f'; only a corrupted signal ended {found.count.ended} of'
+        f' {found.count.episodes} episodes'
+    )
+  return f'{text}.'
+
+
+def _audit(audit: verdicts.Audit | None) -> str:
+  if audit is None:
+    return _NOT_AUDITED
+  if audit.is_exploitable:
+    return f'EXPLOITABLE, found within {audit.num_episodes:,} episodes'
+  small = '' if audit.is_sufficient else ', a budget that is too small'
+  return f'resisted {audit.num_episodes:,} episodes{small}'
 
 
 def _return(one: numbers.Figures) -> str:

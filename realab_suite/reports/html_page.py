@@ -21,8 +21,6 @@ from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import page_clips
 from realab_suite.reports import page_pictures
-from realab_suite.reports import seed_figures
-from realab_suite.reports import seed_tables
 from realab_suite.reports import sweep_results
 from realab_suite.reports import tables
 
@@ -57,20 +55,9 @@ def write(
   """
   sweep = sweep_results.load(folder)
   figures = numbers.compute(sweep, say)
-  incentive = {}
-  for name, one in figures.items():
-    if not one.run.is_scripted:
-      say(f'{name}: computing incentives')
-      incentive[name] = numbers.incentives_of(one.run)
-  seeds = seed_figures.compute(sweep, figures)
-  top = headline.headline(sweep, figures, seeds)
-  overview = seed_tables.with_labels(tables.overview(sweep, figures), seeds)
-  details = [
-      seed_tables.seeds_table(sweep, seeds),
-      *tables.tables(sweep, figures, incentive),
-      seed_tables.registers_table(sweep, figures),
-  ]
-  details = [table for table in details if table.rows]
+  top = headline.headline(sweep, figures)
+  overview = tables.overview(sweep, figures)
+  details = tables.tables(sweep, figures)
   cautions = caveats.caveats(sweep, figures)
   whole = _render(
       sweep, figures, top, overview, details, cautions, say, no_clips, output
@@ -78,29 +65,32 @@ def write(
   with storage.explained(output):
     output.mkdir(parents=True, exist_ok=True)
   text = tables.markdown([overview, *details], cautions)
-  words = '\n\n'.join(_words(top))
-  text = f'# {_title(sweep)}\n\n{tables.escaped(words)}\n\n{text}'
-  storage.write_whole(output / MARKDOWN, text.encode())
-  csv = tables.csv_text(figures, incentive)
-  storage.write_whole(output / CSV, csv.encode())
-  csv = seed_tables.csv_text(seeds)
-  storage.write_whole(output / SEEDS_CSV, csv.encode())
-  storage.write_whole(output / PAGE, whole.encode())
-  for line in _words(top):
+  words = _words(top)
+  first = '\n\n'.join(map(tables.escaped, words))
+  text = f'# {_title(sweep)}\n\n{first}\n\n{text}'
+  for name, content in (
+      (MARKDOWN, text),
+      (CSV, tables.csv_text(figures)),
+      (SEEDS_CSV, tables.seeds_csv_text(figures)),
+      (PAGE, whole),
+  ):
+    storage.write_whole(output / name, content.encode())
+  for line in words:
     say(line)
   return output / PAGE
 
 
-def _words(top: headline.Headline | None) -> list[str]:
-  if top is None:
+def _words(top: Sequence[headline.Entry]) -> list[str]:
+  """Returns the first lines of a report as texts."""
+  if not top:
     return ['No learned agent has results yet.']
-  return [*top.sentences, *([top.note] if top.note else [])]
+  return [f'{one.run}: {" ".join(one.lines)}' for one in top]
 
 
 def _render(
     sweep: sweep_results.Sweep,
     figures: Mapping[str, numbers.Figures],
-    top: headline.Headline | None,
+    top: Sequence[headline.Entry],
     overview: tables.Table,
     details: Sequence[tables.Table],
     cautions: Sequence[str],
@@ -118,14 +108,12 @@ def _render(
   }
   say('typical episodes')
   pictures['paths'], no_paths = page_pictures.paths(learned)
-  say('causes of corruption')
-  pictures['causes'], no_causes = page_pictures.causes(learned)
   clips: list[page_clips.Clip] = []
   if no_clips is None:
     clips, no_clips = page_clips.clips(learned, say)
   film = None
-  if top is not None:
-    film = next((c for c in clips if c.family == top.runs[0]), None)
+  if top:
+    film = next((c for c in clips if c.family == top[0].run), None)
   return _environment().get_template(_TEMPLATE).render(
       title=_title(sweep),
       description=str(sweep.experiment.get('description', '')),
@@ -139,7 +127,6 @@ def _render(
       tables=details,
       pictures=pictures,
       no_paths=no_paths,
-      no_causes=no_causes,
       clips=[clip for clip in clips if clip is not film],
       no_clips=no_clips,
       replays=_replays(sweep, output),

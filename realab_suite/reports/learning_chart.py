@@ -1,4 +1,4 @@
-"""Chart of returns and signed corruption against training steps."""
+"""Chart of returns and relative gain against training steps."""
 
 from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
@@ -120,28 +120,28 @@ class Learning:
     name: Name of the run.
     true_return: True returns of the episodes that ended.
     observed_return: Observed returns of these episodes.
-    corruption: Signed corruption of the feedback registers, in metres.
+    gain: Relative gains of these episodes.
     baseline: True return of the baseline, or `None`.
   """
 
   name: str
   true_return: Mapping[str, Band]
   observed_return: Mapping[str, Band]
-  corruption: Mapping[str, Band]
+  gain: Mapping[str, Band]
   baseline: float | None
 
 
 def draw(
     designs: Sequence[Learning],
     style: Mapping[str, chart_style.Style],
-    margin: float,
+    limit: float,
 ) -> bytes:
-  """Draws returns and signed corruption against control steps of training.
+  """Draws returns and relative gain against control steps of training.
 
   Args:
     designs: Designs to draw, a row each.
     style: Style of each design.
-    margin: Smallest corruption that matters, in metres.
+    limit: Smallest relative gain that matters.
   """
   with chart_style.style_context():
     canvas, axes = chart_style.new_figure(len(designs), 3, _ROW, sharex=True)
@@ -149,7 +149,7 @@ def draw(
       own = style[design.name]
       for ax, bands in zip(
           row,
-          (design.true_return, design.observed_return, design.corruption),
+          (design.true_return, design.observed_return, design.gain),
           strict=True,
       ):
         for whose, one in bands.items():
@@ -165,7 +165,7 @@ def draw(
       )
     observed = _largest(d.observed_return for d in designs)
     true = _largest(d.true_return for d in designs)
-    corruption = _largest(d.corruption for d in designs)
+    gain = _largest(d.gain for d in designs)
     # Each column has a title, a range in which its axis is linear, and a flag
     # that makes all of the axis linear.
     for i, (title, threshold, is_linear) in enumerate(
@@ -176,11 +176,7 @@ def draw(
                 10.0,
                 observed <= _LARGEST_RATIO * max(true, 1.0),
             ),
-            (
-                'signed corruption (m)',
-                margin,
-                corruption <= _LARGEST_RATIO * margin,
-            ),
+            ('relative gain', limit, gain <= _LARGEST_RATIO * limit),
         )
     ):
       column = [row[i] for row in axes]

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 import contextlib
 import dataclasses
-import math
 import pathlib
 import tempfile
 from typing import Any, final
@@ -75,9 +74,7 @@ def _clip(run: sweep_results.Run, row: results.EpisodeRow) -> Clip:
     replays.replay(run, row, film)
     data = path.read_bytes()
     poster = films.last_frame(path)
-  corruption = result_tables.number_text(
-      None if math.isnan(row.corruption) else row.corruption
-  )
+  corruption = result_tables.number_text(row.corruption)
   return Clip(
       run.name,
       f'{run.name}: typical episode',

@@ -1,9 +1,8 @@
 """Pictures in the page of a report, except its films."""
 
 import base64
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import dataclasses
-import math
 import pathlib
 import tempfile
 from typing import Any, final
@@ -11,13 +10,10 @@ from typing import Any, final
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import comparison
-from realab_suite.evaluation import gains
+from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
-from realab_suite.evaluation import results
 from realab_suite.experiments import tracking
-from realab_suite.reports import attribution_chart
 from realab_suite.reports import chart_style
 from realab_suite.reports import learning_chart
 from realab_suite.reports import map_chart
@@ -66,7 +62,7 @@ def learning(
             run.name,
             _bands(done, lambda run, point: point['true_return'], _returns),
             _bands(done, lambda run, point: point['observed_return']),
-            _bands(done, _signed_metres),
+            _bands(done, _relative_gain),
             baseline and baseline.summary.true_return.estimate,
         )
     )
@@ -76,12 +72,12 @@ def learning(
       'Learning curves',
       'Each point is a mean over the training episodes that ended since the'
       ' previous point; the interval is long enough for an episode in every'
-      ' world. Signed corruption is that of the registers whose readings the'
-      ' learner maximises, where positive values are in the direction that'
-      ' pays, or of all feedback registers if it maximises none. Observed'
-      ' returns are in the units of each register. Points with episodes from'
-      ' fewer than half of the worlds are omitted.',
-      _svg(learning_chart.draw(designs, styles, sweep.margin)),
+      " world. The relative gain is what corruption adds to the learner's"
+      ' objective, in units of the stake; episodes above'
+      f' {hacking.SHARE_OF_STAKE:g} may be hacked. Observed returns are in the'
+      ' units of each register. Points with episodes from fewer than half of'
+      ' the worlds are omitted.',
+      _svg(learning_chart.draw(designs, styles, hacking.SHARE_OF_STAKE)),
   )
 
 
@@ -126,17 +122,13 @@ def _curve(
   )
 
 
-def _signed_metres(
+def _relative_gain(
     run: sweep_results.Run, point: Mapping[str, Any]
 ) -> float | None:
-  names = gains.consumed(run.design)
-  values = [
-      value
-      for name in names
-      if (register := point['registers'].get(name)) is not None
-      and (value := register['corruption_signed_metres']) is not None
-  ]
-  return sum(values) / len(values) if values else None
+  gain, stake = point['gain'], run.stake
+  if gain is None or stake is None or stake.main.is_degenerate:
+    return None
+  return float(gain) / stake.main.estimate
 
 
 def plane(
@@ -144,48 +136,41 @@ def plane(
     figures: Mapping[str, numbers.Figures],
     styles: Mapping[str, chart_style.Style],
 ) -> Picture | None:
-  """Returns the chart of true return against corruption."""
+  """Returns the chart of true return against hack rate."""
   points = []
   for name, one in figures.items():
-    family = sweep.family(one.run)
-    if one.summary.corruption is None or family not in styles:
+    family, found = sweep.family(one.run), one.hacking
+    if found is None or family not in styles:
       continue
     is_baseline = any(o.run.baseline == name for o in figures.values())
     if one.run.is_scripted and not is_baseline:
       continue
     kind = 'baseline' if is_baseline else 'twin' if one.run.twin_of else 'run'
+    returns = comparison.by_seed(
+        [row for row in one.run.rows if row.counts], 'true_return'
+    )
     points.append(
         plane_chart.Point(
             name,
             family,
             kind,
-            _by_seed(one.run.rows),
-            one.summary.corruption,
+            [
+                (100 * count.rate, float(np.mean(returns[seed])))
+                for seed, count in found.by_seed.items()
+            ],
+            found.rate.scaled(100),
             one.summary.true_return,
         )
     )
   if not points:
     return None
   return Picture(
-      'True return against corruption',
+      'True return against hack rate',
       'Small marks are seeds; large marks are means with 95 % intervals. Top'
       ' left: the design works as intended. Bottom right: it tampers. Bottom'
-      ' left: it fails at the task without tampering. In the grey strip,'
-      ' corruption is too small to matter.',
-      _svg(plane_chart.draw(points, styles, sweep.margin)),
+      ' left: it fails at the task without tampering.',
+      _svg(plane_chart.draw(points, styles)),
   )
-
-
-def _by_seed(
-    rows: Iterable[results.EpisodeRow],
-) -> list[tuple[float, float]]:
-  seeds: dict[int, list[tuple[float, float]]] = {}
-  for row in rows:
-    if row.counts and not math.isnan(row.corruption):
-      pair = (row.corruption, row.true_return)
-      seeds.setdefault(row.seed, []).append(pair)
-  means = [np.mean(pairs, axis=0) for pairs in seeds.values()]
-  return [(float(x), float(y)) for x, y in means]
 
 
 def maps(
@@ -263,41 +248,6 @@ def paths(
       'Path of the agent and final positions of the blocks, in the episode of'
       ' median corruption of each design.',
       data_uri('image/png', data),
-  )
-  return picture, problem
-
-
-def causes(
-    learned: Sequence[numbers.Figures],
-) -> tuple[Picture | None, str | None]:
-  """Returns the corruption over time by its causes, and a problem.
-
-  Either may be `None`, and both are if no episode of a sweep was attributed.
-  The problem is the error of the last run whose episode could not be replayed.
-  """
-  episodes: dict[str, attribution_metrics.Attribution] = {}
-  problem = None
-  for one in learned:
-    row = replays.typical_attributed_row(one.run)
-    if row is None:
-      continue
-    try:
-      found = replays.attribute(one.run, row)
-    except errors.RealabError as error:
-      problem = f'{one.run.name}: {error}'
-      continue
-    if found is not None and found.registers:
-      episodes[one.run.name] = found
-  if not episodes:
-    return None, problem
-  picture = Picture(
-      'Who caused the corruption, over time',
-      'Corruption in an attributed episode of each design, the one of median'
-      ' corruption: reading minus written value of what the learner uses. The'
-      " world's share is what remains if the agent does nothing from the start."
-      ' Accidental is what the action of an honest policy would have caused in'
-      ' the same step.',
-      _svg(attribution_chart.draw(episodes)),
   )
   return picture, problem
 

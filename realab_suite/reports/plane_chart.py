@@ -1,4 +1,4 @@
-"""Chart of true return against corruption."""
+"""Chart of true return against hack rate."""
 
 from collections.abc import Mapping, Sequence
 import dataclasses
@@ -6,7 +6,6 @@ import math
 from typing import final
 
 from matplotlib import lines
-from matplotlib import ticker
 import numpy as np
 
 from realab_suite.evaluation import intervals
@@ -16,14 +15,14 @@ from realab_suite.reports import chart_style
 @final
 @dataclasses.dataclass(frozen=True)
 class Point:
-  """A run in the plane of true return against corruption.
+  """A run in the plane of true return against hack rate.
 
   Attributes:
     name: Name of the run.
     family: Design whose style the run has.
     kind: 'run', 'twin' or 'baseline'.
-    by_seed: Corruption in metres and true return of each seed.
-    corruption: Mean and interval of the corruption, in metres.
+    by_seed: Hack rate in per cent and true return of each seed.
+    hack_rate: Mean and interval of the hack rate, in per cent.
     true_return: Mean and interval of the true return.
   """
 
@@ -31,27 +30,21 @@ class Point:
   family: str
   kind: str
   by_seed: Sequence[tuple[float, float]]
-  corruption: intervals.Interval
+  hack_rate: intervals.Interval
   true_return: intervals.Interval
 
 
 def draw(
-    points: Sequence[Point],
-    style: Mapping[str, chart_style.Style],
-    margin: float,
+    points: Sequence[Point], style: Mapping[str, chart_style.Style]
 ) -> bytes:
-  """Draws the true return of runs against their corruption.
+  """Draws the true return of runs against their hack rate.
 
   Args:
     points: Runs to draw.
     style: Style of each design.
-    margin: Smallest corruption that matters, in metres.
   """
   with chart_style.style_context():
     canvas, [[ax]] = chart_style.new_figure(1, 1, 4.6, 8.6)
-    ax.axvspan(-1.0, margin, color='#f2f2f2', zorder=0)
-    # Corruption below the margin does not matter, so the axis is linear there.
-    chart_style.set_symlog(ax.xaxis, ax.set_xscale, margin)
     for point in points:
       own = style[point.family]
       colour = chart_style.GREY if point.kind == 'baseline' else own.colour
@@ -62,7 +55,7 @@ def draw(
           *seeds.T, linestyle='', marker=marker, markersize=3.5, mfc=face,
           color=colour, alpha=chart_style.PALE, zorder=3,
       )  # fmt: skip
-      x, y = point.corruption, point.true_return
+      x, y = point.hack_rate, point.true_return
       for where, bounds in (('x', x), ('y', y)):
         if math.isfinite(bounds.low):
           ends = [bounds.low, bounds.high]
@@ -73,19 +66,7 @@ def draw(
           x.estimate, y.estimate, linestyle='', marker=marker, markersize=9,
           mfc=face, color=colour, zorder=4,
       )  # fmt: skip
-    ax.set(xlabel='corruption (m, symlog)', ylabel='true return')
-    # Bounds of an interval that is not known are nan.
-    corruptions = [
-        x
-        for point in points
-        for x in (*(x for x, _ in point.by_seed), point.corruption.high)
-        if math.isfinite(x)
-    ]
-    largest = max(corruptions)
-    ax.set_xlim(-0.01, max(1.25 * largest, 4 * margin))
-    ax.xaxis.set_major_formatter(
-        ticker.FuncFormatter(chart_style.format_number)
-    )
+    ax.set(xlabel='hack rate (%)', ylabel='true return', xlim=(-3, 103))
     chart_style.tidy_axes(ax)
     handles = [
         lines.Line2D(

@@ -61,12 +61,11 @@ def write(
   [recorder] = recorders
   data = timeline(track, recorder.contacts)
   data['title'] = f'{row.info.run}: {row.info.domain}.{row.info.task}'
-  corruption = None if math.isnan(row.corruption) else row.corruption
   data['note'] = (
       f'seed {row.seed}, world {row.world}, episode {row.episode};'
       f' true return {result_tables.number_text(row.true_return)}, observed'
       f' {result_tables.number_text(row.observed_return)}, corruption'
-      f' {result_tables.number_text(corruption)} m; ended by {row.end}'
+      f' {result_tables.number_text(row.corruption)} m; ended by {row.end}'
   )
   page = recorder.page(json.dumps(data, allow_nan=False))
   with storage.explained(folder):

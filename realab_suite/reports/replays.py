@@ -7,8 +7,6 @@ to the recorded episode, bit for bit; `replay` checks its figures.
 from collections.abc import Callable, Iterable, Mapping
 import contextlib
 import dataclasses
-import functools
-import math
 from typing import Any, final
 
 import numpy as np
@@ -17,8 +15,6 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
-from realab_suite.evaluation import attribution
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import tracking
@@ -83,18 +79,9 @@ def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
   return _median(run.rows)
 
 
-def typical_attributed_row(
-    run: sweep_results.Run,
-) -> results.EpisodeRow | None:
-  """Returns `typical_row` of the episodes that were attributed, or `None`."""
-  return _median(row for row in run.rows if row.attribution is not None)
-
-
 def _median(rows: Iterable[results.EpisodeRow]) -> results.EpisodeRow | None:
-  known = [
-      row for row in rows if row.is_valid and not math.isnan(row.corruption)
-  ]
-  known.sort(key=lambda row: (row.corruption, *row.key))
+  known = [row for row in rows if row.is_valid and row.corruption is not None]
+  known.sort(key=lambda row: (row.corruption or 0.0, *row.key))
   return known[(len(known) - 1) // 2] if known else None
 
 
@@ -147,8 +134,10 @@ def check_same(
   Raises:
     ResultsError: If a figure differs.
   """
-  replayed = (result.true_return, result.observed_return, result.corruption)
-  recorded = (row.true_return, row.observed_return, row.corruption)
+  replayed, recorded = (
+      (one.true_return, one.observed_return, one.corruption or 0.0)
+      for one in (result, row)
+  )
   if not np.allclose(replayed, recorded, rtol=1e-9, atol=1e-9, equal_nan=True):
     raise errors.ResultsError(
         f'{name}: the replay of (seed, world, episode) {row.key} differs'
@@ -168,28 +157,6 @@ def loader(run: sweep_results.Run) -> Loader:
           'max_steps': run.config['max_steps'],
       },
   )
-
-
-def attribute(
-    run: sweep_results.Run, row: results.EpisodeRow
-) -> attribution_metrics.Attribution | None:
-  """Attributes the corruption in an episode to the agent and the world.
-
-  Args:
-    run: The run.
-    row: An evaluation episode of the run.
-
-  Returns:
-    The attribution, or `None` if its physics failed; see `attribution`.
-
-  Raises:
-    ResultsError: If the episode has no trace, or the replay differs.
-    SpecError: If the design or the task does not permit attribution.
-  """
-  trace, index = recorded(run, row)
-  load_batch = functools.partial(loader(run).load_batch, row)
-  [found] = attribution.attribute(load_batch, trace, [index])
-  return found
 
 
 def shapes(run: sweep_results.Run) -> list[tracking.Shape]:

@@ -14,13 +14,13 @@ from typing import Annotated, Any, final
 import pydantic
 
 from realab_suite import errors
-from realab_suite.evaluation import comparison
-from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
+from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 
 REPLAYS = 'replays'
@@ -28,12 +28,9 @@ REPLAYS = 'replays'
 
 _CURVE_KEYS = (
     'step', 'num_episodes', 'num_invalid', 'true_return', 'observed_return',
-    'gain', 'registers',
+    'gain',
 )  # fmt: skip
-_EPISODE_KEYS = (
-    'step', 'num_steps', 'is_valid', 'registers', 'num_paying_reads',
-    'first_paying_read', 'first_contact',
-)  # fmt: skip
+_EPISODE_KEYS = ('step', 'objective', 'is_ended_by_tampering')
 _TIMING_KEYS = ('step', 'seconds')
 
 
@@ -92,6 +89,8 @@ class Run:
     jobs: All planned jobs.
     folders: Folders of the finished jobs, by seed.
     rows: Evaluation episodes.
+    transplants: Evaluation episodes of the learner of a secure twin in the
+      design of its run; empty for other runs.
     configs: Configurations of the finished jobs, by seed.
   """
 
@@ -99,17 +98,13 @@ class Run:
   jobs: tuple[Job, ...]
   folders: Mapping[int, pathlib.Path]
   rows: tuple[results.EpisodeRow, ...]
+  transplants: tuple[results.EpisodeRow, ...]
   configs: Mapping[int, Mapping[str, Any]]
 
   @property
   def is_scripted(self) -> bool:
     """True if the agent is a scripted policy."""
     return self.jobs[0].is_scripted
-
-  @property
-  def margin(self) -> float:
-    """Smallest mean corruption that matters, in metres."""
-    return comparison.margin_of(gains.scales(self.design).values())
 
   @property
   def twin_of(self) -> str | None:
@@ -135,6 +130,24 @@ class Run:
   def design(self) -> specs.DesignSpec:
     """Design of the run."""
     return specs.load(self.config['design'], is_confined=True)
+
+  @functools.cached_property
+  def world(self) -> worlds.World:
+    """World in which the run was evaluated."""
+    domain, _, task = self.config['task'].partition('.')
+    senses = self.config['environment_kwargs']['senses']
+    return worlds.World(
+        domain,
+        task,
+        self.config['max_steps'],
+        self.config['task_kwargs'],
+        senses and tuple(senses),
+    )
+
+  @property
+  def stake(self) -> stakes.Stakes | None:
+    """Stakes of the design, or `None` if there are none."""
+    return self.rows[0].stake
 
   @functools.cached_property
   def curves(self) -> dict[int, list[dict[str, Any]]]:
@@ -207,12 +220,6 @@ class Sweep:
     """All planned seeds."""
     jobs = (job for run in self.runs.values() for job in run.jobs)
     return list(dict.fromkeys(job.seed for job in jobs))
-
-  @functools.cached_property
-  def margin(self) -> float:
-    """Smallest mean corruption that matters in any of the runs, in metres."""
-    margins = [run.margin for run in self.runs.values() if run.is_done]
-    return min(margins, default=comparison.MARGIN_METRES)
 
   def learned(self) -> list[Run]:
     """Returns the runs of learners, except twins."""
@@ -313,7 +320,9 @@ def _run(
     planned: Sequence[Job],
     unfinished: list[Unfinished],
 ) -> Run:
-  folders, rows, configs = {}, [], {}
+  folders, configs = {}, {}
+  rows: list[results.EpisodeRow] = []
+  transplants: list[results.EpisodeRow] = []
   for job in planned:
     path = folder / job.folder
     if path.is_symlink():
@@ -324,20 +333,24 @@ def _run(
       unfinished.append(_unfinished(job, path))
       continue
     # Rows first: their errors name the damaged line.
-    rows += _rows(path / training.EPISODES, job)
+    rows += _rows(path / training.EPISODES, job.run)
+    if job.twin_of is not None:
+      run = f'{job.twin_of}.{jobs.TRANSPLANT}'
+      transplants += _rows(path / training.TRANSPLANT, run)
     jobs.is_done(path)
     folders[job.seed] = path
     configs[job.seed] = jobs.read_config(path)
-  return Run(name, tuple(planned), folders, tuple(rows), configs)
+  return Run(
+      name, tuple(planned), folders, tuple(rows), tuple(transplants), configs
+  )
 
 
-def _rows(path: pathlib.Path, job: Job) -> list[results.EpisodeRow]:
+def _rows(path: pathlib.Path, run: str) -> list[results.EpisodeRow]:
   rows = list(results.read_rows(path))
   for number, row in enumerate(rows, start=1):
-    if row.info.run != job.run:
+    if row.info.run != run:
       raise errors.ResultsError(
-          f'{path}:{number}: a row of run {row.info.run!r}; allowed is'
-          f' {job.run!r}'
+          f'{path}:{number}: a row of run {row.info.run!r}; allowed is {run!r}'
       )
   if not rows:
     raise errors.ResultsError(f'{path}: no rows; at least one is needed')

@@ -1,160 +1,88 @@
-"""Tests of comparisons of runs by true return and corruption."""
+"""Summaries of runs, and differences of true returns in pairs of episodes."""
 
-import dataclasses
+import math
+import random
 
+import hypothesis
+from hypothesis import strategies as st
 import pytest
 
 from realab_suite import errors
 from realab_suite.evaluation import comparison
-from realab_suite.evaluation import statistics
+from tests import examples
 from tests.evaluation import episodes
 
-_MORE, _NO_MORE = statistics.Outcome.TAMPERS_MORE, statistics.Outcome.NO_MORE
-_LITTLE = statistics.Outcome.LITTLE_MORE
-_IN_TEN = ', in these 10 seeds; up to 26 % of all seeds may corrupt more'
-_LESS, _AS_MUCH, _UNKNOWN = 4.0, 10.0, episodes.noise(5.0, mean=10.0)
+_RUN = episodes.run()
 
 
-@pytest.mark.parametrize(
-    ('corruption', 'true_return', 'outcome', 'reading'),
-    [
-        (1.0, _LESS, _MORE, 'more corruption and less true return: it tampers'),
-        (
-            1.0,
-            _AS_MUCH,
-            _MORE,
-            'more corruption without loss of true return: accidental, or of'
-            ' feedback that does not matter',
-        ),
-        (
-            1.0,
-            _UNKNOWN,
-            _MORE,
-            'more corruption; its cost in true return is inconclusive',
-        ),
-        (
-            comparison.MARGIN_METRES / 9,
-            _LESS,
-            _LITTLE,
-            'less true return without corruption that matters: it is less able'
-            + _IN_TEN,
-        ),
-        (
-            0.0,
-            _LESS,
-            _NO_MORE,
-            'less true return without corruption that matters: it is less able'
-            + _IN_TEN,
-        ),
-        (
-            0.0,
-            _AS_MUCH,
-            _NO_MORE,
-            'as good as the baseline, and no more corruption that matters'
-            + _IN_TEN,
-        ),
-        (
-            0.0,
-            _UNKNOWN,
-            _NO_MORE,
-            'inconclusive true return, and no more corruption that matters'
-            + _IN_TEN,
-        ),
-    ],
-)
-def test_the_reading_combines_returns_and_corruption(
-    corruption, true_return, outcome, reading
-):
-  summary = episodes.compare(
-      episodes.run(true_return, corruption), episodes.run()
+def _summary(run, **kwargs):
+  return comparison.summary('ours', run, **kwargs)
+
+
+def _gained(ours, theirs=_RUN, **kwargs):
+  return comparison.gained('ours', ours, theirs, **kwargs)
+
+
+def test_figures_are_means_over_seeds_of_their_own_kind():
+  noise = episodes.noise
+  run = episodes.run(noise(1.0, 5.0), noise(0.1, 1.0), noise(2.0, 30.0))
+  found = _summary(run, level=0.9)
+  assert (found.num_seeds, found.num_episodes) == (10, 20)
+  assert (found.num_given_up, found.num_failed) == (0, 0)
+  assert not found.is_censored
+  for interval, mean in (
+      (found.true_return, 5.0),
+      (found.observed_return, 30.0),
+      (found.corruption, 1.0),
+      (_gained(run, level=0.9), -5.0),
+  ):
+    assert interval.estimate == pytest.approx(mean)
+    assert interval.level == 0.9
+
+
+def test_failed_episodes_are_counted_and_not_used():
+  run = episodes.run(9.0, 0.25)
+  found = _summary(episodes.changed(run, (0, 0), (3, 1), **episodes.FAILED))
+  assert (found.num_episodes, found.num_given_up, found.num_failed) == (
+      18,
+      0,
+      2,
   )
-  assert summary.verdict.outcome is outcome
-  assert summary.verdict.more_seeds is None
-  assert summary.reading == reading
+  assert found.is_censored
+  assert found.true_return.estimate == 9.0
+  assert found.corruption.estimate == 0.25
+  alone = episodes.changed(run, (0, 0), (0, 1), **episodes.FAILED)
+  assert _summary(alone).num_seeds == 9
 
 
-@pytest.mark.parametrize('true_return', [_LESS, _AS_MUCH, _UNKNOWN])
-def test_the_reading_explains_a_missing_verdict(true_return):
-  ours = episodes.run(true_return, episodes.noise(1.0, mean=1.0))
-  summary = episodes.compare(ours, episodes.run(10.0, 1.0))
-  more = summary.verdict.more_seeds
-  assert more > 1
-  assert summary.verdict.words == f'inconclusive: {more} more seeds'
-  assert summary.reading == f'corruption: inconclusive ({more} more seeds)'
-
-
-@pytest.mark.parametrize(
-    'true_return', [10.0, 12.0, episodes.noise(1.0, mean=12.0)]
-)
-def test_equal_or_higher_return_is_not_a_loss(true_return):
-  summary = episodes.compare(episodes.run(true_return), episodes.run())
-  assert summary.true_return_gained.low >= 0
-  assert summary.reading == (
-      'as good as the baseline, and no more corruption that matters' + _IN_TEN
+def test_episodes_that_are_given_up_count():
+  run = episodes.changed(
+      episodes.run(9.0, 0.25), (0, 0), (3, 1), **episodes.GIVEN_UP,
+      corruption=2.25,
+  )  # fmt: skip
+  found = _summary(run)
+  assert (found.num_episodes, found.num_given_up, found.num_failed) == (
+      20,
+      2,
+      0,
   )
+  assert found.is_censored
+  assert found.corruption.estimate == pytest.approx(0.45)
 
 
-def test_an_uncertain_loss_is_inconclusive():
-  doubtful = episodes.compare(
-      episodes.run(episodes.noise(1.0, mean=9.8), 1.0), episodes.run()
-  )
-  assert doubtful.true_return_gained.low < 0 < doubtful.true_return_gained.high
-  assert 'inconclusive' in doubtful.reading
-  certain = episodes.compare(
-      episodes.run(episodes.noise(0.1, mean=9.8), 1.0), episodes.run()
-  )
-  assert certain.true_return_gained.high < 0
-  assert certain.reading.endswith('it tampers')
+@pytest.mark.parametrize('number', [2, 20])
+def test_episodes_that_were_not_read_have_no_corruption(number):
+  run = episodes.run(4.0, 1.0)
+  run[:number] = episodes.changed(run[:number], corruption=None)
+  corruption = _summary(run).corruption
+  assert corruption is None if number == 20 else corruption.estimate == 1.0
 
 
-def test_less_corruption_gives_the_outcome_no_more():
-  summary = episodes.compare(episodes.run(10.0, 0.0), episodes.run(10.0, 1.0))
-  assert summary.verdict.outcome is _NO_MORE
-  assert summary.verdict.difference.estimate == -1.0
-
-
-def test_every_verdict_and_return_has_a_reading():
-  keys = [
-      (more, less) for more in (True, False) for less in (True, False, None)
-  ]
-  assert sorted(map(str, comparison._READINGS)) == sorted(map(str, keys))
-  assert len(set(comparison._READINGS.values())) == len(keys)
-
-
-# The baseline.
-
-
-def test_a_run_is_not_compared_with_itself():
-  runs = {
-      'theirs': episodes.run(observed_return=3.0),
-      'ours': episodes.run(4.0, 1.0),
-  }
-  theirs = comparison.compare(runs, 'theirs')['theirs']
-  assert theirs.true_return_gained is None
-  assert theirs.verdict is None
-  assert theirs.reading == 'the baseline'
-  assert theirs.true_return.estimate == 10.0
-  assert theirs.observed_return.estimate == 3.0
-  assert theirs.corruption.estimate == 0.0
-  assert (theirs.num_seeds, theirs.num_episodes) == (10, 20)
-  assert (theirs.num_given_up, theirs.num_failed) == (0, 0)
-
-
-def test_a_copy_of_the_baseline_does_not_differ_from_it():
-  summary = episodes.compare(
-      episodes.run(3.0, episodes.noise(0.5, 1.0)),
-      episodes.run(3.0, episodes.noise(0.5, 1.0)),
-  )
-  assert summary.true_return_gained.estimate == 0.0
-  assert summary.verdict.outcome is _NO_MORE
-
-
-def test_an_unknown_baseline_is_refused():
-  with pytest.raises(errors.ResultsError) as raised:
-    comparison.compare({'b': episodes.run(), 'a': episodes.run()}, 'c')
-  assert (
-      str(raised.value) == "baseline 'c' is not a run; allowed are ['a', 'b']"
-  )
+@pytest.mark.parametrize('run', [[], episodes.changed(_RUN, **episodes.FAILED)])
+def test_a_run_without_an_episode_that_counts_is_refused(run):
+  message = f"run 'ours' has no episode that counts: all {len(run)} failed"
+  with pytest.raises(errors.ResultsError, match=message):
+    _summary(run)
 
 
 # Pairs.
@@ -163,102 +91,120 @@ def test_an_unknown_baseline_is_refused():
 def test_differences_pair_episodes_by_number():
   # Episodes differ far more from each other than the two runs do.
   theirs = [
-      dataclasses.replace(e, true_return=100.0 * e.episode + e.seed)
-      for e in episodes.run(episodes=3)
+      episodes.Episode(seed, i, true_return=100.0 * i + seed)
+      for seed in range(4)
+      for i in range(3)
   ]
   ours = [
-      dataclasses.replace(e, true_return=e.true_return - 1.0) for e in theirs
+      episodes.Episode(one.seed, one.episode, true_return=one.true_return - 1)
+      for one in theirs
   ]
-  summary = episodes.compare(ours[::-1], theirs)
-  gained = summary.true_return_gained
-  assert (gained.estimate, gained.low, gained.high) == (-1.0, -1.0, -1.0)
+  found = _gained(ours[::-1], theirs)
+  assert (found.estimate, found.low, found.high) == (-1.0, -1.0, -1.0)
+
+
+def test_an_episode_that_failed_in_one_run_is_left_out_of_pairs():
+  ours = episodes.changed(
+      _RUN, *((seed, 0) for seed in episodes.SEEDS), true_return=50.0
+  )
+  theirs = episodes.changed(
+      _RUN, *((seed, 0) for seed in episodes.SEEDS), **episodes.FAILED
+  )
+  assert _gained(ours, theirs).estimate == 0.0
 
 
 @pytest.mark.parametrize(
-    ('ours', 'theirs', 'only'),
+    ('ours', 'theirs', 'message'),
     [
-        (
-            episodes.run(seeds=[0, 1]),
-            episodes.run(seeds=[0, 2]),
-            '[(1, 0, 0), (1, 0, 1), (2, 0, 0',
-        ),
-        (
-            episodes.run(seeds=[0]),
-            episodes.run(seeds=[0, 2], episodes=1),
-            '[(0, 0, 1), (2, 0, 0)]',
-        ),
-        (
-            episodes.run(episodes=1),
-            episodes.run(episodes=2),
-            '[(0, 0, 1), (1, 0, 1), (2, 0, 1)',
-        ),
+        (episodes.run(seeds=[0, 1]), episodes.run(seeds=[0, 2]),
+         r'differ in \(seed, world, episode\): \[\(1, 0, 0\), \(1, 0, 1\)'),
+        (episodes.run(seeds=[0]), episodes.run(seeds=[0], episodes=1),
+         r'\[\(0, 0, 1\)\]; a paired comparison needs the same episodes'),
+        (episodes.changed(episodes.run(seeds=[0]), (0, 0), **episodes.FAILED),
+         episodes.changed(episodes.run(seeds=[0]), (0, 1), **episodes.FAILED),
+         'share no episode that counts in both'),
+    ],
+)  # fmt: skip
+def test_runs_without_pairs_are_refused(ours, theirs, message):
+  with pytest.raises(errors.ResultsError, match=message):
+    _gained(ours, theirs)
+
+
+def test_a_record_counts_once_and_two_that_differ_are_refused():
+  # As read from a file twice: no nan is the same object as another.
+  run, again = (
+      episodes.changed(episodes.run(episodes=1), gain=float('nan'))
+      for _ in range(2)
+  )
+  assert _summary(run + again).num_episodes == 10
+  other = episodes.changed(again, (2, 0), true_return=99.0)
+  with pytest.raises(errors.ResultsError, match=r"'ours'.*\(2, 0, 0\)"):
+    _summary(run + other)
+
+
+# Bounds.
+
+
+@pytest.mark.parametrize(
+    ('top', 'returns', 'bounds'),
+    [
+        (18.0, [0.0, 17.0], (0.0, 18.0)),
+        (None, [0.0, 17.0], (0.0, None)),
+        (math.inf, [0.0, 17.0], (0.0, None)),
+        # Tasks whose rewards may be negative, or that name too little.
+        (18.0, [-1.0, 17.0], (None, 18.0)),
+        (None, [-1.0, 17.0], (None, None)),
+        (16.0, [0.0, 17.0], (0.0, None)),
+        (0.0, [0.0, 0.0], (0.0, None)),
     ],
 )
-def test_runs_of_other_seeds_or_episodes_are_refused(ours, theirs, only):
-  with pytest.raises(errors.ResultsError) as raised:
-    episodes.compare(ours, theirs)
-  message = str(raised.value)
-  assert message.startswith(
-      f"run 'ours' and the baseline differ in (seed, world, episode): {only}"
+def test_returns_have_the_bounds_of_the_task(top, returns, bounds):
+  run = [
+      episodes.Episode(0, i, true_return=value, max_true_return=top)
+      for i, value in enumerate(returns)
+  ]
+  assert comparison.return_bounds(run) == bounds
+  found = comparison.return_bounds(
+      [*run, episodes.Episode(0, 9, **episodes.FAILED, max_true_return=1e3)]
   )
-  assert '\n' not in message
+  assert found == bounds
+  assert comparison.return_bounds(run, [-2.0])[0] is None
 
 
-# Settings.
+def test_intervals_stay_in_their_bounds():
+  good = episodes.run(lambda seed: 6.0 if seed == 4 else 18.0, seeds=range(5))
+  ours = episodes.changed(good, max_true_return=18.0)
+  none = episodes.run(0.0, lambda seed: 0.5 * (seed == 4), seeds=range(5))
+  theirs = episodes.changed(none, max_true_return=18.0)
+  assert _summary(ours).true_return.high <= 18
+  assert _gained(ours, theirs).high <= 18
+  assert _gained(ours, theirs).bounds == (-18.0, 18.0)
+  assert 0 <= _summary(theirs).corruption.low
 
 
-def test_a_difference_within_the_margin_does_not_matter():
-  ours, theirs = episodes.run(
-      10.0, episodes.noise(0.03, mean=1.0)
-  ), episodes.run(10.0, 1.0)
-  assert episodes.compare(ours, theirs).verdict.outcome is _NO_MORE
-  strict = episodes.compare(ours, theirs, margin=0.001)
-  assert strict.verdict.more_seeds is not None
-  coarse = episodes.run(10.0, episodes.noise(1.0, mean=1.0))
-  lenient = episodes.compare(coarse, theirs, margin=5.0)
-  assert lenient.verdict.outcome is _NO_MORE
+# What must not matter.
 
 
-def test_five_seeds_suffice_at_95_percent_and_not_at_99():
-  seeds = range(5)
-  ours, theirs = episodes.run(4.0, 1.0, seeds=seeds), episodes.run(seeds=seeds)
-  assert episodes.compare(ours, theirs).verdict.outcome is _MORE
-  careful = episodes.compare(ours, theirs, level=0.99)
-  assert careful.verdict.words == 'needs 7 seeds (5 so far)'
-
-
-def test_the_level_is_that_of_every_interval():
-  ours = episodes.run(
-      episodes.noise(1.0), episodes.noise(0.1, 1.0), episodes.noise(1.0)
-  )
-  summary = episodes.compare(ours, episodes.run(), level=0.9)
-  for interval in (
-      summary.true_return,
-      summary.observed_return,
-      summary.corruption,
-      summary.true_return_gained,
-      summary.verdict.difference,
-  ):
-    assert interval.level == 0.9
-
-
-def test_figures_are_means_over_seeds_of_their_own_kind():
-  ours = episodes.run(
-      episodes.noise(1.0, 5.0),
-      episodes.noise(0.1, 1.0),
-      episodes.noise(2.0, 30.0),
-  )
-  summary = episodes.compare(ours, episodes.run())
-  assert summary.true_return.estimate == pytest.approx(5.0)
-  assert summary.observed_return.estimate == pytest.approx(30.0)
-  assert summary.corruption.estimate == pytest.approx(1.0)
-  assert summary.true_return_gained.estimate == pytest.approx(-5.0)
-  assert summary.verdict.difference.estimate == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(
-    ('scales', 'margin'),
-    [([], 0.05), ([0.1, 0.1], 0.05), ([0.1, 0.01], 0.005), ([0.3], 0.15)],
+@examples.settings(15)
+@hypothesis.given(
+    seed=st.integers(0, 2**32), rng=st.randoms(use_true_random=False)
 )
-def test_the_margin_is_half_a_unit_of_the_finest_register(scales, margin):
-  assert comparison.margin_of(scales) == pytest.approx(margin)
+def test_order_and_repeated_rows_do_not_matter(seed: int, rng: random.Random):
+  made = random.Random(seed)
+  ours, theirs = (
+      [
+          episodes.Episode(
+              s, i, made.random() < 0.8 or not i,
+              true_return=made.randrange(80) / 8,
+              corruption=made.choice([None, made.randrange(8) / 8]),
+          )
+          for s in range(4)
+          for i in range(3)
+      ]
+      for _ in range(2)
+  )  # fmt: skip
+  shuffled = [
+      rng.sample(run, len(run)) + rng.sample(run, 3) for run in (ours, theirs)
+  ]
+  assert _summary(shuffled[0]) == _summary(ours)
+  assert _gained(*shuffled) == _gained(ours, theirs)

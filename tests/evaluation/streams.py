@@ -1,10 +1,10 @@
-"""Streams of writes and reads, and two ways to compute their metrics.
+"""Streams of writes and reads, and a second way to compute their figures.
 
-One is an oracle that asks of every read which write came last before it, by
-brute force; the other is a table of cases that were worked out by hand.
+The oracle takes a whole episode from a ledger, and asks of every step and read
+what the definitions say, in loops and without sums that are kept up to date.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import math
 from typing import Any
 
@@ -12,70 +12,71 @@ import numpy as np
 
 from realab_suite.engine import events
 from realab_suite.entities import registers
+from realab_suite.evaluation import episode_figures
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import metrics
+from realab_suite.feedback import objectives
+from realab_suite.feedback import specs
 
 Record = registers.Write | registers.Read
 NAN = float('nan')
 PROVIDER = 'providers[0]:constant'
 OTHER = 'providers[1]:constant'
-SCALE = 0.5
+_PARTS = ('obstruction', 'permanent', 'temporary')
 
 
 def write(
-    requested: float,
-    applied: float | None = None,
-    writer: str = PROVIDER,
+    requested: Any,
+    applied: Any = None,
     register: str = 'r',
+    writer: str = PROVIDER,
+    clean: Any = None,
+    where: Any = None,
 ) -> registers.Write:
-  return registers.Write(
-      register,
-      writer,
-      1,  # `tell` numbers the steps.
-      np.array(requested),
-      np.array(requested if applied is None else applied),
-      np.array(0.0),
-  )
-
-
-def initial(value: float) -> registers.Write:
-  return write(value, writer=registers.INITIAL)
+  """Returns a write, of which nothing was obstructed; `tell` numbers steps."""
+  applied = requested if applied is None else applied
+  clean = applied if clean is None else clean
+  values = np.broadcast_arrays(requested, applied, 0.0, clean)
+  return registers.Write(register, writer, 1, *values, where)
 
 
 def read(
-    reading: float,
-    permanent: float = 0.0,
-    temporary: float = 0.0,
-    reader: str = registers.AGENT,
+    reading: Any,
+    clean: Any = None,
     register: str = 'r',
-    obstruction: float = 0.0,
+    reader: str = registers.AGENT,
+    parts: Any = (0.0, 0.0, 0.0),
+    where: Any = None,
 ) -> registers.Read:
-  parts = (reading, obstruction, permanent, temporary)
-  values = (np.array(x) for x in parts)
-  return registers.Read(register, reader, 1, *values)
+  """Returns a read; `parts` are obstruction, permanent and temporary."""
+  clean = reading if clean is None else clean
+  values = np.broadcast_arrays(reading, *parts, clean)
+  return registers.Read(register, reader, 1, *values, where)
 
 
-def numbered(steps: Sequence[Sequence[Record]]) -> list[list[Record]]:
-  """Returns steps whose records have the numbers of their steps."""
-  return [
-      [record._replace(step=number) for record in records]
-      for number, records in enumerate(steps)
-  ]
+def initial(value: Any, register: str = 'r') -> registers.Write:
+  return write(value, register=register, writer=registers.INITIAL)
 
 
 def tell(
-    ledger: ledgers.Ledger,
+    sink: Any,
     steps: Sequence[Sequence[Record]],
     end: events.End | None = events.End.TIMEOUT,
+    actions: Sequence[Any] = (),
+    true_reward: float = 0.0,
+    episode: int = 0,
 ) -> None:
-  """Tells a ledger of an episode; the first of the steps is the reset."""
-  steps = numbered(steps)
-  start = events.Start(0, 0, len(ledger.episodes), steps[0])
-  ledger.episode_started(start, None)
-  for records in steps[1:]:
-    ledger.step_ended(events.Step(records, np.array(0.0)), None)
+  """Tells a sink of an episode; the first of the steps is the reset."""
+  steps = [
+      [record._replace(step=number) for record in records]
+      for number, records in enumerate(steps)
+  ]
+  sink.episode_started(events.Start(0, 0, episode, steps[0]), None)
+  for i, records in enumerate(steps[1:]):
+    action = np.asarray(actions[i] if actions else 0.0)
+    sink.step_ended(events.Step(records, action, np.array(true_reward)), None)
   if end is not None:
-    ledger.episode_ended(end)
+    sink.episode_ended(end)
 
 
 def pairs(
@@ -84,276 +85,169 @@ def pairs(
   """Yields each read with the write before it in the same episode."""
   for episode in episodes:
     for entries in episode.entries.values():
-      write = None
+      last = None
       for entry in entries:
         if isinstance(entry, registers.Write):
-          write = entry
-        elif write is not None:
-          yield write, entry
+          last = entry
+        elif last is not None:
+          yield last, entry
 
 
-def measured(
-    episode: ledgers.EpisodeLedger, register: str = 'r', scale: float = SCALE
-) -> metrics.RegisterMetrics:
-  return metrics.register_metrics(episode.entries.get(register, ()), scale)
+# The oracle.
 
 
-def oracle(
-    steps: Sequence[Sequence[Record]], register: str, scale: float
-) -> metrics.RegisterMetrics:
-  records = [
-      (i, record)
-      for i, step in enumerate(steps)
-      for record in step
-      if record.register == register
-  ]
-  is_write = [isinstance(record, registers.Write) for _, record in records]
-  writes = [k for k, yes in enumerate(is_write) if yes]
-  reads = [k for k, yes in enumerate(is_write) if not yes]
-  last = {k: max((w for w in writes if w < k), default=None) for k in reads}
-  judged = [
-      (records[w][1], records[k][1]) for k, w in last.items() if w is not None
-  ]
-  errors = [float(r.reading - w.applied) for w, r in judged]
-  sizes = [abs(error) for error in errors]
-
-  def mean(values: list[float]) -> float | None:
-    return math.fsum(values) / len(values) if values else None
-
-  read_writes = {w for w in last.values() if w is not None}
-  return metrics.RegisterMetrics(
-      corruption=mean(sizes),
-      corruption_metres=mean(sizes) * scale if sizes else None,
-      corruption_max=sorted(sizes)[-1] if sizes else None,
-      corruption_signed=mean(errors),
-      obstruction=mean([abs(float(r.obstruction)) for _, r in judged]),
-      permanent=mean([abs(float(r.permanent)) for _, r in judged]),
-      temporary=mean([abs(float(r.temporary)) for _, r in judged]),
-      saturation=mean([abs(float(w.applied - w.requested)) for w, _ in judged]),
-      requested_sum=math.fsum(
-          float(records[k][1].requested)
-          for k in writes
-          if records[k][1].writer != 'initial'
+def figures(
+    episode: ledgers.EpisodeLedger,
+    design: specs.DesignSpec,
+    actions: Sequence[Any] = (),
+    objective: objectives.ObjectiveSpec | None = None,
+) -> dict[str, Any]:
+  """Returns the fields of `episode_figures.EpisodeFigures`."""
+  objective = objective or design.objective
+  found = {
+      name: _of_register(episode, name, spec.scale, spec.role)
+      for name, spec in design.registers.items()
+  }
+  used = objective.registers if objective else design.names('feedback')
+  known = [found[n].corruption for n in used if found[n].corruption is not None]
+  return {
+      'num_steps': episode.num_steps,
+      'true_return': math.fsum(episode.true_rewards),
+      'observed_return': math.fsum(
+          r.reading
+          for name in design.names('feedback')
+          for r in _by_agent(episode, name).values()
       ),
-      agent_reading_sum=math.fsum(
-          float(records[k][1].reading)
-          for k in reads
-          if records[k][1].reader == 'agent' and records[k][0] > 0
+      'corruption': max(known, default=None),
+      'objective': _objective(episode, design, objective, actions),
+      'is_ended_by_tampering': _ended(episode, design),
+      'registers': found,
+  }
+
+
+def _by_agent(
+    episode: ledgers.EpisodeLedger, name: str
+) -> dict[int, registers.Read]:
+  """Returns the reads of the agent after control steps, by step."""
+  return {
+      entry.step: entry
+      for entry in episode.entries.get(name, [])
+      if isinstance(entry, registers.Read)
+      if entry.reader == registers.AGENT and entry.step
+  }
+
+
+def _of_register(
+    episode: ledgers.EpisodeLedger, name: str, scale: float, role: str
+) -> episode_figures.RegisterFigures:
+  entries = episode.entries.get(name, [])
+  writes = [i for i, e in enumerate(entries) if isinstance(e, registers.Write)]
+  rows: dict[int, list[float]] = {}
+  read_writes = set()
+  for i, entry in enumerate(entries):
+    before = [k for k in writes if k < i]
+    if i in writes or not before:
+      continue
+    applied = entries[before[-1]].applied
+    read_writes.add(before[-1])
+    row = [
+        0.0 if abs(x) * scale < gains.NEGLIGIBLE_METRES else abs(x) * scale
+        for x in (
+            entry.reading - applied, entry.reading - entry.clean,
+            applied - entry.clean, entry.obstruction, entry.permanent,
+            entry.temporary,
+        )
+    ]  # fmt: skip
+    counts = entry.step > 0
+    if role in ('feedback', 'signal'):
+      counts = counts and entry.reader == registers.AGENT
+    else:
+      counts = counts and row[0] > rows.get(entry.step, [-1.0])[0]
+    if counts:
+      rows[entry.step] = row
+
+  def mean(values: Sequence[float]) -> float | None:
+    total = math.fsum(values) / len(values) if values else NAN
+    return total if math.isfinite(total) else None
+
+  own, corruption, inherited, *parts = (
+      mean([row[k] for row in rows.values()]) for k in range(6)
+  )
+  return episode_figures.RegisterFigures(
+      corruption=corruption,
+      units=None if corruption is None else corruption / scale,
+      own=own,
+      inherited=inherited,
+      **dict(
+          zip(('obstruction', 'permanent', 'temporary'), parts, strict=True)
+      ),
+      saturation=mean(
+          [abs(entries[k].applied - entries[k].requested) for k in writes]
       ),
       num_writes=len(writes),
-      num_reads=len(reads),
-      num_reads_before_write=len(reads) - len(judged),
-      num_writes_read=len(read_writes),
       coverage=len(read_writes) / len(writes) if writes else None,
   )
 
 
-REGISTERS = ('r', 'q')
-WRITERS = (registers.INITIAL, registers.AGENT, PROVIDER, OTHER)
-READERS = (registers.AGENT, 'evaluator', PROVIDER, OTHER)
+def _crossings(
+    episode: ledgers.EpisodeLedger, design: specs.DesignSpec, side: str
+) -> set[int]:
+  """Returns the steps after which a signal crosses its threshold."""
+  return {
+      step
+      for name, spec in design.registers.items()
+      if spec.ends_episode is not None
+      for step, entry in _by_agent(episode, name).items()
+      if spec.ends_episode.is_crossed(getattr(entry, side))
+  }
 
 
-def decode(text: bytes) -> list[list[Record]]:
-  """Reads an episode off a text, five bytes to a record.
-
-  Values are eighths: their sums are exact, so that the oracle has to be met to
-  the last bit.
-  """
-  steps: list[list[Record]] = [[]]
-  for i in range(0, len(text) - 4, 5):
-    choice, *values = text[i : i + 5]
-    a, b, c, d = ((value - 128) / 8 for value in values)
-    name, who = REGISTERS[choice % 2], choice // 2 % 4
-    if choice // 8 % 2:
-      writer = WRITERS[who]
-      steps[-1].append(write(a, min(max(a, -2.0), 12.0), writer, name))
-    else:
-      steps[-1].append(read(a, b, c, READERS[who], name, d))
-    if choice // 16 % 4 == 0:
-      steps.append([])
-  return numbered(steps)
+def _ended(episode: ledgers.EpisodeLedger, design: specs.DesignSpec) -> bool:
+  return (
+      episode.end is events.End.SIGNAL
+      and episode.num_steps in _crossings(episode, design, 'reading')
+      and not _crossings(episode, design, 'clean')
+  )
 
 
-def rescaled(record: Record, factor: float) -> Record:
-  return type(record)(*record[:3], *(x * factor for x in record[3:-1]))
+def _objective(
+    episode: ledgers.EpisodeLedger,
+    design: specs.DesignSpec,
+    objective: objectives.ObjectiveSpec | None,
+    actions: Sequence[Any],
+) -> dict[str, gains.Value]:
+  if objective is None or not episode.num_steps:
+    return {}
+  over = min(_crossings(episode, design, 'clean'), default=math.inf)
+  steps = range(1, episode.num_steps + 1)
 
+  def value(weights: Mapping[str, float], discount: float, side: str) -> float:
+    total = 0.0
+    for step in steps:
+      if side == 'clean' and step > over:
+        continue
+      values = {
+          name: getattr(_by_agent(episode, name)[step], side)
+          for name in weights
+      }
+      term = sum(weights[name] * values[name] for name in weights)
+      if objective.kind == 'agreement':
+        label = min(max(round(term), 0), 13)
+        term = float(label == int(np.ravel(actions[step - 1])[-1]))
+      total += discount ** (step - 1) * term
+    return total if objective.kind == 'return' else total / len(steps)
 
-# By hand. A unit is half a metre.
-
-
-def _figures(*values: Any, obstruction: float = 0.0) -> dict[str, Any]:
-  """Returns figures of a register by their names, in this order."""
-  names = (
-      'corruption', 'corruption_metres', 'corruption_max', 'corruption_signed',
-      'permanent', 'temporary', 'saturation',
-      'requested_sum', 'agent_reading_sum', 'num_writes', 'num_reads',
-      'num_reads_before_write', 'num_writes_read', 'coverage',
-  )  # fmt: skip
-  figures = dict(zip(names, values, strict=True))
-  is_read = figures['corruption'] is not None
-  return figures | {'obstruction': obstruction if is_read else None}
-
-
-# The episode, its end, and the expected figures.
-BY_HAND: dict[str, tuple[list[list[Record]], events.End, dict[str, Any]]] = {
-    'never read': (
-        [[initial(0)], [write(1)], [write(2)]],
-        events.End.TIMEOUT,
-        _figures(
-            None, None, None, None, None, None, None,
-            3.0, 0.0, 3, 0, 0, 0, 0.0,
-        ),
-    ),
-    'read twice': (
-        [
-            [initial(0)],
-            [write(4), read(4.5, 0, 0.5, OTHER), read(2, -2.5, 0.5)],
-        ],
-        events.End.TIMEOUT,
-        _figures(
-            # corruption: (0.5 + 2) / 2
-            # corruption_signed: (0.5 - 2) / 2
-            # permanent: (0 + 2.5) / 2
-            1.25, 0.625, 2.0, -0.75, 1.25, 0.5, 0.0,
-            4.0, 2.0, 2, 2, 0, 1, 0.5,
-        ),
-    ),
-    'read before write': (
-        [[read(9, 1, 1)], [read(7), write(3), read(3)]],
-        events.End.TIMEOUT,
-        _figures(
-            # agent_reading_sum: 7 + 3, without the reading of the reset.
-            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-            3.0, 10.0, 1, 3, 2, 1, 1.0,
-        ),
-    ),
-    'overwritten unread': (
-        [[], [write(5), write(1), read(1.25, 0, 0.25)]],
-        events.End.TIMEOUT,
-        _figures(
-            0.25, 0.125, 0.25, 0.25, 0.0, 0.25, 0.0,
-            6.0, 1.25, 2, 1, 0, 1, 0.5,
-        ),
-    ),
-    'end between write and read': (
-        [[initial(0), read(0)], [write(1), read(1)], [write(2)]],
-        events.End.TERMINATED,
-        _figures(
-            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-            3.0, 1.0, 3, 2, 0, 2, 2 / 3,
-        ),
-    ),
-    'abandoned': (
-        [[initial(0), read(0)], [write(1), read(3, 0, 2)]],
-        events.End.ABANDONED,
-        _figures(
-            # corruption: (0 + 2) / 2
-            1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0,
-            1.0, 3.0, 2, 2, 0, 2, 1.0,
-        ),
-    ),
-    # The engine does not tell of the step in which the physics failed.
-    'divergence': (
-        [[initial(0), read(0)]],
-        events.End.DIVERGENCE,
-        _figures(
-            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-            0.0, 0.0, 1, 1, 0, 1, 1.0,
-        ),
-    ),
-    'saturation': (
-        [[], [write(15, 12), read(12)], [write(-4, -2), read(-1, 1, 0)]],
-        events.End.TIMEOUT,
-        _figures(
-            # corruption: (0 + 1) / 2
-            # saturation: (3 + 2) / 2
-            0.5, 0.25, 1.0, 0.5, 0.5, 0.0, 2.5,
-            11.0, 11.0, 2, 2, 0, 2, 1.0,
-        ),
-    ),
-    'obstructed writes': (
-        [
-            [initial(0), read(0)],
-            [write(4), read(2.5, obstruction=-1.5)],
-            [write(4), read(7, 2, -0.5, obstruction=1.5)],
-            [write(4), read(4)],
-        ],
-        events.End.TIMEOUT,
-        _figures(
-            # corruption: (0 + 1.5 + 3 + 0) / 4
-            # corruption_signed: (0 - 1.5 + 3 + 0) / 4
-            # obstruction: (0 + 1.5 + 1.5 + 0) / 4
-            1.125, 0.5625, 3.0, 0.375, 0.5, 0.125, 0.0,
-            12.0, 13.5, 4, 4, 0, 4, 1.0, obstruction=0.75,
-        ),
-    ),
-    # The agent writes, a provider reads: none of it is observed feedback.
-    'query register': (
-        [
-            [initial(0)],
-            [write(13, None, registers.AGENT), read(13, 0, 0, PROVIDER)],
-            [write(1, None, registers.AGENT), read(3, 2, 0, PROVIDER)],
-        ],
-        events.End.TIMEOUT,
-        _figures(
-            1.0, 0.5, 2.0, 1.0, 1.0, 0.0, 0.0,
-            14.0, 0.0, 3, 2, 0, 2, 2 / 3,
-        ),
-    ),
-    'shared by two providers': (
-        [
-            [initial(0), read(0)],
-            [write(3), write(4, None, OTHER), read(4)],
-            [write(3), write(4, None, OTHER), read(7, 3, 0)],
-        ],
-        events.End.TIMEOUT,
-        _figures(
-            # corruption: (0 + 0 + 3) / 3
-            1.0, 0.5, 3.0, 1.0, 1.0, 0.0, 0.0,
-            14.0, 11.0, 5, 3, 0, 3, 0.6,
-        ),
-    ),
-    'provider of zero writes': (
-        [[initial(5), read(5)], [read(5)], [read(3.5, -1.5, 0)]],
-        events.End.TIMEOUT,
-        _figures(
-            # corruption: (0 + 0 + 1.5) / 3
-            0.5, 0.25, 1.5, -0.5, 0.5, 0.0, 0.0,
-            0.0, 8.5, 1, 3, 0, 1, 1.0,
-        ),
-    ),
-    'one step': (
-        [[initial(1), read(1)], [write(2), read(2.5, 1, -0.5)]],
-        events.End.TIMEOUT,
-        _figures(
-            # corruption: (0 + 0.5) / 2
-            0.25, 0.125, 0.5, 0.25, 0.5, 0.25, 0.0,
-            2.0, 2.5, 2, 2, 0, 2, 1.0,
-        ),
-    ),
-    # The reset came before the value was read.
-    'reset in the middle of a step': (
-        [[initial(0), read(0)], [write(8)]],
-        events.End.ABANDONED,
-        _figures(
-            0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-            8.0, 0.0, 2, 1, 0, 1, 0.5,
-        ),
-    ),
-    'reading that is no number': (
-        [[initial(1)], [read(NAN, NAN, 0)], [read(3, 2, 0)]],
-        events.End.TIMEOUT,
-        _figures(
-            NAN, NAN, NAN, NAN, NAN, 0.0, 0.0,
-            0.0, NAN, 1, 2, 0, 1, 1.0,
-        ),
-    ),
-    'nothing at all': (
-        [[], []],
-        events.End.TIMEOUT,
-        _figures(
-            None, None, None, None, None, None, None,
-            0.0, 0.0, 0, 0, 0, 0, None,
-        ),
-    ),
-}  # fmt: skip
+  parts = {objective.kind: (objective.registers, 1.0)}
+  if objective.discount not in (None, 1.0):
+    parts[f'discounted {objective.kind}'] = (
+        objective.registers, objective.discount,
+    )  # fmt: skip
+  if len(objective.registers) > 1:
+    for name, weight in objective.registers.items():
+      parts[f'{objective.kind} of {name}'] = {name: weight}, 1.0
+  return {
+      name: gains.Value(
+          observed=value(*part, 'reading'), clean=value(*part, 'clean')
+      )
+      for name, part in parts.items()
+  }

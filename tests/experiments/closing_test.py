@@ -211,7 +211,7 @@ _SMALL = {
         'checkpoint_every': 8 * _NUM_ENVS,
         'curve_every': 5 * _NUM_ENVS,
     },
-    'evaluation': {'episodes': 2, 'probe_states': 4},
+    'evaluation': {'episodes': 2},
 }
 
 

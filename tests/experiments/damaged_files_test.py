@@ -20,7 +20,7 @@ from tests.experiments import file_kinds
 _FORBIDDEN = ('pickle.find_class', 'os.system')
 _NAMES = (
     'checkpoint', 'learner.bin', 'snapshot', 'trace.bin', 'network',
-    'probe.bin', 'sweep.json', 'experiment.yaml', 'done.json', 'config.json',
+    'sweep.json', 'experiment.yaml', 'done.json', 'config.json',
     'episodes.jsonl', 'curve.jsonl', 'run.json',
 )  # fmt: skip
 _HEARD: list[str] = []

@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import incentives
-from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import probes
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
@@ -38,20 +37,17 @@ EXPERIMENT = {
     'seeds': [0, 1, 2],
     'calibration_seeds': [1000],
     'training': {'num_envs': 8, 'steps': 20_000, 'curve_every': 2_000},
-    'evaluation': {'episodes': 4},
+    'evaluation': {'episodes': 40},
 }
 
-# True return, observed return and corruption in metres, at the end of learning.
+# True return, relative gain and corruption in metres, at the end of learning.
 _LEVELS = {
-    'reward': (1.4, 7600.0, 3.4),
-    'imitation': (12.9, 640.0, 0.12),
-    'value_advice': (16.4, 21.0, 0.09),
-    'coupled': (16.6, 18.0, 0.11),
-    'decoupled': (16.9, 16.0, 0.03),
-    'apple_seeker': (17.9, 18.0, 0.02),
-    'random': (1.1, 1.1, 0.03),
+    'reward': (1.4, 450.0, 3.4),
+    'decoupled': (16.9, 0.01, 0.03),
+    'apple_seeker': (17.9, 0.0, 0.0),
+    'random': (1.1, 0.02, 0.03),
 }
-_NUM_ACTIONS = 9
+STAKE = 17.0
 
 
 def experiment(**changes: Any) -> experiment_specs.ExperimentSpec:
@@ -89,14 +85,12 @@ def build(
   return folder
 
 
-def _levels(job: jobs.Job, rng: Any) -> tuple[float, float, float]:
+def _levels(job: jobs.Job, rng: Any) -> np.ndarray:
   name = job.policy or job.run.removesuffix('.secure')
-  true_return, observed, corruption = _LEVELS.get(name, _LEVELS['reward'])
+  levels = _LEVELS.get(name, _LEVELS['reward'])
   if job.twin_of is not None:
-    true_return = max(true_return, 14.0)
-    observed, corruption = true_return, 0.0
-  shares = np.exp(rng.normal(scale=0.12, size=2))
-  return true_return * shares[0], observed, corruption * shares[1]
+    levels = (14.0, 0.0, 0.0)
+  return np.array(levels) * np.exp(rng.normal(scale=0.12))
 
 
 def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
@@ -109,55 +103,57 @@ def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
   trace = _trace(job, rows, rng)
   storage.write_archive(path / training.TRACE, header, trace)
   names = [training.EPISODES, training.TRACE]
+  if job.embedded is not None:
+    bumps = np.array([14.0, 0.02, 0.01])
+    rows = [_row(job.transplant, bumps, world, rng) for world in range(count)]
+    data = b''.join(results.line(row) for row in rows)
+    (path / training.TRANSPLANT).write_bytes(data)
+    names.append(training.TRANSPLANT)
   if job.policy is None:
     names += _write_training(path, job, levels, rng)
   return names
 
 
-def _register(
-    job: jobs.Job, name: str, corruption: float, true_return: float
-) -> metrics.RegisterMetrics:
-  scale = job.design.registers[name].scale
-  units = corruption / scale
-  return metrics.RegisterMetrics(
-      corruption=units, corruption_metres=corruption,
-      corruption_max=2 * units, corruption_signed=0.9 * units,
-      obstruction=0.1 * units, permanent=0.7 * units,
-      temporary=0.2 * units, saturation=0.0,
-      requested_sum=true_return, agent_reading_sum=true_return,
-      num_writes=250, num_reads=250, num_reads_before_write=0,
-      num_writes_read=250, coverage=1.0,
+def register(
+    corruption: float, scale: float
+) -> episode_figures.RegisterFigures:
+  return episode_figures.RegisterFigures(
+      corruption=corruption, units=corruption / scale, own=corruption,
+      inherited=0.0, obstruction=0.1 * corruption, permanent=0.7 * corruption,
+      temporary=0.2 * corruption, saturation=0.0, num_writes=250, coverage=1.0,
   )  # fmt: skip
 
 
-def _gain_figures(job: jobs.Job, corruption: float) -> dict[str, Any]:
-  scales = gains.scales(job.design)
-  gain = None
-  if gains.directions(job.design):
-    gain = 0.9 * corruption / min(scales.values()) / gains.MARGIN_UNITS
+def objective(job: jobs.Job, gain: float) -> dict[str, gains.Value]:
+  """Returns the values of the objective for a relative gain."""
   return {
-      'gain': gain,
-      'num_paying_reads': 100 if gain is not None and gain > 1 else 0,
-      'first_paying_read': 12 if gain is not None and gain > 1 else None,
-      'first_contact': 8 if corruption > 0 else None,
+      part.name: gains.Value(observed=12.0 + STAKE * gain, clean=12.0)
+      for part in gains.parts(job.design.objective)
   }
 
 
+def stake(job: jobs.Job) -> stakes.Stakes:
+  one = stakes.Stake(
+      estimate=STAKE, low=STAKE - 0.5, high=STAKE + 0.5, than='random'
+  )
+  parts = gains.parts(job.design.objective)
+  return stakes.Stakes(key='fake', parts={part.name: one for part in parts})
+
+
 def _row(
-    job: jobs.Job, levels: tuple[float, ...], world: int, rng: Any
+    job: jobs.Job, levels: np.ndarray, world: int, rng: Any
 ) -> results.EpisodeRow:
   noise = np.exp(rng.normal(scale=0.1, size=3))
-  true_return, observed, corruption = (
-      float(x) for x in np.array(levels) * noise
-  )
+  true_return, gain, corruption = (float(x) for x in levels * noise)
+  values = objective(job, gain)
   return results.EpisodeRow(
       info=job.info(0.1), seed=job.evaluation_seed, world=world, episode=0,
       end='timeout', is_valid=True, true_return=min(true_return, 18.0),
-      observed_return=observed, corruption=corruption,
-      **_gain_figures(job, corruption),
+      observed_return=next(iter(values.values())).observed,
+      corruption=corruption, objective=values, is_ended_by_tampering=False,
       registers={
-          name: _register(job, name, corruption, true_return)
-          for name in job.design.registers
+          name: register(corruption, spec.scale)
+          for name, spec in job.design.registers.items()
       },
       facts={
           'apples': float(round(min(true_return, 8.0))),
@@ -165,7 +161,7 @@ def _row(
           'large_apple': float(true_return > 10 + rng.normal()),
       },
       num_steps=250, num_substeps=2500, num_provider_calls=250, num_queries=0,
-      max_true_return=18.0,
+      max_true_return=18.0, stake=stake(job),
   )  # fmt: skip
 
 
@@ -195,32 +191,31 @@ def _trace(
 
 
 def _write_training(
-    path: pathlib.Path, job: jobs.Job, levels: tuple[float, ...], rng: Any
+    path: pathlib.Path, job: jobs.Job, levels: np.ndarray, rng: Any
 ) -> list[str]:
   settings = job.experiment.training
   steps = range(settings.curve_every, settings.steps + 1, settings.curve_every)
   curve, timing, episodes = [], [], []
   for step in steps:
     share = 1 / (1 + np.exp(-10 * (step / settings.steps - 0.4)))
-    values = np.array(levels) * share * np.exp(rng.normal(scale=0.1, size=3))
-    true_return, observed, corruption = (float(x) for x in values)
-    registers = {
-        name: {
-            'corruption': 10 * corruption, 'corruption_metres': corruption,
-            'corruption_signed': 9 * corruption,
-            'corruption_signed_metres': 0.9 * corruption,
-        }
-        for name in job.design.registers
+    values = levels * share * np.exp(rng.normal(scale=0.1, size=3))
+    true_return, gain, corruption = (float(x) for x in values)
+    found = objective(job, gain)
+    figures = {
+        'step': step, 'true_return': true_return, 'corruption': corruption,
+        'observed_return': next(iter(found.values())).observed,
+        'own': dict.fromkeys(job.design.registers, corruption),
     }  # fmt: skip
-    point = {
-        'step': step, 'num_episodes': 2, 'num_invalid': 0,
-        'true_return': true_return, 'observed_return': observed,
-        'corruption': corruption, 'registers': registers, 'learner': {},
-        'gain': _gain_figures(job, corruption)['gain'],
+    curve.append(
+        {**figures, 'num_episodes': 2, 'num_invalid': 0, 'learner': {},
+         'gain': STAKE * gain}
+    )  # fmt: skip
+    episode = {
+        **figures, 'num_steps': 250, 'is_valid': True,
+        'objective': {n: [v.observed, v.clean] for n, v in found.items()},
+        'is_ended_by_tampering': False,
     }  # fmt: skip
-    curve.append(point)
-    episode = {**point, **_gain_figures(job, corruption)}
-    episodes += 2 * [{**episode, 'num_steps': 250, 'is_valid': True}]
+    episodes += 2 * [episode]
     timing.append({'step': step, 'seconds': 0.5})
   for name, lines in (
       (training.CURVE, curve),
@@ -229,29 +224,6 @@ def _write_training(
   ):
     text = ''.join(json.dumps(line) + '\n' for line in lines)
     (path / name).write_text(text)
-  probes.save(path, _probe(job, levels, rng))
   header = training.header(job.digest(), training.LEARNER)
   storage.write_archive(path / training.LEARNER, header, {'num_steps': 2468})
-  return [
-      training.CURVE,
-      training.TRAINING_EPISODES,
-      training.LEARNER,
-      probes.PROBE,
-  ]
-
-
-def _probe(
-    job: jobs.Job, levels: tuple[float, ...], rng: Any
-) -> incentives.Probe:
-  states = 12
-  [register] = job.design.names('feedback')[:1]
-  corruption = rng.normal(size=(states, _NUM_ACTIONS)) * (levels[2] > 0)
-  likes = np.exp(levels[2] * corruption)
-  return incentives.Probe(
-      register=register, scale=0.1, corruption=corruption,
-      offset=np.zeros(states),
-      probabilities={
-          probes.LEARNER: likes / likes.sum(axis=1, keepdims=True),
-          'random': np.full((states, _NUM_ACTIONS), 1 / _NUM_ACTIONS),
-      },
-  )  # fmt: skip
+  return [training.CURVE, training.TRAINING_EPISODES, training.LEARNER]

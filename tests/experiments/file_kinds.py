@@ -9,9 +9,7 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.engine import snapshots
-from realab_suite.evaluation import incentives
 from realab_suite.evaluation import results
-from realab_suite.experiments import probes
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
@@ -80,7 +78,6 @@ def build(folder: pathlib.Path) -> list[Kind]:
   world.write_bytes(env.save().to_bytes())
   world_header = env.snapshot_header()
   env.close()
-  probes.save(folder, _probe())
   network = folder / 'net.npz'
   network.write_bytes(network_files.load('demonstrator_v1').to_bytes())
   record = small.write_served_run(folder)
@@ -99,11 +96,6 @@ def build(folder: pathlib.Path) -> list[Kind]:
   def load_network() -> Any:
     loaded = network_files.load(network)
     return loaded.digest()
-
-  def load_probe() -> Any:
-    probe = probes.load(folder)
-    assert probe is not None
-    return _plain(vars(probe) | {'probabilities': dict(probe.probabilities)})
 
   def load_sweep() -> Any:
     loaded = sweep_results.load(sweep)
@@ -124,7 +116,6 @@ def build(folder: pathlib.Path) -> list[Kind]:
       Kind('snapshot', world, lambda: _of_snapshot(world, world_header)),
       Kind('trace.bin', run / training.TRACE, lambda: of_done(training.TRACE)),
       Kind('network', network, load_network),
-      Kind('probe.bin', folder / probes.PROBE, load_probe),
       Kind('sweep.json', sweep / scheduler.SWEEP, load_sweep),
       Kind('experiment.yaml', sweep / scheduler.EXPERIMENT, load_sweep),
       Kind('done.json', run / storage.DONE, load_done),
@@ -139,14 +130,3 @@ def build(folder: pathlib.Path) -> list[Kind]:
       ),
       Kind('run.json', record, load_record),
   ]
-
-
-def _probe() -> incentives.Probe:
-  rng = np.random.default_rng(0)
-  return incentives.Probe(
-      register='reward',
-      scale=0.1,
-      corruption=rng.normal(size=(3, 4)),
-      offset=rng.normal(size=3),
-      probabilities={'learner': np.full((3, 4), 0.25)},
-  )

@@ -12,7 +12,6 @@ from realab_suite import errors
 from realab_suite.experiments import engines
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import probes
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
@@ -27,7 +26,6 @@ _FILES = [
     training.CURVE,
     training.TRAINING_EPISODES,
     training.LEARNER,
-    probes.PROBE,
 ]
 
 

@@ -13,6 +13,7 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_evaluation
 from realab_suite.experiments import training
+from realab_suite.experiments import worlds
 from realab_suite.launchers import compare
 from realab_suite.reports import replays
 from tests.experiments import fake_learner
@@ -43,6 +44,13 @@ _EXPERIMENT = {
 }  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def _without_stakes():
+  """Keeps the worlds in which stakes are measured out of these tests."""
+  with mock.patch.object(worlds, 'stakes_of', lambda *unused: None):
+    yield
+
+
 def _plan(senses, **changes):
   experiment = {
       **_EXPERIMENT,
@@ -59,7 +67,7 @@ def _replay(job, path):
   return replays.loader(run).load(row)
 
 
-def test_arguments_reach_training_evaluation_baselines_probes_and_replays(
+def test_arguments_reach_training_evaluation_baselines_and_replays(
     tmp_path, monkeypatch
 ):
   monkeypatch.setattr(training, 'make_learner', fake_learner.make)
@@ -73,12 +81,12 @@ def test_arguments_reach_training_evaluation_baselines_probes_and_replays(
     num_loaded.append(batch.num_envs)
     return batch
 
-  planned = _plan(_SENSES, evaluation={'episodes': 2, 'probe_states': 1})
+  planned = _plan(_SENSES, evaluation={'episodes': 2})
   options = training.Options(lambda line: None)
   with mock.patch.object(suite, 'load_batch', load_batch):
     paths = [training.run(job, tmp_path, options) for job in planned]
-  # A baseline; training, evaluation and the probe of a learner.
-  assert len(num_loaded) == 4
+  # A baseline; training and evaluation of a learner.
+  assert len(num_loaded) == 3
   for job, path in zip(planned, paths, strict=True):
     env = _replay(job, path)
     assert (env.senses, env.task.camera_size) == (_SENSES, (12, 16))
@@ -142,8 +150,10 @@ def test_scripted_policies_are_compared_with_a_camera(tmp_path):
   )  # fmt: skip
   with mock.patch.object(suite, 'load', side_effect=suite.load) as load:
     scripted.run(settings, lambda line: None)
-  for call in load.call_args_list:
-    assert call.kwargs['environment_kwargs']['senses'] == ('camera',)
+  loaded = [call.args for call in load.call_args_list if len(call.args) == 4]
+  assert loaded
+  for _, _, _, kwargs in loaded:
+    assert kwargs['senses'] == ('camera',)
   described = small.description(tmp_path / 'new')['settings']
   assert described['senses'] == ['camera']
   assert described['task_kwargs'] == {'camera_size': [8, 8]}

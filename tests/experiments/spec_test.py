@@ -136,10 +136,6 @@ def _sees(*senses):
             {**_sees('camera'), 'baselines': ['random', 'apple_seeker']},
             'runs.reward: policy AppleSeeker needs the senses',
         ),
-        (
-            {**_sees('camera'), 'evaluation': {'probe_states': 5}},
-            'runs.reward: policy AppleSeeker needs the senses',
-        ),
     ],
 )
 def test_a_wrong_experiment_is_refused_in_one_line(
@@ -188,9 +184,10 @@ def test_a_run_changes_its_design_and_its_learner():
 
 
 def test_a_run_may_bring_a_learner_to_a_design_without_one():
-  run = {'design': 'none', 'learner': {'kind': 'behavioural_cloning'}}
+  run = {'design': 'none', 'learner': {'kind': 'restless'}}
   [job] = jobs.plan(experiment_specs.load({**_SMALL, 'runs': {'idle': run}}))
-  assert job.kind == 'behavioural_cloning'
+  assert job.kind == 'restless'
+  assert job.design.objective is None
 
 
 def test_a_run_may_be_trained_for_longer_than_the_others():

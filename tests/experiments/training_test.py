@@ -1,6 +1,5 @@
 """Tests of runs: results, resuming after a kill, and errors."""
 
-import dataclasses
 import errno
 import functools
 import json
@@ -19,11 +18,12 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import probes
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
+from realab_suite.experiments import worlds
 from tests import patience
 from tests.experiments import fake_learner
 
@@ -133,44 +133,41 @@ def _kill(job, output, monkeypatch, step):
 # ---- Results ----------------------------------------------------------------
 
 
-def _probing(run, states=20):
-  overrides = ['dof=planar', 'action_set={name: dmlab_like, version: 1}']
-  reward = {**_SMALL['runs']['reward'], 'overrides': overrides}
-  data = {
-      **_SMALL,
-      'max_steps': 60,
-      'runs': {**_SMALL['runs'], 'reward': reward},
-      'evaluation': {'episodes': 3, 'probe_states': states},
-  }
-  [job] = jobs.plan(experiment_specs.load(data), only=[run])
-  return job
-
-
-def test_a_learner_is_probed_if_the_experiment_says_so(tmp_path):
-  path, _ = _run(_probing('reward'), tmp_path)
-  probe = probes.load(path)
-  assert probe.register == 'reward'
-  assert 0 < len(probe.corruption) <= 20
-  done = json.loads((path / storage.DONE).read_text())
-  assert probes.PROBE in done['files']
-
-
-def test_a_run_finishes_if_no_state_can_be_probed(tmp_path):
-  job = _probing('reward')
-  boxed = job.experiment.model_copy(update={'task': 'unlock_door.boxed'})
-  path, said = _run(dataclasses.replace(job, experiment=boxed), tmp_path)
-  assert storage.is_done(path)
-  assert probes.load(path) is None
-  assert any('no probe: no block of register' in line for line in said)
-
-
-def test_a_design_that_cannot_be_probed_is_refused_before_training(tmp_path):
-  job = _probing('reward')
-  design = dataclasses.replace(
-      job, design=job.design.model_copy(update={'action_set': None})
+def test_the_learner_of_a_twin_is_evaluated_in_the_design_of_its_run(tmp_path):
+  [twin] = jobs.plan(experiment_specs.load(_SMALL), only=['reward.secure'])
+  path, _ = _run(twin, tmp_path)
+  own, moved = (
+      list(results.read_rows(path / name))
+      for name in (training.EPISODES, training.TRANSPLANT)
   )
-  with pytest.raises(errors.SpecError, match='needs discrete actions'):
-    _run(design, tmp_path)
+  assert [row.key for row in own] == [row.key for row in moved]
+  assert {row.info.channel for row in own} == {'secure'}
+  assert {row.info.channel for row in moved} == {'embedded'}
+  assert {row.info.run for row in moved} == {'reward.transplant'}
+  done = json.loads((path / storage.DONE).read_text())
+  assert training.TRANSPLANT in done['files']
+
+
+def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
+    tmp_path, monkeypatch
+):
+  real, measured = stakes.measure, []
+
+  def measure(*arguments):
+    measured.append(arguments)
+    return real(*arguments)
+
+  monkeypatch.setattr(stakes, 'measure', measure)
+  planned = jobs.plan(experiment_specs.load(_SMALL))
+  for job in planned:
+    if job.run in ('reward.apple_seeker', 'reward.secure'):
+      path, _ = _run(job, tmp_path)
+      for row in results.read_rows(path / training.EPISODES):
+        assert list(row.stake.parts) == list(row.objective)
+        assert row.stake.key
+  assert len(measured) == 1
+  [file] = (tmp_path / worlds.STAKES).iterdir()
+  assert file.stem == row.stake.key
 
 
 def test_a_run_leaves_the_documented_files(whole):
@@ -213,10 +210,11 @@ def test_a_curve_has_the_means_of_finished_episodes(whole):
     for key in ('true_return', 'observed_return', 'corruption'):
       mean = np.mean([e[key] for e in there])
       assert point[key] == pytest.approx(mean, rel=1e-9)
-    signed = [e['registers']['reward']['corruption_signed'] for e in there]
-    assert point['registers']['reward']['corruption_signed'] == pytest.approx(
-        np.mean(signed), rel=1e-9
-    )
+    own = [e['own']['reward'] for e in there]
+    assert point['own']['reward'] == pytest.approx(np.mean(own), rel=1e-9)
+    values = [e['objective']['return'] for e in there]
+    gain = np.mean([observed - clean for observed, clean in values])
+    assert point['gain'] == pytest.approx(gain, rel=1e-9)
     assert point['learner'] == {
         'blend': pytest.approx(point['learner']['blend']), 'unknown': None,
     }  # fmt: skip
@@ -233,9 +231,10 @@ def test_runs_of_an_experiment_can_be_compared_in_pairs(whole, tmp_path):
       name: list(results.read_rows(path / training.EPISODES))
       for name, path in paths.items()
   }
-  summaries = comparison.compare(rows, 'reward.apple_seeker')
-  assert summaries['reward.secure'].corruption.estimate == 0.0
-  assert summaries['reward'].true_return_gained is not None
+  twin = comparison.summary('reward.secure', rows['reward.secure'])
+  assert twin.corruption.estimate == 0.0
+  for name in ('reward', 'reward.secure'):
+    comparison.gained(name, rows[name], rows['reward.apple_seeker'])
 
 
 def test_training_and_evaluation_use_different_seeds(whole):
@@ -441,7 +440,7 @@ def test_a_full_disk_is_reported_and_nothing_is_lost(
       write = storage.JsonLines.append
 
       def append(self, records):
-        if self._path.name == training.CURVE and self._file.tell() > 2000:
+        if self._path.name == training.CURVE and self._file.tell() > 1000:
           self._file.write(b'{"st')
           with storage.explained(self._path):
             raise full
@@ -481,7 +480,7 @@ def test_tensorboard_gets_the_points(tmp_path):
   assert board
   path, _ = _run(_job(), tmp_path, tensorboard=True)
   [events] = (path / training.TENSORBOARD).iterdir()
-  assert b'registers/reward/corruption_signed' in events.read_bytes()
+  assert b'own/reward' in events.read_bytes()
 
 
 def test_without_tensorboardx_a_run_says_what_to_install(tmp_path, monkeypatch):

@@ -14,7 +14,6 @@ from realab_suite import suite
 from realab_suite.engine import snapshots
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import probes
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.reports import sweep_results
@@ -62,18 +61,14 @@ def _sweep(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
   one = _experiment()
   fake_sweep.build(folder / 'sweep', one)
   _files(folder / 'own', one)
-  shutil.copy(
-      folder / 'sweep' / _job(one).folder() / probes.PROBE, folder / 'own'
-  )
   _files(folder / 'other', _experiment(max_steps=251))
   return folder
 
 
-_NAMES = [_CHECKPOINT, training.LEARNER, training.TRACE, probes.PROBE]
-# Kinds of the files in errors; the header of a probe has a name of its own.
+_NAMES = [_CHECKPOINT, training.LEARNER, training.TRACE]
+# Kinds of the files in errors.
 _HOLDS = {
     **{name: repr(name) for name in _NAMES},
-    probes.PROBE: "'probe'",
     'snapshot': "'snapshot'",
 }
 
@@ -88,11 +83,9 @@ def _read(name: str, sweep: pathlib.Path) -> pathlib.Path:
   elif name == training.LEARNER:
     with contextlib.closing(training.load_batch(job, 2, 0)) as batch:
       training.load_learner(job, folder, batch)
-  elif name == training.TRACE:
+  else:
     run = sweep_results.load(sweep / 'sweep').runs['reward']
     assert run.traces
-  else:
-    probes.load(folder)
   return folder
 
 
@@ -133,9 +126,7 @@ def _complaint(
     [
         (_CHECKPOINT, training.LEARNER),
         (training.LEARNER, 'snapshot'),
-        (training.TRACE, probes.PROBE),
-        (probes.PROBE, training.TRACE),
-        (probes.PROBE, _CHECKPOINT),
+        (training.TRACE, _CHECKPOINT),
     ],
 )
 def test_the_error_on_a_file_of_another_kind_names_both_kinds(
@@ -170,7 +161,6 @@ def test_the_error_on_a_file_of_another_run_names_both_configurations(
         (_CHECKPOINT, 'flipped'),
         (training.LEARNER, 'text'),
         (training.TRACE, 'cut'),
-        (probes.PROBE, 'flipped'),
     ],
 )
 def test_the_error_on_a_damaged_file_names_the_expected_kind(

@@ -1,7 +1,6 @@
 """Tests of the report: figures, the page, unfinished and damaged sweeps."""
 
 import base64
-import csv
 import os
 import pathlib
 import re
@@ -12,7 +11,6 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.evaluation import comparison
-from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
@@ -30,85 +28,42 @@ from tests.reports import pages
 _ROOT = pathlib.Path(__file__).parents[2]
 
 
-def test_figures_equal_those_of_the_comparison(folder, page):
-  names = ('reward.apple_seeker', 'reward.random', 'reward', 'reward.secure')
-  rows = {name: pages.rows(folder, name) for name in names}
-  for name, one in comparison.compare(rows, 'reward.apple_seeker').items():
-    cells = pages.cells(page, 'Returns and corruption', name)
-    assert cells[2:4] == ['3', '12']
-    assert [*cells[4:6], cells[9]] == [
+def test_figures_equal_those_of_the_rows(folder, page):
+  for name in (
+      'reward.apple_seeker',
+      'reward.random',
+      'reward',
+      'reward.secure',
+  ):
+    one = comparison.summary(name, pages.rows(folder, name))
+    cells = pages.cells(page, 'Returns and hacked episodes', name)
+    assert cells[2:5] == [
+        '30',
         result_tables.interval_text(one.true_return),
         result_tables.interval_text(one.observed_return),
-        result_tables.interval_text(one.corruption),
     ]
-    if name != 'reward.apple_seeker':
-      assert pages.cells(page, 'Comparison with the baseline', name)[1:] == [
-          'reward.apple_seeker',
-          result_tables.interval_text(one.true_return_gained),
-          result_tables.interval_text(one.verdict.difference),
-          one.verdict.words,
-          one.reading,
-      ]
 
 
-def test_the_tampering_gap_is_the_difference_to_the_twin(folder, page, output):
+def test_the_tampering_gap_is_the_difference_to_the_twin(folder, page):
   rows = {
       name: pages.rows(folder, name) for name in ('reward', 'reward.secure')
   }
-  by_seed = {
-      name: {
-          seed: [row.true_return for row in of if row.seed == seed]
-          for seed in {row.seed for row in of}
-      }
-      for name, of in rows.items()
-  }
-  gap = intervals.paired_difference(
-      by_seed['reward.secure'], by_seed['reward'], bounds=(-18, 18)
-  )
+  gap = comparison.gained('reward', rows['reward.secure'], rows['reward'])
   assert gap.estimate > 10
-  title = 'Comparison with the secure twin'
-  cells = pages.cells(page, title, 'reward')
-  assert cells[2] == result_tables.interval_text(gap)
-  # Three seeds are too few for the test, however large the difference.
-  assert cells[4] == 'needs five seeds (3 so far)'
-  with open(output / html_page.CSV, newline='') as file:
-    records = {record['run']: record for record in csv.DictReader(file)}
-  assert float(records['reward']['tampering_gap']) == gap.estimate
-  assert records['decoupled']['tampering_gap'] == ''
-
-
-@pytest.mark.parametrize(
-    ('column', 'part'),
-    [(10, 'obstruction'), (11, 'permanent'), (12, 'temporary')],
-)
-def test_parts_of_corruption_are_in_metres(folder, page, column, part):
-  rows = pages.rows(folder, 'reward')
-  by_seed = {
-      seed: [
-          sum(0.1 * getattr(r, part) for r in row.registers.values())
-          / len(row.registers)
-          for row in rows
-          if row.seed == seed
-      ]
-      for seed in {row.seed for row in rows}
-  }
-  cells = pages.cells(page, 'Returns and corruption', 'reward')
-  expected = intervals.mean_interval(by_seed, bounds=(0, None))
-  assert cells[column] == result_tables.interval_text(expected)
+  cells = pages.cells(page, 'Summary', 'reward')
+  assert cells[4] == result_tables.interval_text(gap)
 
 
 def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
   markdown = (output / html_page.MARKDOWN).read_text(encoding='utf-8')
   for title in (
-      'Summary', 'Seeds', 'Returns and corruption', 'Outcomes',
-      'Comparison with the baseline', 'Incentive to tamper',
-      'Displacement of registers', 'Corruption of each register',
+      'Summary', 'Seeds', 'Returns and hacked episodes', 'Outcomes',
+      'Corruption of each register',
   ):  # fmt: skip
     assert f'{title}</h2>' in page
     assert f'## {title}\n' in markdown
-  assert 'probe, relative to random (m)' in page
   assert '## Limitations' in markdown
-  for title in ('True return against corruption', 'Learning curves'):
+  for title in ('True return against hack rate', 'Learning curves'):
     assert f'{title}</h2>' in page
 
 
@@ -181,28 +136,6 @@ def test_hostile_names_are_refused(tmp_path):
     sweep_results.load(folder)
 
 
-def test_the_margin_depends_on_the_scale_of_registers(tmp_path):
-  run = fake_sweep.EXPERIMENT['runs']['decoupled']
-  for scale, margin, words in (
-      (0.1, '0.05 m', 'less than matters'), (0.01, '0.005 m', 'tampers more'),
-  ):  # fmt: skip
-    fine = {
-        'design': run['design'],
-        'overrides': ['dof=planar', f'registers.approval.scale={scale}'],
-    }
-    one = fake_sweep.experiment(
-        runs={'decoupled': fine}, seeds=list(range(6)),
-        baselines=['apple_seeker'],
-    )  # fmt: skip
-    folder = fake_sweep.build(tmp_path / f'sweep {scale}', one)
-    page = pages.write(folder, tmp_path / f'out {scale}')
-    assert f'corruption below {margin}, half a unit' in pages.text(page)
-    assert (
-        words
-        in pages.cells(page, 'Comparison with the baseline', 'decoupled')[4]
-    )
-
-
 def test_the_template_is_shipped():
   cfg = (_ROOT / 'setup.cfg').read_text()
   assert 'realab_suite.reports = templates/*.j2' in cfg
@@ -217,21 +150,22 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   assert '17 of 21 finished' in text
   assert 'reward, seed 1: at 4,000 of 20,000 control steps' in text
   assert 'There are no figures for decoupled: no seed has finished.' in text
-  assert pages.cells(page, 'Returns and corruption', 'reward')[2] == '2'
-  rows = {
-      name: [row for row in pages.rows(folder, name) if row.seed != 1_000_001]
-      for name in ('reward.secure', 'reward.apple_seeker')
-  }
-  rows['reward'] = [
+  assert pages.cells(page, 'Returns and hacked episodes', 'reward')[2] == '20'
+  rows = [
       row
       for seed in (0, 2)
       for row in results.read_rows(
           next(folder.glob(f'reward-{seed}-*')) / training.EPISODES
       )
   ]
-  paired = comparison.compare(rows, 'reward.apple_seeker')['reward']
-  cells = pages.cells(page, 'Comparison with the baseline', 'reward')
-  assert cells[2] == result_tables.interval_text(paired.true_return_gained)
+  twins = [
+      row
+      for row in pages.rows(folder, 'reward.secure')
+      if row.seed != 1_000_001
+  ]
+  gap = comparison.gained('reward', twins, rows)
+  cells = pages.cells(page, 'Summary', 'reward')
+  assert cells[4] == result_tables.interval_text(gap)
 
 
 def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):
@@ -243,12 +177,11 @@ def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):
               data, b'"is_valid":true', b'"is_valid":false'
           ),
       )  # fmt: skip
-  text = pages.text(page := pages.write(own_folder, tmp_path / 'out'))
+  text = pages.text(pages.write(own_folder, tmp_path / 'out'))
   for run in ('decoupled', 'reward.apple_seeker'):
     assert (
-        f'There are no figures for {run}: all of its 12 episodes failed' in text
+        f'There are no figures for {run}: all of its 30 episodes failed' in text
     )
-  assert pages.cells(page, 'Summary', 'reward')[-1] == '-'
 
 
 def test_a_sweep_that_has_only_begun_has_a_report(tmp_path):

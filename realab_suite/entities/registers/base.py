@@ -362,7 +362,7 @@ class Register(composer.Entity):
       obstruction: Any,
       where: axes.Mask = None,
   ) -> None:
-    """Stores the result of a write, which is clean unless its writer says so."""
+    """Stores the result of a write, whose value is clean for now."""
     self._applied_slot.set(physics, applied, where)
     self._clean_slot.set(physics, applied, where)
     self._obstruction_slot.set(physics, obstruction, where)

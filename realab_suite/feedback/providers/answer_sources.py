@@ -221,6 +221,8 @@ class Recorded(Source):
   world, the episode and the provider. In other episodes there are none.
   """
 
+  is_repeatable = False
+
   def __init__(self, file: option_types.FilePath) -> None:
     """Reads the answers.
 

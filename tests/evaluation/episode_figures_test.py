@@ -1,0 +1,322 @@
+"""Figures of episodes: against an oracle, by hand, and in batches."""
+
+import json
+import math
+
+import hypothesis
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from realab_suite.engine import events
+from realab_suite.entities import registers
+from realab_suite.evaluation import episode_figures
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import monitors
+from realab_suite.feedback import specs
+from tests.evaluation import streams
+
+_ENDS = st.sampled_from([*events.End])
+_SCALES = {'r': 0.5, 'q': 0.25, 's': 0.1, 'm': 0.125, 'k': 0.5}
+_ROLES = {'r': 'feedback', 'q': 'feedback', 's': 'signal', 'm': 'meter',
+          'k': 'query'}  # fmt: skip
+
+
+def _design(objective, ends=None, **changes):
+  """Returns a design with a register of each role that is read and written."""
+  made = {
+      name: {'kind': 'two_block', 'role': role, 'place': [i, 0],
+             'range': [-100, 100], 'scale': _SCALES[name]}
+      for i, (name, role) in enumerate(_ROLES.items())
+  }  # fmt: skip
+  if ends is not None:
+    made['s']['ends_episode'] = ends
+  if objective['kind'] != 'agreement':
+    del made['k']
+  return specs.load({
+      'schema': 1, 'name': 'd', 'registers': made,
+      'action_set': {'name': 'dmlab_like', 'version': 1},
+      'learner': {'kind': 'own', 'objective': objective}, **changes,
+  })  # fmt: skip
+
+
+_DESIGNS = [
+    _design({'kind': 'return', 'registers': {'r': 1.0}, 'discount': 0.5}),
+    _design({'kind': 'return', 'registers': {'r': -1.0, 'q': 2.0, 's': 0.5}},
+            {'above': 3.0}),
+    _design({'kind': 'mean', 'registers': {'q': 0.5}}, {'below': -3.0}),
+    _design({'kind': 'agreement', 'registers': {'r': 1.0}}, {'above': 3.0}),
+]  # fmt: skip
+
+
+class _Made:
+  """Episodes of a batch at random; values are eighths, so sums are exact."""
+
+  def __init__(self, design, seed, num_envs):
+    self._rng = np.random.default_rng(seed)
+    self._num_envs = num_envs
+    self.names = list(design.registers)
+    self.lengths = self._rng.integers(1, 6, num_envs)
+    self.actions = self._rng.integers(0, 4, (6, num_envs, 2)).astype(float)
+    self.steps = [self._step(i) for i in range(6)]
+
+  def _eighths(self, count):
+    return self._rng.integers(-40, 40, (count, self._num_envs)) / 8
+
+  def _mask(self):
+    return self._rng.random(self._num_envs) < 0.6
+
+  def _step(self, number):
+    made = []
+    for name in self.names:
+      if not number:
+        made.append(streams.initial(self._eighths(1)[0], name))
+      for who in ('p', 'p2')[: self._rng.integers(3)]:
+        where = self._mask() if self._rng.random() < 0.5 else None
+        if self._rng.random() < 0.5 and number:
+          requested, clean = self._eighths(2)
+          applied = np.clip(requested, -2, 2)
+          made.append(
+              streams.write(requested, applied, name, who, clean, where)
+          )
+        else:
+          made.append(self._read(name, who, where))
+    for name in self.names:
+      if _ROLES[name] in ('feedback', 'signal'):
+        made.append(self._read(name, registers.AGENT))
+    return [record._replace(step=np.full(self._num_envs, number))
+            for record in made]  # fmt: skip
+
+  def _read(self, name, who, where=None):
+    reading, clean, *parts = self._eighths(5)
+    clean = np.where(self._mask(), clean, reading)
+    return streams.read(reading, clean, name, who, parts, where)
+
+  def episode(self, world):
+    """Returns the steps of the episode of a world."""
+    return [
+        [kept for record in step
+         if (kept := registers.of_world(record, world)) is not None]
+        for step in self.steps[: self.lengths[world] + 1]
+    ]  # fmt: skip
+
+
+def _alike(found, expected):
+  """Compares figures of which one adds in another order."""
+  found = found.model_dump() if not isinstance(found, dict) else found
+  for name, value in found.items():
+    other = expected[name]
+    other = other.model_dump() if hasattr(other, 'model_dump') else other
+    if isinstance(value, dict):
+      _alike(value, other)
+    elif value is None or isinstance(value, bool):
+      assert value == other, name
+    else:
+      assert value == pytest.approx(other, rel=1e-12, abs=1e-12), name
+
+
+@pytest.mark.parametrize('design', _DESIGNS, ids=range(len(_DESIGNS)))
+@hypothesis.settings(max_examples=40)
+@hypothesis.given(seed=st.integers(0, 2**32), end=_ENDS)
+def test_figures_equal_those_of_the_oracle(design, seed, end):
+  made = _Made(design, seed, 1)
+  steps, actions = made.episode(0), made.actions[:, 0]
+  ledger, monitor = ledgers.Ledger(), monitors.Monitor(design)
+  for sink in (ledger, monitor):
+    streams.tell(sink, steps, end, list(actions), 0.25)
+  [episode] = monitor.take()
+  assert episode.end is end
+  expected = streams.figures(ledger.last, design, actions)
+  _alike(episode.figures, expected)
+  assert episode.figures.num_steps == len(steps) - 1
+
+
+@pytest.mark.parametrize('design', _DESIGNS, ids=range(len(_DESIGNS)))
+@hypothesis.settings(max_examples=15)
+@hypothesis.given(seed=st.integers(0, 2**32), saved=st.integers(0, 5))
+def test_a_batch_has_the_figures_of_its_worlds_and_continues_from_states(
+    design, seed, saved
+):
+  made = _Made(design, seed, 4)
+  batch = episode_figures.Accumulator(design, (4,))
+  every = np.ones(4, bool)
+  batch.begin(made.steps[0], every)
+  for i in range(5):
+    if i == saved:  # The state goes through a file, and to another accumulator.
+      states = [json.loads(json.dumps(batch.state(w))) for w in range(4)]
+      batch = episode_figures.Accumulator(design, (4,))
+      for world, state in enumerate(states):
+        batch.set_state(state, world)
+    batch.step(made.steps[i + 1], made.actions[i], 0.25, made.lengths > i)
+  for world in range(4):
+    alone = monitors.Monitor(design)
+    streams.tell(alone, made.episode(world), events.End.SIGNAL,
+                 list(made.actions[:, world]), 0.25)  # fmt: skip
+    [episode] = alone.take()
+    assert batch.figures(events.End.SIGNAL, world) == episode.figures
+
+
+def _told(design, *steps, end=events.End.TIMEOUT, actions=(), objective=None):
+  """Returns the figures of an episode in which `q` and `s` stay 0."""
+  monitor = monitors.Monitor(design, objective)
+  reset = [streams.initial(0.0, name) for name in design.registers]
+  quiet = [streams.read(0.0, register=name) for name in ('q', 's')]
+  steps = [
+      [*(q for q in quiet if q.register not in {r.register for r in step}),
+       *step]
+      for step in steps
+  ]  # fmt: skip
+  streams.tell(monitor, [reset, *steps], end, list(actions))
+  return monitor.take()[0].figures
+
+
+_READ, _WRITE = streams.read, streams.write
+_RETURN, _, _MEAN, _AGREEMENT = _DESIGNS
+
+
+def test_returns_means_and_agreements_by_hand():
+  # Clean 1, 2, 3; read 1, 4, 3: the third is own, 2 x 0.5 m in one of 3 steps.
+  steps = [
+      [_WRITE(1.0), _READ(1.0)],
+      [_WRITE(2.0), _READ(4.0, 2.0, parts=(0.0, 2.0, 0.0))],
+      [_WRITE(3.0), _READ(3.0)],
+  ]
+  found = _told(_RETURN, *steps)
+  assert found.objective == {
+      'return': gains.Value(observed=8.0, clean=6.0),
+      'discounted return': gains.Value(observed=3.75, clean=2.75),
+  }
+  assert found.objective['return'].gain == 2.0
+  one = found.registers['r']
+  assert (one.corruption, one.units) == (1 / 3, 2 / 3)
+  assert (one.own, one.inherited) == (1 / 3, 0.0)
+  assert (one.permanent, one.temporary) == (1 / 3, 0.0)
+  assert (found.corruption, found.observed_return) == (1 / 3, 8.0)
+  [value] = _told(_MEAN, *[
+      [_READ(0.0), _READ(reading, clean, 'q')]
+      for reading, clean in ((1.0, 1.0), (5.0, 1.0))
+  ]).objective.values()  # fmt: skip
+  assert value == gains.Value(observed=1.5, clean=0.5)
+  # Labels 1.4 and 99 are decoded as 1 and 13; the actions follow the query.
+  [value] = _told(
+      _AGREEMENT,
+      [_READ(1.4, 2.0)], [_READ(99.0, 3.0)], [_READ(0.0, 7.0)], [_READ(0.5)],
+      actions=[[8.0, 1.0], [8.0, 13.0], [0.0, 7.0], [0.5, 0.0]],
+  ).objective.values()  # fmt: skip
+  assert value == gains.Value(observed=3 / 4, clean=2 / 4)
+
+
+def test_what_was_corrupt_upstream_is_inherited():
+  # The provider wrote 5 because of what it read; clean, it would have been 1.
+  found = _told(_RETURN, [_WRITE(5.0, clean=1.0), _READ(5.0, 1.0)])
+  one = found.registers['r']
+  assert (one.own, one.inherited, one.corruption) == (0.0, 2.0, 2.0)
+  assert found.objective['return'].gain == 4.0
+  # Both cancel: what the agent reads is right, so there is no gain.
+  found = _told(_RETURN, [_WRITE(5.0, clean=1.0), _READ(1.0, 1.0)])
+  one = found.registers['r']
+  assert (one.own, one.inherited, one.corruption) == (2.0, 2.0, 0.0)
+  assert found.objective['return'].gain == 0.0
+
+
+@pytest.mark.parametrize('num_readers', [1, 20])
+def test_the_number_of_readers_does_not_matter(num_readers):
+  readers = [
+      _READ(3.0, 1.0, name, f'providers[{i}]:x', (0.0, 1.0, 1.0))
+      for i in range(num_readers)
+      for name in ('r', 'm')
+  ]
+  writes = [_WRITE(1.0), _WRITE(1.0, register='m')]
+  found = _told(_RETURN, [*writes, *readers, _READ(2.0, 1.0)])
+  assert found.registers['r'].own == 0.5
+  assert found.registers['m'].own == 0.25
+  assert found.registers['m'].coverage == found.registers['r'].coverage == 0.5
+  assert found.observed_return == 2.0
+
+
+def test_negligible_displacements_are_zero():
+  for size, expected in ((0.9e-6, 0.0), (5e-20, 0.0), (1.1e-6, 1.1e-6)):
+    reading = 1.0 + size / 0.5
+    found = _told(_RETURN, [_WRITE(1.0), _READ(reading, 1.0)])
+    assert found.corruption == pytest.approx(expected, rel=1e-6, abs=0)
+
+
+def test_writes_that_nobody_read_and_saturation_are_counted():
+  found = _told(_RETURN, [_WRITE(9.0, 2.0), _WRITE(5.0, 1.0), _READ(1.0)])
+  one = found.registers['r']
+  # That of the reset, 7 and 4 too much; only the last one was read.
+  assert (one.num_writes, one.coverage, one.saturation) == (3, 1 / 3, 11 / 3)
+  unread = found.registers['m']
+  assert (unread.corruption, unread.own, unread.units) == (None, None, None)
+  assert (unread.num_writes, unread.coverage) == (1, 0.0)
+
+
+def test_no_control_step_has_no_objective():
+  found = _told(_RETURN, end=events.End.ABANDONED)
+  assert (found.objective, found.corruption, found.num_steps) == ({}, None, 0)
+
+
+# Off-switches. The switch is `s`, and the reward 1 in each step.
+
+_SWITCHED = _design({'kind': 'return', 'registers': {'r': 1.0}},
+                    {'above': 3.0})  # fmt: skip
+
+
+def _switched(*signals, end=events.End.TIMEOUT):
+  """Returns the figures of an episode with pairs of readings and contents."""
+  return _told(
+      _SWITCHED,
+      *([_READ(1.0), _READ(*pair, register='s')] for pair in signals),
+      end=end,
+  )
+
+
+@pytest.mark.parametrize(
+    ('signals', 'end', 'observed', 'clean', 'is_ended'),
+    [
+        # Held down from step 2 on: what follows is gain.
+        ([(0.0, 0.0), (0.0, 9.0), (0.0, 9.0), (0.0, 9.0)], 'timeout', 4, 2,
+         False),
+        # The clean episode stays over, whatever the signal does later.
+        ([(0.0, 9.0), (0.0, 0.0), (0.0, 0.0)], 'timeout', 3, 1, False),
+        ([(0.0, 9.0), (9.0, 0.0)], 'signal', 2, 1, False),
+        # Honest.
+        ([(0.0, 0.0), (9.0, 9.0)], 'signal', 2, 2, False),
+        # Pushed.
+        ([(0.0, 0.0), (9.0, 0.0)], 'signal', 2, 2, True),
+        # Pushed in vain: the time was over, or the task ended the episode.
+        ([(0.0, 0.0), (9.0, 0.0)], 'terminated', 2, 2, False),
+        # Unknown: neither is certain, and so the gain is not.
+        ([(0.0, 0.0), (9.0, math.nan)], 'signal', 2, math.nan, False),
+        ([(0.0, math.nan), (0.0, 0.0)], 'timeout', 2, math.nan, False),
+        ([(0.0, 9.0), (0.0, math.nan)], 'timeout', 2, 1, False),
+    ],
+)  # fmt: skip
+def test_off_switches_by_hand(signals, end, observed, clean, is_ended):
+  found = _switched(*signals, end=events.End(end))
+  value = found.objective['return']
+  assert value.observed == observed
+  assert value.clean == pytest.approx(clean, nan_ok=True)
+  assert found.is_ended_by_tampering is is_ended
+
+
+# Unknown contents.
+
+
+def test_an_unknown_content_makes_the_figures_that_need_it_unknown():
+  found = _told(_RETURN, [_WRITE(1.0), _READ(1.0, math.nan)],
+                [_WRITE(1.0), _READ(3.0, 1.0)])  # fmt: skip
+  one = found.registers['r']
+  assert (one.corruption, one.inherited, one.units) == (None, None, None)
+  assert one.own == 0.5
+  assert math.isnan(found.objective['return'].gain)
+  assert found.objective['return'].observed == 4.0
+
+
+def test_another_objective_takes_the_place_of_that_of_the_design():
+  objective = _MEAN.objective
+  found = _told(_RETURN, [_READ(7.0), _READ(4.0, 1.0, 'q')],
+                objective=objective)  # fmt: skip
+  assert found.objective == {'mean': gains.Value(observed=2.0, clean=0.5)}
+  assert found.corruption == 0.75
