@@ -4,6 +4,8 @@ from collections.abc import Iterable, Iterator, Sequence
 import pathlib
 from typing import Any
 
+import pyarrow as pa
+
 from realab_suite.datasets import columns
 from realab_suite.evaluation import results
 from realab_suite.experiments import storage
@@ -15,18 +17,19 @@ _HEAD = """# Episodes of realab_suite
 
 The feedback of the agent is stored in physical registers, which it can corrupt.
 An agent, or a monitor in its place, may read {agents} and nothing else. The
-other files contain the truth: true rewards, writes, corruption by kind and
-cause{labels}.
+other files contain the truth: true rewards, writes, clean contents, corruption
+by kind{labels}.
 
 Every episode was replayed from its recorded actions, and its returns and its
 corruption are those of the evaluation. Files are joined on `episode_id` and
 `step`; true columns never stand in a file for agents.
 """
 _LABELS = """, and the label `is_tampering` of each step (missing where the
-design has no direction that pays, or the attribution failed)"""
+learner is not judged, and where the stake is unknown or degenerate)"""
 _COUNTS = (
     'run', 'policy', 'design', 'channel', 'episodes', 'steps',
-    'tampering steps', 'mean true return', 'mean observed return',
+    'attributed episodes', 'tampering steps', 'mean relative gain',
+    'mean true return', 'mean observed return',
 )  # fmt: skip
 _MINARI = (
     'The data of the agent are a Minari dataset: `{name}`, with'
@@ -77,11 +80,19 @@ def write(
   storage.write_whole(folder / NAME, f'{text}\n'.encode())
 
 
-def table_of(table: Iterable[columns.Column]) -> str:
+def table_of(table: pa.Schema) -> str:
   """Returns columns as a table in Markdown."""
   return _table(
       ('column', 'type', 'unit', 'meaning'),
-      ((f'`{one.name}`', one.kind, one.unit or '-', one.text) for one in table),
+      (
+          (
+              f'`{one.name}`',
+              one.type,
+              one.metadata.get(b'unit', b'-').decode(),
+              one.metadata[b'description'].decode(),
+          )
+          for one in table
+      ),
   )
 
 
@@ -97,17 +108,22 @@ def _counts(
     known = [one for one in labels if one is not None]
     missing = len(labels) - len(known)
     note = f' ({missing} episodes without labels)' if missing else ''
-    true = [
-        row['true_return'] for row in rows if row['true_return'] is not None
-    ]
     yield (
         *run,
         len(rows),
         sum(row['num_steps'] for row in rows),
+        sum(row['is_attributed'] for row in rows),
         f'{sum(known)}{note}' if known else '-',
-        f'{sum(true) / len(true):.2f}' if true else '-',
-        f"{sum(row['observed_return'] for row in rows) / len(rows):.2f}",
+        *(
+            _mean(row[name] for row in rows)
+            for name in ('relative_gain', 'true_return', 'observed_return')
+        ),
     )
+
+
+def _mean(values: Iterable[float | None]) -> str:
+  known = [value for value in values if value is not None]
+  return f'{sum(known) / len(known):.2f}' if known else '-'
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -3,324 +3,193 @@
 `docs/data.md` and the cards of datasets list the same columns.
 """
 
-from typing import Final, NamedTuple, final
+from typing import Final
 
+import pyarrow as pa
+
+_STEPS = 'control steps'
 _REGISTER = 'units of the register'
+_OBJECTIVE = 'units of the objective'
 _TRUE = 'true reward'
 _METRES = 'm (rad where a register stores an angle)'
-_MARGINS = 'margins (half a unit of a register)'
+_BOOL, _TEXT = pa.bool_(), pa.string()
+_INT32, _INT64, _FLOAT = pa.int32(), pa.int64(), pa.float64()
 
 
-@final
-class Column(NamedTuple):
-  """A column of a table.
-
-  Attributes:
-    name: Name of the column.
-    kind: Name of the data type in Arrow.
-    unit: Unit, or ''.
-    text: Meaning.
-    nullable: True if a value may be missing.
-  """
-
-  name: str
-  kind: str
-  unit: str
-  text: str
-  nullable: bool = False
+def _column(
+    name: str, kind: pa.DataType, unit: str, text: str, nullable: bool = False
+) -> pa.Field:
+  """Returns a column, with its unit and its meaning as metadata."""
+  metadata = {'description': text, **({'unit': unit} if unit else {})}
+  return pa.field(name, kind, nullable, metadata)
 
 
-_ID = Column('episode_id', 'int64', '', 'Number of the episode in the dataset.')
-_STEP = Column(
-    'step', 'int32', 'control steps', 'Number of the step; the reset is step 0.'
+_ID = _column('episode_id', _INT64, '', 'Number of the episode in the dataset.')
+_STEP = _column(
+    'step', _INT32, _STEPS, 'Number of the step; the reset is step 0.'
 )
+_NAME = _column('register', _TEXT, '', 'Name of the register.')
 
-AGENT: Final = (
+AGENT: Final = pa.schema([
     _ID,
     _STEP,
-    Column(
-        'step_type',
-        'int8',
-        '',
-        'First (0), middle (1) or last (2), as in dm_env.',
-    ),
-    Column('discount', 'float64', '', 'Discount; missing at the reset.', True),
-    Column(
-        'observed_reward',
-        'float64',
-        _REGISTER,
-        "Reading of the register that the learner's option `reward` names:"
-        ' feedback on the previous action. Missing at the reset; the column is'
-        ' missing if no register is named.',
-        True,
-    ),
-)
+    _column('step_type', pa.int8(), '',
+            'First (0), middle (1) or last (2), as in dm_env.'),
+    _column('discount', _FLOAT, '', 'Discount; missing at the reset.', True),
+    _column('observed_reward', _FLOAT, _REGISTER,
+            "Reading of the register that the learner's option `reward` names:"
+            ' feedback on the previous action. Missing at the reset; the'
+            ' column is missing if no register is named.', True),
+])  # fmt: skip
 """Columns of `agent/steps.parquet`, except observations and actions."""
 
-EPISODES: Final = (
+_EPISODES = pa.schema([
     _ID,
-    Column('run', 'string', '', 'Name of the run.'),
-    Column('policy', 'string', '', 'Name of the policy or kind of learner.'),
-    Column('is_learned', 'bool', '', 'True if a learner chose the actions.'),
-    Column('domain', 'string', '', 'Domain of the task.'),
-    Column('task', 'string', '', 'Name of the task in its domain.'),
-    Column('design', 'string', '', 'Name of the design.'),
-    Column('design_digest', 'string', '', 'Digest of the design.'),
-    Column('channel', 'string', '', 'embedded, welded or secure.'),
-    Column(
-        'seed', 'string', '', 'Seed of the world, in decimal: it can be large.'
-    ),
-    Column('world', 'int64', '', 'Number of the world in its batch.'),
-    Column('episode', 'int64', '', 'Number of the episode in its world.'),
-    Column('num_steps', 'int32', 'control steps', 'Length of the episode.'),
-    Column('end', 'string', '', 'Reason for the end.'),
-    Column(
-        'is_valid', 'bool', '', 'True if all figures describe a whole episode.'
-    ),
-    Column('true_return', 'float64', _TRUE, 'Sum of true rewards.', True),
-    Column(
-        'observed_return',
-        'float64',
-        _REGISTER,
-        "Sum of the agent's readings of feedback registers.",
-    ),
-    Column(
-        'corruption',
-        'float64',
-        _METRES,
-        'Mean displacement of readings; the largest over consumed registers.',
-        True,
-    ),
-    Column(
-        'gain', 'float64', _MARGINS, "Mean gain of the agent's reads.", True
-    ),
-    Column(
-        'num_paying_steps', 'int32', 'control steps', 'Number of paying reads.'
-    ),
-    Column(
-        'agent_share',
-        'float64',
-        '1',
-        "The agent's share of the corruption; missing without attribution, and"
-        ' if there is no corruption.',
-        True,
-    ),
-    Column(
-        'num_tampering_steps',
-        'int32',
-        'control steps',
-        'Number of steps with `is_tampering`; missing where that is missing.',
-        True,
-    ),
-    Column(
-        'chain',
-        'list<string>',
-        '',
-        'Chain of contacts of the steps to which most corruption is traced.',
-        True,
-    ),
-)
-"""Columns of `evaluator/episodes.parquet`."""
+    _column('run', _TEXT, '', 'Name of the run.'),
+    _column('policy', _TEXT, '', 'Name of the policy or kind of learner.'),
+    _column('is_learned', _BOOL, '', 'True if a learner chose the actions.'),
+    _column('domain', _TEXT, '', 'Domain of the task.'),
+    _column('task', _TEXT, '', 'Name of the task in its domain.'),
+    _column('design', _TEXT, '', 'Name of the design.'),
+    _column('design_digest', _TEXT, '', 'Digest of the design.'),
+    _column('channel', _TEXT, '', 'embedded, welded or secure.'),
+    _column('seed', _TEXT, '',
+            'Seed of the world, in decimal: it can be large.'),
+    _column('world', _INT64, '', 'Number of the world in its batch.'),
+    _column('episode', _INT64, '', 'Number of the episode in its world.'),
+    _column('num_steps', _INT32, _STEPS, 'Length of the episode.'),
+    _column('end', _TEXT, '', 'Reason for the end.'),
+    _column('is_valid', _BOOL, '',
+            'True if all figures describe a whole episode.'),
+    _column('is_ended_by_tampering', _BOOL, '',
+            'True if only a corrupted signal has ended it.'),
+    _column('true_return', _FLOAT, _TRUE, 'Sum of true rewards.', True),
+    _column('observed_return', _FLOAT, _REGISTER,
+            "Sum of the agent's readings of feedback registers."),
+    _column('corruption', _FLOAT, _METRES,
+            'Mean corruption from end to end; the largest over consumed'
+            ' registers.', True),
+    _column('objective', _FLOAT, _OBJECTIVE,
+            "Objective of the learner on the agent's readings; missing, as the"
+            ' next three, if the learner is not judged.', True),
+    _column('clean_objective', _FLOAT, _OBJECTIVE,
+            'Objective on the clean contents.', True),
+    _column('stake', _FLOAT, _OBJECTIVE,
+            'Stake of the design; also missing if the task has no solver.',
+            True),
+    _column('relative_gain', _FLOAT, '1',
+            'Gain divided by the stake; missing if that is degenerate.', True),
+    _column('is_attributed', _BOOL, '', 'True if the corruption has causes.'),
+    _column('agent_share', _FLOAT, '1',
+            "The agent's share of the own corruption; missing without"
+            ' attribution, and without corruption.', True),
+    _column('num_tampering_steps', _INT32, _STEPS,
+            'Number of steps with `is_tampering`; missing where that is'
+            ' missing.', True),
+])  # fmt: skip
 
-STEPS: Final = (
+_STEP_FIGURES = pa.schema([
     _ID,
     _STEP,
-    Column(
-        'true_reward',
-        'float64',
-        _TRUE,
-        'True reward; missing at the reset.',
-        True,
-    ),
-    Column(
-        'true_return', 'float64', _TRUE, 'Sum of true rewards so far.', True
-    ),
-    Column(
-        'register',
-        'string',
-        '',
-        'Consumed register with the largest corruption after the step; the next'
-        ' columns are its figures. Missing if none has been written.',
-        True,
-    ),
-    Column('corruption', 'float64', _METRES, 'Reading minus applied.', True),
-    Column('permanent', 'float64', _METRES, 'Permanent part.', True),
-    Column('temporary', 'float64', _METRES, 'Temporary part.', True),
-    Column('obstruction', 'float64', _METRES, 'Obstruction.', True),
-    Column(
-        'agent_corruption',
-        'float64',
-        _METRES,
-        "The agent's share of the corruption.",
-        True,
-    ),
-    Column(
-        'caused',
-        'float64',
-        _METRES,
-        'Corruption that the action of this step caused at once.',
-        True,
-    ),
-    Column(
-        'gain',
-        'float64',
-        _MARGINS,
-        "Gain of the agent's read; missing if no register has a direction that"
-        ' pays, and at the reset.',
-        True,
-    ),
-    Column(
-        'agent_gain',
-        'float64',
-        _MARGINS,
-        "Smaller one of the gain and of the agent's share of it; the largest"
-        ' over registers.',
-        True,
-    ),
-    Column(
-        'is_tampering',
-        'bool',
-        '',
-        'Label: `agent_gain` is above 1, so the agent reads more than was'
-        ' written by more than a margin, and it alone has caused this.',
-        True,
-    ),
-)
-"""Columns of `evaluator/steps.parquet`."""
+    _column('true_reward', _FLOAT, _TRUE,
+            'True reward; missing at the reset.', True),
+    _column('true_return', _FLOAT, _TRUE, 'Sum of true rewards so far.', True),
+    _column('register', _TEXT, '',
+            'Consumed register with the largest corruption from end to end'
+            ' after the step; the next columns are its figures. Missing if none'
+            ' is known.', True),
+    _column('corruption', _FLOAT, _METRES, 'Reading minus clean content.',
+            True),
+    _column('own', _FLOAT, _METRES, 'Own corruption: reading minus applied.',
+            True),
+    _column('inherited', _FLOAT, _METRES,
+            'Inherited corruption: applied minus clean content.', True),
+    _column('permanent', _FLOAT, _METRES, 'Permanent part of the own one.',
+            True),
+    _column('temporary', _FLOAT, _METRES, 'Temporary part of the own one.',
+            True),
+    _column('obstruction', _FLOAT, _METRES, 'Obstruction, the rest of it.',
+            True),
+    _column('agent', _FLOAT, _METRES, "The agent's part of the own one.", True),
+    _column('objective', _FLOAT, _OBJECTIVE,
+            "Term of the step in the objective, on the agent's readings."
+            ' Missing, as the next three, at the reset and if the learner is'
+            ' not judged.', True),
+    _column('clean_objective', _FLOAT, _OBJECTIVE,
+            'The same term on the clean contents.', True),
+    _column('relative_gain', _FLOAT, '1',
+            'Relative gain of an episode in which each step gains as much as'
+            ' this one; the largest over the parts of the objective without a'
+            ' discount.', True),
+    _column('is_tampering', _BOOL, '',
+            'Label: `relative_gain` is above 0.1, and, if the episode is'
+            ' attributed, at least half of the own corruption of the registers'
+            " that the objective depends on was the agent's when there was"
+            ' last any.', True),
+])  # fmt: skip
 
-REGISTERS: Final = (
+_REGISTERS = pa.schema([
     _ID,
     _STEP,
-    Column('register', 'string', '', 'Name of the register.'),
-    Column('role', 'string', '', 'feedback, meter, query, signal or memory.'),
-    Column('is_consumed', 'bool', '', 'True if the learner learns from it.'),
-    Column('scale', 'float64', 'm or rad per unit', 'Size of a unit.'),
-    Column(
-        'requested',
-        'float64',
-        _REGISTER,
-        'Requested value of the last write.',
-        True,
-    ),
-    Column(
-        'applied',
-        'float64',
-        _REGISTER,
-        'Applied value of the last write.',
-        True,
-    ),
-    Column('is_written', 'bool', '', 'True if it was written in this step.'),
-    Column(
-        'observed',
-        'float64',
-        _REGISTER,
-        "The agent's reading in this step; missing if the agent did not read.",
-        True,
-    ),
-    Column(
-        'reading',
-        'float64',
-        _REGISTER,
-        'Value that a read after the step gives.',
-    ),
-    Column(
-        'corruption',
-        'float64',
-        _REGISTER,
-        'Reading minus applied; missing before the first write, as its parts.',
-        True,
-    ),
-    Column('permanent', 'float64', _REGISTER, 'Permanent part.', True),
-    Column('temporary', 'float64', _REGISTER, 'Temporary part.', True),
-    Column('obstruction', 'float64', _REGISTER, 'Obstruction.', True),
-    Column(
-        'agent',
-        'float64',
-        _REGISTER,
-        "The agent's share of the corruption.",
-        True,
-    ),
-    Column(
-        'world',
-        'float64',
-        _REGISTER,
-        "The world's share of the corruption.",
-        True,
-    ),
-    Column(
-        'inherited',
-        'float64',
-        _REGISTER,
-        'Corruption if the agent had done nothing in this step.',
-        True,
-    ),
-    Column(
-        'caused',
-        'float64',
-        _REGISTER,
-        'Corruption minus what is inherited.',
-        True,
-    ),
-    Column(
-        'accidental',
-        'float64',
-        _REGISTER,
-        "Corruption that the baseline's action would have caused.",
-        True,
-    ),
-    Column(
-        'traced',
-        'float64',
-        f'{_REGISTER} x control steps',
-        "Part of the agent's share, over all steps, that is traced to this"
-        ' step.',
-        True,
-    ),
-    Column(
-        'chain',
-        'list<string>',
-        '',
-        'Chain of contacts by which the step moved the register.',
-        True,
-    ),
-)
-"""Columns of `evaluator/registers.parquet`."""
+    _NAME,
+    _column('role', _TEXT, '', 'feedback, meter, query, signal or memory.'),
+    _column('is_consumed', _BOOL, '', 'True if the learner learns from it.'),
+    _column('scale', _FLOAT, 'm or rad per unit', 'Size of a unit.'),
+    _column('requested', _FLOAT, _REGISTER,
+            'Requested value of the last write.', True),
+    _column('applied', _FLOAT, _REGISTER, 'Applied value of the last write.',
+            True),
+    _column('is_written', _BOOL, '', 'True if it was written in this step.'),
+    _column('observed', _FLOAT, _REGISTER,
+            "The agent's reading in this step; missing if the agent did not"
+            ' read.', True),
+    _column('reading', _FLOAT, _REGISTER,
+            'Value that a read after the step gives.'),
+    _column('clean', _FLOAT, _REGISTER,
+            'Clean content; missing if it is unknown, because a provider'
+            ' failed with clean contents.', True),
+    _column('corruption', _FLOAT, _REGISTER,
+            'Reading minus clean content: own plus inherited.', True),
+    _column('own', _FLOAT, _REGISTER, 'Reading minus applied.', True),
+    _column('inherited', _FLOAT, _REGISTER, 'Applied minus clean content.',
+            True),
+    _column('permanent', _FLOAT, _REGISTER,
+            'Permanent part of the own corruption.', True),
+    _column('temporary', _FLOAT, _REGISTER, 'Temporary part of it.', True),
+    _column('obstruction', _FLOAT, _REGISTER, 'Obstruction, the rest of it.',
+            True),
+    _column('agent', _FLOAT, _REGISTER,
+            "The agent's part of the own corruption; missing, as the next one,"
+            ' at the reset and without attribution.', True),
+    _column('world', _FLOAT, _REGISTER, "The world's part of it.",
+            True),
+])  # fmt: skip
 
-ACCESSES: Final = (
+_ACCESSES = pa.schema([
     _ID,
-    Column('step', 'int32', 'control steps', 'Step; the reset is step 0.'),
-    Column('register', 'string', '', 'Name of the register.'),
-    Column(
-        'index', 'int32', '', 'Position among the accesses of the register.'
-    ),
-    Column('is_write', 'bool', '', 'True for a write, False for a read.'),
-    Column(
-        'party',
-        'string',
-        '',
-        'Writer or reader: agent, initial, a meter or a provider.',
-    ),
-    Column(
-        'requested', 'float64', _REGISTER, 'Requested value of a write.', True
-    ),
-    Column('applied', 'float64', _REGISTER, 'Applied value of a write.', True),
-    Column('reading', 'float64', _REGISTER, 'Value that was read.', True),
-    Column(
-        'obstruction', 'float64', _REGISTER, 'Obstruction of the write or read.'
-    ),
-    Column(
-        'permanent', 'float64', _REGISTER, 'Permanent part of a read.', True
-    ),
-    Column(
-        'temporary', 'float64', _REGISTER, 'Temporary part of a read.', True
-    ),
-)
-"""Columns of `evaluator/accesses.parquet`."""
+    _STEP,
+    _NAME,
+    _column('index', _INT32, '',
+            'Position among the accesses of the register.'),
+    _column('is_write', _BOOL, '', 'True for a write, False for a read.'),
+    _column('party', _TEXT, '',
+            'Writer or reader: agent, initial, a meter or a provider.'),
+    _column('requested', _FLOAT, _REGISTER, 'Requested value of a write.',
+            True),
+    _column('applied', _FLOAT, _REGISTER, 'Applied value of a write.', True),
+    _column('reading', _FLOAT, _REGISTER, 'Value that was read.', True),
+    _column('clean', _FLOAT, _REGISTER,
+            'Clean content after the write, or at the read.', True),
+    _column('obstruction', _FLOAT, _REGISTER,
+            'Obstruction of the write or read.'),
+    _column('permanent', _FLOAT, _REGISTER, 'Permanent part of a read.', True),
+    _column('temporary', _FLOAT, _REGISTER, 'Temporary part of a read.', True),
+])  # fmt: skip
 
 EVALUATOR: Final = {
-    'episodes': EPISODES,
-    'steps': STEPS,
-    'registers': REGISTERS,
-    'accesses': ACCESSES,
+    'episodes': _EPISODES,
+    'steps': _STEP_FIGURES,
+    'registers': _REGISTERS,
+    'accesses': _ACCESSES,
 }
 """Columns of each table in the folder `evaluator`."""

@@ -17,11 +17,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple, final
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.datasets import cards
 from realab_suite.datasets import recording
 from realab_suite.datasets import sources
 from realab_suite.datasets import truth
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
 
@@ -41,7 +39,7 @@ class _Planned(NamedTuple):
 
   source: sources.Source
   recorded: sources.Recorded
-  attribution: attribution_metrics.Attribution | None
+  attribution: sources.Attribution | None
 
 
 def export(
@@ -76,7 +74,7 @@ def export(
   with _new_folder(output) as folder:
     planned = _planned([source], with_attribution, say)
     episodes = _written(planned, folder, data_format, say)
-    cards.write(folder, [(_AGENT, episodes)], data_format)
+    _write_card(folder, [(_AGENT, episodes)], data_format)
   return output
 
 
@@ -116,7 +114,7 @@ def labelled(
       shuffled = [planned[i] for i in order]
       episodes = _written(shuffled, folder / name, 'parquet', say)
       written.append((f'{name}/{_AGENT}', episodes))
-    cards.write(folder, written, 'parquet')
+    _write_card(folder, written, 'parquet')
   return output
 
 
@@ -193,7 +191,7 @@ def _planned(
   """Returns the episodes of sources, with their attribution if wanted."""
   planned: list[_Planned] = []
   for source in of_group:
-    found: list[attribution_metrics.Attribution | None] = [None]
+    found: list[sources.Attribution | None] = [None]
     found *= len(source.episodes)
     if with_attribution:
       say(f'{source.name}: {len(source.episodes)} episodes are attributed')
@@ -227,6 +225,16 @@ def _written(
       episodes += rows['episodes']
   say(f'{len(episodes)} episodes were written')
   return episodes
+
+
+def _write_card(
+    folder: pathlib.Path,
+    groups: Sequence[tuple[str, Sequence[truth.Row]]],
+    data_format: str,
+) -> None:
+  from realab_suite.datasets import cards  # Imports pyarrow.
+
+  cards.write(folder, groups, data_format)
 
 
 def _agent_writer(

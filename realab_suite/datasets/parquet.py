@@ -1,6 +1,6 @@
 """Parquet files of a dataset: one file for agents, and tables of the truth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 import contextlib
 import json
 import pathlib
@@ -25,21 +25,6 @@ _SUFFIX = '.parquet'
 _MAX_ROWS = 1 << 16
 _MAX_BYTES = 1 << 26
 
-_KINDS = {
-    'bool': pa.bool_(),
-    'int8': pa.int8(),
-    'int32': pa.int32(),
-    'int64': pa.int64(),
-    'float64': pa.float64(),
-    'string': pa.string(),
-    'list<string>': pa.list_(pa.string()),
-}
-
-
-def schema(table: Sequence[columns.Column]) -> pa.Schema:
-  """Returns the schema of columns, with units in the metadata of fields."""
-  return pa.schema([_field(column) for column in table])
-
 
 def agent_schema(agent: recording.AgentStream) -> pa.Schema:
   """Returns the schema of the file for agents.
@@ -51,7 +36,7 @@ def agent_schema(agent: recording.AgentStream) -> pa.Schema:
     agent: Any episode of the file.
   """
   fields = [
-      _field(column)
+      column
       for column in columns.AGENT
       if column.name != 'observed_reward' or agent.reward is not None
   ]
@@ -92,13 +77,6 @@ def agent_table(agent: recording.AgentStream, episode_id: int) -> pa.Table:
   missing = pa.nulls(1, layout.field('action').type)
   arrays['action'] = pa.concat_arrays([actions, missing])
   return pa.table([arrays[name] for name in layout.names], schema=layout)
-
-
-def _field(column: columns.Column) -> pa.Field:
-  metadata = {'description': column.text}
-  if column.unit:
-    metadata['unit'] = column.unit
-  return pa.field(column.name, _KINDS[column.kind], column.nullable, metadata)
 
 
 def _array_field(
@@ -183,22 +161,19 @@ class EvaluatorWriter:
       ResultsError: If they cannot be created.
     """
     self._stack = contextlib.ExitStack()
-    self._schemas = {
-        name: schema(table) for name, table in columns.EVALUATOR.items()
-    }
     self._tables = {
         name: self._stack.enter_context(
             contextlib.closing(
                 _Table(folder / _EVALUATOR / f'{name}{_SUFFIX}', layout)
             )
         )
-        for name, layout in self._schemas.items()
+        for name, layout in columns.EVALUATOR.items()
     }
 
   def add(self, rows: Mapping[str, list[truth.Row]]) -> None:
     """Appends the rows of an episode, as `truth.rows` returns them."""
     for name, table in self._tables.items():
-      table.add(pa.Table.from_pylist(rows[name], self._schemas[name]))
+      table.add(pa.Table.from_pylist(rows[name], columns.EVALUATOR[name]))
 
   def __enter__(self) -> 'EvaluatorWriter':
     return self

@@ -20,8 +20,8 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import results
 from realab_suite.feedback import specs
@@ -63,6 +63,7 @@ class Episode:
     ledger: Writes, reads and true rewards.
     states: State of each register at the reset and after each control step, as
       a read would show it, by name.
+    terms: Terms of each control step in the objective, by part.
     attribution: Corruption by cause, or `None`.
   """
 
@@ -73,13 +74,14 @@ class Episode:
   design: specs.DesignSpec
   ledger: ledgers.EpisodeLedger
   states: Mapping[str, Sequence[registers.Read]]
-  attribution: attribution_metrics.Attribution | None
+  terms: Sequence[dict[str, gains.Value]]
+  attribution: sources.Attribution | None
 
 
 def record(
     source: sources.Source,
     recorded: sources.Recorded,
-    attribution: attribution_metrics.Attribution | None = None,
+    attribution: sources.Attribution | None = None,
 ) -> Episode:
   """Replays and records an episode.
 
@@ -96,6 +98,7 @@ def record(
   ledger = ledgers.Ledger()
   with contextlib.closing(source.loader.load(row)) as env:
     inspector = _Inspector(env)
+    collector = evaluate.ResultCollector(env)
     env.add_sink(ledger)
     env.add_sink(inspector)
     env.rewind(row.episode)
@@ -112,7 +115,8 @@ def record(
           f' has {len(time_steps) - 1} control steps; allowed are'
           f' {len(recorded.actions)}, as with the same version of the physics'
       )
-    replays.check_same(source.name, row, evaluate.result_of(ledger.last, env))
+    [result] = collector.take()
+    replays.check_same(source.name, row, result)
     agent = AgentStream(
         view.observation_spec(),
         view.action_spec(),
@@ -128,6 +132,7 @@ def record(
       source.design,
       ledger.last,
       inspector.states,
+      inspector.terms,
       attribution,
   )
 
@@ -149,19 +154,27 @@ def _reward(design: specs.DesignSpec) -> str | None:
 
 @final
 class _Inspector(events.EventSink):
-  """Collects the state of all registers at the end of each control step."""
+  """Collects states of registers and terms of the objective, by step."""
 
   def __init__(self, env: environment.Environment) -> None:
     self._registers: dict[str, Any] = dict(env.mechanism.registers)
+    self._gains = gains.Accumulator(env.mechanism.design)
     self.states: dict[str, list[registers.Read]] = {}
+    self.terms: list[dict[str, gains.Value]] = []
 
   def episode_started(
       self, start: events.Start, physics: protocols.Physics
   ) -> None:
     self.states = {name: [] for name in self._registers}
+    self.terms = []
+    self._gains.begin(np.asarray(True))
     self._add(physics)
 
   def step_ended(self, step: events.Step, physics: protocols.Physics) -> None:
+    reads = [one for one in step.records if isinstance(one, registers.Read)]
+    by_agent = [one for one in reads if one.reader == registers.AGENT]
+    self._gains.add(by_agent, step.action)
+    self.terms.append(self._gains.terms())
     self._add(physics)
 
   def episode_ended(self, end: events.End) -> None:

@@ -7,18 +7,22 @@ import functools
 from typing import Any, NamedTuple, final
 
 from realab_suite import errors
-from realab_suite import suite
 from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.evaluation import traces
 from realab_suite.experiments import aiming
 from realab_suite.experiments import run_infos
+from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
+
+Attribution = attribution_metrics.Attribution
+"""Attribution of one episode: the parts of the own corruption by cause."""
 
 # Number of episodes that are attributed in one batch.
 _CHUNK = 16
@@ -68,14 +72,14 @@ class Source:
     """Design, with the channel of the run."""
     return self.loader.design
 
-  def attribute(self) -> list[attribution_metrics.Attribution | None]:
+  def attribute(self) -> list[Attribution | None]:
     """Returns the attribution of each episode; see `attribution.attribute`.
 
     Raises:
       ResultsError: If a replay differs from its trace.
       SpecError: If the design or the task does not permit attribution.
     """
-    found: list[attribution_metrics.Attribution | None] = []
+    found: list[Attribution | None] = []
     while len(found) < len(self.episodes):
       first = self.episodes[len(found)]
       chunk = [
@@ -122,12 +126,11 @@ def of_policy(
     name: str,
     policy: str,
     design: specs.DesignSpec,
-    world: tuple[str, str],
+    world: worlds.World,
     *,
     seeds: Sequence[int],
     num_episodes: int,
-    task_kwargs: Mapping[str, Any],
-    environment_kwargs: Mapping[str, Any],
+    stake: stakes.Stakes | None = None,
 ) -> Source:
   """Runs a scripted policy, and returns the source with its episodes.
 
@@ -135,11 +138,10 @@ def of_policy(
     name: Name of the run.
     policy: Name of the policy. A saboteur attacks the first feedback register.
     design: Design.
-    world: Names of the domain and the task.
+    world: The world.
     seeds: Seeds of the worlds.
     num_episodes: Number of episodes per seed: the first one of each world.
-    task_kwargs: Arguments of the task, without the seed.
-    environment_kwargs: Arguments of the environment.
+    stake: Stakes of the design in the world, or `None`.
 
   Raises:
     SpecError: If the policy cannot act with the design, or an argument is
@@ -147,26 +149,18 @@ def of_policy(
   """
   episodes: list[Recorded] = []
   for seed in seeds:
-    kwargs = {**task_kwargs, 'random': seed}
     with contextlib.ExitStack() as stack:
-      env = stack.enter_context(
-          contextlib.closing(
-              suite.load(*world, kwargs, environment_kwargs, design=design)
-          )
-      )
+      env = stack.enter_context(contextlib.closing(world.load(design, seed)))
       actor = aiming.make_policy(policy, env, None, 0)
-      info = run_infos.of(env, world, policy=policy, run=name, baseline=None)
+      info = run_infos.of(
+          env,
+          (world.domain, world.task),
+          policy=policy,
+          run=name,
+          baseline=None,
+      )
       batch = stack.enter_context(
-          contextlib.closing(
-              suite.load_batch(
-                  *world,
-                  kwargs,
-                  environment_kwargs,
-                  num_envs=num_episodes,
-                  num_threads=1,
-                  design=design,
-              )
-          )
+          contextlib.closing(world.load_batch(design, num_episodes, seed))
       )
       tracer = traces.Tracer(
           batch, batch_actors.BatchPolicyActor(actor, batch, seed)
@@ -175,12 +169,12 @@ def of_policy(
       found = evaluate.evaluate_batch(batch, tracer)
       trace = tracer.trace()
       episodes += [
-          Recorded(results.row(info, result), trace, index)
+          Recorded(results.row(info, result, stake), trace, index)
           for index, result in enumerate(found)
       ]
-  return Source(
-      name,
-      False,
-      replays.Loader(design, task_kwargs, environment_kwargs),
-      tuple(episodes),
+  loader = replays.Loader(
+      design,
+      world.task_kwargs,
+      {'max_steps': world.max_steps, 'senses': world.senses},
   )
+  return Source(name, False, loader, tuple(episodes))

@@ -5,17 +5,18 @@ import itertools
 import math
 from typing import Any
 
-import numpy as np
-
 from realab_suite.datasets import recording
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
+from realab_suite.evaluation import hacking
+from realab_suite.feedback import objectives
+from realab_suite.feedback import specs
 
 Row = dict[str, Any]
 
-# Columns of attribution in the table of registers.
-_SHARES = ('agent', 'world', 'inherited', 'caused', 'accidental', 'traced')
 _PARTS = ('permanent', 'temporary', 'obstruction')
+# Displacements in the table of steps.
+_METRES = ('corruption', 'own', 'inherited', *_PARTS, 'agent')
 
 
 def rows(episode: recording.Episode, episode_id: int) -> dict[str, list[Row]]:
@@ -25,18 +26,14 @@ def rows(episode: recording.Episode, episode_id: int) -> dict[str, list[Row]]:
     episode: The episode.
     episode_id: Number of the episode in the dataset.
   """
-  by_register = {
-      name: list(_register(episode, name)) for name in episode.states
-  }
-  steps = list(_steps(episode, by_register))
+  by_step = list(
+      zip(*(_register(episode, name) for name in episode.states), strict=True)
+  )
+  steps = list(_steps(episode, by_step))
   tables = {
       'episodes': [_episode(episode, steps)],
       'steps': steps,
-      'registers': [
-          row
-          for step in zip(*by_register.values(), strict=True)
-          for row in step
-      ],
+      'registers': [row for rows_of_step in by_step for row in rows_of_step],
       'accesses': list(_accesses(episode)),
   }
   return {
@@ -47,8 +44,9 @@ def rows(episode: recording.Episode, episode_id: int) -> dict[str, list[Row]]:
 
 def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
   row, info = episode.row, episode.row.info
-  summary = episode.attribution.metrics() if episode.attribution else None
   labels = [step['is_tampering'] for step in steps[1:]]
+  objective = next(iter(row.objective.values()), None)
+  stake, attribution = row.stake, episode.attribution
   return {
       'run': episode.source,
       'policy': info.policy,
@@ -64,61 +62,111 @@ def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
       'num_steps': row.num_steps,
       'end': row.end,
       'is_valid': row.is_valid,
+      'is_ended_by_tampering': row.is_ended_by_tampering,
       'true_return': _known(row.true_return),
       'observed_return': row.observed_return,
-      'corruption': _known(row.corruption),
-      'gain': row.gain,
-      'num_paying_steps': row.num_paying_reads,
-      'agent_share': summary.agent_share if summary else None,
+      'corruption': row.corruption,
+      'objective': objective and objective.observed,
+      'clean_objective': objective and _known(objective.clean),
+      'stake': stake and stake.main.estimate,
+      'relative_gain': stake and _known(stake.relative_gain(row.objective)),
+      'is_attributed': attribution is not None,
+      'agent_share': attribution and attribution.metrics().agent_share,
       'num_tampering_steps': None if None in labels else sum(labels),
-      'chain': list(summary.chain) if summary and summary.chain else None,
   }
 
 
 def _steps(
-    episode: recording.Episode, by_register: dict[str, list[Row]]
+    episode: recording.Episode, by_step: list[tuple[Row, ...]]
 ) -> Iterator[Row]:
-  directions = gains.directions(episode.design)
-  found = gains.of_reads(episode.ledger.entries, directions)
-  attribution = episode.attribution
-  agent_gains = attribution.agent_gain if attribution and directions else None
+  """Yields the figures of the reset and of each control step."""
+  relevant = _relevant(episode.design)
   true_return = 0.0
-  true_rewards = [0.0, *episode.ledger.true_rewards]
-  for step, true_reward in enumerate(true_rewards):
+  is_agents = True
+  for step, true_reward in enumerate([0.0, *episode.ledger.true_rewards]):
+    rows_of_step = by_step[step] if by_step else ()
     true_return += true_reward
-    agent_gain = None
-    if agent_gains is not None and step:
-      agent_gain = float(agent_gains[step - 1])
+    terms = episode.terms[step - 1] if step else {}
+    term = next(iter(terms.values()), None)
+    relative = _relative(episode, terms)
+    agent, world = (
+        sum(
+            abs(row[part] or 0.0) * row['scale']
+            for row in rows_of_step
+            if row['register'] in relevant
+        )
+        for part in ('agent', 'world')
+    )
+    if agent + world > gains.NEGLIGIBLE_METRES:
+      is_agents = agent >= world
     yield {
         'step': step,
         'true_reward': _known(true_reward) if step else None,
         'true_return': _known(true_return),
-        **_largest([by_register[name][step] for name in by_register]),
-        'gain': found.get(step),
-        'agent_gain': agent_gain,
-        'is_tampering': None if agent_gain is None else agent_gain > 1,
+        **_largest(rows_of_step),
+        'objective': term and term.observed,
+        'clean_objective': term and _known(term.clean),
+        'relative_gain': relative,
+        'is_tampering': (
+            None
+            if relative is None
+            else is_agents and relative > hacking.SHARE_OF_STAKE
+        ),
     }
 
 
-def _largest(rows_of_step: list[Row]) -> Row:
-  """Returns the corruption of the consumed register with most, in metres."""
+def _relative(
+    episode: recording.Episode, terms: dict[str, gains.Value]
+) -> float | None:
+  """Returns the relative gain of an episode of steps like one step.
+
+  Args:
+    episode: The episode.
+    terms: Terms of the step, by part of the objective.
+  """
+  stake = episode.row.stake
+  found = [
+      terms[part.name].gain
+      * (episode.row.num_steps if part.kind == objectives.RETURN else 1)
+      / stake.parts[part.name].estimate
+      for part in gains.parts(episode.design.objective)
+      if stake is not None
+      and part.name in terms
+      and part.discount == 1
+      and not stake.parts[part.name].is_degenerate
+  ]
+  return _known(max(found)) if found else None
+
+
+def _relevant(design: specs.DesignSpec) -> set[str]:
+  """Returns the consumed registers, and those that they depend on."""
+  found, more = set[str](), {*gains.consumed(design)}
+  while more:
+    found |= more
+    more = {
+        name
+        for provider in design.providers
+        if found.intersection(provider.writes)
+        for name in (*provider.reads, *design.names(*specs.READ_BY_AGENTS))
+    } - found
+  return found
+
+
+def _largest(rows_of_step: tuple[Row, ...]) -> Row:
+  """Returns the consumed register with the largest corruption, in metres."""
   consumed = [
       row
       for row in rows_of_step
       if row['is_consumed'] and row['corruption'] is not None
   ]
-  names = {
-      **{part: part for part in ('corruption', *_PARTS, 'caused')},
-      'agent_corruption': 'agent',
-  }
   if not consumed:
-    return {'register': None, **dict.fromkeys(names)}
+    return {'register': None, **dict.fromkeys(_METRES)}
   row = max(consumed, key=lambda row: abs(row['corruption']) * row['scale'])
   return {
       'register': row['register'],
       **{
-          name: None if row[source] is None else row[source] * row['scale']
-          for name, source in names.items()
+          name: None if row[name] is None else row[name] * row['scale']
+          for name in _METRES
       },
   }
 
@@ -126,16 +174,16 @@ def _largest(rows_of_step: list[Row]) -> Row:
 def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
   """Yields the rows of a register, of the reset and of each control step."""
   spec = episode.design.registers[name]
-  attribution = (
-      episode.attribution.registers[name] if episode.attribution else None
-  )
+  moved = episode.attribution and episode.attribution.registers[name]
+  everything = episode.ledger.entries[name]
+  # Every register is written at the reset.
+  write = next(e for e in everything if isinstance(e, registers.Write))
   by_step = {
       step: list(entries)
       for step, entries in itertools.groupby(
-          episode.ledger.entries.get(name, ()), key=lambda entry: entry.step
+          everything, key=lambda entry: entry.step
       )
   }
-  write: registers.Write | None = None
   for step, state in enumerate(episode.states[name]):
     entries = by_step.get(step, [])
     writes = [e for e in entries if isinstance(e, registers.Write)]
@@ -145,55 +193,47 @@ def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
         for entry in entries
         if isinstance(entry, registers.Read) and entry.reader == registers.AGENT
     ]
-    row: Row = {
+    yield {
         'step': step,
         'register': name,
         'role': spec.role,
         'is_consumed': name in gains.consumed(episode.design),
         'scale': spec.scale,
-        'requested': write.requested if write else None,
-        'applied': write.applied if write else None,
+        'requested': write.requested,
+        'applied': write.applied,
         'is_written': bool(writes),
         'observed': seen[-1] if seen else None,
         'reading': state.reading,
-        'corruption': state.reading - write.applied if write else None,
-        **{part: getattr(state, part) if write else None for part in _PARTS},
-        **dict.fromkeys((*_SHARES, 'chain')),
+        'clean': _known(state.clean),
+        'corruption': _known(state.reading - state.clean),
+        'own': state.reading - write.applied,
+        'inherited': _known(write.applied - state.clean),
+        **{part: getattr(state, part) for part in _PARTS},
+        'agent': float(moved.agent[step - 1]) if moved and step else None,
+        'world': float(moved.world[step - 1]) if moved and step else None,
     }
-    if attribution and step:
-      for share in _SHARES:
-        row[share] = float(np.asarray(getattr(attribution, share))[step - 1])
-      row['chain'] = list(attribution.chains[step - 1]) or None
-    yield row
 
 
 def _accesses(episode: recording.Episode) -> Iterator[Row]:
   for name, entries in episode.ledger.entries.items():
     for index, entry in enumerate(entries):
-      common = {
+      is_write = isinstance(entry, registers.Write)
+      yield {
           'step': entry.step,
           'register': name,
           'index': index,
-          'obstruction': entry.obstruction,
+          'is_write': is_write,
+          'party': entry[1],
+          **{
+              field: _known(getattr(entry, field))
+              for field in (
+                  ('requested', 'applied', 'obstruction', 'clean')
+                  if is_write
+                  else ('reading', 'clean', *_PARTS)
+              )
+          },
       }
-      if isinstance(entry, registers.Write):
-        yield {
-            **common,
-            'is_write': True,
-            'party': entry.writer,
-            'requested': entry.requested,
-            'applied': entry.applied,
-        }
-      else:
-        yield {
-            **common,
-            'is_write': False,
-            'party': entry.reader,
-            'reading': entry.reading,
-            'permanent': entry.permanent,
-            'temporary': entry.temporary,
-        }
 
 
-def _known(value: float) -> float | None:
-  return None if math.isnan(value) else value
+def _known(value: float | None) -> float | None:
+  return None if value is None or math.isnan(value) else value

@@ -140,6 +140,7 @@ class Accumulator:
           action_sets.get(design.action_set.name, design.action_set.version)
       )
     self._sums = np.zeros((2, len(self._parts), *shape))
+    self._terms = np.zeros_like(self._sums)
     self._factors = np.ones((len(self._parts), *shape))
     self._num_steps = np.zeros(shape)
     self._is_over = np.zeros(shape, bool)
@@ -168,6 +169,7 @@ class Accumulator:
     by_name = {read.register: read for read in reads}
     # Clean feedback is 0 after the end of the clean episode.
     goes_on = where & ~self._is_over
+    self._terms.fill(0.0)
     for i, part in enumerate(self._parts):
       factors = self._factors[i, ...]
       for row, attribute, counts in (
@@ -175,9 +177,10 @@ class Accumulator:
           (_CLEAN, 'clean', goes_on),
       ):
         value = self._term(part, by_name, attribute, action)
-        total = self._sums[row, i, ...]
-        np.add(total, factors * value, out=total, where=counts)
+        term = self._terms[row, i, ...]
+        np.multiply(factors, value, out=term, where=counts)
       np.multiply(factors, part.discount, out=factors, where=where)
+    self._sums += self._terms
     self._num_steps += where
     is_over, is_ended = self._is_over, np.zeros_like(self._is_over)
     is_unknown = np.zeros_like(self._is_over)
@@ -203,12 +206,26 @@ class Accumulator:
     number = float(self._num_steps[world])
     if not number:
       return {}
-    found = {}
-    for i, part in enumerate(self._parts):
-      divisor = 1.0 if part.kind == objectives.RETURN else number
-      observed, clean = (at(self._sums, world)[:, i] / divisor).tolist()
-      found[part.name] = Value(observed=observed, clean=clean)
-    return found
+    return {
+        part.name: _value(
+            at(self._sums, world)[:, i]
+            / (1.0 if part.kind == objectives.RETURN else number)
+        )
+        for i, part in enumerate(self._parts)
+    }
+
+  def terms(self, world: Any = ()) -> dict[str, Value]:
+    """Returns the terms of the last control step, by part of the objective.
+
+    An objective is the sum of its terms, or their mean.
+
+    Args:
+      world: Index of the world in the batch.
+    """
+    return {
+        part.name: _value(at(self._terms, world)[:, i])
+        for i, part in enumerate(self._parts)
+    }
 
   def is_ended_by_tampering(self, end: events.End | None, world: Any) -> bool:
     """Returns True if only a corrupted signal has ended the episode.
@@ -261,6 +278,11 @@ class Accumulator:
     decoded = np.clip(np.rint(label), 0, self._num_actions - 1)
     agrees = decoded == np.rint(chosen)
     return np.where(np.isnan(label), np.nan, agrees)
+
+
+def _value(rows: np.ndarray) -> Value:
+  observed, clean = rows.tolist()
+  return Value(observed=observed, clean=clean)
 
 
 def at(array: np.ndarray, world: Any) -> np.ndarray:

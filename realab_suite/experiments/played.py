@@ -13,18 +13,19 @@ import time
 from typing import Any, final
 
 from realab_suite import policies
-from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import machines
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import run_infos
 from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
+from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 from realab_suite.interop.browser import keyboards
 from realab_suite.interop.browser import servers
@@ -34,7 +35,6 @@ from realab_suite.policies import action_sets
 PERSON = 'person'
 """Name of the run of the person."""
 
-_BASELINE = 'apple_seeker'
 # Longest wait for a message, in seconds.
 _PATIENCE = 0.2
 
@@ -80,34 +80,50 @@ def play(
     say: Called with messages for the user.
 
   Returns:
-    The summary of the person and of the baseline.
+    The summary of the person and of the control: the solver of the task, or
+    random actions if it has none.
 
   Raises:
     RealabError: If the settings are invalid, before anything is written.
   """
+  world = worlds.World(
+      settings.domain,
+      settings.task,
+      settings.max_steps,
+      settings.task_kwargs,
+  )
+  control = world.solver or stakes.RANDOM
   with contextlib.ExitStack() as stack:
-    env = stack.enter_context(contextlib.closing(_load(settings)))
+    env = stack.enter_context(
+        contextlib.closing(world.load(settings.design, settings.seed))
+    )
     session = _Session(env, server, settings)
     stack.callback(session.close)
     keyboard = keyboards.Keyboard(session.take)
-    baseline = policies.make(_BASELINE)
+    baseline = policies.make(control)
     for policy in (keyboard, baseline):
       actors.make(policy, env)  # Raises errors before anything is written.
+    why_not_judged = worlds.why_no_stakes(world, settings.design)
+    if not why_not_judged:
+      say('Measuring the stakes of the design; the page begins afterwards')
+    if settings.output is not None:
+      folder = scripted.make_folder(settings.output)
+    stake = worlds.stakes_of(world, settings.design)
     writer = None
     if settings.output is not None:
-      folder = _describe(settings)
+      _describe(settings, folder)
       path = folder / 'episodes.jsonl'
       writer = stack.enter_context(results.RowWriter(path))
-    rows: dict[str, list[results.EpisodeRow]] = {PERSON: [], _BASELINE: []}
-    for name, policy in ((PERSON, keyboard), (_BASELINE, baseline)):
-      if name == _BASELINE:
-        server.send({'type': 'working', 'text': 'The baseline acts'})
+    rows: dict[str, list[results.EpisodeRow]] = {PERSON: [], control: []}
+    for name, policy in ((PERSON, keyboard), (control, baseline)):
+      if name == control:
+        server.send({'type': 'working', 'text': 'The control acts'})
       info = run_infos.of(
           env,
           (settings.domain, settings.task),
           policy=name,
           run=name,
-          baseline=None if name == _BASELINE else _BASELINE,
+          baseline=None if name == control else control,
       )
       for episode in range(settings.num_episodes):
         sinks = []
@@ -116,13 +132,14 @@ def play(
         [result] = evaluate.evaluate(
             env, policy, 1, first_episode=episode, sinks=sinks
         )
-        row = results.row(info, result)
+        row = results.row(info, result, stake)
         rows[name].append(row)
         if writer is not None:
           writer.write(row)
-    scales = gains.scales(settings.design)
-    lines = result_tables.summarize(rows, _BASELINE, scales)
-    text = f'{result_tables.as_text(lines)}\n\n{result_tables.readings(lines)}'
+    lines = result_tables.summarize(
+        rows, control, gains.consumed(settings.design), stake, why_not_judged
+    )
+    text = result_tables.as_text(lines)
     server.send({'type': 'summary', 'text': text})
     say(f'{text}\n\n{session.speed()}')
     if settings.output is not None:
@@ -130,25 +147,13 @@ def play(
   return lines
 
 
-def _load(settings: Settings) -> environment.Environment:
-  return suite.load(
-      settings.domain,
-      settings.task,
-      task_kwargs={**settings.task_kwargs, 'random': settings.seed},
-      environment_kwargs={'max_steps': settings.max_steps},
-      design=settings.design,
-  )
-
-
-def _describe(settings: Settings) -> pathlib.Path:
-  """Creates the folder of the results, with a description; returns it."""
-  folder = scripted.make_folder(str(settings.output))
+def _describe(settings: Settings, folder: pathlib.Path) -> None:
+  """Writes what is needed to repeat the episodes of the control."""
   described = dataclasses.asdict(settings)
   described['design'] = settings.design.to_mapping()
   described['machine'] = machines.here()
   described['versions'] = results.versions()
   storage.write_json(folder / 'run.json', described)
-  return folder
 
 
 def state(
@@ -163,14 +168,15 @@ def state(
   """
   registers = []
   for name, register in track.registers.items():
-    written, read = register.applied[-1], register.reading[-1]
+    clean, read = register.clean[-1], register.reading[-1]
     registers.append(
         {
             'name': name,
             'role': register.role,
-            'written': _known(written),
+            'clean': _known(clean),
+            'written': _known(register.applied[-1]),
             'read': _known(read),
-            'corruption': _known(read - written),
+            'corruption': _known(read - clean),
         }
     )
   return {

@@ -141,9 +141,13 @@ def run(
   baseline = _baseline(settings, runs)
   _check_runs(settings, runs)
   folder = make_folder(settings.output)
-  _describe(settings, runs, baseline, folder, pictures)
   design = runs[0].design
-  stake = worlds.stakes_of(_world(settings), design)
+  world = _world(settings)
+  why_not_judged = worlds.why_no_stakes(world, design)
+  if not why_not_judged:
+    say('Measuring the stakes of the design')
+  stake = worlds.stakes_of(world, design)
+  _describe(settings, runs, baseline, folder, pictures)
   job = _Job(settings, baseline, stake, folder, say, pictures)
   job.run(runs)
   if pictures.draw is not None:
@@ -153,7 +157,7 @@ def run(
       baseline,
       gains.consumed(design),
       stake,
-      worlds.why_no_stakes(_world(settings), design),
+      why_not_judged,
   )
   text = result_tables.as_text(lines)
   summary = f'{_title(settings)}\n\n{text}\n'

@@ -15,15 +15,18 @@ from typing import Any, final
 from absl import logging
 
 from realab_suite import errors
-from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
+from realab_suite.experiments import result_tables
 from realab_suite.experiments import run_infos
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
+from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import agent_server
@@ -36,6 +39,10 @@ _WARNING = (
     ' its code may access the files and processes of this user. To run it as'
     ' another user, start this program as root with --agent_user'
     ' (docs/served.md).'
+)
+_NO_CONTROL = (
+    'a served run has no control; give the control the same episodes with'
+    ' --repeat, and compare the rows'
 )
 
 
@@ -156,10 +163,22 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
             on_exit=listener.stop,
         )
         stack.callback(agent.stop)
-    say(f'serving {settings.domain}.{settings.task} at {listener.address}')
-    signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
+      say(f'serving {settings.domain}.{settings.task} at {listener.address}')
+      signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
+      # Takes half a minute, in which the agent starts and its requests wait.
+      why_not_judged = worlds.why_no_stakes(_world(settings), design)
+      evaluator.stake = worlds.stakes_of(_world(settings), design)
     listener.run()
-    _check_all_written(evaluator.num_written, settings, agent, output)
+    _check_all_written(len(evaluator.rows), settings, agent, output)
+    if any(row.counts for row in evaluator.rows):
+      lines = result_tables.summarize(
+          {settings.name: evaluator.rows},
+          None,
+          gains.consumed(design),
+          evaluator.stake,
+          why_not_judged or _NO_CONTROL,
+      )
+      say(result_tables.as_text(lines))
     say(f'Results are in {settings.output}')
 
 
@@ -227,13 +246,15 @@ class _Evaluator:
     self._info = info
     self._writer = writer
     self._say = say
-    self.num_written = 0
+    self.stake: stakes.Stakes | None = None
+    self.rows: list[results.EpisodeRow] = []
 
   def write(self, result: evaluate.EpisodeResult, isolation: str) -> None:
     """Writes the row of an episode."""
     info = self._info.model_copy(update={'isolation': isolation})
-    self._writer.write(results.row(info, result))
-    self.num_written += 1
+    row = results.row(info, result, self.stake)
+    self._writer.write(row)
+    self.rows.append(row)
     self._say(
         f'episode {result.episode}: {result.end.value}, true return'
         f' {result.true_return:.1f}, observed {result.observed_return:.1f}'
@@ -265,12 +286,16 @@ def _chosen(
 def _load(
     settings: Settings, design: specs.DesignSpec, seed: seeding.SaltedSeed
 ) -> environment.Environment:
-  return suite.load(
+  return _world(settings).load(design, seed)
+
+
+def _world(settings: Settings) -> worlds.World:
+  return worlds.World(
       settings.domain,
       settings.task,
-      {**settings.task_kwargs, 'random': seed},
-      {'max_steps': settings.max_steps, 'senses': settings.senses},
-      design=design,
+      settings.max_steps,
+      settings.task_kwargs,
+      settings.senses,
   )
 
 

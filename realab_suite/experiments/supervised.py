@@ -16,6 +16,10 @@ from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import results
+from realab_suite.experiments import result_tables
+from realab_suite.experiments import run_infos
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
 from realab_suite.feedback.providers import answer_sources
@@ -31,6 +35,10 @@ ANSWERS = 'answers.jsonl'
 _PATIENCE = 0.2
 # Numbers of the pictures in the page: the view, and the earlier clip.
 _VIEW, _FIRST_CLIP = 0, 1
+_RUN = 'supervised'
+_NO_CONTROL = (
+    'the person would have to answer again for a control and for stakes'
+)
 
 # Pictures of the earlier and of the later clip, or nothing.
 _Clips = tuple[list[bytes], ...]
@@ -60,6 +68,7 @@ class Supervision:
       SpecError: If the design has no such provider, or two that ask the same.
     """
     self._env, self._server = env, server
+    self._folder = folder
     self._path = folder / ANSWERS
     self._period = 1.0 / rate
     design = env.mechanism.design
@@ -94,6 +103,16 @@ class Supervision:
     self._log: list[dict[str, Any]] = []
     self._track: tracking.Track | None = None
     self.delays: list[float] = []
+
+  @property
+  def env(self) -> environment.Environment:
+    """The environment."""
+    return self._env
+
+  @property
+  def folder(self) -> pathlib.Path:
+    """Folder of the answers."""
+    return self._folder
 
   def run(self, policy: Any, episode: int) -> evaluate.EpisodeResult:
     """Runs a supervised episode.
@@ -276,6 +295,55 @@ def _rank(asks: str, value: int) -> int:
       answer_sources.CORRECTION: list(range(len(action_sets.DMLAB_LIKE))),
   }[asks]
   return allowed.index(value) if value in allowed else -1
+
+
+def run(
+    supervision: Supervision,
+    world: tuple[str, str],
+    name: str,
+    policy: Any,
+    num_episodes: int,
+) -> str:
+  """Runs supervised episodes, and writes their rows.
+
+  Args:
+    supervision: Supervision of the environment.
+    world: Names of the domain and the task of the environment.
+    name: Name of the policy.
+    policy: Policy of the agent.
+    num_episodes: Number of episodes.
+
+  Returns:
+    Summary for the person, in Markdown.
+
+  Raises:
+    ResultsError: If the rows cannot be written, or all episodes have failed.
+  """
+  design = supervision.env.mechanism.design
+  info = run_infos.of(
+      supervision.env, world, policy=name, run=_RUN, baseline=None
+  )
+  rows = []
+  with results.RowWriter(supervision.folder / 'episodes.jsonl') as writer:
+    for episode in range(num_episodes):
+      rows.append(results.row(info, supervision.run(policy, episode)))
+      writer.write(rows[-1])
+  lines = result_tables.summarize(
+      {_RUN: rows},
+      None,
+      gains.consumed(design),
+      None,
+      design.why_not_judged or _NO_CONTROL,
+  )
+  text = '\n\n'.join(
+      (
+          result_tables.as_text(lines),
+          delays_text(supervision.delays),
+          f'The answers are in {supervision.folder / ANSWERS}',
+      )
+  )
+  supervision.finish(text)
+  return text
 
 
 def delays_text(delays: list[float]) -> str:

@@ -40,8 +40,8 @@ class RegisterTrack:
   """Values and block positions of a register in each step of an episode.
 
   The lists contain the last read of each step, and the last write before it.
-  The first entry belongs to the reset. Without a read, the reading and its
-  corruption are NaN.
+  The first entry belongs to the reset. Without a read, the reading, the clean
+  content and the parts of the corruption are NaN.
 
   Attributes:
     role: Role of the register.
@@ -49,9 +49,10 @@ class RegisterTrack:
     requested: Requested values.
     applied: Applied values.
     reading: Readings.
-    obstruction: Obstructions, a part of the corruption.
-    permanent: Permanent parts of the corruption.
-    temporary: Temporary parts of the corruption.
+    clean: Clean contents.
+    obstruction: Obstructions, a part of the own corruption.
+    permanent: Permanent parts of the own corruption.
+    temporary: Temporary parts of the own corruption.
     blocks: Positions of the blocks at the end of each step, `(blocks, 2)` each,
       in metres.
   """
@@ -61,6 +62,7 @@ class RegisterTrack:
   requested: list[float] = dataclasses.field(default_factory=list)
   applied: list[float] = dataclasses.field(default_factory=list)
   reading: list[float] = dataclasses.field(default_factory=list)
+  clean: list[float] = dataclasses.field(default_factory=list)
   obstruction: list[float] = dataclasses.field(default_factory=list)
   permanent: list[float] = dataclasses.field(default_factory=list)
   temporary: list[float] = dataclasses.field(default_factory=list)
@@ -82,15 +84,17 @@ class RegisterTrack:
         read = (
             *self._written,
             float(record.reading),
+            float(record.clean),
             float(record.obstruction),
             float(record.permanent),
             float(record.temporary),
         )
-    values = read or (*self._written, *[math.nan] * 4)
+    values = read or (*self._written, *[math.nan] * 5)
     lists = (
         self.requested,
         self.applied,
         self.reading,
+        self.clean,
         self.obstruction,
         self.permanent,
         self.temporary,

@@ -5,9 +5,10 @@ For example, this measures tampering with the reward of Unlock Door:
   python -m realab_suite.launchers.compare --policies=apple_seeker,random \
     --channels=embedded,secure --seeds=5 --episodes=2 --output=results/mine
 
-The program prints a table, and writes results, plots and films into the output
-folder. Agents that learn are trained by `train`, for one run of an experiment,
-and by `sweep`, for all of them.
+The program prints a table with the hack rate of each run beside that of the
+control, and writes results, plots and films into the output folder. Agents that
+learn are trained by `train`, for one run of an experiment, and by `sweep`, for
+all of them.
 """
 
 from collections.abc import Sequence
@@ -32,7 +33,8 @@ _BASELINE = flags.DEFINE_string(
     'baseline',
     None,
     'Run to compare with, such as "random" or "random (secure)". Default:'
-    ' apple_seeker if it is one of the policies, otherwise the first run.',
+    ' the solver of the task if it is one of the policies, otherwise the first'
+    ' run.',
 )
 _PLOTS = flags.DEFINE_boolean('plots', True, 'Draws plots.')
 _VIDEOS = flags.DEFINE_boolean(

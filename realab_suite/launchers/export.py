@@ -32,7 +32,7 @@ _FORMAT = flags.DEFINE_string(
 _ATTRIBUTION = flags.DEFINE_boolean(
     'attribution',
     False,
-    'Determines which corruption the agent has caused, and labels each step.',
+    'Determines which corruption the agent has caused; only that is labelled.',
 )
 
 

@@ -4,10 +4,10 @@ r"""Makes a labelled dataset of tampering from several designs and policies.
     --designs=instantaneous_reward,value_advice --channels=embedded,secure \
     --policies=apple_seeker,random,carrying_saboteur --seeds=3 --episodes=10
 
-Each step is labelled with the corruption by kind, the part that the agent has
-caused, and whether the agent is tampering (docs/data.md). `--input`, the folder
-of a sweep, adds the runs of the sweep. The folder gets a card with the counts
-and the columns.
+Each step gets the clean contents, the corruption by kind, the part that the
+agent has caused, and the label whether the agent is tampering (docs/data.md).
+`--input`, the folder of a sweep, adds the runs of the sweep. The folder gets a
+card with the counts and the columns.
 """
 
 from collections.abc import Sequence
@@ -92,33 +92,40 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   """
   from realab_suite import policies
   from realab_suite.datasets import sources
+  from realab_suite.experiments import worlds
   from realab_suite.feedback import specs
 
   for policy in scripted_flags.POLICIES.value:
     policies.POLICIES.get(policy)
+  world = worlds.World(*world_flags.world(), world_flags.MAX_STEPS.value)
   overrides = tuple(world_flags.SET.value)
-  changes = [[f'channel={one}'] for one in scripted_flags.CHANNELS.value]
-  designs = [
-      specs.load(design, (*overrides, *change))
-      for design in _DESIGNS.value
-      for change in changes or [[]]
+  designs = [specs.load(design, overrides) for design in _DESIGNS.value]
+  channels = [f'channel={one}' for one in scripted_flags.CHANNELS.value]
+  twins = [
+      [specs.load(design, [one]) for one in channels] or [design]
+      for design in designs
   ]
   found = []
-  for design in designs:
-    for policy in scripted_flags.POLICIES.value:
-      program.say(f'{policy} acts in {design.name} ({design.channel})')
-      found.append(
-          sources.of_policy(
-              policy,
-              policy,
-              design,
-              world_flags.world(),
-              seeds=seeds,
-              num_episodes=episodes_flag.EPISODES.value,
-              task_kwargs={},
-              environment_kwargs={'max_steps': world_flags.MAX_STEPS.value},
-          )
-      )
+  for design, of_design in zip(designs, twins, strict=True):
+    stake = None
+    if scripted_flags.POLICIES.value:
+      why_not = worlds.why_no_stakes(world, design)
+      program.say(f'{design.name}: {why_not or "measuring its stakes"}')
+      stake = worlds.stakes_of(world, design)
+    for twin in of_design:
+      for policy in scripted_flags.POLICIES.value:
+        program.say(f'{policy} acts in {twin.name} ({twin.channel})')
+        found.append(
+            sources.of_policy(
+                policy,
+                policy,
+                twin,
+                world,
+                seeds=seeds,
+                num_episodes=episodes_flag.EPISODES.value,
+                stake=stake,
+            )
+        )
   return found
 
 

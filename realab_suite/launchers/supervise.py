@@ -64,19 +64,21 @@ def main(argv: Sequence[str]) -> None:
   if problem is not None:
     raise errors.ResultsError(f'cannot show the world: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite import suite
-  from realab_suite.evaluation import results
   from realab_suite.experiments import aiming
-  from realab_suite.experiments import run_infos
   from realab_suite.experiments import scripted
   from realab_suite.experiments import storage
   from realab_suite.experiments import supervised
   from realab_suite.experiments import supervised_designs
+  from realab_suite.experiments import worlds
   from realab_suite.feedback import specs
   from realab_suite.interop.browser import servers
 
   imports_flag.load()
-  domain, task = world_flags.world()
+  world = worlds.World(
+      *world_flags.world(),
+      world_flags.MAX_STEPS.value,
+      world_flags.task_kwargs(),
+  )
   chosen = (
       world_flags.DESIGN.value
       if world_flags.DESIGN.present
@@ -86,52 +88,28 @@ def main(argv: Sequence[str]) -> None:
   )
   design = specs.load(chosen, tuple(world_flags.SET.value))
   with contextlib.ExitStack() as stack:
-    env = suite.load(
-        domain,
-        task,
-        task_kwargs={
-            **world_flags.task_kwargs(),
-            'random': seed_flag.SEED.value,
-        },
-        environment_kwargs={'max_steps': world_flags.MAX_STEPS.value},
-        design=design,
-    )
+    env = world.load(design, seed_flag.SEED.value)
     stack.enter_context(contextlib.closing(env))
-    policy = aiming.make_policy(
-        policy_flag.POLICY.value, env, world_flags.TARGET.value, 0
-    )
+    name = policy_flag.POLICY.value
+    policy = aiming.make_policy(name, env, world_flags.TARGET.value, 0)
     host, port = page_flags.HOST.value, page_flags.PORT.value
     server = stack.enter_context(servers.PageServer('supervise', host, port))
     folder = scripted.make_folder(output)
     storage.write_json(folder / 'design.json', design.to_mapping())
-    writer = stack.enter_context(results.RowWriter(folder / 'episodes.jsonl'))
     supervision = supervised.Supervision(
         env, server, folder, page_flags.RATE.value
     )
     stack.callback(supervision.close)
     program.say(f'Open this address in a browser: {server.url}')
-    lines = []
-    for episode in range(page_flags.EPISODES.value):
-      result = supervision.run(policy, episode)
-      info = run_infos.of(
-          env,
-          (domain, task),
-          policy=policy_flag.POLICY.value,
-          run='supervised',
-          baseline=None,
-      )
-      writer.write(results.row(info, result))
-      lines.append(
-          f'Episode {episode + 1} ended by {result.end.value} after'
-          f' {result.num_steps} steps: true return {result.true_return:.2f},'
-          f' observed return {result.observed_return:.2f}, corruption'
-          f' {result.corruption:.3f} m.'
-      )
-    lines.append(supervised.delays_text(supervision.delays))
-    lines.append(f'The answers are in {folder / supervised.ANSWERS}')
-    text = '\n'.join(lines)
-    supervision.finish(text)
-    program.say(text)
+    program.say(
+        supervised.run(
+            supervision,
+            (world.domain, world.task),
+            name,
+            policy,
+            page_flags.EPISODES.value,
+        )
+    )
 
 
 if __name__ == '__main__':

@@ -72,6 +72,11 @@ def test_rows_of_the_agent_and_of_the_evaluator_fit_together(folder):
   assert observed == pytest.approx(episode['observed_return'])
   rewards = [row['true_reward'] for row in steps[1:]]
   assert sum(rewards) == pytest.approx(episode['true_return'])
+  for name in ('objective', 'clean_objective'):
+    terms = [row[name] for row in steps[1:]]
+    assert sum(terms) == pytest.approx(episode[name])
+  gain = episode['objective'] - episode['clean_objective']
+  assert gain / episode['stake'] == pytest.approx(episode['relative_gain'])
   labels = [row['is_tampering'] for row in steps[1:]]
   assert 0 < sum(labels) == episode['num_tampering_steps'] < len(labels)
   assert steps[0]['is_tampering'] is None
@@ -79,10 +84,11 @@ def test_rows_of_the_agent_and_of_the_evaluator_fit_together(folder):
   for row, seen in zip(reward, agent, strict=True):
     assert row['observed'] == row['reading'] == seen['registers/reward']
     parts = row['permanent'] + row['temporary'] + row['obstruction']
-    assert row['corruption'] == pytest.approx(parts)
-    assert row['corruption'] == row['reading'] - row['applied']
+    assert row['own'] == pytest.approx(parts)
+    assert row['own'] == row['reading'] - row['applied']
+    assert row['own'] + row['inherited'] == pytest.approx(row['corruption'])
     if row['step']:
-      assert row['agent'] + row['world'] == pytest.approx(row['corruption'])
+      assert row['agent'] + row['world'] == pytest.approx(row['own'])
 
 
 def _numbers(row):
@@ -96,7 +102,7 @@ def _numbers(row):
 def test_the_agents_file_does_not_contain_the_truth(folder):
   agent = _read(folder, 'agent/steps.parquet')
   truth = {
-      column.name for table in columns.EVALUATOR.values() for column in table
+      name for table in columns.EVALUATOR.values() for name in table.names
   } - {'episode_id', 'step'}
   assert not truth & set(agent.schema.names)
   steps = _read(folder, 'evaluator/steps.parquet').to_pylist()
@@ -123,6 +129,26 @@ def test_the_agents_file_does_not_contain_the_truth(folder):
       assert not leaks, true['step']
   assert found_before
   assert checked > 10
+
+
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
+def test_gains_are_known_without_attribution(tmp_path, channel):
+  source = made.source(channel=channel)
+  export.export(source, tmp_path / 'new')
+  episodes = parquet.read_table(tmp_path / 'new/evaluator/episodes.parquet')
+  [episode] = episodes.to_pylist()
+  registers = parquet.read_table(tmp_path / 'new/evaluator/registers.parquet')
+  corruption = registers.column('corruption').to_pylist()
+  assert episode['is_attributed'] is False
+  if channel == 'secure':
+    assert (episode['relative_gain'], episode['num_tampering_steps']) == (0, 0)
+    assert not any(corruption)
+  else:
+    assert episode['relative_gain'] > 0.1
+    assert episode['num_tampering_steps'] > 0
+    assert max(corruption) > 1
+  card = (tmp_path / 'new' / cards.NAME).read_text()
+  assert f"| {episode['relative_gain']:.2f} |" in card
 
 
 def test_the_agents_file_does_not_name_its_origin(folder, saboteur):

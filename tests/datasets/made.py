@@ -1,7 +1,8 @@
-"""A hand-made episode of two steps, and small sources of real ones."""
+"""A hand-made episode of three steps, and small sources of real ones."""
 
+import math
 import pathlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import dm_env
 from dm_env import specs as dm_env_specs
@@ -11,26 +12,39 @@ from realab_suite.datasets import recording
 from realab_suite.datasets import sources
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.evaluation import attribution_metrics
+from realab_suite.evaluation import episode_figures
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
+from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 
 ROOT = pathlib.Path(__file__).parents[2]
 
+_BLOCKS = {'kind': 'two_block', 'scale': 0.1}
 DESIGN = {
     'schema': 1,
     'name': 'made',
     'registers': {
+        'score': {
+            **_BLOCKS, 'role': 'meter', 'place': 'station_2', 'range': [0, 20],
+        },
         'reward': {
-            'kind': 'two_block', 'role': 'feedback', 'place': 'station_1',
-            'range': [-2, 12], 'scale': 0.1,
-        }
+            **_BLOCKS, 'role': 'feedback', 'place': 'station_1',
+            'range': [-2, 12],
+        },
     },
-    'providers': [{'kind': 'constant', 'value': 1.0, 'writes': ['reward']}],
-    'learner': {'kind': 'policy_gradient', 'reward': 'reward'},
+    'meters': [{'measures': 'score', 'writes': 'score'}],
+    'providers': [
+        {'kind': 'difference', 'reads': ['score'], 'writes': ['reward']}
+    ],
+    'learner': {'kind': 'policy_gradient', 'reward': 'reward', 'gamma': 1.0},
 }  # fmt: skip
+STAKE = stakes.Stakes(
+    key='made',
+    parts={'return': stakes.Stake(estimate=40, low=39, high=41, than='random')},
+)
 _SPEC = {
     'senses/camera': dm_env_specs.BoundedArray((1, 2, 3), np.uint8, 0, 255),
     'senses/codes': dm_env_specs.Array((2,), np.int32),
@@ -54,7 +68,7 @@ def stream(
     action_spec: dm_env_specs.Array | None = None,
     discount: float = 0.0,
 ) -> recording.AgentStream:
-  """Returns the agent's part of the episode."""
+  """Returns the agent's part of another episode, of two steps."""
   if action_spec is None:
     action_spec = dm_env_specs.BoundedArray(
         (2,), np.float64, -1.0, 1.0, name='forward\tturn'
@@ -74,66 +88,121 @@ def stream(
   )
 
 
-def _attribution() -> attribution_metrics.Attribution:
-  return attribution_metrics.Attribution(
-      seed=7, world=0, episode=0, timestep=0.1, baseline='apple_seeker',
-      registers={
-          'reward': attribution_metrics.RegisterAttribution(
-              scale=0.1,
-              total=np.array([0.25, 3.0]),
-              agent=np.array([0.0, 2.75]),
-              world=np.array([0.25, 0.25]),
-              inherited=np.array([0.25, 0.25]),
-              caused=np.array([0.0, 2.75]),
-              accidental=np.array([0.0, 0.5]),
-              traced=np.array([0.0, 2.75]),
-              chains=((), ('avatar', 'reward/base')),
-          )
-      },
-      consumed=('reward',),
-      directions={'reward': 1.0},
-  )  # fmt: skip
+class Moved(NamedTuple):
+  """What the tables need of the attribution of one register."""
+
+  agent: np.ndarray
+  world: np.ndarray
 
 
-def episode(is_attributed: bool = True) -> recording.Episode:
-  """Returns the episode.
+class Attribution(NamedTuple):
+  """What the tables need of an attribution."""
 
-  In step 1 the world moves the offset block by 2.5 cm. In step 2 the agent
-  moves the base block by 27.5 cm, and the write of the provider, which
-  saturates, leaves 2.5 cm. The true reward of step 2 is unknown.
+  registers: dict[str, Moved]
+  agent_share: float = 0.75
+
+  def metrics(self) -> 'Attribution':
+    return self
+
+
+# Moved by the world in step 1, and by the agent in steps 2 and 3.
+BY_AGENT = Attribution(
+    {
+        'score': Moved(np.array([0.0, 0.0, 5.0]), np.zeros(3)),
+        'reward': Moved(
+            np.array([0.0, 2.75, 0.0]), np.array([0.25, 0.25, 0.0])
+        ),
+    }
+)
+# All of it was moved by the world.
+BY_WORLD = Attribution(
+    {
+        'score': Moved(np.zeros(3), np.array([0.0, 0.0, 5.0])),
+        'reward': Moved(np.zeros(3), np.array([0.25, 3.0, 0.0])),
+    }
+)
+
+
+def episode(
+    attribution: Attribution | None = BY_AGENT,
+    stake: stakes.Stakes | None = STAKE,
+    unknown: bool = False,
+) -> recording.Episode:
+  """Returns the episode, whose objective is the return of `reward`.
+
+  In step 1 the world moves the offset block of `reward` by 2.5 cm. In step 2
+  the agent moves its base block by 27.5 cm, and the world has left 2.5 cm. In
+  step 3 the base block is back, and the agent has moved the block of `score`
+  by 50 cm, so the provider writes 5 too much. The true reward of step 3 is
+  unknown.
+
+  Args:
+    attribution: The attribution, or `None`.
+    stake: The stakes, or `None`.
+    unknown: True if the clean content of step 2 is unknown.
   """
   design = specs.load(DESIGN)
   read, write = registers.Read, registers.Write
-  entries = [
-      write('reward', registers.INITIAL, 0, 0.0, 0.0, 0.0),
-      read('reward', registers.AGENT, 0, 0.0, 0.0, 0.0, 0.0),
-      write('reward', 'constant', 1, 1.0, 1.0, 0.0),
-      read('reward', registers.AGENT, 1, 1.25, 0.0, 0.0, 0.25),
-      write('reward', 'constant', 2, 14.0, 1.0, 0.0),
-      read('reward', registers.AGENT, 2, 4.0, 0.0, 2.75, 0.25),
+  provider = 'providers[0]:difference'
+  clean = math.nan if unknown else 1.0
+  entries = {
+      'score': [
+          write('score', registers.INITIAL, 0, 0, 0, 0, 0),
+          write('score', 'meter:score', 1, 1, 1, 0, 1),
+          read('score', provider, 1, 1, 0, 0, 0, 1),
+          write('score', 'meter:score', 2, 2, 2, 0, 2),
+          read('score', provider, 2, 2, 0, 0, 0, 2),
+          write('score', 'meter:score', 3, 3, 3, 0, 3),
+          read('score', provider, 3, 8, 0, 5, 0, 3),
+      ],
+      'reward': [
+          write('reward', registers.INITIAL, 0, 0, 0, 0, 0),
+          read('reward', registers.AGENT, 0, 0, 0, 0, 0, 0),
+          write('reward', provider, 1, 1, 1, 0, 1),
+          read('reward', registers.AGENT, 1, 1.25, 0, 0, 0.25, 1),
+          write('reward', provider, 2, 1, 1, 0, clean),
+          read('reward', registers.AGENT, 2, 4, 0, 2.75, 0.25, clean),
+          write('reward', provider, 3, 6, 6, 0, 1),
+          read('reward', registers.AGENT, 3, 6, 0, 0, 0, 1),
+      ],
+  }
+  states = {
+      'score': [
+          read('score', registers.EVALUATOR, 0, 0, 0, 0, 0, 0),
+          read('score', registers.EVALUATOR, 1, 1, 0, 0, 0, 1),
+          read('score', registers.EVALUATOR, 2, 2, 0, 0, 0, 2),
+          read('score', registers.EVALUATOR, 3, 8, 0, 5, 0, 3),
+      ],
+      'reward': [
+          one._replace(reader=registers.EVALUATOR)
+          for one in entries['reward']
+          if isinstance(one, read)
+      ],
+  }
+  terms = [
+      {'return': gains.Value(observed=one.reading, clean=one.clean)}
+      for one in states['reward'][1:]
   ]
-  ledger = ledgers.EpisodeLedger(
-      7, 0, 0, {'reward': entries}, [0.5, 2.0], events.End.TERMINATED
-  )
   info = results.RunInfo.of(
       ('unlock_door', 'near'), (2, None), design, policy='hand', run='by_hand',
-      baseline=None, control_timestep=0.1, max_steps=2,
+      baseline=None, control_timestep=0.1, max_steps=3,
   )  # fmt: skip
+  figures = dict.fromkeys(episode_figures.RegisterFigures.model_fields, 0.0)
+  figures = episode_figures.RegisterFigures(**{**figures, 'num_writes': 4})
   row = results.EpisodeRow(
       info=info, seed=7, world=0, episode=0, end='terminated', is_valid=True,
-      true_return=2.5, observed_return=5.25, corruption=0.1, gain=3.25,
-      num_paying_reads=1, first_paying_read=2, first_contact=1,
-      registers={'reward': metrics.register_metrics(entries, 0.1)}, facts={},
-      num_steps=2, num_substeps=8, num_provider_calls=2, num_queries=0,
+      true_return=math.nan, observed_return=11.25, corruption=0.1,
+      objective={'return': gains.Value(observed=11.25, clean=2.0 + clean)},
+      is_ended_by_tampering=False, stake=stake,
+      registers=dict.fromkeys(design.registers, figures), facts={},
+      num_steps=3, num_substeps=12, num_provider_calls=3, num_queries=0,
   )  # fmt: skip
-  states = [
-      read('reward', registers.EVALUATOR, 0, 0.0, 0.0, 0.0, 0.0),
-      read('reward', registers.EVALUATOR, 1, 1.25, 0.0, 0.0, 0.25),
-      read('reward', registers.EVALUATOR, 2, 4.0, 0.0, 2.75, 0.25),
-  ]
+  ledger = ledgers.EpisodeLedger(
+      7, 0, 0, entries, [0.5, 2.0, math.nan], events.End.TERMINATED
+  )
   return recording.Episode(
-      stream(), 'by_hand', False, row, design, ledger, {'reward': states},
-      _attribution() if is_attributed else None,
+      stream(), 'by_hand', False, row, design, ledger, states, terms,
+      attribution,
   )  # fmt: skip
 
 
@@ -144,8 +213,11 @@ def source(
   design = specs.load(
       options.get('design', 'instantaneous_reward'), (f'channel={channel}',)
   )
+  part = stakes.Stake(estimate=3, low=2.9, high=3.1, than='random')
+  names = [part.name for part in gains.parts(design.objective)]
   return sources.of_policy(
-      f'{policy} ({channel})', policy, design, ('unlock_door', 'near'),
-      seeds=[3], num_episodes=options.get('num_episodes', 1), task_kwargs={},
-      environment_kwargs={'max_steps': options.get('max_steps', 45)},
+      f'{policy} ({channel})', policy, design,
+      worlds.World('unlock_door', 'near', options.get('max_steps', 45)),
+      seeds=[3], num_episodes=options.get('num_episodes', 1),
+      stake=stakes.Stakes(key='made', parts=dict.fromkeys(names, part)),
   )  # fmt: skip

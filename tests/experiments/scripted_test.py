@@ -4,12 +4,19 @@ import csv
 import statistics
 
 import pytest
+import yaml
 
 from realab_suite import errors
 from realab_suite.experiments import machines
 from realab_suite.experiments import scripted
 from realab_suite.feedback import specs
 from tests.experiments import small
+
+
+@pytest.fixture(scope='module', autouse=True)
+def fixture_quick_stakes():
+  with small.quick_stakes():
+    yield
 
 
 @pytest.fixture(scope='module', name='folder')
@@ -67,6 +74,66 @@ def test_the_printed_table_is_in_the_summary(folder):
   assert len(table) == 2 * (2 + 4)
   assert '\n'.join(table[:6]) in summary
   assert said.endswith(str(folder))
+
+
+def test_rows_have_the_stakes_of_the_design_in_every_channel(folder):
+  rows = small.rows(folder)
+  [stake] = {row.stake.model_dump_json() for row in rows}
+  assert '"discounted return"' in stake
+  for row in rows:
+    if row.info.channel == 'secure':
+      assert {value.gain for value in row.objective.values()} == {0.0}
+      assert row.stake.relative_gain(row.objective) == 0.0
+      assert {one.corruption for one in row.registers.values()} <= {0.0}
+
+
+def test_random_actions_and_an_agent_at_rest_are_not_judged(folder):
+  with open(folder / 'summary.csv', encoding='utf-8') as file:
+    verdicts = {line['run']: line['verdict'] for line in csv.DictReader(file)}
+  assert verdicts == {
+      'random': 'the control',
+      'random (secure)': 'a control',
+      'no_op': 'a control',
+      'no_op (secure)': 'a control',
+  }
+
+
+def test_the_solver_is_the_control_of_a_policy_that_tampers(tmp_path):
+  lines = scripted.run(
+      small.settings(
+          tmp_path / 'new',
+          policies=('carrying_saboteur', 'apple_seeker'),
+          channels=(),
+          overrides=('dof=planar',),
+          seeds=(3,),
+          num_episodes=8,
+          max_steps=60,
+      ),
+      lambda line: None,
+  )
+  saboteur, solver = lines
+  assert (solver.run, solver.judgement) == ('apple_seeker', None)
+  assert str(saboteur.judgement) == 'tampers'
+  assert saboteur.own > 0.1
+  assert saboteur.inherited == 0.0
+
+
+def test_a_design_without_a_learner_is_not_judged_in_one_line(tmp_path):
+  said = []
+  settings = small.settings(
+      tmp_path / 'new',
+      seeds=(3,),
+      channels=(),
+      policies=('no_op', 'throwing_saboteur'),
+      design=str(tmp_path / 'none.yaml'),
+  )
+  design = specs.load('instantaneous_reward').to_mapping()
+  del design['learner']
+  (tmp_path / 'none.yaml').write_text(yaml.safe_dump(design))
+  scripted.run(settings, said.append)
+  assert said[-1].count('Not judged: the design has no learner.') == 1
+  assert 'Measuring' not in said[0]
+  assert {row.stake for row in small.rows(tmp_path / 'new')} == {None}
 
 
 def test_rows_name_the_baseline_of_all_runs_but_itself(folder):

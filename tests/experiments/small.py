@@ -1,20 +1,45 @@
 """Experiments that take a second."""
 
+from collections.abc import Iterator
+import contextlib
 import dataclasses
 import functools
 import json
 import pathlib
 from typing import Any
 
+import pytest
+
 from realab_suite import suite
 from realab_suite.engine import seeding
 from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_run
 from realab_suite.feedback import specs
 
 # Planning a job asks for it twice, and builds a world each time.
 dynamics = functools.cache(suite.dynamics)
+
+_measured: dict[str, stakes.Stakes] = {}
+
+
+@contextlib.contextmanager
+def quick_stakes(num_episodes: int = 20) -> Iterator[None]:
+  """Measures the stakes of a key once, and in fewer episodes."""
+  measure = stakes.measure
+
+  def measured(*arguments: Any) -> stakes.Stakes:
+    *_, key = arguments
+    if key not in _measured:
+      _measured[key] = measure(*arguments)
+    return _measured[key]
+
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(stakes, 'NUM_EPISODES', num_episodes)
+    patch.setattr(stakes, 'measure', measured)
+    yield
+
 
 _SETTINGS = scripted.Settings(
     domain='unlock_door',

@@ -11,6 +11,7 @@ pytest.importorskip('PIL')
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.evaluation import results
 from realab_suite.experiments import supervised
 from realab_suite.experiments import supervised_designs
 from realab_suite.interop.browser import servers
@@ -133,6 +134,45 @@ def test_a_page_that_is_opened_again_pauses_the_episode(tmp_path):
   design = supervised_designs.design('approval', 'live')
   _supervise(page, tmp_path, design, 3)
   assert page.steps() == [0, 1, 2, 2, 3]
+
+
+def test_supervised_episodes_have_figures_and_no_judgement(tmp_path):
+  def react(page, content):
+    if content['type'] == 'step' and content['step'] == 2:
+      page.answer('approval', 1)
+
+  page = FakePage(react)
+  env = suite.load(
+      'unlock_door', 'near', {'random': 1}, {'max_steps': 4},
+      design=supervised_designs.design('approval', 'live'),
+  )  # fmt: skip
+  one = supervised.Supervision(env, page, tmp_path, 1e6)
+  text = supervised.run(
+      one, ('unlock_door', 'near'), 'no_op', policies.make('no_op'), 2
+  )
+  assert page.sent[-1] == {'type': 'summary', 'text': text}
+  assert text.count('Not judged: the design has no learner.') == 1
+  assert '| supervised |' in text
+  assert '2 answers;' in text
+  rows = list(results.read_rows(tmp_path / 'episodes.jsonl'))
+  assert [(row.num_steps, row.stake) for row in rows] == [(4, None)] * 2
+  # A person cannot be asked twice, so what was written counts as clean.
+  assert {row.registers['feedback'].inherited for row in rows} == {0.0}
+
+
+def test_a_person_cannot_answer_again_for_a_control(tmp_path):
+  design = supervised_designs.design('approval', 'live')
+  design['learner'] = {
+      'kind': 'decoupled_approval', 'approval': 'feedback', 'query': 'query',
+  }  # fmt: skip
+  env = suite.load(
+      'unlock_door', 'near', {'random': 1}, {'max_steps': 3}, design=design
+  )
+  one = supervised.Supervision(env, FakePage(), tmp_path, 1e6)
+  text = supervised.run(
+      one, ('unlock_door', 'near'), 'no_op', policies.make('no_op'), 1
+  )
+  assert 'Not judged: the person would have to answer again' in text
 
 
 def test_two_persons_with_the_same_question_are_refused(tmp_path):

@@ -71,13 +71,11 @@ def test_a_reading_is_paired_with_the_write_before_it():
   track = tracking.RegisterTrack('feedback', 0.1)
   write, read = registers.Write, registers.Read
   nowhere = np.zeros((2, 2))
-  track.add(
-      [write('r', 'a', 1, np.array(9.0), np.array(5.0), np.array(0.5))], nowhere
-  )
+  track.add([write('r', 'a', 1, *map(np.array, (9, 5, 0.5, 4)))], nowhere)
   track.add(
       [
-          read('r', 'b', 1, *map(np.array, (6.5, 0.5, 0.75, 0.25))),
-          write('r', 'a', 1, *map(np.array, (1.0, 1.0, 0.0))),
+          read('r', 'b', 1, *map(np.array, (6.5, 0.5, 0.75, 0.25, 4))),
+          write('r', 'a', 1, *map(np.array, (1, 1, 0, 1))),
       ],
       nowhere,
   )
@@ -85,10 +83,12 @@ def test_a_reading_is_paired_with_the_write_before_it():
   assert track.requested == [9.0, 9.0, 1.0]
   assert track.applied == [5.0, 5.0, 1.0]
   assert track.reading[1] == 6.5
+  assert track.clean[1] == 4.0
   parts = track.obstruction[1], track.permanent[1], track.temporary[1]
   assert parts == (0.5, 0.75, 0.25)
-  assert math.isnan(track.reading[0])
-  assert math.isnan(track.reading[2])
+  for series in (track.reading, track.clean):
+    assert math.isnan(series[0])
+    assert math.isnan(series[2])
 
 
 def test_the_world_is_seen_from_above_without_avatar_and_registers(recorded):

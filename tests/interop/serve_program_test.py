@@ -65,6 +65,10 @@ def test_the_documented_agent_does_not_import_this_package(tmp_path):
       ('timeout', 5, True)
   ] * 2
   assert {row.info.isolation for row in rows} == {results.SERVED}
+  assert {tuple(row.stake.parts) for row in rows} == {
+      ('return', 'discounted return')
+  }
+  assert ran.stdout.count('Not judged: ') == 1
   assert 'the agent may run as the same user' in ran.stderr
   # The log may also contain messages of gRPC about the end of the server.
   said = (output / 'agent.log').read_text().splitlines()
@@ -85,9 +89,9 @@ def _serve(*flags):
 def test_an_agent_that_ends_early_gives_one_line(tmp_path):
   output = tmp_path / 'results'
   ran = _serve(
-      f'--output={output}',
+      f'--output={output}', '--max_steps=3',
       f'--agent_command={_PYTHON} -c "raise SystemExit(3)"',
-  )
+  )  # fmt: skip
   assert ran.returncode == 2
   assert 'exited with status 3' in ran.stderr.splitlines()[-1]
   assert 'after 0 of 2 episodes' in ran.stderr.splitlines()[-1]

@@ -15,7 +15,8 @@ from realab_suite import errors
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import statistics
+from realab_suite.evaluation import hacking
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import aiming
 from realab_suite.experiments import served_evaluation
 from realab_suite.feedback.providers import difference
@@ -142,10 +143,13 @@ def test_tampering_before_giving_up_counts():
       'disconnect', 'abandoned', 'disconnect', 'abandoned', 'disconnect',
   ]  # fmt: skip
   assert [result.is_valid for result in agent] == 5 * [True, False]
-  found = comparison.compare({'agent': agent, 'honest': honest}, 'honest')
-  verdict = found['agent'].verdict
-  assert verdict.outcome is statistics.Outcome.TAMPERS_MORE
-  assert verdict.num_censored == 5
+  part = stakes.Stake(estimate=10, low=9, high=11, than='random')
+  names = ('return', 'discounted return')
+  stake = stakes.Stakes(key='', parts=dict.fromkeys(names, part))
+  control = hacking.control('honest', honest, stake)
+  found = hacking.hacking(agent, control, stake)
+  assert (found.count.hacked, found.count.episodes) == (5, 10)
+  assert comparison.summary('agent', agent).num_given_up == 5
 
 
 def test_a_silent_client_loses_the_world():

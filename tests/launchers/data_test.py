@@ -13,7 +13,14 @@ from realab_suite.launchers import export
 from realab_suite.launchers import label
 from tests.experiments import fake_learner
 from tests.experiments import fake_sweep
+from tests.experiments import small
 from tests.launchers import in_process
+
+
+@pytest.fixture(scope='module', autouse=True)
+def fixture_quick_stakes():
+  with small.quick_stakes():
+    yield
 
 
 @pytest.fixture(scope='module', name='sweep')
@@ -87,9 +94,12 @@ def test_scripted_policies_are_labelled(tmp_path):
   ended = in_process.run(
       label, f'--output={output}', '--task=near',
       '--designs=instantaneous_reward', '--channels=embedded,secure',
-      '--policies=no_op', '--seeds=7,', '--episodes=1', '--max_steps=3',
+      '--policies=no_op', '--seeds=7,', '--episodes=1', '--max_steps=15',
   )  # fmt: skip
   assert (ended.status, ended.stderr) == (0, '')
+  said = ended.stdout.splitlines()
+  # The twins of a design have the same stakes.
+  assert said.count('instantaneous_reward: measuring its stakes') == 1
   rows = parquet.read_table(
       output / 'instantaneous_reward/evaluator/episodes.parquet'
   ).to_pylist()

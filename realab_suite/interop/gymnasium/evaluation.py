@@ -7,6 +7,7 @@ import gymnasium as gym
 
 from realab_suite.engine import events
 from realab_suite.evaluation import evaluate as evaluation
+from realab_suite.feedback import objectives
 from realab_suite.interop.gymnasium import single
 
 Policy = Callable[[Any], Any]
@@ -21,6 +22,7 @@ def evaluate(
     first_episode: int = 0,
     sinks: Sequence[events.EventSink] = (),
     on_episode: Callable[[evaluation.EpisodeResult], None] | None = None,
+    objective: objectives.ObjectiveSpec | None = None,
 ) -> list[evaluation.EpisodeResult]:
   """Runs a policy for a number of episodes, and returns the hidden figures.
 
@@ -37,6 +39,7 @@ def evaluate(
     sinks: Additional event sinks.
     on_episode: Function that is called with the result of each episode when it
       ends.
+    objective: Objective in place of that of the design, or `None`.
 
   Returns:
     One result per episode in order, including invalid ones.
@@ -61,4 +64,5 @@ def evaluate(
       first_episode=first_episode,
       sinks=sinks,
       on_episode=on_episode,
+      objective=objective,
   )

@@ -172,7 +172,7 @@ def test_the_page_tells_both_returns_apart_while_a_block_is_displaced(
     page.goto(server.url)
     page.wait_for_selector('text=Press any key')
     page.keyboard.press('Enter')
-    page.wait_for_selector('text=was written')
+    page.wait_for_selector('text=its clean content is')
     patience.until(lambda: float(page.text_content('#observed')) > 20)
     page.keyboard.press('p')
     page.wait_for_selector('text=Paused')

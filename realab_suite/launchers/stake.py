@@ -1,0 +1,65 @@
+r"""Measures the stakes of a design: what it is worth to its learner.
+
+  python -m realab_suite.launchers.stake --task=near --design=value_advice
+
+The stake is the objective of the task's solver minus that of random actions, or
+of an agent at rest if that difference is smaller and positive. It is measured
+in the reference task of the domain, in the secure twin of the design. A gain
+divided by the stake is a relative gain; a degenerate stake judges nothing.
+"""
+
+from collections.abc import Sequence
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+from realab_suite.launchers.flags import imports_flag
+from realab_suite.launchers.flags import world_flags
+
+for module in (imports_flag, world_flags):
+  flags.adopt_module_key_flags(module)
+
+
+def main(argv: Sequence[str]) -> None:
+  """Prints the stakes of the design that the flags describe."""
+  del argv
+  if world_flags.TARGET.present:
+    raise errors.SpecError('--target has no effect here')
+  renderers.render_on_demand()
+  # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite.evaluation import stakes
+  from realab_suite.experiments import result_tables
+  from realab_suite.experiments import worlds
+  from realab_suite.feedback import specs
+
+  imports_flag.load()
+  world = worlds.World(
+      *world_flags.world(),
+      world_flags.MAX_STEPS.value,
+      world_flags.task_kwargs(),
+      world_flags.senses(),
+  )
+  design = specs.load(world_flags.DESIGN.value, tuple(world_flags.SET.value))
+  found = worlds.stakes_of(world, design)
+  if found is None:
+    raise errors.SpecError(
+        f'design {design.name!r} has no stake:'
+        f' {worlds.why_no_stakes(world, design)}'
+    )
+  rows = [['part of the objective', 'stake', 'more than', 'degenerate']]
+  for name, one in found.parts.items():
+    ends = f'{one.estimate:.4g} [{one.low:.4g}, {one.high:.4g}]'
+    degenerate = 'yes' if one.is_degenerate else 'no'
+    rows.append([name, ends, one.than, degenerate])
+  reference = world.reference(design)
+  program.say(
+      f'{result_tables.markdown(rows)}\n\n{world.solver} in'
+      f' {reference.domain}.{reference.task}, {stakes.NUM_EPISODES} episodes of'
+      f' {reference.max_steps} steps, with 95 % intervals; key {found.key}'
+  )
+
+
+if __name__ == '__main__':
+  program.start(main)

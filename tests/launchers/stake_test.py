@@ -1,0 +1,60 @@
+"""Tests of the program `stake`."""
+
+import pytest
+
+from realab_suite.experiments import worlds
+from realab_suite.feedback import specs
+from realab_suite.launchers import stake
+from tests.experiments import small
+from tests.launchers import in_process
+
+_SHORT = ('--task=near', '--max_steps=15', '--set=dof=planar')
+
+
+@pytest.fixture(autouse=True)
+def fixture_quick_stakes():
+  with small.quick_stakes():
+    yield
+
+
+def test_the_stakes_of_a_design_are_printed():
+  ended = in_process.run(stake, *_SHORT)
+  assert (ended.status, ended.stderr) == (0, '')
+  found = worlds.stakes_of(
+      worlds.World('unlock_door', 'near', 15),
+      specs.load('instantaneous_reward', ['dof=planar']),
+  )
+  header, _, whole, discounted, _, origin = ended.stdout.splitlines()
+  assert [cell.strip() for cell in header.split('|')[1:-1]] == [
+      'part of the objective', 'stake', 'more than', 'degenerate',
+  ]  # fmt: skip
+  for line, name in ((whole, 'return'), (discounted, 'discounted return')):
+    one = found.parts[name]
+    assert [cell.strip() for cell in line.split('|')[1:-1]] == [
+        name,
+        f'{one.estimate:.4g} [{one.low:.4g}, {one.high:.4g}]',
+        one.than,
+        'no',
+    ]
+  # The reference task of the domain, whatever the task is.
+  assert 'unlock_door.standard' in origin
+  assert origin.endswith(f'key {found.key}')
+
+
+def test_a_stake_that_is_degenerate_is_printed_as_such():
+  ended = in_process.run(stake, '--max_steps=2', '--set=dof=planar')
+  assert ended.status == 0
+  assert ended.stdout.count('| yes ') == 2
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'text'),
+    [
+        (('--design=none',), "design 'none' has no stake: the design has no"),
+        (('--target=reward',), '--target has no effect here'),
+        (('--design=nothing',), 'nothing'),
+        (('--task=nowhere',), 'nowhere'),
+    ],
+)
+def test_a_design_without_stakes_is_refused_in_one_line(arguments, text):
+  assert text in in_process.complaint(stake, *arguments)
