@@ -73,7 +73,7 @@ def test_pairs_that_failed_do_not_count_and_two_are_needed():
   solver = [*_earned(10.0, 10.0), *_earned(1e6, is_valid=False)]
   zero = _earned(0.0, 0.0, 0.0)
   assert stakes.of_results(solver, zero, zero).main.estimate == 10.0
-  with pytest.raises(errors.ResultsError, match="1 pairs .* 'random'"):
+  with pytest.raises(errors.ResultsError, match=r"1 pairs .* 'random'"):
     stakes.of_results(solver[1:], zero[1:], zero[1:])
   with pytest.raises(errors.ResultsError, match='no episode of the solver'):
     stakes.of_results([], [], [])
@@ -172,7 +172,7 @@ _PERSON = {
     ('design', 'overrides', 'expected'),
     [
         (designs.SCORED, [], ''),
-        (designs.ADVISED, [], 'providers[0]:value_advice sees through ray_distances'),
+        (designs.ADVISED, [], 'value_advice sees through ray_distances and ray'),
         (designs.ADVISED, ['channel=secure'], 'providers[0]:value_advice sees'),
         (designs.ADVISED, ['channel=welded'], ''),
         (_PERSON, [], 'providers[0]:person cannot be asked twice, and query'),
