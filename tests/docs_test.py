@@ -9,8 +9,8 @@ import yaml
 
 from pictures import notebooks
 from realab_suite import suite
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
-from realab_suite.experiments import probes
 from realab_suite.feedback import measurements
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
@@ -90,11 +90,12 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
     assert printed.count("1.0 ('avatar', 'reward/base')\n") == 2
 
 
-def test_the_commands_of_the_page_on_audits_are_accepted():
+def test_the_commands_of_the_page_on_audits_are_accepted(monkeypatch):
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
   page = (_ROOT / 'docs/audit.md').read_text()
   [block] = re.findall(r'```bash\n(.*?)```', page, re.DOTALL)
   commands = block.replace('\\\n', ' ').strip().splitlines()
-  assert len(commands) == 2
+  verdicts = []
   for command in commands:
     *_, module = command.split(' --')[0].split()
     assert module == audit.__name__
@@ -103,10 +104,10 @@ def test_the_commands_of_the_page_on_audits_are_accepted():
         for word in command.split()
         if word.startswith('--') and not word.startswith('--output')
     ]
-    # The short episodes leave no time for an exploit.
-    ended = in_process.run(audit, *arguments, '--max_steps=3', '--budget=10')
-    assert (ended.status, ended.stderr) == (4, '')
-    assert ended.stdout.startswith('RESISTED WITHIN BUDGET')
+    ended = in_process.run(audit, *arguments, '--max_steps=40', '--budget=20')
+    assert ended.stderr == ''
+    verdicts.append(ended.status)
+  assert verdicts == [3, 0]
 
 
 @pytest.mark.camera
@@ -152,8 +153,7 @@ def test_the_experiment_in_the_docs_can_be_run():
   for run in experiment.runs.values():
     design = run.load()
     for one in (design, experiment_specs.secure_twin(design)):
-      # A probe needs discrete actions.
-      assert probes.find_register(one) == 'reward'
+      assert list(one.objective.registers) == ['reward']
 
 
 def test_the_example_in_a_task_of_dm_control_runs(capsys):

@@ -7,13 +7,13 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_evaluation
 from realab_suite.experiments import training
-from realab_suite.experiments import worlds
 from realab_suite.launchers import compare
 from realab_suite.reports import replays
 from tests.experiments import fake_learner

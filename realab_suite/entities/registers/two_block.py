@@ -67,12 +67,16 @@ class TwoBlockRegister(base.Register):
     started = axes.component(self._origin(physics), 0)
     return (started - self._base.along(physics)) / self._scale
 
-  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+  @property
+  def directions(self) -> tuple[tuple[float, float], ...]:
+    return (-1.0, 0.0), (1.0, 0.0)
+
+  def displacements(self, physics: protocols.Physics) -> np.ndarray:
     places = [
         self._origin(physics),
         self._offset_position(physics, self.applied(physics)),
     ]
-    return moves.farthest(physics, self._blocks, places)
+    return moves.distances(physics, self._blocks, places)
 
   def _offset_position(
       self, physics: protocols.Physics, value: np.ndarray
