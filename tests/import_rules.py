@@ -47,7 +47,12 @@ _MAY_IMPORT = {
         'config', 'entities', 'policies', 'feedback', 'tasks', 'engine',
     ),
     # Nothing here may reach the true reward.
-    'agents': ('config', 'feedback.specs', 'policies.action_sets'),
+    'agents': (
+        'config',
+        'entities.appearance',
+        'feedback.specs',
+        'policies.action_sets',
+    ),
     'suite': _BELOW_SUITE,
     'interop': (*_BELOW_SUITE, 'suite'),
     'experiments': (*_BELOW_SUITE, 'suite', 'agents', 'interop'),

@@ -8,6 +8,7 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.entities import appearance
+from realab_suite.entities import block_kinds
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 
@@ -92,7 +93,7 @@ class Saboteur(base.Policy, abc.ABC):
         direction=along,
         # The offset block stands beside it at first: the free side.
         side=along,
-        code=np.array(appearance.code('base_block')),
+        code=np.array(appearance.code(block_kinds.BASE_BLOCK)),
     )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:

@@ -15,7 +15,7 @@ from realab_suite.evaluation import labels
 from realab_suite.evaluation import results
 from realab_suite.experiments import gymnasium_report
 
-_NAME = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_NAME = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _SHORT: Any = {'environment_kwargs': {'max_steps': 4}, 'flat': True}
 
 
