@@ -9,6 +9,7 @@ import yaml
 
 from pictures import notebooks
 from realab_suite import suite
+from realab_suite.entities import appearance
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import measurements
@@ -50,6 +51,7 @@ def registries():
           providers.PROVIDERS._entries,
           register_kinds.REGISTER_KINDS._entries,
           action_sets.ACTION_SETS._entries,
+          appearance._CLASSES,
           suite._TASKS,
       )
   ]

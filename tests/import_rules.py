@@ -51,6 +51,7 @@ _MAY_IMPORT = {
     # Nothing here may reach the true reward.
     'agents': (
         'config',
+        'entities.appearance',
         'feedback.objectives',
         'feedback.specs',
         'policies.action_sets',

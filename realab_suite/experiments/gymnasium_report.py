@@ -79,7 +79,7 @@ def write(
 
   Args:
     name: Id of a world, such as
-      `'realab/UnlockDoor-near-InstantaneousReward-v2'`.
+      `'realab/UnlockDoor-near-InstantaneousReward-v3'`.
     agents: Policies by the name of the agent: one for each seed of training,
       equally many for each agent. Policy i acts in the episodes of seed
       `first_seed + i`. A verdict needs five.

@@ -526,10 +526,11 @@ class Register(composer.Entity):
 
     Args:
       name: Name of the block within the register.
-      class_name: Class that the ray sense reports, of `appearance.CLASSES`.
+      class_name: Class that the ray sense reports: `block_kinds.BASE_BLOCK` or
+        `block_kinds.OFFSET_BLOCK`.
       position: Position at rest in the register's frame, `(x, y)`, in m.
     """
-    index = int(class_name == 'offset_block')
+    index = int(class_name == block_kinds.OFFSET_BLOCK)
     style = appearance.geom_style(
         class_name, appearance.ROLE_COLOURS[self._role][index]
     )

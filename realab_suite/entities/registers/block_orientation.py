@@ -33,7 +33,7 @@ class BlockOrientationRegister(base.Register):
           f' {self._scale} turns the block by up to {widest:.3g} rad; allowed'
           f' are at most {_LARGEST_ANGLE} rad'
       )
-    self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
+    self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
     return [self._block]
 
   def _put(

@@ -21,7 +21,7 @@ class BlockPositionRegister(base.Register):
   """
 
   def _build_blocks(self) -> list[block_kinds.Block]:
-    self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
+    self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
     return [self._block]
 
   def _put(

@@ -34,8 +34,10 @@ class TwoBlockRegister(base.Register):
 
   def _build_blocks(self) -> list[block_kinds.Block]:
     lateral = self._block_size + _LATERAL
-    self._base = self._add_block('base', 'base_block', (0.0, 0.0))
-    self._offset = self._add_block('offset', 'offset_block', (0.0, lateral))
+    self._base = self._add_block('base', block_kinds.BASE_BLOCK, (0.0, 0.0))
+    self._offset = self._add_block(
+        'offset', block_kinds.OFFSET_BLOCK, (0.0, lateral)
+    )
     self._from_origin = np.array([0.0, lateral, 0.0])
     if self._channel != 'welded':
       self._mjcf_root.contact.add('exclude', body1='base', body2='offset')
