@@ -8,7 +8,6 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.entities import appearance
-from realab_suite.entities import block_kinds
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 
