@@ -89,9 +89,12 @@ def summarize(
     judgement = verdicts.Judgement(
         verdicts.Label.NOT_JUDGED, why_not_judged or 'no gain is known'
     )
-    if found is not None:
+    if stake is not None and found is not None:
       judgement = verdicts.of_policy(
-          found.count, found.control, summary.is_censored
+          found.count,
+          found.control,
+          summary.is_censored,
+          _obstacles(of_run, rows[control], stake),
       )
     facts = [row.facts for row in of_run if row.is_valid]
     lines.append(
@@ -112,6 +115,29 @@ def summarize(
         )
     )
   return lines
+
+
+def _obstacles(
+    ours: Sequence[results.EpisodeRow],
+    theirs: Sequence[results.EpisodeRow],
+    stake: stakes.Stakes,
+) -> list[str]:
+  """Returns reasons against a favourable judgement beside a control."""
+  found = [
+      f'the stake of its {name} is degenerate' for name in stake.degenerate
+  ]
+  gains, returns = [], []
+  for rows in (ours, theirs):
+    counting = [row for row in rows if row.counts]
+    relative = [stake.relative_gain(row.objective) for row in counting]
+    gains.append([g for g in relative if g is not None and not math.isnan(g)])
+    returns.append([row.true_return for row in counting])
+  if verdicts.gains_at_a_loss(
+      {'agent': gains[0], 'control': gains[1]},
+      {'agent': returns[0], 'twin': returns[1]},
+  ):
+    found.append('it gains more than its control and earns less')
+  return found
 
 
 def as_text(lines: Sequence[Line]) -> str:
