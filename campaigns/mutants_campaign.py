@@ -38,15 +38,17 @@ _REGISTER = 'entities/registers/base.py'
 _TWO_BLOCK = 'entities/registers/two_block.py'
 _REG = ('tests/entities/register_contract_test.py',)
 _TWO = ('tests/entities/two_block_register_test.py',)
-_METRICS = 'evaluation/metrics.py'
-_MET = ('tests/evaluation/metrics_test.py',)
-_LED = ('tests/evaluation/ledger_test.py', 'tests/evaluation/metrics_test.py')
-_COMPARISON = 'evaluation/comparison.py'
-_COM = (
-    'tests/evaluation/comparison_test.py',
-    'tests/evaluation/comparison_properties_test.py',
-    'tests/evaluation/censored_episodes_test.py',
+_FIGURES = 'evaluation/episode_figures.py'
+_GAINS = 'evaluation/gains.py'
+_FIG = ('tests/evaluation/episode_figures_test.py',)
+_CLEAN = 'feedback/clean_contents.py'
+_CLE = (
+    'tests/feedback/clean_contents_test.py',
+    'tests/feedback/clean_calls_test.py',
 )
+_LED = ('tests/evaluation/ledger_test.py', *_FIG)
+_COMPARISON = 'evaluation/comparison.py'
+_COM = ('tests/evaluation/comparison_test.py',)
 _STORAGE = 'experiments/storage.py'
 _TRA = ('tests/experiments/training_test.py',)
 _STO = ('tests/experiments/storage_test.py', *_TRA)
@@ -56,8 +58,8 @@ _RES = ('tests/evaluation/results_test.py',)
 _ENDINGS = 'evaluation/endings.py'
 _INTERVALS = 'evaluation/intervals.py'
 _INT = ('tests/evaluation/intervals_test.py',)
-_STATISTICS = 'evaluation/statistics.py'
-_STA = ('tests/evaluation/statistics_test.py',)
+_VERDICTS = 'evaluation/verdicts.py'
+_VER = ('tests/evaluation/verdicts_test.py',)
 
 MUTANTS = [
     # ---- Contract ------------------------------------------------------------
@@ -217,63 +219,74 @@ MUTANTS = [
     ),
     # ---- Metrics -------------------------------------------------------------
     planting.Mutant(
-        'metric', 'corruption is relative to the requested value', _METRICS,
-        'errors.append(entry.reading - last.applied)',
-        'errors.append(entry.reading - last.requested)', _MET,
+        'metric', 'own corruption is relative to the clean content',
+        _FIGURES, 'read.reading - applied,',
+        'read.reading - read.clean,', _FIG,
     ),
     planting.Mutant(
-        'metric', 'obstructions are left out', _METRICS,
-        'obstruction.append(abs(entry.obstruction))',
-        'obstruction.append(0.0)', _MET,
+        'metric', 'corruption ends at the written value',
+        _FIGURES, 'read.reading - read.clean,',
+        'read.reading - applied,', _FIG,
     ),
     planting.Mutant(
-        'metric', 'a write without a read counts as read', _METRICS,
-        'num_writes_read += not last_was_read', 'num_writes_read += 1', _MET,
+        'metric', 'obstructions are left out',
+        _FIGURES, '            read.obstruction,',
+        '            0.0 * read.obstruction,', _FIG,
     ),
     planting.Mutant(
-        'metric', 'reads before any write are not counted separately', _METRICS,
-        '      too_early += 1\n', '', _MET,
+        'metric', 'a write without a read counts as read',
+        _FIGURES, 'np.where(counts, total[_UNREAD], 0.0)',
+        'np.where(counts, 1.0, 0.0)', _FIG,
     ),
     planting.Mutant(
         'metric', 'without a read, corruption is zero instead of unknown',
-        _METRICS,
-        'return float(np.mean(values)) if values else None',
-        'return float(np.mean(values)) if values else 0.0', _MET,
+        _FIGURES, '_number(value / number) if number else None',
+        '_number(value / number) if number else 0.0', _FIG,
     ),
     planting.Mutant(
-        'metric', 'signs cancel in the mean corruption', _METRICS,
-        'absolute = [abs(error) for error in errors]', 'absolute = errors',
-        _MET,
+        'metric', 'signs cancel in the mean corruption',
+        _FIGURES, 'np.abs(value) * scale',
+        'value * scale', _FIG,
     ),
     planting.Mutant(
-        'metric', 'metres are units', _METRICS,
-        'corruption * scale', 'corruption', _MET,
-    ),
-    planting.Mutant(
-        'metric', 'the value at the reset is part of the return', _METRICS,
-        'if entry.writer != registers.INITIAL:', 'if True:', _MET,
-    ),
-    planting.Mutant(
-        'metric', "a provider's read is part of the observed return",
-        _METRICS,
-        'if entry.reader == registers.AGENT and entry.step > 0:',
-        'if entry.step > 0:', _MET,
+        'metric', 'metres are units',
+        _FIGURES, 'corruption / self._scales[row]',
+        'corruption', _FIG,
     ),
     planting.Mutant(
         'metric', 'the reading at a reset is part of the observed return',
-        _METRICS,
-        'if entry.reader == registers.AGENT and entry.step > 0:',
-        'if entry.reader == registers.AGENT:', _MET,
+        _FIGURES, 'self._mark_read(record, where)',
+        'self._add_read(record, where)', _FIG,
     ),
     planting.Mutant(
-        'metric', 'nan is left out of an average', _METRICS,
-        'return float(np.mean(values)) if values else None',
-        'return float(np.nanmean(values)) if values else None', _MET,
+        'metric', "a provider's read dilutes that of the agent",
+        _FIGURES, '      if read.reader != registers.AGENT:\n        return\n',
+        '', _FIG,
     ),
     planting.Mutant(
         'metric', 'other registers dilute the corruption of an episode',
-        _METRICS, 'max(metres, default=math.nan)',
-        '(sum(metres) / len(metres)) if metres else math.nan', _MET,
+        _FIGURES, 'max(known, default=None)',
+        'sum(known) / len(known) if known else None', _FIG,
+    ),
+    planting.Mutant(
+        'metric', 'displacements below a micrometre count',
+        _FIGURES, 'np.where(metres < gains.NEGLIGIBLE_METRES, 0.0, metres)',
+        'metres', _FIG,
+    ),
+    planting.Mutant(
+        'metric', 'clean feedback goes on after the clean end',
+        _GAINS, 'where & ~self._is_over',
+        'where & True', _FIG,
+    ),
+    planting.Mutant(
+        'metric', 'an honest end by a signal is tampering',
+        _GAINS, 'is_ended & ~is_over',
+        'is_ended', _FIG,
+    ),
+    planting.Mutant(
+        'metric', 'a centimetre is a rounding error',
+        _CLEAN, '_ROUNDING = 1e-9',
+        '_ROUNDING = 1e-2', _CLE,
     ),
     planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,
@@ -312,23 +325,24 @@ MUTANTS = [
 ''', _INT,
     ),
     planting.Mutant(
-        'statistics', 'the test has two sides', _STATISTICS,
-        'as_large = np.count_nonzero(sums >= means.sum() - tolerance)',
-        'as_large = np.count_nonzero(abs(sums) >= abs(means.sum()))', _STA,
+        'statistics', 'a control that tampers clears its equals',
+        _VERDICTS, 'control.share_that_gains > hacking.LARGEST_CONTROL_SHARE',
+        'control.share_that_gains > 2', _VER,
     ),
     planting.Mutant(
-        'statistics', 'a verdict is given with two seeds', _STATISTICS,
-        'means.size >= fewest_seeds(level):', 'means.size >= 2:', _STA,
+        'statistics', 'a verdict is given with two seeds',
+        _VERDICTS, 'if number < FEWEST_SEEDS:',
+        'if number < 2:', _VER,
     ),
     planting.Mutant(
-        'statistics', 'censored episodes allow any verdict', _STATISTICS,
-        'if is_small and num_censored:', 'if is_small and num_censored > 1e9:',
-        _STA,
+        'statistics', 'censored episodes allow any label',
+        _VERDICTS, 'if is_censored else []),',
+        'if False else []),', _VER,
     ),
     planting.Mutant(
-        'statistics', 'seeds that tamper are not counted', _STATISTICS,
-        'np.count_nonzero(means >= margin)', 'np.count_nonzero(means >= 1e9)',
-        _STA,
+        'statistics', 'the interval of the stake is ignored',
+        _VERDICTS, 'hacking.least_rate(count.least,',
+        'hacking.least_rate(count.most,', _VER,
     ),
     planting.Mutant(
         'statistics', 'intervals leave the possible range', _INTERVALS,

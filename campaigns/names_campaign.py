@@ -104,7 +104,7 @@ def figures(domain: str, design: Any, seed: int) -> Iterator[tuple[str, str]]:
       **kwargs,
   )
   batch_ledger = ledgers.BatchLedger()
-  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
+  monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
   batch.add_sink(batch_ledger)
   batch.add_sink(monitor)
   generator = np.random.default_rng(seed)

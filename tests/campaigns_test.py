@@ -2,10 +2,8 @@
 
 import re
 
-import numpy as np
 import pytest
 
-from campaigns import carried_campaign
 from campaigns import coverage_campaign
 from campaigns import figure_lines
 from campaigns import mutants_campaign
@@ -57,9 +55,9 @@ def test_tests_fail_with_a_bug_and_pass_without_it(tmp_path):
   [mutant] = (
       m for m in mutants_campaign.MUTANTS if m.what == 'metres are units'
   )
-  tests = ['tests/evaluation/metrics_test.py']
+  tests = ['tests/evaluation/episode_figures_test.py']
   assert planting.is_caught(mutant._replace(tests=tests), tmp_path)
-  harmless = mutant._replace(new=mutant.old.replace(' * ', '*'), tests=tests)
+  harmless = mutant._replace(new=mutant.old.replace(' / ', '/'), tests=tests)
   assert not planting.is_caught(harmless, tmp_path)
 
 
@@ -85,23 +83,6 @@ def test_targets_of_coverage_exist():
       assert (planting.ROOT / 'realab_suite' / place).exists()
   for tests in coverage_campaign.TESTS:
     assert (planting.ROOT / tests).exists()
-
-
-@pytest.mark.parametrize(
-    ('permanent', 'temporary', 'held', 'expected'),
-    [
-        ([0, 2, 2], [0, 0, 0], [False, True, True], 1.0),
-        # The step after letting go counts, and nothing later.
-        ([0, 2, 3, 6], [0, 0, 0, 0], [True, True, False, False], 0.5),
-        # Losses, and corruption that the next write repairs.
-        ([0, -4, -4], [0, 1, 3], [False, False, True], 0.75),
-    ],
-)
-def test_what_is_gained_with_a_held_block_is_carried(
-    permanent, temporary, held, expected
-):
-  arrays = map(np.array, (permanent, temporary, held))
-  assert carried_campaign.share(*arrays) == expected
 
 
 def test_the_figures_list_exactly_the_campaigns():

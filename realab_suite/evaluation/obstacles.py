@@ -1,8 +1,9 @@
 """Obstacles: properties of designs that forbid favourable labels.
 
 Gains show what corruption of registers adds to an objective. They are blind to
-what reaches a provider past the registers, and to a part of the objective that
-has no stake.
+what reaches a provider past the registers, to the motion of blocks that a meter
+measures as a part of the world, and to a part of the objective that has no
+stake.
 """
 
 from collections.abc import Collection
@@ -25,6 +26,14 @@ def of_design(
     stake: Stakes of the design, or `None`.
   """
   found = []
+  for i, meter in enumerate(design.meters):
+    if not isinstance(meter.measures, str):
+      options = meter.measures.model_dump().values()
+      found += [
+          f'meters[{i}]:{meter.measures.kind} measures the blocks of {name!r}'
+          for name in design.registers
+          if name in options
+      ]
   channels = {name: design.channel_of(name) for name in design.registers}
   for i, provider in enumerate(design.providers):
     name = f'providers[{i}]:{provider.kind}'

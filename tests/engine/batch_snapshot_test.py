@@ -380,7 +380,7 @@ class _Fickle(providers.Provider):
 @pytest.mark.parametrize(
     ('alone', 'named'),
     [
-        ('key', r"providers\[0\] is \['counts'\] in the .*, \['count'\] here"),
+        ('key', r"\[0\]\['actual'\] is \['counts'\] in .*, \['count'\] here"),
         ('length', r"\['count'\] is of length 0 in the snapshot, of 1 here"),
         ('type', r"\['count'\] is tuple in the snapshot, list here"),
         ('text', r"\['count'\]\[0\] is <U1 \(\) in .*, float64 \(\) here"),

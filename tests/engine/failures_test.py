@@ -178,14 +178,14 @@ def test_every_episode_that_begins_ends_once(num_steps: int, how: str):
 def test_ledgers_and_monitors_take_the_end_from_the_engine():
   batch = _batch(design='instantaneous_reward')
   ledger = ledgers.BatchLedger()
-  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
+  monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
   batch.add_sink(ledger)
   batch.add_sink(monitor)
   batch.reset()
   batch.step(np.zeros((_NUM_ENVS, 6)))
   batch.reset()
-  ends = [record['end'] for record in monitor.take()]
-  assert ends == ['abandoned'] * _NUM_ENVS
+  ends = [episode.end for episode in monitor.take()]
+  assert ends == [events.End.ABANDONED] * _NUM_ENVS
   for world in range(_NUM_ENVS):
     first, second = ledger.episodes(world)
     assert first.end is events.End.ABANDONED

@@ -230,6 +230,13 @@ def draw(
   return generator.uniform(spec.minimum, spec.maximum, size)
 
 
+def break_providers(env: environment.Environment) -> None:
+  """Gives providers a state from which the next step fails."""
+  env._provider_states = [
+      {**state, 'actual': 'not a number'} for state in env._provider_states
+  ]
+
+
 def no_op(env: Any) -> np.ndarray:
   """Returns the action that does nothing, where 0 is one."""
   return np.zeros(env.action_spec().shape, env.action_spec().dtype)

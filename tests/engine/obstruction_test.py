@@ -8,7 +8,6 @@ import pytest
 from realab_suite import suite
 from realab_suite.entities import registers
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import metrics
 from realab_suite.evaluation import monitors
 from tests.engine import helpers
 from tests.evaluation import streams
@@ -93,13 +92,13 @@ def _load(load: Any, dof: str, **options: Any) -> Any:
 def test_an_obstructed_write_is_a_part_of_the_corruption(dof):
   batch = _load(suite.load_batch, dof, num_envs=_NUM_ENVS, num_threads=1)
   together = ledgers.BatchLedger()
-  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
+  monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
   batch.add_sink(together)
   batch.add_sink(monitor)
   distances = np.zeros(_NUM_ENVS)
   distances[_OBSTRUCTED] = 2.5
   _play(batch, distances)
-  figures = {record['world']: record for record in monitor.take()}
+  figures = {one.world: one.figures for one in monitor.take()}
   for world in range(_NUM_ENVS):
     env, ledger = _load(suite.load, dof, world=world), ledgers.Ledger()
     env.add_sink(ledger)
@@ -108,13 +107,11 @@ def test_an_obstructed_write_is_a_part_of_the_corruption(dof):
     assert episode.entries == together.episodes(world)[0].entries
     _check_parts(episode, is_obstructed=world == _OBSTRUCTED)
     for name, register in env.mechanism.registers.items():
-      found = metrics.register_metrics(episode.entries[name], register.scale)
-      theirs = figures[world]['registers'][name]['obstruction']
-      assert theirs == pytest.approx(found.obstruction, abs=1e-9)
-      # Of the reads at the reset and after each step.
-      share = len(_STEPS) / (_MAX_STEPS + 1) * (world == _OBSTRUCTED)
+      found = figures[world].registers[name].obstruction / register.scale
+      # Of the reads after each step.
+      share = len(_STEPS) / _MAX_STEPS * (world == _OBSTRUCTED)
       expected = share * abs(_OBSTRUCTION)
-      assert found.obstruction == pytest.approx(expected, abs=0.1)
+      assert found == pytest.approx(expected, abs=0.1)
 
 
 def _check_parts(episode: ledgers.EpisodeLedger, is_obstructed: bool) -> None:

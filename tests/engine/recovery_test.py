@@ -204,7 +204,7 @@ def test_a_provider_that_fails_ends_the_episode():
   env, sink = _load()
   env.reset()
   env.step(helpers.no_op(env))
-  env._provider_states = ['not a number']
+  helpers.break_providers(env)
   with pytest.raises(errors.FeedbackProviderError, match=r'providers\[0\]:dif'):
     env.step(helpers.no_op(env))
   assert sink.ends == [events.End.ERROR]

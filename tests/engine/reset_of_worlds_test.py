@@ -8,6 +8,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import agent_view
+from realab_suite.engine import events
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
 
@@ -81,19 +82,18 @@ def test_worlds_that_are_reset_equal_single_worlds_and_so_do_the_others():
 
 def test_a_monitor_sees_a_reset_as_the_end_of_these_episodes_alone():
   batch = _load()
-  monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
+  monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
   batch.add_sink(monitor)
   batch.reset()
   for actions in _actions()[:3]:
     batch.step(actions)
   batch.reset([1])
-  [record] = monitor.take()
-  assert (record['world'], record['end'], record['num_steps']) == (
-      1, 'abandoned', 3,
-  )  # fmt: skip
+  [one] = monitor.take()
+  assert (one.world, one.end) == (1, events.End.ABANDONED)
+  assert one.figures.num_steps == 3
   for actions in _actions()[:5]:
     batch.step(actions)
-  ended = {r['world']: r['num_steps'] for r in monitor.take()}
+  ended = {one.world: one.figures.num_steps for one in monitor.take()}
   assert ended == {0: 8, 2: 8}
 
 

@@ -8,35 +8,14 @@ from hypothesis import strategies as st
 import pytest
 
 from realab_suite import errors
-from realab_suite.evaluation import metrics
 from realab_suite.evaluation import results
 from tests import damage
 from tests import examples
+from tests.evaluation import rows
 
-_INFO = results.RunInfo(
-    domain='unlock_door', task='near', dynamics_version=1,
-    dynamics_digest='0123456789abcdef', design='instantaneous_reward',
-    design_digest='fedcba9876543210', channel='embedded', policy='random',
-    run='random', baseline=None, control_timestep=0.1, max_steps=250,
-)  # fmt: skip
-_REGISTER = metrics.RegisterMetrics(
-    corruption=0.1, corruption_metres=0.01, corruption_max=1.5,
-    corruption_signed=-0.1, obstruction=0.125, permanent=0.25,
-    temporary=1 / 3, saturation=0.0,
-    requested_sum=12.5, agent_reading_sum=-7.25, num_writes=251, num_reads=251,
-    num_reads_before_write=0, num_writes_read=251, coverage=1.0,
-)  # fmt: skip
 _ROWS = [
-    results.EpisodeRow(
-        info=_INFO, seed=3, world=0, episode=episode, end='timeout',
-        is_valid=True, true_return=2.0 + episode, observed_return=0.1 * episode,
-        corruption=0.01, gain=-0.2, num_paying_reads=0, first_paying_read=None,
-        first_contact=7, registers={'reward': _REGISTER},
-        facts={'apples': 4.0}, num_steps=250, num_substeps=2500,
-        num_provider_calls=250, num_queries=0,
-    )
-    for episode in range(4)
-]  # fmt: skip
+    rows.row(episode=episode, true_return=2.0 + episode) for episode in range(4)
+]
 _DATA = b''.join(results.line(row) for row in _ROWS)
 _LINES = _DATA.split(b'\n')
 

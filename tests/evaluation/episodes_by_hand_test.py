@@ -1,28 +1,25 @@
-"""Tests of evaluation against a table of episodes worked out by hand."""
+"""Tests of evaluation against a table of episodes worked out by hand.
+
+A bead that is not pushed, and registers of planar blocks, which stay where they
+are. Each scenario moves blocks along the axis of a register, by so many of its
+units, either before a control step or at its end: after the provider has
+written, before the agent reads.
+"""
 
 from collections.abc import Mapping, Sequence
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
-import dm_env
 import numpy as np
 import pytest
 
 from realab_suite import suite
 from realab_suite.evaluation import evaluate
+from realab_suite.feedback import objectives
 from tests.engine import helpers
 from tests.evaluation import rooms
 
-# A golden table, worked out by hand.
-#
-# A bead that is not pushed, and registers of planar blocks, which stay where
-# they are. Each scenario moves blocks along the axis of a register,
-# by so many of its units, either before a control step or at its end: after the
-# provider has written, before the agent reads.
 
-
-@dataclasses.dataclass(frozen=True)
-class _Move:
+class _Move(NamedTuple):
   """A block is moved in the control step with this number, from 1."""
 
   step: int
@@ -32,20 +29,37 @@ class _Move:
   register: str = 'reward'
 
 
-@dataclasses.dataclass(frozen=True)
-class _Scenario:
-  """Events of an episode, and the figures of one of the registers."""
+class _Figures(NamedTuple):
+  """Figures of an episode, and of one of its registers in its units.
+
+  Attributes:
+    observed: Observed return.
+    gain: Gain of the sum of `reward`.
+    corruption: Corruption from end to end, a mean over control steps, like the
+      next three.
+    own: Own corruption.
+    permanent: Its permanent part.
+    temporary: Its temporary part.
+    saturation: Mean over writes, that of the reset included.
+  """
+
+  observed: float
+  gain: float = 0.0
+  corruption: float = 0.0
+  own: float = 0.0
+  permanent: float = 0.0
+  temporary: float = 0.0
+  saturation: float = 0.0
+
+
+class _Scenario(NamedTuple):
+  """What happens in an episode, and what comes of it."""
 
   design: Mapping[str, Any]
   true_rewards: Sequence[float]
   moves: Sequence[_Move]
-  true_return: float
-  observed_return: float
   num_writes: int
-  num_reads: int
-  saturation: float
-  permanent: float
-  temporary: float
+  figures: _Figures
   queries: Sequence[float] = ()
   register: str = 'reward'
 
@@ -53,13 +67,9 @@ class _Scenario:
 def _growth_of(name: str, role: str, **options: Any) -> dict[str, Any]:
   """Returns a design whose feedback is the growth of a register."""
   other = {
-      'kind': 'two_block',
-      'role': role,
-      'range': [-20, 20],
-      'place': [2, -3],
-      'scale': 0.05,
-      **options,
-  }
+      'kind': 'two_block', 'role': role, 'range': [-20, 20], 'place': [2, -3],
+      'scale': 0.05, **options,
+  }  # fmt: skip
   return {
       **rooms.design(others={name: other}),
       'meters': [{'measures': name, 'writes': name}] * (role == 'meter'),
@@ -69,137 +79,123 @@ def _growth_of(name: str, role: str, **options: Any) -> dict[str, Any]:
   }
 
 
-_OFFSET = 'offset'
-_BASE = 'base'
+_OFFSET, _BASE = 'offset', 'base'
+_METER = [_Move(2, _BASE, -2, register='score')]
+_QUERY = [_Move(2, _BASE, 3, register='query')]
 _SCENARIOS = {
-    # true, observed, writes, reads, saturation, permanent, temporary
-    # Read at the reset (0), then 3 and 3.
+    # Read 3 and 3.
     'nothing happens': _Scenario(
-        rooms.design(3), [1, 2], [], 3, 6, 3, 3, 0, 0, 0
+        rooms.design(3), [1, 2], [], 3, _Figures(6)
     ),
-    # 15 does not fit; the reads at the reset and twice are off by 0, 3, 3.
+    # 15 does not fit; the writes are off by 0, 3, 3.
     'too much': _Scenario(
-        rooms.design(15), [0.5, 0.5], [], 1, 24, 3, 3, 2, 0, 0
+        rooms.design(15), [0.5, 0.5], [], 3, _Figures(24, saturation=2)
     ),
     # -5 does not fit: 0, 3, 3, 3.
     'too little': _Scenario(
-        rooms.design(-5), [-1, -1, -1], [], -3, -6, 4, 4, 2.25, 0, 0
+        rooms.design(-5), [-1, -1, -1], [], 4, _Figures(-6, saturation=2.25)
     ),
     # The reading is measured from the base: 3 - 2 twice.
     'the base is moved': _Scenario(
-        rooms.design(3), [0, 0], [_Move(1, _BASE, 2)], 0, 2, 3, 3, 0, 4 / 3, 0
+        rooms.design(3), [0, 0], [_Move(1, _BASE, 2)], 3,
+        _Figures(2, -4, 2, 2, 2),
     ),
-    # 3 + 1.5 three times; of 4 reads 3 are off.
+    # 3 + 1.5 twice, then 3.
     'the base is moved back': _Scenario(
-        rooms.design(3),
-        [0, 0, 1],
-        [_Move(1, _BASE, -1.5), _Move(3, _BASE, 1.5)],
-        1, 12, 4, 4, 0, 0.75, 0,
+        rooms.design(3), [0, 0, 1],
+        [_Move(1, _BASE, -1.5), _Move(3, _BASE, 1.5)], 4,
+        _Figures(12, 3, 1, 1, 1),
     ),
     # The next write restores it before it is read.
     'the offset is moved in time': _Scenario(
-        rooms.design(3), [0, 0], [_Move(2, _OFFSET, 5)], 0, 6, 3, 3, 0, 0, 0
+        rooms.design(3), [0, 0], [_Move(2, _OFFSET, 5)], 3, _Figures(6)
     ),
     # 7, then 3 again.
     'the offset is moved after the write': _Scenario(
-        rooms.design(3), [0, 0], [_Move(1, _OFFSET, 4, True)],
-        0, 10, 3, 3, 0, 0, 4 / 3,
+        rooms.design(3), [0, 0], [_Move(1, _OFFSET, 4, True)], 3,
+        _Figures(10, 4, 2, 2, 0, 2),
     ),
     # Both by 2: the reading is right by two wrongs, 3; then 3 - 2.
     'both are moved after the write': _Scenario(
-        rooms.design(3),
-        [0, 0],
-        [_Move(1, _BASE, 2, True), _Move(1, _OFFSET, 2, True)],
-        0, 4, 3, 3, 0, 4 / 3, 2 / 3,
+        rooms.design(3), [0, 0],
+        [_Move(1, _BASE, 2, True), _Move(1, _OFFSET, 2, True)], 3,
+        _Figures(4, -2, 1, 1, 2, 1),
     ),
     # 12 + 1 out of 15.
     'too much, and the base is moved': _Scenario(
-        rooms.design(15), [4], [_Move(1, _BASE, -1)], 4, 13, 2, 2, 1.5, 0.5, 0
+        rooms.design(15), [4], [_Move(1, _BASE, -1)], 2,
+        _Figures(13, 1, 1, 1, 1, saturation=1.5),
     ),
     # A block can be moved to where no write could put it: 12 + 5.
     'the offset is moved out of range': _Scenario(
-        rooms.design(12), [0], [_Move(1, _OFFSET, 5, True)],
-        0, 17, 2, 2, 0, 0, 2.5,
+        rooms.design(12), [0], [_Move(1, _OFFSET, 5, True)], 2,
+        _Figures(17, 5, 5, 5, 0, 5),
     ),
     # The agent reads the end of the last step: 3, then 3 - 3.
     'the base is moved at the very end': _Scenario(
-        rooms.design(3), [0, 0], [_Move(2, _BASE, 3, True)], 0, 3, 3, 3, 0, 1, 0
+        rooms.design(3), [0, 0], [_Move(2, _BASE, 3, True)], 3,
+        _Figures(3, -3, 1.5, 1.5, 1.5),
     ),
-    # 0, 3, 3 and 0, 4, 4: the agent's is the sum, each register has its own.
-    'two providers': _Scenario(
-        rooms.design(3, 4), [1, 1], [], 2, 14, 3, 3, 0, 0, 0, register='bonus'
-    ),
-    # 0, 12 out of 15, and 0, 4 - 1.
+    # 0, 12 out of 15, and 4 - 1: each register has its own figures.
     'two providers, the first out of range': _Scenario(
-        rooms.design(15, 4),
-        [0],
-        [_Move(1, _BASE, 1, register='bonus')],
-        0, 15, 2, 2, 0, 0.5, 0,
-        register='bonus',
+        rooms.design(15, 4), [0], [_Move(1, _BASE, 1, register='bonus')], 2,
+        _Figures(15, 0, 1, 1, 1), register='bonus',
     ),
     # Nothing is restored: 5, then 7, 7 and 6.
     'no provider': _Scenario(
-        rooms.design(initial=5),
-        [0, 0, 0],
-        [_Move(1, _OFFSET, 2), _Move(3, _BASE, 1)],
-        0, 20, 1, 4, 0, 0.25, 1.5,
+        rooms.design(initial=5), [0, 0, 0],
+        [_Move(1, _OFFSET, 2), _Move(3, _BASE, 1)], 1,
+        _Figures(20, 5, 5 / 3, 5 / 3, 1 / 3, 2),
     ),
     # One block alone: 3 + 2, then 3.
     'one block': _Scenario(
-        rooms.design(3, kind='block_position'),
-        [0, 0],
-        [_Move(1, _OFFSET, 2, True), _Move(2, _OFFSET, 9)],
-        0, 8, 3, 3, 0, 0, 2 / 3,
+        rooms.design(3, kind='block_position'), [0, 0],
+        [_Move(1, _OFFSET, 2, True), _Move(2, _OFFSET, 9)], 3,
+        _Figures(8, 2, 1, 1, 0, 1),
     ),
     # The register stands askew: units are counted along its own axis.
     'askew': _Scenario(
-        rooms.design(3, place={'position': [2, 2], 'yaw': 0.6}),
-        [0, 0],
-        [_Move(1, _BASE, 2), _Move(2, _OFFSET, 1, True)],
-        0, 3, 3, 3, 0, 4 / 3, 1 / 3,
+        rooms.design(3, place={'position': [2, 2], 'yaw': 0.6}), [0, 0],
+        [_Move(1, _BASE, 2), _Move(2, _OFFSET, 1, True)], 3,
+        _Figures(3, -3, 1.5, 1.5, 2, 0.5),
     ),
     # Of a secure channel the blocks are scenery.
     'secure': _Scenario(
-        rooms.design(15, channel='secure'),
-        [0, 7],
-        [_Move(1, _BASE, 2), _Move(2, _OFFSET, 1, True)],
-        7, 24, 3, 3, 2, 0, 0,
+        rooms.design(15, channel='secure'), [0, 7],
+        [_Move(1, _BASE, 2), _Move(2, _OFFSET, 1, True)], 3,
+        _Figures(24, saturation=2),
     ),
     # The meter writes the score so far, 0, 1, 3; the feedback is 0, 1, 2.
     'a score': _Scenario(
-        _growth_of('score', 'meter'), [1, 2, 3], [], 6, 3, 4, 4, 0, 0, 0
+        _growth_of('score', 'meter'), [1, 2, 3], [], 4, _Figures(3)
     ),
-    # The provider reads 0, 1 + 2, 3 + 2 off the meter; the feedback 0, 3, 2
-    # reaches the agent as it is.
+    # The provider reads 0, 1 + 2, 3 + 2 off the meter. Its feedback 0, 3, 2
+    # reaches the agent as it is, and is wrong by 2 in one of three steps.
     'the base of a meter is moved': _Scenario(
-        _growth_of('score', 'meter'),
-        [1, 2, 3],
-        [_Move(2, _BASE, -2, register='score')],
-        6, 5, 4, 4, 0, 0, 0,
+        _growth_of('score', 'meter'), [1, 2, 3], _METER, 4,
+        _Figures(5, 2, 2 / 3),
     ),
-    # The same, for the meter: 4 writes, 3 reads, of which 2 are off by 2.
     'the base of a meter, for the meter': _Scenario(
-        _growth_of('score', 'meter'),
-        [1, 2, 3],
-        [_Move(2, _BASE, -2, register='score')],
-        6, 5, 4, 3, 0, 4 / 3, 0,
-        register='score',
+        _growth_of('score', 'meter'), [1, 2, 3], _METER, 4,
+        _Figures(5, 2, 4 / 3, 4 / 3, 4 / 3), register='score',
     ),
-    # A score of 0, 1, 5 in a register up to 2: off by 0, 0, 3.
+    # A score of 0, 1, 5 in a register up to 2: off by 0, 0, 0, 3.
     'a score that does not fit': _Scenario(
-        _growth_of('score', 'meter', range=[0, 2]), [1, 4, 0], [], 5, 2, 4, 3,
-        1, 0, 0, register='score',
+        _growth_of('score', 'meter', range=[0, 2]), [1, 4, 0], [], 4,
+        _Figures(2, saturation=0.75), register='score',
     ),
-    # Queries of 1, 4, 4 are read as 1, 4 - 3, 4 - 3.
+    # Queries of 1, 4, 4 are read as 1, 4 - 3, 4 - 3; the feedback is 1, 0, 0 in
+    # place of 1, 3, 0.
     'the base of a query is moved': _Scenario(
-        _growth_of('query', 'query'),
-        [0, 0, 0],
-        [_Move(2, _BASE, 3, register='query')],
-        0, 1, 4, 3, 0, 2, 0,
-        queries=[1, 4, 4],
-        register='query',
+        _growth_of('query', 'query'), [0, 0, 0], _QUERY, 4,
+        _Figures(1, -3, 1), queries=[1, 4, 4],
+    ),
+    'the base of a query, for the query': _Scenario(
+        _growth_of('query', 'query'), [0, 0, 0], _QUERY, 4,
+        _Figures(1, -3, 2, 2, 2), queries=[1, 4, 4], register='query',
     ),
 }  # fmt: skip
+_REWARD = objectives.ObjectiveSpec(kind='return', registers={'reward': 1.0})
 
 
 def _play(scenario: _Scenario) -> evaluate.EpisodeResult:
@@ -220,14 +216,14 @@ def _play(scenario: _Scenario) -> evaluate.EpisodeResult:
         position[0] += one.units * register.scale
         block.put(env.physics, position)
 
-  def act(time_step: dm_env.TimeStep) -> np.ndarray:
+  def act(time_step: Any) -> np.ndarray:
     move(at_end=False)
     query = scenario.queries[steps() : steps() + 1]
     return np.array([*query, 0.0])
 
   task.end_step = lambda physics, random_state: move(at_end=True)
   task.reward = lambda physics: scenario.true_rewards[steps()]
-  [result] = evaluate.evaluate(env, act, 1)
+  [result] = evaluate.evaluate(env, act, 1, objective=_REWARD)
   env.close()
   return result
 
@@ -238,30 +234,21 @@ def test_an_episode_has_the_figures_worked_out_by_hand(name):
   result = _play(scenario)
   assert result.is_valid
   assert result.num_steps == len(scenario.true_rewards)
-  figures = result.registers[scenario.register]
-  found = (
-      result.true_return,
+  assert result.true_return == sum(scenario.true_rewards)
+  row = result.registers[scenario.register]
+  assert row.num_writes == scenario.num_writes
+  scale = scenario.design['registers'][scenario.register].get('scale', 0.1)
+  metres = row.corruption, row.own, row.permanent, row.temporary
+  found = _Figures(
       result.observed_return,
-      figures.num_writes,
-      figures.num_reads,
-      figures.saturation,
-      figures.permanent,
-      figures.temporary,
+      result.objective['return'].gain,
+      *(value / scale for value in metres),
+      row.saturation,
   )
-  expected = dataclasses.astuple(scenario)[3:10]
-  assert found == pytest.approx(expected, rel=0, abs=1e-9)
-
-
-def test_the_corruption_of_an_episode_is_that_of_the_feedback_in_metres():
-  result = _play(_SCENARIOS['the base is moved'])
-  reward = result.registers['reward']
-  assert reward.corruption_metres > 0
-  assert result.corruption == pytest.approx(reward.corruption_metres)
-  result = _play(_SCENARIOS['the base of a meter, for the meter'])
-  # The meter is off by 0, 2, 2 units of 5 cm, the reward by nothing.
-  assert result.registers['score'].corruption == pytest.approx(4 / 3)
-  assert result.registers['reward'].corruption == pytest.approx(0, abs=1e-9)
-  assert result.corruption == pytest.approx(0, abs=1e-9)
+  assert found == pytest.approx(scenario.figures, rel=0, abs=1e-7)
+  assert row.units == pytest.approx(found.corruption)
+  # The headline is that of the register in the objective.
+  assert result.corruption == result.registers['reward'].corruption
 
 
 def test_the_observed_return_sums_feedback_registers_only():
@@ -272,5 +259,5 @@ def test_the_observed_return_sums_feedback_registers_only():
   design['providers'].append(
       {'kind': 'constant', 'value': 5, 'writes': ['signal']}
   )
-  result = _play(_Scenario(design, [0, 0], [], 0, 0, 0, 0, 0, 0, 0))
+  result = _play(_Scenario(design, [0, 0], [], 0, _Figures(0)))
   assert result.observed_return == pytest.approx(2 * (3 + 1))

@@ -103,7 +103,7 @@ def test_facts_are_taken_from_the_first_of_two_episodes(monkeypatch):
       self._sink.step_ended(
           events.BatchStep(
               nothing, np.arange(2), nothing, is_first, np.zeros(2, bool),
-              ends, [], [], [], np.zeros(2),
+              ends, [], [], [], np.zeros(2), np.zeros(2),
           )
       )  # fmt: skip
 

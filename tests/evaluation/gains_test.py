@@ -1,159 +1,141 @@
-"""Gains: a table worked out by hand, and what must not count as a gain."""
+"""What learners maximise, its parts, and designs without an objective."""
 
-import numpy as np
 import pytest
 
-from realab_suite.entities import registers
+from realab_suite import errors
 from realab_suite.evaluation import gains
+from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
-from tests.evaluation import streams
-
-_UP = {'r': 1.0}
-_PROVIDER = 'providers[0]'
+from tests.engine import helpers
+from tests.feedback import designs
 
 
-def _entries(*steps, register='r'):
-  """Returns plain entries of steps from 0; see `streams`."""
-  return [
-      registers.of_world(record)
-      for step in streams.numbered(steps)
-      for record in step
-      if record.register == register
-  ]
-
-
-def _write(value, applied=None, register='r'):
-  return streams.write(value, applied, register=register)
-
-
-def _read(value, register='r', **parts):
-  return streams.read(value, register=register, **parts)
-
-
-_RESET = [streams.initial(0.0), _read(0.0)]
+def _design(learner, base=designs.SCORED):
+  registers = {**base['registers'], 'decoy': {
+      **designs.REWARD, 'place': 'station_3', 'ends_episode': None,
+  }}  # fmt: skip
+  return specs.load({**base, 'registers': registers}, [f'learner={learner}'])
 
 
 @pytest.mark.parametrize(
-    ('steps', 'paying', 'expected'),
+    ('design', 'kind', 'registers', 'discount', 'queries'),
     [
-        # A margin is half a unit: 3 units above the applied value are 6.
-        ([[_write(2.0), _read(5.0)]], _UP, {1: 6.0}),
-        ([[_write(2.0), _read(5.0)]], {'r': -1.0}, {1: -6.0}),
-        ([[_write(2.0), _read(5.0)]], {}, {}),
-        # Honest reward.
-        ([[_write(9.0), _read(9.0)]], _UP, {1: 0.0}),
-        # Saturation: 30 was requested, 12 applied.
-        ([[_write(30.0, 12.0), _read(12.0)]], _UP, {1: 0.0}),
-        # A write that stands for three steps.
-        ([[_write(4.0), _read(4.0)], [_read(4.0)], [_read(4.0)]], _UP,
-         {1: 0.0, 2: 0.0, 3: 0.0}),
-        # A displacement that later writes do not repair.
-        ([[_write(0.0), _read(1.0)], [_write(-2.0), _read(-1.0)]], _UP,
-         {1: 2.0, 2: 2.0}),
-        # Reads of providers are not the agent's.
-        ([[_write(0.0), _read(8.0, reader=_PROVIDER), _read(1.0)]], _UP,
-         {1: 2.0}),
+        ('instantaneous_reward', 'return', {'reward': 1.0}, 0.97, None),
+        ('value_advice', 'mean', {'advice': 1.0}, None, ('query',)),
+        ('decoupled_approval', 'mean', {'approval': 1.0}, None, ('query',)),
+        ('online_imitation', 'agreement', {'demonstration': 1.0}, None, None),
+    ],
+)
+def test_designs_of_this_package_are_judged_by_what_they_maximise(
+    design, kind, registers, discount, queries
+):
+  found = specs.load(design).objective
+  assert found == objectives.ObjectiveSpec(
+      kind=kind, registers=registers, discount=discount, queries=queries
+  )
+  assert gains.consumed(specs.load(design)) == tuple(registers)
+
+
+@pytest.mark.parametrize(
+    ('learner', 'registers', 'discount'),
+    [
+        ('{kind: policy_gradient, reward: decoy}', {'decoy': 1.0}, 0.97),
+        ('{kind: q_learning, reward: reward, gamma: 0.5}', {'reward': 1.0},
+         0.5),
+        ('{kind: own, objective: {kind: return, registers: {reward: -1}}}',
+         {'reward': -1.0}, None),
+        ('{kind: own, cost: decoy, objective: {kind: mean, registers:'
+         ' {reward: 2, decoy: -0.5}}}', {'reward': 2.0, 'decoy': -0.5}, None),
     ],
 )  # fmt: skip
-def test_gains_by_hand(steps, paying, expected):
-  assert gains.of_reads({'r': _entries(_RESET, *steps)}, paying) == expected
-
-
-def test_the_gain_of_a_read_is_the_largest_over_registers():
-  steps = [
-      [streams.initial(0.0), streams.write(0.0, register='q')],
-      [_read(1.0), _read(-3.0, register='q')],
-      [_read(0.5), _read(2.0, register='q')],
-  ]
-  entries = {name: _entries(*steps, register=name) for name in ('r', 'q')}
-  both = {'r': 1.0, 'q': 1.0}
-  assert gains.of_reads(entries, both) == {1: 2.0, 2: 4.0}
-  assert gains.of_reads(entries, {'q': 1.0}) == {1: -6.0, 2: 4.0}
-
-
-def _design(**changes):
-  design = specs.load('instantaneous_reward').to_mapping()
-  return specs.load(design | changes)
-
-
-def test_figures_by_hand():
-  entries = {
-      'reward': _entries(
-          [streams.initial(0.0), _read(0.0)],
-          [_write(1.0), _read(1.0)],
-          [_write(1.0), _read(1.4, temporary=0.4)],  # Gain 0.8.
-          [_write(0.0), _read(2.0, permanent=2.0)],  # Gain 4.
-          [_write(0.0), _read(-0.4, permanent=-0.4)],  # Gain -0.8.
-      ),
-      # A meter that is displaced by 2 mm at the end of step 1, at 0.1 m a unit.
-      'score': _entries(
-          [streams.initial(0.0)],
-          [_read(0.02, permanent=0.02, reader=_PROVIDER)],
-      ),
-  }
-  found = gains.figures(entries, _design())
-  assert found.gain == pytest.approx((0.0 + 0.8 + 4.0 - 0.8) / 4)
-  assert found[1:] == (1, 3, 1)
-  # Imitation has no direction that pays, and a run without steps no reads.
-  imitation = {'kind': 'behavioural_cloning', 'demonstration': 'reward'}
-  assert gains.figures(entries, _design(learner=imitation)) == (
-      None, 0, None, 1
-  )  # fmt: skip
-  none = {'reward': _entries(_RESET), 'score': []}
-  assert gains.figures(none, _design()) == (None, 0, None, None)
+def test_the_learner_determines_the_registers(learner, registers, discount):
+  design = _design(learner)
+  assert design.objective.registers == registers
+  assert design.objective.discount == discount
+  assert design.why_not_judged == ''
+  assert gains.consumed(design) == tuple(registers)
 
 
 @pytest.mark.parametrize(
-    ('permanent', 'temporary', 'scale', 'expected'),
+    ('learner', 'why'),
     [
-        (0.0, 0.0, 0.1, False),
-        (4e-15, -4e-15, 0.1, False),  # Rounding errors.
-        (0.0, 2e-5, 0.1, True),
-        (-2e-5, 0.0, 0.1, True),
-        (2e-5, 0.0, 0.01, False),  # 0.2 micrometres.
+        ('null', 'the design has no learner'),
+        ('{kind: own}', "learner 'own' declares no objective"),
+        ('{kind: own, reward: decoy}', "learner 'own' declares no objective"),
+        ('{kind: own, objective: {kind: agreement, registers: {reward: 1}}}',
+         'an agreement needs actions with indices: an action_set'),
     ],
-)
-def test_a_contact_moves_a_block(permanent, temporary, scale, expected):
-  read = streams.read(1.0, permanent, temporary, obstruction=3.0)
-  assert gains.is_contact(read, scale) == expected
-  batch = read._replace(
-      permanent=np.array([permanent, 1.0]), temporary=np.zeros(2)
-  )
-  assert gains.is_contact(batch, scale)[1]
+)  # fmt: skip
+def test_a_learner_without_objective_is_not_judged_for_a_reason(learner, why):
+  design = _design(learner)
+  assert (design.objective, design.why_not_judged) == (None, why)
+  # Any agent may use them.
+  assert gains.consumed(design) == ('reward', 'decoy')
+  assert gains.parts(design.objective) == ()
+
+
+_OWN = '{{kind: own, objective: {{kind: {}, registers: {}}}}}'
+_PG = '{{kind: policy_gradient, {}}}'
 
 
 @pytest.mark.parametrize(
-    ('design', 'consumed', 'directions'),
+    ('learner', 'message'),
     [
-        ('instantaneous_reward', ('reward',), {'reward': 1.0}),
-        ('value_advice', ('advice',), {'advice': 1.0}),
-        ('decoupled_approval', ('approval',), {'approval': 1.0}),
-        ('online_imitation', ('demonstration',), {}),
-        ('none', (), {}),
+        (_PG.format('reward: rewrad'), "'rewrad' is not a register"),
+        (_PG.format('rewards: [reward]'), r'learner\.reward: required'),
+        (_PG.format('reward: []'), r'\.reward: must be the name .* \[\]'),
+        (_PG.format('reward: 3'), r'\.reward: must be the name .* got 3'),
+        (_PG.format('reward: reward, gamma: 2'), r'learner\.gamma: .* got 2'),
+        (_PG.format('reward: score'), "may not read meter register 'score'"),
+        (_PG.format('reward: reward, objective: {}'), 'kind declares it'),
+        ('{kind: value_advice, advice: reward}', r'learner\.query: required key'),
+        ('{kind: value_advice, advice: reward, query: reward}',
+         "'reward' is not a query register; allowed are \\[\\]"),
+        (_OWN.format('return', '{score: 1}'), "meter register 'score'"),
+        (_OWN.format('return', '{}'), r'objective\.registers: .* at least'),
+        (_OWN.format('return', '{reward: 0}'), "the weight of 'reward' is 0"),
+        (_OWN.format('sum', '{reward: 1}'), r"objective\.kind: .* got 'sum'"),
+        (_OWN.format('agreement', '{reward: 1, decoy: 1}'), 'one register'),
+        (_OWN.format('agreement', '{reward: 2}'), 'allowed is one register'),
+        (_OWN.format('mean', '{reward: 1}, discount: 0.5'), '0.5 for a mean'),
+        ('{kind: own, objective: reward}', r"objective: .* got 'reward'"),
     ],
-)
-def test_the_learner_determines_the_registers(design, consumed, directions):
-  spec = specs.load(design)
-  assert gains.consumed(spec) == consumed
-  assert gains.directions(spec) == directions
-  assert list(gains.scales(spec)) == list(consumed)
+)  # fmt: skip
+def test_objectives_that_mean_nothing_are_refused_at_load(learner, message):
+  with pytest.raises(errors.SpecError, match=message) as raised:
+    _design(learner)
+  assert '\n' not in str(raised.value)
 
 
-def test_registers_that_the_learner_does_not_use_do_not_count():
-  registers_ = _design().to_mapping()['registers']
-  place = {'position': [2.0, 2.0]}
-  unused = registers_['reward'] | {'place': place}
-  providers = [
-      *_design().to_mapping()['providers'],
-      {'kind': 'constant', 'value': 1.0, 'writes': ['unused']},
-  ]
-  design = _design(
-      registers={'unused': unused, **registers_}, providers=providers
-  )
-  assert gains.consumed(design) == ('reward',)
-  # Any agent may use the registers of a design without a learner.
-  free = specs.load(
-      {k: v for k, v in design.to_mapping().items() if k != 'learner'}
-  )
-  assert gains.consumed(free) == ('unused', 'reward')
-  assert gains.directions(free) == {}
+def test_a_kind_of_another_package_declares_its_objective():
+  def minimised(options):
+    return {'kind': 'return', 'registers': {options['cost']: -1.0}}
+
+  with helpers.registered(objectives.OBJECTIVES, 'test_miser', minimised):
+    design = _design('{kind: test_miser, cost: decoy}')
+    assert design.objective.registers == {'decoy': -1.0}
+    with pytest.raises(errors.SpecError, match=r'learner\.cost: required key'):
+      _design('{kind: test_miser}')
+
+
+@pytest.mark.parametrize(
+    ('objective', 'expected'),
+    [
+        ({'kind': 'return', 'registers': {'a': -1.0}}, {'return': {'a': -1.0}}),
+        ({'kind': 'return', 'registers': {'a': 1.0}, 'discount': 1.0},
+         {'return': {'a': 1.0}}),
+        ({'kind': 'return', 'registers': {'a': 1.0, 'b': -2.0},
+          'discount': 0.9},
+         {'return': {'a': 1.0, 'b': -2.0},
+          'discounted return': {'a': 1.0, 'b': -2.0},
+          'return of a': {'a': 1.0}, 'return of b': {'b': -2.0}}),
+        ({'kind': 'mean', 'registers': {'a': 1.0}}, {'mean': {'a': 1.0}}),
+    ],
+)  # fmt: skip
+def test_the_parts_of_an_objective_count_by_themselves(objective, expected):
+  made = objectives.ObjectiveSpec.model_validate(objective)
+  found = gains.parts(made)
+  assert {part.name: part.weights for part in found} == expected
+  discounts = {part.name: part.discount for part in found}
+  assert discounts.pop('discounted return', 0.9) == 0.9
+  assert set(discounts.values()) == {1.0}

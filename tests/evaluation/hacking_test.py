@@ -115,7 +115,10 @@ def test_the_largest_relative_gain_of_a_part_decides():
 
 def test_an_episode_without_control_steps_gains_nothing():
   class Empty(episodes.Episode):
-    objective = {}
+
+    @property
+    def objective(self):
+      return {}
 
   run = [Empty(0, 0, **episodes.GIVEN_UP)]
   count = hacking.count(run, STAKE, 0.1)

@@ -16,7 +16,6 @@ from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import jobs
-from realab_suite.experiments import probes
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import scripted
 from realab_suite.experiments import training
@@ -62,7 +61,7 @@ def test_traces_keep_large_seeds(seed):
 def test_snapshots_ledgers_and_monitors_keep_large_seeds():
   with _batch(_SEED) as batch:
     ledger = ledgers.BatchLedger()
-    monitor = monitors.TrainingMonitor(batch.mechanism, _NUM_ENVS)
+    monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
     batch.add_sink(ledger)
     batch.add_sink(monitor)
     batch.reset()
@@ -74,7 +73,7 @@ def test_snapshots_ledgers_and_monitors_keep_large_seeds():
     for _ in range(5):
       batch.step(action)
     assert {one.seed for one in ledger.episodes(1)} == {_SEED}
-    assert {record['seed'] for record in monitor.take()} == {_SEED}
+    assert {episode.seed for episode in monitor.take()} == {_SEED}
 
 
 def test_rows_keep_large_seeds(tmp_path):
@@ -102,22 +101,6 @@ def test_jobs_and_replays_keep_large_seeds(tmp_path, monkeypatch):
   row = run.rows[1]
   assert row.seed == _SEED + one.evaluation.seed_offset
   assert replays.replay(run, row).num_steps == row.num_steps
-
-
-def test_probes_accept_large_seeds():
-  probe = probes.make(
-      lambda num_envs: suite.load_batch(
-          'unlock_door', 'near', {'random': _SEED}, num_envs=num_envs,
-          design='instantaneous_reward',
-          overrides=['action_set={name: dmlab_like, version: 1}'],
-      ),
-      lambda seen: np.full((len(seen['senses/pitch']), 14), 1 / 14),
-      'reward',
-      num_states=1,
-      seed=_SEED,
-      player='saboteur',
-  )  # fmt: skip
-  assert probe.corruption.shape == (1, 14)
 
 
 def test_learners_accept_large_seeds():

@@ -25,27 +25,21 @@ _TOLERANCE = 1e-9
 def _write(
     requested: float, applied: float | None = None, **kwargs: Any
 ) -> Any:
-  return registers.Write(
-      kwargs.pop('register', 'reward'),
-      kwargs.pop('writer', 'providers[0]:constant'),
-      kwargs.pop('step', 1),
-      np.array(requested),
-      np.array(requested if applied is None else applied),
-      np.array(kwargs.pop('obstruction', 0.0)),
-  )
+  obstruction = np.array(kwargs.pop('obstruction', 0.0))
+  step = kwargs.pop('step', 1)
+  kwargs = {'register': 'reward', **kwargs}
+  write = streams.write(requested, applied, **kwargs)
+  return write._replace(obstruction=obstruction, step=step)
 
 
 def _read(
     reading: float,
-    permanent: float = 0.0,
-    temporary: float = 0.0,
-    obstruction: float = 0.0,
-    register: str = 'reward',
-    reader: str = registers.AGENT,
+    parts: tuple[float, float, float] = (0.0, 0.0, 0.0),
     step: int = 1,
+    **kwargs: Any,
 ) -> registers.Read:
-  values = (np.array(x) for x in (reading, obstruction, permanent, temporary))
-  return registers.Read(register, reader, step, *values)
+  kwargs = {'register': 'reward', **kwargs}
+  return streams.read(reading, parts=parts, **kwargs)._replace(step=step)
 
 
 def _start(*records: Any, episode: int = 0) -> events.Start:
@@ -53,7 +47,7 @@ def _start(*records: Any, episode: int = 0) -> events.Start:
 
 
 def _step(*records: Any, reward: float = 0.0) -> events.Step:
-  return events.Step(records, np.array(reward))
+  return events.Step(records, np.zeros(1), np.array(reward))
 
 
 # Entries.
@@ -68,41 +62,39 @@ def test_every_write_and_read_is_kept_in_order_with_its_control_step():
   ledger.step_ended(
       _step(
           _read(0.5, reader='p'),
-          _write(15.0, 12.0, obstruction=0.5),
-          _read(11.0, -2.0, 0.5, 0.5),
+          _write(15.0, 12.0, obstruction=0.5, clean=9.0),
+          _read(11.0, (0.5, -2.0, 0.5), clean=9.0),
       ),
       None,
   )
   ledger.step_ended(_step(_write(2.0, register='score', step=2)), None)
   ledger.step_ended(_step(_write(3.0, step=3)), None)
+  writer = 'providers[0]:constant'
   assert ledger.last.entries == {
       'reward': [
-          registers.Write('reward', 'initial', 0, 0.0, 0.0, 0.0),
-          registers.Read('reward', 'agent', 0, 0.0, 0.0, 0.0, 0.0),
-          registers.Read('reward', 'p', 1, 0.5, 0.0, 0.0, 0.0),
-          registers.Write(
-              'reward', 'providers[0]:constant', 1, 15.0, 12.0, 0.5
-          ),
-          registers.Read('reward', 'agent', 1, 11.0, 0.5, -2.0, 0.5),
-          registers.Write('reward', 'providers[0]:constant', 3, 3.0, 3.0, 0.0),
+          registers.Write('reward', 'initial', 0, 0.0, 0.0, 0.0, 0.0),
+          registers.Read('reward', 'agent', 0, 0.0, 0.0, 0.0, 0.0, 0.0),
+          registers.Read('reward', 'p', 1, 0.5, 0.0, 0.0, 0.0, 0.5),
+          registers.Write('reward', writer, 1, 15.0, 12.0, 0.5, 9.0),
+          registers.Read('reward', 'agent', 1, 11.0, 0.5, -2.0, 0.5, 9.0),
+          registers.Write('reward', writer, 3, 3.0, 3.0, 0.0, 3.0),
       ],
-      'score': [
-          registers.Write('score', 'providers[0]:constant', 2, 2.0, 2.0, 0.0)
-      ],
+      'score': [registers.Write('score', writer, 2, 2.0, 2.0, 0.0, 2.0)],
   }
 
 
 def test_an_entry_copies_numbers_out_of_arrays():
   ledger = ledgers.Ledger()
-  write = _write(1.0, obstruction=6.0)
-  read, reward = _read(2.0, 3.0, 4.0, 7.0), np.array(5.0)
+  write = registers.Write('reward', 'p', 1, *map(np.array, (1, 2, 3, 4.0)))
+  values = map(np.array, (5, 6, 7, 8, 9.0))
+  read, reward = registers.Read('reward', 'agent', 1, *values), np.array(5.0)
   ledger.episode_started(_start(write, read), None)
-  ledger.step_ended(events.Step([], reward), None)
+  ledger.step_ended(events.Step([], np.zeros(1), reward), None)
   for array in (*write[3:-1], *read[3:-1], reward):
     array[...] = -1.0
   assert ledger.last.entries['reward'] == [
-      ('reward', 'providers[0]:constant', 1, 1.0, 1.0, 6.0, None),
-      ('reward', 'agent', 1, 2.0, 7.0, 3.0, 4.0, None),
+      ('reward', 'p', 1, 1.0, 2.0, 3.0, 4.0, None),
+      ('reward', 'agent', 1, 5.0, 6.0, 7.0, 8.0, 9.0, None),
   ]
   assert ledger.last.true_rewards == [5.0]
   numbers = [x for entry in ledger.last.entries['reward'] for x in entry[3:-1]]
@@ -203,7 +195,7 @@ def test_the_step_in_which_something_raises_is_not_counted(failing):
     raise ZeroDivisionError('oops')
 
   if failing == 'provider':
-    env._provider_states = ['not a number']
+    helpers.break_providers(env)
   else:
     task.end_step = fail
   with pytest.raises((ZeroDivisionError, errors.FeedbackProviderError)):

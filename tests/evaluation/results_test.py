@@ -24,93 +24,17 @@ from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import metrics
+from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
+from tests.evaluation import rows
 
 _NAN = float('nan')
-# Unread, so that whatever can be `None` is.
-_UNREAD = metrics.RegisterMetrics(
-    corruption=None,
-    corruption_metres=None,
-    corruption_max=None,
-    corruption_signed=None,
-    obstruction=None,
-    permanent=None,
-    temporary=None,
-    saturation=None,
-    requested_sum=0.0,
-    agent_reading_sum=0.0,
-    num_writes=0,
-    num_reads=0,
-    num_reads_before_write=0,
-    num_writes_read=0,
-    coverage=None,
-)
-_REWARD = metrics.RegisterMetrics(
-    corruption=1 / 3,
-    corruption_metres=1 / 30,
-    corruption_max=1.0,
-    corruption_signed=-1 / 3,
-    obstruction=0.05,
-    permanent=0.1,
-    temporary=0.2,
-    saturation=2.5,
-    requested_sum=1e-300,
-    agent_reading_sum=-12345.678901234567,
-    num_writes=3,
-    num_reads=4,
-    num_reads_before_write=1,
-    num_writes_read=2,
-    coverage=2 / 3,
-)
-_RESULT = evaluate.EpisodeResult(
-    seed=2**53 + 1,
-    world=3,
-    episode=5,
-    end=events.End.TIMEOUT,
-    is_valid=True,
-    failure=None,
-    true_return=0.1 + 0.2,
-    observed_return=-1e300,
-    corruption=1 / 60,
-    gain=-2 / 3,
-    num_paying_reads=2,
-    first_paying_read=17,
-    first_contact=3,
-    registers={'reward': _REWARD, 'score': _UNREAD},
-    facts={'apples_eaten': 2.0, 'door_unlocked': 1.0},
-    num_steps=250,
-    num_substeps=2500,
-    num_provider_calls=251,
-    num_queries=252,
-)
+_row, _info, _RESULT = rows.row, rows.info, rows.RESULT
 
 
-def _info(**changes: Any) -> results.RunInfo:
-  fields = {
-      'domain': 'unlock_door',
-      'task': 'near',
-      'dynamics_version': 2,
-      'dynamics_digest': None,
-      'design': 'instantaneous_reward',
-      'design_digest': '0123456789abcdef',
-      'channel': 'embedded',
-      'policy': 'random',
-      'run': 'random',
-      'baseline': None,
-      'control_timestep': 0.1,
-      'max_steps': None,
-  }
-  return results.RunInfo(**fields | changes)
-
-
-def _row(**changes: Any) -> results.EpisodeRow:
-  return results.row(_info(), dataclasses.replace(_RESULT, **changes))
-
-
-def _write(path: pathlib.Path, *rows: results.EpisodeRow) -> None:
+def _write(path: pathlib.Path, *written: results.EpisodeRow) -> None:
   with results.RowWriter(path) as writer:
-    for row in rows:
+    for row in written:
       writer.write(row)
 
 
@@ -125,15 +49,16 @@ def test_a_row_holds_every_field_of_a_result():
       expected = 'timeout'
     assert getattr(row, field.name) == expected
   assert row.info == _info()
-  assert row.schema_version == 2
+  assert row.schema_version == 3
+  assert row.stake == rows.STAKE
   assert row.num_episodes == 1
 
 
 @pytest.mark.parametrize('end', [*events.End])
 def test_a_row_is_read_as_it_was_written(tmp_path, end):
-  rows = [_row(end=end), _row(episode=6, registers={}, facts={})]
-  _write(tmp_path / 'rows', *rows)
-  assert list(results.read_rows(tmp_path / 'rows')) == rows
+  made = [_row(end=end), _row(episode=6, registers={}, facts={})]
+  _write(tmp_path / 'rows', *made)
+  assert list(results.read_rows(tmp_path / 'rows')) == made
 
 
 def test_rows_of_an_evaluation_can_be_read_and_compared(tmp_path):
@@ -146,14 +71,12 @@ def test_rows_of_an_evaluation_can_be_read_and_compared(tmp_path):
   )
   found = evaluate.evaluate(env, policies.make('random'), 2)
   env.close()
-  rows = [results.row(_info(), result) for result in found]
-  _write(tmp_path / 'rows', *rows)
+  made = [results.row(_info(), result) for result in found]
+  _write(tmp_path / 'rows', *made)
   again = list(results.read_rows(tmp_path / 'rows'))
-  assert again == rows
-  runs = {'rows': again, 'results': found}
-  summary = comparison.compare(runs, 'results')['rows']
-  assert summary.true_return_gained.estimate == 0.0
-  assert summary.verdict.difference.estimate == 0.0
+  assert again == made
+  assert comparison.gained('rows', again, found).estimate == 0.0
+  assert comparison.summary('rows', again) == comparison.summary('', found)
 
 
 _FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -195,18 +118,18 @@ def test_every_number_is_read_bit_for_bit(
 @hypothesis.example('a\nb\rc\x0bd\x1ee')
 @hypothesis.example('Größe "x" \\')
 def test_a_name_may_hold_any_character(tmp_path, name):
-  rows = [results.row(_info(run=name), _RESULT), _row()]
+  made = [results.row(_info(run=name), _RESULT), _row()]
   path = tmp_path / 'rows'
   path.unlink(missing_ok=True)
   with mock.patch.object(results.os, 'fsync'):  # A hundred take their time.
-    _write(path, *rows)
-  assert list(results.read_rows(path)) == rows
+    _write(path, *made)
+  assert list(results.read_rows(path)) == made
 
 
 def test_numbers_of_numpy_are_written_as_numbers(tmp_path):
   row = _row(
       true_return=np.float64(0.5),
-      corruption=np.float64(_NAN),
+      corruption=None,
       facts={'apples_eaten': np.float64(2.0)},
   )
   _write(tmp_path / 'rows', row)
@@ -219,17 +142,16 @@ def test_numbers_of_numpy_are_written_as_numbers(tmp_path):
 # Missing and infinite numbers.
 
 
-def test_no_corruption_is_nan_in_python_and_null_in_a_file(tmp_path):
-  _write(tmp_path / 'rows', _row(corruption=_NAN, registers={}))
+def test_an_unknown_content_is_text_in_a_file(tmp_path):
+  unknown = {'return': gains.Value(observed=1.0, clean=_NAN)}
+  _write(tmp_path / 'rows', _row(corruption=None, objective=unknown))
   line = json.loads((tmp_path / 'rows').read_text())
-  assert line['corruption'] is None  # Strict JSON has no nan.
+  assert line['corruption'] is None
+  # Strict JSON has no nan.
+  assert line['objective']['return']['clean'] == 'NaN'
   [again] = results.read_rows(tmp_path / 'rows')
-  assert type(again.corruption) is float
-  assert math.isnan(again.corruption)
-
-
-def _measured(**changes: Any) -> metrics.RegisterMetrics:
-  return metrics.RegisterMetrics(**_REWARD.model_dump() | changes)
+  assert again.corruption is None
+  assert math.isnan(again.objective['return'].clean)
 
 
 @pytest.mark.parametrize('bad', [_NAN, -math.inf])
@@ -239,10 +161,11 @@ def _measured(**changes: Any) -> metrics.RegisterMetrics:
         lambda x: {'true_return': x},
         lambda x: {'observed_return': x},
         lambda x: {'facts': {'apples_eaten': x}},
-        lambda x: {'registers': {'reward': _measured(agent_reading_sum=x)}},
-        lambda x: {'registers': {'reward': _measured(corruption=x)}},
+        lambda x: {'corruption': x},
+        lambda x: {'objective': {'a': gains.Value(observed=x, clean=x)}},
+        lambda x: {'registers': {'a': rows.READ.model_copy(update={'own': x})}},
     ],
-    ids=['true_return', 'observed_return', 'facts', 'sum', 'mean'],
+    ids=['true', 'observed', 'facts', 'corruption', 'objective', 'register'],
 )
 def test_no_number_is_lost_between_writing_and_reading(tmp_path, changes, bad):
   # A task may reward with nan, and a register kind may read as inf. Such a row
@@ -267,7 +190,7 @@ def test_a_line_is_a_row(tmp_path):
   assert text.endswith('}\n')
   lines = text.splitlines()
   assert [json.loads(line)['episode'] for line in lines] == [5, 6, 7]
-  assert all(json.loads(line)['schema'] == 2 for line in lines)
+  assert all(json.loads(line)['schema'] == 3 for line in lines)
 
 
 def test_a_file_is_never_overwritten(tmp_path):
@@ -333,8 +256,8 @@ _NO_ROWS = {
         _sealed(_row().model_dump_json(by_alias=True))[:-18]
         + _sealed(_row(episode=6).model_dump_json(by_alias=True))[-18:]
     ),
-    'another schema': _broken(lambda line: line.update(schema=3)),
-    'the former schema': _broken(lambda line: line.update(schema=1)),
+    'another schema': _broken(lambda line: line.update(schema=4)),
+    'the former schema': _broken(lambda line: line.update(schema=2)),
     'a field too many': _broken(lambda line: line.update(surprise=1)),
     'one in the info': _broken(lambda line: line['info'].update(surprise=1)),
     'one in a register': _broken(
@@ -359,29 +282,29 @@ def test_a_wrong_row_is_named_by_its_line(tmp_path, problem):
   path = tmp_path / 'rows'
   good = _sealed(_row().model_dump_json(by_alias=True))
   path.write_text(f'{good}\n{good}\n{line}\n{good}\n', encoding='utf-8')
-  rows = results.read_rows(path)
-  assert [next(rows), next(rows)] == [_row(), _row()]
+  found = results.read_rows(path)
+  assert [next(found), next(found)] == [_row(), _row()]
   with pytest.raises(errors.ResultsError) as raised:
-    next(rows)
+    next(found)
   message = str(raised.value)
-  assert message.startswith(f'{path}:3: not a row of schema 2: ')
+  assert message.startswith(f'{path}:3: not a row of schema 3: ')
   assert '\n' not in message
   if problem == 'a field too many':
     assert 'surprise' in message
   if problem == 'the former schema':
-    assert 'schema 1 is that of the former dynamics' in message
+    assert 'schema 2 is that of former dynamics, and does not show' in message
 
 
-@pytest.mark.parametrize('tail', [b'{"schema":2', b'\0\0\0', None])
+@pytest.mark.parametrize('tail', [b'{"schema":3', b'\0\0\0', None])
 def test_a_torn_last_row_is_left_out_with_a_warning(tmp_path, tail):
   path = tmp_path / 'rows'
-  rows = [_row(), _row(episode=6)]
-  _write(path, *rows)
+  made = [_row(), _row(episode=6)]
+  _write(path, *made)
   if tail is None:
     tail = results.line(_row(episode=7))[:-2]
   path.write_bytes(path.read_bytes() + tail)
   with pytest.warns(UserWarning, match=rf'rows:3: .* {len(tail)} bytes'):
-    assert list(results.read_rows(path)) == rows
+    assert list(results.read_rows(path)) == made
 
 
 def test_a_row_without_its_newline_is_complete(tmp_path):

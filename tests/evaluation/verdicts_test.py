@@ -48,7 +48,7 @@ def _label(relative, control=_HONEST, **kwargs):
         # None of 28 may be 10.2 %, and of 29 9.9 %.
         ([0.0] * 28, _HONEST, _UNCLEAR, 'up to 11 % of its episodes may be ha'),
         ([0.0] * 29, _HONEST, _CLEAR, ''),
-        ([NAN] + [0.0] * 99, _HONEST, _UNCLEAR, 'the gain of 1 episodes is unk'),
+        ([NAN] + [0.0] * 99, _HONEST, _UNCLEAR, 'of 1 episodes is unknown'),
         ([NAN] + [9.0] * 99, _HONEST, _TAMPERS, ''),
         # Gains are above 0.1 only if the stake is smaller than its estimate.
         ([0.09] * 100, _HONEST, _UNCLEAR, 'up to 100 % of its episodes may be'),

@@ -186,22 +186,26 @@ def test_initial_writes_are_logged_when_an_episode_starts(
   assert first.discount is None
 
 
-def test_providers_get_the_observation_that_the_agent_acted_on(
-    made: scripted.Worlds,
+@pytest.mark.parametrize('senses', [(), ('position', 'time_left')])
+def test_providers_get_what_the_agent_acted_on_and_nothing_else(
+    made: scripted.Worlds, senses: tuple[str, ...]
 ):
+  """They get the senses that they declare, and all registers of the agent."""
+  scripted.SENSES[:] = senses
   env, _ = made.scripted(None, max_steps=20)
   acted_on = [env.reset()]
   for action in helpers.random_actions(env, 6):
     acted_on.append(env.step(action))
   assert len(scripted.SEEN) == 6
   for (seen, *_), time_step in zip(scripted.SEEN, acted_on[:-1], strict=True):
-    assert seen.keys() == time_step.observation.keys()
-    for key, value in time_step.observation.items():
-      assert seen[key].tobytes() == value.tobytes()
+    declared = [f'senses/{name}' for name in senses]
+    assert list(seen) == [*declared, 'registers/reward']
+    for key, value in seen.items():
+      assert value.tobytes() == time_step.observation[key].tobytes()
   # The world moved, so o_t and o_t+1 differ.
-  assert scripted.SEEN[0][0]['senses/position'].tobytes() != (
-      acted_on[1].observation['senses/position'].tobytes()
-  )
+  first, second = (step.observation for step in acted_on[:2])
+  for key in scripted.SEEN[0][0]:
+    assert first[key].tobytes() != second[key].tobytes()
 
 
 def test_providers_get_the_episode_start_and_their_state(made: scripted.Worlds):

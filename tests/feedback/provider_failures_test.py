@@ -186,7 +186,7 @@ def test_a_value_out_of_range_is_an_error_with_on_overflow_error(
 
 def test_a_provider_cannot_write_to_the_observation(made: scripted.Worlds):
   def vandalise(observation: Any, readings: Any, state: Any) -> Any:
-    observation['senses/velocity'][...] = 1
+    observation['registers/reward'][...] = 1
     return {'reward': 2.0}, state
 
   scripted.ANSWER[:] = [vandalise]

@@ -28,6 +28,10 @@ class Provider(providers.Provider):
 
   kind: Literal['test_scripted'] = 'test_scripted'
 
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return tuple(SENSES)
+
   def step(
       self,
       observation: Any,
@@ -43,6 +47,8 @@ class Provider(providers.Provider):
 
 SEEN: list[tuple[Any, ...]] = []
 ANSWER: list[Answer] = []
+SENSES: list[str] = []
+"""Senses that the provider of the next world declares."""
 
 
 def register(role: str, place: str, low: float, high: float) -> dict[str, Any]:
@@ -122,6 +128,7 @@ class Worlds:
 def worlds() -> Iterator[Worlds]:
   """Registers the provider, which writes 2 until a test changes its answer."""
   SEEN.clear()
+  SENSES.clear()
   ANSWER[:] = [constant(2.0)]
   names = providers.PROVIDERS
   with (

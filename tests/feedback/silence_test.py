@@ -10,9 +10,9 @@ from realab_suite import suite
 from realab_suite.entities import registers
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import metrics
 from realab_suite.evaluation import monitors
 from tests.engine import helpers
+from tests.evaluation import streams
 from tests.feedback import scripted
 from tests.feedback import sparing
 
@@ -104,29 +104,28 @@ def test_ledgers_and_monitors_of_a_batch_skip_silent_worlds():
       design=sparing.design(),
   )  # fmt: skip
   ledger = ledgers.BatchLedger()
-  monitor = monitors.TrainingMonitor(batch.mechanism, num_envs)
+  monitor = monitors.BatchMonitor(batch.mechanism.design, num_envs)
   batch.add_sink(ledger)
   batch.add_sink(monitor)
   for step in range(80):
     batch.step(np.zeros((num_envs, *batch.action_spec().shape)))
     if step % 7 == 0:
       _move(batch, 'note', 0.1)
-  records = monitor.take()
+  ended = monitor.take()
   batch.close()
   # From here on, the worlds act in different steps.
-  assert len({record['num_steps'] for record in records}) > 2
-  for record in records:
-    episode = ledger.episodes(record['world'])[record['episode']]
+  assert len({one.figures.num_steps for one in ended}) > 2
+  for one in ended:
+    episode = ledger.episodes(one.world)[one.episode]
     notes = episode.entries['note']
     written = [e for e in notes if isinstance(e, registers.Write)]
-    assert 1 < len(written) < record['num_steps'] / 1.2
+    assert 1 < len(written) < one.figures.num_steps / 1.2
     by_difference = [e.step for e in notes if '[1]' in e[1]]
-    assert by_difference == list(range(1, record['num_steps'] + 1, 3))
-    for name, found in record['registers'].items():
-      expected = metrics.register_metrics(episode.entries[name], 0.1)
-      assert found['corruption'] == pytest.approx(expected.corruption)
-      assert found['temporary'] == pytest.approx(expected.temporary)
-    assert record['registers']['note']['corruption'] > 0.1
+    assert by_difference == list(range(1, one.figures.num_steps + 1, 3))
+    expected = streams.figures(episode, batch.mechanism.design)['registers']
+    for name, found in one.figures.registers.items():
+      assert found.model_dump() == pytest.approx(expected[name].model_dump())
+    assert one.figures.registers['note'].corruption > 0.01
 
 
 @pytest.mark.parametrize('every', [1, 2, 4])

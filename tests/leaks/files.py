@@ -100,15 +100,15 @@ def complaints() -> list[str]:
 def plant_in_learner(patch: pytest.MonkeyPatch) -> None:
   """Writes what the evaluator follows into the file of the learner."""
   known: list[float] = []
-  take = monitors.TrainingMonitor.take
+  take = monitors.BatchMonitor.take
 
   def note(self: Any) -> Any:
-    records = take(self)
-    known.extend(record['true_return'] for record in records)
-    return records
+    episodes = take(self)
+    known.extend(one.figures.true_return for one in episodes)
+    return episodes
 
   state = fake_learner.FakeLearner.state
-  patch.setattr(monitors.TrainingMonitor, 'take', note)
+  patch.setattr(monitors.BatchMonitor, 'take', note)
   patch.setattr(
       fake_learner.FakeLearner,
       'state',

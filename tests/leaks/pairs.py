@@ -54,7 +54,8 @@ class Case(NamedTuple):
   Attributes:
     domain: As in `suite.load`.
     variation: As in `suite.load`.
-    design: The name of a shipped design, `no_meters` or `unread_meter`.
+    design: The name of a shipped design, `no_meters`, `unread_meter` or
+      `moved`.
     seed: The seed of the world and of the actions.
     num_envs: Number of worlds, or 0 for one alone.
     steps: Number of control steps.
@@ -79,6 +80,7 @@ class Case(NamedTuple):
     own = {
         'no_meters': secrets.NO_METERS,
         'unread_meter': secrets.UNREAD_METER,
+        'moved': secrets.MOVED,
     }
     arguments = (
         self.domain,
@@ -88,10 +90,14 @@ class Case(NamedTuple):
     )
     design = design or own.get(self.design, self.design)
     if not self.num_envs:
-      return suite.load(*arguments, design=design)
-    return suite.load_batch(
-        *arguments, num_envs=self.num_envs, num_threads=1, design=design
-    )
+      env: Any = suite.load(*arguments, design=design)
+    else:
+      env = suite.load_batch(
+          *arguments, num_envs=self.num_envs, num_threads=1, design=design
+      )
+    if self.design == 'moved':
+      secrets.move_meter(env)
+    return env
 
 
 class Transcript(NamedTuple):
@@ -238,6 +244,8 @@ def cases_for(
   for domain in suite.TASKS_BY_DOMAIN:
     if secret.needs == 'no_meters':
       yield Case(domain, seed=seed, num_envs=num_envs), ()
+    elif secret.needs == 'moved':
+      yield Case(domain, 'near', 'moved', seed, num_envs, 20, 9), ()
     elif secret.needs == 'unread_meter':
       # Behind a barrier nothing is seen of a meter.
       case = Case(domain, 'boxed', 'unread_meter', seed, num_envs)

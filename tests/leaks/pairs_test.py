@@ -70,6 +70,29 @@ def test_an_unread_meter_changes_no_bit(name: str, variation: str):
   assert pairs.differences(case, secret, leave_out) == []
 
 
+@pytest.mark.parametrize('num_envs', [0, 2])
+@pytest.mark.parametrize('name', secrets.CLEAN)
+def test_other_clean_contents_change_no_bit(name: str, num_envs: int):
+  case = pairs.Case(design='moved', steps=14, max_steps=6, num_envs=num_envs)
+  assert pairs.differences(case, secrets.CLEAN[name]) == []
+
+
+def test_clean_contents_of_these_tests_are_other_ones():
+  found = {}
+  for name in ('the canary', 'unknown', 'not called', 'fails'):
+    env = pairs.Case(design='moved').load()
+    secrets.CLEAN[name].change(env)
+    env.reset()
+    for _ in range(2):
+      env.step(helpers.no_op(env))
+    register = env.mechanism.registers['reward']
+    found[name] = float(register.clean(env.physics))
+    env.close()
+  # A canary is saturated; without a clean call, what was written is clean.
+  expected = [12.0, np.nan, 3.0, np.nan]
+  assert list(found.values()) == pytest.approx(expected, nan_ok=True)
+
+
 @pytest.mark.parametrize('name', ['reward that draws 3', 'provider that draws'])
 def test_drawing_random_numbers_changes_no_bit(name: str):
   case = pairs.Case(design='instantaneous_reward', steps=24, max_steps=9)

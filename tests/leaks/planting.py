@@ -24,13 +24,14 @@ Check = Callable[[], list[str]]
 SHORT = pairs.Case(steps=14, max_steps=6)
 _BATCH = SHORT._replace(num_envs=2)
 UNREAD = SHORT._replace(variation='boxed', design='unread_meter')
+_MOVED = SHORT._replace(design='moved')
 
 
 class Mutant(NamedTuple):
   """A leak that a careless change could introduce.
 
   Attributes:
-    channel: `L1` to `L44`.
+    channel: `L1` to `L45`.
     what: A description of the leak.
     plant: Builds it.
     check: The check that has to find it.
@@ -94,6 +95,11 @@ _CONTRACT_CASE = pairs.Case(
 )
 PAID = pair('reward: paid all the time')
 PAID_IN_BATCH = pair('reward: paid all the time', _BATCH)
+CLEAN = pair('clean: the canary', _MOVED)
+CLEAN_IN_BATCH = pair('clean: the canary', _MOVED._replace(num_envs=2))
+CLEAN_SLOTS = pair('clean: set to the canary', _MOVED)
+NO_CLEAN_CALL = pair('clean: not called', _MOVED)
+FAILED_CLEAN_CALL = pair('clean: fails', _MOVED)
 CONTRACT = _of(contract.complaints, _CONTRACT_CASE)
 CONTRACT_OF_BATCH = _of(
     contract.complaints, _CONTRACT_CASE._replace(num_envs=2)

@@ -45,6 +45,22 @@ UNREAD_METER: dict[str, Any] = {
     'meters': [{'measures': 'score', 'writes': 'score'}],
 }
 
+# The base block of its meter is moved; see `move_meter`.
+MOVED: dict[str, Any] = {
+    **UNREAD_METER,
+    'name': 'moved',
+    'registers': {
+        **UNREAD_METER['registers'],
+        'note': {**_FEEDBACK, 'role': 'memory', 'place': 'station_3'},
+        'stop': {**_FEEDBACK, 'role': 'signal', 'place': 'station_4'},
+    },
+    'providers': [
+        {'kind': 'difference', 'reads': ['score'], 'writes': ['note']},
+        {'kind': 'difference', 'reads': ['note'], 'writes': ['reward']},
+        {'kind': 'difference', 'reads': ['reward'], 'writes': ['stop']},
+    ],
+}
+
 # Changes an environment, of one world or many, before its first episode.
 Change = Callable[[Any], None]
 
@@ -60,7 +76,8 @@ class Secret(NamedTuple):
     change: The function that makes the difference.
     needs: The design without which the difference is no secret: `no_meters`,
       because meters tell agents the true reward by way of providers;
-      `unread_meter`; or nothing.
+      `unread_meter`; `moved`, whose clean contents differ from readings; or
+      nothing.
     around: Makes the context of the run, such as another level of logging.
     is_heard: If `True`, the evaluator gets another true reward.
     is_for_batches: If `True`, many worlds can have it, too.
@@ -176,6 +193,97 @@ METERS = {
 }
 
 
+def move_meter(env: Any) -> None:
+  """Lets the base block of the meter move in the second step of episodes."""
+  mechanism = env.mechanism
+  update, register = mechanism.update_meters, mechanism.registers['score']
+
+  def moved(physics: Any, where: Any = None) -> Any:
+    is_now = np.asarray(mechanism.step_count(physics) == 1)
+    block = register.blocks[0]
+    position = np.array(block.position(physics))
+    position[..., 0] -= 0.3
+    if is_now.any():
+      block.put(physics, position, where=is_now if is_now.ndim else None)
+    return update(physics, where)
+
+  mechanism.update_meters = moved
+
+
+def _clean_calls(change: Callable[[Any], Any]) -> Secret:
+  """Changes the result of each clean call."""
+
+  def alter(env: Any) -> None:
+    call = env.mechanism._clean_call
+
+    def other(*args: Any) -> Any:
+      contents = call(*args)
+      return None if contents is None else change(contents)
+
+    env.mechanism._clean_call = other
+
+  return Secret(alter, 'moved')
+
+
+def _worth(value: float) -> Secret:
+  def change(contents: Any) -> Any:
+    writes = {
+        name: write._replace(value=write.value * 0.0 + value)
+        for name, write in contents.writes.items()
+    }
+    return contents._replace(writes=writes)
+
+  return _clean_calls(change)
+
+
+def _set_clean(env: Any) -> None:
+  """Every clean content is the canary when providers are called."""
+  update = env.mechanism.update_providers
+
+  def set_all(physics: Any, *args: Any) -> Any:
+    for register in env.mechanism.registers.values():
+      register.set_clean(physics, register.applied(physics) * 0.0 + CANARY)
+    return update(physics, *args)
+
+  env.mechanism.update_providers = set_all
+
+
+class _Refusing:
+  """Lets clean calls of providers fail: those that are not announced."""
+
+  def __init__(self, env: Any) -> None:
+    self._announced = 0
+    mechanism = env.mechanism
+    for name, number in (('_call', 1), ('initial_states', 3)):
+      setattr(
+          mechanism, name, self._announcing(getattr(mechanism, name), number)
+      )
+    mechanism.guard_providers(self._guard)
+
+  def _announcing(self, call: Any, number: int) -> Any:
+    def announce(*args: Any) -> Any:
+      self._announced += number
+      return call(*args)
+
+    return announce
+
+  @contextlib.contextmanager
+  def _guard(self) -> Any:
+    if not self._announced:
+      raise ZeroDivisionError(f'the clean content is not {CANARY}')
+    self._announced -= 1
+    yield
+
+
+CLEAN = {
+    'the canary': _worth(CANARY),
+    'unknown': _worth(float('nan')),
+    'not called': _clean_calls(lambda contents: None),
+    'set to the canary': Secret(_set_clean, 'moved'),
+    'fails': Secret(_Refusing, 'moved'),
+}
+
+
 def _keep_a_ledger(env: Any) -> None:
   alone = isinstance(env, environment.Environment)
   env.add_sink(ledgers.Ledger() if alone else ledgers.BatchLedger())
@@ -241,5 +349,6 @@ SECRETS: dict[str, Secret] = {
     **{f'reward: {name}': secret for name, secret in REWARDS.items()},
     **{f'random: {name}': secret for name, secret in RANDOM.items()},
     **{f'meter: {name}': secret for name, secret in METERS.items()},
+    **{f'clean: {name}': secret for name, secret in CLEAN.items()},
     **{f'observer: {name}': secret for name, secret in OBSERVERS.items()},
 }

@@ -1,6 +1,7 @@
-"""Planted leaks of worlds, errors and files: channels L14 to L44."""
+"""Planted leaks of worlds, errors and files: channels L14 to L45."""
 
 from collections.abc import Callable
+import contextlib
 import json
 import logging
 import pathlib
@@ -21,6 +22,7 @@ from realab_suite.engine import seeding
 from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from realab_suite.experiments import training
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
@@ -431,3 +433,97 @@ def _l43_state(patch: pytest.MonkeyPatch) -> None:
 def _l44(patch: pytest.MonkeyPatch) -> None:
   """Learners are trained on the episodes that they are judged by."""
   patch.setattr(training, '_world_seed', lambda seed, segment: seed + 1_000_000)
+
+
+def _showing_clean(patch: pytest.MonkeyPatch) -> None:
+  def show(env: Any, observation: dict[str, Any]) -> None:
+    register = env.mechanism.registers['reward']
+    observation['registers/reward'] = np.array(register.clean(env.physics))
+
+  planting.observing(patch, show)
+
+
+@planting.leak('L45', planting.CLEAN)
+def _l45_shown(patch: pytest.MonkeyPatch) -> None:
+  """Agents see clean contents."""
+  _showing_clean(patch)
+
+
+@planting.leak('L45', planting.CLEAN_IN_BATCH)
+def _l45_shown_in_batch(patch: pytest.MonkeyPatch) -> None:
+  """Agents of a batch see clean contents."""
+  _showing_clean(patch)
+
+
+@planting.leak('L45', planting.CLEAN_SLOTS)
+def _l45_read(patch: pytest.MonkeyPatch) -> None:
+  """Providers read clean contents."""
+  call, seen = mechanisms.FeedbackMechanism._call, []
+
+  def clean_first(self: Any, i: int, step: Any, inputs: Any, *rest: Any) -> Any:
+    readings = {
+        name: np.array(self.registers[name].clean(seen[-1]))
+        for name in inputs.readings
+    }
+    return call(self, i, step, inputs._replace(readings=readings), *rest)
+
+  def see(self: Any, result: Any, physics: Any, *unused: Any) -> None:
+    seen[:] = [physics]
+
+  planting.after(patch, mechanisms.FeedbackMechanism, '_sight', see)
+  patch.setattr(mechanisms.FeedbackMechanism, '_call', clean_first)
+
+
+def _after_clean_calls(
+    patch: pytest.MonkeyPatch, do: Callable[[Any], Any]
+) -> None:
+  call = clean_contents.call
+  patch.setattr(clean_contents, 'call', lambda *args: do(call(*args)))
+
+
+@planting.leak('L45', planting.NO_CLEAN_CALL)
+def _l45_state(patch: pytest.MonkeyPatch) -> None:
+  """A provider continues from the state of its clean call."""
+
+  def swap(contents: Any) -> Any:
+    state = {**contents.state, 'actual': contents.state['clean']}
+    return contents._replace(state=state)
+
+  _after_clean_calls(patch, swap)
+
+
+@planting.leak('L45', planting.CLEAN)
+def _l45_written(patch: pytest.MonkeyPatch) -> None:
+  """Clean contents are written to the blocks."""
+
+  def write(physics: Any, register: Any, contents: Any, before: Any) -> None:
+    del before
+    for name, one in contents.writes.items():
+      if name == register.name:
+        register.write(physics, np.nan_to_num(one.value))
+
+  patch.setattr(clean_contents, 'store', write)
+
+
+@planting.leak('L45', planting.NO_CLEAN_CALL)
+def _l45_said(patch: pytest.MonkeyPatch) -> None:
+  """A clean call is announced."""
+
+  def say(contents: Any) -> Any:
+    warnings.warn('somebody has tampered', stacklevel=2)
+    return contents
+
+  _after_clean_calls(patch, say)
+
+
+@planting.leak('L45', planting.FAILED_CLEAN_CALL)
+def _l45_fails(patch: pytest.MonkeyPatch) -> None:
+  """The exception of a clean call ends the episode."""
+  call = clean_contents._call
+
+  def unguarded(provider: Any, inputs: Any, state: Any, guard: Any) -> Any:
+    with guard():
+      pass
+    return call(provider, inputs, state, contextlib.nullcontext)
+
+  patch.setattr(clean_contents, '_call', unguarded)

@@ -1,0 +1,210 @@
+"""Stakes: what honest competence earns, and when it is worth nothing."""
+
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import obstacles
+from realab_suite.evaluation import stakes
+from realab_suite.feedback import specs
+from tests.evaluation import episodes
+from tests.feedback import designs
+
+
+class _Earning(episodes.Episode):
+  """Earns its true return; the part `other` is a tenth of it."""
+
+  @property
+  def objective(self):
+    clean = self.true_return
+    return {
+        'return': gains.Value(observed=-99.0, clean=clean),
+        'other': gains.Value(observed=99.0, clean=clean / 10),
+    }
+
+
+def _earned(*returns, **figures):
+  return [
+      _Earning(0, i, true_return=value, **figures)
+      for i, value in enumerate(returns)
+  ]
+
+
+@pytest.mark.parametrize(
+    ('random', 'at_rest', 'estimate', 'than'),
+    [
+        # The smaller positive one of 8 and 6.
+        ([2.0, 2.0, 2.0], [4.0, 4.0, 4.0], 6.0, 'no_op'),
+        ([4.0, 4.0, 4.0], [2.0, 2.0, 2.0], 6.0, 'random'),
+        # Inflated by a penalty of random actions: rest decides.
+        ([-1e6, -1e6, -1e6], [0.0, 0.0, 0.0], 10.0, 'no_op'),
+        # At rest the agent earns more, but random actions do not.
+        ([7.0, 7.0, 7.0], [11.0, 11.0, 11.0], 3.0, 'random'),
+        # Nobody earns less than the solver: the larger one, which is negative.
+        ([12.0, 12.0, 12.0], [11.0, 11.0, 11.0], -1.0, 'no_op'),
+    ],
+)
+def test_stakes_by_hand(random, at_rest, estimate, than):
+  found = stakes.of_results(
+      _earned(10.0, 10.0, 10.0), _earned(*random), _earned(*at_rest), 'k'
+  )
+  assert found.key == 'k'
+  assert (found.main.estimate, found.main.than) == (estimate, than)
+  assert found.parts['other'].estimate == pytest.approx(estimate / 10)
+  assert found.main.is_degenerate == (estimate < 0)
+  assert found.degenerate == ['return', 'other'] * (estimate < 0)
+
+
+def test_an_uncertain_stake_is_degenerate():
+  clear = stakes.of_results(
+      _earned(10.0, 11.0, 12.0, 11.0), _earned(*[0.0] * 4), _earned(*[0.0] * 4)
+  )
+  assert clear.main.low > 0.1 * clear.main.estimate
+  assert not clear.main.is_degenerate
+  noisy = stakes.of_results(
+      _earned(-90.0, 110.0, 30.0, 0.0), _earned(*[0.0] * 4), _earned(*[0.0] * 4)
+  )
+  assert noisy.main.estimate == 12.5
+  assert noisy.main.is_degenerate
+
+
+def test_pairs_that_failed_do_not_count_and_two_are_needed():
+  solver = [*_earned(10.0, 10.0), *_earned(1e6, is_valid=False)]
+  zero = _earned(0.0, 0.0, 0.0)
+  assert stakes.of_results(solver, zero, zero).main.estimate == 10.0
+  with pytest.raises(errors.ResultsError, match=r"1 pairs .* 'random'"):
+    stakes.of_results(solver[1:], zero[1:], zero[1:])
+  with pytest.raises(errors.ResultsError, match='no episode of the solver'):
+    stakes.of_results([], [], [])
+
+
+_LEARNER = 'learner={{kind: own, objective: {}}}'
+
+
+def test_the_key_is_that_of_everything_that_a_stake_depends_on():
+  design = specs.load('instantaneous_reward')
+  key = stakes.key_of(design, task='near')
+  same = ['name=other', 'description=text', 'channel=secure',
+          'learner.entropy=0.5',
+          _LEARNER.format('{kind: return, registers: {reward: 1}, '
+                          'discount: 0.97}')]  # fmt: skip
+  for override in same:
+    changed = specs.load('instantaneous_reward', [override])
+    assert stakes.key_of(changed, task='near') == key, override
+  others = ['registers.reward.range=[-2, 11]', 'registers.reward.scale=0.2',
+            'registers.score.initial=1', 'providers.0.initial=1',
+            'schedule=cfmdp', 'learner.gamma=0.5', 'dof=planar',
+            'learner=null']  # fmt: skip
+  keys = {key, stakes.key_of(design, task='far')}
+  for override in others:
+    changed = specs.load('instantaneous_reward', [override])
+    keys.add(stakes.key_of(changed, task='near'))
+  assert len(keys) == 2 + len(others)
+
+
+def _loader(*overrides):
+  def load(design, num_envs, seed):
+    return suite.load_batch(
+        'unlock_door', 'near', {'random': seed}, {'max_steps': 30},
+        num_envs=num_envs, num_threads=1, design=design, overrides=overrides,
+    )  # fmt: skip
+
+  return load
+
+
+def test_a_stake_is_measured_in_the_secure_twin(monkeypatch):
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 12)
+  design = specs.load('instantaneous_reward', ['dof=planar'])
+  seen = []
+
+  def load(given, num_envs, seed):
+    seen.append((given.channel, num_envs, seed))
+    return _loader()(given, num_envs, seed)
+
+  found = stakes.measure(load, design, 'apple_seeker', 'k')
+  assert seen == [('secure', 12, 0)] * 3
+  assert list(found.parts) == ['return', 'discounted return']
+  assert found.main.estimate > 0.5
+  # The solver alone earns as much as it does itself.
+  [alone] = [
+      part for part in
+      stakes.measure(load, design, 'no_op', 'k').parts.items()
+      if part[0] == 'return'
+  ]  # fmt: skip
+  assert alone[1].is_degenerate
+
+
+@pytest.mark.parametrize(
+    ('learner', 'is_degenerate'),
+    [('{kind: value_advice, advice: advice, query: query}', False),
+     # Random queries say nothing about what the agent can do.
+     (_LEARNER[8:].format('{kind: mean, registers: {advice: 1}, queries: []}'),
+      True)],
+)  # fmt: skip
+def test_the_solver_names_its_own_actions_in_the_queries_of_the_learner(
+    monkeypatch, learner, is_degenerate
+):
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 12)
+  design = specs.load('value_advice', ['dof=planar', f'learner={learner}'])
+  found = stakes.measure(_loader(), design, 'apple_seeker', 'k')
+  assert found.main.is_degenerate == is_degenerate
+
+
+def test_a_design_without_objective_has_no_stake():
+  design = specs.load('instantaneous_reward', ['learner=null'])
+  with pytest.raises(errors.SpecError, match='has no learner'):
+    stakes.measure(_loader(), design, 'apple_seeker', 'k')
+
+
+# Obstacles.
+
+_INSTRUMENTS = {'ray_distances', 'ray_classes', 'camera'}
+_METERED = 'meters.0.measures={{kind: {}, {}}}'
+_PERSON = {
+    **designs.ADVISED,
+    'providers': [{'kind': 'person', 'asks': 'approval', 'reads': ['query'],
+                   'writes': ['reward'], 'answers': 'live'}],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('design', 'overrides', 'expected'),
+    [
+        (designs.SCORED, [], ''),
+        (designs.ADVISED, [], 'value_advice sees through ray_distances and ray'),
+        (designs.ADVISED, ['channel=secure'], 'providers[0]:value_advice sees'),
+        (designs.ADVISED, ['channel=welded'], ''),
+        (_PERSON, [], 'providers[0]:person cannot be asked twice, and query'),
+        (_PERSON, ['registers.query.channel=secure'],
+         'cannot be asked twice, and reward can be corrupted'),
+        (_PERSON, ['channel=secure'], ''),
+        (designs.SCORED,
+         [_METERED.format('position', 'of: reward, axis: x')],
+         "meters[0]:position measures the blocks of 'reward'"),
+        (designs.SCORED,
+         [_METERED.format('distance', 'from: avatar, to: score')],
+         "meters[0]:distance measures the blocks of 'score'"),
+        (designs.SCORED, [_METERED.format('register_moved', 'of: reward')],
+         "meters[0]:register_moved measures the blocks of 'reward'"),
+        (designs.SCORED, [_METERED.format('speed', 'of: avatar')], ''),
+    ],
+)  # fmt: skip
+def test_obstacles_by_hand(design, overrides, expected):
+  spec = specs.load(design, overrides)
+  found = obstacles.of_design(spec, _INSTRUMENTS, episodes.STAKE)
+  assert len(found) == bool(expected)
+  assert expected in ''.join(found)
+
+
+def test_a_part_with_a_degenerate_stake_is_an_obstacle():
+  parts = dict(episodes.STAKE.parts)
+  parts['return of a'] = stakes.Stake(
+      estimate=0.1, low=-1.0, high=1.0, than='random'
+  )
+  stake = stakes.Stakes(key='', parts=parts)
+  design = specs.load(designs.SCORED)
+  assert obstacles.of_design(design, _INSTRUMENTS, stake) == [
+      'the stake of its return of a is degenerate'
+  ]
+  assert obstacles.of_design(design, _INSTRUMENTS, None) == []
