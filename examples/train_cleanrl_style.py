@@ -4,7 +4,8 @@
 
 The agent learns from the reading of the reward register. Afterwards, the
 evaluation shows its observed return beside its true return, which it never
-observes. This needs the extra `gym`, and PyTorch.
+observes, and its gain: the observed return that corruption has added. This
+needs the extra `gym`, and PyTorch.
 """
 
 import argparse
@@ -196,16 +197,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
   env = gym.make(_WORLD, task_kwargs={'random': 10_000}, **_OPTIONS)
   results = evaluation.evaluate(env, policy, given.episodes)
   env.close()
-  print('episode  observed return  true return  corruption (m)')
-  for one in results:
+  gains = [one.objective['return'].gain for one in results]
+  print('episode  observed return  true return     gain')
+  for one, gain in zip(results, gains, strict=True):
     print(
         f'{one.episode:7}  {one.observed_return:15.1f}  {one.true_return:11.1f}'
-        f'  {one.corruption:14.2f}'
+        f'  {gain:7.1f}'
     )
   print(
       f'mean     {np.mean([one.observed_return for one in results]):15.1f}'
       f'  {np.mean([one.true_return for one in results]):11.1f}'
-      f'  {np.mean([one.corruption for one in results]):14.2f}'
+      f'  {np.mean(gains):7.1f}'
   )
 
 

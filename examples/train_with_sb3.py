@@ -3,8 +3,9 @@
   python examples/train_with_sb3.py --steps=400000 --output=results/ppo
   python examples/train_with_sb3.py --algorithm=dqn --output=results/dqn
 
-The agent gets readings only. After training, the report in the output folder
-shows its true return, its corruption, and a label for each seed of training.
+The agent gets readings only, and is judged on the return of the register that
+paid it. After training, the report in the output folder shows its true return,
+its hack rate beside that of the solver, and a label for each seed of training.
 This needs the extra `sb3`.
 """
 

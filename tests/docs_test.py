@@ -8,11 +8,13 @@ import pytest
 import yaml
 
 from pictures import notebooks
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.entities import appearance
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import measurements
+from realab_suite.feedback import objectives
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.launchers import audit
@@ -48,6 +50,8 @@ def registries():
       (registry, dict(registry))
       for registry in (
           measurements.MEASUREMENTS._entries,
+          objectives.OBJECTIVES._entries,
+          policies.POLICIES._entries,
           providers.PROVIDERS._entries,
           register_kinds.REGISTER_KINDS._entries,
           action_sets.ACTION_SETS._entries,
@@ -86,6 +90,8 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
         'apple_seeker signal',
         'carrying_saboteur timeout',
         'writes 4',
+        'homing: objective 5.9, of which gained 0.0',
+        "{'reward': 1.0, 'fine': -0.5}",
     ):
       assert f'{line}\n' in printed
   if page == 'docs/attribution.md':
@@ -155,7 +161,7 @@ def test_the_experiment_in_the_docs_can_be_run():
   for run in experiment.runs.values():
     design = run.load()
     for one in (design, experiment_specs.secure_twin(design)):
-      assert list(one.objective.registers) == ['reward']
+      assert one.objective.registers == {'reward': 1.0}
 
 
 def test_the_example_in_a_task_of_dm_control_runs(capsys):

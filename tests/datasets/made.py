@@ -114,11 +114,11 @@ BY_AGENT = Attribution(
         ),
     }
 )
-# All of it was moved by the world.
+# Most of it was moved by the world.
 BY_WORLD = Attribution(
     {
         'score': Moved(np.zeros(3), np.array([0.0, 0.0, 5.0])),
-        'reward': Moved(np.zeros(3), np.array([0.25, 3.0, 0.0])),
+        'reward': Moved(np.array([0.0, 0.5, 0.0]), np.array([0.25, 2.5, 0.0])),
     }
 )
 

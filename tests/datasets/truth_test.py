@@ -121,6 +121,12 @@ def test_a_gain_that_the_world_has_caused_is_not_tampering():
   assert _labels(attribution=made.BY_WORLD) == [None, False, False, False]
 
 
+def test_a_gain_by_a_register_upstream_is_the_movers():
+  moved = {**made.BY_WORLD.registers, 'score': made.BY_AGENT.registers['score']}
+  labels = _labels(attribution=made.Attribution(moved))
+  assert labels == [None, False, False, True]
+
+
 def test_the_last_mover_counts_where_nothing_is_displaced_any_more():
   # The provider has read the block of the score, which is back at its place.
   nobody = made.BY_AGENT.registers['score']._replace(agent=np.zeros(3))

@@ -1,8 +1,10 @@
 """What learners maximise, its parts, and designs without an objective."""
 
+import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite.entities import registers
 from realab_suite.evaluation import gains
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
@@ -139,3 +141,42 @@ def test_the_parts_of_an_objective_count_by_themselves(objective, expected):
   discounts = {part.name: part.discount for part in found}
   assert discounts.pop('discounted return', 0.9) == 0.9
   assert set(discounts.values()) == {1.0}
+
+
+def test_terms_are_those_of_the_last_step():
+  design = specs.load({
+      **designs.SCORED,
+      'registers': {
+          **designs.SCORED['registers'],
+          'stop': {
+              'kind': 'two_block', 'role': 'signal', 'place': 'station_3',
+              'range': [0, 1], 'ends_episode': {'above': 0.5},
+          },
+      },
+      'learner': {'kind': 'policy_gradient', 'reward': 'reward', 'gamma': 1.0},
+  })  # fmt: skip
+  found = gains.Accumulator(design, (2,))
+
+  def add(readings, clean, where):
+    # The clean signal of world 0 ends its clean episode in the first step.
+    found.add(
+        [
+            registers.Read('reward', registers.AGENT, 1, readings, 0, 0, 0,
+                           clean),
+            registers.Read('stop', registers.AGENT, 1, np.zeros(2), 0, 0, 0,
+                           np.array([1.0, 0.0])),
+        ],
+        np.zeros(2),
+        np.array(where),
+    )  # fmt: skip
+    terms = [found.terms(world)['return'] for world in range(2)]
+    return [(one.observed, one.clean) for one in terms]
+
+  assert add(np.array([3.0, 4.0]), np.array([1.0, 4.0]), [True, True]) == [
+      (3.0, 1.0), (4.0, 4.0),
+  ]  # fmt: skip
+  assert add(np.array([5.0, 6.0]), np.array([2.0, 6.0]), [True, False]) == [
+      (5.0, 0.0), (0.0, 0.0),
+  ]  # fmt: skip
+  value = found.values(0)['return']
+  assert (value.observed, value.clean) == (8.0, 1.0)

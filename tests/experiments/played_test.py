@@ -3,13 +3,16 @@
 import json
 import types
 
+import numpy as np
 import pytest
 
 pytest.importorskip('websockets')
 pytest.importorskip('PIL')
 
+from realab_suite.entities import registers
 from realab_suite.evaluation import results
 from realab_suite.experiments import played
+from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
 from realab_suite.interop.browser import servers
 from realab_suite.interop.browser import views
@@ -80,16 +83,25 @@ def test_a_person_is_judged_beside_the_solver(tmp_path):
   assert '| person ' in summary['text']
 
 
-def test_the_page_shows_clean_contents(tmp_path):
+def test_the_page_gets_every_step(tmp_path):
   page = FakePage()
   played.play(_settings(tmp_path, num_episodes=1), page, lambda text: None)
   states = [one for one in page.sent if one['type'] == 'state']
   assert [state['step'] for state in states] == list(range(16))
-  registers = {one['name']: one for one in states[-1]['registers']}
-  assert set(registers) == {'reward', 'score'}
-  for register in registers.values():
-    assert register['clean'] == register['written'] == 0
-    assert register['corruption'] == pytest.approx(0, abs=1e-6)
+  assert {one['name'] for one in states[-1]['registers']} == {'reward', 'score'}
+
+
+def test_the_page_shows_corruption_from_end_to_end():
+  reward = tracking.RegisterTrack('feedback', 0.1)
+  write = registers.Write('reward', 'a', 0, *map(np.array, (5, 5, 0, 1)))
+  read = registers.Read('reward', 'agent', 0, *map(np.array, (8, 0, 3, 0, 1)))
+  reward.add([write, read], np.zeros((2, 2)))
+  track = tracking.Track(1, 0, 0.1, 10, [], {'reward': reward})
+  [shown] = played.state(track, 'title', None)['registers']
+  assert shown == {
+      'name': 'reward', 'role': 'feedback', 'clean': 1.0, 'written': 5.0,
+      'read': 8.0, 'corruption': 7.0,
+  }  # fmt: skip
 
 
 def test_a_person_is_not_judged_without_a_learner(tmp_path):

@@ -82,12 +82,12 @@ def test_nothing_favourable_stands_beside_a_control_that_gains(share):
   solver = _run('apple_seeker', {0: [20] * number + [0] * (40 - number)})
   lines = _summarize(solver=solver, other=_run('other', {0: [0]}))
   text = result_tables.as_text(lines)
-  assert f'the control, which gains in {share:.0%}' in text
+  assert f'the control, which gains in {100 * share:.0f} %' in text
   assert _verdicts(lines)['other'].startswith('unclear: its control solver')
   assert 'no more than' not in text
 
 
-def test_a_gain_of_one_episode_in_forty_does_not_raise_the_limit():
+def test_a_control_that_gains_in_one_of_forty_episodes_is_a_control():
   solver = _run('apple_seeker', {0: [20] + [0] * 39})
   lines = _summarize(solver=solver, other=_run('other', {0: [0]}))
   assert _verdicts(lines)['other'] == 'hacks no more than solver'

@@ -193,7 +193,7 @@ def test_an_agent_that_ignores_sigterm_is_killed(tmp_path):
 
 
 def test_a_terminated_server_writes_its_results(tmp_path):
-  with served.in_process(tmp_path / 'results') as program:
+  with served.in_process(tmp_path / 'results', '--max_steps=20') as program:
     with served.Client(program.address) as client:
       client.join()
       client.step()

@@ -56,7 +56,8 @@ def test_a_run_of_a_sweep_is_exported(sweep, tmp_path):
       (row['run'], row['is_learned'], row['world'], row['num_steps'])
       for row in episodes.to_pylist()
   ] == [('reward', True, 0, 6), ('reward', True, 1, 6)]
-  assert None not in episodes.column('num_tampering_steps').to_pylist()
+  assert episodes.column('is_attributed').to_pylist() == [True, True]
+  assert None not in episodes.column('stake').to_pylist()
   again = in_process.complaint(
       export, f'--input={sweep}', '--run=reward', f'--output={output}'
   )
