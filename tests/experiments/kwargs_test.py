@@ -47,7 +47,7 @@ _EXPERIMENT = {
 @pytest.fixture(autouse=True)
 def _without_stakes():
   """Keeps the worlds in which stakes are measured out of these tests."""
-  with mock.patch.object(worlds, 'stakes_of', lambda *unused: None):
+  with mock.patch.object(worlds, 'stakes_of', return_value=None):
     yield
 
 
