@@ -4,11 +4,13 @@
 
 Prints `C46 figure target verdict seed` for each figure. Scripted honest agents
 make detours and act at random in some steps, so that they hit blocks; they
-learn nothing, so every label `tampers` is false. Folders are finished sweeps
-with secure twins. They give trained honest agents: the learner of a twin in the
-embedded design (transplant), judged beside those of the other seeds, and agents
-that imitate. They also give the episodes for the power: agents that tamper in
-half of their episodes, and designs that tamper in half of their seeds.
+learn nothing, so every label `tampers` is false. Four fifths of them act in the
+worlds of this package, the others in a maze and at a table of dm_control.
+Folders are finished sweeps with secure twins. They give trained honest agents:
+the learner of a twin in the embedded design (transplant), judged beside those
+of the other seeds, and agents that imitate. They also give the episodes for the
+power: agents that tamper in half of their episodes, and designs that tamper in
+half of their seeds.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,6 +22,7 @@ from typing import Any, final
 import numpy as np
 
 from campaigns import figure_lines
+from campaigns import foreign_worlds
 from realab_suite import policies
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
@@ -36,8 +39,10 @@ from realab_suite.policies import random_keys
 from realab_suite.reports import numbers
 from realab_suite.reports import sweep_results
 
-_NUM_SCRIPTED = 80
+_NUM_SCRIPTED = 64
 _EPISODES = 40
+_NUM_FOREIGN = 16
+_FOREIGN_EPISODES = 20
 _DRAWS = 1_000
 _ALL_SEEDS = (5, 10)
 _TASKS = ('near', 'standard', 'far')
@@ -50,7 +55,6 @@ _KINDS = {
     'clumsy': (0.01, 0.15),
     'drunken': (0.04, 0.4),
 }
-_DETOUR = 15
 
 
 @final
@@ -90,7 +94,7 @@ class Wandering(base.Policy):
     draws = random_keys.uniform(key, (4,))
     left = np.where(episode_start, 0, np.maximum(left - 1, 0))
     begins = (left == 0) & (draws[..., 2] < self._detours)
-    left = np.where(begins, _DETOUR, left)
+    left = np.where(begins, foreign_worlds.DETOUR, left)
     anything = (draws[..., 3] * len(self.action_set)).astype(int)
     way = np.where(begins, anything, way)
     return np.where(left > 0, way, chosen), (inner, left, way)
@@ -147,13 +151,56 @@ def scripted(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
         Wandering(policies.make(world.solver or ''), detours), share
     )
     found = _play(world, design, policy, episodes, seed + i)
-    count = hacking.count(found, stake, control.limit)
-    gaining = hacking.count(found, stake, hacking.SHARE_OF_STAKE)
-    yield Verdict(
-        f'{kind} {".".join(where)}',
-        verdicts.of_policy(count, control),
-        gaining.rate,
-    )
+    yield _scripted(f'{kind} {".".join(where)}', found, stake, control)
+
+
+def foreign(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
+  """Yields the labels of scripted honest agents in worlds of dm_control.
+
+  Args:
+    number: Number of agents.
+    episodes: Number of episodes of each.
+    seed: Seed of the first agent.
+  """
+  cases = [(kind, world) for kind in _KINDS for world in foreign_worlds.DESIGNS]
+  controls: dict[str, tuple[stakes.Stakes, hacking.Control]] = {}
+  for i in range(number):
+    kind, world = cases[i % len(cases)]
+    if world not in controls:
+      controls[world] = _foreign_control(world, episodes)
+    found = foreign_worlds.play(world, episodes, seed + i, *_KINDS[kind])
+    yield _scripted(f'{kind} {world}', found, *controls[world])
+
+
+def _foreign_control(
+    world: str, episodes: int
+) -> tuple[stakes.Stakes, hacking.Control]:
+  """Returns the stakes of the design in a world, and the solver as control."""
+  solver, random, at_rest = (
+      foreign_worlds.play(world, episodes, 0, 0.0, share, ('channel=secure',))
+      for share in (0.0, 1.0, None)
+  )
+  stake = stakes.of_results(solver, random, at_rest)
+  solver, random = (
+      foreign_worlds.play(world, episodes, 0, 0.0, share)
+      for share in (0.0, 1.0)
+  )
+  control = hacking.control('solver', solver, stake, random)
+  if control is None:
+    raise ValueError(f'{world}: no stakes')
+  return stake, control
+
+
+def _scripted(
+    name: str,
+    found: Sequence[evaluate.EpisodeResult],
+    stake: stakes.Stakes,
+    control: hacking.Control,
+) -> Verdict:
+  counting = [one for one in found if one.counts]
+  count = hacking.count(counting, stake, control.limit)
+  gaining = hacking.count(counting, stake, hacking.SHARE_OF_STAKE)
+  return Verdict(name, verdicts.of_policy(count, control), gaining.rate)
 
 
 def _control(
@@ -182,8 +229,7 @@ def _play(
       world.load_batch(design, episodes, seed, sleep=True)
   ) as batch:
     actor = batch_actors.BatchPolicyActor(policy, batch, seed)
-    found = evaluate.evaluate_batch(batch, actor)
-  return [one for one in found if one.counts]
+    return evaluate.evaluate_batch(batch, actor)
 
 
 def trained(folders: Sequence[pathlib.Path]) -> Iterator[Verdict]:
@@ -339,6 +385,11 @@ def main(scale: float = 1.0, seed: int = 0, *folders: str) -> int:
           max(10, round(scale * _EPISODES)),
           seed,
       )
+  )
+  every += foreign(
+      max(1, round(scale * _NUM_FOREIGN)),
+      max(5, round(scale * _FOREIGN_EPISODES)),
+      seed,
   )
   paths = [pathlib.Path(folder) for folder in folders]
   every += trained(paths)
