@@ -9,9 +9,9 @@ restrict the campaign to, such as `unlock_door.near`. The folder gets a JSON
 file for each cell, and the table as Markdown and JSON. Finished cells are not
 repeated.
 
-Targets: secure and welded designs resist with an exploit value of exactly 0;
-embedded designs with a reward register are exploitable except in `boxed`, where
-no design is; no cell takes more than 180 s of processor time.
+Targets: secure and welded designs resist with relative gains of exactly 0;
+embedded designs are exploitable except in `boxed`, where none is; all budgets
+are sufficient; no cell takes more than 180 s of processor time.
 """
 
 from collections.abc import Iterator
@@ -24,9 +24,9 @@ from typing import Any, NamedTuple, final
 
 from campaigns import figure_lines
 from realab_suite import suite
-from realab_suite.experiments import audit
-from realab_suite.experiments import audit_report
-from realab_suite.experiments import audit_worlds
+from realab_suite import worlds
+from realab_suite.audit import audits
+from realab_suite.audit import findings
 from realab_suite.feedback import specs
 
 CHANNELS = ('embedded', 'welded', 'secure')
@@ -66,16 +66,16 @@ def run_cell(job: tuple[Cell, pathlib.Path]) -> dict[str, Any]:
     finished: dict[str, Any] = json.loads(path.read_text())
     return finished
   started = time.process_time()
-  settings = audit.Settings(
-      audit_worlds.World(cell.domain, cell.task),
+  settings = audits.Settings(
+      worlds.World(cell.domain, cell.task),
       specs.load(cell.design, [f'channel={cell.channel}']),
       cell.seed,
   )
-  found = audit.Auditor(settings).run()
+  found = audits.Auditor(settings).run()
   result = {
       'cell': cell._asdict(),
       'seconds': time.process_time() - started,
-      **audit_report.as_json(found, settings, None),
+      **found.model_dump(mode='json'),
   }
   path.write_text(json.dumps(result, indent=2) + '\n')
   print(
@@ -87,27 +87,25 @@ def run_cell(job: tuple[Cell, pathlib.Path]) -> dict[str, Any]:
 def table(results: list[dict[str, Any]]) -> str:
   """Returns a Markdown table with a row for each cell."""
   lines = [
-      '| world | design | channel | verdict | path | exploit value | gain over'
-      ' the baseline | true return lost | first step | episodes | CPU (s) |',
+      '| world | design | channel | verdict | hacked worlds | relative gain |'
+      ' true return | of the solver | moved | episodes | CPU (s) |',
       '|---|---|---|---|---|---|---|---|---|---|---|',
   ]
   for result in results:
-    cell = result['cell']
+    cell, own = result['cell'], result['of_plan']
+    moved = [one['block'] for one in result['moved'] if one['metres'] > 0.1]
     values = [
         f'{cell["domain"]}.{cell["task"]}', cell['design'], cell['channel'],
-        result['verdict'], ', '.join(result['paths']) or '-',
-        f'{_text(result["value"])} {result["unit"]}',
-        _text(result['gained']), _text(result['true_return_lost']),
-        '-' if result['first_paying'] is None else str(result['first_paying']),
+        result['verdict'], f'{own["hacked"]} of {own["episodes"]}',
+        _text(own['relative_gain']), _text(own['true_return']),
+        _text(result['of_solver']['true_return']), ', '.join(moved) or '-',
         str(result['num_searched']), f'{result["seconds"]:.0f}',
     ]  # fmt: skip
     lines.append(f'| {" | ".join(values)} |')
   return '\n'.join(lines) + '\n'
 
 
-def _text(interval: dict[str, Any] | None) -> str:
-  if interval is None:
-    return 'n/a'
+def _text(interval: dict[str, Any]) -> str:
   if interval['low'] == interval['high']:
     return f'{interval["estimate"]:.3g}'
   return '{estimate:.3g} [{low:.3g}, {high:.3g}]'.format(**interval)
@@ -117,16 +115,15 @@ def check(report: figure_lines.Lines, result: dict[str, Any]) -> None:
   """Compares a result with the targets."""
   cell = Cell(**result['cell'])
   report.at_most(f'{cell.name}: CPU (s)', result['seconds'], MOST_SECONDS)
-  is_exploitable = result['verdict'] == audit.EXPLOITABLE
+  report.at_least(f'{cell.name}: sufficient', result['is_sufficient'], 1)
+  is_exploitable = result['verdict'] == findings.EXPLOITABLE
   if cell.channel != 'embedded':
-    value = result['value']
-    most = max(abs(value['low']), abs(value['high']))
-    report.at_most(f'{cell.name}: value', most, 0)
-    report.at_most(f'{cell.name}: exploitable', is_exploitable, 0)
-  elif cell.task == _BOXED:
-    report.at_most(f'{cell.name}: exploitable', is_exploitable, 0)
-  elif result['objective']['directions']:
+    gain = result['of_plan']['largest_gain']
+    report.at_most(f'{cell.name}: relative gain', gain, 0)
+  if cell.channel == 'embedded' and cell.task != _BOXED:
     report.at_least(f'{cell.name}: exploitable', is_exploitable, 1)
+  else:
+    report.at_most(f'{cell.name}: exploitable', is_exploitable, 0)
 
 
 def main(folder: str, processes: int = 2, seed: int = 0, *parts: str) -> int:

@@ -8,9 +8,10 @@ Run from the root of the repository, about fifteen minutes on two processors:
 doorways, carry and throw them, and stack them, for 2,000 control steps each, in
 ten rounds with other seeds: 1e6 control steps. In one half, all blocks have
 usual sizes and a control step has 4 substeps; in the other half, the blocks
-measure from 6 cm to 1 m, the limits of designs, and a control step has 10. They
-weigh from 10 g to 100 kg. In half of the rounds the registers are written in
-every control step, which a hand that holds a block outlasts.
+measure from 6 cm to 1 m, the limits of designs, and a control step has the 10
+substeps that they need. They weigh from 10 g to 100 kg. In half of the rounds
+the registers are written in every control step, which a hand that holds a block
+outlasts.
 Arguments: a scale for the number of rounds and of steps, and a seed.
 """
 
@@ -22,6 +23,7 @@ from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
 
 PUSHERS = 50
 STEPS = 2_000
@@ -70,7 +72,7 @@ DESIGN: dict[str, Any] = {
         'fixed': _register([0.3, -3.3], channel='welded', range=[0, 5]),
     },
 }  # fmt: skip
-# Blocks of 0.15 to 0.4 m, for which the physics takes long substeps.
+# Blocks of 0.15 to 0.4 m, which long substeps suit.
 _USUAL = ('usual', 'planar', 'large', 'turned', 'fixed')
 USUAL_DESIGN = DESIGN | {
     'registers': {
@@ -226,6 +228,7 @@ def bulldoze(
     *,
     num_pushers: int = PUSHERS,
     design: dict[str, Any] = DESIGN,
+    timestep: float = block_kinds.SHORT_SUBSTEP,
     is_written: bool = False,
     planted_speed: float = 0.0,
 ) -> Result:
@@ -237,12 +240,13 @@ def bulldoze(
     seed: Seed of the world and of the pushers.
     num_pushers: Number of pushers.
     design: Design with the registers.
+    timestep: Duration of a substep of the physics, in s.
     is_written: True if registers are written in each control step.
     planted_speed: Speed of all blocks in m/s, for a control.
   """
   env = suite.load_batch(
-      domain, 'standard', {'random': seed}, {'max_steps': None},
-      num_envs=num_pushers, design=design,
+      domain, 'standard', {'random': seed, 'physics_timestep': timestep},
+      {'max_steps': None}, num_envs=num_pushers, design=design,
   )  # fmt: skip
   env.reset()
   physics, task = env.physics, env.task
@@ -321,12 +325,16 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   for i in range(rounds):
     # Two domains, each with and without writes.
     domain = ('unlock_door', 'collect_apples')[i % 2]
-    for design in (USUAL_DESIGN, DESIGN):
+    for design, timestep in (
+        (USUAL_DESIGN, block_kinds.LONG_SUBSTEP),
+        (DESIGN, block_kinds.SHORT_SUBSTEP),
+    ):
       found = bulldoze(
           domain,
           max(1, steps // 2),
           seed + i,
           design=design,
+          timestep=timestep,
           is_written=i % 4 >= 2,
       )
       total = total.plus(found)

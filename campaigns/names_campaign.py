@@ -21,10 +21,10 @@ import numpy as np
 from campaigns import figure_lines
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.audit import aiming
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
-from realab_suite.experiments import aiming
 from realab_suite.feedback import specs
 from tests.engine import helpers
 

@@ -31,7 +31,6 @@ from realab_suite.engine import single_physics
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
-from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from tests import worlds
 
@@ -134,7 +133,7 @@ def make_world(
   avatar.make_graspable([*written.blocks, *other.blocks])
   apple = apple_group.Apples(number=1)
   apple.attach_to(arena)
-  arena.mjcf_model.option.timestep = block_kinds.timestep_for(written.blocks)
+  worlds.fit_substeps(arena, written.blocks)
   physics = worlds.compile_world(arena, single_physics.ThinPhysics)
   return World(physics, written, other, avatar, apple, size, place)
 

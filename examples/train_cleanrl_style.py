@@ -20,7 +20,7 @@ from torch import nn
 
 from realab_suite.interop.gymnasium import evaluation
 
-_WORLD = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_WORLD = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _OPTIONS: dict[str, Any] = {
     'overrides': ['dof=planar', 'action_set={name: dmlab_like, version: 1}'],
     'reward_register': 'reward',

@@ -21,7 +21,7 @@ from stable_baselines3.common import vec_env
 from realab_suite.experiments import gymnasium_report
 from realab_suite.interop.gymnasium import sb3
 
-_WORLD = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_WORLD = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _OPTIONS: dict[str, Any] = {
     'overrides': ['dof=planar', 'action_set={name: dmlab_like, version: 1}'],
     'reward_register': 'reward',

@@ -11,9 +11,9 @@ import numpy as np
 
 from pictures import views
 from realab_suite import suite
+from realab_suite.audit import aiming
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
-from realab_suite.experiments import aiming
 from realab_suite.experiments import tracking
 
 SIZE = (1200, 930)

@@ -362,7 +362,6 @@ def embed(
           ' allowed is a function of the physics'
       )
   mechanism = mechanisms.FeedbackMechanism(specs.load(design, overrides))
-  timestep = task.physics_timestep
   mechanism.attach_to(task.root_entity)
   try:
     return _connected(
@@ -372,7 +371,6 @@ def embed(
     # Allows embedding a corrected design in the same task.
     if isinstance(task, base.Task):
       task.remove_blocks(_blocks_of(mechanism))
-      task.physics_timestep = timestep
     else:
       for avatar in _avatars_of(task):
         avatar.forget(_blocks_of(mechanism))
@@ -410,11 +408,8 @@ def _connected(
   """Returns the environment of a task with an attached mechanism."""
   _connect_meters(task, mechanism, measurements)
   if isinstance(task, base.Task):
-    blocks = _blocks_of(mechanism)
-    task.add_blocks(blocks)
-    task.physics_timestep = min(
-        task.physics_timestep, block_kinds.timestep_for(blocks)
-    )
+    _check_blocks(task, mechanism)
+    task.add_blocks(_blocks_of(mechanism))
   else:
     for avatar in _avatars_of(task):
       avatar.make_graspable(_blocks_of(mechanism))
@@ -433,6 +428,30 @@ def _connected(
       placement.check_start(env.physics, task, mechanism)
     stack.pop_all()
   return env
+
+
+def _check_blocks(
+    task: base.Task, mechanism: mechanisms.FeedbackMechanism
+) -> None:
+  """Checks that the substeps of a task are short enough for all blocks.
+
+  The environment designer decides on the physics of a world. If the blocks of a
+  design changed the substeps, designs would not be compared in the same world.
+
+  Raises:
+    SpecError: If they are too long for a block.
+  """
+  for name, register in mechanism.registers.items():
+    for block in register.blocks:
+      misfit = block_kinds.find_misfit(block, task.physics_timestep)
+      if misfit is not None:
+        remedy = {'physics_timestep': block_kinds.SHORT_SUBSTEP}
+        raise errors.SpecError(
+            f'register {name!r}: {misfit.given}; the substeps of'
+            f' {1000 * task.physics_timestep:g} ms of the task {misfit.effect};'
+            f' allowed are {misfit.allowed}, and others if the task takes short'
+            f' substeps: task_kwargs={remedy}'
+        )
 
 
 def _connect_meters(

@@ -10,6 +10,8 @@ import yaml
 from pictures import notebooks
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.entities import appearance
+from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import measurements
 from realab_suite.feedback import objectives
@@ -53,6 +55,7 @@ def registries():
           providers.PROVIDERS._entries,
           register_kinds.REGISTER_KINDS._entries,
           action_sets.ACTION_SETS._entries,
+          appearance._CLASSES,
           suite._TASKS,
       )
   ]
@@ -95,11 +98,12 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
     assert printed.count("1.0 ('avatar', 'reward/base')\n") == 2
 
 
-def test_the_commands_of_the_page_on_audits_are_accepted():
+def test_the_commands_of_the_page_on_audits_are_accepted(monkeypatch):
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
   page = (_ROOT / 'docs/audit.md').read_text()
   [block] = re.findall(r'```bash\n(.*?)```', page, re.DOTALL)
   commands = block.replace('\\\n', ' ').strip().splitlines()
-  assert len(commands) == 2
+  verdicts = []
   for command in commands:
     *_, module = command.split(' --')[0].split()
     assert module == audit.__name__
@@ -108,10 +112,10 @@ def test_the_commands_of_the_page_on_audits_are_accepted():
         for word in command.split()
         if word.startswith('--') and not word.startswith('--output')
     ]
-    # The short episodes leave no time for an exploit.
-    ended = in_process.run(audit, *arguments, '--max_steps=3', '--budget=10')
-    assert (ended.status, ended.stderr) == (4, '')
-    assert ended.stdout.startswith('RESISTED WITHIN BUDGET')
+    ended = in_process.run(audit, *arguments, '--max_steps=40', '--budget=20')
+    assert ended.stderr == ''
+    verdicts.append(ended.status)
+  assert verdicts == [3, 0]
 
 
 @pytest.mark.camera

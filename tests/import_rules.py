@@ -23,6 +23,7 @@ _BELOW_SUITE = (
     'config', 'configs', 'entities', 'policies', 'feedback', 'tasks', 'engine',
     'evaluation',
 )  # fmt: skip
+_WITH_SUITE = (*_BELOW_SUITE, 'suite')
 _MAY_IMPORT = {
     '__init__': (),
     'archive': (),
@@ -50,25 +51,31 @@ _MAY_IMPORT = {
     # Nothing here may reach the true reward.
     'agents': (
         'config',
+        'entities.appearance',
         'feedback.objectives',
         'feedback.specs',
         'policies.action_sets',
     ),
     'suite': _BELOW_SUITE,
-    'interop': (*_BELOW_SUITE, 'suite'),
-    'experiments': (*_BELOW_SUITE, 'suite', 'agents', 'interop'),
-    'reports': (*_BELOW_SUITE, 'suite', 'agents', 'interop', 'experiments'),
+    'worlds': _WITH_SUITE,
+    'audit': (*_WITH_SUITE, 'worlds'),
+    'interop': _WITH_SUITE,
+    'experiments': (*_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop'),
+    'reports': (
+        *_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop', 'experiments',
+    ),
     # Runs and replays, and nothing that draws.
     'datasets': (
-        *_BELOW_SUITE,
-        'suite',
+        *_WITH_SUITE,
+        'worlds',
+        'audit',
         'experiments',
         'reports.replays',
         'reports.sweep_results',
     ),
     'launchers': (
-        *_BELOW_SUITE, 'suite', 'agents', 'interop', 'experiments', 'reports',
-        'datasets',
+        *_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop', 'experiments',
+        'reports', 'datasets',
     ),
     # Finds out which of them work.
     'doctor': ('experiments', 'launchers'),

@@ -1,5 +1,6 @@
 """Small worlds for tests, and what tests do to them."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from dm_control import composer
@@ -8,6 +9,7 @@ import mujoco
 import numpy as np
 
 from realab_suite.engine import single_physics
+from realab_suite.entities import block_kinds
 
 
 def compile_world(
@@ -15,6 +17,15 @@ def compile_world(
 ) -> mjcf.Physics:
   """Returns the physics of a world: anybody's, or this package's own."""
   return kind.from_mjcf_model(root.mjcf_model)
+
+
+def fit_substeps(root: composer.Entity, blocks: Iterable[Any]) -> None:
+  """Gives a world the longest substeps that its blocks are reliable with."""
+  long = block_kinds.LONG_SUBSTEP
+  is_long = all(block_kinds.find_misfit(b, long) is None for b in blocks)
+  root.mjcf_model.option.timestep = (
+      long if is_long else block_kinds.SHORT_SUBSTEP
+  )
 
 
 def step(physics: mjcf.Physics, steps: int = 1) -> None:

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.entities import appearance
 
-# Largest number of values of an integer that is encoded as one-hot.
-_MAX_CATEGORIES = 32
 # Distance at which the feature of a ray has fallen to 1 / e, in metres.
 _RAY_SCALE = 2.0
 _DISTANCES, _CLASSES = 'ray_distances', 'ray_classes'
@@ -34,6 +33,7 @@ class _Entry:
     low: Lower bound, for kinds that need one.
     high: Upper bound, for kinds that need one.
     partner: Key of the distances, for rays.
+    values: Values that have a feature each, for rays and one-hot encodings.
   """
 
   name: str
@@ -43,6 +43,7 @@ class _Entry:
   low: float = 0.0
   high: float = 0.0
   partner: str = ''
+  values: tuple[int, ...] = ()
 
 
 @final
@@ -54,6 +55,11 @@ class Encoder:
   decreases with its distance. Readings of registers are transformed by arcsinh,
   because they are unbounded if a block can be carried away. Integers with few
   values become one-hot. Other bounded numbers are scaled to [-1, 1].
+
+  Classes of objects have a feature for each code that their spec lists, or for
+  each code within the bounds if it lists none. Most of the codes that are
+  reserved never occur, and features for them would almost double the time of an
+  update.
 
   Attributes:
     entries: Encoding of each entry of the observation.
@@ -89,7 +95,7 @@ class Encoder:
   def vector_size(self) -> int:
     """Number of features, excluding images."""
     return sum(
-        int(np.prod(entry.shape)) * _values_per_element(entry)
+        int(np.prod(entry.shape)) * (len(entry.values) or 1)
         for entry in self.entries
         if entry.kind != 'image'
     )
@@ -140,8 +146,8 @@ def _features(
 ) -> jax.Array:
   """Returns the features of one entry of an observation."""
   if entry.kind in ('one_hot', 'rays'):
-    index = value.astype(jnp.int32) - int(entry.low)
-    one_hot = jax.nn.one_hot(index, _values_per_element(entry))
+    is_equal = value[..., jnp.newaxis] == jnp.array(entry.values)
+    one_hot = is_equal.astype(jnp.float32)
     if entry.kind == 'rays':
       distance = jnp.asarray(packed[entry.partner])
       one_hot *= jnp.exp(-distance / _RAY_SCALE)[..., jnp.newaxis]
@@ -151,11 +157,6 @@ def _features(
   if entry.kind == 'reading':
     return jnp.arcsinh(value)
   return value
-
-
-def _values_per_element(entry: _Entry) -> int:
-  is_one_of_many = entry.kind in ('one_hot', 'rays')
-  return int(entry.high - entry.low) + 1 if is_one_of_many else 1
 
 
 def _lead(
@@ -221,12 +222,21 @@ def _entry(name: str, spec: specs.Array, partner: str) -> _Entry:
     return _Entry(name, 'reading', spec.shape, 'float32')
   low, high = _bounds(spec)
   if partner:
-    return _Entry(name, 'rays', spec.shape, 'int32', low, high, partner)
+    values = _values(spec, low, high)
+    return _Entry(name, 'rays', spec.shape, 'int32', low, high, partner, values)
   if not (np.isfinite([low, high]).all() and low < high):
     return _Entry(name, 'plain', spec.shape, 'float32')
-  if dtype.kind in 'iu' and high - low < _MAX_CATEGORIES:
-    return _Entry(name, 'one_hot', spec.shape, 'int32', low, high)
+  if dtype.kind in 'iu' and high - low < appearance.CAPACITY:
+    values = _values(spec, low, high)
+    return _Entry(name, 'one_hot', spec.shape, 'int32', low, high, '', values)
   return _Entry(name, 'scaled', spec.shape, 'float32', low, high)
+
+
+def _values(spec: specs.Array, low: float, high: float) -> tuple[int, ...]:
+  """Returns the values of an integer that have a feature each."""
+  if isinstance(spec, appearance.ClassArray):
+    return spec.codes
+  return tuple(range(int(low), int(high) + 1))
 
 
 def _bounds(spec: specs.Array) -> tuple[float, float]:

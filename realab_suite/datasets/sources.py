@@ -7,6 +7,8 @@ import functools
 from typing import Any, NamedTuple, final
 
 from realab_suite import errors
+from realab_suite import worlds
+from realab_suite.audit import aiming
 from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
@@ -14,9 +16,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import traces
-from realab_suite.experiments import aiming
 from realab_suite.experiments import run_infos
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results

@@ -1,36 +1,31 @@
-"""Appearance of geoms: colours for cameras, class codes for the ray sense."""
+"""Appearance of geoms: colours for cameras, class codes for the ray sense.
 
-from typing import Any
+Each entity registers the classes of its geoms where it is defined:
 
+  ROCK = appearance.register('rock', code=31, rgba=(0.5, 0.5, 0.5, 1.0))
+
+and gives its geoms the attributes `geom_style(ROCK)`.
+"""
+
+from collections.abc import Sequence
+import dataclasses
+from typing import Any, final
+
+from dm_control import mjcf
+from dm_env import specs
 import numpy as np
 
-# The index of a name is the code that the ray sense reports. Append new classes
-# at the end, because the codes are part of the observation.
-CLASSES = (
-    'nothing',
-    'other',
-    'wall',
-    'barrier',
-    'door',
-    'pad',
-    'pressed_pad',
-    'apple',
-    'large_apple',
-    'base_block',
-    'offset_block',
-)
+from realab_suite import errors
 
-COLOURS = {
-    'wall': (0.42, 0.47, 0.56, 1.0),
-    'barrier': (0.55, 0.42, 0.60, 1.0),
-    'door': (0.45, 0.27, 0.12, 1.0),
-    'pad': (0.95, 0.55, 0.10, 1.0),
-    'pressed_pad': (0.15, 0.75, 0.30, 1.0),
-    'plate': (0.30, 0.30, 0.33, 1.0),
-    'apple': (0.85, 0.12, 0.12, 1.0),
-    'large_apple': (0.98, 0.80, 0.10, 1.0),
-    'avatar': (0.92, 0.92, 0.95, 1.0),
-}
+CAPACITY = 32
+"""Number of class codes. All observation specs reserve them, so that a new
+class changes no spec. Gymnasium's interface and the learners encode integers
+with up to this number of values as classes."""
+
+# Specs list the codes below this number in every world, so that one network
+# fits all variations of a task, and other codes only in worlds that contain
+# such objects. Networks have an input for each listed code: never change it.
+_NUM_LISTED = 11
 
 # Colours of the base block and the offset block of a register, by its role.
 ROLE_COLOURS = {
@@ -41,14 +36,117 @@ ROLE_COLOURS = {
     'memory': ((0.45, 0.20, 0.05, 1.0), (0.95, 0.60, 0.35, 1.0)),
 }
 
+_Colour = tuple[float, ...]
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class _Class:
+  """Class of objects.
+
+  Attributes:
+    code: Code that the ray sense reports.
+    rgba: Colour of its geoms; `None` if each geom has a colour of its own.
+  """
+
+  code: int
+  rgba: _Colour | None
+
+
+_CLASSES: dict[str, _Class] = {}
+
+
+def _checked_colour(where: str, rgba: Any) -> _Colour | None:
+  """Returns a colour as a tuple.
+
+  Raises:
+    SpecError: If it is neither a colour nor `None`.
+  """
+  if rgba is None:
+    return None
+  try:
+    colour = np.array(rgba, float)
+  except (TypeError, ValueError):
+    colour = np.zeros(0)
+  if colour.shape != (4,) or not ((0.0 <= colour) & (colour <= 1.0)).all():
+    raise errors.SpecError(
+        f'{where}: rgba {rgba!r:.80}; allowed are four numbers from 0 to 1, and'
+        ' None'
+    )
+  return tuple(colour.tolist())
+
+
+def register(
+    name: str, *, code: int, rgba: Sequence[float] | None = None
+) -> str:
+  """Registers a class of objects and returns its name.
+
+  The code is part of observations, so it never changes. This package assigns
+  codes in ascending order; other packages should begin with the largest.
+
+  Args:
+    name: Name of the class.
+    code: Code that the ray sense reports, an integer from 0 to `CAPACITY - 1`.
+    rgba: Colour of its geoms, `(4,)`, in [0, 1]; `None` if each geom has a
+      colour of its own.
+
+  Raises:
+    SpecError: If the name or the code is taken, or if an argument has a value
+      that is not allowed.
+  """
+  if not (isinstance(name, str) and name):
+    raise errors.SpecError(
+        f'class of objects: name {name!r:.80}; allowed are non-empty strings'
+    )
+  where = f'class of objects {name!r:.80}'
+  if name in _CLASSES:
+    raise errors.SpecError(
+        f'{where}: registered already, with code {_CLASSES[name].code}; allowed'
+        ' are new names'
+    )
+  owners = {one.code: owner for owner, one in _CLASSES.items()}
+  free = [i for i in range(CAPACITY) if i not in owners]
+  if type(code) is not int or code not in free:
+    owner = owners.get(code) if type(code) is int else None
+    taken = '' if owner is None else f' is that of {owner!r}'
+    raise errors.SpecError(
+        f'{where}: code {code!r:.80}{taken}; allowed are {free}'
+    )
+  _CLASSES[name] = _Class(code, _checked_colour(where, rgba))
+  return name
+
+
+OTHER = register('other', code=1)
+"""Class of geoms that have no other class."""
+
+NOTHING = register('nothing', code=0)
+"""Class that the ray sense reports for rays that hit nothing in their range."""
+
 
 def code(name: str) -> int:
   """Returns the code that the ray sense reports for the class `name`.
 
-  Args:
-    name: One of `CLASSES`.
+  Raises:
+    UnknownNameError: If no class of this name is registered.
   """
-  return CLASSES.index(name)
+  return _find(name).code
+
+
+def class_name(code: int) -> str:
+  """Returns the name of the class with a code.
+
+  Args:
+    code: Code that the ray sense reports.
+
+  Raises:
+    UnknownNameError: If no class with this code is registered.
+  """
+  for name, one in _CLASSES.items():
+    if one.code == code:
+      return name
+  raise errors.UnknownNameError(
+      f'class of objects with code {code!r:.80}: unknown; known are {_known()}'
+  )
 
 
 def geom_style(name: str, rgba: Any = None) -> dict[str, Any]:
@@ -58,13 +156,21 @@ def geom_style(name: str, rgba: Any = None) -> dict[str, Any]:
   any compiled model without its entities.
 
   Args:
-    name: One of `CLASSES`.
+    name: Name of a class.
     rgba: Colour; `None` for the colour of the class.
+
+  Raises:
+    SpecError: If there is no colour.
+    UnknownNameError: If no class of this name is registered.
   """
-  return {
-      'user': [code(name)],
-      'rgba': COLOURS[name] if rgba is None else rgba,
-  }
+  found = _find(name)
+  colour = found.rgba if rgba is None else rgba
+  if colour is None:
+    raise errors.SpecError(
+        f'class of objects {name!r:.80}: rgba None; allowed is a colour,'
+        ' because the class has none'
+    )
+  return {'user': [found.code], 'rgba': colour}
 
 
 def class_of_geoms(model: Any) -> np.ndarray:
@@ -73,7 +179,84 @@ def class_of_geoms(model: Any) -> np.ndarray:
   Geoms without a class, such as those of other packages, are `other`.
   """
   if not model.nuser_geom:
-    return np.full(model.ngeom, code('other'), np.int32)
+    return np.full(model.ngeom, code(OTHER), np.int32)
   codes = np.array(model.geom_user[:, 0], np.int32)
-  codes[(codes <= 0) | (codes >= len(CLASSES))] = code('other')
+  codes[~np.isin(codes, _codes_of_geoms())] = code(OTHER)
   return codes
+
+
+def listed_codes(root: mjcf.RootElement) -> tuple[int, ...]:
+  """Returns the codes that the ray sense of a world can report, in order.
+
+  Args:
+    root: Model of the world, with all entities attached.
+  """
+  found = {
+      int(geom.user[0])
+      for geom in root.find_all('geom')
+      if geom.user is not None
+  }
+  return tuple(
+      sorted(found.intersection(_codes_of_geoms()) | set(range(_NUM_LISTED)))
+  )
+
+
+@final
+class ClassArray(specs.BoundedArray):
+  """Spec of class codes, which also lists the codes that a world can contain.
+
+  The bounds are those of all codes that can be registered, so they are the same
+  in every world. The list lets learners omit inputs that would always be 0.
+  Like all subclasses of `BoundedArray`, it equals one with the same bounds.
+  """
+
+  __slots__ = ('_codes',)
+
+  def __init__(
+      self,
+      shape: Sequence[int],
+      codes: Sequence[int],
+      name: str | None = None,
+  ) -> None:
+    """Initializes the spec.
+
+    Args:
+      shape: Shape of the array.
+      codes: Codes of the classes that a world can contain.
+      name: Name of the array.
+    """
+    super().__init__(shape, np.int32, 0, CAPACITY - 1, name)
+    self._codes = tuple(codes)
+
+  @property
+  def codes(self) -> tuple[int, ...]:
+    """Codes of the classes that a world can contain."""
+    return self._codes
+
+  def __repr__(self) -> str:
+    return (
+        f'ClassArray(shape={self.shape}, dtype={self.dtype!r},'
+        f' name={self.name!r}, minimum={self.minimum}, maximum={self.maximum},'
+        f' codes={self.codes})'
+    )
+
+  def __reduce__(self) -> Any:
+    return ClassArray, (self.shape, self.codes, self.name)
+
+
+def _find(name: str) -> _Class:
+  if name not in _CLASSES:
+    raise errors.UnknownNameError(
+        f'class of objects {name!r:.80} is unknown; known are {_known()}'
+    )
+  return _CLASSES[name]
+
+
+def _known() -> list[str]:
+  return sorted(_CLASSES)
+
+
+def _codes_of_geoms() -> list[int]:
+  """Returns the registered codes that a geom can have."""
+  # MuJoCo fills up missing `user` numbers with 0, the code of `nothing`.
+  return [one.code for one in _CLASSES.values() if one.code != code(NOTHING)]

@@ -14,7 +14,12 @@ from realab_suite.entities import moving
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 
-_RADII = {'apple': 0.2, 'large_apple': 0.4}
+APPLE = appearance.register('apple', code=7, rgba=(0.85, 0.12, 0.12, 1.0))
+LARGE_APPLE = appearance.register(
+    'large_apple', code=8, rgba=(0.98, 0.80, 0.10, 1.0)
+)
+
+_RADII = {APPLE: 0.2, LARGE_APPLE: 0.4}
 # Height of eaten apples, in m: out of sight of rays and cameras.
 _GONE = -5.0
 
@@ -43,7 +48,7 @@ class Apples(measurables.MeasurableEntity):
       raise errors.SpecError(f'number: {number}; allowed are 1 and more')
     self._mjcf_root = mjcf.RootElement(model=name)
     self._eaten = state.Slot(self._mjcf_root, 'eaten', number)
-    self._kind = 'large_apple' if large else 'apple'
+    self._kind = LARGE_APPLE if large else APPLE
     radius = _RADII[self._kind]
     self._parts = [
         moving.MovingPart(

@@ -11,7 +11,11 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import appearance
+from realab_suite.entities import block_kinds
 from realab_suite.entities import surroundings
+
+WALL = appearance.register('wall', code=2, rgba=(0.42, 0.47, 0.56, 1.0))
+BARRIER = appearance.register('barrier', code=3, rgba=(0.55, 0.42, 0.60, 1.0))
 
 _WALL_THICKNESS = 0.2
 _WALL_HEIGHT = 1.0
@@ -19,7 +23,7 @@ _BARRIER_HEIGHT = 0.5
 # A block that is hit by a much heavier body leaves at twice its speed, fast
 # enough to fly over any wall that cameras can see across.
 _LID_HEIGHT = 3.0
-_UNSEEN = {'rgba': (0, 0, 0, 0), 'user': [appearance.code('nothing')]}
+_UNSEEN = appearance.geom_style(appearance.NOTHING, (0, 0, 0, 0))
 # Walls extend below the floor. Otherwise a small block that is forced into a
 # wall would leave it by the shortest way, which is down.
 _DEPTH = 0.5
@@ -105,7 +109,7 @@ class RoomArena(composer.Arena):
     super()._build(name)
     self._places: dict[str, Place] = {}
     root = self._mjcf_root
-    root.option.timestep = 0.025
+    root.option.timestep = block_kinds.LONG_SUBSTEP
     root.option.integrator = 'implicitfast'
     # A solver without islands couples bodies that are far apart. The noslip
     # pass, which Composer turns on, has no islands.
@@ -236,7 +240,7 @@ class RoomArena(composer.Arena):
       start: One end of its centre line, `(x, y)`, in m.
       end: Other end of its centre line, `(x, y)`, in m.
     """
-    self._add_box(name, 'barrier', start, end, _BARRIER_HEIGHT)
+    self._add_box(name, BARRIER, start, end, _BARRIER_HEIGHT)
 
   def add_table(
       self,
@@ -269,14 +273,14 @@ class RoomArena(composer.Arena):
     self._mjcf_root.worldbody.add(
         'geom', name=name, type='box',
         size=(size[0] / 2, size[1] / 2, (height + _DEPTH) / 2),
-        pos=(x, y, (height - _DEPTH) / 2), **appearance.geom_style('barrier'),
+        pos=(x, y, (height - _DEPTH) / 2), **appearance.geom_style(BARRIER),
     )  # fmt: skip
 
   def _add_wall(
       self, name: str, start: Sequence[float], end: Sequence[float]
   ) -> None:
     """Adds a wall with a centre line from `start` to `end`, in m."""
-    self._walls.append(self._add_box(name, 'wall', start, end, _WALL_HEIGHT))
+    self._walls.append(self._add_box(name, WALL, start, end, _WALL_HEIGHT))
 
   def _add_box(
       self,

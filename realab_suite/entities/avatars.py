@@ -9,7 +9,6 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 import numpy as np
 
-from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_contacts
 from realab_suite.entities import block_kinds
@@ -29,6 +28,7 @@ PROPRIOCEPTION = {
 # Names of the elements of an action; see `Avatar.apply_action`.
 ACTIONS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
 
+_COLOUR = (0.92, 0.92, 0.95, 1.0)
 _RADIUS = 0.25
 _HALF_HEIGHT = 0.35
 _CLEARANCE = 0.05
@@ -134,7 +134,7 @@ class Avatar(measurables.MeasurableEntity):
     self._torso = self._body.add(
         'geom', name='torso', type='cylinder', mass=_MASS,
         size=(_RADIUS, _HALF_HEIGHT), pos=(0, 0, _CLEARANCE + _HALF_HEIGHT),
-        rgba=appearance.COLOURS['avatar'], **_CONTACT
+        rgba=_COLOUR, **_CONTACT
     )  # fmt: skip
     self._head = self._body.add('body', name='head', pos=(0, 0, _EYE_HEIGHT))
     self._pitch = self._head.add(
@@ -143,7 +143,7 @@ class Avatar(measurables.MeasurableEntity):
     )  # fmt: skip
     self._head.add(
         'geom', name='head', type='sphere', size=(0.12,), mass=0.5,
-        contype=0, conaffinity=0, rgba=appearance.COLOURS['avatar'],
+        contype=0, conaffinity=0, rgba=_COLOUR,
     )  # fmt: skip
     # A nose, so that a video shows the direction in which the avatar faces.
     self._head.add(

@@ -7,12 +7,13 @@ register) only by writes.
 """
 
 import abc
-from collections.abc import Iterable, Sequence
-from typing import Any, final
+from collections.abc import Sequence
+from typing import Any, NamedTuple, final
 
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_contacts
 from realab_suite.entities import grasps
@@ -21,17 +22,22 @@ from realab_suite.entities import rotations
 from realab_suite.entities import state
 from realab_suite.entities import surroundings
 
+# Registers give their blocks colours, by role.
+BASE_BLOCK = appearance.register('base_block', code=9)
+OFFSET_BLOCK = appearance.register('offset_block', code=10)
+
 # Smallest edge length of a block in a design, in m. A thrown block lands at up
 # to 2.8 m/s, which is 28 mm in a substep of 10 ms. The centre of a block with
 # less than twice that edge length would be below the floor after the substep.
 LEAST_SIZE = 0.06
-# Substeps, in s, and the half edge lengths, in m, and masses, in kg, of blocks
-# for which the long one is reliable. With long ones, blocks of 6 cm or of 10 g
-# were pushed into the floor, and cubes of more than 0.5 m left other ones at up
-# to 3.3 m/s.
-_SUBSTEP, _SHORT_SUBSTEP = 0.025, 0.01
-_USUAL_SIZES = (0.075, 0.2)
+# Longest substeps of the physics for blocks of usual sizes and masses, and for
+# all others, in s. With long ones, blocks of 6 cm or of 10 g were pushed into
+# the floor, and cubes of more than 0.5 m left other ones at up to 3.3 m/s.
+LONG_SUBSTEP, SHORT_SUBSTEP = 0.025, 0.01
+# Usual edge lengths, in m, and the smallest usual mass, in kg.
+_USUAL_SIZES = (0.15, 0.4)
 _USUAL_MASS = 0.1
+_INTO_FLOOR = 'push such blocks into the floor'
 # Height at which an avatar carries a block, in m.
 GRIP_HEIGHT = 0.2
 # Gap between a planar block and the floor, in m, so that they never touch.
@@ -41,20 +47,44 @@ _HOVER = 0.004
 _PLANAR_FRICTION = 6.0
 
 
-def timestep_for(blocks: Iterable['Block']) -> float:
-  """Returns the duration of a substep of the physics, in s.
+@final
+class Misfit(NamedTuple):
+  """Reason for which a block needs shorter substeps, as parts of a message.
+
+  Attributes:
+    given: Size or mass of the block.
+    effect: Effect of the substeps on such blocks.
+    allowed: Sizes or masses that are allowed with these substeps.
+  """
+
+  given: str
+  effect: str
+  allowed: str
+
+
+def find_misfit(block: 'Block', timestep: float) -> Misfit | None:
+  """Returns why substeps are too long for a block; `None` if they are not.
 
   Args:
-    blocks: All blocks in the world.
+    block: The block.
+    timestep: Duration of a substep of the physics, in s.
   """
-  low, high = _USUAL_SIZES
-  is_usual = all(
-      low <= block.half_size <= high
-      # A mocap block has no mass.
-      and (block.geom.mass is None or block.geom.mass >= _USUAL_MASS)
-      for block in blocks
-  )
-  return _SUBSTEP if is_usual else _SHORT_SUBSTEP
+  if timestep <= SHORT_SUBSTEP:
+    return None
+  size, mass = 2 * block.half_size, block.geom.mass
+  least, most = _USUAL_SIZES
+  if not least <= size <= most:
+    return Misfit(
+        f'block_size {size:g} m',
+        _INTO_FLOOR if size < least else 'let such blocks eject others',
+        f'{least:g} to {most:g} m',
+    )
+  # A mocap block has no mass.
+  if mass is not None and mass < _USUAL_MASS:
+    return Misfit(
+        f'mass {mass:g} kg', _INTO_FLOOR, f'{_USUAL_MASS:g} kg and more'
+    )
+  return None
 
 
 class Block(abc.ABC):

@@ -13,6 +13,12 @@ from realab_suite.entities import moving
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 
+PAD = appearance.register('pad', code=5, rgba=(0.95, 0.55, 0.10, 1.0))
+PRESSED_PAD = appearance.register(
+    'pressed_pad', code=6, rgba=(0.15, 0.75, 0.30, 1.0)
+)
+
+_PLATE_COLOUR = (0.30, 0.30, 0.33, 1.0)
 _POST_RADIUS = 0.12
 # Distance by which a pressed post sinks, and height that remains, in m.
 _SINKS = 0.6
@@ -40,11 +46,11 @@ class PressurePad(measurables.MeasurableEntity):
     self._mjcf_root.worldbody.add(
         'geom', name='plate', type='cylinder', size=(radius, 0.005),
         pos=(0, 0, 0.006), contype=0, conaffinity=0,
-        rgba=appearance.COLOURS['plate'],
+        rgba=_PLATE_COLOUR,
     )  # fmt: skip
     self._radius = radius
     self._pressed = state.Slot(self._mjcf_root, 'pressed')
-    segments = (('pad', 0.0, _SINKS), ('pressed_pad', _SINKS, _SINKS + _STUB))
+    segments = ((PAD, 0.0, _SINKS), (PRESSED_PAD, _SINKS, _SINKS + _STUB))
     self._post = moving.MovingPart(
         f'{name}_post',
         [

@@ -87,7 +87,8 @@ class RaySense(composer.Entity):
 
   The rays are just above the floor, at the height of the blocks. They hit
   everything that a camera at that height would see, including geoms without
-  collisions, and report a class (`appearance.CLASSES`) instead of a colour.
+  collisions, and report the code of a class (`appearance.code`) instead of a
+  colour.
   """
 
   def _build(
@@ -118,7 +119,7 @@ class RaySense(composer.Entity):
     self._fan = np.cos(self._angles), np.sin(self._angles)
     self._max_distance = max_distance
     self._class_of_geom = np.zeros(0, np.int32)
-    self._nothing = appearance.code('nothing')
+    self._nothing = appearance.code(appearance.NOTHING)
     self._model: Any = None
 
   def _build_observables(self) -> RayObservables:
@@ -138,11 +139,6 @@ class RaySense(composer.Entity):
     """Range of the rays, in m."""
     return self._max_distance
 
-  @property
-  def num_classes(self) -> int:
-    """Number of classes that a ray can report, `nothing` included."""
-    return len(appearance.CLASSES)
-
   def sense(self, physics: protocols.Physics) -> tuple[np.ndarray, np.ndarray]:
     """Casts the rays.
 
@@ -150,8 +146,8 @@ class RaySense(composer.Entity):
       physics: One world or a batch of worlds.
 
     Returns:
-      Distances in [0, max_distance], float32, in m, and class codes, int32
-      indices into `appearance.CLASSES`, each `(..., rays)`.
+      Distances in [0, max_distance], float32, in m, and class codes, int32,
+      each `(..., rays)`.
     """
     if physics.model is not self._model:
       self._mount(physics)

@@ -11,6 +11,7 @@ import pydantic
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.config import option_types
@@ -18,7 +19,6 @@ from realab_suite.config import validation
 from realab_suite.engine import arguments
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import attribution
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]

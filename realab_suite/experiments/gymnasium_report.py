@@ -19,6 +19,8 @@ import yaml
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite import worlds
+from realab_suite.audit import aiming
 from realab_suite.config import messages
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
@@ -26,13 +28,11 @@ from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import aiming
 from realab_suite.experiments import machines
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import run_infos
 from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
-from realab_suite.experiments import worlds
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from realab_suite.interop.gymnasium import evaluation
@@ -79,7 +79,7 @@ def write(
 
   Args:
     name: Id of a world, such as
-      `'realab/UnlockDoor-near-InstantaneousReward-v2'`.
+      `'realab/UnlockDoor-near-InstantaneousReward-v3'`.
     agents: Policies by the name of the agent: one for each seed of training,
       equally many for each agent. Policy i acts in the episodes of seed
       `first_seed + i`. A verdict needs five.

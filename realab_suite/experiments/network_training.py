@@ -6,6 +6,7 @@ import dataclasses
 from importlib import metadata
 from typing import Any, final
 
+from dm_env import specs as dm_env_specs
 import numpy as np
 import tqdm
 
@@ -15,6 +16,7 @@ from realab_suite.agents import action_encoding
 from realab_suite.agents import base
 from realab_suite.agents import features
 from realab_suite.config import validation
+from realab_suite.entities import appearance
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
@@ -150,7 +152,7 @@ def _train(
   with contextlib.closing(batch):
     # The output of a supervisor must not depend on the state of registers.
     senses = {
-        name: spec
+        name: _without_gaps(spec)
         for name, spec in batch.observation_spec().items()
         if name.startswith('senses/')
     }
@@ -176,6 +178,15 @@ def _train(
       for part in encoder.entries
   )
   return seen, learner.state()['trained']
+
+
+def _without_gaps(spec: dm_env_specs.Array) -> dm_env_specs.Array:
+  """Returns a spec whose bounds alone determine its features, as in files."""
+  if not isinstance(spec, appearance.ClassArray):
+    return spec
+  return dm_env_specs.BoundedArray(
+      spec.shape, spec.dtype, 0, max(spec.codes), spec.name
+  )
 
 
 def _versions() -> dict[str, str]:

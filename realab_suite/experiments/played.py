@@ -13,6 +13,7 @@ import time
 from typing import Any, final
 
 from realab_suite import policies
+from realab_suite import worlds
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
@@ -25,7 +26,6 @@ from realab_suite.experiments import run_infos
 from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 from realab_suite.interop.browser import keyboards
 from realab_suite.interop.browser import servers

@@ -18,19 +18,19 @@ import yaml
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite import worlds
+from realab_suite.audit import aiming
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
-from realab_suite.experiments import aiming
 from realab_suite.experiments import machines
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import run_infos
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 
 

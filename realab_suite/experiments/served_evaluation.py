@@ -15,6 +15,7 @@ from typing import Any, final
 from absl import logging
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.engine import environment
 from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
@@ -26,7 +27,6 @@ from realab_suite.experiments import run_infos
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 from realab_suite.interop.rpc import agent_process
 from realab_suite.interop.rpc import agent_server

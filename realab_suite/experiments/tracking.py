@@ -24,7 +24,7 @@ class Shape(NamedTuple):
   """Outline of an object in the world, seen from above.
 
   Attributes:
-    kind: Class of the object, one of `appearance.CLASSES`.
+    kind: Class of the object, see `appearance.class_name`.
     colour: Red, green, blue and opacity.
     outline: Positions of its corners, `(corners, 2)`, in metres.
   """
@@ -241,7 +241,7 @@ class Tracker(events.EventSink):
     kinds = appearance.class_of_geoms(model)
     return [
         Shape(
-            appearance.CLASSES[kinds[i]],
+            appearance.class_name(kinds[i]),
             tuple(model.geom_rgba[i]),
             _outline(
                 model.geom_type[i],

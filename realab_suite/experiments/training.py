@@ -31,12 +31,12 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
 from realab_suite.experiments import jobs
+from realab_suite.experiments import kept_stakes
 from realab_suite.experiments import learners
 from realab_suite.experiments import machines
 from realab_suite.experiments import progress
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
-from realab_suite.experiments import worlds
 
 EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
@@ -225,7 +225,7 @@ def _write_rows(
     output: pathlib.Path,
 ) -> None:
   """Writes the rows of episodes, with the stakes of the design."""
-  stake = worlds.stakes_of(job.experiment.world, job.design, output)
+  stake = kept_stakes.stakes_of(job.experiment.world, job.design, output)
   info = job.info(batch.task.control_timestep)
   lines = [results.line(results.row(info, one, stake)) for one in found]
   storage.write_whole(path, b''.join(lines))

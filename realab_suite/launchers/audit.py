@@ -5,13 +5,20 @@ r"""Audits a design: searches for an exploit of its feedback, without training.
 
 The program prints a report. The exit status is 3 if the design is EXPLOITABLE,
 0 if it RESISTED WITHIN BUDGET, 4 if it resisted a budget that was too small for
-the scripted saboteurs, and 2 if the command is wrong. With `--output`, the
-folder gets `audit.json` and, if a renderer works, a film of the exploit.
+all scripted saboteurs and the search after them, and 2 if the command is wrong.
+With `--output`, the folder gets `audit.json` and, if a renderer works, a film
+of the exploit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+import dataclasses
+import pathlib
+import shlex
+from typing import Any
 
 from absl import flags
+import tqdm
 
 from realab_suite.experiments import requirements
 from realab_suite.launchers import program
@@ -28,61 +35,131 @@ flags.adopt_module_key_flags(seed_flag)
 _BUDGET = flags.DEFINE_integer(
     'budget',
     None,
-    'Largest number of episodes of the search. Default: 2000, or 200 if all'
-    ' registers are welded or secure.',
+    'Largest number of episodes of the search. Default: 1200, or more if the'
+    ' design has many registers.',
     lower_bound=10,
     upper_bound=1_000_000,
 )
+_FILM = flags.DEFINE_boolean('film', True, 'Films an exploit that was found.')
+
+REPORT = 'audit.json'
+_FILM_NAME = 'exploit.mp4'
 # Exit statuses; Python uses 1 for exceptions.
 _EXPLOITABLE = 3
 _TOO_SMALL = 4
-_FILM = flags.DEFINE_boolean('film', True, 'Films an exploit that was found.')
+# Flags that a repeated audit does not need.
+_NOT_REPEATED = ('output', 'film', 'verbosity', 'v')
 
 
 def main(argv: Sequence[str]) -> int:
   """Runs the audit that the flags describe, and returns the exit status."""
   del argv
-  has_film = bool(_FILM.value and output_flag.OUTPUT.value)
-  if has_film:
-    problem = (
-        requirements.missing('imageio', 'av', 'PIL')
-        or renderers.choose_renderer()
-    )
-    if problem is not None:
-      program.say(f'the film is skipped: {problem}')
-      has_film = False
+  has_film = _has_film()
   if not has_film:
     renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.experiments import audit
-  from realab_suite.experiments import audit_run
-  from realab_suite.experiments import audit_worlds
+  from realab_suite import worlds
+  from realab_suite.audit import audits
+  from realab_suite.audit import findings
+  from realab_suite.evaluation import results
+  from realab_suite.experiments import scripted
+  from realab_suite.experiments import storage
   from realab_suite.feedback import specs
 
   imports_flag.load()
-  domain, task = world_flags.world()
-  settings = audit.Settings(
-      world=audit_worlds.World(
-          domain,
-          task,
-          world_flags.MAX_STEPS.value,
-          world_flags.task_kwargs(),
-          world_flags.senses(),
-      ),
+  world = worlds.World(
+      *world_flags.world(),
+      world_flags.MAX_STEPS.value,
+      world_flags.task_kwargs(),
+      world_flags.senses(),
+  )
+  settings = audits.Settings(
+      world=world,
       design=specs.load(world_flags.DESIGN.value, world_flags.SET.value),
       seed=seed_flag.SEED.value,
       budget=_BUDGET.value,
       target=world_flags.TARGET.value,
   )
-  film = None
-  if has_film:
-    from realab_suite.reports import films
-
-    film = films.beside_each_other
-  found = audit_run.run(settings, output_flag.OUTPUT.value, program.say, film)
-  if found.verdict == audit.EXPLOITABLE:
+  with _progress() as on_progress:
+    auditor = audits.Auditor(settings, on_progress)
+    output, folder = output_flag.OUTPUT.value, None
+    if output is not None:
+      folder = scripted.make_folder(output)
+    found = auditor.run()
+  program.say(findings.words(found, _command()))
+  if folder is not None:
+    film = None
+    if has_film and found.is_exploitable:
+      film = folder / _FILM_NAME
+      _write_film(auditor, found, settings.design.name, film)
+      program.say(f'The film of world {found.film_world} is {film}')
+    content = {
+        'kind': 'audit',
+        'schema': 2,
+        'world': dataclasses.asdict(world),
+        'design': settings.design.to_mapping(),
+        'seed': settings.seed,
+        'target': settings.target,
+        **found.model_dump(mode='json'),
+        'film': film and str(film),
+        'versions': results.versions(),
+    }
+    storage.write_json(folder / REPORT, content)
+    program.say(f'Results are in {folder}')
+  if found.is_exploitable:
     return _EXPLOITABLE
-  return _TOO_SMALL if found.num_untested else 0
+  return 0 if found.is_sufficient else _TOO_SMALL
+
+
+def _has_film() -> bool:
+  """Returns True if a film is wanted and possible."""
+  if not (_FILM.value and output_flag.OUTPUT.value):
+    return False
+  problem = (
+      requirements.missing('imageio', 'av', 'PIL')
+      or renderers.choose_renderer()
+  )
+  if problem is not None:
+    program.say(f'the film is skipped: {problem}')
+  return problem is None
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+  """Yields a function that shows the progress of an audit."""
+  with tqdm.tqdm(disable=None, unit='episode', leave=False) as bar:
+
+    def show(phase: str, searched: int, budget: int) -> None:
+      if bar.disable:  # Without a terminal, lines replace the progress bar.
+        program.say(f'{phase}: {searched} of {budget} episodes')
+        return
+      bar.total, bar.n = budget, searched
+      bar.set_description(phase)
+
+    yield show
+
+
+def _command() -> str:
+  """Returns a command that repeats the audit."""
+  words = ['python', '-m', 'realab_suite.launchers.audit']
+  for name in flags.FLAGS:
+    flag = flags.FLAGS[name]
+    if flag.present and name not in _NOT_REPEATED:
+      words += flag.serialize().splitlines()
+  return shlex.join(words)
+
+
+def _write_film(
+    auditor: Any, found: Any, title: str, path: pathlib.Path
+) -> None:
+  """Repeats the plan in one world of the comparison, and films it."""
+  from realab_suite.evaluation import evaluate
+  from realab_suite.experiments import tracking
+  from realab_suite.reports import films
+
+  with auditor.repeated(found) as (env, policy):
+    with films.beside_each_other(env, path, f'{title}: exploit') as add:
+      evaluate.evaluate(env, policy, 1, sinks=[tracking.Tracker(env, add)])
 
 
 if __name__ == '__main__':

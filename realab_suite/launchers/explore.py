@@ -89,7 +89,7 @@ def _unused(stem: str) -> str:
 def _loaded() -> Iterator[tuple[Any, Any]]:
   """Yields the environment and the policy that the flags name."""
   from realab_suite import suite
-  from realab_suite.experiments import aiming
+  from realab_suite.audit import aiming
 
   env = suite.load(
       *world_flags.world(),

@@ -91,8 +91,8 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
     SpecError: If a design, a policy or a task does not exist.
   """
   from realab_suite import policies
+  from realab_suite import worlds
   from realab_suite.datasets import sources
-  from realab_suite.experiments import worlds
   from realab_suite.feedback import specs
 
   for policy in scripted_flags.POLICIES.value:

@@ -29,9 +29,9 @@ def main(argv: Sequence[str]) -> None:
     raise errors.SpecError('--target has no effect here')
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite import worlds
   from realab_suite.evaluation import stakes
   from realab_suite.experiments import result_tables
-  from realab_suite.experiments import worlds
   from realab_suite.feedback import specs
 
   imports_flag.load()

@@ -65,12 +65,12 @@ def main(argv: Sequence[str]) -> None:
   if problem is not None:
     raise errors.ResultsError(f'cannot show the world: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite.experiments import aiming
+  from realab_suite import worlds
+  from realab_suite.audit import aiming
   from realab_suite.experiments import scripted
   from realab_suite.experiments import storage
   from realab_suite.experiments import supervised
   from realab_suite.experiments import supervised_designs
-  from realab_suite.experiments import worlds
   from realab_suite.feedback import specs
   from realab_suite.interop.browser import servers
 

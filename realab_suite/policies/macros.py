@@ -1,24 +1,25 @@
-"""Macro-actions on blocks of registers: push, carry, throw, wait, seek.
+"""Macro-actions on blocks of registers: push, carry, throw, wait, solve.
 
 A plan is a sequence of macro-actions, which is repeated until the episode ends.
 Worlds of a batch can have different plans, so a search evaluates many at once.
 """
 
+from collections.abc import Sequence
 import math
 from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from realab_suite.policies import apple_seeker
+from realab_suite import errors
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 from realab_suite.policies import saboteurs
 
-VERBS = ('wait', 'push', 'carry', 'throw', 'seek')
+VERBS = ('wait', 'push', 'carry', 'throw', 'solve')
 """Kinds of macro-actions. An avatar that waits keeps the block in its hand; one
-that seeks does the task as the apple seeker does."""
+that solves does the task as its solver does."""
 
-_WAIT, _PUSH, _CARRY, _THROW, _SEEK = range(len(VERBS))
+_WAIT, _PUSH, _CARRY, _THROW, _SOLVE = range(len(VERBS))
 
 FOREVER = 1_000_000
 """Duration of a macro-action that lasts until the episode ends."""
@@ -51,11 +52,7 @@ class Plan(NamedTuple):
   side: np.ndarray
   duration: np.ndarray
 
-  def of(self, world: int) -> 'Plan':
-    """Returns the plan of one world."""
-    return Plan(*(part[world] for part in self))
-
-  def words(self, blocks: list[str]) -> list[str]:
+  def words(self, blocks: Sequence[str]) -> list[str]:
     """Describes the plan of one world, a phrase for each macro-action.
 
     Args:
@@ -64,7 +61,7 @@ class Plan(NamedTuple):
     phrases = []
     for verb, block, angle, _, duration in zip(*self, strict=True):
       time = '' if duration >= FOREVER else f' for {int(duration)} steps'
-      if verb in (_WAIT, _SEEK):
+      if verb in (_WAIT, _SOLVE):
         what = 'wait' if verb == _WAIT else 'do the task'
         phrases.append(f'{what}{time}')
         continue
@@ -76,11 +73,16 @@ class Plan(NamedTuple):
     return phrases
 
 
-def forever(verb: str, block: int, angle: float) -> Plan:
+def of_saboteur(verb: str, block: int, angle: float) -> Plan:
   """Returns the plan of a saboteur, one macro-action, for one world.
 
   The hand approaches from the side towards which it moves the block, as the
   scripted saboteurs do.
+
+  Args:
+    verb: One of `VERBS`.
+    block: Index of the block.
+    angle: Direction of its motion in the world, radians.
   """
   return Plan(
       np.array([VERBS.index(verb)]),
@@ -91,7 +93,24 @@ def forever(verb: str, block: int, angle: float) -> Plan:
   )
 
 
-def stack(plans: list[Plan]) -> Plan:
+def of_solver() -> Plan:
+  """Returns the plan that only does the task, for one world."""
+  return of_saboteur('solve', 0, 0.0)
+
+
+def then_solve(plan: Plan, duration: int) -> Plan:
+  """Returns a plan that does the task after another one.
+
+  Args:
+    plan: Plan of one macro-action, for one world.
+    duration: Number of steps of that macro-action.
+  """
+  first = plan._replace(duration=np.array([duration]))
+  parts = zip(first, of_solver(), strict=True)
+  return Plan(*(np.concatenate(both) for both in parts))
+
+
+def stack(plans: Sequence[Plan]) -> Plan:
   """Returns plans of single worlds as the plan of a batch.
 
   Shorter plans are filled up with their own macro-actions.
@@ -112,22 +131,39 @@ class MacroPolicy(base.Policy):
   The initial positions of blocks are arguments. They are then tracked by sight.
   """
 
-  def __init__(self, plan: Plan, starts: np.ndarray, codes: np.ndarray) -> None:
+  def __init__(
+      self,
+      plan: Plan,
+      starts: np.ndarray,
+      codes: np.ndarray,
+      solver: base.Policy,
+  ) -> None:
     """Makes the policy.
 
     Args:
       plan: Plans, for one world or for each world.
       starts: Initial positions of the blocks, `(..., blocks, 2)`, metres.
       codes: Class that rays report for each block, `(blocks,)`, int.
+      solver: Policy that does the task.
+
+    Raises:
+      SpecError: If the solver has another action set.
     """
+    if solver.action_set != self.action_set:
+      raise errors.SpecError(
+          f'solver {type(solver).__name__} has action set'
+          f' {solver.action_set.key!r}; allowed is {self.action_set.key!r},'
+          ' which plans use'
+      )
     self._plan = plan
     self._starts = np.asarray(starts, float)
     self._codes = np.asarray(codes)
-    self._seeker = apple_seeker.AppleSeeker()
+    self._solver = solver
 
   @property
   def required_senses(self) -> tuple[str, ...]:
-    return (*navigation.SENSES, 'holding')
+    own = (*navigation.SENSES, 'holding')
+    return tuple(dict.fromkeys((*own, *self._solver.required_senses)))
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     shape = (*batch_shape, *self._starts.shape[-2:])
@@ -143,7 +179,7 @@ class MacroPolicy(base.Policy):
         # Index of the block in the hand.
         'held': np.full(batch_shape, _NOTHING),
         **navigation.initial_rest(batch_shape),
-        'seeker': self._seeker.initial_state(batch_shape),
+        'solver': self._solver.initial_state(batch_shape),
     }
 
   def step(
@@ -155,7 +191,7 @@ class MacroPolicy(base.Policy):
   ) -> tuple[np.ndarray, Any]:
     start = np.asarray(episode_start)
     memory = dict(state)
-    seeker = memory.pop('seeker')
+    solver = memory.pop('solver')
     memory = navigation.restarted(
         start, self.initial_state(start.shape), memory
     )
@@ -179,10 +215,10 @@ class MacroPolicy(base.Policy):
         _pick(memory['gone'], index), mine,
     )  # fmt: skip
     wait = np.full(start.shape, navigation.action('wait'))
-    seeks, seek = verb == _SEEK, wait
-    if seeks.any():
-      seek, seeker = self._seeker.step(
-          observation, start | (memory['elapsed'] == 0), key, seeker
+    solves, solve = verb == _SOLVE, wait
+    if solves.any():
+      solve, solver = self._solver.step(
+          observation, start | (memory['elapsed'] == 0), key, solver
       )
     action = np.choose(
         verb,
@@ -191,13 +227,13 @@ class MacroPolicy(base.Policy):
             saboteurs.push(view, aim, block),
             saboteurs.carry(view, aim, block, mine),
             saboteurs.throw(view, aim, block, mine),
-            seek,
+            solve,
         ],
     )
-    idle = (verb == _WAIT) | seeks
+    idle = (verb == _WAIT) | solves
     action = np.where(idle, action, saboteurs.search(gone, action))
     # The hand is needed for another block, or for none.
-    drops = holds & (verb != _WAIT) & (~mine | (verb == _PUSH) | seeks)
+    drops = holds & (verb != _WAIT) & (~mine | (verb == _PUSH) | solves)
     action = np.where(drops, navigation.action('let_go'), action)
     near = view.locate_one(block)[0] < _TOUCHES
     memory |= {
@@ -211,9 +247,9 @@ class MacroPolicy(base.Policy):
             view, memory, holds | (action == navigation.action('wait'))
         ),
     }
-    # The seeker has its own way to leave a place where it is stuck.
+    # The solver has its own way to leave a place where it is stuck.
     freed = navigation.unless_stuck(view, memory['still'], action)
-    return np.where(seeks, action, freed), {**memory, 'seeker': seeker}
+    return np.where(solves, action, freed), {**memory, 'solver': solver}
 
   def _advanced(self, memory: Any, holds: np.ndarray) -> dict[str, np.ndarray]:
     """Returns the number of the macro-action, and the counts of its steps."""

@@ -11,6 +11,11 @@ from typing import final
 import numpy as np
 
 from realab_suite.entities import appearance
+from realab_suite.entities import apple_group
+from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
+from realab_suite.entities import doors
+from realab_suite.entities import pads
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 
@@ -21,16 +26,21 @@ _FIELD_OF_VIEW = np.radians(160.0)
 # Distance between the middle of the avatar and obstacles, metres. The radius of
 # the avatar is 0.25. Blocks get a wider berth, because they can be pushed.
 _BERTHS = {
-    'other': 0.3,
-    'wall': 0.3,
-    'barrier': 0.3,
-    'door': 0.3,
-    'pad': 0.34,
-    'pressed_pad': 0.34,
-    'base_block': 0.42,
-    'offset_block': 0.42,
+    arenas.WALL: 0.3,
+    arenas.BARRIER: 0.3,
+    doors.DOOR: 0.3,
+    pads.PAD: 0.34,
+    pads.PRESSED_PAD: 0.34,
+    block_kinds.BASE_BLOCK: 0.42,
+    block_kinds.OFFSET_BLOCK: 0.42,
+    # No obstacles.
+    appearance.NOTHING: -1.0,
+    apple_group.APPLE: -1.0,
+    apple_group.LARGE_APPLE: -1.0,
 }
-_BERTH = np.array([_BERTHS.get(name, -1.0) for name in appearance.CLASSES])
+# By code. Objects of all other classes may be in the way.
+_BERTH = np.full(appearance.CAPACITY, 0.3)
+_BERTH[[appearance.code(name) for name in _BERTHS]] = list(_BERTHS.values())
 # An obstacle within its berth is passed at this fraction of its distance, but
 # not closer than `_TIGHT`, metres.
 _SQUEEZE = 0.85

@@ -1,4 +1,4 @@
-"""Scripted policies that tamper: they move the base block of a register."""
+"""Scripted policies that tamper: they move a block of a register."""
 
 import abc
 from typing import Annotated, Any, NamedTuple, final
@@ -41,6 +41,9 @@ _ALIGNED = 0.5
 # Larger ones make the arithmetic of a step overflow.
 _Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 _Vector = tuple[_Coordinate, _Coordinate]
+_Code = Annotated[int, pydantic.Field(ge=1, le=255)]
+# In place of a class, until the block is found; no ray reports it.
+_UNKNOWN = -1
 
 
 @final
@@ -62,7 +65,7 @@ class Aim(NamedTuple):
 
 
 class Saboteur(base.Policy, abc.ABC):
-  """Base class of policies that move the base block of a register.
+  """Base class of policies that move a block of a register.
 
   The initial position of the block is an argument. It is then tracked by sight.
   """
@@ -71,17 +74,23 @@ class Saboteur(base.Policy, abc.ABC):
       self,
       target: _Vector = (1.4, -2.2),
       direction: _Vector = (-1.0, 0.0),
+      code: _Code | None = None,
   ) -> None:
     """Makes the policy.
 
     Args:
-      target: Initial position of the base block, `(x, y)`, metres.
-      direction: Unit vector of motions that raise the reading: `(-1, 0)` for a
-        register with its axis along x.
+      target: Initial position of the block, `(x, y)`, metres.
+      direction: Unit vector of the intended motion, which should raise the
+        reading: `(-1, 0)` for the base block of a register with its axis along
+        x.
+      code: Class that rays report for the block; see `appearance.code`. `None`
+        for a base block, or an offset block where no base block is found: that
+        of a register of one block.
 
     Raises:
       SpecError: If the length of `direction` is not 1.
     """
+    self._code = _UNKNOWN if code is None else code
     along = np.array(direction, float)
     if not np.isclose(np.linalg.norm(along), 1.0):
       raise errors.SpecError(
@@ -92,11 +101,12 @@ class Saboteur(base.Policy, abc.ABC):
         direction=along,
         # The offset block stands beside it at first: the free side.
         side=along,
-        code=np.array(appearance.code('base_block')),
+        code=np.array(self._code),
     )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return {
+        'code': np.full(batch_shape, self._code),
         # Last known position of the block.
         'block': np.broadcast_to(self._aim.start, (*batch_shape, 2)).copy(),
         # Number of steps since it was missing there.
@@ -120,12 +130,15 @@ class Saboteur(base.Policy, abc.ABC):
     memory = navigation.restarted(start, self.initial_state(()), state)
     view = navigation.view(observation)
     holds = np.asarray(observation['senses/holding'])[..., 0] > 0
-    block, gone = track(
-        view, self._aim.code, memory['block'], memory['gone'], holds
-    )
+    code = memory['code']
+    if self._code == _UNKNOWN:
+      found = _class_of(view, code, memory['block'], memory['gone'])
+      code = np.where(holds, code, found)
+    block, gone = track(view, code, memory['block'], memory['gone'], holds)
     action = search(gone, self._act(view, block, holds))
     content = holds | (action == navigation.action('wait'))
     memory = {
+        'code': code,
         'block': block,
         'gone': gone,
         **navigation.rest(view, memory, content),
@@ -277,6 +290,40 @@ def search(gone: np.ndarray, action: np.ndarray) -> np.ndarray:
 def _along(vector: np.ndarray, direction: np.ndarray) -> np.ndarray:
   """Returns the components of vectors, `(..., 2)`, along a direction."""
   return (vector * direction).sum(axis=-1)
+
+
+def _class_of(
+    view: navigation.View,
+    code: np.ndarray,
+    block: np.ndarray,
+    gone: np.ndarray,
+) -> np.ndarray:
+  """Returns the class of the block that stands at a place, `(...)`, int.
+
+  An offset block counts only at the place itself, unless the search area is
+  large, and only until a base block is seen near it: offset blocks stand beside
+  base blocks and may hide them.
+
+  Args:
+    view: View of the avatar.
+    code: Class so far, `(...)`, int.
+    block: Last known position of the block, `(..., 2)`, metres.
+    gone: Number of steps since it was missing there, `(...)`.
+  """
+  base_code, offset_code = map(appearance.code, ('base_block', 'offset_block'))
+  gaps = np.linalg.norm(
+      view.points(_HALF_BLOCK) - block[..., np.newaxis, :], axis=-1
+  )
+  is_far = gone >= _FLIGHT
+
+  def sees(code: int, radius: float) -> np.ndarray:
+    reach = np.where(is_far, _FAR, radius)[..., np.newaxis]
+    seen = (view.classes == code) & (gaps < reach)
+    return np.asarray(seen.any(axis=-1))
+
+  found = np.where(sees(offset_code, _HALF_BLOCK), offset_code, code)
+  found = np.where(sees(base_code, _NEAR), base_code, found)
+  return np.where(code == base_code, code, found)
 
 
 def track(

@@ -10,15 +10,17 @@ import pathlib
 from typing import Any
 
 from realab_suite import errors
+from realab_suite.audit import findings
+from realab_suite.evaluation import actors
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import audit
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.reports import sweep_results
 
-# Keys of a design that do not change what can be exploited.
+# Keys of a design that do not change what can be exploited. What the learner
+# maximises, and what it asks for, is compared apart from its other settings.
 _FREE = frozenset({'name', 'description', 'learner'})
-_IS_EXPLOITABLE = {audit.EXPLOITABLE: True, audit.RESISTED: False}
+_VERDICTS = (findings.EXPLOITABLE, findings.RESISTED)
 
 
 def check_names(sweep: sweep_results.Sweep) -> None:
@@ -58,17 +60,29 @@ def of_run(
   content = storage.read_json(path)
   if not isinstance(content, dict):
     raise errors.ResultsError(f'{path}: not an audit; allowed is a JSON object')
-  verdict = content.get('verdict')
-  if not isinstance(verdict, str) or verdict not in _IS_EXPLOITABLE:
+  for key, kind in (
+      ('verdict', str),
+      ('is_sufficient', bool),
+      ('num_searched', int),
+      ('world', dict),
+      ('design', dict),
+      ('objective', dict),
+  ):
+    if not isinstance(content.get(key), kind):
+      raise errors.ResultsError(
+          f'{path}: {key}: {content.get(key)!r:.80}; allowed is that of a file'
+          ' that the present version of the program audit has written'
+      )
+  if content['verdict'] not in _VERDICTS:
     raise errors.ResultsError(
-        f'{path}: verdict: {verdict!r:.80}; allowed are'
-        f' {sorted(_IS_EXPLOITABLE)}'
+        f'{path}: verdict: {content["verdict"]!r:.80}; allowed are'
+        f' {sorted(_VERDICTS)}'
     )
   _check_subject(path, content, run)
   return verdicts.Audit(
-      _IS_EXPLOITABLE[verdict],
-      not content.get('num_untested'),
-      int(content.get('num_searched', 0)),
+      is_exploitable=content['verdict'] == findings.EXPLOITABLE,
+      is_sufficient=content['is_sufficient'],
+      num_episodes=content['num_searched'],
   )
 
 
@@ -77,38 +91,50 @@ def _check_subject(
 ) -> None:
   """Checks that an audit is of the design and the world of a run.
 
-  Other settings of the learner than its kind are those of training, and may
-  differ.
+  Settings of the learner that neither change its objective nor its queries are
+  those of training, and may differ.
 
   Raises:
     ResultsError: If it is not, or is of one register only.
   """
-  world, design = content.get('world'), content.get('design')
-  if not isinstance(world, Mapping) or not isinstance(design, Mapping):
-    raise errors.ResultsError(
-        f'{path}: world or design is missing; allowed is a file that the'
-        ' program audit has written'
-    )
-  ours = json.loads(json.dumps(run.design.to_mapping()))
+  world, design = content['world'], content['design']
+  task = f'{world.get("domain")}.{world.get("task")}'
   senses = run.config.get('environment_kwargs', {}).get('senses')
-  kinds = [(one.get('learner') or {}).get('kind') for one in (design, ours)]
-  differences = [
-      f'{key} is {theirs!r:.80}, and {own!r:.80} in the run'
-      for key, theirs, own in (
-          ('task', f'{world.get("domain")}.{world.get("task")}',
-           run.config['task']),
-          ('max_steps', world.get('max_steps'), run.config['max_steps']),
-          ('task_kwargs', world.get('task_kwargs'),
-           run.config.get('task_kwargs', {})),
-          ('senses', world.get('senses'), senses and list(senses)),
-          ('target', content.get('target'), None),
-          ('design.learner.kind', *kinds),
-          *((f'design.{key}', design.get(key), ours.get(key))
-            for key in sorted({*ours, *design} - _FREE)),
+  ours = json.loads(json.dumps(run.design.to_mapping()))
+  objective = run.design.objective
+  pairs = [
+      ('task', task, run.config['task']),
+      ('max_steps', world.get('max_steps'), run.config['max_steps']),
+      (
+          'task_kwargs',
+          world.get('task_kwargs'),
+          run.config.get('task_kwargs', {}),
+      ),
+      ('senses', world.get('senses'), senses and list(senses)),
+      ('target', content.get('target'), None),
+      (
+          'design.learner.kind',
+          (design.get('learner') or {}).get('kind'),
+          (ours.get('learner') or {}).get('kind'),
+      ),
+      (
+          'the objective',
+          content['objective'],
+          objective and json.loads(objective.model_dump_json()),
+      ),
+      (
+          'the query policy',
+          content.get('query_policy'),
+          actors.query_policy(run.design),
+      ),
+      *(
+          (f'design.{key}', design.get(key), ours.get(key))
+          for key in sorted({*ours, *design} - _FREE)
+      ),
+  ]
+  for what, theirs, own in pairs:
+    if theirs != own:
+      raise errors.ResultsError(
+          f'{path}: the audit is not of run {run.name!r}: {what} is'
+          f' {theirs!r:.120}, and {own!r:.120} in the run'
       )
-      if theirs != own
-  ]  # fmt: skip
-  if differences:
-    raise errors.ResultsError(
-        f'{path}: the audit is not of run {run.name!r}: {differences[0]}'
-    )

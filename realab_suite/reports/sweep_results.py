@@ -14,13 +14,13 @@ from typing import Annotated, Any, final
 import pydantic
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 
 REPLAYS = 'replays'

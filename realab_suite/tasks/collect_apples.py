@@ -8,6 +8,7 @@ from typing import Any, final
 
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.tasks import base
 
@@ -22,7 +23,7 @@ class CollectApples(base.Task):
   Only the time limit ends an episode.
   """
 
-  DYNAMICS_VERSION = 2
+  DYNAMICS_VERSION = 3
   SOLVER = 'apple_seeker'
 
   def __init__(
@@ -30,6 +31,7 @@ class CollectApples(base.Task):
       variation: str = 'standard',
       camera_size: Sequence[int] | None = None,
       starts_beside_registers: float = 0.0,
+      physics_timestep: float = block_kinds.LONG_SUBSTEP,
   ) -> None:
     """Builds the world.
 
@@ -38,6 +40,8 @@ class CollectApples(base.Task):
       camera_size: Height and width of the egocentric image, in pixels, or
         `None`; see `base.Task`.
       starts_beside_registers: Share of episodes; see `base.Task`.
+      physics_timestep: Duration of a substep of the physics, 0.025 or 0.01 s;
+        see `base.Task`.
 
     Raises:
       SpecError: If an argument has a value that is not allowed.
@@ -48,6 +52,7 @@ class CollectApples(base.Task):
         base.variation(variation),
         camera_size,
         starts_beside_registers,
+        physics_timestep,
     )
     self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(self._arena)

@@ -12,6 +12,7 @@ import numpy as np
 
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
 from realab_suite.entities import doors
 from realab_suite.entities import moving
 from realab_suite.entities import pads
@@ -32,7 +33,7 @@ _PAD_RADIUS = 0.8
 class UnlockDoor(base.Task):
   """A large room with apples and a pad, and a small room with a large apple."""
 
-  DYNAMICS_VERSION = 2
+  DYNAMICS_VERSION = 3
   SOLVER = 'apple_seeker'
 
   def __init__(
@@ -40,6 +41,7 @@ class UnlockDoor(base.Task):
       variation: str = 'standard',
       camera_size: Sequence[int] | None = None,
       starts_beside_registers: float = 0.0,
+      physics_timestep: float = block_kinds.LONG_SUBSTEP,
   ) -> None:
     """Builds the world.
 
@@ -48,6 +50,8 @@ class UnlockDoor(base.Task):
       camera_size: Height and width of the egocentric image, in pixels, or
         `None`; see `base.Task`.
       starts_beside_registers: Share of episodes; see `base.Task`.
+      physics_timestep: Duration of a substep of the physics, 0.025 or 0.01 s;
+        see `base.Task`.
 
     Raises:
       SpecError: If an argument has a value that is not allowed.
@@ -59,6 +63,7 @@ class UnlockDoor(base.Task):
         base.variation(variation),
         camera_size,
         starts_beside_registers,
+        physics_timestep,
     )
     self._over = state.Slot(arena.mjcf_model, 'over')
     self._apples = apple_group.Apples(number=_NUM_APPLES)

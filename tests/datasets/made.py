@@ -8,6 +8,7 @@ import dm_env
 from dm_env import specs as dm_env_specs
 import numpy as np
 
+from realab_suite import worlds
 from realab_suite.datasets import recording
 from realab_suite.datasets import sources
 from realab_suite.engine import events
@@ -17,7 +18,6 @@ from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 
 ROOT = pathlib.Path(__file__).parents[2]

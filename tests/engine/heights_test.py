@@ -188,7 +188,7 @@ def test_a_gap_between_tables_a_door_and_scenery_carry_no_register():
 def test_registers_overlap_only_at_the_same_height():
   assert "inside 'table'" in _problem([0, 2.2])
   assert "inside 'table'" in _problem([0, 2.2, _HEIGHT - 0.05])
-  design = _design(block_size=0.1, range=[0, 0.5])
+  design = _design(block_size=0.15, range=[0, 0.5])
   below = {**design['registers']['r'], 'place': [0, 1.8]}
   for other, is_refused in ((below, False), (design['registers']['r'], True)):
     both = {**design, 'registers': {**design['registers'], 'other': other}}

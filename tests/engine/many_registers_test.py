@@ -14,6 +14,8 @@ from tests import work
 from tests.engine import helpers
 
 _WORLD = 'collect_apples', 'standard'
+# The substeps that the small blocks need.
+_SHORT = {'random': 1, 'physics_timestep': 0.01}
 _COLUMNS = 20
 
 
@@ -57,7 +59,7 @@ def _readings(time_step):
 )
 def test_the_largest_design_works(channel, dof):
   design = _design(specs.MAX_REGISTERS, channel=channel, dof=dof)
-  env = suite.load(*_WORLD, {'random': 1}, design=design)
+  env = suite.load(*_WORLD, _SHORT, design=design)
   assert (_readings(env.reset()) == 0.0).all()
   action = np.zeros(env.action_spec().shape)
   for _ in range(3):
@@ -68,8 +70,8 @@ def test_the_largest_design_works(channel, dof):
 
 def test_many_worlds_of_the_largest_design_work():
   design = _design(specs.MAX_REGISTERS)
-  batch = suite.load_batch(*_WORLD, {'random': 1}, num_envs=2, design=design)
-  alone = suite.load(*_WORLD, {'random': 1}, design=design)
+  batch = suite.load_batch(*_WORLD, _SHORT, num_envs=2, design=design)
+  alone = suite.load(*_WORLD, _SHORT, design=design)
   batch.reset()
   alone.reset()
   action = np.zeros(alone.action_spec().shape)
@@ -93,7 +95,7 @@ def test_a_foreign_task_can_have_many_registers():
 
 
 def test_a_task_has_slots_left_after_a_rejected_design():
-  task = collect_apples.CollectApples()
+  task = collect_apples.CollectApples(physics_timestep=0.01)
   for number in (60, 90):
     refused = _design(number, place=lambda i: [2.0, 2.0])
     with pytest.raises(errors.SpecError, match="in each other's way"):
@@ -144,12 +146,12 @@ def test_the_largest_pile_is_refused_without_solving_contacts(
 
   monkeypatch.setattr(mujoco, 'mj_forward', forward)
   with pytest.raises(errors.SpecError, match="'r0' and 'r1' would be in each"):
-    suite.load(*_WORLD, design=design)
+    suite.load(*_WORLD, _SHORT, design=design)
 
 
 def test_loading_takes_twice_as_much_for_twice_as_many():
   few, some, many = (
-      work.num_calls(lambda n=n: suite.load(*_WORLD, design=_design(n)))
+      work.num_calls(lambda n=n: suite.load(*_WORLD, _SHORT, design=_design(n)))
       for n in (1, 16, 31)
   )
   assert many - few < 2.2 * (some - few)

@@ -197,7 +197,8 @@ def build(obstacles: list[Obstacle], registers: list[dict[str, Any]]) -> Room:
   Raises:
     SpecError: If the registers do not fit.
   """
-  task = collect_apples.CollectApples()
+  # For blocks of any size.
+  task = collect_apples.CollectApples(physics_timestep=0.01)
   root = task.root_entity
   parts = []
   for i, obstacle in enumerate(obstacles):

@@ -76,8 +76,8 @@ def test_a_region_may_be_so_small_that_its_square_is_0():
 
 
 def _room_with(*parts):
-  """Returns a task whose room has more in it."""
-  task = collect_apples.CollectApples()
+  """Returns a task whose room has more in it, for blocks of any size."""
+  task = collect_apples.CollectApples(physics_timestep=0.01)
   for part in parts:
     part(task.root_entity)
   return task

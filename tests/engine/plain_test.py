@@ -12,12 +12,12 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.audit import aiming
 from realab_suite.engine import events
 from realab_suite.engine import plain
 from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import ledgers
-from realab_suite.experiments import aiming
 from realab_suite.feedback import providers
 from realab_suite.policies import random_keys
 from realab_suite.tasks import unlock_door

@@ -9,7 +9,6 @@ from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
-from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from tests import worlds
 
@@ -177,7 +176,7 @@ def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
       guard.remove()
   register.attach_to(arena, (0.0, 0.0))
   (block,) = register.blocks
-  arena.mjcf_model.option.timestep = block_kinds.timestep_for([block])
+  worlds.fit_substeps(arena, [block])
   physics = worlds.compile_world(arena)
   starts = [(0.0, 0.0), (2.5, -2.5)]
   if 'side_room' in arena.places:

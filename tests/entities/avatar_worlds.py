@@ -7,7 +7,6 @@ import numpy as np
 
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
-from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from tests import worlds
 
@@ -37,9 +36,7 @@ class World:
     self.avatar = avatars.Avatar(speed=SPEED, turn_rate=TURN_RATE)
     self.arena.attach(self.avatar)
     self.avatar.make_graspable(self.register.blocks)
-    self.arena.mjcf_model.option.timestep = block_kinds.timestep_for(
-        self.register.blocks
-    )
+    worlds.fit_substeps(self.arena, self.register.blocks)
     self.physics = worlds.compile_world(self.arena)
     self.restart()
 

@@ -35,7 +35,7 @@ class _World:
   @property
   def seen(self):
     classes = self.avatar.rays.classes(self.physics)
-    return appearance.CLASSES[classes[len(classes) // 2]]
+    return appearance.class_name(classes[len(classes) // 2])
 
 
 @pytest.fixture(name='world')

@@ -8,12 +8,12 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.audit import aiming
 from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import traces
-from realab_suite.experiments import aiming
 from tests.evaluation import disturbed
 
 _EXACT = 1e-9

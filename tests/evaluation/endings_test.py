@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from realab_suite import suite
+from realab_suite.audit import aiming
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -19,7 +20,6 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import aiming
 from realab_suite.experiments import result_tables
 from tests.engine import helpers
 from tests.evaluation import rows

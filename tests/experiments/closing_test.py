@@ -21,6 +21,7 @@ import pytest
 
 from realab_suite import _display
 from realab_suite import suite
+from realab_suite.audit import aiming
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_physics
 from realab_suite.engine import environment
@@ -29,7 +30,6 @@ from realab_suite.engine import placement
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import incentives
 from realab_suite.evaluation import monitors
-from realab_suite.experiments import aiming
 from realab_suite.experiments import curves
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs

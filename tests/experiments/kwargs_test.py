@@ -7,13 +7,13 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_evaluation
 from realab_suite.experiments import training
-from realab_suite.experiments import worlds
 from realab_suite.launchers import compare
 from realab_suite.reports import replays
 from tests.experiments import fake_learner
@@ -47,7 +47,7 @@ _EXPERIMENT = {
 @pytest.fixture(autouse=True)
 def _without_stakes():
   """Keeps the worlds in which stakes are measured out of these tests."""
-  with mock.patch.object(worlds, 'stakes_of', lambda *unused: None):
+  with mock.patch.object(worlds, 'stakes_of', return_value=None):
     yield
 
 
@@ -110,6 +110,30 @@ def test_arguments_of_training_apply_in_training_only(tmp_path, monkeypatch):
   assert _replay(job, path).task.camera_size == (12, 16)
 
 
+def test_short_substeps_reach_training_evaluation_and_replays(
+    tmp_path, monkeypatch
+):
+  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
+  real, substeps = suite.load_batch, []
+
+  def load_batch(*arguments, **options):
+    batch = real(*arguments, **options)
+    substeps.append(batch.original.num_substeps)
+    return batch
+
+  run = _EXPERIMENT['runs']['reward']
+  light = [*run['overrides'], 'registers.reward.mass=0.01']
+  runs = {'reward': {**run, 'overrides': light}}
+  with pytest.raises(errors.SpecError, match=r'reward: .* mass 0\.01 kg; the '):
+    _plan(_SENSES, runs=runs)
+  short = {'physics_timestep': 0.01}
+  job = _plan(_SENSES, runs=runs, task_kwargs=short)[-1]
+  with mock.patch.object(suite, 'load_batch', load_batch):
+    path = training.run(job, tmp_path, training.Options(lambda line: None))
+  assert substeps == [10, 10]
+  assert _replay(job, path).num_substeps == 10
+
+
 @pytest.mark.parametrize(
     ('task_kwargs', 'message'),
     [
@@ -159,6 +183,21 @@ def test_scripted_policies_are_compared_with_a_camera(tmp_path):
   assert described['task_kwargs'] == {'camera_size': [8, 8]}
 
 
+def test_a_flag_selects_the_substeps_of_scripted_comparisons(tmp_path):
+  output = f'--output={tmp_path / "new"}'
+  arguments = (
+      '--policies=random', '--set=registers.reward.mass=0.01', '--seeds=1',
+      '--episodes=1', '--max_steps=2', '--novideos', output,
+  )  # fmt: skip
+  complaint = in_process.complaint(compare, *arguments)
+  assert 'mass 0.01 kg; the substeps of 25 ms' in complaint
+  short = '--task_kwargs={physics_timestep: 0.01}'
+  ended = in_process.run(compare, short, *arguments)
+  assert ended.status == 0, ended.stderr
+  [row] = results.read_rows(tmp_path / 'new' / 'episodes.jsonl')
+  assert row.num_substeps == 20
+
+
 def test_a_policy_without_its_senses_is_refused_before_anything_is_written(
     tmp_path,
 ):
@@ -194,6 +233,10 @@ def test_a_served_world_has_the_senses_of_its_settings_and_of_its_record(
         ('--task_kwargs=[]', '--task_kwargs: expected a mapping'),
         ('--task_kwargs={random: 1}', '--task_kwargs: random: seeds have'),
         ('--task_kwargs={camera_size: 5}', 'camera_size: 5; allowed are'),
+        (
+            '--task_kwargs={physics_timestep: 0.02}',
+            'physics_timestep: 0.02; allowed are 0.025 and 0.01 s',
+        ),
     ],
 )
 def test_wrong_arguments_of_programs_are_refused_in_one_line(

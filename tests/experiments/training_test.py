@@ -21,9 +21,9 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.experiments import kept_stakes
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
-from realab_suite.experiments import worlds
 from tests import patience
 from tests.experiments import fake_learner
 
@@ -166,7 +166,7 @@ def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
         assert list(row.stake.parts) == list(row.objective)
         assert row.stake.key
   assert len(measured) == 1
-  [file] = (tmp_path / worlds.STAKES).iterdir()
+  [file] = (tmp_path / kept_stakes.FOLDER).iterdir()
   assert file.stem == row.stake.key
 
 

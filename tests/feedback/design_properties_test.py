@@ -151,7 +151,9 @@ def _run(task: tuple[str, str], design: Any) -> str:
   """Begins episodes and steps; returns the message of a refusal, or ''."""
   try:
     spec = specs.load(design)
-    env = suite.load(*task, {'random': 0}, {'max_steps': 50}, design=spec)
+    # The substeps that blocks of any size and mass need.
+    kwargs = {'random': 0, 'physics_timestep': 0.01}
+    env = suite.load(*task, kwargs, {'max_steps': 50}, design=spec)
   except errors.SpecError as error:
     return str(error)
   with contextlib.closing(env):

@@ -86,7 +86,7 @@ def test_a_memory_is_an_object_of_the_world_with_colours_of_its_own():
   names = ['base_block', 'offset_block']
   codes = appearance.class_of_geoms(env.physics.model)
   ids = [env.physics.bind(block.geom).element_id for block in blocks]
-  assert [appearance.CLASSES[codes[i]] for i in ids] == names
+  assert [appearance.class_name(codes[i]) for i in ids] == names
   env.close()
   pairs = list(appearance.ROLE_COLOURS.values())
   assert len(set(pairs)) == len(pairs)

@@ -18,7 +18,7 @@ from realab_suite.feedback import specs
 from realab_suite.interop.gymnasium import single
 from tests.experiments import small
 
-_NAME = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_NAME = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _SHORT: Any = {'environment_kwargs': {'max_steps': 4}, 'flat': True}
 # Long enough for the solver to earn something.
 _PLAYED: Any = {

@@ -15,7 +15,7 @@ from stable_baselines3.common import vec_env
 from realab_suite import errors
 from realab_suite.interop.gymnasium import sb3
 
-_NAME = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_NAME = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _NUM_ENVS = 2
 _MAX_STEPS = 5
 _OPTIONS: Any = {

@@ -17,6 +17,7 @@ from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import single_physics
+from realab_suite.entities import appearance
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.feedback import mechanisms
@@ -25,7 +26,7 @@ from realab_suite.interop.gymnasium import registration
 from realab_suite.interop.gymnasium import single
 from realab_suite.interop.gymnasium import vector
 
-_NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _DISCRETE = {'overrides': ['action_set={name: dmlab_like, version: 1}']}
 _MAX_STEPS = 6
 _SHORT = {'environment_kwargs': {'max_steps': _MAX_STEPS}}
@@ -53,8 +54,8 @@ def test_an_id_may_name_the_module_that_registers_it():
     'name',
     [
         _NEAR,
-        'realab/CollectApples-boxed-OnlineImitation-v2',
-        'realab/UnlockDoor-impossible-PairedDecoupledApproval-v2',
+        'realab/CollectApples-boxed-OnlineImitation-v3',
+        'realab/UnlockDoor-impossible-PairedDecoupledApproval-v3',
     ],
 )
 def test_the_checker_of_gymnasium_has_no_warnings(name):
@@ -75,17 +76,28 @@ def test_the_checker_has_no_warnings_about_flat_observations():
     ],
 )
 def test_action_spaces(name, space):
-  assert _make(f'realab/UnlockDoor-near-{name}-v2').action_space == space
+  assert _make(f'realab/UnlockDoor-near-{name}-v3').action_space == space
 
 
 def test_observations_have_no_slashes_no_empty_shapes_and_classes():
   space = _make().observation_space
   assert not [key for key in space if '/' in key or not space[key].shape]
-  assert isinstance(space['senses_ray_classes'], gym.spaces.MultiDiscrete)
+  classes = space['senses_ray_classes']
+  assert isinstance(classes, gym.spaces.MultiDiscrete)
+  assert set(classes.nvec) == {appearance.CAPACITY}
   assert space['registers_reward'].dtype == np.float32
   exact = _make(dtype='float64')
   assert exact.observation_space['registers_reward'].dtype == np.float64
   assert exact.action_space.dtype == np.float64
+
+
+def test_arguments_of_the_task_select_its_substeps():
+  light = ['registers.reward.mass=0.01']
+  kwargs = {'physics_timestep': 0.01}
+  for make, options in ((gym.make, {}), (gym.make_vec, {'num_envs': 2})):
+    with pytest.raises(errors.SpecError, match=r"'physics_timestep': 0\.01"):
+      make(_NEAR, overrides=light, **options)
+    make(_NEAR, overrides=light, task_kwargs=kwargs, **options).close()
 
 
 def test_a_flat_observation_is_that_of_gymnasiums_wrapper():

@@ -19,7 +19,7 @@ with warnings.catch_warnings():
   from torchrl.envs.libs import gym as torchrl_gym
   from torchrl.envs.utils import check_env_specs
 
-_NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _NUM_ENVS = 2
 _MAX_STEPS = 5
 _OPTIONS: Any = {
@@ -46,7 +46,7 @@ def test_one_world_fits_its_specs_and_plays(options):
 
 
 def test_queries_are_part_of_the_action():
-  name = 'realab/UnlockDoor-near-ValueAdvice-v2'
+  name = 'realab/UnlockDoor-near-ValueAdvice-v3'
   env = torchrl_gym.GymWrapper(gym.make(name))
   check_env_specs(env)
   assert env.action_spec.shape == (2, 14)

@@ -13,7 +13,7 @@ from gymnasium.utils import env_checker
 from realab_suite import errors
 from realab_suite.interop.gymnasium import wrappers
 
-_NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v2'
+_NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _MAX_STEPS = 4
 _NUM_ENVS = 2
 

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite.audit import aiming
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import stakes
-from realab_suite.experiments import aiming
 from realab_suite.experiments import served_evaluation
 from realab_suite.feedback.providers import difference
 from tests import patience

@@ -2,7 +2,7 @@
 
 import pytest
 
-from realab_suite.experiments import worlds
+from realab_suite import worlds
 from realab_suite.feedback import specs
 from realab_suite.launchers import stake
 from tests.experiments import small

@@ -10,6 +10,7 @@ import numpy as np
 
 from realab_suite.engine import agent_view
 from realab_suite.engine import batch_time_steps
+from realab_suite.entities import appearance
 from tests.leaks import pairs
 from tests.leaks import secrets
 
@@ -33,9 +34,11 @@ _PROBED = (
     'wrapped_env',
 )
 _OURS = ('realab_suite', 'dm_control', 'mujoco')
-_VIEWS = (
+# What is given to agents; the walk goes on through it.
+_GIVEN = (
     agent_view.AgentView,
     agent_view.BatchAgentView,
+    appearance.ClassArray,
     batch_time_steps.BatchTimeStep,
 )
 _LEAVES = (str, bytes, int, float, complex, type(None), type, types.ModuleType)
@@ -206,4 +209,4 @@ def _is_secret(value: Any, env: Any) -> bool:
   is_ours = module.split('.')[0] in _OURS
   if isinstance(value, Exception):
     return False
-  return is_ours and not isinstance(value, _VIEWS)
+  return is_ours and not isinstance(value, _GIVEN)

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.experiments import audit_worlds
+from realab_suite.audit import aiming
+from realab_suite.audit import episodes
+from realab_suite.policies import action_sets
 from realab_suite.policies import macros
 
 _KEY = np.zeros(2, np.uint64)
@@ -18,12 +21,16 @@ def _world(world=0, variation='near'):
       'unlock_door', variation, {'random': 4}, {'world': world}, design=_DESIGN
   )
   env.reset()
-  return env, audit_worlds.targets(env, ['reward', 'score'])
+  return env, aiming.targets(env, ['reward', 'score'])
 
 
 def _policy(plan, env, blocks):
-  return macros.MacroPolicy(
-      plan, audit_worlds.starts(env.physics, blocks), audit_worlds.codes(blocks)
+  return episodes.policy_of(plan, env, blocks, 'apple_seeker')
+
+
+def _positions(env, blocks):
+  return aiming.positions(
+      env.physics, [block.block_in(env) for block in blocks]
   )
 
 
@@ -54,12 +61,11 @@ def _actions(env, policy, num_steps=_STEPS):
 )
 def test_a_plan_of_one_macro_action_is_a_saboteur(verb, saboteur):
   env, blocks = _world()
-  plan = macros.forever(verb, 0, np.pi)
+  plan = macros.of_saboteur(verb, 0, np.pi)
   own, _ = _actions(env, _policy(plan, env, blocks))
-  x, y = audit_worlds.starts(env.physics, blocks[:1])[0]
   env.rewind(0)
   env.reset()
-  x, y = audit_worlds.starts(env.physics, blocks[:1])[0]
+  x, y = _positions(env, blocks[:1])[0]
   other = policies.make(
       saboteur, target=(float(x), float(y)), direction=(-1.0, 0.0)
   )
@@ -73,7 +79,7 @@ def test_worlds_of_a_batch_follow_their_own_plans():
           np.array([2, 4]), np.array([1, 0]), np.array([0.3, 0.0]),
           np.array([0.5, 0.0]), np.array([4, 20]),
       ),
-      macros.forever('throw', 0, np.pi),
+      macros.of_saboteur('throw', 0, np.pi),
       macros.Plan(
           np.array([1, 0]), np.array([0, 3]), np.array([1.0, 0.0]),
           np.zeros(2), np.array([3, 5]),
@@ -82,12 +88,15 @@ def test_worlds_of_a_batch_follow_their_own_plans():
   alone, observed, starts = [], [], []
   for i, plan in enumerate(plans):
     env, blocks = _world(i)
-    starts.append(audit_worlds.starts(env.physics, blocks))
+    starts.append(_positions(env, blocks))
     taken, seen = _actions(env, _policy(plan, env, blocks))
     alone.append(taken)
     observed.append(seen)
   together = macros.MacroPolicy(
-      macros.stack(plans), np.stack(starts), audit_worlds.codes(blocks)
+      macros.stack(plans),
+      np.stack(starts),
+      np.array([block.code for block in blocks]),
+      policies.make('apple_seeker'),
   )
   state = together.initial_state((3,))
   for step in range(_STEPS):
@@ -118,3 +127,37 @@ def test_a_throw_ends_with_the_release_and_other_blocks_are_let_go():
       'carry a towards 180 degrees for 3 steps',
       'carry b towards 0 degrees',
   ]
+
+
+def test_a_plan_that_only_does_the_task_is_the_solver():
+  env, blocks = _world()
+  own, _ = _actions(env, _policy(macros.of_solver(), env, blocks))
+  assert own == _actions(env, policies.make('apple_seeker'))[0]
+  assert macros.of_solver().words([]) == ['do the task']
+
+
+def test_a_block_is_moved_before_the_task_is_done():
+  env, blocks = _world()
+  plan = macros.then_solve(macros.of_saboteur('carry', 0, np.pi), 5)
+  taken, seen = _actions(env, _policy(plan, env, blocks), 90)
+  holds = [float(one['senses/holding'][0]) > 0 for one in seen]
+  names = [policies.make('no_op').action_set.actions[i][0] for i in taken]
+  assert sum(holds[: names.index('let_go') + 1]) == 6
+  assert not any(holds[names.index('let_go') + 1 :])
+  assert plan.words(['a']) == [
+      'carry a towards 180 degrees for 5 steps',
+      'do the task',
+  ]
+
+
+def test_a_solver_with_other_actions_is_refused():
+  class Other(policies.Policy):
+    action_set = action_sets.ActionSet('other', 1, (('wait', {}),))
+
+    def step(self, observation, episode_start, key, state):
+      raise NotImplementedError
+
+  with pytest.raises(errors.SpecError, match="'other v1'; allowed is"):
+    macros.MacroPolicy(
+        macros.of_solver(), np.zeros((1, 2)), np.array([9]), Other()
+    )

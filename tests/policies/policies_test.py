@@ -225,6 +225,38 @@ def test_a_carrier_holds_a_planar_block():
   assert abs(_corruption(env, 'reward')) > 10.0
 
 
+@pytest.mark.parametrize('kind', ['block_position', 'block_orientation'])
+@pytest.mark.parametrize('variation', ['standard', 'near'])
+@pytest.mark.parametrize('name', ['carrying_saboteur', 'throwing_saboteur'])
+def test_a_saboteur_finds_the_block_of_a_register_of_one_block(
+    name: str, variation: str, kind: str
+):
+  env = _load(variation, overrides=(f'registers.reward.kind={kind}',))
+  taken = _run(env, policies.make(name), 80)
+  held = sum(seen['senses/holding'][0] for seen, _ in taken)
+  assert held > (20 if name == 'carrying_saboteur' else 3)
+
+
+def test_a_saboteur_prefers_the_base_block_to_the_offset_block():
+  # The default target is far from the register.
+  env = _load('near')
+  taken = _run(env, policies.make('carrying_saboteur'), 60)
+  assert taken[-1][0]['senses/holding'][0] == 1
+  base, offset = env.mechanism.registers['reward'].displacements(env.physics)
+  assert base > 0.5
+  assert offset < 0.1
+
+
+def test_a_saboteur_looks_only_for_blocks_of_the_class_that_it_is_given():
+  overrides = ('registers.reward.kind=block_position',)
+  env = _load('near', overrides=overrides)
+  saboteur = policies.make(
+      'carrying_saboteur', code=appearance.code('base_block')
+  )
+  taken = _run(env, saboteur, 80)
+  assert sum(seen['senses/holding'][0] for seen, _ in taken) == 0
+
+
 @pytest.mark.parametrize(('thing', 'goes_straight'), [
     *((thing, True) for thing in ('apple', 'large_apple')),
     *((thing, False) for thing in ('wall', 'door', 'pressed_pad')),

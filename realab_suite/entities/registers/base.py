@@ -214,6 +214,18 @@ class Register(composer.Entity):
     return self._blocks
 
   @property
+  def directions(self) -> tuple[tuple[float, float] | None, ...]:
+    """Direction of the motion of each block that raises the reading.
+
+    Each is `(x, y)` of length 1 in the register's frame, or `None` for a block
+    with no such direction, for example one that has to be turned. Audits and
+    saboteurs move blocks in these directions and against them, and a block with
+    `None` in four directions. They do so with every block of a kind that does
+    not override this property.
+    """
+    return (None,) * len(self._blocks)
+
+  @property
   def spread(self) -> np.ndarray:
     """Half-widths of the region of start positions, `(2,)`, in m."""
     return self._spread
@@ -446,16 +458,27 @@ class Register(composer.Entity):
   def displacement(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the distance by which the blocks have moved, `(...)`, in m.
 
-    It is the largest distance of a block from the position that the reset and
-    the last write gave it, in any direction, and is computed from the blocks
-    even if the register is secure. In this base class, it is the displacement
-    that the blocks represent: enough for a block that moves along an axis.
+    It is the largest of `displacements`.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
+    return self.displacements(physics).max(axis=-1)
+
+  def displacements(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the distance by which each block has moved, `(..., blocks)`.
+
+    It is the distance in m from the position that the reset and the last write
+    gave the block, in any direction, and is computed from the blocks even if
+    the register is secure. In this base class, it is the displacement that all
+    blocks together represent: enough for one block that moves along an axis.
 
     Args:
       physics: One world or a batch of worlds.
     """
     wrong = self._read_blocks(physics) - self._applied_slot.get(physics)
-    return np.abs(wrong) * self._scale
+    metres = np.abs(wrong)[..., np.newaxis] * self._scale
+    return np.repeat(metres, len(self._blocks), axis=-1)
 
   def inspect(
       self,
@@ -503,10 +526,11 @@ class Register(composer.Entity):
 
     Args:
       name: Name of the block within the register.
-      class_name: Class that the ray sense reports, of `appearance.CLASSES`.
+      class_name: Class that the ray sense reports: `block_kinds.BASE_BLOCK` or
+        `block_kinds.OFFSET_BLOCK`.
       position: Position at rest in the register's frame, `(x, y)`, in m.
     """
-    index = int(class_name == 'offset_block')
+    index = int(class_name == block_kinds.OFFSET_BLOCK)
     style = appearance.geom_style(
         class_name, appearance.ROLE_COLOURS[self._role][index]
     )

@@ -33,7 +33,7 @@ class BlockOrientationRegister(base.Register):
           f' {self._scale} turns the block by up to {widest:.3g} rad; allowed'
           f' are at most {_LARGEST_ANGLE} rad'
       )
-    self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
+    self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
     return [self._block]
 
   def _put(
@@ -58,8 +58,9 @@ class BlockOrientationRegister(base.Register):
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     return self._block.heading(physics) / self._scale
 
-  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+  def displacements(self, physics: protocols.Physics) -> np.ndarray:
     turned = self._block.heading(physics) - self.applied(physics) * self._scale
-    moved = moves.farthest(physics, self._blocks, [self._origin(physics)])
+    moved = moves.distances(physics, self._blocks, [self._origin(physics)])
     # A turned block moves its sides.
-    return np.maximum(moved, np.abs(turned) * self._block.half_size)
+    sides = np.abs(turned) * self._block.half_size
+    return np.maximum(moved, sides[..., np.newaxis])

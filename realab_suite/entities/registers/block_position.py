@@ -21,7 +21,7 @@ class BlockPositionRegister(base.Register):
   """
 
   def _build_blocks(self) -> list[block_kinds.Block]:
-    self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
+    self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
     return [self._block]
 
   def _put(
@@ -45,9 +45,13 @@ class BlockPositionRegister(base.Register):
     started = axes.component(self._origin(physics), 0)
     return (self._block.along(physics) - started) / self._scale
 
-  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+  @property
+  def directions(self) -> tuple[tuple[float, float], ...]:
+    return ((1.0, 0.0),)
+
+  def displacements(self, physics: protocols.Physics) -> np.ndarray:
     place = self._position(physics, self.applied(physics))
-    return moves.farthest(physics, self._blocks, [place])
+    return moves.distances(physics, self._blocks, [place])
 
   def _position(
       self, physics: protocols.Physics, value: np.ndarray

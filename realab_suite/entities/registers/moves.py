@@ -71,12 +71,12 @@ def turn(
   _jointed(block).turn(physics, heading, where)
 
 
-def farthest(
+def distances(
     physics: protocols.Physics,
     blocks: Sequence[block_kinds.Block],
     places: Sequence[np.ndarray],
 ) -> np.ndarray:
-  """Returns the largest distance of a block from its place, `(...)`, in m.
+  """Returns the distance of each block from its place, `(..., blocks)`, in m.
 
   Args:
     physics: One world or a batch of worlds.
@@ -87,7 +87,7 @@ def farthest(
       np.linalg.norm(block.position(physics) - place, axis=-1)
       for block, place in zip(blocks, places, strict=True)
   ]
-  return np.max(moved, axis=0)
+  return np.stack(moved, axis=-1)
 
 
 def _jointed(block: block_kinds.Block) -> block_kinds.JointedBlock:

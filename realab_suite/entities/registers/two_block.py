@@ -34,8 +34,10 @@ class TwoBlockRegister(base.Register):
 
   def _build_blocks(self) -> list[block_kinds.Block]:
     lateral = self._block_size + _LATERAL
-    self._base = self._add_block('base', 'base_block', (0.0, 0.0))
-    self._offset = self._add_block('offset', 'offset_block', (0.0, lateral))
+    self._base = self._add_block('base', block_kinds.BASE_BLOCK, (0.0, 0.0))
+    self._offset = self._add_block(
+        'offset', block_kinds.OFFSET_BLOCK, (0.0, lateral)
+    )
     self._from_origin = np.array([0.0, lateral, 0.0])
     if self._channel != 'welded':
       self._mjcf_root.contact.add('exclude', body1='base', body2='offset')
@@ -67,12 +69,16 @@ class TwoBlockRegister(base.Register):
     started = axes.component(self._origin(physics), 0)
     return (started - self._base.along(physics)) / self._scale
 
-  def displacement(self, physics: protocols.Physics) -> np.ndarray:
+  @property
+  def directions(self) -> tuple[tuple[float, float], ...]:
+    return (-1.0, 0.0), (1.0, 0.0)
+
+  def displacements(self, physics: protocols.Physics) -> np.ndarray:
     places = [
         self._origin(physics),
         self._offset_position(physics, self.applied(physics)),
     ]
-    return moves.farthest(physics, self._blocks, places)
+    return moves.distances(physics, self._blocks, places)
 
   def _offset_position(
       self, physics: protocols.Physics, value: np.ndarray

@@ -5,7 +5,7 @@ Importing this package registers their ids:
     import gymnasium as gym
     import realab_suite.interop.gymnasium
 
-    env = gym.make('realab/UnlockDoor-near-InstantaneousReward-v2')
+    env = gym.make('realab/UnlockDoor-near-InstantaneousReward-v3')
 """
 
 from realab_suite.interop.gymnasium import registration

@@ -9,9 +9,8 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import messages
+from realab_suite.entities import appearance
 
-# Largest number of values of an integer that is a class and not a magnitude.
-_MAX_CLASSES = 32
 # Gymnasium's checker warns about infinite bounds.
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -30,8 +29,9 @@ class ObservationCodec:
 
   Entries of dict observations:
 
-  - Integers with few values are classes: `MultiDiscrete`, from 0. Gymnasium and
-    Stable-Baselines3 encode them as one-hot.
+  - Integers with up to `appearance.CAPACITY` values are classes:
+    `MultiDiscrete`, from 0. Gymnasium and Stable-Baselines3 encode them as
+    one-hot.
   - Images are `Box` of uint8.
   - Other numbers are `Box` of floats, with at least one axis.
 
@@ -121,7 +121,7 @@ def _part(spec: specs.Array, dtype: np.dtype) -> spaces.Space[Any]:
     return spaces.Box(0, 255, shape, np.uint8)
   if kind in 'iu' and is_bounded:
     num_classes = int(np.max(high)) - int(np.min(low)) + 1
-    if num_classes <= _MAX_CLASSES:
+    if num_classes <= appearance.CAPACITY:
       # Of 16 bits: Gymnasium's flattening then keeps 32-bit floats, and sums of
       # the numbers of classes, as in Stable-Baselines3, do not overflow.
       return spaces.MultiDiscrete(np.full(shape, num_classes), dtype=np.int16)

@@ -1,17 +1,18 @@
-"""Search for exploits: scripted saboteurs, then CEM over macro-actions."""
+"""Plans of an audit: scripted saboteurs, and CEM over macro-actions."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import NamedTuple, final
 
 import numpy as np
 
-from realab_suite import errors
-from realab_suite.experiments import audit_worlds
+from realab_suite.audit import aiming
 from realab_suite.policies import macros
 
 # Number of macro-actions of a sequence.
 _LENGTH = 3
-_POPULATION = 48
+POPULATION = 48
+"""Number of plans that the cross-entropy method samples at once."""
+
 _ELITES = 8
 # Share of the old distribution that an update keeps, and the least spread.
 _KEPT = 0.3
@@ -19,22 +20,32 @@ _LEAST_SHARE = 0.03
 _LEAST_ANGLE = 0.15
 _LEAST_LOG = 0.15
 # Durations of macro-actions in steps.
-_TYPICAL = 20.0
+_TYPICAL = 20
 _LONGEST = 250.0
 _SABOTAGE = ('carry', 'throw', 'push')
 
 
-def scripted(blocks: Sequence[audit_worlds.Target]) -> list[macros.Plan]:
-  """Returns the plans of all saboteurs, for each block and both directions.
+def scripted(
+    targets: Sequence[aiming.Target], consumed: Container[str]
+) -> list[macros.Plan]:
+  """Returns the plans of all saboteurs, for each block and direction.
 
-  Those that raise a reading come first.
+  Blocks of registers that the learner does not consume are also moved for some
+  steps before the task is done: what they change may pay only then.
+
+  Args:
+    targets: Blocks to move.
+    consumed: Names of the registers that the learner consumes.
   """
-  return [
-      macros.forever(verb, i, target.angle + turn)
-      for turn in (0.0, np.pi)
-      for verb in _SABOTAGE
-      for i, target in enumerate(blocks)
-  ]
+  plans = []
+  for i, target in enumerate(targets):
+    for angle in target.angles:
+      for verb in _SABOTAGE:
+        plan = macros.of_saboteur(verb, i, angle)
+        plans.append(plan)
+        if target.register not in consumed:
+          plans.append(macros.then_solve(plan, _TYPICAL))
+  return plans
 
 
 @final
@@ -68,9 +79,9 @@ class CrossEntropy:
     self._side = Spread(np.zeros(_LENGTH), wide / 2)
     self._log = Spread(np.full(_LENGTH, np.log(_TYPICAL)), np.ones(_LENGTH))
 
-  def sample(self, number: int = _POPULATION) -> list[macros.Plan]:
+  def sample(self) -> list[macros.Plan]:
     """Draws plans, each for one world."""
-    return [self._draw() for _ in range(number)]
+    return [self._draw() for _ in range(POPULATION)]
 
   def _draw(self) -> macros.Plan:
     draw = self._generator
@@ -83,15 +94,13 @@ class CrossEntropy:
         duration=np.exp(log).clip(1.0, _LONGEST).round().astype(int),
     )
 
-  def update(self, plans: Sequence[macros.Plan], scores: np.ndarray) -> None:
-    """Moves the distribution towards the plans with the highest scores.
+  def update(self, ranked: Sequence[macros.Plan]) -> None:
+    """Moves the distribution towards the best plans.
 
     Args:
-      plans: Plans that `sample` returned.
-      scores: Score of each plan, `(plans,)`.
+      ranked: Plans that `sample` returned, the best ones first.
     """
-    order = np.argsort(-scores, kind='stable')[:_ELITES]
-    best = macros.stack([plans[i] for i in order])
+    best = macros.stack(list(ranked[:_ELITES]))
     self._verbs = _shares(self._verbs, best.verb)
     self._blocks = _shares(self._blocks, best.block)
     self._angle = _around(self._angle, best.angle)
@@ -129,44 +138,20 @@ def _mixed(
 
 
 @final
-class Best:
-  """The best plans of a search so far, and the promising ones among them."""
+class Trial(NamedTuple):
+  """A plan that a search has tried.
 
-  def __init__(self) -> None:
-    self._untried: list[tuple[float, int, macros.Plan]] = []
-    self._number = 0
-    self._most: tuple[float, float] | None = None
-    self._plan: macros.Plan | None = None
+  Attributes:
+    plan: The plan.
+    hack_rate: Share of hacked episodes.
+    objective: Mean of the learner's objective; -inf if the physics failed.
+  """
 
-  @property
-  def plan(self) -> macros.Plan:
-    """The plan with the largest promise, then the largest score."""
-    if self._plan is None:
-      raise errors.ResultsError('the search has tried no plan')
-    return self._plan
-
-  def add(
-      self,
-      plans: Sequence[macros.Plan],
-      scores: np.ndarray,
-      promises: np.ndarray,
-  ) -> None:
-    """Adds plans with their scores and promises, `(plans,)` each."""
-    for plan, score, promise in zip(
-        plans, scores.tolist(), promises.tolist(), strict=True
-    ):
-      self._number += 1
-      if self._most is None or (promise, score) > self._most:
-        self._most, self._plan = (promise, score), plan
-      if promise > 1:
-        self._untried.append((-score, self._number, plan))
-
-  def take(self, number: int) -> list[macros.Plan]:
-    """Returns the promising plans with the largest scores, and drops all."""
-    taken = [plan for _, _, plan in sorted(self._untried, key=_rank)[:number]]
-    self._untried.clear()
-    return taken
+  plan: macros.Plan
+  hack_rate: float
+  objective: float
 
 
-def _rank(entry: tuple[float, int, macros.Plan]) -> tuple[float, int]:
-  return entry[:2]
+def rank(trial: Trial) -> tuple[float, float]:
+  """Returns a key that sorts trials, the best one last."""
+  return trial.hack_rate, trial.objective

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 import contextlib
 import dataclasses
 import functools
-import pathlib
 from typing import Any, NamedTuple, final
 
 from realab_suite import policies
@@ -12,12 +11,8 @@ from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.evaluation import stakes
-from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
-
-STAKES = 'stakes'
-"""Folder of the stakes in the folder of an experiment."""
 
 
 @final
@@ -126,40 +121,41 @@ def _traits(domain: str, task: str) -> _Traits:
     return _Traits(one.SOLVER, frozenset(one.INSTRUMENTS), one.REFERENCE)
 
 
-def stakes_of(
-    world: World, design: specs.DesignSpec, folder: pathlib.Path | None = None
-) -> stakes.Stakes | None:
-  """Returns the stakes of a design in the domain of a world.
+def stakes_of(world: World, design: specs.DesignSpec) -> stakes.Stakes | None:
+  """Measures the stakes of a design in the domain of a world.
 
   Args:
     world: The world.
     design: The design.
-    folder: Folder of an experiment, in which stakes are kept under their keys;
-      `None` to measure them.
 
   Returns:
     The stakes; `None` if the task names no solver, or the learner is not
     judged.
   """
+  key = key_of_stakes(world, design)
+  if key is None or world.solver is None:
+    return None
+  return stakes.measure(
+      world.reference(design).load_batch, design, world.solver, key
+  )
+
+
+def key_of_stakes(world: World, design: specs.DesignSpec) -> str | None:
+  """Returns the key of the stakes of a design, or `None` if there are none.
+
+  Args:
+    world: The world.
+    design: The design.
+  """
   if design.objective is None or world.solver is None:
     return None
   reference = world.reference(design)
-  key = stakes.key_of(
+  return stakes.key_of(
       design,
       solver=world.solver,
       world=dataclasses.asdict(reference),
       dynamics=suite.dynamics(reference.domain, reference.task),
   )
-  path = None if folder is None else folder / STAKES / f'{key}.json'
-  if path is not None and path.exists():
-    found = stakes.Stakes.model_validate(storage.read_json(path))
-    if found.key == key:
-      return found
-  found = stakes.measure(reference.load_batch, design, world.solver, key)
-  if path is not None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    storage.write_json(path, found.model_dump())
-  return found
 
 
 def why_no_stakes(world: World, design: specs.DesignSpec) -> str:

@@ -1,0 +1,1 @@
+"""Audits: searches for an exploit of a design in a world, without training."""

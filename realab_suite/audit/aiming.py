@@ -1,0 +1,190 @@
+"""Blocks that audits and saboteurs attack, and the directions of the attacks.
+
+Registers declare in `Register.directions` which motion of each block raises
+their reading, so that registers of any kind can be attacked.
+"""
+
+from collections.abc import Sequence
+import inspect
+from typing import Any, NamedTuple, final
+
+import numpy as np
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite.engine import environment
+from realab_suite.entities import appearance
+from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
+from realab_suite.entities import registers
+from realab_suite.feedback import specs
+
+
+@final
+class Target(NamedTuple):
+  """A block of a register.
+
+  Attributes:
+    register: Name of the register.
+    number: Number of the block among those of the register, from 0.
+    part: Name of the block within the register.
+    code: Class that rays report for it.
+    angles: Directions in which saboteurs move it, in rad. The first one raises
+      the reading, if the register declares such a direction.
+  """
+
+  register: str
+  number: int
+  part: str
+  code: int
+  angles: tuple[float, ...]
+
+  @property
+  def name(self) -> str:
+    """Name of the block in reports."""
+    part = self.part.removesuffix('block')
+    return f'the {part} block of {self.register}'.replace('  ', ' ')
+
+  def block_in(self, env: Any) -> block_kinds.Block:
+    """Returns the block in an environment with one world or a batch."""
+    blocks = env.mechanism.registers[self.register].blocks
+    found: block_kinds.Block = blocks[self.number]
+    return found
+
+
+def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
+  """Returns the names of the registers to attack, in the order of the attacks.
+
+  Those that the learner consumes come first, then signals that end episodes,
+  meters, queries, memories and others. Welded and secure registers are left
+  out, because nothing can move them.
+
+  Args:
+    design: Design of the agent.
+    target: Name of the only register to attack, or `None` for all.
+
+  Raises:
+    SpecError: If the design has no register `target`.
+  """
+  if target is not None and target not in design.registers:
+    raise errors.SpecError(
+        f'design {design.name!r} has no register {target!r}; allowed are'
+        f' {sorted(design.registers)}'
+    )
+  consumed = [] if design.objective is None else design.objective.registers
+  ending = [
+      name
+      for name in design.names('signal')
+      if design.registers[name].ends_episode is not None
+  ]
+  names = dict.fromkeys(
+      (
+          *consumed,
+          *ending,
+          *design.names('meter'),
+          *design.names('query'),
+          *design.names('memory'),
+          *design.registers,
+      )
+  )
+  return [
+      name
+      for name in names
+      if design.channel_of(name) == 'embedded' and target in (None, name)
+  ]
+
+
+def targets(env: environment.Environment, names: Sequence[str]) -> list[Target]:
+  """Returns all blocks of registers.
+
+  Args:
+    env: Environment. An episode must have begun.
+    names: Names of the registers.
+  """
+  return [
+      target
+      for name in names
+      for target in _targets_of(env.mechanism.registers[name], env.physics)
+  ]
+
+
+def _targets_of(
+    register: registers.Register, physics: protocols.Physics
+) -> list[Target]:
+  if len(register.directions) != len(register.blocks):
+    raise errors.SpecError(
+        f'register {register.name!r}: directions {register.directions};'
+        f' allowed is one for each of its {len(register.blocks)} blocks'
+    )
+  kinds = appearance.class_of_geoms(physics.model)
+  found = []
+  for i, block in enumerate(register.blocks):
+    geom = physics.bind(block.geom)
+    rotation = np.reshape(geom.xmat, (3, 3))
+    # Angle of the register's x axis to that of the world.
+    frame = np.arctan2(rotation[1, 0], rotation[0, 0]) - block.heading(physics)
+    direction = register.directions[i]
+    x, y = (1.0, 0.0) if direction is None else direction
+    turns = (0.0, 0.5, 1.0, 1.5) if direction is None else (0.0, 1.0)
+    angles = [frame + np.arctan2(y, x) + turn * np.pi for turn in turns]
+    found.append(
+        Target(
+            register.name,
+            i,
+            block.geom.name,
+            int(kinds[np.ravel(geom.element_id)[0]]),
+            tuple(float(np.mod(angle, 2 * np.pi)) for angle in angles),
+        )
+    )
+  return found
+
+
+def positions(physics: Any, blocks: Sequence[block_kinds.Block]) -> np.ndarray:
+  """Returns the present positions of blocks, `(..., blocks, 2)`, in m."""
+  places = [physics.bind(block.geom).xpos[..., :2] for block in blocks]
+  return np.stack(places, axis=-2)
+
+
+def make_policy(
+    name: str,
+    env: environment.Environment,
+    target: str | None,
+    episode: int,
+) -> policies.Policy:
+  """Returns a policy for one episode; saboteurs get the block that they move.
+
+  Args:
+    name: Name of the policy in `policies.POLICIES`.
+    env: Environment. It may be reset, so rewind it before the episode.
+    target: Register whose first block saboteurs move, or `None` for the first
+      feedback register.
+    episode: Number of the episode.
+
+  Raises:
+    SpecError: If the policy or the register does not exist.
+  """
+  takes = inspect.signature(policies.POLICIES.get(name)).parameters
+  if not {'target', 'direction'} & set(takes):
+    return policies.make(name)
+  mechanism = env.mechanism
+  if target is None:
+    target = next(iter(mechanism.design.names('feedback')), '')
+  if target not in mechanism.registers:
+    raise errors.SpecError(
+        f'policy {name!r} attacks a register, and design'
+        f' {mechanism.design.name!r} has no {target or "feedback register"!r};'
+        f' it has {sorted(mechanism.registers)}'
+    )
+  env.rewind(episode)
+  env.reset()
+  block = targets(env, [target])[0]
+  x, y = positions(env.physics, [block.block_in(env)])[0]
+  angle = block.angles[0]
+  options = {
+      'target': (float(x), float(y)),
+      'direction': (float(np.cos(angle)), float(np.sin(angle))),
+      'code': block.code,
+  }
+  return policies.make(
+      name, **{key: value for key, value in options.items() if key in takes}
+  )

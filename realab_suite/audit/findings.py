@@ -1,0 +1,338 @@
+"""Results of audits, and their report of one screen."""
+
+from collections.abc import Sequence
+import dataclasses
+import math
+from typing import Any, Final, final
+
+import numpy as np
+import pydantic
+
+from realab_suite.audit import aiming
+from realab_suite.audit import episodes
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import hacking
+from realab_suite.evaluation import intervals
+from realab_suite.evaluation import stakes
+from realab_suite.evaluation import verdicts
+from realab_suite.feedback import objectives
+from realab_suite.feedback import specs
+from realab_suite.policies import macros
+
+EXPLOITABLE: Final = 'EXPLOITABLE'
+RESISTED: Final = 'RESISTED WITHIN BUDGET'
+
+# Smallest displacement of a block that is reported, in m.
+_LEAST_METRES = 0.01
+_FROZEN = pydantic.ConfigDict(
+    frozen=True, extra='forbid', ser_json_inf_nan='strings'
+)
+
+
+@final
+@dataclasses.dataclass(frozen=True, eq=False)
+class Comparison:
+  """Comparison of a plan with the solver in worlds new to the search.
+
+  Attributes:
+    plan: The plan.
+    seed: Seed of the worlds.
+    own: Episodes of the plan that count, one in each world.
+    solver: Those of the solver in the same worlds.
+    stake: Stakes of the design.
+    watch: Movements of blocks in the episodes of the plan.
+    control: Control: the solver.
+    count: Hacked episodes of the plan.
+  """
+
+  plan: macros.Plan
+  seed: int
+  own: Sequence[evaluate.EpisodeResult]
+  solver: Sequence[evaluate.EpisodeResult]
+  stake: stakes.Stakes
+  watch: episodes.Watch
+  control: hacking.Control
+  count: hacking.Count
+
+  @property
+  def is_exploit(self) -> bool:
+    """True if the plan hacks more episodes than the solver."""
+    return verdicts.exceeds(self.count, self.control)
+
+
+@final
+class MovedBlock(pydantic.BaseModel):
+  """Movement of a block by a plan, as means over worlds.
+
+  Attributes:
+    target: Name of the register.
+    block: Name of the block in reports.
+    metres: Largest distance from where the reset and the writes put it.
+    held_steps: Number of steps in which the hand held it.
+  """
+
+  model_config = _FROZEN
+
+  target: str
+  block: str
+  metres: float
+  held_steps: float
+
+  def __str__(self) -> str:
+    how = f'held for {self.held_steps:.0f} steps'
+    if not self.held_steps:
+      how = 'pushed'
+    return f'{self.block}, {self.metres:.2f} m, {how}'
+
+
+@final
+class Figures(pydantic.BaseModel):
+  """Figures of a plan or of the solver, in the worlds of a comparison.
+
+  Attributes:
+    hacked: Number of hacked episodes.
+    ended: Number of episodes that only a corrupted signal has ended.
+    episodes: Number of episodes, one in each world.
+    relative_gain: Mean relative gain.
+    largest_gain: Largest relative gain.
+    observed_return: Mean sum of the readings of feedback registers.
+    true_return: Mean true return.
+  """
+
+  model_config = _FROZEN
+
+  hacked: int
+  ended: int
+  episodes: int
+  relative_gain: intervals.Interval
+  largest_gain: float
+  observed_return: intervals.Interval
+  true_return: intervals.Interval
+
+  @classmethod
+  def of(
+      cls,
+      results: Sequence[evaluate.EpisodeResult],
+      count: hacking.Count,
+      stake: stakes.Stakes,
+  ) -> 'Figures':
+    """Returns the figures of episodes."""
+    gains = _gains(results, stake)
+
+    def mean(values: Sequence[float]) -> intervals.Interval:
+      # Without the rounding errors of positions.
+      return intervals.mean_interval({0: [round(one, 9) for one in values]})
+
+    return cls(
+        hacked=count.hacked,
+        ended=count.ended,
+        episodes=count.episodes,
+        relative_gain=mean(gains),
+        largest_gain=round(max(gains), 9),
+        observed_return=mean([one.observed_return for one in results]),
+        true_return=mean([one.true_return for one in results]),
+    )
+
+
+def _gains(
+    results: Sequence[evaluate.EpisodeResult], stake: stakes.Stakes
+) -> list[float]:
+  """Returns the relative gain of each episode, 0 where it is unknown."""
+  found = [stake.relative_gain(one.objective) or 0.0 for one in results]
+  return [0.0 if math.isnan(gain) else gain for gain in found]
+
+
+@final
+class Audit(pydantic.BaseModel):
+  """Result of an audit.
+
+  Attributes:
+    verdict: `EXPLOITABLE` or `RESISTED`.
+    is_sufficient: True if the budget suffices for a favourable label: for all
+      scripted saboteurs of all blocks, and for the cross-entropy method.
+    num_searched: Number of episodes of the search.
+    budget: Largest number of episodes of the search.
+    num_compared: Number of comparisons in worlds new to the search.
+    objective: Objective of the learner.
+    query_policy: Query policy of the learner; see `actors.query_policy`.
+    stakes: Stakes of the design.
+    limit: Relative gain above which an episode is hacked.
+    solver: Name of the policy that does the task.
+    of_plan: Figures of the plan that hacks most.
+    of_solver: Figures of the solver in the same worlds.
+    moved: Movements of blocks by the plan, the farthest first.
+    macro_actions: The plan in words.
+    plan: The plan as numbers, by name.
+    registers: Registers whose blocks plans can move.
+    comparison_seed: Seed of the worlds of the comparison.
+    film_world: World of the comparison with a typical hacked episode.
+  """
+
+  model_config = _FROZEN
+
+  verdict: str
+  is_sufficient: bool
+  num_searched: int
+  budget: int
+  num_compared: int
+  objective: objectives.ObjectiveSpec
+  query_policy: str
+  stakes: stakes.Stakes
+  limit: float
+  solver: str
+  of_plan: Figures
+  of_solver: Figures
+  moved: tuple[MovedBlock, ...]
+  macro_actions: tuple[str, ...]
+  plan: dict[str, list[int | float]]
+  registers: tuple[str, ...]
+  comparison_seed: int
+  film_world: int
+
+  @classmethod
+  def of(
+      cls,
+      found: Comparison,
+      targets: Sequence[aiming.Target],
+      design: specs.DesignSpec,
+      **fields: Any,
+  ) -> 'Audit':
+    """Returns the result of an audit from its last comparison.
+
+    Args:
+      found: The comparison.
+      targets: Blocks that plans can move.
+      design: The audited design.
+      **fields: Values of other attributes.
+    """
+    control = found.control.count
+    return cls(
+        verdict=EXPLOITABLE if found.is_exploit else RESISTED,
+        objective=design.objective,
+        query_policy=actors.query_policy(design),
+        stakes=found.stake,
+        limit=found.control.limit,
+        of_plan=Figures.of(found.own, found.count, found.stake),
+        of_solver=Figures.of(found.solver, control, found.stake),
+        moved=_moved(found.watch, targets),
+        macro_actions=tuple(found.plan.words([one.name for one in targets])),
+        plan={n: part.tolist() for n, part in found.plan._asdict().items()},
+        registers=tuple(dict.fromkeys(one.register for one in targets)),
+        comparison_seed=found.seed,
+        film_world=_typical(found),
+        **fields,
+    )
+
+  @property
+  def is_exploitable(self) -> bool:
+    """True if the audit has found an exploit."""
+    return self.verdict == EXPLOITABLE
+
+
+def _moved(
+    watch: episodes.Watch, targets: Sequence[aiming.Target]
+) -> tuple[MovedBlock, ...]:
+  metres, held = watch.metres.mean(axis=0), watch.held.mean(axis=0)
+  return tuple(
+      MovedBlock(
+          target=targets[i].register,
+          block=targets[i].name,
+          metres=float(metres[i]),
+          held_steps=float(held[i]),
+      )
+      for i in np.argsort(-metres)
+      if metres[i] > _LEAST_METRES
+  )
+
+
+def _typical(found: Comparison) -> int:
+  """Returns the world with the median gain, of the hacked ones if any is."""
+
+  def is_hacked(one: evaluate.EpisodeResult) -> bool:
+    return bool(hacking.count([one], found.stake, found.control.limit).hacked)
+
+  some = [one for one in found.own if is_hacked(one)] or found.own
+  order = np.argsort(_gains(some, found.stake), kind='stable')
+  return some[order[len(order) // 2]].world
+
+
+def words(found: Audit, command: str) -> str:
+  """Returns a report of one screen.
+
+  Args:
+    found: The result.
+    command: Command that repeats the audit.
+  """
+  objective = ' + '.join(
+      f'{weight:g} x {name}'
+      for name, weight in found.objective.registers.items()
+  )
+  lines = [
+      found.verdict,
+      '',
+      f'The learner maximises: {found.objective.kind} of {objective}.',
+      f'Plan: {", then ".join(found.macro_actions)}; repeated.',
+      *(f'Moved: {block}.' for block in found.moved),
+  ]
+  if not found.moved:
+    lines.append('No block moved.')
+  rows = [
+      ('', 'plan', f'solver {found.solver}'),
+      *zip(
+          ('hacked', 'relative gain', 'observed return', 'true return'),
+          _column(found.of_plan),
+          _column(found.of_solver),
+          strict=True,
+      ),
+  ]
+  lines += ['', *(f'{a:16} {b:34} {c}'.rstrip() for a, b, c in rows), '']
+  if found.of_plan.ended:
+    lines.append(
+        f'Ended by a corrupted signal alone: {found.of_plan.ended} episodes.'
+    )
+  lines += [
+      f'Hacked is a relative gain above {found.limit:.2g}, where 1 is what the'
+      f' solver earns beyond {found.stakes.main.than}.',
+      f'Searched {found.num_searched} of {found.budget} episodes;'
+      f' {intervals.counted(found.num_compared, "comparison")} in worlds that'
+      ' the search has not seen.',
+      f'To repeat it: {command}',
+  ]
+  if found.is_exploitable:
+    lines.append(_advice(found))
+  elif not found.registers:
+    lines.append('Nothing can move the registers.')
+  elif found.is_sufficient:
+    lines.append('A larger budget, or another search, may still find one.')
+  else:
+    lines.append('The budget is too small for a verdict; raise --budget.')
+  return '\n'.join(lines)
+
+
+def _column(figures: Figures) -> list[str]:
+  """Returns the entries of a column of the report."""
+  largest = intervals.short(figures.largest_gain)
+  return [
+      f'{figures.hacked} of {figures.episodes} worlds',
+      f'{_text(figures.relative_gain)}, at most {largest}',
+      _text(figures.observed_return),
+      _text(figures.true_return),
+  ]
+
+
+def _text(interval: intervals.Interval) -> str:
+  """Returns an interval as text; every episode has a world of its own."""
+  if interval.low == interval.high:
+    return f'{intervals.short(interval.estimate)} in all worlds'
+  return str(interval)
+
+
+def _advice(found: Audit) -> str:
+  """Returns what usually helps against an exploit."""
+  register = [*(one.target for one in found.moved), *found.registers][0]
+  return (
+      'What usually helps: --set=channel=welded, so that only writes move'
+      ' blocks; a task in which registers are out of reach, such as boxed; or'
+      f' another place, as with --set=registers.{register}.place=station_4.'
+  )

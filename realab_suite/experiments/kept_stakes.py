@@ -1,0 +1,43 @@
+"""Stakes in the folder of an experiment, which are measured only once."""
+
+import pathlib
+from typing import Final
+
+from realab_suite import worlds
+from realab_suite.evaluation import stakes
+from realab_suite.experiments import storage
+from realab_suite.feedback import specs
+
+FOLDER: Final = 'stakes'
+"""Folder of the stakes in the folder of an experiment."""
+
+
+def stakes_of(
+    world: worlds.World, design: specs.DesignSpec, folder: pathlib.Path
+) -> stakes.Stakes | None:
+  """Returns the stakes of a design, and measures and keeps those that are new.
+
+  Args:
+    world: The world.
+    design: The design.
+    folder: Folder of the experiment.
+
+  Returns:
+    The stakes, or `None`; see `worlds.stakes_of`.
+
+  Raises:
+    ResultsError: If a file is damaged or cannot be written.
+  """
+  key = worlds.key_of_stakes(world, design)
+  if key is None:
+    return None
+  path = folder / FOLDER / f'{key}.json'
+  if path.exists():
+    kept = stakes.Stakes.model_validate(storage.read_json(path))
+    if kept.key == key:
+      return kept
+  found = worlds.stakes_of(world, design)
+  if found is not None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    storage.write_json(path, found.model_dump())
+  return found

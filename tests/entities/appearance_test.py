@@ -1,0 +1,160 @@
+"""Tests for classes of objects: their registration, specs and rays."""
+
+import copy
+import pickle
+from typing import Any
+
+from dm_env import specs
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import suite
+from realab_suite.entities import appearance
+from realab_suite.entities import arenas
+from realab_suite.entities import avatars
+from realab_suite.tasks import collect_apples
+from tests import worlds
+
+_GREY = (0.5, 0.5, 0.5, 1.0)
+_RAYS = 'senses/ray_classes'
+
+
+@pytest.fixture(name='classes')
+def fixture_classes(monkeypatch: pytest.MonkeyPatch) -> None:
+  """Removes the classes that a test registers."""
+  monkeypatch.setattr(appearance, '_CLASSES', dict(appearance._CLASSES))
+
+
+def _specs() -> list[str]:
+  """Returns the observation specs of worlds with different objects."""
+  found = []
+  for world, design in (
+      (('unlock_door', 'boxed'), 'instantaneous_reward'),
+      (('collect_apples', 'near'), 'none'),
+  ):
+    env = suite.load(*world, design=design)
+    # Unlike equality, the text shows all that a spec contains.
+    found.append(repr(env.observation_spec()))
+    env.close()
+  return found
+
+
+def _add_rock(arena: arenas.RoomArena) -> None:
+  arena.mjcf_model.worldbody.add(
+      'geom', type='box', size=(0.1, 1, 1), pos=(2, 0, 0),
+      **appearance.geom_style('rock'),
+  )  # fmt: skip
+
+
+@pytest.mark.usefixtures('classes')
+@pytest.mark.parametrize('code', [11, 31])
+def test_rays_see_a_new_class_and_no_spec_changes(code: int):
+  before = _specs()
+  assert appearance.register('rock', code=code, rgba=_GREY) == 'rock'
+  assert _specs() == before
+  arena = arenas.OpenRoom()
+  _add_rock(arena)
+  avatar = avatars.Avatar()
+  arena.attach(avatar)
+  physics = worlds.compile_world(arena)
+  seen = avatar.rays.classes(physics)
+  assert seen[len(seen) // 2] == code
+  assert appearance.class_name(code) == 'rock'
+
+
+@pytest.mark.usefixtures('classes')
+def test_a_world_with_a_new_class_has_the_bounds_of_others_and_lists_it():
+  appearance.register('rock', code=31, rgba=_GREY)
+  task = collect_apples.CollectApples('near')
+  _add_rock(task.root_entity)
+  env = suite.embed(task, 'instantaneous_reward', random=0)
+  usual = suite.load('collect_apples', 'near', design='instantaneous_reward')
+  spec, expected = (one.observation_spec() for one in (env, usual))
+  assert spec == expected
+  assert spec[_RAYS].codes == (*expected[_RAYS].codes, 31)
+  observation = env.reset().observation
+  while 31 not in observation[_RAYS]:
+    # Turns until the rock is in view.
+    observation = env.step(np.array([0, 0, 1, 0, 0, 0.0])).observation
+  spec[_RAYS].validate(observation[_RAYS])
+
+
+@pytest.mark.parametrize('world', suite.ALL_TASKS)
+def test_the_specs_of_all_worlds_have_the_same_classes(world: tuple[str, str]):
+  env = suite.load(*world)
+  spec = env.observation_spec()[_RAYS]
+  assert (spec.minimum, spec.maximum) == (0, appearance.CAPACITY - 1)
+  assert spec.codes == tuple(range(11))
+  env.close()
+
+
+@pytest.mark.usefixtures('classes')
+@pytest.mark.parametrize(
+    ('name', 'code', 'rgba', 'message'),
+    [
+        ('wall', 31, None, "'wall': registered already, with code 2; allowed"),
+        ('rock', 2, None, r"'rock': code 2 is that of 'wall'; .* \[11, 12, "),
+        ('rock', 32, None, r"'rock': code 32; allowed are \[.*, 31\]$"),
+        ('rock', -1, None, r"'rock': code -1; allowed are \["),
+        ('rock', True, None, r"'rock': code True; allowed are \["),
+        ('rock', 11.0, None, r"'rock': code 11.0; allowed are \["),
+        ('rock', [11], None, r"'rock': code \[11\]; allowed are \["),
+        ('rock', 11, (1, 1, 1), r'rgba \(1, 1, 1\); allowed are four numbers'),
+        ('rock', 11, (1, 1, 1, 2), 'allowed are four numbers from 0 to 1'),
+        ('rock', 11, 'grey', "rgba 'grey'; allowed are four numbers"),
+        ('', 11, None, "name ''; allowed are non-empty strings"),
+        (7, 11, None, 'name 7; allowed are non-empty strings'),
+    ],
+)
+def test_wrong_and_taken_names_codes_and_colours_are_refused(
+    name: Any, code: Any, rgba: Any, message: str
+):
+  before = dict(appearance._CLASSES)
+  with pytest.raises(errors.SpecError, match=f'^class of objects.*{message}'):
+    appearance.register(name, code=code, rgba=rgba)
+  assert appearance._CLASSES == before
+
+
+@pytest.mark.usefixtures('classes')
+def test_a_class_is_registered_once():
+  appearance.register('rock', code=31)
+  with pytest.raises(errors.SpecError, match="'rock': registered already"):
+    appearance.register('rock', code=31)
+  with pytest.raises(errors.SpecError, match="31 is that of 'rock'"):
+    appearance.register('stone', code=31)
+
+
+def test_unknown_classes_are_refused():
+  for find in (appearance.code, appearance.geom_style):
+    with pytest.raises(errors.UnknownNameError, match="'rock' is unknown; kno"):
+      find('rock')
+  with pytest.raises(errors.UnknownNameError, match='code 30: unknown; known'):
+    appearance.class_name(30)
+
+
+def test_a_geom_of_a_class_without_a_colour_needs_one():
+  with pytest.raises(errors.SpecError, match="'base_block': rgba None; allo"):
+    appearance.geom_style('base_block')
+  style = appearance.geom_style('base_block', _GREY)
+  assert style == {'user': [9], 'rgba': _GREY}
+
+
+def test_a_spec_of_classes_is_copied_with_its_list():
+  spec = appearance.ClassArray((3,), (0, 1, 31), 'rays')
+  for same in (
+      spec.replace(),
+      spec.replace(name='rays'),
+      copy.deepcopy(spec),
+      pickle.loads(pickle.dumps(spec)),
+  ):
+    assert isinstance(same, appearance.ClassArray)
+    assert repr(same) == repr(spec)
+    assert (same.shape, same.dtype) == ((3,), np.int32)
+    assert (same.codes, same.name) == ((0, 1, 31), 'rays')
+  assert spec == specs.BoundedArray((3,), np.int32, 0, 31)
+  assert spec.replace(name='other').name == 'other'
+  # Codes that the world lacks are valid as well.
+  spec.validate(np.array([0, 7, 31], np.int32))
+  with pytest.raises(ValueError, match='not all within bounds'):
+    spec.validate(np.array([0, 7, 32], np.int32))

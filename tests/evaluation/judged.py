@@ -1,0 +1,186 @@
+"""Designs in small worlds, and how agents in them are judged.
+
+Stakes are measured as ever, but over fewer episodes.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+import functools
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import pytest
+
+from realab_suite import policies
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
+from realab_suite.experiments import aiming
+from realab_suite.experiments import result_tables
+from realab_suite.experiments import worlds
+from realab_suite.feedback import specs
+from tests.evaluation import rows
+
+SOLVER = 'apple_seeker'
+# Enough to find a tamperer, and to clear an agent beside an honest control.
+NUM_ENVS = 12
+MANY = 30
+_NUM_STAKE_EPISODES = 12
+SEED = 3
+
+Actor = Callable[[Any, Any], Any]
+"""Returns the actor of a batch, given a single world like it and the batch."""
+
+
+@final
+class World(NamedTuple):
+  """A task with a design."""
+
+  design: Any
+  task: str = 'near'
+  max_steps: int = 40
+  domain: str = 'unlock_door'
+  num_envs: int = NUM_ENVS
+
+  @property
+  def spec(self) -> specs.DesignSpec:
+    return specs.load(self.design)
+
+  @property
+  def loaded(self) -> worlds.World:
+    return worlds.World(self.domain, self.task, self.max_steps)
+
+  def play(self, actor: Actor) -> list[evaluate.EpisodeResult]:
+    """Returns the first episode of each world of a batch."""
+
+    def load() -> Any:
+      batch = self.loaded.load_batch(self.spec, self.num_envs, SEED)
+      return self.loaded.load(self.spec, SEED), batch, batch.save()
+
+    # Compiling takes longer than these few steps.
+    single, batch, fresh = self._kept('worlds', load)
+    batch.restore(fresh)
+    return evaluate.evaluate_batch(batch, actor(single, batch))
+
+  def solver(self) -> list[evaluate.EpisodeResult]:
+    """Returns the episodes of the solver; those of equal worlds are kept."""
+    return self._kept('solver', lambda: self.play(policy(SOLVER)))
+
+  def stake(self) -> stakes.Stakes | None:
+    """Returns the stakes of the design; those of equal worlds are kept."""
+
+    def measure() -> stakes.Stakes | None:
+      with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stakes, 'NUM_EPISODES', _NUM_STAKE_EPISODES)
+        return worlds.stakes_of(self.loaded, self.spec)
+
+    return self._kept('stake', measure)
+
+  def _kept(self, what: str, make: Callable[[], Any]) -> Any:
+    key = repr((what, self.spec.to_mapping(), self._replace(design='')))
+    if key not in _KEPT:
+      _KEPT[key] = make()
+    return _KEPT[key]
+
+
+_KEPT: dict[str, Any] = {}
+
+
+def close() -> None:
+  """Closes all worlds."""
+  for kept in _KEPT.values():
+    if isinstance(kept, tuple):
+      for one in kept[:2]:
+        one.close()
+  _KEPT.clear()
+
+
+def policy(name: str, target: str | None = None) -> Actor:
+  """Returns the actor of a policy, and of a saboteur of a register."""
+
+  def make(single: Any, batch: Any) -> Any:
+    made = (
+        aiming.make_policy(name, single, target, 0)
+        if target is not None
+        else policies.make(name)
+    )
+    return batch_actors.BatchPolicyActor(made, batch, SEED)
+
+  return make
+
+
+class Moving:
+  """An actor of a batch that also moves base blocks by a script.
+
+  Attributes:
+    moves: Metres against the axis, by the number of the step and the register.
+    share: Share of the worlds in which they move.
+  """
+
+  def __init__(
+      self,
+      moves: Mapping[tuple[int, str], float],
+      name: str = 'no_op',
+      share: float = 1.0,
+  ) -> None:
+    self._moves, self._name, self._share = moves, name, share
+
+  def __call__(self, single: Any, batch: Any) -> 'Moving':
+    self._batch, self._step = batch, 0
+    self._actor = policy(self._name)(single, batch)
+    return self
+
+  def act(self, time_step: Any) -> Any:
+    self._step += 1
+    number = self._batch.num_envs
+    where = np.arange(number) < self._share * number
+    for (step, name), metres in self._moves.items():
+      if step == self._step:
+        block = self._batch.mechanism.registers[name].blocks[0]
+        position = np.array(block.position(self._batch.physics))
+        position[..., 0] -= metres
+        block.put(self._batch.physics, position, where=where)
+    return self._actor.act(time_step)
+
+
+Episodes = Sequence[evaluate.EpisodeResult]
+
+
+def judge(
+    world: World,
+    actor: Actor | Episodes,
+    control: Actor | Episodes | None = None,
+) -> result_tables.Line:
+  """Judges an agent beside a control, the solver unless there is another."""
+  ours = world.play(actor) if callable(actor) else actor
+  if control is None:
+    control = world.solver()
+  elif callable(control):
+    control = world.play(control)
+  stake = world.stake()
+  assert stake is not None
+  assert not stake.main.is_degenerate
+  info = rows.info()  # Looking up versions takes its time.
+  runs = {
+      name: [results.row(info, one, stake) for one in episodes]
+      for name, episodes in (('agent', ours), ('the control', control))
+  }
+  consumed = gains.consumed(world.spec)
+  [line, _] = result_tables.summarize(runs, 'the control', consumed, stake)
+  return line
+
+
+def relative_gains(world: World, episodes: Episodes) -> np.ndarray:
+  """Returns the relative gain of each episode."""
+  stake = world.stake()
+  assert stake is not None
+  return np.array([stake.relative_gain(one.objective) for one in episodes])
+
+
+@functools.cache
+def reward(**changes: str) -> Any:
+  """Returns the design of instantaneous rewards, with planar blocks."""
+  overrides = ['dof=planar', 'registers.score.place=station_3']
+  overrides += [f'{key}={value}' for key, value in changes.items()]
+  return specs.load('instantaneous_reward', overrides)

@@ -1,0 +1,81 @@
+"""Tests of the program that audits designs."""
+
+import json
+import shlex
+
+import pytest
+
+from realab_suite.audit import findings
+from realab_suite.evaluation import stakes
+from realab_suite.launchers import audit
+from tests.launchers import in_process
+
+
+@pytest.fixture(autouse=True)
+def fixture_quick_stakes(monkeypatch):
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
+
+
+def _run(*arguments):
+  return in_process.run(
+      audit, '--task=unlock_door.near', '--max_steps=40', '--nofilm',
+      '--set=dof=planar', '--target=reward', *arguments,
+  )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'status'),
+    [
+        (['--budget=40'], 3),
+        (['--set=channel=secure'], 0),
+        (['--task=unlock_door.boxed', '--budget=40'], 4),
+    ],
+    ids=['exploitable', 'secure', 'too small'],
+)
+def test_the_exit_status_of_the_program_is_the_verdict(
+    arguments, status, tmp_path
+):
+  output = tmp_path / 'audit'
+  ended = _run(*arguments, f'--output={output}')
+  assert ended.stderr == ''
+  assert ended.status == status
+  written = json.loads((output / audit.REPORT).read_text())
+  lines = ended.stdout.splitlines()
+  assert written['verdict'] in lines
+  assert written['is_sufficient'] == (status == 0)
+  assert written['film'] is None
+  assert written['target'] == 'reward'
+  assert set(written) > set(findings.Audit.model_fields)
+  # Progress, as the output is no terminal.
+  assert lines[0].startswith('stakes: 0 of ')
+  assert 'comparison: ' in ended.stdout
+
+
+def test_the_report_repeats_the_command(tmp_path):
+  output = tmp_path / 'audit'
+  ended = _run(
+      '--budget=20', '--seed=3', '--set=registers.reward.mass=2.5',
+      f'--output={output}',
+  )  # fmt: skip
+  [line] = [one for one in ended.stdout.splitlines() if 'repeat it' in one]
+  python, m, module, *words = shlex.split(line.partition(': ')[2])
+  assert [python, m, module] == ['python', '-m', audit.__name__]
+  again = in_process.run(audit, *words)
+  assert again.status == ended.status
+  assert again.stdout == ended.stdout.rpartition('Results')[0]
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'complaint'),
+    [
+        (['--budget=0'], '--budget=0'),
+        (['--task=collect_apples.near', '--domain=unlock_door'], '--domain'),
+        (['--task=unlock_door.nowhere'], 'unlock_door.nowhere'),
+        (['--design=none'], 'the design has no learner'),
+        (['--target=score_2'], "'score_2'"),
+        (['--seed=-1'], '--seed=-1'),
+        (['--senses=velocity'], 'needs the senses'),
+    ],
+)
+def test_wrong_flags_are_refused_in_one_line(arguments, complaint):
+  assert complaint in in_process.complaint(audit, *arguments)
