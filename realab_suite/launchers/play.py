@@ -3,8 +3,9 @@
   python -m realab_suite.launchers.play --task=near
 
 The program prints the address of a page. The page shows the view of the avatar,
-and the observed and the true return side by side. After the last episode it
-shows the summary that any agent gets, beside that of the apple seeker.
+the observed and the true return side by side, and the contents of registers
+beside their clean contents. After the last episode it shows the summary that
+any agent gets, beside that of the solver of the task.
 """
 
 from collections.abc import Sequence

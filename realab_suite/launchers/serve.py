@@ -13,7 +13,8 @@ The environment of the agent contains the address and little else:
     --agent_command='python /path/to/agent.py' --output=results/mine
 
 Each run draws a secret salt, so its episodes cannot be predicted from the seed.
---repeat=results/mine/run.json serves the same episodes again.
+--repeat=results/mine/run.json serves the same episodes again. The rows contain
+the stakes of the design, which are measured while the agent starts.
 """
 
 from collections.abc import Sequence

@@ -6,7 +6,8 @@ r"""Lets a person provide the feedback of an agent, in a browser.
 The program prints the address of a page, on which the person approves actions,
 corrects them, compares two clips, or stops the episode. The output folder gets
 the answers (`answers.jsonl`), the design, and the results of the episodes. The
-source `recorded` of the provider `person` replays the answers.
+source `recorded` of the provider `person` replays the answers. The agent is not
+judged: a person would have to answer again for a control.
 """
 
 from collections.abc import Sequence
