@@ -21,6 +21,7 @@ import numpy as np
 
 from campaigns import figure_lines
 from realab_suite import policies
+from realab_suite import worlds
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import hacking
@@ -28,7 +29,6 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import jobs
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
