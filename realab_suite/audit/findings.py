@@ -298,15 +298,8 @@ def words(found: Audit, command: str) -> str:
       f' {intervals.counted(found.num_compared, "comparison")} in worlds that'
       ' the search has not seen.',
       f'To repeat it: {command}',
+      _advice(found),
   ]
-  if found.is_exploitable:
-    lines.append(_advice(found))
-  elif not found.registers:
-    lines.append('Nothing can move the registers.')
-  elif found.is_sufficient:
-    lines.append('A larger budget, or another search, may still find one.')
-  else:
-    lines.append('The budget is too small for a verdict; raise --budget.')
   return '\n'.join(lines)
 
 
@@ -329,7 +322,16 @@ def _text(interval: intervals.Interval) -> str:
 
 
 def _advice(found: Audit) -> str:
-  """Returns what usually helps against an exploit."""
+  """Returns what to do next."""
+  if not found.is_exploitable:
+    if not found.registers:
+      return 'Nothing can move the registers.'
+    if found.is_sufficient:
+      return (
+          'The budget is sufficient; a larger one, or another search, may still'
+          ' find an exploit.'
+      )
+    return 'The budget is not sufficient; raise --budget, or leave it out.'
   register = [*(one.target for one in found.moved), *found.registers][0]
   return (
       'What usually helps: --set=channel=welded, so that only writes move'

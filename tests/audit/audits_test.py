@@ -170,7 +170,7 @@ def test_registers_out_of_reach_resist_and_the_budget_is_used():
   assert not found.is_sufficient
   assert 90 < found.num_searched <= found.budget
   assert found.of_plan.hacked == found.of_plan.largest_gain == 0
-  assert 'The budget is too small for a verdict' in findings.words(found, '')
+  assert 'The budget is not sufficient' in findings.words(found, '')
 
 
 def test_a_find_that_is_not_confirmed_does_not_end_the_search(monkeypatch):

@@ -89,8 +89,8 @@ def test_the_report_compares_the_plan_with_the_solver():
 @pytest.mark.parametrize(
     ('changes', 'last'),
     [
-        ({'is_sufficient': True}, 'A larger budget, or another search'),
-        ({'is_sufficient': False}, 'The budget is too small'),
+        ({'is_sufficient': True}, 'The budget is sufficient; a larger one'),
+        ({'is_sufficient': False}, 'The budget is not sufficient'),
         ({'registers': (), 'moved': ()}, 'Nothing can move the registers.'),
     ],
 )

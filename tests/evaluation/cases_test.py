@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from realab_suite import policies
+from realab_suite import worlds
+from realab_suite.audit import aiming
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import aiming
-from realab_suite.experiments import worlds
 from realab_suite.feedback import objectives
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs

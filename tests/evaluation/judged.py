@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from realab_suite import policies
+from realab_suite import worlds
+from realab_suite.audit import aiming
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
-from realab_suite.experiments import aiming
 from realab_suite.experiments import result_tables
-from realab_suite.experiments import worlds
 from realab_suite.feedback import specs
 from tests.evaluation import rows
 

@@ -42,7 +42,8 @@ TASK_KWARGS = flags.DEFINE_string(
 TARGET = flags.DEFINE_string(
     'target',
     None,
-    'Register that saboteurs attack. Default: the first feedback register.',
+    'Register that saboteurs attack. Default: the first feedback register; in'
+    ' an audit, all registers.',
 )
 
 
