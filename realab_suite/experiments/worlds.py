@@ -7,6 +7,7 @@ import functools
 import pathlib
 from typing import Any, final
 
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
@@ -123,6 +124,14 @@ def stakes_of(
   if design.objective is None or world.solver is None:
     return None
   reference = world.reference
+  if reference.senses is not None:
+    # The agent's senses are not those that the solver needs.
+    senses = [*policies.make(world.solver).required_senses]
+    for provider in design.providers:
+      senses += provider.required_senses
+    reference = dataclasses.replace(
+        reference, senses=tuple(dict.fromkeys(senses))
+    )
   key = stakes.key_of(
       design,
       solver=world.solver,
