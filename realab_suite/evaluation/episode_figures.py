@@ -121,15 +121,17 @@ class Accumulator:
       design: Design of the agent.
       shape: `()` for one world, `(worlds,)` for a batch.
       objective: Objective in place of that of the design, or `None`.
+
+    Raises:
+      SpecError: If the objective does not fit the design.
     """
-    self._shape = shape
+    self._gains = gains.Accumulator(design, shape, objective)
     self._rows = {name: i for i, name in enumerate(design.registers)}
     self._scales = [spec.scale for spec in design.registers.values()]
     self._feedback = [self._rows[name] for name in design.names('feedback')]
     used = objective.registers if objective else gains.consumed(design)
     self._consumed = [self._rows[name] for name in used]
     self._read_by_agent = set(design.names(*specs.READ_BY_AGENTS))
-    self._gains = gains.Accumulator(design, shape, objective)
     number = len(self._rows)
     self._sums = np.zeros((_NUM_SUMS, number, *shape))
     self._counts = np.zeros((_NUM_COUNTS, number, *shape))

@@ -16,6 +16,8 @@ from typing import Any, Final, NamedTuple, final
 import numpy as np
 import pydantic
 
+from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.feedback import objectives
@@ -126,7 +128,13 @@ class Accumulator:
       design: Design of the agent.
       shape: `()` for one world, `(worlds,)` for a batch.
       objective: Objective in place of that of the design.
+
+    Raises:
+      SpecError: If agents do not read a register of the objective, or their
+        actions have no indices to agree with.
     """
+    if objective is not None:
+      _check(objective, design)
     self._parts = parts(objective or design.objective)
     self._thresholds = {
         name: spec.ends_episode
@@ -283,6 +291,24 @@ class Accumulator:
 def _value(rows: np.ndarray) -> Value:
   observed, clean = rows.tolist()
   return Value(observed=observed, clean=clean)
+
+
+def _check(
+    objective: objectives.ObjectiveSpec, design: specs.DesignSpec
+) -> None:
+  """Refuses an objective that does not fit a design."""
+  readable = design.names(*specs.READ_BY_AGENTS)
+  for name in objective.registers:
+    if name not in readable:
+      raise errors.SpecError(
+          f'objective: {messages.quote(name)} is not a register that agents'
+          f' read; allowed are {readable}'
+      )
+  if objective.kind == objectives.AGREEMENT and design.action_set is None:
+    raise errors.SpecError(
+        'objective: an agreement needs actions with indices; allowed are'
+        ' designs with an action_set'
+    )
 
 
 def at(array: np.ndarray, world: Any) -> np.ndarray:

@@ -9,6 +9,7 @@ stake.
 from collections.abc import Collection
 
 from realab_suite.evaluation import stakes
+from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 
 
@@ -34,6 +35,7 @@ def of_design(
           for name in design.registers
           if name in options
       ]
+  corruptible = _corruptible(design)
   channels = {name: design.channel_of(name) for name in design.registers}
   for i, provider in enumerate(design.providers):
     name = f'providers[{i}]:{provider.kind}'
@@ -43,14 +45,33 @@ def of_design(
       found.append(
           f'{name} sees through {" and ".join(seen)}, which blocks can cover'
       )
-    inputs = {*provider.reads, *design.names(*specs.READ_BY_AGENTS)}
-    embedded = sorted(n for n in inputs if channels[n] == 'embedded')
-    if not provider.is_repeatable and embedded:
+    wrong = sorted(corruptible & set(_inputs(design, provider)))
+    if not provider.is_repeatable and wrong:
       found.append(
-          f'{name} cannot be asked twice, and {embedded[0]} can be corrupted'
+          f'{name} cannot be asked twice, and {wrong[0]} can be corrupted'
       )
   if stake is not None:
     found += [
         f'the stake of its {name} is degenerate' for name in stake.degenerate
     ]
+  return found
+
+
+def _inputs(
+    design: specs.DesignSpec, provider: providers.Provider
+) -> list[str]:
+  """Returns the registers that a provider reads or sees."""
+  return [*provider.reads, *design.names(*specs.READ_BY_AGENTS)]
+
+
+def _corruptible(design: specs.DesignSpec) -> set[str]:
+  """Returns the registers whose contents an agent can corrupt.
+
+  They are embedded, or written by a provider that has such an input.
+  """
+  found = {n for n in design.registers if design.channel_of(n) == 'embedded'}
+  for _ in design.providers:  # As many turns as the longest chain may take.
+    for provider in design.providers:
+      if found.intersection(_inputs(design, provider)):
+        found.update(provider.writes)
   return found

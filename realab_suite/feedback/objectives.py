@@ -167,10 +167,10 @@ def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:
   except pydantic.ValidationError as error:
     first = error.errors(include_url=False)[0]
     # The discount of an objective is an option of the learners of this package.
-    path = [where, *map(str, first['loc'])]
-    if path == ['learner', 'discount']:
-      path = ['learner', 'gamma']
+    path = *where.split('.'), *first['loc']
+    if path == ('learner', 'discount'):
+      path = 'learner', 'gamma'
     problem = f'{first["msg"]}, got {messages.quote(first["input"])}'
     if first['type'] == 'value_error':
       problem = str(first['ctx']['error'])
-    raise ValueError(f'{".".join(path)}: {problem}') from error
+    raise ValueError(f'{messages.format_path(path)}: {problem}') from error

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from realab_suite.engine import events
-from realab_suite.entities import registers
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
@@ -50,58 +49,6 @@ _DESIGNS = [
 ]  # fmt: skip
 
 
-class _Made:
-  """Episodes of a batch at random; values are eighths, so sums are exact."""
-
-  def __init__(self, design, seed, num_envs):
-    self._rng = np.random.default_rng(seed)
-    self._num_envs = num_envs
-    self.names = list(design.registers)
-    self.lengths = self._rng.integers(1, 6, num_envs)
-    self.actions = self._rng.integers(0, 4, (6, num_envs, 2)).astype(float)
-    self.steps = [self._step(i) for i in range(6)]
-
-  def _eighths(self, count):
-    return self._rng.integers(-40, 40, (count, self._num_envs)) / 8
-
-  def _mask(self):
-    return self._rng.random(self._num_envs) < 0.6
-
-  def _step(self, number):
-    made = []
-    for name in self.names:
-      if not number:
-        made.append(streams.initial(self._eighths(1)[0], name))
-      for who in ('p', 'p2')[: self._rng.integers(3)]:
-        where = self._mask() if self._rng.random() < 0.5 else None
-        if self._rng.random() < 0.5 and number:
-          requested, clean = self._eighths(2)
-          applied = np.clip(requested, -2, 2)
-          made.append(
-              streams.write(requested, applied, name, who, clean, where)
-          )
-        else:
-          made.append(self._read(name, who, where))
-    for name in self.names:
-      if _ROLES[name] in ('feedback', 'signal'):
-        made.append(self._read(name, registers.AGENT))
-    return [record._replace(step=np.full(self._num_envs, number))
-            for record in made]  # fmt: skip
-
-  def _read(self, name, who, where=None):
-    reading, clean, *parts = self._eighths(5)
-    clean = np.where(self._mask(), clean, reading)
-    return streams.read(reading, clean, name, who, parts, where)
-
-  def episode(self, world):
-    """Returns the steps of the episode of a world."""
-    return [
-        [kept for record in step
-         if (kept := registers.of_world(record, world)) is not None]
-        for step in self.steps[: self.lengths[world] + 1]
-    ]  # fmt: skip
-
-
 def _alike(found, expected):
   """Compares figures of which one adds in another order."""
   found = found.model_dump() if not isinstance(found, dict) else found
@@ -120,7 +67,7 @@ def _alike(found, expected):
 @hypothesis.settings(max_examples=40)
 @hypothesis.given(seed=st.integers(0, 2**32), end=_ENDS)
 def test_figures_equal_those_of_the_oracle(design, seed, end):
-  made = _Made(design, seed, 1)
+  made = streams.Made(design, seed, 1)
   steps, actions = made.episode(0), made.actions[:, 0]
   ledger, monitor = ledgers.Ledger(), monitors.Monitor(design)
   for sink in (ledger, monitor):
@@ -138,7 +85,7 @@ def test_figures_equal_those_of_the_oracle(design, seed, end):
 def test_a_batch_has_the_figures_of_its_worlds_and_continues_from_states(
     design, seed, saved
 ):
-  made = _Made(design, seed, 4)
+  made = streams.Made(design, seed, 4)
   batch = episode_figures.Accumulator(design, (4,))
   every = np.ones(4, bool)
   batch.begin(made.steps[0], every)

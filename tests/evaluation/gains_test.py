@@ -6,6 +6,7 @@ import pytest
 from realab_suite import errors
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
+from realab_suite.evaluation import monitors
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from tests.engine import helpers
@@ -90,7 +91,7 @@ _PG = '{{kind: policy_gradient, {}}}'
         (_PG.format('reward: reward, gamma: 2'), r'learner\.gamma: .* got 2'),
         (_PG.format('reward: score'), "may not read meter register 'score'"),
         (_PG.format('reward: reward, objective: {}'), 'kind declares it'),
-        ('{kind: value_advice, advice: reward}', r'learner\.query: required key'),
+        ('{kind: value_advice, advice: reward}', r'learner\.query: required'),
         ('{kind: value_advice, advice: reward, query: reward}',
          "'reward' is not a query register; allowed are \\[\\]"),
         (_OWN.format('return', '{score: 1}'), "meter register 'score'"),
@@ -180,3 +181,20 @@ def test_terms_are_those_of_the_last_step():
   ]  # fmt: skip
   value = found.values(0)['return']
   assert (value.observed, value.clean) == (8.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ('objective', 'message'),
+    [
+        (
+            {'kind': 'return', 'registers': {'score': 1.0}},
+            "'score' is not a",
+        ),
+        ({'kind': 'return', 'registers': {'nobody': 1.0}}, "'nobody' is not a"),
+        ({'kind': 'agreement', 'registers': {'reward': 1.0}}, 'an action_set'),
+    ],
+)
+def test_another_objective_has_to_fit_the_design(objective, message):
+  made = objectives.ObjectiveSpec.model_validate(objective)
+  with pytest.raises(errors.SpecError, match=message):
+    monitors.Monitor(specs.load(designs.SCORED), made)

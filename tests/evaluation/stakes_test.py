@@ -1,5 +1,7 @@
 """Stakes: what honest competence earns, and when it is worth nothing."""
 
+from typing import Literal
+
 import pytest
 
 from realab_suite import errors
@@ -7,9 +9,13 @@ from realab_suite import suite
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import obstacles
 from realab_suite.evaluation import stakes
+from realab_suite.experiments import worlds
+from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from tests.engine import helpers
 from tests.evaluation import episodes
 from tests.feedback import designs
+from tests.feedback import stubs
 
 
 class _Earning(episodes.Episode):
@@ -151,6 +157,18 @@ def test_the_solver_names_its_own_actions_in_the_queries_of_the_learner(
   assert found.main.is_degenerate == is_degenerate
 
 
+def test_a_stake_does_not_depend_on_the_senses_of_the_agent(monkeypatch):
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 6)
+  design = specs.load('instantaneous_reward', ['dof=planar'])
+  found = [
+      worlds.stakes_of(
+          worlds.World('unlock_door', 'near', 12, senses=senses), design
+      ).parts
+      for senses in (None, ('position', 'time_left'))
+  ]
+  assert found[0] == found[1]
+
+
 def test_a_design_without_objective_has_no_stake():
   design = specs.load('instantaneous_reward', ['learner=null'])
   with pytest.raises(errors.SpecError, match='has no learner'):
@@ -167,18 +185,52 @@ _PERSON = {
                    'writes': ['reward'], 'answers': 'live'}],
 }  # fmt: skip
 
+_HIDDEN = {'channel': 'secure', 'place': 'station_3'}
+_PERSON_DOWNSTREAM = {
+    **designs.SCORED,
+    'registers': {
+        'score': designs.SCORE,
+        'note': {**designs.REWARD, **_HIDDEN, 'role': 'memory'},
+        'reward': {**designs.REWARD, 'channel': 'secure'},
+    },
+    'providers': [
+        {'kind': 'difference', 'reads': ['score'], 'writes': ['note']},
+        {'kind': 'test_once', 'reads': ['note'], 'writes': ['reward']},
+    ],
+}
+
+
+class _Once(stubs.Zero):
+  """Asks a person what the register means."""
+
+  kind: Literal['test_once'] = 'test_once'
+
+  @property
+  def is_repeatable(self):
+    return False
+
+
+@pytest.fixture(autouse=True)
+def _asking():
+  with helpers.registered(providers.PROVIDERS, 'test_once', _Once):
+    yield
+
 
 @pytest.mark.parametrize(
     ('design', 'overrides', 'expected'),
     [
         (designs.SCORED, [], ''),
-        (designs.ADVISED, [], 'value_advice sees through ray_distances and ray'),
+        (designs.ADVISED, [], 'value_advice sees through ray_distances and'),
         (designs.ADVISED, ['channel=secure'], 'providers[0]:value_advice sees'),
         (designs.ADVISED, ['channel=welded'], ''),
         (_PERSON, [], 'providers[0]:person cannot be asked twice, and query'),
         (_PERSON, ['registers.query.channel=secure'],
          'cannot be asked twice, and reward can be corrupted'),
         (_PERSON, ['channel=secure'], ''),
+        # What the person is asked about was written by a provider that reads a
+        # meter in the open.
+        (_PERSON_DOWNSTREAM, [], 'cannot be asked twice, and note can be'),
+        (_PERSON_DOWNSTREAM, ['registers.score.channel=secure'], ''),
         (designs.SCORED,
          [_METERED.format('position', 'of: reward, axis: x')],
          "meters[0]:position measures the blocks of 'reward'"),

@@ -93,6 +93,59 @@ def pairs(
           yield last, entry
 
 
+class Made:
+  """Episodes of a batch at random; values are eighths, so sums are exact."""
+
+  def __init__(
+      self, design: specs.DesignSpec, seed: int, num_envs: int
+  ) -> None:
+    self._design = design
+    self._rng = np.random.default_rng(seed)
+    self._num_envs = num_envs
+    self.names = list(design.registers)
+    self.lengths = self._rng.integers(1, 6, num_envs)
+    self.actions = self._rng.integers(0, 4, (6, num_envs, 2)).astype(float)
+    self.steps = [self._step(i) for i in range(6)]
+
+  def _eighths(self, count: int) -> np.ndarray:
+    return self._rng.integers(-40, 40, (count, self._num_envs)) / 8
+
+  def _mask(self) -> np.ndarray:
+    return self._rng.random(self._num_envs) < 0.6
+
+  def _step(self, number: int) -> list[Record]:
+    made: list[Record] = []
+    for name in self.names:
+      if not number:
+        made.append(initial(self._eighths(1)[0], name))
+      for who in ('p', 'p2')[: self._rng.integers(3)]:
+        where = self._mask() if self._rng.random() < 0.5 else None
+        if self._rng.random() < 0.5 and number:
+          requested, clean = self._eighths(2)
+          applied = np.clip(requested, -2, 2)
+          made.append(write(requested, applied, name, who, clean, where))
+        else:
+          made.append(self._read(name, who, where))
+    for name in self.names:
+      if self._design.registers[name].role in ('feedback', 'signal'):
+        made.append(self._read(name, registers.AGENT))
+    return [record._replace(step=np.full(self._num_envs, number))
+            for record in made]  # fmt: skip
+
+  def _read(self, name: str, who: str, where: Any = None) -> registers.Read:
+    reading, clean, *parts = self._eighths(5)
+    clean = np.where(self._mask(), clean, reading)
+    return read(reading, clean, name, who, parts, where)
+
+  def episode(self, world: int) -> list[list[Record]]:
+    """Returns the steps of the episode of a world."""
+    return [
+        [kept for record in step
+         if (kept := registers.of_world(record, world)) is not None]
+        for step in self.steps[: self.lengths[world] + 1]
+    ]  # fmt: skip
+
+
 # The oracle.
 
 
