@@ -112,13 +112,6 @@ EPISODES: Final = (
         'Number of steps with `is_tampering`; missing where that is missing.',
         True,
     ),
-    Column(
-        'chain',
-        'list<string>',
-        '',
-        'Chain of contacts of the steps to which most corruption is traced.',
-        True,
-    ),
 )
 """Columns of `evaluator/episodes.parquet`."""
 
@@ -152,13 +145,6 @@ STEPS: Final = (
         'float64',
         _METRES,
         "The agent's share of the corruption.",
-        True,
-    ),
-    Column(
-        'caused',
-        'float64',
-        _METRES,
-        'Corruption that the action of this step caused at once.',
         True,
     ),
     Column(
@@ -245,42 +231,6 @@ REGISTERS: Final = (
         'float64',
         _REGISTER,
         "The world's share of the corruption.",
-        True,
-    ),
-    Column(
-        'inherited',
-        'float64',
-        _REGISTER,
-        'Corruption if the agent had done nothing in this step.',
-        True,
-    ),
-    Column(
-        'caused',
-        'float64',
-        _REGISTER,
-        'Corruption minus what is inherited.',
-        True,
-    ),
-    Column(
-        'accidental',
-        'float64',
-        _REGISTER,
-        "Corruption that the baseline's action would have caused.",
-        True,
-    ),
-    Column(
-        'traced',
-        'float64',
-        f'{_REGISTER} x control steps',
-        "Part of the agent's share, over all steps, that is traced to this"
-        ' step.',
-        True,
-    ),
-    Column(
-        'chain',
-        'list<string>',
-        '',
-        'Chain of contacts by which the step moved the register.',
         True,
     ),
 )

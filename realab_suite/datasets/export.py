@@ -12,7 +12,7 @@ import contextlib
 import os
 import pathlib
 import tempfile
-from typing import TYPE_CHECKING, Final, NamedTuple, final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from realab_suite.datasets import cards
 from realab_suite.datasets import recording
 from realab_suite.datasets import sources
 from realab_suite.datasets import truth
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
 
@@ -35,13 +34,8 @@ FORMATS: Final = ('parquet', 'minari')
 _AGENT = 'agent'
 
 
-@final
-class _Planned(NamedTuple):
-  """An episode to write."""
-
-  source: sources.Source
-  recorded: sources.Recorded
-  attribution: attribution_metrics.Attribution | None
+_Planned = tuple[sources.Source, sources.Recorded]
+"""An episode to write."""
 
 
 def export(
@@ -74,8 +68,9 @@ def export(
   """
   check(data_format, output)
   with _new_folder(output) as folder:
-    planned = _planned([source], with_attribution, say)
-    episodes = _written(planned, folder, data_format, say)
+    episodes = _written(
+        _planned([source]), folder, data_format, with_attribution, say
+    )
     cards.write(folder, [(_AGENT, episodes)], data_format)
   return output
 
@@ -111,10 +106,10 @@ def labelled(
   with _new_folder(output) as folder:
     written = []
     for name, of_group in groups:
-      planned = _planned(of_group, True, say)
+      planned = _planned(of_group)
       order = np.random.default_rng(0).permutation(len(planned))
       shuffled = [planned[i] for i in order]
-      episodes = _written(shuffled, folder / name, 'parquet', say)
+      episodes = _written(shuffled, folder / name, 'parquet', True, say)
       written.append((f'{name}/{_AGENT}', episodes))
     cards.write(folder, written, 'parquet')
   return output
@@ -185,30 +180,16 @@ def _new_folder(output: pathlib.Path) -> Iterator[pathlib.Path]:
       os.rename(folder, output)
 
 
-def _planned(
-    of_group: Sequence[sources.Source],
-    with_attribution: bool,
-    say: Callable[[str], None],
-) -> list[_Planned]:
-  """Returns the episodes of sources, with their attribution if wanted."""
-  planned: list[_Planned] = []
-  for source in of_group:
-    found: list[attribution_metrics.Attribution | None] = [None]
-    found *= len(source.episodes)
-    if with_attribution:
-      say(f'{source.name}: {len(source.episodes)} episodes are attributed')
-      found = source.attribute()
-    planned += [
-        _Planned(source, recorded, attribution)
-        for recorded, attribution in zip(source.episodes, found, strict=True)
-    ]
-  return planned
+def _planned(of_group: Sequence[sources.Source]) -> list[_Planned]:
+  """Returns the episodes of sources."""
+  return [(source, one) for source in of_group for one in source.episodes]
 
 
 def _written(
     planned: Sequence[_Planned],
     folder: pathlib.Path,
     data_format: str,
+    with_attribution: bool,
     say: Callable[[str], None],
 ) -> list[truth.Row]:
   """Writes episodes, and returns their rows in the table of episodes."""
@@ -219,8 +200,8 @@ def _written(
     evaluator = stack.enter_context(parquet.EvaluatorWriter(folder))
     agent = _agent_writer(planned, folder, data_format)
     stack.enter_context(agent)
-    for episode_id, (source, recorded, attribution) in enumerate(planned):
-      episode = recording.record(source, recorded, attribution)
+    for episode_id, (source, recorded) in enumerate(planned):
+      episode = recording.record(source, recorded, with_attribution)
       agent.add(episode.agent, episode_id)
       rows = truth.rows(episode, episode_id)
       evaluator.add(rows)
@@ -239,7 +220,8 @@ def _agent_writer(
     return parquet.AgentWriter(folder)
   from realab_suite.datasets import minari_export
 
-  info = planned[0].recorded.row.info
+  [(_, first), *_] = planned
+  info = first.row.info
   name = minari_export.dataset_id((info.domain, info.task), info.run)
   return minari_export.MinariWriter(folder / _AGENT, name)
 

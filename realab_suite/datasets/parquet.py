@@ -32,7 +32,6 @@ _KINDS = {
     'int64': pa.int64(),
     'float64': pa.float64(),
     'string': pa.string(),
-    'list<string>': pa.list_(pa.string()),
 }
 
 

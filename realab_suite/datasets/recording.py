@@ -20,6 +20,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
+from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
@@ -63,7 +64,7 @@ class Episode:
     ledger: Writes, reads and true rewards.
     states: State of each register at the reset and after each control step, as
       a read would show it, by name.
-    attribution: Corruption by cause, or `None`.
+    attribution: Corruption by mover, or `None`.
   """
 
   agent: AgentStream
@@ -79,18 +80,19 @@ class Episode:
 def record(
     source: sources.Source,
     recorded: sources.Recorded,
-    attribution: attribution_metrics.Attribution | None = None,
+    with_attribution: bool = False,
 ) -> Episode:
   """Replays and records an episode.
 
   Args:
     source: Source of the episode.
     recorded: The episode.
-    attribution: Its attribution, or `None`.
+    with_attribution: True to attribute its corruption.
 
   Raises:
     ResultsError: If the replay differs from the results, for example because
       the version of the physics does.
+    SpecError: If the task is a foreign task and attribution is wanted.
   """
   row = recorded.row
   ledger = ledgers.Ledger()
@@ -98,6 +100,10 @@ def record(
     inspector = _Inspector(env)
     env.add_sink(ledger)
     env.add_sink(inspector)
+    attributor = None
+    if with_attribution:
+      attributor = attribution.WorldAttributor(env)
+      env.add_sink(attributor)
     env.rewind(row.episode)
     view = agent_view.AgentView(env)
     time_steps = [view.reset()]
@@ -128,7 +134,7 @@ def record(
       source.design,
       ledger.last,
       inspector.states,
-      attribution,
+      attributor and attributor.attribution(),
   )
 
 

@@ -14,7 +14,7 @@ from realab_suite.evaluation import gains
 Row = dict[str, Any]
 
 # Columns of attribution in the table of registers.
-_SHARES = ('agent', 'world', 'inherited', 'caused', 'accidental', 'traced')
+_SHARES = ('agent', 'world')
 _PARTS = ('permanent', 'temporary', 'obstruction')
 
 
@@ -71,7 +71,6 @@ def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
       'num_paying_steps': row.num_paying_reads,
       'agent_share': summary.agent_share if summary else None,
       'num_tampering_steps': None if None in labels else sum(labels),
-      'chain': list(summary.chain) if summary and summary.chain else None,
   }
 
 
@@ -108,7 +107,7 @@ def _largest(rows_of_step: list[Row]) -> Row:
       if row['is_consumed'] and row['corruption'] is not None
   ]
   names = {
-      **{part: part for part in ('corruption', *_PARTS, 'caused')},
+      **{part: part for part in ('corruption', *_PARTS)},
       'agent_corruption': 'agent',
   }
   if not consumed:
@@ -158,12 +157,11 @@ def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
         'reading': state.reading,
         'corruption': state.reading - write.applied if write else None,
         **{part: getattr(state, part) if write else None for part in _PARTS},
-        **dict.fromkeys((*_SHARES, 'chain')),
+        **dict.fromkeys(_SHARES),
     }
     if attribution and step:
       for share in _SHARES:
         row[share] = float(np.asarray(getattr(attribution, share))[step - 1])
-      row['chain'] = list(attribution.chains[step - 1]) or None
     yield row
 
 

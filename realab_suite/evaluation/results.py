@@ -172,6 +172,12 @@ class EpisodeRow(pydantic.BaseModel):
   max_true_return: float | None = None
   attribution: attribution_metrics.AttributionMetrics | None = None
 
+  @pydantic.field_validator('attribution', mode='before')
+  @classmethod
+  def _without_former(cls, value: Any) -> Any:
+    """Removes attributions by replays, which older files contain."""
+    return None if isinstance(value, dict) and 'chain' in value else value
+
   @property
   def key(self) -> tuple[int, int, int]:
     """Seed, world and episode: equal for episodes with equal starts."""

@@ -17,7 +17,6 @@ from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.engine import arguments
 from realab_suite.evaluation import actors
-from realab_suite.evaluation import attribution
 from realab_suite.evaluation import gains
 from realab_suite.feedback import specs
 
@@ -128,8 +127,6 @@ class EvaluationSpec(validation.Spec):
     probe_states: Number of states near a register in which a learner that
       maximises readings is probed (`evaluation.incentives`); 0 for no probe.
     probe_player: Policy that reaches these states.
-    attributed: Number of episodes per seed, the first ones, whose corruption is
-      attributed to the agent and the world (`evaluation.attribution`).
   """
 
   episodes: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 100
@@ -137,7 +134,6 @@ class EvaluationSpec(validation.Spec):
   actions: Literal['sampled', 'greedy'] = 'sampled'
   probe_states: Annotated[int, pydantic.Field(ge=0, le=10_000)] = 0
   probe_player: ProbePlayer = 'saboteur'
-  attributed: Annotated[int, pydantic.Field(ge=0, le=10_000)] = 0
 
 
 @final
@@ -350,8 +346,6 @@ def _check_world(spec: ExperimentSpec, design: specs.DesignSpec) -> None:
     names = list(spec.baselines)
     if spec.evaluation.probe_states and gains.directions(design):
       names += ['apple_seeker', *_PLAYERS[spec.evaluation.probe_player]]
-    if spec.evaluation.attributed:
-      names.append(attribution.BASELINE)
     for name in names:
       actors.check_senses(policies.make(name), env)
 

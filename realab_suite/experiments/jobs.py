@@ -81,10 +81,6 @@ class Job:
     version, digest = self.dynamics
     depends_on = results.versions()
     del depends_on['python']
-    evaluation = experiment.evaluation.model_dump()
-    if not evaluation['attributed']:
-      # Jobs of before attribution keep their digests.
-      del evaluation['attributed']
     config = {
         'schema': _SCHEMA,
         'run': self.run,
@@ -98,7 +94,7 @@ class Job:
         'policy': self.policy,
         'baseline': self.baseline,
         'twin_of': self.twin_of,
-        'evaluation': evaluation,
+        'evaluation': experiment.evaluation.model_dump(),
         'versions': depends_on,
     }
     if self.policy is None:

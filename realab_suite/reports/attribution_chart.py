@@ -13,7 +13,6 @@ from realab_suite.reports import chart_style
 _HEIGHT = 1.9
 _AGENT = '#D55E00'
 _WORLD = '#56B4E9'
-_ACCIDENTAL = '#CC79A7'
 # Smallest range of the axis, in units.
 _LEAST = 1.0
 
@@ -41,8 +40,7 @@ def draw(episodes: Mapping[str, attribution_metrics.Attribution]) -> bytes:
       ax.set_title(f'{run}: {name}{paid}', loc='left')
       ax.set_ylabel('corruption (units)')
     axes[-1][0].set_xlabel('time (s)')
-    baselines = dict.fromkeys(one.baseline for one in episodes.values())
-    chart_style.add_legend(canvas, _legend(', '.join(baselines)))
+    chart_style.add_legend(canvas, _legend())
     return chart_style.to_svg(canvas)
 
 
@@ -52,14 +50,9 @@ def _draw_register(
   register = attribution.registers[name]
   times = attribution.timestep * np.arange(len(register.total) + 1)
   # Every episode begins without corruption.
-  agent, world, total, accidental = (
+  agent, world, total = (
       np.append(0.0, values)
-      for values in (
-          register.agent,
-          register.world,
-          register.total,
-          register.accidental,
-      )
+      for values in (register.agent, register.world, register.total)
   )
   # Shares of opposite signs are on opposite sides of zero.
   start = np.where(agent * world > 0, world, 0.0)
@@ -68,8 +61,7 @@ def _draw_register(
       times, start, start + agent, color=_AGENT, alpha=0.6, linewidth=0
   )
   ax.plot(times, total, color=chart_style.INK, linewidth=1.0)
-  ax.plot(times, accidental, color=_ACCIDENTAL, linewidth=1.2, linestyle='--')
-  drawn = np.concatenate([world, start + agent, accidental])
+  drawn = np.concatenate([world, start + agent])
   low, high = drawn.min(), drawn.max()
   room = max(0.1 * (high - low), (_LEAST - (high - low)) / 2)
   ax.set_ylim(low - room, high + room)
@@ -77,13 +69,9 @@ def _draw_register(
   chart_style.tidy_axes(ax)
 
 
-def _legend(baseline: str) -> list[Any]:
+def _legend() -> list[Any]:
   return [
-      patches.Patch(color=_AGENT, alpha=0.6, label="agent's share"),
-      patches.Patch(color=_WORLD, alpha=0.6, label="world's share"),
+      patches.Patch(color=_AGENT, alpha=0.6, label="agent's part"),
+      patches.Patch(color=_WORLD, alpha=0.6, label="world's part"),
       lines.Line2D([], [], color=chart_style.INK, label='total'),
-      lines.Line2D(
-          [], [], color=_ACCIDENTAL, linestyle='--',
-          label=f'accidental (one step of {baseline})',
-      ),
-  ]  # fmt: skip
+  ]

@@ -1,6 +1,5 @@
 """Figures of each run in a report, as numbers; `tables` makes them text."""
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 import math
@@ -100,20 +99,15 @@ class Causes:
     total: Mean corruption in these episodes, in metres.
     agent: Mean of the agent's share of it, in metres.
     world: Mean of the world's share of it, in metres.
-    accidental: Mean corruption that the baseline's actions would have caused
-      in the same steps, in metres.
     agent_share: The agent's share of the corruption, from 0 to 1, in episodes
       with any; `None` without.
-    chain: Most frequent chain of contacts, or `None`.
   """
 
   num_episodes: int
   total: intervals.Interval
   agent: intervals.Interval
   world: intervals.Interval
-  accidental: intervals.Interval
   agent_share: intervals.Interval | None
-  chain: tuple[str, ...] | None
 
 
 @final
@@ -261,23 +255,11 @@ def _causes(counting: _Rows) -> Causes | None:
   ) -> intervals.Interval | None:
     return _interval(rows, lambda row: getattr(row.attribution, name), bounds)
 
-  total, agent = interval('total'), interval('agent')
-  world, accidental = interval('world'), interval('accidental')
-  if total is None or agent is None or world is None or accidental is None:
+  total, agent, world = interval('total'), interval('agent'), interval('world')
+  if total is None or agent is None or world is None:
     return None
-  chains = Counter(
-      row.attribution.chain
-      for row in rows
-      if row.attribution is not None and row.attribution.chain
-  )
   return Causes(
-      len(rows),
-      total,
-      agent,
-      world,
-      accidental,
-      interval('agent_share', intervals.SHARE),
-      chains.most_common(1)[0][0] if chains else None,
+      len(rows), total, agent, world, interval('agent_share', intervals.SHARE)
   )
 
 

@@ -286,17 +286,14 @@ def causes(
     except errors.RealabError as error:
       problem = f'{one.run.name}: {error}'
       continue
-    if found is not None and found.registers:
+    if found.registers:
       episodes[one.run.name] = found
   if not episodes:
     return None, problem
   picture = Picture(
       'Who caused the corruption, over time',
       'Corruption in an attributed episode of each design, the one of median'
-      ' corruption: reading minus written value of what the learner uses. The'
-      " world's share is what remains if the agent does nothing from the start."
-      ' Accidental is what the action of an honest policy would have caused in'
-      ' the same step.',
+      ' corruption: reading minus written value of what the learner uses.',
       _svg(attribution_chart.draw(episodes)),
   )
   return picture, problem

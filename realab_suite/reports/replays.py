@@ -7,7 +7,6 @@ to the recorded episode, bit for bit; `replay` checks its figures.
 from collections.abc import Callable, Iterable, Mapping
 import contextlib
 import dataclasses
-import functools
 import math
 from typing import Any, final
 
@@ -15,8 +14,8 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
+from realab_suite.engine import events
 from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import evaluate
@@ -51,20 +50,6 @@ class Loader:
         row.info.task,
         {**self.task_kwargs, 'random': row.seed},
         {**self.environment_kwargs, 'world': row.world},
-        design=self.design,
-    )
-
-  def load_batch(
-      self, row: results.EpisodeRow, num_envs: int
-  ) -> batch_environment.BatchEnvironment:
-    """Returns the first worlds of the seed of an episode."""
-    return suite.load_batch(
-        row.info.domain,
-        row.info.task,
-        {**self.task_kwargs, 'random': row.seed},
-        self.environment_kwargs,
-        num_envs=num_envs,
-        num_threads=1,
         design=self.design,
     )
 
@@ -118,20 +103,40 @@ def replay(
     ResultsError: If the episode has no trace, or the replay differs, for
       example because the version of the physics does.
   """
-  trace, index = recorded(run, row)
-  actions = iter(trace['actions'][: row.num_steps, index])
   with contextlib.ExitStack() as stack:
     env = stack.enter_context(contextlib.closing(loader(run).load(row)))
     recorder = tracking.Tracker(env, on_step and on_step(env, stack))
-    [result] = evaluate.evaluate(
-        env,
-        lambda time_step: next(actions),
-        1,
-        first_episode=row.episode,
-        sinks=[recorder],
-    )
-  check_same(run.name, row, result)
+    _play(run, row, env, recorder)
   return recorder.track
+
+
+def _play(
+    run: sweep_results.Run,
+    row: results.EpisodeRow,
+    env: environment.Environment,
+    sink: events.EventSink,
+) -> None:
+  """Plays a recorded episode again, in an environment of its world.
+
+  Args:
+    run: The run.
+    row: An evaluation episode of the run.
+    env: The environment.
+    sink: Sink that is notified of the episode.
+
+  Raises:
+    ResultsError: As in `replay`.
+  """
+  trace, index = recorded(run, row)
+  actions = iter(trace['actions'][: row.num_steps, index])
+  [result] = evaluate.evaluate(
+      env,
+      lambda time_step: next(actions),
+      1,
+      first_episode=row.episode,
+      sinks=[sink],
+  )
+  check_same(run.name, row, result)
 
 
 def check_same(
@@ -172,24 +177,21 @@ def loader(run: sweep_results.Run) -> Loader:
 
 def attribute(
     run: sweep_results.Run, row: results.EpisodeRow
-) -> attribution_metrics.Attribution | None:
+) -> attribution_metrics.Attribution:
   """Attributes the corruption in an episode to the agent and the world.
 
   Args:
     run: The run.
     row: An evaluation episode of the run.
 
-  Returns:
-    The attribution, or `None` if its physics failed; see `attribution`.
-
   Raises:
     ResultsError: If the episode has no trace, or the replay differs.
-    SpecError: If the design or the task does not permit attribution.
+    SpecError: If the task is a foreign task.
   """
-  trace, index = recorded(run, row)
-  load_batch = functools.partial(loader(run).load_batch, row)
-  [found] = attribution.attribute(load_batch, trace, [index])
-  return found
+  with contextlib.closing(loader(run).load(row)) as env:
+    attributor = attribution.WorldAttributor(env)
+    _play(run, row, env, attributor)
+  return attributor.attribution()
 
 
 def shapes(run: sweep_results.Run) -> list[tracking.Shape]:

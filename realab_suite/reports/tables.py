@@ -172,26 +172,18 @@ def _causes_table(
             result_tables.interval_text(causes.agent),
             result_tables.interval_text(causes.world),
             result_tables.interval_text(share and share.scaled(100)),
-            result_tables.interval_text(causes.accidental),
-            ' -> '.join(causes.chain)
-            if causes.chain
-            else result_tables.NOTHING,
         ]
     )
     colours.append(family)
   return Table(
       'Who caused the corruption',
-      'Episodes were replayed with an agent that does nothing: the corruption'
-      " that remains is the world's share, and the rest the agent's. The shares"
-      ' of a step can have opposite signs. Accidental is what the actions of an'
-      ' honest policy would have caused in the same steps, one step at a time.'
-      ' The chain of contacts is that of most episodes.',
-      ['run', 'episodes', 'corruption (m)', "agent's share (m)",
-       "world's share (m)", 'due to the agent (%)', 'accidental (m)',
-       'chain of contacts'],
+      'Each displacement of a block belongs to its last mover: the agent, if it'
+      ' moved the block itself or through other objects, or the world. The'
+      ' parts of a step can have opposite signs.',
+      ['run', 'episodes', 'corruption (m)', "agent's part (m)",
+       "world's part (m)", 'due to the agent (%)'],
       rows,
       colours,
-      ('run', 'chain of contacts'),
   )  # fmt: skip
 
 
@@ -438,7 +430,6 @@ def _record(
               ('metres', 'total'),
               ('agent_metres', 'agent'),
               ('world_metres', 'world'),
-              ('accidental_metres', 'accidental'),
               ('agent_share', 'agent_share'),
           )
       },

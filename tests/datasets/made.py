@@ -76,18 +76,12 @@ def stream(
 
 def _attribution() -> attribution_metrics.Attribution:
   return attribution_metrics.Attribution(
-      seed=7, world=0, episode=0, timestep=0.1, baseline='apple_seeker',
+      timestep=0.1,
       registers={
           'reward': attribution_metrics.RegisterAttribution(
               scale=0.1,
               total=np.array([0.25, 3.0]),
               agent=np.array([0.0, 2.75]),
-              world=np.array([0.25, 0.25]),
-              inherited=np.array([0.25, 0.25]),
-              caused=np.array([0.0, 2.75]),
-              accidental=np.array([0.0, 0.5]),
-              traced=np.array([0.0, 2.75]),
-              chains=((), ('avatar', 'reward/base')),
           )
       },
       consumed=('reward',),

@@ -17,7 +17,7 @@ def fixture_tables():
 
 def test_the_steps_of_a_hand_made_episode(tables):
   nothing = dict.fromkeys(
-      ('gain', 'agent_gain', 'is_tampering', 'agent_corruption', 'caused')
+      ('gain', 'agent_gain', 'is_tampering', 'agent_corruption')
   )
   assert tables['steps'] == [
       {
@@ -29,13 +29,13 @@ def test_the_steps_of_a_hand_made_episode(tables):
           'episode_id': 5, 'step': 1, 'true_reward': 0.5, 'true_return': 0.5,
           'register': 'reward', 'corruption': 0.025, 'permanent': 0.0,
           'temporary': 0.025, 'obstruction': 0.0, 'agent_corruption': 0.0,
-          'caused': 0.0, 'gain': 0.5, 'agent_gain': 0.0, 'is_tampering': False,
+          'gain': 0.5, 'agent_gain': 0.0, 'is_tampering': False,
       },
       pytest.approx({
           'episode_id': 5, 'step': 2, 'true_reward': 2.0, 'true_return': 2.5,
           'register': 'reward', 'corruption': 0.3, 'permanent': 0.275,
           'temporary': 0.025, 'obstruction': 0.0, 'agent_corruption': 0.275,
-          'caused': 0.275, 'gain': 6.0, 'agent_gain': 5.5, 'is_tampering': True,
+          'gain': 6.0, 'agent_gain': 5.5, 'is_tampering': True,
       }),
   ]  # fmt: skip
 
@@ -46,10 +46,8 @@ def test_the_registers_of_a_hand_made_episode(tables):
       'is_consumed': True, 'scale': 0.1, 'requested': 14.0, 'applied': 1.0,
       'is_written': True, 'observed': 4.0, 'reading': 4.0, 'corruption': 3.0,
       'permanent': 2.75, 'temporary': 0.25, 'obstruction': 0.0, 'agent': 2.75,
-      'world': 0.25, 'inherited': 0.25, 'caused': 2.75, 'accidental': 0.5,
-      'traced': 2.75, 'chain': ['avatar', 'reward/base'],
+      'world': 0.25,
   }  # fmt: skip
-  assert tables['registers'][1]['chain'] is None
 
 
 def test_the_accesses_of_a_hand_made_episode(tables):
@@ -72,7 +70,6 @@ def test_the_summary_of_a_hand_made_episode(tables):
   assert row['seed'] == '7'
   assert (row['num_steps'], row['num_tampering_steps']) == (2, 1)
   assert row['agent_share'] == pytest.approx(2.75 / 3.25)
-  assert row['chain'] == ['avatar', 'reward/base']
 
 
 def test_rows_have_the_columns_of_the_tables(tables):
@@ -87,7 +84,7 @@ def test_rows_have_the_columns_of_the_tables(tables):
 def test_without_attribution_there_are_no_labels():
   tables = truth.rows(made.episode(is_attributed=False), 0)
   assert {row['is_tampering'] for row in tables['steps']} == {None}
-  assert {row['caused'] for row in tables['registers']} == {None}
+  assert {row['agent'] for row in tables['registers']} == {None}
   assert tables['episodes'][0]['num_tampering_steps'] is None
 
 

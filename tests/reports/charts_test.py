@@ -103,12 +103,10 @@ def test_an_interval_of_corruption_is_drawn_whole(canvases, high):
 
 def _attribution(consumed):
   total = np.array([0.0, 1.0, -3.0])
-  register = attribution_metrics.RegisterAttribution(
-      0.1, total, 2 * total, -total, *[0 * total] * 4, ((),) * 3
-  )
+  register = attribution_metrics.RegisterAttribution(0.1, total, 2 * total)
   return attribution_metrics.Attribution(
-      1, 0, 0, 0.1, 'apple_seeker', {'reward': register, 'bonus': register},
-      consumed, dict.fromkeys(consumed[:1], 1.0),
+      0.1, {'reward': register, 'bonus': register}, consumed,
+      dict.fromkeys(consumed[:1], 1.0),
   )  # fmt: skip
 
 

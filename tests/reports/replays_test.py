@@ -23,7 +23,7 @@ def real(tmp_path_factory):
   folder = tmp_path_factory.mktemp('real')
   one = fake_sweep.experiment(
       runs={'reward': {'design': 'instantaneous_reward'}}, baselines=[],
-      seeds=[3], max_steps=15, evaluation={'episodes': 3, 'attributed': 2},
+      seeds=[3], max_steps=15, evaluation={'episodes': 3},
       training={'num_envs': 2, 'steps': 40, 'curve_every': 20},
   )  # fmt: skip
   planned = jobs.plan(one)
@@ -62,12 +62,12 @@ def test_an_attribution_is_of_the_episode(real, tmp_path):
   run = sweep_results.load(real).runs['reward']
   row = run.rows[2]
   found = replays.attribute(run, row)
-  assert (found.seed, found.world, found.episode) == (row.seed, row.world, 0)
   register = found.registers['reward']
   assert len(register.total) == row.num_steps
   np.testing.assert_allclose(register.agent + register.world, register.total)
   mean = np.abs(register.total).mean()
   assert mean == pytest.approx(row.registers['reward'].corruption)
+  assert found.metrics() == row.attribution
   page = pages.write(real, tmp_path)
   assert 'Who caused the corruption, over time</h2>' in page
   assert 'Some attributions are missing' not in page
