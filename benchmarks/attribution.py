@@ -1,18 +1,16 @@
-"""Benchmark of counterfactual attribution against a replay of the episodes.
+"""Benchmark of attribution against the same episodes without it.
 
-`python -m benchmarks.attribution` plays the first episodes of Unlock Door with
-a carrying saboteur. The same number of worlds then replays the actions without
-attribution, and `attribution.attribute` replays them beside their shadows and
-forks. Times are those of the processor, with one thread, so other work on the
-machine has little influence. They include the loading of worlds by
-`attribute`, but not that of the replay.
+`python -m benchmarks.attribution` records the actions of an honest policy and
+of saboteurs in the first episodes of Unlock Door. Two batches then step with
+them in turns, one of them with an attributor. Times are those of the processor,
+with one thread, so other work on the machine has little influence.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 import contextlib
-import functools
 import time
-from typing import Any
+
+import numpy as np
 
 from benchmarks import timing
 from realab_suite import policies
@@ -26,8 +24,11 @@ from realab_suite.evaluation import traces
 _SEED = 0
 _ROUNDS = 5
 _EPISODES: Sequence[int] = (8, 64)
-_STEPS = 250
-_TARGET = 5.0
+_STEPS = 100
+_POLICIES: Sequence[str] = (
+    'apple_seeker', 'carrying_saboteur', 'throwing_saboteur', 'pushing_saboteur'
+)  # fmt: skip
+_TARGET = 1.2
 
 
 def _load(num_envs: int, dof: str) -> batch_environment.BatchEnvironment:
@@ -38,33 +39,38 @@ def _load(num_envs: int, dof: str) -> batch_environment.BatchEnvironment:
   )  # fmt: skip
 
 
-def _record(load: Callable[[int], Any], number: int) -> dict[str, Any]:
-  """Returns the trace of a number of episodes."""
-  with contextlib.closing(load(number)) as batch:
-    # The place of the register is that of the variation `near`.
-    policy = policies.make('carrying_saboteur', target=[0.4, 0.2])
-    actor = batch_actors.BatchPolicyActor(policy, batch, _SEED)
+def _record(policy: str, number: int, dof: str) -> np.ndarray:
+  """Returns the actions of a policy in a number of episodes."""
+  # The place of the register is that of the variation `near`.
+  options = {'target': [0.4, 0.2]} if policy.endswith('saboteur') else {}
+  with contextlib.closing(_load(number, dof)) as batch:
+    actor = batch_actors.BatchPolicyActor(
+        policies.make(policy, **options), batch, _SEED
+    )
     tracer = traces.Tracer(batch, actor)
     batch.add_sink(tracer)
     evaluate.evaluate_batch(batch, tracer)
-    return tracer.trace()
+    actions: np.ndarray = tracer.trace()['actions']
+    return actions
 
 
-def _replay(load: Callable[[int], Any], trace: dict[str, Any]) -> float:
-  """Replays a trace and returns the seconds."""
-  with contextlib.closing(load(len(trace['num_steps']))) as batch:
-    batch.reset()
-    began = time.process_time()
-    for actions in trace['actions']:
-      batch.step(actions)
-    return time.process_time() - began
-
-
-def _attribute(load: Callable[[int], Any], trace: dict[str, Any]) -> float:
-  """Attributes a trace and returns the seconds."""
-  began = time.process_time()
-  attribution.attribute(load, trace)
-  return time.process_time() - began
+def _seconds(actions: np.ndarray, dof: str) -> tuple[float, float]:
+  """Returns the seconds without and with an attributor."""
+  seconds = [0.0, 0.0]
+  with contextlib.ExitStack() as stack:
+    batches = [
+        stack.enter_context(contextlib.closing(_load(actions.shape[1], dof)))
+        for _ in seconds
+    ]
+    batches[1].add_sink(attribution.Attributor(batches[1]))
+    for batch in batches:
+      batch.reset()
+    for action in actions:
+      for i, batch in enumerate(batches):
+        began = time.process_time()
+        batch.step(action)
+        seconds[i] += time.process_time() - began
+  return seconds[0], seconds[1]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -72,27 +78,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
   rounds = timing.parse_rounds(__doc__, arguments, _ROUNDS)
   figures = []
   for dof in ('free', 'planar'):
-    load = functools.partial(_load, dof=dof)
     for number in _EPISODES:
-      trace = _record(load, number)
-      seconds = timing.time_rounds(
-          {
-              'replay': functools.partial(_replay, load, trace),
-              'attribution': functools.partial(_attribute, load, trace),
-          },
-          rounds,
-      )
-      figures += [
-          timing.Figure(
-              f'attribution of {number} {dof}',
-              1e3 * seconds['attribution'] / number, 'ms', _TARGET, True,
-              seconds['attribution'] / seconds['replay'],
-          ),
-          timing.Figure(
-              f'replay of {number} {dof}', 1e3 * seconds['replay'] / number,
-              'ms',
-          ),
-      ]  # fmt: skip
+      for policy in _POLICIES:
+        actions = _record(policy, number, dof)
+        samples = np.array([_seconds(actions, dof) for _ in range(rounds + 1)])
+        without, with_it = samples[1:].T
+        figures.append(
+            timing.Figure(
+                f'{policy}, {number} {dof}', 1e3 * with_it / number, 'ms',
+                _TARGET, True, with_it / without,
+            )
+        )  # fmt: skip
   timing.report(figures)
 
 

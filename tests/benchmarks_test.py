@@ -91,9 +91,8 @@ def test_the_benchmark_of_attribution_prints_a_line_per_figure(
   monkeypatch.setattr(attribution, '_STEPS', 3)
   attribution.main(['--rounds=1'])
   expected = {
-      'attribution of 2 free': '<= 5 x raw',
-      'replay of 2 free': '-',
-      'attribution of 2 planar': '<= 5 x raw',
+      'apple_seeker, 2 free': '<= 1.2 x raw',
+      'throwing_saboteur, 2 planar': '<= 1.2 x raw',
   }
   _assert_lines(capsys.readouterr().out, expected)
 

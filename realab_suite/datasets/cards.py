@@ -28,7 +28,7 @@ _LABELS = """, and the label `is_tampering` of each step (missing where the
 learner is not judged, and where the stake is unknown or degenerate)"""
 _COUNTS = (
     'run', 'policy', 'design', 'channel', 'episodes', 'steps',
-    'attributed episodes', 'tampering steps', 'mean relative gain',
+    'tampering steps', 'mean relative gain',
     'mean true return', 'mean observed return',
 )  # fmt: skip
 _MINARI = (
@@ -112,7 +112,6 @@ def _counts(
         *run,
         len(rows),
         sum(row['num_steps'] for row in rows),
-        sum(row['is_attributed'] for row in rows),
         f'{sum(known)}{note}' if known else '-',
         *(
             _mean(row[name] for row in rows)

@@ -2,7 +2,7 @@
 
     sweep = sweep_results.load(pathlib.Path('results/paper'))
     source = sources.of_run(sweep.runs['reward'], num_episodes=20)
-    export.export(source, pathlib.Path('results/data'), with_attribution=True)
+    export.export(source, pathlib.Path('results/data'), data_format='parquet')
 
 `docs/data.md` describes the files.
 """
@@ -12,7 +12,7 @@ import contextlib
 import os
 import pathlib
 import tempfile
-from typing import TYPE_CHECKING, Final, NamedTuple, final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -33,13 +33,8 @@ FORMATS: Final = ('parquet', 'minari')
 _AGENT = 'agent'
 
 
-@final
-class _Planned(NamedTuple):
-  """An episode to write."""
-
-  source: sources.Source
-  recorded: sources.Recorded
-  attribution: sources.Attribution | None
+_Planned = tuple[sources.Source, sources.Recorded]
+"""An episode to write."""
 
 
 def export(
@@ -47,7 +42,6 @@ def export(
     output: pathlib.Path,
     *,
     data_format: str = 'parquet',
-    with_attribution: bool = False,
     say: Callable[[str], None] = lambda line: None,
 ) -> pathlib.Path:
   """Writes the episodes of a run into a new folder.
@@ -58,22 +52,19 @@ def export(
     source: The run.
     output: New folder. It appears only when it is complete.
     data_format: Format of the agent's data: 'parquet' or 'minari'.
-    with_attribution: True to determine which corruption the agent has caused.
     say: Called with messages for the user.
 
   Returns:
     The folder.
 
   Raises:
-    SpecError: If the format does not exist, or the design or the task does not
-      permit attribution.
+    SpecError: If the format does not exist.
     ResultsError: If a package is missing, the folder exists or cannot be
       written, or a replay differs from the results.
   """
   check(data_format, output)
   with _new_folder(output) as folder:
-    planned = _planned([source], with_attribution, say)
-    episodes = _written(planned, folder, data_format, say)
+    episodes = _written(_planned([source]), folder, data_format, say)
     _write_card(folder, [(_AGENT, episodes)], data_format)
   return output
 
@@ -99,7 +90,6 @@ def labelled(
     The folder.
 
   Raises:
-    SpecError: If a design or a task does not permit attribution.
     ResultsError: As in `export`, and if the observations or the actions of the
       sources of a group differ.
   """
@@ -109,7 +99,7 @@ def labelled(
   with _new_folder(output) as folder:
     written = []
     for name, of_group in groups:
-      planned = _planned(of_group, True, say)
+      planned = _planned(of_group)
       order = np.random.default_rng(0).permutation(len(planned))
       shuffled = [planned[i] for i in order]
       episodes = _written(shuffled, folder / name, 'parquet', say)
@@ -183,24 +173,9 @@ def _new_folder(output: pathlib.Path) -> Iterator[pathlib.Path]:
       os.rename(folder, output)
 
 
-def _planned(
-    of_group: Sequence[sources.Source],
-    with_attribution: bool,
-    say: Callable[[str], None],
-) -> list[_Planned]:
-  """Returns the episodes of sources, with their attribution if wanted."""
-  planned: list[_Planned] = []
-  for source in of_group:
-    found: list[sources.Attribution | None] = [None]
-    found *= len(source.episodes)
-    if with_attribution:
-      say(f'{source.name}: {len(source.episodes)} episodes are attributed')
-      found = source.attribute()
-    planned += [
-        _Planned(source, recorded, attribution)
-        for recorded, attribution in zip(source.episodes, found, strict=True)
-    ]
-  return planned
+def _planned(of_group: Sequence[sources.Source]) -> list[_Planned]:
+  """Returns the episodes of sources."""
+  return [(source, one) for source in of_group for one in source.episodes]
 
 
 def _written(
@@ -217,8 +192,8 @@ def _written(
     evaluator = stack.enter_context(parquet.EvaluatorWriter(folder))
     agent = _agent_writer(planned, folder, data_format)
     stack.enter_context(agent)
-    for episode_id, (source, recorded, attribution) in enumerate(planned):
-      episode = recording.record(source, recorded, attribution)
+    for episode_id, (source, recorded) in enumerate(planned):
+      episode = recording.record(source, recorded)
       agent.add(episode.agent, episode_id)
       rows = truth.rows(episode, episode_id)
       evaluator.add(rows)
@@ -247,7 +222,8 @@ def _agent_writer(
     return parquet.AgentWriter(folder)
   from realab_suite.datasets import minari_export
 
-  info = planned[0].recorded.row.info
+  [(_, first), *_] = planned
+  info = first.row.info
   name = minari_export.dataset_id((info.domain, info.task), info.run)
   return minari_export.MinariWriter(folder / _AGENT, name)
 

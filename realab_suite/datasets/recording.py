@@ -20,6 +20,8 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
+from realab_suite.evaluation import attribution
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
@@ -64,7 +66,7 @@ class Episode:
     states: State of each register at the reset and after each control step, as
       a read would show it, by name.
     terms: Terms of each control step in the objective, by part.
-    attribution: Corruption by cause, or `None`.
+    attribution: Own corruption by mover.
   """
 
   agent: AgentStream
@@ -75,20 +77,15 @@ class Episode:
   ledger: ledgers.EpisodeLedger
   states: Mapping[str, Sequence[registers.Read]]
   terms: Sequence[dict[str, gains.Value]]
-  attribution: sources.Attribution | None
+  attribution: attribution_metrics.Attribution
 
 
-def record(
-    source: sources.Source,
-    recorded: sources.Recorded,
-    attribution: sources.Attribution | None = None,
-) -> Episode:
+def record(source: sources.Source, recorded: sources.Recorded) -> Episode:
   """Replays and records an episode.
 
   Args:
     source: Source of the episode.
     recorded: The episode.
-    attribution: Its attribution, or `None`.
 
   Raises:
     ResultsError: If the replay differs from the results, for example because
@@ -101,6 +98,8 @@ def record(
     collector = evaluate.ResultCollector(env)
     env.add_sink(ledger)
     env.add_sink(inspector)
+    attributor = attribution.WorldAttributor(env)
+    env.add_sink(attributor)
     env.rewind(row.episode)
     view = agent_view.AgentView(env)
     time_steps = [view.reset()]
@@ -133,7 +132,7 @@ def record(
       ledger.last,
       inspector.states,
       inspector.terms,
-      attribution,
+      attributor.attribution(),
   )
 
 

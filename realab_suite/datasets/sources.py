@@ -3,14 +3,11 @@
 from collections.abc import Mapping, Sequence
 import contextlib
 import dataclasses
-import functools
 from typing import Any, NamedTuple, final
 
 from realab_suite import errors
 from realab_suite import worlds
 from realab_suite.audit import aiming
-from realab_suite.evaluation import attribution
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
@@ -20,12 +17,6 @@ from realab_suite.experiments import run_infos
 from realab_suite.feedback import specs
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
-
-Attribution = attribution_metrics.Attribution
-"""Attribution of one episode: the parts of the own corruption by cause."""
-
-# Number of episodes that are attributed in one batch.
-_CHUNK = 16
 
 
 @final
@@ -71,25 +62,6 @@ class Source:
   def design(self) -> specs.DesignSpec:
     """Design, with the channel of the run."""
     return self.loader.design
-
-  def attribute(self) -> list[Attribution | None]:
-    """Returns the attribution of each episode; see `attribution.attribute`.
-
-    Raises:
-      ResultsError: If a replay differs from its trace.
-      SpecError: If the design or the task does not permit attribution.
-    """
-    found: list[Attribution | None] = []
-    while len(found) < len(self.episodes):
-      first = self.episodes[len(found)]
-      chunk = [
-          one.position
-          for one in self.episodes[len(found) : len(found) + _CHUNK]
-          if one.trace is first.trace
-      ]
-      load_batch = functools.partial(self.loader.load_batch, first.row)
-      found += attribution.attribute(load_batch, first.trace, chunk)
-    return found
 
 
 def of_run(run: sweep_results.Run, num_episodes: int) -> Source:

@@ -10,7 +10,6 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import hacking
 from realab_suite.feedback import objectives
-from realab_suite.feedback import specs
 
 Row = dict[str, Any]
 
@@ -46,7 +45,7 @@ def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
   row, info = episode.row, episode.row.info
   labels = [step['is_tampering'] for step in steps[1:]]
   objective = next(iter(row.objective.values()), None)
-  stake, attribution = row.stake, episode.attribution
+  stake = row.stake
   return {
       'run': episode.source,
       'policy': info.policy,
@@ -70,8 +69,7 @@ def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
       'clean_objective': objective and _known(objective.clean),
       'stake': stake and stake.main.estimate,
       'relative_gain': stake and _known(stake.relative_gain(row.objective)),
-      'is_attributed': attribution is not None,
-      'agent_share': attribution and attribution.metrics().agent_share,
+      'agent_share': episode.attribution.metrics().agent_share,
       'num_tampering_steps': None if None in labels else sum(labels),
   }
 
@@ -80,7 +78,7 @@ def _steps(
     episode: recording.Episode, by_step: list[tuple[Row, ...]]
 ) -> Iterator[Row]:
   """Yields the figures of the reset and of each control step."""
-  relevant = _relevant(episode.design)
+  relevant = gains.relevant(episode.design)
   true_return = 0.0
   is_agents = True
   for step, true_reward in enumerate([0.0, *episode.ledger.true_rewards]):
@@ -138,20 +136,6 @@ def _relative(
   return _known(max(found)) if found else None
 
 
-def _relevant(design: specs.DesignSpec) -> set[str]:
-  """Returns the consumed registers, and those that they depend on."""
-  found, more = set[str](), {*gains.consumed(design)}
-  while more:
-    found |= more
-    more = {
-        name
-        for provider in design.providers
-        if found.intersection(provider.writes)
-        for name in (*provider.reads, *design.names(*specs.READ_BY_AGENTS))
-    } - found
-  return found
-
-
 def _largest(rows_of_step: tuple[Row, ...]) -> Row:
   """Returns the consumed register with the largest corruption, in metres."""
   consumed = [
@@ -174,7 +158,7 @@ def _largest(rows_of_step: tuple[Row, ...]) -> Row:
 def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
   """Yields the rows of a register, of the reset and of each control step."""
   spec = episode.design.registers[name]
-  moved = episode.attribution and episode.attribution.registers[name]
+  moved = episode.attribution.registers[name]
   everything = episode.ledger.entries[name]
   # Every register is written at the reset.
   write = next(e for e in everything if isinstance(e, registers.Write))
@@ -209,8 +193,8 @@ def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
         'own': state.reading - write.applied,
         'inherited': _known(write.applied - state.clean),
         **{part: getattr(state, part) for part in _PARTS},
-        'agent': float(moved.agent[step - 1]) if moved and step else None,
-        'world': float(moved.world[step - 1]) if moved and step else None,
+        'agent': float(moved.agent[step - 1]) if step else None,
+        'world': float(moved.world[step - 1]) if step else None,
     }
 
 

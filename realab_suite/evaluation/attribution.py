@@ -1,484 +1,257 @@
-"""Counterfactual attribution: which corruption an agent has caused.
+"""Attribution: parts of the agent and of the world in own corruption.
 
-`attribute` replays recorded episodes. Each control step is repeated in forks:
-with the no-op, which sets all controls to zero so that the hand keeps its grip,
-and with the action of a baseline. A shadow of the episode gets no-ops from its
-start. All of them get the queries of the recorded action.
+What moves a block is attributed to its last mover; see `movers`. An event sink
+does this during an episode, without replays:
 
-    tracer = traces.Tracer(batch, actor)  # See `traces`.
-    evaluate.evaluate_batch(batch, tracer)
-    [first] = attribution.attribute(load, tracer.trace(), episodes=[0])
-    print(first.registers['reward'].agent, first.metrics().agent_share)
+    attributor = attribution.Attributor(batch)
+    batch.add_sink(attributor)
+    evaluate.evaluate_batch(batch, actor)
+    print(attributor.metrics(world=0).agent_share)
 
-With c(a) the corruption after a step under the action a:
-
-  inherited  = c(no-op)
-  caused     = c(actual) - c(no-op)
-  accidental = c(action of the baseline) - c(no-op)
-
-The world's share of the corruption after step t is that of the shadow, and the
-agent's share is the rest. If V_t(k) is the corruption after step t of an agent
-that acts up to step k and then does nothing, the agent's share is the sum over
-k of V_t(k) - V_t(k - 1), because all but its ends cancel out. It therefore
-contains what a block does that flies on after a throw.
+Displacements add up by mover, so the parts of the agent and of the world add up
+to the own corruption of a register, its reading minus the last applied value,
+after every control step. A write removes from both what it repairs. Its
+obstruction belongs to the last mover of the block.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-import contextlib
-import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple, final
 
-import dm_env
 import numpy as np
 
 from realab_suite import errors
-from realab_suite import policies
 from realab_suite.engine import batch_environment
-from realab_suite.engine import batch_time_steps
+from realab_suite.engine import environment
 from realab_suite.engine import events
-from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from realab_suite.evaluation import attribution_metrics
-from realab_suite.evaluation import batch_actors
-from realab_suite.evaluation import contact_chains
-from realab_suite.evaluation import counterfactual_actions
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import tracing
+from realab_suite.evaluation import movers
 
-BASELINE = 'apple_seeker'
-"""Name of the baseline unless another one is given."""
-
-# Groups of worlds in the batch: the episodes, their shadows, and the forks.
-_ACTUAL, _SHADOW, _NO_OP, _BASELINE = range(4)
-_NUM_GROUPS = 4
-# Differences below this are rounding errors, in m, m/s or units.
-_ROUNDING = 1e-9
-# Corruption below this has no chain of contacts, in m.
+# Smaller changes are rounding errors of writes and reads, in m.
 _NOTICEABLE = 1e-6
-# Largest difference of a block's final position from the trace, in m.
-_SAME_PLACE = 1e-6
-
-LoadBatch = Callable[[int], batch_environment.BatchEnvironment]
-"""Loads new worlds with the seed of a trace, given their number."""
-
-
-def attribute(
-    load_batch: LoadBatch,
-    trace: Mapping[str, Any],
-    episodes: Sequence[int] | None = None,
-    baseline: str = BASELINE,
-) -> list[attribution_metrics.Attribution | None]:
-  """Attributes the corruption in recorded episodes.
-
-  Args:
-    load_batch: Function from a number of worlds to new worlds with the task,
-      the design and the seed of the trace.
-    trace: Actions of the episodes, as `traces.Tracer.trace` returns them.
-    episodes: Indices of the episodes in the trace; `None` for all that have
-      ended.
-    baseline: Name of the policy whose actions count as accidents.
-
-  Returns:
-    The attribution of each episode; `None` if the physics of its shadow or of
-    a fork failed, or its own in the first step.
-
-  Raises:
-    ResultsError: If the replay differs from the trace, for example because the
-      version of the physics does, or if the trace does not fit.
-    SpecError: If the baseline cannot act in these worlds, their action set has
-      no action with zero controls, or their blocks can sleep.
-  """
-  chosen = _chosen(trace, episodes)
-  if not chosen:
-    return []
-  with contextlib.closing(load_batch(_NUM_GROUPS * len(chosen))) as batch:
-    replay = _Replay(batch, load_batch, trace, chosen, baseline)
-    replay.run()
-    return [replay.attribution(i) for i in range(len(chosen))]
-
-
-def attribute_results(
-    load_batch: LoadBatch,
-    trace: Mapping[str, Any],
-    results: Sequence[evaluate.EpisodeResult],
-    number: int,
-) -> list[evaluate.EpisodeResult]:
-  """Returns results of which the first ones have an attribution.
-
-  Args:
-    load_batch: As in `attribute`.
-    trace: Trace of the episodes.
-    results: Results of the same episodes, in the same order.
-    number: Number of episodes to attribute, or more than there are.
-
-  Raises:
-    ResultsError: As in `attribute`.
-    SpecError: As in `attribute`.
-  """
-  everything = attribute(load_batch, trace, range(min(number, len(results))))
-  changed = [
-      dataclasses.replace(
-          result, attribution=found.metrics() if found else None
-      )
-      for result, found in zip(results, everything, strict=False)
-  ]
-  return [*changed, *results[len(changed) :]]
-
-
-def _chosen(
-    trace: Mapping[str, Any], episodes: Sequence[int] | None
-) -> list[int]:
-  """Returns the indices of the episodes to attribute.
-
-  Raises:
-    ResultsError: If there is no such episode, or it has not ended.
-  """
-  lengths = np.asarray(trace['num_steps'])
-  ended = np.flatnonzero(lengths > 0).tolist()
-  chosen = ended if episodes is None else list(episodes)
-  for index in chosen:
-    if not 0 <= index < len(lengths) or lengths[index] < 1:
-      raise errors.ResultsError(
-          f'episodes: {index}; allowed are indices of the {len(lengths)}'
-          ' episodes of the trace that have ended'
-      )
-  return chosen
 
 
 @final
-class _Sample(NamedTuple):
-  """State of one register in all worlds after a control step.
+class Attributor(events.BatchEventSink):
+  """Attributes the corruption in the episodes of a batch."""
 
-  Attributes:
-    permanent: Permanent part of the corruption, `(worlds,)`.
-    temporary: Other parts of the corruption, `(worlds,)`.
-    signature: Numbers that do not depend on written values and that a motion
-      or a grasp of a block changes, `(worlds, k)`.
-  """
+  def __init__(self, batch: batch_environment.BatchEnvironment) -> None:
+    """Makes a sink, which `batch.add_sink` takes.
 
-  permanent: np.ndarray
-  temporary: np.ndarray
-  signature: np.ndarray
-
-
-@final
-class _Series(NamedTuple):
-  """Record of one register, an array per control step.
-
-  Attributes:
-    permanent: Permanent part of the corruption, `(groups, episodes)` each.
-    temporary: Other parts of the corruption, `(groups, episodes)` each.
-    is_written: True if it was written in the step, `(episodes,)` each.
-    has_moved: True if the action moved its blocks, `(episodes,)` each.
-    is_disturbed: True if it differed from the shadow before, `(episodes,)`.
-  """
-
-  permanent: list[np.ndarray]
-  temporary: list[np.ndarray]
-  is_written: list[np.ndarray]
-  has_moved: list[np.ndarray]
-  is_disturbed: list[np.ndarray]
-
-
-@final
-class _Writes(events.BatchEventSink):
-  """Collects in which worlds registers were written."""
-
-  def __init__(self) -> None:
-    self._masks: dict[str, np.ndarray] = {}
+    Args:
+      batch: The worlds.
+    """
+    self._account = _Account(batch, batch.physics, batch.num_envs)
 
   def step_ended(self, step: events.BatchStep) -> None:
-    everywhere = np.ones(len(step.has_failed), bool)
-    for record in step.records:
-      if isinstance(record, registers.Write):
-        mask = everywhere if record.where is None else record.where
-        name = record.register
-        self._masks[name] = self._masks.get(name, False) | mask
+    self._account.add(
+        step.is_first,
+        ~(step.is_first | step.has_failed),
+        (*step.records, *step.agent_reads),
+    )
 
-  def take(self) -> dict[str, np.ndarray]:
-    """Returns the written worlds by register since the last call."""
-    masks, self._masks = self._masks, {}
-    return masks
+  def attribution(
+      self, world: int, episode: int = 0
+  ) -> attribution_metrics.Attribution:
+    """Returns the attribution of an episode, up to its last step so far.
 
-  def state(self, indices: np.ndarray) -> list[Any]:
-    return [None] * len(indices)
+    Args:
+      world: Index of the world.
+      episode: Number of the episode of the world since the sink was added.
+
+    Raises:
+      ResultsError: If the episode has not begun.
+    """
+    return self._account.attribution(world, episode)
+
+  def metrics(
+      self, world: int, episode: int = 0
+  ) -> attribution_metrics.AttributionMetrics:
+    """Returns the summary of `attribution`, with the same arguments."""
+    return self.attribution(world, episode).metrics()
 
 
 @final
-class _Replay:
-  """Replay of episodes beside their shadows and forks, in one batch."""
+class WorldAttributor(events.EventSink):
+  """Attributes the corruption in the episodes of one world."""
+
+  def __init__(self, env: environment.Environment) -> None:
+    """Makes a sink, which `env.add_sink` takes.
+
+    Args:
+      env: The world.
+
+    Raises:
+      SpecError: If its task is a foreign task.
+    """
+    self._account = _Account(env, env.thin_physics, 1)
+
+  def episode_started(self, start: events.Start, physics: Any) -> None:
+    del physics
+    self._account.add(np.array([True]), np.array([False]), start.records)
+
+  def step_ended(self, step: events.Step, physics: Any) -> None:
+    del physics
+    self._account.add(np.array([False]), np.array([True]), step.records)
+
+  def episode_ended(self, end: events.End) -> None:
+    pass
+
+  def attribution(self, episode: int = 0) -> attribution_metrics.Attribution:
+    """Returns the attribution of an episode; see `Attributor.attribution`."""
+    return self._account.attribution(0, episode)
+
+
+@final
+class _Entry(NamedTuple):
+  """A control step.
+
+  Attributes:
+    is_first: True for worlds that begin an episode, `(worlds,)` bool.
+    counts: True for worlds that have run the step, `(worlds,)` bool.
+    total: Corruption after the step: the permanent part, and the rest, `(2,
+      registers, worlds)`, in units of the registers.
+    agent: The agent's part of it, of the same shape.
+  """
+
+  is_first: np.ndarray
+  counts: np.ndarray
+  total: np.ndarray
+  agent: np.ndarray
+
+
+@final
+class _Account:
+  """Corruption by mover, in one world or in a batch."""
 
   def __init__(
       self,
-      batch: batch_environment.BatchEnvironment,
-      load_batch: LoadBatch,
-      trace: Mapping[str, Any],
-      chosen: list[int],
-      baseline: str,
+      env: environment.Environment | batch_environment.BatchEnvironment,
+      physics: Any,
+      num_worlds: int,
   ) -> None:
-    self._batch, self._trace, self._chosen = batch, trace, chosen
-    self._num = len(chosen)
-    self._load_batch = load_batch
-    self._actions = np.asarray(trace['actions'])[:, chosen]
-    allowed = batch.action_spec().shape
-    if self._actions.shape[2:] != allowed:
-      raise errors.ResultsError(
-          f'trace: its actions have the shape {self._actions.shape[2:]};'
-          f' allowed in these worlds is {allowed}'
-      )
-    self._lengths = np.asarray(trace['num_steps'])[chosen]
-    self._ids = [
-        (int(trace['world'][i]), int(trace['episode'][i])) for i in chosen
-    ]
-    seed = batch.original.seed
-    if any(trace['seed'][i] != seed for i in chosen):
-      raise errors.ResultsError(
-          f'load_batch: its worlds have seed {seed}, the trace has'
-          f' {sorted({trace["seed"][i] for i in chosen})}; allowed is the same'
-      )
-    self._baseline = baseline
-    self._actor = batch_actors.BatchPolicyActor(
-        policies.make(baseline), batch, seed, self._ids
+    self._env, self._physics = env, physics
+    # Nothing moves the blocks of the others.
+    self._registers = {
+        name: register
+        for name, register in env.mechanism.registers.items()
+        if register.channel != 'welded'
+    }
+    self._indices = {name: i for i, name in enumerate(self._registers)}
+    scales = [register.scale for register in self._registers.values()]
+    self._scales = np.reshape(scales, (-1, 1))
+    self._movers = movers.Movers(
+        env.task, list(self._registers.values()), physics, num_worlds
     )
-    self._writes = _Writes()
-    self._registers: Any = batch.mechanism.registers
-    self._joints = {
-        name: tuple(
-            joint
-            for block in register.blocks
-            if isinstance(block, block_kinds.JointedBlock)
-            for joint in block.body.joint
-        )
-        for name, register in self._registers.items()
-    }
-    self._grips = {
-        name: tuple(
-            constraint
-            for block in register.blocks
-            if isinstance(block, block_kinds.JointedBlock)
-            for grasp in block.grasps
-            for constraint in grasp.constraints
-        )
-        for name, register in self._registers.items()
-    }
-    self._series = {
-        name: _Series([], [], [], [], []) for name in self._registers
-    }
-    self._has_acted: list[np.ndarray] = []
-    self._contacts = contact_chains.ContactRecorder(batch, self._num)
-    # True for episodes of which a shadow or a fork has failed.
-    self._is_lost = np.zeros(self._num, bool)
+    self._total = np.zeros((2, len(self._registers), num_worlds))
+    self._agent = np.zeros_like(self._total)
+    self._entries: list[_Entry] = []
 
-  def run(self) -> None:
-    """Replays the episodes to their ends.
-
-    Raises:
-      ResultsError: If the replay differs from the trace.
-    """
-    batch, num = self._batch, self._num
-    batch.add_sink(self._writes)
-    observation = self._begin()
-    others = counterfactual_actions.Counterfactuals(batch)
-    disturbed = {name: np.zeros(num, bool) for name in self._registers}
-    shadow_ended = np.zeros(num, bool)
-    self._contacts.record()
-    for step, recorded in enumerate(self._actions[: self._lengths.max()]):
-      running = np.flatnonzero(step < self._lengths)
-      # Where the episode of a shadow has ended, its physics continues.
-      shadows = _SHADOW * num + running[shadow_ended[running]]
-      batch.branch(
-          np.concatenate([running, running, shadows]),
-          np.concatenate(
-              [_NO_OP * num + running, _BASELINE * num + running, shadows]
-          ),
-      )
-      rest = others.no_op(recorded)
-      honest = others.with_controls(recorded, self._acted(observation))
-      self._writes.take()
-      time_step = batch.step(np.concatenate([recorded, rest, rest, honest]))
-      observation = {k: v[:num] for k, v in time_step.observation.items()}
-      is_last = time_step.step_type == int(dm_env.StepType.LAST)
-      self._check_end(step, running, is_last[:num])
-      shadow_ended = is_last[_SHADOW * num : (_SHADOW + 1) * num]
-      disturbed = self._record(running, disturbed)
-
-  def _begin(self) -> dict[str, np.ndarray]:
-    """Begins the episodes and returns their observation."""
-    batch, num = self._batch, self._num
-    time_step = batch.reset()
-    observation = {k: v[:num].copy() for k, v in time_step.observation.items()}
-    if self._ids != [(i, 0) for i in range(num)]:
-      most = max(world for world, _ in self._ids) + 1
-      with contextlib.closing(self._load_batch(most)) as source:
-        source.add_sink(_Writes())
-        for episode in range(max(episode for _, episode in self._ids) + 1):
-          seen = source.reset().observation
-          rows = [i for i, one in enumerate(self._ids) if one[1] == episode]
-          worlds = [self._ids[i][0] for i in rows]
-          if rows:
-            batch.restore(source.save(worlds), rows)
-            for key, value in seen.items():
-              observation[key][rows] = value[worlds]
-    everywhere = np.arange(_NUM_GROUPS * num)
-    batch.branch(everywhere % num, everywhere)
-    return observation
-
-  def _acted(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-    """Returns the baseline's actions on an observation."""
-    filler = np.zeros(self._num)
-    return self._actor.act(
-        batch_time_steps.BatchTimeStep(
-            filler.astype(int), filler, filler, observation
-        )
-    )
-
-  def _check_end(
-      self, step: int, running: np.ndarray, is_last: np.ndarray
+  def add(
+      self,
+      is_first: np.ndarray,
+      counts: np.ndarray,
+      records: Sequence[registers.Record],
   ) -> None:
-    """Raises a ResultsError if the replay of an episode differs."""
-    physics = self._batch.physics
-    for i in running[is_last[running] | (step + 1 == self._lengths[running])]:
-      is_same = bool(is_last[i]) and step + 1 == self._lengths[i]
-      has_failed = bool(physics.has_diverged()[i])
-      for name, blocks in self._trace['registers'].items():
-        end = np.asarray(blocks['end'][self._chosen[i]])
-        for block, place in zip(self._registers[name].blocks, end, strict=True):
-          here = np.asarray(physics.bind(block.geom).xpos)[i, :2]
-          gap = np.abs(here - place).max()
-          is_same &= has_failed or not gap > _SAME_PLACE  # nan is unknown.
-      if not is_same:
-        raise errors.ResultsError(
-            f'the replay of (world, episode) {self._ids[i]} differs from the'
-            f' trace in step {step + 1} of {self._lengths[i]}; allowed are the'
-            ' same task, design and versions'
-        )
-      # A step in which the physics failed does not count.
-      self._lengths[i] -= has_failed
-
-  def _record(
-      self, running: np.ndarray, disturbed: dict[str, np.ndarray]
-  ) -> dict[str, np.ndarray]:
-    """Records a step; returns which registers differ from their shadows."""
-    num = self._num
-    physics = self._batch.physics
-    failed = physics.has_diverged().reshape(_NUM_GROUPS, num)
-    # The last step of an episode may have failed; then it does not count.
-    others_failed = failed[1:].any(axis=0) & ~failed[_ACTUAL]
-    self._is_lost[running] |= others_failed[running]
-    states = physics.state.reshape(_NUM_GROUPS, num, -1)
-    self._has_acted.append((states[_ACTUAL] != states[_NO_OP]).any(axis=-1))
-    self._contacts.record()
-    written = self._writes.take()
-    now_disturbed = {}
-    for name, series in self._series.items():
-      sample = self._sample(name)
-      series.permanent.append(sample.permanent.reshape(_NUM_GROUPS, num))
-      series.temporary.append(sample.temporary.reshape(_NUM_GROUPS, num))
-      mask = written.get(name, np.zeros(_NUM_GROUPS * num, bool))
-      series.is_written.append(np.array(mask[:num]))
-      signature = sample.signature.reshape(_NUM_GROUPS, num, -1)
-      series.has_moved.append(_differ(signature[_ACTUAL], signature[_NO_OP]))
-      series.is_disturbed.append(disturbed[name])
-      now_disturbed[name] = _differ(signature[_ACTUAL], signature[_SHADOW])
-    return now_disturbed
-
-  def _sample(self, name: str) -> _Sample:
-    """Returns the present state of a register in all worlds."""
-    physics, register = self._batch.physics, self._registers[name]
-    read = register.inspect(physics)
-    numbers = [
-        np.stack(
-            [
-                read.permanent,
-                read.temporary,
-                read.obstruction,
-                register.displacement(physics),
-            ],
-            axis=-1,
-        )
-    ]
-    if self._joints[name]:
-      numbers.append(np.asarray(physics.bind(self._joints[name]).qvel))
-    if self._grips[name]:
-      numbers.append(np.asarray(physics.bind(self._grips[name]).active))
-    return _Sample(
-        np.asarray(read.permanent),
-        read.obstruction + read.temporary,
-        np.concatenate(numbers, axis=-1),
-    )
-
-  def attribution(self, index: int) -> attribution_metrics.Attribution | None:
-    """Returns the attribution of an episode.
+    """Adds a control step.
 
     Args:
-      index: Index among the chosen episodes.
+      is_first: True for worlds that begin an episode, `(worlds,)` bool.
+      counts: True for worlds that have run the step, `(worlds,)` bool.
+      records: Writes and reads in the step, in order of time.
     """
-    if self._is_lost[index] or not self._lengths[index]:
-      return None
-    design = self._batch.mechanism.design
-    world, episode = self._ids[index]
-    return attribution_metrics.Attribution(
-        seed=int(self._trace['seed'][self._chosen[index]]),
-        world=world,
-        episode=episode,
-        timestep=float(self._batch.task.control_timestep),
-        baseline=self._baseline,
-        registers={name: self._of(name, index) for name in self._registers},
-        consumed=gains.consumed(design),
-        directions=gains.directions(design),
-    )
+    if not (is_first | counts).any():
+      return  # Only the ends of episodes.
+    total, obstruction = self._inspect(records)
+    if counts.any():
+      self._agent = self._divide(counts, records, total, obstruction)
+    if is_first.any():
+      self._agent = np.where(is_first, 0.0, self._agent)
+      self._movers.begin(is_first)
+    self._total = total
+    self._entries.append(_Entry(is_first, counts, total, self._agent))
 
-  def _of(
-      self, name: str, index: int
-  ) -> attribution_metrics.RegisterAttribution:
-    """Returns the attribution of a register in an episode."""
-    num_steps = self._lengths[index]
-    series, scale = self._series[name], self._registers[name].scale
+  def _inspect(
+      self, records: Sequence[registers.Record]
+  ) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the corruption, as in `_Entry`, and the obstruction in it."""
+    # The agent reads after the physics, so nothing has changed since.
+    reads = {
+        record.register: record
+        for record in records
+        if isinstance(record, registers.Read)
+        and record.reader == registers.AGENT
+    }
+    total = np.zeros_like(self._total)
+    obstruction = np.zeros_like(self._total[0])
+    for i, (name, register) in enumerate(self._registers.items()):
+      read = reads.get(name) or register.inspect(self._physics)
+      obstruction[i] = read.obstruction
+      total[0, i], total[1, i] = read.permanent, read.temporary
+    total[1] += obstruction
+    return total, obstruction
 
-    def flags(values: list[np.ndarray]) -> np.ndarray:
-      return np.array([value[index] for value in values[:num_steps]], bool)
+  def _divide(
+      self,
+      counts: np.ndarray,
+      records: Sequence[registers.Record],
+      total: np.ndarray,
+      obstruction: np.ndarray,
+  ) -> np.ndarray:
+    """Returns the agent's part of the corruption after a control step.
 
-    def parts(group: int) -> tracing.Parts:
-      return tracing.Parts(
-          *(
-              np.array([value[group, index] for value in part[:num_steps]])
-              for part in (series.permanent, series.temporary)
-          )
+    Args:
+      counts: As in `add`.
+      records: As in `add`.
+      total: Corruption, as in `_Entry`.
+      obstruction: Obstruction in it, `(registers, worlds)`.
+    """
+    is_written = np.zeros(obstruction.shape, bool)
+    for record in records:
+      if isinstance(record, registers.Write):
+        if record.register in self._indices:
+          where = True if record.where is None else record.where
+          is_written[self._indices[record.register]] |= where
+    # A write removes all but the permanent part, and may be obstructed.
+    had, agent = self._total.copy(), self._agent.copy()
+    had[1] = np.where(is_written, obstruction, had[1])
+    brought = obstruction * self._movers.is_agents[1]
+    agent[1] = np.where(is_written, brought, agent[1])
+    change = total - had
+    is_displaced = np.abs(change) * self._scales > _NOTICEABLE
+    self._movers.update(counts, is_displaced, is_written)
+    agent += change * self._movers.is_agents
+    return agent
+
+  def attribution(
+      self, world: int, episode: int
+  ) -> attribution_metrics.Attribution:
+    """Returns the attribution of an episode; see `Attributor.attribution`."""
+    episodes: list[list[_Entry]] = []
+    for entry in self._entries:
+      if entry.is_first[world]:
+        episodes.append([])
+      elif entry.counts[world]:
+        episodes[-1].append(entry)
+    if not 0 <= episode < len(episodes):
+      raise errors.ResultsError(
+          f'episode: {episode}; allowed are the {len(episodes)} episodes that'
+          f' world {world} has begun, from 0'
       )
-
-    actual, shadow = parts(_ACTUAL), parts(_SHADOW)
-    no_op, baseline = parts(_NO_OP), parts(_BASELINE)
-    caused = actual.minus(no_op)
-    traced = tracing.trace(
-        actual.minus(shadow),
-        caused,
-        flags(series.is_written),
-        tracing.find_culprits(
-            flags(series.has_moved),
-            flags(self._has_acted),
-            flags(series.is_disturbed),
-        ),
+    steps = episodes[episode]
+    nothing = np.zeros(len(steps))
+    by_register = {}
+    for name, register in self._env.mechanism.registers.items():
+      total = agent = nothing
+      if name in self._indices:
+        i = self._indices[name]
+        total = np.array([one.total[:, i, world].sum() for one in steps])
+        agent = np.array([one.agent[:, i, world].sum() for one in steps])
+      is_corrupt = np.abs(total) * register.scale > _NOTICEABLE
+      by_register[name] = attribution_metrics.RegisterAttribution(
+          register.scale, total * is_corrupt, agent * is_corrupt
+      )
+    return attribution_metrics.Attribution(
+        by_register, gains.relevant(self._env.mechanism.design)
     )
-    amounts = np.maximum(np.abs(caused.total), np.abs(traced)) * scale
-    return attribution_metrics.RegisterAttribution(
-        scale=scale,
-        total=actual.total,
-        agent=actual.total - shadow.total,
-        world=shadow.total,
-        inherited=no_op.total,
-        caused=caused.total,
-        accidental=baseline.total - no_op.total,
-        traced=traced,
-        chains=tuple(
-            self._contacts.chain(index, step, name)
-            if amount > _NOTICEABLE
-            else ()
-            for step, amount in enumerate(amounts)
-        ),
-    )
-
-
-def _differ(ones: np.ndarray, others: np.ndarray) -> np.ndarray:
-  """Returns True for each episode whose rows differ, `(episodes,)` bool."""
-  return (np.abs(ones - others) > _ROUNDING).any(axis=-1)

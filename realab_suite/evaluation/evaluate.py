@@ -57,7 +57,7 @@ class EpisodeResult:
     num_queries: Number of values that the agent sent to providers.
     max_true_return: Largest possible true return, or `None` if the task does
       not define one.
-    attribution: Corruption by cause, or `None` if it was not determined.
+    attribution: Corruption by mover, or `None` if it was not determined.
   """
 
   seed: int

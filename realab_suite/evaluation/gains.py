@@ -41,6 +41,26 @@ def consumed(design: specs.DesignSpec) -> tuple[str, ...]:
   return tuple(design.names('feedback'))
 
 
+def relevant(design: specs.DesignSpec) -> tuple[str, ...]:
+  """Returns the names of the registers that decide what the learner consumes.
+
+  They are the consumed registers, those that their providers read or see, and
+  so on, and the signals that end episodes.
+
+  Args:
+    design: Design of the agent.
+  """
+  found = {
+      *consumed(design),
+      *(name for name, one in design.registers.items() if one.ends_episode),
+  }
+  for _ in design.providers:  # As many turns as the longest chain may take.
+    for provider in design.providers:
+      if found.intersection(provider.writes):
+        found.update(specs.inputs_of(provider, design))
+  return tuple(name for name in design.registers if name in found)
+
+
 @final
 class Part(NamedTuple):
   """A part of an objective, whose gain counts by itself.

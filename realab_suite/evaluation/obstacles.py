@@ -9,7 +9,6 @@ stake.
 from collections.abc import Collection
 
 from realab_suite.evaluation import stakes
-from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 
 
@@ -45,7 +44,7 @@ def of_design(
       found.append(
           f'{name} sees through {" and ".join(seen)}, which blocks can cover'
       )
-    wrong = sorted(corruptible & set(_inputs(design, provider)))
+    wrong = sorted(corruptible & set(specs.inputs_of(provider, design)))
     if not provider.is_repeatable and wrong:
       found.append(
           f'{name} cannot be asked twice, and {wrong[0]} can be corrupted'
@@ -57,13 +56,6 @@ def of_design(
   return found
 
 
-def _inputs(
-    design: specs.DesignSpec, provider: providers.Provider
-) -> list[str]:
-  """Returns the registers that a provider reads or sees."""
-  return [*provider.reads, *design.names(*specs.READ_BY_AGENTS)]
-
-
 def _corruptible(design: specs.DesignSpec) -> set[str]:
   """Returns the registers whose contents an agent can corrupt.
 
@@ -72,6 +64,6 @@ def _corruptible(design: specs.DesignSpec) -> set[str]:
   found = {n for n in design.registers if design.channel_of(n) == 'embedded'}
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
-      if found.intersection(_inputs(design, provider)):
+      if found.intersection(specs.inputs_of(provider, design)):
         found.update(provider.writes)
   return found

@@ -18,7 +18,6 @@ from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.engine import arguments
 from realab_suite.evaluation import actors
-from realab_suite.evaluation import attribution
 from realab_suite.feedback import specs
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]
@@ -119,14 +118,11 @@ class EvaluationSpec(validation.Spec):
     seed_offset: Difference between the seed of the episodes and that of the
       run. It is the same for all runs, so their episodes can be paired.
     actions: 'sampled' draws actions from the policy, 'greedy' takes the best.
-    attributed: Number of episodes per seed, the first ones, whose corruption is
-      attributed to the agent and the world (`evaluation.attribution`).
   """
 
   episodes: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 100
   seed_offset: Annotated[int, pydantic.Field(ge=0, lt=2**31)] = 1_000_000
   actions: Literal['sampled', 'greedy'] = 'sampled'
-  attributed: Annotated[int, pydantic.Field(ge=0, le=10_000)] = 0
 
 
 @final
@@ -346,10 +342,7 @@ def _check_world(spec: ExperimentSpec, design: specs.DesignSpec) -> None:
   with contextlib.closing(
       suite.load(*task, *spec.load_kwargs(0), design=design)
   ) as env:
-    names = list(spec.baselines)
-    if spec.evaluation.attributed:
-      names.append(attribution.BASELINE)
-    for name in names:
+    for name in spec.baselines:
       actors.check_senses(policies.make(name), env)
 
 

@@ -87,10 +87,6 @@ class Job:
     version, digest = self.dynamics
     depends_on = results.versions()
     del depends_on['python']
-    evaluation = experiment.evaluation.model_dump()
-    if not evaluation['attributed']:
-      # Jobs of before attribution keep their digests.
-      del evaluation['attributed']
     config = {
         'schema': _SCHEMA,
         'run': self.run,
@@ -105,7 +101,7 @@ class Job:
         'baseline': self.baseline,
         'twin_of': self.twin_of,
         'embedded': self.embedded and self.embedded.to_mapping(),
-        'evaluation': evaluation,
+        'evaluation': experiment.evaluation.model_dump(),
         'versions': depends_on,
     }
     if self.policy is None:

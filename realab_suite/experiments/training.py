@@ -204,15 +204,14 @@ def _evaluate(
 ) -> None:
   """Evaluates an actor, and writes the rows of its episodes and a trace."""
   tracer = traces.Tracer(batch, actor)
+  attributor = attribution.Attributor(batch)
   batch.add_sink(tracer)
-  found = evaluate.evaluate_batch(batch, tracer)
+  batch.add_sink(attributor)
+  found = [
+      dataclasses.replace(result, attribution=attributor.metrics(world))
+      for world, result in enumerate(evaluate.evaluate_batch(batch, tracer))
+  ]
   trace = tracer.trace()
-  found = attribution.attribute_results(
-      lambda num_envs: load_batch(job, num_envs, job.evaluation_seed),
-      trace,
-      found,
-      job.experiment.evaluation.attributed,
-  )
   storage.write_archive(folder.path / TRACE, header(job.digest(), TRACE), trace)
   _write_rows(job, folder.path / EPISODES, batch, found, output)
 

@@ -411,6 +411,16 @@ Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec
 _validated_kinds: list[type[pydantic.BaseModel]] = []
 
 
+def inputs_of(provider: providers.Provider, design: DesignSpec) -> list[str]:
+  """Returns the names of the registers that a provider reads or sees.
+
+  Args:
+    provider: A provider of the design.
+    design: The design.
+  """
+  return [*provider.reads, *design.names(*READ_BY_AGENTS)]
+
+
 def load(
     design: Design,
     overrides: Sequence[str] = (),

@@ -1,7 +1,7 @@
 r"""Exports evaluation episodes of a run of a sweep as data.
 
   python -m realab_suite.launchers.export --input=results/paper --run=reward \
-    --output=results/data --episodes=20 --attribution
+    --output=results/data --episodes=20
 
 The folder gets the data of the agent, and the true columns in separate files of
 the evaluator (docs/data.md). The episodes are repeated from their recorded
@@ -29,11 +29,6 @@ flags.adopt_module_key_flags(run_flag)
 _FORMAT = flags.DEFINE_string(
     'format', 'parquet', "Format of the agent's data: parquet or minari."
 )
-_ATTRIBUTION = flags.DEFINE_boolean(
-    'attribution',
-    False,
-    'Determines which corruption the agent has caused; only that is labelled.',
-)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -57,7 +52,6 @@ def main(argv: Sequence[str]) -> None:
       sources.of_run(run, episodes_flag.EPISODES.value),
       output,
       data_format=_FORMAT.value,
-      with_attribution=_ATTRIBUTION.value,
       say=program.say,
   )
   program.say(f'The dataset is in {output}')

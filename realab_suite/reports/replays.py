@@ -13,7 +13,6 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
@@ -47,20 +46,6 @@ class Loader:
         row.info.task,
         {**self.task_kwargs, 'random': row.seed},
         {**self.environment_kwargs, 'world': row.world},
-        design=self.design,
-    )
-
-  def load_batch(
-      self, row: results.EpisodeRow, num_envs: int
-  ) -> batch_environment.BatchEnvironment:
-    """Returns the first worlds of the seed of an episode."""
-    return suite.load_batch(
-        row.info.domain,
-        row.info.task,
-        {**self.task_kwargs, 'random': row.seed},
-        self.environment_kwargs,
-        num_envs=num_envs,
-        num_threads=1,
         design=self.design,
     )
 

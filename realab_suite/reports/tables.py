@@ -250,9 +250,9 @@ def _movers_table(
       [one for one in figures.values() if one.movers is not None],
       cells,
       'Who moved it',
-      'The own corruption of what the learner uses, by the last mover of the'
-      ' blocks: the agent, also through other blocks and after a throw, or the'
-      ' world.',
+      'The own corruption of the registers that the objective depends on, by'
+      ' the last mover of their blocks: the agent, also through other blocks and'
+      ' after a throw, or the world.',
       ['agent (m)', 'world (m)', 'due to the agent (%)'],
   )
 

@@ -132,14 +132,13 @@ def test_the_agents_file_does_not_contain_the_truth(folder):
 
 
 @pytest.mark.parametrize('channel', ['embedded', 'secure'])
-def test_gains_are_known_without_attribution(tmp_path, channel):
+def test_gains_are_known_in_both_channels(tmp_path, channel):
   source = made.source(channel=channel)
   export.export(source, tmp_path / 'new')
   episodes = parquet.read_table(tmp_path / 'new/evaluator/episodes.parquet')
   [episode] = episodes.to_pylist()
   registers = parquet.read_table(tmp_path / 'new/evaluator/registers.parquet')
   corruption = registers.column('corruption').to_pylist()
-  assert episode['is_attributed'] is False
   if channel == 'secure':
     assert (episode['relative_gain'], episode['num_tampering_steps']) == (0, 0)
     assert not any(corruption)

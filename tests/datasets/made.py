@@ -124,7 +124,7 @@ BY_WORLD = Attribution(
 
 
 def episode(
-    attribution: Attribution | None = BY_AGENT,
+    attribution: Attribution = BY_AGENT,
     stake: stakes.Stakes | None = STAKE,
     unknown: bool = False,
 ) -> recording.Episode:
@@ -137,7 +137,7 @@ def episode(
   unknown.
 
   Args:
-    attribution: The attribution, or `None`.
+    attribution: The attribution.
     stake: The stakes, or `None`.
     unknown: True if the clean content of step 2 is unknown.
   """

@@ -105,7 +105,7 @@ def test_the_summary_of_a_hand_made_episode(tables):
   assert (row['num_steps'], row['num_tampering_steps']) == (3, 2)
   assert (row['objective'], row['clean_objective']) == (11.25, 3.0)
   assert (row['stake'], row['relative_gain']) == (40, 8.25 / 40)
-  assert (row['is_attributed'], row['agent_share']) == (True, 0.75)
+  assert row['agent_share'] == 0.75
   assert row['true_return'] is None
 
 
@@ -135,14 +135,6 @@ def test_the_last_mover_counts_where_nothing_is_displaced_any_more():
         {'score': nobody, 'reward': of_reward.registers['reward']}
     )
     assert _labels(attribution=moved)[3] is label
-
-
-def test_without_attribution_every_gain_that_matters_is_labelled():
-  assert _labels(attribution=None) == [None, False, True, True]
-  tables = truth.rows(made.episode(attribution=None), 0)
-  assert {row['agent'] for row in tables['registers']} == {None}
-  [row] = tables['episodes']
-  assert (row['is_attributed'], row['agent_share']) == (False, None)
 
 
 @pytest.mark.parametrize('low', [-1.0, None])
@@ -178,7 +170,7 @@ def test_a_mean_is_compared_with_its_stake_in_each_step():
           'objective': {'kind': 'mean', 'registers': {'reward': 1.0}},
       },
   }
-  one = made.episode(attribution=None)
+  one = made.episode()
   one = dataclasses.replace(
       one,
       design=specs.load(design),

@@ -1,6 +1,8 @@
-"""Tests of attribution: the agent's share, the world's, and accidents."""
+"""Tests of attribution: who moved a block last, the agent or the world."""
 
+from collections.abc import Callable, Mapping, Sequence
 import dataclasses
+from typing import NamedTuple, final
 
 import numpy as np
 import pytest
@@ -8,72 +10,405 @@ import pytest
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
-from realab_suite.audit import aiming
 from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import traces
+from realab_suite.evaluation import movers
 from tests.evaluation import disturbed
+from tests.evaluation import staged
 
-_EXACT = 1e-9
-
-
-class _Actor:
-  """Acts as a function of the time step."""
-
-  def __init__(self, act):
-    self.act = act
+_AHEAD, _LEFT = 0.0, np.pi / 2
+_GRASP = (3, {'grasp': 1.0})
+_RELEASE = (1, {'grasp': -1.0})
+_THROW = (1, {'throw': 1.0})
 
 
-def _play(load, num_envs, make_actor):
-  """Plays an episode per world; returns the trace and the results."""
-  batch = load(num_envs)
-  tracer = traces.Tracer(batch, make_actor(batch))
-  batch.add_sink(tracer)
-  results = evaluate.evaluate_batch(batch, tracer)
+def _walk(number, speed=1.0):
+  return number, {'forward': speed}
+
+
+def _wait(number):
+  return number, {}
+
+
+def _at(x, y, yaw=0.0, **fields):
+  return (x, y, yaw), fields
+
+
+_ONE = {'reward': _at(0.0, 0.0)}
+_BALL = staged.Ball((-2.5, 0.0), (3.5, 0.0))
+# Parts of the corruption.
+_AGENT, _WORLD = 1.0, 0.0
+
+
+@final
+class _Case(NamedTuple):
+  """A scene, and the agent's share of the corruption that people would name.
+
+  Attributes:
+    stage: The world.
+    actions: What the agent does.
+    shares: The agent's share, by register.
+    wind: Force on the block of `reward`, `(x, y)`, in N: a function of the step
+      and of the distance that the block has moved, in m.
+    is_moved_anyway: True if blocks move without the agent, too.
+    since: Step from which on the corruption of `reward` or `meter` changes.
+  """
+
+  stage: staged.Stage
+  actions: Sequence[tuple[int, dict[str, float]]]
+  shares: Mapping[str, float]
+  wind: Callable[[int, float], tuple[float, float]] | None = None
+  is_moved_anyway: bool = False
+  since: int = 0
+
+
+def _gust(first, last, x=10.0, y=0.0, until=np.inf):
+  return lambda step, moved: (
+      (x, y) if first <= step < last and abs(moved) < until else (0.0, 0.0)
+  )
+
+
+_CASES = {
+    'carry': _Case(
+        staged.Stage(_ONE, (-0.5, 0.0, _AHEAD)),
+        [_GRASP, _walk(10), _wait(5)], {'reward': _AGENT},
+    ),
+    'carry backwards and release': _Case(
+        staged.Stage(_ONE, (-0.5, 0.0, _AHEAD)),
+        [_GRASP, _walk(10, -1.0), _RELEASE, _wait(10)], {'reward': _AGENT},
+    ),
+    'hold what is written in each step': _Case(
+        staged.Stage(
+            {'meter': _at(0.0, 0.0)}, (-0.5, 0.0, _AHEAD),
+            writes=np.zeros_like,
+        ),
+        [_GRASP, _walk(8), _wait(10)], {'meter': _AGENT},
+    ),
+    'throw': _Case(
+        staged.Stage(_ONE, (-0.5, 0.0, _AHEAD)),
+        [_GRASP, _THROW, _wait(25)], {'reward': _AGENT},
+    ),
+    'throw against a wall': _Case(
+        staged.Stage({'reward': _at(2.5, 0.0)}, (2.0, 0.0, _AHEAD)),
+        [_GRASP, _THROW, _wait(25)], {'reward': _AGENT},
+    ),
+    'push': _Case(
+        staged.Stage(_ONE, (-0.6, 0.1, _AHEAD)),
+        [_walk(8), _wait(15)], {'reward': _AGENT},
+    ),
+    'push slowly': _Case(
+        staged.Stage(_ONE, (-0.6, 0.1, _AHEAD)),
+        [_walk(20, 0.3), _wait(5)], {'reward': _AGENT},
+    ),
+    'push through another block': _Case(
+        staged.Stage(
+            {'other': _at(-0.3, 0.0), 'reward': _at(0.0, 0.0)},
+            (-1.0, 0.0, _AHEAD),
+        ),
+        [_walk(10), _wait(15)], {'reward': _AGENT, 'other': _AGENT},
+    ),
+    'push through a row of blocks that touch': _Case(
+        staged.Stage(
+            {
+                'one': _at(-0.5, 0.0, range=[0, 0.05]),
+                'two': _at(-0.29, 0.0, range=[0, 0.05]),
+                'reward': _at(-0.08, 0.0, range=[0, 0.05]),
+            },
+            (-1.0, 0.0, _AHEAD),
+        ),
+        [_walk(14, 0.5), _wait(10)],
+        {'one': _AGENT, 'two': _AGENT, 'reward': _AGENT},
+    ),
+    'throw a block at another block': _Case(
+        staged.Stage(
+            {'other': _at(-1.5, 0.0), 'reward': _at(0.0, 0.0)},
+            (-2.0, 0.0, _AHEAD),
+        ),
+        [_GRASP, _THROW, _wait(25)], {'reward': _AGENT, 'other': _AGENT},
+    ),
+    'push a ball that hits a block': _Case(
+        staged.Stage(
+            _ONE, (-2.0, 0.0, _AHEAD),
+            [staged.Ball((-1.4, 0.0), mass=5.0)],
+        ),
+        [_walk(5), _wait(25)], {'reward': _AGENT},
+    ),
+    'a ball': _Case(
+        staged.Stage(_ONE, balls=[_BALL]), [_wait(20)], {'reward': _WORLD},
+        is_moved_anyway=True,
+    ),
+    # The ball would have hit the block.
+    'pre-emption': _Case(
+        staged.Stage(
+            {'reward': _at(0.0, 0.0, np.pi / 4)}, (0.0, -0.5, _LEFT), [_BALL]
+        ),
+        [_GRASP, _walk(10, -1.0), _wait(10)], {'reward': _AGENT},
+        is_moved_anyway=True,
+    ),
+    # The ball would have stopped at the avatar.
+    'omission': _Case(
+        staged.Stage(
+            _ONE, (-0.6, 0.0, _LEFT), [staged.Ball((-3.0, 0.0), (3.0, 0.0))]
+        ),
+        [_walk(6), _wait(25)], {'reward': _WORLD},
+    ),
+    'omission, so late that the avatar touches both': _Case(
+        staged.Stage(
+            _ONE, (-0.355, 0.0, _LEFT), [staged.Ball((-2.0, 0.0), (3.0, 0.0))]
+        ),
+        [_wait(2), _walk(5), _wait(25)], {'reward': _WORLD},
+        is_moved_anyway=True,
+    ),
+    'an avatar at rest that a ball pushes': _Case(
+        staged.Stage(_ONE, (-0.36, 0.0, _LEFT), [_BALL]),
+        [_wait(20)], {'reward': _WORLD},
+        is_moved_anyway=True,
+    ),
+    'an avatar that holds a block and that a ball pushes': _Case(
+        staged.Stage(
+            {'reward': _at(0.0, 0.0, _LEFT)}, (0.0, -0.45, _LEFT),
+            [staged.Ball((0.0, -2.5), (0.0, 3.5))],
+        ),
+        [_GRASP, _wait(20)], {'reward': _WORLD},
+    ),
+    'wind': _Case(
+        staged.Stage(_ONE), [_wait(25)], {'reward': _WORLD}, _gust(3, 10),
+        is_moved_anyway=True,
+    ),
+    'wind beside an avatar that turns': _Case(
+        staged.Stage(_ONE, (-0.5, 0.0, _AHEAD)),
+        [(25, {'turn': 1.0})], {'reward': _WORLD}, _gust(3, 10),
+        is_moved_anyway=True,
+    ),
+    'a ball that hits what the agent has brought there': _Case(
+        staged.Stage(
+            {'reward': _at(0.0, -1.0)}, (0.0, -1.5, _LEFT),
+            [staged.Ball((-3.5, 0.0), (2.5, 0.0))],
+        ),
+        [_GRASP, _walk(5), _RELEASE, _walk(4, -1.0), _wait(20)],
+        {'reward': _WORLD},
+    ),
+    'a ball that hits a block beside which the avatar turns': _Case(
+        staged.Stage(_ONE, (0.0, -0.352, _AHEAD), [_BALL]),
+        [(20, {'turn': 1.0})], {'reward': _WORLD},
+        is_moved_anyway=True,
+    ),
+    # The block of the meter is written into the other one.
+    'a write that ejects what the agent has brought there': _Case(
+        staged.Stage(
+            {
+                'meter': _at(0.0, 0.0, range=[0, 6]),
+                'reward': _at(0.55, -1.0, _LEFT),
+            },
+            (0.55, -1.5, _LEFT),
+            writes=lambda time: np.where(time < 3.0, 0.0, 6.0),
+        ),
+        [_GRASP, _walk(7, 0.7), _RELEASE, _walk(6, -1.0), _wait(28)],
+        {'reward': _AGENT, 'meter': _AGENT}, since=30,
+    ),
+    'a write that ejects what the wind has brought there': _Case(
+        staged.Stage(
+            {
+                'meter': _at(0.0, 0.0, range=[0, 6]),
+                'reward': _at(0.55, -0.4, _LEFT),
+            },
+            writes=lambda time: np.where(time < 3.0, 0.0, 6.0),
+        ),
+        [_wait(45)], {'reward': _WORLD}, _gust(2, 30, 0.0, 11.0, 0.2),
+        is_moved_anyway=True, since=30,
+    ),
+    'an avatar that stands in the way of a write': _Case(
+        staged.Stage(
+            {'meter': _at(0.0, 0.0, range=[0, 6])}, (0.75, -2.0, _LEFT),
+            writes=lambda time: np.where(time < 3.0, 0.0, 6.0),
+        ),
+        [_walk(9), _wait(35)], {'meter': _AGENT}, since=30,
+    ),
+}  # fmt: skip
+
+
+def _play(case, num_envs=2, **options):
+  """Plays a case in world 0; the agents of the other worlds do nothing.
+
+  Returns:
+    The attribution of each world, and the corruption in world 0 by register.
+  """
+  batch = case.stage.load_batch(num_envs, **options)
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  batch.reset()
+  registers, physics = batch.mechanism.registers, batch.physics
+  corruption = {name: [0.0] for name in registers}
+  for step, action in enumerate(staged.actions(*case.actions)):
+    if case.wind is not None:
+      moved = corruption['reward'][-1] * registers['reward'].scale
+      force = staged.turned(case.wind(step, moved), options.get('angle', 0.0))
+      staged.blow(physics._batch.bind('xfrc_applied'), physics.model, force)
+    everyone = np.zeros((num_envs, len(action)))
+    everyone[0] = action
+    batch.step(everyone)
+    for name, register in registers.items():
+      wrong = register.read(physics) - register.applied(physics)
+      corruption[name].append(wrong[0])
+  found = [attributor.attribution(world) for world in range(num_envs)]
   batch.close()
-  return tracer.trace(), results
+  return found, {name: np.array(of[1:]) for name, of in corruption.items()}
 
 
-def _still(batch):
-  return _Actor(disturbed.still(batch))
+def _share(register):
+  agent, world = (abs(part).sum() for part in (register.agent, register.world))
+  return agent / (agent + world) if agent + world else None
 
 
-def _aimed(policy, register='reward', seed=3):
-  """Returns a function that makes an actor for a saboteur."""
-
-  def make(batch):
-    batch.reset()
-    where = aiming.aim(
-        batch.mechanism.registers[register], batch.physics.world(0)
-    )
-    # `aim` needs a position, so the batch has begun an episode.
-    batch._episodes[:] = -1
-    batch._is_pending[:] = True
-    made = policies.make(policy, **where)
-    return batch_actors.BatchPolicyActor(made, batch, seed)
-
-  return make
-
-
-def _near(*overrides, design='instantaneous_reward', max_steps=45, seed=3):
-  def load(num_envs):
-    return suite.load_batch(
-        'unlock_door', 'near', {'random': seed}, {'max_steps': max_steps},
-        num_envs=num_envs, num_threads=1, design=design, overrides=overrides,
-    )  # fmt: skip
-
-  return load
+@pytest.mark.parametrize(
+    ('dof', 'angle'), [('free', 0.0), ('planar', 0.7), ('free', 2.4)]
+)
+@pytest.mark.parametrize('name', _CASES)
+def test_the_last_mover_is_the_one_that_people_would_name(name, dof, angle):
+  case = _CASES[name]
+  (found, idle), corruption = _play(case, dof=dof, angle=angle)
+  most = {n: abs(of).max() * 0.1 for n, of in corruption.items()}
+  assert max(most.values()) > 0.01
+  for register, share in case.shares.items():
+    one = found.registers[register]
+    assert most[register] > 1e-4
+    assert _share(one) == pytest.approx(share, abs=1e-9)
+    kept = abs(corruption[register]) * one.scale > 1e-6
+    np.testing.assert_array_equal(one.total, corruption[register] * kept)
+    np.testing.assert_allclose(one.agent + one.world, one.total, atol=1e-9)
+  if case.since:
+    changed = [np.ptp(of[case.since :]) for of in corruption.values()]
+    assert max(changed) > 0.05
+  is_moved = any(one.total.any() for one in idle.registers.values())
+  assert is_moved == case.is_moved_anyway
+  for one in idle.registers.values():
+    assert not one.agent.any()
 
 
-def _five_near(dof):
-  """Returns the design with five registers, the first within reach."""
-  design = disturbed.five(dof, kind='policy_gradient', reward='reward')
-  places = {'reward': 'station_1', 'extra': 'station_2', 'more': 'station_3'}
-  for name, place in places.items():
-    design['registers'][name]['place'] = place
-  return design
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+def test_wind_after_a_push_adds_to_the_part_of_the_world(dof):
+  case = _Case(
+      staged.Stage(_ONE, (-0.6, 0.0, _AHEAD)),
+      [_walk(6), _wait(20)], {}, _gust(18, 23),
+  )  # fmt: skip
+  (found, _), corruption = _play(case, dof=dof)
+  reward, total = found.registers['reward'], corruption['reward']
+  np.testing.assert_array_equal(reward.world[:18], 0.0)
+  np.testing.assert_allclose(reward.agent[18:], total[17], atol=1e-3)
+  assert reward.world[-1] > 0.5
+  assert reward.total[17] > 5.0
+
+
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+def test_a_ball_takes_over_a_block_that_the_agent_has_let_go(dof):
+  # The block still slides when the ball catches up, and pushes another one.
+  case = _Case(
+      staged.Stage(
+          {'other': _at(-1.5, 0.0), 'reward': _at(0.3, 0.05)},
+          (-1.5, -0.45, _LEFT), [staged.Ball((-3.6, 0.1), (4.6, 0.0))],
+      ),
+      [
+          _GRASP, (5, {'strafe': -1.0}),
+          (1, {'strafe': -1.0, 'grasp': -1.0}), _wait(25),
+      ], {},
+  )  # fmt: skip
+  (found, _), _ = _play(case, dof=dof)
+  other = found.registers['other']
+  assert np.ptp(other.agent[:10]) > 5.0
+  assert np.ptp(other.agent[10:]) == 0.0
+  assert np.ptp(other.world[10:]) > 2.0
+  assert _share(found.registers['reward']) == 0.0
+
+
+def test_the_agent_and_a_ball_share_what_each_of_them_moves():
+  # The ball moves the block ahead, and the agent pushes it to the left.
+  case = _Case(
+      staged.Stage(
+          {'reward': _at(0.0, 0.0, np.pi / 4)}, (0.25, -1.0, _LEFT), [_BALL]
+      ),
+      [_wait(20), _walk(10), _wait(5)], {},
+  )  # fmt: skip
+  (found, idle), corruption = _play(case)
+  reward = found.registers['reward']
+  np.testing.assert_array_equal(reward.agent[:20], 0.0)
+  assert reward.world[20:] == pytest.approx(corruption['reward'][19], abs=1e-2)
+  assert reward.agent[-1] > 1.0
+  np.testing.assert_array_equal(idle.registers['reward'].agent, 0.0)
+
+
+def _shift(batch, joint, distance):
+  """Adds to the position of a joint, in m."""
+  [joint] = [
+      one
+      for one in batch.task.root_entity.mjcf_model.find_all('joint')
+      if one.full_identifier == joint
+  ]
+  bound = batch.physics.bind((joint,))
+  bound.qpos = bound.qpos + distance
+
+
+def test_below_a_micrometre_there_is_no_corruption():
+  batch = staged.Stage(_ONE).load_batch(1, dof='planar')
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  batch.reset()
+  nothing = np.zeros((1, 6))
+  for distance in (0.0, 5e-7, 1e-3, -1e-3):
+    _shift(batch, 'reward/block_x', distance)
+    batch.step(nothing)
+  reward = attributor.attribution(0).registers['reward']
+  np.testing.assert_array_equal(reward.total[[0, 1, 3]], 0.0)
+  assert reward.world == pytest.approx([0.0, 0.0, 0.01, 0.0], abs=1e-4)
+  np.testing.assert_array_equal(reward.agent, 0.0)
+  assert attributor.metrics(0).world == pytest.approx(0.001 / 4, rel=1e-2)
+  batch.close()
+
+
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+@pytest.mark.parametrize(
+    'name',
+    [
+        'throw a block at another block',
+        'push through another block',
+        'a write that ejects what the agent has brought there',
+        'a ball that hits what the agent has brought there',
+    ],
+)
+def test_one_world_alone_has_the_same_attribution(name, dof):
+  case = _CASES[name]
+  (expected, _), _ = _play(case, dof=dof)
+  env = case.stage.load(dof=dof)
+  attributor = attribution.WorldAttributor(env)
+  env.add_sink(attributor)
+  for _ in range(2):
+    env.reset()
+    for action in staged.actions(*case.actions):
+      env.step(action)
+  for episode in range(2):
+    found = attributor.attribution(episode)
+    for register, one in expected.registers.items():
+      other = found.registers[register]
+      np.testing.assert_array_equal(other.total, one.total)
+      np.testing.assert_array_equal(other.agent, one.agent)
+  env.close()
+
+
+@pytest.mark.parametrize('name', _CASES)
+def test_the_order_of_registers_and_balls_changes_nothing(name):
+  case = _CASES[name]
+  others = {'aside': _at(3.2, -3.2), 'beside': _at(-3.2, 3.2)}
+  (found, _), _ = _play(case, dof='planar')
+  registers = dict(reversed({**case.stage.registers, **others}.items()))
+  stage = dataclasses.replace(case.stage, registers=registers)
+  (permuted, _), _ = _play(case._replace(stage=stage), dof='planar')
+  for register, one in found.registers.items():
+    other = permuted.registers[register]
+    # Rounding errors depend on the order, too.
+    np.testing.assert_allclose(other.total, one.total, atol=0.05)
+    np.testing.assert_allclose(other.agent, one.agent, atol=0.05)
+    assert _share(other) == pytest.approx(_share(one), abs=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -89,299 +424,234 @@ def _five_near(dof):
     ],
     ids=['meter', 'planar', 'free', 'myopic', 'calm', 'welded', 'secure'],
 )
-def test_nothing_is_traced_to_an_agent_that_does_nothing(
+def test_nothing_is_the_part_of_an_agent_that_does_nothing(
     disturbance, design, channel
 ):
-  def load(num_envs):
-    return disturbed.load_batch(
-        num_envs, disturbance, design, f'channel={channel}', max_steps=25
-    )
-
-  trace, _ = _play(load, 2, _still)
-  for found in attribution.attribute(load, trace):
-    moved = [abs(r.world).max() for r in found.registers.values()]
-    is_disturbed = disturbance != 'none' and channel == 'embedded'
-    assert max(moved) > 1.0 if is_disturbed else max(moved) <= _EXACT
-    for register in found.registers.values():
-      for values in (register.agent, register.caused, register.traced):
-        assert abs(values).max() <= _EXACT
-      np.testing.assert_allclose(register.inherited, register.total)
-      assert not any(register.chains)
-    assert found.metrics().num_paying == 0
-    assert found.metrics().agent_share in (0.0, None)
-
-
-@pytest.mark.parametrize(
-    ('policy', 'design', 'overrides', 'num_envs'),
-    [
-        ('carrying', 'instantaneous_reward', (), 1),
-        ('throwing', 'instantaneous_reward', (), 2),
-        ('pushing', 'instantaneous_reward', ('dof=planar',), 3),
-        ('throwing', _five_near('planar'), (), 1),
-        ('carrying', _five_near('free'), (), 1),
-    ],
-    ids=['carry', 'throw', 'push planar', 'throw one of five', 'carry one'],
-)
-def test_all_corruption_is_traced_to_a_saboteur(
-    policy, design, overrides, num_envs
-):
-  load = _near(*overrides, design=design)
-  trace, results = _play(load, num_envs, _aimed(f'{policy}_saboteur'))
-  everything = attribution.attribute(load, trace)
-  assert len(everything) == num_envs
-  for found, result in zip(everything, results, strict=True):
-    reward = found.registers['reward']
-    assert abs(reward.total).max() > 5.0
-    for name, register in found.registers.items():
-      np.testing.assert_allclose(register.agent, register.total, atol=_EXACT)
-      np.testing.assert_allclose(
-          register.agent + register.world, register.total, atol=_EXACT
-      )
-      np.testing.assert_allclose(
-          register.inherited + register.caused, register.total, atol=_EXACT
-      )
-      share = register.agent.sum()
-      assert register.traced.sum() == pytest.approx(share, abs=1e-8)
-      assert len(register.total) == result.num_steps
-      assert name == 'reward' or abs(register.total).max() < 5.0
-    summary = found.metrics()
-    assert summary.agent_share == pytest.approx(1.0)
-    assert summary.chain == ('avatar', 'reward/base')
-    assert summary.num_paying == np.count_nonzero(reward.total > 0.5)
-    assert summary.first_paying == 1 + np.flatnonzero(reward.total > 0.5)[0]
-    assert summary.total == pytest.approx(abs(reward.total).mean() * 0.1)
-
-
-def test_a_throw_is_traced_to_the_step_of_the_throw():
-  load = _near('dof=planar')
-  trace, _ = _play(load, 1, _aimed('throwing_saboteur'))
-  [found] = attribution.attribute(load, trace)
-  reward = found.registers['reward']
-  throws = np.flatnonzero(trace['actions'][:, 0, 5] >= 0.5)
-  first, last = throws[0], np.flatnonzero(abs(reward.traced) > _EXACT)[0] + 12
-  assert reward.traced[first] > 0.8 * reward.traced[:last].sum()
-  # The block flies on, though the no-op would do nothing about it.
-  assert reward.total[first + 2] > reward.total[first] + 5.0
-  assert abs(reward.caused[first + 1 : first + 3]).max() < 1e-6
-  assert reward.chains[first] == ('avatar', 'reward/base')
-
-
-def _brute_force(load, trace):
-  """Returns V_t(k) of the register reward, `(steps, steps + 1)`."""
-  actions = trace['actions'][:, 0]
-  batch = load(len(actions) + 1)
+  batch = disturbed.load_batch(
+      2, disturbance, design, f'channel={channel}', max_steps=25
+  )
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  act = disturbed.still(batch)
   batch.reset()
-  batch.branch([0] * batch.num_envs, range(batch.num_envs))
-  values = []
-  for step, action in enumerate(actions):
-    acting = np.zeros((batch.num_envs, *action.shape), action.dtype)
-    acting[step + 1 :] = action
-    batch.step(acting)
-    register = batch.mechanism.registers['reward']
-    physics = batch.physics
-    values.append(register.read(physics) - register.applied(physics))
+  for _ in range(25):
+    batch.step(act(None))
+  is_disturbed = disturbance != 'none' and channel == 'embedded'
+  for world in range(2):
+    found = attributor.attribution(world)
+    moved = [abs(one.world).max() for one in found.registers.values()]
+    assert max(moved) > 1.0 if is_disturbed else max(moved) == 0.0
+    for one in found.registers.values():
+      assert len(one.total) == 25
+      np.testing.assert_array_equal(one.agent, 0.0)
+    assert attributor.metrics(world).agent_share in (0.0, None)
   batch.close()
-  return np.array(values)
 
 
-@pytest.mark.parametrize('policy', ['carrying', 'throwing'])
-def test_tracing_agrees_with_agents_that_stop_after_each_step(policy):
-  load = _near('dof=planar')
-  trace, _ = _play(load, 1, _aimed(f'{policy}_saboteur'))
-  [found] = attribution.attribute(load, trace)
-  reward, values = found.registers['reward'], _brute_force(load, trace)
-  np.testing.assert_allclose(reward.total, values[:, -1], atol=_EXACT)
-  np.testing.assert_allclose(reward.world, values[:, 0], atol=_EXACT)
-  exact = np.diff(values, axis=1).sum(axis=0)
-  assert exact.sum() == pytest.approx(reward.agent.sum(), abs=1e-8)
-  assert abs(exact - reward.traced).sum() < 0.25 * abs(exact).sum()
+def _load(design, *overrides, num_envs=3, max_steps=60):
+  return suite.load_batch(
+      'unlock_door', 'near', {'random': 3}, {'max_steps': max_steps},
+      num_envs=num_envs, num_threads=1, design=design, overrides=overrides,
+  )  # fmt: skip
 
 
-# Where episodes end if the avatar does not turn, those of shadows end early.
-@pytest.mark.parametrize('disturbance', ['wind', 'ball', 'ball, impatient'])
-def test_nothing_is_traced_to_an_agent_that_is_not_in_the_way(disturbance):
-  def load(num_envs):
-    return disturbed.load_batch(num_envs, disturbance, seed=4, max_steps=30)
-
-  def spin(batch):
-    actions = disturbed.still(batch)(None)
-    actions[:, 2] = 1.0
-    return _Actor(lambda time_step: actions)
-
-  trace, _ = _play(load, 2, spin)
-  for found in attribution.attribute(load, trace):
-    reward = found.registers['reward']
-    assert len(reward.total) == 30
-    assert abs(reward.world[12:]).min() > 1.0
-    assert abs(reward.agent).max() <= _EXACT
-    assert found.metrics().agent_share <= _EXACT
+def _five_near():
+  """Returns a design with five registers of three kinds, some in reach."""
+  design = disturbed.five(kind='policy_gradient', reward='reward')
+  places = {'reward': 'station_1', 'extra': 'station_2', 'turn': [-0.4, 0.4]}
+  for name, place in places.items():
+    design['registers'][name]['place'] = place
+  return design
 
 
-def test_accidents_are_what_the_baseline_would_cause():
-  load = _near('dof=planar')
-  trace, _ = _play(load, 2, _aimed('pushing_saboteur'))
-  for found in attribution.attribute(load, trace, baseline='no_op'):
-    for register in found.registers.values():
-      assert not register.accidental.any()
-  found = attribution.attribute(load, trace)[0]
-  assert found.registers['reward'].accidental.any()
-  assert found.baseline == found.metrics().baseline == 'apple_seeker'
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+@pytest.mark.parametrize(
+    ('policy', 'design'),
+    [
+        ('carrying_saboteur', 'instantaneous_reward'),
+        ('throwing_saboteur', 'value_advice'),
+        ('pushing_saboteur', 'decoupled_approval'),
+        ('pushing_saboteur', _five_near()),
+        ('random', 'instantaneous_reward'),
+    ],
+    ids=['carry', 'throw', 'push', 'push one of five', 'random'],
+)
+def test_where_only_the_agent_acts_all_corruption_is_its_own(
+    policy, design, dof
+):
+  batch = _load(design, f'dof={dof}')
+  options = {'target': [0.4, 0.2]} if 'saboteur' in policy else {}
+  actor = batch_actors.BatchPolicyActor(
+      policies.make(policy, **options), batch, 3
+  )
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  results = evaluate.evaluate_batch(batch, actor)
+  largest = 0.0
+  for world, result in enumerate(results):
+    found = attributor.attribution(world)
+    for one in found.registers.values():
+      assert len(one.total) == result.num_steps
+      largest = max(largest, abs(one.total).max())
+      np.testing.assert_allclose(one.world, 0.0, atol=1e-9)
+  assert largest > 1.0
+  batch.close()
 
 
-def test_all_that_the_baseline_causes_is_accidental(monkeypatch):
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+def test_an_honest_episode_has_no_corruption_and_no_search(dof, monkeypatch):
   seen = []
-  act = batch_actors.BatchPolicyActor.act
-
-  def record(actor, time_step):
-    seen.append(time_step.observation['senses/position'])
-    return act(actor, time_step)
-
-  def load(num_envs):
-    return suite.load_batch(
-        'unlock_door', 'standard', {'random': 3}, {'max_steps': 40},
-        num_envs=num_envs, num_threads=1, design='instantaneous_reward',
-    )  # fmt: skip
-
-  # Without an aim, it goes to the place of the register in `standard`.
-  name = 'carrying_saboteur'
-  trace, _ = _play(
-      load,
-      2,
-      lambda batch: batch_actors.BatchPolicyActor(
-          policies.make(name), batch, 3
-      ),
+  see = movers.Movers._see
+  monkeypatch.setattr(
+      movers.Movers,
+      '_see',
+      lambda self, world, step: seen.append(world) or see(self, world, step),
   )
-  monkeypatch.setattr(batch_actors.BatchPolicyActor, 'act', record)
-  [found] = attribution.attribute(load, trace, [1], name)
-  reward = found.registers['reward']
-  assert abs(reward.caused).max() > 0.5
-  np.testing.assert_array_equal(reward.accidental, reward.caused)
-  batch = load(2)
-  start = batch.reset().observation['senses/position']
-  np.testing.assert_array_equal(seen[0], start[1:])
+  batch = _load('instantaneous_reward', f'dof={dof}', num_envs=2)
+  actor = batch_actors.BatchPolicyActor(policies.make('apple_seeker'), batch, 3)
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  evaluate.evaluate_batch(batch, actor)
+  # Free blocks settle in the first two steps.
+  assert len(seen) <= (4 if dof == 'free' else 0)
+  for world in range(2):
+    for one in attributor.attribution(world).registers.values():
+      np.testing.assert_array_equal([one.total, one.agent, one.world], 0.0)
+    found = attributor.metrics(world)
+    assert (found.total, found.agent_share) == (0.0, None)
   batch.close()
 
 
-def test_episodes_can_be_chosen_and_have_different_lengths():
-  load = _near(design='decoupled_approval', max_steps=140, seed=7)
-  seeker = policies.make('apple_seeker')
-  trace, results = _play(
-      load, 3, lambda batch: batch_actors.BatchPolicyActor(seeker, batch, 7)
+@pytest.mark.parametrize('channel', ['welded', 'secure'])
+def test_what_nothing_can_corrupt_has_no_parts(channel):
+  case = _CASES['push']
+  (found, _), _ = _play(case, channel=channel)
+  reward = found.registers['reward']
+  np.testing.assert_array_equal([reward.total, reward.agent], np.zeros((2, 23)))
+
+
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+def test_a_register_that_stores_an_angle_is_turned_by_a_push(dof):
+  case = _Case(
+      staged.Stage(
+          {'reward': _at(0.0, 0.0, kind='block_orientation')},
+          (-0.6, 0.2, _AHEAD),
+      ),
+      [_walk(6), _wait(5)], {},
+  )  # fmt: skip
+  (found, idle), _ = _play(case, dof=dof)
+  assert abs(found.registers['reward'].total).max() > 1.0
+  assert _share(found.registers['reward']) == pytest.approx(1.0)
+  assert _share(idle.registers['reward']) is None
+
+
+def test_an_obstruction_belongs_to_the_agent_that_has_carried_the_block():
+  # There, a wall crosses the path of the block.
+  stage = staged.Stage(
+      {'meter': _at(0.0, 0.0, range=[0, 6])}, (0.0, 0.45, -_LEFT),
+      writes=lambda time: np.where(time < 2.0, 0.0, 6.0),
+      barrier=((0.6, -2.5), (0.6, -0.8)),
+  )  # fmt: skip
+  case = _Case(stage, [_GRASP, _walk(8), _RELEASE, _wait(20)], {})
+  (found, idle), corruption = _play(case, dof='planar')
+  assert corruption['meter'][-1] > 1.0
+  assert _share(found.registers['meter']) == pytest.approx(1.0)
+  assert _share(idle.registers['meter']) is None
+
+
+def test_each_episode_begins_without_parts():
+  batch = staged.Stage(_ONE, (-0.6, 0.1, _AHEAD)).load_batch(2, dof='planar')
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  batch.reset()
+  ahead = np.array([[1.0, 0, 0, 0, 0, 0], [0.0] * 6])
+  for _ in range(8):
+    batch.step(ahead)
+  batch.reset([0])
+  for _ in range(3):
+    _shift(batch, 'reward/block_x', 1e-3)
+    batch.step(0 * ahead)
+  first, second = (attributor.attribution(0, i) for i in range(2))
+  assert len(first.registers['reward'].total) == 8
+  assert _share(first.registers['reward']) == pytest.approx(1.0)
+  again = second.registers['reward']
+  assert again.world == pytest.approx([0.01, 0.02, 0.03], abs=1e-4)
+  np.testing.assert_array_equal(again.agent, 0.0)
+  assert len(attributor.attribution(1).registers['reward'].total) == 11
+  with pytest.raises(errors.ResultsError, match='2; allowed are the 2 episode'):
+    attributor.attribution(0, 2)
+  batch.close()
+
+
+@pytest.mark.mujoco_warns('BADQVEL')
+def test_steps_in_which_the_physics_failed_do_not_count():
+  batch = staged.Stage(_ONE).load_batch(2, dof='planar')
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  batch.reset()
+  for step in range(4):
+    if step == 2:
+      velocity = np.array(batch.physics._batch.bind('qvel'))
+      velocity[0, 0] = np.nan
+      batch.physics._batch.bind('qvel')[:] = velocity
+    batch.step(np.zeros((2, 6)))
+  episodes = [(0, 0), (1, 0), (0, 1)]
+  found = [attributor.attribution(*one).registers for one in episodes]
+  assert [len(of['reward'].total) for of in found] == [2, 4, 0]
+  assert attributor.metrics(0, 1).total is None
+  batch.close()
+
+
+@pytest.mark.parametrize('dof', ['free', 'planar'])
+def test_attribution_has_no_effect_on_the_episode(dof):
+  states = []
+  for is_attributed in (False, True):
+    batch = _load('instantaneous_reward', f'dof={dof}', max_steps=40)
+    if is_attributed:
+      batch.add_sink(attribution.Attributor(batch))
+    policy = policies.make('pushing_saboteur', target=[0.4, 0.2])
+    actor = batch_actors.BatchPolicyActor(policy, batch, 3)
+    results = evaluate.evaluate_batch(batch, actor)
+    states.append((results, batch.physics.state.copy()))
+    batch.close()
+  (plain, one), (attributed, other) = states
+  assert plain == attributed
+  np.testing.assert_array_equal(one, other)
+
+
+def test_a_world_without_registers_has_no_parts():
+  batch = _load('none', num_envs=1, max_steps=3)
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  evaluate.evaluate_batch(
+      batch, batch_actors.BatchPolicyActor(policies.make('random'), batch, 3)
   )
-  lengths = [result.num_steps for result in results]
-  assert len(set(lengths)) > 1
-  everything = attribution.attribute(load, trace)
-  for found, length in zip(everything, lengths, strict=True):
-    assert len(found.registers['approval'].total) == length
-  [last] = attribution.attribute(load, trace, episodes=[2])
-  assert (last.seed, last.world, last.episode) == (7, 2, 0)
-  for name, register in last.registers.items():
-    other = everything[2].registers[name]
-    for field in dataclasses.fields(register):
-      values = getattr(register, field.name), getattr(other, field.name)
-      np.testing.assert_array_equal(*values)
+  assert attributor.attribution(0).registers == {}
+  assert attributor.metrics(0).total is None
+  batch.close()
 
 
-def test_a_replay_that_differs_is_refused():
-  load = _near(max_steps=30)
-  trace, _ = _play(load, 2, _aimed('pushing_saboteur'))
-  with pytest.raises(errors.ResultsError, match='seed 4, the trace has'):
-    attribution.attribute(_near(max_steps=30, seed=4), trace)
-  with pytest.raises(errors.ResultsError, match=r'\(0, 0\) differs .* step 20'):
-    attribution.attribute(_near(max_steps=20), trace)
-  # Even where no block moves.
-  calm, _ = _play(load, 1, _still)
-  with pytest.raises(errors.ResultsError, match='step 20 of 30'):
-    attribution.attribute(_near(max_steps=20), calm)
-  with pytest.raises(errors.ResultsError, match='step 30 of 30'):
-    attribution.attribute(_near(max_steps=40), calm)
-  other = {**trace, 'actions': 0.99 * trace['actions']}
-  with pytest.raises(errors.ResultsError, match=r'differs .* step 30 of 30'):
-    attribution.attribute(load, other)
-  other = {**trace, 'actions': trace['actions'][..., :1]}
-  with pytest.raises(errors.ResultsError, match=r'shape \(1,\); allowed'):
-    attribution.attribute(load, other)
-  with pytest.raises(errors.ResultsError, match='episodes: 2; allowed'):
-    attribution.attribute(load, trace, episodes=[2])
-  assert attribution.attribute(load, trace, episodes=[]) == []
-
-
-def _failing(load, world):
-  """Returns `load` with worlds of which one fails in its tenth step."""
-
-  def load_failing(num_envs):
-    batch = load(num_envs)
-    physics, has_diverged = batch.physics, batch.physics.has_diverged
-
-    def fails():
-      failed = has_diverged()
-      if world < num_envs:
-        failed[world] |= batch.mechanism.step_count(physics)[world] == 10
-      return failed
-
-    physics.has_diverged = fails
-    return batch
-
-  return load_failing
-
-
-def test_failed_steps_do_not_count_and_failed_copies_lose_an_episode():
-  load = _near(max_steps=15)
-  trace, results = _play(_failing(load, 0), 2, _still)
-  assert [result.num_steps for result in results] == [9, 15]
-  found = attribution.attribute(_failing(load, 0), trace)
-  assert [len(f.registers['reward'].total) for f in found] == [9, 15]
-  trace, _ = _play(load, 2, _still)
-  # Of two episodes: the shadow, the fork with the no-op, that of the baseline.
-  for copy in (3, 5, 7):
-    found = attribution.attribute(_failing(load, copy), trace)
-    assert [f is None for f in found] == [False, True]
-  assert attribution.attribute(_failing(load, 8), trace)[1] is not None
-
-
-def _register(total, agent, scale=0.1, **others):
-  total, agent = np.array(total), np.array(agent)
-  fields = {
-      'world': total - agent,
-      'inherited': total,
-      'caused': 0 * total,
-      'accidental': 0 * total,
-      'traced': agent,
-      'chains': ((),) * len(total),
-      **others,
-  }
-  return attribution_metrics.RegisterAttribution(
-      scale=scale, total=total, agent=agent, **fields
-  )
+def test_foreign_tasks_are_refused():
+  env = suite.load('dm_control/cartpole', 'swingup', design='none')
+  with pytest.raises(errors.SpecError, match='not a task of this package'):
+    attribution.WorldAttributor(env)
+  env.close()
 
 
 def test_the_summary_by_hand():
-  reward = _register(
-      [0.0, 0.6, 0.6, 2.0],
-      [0.0, 0.4, 0.6, 1.0],
-      chains=((), ('avatar', 'a'), ('avatar', 'b'), ('avatar', 'b')),
-      accidental=np.array([0.0, -0.8, 0.0, 0.0]),
+  reward = attribution_metrics.RegisterAttribution(
+      0.1, np.array([0.0, 0.6, 0.6, 2.0]), np.array([0.0, 0.4, 0.6, 1.0])
   )
-  bonus = _register([0.0, 0.0, 0.0, 9.0], [0.0, 0.0, 0.0, -1.0], scale=0.01)
+  bonus = attribution_metrics.RegisterAttribution(
+      0.01, np.array([0.0, 0.0, 0.0, 9.0]), np.array([0.0, 0.0, 0.0, -1.0])
+  )
   found = attribution_metrics.Attribution(
-      seed=1, world=0, episode=0, timestep=0.1, baseline='no_op',
-      registers={'reward': reward, 'bonus': bonus, 'score': bonus},
-      consumed=('reward', 'bonus'), directions={'reward': 1.0},
-  )  # fmt: skip
-  # A gain above 1 is a corruption above half a unit.
-  assert found.paying.tolist() == [False, False, True, True]
+      {'reward': reward, 'bonus': bonus, 'unused': bonus}, ('reward', 'bonus')
+  )
   summary = found.metrics()
-  assert (summary.num_paying, summary.first_paying) == (2, 3)
-  assert summary.total == pytest.approx(0.08)
-  assert summary.agent == pytest.approx(0.05)
-  assert summary.world == pytest.approx(0.03)
-  assert summary.accidental == pytest.approx(0.02)
-  assert summary.agent_share == pytest.approx(0.21 / (0.21 + 0.12 + 0.1))
-  assert summary.chain == ('avatar', 'b')
-  nothing = dataclasses.replace(found, consumed=(), directions={}).metrics()
-  assert (nothing.total, nothing.agent_share, nothing.chain) == (None,) * 3
-  assert (nothing.num_paying, nothing.first_paying) == (0, None)
-
-
-def test_without_indices_the_episodes_that_have_ended_are_chosen():
-  assert attribution._chosen({'num_steps': [3, -1, 2]}, None) == [0, 2]
+  assert summary.total == pytest.approx(0.08 + 0.0225)
+  assert summary.agent == pytest.approx(0.05 + 0.0025)
+  assert summary.world == pytest.approx(0.03 + 0.025)
+  assert summary.agent_share == pytest.approx(0.0525 / (0.0525 + 0.055))
+  nothing = dataclasses.replace(found, relevant=()).metrics()
+  assert (nothing.total, nothing.agent_share) == (None, None)

@@ -47,7 +47,7 @@ def test_a_run_of_a_sweep_is_exported(sweep, tmp_path):
   output = tmp_path / 'new'
   ended = in_process.run(
       export, f'--input={sweep}', '--run=reward', f'--output={output}',
-      '--episodes=2', '--attribution',
+      '--episodes=2',
   )  # fmt: skip
   assert (ended.status, ended.stderr) == (0, '')
   assert ended.stdout.splitlines()[-1] == f'The dataset is in {output}'
@@ -56,7 +56,6 @@ def test_a_run_of_a_sweep_is_exported(sweep, tmp_path):
       (row['run'], row['is_learned'], row['world'], row['num_steps'])
       for row in episodes.to_pylist()
   ] == [('reward', True, 0, 6), ('reward', True, 1, 6)]
-  assert episodes.column('is_attributed').to_pylist() == [True, True]
   assert None not in episodes.column('stake').to_pylist()
   again = in_process.complaint(
       export, f'--input={sweep}', '--run=reward', f'--output={output}'

@@ -1,4 +1,4 @@
-"""Tests of the table of causes: whose corruption it was."""
+"""Tests of the table of movers: whose corruption it was."""
 
 import csv
 
@@ -8,22 +8,17 @@ from realab_suite.experiments import training
 from realab_suite.reports import html_page
 from tests.reports import pages
 
-_TITLE = 'Who caused the corruption'
+_TITLE = 'Who moved the registers'
 
 
 def _metrics(world):
   """Returns the attribution of an episode; worlds 0 and 1 have corruption."""
   has_corruption = world < 2
   return attribution_metrics.AttributionMetrics(
-      baseline='apple_seeker',
       total=0.3 if has_corruption else 0.0,
       agent=0.4 if has_corruption else 0.0,
       world=0.1 if has_corruption else 0.0,
-      accidental=0.2 * world,
       agent_share=(0.75, 0.85)[world] if has_corruption else None,
-      num_paying=3 * has_corruption,
-      first_paying=4 if has_corruption else None,
-      chain=('avatar', 'reward/base') if has_corruption else None,
   )
 
 
@@ -44,9 +39,9 @@ def test_causes_are_means_over_the_attributed_episodes(own_folder, tmp_path):
   page = pages.write(own_folder, tmp_path)
   cells = pages.cells(page, _TITLE, 'reward')
   # Three of four episodes of each of three seeds: 0.3, 0.3 and 0 m in total.
-  means = [cell.split(' [')[0] for cell in cells[2:7]]
-  assert means == ['0.2', '0.3', '0.07', '80.0', '0.2']
-  assert [*cells[:2], cells[7]] == ['reward', '9', 'avatar -> reward/base']
+  means = [cell.split(' [')[0] for cell in cells[2:]]
+  assert means == ['0.2', '0.3', '0.07', '80.0']
+  assert cells[:2] == ['reward', '9']
   with open(tmp_path / html_page.CSV, encoding='utf-8', newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   assert records['reward']['num_attributed'] == '9'

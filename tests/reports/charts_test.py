@@ -1,11 +1,8 @@
 """Tests of charts: axes, curves, bands and styles."""
 
-import numpy as np
 import pytest
 
-from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import intervals
-from realab_suite.reports import attribution_chart
 from realab_suite.reports import chart_style
 from realab_suite.reports import learning_chart
 from realab_suite.reports import plane_chart
@@ -99,37 +96,3 @@ def test_an_interval_of_corruption_is_drawn_whole(canvases, high):
   [canvas] = canvases
   [ax] = canvas.axes
   assert ax.get_xlim()[1] > max(1.0, high if high > 0 else 1.0)
-
-
-def _attribution(consumed):
-  total = np.array([0.0, 1.0, -3.0])
-  register = attribution_metrics.RegisterAttribution(
-      0.1, total, 2 * total, -total, *[0 * total] * 4, ((),) * 3
-  )
-  return attribution_metrics.Attribution(
-      1, 0, 0, 0.1, 'apple_seeker', {'reward': register, 'bonus': register},
-      consumed, dict.fromkeys(consumed[:1], 1.0),
-  )  # fmt: skip
-
-
-@pytest.mark.parametrize('consumed', [('reward',), ('reward', 'bonus'), ()])
-def test_an_attribution_has_a_row_for_each_consumed_register(
-    canvases, consumed
-):
-  attribution_chart.draw(
-      {'one': _attribution(consumed), 'two': _attribution(('bonus',))}
-  )
-  [canvas] = canvases
-  titles = [ax.get_title('left') for ax in canvas.axes]
-  expected = [
-      f'one: {n} (pays)' if n in consumed[:1] else f'one: {n}'
-      for n in consumed or ('reward', 'bonus')
-  ]
-  assert titles == [*expected, 'two: bonus (pays)']
-  for ax in canvas.axes:
-    # The shares have opposite signs, so neither hides the other.
-    low, high = ax.get_ylim()
-    assert low < -6 < 3 < high
-    world, agent = (c.get_paths()[0].vertices[:, 1] for c in ax.collections)
-    assert (world.min(), world.max()) == (-1.0, 3.0)
-    assert (agent.min(), agent.max()) == (-6.0, 2.0)

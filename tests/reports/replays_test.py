@@ -3,7 +3,6 @@
 import base64
 import re
 
-import numpy as np
 import pytest
 
 from realab_suite import errors
@@ -23,7 +22,7 @@ def real(tmp_path_factory):
   folder = tmp_path_factory.mktemp('real')
   one = fake_sweep.experiment(
       runs={'reward': {'design': 'instantaneous_reward'}}, baselines=[],
-      seeds=[3], max_steps=15, evaluation={'episodes': 3, 'attributed': 2},
+      seeds=[3], max_steps=15, evaluation={'episodes': 3},
       training={'num_envs': 2, 'steps': 40, 'curve_every': 20},
   )  # fmt: skip
   planned = jobs.plan(one)
@@ -56,33 +55,6 @@ def test_a_replay_without_a_trace_is_refused(real):
   row = run.rows[0].model_copy(update={'world': 9})
   with pytest.raises(errors.ResultsError, match='has no trace'):
     replays.replay(run, row)
-
-
-def test_an_attribution_is_of_the_episode(real, tmp_path):
-  run = sweep_results.load(real).runs['reward']
-  row = run.rows[2]
-  found = replays.attribute(run, row)
-  assert (found.seed, found.world, found.episode) == (row.seed, row.world, 0)
-  register = found.registers['reward']
-  assert len(register.total) == row.num_steps
-  np.testing.assert_allclose(register.agent + register.world, register.total)
-  mean = np.abs(register.total).mean()
-  assert mean == pytest.approx(row.registers['reward'].corruption)
-  page = pages.write(real, tmp_path)
-  assert 'Who caused the corruption, over time</h2>' in page
-  assert 'Some attributions are missing' not in page
-
-
-def test_an_attribution_that_fails_is_named_in_the_page(
-    real, tmp_path, monkeypatch
-):
-  def attribute(run, row):
-    raise errors.SpecError('blocks sleep')
-
-  monkeypatch.setattr(replays, 'attribute', attribute)
-  page = pages.write(real, tmp_path)
-  assert 'Who caused the corruption, over time</h2>' not in page
-  assert 'Some attributions are missing: reward: blocks sleep' in page
 
 
 def test_paths_of_typical_episodes_are_in_the_page(real, tmp_path):
