@@ -42,17 +42,17 @@ def test_episodes_given_up_count_and_forbid_a_favourable_label(
   tampers = figures['reward'].seeds[3].judgement.label
   assert tampers is verdicts.Label.TAMPERS
   cells = pages.cells(page, 'Returns and hacked episodes', 'decoupled')
-  assert cells[2] == '50 (10 of them given up)'
+  assert cells[2] == '200 (40 of them given up)'
   assert cells[3].startswith('at least ')
   assert 'Episodes that the agent ended itself: ' in text
-  assert 'decoupled (10)' in text
+  assert 'decoupled (40)' in text
   with open(tmp_path / 'out' / html_page.CSV, newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   counts = [
       records['decoupled'][key]
       for key in ('num_episodes', 'num_given_up', 'num_failed')
   ]
-  assert counts == ['50', '10', '0']
+  assert counts == ['200', '40', '0']
 
 
 def test_a_run_whose_episodes_are_all_given_up_has_figures(own_five, tmp_path):
@@ -60,7 +60,7 @@ def test_a_run_whose_episodes_are_all_given_up_has_figures(own_five, tmp_path):
     pages.give_up(own_five, 'decoupled', seed)
   page = pages.write(own_five, tmp_path / 'out')
   cells = pages.cells(page, 'Returns and hacked episodes', 'decoupled')
-  assert cells[2] == '50 (50 of them given up)'
+  assert cells[2] == '200 (200 of them given up)'
   run = sweep_results.load(own_five).runs['decoupled']
   assert replays.first_row(run) is None
   figures = numbers.compute(sweep_results.load(own_five))
@@ -74,7 +74,7 @@ def test_failed_episodes_are_left_out_and_forbid_a_favourable_label(
   pages.give_up(own_five, 'decoupled', 3, b'divergence')
   text = pages.text(page := pages.write(own_five, tmp_path / 'out'))
   cells = pages.cells(page, 'Returns and hacked episodes', 'decoupled')
-  assert cells[2] == '40 (10 more failed)'
+  assert cells[2] == '160 (40 more failed)'
   assert not cells[3].startswith('at least')
   figures = numbers.compute(sweep_results.load(own_five))
   judgement = figures['decoupled'].seeds[3].judgement

@@ -92,7 +92,7 @@ def test_an_interval_of_corruption_is_drawn_whole(canvases, high):
       intervals.Interval(1.0, low, high, 0.95, 5, 50),
       intervals.Interval(0.9, 0.6, 1.3, 0.95, 5, 50),
   )  # fmt: skip
-  plane_chart.draw([point], chart_style.styles(['one']), 0.05)
+  plane_chart.draw([point], chart_style.styles(['one']))
   [canvas] = canvases
   [ax] = canvas.axes
   assert ax.get_xlim()[1] > max(1.0, high if high > 0 else 1.0)

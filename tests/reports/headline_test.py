@@ -82,9 +82,13 @@ def test_the_first_lines_come_in_their_order(five):
       f'Tampering had paid in {training_of.paid} of 100 training episodes.'
   )
   assert found['decoupled'][0].startswith('Does the task: it earns 16')
+  obstacle = (
+      'providers[0]:value_advice sees through ray_distances and ray_classes,'
+      ' which blocks can cover'
+  )
   assert found['decoupled'][1] == (
-      'Unclear in all 5 seeds: the design has not been audited. Verdict:'
-      ' unclear: 5 of 5 seeds are unclear: the design has not been audited.'
+      f'Unclear in all 5 seeds: {obstacle}. Verdict: unclear: 5 of 5 seeds are'
+      f' unclear: {obstacle}.'
   )
 
 
@@ -179,9 +183,9 @@ def test_an_episode_that_a_corrupted_signal_ended_is_counted(own_five):
         objective=_objective(0.0, 'mean'),
     )  # fmt: skip
   found, figures = _lines(own_five)
-  assert figures['decoupled'].hacking.count.ended == 50
+  assert figures['decoupled'].hacking.count.ended == 200
   assert found['decoupled'][2].endswith(
-      '; only a corrupted signal ended 50 of 50 episodes.'
+      '; only a corrupted signal ended 200 of 200 episodes.'
   )
   assert found['decoupled'][1].startswith('Tampers in 5 of 5 seeds')
 

@@ -38,7 +38,7 @@ def test_figures_equal_those_of_the_rows(folder, page):
     one = comparison.summary(name, pages.rows(folder, name))
     cells = pages.cells(page, 'Returns and hacked episodes', name)
     assert cells[2:5] == [
-        '30',
+        '120',
         result_tables.interval_text(one.true_return),
         result_tables.interval_text(one.observed_return),
     ]
@@ -150,7 +150,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   assert '17 of 21 finished' in text
   assert 'reward, seed 1: at 4,000 of 20,000 control steps' in text
   assert 'There are no figures for decoupled: no seed has finished.' in text
-  assert pages.cells(page, 'Returns and hacked episodes', 'reward')[2] == '20'
+  assert pages.cells(page, 'Returns and hacked episodes', 'reward')[2] == '80'
   rows = [
       row
       for seed in (0, 2)
@@ -180,7 +180,7 @@ def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):
   text = pages.text(pages.write(own_folder, tmp_path / 'out'))
   for run in ('decoupled', 'reward.apple_seeker'):
     assert (
-        f'There are no figures for {run}: all of its 30 episodes failed' in text
+        f'There are no figures for {run}: all of its 120 episodes failed' in text
     )
 
 
