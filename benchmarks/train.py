@@ -72,7 +72,7 @@ class _Trainee:
     (job,) = jobs.plan(experiment)
     self.batch = training.load_batch(job, num_envs, seed, sleep=sleep)
     self.batch.add_sink(
-        monitors.TrainingMonitor(self.batch.mechanism, num_envs)
+        monitors.BatchMonitor(self.batch.mechanism.design, num_envs)
     )
     self.learner: Any = training.make_learner(job, self.batch)
     self._time_step = self.batch.reset()

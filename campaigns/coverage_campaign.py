@@ -35,7 +35,9 @@ TESTS = (
     'tests/feedback',
     'tests/evaluation/ledger_test.py',
     'tests/evaluation/batch_ledger_test.py',
-    'tests/evaluation/metrics_test.py',
+    'tests/evaluation/episode_figures_test.py',
+    'tests/evaluation/gains_test.py',
+    'tests/evaluation/monitor_test.py',
     'tests/evaluation/evaluate_test.py',
     'tests/evaluation/episodes_by_hand_test.py',
     'tests/evaluation/independence_test.py',
@@ -60,7 +62,9 @@ TARGETS: Mapping[str, tuple[Sequence[str], float]] = {
     'feedback': (['feedback/', 'policies/'], 0.95),
     'spec loader': (['config/loading.py', 'feedback/specs.py'], 0.95),
     'ledger': (['evaluation/ledgers.py'], 1.0),
-    'metrics': (['evaluation/metrics.py'], 1.0),
+    'figures': (
+        ['evaluation/episode_figures.py', 'evaluation/gains.py'], 1.0,
+    ),
     'rows': (['evaluation/results.py'], 1.0),
     'storage': (['experiments/storage.py'], 1.0),
 }

@@ -251,8 +251,8 @@ def _movers_table(
       cells,
       'Who moved it',
       'The own corruption of the registers that the objective depends on, by'
-      ' the last mover of their blocks: the agent, also through other blocks and'
-      ' after a throw, or the world.',
+      ' the last mover of their blocks: the agent, also through other blocks'
+      ' and after a throw, or the world.',
       ['agent (m)', 'world (m)', 'due to the agent (%)'],
   )
 

@@ -290,7 +290,7 @@ def test_experiments_are_confined_with_their_overrides(outside: pathlib.Path):
   without = _design(_wrapped(1, 'network_demonstrator', weights=path))
   pathlib.Path('without.yaml').write_text(json.dumps(without))
   (outside / 'design.yaml').write_text(json.dumps(_within()))
-  learner = {'learner': {'kind': 'behavioural_cloning'}}
+  learner = {'learner': {'kind': 'mine'}}
 
   def experiment(**run: Any) -> dict[str, Any]:
     return {

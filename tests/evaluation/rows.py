@@ -48,7 +48,7 @@ def info(**changes: Any) -> results.RunInfo:
       'domain': 'unlock_door', 'task': 'near', 'dynamics_version': 2,
       'dynamics_digest': None, 'design': 'instantaneous_reward',
       'design_digest': '0123456789abcdef', 'channel': 'embedded',
-      'policy': 'random', 'run': 'random', 'baseline': None,
+      'policy': 'mine', 'run': 'mine', 'baseline': None,
       'control_timestep': 0.1, 'max_steps': None,
   }  # fmt: skip
   return results.RunInfo(**fields | changes)

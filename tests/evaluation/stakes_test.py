@@ -6,10 +6,10 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import obstacles
 from realab_suite.evaluation import stakes
-from realab_suite.experiments import worlds
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.engine import helpers

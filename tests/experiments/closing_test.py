@@ -28,7 +28,6 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import placement
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import incentives
 from realab_suite.evaluation import monitors
 from realab_suite.experiments import curves
 from realab_suite.experiments import experiment_specs
@@ -236,7 +235,7 @@ _LEARNER = fake_learner.FakeLearner
 # Functions that fail in training and evaluation, and after how many calls.
 _PLACES: list[tuple[Any, str, int]] = [
     (training, 'make_learner', 0),
-    (monitors.TrainingMonitor, '__init__', 0),
+    (monitors.BatchMonitor, '__init__', 0),
     (_BATCH, 'add_sink', 0),
     (_BATCH, 'reset', 0),
     (_BATCH, 'reset', 1),
@@ -247,8 +246,6 @@ _PLACES: list[tuple[Any, str, int]] = [
     (storage.JsonLines, '__init__', 1),
     (storage.RunFolder, 'finish', 0),
     (curves, 'point', 0),
-    (incentives, 'collect', 0),
-    (incentives, '_simulate', 0),
 ]
 
 
@@ -284,7 +281,7 @@ def test_a_job_that_fails_closes_its_worlds(made, tmp_path, monkeypatch, place):
 def test_a_job_whose_worlds_sleep_closes_them_in_every_segment(
     made, tmp_path, monkeypatch, after
 ):
-  _fail_at(monkeypatch, monitors.TrainingMonitor, '__init__', after, Stopped)
+  _fail_at(monkeypatch, monitors.BatchMonitor, '__init__', after, Stopped)
   with pytest.raises(Stopped):
     _run(_job(sleep=True), tmp_path)
   assert made.num_made == after + 1

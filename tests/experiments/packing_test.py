@@ -44,13 +44,16 @@ def _built(tmp_path_factory):
   (folder / scheduler.AUDITS).mkdir()
   audit = folder / scheduler.AUDITS / 'reward.json'
   domain, task = _experiment().domain_and_variation
+  design = sweep_results.load(folder).runs['reward'].design
   content = {
-      'verdict': 'EXPLOITABLE',
+      'verdict': 'EXPLOITABLE', 'is_sufficient': True, 'num_searched': 9,
       'world': {
           'domain': domain, 'task': task, 'max_steps': 250,
           'task_kwargs': {}, 'senses': None,
       },
-      'design': sweep_results.load(folder).runs['reward'].design.to_mapping(),
+      'design': design.to_mapping(), 'target': None,
+      'objective': design.objective.model_dump(mode='json'),
+      'query_policy': 'taken_action',
   }  # fmt: skip
   audit.write_text(json.dumps(content))
   (folder / scheduler.LOGS).mkdir()

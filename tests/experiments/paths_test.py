@@ -182,7 +182,7 @@ def test_a_design_within_the_working_directory_may_be_named(
   monkeypatch.chdir(tmp_path)
   (tmp_path / 'designs').mkdir()
   action_set = {'name': 'dmlab_like', 'version': 1}
-  design = _design(action_set=action_set, learner={'kind': 'q_learning'})
+  design = _design(action_set=action_set, learner={'kind': 'mine'})
   text = yaml.safe_dump(design)
   (tmp_path / 'designs' / 'mine.yaml').write_text(text, encoding='utf-8')
   for name in ('designs/mine.yaml', str(tmp_path / 'designs' / 'mine.yaml')):

@@ -76,15 +76,16 @@ def test_random_actions_and_an_agent_at_rest_are_controls():
   }
 
 
-@pytest.mark.parametrize('share', [0.075, 0.25])
-def test_nothing_favourable_stands_beside_a_control_that_gains(share):
-  number = round(40 * share)
+@pytest.mark.parametrize(
+    ('number', 'verdict'),
+    [(8, 'hacks no more than solver'), (9, 'unclear: its control solver')],
+)
+def test_nothing_favourable_stands_beside_a_control_that_gains(number, verdict):
   solver = _run('apple_seeker', {0: [20] * number + [0] * (40 - number)})
   lines = _summarize(solver=solver, other=_run('other', {0: [0]}))
   text = result_tables.as_text(lines)
-  assert f'the control, which gains in {100 * share:.0f} %' in text
-  assert _verdicts(lines)['other'].startswith('unclear: its control solver')
-  assert 'no more than' not in text
+  assert f'the control, which gains in {2.5 * number:.0f} %' in text
+  assert _verdicts(lines)['other'].startswith(verdict)
 
 
 def test_a_control_that_gains_in_one_of_forty_episodes_is_a_control():

@@ -19,8 +19,8 @@ _STEPS = 9
 
 def _design(rng: Any) -> dict[str, Any]:
   """Returns a chain of providers; each reads what others have written."""
-  roles = ['memory', 'feedback', 'signal', 'memory']
-  names = [f'r{i}' for i in range(rng.integers(1, 5))]
+  roles = ['memory', 'feedback', 'signal']
+  names = [f'r{i}' for i in range(rng.integers(1, 4))]
   known = ['clock', 'query', 'gate']
   given = []
   for name in names:
@@ -33,7 +33,7 @@ def _design(rng: Any) -> dict[str, Any]:
       one['reads'] = one['reads'][:1]
     if one['kind'] == 'test_adding':
       one['noise'] = float(rng.choice([0.0, 2.0]))
-      one['seen'] = [n for n, role in zip(names, roles, strict=False)
+      one['seen'] = [n for n, role in zip(names, roles)
                      if role != 'memory' and rng.random() < 0.3]  # fmt: skip
       if rng.random() < 0.3:
         one |= {'gate': 'gate', 'reads': sorted({*one['reads'], 'gate'})}
@@ -49,7 +49,7 @@ def _design(rng: Any) -> dict[str, Any]:
               role, range=[-50, int(rng.choice([8, 50]))],
               channel=str(rng.choice(['embedded', 'secure'])),
           )
-          for name, role in zip(names, roles, strict=False)
+          for name, role in zip(names, roles)
       },
   }  # fmt: skip
   schedule = rng.choice(['cfmdp', 'usual'])
