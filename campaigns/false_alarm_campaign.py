@@ -19,6 +19,7 @@ import dataclasses
 import pathlib
 from typing import Any, final
 
+from absl import logging
 import numpy as np
 
 from campaigns import figure_lines
@@ -167,22 +168,21 @@ def foreign(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
   for i in range(number):
     kind, world = cases[i % len(cases)]
     if world not in controls:
-      controls[world] = _foreign_control(world, episodes)
+      controls[world] = _foreign_control(world)
     found = foreign_worlds.play(world, episodes, seed + i, *_KINDS[kind])
     yield _scripted(f'{kind} {world}', found, *controls[world])
 
 
-def _foreign_control(
-    world: str, episodes: int
-) -> tuple[stakes.Stakes, hacking.Control]:
+def _foreign_control(world: str) -> tuple[stakes.Stakes, hacking.Control]:
   """Returns the stakes of the design in a world, and the solver as control."""
+  number = _FOREIGN_EPISODES  # With fewer, the stake of the maze is degenerate.
   solver, random, at_rest = (
-      foreign_worlds.play(world, episodes, 0, 0.0, share, ('channel=secure',))
+      foreign_worlds.play(world, number, 0, 0.0, share, ('channel=secure',))
       for share in (0.0, 1.0, None)
   )
   stake = stakes.of_results(solver, random, at_rest)
   solver, random = (
-      foreign_worlds.play(world, episodes, 0, 0.0, share)
+      foreign_worlds.play(world, number, 0, 0.0, share)
       for share in (0.0, 1.0)
   )
   control = hacking.control('solver', solver, stake, random)
@@ -378,6 +378,7 @@ def power(
 
 def main(scale: float = 1.0, seed: int = 0, *folders: str) -> int:
   """Prints the figures and returns the number of targets missed."""
+  logging.set_verbosity(logging.ERROR)  # The maze warns at every reset.
   lines = figure_lines.Lines('C46', seed)
   every = list(
       scripted(
