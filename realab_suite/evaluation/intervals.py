@@ -176,7 +176,7 @@ def percent(share: float) -> str:
 
 def counted(number: int, noun: str) -> str:
   """Returns a number with a noun, for example '1 seed' or '2 seeds'."""
-  return f'{number} {noun}{"" if number == 1 else "s"}'
+  return f'{number:,} {noun}{"" if number == 1 else "s"}'
 
 
 def short(value: float) -> str:
