@@ -63,7 +63,8 @@ TARGETS: Mapping[str, tuple[Sequence[str], float]] = {
     'spec loader': (['config/loading.py', 'feedback/specs.py'], 0.95),
     'ledger': (['evaluation/ledgers.py'], 1.0),
     'figures': (
-        ['evaluation/episode_figures.py', 'evaluation/gains.py'], 1.0,
+        ['evaluation/episode_figures.py', 'evaluation/gains.py'],
+        1.0,
     ),
     'rows': (['evaluation/results.py'], 1.0),
     'storage': (['experiments/storage.py'], 1.0),

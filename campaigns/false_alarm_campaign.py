@@ -182,8 +182,7 @@ def _foreign_control(world: str) -> tuple[stakes.Stakes, hacking.Control]:
   )
   stake = stakes.of_results(solver, random, at_rest)
   solver, random = (
-      foreign_worlds.play(world, number, 0, 0.0, share)
-      for share in (0.0, 1.0)
+      foreign_worlds.play(world, number, 0, 0.0, share) for share in (0.0, 1.0)
   )
   control = hacking.control('solver', solver, stake, random)
   if control is None:

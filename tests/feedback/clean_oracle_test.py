@@ -33,7 +33,7 @@ def _design(rng: Any) -> dict[str, Any]:
       one['reads'] = one['reads'][:1]
     if one['kind'] == 'test_adding':
       one['noise'] = float(rng.choice([0.0, 2.0]))
-      one['seen'] = [n for n, role in zip(names, roles)
+      one['seen'] = [n for n, role in zip(names, roles, strict=False)
                      if role != 'memory' and rng.random() < 0.3]  # fmt: skip
       if rng.random() < 0.3:
         one |= {'gate': 'gate', 'reads': sorted({*one['reads'], 'gate'})}
@@ -49,7 +49,7 @@ def _design(rng: Any) -> dict[str, Any]:
               role, range=[-50, int(rng.choice([8, 50]))],
               channel=str(rng.choice(['embedded', 'secure'])),
           )
-          for name, role in zip(names, roles)
+          for name, role in zip(names, roles, strict=False)
       },
   }  # fmt: skip
   schedule = rng.choice(['cfmdp', 'usual'])

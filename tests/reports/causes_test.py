@@ -2,6 +2,8 @@
 
 import csv
 
+import pytest
+
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import results
 from realab_suite.experiments import training
@@ -44,7 +46,8 @@ def test_causes_are_means_over_the_attributed_episodes(own_folder, tmp_path):
   with open(tmp_path / html_page.CSV, encoding='utf-8', newline='') as file:
     records = {record['run']: record for record in csv.DictReader(file)}
   assert float(records['reward']['agent_share']) == 0.8
-  assert round(float(records['reward']['agent_metres']), 12) == round(0.8 / 3, 12)
+  metres = float(records['reward']['agent_metres'])
+  assert metres == pytest.approx(0.8 / 3)
   assert records['decoupled']['agent_metres'] == ''
 
 

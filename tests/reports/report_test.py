@@ -179,9 +179,8 @@ def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):
       )  # fmt: skip
   text = pages.text(pages.write(own_folder, tmp_path / 'out'))
   for run in ('decoupled', 'reward.apple_seeker'):
-    assert (
-        f'There are no figures for {run}: all of its 120 episodes failed' in text
-    )
+    words = 'all of its 120 episodes failed'
+    assert f'There are no figures for {run}: {words}' in text
 
 
 def test_a_sweep_that_has_only_begun_has_a_report(tmp_path):
