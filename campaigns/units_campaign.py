@@ -187,7 +187,7 @@ class Recording:
     return [name for name in self.design.registers if name not in kept]
 
   def judged(self, factors: Mapping[str, float], scale: float = 1.0) -> Any:
-    """Returns what is said about the agents, in these units.
+    """Returns the labels and verdicts of the agents in these units.
 
     Args:
       factors: Factor of the units of registers, by name.

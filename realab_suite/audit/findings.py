@@ -322,7 +322,7 @@ def _text(interval: intervals.Interval) -> str:
 
 
 def _advice(found: Audit) -> str:
-  """Returns what to do next."""
+  """Returns advice on the next step."""
   if not found.is_exploitable:
     if not found.registers:
       return 'Nothing can move the registers.'

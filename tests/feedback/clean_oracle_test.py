@@ -69,6 +69,7 @@ class _Simulation:
         for name, spec in mechanism.design.registers.items()
     }
     self.largest_difference = 0.0
+    self.num_steps = 0
     self._update = mechanism.update_providers
     mechanism.update_providers = self._checked
 
@@ -104,6 +105,7 @@ class _Simulation:
       )
       wrong = np.abs(one.applied(physics) - clean[name])
       self.largest_difference = max(self.largest_difference, float(wrong.max()))
+    self.num_steps += 1
     return result
 
 
@@ -121,8 +123,8 @@ def _providers():
     yield
 
 
-def _play(host: str, seed: int) -> float:
-  """Plays an episode in which blocks move, and returns what was inherited."""
+def _play(host: str, seed: int) -> _Simulation:
+  """Plays an episode in which blocks move, and returns its simulation."""
   rng = np.random.default_rng(seed)
   world = tampered.World(host, _design(rng))
   shape = (world.num_envs,) if world.is_batch else ()
@@ -135,15 +137,17 @@ def _play(host: str, seed: int) -> float:
       moves = [(name, float(rng.choice([-12, -4, 4, 12])))]
     world.step(moves, query=float(rng.integers(0, 5)))
   world.close()
-  return simulation.largest_difference
+  return simulation
 
 
 @pytest.mark.parametrize('host', ['embedded', 'batch'])
 @examples.settings(6)
 @hypothesis.given(seed=st.integers(0, 2**32))
 def test_clean_contents_equal_those_of_a_simulation(host, seed):
-  _play(host, seed)
+  # The simulation compares the contents after every step.
+  assert _play(host, seed).num_steps == _STEPS
 
 
 def test_these_episodes_are_tampered_with():
-  assert max(_play('embedded', seed) for seed in range(4)) > 1.0
+  played = [_play('embedded', seed) for seed in range(4)]
+  assert max(one.largest_difference for one in played) > 1.0
