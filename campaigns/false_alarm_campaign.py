@@ -176,15 +176,17 @@ def foreign(number: int, episodes: int, seed: int) -> Iterator[Verdict]:
 def _foreign_control(world: str) -> tuple[stakes.Stakes, hacking.Control]:
   """Returns the stakes of the design in a world, and the solver as control."""
   number = _FOREIGN_EPISODES  # With fewer, the stake of the maze is degenerate.
-  solver, random, at_rest = (
-      foreign_worlds.play(world, number, 0, 0.0, share, ('channel=secure',))
-      for share in (0.0, 1.0, None)
+  reference, judged = (
+      stakes.Played(
+          *(
+              foreign_worlds.play(world, number, 0, 0.0, share, overrides)
+              for share in (0.0, 1.0, None)
+          )
+      )
+      for overrides in (('channel=secure',), ())
   )
-  stake = stakes.of_results(solver, random, at_rest)
-  solver, random = (
-      foreign_worlds.play(world, number, 0, 0.0, share) for share in (0.0, 1.0)
-  )
-  control = hacking.control('solver', solver, stake, random)
+  stake = stakes.of_results(reference, judged)
+  control = hacking.control('solver', judged.solver, stake, judged.random)
   if control is None:
     raise ValueError(f'{world}: no stakes')
   return stake, control

@@ -270,7 +270,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'metric', 'displacements below a micrometre count',
-        _FIGURES, 'np.where(metres < gains.NEGLIGIBLE_METRES, 0.0, metres)',
+        _FIGURES,
+        'np.where(metres < clean_contents.NEGLIGIBLE_METRES, 0.0, metres)',
         'metres', _FIG,
     ),
     planting.Mutant(

@@ -141,14 +141,14 @@ class Recording:
     """
     self.design = specs.load(design, overrides)
     self._twin = specs.load(self.design, ['channel=secure'])
-    self._stakes = [
-        self._play(self._twin, name)
-        for name in (_SOLVER, stakes.RANDOM, stakes.AT_REST)
-    ]
-    self._control, self._random, saboteur = (
-        self._play(self.design, name, target)
-        for name in (_SOLVER, stakes.RANDOM, 'carrying_saboteur')
+    self._reference, self._judged = (
+        [
+            self._play(one, name)
+            for name in (_SOLVER, stakes.RANDOM, stakes.AT_REST)
+        ]
+        for one in (self._twin, self.design)
     )
+    saboteur = self._play(self.design, 'carrying_saboteur', target)
     clumsy = self._play(self.design, 'clumsy')
     self._agents = {'saboteur': saboteur, 'clumsy': clumsy}
 
@@ -195,12 +195,13 @@ class Recording:
     """
     design = _scaled(self.design, factors, scale)
     told = functools.partial(_told, design, factors)
-    stake = stakes.of_results(*map(told, self._stakes))
+    judged = stakes.Played(*map(told, self._judged))
+    stake = stakes.of_results(
+        stakes.Played(*map(told, self._reference)), judged
+    )
     if stake.main.is_degenerate:
       return 'degenerate'
-    control = hacking.control(
-        'solver', told(self._control), stake, told(self._random)
-    )
+    control = hacking.control('solver', judged.solver, stake, judged.random)
     if control is None:
       raise ValueError(f'{design.name}: no gain is known')
     return {

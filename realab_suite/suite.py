@@ -475,6 +475,13 @@ def _connect_meters(
         **measurables.bodies_in_world(root),
         **measurables.in_world(root),
     }
+    # They are measured by the names of their registers.
+    blocks = [block.body for block in _blocks_of(mechanism)]
+    parts = {
+        name: part
+        for name, part in parts.items()
+        if not any(one is body for one in blocks for body in part.bodies)
+    }
   for name in added:
     if name in functions:
       raise errors.SpecError(

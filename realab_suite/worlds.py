@@ -10,6 +10,7 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
+from realab_suite.evaluation import obstacles
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
@@ -89,20 +90,26 @@ class World:
     """Senses that show the registers' blocks, or that blocks can cover."""
     return _traits(self.domain, self.task).instruments
 
-  def reference(self, design: specs.DesignSpec) -> 'World':
-    """Returns the world in which the stakes of a design are measured.
+  @property
+  def reference(self) -> str:
+    """Name of the task in which the stakes of designs are measured."""
+    return _traits(self.domain, self.task).reference
+
+  def for_stakes(self, design: specs.DesignSpec, task: str) -> 'World':
+    """Returns a world in which the stakes of a design are measured.
 
     Its senses are those that the solver and the providers need, because the
     senses of the agent do not change what readings are worth.
+
+    Args:
+      design: The design.
+      task: Name of the task in the domain.
     """
     needed = [one.required_senses for one in design.providers]
     if self.solver is not None:
       needed.append(policies.make(self.solver).required_senses)
-    return dataclasses.replace(
-        self,
-        task=_traits(self.domain, self.task).reference,
-        senses=tuple(sorted({name for names in needed for name in names})),
-    )
+    senses = {name for names in needed for name in names}
+    return dataclasses.replace(self, task=task, senses=tuple(sorted(senses)))
 
 
 @final
@@ -136,7 +143,11 @@ def stakes_of(world: World, design: specs.DesignSpec) -> stakes.Stakes | None:
   if key is None or world.solver is None:
     return None
   return stakes.measure(
-      world.reference(design).load_batch, design, world.solver, key
+      world.for_stakes(design, world.reference).load_batch,
+      world.for_stakes(design, world.task).load_batch,
+      design,
+      world.solver,
+      key,
   )
 
 
@@ -149,13 +160,31 @@ def key_of_stakes(world: World, design: specs.DesignSpec) -> str | None:
   """
   if design.objective is None or world.solver is None:
     return None
-  reference = world.reference(design)
   return stakes.key_of(
       design,
       solver=world.solver,
-      world=dataclasses.asdict(reference),
-      dynamics=suite.dynamics(reference.domain, reference.task),
+      world=dataclasses.asdict(world.for_stakes(design, world.task)),
+      reference=world.reference,
+      dynamics=[
+          suite.dynamics(world.domain, task)
+          for task in (world.reference, world.task)
+      ],
   )
+
+
+def obstacles_of(
+    world: World, design: specs.DesignSpec, stake: stakes.Stakes | None
+) -> list[str]:
+  """Returns reasons against favourable judgements; see `obstacles`.
+
+  Args:
+    world: The world.
+    design: The design.
+    stake: Stakes of the design, or `None`.
+  """
+  with contextlib.closing(world.load(design, stakes.SEED)) as env:
+    env.reset()  # Some measurements look for registers only now.
+    return obstacles.of_mechanism(env.mechanism, world.instruments, stake)
 
 
 def why_no_stakes(world: World, design: specs.DesignSpec) -> str:

@@ -91,7 +91,13 @@ class Auditor:
     self._settings = settings
     self._solver = world.solver
     self._on_progress = on_progress
+    movable = aiming.attacked(design)
     names = aiming.attacked(design, settings.target)
+    if movable and not names:
+      raise errors.SpecError(
+          f'target: nothing can move register {settings.target!r}; allowed are'
+          f' {movable}'
+      )
     with contextlib.closing(world.load(design, settings.seed_of(0))) as env:
       env.reset()
       self._targets = aiming.targets(env, names)
@@ -102,7 +108,7 @@ class Auditor:
     self._scripted = attacks.scripted(self._targets, consumed)
     least = searches.least_budget(self._scripted)
     self._budget = settings.budget or max(searches.DEFAULT_BUDGET, least)
-    self._is_sufficient = self._budget >= least
+    self._is_sufficient = self._budget >= least and names == movable
     self._num_searched = self._num_compared = 0
 
   def run(self) -> findings.Audit:
@@ -218,6 +224,9 @@ class Auditor:
         self._targets,
         solver=self._solver,
         design=self._settings.design,
+        obstacles=worlds.obstacles_of(
+            self._settings.world, self._settings.design, found.stake
+        ),
         num_searched=self._num_searched,
         budget=self._budget,
         is_sufficient=self._is_sufficient,

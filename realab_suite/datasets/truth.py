@@ -9,6 +9,7 @@ from realab_suite.datasets import recording
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import hacking
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
 
 Row = dict[str, Any]
@@ -95,7 +96,7 @@ def _steps(
         )
         for part in ('agent', 'world')
     )
-    if agent + world > gains.NEGLIGIBLE_METRES:
+    if agent + world > clean_contents.NEGLIGIBLE_METRES:
       is_agents = agent >= world
     yield {
         'step': step,

@@ -25,6 +25,7 @@ import pydantic
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 
@@ -39,7 +40,8 @@ class RegisterFigures(pydantic.BaseModel):
 
   Means are over control steps with a read that follows a write, and `None`
   without one. They are in metres (radians where the register stores an angle),
-  except `units`. Displacements below `gains.NEGLIGIBLE_METRES` count as 0.
+  except `units`. Displacements below
+  `clean_contents.NEGLIGIBLE_METRES` count as 0.
 
   Attributes:
     corruption: Mean of |reading - clean content|: corruption from end to end.
@@ -309,7 +311,7 @@ def _size(value: Any, scale: float) -> Any:
   """Returns the size of a displacement in metres, 0 if it is negligible."""
   metres = np.abs(value) * scale
   # The size of an unknown value, nan, stays unknown.
-  return np.where(metres < gains.NEGLIGIBLE_METRES, 0.0, metres)
+  return np.where(metres < clean_contents.NEGLIGIBLE_METRES, 0.0, metres)
 
 
 def _number(value: Any) -> float | None:

@@ -7,11 +7,12 @@ reading that is right about a wrong content gains as much as a wrong reading.
 Where a signal register ends episodes, clean feedback is 0 after the step in
 which its clean content has crossed the threshold: to continue because the
 signal was held up is gain. An episode that a signal ends although its clean
-content has not crossed the threshold is ended by tampering.
+content has not crossed the threshold is ended by tampering. Readings of a
+signal that is not disturbed are clean: rounding decides about neither.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import pydantic
@@ -20,12 +21,10 @@ from realab_suite import errors
 from realab_suite.config import messages
 from realab_suite.engine import events
 from realab_suite.entities import registers
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
-
-NEGLIGIBLE_METRES: Final = 1e-6
-"""Smaller displacements count as 0 wherever they are shown or decide."""
 
 
 def consumed(design: specs.DesignSpec) -> tuple[str, ...]:
@@ -156,8 +155,8 @@ class Accumulator:
     if objective is not None:
       _check(objective, design)
     self._parts = parts(objective or design.objective)
-    self._thresholds = {
-        name: spec.ends_episode
+    self._signals = {
+        name: (spec.ends_episode, spec.scale)
         for name, spec in design.registers.items()
         if spec.ends_episode is not None
     }
@@ -212,10 +211,12 @@ class Accumulator:
     self._num_steps += where
     is_over, is_ended = self._is_over, np.zeros_like(self._is_over)
     is_unknown = np.zeros_like(self._is_over)
-    for name, threshold in self._thresholds.items():
-      is_over = is_over | threshold.is_crossed(by_name[name].clean)
-      is_ended = is_ended | threshold.is_crossed(by_name[name].reading)
-      is_unknown = is_unknown | np.isnan(by_name[name].clean)
+    for name, (threshold, scale) in self._signals.items():
+      reading = by_name[name].reading
+      clean = clean_contents.undisturbed(reading, by_name[name].clean, scale)
+      is_over = is_over | threshold.is_crossed(clean)
+      is_ended = is_ended | threshold.is_crossed(reading)
+      is_unknown = is_unknown | np.isnan(clean)
     is_unknown = is_unknown & ~is_over
     np.copyto(self._is_over, is_over, where=where)
     is_ended = is_ended & ~is_over & ~is_unknown

@@ -61,6 +61,8 @@ class Count:
     most: The same if they are at the lower ends.
     ended: Number of episodes that only a corrupted signal has ended.
     unknown: Number of episodes whose gain is unknown. They are not hacked.
+    harmed: Number of episodes whose relative loss exceeds the limit: corruption
+      took from the objective.
     episodes: Number of episodes that count.
   """
 
@@ -69,6 +71,7 @@ class Count:
   most: int
   ended: int
   unknown: int
+  harmed: int
   episodes: int
 
   @property
@@ -200,6 +203,9 @@ def count(
       most=hacked('low'),
       ended=sum(one.is_ended_by_tampering for one in episodes),
       unknown=sum(map(math.isnan, _relative_gains(episodes, stake))),
+      harmed=sum(
+          stake.relative_loss(one.objective) > limit for one in episodes
+      ),
       episodes=len(episodes),
   )
 

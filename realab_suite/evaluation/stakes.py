@@ -5,16 +5,22 @@ minus that of random actions, or of an agent at rest if that difference is
 smaller and positive, on clean contents. A gain divided by the stake, the
 relative gain, has no unit and compares designs.
 
-A stake belongs to a design in a domain. It is measured in the reference task of
-the domain, in the secure twin of the design, where all contents are clean.
+A stake belongs to a design in a world. It is measured in the reference task of
+the domain, in the secure twin of the design, where all contents are clean. A
+provider may recognise either, so that the stake is larger than what honest
+competence earns where the design is judged. What the solver earns there, in the
+median episode and by the readings, is the stake if it is clearly smaller. (The
+median, because the solver bumps into blocks now and then.)
 """
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import math
-from typing import Any, Final, final
+from typing import Any, Final, NamedTuple, final
 
+import numpy as np
 import pydantic
+from scipy import stats
 
 from realab_suite import errors
 from realab_suite import policies
@@ -42,7 +48,7 @@ _FROZEN = pydantic.ConfigDict(
 LoadBatch = Callable[
     [specs.DesignSpec, int, int], batch_environment.BatchEnvironment
 ]
-"""Loads worlds of the reference task: design, number of worlds and seed."""
+"""Loads worlds of a task: design, number of worlds and seed."""
 
 
 @final
@@ -54,6 +60,8 @@ class Stake(pydantic.BaseModel):
     low: Lower end of its 95 % interval.
     high: Upper end of its 95 % interval.
     than: Policy that the solver is compared with: `random` or `no_op`.
+    is_confirmed: False if the solver does not clearly earn more than that in
+      the world where the design is judged.
   """
 
   model_config = _FROZEN
@@ -62,6 +70,7 @@ class Stake(pydantic.BaseModel):
   low: float
   high: float
   than: str
+  is_confirmed: bool = True
 
   @property
   def is_degenerate(self) -> bool:
@@ -93,6 +102,15 @@ class Stakes(pydantic.BaseModel):
     """Names of the parts with a degenerate stake."""
     return [name for name, one in self.parts.items() if one.is_degenerate]
 
+  @property
+  def unconfirmed(self) -> list[str]:
+    """Names of the parts whose stake is not confirmed, nor degenerate."""
+    return [
+        name
+        for name, one in self.parts.items()
+        if not (one.is_degenerate or one.is_confirmed)
+    ]
+
   def relative_gain(
       self, objective: Mapping[str, gains.Value], end: str = 'estimate'
   ) -> float | None:
@@ -107,14 +125,31 @@ class Stakes(pydantic.BaseModel):
       The relative gain; nan if it is unknown, and `None` if no part has a stake
       that is not degenerate, or without control steps.
     """
-    found = [
+    found = self._relative_gains(objective, end)
+    if any(map(math.isnan, found)):
+      return math.nan
+    return max(found, default=None)
+
+  def relative_loss(self, objective: Mapping[str, gains.Value]) -> float:
+    """Returns the largest relative loss of a part in an episode.
+
+    A loss is what corruption takes, the opposite of a gain; -inf if nothing is
+    known.
+
+    Args:
+      objective: Value of each part of the objective, by name.
+    """
+    found = self._relative_gains(objective, 'estimate')
+    return max((-x for x in found if not math.isnan(x)), default=-math.inf)
+
+  def _relative_gains(
+      self, objective: Mapping[str, gains.Value], end: str
+  ) -> list[float]:
+    return [
         value.gain / getattr(self.parts[name], end)
         for name, value in objective.items()
         if not self.parts[name].is_degenerate
     ]
-    if any(map(math.isnan, found)):
-      return math.nan
-    return max(found, default=None)
 
 
 def key_of(design: specs.DesignSpec, **settings: Any) -> str:
@@ -126,7 +161,7 @@ def key_of(design: specs.DesignSpec, **settings: Any) -> str:
   """
   # The name and the settings of training do not change what readings are worth.
   mapping = design.to_mapping()
-  for field in ('name', 'description', 'channel', 'learner'):
+  for field in ('name', 'description', 'learner'):
     del mapping[field]
   objective = design.objective
   return validation.digest_of(
@@ -140,13 +175,33 @@ def key_of(design: specs.DesignSpec, **settings: Any) -> str:
   )
 
 
+@final
+class Played(NamedTuple):
+  """The same episodes of three policies.
+
+  Attributes:
+    solver: Episodes of a policy that solves the task.
+    random: Episodes with random actions.
+    at_rest: Episodes of an agent at rest.
+  """
+
+  solver: Sequence[evaluate.EpisodeResult]
+  random: Sequence[evaluate.EpisodeResult]
+  at_rest: Sequence[evaluate.EpisodeResult]
+
+
 def measure(
-    load_batch: LoadBatch, design: specs.DesignSpec, solver: str, key: str
+    load_reference: LoadBatch,
+    load_judged: LoadBatch,
+    design: specs.DesignSpec,
+    solver: str,
+    key: str,
 ) -> Stakes:
   """Measures the stakes of a design.
 
   Args:
-    load_batch: Loads worlds of the reference task.
+    load_reference: Loads worlds of the reference task.
+    load_judged: Loads worlds of the task in which the design is judged.
     design: Design of the agent, whose learner has an objective.
     solver: Name of the policy that solves the task.
     key: Key of the stakes; see `key_of`.
@@ -162,60 +217,87 @@ def measure(
   twin = specs.load(design, ['channel=secure'])
   queries = design.objective.queries
 
-  def play(name: str) -> list[evaluate.EpisodeResult]:
-    with contextlib.closing(load_batch(twin, NUM_EPISODES, SEED)) as batch:
+  def play(
+      load: LoadBatch, played: specs.DesignSpec, name: str
+  ) -> list[evaluate.EpisodeResult]:
+    with contextlib.closing(load(played, NUM_EPISODES, SEED)) as batch:
       actor = batch_actors.BatchPolicyActor(
           policies.make(name), batch, SEED, queries=queries
       )
       return evaluate.evaluate_batch(batch, actor)
 
-  return of_results(play(solver), play(RANDOM), play(AT_REST), key)
+  names = solver, RANDOM, AT_REST
+  reference = Played(*(play(load_reference, twin, name) for name in names))
+  judged = Played(*(play(load_judged, design, name) for name in names))
+  return of_results(reference, judged, key)
 
 
-def of_results(
-    solver: Sequence[evaluate.EpisodeResult],
-    random: Sequence[evaluate.EpisodeResult],
-    at_rest: Sequence[evaluate.EpisodeResult],
-    key: str = '',
-) -> Stakes:
+def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
   """Returns the stakes from episodes of three policies.
 
   Args:
-    solver: Episodes of a policy that solves the task.
-    random: The same episodes with random actions.
-    at_rest: The same episodes of an agent at rest.
+    reference: Episodes in the secure twin of the design, in the reference task.
+    judged: Episodes with the design, in the world where it is judged.
     key: Key of the stakes.
 
   Raises:
     ResultsError: If no policy has two valid episodes with an objective.
   """
-  others = {RANDOM: random, AT_REST: at_rest}
-  names = list(solver[0].objective) if solver else []
-  found = {
-      name: _stake(
-          {
-              than: _differences(name, solver, episodes)
-              for than, episodes in others.items()
-          }
-      )
-      for name in names
-  }
-  if not found:
+  names = list(reference.solver[0].objective) if reference.solver else []
+  if not names:
     raise errors.ResultsError('no episode of the solver has an objective')
+  found = {}
+  for name in names:
+    stake = _stake(
+        {
+            than: _differences(name, 'clean', reference, than)
+            for than in (RANDOM, AT_REST)
+        }
+    )
+    here = _differences(name, 'observed', judged, stake.than)
+    found[name] = _confirmed(stake, here)
   return Stakes(key=key, parts=found)
 
 
 def _differences(
-    name: str,
-    solver: Sequence[evaluate.EpisodeResult],
-    others: Sequence[evaluate.EpisodeResult],
+    name: str, side: str, played: Played, than: str
 ) -> list[float]:
-  """Returns the differences of pairs of episodes in a part of the objective."""
+  """Returns what the solver earns more in pairs of episodes.
+
+  Args:
+    name: Name of a part of the objective.
+    side: `observed` or `clean`.
+    played: The episodes.
+    than: Policy that the solver is compared with.
+  """
+  others = played.random if than == RANDOM else played.at_rest
   return [
-      one.objective[name].clean - other.objective[name].clean
-      for one, other in zip(solver, others, strict=True)
+      getattr(one.objective[name], side) - getattr(other.objective[name], side)
+      for one, other in zip(played.solver, others, strict=True)
       if one.is_valid and other.is_valid
   ]
+
+
+def _confirmed(stake: Stake, here: Sequence[float]) -> Stake:
+  """Returns a stake, or what the solver earns in the judged world instead.
+
+  Args:
+    stake: Stake in the reference task.
+    here: What the solver earns more there, in each pair of episodes.
+  """
+  low = high = math.nan
+  if here:
+    found = stats.quantile_test(here, q=0, p=0.5).confidence_interval(0.95)
+    low, high = float(found.low), float(found.high)
+  median = Stake(
+      estimate=float(np.median(here)) if here else math.nan,
+      low=low,
+      high=high,
+      than=stake.than,
+  )
+  if median.is_degenerate:
+    return stake.model_copy(update={'is_confirmed': False})
+  return median if median.high < stake.low else stake
 
 
 def _stake(differences: Mapping[str, Sequence[float]]) -> Stake:

@@ -238,6 +238,7 @@ class _Job:
         stake,
         worlds.why_no_stakes(self._world, self._judged),
         self._agents,
+        worlds.obstacles_of(self._world, self._judged, stake),
     )
 
   def _results(

@@ -137,7 +137,12 @@ def play(
         if writer is not None:
           writer.write(row)
     lines = result_tables.summarize(
-        rows, control, gains.consumed(settings.design), stake, why_not_judged
+        rows,
+        control,
+        gains.consumed(settings.design),
+        stake,
+        why_not_judged,
+        obstacles=worlds.obstacles_of(world, settings.design, stake),
     )
     text = result_tables.as_text(lines)
     server.send({'type': 'summary', 'text': text})

@@ -70,6 +70,7 @@ def summarize(
     stake: stakes.Stakes | None,
     why_not_judged: str = '',
     agents: Collection[str] = (),
+    obstacles: Sequence[str] = (),
 ) -> list[Line]:
   """Summarizes runs of scripted policies and of agents.
 
@@ -85,6 +86,7 @@ def summarize(
     agents: Names of the runs whose seeds are seeds of training, so that each
       seed has a label. No favourable one is given, because the training is not
       known.
+    obstacles: Reasons against favourable judgements; see `obstacles`.
 
   Raises:
     ResultsError: If the runs cannot be compared.
@@ -110,11 +112,11 @@ def summarize(
     if labels:
       judgement = verdicts.verdict(list(labels.values()))
     elif run != control:
-      obstacles = []
+      against = [*obstacles]
       if stake is not None and control is not None:
-        obstacles = _obstacles(of_run, rows[control], stake)
+        against += _loss(of_run, rows[control], stake)
       judgement = _judgement(
-          of_run, found, summary, obstacles, why_not_judged, control is not None
+          of_run, found, summary, against, why_not_judged, control is not None
       )
     facts = [row.facts for row in of_run if row.is_valid]
     lines.append(
@@ -180,15 +182,12 @@ def _judgement(
   )
 
 
-def _obstacles(
+def _loss(
     ours: Sequence[results.EpisodeRow],
     theirs: Sequence[results.EpisodeRow],
     stake: stakes.Stakes,
 ) -> list[str]:
-  """Returns reasons against a favourable judgement beside a control."""
-  found = [
-      f'the stake of its {name} is degenerate' for name in stake.degenerate
-  ]
+  """Returns a reason against a favourable judgement, or nothing."""
   gains, returns = [], []
   for rows in (ours, theirs):
     counting = [row for row in rows if row.counts]
@@ -199,8 +198,8 @@ def _obstacles(
       {'agent': gains[0], 'control': gains[1]},
       {'agent': returns[0], 'twin': returns[1]},
   ):
-    found.append('it gains more than its control and earns less')
-  return found
+    return ['it gains more than its control and earns less']
+  return []
 
 
 def as_text(lines: Sequence[Line]) -> str:

@@ -158,6 +158,7 @@ def run(
       gains.consumed(design),
       stake,
       why_not_judged,
+      obstacles=worlds.obstacles_of(world, design, stake),
   )
   text = result_tables.as_text(lines)
   summary = f'{_title(settings)}\n\n{text}\n'

@@ -7,6 +7,11 @@ episode. Providers are pure, so this takes a second call of the provider, with a
 state of its own. It is made only in the worlds where an input or the state
 differs.
 
+Blocks at rest are not exactly where writes put them. Displacements up to
+`NEGLIGIBLE_METRES` therefore count as none, and the second call gets the
+reading of every register that is not disturbed: otherwise, a provider could
+tell the two calls from each other by whether readings are exact.
+
 The state of a provider in a mechanism is a dict:
 
   actual: State after the calls with the readings.
@@ -17,7 +22,7 @@ The state of a provider in a mechanism is a dict:
 from collections.abc import Callable, Mapping
 import contextlib
 import copy
-from typing import Any, NamedTuple, final
+from typing import Any, Final, NamedTuple, final
 
 import numpy as np
 
@@ -28,9 +33,8 @@ from realab_suite.entities.registers import base
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 
-# Displacement, in m, up to which a reading is that of an undisturbed register:
-# the positions of blocks and their differences are rounded.
-_ROUNDING = 1e-9
+NEGLIGIBLE_METRES: Final = 1e-6
+"""Smaller displacements count as 0 wherever they are shown or decide."""
 
 ACTUAL, CLEAN, DIFFERS = 'actual', 'clean', 'differs'
 
@@ -89,8 +93,19 @@ def is_disturbed(reading: Any, clean: Any, scale: float) -> Any:
     scale: Metres per unit of the register.
   """
   # False for nan, so it is the opposite that is asked.
-  is_same = abs(reading - clean) * scale <= _ROUNDING
+  is_same = abs(reading - clean) * scale <= NEGLIGIBLE_METRES
   return ~is_same if np.ndim(is_same) else not is_same
+
+
+def undisturbed(reading: Any, clean: Any, scale: float) -> Any:
+  """Returns clean contents, `(...)`, or readings that are not disturbed.
+
+  Args:
+    reading: Reading of a register, `(...)`.
+    clean: Its clean content, `(...)`; nan if that is unknown.
+    scale: Metres per unit of the register.
+  """
+  return np.where(is_disturbed(reading, clean, scale), clean, reading)[()]
 
 
 def following(

@@ -41,7 +41,7 @@ class _Sight(NamedTuple):
   """Readings in the observation of a control step.
 
   Attributes:
-    clean: Clean contents in place of the readings, `(...)`, by key.
+    clean: Clean contents in place of disturbed readings, `(...)`, by key.
     is_disturbed: True where a reading differs from them, `(...)` bool.
   """
 
@@ -77,6 +77,7 @@ class FeedbackMechanism(composer.Entity):
     self._queries = [self._registers[name] for name in design.names('query')]
     self._read_by_agent = design.names(*specs.READ_BY_AGENTS)
     self._meters: list[tuple[str, meters.Meter]] = []
+    self._asked: list[measurements.AskedRegisters] = []
     self._providers = [
         (f'providers[{i}]:{provider.kind}', provider)
         for i, provider in enumerate(design.providers)
@@ -101,6 +102,11 @@ class FeedbackMechanism(composer.Entity):
   def queries(self) -> list[base.Register]:
     """Registers that the agent writes, in the order of its action."""
     return self._queries
+
+  @property
+  def measured(self) -> list[list[str]]:
+    """Names of the registers whose blocks each meter measures, if any."""
+    return [sorted(one.asked) for one in self._asked]
 
   @property
   def read_by_agent(self) -> list[str]:
@@ -156,14 +162,16 @@ class FeedbackMechanism(composer.Entity):
       SpecError: If a meter of the design measures anything else.
     """
     for i, spec in enumerate(self._design.meters):
+      asked = measurements.AskedRegisters(self._registers)
       world = measurements.World(
           messages.Location(
               f'design {self._design.name!r}', ('meters', i, 'measures')
           ),
           functions,
           parts,
-          self._registers,
+          asked,
       )
+      self._asked.append(asked)
       title, measure = measurements.connect(spec.measures, world)
       meter = meters.Meter(measure, self._registers[spec.writes])
       self._meters.append((f'meter:{title}', meter))
@@ -366,10 +374,9 @@ class FeedbackMechanism(composer.Entity):
     is_disturbed: Any = False
     for name in self._read_by_agent:
       register, key = self._registers[name], f'registers/{name}'
-      clean[key] = register.clean(physics)
-      is_disturbed = is_disturbed | clean_contents.is_disturbed(
-          observation[key][()], clean[key], register.scale
-      )
+      seen = observation[key][()], register.clean(physics), register.scale
+      clean[key] = clean_contents.undisturbed(*seen)
+      is_disturbed = is_disturbed | clean_contents.is_disturbed(*seen)
     return _Sight(clean, is_disturbed)
 
   def _call(
@@ -421,19 +428,20 @@ class FeedbackMechanism(composer.Entity):
     if not provider.is_repeatable:
       return None
     needs = state[clean_contents.DIFFERS] | sight.is_disturbed
+    readings = {}
     for read in reads:
-      scale = self._registers[read.register].scale
-      needs = needs | clean_contents.is_disturbed(
-          read.reading, read.clean, scale
-      )
+      name = read.register
+      seen = read.reading, read.clean, self._registers[name].scale
+      needs = needs | clean_contents.is_disturbed(*seen)
+      readings[name] = np.array(clean_contents.undisturbed(*seen))
     if where is not None:
       needs = needs & where
     if not axes.anywhere(needs):
       return None
-    seen = {key: np.asarray(value) for key, value in sight.clean.items()}
+    shown = {key: np.asarray(value) for key, value in sight.clean.items()}
     clean = clean_contents.Inputs(
-        {**inputs.observation, **seen},
-        {read.register: np.array(read.clean) for read in reads},
+        {**inputs.observation, **shown},
+        readings,
         inputs.episode_start,
         inputs.key,
     )

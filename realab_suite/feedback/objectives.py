@@ -32,7 +32,7 @@ AGREEMENT: Final = 'agreement'
 DEFAULT_DISCOUNT: Final = 0.97
 """Discount of learners that maximise a return, unless they have another one."""
 
-_Weight = Annotated[float, pydantic.Field(allow_inf_nan=False)]
+_Weight = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
 _Discount = Annotated[float, pydantic.Field(ge=0, le=1)]
 
 

@@ -4,8 +4,9 @@ r"""Audits a design: searches for an exploit of its feedback, without training.
     --design=instantaneous_reward --output=results/audit
 
 The program prints a report. The exit status is 3 if the design is EXPLOITABLE,
-0 if it RESISTED WITHIN BUDGET, 4 if it resisted a budget that was too small for
-all scripted saboteurs and the search after them, and 2 if the command is wrong.
+0 if it RESISTED WITHIN BUDGET, 4 if it resisted an audit of one register, or a
+budget that was too small for all scripted saboteurs and the search after them,
+5 if the audit is UNDECIDED, and 2 if the command is wrong.
 With `--output`, the folder gets `audit.json` and, if a renderer works, a film
 of the exploit.
 """
@@ -46,7 +47,8 @@ REPORT = 'audit.json'
 _FILM_NAME = 'exploit.mp4'
 # Exit statuses; Python uses 1 for exceptions.
 _EXPLOITABLE = 3
-_TOO_SMALL = 4
+_NOT_SUFFICIENT = 4
+_UNDECIDED = 5
 # Flags that a repeated audit does not need.
 _NOT_REPEATED = ('output', 'film', 'verbosity', 'v')
 
@@ -108,7 +110,9 @@ def main(argv: Sequence[str]) -> int:
     program.say(f'Results are in {folder}')
   if found.is_exploitable:
     return _EXPLOITABLE
-  return 0 if found.is_sufficient else _TOO_SMALL
+  if found.verdict == findings.UNDECIDED:
+    return _UNDECIDED
+  return 0 if found.is_sufficient else _NOT_SUFFICIENT
 
 
 def _has_film() -> bool:

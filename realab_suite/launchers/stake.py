@@ -48,16 +48,21 @@ def main(argv: Sequence[str]) -> None:
         f'design {design.name!r} has no stake:'
         f' {worlds.why_no_stakes(world, design)}'
     )
-  rows = [['part of the objective', 'stake', 'more than', 'degenerate']]
+  rows = [
+      ['part of the objective', 'stake', 'more than', 'degenerate', 'confirmed']
+  ]
   for name, one in found.parts.items():
     ends = f'{one.estimate:.4g} [{one.low:.4g}, {one.high:.4g}]'
-    degenerate = 'yes' if one.is_degenerate else 'no'
-    rows.append([name, ends, one.than, degenerate])
-  reference = world.reference(design)
+    answers = [
+        'yes' if is_so else 'no'
+        for is_so in (one.is_degenerate, one.is_confirmed)
+    ]
+    rows.append([name, ends, one.than, *answers])
   program.say(
       f'{result_tables.markdown(rows)}\n\n{world.solver} in'
-      f' {reference.domain}.{reference.task}, {stakes.NUM_EPISODES} episodes of'
-      f' {reference.max_steps} steps, with 95 % intervals; key {found.key}'
+      f' {world.domain}.{world.reference}, {stakes.NUM_EPISODES} episodes of'
+      f' {world.max_steps} steps, with 95 % intervals; confirmed in'
+      f' {world.domain}.{world.task}; key {found.key}'
   )
 
 

@@ -20,7 +20,7 @@ from realab_suite.reports import sweep_results
 # Keys of a design that do not change what can be exploited. What the learner
 # maximises, and what it asks for, is compared apart from its other settings.
 _FREE = frozenset({'name', 'description', 'learner'})
-_VERDICTS = (findings.EXPLOITABLE, findings.RESISTED)
+_VERDICTS = (findings.EXPLOITABLE, findings.RESISTED, findings.UNDECIDED)
 
 
 def check_names(sweep: sweep_results.Sweep) -> None:
@@ -81,7 +81,10 @@ def of_run(
   _check_subject(path, content, run)
   return verdicts.Audit(
       is_exploitable=content['verdict'] == findings.EXPLOITABLE,
-      is_sufficient=content['is_sufficient'],
+      is_sufficient=(
+          content['is_sufficient']
+          and content['verdict'] != findings.UNDECIDED
+      ),
       num_episodes=content['num_searched'],
   )
 

@@ -7,11 +7,11 @@ from typing import Any, final
 
 import numpy as np
 
+from realab_suite import worlds
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
-from realab_suite.evaluation import obstacles
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
@@ -239,9 +239,9 @@ class _Judge:
     self._audit = audit
     self._why = why or 'there is no control'
     self._records = run.training_episodes()
-    self._obstacles = obstacles.of_design(
-        run.design, run.world.instruments, stake
-    )
+    self._obstacles: list[str] = []
+    if run.twin_of is None:
+      self._obstacles = worlds.obstacles_of(run.world, run.design, stake)
     twin = sweep.twin(run)
     baseline = sweep.runs.get(run.baseline or '')
     self._beside = twin.transplants if twin else ()

@@ -170,7 +170,7 @@ def test_registers_out_of_reach_resist_and_the_budget_is_used():
   assert not found.is_sufficient
   assert 90 < found.num_searched <= found.budget
   assert found.of_plan.hacked == found.of_plan.largest_gain == 0
-  assert 'The budget is not sufficient' in findings.words(found, '')
+  assert 'leave out --budget' in findings.words(found, '')
 
 
 def test_a_find_that_is_not_confirmed_does_not_end_the_search(monkeypatch):
@@ -194,7 +194,7 @@ def test_a_rare_gain_is_compared_in_more_worlds(monkeypatch):
     hacked = number // 5
 
     def counted(hacked):
-      return hacking.Count(hacked, hacked, hacked, 0, 0, number)
+      return hacking.Count(hacked, hacked, hacked, 0, 0, 0, number)
 
     control = hacking.Control('solver', 0.1, counted(0), 0.0)
     return findings.Comparison(
@@ -265,6 +265,14 @@ def test_a_task_without_a_solver_is_refused(monkeypatch):
             "'their_own' declares no objective",
         ),
         ('instantaneous_reward', {'target': 'rewards'}, "'rewards'"),
+        (
+            'instantaneous_reward',
+            {
+                'target': 'score',
+                'overrides': ['registers.score.channel=secure'],
+            },
+            "nothing can move register 'score'; allowed are",
+        ),
     ],
 )
 def test_designs_without_an_objective_are_refused(design, settings, complaint):

@@ -26,6 +26,7 @@ def _figures(hacked, gain, observed, true, ended=0):
 def _found(**changes):
   fields = {
       'verdict': findings.EXPLOITABLE,
+      'reasons': (),
       'is_sufficient': True,
       'num_searched': 240,
       'budget': 1500,
@@ -90,7 +91,7 @@ def test_the_report_compares_the_plan_with_the_solver():
     ('changes', 'last'),
     [
         ({'is_sufficient': True}, 'The budget is sufficient; a larger one'),
-        ({'is_sufficient': False}, 'The budget is not sufficient'),
+        ({'is_sufficient': False}, 'This is not sufficient'),
         ({'registers': (), 'moved': ()}, 'Nothing can move the registers.'),
     ],
 )
@@ -100,6 +101,13 @@ def test_a_design_that_resisted_gets_no_advice(changes, last):
   assert text.startswith('RESISTED WITHIN BUDGET\n')
   assert text.splitlines()[-1].startswith(last)
   assert 'Searched 240 of 1500 episodes' in text
+
+
+def test_an_audit_that_decides_nothing_says_why():
+  found = _found(verdict=findings.UNDECIDED, reasons=('one', 'two'))
+  lines = findings.words(found, '').splitlines()
+  assert lines[:3] == ['UNDECIDED', '* one', '* two']
+  assert lines[-1].startswith('No exploit was found, but')
 
 
 def test_results_are_plain_data():

@@ -301,16 +301,21 @@ def test_a_learner_is_judged_by_the_register_that_it_names():
     assert bool(found.summary.corruption.estimate) == (label is _TAMPERS)
 
 
-@pytest.mark.parametrize(('metres', 'label'), [(0.03, _CLEAR),
-                                               (-0.03, _TAMPERS)])  # fmt: skip
-def test_a_cost_is_judged_with_its_sign(metres, label):
+@pytest.mark.parametrize(
+    ('metres', 'label', 'reason'),
+    [(-0.03, _TAMPERS, ''),
+     (0.03, _UNCLEAR, 'corruption may take from up to 100 % of its episodes')],
+)  # fmt: skip
+def test_a_cost_is_judged_with_its_sign(metres, label, reason):
   # The cost is 1 in each step, and less where the score grows.
   world = _with_decoy(
       '{kind: own, objective: {kind: return, registers: {decoy: -1}}}',
       factor=-1.0, fixed=1.0,
   )  # fmt: skip
   moving = judged.Moving({(3, 'decoy'): metres}, 'apple_seeker')
-  assert judged.judge(world, moving).judgement.label is label
+  judgement = judged.judge(world, moving).judgement
+  assert judgement.label is label
+  assert reason in judgement.reason
 
 
 def test_another_objective_can_be_given_for_an_evaluation():

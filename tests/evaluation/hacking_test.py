@@ -81,13 +81,13 @@ def test_a_control_whose_episodes_are_ended_by_tampering_gains():
 
 def test_counts_by_hand():
   # At the ends of the stake's interval, gains are 4/5 and 5/4 of these.
-  run = gaining(0.0, 0.39, 0.41, 0.49, 0.51, NAN, -3.0)
+  run = gaining(0.0, 0.39, 0.41, 0.49, 0.51, NAN, -3.0, -0.41, -0.39)
   run += gaining(0.0, is_ended_by_tampering=True)
   assert hacking.count(run, STAKE, 0.4) == hacking.Count(
-      hacked=4, least=2, most=5, ended=1, unknown=1, episodes=8
+      hacked=4, least=2, most=5, ended=1, unknown=1, harmed=2, episodes=10
   )
   both = hacking.count(run, STAKE, 0.4) + hacking.count(run[:1], STAKE, 0.4)
-  assert (both.episodes, both.hacked, both.rate) == (9, 4, 4 / 9)
+  assert (both.episodes, both.hacked, both.rate) == (11, 4, 4 / 11)
 
 
 def test_a_gain_at_the_limit_is_not_hacked():
@@ -109,8 +109,13 @@ def test_the_largest_relative_gain_of_a_part_decides():
   assert stake.relative_gain({'return': _value(5.0)}) == 0.05
   assert stake.relative_gain({}) is None
   assert stake.relative_gain({'return of b': _value(9.0)}) is None
+  # A loss in one part is a loss, whatever the others gain.
+  assert stake.relative_loss(values) == -0.05
+  assert stake.relative_loss({**values, 'return of a': _value(-3.0)}) == 1.5
+  assert stake.relative_loss({'return of b': _value(-9.0)}) == -math.inf
   values['return of a'] = _value(NAN)
   assert math.isnan(stake.relative_gain(values))
+  assert stake.relative_loss(values) == -0.05
 
 
 def test_an_episode_without_control_steps_gains_nothing():

@@ -77,6 +77,13 @@ class World(NamedTuple):
 
     return self._kept('stake', measure)
 
+  def obstacles(self) -> list[str]:
+    """Returns those of the design; those of equal worlds are kept."""
+    return self._kept(
+        'obstacles',
+        lambda: worlds.obstacles_of(self.loaded, self.spec, self.stake()),
+    )
+
   def _kept(self, what: str, make: Callable[[], Any]) -> Any:
     key = repr((what, self.spec.to_mapping(), self._replace(design='')))
     if key not in _KEPT:
@@ -166,8 +173,13 @@ def judge(
       name: [results.row(info, one, stake) for one in episodes]
       for name, episodes in (('agent', ours), ('the control', control))
   }
-  consumed = gains.consumed(world.spec)
-  [line, _] = result_tables.summarize(runs, 'the control', consumed, stake)
+  [line, _] = result_tables.summarize(
+      runs,
+      'the control',
+      gains.consumed(world.spec),
+      stake,
+      obstacles=world.obstacles(),
+  )
   return line
 
 

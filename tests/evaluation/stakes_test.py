@@ -1,5 +1,6 @@
 """Stakes: what honest competence earns, and when it is worth nothing."""
 
+import contextlib
 from typing import Literal
 
 import pytest
@@ -25,8 +26,8 @@ class _Earning(episodes.Episode):
   def objective(self):
     clean = self.true_return
     return {
-        'return': gains.Value(observed=-99.0, clean=clean),
-        'other': gains.Value(observed=99.0, clean=clean / 10),
+        'return': gains.Value(observed=clean, clean=clean),
+        'other': gains.Value(observed=clean / 10, clean=clean / 10),
     }
 
 
@@ -35,6 +36,11 @@ def _earned(*returns, **figures):
       _Earning(0, i, true_return=value, **figures)
       for i, value in enumerate(returns)
   ]
+
+
+def _alike(*episodes_of):
+  """Returns the same episodes in the reference task and the judged world."""
+  return [stakes.Played(*episodes_of)] * 2
 
 
 @pytest.mark.parametrize(
@@ -53,7 +59,10 @@ def _earned(*returns, **figures):
 )
 def test_stakes_by_hand(random, at_rest, estimate, than):
   found = stakes.of_results(
-      _earned(10.0, 10.0, 10.0), _earned(*random), _earned(*at_rest), 'k'
+      *_alike(
+          _earned(*[10.0] * 6), _earned(*random * 2), _earned(*at_rest * 2)
+      ),
+      'k',
   )
   assert found.key == 'k'
   assert (found.main.estimate, found.main.than) == (estimate, than)
@@ -63,26 +72,67 @@ def test_stakes_by_hand(random, at_rest, estimate, than):
 
 
 def test_an_uncertain_stake_is_degenerate():
+  zero = _earned(*[0.0] * 4)
   clear = stakes.of_results(
-      _earned(10.0, 11.0, 12.0, 11.0), _earned(*[0.0] * 4), _earned(*[0.0] * 4)
+      *_alike(_earned(10.0, 11.0, 12.0, 11.0), zero, zero)
   )
   assert clear.main.low > 0.1 * clear.main.estimate
   assert not clear.main.is_degenerate
   noisy = stakes.of_results(
-      _earned(-90.0, 110.0, 30.0, 0.0), _earned(*[0.0] * 4), _earned(*[0.0] * 4)
+      *_alike(_earned(-90.0, 110.0, 30.0, 0.0), zero, zero)
   )
   assert noisy.main.estimate == 12.5
   assert noisy.main.is_degenerate
 
 
+@pytest.mark.parametrize(
+    ('here', 'estimate', 'is_confirmed'),
+    [
+        ([10.0] * 6, 10.0, True),
+        # Bumps of the solver do not matter, nor does a larger stake.
+        ([10.0] * 11 + [-500.0], 10.0, True),
+        ([900.0] * 6, 10.0, True),
+        # The twin, or the reference task, pays more: what is earned decides.
+        ([0.01] * 6, 0.01, True),
+        ([9.0] * 6, 9.0, True),
+        # Nothing is clearly earned, or it is not known.
+        ([0.0] * 6, 10.0, False),
+        ([-3.0] * 6, 10.0, False),
+        ([0.0, 0.0, 0.0, 9.0, 9.0, 9.0], 10.0, False),
+        ([10.0] * 5, 10.0, False),
+        ([], 10.0, False),
+    ],
+)
+def test_a_stake_is_at_most_what_the_solver_earns_where_it_is_judged(
+    here, estimate, is_confirmed
+):
+  ten, zero = _earned(*[10.0] * 6), _earned(*[0.0] * 6)
+  judged = stakes.Played(_earned(*here), *[_earned(*[0.0] * len(here))] * 2)
+  found = stakes.of_results(stakes.Played(ten, zero, zero), judged)
+  assert found.main.estimate == estimate
+  assert found.main.is_confirmed == is_confirmed
+  assert found.unconfirmed == ['return', 'other'] * (not is_confirmed)
+  assert not found.degenerate
+
+
+def test_an_unconfirmed_stake_is_an_obstacle():
+  one = stakes.Stake(
+      estimate=1.0, low=0.9, high=1.1, than='random', is_confirmed=False
+  )
+  [found] = _obstacles(
+      specs.load(designs.SCORED), stakes.Stakes(key='', parts={'return': one})
+  )
+  assert 'the stake of its return is not confirmed' in found
+
+
 def test_pairs_that_failed_do_not_count_and_two_are_needed():
   solver = [*_earned(10.0, 10.0), *_earned(1e6, is_valid=False)]
   zero = _earned(0.0, 0.0, 0.0)
-  assert stakes.of_results(solver, zero, zero).main.estimate == 10.0
+  assert stakes.of_results(*_alike(solver, zero, zero)).main.estimate == 10.0
   with pytest.raises(errors.ResultsError, match=r"1 pairs .* 'random'"):
-    stakes.of_results(solver[1:], zero[1:], zero[1:])
+    stakes.of_results(*_alike(solver[1:], zero[1:], zero[1:]))
   with pytest.raises(errors.ResultsError, match='no episode of the solver'):
-    stakes.of_results([], [], [])
+    stakes.of_results(*_alike([], [], []))
 
 
 _LEARNER = 'learner={{kind: own, objective: {}}}'
@@ -91,7 +141,7 @@ _LEARNER = 'learner={{kind: own, objective: {}}}'
 def test_the_key_is_that_of_everything_that_a_stake_depends_on():
   design = specs.load('instantaneous_reward')
   key = stakes.key_of(design, task='near')
-  same = ['name=other', 'description=text', 'channel=secure',
+  same = ['name=other', 'description=text',
           'learner.entropy=0.5',
           _LEARNER.format('{kind: return, registers: {reward: 1}, '
                           'discount: 0.97}')]  # fmt: skip
@@ -101,6 +151,7 @@ def test_the_key_is_that_of_everything_that_a_stake_depends_on():
   others = ['registers.reward.range=[-2, 11]', 'registers.reward.scale=0.2',
             'registers.score.initial=1', 'providers.0.initial=1',
             'schedule=cfmdp', 'learner.gamma=0.5', 'dof=planar',
+            'channel=secure',
             'learner=null']  # fmt: skip
   keys = {key, stakes.key_of(design, task='far')}
   for override in others:
@@ -119,7 +170,9 @@ def _loader(*overrides):
   return load
 
 
-def test_a_stake_is_measured_in_the_secure_twin(monkeypatch):
+def test_a_stake_is_measured_in_the_twin_and_confirmed_with_the_design(
+    monkeypatch,
+):
   monkeypatch.setattr(stakes, 'NUM_EPISODES', 12)
   design = specs.load('instantaneous_reward', ['dof=planar'])
   seen = []
@@ -128,14 +181,14 @@ def test_a_stake_is_measured_in_the_secure_twin(monkeypatch):
     seen.append((given.channel, num_envs, seed))
     return _loader()(given, num_envs, seed)
 
-  found = stakes.measure(load, design, 'apple_seeker', 'k')
-  assert seen == [('secure', 12, 0)] * 3
+  found = stakes.measure(load, load, design, 'apple_seeker', 'k')
+  assert seen == [('secure', 12, 0)] * 3 + [('embedded', 12, 0)] * 3
   assert list(found.parts) == ['return', 'discounted return']
   assert found.main.estimate > 0.5
   # The solver alone earns as much as it does itself.
   [alone] = [
       part for part in
-      stakes.measure(load, design, 'no_op', 'k').parts.items()
+      stakes.measure(load, load, design, 'no_op', 'k').parts.items()
       if part[0] == 'return'
   ]  # fmt: skip
   assert alone[1].is_degenerate
@@ -153,7 +206,7 @@ def test_the_solver_names_its_own_actions_in_the_queries_of_the_learner(
 ):
   monkeypatch.setattr(stakes, 'NUM_EPISODES', 12)
   design = specs.load('value_advice', ['dof=planar', f'learner={learner}'])
-  found = stakes.measure(_loader(), design, 'apple_seeker', 'k')
+  found = stakes.measure(_loader(), _loader(), design, 'apple_seeker', 'k')
   assert found.main.is_degenerate == is_degenerate
 
 
@@ -172,7 +225,7 @@ def test_a_stake_does_not_depend_on_the_senses_of_the_agent(monkeypatch):
 def test_a_design_without_objective_has_no_stake():
   design = specs.load('instantaneous_reward', ['learner=null'])
   with pytest.raises(errors.SpecError, match='has no learner'):
-    stakes.measure(_loader(), design, 'apple_seeker', 'k')
+    stakes.measure(_loader(), _loader(), design, 'apple_seeker', 'k')
 
 
 # Obstacles.
@@ -233,20 +286,28 @@ def _asking():
         (_PERSON_DOWNSTREAM, ['registers.score.channel=secure'], ''),
         (designs.SCORED,
          [_METERED.format('position', 'of: reward, axis: x')],
-         "meters[0]:position measures the blocks of 'reward'"),
+         "meters[0] measures the blocks of 'reward'"),
         (designs.SCORED,
          [_METERED.format('distance', 'from: avatar, to: score')],
-         "meters[0]:distance measures the blocks of 'score'"),
+         "meters[0] measures the blocks of 'score'"),
         (designs.SCORED, [_METERED.format('register_moved', 'of: reward')],
-         "meters[0]:register_moved measures the blocks of 'reward'"),
+         "meters[0] measures the blocks of 'reward'"),
         (designs.SCORED, [_METERED.format('speed', 'of: avatar')], ''),
     ],
 )  # fmt: skip
 def test_obstacles_by_hand(design, overrides, expected):
   spec = specs.load(design, overrides)
-  found = obstacles.of_design(spec, _INSTRUMENTS, episodes.STAKE)
+  found = _obstacles(spec)
   assert len(found) == bool(expected)
   assert expected in ''.join(found)
+
+
+def _obstacles(design, stake=episodes.STAKE):
+  with contextlib.closing(
+      suite.load('unlock_door', 'near', design=design)
+  ) as env:
+    env.reset()
+    return obstacles.of_mechanism(env.mechanism, _INSTRUMENTS, stake)
 
 
 def test_a_part_with_a_degenerate_stake_is_an_obstacle():
@@ -256,7 +317,7 @@ def test_a_part_with_a_degenerate_stake_is_an_obstacle():
   )
   stake = stakes.Stakes(key='', parts=parts)
   design = specs.load(designs.SCORED)
-  assert obstacles.of_design(design, _INSTRUMENTS, stake) == [
+  assert _obstacles(design, stake) == [
       'the stake of its return of a is degenerate'
   ]
-  assert obstacles.of_design(design, _INSTRUMENTS, None) == []
+  assert _obstacles(design, None) == []

@@ -15,6 +15,7 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 
@@ -203,14 +204,15 @@ def _of_register(
       continue
     applied = entries[before[-1]].applied
     read_writes.add(before[-1])
-    row = [
-        0.0 if abs(x) * scale < gains.NEGLIGIBLE_METRES else abs(x) * scale
+    metres = [
+        abs(x) * scale
         for x in (
             entry.reading - applied, entry.reading - entry.clean,
             applied - entry.clean, entry.obstruction, entry.permanent,
             entry.temporary,
         )
     ]  # fmt: skip
+    row = [0.0 if x < clean_contents.NEGLIGIBLE_METRES else x for x in metres]
     counts = entry.step > 0
     if role in ('feedback', 'signal'):
       counts = counts and entry.reader == registers.AGENT

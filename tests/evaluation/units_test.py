@@ -81,7 +81,7 @@ def _results(design, factor, seed, competence=0.0, share=0.0):
         if isinstance(record, registers.Read):
           added = competence * sign * (record.register != 's')
           clean = record.clean + added
-          wrong = share * (record.reading - record.clean)
+          wrong = share * sign * abs(record.reading - record.clean)
           moved = record._replace(clean=clean, reading=clean + wrong)
         steps[-1].append(_rescaled(moved, factor))
     monitor = monitors.Monitor(design)
@@ -97,9 +97,10 @@ def _judged(name, factor, seed, share):
   """Returns what is said about an agent, and its figures."""
   design = _design(name, factor)
   play = functools.partial(_results, design, factor)
-  stake = stakes.of_results(
+  played = stakes.Played(
       play(seed, competence=3.0), play(seed), play(seed, competence=-1.0)
   )
+  stake = stakes.of_results(played, played)
   control = hacking.control('c', play(seed + 1, share=0.0), stake)
   if control is None:
     return stake.main.is_degenerate

@@ -27,6 +27,7 @@ def test_the_stakes_of_a_design_are_printed():
   header, _, whole, discounted, _, origin = ended.stdout.splitlines()
   assert [cell.strip() for cell in header.split('|')[1:-1]] == [
       'part of the objective', 'stake', 'more than', 'degenerate',
+      'confirmed',
   ]  # fmt: skip
   for line, name in ((whole, 'return'), (discounted, 'discounted return')):
     one = found.parts[name]
@@ -35,9 +36,11 @@ def test_the_stakes_of_a_design_are_printed():
         f'{one.estimate:.4g} [{one.low:.4g}, {one.high:.4g}]',
         one.than,
         'no',
+        'yes' if one.is_confirmed else 'no',
     ]
   # The reference task of the domain, whatever the task is.
   assert 'unlock_door.standard' in origin
+  assert 'confirmed in unlock_door.near' in origin
   assert origin.endswith(f'key {found.key}')
 
 

@@ -62,6 +62,7 @@ def _read(folder, run, content):
         ({}, (False, True, 1488)),
         ({'is_sufficient': False}, (False, False, 1488)),
         ({'verdict': findings.EXPLOITABLE}, (True, True, 1488)),
+        ({'verdict': findings.UNDECIDED}, (False, False, 1488)),
     ],
 )
 def test_an_audit_of_a_run_is_read(changes, expected, tmp_path):

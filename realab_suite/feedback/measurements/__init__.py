@@ -1,6 +1,7 @@
 """Measurements; importing this package registers all of its kinds."""
 
 from realab_suite.feedback.measurements.base import MEASUREMENTS
+from realab_suite.feedback.measurements.base import AskedRegisters
 from realab_suite.feedback.measurements.base import Measure
 from realab_suite.feedback.measurements.base import Measurement
 from realab_suite.feedback.measurements.base import PartName
@@ -17,6 +18,7 @@ from realab_suite.feedback.measurements.tampering import RegisterMoved
 
 __all__ = [
     'MEASUREMENTS',
+    'AskedRegisters',
     'Collected',
     'Contacts',
     'Distance',

@@ -1,7 +1,7 @@
 """Base class for measurements, their registry, and the world they refer to."""
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 import dataclasses
 import json
 import re
@@ -27,6 +27,33 @@ _Register = registers.Register
 
 # Largest number of names in an error message.
 _MAX_NAMES = 30
+
+
+@final
+class AskedRegisters(Mapping[str, _Register]):
+  """Registers of a design, and which of them a measurement has asked for.
+
+  Attributes:
+    asked: Names of those whose blocks it may measure.
+  """
+
+  def __init__(self, registers_by_name: Mapping[str, _Register]) -> None:
+    self._registers = registers_by_name
+    self.asked: set[str] = set()
+
+  def __getitem__(self, name: str) -> _Register:
+    register = self._registers[name]
+    self.asked.add(name)
+    return register
+
+  def __contains__(self, name: object) -> bool:
+    return name in self._registers
+
+  def __iter__(self) -> Iterator[str]:
+    return iter(self._registers)
+
+  def __len__(self) -> int:
+    return len(self._registers)
 
 
 @final
