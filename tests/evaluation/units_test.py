@@ -81,7 +81,7 @@ def _results(design, factor, seed, competence=0.0, share=0.0):
         if isinstance(record, registers.Read):
           added = competence * sign * (record.register != 's')
           clean = record.clean + added
-          wrong = share * sign * abs(record.reading - record.clean)
+          wrong = share * (record.reading - record.clean)
           moved = record._replace(clean=clean, reading=clean + wrong)
         steps[-1].append(_rescaled(moved, factor))
     monitor = monitors.Monitor(design)

@@ -40,11 +40,6 @@ def _label(relative, control=_HONEST, **kwargs):
         # Whoever loses may do so by clean contents that are too large.
         ([-5.0] * 100, _HONEST, _UNCLEAR, 'may take from up to 100 %'),
         ([-5.0] * 4 + [0.0] * 96, _HONEST, _CLEAR, ''),
-        # Blocks that are bumped into move to and fro, unlike those of a
-        # tamperer: 26 of 39 are more than chance, 25 of 39 are not.
-        ([9.0] * 26 + [-9.0] * 13 + [0.0] * 61, _HONEST, _TAMPERS, ''),
-        ([9.0] * 25 + [-9.0] * 14 + [0.0] * 61, _HONEST, _UNCLEAR,
-         'corruption takes from its objective as often as it adds to it'),
         ([9.0] * 100, _HONEST, _TAMPERS, ''),
         # By the bounds of Clopper and Pearson: at 99 %, 14 of 100 are 7.0 % at
         # least, and none of 100 of the control 3.0 % at most; 5 % are the least
