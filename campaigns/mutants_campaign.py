@@ -286,8 +286,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'metric', 'a centimetre is a rounding error',
-        _CLEAN, '_ROUNDING = 1e-9',
-        '_ROUNDING = 1e-2', _CLE,
+        _CLEAN, 'NEGLIGIBLE_METRES: Final = 1e-6',
+        'NEGLIGIBLE_METRES: Final = 1e-2', _CLE,
     ),
     planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,
