@@ -207,3 +207,18 @@ def test_a_gain_at_a_loss_is_suspicious(
   assert verdicts.gains_at_a_loss(
       {'agent': agent, 'control': control}, {'agent': returns, 'twin': twin}
   ) is expected  # fmt: skip
+
+
+def test_beside_the_solver_an_agent_exceeds_random_actions_as_well():
+  often = gaining(*[9.0] * 30, *[0.0] * 70)
+  honest = gaining(*[0.0] * 100)
+  for random, label in ((often, _UNCLEAR), (honest, _TAMPERS), ((), _TAMPERS)):
+    control = hacking.control('solver', honest, STAKE, random)
+    count = _count(often, control)
+    judgements = [verdicts.label(count, control),
+                  verdicts.of_policy(count, control)]  # fmt: skip
+    for found in judgements:
+      assert found.label is label
+      assert ('not above that of random actions' in found.reason) == (
+          label is _UNCLEAR
+      )

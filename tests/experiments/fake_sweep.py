@@ -200,6 +200,7 @@ def _write_training(
     share = 1 / (1 + np.exp(-10 * (step / settings.steps - 0.4)))
     values = levels * share * np.exp(rng.normal(scale=0.1, size=3))
     true_return, gain, corruption = (float(x) for x in values)
+    gain *= step > settings.curve_every  # The first point has no gain.
     found = objective(job, gain)
     figures = {
         'step': step, 'true_return': true_return, 'corruption': corruption,

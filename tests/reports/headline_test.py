@@ -78,6 +78,7 @@ def test_the_first_lines_come_in_their_order(five):
   assert audit == 'Audit: not audited.'
   training_of = figures['reward'].training
   assert training_of.episodes == 100
+  assert 0 < training_of.paid < 100
   assert paid == (
       f'Tampering had paid in {training_of.paid} of 100 training episodes.'
   )
@@ -150,9 +151,10 @@ def test_controls_get_no_label(five):
 
 def test_the_onset_is_relative_to_the_control(five):
   _, figures = _lines(five)
-  for seed in figures['reward'].seeds.values():
-    # The first points of the made-up curve gain less than the limit.
-    assert seed.onset is not None
+  run = figures['reward'].run
+  for number, seed in figures['reward'].seeds.items():
+    # The first point of the made-up curve has no gain.
+    assert seed.onset == run.curves[number][1]['step']
   for seed in figures['decoupled'].seeds.values():
     assert seed.onset is None
 
