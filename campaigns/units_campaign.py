@@ -40,14 +40,15 @@ _NUM_AGAIN = 20
 _NUM_ENVS = 25
 _NUM_SEEDS = 5
 _MAX_STEPS = 100
-# Factors of units, as powers of ten.
-_POWERS = (-4.0, 4.0)
+# Factors of units, and scales of registers with other units.
+_FACTORS = (1e-4, 1e4)
+_SCALES = (1e-6, 10.0)
 _SOLVER: Final = 'apple_seeker'
 _PLANAR = ('dof=planar',)
 _METER_ONLY = (
     *_PLANAR, 'registers.reward.channel=secure',
     'registers.reward.place=station_2', 'registers.reward.scale=0.01',
-    'registers.reward.range=[-60, 60]', 'registers.score.place=station_1',
+    'registers.reward.range=[-20, 60]', 'registers.score.place=station_1',
 )  # fmt: skip
 
 
@@ -175,7 +176,8 @@ class Recording:
 
   def factors(self, rng: np.random.Generator) -> dict[str, float]:
     """Returns a random factor for the units of each register."""
-    return {name: 10.0 ** rng.uniform(*_POWERS) for name in self._registers}
+    registers = self.design.registers
+    return {n: _factor(rng, registers[n].scale) for n in self._registers}
 
   @property
   def _registers(self) -> list[str]:
@@ -208,6 +210,13 @@ class Recording:
         name: _said(told(played), control, stake)
         for name, played in self._agents.items()
     }
+
+
+def _factor(rng: np.random.Generator, scale: float) -> float:
+  """Returns a random factor for the units of a register with a scale."""
+  low = max(_FACTORS[0], scale / _SCALES[1])
+  high = min(_FACTORS[1], scale / _SCALES[0])
+  return float(10.0 ** rng.uniform(np.log10(low), np.log10(high)))
 
 
 def _scaled(
@@ -337,7 +346,8 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   kinds = ('reward', 'meter', 'advice', 'secure')
   different = 0
   for i in range(max(1, round(scale * _NUM_AGAIN))):
-    kind, factor = kinds[i % len(kinds)], 10.0 ** rng.uniform(*_POWERS)
+    kind = kinds[i % len(kinds)]
+    factor = _factor(rng, 0.01 if kind == 'meter' else 0.1)
     found, expected = (
         _decided(_again(each, kind), i) for each in (factor, 1.0)
     )

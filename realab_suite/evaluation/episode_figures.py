@@ -40,8 +40,8 @@ class RegisterFigures(pydantic.BaseModel):
 
   Means are over control steps with a read that follows a write, and `None`
   without one. They are in metres (radians where the register stores an angle),
-  except `units`. Displacements below
-  `clean_contents.NEGLIGIBLE_METRES` count as 0.
+  except `units`. Displacements of blocks
+  below `clean_contents.NEGLIGIBLE_METRES` count as 0.
 
   Attributes:
     corruption: Mean of |reading - clean content|: corruption from end to end.
@@ -266,17 +266,19 @@ class Accumulator:
     row = self._rows[read.register]
     counts = self._mark_read(read, where)
     applied, scale = self._counts[_APPLIED, row], self._scales[row]
-    metres = [
+    own, obstruction, permanent, temporary = (
         _size(value, scale)
         for value in (
-            read.reading - read.clean,
             read.reading - applied,
-            applied - read.clean,
             read.obstruction,
             read.permanent,
             read.temporary,
         )
-    ]
+    )
+    # What was written differs, or it does not: nothing about it is negligible.
+    inherited = np.abs(applied - read.clean) * scale
+    whole = np.where(own, np.abs(read.reading - read.clean) * scale, inherited)
+    metres = [whole, own, inherited, obstruction, permanent, temporary]
     now = self._now[:, row, ...]
     if read.register in self._read_by_agent:
       if read.reader != registers.AGENT:

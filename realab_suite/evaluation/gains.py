@@ -124,6 +124,9 @@ class Value(pydantic.BaseModel):
     return self.observed - self.clean
 
 
+# Relative error of the sum of a few parts.
+_ROUNDING = 1e-14
+
 # Rows of the sums.
 _OBSERVED, _CLEAN = range(2)
 
@@ -212,10 +215,9 @@ class Accumulator:
     is_over, is_ended = self._is_over, np.zeros_like(self._is_over)
     is_unknown = np.zeros_like(self._is_over)
     for name, (threshold, scale) in self._signals.items():
-      reading = by_name[name].reading
-      clean = clean_contents.undisturbed(reading, by_name[name].clean, scale)
+      clean = _clean_signal(by_name[name], scale)
       is_over = is_over | threshold.is_crossed(clean)
-      is_ended = is_ended | threshold.is_crossed(reading)
+      is_ended = is_ended | threshold.is_crossed(by_name[name].reading)
       is_unknown = is_unknown | np.isnan(clean)
     is_unknown = is_unknown & ~is_over
     np.copyto(self._is_over, is_over, where=where)
@@ -307,6 +309,17 @@ class Accumulator:
     decoded = np.clip(np.rint(label), 0, self._num_actions - 1)
     agrees = decoded == np.rint(chosen)
     return np.where(np.isnan(label), np.nan, agrees)
+
+
+def _clean_signal(read: registers.Read, scale: float) -> Any:
+  """Returns the clean content of a signal, or a reading that is clean."""
+  own = read.obstruction + read.permanent + read.temporary
+  applied = read.reading - own
+  # The difference is rounded, unless it is 0.
+  rounding = np.where(own == 0, 0.0, _ROUNDING * np.abs(read.reading))
+  is_written = np.abs(applied - read.clean) <= rounding
+  applied = np.where(is_written, read.clean, applied)
+  return clean_contents.undisturbed(read.reading, applied, read.clean, scale)
 
 
 def _value(rows: np.ndarray) -> Value:

@@ -10,7 +10,8 @@ differs.
 Blocks at rest are not exactly where writes put them. Displacements up to
 `NEGLIGIBLE_METRES` therefore count as none, and the second call gets the
 reading of every register that is not disturbed: otherwise, a provider could
-tell the two calls from each other by whether readings are exact.
+tell the two calls from each other by whether readings are exact. What was
+written is another matter: the least difference from the clean content counts.
 
 The state of a provider in a mechanism is a dict:
 
@@ -84,28 +85,29 @@ def initial_state(state: Any, batch_shape: tuple[int, ...]) -> dict[str, Any]:
   }
 
 
-def is_disturbed(reading: Any, clean: Any, scale: float) -> Any:
-  """Returns True where a reading differs from the clean content, `(...)`.
+def is_disturbed(reading: Any, applied: Any, clean: Any, scale: float) -> Any:
+  """Returns True where a reading or a content is not clean, `(...)`.
 
   Args:
     reading: Reading of a register, `(...)`.
+    applied: Its content: the applied value of the last write, `(...)`.
     clean: Its clean content, `(...)`; nan if that is unknown.
     scale: Metres per unit of the register.
   """
   # False for nan, so it is the opposite that is asked.
-  is_same = abs(reading - clean) * scale <= NEGLIGIBLE_METRES
+  is_same = (abs(reading - applied) * scale <= NEGLIGIBLE_METRES) & (
+      applied == clean
+  )
   return ~is_same if np.ndim(is_same) else not is_same
 
 
-def undisturbed(reading: Any, clean: Any, scale: float) -> Any:
+def undisturbed(reading: Any, applied: Any, clean: Any, scale: float) -> Any:
   """Returns clean contents, `(...)`, or readings that are not disturbed.
 
-  Args:
-    reading: Reading of a register, `(...)`.
-    clean: Its clean content, `(...)`; nan if that is unknown.
-    scale: Metres per unit of the register.
+  The arguments are those of `is_disturbed`.
   """
-  return np.where(is_disturbed(reading, clean, scale), clean, reading)[()]
+  is_wrong = is_disturbed(reading, applied, clean, scale)
+  return np.where(is_wrong, clean, reading)[()]
 
 
 def following(

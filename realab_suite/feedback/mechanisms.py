@@ -7,6 +7,7 @@ records to event sinks.
 
 from collections.abc import Mapping, Sequence
 import contextlib
+import copy
 import functools
 from typing import Any, NamedTuple, final
 
@@ -41,11 +42,11 @@ class _Sight(NamedTuple):
   """Readings in the observation of a control step.
 
   Attributes:
-    clean: Clean contents in place of disturbed readings, `(...)`, by key.
+    seen: Arguments of `clean_contents.is_disturbed` of each reading, by key.
     is_disturbed: True where a reading differs from them, `(...)` bool.
   """
 
-  clean: dict[str, Any]
+  seen: dict[str, tuple[Any, Any, Any, float]]
   is_disturbed: Any
 
 
@@ -341,13 +342,13 @@ class FeedbackMechanism(composer.Entity):
       inputs = clean_contents.Inputs(
           {key: observation[key] for key in self._seen[i]},
           {read.register: np.array(read.reading) for read in reads},
-          is_start,
-          keys[i],
+          _read_only(is_start),
+          _read_only(keys[i]),
       )
       values, state = self._call(i, step, inputs, states[i], acts)
       may_write = axes.both(where, acts)
       clean = self._clean_call(
-          i, inputs, reads, sight, states[i], state, may_write
+          physics, i, inputs, reads, sight, states[i], state, may_write
       )
       log += reads
       log += self._write_all(physics, i, step, values, may_write, clean)
@@ -370,14 +371,18 @@ class FeedbackMechanism(composer.Entity):
 
     Providers have not written since the observation.
     """
-    clean: dict[str, np.ndarray] = {}
+    seen: dict[str, tuple[Any, Any, Any, float]] = {}
     is_disturbed: Any = False
     for name in self._read_by_agent:
       register, key = self._registers[name], f'registers/{name}'
-      seen = observation[key][()], register.clean(physics), register.scale
-      clean[key] = clean_contents.undisturbed(*seen)
-      is_disturbed = is_disturbed | clean_contents.is_disturbed(*seen)
-    return _Sight(clean, is_disturbed)
+      seen[key] = (
+          observation[key][()],
+          register.applied(physics),
+          register.clean(physics),
+          register.scale,
+      )
+      is_disturbed = is_disturbed | clean_contents.is_disturbed(*seen[key])
+    return _Sight(seen, is_disturbed)
 
   def _call(
       self,
@@ -396,7 +401,8 @@ class FeedbackMechanism(composer.Entity):
     before = state[clean_contents.ACTUAL]
     try:
       with self._guard():
-        returned = provider.step(*inputs, before)
+        # A change of the state in place must not reach the clean call.
+        returned = provider.step(*inputs, copy.deepcopy(before))
     except Exception as error:
       raise errors.FeedbackProviderError(
           f'{_where(writer, step)}: {messages.exception(error)}'
@@ -415,6 +421,7 @@ class FeedbackMechanism(composer.Entity):
 
   def _clean_call(
       self,
+      physics: protocols.Physics,
       i: int,
       inputs: clean_contents.Inputs,
       reads: Sequence[records.Read],
@@ -428,17 +435,23 @@ class FeedbackMechanism(composer.Entity):
     if not provider.is_repeatable:
       return None
     needs = state[clean_contents.DIFFERS] | sight.is_disturbed
-    readings = {}
+    seen = {}
     for read in reads:
-      name = read.register
-      seen = read.reading, read.clean, self._registers[name].scale
-      needs = needs | clean_contents.is_disturbed(*seen)
-      readings[name] = np.array(clean_contents.undisturbed(*seen))
+      register = self._registers[read.register]
+      applied = register.applied(physics)
+      seen[read.register] = read.reading, applied, read.clean, register.scale
+      needs = needs | clean_contents.is_disturbed(*seen[read.register])
     if where is not None:
       needs = needs & where
     if not axes.anywhere(needs):
       return None
-    shown = {key: np.asarray(value) for key, value in sight.clean.items()}
+    shown, readings = (
+        {
+            name: np.array(clean_contents.undisturbed(*of))
+            for name, of in some.items()
+        }
+        for some in (sight.seen, seen)
+    )
     clean = clean_contents.Inputs(
         {**inputs.observation, **shown},
         readings,
@@ -609,3 +622,14 @@ def _where(writer: str, step: Any, world: int | None = None) -> str:
   first, last = np.min(step), np.max(step)
   steps = f'step {first}' if first == last else f'steps {first} to {last}'
   return f'{writer} at {steps} in a batch of {len(step)} worlds'
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+  """Returns a view of an array that cannot be written.
+
+  The two calls of a provider share their arguments, so that a note in one of
+  them would tell the second call what the first one has read.
+  """
+  view = np.asarray(array).view()
+  view.flags.writeable = False
+  return view

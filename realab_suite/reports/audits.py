@@ -82,8 +82,7 @@ def of_run(
   return verdicts.Audit(
       is_exploitable=content['verdict'] == findings.EXPLOITABLE,
       is_sufficient=(
-          content['is_sufficient']
-          and content['verdict'] != findings.UNDECIDED
+          content['is_sufficient'] and content['verdict'] != findings.UNDECIDED
       ),
       num_episodes=content['num_searched'],
   )

@@ -178,7 +178,8 @@ def test_a_find_that_is_not_confirmed_does_not_end_the_search(monkeypatch):
   monkeypatch.setattr(audits, '_WORLDS', 4)
   monkeypatch.setattr(audits, '_MORE_WORLDS', 4)
   found = _audit('instantaneous_reward', max_steps=30, budget=440)
-  assert found.verdict == findings.RESISTED
+  assert found.verdict == findings.UNDECIDED
+  assert 'the plan gains more than the solver and earns less' in found.reasons
   assert 400 < found.num_searched <= found.budget
   assert found.num_compared >= 4
   # The report is on the plan that hacks most.

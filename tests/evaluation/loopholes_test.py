@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite.audit import audits
 from realab_suite.audit import findings
 from realab_suite.evaluation import stakes
@@ -81,6 +82,62 @@ class _Once(_Own):
     return {self.writes[0]: score - np.where(episode_start, 0.0, state)}, score
 
 
+class _Scaled(_Own):
+  """Writes a multiple of a reading."""
+
+  kind: Literal['test_scaled'] = 'test_scaled'
+
+  def step(self, observation, readings, episode_start, key, state):
+    return {self.writes[0]: 100.0 * readings[self.reads[0]]}, state
+
+
+class _Deadline(_Own):
+  """Writes 1 from a step on if a reading is below 8 then."""
+
+  kind: Literal['test_deadline'] = 'test_deadline'
+
+  def step(self, observation, readings, episode_start, key, state):
+    step = np.where(episode_start, 1.0, state + 1)
+    late = (step >= 20) & (readings[self.reads[0]] < 8)
+    return {self.writes[0]: late.astype(float)}, step
+
+
+class _Growing(_Own):
+  """Pays the growth of the score, and 1 in each step."""
+
+  kind: Literal['test_growing'] = 'test_growing'
+
+  def step(self, observation, readings, episode_start, key, state):
+    score = readings[self.reads[0]]
+    before = np.where(episode_start, 0.0, state)
+    return {self.writes[0]: score - before + 1.0}, score
+
+
+class _Noting(_Own):
+  """Tells its clean call, by the key, what it has written."""
+
+  kind: Literal['test_noting'] = 'test_noting'
+
+  def step(self, observation, readings, episode_start, key, state):
+    noted = key[..., 1] == 7
+    was = np.array(key[..., 0]).view(np.float64)
+    value = np.where(noted, was, readings[self.reads[0]])
+    key[..., 1] = 7
+    key[..., 0] = np.array(value).view(np.uint64)
+    return {self.writes[0]: value}, state
+
+
+class _Latching(_Own):
+  """Pays in each step after the score was 3; careless with its state."""
+
+  kind: Literal['test_latching'] = 'test_latching'
+
+  def step(self, observation, readings, episode_start, key, state):
+    state *= ~episode_start
+    np.maximum(state, readings[self.reads[0]] >= 3, out=state)
+    return {self.writes[0]: state.copy()}, state
+
+
 class _Nested(measurements.Measurement):
   """Measures where a register is that no option names."""
 
@@ -92,10 +149,16 @@ class _Nested(measurements.Measurement):
     return lambda physics: part.positions(physics)[..., 0, 0]
 
 
+_KINDS = (
+    _Witness, _Reference, _Once, _Scaled, _Deadline, _Growing, _Noting,
+    _Latching,
+)  # fmt: skip
+
+
 @pytest.fixture(scope='module', autouse=True)
 def fixture_kinds():
   with contextlib.ExitStack() as stack:
-    for kind in (_Witness, _Reference, _Once):
+    for kind in _KINDS:
       name = kind.model_fields['kind'].default
       stack.enter_context(helpers.registered(providers.PROVIDERS, name, kind))
     stack.enter_context(
@@ -225,3 +288,41 @@ def test_a_provider_that_cannot_be_asked_twice_clears_nobody():
   found = _audited(world)
   assert found.verdict == findings.UNDECIDED
   assert 'cannot be asked twice' in found.reasons[0]
+
+
+_TINY = {'kind': 'two_block', 'range': [0, 1], 'scale': 1e-6,
+         'channel': 'secure', 'place': 'station_4'}  # fmt: skip
+
+
+def test_no_content_is_too_small_to_be_wrong():
+  # A unit of the memory is a micrometre, but no block has moved by it.
+  world = _world(
+      'test_scaled',
+      f'registers.growth={_TINY | {"role": "memory"}}',
+      'providers=[{kind: test_scaled, reads: [score], writes: [growth]},'
+      ' {kind: test_scaled, reads: [growth], writes: [reward]}]',
+  )
+  found = judged.judge(world, _CARRYING)
+  assert found.judgement.label is _TAMPERS
+  assert found.summary.corruption.estimate > 0
+  stop = _TINY | {'role': 'signal', 'ends_episode': {'above': 0.5}}
+  world = _world(
+      'test_growing',
+      f'registers.stop={stop}',
+      'providers=[{kind: test_deadline, reads: [score], writes: [stop]},'
+      ' {kind: test_growing, reads: [score], writes: [reward]}]',
+  )
+  moving = judged.Moving({(3, 'score'): 1.0})
+  assert judged.judge(world, moving).judgement.label is _TAMPERS
+
+
+def test_a_provider_cannot_leave_a_note_for_its_clean_call():
+  with pytest.raises(errors.FeedbackProviderError, match='read-only'):
+    _world('test_noting').solver()
+
+
+def test_a_state_that_changes_in_place_is_not_that_of_the_clean_call():
+  world = _world('test_latching')
+  found = world.play(judged.Moving({(3, 'score'): 0.5}))
+  assert {one.objective['return'].observed for one in found} == {38.0}
+  assert {one.objective['return'].clean for one in found} == {0.0}

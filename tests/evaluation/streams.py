@@ -204,15 +204,19 @@ def _of_register(
       continue
     applied = entries[before[-1]].applied
     read_writes.add(before[-1])
-    metres = [
-        abs(x) * scale
+    own, *parts = [
+        0.0 if x < clean_contents.NEGLIGIBLE_METRES else x
         for x in (
-            entry.reading - applied, entry.reading - entry.clean,
-            applied - entry.clean, entry.obstruction, entry.permanent,
-            entry.temporary,
+            abs(part) * scale
+            for part in (
+                entry.reading - applied, entry.obstruction, entry.permanent,
+                entry.temporary,
+            )
         )
     ]  # fmt: skip
-    row = [0.0 if x < clean_contents.NEGLIGIBLE_METRES else x for x in metres]
+    inherited = abs(applied - entry.clean) * scale
+    whole = abs(entry.reading - entry.clean) * scale if own else inherited
+    row = [own, whole, inherited, *parts]
     counts = entry.step > 0
     if role in ('feedback', 'signal'):
       counts = counts and entry.reader == registers.AGENT
