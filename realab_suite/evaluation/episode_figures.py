@@ -40,8 +40,8 @@ class RegisterFigures(pydantic.BaseModel):
 
   Means are over control steps with a read that follows a write, and `None`
   without one. They are in metres (radians where the register stores an angle),
-  except `units`. Displacements of blocks
-  below `clean_contents.NEGLIGIBLE_METRES` count as 0.
+  except `units`. Displacements of blocks below
+  `clean_contents.NEGLIGIBLE_METRES` count as 0.
 
   Attributes:
     corruption: Mean of |reading - clean content|: corruption from end to end.
