@@ -225,8 +225,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'metric', 'corruption ends at the written value',
-        _FIGURES, 'read.reading - read.clean,',
-        'read.reading - applied,', _FIG,
+        _FIGURES, 'np.abs(read.reading - read.clean) * scale, inherited',
+        'own, 0.0', _FIG,
     ),
     planting.Mutant(
         'metric', 'obstructions are left out',

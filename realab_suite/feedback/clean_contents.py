@@ -209,11 +209,12 @@ def _call(
   try:
     if axes.anywhere(_is_unknown(inputs)):
       raise ValueError('an input is unknown')
-    # A provider that changes its arguments must not change those of the other
-    # call: an agent would notice that there was this one.
-    some, before = copy.deepcopy((inputs, state))
+    # A provider that changes what it gets must not change it for another call.
+    # Observations, the key and the start of the episode are read-only.
+    readings = {name: np.array(one) for name, one in inputs.readings.items()}
+    some = inputs._replace(readings=readings)
     with guard():
-      returned = provider.step(*some, before)
+      returned = provider.step(*some, copy.deepcopy(state))
     writes, following = provider_results.checked(provider, returned, shape)
     if shape:
       trees.put(state, np.arange(*shape), following)  # Checks its structure.
