@@ -340,7 +340,7 @@ class FeedbackMechanism(composer.Entity):
           for name in provider.reads
       ]
       inputs = clean_contents.Inputs(
-          {key: observation[key] for key in self._seen[i]},
+          {key: _read_only(observation[key]) for key in self._seen[i]},
           {read.register: np.array(read.reading) for read in reads},
           _read_only(is_start),
           _read_only(keys[i]),
