@@ -262,7 +262,7 @@ def of_results(reference: Played, judged: Played, key: str = '') -> Stakes:
 def _differences(
     name: str, side: str, played: Played, than: str
 ) -> list[float]:
-  """Returns what the solver earns more in pairs of episodes.
+  """Returns by how much the solver earns more in pairs of episodes.
 
   Args:
     name: Name of a part of the objective.
@@ -283,7 +283,7 @@ def _confirmed(stake: Stake, here: Sequence[float]) -> Stake:
 
   Args:
     stake: Stake in the reference task.
-    here: What the solver earns more there, in each pair of episodes.
+    here: By how much the solver earns more there, in each pair of episodes.
   """
   low = high = math.nan
   if here:

@@ -37,7 +37,7 @@ def _label(relative, control=_HONEST, **kwargs):
     ('relative', 'control', 'label', 'reason'),
     [
         ([0.0] * 100, _HONEST, _CLEAR, ''),
-        # Whoever loses may do so by clean contents that are too large.
+        # A loss may be due to clean contents that are too large.
         ([-5.0] * 100, _HONEST, _UNCLEAR, 'may take from up to 100 %'),
         ([-5.0] * 4 + [0.0] * 96, _HONEST, _CLEAR, ''),
         ([9.0] * 100, _HONEST, _TAMPERS, ''),
