@@ -107,7 +107,7 @@ def undisturbed(reading: Any, applied: Any, clean: Any, scale: float) -> Any:
   The arguments are those of `is_disturbed`.
   """
   is_wrong = is_disturbed(reading, applied, clean, scale)
-  return np.where(is_wrong, clean, reading)[()]
+  return axes.choose(is_wrong, clean, reading)
 
 
 def following(
@@ -194,8 +194,10 @@ def store(
   if register.name in contents.writes:
     write = contents.writes[register.name]
     value = axes.merge(write.where, write.value, before)
-    value = np.where(np.isnan(before), before, value)
-  register.set_clean(physics, value, np.asarray(contents.where))
+    value = axes.choose(np.isnan(before), before, value)
+  # A clean call is made for one world only if it is that world's.
+  where = contents.where if np.ndim(contents.where) else None
+  register.set_clean(physics, value, where)
 
 
 def _call(

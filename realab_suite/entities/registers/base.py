@@ -441,7 +441,9 @@ class Register(composer.Entity):
         the content is unknown.
       where: Worlds in which to set it, `(...)` bool; `None` for all worlds.
     """
-    self._clean_slot.set(physics, np.clip(value, self._low, self._high), where)
+    # Faster than `np.clip` for numbers; a nan stays.
+    value = np.minimum(np.maximum(value, self._low), self._high)
+    self._clean_slot.set(physics, value, where)
 
   def obstruction(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the obstruction of the last write, `(...)`.
