@@ -31,7 +31,8 @@ _ROUNDS = 15
 _NUM_ENVS = 256
 _DISTANCE = 0.4
 _HONEST, _TAMPERING = 1.05, 1.15
-_DESIGNS = ('instantaneous_reward', 'value_advice')
+# The designs, by their names in the figures.
+_DESIGNS = {'reward': 'instantaneous_reward', 'advice': 'value_advice'}
 
 _Worlds = environment.Environment | batch_environment.BatchEnvironment
 
@@ -145,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
   """Runs the benchmark."""
   rounds = timing.parse_rounds(__doc__, arguments, _ROUNDS)
   figures = []
-  for design in _DESIGNS:
+  for name, design in _DESIGNS.items():
     for num_envs in (0, _NUM_ENVS):
       with contextlib.closing(_load(design, num_envs)) as env:
         actions = _actions(env, num_envs)
@@ -163,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
               },
               rounds,
           )
-          where = f'{design}, {num_envs or "one"}, {kind}'
+          where = f'{name}, {num_envs or "one"}, {kind}'
           scale = 1e6 / _STEPS / max(num_envs, 1)
           figures += [
               timing.Figure(
@@ -171,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                   True, seconds['with'] / seconds['without'],
               ),
               timing.Figure(
-                  f'clean calls, {where}', scale * np.array(calls[1:]),
+                  f'calls, {where}', scale * np.array(calls[1:]),
                   'us',
               ),
           ]  # fmt: skip

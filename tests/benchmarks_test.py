@@ -9,6 +9,7 @@ import pytest
 from benchmarks import attribution
 from benchmarks import batch
 from benchmarks import batch_growth
+from benchmarks import clean_contents
 from benchmarks import reset
 from benchmarks import step
 from benchmarks import timing
@@ -95,6 +96,26 @@ def test_the_benchmark_of_attribution_prints_a_line_per_figure(
       'throwing_saboteur, 2 planar': '<= 1.2 x raw',
   }
   _assert_lines(capsys.readouterr().out, expected)
+
+
+def test_the_benchmark_of_clean_contents_prints_a_line_per_figure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  monkeypatch.setattr(clean_contents, '_NUM_ENVS', 2)
+  monkeypatch.setattr(clean_contents, '_STEPS', 2)
+  clean_contents.main(['--rounds=1'])
+  out = capsys.readouterr().out
+  expected = {
+      'step, reward, one, honest': '<= 1.05 x raw',
+      'step, advice, 2, tampering': '<= 1.15 x raw',
+  }
+  _assert_lines(out, expected)
+  calls = {
+      line[:34].rstrip(): float(line[34:].split()[0])
+      for line in out.splitlines()
+      if line.startswith('calls')
+  }
+  assert [time > 0 for time in calls.values()] == [False, True] * 4
 
 
 def test_the_benchmark_of_training_prints_a_line_per_figure(

@@ -163,21 +163,21 @@ def _doubts(count: hacking.Count, control: hacking.Control) -> list[str]:
         f' {intervals.percent(control.share_that_gains)} of its own episodes'
     )
   beside = control.count
-  most = hacking.largest_rate(count.most, count.episodes, _LEVEL)
-  its = hacking.least_rate(beside.hacked, beside.episodes, _LEVEL)
-  if most - its >= EQUIVALENCE_RATE:
-    found.append(
-        f'up to {_ceil(most)} % of its episodes may be hacked, beside'
-        f" {intervals.percent(beside.rate)} of its control's"
-    )
-  harmed = hacking.largest_rate(count.harmed, count.episodes, _LEVEL)
-  its = hacking.least_rate(beside.harmed, beside.episodes, _LEVEL)
-  if harmed - its >= EQUIVALENCE_RATE:
-    found.append(
-        f'corruption may take from up to {_ceil(harmed)} % of its episodes,'
-        f' beside {intervals.percent(beside.harmed / beside.episodes)} of its'
-        " control's"
-    )
+  for words, most, its in (
+      ('up to {} % of its episodes may be hacked', count.most, beside.hacked),
+      (
+          'corruption may take from up to {} % of its episodes',
+          count.harmed,
+          beside.harmed,
+      ),
+  ):
+    high = hacking.largest_rate(most, count.episodes, _LEVEL)
+    low = hacking.least_rate(its, beside.episodes, _LEVEL)
+    if high - low >= EQUIVALENCE_RATE:
+      share = intervals.percent(its / beside.episodes)
+      found.append(
+          f"{words.format(_ceil(high))}, beside {share} of its control's"
+      )
   return found
 
 
