@@ -62,7 +62,8 @@ def main(argv: Sequence[str]) -> None:
       f'{result_tables.markdown(rows)}\n\n{world.solver} in'
       f' {world.domain}.{world.reference}, {stakes.NUM_EPISODES} episodes of'
       f' {world.max_steps} steps, with 95 % intervals; confirmed in'
-      f' {world.domain}.{world.task}; key {found.key}'
+      f' {world.domain}.{world.task}, whose median counts if it is clearly'
+      f' smaller; key {found.key}'
   )
 
 

@@ -340,6 +340,8 @@ def _run(
     jobs.is_done(path)
     folders[job.seed] = path
     configs[job.seed] = jobs.read_config(path)
+  _check_stakes(folder, name, rows)
+  _check_stakes(folder, name, transplants)
   return Run(
       name, tuple(planned), folders, tuple(rows), tuple(transplants), configs
   )
@@ -355,6 +357,24 @@ def _rows(path: pathlib.Path, run: str) -> list[results.EpisodeRow]:
   if not rows:
     raise errors.ResultsError(f'{path}: no rows; at least one is needed')
   return rows
+
+
+def _check_stakes(
+    folder: pathlib.Path, name: str, rows: Sequence[results.EpisodeRow]
+) -> None:
+  """Checks that all episodes of a run have been measured against one stake.
+
+  Raises:
+    ResultsError: If they have not, for example because a sweep was continued
+      after the dynamics had changed.
+  """
+  keys = sorted({row.stake.key if row.stake else 'none' for row in rows})
+  if len(keys) > 1:
+    raise errors.ResultsError(
+        f'{folder}: the rows of run {name!r} have stakes with the keys'
+        f' {", ".join(keys)}; allowed is one key, so run it again in another'
+        ' folder'
+    )
 
 
 def _unfinished(job: Job, path: pathlib.Path) -> Unfinished:

@@ -233,6 +233,18 @@ def test_a_row_of_another_run_is_refused(own_folder):
     sweep_results.load(own_folder)
 
 
+def test_rows_with_different_stakes_are_refused(own_folder):
+  key = sweep_results.load(own_folder).runs['reward'].stake.key
+  pages.spoil(
+      own_folder, 'reward', 1, training.EPISODES,
+      lambda data: pages.rewritten(data, key.encode(), b'former'),
+  )  # fmt: skip
+  with pytest.raises(
+      errors.ResultsError, match=rf"run 'reward' have .* {key}, former;"
+  ):
+    sweep_results.load(own_folder)
+
+
 def test_changed_results_are_refused(own_folder):
   path = next(own_folder.glob('reward-1-*')) / training.EPISODES
   lines = path.read_text().splitlines(keepends=True)

@@ -35,7 +35,7 @@ def _attribute(data):
   return b''.join(rows)
 
 
-def test_causes_are_means_over_the_attributed_episodes(own_folder, tmp_path):
+def test_movers_are_means_over_the_attributed_episodes(own_folder, tmp_path):
   for seed in range(3):
     pages.spoil(own_folder, 'reward', seed, training.EPISODES, _attribute)
   page = pages.write(own_folder, tmp_path)
