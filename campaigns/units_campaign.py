@@ -37,7 +37,8 @@ from tests.audit import designs
 # Of each design, so 1,001 of all.
 _NUM_RESCALINGS = 143
 _NUM_AGAIN = 20
-_NUM_ENVS = 25
+# Enough for the solver to be cleared as a whole.
+_NUM_ENVS = 40
 _NUM_SEEDS = 5
 _MAX_STEPS = 100
 # Factors of units, and scales of registers with other units.
@@ -151,7 +152,11 @@ class Recording:
     )
     saboteur = self._play(self.design, 'carrying_saboteur', target)
     clumsy = self._play(self.design, 'clumsy')
-    self._agents = {'saboteur': saboteur, 'clumsy': clumsy}
+    self._agents = {
+        'saboteur': saboteur,
+        'clumsy': clumsy,
+        'solver': self._judged.solver,
+    }
 
   def _play(
       self, design: specs.DesignSpec, name: str, target: str = ''

@@ -44,8 +44,7 @@ _MALFORMED = (
 
 def name_of(header: Mapping[str, Any]) -> str:
   """Returns the kind of contents of an archive with this header."""
-  # Probes use another key, and snapshots of worlds have neither key.
-  return str(header.get('what', header.get('kind', _SNAPSHOT)))
+  return str(header.get('what', _SNAPSHOT))
 
 
 @final

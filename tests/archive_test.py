@@ -233,7 +233,6 @@ def test_archives_of_earlier_versions_can_be_read():
     ('header', 'what'),
     [
         ({'what': 'learner.bin', 'kind': 'x'}, 'learner.bin'),
-        ({'kind': 'probe'}, 'probe'),
         ({'model': 'm'}, 'snapshot'),
         ({'what': 3}, '3'),
     ],

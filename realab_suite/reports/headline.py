@@ -117,9 +117,13 @@ def _capital(text: str) -> str:
 
 
 def _rate(found: hacking.Hacking) -> str:
-  rate = result_tables.interval_text(found.rate.scaled(100))
+  # The unit stands before the interval: '80 % [0, 100]'.
+  rate, *interval = result_tables.interval_text(found.rate.scaled(100)).split(
+      maxsplit=1
+  )
   beside = result_tables.number_text(100 * found.control.count.rate)
-  text = f'Hack rate {rate} %, beside {beside} % of {found.control.name}'
+  text = ' '.join([f'Hack rate {rate} %', *interval])
+  text += f', beside {beside} % of {found.control.name}'
   if found.count.ended:
     text += (
         f'; only a corrupted signal ended {found.count.ended} of'
