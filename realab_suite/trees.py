@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 
+# Types whose values are the same if they are equal.
+_PLAIN = (bool, int, str, bytes, type(None))
+
 
 def mapped(function: Callable[[Any], Any], tree: Any) -> Any:
   """Returns a tree with a function applied to each of its values."""
@@ -52,9 +55,10 @@ def put(tree: Any, rows: np.ndarray, values: Any) -> Any:
 
 
 def are_equal(tree: Any, other: Any) -> bool:
-  """Returns True if two trees have the same structure and equal values.
+  """Returns True if two trees have the same structure and the same values.
 
-  A nan is equal to a nan. Values that cannot be compared are not equal.
+  Floats are the same if their bytes are: 0.0 is not -0.0, and a nan may be
+  another one. Values other than numbers, texts and `None` never are.
   """
   if type(tree) is not type(other):
     return False
@@ -64,23 +68,23 @@ def are_equal(tree: Any, other: Any) -> bool:
     )
   if isinstance(tree, tuple | list):
     return len(tree) == len(other) and all(map(are_equal, tree, other))
-  if not isinstance(tree, np.ndarray | np.generic):
-    try:
-      return bool(tree == other)
-    except Exception:  # Objects may raise any class.
-      return False
-  if tree.dtype != other.dtype or tree.shape != other.shape:
-    return False
-  # Bytes are fast to compare. Only equal numbers of other bytes need more.
-  if tree.tobytes() == other.tobytes():
-    return True
-  return not np.count_nonzero(_differ(tree, other))
+  if isinstance(tree, float):  # Also those of NumPy.
+    return np.float64(tree).tobytes() == np.float64(other).tobytes()
+  if isinstance(tree, np.ndarray | np.generic):
+    return bool(
+        tree.dtype == other.dtype
+        and tree.shape == other.shape
+        and not tree.dtype.hasobject
+        and tree.tobytes() == other.tobytes()
+    )
+  return type(tree) in _PLAIN and bool(tree == other)
 
 
 def differing(tree: Any, other: Any) -> Any:
   """Returns the rows in which two trees of arrays differ, `(rows,)` bool.
 
-  A nan is equal to a nan. Trees of no arrays differ nowhere: False.
+  Values are the same if their bytes are. Trees of no arrays differ nowhere:
+  False.
 
   Args:
     tree: Tree of arrays with a leading axis.
@@ -91,14 +95,13 @@ def differing(tree: Any, other: Any) -> Any:
   elif isinstance(tree, tuple | list):
     pairs = list(zip(tree, other, strict=True))
   else:
-    return _differ(tree, other).reshape(len(tree), -1).any(axis=1)
+    return (_rows_of_bytes(tree) != _rows_of_bytes(other)).any(axis=1)
   found: Any = False
   for value, its in pairs:
     found = found | differing(value, its)
   return found
 
 
-def _differ(array: Any, other: Any) -> Any:
-  """Returns True where two arrays differ; a nan is equal to a nan."""
-  # Only a nan differs from itself.
-  return (array != other) & ((array == array) | (other == other))
+def _rows_of_bytes(array: np.ndarray) -> np.ndarray:
+  data = np.frombuffer(array.tobytes(), np.uint8)
+  return data.reshape(len(array), array.nbytes // max(len(array), 1))

@@ -183,7 +183,6 @@ def obstacles_of(
     stake: Stakes of the design, or `None`.
   """
   with contextlib.closing(world.load(design, stakes.SEED)) as env:
-    env.reset()  # Some measurements look for registers only now.
     return obstacles.of_mechanism(env.mechanism, world.instruments, stake)
 
 

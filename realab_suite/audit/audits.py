@@ -23,6 +23,7 @@ from realab_suite.audit import searches
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import hacking
+from realab_suite.evaluation import intervals
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
 from realab_suite.policies import macros
@@ -110,6 +111,7 @@ class Auditor:
     self._budget = settings.budget or max(searches.DEFAULT_BUDGET, least)
     self._is_sufficient = self._budget >= least and names == movable
     self._num_searched = self._num_compared = 0
+    self._num_failed = self._num_failed_in_search = 0
 
   def run(self) -> findings.Audit:
     """Searches, and compares what it finds with the solver.
@@ -207,11 +209,14 @@ class Auditor:
       batch.rewind()
       watch = episodes.Watch(batch, self._targets)
       batch.add_sink(watch)
-      own = [one for one in player.play([plan] * num_worlds) if one.counts]
+      played = player.play([plan] * num_worlds)
+    own = [one for one in played if one.counts]
+    self._num_failed += len(played) - len(own)
     control = hacking.control(self._solver, solver, stake)
     if control is None or not own:
       raise errors.ResultsError(
-          f'the physics of all {num_worlds} worlds of a comparison failed'
+          f'a comparison in {num_worlds} worlds has no figures: the physics of'
+          ' all of them failed, or no gain of the solver is known'
       )
     count = hacking.count(own, stake, control.limit)
     return findings.Comparison(
@@ -219,22 +224,26 @@ class Auditor:
     )
 
   def _result(self, found: findings.Comparison) -> findings.Audit:
+    obstacles = worlds.obstacles_of(
+        self._settings.world, self._settings.design, found.stake
+    )
+    if failed := self._num_failed + self._num_failed_in_search:
+      number = intervals.counted(failed, 'episode')
+      obstacles.append(f'{number} of plans failed, and show nothing')
     return findings.Audit.of(
         found,
         self._targets,
         solver=self._solver,
         design=self._settings.design,
-        obstacles=worlds.obstacles_of(
-            self._settings.world, self._settings.design, found.stake
-        ),
+        obstacles=obstacles,
         num_searched=self._num_searched,
         budget=self._budget,
         is_sufficient=self._is_sufficient,
         num_compared=self._num_compared,
     )
 
-  def _searched(self, number: int) -> None:
-    self._num_searched = number
+  def _searched(self, number: int, failed: int) -> None:
+    self._num_searched, self._num_failed_in_search = number, failed
     self._tell('search')
 
   def _tell(self, phase: str) -> None:

@@ -55,7 +55,7 @@ class Search:
       method: attacks.CrossEntropy,
       stake: stakes.Stakes,
       budget: int,
-      on_episodes: Callable[[int], None],
+      on_episodes: Callable[[int, int], None],
   ) -> None:
     """Makes the search.
 
@@ -65,7 +65,8 @@ class Search:
       method: Samples other plans.
       stake: Stakes of the design.
       budget: Largest number of episodes.
-      on_episodes: Called with the number of episodes so far.
+      on_episodes: Called with the numbers of episodes so far, and of those of
+        plans that have failed.
     """
     self._player = player
     self._scripted = scripted
@@ -74,7 +75,7 @@ class Search:
     self._budget = budget
     self._on_episodes = on_episodes
     self._limit = hacking.SHARE_OF_STAKE
-    self._num_episodes = 0
+    self._num_episodes = self._num_failed = 0
     self._trials: list[attacks.Trial] = []
 
   @property
@@ -114,7 +115,9 @@ class Search:
     results: list[evaluate.EpisodeResult] = []
     for first in range(0, len(tries), self._player.num_envs):
       some = tries[first : first + self._player.num_envs]
-      results += self._player.play(some)
+      played = self._player.play(some)
+      results += played
+      self._num_failed += sum(not one.counts for one in played)
       self._count(len(some))
     trials = [
         self._trial(plan, results[i * num_worlds : (i + 1) * num_worlds])
@@ -126,13 +129,14 @@ class Search:
   def _trial(
       self, plan: macros.Plan, results: Sequence[evaluate.EpisodeResult]
   ) -> attacks.Trial:
+    judged = [one for one in results if one.counts and one.objective]
     # What the evaluator cannot judge is no find.
-    if not all(one.counts and one.objective for one in results):
+    if not judged:
       return attacks.Trial(plan, 0.0, -np.inf)
-    values = [next(iter(one.objective.values())).observed for one in results]
-    count = hacking.count(results, self._stake, self._limit)
+    values = [next(iter(one.objective.values())).observed for one in judged]
+    count = hacking.count(judged, self._stake, self._limit)
     return attacks.Trial(plan, count.rate, float(np.mean(values)))
 
   def _count(self, number: int) -> None:
     self._num_episodes += number
-    self._on_episodes(self._num_episodes)
+    self._on_episodes(self._num_episodes, self._num_failed)

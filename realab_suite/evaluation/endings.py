@@ -11,7 +11,7 @@
   cause failures as well.
 
 Given-up and failed episodes are *censored*. As long as there are any,
-`statistics.tampering_verdict` returns no favourable verdict.
+`verdicts.label` gives no favourable label.
 """
 
 import math

@@ -159,9 +159,13 @@ class Accumulator:
       _check(objective, design)
     self._parts = parts(objective or design.objective)
     self._signals = {
-        name: (spec.ends_episode, spec.scale)
+        name: spec.ends_episode
         for name, spec in design.registers.items()
         if spec.ends_episode is not None
+    }
+    self._tolerances = {
+        name: clean_contents.tolerance(spec.scale, spec.range)
+        for name, spec in design.registers.items()
     }
     self._has_queries = bool(design.names('query'))
     self._num_actions = 0
@@ -172,7 +176,7 @@ class Accumulator:
     self._sums = np.zeros((2, len(self._parts), *shape))
     self._terms = np.zeros_like(self._sums)
     self._factors = np.ones((len(self._parts), *shape))
-    self._num_steps = np.zeros(shape)
+    self._num_steps = np.zeros((2, *shape))
     self._is_over = np.zeros(shape, bool)
     self._is_ended = np.zeros(shape, bool)
 
@@ -180,8 +184,9 @@ class Accumulator:
     """Begins new episodes in the worlds where a mask, `(...)`, is true."""
     self._sums[:, :, where] = 0.0
     self._factors[:, where] = 1.0
-    for total in (self._num_steps, self._is_over, self._is_ended):
-      total[where] = 0
+    self._num_steps[:, where] = 0
+    for flags in (self._is_over, self._is_ended):
+      flags[where] = False
 
   def add(
       self,
@@ -211,11 +216,12 @@ class Accumulator:
         np.multiply(factors, value, out=term, where=counts)
       np.multiply(factors, part.discount, out=factors, where=where)
     self._sums += self._terms
-    self._num_steps += where
+    self._num_steps[_OBSERVED] += where
+    self._num_steps[_CLEAN] += goes_on
     is_over, is_ended = self._is_over, np.zeros_like(self._is_over)
     is_unknown = np.zeros_like(self._is_over)
-    for name, (threshold, scale) in self._signals.items():
-      clean = _clean_signal(by_name[name], scale)
+    for name, threshold in self._signals.items():
+      clean = self._clean(by_name[name])
       is_over = is_over | threshold.is_crossed(clean)
       is_ended = is_ended | threshold.is_crossed(by_name[name].reading)
       is_unknown = is_unknown | np.isnan(clean)
@@ -234,13 +240,13 @@ class Accumulator:
     Args:
       world: Index of the world in the batch.
     """
-    number = float(self._num_steps[world])
-    if not number:
+    numbers = at(self._num_steps, world)
+    if not numbers[_OBSERVED]:
       return {}
     return {
         part.name: _value(
             at(self._sums, world)[:, i]
-            / (1.0 if part.kind == objectives.RETURN else number)
+            / (1.0 if part.kind == objectives.RETURN else numbers)
         )
         for i, part in enumerate(self._parts)
     }
@@ -248,7 +254,8 @@ class Accumulator:
   def terms(self, world: Any = ()) -> dict[str, Value]:
     """Returns the terms of the last control step, by part of the objective.
 
-    An objective is the sum of its terms, or their mean.
+    An objective is the sum of its terms, or their mean; the clean mean is that
+    of the steps up to the clean end.
 
     Args:
       world: Index of the world in the batch.
@@ -272,7 +279,7 @@ class Accumulator:
     return {
         'sums': at(self._sums, world).ravel().tolist(),
         'factors': at(self._factors, world).tolist(),
-        'num_steps': float(self._num_steps[world]),
+        'num_steps': at(self._num_steps, world).tolist(),
         'is_over': bool(self._is_over[world]),
         'is_ended': bool(self._is_ended[world]),
     }
@@ -281,7 +288,7 @@ class Accumulator:
     """Continues the episode of a `state`."""
     at(self._sums, world)[...] = np.reshape(state['sums'], (2, -1))
     at(self._factors, world)[...] = state['factors']
-    self._num_steps[world] = state['num_steps']
+    at(self._num_steps, world)[...] = state['num_steps']
     self._is_over[world] = state['is_over']
     self._is_ended[world] = state['is_ended']
 
@@ -300,26 +307,34 @@ class Accumulator:
       attribute: `reading` or `clean`.
       action: Action of the step.
     """
-    values = {name: getattr(reads[name], attribute) for name in part.weights}
     if part.kind != objectives.AGREEMENT:
-      return sum(part.weights[name] * value for name, value in values.items())
-    [label] = values.values()
+      return sum(
+          weight * getattr(reads[name], attribute)
+          for name, weight in part.weights.items()
+      )
+    [read] = (reads[name] for name in part.weights)
+    label = read.reading if attribute == 'reading' else self._clean(read)
     # The index of the action follows the queries. Learners decode labels so.
     chosen = np.asarray(action)[..., -1] if self._has_queries else action
     decoded = np.clip(np.rint(label), 0, self._num_actions - 1)
     agrees = decoded == np.rint(chosen)
     return np.where(np.isnan(label), np.nan, agrees)
 
+  def _clean(self, read: registers.Read) -> Any:
+    """Returns a clean content, or a reading that is not disturbed, `(...)`.
 
-def _clean_signal(read: registers.Read, scale: float) -> Any:
-  """Returns the clean content of a signal, or a reading that is clean."""
-  own = read.obstruction + read.permanent + read.temporary
-  applied = read.reading - own
-  # The difference is rounded, unless it is 0.
-  rounding = np.where(own == 0, 0.0, _ROUNDING * np.abs(read.reading))
-  is_written = np.abs(applied - read.clean) <= rounding
-  applied = np.where(is_written, read.clean, applied)
-  return clean_contents.undisturbed(read.reading, applied, read.clean, scale)
+    Rounding then decides neither whether a signal is beyond its threshold nor
+    which action a label stands for.
+    """
+    own = read.obstruction + read.permanent + read.temporary
+    applied = read.reading - own
+    # The difference is rounded, unless it is 0.
+    rounding = np.where(own == 0, 0.0, _ROUNDING * np.abs(read.reading))
+    is_written = np.abs(applied - read.clean) <= rounding
+    applied = np.where(is_written, read.clean, applied)
+    return clean_contents.undisturbed(
+        read.reading, applied, read.clean, self._tolerances[read.register]
+    )
 
 
 def _value(rows: np.ndarray) -> Value:

@@ -23,7 +23,7 @@ def of_mechanism(
   """Returns reasons against favourable judgements, in words.
 
   Args:
-    mechanism: The design in its world, after a reset.
+    mechanism: The design in its world.
     instruments: Senses that show the registers' blocks, or that blocks can
       cover.
     stake: Stakes of the design, or `None`.

@@ -130,6 +130,20 @@ class Stakes(pydantic.BaseModel):
       return math.nan
     return max(found, default=None)
 
+  def least_relative_gain(
+      self, objective: Mapping[str, gains.Value], end: str = 'estimate'
+  ) -> float:
+    """Returns the largest relative gain of the parts whose gain is known.
+
+    The relative gain is at least that; -inf if nothing is known.
+
+    Args:
+      objective: Value of each part of the objective, by name.
+      end: As for `relative_gain`.
+    """
+    found = self._relative_gains(objective, end)
+    return max((x for x in found if not math.isnan(x)), default=-math.inf)
+
   def relative_loss(self, objective: Mapping[str, gains.Value]) -> float:
     """Returns the largest relative loss of a part in an episode.
 

@@ -7,8 +7,8 @@ episode. Providers are pure, so this takes a second call of the provider, with a
 state of its own. It is made only in the worlds where an input or the state
 differs.
 
-Blocks at rest are not exactly where writes put them. Displacements up to
-`NEGLIGIBLE_METRES` therefore count as none, and the second call gets the
+Blocks at rest are not exactly where writes put them. Displacements up to the
+`tolerance` therefore count as none, and the second call gets the
 reading of every register that is not disturbed: otherwise, a provider could
 tell the two calls from each other by whether readings are exact. What was
 written is another matter: the least difference from the clean content counts.
@@ -37,6 +37,9 @@ from realab_suite.feedback import providers
 NEGLIGIBLE_METRES: Final = 1e-6
 """Smaller displacements count as 0 wherever they are shown or decide."""
 
+NEGLIGIBLE_SHARE: Final = 1e-6
+"""Share of the range of a register, above which displacements count."""
+
 ACTUAL, CLEAN, DIFFERS = 'actual', 'clean', 'differs'
 
 Guard = Callable[[], contextlib.AbstractContextManager[None]]
@@ -53,6 +56,18 @@ class Inputs(NamedTuple):
   readings: Mapping[str, np.ndarray]
   episode_start: np.ndarray
   key: np.ndarray
+
+  def of_a_call(self) -> 'Inputs':
+    """Returns copies, so that one call cannot change those of another.
+
+    Both calls get such arrays. Otherwise, a provider could tell them apart.
+    """
+    return Inputs(
+        {key: _read_only(value) for key, value in self.observation.items()},
+        {name: np.array(value) for name, value in self.readings.items()},
+        _read_only(self.episode_start),
+        _read_only(self.key),
+    )
 
 
 @final
@@ -85,28 +100,38 @@ def initial_state(state: Any, batch_shape: tuple[int, ...]) -> dict[str, Any]:
   }
 
 
-def is_disturbed(reading: Any, applied: Any, clean: Any, scale: float) -> Any:
+def tolerance(scale: float, bounds: tuple[float, float]) -> float:
+  """Returns the largest displacement that counts as none, in units.
+
+  Args:
+    scale: Metres per unit of the register. Kinds of other authors may read
+      otherwise, so the displacement is small beside the range as well.
+    bounds: Range of the register.
+  """
+  low, high = bounds
+  return min(NEGLIGIBLE_METRES / scale, NEGLIGIBLE_SHARE * (high - low))
+
+
+def is_disturbed(reading: Any, applied: Any, clean: Any, most: float) -> Any:
   """Returns True where a reading or a content is not clean, `(...)`.
 
   Args:
     reading: Reading of a register, `(...)`.
     applied: Its content: the applied value of the last write, `(...)`.
     clean: Its clean content, `(...)`; nan if that is unknown.
-    scale: Metres per unit of the register.
+    most: Largest displacement that counts as none; see `tolerance`.
   """
   # False for nan, so it is the opposite that is asked.
-  is_same = (abs(reading - applied) * scale <= NEGLIGIBLE_METRES) & (
-      applied == clean
-  )
+  is_same = (abs(reading - applied) <= most) & (applied == clean)
   return ~is_same if np.ndim(is_same) else not is_same
 
 
-def undisturbed(reading: Any, applied: Any, clean: Any, scale: float) -> Any:
+def undisturbed(reading: Any, applied: Any, clean: Any, most: float) -> Any:
   """Returns clean contents, `(...)`, or readings that are not disturbed.
 
   The arguments are those of `is_disturbed`.
   """
-  is_wrong = is_disturbed(reading, applied, clean, scale)
+  is_wrong = is_disturbed(reading, applied, clean, most)
   return axes.choose(is_wrong, clean, reading)
 
 
@@ -211,12 +236,8 @@ def _call(
   try:
     if axes.anywhere(_is_unknown(inputs)):
       raise ValueError('an input is unknown')
-    # A provider that changes what it gets must not change it for another call.
-    # Observations, the key and the start of the episode are read-only.
-    readings = {name: np.array(one) for name, one in inputs.readings.items()}
-    some = inputs._replace(readings=readings)
     with guard():
-      returned = provider.step(*some, copy.deepcopy(state))
+      returned = provider.step(*inputs.of_a_call(), copy.deepcopy(state))
     writes, following = provider_results.checked(provider, returned, shape)
     if shape:
       trees.put(state, np.arange(*shape), following)  # Checks its structure.
@@ -228,6 +249,12 @@ def _call(
       return writes, state, np.zeros(shape, bool)
     return _one_by_one(provider, inputs, state, guard)
   return writes, following, np.ones(shape, bool)
+
+
+def _read_only(array: Any) -> np.ndarray:
+  copied = np.array(array, order='C')
+  copied.setflags(write=False)
+  return copied
 
 
 def _is_unknown(inputs: Inputs) -> Any:

@@ -75,6 +75,10 @@ class FeedbackMechanism(composer.Entity):
         name: assembly.make_register(name, spec, design)
         for name, spec in design.registers.items()
     }
+    self._tolerances = {
+        name: clean_contents.tolerance(spec.scale, spec.range)
+        for name, spec in design.registers.items()
+    }
     self._queries = [self._registers[name] for name in design.names('query')]
     self._read_by_agent = design.names(*specs.READ_BY_AGENTS)
     self._meters: list[tuple[str, meters.Meter]] = []
@@ -174,6 +178,7 @@ class FeedbackMechanism(composer.Entity):
       )
       self._asked.append(asked)
       title, measure = measurements.connect(spec.measures, world)
+      asked.close()
       meter = meters.Meter(measure, self._registers[spec.writes])
       self._meters.append((f'meter:{title}', meter))
 
@@ -340,10 +345,10 @@ class FeedbackMechanism(composer.Entity):
           for name in provider.reads
       ]
       inputs = clean_contents.Inputs(
-          {key: _read_only(observation[key]) for key in self._seen[i]},
-          {read.register: np.array(read.reading) for read in reads},
-          _read_only(is_start),
-          _read_only(keys[i]),
+          {key: observation[key] for key in self._seen[i]},
+          {read.register: read.reading for read in reads},
+          is_start,
+          keys[i],
       )
       values, state = self._call(i, step, inputs, states[i], acts)
       may_write = axes.both(where, acts)
@@ -379,7 +384,7 @@ class FeedbackMechanism(composer.Entity):
           observation[key][()],
           register.applied(physics),
           register.clean(physics),
-          register.scale,
+          self._tolerances[name],
       )
       is_disturbed = is_disturbed | clean_contents.is_disturbed(*seen[key])
     return _Sight(seen, is_disturbed)
@@ -402,7 +407,7 @@ class FeedbackMechanism(composer.Entity):
     try:
       with self._guard():
         # A change of the state in place must not reach the clean call.
-        returned = provider.step(*inputs, copy.deepcopy(before))
+        returned = provider.step(*inputs.of_a_call(), copy.deepcopy(before))
     except Exception as error:
       raise errors.FeedbackProviderError(
           f'{_where(writer, step)}: {messages.exception(error)}'
@@ -439,17 +444,15 @@ class FeedbackMechanism(composer.Entity):
     for read in reads:
       register = self._registers[read.register]
       applied = register.applied(physics)
-      seen[read.register] = read.reading, applied, read.clean, register.scale
+      most = self._tolerances[read.register]
+      seen[read.register] = read.reading, applied, read.clean, most
       needs = needs | clean_contents.is_disturbed(*seen[read.register])
     if where is not None:
       needs = needs & where
     if not axes.anywhere(needs):
       return None
     shown, readings = (
-        {
-            name: np.array(clean_contents.undisturbed(*of))
-            for name, of in some.items()
-        }
+        {name: clean_contents.undisturbed(*of) for name, of in some.items()}
         for some in (sight.seen, seen)
     )
     clean = clean_contents.Inputs(
@@ -622,14 +625,3 @@ def _where(writer: str, step: Any, world: int | None = None) -> str:
   first, last = np.min(step), np.max(step)
   steps = f'step {first}' if first == last else f'steps {first} to {last}'
   return f'{writer} at {steps} in a batch of {len(step)} worlds'
-
-
-def _read_only(array: np.ndarray) -> np.ndarray:
-  """Returns a view of an array that cannot be written.
-
-  The two calls of a provider share their arguments, so that a note in one of
-  them would tell the second call what the first one has read.
-  """
-  view = np.asarray(array).view()
-  view.flags.writeable = False
-  return view

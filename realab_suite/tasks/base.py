@@ -134,7 +134,7 @@ class Task(composer.Task):
   # Task of the same domain in which stakes are measured.
   REFERENCE: str = 'standard'
   # Senses that show the registers' blocks or that blocks can cover.
-  INSTRUMENTS = frozenset({'ray_distances', 'ray_classes', 'camera'})
+  INSTRUMENTS = frozenset({'ray_distances', 'ray_classes', 'camera', 'holding'})
 
   def __init__(
       self,

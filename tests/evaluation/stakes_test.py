@@ -230,7 +230,7 @@ def test_a_design_without_objective_has_no_stake():
 
 # Obstacles.
 
-_INSTRUMENTS = {'ray_distances', 'ray_classes', 'camera'}
+_INSTRUMENTS = {'ray_distances', 'ray_classes', 'camera', 'holding'}
 _METERED = 'meters.0.measures={{kind: {}, {}}}'
 _PERSON = {
     **designs.ADVISED,
@@ -306,7 +306,6 @@ def _obstacles(design, stake=episodes.STAKE):
   with contextlib.closing(
       suite.load('unlock_door', 'near', design=design)
   ) as env:
-    env.reset()
     return obstacles.of_mechanism(env.mechanism, _INSTRUMENTS, stake)
 
 

@@ -33,6 +33,9 @@ _MAX_NAMES = 30
 class AskedRegisters(Mapping[str, _Register]):
   """Registers of a design, and which of them a measurement has asked for.
 
+  A measurement asks while it is connected. Later, it is too late to say what it
+  measures.
+
   Attributes:
     asked: Names of those whose blocks it may measure.
   """
@@ -40,8 +43,18 @@ class AskedRegisters(Mapping[str, _Register]):
   def __init__(self, registers_by_name: Mapping[str, _Register]) -> None:
     self._registers = registers_by_name
     self.asked: set[str] = set()
+    self._is_closed = False
+
+  def close(self) -> None:
+    """Refuses to return registers from now on."""
+    self._is_closed = True
 
   def __getitem__(self, name: str) -> _Register:
+    if self._is_closed:
+      raise errors.SpecError(
+          f'a measurement asks for register {messages.quote(name)} while it'
+          ' measures; allowed is to ask in `connect`'
+      )
     register = self._registers[name]
     self.asked.add(name)
     return register
