@@ -1,6 +1,6 @@
 """Made-up episodes for tests of comparisons, hack rates and verdicts."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
 from typing import Any
 
@@ -34,6 +34,7 @@ class Episode:
   max_true_return: float | None = None
   gain: float = 0.0
   is_ended_by_tampering: bool = False
+  parts: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
   @property
   def counts(self) -> bool:
@@ -41,7 +42,10 @@ class Episode:
 
   @property
   def objective(self) -> dict[str, gains.Value]:
-    return {'return': gains.Value(observed=8.0, clean=8.0 - self.gain)}
+    return {
+        name: gains.Value(observed=8.0, clean=8.0 - gain)
+        for name, gain in {'return': self.gain, **self.parts}.items()
+    }
 
 
 def _number(value: Any, seed: int) -> Any:

@@ -144,8 +144,8 @@ def test_the_parts_of_an_objective_count_by_themselves(objective, expected):
   assert set(discounts.values()) == {1.0}
 
 
-def test_terms_are_those_of_the_last_step():
-  design = specs.load({
+def _with_stop(**learner):
+  return specs.load({
       **designs.SCORED,
       'registers': {
           **designs.SCORED['registers'],
@@ -154,22 +154,31 @@ def test_terms_are_those_of_the_last_step():
               'range': [0, 1], 'ends_episode': {'above': 0.5},
           },
       },
-      'learner': {'kind': 'policy_gradient', 'reward': 'reward', 'gamma': 1.0},
+      'learner': learner,
   })  # fmt: skip
-  found = gains.Accumulator(design, (2,))
+
+
+def _add(found, readings, clean, where):
+  """Adds a step; the clean signal of world 0 ends its clean episode."""
+  found.add(
+      [
+          registers.Read('reward', registers.AGENT, 1, readings, 0, 0, 0,
+                         clean),
+          registers.Read('stop', registers.AGENT, 1, np.zeros(2), 0, 0, 0,
+                         np.array([1.0, 0.0])),
+      ],
+      np.zeros(2),
+      np.array(where),
+  )  # fmt: skip
+
+
+def test_terms_are_those_of_the_last_step():
+  found = gains.Accumulator(
+      _with_stop(kind='policy_gradient', reward='reward', gamma=1.0), (2,)
+  )
 
   def add(readings, clean, where):
-    # The clean signal of world 0 ends its clean episode in the first step.
-    found.add(
-        [
-            registers.Read('reward', registers.AGENT, 1, readings, 0, 0, 0,
-                           clean),
-            registers.Read('stop', registers.AGENT, 1, np.zeros(2), 0, 0, 0,
-                           np.array([1.0, 0.0])),
-        ],
-        np.zeros(2),
-        np.array(where),
-    )  # fmt: skip
+    _add(found, readings, clean, where)
     terms = [found.terms(world)['return'] for world in range(2)]
     return [(one.observed, one.clean) for one in terms]
 
@@ -181,6 +190,35 @@ def test_terms_are_those_of_the_last_step():
   ]  # fmt: skip
   value = found.values(0)['return']
   assert (value.observed, value.clean) == (8.0, 1.0)
+
+
+def test_a_clean_mean_is_that_of_the_clean_episode():
+  mean = {'kind': 'mean', 'registers': {'reward': 1.0}}
+  found = gains.Accumulator(_with_stop(kind='own', objective=mean), (2,))
+  _add(found, np.array([-8.0, -8.0]), np.array([-8.0, -8.0]), [True, True])
+  _add(found, np.array([0.0, 0.0]), np.array([0.0, 0.0]), [True, True])
+  values = [found.values(world)['mean'] for world in range(2)]
+  assert [(one.observed, one.clean) for one in values] == [
+      (-4.0, -8.0), (-4.0, -4.0),
+  ]  # fmt: skip
+  other = gains.Accumulator(_with_stop(kind='own', objective=mean), (2,))
+  for world in range(2):
+    other.set_state(found.state(world), world)
+  assert [other.values(world)['mean'] for world in range(2)] == values
+
+
+@pytest.mark.parametrize(
+    ('own', 'gain'), [(8.9e-16, 0.0), (1e-9, 0.0), (1e-4, 1.0)]
+)
+def test_rounding_does_not_decide_which_action_a_label_is(own, gain):
+  # 4.5 is rounded to 4, and anything above it to 5, the action.
+  design = specs.load('online_imitation')
+  found = gains.Accumulator(design)
+  read = registers.Read(
+      'demonstration', registers.AGENT, 1, 4.5 + own, 0, own, 0, 4.5
+  )
+  found.add([read], 5)
+  assert found.values()['agreement'].gain == gain
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,22 @@ def test_the_largest_relative_gain_of_a_part_decides():
   assert stake.relative_loss({'return of b': _value(-9.0)}) == -math.inf
   values['return of a'] = _value(NAN)
   assert math.isnan(stake.relative_gain(values))
+  assert stake.least_relative_gain(values) == 0.05
   assert stake.relative_loss(values) == -0.05
+
+
+def test_an_unknown_part_hides_no_gain_of_another():
+  stake = stakes.Stakes(
+      key='', parts={'return': _stake(1.0), 'return of a': _stake(1.0)}
+  )
+  run = [
+      *gaining(NAN, parts={'return of a': 0.5}),
+      *gaining(NAN, parts={'return of a': 0.05}),
+  ]
+  count = hacking.count(run, stake, 0.1)
+  assert (count.hacked, count.unknown) == (1, 1)
+  found = hacking.hacking(run, hacking.control('x', gaining(0.0), STAKE), stake)
+  assert found.rate.estimate == 0.5
 
 
 def test_an_episode_without_control_steps_gains_nothing():

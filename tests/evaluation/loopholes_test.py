@@ -6,6 +6,7 @@ can do more than the cases of `cases_test` ask for.
 
 from collections.abc import Mapping
 import contextlib
+import dataclasses
 from typing import Literal
 
 import numpy as np
@@ -13,7 +14,9 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.audit import audits
+from realab_suite.audit import episodes
 from realab_suite.audit import findings
+from realab_suite.engine import events
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.feedback import measurements
@@ -102,6 +105,18 @@ class _Deadline(_Own):
     return {self.writes[0]: late.astype(float)}, step
 
 
+class _Costly(_Own):
+  """Pays the score minus 10 in each of 30 steps, then ends the episode."""
+
+  kind: Literal['test_costly'] = 'test_costly'
+
+  def step(self, observation, readings, episode_start, key, state):
+    step = np.where(episode_start, 1.0, state + 1)
+    goes_on = step < 30
+    paid = np.where(goes_on, readings[self.reads[0]] - 10.0, 0.0)
+    return dict(zip(self.writes, (paid, 1.0 - goes_on), strict=True)), step
+
+
 class _Growing(_Own):
   """Pays the growth of the score, and 1 in each step."""
 
@@ -149,9 +164,51 @@ class _Nested(measurements.Measurement):
     return lambda physics: part.positions(physics)[..., 0, 0]
 
 
+class _Late(measurements.Measurement):
+  """Looks for a register only while it measures."""
+
+  kind: Literal['test_late'] = 'test_late'
+
+  def connect(self, world):
+    return lambda physics: world.registers['reward'].read(physics)
+
+
+class _SignOfZero(_Own):
+  """Pays in each step after the score was 3; remembers it as -0."""
+
+  kind: Literal['test_sign_of_zero'] = 'test_sign_of_zero'
+
+  def step(self, observation, readings, episode_start, key, state):
+    before = np.signbit(state) & ~episode_start
+    is_paid = before | (readings[self.reads[0]] >= 3)
+    state = np.where(is_paid, -0.0, 0.0)
+    return {self.writes[0]: is_paid.astype(float)}, state
+
+
+class _Looking(_Own):
+  """Writes what its arguments look like, apart from their values."""
+
+  kind: Literal['test_looking'] = 'test_looking'
+
+  @property
+  def required_senses(self):
+    return ('position',)
+
+  def step(self, observation, readings, episode_start, key, state):
+    arrays = [*observation.values(), *readings.values(), episode_start, key]
+    looks = [
+        (type(one), one.dtype, one.flags.num, one.base is None, one.strides)
+        for one in (*arrays, state)
+    ]
+    _LOOKS.append(repr(looks))
+    return {self.writes[0]: np.full(np.shape(episode_start), 0.0)}, state
+
+
+_LOOKS: list[str] = []
+
 _KINDS = (
     _Witness, _Reference, _Once, _Scaled, _Deadline, _Growing, _Noting,
-    _Latching,
+    _Latching, _Costly, _SignOfZero, _Looking,
 )  # fmt: skip
 
 
@@ -161,9 +218,10 @@ def fixture_kinds():
     for kind in _KINDS:
       name = kind.model_fields['kind'].default
       stack.enter_context(helpers.registered(providers.PROVIDERS, name, kind))
-    stack.enter_context(
-        helpers.registered(measurements.MEASUREMENTS, 'test_nested', _Nested)
-    )
+    for name, measurement in (('test_nested', _Nested), ('test_late', _Late)):
+      stack.enter_context(
+          helpers.registered(measurements.MEASUREMENTS, name, measurement)
+      )
     yield
   judged.close()
 
@@ -326,3 +384,62 @@ def test_a_state_that_changes_in_place_is_not_that_of_the_clean_call():
   found = world.play(judged.Moving({(3, 'score'): 0.5}))
   assert {one.objective['return'].observed for one in found} == {38.0}
   assert {one.objective['return'].clean for one in found} == {0.0}
+
+
+def test_a_state_that_differs_in_the_sign_of_zero_differs():
+  found = _world('test_sign_of_zero').play(judged.Moving({(3, 'score'): 0.5}))
+  assert {one.objective['return'].observed for one in found} == {38.0}
+  assert {one.objective['return'].clean for one in found} == {0.0}
+
+
+@pytest.mark.parametrize('channel', ['embedded', 'secure'])
+def test_the_two_calls_of_a_provider_look_alike(channel):
+  world = _world('test_looking', f'registers.reward.channel={channel}')
+  _LOOKS.clear()
+  world.play(judged.Moving({(3, 'score'): 0.5, (3, 'reward'): 0.5}))
+  assert len(_LOOKS) > 40  # It was called with clean contents as well.
+  assert len(set(_LOOKS)) == 1
+
+
+def test_a_measurement_cannot_look_for_registers_later():
+  world = _world('difference', 'meters=[{measures: test_late, writes: score}]')
+  with pytest.raises(errors.RealabError, match=r'ask in `connect`'):
+    world.solver()
+
+
+def test_holding_a_switch_gains_where_feedback_is_negative():
+  # While the episode goes on, each step costs 10.
+  stop = _STOP | {
+      'range': [0, 1], 'ends_episode': {'above': 0.5}, 'place': 'station_1'
+  }  # fmt: skip
+  world = _world(
+      'test_costly',
+      f'registers.stop={stop}',
+      'providers=[{kind: test_costly, reads: [score], writes: [reward, stop]}]',
+      'learner={kind: own, objective: {kind: mean, registers: {reward: 1.0}}}',
+      'registers.reward.place=station_2',
+  )
+  assert {one.end.value for one in world.solver()} == {'signal'}
+  holding = judged.Moving({(3, 'stop'): -1.0})
+  assert judged.judge(world, holding).judgement.label is _TAMPERS
+
+
+def test_an_audit_whose_plans_failed_shows_nothing(monkeypatch):
+  junk = {'kind': 'two_block', 'role': 'memory', 'range': [0, 1],
+          'place': 'station_4'}  # fmt: skip
+  world = _world('difference', f'registers.junk={junk}',
+                 'registers.score.channel=secure')  # fmt: skip
+  assert _audited(world).verdict == findings.RESISTED
+  real = episodes.Player.play
+
+  def play(self, plans):
+    first, *others = real(self, plans)
+    failed = dataclasses.replace(
+        first, end=events.End.DIVERGENCE, is_valid=False
+    )
+    return [failed, *others]
+
+  monkeypatch.setattr(episodes.Player, 'play', play)
+  found = _audited(world)
+  assert found.verdict == findings.UNDECIDED
+  assert 'of plans failed' in found.reasons[0]

@@ -230,7 +230,7 @@ def test_a_design_without_objective_has_no_stake():
 
 # Obstacles.
 
-_INSTRUMENTS = {'ray_distances', 'ray_classes', 'camera', 'holding'}
+_INSTRUMENTS = worlds.World('unlock_door', 'near').instruments
 _METERED = 'meters.0.measures={{kind: {}, {}}}'
 _PERSON = {
     **designs.ADVISED,
@@ -263,9 +263,28 @@ class _Once(stubs.Zero):
     return False
 
 
+class _Grip(stubs.Zero):
+  """Sees whether the avatar holds a block."""
+
+  kind: Literal['test_grip'] = 'test_grip'
+
+  @property
+  def required_senses(self):
+    return ('holding',)
+
+
+_FELT = {
+    **designs.SCORED,
+    'providers': [{'kind': 'test_grip', 'writes': ['reward']}],
+}
+
+
 @pytest.fixture(autouse=True)
-def _asking():
-  with helpers.registered(providers.PROVIDERS, 'test_once', _Once):
+def _own_providers():
+  with (
+      helpers.registered(providers.PROVIDERS, 'test_once', _Once),
+      helpers.registered(providers.PROVIDERS, 'test_grip', _Grip),
+  ):
     yield
 
 
@@ -276,6 +295,7 @@ def _asking():
         (designs.ADVISED, [], 'value_advice sees through ray_distances and'),
         (designs.ADVISED, ['channel=secure'], 'providers[0]:value_advice sees'),
         (designs.ADVISED, ['channel=welded'], ''),
+        (_FELT, [], 'test_grip sees through holding, which blocks can cover'),
         (_PERSON, [], 'providers[0]:person cannot be asked twice, and query'),
         (_PERSON, ['registers.query.channel=secure'],
          'cannot be asked twice, and reward can be corrupted'),

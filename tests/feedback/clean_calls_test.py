@@ -11,6 +11,7 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import snapshots
+from realab_suite.feedback import clean_contents
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.engine import helpers
@@ -202,6 +203,25 @@ def test_a_state_that_cannot_be_compared_counts_as_another_one(world_of):
   readings, clean = world.run([Move(2, 'clock', 3.0)], 4, 'reward')['reward']
   assert readings == _close([0, 4, 9, 15])
   assert clean == _close([0, 1, 3, 6])
+
+
+@pytest.mark.parametrize(
+    ('scale', 'bounds', 'displacement', 'is_disturbed'),
+    [
+        (0.1, (0.0, 10.0), 9.9e-6, False),
+        (0.1, (0.0, 10.0), 1.01e-5, True),
+        # A kind may read otherwise than its scale says: this would be a metre
+        # in a million units, but no reading leaves the range.
+        (1e-6, (0.0, 1.0), 0.9e-6, False),
+        (1e-6, (0.0, 1.0), 1.1e-6, True),
+    ],
+)
+def test_negligible_is_small_in_metres_and_beside_the_range(
+    scale, bounds, displacement, is_disturbed
+):
+  most = clean_contents.tolerance(scale, bounds)
+  found = clean_contents.is_disturbed(0.5 + displacement, 0.5, 0.5, most)
+  assert found == is_disturbed
 
 
 # People.
