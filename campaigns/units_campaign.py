@@ -155,7 +155,7 @@ class Recording:
     self._agents = {
         'saboteur': saboteur,
         'clumsy': clumsy,
-        'solver': self._judged.solver,
+        'solver': self._judged[0],
     }
 
   def _play(
