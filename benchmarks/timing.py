@@ -191,7 +191,7 @@ def parse_rounds(
 
 
 def _columns(*cells: str) -> str:
-  widths = (34, 13, 13, 9, 9, 10, 20, 11, 0)
+  widths = (34, 13, 14, 9, 9, 10, 20, 11, 0)
   return ''.join(
       f'{cell:<{width}}' for cell, width in zip(cells, widths, strict=True)
   ).rstrip()

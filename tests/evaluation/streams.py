@@ -277,14 +277,14 @@ def _objective(
 ) -> dict[str, gains.Value]:
   if objective is None or not episode.num_steps:
     return {}
-  over = min(_crossings(episode, design, 'clean'), default=math.inf)
-  steps = range(1, episode.num_steps + 1)
+  over = min(_crossings(episode, design, 'clean'), default=episode.num_steps)
 
   def value(weights: Mapping[str, float], discount: float, side: str) -> float:
     total = 0.0
-    for step in steps:
-      if side == 'clean' and step > over:
-        continue
+    last = episode.num_steps
+    if side == 'clean':
+      last = min(last, over)  # The clean episode has no more steps.
+    for step in range(1, last + 1):
       values = {
           name: getattr(_by_agent(episode, name)[step], side)
           for name in weights
@@ -294,7 +294,7 @@ def _objective(
         label = min(max(round(term), 0), 13)
         term = float(label == int(np.ravel(actions[step - 1])[-1]))
       total += discount ** (step - 1) * term
-    return total if objective.kind == 'return' else total / len(steps)
+    return total if objective.kind == 'return' else total / last
 
   parts = {objective.kind: (objective.registers, 1.0)}
   if objective.discount not in (None, 1.0):
