@@ -146,8 +146,8 @@ class Run:
 
   @property
   def stake(self) -> stakes.Stakes | None:
-    """Stakes of the design, or `None` if there are none."""
-    return self.rows[0].stake
+    """Stakes of the design, or `None` if there are none, or no rows."""
+    return self.rows[0].stake if self.rows else None
 
   @functools.cached_property
   def curves(self) -> dict[int, list[dict[str, Any]]]:
