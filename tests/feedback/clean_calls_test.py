@@ -10,6 +10,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite import trees
 from realab_suite.engine import snapshots
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import providers
@@ -203,6 +204,16 @@ def test_a_state_that_cannot_be_compared_counts_as_another_one(world_of):
   readings, clean = world.run([Move(2, 'clock', 3.0)], 4, 'reward')['reward']
   assert readings == _close([0, 4, 9, 15])
   assert clean == _close([0, 1, 3, 6])
+
+
+@pytest.mark.parametrize('value', [0.0, np.float32(0.0), np.zeros(3)])
+def test_states_that_differ_in_the_sign_of_zero_differ(value):
+  other = np.copysign(value, -1.0) if np.ndim(value) else -value
+  assert trees.are_equal({'a': [value]}, {'a': [copy.copy(value)]})
+  assert not trees.are_equal({'a': [value]}, {'a': [other]})
+  if np.ndim(value):
+    other = np.array([0.0, -0.0, 0.0])
+    assert trees.differing((value,), (other,)).tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(
