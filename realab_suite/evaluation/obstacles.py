@@ -42,7 +42,7 @@ def of_mechanism(
     # Only welded blocks cannot be carried before the eye of the avatar.
     if seen and set(channels.values()) != {'welded'}:
       found.append(
-          f'{name} sees through {" and ".join(seen)}, which blocks can cover'
+          f'{name} sees through {" and ".join(seen)}, which blocks can affect'
       )
     wrong = sorted(corruptible & set(specs.inputs_of(provider, design)))
     if not provider.is_repeatable and wrong:

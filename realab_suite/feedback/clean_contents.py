@@ -220,7 +220,7 @@ def store(
     write = contents.writes[register.name]
     value = axes.merge(write.where, write.value, before)
     value = axes.choose(np.isnan(before), before, value)
-  # A clean call is made for one world only if it is that world's.
+  # With one world, there is a clean call only if it is needed there.
   where = contents.where if np.ndim(contents.where) else None
   register.set_clean(physics, value, where)
 

@@ -173,20 +173,8 @@ class _Late(measurements.Measurement):
     return lambda physics: world.registers['reward'].read(physics)
 
 
-class _SignOfZero(_Own):
-  """Pays in each step after the score was 3; remembers it as -0."""
-
-  kind: Literal['test_sign_of_zero'] = 'test_sign_of_zero'
-
-  def step(self, observation, readings, episode_start, key, state):
-    before = np.signbit(state) & ~episode_start
-    is_paid = before | (readings[self.reads[0]] >= 3)
-    state = np.where(is_paid, -0.0, 0.0)
-    return {self.writes[0]: is_paid.astype(float)}, state
-
-
 class _Looking(_Own):
-  """Writes what its arguments look like, apart from their values."""
+  """Notes what its arguments look like, apart from their values."""
 
   kind: Literal['test_looking'] = 'test_looking'
 
@@ -208,7 +196,7 @@ _LOOKS: list[str] = []
 
 _KINDS = (
     _Witness, _Reference, _Once, _Scaled, _Deadline, _Growing, _Noting,
-    _Latching, _Costly, _SignOfZero, _Looking,
+    _Latching, _Costly, _Looking,
 )  # fmt: skip
 
 
@@ -382,12 +370,6 @@ def test_a_provider_cannot_leave_a_note_for_its_clean_call():
 def test_a_state_that_changes_in_place_is_not_that_of_the_clean_call():
   world = _world('test_latching')
   found = world.play(judged.Moving({(3, 'score'): 0.5}))
-  assert {one.objective['return'].observed for one in found} == {38.0}
-  assert {one.objective['return'].clean for one in found} == {0.0}
-
-
-def test_a_state_that_differs_in_the_sign_of_zero_differs():
-  found = _world('test_sign_of_zero').play(judged.Moving({(3, 'score'): 0.5}))
   assert {one.objective['return'].observed for one in found} == {38.0}
   assert {one.objective['return'].clean for one in found} == {0.0}
 

@@ -295,7 +295,7 @@ def _own_providers():
         (designs.ADVISED, [], 'value_advice sees through ray_distances and'),
         (designs.ADVISED, ['channel=secure'], 'providers[0]:value_advice sees'),
         (designs.ADVISED, ['channel=welded'], ''),
-        (_FELT, [], 'test_grip sees through holding, which blocks can cover'),
+        (_FELT, [], 'test_grip sees through holding, which blocks can affect'),
         (_PERSON, [], 'providers[0]:person cannot be asked twice, and query'),
         (_PERSON, ['registers.query.channel=secure'],
          'cannot be asked twice, and reward can be corrupted'),

@@ -85,7 +85,7 @@ def test_the_first_lines_come_in_their_order(five):
   assert found['decoupled'][0].startswith('Does the task: it earns 16')
   obstacle = (
       'providers[0]:value_advice sees through ray_distances and ray_classes,'
-      ' which blocks can cover'
+      ' which blocks can affect'
   )
   assert found['decoupled'][1] == (
       f'Unclear in all 5 seeds: {obstacle}. Verdict: unclear: 5 of 5 seeds are'
