@@ -144,7 +144,7 @@ def _note(track: tracking.Track) -> str:
   if track.true_rewards and track.true_rewards[-1] >= _LARGE_APPLE:
     return 'takes the large apple: the episode ends'
   reward = track.registers['reward']
-  error = reward.reading[-1] - reward.applied[-1]
+  error = reward.reading[-1] - reward.clean[-1]
   if abs(error) < 0.5:
     return ''
   side = 'high' if error > 0 else 'low'

@@ -46,7 +46,6 @@ class RegisterTrack:
   Attributes:
     role: Role of the register.
     half_size: Half the edge length of a block, in metres.
-    requested: Requested values.
     applied: Applied values.
     reading: Readings.
     clean: Clean contents.
@@ -59,7 +58,6 @@ class RegisterTrack:
 
   role: str
   half_size: float
-  requested: list[float] = dataclasses.field(default_factory=list)
   applied: list[float] = dataclasses.field(default_factory=list)
   reading: list[float] = dataclasses.field(default_factory=list)
   clean: list[float] = dataclasses.field(default_factory=list)
@@ -67,7 +65,7 @@ class RegisterTrack:
   permanent: list[float] = dataclasses.field(default_factory=list)
   temporary: list[float] = dataclasses.field(default_factory=list)
   blocks: list[np.ndarray] = dataclasses.field(default_factory=list)
-  _written: tuple[float, float] = (math.nan, math.nan)
+  _applied: float = math.nan
 
   def add(self, records: events.Records, blocks: np.ndarray) -> None:
     """Adds a step.
@@ -79,19 +77,18 @@ class RegisterTrack:
     read: tuple[float, ...] | None = None
     for record in records:
       if isinstance(record, registers.Write):
-        self._written = (float(record.requested), float(record.applied))
+        self._applied = float(record.applied)
       else:
         read = (
-            *self._written,
+            self._applied,
             float(record.reading),
             float(record.clean),
             float(record.obstruction),
             float(record.permanent),
             float(record.temporary),
         )
-    values = read or (*self._written, *[math.nan] * 5)
+    values = read or (self._applied, *[math.nan] * 5)
     lists = (
-        self.requested,
         self.applied,
         self.reading,
         self.clean,

@@ -38,7 +38,7 @@ _CODECS: dict[str, tuple[str, dict[str, str]]] = {
 _BACKGROUND = (24, 28, 36)
 _PLAIN = (235, 238, 242)
 _FAINT = (150, 158, 170)
-_WRITTEN = (120, 190, 255)
+_CLEAN = (120, 190, 255)
 _READ = (255, 160, 40)
 _MARGIN = 12
 _HEADER = 60
@@ -173,7 +173,7 @@ def last_frame(path: str | os.PathLike[str]) -> bytes:
 
 
 def draw_strip(title: str, track: tracking.Track, width: int) -> np.ndarray:
-  """Draws returns, written values and readings, as `(height, width, 3)`."""
+  """Draws returns, clean contents and readings, as `(height, width, 3)`."""
   feedback = track.feedback
   image = Image.new(
       'RGB', (width, _HEADER + _LANE * len(feedback)), _BACKGROUND
@@ -185,7 +185,7 @@ def draw_strip(title: str, track: tracking.Track, width: int) -> np.ndarray:
       anchor='ra',
   )  # fmt: skip
   true_return = f'true return {track.true_return:.1f}'
-  _write(draw, (_MARGIN, 34), true_return, _WRITTEN, _LARGE)
+  _write(draw, (_MARGIN, 34), true_return, _CLEAN, _LARGE)
   observed = f'observed return {track.observed_return:.1f}'
   _write(draw, (width - _MARGIN, 34), observed, _READ, _LARGE, anchor='ra')
   for i, (name, register) in enumerate(feedback.items()):
@@ -202,10 +202,10 @@ def _draw_lane(
     width: int,
 ) -> None:
   """Draws the values of one register, as numbers and as curves."""
-  written, read = np.array(register.requested), np.array(register.reading)
+  clean, read = np.array(register.clean), np.array(register.reading)
   _write(draw, (_MARGIN, top), name, _FAINT, _SMALL)
   for line, (label, values, colour) in enumerate(
-      (('written', written, _WRITTEN), ('read', read, _READ)), start=1
+      (('clean', clean, _CLEAN), ('read', read, _READ)), start=1
   ):
     y = top + 20 * line
     _write(draw, (_MARGIN, y), label, colour, _SMALL)
@@ -213,7 +213,7 @@ def _draw_lane(
         draw, (_LABELS - 20, y), f'{values[-1]:.2f}', colour, _SMALL,
         anchor='ra',
     )  # fmt: skip
-  both = np.concatenate([written, read, [0.0]])
+  both = np.concatenate([clean, read, [0.0]])
   low, high = np.nanmin(both), np.nanmax(both)
   lowest, highest = top + _LANE - 14, top + 6
   length = max(track.max_steps or track.num_steps, 1)
@@ -227,7 +227,7 @@ def _draw_lane(
 
   zero = curve(np.zeros_like(read))[0][1]
   draw.line([(_LABELS, zero), (width - _MARGIN, zero)], fill=(70, 78, 92))
-  draw.line(curve(written), fill=_WRITTEN, width=4)
+  draw.line(curve(clean), fill=_CLEAN, width=4)
   draw.line(curve(read), fill=_READ, width=2)
 
 

@@ -100,7 +100,7 @@ def draw_trajectories(
 def draw_time_line(
     tracks: Mapping[str, tracking.Track], path: str | os.PathLike[str]
 ) -> None:
-  """Draws the values written to registers and their readings over time.
+  """Draws clean contents, written values and readings of registers over time.
 
   Args:
     tracks: A track per run, all with the same registers, at least one.
@@ -223,13 +223,13 @@ def _draw_values(
   ax.fill_between(
       times, repaired, reading, color=_SKY_BLUE, alpha=0.55, linewidth=0
   )
-  ax.plot(times, register.requested, color='0.6', linewidth=4.0)
+  ax.plot(times, register.clean, color='0.6', linewidth=4.0)
   ax.plot(times, applied, color=_INK, linewidth=1.2)
   ax.plot(times, reading, color=_VERMILLION, linewidth=1.2, linestyle='--')
   ax.grid(color='0.9')
   ax.set_axisbelow(True)
   ax.margins(x=0.01)
-  ax.set_ylim(_limits([register.requested, register.reading]))
+  ax.set_ylim(_limits([register.clean, register.applied, register.reading]))
   for side in ('top', 'right'):
     ax.spines[side].set_visible(False)
 
@@ -275,7 +275,7 @@ def _marker(marker: str, label: str, **options: Any) -> lines.Line2D:
 
 def _value_legend() -> list[Any]:
   return [
-      lines.Line2D([], [], color='0.6', linewidth=4.0, label='requested'),
+      lines.Line2D([], [], color='0.6', linewidth=4.0, label='clean'),
       lines.Line2D([], [], color=_INK, label='applied'),
       lines.Line2D([], [], color=_VERMILLION, linestyle='--', label='reading'),
       patches.Patch(color=_PURPLE, alpha=0.45, label='obstruction'),

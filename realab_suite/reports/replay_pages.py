@@ -93,6 +93,7 @@ def timeline(
       'registers': {
           name: {
               'role': register.role,
+              'clean': _rounded(register.clean),
               'applied': _rounded(register.applied),
               'reading': _rounded(register.reading),
               **{part: _rounded(getattr(register, part)) for part in _PARTS},

@@ -80,7 +80,6 @@ def test_a_reading_is_paired_with_the_write_before_it():
       nowhere,
   )
   track.add([], nowhere)
-  assert track.requested == [9.0, 9.0, 1.0]
   assert track.applied == [5.0, 5.0, 1.0]
   assert track.reading[1] == 6.5
   assert track.clean[1] == 4.0

@@ -94,6 +94,19 @@ def test_a_strip_shows_what_was_read(track):
   assert (before != after).any()
 
 
+def test_pictures_show_corruption_that_a_meter_passed_on(tmp_path, track):
+  strip = films.draw_strip('run', track, 480)
+  plots.draw_time_line({'run': track}, tmp_path / 'before.png')
+  # Nobody touched the register: its reading is what was written.
+  track.registers['reward'].clean[-1] -= 7.0
+  assert (films.draw_strip('run', track, 480) != strip).any()
+  plots.draw_time_line({'run': track}, tmp_path / 'after.png')
+  before, after = (
+      (tmp_path / name).read_bytes() for name in ('before.png', 'after.png')
+  )
+  assert before != after
+
+
 def test_a_film_of_another_kind_is_refused(tmp_path):
   with pytest.raises(errors.ResultsError, match=r"'\.gif'; allowed.*webp"):
     films.Film(None, tmp_path / 'film.gif', 'run')

@@ -12,6 +12,7 @@ pytest.importorskip('mjviser')
 
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.audit import aiming
 from realab_suite.evaluation import evaluate
 from realab_suite.experiments import tracking
 from realab_suite.reports import html_page
@@ -40,8 +41,24 @@ def test_a_timeline_contains_the_returns_of_the_episode():
       result.observed_return, rel=1e-5
   )
   reward = data['registers']['reward']
-  mean = np.mean(np.abs(reward['permanent']))
+  # A unit of the register is 0.1 m, and the reset is no control step.
+  mean = 0.1 * np.sum(np.abs(reward['permanent'])) / 60
   assert mean == pytest.approx(result.registers['reward'].permanent, rel=1e-4)
+
+
+def test_a_timeline_shows_corruption_that_a_meter_passed_on():
+  env = suite.load(
+      'unlock_door', 'near', {'random': 1}, {'max_steps': 60},
+      design='instantaneous_reward',
+      overrides=['registers.reward.channel=secure'],
+  )  # fmt: skip
+  saboteur = aiming.make_policy('carrying_saboteur', env, 'score', 0)
+  env.rewind()
+  recorder = tracking.Tracker(env)
+  evaluate.evaluate(env, saboteur, 1, first_episode=0, sinks=[recorder])
+  reward = replay_pages.timeline(recorder.track, {})['registers']['reward']
+  assert reward['reading'] == reward['applied']
+  assert reward['reading'] != reward['clean']
 
 
 def test_contacts_name_the_block_that_the_hand_holds():
