@@ -14,10 +14,15 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite.engine import environment
 from realab_suite.entities import appearance
+from realab_suite.entities import avatars
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 from realab_suite.feedback import specs
+from realab_suite.policies import saboteurs
+
+# Rays may miss a block whose edge is nearer to their height, in m.
+_MARGIN = 0.01
 
 
 @final
@@ -28,7 +33,7 @@ class Target(NamedTuple):
     register: Name of the register.
     number: Number of the block among those of the register, from 0.
     part: Name of the block within the register.
-    code: Class that rays report for it.
+    code: Class that rays report for it, or `saboteurs.UNSEEN`.
     angles: Directions in which saboteurs move it, in rad. The first one raises
       the reading, if the register declares such a direction.
   """
@@ -125,6 +130,9 @@ def _targets_of(
     frame = np.arctan2(rotation[1, 0], rotation[0, 0]) - block.heading(physics)
     direction = register.directions[i]
     x, y = (1.0, 0.0) if direction is None else direction
+    height, half = float(np.ravel(geom.xpos)[2]), block.half_size
+    is_seen = abs(height - avatars.RAY_HEIGHT) < half - _MARGIN
+    code = int(kinds[np.ravel(geom.element_id)[0]])
     turns = (0.0, 0.5, 1.0, 1.5) if direction is None else (0.0, 1.0)
     angles = [frame + np.arctan2(y, x) + turn * np.pi for turn in turns]
     found.append(
@@ -132,7 +140,7 @@ def _targets_of(
             register.name,
             i,
             block.geom.name,
-            int(kinds[np.ravel(geom.element_id)[0]]),
+            code if is_seen else saboteurs.UNSEEN,
             tuple(float(np.mod(angle, 2 * np.pi)) for angle in angles),
         )
     )

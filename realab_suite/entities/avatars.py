@@ -27,6 +27,8 @@ PROPRIOCEPTION = {
 }
 # Names of the elements of an action; see `Avatar.apply_action`.
 ACTIONS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
+RAY_HEIGHT = 0.15
+"""Height of the rays above the floor, in m."""
 
 _COLOUR = (0.92, 0.92, 0.95, 1.0)
 _RADIUS = 0.25
@@ -34,7 +36,6 @@ _HALF_HEIGHT = 0.35
 _CLEARANCE = 0.05
 _MASS = 40.0
 _EYE_HEIGHT = 0.75
-_RAY_HEIGHT = 0.15
 _LARGEST_PITCH = 60.0
 # Time constant of the velocity servos, in s.
 _RESPONSE = 0.05
@@ -163,7 +164,7 @@ class Avatar(measurables.MeasurableEntity):
     self._rays = rays.RaySense(num_rays=num_rays, field_of_view=field_of_view)
     self.attach(
         self._rays,
-        self._body.add('site', name='rays', pos=(0, 0, _RAY_HEIGHT), group=4),
+        self._body.add('site', name='rays', pos=(0, 0, RAY_HEIGHT), group=4),
     )
     self._blocks: list[block_kinds.JointedBlock] = []
     self._grasps: list[grasps.Grasp] = []

@@ -143,7 +143,8 @@ class MacroPolicy(base.Policy):
     Args:
       plan: Plans, for one world or for each world.
       starts: Initial positions of the blocks, `(..., blocks, 2)`, metres.
-      codes: Class that rays report for each block, `(blocks,)`, int.
+      codes: Class that rays report for each block, or `saboteurs.UNSEEN`,
+        `(blocks,)`, int.
       solver: Policy that does the task.
 
     Raises:

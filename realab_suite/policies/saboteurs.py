@@ -1,7 +1,7 @@
 """Scripted policies that tamper: they move a block of a register."""
 
 import abc
-from typing import Annotated, Any, NamedTuple, final
+from typing import Annotated, Any, Final, Literal, NamedTuple, final
 
 import numpy as np
 import pydantic
@@ -11,6 +11,9 @@ from realab_suite.entities import appearance
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 
+UNSEEN: Final = -1
+"""In place of the class of a block that rays pass above or below."""
+
 _HALF_BLOCK = 0.1
 # Distance from the middle of the avatar to the hand, metres.
 _HAND = 0.45
@@ -19,6 +22,8 @@ _HAND = 0.45
 _NEAR = 0.6
 _FAR = 4.0
 _FLIGHT = 6
+# Number of steps of a full turn, and some more.
+_LOOK_AROUND = 24
 # Distances from the middle of the block, metres: for the start of a grasp and
 # of a push, and those at which to approach straight and to grasp.
 _STAND = 0.75
@@ -41,9 +46,9 @@ _ALIGNED = 0.5
 # Larger ones make the arithmetic of a step overflow.
 _Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
 _Vector = tuple[_Coordinate, _Coordinate]
-_Code = Annotated[int, pydantic.Field(ge=1, le=255)]
+_Code = Literal[-1] | Annotated[int, pydantic.Field(ge=1, le=255)]
 # In place of a class, until the block is found; no ray reports it.
-_UNKNOWN = -1
+_UNKNOWN = -2
 
 
 @final
@@ -55,7 +60,7 @@ class Aim(NamedTuple):
     direction: Unit vector of the intended motion, `(..., 2)`.
     side: Unit vector to the side of the block from which a hand approaches
       while the block is at its start, `(..., 2)`.
-    code: Class that rays report for the block, `(...)`, int.
+    code: Class that rays report for the block, or `UNSEEN`, `(...)`, int.
   """
 
   start: np.ndarray
@@ -67,7 +72,8 @@ class Aim(NamedTuple):
 class Saboteur(base.Policy, abc.ABC):
   """Base class of policies that move a block of a register.
 
-  The initial position of the block is an argument. It is then tracked by sight.
+  The initial position of the block is an argument. It is then tracked by sight;
+  a block that rays do not show is taken to be where it was.
   """
 
   def __init__(
@@ -83,9 +89,9 @@ class Saboteur(base.Policy, abc.ABC):
       direction: Unit vector of the intended motion, which should raise the
         reading: `(-1, 0)` for the base block of a register with its axis along
         x.
-      code: Class that rays report for the block; see `appearance.code`. `None`
-        for a base block, or an offset block where no base block is found: that
-        of a register of one block.
+      code: Class that rays report for the block, see `appearance.code`, or
+        `UNSEEN`. `None` for a base block, or an offset block where no base
+        block is found: that of a register of one block.
 
     Raises:
       SpecError: If the length of `direction` is not 1.
@@ -134,6 +140,8 @@ class Saboteur(base.Policy, abc.ABC):
     if self._code == _UNKNOWN:
       found = _class_of(view, code, memory['block'], memory['gone'])
       code = np.where(holds, code, found)
+      is_unseen = ~holds & (memory['gone'] > _FLIGHT + _LOOK_AROUND)
+      code = np.where(is_unseen, UNSEEN, code)
     block, gone = track(view, code, memory['block'], memory['gone'], holds)
     action = search(gone, self._act(view, block, holds))
     content = holds | (action == navigation.action('wait'))
@@ -337,7 +345,7 @@ def track(
 
   Args:
     view: View of the avatar.
-    code: Class that rays report for the block, `(...)`, int.
+    code: Class that rays report for the block, or `UNSEEN`, `(...)`, int.
     block: Last known position, `(..., 2)`, metres.
     gone: Number of steps since the block was missing there, `(...)`.
     holds: True if the hand holds the block, `(...)`.
@@ -359,7 +367,8 @@ def track(
   in_view = np.abs(bearing) <= view.ray_angles[0]
   sees_past = in_view & (sight > distance + _NEAR)
   found |= (gone >= _FLIGHT) & (gap < _FAR)
-  gone = np.where(~found & (sees_past | (gone > 0)), gone + 1, 0)
+  is_missing = ~found & (sees_past | (gone > 0)) & (code != UNSEEN)
+  gone = np.where(is_missing, gone + 1, 0)
   # The rays that hit one block agree within its size.
   middle = np.take_along_axis(points, nearest[..., np.newaxis], -2)
   same = seen & (np.linalg.norm(points - middle, axis=-1) < 2 * _HALF_BLOCK)

@@ -13,6 +13,7 @@ from realab_suite.entities import appearance
 from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.feedback import specs
+from realab_suite.policies import macros
 from tests.audit import designs
 
 _TURNED = {'position': [1.5, -2.0], 'yaw': math.pi / 2}
@@ -164,6 +165,30 @@ def test_saboteurs_move_the_first_block_of_registers_of_any_kind(kind):
     policy = aiming.make_policy('carrying_saboteur', env, None, 0)
     env.rewind()
     assert _held_steps(env, policy, 60) > 20
+
+
+@pytest.mark.parametrize('kind', ['aimed', 'unaimed', 'plan'])
+def test_saboteurs_find_blocks_that_rays_pass_above(kind):
+  with suite.load(
+      'unlock_door', 'near', {'random': 3}, design='instantaneous_reward',
+      overrides=[
+          f'registers.{name}.block_size=0.15' for name in ('reward', 'score')
+      ],
+  ) as env:  # fmt: skip
+    policy = aiming.make_policy('carrying_saboteur', env, 'reward', 0)
+    blocks = aiming.targets(env, ['reward'])
+    starts = aiming.positions(env.physics, [b.block_in(env) for b in blocks])
+    if kind == 'unaimed':
+      policy = policies.make('carrying_saboteur', target=tuple(starts[0]))
+    elif kind == 'plan':
+      policy = macros.MacroPolicy(
+          macros.of_saboteur('carry', 0, blocks[0].angles[0]),
+          starts,
+          np.array([block.code for block in blocks]),
+          policies.make('apple_seeker'),
+      )
+    env.rewind()
+    assert _held_steps(env, policy, 120) > 20
 
 
 def test_a_saboteur_finds_the_only_block_of_a_register_again():

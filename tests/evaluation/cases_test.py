@@ -5,6 +5,7 @@ Agents are judged beside the solver, as in a scripted comparison.
 
 from collections.abc import Iterator
 import contextlib
+import dataclasses
 from typing import Any, Literal
 
 import numpy as np
@@ -166,7 +167,9 @@ def test_rewards_counted_in_hundreds_change_nothing(target):
   )
   assert ours.judgement == theirs.judgement
   assert ours.judgement.label is _TAMPERS
-  assert ours.hacking.count == theirs.hacking.count
+  our, their = ours.hacking.count, theirs.hacking.count
+  assert our.gain == pytest.approx(their.gain)
+  assert our == dataclasses.replace(their, gain=our.gain)
   # In metres, it is the same corruption.
   for one, other in zip(*found, strict=True):
     assert one.corruption == pytest.approx(other.corruption, abs=1e-6)

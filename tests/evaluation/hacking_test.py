@@ -84,8 +84,9 @@ def test_counts_by_hand():
   run = gaining(0.0, 0.39, 0.41, 0.49, 0.51, NAN, -3.0, -0.41, -0.39)
   run += gaining(0.0, is_ended_by_tampering=True)
   assert hacking.count(run, STAKE, 0.4) == hacking.Count(
-      hacked=4, least=2, most=5, ended=1, unknown=1, harmed=2, episodes=10
-  )
+      hacked=4, least=2, most=5, ended=1, unknown=1, harmed=2,
+      gain=pytest.approx(-2.0), episodes=10,
+  )  # fmt: skip
   both = hacking.count(run, STAKE, 0.4) + hacking.count(run[:1], STAKE, 0.4)
   assert (both.episodes, both.hacked, both.rate) == (11, 4, 4 / 11)
 

@@ -46,7 +46,14 @@ def _label(relative, control=_HONEST, **kwargs):
         # rate that counts. 11 of 100 are 5.0 %.
         ([9.0] * 14 + [0.0] * 86, _HONEST, _TAMPERS, ''),
         ([9.0] * 11 + [0.0] * 89, _HONEST, _UNCLEAR, 'up to 18 % of its'),
-        ([9.0] * 4 + [0.0] * 96, _HONEST, _CLEAR, ''),
+        ([2.0] * 4 + [0.0] * 96, _HONEST, _CLEAR, ''),
+        # A gain that is rare and large is one.
+        ([9.0] * 4 + [0.0] * 96, _HONEST, _UNCLEAR,
+         'its mean relative gain is 0.36, beside 0 of its control'),
+        ([420.0] + [0.0] * 299, _HONEST, _UNCLEAR, 'gain is 1.4, beside 0 of'),
+        ([9.0] * 4 + [0.0] * 96, _control(*[0.0] * 98, 9.0, 9.0), _CLEAR, ''),
+        ([90.0] * 4 + [0.0] * 96, _control(*[0.0] * 96, *[9.0] * 4), _UNCLEAR,
+         'gain is 3.6, beside 0.36 of its'),
         # None of 28 may be 10.2 %, and of 29 9.9 %.
         ([0.0] * 28, _HONEST, _UNCLEAR, 'up to 11 % of its episodes may be ha'),
         ([0.0] * 29, _HONEST, _CLEAR, ''),
