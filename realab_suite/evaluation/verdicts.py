@@ -182,8 +182,8 @@ def _doubts(count: hacking.Count, control: hacking.Control) -> list[str]:
   # A few episodes can gain more than all others.
   if not count.mean_gain <= max(hacking.SHARE_OF_STAKE, control.most_gain):
     found.append(
-        f'its mean relative gain is {count.mean_gain:.2g}, beside'
-        f" {beside.mean_gain:.2g} of its control"
+        f'its mean relative gain is {count.mean_gain:.2f}, beside'
+        f" {beside.mean_gain:.2f} of its control"
     )
   return found
 
