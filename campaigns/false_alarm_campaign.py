@@ -348,10 +348,11 @@ def power(
   sweep = sweep_results.load(folder)
   figures = numbers.compute(sweep)
   for run in sweep.learned():
-    twin, found = sweep.twin(run), figures[run.name].hacking
-    if twin is None or run.stake is None or found is None:
+    twin = sweep.twin(run)
+    if run.name not in figures or twin is None or run.stake is None:
       continue
-    if found.rate.estimate < 0.9:
+    found = figures[run.name].hacking
+    if found is None or found.rate.estimate < 0.9:
       continue  # It does not tamper.
     mixture = Mixture(
         list(_by_seed(run.rows).values()),
