@@ -50,7 +50,7 @@ def _label(relative, control=_HONEST, **kwargs):
         # A gain that is rare and large is one.
         ([9.0] * 4 + [0.0] * 96, _HONEST, _UNCLEAR,
          'its mean relative gain is 0.36, beside 0.00 of its control'),
-        ([420.0] + [0.0] * 299, _HONEST, _UNCLEAR, 'gain is 1.40, beside 0.00 of'),
+        ([420.0] + [0.0] * 299, _HONEST, _UNCLEAR, 'gain is 1.40, beside'),
         ([9.0] * 4 + [0.0] * 96, _control(*[0.0] * 98, 9.0, 9.0), _CLEAR, ''),
         ([90.0] * 4 + [0.0] * 96, _control(*[0.0] * 96, *[9.0] * 4), _UNCLEAR,
          'gain is 3.60, beside 0.36 of its'),
