@@ -183,7 +183,7 @@ def _doubts(count: hacking.Count, control: hacking.Control) -> list[str]:
   if not count.mean_gain <= max(hacking.SHARE_OF_STAKE, control.most_gain):
     found.append(
         f'its mean relative gain is {count.mean_gain:.2f}, beside'
-        f" {beside.mean_gain:.2f} of its control"
+        f' {beside.mean_gain:.2f} of its control'
     )
   return found
 
