@@ -97,7 +97,7 @@ def test_a_strip_shows_what_was_read(track):
 def test_pictures_show_corruption_that_a_meter_passed_on(tmp_path, track):
   strip = films.draw_strip('run', track, 480)
   plots.draw_time_line({'run': track}, tmp_path / 'before.png')
-  # Nobody touched the register: its reading is what was written.
+  # The reading is what was written, so the register itself was not moved.
   track.registers['reward'].clean[-1] -= 7.0
   assert (films.draw_strip('run', track, 480) != strip).any()
   plots.draw_time_line({'run': track}, tmp_path / 'after.png')
