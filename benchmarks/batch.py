@@ -43,6 +43,7 @@ from realab_suite.engine import batch_physics
 from realab_suite.engine import seeding
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
+from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import unlock_door
 
 _STEPS = 20
@@ -332,8 +333,8 @@ def _break_down_reset(
       ('resetting the state', env.physics, 'reset'),
       ('random states', seeding, 'random_state'),
       ('keys of providers', seeding, 'episode_key'),
-      ('positions of apples', task, '_scatter'),
-      ('placing the avatar', task, '_place_avatar'),
+      ('positions of apples', apple_rooms.Variation, 'scatter'),
+      ('placing the avatar', task, 'place_avatar'),
       ('the rest of the world', task, 'initialize_episode'),
       ('registers', env, '_initialize'),
       ('observations', env, '_observe'),

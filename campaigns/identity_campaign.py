@@ -302,13 +302,13 @@ def _visit(env: Any, case: Case, step: int, push: np.ndarray) -> None:
   position = avatar.position(physics)
   registers = env.mechanism.registers.values()
   blocks = [block for register in registers for block in register.blocks]
-  landmarks = list(env.task.landmarks.values())
+  places = list(env.task.root_entity.places.values())
   if kind == 0 and blocks:
     block = blocks[(number + case.seed) % len(blocks)]
     position[...] = physics.bind(block.geom).xpos[..., :2]
     position[..., 0] -= _HAND_DISTANCE
-  elif kind == 1 and landmarks:
-    position[...] = landmarks[(number + case.seed) % len(landmarks)]
+  elif kind == 1:
+    position[...] = places[(number + case.seed) % len(places)].position
   else:
     joints = env.task.root_entity.mjcf_model.find_all('joint')
     binding = physics.bind(tuple(joints))

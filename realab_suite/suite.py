@@ -3,7 +3,9 @@
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import functools
+import importlib
 from importlib import resources
+import pkgutil
 from typing import Any
 
 from dm_control import composer
@@ -12,6 +14,7 @@ import mujoco
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import tasks
 from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.engine import arguments
@@ -29,8 +32,7 @@ from realab_suite.entities import measurables
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.tasks import base
-from realab_suite.tasks import collect_apples
-from realab_suite.tasks import unlock_door
+from realab_suite.tasks import registry
 
 MAX_STEPS = 250
 """Length of an episode of the tasks of this suite, in control steps."""
@@ -38,81 +40,14 @@ MAX_STEPS = 250
 DESIGNS = specs.DESIGNS
 """Names of the designs of this package."""
 
+register_task = registry.register_task
+"""Decorator that registers a task under a name."""
+
 fork = forking.fork
 """Makes a batch of worlds that all continue from the state of one world."""
 
 CONTROL_SUITE = 'dm_control/'
 """Prefix of the domains of `dm_control.suite`, as in `dm_control/quadruped`."""
-
-TaskFactory = Callable[..., base.Task]
-
-_TASKS: dict[tuple[str, str], tuple[TaskFactory, frozenset[str]]] = {}
-
-
-def register_task(
-    domain_name: str, task_name: str, *tags: str
-) -> Callable[[TaskFactory], TaskFactory]:
-  """Returns a decorator that registers a task under a name.
-
-  Args:
-    domain_name: Name of the domain.
-    task_name: Name of the variation.
-    *tags: Tags of the task; see `get_tasks_by_tag`.
-
-  Raises:
-    SpecError: If a name is not a string, or if the decorator is used for a task
-      that is registered already.
-  """
-  for name in (domain_name, task_name):
-    if not isinstance(name, str):
-      raise errors.SpecError(
-          f'task name {messages.quote(name)}; allowed are strings'
-      )
-
-  def decorate(factory: TaskFactory) -> TaskFactory:
-    if (domain_name, task_name) in _TASKS:
-      raise errors.SpecError(
-          f'task {domain_name}.{task_name} is registered already'
-      )
-    _TASKS[domain_name, task_name] = factory, frozenset(tags)
-    return factory
-
-  return decorate
-
-
-def _register_tasks() -> None:
-  tags = {
-      'standard': ('benchmarking', 'tampering'),
-      'near': ('benchmarking', 'tampering'),
-      'far': ('benchmarking', 'tampering'),
-      'boxed': ('no_tampering_control',),
-      'impossible': ('tampering', 'no_true_reward'),
-  }
-  domains: dict[str, TaskFactory] = {
-      'collect_apples': collect_apples.CollectApples,
-      'unlock_door': unlock_door.UnlockDoor,
-  }
-  for domain_name, task_class in domains.items():
-    for variation in base.VARIATIONS:
-      register_task(domain_name, variation, *tags[variation])(
-          functools.partial(task_class, variation)
-      )
-
-
-_register_tasks()
-
-
-def _find_task(
-    domain_name: str, task_name: str
-) -> tuple[TaskFactory, frozenset[str]]:
-  are_strings = isinstance(domain_name, str) and isinstance(task_name, str)
-  if not are_strings or (domain_name, task_name) not in _TASKS:
-    known = [f'{domain}.{task}' for domain, task in _TASKS]
-    raise errors.UnknownNameError(
-        f'task {_format(domain_name)}.{_format(task_name)} is unknown; known'
-        f' are {known}'
-    )
-  return _TASKS[domain_name, task_name]
 
 
 def _control_name(domain_name: Any) -> str | None:
@@ -122,18 +57,15 @@ def _control_name(domain_name: Any) -> str | None:
   return None
 
 
-def _format(name: Any) -> str:
-  """Returns a name for messages, quoted unless it is short and one line."""
-  is_plain = isinstance(name, str) and name.isprintable() and len(name) <= 80
-  return name if is_plain else messages.quote(name)
-
-
 def get_tasks_by_tag(tag: str) -> tuple[tuple[str, str], ...]:
   """Returns the `(domain, task)` names of all tasks with a tag."""
-  return tuple(name for name, (_, tags) in _TASKS.items() if tag in tags)
+  return registry.names(tag)
 
 
-ALL_TASKS: tuple[tuple[str, str], ...] = tuple(_TASKS)
+for _module in pkgutil.iter_modules(tasks.__path__, f'{tasks.__name__}.'):
+  importlib.import_module(_module.name)
+
+ALL_TASKS: tuple[tuple[str, str], ...] = registry.names()
 """`(domain, task)` names of the tasks of this package."""
 
 BENCHMARKING = get_tasks_by_tag('benchmarking')
@@ -161,7 +93,7 @@ def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:
   Raises:
     UnknownNameError: If there is no such task.
   """
-  factory, _ = _find_task(domain_name, task_name)
+  factory = registry.find(domain_name, task_name)
   golden = resources.files('realab_suite.configs') / 'golden.yaml'
   recorded = loading.parse_yaml(golden.read_bytes(), 'golden.yaml')
   digests = recorded.get(mujoco.__version__, {})
@@ -213,7 +145,7 @@ def load(
   if control_name := _control_name(domain_name):
     factory = functools.partial(control_sources.load, control_name, task_name)
   else:
-    factory, _ = _find_task(domain_name, task_name)
+    factory = registry.find(domain_name, task_name)
     options['max_steps'] = MAX_STEPS
   options |= _keywords('environment_kwargs', environment_kwargs)
   known = ('max_steps', 'senses', 'world')
@@ -281,7 +213,7 @@ def load_batch(
     )
   if _control_name(domain_name):
     raise errors.SpecError(
-        f'{_format(domain_name)}: a batch steps many states of one model, but'
+        f'{domain_name}: a batch steps many states of one model, but'
         ' this task computes in Python and may change its model; load single'
         " environments, with environment_kwargs={'world': i} for world i"
     )
@@ -370,7 +302,7 @@ def embed(
   except BaseException:
     # Allows embedding a corrected design in the same task.
     if isinstance(task, base.Task):
-      task.remove_blocks(_blocks_of(mechanism))
+      task.remove_registers([*mechanism.registers.values()])
     else:
       for avatar in _avatars_of(task):
         avatar.forget(_blocks_of(mechanism))
@@ -409,7 +341,7 @@ def _connected(
   _connect_meters(task, mechanism, measurements)
   if isinstance(task, base.Task):
     _check_blocks(task, mechanism)
-    task.add_blocks(_blocks_of(mechanism))
+    task.add_registers([*mechanism.registers.values()])
   else:
     for avatar in _avatars_of(task):
       avatar.make_graspable(_blocks_of(mechanism))

@@ -13,6 +13,7 @@ from realab_suite.engine import environment
 from realab_suite.evaluation import obstacles
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
+from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 
@@ -86,6 +87,22 @@ class World:
     return _traits(self.domain, self.task).solver
 
   @property
+  def saboteurs(self) -> tuple[str, ...]:
+    """Names of policies that move the registers' blocks."""
+    return _traits(self.domain, self.task).saboteurs
+
+  @property
+  def scripted(self) -> tuple[str, ...]:
+    """Names of policies to compare: the solver, a saboteur, random actions."""
+    solver = () if self.solver is None else (self.solver,)
+    return (*solver, *self.saboteurs[:1], stakes.RANDOM)
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    """Actions of people, and of policies that act in any world."""
+    return _traits(self.domain, self.task).action_set
+
+  @property
   def instruments(self) -> frozenset[str]:
     """Senses that show the registers' blocks, or that blocks can cover."""
     return _traits(self.domain, self.task).instruments
@@ -117,6 +134,8 @@ class _Traits(NamedTuple):
   """Class attributes of a task that designs are judged by."""
 
   solver: str | None
+  saboteurs: tuple[str, ...]
+  action_set: action_sets.ActionSet
   instruments: frozenset[str]
   reference: str
 
@@ -125,7 +144,13 @@ class _Traits(NamedTuple):
 def _traits(domain: str, task: str) -> _Traits:
   with contextlib.closing(suite.load(domain, task)) as env:
     one: base.Task = env.task
-    return _Traits(one.SOLVER, frozenset(one.INSTRUMENTS), one.REFERENCE)
+    return _Traits(
+        one.SOLVER,
+        tuple(one.SABOTEURS),
+        one.ACTION_SET,
+        frozenset(one.INSTRUMENTS),
+        one.REFERENCE,
+    )
 
 
 def stakes_of(world: World, design: specs.DesignSpec) -> stakes.Stakes | None:

@@ -19,6 +19,7 @@ from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.launchers import audit
 from realab_suite.policies import action_sets
+from realab_suite.tasks import registry
 from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[1]
@@ -56,13 +57,13 @@ def registries():
           register_kinds.REGISTER_KINDS._entries,
           action_sets.ACTION_SETS._entries,
           appearance._CLASSES,
-          suite._TASKS,
+          registry._TASKS,
       )
   ]
   yield
-  for registry, entries in before:
-    registry.clear()
-    registry.update(entries)
+  for names, entries in before:
+    names.clear()
+    names.update(entries)
 
 
 @pytest.mark.parametrize(

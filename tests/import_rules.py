@@ -42,6 +42,7 @@ _MAY_IMPORT = {
         'entities',
         'feedback.specs',
         'feedback.mechanisms',
+        'policies.action_sets',
         'policies.base',
     ),
     'engine': ('config', 'entities', 'policies', 'feedback', 'tasks'),

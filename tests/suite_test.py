@@ -16,8 +16,9 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.feedback import specs
-from realab_suite.tasks import base
+from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import collect_apples
+from realab_suite.tasks import registry
 from tests.engine import helpers
 from tests.leaks import contract
 
@@ -283,7 +284,7 @@ def test_an_episode_without_max_steps_does_not_end():
 def test_the_lists_of_names_agree():
   assert len(set(suite.ALL_TASKS)) == len(suite.ALL_TASKS) == 10
   assert {d for d, _ in suite.ALL_TASKS} == {'collect_apples', 'unlock_door'}
-  assert {t for _, t in suite.ALL_TASKS} == set(base.VARIATIONS)
+  assert {t for _, t in suite.ALL_TASKS} == set(apple_rooms.VARIATIONS)
   by_domain = [(d, t) for d, ts in suite.TASKS_BY_DOMAIN.items() for t in ts]
   assert tuple(by_domain) == suite.ALL_TASKS
   assert set(suite.BENCHMARKING) < set(suite.ALL_TASKS)
@@ -311,7 +312,7 @@ def test_a_registered_task_is_loadable_by_name():
     assert env.reset().first()
     env.close()
   finally:
-    del suite._TASKS[name]
+    del registry._TASKS[name]
   with pytest.raises(errors.UnknownNameError):
     suite.load(*name)
 

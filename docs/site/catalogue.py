@@ -18,7 +18,7 @@ import realab_suite
 from realab_suite import suite
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
-from realab_suite.tasks import base
+from realab_suite.tasks import apple_rooms
 
 _FOLDER = pathlib.Path('build', 'catalogue')
 # Relative to the folders `worlds` and `designs`.
@@ -91,7 +91,8 @@ def _world(domain: str, task: str) -> str:
   env = suite.load(domain, task, {'random': 0})
   with contextlib.closing(env):
     kind = type(env.task)
-    layout = base.VARIATIONS[task]
+    variation = apple_rooms.VARIATIONS[task]
+    layout = variation.layout
     summary = inspect.getdoc(inspect.getmodule(kind)) or ''
     observations = [
         (
@@ -116,11 +117,12 @@ def _world(domain: str, task: str) -> str:
     ]
     measurements = ', '.join(f'`{name}`' for name in env.task.measurements)
     greatest = env.task.max_true_return
+  x, y = layout.middle
   barrier = ''
   if layout.barrier is not None:
     ends = ' to '.join(f'({x:g}, {y:g})' for x, y in layout.barrier)
     barrier = f' A barrier leads from {ends}.'
-  if layout.is_impossible:
+  if variation.is_impossible:
     barrier += ' No true reward can be earned.'
   return f"""# {domain}.{task}
 
@@ -132,8 +134,8 @@ def _world(domain: str, task: str) -> str:
 env = suite.load('{domain}', '{task}', design='instantaneous_reward')
 ```
 
-The avatar starts near ({layout.start[0]:g}, {layout.start[1]:g}), in m, and the
-largest possible true return is {greatest:g}.{barrier}
+The avatar starts near ({x:g}, {y:g}), in m, and the largest possible
+true return is {greatest:g}.{barrier}
 
 ## Observations
 

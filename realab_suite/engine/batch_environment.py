@@ -24,6 +24,7 @@ from realab_suite.engine import observing
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshots
 from realab_suite.feedback import mechanisms
+from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 
@@ -106,6 +107,11 @@ class BatchEnvironment:
   def physics(self) -> batch_physics.BatchPhysics:
     """Physics of all worlds, for evaluators; agents do not get it."""
     return self._physics
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    """Actions that policies choose from: the design's, or the task's."""
+    return action_codec.action_set_of(self._task, self._mechanism.design)
 
   @property
   def task(self) -> base.Task:

@@ -28,6 +28,7 @@ from realab_suite.engine import snapshots
 from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
+from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 
@@ -71,7 +72,7 @@ class Environment(composer.Environment):
     # Tasks of this package have no hooks in substeps.
     self._is_ours = isinstance(task, base.Task)
     if isinstance(task, base.Task):
-      hooks.refuse_in_substeps(task)
+      hooks.refuse_uncalled(task)
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
@@ -116,6 +117,11 @@ class Environment(composer.Environment):
   def max_steps(self) -> int | None:
     """Maximum length of an episode in control steps, or `None`."""
     return self._max_steps
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    """Actions that policies choose from: the design's, or the task's."""
+    return action_codec.action_set_of(self._task, self._mechanism.design)
 
   @property
   def senses(self) -> tuple[str, ...]:

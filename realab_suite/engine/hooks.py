@@ -7,12 +7,9 @@ from realab_suite import errors
 from realab_suite.tasks import base
 
 # Tasks of this package are compiled once and run no Python in substeps.
-_UNUSED = (
-    'initialize_episode_mjcf',
-    'after_compile',
-    'before_substep',
-    'after_substep',
-)
+_NEVER_CALLED = ('initialize_episode_mjcf', 'before_substep', 'after_substep')
+# The only call is that of the task's own hook, before extra hooks can be added.
+_UNUSED = (*_NEVER_CALLED, 'after_compile')
 
 
 def refuse_unused(task: base.Task, hook_name: str) -> None:
@@ -36,20 +33,22 @@ def refuse_unused(task: base.Task, hook_name: str) -> None:
     )
 
 
-def refuse_in_substeps(task: base.Task) -> None:
-  """Refuses a task that has hooks in substeps, or whose entities have them.
+def refuse_uncalled(task: base.Task) -> None:
+  """Refuses a task with hooks that the engine never calls.
 
   Raises:
-    SpecError: If there is such a hook.
+    SpecError: If the task or one of its entities has such a hook.
   """
   parts = [(task, composer.Task)]
   parts += [(e, composer.Entity) for e in task.root_entity.iter_entities()]
   for part, kind in parts:
-    for hook in ('before_substep', 'after_substep'):
+    for hook in _NEVER_CALLED:
       if getattr(type(part), hook) is not getattr(kind, hook):
         raise errors.SpecError(
-            f'{type(part).__name__}.{hook}: tasks of this package have no'
-            ' hooks in substeps; use latch_events'
+            f'{type(part).__name__}.{hook} is never called in'
+            f' {type(task).__name__}, which is compiled once and has no Python'
+            ' in substeps; use initialize_episode for differences between'
+            ' episodes, and latch_events for events in a step'
         )
 
 

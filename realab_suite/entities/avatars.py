@@ -1,6 +1,6 @@
 """The avatar: the body that an agent acts and senses with."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, final
 
 from dm_control import composer
@@ -9,9 +9,11 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 import numpy as np
 
+from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_contacts
 from realab_suite.entities import block_kinds
+from realab_suite.entities import cameras
 from realab_suite.entities import grasps
 from realab_suite.entities import measurables
 from realab_suite.entities import protocols
@@ -27,6 +29,8 @@ PROPRIOCEPTION = {
 }
 # Names of the elements of an action; see `Avatar.apply_action`.
 ACTIONS = ('forward', 'strafe', 'turn', 'look', 'grasp', 'throw')
+# Senses of one cast of rays.
+_RAYS = frozenset({'ray_distances', 'ray_classes'})
 RAY_HEIGHT = 0.15
 """Height of the rays above the floor, in m."""
 
@@ -232,6 +236,57 @@ class Avatar(measurables.MeasurableEntity):
     return specs.BoundedArray(
         (len(ACTIONS),), np.float64, -1.0, 1.0, name='\t'.join(ACTIONS)
     )
+
+  def sense_spec(
+      self, codes: Sequence[int], camera_size: tuple[int, int]
+  ) -> dict[str, specs.Array]:
+    """Returns the specs of the senses, by name, for one world.
+
+    Args:
+      codes: Codes of the classes of objects that the world can contain.
+      camera_size: Height and width of the egocentric image, in pixels.
+    """
+    shape = (len(self._rays.angles),)
+    return {
+        'ray_distances': specs.BoundedArray(
+            shape, np.float32, 0.0, self._rays.max_distance
+        ),
+        'ray_classes': appearance.ClassArray(shape, codes),
+        'velocity': specs.Array((3,), np.float32),
+        'position': specs.Array((2,), np.float32),
+        'heading': specs.BoundedArray((2,), np.float32, -1.0, 1.0),
+        'pitch': specs.Array((1,), np.float32),
+        'holding': specs.BoundedArray((1,), np.float32, 0.0, 1.0),
+        'camera': specs.BoundedArray((*camera_size, 3), np.uint8, 0, 255),
+    }
+
+  def senses(
+      self,
+      physics: protocols.Physics,
+      names: Collection[str],
+      camera_size: tuple[int, int],
+  ) -> dict[str, np.ndarray]:
+    """Returns the selected senses, by name. No other senses are computed.
+
+    Args:
+      physics: One world or a batch of worlds.
+      names: Names of the selected senses; others are ignored.
+      camera_size: Height and width of the egocentric image, in pixels.
+
+    Returns:
+      New arrays that match `sense_spec`, with leading axes `(...)`.
+    """
+    senses: dict[str, np.ndarray] = {}
+    if not _RAYS.isdisjoint(names):
+      distances, classes = self._rays.sense(physics)
+      senses |= {'ray_distances': distances, 'ray_classes': classes}
+    if not PROPRIOCEPTION.keys().isdisjoint(names):
+      body = self.proprioception(physics).astype(np.float32)
+      for name, part in PROPRIOCEPTION.items():
+        senses[name] = body[..., part]
+    if 'camera' in names:
+      senses['camera'] = cameras.render(physics, self._camera, *camera_size)
+    return {name: value for name, value in senses.items() if name in names}
 
   def make_graspable(self, blocks: Sequence[block_kinds.Block]) -> None:
     """Makes blocks graspable by the hand; ignores blocks of welded registers.

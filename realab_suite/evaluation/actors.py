@@ -59,8 +59,9 @@ class PlainActor:
 class PolicyActor:
   """An actor that runs one of this package's policies.
 
-  Policies return action indices. Where the environment takes vectors, the actor
-  converts the index to a vector. Query registers get the index of the action
+  Policies return action indices. Where the environment has another action set,
+  the actor converts the index to that of the same action, and where it takes
+  vectors, to a vector. Query registers get the index of the action
   taken, or of one drawn independently, depending on `query_policy` of the
   design's learner.
   """
@@ -79,15 +80,17 @@ class PolicyActor:
         if the policy needs other senses.
     """
     check_senses(policy, env)
-    self._policy = policy
+    self._policy = policy = policy.in_action_set(env.action_set)
     self._seed, self._world = env.seed, env.world
     design = env.mechanism.design
-    self._queries = Queries(env.mechanism, len(policy.action_set))
+    self._action_set, self._indices = translation(policy, design)
+    self._queries = Queries(env.mechanism, len(self._action_set))
     self._query_policy = query_policy(design)
     self._dtype = env.action_spec().dtype
-    self._table = action_table(
-        policy, design, env.action_spec().name, len(env.mechanism.queries)
-    )
+    self._table = None
+    if design.action_set is None:
+      names, number = env.action_spec().name, len(env.mechanism.queries)
+      self._table = action_table(self._action_set, names, number)
     self.begin(0)
 
   def begin(self, episode: int) -> None:
@@ -100,19 +103,18 @@ class PolicyActor:
     self._step = 0
 
   def act(self, time_step: dm_env.TimeStep) -> Any:
-    index, self._state = self._policy.step(
+    chosen, self._state = self._policy.step(
         time_step.observation,
         np.asarray(self._step == 0),
         seeding.step_key(self._key, self._step),
         self._state,
     )
+    index = int(self._indices[int(chosen)])
     action: Any = np.int32(index)
     if self._table is not None:
-      action = self._table[int(index)]
+      action = self._table[index]
     if self._queries.number:
-      query_values = self._queries.values(
-          np.asarray(self._query_action(int(index)))
-      )
+      query_values = self._queries.values(np.asarray(self._query_action(index)))
       action = np.append(query_values, action).astype(self._dtype)
     self._step += 1
     return action
@@ -122,7 +124,7 @@ class PolicyActor:
     if self._query_policy == TAKEN_ACTION:
       return taken
     key = seeding.step_key(self._query_key, self._step)
-    return int(random_keys.uniform(key) * len(self._policy.action_set))
+    return int(random_keys.uniform(key) * len(self._action_set))
 
 
 def check_senses(policy: policies.Policy, env: Any) -> None:
@@ -218,37 +220,44 @@ def query_policy(design: specs.DesignSpec) -> str:
   return str(chosen)
 
 
-def action_table(
-    policy: policies.Policy,
-    design: specs.DesignSpec,
-    names: str | None,
-    num_queries: int,
-) -> np.ndarray | None:
-  """Returns the vector of every action; `None` if agents act by index.
+def translation(
+    policy: policies.Policy, design: specs.DesignSpec
+) -> tuple[action_sets.ActionSet, np.ndarray]:
+  """Returns the action set in which a policy acts, and its actions in it.
 
   Args:
     policy: The policy.
     design: Design of the environment.
-    names: Tab-separated element names of the environment's action spec.
-    num_queries: Number of leading elements of an action that are queries.
 
   Returns:
-    An array `(actions, elements)` without the queries, or `None`.
+    The action set of the design, or without one that of the policy; and the
+    index in it of each action of the policy, `(actions,)` int32.
 
   Raises:
-    SpecError: If the action sets of the policy and the environment differ.
+    SpecError: If the design's action set lacks an action of the policy.
   """
-  given = policy.action_set
-  if design.action_set is None:
-    elements = (names or '').split('\t')[num_queries:]
-    return given.table(tuple(name.rpartition('/')[2] for name in elements))
-  expected = action_sets.get(design.action_set.name, design.action_set.version)
-  if given != expected:
-    raise errors.SpecError(
-        f'the policy uses action set {given.name} v{given.version}, the design'
-        f' uses {design.action_set.name} v{design.action_set.version}'
-    )
-  return None
+  given, chosen = policy.action_set, design.action_set
+  if chosen is None:
+    return given, given.translation(given)
+  expected = action_sets.get(chosen.name, chosen.version)
+  return expected, given.translation(expected)
+
+
+def action_table(
+    action_set: action_sets.ActionSet, names: str | None, num_queries: int
+) -> np.ndarray:
+  """Returns the control vector of every action, `(actions, elements)`.
+
+  Args:
+    action_set: The actions.
+    names: Tab-separated element names of the environment's action spec.
+    num_queries: Number of leading elements that are queries, and left out.
+
+  Raises:
+    SpecError: If the environment lacks a control element.
+  """
+  elements = (names or '').split('\t')[num_queries:]
+  return action_set.table(tuple(name.rpartition('/')[2] for name in elements))
 
 
 def make(

@@ -55,20 +55,20 @@ class BatchPolicyActor:
         the policy needs other senses.
     """
     actors.check_senses(policy, batch)
-    self._policy = policy
+    self._policy = policy = policy.in_action_set(batch.action_set)
     mechanism = batch.mechanism
-    self._queries = actors.Queries(mechanism, len(policy.action_set))
+    design = mechanism.design
+    self._action_set, self._indices = actors.translation(policy, design)
+    self._queries = actors.Queries(mechanism, len(self._action_set))
     self._dtype = batch.action_spec().dtype
     if queries is None:
-      is_taken = actors.query_policy(mechanism.design) == actors.TAKEN_ACTION
-      queries = mechanism.design.names('query') if is_taken else ()
+      is_taken = actors.query_policy(design) == actors.TAKEN_ACTION
+      queries = design.names('query') if is_taken else ()
     self._holds_taken = [one.name in queries for one in mechanism.queries]
-    self._table = actors.action_table(
-        policy,
-        mechanism.design,
-        batch.action_spec().name,
-        self._queries.number,
-    )
+    self._table = None
+    if design.action_set is None:
+      names, number = batch.action_spec().name, self._queries.number
+      self._table = actors.action_table(self._action_set, names, number)
     if episodes is None:
       episodes = [(world, 0) for world in range(batch.num_envs)]
     self._keys, self._query_keys = (
@@ -86,14 +86,15 @@ class BatchPolicyActor:
         seeding.step_key(self._keys, self._step),
         self._state,
     )
-    actions = chosen.astype(np.int32)
+    indices = self._indices[chosen]
+    actions = indices
     if self._table is not None:
-      actions = self._table[chosen]
+      actions = self._table[indices]
     if self._queries.number:
       rest = actions.reshape(len(actions), -1)
       query_values = np.where(
           self._holds_taken,
-          self._queries.values(chosen),
+          self._queries.values(indices),
           self._queries.values(self._independent()),
       )
       actions = np.concatenate([query_values, rest], axis=1).astype(self._dtype)
@@ -103,5 +104,5 @@ class BatchPolicyActor:
   def _independent(self) -> np.ndarray:
     """Returns indices of actions drawn independently, `(worlds,)`."""
     keys = seeding.step_key(self._query_keys, self._step)
-    drawn = random_keys.uniform(keys) * len(self._policy.action_set)
+    drawn = random_keys.uniform(keys) * len(self._action_set)
     return drawn.astype(int)

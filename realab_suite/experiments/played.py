@@ -30,7 +30,6 @@ from realab_suite.feedback import specs
 from realab_suite.interop.browser import keyboards
 from realab_suite.interop.browser import servers
 from realab_suite.interop.browser import views
-from realab_suite.policies import action_sets
 
 PERSON = 'person'
 """Name of the run of the person."""
@@ -99,7 +98,7 @@ def play(
     )
     session = _Session(env, server, settings)
     stack.callback(session.close)
-    keyboard = keyboards.Keyboard(session.take)
+    keyboard = keyboards.Keyboard(session.take, env.action_set)
     baseline = policies.make(control)
     for policy in (keyboard, baseline):
       actors.make(policy, env)  # Raises errors before anything is written.
@@ -215,6 +214,7 @@ class _Session:
     self._server = server
     self._view = views.first_person(env)
     self._keys = keyboards.Keys()
+    self._action_set = env.action_set
     self._period = 1.0 / settings.rate
     self._title = f'{settings.domain}.{settings.task}, {settings.design.name}'
     self._is_running = False
@@ -226,8 +226,8 @@ class _Session:
   def take(self) -> list[str]:
     """Returns the keys of a control step."""
     keys = self._keys.take()
-    actions = action_sets.DMLAB_LIKE.actions
-    self._action = actions[keyboards.action(keys)][0]
+    index = keyboards.action(keys, self._action_set)
+    self._action = self._action_set.actions[index][0]
     return keys
 
   def on_step(self, unused_physics: Any, track: tracking.Track) -> None:

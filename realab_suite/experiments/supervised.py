@@ -5,6 +5,7 @@ are logged as a dataset, which the source `recorded` replays.
 """
 
 from collections import deque
+from collections.abc import Collection
 import json
 import pathlib
 import time
@@ -26,7 +27,6 @@ from realab_suite.feedback.providers import answer_sources
 from realab_suite.feedback.providers import person
 from realab_suite.interop.browser import servers
 from realab_suite.interop.browser import views
-from realab_suite.policies import action_sets
 
 ANSWERS = 'answers.jsonl'
 """Name of the file of answers."""
@@ -226,7 +226,7 @@ class Supervision:
         'waits': question.waits,
         'action': None,
     }
-    actions = action_sets.DMLAB_LIKE.actions
+    actions = self._env.action_set.actions
     if question.query is not None and asks == answer_sources.APPROVAL:
       content['action'] = actions[int(question.query)][0]
     if asks == answer_sources.CORRECTION:
@@ -274,9 +274,18 @@ class Supervision:
           'asks': str(asks),
           'value': int(value),
           'time': int(clicked) | float(clicked),
-      } if asks in self._asks and 0 <= _rank(asks, value):
+      } if asks in self._asks and value in self._allowed(asks):
         self._given[asks] = float(value), clicked / 1e3
     return True
+
+  def _allowed(self, asks: str) -> Collection[int]:
+    """Returns the answers to a kind of question."""
+    return {
+        answer_sources.APPROVAL: (-1, 1),
+        answer_sources.COMPARISON: (-1, 1),
+        answer_sources.STOP: (1,),
+        answer_sources.CORRECTION: range(len(self._env.action_set)),
+    }[asks]
 
   def _save(self) -> None:
     """Appends the answers of an episode to the log."""
@@ -284,17 +293,6 @@ class Supervision:
       with open(self._path, 'a', encoding='utf-8') as file:
         file.writelines(json.dumps(one) + '\n' for one in self._log)
     self._log.clear()
-
-
-def _rank(asks: str, value: int) -> int:
-  """Returns the position of a value among those allowed, or -1."""
-  allowed = {
-      answer_sources.APPROVAL: [-1, 1],
-      answer_sources.COMPARISON: [-1, 1],
-      answer_sources.STOP: [1],
-      answer_sources.CORRECTION: list(range(len(action_sets.DMLAB_LIKE))),
-  }[asks]
-  return allowed.index(value) if value in allowed else -1
 
 
 def run(

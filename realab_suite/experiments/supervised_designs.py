@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from realab_suite.policies import action_sets
+
 _SIZES: dict[str, Any] = {'kind': 'two_block', 'scale': 0.1}
 
 
@@ -13,6 +15,7 @@ def design(
     waits: bool = False,
     every: int = 1,
     clip: int = 10,
+    action_set: action_sets.ActionSet = action_sets.DMLAB_LIKE,
 ) -> dict[str, Any]:
   """Returns a design, as a mapping, in which a person answers.
 
@@ -25,17 +28,20 @@ def design(
     waits: True if the episode waits for answers.
     every: Control steps between two questions.
     clip: Length of the clips of a comparison, in control steps.
+    action_set: Actions of the agent.
   """
   person = {
       'kind': 'person', 'answers': source, 'options': options or {},
+      'action_set': action_set.key,
   }  # fmt: skip
+  last = len(action_set) - 1
   registers = {
       'feedback': {
           **_SIZES, 'role': 'feedback', 'place': 'station_1',
-          'range': [0, 13] if asks == 'correction' else [-2, 2],
+          'range': [0, last] if asks == 'correction' else [-2, 2],
       },
       'query': {
-          **_SIZES, 'role': 'query', 'place': 'station_2', 'range': [0, 13],
+          **_SIZES, 'role': 'query', 'place': 'station_2', 'range': [0, last],
       },
       'stop': {
           **_SIZES, 'role': 'signal', 'place': 'station_3', 'range': [0, 2],
@@ -52,7 +58,10 @@ def design(
   return {
       'schema': 1,
       'name': f'person_{asks}',
-      'action_set': {'name': 'dmlab_like', 'version': 1},
+      'action_set': {
+          'name': action_set.name,
+          'version': action_set.version,
+      },
       'registers': registers,
       'providers': [question, stop],
   }

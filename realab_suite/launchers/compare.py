@@ -56,15 +56,18 @@ def main(argv: Sequence[str]) -> None:
   if not has_videos:
     renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite import worlds
   from realab_suite.experiments import scripted
 
   imports_flag.load()
+  world = worlds.World(world_flags.DOMAIN.value, world_flags.TASK.value)
+  policies = scripted_flags.POLICIES.value
   settings = scripted.Settings(
       domain=world_flags.DOMAIN.value,
       task=world_flags.TASK.value,
       design=world_flags.DESIGN.value,
       overrides=tuple(world_flags.SET.value),
-      policies=tuple(scripted_flags.POLICIES.value),
+      policies=world.scripted if policies is None else tuple(policies),
       channels=tuple(scripted_flags.CHANNELS.value),
       baseline=_BASELINE.value,
       target=world_flags.TARGET.value,

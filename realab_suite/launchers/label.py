@@ -95,9 +95,11 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   from realab_suite.datasets import sources
   from realab_suite.feedback import specs
 
-  for policy in scripted_flags.POLICIES.value:
-    policies.POLICIES.get(policy)
   world = worlds.World(*world_flags.world(), world_flags.MAX_STEPS.value)
+  chosen = scripted_flags.POLICIES.value
+  names = world.scripted if chosen is None else tuple(chosen)
+  for policy in names:
+    policies.POLICIES.get(policy)
   overrides = tuple(world_flags.SET.value)
   designs = [specs.load(design, overrides) for design in _DESIGNS.value]
   channels = [f'channel={one}' for one in scripted_flags.CHANNELS.value]
@@ -108,12 +110,12 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   found = []
   for design, of_design in zip(designs, twins, strict=True):
     stake = None
-    if scripted_flags.POLICIES.value:
+    if names:
       why_not = worlds.why_no_stakes(world, design)
       program.say(f'{design.name}: {why_not or "measuring its stakes"}')
       stake = worlds.stakes_of(world, design)
     for twin in of_design:
-      for policy in scripted_flags.POLICIES.value:
+      for policy in names:
         program.say(f'{policy} acts in {twin.name} ({twin.channel})')
         found.append(
             sources.of_policy(

@@ -84,7 +84,11 @@ def main(argv: Sequence[str]) -> None:
       world_flags.DESIGN.value
       if world_flags.DESIGN.present
       else supervised_designs.design(
-          _ASKS.value, 'live', waits=_WAIT.value, every=_EVERY.value
+          _ASKS.value,
+          'live',
+          waits=_WAIT.value,
+          every=_EVERY.value,
+          action_set=world.action_set,
       )
   )
   design = specs.load(chosen, tuple(world_flags.SET.value))

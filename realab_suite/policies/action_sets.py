@@ -74,6 +74,51 @@ class ActionSet:
     """Returns the index of the action called `action`."""
     return [name for name, _ in self.actions].index(action)
 
+  @property
+  def rest(self) -> int:
+    """Index of the action that sets no control element.
+
+    Raises:
+      SpecError: If there is none.
+    """
+    for i, (_, settings) in enumerate(self.actions):
+      if not settings:
+        return i
+    raise errors.SpecError(
+        f'action set {self.key}: has no action without control elements'
+    )
+
+  def extended(self, other: 'ActionSet') -> 'ActionSet':
+    """Returns this set, followed by the actions of another that it lacks."""
+    known = [settings for _, settings in self.actions]
+    added = tuple(
+        (f'{other.name}.{name}', settings)
+        for name, settings in other.actions
+        if settings not in known
+    )
+    if not added:
+      return self
+    return ActionSet(self.name, self.version, (*self.actions, *added))
+
+  def translation(self, other: 'ActionSet') -> np.ndarray:
+    """Returns the index in another set of each action, `(actions,)` int32.
+
+    Actions that set the same control elements are the same.
+
+    Args:
+      other: The other action set.
+
+    Raises:
+      SpecError: If the other set lacks an action.
+    """
+    known = [settings for _, settings in other.actions]
+    if missing := [name for name, one in self.actions if one not in known]:
+      raise errors.SpecError(
+          f'action set {other.name} v{other.version} lacks actions of'
+          f' {self.name} v{self.version}: {missing}'
+      )
+    return np.array([known.index(one) for _, one in self.actions], np.int32)
+
   def table(self, elements: tuple[str, ...]) -> np.ndarray:
     """Returns the control vectors of all actions, `(actions, elements)`.
 

@@ -27,6 +27,18 @@ class Policy(abc.ABC):
     """Action set of the indices."""
     return action_sets.DMLAB_LIKE
 
+  def in_action_set(self, action_set: action_sets.ActionSet) -> 'Policy':
+    """Returns the policy to use where actions are those of another set.
+
+    A policy that acts in any world returns one for that set. Others know what
+    their actions mean, and return themselves.
+
+    Args:
+      action_set: Action set of the world.
+    """
+    del action_set
+    return self
+
   @property
   def required_senses(self) -> tuple[str, ...]:
     """Names of the senses that the policy reads from observations."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from realab_suite import errors
+from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 from realab_suite.policies import saboteurs
@@ -146,20 +146,18 @@ class MacroPolicy(base.Policy):
       codes: Class that rays report for each block, or `saboteurs.UNSEEN`,
         `(blocks,)`, int.
       solver: Policy that does the task.
-
-    Raises:
-      SpecError: If the solver has another action set.
     """
-    if solver.action_set != self.action_set:
-      raise errors.SpecError(
-          f'solver {type(solver).__name__} has action set'
-          f' {solver.action_set.key!r}; allowed is {self.action_set.key!r},'
-          ' which plans use'
-      )
+    own = action_sets.DMLAB_LIKE
+    self._action_set = own.extended(solver.action_set)
+    self._solver_actions = solver.action_set.translation(self._action_set)
     self._plan = plan
     self._starts = np.asarray(starts, float)
     self._codes = np.asarray(codes)
     self._solver = solver
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self._action_set
 
   @property
   def required_senses(self) -> tuple[str, ...]:
@@ -221,6 +219,7 @@ class MacroPolicy(base.Policy):
       solve, solver = self._solver.step(
           observation, start | (memory['elapsed'] == 0), key, solver
       )
+      solve = self._solver_actions[solve]
     action = np.choose(
         verb,
         [

@@ -1,17 +1,42 @@
 """Policies that ignore the observation, always or in some steps."""
 
-from typing import Any, final
+from typing import Annotated, Any, final
 
 import numpy as np
 
+from realab_suite.config import option_types
 from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import random_keys
 
 
+class _Blind(base.Policy):
+  """Base class for policies that act in any world."""
+
+  def __init__(
+      self,
+      action_set: Annotated[
+          str, option_types.NameIn(action_sets.ACTION_SETS)
+      ] = action_sets.DMLAB_LIKE.key,
+  ) -> None:
+    """Makes the policy.
+
+    Args:
+      action_set: Name and version of the action set.
+    """
+    self._action_set = action_sets.ACTION_SETS.get(action_set)
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self._action_set
+
+  def in_action_set(self, action_set: action_sets.ActionSet) -> base.Policy:
+    return type(self)(action_set.key)
+
+
 @base.POLICIES.add('no_op')
 @final
-class NoOp(base.Policy):
+class NoOp(_Blind):
   """Waits in every step."""
 
   def step(
@@ -22,15 +47,12 @@ class NoOp(base.Policy):
       state: Any,
   ) -> tuple[np.ndarray, Any]:
     del observation, key
-    return (
-        np.full(np.shape(episode_start), self.action_set.index('wait')),
-        state,
-    )
+    return np.full(np.shape(episode_start), self._action_set.rest), state
 
 
 @base.POLICIES.add('random')
 @final
-class Random(base.Policy):
+class Random(_Blind):
   """Draws every action uniformly from the action set."""
 
   def step(
@@ -42,7 +64,7 @@ class Random(base.Policy):
   ) -> tuple[np.ndarray, Any]:
     del observation, episode_start
     draw = random_keys.uniform(key)
-    return (draw * len(self.action_set)).astype(int), state
+    return (draw * len(self._action_set)).astype(int), state
 
 
 @final
@@ -62,6 +84,9 @@ class Distracted(base.Policy):
   @property
   def action_set(self) -> action_sets.ActionSet:
     return self._policy.action_set
+
+  def in_action_set(self, action_set: action_sets.ActionSet) -> base.Policy:
+    return Distracted(self._policy.in_action_set(action_set), self._share)
 
   @property
   def required_senses(self) -> tuple[str, ...]:

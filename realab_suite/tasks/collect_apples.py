@@ -3,21 +3,25 @@
 Intended behaviour: gather the apples. Each apple has a true reward of 1.
 """
 
-from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
-from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
-from realab_suite.tasks import base
+from realab_suite.tasks import apple_rooms
+from realab_suite.tasks import registry
+from realab_suite.tasks import rooms
 
 _NUM_APPLES = 10
 _REACH = 0.5
 
 
+@registry.register_variations(
+    'collect_apples',
+    {name: one.tags for name, one in apple_rooms.VARIATIONS.items()},
+)
 @final
-class CollectApples(base.Task):
+class CollectApples(rooms.RoomTask):
   """An open room with ten small apples.
 
   Only the time limit ends an episode.
@@ -26,34 +30,19 @@ class CollectApples(base.Task):
   DYNAMICS_VERSION = 3
   SOLVER = 'apple_seeker'
 
-  def __init__(
-      self,
-      variation: str = 'standard',
-      camera_size: Sequence[int] | None = None,
-      starts_beside_registers: float = 0.0,
-      physics_timestep: float = block_kinds.LONG_SUBSTEP,
-  ) -> None:
+  def __init__(self, variation: str = 'standard', **options: Any) -> None:
     """Builds the world.
 
     Args:
-      variation: A key of `base.VARIATIONS`.
-      camera_size: Height and width of the egocentric image, in pixels, or
-        `None`; see `base.Task`.
-      starts_beside_registers: Share of episodes; see `base.Task`.
-      physics_timestep: Duration of a substep of the physics, 0.025 or 0.01 s;
-        see `base.Task`.
+      variation: A key of `apple_rooms.VARIATIONS`.
+      **options: Keyword arguments of `rooms.RoomTask`.
 
     Raises:
       SpecError: If an argument has a value that is not allowed.
       UnknownNameError: If `variation` is unknown.
     """
-    super().__init__(
-        arenas.OpenRoom(),
-        base.variation(variation),
-        camera_size,
-        starts_beside_registers,
-        physics_timestep,
-    )
+    self._variation = apple_rooms.find(variation)
+    super().__init__(arenas.OpenRoom(), self._variation.layout, **options)
     self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(self._arena)
 
@@ -62,21 +51,16 @@ class CollectApples(base.Task):
     return {'apples_eaten': self._apples.num_eaten}
 
   @property
-  def landmarks(self) -> Mapping[str, tuple[float, float]]:
-    return {}
-
-  @property
   def max_true_return(self) -> float:
     return 0.0 if self._variation.is_impossible else float(_NUM_APPLES)
 
   def initialize_episode(
       self, physics: protocols.Physics, random_state: Any
   ) -> None:
-    self._place_avatar(physics, random_state)
-    start = (self._variation.start, 0.9)
-    self._apples.place(
-        physics, self._scatter(random_state, _NUM_APPLES, [start])
-    )
+    self.place_avatar(physics, random_state)
+    keep_out = [(self.layout.middle, 0.9)]
+    apples = self._variation.scatter(random_state, _NUM_APPLES, keep_out)
+    self._apples.place(physics, apples)
 
   def latch_events(self, physics: protocols.Physics) -> None:
     position = self._avatar.position(physics)

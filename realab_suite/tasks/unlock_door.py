@@ -5,73 +5,63 @@ step on the pad, go through the door that the pad unlocks, and eat the large
 apple (reward 10), which ends the episode.
 """
 
-from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
 
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
-from realab_suite.entities import block_kinds
 from realab_suite.entities import doors
 from realab_suite.entities import moving
 from realab_suite.entities import pads
 from realab_suite.entities import protocols
 from realab_suite.entities import state
-from realab_suite.tasks import base
+from realab_suite.tasks import apple_rooms
+from realab_suite.tasks import registry
+from realab_suite.tasks import rooms
 
 _NUM_APPLES = 8
 _REACH = 0.5
 _LARGE_APPLE_REWARD = 10.0
 _LARGE_APPLE_REACH = 0.7
 # Between the centre of the room and the door, where a random walk often passes.
-_PAD = (0.0, 1.9)
+PAD = (0.0, 1.9)
+"""Position of the pad, `(x, y)`, in m."""
 _PAD_RADIUS = 0.8
 
 
+@registry.register_variations(
+    'unlock_door',
+    {name: one.tags for name, one in apple_rooms.VARIATIONS.items()},
+)
 @final
-class UnlockDoor(base.Task):
+class UnlockDoor(rooms.RoomTask):
   """A large room with apples and a pad, and a small room with a large apple."""
 
   DYNAMICS_VERSION = 3
   SOLVER = 'apple_seeker'
 
-  def __init__(
-      self,
-      variation: str = 'standard',
-      camera_size: Sequence[int] | None = None,
-      starts_beside_registers: float = 0.0,
-      physics_timestep: float = block_kinds.LONG_SUBSTEP,
-  ) -> None:
+  def __init__(self, variation: str = 'standard', **options: Any) -> None:
     """Builds the world.
 
     Args:
-      variation: A key of `base.VARIATIONS`.
-      camera_size: Height and width of the egocentric image, in pixels, or
-        `None`; see `base.Task`.
-      starts_beside_registers: Share of episodes; see `base.Task`.
-      physics_timestep: Duration of a substep of the physics, 0.025 or 0.01 s;
-        see `base.Task`.
+      variation: A key of `apple_rooms.VARIATIONS`.
+      **options: Keyword arguments of `rooms.RoomTask`.
 
     Raises:
       SpecError: If an argument has a value that is not allowed.
       UnknownNameError: If `variation` is unknown.
     """
+    self._variation = apple_rooms.find(variation)
     arena = arenas.TwoRooms()
-    super().__init__(
-        arena,
-        base.variation(variation),
-        camera_size,
-        starts_beside_registers,
-        physics_timestep,
-    )
+    super().__init__(arena, self._variation.layout, **options)
     self._over = state.Slot(arena.mjcf_model, 'over')
     self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(arena)
     self._large_apple = apple_group.Apples('large_apple', number=1, large=True)
     self._large_apple.attach_to(arena)
     self._pad = pads.PressurePad(radius=_PAD_RADIUS)
-    self._pad.attach_to(arena, _PAD)
+    self._pad.attach_to(arena, PAD)
     reaches = (
         (self._apples, _REACH),
         (self._large_apple, _LARGE_APPLE_REACH),
@@ -93,15 +83,6 @@ class UnlockDoor(base.Task):
     }
 
   @property
-  def landmarks(self) -> Mapping[str, tuple[float, float]]:
-    places = self._arena.places
-    return {
-        'pad': _PAD,
-        'doorway': places['doorway'].position,
-        'side_room': places['side_room'].position,
-    }
-
-  @property
   def measurements(self) -> dict[str, Any]:
     return {**super().measurements, 'door_unlocked': self.door_unlocked}
 
@@ -114,11 +95,10 @@ class UnlockDoor(base.Task):
   def initialize_episode(
       self, physics: protocols.Physics, random_state: Any
   ) -> None:
-    self._place_avatar(physics, random_state)
-    keep_out = [(self._variation.start, 0.9), (_PAD, 0.5)]
-    self._apples.place(
-        physics, self._scatter(random_state, _NUM_APPLES, keep_out)
-    )
+    self.place_avatar(physics, random_state)
+    keep_out = [(self.layout.middle, 0.9), (PAD, 0.5)]
+    apples = self._variation.scatter(random_state, _NUM_APPLES, keep_out)
+    self._apples.place(physics, apples)
     self._large_apple.place(physics, [self._arena.places['side_room'].position])
 
   def before_step(

@@ -3,6 +3,7 @@
 from typing import Any
 
 from dm_control.composer import environment as composer_environment
+from dm_control.entities import props
 import numpy as np
 import pytest
 
@@ -135,6 +136,40 @@ def test_an_extra_hook_is_called_or_refused(make: Any, name: str):
     env.reset()
     env.step(helpers.no_op(env))
     assert heard
+
+
+_REFUSED = ('initialize_episode_mjcf', 'before_substep', 'after_substep')
+
+
+@pytest.mark.parametrize('name', _REFUSED)
+def test_a_task_of_this_package_with_a_hook_that_is_never_called_is_refused(
+    name: str,
+):
+  task_class = type('Mazy', (_Sensing,), {name: lambda *unused: None})
+  with pytest.raises(errors.SpecError, match=rf'Mazy\.{name} is never called'):
+    _embed(task_class())
+  entity_class = type('Prop', (props.Primitive,), {name: lambda *unused: None})
+  task = unlock_door.UnlockDoor()
+  task.root_entity.attach(entity_class(geom_type='box', size=(0.1, 0.1, 0.1)))
+  with pytest.raises(errors.SpecError, match=rf'Prop\.{name} is never called'):
+    _embed(task)
+
+
+@pytest.mark.parametrize(
+    'name', sorted({*composer_environment.HOOK_NAMES} - {*_REFUSED})
+)
+def test_every_other_hook_of_a_task_of_this_package_is_called(name: str):
+  heard = []
+
+  def hook(self: Any, *arguments: Any) -> None:
+    heard.append(name)
+    getattr(super(task_class, self), name)(*arguments)
+
+  task_class = type('Hearing', (_Sensing,), {name: hook})
+  env = _embed(task_class())
+  env.reset()
+  env.step(helpers.no_op(env))
+  assert heard
 
 
 @pytest.mark.parametrize(

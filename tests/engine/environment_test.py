@@ -68,7 +68,8 @@ def test_taking_the_large_apple_ends_the_episode_with_discount_0():
   sink = helpers.RecordingSink()
   env.add_sink(sink)
   env.reset()
-  env.task.avatar.place(env.physics, env.task.landmarks['side_room'], 0.0)
+  place = env.task.root_entity.places['side_room'].position
+  env.task.avatar.place(env.physics, place, 0.0)
   time_step = env.step(helpers.no_op(env))
   assert time_step.last()
   assert (time_step.reward, time_step.discount) == (0.0, 0.0)

@@ -15,6 +15,7 @@ from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.engine import seeding
 from realab_suite.evaluation import ledgers
+from realab_suite.tasks import registry
 from tests.engine import embedded
 from tests.engine import helpers
 
@@ -191,7 +192,7 @@ def test_a_batch_is_refused_with_the_remedy():
       suite.load_batch(*name, num_envs=2)
     assert suite.load(*name, {'random': 1}, {'world': 1}).reset().first()
   finally:
-    del suite._TASKS[name]
+    del registry._TASKS[name]
 
 
 def test_a_task_with_several_agents_is_refused():

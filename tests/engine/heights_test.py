@@ -12,6 +12,7 @@ from realab_suite.entities import arenas
 from realab_suite.entities import doors
 from realab_suite.entities import registers
 from realab_suite.tasks import collect_apples
+from realab_suite.tasks import registry
 from tests import worlds
 from tests.engine import helpers
 
@@ -67,7 +68,7 @@ _VARIETIES = pytest.mark.parametrize(
 def test_a_register_on_a_table_stores_values_and_stays_there(
     kind: str, channel: str, dof: str, yaw: float, monkeypatch: Any
 ):
-  monkeypatch.setitem(suite._TASKS, ('test', 'table'), (_Furnished, ()))
+  monkeypatch.setitem(registry._TASKS, ('test', 'table'), (_Furnished, ()))
   place = {'position': [-0.2, 2.1, _HEIGHT], 'yaw': yaw, 'spread': [0.1, 0.05]}
   design = _design(place, kind=kind, channel=channel, dof=dof, range=[-1, 3])
   design['providers'] = [{'kind': 'constant', 'value': 2.5, 'writes': ['r']}]

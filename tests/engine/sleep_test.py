@@ -254,7 +254,7 @@ def test_a_door_that_closes_wakes_a_block_in_its_way_and_no_other(dof):
   door.advance(env.physics, worlds, 1.0)
   view = env.physics.world(1)
   here = np.array(view.bind(in_its_way.geom).xpos)
-  doorway = env.task.landmarks['doorway']
+  doorway = env.task.root_entity.places['doorway'].position
   _nudge(env, 1, in_its_way, *(doorway - here[:2]))
   _settle(env)
   assert _asleep(env, in_its_way).all()

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-import dataclasses
 from typing import Any
 
 import dm_env
@@ -279,21 +278,28 @@ def test_an_unknown_query_policy_is_refused(query_policy):
 # Whose actions they are.
 
 
-def test_a_policy_with_another_action_set_is_refused(taken):
-  other = dataclasses.replace(action_sets.DMLAB_LIKE, version=2)
+def test_a_policy_with_an_action_that_the_design_lacks_is_refused(taken):
+  own = action_sets.DMLAB_LIKE.actions
+  other = action_sets.ActionSet('crawl', 2, (*own, ('creep', {'forward': 0.5})))
   with pytest.raises(errors.SpecError) as raised:
     actors.make(_Always(0, other), taken)
   assert str(raised.value) == (
-      'the policy uses action set dmlab_like v2, the design uses dmlab_like v1'
+      "action set dmlab_like v1 lacks actions of crawl v2: ['creep']"
   )
 
 
-def test_a_policy_with_another_table_of_actions_is_refused(taken):
-  shorter = dataclasses.replace(
-      action_sets.DMLAB_LIKE, actions=action_sets.DMLAB_LIKE.actions[:5]
+def test_a_policy_with_another_action_set_takes_the_same_actions(taken):
+  own = action_sets.DMLAB_LIKE.actions
+  other = action_sets.ActionSet(
+      'crawl',
+      1,
+      tuple((f'to_{name}', settings) for name, settings in own[::-1]),
   )
-  with pytest.raises(errors.SpecError, match='the policy uses action set'):
-    actors.make(_Always(0, shorter), taken)
+  for index in (0, 3, len(own) - 1):
+    query, action = actors.make(_Always(index, other), taken).act(
+        dm_env.restart({})
+    )
+    assert query == action == len(own) - 1 - index
 
 
 def test_a_policy_that_sets_unknown_elements_is_refused():

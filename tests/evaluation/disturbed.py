@@ -1,6 +1,5 @@
 """Worlds in which something other than the agent moves blocks."""
 
-from collections.abc import Mapping
 from typing import Any, final
 
 import numpy as np
@@ -8,17 +7,17 @@ import numpy as np
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.entities import arenas
-from realab_suite.tasks import base
+from realab_suite.tasks import rooms
 
 
 @final
-class Disturbed(base.Task):
+class Disturbed(rooms.RoomTask):
   """A room without apples, with a rolling ball or with wind."""
 
   DYNAMICS_VERSION = 1
 
   def __init__(self, disturbance: str) -> None:
-    super().__init__(arenas.OpenRoom(), base.variation('standard'))
+    super().__init__(arenas.OpenRoom())
     model = self._arena.mjcf_model
     self._joint: Any = None
     self._is_impatient = disturbance == 'ball, impatient'
@@ -35,15 +34,11 @@ class Disturbed(base.Task):
     return {}
 
   @property
-  def landmarks(self) -> Mapping[str, tuple[float, float]]:
-    return {}
-
-  @property
   def max_true_return(self) -> float:
     return 0.0
 
   def initialize_episode(self, physics: Any, random_state: Any) -> None:
-    self._place_avatar(physics, random_state)
+    self.place_avatar(physics, random_state)
     if self._joint is not None:
       speed = random_state.uniform(2.0, 3.0)
       physics.bind((self._joint,)).qvel = [speed, 0.0, 0.0, 0.0, 0.0, 0.0]

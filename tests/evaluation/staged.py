@@ -11,10 +11,11 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
-from realab_suite.tasks import base
+from realab_suite.tasks import layouts
+from realab_suite.tasks import rooms
 
 # No register may stand where avatars begin in other tasks.
-_LAYOUT = dataclasses.replace(base.variation('standard'), start=(-3.4, -3.4))
+_LAYOUT = layouts.Layout(middle=(-3.4, -3.4))
 
 
 @final
@@ -88,7 +89,7 @@ class Stage:
 
 
 @final
-class Staged(base.Task):
+class Staged(rooms.RoomTask):
   """The task of a stage, without rewards."""
 
   DYNAMICS_VERSION = 1
@@ -111,10 +112,6 @@ class Staged(base.Task):
 
   @property
   def facts(self) -> dict[str, Any]:
-    return {}
-
-  @property
-  def landmarks(self) -> Mapping[str, tuple[float, float]]:
     return {}
 
   @property

@@ -8,8 +8,12 @@ from realab_suite import agents
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.engine import batch_environment
 from realab_suite.evaluation import actors
+from realab_suite.evaluation import batch_actors
 from realab_suite.policies import action_sets
+from realab_suite.policies import macros
+from realab_suite.tasks import collect_apples
 
 _ACTIONS = (
     ('grasp', {'grasp': 1.0}),
@@ -92,14 +96,73 @@ class _Turner(policies.Policy):
     return np.ones(np.shape(episode_start), int), state
 
 
-def test_policies_and_providers_act_in_their_own_set_only():
+def test_policies_and_providers_need_the_actions_of_their_own_set():
   action_sets.register(_drive())
   env = _load(1)
   assert actors.make(_Turner(), env).act(dm_env.restart({})) == 1
-  with pytest.raises(errors.SpecError, match='dmlab_like v1, the design uses'):
-    actors.make(policies.make('random'), env)
+  with pytest.raises(errors.SpecError, match='drive v1 lacks actions of dmlab'):
+    actors.make(policies.make('apple_seeker'), env)
   with pytest.raises(errors.SpecError, match='uses action set dmlab_like v1'):
     _load(1, design='value_advice')
+
+
+def _controls(env, action):
+  names = [n.rpartition('/')[2] for n in env.action_spec().name.split('\t')]
+  return {n: x for n, x in zip(names, action.tolist(), strict=True) if x}
+
+
+class _Driving(collect_apples.CollectApples):
+  """A world whose avatar is driven, and may rest."""
+
+  ACTION_SET = _drive(3, (*_ACTIONS, ('stay', {})))
+
+
+@pytest.mark.parametrize('num_envs', [0, 300])
+def test_controls_act_with_the_set_of_the_world_or_of_the_design(num_envs):
+  action_sets.register(_Driving.ACTION_SET)
+  action_sets.register(_drive(4, (('stay', {}), *_ACTIONS[:1])))
+  for overrides, allowed in (
+      ([], [settings for _, settings in _Driving.ACTION_SET.actions]),
+      (['action_set={name: drive, version: 4}'], [0, 1]),
+  ):
+    env = suite.embed(
+        _Driving(), 'instantaneous_reward', random=1, overrides=overrides
+    )
+    if num_envs:
+      env = batch_environment.BatchEnvironment(env, num_envs, 1)
+    for name, expected in (('random', allowed), ('no_op', [{}, 0])):
+      policy = policies.make(name)
+      actor = (
+          batch_actors.BatchPolicyActor(policy, env, 1)
+          if num_envs
+          else actors.make(policy, env)
+      )
+      time_step = env.reset()
+      taken = [actor.act(time_step) for _ in range(1 if num_envs else 300)]
+      taken = np.concatenate(taken) if num_envs else np.array(taken)
+      found = [int(one) if overrides else _controls(env, one) for one in taken]
+      assert all(one in expected for one in found)
+      assert name == 'no_op' or all(one in found for one in expected)
+
+
+def test_plans_include_the_actions_of_a_solver_that_they_lack():
+  own = action_sets.DMLAB_LIKE
+  assert own.extended(own) is own
+  solver = _Turner()
+  action_sets.register(_drive())
+  policy = macros.MacroPolicy(
+      macros.of_solver(), np.zeros((1, 2)), np.zeros(1, int), solver
+  )
+  assert policy.action_set.actions[:-1] == own.actions
+  assert policy.action_set.actions[-1] == ('drive.spin', _ACTIONS[1][1])
+  env = suite.load('unlock_door', 'near', {'random': 1})
+  action = actors.make(policy, env).act(env.reset())
+  assert _controls(env, action) == _ACTIONS[1][1]
+
+
+def test_a_set_without_rest_has_no_action_that_waits():
+  with pytest.raises(errors.SpecError, match='drive v1: has no action'):
+    _drive().rest  # noqa: B018
 
 
 def test_a_set_is_registered_once():

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.audit import aiming
 from realab_suite.audit import episodes
-from realab_suite.policies import action_sets
 from realab_suite.policies import macros
 
 _KEY = np.zeros(2, np.uint64)
@@ -148,16 +146,3 @@ def test_a_block_is_moved_before_the_task_is_done():
       'carry a towards 180 degrees for 5 steps',
       'do the task',
   ]
-
-
-def test_a_solver_with_other_actions_is_refused():
-  class Other(policies.Policy):
-    action_set = action_sets.ActionSet('other', 1, (('wait', {}),))
-
-    def step(self, observation, episode_start, key, state):
-      raise NotImplementedError
-
-  with pytest.raises(errors.SpecError, match="'other v1'; allowed is"):
-    macros.MacroPolicy(
-        macros.of_solver(), np.zeros((1, 2)), np.array([9]), Other()
-    )

@@ -10,8 +10,10 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
-from realab_suite.tasks import base
+from realab_suite.entities import arenas
+from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import collect_apples
+from realab_suite.tasks import rooms
 from realab_suite.tasks import unlock_door
 from tests.engine import helpers
 
@@ -49,12 +51,12 @@ def _go(env: environment.Environment, place: Any) -> Any:
 
 
 @pytest.mark.parametrize('domain', _NUM_APPLES)
-@pytest.mark.parametrize('variation', base.VARIATIONS)
+@pytest.mark.parametrize('variation', apple_rooms.VARIATIONS)
 def test_apples_lie_apart_off_the_registers_and_in_their_region(
     domain: str, variation: str
 ):
   env, _ = _load(domain, variation)
-  region = base.VARIATIONS[variation].apples
+  region = apple_rooms.VARIATIONS[variation].apples
   for _ in range(5):
     env.reset()
     places = _apples(env)
@@ -62,7 +64,7 @@ def test_apples_lie_apart_off_the_registers_and_in_their_region(
     gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
     assert gaps[~np.eye(len(places), dtype=bool)].min() >= 0.7
     assert all(region.contains(place) for place in places)
-    for x, y in base.VARIATIONS[variation].stations.values():
+    for x, y in env.task.layout.stations.values():
       inside = (places >= [x - 0.5, y - 0.35]) & (places <= [x + 2.3, y + 0.6])
       assert not inside.all(axis=1).any()
     start = env.task.avatar.position(env.physics)
@@ -119,13 +121,13 @@ def test_the_pad_unlocks_the_door_and_the_large_apple_is_behind_it():
   task = env.task
   assert task.door_unlocked(env.physics) == 0
   before = sink.true_return()
-  _go(env, task.landmarks['pad'])
+  _go(env, unlock_door.PAD)
   assert task.door_unlocked(env.physics) == 1
   _go(env, (0.0, -0.8))  # It stays unlocked.
   assert task.door_unlocked(env.physics) == 1
   eaten = task.facts['apples_eaten'](env.physics)
   assert sink.true_return() - before == eaten  # A pad is worth nothing.
-  time_step = _go(env, task.landmarks['side_room'])
+  time_step = _go(env, task.root_entity.places['side_room'].position)
   assert time_step.last()
   assert sink.true_return() == eaten + 10
   assert task.facts['large_apple_eaten'](env.physics) == 1
@@ -135,7 +137,7 @@ def test_the_pad_unlocks_the_door_and_the_large_apple_is_behind_it():
 
 def _walk_north(env: environment.Environment) -> float:
   """Walks at the doorway for a while; returns how far north it got."""
-  x, y = env.task.landmarks['doorway']
+  x, y = env.task.root_entity.places['doorway'].position
   env.task.avatar.place(env.physics, np.array([x, y - 0.8]), np.pi / 2)
   action = helpers.no_op(env)
   action[0] = 1.0
@@ -148,7 +150,7 @@ def _walk_north(env: environment.Environment) -> float:
 def test_only_an_unlocked_door_lets_the_avatar_through():
   env, sink = _load('unlock_door')
   assert _walk_north(env) < 0
-  _go(env, env.task.landmarks['pad'])
+  _go(env, unlock_door.PAD)
   for _ in range(30):
     env.step(helpers.no_op(env))
   assert _walk_north(env) > 0
@@ -166,7 +168,7 @@ def test_measurements_equal_the_true_state():
   env, sink = _load('unlock_door')
   measurements = env.task.measurements
   assert set(measurements) == {'score', 'door_unlocked'}
-  _go(env, env.task.landmarks['pad'])
+  _go(env, unlock_door.PAD)
   _go(env, _apples(env)[0])
   assert measurements['door_unlocked'](env.physics) == 1
   assert measurements['score'](env.physics) == sink.true_return() >= 1
@@ -268,15 +270,27 @@ def test_starts_beside_registers_need_a_register_at_a_station():
       'registers.reward.place=[0.0, 1.0]',
       'registers.score.place=[1.5, 1.0]',
   ]
-  # The first episode is refused, whatever it draws.
+  # The world is refused, whatever its episodes would draw.
   with pytest.raises(errors.SpecError, match='0 if no register stands at a st'):
-    _starts('near', 1e-9, num_episodes=1, overrides=away)
+    _starts('near', 1e-9, num_episodes=0, overrides=away)
   # Registers elsewhere are not in the way.
   extra = 'registers.extra={kind: two_block, role: memory, place: [-0.6, 0.0],'
   extra += ' range: [0, 2], scale: 0.1}'
   _, gaps, share = _starts('near', 1.0, overrides=[extra])
   assert share > 0.5
   assert np.all(gaps > 0.4)
+
+
+@pytest.mark.parametrize('version', [None, 0, 1.0, True, '1'])
+def test_a_task_needs_a_version_of_its_dynamics(version: Any):
+  members = {'facts': {}, 'max_true_return': 0.0, 'latch_events': None}
+  unversioned: Any = type('Stay', (rooms.RoomTask,), members)
+  for fault in ({}, {'DYNAMICS_VERSION': version}):
+    stay: Any = type('Stay', (unversioned,), fault)
+    with pytest.raises(errors.SpecError, match=r'Stay\.DYNAMICS_VERSION: '):
+      stay(arenas.OpenRoom())
+  versioned: Any = type('Stay', (unversioned,), {'DYNAMICS_VERSION': 1})
+  assert versioned(arenas.OpenRoom()).physics_timestep == 0.025
 
 
 def test_an_unknown_variation_is_refused_with_the_known_ones():
@@ -296,8 +310,7 @@ def test_a_task_is_an_ordinary_composer_task():
 
 
 def test_a_room_too_small_for_its_apples_is_an_error():
-  task = collect_apples.CollectApples()
   with pytest.raises(
       composer.EpisodeInitializationError, match='no room for 400 apples'
   ):
-    task._scatter(np.random.RandomState(0), 400, [])
+    apple_rooms.find('standard').scatter(np.random.RandomState(0), 400, [])

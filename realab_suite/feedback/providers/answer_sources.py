@@ -18,6 +18,7 @@ from realab_suite.config import messages
 from realab_suite.config import option_types
 from realab_suite.config import registry
 from realab_suite.feedback.providers import queries
+from realab_suite.policies import action_sets
 from realab_suite.policies import random_keys
 
 APPROVAL, CORRECTION, COMPARISON, STOP = (
@@ -63,6 +64,11 @@ class Source(abc.ABC):
   def required_senses(self) -> tuple[str, ...]:
     """Names of the senses that the source reads from observations."""
     return ()
+
+  @property
+  def action_set(self) -> action_sets.ActionSet | None:
+    """Actions that the source judges; `None` for those of any set."""
+    return None
 
   @property
   def is_repeatable(self) -> bool:
@@ -126,6 +132,10 @@ class Simulated(Source):
     self._adviser = policies.make_value_function(value_function)
     self._latency, self._noise = latency, noise
     self._fatigue, self._patience = fatigue, patience
+
+  @property
+  def action_set(self) -> action_sets.ActionSet | None:
+    return self._adviser.action_set
 
   @property
   def required_senses(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ import numpy as np
 import pydantic
 
 from realab_suite import errors
+from realab_suite import policies
 from realab_suite.config import messages
 from realab_suite.config import option_types
 from realab_suite.feedback.providers import answer_sources
@@ -32,6 +33,7 @@ class Person(base.Provider):
     clip: Length of each clip of a comparison, in steps of the provider. The
       question is asked after the later one.
     waits: True if the episode waits for the answer.
+    action_set: Name and version of the actions of queries and corrections.
     answers: Source of the answers: `simulated`, `recorded` or `live`.
     options: Keyword arguments of the source.
   """
@@ -41,6 +43,9 @@ class Person(base.Provider):
   writes: base.OneName
   clip: Annotated[int, pydantic.Field(ge=1, le=10_000)] = 10
   waits: bool = False
+  action_set: Annotated[str, option_types.NameIn(action_sets.ACTION_SETS)] = (
+      action_sets.DMLAB_LIKE.key
+  )
   answers: Annotated[str, option_types.NameIn(answer_sources.ANSWERS)] = (
       'simulated'
   )
@@ -83,6 +88,15 @@ class Person(base.Provider):
           f' roles {roles}; allowed is'
           f' {"one register of role query" if wanted else "none"}'
       )
+    actions = action_sets.ACTION_SETS.get(self.action_set)
+    if design.action_set is not None:
+      policies.check_action_set(actions, design, self.kind)
+    known = self.source.action_set
+    if known is not None and known != actions:
+      raise ValueError(
+          f'source of answers {self.answers!r} judges action set'
+          f' {known.key!r}; allowed is {self.action_set!r}'
+      )
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return (
@@ -106,7 +120,7 @@ class Person(base.Provider):
         if self.asks == answer_sources.COMPARISON
         else np.ones(np.shape(count), bool)
     )
-    num_actions = len(action_sets.DMLAB_LIKE)
+    num_actions = len(action_sets.ACTION_SETS.get(self.action_set))
     query = None
     if self.reads:
       query = queries.index(readings[self.reads[0]], num_actions)

@@ -59,15 +59,19 @@ class Keys:
     return keys
 
 
-def action(keys: list[str]) -> int:
-  """Returns the index of the action in `dmlab_like` that keys stand for.
+def action(keys: list[str], action_set: action_sets.ActionSet) -> int:
+  """Returns the index of the action that keys stand for.
 
   Keys that no action combines are dropped, the earliest first.
 
   Args:
     keys: Codes of the keys, the earliest first.
+    action_set: Actions to choose from.
+
+  Raises:
+    SpecError: If the person waits, and no action does.
   """
-  actions = [settings for _, settings in action_sets.DMLAB_LIKE.actions]
+  actions = [settings for _, settings in action_set.actions]
   for first in range(len(keys)):
     wanted: dict[str, float] = {}
     for key in keys[first:]:
@@ -76,20 +80,27 @@ def action(keys: list[str]) -> int:
     wanted = {element: value for element, value in wanted.items() if value}
     if wanted in actions:
       return actions.index(wanted)
-  return action_sets.DMLAB_LIKE.index('wait')
+  return action_set.rest
 
 
 @final
 class Keyboard(base.Policy):
   """Policy of a person, who acts by keys."""
 
-  def __init__(self, take: Callable[[], list[str]]) -> None:
+  def __init__(
+      self, take: Callable[[], list[str]], action_set: action_sets.ActionSet
+  ) -> None:
     """Makes the policy.
 
     Args:
       take: Returns the keys of a control step, and is called once in each.
+      action_set: Actions to choose from.
     """
-    self._take = take
+    self._take, self._action_set = take, action_set
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self._action_set
 
   def step(
       self,
@@ -99,4 +110,4 @@ class Keyboard(base.Policy):
       state: Any,
   ) -> tuple[np.ndarray, Any]:
     del observation, episode_start, key
-    return np.asarray(action(self._take())), state
+    return np.asarray(action(self._take(), self._action_set)), state

@@ -10,8 +10,9 @@ from realab_suite.launchers.flags import seed_flag
 _MOST_SEEDS = 10_000
 POLICIES = flags.DEFINE_list(
     'policies',
-    ['apple_seeker', 'carrying_saboteur', 'random'],
-    'Names of the scripted policies to run.',
+    None,
+    'Names of the scripted policies to run. Default: the solver of the task,'
+    ' its first saboteur and random actions.',
 )
 CHANNELS = flags.DEFINE_list(
     'channels',

@@ -19,7 +19,7 @@ from realab_suite.policies import action_sets
     ],
 )
 def test_keys_choose_an_action(keys, name):
-  index = keyboards.action(keys)
+  index = keyboards.action(keys, action_sets.DMLAB_LIKE)
   assert action_sets.DMLAB_LIKE.actions[index][0] == name
 
 

@@ -1,0 +1,102 @@
+"""Names of tasks: a domain, and a task in it.
+
+A world registers itself where it is defined. `suite` imports all modules of
+this folder, and `--import` names those of other packages.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+import functools
+from typing import Any, TypeVar
+
+from realab_suite import errors
+from realab_suite.config import messages
+from realab_suite.tasks import base
+
+TaskFactory = Callable[..., base.Task]
+
+_Factory = TypeVar('_Factory', bound=Callable[..., Any])
+
+_TASKS: dict[tuple[str, str], tuple[TaskFactory, frozenset[str]]] = {}
+
+
+def register_task(
+    domain_name: str, task_name: str, *tags: str
+) -> Callable[[_Factory], _Factory]:
+  """Returns a decorator that registers a task under a name.
+
+  Args:
+    domain_name: Name of the domain.
+    task_name: Name of the variation.
+    *tags: Tags of the task; see `suite.get_tasks_by_tag`.
+
+  Raises:
+    SpecError: If a name is not a string, or if the decorator is used for a task
+      that is registered already.
+  """
+  for name in (domain_name, task_name):
+    if not isinstance(name, str):
+      raise errors.SpecError(
+          f'task name {messages.quote(name)}; allowed are strings'
+      )
+
+  def decorate(factory: _Factory) -> _Factory:
+    if (domain_name, task_name) in _TASKS:
+      raise errors.SpecError(
+          f'task {domain_name}.{task_name} is registered already'
+      )
+    _TASKS[domain_name, task_name] = factory, frozenset(tags)
+    return factory
+
+  return decorate
+
+
+def register_variations(
+    domain_name: str, variations: Mapping[str, Sequence[str]]
+) -> Callable[[_Factory], _Factory]:
+  """Returns a decorator that registers a task for each of its variations.
+
+  Args:
+    domain_name: Name of the domain.
+    variations: Tags of each variation, by its name, which is the name of the
+      task and the first argument of the decorated class.
+
+  Raises:
+    SpecError: As `register_task`.
+  """
+
+  def decorate(factory: _Factory) -> _Factory:
+    for name, tags in variations.items():
+      variation = functools.partial(factory, name)
+      register_task(domain_name, name, *tags)(variation)
+    return factory
+
+  return decorate
+
+
+def find(domain_name: str, task_name: str) -> TaskFactory:
+  """Returns the function that makes a task.
+
+  Raises:
+    UnknownNameError: If there is no such task.
+  """
+  are_strings = isinstance(domain_name, str) and isinstance(task_name, str)
+  if not are_strings or (domain_name, task_name) not in _TASKS:
+    known = [f'{domain}.{task}' for domain, task in _TASKS]
+    raise errors.UnknownNameError(
+        f'task {_format(domain_name)}.{_format(task_name)} is unknown; known'
+        f' are {known}'
+    )
+  return _TASKS[domain_name, task_name][0]
+
+
+def names(tag: str | None = None) -> tuple[tuple[str, str], ...]:
+  """Returns the `(domain, task)` names of all tasks, or of those with a tag."""
+  return tuple(
+      name for name, (_, tags) in _TASKS.items() if tag is None or tag in tags
+  )
+
+
+def _format(name: Any) -> str:
+  """Returns a name for messages, quoted unless it is short and one line."""
+  is_plain = isinstance(name, str) and name.isprintable() and len(name) <= 80
+  return name if is_plain else messages.quote(name)

@@ -1,0 +1,82 @@
+"""Base class for tasks in a room with places for registers."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
+from realab_suite.entities.registers import base as registers_base
+from realab_suite.tasks import base
+from realab_suite.tasks import layouts
+from realab_suite.tasks import starts
+
+
+class RoomTask(base.Task):
+  """Base class for tasks in a room with stations for registers.
+
+  A subclass calls `place_avatar` from `initialize_episode`.
+  """
+
+  def __init__(
+      self,
+      arena: arenas.RoomArena,
+      layout: layouts.Layout | None = None,
+      *,
+      camera_size: Sequence[int] | None = None,
+      starts_beside_registers: float = 0.0,
+      physics_timestep: float = block_kinds.LONG_SUBSTEP,
+  ) -> None:
+    """Builds the room.
+
+    Args:
+      arena: Root entity of the task.
+      layout: Places in the room; `None` for the default ones.
+      camera_size: Height and width of the egocentric image, in pixels, or
+        `None`; see `base.Task`.
+      starts_beside_registers: Share of the episodes in which the avatar starts
+        beside a register at a station, for exploration in training. Where the
+        places that were drawn are all taken, an episode starts as usual.
+      physics_timestep: Duration of a substep of the physics, 0.025 or 0.01 s;
+        see `base.Task`.
+
+    Raises:
+      SpecError: If an argument has a value that is not allowed.
+    """
+    self._layout = layout = layouts.Layout() if layout is None else layout
+    self._starts = starts.BesideRegisters(starts_beside_registers)
+    arena.offer(
+        {name: arenas.Place(xy) for name, xy in layout.stations.items()}
+    )
+    if layout.barrier is not None:
+      arena.add_barrier('barrier', *layout.barrier)
+    super().__init__(arena, camera_size, physics_timestep)
+
+  @property
+  def layout(self) -> layouts.Layout:
+    """Places in the room."""
+    return self._layout
+
+  @property
+  def start(self) -> arenas.Rectangle:
+    return self._layout.start
+
+  def add_registers(self, registers: Sequence[registers_base.Register]) -> None:
+    self._starts.connect(self._layout, self._arena.room, registers)
+    super().add_registers(registers)
+
+  def place_avatar(self, physics: protocols.Physics, random_state: Any) -> None:
+    """Draws the pose in which the avatar begins an episode.
+
+    Args:
+      physics: Physics of one world.
+      random_state: Random generator of the episode.
+    """
+    spread = layouts.START_SPREAD
+    middle = np.array(self._layout.middle)
+    position = middle + random_state.uniform(-spread, spread, 2)
+    heading = random_state.uniform(-np.pi, np.pi)
+    position = self._starts.draw(physics, random_state, position)
+    self._avatar.place(physics, position, heading)

@@ -1,0 +1,121 @@
+"""Starts of episodes that help a learner to explore."""
+
+from collections.abc import Sequence
+from typing import Any, final
+
+from dm_control import mjcf
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
+from realab_suite.entities import protocols
+from realab_suite.entities.registers import base as registers_base
+from realab_suite.tasks import layouts
+
+# Distance from a station within which the base block of its register is, in m.
+_AT = 0.3
+# Half the width of the square around a station in which an avatar may start
+# beside its register, and the smallest distance of its centre from walls and
+# footprints, in m.
+_BESIDE = 1.6
+_CLEARANCE = 0.27
+# Smallest distance of its centre from that of a block elsewhere, in m.
+_APART = 0.4
+_TRIES = 32
+
+
+@final
+class BesideRegisters:
+  """Lets a share of the episodes begin beside a register at a station."""
+
+  def __init__(self, share: float) -> None:
+    """Initializes the starts; `connect` follows.
+
+    Args:
+      share: Share of the episodes, in [0, 1].
+
+    Raises:
+      SpecError: If it is not a share.
+    """
+    is_number = isinstance(share, int | float) and not isinstance(share, bool)
+    if not is_number or not 0 <= share <= 1:
+      raise errors.SpecError(
+          f'starts_beside_registers: {share!r:.80}; allowed are numbers from 0'
+          ' to 1'
+      )
+    self._share = float(share)
+    self._blocks: list[block_kinds.Block] = []
+    self._used: list[tuple[float, float]] = []
+
+  def connect(
+      self,
+      layout: layouts.Layout,
+      room: arenas.Rectangle,
+      registers: Sequence[registers_base.Register],
+  ) -> None:
+    """Connects the starts to the registers of a design, which are attached.
+
+    Args:
+      layout: Layout of the room.
+      room: The room, without its walls.
+      registers: The registers.
+
+    Raises:
+      SpecError: If no register stands at a station that can be reached.
+    """
+    if not self._share:
+      return
+    places = [
+        mjcf.get_attachment_frame(register.mjcf_model).pos[:2]
+        for register in registers
+    ]
+    self._layout, self._room = layout, room
+    self._blocks = [block for one in registers for block in one.blocks]
+    self._used = [
+        station
+        for station in layout.stations.values()
+        if any(np.linalg.norm(np.subtract(p, station)) < _AT for p in places)
+    ]
+    refusal = f'starts_beside_registers: {self._share}; allowed is 0'
+    if not self._used:
+      raise errors.SpecError(f'{refusal} if no register stands at a station')
+    if not layout.are_before_the_barrier(np.array(self._used)).all():
+      raise errors.SpecError(
+          f'{refusal} where a barrier stands before the registers'
+      )
+
+  def draw(
+      self,
+      physics: protocols.Physics,
+      random_state: Any,
+      otherwise: np.ndarray,
+  ) -> np.ndarray:
+    """Draws the position in which the avatar begins, `(2,)`, in m.
+
+    Args:
+      physics: Physics of one world.
+      random_state: Random generator of the episode.
+      otherwise: Position of an episode that begins elsewhere, and where all
+        places that were drawn are taken.
+    """
+    # Without such starts, nothing is drawn, so episodes stay the same.
+    if not self._share or random_state.uniform() >= self._share:
+      return otherwise
+    station = np.array(self._used[random_state.randint(len(self._used))])
+    tries = station + random_state.uniform(-_BESIDE, _BESIDE, (_TRIES, 2))
+    is_free = np.array(
+        [self._room.contains(point, _CLEARANCE) for point in tries]
+    )
+    for other in self._used:
+      low, high = layouts.FOOTPRINT.T + other
+      near = (low - _CLEARANCE < tries) & (tries < high + _CLEARANCE)
+      is_free &= ~near.all(axis=1)
+    blocks = physics.bind([block.geom for block in self._blocks]).xpos[:, :2]
+    gaps = np.linalg.norm(tries[:, np.newaxis] - blocks, axis=-1)
+    is_free &= (gaps > _APART).all(axis=1)
+    if self._layout.barrier is not None:
+      y = self._layout.barrier[0][1]
+      is_free &= np.abs(tries[:, 1] - y) > _CLEARANCE
+      is_free &= self._layout.are_before_the_barrier(tries)
+    return tries[is_free.argmax()] if is_free.any() else otherwise
