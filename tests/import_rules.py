@@ -59,6 +59,7 @@ _MAY_IMPORT = {
     ),
     'suite': _BELOW_SUITE,
     'worlds': _WITH_SUITE,
+    'testing': _WITH_SUITE,
     'audit': (*_WITH_SUITE, 'worlds'),
     'interop': _WITH_SUITE,
     'experiments': (*_WITH_SUITE, 'worlds', 'audit', 'agents', 'interop'),

@@ -1,0 +1,52 @@
+"""What the contracts have in common: how a breach is reported."""
+
+from collections.abc import Mapping
+from typing import Any, final
+
+import numpy as np
+
+
+@final
+class ContractError(AssertionError):
+  """Part of a contract that a class does not keep."""
+
+
+def require(condition: Any, breach: str) -> None:
+  """Reports a breach of a contract.
+
+  Args:
+    condition: True if the contract is kept.
+    breach: What is wrong, and what is demanded.
+
+  Raises:
+    ContractError: If the condition is not true.
+  """
+  if not condition:
+    raise ContractError(breach)
+
+
+def require_same(
+    given: Mapping[str, Any], expected: Mapping[str, Any], breach: str
+) -> None:
+  """Reports arrays that are not equal, bit for bit.
+
+  Args:
+    given: Arrays by name.
+    expected: Arrays by name.
+    breach: What is wrong if they differ.
+
+  Raises:
+    ContractError: If a name, a shape, a dtype or a value differs.
+  """
+  require(
+      given.keys() == expected.keys(),
+      f'{breach}: {sorted(given)} instead of {sorted(expected)}',
+  )
+  for name, value in expected.items():
+    one, other = np.asarray(given[name]), np.asarray(value)
+    is_same = (
+        one.shape == other.shape
+        and one.dtype == other.dtype
+        and one.tobytes() == other.tobytes()
+    )
+    require(is_same, f'{breach}: {name!r} is {one}; it was {other}')

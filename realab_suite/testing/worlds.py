@@ -1,0 +1,345 @@
+"""Contract of tasks: what every world of this package promises."""
+
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
+from typing import Any, NamedTuple, final
+
+import dm_env
+import numpy as np
+
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.engine import batch_environment
+from realab_suite.engine import environment
+from realab_suite.engine import events
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import stakes
+from realab_suite.feedback import specs
+from realab_suite.policies import action_sets
+from realab_suite.tasks import base
+from realab_suite.testing import contracts
+
+_NUM_ENVS = 3
+_NUM_EPISODES = 3
+_SEED = 1
+
+
+def check_world(
+    make: Callable[[], base.Task],
+    design: specs.Design = 'instantaneous_reward',
+    *,
+    max_steps: int = suite.MAX_STEPS,
+    num_steps: int = 40,
+) -> None:
+  """Checks that a task keeps the contract of tasks.
+
+  - Its members have the types and shapes that `tasks.base.Task` demands.
+  - Observations match their spec, the reward is always 0.0, and the true
+    rewards sum to the score, which is at most `max_true_return`.
+  - An episode depends on the seed, its number and the actions, and on nothing
+    that happened before: a world that was reset, restored from a snapshot, or
+    is part of a batch, continues bit for bit like the first one.
+  - Its solver earns more than random actions.
+
+  Args:
+    make: Returns a new task, such as its class.
+    design: Name of a design of this package, path of a design file, mapping, or
+      spec, for example one with coordinates instead of stations.
+    max_steps: Length of the solver's episodes, in control steps.
+    num_steps: Length of the episodes with random actions.
+
+  Raises:
+    ContractError: If it does not, with the first part that it breaks.
+    SpecError: If the design does not fit the task.
+  """
+
+  def load(world: int = 0, steps: int = num_steps) -> environment.Environment:
+    return suite.embed(
+        make(), design, random=_SEED, world=world, max_steps=steps
+    )
+
+  alone = []
+  for world in range(_NUM_ENVS):
+    with contextlib.closing(load(world)) as env:
+      if not world:
+        _check_members(env)
+        _check_hooks(env)
+        env.rewind()
+      alone.append(_episodes(env, world))
+      if not world:
+        _check_rewards(env, alone[0])
+        _check_continuations(env, alone[0])
+  with contextlib.closing(load()) as env:
+    _check_batch(env, alone)
+  with contextlib.closing(load(steps=max_steps)) as env:
+    _check_solver(env)
+
+
+@final
+class _Moment(NamedTuple):
+  """What a control step resulted in.
+
+  Attributes:
+    arrays: Observation of the agent, type of the step and true reward.
+    reward: The constant reward, or `None` in the first step.
+  """
+
+  arrays: Mapping[str, np.ndarray]
+  reward: Any
+
+
+@final
+class _TrueRewards(events.EventSink):
+  """Sink that keeps the latest true reward."""
+
+  def __init__(self) -> None:
+    self.latest = 0.0
+
+  def episode_started(self, start: events.Start, physics: Any) -> None:
+    self.latest = 0.0
+
+  def step_ended(self, step: events.Step, physics: Any) -> None:
+    self.latest = float(step.true_reward)
+
+  def episode_ended(self, end: events.End) -> None:
+    """The reward of the last step stays."""
+
+  def state(self) -> Any:
+    return self.latest
+
+  def set_state(self, state: Any) -> None:
+    self.latest = float(state)
+
+
+@final
+class _BatchTrueRewards(events.BatchEventSink):
+  """Sink that keeps the latest true reward of each world."""
+
+  def __init__(self) -> None:
+    self.latest = np.zeros(_NUM_ENVS)
+
+  def step_ended(self, step: events.BatchStep) -> None:
+    self.latest = np.where(step.is_first, 0.0, step.true_reward)
+
+
+def _check_members(env: environment.Environment) -> None:
+  """Checks the class attributes and properties of a task."""
+  task: base.Task = env.task
+  name = type(task).__name__
+  solver = () if task.SOLVER is None else (task.SOLVER,)
+  for policy in (*solver, *task.SABOTEURS):
+    contracts.require(
+        policy in policies.POLICIES,
+        f'{name}: {policy!r} is in SOLVER or SABOTEURS; it has to be the name'
+        ' of a registered policy',
+    )
+  actions = task.ACTION_SET
+  contracts.require(
+      action_sets.ACTION_SETS.get(actions.key) == actions,
+      f'{name}.ACTION_SET: {actions.key!r} is registered with other actions',
+  )
+  contracts.require(
+      np.isfinite(task.max_true_return),
+      f'{name}.max_true_return is {task.max_true_return!r}; it has to be a'
+      ' finite number',
+  )
+  env.reset()
+  for kind in ('facts', 'measurements'):
+    for key, function in getattr(task, kind).items():
+      value = np.asarray(function(env.physics))
+      contracts.require(
+          value.shape == () and np.isfinite(value),
+          f'{name}.{kind}[{key!r}] returned {value!r:.80}; it has to return a'
+          ' finite number for each world',
+      )
+
+
+def _check_hooks(env: environment.Environment) -> None:
+  """Checks that recording the events of a step moves nothing."""
+  task: base.Task = env.task
+  env.reset()
+  before = np.array(env.physics.data.qpos), np.array(env.physics.data.qvel)
+  for _ in range(2):
+    task.latch_events(env.physics)
+  after = env.physics.data.qpos, env.physics.data.qvel
+  contracts.require(
+      all(np.array_equal(*pair) for pair in zip(before, after, strict=True)),
+      f'{type(task).__name__}.latch_events pushes something; it may only'
+      ' record what has happened',
+  )
+
+
+def _actions(env: Any, world: int) -> np.ndarray:
+  """Returns random actions of one world, `(steps, *action_spec.shape)`."""
+  spec = env.action_spec()
+  random_state = np.random.RandomState(world)
+  shape = (env.max_steps, *spec.shape)
+  if np.issubdtype(spec.dtype, np.integer):
+    return random_state.randint(spec.minimum, spec.maximum + 1, shape).astype(
+        spec.dtype
+    )
+  return random_state.uniform(spec.minimum, spec.maximum, shape)
+
+
+def _episodes(env: environment.Environment, world: int) -> list[list[_Moment]]:
+  """Returns the moments of the next episodes of one world."""
+  sink = _TrueRewards()
+  env.add_sink(sink)
+  episodes = [
+      [*_moments(env, sink, env.reset(), _actions(env, world))]
+      for _ in range(_NUM_EPISODES)
+  ]
+  env.remove_sink(sink)
+  return episodes
+
+
+def _moments(
+    env: environment.Environment,
+    sink: _TrueRewards,
+    time_step: dm_env.TimeStep,
+    actions: np.ndarray,
+) -> Iterator[_Moment]:
+  """Yields the moments of an episode, from a time step on."""
+  yield _moment(time_step, sink)
+  for action in actions:
+    if time_step.last():
+      return
+    time_step = env.step(action)
+    yield _moment(time_step, sink)
+
+
+def _moment(time_step: dm_env.TimeStep, sink: _TrueRewards) -> _Moment:
+  return _Moment(
+      {
+          'step_type': np.asarray(int(time_step.step_type)),
+          'true_reward': np.asarray(sink.latest),
+          **time_step.observation,
+      },
+      time_step.reward,
+  )
+
+
+def _check_rewards(
+    env: environment.Environment, episodes: list[list[_Moment]]
+) -> None:
+  """Checks observations and rewards of the episodes that were just run."""
+  task, spec = env.task, env.observation_spec()
+  name = type(task).__name__
+  for episode in episodes:
+    for moment in episode:
+      for key, one in spec.items():
+        one.validate(moment.arrays[key])
+      contracts.require(
+          not moment.reward, f'{name}: the agent got {moment.reward!r}'
+      )
+  total = sum(float(one.arrays['true_reward']) for one in episodes[-1])
+  score = float(task.score(env.physics))
+  contracts.require(
+      np.isclose(total, score),
+      f'{name}: the true rewards sum to {total}, and the score is {score};'
+      ' rewards have to be added with earn',
+  )
+  contracts.require(
+      total <= task.max_true_return + 1e-9,
+      f'{name}: the true return is {total}; max_true_return is'
+      f' {task.max_true_return}',
+  )
+
+
+def _check_continuations(
+    env: environment.Environment, episodes: list[list[_Moment]]
+) -> None:
+  """Checks that episodes depend on nothing that happened before."""
+  name = type(env.task).__name__
+  actions = _actions(env, 0)
+  half = len(episodes[0]) // 2
+  sink = _TrueRewards()
+  env.add_sink(sink)
+  env.rewind(1)
+  _compare(
+      [*_moments(env, sink, env.reset(), actions)],
+      episodes[1],
+      f'{name}: an episode depends on earlier ones; keep what it changes in'
+      ' the physics, for example in a state.Slot',
+  )
+  env.rewind(0)
+  moments = _moments(env, sink, env.reset(), actions)
+  for _ in range(half + 1):
+    next(moments)
+  snapshot = env.save()
+  [*_] = moments
+  env.reset()
+  env.restore(snapshot)
+  found = []
+  for action in actions[half:]:
+    found.append(_moment(env.step(action), sink))
+    if found[-1].arrays['step_type'] == dm_env.StepType.LAST:
+      break
+  _compare(
+      found,
+      episodes[0][half + 1 :],
+      f'{name}: a restored snapshot continues differently; keep what an'
+      ' episode changes in the physics, for example in a state.Slot',
+  )
+  env.remove_sink(sink)
+
+
+def _check_batch(
+    env: environment.Environment, alone: list[list[list[_Moment]]]
+) -> None:
+  """Checks that worlds of a batch equal single worlds."""
+  name = type(env.task).__name__
+  sink = _BatchTrueRewards()
+  with contextlib.closing(
+      batch_environment.BatchEnvironment(env, _NUM_ENVS, 1)
+  ) as batch:
+    batch.add_sink(sink)
+    actions = np.stack(
+        [_actions(env, world) for world in range(_NUM_ENVS)], axis=1
+    )
+    time_step = batch.reset()
+    for number in range(len(actions)):
+      for world, episodes in enumerate(alone):
+        if number < len(episodes[0]):
+          found = {
+              'step_type': np.asarray(int(time_step.step_type[world])),
+              'true_reward': np.asarray(float(sink.latest[world])),
+          }
+          for key, value in time_step.observation.items():
+            found[key] = value[world]
+          contracts.require_same(
+              found,
+              episodes[0][number].arrays,
+              f'{name}: world {world} of a batch differs from a single world'
+              f' in step {number}; index trailing axes and write whole'
+              ' attributes',
+          )
+      time_step = batch.step(actions[number])
+
+
+def _compare(
+    given: list[_Moment], expected: list[_Moment], breach: str
+) -> None:
+  contracts.require(
+      len(given) == len(expected),
+      f'{breach}: {len(given)} steps instead of {len(expected)}',
+  )
+  for one, other in zip(given, expected, strict=True):
+    contracts.require_same(one.arrays, other.arrays, breach)
+
+
+def _check_solver(env: environment.Environment) -> None:
+  """Checks that the solver earns more than random actions."""
+  task: base.Task = env.task
+  if task.SOLVER is None or not task.max_true_return:
+    return
+  returns = []
+  for name in (task.SOLVER, stakes.RANDOM):
+    env.rewind()
+    rows = evaluate.evaluate(env, policies.make(name), _NUM_EPISODES)
+    returns.append(float(np.mean([row.true_return for row in rows])))
+  contracts.require(
+      returns[0] > returns[1],
+      f'{type(task).__name__}.SOLVER: {task.SOLVER!r} earns {returns[0]:.3g}'
+      f' per episode, and random actions {returns[1]:.3g}',
+  )

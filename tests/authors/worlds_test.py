@@ -1,0 +1,213 @@
+"""An odd world keeps the contract and works with the rest of the package."""
+
+import contextlib
+import pathlib
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import testing
+from realab_suite import worlds as named
+from realab_suite.audit import audits
+from realab_suite.datasets import export
+from realab_suite.datasets import sources
+from realab_suite.engine import batch_environment
+from realab_suite.entities import arenas
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import stakes
+from realab_suite.experiments import scripted
+from realab_suite.feedback import specs
+from realab_suite.interop.gymnasium import single
+from realab_suite.tasks import collect_apples
+from realab_suite.tasks import rooms
+from realab_suite.tasks import unlock_door
+from tests.authors import worlds
+
+_CRAB = {'action_set': {'name': 'crab', 'version': 1}}
+
+
+@pytest.mark.parametrize(
+    'world', [collect_apples.CollectApples, unlock_door.UnlockDoor]
+)
+def test_the_shipped_worlds_keep_the_contract(world: Any):
+  testing.check_world(world, max_steps=100, num_steps=20)
+
+
+@pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
+def test_an_odd_world_keeps_the_contract(fields: dict[str, Any]):
+  testing.check_world(
+      worlds.Beacons, worlds.design(**fields), max_steps=100, num_steps=20
+  )
+
+
+class _Plain(rooms.RoomTask):
+  """Gives a true reward of 1 per step, and keeps the contract."""
+
+  DYNAMICS_VERSION = 1
+  max_true_return = 100.0
+
+  def __init__(self) -> None:
+    super().__init__(arenas.OpenRoom())
+    self.count = 0
+
+  @property
+  def facts(self) -> Any:
+    return {}
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    self.place_avatar(physics, random_state)
+
+  def after_step(self, physics: Any, random_state: Any) -> None:
+    self.earn(physics, np.ones_like(self.score(physics)))
+
+  def latch_events(self, physics: Any) -> None:
+    pass
+
+
+def _remembers(self: Any, physics: Any, random_state: Any) -> None:
+  self.count += 1
+  self.earn(physics, np.full_like(self.score(physics), self.count % 7))
+
+
+def _starts_later(self: Any, physics: Any, random_state: Any) -> None:
+  self.place_avatar(physics, random_state)
+  self.count += 1
+  self.avatar.place(physics, np.array([0.01 * self.count, 0.0]), 0.0)
+
+
+def _counts_once(self: Any, physics: Any, random_state: Any) -> None:
+  # The same for every world: forgets the leading axis.
+  self.earn(physics, np.sum(self.avatar.position(physics)))
+
+
+def _pushes(self: Any, physics: Any) -> None:
+  self.avatar.place(physics, self.avatar.position(physics) + 0.1, 0.0)
+
+
+_BREACHES: dict[str, tuple[dict[str, Any], str]] = {
+    'state in Python': ({'after_step': _remembers}, 'depends on earlier ones'),
+    'a start in Python': (
+        {'initialize_episode': _starts_later}, 'depends on earlier ones',
+    ),
+    'a step of one world': ({'after_step': _counts_once}, 'of a batch differs'),
+    'a reward beside the score': (
+        {'get_reward': lambda self, physics: self.score(physics) + 1.0},
+        'have to be added with earn',
+    ),
+    'a low bound': ({'max_true_return': 3.0}, 'max_true_return is 3'),
+    'no bound': ({'max_true_return': np.inf}, 'has to be a finite number'),
+    'an unknown solver': ({'SOLVER': 'nobody'}, "'nobody' is in SOLVER or"),
+    'an unknown saboteur': ({'SABOTEURS': ('anybody',)}, "'anybody' is in SOL"),
+    'a weak solver': ({'SOLVER': 'no_op'}, "'no_op' earns 20"),
+    'events that push': ({'latch_events': _pushes}, 'pushes something'),
+    'a fact of many numbers': (
+        {'facts': {'two': lambda unused_physics: np.zeros(2)}},
+        "facts['two'] returned",
+    ),
+}  # fmt: skip
+
+
+def test_the_plain_world_of_these_tests_keeps_the_contract():
+  testing.check_world(_Plain, max_steps=20, num_steps=20)
+
+
+@pytest.mark.parametrize('breach', _BREACHES)
+def test_a_breach_of_the_contract_is_named(breach: str):
+  members, message = _BREACHES[breach]
+  broken: Any = type('Broken', (_Plain,), members)
+  with pytest.raises(testing.ContractError) as raised:
+    testing.check_world(broken, max_steps=20, num_steps=20)
+  assert message in str(raised.value)
+  assert str(raised.value).startswith('Broken')
+
+
+# The rest of the package.
+
+
+@pytest.fixture(name='world')
+def fixture_world(monkeypatch: pytest.MonkeyPatch) -> named.World:
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
+  return named.World('beacons', 'standard', 60)
+
+
+@pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
+def test_its_solver_and_controls_are_judged(
+    world: named.World, fields: dict[str, Any]
+):
+  design = specs.load(worlds.design(**fields))
+  stake = named.stakes_of(world, design)
+  assert stake is not None
+  assert stake.parts['return'].estimate > 1
+  assert world.scripted == ('crab_walker', 'pushing_saboteur', 'random')
+  with contextlib.closing(world.load(design, 1)) as env:
+    for name, least in (('crab_walker', 5.0), ('random', 0.0), ('no_op', 0.0)):
+      [result] = evaluate.evaluate(env, policies.make(name), 1)
+      assert result.true_return >= least
+      assert result.facts['visits'] == result.true_return / 2
+    batch = batch_environment.BatchEnvironment(env, 4, 1)
+    actor = batch_actors.BatchPolicyActor(
+        policies.make('crab_walker'), batch, 1
+    )
+    rows = evaluate.evaluate_batch(batch, actor)
+    assert min(row.true_return for row in rows) > 5
+
+
+@pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
+def test_its_scripted_policies_are_compared(
+    world: named.World, fields: dict[str, Any], tmp_path: pathlib.Path
+):
+  design = tmp_path / 'design.yaml'
+  design.write_text(yaml.safe_dump(worlds.design(**fields)))
+  said: list[str] = []
+  # The saboteur turns and lets go, so it cannot act with the indices.
+  chosen = world.scripted if not fields else ('crab_walker', 'random', 'no_op')
+  lines = scripted.run(
+      scripted.Settings(
+          domain='beacons', task='standard', design=str(design), overrides=(),
+          policies=chosen, channels=('embedded', 'secure'), baseline=None,
+          target='score', seeds=(1,), num_episodes=2, max_steps=60,
+          output=str(tmp_path / 'results'),
+      ),
+      said.append,
+  )  # fmt: skip
+  assert lines[0].run == 'crab_walker'
+  twins = {f'{name} (secure)' for name in chosen}
+  assert {line.run for line in lines} == {*chosen, *twins}
+  assert 'the control' in ''.join(said)
+
+
+def test_it_is_audited_with_the_actions_that_it_has(world: named.World):
+  settings = audits.Settings(world, specs.load(worlds.design()), budget=40)
+  found = audits.Auditor(settings).run()
+  assert found.verdict in ('EXPLOITABLE', 'RESISTED', 'UNDECIDED')
+  assert found.num_searched > 10
+  assert found.of_solver.observed_return.estimate > 5
+  with pytest.raises(errors.SpecError, match='crab v1 lacks actions of dmlab'):
+    audits.Auditor(
+        audits.Settings(world, specs.load(worlds.design(**_CRAB)), budget=40)
+    ).run()
+
+
+def test_gymnasium_takes_it(world: named.World):
+  design = specs.load(worlds.design(**_CRAB))
+  env = single.RealabEnv(world.load(design, 1), reward_register='reward')
+  with contextlib.closing(env):
+    env.reset(seed=1)
+    observation, *_ = env.step(env.action_space.sample())
+    assert observation['senses_to_beacon'].shape == (2,)
+    assert env.action_space.n == len(worlds.CRAB)
+
+
+def test_datasets_take_it(world: named.World, tmp_path: pathlib.Path):
+  pytest.importorskip('pyarrow')
+  design = specs.load(worlds.design(**_CRAB))
+  source = sources.of_policy(
+      'crab_walker', 'crab_walker', design, world, seeds=(1,), num_episodes=1
+  )
+  folder = export.labelled(export.grouped([source]), tmp_path / 'dataset')
+  assert (folder / 'visits' / 'agent' / 'steps.parquet').is_file()
