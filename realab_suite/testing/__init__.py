@@ -1,6 +1,7 @@
 """Contracts for tests of one's own: `testing.check_world(MyWorld)`."""
 
 from realab_suite.testing.contracts import ContractError
+from realab_suite.testing.providers import check_provider
 from realab_suite.testing.worlds import check_world
 
-__all__ = ['ContractError', 'check_world']
+__all__ = ['ContractError', 'check_provider', 'check_world']

@@ -1,21 +1,18 @@
 """Tests for providers: their writes, and that they are pure."""
 
 from collections.abc import Iterator
-import copy
-import functools
+import itertools
 from typing import Any, final
 
 import numpy as np
 import pytest
 
 from realab_suite import policies
-from realab_suite import suite
+from realab_suite import testing
 from realab_suite.feedback import providers
 from realab_suite.policies import action_sets
 from realab_suite.policies import random_keys
 from tests.engine import helpers
-
-_STEPS = 6
 
 
 @final
@@ -75,62 +72,6 @@ _CASES: list[tuple[str, dict[str, Any]]] = [
 _IDS = ['-'.join(map(str, [k, *f.values()])) for k, f in _CASES]
 
 
-@functools.cache
-def _observations(seed: int) -> list[dict[str, np.ndarray]]:
-  """Returns the observations of an agent that acts at random in a world."""
-  env = suite.load(
-      'unlock_door', 'standard', {'random': seed}, {'max_steps': 50}
-  )
-  seen = [env.reset().observation]
-  for action in helpers.random_actions(env, _STEPS - 1, seed):
-    seen.append(env.step(action).observation)
-  env.close()
-  return seen
-
-
-def _inputs(world: int, step: int) -> tuple[Any, ...]:
-  """Returns the inputs of a step; world 1 starts again in step 3."""
-  generator = np.random.default_rng((world, step))
-  readings = {
-      'score': np.array(generator.uniform(0, 20)),
-      'query': np.array(generator.uniform(-1, 15)),
-  }
-  start = step == 0 or (world == 1 and step == 3)
-  key = generator.integers(2**63, size=2, dtype=np.uint64)
-  return _observations(world + 1)[step], readings, np.array(start), key
-
-
-def _stack(parts: list[Any]) -> Any:
-  if isinstance(parts[0], dict):
-    return {key: np.stack([p[key] for p in parts]) for key in parts[0]}
-  return np.stack(parts)
-
-
-def _stacked_inputs(worlds: int | None, step: int) -> tuple[Any, ...]:
-  """Returns the inputs of one world, or of a batch with a leading axis."""
-  if worlds is None:
-    return _inputs(0, step)
-  inputs = [_inputs(world, step) for world in range(worlds)]
-  return tuple(_stack(list(part)) for part in zip(*inputs, strict=True))
-
-
-def _leaves(tree: Any) -> list[np.ndarray]:
-  if isinstance(tree, dict):
-    return [leaf for key in sorted(tree) for leaf in _leaves(tree[key])]
-  if isinstance(tree, tuple | list):
-    return [leaf for item in tree for leaf in _leaves(item)]
-  return [np.asarray(tree)]
-
-
-def _parts(write: Any) -> tuple[Any, Any]:
-  """Returns the value of a write, and whether the provider speaks."""
-  return write if isinstance(write, tuple) else (write, np.array(True))
-
-
-def _bytes(tree: Any) -> list[tuple[Any, ...]]:
-  return [(leaf.shape, leaf.tobytes()) for leaf in _leaves(tree)]
-
-
 def test_every_shipped_kind_is_tested_here():
   shipped = {
       kind
@@ -141,65 +82,102 @@ def test_every_shipped_kind_is_tested_here():
 
 
 @pytest.mark.parametrize(('kind', 'fields'), _CASES, ids=_IDS)
-class TestContract:
+def test_shipped_providers_keep_the_contract(kind: str, fields: dict[str, Any]):
+  testing.check_provider(_make(kind, **fields))
 
-  @pytest.mark.parametrize('worlds', [None, 3])
-  def test_equal_inputs_give_equal_outputs_and_stay_unchanged(
-      self, kind: str, fields: dict[str, Any], worlds: int | None
-  ):
-    provider, twin = _make(kind, **fields), _make(kind, **fields)
-    shape = () if worlds is None else (worlds,)
-    state = provider.initial_state(shape)
-    assert _bytes(state) == _bytes(twin.initial_state(shape))
-    for step in range(_STEPS):
-      inputs = (*_stacked_inputs(worlds, step), state)
-      before = copy.deepcopy(inputs)
-      first = provider.step(*inputs)
-      kept = copy.deepcopy(first)
-      assert _bytes(inputs) == _bytes(before)
-      assert _bytes(provider.step(*inputs)) == _bytes(kept)
-      assert _bytes(twin.step(*before)) == _bytes(kept)
-      # Later steps do not write to earlier outputs.
-      assert _bytes(first) == _bytes(kept)
-      state = first[1]
 
-  def test_a_batch_gives_the_finite_numbers_of_its_worlds_alone(
-      self, kind: str, fields: dict[str, Any]
-  ):
-    provider = _make(kind, **fields)
-    batch_state = provider.initial_state((3,))
-    states = [provider.initial_state(()) for _ in range(3)]
-    for step in range(_STEPS):
-      together, batch_state = provider.step(
-          *_stacked_inputs(3, step), batch_state
-      )
-      for world in range(3):
-        alone, states[world] = provider.step(
-            *_inputs(world, step), states[world]
-        )
-        assert set(alone) == set(fields['writes'])
-        for name in alone:
-          values, speaks = _parts(together[name])
-          value, is_spoken = _parts(alone[name])
-          assert np.shape(values) == (3,)
-          assert values[world] == value
-          assert np.broadcast_to(speaks, 3)[world] == is_spoken
-          assert np.asarray(value).dtype.kind == 'f'
-          assert np.isfinite(value)
+@final
+class _Plain(providers.Provider):
+  """Writes the sum of its readings in an episode."""
 
-  def test_an_episode_does_not_depend_on_the_one_before(
-      self, kind: str, fields: dict[str, Any]
-  ):
-    provider = _make(kind, **fields)
-    worn = provider.initial_state(())
-    for step in range(_STEPS):
-      _, worn = provider.step(*_inputs(1, step), worn)
-    fresh = provider.initial_state(())
-    for step in range(_STEPS):
-      inputs = _inputs(0, step)
-      from_worn, worn = provider.step(*inputs, worn)
-      from_fresh, fresh = provider.step(*inputs, fresh)
-      assert _bytes(from_worn) == _bytes(from_fresh)
+  kind: str = 'plain'
+  reads: Any = ('score',)
+  writes: Any = ('reward',)
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return {'sum': np.zeros(batch_shape)}
+
+  def step(
+      self,
+      observation: Any,
+      readings: Any,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> Any:
+    total = np.where(episode_start, 0.0, state['sum']) + readings['score']
+    return {'reward': total}, {'sum': total}
+
+
+_NUMBERS = itertools.count()
+
+
+def _with(change: Any) -> Any:
+  """Returns a `step` that changes the arguments or the result of `_Plain`."""
+
+  def step(self: Any, *inputs: Any) -> Any:
+    return change(self, _Plain.step, *inputs)
+
+  return step
+
+
+def _draw(self: Any, step: Any, *inputs: Any) -> Any:
+  writes, state = step(self, *inputs)
+  return {'reward': writes['reward'] + next(_NUMBERS)}, state
+
+
+def _scribble(self: Any, step: Any, *inputs: Any) -> Any:
+  inputs[1]['score'][...] = 0.0
+  return step(self, *inputs)
+
+
+def _reuse(self: Any, step: Any, *inputs: Any) -> Any:
+  writes, state = step(self, *inputs)
+  state['sum'] = inputs[-1]['sum']
+  state['sum'][...] = writes['reward']
+  return writes, state
+
+
+def _forget(self: Any, step: Any, *inputs: Any) -> Any:
+  observation, readings, start, key, state = inputs
+  return step(self, observation, readings, start & False, key, state)
+
+
+def _average(self: Any, step: Any, *inputs: Any) -> Any:
+  writes, state = step(self, *inputs)
+  mean = np.full(np.shape(writes['reward']), np.mean(writes['reward']))
+  return {'reward': mean}, state
+
+
+def _elsewhere(self: Any, step: Any, *inputs: Any) -> Any:
+  writes, state = step(self, *inputs)
+  return {'bonus': writes['reward']}, state
+
+
+def _divide(self: Any, step: Any, *inputs: Any) -> Any:
+  writes, state = step(self, *inputs)
+  return {'reward': writes['reward'] * np.inf}, state
+
+
+_BREACHES = {
+    'chance': (_draw, 'equal arguments gave other results'),
+    'changed readings': (_scribble, 'step changed its arguments'),
+    'a state in place': (_reuse, 'step changed its arguments'),
+    'no new episodes': (_forget, 'an episode depends on the one before'),
+    'worlds mixed up': (_average, 'in that world alone'),
+    'another register': (_elsewhere, "wrote to ['bonus']"),
+    'infinite values': (_divide, 'values have to be finite'),
+}
+
+
+@pytest.mark.parametrize('breach', _BREACHES)
+def test_a_breach_of_the_contract_is_named(breach: str):
+  testing.check_provider(_Plain())
+  change, message = _BREACHES[breach]
+  broken: Any = type('Broken', (_Plain,), {'step': _with(change)})
+  with pytest.raises(testing.ContractError) as raised:
+    testing.check_provider(broken())
+  assert message in str(raised.value)
 
 
 def _play(
@@ -312,10 +290,10 @@ def test_a_demonstration_is_the_index_of_the_policys_action():
   policy = policies.make('random')
   shown = set()
   for step in range(40):
-    inputs = _inputs(0, step % _STEPS)
     key = np.array([7, step], np.uint64)
-    writes, _ = provider.step(*inputs[:3], key, ())
-    action, _ = policy.step(inputs[0], inputs[2], key, ())
+    start = np.array(step == 0)
+    writes, _ = provider.step({}, {}, start, key, ())
+    action, _ = policy.step({}, start, key, ())
     assert writes['shown'] == action
     shown.add(int(action))
   assert shown <= set(range(len(action_sets.DMLAB_LIKE)))

@@ -1,0 +1,191 @@
+"""Contract of feedback providers: pure functions that serve whole batches."""
+
+from collections.abc import Mapping
+import copy
+from typing import Any
+
+import numpy as np
+
+from realab_suite import suite
+from realab_suite import trees
+from realab_suite.feedback.providers import base
+from realab_suite.testing import contracts
+
+_NUM_WORLDS = 3
+_NUM_STEPS = 6
+# World 1 begins another episode in this step.
+_SECOND_START = 3
+_RANGE = (-2.0, 16.0)
+
+
+def check_provider(
+    provider: base.Provider,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    *,
+    domain_name: str = 'unlock_door',
+    task_name: str = 'standard',
+) -> None:
+  """Checks that a provider keeps the contract of providers.
+
+  - Equal inputs give equal outputs. Inputs and earlier outputs stay unchanged.
+  - It writes finite numbers, and only to the registers that it declares.
+  - Each world of a batch gets what it would get alone.
+  - An episode does not depend on the one before.
+
+  Args:
+    provider: The provider.
+    ranges: Lowest and highest reading of the registers that it reads, by name;
+      -2 to 16 for others.
+    domain_name: Domain of the world whose senses it gets.
+    task_name: Task of that world.
+
+  Raises:
+    ContractError: If it does not, with the first part that it breaks.
+  """
+  worlds = [
+      _inputs(provider, ranges or {}, world, (domain_name, task_name))
+      for world in range(_NUM_WORLDS)
+  ]
+  batch = [
+      tuple(_stack(list(part)) for part in zip(*of_worlds, strict=True))
+      for of_worlds in zip(*worlds, strict=True)
+  ]
+  _check_purity(provider, worlds[0], ())
+  _check_purity(provider, batch, (_NUM_WORLDS,))
+  _check_batch(provider, batch, worlds)
+  _check_episodes(provider, worlds)
+
+
+def _inputs(
+    provider: base.Provider,
+    ranges: Mapping[str, tuple[float, float]],
+    world: int,
+    names: tuple[str, str],
+) -> list[tuple[Any, ...]]:
+  """Returns the inputs of the steps of one world, without the state."""
+  env = suite.load(
+      *names,
+      {'random': 1},
+      {
+          'world': world,
+          'max_steps': _NUM_STEPS,
+          # The agent needs at least one sense.
+          'senses': sorted({*provider.required_senses, 'time_left'}),
+      },
+  )
+  generator = np.random.default_rng(world)
+  spec = env.action_spec()
+  time_step = env.reset()
+  steps = []
+  for step in range(_NUM_STEPS):
+    readings = {
+        name: np.array(generator.uniform(*ranges.get(name, _RANGE)))
+        for name in provider.reads
+    }
+    start = step == 0 or (world == 1 and step == _SECOND_START)
+    key = generator.integers(2**63, size=2, dtype=np.uint64)
+    steps.append((time_step.observation, readings, np.array(start), key))
+    time_step = env.step(generator.uniform(spec.minimum, spec.maximum))
+  env.close()
+  return steps
+
+
+def _stack(parts: list[Any]) -> Any:
+  if isinstance(parts[0], dict):
+    return {key: np.stack([part[key] for part in parts]) for key in parts[0]}
+  return np.stack(parts)
+
+
+def _check_purity(
+    provider: base.Provider,
+    steps: list[tuple[Any, ...]],
+    batch_shape: tuple[int, ...],
+) -> None:
+  """Checks that a provider is a function that changes nothing."""
+  twin = provider.model_copy(deep=True)
+  where = f'provider {provider.kind!r}'
+  state = provider.initial_state(batch_shape)
+  contracts.require(
+      trees.are_equal(state, twin.initial_state(batch_shape)),
+      f'{where}: initial_state differs between two equal providers',
+  )
+  for inputs in steps:
+    before = copy.deepcopy((*inputs, state))
+    first = provider.step(*inputs, state)
+    kept = copy.deepcopy(first)
+    contracts.require(
+        trees.are_equal((*inputs, state), before),
+        f'{where}: step changed its arguments; return new arrays',
+    )
+    again, of_twin = provider.step(*inputs, state), twin.step(*before)
+    contracts.require(
+        trees.are_equal(again, kept) and trees.are_equal(of_twin, kept),
+        f'{where}: equal arguments gave other results; keep what it remembers'
+        ' in the state, and draw from the key',
+    )
+    contracts.require(
+        trees.are_equal(first, kept),
+        f'{where}: a later step changed an earlier result',
+    )
+    state = first[1]
+
+
+def _parts(write: Any) -> tuple[Any, Any]:
+  """Returns the value of a write, and whether the provider speaks."""
+  return write if isinstance(write, tuple) else (write, np.array(True))
+
+
+def _check_batch(
+    provider: base.Provider,
+    batch: list[tuple[Any, ...]],
+    worlds: list[list[tuple[Any, ...]]],
+) -> None:
+  """Checks that each world of a batch gets what it would get alone."""
+  where = f'provider {provider.kind!r}'
+  together = provider.initial_state((_NUM_WORLDS,))
+  alone = [provider.initial_state(()) for _ in worlds]
+  for number, inputs in enumerate(batch):
+    writes, together = provider.step(*inputs, together)
+    contracts.require(
+        {*writes} <= {*provider.writes},
+        f'{where}: wrote to {sorted(writes)}; it declares'
+        f' {list(provider.writes)}',
+    )
+    for world, steps in enumerate(worlds):
+      own, alone[world] = provider.step(*steps[number], alone[world])
+      for name in {*own} | {*writes}:
+        value, speaks = _parts(own.get(name, (np.zeros(()), False)))
+        values, speak = _parts(writes.get(name, (np.zeros(3), False)))
+        contracts.require(
+            np.shape(value) == () and np.shape(values) == (_NUM_WORLDS,),
+            f'{where}: wrote {name!r} with the shapes {np.shape(value)} for one'
+            f' world and {np.shape(values)} for {_NUM_WORLDS}',
+        )
+        spoken = bool(np.broadcast_to(speak, _NUM_WORLDS)[world])
+        contracts.require(
+            spoken == bool(speaks) and (not spoken or values[world] == value),
+            f'{where}: wrote {values[world]} to {name!r} in a batch, and'
+            f' {value} in that world alone',
+        )
+        contracts.require(
+            not spoken or np.isfinite(np.asarray(value, float)),
+            f'{where}: wrote {value} to {name!r}; values have to be finite',
+        )
+
+
+def _check_episodes(
+    provider: base.Provider, worlds: list[list[tuple[Any, ...]]]
+) -> None:
+  """Checks that an episode does not depend on the one before."""
+  worn = provider.initial_state(())
+  for inputs in worlds[1]:
+    _, worn = provider.step(*inputs, worn)
+  fresh = provider.initial_state(())
+  for inputs in worlds[0]:
+    from_worn, worn = provider.step(*inputs, worn)
+    from_fresh, fresh = provider.step(*inputs, fresh)
+    contracts.require(
+        trees.are_equal(from_worn, from_fresh),
+        f'provider {provider.kind!r}: an episode depends on the one before;'
+        ' begin anew where episode_start is True',
+    )
