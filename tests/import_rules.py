@@ -81,8 +81,6 @@ _MAY_IMPORT = {
     ),
     # Finds out which of them work.
     'doctor': ('experiments', 'launchers'),
-    # The old name of a command, which imports nothing.
-    'explore': (),
 }  # fmt: skip
 
 _PICKLES = ('pickle', 'cloudpickle', 'dill', 'shelve', 'marshal')

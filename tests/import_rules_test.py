@@ -64,7 +64,6 @@ _FORBIDDEN = {
         'from realab_suite import suite',
     ],
     'suite': ['from realab_suite import agents'],
-    'explore': ['from realab_suite import agents'],
     'worlds': ['from realab_suite.audit import audits'],
     'audit.planted': [
         'from realab_suite.agents import base',

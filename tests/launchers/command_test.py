@@ -5,7 +5,6 @@ import importlib
 import os
 import pathlib
 import re
-import runpy
 import subprocess
 import sys
 import types
@@ -96,26 +95,6 @@ def test_the_main_job_runs_from_the_command_line(tmp_path):
 )
 def test_a_wrong_command_is_refused_in_one_line(arguments, complaint):
   assert complaint in in_process.complaint(compare, *arguments)
-
-
-@pytest.mark.parametrize(
-    ('old', 'new'),
-    [
-        ('experiments.run', ['compare', 'train']),
-        ('experiments.sweep', ['sweep']),
-        ('experiments.serve', ['serve']),
-        ('experiments.report', ['report']),
-        ('experiments.make_networks', ['make_networks']),
-        ('explore', ['explore']),
-    ],
-)
-def test_a_command_that_has_moved_names_its_successor(old, new):
-  with pytest.raises(SystemExit, match=r'\Aerror: .*\Z') as raised:
-    runpy.run_module(f'realab_suite.{old}', run_name='__main__')
-  line = str(raised.value)
-  for name in new:
-    assert f'python -m realab_suite.launchers.{name}' in line
-    importlib.import_module(f'realab_suite.launchers.{name}')
 
 
 @pytest.mark.parametrize(
