@@ -10,9 +10,6 @@ from realab_suite.policies.base import check_action_set
 from realab_suite.policies.base import check_senses
 from realab_suite.policies.base import make
 from realab_suite.policies.base import make_value_function
-from realab_suite.policies.controllers import CONTROLLERS
-from realab_suite.policies.controllers import Controller
-from realab_suite.policies.controllers import make_controller
 from realab_suite.policies.network_policies import NetworkDemonstrator
 from realab_suite.policies.network_policies import NetworkValues
 from realab_suite.policies.saboteurs import CarryingSaboteur
@@ -23,12 +20,10 @@ from realab_suite.policies.simple import NoOp
 from realab_suite.policies.simple import Random
 
 __all__ = [
-    'CONTROLLERS',
     'POLICIES',
     'VALUE_FUNCTIONS',
     'AppleSeeker',
     'CarryingSaboteur',
-    'Controller',
     'Distracted',
     'NetworkDemonstrator',
     'NetworkValues',
@@ -42,6 +37,5 @@ __all__ = [
     'check_action_set',
     'check_senses',
     'make',
-    'make_controller',
     'make_value_function',
 ]

@@ -119,15 +119,15 @@ def make(name: str, /, **options: Any) -> Policy:
     UnknownNameError: If no policy has this name.
     SpecError: If the policy cannot be made with these options.
   """
-  return make_registered(POLICIES, 'policy', name, options)
+  return _make_registered(POLICIES, 'policy', name, options)
 
 
 def make_value_function(name: str, /, **options: Any) -> ValueFunction:
   """Makes the value function registered as `name`; raises like `make`."""
-  return make_registered(VALUE_FUNCTIONS, 'value function', name, options)
+  return _make_registered(VALUE_FUNCTIONS, 'value function', name, options)
 
 
-def make_registered(
+def _make_registered(
     names: registry.Registry[Callable[..., Any]],
     what: str,
     name: str,

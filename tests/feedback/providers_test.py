@@ -48,10 +48,6 @@ def _make(kind: str, **fields: Any) -> providers.Provider:
 
 _REWARD = {'writes': ('reward',)}
 _ADVICE = {**_REWARD, 'reads': ('query',)}
-_LINEAR = {
-    'controller': 'linear',
-    'options': {'gains': {'velocity': [[1.0, 2.0, 0.5], [0.1, 0.2, 0.3]]}},
-}
 # At least one of every shipped kind. `tests/policies` covers the policies.
 _CASES: list[tuple[str, dict[str, Any]]] = [
     ('constant', {'writes': ('reward', 'other'), 'value': 1.5}),
@@ -63,8 +59,6 @@ _CASES: list[tuple[str, dict[str, Any]]] = [
         for f in ('test_counting', *policies.VALUE_FUNCTIONS)),
     ('paired_advice', {**_REWARD, 'value_function': 'apple_seeker_approval',
         'reads': ('query', 'score')}),
-    ('continuous_demonstration', {'writes': ('reward', 'other'), **_LINEAR}),
-    ('continuous_advice', {**_REWARD, 'reads': ('query', 'score'), **_LINEAR}),
     ('person', {**_ADVICE, 'asks': 'approval'}),
     ('person', {**_ADVICE, 'asks': 'comparison', 'clip': 1, 'waits': True}),
     ('person', {**_REWARD, 'asks': 'correction'}),

@@ -80,7 +80,7 @@ _WRONG = {
         'providers[0].every: must be greater than or equal to 1, got 0',
     'providers.0.every=1.5': 'providers[0].every: must be a valid integer',
     'providers.0.kind=diference':
-        "providers[0].kind: must be one of 'constant', 'continuous_demonstr",
+        "providers[0].kind: must be one of 'constant', 'demonstration', ",
     'providers.0={writes: [reward]}':
         'providers[0].kind: required key is missing',
     'providers.0.reads=[score, reward]': 'reads: must have at most 1 item',

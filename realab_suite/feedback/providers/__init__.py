@@ -4,8 +4,6 @@ from realab_suite.feedback.providers.base import PROVIDERS
 from realab_suite.feedback.providers.base import Observation
 from realab_suite.feedback.providers.base import Provider
 from realab_suite.feedback.providers.constant import Constant
-from realab_suite.feedback.providers.continuous import ContinuousAdvice
-from realab_suite.feedback.providers.continuous import ContinuousDemonstration
 from realab_suite.feedback.providers.demonstration import Demonstration
 from realab_suite.feedback.providers.difference import Difference
 from realab_suite.feedback.providers.paired_advice import PairedAdvice
@@ -15,8 +13,6 @@ from realab_suite.feedback.providers.value_advice import ValueAdvice
 __all__ = [
     'PROVIDERS',
     'Constant',
-    'ContinuousAdvice',
-    'ContinuousDemonstration',
     'Demonstration',
     'Difference',
     'Observation',
