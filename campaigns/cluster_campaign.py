@@ -8,7 +8,9 @@ It needs the extra `cluster`. Ray is started here, unless RAY_ADDRESS names a
 cluster. `submitit` uses Slurm if `srun` is there, and processes of this machine
 if not; docs/experiments.md has the commands that start Slurm on one machine.
 Each engine runs a sweep of four jobs twice. The second time, one learner and
-the worker of another are killed with SIGKILL. Prints
+the worker of another are killed with SIGKILL; with Slurm the learner alone,
+because the cluster of one machine has no accounting, without which submitit
+does not notice a lost worker. Prints
 `engine figure target verdict seed`.
 """
 
@@ -19,6 +21,7 @@ import os
 import pathlib
 import pty
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -186,11 +189,14 @@ def _run(
 
   sweep = Sweep(experiment, folder / f'{engine}_killed', engine)
   learned = [job for job in planned if job.policy is None]
-  for job, worker in zip(learned, (False, True), strict=True):
+  is_slurm = engine == 'submitit' and shutil.which('srun')
+  kills = (False,) if is_slurm else (False, True)
+  for job, worker in zip(learned, kills, strict=False):
     _kill(sweep, job, worker=worker)
   said = sweep.wait()
   print(said, end='')
-  lines.within('restarts after two kills', said.count(_AGAIN), 2, 2)
+  lines.within(f'restarts after {len(kills)} kills', said.count(_AGAIN),
+               len(kills), len(kills))  # fmt: skip
   finished = len(re.findall('finished, results in', said))
   lines.within('finished jobs', finished, len(planned), len(planned))
   found = _digests(sweep.folder)

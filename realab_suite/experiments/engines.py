@@ -4,15 +4,11 @@ import abc
 from collections.abc import Callable, Sequence
 import contextlib
 import importlib
-import logging
-import math
 import os
 import pathlib
-import shutil
 import signal
 import subprocess
 import sys
-import time
 from typing import Any, final
 
 from realab_suite import errors
@@ -22,8 +18,6 @@ from realab_suite.experiments import requirements
 _PATIENCE = 10.0
 # Time limit of a Slurm job; the default of submitit is five minutes.
 _MAX_MINUTES = 24 * 60
-# Time between two looks at the queue of Slurm.
-_QUEUE_SECONDS = 10.0
 
 
 class Engine(abc.ABC):
@@ -134,16 +128,15 @@ class Ray(Engine):
 
 @final
 class Submitit(Engine):
-  """Jobs of a Slurm cluster whose machines share the file system."""
+  """Jobs of a Slurm cluster whose machines share the file system.
+
+  Only the accounting of Slurm tells submitit that a job ended without a result.
+  """
 
   def __init__(self, workers: int) -> None:
     """Makes an engine. Without Slurm, submitit runs jobs on this machine."""
     del workers  # Slurm determines the number of processors.
     self._submitit = _import('submitit')
-    self._queue = _SlurmQueue()
-    # Without accounting, it warns again and again that it may miss the end of
-    # a job; `_SlurmQueue` does not.
-    logging.getLogger('submitit').setLevel(logging.ERROR)
 
   @property
   def capacity(self) -> int:
@@ -161,57 +154,12 @@ class Submitit(Engine):
 
   def poll(self, task: Any) -> int | None:
     with _errors_in_one_line('submitit'):
-      if task.done():
-        return int(task.result())
-    if self._queue.has_lost(task.job_id):
-      raise errors.ResultsError(
-          f'--engine=submitit: job {task.job_id} left the queue of Slurm'
-          ' without a result'
-      )
-    return None
+      return int(task.result()) if task.done() else None
 
   def stop(self, tasks: Sequence[Any]) -> None:
     for task in tasks:
-      task.cancel()
-
-
-@final
-class _SlurmQueue:
-  """Looks at the queue of Slurm, to notice jobs that ended without a result.
-
-  submitit itself needs a database for accounting to notice them, and up to ten
-  minutes.
-  """
-
-  # The file of a result may arrive a little later than its job ends.
-  _MOST_MISSES = 2
-
-  def __init__(self) -> None:
-    self._exists = shutil.which('squeue') is not None
-    self._read_at = -math.inf
-    self._misses: dict[str, int] = {}
-
-  def has_lost(self, job: str) -> bool:
-    """Returns whether a job was missing twice in succession."""
-    self._misses.setdefault(job, 0)
-    now = time.monotonic()
-    if self._exists and now - self._read_at >= _QUEUE_SECONDS:
-      self._read_at = now
-      self._read()
-    return self._misses[job] >= self._MOST_MISSES
-
-  def _read(self) -> None:
-    ran = subprocess.run(
-        ['squeue', '--me', '--noheader', '--format=%i'],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if ran.returncode:
-      return  # The controller may be restarting.
-    present = set(ran.stdout.split())
-    for job in self._misses:
-      self._misses[job] = 0 if job in present else self._misses[job] + 1
+      # A job that Slurm no longer has is no error.
+      task.cancel(check=False)
 
 
 ENGINES: dict[str, Callable[[int], Engine]] = {

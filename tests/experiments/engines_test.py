@@ -109,34 +109,36 @@ def test_a_cluster_runs_the_same_commands(tmp_path, monkeypatch, name):
   assert log.read_text() == 'said\n'
 
 
-def test_a_job_that_left_the_queue_of_slurm_without_a_result_is_lost(
-    tmp_path, monkeypatch
-):
+def test_a_job_of_slurm_that_ended_without_a_result_is_lost(monkeypatch):
   fake = types.ModuleType('submitit')
-  fake.AutoExecutor = _FakeExecutor
   monkeypatch.setitem(sys.modules, 'submitit', fake)
   monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
-  monkeypatch.setattr('shutil.which', lambda name: f'/bin/{name}')
-  monkeypatch.setattr(engines, '_QUEUE_SECONDS', 0.0)
-  # The queue is unknown once, as while the controller is restarting.
-  queues = iter(
-      [(0, '6\n7\n'), (0, '6\n'), (0, '7\n'), (0, ''), (1, ''), (0, '')]
-  )
 
-  def run(command, **unused):
-    assert command[0] == 'squeue'
-    status, text = next(queues)
-    return subprocess.CompletedProcess(command, status, text)
+  def fail():
+    raise RuntimeError('Job 7 (task: 0)\nhas not produced any output')
 
-  monkeypatch.setattr(subprocess, 'run', run)
+  task = types.SimpleNamespace(done=lambda: False, result=fail)
   engine = engines.Submitit(1)
-  task = types.SimpleNamespace(done=lambda: False, job_id='7')
-  for _ in range(5):
-    assert engine.poll(task) is None
-  with pytest.raises(
-      errors.ResultsError, match='=submitit: job 7 left the queue'
-  ):
+  assert engine.poll(task) is None
+  task.done = lambda: True
+  with pytest.raises(errors.ResultsError, match=r'=submitit: .*Job 7'):
     engine.poll(task)
+
+
+def test_a_job_that_slurm_no_longer_has_does_not_keep_others_alive(monkeypatch):
+  fake = types.ModuleType('submitit')
+  monkeypatch.setitem(sys.modules, 'submitit', fake)
+  monkeypatch.setattr('importlib.util.find_spec', lambda name: fake)
+  cancelled = []
+
+  def cancel(check=True):
+    cancelled.append(check)
+    if check:
+      raise subprocess.CalledProcessError(1, 'scancel')
+
+  task = types.SimpleNamespace(cancel=cancel)
+  engines.Submitit(1).stop([task, task])
+  assert cancelled == [False, False]
 
 
 @pytest.mark.parametrize('name', ['Local', 'execute'])
