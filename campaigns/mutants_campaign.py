@@ -421,7 +421,7 @@ MUTANTS = [
         ('tests/archive_test.py',),
     ),
     planting.Mutant(
-        'storage', 'a run continues on another machine without a flag',
+        'storage', 'a run continues on another machine unrecorded',
         'experiments/training.py',
         '      if not differences:\n', '      if differences:\n',
         ('tests/experiments/machines_test.py',),

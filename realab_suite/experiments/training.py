@@ -12,6 +12,7 @@ import os
 import pathlib
 from typing import Any, final
 
+from absl import logging
 import dm_env
 import numpy as np
 import tqdm
@@ -61,14 +62,11 @@ class Options:
     say: Called with messages for the user.
     tensorboard: True to write learning curves for TensorBoard as well.
     parent: Process whose end also ends the job, or `None`.
-    other_machine: True to continue from a checkpoint of another machine or with
-      other settings. Results depend on both; `done.json` records this.
   """
 
   say: Say
   tensorboard: bool = False
   parent: int | None = None
-  other_machine: bool = False
 
 
 def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
@@ -297,10 +295,8 @@ class _Training:
   ) -> None:
     """Records the machine, unless it is that of the last checkpoint.
 
-    Raises:
-      ResultsError: If it differs and the options do not allow this.
+    Results then depend on both machines, so a warning is logged.
     """
-    job, path = self._job, self._folder.path
     here = {**machines.here(), **learner.settings()}
     step = self._done * self._num_envs
     if saved is not None:
@@ -310,17 +306,11 @@ class _Training:
       differences = machines.differences(there, here)
       if not differences:
         return
-      if not self._options.other_machine:
-        raise errors.ResultsError(
-            f'{path}: its checkpoint of step {step} is from another machine or'
-            f' other settings: {differences}; continue it there, remove {path}'
-            ' to start again, or use --other_machine to continue here, with'
-            ' results that depend on both'
-        )
-      self._options.say(
-          f'{job.run}, seed {job.seed}: continues from step {step} on another'
-          f' machine or with other settings: {differences}'
-      )
+      logging.warning(
+          '%s, seed %d: continues from step %d on another machine or with other'
+          ' settings, and its results depend on both: %s',
+          self._job.run, self._job.seed, step, differences,
+      )  # fmt: skip
     self._machines = [*self._machines, {'step': step, 'machine': here}]
 
   def _restore(

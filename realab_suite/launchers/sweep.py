@@ -75,11 +75,8 @@ def main(argv: Sequence[str]) -> None:
   if learning_flags.TENSORBOARD.value:
     curves.check_tensorboard()
   arguments = imports_flag.arguments()
-  arguments += [
-      f'--{flag.name}'
-      for flag in (learning_flags.TENSORBOARD, learning_flags.OTHER_MACHINE)
-      if flag.value
-  ]
+  if learning_flags.TENSORBOARD.value:
+    arguments.append(f'--{learning_flags.TENSORBOARD.name}')
   engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
   scheduler.sweep(
       experiment,

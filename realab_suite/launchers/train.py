@@ -51,10 +51,7 @@ def main(argv: Sequence[str]) -> None:
   imports_flag.load()
   [job] = jobs.plan(experiment_specs.load(name), [seed_flag.SEED.value], [run])
   options = training.Options(
-      program.say,
-      learning_flags.TENSORBOARD.value,
-      _PARENT.value,
-      learning_flags.OTHER_MACHINE.value,
+      program.say, learning_flags.TENSORBOARD.value, _PARENT.value
   )
   training.run(job, pathlib.Path(output), options)
 
