@@ -7,13 +7,10 @@ names, the sizes and the contents of all members, and then moves whole folders
 to their places.
 """
 
-from collections.abc import Iterator
-import contextlib
+from collections.abc import Iterable, Mapping
 import hashlib
 import io
-import itertools
 import json
-import lzma
 import os
 import pathlib
 import re
@@ -34,24 +31,11 @@ _SUFFIX = '.zip'
 _NAME = r'\w[\w.-]*'
 # Files of the sweep, of a job or of an audit. No name leads elsewhere.
 _MEMBER = re.compile(rf'{_NAME}(/{_NAME})?', re.ASCII)
-_MAX_MEMBER_BYTES = 1 << 28
-_MAX_BYTES = 1 << 32
+# Contents are held in memory.
+_MAX_BYTES = 1 << 30
 # The decompressor has no limit on its output, so it gets small parts.
 _CHUNK = 1 << 12
-_FILE_MODE = stat.S_IFREG | 0o644
 _UNIX = 3
-# Errors of the libraries that read a zip file, if it is damaged or forged.
-_MALFORMED = (
-    EOFError,
-    LookupError,
-    MemoryError,
-    NotImplementedError,
-    RecursionError,
-    RuntimeError,
-    ValueError,
-    lzma.LZMAError,
-    zipfile.BadZipFile,
-)
 
 
 @final
@@ -85,12 +69,12 @@ def pack(
   """
   if output.suffix != _SUFFIX:
     raise errors.ResultsError(f'{output}: allowed are names with {_SUFFIX}')
-  sweep = _read_sweep(folder)
-  finished = [name for name in sweep.jobs if jobs.is_done(folder / name)]
+  planned, audits = _read_sweep(folder)
+  finished = [name for name in planned if jobs.is_done(folder / name)]
   if not finished:
     raise errors.ResultsError(f'{folder}: no job has finished yet')
   names = [scheduler.SWEEP, scheduler.EXPERIMENT]
-  names += [name for name in sweep.audits if (folder / name).exists()]
+  names += [name for name in audits if (folder / name).exists()]
   left_out = {}
   for job in finished:
     done = storage.read_done(folder / job / storage.DONE)
@@ -100,41 +84,31 @@ def pack(
       else:
         storage.result_path(folder / job, name)
         names.append(f'{job}/{name}')
-  data = _zipped(folder, sorted(names), left_out)
+  files = {}
+  for name in sorted(names):
+    with storage.explained(folder / name):
+      files[name] = (folder / name).read_bytes()
+  _refuse_size(folder, map(len, files.values()))
   with storage.explained(output.parent):
     output.parent.mkdir(parents=True, exist_ok=True)
-  storage.write_whole(output, data)
-  return Counts(len(finished), len(sweep.jobs) - len(finished))
+  storage.write_whole(output, _zipped(files, left_out))
+  return Counts(len(finished), len(planned) - len(finished))
 
 
-def _zipped(
-    folder: pathlib.Path, names: list[str], left_out: dict[str, str]
-) -> bytes:
-  """Returns a packed sweep with files of a folder."""
-  file, digests = io.BytesIO(), {}
+def _zipped(files: Mapping[str, bytes], left_out: Mapping[str, str]) -> bytes:
+  """Returns a packed sweep with files, and with the digests of others."""
+  digests = {name: _digest(data) for name, data in files.items()}
+  manifest = {'schema': _SCHEMA, 'files': digests, 'left_out': left_out}
+  text = json.dumps(manifest, indent=2, sort_keys=True)
+  file = io.BytesIO()
   with zipfile.ZipFile(file, 'w') as target:
-    for name in names:
-      path = folder / name
-      with storage.explained(path):
-        data = path.read_bytes()
-      if len(data) > _MAX_MEMBER_BYTES:
-        raise errors.ResultsError(
-            f'{path}: has {len(data)} bytes; allowed are {_MAX_MEMBER_BYTES}'
-        )
-      digests[name] = hashlib.sha256(data).hexdigest()
-      _add(target, name, data)
-    manifest = {'schema': _SCHEMA, 'files': digests, 'left_out': left_out}
-    text = json.dumps(manifest, indent=2, sort_keys=True)
-    _add(target, MANIFEST, text.encode())
+    for name, data in [*files.items(), (MANIFEST, text.encode())]:
+      info = zipfile.ZipInfo(name)  # Its date is that of no file: 1980.
+      info.compress_type = zipfile.ZIP_LZMA
+      info.create_system = _UNIX
+      info.external_attr = (stat.S_IFREG | 0o644) << 16
+      target.writestr(info, data)
   return file.getvalue()
-
-
-def _add(target: zipfile.ZipFile, name: str, data: bytes) -> None:
-  info = zipfile.ZipInfo(name)  # Its date is that of no file: 1980.
-  info.compress_type = zipfile.ZIP_LZMA
-  info.create_system = _UNIX
-  info.external_attr = _FILE_MODE << 16
-  target.writestr(info, data)
 
 
 def unpack(path: pathlib.Path, output: pathlib.Path) -> Counts:
@@ -151,24 +125,54 @@ def unpack(path: pathlib.Path, output: pathlib.Path) -> Counts:
     ResultsError: If the file is damaged or is not a packed sweep, or the folder
       contains anything else or an unfinished job of the file. Nothing changes.
   """
-  with _opened(path) as packed:
-    for name in packed.digests:
-      packed.read(name)
-    with storage.explained(output):
-      target = pathlib.Path(os.path.realpath(output))
-      is_new = not target.exists() or not any(target.iterdir())
+  files, left_out = _read(path)
+  with storage.explained(output):
+    target = pathlib.Path(os.path.realpath(output))
+    is_new = not target.exists() or not any(target.iterdir())
     if not is_new and not (target / scheduler.SWEEP).is_file():
       raise errors.ResultsError(
           f'{output}: not empty, and not the folder of a sweep; name a new'
           ' folder'
       )
-    with _temporary(target.parent if is_new else target) as staged:
-      found = packed.stage(staged)
+    parent = target.parent if is_new else target
+    parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix='.unpacking-', dir=parent) as name:
+      staged = pathlib.Path(name) / 'sweep'
+      try:
+        found = _stage(files, left_out, staged)
+      except errors.RealabError as error:
+        # The temporary folder means nothing to the user.
+        problem = str(error).replace(f'{staged}{os.sep}', '')
+        raise errors.ResultsError(f'{path}: {problem}') from error
       if not is_new:
         return _merge(path, staged, found, target)
-      with storage.explained(output):
-        os.rename(staged, target)
+      os.rename(staged, target)
   return Counts(len(found), 0)
+
+
+def _stage(
+    files: Mapping[str, bytes],
+    left_out: Mapping[str, str],
+    folder: pathlib.Path,
+) -> list[str]:
+  """Writes files into a new folder, and returns the names of its jobs.
+
+  Raises:
+    ResultsError: If the folder is not that of a sweep with finished jobs.
+  """
+  for name, data in files.items():
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(data)
+  planned, _ = _read_sweep(folder)
+  found = [name for name in planned if (folder / name).is_dir()]
+  for job in found:
+    if digest := left_out.get(f'{job}/{storage.LEARNER}'):
+      storage.write_sealed(
+          folder / job / storage.LEFT_OUT, {'files': {storage.LEARNER: digest}}
+      )
+    if not jobs.is_done(folder / job):
+      raise errors.ResultsError(f'{folder / job / storage.DONE}: missing')
+  return found
 
 
 def _merge(
@@ -183,7 +187,7 @@ def _merge(
       loading.read_mapping(staged / scheduler.EXPERIMENT),
       scheduler.read_description(staged)['calibration'],
   )
-  planned = _read_sweep(target).jobs
+  planned, _ = _read_sweep(target)
   missing = []
   for name in found:
     if name not in planned:
@@ -216,33 +220,12 @@ def _merge(
   return Counts(len(missing), len(found) - len(missing))
 
 
-@contextlib.contextmanager
-def _temporary(parent: pathlib.Path) -> Iterator[pathlib.Path]:
-  """Yields a path in a folder that is removed at the end."""
-  with contextlib.ExitStack() as stack:
-    with storage.explained(parent):
-      parent.mkdir(parents=True, exist_ok=True)
-      folder = stack.enter_context(
-          tempfile.TemporaryDirectory(prefix='.unpacking-', dir=parent)
-      )
-    yield pathlib.Path(folder) / 'sweep'
-
-
-@final
-class _Sweep(NamedTuple):
-  """Names in the description of a sweep.
-
-  Attributes:
-    jobs: Folders of all jobs.
-    audits: Files of possible audits, relative to the folder of the sweep.
-  """
-
-  jobs: list[str]
-  audits: list[str]
-
-
-def _read_sweep(folder: pathlib.Path) -> _Sweep:
+def _read_sweep(folder: pathlib.Path) -> tuple[list[str], list[str]]:
   """Reads and verifies the description of a sweep.
+
+  Returns:
+    The folders of all jobs, and the files of possible audits, by their names
+    in the folder of the sweep.
 
   Raises:
     ResultsError: If it is damaged, or a name leads out of the folder.
@@ -261,147 +244,79 @@ def _read_sweep(folder: pathlib.Path) -> _Sweep:
       raise errors.ResultsError(
           f'{folder / scheduler.SWEEP}: {name!r:.80} is not the name of a job'
       )
-  return _Sweep(folders, [f'{scheduler.AUDITS}/{run}.json' for run in runs])
+  return folders, [f'{scheduler.AUDITS}/{run}.json' for run in runs]
 
 
-@contextlib.contextmanager
-def _opened(path: pathlib.Path) -> Iterator['_Packed']:
-  """Opens a packed sweep and checks the names and sizes of its members.
+def _read(path: pathlib.Path) -> tuple[dict[str, bytes], dict[str, str]]:
+  """Reads and verifies a packed sweep.
+
+  Returns:
+    The contents of its files, and the SHA-256 of those that were left out.
 
   Raises:
     ResultsError: If it is not a packed sweep, or is damaged.
   """
-  with storage.explained(path), contextlib.ExitStack() as stack:
-    file = stack.enter_context(open(path, 'rb'))
-    with _intact(path):
-      source = stack.enter_context(zipfile.ZipFile(file))
-      packed = _Packed(path, source)
-    yield packed
-
-
-@contextlib.contextmanager
-def _intact(path: pathlib.Path, name: str = '') -> Iterator[None]:
-  """Turns errors of the libraries that read zip files into one line."""
   try:
-    yield
+    with storage.explained(path):
+      # To open a pipe may take for ever, and so may to read a device.
+      if not path.is_file() and path.exists():
+        raise errors.ResultsError(
+            f'{path}: not a regular file; allowed is a packed sweep'
+        )
+      with zipfile.ZipFile(path) as source:
+        _check_members(path, source.infolist())
+        files = {name: _contents(source, name) for name in source.namelist()}
+    manifest = json.loads(files.pop(MANIFEST))
+    schema, digests, left_out = (
+        manifest.get(key) for key in ('schema', 'files', 'left_out')
+    )
   except errors.RealabError:
     raise
-  except _MALFORMED as error:
-    where = f'{path}: {name}' if name else f'{path}'
+  except Exception as error:  # Damage raises errors of many libraries.
     raise errors.ResultsError(
-        f'{where}: damaged, or not a packed sweep: {error}'
+        f'{path}: damaged, or not a packed sweep: {error}'
     ) from error
-
-
-@final
-class _Packed:
-  """An open packed sweep whose names and sizes have been checked.
-
-  Attributes:
-    digests: SHA-256 of each file, by its name.
-  """
-
-  def __init__(self, path: pathlib.Path, source: zipfile.ZipFile) -> None:
-    self._path = path
-    self._source = source
-    members = source.infolist()
-    for member in members:
-      if problem := _problem(member):
-        raise self._error(member.orig_filename, problem)
-    names = sorted(member.filename for member in members)
-    for name, following in itertools.pairwise(names):
-      if name == following:
-        raise self._error(name, 'is there twice')
-    if sum(member.file_size for member in members) > _MAX_BYTES:
+  if schema != _SCHEMA:
+    raise errors.ResultsError(
+        f'{path}: {MANIFEST!r} schema is {schema!r:.40}; allowed is {_SCHEMA}'
+    )
+  if not isinstance(digests, dict) or not isinstance(left_out, dict):
+    raise errors.ResultsError(f'{path}: {MANIFEST!r} has no SHA-256 of files')
+  for name in sorted(files.keys() | digests.keys()):
+    if name not in files or name not in digests:
+      problem = 'is not in the manifest' if name in files else 'is missing'
+      raise errors.ResultsError(f'{path}: {name!r:.80} {problem}')
+    if _digest(files[name]) != digests[name]:
       raise errors.ResultsError(
-          f'{path}: has more than {_MAX_BYTES} bytes of contents'
+          f'{path}: {name!r} changed since the sweep was packed'
       )
-    self.digests, self._left_out = self._manifest()
-    for name in sorted({*names} ^ {*self.digests, MANIFEST}):
-      raise self._error(
-          name, 'is not in the manifest' if name in names else 'is missing'
-      )
-
-  def read(self, name: str) -> bytes:
-    """Returns the contents of a file, after checking its SHA-256."""
-    data = self._contents(name)
-    if hashlib.sha256(data).hexdigest() != self.digests[name]:
-      raise self._error(name, 'changed since the sweep was packed')
-    return data
-
-  def stage(self, folder: pathlib.Path) -> list[str]:
-    """Writes all files into a new folder, and returns the names of the jobs.
-
-    Raises:
-      ResultsError: If the folder would not be that of a sweep with finished
-        jobs.
-    """
-    with storage.explained(self._path):
-      for name in self.digests:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        with open(folder / name, 'xb') as file:
-          file.write(self.read(name))
-    try:
-      return self._check(folder)
-    except errors.RealabError as error:
-      # The temporary folder means nothing to the user.
-      problem = str(error).replace(f'{folder}{os.sep}', '')
-      raise errors.ResultsError(f'{self._path}: {problem}') from error
-
-  def _check(self, folder: pathlib.Path) -> list[str]:
-    """Checks the files of a folder, and marks what was left out."""
-    sweep = _read_sweep(folder)
-    found = [name for name in sweep.jobs if (folder / name).is_dir()]
-    expected = {scheduler.SWEEP, scheduler.EXPERIMENT, *sweep.audits}
-    for job in found:
-      learner = f'{job}/{storage.LEARNER}'
-      if digest := self._left_out.get(learner):
-        storage.write_sealed(
-            folder / job / storage.LEFT_OUT,
-            {'files': {storage.LEARNER: digest}},
-        )
-      if not jobs.is_done(folder / job):
-        raise self._error(f'{job}/{storage.DONE}', 'is missing')
-      done = storage.read_done(folder / job / storage.DONE)
-      own = {storage.CONFIG, storage.DONE, *done}
-      expected |= {f'{job}/{name}' for name in own}
-    for name in sorted({*self.digests, *self._left_out} - expected):
-      raise self._error(name, 'does not belong to a job of the sweep')
-    return found
-
-  def _manifest(self) -> tuple[dict[str, str], dict[str, str]]:
-    content: Any = json.loads(self._contents(MANIFEST))
-    schema = content.get('schema') if isinstance(content, dict) else None
-    if schema != _SCHEMA:
-      raise self._error(
-          MANIFEST, f'schema is {schema!r:.40}; allowed is {_SCHEMA}'
-      )
-    parts = content.get('files'), content.get('left_out')
-    for part in parts:
-      if not isinstance(part, dict) or not all(
-          isinstance(digest, str) for digest in part.values()
-      ):
-        raise self._error(MANIFEST, 'has no SHA-256 of each file')
-    return parts
-
-  def _contents(self, name: str) -> bytes:
-    with _intact(self._path, name), self._source.open(name) as file:
-      return b''.join(iter(lambda: file.read(_CHUNK), b''))
-
-  def _error(self, name: str, problem: str) -> errors.ResultsError:
-    return errors.ResultsError(f'{self._path}: {name!r:.80} {problem}')
+  return files, left_out
 
 
-def _problem(member: zipfile.ZipInfo) -> str:
-  """Returns the reason for not reading a member, or ''."""
-  if member.filename != member.orig_filename or not _MEMBER.fullmatch(
-      member.filename
-  ):
-    return 'is not the name of a file of a sweep'
-  if stat.S_IFMT(member.external_attr >> 16) != stat.S_IFREG:
-    return 'is not a regular file'
-  if member.compress_type != zipfile.ZIP_LZMA:
-    return 'is not compressed as `pack` does'
-  if member.file_size > _MAX_MEMBER_BYTES:
-    return f'has {member.file_size} bytes; allowed are {_MAX_MEMBER_BYTES}'
-  return ''
+def _check_members(path: pathlib.Path, members: list[zipfile.ZipInfo]) -> None:
+  """Checks the names, kinds and sizes of the members of a zip file."""
+  for member in members:
+    name, problem = member.orig_filename, ''
+    if member.filename != name or not _MEMBER.fullmatch(name):
+      problem = 'is not the name of a file of a sweep'
+    elif not stat.S_ISREG(member.external_attr >> 16):
+      problem = 'is not a regular file'
+    if problem:
+      raise errors.ResultsError(f'{path}: {name!r:.80} {problem}')
+  _refuse_size(path, (member.file_size for member in members))
+
+
+def _refuse_size(path: pathlib.Path, sizes: Iterable[int]) -> None:
+  if (size := sum(sizes)) > _MAX_BYTES:
+    raise errors.ResultsError(
+        f'{path}: has {size} bytes of contents; allowed are {_MAX_BYTES}'
+    )
+
+
+def _contents(source: zipfile.ZipFile, name: str) -> bytes:
+  with source.open(name) as file:
+    return b''.join(iter(lambda: file.read(_CHUNK), b''))
+
+
+def _digest(data: bytes) -> str:
+  return hashlib.sha256(data).hexdigest()
