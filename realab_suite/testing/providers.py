@@ -1,6 +1,6 @@
 """Contract of feedback providers: pure functions that serve whole batches."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import copy
 from typing import Any
 
@@ -16,6 +16,9 @@ _NUM_STEPS = 6
 # World 1 begins another episode in this step.
 _SECOND_START = 3
 _RANGE = (-2.0, 16.0)
+
+# Arguments of `step`, without the state.
+_Inputs = tuple[Any, Any, Any, Any]
 
 
 def check_provider(
@@ -46,10 +49,7 @@ def check_provider(
       _inputs(provider, ranges or {}, world, (domain_name, task_name))
       for world in range(_NUM_WORLDS)
   ]
-  batch = [
-      tuple(_stack(list(part)) for part in zip(*of_worlds, strict=True))
-      for of_worlds in zip(*worlds, strict=True)
-  ]
+  batch = [_together(of_worlds) for of_worlds in zip(*worlds, strict=True)]
   _check_purity(provider, worlds[0], ())
   _check_purity(provider, batch, (_NUM_WORLDS,))
   _check_batch(provider, batch, worlds)
@@ -61,7 +61,7 @@ def _inputs(
     ranges: Mapping[str, tuple[float, float]],
     world: int,
     names: tuple[str, str],
-) -> list[tuple[Any, ...]]:
+) -> list[_Inputs]:
   """Returns the inputs of the steps of one world, without the state."""
   env = suite.load(
       *names,
@@ -90,7 +90,13 @@ def _inputs(
   return steps
 
 
-def _stack(parts: list[Any]) -> Any:
+def _together(of_worlds: Sequence[_Inputs]) -> _Inputs:
+  """Returns the inputs of a batch."""
+  observation, readings, start, key = zip(*of_worlds, strict=True)
+  return _stack(observation), _stack(readings), _stack(start), _stack(key)
+
+
+def _stack(parts: Sequence[Any]) -> Any:
   if isinstance(parts[0], dict):
     return {key: np.stack([part[key] for part in parts]) for key in parts[0]}
   return np.stack(parts)
@@ -98,7 +104,7 @@ def _stack(parts: list[Any]) -> Any:
 
 def _check_purity(
     provider: base.Provider,
-    steps: list[tuple[Any, ...]],
+    steps: list[_Inputs],
     batch_shape: tuple[int, ...],
 ) -> None:
   """Checks that a provider is a function that changes nothing."""
@@ -137,8 +143,8 @@ def _parts(write: Any) -> tuple[Any, Any]:
 
 def _check_batch(
     provider: base.Provider,
-    batch: list[tuple[Any, ...]],
-    worlds: list[list[tuple[Any, ...]]],
+    batch: list[_Inputs],
+    worlds: list[list[_Inputs]],
 ) -> None:
   """Checks that each world of a batch gets what it would get alone."""
   where = f'provider {provider.kind!r}'
@@ -174,7 +180,7 @@ def _check_batch(
 
 
 def _check_episodes(
-    provider: base.Provider, worlds: list[list[tuple[Any, ...]]]
+    provider: base.Provider, worlds: list[list[_Inputs]]
 ) -> None:
   """Checks that an episode does not depend on the one before."""
   worn = provider.initial_state(())
