@@ -299,6 +299,8 @@ class JointedBlock(Block):
     for world in np.argwhere(~np.asarray(is_far)):
       index = tuple(world)
       free[index] = self._surroundings.nearest_free(
+          physics,
+          index,
           np.array([free[index], *position[index][1:]]),
           surroundings.matrix(orientation[index]),
           float(position[index][0]),

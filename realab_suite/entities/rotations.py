@@ -1,4 +1,4 @@
-"""Rotations about the vertical, of vectors and quaternions."""
+"""Rotations of vectors and quaternions, most of them about the vertical."""
 
 from typing import Any
 
@@ -16,6 +16,17 @@ def rotate(vector: np.ndarray, angle: float) -> np.ndarray:
   cos, sin = np.cos(angle), np.sin(angle)
   x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
   return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+
+
+def matrices(quaternion: np.ndarray) -> np.ndarray:
+  """Returns the matrices, `(..., 3, 3)`, of quaternions, `(..., 4)`."""
+  w, x, y, z = (quaternion[..., i] for i in range(4))
+  rows = [
+      [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+      [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+      [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+  ]
+  return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def heading_of(quaternion: np.ndarray) -> np.ndarray:

@@ -1,10 +1,12 @@
 """Surroundings of blocks: the immovable objects that writes must avoid.
 
-An agent can carry a block beside a wall. A write that changes only one
-coordinate could then put the block into the wall, or beyond it. Instead, the
-block is put at the nearest free coordinate.
+An agent can carry a block beside a wall or a door. A write that changes only
+one coordinate could then put the block into it, or beyond it. Instead, the
+block is put at the nearest free coordinate. Doors and other mocap bodies count
+where they are at the moment of the write.
 """
 
+from collections.abc import Sequence
 from typing import Any, Self, final
 
 from dm_control import mjcf
@@ -13,6 +15,7 @@ import numpy as np
 
 from realab_suite.entities import axes
 from realab_suite.entities import protocols
+from realab_suite.entities import rotations
 
 # Prefix of the names of box sites in which no block may be written: the space
 # outside of rooms.
@@ -28,6 +31,7 @@ _TOLERANCE, _DEEPEST = 0.5, 0.05
 _PARALLEL = 1e-9
 # Distance to an obstacle at which blocks are put, in m.
 _GAP = 1e-6
+_Corridor = tuple[Any, Any, Any, Any]
 # MuJoCo computes no bounding boxes of planes. Height fields are the ground.
 _IGNORED_TYPES = (
     mujoco.mjtGeom.mjGEOM_PLANE,
@@ -41,12 +45,12 @@ class Boxes:
   """Oriented bounding boxes of obstacles, in the frame of a register.
 
   Attributes:
-    centres: `(boxes, 3)`, in m.
-    rotations: Axes of the boxes, as columns, `(boxes, 3, 3)`.
+    centres: `(..., boxes, 3)`, in m.
+    rotations: Axes of the boxes, as columns, `(..., boxes, 3, 3)`.
     halves: Half edge lengths, `(boxes, 3)`, in m.
     is_exact: True for each obstacle that is a box itself, `(boxes,)` bool.
-    low: Smallest coordinates of each box, `(boxes, 3)`, in m.
-    high: Largest coordinates of each box, `(boxes, 3)`, in m.
+    low: Smallest coordinates of each box, `(..., boxes, 3)`, in m.
+    high: Largest coordinates of each box, `(..., boxes, 3)`, in m.
   """
 
   def __init__(
@@ -60,7 +64,7 @@ class Boxes:
     self.rotations = rotations
     self.halves = halves
     self.is_exact = is_exact
-    extent = np.einsum('bij,bj->bi', np.abs(rotations), halves)
+    extent = np.einsum('...bij,bj->...bi', np.abs(rotations), halves)
     self.low = centres - extent
     self.high = centres + extent
 
@@ -77,6 +81,15 @@ class Boxes:
         self.rotations[mask],
         self.halves[mask],
         self.is_exact[mask],
+    )
+
+  def joined(self, others: 'Boxes') -> 'Boxes':
+    """Returns these boxes and others."""
+    return Boxes(
+        np.concatenate([self.centres, others.centres]),
+        np.concatenate([self.rotations, others.rotations]),
+        np.concatenate([self.halves, others.halves]),
+        np.concatenate([self.is_exact, others.is_exact]),
     )
 
   def taken(
@@ -129,6 +142,63 @@ class Boxes:
 
 
 @final
+class Movers:
+  """Solid mocap bodies, such as doors, in the frame of a register."""
+
+  def __init__(
+      self,
+      model: Any,
+      frames: Sequence[mjcf.Element],
+      origin: np.ndarray,
+      rotation: np.ndarray,
+  ) -> None:
+    """Finds the bodies.
+
+    Args:
+      model: Compiled model, as `physics.model`.
+      frames: Mocap bodies of the model.
+      origin: Position of the register's frame, `(3,)`, in m.
+      rotation: Axes of that frame, as columns, `(3, 3)`.
+    """
+    self._origin, self._rotation = origin, rotation
+    carriers = model.body_weldid[model.geom_bodyid]
+    is_solid = _are_obstacles(model)
+    self._frames: tuple[mjcf.Element, ...] = ()
+    geoms, owners = [], []
+    for frame in frames:
+      body = model.name2id(frame.full_identifier, 'body')
+      if found := np.flatnonzero(is_solid & (carriers == body)).tolist():
+        geoms += found
+        owners += [len(self._frames)] * len(found)
+        self._frames += (frame,)
+    self._owners = np.array(owners, int)
+    self._boxes = _collected(model, geoms, [], np.zeros(3), np.eye(3))
+
+  @property
+  def frames(self) -> tuple[mjcf.Element, ...]:
+    """The mocap bodies."""
+    return self._frames
+
+  def at(self, positions: np.ndarray, quaternions: np.ndarray) -> Boxes:
+    """Returns the boxes of the bodies.
+
+    Args:
+      positions: Positions of the bodies, `(..., bodies, 3)`, in m.
+      quaternions: Their orientations, `(..., bodies, 4)`.
+    """
+    axes_of_bodies = self._rotation.T @ rotations.matrices(quaternions)
+    places = (positions - self._origin) @ self._rotation
+    turned = axes_of_bodies[..., self._owners, :, :]
+    offsets = np.einsum('...bij,bj->...bi', turned, self._boxes.centres)
+    return Boxes(
+        places[..., self._owners, :] + offsets,
+        turned @ self._boxes.rotations,
+        self._boxes.halves,
+        self._boxes.is_exact,
+    )
+
+
+@final
 class Surroundings:
   """Frame and obstacles of a block, as found in the compiled model."""
 
@@ -148,7 +218,14 @@ class Surroundings:
     self._radius = np.sqrt(3.0) * self._half_size
     self._model: Any = None
     self._boxes = Boxes.none()
-    self._corridor = np.zeros((2, 2))
+    self._movers: Movers | None = None
+    # Bounds between which no obstacle is, whatever value is written: the least
+    # y and z, and the largest ones, each `(...)`; of static obstacles, and of
+    # all of them. Movers rarely move, so the latter are kept with the poses
+    # that they were computed from.
+    self._fixed_corridor: _Corridor = (0.0, 0.0, 0.0, 0.0)
+    self._corridor = self._fixed_corridor
+    self._poses: Any = None
     self._origin = np.zeros(3)
     self._rotation = np.eye(3)
     self._limits = self._reach = -np.inf, np.inf
@@ -192,12 +269,19 @@ class Surroundings:
     """
     if physics.model is not self._model:
       self._resolve(physics)
-    (right, floor), (left, ceiling) = self._corridor
+    if self._movers is not None:
+      self._follow(physics, self._movers)
+    right, floor, left, ceiling = self._corridor
     y, z = axes.component(position, 1), axes.component(position, 2)
     return (right < y) & (y < left) & (floor < z) & (z < ceiling)
 
   def nearest_free(
-      self, position: np.ndarray, rotation: np.ndarray, before: float
+      self,
+      physics: protocols.Physics,
+      world: tuple[int, ...],
+      position: np.ndarray,
+      rotation: np.ndarray,
+      before: float,
   ) -> float:
     """Returns the free x coordinate that is nearest to a wanted one, in m.
 
@@ -206,17 +290,24 @@ class Surroundings:
     new model.
 
     Args:
-      position: Wanted position of a block in one world, `(3,)`, in m.
+      physics: One world or a batch of worlds.
+      world: Index of the world, `()` for one world.
+      position: Wanted position of the block in this world, `(3,)`, in m.
       rotation: Axes of the block, as columns, `(3, 3)`.
       before: Present x coordinate of the block, in m.
     """
     along = float(position[0])
-    low, high = self._boxes.low - self._radius, self._boxes.high + self._radius
+    boxes = self._boxes
+    if self._movers is not None:
+      bound = physics.bind(self._movers.frames)
+      moving = self._movers.at(bound.mocap_pos[world], bound.mocap_quat[world])
+      boxes = boxes.joined(self._without_region(moving))
+    low, high = boxes.low - self._radius, boxes.high + self._radius
     beside = (low[:, 1:] < position[1:]) & (position[1:] < high[:, 1:])
     is_near = beside.all(axis=1)
     if not (is_near & (low[:, 0] < along) & (along < high[:, 0])).any():
       return along
-    taken = self._boxes.taken(position, rotation, self._half_size)[is_near]
+    taken = boxes.taken(position, rotation, self._half_size)[is_near]
     taken = taken[(before <= taken[:, 0]) | (taken[:, 1] <= before)]
     if not _is_taken(along, taken):
       return along
@@ -259,30 +350,66 @@ class Surroundings:
     model = physics.model
     body = int(physics.bind(self._body).element_id)
     frame = int(model.body_parentid[body])
-    boxes = boxes_of(model, frame)
-    self._boxes = boxes.only(boxes.is_exact | ~self._are_in_region(boxes))
+    self._boxes = self._without_region(boxes_of(model, frame))
     self._origin, self._rotation = _pose_of(model, frame)
+    self._fixed_corridor = self._corridor = self._corridor_beside(self._boxes)
+    self._movers = self._poses = None
     if model.body_weldid[frame] != 0:
       self._origin = np.full(3, ENDLESS)
-    low, high = self._boxes.low - self._radius, self._boxes.high + self._radius
-    # The corridor has to be free only where blocks are written.
-    is_ahead = (low[:, 0] < self._reach[1]) & (high[:, 0] > self._reach[0])
-    low, high = low[is_ahead, 1:], high[is_ahead, 1:]
-    self._corridor = np.array([[-np.inf] * 2, [np.inf] * 2])
-    for box_low, box_high in zip(low, high, strict=True):
-      # The placement check refuses boxes in the region, so most boxes are on
-      # one side of it.
-      gaps = np.stack([self._rest[1:] - box_high, box_low - self._rest[1:]])
-      side, axis = np.unravel_index(gaps.argmax(), gaps.shape)
-      if side == 0:
-        bound = max(self._corridor[0, axis], box_high[axis])
-      else:
-        bound = min(self._corridor[1, axis], box_low[axis])
-      self._corridor[side, axis] = bound
+    else:
+      bodies = self._body.root.root_model.find_all('body')
+      frames = [b for b in bodies if getattr(b, 'mocap', None) == 'true']
+      movers = Movers(model, frames, self._origin, self._rotation)
+      self._movers = movers if movers.frames else None
     self._model = model
 
-  def _are_in_region(self, boxes: Boxes) -> np.ndarray:
-    """Returns True for boxes in which undisturbed blocks are, `(boxes,)` bool.
+  def _follow(self, physics: protocols.Physics, movers: Movers) -> None:
+    """Adapts the corridor to the present poses of movers."""
+    bound = physics.bind(movers.frames)
+    positions, quaternions = bound.mocap_pos, bound.mocap_quat
+    poses = positions.tobytes(), quaternions.tobytes()
+    if poses == self._poses:
+      return
+    moving = movers.at(positions, quaternions)
+    right, floor, left, ceiling = self._corridor_beside(moving)
+    fixed = self._fixed_corridor
+    self._corridor = (
+        np.maximum(right, fixed[0]),
+        np.maximum(floor, fixed[1]),
+        np.minimum(left, fixed[2]),
+        np.minimum(ceiling, fixed[3]),
+    )
+    self._poses = poses
+
+  def _corridor_beside(self, boxes: Boxes) -> _Corridor:
+    """Returns the bounds of the space beside boxes; see `_fixed_corridor`."""
+    low, high = boxes.low - self._radius, boxes.high + self._radius
+    # The corridor has to be free only where blocks are written.
+    least, most = self._reach
+    is_ahead = (low[..., 0] < most) & (high[..., 0] > least)
+    low, high = low[..., 1:], high[..., 1:]
+    # The placement check refuses boxes in the region, so most boxes are on one
+    # side of it.
+    gaps = np.concatenate([self._rest[1:] - high, low - self._rest[1:]], -1)
+    sides, bounds = gaps.argmax(axis=-1), np.concatenate([high, low], axis=-1)
+    on_side = [
+        np.where(
+            is_ahead & (sides == i),
+            bounds[..., i],
+            -np.inf if i < 2 else np.inf,
+        )
+        for i in range(4)
+    ]
+    right, floor = (
+        bound.max(axis=-1, initial=-np.inf) for bound in on_side[:2]
+    )
+    left, ceiling = (
+        bound.min(axis=-1, initial=np.inf) for bound in on_side[2:]
+    )
+    return right, floor, left, ceiling
+
+  def _without_region(self, boxes: Boxes) -> Boxes:
+    """Returns boxes without those that undisturbed blocks are in.
 
     The placement check refuses obstacles there. The obstacles in these boxes
     are round or hollow, and beside the blocks.
@@ -291,7 +418,8 @@ class Surroundings:
     taken = boxes.taken(self._rest, np.eye(3), self._half_size + margin)
     low, high = self._reach
     is_ahead = (taken[:, 0] < high) & (low < taken[:, 1])
-    return is_ahead & (taken[:, 0] < taken[:, 1])
+    is_in_region = is_ahead & (taken[:, 0] < taken[:, 1])
+    return boxes.only(boxes.is_exact | ~is_in_region)
 
 
 def _is_taken(along: float, taken: np.ndarray) -> bool:
@@ -299,7 +427,7 @@ def _is_taken(along: float, taken: np.ndarray) -> bool:
 
 
 def boxes_of(model: Any, frame: int) -> Boxes:
-  """Returns the boxes of immovable, solid geoms in the frame of a body.
+  """Returns the boxes of static, solid geoms in the frame of a body.
 
   Args:
     model: Compiled model, as `physics.model`.
@@ -308,23 +436,46 @@ def boxes_of(model: Any, frame: int) -> Boxes:
   if model.body_weldid[frame] != 0:
     return Boxes.none()
   is_static = model.body_weldid == 0  # Of a mocap body, its own index.
-  solid = (model.geom_contype | model.geom_conaffinity) != 0
-  solid &= is_static[model.geom_bodyid]
-  solid &= ~np.isin(model.geom_type, _IGNORED_TYPES)
-  geoms = np.flatnonzero(solid)
+  geoms = np.flatnonzero(_are_obstacles(model) & is_static[model.geom_bodyid])
   sites = [
       site
       for site in range(model.nsite)
       if model.id2name(site, 'site').startswith(OUTSIDE)
   ]
+  origin, turned = _pose_of(model, frame)
+  return _collected(model, geoms.tolist(), sites, origin, turned)
+
+
+def _are_obstacles(model: Any) -> np.ndarray:
+  """Returns True for solid geoms that have a bounding box, `(geoms,)` bool."""
+  is_solid = (model.geom_contype | model.geom_conaffinity) != 0
+  return is_solid & ~np.isin(model.geom_type, _IGNORED_TYPES)
+
+
+def _collected(
+    model: Any,
+    geoms: list[int],
+    sites: list[int],
+    origin: np.ndarray,
+    turned: np.ndarray,
+) -> Boxes:
+  """Returns the boxes around geoms, and those of sites.
+
+  Args:
+    model: Compiled model.
+    geoms: Indices of static geoms, or of geoms of mocap bodies.
+    sites: Indices of sites that are boxes, of the same kinds of bodies.
+    origin: Origin of the frame of the result, in that of the world, or of the
+      mocap body that a geom belongs to, `(3,)`, in m.
+    turned: Axes of the frame of the result, as columns, `(3, 3)`.
+  """
   bodies = [*model.geom_bodyid[geoms], *model.site_bodyid[sites]]
   boxes = model.geom_aabb[geoms]
   positions = np.concatenate([model.geom_pos[geoms], model.site_pos[sites]])
   quaternions = np.concatenate([model.geom_quat[geoms], model.site_quat[sites]])
   middles = np.concatenate([boxes[:, :3], np.zeros((len(sites), 3))])
   halves = np.concatenate([boxes[:, 3:], model.site_size[sites]])
-  origin, turned = _pose_of(model, frame)
-  centres, rotations = [], []
+  centres, rotated = [], []
   for body, position, quaternion, middle in zip(
       bodies, positions, quaternions, middles, strict=True
   ):
@@ -332,20 +483,23 @@ def boxes_of(model: Any, frame: int) -> Boxes:
     axes_of_box = rotation @ matrix(quaternion)
     centre = place + rotation @ position + axes_of_box @ middle
     centres.append(turned.T @ (centre - origin))
-    rotations.append(turned.T @ axes_of_box)
+    rotated.append(turned.T @ axes_of_box)
   are_boxes = model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_BOX
   return Boxes(
       np.reshape(centres, (-1, 3)),
-      np.reshape(rotations, (-1, 3, 3)),
+      np.reshape(rotated, (-1, 3, 3)),
       np.reshape(halves, (-1, 3)),
       np.append(are_boxes, np.ones(len(sites), bool)),
   )
 
 
 def _pose_of(model: Any, body: int) -> tuple[np.ndarray, np.ndarray]:
-  """Returns the position and the rotation of an immovable body."""
+  """Returns the position and the rotation of an immovable body.
+
+  Those of a part of a mocap body are in the frame of that body.
+  """
   position, rotation = np.zeros(3), np.eye(3)
-  while body:
+  while body and model.body_mocapid[body] < 0:
     turn = matrix(model.body_quat[body])
     position = model.body_pos[body] + turn @ position
     rotation = turn @ rotation

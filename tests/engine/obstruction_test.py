@@ -2,13 +2,16 @@
 
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 from realab_suite import suite
+from realab_suite.entities import moving
 from realab_suite.entities import registers
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
+from realab_suite.tasks import collect_apples
 from tests.engine import helpers
 from tests.evaluation import streams
 
@@ -189,3 +192,112 @@ def test_an_obstructed_block_leaves_the_wall_slowly(size):
         env.physics.advance(1)
         velocity = env.physics.bind(block.body.joint[:3]).qvel
         assert np.linalg.norm(velocity) < 2.0
+
+
+# ---- Doors -------------------------------------------------------------------
+
+# A register along the diagonal of the large room, and where its block meets the
+# door: the coordinates along and beside its axis, in m.
+_DIAGONAL = {
+    'schema': 1,
+    'name': 'diagonal',
+    'registers': {
+        'reward': {
+            'kind': 'block_position',
+            'role': 'feedback',
+            'place': {'position': [-3.0, -3.0], 'yaw': np.pi / 4},
+            'range': [0, 80],
+        }
+    },
+    'providers': [{'kind': 'constant', 'value': 71.4, 'writes': ['reward']}],
+}
+_BESIDE_THE_DOOR = 5.5, 2.9
+_PAD = np.array([0.0, 1.9])
+
+
+def _play_at_the_door(env: Any, press: Any) -> list[np.ndarray]:
+  """Returns the obstructions of each step, beside a door that may open.
+
+  Args:
+    env: One world or a batch.
+    press: True in each world where the pad is pressed, `(...)` bool.
+  """
+  env.reset()
+  (register,) = env.mechanism.registers.values()
+  (block,) = register.blocks
+  position = np.where(np.asarray(press)[..., np.newaxis], _PAD, 99.0)
+  env.task._pad.press(env.physics, position)
+  found = []
+  for _ in range(12):
+    place = np.array(block.position(env.physics))
+    place[..., :2] = _BESIDE_THE_DOOR
+    block.put(env.physics, place)
+    shape = np.shape(press) + env.action_spec().shape
+    env.step(np.zeros(shape, env.action_spec().dtype))
+    found.append(np.array(register.obstruction(env.physics)))
+  return found
+
+
+def _at_the_door(load: Any, **options: Any) -> Any:
+  world = {'world': options.pop('world')} if 'world' in options else {}
+  return load(
+      'unlock_door', 'standard', {'random': 3}, world, design=_DIAGONAL,
+      **options,
+  )  # fmt: skip
+
+
+def test_a_shut_door_obstructs_and_an_open_one_does_not():
+  batch = _at_the_door(suite.load_batch, num_envs=2, num_threads=1)
+  ledger = ledgers.BatchLedger()
+  batch.add_sink(ledger)
+  together = np.array(_play_at_the_door(batch, np.array([False, True])))
+  batch.close()
+  for world, is_pressed in enumerate([False, True]):
+    env, alone = _at_the_door(suite.load, world=world), ledgers.Ledger()
+    env.add_sink(alone)
+    found = np.array(_play_at_the_door(env, np.bool_(is_pressed)))
+    env.close()
+    np.testing.assert_array_equal(found, together[:, world])
+    [episode] = alone.episodes
+    assert episode.entries == ledger.episodes(world)[0].entries
+    # The leaf is 0.08 m wide, and a block may be 0.05 m inside.
+    before = -found[: 1 if is_pressed else None]
+    assert (before > 1.0).all()
+    assert (before < 3.0).all()
+    if is_pressed:
+      np.testing.assert_array_equal(found[-3:], 0.0)
+
+
+@pytest.mark.parametrize('turn', [0.0, 0.6, np.pi / 2])
+def test_a_block_is_put_beside_a_wall_that_was_moved(turn):
+  task = collect_apples.CollectApples()
+  wall = moving.MovingPart('wall', [{'type': 'box', 'size': (0.5, 0.2, 0.5)}])
+  wall.attach_to(task.root_entity, (0.0, 0.0, -3.0))
+  design = {**_DIAGONAL, 'providers': []}
+  env = suite.embed(task, design, random=0)
+  env.reset()
+  (register,) = env.mechanism.registers.values()
+  (block,) = register.blocks
+  geoms = [env.physics.bind(g).element_id for g in (block.geom, wall.geoms[0])]
+  for aside in (1.5, 1.9):
+    along = 4.5
+    place = np.array([along - 2.0, aside, 0.1])
+    block.put(env.physics, place)
+    # The middle of the wall, in the world.
+    middle = np.array([along - aside, along + aside]) / np.sqrt(2) - 3.0
+    for height, is_in_the_way in ((0.5, True), (3.0, False), (-3.0, False)):
+      quaternion = [np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]
+      moving.move(env.physics, wall.frame, [*middle, height], quaternion)
+      register.write(env.physics, along / 0.1)
+      obstruction = float(register.obstruction(env.physics))
+      assert (abs(obstruction) > 1.0) == is_in_the_way
+      assert (obstruction != 0.0) == is_in_the_way
+      env.physics.forward()
+      distance = mujoco.mj_geomDistance(
+          env.physics.model.ptr, env.physics.data.ptr, *geoms, 1.0, None
+      )
+      # Contacts push out a block whose sides are at most 0.05 m inside, and
+      # its corners 0.07 m.
+      assert -0.075 < distance < 0.0 or not is_in_the_way
+      block.put(env.physics, place)
+  env.close()
