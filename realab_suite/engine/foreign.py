@@ -22,7 +22,7 @@ from realab_suite.engine import control_tasks
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import replacement
-from realab_suite.engine import swept_volumes
+from realab_suite.engine import solids
 from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 
@@ -297,7 +297,7 @@ def check_start(
       continue
     if model.geom_type[body] == mujoco.mjtGeom.mjGEOM_HFIELD:
       continue  # Uneven ground, which lifts a block.
-    if depth > swept_volumes.TOLERANCE:
+    if depth > solids.TOLERANCE:
       name = model.id2name(int(body), 'geom') or f'geom {body}'
       raise composer.EpisodeInitializationError(
           f'design {mechanism.design.name!r}: register {owners[block]!r} would'

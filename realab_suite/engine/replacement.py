@@ -6,7 +6,7 @@ the nearest clear place. Nothing is drawn at random, and nothing but registers
 moves, so the episodes of the task stay what they are.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 import contextlib
 import copy
 from typing import Any, NamedTuple, final
@@ -16,7 +16,7 @@ from dm_control import mjcf
 import mujoco
 import numpy as np
 
-from realab_suite.engine import swept_volumes
+from realab_suite.engine import solids
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
 from realab_suite.entities import surroundings
@@ -29,8 +29,6 @@ _CLEARANCE = 0.01
 # Largest difference in height between a register and its ground, in m. It
 # exceeds the gap under a planar block.
 _GAP = 0.01
-# Least number of values that are written to find out where blocks can be.
-_NUM_VALUES = 33
 # Number of places that are checked at once.
 _CHUNK = 4096
 _PLANE = mujoco.mjtGeom.mjGEOM_PLANE
@@ -50,16 +48,16 @@ class _Blocks(NamedTuple):
   """Blocks of a register, as it stands at the start of an episode.
 
   Attributes:
-    start: Bounds of each block, `(blocks, 2, 3)`, in m.
-    reach: Bounds of each block for all values, `(blocks, 2, 3)`, in m.
-    starts: Pose of each block.
-    poses: Poses of all blocks for all values.
+    starts: Each block, where the episode begins with it.
+    paths: Solids that contain the poses of the blocks for all values.
+    start: Bounds of each of `starts`, `(blocks, 2, 3)`, in m.
+    reach: Bounds of each of `paths`, `(paths, 2, 3)`, in m.
   """
 
+  starts: list[list[solids.Solid]]
+  paths: list[list[solids.Solid]]
   start: np.ndarray
   reach: np.ndarray
-  starts: list[swept_volumes.Sweep]
-  poses: list[swept_volumes.Sweep]
 
   @property
   def footprint(self) -> np.ndarray:
@@ -89,11 +87,15 @@ def place(
   if not mechanism.registers:
     return
   with _unchanged(physics):
-    blocks = _find_blocks(physics, mechanism.registers)
-    own = {one.geom for each in blocks.values() for one in each.starts}
+    space = solids.Space(physics.model.ptr)
+    blocks = {
+        name: _find_blocks(physics, register, space)
+        for name, register in mechanism.registers.items()
+    }
+    own = {one.geom for each in blocks.values() for one, *_ in each.starts}
   with _unchanged(physics):
     mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
-    world = _World(physics, own)
+    world = _World(physics, space, own)
     # A register in a clear place does not make way for another one.
     blocked = []
     for name, each in blocks.items():
@@ -146,88 +148,60 @@ def _unchanged(physics: mjcf.Physics) -> Iterator[None]:
 
 
 def _find_blocks(
-    physics: mjcf.Physics, named: Mapping[str, registers.Register]
-) -> dict[str, _Blocks]:
-  """Writes many values to all registers and returns where blocks are.
+    physics: mjcf.Physics, register: registers.Register, space: solids.Space
+) -> _Blocks:
+  """Returns where the blocks of a register are, and can be written to.
 
   Args:
     physics: Physics; its state is changed.
-    named: Registers, by name.
+    register: The register.
+    space: Space of the model.
   """
-  geoms = {
-      name: [int(physics.bind(b.geom).element_id) for b in register.blocks]
-      for name, register in named.items()
-  }
-  mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
-  starts = {name: _poses(physics, ids) for name, ids in geoms.items()}
-  poses: dict[str, list[swept_volumes.Sweep]] = {name: [] for name in named}
-  # Between two values, a block moves by less than its edge length.
-  lengths = [
-      np.diff(register.value_range).item()
-      * register.scale
-      / (2 * register.blocks[0].half_size)
-      for register in named.values()
-  ]
-  num_values = max(_NUM_VALUES, int(np.ceil(max(lengths))) + 1)
-  for fraction in np.linspace(0.0, 1.0, num_values):
-    for register in named.values():
-      low, high = register.value_range
-      register.pose(physics, low + fraction * (high - low))
-    mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
-    for name, ids in geoms.items():
-      poses[name] += _poses(physics, ids)
-  space = swept_volumes.Space(physics.model.ptr)
-  found = {}
-  for name, ids in geoms.items():
-    bounds = np.array([space.bounds(pose) for pose in poses[name]])
-    bounds = bounds.reshape(num_values, len(ids), 2, 3)
-    found[name] = _Blocks(
-        np.array([space.bounds(pose) for pose in starts[name]]),
-        np.stack([bounds[:, :, 0].min(axis=0), bounds[:, :, 1].max(axis=0)], 1),
-        starts[name],
-        poses[name],
-    )
-  return found
-
-
-def _poses(physics: mjcf.Physics, geoms: Any) -> list[swept_volumes.Sweep]:
-  """Returns the present poses of geoms."""
-  data = physics.data.ptr
-  return [
-      swept_volumes.Sweep(
-          geom,
-          np.array(data.geom_xpos[geom]),
-          np.reshape(data.geom_xmat[geom], (3, 3)).copy(),
-      )
-      for geom in geoms
-  ]
+  still = np.zeros(2)
+  regions = solids.initial_regions(physics, register, still)
+  starts = [region.hulls for region in regions]
+  paths = [one.hulls for one in solids.regions(physics, register, still)]
+  return _Blocks(
+      starts,
+      paths,
+      np.array([space.bounds(hull) for hull, *_ in starts]),
+      np.array([space.bounds(hull) for hull, *_ in paths]),
+  )
 
 
 @final
 class _World:
   """Everything solid in a world, except the registers that are to be placed."""
 
-  def __init__(self, physics: mjcf.Physics, own: set[int]) -> None:
+  def __init__(
+      self, physics: mjcf.Physics, space: solids.Space, own: set[int]
+  ) -> None:
     """Collects the geoms of a physics in its present state.
 
     Args:
       physics: Physics of one world.
+      space: Space of its model.
       own: Geoms of registers.
     """
     model, data = physics.model, physics.data.ptr
-    self._space = swept_volumes.Space(model.ptr)
+    self._space = space
     solid = (model.geom_contype | model.geom_conaffinity) != 0
     solid[list(own)] = False
     carriers = model.body_weldid[model.geom_bodyid]
     fixed = (carriers == 0) | (model.body_mocapid[carriers] >= 0)
-    matrices = np.reshape(data.geom_xmat, (-1, 3, 3))
+    matrices = np.reshape(data.geom_xmat, (-1, 3, 3)).copy()
     is_plane = model.geom_type == _PLANE
     planes = np.flatnonzero(solid & is_plane)
     self._normals = matrices[planes, :, 2]
     self._offsets = (self._normals * data.geom_xpos[planes]).sum(axis=1)
     measured = solid & ~np.isin(model.geom_type, _IGNORED_TYPES)
-    self._fixed = _poses(physics, np.flatnonzero(measured & fixed).tolist())
-    self._movable = _poses(physics, np.flatnonzero(measured & ~fixed).tolist())
+    self._fixed, self._movable = (
+        [
+            space.solid(geom, np.array(data.geom_xpos[geom]), matrices[geom])
+            for geom in np.flatnonzero(mask).tolist()
+        ]
+        for mask in (measured & fixed, measured & ~fixed)
+    )
     self._fixed_bounds = self._bounds_of(self._fixed)
     self._movable_bounds = self._bounds_of(self._movable)
     # Ground: planes that face up, and tops of upright boxes.
@@ -265,7 +239,7 @@ class _World:
     if any(_overlap(one, taken).any() for one in blocks.reach):
       return False
     return not (
-        self._meets(blocks.poses, self._fixed, self._fixed_bounds)
+        self._meets(blocks.paths, self._fixed, self._fixed_bounds)
         or self._meets(blocks.starts, self._movable, self._movable_bounds)
     )
 
@@ -275,7 +249,7 @@ class _World:
     shifts = self._shifts_on_ground(blocks.footprint, step)
     margin = np.array([[-_CLEARANCE] * 3, [_CLEARANCE] * 3])
     # A register stands on its ground.
-    margin[0, 2] = swept_volumes.TOLERANCE
+    margin[0, 2] = solids.TOLERANCE
     for i in range(0, len(shifts), _CHUNK):
       some = shifts[i : i + _CHUNK]
       blocked = self._is_behind_plane(blocks.reach, some)
@@ -293,23 +267,24 @@ class _World:
         return some[int(np.argmin(blocked))]
     return None
 
-  def _bounds_of(self, poses: list[swept_volumes.Sweep]) -> np.ndarray:
+  def _bounds_of(self, geoms: list[solids.Solid]) -> np.ndarray:
     """Returns the bounds of geoms, `(geoms, 2, 3)`, in m."""
-    return np.reshape([self._space.bounds(pose) for pose in poses], (-1, 2, 3))
+    return np.reshape([self._space.bounds(geom) for geom in geoms], (-1, 2, 3))
 
   def _meets(
       self,
-      poses: list[swept_volumes.Sweep],
-      obstacles: list[swept_volumes.Sweep],
+      blocks: list[list[solids.Solid]],
+      obstacles: list[solids.Solid],
       bounds: np.ndarray,
   ) -> bool:
-    """Returns True if a geom in one of its poses is inside an obstacle."""
-    for pose in poses:
-      near = _overlap(np.array(self._space.bounds(pose)), bounds)
-      for i in np.flatnonzero(near[: len(obstacles)]).tolist():
-        if self._space.meet(pose, obstacles[i]) is not None:
-          return True
-    return False
+    """Returns True if a block can be inside an obstacle."""
+    return any(
+        self._space.meet(hulls, [obstacles[i]]) is not None
+        for hulls in blocks
+        for i in np.flatnonzero(
+            _overlap(self._space.bounds(hulls[0]), bounds)[: len(obstacles)]
+        ).tolist()
+    )
 
   def _is_behind_plane(
       self, reach: np.ndarray, shifts: np.ndarray
@@ -319,7 +294,7 @@ class _World:
     ahead = centres @ self._normals.T - halves @ np.abs(self._normals).T
     moved = shifts @ self._normals[:, :2].T
     nearest = ahead.min(axis=0) - self._offsets + moved
-    return (nearest < -swept_volumes.TOLERANCE).any(axis=1)
+    return (nearest < -solids.TOLERANCE).any(axis=1)
 
   def _is_on_ground(self, footprint: np.ndarray) -> bool:
     """Returns True if a register is on ground, or if there is none.

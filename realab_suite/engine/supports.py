@@ -5,14 +5,13 @@ is carried by a convex geom if its extreme poses are, so that no poses between
 them have to be sampled.
 """
 
-import itertools
 from typing import final
 
 from dm_control import mjcf
 import mujoco
 import numpy as np
 
-from realab_suite.engine import swept_volumes
+from realab_suite.engine import solids
 
 # Largest height of a block above the surface that carries it, in metres. It
 # exceeds the gap under a planar block.
@@ -33,35 +32,25 @@ class Surfaces:
     self._model, self._data = model.ptr, physics.data.ptr
     self._geoms = np.flatnonzero(is_solid & is_fixed).tolist()
 
-  def find_unsupported(
-      self, sweep: swept_volumes.Sweep
-  ) -> swept_volumes.Sweep | None:
-    """Returns a pose above the floor that no one surface carries, or `None`.
+  def find_unsupported(self, region: solids.Region) -> np.ndarray | None:
+    """Returns a position above the floor that no one surface carries, `(3,)`.
 
     Args:
-      sweep: Poses of the geom of a block.
+      region: Poses of a block.
+
+    Returns:
+      A position of its centre, in m; `None` if a surface carries all of them.
     """
-    half = float(self._model.geom_size[sweep.geom][2])
-    if sweep.centre[2] - half <= _GAP:
+    half = region.half_size
+    points = np.unique(region.corners().round(9), axis=0)
+    if points[:, 2].min() - half <= _GAP:
       return None
-    poses = [
-        sweep.pose(np.array(sides))
-        for sides in itertools.product((-1.0, 1.0), repeat=len(sweep.motions))
-    ]
-    # Poses may differ from these in any direction.
-    offsets = sweep.slack * np.vstack([np.eye(3)[:2], -np.eye(3)[:2]])
-    points = np.array(
-        [pose.centre + offset for pose in poses for offset in offsets]
-    )
-    points = np.unique(points.round(9), axis=0)
     unsupported = [
         [p for p in points if not self._is_over(geom, p, half)]
         for geom in self._geoms
     ]
     missing = min(unsupported, key=len, default=list(points))
-    if not missing:
-      return None
-    return min(poses, key=lambda pose: np.linalg.norm(pose.centre - missing[0]))
+    return missing[0] if missing else None
 
   def _is_over(self, geom: int, point: np.ndarray, half: float) -> bool:
     """Returns True if a geom is close under a block with its centre here."""

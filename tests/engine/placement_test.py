@@ -7,7 +7,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import swept_volumes
+from realab_suite.engine import solids
 from realab_suite.entities import arenas
 from realab_suite.entities import doors
 from realab_suite.entities import moving
@@ -209,8 +209,8 @@ def test_accepted_rooms_have_no_overlap(room):
     hypothesis.event(f'refused: {str(error).split()[0]}')
     return
   hypothesis.event('accepted')
-  assert built.deepest(100) <= swept_volumes.TOLERANCE
-  assert built.deepest_start(5) <= swept_volumes.TOLERANCE
+  assert built.deepest(100) <= solids.TOLERANCE
+  assert built.deepest_start(5) <= solids.TOLERANCE
   built.env.close()
 
 

@@ -6,7 +6,7 @@ from dm_control import composer
 import numpy as np
 import pytest
 
-from realab_suite.engine import swept_volumes
+from realab_suite.engine import solids
 from tests.engine import helpers
 
 _REGISTER = {
@@ -87,7 +87,7 @@ def test_a_register_makes_way_for_a_wall_and_returns(channel: str):
     for value in (-2.0, 4.0):
       register.write(env.physics, value)
       env.physics.forward()
-      assert _depth(env) < swept_volumes.TOLERANCE
+      assert _depth(env) < solids.TOLERANCE
       np.testing.assert_allclose(register.read(env.physics), value)
       assert register.obstruction(env.physics) == 0.0
     np.testing.assert_allclose(readings, 0.0, atol=1e-9)

@@ -9,6 +9,7 @@ from realab_suite.entities.registers.checks import CHANNELS
 from realab_suite.entities.registers.checks import DOFS
 from realab_suite.entities.registers.checks import OVERFLOWS
 from realab_suite.entities.registers.checks import WRITES
+from realab_suite.entities.registers.footprints import Path
 from realab_suite.entities.registers.records import AGENT
 from realab_suite.entities.registers.records import EVALUATOR
 from realab_suite.entities.registers.records import INITIAL
@@ -28,6 +29,7 @@ __all__ = [
     'WRITES',
     'BlockOrientationRegister',
     'BlockPositionRegister',
+    'Path',
     'Read',
     'Record',
     'Register',

@@ -22,6 +22,7 @@ from realab_suite.entities import mocap_blocks
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import checks
+from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import records
 
 
@@ -224,6 +225,27 @@ class Register(composer.Entity):
     not override this property.
     """
     return (None,) * len(self._blocks)
+
+  def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
+    """Returns where writes put the blocks in this episode, if undisturbed.
+
+    Worlds in which something that nothing can push, or another register, is in
+    the way of a path are refused. The paths must contain the poses of all
+    values of the range.
+
+    This base class tries 257 values. A kind whose blocks jump, or move to and
+    fro between two of these values, has to override this method; a kind whose
+    blocks move along a line overrides it to be loaded faster.
+
+    Args:
+      physics: One world; the blocks are moved.
+    """
+    return footprints.sampled(
+        physics,
+        self._blocks,
+        self.value_range,
+        lambda value: self.pose(physics, value),
+    )
 
   @property
   def spread(self) -> np.ndarray:

@@ -8,6 +8,7 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
+from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import moves
 
 
@@ -48,6 +49,10 @@ class BlockPositionRegister(base.Register):
   @property
   def directions(self) -> tuple[tuple[float, float], ...]:
     return ((1.0, 0.0),)
+
+  def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
+    first, last = (self._position(physics, v) for v in self.value_range)
+    return [footprints.Path(0, first, last, self.value_range)]
 
   def displacements(self, physics: protocols.Physics) -> np.ndarray:
     place = self._position(physics, self.applied(physics))

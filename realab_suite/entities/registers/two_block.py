@@ -8,6 +8,7 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base
+from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import moves
 
 # Gap between the paths of the two blocks, in m, so that both blocks are visible
@@ -72,6 +73,14 @@ class TwoBlockRegister(base.Register):
   @property
   def directions(self) -> tuple[tuple[float, float], ...]:
     return (-1.0, 0.0), (1.0, 0.0)
+
+  def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
+    base_position = np.array(self._origin(physics))
+    first, last = (self._offset_position(physics, v) for v in self.value_range)
+    return [
+        footprints.Path(0, base_position, base_position, self.value_range),
+        footprints.Path(1, first, last, self.value_range),
+    ]
 
   def displacements(self, physics: protocols.Physics) -> np.ndarray:
     places = [
