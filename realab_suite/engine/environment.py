@@ -25,6 +25,7 @@ from realab_suite.engine import observing
 from realab_suite.engine import seeding
 from realab_suite.engine import single_physics
 from realab_suite.engine import snapshots
+from realab_suite.engine import starts
 from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
@@ -95,6 +96,9 @@ class Environment(composer.Environment):
     self._provider_keys = self._new_provider_keys()
     self._provider_states: list[Any] = []
     self._episode_is_open = False
+    self._start_check: starts.StartCheck | None = None
+    if isinstance(task, base.Task):
+      self._start_check = starts.StartCheck(self._physics, task, mechanism)
 
   # The interface for evaluators and launchers. Agents do not get this object.
 
@@ -167,6 +171,11 @@ class Environment(composer.Environment):
           f'{type(self._task).__name__} is not a task of this package'
       )
     return self._physics
+
+  @property
+  def start_check(self) -> starts.StartCheck | None:
+    """Check of the start of an episode; `None` for a foreign task."""
+    return self._start_check
 
   def add_extra_hook(self, hook_name: str, hook_callable: Any) -> None:
     """Adds a hook, as in `composer.Environment`.
@@ -472,7 +481,9 @@ class Environment(composer.Environment):
       self._recompile_physics_and_update_observables()
     with foreign.initializing(self._physics, self._task, self._mechanism):
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
-    if not self._is_ours:
+    if self._start_check is not None:
+      self._start_check(self._physics)
+    else:
       foreign.check_start(self._physics, self._mechanism)
       self._observation_updater.reset(self._physics_proxy, self._random_state)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite.engine import solids
+from realab_suite.engine import starts
 from realab_suite.engine import supports
 from realab_suite.entities import arenas
 from realab_suite.entities import moving
@@ -98,9 +99,11 @@ def check_start(
     task: base.Task,
     mechanism: mechanisms.FeedbackMechanism,
 ) -> None:
-  """Checks that no episode begins with the avatar inside a block.
+  """Checks that no episode begins with something movable inside a block.
 
-  The state is reset at the end.
+  This covers every position of the avatar, and other bodies where the compiled
+  model has them; `starts` checks where episodes put them. The state is reset at
+  the end.
 
   Args:
     physics: Physics of one world.
@@ -108,7 +111,8 @@ def check_start(
     mechanism: Registers, meters and providers.
 
   Raises:
-    SpecError: If a block could overlap the avatar when an episode begins.
+    SpecError: If a block could overlap the avatar or another body when an
+      episode begins.
   """
   low, high = np.array(task.start.low), np.array(task.start.high)
   space = solids.Space(physics.model.ptr)
@@ -122,12 +126,19 @@ def check_start(
   )
   radius = task.avatar.radius
   solids.settle(physics, mechanism.registers.values())
+  bodies = starts.movable_geoms(physics, task, mechanism)
   for name, register in mechanism.registers.items():
     for region in solids.initial_regions(physics, register, register.spread):
+      problem = ''
       if space.meet(region.hulls, [start], clearance=radius) is not None:
+        problem = f'where the avatar begins, {_format(low, high)}'
+      for geom in bodies:
+        if space.meet(region.hulls, [space.posed(physics, geom)]) is not None:
+          problem = f'inside {geom.full_identifier!r} when an episode begins'
+      if problem:
         raise errors.SpecError(
-            f'register {name!r} would be at {_filled(space, [region])}, where'
-            f' the avatar begins, {_format(low, high)}; place it elsewhere'
+            f'register {name!r} would be at {_filled(space, [region])},'
+            f' {problem}; place it elsewhere'
         )
   physics.reset()
 
