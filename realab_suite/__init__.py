@@ -10,4 +10,4 @@ __version__ = '0.1.0'
 
 _versions.check()
 # Before the import of dm_control, which chooses a renderer.
-_display.postpone_choice()
+_display.prepare()

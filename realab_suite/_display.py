@@ -1,31 +1,31 @@
-"""Postpones the choice of a renderer until the first frame is drawn.
+"""Preparations for rendering, before dm_control is imported.
 
-Importing dm_control chooses a renderer and starts EGL. With software rendering,
-EGL loads Mesa's LLVM and makes its symbols visible to all libraries that are
-loaded later. A library with another LLVM, such as torch's triton, then ends the
-process with a segmentation fault.
+Importing dm_control chooses a renderer: that of `MUJOCO_GL`, or else GLFW, but
+GLFW needs a display. `engine/gl_contexts.py` makes the contexts of worlds.
+
+That import starts EGL if it is named. With software rendering, EGL loads Mesa's
+LLVM and makes its symbols visible to all libraries that are loaded later. A
+library with another LLVM, such as torch's triton, then ends the process with a
+segmentation fault.
 """
 
-from collections.abc import Iterator
 import contextlib
 import ctypes
 import functools
-import importlib
 from importlib import util
 import os
 import pathlib
 import sys
-import threading
-from typing import Any
+import warnings
 
 _VARIABLE = 'MUJOCO_GL'
-# Renderers that start a driver when dm_control imports them; glfw does not.
+# Renderers that dm_control starts when it is imported.
 _STARTED_BY_IMPORT = ('egl', 'osmesa')
+# GLFW's warning that there is no display.
+_NO_DISPLAY = r'\(65550\) .*DISPLAY'
 # Packages, with their libraries, that look up symbols of their own LLVM
 # globally.
 _WITH_LLVM = (('triton', '_C/libtriton*.so'),)
-
-_lock = threading.Lock()
 
 
 def has_display() -> bool:
@@ -35,20 +35,36 @@ def has_display() -> bool:
   return bool(os.environ.get('DISPLAY') or os.environ.get('WAYLAND_DISPLAY'))
 
 
-def postpone_choice() -> None:
-  """Makes dm_control choose a renderer when the first frame is drawn.
+def is_named() -> bool:
+  """Returns True if the user, or a launcher, has named a renderer."""
+  return bool(os.environ.get(_VARIABLE))
 
-  dm_control then loads the renderer in `MUJOCO_GL`, or EGL if the variable is
-  not set and there is no display. This function has no effect if dm_control has
-  chosen a renderer already, or would choose one that starts no driver.
+
+def prepare() -> None:
+  """Prepares the import of dm_control, which it does not change.
+
+  If the renderer that is named starts with that import, libraries with their
+  own LLVM are loaded first. If none is named and there is no display, a warning
+  of GLFW is suppressed, because worlds are then drawn with EGL. This function
+  has no effect if dm_control has chosen a renderer already.
   """
-  default = None if has_display() else 'egl'
-  if (os.environ.get(_VARIABLE) or default) not in _STARTED_BY_IMPORT:
-    return
   if 'dm_control._render' in sys.modules:
     return
-  with _set_variable('disable'):
-    _import_choice().Renderer = _make_renderer
+  if os.environ.get(_VARIABLE) in _STARTED_BY_IMPORT:
+    load_llvm()
+  elif not (is_named() or has_display()):
+    warnings.filterwarnings('ignore', _NO_DISPLAY, UserWarning)
+
+
+def what_to_set(renderer: str | None, error: Exception) -> str:
+  """Returns advice on an error: the renderer, the cause and alternatives."""
+  lines = str(error).strip().splitlines()
+  return (
+      f'MUJOCO_GL={renderer or "disable"}'
+      f' ({lines[0] if lines else type(error).__name__});'
+      ' set MUJOCO_GL to egl (headless), glfw (with a display) or osmesa'
+      ' before Python starts'
+  )
 
 
 @functools.cache
@@ -66,39 +82,6 @@ def load_llvm() -> None:
       for path in pathlib.Path(folder).glob(library):
         with contextlib.suppress(OSError):
           ctypes.CDLL(os.fspath(path))
-
-
-def _make_renderer(*args: Any, **kwargs: Any) -> Any:
-  """Chooses a renderer and makes one.
-
-  Reloads dm_control's choice, which replaces this function by the class of the
-  chosen renderer.
-  """
-  choice = _import_choice()
-  with _lock:
-    if choice.Renderer is _make_renderer:
-      load_llvm()
-      with _set_variable(os.environ.get(_VARIABLE) or 'egl'):
-        importlib.reload(choice)
-  return choice.Renderer(*args, **kwargs)
-
-
-def _import_choice() -> Any:
-  return importlib.import_module('dm_control._render')
-
-
-@contextlib.contextmanager
-def _set_variable(renderer: str) -> Iterator[None]:
-  """Sets `MUJOCO_GL` and restores it at the end of the context."""
-  before = os.environ.get(_VARIABLE)
-  os.environ[_VARIABLE] = renderer
-  try:
-    yield
-  finally:
-    if before is None:
-      del os.environ[_VARIABLE]
-    else:
-      os.environ[_VARIABLE] = before
 
 
 def _folders(package: str) -> list[str]:

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 
 from realab_suite.engine import control_tasks
+from realab_suite.engine import gl_contexts
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import replacement
@@ -73,6 +74,14 @@ class ForeignPhysics(mjcf.Physics):
   def advance(self, num_substeps: int) -> None:
     """Runs substeps in the same way as Composer."""
     self.step(num_substeps)
+
+  def _make_rendering_contexts(self) -> None:
+    """Creates the contexts for `render`.
+
+    Raises:
+      RenderingError: If no renderer is available.
+    """
+    self._contexts = gl_contexts.for_pictures(self.model)
 
 
 @contextlib.contextmanager

@@ -12,12 +12,11 @@ import threading
 from typing import Any, final
 import weakref
 
-from dm_control import _render
 import mujoco
 import numpy as np
 
-from realab_suite import _display
 from realab_suite import errors
+from realab_suite.engine import gl_contexts
 
 # Slices and stacks of the meshes of round geoms.
 _SLICES, _STACKS = 12, 6
@@ -83,7 +82,8 @@ class FrameRenderer:
     except Exception as error:  # Each renderer has its own errors.
       raise errors.RenderingError(
           f'camera: no frame of {height} x {width} pixels with'
-          f' {what_to_set(error)}, or select senses without the camera'
+          f' {gl_contexts.what_to_set(error)}, or select senses without the'
+          ' camera'
       ) from error
     self._gl.increment_refcount()
     # Frees the context at garbage collection as well, but not at exit, because
@@ -131,15 +131,6 @@ class FrameRenderer:
     self._finalizer()
 
 
-def what_to_set(error: Exception) -> str:
-  """Returns advice on an error: the renderer, the cause and alternatives."""
-  return (
-      f'MUJOCO_GL={_render.BACKEND or "disable"} ({_first_line(error)});'
-      ' set MUJOCO_GL to egl (headless), glfw (with a display) or osmesa'
-      ' before Python starts'
-  )
-
-
 def _plain(model: mujoco.MjModel, height: int, width: int) -> mujoco.MjModel:
   """Returns a copy of a model with settings for fast rendering."""
   plain = copy.copy(model)
@@ -157,8 +148,7 @@ def _plain(model: mujoco.MjModel, height: int, width: int) -> mujoco.MjModel:
 def _start() -> Any:
   """Returns the GL context of this thread, which is created once."""
   if _threads.gl is None or _threads.gl.terminated:
-    _display.load_llvm()
-    _threads.gl = _render.Renderer(max_width=1, max_height=1)
+    _threads.gl = gl_contexts.make(1, 1)
     reference = weakref.ref(_threads.gl)
     _gl_contexts.append(reference)
     if threading.current_thread() is not threading.main_thread():
@@ -214,7 +204,3 @@ def _record_fork() -> None:
 
 
 os.register_at_fork(after_in_child=_record_fork)
-
-
-def _first_line(error: Exception) -> str:
-  return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -9,9 +9,8 @@ from dm_control.rl import control
 import mujoco
 import numpy as np
 
-from realab_suite import _display
-from realab_suite import errors
 from realab_suite.engine import frame_renderer
+from realab_suite.engine import gl_contexts
 from realab_suite.entities import cameras
 
 # Attributes of bound elements that belong to the state.
@@ -111,13 +110,7 @@ class ThinPhysics(mjcf.Physics):
     Raises:
       RenderingError: If no renderer is available.
     """
-    _display.load_llvm()
-    try:
-      super()._make_rendering_contexts()
-    except Exception as error:  # Each renderer has its own errors.
-      raise errors.RenderingError(
-          f'physics: no picture with {frame_renderer.what_to_set(error)}'
-      ) from error
+    self._contexts = gl_contexts.for_pictures(self.model)
 
   def _refuse_warnings(self) -> None:
     if any(self._num_warnings.tolist()):

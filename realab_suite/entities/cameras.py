@@ -2,9 +2,12 @@
 
 import functools
 
+from dm_control import _render
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite import _display
+from realab_suite import errors
 from realab_suite.entities import protocols
 
 
@@ -27,6 +30,7 @@ def render(
 
   Raises:
     NotImplementedError: If the engine cannot render.
+    RenderingError: If no renderer is available.
   """
   raise NotImplementedError(f'{type(physics).__name__} cannot be rendered')
 
@@ -35,4 +39,11 @@ def render(
 def _(
     physics: mjcf.Physics, camera: mjcf.Element, height: int, width: int
 ) -> np.ndarray:
+  try:
+    _ = physics.contexts
+  except errors.RenderingError:
+    raise
+  except Exception as error:  # Each renderer has its own errors.
+    advice = _display.what_to_set(_render.BACKEND, error)
+    raise errors.RenderingError(f'camera: no frame with {advice}') from error
   return physics.render(height, width, camera_id=camera.full_identifier)

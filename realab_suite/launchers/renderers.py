@@ -3,11 +3,13 @@
 Both read `MUJOCO_GL` only once, so this module does not import them.
 """
 
+import importlib
 import os
 import subprocess
 import sys
 
 from realab_suite import _display
+from realab_suite import errors
 
 # Enough time to import dm_control and render on a slow machine under load.
 _PATIENCE_SECONDS = 300
@@ -32,23 +34,43 @@ def choose_renderer() -> str | None:
   for renderer in _candidates():
     problem = _problem(renderer)
     if problem is None:
-      os.environ['MUJOCO_GL'] = renderer
+      _name(renderer)
       return None
     problems.append(f'{renderer}: {problem}')
-  os.environ['MUJOCO_GL'] = 'disable'
+  _name('disable')
   return '; '.join(problems)
 
 
 def render_on_demand() -> None:
-  """Postpones the choice of a renderer to the first frame, if there is one.
+  """Names EGL for the frames of agents, if they would get a window.
 
-  Without a camera, nothing is rendered, and no GL library is loaded. Frames of
-  agents need no window, so the renderer on Linux is EGL, even if there is a
-  display. A renderer that the user has set in `MUJOCO_GL` is kept.
+  Frames need no window, so the renderer on Linux is EGL, even if there is a
+  display. Without one, worlds are drawn with EGL anyway, and no GL library is
+  loaded before the first frame. A renderer that the user has set in `MUJOCO_GL`
+  is kept.
+
+  Raises:
+    RenderingError: If dm_control cannot be imported with that renderer.
   """
-  if sys.platform == 'linux' and not os.environ.get('MUJOCO_GL'):
-    os.environ['MUJOCO_GL'] = 'egl'
-    _display.postpone_choice()
+  named = os.environ.get('MUJOCO_GL')
+  if named:
+    _import_choice(named)
+  elif sys.platform == 'linux' and _display.has_display():
+    _name('egl')
+
+
+def _name(renderer: str) -> None:
+  """Sets `MUJOCO_GL` before dm_control is imported."""
+  os.environ['MUJOCO_GL'] = renderer
+  _display.prepare()
+
+
+def _import_choice(named: str) -> None:
+  """Imports dm_control's choice, which fails without the named renderer."""
+  try:
+    importlib.import_module('dm_control._render')
+  except Exception as error:  # Each renderer has its own errors.
+    raise errors.RenderingError(_display.what_to_set(named, error)) from error
 
 
 def _candidates() -> list[str]:

@@ -6,6 +6,8 @@ import subprocess
 import sys
 import threading
 
+from dm_control import composer
+from dm_control import mjcf
 import mujoco
 import numpy as np
 import pytest
@@ -220,6 +222,17 @@ def test_a_frame_without_a_renderer_names_the_setting():
   with pytest.raises(errors.RenderingError, match='set MUJOCO_GL to egl'):
     env.reset()
   env.close()
+
+
+@pytest.mark.skipif(
+    os.environ['MUJOCO_GL'] != 'disable', reason='something renders'
+)
+def test_a_frame_of_a_plain_environment_names_the_setting():
+  arena = composer.Arena()
+  camera = arena.mjcf_model.worldbody.add('camera', name='eye')
+  physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+  with pytest.raises(errors.RenderingError, match='set MUJOCO_GL to egl'):
+    cameras.render(physics, camera, 8, 8)
 
 
 def test_agents_frames_are_drawn_from_a_plain_copy_of_the_model():

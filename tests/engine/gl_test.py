@@ -50,6 +50,15 @@ scene.reset()
 assert scene.physics.render(16, 16, camera_id='top_down').std() > 1
 """
 _FOREIGN = """
+from dm_control import composer
+from realab_suite import suite
+class Task(composer.NullTask):
+  control_timestep = 0.02
+foreign = suite.embed(Task(composer.Arena()), design='none', random=0)
+foreign.reset()
+foreign.physics.render(16, 16)
+"""
+_DM_CONTROL = """
 import realab_suite
 from dm_control import mujoco
 xml = '<mujoco><worldbody><light/><geom size="1"/></worldbody></mujoco>'
@@ -62,6 +71,8 @@ _DRAWN = [
     (_PICTURE, None),
     (_PICTURE, ''),
     (_FOREIGN, None),
+    (_FOREIGN, 'egl'),
+    (_DM_CONTROL, 'egl'),
 ]
 _IMPORT_TORCH = """
 import torch
@@ -108,15 +119,15 @@ def _run(*parts, named=None, **variables):
 
 @pytest.mark.parametrize('named', [None, '', 'egl', 'disable'])
 def test_worlds_without_a_camera_load_no_gl(named):
-  # What MuJoCo alone maps for a renderer that the user named is not ours.
+  # What dm_control alone maps for a renderer that the user named is not ours.
   printed = _run(
       _MAPPED,
-      'import mujoco\nbefore = mapped()\n',
+      'from dm_control import composer\nbefore = mapped()\n',
       _STEPS,
-      'print(set(mapped()) - set(before), "libLLVM" in mapped())\n',
+      'print(set(mapped()) - set(before))\n',
       named=named,
   )
-  assert printed == 'set() False\n'
+  assert printed == 'set()\n'
 
 
 def test_importing_the_package_imports_no_numpy_and_sets_nothing():
@@ -128,39 +139,60 @@ def test_importing_the_package_imports_no_numpy_and_sets_nothing():
   assert printed == 'False True\n'
 
 
-@pytest.mark.parametrize(
-    ('variables', 'postponed'),
-    [
-        ({}, True),
-        ({'MUJOCO_GL': 'osmesa'}, True),
-        ({'MUJOCO_GL': 'osmesa', 'DISPLAY': ':0'}, True),
-        ({'DISPLAY': ':0'}, False),
-        ({'WAYLAND_DISPLAY': 'wayland-0'}, False),
-        ({'MUJOCO_GL': 'glfw'}, False),
-        ({'MUJOCO_GL': 'off'}, False),
-    ],
-)
-def test_backends_without_a_driver_are_left_to_dm_control(variables, postponed):
-  # The viewer needs GLFW to be chosen before its window is opened.
-  printed = _run(
-      'import sys\nimport realab_suite\n'
-      'print("dm_control._render" in sys.modules)\n',
-      **variables,
-  )
-  assert printed == f'{postponed}\n'
+_CHOICE = """
+import os
+from dm_control import _render
+print(_render.BACKEND, isinstance(_render.Renderer, type), dict(os.environ) ==
+      before, isinstance(0, _render.Renderer))
+"""
 
 
 @renders
+@pytest.mark.parametrize(
+    'variables',
+    [
+        {},
+        {'MUJOCO_GL': ''},
+        {'MUJOCO_GL': 'egl'},
+        {'MUJOCO_GL': 'glfw'},
+    ],
+)
+def test_importing_the_package_leaves_the_choice_to_dm_control(variables):
+  before = 'import os\nbefore = dict(os.environ)\n'
+  alone = _run(before, _CHOICE, PYTHONWARNINGS='ignore', **variables)
+  printed = _run(before, 'import realab_suite.suite\n', _CHOICE, **variables)
+  assert printed == alone
+  assert ' True ' in printed
+  assert printed.endswith(' False\n')
+
+
+def test_without_a_display_the_import_gives_no_warning():
+  printed = _run("""
+import warnings
+with warnings.catch_warnings(record=True) as seen:
+  warnings.simplefilter('always')
+  import realab_suite.suite
+print([str(w.message) for w in seen if 'DISPLAY' in str(w.message)])
+""")
+  assert printed == '[]\n'
+
+
+@renders
+@pytest.mark.parametrize('first', ['realab_suite', 'dm_control.composer'])
 @pytest.mark.parametrize(('draw', 'named'), _DRAWN)
-def test_the_first_frame_chooses_egl_where_there_is_no_display(draw, named):
+def test_worlds_are_drawn_with_egl_where_there_is_no_display(
+    first, draw, named
+):
   printed = _run(
-      'import os\nbefore = os.environ.get("MUJOCO_GL")\n',
+      f'import {first}\nfrom dm_control import _render\n'
+      'choice = _render.BACKEND, _render.Renderer\n',
+      _MAPPED,
       draw,
-      'from dm_control import _render\n'
-      'print(_render.BACKEND, os.environ.get("MUJOCO_GL") == before)\n',
+      'print(choice == (_render.BACKEND, _render.Renderer),'
+      ' "libEGL" in mapped())\n',
       named=named,
   )
-  assert printed == 'egl True\n'
+  assert printed == 'True True\n'
 
 
 @renders
@@ -169,7 +201,7 @@ def test_threads_that_draw_first_choose_once():
       'import threading\n',
       _STEPS,
       """
-from dm_control import _render
+from realab_suite.engine import gl_contexts
 barrier = threading.Barrier(4)
 kinds = []
 def draw():
@@ -177,7 +209,7 @@ def draw():
                    {'random': 0, 'camera_size': (16, 16)})
   barrier.wait()
   frame = eye.reset().observation['senses/camera']
-  kinds.append((_render.Renderer, frame.tobytes()))
+  kinds.append((type(gl_contexts.make(1, 1)), frame.tobytes()))
   eye.close()
 threads = [threading.Thread(target=draw) for _ in range(4)]
 for thread in threads: thread.start()
@@ -233,6 +265,23 @@ def test_a_library_with_an_llvm_of_its_own_is_loaded_before_gl(draw, tmp_path):
       PYTHONPATH=os.pathsep.join([str(tmp_path), *sys.path]),
   )
   assert printed == 'False\nTrue False\n'
+
+
+@renders
+@pytest.mark.parametrize(('named', 'loaded'), [('egl', True), (None, False)])
+def test_a_library_with_an_llvm_is_loaded_with_a_named_egl(
+    named, loaded, tmp_path
+):
+  folder = tmp_path / 'triton' / '_C'
+  folder.mkdir(parents=True)
+  shutil.copy(np._core._multiarray_umath.__file__, folder / 'libtriton.so')
+  printed = _run(
+      _MAPPED,
+      'import numpy\nimport realab_suite\nprint(mapped())\n',
+      named=named,
+      PYTHONPATH=os.pathsep.join([str(tmp_path), *sys.path]),
+  )
+  assert printed == f"{['libtriton'] if loaded else []}\n"
 
 
 @renders

@@ -297,15 +297,27 @@ def test_a_film_needs_a_run_and_a_renderer(monkeypatch, arguments, complaint):
   assert complaint in in_process.complaint(film, *arguments)
 
 
-@pytest.mark.parametrize('given', ['', 'osmesa', 'disable'])
-def test_a_renderer_is_chosen_at_the_first_frame(monkeypatch, given):
+@pytest.mark.skipif(sys.platform != 'linux', reason='EGL exists on Linux')
+@pytest.mark.parametrize(
+    ('given', 'display', 'named'),
+    [('', ':0', 'egl'), ('', '', ''), ('disable', ':0', 'disable')],
+)
+def test_frames_of_programs_get_no_window(monkeypatch, given, display, named):
   monkeypatch.setenv('MUJOCO_GL', given)
-  postponed = []
-  monkeypatch.setattr(_display, 'postpone_choice', lambda: postponed.append(1))
+  monkeypatch.setenv('DISPLAY', display)
+  monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
   renderers.render_on_demand()
-  is_ours = not given and sys.platform == 'linux'
-  assert os.environ['MUJOCO_GL'] == ('egl' if is_ours else given)
-  assert len(postponed) == is_ours
+  assert os.environ['MUJOCO_GL'] == named
+
+
+def test_a_program_names_a_renderer_that_dm_control_cannot_import():
+  ran = _run(
+      '--input=runs', '--run=a', '--output=new',
+      module='realab_suite.launchers.export', MUJOCO_GL='crayons',
+  )  # fmt: skip
+  assert ran.returncode == 2
+  assert len(ran.stderr.splitlines()) == 1
+  assert 'MUJOCO_GL=crayons' in ran.stderr
 
 
 def test_a_renderer_that_works_is_chosen(monkeypatch):
