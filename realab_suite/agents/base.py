@@ -14,6 +14,7 @@ from realab_suite import errors
 from realab_suite.agents import action_encoding
 from realab_suite.agents import features
 from realab_suite.agents import jax_settings
+from realab_suite.config import integers
 from realab_suite.config import registry
 from realab_suite.config import validation
 from realab_suite.feedback import specs
@@ -355,11 +356,8 @@ def make(
         'learner: None; allowed are a design with a learner, and a mapping'
         f' whose kind is one of {sorted(LEARNERS)}'
     )
-  for name, value, least in (('num_envs', num_envs, 1), ('seed', seed, 0)):
-    if type(value) is not int or value < least:
-      raise errors.SpecError(
-          f'{name}: {value!r:.80}; allowed are integers from {least}'
-      )
+  num_envs = integers.check('num_envs', num_envs, 1)
+  seed = integers.check('seed', seed, 0)
   if not isinstance(spec, specs.LearnerSpec):
     spec = validation.validate(specs.LearnerSpec, spec, 'learner')
   learner_class = LEARNERS.get(spec.kind)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import integers
 from realab_suite.config import messages
 
 MAX_ENVS = 2**16
@@ -15,8 +16,6 @@ Indices = Sequence[int] | np.ndarray
 """Indices of worlds in a batch."""
 
 _MAX_THREADS = 1024
-# Numbers in result rows have 64 bits.
-_LARGEST = 2**63 - 1
 
 
 def num_envs(given: Any) -> int:
@@ -25,7 +24,7 @@ def num_envs(given: Any) -> int:
   Raises:
     SpecError: If it is not an integer from 1 to 65,536.
   """
-  return _integer('num_envs', given, 1, MAX_ENVS)
+  return integers.check('num_envs', given, 1, MAX_ENVS)
 
 
 def num_threads(given: Any) -> int:
@@ -34,7 +33,7 @@ def num_threads(given: Any) -> int:
   Raises:
     SpecError: If it is not an integer from 0 to 1,024.
   """
-  return _integer('num_threads', given, 0, _MAX_THREADS)
+  return integers.check('num_threads', given, 0, _MAX_THREADS)
 
 
 def world(given: Any) -> int:
@@ -43,7 +42,7 @@ def world(given: Any) -> int:
   Raises:
     SpecError: If it is not an integer from 0 to 2**63 - 1.
   """
-  return _integer('world', given, 0, _LARGEST)
+  return integers.check('world', given, 0)
 
 
 def indices(given: Any, num_envs: int) -> np.ndarray:
@@ -63,9 +62,7 @@ def indices(given: Any, num_envs: int) -> np.ndarray:
       not isinstance(given, Sequence | np.ndarray)
       or not len(given)
       or not all(
-          isinstance(index, int | np.integer)
-          and type(index) is not bool
-          and 0 <= index < num_envs
+          integers.is_integer(index) and 0 <= index < num_envs
           for index in given
       )
       or len(set(given)) < len(given)
@@ -106,7 +103,7 @@ def max_steps(given: Any) -> int | None:
   """
   if given is None:
     return None
-  return _integer('max_steps', given, 1, _LARGEST, ', and None')
+  return integers.check('max_steps', given, 1, more=', and None')
 
 
 def senses(given: Any) -> tuple[str, ...] | None:
@@ -156,13 +153,3 @@ def flag(name: str, given: Any) -> bool:
         f'{name}: {messages.quote(given)}; allowed are True and False'
     )
   return bool(given)
-
-
-def _integer(name: str, given: Any, low: int, high: int, more: str = '') -> int:
-  is_integer = isinstance(given, int | np.integer)
-  if isinstance(given, bool) or not is_integer or not low <= given <= high:
-    raise errors.SpecError(
-        f'{name}: {messages.quote(given)}; allowed are integers from {low} to'
-        f' {high}{more}'
-    )
-  return int(given)

@@ -15,6 +15,7 @@ from dm_env import specs as dm_env_specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import integers
 from realab_suite.engine import action_codec
 from realab_suite.engine import control_step
 from realab_suite.engine import episodes
@@ -215,8 +216,7 @@ class Environment(composer.Environment):
       SpecError: If the number or the seed is invalid.
     """
     self._refuse_if_closed()
-    if episode < 0:
-      raise errors.SpecError(f'episode: {episode}; allowed are 0 and more')
+    episode = integers.check('episode', episode, 0)
     if random is not None:
       self._seed = seeding.as_seed(random)
     self._abandon()

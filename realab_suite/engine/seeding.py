@@ -15,6 +15,7 @@ import zlib
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import integers
 from realab_suite.config import messages
 
 NUM_SALT_BYTES = 16
@@ -97,9 +98,8 @@ def as_seed(random: Any) -> int:
     copy = np.random.RandomState()
     copy.set_state(random.get_state())
     return int(copy.randint(2**31))
-  if isinstance(random, int | np.integer) and not isinstance(random, bool):
-    if random >= 0:
-      return int(random)
+  if integers.is_integer(random) and random >= 0:
+    return int(random)
   raise errors.SpecError(
       f'random: {messages.quote(random)}; allowed are a non-negative integer, a'
       ' RandomState or None'

@@ -12,6 +12,7 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import policies
+from realab_suite.config import integers
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -181,7 +182,8 @@ def evaluate(
 
   Raises:
     ResultsError: If `env` is not an `Environment` of this package,
-      `num_episodes` is not positive, or `first_episode` is negative.
+      `num_episodes` is not a positive integer, or `first_episode` not one from
+      0.
   """
   if not isinstance(env, environment.Environment):
     raise errors.ResultsError(
@@ -232,17 +234,15 @@ def results_of(
     One result per episode in order, including invalid ones.
 
   Raises:
-    ResultsError: If `num_episodes` is not positive, or `first_episode` is
-      negative.
+    ResultsError: If `num_episodes` is not a positive integer, or
+      `first_episode` not one from 0.
   """
-  if not isinstance(num_episodes, int) or num_episodes < 1:
-    raise errors.ResultsError(
-        f'num_episodes: {num_episodes}; allowed are positive integers'
-    )
-  if first_episode < 0:
-    raise errors.ResultsError(
-        f'first_episode: {first_episode}; allowed are integers from 0'
-    )
+  num_episodes = integers.check(
+      'num_episodes', num_episodes, 1, error=errors.ResultsError
+  )
+  first_episode = integers.check(
+      'first_episode', first_episode, 0, error=errors.ResultsError
+  )
   collector = ResultCollector(env, objective)
   added: list[events.EventSink] = [collector]
   results: list[EpisodeResult] = []

@@ -21,6 +21,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.audit import aiming
+from realab_suite.config import integers
 from realab_suite.config import messages
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
@@ -134,16 +135,11 @@ class _Job:
   ) -> None:
     self._name = name
     self._agents = agents
-    self._num_episodes = num_episodes
-    self._first_seed = first_seed
+    self._num_episodes = integers.check('num_episodes', num_episodes, 1)
+    self._first_seed = integers.check('first_seed', first_seed, 0)
     self._wrap = wrap
     self._options = dict(options)
     self.num_seeds = _num_seeds(agents)
-    if not isinstance(num_episodes, int) or num_episodes < 1:
-      raise errors.SpecError(
-          f'num_episodes: {messages.quote(num_episodes)}; allowed are positive'
-          ' integers'
-      )
     self._settings = {**_spec(name).kwargs, **self._options}
     if 'domain_name' not in self._settings:
       raise errors.SpecError(

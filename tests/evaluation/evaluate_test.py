@@ -98,7 +98,7 @@ def test_a_terminated_episode_is_valid_and_counts_the_last_reward():
   assert result.true_return == 110.0
 
 
-@pytest.mark.parametrize('number', [0, -1])
+@pytest.mark.parametrize('number', [0, -1, True, 1.0])
 def test_fewer_than_one_episode_is_refused(number):
   env = rooms.load(design='none')
   with pytest.raises(errors.ResultsError, match=f'num_episodes: {number}'):
@@ -107,11 +107,23 @@ def test_fewer_than_one_episode_is_refused(number):
   env.close()
 
 
-def test_episodes_are_numbered_from_0():
+@pytest.mark.parametrize('number', [-1, True, 0.5])
+def test_episodes_are_numbered_from_0(number):
   env = rooms.load(design='none')
-  with pytest.raises(errors.ResultsError, match='first_episode: -1'):
-    evaluate.evaluate(env, rooms.still(env), 1, first_episode=-1)
+  with pytest.raises(errors.ResultsError, match=f'first_episode: {number}'):
+    evaluate.evaluate(env, rooms.still(env), 1, first_episode=number)
+  with pytest.raises(errors.SpecError, match=f'episode: {number}'):
+    env.rewind(number)
   env.close()
+
+
+def test_numbers_of_episodes_may_be_integers_of_numpy():
+  env = rooms.load(design='none', max_steps=2)
+  [result] = evaluate.evaluate(
+      env, rooms.still(env), np.int64(1), first_episode=np.int32(3)
+  )
+  env.close()
+  assert result.episode == 3
 
 
 def test_a_callable_gets_time_steps_and_its_actions_are_taken():

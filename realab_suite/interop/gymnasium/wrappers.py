@@ -8,6 +8,7 @@ from gymnasium.vector import utils
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import integers
 from realab_suite.config import messages
 
 _CAMERA = 'senses_camera'
@@ -77,7 +78,7 @@ class VectorFrameStack(gym.vector.VectorWrapper):
       SpecError: If `stack_size` is something else.
     """
     super().__init__(env)
-    self._stack_size = _checked_size(stack_size)
+    self._stack_size = integers.check('stack_size', stack_size, 1)
     self._single_observation_space = utils.batch_space(
         env.single_observation_space, stack_size
     )
@@ -145,14 +146,6 @@ class VectorFrameStack(gym.vector.VectorWrapper):
 
 def _parts(observation: Any) -> dict[str, np.ndarray]:
   return observation if isinstance(observation, dict) else {_WHOLE: observation}
-
-
-def _checked_size(given: Any) -> int:
-  if not isinstance(given, int) or isinstance(given, bool) or given < 1:
-    raise errors.SpecError(
-        f'stack_size: {messages.quote(given)}; allowed are positive integers'
-    )
-  return given
 
 
 def _image_space(space: Any) -> spaces.Space[Any]:
