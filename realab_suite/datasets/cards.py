@@ -77,7 +77,10 @@ def write(
   for name, table in columns.EVALUATOR.items():
     parts.append(f'### evaluator/{name}.parquet\n\n{table_of(table)}')
   text = '\n\n'.join(part.strip('\n') for part in parts)
-  storage.write_whole(folder / NAME, f'{text}\n'.encode())
+  path = folder / NAME
+  storage.write_whole(path, f'{text}\n'.encode())
+  with storage.explained(path):
+    path.chmod(0o600)  # It summarises the tables of the evaluator.
 
 
 def table_of(table: pa.Schema) -> str:

@@ -148,7 +148,8 @@ class _Table:
 class EvaluatorWriter:
   """Writes the tables of the truth, in the folder `evaluator`.
 
-  Use it as a context manager, which completes the files at its end.
+  Other users, who may run the agent, cannot read this folder. Use the writer as
+  a context manager, which completes the files at its end.
   """
 
   def __init__(self, folder: pathlib.Path) -> None:
@@ -161,11 +162,13 @@ class EvaluatorWriter:
       ResultsError: If they cannot be created.
     """
     self._stack = contextlib.ExitStack()
+    evaluator = folder / _EVALUATOR
+    with storage.explained(evaluator):
+      folder.mkdir(parents=True, exist_ok=True)
+      evaluator.mkdir(mode=0o700)
     self._tables = {
         name: self._stack.enter_context(
-            contextlib.closing(
-                _Table(folder / _EVALUATOR / f'{name}{_SUFFIX}', layout)
-            )
+            contextlib.closing(_Table(evaluator / f'{name}{_SUFFIX}', layout))
         )
         for name, layout in columns.EVALUATOR.items()
     }

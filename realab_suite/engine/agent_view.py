@@ -26,7 +26,25 @@ _REGISTERS = 'registers/'
 _T = TypeVar('_T')
 
 
-class _View(abc.ABC):
+class Uncopied(abc.ABC):  # noqa: B024 - It only refuses.
+  """Base class of the faces of a world for agents.
+
+  `copy` and `pickle` are refused, because they would expose the environment.
+  """
+
+  __slots__ = ()
+
+  def __reduce_ex__(self, protocol: Any) -> Any:
+    raise TypeError(f'{type(self).__name__} cannot be pickled or copied')
+
+  def __reduce__(self) -> Any:
+    return self.__reduce_ex__(0)
+
+  def __getstate__(self) -> Any:
+    return self.__reduce_ex__(0)
+
+
+class _View(Uncopied):
   """Base class of the views of one world and of a batch.
 
   - Observations contain the keys that the agent may observe when the view is
@@ -125,16 +143,6 @@ class _View(abc.ABC):
     The environment stays open, and its current episode does not end.
     """
     self.__is_closed = True
-
-  def __reduce_ex__(self, protocol: Any) -> Any:
-    """Refuses `copy` and `pickle`, which would expose the environment."""
-    raise TypeError('views cannot be pickled or copied')
-
-  def __reduce__(self) -> Any:
-    return self.__reduce_ex__(0)
-
-  def __getstate__(self) -> Any:
-    return self.__reduce_ex__(0)
 
   @abc.abstractmethod
   def _restate(self, time_step: Any) -> Any:

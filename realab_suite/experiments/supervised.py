@@ -33,6 +33,8 @@ ANSWERS = 'answers.jsonl'
 
 # Longest wait for a message, in seconds.
 _PATIENCE = 0.2
+# Upper bound of the times of a page, in ms since 1970.
+_LATEST = 1e15
 # Numbers of the pictures in the page: the view, and the earlier clip.
 _VIEW, _FIRST_CLIP = 0, 1
 _RUN = 'supervised'
@@ -274,7 +276,11 @@ class Supervision:
           'asks': str(asks),
           'value': int(value),
           'time': int(clicked) | float(clicked),
-      } if asks in self._asks and value in self._allowed(asks):
+      } if (
+          asks in self._asks
+          and value in self._allowed(asks)
+          and 0 <= clicked < _LATEST
+      ):
         self._given[asks] = float(value), clicked / 1e3
     return True
 

@@ -19,7 +19,7 @@ def test_integers_of_python_and_numpy_become_integers_of_python(given):
 )
 def test_anything_else_is_refused(given):
   with pytest.raises(
-      errors.SpecError, match='number: .*; allowed are integers from 1 to 2$'
+      errors.SpecError, match=r'number: .*; allowed are integers from 1 to 2$'
   ):
     integers.check('number', given, 1, 2)
 

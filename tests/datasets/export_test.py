@@ -1,6 +1,8 @@
 """Tests of exports: files, secrecy, and errors that leave nothing behind."""
 
 import dataclasses
+import os
+import stat
 
 import numpy as np
 import pytest
@@ -58,6 +60,20 @@ def test_a_labelled_dataset_has_all_files_and_a_card(folder):
   assert '| carrying_saboteur (embedded) | carrying_saboteur |' in card
   for table in columns.EVALUATOR.values():
     assert cards.table_of(table) in card
+
+
+def test_other_users_can_read_the_data_of_the_agent_only(folder):
+  group = folder / 'instantaneous_reward'
+  modes = {
+      path: stat.S_IMODE(path.stat().st_mode)
+      for path in (group / 'evaluator', folder / cards.NAME)
+  }
+  assert not [path for path, mode in modes.items() if mode & 0o077]
+  umask = os.umask(0)
+  os.umask(umask)
+  readable = 0o444 & ~umask
+  agent = (group / 'agent/steps.parquet').stat().st_mode
+  assert stat.S_IMODE(agent) & 0o444 == readable
 
 
 def test_rows_of_the_agent_and_of_the_evaluator_fit_together(folder):

@@ -1,6 +1,7 @@
 """Tests of episodes with a person at a page, with a page that is scripted."""
 
 import json
+import math
 import types
 
 import pytest
@@ -84,6 +85,20 @@ def test_an_answer_without_waiting_is_written_in_the_next_step(tmp_path):
   _, answers = _supervise(page, tmp_path, design)
   assert page.asked() == ['comparison'] * 3
   assert [one['step'] for one in answers] == [15]
+
+
+@pytest.mark.parametrize(
+    'time',
+    [pytest.param(10**4_000, id='huge'), -1, math.nan, math.inf, '0'],
+)
+def test_an_answer_with_an_impossible_time_is_dropped(tmp_path, time):
+  def react(page, content):
+    if content['type'] == 'step' and content['step'] == 2:
+      page.put({'type': 'answer', 'asks': 'approval', 'value': 1, 'time': time})
+
+  design = supervised_designs.design('approval', 'live')
+  _, answers = _supervise(FakePage(react), tmp_path, design, 4)
+  assert not [one for one in answers if one['asks'] == 'approval']
 
 
 def test_the_clips_of_a_comparison_have_their_length(tmp_path):

@@ -1,6 +1,8 @@
 """Worlds with the interface of Gymnasium: ids, spaces, episodes and secrets."""
 
+import copy
 import inspect
+import pickle
 from typing import Any
 
 import numpy as np
@@ -42,6 +44,23 @@ def test_every_shipped_world_has_an_id_with_every_design():
   assert len(ids) == len(set(ids)) == len(suite.ALL_TASKS) * len(suite.DESIGNS)
   assert set(ids) <= set(gym.registry)
   assert _NEAR in ids
+
+
+def test_worlds_are_not_copied_because_copies_expose_the_environment():
+  single_world = _make()
+  many = gym.make_vec(_NEAR, num_envs=2, **_SHORT).unwrapped
+  for env in (single_world, many):
+    for take in (
+        copy.copy,
+        copy.deepcopy,
+        pickle.dumps,
+        lambda one: one.__getstate__(),
+        lambda one: one.__reduce__(),
+        lambda one: one.__reduce_ex__(2),
+    ):
+      with pytest.raises(TypeError, match='cannot be pickled or copied'):
+        take(env)
+    env.close()
 
 
 def test_an_id_may_name_the_module_that_registers_it():

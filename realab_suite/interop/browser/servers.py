@@ -175,8 +175,13 @@ class PageServer:
       request: http11.Request,
   ) -> http11.Response | None:
     """Returns the page or a refusal, or `None` to accept a connection."""
-    parts = parse.urlsplit(request.path)
-    [token] = parse.parse_qs(parts.query).get('token', [''])[:1]
+    try:
+      parts = parse.urlsplit(request.path)
+      [token] = parse.parse_qs(parts.query).get('token', [''])[:1]
+    except ValueError:
+      return connection.respond(
+          http.HTTPStatus.BAD_REQUEST, 'The address is malformed.\n'
+      )
     # Bytes, because strings may contain only ASCII characters.
     if not hmac.compare_digest(token.encode(), self._token.encode()):
       return connection.respond(
@@ -208,7 +213,7 @@ class PageServer:
         arrival = time.monotonic()
         try:
           content = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
           continue
         if isinstance(content, dict):
           self._messages.put(Message(arrival, content))

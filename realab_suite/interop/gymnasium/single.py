@@ -13,7 +13,7 @@ from realab_suite.interop.gymnasium import interfaces
 
 
 @final
-class RealabEnv(gym.Env):
+class RealabEnv(agent_view.Uncopied, gym.Env):
   """A world of this package as a `gymnasium.Env`.
 
   `info` is always empty. The reward is 0.0, or the reading of a register: the

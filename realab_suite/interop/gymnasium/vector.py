@@ -18,7 +18,7 @@ AutoresetMode = gym.vector.AutoresetMode
 
 
 @final
-class RealabVectorEnv(gym.vector.VectorEnv):
+class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
   """A batch of worlds as a `gymnasium.vector.VectorEnv`.
 
   World i is bit for bit the `RealabEnv` with `environment_kwargs={'world': i}`

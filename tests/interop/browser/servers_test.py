@@ -1,6 +1,8 @@
 """Tests of the server of a page for one person."""
 
+import socket
 from urllib import error
+from urllib import parse
 from urllib import request
 
 import pytest
@@ -13,6 +15,12 @@ from websockets.sync import client
 from realab_suite import errors
 from realab_suite.interop.browser import servers
 from tests import patience
+
+_UPGRADE = (
+    b'Host: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n'
+    b'Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n'
+    b'Sec-WebSocket-Version: 13\r\n\r\n'
+)
 
 
 @pytest.fixture(name='server')
@@ -59,17 +67,38 @@ def test_a_page_of_another_address_cannot_connect(server):
 
 
 def test_messages_go_both_ways_and_others_are_dropped(server):
-  with _connect(server) as socket:
+  with _connect(server) as connection:
     assert server.wait(patience.SECONDS)
     for text in ('not json', '[1]', '{"type": "run"}'):
-      socket.send(text)
+      connection.send(text)
     message = server.receive(patience.SECONDS)
     assert message.content == {'type': 'run'}
     assert message.time > 0
     server.send({'type': 'state'})
-    assert socket.recv(timeout=patience.SECONDS) == '{"type": "state"}'
+    assert connection.recv(timeout=patience.SECONDS) == '{"type": "state"}'
     server.send_picture(2, b'jpeg')
-    assert socket.recv(timeout=patience.SECONDS) == b'\x02jpeg'
+    assert connection.recv(timeout=patience.SECONDS) == b'\x02jpeg'
+
+
+@pytest.mark.parametrize('target', ['http://[::1?token=', '//[/?token='])
+def test_a_malformed_request_is_refused_without_a_traceback(
+    server, target, caplog
+):
+  address = parse.urlsplit(server.url)
+  with socket.create_connection((address.hostname, address.port)) as raw:
+    raw.settimeout(patience.SECONDS)
+    raw.sendall(f'GET {target} HTTP/1.1\r\n'.encode() + _UPGRADE)
+    assert raw.recv(4096).startswith(b'HTTP/1.1 400 ')
+  assert not [one for one in caplog.records if one.exc_info]
+
+
+@pytest.mark.parametrize('text', ['[' * 4_000, '{"a":' * 800, '1' * 4_000])
+def test_a_message_that_cannot_be_parsed_is_dropped(server, text):
+  with _connect(server) as connection:
+    connection.send(text)
+    connection.send('{"type": "run"}')
+    message = server.receive(60.0)  # Not longer: a failure never answers.
+  assert message.content == {'type': 'run'}
 
 
 def test_a_port_in_use_is_refused(server):
