@@ -46,7 +46,8 @@ class RoomTask(base.Task):
       SpecError: If an argument has a value that is not allowed.
     """
     self._layout = layout = layouts.Layout() if layout is None else layout
-    self._starts = starts.BesideRegisters(starts_beside_registers)
+    self._share_beside = starts.checked_share(starts_beside_registers)
+    self._starts: starts.BesideRegisters | None = None
     arena.offer(
         {name: arenas.Place(xy) for name, xy in layout.stations.items()}
     )
@@ -64,8 +65,24 @@ class RoomTask(base.Task):
     return self._layout.start
 
   def add_registers(self, registers: Sequence[registers_base.Register]) -> None:
-    self._starts.connect(self._layout, self._arena.room, registers)
+    if self._share_beside:
+      self._starts = starts.BesideRegisters(
+          self._share_beside,
+          self._avatar,
+          self._layout,
+          self._arena.room,
+          registers,
+      )
+      self._arena.attach(self._starts)
     super().add_registers(registers)
+
+  def remove_registers(
+      self, registers: Sequence[registers_base.Register]
+  ) -> None:
+    super().remove_registers(registers)
+    if self._starts is not None:
+      self._starts.detach()
+      self._starts = None
 
   def place_avatar(self, physics: protocols.Physics, random_state: Any) -> None:
     """Draws the pose in which the avatar begins an episode.
@@ -78,5 +95,4 @@ class RoomTask(base.Task):
     middle = np.array(self._layout.middle)
     position = middle + random_state.uniform(-spread, spread, 2)
     heading = random_state.uniform(-np.pi, np.pi)
-    position = self._starts.draw(physics, random_state, position)
     self._avatar.place(physics, position, heading)

@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from typing import Any, final
 
+from dm_control import composer
 from dm_control import mjcf
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.entities import arenas
-from realab_suite.entities import block_kinds
+from realab_suite.entities import avatars
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base as registers_base
 from realab_suite.tasks import layouts
@@ -26,58 +27,47 @@ _TRIES = 32
 
 
 @final
-class BesideRegisters:
-  """Lets a share of the episodes begin beside a register at a station."""
+class BesideRegisters(composer.Entity):
+  """Lets a share of the episodes begin beside a register at a station.
 
-  def __init__(self, share: float) -> None:
-    """Initializes the starts; `connect` follows.
+  Hooks of entities run in the order in which the entities were attached, so it
+  is attached after the registers: it has to see where their blocks are.
+  """
 
-    Args:
-      share: Share of the episodes, in [0, 1].
-
-    Raises:
-      SpecError: If it is not a share.
-    """
-    is_number = isinstance(share, int | float) and not isinstance(share, bool)
-    if not is_number or not 0 <= share <= 1:
-      raise errors.SpecError(
-          f'starts_beside_registers: {share!r:.80}; allowed are numbers from 0'
-          ' to 1'
-      )
-    self._share = float(share)
-    self._blocks: list[block_kinds.Block] = []
-    self._used: list[tuple[float, float]] = []
-
-  def connect(
+  def _build(
       self,
+      share: float,
+      avatar: avatars.Avatar,
       layout: layouts.Layout,
       room: arenas.Rectangle,
       registers: Sequence[registers_base.Register],
   ) -> None:
-    """Connects the starts to the registers of a design, which are attached.
+    """Builds the entity.
 
     Args:
+      share: Share of the episodes.
+      avatar: Avatar, which another hook has placed.
       layout: Layout of the room.
       room: The room, without its walls.
-      registers: The registers.
+      registers: Registers of a design, which are attached.
 
     Raises:
       SpecError: If no register stands at a station that can be reached.
     """
-    if not self._share:
-      return
+    self._mjcf_root = mjcf.RootElement(model='starts')
+    self._share, self._avatar = share, avatar
+    self._layout, self._room = layout, room
+    self._geoms = [block.geom for one in registers for block in one.blocks]
     places = [
         mjcf.get_attachment_frame(register.mjcf_model).pos[:2]
         for register in registers
     ]
-    self._layout, self._room = layout, room
-    self._blocks = [block for one in registers for block in one.blocks]
     self._used = [
         station
         for station in layout.stations.values()
         if any(np.linalg.norm(np.subtract(p, station)) < _AT for p in places)
     ]
-    refusal = f'starts_beside_registers: {self._share}; allowed is 0'
+    refusal = f'starts_beside_registers: {share}; allowed is 0'
     if not self._used:
       raise errors.SpecError(f'{refusal} if no register stands at a station')
     if not layout.are_before_the_barrier(np.array(self._used)).all():
@@ -85,23 +75,16 @@ class BesideRegisters:
           f'{refusal} where a barrier stands before the registers'
       )
 
-  def draw(
-      self,
-      physics: protocols.Physics,
-      random_state: Any,
-      otherwise: np.ndarray,
-  ) -> np.ndarray:
-    """Draws the position in which the avatar begins, `(2,)`, in m.
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
 
-    Args:
-      physics: Physics of one world.
-      random_state: Random generator of the episode.
-      otherwise: Position of an episode that begins elsewhere, and where all
-        places that were drawn are taken.
-    """
-    # Without such starts, nothing is drawn, so episodes stay the same.
-    if not self._share or random_state.uniform() >= self._share:
-      return otherwise
+  def initialize_episode(
+      self, physics: protocols.Physics, random_state: Any
+  ) -> None:
+    """Moves the avatar in some episodes, unless all tries are taken."""
+    if random_state.uniform() >= self._share:
+      return
     station = np.array(self._used[random_state.randint(len(self._used))])
     tries = station + random_state.uniform(-_BESIDE, _BESIDE, (_TRIES, 2))
     is_free = np.array(
@@ -111,11 +94,29 @@ class BesideRegisters:
       low, high = layouts.FOOTPRINT.T + other
       near = (low - _CLEARANCE < tries) & (tries < high + _CLEARANCE)
       is_free &= ~near.all(axis=1)
-    blocks = physics.bind([block.geom for block in self._blocks]).xpos[:, :2]
+    blocks = physics.bind(self._geoms).xpos[:, :2]
     gaps = np.linalg.norm(tries[:, np.newaxis] - blocks, axis=-1)
     is_free &= (gaps > _APART).all(axis=1)
     if self._layout.barrier is not None:
       y = self._layout.barrier[0][1]
       is_free &= np.abs(tries[:, 1] - y) > _CLEARANCE
       is_free &= self._layout.are_before_the_barrier(tries)
-    return tries[is_free.argmax()] if is_free.any() else otherwise
+    if is_free.any():
+      self._avatar.place(
+          physics, tries[is_free.argmax()], self._avatar.angle(physics)
+      )
+
+
+def checked_share(share: Any) -> float:
+  """Returns a share of episodes.
+
+  Raises:
+    SpecError: If it is not a number from 0 to 1.
+  """
+  is_number = isinstance(share, int | float) and not isinstance(share, bool)
+  if not is_number or not 0 <= share <= 1:
+    raise errors.SpecError(
+        f'starts_beside_registers: {share!r:.80}; allowed are numbers from 0 to'
+        ' 1'
+    )
+  return float(share)

@@ -257,6 +257,14 @@ def test_a_share_of_episodes_starts_beside_registers(variation):
   assert 0.0 < some < share
 
 
+def test_no_episode_starts_inside_the_block_of_a_scattered_register():
+  scattered = [
+      'registers.reward.place={position: [1.4, -2.2], spread: [0.5, 0.75]}'
+  ]
+  _, gaps, _ = _starts('standard', 1.0, num_episodes=400, overrides=scattered)
+  assert gaps.min() > 0.4
+
+
 def test_starts_beside_registers_are_refused_where_a_barrier_stands():
   with pytest.raises(errors.SpecError, match=r'0\.5; allowed is 0'):
     _starts('boxed', 0.5)
