@@ -162,7 +162,8 @@ def load(
     raise
   except Exception as error:  # Tasks may raise any class.
     location = messages.Location(f'task_kwargs of {domain_name}.{task_name}')
-    raise location.error(messages.exception(error)) from error
+    hint = "; the seed is 'random'" if 'seed' in kwargs else ''
+    raise location.error(f'{messages.exception(error)}{hint}') from error
   return embed(
       task,
       'none' if design is None else design,

@@ -1,6 +1,6 @@
 """Tests for the suite: every task with every design is a sound environment."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import functools
 import inspect
 from typing import Any, final
@@ -15,6 +15,7 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import collect_apples
@@ -318,6 +319,7 @@ def test_a_registered_task_is_loadable_by_name():
 
 
 _LOAD = functools.partial(suite.load, 'collect_apples', 'standard')
+_load_batch = functools.partial(suite.load_batch, num_envs=2)
 
 
 @pytest.mark.parametrize(
@@ -353,9 +355,36 @@ def test_an_unknown_task_is_refused_with_the_known_ones(domain: str, task: str):
   with pytest.raises(errors.UnknownNameError) as caught:
     suite.load(domain, task)
   text = str(caught.value)
-  assert text.startswith(f'task {domain}.{task} is unknown; known are')
+  assert text.startswith(f'task {domain}.{task} is unknown; ')
+  assert 'known once its module is imported (--import' in text
   for known in suite.ALL_TASKS:
     assert '.'.join(known) in text
+
+
+@pytest.mark.parametrize(
+    ('load', 'meant'),
+    [
+        (lambda: suite.load('unlok_door', 'near'), 'unlock_door.near'),
+        (lambda: suite.load('unlock_door', 'nere'), 'unlock_door.near'),
+        (
+            lambda: _LOAD(design='instantaneous_rewards'),
+            'instantaneous_reward',
+        ),
+        (lambda: experiment_specs.load('quik'), 'quick'),
+    ],
+)
+def test_a_misspelt_name_is_answered_with_the_nearest_one(
+    load: Callable[[], Any], meant: str
+):
+  with pytest.raises(errors.UnknownNameError) as caught:
+    load()
+  assert f'; did you mean {meant!r}?' in str(caught.value)
+
+
+@pytest.mark.parametrize('load', [suite.load, _load_batch])
+def test_a_seed_among_the_arguments_of_a_task_is_told_its_name(load: Any):
+  with pytest.raises(errors.SpecError, match="'seed'; the seed is 'random'"):
+    load('unlock_door', 'near', {'seed': 1})
 
 
 def test_the_signature_is_that_of_dm_control():

@@ -3,8 +3,9 @@
 The module does not decide what is wrong.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 import dataclasses
+import difflib
 import re
 from typing import final
 
@@ -56,6 +57,12 @@ def quote(value: object) -> str:
   except Exception:  # For instance an integer too long for Python to print.
     text = f'<{type(value).__name__}>'
   return text if len(text) <= _MAX_LENGTH else f'{text[: _MAX_LENGTH - 3]}...'
+
+
+def did_you_mean(given: object, known: Iterable[str]) -> str:
+  """Returns a hint at the known name that is most like a name, or ''."""
+  close = difflib.get_close_matches(str(given), known, n=1)
+  return f'; did you mean {close[0]!r}?' if close else ''
 
 
 def exception(error: BaseException) -> str:

@@ -4,7 +4,6 @@ The entries are registered elsewhere, beside their definitions.
 """
 
 from collections.abc import Callable, Iterator
-import difflib
 from typing import Generic, TypeVar, final
 
 from realab_suite import errors
@@ -48,8 +47,7 @@ class Registry(Generic[T]):
       UnknownNameError: If nothing is registered as `name`.
     """
     if name not in self._entries:
-      close = difflib.get_close_matches(name, self._entries, n=1)
-      hint = f'; did you mean {close[0]!r}?' if close else ''
+      hint = messages.did_you_mean(name, self._entries)
       raise errors.UnknownNameError(
           f'{self._what} {messages.quote(name)} is unknown{hint}; known are'
           f' {sorted(self)}'

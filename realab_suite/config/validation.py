@@ -6,7 +6,6 @@ The module contains the base class of specs, but no spec.
 import abc
 import bisect
 from collections.abc import Callable, Mapping, Sequence
-import difflib
 import functools
 import hashlib
 import json
@@ -200,8 +199,7 @@ def _describe_unknown_key(key: str, found: Sequence[Any]) -> str:
   ]
   allowed = [key for keys in declared for key in keys]
   text = f'unknown key {messages.quote(key)}'
-  for match in difflib.get_close_matches(key, allowed, n=1):
-    text += f"; did you mean '{match}'?"
+  text += messages.did_you_mean(key, allowed)
   if not declared:
     return text
   return f'{text} (allowed: {", ".join(allowed) or "none"})'

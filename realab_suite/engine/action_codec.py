@@ -115,8 +115,14 @@ class ActionCodec:
     values = self._cast(action)
     expected = (*batch_shape, *self._spec.shape)
     if values.shape != expected:
+      hint = (
+          '; the number of an action needs a design or an override with an'
+          ' action_set'
+          if values.shape == batch_shape and self._table is None
+          else ''
+      )
       raise errors.ActionError(
-          f'action: shape {values.shape}, expected {expected}'
+          f'action: shape {values.shape}, expected {expected}{hint}'
       )
     if not self._spec.shape:
       values = values[..., np.newaxis]

@@ -277,7 +277,7 @@ def load(experiment: Experiment) -> ExperimentSpec:
   elif isinstance(experiment, str) and not os.path.exists(experiment):
     raise errors.UnknownNameError(
         f'experiment {messages.quote(experiment)} is neither a file nor one of'
-        f' {list(EXPERIMENTS)}'
+        f' {list(EXPERIMENTS)}{messages.did_you_mean(experiment, EXPERIMENTS)}'
     )
   else:
     where = (

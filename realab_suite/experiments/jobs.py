@@ -14,6 +14,7 @@ from typing import Any, final
 
 from realab_suite import errors
 from realab_suite import suite
+from realab_suite.config import messages
 from realab_suite.config import validation
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
@@ -204,7 +205,7 @@ def plan(
   if unknown := sorted(set(only) - set(names)):
     raise errors.UnknownNameError(
         f'experiment {experiment.name!r} has no run {unknown[0]!r}; it has'
-        f' {names}'
+        f' {names}{messages.did_you_mean(unknown[0], names)}'
     )
   dynamics = suite.dynamics(*experiment.domain_and_variation)
   return [

@@ -463,7 +463,7 @@ def load(
   elif isinstance(design, str) and not os.path.exists(design):
     raise errors.UnknownNameError(
         f'design {messages.quote(design)} is neither a file nor one of'
-        f' {list(DESIGNS)}'
+        f' {list(DESIGNS)}{messages.did_you_mean(design, DESIGNS)}'
     )
   elif isinstance(design, Mapping):
     where, data = 'design', loading.read_mapping(design)

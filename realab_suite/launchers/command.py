@@ -7,12 +7,12 @@ is short for `python -m realab_suite.launchers.sweep` with the same flags.
 
 from collections.abc import Mapping
 import datetime
-import difflib
 import os
 import runpy
 import subprocess
 import sys
 
+from realab_suite.config import messages
 from realab_suite.experiments import requirements
 from realab_suite.launchers import program
 
@@ -54,10 +54,10 @@ def main() -> int:
     return 0 if arguments else program.USAGE_ERROR
   name, *rest = arguments
   if name not in COMMANDS:
-    near = difflib.get_close_matches(name, COMMANDS, 1)
-    meant = f' (did you mean {near[0]!r}?)' if near else ''
     return _refuse(
-        f'command {name!r:.80} is unknown{meant}; known are {list(COMMANDS)}'
+        f'command {name!r:.80} is'
+        f' unknown{messages.did_you_mean(name, COMMANDS)}; known are'
+        f' {list(COMMANDS)}'
     )
   if name in ('demo', 'doctor') and rest:
     return _refuse(f'{name}: arguments {rest}; allowed are none')

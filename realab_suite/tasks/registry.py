@@ -82,9 +82,11 @@ def find(domain_name: str, task_name: str) -> TaskFactory:
   are_strings = isinstance(domain_name, str) and isinstance(task_name, str)
   if not are_strings or (domain_name, task_name) not in _TASKS:
     known = [f'{domain}.{task}' for domain, task in _TASKS]
+    given = f'{_format(domain_name)}.{_format(task_name)}'
     raise errors.UnknownNameError(
-        f'task {_format(domain_name)}.{_format(task_name)} is unknown; known'
-        f' are {known}'
+        f'task {given} is unknown{messages.did_you_mean(given, known)}; known'
+        f' are {known}; a task of your own is known once its module is imported'
+        ' (--import of programs)'
     )
   return _TASKS[domain_name, task_name][0]
 

@@ -61,6 +61,7 @@ _BAD_ACTIONS: dict[str, tuple[Any, str]] = {
     'float16': (_with(3, _INF).astype(np.float16), 'action[3] (look) = inf'),
     'longdouble': (np.full(6, np.longdouble('1e4000')), '= inf outside'),
     'scalar': (0.5, 'shape (), expected (6,)'),
+    'number': (3, 'expected (6,); the number of an action needs'),
     'shape (1, 6)': (np.zeros((1, 6)), 'shape (1, 6), expected (6,)'),
     'shape (7,)': (np.zeros(7), 'shape (7,), expected (6,)'),
     'empty list': ([], 'shape (0,), expected (6,)'),

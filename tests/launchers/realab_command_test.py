@@ -84,7 +84,7 @@ def test_a_subcommand_runs_its_launcher_with_its_flags(realab):
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        (['repot'], "command 'repot' is unknown (did you mean 'report'?); "),
+        (['repot'], "command 'repot' is unknown; did you mean 'report'?; "),
         (['--experiment=quick'], "command '--experiment=quick' is unknown; kn"),
         (['demo', '--seed=1'], "demo: arguments ['--seed=1']; allowed are no"),
     ],

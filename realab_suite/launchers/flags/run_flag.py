@@ -7,6 +7,7 @@ from typing import TypeVar
 from absl import flags
 
 from realab_suite import errors
+from realab_suite.config import messages
 
 _Run = TypeVar('_Run')
 
@@ -32,5 +33,6 @@ def find(name: str, runs: Mapping[str, _Run], folder: pathlib.Path) -> _Run:
   if name not in runs:
     raise errors.UnknownNameError(
         f'--run={name:.80}: not a run of {folder}; allowed are {list(runs)}'
+        f'{messages.did_you_mean(name, runs)}'
     )
   return runs[name]
