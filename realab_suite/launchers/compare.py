@@ -60,11 +60,12 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.experiments import scripted
 
   imports_flag.load()
-  world = worlds.World(world_flags.DOMAIN.value, world_flags.TASK.value)
+  domain, task = world_flags.world()
+  world = worlds.World(domain, task)
   policies = scripted_flags.POLICIES.value
   settings = scripted.Settings(
-      domain=world_flags.DOMAIN.value,
-      task=world_flags.TASK.value,
+      domain=domain,
+      task=task,
       design=world_flags.DESIGN.value,
       overrides=tuple(world_flags.SET.value),
       policies=world.scripted if policies is None else tuple(policies),
@@ -87,6 +88,10 @@ def main(argv: Sequence[str]) -> None:
     from realab_suite.reports import films
 
     film = films.all_views
+    program.say(
+        'The first episode of each policy is filmed, which takes minutes'
+        ' without a graphics card; --novideos skips the films'
+    )
   scripted.run(settings, program.say, scripted.Pictures(draw, film))
 
 

@@ -19,11 +19,13 @@ from realab_suite import errors
 from realab_suite.experiments import requirements
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
+from realab_suite.launchers.flags import imports_flag
 from realab_suite.launchers.flags import policy_flag
 from realab_suite.launchers.flags import seed_flag
 from realab_suite.launchers.flags import video_flag
 from realab_suite.launchers.flags import world_flags
 
+flags.adopt_module_key_flags(imports_flag)
 flags.adopt_module_key_flags(policy_flag)
 flags.adopt_module_key_flags(seed_flag)
 flags.adopt_module_key_flags(video_flag)
@@ -91,6 +93,7 @@ def _loaded() -> Iterator[tuple[Any, Any]]:
   from realab_suite import suite
   from realab_suite.audit import aiming
 
+  imports_flag.load()
   env = suite.load(
       *world_flags.world(),
       task_kwargs={

@@ -269,9 +269,34 @@ def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
   monkeypatch.setattr('dm_control.viewer', viewer, raising=False)
   monkeypatch.setenv('DISPLAY', ':0')
   with flagsaver.flagsaver():
-    flags.FLAGS(['explore', '--policy=random', '--task=far'])
+    flags.FLAGS(['explore', '--policy=random', '--task=unlock_door.far'])
     explore.main(['explore'])
   assert lengths == [5, 5]
+
+
+def test_exploring_imports_modules_first(monkeypatch):
+  viewer = types.SimpleNamespace(launch=None)
+  monkeypatch.setitem(sys.modules, 'dm_control.viewer', viewer)
+  monkeypatch.setattr('dm_control.viewer', viewer, raising=False)
+  monkeypatch.setenv('DISPLAY', ':0')
+  complaint = in_process.complaint(explore, '--import=no_such_module')
+  assert '--import=no_such_module: No module named' in complaint
+
+
+def test_a_task_of_a_comparison_may_have_its_domain(monkeypatch, tmp_path):
+  given = []
+  monkeypatch.setattr(scripted, 'run', lambda one, *unused: given.append(one))
+  in_process.run(
+      compare, '--task=collect_apples.near', '--novideos', '--noplots',
+      f'--output={tmp_path}',
+  )  # fmt: skip
+  [settings] = given
+  assert (settings.domain, settings.task) == ('collect_apples', 'near')
+  complaint = in_process.complaint(
+      compare, '--task=collect_apples.near', '--domain=unlock_door',
+      '--novideos', '--noplots', f'--output={tmp_path}',
+  )  # fmt: skip
+  assert 'is not a task of --domain=unlock_door' in complaint
 
 
 def test_a_renderer_that_does_not_work_is_refused_in_one_line(monkeypatch):

@@ -8,10 +8,13 @@ from realab_suite import errors
 from realab_suite.config import loading
 
 DOMAIN = flags.DEFINE_string(
-    'domain', 'unlock_door', 'Domain: unlock_door or collect_apples.'
+    'domain', 'unlock_door', 'Domain, such as unlock_door or collect_apples.'
 )
 TASK = flags.DEFINE_string(
-    'task', 'standard', 'Task of the domain: standard, near, far or boxed.'
+    'task',
+    'standard',
+    'Task of the domain: standard, near, far or boxed; or with its domain, such'
+    ' as unlock_door.near.',
 )
 DESIGN = flags.DEFINE_string(
     'design',
@@ -68,12 +71,16 @@ def task_kwargs() -> dict[str, Any]:
 
 
 def world() -> tuple[str, str]:
-  """Returns the names of the domain and the task."""
+  """Returns the names of the domain and the task.
+
+  Raises:
+    SpecError: If the flags name two domains.
+  """
   domain, dot, task = TASK.value.rpartition('.')
   if not dot:
     return DOMAIN.value, task
   if DOMAIN.present and DOMAIN.value != domain:
     raise errors.SpecError(
-        f'--task={TASK.value} is not a task of' f' --domain={DOMAIN.value}'
+        f'--task={TASK.value} is not a task of --domain={DOMAIN.value}'
     )
   return domain, task
