@@ -180,7 +180,7 @@ def parse_rounds(
     description: str | None, arguments: Sequence[str] | None, default: int
 ) -> int:
   """Returns the number of rounds from the command line."""
-  parser = argparse.ArgumentParser(description=description)
+  parser = argparse.ArgumentParser(description=description, allow_abbrev=False)
   parser.add_argument(
       '--rounds', type=int, default=default, help='number of rounds'
   )

@@ -181,7 +181,7 @@ def _learn(
 
 def main(arguments: Sequence[str] | None = None) -> None:
   """Trains an agent, and shows what it never observes."""
-  parser = argparse.ArgumentParser(description=__doc__)
+  parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
   parser.add_argument('--steps', type=int, default=300_000)
   parser.add_argument('--num_envs', type=int, default=64)
   parser.add_argument('--seed', type=int, default=0)

@@ -6,11 +6,14 @@
 The agent gets readings only, and is judged on the return of the register that
 paid it. After training, the report in the output folder shows its true return,
 its hack rate beside that of the solver, and a label for each seed of training.
-This needs the extra `sb3`.
+The report names each seed by that of its evaluation: 10000 is the policy of
+training seed 0. The folder `<output>_models` contains the models. This needs
+the extra `sb3`.
 """
 
 import argparse
 from collections.abc import Callable, Sequence
+import pathlib
 from typing import Any
 
 import gymnasium as gym
@@ -51,9 +54,13 @@ _ALGORITHMS = {
 
 
 def train(
-    algorithm: str, seed: int, steps: int, num_envs: int
+    algorithm: str, seed: int, steps: int, num_envs: int, folder: pathlib.Path
 ) -> Callable[[Any], Any]:
-  """Returns a trained policy: a function from an observation to an action."""
+  """Returns a trained policy: a function from an observation to an action.
+
+  The model, and the means of the observations that it was trained with, are
+  saved in a folder.
+  """
   envs = gym.make_vec(
       _WORLD,
       num_envs=num_envs,
@@ -70,6 +77,9 @@ def train(
       'MlpPolicy', normalized, seed=seed, device='cpu', verbose=1, **settings
   )
   model.learn(steps)
+  folder.mkdir(parents=True, exist_ok=True)
+  model.save(folder / f'{algorithm}_{seed}.zip')
+  normalized.save(str(folder / f'{algorithm}_{seed}_normalization.pkl'))
   normalized.close()
 
   def policy(observation: np.ndarray) -> Any:
@@ -81,7 +91,7 @@ def train(
 
 def main(arguments: Sequence[str] | None = None) -> None:
   """Trains one policy per seed, and writes the report on all of them."""
-  parser = argparse.ArgumentParser(description=__doc__)
+  parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
   parser.add_argument('--algorithm', choices=_ALGORITHMS, default='ppo')
   parser.add_argument('--steps', type=int, default=400_000)
   parser.add_argument('--num_envs', type=int, default=64)
@@ -89,8 +99,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
   parser.add_argument('--episodes', type=int, default=20)
   parser.add_argument('--output', required=True)
   given = parser.parse_args(arguments)
+  models = pathlib.Path(f'{given.output}_models')
   trained = [
-      train(given.algorithm, seed, given.steps, given.num_envs)
+      train(given.algorithm, seed, given.steps, given.num_envs, models)
       for seed in range(given.seeds)
   ]
   report = gymnasium_report.write(

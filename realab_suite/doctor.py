@@ -160,7 +160,8 @@ def _core() -> Finding:
       'core',
       False,
       f'cannot step a world: {problem}',
-      'python -m pip install --force-reinstall realab-suite',
+      'python -m pip install --force-reinstall -e . -c constraints.txt, in the'
+      ' clone',
       is_core=True,
   )
 

@@ -14,6 +14,6 @@ def missing(*modules: str, extra: str = 'report') -> str | None:
   if not absent:
     return None
   return (
-      f'{", ".join(absent)} not installed; run: python -m pip install'
-      f' "realab-suite[{extra}]"'
+      f'{", ".join(absent)} not installed; run: python -m pip install -e'
+      f" '.[{extra}]' -c constraints.txt, in the clone"
   )

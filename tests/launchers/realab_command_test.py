@@ -145,8 +145,8 @@ def test_a_demo_without_its_extras_is_refused_at_once(
   monkeypatch.delattr(subprocess, 'run')
   assert realab('demo')[0] == 2
   assert capsys.readouterr().err == (
-      'error: demo: optax not installed; run: python -m pip install'
-      ' "realab-suite[agents,report]"\n'
+      'error: demo: optax not installed; run: python -m pip install -e'
+      " '.[agents,report]' -c constraints.txt, in the clone\n"
   )
 
 
@@ -204,7 +204,8 @@ def test_a_bad_installation(monkeypatch, capsys):
   assert '--  rendering  no camera works: egl: ImportError' in shown
   assert 'apt install libegl1' in shown
   assert '--  tb         no_such_module not installed, for curves\n' in shown
-  assert 'to repair: python -m pip install "realab-suite[tb]"\n' in shown
+  repair = "python -m pip install -e '.[tb]' -c constraints.txt, in the clone"
+  assert f'to repair: {repair}\n' in shown
 
 
 def test_missing_extras_and_cameras_are_no_failure(monkeypatch, capsys):
