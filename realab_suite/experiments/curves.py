@@ -1,13 +1,20 @@
 """Learning curves: means over the training episodes of each interval."""
 
+import bisect
+import collections
 from collections.abc import Iterable, Mapping, Sequence
+import json
 import math
+import operator
 import pathlib
 from typing import Any, Protocol, final
 
 from realab_suite import errors
 from realab_suite.evaluation import monitors
 from realab_suite.experiments import requirements
+
+# Gains below this share of the values are rounding errors.
+_ROUNDING = 1e-6
 
 
 def point(
@@ -75,6 +82,49 @@ def record(step: int, episode: monitors.Episode) -> dict[str, Any]:
       'is_ended_by_tampering': figures.is_ended_by_tampering,
       'own': {name: one.own for name, one in figures.registers.items()},
   }
+
+
+def condensed(
+    records: Iterable[Mapping[str, Any]], points: Iterable[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+  """Returns the part of training episodes that reports need.
+
+  Args:
+    records: Records of episodes; see `record`.
+    points: Points of the learning curve; see `point`.
+
+  Returns:
+    A record for all equal episodes of a point, with their number. Each has the
+    step of the point, and of the objective the gains, to three digits. Gains
+    that are rounding errors are 0.
+  """
+  steps = [one['step'] for one in points]
+  numbers: collections.Counter[str] = collections.Counter()
+  for one in records:
+    objective = {
+        name: [_rounded_gain(*values), 0.0]
+        for name, values in one['objective'].items()
+    }
+    condensed_record = {
+        'step': steps[bisect.bisect_left(steps, one['step'])],
+        'objective': objective,
+        'is_ended_by_tampering': one['is_ended_by_tampering'],
+    }
+    numbers[json.dumps(condensed_record)] += 1
+  found = [
+      {**json.loads(text), 'num_episodes': number}
+      for text, number in sorted(numbers.items())
+  ]
+  return sorted(found, key=operator.itemgetter('step'))
+
+
+def _rounded_gain(observed: float | None, clean: float | None) -> float | None:
+  if observed is None or clean is None:
+    return None
+  gain = observed - clean
+  if abs(gain) <= _ROUNDING * max(abs(observed), abs(clean)):
+    return 0.0
+  return float(f'{gain:.3g}')
 
 
 class Board(Protocol):

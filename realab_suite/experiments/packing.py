@@ -21,9 +21,11 @@ import zipfile
 
 from realab_suite import errors
 from realab_suite.config import loading
+from realab_suite.experiments import curves
 from realab_suite.experiments import jobs
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
+from realab_suite.experiments import training
 
 MANIFEST: Final = 'manifest.json'
 _SCHEMA = 1
@@ -56,7 +58,8 @@ def pack(
 ) -> Counts:
   """Writes the finished jobs of a sweep into a file, and replaces the file.
 
-  Checkpoints, logs and times are left out, and by default trained learners.
+  Checkpoints, logs and times are left out, and by default trained learners. Of
+  training episodes, the file has the part that reports need.
 
   Args:
     folder: Folder of the sweep, which may still be running.
@@ -75,24 +78,41 @@ def pack(
     raise errors.ResultsError(f'{folder}: no job has finished yet')
   names = [scheduler.SWEEP, scheduler.EXPERIMENT]
   names += [name for name in audits if (folder / name).exists()]
-  left_out = {}
+  files, left_out = {}, {}
   for job in finished:
     done = storage.read_done(folder / job / storage.DONE)
     for name in {storage.CONFIG, storage.DONE, *done}:
-      if name == storage.LEARNER and not learners:
+      if name == storage.TRAINING_EPISODES or (
+          name == storage.LEARNER and not learners
+      ):
         left_out[f'{job}/{name}'] = done[name]
       else:
         storage.result_path(folder / job, name)
         names.append(f'{job}/{name}')
-  files = {}
+    if storage.TRAINING_EPISODES in done:
+      files[f'{job}/{training.TRAINING_GAINS}'] = _gains(folder / job)
   for name in sorted(names):
     with storage.explained(folder / name):
       files[name] = (folder / name).read_bytes()
   _refuse_size(folder, map(len, files.values()))
   with storage.explained(output.parent):
     output.parent.mkdir(parents=True, exist_ok=True)
+  files = dict(sorted(files.items()))
   storage.write_whole(output, _zipped(files, left_out))
   return Counts(len(finished), len(planned) - len(finished))
+
+
+def _gains(path: pathlib.Path) -> bytes:
+  """Returns the training episodes of a job as reports need them."""
+  with storage.explained(path):
+    if (path / training.TRAINING_GAINS).exists():  # From a packed sweep.
+      return (path / training.TRAINING_GAINS).read_bytes()
+    episodes, curve = (
+        [json.loads(line) for line in (path / name).read_text().splitlines()]
+        for name in (storage.TRAINING_EPISODES, training.CURVE)
+    )
+  lines = [json.dumps(one) for one in curves.condensed(episodes, curve)]
+  return ''.join(f'{line}\n' for line in lines).encode()
 
 
 def _zipped(files: Mapping[str, bytes], left_out: Mapping[str, str]) -> bytes:
@@ -166,10 +186,13 @@ def _stage(
   planned, _ = _read_sweep(folder)
   found = [name for name in planned if (folder / name).is_dir()]
   for job in found:
-    if digest := left_out.get(f'{job}/{storage.LEARNER}'):
-      storage.write_sealed(
-          folder / job / storage.LEFT_OUT, {'files': {storage.LEARNER: digest}}
-      )
+    missing = {
+        name: left_out[f'{job}/{name}']
+        for name in sorted(storage.LEAVABLE)
+        if f'{job}/{name}' in left_out
+    }
+    if missing:
+      storage.write_sealed(folder / job / storage.LEFT_OUT, {'files': missing})
     if not jobs.is_done(folder / job):
       raise errors.ResultsError(f'{folder / job / storage.DONE}: missing')
   return found

@@ -19,6 +19,9 @@ CONFIG = 'config.json'
 DONE = 'done.json'
 LEFT_OUT = 'left_out.json'
 LEARNER = 'learner.bin'
+TRAINING_EPISODES = 'training_episodes.jsonl'
+# Results that packed sweeps may leave out.
+LEAVABLE = frozenset({LEARNER, TRAINING_EPISODES})
 _LOCK = 'lock'
 _CHECKPOINTS = 'checkpoints'
 _SUFFIX = '.ckpt'
@@ -233,16 +236,17 @@ def left_out(path: pathlib.Path) -> dict[str, str]:
   """Returns the SHA-256 of each result that a packed sweep left out.
 
   Raises:
-    ResultsError: If the list is damaged or has a result other than the learner.
+    ResultsError: If the list is damaged or names results that are never left
+      out.
   """
   if not os.path.lexists(path / LEFT_OUT):
     return {}
   advice = f'remove {path} to run it again'
   files = read_sealed(path / LEFT_OUT, advice).get('files')
-  if not isinstance(files, dict) or list(files) != [LEARNER]:
+  if not isinstance(files, dict) or not files or files.keys() - LEAVABLE:
     raise errors.ResultsError(
-        f'{path / LEFT_OUT}: files is {files!r:.80}; allowed is {LEARNER};'
-        f' {advice}'
+        f'{path / LEFT_OUT}: files is {files!r:.80}; allowed are'
+        f' {", ".join(sorted(LEAVABLE))}; {advice}'
     )
   return files
 

@@ -42,7 +42,9 @@ from realab_suite.experiments import storage
 EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
 TIMING = 'timing.jsonl'
-TRAINING_EPISODES = 'training_episodes.jsonl'
+TRAINING_EPISODES = storage.TRAINING_EPISODES
+# In packed sweeps, instead of TRAINING_EPISODES.
+TRAINING_GAINS = 'training_gains.jsonl'
 LEARNER = storage.LEARNER
 TRACE = 'trace.bin'
 TRANSPLANT = 'transplant.jsonl'

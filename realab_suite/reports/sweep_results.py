@@ -167,8 +167,24 @@ class Run:
     }
 
   def training_episodes(self) -> dict[int, list[dict[str, Any]]]:
-    """Returns the record of each training episode, by seed."""
-    return self._lines(training.TRAINING_EPISODES, _EPISODE_KEYS)
+    """Returns the record of each training episode, by seed.
+
+    In a packed sweep, equal episodes between two points of the curve have one
+    record with their number.
+    """
+    if self.is_scripted:
+      return {}
+    found = {}
+    for seed, path in self.folders.items():
+      name = training.TRAINING_EPISODES
+      if not (path / name).exists() and name in storage.left_out(path):
+        name = training.TRAINING_GAINS
+      found[seed] = [
+          record
+          for record in read_lines(path / name, _EPISODE_KEYS)
+          for _ in range(record.get('num_episodes', 1))
+      ]
+    return found
 
   @functools.cached_property
   def traces(self) -> dict[int, dict[str, Any]]:

@@ -11,6 +11,7 @@ import zipfile
 import pytest
 
 from realab_suite import errors
+from realab_suite.experiments import curves
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import packing
@@ -87,13 +88,15 @@ def test_an_unpacked_sweep_has_the_verified_files_and_no_others(
   output = tmp_path / 'new' / 'sweep'
   assert packing.unpack(packed, output) == (3, 0)
   there, before = _files(output), _files(built)
-  added = {name for name in there if name.endswith(storage.LEFT_OUT)}
-  assert len(added) == 2  # One for each finished learner.
+  new = (storage.LEFT_OUT, training.TRAINING_GAINS)
+  added = {name for name in there if name.endswith(new)}
+  assert len(added) == 4  # Two for each finished learner.
   expected = {
       name
       for name in before
       if not name.startswith((scheduler.LOGS, _job(*_UNFINISHED).folder()))
-      and pathlib.Path(name).name not in (training.LEARNER, training.TIMING)
+      and pathlib.Path(name).name
+      not in (training.LEARNER, training.TIMING, training.TRAINING_EPISODES)
   }
   assert there.keys() - added == expected
   assert all(there[name] == before[name] for name in expected)
@@ -157,7 +160,7 @@ def test_a_missing_learner_is_refused_except_if_it_was_left_out(
   assert jobs.is_done(folder)
   learner.unlink()
   (folder / storage.LEFT_OUT).unlink()
-  with pytest.raises(errors.ResultsError, match=r'learner\.bin: No such file'):
+  with pytest.raises(errors.ResultsError, match=r'jsonl: No such file'):
     jobs.is_done(folder)
 
 
@@ -167,8 +170,32 @@ def test_a_missing_learner_is_refused_except_if_it_was_left_out(
 def test_nothing_but_the_learner_can_be_left_out(tmp_path, files):
   storage.write_done(tmp_path, {'files': {}})
   storage.write_sealed(tmp_path / storage.LEFT_OUT, {'files': files})
-  with pytest.raises(errors.ResultsError, match=r'allowed is learner\.bin'):
+  with pytest.raises(
+      errors.ResultsError, match=r'allowed are learner\.bin, training_ep'
+  ):
     storage.is_done(tmp_path)
+
+
+def test_equal_training_episodes_are_counted():
+  def record(step, *values, is_ended=False):
+    return {
+        'step': step, 'objective': {'return': list(values)},
+        'is_ended_by_tampering': is_ended, 'true_return': 0.1 * step,
+    }  # fmt: skip
+
+  records = [
+      record(1, 10.0, 10.0 + 1e-12), record(5, 3.0, 3.0), record(9, None, 1.0),
+      record(10, 15.12345, 10.0), record(11, 15.12399, 10.0),
+      record(12, -3.0, -3.0, is_ended=True), record(20, 15.12345, 10.0),
+  ]  # fmt: skip
+  found = curves.condensed(records, [{'step': 10}, {'step': 20}])
+  assert [tuple(one.values()) for one in found] == [
+      (10, {'return': [0.0, 0.0]}, False, 2),
+      (10, {'return': [5.12, 0.0]}, False, 1),
+      (10, {'return': [None, 0.0]}, False, 1),
+      (20, {'return': [0.0, 0.0]}, True, 1),
+      (20, {'return': [5.12, 0.0]}, False, 2),
+  ]
 
 
 def test_learners_are_packed_on_request(built, tmp_path):
@@ -176,7 +203,7 @@ def test_learners_are_packed_on_request(built, tmp_path):
   packing.unpack(tmp_path / 'all.zip', tmp_path / 'sweep')
   folder = tmp_path / 'sweep' / _job('reward', 0).folder()
   assert (folder / training.LEARNER).exists()
-  assert not (folder / storage.LEFT_OUT).exists()
+  assert set(storage.left_out(folder)) == {training.TRAINING_EPISODES}
 
 
 def test_only_missing_jobs_are_added_to_a_folder(built, packed, tmp_path):
@@ -258,7 +285,11 @@ def _forged(packed: pathlib.Path, path: pathlib.Path, how: str) -> None:
   elif how == 'no digests':
     manifest['files'] = [1]
   elif how == 'no learner':
-    manifest['left_out'] = {}
+    manifest['left_out'] = {
+        name: digest
+        for name, digest in manifest['left_out'].items()
+        if not name.endswith(training.LEARNER)
+    }
   elif how != 'no manifest':
     members[info] = b''
   with zipfile.ZipFile(path, 'w') as target:
