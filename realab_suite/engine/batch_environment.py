@@ -70,7 +70,6 @@ class BatchEnvironment:
     self._num_envs = num_envs
     self._sleep = sleep
     self._entities = hooks.with_start(self._task)
-    self._start_check = single.start_check
     self._host = hosts.WorldHost(self._task, self._task, None, (num_envs,))
     self._observer = observing.Observer(
         self._host, self._mechanism, single.max_steps, single.senses
@@ -461,7 +460,7 @@ class BatchEnvironment:
     self._task.initialize_episode(view, self._random_state)
     for entity in self._entities:
       entity.initialize_episode(view, self._random_state)
-    self._start_check(view)
+    self._single.check_start(view)
 
   def _observe(self) -> list[Any]:
     """Updates the observation and returns the reads of registers for it."""

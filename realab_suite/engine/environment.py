@@ -173,11 +173,6 @@ class Environment(composer.Environment):
       )
     return self._physics
 
-  @property
-  def start_check(self) -> starts.StartCheck | None:
-    """Check of the start of an episode; `None` for a foreign task."""
-    return self._start_check
-
   def add_extra_hook(self, hook_name: str, hook_callable: Any) -> None:
     """Adds a hook, as in `composer.Environment`.
 
@@ -303,6 +298,20 @@ class Environment(composer.Environment):
       sink.set_state(states[0])
     (self._episode_is_open,) = saved.is_open
     (self._reset_next_step,) = saved.is_pending
+
+  def check_start(self, physics: Any) -> None:
+    """Checks an episode that has just been initialized.
+
+    Args:
+      physics: Physics of this world, or of a world of a batch.
+
+    Raises:
+      EpisodeInitializationError: If something is inside a register.
+    """
+    if self._start_check is not None:
+      self._start_check(physics)
+    else:
+      foreign.check_start(physics, self._mechanism)
 
   def snapshot_header(self, model: Any = None) -> dict[str, Any]:
     """Returns the header that a snapshot needs to fit this environment.
@@ -481,10 +490,8 @@ class Environment(composer.Environment):
       self._recompile_physics_and_update_observables()
     with foreign.initializing(self._physics, self._task, self._mechanism):
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
-    if self._start_check is not None:
-      self._start_check(self._physics)
-    else:
-      foreign.check_start(self._physics, self._mechanism)
+    self.check_start(self._physics)
+    if not self._is_ours:
       self._observation_updater.reset(self._physics_proxy, self._random_state)
 
   def _make_observation_updater(self) -> Any:

@@ -71,12 +71,15 @@ class Region(NamedTuple):
   spread: np.ndarray
 
   @property
-  def centres(self) -> Solid:
-    """All positions of the centre of the block."""
+  def middle(self) -> np.ndarray:
+    """Middle of the positions of the centre of the block, `(3,)`, in m."""
+    return self.origin + self.matrix @ (self.path.first + self.path.last) / 2
+
+  @property
+  def half(self) -> np.ndarray:
+    """Half the widths of the box of these positions, `(3,)`, in m."""
     path = self.path
-    half = np.abs(path.last - path.first) / 2 + self.spread + path.slack
-    middle = self.origin + self.matrix @ (path.first + path.last) / 2
-    return Solid(self.geom, middle, self.matrix, half)
+    return np.abs(path.last - path.first) / 2 + self.spread + path.slack
 
   def moved(self, displacement: np.ndarray) -> Self:
     """Returns the region moved by a vector in its frame, `(3,)`, in m."""
@@ -89,24 +92,23 @@ class Region(NamedTuple):
     The first one is exact for a block that does not turn, and the second one
     for a block that makes a quarter turn.
     """
-    centres = self.centres
     size = np.full(3, self.half_size)
     first, last = self.path.headings
     size[:2] = _half_width(self.half_size, first, last)
-    hulls = [centres._replace(half=centres.half + size)]
-    if first != last:
-      size[:2] = _THIN
-      radius = np.sqrt(2.0) * self.half_size
-      upright = centres.half + size
-      hulls.append(centres._replace(half=upright, margin=radius))
-    return hulls
+    box = Solid(self.geom, self.middle, self.matrix, self.half + size)
+    if first == last:
+      return [box]
+    size[:2] = _THIN
+    rounded = box._replace(
+        half=self.half + size, margin=np.sqrt(2.0) * self.half_size
+    )
+    return [box, rounded]
 
   def corners(self) -> np.ndarray:
     """Returns the extreme positions of the centre, `(corners, 3)`, in m."""
-    centres = self.centres
     signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
-    half = centres.half - [0.0, 0.0, self.path.slack]
-    return centres.centre + (signs * half) @ self.matrix.T
+    half = self.half - [0.0, 0.0, self.path.slack]
+    return self.middle + (signs * half) @ self.matrix.T
 
   def poses_near(self, point: np.ndarray) -> list[tuple[float, Solid]]:
     """Returns poses of the block near a point of the world, `(3,)`, in m.

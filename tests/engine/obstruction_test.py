@@ -268,12 +268,15 @@ def test_a_shut_door_obstructs_and_an_open_one_does_not():
       np.testing.assert_array_equal(found[-3:], 0.0)
 
 
+@pytest.mark.parametrize('yaw', [0.0, np.pi / 4])
 @pytest.mark.parametrize('turn', [0.0, 0.6, np.pi / 2])
-def test_a_block_is_put_beside_a_wall_that_was_moved(turn):
+def test_a_block_is_put_beside_a_wall_that_was_moved(turn, yaw):
   task = collect_apples.CollectApples()
   wall = moving.MovingPart('wall', [{'type': 'box', 'size': (0.5, 0.2, 0.5)}])
   wall.attach_to(task.root_entity, (0.0, 0.0, -3.0))
-  design = {**_DIAGONAL, 'providers': []}
+  place = {'position': [-3.0, -3.0], 'yaw': yaw}
+  reward = _DIAGONAL['registers']['reward'] | {'place': place, 'range': [0, 60]}
+  design = {**_DIAGONAL, 'registers': {'reward': reward}, 'providers': []}
   env = suite.embed(task, design, random=0)
   env.reset()
   (register,) = env.mechanism.registers.values()
@@ -284,8 +287,9 @@ def test_a_block_is_put_beside_a_wall_that_was_moved(turn):
     place = np.array([along - 2.0, aside, 0.1])
     block.put(env.physics, place)
     # The middle of the wall, in the world.
-    middle = np.array([along - aside, along + aside]) / np.sqrt(2) - 3.0
-    for height, is_in_the_way in ((0.5, True), (3.0, False), (-3.0, False)):
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    middle = np.array([[cos, -sin], [sin, cos]]) @ [along, aside] - 3.0
+    for height, is_in_the_way in ((-3.0, False), (0.5, True), (3.0, False)):
       quaternion = [np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]
       moving.move(env.physics, wall.frame, [*middle, height], quaternion)
       register.write(env.physics, along / 0.1)

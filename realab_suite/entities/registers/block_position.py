@@ -51,7 +51,9 @@ class BlockPositionRegister(base.Register):
     return ((1.0, 0.0),)
 
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
-    first, last = (self._position(physics, v) for v in self.value_range)
+    first, last = (
+        self._position(physics, np.float64(value)) for value in self.value_range
+    )
     return [footprints.Path(0, first, last, self.value_range)]
 
   def displacements(self, physics: protocols.Physics) -> np.ndarray:

@@ -76,7 +76,10 @@ class TwoBlockRegister(base.Register):
 
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
     base_position = np.array(self._origin(physics))
-    first, last = (self._offset_position(physics, v) for v in self.value_range)
+    first, last = (
+        self._offset_position(physics, np.float64(value))
+        for value in self.value_range
+    )
     return [
         footprints.Path(0, base_position, base_position, self.value_range),
         footprints.Path(1, first, last, self.value_range),
