@@ -124,7 +124,7 @@ class Region(NamedTuple):
       along = [float(np.clip(local @ line / square, 0.0, 1.0))]
     else:
       is_turned = path.headings[0] != path.headings[1]
-      along = np.linspace(0.0, 1.0, _NUM_TURNS).tolist() if is_turned else [0.5]
+      along = np.linspace(0.0, 1.0, _NUM_TURNS).tolist() if is_turned else [0.0]
     found = []
     for share in along:
       beside = np.clip(local - share * line, -self.spread, self.spread)

@@ -218,7 +218,7 @@ def test_a_missing_distance_of_mujoco_is_found_otherwise(monkeypatch):
   monkeypatch.setattr(mujoco, 'mj_geomDistance', lambda *args: 0.0)
   point = space.meet(_region().hulls, wall)
   text = space.describe('r', _region(), point, wall[0])
-  assert text == "register 'r' at value 1 would be at (0, 0), inside 'geom 2'"
+  assert text == "register 'r' at value -3 would be at (0, 0), inside 'geom 2'"
 
 
 @pytest.mark.parametrize('geom', range(1, 7))

@@ -52,7 +52,7 @@ class BlockPositionRegister(base.Register):
 
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
     first, last = (
-        self._position(physics, np.float64(value)) for value in self.value_range
+        self._position(physics, np.array(value)) for value in self.value_range
     )
     return [footprints.Path(0, first, last, self.value_range)]
 

@@ -77,7 +77,7 @@ class TwoBlockRegister(base.Register):
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
     base_position = np.array(self._origin(physics))
     first, last = (
-        self._offset_position(physics, np.float64(value))
+        self._offset_position(physics, np.array(value))
         for value in self.value_range
     )
     return [
