@@ -13,6 +13,7 @@ import jinja2
 import numpy as np
 import yaml
 
+from realab_suite import errors
 from realab_suite.experiments import result_tables
 from realab_suite.experiments import storage
 from realab_suite.reports import caveats
@@ -51,9 +52,10 @@ def write(
 
   Raises:
     ResultsError: If the folder does not contain a sweep, a file in it is
-      damaged, or the output cannot be written.
+      damaged, a design or world is unknown, or the output cannot be written.
   """
   sweep = sweep_results.load(folder)
+  _check_modules(sweep)
   figures = numbers.compute(sweep, say)
   top = headline.headline(sweep, figures)
   overview = tables.overview(sweep, figures)
@@ -78,6 +80,24 @@ def write(
   for line in words:
     say(line)
   return output / PAGE
+
+
+def _check_modules(sweep: sweep_results.Sweep) -> None:
+  """Loads what the runs name, before any work.
+
+  Raises:
+    ResultsError: If a name is unknown, for example because its module was not
+      imported.
+  """
+  for run in sweep.learned():
+    if run.is_done:
+      try:
+        _ = run.design, run.world.solver
+      except errors.SpecError as error:
+        raise errors.ResultsError(
+            f'{sweep.folder}: run {run.name}: {error}; import modules of your'
+            ' own with --import'
+        ) from error
 
 
 def _words(top: Sequence[headline.Entry]) -> list[str]:

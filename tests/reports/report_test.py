@@ -10,6 +10,8 @@ import sys
 import pytest
 
 from realab_suite import errors
+from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
@@ -200,6 +202,23 @@ def test_a_report_on_calibration_seeds_says_so(tmp_path):
   text = pages.text(pages.write(folder, tmp_path / 'out'))
   assert 'calibration seeds, which were used to choose settings' in text
   assert 'With one seed, intervals are over its episodes' in text
+
+
+def test_a_world_that_is_not_imported_is_named_before_any_work(
+    folder, tmp_path, monkeypatch
+):
+  def load(*unused, **unused_too):
+    raise errors.UnknownNameError('task mine.own is unknown')
+
+  worlds._traits.cache_clear()
+  monkeypatch.setattr(suite, 'load', load)
+  said = []
+  with pytest.raises(
+      errors.ResultsError, match=r'mine\.own is unknown; import .* --import'
+  ):
+    html_page.write(folder, tmp_path, said.append)
+  assert not said
+  assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_without_a_sweep_is_refused(tmp_path):
