@@ -347,8 +347,7 @@ MUTANTS = [
     ),
     planting.Mutant(
         'statistics', 'intervals leave the possible range', _INTERVALS,
-        '  if high is None:\n    if low is None:\n',
-        '  if True:\n    if True:\n', _INT,
+        'max(low, least)', 'low', _INT,
     ),
     planting.Mutant(
         'statistics', 'intervals ignore skewness', _INTERVALS,

@@ -3,7 +3,7 @@
 A seed is the unit of evidence: episodes of one trained agent resemble each
 other, so a hundred episodes of one seed are one observation of the design. All
 functions work on one mean per seed with equal weights, and use single episodes
-only to estimate the uncertainty of that mean. Verdicts are in `statistics`.
+only to estimate the uncertainty of that mean. Verdicts are in `verdicts`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,17 +12,9 @@ import math
 from typing import final
 
 import numpy as np
+from scipy import special
 
 from realab_suite import errors
-
-# For n seeds, the side of an interval towards the longer tail exceeds Student's
-# by skewness * (0.74 / sqrt(n) + c / n). The first term is Edgeworth's
-# correction at level 0.95. The second term corrects for few seeds, which
-# understate skewness; c was chosen by measured coverage.
-_OF_MANY_SEEDS = 0.74
-_OF_FEW_SEEDS = 6.0
-# A scale that ends at a bound already corrects for some of the skewness.
-_OF_FEW_SEEDS_WITHIN_BOUNDS = 4.0
 
 # Relative distance by which rounding may move a value across a bound.
 _ROUNDING = 1e-9
@@ -101,15 +93,15 @@ def mean_interval(
 ) -> Interval:
   """Returns the mean over seeds with its confidence interval.
 
-  The interval is Student's, with two changes. It is computed on a scale that
-  ends at the bounds (square root for one bound, arcsine for two), so it stays
-  within them. Its side towards the longer tail is lengthened by the skewness of
-  the seeds, because few seeds rarely show the whole tail.
+  The interval is the skewness-corrected t interval of Hall (1992), "On the
+  removal of skewness by transformation", J. R. Stat. Soc. B 54(1): Student's
+  quantiles of a monotone cubic transformation of t. Its side towards the longer
+  tail is longer, because few seeds rarely show the whole tail. For seeds
+  without skewness, it is Student's interval. It is cut off at the bounds.
 
   The campaign `campaigns/statistics_campaign.py` measures the coverage. The
-  figures are in docs/reliability.md (C43), with those of the methods that did
-  worse: bootstrap-t, BCa, Student's on a log or logit scale, and distribution-
-  free bounds, which are several times as wide.
+  figures are in docs/reliability_figures.md (C43), with those of other
+  intervals, such as BCa and Student's on a transformed scale.
 
   Small samples are reported as follows:
 
@@ -117,7 +109,7 @@ def mean_interval(
     not cover other seeds.
   * One value: the ends are nan.
   * Equal values: both ends equal the estimate, and the text is '0 (all 5
-    seeds)' without an interval. `statistics.share_bound` bounds the share of
+    seeds)' without an interval. `hacking.largest_rate` bounds the share of
     seeds that may differ.
 
   No interval covers a kind of seed that is so rare that the sample contains
@@ -136,7 +128,7 @@ def mean_interval(
   """
   check_level('mean_interval', level)
   values = _checked_values('mean_interval', 'values', values_by_seed)
-  return interval_of(_within('mean_interval', values, bounds), bounds, level)
+  return _interval_of(_within('mean_interval', values, bounds), bounds, level)
 
 
 def paired_difference(
@@ -166,7 +158,7 @@ def paired_difference(
   check_level('paired_difference', level)
   differences = paired('paired_difference', treatment, baseline)
   values = _within('paired_difference', differences, bounds)
-  return interval_of(values, bounds, level)
+  return _interval_of(values, bounds, level)
 
 
 def percent(share: float) -> str:
@@ -299,8 +291,7 @@ def _within(
   Raises:
     ResultsError: If a value is further out of bounds.
   """
-  low = -math.inf if bounds[0] is None else bounds[0]
-  high = math.inf if bounds[1] is None else bounds[1]
+  low, high = _limits(bounds)
   if not low < high:
     raise errors.ResultsError(
         f'{where}: bounds are {bounds}; the lower must be below the upper'
@@ -316,6 +307,15 @@ def _within(
   return [np.clip(values, low, high) for values in values_by_seed.values()]
 
 
+def _limits(bounds: Bounds) -> tuple[float, float]:
+  """Returns bounds as numbers, which are infinite if there is none."""
+  low, high = bounds
+  return (
+      -math.inf if low is None else float(low),
+      math.inf if high is None else float(high),
+  )
+
+
 def mean(values: np.ndarray) -> float:
   """Returns the mean, with a result that is independent of the order."""
   found = math.fsum(values) / values.size
@@ -323,7 +323,7 @@ def mean(values: np.ndarray) -> float:
   return min(max(found, float(values.min())), float(values.max()))
 
 
-def interval_of(
+def _interval_of(
     values_of_seeds: Iterable[np.ndarray], bounds: Bounds, level: float
 ) -> Interval:
   """Returns the interval of `mean_interval`, from values already checked.
@@ -350,57 +350,21 @@ def interval_of(
   num_units = len(units)
   if num_units == 1:
     return interval(math.nan, math.nan)
-  deviation = spread(means, units)
+  deviation = _spread(means, units)
   if not deviation:
     return interval(estimate, estimate)
-  longer = lengthening(skewness(means, deviation), num_units, bounds)
   error = deviation / math.sqrt(num_units)
-  error *= student_quantile((1 + level) / 2, num_units - 1)
-  low, high = _ends(
-      estimate,
-      error * (1 + max(-longer, 0.0)),
-      error * (1 + max(longer, 0.0)),
-      bounds,
+  quantile = float(special.stdtrit(num_units - 1, (1 + level) / 2))
+  skewness = _skewness(means, deviation)
+  least, most = _limits(bounds)
+  low = estimate - error * _hall(quantile, skewness, num_units)
+  high = estimate - error * _hall(-quantile, skewness, num_units)
+  return interval(
+      min(max(low, least), estimate), max(min(high, most), estimate)
   )
-  return interval(min(low, estimate), max(high, estimate))
 
 
-def _ends(
-    middle: float, below: float, above: float, bounds: Bounds
-) -> tuple[float, float]:
-  """Returns the points at given distances below and above, within the bounds.
-
-  Distances are measured on a scale that ends at the bounds, and whose unit at
-  `middle` is that of the values.
-  """
-  low, high = bounds
-  if high is None:
-    if low is None:
-      return middle - below, middle + above
-    depth = middle - low
-    if not depth:
-      return middle, middle  # The spread is less than a rounding error.
-    # Squaring a ratio keeps the rounding independent of the unit of the values.
-    bottom = max(1 - below / (2 * depth), 0.0)
-    return low + depth * bottom**2, low + depth * (1 + above / (2 * depth)) ** 2
-  if low is None:
-    # Mirror image of a lower bound.
-    top, bottom = _ends(-middle, above, below, (-high, None))
-    return -bottom, -top
-  depth, rest, width = middle - low, high - middle, high - low
-  if not depth * rest:
-    return middle, middle
-  angle = math.atan2(math.sqrt(depth / width), math.sqrt(rest / width))
-  per_unit = 1 / (2 * math.sqrt(depth * rest))
-  angles = (
-      max(angle - below * per_unit, 0.0),
-      min(angle + above * per_unit, math.pi / 2),
-  )
-  bottom, top = (low + width * math.sin(x) ** 2 for x in angles)
-  return bottom, top
-
-
-def spread(means: np.ndarray, units: Sequence[np.ndarray]) -> float:
+def _spread(means: np.ndarray, units: Sequence[np.ndarray]) -> float:
   """Returns the standard deviation of the means of at least two seeds.
 
   Means of few discrete values can coincide by chance, for example if two seeds
@@ -425,22 +389,8 @@ def _variance(values: np.ndarray) -> float:
   return float(np.var(values - values[0], ddof=1))
 
 
-def lengthening(skewed: float, num_seeds: int, bounds: Bounds) -> float:
-  """Returns the share by which one side of an interval exceeds Student's.
-
-  Args:
-    skewed: Skewness of the seeds; positive if the upper side is longer.
-    num_seeds: Number of seeds.
-    bounds: Smallest and largest possible value.
-  """
-  of_few = _OF_FEW_SEEDS_WITHIN_BOUNDS
-  if bounds == UNBOUNDED:
-    of_few = _OF_FEW_SEEDS
-  return skewed * (_OF_MANY_SEEDS / math.sqrt(num_seeds) + of_few / num_seeds)
-
-
-def skewness(means: np.ndarray, deviation: float) -> float:
-  """Returns the sample skewness; 0 for fewer than three values.
+def _skewness(means: np.ndarray, deviation: float) -> float:
+  """Returns the adjusted sample skewness; 0 for fewer than three values.
 
   Args:
     means: Mean of each seed, `(seeds,)`.
@@ -453,18 +403,19 @@ def skewness(means: np.ndarray, deviation: float) -> float:
   return cubes * n / ((n - 1) * (n - 2))
 
 
-def student_quantile(probability: float, dof: int) -> float:
-  """Returns a quantile of Student's distribution, accurate to 0.03 %.
+def _hall(quantile: float, skewness: float, num_seeds: int) -> float:
+  """Returns the t statistic whose transformation by Hall is a given quantile.
 
-  If tan(angle) = t / sqrt(dof), then the density of the angle is proportional
-  to cos(angle) ** (dof - 1), whose support is bounded.
+  With a = skewness / sqrt(seeds), Hall's transformation of t is
+  t + a t^2 / 3 + a^2 t^3 / 27 + a / 6 = ((1 + a t / 3)^3 - 1) / a + a / 6.
 
   Args:
-    probability: Probability of values below the quantile.
-    dof: Degrees of freedom.
+    quantile: Quantile of the transformed statistic.
+    skewness: Skewness of the seeds.
+    num_seeds: Number of seeds.
   """
-  edges = np.linspace(-math.pi / 2, math.pi / 2, 4_001)
-  centres = (edges[1:] + edges[:-1]) / 2
-  mass = np.concatenate([[0], np.cumsum(np.cos(centres) ** (dof - 1))])
-  angle = np.interp(probability, mass / mass[-1], edges)
-  return math.sqrt(dof) * math.tan(angle)
+  a = skewness / math.sqrt(num_seeds)
+  centred = quantile - a / 6
+  root = float(np.cbrt(1 + a * centred))
+  # 3 * (root - 1) / a, also if a is 0.
+  return 3 * centred / (root**2 + root + 1)
