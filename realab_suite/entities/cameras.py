@@ -1,6 +1,8 @@
 """Rendering of camera images."""
 
 import functools
+import typing
+from typing import Any
 
 from dm_control import _render
 from dm_control import mjcf
@@ -40,7 +42,7 @@ def _(
     physics: mjcf.Physics, camera: mjcf.Element, height: int, width: int
 ) -> np.ndarray:
   try:
-    _ = physics.contexts
+    _ = typing.cast(Any, physics).contexts
   except errors.RenderingError:
     raise
   except Exception as error:  # Each renderer has its own errors.
