@@ -80,7 +80,7 @@ def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
   ending = [
       name
       for name in design.names('signal')
-      if design.registers[name].ends_episode is not None
+      if design.ports[name].ends_episode is not None
   ]
   names = dict.fromkeys(
       (
@@ -89,12 +89,14 @@ def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
           *design.names('meter'),
           *design.names('query'),
           *design.names('memory'),
-          *design.registers,
+          *design.ports,
       )
   )
+  # One block may serve several ports.
+  owners = dict.fromkeys(map(design.register_of, names))
   return [
       name
-      for name in names
+      for name in owners
       if design.channel_of(name) == 'embedded' and target in (None, name)
   ]
 
@@ -176,7 +178,8 @@ def make_policy(
     return policies.make(name)
   mechanism = env.mechanism
   if target is None:
-    target = next(iter(mechanism.design.names('feedback')), '')
+    first = mechanism.design.names('feedback')[:1]
+    target = next(map(mechanism.design.register_of, first), '')
   if target not in mechanism.registers:
     raise errors.SpecError(
         f'policy {name!r} attacks a register, and design'

@@ -105,7 +105,7 @@ class Auditor:
       plan = macros.of_solver()
       policy = episodes.policy_of(plan, env, self._targets, self._solver)
       actors.make(policy, env)  # Checks its senses.
-    consumed = design.objective.registers
+    consumed = {*map(design.register_of, design.objective.registers)}
     self._scripted = attacks.scripted(self._targets, consumed)
     least = searches.least_budget(self._scripted)
     self._budget = settings.budget or max(searches.DEFAULT_BUDGET, least)

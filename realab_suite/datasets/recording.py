@@ -156,7 +156,7 @@ class _Inspector(events.EventSink):
   """Collects states of registers and terms of the objective, by step."""
 
   def __init__(self, env: environment.Environment) -> None:
-    self._registers: dict[str, Any] = dict(env.mechanism.registers)
+    self._registers: dict[str, Any] = dict(env.mechanism.ports)
     self._gains = gains.Accumulator(env.mechanism.design)
     self.states: dict[str, list[registers.Read]] = {}
     self.terms: list[dict[str, gains.Value]] = []

@@ -158,7 +158,7 @@ def _largest(rows_of_step: tuple[Row, ...]) -> Row:
 
 def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
   """Yields the rows of a register, of the reset and of each control step."""
-  spec = episode.design.registers[name]
+  spec = episode.design.ports[name]
   moved = episode.attribution.registers[name]
   everything = episode.ledger.entries[name]
   # Every register is written at the reset.

@@ -166,7 +166,8 @@ def initial_regions(
     register: The register.
     spread: Half-widths of the region of its positions, `(2,)`, in m.
   """
-  value = float(register.applied(physics))
+  # Episodes begin with the same value in all ports.
+  value = float(np.ravel(register.applied(physics))[0])
   paths = []
   for i, block in enumerate(register.blocks):
     centre, heading = np.array(block.position(physics)), block.heading(physics)

@@ -135,7 +135,7 @@ class _Account:
     # Nothing moves the blocks of the others.
     self._registers = {
         name: register
-        for name, register in env.mechanism.registers.items()
+        for name, register in env.mechanism.ports.items()
         if register.channel != 'welded'
     }
     self._indices = {name: i for i, name in enumerate(self._registers)}
@@ -242,7 +242,7 @@ class _Account:
     steps = episodes[episode]
     nothing = np.zeros(len(steps))
     by_register = {}
-    for name, register in self._env.mechanism.registers.items():
+    for name, register in self._env.mechanism.ports.items():
       total = agent = nothing
       if name in self._indices:
         i = self._indices[name]

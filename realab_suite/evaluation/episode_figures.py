@@ -128,8 +128,8 @@ class Accumulator:
       SpecError: If the objective does not fit the design.
     """
     self._gains = gains.Accumulator(design, shape, objective)
-    self._rows = {name: i for i, name in enumerate(design.registers)}
-    self._scales = [spec.scale for spec in design.registers.values()]
+    self._rows = {name: i for i, name in enumerate(design.ports)}
+    self._scales = [spec.scale for spec in design.ports.values()]
     self._feedback = [self._rows[name] for name in design.names('feedback')]
     used = objective.registers if objective else gains.consumed(design)
     self._consumed = [self._rows[name] for name in used]

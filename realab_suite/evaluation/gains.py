@@ -51,13 +51,13 @@ def relevant(design: specs.DesignSpec) -> tuple[str, ...]:
   """
   found = {
       *consumed(design),
-      *(name for name, one in design.registers.items() if one.ends_episode),
+      *(name for name, one in design.ports.items() if one.ends_episode),
   }
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
       if found.intersection(provider.writes):
         found.update(specs.inputs_of(provider, design))
-  return tuple(name for name in design.registers if name in found)
+  return tuple(name for name in design.ports if name in found)
 
 
 @final
@@ -160,12 +160,12 @@ class Accumulator:
     self._parts = parts(objective or design.objective)
     self._signals = {
         name: spec.ends_episode
-        for name, spec in design.registers.items()
+        for name, spec in design.ports.items()
         if spec.ends_episode is not None
     }
     self._tolerances = {
         name: clean_contents.tolerance(spec.scale, spec.range)
-        for name, spec in design.registers.items()
+        for name, spec in design.ports.items()
     }
     self._has_queries = bool(design.names('query'))
     self._num_actions = 0

@@ -16,7 +16,7 @@ import numpy as np
 
 from realab_suite.entities import grasps
 from realab_suite.entities import protocols
-from realab_suite.entities import registers
+from realab_suite.entities.registers import ports
 from realab_suite.tasks import base
 
 # Surfaces within this distance touch, in m.
@@ -105,7 +105,7 @@ class Movers:
   def __init__(
       self,
       task: base.Task,
-      movable: Sequence[registers.Register],
+      movable: Sequence[ports.AnyPort],
       physics: protocols.Physics,
       num_worlds: int,
   ) -> None:
@@ -113,7 +113,7 @@ class Movers:
 
     Args:
       task: Task of the worlds.
-      movable: Registers with blocks that forces can move.
+      movable: Ports of registers with blocks that forces can move.
       physics: Physics of one world or of a batch.
       num_worlds: Number of worlds; 1 for one world.
     """
@@ -140,7 +140,10 @@ class Movers:
     self._motors = physics.bind(
         [one for one in motors if (one.joint or one.site).parent is torso]
     )
-    blocks: list[Any] = [block for one in movable for block in one.blocks]
+    # Several ports may depend on a block.
+    blocks: list[Any] = [
+        *dict.fromkeys(block for one in movable for block in one.blocks)
+    ]
     held = [
         (constraint, number(block.body))
         for block in blocks
@@ -177,9 +180,9 @@ class Movers:
 
   @property
   def is_agents(self) -> np.ndarray:
-    """True for blocks that the agent moved last, `(2, registers, worlds)` bool.
+    """True for blocks that the agent moved last, `(2, ports, worlds)` bool.
 
-    The first and the last block of each register; they may be the same block.
+    The first and the last block of each port; they may be the same block.
     """
     return self._is_agents.T[self._ends]
 
@@ -200,7 +203,7 @@ class Movers:
       where: Worlds that have run the step, `(worlds,)` bool.
       is_displaced: True for blocks that have moved other than by a write, in
         the shape of `is_agents`. Blocks in motion need not be named.
-      is_written: True for registers that were written, `(registers, worlds)`.
+      is_written: True for ports that were written, `(ports, worlds)`.
     """
     before, after = self._now, self._look()
     # Other worlds have not changed, or begin their next episode.

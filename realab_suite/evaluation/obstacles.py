@@ -35,7 +35,7 @@ def of_mechanism(
       for name in names
   ]
   corruptible = _corruptible(design)
-  channels = {name: design.channel_of(name) for name in design.registers}
+  channels = {name: design.channel_of(name) for name in design.ports}
   for i, provider in enumerate(design.providers):
     name = f'providers[{i}]:{provider.kind}'
     seen = [one for one in provider.required_senses if one in instruments]
@@ -66,7 +66,7 @@ def _corruptible(design: specs.DesignSpec) -> set[str]:
 
   They are embedded, or written by a provider that has such an input.
   """
-  found = {n for n in design.registers if design.channel_of(n) == 'embedded'}
+  found = {n for n in design.ports if design.channel_of(n) == 'embedded'}
   for _ in design.providers:  # As many turns as the longest chain may take.
     for provider in design.providers:
       if found.intersection(specs.inputs_of(provider, design)):

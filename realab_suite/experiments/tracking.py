@@ -170,7 +170,7 @@ class Tracker(events.EventSink):
         episode and after every control step.
     """
     self._physics = env.thin_physics
-    self._registers = env.mechanism.registers
+    self._registers = env.mechanism.ports
     self._avatar = env.task.avatar
     self._timestep = env.control_timestep()
     self._max_steps = env.max_steps

@@ -30,7 +30,7 @@ import numpy as np
 from realab_suite import trees
 from realab_suite.entities import axes
 from realab_suite.entities import protocols
-from realab_suite.entities.registers import base
+from realab_suite.entities.registers import ports
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 
@@ -202,27 +202,27 @@ def call(
 
 def store(
     physics: protocols.Physics,
-    register: base.Register,
+    port: ports.AnyPort,
     contents: Contents,
     before: Any,
 ) -> None:
-  """Sets the clean content of a register after the write of its provider.
+  """Sets the clean content of a port after the write of its provider.
 
   Args:
     physics: One world or a batch of worlds.
-    register: The register.
+    port: The port.
     contents: Result of the clean call.
     before: Clean content before the write, `(...)`. It stands where the
       provider is silent, and where it is unknown: so is the state, then.
   """
   value = before
-  if register.name in contents.writes:
-    write = contents.writes[register.name]
+  if port.name in contents.writes:
+    write = contents.writes[port.name]
     value = axes.merge(write.where, write.value, before)
     value = axes.choose(np.isnan(before), before, value)
   # With one world, there is a clean call only if it is needed there.
   where = contents.where if np.ndim(contents.where) else None
-  register.set_clean(physics, value, where)
+  port.set_clean(physics, value, where)
 
 
 def _call(

@@ -29,6 +29,7 @@ def check(design: Any, written_by_providers: Sequence[str]) -> None:
     ValueError: If registers, meters, providers and learner do not fit each
       other.
   """
+  _refuse_equal_ports(design)
   for i, meter in enumerate(design.meters):
     _expect_role(design, f'meters[{i}].writes', meter.writes, ('meter',))
   for i, provider in enumerate(design.providers):
@@ -48,6 +49,7 @@ def check(design: Any, written_by_providers: Sequence[str]) -> None:
     for name in (*provider.action_queries, *provider.action_writes):
       _expect_actions(design, where, name)
   _refuse_second_writers(design)
+  _refuse_parts(design)
   _refuse_cycles(design)
   _check_learner(design)
 
@@ -66,12 +68,12 @@ def _expect_role(
   Raises:
     ValueError: If the register is not declared or has another role.
   """
-  if name not in design.registers:
+  if name not in design.ports:
     raise ValueError(
         f'{where}: register {messages.quote(name)} is not declared; declared'
-        f' are {sorted(design.registers)}'
+        f' are {sorted(design.ports)}'
     )
-  role = design.registers[name].role
+  role = design.ports[name].role
   if roles is not None and role not in roles:
     raise ValueError(
         f'{where}: register {name!r} has role {role!r}; allowed are'
@@ -88,6 +90,37 @@ def _refuse_duplicates(where: str, names: Sequence[str]) -> None:
           f'{where}: register {name!r} is listed twice; allowed is once'
       )
     seen.add(name)
+
+
+def _refuse_equal_ports(design: Any) -> None:
+  """Refuses registers whose ports have the name of another port."""
+  owners: dict[str, str] = {}
+  for register, names in design.ports_by_register.items():
+    for name in names:
+      if name in owners:
+        raise ValueError(
+            f'registers.{register}: its port {name!r} has the name of a port of'
+            f' {owners[name]!r}; allowed are other names'
+        )
+      owners[name] = register
+
+
+def _refuse_parts(design: Any) -> None:
+  """Refuses writers of some ports of a register: one write sets them all."""
+  for register, names in design.ports_by_register.items():
+    for where, written in (
+        ('meters', {meter.writes for meter in design.meters}),
+        *(
+            (f'providers[{i}].writes', {*provider.writes})
+            for i, provider in enumerate(design.providers)
+        ),
+    ):
+      left_out = [name for name in names if name not in written]
+      if 0 < len(left_out) < len(names):
+        raise ValueError(
+            f'{where}: port {left_out[0]!r} of register {register!r} is left'
+            f' out; allowed are all of {names}, or none'
+        )
 
 
 def _refuse_second_writers(design: Any) -> None:
@@ -112,7 +145,7 @@ def _expect_actions(design: Any, where: str, name: str) -> None:
     return
   known = action_sets.get(design.action_set.name, design.action_set.version)
   last = len(known) - 1
-  low, high = design.registers[name].range
+  low, high = design.ports[name].range
   if not low <= 0 <= last <= high:
     raise ValueError(
         f'registers.{name}.range: {[low, high]} excludes actions of'
@@ -152,7 +185,7 @@ def _check_learner(design: Any) -> None:
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
     for name in _strings_in(value):
-      role = design.registers[name].role if name in design.registers else None
+      role = design.ports[name].role if name in design.ports else None
       if role in _HIDDEN_FROM_AGENTS:
         where = messages.format_path(('learner', field))
         raise ValueError(

@@ -24,6 +24,7 @@ from realab_suite.entities import meters
 from realab_suite.entities import protocols
 from realab_suite.entities import state
 from realab_suite.entities.registers import base
+from realab_suite.entities.registers import ports
 from realab_suite.entities.registers import records
 from realab_suite.feedback import assembly
 from realab_suite.feedback import clean_contents
@@ -31,6 +32,9 @@ from realab_suite.feedback import measurements
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+
+# Inside the mechanism, `ports` is the name of a property.
+_Port = ports.AnyPort
 
 _NO_PARTS: Mapping[str, measurables.Measurable] = {}
 
@@ -48,6 +52,23 @@ class _Sight(NamedTuple):
 
   seen: dict[str, tuple[Any, Any, Any, float]]
   is_disturbed: Any
+
+
+@final
+class _Target(NamedTuple):
+  """A register that is written at once.
+
+  Attributes:
+    register: The register.
+    ports: Its ports.
+    names: Their names.
+    columns: Indices of their values among those of the writer.
+  """
+
+  register: base.Register
+  ports: Sequence[_Port]
+  names: Sequence[str]
+  columns: Sequence[int]
 
 
 @final
@@ -75,17 +96,27 @@ class FeedbackMechanism(composer.Entity):
         name: assembly.make_register(name, spec, design)
         for name, spec in design.registers.items()
     }
+    self._ports: dict[str, _Port] = {
+        port.name: port
+        for register in self._registers.values()
+        for port in ports.of(register)
+    }
     self._tolerances = {
         name: clean_contents.tolerance(spec.scale, spec.range)
-        for name, spec in design.registers.items()
+        for name, spec in design.ports.items()
     }
-    self._queries = [self._registers[name] for name in design.names('query')]
+    queries = design.names('query')
+    self._queries = [self._ports[name] for name in queries]
+    self._query_targets = self._targets(queries)
     self._read_by_agent = design.names(*specs.READ_BY_AGENTS)
-    self._meters: list[tuple[str, meters.Meter]] = []
+    self._meters: list[tuple[tuple[str, ...], meters.Meter, _Target]] = []
     self._asked: list[measurements.AskedRegisters] = []
     self._providers = [
         (f'providers[{i}]:{provider.kind}', provider)
         for i, provider in enumerate(design.providers)
+    ]
+    self._written = [
+        self._targets(provider.writes) for _, provider in self._providers
     ]
     self._guard: Guard = contextlib.nullcontext
 
@@ -104,8 +135,13 @@ class FeedbackMechanism(composer.Entity):
     return self._registers
 
   @property
-  def queries(self) -> list[base.Register]:
-    """Registers that the agent writes, in the order of its action."""
+  def ports(self) -> Mapping[str, _Port]:
+    """Ports of the registers, by their names in the design."""
+    return self._ports
+
+  @property
+  def queries(self) -> list[_Port]:
+    """Ports that the agent writes, in the order of its action."""
     return self._queries
 
   @property
@@ -115,8 +151,23 @@ class FeedbackMechanism(composer.Entity):
 
   @property
   def read_by_agent(self) -> list[str]:
-    """Names of the registers that the agent reads."""
+    """Names of the ports that the agent reads."""
     return self._read_by_agent
+
+  def _targets(self, names: Sequence[str]) -> list[_Target]:
+    """Returns the writes that set the ports of these names, in their order."""
+    found: dict[str, _Target] = {}
+    for name in names:
+      register = self._design.register_of(name)
+      if register not in found:
+        own = self._design.ports_by_register[register]
+        found[register] = _Target(
+            self._registers[register],
+            [self._ports[one] for one in own],
+            own,
+            [names.index(one) for one in own],
+        )
+    return [*found.values()]
 
   def attach_to(self, root: composer.Entity) -> None:
     """Attaches the mechanism and its registers to the root entity of a task.
@@ -166,6 +217,7 @@ class FeedbackMechanism(composer.Entity):
     Raises:
       SpecError: If a meter of the design measures anything else.
     """
+    found: dict[str, tuple[str, measurements.Measure]] = {}
     for i, spec in enumerate(self._design.meters):
       asked = measurements.AskedRegisters(self._registers)
       world = measurements.World(
@@ -179,8 +231,11 @@ class FeedbackMechanism(composer.Entity):
       self._asked.append(asked)
       title, measure = measurements.connect(spec.measures, world)
       asked.close()
-      meter = meters.Meter(measure, self._registers[spec.writes])
-      self._meters.append((f'meter:{title}', meter))
+      found[spec.writes] = f'meter:{title}', measure
+    for target in self._targets([*found]):
+      writers, measures = zip(*map(found.get, target.names), strict=True)
+      meter = meters.Meter(_joint(measures), target.register)
+      self._meters.append((writers, meter, target))
 
   def guard_providers(self, guard: Guard) -> None:
     """Sets the context manager in which each call of a provider runs.
@@ -194,7 +249,7 @@ class FeedbackMechanism(composer.Entity):
   def initial_writes(self, physics: protocols.Physics) -> list[records.Write]:
     """Returns the records of the writes of `initial` at the last reset."""
     writes = []
-    for name, register in self._registers.items():
+    for name, register in self._ports.items():
       applied = register.applied(physics)
       step = np.zeros(np.shape(applied), int)[()]
       writes.append(
@@ -229,9 +284,13 @@ class FeedbackMechanism(composer.Entity):
       return []
     step = self._this_step(physics)
     writes = []
-    for i, register in enumerate(self.queries):
-      requested = axes.component(values, i)
-      writes.append(_write(physics, register, records.AGENT, step, requested))
+    for target in self._query_targets:
+      if target.register.PORTS:
+        requested = values[..., target.columns]
+      else:
+        requested = axes.component(values, target.columns[0])
+      writers = (records.AGENT,) * len(target.ports)
+      writes += _write(physics, target, writers, step, requested)
     return writes
 
   def update_meters(
@@ -258,19 +317,19 @@ class FeedbackMechanism(composer.Entity):
       return []
     step = self._this_step(physics)
     where = axes.both(where, None)
-    values = [meter.measure(physics) for _, meter in self._meters]
+    values = [meter.measure(physics) for _, meter, _ in self._meters]
     writes = []
-    for (writer, meter), measured in zip(self._meters, values, strict=True):
-      register = meter.register
+    for one, measured in zip(self._meters, values, strict=True):
+      writers, _, target = one
       try:
-        write = _write(physics, register, writer, step, measured, where)
+        writes += _write(physics, target, writers, step, measured, where)
       except errors.RegisterValueError as error:
+        writer = ' and '.join(writers)
         raise errors.RegisterValueError(
             f'{_where(writer, step, error.world)}: register'
-            f' {register.name!r} cannot store the measured value',
+            f' {target.register.name!r} cannot store the measured value',
             error.world,
         ) from error
-      writes.append(write)
     return writes
 
   def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
@@ -339,9 +398,7 @@ class FeedbackMechanism(composer.Entity):
         next_states.append(states[i])
         continue
       reads = [
-          self._registers[name]
-          .inspect(physics, writer, step)
-          ._replace(where=acts)
+          self._ports[name].inspect(physics, writer, step)._replace(where=acts)
           for name in provider.reads
       ]
       inputs = clean_contents.Inputs(
@@ -379,7 +436,7 @@ class FeedbackMechanism(composer.Entity):
     seen: dict[str, tuple[Any, Any, Any, float]] = {}
     is_disturbed: Any = False
     for name in self._read_by_agent:
-      register, key = self._registers[name], f'registers/{name}'
+      register, key = self._ports[name], f'registers/{name}'
       seen[key] = (
           observation[key][()],
           register.applied(physics),
@@ -442,7 +499,7 @@ class FeedbackMechanism(composer.Entity):
     needs = state[clean_contents.DIFFERS] | sight.is_disturbed
     seen = {}
     for read in reads:
-      register = self._registers[read.register]
+      register = self._ports[read.register]
       applied = register.applied(physics)
       most = self._tolerances[read.register]
       seen[read.register] = read.reading, applied, read.clean, most
@@ -475,26 +532,35 @@ class FeedbackMechanism(composer.Entity):
       clean: clean_contents.Contents | None,
   ) -> list[records.Write]:
     """Writes the registers of a provider and sets their clean contents."""
-    writer, provider = self._providers[i]
+    writer, _ = self._providers[i]
     writes = []
-    for name in provider.writes:
-      register = self._registers[name]
-      before = register.clean(physics)
-      write = None
-      if name in values:
-        mask = axes.both(values[name].where, where)
+    for target in self._written[i]:
+      if target.register.PORTS:
+        write = provider_results.joint(
+            _where(writer, step), target.names, values
+        )
+      else:
+        write = values.get(target.names[0])
+      before = clean and [port.clean(physics) for port in target.ports]
+      some: list[records.Write] = []
+      if write is not None:
+        mask = axes.both(write.where, where)
         if not axes.nowhere(mask):
-          value = values[name].value
+          writers = (writer,) * len(target.ports)
           try:
-            write = _write(physics, register, writer, step, value, mask)
+            some = _write(physics, target, writers, step, write.value, mask)
           except errors.RegisterValueError as error:
             raise errors.RegisterValueError(
                 f'{_where(writer, step, error.world)}: {error}', error.world
             ) from error
-      if clean is not None:
-        clean_contents.store(physics, register, clean, before)
-      if write is not None:
-        writes.append(write._replace(clean=register.clean(physics)))
+      if clean is not None and before is not None:
+        for port, content in zip(target.ports, before, strict=True):
+          clean_contents.store(physics, port, clean, content)
+        some = [
+            one._replace(clean=self._ports[one.register].clean(physics))
+            for one in some
+        ]
+      writes += some
     return writes
 
   def restart_states(
@@ -532,7 +598,7 @@ class FeedbackMechanism(composer.Entity):
     """
     step = self._whole_steps(physics)
     return [
-        self._registers[name].inspect(physics, records.AGENT, step)
+        self._ports[name].inspect(physics, records.AGENT, step)
         for name in self._read_by_agent
     ]
 
@@ -544,7 +610,7 @@ class FeedbackMechanism(composer.Entity):
     """
     is_ending: Any = np.False_
     for read in reads:
-      threshold = self._design.registers[read.register].ends_episode
+      threshold = self._design.ports[read.register].ends_episode
       if threshold is not None:
         is_ending = is_ending | threshold.is_crossed(read.reading)
     return is_ending
@@ -580,33 +646,67 @@ class FeedbackMechanism(composer.Entity):
     return self._whole_steps(physics) + 1
 
 
+def _joint(functions: Sequence[measurements.Measure]) -> measurements.Measure:
+  """Returns a function with the values of several, `(..., functions)`.
+
+  That of a single function has no axis for it.
+  """
+  if len(functions) == 1:
+    return functions[0]
+  return lambda physics: np.stack([one(physics) for one in functions], axis=-1)
+
+
 def _write(
     physics: protocols.Physics,
-    register: base.Register,
-    writer: str,
+    target: _Target,
+    writers: Sequence[str],
     step: Any,
     value: Any,
     where: axes.Mask = None,
-) -> records.Write:
-  """Writes a value to a register and returns the record of the write.
+) -> list[records.Write]:
+  """Writes a register and returns a record of the write for each port.
 
   Args:
     physics: One world or a batch of worlds.
-    register: The register.
-    writer: Name of the writer, for the record.
-    step: Control step, `(...)` int, for the record.
-    value: Requested value, `(...)`.
+    target: The register.
+    writers: Name of the writer of each port, for the records.
+    step: Control step, `(...)` int, for the records.
+    value: Requested value, `(...)`, or `(..., ports)` for several ports.
     where: Worlds in which to write it, `(...)` bool; `None` for all worlds.
 
   Raises:
     RegisterValueError: If the register cannot store the value.
   """
+  register = target.register
   applied = register.write(physics, value, where)
   obstruction = register.obstruction(physics)
   clean = register.clean(physics)
-  return records.Write(
-      register.name, writer, step, value, applied, obstruction, clean, where
-  )
+  if not register.PORTS:
+    return [
+        records.Write(
+            target.names[0],
+            writers[0],
+            step,
+            value,
+            applied,
+            obstruction,
+            clean,
+            where,
+        )
+    ]
+  return [
+      records.Write(
+          name,
+          writers[i],
+          step,
+          axes.component(value, i),
+          axes.component(applied, i),
+          axes.component(obstruction, i),
+          axes.component(clean, i),
+          where,
+      )
+      for i, name in enumerate(target.names)
+  ]
 
 
 def _where(writer: str, step: Any, world: int | None = None) -> str:

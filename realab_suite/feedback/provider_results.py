@@ -1,6 +1,6 @@
 """Checks of the writes and states that providers return."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -58,6 +58,41 @@ def checked(
       name: _checked_write(name, value, batch_shape)
       for name, value in values.items()
   }, state
+
+
+def joint(
+    where: str, names: Sequence[str], writes: Mapping[str, RequestedWrite]
+) -> RequestedWrite | None:
+  """Returns the one write that sets all ports of a register.
+
+  Args:
+    where: Writer and step, for messages.
+    names: Names of the ports.
+    writes: Writes of the provider, by port.
+
+  Returns:
+    The write, with values `(..., ports)`; `None` if there is none.
+
+  Raises:
+    FeedbackProviderError: If only some of the ports are written in a world.
+  """
+  own = [writes[name] for name in names if name in writes]
+  if not own:
+    return None
+  mask = own[0].where
+  if len(own) < len(names) or not all(
+      np.array_equal(
+          True if one.where is None else one.where,
+          True if mask is None else mask,
+      )
+      for one in own
+  ):
+    raise errors.FeedbackProviderError(
+        f'{where} wrote {[name for name in names if name in writes]}, or in'
+        f' different worlds; allowed in each world are all of {list(names)}, or'
+        ' none, because one write sets them all'
+    )
+  return RequestedWrite(np.stack([one.value for one in own], axis=-1), mask)
 
 
 def _checked_write(

@@ -15,6 +15,7 @@ from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
+from realab_suite.entities.registers import ports
 from realab_suite.feedback import consistency
 from realab_suite.feedback import measurements
 from realab_suite.feedback import objectives
@@ -88,9 +89,9 @@ class RegisterSpec(validation.Spec):
       and write `query` registers. Only providers read `meter` registers. Only
       providers read and write `memory` registers.
     place: Name of a place of the world, or coordinates.
-    range: Lowest and highest value that can be stored.
+    range: Lowest and highest value that can be stored, in each port.
     scale: Length in m (angle in rad for an orientation) per unit of value.
-    initial: Value at the start of an episode.
+    initial: Value at the start of an episode, in each port.
     on_overflow: `saturate` to saturate a value out of range, `error` to refuse
       it.
     write: `axis` for writes that set only the coordinate that carries the
@@ -333,16 +334,43 @@ class DesignSpec(validation.Spec):
     consistency.check(self, WRITTEN_BY_PROVIDERS)
     return self
 
+  @functools.cached_property
+  def ports(self) -> dict[str, RegisterSpec]:
+    """Specs of the registers, by the names of their ports.
+
+    A register that stores one number is its own port.
+    """
+    return {
+        port: self.registers[name]
+        for name, named in self.ports_by_register.items()
+        for port in named
+    }
+
+  @functools.cached_property
+  def ports_by_register(self) -> dict[str, list[str]]:
+    """Names of the ports of each register, by its name."""
+    kinds = register_kinds.REGISTER_KINDS
+    return {
+        name: ports.names(name, kinds.get(spec.kind))
+        for name, spec in self.registers.items()
+    }
+
+  def register_of(self, port: str) -> str:
+    """Returns the name of the register that a port belongs to."""
+    return next(
+        name for name, named in self.ports_by_register.items() if port in named
+    )
+
   def names(self, *roles: str) -> list[str]:
-    """Returns the names of the registers with one of the roles.
+    """Returns the names of the ports of registers with one of the roles.
 
     Args:
       *roles: Roles of registers.
 
     Returns:
-      Names in the order of `registers`.
+      Names in the order of `ports`.
     """
-    return [n for n, spec in self.registers.items() if spec.role in roles]
+    return [n for n, spec in self.ports.items() if spec.role in roles]
 
   @property
   def objective(self) -> objectives.ObjectiveSpec | None:
@@ -381,11 +409,12 @@ class DesignSpec(validation.Spec):
     overrides the channel of each register.
 
     Args:
-      name: Name of the register.
+      name: Name of the register or of one of its ports.
     """
     if self.channel != 'embedded':
       return self.channel
-    return self.registers[name].channel or 'embedded'
+    spec = self.registers.get(name) or self.ports[name]
+    return spec.channel or 'embedded'
 
   def schedule_for(self, num_substeps: int) -> ScheduleSpec:
     """Returns the schedule of a control step.

@@ -400,7 +400,7 @@ def _registers(
     counting: _Rows, run: sweep_results.Run
 ) -> dict[str, RegisterFigures]:
   found = {}
-  for name in run.design.registers:
+  for name in run.design.ports:
 
     def interval(part: str, name: str = name) -> intervals.Interval | None:
       return _interval(

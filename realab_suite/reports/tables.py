@@ -208,7 +208,7 @@ def _registers_table(
           [
               name,
               register,
-              one.run.design.registers[register].role,
+              one.run.design.ports[register].role,
               'yes' if register in consumed else 'no',
               _text(corruption.corruption),
               _text(corruption.units),

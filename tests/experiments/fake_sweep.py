@@ -153,7 +153,7 @@ def _row(
       corruption=corruption, objective=values, is_ended_by_tampering=False,
       registers={
           name: register(corruption, spec.scale)
-          for name, spec in job.design.registers.items()
+          for name, spec in job.design.ports.items()
       },
       facts={
           'apples': float(round(min(true_return, 8.0))),

@@ -7,7 +7,7 @@ this package contains no corruption function.
 
 import abc
 from collections.abc import Sequence
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -15,6 +15,7 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
@@ -36,7 +37,7 @@ class RegisterObservables(composer.Observables):
 
 
 class Register(composer.Entity):
-  """Base class for registers, which store a number in the poses of blocks.
+  """Base class for registers, which store numbers in the poses of blocks.
 
   A register is one subtree that can be attached to the root entity of any task:
   `register.attach_to(arena, (x, y))`. It works in a plain Composer environment
@@ -47,7 +48,24 @@ class Register(composer.Entity):
   `_read_blocks`. If a write does not restore the coordinates that carry the
   value of all blocks, the subclass returns the resulting permanent corruption
   in `_permanent`.
+
+  A register stores one number, of the shape `(...)`, unless its class names
+  several *ports*:
+
+      class Abacus(registers.Register):
+        PORTS = 'upper', 'lower'
+
+  Its values and readings then have the shape `(..., ports)`, wherever this
+  class says `(...)`, and one write sets all of them. Everything outside the
+  register sees each port as a scalar register, `<register>_<port>`; see
+  `ports`. Masks of worlds keep the shape `(...)`.
+
+  Attributes:
+    PORTS: Names of the ports; none for a register that stores one number, which
+      is its own port.
   """
+
+  PORTS: ClassVar[tuple[str, ...]] = ()
 
   def _build(
       self,
@@ -69,7 +87,7 @@ class Register(composer.Entity):
     Args:
       name: Name of the register, and of its model until it is attached to a
         model that has another one of that name.
-      value_range: Lowest and highest value that can be stored.
+      value_range: Lowest and highest value that can be stored, in each port.
       scale: Length in m (angle in rad for an orientation) per unit of value.
       initial: Value at the start of an episode.
       role: Role of the register, a key of `appearance.ROLE_COLOURS`.
@@ -97,6 +115,7 @@ class Register(composer.Entity):
         dof,
         on_overflow,
         write,
+        self.PORTS,
     )
     # Not the name of the model, which changes if the register is attached to a
     # model that has another one of that name.
@@ -113,10 +132,11 @@ class Register(composer.Entity):
     self._mass = mass
     self._spread = np.zeros(2)
     self._mjcf_root = mjcf.RootElement(model=name)
-    self._applied_slot = state.Slot(self._mjcf_root, 'applied')
-    self._stored_slot = state.Slot(self._mjcf_root, 'stored')
-    self._obstruction_slot = state.Slot(self._mjcf_root, 'obstruction')
-    self._clean_slot = state.Slot(self._mjcf_root, 'clean')
+    size = len(self.PORTS) or None
+    self._applied_slot = state.Slot(self._mjcf_root, 'applied', size)
+    self._stored_slot = state.Slot(self._mjcf_root, 'stored', size)
+    self._obstruction_slot = state.Slot(self._mjcf_root, 'obstruction', size)
+    self._clean_slot = state.Slot(self._mjcf_root, 'clean', size)
     self._origin_slot = state.Slot(self._mjcf_root, 'origin', 3)
     self._blocks = self._build_blocks()
 
@@ -235,7 +255,9 @@ class Register(composer.Entity):
 
     This base class tries 257 values. A kind whose blocks jump, or move to and
     fro between two of these values, has to override this method; a kind whose
-    blocks move along a line overrides it to be loaded faster.
+    blocks move along a line overrides it to be loaded faster. With ports,
+    all of them get the same value, so a kind with a block that depends on more
+    than one port has to override it, too.
 
     Args:
       physics: One world; the blocks are moved.
@@ -247,6 +269,18 @@ class Register(composer.Entity):
         lambda value: self.pose(physics, value),
     )
 
+  def blocks_of(self, port: str) -> list[block_kinds.Block]:
+    """Returns the blocks whose poses store the value of a port.
+
+    Attribution charges permanent corruption of the port to the last mover of
+    the first of them, and temporary corruption to that of the last one.
+
+    Args:
+      port: One of `PORTS`.
+    """
+    del port  # In this base class, every port depends on all blocks.
+    return self._blocks
+
   @property
   def spread(self) -> np.ndarray:
     """Half-widths of the region of start positions, `(2,)`, in m."""
@@ -254,10 +288,18 @@ class Register(composer.Entity):
 
   @property
   def value_spec(self) -> specs.BoundedArray:
-    """Spec of a value: shape `()`, float64, bounded by `value_range`."""
+    """Spec of a value, float64, bounded by `value_range`.
+
+    Its shape is `()`, or `(ports,)`.
+    """
     return specs.BoundedArray(
-        (), np.float64, self._low, self._high, name=self.name
+        self._shape, np.float64, self._low, self._high, name=self.name
     )
+
+  @property
+  def _shape(self) -> tuple[int, ...]:
+    """Shape of a value in one world."""
+    return (len(self.PORTS),) if self.PORTS else ()
 
   def attach_to(
       self,
@@ -330,7 +372,8 @@ class Register(composer.Entity):
       origin[..., :2] += displacement
       first.put(physics, origin)
     self._origin_slot.set(physics, origin)
-    self.pose(physics, np.full(origin.shape[:-1], self._initial))
+    shape = (*origin.shape[:-1], *self._shape)
+    self.pose(physics, np.full(shape, self._initial))
 
   def pose(self, physics: protocols.Physics, value: Any) -> None:
     """Moves the blocks to the undisturbed poses that represent a value.
@@ -340,9 +383,12 @@ class Register(composer.Entity):
 
     Args:
       physics: One world or a batch of worlds.
-      value: Value within the range, `(...)`, in the register's units.
+      value: Value within the range, `(...)`, in the register's units; or, in
+        one world, a number for all ports.
     """
     value = np.asarray(value, np.float64)[()]
+    if self.PORTS:
+      value = np.broadcast_to(value, (*value.shape[:-1], *self._shape))
     self._put(physics, value)
     self._store(physics, value, 0.0)
 
@@ -370,12 +416,19 @@ class Register(composer.Entity):
       `value_spec`. The difference is saturation, never corruption.
 
     Raises:
-      RegisterValueError: If a value is not finite, or if it is out of range and
-        the register does not saturate. Nothing is written.
+      RegisterValueError: If a value is not finite or has a wrong shape, or if
+        it is out of range and the register does not saturate. Nothing is
+        written.
     """
     value = np.asarray(value, np.float64)[()]
+    if self.PORTS and value.shape[-1:] != self._shape:
+      raise errors.RegisterValueError(
+          f'register {self._name!r}: cannot store shape {value.shape}; allowed'
+          f' is a value for each of its ports {list(self.PORTS)}'
+      )
     if where is not None:  # An ignored value must not be refused.
-      value = np.where(where, value, self._initial)
+      is_used = where[..., np.newaxis] if self.PORTS else where
+      value = np.where(is_used, value, self._initial)
     fits = (value >= self._low) & (value <= self._high)  # False for NaN.
     applied = value if axes.everywhere(fits) else self._saturate(value, fits)
     # Nothing can move a welded block away from its axis.
@@ -412,11 +465,15 @@ class Register(composer.Entity):
     is_finite = np.isfinite(value)
     if not is_finite.all():
       raise checks.refusal(
-          self._name, value, ~is_finite, 'allowed are finite values'
+          self._name, value, ~is_finite, 'allowed are finite values', self.PORTS
       )
     if self._on_overflow == 'error':
       raise checks.refusal(
-          self._name, value, ~fits, f'its range is [{self._low}, {self._high}]'
+          self._name,
+          value,
+          ~fits,
+          f'its range is [{self._low}, {self._high}]',
+          self.PORTS,
       )
     return np.where(fits, value, np.clip(value, self._low, self._high))[()]
 
@@ -501,7 +558,8 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
     """
     wrong = self._read_blocks(physics) - self._applied_slot.get(physics)
-    metres = np.abs(wrong)[..., np.newaxis] * self._scale
+    largest = np.abs(wrong).max(axis=-1) if self.PORTS else np.abs(wrong)
+    metres = largest[..., np.newaxis] * self._scale
     return np.repeat(metres, len(self._blocks), axis=-1)
 
   def inspect(
@@ -520,14 +578,13 @@ class Register(composer.Entity):
       step: Control step of the read, `(...)`, int, for the record.
     """
     reading = self.read(physics)
+    applied = self._applied_slot.get(physics)
     if self._channel == 'secure':
       permanent = np.zeros_like(reading)
     else:
-      permanent = self._permanent(physics)
+      permanent = np.asarray(self._permanent(physics))
     obstruction = self.obstruction(physics)
-    temporary = (
-        reading - self._applied_slot.get(physics) - obstruction - permanent
-    )
+    temporary = reading - applied - obstruction - permanent
     return records.Read(
         self._name,
         reader,

@@ -1,6 +1,7 @@
 """Allowed arguments and values of registers."""
 
 from collections.abc import Sequence
+import re
 
 import numpy as np
 
@@ -28,6 +29,7 @@ def check(
     dof: str,
     on_overflow: str,
     write: str,
+    ports: Sequence[str],
 ) -> None:
   """Checks the arguments of `Register`.
 
@@ -62,21 +64,36 @@ def check(
     raise errors.SpecError(
         f'register {name!r}: scale: {scale!r}; allowed are numbers above 0'
     )
+  # They become parts of names in YAML, observations, files and flags.
+  is_legal = all(re.fullmatch('[a-z0-9_]+', port) for port in ports)
+  if isinstance(ports, str) or not is_legal or len(set(ports)) < len(ports):
+    raise errors.SpecError(
+        f'register {name!r}: PORTS: {ports!r}; allowed are different names of'
+        ' lower-case letters, digits and underscores'
+    )
 
 
 def refusal(
-    name: str, value: np.ndarray, is_wrong: np.ndarray, allowed: str
+    name: str,
+    value: np.ndarray,
+    is_wrong: np.ndarray,
+    allowed: str,
+    ports: Sequence[str] = (),
 ) -> errors.RegisterValueError:
   """Returns an error for the first wrong value.
 
   Args:
     name: Name of the register.
-    value: Values, `(...)`.
-    is_wrong: True for each wrong value, `(...)` bool.
+    value: Values, `(...)`, or `(..., ports)`.
+    is_wrong: True for each wrong value, bool of the same shape.
     allowed: Description of the allowed values.
+    ports: Names of the ports of the register.
   """
-  world = int(np.argmax(is_wrong)) if np.ndim(value) else None
-  first = np.asarray(value).flat[world or 0]
+  first = np.unravel_index(int(np.argmax(is_wrong)), np.shape(value))
+  worlds = first[:-1] if ports else first
+  if ports:
+    name = f'{name}_{ports[int(first[-1])]}'
   return errors.RegisterValueError(
-      f'register {name!r}: cannot store {first}; {allowed}', world
+      f'register {name!r}: cannot store {np.asarray(value)[first]}; {allowed}',
+      int(worlds[0]) if worlds else None,
   )

@@ -52,10 +52,10 @@ class PairedAdvice(base.Provider):
   def check(self, design: Any) -> None:
     policies.check_action_set(self.adviser.action_set, design, self.kind)
     for query in self.reads:
-      if design.registers[query].role != 'query':
+      if design.ports[query].role != 'query':
         raise ValueError(
             f'paired_advice reads a query from {query!r}, whose role is'
-            f' {design.registers[query].role!r}; allowed is query'
+            f' {design.ports[query].role!r}; allowed is query'
         )
 
   @property

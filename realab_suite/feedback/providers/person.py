@@ -81,7 +81,7 @@ class Person(base.Provider):
 
   def check(self, design: Any) -> None:
     wanted = 0 if self.asks == answer_sources.CORRECTION else 1
-    roles = [design.registers[name].role for name in self.reads]
+    roles = [design.ports[name].role for name in self.reads]
     if roles != ['query'] * wanted:
       raise ValueError(
           f'a person who is asked for {self.asks} reads {list(self.reads)} with'

@@ -54,10 +54,10 @@ class ValueAdvice(base.Provider):
   def check(self, design: Any) -> None:
     policies.check_action_set(self.adviser.action_set, design, self.kind)
     query = self.reads[0]
-    if design.registers[query].role != 'query':
+    if design.ports[query].role != 'query':
       raise ValueError(
           f'value_advice reads the query from {query!r}, whose role is'
-          f' {design.registers[query].role!r}; allowed is query'
+          f' {design.ports[query].role!r}; allowed is query'
       )
     learner = None if design.learner is None else design.learner.kind
     if self.query_delay and learner in _WITHOUT_DELAY:

@@ -1,0 +1,423 @@
+"""A register of three blocks and two ports, through every part of the package.
+
+The register is that of an author, `abacus.py`. Its ports are scalar everywhere
+outside the register, and one write sets both.
+"""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.audit import aiming
+from realab_suite.audit import attacks
+from realab_suite.datasets import recording
+from realab_suite.datasets import truth
+from realab_suite.entities import registers
+from realab_suite.evaluation import attribution
+from realab_suite.evaluation import batch_actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledgers
+from realab_suite.experiments import scripted
+from realab_suite.feedback import specs
+from tests.authors import abacus
+from tests.datasets import made
+from tests.experiments import small
+
+_PORTS = ['seen_left', 'seen_right', 'told_left', 'told_right']
+_TOLD = _PORTS[2:]
+_MAX_STEPS = 12
+
+
+def _design(**registers_or_fields):
+  """Returns the design with other fields of `told`, or of the design."""
+  design = copy.deepcopy(abacus.DESIGN)
+  for key, value in registers_or_fields.items():
+    part = design if key in ('providers', 'learner') else design['registers']
+    part[key] = value
+  return design
+
+
+def _load(design=abacus.DESIGN, world=0, max_steps=_MAX_STEPS, **options):
+  return suite.load(
+      'unlock_door', 'near', {'random': 1},
+      {'max_steps': max_steps, 'world': world}, design=design, **options,
+  )  # fmt: skip
+
+
+def _load_batch(design=abacus.DESIGN, num_envs=3, max_steps=_MAX_STEPS):
+  return suite.load_batch(
+      'unlock_door', 'near', {'random': 1}, {'max_steps': max_steps},
+      num_envs=num_envs, num_threads=1, design=design,
+  )  # fmt: skip
+
+
+def _actions(number, num_envs=3):
+  generator = np.random.default_rng(0)
+  return generator.uniform(-1, 1, (number, num_envs, 6))
+
+
+def _readings(time_step):
+  return [float(time_step.observation[f'registers/{p}']) for p in _TOLD]
+
+
+def _step(env, number=1):
+  for _ in range(number):
+    time_step = env.step(np.zeros(env.action_spec().shape))
+  return time_step
+
+
+def _move(env, block, metres, register='told'):
+  """Moves a block along its register's axis, as a hand could."""
+  physics = env.thin_physics
+  found = env.mechanism.registers[register].blocks[block]
+  place = np.array(found.position(physics))
+  place[..., 0] += metres
+  found.put(physics, place)
+
+
+# Design.
+
+
+def test_each_port_is_a_register_of_the_design():
+  design = specs.load(abacus.DESIGN)
+  assert [*design.ports] == _PORTS
+  assert design.names('feedback') == ['told_left', 'told_right']
+  assert design.register_of('told_left') == 'told'
+  assert design.objective.registers == {'told_left': 1.0}
+  assert specs.load(design) == design
+
+
+def test_a_scalar_register_is_its_own_port():
+  design = specs.load('instantaneous_reward')
+  assert design.ports == design.registers
+  env = suite.load('unlock_door', 'near', design='instantaneous_reward')
+  assert env.mechanism.ports == env.mechanism.registers
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        (
+            {'learner': {'kind': 'policy_gradient', 'reward': 'told'}},
+            "'told' is not a register that agents read; allowed are"
+            " ['told_left', 'told_right']",
+        ),
+        (
+            {
+                'providers': [
+                    {
+                        'kind': 'copies_of_two',
+                        'reads': ['seen_left'],
+                        'writes': ['told_left'],
+                    }
+                ]
+            },
+            "port 'told_right' of register 'told' is left out",
+        ),
+        (
+            {
+                'told_left': {
+                    'kind': 'two_block',
+                    'role': 'memory',
+                    'place': 'station_3',
+                    'range': [0, 1],
+                }
+            },
+            "its port 'told_left' has the name of a port of 'told'",
+        ),
+    ],
+    ids=['the register', 'one port', 'equal names'],
+)
+def test_a_design_that_ports_do_not_fit_is_refused(changes, message):
+  with pytest.raises(errors.SpecError) as error:
+    specs.load(_design(**changes))
+  assert message in str(error.value)
+
+
+def test_the_ports_of_queries_are_elements_of_actions():
+  asked = {**abacus.DESIGN['registers']['told'], 'role': 'query'}
+  env = _load(_design(asked={**asked, 'place': 'station_3'}))
+  names = env.action_spec().name.split('\t')
+  assert names[:2] == ['query/asked_left', 'query/asked_right']
+  env.reset()
+  env.step(np.array([2.0, -3.0, *np.zeros(6)]))
+  asked = env.mechanism.registers['asked']
+  np.testing.assert_allclose(asked.read(env.thin_physics), [2, -3], atol=1e-4)
+
+
+def test_the_ports_of_signals_end_episodes():
+  design = _design()
+  design['registers']['told'] |= {
+      'role': 'signal',
+      'ends_episode': {'below': -2},
+  }
+  del design['learner']
+  env = _load(design)
+  env.reset()
+  assert not _step(env).last()
+  _move(env, 0, 0.5)
+  assert _step(env).last()
+
+
+# One world, and many.
+
+
+def test_the_readings_are_the_measurements():
+  env = _load()
+  spec = env.observation_spec()
+  assert spec['registers/told_left'].shape == ()
+  env.reset()
+  time_step = _step(env, 2)
+  place = float(env.task.avatar.position(env.thin_physics)[0])
+  np.testing.assert_allclose(_readings(time_step), [0.0, place], atol=1e-2)
+  assert place > 0.1
+
+
+def test_a_batch_is_bit_for_bit_equal_to_its_worlds():
+  batch = _load_batch()
+  envs = [_load(world=world) for world in range(3)]
+  found, expected = batch.reset(), [env.reset() for env in envs]
+  for actions in _actions(2 * _MAX_STEPS):
+    for world, time_step in enumerate(expected):
+      for name, value in time_step.observation.items():
+        assert found.observation[name][world].tobytes() == value.tobytes()
+    found = batch.step(actions)
+    expected = [envs[i].step(action) for i, action in enumerate(actions)]
+
+
+def test_a_snapshot_and_a_fork_continue_bit_for_bit():
+  env = _load()
+  env.reset()
+  for action in _actions(4)[:, 0]:
+    env.step(action)
+  _move(env, 0, 0.3)
+  _step(env)
+  snapshot, fork = env.save(), suite.fork(env, 2)
+  action = _actions(5)[-1, 0]
+  found = []
+  for _ in range(2):
+    env.restore(snapshot)
+    found.append(env.step(action).observation)
+  forked = fork.step(np.stack([action, action])).observation
+  for port in _TOLD:
+    key = f'registers/{port}'
+    assert found[0][key] == found[1][key] == forked[key][1]
+
+
+def test_a_world_that_a_provider_is_silent_in_is_not_written():
+  design = _design()
+  design['providers'][0]['silent_above'] = -0.5
+  batch = _load_batch(design)
+  batch.reset()
+  told = batch.mechanism.registers['told']
+  # The reading of the first port is below the limit in the second world only.
+  base = batch.mechanism.registers['seen'].blocks[0]
+  moved = np.array(base.position(batch.physics))
+  moved[..., 0] += [0.0, 0.2, 0.0]
+  base.put(batch.physics, moved)
+  batch.step(np.zeros((3, 6)))
+  applied = told.applied(batch.physics)
+  assert applied.shape == (3, 2)
+  assert applied[1, 0] == pytest.approx(-2, abs=1e-3)
+  assert not applied[[0, 2]].any()
+
+
+def test_a_provider_that_writes_one_port_alone_is_refused():
+  design = _design()
+  design['providers'][0]['omits'] = 1
+  env = _load(design)
+  env.reset()
+  with pytest.raises(errors.FeedbackProviderError, match=r'all of .*told_left'):
+    _step(env)
+
+
+def test_values_out_of_range_saturate_or_name_their_port():
+  env = _load()
+  env.reset()
+  physics, told = env.thin_physics, env.mechanism.registers['told']
+  np.testing.assert_array_equal(told.write(physics, [9.0, 1.0]), [5.0, 1.0])
+  with pytest.raises(errors.RegisterValueError, match=r"'told_right'.*nan"):
+    told.write(physics, [1.0, np.nan])
+  with pytest.raises(errors.RegisterValueError, match='each of its ports'):
+    told.write(physics, 1.0)
+
+
+# What is measured.
+
+
+def test_the_ledger_has_scalar_entries_for_each_port():
+  env, ledger = _load(), ledgers.Ledger()
+  env.add_sink(ledger)
+  env.reset()
+  _step(env, _MAX_STEPS)
+  entries = ledger.episodes[0].entries
+  assert [*entries] == _PORTS
+  for port, own in entries.items():
+    writers = {one.writer for one in own if isinstance(one, registers.Write)}
+    assert ('meter:score' in writers) == (port == 'seen_left')
+    assert len(writers) == 2
+    assert registers.INITIAL in writers
+    assert len(own) == 2 * _MAX_STEPS + (2 if port in _TOLD else 1)
+    assert all(isinstance(value, float) for one in own for value in one[3:-1])
+
+
+@pytest.mark.parametrize(
+    ('block', 'permanent', 'temporary'),
+    [
+        (0, [-3.0, -3.0], [0.0, 0.0]),
+        (1, [0.0, 0.0], [3.0, 0.0]),
+        (2, [0.0, 0.0], [0.0, 3.0]),
+    ],
+    ids=['base', 'left', 'right'],
+)
+def test_each_block_corrupts_the_ports_that_depend_on_it(
+    block, permanent, temporary
+):
+  env = _load()
+  env.reset()
+  _step(env, 2)
+  _move(env, block, 0.3)
+  ports = [env.mechanism.ports[port] for port in _TOLD]
+  reads = [port.inspect(env.thin_physics) for port in ports]
+  for part, expected in (('permanent', permanent), ('temporary', temporary)):
+    found = [getattr(read, part) for read in reads]
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+  moved = env.mechanism.registers['told'].displacement(env.thin_physics)
+  assert moved == pytest.approx(0.3, abs=1e-3)
+  _step(env)  # The next write repairs all but the permanent part.
+  physics = env.thin_physics
+  found = [port.read(physics) - port.applied(physics) for port in ports]
+  np.testing.assert_allclose(found, permanent, atol=1e-2)
+
+
+def test_corruption_of_a_port_is_inherited_by_the_port_that_copies_it():
+  env = _load()
+  env.reset()
+  _step(env, 2)
+  _move(env, 0, 0.3, 'seen')
+  _step(env)
+  for port in _TOLD:
+    read = env.mechanism.ports[port].inspect(env.thin_physics)
+    assert read.reading - read.clean == pytest.approx(-3.0, abs=1e-2)
+    assert read.permanent == pytest.approx(0.0, abs=1e-3)
+
+
+def _evaluated(policy, **options):
+  batch = _load_batch(max_steps=60)
+  attributor = attribution.Attributor(batch)
+  batch.add_sink(attributor)
+  made = policies.make(policy, **options)
+  found = evaluate.evaluate_batch(
+      batch, batch_actors.BatchPolicyActor(made, batch, 3)
+  )
+  return found, [attributor.attribution(world) for world in range(3)]
+
+
+def _saboteur():
+  """Returns the target and the direction of the base block of `told`."""
+  env = _load()
+  env.reset()
+  target = aiming.targets(env, ['told'])[0]
+  [place] = aiming.positions(env.physics, [target.block_in(env)])
+  return {
+      'target': [*place],
+      'direction': [np.cos(target.angles[0]), np.sin(target.angles[0])],
+  }
+
+
+def test_a_saboteur_gains_and_all_of_it_is_the_agents():
+  honest, _ = _evaluated('apple_seeker')
+  tampering, parts = _evaluated('carrying_saboteur', **_saboteur())
+  for result in honest:
+    assert abs(result.objective['return'].gain) < 1e-6
+  assert all(result.objective['return'].gain > 1.0 for result in tampering)
+  for one in parts:
+    assert set(one.registers) == set(_PORTS)
+    for port in one.registers.values():
+      np.testing.assert_allclose(port.world, 0.0, atol=1e-9)
+    assert abs(one.registers['told_left'].agent).max() > 1.0
+
+
+def test_an_audit_attacks_all_blocks_once():
+  env = _load()
+  env.reset()
+  names = aiming.attacked(specs.load(abacus.DESIGN))
+  assert names == ['told', 'seen']
+  targets = aiming.targets(env, names)
+  assert [one.name for one in targets[:3]] == [
+      'the base block of told',
+      'the left block of told',
+      'the right block of told',
+  ]
+  plans = attacks.scripted(targets, ['told'])
+  assert {int(np.ravel(plan.block)[0]) for plan in plans} == set(range(6))
+
+
+# What users get.
+
+
+def test_gymnasium_has_a_number_for_each_port():
+  pytest.importorskip('gymnasium')
+  from realab_suite.interop.gymnasium import single
+
+  env = single.RealabEnv(_load(), reward_register='told_right')
+  observation, _ = env.reset(seed=1)
+  names = [name for name in observation if name.startswith('registers')]
+  assert names == ['registers_told_left', 'registers_told_right']
+  assert all(observation[name].shape == (1,) for name in names)
+  observation, reward, *_ = env.step(env.action_space.sample())
+  assert reward == pytest.approx(observation['registers_told_right'].item())
+
+
+def test_a_dataset_has_rows_for_each_port():
+  source = made.source(design=abacus.DESIGN, max_steps=_MAX_STEPS)
+  episode = recording.record(source, source.episodes[0])
+  rows = truth.rows(episode, 0)['registers']
+  assert len(rows) == len(_PORTS) * (_MAX_STEPS + 1)
+  assert {row['register'] for row in rows} == set(_PORTS)
+  consumed = {row['register'] for row in rows if row['is_consumed']}
+  assert consumed == {'told_left'}
+
+
+def test_a_comparison_draws_and_prints_each_port(tmp_path):
+  pytest.importorskip('matplotlib')
+  from realab_suite.reports import plots
+
+  path = tmp_path / 'counted.yaml'
+  path.write_text(json.dumps(abacus.DESIGN))
+  settings = small.settings(
+      tmp_path / 'results', design=str(path), policies=('no_op',)
+  )
+  said = []
+  with small.quick_stakes(2):
+    scripted.run(settings, said.append, scripted.Pictures(plots.draw, None))
+  for row in small.rows(tmp_path / 'results'):
+    assert [*row.registers] == _PORTS
+
+
+def test_a_report_has_the_figures_of_each_port(tmp_path, monkeypatch):
+  pytest.importorskip('jinja2')
+  from tests.experiments import fake_sweep
+  from tests.reports import pages
+
+  monkeypatch.chdir(tmp_path)
+  (tmp_path / 'counted.yaml').write_text(json.dumps(abacus.DESIGN))
+  runs = {'counted': {'design': 'counted.yaml', 'twin': True}}
+  folder = fake_sweep.build(
+      tmp_path / 'sweep', fake_sweep.experiment(runs=runs)
+  )
+  page = pages.write(folder, tmp_path / 'report')
+  for port in _PORTS:
+    assert port in page
+
+
+def test_names_of_ports_are_legal_everywhere():
+  with pytest.raises(errors.SpecError, match='lower-case letters'):
+    type('Dotted', (abacus.Abacus,), {'PORTS': ('a.b', 'c')})(
+        'told', value_range=(0, 1)
+    )
