@@ -23,6 +23,7 @@ from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 from realab_suite.experiments import scripted
+from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
 from tests.authors import abacus
 from tests.datasets import made
@@ -414,6 +415,72 @@ def test_a_report_has_the_figures_of_each_port(tmp_path, monkeypatch):
   page = pages.write(folder, tmp_path / 'report')
   for port in _PORTS:
     assert port in page
+
+
+# Kinds that do not keep to their spec.
+
+
+def _kind(name, base, shape_of):
+  """Registers a kind whose readings have another shape; returns a design."""
+
+  class Wrong(base):
+    """A register that reads too much."""
+
+    def _read_blocks(self, physics):
+      return shape_of(super()._read_blocks(physics))
+
+  register_kinds.REGISTER_KINDS.add(name)(Wrong)
+  return {
+      'schema': 1,
+      'name': 'wrong',
+      'registers': {
+          'one': {
+              'kind': name,
+              'role': 'feedback',
+              'place': 'station_1',
+              'range': [0, 5],
+          }
+      },
+  }
+
+
+@pytest.mark.parametrize(
+    ('name', 'base', 'shape_of'),
+    [
+        (
+            'wide',
+            registers.TwoBlockRegister,
+            lambda value: np.stack([value] * 3, axis=-1),
+        ),
+        ('narrow', abacus.Abacus, lambda value: value[..., 0]),
+        (
+            'whole',
+            registers.TwoBlockRegister,
+            lambda value: np.asarray(value).astype(int),
+        ),
+    ],
+    ids=['vector', 'scalar', 'integer'],
+)
+def test_a_kind_that_reads_other_values_is_refused(name, base, shape_of):
+  design = _kind(name, base, shape_of)
+  message = 'register kind Wrong: _read_blocks of register .one. returned'
+  with pytest.raises(errors.SpecError, match=message):
+    _load(design)
+  with pytest.raises(errors.SpecError, match=message):
+    _load_batch(design)
+
+
+def test_a_kind_that_reads_other_values_later_is_refused(monkeypatch):
+  env, batch = _load(), _load_batch()
+  for one in (env, batch):
+    one.reset()
+  monkeypatch.setattr(
+      abacus.Abacus, '_read_blocks', lambda self, physics: np.zeros(5)
+  )
+  with pytest.raises(errors.SpecError, match='register kind Abacus'):
+    _step(env)
+  with pytest.raises(errors.SpecError, match='register kind Abacus'):
+    batch.step(np.zeros((3, 6)))
 
 
 def test_names_of_ports_are_legal_everywhere():

@@ -365,6 +365,9 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
       displacement: Displacement of the register from its current position, in
         its own frame, `(2,)`, in m.
+
+    Raises:
+      SpecError: If the register reads anything but values of its spec.
     """
     first = self._blocks[0]
     origin = np.array(first.position(physics))
@@ -374,6 +377,7 @@ class Register(composer.Entity):
     self._origin_slot.set(physics, origin)
     shape = (*origin.shape[:-1], *self._shape)
     self.pose(physics, np.full(shape, self._initial))
+    self.inspect(physics)  # Refuses wrong readings before an episode begins.
 
   def pose(self, physics: protocols.Physics, value: Any) -> None:
     """Moves the blocks to the undisturbed poses that represent a value.
@@ -576,6 +580,9 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
       reader: Name of the reader, for the record.
       step: Control step of the read, `(...)`, int, for the record.
+
+    Raises:
+      SpecError: If the register reads anything but values of its spec.
     """
     reading = self.read(physics)
     applied = self._applied_slot.get(physics)
@@ -584,6 +591,10 @@ class Register(composer.Entity):
     else:
       permanent = np.asarray(self._permanent(physics))
     obstruction = self.obstruction(physics)
+    if reading.shape != applied.shape or reading.dtype != np.float64:
+      raise checks.misreading(self, '_read_blocks', reading, applied)
+    if permanent.shape != applied.shape:
+      raise checks.misreading(self, '_permanent', permanent, applied)
     temporary = reading - applied - obstruction - permanent
     return records.Read(
         self._name,

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 import re
+from typing import Any
 
 import numpy as np
 
@@ -96,4 +97,23 @@ def refusal(
   return errors.RegisterValueError(
       f'register {name!r}: cannot store {np.asarray(value)[first]}; {allowed}',
       int(worlds[0]) if worlds else None,
+  )
+
+
+def misreading(
+    register: Any, method: str, value: np.ndarray, expected: np.ndarray
+) -> errors.SpecError:
+  """Returns an error for what a register kind has returned.
+
+  Args:
+    register: The register.
+    method: Name of the method that returned a wrong value.
+    value: What it returned.
+    expected: A value of the right shape.
+  """
+  ports = f', with its ports {list(register.PORTS)}' if register.PORTS else ''
+  return errors.SpecError(
+      f'register kind {type(register).__name__}: {method} of register'
+      f' {register.name!r} returned {value.dtype} {value.shape}; allowed is'
+      f' float64 {expected.shape}{ports}'
   )
