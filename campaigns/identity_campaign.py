@@ -22,6 +22,7 @@ from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import ledgers
 from realab_suite.policies import action_sets
+from realab_suite.tasks import unlock_door
 from tests import worlds
 from tests.engine import helpers
 
@@ -32,6 +33,7 @@ _PROCESSES = 2
 _MAX_STEPS = 120  # Every run contains ends of episodes.
 _REPEATS = 6  # An agent with a new action in each step stays where it is.
 _STEPS_PER_VISIT = 20
+_VISITED = ('doorway', 'side_room')
 _HAND_DISTANCE = 0.5  # Distance from the avatar, in m.
 _PUSH = 3.0  # In m/s or rad/s.
 
@@ -302,13 +304,16 @@ def _visit(env: Any, case: Case, step: int, push: np.ndarray) -> None:
   position = avatar.position(physics)
   registers = env.mechanism.registers.values()
   blocks = [block for register in registers for block in register.blocks]
-  places = list(env.task.root_entity.places.values())
+  places = env.task.root_entity.places
+  visited = [places[name].position for name in _VISITED if name in places]
+  if isinstance(env.task, unlock_door.UnlockDoor):
+    visited.insert(0, unlock_door.PAD)
   if kind == 0 and blocks:
     block = blocks[(number + case.seed) % len(blocks)]
     position[...] = physics.bind(block.geom).xpos[..., :2]
     position[..., 0] -= _HAND_DISTANCE
-  elif kind == 1:
-    position[...] = places[(number + case.seed) % len(places)].position
+  elif kind == 1 and visited:
+    position[...] = visited[(number + case.seed) % len(visited)]
   else:
     joints = env.task.root_entity.mjcf_model.find_all('joint')
     binding = physics.bind(tuple(joints))

@@ -8,18 +8,11 @@ import pytest
 import yaml
 
 from pictures import notebooks
-from realab_suite import policies
 from realab_suite import suite
-from realab_suite.entities import appearance
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
-from realab_suite.feedback import measurements
-from realab_suite.feedback import objectives
-from realab_suite.feedback import providers
-from realab_suite.feedback import register_kinds
 from realab_suite.launchers import audit
-from realab_suite.policies import action_sets
-from realab_suite.tasks import registry
+from tests import registries
 from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[1]
@@ -44,26 +37,11 @@ def _python_blocks(path):
   return re.findall(r'```python\n(.*?)```', path.read_text(), re.DOTALL)
 
 
-@pytest.fixture
-def registries():
+@pytest.fixture(name='registries')
+def fixture_registries():
   """Removes the entries that a page registers."""
-  before = [
-      (registry, dict(registry))
-      for registry in (
-          measurements.MEASUREMENTS._entries,
-          objectives.OBJECTIVES._entries,
-          policies.POLICIES._entries,
-          providers.PROVIDERS._entries,
-          register_kinds.REGISTER_KINDS._entries,
-          action_sets.ACTION_SETS._entries,
-          appearance._CLASSES,
-          registry._TASKS,
-      )
-  ]
-  yield
-  for names, entries in before:
-    names.clear()
-    names.update(entries)
+  with registries.preserved():
+    yield
 
 
 @pytest.mark.parametrize(

@@ -357,7 +357,7 @@ def make(
         f' whose kind is one of {sorted(LEARNERS)}'
     )
   num_envs = integers.check('num_envs', num_envs, 1)
-  seed = integers.check('seed', seed, 0)
+  seed = integers.check('seed', seed, 0, high=None)
   if not isinstance(spec, specs.LearnerSpec):
     spec = validation.validate(specs.LearnerSpec, spec, 'learner')
   learner_class = LEARNERS.get(spec.kind)

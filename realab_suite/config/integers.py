@@ -19,7 +19,7 @@ def check(
     name: str,
     given: Any,
     low: int,
-    high: int = LARGEST,
+    high: int | None = LARGEST,
     *,
     more: str = '',
     error: type[errors.RealabError] = errors.SpecError,
@@ -30,16 +30,16 @@ def check(
     name: Name of the argument, for the error message.
     given: Value of the argument.
     low: Smallest allowed value.
-    high: Largest allowed value.
+    high: Largest allowed value; `None` if there is none.
     more: Other allowed values, for the error message.
     error: Class of the error.
 
   Raises:
     RealabError: Of the class `error`, if it is not an integer in this range.
   """
-  if is_integer(given) and low <= given <= high:
+  if is_integer(given) and low <= given and (high is None or given <= high):
     return int(given)
-  limit = '' if high == LARGEST else f' to {high}'
+  limit = '' if high in (None, LARGEST) else f' to {high}'
   raise error(
       f'{name}: {messages.quote(given)}; allowed are integers from'
       f' {low}{limit}{more}'

@@ -1,7 +1,9 @@
 """An odd world keeps the contract and works with the rest of the package."""
 
 import contextlib
+import importlib
 import pathlib
+import sys
 from typing import Any
 
 import numpy as np
@@ -26,9 +28,18 @@ from realab_suite.interop.gymnasium import single
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import rooms
 from realab_suite.tasks import unlock_door
-from tests.authors import worlds
+from tests import registries
 
+_AUTHORS = 'tests.authors.worlds'
 _CRAB = {'action_set': {'name': 'crab', 'version': 1}}
+
+
+@pytest.fixture(scope='module', name='worlds')
+def fixture_worlds() -> Any:
+  """The module of the author, whose names other tests do not know."""
+  with registries.preserved():
+    yield importlib.import_module(_AUTHORS)
+  del sys.modules[_AUTHORS]
 
 
 @pytest.mark.parametrize(
@@ -39,7 +50,7 @@ def test_the_shipped_worlds_keep_the_contract(world: Any):
 
 
 @pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
-def test_an_odd_world_keeps_the_contract(fields: dict[str, Any]):
+def test_an_odd_world_keeps_the_contract(worlds: Any, fields: dict[str, Any]):
   testing.check_world(
       worlds.Beacons, worlds.design(**fields), max_steps=100, num_steps=20
   )
@@ -130,14 +141,15 @@ def test_a_breach_of_the_contract_is_named(breach: str):
 
 
 @pytest.fixture(name='world')
-def fixture_world(monkeypatch: pytest.MonkeyPatch) -> named.World:
+def fixture_world(worlds: Any, monkeypatch: pytest.MonkeyPatch) -> named.World:
+  del worlds  # Registers the world.
   monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
   return named.World('beacons', 'standard', 60)
 
 
 @pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
 def test_its_solver_and_controls_are_judged(
-    world: named.World, fields: dict[str, Any]
+    worlds: Any, world: named.World, fields: dict[str, Any]
 ):
   design = specs.load(worlds.design(**fields))
   stake = named.stakes_of(world, design)
@@ -159,7 +171,10 @@ def test_its_solver_and_controls_are_judged(
 
 @pytest.mark.parametrize('fields', [{}, _CRAB], ids=['vectors', 'indices'])
 def test_its_scripted_policies_are_compared(
-    world: named.World, fields: dict[str, Any], tmp_path: pathlib.Path
+    worlds: Any,
+    world: named.World,
+    fields: dict[str, Any],
+    tmp_path: pathlib.Path,
 ):
   design = tmp_path / 'design.yaml'
   design.write_text(yaml.safe_dump(worlds.design(**fields)))
@@ -181,7 +196,9 @@ def test_its_scripted_policies_are_compared(
   assert 'the control' in ''.join(said)
 
 
-def test_it_is_audited_with_the_actions_that_it_has(world: named.World):
+def test_it_is_audited_with_the_actions_that_it_has(
+    worlds: Any, world: named.World
+):
   settings = audits.Settings(world, specs.load(worlds.design()), budget=40)
   found = audits.Auditor(settings).run()
   assert found.verdict in ('EXPLOITABLE', 'RESISTED', 'UNDECIDED')
@@ -193,7 +210,7 @@ def test_it_is_audited_with_the_actions_that_it_has(world: named.World):
     ).run()
 
 
-def test_gymnasium_takes_it(world: named.World):
+def test_gymnasium_takes_it(worlds: Any, world: named.World):
   design = specs.load(worlds.design(**_CRAB))
   env = single.RealabEnv(world.load(design, 1), reward_register='reward')
   with contextlib.closing(env):
@@ -203,7 +220,9 @@ def test_gymnasium_takes_it(world: named.World):
     assert env.action_space.n == len(worlds.CRAB)
 
 
-def test_datasets_take_it(world: named.World, tmp_path: pathlib.Path):
+def test_datasets_take_it(
+    worlds: Any, world: named.World, tmp_path: pathlib.Path
+):
   pytest.importorskip('pyarrow')
   design = specs.load(worlds.design(**_CRAB))
   source = sources.of_policy(

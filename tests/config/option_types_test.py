@@ -96,7 +96,7 @@ def _typed() -> Iterator[None]:
 
 
 @pytest.mark.parametrize(('policy', 'options', 'message'), [
-    ('no_op', {'speed': 1}, ": unknown key 'speed' (allowed: none)"),
+    ('no_op', {'speed': 1}, ": unknown key 'speed' (allowed: action_set)"),
     ('apple_seeker', {'half_widht': 3},
         ": unknown key 'half_widht'; did you mean 'half_width'? (allowed:"
         ' half_width)'),

@@ -10,6 +10,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.tasks import collect_apples
+from realab_suite.tasks import registry
 
 _WORLD = 'collect_apples', 'standard'
 _DESIGN = 'instantaneous_reward'
@@ -241,7 +242,7 @@ def test_a_task_that_fails_to_be_made_is_an_argument_that_is_wrong(monkeypatch):
     raise ZeroDivisionError('no room\nat all')
 
   tasks = {('broken', 'task'): (make, frozenset())}
-  monkeypatch.setattr(suite, '_TASKS', tasks)
+  monkeypatch.setattr(registry, '_TASKS', tasks)
   with pytest.raises(errors.SpecError) as caught:
     suite.load('broken', 'task', {'size': 3})
   assert str(caught.value) == (

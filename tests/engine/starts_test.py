@@ -13,6 +13,7 @@ from realab_suite.engine import starts
 from realab_suite.entities import moving
 from realab_suite.entities import rotations
 from realab_suite.tasks import collect_apples
+from realab_suite.tasks import registry
 
 _WALL = {'name': 'slab', 'type': 'box', 'size': (0.6, 0.05, 0.5)}
 _PARKED = (0.0, 0.0, -3.0)
@@ -97,8 +98,8 @@ def test_another_attempt_may_put_the_wall_elsewhere():
 
 
 def test_a_batch_refuses_and_repeats_as_one_world_does(monkeypatch: Any):
-  monkeypatch.setitem(suite._TASKS, ('test', 'maze'), (_two_places, ()))
-  monkeypatch.setitem(suite._TASKS, ('test', 'shut'), (_taken, ()))
+  monkeypatch.setitem(registry._TASKS, ('test', 'maze'), (_two_places, ()))
+  monkeypatch.setitem(registry._TASKS, ('test', 'shut'), (_taken, ()))
   kwargs = {'num_envs': 3, 'num_threads': 1, 'design': _design()}
   batch = suite.load_batch('test', 'maze', {'random': 2}, **kwargs)
   for _ in range(3):

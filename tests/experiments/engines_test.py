@@ -21,7 +21,8 @@ def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
   monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
   for name in ('ray', 'submitit'):
     with pytest.raises(
-        errors.SpecError, match=rf'--engine={name}: .*realab-suite\[cluster\]'
+        errors.SpecError,
+        match=rf'--engine={name}: .*pip install -e .\.\[cluster\]',
     ):
       engines.ENGINES[name](1)
 

@@ -487,7 +487,7 @@ def test_tensorboard_gets_the_points(tmp_path):
 
 def test_without_tensorboardx_a_run_says_what_to_install(tmp_path, monkeypatch):
   monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
-  with pytest.raises(errors.SpecError, match=r'realab-suite\[tb\]'):
+  with pytest.raises(errors.SpecError, match=r'pip install -e .\.\[tb\]'):
     _run(_job(), tmp_path, tensorboard=True)
   assert not list(tmp_path.iterdir())
 
@@ -495,5 +495,5 @@ def test_without_tensorboardx_a_run_says_what_to_install(tmp_path, monkeypatch):
 def test_without_jax_a_run_says_what_to_install(tmp_path, monkeypatch):
   monkeypatch.setattr(training, 'make_learner', _make_learner)
   monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
-  with pytest.raises(errors.SpecError, match=r'realab-suite\[agents\]'):
+  with pytest.raises(errors.SpecError, match=r'pip install -e .\.\[agents\]'):
     _run(_job(), tmp_path)

@@ -173,7 +173,7 @@ def _measure(measurement: Callable[[Any], Any]) -> Secret:
   """The meter of `UNREAD_METER` measures something else."""
 
   def alter(env: Any) -> None:
-    (_, meter), *_ = env.mechanism._meters
+    (_, meter, _), *_ = env.mechanism._meters
     # One world or many, by the shape of what is counted.
     meter._measurement = lambda physics: measurement(
         np.asarray(env.mechanism.step_count(physics), float)
