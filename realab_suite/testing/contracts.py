@@ -1,4 +1,4 @@
-"""What the contracts have in common: how a breach is reported."""
+"""Reports of breaches, which all contracts share."""
 
 from collections.abc import Mapping
 from typing import Any, final

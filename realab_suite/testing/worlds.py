@@ -77,7 +77,7 @@ def check_world(
 
 @final
 class _Moment(NamedTuple):
-  """What a control step resulted in.
+  """Result of a control step.
 
   Attributes:
     arrays: Observation of the agent, type of the step and true reward.

@@ -112,7 +112,7 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     'a low bound': ({'max_true_return': 3.0}, 'max_true_return is 3'),
     'no bound': ({'max_true_return': np.inf}, 'has to be a finite number'),
-    'an unknown solver': ({'SOLVER': 'nobody'}, "'nobody' is in SOLVER or"),
+    'an unknown solver': ({'SOLVER': 'unknown'}, "'unknown' is in SOLVER or"),
     'an unknown saboteur': ({'SABOTEURS': ('anybody',)}, "'anybody' is in SOL"),
     'a weak solver': ({'SOLVER': 'no_op'}, "'no_op' earns 20"),
     'events that push': ({'latch_events': _pushes}, 'pushes something'),
