@@ -61,9 +61,8 @@ class PolicyActor:
 
   Policies return action indices. Where the environment has another action set,
   the actor converts the index to that of the same action, and where it takes
-  vectors, to a vector. Query registers get the index of the action
-  taken, or of one drawn independently, depending on `query_policy` of the
-  design's learner.
+  vectors, to a vector. Query registers get the index of the action taken, or of
+  one drawn independently, depending on `query_policy` of the design's learner.
   """
 
   def __init__(

@@ -90,7 +90,7 @@ def pack(
         storage.result_path(folder / job, name)
         names.append(f'{job}/{name}')
     if storage.TRAINING_EPISODES in done:
-      files[f'{job}/{training.TRAINING_GAINS}'] = _gains(folder / job)
+      files[f'{job}/{storage.TRAINING_GAINS}'] = _gains(folder / job)
   for name in sorted(names):
     with storage.explained(folder / name):
       files[name] = (folder / name).read_bytes()
@@ -105,8 +105,8 @@ def pack(
 def _gains(path: pathlib.Path) -> bytes:
   """Returns the training episodes of a job as reports need them."""
   with storage.explained(path):
-    if (path / training.TRAINING_GAINS).exists():  # From a packed sweep.
-      return (path / training.TRAINING_GAINS).read_bytes()
+    if (path / storage.TRAINING_GAINS).exists():  # From a packed sweep.
+      return (path / storage.TRAINING_GAINS).read_bytes()
     episodes, curve = (
         [json.loads(line) for line in (path / name).read_text().splitlines()]
         for name in (storage.TRAINING_EPISODES, training.CURVE)
@@ -192,7 +192,15 @@ def _stage(
         if f'{job}/{name}' in left_out
     }
     if missing:
-      storage.write_sealed(folder / job / storage.LEFT_OUT, {'files': missing})
+      gains = f'{job}/{storage.TRAINING_GAINS}'
+      added = (
+          {storage.TRAINING_GAINS: _digest(files[gains])}
+          if gains in files
+          else {}
+      )
+      storage.write_sealed(
+          folder / job / storage.LEFT_OUT, {'files': missing, 'added': added}
+      )
     if not jobs.is_done(folder / job):
       raise errors.ResultsError(f'{folder / job / storage.DONE}: missing')
   return found

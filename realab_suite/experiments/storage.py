@@ -20,6 +20,8 @@ DONE = 'done.json'
 LEFT_OUT = 'left_out.json'
 LEARNER = 'learner.bin'
 TRAINING_EPISODES = 'training_episodes.jsonl'
+# In packed sweeps, instead of TRAINING_EPISODES.
+TRAINING_GAINS = 'training_gains.jsonl'
 # Results that packed sweeps may leave out.
 LEAVABLE = frozenset({LEARNER, TRAINING_EPISODES})
 _LOCK = 'lock'
@@ -163,13 +165,15 @@ def is_done(path: pathlib.Path) -> bool:
   """Returns True if the run of a folder has finished.
 
   Raises:
-    ResultsError: If a result was changed or removed after that. Only results
-      that `left_out` lists may be missing.
+    ResultsError: If a result, or a file that a packed sweep has instead, was
+      changed or removed after that. Only results that `left_out` lists may be
+      missing.
   """
   if not (path / DONE).exists():
     return False
   missing = left_out(path)
-  for name, digest in read_done(path / DONE).items():
+  recorded = {**read_done(path / DONE), **_added(path)}
+  for name, digest in recorded.items():
     if missing.get(name) == digest and not os.path.lexists(path / name):
       continue
     if _digest(path / name) != digest:
@@ -249,6 +253,20 @@ def left_out(path: pathlib.Path) -> dict[str, str]:
         f' {", ".join(sorted(LEAVABLE))}; {advice}'
     )
   return files
+
+
+def _added(path: pathlib.Path) -> dict[str, str]:
+  """Returns the SHA-256 of files that a packed sweep has instead of results."""
+  if not os.path.lexists(path / LEFT_OUT):
+    return {}
+  advice = f'remove {path} to run it again'
+  added = read_sealed(path / LEFT_OUT, advice).get('added', {})
+  if not isinstance(added, dict) or added.keys() - {TRAINING_GAINS}:
+    raise errors.ResultsError(
+        f'{path / LEFT_OUT}: added is {added!r:.80}; allowed is'
+        f' {TRAINING_GAINS}; {advice}'
+    )
+  return added
 
 
 def result_path(path: pathlib.Path, name: str) -> pathlib.Path:

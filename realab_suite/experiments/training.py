@@ -43,8 +43,7 @@ EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
 TIMING = 'timing.jsonl'
 TRAINING_EPISODES = storage.TRAINING_EPISODES
-# In packed sweeps, instead of TRAINING_EPISODES.
-TRAINING_GAINS = 'training_gains.jsonl'
+TRAINING_GAINS = storage.TRAINING_GAINS
 LEARNER = storage.LEARNER
 TRACE = 'trace.bin'
 TRANSPLANT = 'transplant.jsonl'
