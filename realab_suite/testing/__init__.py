@@ -2,6 +2,7 @@
 
 from realab_suite.testing.contracts import ContractError
 from realab_suite.testing.providers import check_provider
+from realab_suite.testing.registers import check_register
 from realab_suite.testing.worlds import check_world
 
-__all__ = ['ContractError', 'check_provider', 'check_world']
+__all__ = ['ContractError', 'check_provider', 'check_register', 'check_world']

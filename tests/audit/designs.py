@@ -66,13 +66,19 @@ class ThreeBlocks(registers.Register):
     ]
     return [self._base, *self._others]
 
+  def _places(self, physics, value):
+    origin = self._origin(physics)
+    along = np.asarray(value) * self._scale
+    return [origin] + [
+        moves.undisturbed(
+            origin + np.array([0.0, y, 0.0]), along, block.rest_height
+        )
+        for block, y in zip(self._others, _ASIDE, strict=True)
+    ]
+
   def _put(self, physics, value, where=None):
-    for block, y in zip(self._others, _ASIDE, strict=True):
-      place = moves.undisturbed(
-          self._origin(physics) + np.array([0.0, y, 0.0]),
-          np.asarray(value) * self._scale,
-          block.rest_height,
-      )
+    _, *places = self._places(physics, value)
+    for block, place in zip(self._others, places, strict=True):
       block.put(physics, place, where=where)
 
   def _shift(self, physics, value, where=None):

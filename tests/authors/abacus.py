@@ -32,11 +32,20 @@ class Abacus(registers.Register):
     ]
     return [base, *self._beads]
 
+  def _places(self, physics, value):
+    origin = self._origin(physics)
+    return [origin] + [
+        moves.undisturbed(
+            origin + start, value[..., i] * self._scale, bead.rest_height
+        )
+        for i, (start, bead) in enumerate(
+            zip(self._starts, self._beads, strict=True)
+        )
+    ]
+
   def _put(self, physics, value, where=None):
-    for i, bead in enumerate(self._beads):
-      start = self._origin(physics) + self._starts[i]
-      along = value[..., i] * self._scale
-      place = moves.undisturbed(start, along, bead.rest_height)
+    _, *places = self._places(physics, value)
+    for bead, place in zip(self._beads, places, strict=True):
       bead.put(physics, place, where=where)
 
   def _shift(self, physics, value, where=None):

@@ -376,10 +376,14 @@ class _Circling(registers.Register):
     self._block = self._add_block('block', 'offset_block', (0.0, 0.0))
     return [self._block]
 
-  def _put(self, physics, value, where=None):
+  def _places(self, physics, value):
     position = np.array(self._origin(physics))
     position[..., 0] += 0.5 * np.cos(value)
     position[..., 1] += 0.5 * np.sin(value)
+    return [position]
+
+  def _put(self, physics, value, where=None):
+    [position] = self._places(physics, value)
     self._block.put(physics, position, heading=value, where=where)
 
   def _read_blocks(self, physics):

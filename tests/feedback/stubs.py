@@ -38,8 +38,9 @@ class Still(registers.Register):
   def _build_blocks(self) -> list[Any]:
     return [self._add_block('block', 'offset_block', (0.0, 0.0))]
 
-  def _put(self, physics: Any, value: Any, where: Any = None) -> None:
-    del physics, value, where
+  def _places(self, physics: Any, value: Any) -> list[np.ndarray]:
+    del value
+    return [self._origin(physics)]
 
   def _read_blocks(self, physics: Any) -> np.ndarray:
     return self.applied(physics)

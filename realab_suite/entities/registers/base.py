@@ -43,11 +43,12 @@ class Register(composer.Entity):
   `register.attach_to(arena, (x, y))`. It works in a plain Composer environment
   as well as in the environments of this package.
 
-  A subclass builds its blocks in `_build_blocks`, moves them to represent a
-  value in `_put` and `_shift`, and computes the represented value in
-  `_read_blocks`. If a write does not restore the coordinates that carry the
-  value of all blocks, the subclass returns the resulting permanent corruption
-  in `_permanent`.
+  A subclass builds its blocks in `_build_blocks`, says where they are for a
+  value in `_places`, and computes the represented value in `_read_blocks`. If
+  values turn blocks, or leave some of them alone, it overrides `_put`; if a
+  write changes less than the poses of the blocks, `_shift`. If a write does not
+  restore the coordinates that carry the value of all blocks, it returns the
+  resulting permanent corruption in `_permanent`.
 
   A register stores one number, of the shape `(...)`, unless its class names
   several *ports*:
@@ -151,6 +152,19 @@ class Register(composer.Entity):
     """
 
   @abc.abstractmethod
+  def _places(
+      self, physics: protocols.Physics, value: np.ndarray
+  ) -> list[np.ndarray]:
+    """Returns the undisturbed position of each block, `(..., 3)`, in m.
+
+    Positions are in the register's frame. `_origin` is that of the first block
+    at the start of the episode.
+
+    Args:
+      physics: One world or a batch of worlds.
+      value: Value in the register's units, `(...)`.
+    """
+
   def _put(
       self,
       physics: protocols.Physics,
@@ -166,6 +180,9 @@ class Register(composer.Entity):
       value: Value in the register's units, `(...)`.
       where: Worlds in which to move them, `(...)` bool; `None` for all worlds.
     """
+    places = self._places(physics, value)
+    for block, place in zip(self._blocks, places, strict=True):
+      block.put(physics, place, where=where)
 
   def _shift(
       self,
@@ -555,16 +572,17 @@ class Register(composer.Entity):
 
     It is the distance in m from the position that the reset and the last write
     gave the block, in any direction, and is computed from the blocks even if
-    the register is secure. In this base class, it is the displacement that all
-    blocks together represent: enough for one block that moves along an axis.
+    the register is secure.
 
     Args:
       physics: One world or a batch of worlds.
     """
-    wrong = self._read_blocks(physics) - self._applied_slot.get(physics)
-    largest = np.abs(wrong).max(axis=-1) if self.PORTS else np.abs(wrong)
-    metres = largest[..., np.newaxis] * self._scale
-    return np.repeat(metres, len(self._blocks), axis=-1)
+    places = self._places(physics, self._applied_slot.get(physics))
+    moved = [
+        np.linalg.norm(block.position(physics) - place, axis=-1)
+        for block, place in zip(self._blocks, places, strict=True)
+    ]
+    return np.stack(moved, axis=-1)
 
   def inspect(
       self,

@@ -37,14 +37,21 @@ class BlockOrientationRegister(base.Register):
     self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
     return [self._block]
 
+  def _places(
+      self, physics: protocols.Physics, value: np.ndarray
+  ) -> list[np.ndarray]:
+    del value  # It turns the block.
+    position = np.array(self._origin(physics))
+    position[..., 2] = self._block.rest_height
+    return [position]
+
   def _put(
       self,
       physics: protocols.Physics,
       value: np.ndarray,
       where: axes.Mask = None,
   ) -> None:
-    position = np.array(self._origin(physics))
-    position[..., 2] = self._block.rest_height
+    [position] = self._places(physics, value)
     self._block.put(physics, position, value * self._scale, where)
 
   def _shift(
@@ -66,7 +73,7 @@ class BlockOrientationRegister(base.Register):
 
   def displacements(self, physics: protocols.Physics) -> np.ndarray:
     turned = self._block.heading(physics) - self.applied(physics) * self._scale
-    moved = moves.distances(physics, self._blocks, [self._origin(physics)])
+    moved = super().displacements(physics)
     # A turned block moves its sides.
     sides = np.abs(turned) * self._block.half_size
     return np.maximum(moved, sides[..., np.newaxis])

@@ -25,13 +25,12 @@ class BlockPositionRegister(base.Register):
     self._block = self._add_block('block', block_kinds.OFFSET_BLOCK, (0.0, 0.0))
     return [self._block]
 
-  def _put(
-      self,
-      physics: protocols.Physics,
-      value: np.ndarray,
-      where: axes.Mask = None,
-  ) -> None:
-    self._block.put(physics, self._position(physics, value), where=where)
+  def _places(
+      self, physics: protocols.Physics, value: np.ndarray
+  ) -> list[np.ndarray]:
+    start = self._origin(physics)
+    along = value * self._scale
+    return [moves.undisturbed(start, along, self._block.rest_height)]
 
   def _shift(
       self,
@@ -51,19 +50,7 @@ class BlockPositionRegister(base.Register):
     return ((1.0, 0.0),)
 
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
-    first, last = (
-        self._position(physics, np.array(value)) for value in self.value_range
+    [first], [last] = (
+        self._places(physics, np.array(value)) for value in self.value_range
     )
     return [footprints.Path(0, first, last, self.value_range)]
-
-  def displacements(self, physics: protocols.Physics) -> np.ndarray:
-    place = self._position(physics, self.applied(physics))
-    return moves.distances(physics, self._blocks, [place])
-
-  def _position(
-      self, physics: protocols.Physics, value: np.ndarray
-  ) -> np.ndarray:
-    """Returns the undisturbed position of the block, `(..., 3)`, in m."""
-    return moves.undisturbed(
-        self._origin(physics), value * self._scale, self._block.rest_height
-    )

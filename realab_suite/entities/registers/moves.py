@@ -1,7 +1,5 @@
 """Moves of the blocks of registers."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from realab_suite.entities import axes
@@ -69,25 +67,6 @@ def turn(
     where: As in `slide`.
   """
   _jointed(block).turn(physics, heading, where)
-
-
-def distances(
-    physics: protocols.Physics,
-    blocks: Sequence[block_kinds.Block],
-    places: Sequence[np.ndarray],
-) -> np.ndarray:
-  """Returns the distance of each block from its place, `(..., blocks)`, in m.
-
-  Args:
-    physics: One world or a batch of worlds.
-    blocks: Blocks of a register.
-    places: Position of each block in the register's frame, `(..., 3)`, in m.
-  """
-  moved = [
-      np.linalg.norm(block.position(physics) - place, axis=-1)
-      for block, place in zip(blocks, places, strict=True)
-  ]
-  return np.stack(moved, axis=-1)
 
 
 def _jointed(block: block_kinds.Block) -> block_kinds.JointedBlock:

@@ -44,13 +44,24 @@ class TwoBlockRegister(base.Register):
       self._mjcf_root.contact.add('exclude', body1='base', body2='offset')
     return [self._base, self._offset]
 
+  def _places(
+      self, physics: protocols.Physics, value: np.ndarray
+  ) -> list[np.ndarray]:
+    base_position = self._origin(physics)
+    offset_position = moves.undisturbed(
+        base_position + self._from_origin,
+        value * self._scale,
+        self._offset.rest_height,
+    )
+    return [base_position, offset_position]
+
   def _put(
       self,
       physics: protocols.Physics,
       value: np.ndarray,
       where: axes.Mask = None,
   ) -> None:
-    position = self._offset_position(physics, value)
+    _, position = self._places(physics, value)
     self._offset.put(physics, position, where=where)
 
   def _shift(
@@ -75,28 +86,10 @@ class TwoBlockRegister(base.Register):
     return (-1.0, 0.0), (1.0, 0.0)
 
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
-    base_position = np.array(self._origin(physics))
     first, last = (
-        self._offset_position(physics, np.array(value))
-        for value in self.value_range
+        self._places(physics, np.array(value)) for value in self.value_range
     )
     return [
-        footprints.Path(0, base_position, base_position, self.value_range),
-        footprints.Path(1, first, last, self.value_range),
+        footprints.Path(i, np.array(start), np.array(end), self.value_range)
+        for i, (start, end) in enumerate(zip(first, last, strict=True))
     ]
-
-  def displacements(self, physics: protocols.Physics) -> np.ndarray:
-    places = [
-        self._origin(physics),
-        self._offset_position(physics, self.applied(physics)),
-    ]
-    return moves.distances(physics, self._blocks, places)
-
-  def _offset_position(
-      self, physics: protocols.Physics, value: np.ndarray
-  ) -> np.ndarray:
-    """Returns the undisturbed position of the offset block, `(..., 3)`."""
-    start = self._origin(physics) + self._from_origin
-    return moves.undisturbed(
-        start, value * self._scale, self._offset.rest_height
-    )

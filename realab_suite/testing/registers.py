@@ -1,0 +1,417 @@
+"""Contract of registers: what every kind of register promises."""
+
+from typing import Any, NamedTuple, final
+
+import mujoco
+import numpy as np
+
+from realab_suite import errors
+from realab_suite.engine import batch_physics
+from realab_suite.engine import single_physics
+from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
+from realab_suite.entities import registers
+from realab_suite.testing import contracts
+
+# Kinds of blocks: channel, dof and yaw of each register that is tried.
+_VARIETIES = (
+    ('embedded', 'free', 0.0),
+    ('embedded', 'planar', 0.7),
+    ('secure', 'free', 0.7),
+    ('welded', 'free', 0.7),
+)
+# Largest rounding error of a reading, in units, and of a position, in m.
+_ROUNDING = 1e-9
+_NUM_VALUES = 9
+_NUM_SHOVES = 3
+_NUM_WORLDS = 3
+# Distance by which a block is displaced in a test, and the least distance that
+# has to be reported for it, in m.
+_MOVED, _LEAST = 0.05, 0.025
+_DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+
+
+def check_register(
+    kind: type[registers.Register],
+    *,
+    value_range: tuple[float, float] = (-2.0, 5.0),
+    **options: Any,
+) -> None:
+  """Checks that a kind of register keeps the contract of registers.
+
+  It is built with blocks of every kind, and in every channel.
+
+  - It stores each value of its range, and the nearest bound of others. A value
+    that is not finite is refused, and nothing changes.
+  - Its readings have the shape and dtype of its values. A look at a register
+    changes nothing, and later writes change no earlier reading.
+  - A write removes temporary corruption, and keeps permanent corruption.
+  - A block that is moved in any direction is a displacement, and some motion of
+    some block changes each reading. A port depends on its own blocks only, and
+    `directions` raise a reading.
+  - Nothing that happens to blocks changes the reading of a secure register, and
+    nothing but writes moves the blocks of a welded one.
+  - Writes put blocks nowhere but on the paths of the footprint.
+  - A reset restores everything. A write to some worlds of a batch is the same
+    as in these worlds alone, and changes no other world.
+
+  Args:
+    kind: Class of the register.
+    value_range: Lowest and highest value.
+    **options: Further arguments of the class.
+
+  Raises:
+    ContractError: If it does not, with the first part that it breaks.
+  """
+  options['value_range'] = value_range
+  world = _World(kind, options)
+  for register in world.registers:
+    subject = _Subject(register, world, _where(register))
+    _check_values(subject)
+    _check_looks(subject)
+    _check_shoves(subject)
+    _check_footprint(subject)
+    if register.channel == 'embedded':
+      _check_displacements(subject)
+    world.restart()
+    before = _state(world.physics)
+    register.write(world.physics, subject.values[-1])
+    _shove(subject, np.random.default_rng(0))
+    world.restart()
+    contracts.require(
+        np.array_equal(_state(world.physics), before),
+        f'{subject.where}: a reset does not restore everything',
+    )
+  _check_batch(world)
+
+
+@final
+class _World:
+  """World with a register of every variety, out of reach of one another."""
+
+  def __init__(
+      self, kind: type[registers.Register], options: dict[str, Any]
+  ) -> None:
+    low, high = options['value_range']
+    spacing = 2.0 + 2 * (high - low) * options.get('scale', 0.1)
+    arena = arenas.OpenRoom(half_width=spacing)
+    self.registers = []
+    for i, (channel, dof, yaw) in enumerate(_VARIETIES):
+      register = kind(f'r{i}', **options, channel=channel, dof=dof)
+      place = spacing * ((i % 2) - 0.5), spacing * ((i // 2) - 0.5)
+      register.attach_to(arena, place, yaw)
+      self.registers.append(register)
+    blocks = [b for register in self.registers for b in register.blocks]
+    if any(
+        block_kinds.find_misfit(b, block_kinds.LONG_SUBSTEP) for b in blocks
+    ):
+      arena.mjcf_model.option.timestep = block_kinds.SHORT_SUBSTEP
+    else:
+      arena.mjcf_model.option.timestep = block_kinds.LONG_SUBSTEP
+    self.physics = single_physics.ThinPhysics.from_mjcf_model(arena.mjcf_model)
+    self.restart()
+
+  def restart(self) -> None:
+    """Begins an episode."""
+    with self.physics.reset_context():
+      for register in self.registers:
+        register.initialize_episode(self.physics, np.random.RandomState(0))
+
+
+@final
+class _Subject(NamedTuple):
+  """A register in a world.
+
+  Attributes:
+    register: The register.
+    world: Its world.
+    where: Description of the register, for messages.
+  """
+
+  register: registers.Register
+  world: _World
+  where: str
+
+  @property
+  def physics(self) -> single_physics.ThinPhysics:
+    """The world."""
+    return self.world.physics
+
+  @property
+  def values(self) -> np.ndarray:
+    """Values of the range, `(values, ...)`; those of ports differ."""
+    low, high = self.register.value_range
+    values = np.linspace(low, high, _NUM_VALUES)
+    if not self.register.PORTS:
+      return values
+    shifted = [np.roll(values, i) for i in range(len(self.register.PORTS))]
+    return np.stack(shifted, axis=-1)
+
+  def read(self) -> np.ndarray:
+    """Returns the reading."""
+    return self.register.read(self.physics)
+
+  def write(self, value: Any) -> np.ndarray:
+    """Writes a value and returns the applied one."""
+    return self.register.write(self.physics, value)
+
+
+def _where(register: registers.Register) -> str:
+  name = type(register).__name__
+  return f'{name}, {register.channel} with {type(register.blocks[0]).__name__}'
+
+
+def _state(physics: single_physics.ThinPhysics) -> np.ndarray:
+  """Returns all that the future of a world depends on."""
+  kind = mujoco.mjtState.mjSTATE_INTEGRATION
+  model, data = physics.model.ptr, physics.data.ptr
+  state = np.empty(mujoco.mj_stateSize(model, kind))
+  mujoco.mj_getState(model, data, state, kind)
+  return state
+
+
+def _are_close(one: Any, other: Any) -> bool:
+  return np.allclose(one, other, rtol=0, atol=_ROUNDING)
+
+
+def _check_values(subject: _Subject) -> None:
+  """Checks that the register stores values, saturates and refuses."""
+  register, where = subject.register, subject.where
+  spec = register.value_spec
+  contracts.require(
+      len({*register.PORTS}) == len(register.PORTS),
+      f'{where}: PORTS names a port twice: {register.PORTS}',
+  )
+  low, high = register.value_range
+  for value in subject.values:
+    applied, reading = subject.write(value), subject.read()
+    contracts.require(
+        np.array_equal(applied, value),
+        f'{where}: write({value}) returned {applied}',
+    )
+    for look in (applied, reading):
+      contracts.require(
+          type(look) in (np.ndarray, np.float64)
+          and (look.shape, look.dtype) == (spec.shape, np.float64),
+          f'{where}: {look!r}; values are float64 of the shape {spec.shape}',
+      )
+    contracts.require(
+        _are_close(reading, value), f'{where}: {value} is read as {reading}'
+    )
+  for beyond, bound in ((low - 1.0, low), (high + 1.0, high)):
+    applied = subject.write(np.full(spec.shape, beyond))
+    contracts.require(
+        np.all(applied == bound) and _are_close(subject.read(), bound),
+        f'{where}: {beyond} was applied as {applied}, not saturated to {bound}',
+    )
+  before = _state(subject.physics)
+  for value in (np.nan, np.inf):
+    try:
+      subject.write(np.full(spec.shape, value))
+    except errors.RegisterValueError:
+      pass
+    else:
+      raise contracts.ContractError(f'{where}: {value} is not refused')
+  contracts.require(
+      np.array_equal(_state(subject.physics), before),
+      f'{where}: a refused value changes the world',
+  )
+
+
+def _check_looks(subject: _Subject) -> None:
+  """Checks that looks change nothing and stay what they were."""
+  register, physics = subject.register, subject.physics
+  where = subject.where
+  subject.write(subject.values[1])
+  _shove(subject, np.random.default_rng(0))
+  physics.forward()
+  before = _state(physics)
+  looks = [
+      subject.read(),
+      register.applied(physics),
+      register.displacements(physics),
+      register.inspect(physics).permanent,
+  ]
+  contracts.require(
+      np.array_equal(_state(physics), before),
+      f'{where}: a look at the register changes the world',
+  )
+  kept = [np.copy(look) for look in looks]
+  subject.write(subject.values[-2])
+  for look, was in zip(looks, kept, strict=True):
+    contracts.require(
+        np.array_equal(look, was), f'{where}: a later write changes a reading'
+    )
+
+
+def _shove(subject: _Subject, generator: np.random.Generator) -> None:
+  """Pushes, lifts and turns every block of a register, at random."""
+  physics = subject.physics
+  for block in subject.register.blocks:
+    body = physics.model.geom_bodyid[physics.bind(block.geom).element_id]
+    force = generator.uniform((-40, -40, 0, -2, -2, -2), (40, 40, 30, 2, 2, 2))
+    force *= physics.model.body_mass[body]
+    physics.data.xfrc_applied[body] = force
+    physics.advance(8)
+    physics.data.xfrc_applied[body] = 0.0
+
+
+def _check_shoves(subject: _Subject) -> None:
+  """Checks what remains of the value when blocks are pushed."""
+  register, physics = subject.register, subject.physics
+  where = subject.where
+  generator = np.random.default_rng(0)
+  value = subject.values[2]
+  for _ in range(_NUM_SHOVES):
+    subject.write(value)
+    reading = subject.read()
+    places = [np.array(block.position(physics)) for block in register.blocks]
+    _shove(subject, generator)
+    if register.channel != 'embedded':
+      contracts.require(
+          np.array_equal(subject.read(), reading),
+          f'{where}: the reading changed from {reading} to {subject.read()}',
+      )
+    if register.channel == 'welded':
+      now = [block.position(physics) for block in register.blocks]
+      contracts.require(
+          np.array_equal(now, places),
+          f'{where}: something but a write moved it',
+      )
+    before = register.inspect(physics).permanent
+    subject.write(value)
+    after = register.inspect(physics)
+    contracts.require(
+        _are_close(after.temporary, 0.0),
+        f'{where}: a write leaves a temporary corruption of {after.temporary};'
+        ' _permanent returns what a write cannot undo',
+    )
+    contracts.require(
+        _are_close(after.permanent, before),
+        f'{where}: a write changes the permanent corruption from {before} to'
+        f' {after.permanent}',
+    )
+
+
+def _check_displacements(subject: _Subject) -> None:
+  """Checks the consequences of the motion of a single block."""
+  register, physics = subject.register, subject.physics
+  where = subject.where
+  contracts.require(
+      len(register.directions) == len(register.blocks),
+      f'{where}: {len(register.directions)} directions for'
+      f' {len(register.blocks)} blocks',
+  )
+  changed = np.zeros(register.value_spec.shape, bool)
+  for i, (block, direction) in enumerate(
+      zip(register.blocks, register.directions, strict=True)
+  ):
+    depends = np.array(
+        [block in register.blocks_of(port) for port in register.PORTS] or True
+    )
+    for x, y in (*_DIRECTIONS, *([direction] if direction else [])):
+      difference = _moved(subject, block, (x, y))
+      reported = register.displacements(physics)[i]
+      contracts.require(
+          reported >= _LEAST,
+          f'{where}: block {i} was moved by {_MOVED} m in the direction'
+          f' {(x, y)}, and displacements reports {reported} m; override it',
+      )
+      contracts.require(
+          _are_close(difference[~depends], 0.0),
+          f'{where}: block {i} changes ports that do not name it in blocks_of',
+      )
+      changed |= np.abs(difference) > _ROUNDING
+    if direction:
+      contracts.require(
+          difference.max() > _ROUNDING,
+          f'{where}: block {i} was moved in its direction {direction}, and the'
+          f' reading changed by {difference}; directions raise a reading',
+      )
+    changed |= np.abs(_turned(subject, block)) > _ROUNDING
+  contracts.require(
+      changed.all(),
+      f'{where}: no motion of a single block changes'
+      f' {[*np.array(register.PORTS)[~changed]] or "the reading"}',
+  )
+
+
+def _moved(
+    subject: _Subject, block: block_kinds.Block, direction: tuple[float, float]
+) -> np.ndarray:
+  """Moves a block after a write; returns the change of the reading."""
+  subject.world.restart()
+  subject.write(subject.values[2])
+  reading = subject.read()
+  place = np.array(block.position(subject.physics))
+  place[:2] += _MOVED * np.array(direction)
+  block.put(subject.physics, place, block.heading(subject.physics))
+  return np.asarray(subject.read() - reading)
+
+
+def _turned(subject: _Subject, block: block_kinds.Block) -> np.ndarray:
+  """Turns a block after a write; returns the change of the reading."""
+  subject.world.restart()
+  subject.write(subject.values[2])
+  reading = subject.read()
+  place = np.array(block.position(subject.physics))
+  block.put(subject.physics, place, block.heading(subject.physics) + 0.1)
+  return np.asarray(subject.read() - reading)
+
+
+def _check_footprint(subject: _Subject) -> None:
+  """Checks that values put the blocks on the paths of the footprint."""
+  register, physics = subject.register, subject.physics
+  where = subject.where
+  subject.world.restart()
+  paths = register.footprint(physics)
+  for value in np.linspace(*register.value_range, _NUM_VALUES):
+    register.pose(physics, value)
+    for i, block in enumerate(register.blocks):
+      place = np.array(block.position(physics))
+      nearest = min(
+          (_distance(place, path) for path in paths if path.block == i),
+          default=np.inf,
+      )
+      contracts.require(
+          nearest <= _ROUNDING,
+          f'{where}: {value} puts block {i} {nearest} m beside the paths of its'
+          ' footprint',
+      )
+
+
+def _distance(place: np.ndarray, path: Any) -> float:
+  """Returns the distance of a place from a path, in m."""
+  along = path.last - path.first
+  length = along @ along
+  share = (place - path.first) @ along / length if length else 0.0
+  nearest = path.first + np.clip(share, 0.0, 1.0) * along
+  return max(0.0, float(np.linalg.norm(place - nearest)) - path.slack)
+
+
+def _check_batch(world: _World) -> None:
+  """Checks that worlds of a batch are written as they would be alone."""
+  world.restart()
+  batch = batch_physics.BatchPhysics(world.physics, _NUM_WORLDS, 1, False)
+  where = np.array([True, False, True])
+  for register in world.registers:
+    subject = _Subject(register, world, _where(register))
+    values = subject.values[1 : 1 + _NUM_WORLDS]
+    register.write(batch, subject.values[-_NUM_WORLDS:])
+    before = register.read(batch)
+    register.write(batch, values, where)
+    readings = register.read(batch)
+    contracts.require(
+        np.array_equal(readings[~where], before[~where]),
+        f'{subject.where}: a write to other worlds of a batch changes a world',
+    )
+    for i in np.flatnonzero(where):
+      world.restart()
+      subject.write(subject.values[-_NUM_WORLDS:][i])
+      subject.write(values[i])
+      alone = subject.read()
+      contracts.require(
+          np.array_equal(readings[i], alone),
+          f'{subject.where}: {values[i]} is read as {readings[i]} in a batch,'
+          f' and as {alone} in one world',
+      )

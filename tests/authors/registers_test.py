@@ -1,0 +1,133 @@
+"""Tests of the contract of registers, which ships for tests of authors."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realab_suite import testing
+from realab_suite.entities import registers
+from tests.authors import abacus
+
+_KINDS: dict[str, tuple[type[registers.Register], dict[str, Any]]] = {
+    'two_block': (registers.TwoBlockRegister, {}),
+    'written with the pose': (registers.TwoBlockRegister, {'write': 'pose'}),
+    'small and light': (
+        registers.TwoBlockRegister, {'block_size': 0.06, 'mass': 0.02}
+    ),
+    'block_position': (registers.BlockPositionRegister, {}),
+    'in centimetres': (
+        registers.BlockPositionRegister,
+        {'value_range': (0, 900), 'scale': 0.001, 'initial': 20},
+    ),
+    'block_orientation': (
+        registers.BlockOrientationRegister, {'value_range': (-1.5, 1.0)}
+    ),
+    'an abacus': (abacus.Abacus, {}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', _KINDS)
+def test_kinds_keep_the_contract(name: str):
+  kind, options = _KINDS[name]
+  testing.check_register(kind, **options)
+
+
+class _Counting(registers.Register):
+  """A register of one block along its axis, written as simply as possible."""
+
+  def _build_blocks(self):
+    self.count = 0
+    return [self._add_block('block', 'offset_block', (0.0, 0.0))]
+
+  def _places(self, physics, value):
+    place = np.array(self._origin(physics))
+    place[..., 0] += value * self._scale
+    return [place]
+
+  def _read_blocks(self, physics):
+    start = self._origin(physics)[..., 0]
+    return (self._blocks[0].along(physics) - start) / self._scale
+
+
+def _remembers(self, physics):
+  self.count += 1
+  return _Counting._read_blocks(self, physics) + 1e-6 * (self.count > 5)
+
+
+def _ignores_where(self, physics, value, where=None):
+  self._blocks[0].put(physics, *self._places(physics, value))
+
+
+def _nudges(self, physics):
+  self._blocks[0].put(physics, self._blocks[0].position(physics))
+  return _Counting._read_blocks(self, physics)
+
+
+def _only_half(self, physics, value, where=None):
+  registers.Register._put(self, physics, value / 2, where)
+
+
+def _stays_aside(self, physics, value, where=None):
+  place = np.array(self._blocks[0].position(physics))
+  place[..., 0] = self._places(physics, value)[0][..., 0]
+  self._blocks[0].put(physics, place, where=where)
+
+
+def _reads_aside(self, physics):
+  aside = self._blocks[0].position(physics)[..., 1]
+  return _Counting._read_blocks(self, physics) + aside
+
+
+def _along_only(self, physics):
+  wrong = self._read_blocks(physics) - self.applied(physics)
+  return np.abs(wrong)[..., np.newaxis] * self._scale
+
+
+def _no_paths(self, physics):
+  return []
+
+
+def _constant(self, physics):
+  return self._applied_slot.copy(physics)
+
+
+_BREACHES: dict[str, tuple[dict[str, Any], str]] = {
+    'remembers': ({'_read_blocks': _remembers}, 'read as'),
+    'ignores masks': ({'_put': _ignores_where}, 'to other worlds of a batch'),
+    'moves blocks when it is read': (
+        {'_read_blocks': _nudges}, 'a look at the register changes the world'
+    ),
+    'puts blocks elsewhere': ({'_put': _only_half}, 'is read as'),
+    'hides permanent corruption': (
+        {'_put': _stays_aside, '_read_blocks': _reads_aside},
+        'leaves a temporary corruption',
+    ),
+    'sees motion along its axis only': (
+        {'displacements': _along_only}, 'displacements reports 0.0 m'
+    ),
+    'has no paths': ({'footprint': _no_paths}, 'the paths of its footprint'),
+    'has directions that lower it': (
+        {"directions": ((-1.0, 0.0),)}, 'directions raise a reading'
+    ),
+    'has too many directions': (
+        {'directions': (None, None)}, '2 directions for 1 blocks'
+    ),
+    'cannot be corrupted': (
+        {'_read_blocks': _constant}, 'no motion of a single block'
+    ),
+}  # fmt: skip
+
+
+def test_a_simple_kind_keeps_the_contract():
+  testing.check_register(_Counting)
+
+
+@pytest.mark.parametrize('breach', _BREACHES)
+def test_a_breach_of_the_contract_is_named(breach: str):
+  members, message = _BREACHES[breach]
+  broken: Any = type('Broken', (_Counting,), members)
+  with pytest.raises(testing.ContractError) as raised:
+    testing.check_register(broken)
+  assert message in str(raised.value)
+  assert str(raised.value).startswith('Broken, embedded')
