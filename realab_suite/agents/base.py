@@ -78,6 +78,9 @@ class Learner(abc.ABC):
   OPTIONS: ClassVar[type[Options]]
   # The option with the name of the register whose reading is learned from.
   READS: ClassVar[str]
+  # Networks and the state of the optimiser, a pytree of arrays that a subclass
+  # makes in `__init__`.
+  _networks: Any
 
   def __init__(
       self,
@@ -225,7 +228,7 @@ class Learner(abc.ABC):
         'keys': {name: key.copy() for name, key in self._keys.items()},
         'last': _copy(self._last),
         'metrics': dict(self._metrics),
-        'trained': _to_plain(self._trained()),
+        'trained': _to_plain(self._networks),
         'memory': _copy(self._memory()),
     }
 
@@ -242,8 +245,7 @@ class Learner(abc.ABC):
           f'state of a learner: kind {state.get("kind")!r}; this learner is'
           f' {self._options.kind!r}'
       )
-    trained = _from_plain(self._trained(), state['trained'])
-    self._set_trained(trained)
+    self._networks = _from_plain(self._networks, state['trained'])
     self._set_memory(_copy(state['memory']))
     self._num_acts = int(state['num_acts'])
     self._num_updates = int(state['num_updates'])
@@ -311,21 +313,13 @@ class Learner(abc.ABC):
       observation: Observation of the step after it.
     """
 
-  @abc.abstractmethod
-  def _trained(self) -> Any:
-    """Returns the networks and the optimiser's state, a pytree of arrays."""
-
-  @abc.abstractmethod
-  def _set_trained(self, trained: Any) -> None:
-    """Replaces the networks and the optimiser's state."""
-
-  @abc.abstractmethod
   def _memory(self) -> dict[str, Any]:
     """Returns the state other than networks, as plain data."""
+    return {}
 
-  @abc.abstractmethod
   def _set_memory(self, memory: dict[str, Any]) -> None:
     """Replaces the state that `_memory` returns."""
+    del memory  # There is none in this base class.
 
 
 LEARNERS: registry.Registry[type[Learner]] = registry.Registry('learner')
@@ -443,8 +437,11 @@ def _from_plain(like: Any, arrays: Mapping[str, Any]) -> Any:
           f'state of a learner: {name!r} has shape {np.shape(arrays[name])},'
           f' expected {leaf.shape}'
       )
+  # JAX would round the float64 of a learner that uses NumPy.
   new = [
-      jax.numpy.asarray(arrays[name], leaf.dtype)
+      np.array(arrays[name], leaf.dtype)
+      if isinstance(leaf, np.ndarray)
+      else jax.numpy.asarray(arrays[name], leaf.dtype)
       for name, leaf in expected.items()
   ]
   return jax.tree_util.tree_unflatten(structure, new)

@@ -60,12 +60,6 @@ class OnPolicyLearner(base.Learner):
         self._options, num_samples, self._update_key()
     )
 
-  def _trained(self) -> Any:
-    return self._networks
-
-  def _set_trained(self, trained: Any) -> None:
-    self._networks = trained
-
   def _memory(self) -> dict[str, Any]:
     return {'transitions': self._transitions}
 

@@ -74,7 +74,7 @@ class QLearning(base.Learner):
         self._initial_generator(),
     )
     optimizer_state = training.optimizer(options).init(network)
-    self._networks: Any = ((network, optimizer_state), network)
+    self._networks = ((network, optimizer_state), network)
     self._scale = training.FeedbackScale(self._num_envs, options.gamma)
     # Each slot has a transition of every world. New ones replace the oldest.
     self._num_slots = max(
@@ -161,12 +161,6 @@ class QLearning(base.Learner):
 
     jax.tree.map(write, self._replay, transition)
     self._num_stored += 1
-
-  def _trained(self) -> Any:
-    return self._networks
-
-  def _set_trained(self, trained: Any) -> None:
-    self._networks = trained
 
   def _memory(self) -> dict[str, Any]:
     filled = min(self._num_stored, self._num_slots)

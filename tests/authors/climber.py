@@ -1,0 +1,78 @@
+"""An author's learner, with options of its own and without networks.
+
+It maximises one register and minimises another one, and remembers how well each
+action went on average.
+"""
+
+from typing import Any, Literal
+
+import numpy as np
+
+from realab_suite import agents
+from realab_suite.agents import base
+from realab_suite.feedback import objectives
+
+KIND = 'climber'
+
+
+class ClimberOptions(base.Options):
+  """Options of a climber.
+
+  Attributes:
+    lures: Name of the register that it learns from.
+    daring: Chance of a random action.
+  """
+
+  kind: Literal['climber']
+  lures: str
+  daring: float = 0.3
+
+
+@objectives.OBJECTIVES.add(KIND)
+def _objective(options: Any) -> dict[str, Any]:
+  return {'kind': 'return', 'registers': {options['lures']: 2.0}}
+
+
+@agents.LEARNERS.add(KIND)
+class Climber(agents.Learner):
+  """Takes the action whose readings were the largest on average."""
+
+  OPTIONS = ClimberOptions
+  READS = 'lures'
+
+  def __init__(self, *arguments: Any) -> None:
+    super().__init__(*arguments)
+    num_actions = self._controls.check_discrete(KIND)
+    self._networks = {
+        'sums': np.zeros(num_actions),
+        'counts': np.ones(num_actions),
+    }
+
+  def _choose(self, observation, keys, greedy):
+    generator = np.random.default_rng([int(word) for word in keys['act']])
+    means, num_envs = self._means(), len(next(iter(observation.values())))
+    best = np.full(num_envs, np.argmax(means))
+    drawn = generator.integers(len(means), size=num_envs)
+    dares = generator.random(num_envs) < self._options.daring
+    return {'action': best if greedy else np.where(dares, drawn, best)}
+
+  def _probabilities(self, observation):
+    means, num_envs = self._means(), len(next(iter(observation.values())))
+    chances = np.full((num_envs, len(means)), self._options.daring / len(means))
+    chances[:, np.argmax(means)] += 1 - self._options.daring
+    return chances
+
+  def _observe(self, transition, observation):
+    valid = transition['is_valid']
+    actions = transition['choice']['action'][valid]
+    readings = transition['reading'][valid]
+    size = len(self._means())
+    self._networks = {
+        'sums': self._networks['sums'] + np.bincount(actions, readings, size),
+        'counts': self._networks['counts'] + np.bincount(actions, None, size),
+    }
+    self._num_updates += 1
+    self._metrics = {'best': float(self._means().max())}
+
+  def _means(self):
+    return np.asarray(self._networks['sums'] / self._networks['counts'])
