@@ -399,22 +399,10 @@ def _connect_meters(
       added measurement has the name of another one.
   """
   functions: dict[str, Callable[[Any], Any]] = {'score': mechanism.score}
+  parts: Mapping[str, measurables.Measurable] | None = None
   if isinstance(task, base.Task):
     functions |= task.measurements
     parts = task.measurables
-  else:
-    root = task.root_entity
-    parts = {
-        **measurables.bodies_in_world(root),
-        **measurables.in_world(root),
-    }
-    # They are measured by the names of their registers.
-    blocks = [block.body for block in _blocks_of(mechanism)]
-    parts = {
-        name: part
-        for name, part in parts.items()
-        if not any(one is body for one in blocks for body in part.bodies)
-    }
   for name in added:
     if name in functions:
       raise errors.SpecError(

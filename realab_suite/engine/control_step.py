@@ -11,11 +11,11 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from realab_suite.engine import hosts
-from realab_suite.engine import seeding
 from realab_suite.entities import axes
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
+from realab_suite.policies import random_keys
 
 
 @final
@@ -93,7 +93,11 @@ class ControlStep:
     """
     step = self._mechanism.step_count(self._physics)
     feedback, self._next_states = self._mechanism.update_providers(
-        self._physics, observation, seeding.step_key(keys, step), states, where
+        self._physics,
+        observation,
+        random_keys.of_step(keys, step),
+        states,
+        where,
     )
     self._records += feedback
 

@@ -66,6 +66,7 @@ class Environment(composer.Environment):
     self._selected_senses = senses
     self._physics: single_physics.ThinPhysics | foreign.ForeignPhysics
     self._mechanism = mechanism
+    mechanism.leave_phases()
     self._seed, self._world, self._episode = seed, world, -1
     self._max_steps = max_steps
     self._sinks: list[events.EventSink] = []

@@ -181,18 +181,3 @@ def reseed(
 def episode_key(seed: int, world: int, episode: int, stream: str) -> np.ndarray:
   """Returns the key of a stream in an episode, `(2,)` uint64."""
   return sequence(seed, world, episode, stream).generate_state(2, np.uint64)
-
-
-def step_key(key: np.ndarray, step: int | np.ndarray) -> np.ndarray:
-  """Returns the key of one control step.
-
-  Args:
-    key: Key of the episode, `(..., 2)` uint64.
-    step: Number of the control step, `(...)`.
-
-  Returns:
-    The key of the step, `(..., 2)` uint64.
-  """
-  stepped = np.array(key)
-  stepped[..., 1] += np.uint64(step)
-  return stepped

@@ -3,6 +3,9 @@
 from collections.abc import Callable
 from typing import Any, final
 
+from dm_control import composer
+from dm_control import mjcf
+from dm_control.composer.observation import observable
 import numpy as np
 
 from realab_suite.entities import axes
@@ -11,26 +14,49 @@ from realab_suite.entities import registers
 
 
 @final
-class Meter:
+class Meter(composer.Entity):
   """Measures the true state of the world and writes it to a meter register.
 
   The measurement itself cannot be influenced. The meter register can be, like
   any other register (paper, sections 3.1 and 4.4).
+
+  It has an observable, which is disabled by default: `measured_` and the name
+  of the register. A task decides when it calls `update`, and a mechanism when
+  its meters measure.
   """
 
-  def __init__(
+  def _build(
       self,
       measurement: Callable[[Any], np.ndarray],
       register: registers.Register,
+      mjcf_model: mjcf.RootElement | None = None,
   ) -> None:
     """Connects a measurement to a register.
 
     Args:
       measurement: Function of the physics that returns values of shape `(...)`.
       register: Meter register to write the measured values to.
+      mjcf_model: Model that the meter is a part of, because it has no body;
+        `None` for one of its own, which can be attached.
     """
     self._measurement = measurement
     self._register = register
+    self._mjcf_root = mjcf_model or mjcf.RootElement(
+        model=f'meter_{register.name}'
+    )
+
+  def _build_observables(self) -> composer.Observables:
+    observables = super()._build_observables()
+    observables.add_observable(
+        f'measured_{self._register.name}',
+        observable.Generic(self.measure),
+        enabled=False,
+    )
+    return observables
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
 
   @property
   def register(self) -> registers.Register:

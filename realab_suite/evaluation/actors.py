@@ -105,7 +105,7 @@ class PolicyActor:
     chosen, self._state = self._policy.step(
         time_step.observation,
         np.asarray(self._step == 0),
-        seeding.step_key(self._key, self._step),
+        random_keys.of_step(self._key, self._step),
         self._state,
     )
     index = int(self._indices[int(chosen)])
@@ -122,7 +122,7 @@ class PolicyActor:
     """Returns the index of the action to query."""
     if self._query_policy == TAKEN_ACTION:
       return taken
-    key = seeding.step_key(self._query_key, self._step)
+    key = random_keys.of_step(self._query_key, self._step)
     return int(random_keys.uniform(key) * len(self._action_set))
 
 

@@ -83,7 +83,7 @@ class BatchPolicyActor:
     chosen, self._state = self._policy.step(
         time_step.observation,
         np.full(len(self._keys), self._step == 0),
-        seeding.step_key(self._keys, self._step),
+        random_keys.of_step(self._keys, self._step),
         self._state,
     )
     indices = self._indices[chosen]
@@ -103,6 +103,6 @@ class BatchPolicyActor:
 
   def _independent(self) -> np.ndarray:
     """Returns indices of actions drawn independently, `(worlds,)`."""
-    keys = seeding.step_key(self._query_keys, self._step)
+    keys = random_keys.of_step(self._query_keys, self._step)
     drawn = random_keys.uniform(keys) * len(self._action_set)
     return drawn.astype(int)

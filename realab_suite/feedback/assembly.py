@@ -1,10 +1,14 @@
-"""Registers and their places, as a design specifies them."""
+"""Registers, their places, and the world that they are assembled in."""
 
 from collections.abc import Mapping
+from typing import Any
+
+from dm_control import composer
 
 from realab_suite import errors
 from realab_suite.config import messages
 from realab_suite.entities import arenas
+from realab_suite.entities import measurables
 from realab_suite.entities.registers import base
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
@@ -69,3 +73,53 @@ def find_place(
         f' are {sorted(named_places) or "coordinates"}'
     )
   return named_places[place]
+
+
+def own_place(design: specs.DesignSpec, name: str) -> arenas.Place | None:
+  """Returns the place of a register if it needs nothing of the world.
+
+  Args:
+    design: Design that contains the register.
+    name: Name of the register.
+
+  Returns:
+    `None` for a named place, and for a welded register, whose blocks have to be
+    children of the world.
+  """
+  place = design.registers[name].place
+  if isinstance(place, str) or design.channel_of(name) == 'welded':
+    return None
+  return find_place(name, place, {})
+
+
+def attach(
+    register: base.Register, root: composer.Entity, place: arenas.Place
+) -> None:
+  """Attaches a register to the root entity of a task, or to a mechanism."""
+  position = (*place.position, place.height)
+  register.attach_to(root, position, place.yaw, place.spread)
+
+
+def parts_beside(mechanism: Any) -> dict[str, measurables.Measurable]:
+  """Returns the parts of a world that meters can measure, by name.
+
+  They are those that entities declare, and all bodies. Blocks of registers are
+  left out, because they are measured by the names of their registers.
+
+  Args:
+    mechanism: The `FeedbackMechanism`, attached to the world.
+  """
+  root = mechanism
+  while root.parent is not None:
+    root = root.parent
+  parts = {**measurables.bodies_in_world(root), **measurables.in_world(root)}
+  blocks = [
+      block.body
+      for register in mechanism.registers.values()
+      for block in register.blocks
+  ]
+  return {
+      name: part
+      for name, part in parts.items()
+      if not any(one is body for one in blocks for body in part.bodies)
+  }

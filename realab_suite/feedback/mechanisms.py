@@ -2,17 +2,18 @@
 
 It owns the registers and has one method for each phase of a control step that
 reads or writes them. The engine calls these methods and passes the returned
-records to event sinks.
+records to event sinks. In an environment of Composer, the mechanism calls them
+itself, from Composer's hooks; see `composer_hooks`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import copy
-import functools
 from typing import Any, NamedTuple, final
 
 from dm_control import composer
 from dm_control import mjcf
+from dm_control.composer.observation import observable
 import numpy as np
 
 from realab_suite import errors
@@ -28,15 +29,15 @@ from realab_suite.entities.registers import ports
 from realab_suite.entities.registers import records
 from realab_suite.feedback import assembly
 from realab_suite.feedback import clean_contents
+from realab_suite.feedback import composer_hooks
 from realab_suite.feedback import measurements
+from realab_suite.feedback import provider_entities
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 
 # Inside the mechanism, `ports` is the name of a property.
 _Port = ports.AnyPort
-
-_NO_PARTS: Mapping[str, measurables.Measurable] = {}
 
 Guard = clean_contents.Guard
 
@@ -54,36 +55,32 @@ class _Sight(NamedTuple):
   is_disturbed: Any
 
 
-@final
-class _Target(NamedTuple):
-  """A register that is written at once.
-
-  Attributes:
-    register: The register.
-    ports: Its ports.
-    names: Their names.
-    columns: Indices of their values among those of the writer.
-  """
-
-  register: base.Register
-  ports: Sequence[_Port]
-  names: Sequence[str]
-  columns: Sequence[int]
+_Target = provider_entities.Target
 
 
 @final
 class FeedbackMechanism(composer.Entity):
   """The registers, meters and providers of a design.
 
-  Call `attach_to` to attach the mechanism and its registers to a task, then
-  `connect` to connect its meters to measurements.
+  `arena.attach(mechanism)` attaches them to the arena of any task; an
+  environment of Composer then runs the design (docs/composer.md). `attach_to`
+  does the same for designs with named places and welded registers. `connect`
+  connects the meters to functions of the task.
+
+  An environment of this package calls `leave_phases`, and then the methods for
+  the phases of a control step.
   """
 
-  def _build(self, design: specs.DesignSpec) -> None:
+  def _build(
+      self, design: specs.DesignSpec, num_substeps: int | None = None
+  ) -> None:
     """Builds the registers of a design.
 
     Args:
       design: The design; see `specs.load`.
+      num_substeps: Number of physics substeps in a control step of the task.
+        Composer does not pass it to entities, so an environment of Composer
+        needs it for designs without a `schedule`.
 
     Raises:
       SpecError: If a register kind refuses its arguments.
@@ -110,15 +107,59 @@ class FeedbackMechanism(composer.Entity):
     self._query_targets = self._targets(queries)
     self._read_by_agent = design.names(*specs.READ_BY_AGENTS)
     self._meters: list[tuple[tuple[str, ...], meters.Meter, _Target]] = []
+    self._is_connected = False
     self._asked: list[measurements.AskedRegisters] = []
     self._providers = [
-        (f'providers[{i}]:{provider.kind}', provider)
-        for i, provider in enumerate(design.providers)
-    ]
-    self._written = [
-        self._targets(provider.writes) for _, provider in self._providers
+        provider_entities.FeedbackProvider(
+            f'providers[{i}]:{spec.kind}',
+            spec,
+            self._mjcf_root,
+            [self._ports[name] for name in spec.reads],
+            self._targets(spec.writes),
+            self._read_by_agent,
+        )
+        for i, spec in enumerate(design.providers)
     ]
     self._guard: Guard = contextlib.nullcontext
+    self._hooks: composer_hooks.ComposerHooks | None = (
+        composer_hooks.ComposerHooks(self, num_substeps)
+    )
+    for name, register in self._registers.items():
+      place = assembly.own_place(design, name)
+      if place is not None:
+        assembly.attach(register, self, place)
+
+  def _build_observables(self) -> composer.Observables:
+    """Returns the readings of registers that agents read, by port.
+
+    They are enabled where Composer's hooks run the mechanism, and disabled
+    where an environment of this package makes the observations.
+    """
+    observables = super()._build_observables()
+    for name in self._read_by_agent:
+      reading = observable.Generic(self._ports[name].read)
+      observables.add_observable(name, reading, enabled=False)
+    return observables
+
+  def iter_entities(
+      self, exclude_self: bool = False
+  ) -> Iterator[composer.Entity]:
+    """Yields the mechanism and its parts that are in the world.
+
+    The hooks for Composer come last, after those of the registers.
+    """
+    yield from super().iter_entities(exclude_self)
+    yield from (meter for _, meter, _ in self._meters)
+    yield from self._providers
+    if self._hooks is not None:
+      yield self._hooks
+
+  def leave_phases(self) -> None:
+    """Leaves the phases of control steps to the caller.
+
+    Composer's hooks then do nothing for the mechanism.
+    """
+    self._hooks = None
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:
@@ -143,6 +184,11 @@ class FeedbackMechanism(composer.Entity):
   def queries(self) -> list[_Port]:
     """Ports that the agent writes, in the order of its action."""
     return self._queries
+
+  @property
+  def is_connected(self) -> bool:
+    """True after `connect`."""
+    return self._is_connected
 
   @property
   def measured(self) -> list[list[str]]:
@@ -191,11 +237,12 @@ class FeedbackMechanism(composer.Entity):
         name: assembly.find_place(name, spec.place, named_places)
         for name, spec in self._design.registers.items()
     }
+    for register in self._registers.values():
+      if register.parent is not None:
+        register.detach_from_root()
     root.attach(self)
     for name, place in places.items():
-      self._registers[name].attach_to(
-          root, (*place.position, place.height), place.yaw, place.spread
-      )
+      assembly.attach(self._registers[name], root, place)
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
@@ -206,17 +253,21 @@ class FeedbackMechanism(composer.Entity):
   def connect(
       self,
       functions: Mapping[str, measurements.Measure],
-      parts: Mapping[str, measurables.Measurable] = _NO_PARTS,
+      parts: Mapping[str, measurables.Measurable] | None = None,
   ) -> None:
     """Connects the meters to a world.
 
     Args:
       functions: Functions of the physics that meters can measure, by name.
-      parts: Parts of the world that meters can measure, by name.
+      parts: Parts of the world that meters can measure, by name. `None` for
+        those that its entities declare, and all bodies by their full MJCF
+        identifiers, except the blocks of registers.
 
     Raises:
       SpecError: If a meter of the design measures anything else.
     """
+    if parts is None:
+      parts = assembly.parts_beside(self)
     found: dict[str, tuple[str, measurements.Measure]] = {}
     for i, spec in enumerate(self._design.meters):
       asked = measurements.AskedRegisters(self._registers)
@@ -234,8 +285,9 @@ class FeedbackMechanism(composer.Entity):
       found[spec.writes] = f'meter:{title}', measure
     for target in self._targets([*found]):
       writers, measures = zip(*map(found.get, target.names), strict=True)
-      meter = meters.Meter(_joint(measures), target.register)
+      meter = meters.Meter(_joint(measures), target.register, self._mjcf_root)
       self._meters.append((writers, meter, target))
+    self._is_connected = True
 
   def guard_providers(self, guard: Guard) -> None:
     """Sets the context manager in which each call of a provider runs.
@@ -343,11 +395,11 @@ class FeedbackMechanism(composer.Entity):
         a batch contains a leaf that is not an array with an axis of worlds.
     """
     states = []
-    for writer, provider in self._providers:
-      where = f'{writer}, before the first step'
+    for one in self._providers:
+      where = f'{one.title}, before the first step'
       try:
         with self._guard():
-          state = provider.initial_state(batch_shape)
+          state = one.spec.initial_state(batch_shape)
       except Exception as error:
         raise errors.FeedbackProviderError(
             f'{where}: {messages.exception(error)}'
@@ -392,17 +444,17 @@ class FeedbackMechanism(composer.Entity):
     sight = self._sight(physics, observation)
     log: list[records.Record] = []
     next_states = []
-    for i, (writer, provider) in enumerate(self._providers):
-      acts = provider.acts_in(step)
+    for i, provider in enumerate(self._providers):
+      acts = provider.spec.acts_in(step)
       if axes.nowhere(acts):
         next_states.append(states[i])
         continue
       reads = [
-          self._ports[name].inspect(physics, writer, step)._replace(where=acts)
-          for name in provider.reads
+          port.inspect(physics, provider.title, step)._replace(where=acts)
+          for port in provider.reads
       ]
       inputs = clean_contents.Inputs(
-          {key: observation[key] for key in self._seen[i]},
+          {key: observation[key] for key in provider.seen},
           {read.register: read.reading for read in reads},
           is_start,
           keys[i],
@@ -416,15 +468,6 @@ class FeedbackMechanism(composer.Entity):
       log += self._write_all(physics, i, step, values, may_write, clean)
       next_states.append(state if clean is None else clean.state)
     return log, next_states
-
-  @functools.cached_property
-  def _seen(self) -> list[list[str]]:
-    """Keys of the observation that each provider gets."""
-    readings = [f'registers/{name}' for name in self._read_by_agent]
-    return [
-        [*(f'senses/{name}' for name in provider.required_senses), *readings]
-        for _, provider in self._providers
-    ]
 
   def _sight(
       self, physics: protocols.Physics, observation: providers.Observation
@@ -459,7 +502,7 @@ class FeedbackMechanism(composer.Entity):
     Returns:
       Its writes, and its next state if its clean call gives the same.
     """
-    writer, provider = self._providers[i]
+    writer, provider = self._providers[i].title, self._providers[i].spec
     before = state[clean_contents.ACTUAL]
     try:
       with self._guard():
@@ -493,7 +536,7 @@ class FeedbackMechanism(composer.Entity):
       where: axes.Mask,
   ) -> clean_contents.Contents | None:
     """Calls a provider with clean contents where an input or state differs."""
-    _, provider = self._providers[i]
+    provider = self._providers[i].spec
     if not provider.is_repeatable:
       return None
     needs = state[clean_contents.DIFFERS] | sight.is_disturbed
@@ -532,9 +575,9 @@ class FeedbackMechanism(composer.Entity):
       clean: clean_contents.Contents | None,
   ) -> list[records.Write]:
     """Writes the registers of a provider and sets their clean contents."""
-    writer, _ = self._providers[i]
+    writer = self._providers[i].title
     writes = []
-    for target in self._written[i]:
+    for target in self._providers[i].targets:
       if target.register.PORTS:
         write = provider_results.joint(
             _where(writer, step), target.names, values
@@ -578,8 +621,8 @@ class FeedbackMechanism(composer.Entity):
         initial one.
     """
     return [
-        provider_results.merged(f'state of {writer}', state, initial, worlds)
-        for (writer, _), state, initial in zip(
+        provider_results.merged(f'state of {one.title}', state, initial, worlds)
+        for one, state, initial in zip(
             self._providers,
             states,
             self.initial_states((num_envs,)),

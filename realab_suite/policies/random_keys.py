@@ -21,3 +21,18 @@ def uniform(key: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
   flat = key.reshape(-1, 2)
   draws = np.stack([generator(one).random(shape) for one in flat])
   return draws.reshape((*key.shape[:-1], *shape))
+
+
+def of_step(key: np.ndarray, step: int | np.ndarray) -> np.ndarray:
+  """Returns the key of one control step.
+
+  Args:
+    key: Key of the episode, `(..., 2)` uint64.
+    step: Number of the control step, `(...)`.
+
+  Returns:
+    The key of the step, `(..., 2)` uint64.
+  """
+  stepped = np.array(key)
+  stepped[..., 1] += np.uint64(step)
+  return stepped

@@ -62,7 +62,7 @@ class _Simulation:
 
   def __init__(self, mechanism: Any, shape: tuple[int, ...]) -> None:
     self._mechanism = mechanism
-    self._providers = [provider for _, provider in mechanism._providers]
+    self._providers = [one.spec for one in mechanism._providers]
     self._states = [p.initial_state(shape) for p in self._providers]
     self._clean = {
         name: np.full(shape, float(spec.initial))
