@@ -435,7 +435,7 @@ def _keywords(argument: str, value: Any) -> dict[str, Any]:
 
 
 def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
-  return [b for r in mechanism.registers.values() for b in r.blocks]
+  return [b for r in mechanism.registers.values() for b in r.own_blocks]
 
 
 def _avatars_of(task: composer.Task) -> list[avatars.Avatar]:

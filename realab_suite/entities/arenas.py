@@ -41,12 +41,15 @@ class Place:
     spread: Half-widths of the region around `position`, along the register's
       axis and across it, in m. Each episode draws a position from the region.
     height: Height of the surface that the register stands on, in m.
+    block: Block of the world that is the base block of a register at this
+      place, whose start position is then that of the block; `None` for none.
   """
 
   position: tuple[float, float]
   yaw: float = 0.0
   spread: tuple[float, float] = (0.0, 0.0)
   height: float = 0.0
+  block: block_kinds.JointedBlock | None = None
 
   def __post_init__(self) -> None:
     """Checks the numbers.

@@ -31,7 +31,7 @@ def make_register(
   common = dict(
       value_range=spec.range,
       scale=spec.scale,
-      initial=spec.initial,
+      initial=spec.constant_initial,
       role=spec.role,
       channel=design.channel_of(name),
       dof=spec.dof or design.dof,
@@ -97,7 +97,7 @@ def attach(
 ) -> None:
   """Attaches a register to the root entity of a task, or to a mechanism."""
   position = (*place.position, place.height)
-  register.attach_to(root, position, place.yaw, place.spread)
+  register.attach_to(root, position, place.yaw, place.spread, place.block)
 
 
 def parts_beside(mechanism: Any) -> dict[str, measurables.Measurable]:

@@ -222,8 +222,9 @@ class FeedbackMechanism(composer.Entity):
       root: Root entity of the task, usually its arena.
 
     Raises:
-      SpecError: If the world has no place of a name in the design, or has a
-        mechanism already. Nothing is attached.
+      SpecError: If the world has no place of a name in the design, a register
+        cannot be at its place, or the world has a mechanism already. Nothing is
+        attached.
     """
     for entity in root.iter_entities():
       if isinstance(entity, FeedbackMechanism):
@@ -237,6 +238,9 @@ class FeedbackMechanism(composer.Entity):
         name: assembly.find_place(name, spec.place, named_places)
         for name, spec in self._design.registers.items()
     }
+    for name, place in places.items():
+      if place.block is not None:
+        self._registers[name].check_can_use_a_block()
     for register in self._registers.values():
       if register.parent is not None:
         register.detach_from_root()
@@ -264,10 +268,21 @@ class FeedbackMechanism(composer.Entity):
         identifiers, except the blocks of registers.
 
     Raises:
-      SpecError: If a meter of the design measures anything else.
+      SpecError: If a meter of the design measures, or a register begins with,
+        anything else.
     """
     if parts is None:
       parts = assembly.parts_beside(self)
+    for name, register in self._registers.items():
+      initial = self._design.registers[name].initial
+      if isinstance(initial, str):
+        if initial not in functions:
+          raise errors.SpecError(
+              f'design {self._design.name!r}: registers.{name}.initial: this'
+              f' world does not offer {initial!r}; allowed are numbers and'
+              f' {sorted(functions)}'
+          )
+        register.start_with(functions[initial])
     found: dict[str, tuple[str, measurements.Measure]] = {}
     for i, spec in enumerate(self._design.meters):
       asked = measurements.AskedRegisters(self._registers)

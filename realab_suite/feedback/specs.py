@@ -91,7 +91,8 @@ class RegisterSpec(validation.Spec):
     place: Name of a place of the world, or coordinates.
     range: Lowest and highest value that can be stored, in each port.
     scale: Length in m (angle in rad for an orientation) per unit of value.
-    initial: Value at the start of an episode, in each port.
+    initial: Value at the start of an episode, in each port; or the name of a
+      function that the task offers to meters, which returns it.
     on_overflow: `saturate` to saturate a value out of range, `error` to refuse
       it.
     write: `axis` for writes that set only the coordinate that carries the
@@ -113,7 +114,7 @@ class RegisterSpec(validation.Spec):
   range: Annotated[tuple[Value, Value], pydantic.Field(strict=False)]
   # With a smaller scale, readings are mostly numerical noise of positions.
   scale: Annotated[float, pydantic.Field(ge=1e-6, le=10)] = 0.1
-  initial: Value = 0.0
+  initial: Value | Name = 0.0
   on_overflow: Literal['saturate', 'error'] = 'saturate'
   write: Literal['axis', 'pose'] = 'axis'
   channel: Channel | None = None
@@ -139,12 +140,19 @@ class RegisterSpec(validation.Spec):
       return {'position': place}
     return place
 
+  @property
+  def constant_initial(self) -> float:
+    """Value of `initial`, or a value in the range in place of a function."""
+    if isinstance(self.initial, str):
+      return min(max(0.0, self.range[0]), self.range[1])
+    return self.initial
+
   @pydantic.model_validator(mode='after')
   def _in_order(self) -> 'RegisterSpec':
     low, high = self.range
     if not low < high:
       raise ValueError(f'range {list(self.range)} must have low < high')
-    if not low <= self.initial <= high:
+    if not low <= self.constant_initial <= high:
       raise ValueError(
           f'initial {self.initial} must be in range {list(self.range)}'
       )

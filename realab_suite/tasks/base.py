@@ -231,7 +231,7 @@ class Task(composer.Task):
 def _blocks_of(
     registers: Sequence[registers_base.Register],
 ) -> list[block_kinds.Block]:
-  return [block for register in registers for block in register.blocks]
+  return [block for register in registers for block in register.own_blocks]
 
 
 def _check_version(task_class: type[Task]) -> None:

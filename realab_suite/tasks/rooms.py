@@ -7,6 +7,7 @@ import numpy as np
 
 from realab_suite.entities import arenas
 from realab_suite.entities import block_kinds
+from realab_suite.entities import crates
 from realab_suite.entities import protocols
 from realab_suite.entities.registers import base as registers_base
 from realab_suite.tasks import base
@@ -83,6 +84,23 @@ class RoomTask(base.Task):
     if self._starts is not None:
       self._starts.detach()
       self._starts = None
+
+  def add_crate(
+      self,
+      crate: crates.Crate,
+      position: Sequence[float],
+      spread: Sequence[float] = (0.0, 0.0),
+  ) -> None:
+    """Adds a crate, and offers its name as a place for a register.
+
+    Args:
+      crate: The crate.
+      position: Centre of the region of its start positions, `(x, y)`, in m.
+      spread: Half-widths of that region, `(x, y)`, in m.
+    """
+    crate.attach_to(self._arena, position, spread)
+    self._arena.offer({crate.mjcf_model.model: crate.place})
+    self._avatar.make_graspable([crate.block])
 
   def place_avatar(self, physics: protocols.Physics, random_state: Any) -> None:
     """Draws the pose in which the avatar begins an episode.

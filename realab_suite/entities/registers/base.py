@@ -6,7 +6,7 @@ this package contains no corruption function.
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, final
 
 from dm_control import composer
@@ -140,6 +140,8 @@ class Register(composer.Entity):
     self._clean_slot = state.Slot(self._mjcf_root, 'clean', size)
     self._origin_slot = state.Slot(self._mjcf_root, 'origin', 3)
     self._blocks = self._build_blocks()
+    self._borrowed: block_kinds.JointedBlock | None = None
+    self._measure_initial: Callable[[Any], np.ndarray] | None = None
 
   def _build_observables(self) -> RegisterObservables:
     return RegisterObservables(self)
@@ -252,6 +254,11 @@ class Register(composer.Entity):
     return self._blocks
 
   @property
+  def own_blocks(self) -> list[block_kinds.Block]:
+    """Blocks that are no blocks of the world."""
+    return [block for block in self._blocks if block is not self._borrowed]
+
+  @property
   def directions(self) -> tuple[tuple[float, float] | None, ...]:
     """Direction of the motion of each block that raises the reading.
 
@@ -324,6 +331,7 @@ class Register(composer.Entity):
       position: Sequence[float],
       yaw: float = 0.0,
       spread: Sequence[float] = (0.0, 0.0),
+      block: block_kinds.JointedBlock | None = None,
   ) -> None:
     """Attaches the register to the root entity of a task.
 
@@ -336,7 +344,16 @@ class Register(composer.Entity):
       spread: Half-widths of the region around `position` from which each
         episode draws the start position, `(x, y)` in the register's frame, in
         m.
+      block: Block of the world, in a frame with this position and yaw, that the
+        register uses instead of its own base block. The register then begins
+        where the block does.
+
+    Raises:
+      SpecError: If this kind of register, or a welded one, cannot use a block
+        of the world.
     """
+    if block is not None:
+      self.check_can_use_a_block()
     self._spread = np.array(spread, float)
     frame = root.attach(self)
     x, y, height = (*position, 0.0)[:3]
@@ -344,15 +361,51 @@ class Register(composer.Entity):
     if yaw:
       frame.quat = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
     reach = np.array([self._low, self._high]) * self._scale
-    for block in self._blocks:
-      if isinstance(block, mocap_blocks.MocapBlock):
-        block.attach_to(root, (x, y, height), yaw)
-      elif isinstance(block, block_kinds.JointedBlock):
-        block.surroundings.limit(
+    for own in self._blocks:
+      if isinstance(own, mocap_blocks.MocapBlock):
+        own.attach_to(root, (x, y, height), yaw)
+      elif isinstance(own, block_kinds.JointedBlock):
+        own.surroundings.limit(
             reach[0] - spread[0], reach[1] + spread[0], spread[1]
         )
-      if isinstance(block, block_kinds.PlanarBlock):
-        block.stand_at(height)
+      if isinstance(own, block_kinds.PlanarBlock):
+        own.stand_at(height)
+    if block is not None:
+      self._use_block(root, block)
+      self._borrowed = block
+
+  def check_can_use_a_block(self) -> None:
+    """Checks that the register can use a block of the world.
+
+    Raises:
+      SpecError: If its kind does not override `_use_block`, or it is welded.
+    """
+    if type(self)._use_block is Register._use_block:
+      problem = f'{type(self).__name__} has no base block'
+    elif self._channel == 'welded':
+      problem = 'a welded block cannot be moved, and the block of the world can'
+    elif self._borrowed is not None:
+      problem = 'it uses another block already'
+    else:
+      return
+    raise errors.SpecError(
+        f'register {self._name!r}: cannot use a block of the world: {problem};'
+        ' allowed are kinds with a base block, embedded or secure, such as'
+        ' two_block, and other places'
+    )
+
+  def _use_block(
+      self, root: composer.Entity, block: block_kinds.JointedBlock
+  ) -> None:
+    """Replaces the base block by a block of the world, in `blocks` as well.
+
+    Kinds with a base block may override this method. The register is attached.
+
+    Args:
+      root: Root entity of the task.
+      block: Block of the world.
+    """
+    raise NotImplementedError  # See `check_can_use_a_block`.
 
   def detach_from_root(self) -> None:
     """Undoes `attach_to`."""
@@ -369,7 +422,7 @@ class Register(composer.Entity):
     Composer calls this after the task has initialized the episode.
     """
     displacement = np.zeros(2)
-    if self._spread.any():
+    if self._spread.any() and self._borrowed is None:
       displacement = random_state.uniform(-self._spread, self._spread)
     self.settle(physics, displacement)
 
@@ -393,8 +446,31 @@ class Register(composer.Entity):
       first.put(physics, origin)
     self._origin_slot.set(physics, origin)
     shape = (*origin.shape[:-1], *self._shape)
-    self.pose(physics, np.full(shape, self._initial))
+    self.pose(physics, np.broadcast_to(self._start_value(physics), shape))
     self.inspect(physics)  # Refuses wrong readings before an episode begins.
+
+  def start_with(self, initial: Callable[[Any], np.ndarray]) -> None:
+    """Sets a function that returns the value at the start of each episode.
+
+    Args:
+      initial: Function of the physics, called after the task has initialized
+        the episode. It returns values of shape `(...)`, for all ports, which
+        are saturated to the range.
+    """
+    self._measure_initial = initial
+
+  def _start_value(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the value at the start of an episode, `(..., ports)` or `(...)`.
+
+    Raises:
+      RegisterValueError: If it is not finite, or out of the range of a register
+        that does not saturate.
+    """
+    if self._measure_initial is None:
+      return np.array(self._initial)
+    value = np.asarray(self._measure_initial(physics), np.float64)
+    value = self._saturate(value, (value >= self._low) & (value <= self._high))
+    return value[..., np.newaxis] if self.PORTS else value
 
   def pose(self, physics: protocols.Physics, value: Any) -> None:
     """Moves the blocks to the undisturbed poses that represent a value.

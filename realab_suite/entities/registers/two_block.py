@@ -2,6 +2,7 @@
 
 from typing import final
 
+from dm_control import composer
 import numpy as np
 
 from realab_suite.entities import axes
@@ -41,8 +42,27 @@ class TwoBlockRegister(base.Register):
     )
     self._from_origin = np.array([0.0, lateral, 0.0])
     if self._channel != 'welded':
-      self._mjcf_root.contact.add('exclude', body1='base', body2='offset')
+      self._exclusion = self._mjcf_root.contact.add(
+          'exclude', body1='base', body2='offset'
+      )
     return [self._base, self._offset]
+
+  def _use_block(
+      self, root: composer.Entity, block: block_kinds.JointedBlock
+  ) -> None:
+    self._exclusion.remove()
+    self._mjcf_root.find('body', 'base').remove()
+    self._base = self._blocks[0] = block
+    lateral = block.half_size + self._block_size / 2 + _LATERAL
+    self._from_origin = np.array([0.0, lateral, 0.0])
+    self._exclusion = root.mjcf_model.contact.add(
+        'exclude', body1=block.body, body2=self._offset.body
+    )
+
+  def detach_from_root(self) -> None:
+    if self._borrowed is not None:
+      self._exclusion.remove()
+    super().detach_from_root()
 
   def _places(
       self, physics: protocols.Physics, value: np.ndarray

@@ -1,0 +1,99 @@
+"""Crates: cubes of a world, which registers may use as their base blocks."""
+
+from collections.abc import Sequence
+from typing import Any, final
+
+from dm_control import composer
+from dm_control import mjcf
+import numpy as np
+
+from realab_suite.entities import appearance
+from realab_suite.entities import arenas
+from realab_suite.entities import block_kinds
+from realab_suite.entities import measurables
+from realab_suite.entities import protocols
+
+CRATE = appearance.register('crate', code=11, rgba=(0.72, 0.55, 0.33, 1.0))
+
+
+@final
+class Crate(measurables.MeasurableEntity):
+  """A cube that an avatar can push, carry and throw, as it can blocks.
+
+  A world attaches it, and may offer its `place` to registers. A two-block
+  register there has no base block of its own: the crate is its base block, so
+  that moving the crate is permanent corruption.
+  """
+
+  def _build(
+      self,
+      name: str = 'crate',
+      size: float = 0.3,
+      mass: float = 1.0,
+      is_planar: bool = False,
+  ) -> None:
+    """Builds the crate.
+
+    Args:
+      name: Name of the model.
+      size: Edge length, in m.
+      mass: Mass, in kg.
+      is_planar: True for a crate that slides along the floor and is never
+        lifted.
+    """
+    self._mjcf_root = mjcf.RootElement(model=name)
+    kind = block_kinds.PlanarBlock if is_planar else block_kinds.FreeBlock
+    style = appearance.geom_style(CRATE)
+    self._block: block_kinds.JointedBlock = kind(
+        self._mjcf_root, 'block', (0.0, 0.0), size / 2, mass, style
+    )
+    self._place = arenas.Place((0.0, 0.0))
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._mjcf_root
+
+  @property
+  def block(self) -> block_kinds.JointedBlock:
+    """Cube of the crate."""
+    return self._block
+
+  @property
+  def place(self) -> arenas.Place:
+    """Place for a register whose base block is the crate."""
+    return self._place
+
+  @property
+  def measurable(self) -> measurables.Measurable:
+    return measurables.Measurable((self._block.body,))
+
+  def attach_to(
+      self,
+      root: composer.Entity,
+      position: Sequence[float],
+      spread: Sequence[float] = (0.0, 0.0),
+  ) -> None:
+    """Attaches the crate to the root entity of a task.
+
+    Args:
+      root: Root entity of the task.
+      position: Centre of the region of start positions, `(x, y)`, in m.
+      spread: Half-widths of that region, `(x, y)`, in m.
+    """
+    x, y = (float(number) for number in position)
+    along, across = (float(number) for number in spread)
+    root.attach(self).pos = (x, y, 0.0)
+    self._block.surroundings.limit(-along, along, across)
+    self._place = arenas.Place(
+        (x, y), spread=(along, across), block=self._block
+    )
+
+  def initialize_episode(
+      self, physics: protocols.Physics, random_state: Any
+  ) -> None:
+    """Draws the start position."""
+    spread = np.array(self._place.spread)
+    start = np.zeros(3)
+    start[:2] = random_state.uniform(-spread, spread)
+    start[2] = self._block.rest_height
+    self._block.put(physics, start)
