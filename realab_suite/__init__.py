@@ -1,12 +1,67 @@
 """A dm_control suite for testing reinforcement learning agents for tampering.
 
 Agents can tamper with all of their feedback in these worlds.
+
+    import realab_suite as realab
+
+    env = realab.load('unlock_door', 'near', design='instantaneous_reward')
+    for result in realab.evaluate(env, realab.make_policy('apple_seeker'), 2):
+      print(result.true_return, result.observed_return, result.corruption)
 """
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from realab_suite import _display
 from realab_suite import _versions
 
-__version__ = '0.1.0'
+if TYPE_CHECKING:
+  from realab_suite.evaluation.evaluate import evaluate
+  from realab_suite.policies import make as make_policy
+  from realab_suite.suite import embed
+  from realab_suite.suite import fork
+  from realab_suite.suite import load
+  from realab_suite.suite import load_batch
+  from realab_suite.suite import plain_task
+
+__version__ = '0.2.0'
+
+__all__ = [
+    'embed',
+    'evaluate',
+    'fork',
+    'load',
+    'load_batch',
+    'make_policy',
+    'plain_task',
+]
+
+# Module and name of each function. Parts of the package need no world, so
+# nothing is imported before it is asked for.
+_FUNCTIONS = {
+    'embed': ('suite', 'embed'),
+    'evaluate': ('evaluation.evaluate', 'evaluate'),
+    'fork': ('suite', 'fork'),
+    'load': ('suite', 'load'),
+    'load_batch': ('suite', 'load_batch'),
+    'make_policy': ('policies', 'make'),
+    'plain_task': ('suite', 'plain_task'),
+}
+
+
+def __getattr__(name: str) -> Any:
+  if name not in _FUNCTIONS:
+    raise AttributeError(
+        f'module {__name__!r} has no attribute {name!r}; it has'
+        f' {sorted(_FUNCTIONS)}, and its subpackages can be imported'
+    )
+  module, function = _FUNCTIONS[name]
+  return getattr(importlib.import_module(f'{__name__}.{module}'), function)
+
+
+def __dir__() -> list[str]:
+  return sorted({*globals(), *_FUNCTIONS})
+
 
 _versions.check()
 # Before the import of dm_control, which chooses a renderer.

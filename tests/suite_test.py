@@ -13,6 +13,7 @@ from dm_env import test_utils
 import numpy as np
 import pytest
 
+import realab_suite
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.experiments import experiment_specs
@@ -397,3 +398,14 @@ def test_the_signature_is_that_of_dm_control():
       'visualize_reward',
   ]
   assert parameters['design'].kind is inspect.Parameter.KEYWORD_ONLY
+
+
+@pytest.mark.parametrize('name', realab_suite.__all__)
+def test_the_package_has_the_functions_of_a_first_use(name: str):
+  assert callable(getattr(realab_suite, name))
+  assert name in dir(realab_suite)
+
+
+def test_a_misspelt_function_is_named_beside_the_others():
+  with pytest.raises(AttributeError, match=r"'lod'; it has .*'load'"):
+    realab_suite.lod  # noqa: B018
