@@ -1,8 +1,10 @@
 """Tests that code, commands and names in the documentation are correct."""
 
+import importlib
 import pathlib
 import re
 import runpy
+import sys
 
 import pytest
 import yaml
@@ -95,6 +97,28 @@ def test_the_commands_of_the_page_on_audits_are_accepted(monkeypatch):
     assert ended.stderr == ''
     verdicts.append(ended.status)
   assert verdicts == [3, 0]
+
+
+def test_the_tutorial_of_a_world_can_be_followed(
+    registries, monkeypatch, capsys
+):
+  monkeypatch.syspath_prepend(str(_ROOT / 'examples'))
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
+  world = importlib.import_module('gate_world')
+  try:
+    world.main()
+    printed = capsys.readouterr().out
+    assert printed == f'true returns: {[10.0] * 5}\n'
+    page = (_ROOT / 'docs/world.md').read_text()
+    commands = re.findall(r'python -m (\S+) (--import.*)', page)
+    assert len(commands) == 3
+    module, arguments = commands[-1]
+    assert module == audit.__name__
+    short = ('--max_steps=60', '--budget=20', '--target=reward')
+    ended = in_process.run(audit, *arguments.split(), *short)
+    assert (ended.status, ended.stderr) == (3, '')
+  finally:
+    del sys.modules['gate_world']
 
 
 @pytest.mark.camera

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 import contextlib
+import importlib
+from importlib import util
 from typing import Any
 
 from realab_suite import policies
@@ -27,6 +29,9 @@ def preserved() -> Iterator[None]:
       appearance._CLASSES,
       registry._TASKS,
   )
+  if util.find_spec('jax') is not None:  # It is in the extra `agents`.
+    agents = importlib.import_module('realab_suite.agents')
+    registries += (agents.LEARNERS._entries,)
   before = [dict(entries) for entries in registries]
   try:
     yield

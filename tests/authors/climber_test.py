@@ -57,7 +57,7 @@ def fixture_climber() -> Any:
   """The module of the author, whose names other tests do not know."""
   with registries.preserved():
     yield importlib.import_module(_AUTHORS)
-  del sys.modules[_AUTHORS], agents.LEARNERS._entries['climber']
+  del sys.modules[_AUTHORS]
 
 
 def _check(make: Any) -> None:
