@@ -46,7 +46,7 @@ def _header(**changes: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     'case',
-    [*snapshot_campaign.CASES[:18:4], _ADVICE, _LATE, _AT_ONCE, _SALTED],
+    [*snapshot_campaign.CASES[:18:8], _LATE, _AT_ONCE, _SALTED],
     ids=lambda case: '-'.join(
         (case.domain, case.design, *case.overrides, type(case.seed).__name__)
     ),
@@ -56,31 +56,26 @@ def test_a_restored_world_continues_bit_for_bit(case):
   assert snapshot_campaign.num_differences(case, point, _STEPS) == 0
 
 
-@examples.settings(4)
+@examples.settings(3)
 @hypothesis.given(point=st.integers(0, 100), seed=st.integers(0, 2**32))
 def test_any_step_of_any_seed_can_be_saved(point: int, seed: int):
   case = _REWARD._replace(seed=seed)
   assert snapshot_campaign.num_differences(case, point, _STEPS) == 0
 
 
-@pytest.mark.parametrize('case', [_LATE, _SALTED])
-def test_another_process_continues_bit_for_bit(case):
+def test_another_process_continues_bit_for_bit():
   # It is started with the number of the seed alone.
-  assert snapshot_campaign.in_another_process(case, 30, _STEPS) == 0
+  assert snapshot_campaign.in_another_process(_SALTED, 30, _STEPS) == 0
 
 
-def test_transcripts_tell_runs_apart():
+def test_saved_worlds_are_corrupted_and_transcripts_tell_runs_apart():
   env, snapshot = snapshot_campaign.saved(_REWARD, 20)
+  reads = snapshot_campaign.ledger_of(env).last.entries['score']
+  assert abs(reads[-1].permanent) > 0.01
   first = snapshot_campaign.play(env, 5, seed=2)
   env.restore(snapshot)
   second = snapshot_campaign.play(env, 5, seed=3)
   assert all(a != b for a, b in zip(first[:-1], second[:-1], strict=True))
-
-
-def test_saved_worlds_contain_corruption():
-  env, _ = snapshot_campaign.saved(_REWARD, 20)
-  reads = snapshot_campaign.ledger_of(env).last.entries['score']
-  assert abs(reads[-1].permanent) > 0.01
 
 
 def test_a_snapshot_can_be_restored_again_and_again():

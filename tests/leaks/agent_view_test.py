@@ -1,6 +1,7 @@
 """Tests for the agent's view: what passes, what does not, and who closes it."""
 
 import copy
+import pickle
 from typing import Any
 
 import dm_env
@@ -22,54 +23,30 @@ _MANY = _ALONE._replace(num_envs=2)
 _EITHER = pytest.mark.parametrize('case', [_ALONE, _MANY], ids=['one', 'many'])
 
 
-def _one_case_per_task_and_design() -> list[pairs.Case]:
-  tasks, designs = suite.ALL_TASKS, suite.DESIGNS
-  return [
-      _ALONE._replace(
-          domain=tasks[i % len(tasks)][0],
-          variation=tasks[i % len(tasks)][1],
-          design=designs[i % len(designs)],
-          num_envs=num_envs,
-      )
-      for num_envs in (0, 2)
-      for i in range(max(len(tasks), len(designs)))
-  ]
-
-
+# Every task and every design, alone or in a batch; the campaign combines them.
 @pytest.mark.parametrize(
-    'case',
-    _one_case_per_task_and_design(),
-    ids=lambda case: f'{case.variation}-{case.design}-{case.num_envs}',
+    'i', range(max(len(suite.ALL_TASKS), len(suite.DESIGNS)))
 )
-def test_a_view_keeps_the_contract(case: pairs.Case):
+def test_a_view_keeps_the_contract(i: int):
+  domain, variation = suite.ALL_TASKS[i % len(suite.ALL_TASKS)]
+  case = _ALONE._replace(
+      domain=domain,
+      variation=variation,
+      design=suite.DESIGNS[i % len(suite.DESIGNS)],
+      num_envs=2 * (i % 2),
+  )
   assert contract.complaints(case) == []
 
 
-def test_a_view_returns_the_time_steps_of_the_environment():
-  env, other = _ALONE.load(), _ALONE.load()
-  view = agent_view.AgentView(other)
-  assert isinstance(view, dm_env.Environment)
-  for action in pairs.walk(env.action_spec(), _ALONE):
-    assert pairs.encode(view.step(action)) == pairs.encode(env.step(action))
-
-
-def test_a_batch_view_returns_the_time_steps_of_the_batch():
-  batch, other = _MANY.load(), _MANY.load()
-  view = agent_view.BatchAgentView(other)
-  for action in pairs.walk(batch.action_spec(), _MANY):
-    assert pairs.encode(view.step(action)) == pairs.encode(batch.step(action))
-
-
 @_EITHER
-def test_sinks_record_steps_taken_through_a_view(
-    case: pairs.Case,
-):
-  env = case.load()
+def test_a_view_returns_the_time_steps_of_the_environment(case: pairs.Case):
+  env, other = case.load(), case.load()
   ledger = ledgers.BatchLedger() if case.num_envs else ledgers.Ledger()
-  env.add_sink(ledger)
-  view = pairs.view_of(env)
-  for action in pairs.walk(view.action_spec(), case):
-    view.step(action)
+  other.add_sink(ledger)
+  view = pairs.view_of(other)
+  assert isinstance(view, dm_env.Environment) == (not case.num_envs)
+  for action in pairs.walk(env.action_spec(), case):
+    assert pairs.encode(view.step(action)) == pairs.encode(env.step(action))
   episodes = ledger.episodes(1) if case.num_envs else ledger.episodes
   assert [e.num_steps for e in episodes if e.end is not None] == [9, 9]
 
@@ -90,15 +67,10 @@ def test_closing_a_view_leaves_the_environment_alone(case: pairs.Case):
   # The running episode continues.
   step_type = np.ravel(env.step(action).step_type)
   assert set(step_type.tolist()) == {1}
-
-
-@_EITHER
-def test_a_closed_environment_is_closed_to_the_view(case: pairs.Case):
-  env = case.load()
-  view = pairs.view_of(env)
+  other = pairs.view_of(env)
   env.close()
   with pytest.raises(errors.ClosedError, match='closed'):
-    view.reset()
+    other.reset()
 
 
 def test_a_view_of_something_else_is_refused():
@@ -110,10 +82,19 @@ def test_a_view_of_something_else_is_refused():
     agent_view.BatchAgentView(env)  # type: ignore[arg-type]
 
 
-def test_a_view_cannot_be_deep_copied():
-  view = agent_view.AgentView(_ALONE.load())
-  with pytest.raises(TypeError, match='cannot be pickled or copied'):
-    copy.deepcopy(view)
+@_EITHER
+def test_a_view_cannot_be_copied(case: pairs.Case):
+  view: Any = pairs.view_of(case.load())
+  for steal in (
+      copy.copy,
+      copy.deepcopy,
+      pickle.dumps,
+      lambda view: view.__reduce__(),
+      lambda view: view.__reduce_ex__(4),
+      lambda view: view.__getstate__(),
+  ):
+    with pytest.raises(TypeError, match='cannot be pickled or copied'):
+      steal(view)
 
 
 def test_errors_hidden_from_the_agent_reach_the_evaluator():
@@ -148,7 +129,9 @@ def test_an_action_error_of_a_task_is_a_world_error():
 def test_view_and_environment_reject_actions_with_one_message():
   env = _ALONE.load()
   view = agent_view.AgentView(env)
-  for action in (None, 'a', [np.nan] * 6, np.zeros(2), [[1.0], [2.0, 3.0]]):
+  for action in (
+      None, 'a', [np.nan] * 6, np.zeros(2), [[1.0], [2.0, 3.0]], np.ma.zeros(6)
+  ):  # fmt: skip
     with pytest.raises(errors.ActionError) as of_view:
       view.step(action)
     if not isinstance(action, list) or len(action) == 6:
@@ -204,9 +187,11 @@ def test_enabling_an_observable_of_a_foreign_task_shows_nothing():
   assert sorted(view.observation_spec()) == keys
 
 
-@pytest.mark.parametrize('domain', suite.TASKS_BY_DOMAIN)
-def test_enabling_every_observable_shows_the_agent_nothing_more(domain: str):
-  case = _ALONE._replace(domain=domain)
+# The checks of planted leaks are run in Collect Apples without a leak, too.
+
+
+def test_enabling_every_observable_shows_the_agent_nothing_more():
+  case = _ALONE._replace(domain='unlock_door')
   assert contract.enabling_everything(case) == []
   env = case.load()
   assert contract.enable_all(env) > 5
@@ -214,8 +199,7 @@ def test_enabling_every_observable_shows_the_agent_nothing_more(domain: str):
 
 @pytest.mark.mujoco_warns('BADQPOS')
 def test_failing_physics_leak_nothing_to_the_agent():
-  for domain in suite.TASKS_BY_DOMAIN:
-    assert contract.divergence(_ALONE._replace(domain=domain)) == []
+  assert contract.divergence(_ALONE._replace(domain='unlock_door')) == []
 
 
 def test_blocks_of_registers_hang_from_nothing_that_moves():
@@ -228,23 +212,10 @@ def test_there_is_room_for_twice_the_contacts():
     assert contract.headroom(_ALONE._replace(design=design)) == []
 
 
-def test_no_key_of_an_observation_names_a_meter_or_query_register():
-  for design in suite.DESIGNS:
-    env = _ALONE._replace(design=design).load()
-    keys = agent_view.AgentView(env).observation_spec()
-    roles = {
-        env.mechanism.design.registers[key.partition('/')[2]].role
-        for key in keys
-        if key.startswith('registers/')
-    }
-    env.close()
-    assert roles <= {'feedback', 'signal'}
-
-
-def test_five_hundred_failures_leak_nothing():
-  scanned = failures.scan(2)
+def test_hundreds_of_failures_leak_nothing():
+  scanned = failures.scan(1)
   assert scanned.found == []
-  assert scanned.num_failures >= 500
+  assert scanned.num_failures >= 300
   assert scanned.num_kinds >= 30
 
 
