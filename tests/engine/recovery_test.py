@@ -1,5 +1,6 @@
 """Broken physics, failed resets and errors of hooks end one episode only."""
 
+import functools
 from typing import Any
 
 from dm_control import composer
@@ -16,8 +17,17 @@ _BREAKS = pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
 _NO_OP = np.zeros(1)  # Of `PointTask`.
 
 
+@functools.cache
+def _loaded() -> environment.Environment:
+  return helpers.load_apples()
+
+
 def _load() -> tuple[Any, helpers.RecordingSink]:
-  env, sink = helpers.load_apples(), helpers.RecordingSink()
+  """Returns a world whose first episode is the next, and a new sink."""
+  env, sink = _loaded(), helpers.RecordingSink()
+  for other in list(env._sinks):
+    env.remove_sink(other)
+  env.rewind()
   env.add_sink(sink)
   return env, sink
 
@@ -38,18 +48,25 @@ def _break_now(env: environment.Environment, how: str) -> None:
     data.qfrc_applied[0] = 1e30
 
 
-def _assert_recovers(env: environment.Environment) -> None:
-  """After a broken episode, the next one is that of a clean environment."""
+@functools.cache
+def _second_episode() -> list[bytes]:
+  """Returns the beginning of an episode in which nothing has failed."""
   clean = helpers.load_apples()
   clean.rewind(1)
+  actions = helpers.random_actions(clean, 10, seed=4)
+  return [helpers.to_bytes(clean.step(action)) for action in actions]
+
+
+def _assert_recovers(env: environment.Environment) -> None:
+  """After a broken episode, the next one is that of a clean environment."""
   for i, action in enumerate(helpers.random_actions(env, 10, seed=4)):
     found = env.step(action)
     assert found.first() == (i == 0)
-    assert helpers.to_bytes(found) == helpers.to_bytes(clean.step(action))
+    assert helpers.to_bytes(found) == _second_episode()[i]
 
 
 @pytest.mark.parametrize(
-    ('how', 'before'), [('qvel', 0), ('qpos', 1), ('far', 0), ('force', 7)]
+    ('how', 'before'), [('qvel', 0), ('qpos', 1), ('far', 0), ('force', 3)]
 )
 @_BREAKS
 def test_physics_that_fail_end_the_episode_and_nothing_else(
@@ -73,7 +90,7 @@ def test_physics_that_fail_end_the_episode_and_nothing_else(
 
 
 @pytest.mark.parametrize(
-    ('phase', 'how'), [(1, 'qvel'), (2, 'qpos'), (3, 'far'), (3, 'qvel')]
+    ('phase', 'how'), [(1, 'qvel'), (2, 'qpos'), (3, 'far')]
 )
 @_BREAKS
 def test_physics_that_fail_within_a_step_are_noticed_in_that_step(

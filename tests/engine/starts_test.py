@@ -1,5 +1,6 @@
 """No episode begins with a moved wall, or a body, inside a register."""
 
+import functools
 from typing import Any
 
 from dm_control import composer
@@ -17,6 +18,8 @@ from realab_suite.tasks import registry
 
 _WALL = {'name': 'slab', 'type': 'box', 'size': (0.6, 0.05, 0.5)}
 _PARKED = (0.0, 0.0, -3.0)
+# Places of the wall, and its angle: beside the register, and in it.
+_CLEAR, _TAKEN = (0.0, 3.5, 0.0), (0.5, 2.0, 0.0)
 
 
 class _Maze(collect_apples.CollectApples):
@@ -46,15 +49,32 @@ def _design(**register: Any) -> dict[str, Any]:
   return {'schema': 1, 'name': 'd', 'registers': {'r': register}}
 
 
-def _problem(task: Any, **register: Any) -> str:
+@functools.cache
+def _maze(**register: str) -> Any:
+  return suite.embed(_Maze(_CLEAR), _design(**register), random=0)
+
+
+def _problem_at(place: Any, **register: str) -> str:
+  """Returns the message of a reset with the wall at a place, or ''."""
+  env = _maze(**register)
+  env.task._places = [place]
+  return _problem_of(env)
+
+
+def _problem(task: Any) -> str:
   """Returns the message of the first reset, or ''."""
-  env = suite.embed(task, _design(**register), random=0)
+  env = suite.embed(task, _design(), random=0)
+  try:
+    return _problem_of(env)
+  finally:
+    env.close()
+
+
+def _problem_of(env: Any) -> str:
   try:
     env.reset()
   except composer.EpisodeInitializationError as error:
     return str(error)
-  finally:
-    env.close()
   return ''
 
 
@@ -74,7 +94,7 @@ def _problem(task: Any, **register: Any) -> str:
 def test_a_wall_that_is_moved_into_a_register_is_refused(
     place: Any, is_refused: bool, kind: str
 ):
-  problem = _problem(_Maze(place), kind=kind)
+  problem = _problem_at(place, kind=kind)
   assert bool(problem) == is_refused
   if is_refused:
     assert problem.startswith("design 'd': register 'r' at value ")
@@ -83,18 +103,17 @@ def test_a_wall_that_is_moved_into_a_register_is_refused(
 
 @pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
 def test_twins_are_refused_alike(channel: str):
-  assert _problem(_Maze((0.5, 2.0, 0.0)), channel=channel)
-  assert not _problem(_Maze((0.5, 1.5, 0.0)), channel=channel)
+  assert _problem_at(_TAKEN, channel=channel)
+  assert not _problem_at((0.5, 1.5, 0.0), channel=channel)
 
 
 def test_another_attempt_may_put_the_wall_elsewhere():
-  clear, taken = (0.0, 3.5, 0.0), (0.5, 2.0, 0.0)
-  env = suite.embed(_Maze(clear, taken), _design(), random=0)
+  env = _maze()
+  env.task._places = [_CLEAR, _TAKEN]
   for _ in range(8):
     env.reset()
     frame = env.task._wall.frame
     np.testing.assert_array_equal(env.physics.bind(frame).mocap_pos[1], 3.5)
-  env.close()
 
 
 def test_a_batch_refuses_and_repeats_as_one_world_does(monkeypatch: Any):
@@ -126,22 +145,22 @@ def test_a_batch_refuses_and_repeats_as_one_world_does(monkeypatch: Any):
 
 
 def _two_places() -> _Maze:
-  return _Maze((0.0, 3.5, 0.0), (0.5, 2.0, 0.0))
+  return _Maze(_CLEAR, _TAKEN)
 
 
 def _taken() -> _Maze:
-  return _Maze((0.5, 2.0, 0.0))
+  return _Maze(_TAKEN)
 
 
 def test_the_way_of_a_moved_part_has_to_be_free():
   place = (-2.0, 2.0, np.pi / 2)
-  assert not _problem(_Maze(place))
+  assert not _problem_at(place)
   assert _problem(_Maze(place, travel=(1.9, 0.0, 0.0)))
   assert not _problem(_Maze(place, travel=(1.8, 0.0, 0.0)))
 
 
 def test_a_part_that_nothing_collides_with_may_be_anywhere():
-  assert not _problem(_Maze((0.5, 2.0, 0.0), solid=False))
+  assert not _problem(_Maze(_TAKEN, solid=False))
 
 
 def test_the_place_that_an_episode_draws_counts():
@@ -181,7 +200,7 @@ class _Crated(collect_apples.CollectApples):
     physics.bind(joint).qpos = [*self._begins, 0.2, 1.0, 0.0, 0.0, 0.0]
 
 
-_CLEAR, _TAKEN = (-2.0, 2.0), (0.25, 2.0)
+_ASIDE, _INSIDE = (-2.0, 2.0), (0.25, 2.0)
 
 
 def test_a_register_in_a_body_of_the_task_is_refused():
@@ -189,10 +208,10 @@ def test_a_register_in_a_body_of_the_task_is_refused():
       errors.SpecError,
       match=r"register 'r' would be at .* inside 'crate' when an episode",
   ):
-    suite.embed(_Crated(_TAKEN, _CLEAR), _design(), random=0)
-  assert "inside 'crate' when the" in _problem(_Crated(_CLEAR, _TAKEN))
+    suite.embed(_Crated(_INSIDE, _ASIDE), _design(), random=0)
+  assert "inside 'crate' when the" in _problem(_Crated(_ASIDE, _INSIDE))
   # Unlike a wall, it may be where blocks are written later.
-  assert not _problem(_Crated(_CLEAR, (0.9, 2.0)))
+  assert not _problem(_Crated(_ASIDE, (0.9, 2.0)))
 
 
 def test_worlds_whose_parts_stay_pay_nothing(monkeypatch: Any):
