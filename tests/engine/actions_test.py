@@ -1,7 +1,5 @@
 """Every action that satisfies `action_spec()` is accepted, everywhere."""
 
-import copy
-import pickle
 from typing import Any
 
 from dm_env import specs as dm_env_specs
@@ -21,22 +19,28 @@ from tests.engine import helpers
 _NUM_ACTIONS = 200
 # Every so many of them are taken as steps.
 _STRIDE = 5
-# Besides the designs that ship: a query that cannot be an index, and
-# queries beside the elements of continuous control.
-_REAL = {
-    'real query': ('providers=[]', 'learner=null'),
+# By name: a design, its overrides, and the type and the shape of actions.
+# Besides the designs that ship: a query that cannot be an index, and queries
+# beside the elements of continuous control.
+_CASES: dict[str, tuple[str, tuple[str, ...], Any, tuple[int, ...]]] = {
+    'controls': ('instantaneous_reward', (), np.float64, (6,)),
+    'an index': ('online_imitation', (), np.int32, ()),
+    'a query': ('value_advice', (), np.int32, (2,)),
+    'two queries': ('paired_decoupled_approval', (), np.int32, (3,)),
+    'real query': (
+        'value_advice', ('providers=[]', 'learner=null'), np.float64, (2,),
+    ),
     'continuous, with queries': (
-        'providers=[]', 'learner=null', 'action_set=null',
+        'value_advice', ('providers=[]', 'learner=null', 'action_set=null'),
+        np.float64, (7,),
     ),
     'real and integer queries': (
-        'registers.other={kind: two_block, role: query, place: station_3,'
-        ' range: [-1.5, 2.5]}',
+        'value_advice',
+        ('registers.other={kind: two_block, role: query, place: station_3,'
+         ' range: [-1.5, 2.5]}',),
+        np.float64, (3,),
     ),
 }  # fmt: skip
-_CASES = {
-    **{design: (design, ()) for design in suite.DESIGNS},
-    **{name: ('value_advice', overrides) for name, overrides in _REAL.items()},
-}
 
 
 def _extremes(spec: Any) -> list[np.ndarray]:
@@ -59,17 +63,23 @@ def _actions(spec: Any) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ('design', 'overrides'), _CASES.values(), ids=list(_CASES)
+    ('design', 'overrides', 'dtype', 'shape'),
+    _CASES.values(),
+    ids=list(_CASES),
 )
-def test_every_action_in_the_spec_is_accepted(design: str, overrides: Any):
-  env = suite.load(
-      'collect_apples', 'standard', {'random': 1}, {'max_steps': 10_000},
-      design=design, overrides=overrides,
-  )  # fmt: skip
+def test_every_action_in_the_spec_is_accepted(
+    design: str, overrides: Any, dtype: Any, shape: tuple[int, ...]
+):
+  arguments = 'collect_apples', 'standard', {'random': 1}, {'max_steps': 10_000}
+  env = suite.load(*arguments, design=design, overrides=overrides)
+  spec = env.action_spec()
+  # Integers where all elements are indices.
+  assert (spec.dtype, spec.shape) == (dtype, shape)
+  assert spec.name.count('\t') == max(np.prod(shape), 1) - 1
   view = agent_view.AgentView(env)
   port = agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
   env.reset()
-  actions = _actions(env.action_spec())
+  actions = _actions(spec)
   for action in actions:
     queries, controls = env.codec.decode(action)
     assert queries.dtype == controls.dtype == np.float64
@@ -86,53 +96,17 @@ def test_every_action_in_the_spec_is_accepted(design: str, overrides: Any):
         port.answer(request.SerializeToString())
     )
     assert not answer.HasField('error'), (i, answer.error.message)
-
-
-@pytest.mark.parametrize(
-    ('design', 'overrides'), _CASES.values(), ids=list(_CASES)
-)
-def test_every_action_in_the_spec_is_accepted_in_a_batch(
-    design: str, overrides: Any
-):
   batch = suite.load_batch(
-      'collect_apples', 'standard', {'random': 1}, {'max_steps': 10_000},
-      num_envs=4, design=design, overrides=overrides,
-  )  # fmt: skip
+      *arguments, num_envs=4, design=design, overrides=overrides
+  )
   batch.reset()
-  found = _actions(batch.action_spec())[-3::-_STRIDE]
-  assert len(found) >= 4
-  for first in range(0, len(found) - 3, 4):
-    time_step = batch.step(np.stack(found[first : first + 4]))
+  for first in range(0, len(actions) - 3, 4 * _STRIDE):
+    time_step = batch.step(np.stack(actions[first : first + 4]))
     assert (time_step.step_type == 1).all()
 
 
-@pytest.mark.parametrize(
-    ('name', 'dtype', 'shape'),
-    [
-        ('none', np.float64, (6,)),
-        ('instantaneous_reward', np.float64, (6,)),
-        ('online_imitation', np.int32, ()),
-        ('value_advice', np.int32, (2,)),
-        ('paired_decoupled_approval', np.int32, (3,)),
-        ('real query', np.float64, (2,)),
-        ('real and integer queries', np.float64, (3,)),
-        ('continuous, with queries', np.float64, (7,)),
-    ],
-)
-def test_a_spec_has_integers_where_all_elements_are_indices(
-    name: str, dtype: Any, shape: tuple[int, ...]
-):
-  design, overrides = _CASES[name]
-  env = suite.load(
-      'collect_apples', 'standard', design=design, overrides=overrides
-  )
-  spec = env.action_spec()
-  assert (spec.dtype, spec.shape) == (dtype, shape)
-  assert spec.name.count('\t') == max(np.prod(shape), 1) - 1
-
-
 def test_an_index_in_a_vector_of_real_numbers_is_rounded():
-  design, overrides = _CASES['real query']
+  design, overrides, *_ = _CASES['real query']
   env, twin = (
       suite.load(
           'collect_apples', 'standard', {'random': 1}, design=design,
@@ -191,48 +165,3 @@ def test_an_action_spec_that_is_no_bounded_vector_is_refused(spec: Any):
   task.action_spec = lambda physics: spec  # type: ignore[method-assign]
   with pytest.raises(errors.SpecError, match='action_spec of the task'):
     suite.embed(task, 'none')
-
-
-# What is no array of numbers.
-
-
-@pytest.mark.parametrize('is_batch', [False, True])
-def test_a_masked_array_is_refused(is_batch: bool):
-  load: Any = suite.load
-  kwargs: dict[str, Any] = {}
-  view: Any = agent_view.AgentView
-  if is_batch:
-    load, kwargs = suite.load_batch, {'num_envs': 2}
-    view = agent_view.BatchAgentView
-  env = load('collect_apples', 'standard', **kwargs)
-  leading = (2,) if is_batch else ()
-  env.reset()
-  for mask in (True, False):
-    action = np.ma.masked_array(np.zeros((*leading, 6)), mask=mask)
-    for step in (env.step, view(env).step):
-      with pytest.raises(errors.ActionError, match='masked'):
-        step(action)
-
-
-@pytest.mark.parametrize(
-    'steal',
-    [
-        copy.copy,
-        copy.deepcopy,
-        pickle.dumps,
-        lambda view: view.__reduce__(),
-        lambda view: view.__reduce_ex__(4),
-        lambda view: view.__getstate__(),
-    ],
-    ids=['copy', 'deepcopy', 'pickle', 'reduce', 'reduce_ex', 'getstate'],
-)
-@pytest.mark.parametrize('is_batch', [False, True])
-def test_a_view_cannot_be_copied(steal: Any, is_batch: bool):
-  if is_batch:
-    env: Any = suite.load_batch('collect_apples', 'near', num_envs=2)
-    view: Any = agent_view.BatchAgentView(env)
-  else:
-    env = suite.load('collect_apples', 'near')
-    view = agent_view.AgentView(env)
-  with pytest.raises(TypeError, match='cannot be pickled or copied'):
-    steal(view)

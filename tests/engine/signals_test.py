@@ -13,7 +13,6 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import episodes
 from realab_suite.engine import events
-from realab_suite.entities import registers
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
@@ -109,16 +108,22 @@ def _push(env: Any, worlds: Any, distance: float) -> None:
 _EITHER = pytest.mark.parametrize('num_envs', [0, 3], ids=['one', 'batch'])
 
 
-@_EITHER
-@pytest.mark.parametrize('channel', registers.CHANNELS)
 @pytest.mark.parametrize(
-    ('threshold', 'initial', 'value'),
-    [({'above': 2}, 0, 5), ({'below': 2.5}, 4, 0)],
-    ids=['above', 'below'],
+    ('num_envs', 'channel', 'is_above'),
+    [
+        (0, 'embedded', True),
+        (0, 'welded', False),
+        (0, 'secure', True),
+        (3, 'embedded', False),
+        (3, 'secure', False),
+    ],
 )
 def test_a_signal_ends_every_episode_with_discount_0(
-    num_envs, channel, threshold, initial, value
+    num_envs, channel, is_above
 ):
+  threshold, initial, value = (
+      ({'above': 2}, 0, 5) if is_above else ({'below': 2.5}, 4, 0)
+  )
   design = _design(
       threshold, {'value': float(value)}, initial=initial, channel=channel,
       dof='planar' if num_envs else 'free',
@@ -189,7 +194,6 @@ def test_providers_do_not_write_in_a_world_whose_episode_has_ended():
         ('apple_seeker', 'embedded', 'signal'),
         ('carrying_saboteur', 'embedded', 'timeout'),
         ('carrying_saboteur', 'secure', 'signal'),
-        ('carrying_saboteur', 'welded', 'signal'),
     ],
 )
 def test_an_agent_that_moves_a_signal_goes_on(policy, channel, end):
