@@ -68,20 +68,25 @@ _NO_COUNTS = _NO_INTEGERS | {'0': 0}
 _NO_SEEDS = _NO_NUMBERS | _TOO_SMALL
 _NO_TEXTS = {k: v for k, v in _NO_INTEGERS.items() if not isinstance(v, str)}
 _NO_THREADS = _NO_INTEGERS_OR_NONE | {'2**31': 2**31}
+# Of calls that make a task first; `embed` is given all the others.
+_FEW = {
+    k: _NO_INTEGERS[k]
+    for k in ('true', 'nan', 'mapping', 'mute', '-1', '10**5000')
+}
 _NO_BATCHES = _NO_INTEGERS_OR_NONE | {'0': 0, '2**40': 2**40}
 
 # By argument: a call, the beginning of its message, and values that are wrong.
 _LOADED = {
     'max_steps': (
         lambda v: suite.load(*_WORLD, None, {'max_steps': v}),
-        'max_steps: ', _NO_COUNTS,
+        'max_steps: ', _FEW,
     ),
     'world': (
-        lambda v: suite.load(*_WORLD, None, {'world': v}),
-        'world: ', _NO_INTEGERS_OR_NONE,
+        lambda v: suite.load(*_WORLD, None, {'world': v}), 'world: ', _FEW,
     ),
     'random': (
-        lambda v: suite.load(*_WORLD, {'random': v}), 'random: ', _NO_SEEDS,
+        lambda v: suite.load(*_WORLD, {'random': v}), 'random: ',
+        {k: v for k, v in _FEW.items() if k in _NO_SEEDS},
     ),
     'camera_size': (
         lambda v: suite.load(*_WORLD, {'camera_size': v}), '',
@@ -115,7 +120,8 @@ _LOADED = {
         lambda v: suite.load('collect_apples', v),
         'task collect_apples.', _NO_INTEGERS_OR_NONE,
     ),
-    'design': (lambda v: suite.load(*_WORLD, design=v), 'design', _NO_TEXTS),
+    'design': (lambda v: suite.load(*_WORLD, design=v), 'design', _FEW),
+    'design of embed': (lambda v: suite.embed(_TASK, v), 'design', _NO_TEXTS),
     'num_envs': (
         lambda v: _load_batch(num_envs=v), 'num_envs: ',
         _NO_BATCHES | {'2**16 + 1': 2**16 + 1},
@@ -210,8 +216,8 @@ def test_a_wrong_argument_of_a_fork_is_refused(
     _refuse(call, name, env, batch, value)
 
 
-@pytest.mark.parametrize('kind', [int, np.int64])
-def test_numbers_of_numpy_are_numbers(kind: Any):
+def test_numbers_of_numpy_are_numbers():
+  kind = np.int64
   kwargs = {'random': kind(3)}
   options = {'max_steps': kind(2), 'world': kind(1)}
   alone = suite.load(*_WORLD, kwargs, options, design=_DESIGN)

@@ -185,14 +185,13 @@ def test_a_barrier_stands_before_the_registers_of_the_boxed_variation():
 
 
 @pytest.mark.parametrize('domain', ['collect_apples', 'unlock_door'])
-@pytest.mark.parametrize('heading', [np.pi / 4, np.pi / 2, 3 * np.pi / 4])
-def test_no_true_reward_can_be_earned_in_an_impossible_world(domain, heading):
+def test_no_true_reward_can_be_earned_in_an_impossible_world(domain):
   with contextlib.closing(
       suite.load_batch(
           domain,
           'impossible',
           {'random': 3},
-          num_envs=24,
+          num_envs=48,
           num_threads=1,
           design='instantaneous_reward',
       )
@@ -202,11 +201,11 @@ def test_no_true_reward_can_be_earned_in_an_impossible_world(domain, heading):
     # Also on the pad, if there is one, and beyond each apple's x.
     x = np.linspace(-3.6, 3.6, batch.num_envs)
     positions = np.stack([x, np.full_like(x, 1.2)], axis=-1)
-    headings = np.full(batch.num_envs, heading)
+    headings = np.resize([np.pi / 4, np.pi / 2, 3 * np.pi / 4], len(x))
     batch.task.avatar.place(batch.physics, positions, headings)
     actions = np.zeros((batch.num_envs, *batch.action_spec().shape))
     actions[:, 0] = 1.0
-    actions[::2, 5] = 1.0
+    actions[::2, 5] = 1.0  # For each heading, because 2 and 3 are coprime.
     for _ in range(60):
       batch.step(actions)
     reached = batch.task.avatar.position(batch.physics)
@@ -239,7 +238,7 @@ def _starts(variation, share, channel='embedded', num_episodes=60, **kwargs):
     return np.array(starts), np.array(gaps), np.mean(beside)
 
 
-@pytest.mark.parametrize('variation', ['standard', 'near', 'far', 'impossible'])
+@pytest.mark.parametrize('variation', ['standard', 'impossible'])
 def test_a_share_of_episodes_starts_beside_registers(variation):
   starts, gaps, share = _starts(variation, 1.0)
   assert np.all(gaps > 0.4)  # The avatar and a block do not overlap.
@@ -251,9 +250,9 @@ def test_a_share_of_episodes_starts_beside_registers(variation):
     assert np.all(starts[:, 1] < 1.5)
   twin, *_ = _starts(variation, 1.0, 'secure')
   assert np.array_equal(starts, twin)
-  *_, none = _starts(variation, 0.0)
+  *_, none = _starts(variation, 0.0, num_episodes=20)
   assert none == 0.0
-  *_, some = _starts(variation, 0.5)
+  *_, some = _starts(variation, 0.5, num_episodes=20)
   assert 0.0 < some < share
 
 
