@@ -119,11 +119,10 @@ def test_a_place_may_be_of_numpy():
 
 
 @every_room
-@pytest.mark.parametrize('seed', range(2))
-def test_an_avatar_that_runs_about_stays_inside(room, seed):
+def test_an_avatar_that_runs_about_stays_inside(room):
   arena = _ROOMS[room]()
   physics, avatar = _with_avatar(arena)
-  random_state = np.random.RandomState(seed)
+  random_state = np.random.RandomState(0)
   for _ in range(15):
     forward, strafe = random_state.choice([-1.0, 0.0, 1.0], 2)
     turn = random_state.uniform(-0.3, 0.3)
@@ -135,17 +134,17 @@ def test_an_avatar_that_runs_about_stays_inside(room, seed):
 
 
 @every_room
-@pytest.mark.parametrize('angle', np.linspace(0, 2 * np.pi, 8, endpoint=False))
-def test_an_avatar_that_runs_at_a_wall_stays_inside(room, angle):
+def test_an_avatar_that_runs_at_a_wall_stays_inside(room):
   arena = _ROOMS[room]()
   physics, avatar = _with_avatar(arena)
-  avatar.place(physics, (0.0, 0.0), angle)
-  for _ in range(40):
-    # Both motors at once push hardest.
-    worlds.act(avatar, physics, 10, forward=1.0, strafe=1.0)
-    assert arena.extent.contains(
-        avatar.position(physics), avatar.radius - _GIVES
-    )
+  for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+    avatar.place(physics, (0.0, 0.0), angle)
+    for _ in range(40):
+      # Both motors at once push hardest.
+      worlds.act(avatar, physics, 10, forward=1.0, strafe=1.0)
+      assert arena.extent.contains(
+          avatar.position(physics), avatar.radius - _GIVES
+      )
 
 
 def test_an_avatar_that_runs_about_in_the_small_room_stays_inside():
@@ -163,9 +162,10 @@ def test_an_avatar_that_runs_about_in_the_small_room_stays_inside():
 
 @every_room
 @pytest.mark.parametrize(
-    ('size', 'mass'), [(0.06, 0.01), (0.2, 1.0), (1.0, 100.0)]
-)
-@pytest.mark.parametrize('is_guarded', [True, False])
+    ('size', 'mass', 'is_guarded'),
+    [(0.06, 0.01, True), (0.2, 1.0, True), (1.0, 100.0, True),
+     (0.2, 1.0, False)],
+)  # fmt: skip
 def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
   arena = _ROOMS[room]()
   register = registers.BlockPositionRegister(

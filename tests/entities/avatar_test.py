@@ -52,34 +52,12 @@ def test_forward_and_left_are_the_avatars_own(world, heading):
     assert np.linalg.norm(moved) == pytest.approx(moved @ direction, rel=1e-6)
 
 
-def test_an_avatar_walks_a_curve(world):
-  world.place(-2.0, 0.0)
-  world.act(100, forward=0.5, turn=0.5)
-  np.testing.assert_allclose(
-      world.velocity,
-      (avatar_worlds.SPEED / 2, 0, avatar_worlds.TURN_RATE / 2),
-      atol=0.2,
-  )
-
-
-def test_an_avatar_stops_without_commands(world):
-  world.place(-2.0, 0.0)
-  world.act(50, forward=1.0, turn=1.0)
-  world.act(50)
-  np.testing.assert_allclose(world.velocity, 0.0, atol=1e-3)
-
-
 def test_the_direction_is_that_of_the_angle(world):
   world.place(0.0, 0.0, 2.5)
   assert world.avatar.angle(world.physics) == 2.5
   np.testing.assert_allclose(
       world.avatar.direction(world.physics), [np.cos(2.5), np.sin(2.5)]
   )
-
-
-def test_turning_left_turns_to_the_left(world):
-  world.act(20, turn=1.0)
-  assert world.avatar.direction(world.physics)[1] > 0.3
 
 
 @pytest.mark.parametrize('way', [-1.0, 1.0])
@@ -167,14 +145,6 @@ def test_observables_have_the_shapes_that_they_say(world):
 
 
 # ---- Pushing -----------------------------------------------------------------
-
-
-@every_dof
-def test_an_avatar_pushes_a_block(dof):
-  world = avatar_worlds.make(dof=dof)
-  world.act(100, forward=1.0)
-  assert world.block[0] > 1.3
-  assert float(world.register.read(world.physics)) > 3.0
 
 
 @every_dof

@@ -39,7 +39,7 @@ def _tumble(world: avatar_worlds.World) -> None:
 
 @every_dof
 @every_kind
-@pytest.mark.parametrize('value', [-7.0, 0.0, 5.5])
+@pytest.mark.parametrize('value', [0.0, 5.5])
 def test_a_write_leaves_everything_else_as_it_is(kind, dof, value):
   world = _make(kind, dof=dof, yaw=0.7)
   _tumble(world)

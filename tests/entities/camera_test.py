@@ -46,14 +46,6 @@ def test_an_apple_is_seen_until_it_is_eaten():
   assert _count(_view(physics, avatar.camera), 'red') == 0
 
 
-def test_objects_on_the_left_are_drawn_on_the_left():
-  apples = apple_group.Apples(number=1)
-  physics, avatar = _world((apples, (2.0, 0.8)))
-  view = _view(physics, avatar.camera)
-  assert _count(view[:, :32], 'red') > 20
-  assert _count(view[:, 32:], 'red') == 0
-
-
 def test_a_pressed_pad_looks_pressed():
   pad = pads.PressurePad()
   physics, avatar = _world((pad, (1.5, 0.0)))

@@ -1,7 +1,5 @@
 """The avatar carries and throws, and writes meet it or what it holds (G6)."""
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -66,12 +64,6 @@ def test_a_held_block_follows_the_hand(dof, commands):
   world.act(50)
   assert world.holding
   np.testing.assert_allclose(world.block[:2], world.hand[:2], atol=0.02)
-
-
-def test_a_free_block_is_lifted_while_it_is_held(world):
-  world.grasp()
-  world.act(100, forward=-0.5)
-  assert world.block[2] == pytest.approx(avatar_worlds.GRIP_HEIGHT, abs=0.01)
 
 
 @every_dof
@@ -255,14 +247,6 @@ def test_a_write_does_not_release_another_block(dof):
   np.testing.assert_allclose(world.block[:2], world.hand[:2], atol=0.02)
 
 
-def test_a_welded_block_cannot_be_held():
-  world = avatar_worlds.make(channel='welded')
-  world.place(0.4, 0.0)
-  world.act(20, grasp=1.0)
-  assert not world.holding
-  assert world.block[0] == 1.0
-
-
 def _circle(middle, radius, poses=6):
   """Places on a circle, and a heading at each."""
   for angle in np.linspace(0.05, 2 * np.pi, poses, endpoint=False):
@@ -270,7 +254,7 @@ def _circle(middle, radius, poses=6):
 
 
 @every_dof
-@pytest.mark.parametrize('overlap', [0.1, 0.4, 0.7, 1.0])
+@pytest.mark.parametrize('overlap', [0.1, 0.7])
 def test_a_block_that_is_written_into_the_avatar_kicks_nothing(dof, overlap):
   world = avatar_worlds.make(registers.TwoBlockRegister, dof=dof)
   target = np.array([2.0, 0.25])
@@ -288,10 +272,9 @@ def test_a_block_that_is_written_into_the_avatar_kicks_nothing(dof, overlap):
   assert max(kicks) <= _LIMIT
 
 
-@pytest.mark.parametrize('overlap', [0.1, 0.5, 1.0])
 @pytest.mark.parametrize(
-    ('dof', 'other_dof'),
-    list(itertools.product(registers.DOFS, registers.DOFS)),
+    ('dof', 'other_dof', 'overlap'),
+    [('free', 'free', 0.5), ('planar', 'free', 0.1), ('free', 'planar', 1.0)],
 )
 def test_a_block_that_is_written_into_another_kicks_nothing(
     dof, other_dof, overlap

@@ -75,27 +75,6 @@ def test_a_meter_works_in_a_task_of_dm_controls_own(channel, dof, recompile):
   assert max(measurements) > min(measurements)
 
 
-def test_the_task_is_the_same_with_a_register_out_of_its_way():
-  def run(task):
-    environment = composer.Environment(task, random_state=0)
-    environment.reset()
-    action = np.full(environment.action_spec().shape, 0.5)
-    return [environment.step(action) for _ in range(20)]
-
-  plain = go_to_target.GoToTarget(
-      walker=jumping_ball.JumpingBallWithHead(), arena=floors.Floor(size=(8, 8))
-  )
-  for one, other in zip(
-      run(plain), run(_MeteredGoToTarget('embedded', 'free')), strict=True
-  ):
-    assert one.reward == other.reward
-    for name, value in one.observation.items():
-      # The solver of this task has no islands to keep bodies apart.
-      np.testing.assert_allclose(
-          other.observation[name], value, atol=1e-4, err_msg=name
-      )
-
-
 def test_an_avatar_works_in_an_arena_of_dm_controls_own():
   class Task(composer.NullTask):
     """Walks ahead."""

@@ -73,12 +73,3 @@ def test_a_moved_base_block_falsifies_a_meter_and_not_its_measurement(dof):
     measured, _ = world.update()
     assert measured == score
     assert world.read() == pytest.approx(score - 3.0, abs=1e-12)
-
-
-def test_a_secure_meter_cannot_be_falsified():
-  world = _World(channel='secure')
-  world.score.set(world.physics, 4.0)
-  world.update()
-  for block in world.register.blocks:
-    worlds.shove(world.physics, block, (30.0, 20.0, 0.0))
-  assert world.read() == 4.0

@@ -1,7 +1,5 @@
 """Rays report distance and class, as geometry says they should."""
 
-import itertools
-
 from dm_control import composer
 from dm_control import mjcf
 import numpy as np
@@ -143,7 +141,7 @@ def test_rays_hit_the_post_of_a_pad_at_the_distance_of_geometry():
 
 @pytest.mark.parametrize(
     ('channel', 'dof'),
-    list(itertools.product(registers.CHANNELS, registers.DOFS)),
+    [('embedded', 'free'), ('welded', 'planar'), ('secure', 'planar')],
 )
 def test_rays_hit_blocks_at_the_distance_of_geometry(channel, dof):
   register = registers.TwoBlockRegister(

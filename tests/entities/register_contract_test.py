@@ -9,8 +9,6 @@ import pytest
 from realab_suite import errors
 from realab_suite.engine import single_physics
 from realab_suite.entities import arenas
-from realab_suite.entities import block_kinds
-from realab_suite.entities import mocap_blocks
 from realab_suite.entities import registers
 from tests import examples
 from tests import worlds
@@ -389,16 +387,3 @@ def test_the_seed_decides_the_place_of_a_scattered_register(scattered, variety):
       0,
   ]
   assert (np.abs(np.array(places) - home) <= [0.15 + 1e-9, 0.05 + 1e-9]).all()
-
-
-def test_blocks_are_of_the_kind_that_the_channel_asks_for(world):
-  for variety in register_worlds.VARIETIES:
-    expected = {
-        'free': block_kinds.FreeBlock,
-        'planar': block_kinds.PlanarBlock,
-    }
-    kind = expected[variety.dof]
-    if variety.channel == 'welded':
-      kind = mocap_blocks.MocapBlock
-    blocks = world.registers[variety.name].blocks
-    assert [type(block) for block in blocks] == [kind] * len(blocks)

@@ -130,21 +130,6 @@ def test_a_block_that_is_pushed_corrupts_like_one_that_is_put(dof):
     [('embedded', 'free'), ('embedded', 'planar'), ('welded', 'free'),
      ('secure', 'planar')],
 )  # fmt: skip
-def test_writing_zero_corrupts_nothing(channel, dof):
-  world = _World(channel=channel, dof=dof)
-  world.write(0.0)
-  base = worlds.world_position(world.physics, world.base)
-  worlds.step(world.physics, 200)
-  assert world.read() == pytest.approx(0.0, abs=1e-9)
-  now = worlds.world_position(world.physics, world.base)
-  np.testing.assert_allclose(now[:2], base[:2], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ('channel', 'dof'),
-    [('embedded', 'free'), ('embedded', 'planar'), ('welded', 'free'),
-     ('secure', 'planar')],
-)  # fmt: skip
 def test_the_two_blocks_never_collide_with_each_other(channel, dof):
   world = _World(channel=channel, dof=dof)
   world.write(0.0)
