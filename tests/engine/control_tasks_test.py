@@ -21,8 +21,9 @@ _TOTAL_MASS = (
     ' future release: scale the masses and densities in the model, or call'
     ' mj_setTotalmass and mj_setConst on the compiled model'
 )
-# Each of them has what the ones before lack: no floor, a deprecated model, a
-# fluid, walls that are planes, a model that an episode changes, a terrain. The
+# Each of them has what the ones before lack: contacts that are disabled;
+# contacts; a fluid without gravity and constraints; equalities, and walls that
+# are planes; a model that an episode changes; a terrain and activations. The
 # campaign `embedding` plays all of `embedded.CONTROL_TASKS`.
 _NAMES = [
     ('cartpole', 'two_poles'),

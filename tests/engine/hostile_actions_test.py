@@ -123,7 +123,7 @@ def _hostile(draw: Any, env: Any) -> Any:
   return values
 
 
-@examples.settings(40)
+@examples.settings(20)
 @hypothesis.given(data=st.data())
 def test_a_hostile_action_leaves_no_trace(world: _World, data: Any):
   env, twin = world

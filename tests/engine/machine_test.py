@@ -380,7 +380,7 @@ def _run(number: int) -> None:
 
 def test_an_environment_stays_whole_in_any_order_of_operations():
   _COUNTS.clear()
-  _run(40)
+  _run(20)
   assert not [name for name in _REACHED if not _COUNTS[name]]
 
 
