@@ -109,22 +109,6 @@ def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
       assert found.step_type[1] == int(dm_env.StepType.MID)
 
 
-def test_observations_of_a_batch_are_not_shared(batch):
-  first = batch.reset()
-  kept = {name: value.copy() for name, value in first.observation.items()}
-  second = batch.step(np.ones((_NUM_ENVS, 6)))
-  for name, value in first.observation.items():
-    np.testing.assert_array_equal(value, kept[name])
-    assert not np.shares_memory(value, second.observation[name])
-    value[...] = 0
-
-
-@pytest.mark.parametrize('num_envs', [0, -1, 1.5, True, None])
-def test_a_number_of_worlds_that_makes_no_sense_is_refused(num_envs):
-  with pytest.raises(errors.SpecError, match='num_envs'):
-    suite.load_batch('unlock_door', 'standard', num_envs=num_envs)
-
-
 def test_a_closed_batch_does_nothing(batch):
   batch.close()
   batch.close()

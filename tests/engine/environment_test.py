@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import random
 from typing import Any
 
 import numpy as np
@@ -113,14 +112,6 @@ def test_a_removed_sink_receives_nothing():
   assert len(sink.heard) == 1
 
 
-def test_a_sink_changes_nothing_for_the_agent():
-  env, twin = _load(max_steps=10), _load(max_steps=10)
-  env.add_sink(helpers.RecordingSink())
-  for action in helpers.random_actions(env, 25):
-    expected = helpers.to_bytes(twin.step(action))
-    assert helpers.to_bytes(env.step(action)) == expected
-
-
 class _FailingSink(events.EventSink):
   """Fails at the second beginning."""
 
@@ -176,13 +167,6 @@ def test_closing_twice_does_nothing_and_a_closed_environment_does_nothing():
       use()
 
 
-def test_an_environment_that_was_never_used_can_be_closed():
-  env = _load()
-  env.close()
-  with pytest.raises(errors.ClosedError):
-    env.reset()
-
-
 def test_an_environment_cannot_be_copied():
   env = _load()
   for copying in (pickle.dumps, copy.deepcopy, copy.copy):
@@ -191,36 +175,6 @@ def test_an_environment_cannot_be_copied():
 
 
 # Independence.
-
-
-def test_environments_are_independent():
-  envs = {seed: _load(seed=seed, max_steps=7) for seed in (1, 2)}
-  actions = {s: helpers.random_actions(envs[s], 30, s) for s in envs}
-  alone = {
-      seed: [helpers.to_bytes(env.step(action)) for action in actions[seed]]
-      for seed, env in envs.items()
-  }
-  envs = {seed: _load(seed=seed, max_steps=7) for seed in envs}
-  turns = [1] * 30 + [2] * 30
-  random.Random(5).shuffle(turns)
-  together: dict[int, list[bytes]] = {1: [], 2: []}
-  for seed in turns:
-    time_step = envs[seed].step(actions[seed][len(together[seed])])
-    together[seed].append(helpers.to_bytes(time_step))
-  assert together == alone
-
-
-def _global_state() -> tuple[Any, ...]:
-  legacy = np.random.get_state()  # noqa: NPY002 - it must not change.
-  return legacy[1].tobytes(), legacy[2:], random.getstate()
-
-
-def test_global_generators_are_not_used():
-  before = _global_state()
-  env = _load(max_steps=5)
-  for action in helpers.random_actions(env, 14):
-    env.step(action)
-  assert _global_state() == before
 
 
 def test_an_episode_does_not_depend_on_how_long_the_one_before_was():

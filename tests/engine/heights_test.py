@@ -138,16 +138,6 @@ def test_every_block_stands_on_the_table_in_all_of_its_range(
   assert problem.startswith("register 'r' at value ") == is_refused
 
 
-@pytest.mark.parametrize(
-    ('dof', 'channel'),
-    [('planar', 'embedded'), ('planar', 'secure'), ('free', 'welded')],
-)
-def test_twins_are_accepted_or_refused_alike(dof: str, channel: str):
-  for x, is_refused in ((0.39, False), (0.41, True)):
-    problem = _problem([x, 2.2, _HEIGHT], dof=dof, channel=channel)
-    assert bool(problem) == is_refused
-
-
 def test_a_gap_between_tables_a_door_and_scenery_carry_no_register():
   def build(*parts: Any) -> Any:
     task = collect_apples.CollectApples()

@@ -342,14 +342,6 @@ def test_a_closed_world_is_neither_saved_nor_restored():
 # To bytes and back; `tests/archive_test.py` has more.
 
 
-def test_a_snapshot_goes_through_bytes_and_back():
-  _, snapshot = snapshot_campaign.saved(_REWARD, 3)
-  data = snapshot.to_bytes()
-  copy = snapshots.Snapshot.from_bytes(data)
-  assert copy.header == snapshot.header
-  assert copy.to_bytes() == data
-
-
 def test_a_snapshot_shares_nothing_with_what_was_saved_or_is_returned():
   array = np.zeros(3)
   snapshot = snapshots.Snapshot(_header(), [array])
@@ -363,13 +355,3 @@ def test_objects_in_an_archive_are_rejected_with_their_place():
       errors.StateLayoutError, match=r"snapshot\['a'\]\[0\] is a object"
   ):
     snapshots.Snapshot(_header(), {'a': [object()]})
-
-
-@pytest.mark.parametrize('data', [b'', b'x' * 200, None])
-def test_damaged_bytes_are_no_snapshot(data):
-  if data is None:
-    data = snapshots.Snapshot(_header(), [np.arange(9.0), 'x']).to_bytes()[:-1]
-  with pytest.raises(
-      errors.StateLayoutError, match='bytes are not a valid snapshot'
-  ):
-    snapshots.Snapshot.from_bytes(data)
