@@ -10,11 +10,15 @@ from tests.leaks import walk
 # Channel L43 is about physics that fail.
 _BREAKS = pytest.mark.mujoco_warns('BADQPOS')
 _CHANNELS = [f'L{number}' for number in range(1, 46)]
+# One of each channel; the campaign plants all of them.
+_ONE_OF_EACH = {mutant.channel: mutant for mutant in mutants.MUTANTS[::-1]}
 
 
 @_BREAKS
 @pytest.mark.parametrize(
-    'mutant', mutants.MUTANTS, ids=lambda m: f'{m.channel} {m.what}'
+    'mutant',
+    _ONE_OF_EACH.values(),
+    ids=lambda m: f'{m.channel} {m.what}',
 )
 def test_a_planted_leak_is_found(mutant: mutants.Mutant):
   assert mutants.found_by(mutant)
