@@ -143,8 +143,8 @@ MUTANTS = [
     planting.Mutant(
         'contract', "finding 13: a sense may be called like one of the suite's",
         _OBSERVING,
-        'if max_steps is not None and TIME_LEFT in host.sense_spec:',
-        'if max_steps == -1 and TIME_LEFT in host.sense_spec:', _ENV,
+        'if max_steps is not None and TIME_LEFT in of_task:',
+        'if max_steps == -1 and TIME_LEFT in of_task:', _ENV,
     ),
     planting.Mutant(
         'contract', 'finding 14: closing twice is an error', _ENVIRONMENT,

@@ -50,12 +50,13 @@ class Observer:
     self._host = host
     self._mechanism = mechanism
     self._max_steps = max_steps
-    if max_steps is not None and TIME_LEFT in host.sense_spec:
+    of_task = host.sense_spec
+    if max_steps is not None and TIME_LEFT in of_task:
       raise errors.SpecError(
           f'the task has its own observable {TIME_LEFT!r}; rename it, or pass'
           ' max_steps=None'
       )
-    offered = dict(host.sense_spec)
+    offered = dict(of_task)
     default = list(host.default_senses)
     if max_steps is not None:
       offered[TIME_LEFT] = specs.BoundedArray((), np.float32, 0.0, 1.0)
@@ -65,9 +66,7 @@ class Observer:
     # In the order of the specs, whatever the order of the selection.
     self._specs = {n: spec for n, spec in offered.items() if n in selected}
     self._keys = {
-        name: f'senses/{name}'
-        for name in self._specs
-        if name in host.sense_spec
+        name: f'senses/{name}' for name in self._specs if name in of_task
     }
     self._has_time_left = len(self._keys) < len(self._specs)
     if senses is not None and not (self._specs or mechanism.read_by_agent):
