@@ -84,19 +84,6 @@ _MAY_IMPORT = {
     'doctor': ('experiments', 'launchers'),
 }  # fmt: skip
 
-_PICKLES = ('pickle', 'cloudpickle', 'dill', 'shelve', 'marshal')
-_UNSAFE_YAML = re.compile(r'yaml\.(load|(full|unsafe)_load)(_all)?')
-_LOCAL_GENERATORS = (
-    'BitGenerator',
-    'Generator',
-    'MT19937',
-    'PCG64',
-    'PCG64DXSM',
-    'Philox',
-    'RandomState',
-    'SeedSequence',
-    'default_rng',
-)
 # Bases whose children are neither abstract nor final, each by its own nature.
 _OPEN_BASES = re.compile(
     r'enum\.\w*(Enum|Flag)|typing\.(NamedTuple|Protocol|TypedDict)'
@@ -215,49 +202,14 @@ def _targets(module: Module) -> Iterator[tuple[ast.AST, str]]:
       yield node, node.args[0].value
 
 
-def check_assert(modules: list[Module]) -> Iterator[str]:
-  """`python -O` removes asserts, and they do not say what to do."""
-  for module, node in _walk(modules):
-    if isinstance(node, ast.Assert):
-      yield module.complaint(
-          node, 'assert; raise an error that says what to do'
-      )
-
-
-def check_print(modules: list[Module]) -> Iterator[str]:
-  """A library that prints clutters the output of its users' programs."""
-  for module, node in _walk(modules):
-    if isinstance(node, ast.Call) and module.dotted(node.func) == 'print':
-      yield module.complaint(node, 'print; use absl.logging')
-
-
 def check_pickle(modules: list[Module]) -> Iterator[str]:
-  """Loading a pickle runs code."""
-  for module in modules:
-    for node, target, _ in module.imports:
-      if target.split('.')[0] in _PICKLES:
-        yield module.complaint(node, f'import of {target}')
+  """Loading a pickle runs code; `ruff.toml` bans its modules."""
   for module, node in _walk(modules):
     if isinstance(node, ast.keyword) and node.arg == 'allow_pickle':
       if not (
           isinstance(node.value, ast.Constant) and node.value.value is False
       ):
         yield module.complaint(node.value, 'allow_pickle')
-
-
-def check_yaml(modules: list[Module]) -> Iterator[str]:
-  """YAML comes from strangers: `config.loading` is the one safe way."""
-  for module, node, name in _uses_of_imports(modules):
-    if _UNSAFE_YAML.fullmatch(name):
-      yield module.complaint(node, f'{name}; use config.loading')
-
-
-def check_global_random(modules: list[Module]) -> Iterator[str]:
-  """Every stream is derived from a seed; global generators have none."""
-  for module, node, name in _uses_of_imports(modules):
-    drawn = re.fullmatch(r'(?:numpy\.random|random)\.(\w+)', name)
-    if drawn and drawn[1] not in (*_LOCAL_GENERATORS, 'Random'):
-      yield module.complaint(node, f'{name} draws from a global generator')
 
 
 def check_getattr(modules: list[Module]) -> Iterator[str]:
@@ -274,18 +226,6 @@ def _walk(modules: list[Module]) -> Iterator[tuple[Module, ast.AST]]:
   for module in modules:
     for node in ast.walk(module.tree):
       yield module, node
-
-
-def _uses_of_imports(
-    modules: list[Module],
-) -> Iterator[tuple[Module, ast.expr, str]]:
-  """Names and attributes with their full dotted names; no local variables."""
-  for module, node in _walk(modules):
-    root = node
-    while isinstance(root, ast.Attribute):
-      root = root.value
-    if isinstance(root, ast.Name) and root.id in module.local_names:
-      yield module, node, module.dotted(node)
 
 
 def check_classes(modules: list[Module]) -> Iterator[str]:
@@ -393,11 +333,7 @@ def _is_exception(name: str) -> bool:
 
 RULES = [
     check_layers,
-    check_assert,
-    check_print,
     check_pickle,
-    check_yaml,
-    check_global_random,
     check_getattr,
     check_classes,
 ]

@@ -125,24 +125,8 @@ def test_relative_imports_of_a_package_start_at_the_package():
 
 
 _OFFENCES = {
-    import_rules.check_assert: ['assert True'],
-    import_rules.check_print: ['print(1)'],
     import_rules.check_pickle: [
-        'import pickle',
-        'from cloudpickle import dumps',
         "import numpy as np\nnp.load('x', allow_pickle=True)",
-    ],
-    import_rules.check_yaml: [
-        "import yaml\nyaml.load('x')",
-        "import yaml as y\ny.full_load('x')",
-        "from yaml import unsafe_load_all\nunsafe_load_all('x')",
-    ],
-    import_rules.check_global_random: [
-        'import numpy as np\nnp.random.uniform()',
-        'from numpy import random\nrandom.normal()',
-        'import numpy.random as r\nr.shuffle([])',
-        'import random\nrandom.random()',
-        'from random import choice\nchoice([1])',
     ],
     import_rules.check_getattr: [
         'class A:\n  def __getattr__(self, name): ...',
@@ -155,16 +139,8 @@ _OFFENCES = {
     ],
 }
 _HARMLESS = {
-    import_rules.check_print: ['sprint(1)'],
     import_rules.check_pickle: [
         "import numpy as np\nnp.load('x', allow_pickle=False)"
-    ],
-    import_rules.check_yaml: ["import yaml\nyaml.compose('x')"],
-    import_rules.check_global_random: [
-        'import numpy as np\nnp.random.default_rng(1)',
-        'def f(random: np.random.RandomState): ...',
-        'import random\nrandom.Random(1)',
-        'def f(state): return state.random.uniform()',
     ],
     import_rules.check_getattr: ["getattr(1, 'real')"],
 }
