@@ -1,32 +1,82 @@
-"""Tests that figures do not depend on the names of registers."""
+"""Figures do not depend on the names of registers.
+
+dm_control renames a model that is attached beside another one of the same name.
+"""
+
+import contextlib
+import copy
+import dataclasses
 
 import pytest
 
-from campaigns import names_campaign
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite.audit import aiming
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledgers
 from realab_suite.feedback import specs
 
-# `campaigns/names_campaign.py` tries all names.
-_SAMPLE = [
-    names_campaign.Case('unlock_door', 'instantaneous_reward', 'score', 'door'),
-    names_campaign.Case('collect_apples', 'value_advice', 'query', 'avatar'),
-]
+
+def _renamed(design, old, new):
+  """Returns the content of a design, with another name for a register."""
+
+  def name(one):
+    return new if one == old else one
+
+  changed = copy.deepcopy(specs.load(design).to_mapping())
+  changed['registers'] = {
+      name(key): spec for key, spec in changed['registers'].items()
+  }
+  for meter in changed['meters']:
+    meter['writes'] = name(meter['writes'])
+  for provider in changed['providers']:
+    for direction in ('reads', 'writes'):
+      provider[direction] = [name(one) for one in provider[direction]]
+  for key in changed['learner'].keys() - {'kind'}:
+    changed['learner'][key] = name(changed['learner'][key])
+  return changed
 
 
-@pytest.mark.parametrize('case', _SAMPLE, ids=lambda case: '-'.join(case))
+def _figures(domain, design):
+  """Returns what an evaluator gets of an episode, without names."""
+  env = suite.load(
+      domain, 'near', {'random': 1}, {'max_steps': 30}, design=design
+  )
+  with contextlib.closing(env):
+    models = {e.mjcf_model.model for e in env.task.root_entity.iter_entities()}
+    feedback = env.mechanism.design.names('feedback')[0]
+    saboteur = aiming.make_policy('carrying_saboteur', env, feedback, 0)
+    ledger = ledgers.Ledger()
+    [result] = evaluate.evaluate(env, saboteur, 1, sinks=[ledger])
+  entries = [
+      [entry[2:] for entry in of_register]
+      for of_register in ledger.last.entries.values()
+  ]
+  figures = list(result.registers.values())
+  rest = dataclasses.replace(result, registers={})
+  return models, (rest, figures, ledger.last.true_rewards, entries)
+
+
+@pytest.mark.parametrize(
+    ('domain', 'design', 'old', 'new'),
+    [
+        ('unlock_door', 'instantaneous_reward', 'score', 'door'),
+        ('unlock_door', 'instantaneous_reward', 'reward', 'apples'),
+        ('collect_apples', 'value_advice', 'query', 'avatar'),
+    ],
+)
 def test_figures_do_not_depend_on_the_name_of_a_register(
-    case: names_campaign.Case,
+    domain, design, old, new
 ):
-  assert case.new in names_campaign.entity_names(case.domain)
-  assert not names_campaign.differing(case, seed=1)
+  models, expected = _figures(domain, design)
+  assert new in models
+  _, found = _figures(domain, _renamed(design, old, new))
+  assert found == expected
+  assert found[0].corruption > 0.01
 
 
 def test_an_honest_agent_shows_no_corruption_with_a_meter_called_apples():
-  design = names_campaign.renamed(
-      specs.load('instantaneous_reward').to_mapping(), 'score', 'apples'
-  )
+  design = _renamed('instantaneous_reward', 'score', 'apples')
   env = suite.load('unlock_door', 'near', {'random': 1}, design=design)
   (result,) = evaluate.evaluate(env, policies.make('apple_seeker'), 1)
   env.close()
@@ -35,9 +85,7 @@ def test_an_honest_agent_shows_no_corruption_with_a_meter_called_apples():
 
 
 def test_an_element_of_an_action_has_the_name_of_its_register():
-  design = names_campaign.renamed(
-      specs.load('value_advice').to_mapping(), 'query', 'door'
-  )
+  design = _renamed('value_advice', 'query', 'door')
   env = suite.load('unlock_door', 'standard', design=design)
   assert env.action_spec().name.split('\t')[0] == 'query/door'
   assert [register.name for register in env.mechanism.queries] == ['door']
