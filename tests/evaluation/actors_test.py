@@ -14,6 +14,7 @@ from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.policies import action_sets
+from tests import kept
 from tests.engine import helpers
 
 _NUM_ACTIONS = 14
@@ -95,8 +96,11 @@ def _design(
 
 
 def _load(design: Any, seed: int = 7) -> environment.Environment:
-  return suite.load(
-      'collect_apples', 'standard', {'random': seed}, design=design
+  return kept.load(
+      (design, seed),
+      lambda: suite.load(
+          'collect_apples', 'standard', {'random': seed}, design=design
+      ),
   )
 
 

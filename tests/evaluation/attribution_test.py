@@ -257,18 +257,27 @@ def _play(case, num_envs=2, **options):
   return found, {name: np.array(of[1:]) for name, of in corruption.items()}
 
 
+_PLAYED = {}
+
+
+def _played(name, dof, angle=0.0):
+  """Returns what `_play` does; a case is played once."""
+  key = name, dof, angle
+  if key not in _PLAYED:
+    _PLAYED[key] = _play(_CASES[name], dof=dof, angle=angle)
+  return _PLAYED[key]
+
+
 def _share(register):
   agent, world = (abs(part).sum() for part in (register.agent, register.world))
   return agent / (agent + world) if agent + world else None
 
 
-@pytest.mark.parametrize(
-    ('dof', 'angle'), [('free', 0.0), ('planar', 0.7), ('free', 2.4)]
-)
+@pytest.mark.parametrize(('dof', 'angle'), [('free', 2.4), ('planar', 0.0)])
 @pytest.mark.parametrize('name', _CASES)
 def test_the_last_mover_is_the_one_that_people_would_name(name, dof, angle):
   case = _CASES[name]
-  (found, idle), corruption = _play(case, dof=dof, angle=angle)
+  (found, idle), corruption = _played(name, dof, angle)
   most = {n: abs(of).max() * 0.1 for n, of in corruption.items()}
   assert max(most.values()) > 0.01
   for register, share in case.shares.items():
@@ -366,19 +375,18 @@ def test_below_a_micrometre_there_is_no_corruption():
   batch.close()
 
 
-@pytest.mark.parametrize('dof', ['free', 'planar'])
 @pytest.mark.parametrize(
-    'name',
+    ('name', 'dof'),
     [
-        'throw a block at another block',
-        'push through another block',
-        'a write that ejects what the agent has brought there',
-        'a ball that hits what the agent has brought there',
+        ('throw a block at another block', 'free'),
+        ('push through another block', 'planar'),
+        ('a write that ejects what the agent has brought there', 'planar'),
+        ('a ball that hits what the agent has brought there', 'planar'),
     ],
 )
 def test_one_world_alone_has_the_same_attribution(name, dof):
   case = _CASES[name]
-  (expected, _), _ = _play(case, dof=dof)
+  (expected, _), _ = _played(name, dof)
   env = case.stage.load(dof=dof)
   attributor = attribution.WorldAttributor(env)
   env.add_sink(attributor)
@@ -395,11 +403,19 @@ def test_one_world_alone_has_the_same_attribution(name, dof):
   env.close()
 
 
-@pytest.mark.parametrize('name', _CASES)
+@pytest.mark.parametrize(
+    'name',
+    [
+        'push through a row of blocks that touch',
+        'throw a block at another block',
+        'a ball that hits what the agent has brought there',
+        'a write that ejects what the wind has brought there',
+    ],
+)
 def test_the_order_of_registers_and_balls_changes_nothing(name):
   case = _CASES[name]
   others = {'aside': _at(3.2, -3.2), 'beside': _at(-3.2, 3.2)}
-  (found, _), _ = _play(case, dof='planar')
+  (found, _), _ = _played(name, 'planar')
   registers = dict(reversed({**case.stage.registers, **others}.items()))
   stage = dataclasses.replace(case.stage, registers=registers)
   (permuted, _), _ = _play(case._replace(stage=stage), dof='planar')
@@ -464,15 +480,14 @@ def _five_near():
   return design
 
 
-@pytest.mark.parametrize('dof', ['free', 'planar'])
 @pytest.mark.parametrize(
-    ('policy', 'design'),
+    ('policy', 'design', 'dof'),
     [
-        ('carrying_saboteur', 'instantaneous_reward'),
-        ('throwing_saboteur', 'value_advice'),
-        ('pushing_saboteur', 'decoupled_approval'),
-        ('pushing_saboteur', _five_near()),
-        ('random', 'instantaneous_reward'),
+        ('carrying_saboteur', 'instantaneous_reward', 'free'),
+        ('throwing_saboteur', 'value_advice', 'planar'),
+        ('pushing_saboteur', 'decoupled_approval', 'planar'),
+        ('pushing_saboteur', _five_near(), 'free'),
+        ('random', 'instantaneous_reward', 'planar'),
     ],
     ids=['carry', 'throw', 'push', 'push one of five', 'random'],
 )

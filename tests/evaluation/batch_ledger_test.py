@@ -71,25 +71,6 @@ def test_a_reset_in_mid_episode_abandons_every_episode():
   batch.close()
 
 
-@pytest.mark.mujoco_warns('BADQVEL')
-def test_divergence_makes_an_episode_invalid():
-  batch = suite.load_batch(
-      'collect_apples', 'standard', {'random': 1}, num_envs=2
-  )
-  batch_ledger = ledgers.BatchLedger()
-  batch.add_sink(batch_ledger)
-  batch.reset()
-  batch.step(np.zeros((2, 6)))
-  joint = batch.task.avatar.body.find_all('joint')[0]
-  batch.physics.world(1).bind((joint,)).qvel = np.nan
-  batch.step(np.zeros((2, 6)))
-  well, failed = (batch_ledger.episodes(world)[0] for world in range(2))
-  assert (well.end, well.num_steps) == (None, 2)
-  assert (failed.end, failed.num_steps) == (events.End.DIVERGENCE, 1)
-  assert not failed.is_valid
-  batch.close()
-
-
 def test_snapshots_move_between_ledger_and_batch_ledger():
   world = ('collect_apples', 'standard', {'random': 1})
   design = 'instantaneous_reward'

@@ -22,6 +22,7 @@ from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.experiments import result_tables
 from tests.engine import helpers
+from tests.evaluation import rooms
 from tests.evaluation import rows
 
 _MAX_STEPS = 90
@@ -33,10 +34,7 @@ _NUM_EPISODES = 3
 
 @contextlib.contextmanager
 def _world(seed: int) -> Iterator[environment.Environment]:
-  env = suite.load(
-      'unlock_door', 'near', {'random': seed}, {'max_steps': _MAX_STEPS},
-      design='instantaneous_reward',
-  )  # fmt: skip
+  env = rooms.load(seed=seed, max_steps=_MAX_STEPS)
   with contextlib.closing(env):
     yield env
 

@@ -32,7 +32,6 @@ def _evaluate_batch(design, policy, **limit):
     ('design', 'policy'),
     [
         ('instantaneous_reward', 'apple_seeker'),
-        ('value_advice', 'random'),
         ('decoupled_approval', 'random'),
     ],
 )

@@ -49,12 +49,10 @@ def test_every_provider_and_every_query_is_counted():
 
 
 def test_facts_are_taken_at_the_end_of_each_episode():
-  env = rooms.load('collect_apples', 'standard', max_steps=120)
-  [one] = evaluate.evaluate(env, policies.make('apple_seeker'), 1)
+  env = rooms.load('collect_apples', 'standard', max_steps=60)
   busy = evaluate.evaluate(env, policies.make('apple_seeker'), 2)
-  idle = evaluate.evaluate(env, rooms.still(env), 2)
+  idle = evaluate.evaluate(env, rooms.still(env), 1)
   env.close()
-  assert busy[0] == one
   for result in (*busy, *idle):
     # Each apple is worth 1, and nothing else is.
     assert result.facts == {'apples_eaten': result.true_return}
@@ -211,22 +209,6 @@ def test_sinks_are_removed_after_the_last_episode():
   env.reset()
   env.close()
   assert guest.ends == heard == [events.End.TIMEOUT]
-
-
-def test_sinks_are_removed_when_a_provider_fails():
-  env = rooms.load()
-
-  def act(time_step: dm_env.TimeStep) -> np.ndarray:
-    if not time_step.first():
-      helpers.break_providers(env)
-    return helpers.no_op(env)
-
-  guest = helpers.RecordingSink()
-  with pytest.raises(errors.FeedbackProviderError, match=r'providers\[0\]'):
-    evaluate.evaluate(env, act, 1, sinks=[guest])
-  assert env._sinks == []
-  assert guest.ends == [events.End.ERROR]
-  env.close()
 
 
 def test_no_sink_is_added_for_a_policy_that_does_not_fit():

@@ -12,7 +12,6 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
-from realab_suite.entities import registers
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
 from tests import worlds
@@ -194,80 +193,18 @@ def _alone(
   return [*transcript, env.physics.data.qpos.tobytes()]
 
 
-def _assert_looking_is_free(
-    world: tuple[str, ...], make_policy: Callable[..., Any], max_steps: int
-) -> None:
-  env, twin = (rooms.load(*world, max_steps=max_steps) for _ in range(2))
-  expected = _alone(twin, make_policy(twin), 2)
-  found: list[bytes] = []
-  with _transcribed(env, found):
-    evaluate.evaluate(env, make_policy(env), 2, sinks=[_Nosy(env)])
-  found.append(env.physics.data.qpos.tobytes())
-  assert len(expected) == 2 * (max_steps + 1) + 1
-  assert found == expected
-  env.close()
-  twin.close()
-
-
-@pytest.mark.parametrize(
-    'world',
-    [
-        *_WORLDS,
-        ('unlock_door', 'near', 'decoupled_approval', 'channel=welded'),
-        ('unlock_door', 'near', 'instantaneous_reward', 'channel=secure'),
-        ('unlock_door', 'near', 'instantaneous_reward', 'dof=planar'),
-    ],
-)
-def test_evaluation_changes_nothing_for_the_agent(world):
-  _assert_looking_is_free(world, rooms.restless, max_steps=40)
-
-
 def test_evaluation_changes_nothing_while_blocks_are_pushed():
+  # `tests/leaks/pairs_test.py` has the other worlds.
   def push(env: environment.Environment) -> Any:
     return actors.make(policies.make('pushing_saboteur'), env).act
 
-  _assert_looking_is_free(
-      ('unlock_door', 'near', 'instantaneous_reward'), push, max_steps=80
-  )
-
-
-def test_the_true_reward_and_the_ledger_do_not_reach_the_agent():
-  task = helpers.PointTask()
-  env = suite.embed(task, rooms.design(3), random=7, max_steps=3)
-  seen: list[dm_env.TimeStep] = []
-
-  def act(time_step: dm_env.TimeStep) -> np.ndarray:
-    seen.append(time_step)
-    return np.zeros(1)
-
-  task.reward = lambda physics: 77.0
-  [result] = evaluate.evaluate(env, act, 1)
+  env, twin = (rooms.load(max_steps=80) for _ in range(2))
+  expected = _alone(twin, push(twin), 2)
+  found: list[bytes] = []
+  with _transcribed(env, found):
+    evaluate.evaluate(env, push(env), 2, sinks=[_Nosy(env)])
+  found.append(env.physics.data.qpos.tobytes())
+  assert len(expected) == 2 * (80 + 1) + 1
+  assert found == expected
   env.close()
-  assert result.true_return == 3 * 77.0
-  for time_step in seen:
-    assert time_step.reward in (None, 0.0)
-    assert set(time_step.observation) == {
-        'senses/bead',
-        'senses/time_left',
-        'registers/reward',
-    }
-    assert all(
-        not (np.asarray(value) == 77.0).any()
-        for value in time_step.observation.values()
-    )
-
-
-def test_sinks_receive_writes_in_order_with_their_writers():
-  env = rooms.load(design='decoupled_approval', max_steps=2)
-  sink = helpers.RecordingSink()
-  evaluate.evaluate(env, policies.make('random'), 1, sinks=[sink])
-  env.close()
-  writers = [
-      (record.register, record.writer)
-      for record in sink.steps[0].records
-      if isinstance(record, registers.Write)
-  ]
-  assert writers == [
-      ('query', registers.AGENT),
-      ('approval', 'providers[0]:value_advice'),
-  ]
+  twin.close()

@@ -109,57 +109,6 @@ class TestMeanInterval:
     interval = intervals.mean_interval({1: [0.0], 2: [1.0] * 99})
     assert interval.estimate == 0.5
 
-  def test_resembles_student_s_interval_for_many_normal_seeds(self):
-    values = np.random.default_rng(0).normal(5, 2, size=(400, 1))
-    interval = intervals.mean_interval(_by_seed(values))
-    student = stats.t.interval(
-        0.95, 399, loc=values.mean(), scale=stats.sem(values[:, 0])
-    )
-    np.testing.assert_allclose(
-        (interval.low, interval.high), student, rtol=2e-3
-    )
-
-  @pytest.mark.parametrize('bounds', [(None, None), (0, None), (0, 50)])
-  def test_resembles_scipy_s_bca_interval_for_many_skewed_seeds(self, bounds):
-    values = np.random.default_rng(1).exponential(size=(200, 1))
-    interval = intervals.mean_interval(_by_seed(values), bounds=bounds)
-    bca = stats.bootstrap(
-        (values[:, 0],), np.mean, rng=np.random.default_rng(2)
-    ).confidence_interval
-    np.testing.assert_allclose((interval.low, interval.high), bca, rtol=4e-2)
-
-  @pytest.mark.parametrize('bounds', [(None, None), (0, None), (0, 50)])
-  def test_reaches_further_into_the_long_tail(self, bounds):
-    values = np.random.default_rng(2).exponential(size=(15, 1))
-    found = intervals.mean_interval(_by_seed(values), bounds=bounds)
-    assert found.high - found.estimate > 1.2 * (found.estimate - found.low)
-
-  def test_more_episodes_of_the_same_seeds_are_not_more_seeds(self):
-    seed_means = np.random.default_rng(3).normal(size=(10, 1))
-    few = intervals.mean_interval(_by_seed(np.repeat(seed_means, 1, axis=1)))
-    many = intervals.mean_interval(_by_seed(np.repeat(seed_means, 50, axis=1)))
-    assert many.high - many.low == pytest.approx(few.high - few.low, rel=0.1)
-
-  def test_spread_between_episodes_counts_once(self):
-    # A percentile bootstrap over seeds and episodes is a third too wide here.
-    widths = []
-    student_widths = []
-    for seed in range(30):
-      values = np.random.default_rng(seed).normal(size=(20, 5))
-      interval = intervals.mean_interval(_by_seed(values))
-      widths.append(interval.high - interval.low)
-      sem = stats.sem(values.mean(axis=1))
-      student_widths.append(2 * stats.t.ppf(0.975, 19) * sem)
-    # Chance makes twenty seeds skewed, which lengthens a side.
-    assert 1 < np.mean(widths) / np.mean(student_widths) < 1.2
-
-  def test_a_higher_level_is_wider(self):
-    values = _by_seed(_draw(0))
-    usual = intervals.mean_interval(values, level=0.95)
-    wide = intervals.mean_interval(values, level=0.99)
-    assert wide.low < usual.low < usual.high < wide.high
-    assert (usual.level, wide.level) == (0.95, 0.99)
-
   def test_one_seed_is_judged_by_its_episodes(self):
     episodes = np.random.default_rng(4).normal(size=30)
     one_seed = intervals.mean_interval({7: episodes})
@@ -185,22 +134,6 @@ class TestMeanInterval:
     assert interval.low < 2.5
     assert interval.high > 3.5
 
-  @pytest.mark.parametrize('seeds', [2, 3, 10])
-  def test_few_symmetric_seeds_give_student_s_interval(self, seeds):
-    values = stats.norm.ppf((np.arange(seeds) + 0.5) / seeds)
-    interval = intervals.mean_interval(_by_seed(values[:, np.newaxis]))
-    student = 2 * stats.t.ppf(0.975, seeds - 1) * stats.sem(values)
-    assert (interval.high - interval.low) / student == pytest.approx(
-        1, abs=0.01
-    )
-
-  def test_no_generator_is_used(self):
-    values = _by_seed(_draw(0))
-    np.random.seed(0)  # noqa: NPY002, the global state must not matter.
-    first = intervals.mean_interval(values)
-    np.random.seed(1)  # noqa: NPY002
-    assert intervals.mean_interval(values) == first
-
   def test_the_ends_are_those_of_hall_by_hand(self):
     # Mean 0.75, deviation 1.5 and skewness 2, so a = 1. The quantile of
     # Student's t with three degrees of freedom is 3.182446. The statistics are
@@ -213,12 +146,14 @@ class TestMeanInterval:
   @pytest.mark.parametrize('seeds', [3, 5, 10, 40])
   @pytest.mark.parametrize('level', [0.5, 0.95, 0.999])
   def test_the_ends_solve_hall_s_equation(self, seeds, level):
-    values = np.random.default_rng(seeds).lognormal(size=seeds)
-    found = intervals.mean_interval(_by_seed(values[:, None]), level=level)
-    a = stats.skew(values, bias=False) / math.sqrt(seeds)
+    # Of episodes, only the mean of each seed matters.
+    values = np.random.default_rng(seeds).lognormal(size=(seeds, 3))
+    found = intervals.mean_interval(_by_seed(values), level=level)
+    means = values.mean(axis=1)
+    a = stats.skew(means, bias=False) / math.sqrt(seeds)
     quantile = stats.t.ppf((1 + level) / 2, seeds - 1)
     for end, expected in ((found.low, quantile), (found.high, -quantile)):
-      t = (values.mean() - end) / stats.sem(values)
+      t = (means.mean() - end) / stats.sem(means)
       transformed = t + a * t**2 / 3 + a**2 * t**3 / 27 + a / 6
       assert transformed == pytest.approx(expected, rel=1e-9)
 
@@ -251,32 +186,6 @@ class TestBounds:
     for number in re.findall(r'-?\d+\.\d+(?=[],]| \[)', str(found)):
       assert low <= float(number) <= high
     assert '-0.0,' not in str(found)
-
-  def test_one_bad_seed_does_not_push_the_interval_out_of_bounds(self):
-    # docs/experiments.md had 15.3 [1.6, 20.5] of 18.
-    values = {0: [17.6], 1: [17.6], 2: [17.6], 3: [17.7], 4: [6.0]}
-    found = intervals.mean_interval(values, bounds=(0, 18))
-    assert 0 <= found.low < 6
-    assert 17.7 < found.high <= 18
-    assert str(found).startswith('15.3 [')
-
-  def test_the_mean_of_sizes_is_not_negative(self):
-    # README.md had 0.000 [-0.000, 0.003].
-    values = {0: [0.0], 1: [0.0], 2: [0.0], 3: [0.001], 4: [0.004]}
-    found = intervals.mean_interval(values, bounds=(0, None))
-    assert str(found).startswith('0.001 [0.000, 0.0')
-
-  def test_bounds_are_mirrored(self):
-    values = _draw(0) ** 2
-    above = intervals.mean_interval(_by_seed(values), bounds=(0, None))
-    below = intervals.mean_interval(_by_seed(-values), bounds=(None, 0))
-    assert _ends(below) == pytest.approx(
-        (-above.estimate, -above.high, -above.low)
-    )
-    both = intervals.mean_interval(_by_seed(values), bounds=(0, 40))
-    flipped = intervals.mean_interval(_by_seed(40 - values), bounds=(0, 40))
-    assert flipped.low == pytest.approx(40 - both.high)
-    assert flipped.high == pytest.approx(40 - both.low)
 
   def test_an_interval_is_cut_off_at_the_bounds_and_nothing_else(self):
     values = _by_seed(10 + _draw(0))
@@ -333,14 +242,6 @@ class TestPairedDifference:
     shared = intervals.paired_difference(_by_seed(luck + noise), _by_seed(luck))
     alone = intervals.mean_interval(_by_seed(noise))
     np.testing.assert_allclose(_ends(shared), _ends(alone), atol=1e-9)
-
-  def test_changes_sign_with_the_order_of_the_arguments(self):
-    first, second = _by_seed(_draw(0)), _by_seed(_draw(1))
-    forward = intervals.paired_difference(first, second)
-    backward = intervals.paired_difference(second, first)
-    assert _ends(backward) == pytest.approx(
-        (-forward.estimate, -forward.high, -forward.low)
-    )
 
   def test_respects_the_possible_differences(self):
     treatment = {seed: [18.0 - 0.01 * seed] for seed in range(5)}

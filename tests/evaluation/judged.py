@@ -3,7 +3,8 @@
 Stakes are measured as ever, but over fewer episodes.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
 import functools
 from typing import Any, NamedTuple, final
 
@@ -13,9 +14,12 @@ import pytest
 from realab_suite import policies
 from realab_suite import worlds
 from realab_suite.audit import aiming
+from realab_suite.engine import batch_environment
+from realab_suite.engine import environment
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
+from realab_suite.evaluation import obstacles
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import result_tables
@@ -53,15 +57,8 @@ class World(NamedTuple):
 
   def play(self, actor: Actor) -> list[evaluate.EpisodeResult]:
     """Returns the first episode of each world of a batch."""
-
-    def load() -> Any:
-      batch = self.loaded.load_batch(self.spec, self.num_envs, SEED)
-      return self.loaded.load(self.spec, SEED), batch, batch.save()
-
-    # Compiling takes longer than these few steps.
-    single, batch, fresh = self._kept('worlds', load)
-    batch.restore(fresh)
-    return evaluate.evaluate_batch(batch, actor(single, batch))
+    batch = fresh_batch(self.loaded, self.spec, self.num_envs, SEED)
+    return evaluate.evaluate_batch(batch, actor(self._single(), batch))
 
   def solver(self) -> list[evaluate.EpisodeResult]:
     """Returns the episodes of the solver; those of equal worlds are kept."""
@@ -73,33 +70,66 @@ class World(NamedTuple):
     def measure() -> stakes.Stakes | None:
       with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stakes, 'NUM_EPISODES', _NUM_STAKE_EPISODES)
-        return worlds.stakes_of(self.loaded, self.spec)
+        patch.setattr(worlds.World, 'load_batch', fresh_batch)
+        with kept_open():
+          return worlds.stakes_of(self.loaded, self.spec)
 
     return self._kept('stake', measure)
 
   def obstacles(self) -> list[str]:
-    """Returns those of the design; those of equal worlds are kept."""
-    return self._kept(
-        'obstacles',
-        lambda: worlds.obstacles_of(self.loaded, self.spec, self.stake()),
+    """Returns those of the design, as `worlds.obstacles_of` does."""
+    return obstacles.of_mechanism(
+        self._single().mechanism, self.loaded.instruments, self.stake()
     )
 
+  def _single(self) -> environment.Environment:
+    return self._kept('world', lambda: self.loaded.load(self.spec, SEED))
+
   def _kept(self, what: str, make: Callable[[], Any]) -> Any:
-    key = repr((what, self.spec.to_mapping(), self._replace(design='')))
-    if key not in _KEPT:
-      _KEPT[key] = make()
-    return _KEPT[key]
+    return _kept((what, self.spec.to_mapping(), self._replace(design='')), make)
 
 
 _KEPT: dict[str, Any] = {}
+_load_batch = worlds.World.load_batch
+
+
+def _kept(key: Any, make: Callable[[], Any]) -> Any:
+  if repr(key) not in _KEPT:
+    _KEPT[repr(key)] = make()
+  return _KEPT[repr(key)]
+
+
+def fresh_batch(
+    world: worlds.World, design: specs.DesignSpec, num_envs: int, seed: int
+) -> Any:
+  """Returns a batch as if just loaded; loading takes longer than its steps."""
+
+  def load() -> Any:
+    batch = _load_batch(world, design, num_envs, seed)
+    return batch, batch.save()
+
+  key = world, design.to_mapping(), num_envs, seed
+  batch, fresh = _kept(('batch', *key), load)
+  batch.restore(fresh)
+  return batch
+
+
+@contextlib.contextmanager
+def kept_open() -> Iterator[None]:
+  """Keeps batches open that are closed here."""
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(
+        batch_environment.BatchEnvironment, 'close', lambda batch: None
+    )
+    yield
 
 
 def close() -> None:
   """Closes all worlds."""
   for kept in _KEPT.values():
-    if isinstance(kept, tuple):
-      for one in kept[:2]:
-        one.close()
+    one = kept[0] if isinstance(kept, tuple) else kept
+    if hasattr(one, 'close'):
+      one.close()
   _KEPT.clear()
 
 

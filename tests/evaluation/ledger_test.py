@@ -333,25 +333,6 @@ def test_a_reading_is_the_request_plus_saturation_plus_corruption(dof):
     assert _largest(episodes, part) > 0.5
 
 
-def test_a_query_is_the_sum_of_the_same_parts():
-  episodes = _play('decoupled_approval', has_helper=True)
-  assert _largest(episodes, 'excess') <= _TOLERANCE
-  assert _largest(episodes, 'permanent') > 0.5
-  writers = {e.writer for e in _writes(episodes, 'query')}
-  assert writers == {registers.INITIAL, registers.AGENT}
-
-
-def _writes(
-    episodes: list[ledgers.EpisodeLedger], register: str
-) -> list[registers.Write]:
-  return [
-      entry
-      for episode in episodes
-      for entry in episode.entries[register]
-      if isinstance(entry, registers.Write)
-  ]
-
-
 def test_a_secure_channel_has_saturation_and_no_corruption():
   episodes = _play(_ODD, 'channel=secure', has_helper=True)
   assert _largest(episodes, 'excess') <= _TOLERANCE

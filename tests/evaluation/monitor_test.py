@@ -111,22 +111,6 @@ def test_figures_equal_those_of_the_ledger(design, channel):
     assert set(corruption) == {0.0}
 
 
-def test_nothing_is_corrupt_in_a_secure_twin():
-  with contextlib.closing(_load(channel='secure')) as batch:
-    monitor = _monitored(batch)
-    # Its blocks are scenery, and are pushed.
-    found, _ = _play(batch, np.random.default_rng(0), 40, monitor)
-    moved = batch.mechanism.registers['reward'].displacement(batch.physics)
-  assert moved.max() > 0.1
-  assert len(found) == _NUM_ENVS
-  for one in found:
-    for value in one.figures.objective.values():
-      assert value.gain == 0.0
-    for row in one.figures.registers.values():
-      parts = row.corruption, row.own, row.inherited, row.units
-      assert parts == (0.0,) * 4
-
-
 @pytest.mark.mujoco_warns('BADQVEL')
 def test_the_episode_of_a_diverged_world_is_invalid():
   with contextlib.closing(_load()) as batch:

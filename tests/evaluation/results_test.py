@@ -26,6 +26,7 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
+from tests import examples
 from tests.evaluation import rows
 
 _NAN = float('nan')
@@ -107,10 +108,8 @@ def test_every_number_is_read_bit_for_bit(
 
 
 @hypothesis.settings(
-    suppress_health_check=[
-        hypothesis.HealthCheck.function_scoped_fixture,
-        hypothesis.HealthCheck.too_slow,
-    ]
+    examples.settings(30),
+    suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture],
 )
 @hypothesis.given(_TEXT)
 @hypothesis.example('a\u2028b')

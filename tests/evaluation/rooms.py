@@ -9,6 +9,7 @@ import numpy as np
 
 from realab_suite import suite
 from realab_suite.engine import environment
+from tests import kept
 from tests.engine import helpers
 
 
@@ -20,13 +21,17 @@ def load(
     seed: int = 7,
     max_steps: int = 12,
 ) -> environment.Environment:
-  return suite.load(
-      domain,
-      task,
-      {'random': seed},
-      {'max_steps': max_steps},
-      design=design,
-      overrides=overrides,
+  """Returns a world; one that was closed is used again."""
+  return kept.load(
+      (domain, task, design, overrides, seed, max_steps),
+      lambda: suite.load(
+          domain,
+          task,
+          {'random': seed},
+          {'max_steps': max_steps},
+          design=design,
+          overrides=overrides,
+      ),
   )
 
 

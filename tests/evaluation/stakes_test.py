@@ -15,6 +15,7 @@ from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.engine import helpers
 from tests.evaluation import episodes
+from tests.evaluation import judged
 from tests.feedback import designs
 from tests.feedback import stubs
 
@@ -160,14 +161,10 @@ def test_the_key_is_that_of_everything_that_a_stake_depends_on():
   assert len(keys) == 2 + len(others)
 
 
-def _loader(*overrides):
-  def load(design, num_envs, seed):
-    return suite.load_batch(
-        'unlock_door', 'near', {'random': seed}, {'max_steps': 30},
-        num_envs=num_envs, num_threads=1, design=design, overrides=overrides,
-    )  # fmt: skip
-
-  return load
+def _load(design, num_envs, seed):
+  return judged.fresh_batch(
+      worlds.World('unlock_door', 'near', 30), design, num_envs, seed
+  )
 
 
 def test_a_stake_is_measured_in_the_twin_and_confirmed_with_the_design(
@@ -179,7 +176,7 @@ def test_a_stake_is_measured_in_the_twin_and_confirmed_with_the_design(
 
   def load(given, num_envs, seed):
     seen.append((given.channel, num_envs, seed))
-    return _loader()(given, num_envs, seed)
+    return _load(given, num_envs, seed)
 
   found = stakes.measure(load, load, design, 'apple_seeker', 'k')
   assert seen == [('secure', 12, 0)] * 3 + [('embedded', 12, 0)] * 3
@@ -206,13 +203,14 @@ def test_the_solver_names_its_own_actions_in_the_queries_of_the_learner(
 ):
   monkeypatch.setattr(stakes, 'NUM_EPISODES', 12)
   design = specs.load('value_advice', ['dof=planar', f'learner={learner}'])
-  found = stakes.measure(_loader(), _loader(), design, 'apple_seeker', 'k')
+  found = stakes.measure(_load, _load, design, 'apple_seeker', 'k')
   assert found.main.is_degenerate == is_degenerate
 
 
 def test_a_stake_does_not_depend_on_the_senses_of_the_agent(monkeypatch):
   monkeypatch.setattr(stakes, 'NUM_EPISODES', 6)
   design = specs.load('instantaneous_reward', ['dof=planar'])
+  monkeypatch.setattr(worlds.World, 'load_batch', judged.fresh_batch)
   found = [
       worlds.stakes_of(
           worlds.World('unlock_door', 'near', 12, senses=senses), design
@@ -225,7 +223,7 @@ def test_a_stake_does_not_depend_on_the_senses_of_the_agent(monkeypatch):
 def test_a_design_without_objective_has_no_stake():
   design = specs.load('instantaneous_reward', ['learner=null'])
   with pytest.raises(errors.SpecError, match='has no learner'):
-    stakes.measure(_loader(), _loader(), design, 'apple_seeker', 'k')
+    stakes.measure(_load, _load, design, 'apple_seeker', 'k')
 
 
 # Obstacles.
@@ -277,6 +275,13 @@ _FELT = {
     **designs.SCORED,
     'providers': [{'kind': 'test_grip', 'writes': ['reward']}],
 }
+
+
+@pytest.fixture(scope='module', autouse=True)
+def _closed():
+  with judged.kept_open():
+    yield
+  judged.close()
 
 
 @pytest.fixture(autouse=True)

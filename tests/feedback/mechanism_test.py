@@ -38,7 +38,9 @@ def _move(
   moved.put(env.physics, position)
 
 
-def _trace(env: environment.Environment) -> list[tuple[Any, ...]]:
+def _trace(
+    env: environment.Environment, patch: pytest.MonkeyPatch
+) -> list[tuple[Any, ...]]:
   """Returns a list that gets the substep of each write and read."""
   trace: list[tuple[Any, ...]] = []
   began = env.physics.time()
@@ -53,7 +55,7 @@ def _trace(env: environment.Environment) -> list[tuple[Any, ...]]:
       trace.append((substep(physics), method, name))
       return original(physics, *args)
 
-    setattr(register, method, noting)
+    patch.setattr(register, method, noting)
 
   for name, register in env.mechanism.registers.items():
     note('write', name, register)
@@ -62,7 +64,10 @@ def _trace(env: environment.Environment) -> list[tuple[Any, ...]]:
 
 
 def _once_at(
-    env: environment.Environment, substep: int, act: Callable[[], None]
+    env: environment.Environment,
+    substep: int,
+    act: Callable[[], None],
+    patch: pytest.MonkeyPatch,
 ) -> None:
   """Acts once, after a number of substeps, in place of the world."""
   latch = env.task.latch_events
@@ -75,7 +80,7 @@ def _once_at(
       done.append(None)
       act()
 
-  env.task.latch_events = latch_and_act
+  patch.setattr(env.task, 'latch_events', latch_and_act)
 
 
 def _brief(record: Any) -> tuple[Any, ...]:
@@ -98,7 +103,11 @@ def _brief(record: Any) -> tuple[Any, ...]:
     ],
 )
 def test_meters_and_providers_act_in_order_in_their_substeps(
-    made: scripted.Worlds, schedule: Any, meter: int, provider: int
+    made: scripted.Worlds,
+    schedule: Any,
+    meter: int,
+    provider: int,
+    monkeypatch: pytest.MonkeyPatch,
 ):
   measured_at: list[float] = []
 
@@ -109,7 +118,7 @@ def test_meters_and_providers_act_in_order_in_their_substeps(
   env, sink = made.scripted(scripted.design(schedule=schedule), clock)
   env.reset()
   began = env.physics.time()
-  trace = _trace(env)
+  trace = _trace(env, monkeypatch)
   env.step(_query(env, 4.0))
   assert env.num_substeps == 4
   assert round(env.physics.time() - began, 9) == 0.1
@@ -247,7 +256,9 @@ def test_keys_differ_between_providers_steps_and_episodes(
   assert [k.tobytes() for k in again] == [k.tobytes() for k in keys[:10]]
 
 
-def test_providers_read_the_positions_of_blocks(made: scripted.Worlds):
+def test_providers_read_the_positions_of_blocks(
+    made: scripted.Worlds, monkeypatch: pytest.MonkeyPatch
+):
   env, sink = made.scripted()
   env.reset()
 
@@ -256,7 +267,7 @@ def test_providers_read_the_positions_of_blocks(made: scripted.Worlds):
     _move(env, 'query', 0, -0.1)
 
   # The meter has written by then; the provider is next.
-  _once_at(env, 2, disturb)
+  _once_at(env, 2, disturb, monkeypatch)
   env.step(_query(env, 4.0))
   readings = {name: float(value) for name, value in scripted.SEEN[0][1].items()}
   assert readings == pytest.approx({'clock': 9.0, 'query': 5.0}, abs=1e-6)
@@ -335,9 +346,15 @@ def test_moving_a_block_corrupts_the_reward(
     substep: int,
     requested: list[float],
     read: list[float],
+    monkeypatch: pytest.MonkeyPatch,
 ):
   env, sink = made.instantaneous()
-  _once_at(env, substep, lambda: _move(env, register, block, distance))
+  _once_at(
+      env,
+      substep,
+      lambda: _move(env, register, block, distance),
+      monkeypatch,
+  )
   for _ in range(6):
     env.step(helpers.no_op(env))
   np.testing.assert_allclose(sink.requested('reward'), requested, atol=1e-6)
@@ -371,26 +388,3 @@ def test_reading_registers_does_not_change_the_world(made: scripted.Worlds):
     assert helpers.to_bytes(looked) == helpers.to_bytes(twin.step(action))
     assert worlds.state_bytes(env.physics) == worlds.state_bytes(twin.physics)
   twin.close()
-
-
-def test_a_reading_is_the_applied_value_plus_its_corruption(
-    made: scripted.Worlds,
-):
-  env, sink = made.scripted(None, max_steps=80)
-  env.reset()
-  for i, action in enumerate(helpers.random_actions(env, 80)):
-    if i % 7 == 3:
-      _move(env, 'reward', 0, 0.03)
-      _move(env, 'clock', 1, -0.02)
-    env.step(action)
-  applied: dict[str, float] = {}
-  checked = 0
-  for record in (record for step in sink.steps for record in step.records):
-    if isinstance(record, registers.Write):
-      applied[record.register] = float(record.applied)
-      continue
-    corruption = record.obstruction + record.permanent + record.temporary
-    error = record.reading - applied[record.register] - corruption
-    np.testing.assert_allclose(error, 0.0, atol=1e-9)
-    checked += bool(abs(corruption) > 0.01)
-  assert checked > 50

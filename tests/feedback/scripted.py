@@ -11,6 +11,7 @@ from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.feedback import providers
 from realab_suite.tasks import collect_apples
+from tests import kept
 from tests.engine import helpers
 
 Answer = Callable[[Any, Any, Any], Any]
@@ -47,6 +48,8 @@ class Provider(providers.Provider):
 
 SEEN: list[tuple[Any, ...]] = []
 ANSWER: list[Answer] = []
+CLOCK: list[Callable[[Any], Any]] = []
+"""What the meter of the world that was made last measures."""
 SENSES: list[str] = []
 """Senses that the provider of the next world declares."""
 
@@ -82,7 +85,7 @@ def design(**changes: Any) -> dict[str, Any]:
 
 
 class Worlds:
-  """Makes worlds that are closed at the end of a test."""
+  """Makes worlds that are closed at the end of a test, and used again."""
 
   def __init__(self, stack: contextlib.ExitStack) -> None:
     self._stack = stack
@@ -94,12 +97,16 @@ class Worlds:
       **kwargs: Any,
   ) -> tuple[environment.Environment, helpers.RecordingSink]:
     """Returns a world with the scripted provider, and its events."""
-    env = suite.embed(
-        collect_apples.CollectApples('standard'),
-        changed or design(),
-        random=3,
-        measurements={'clock': measurement},
-        **kwargs,
+    CLOCK[:] = [measurement]
+    env = kept.load(
+        (changed or design(), SENSES, kwargs),
+        lambda: suite.embed(
+            collect_apples.CollectApples('standard'),
+            changed or design(),
+            random=3,
+            measurements={'clock': lambda physics: CLOCK[0](physics)},
+            **kwargs,
+        ),
     )
     return env, self._sink(env)
 
@@ -107,11 +114,14 @@ class Worlds:
       self,
   ) -> tuple[environment.Environment, helpers.RecordingSink]:
     """Returns a world with the shipped score meter, and its events."""
-    env = suite.load(
-        'collect_apples',
-        'standard',
-        {'random': 3},
-        design='instantaneous_reward',
+    env = kept.load(
+        'instantaneous_reward',
+        lambda: suite.load(
+            'collect_apples',
+            'standard',
+            {'random': 3},
+            design='instantaneous_reward',
+        ),
     )
     sink = self._sink(env)
     env.reset()

@@ -19,14 +19,10 @@ from tests.feedback import sparing
 _PLANAR = {'dof': 'planar'}
 _CASES = {
     'free': {},
-    'planar': {
+    'mixed': {
         'reward': {**_PLANAR, 'kind': 'block_position'},
-        'note': _PLANAR,
-        'stop': {**_PLANAR, 'channel': 'secure'},
-    },
-    'welded': {
-        'reward': {'channel': 'welded'},
         'note': {'kind': 'block_orientation'},
+        'score': {'channel': 'secure'},
         'stop': {'channel': 'welded'},
     },
 }
