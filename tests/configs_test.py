@@ -1,4 +1,4 @@
-"""Tests for the designs that ship: each fits every world, and runs."""
+"""Tests for the designs that ship: they fit the worlds, and run."""
 
 from collections.abc import Iterator
 import importlib.resources
@@ -91,10 +91,13 @@ def test_nothing_in_a_design_is_without_use(path: pathlib.Path):
 
 
 def _cases() -> Iterator[Any]:
-  """Yields every design in every world, and each as two kinds of twins."""
+  """Yields each design in half of the worlds, and as two kinds of twins.
+
+  Each world has half of the designs.
+  """
   twins = list(itertools.product(registers.DOFS, registers.CHANNELS))
   for i, design in enumerate(_ids(_DESIGN_FILES)):
-    for task in suite.ALL_TASKS:
+    for task in suite.ALL_TASKS[i % 2 :: 2]:
       yield pytest.param(task, design, (), id=f'{".".join(task)}-{design}')
     for dof, channel in (twins[i % 6], twins[(i + 3) % 6]):
       yield pytest.param(
@@ -106,7 +109,7 @@ def _cases() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(('task', 'design', 'overrides'), list(_cases()))
-def test_every_design_runs_in_every_world(
+def test_designs_run_in_worlds_and_as_twins(
     task: tuple[str, str], design: str, overrides: tuple[str, ...]
 ):
   env = suite.load(
