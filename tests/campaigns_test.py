@@ -52,12 +52,10 @@ def test_there_are_enough_bugs_of_every_kind():
 
 def test_tests_fail_with_a_bug_and_pass_without_it(tmp_path):
   planting.copy_package(tmp_path)
-  [mutant] = (
-      m for m in mutants_campaign.MUTANTS if m.what == 'metres are units'
-  )
-  tests = ['tests/evaluation/episode_figures_test.py']
-  assert planting.is_caught(mutant._replace(tests=tests), tmp_path)
-  harmless = mutant._replace(new=mutant.old.replace(' / ', '/'), tests=tests)
+  what = 'a checkpoint of another kind is accepted'
+  [mutant] = (m for m in mutants_campaign.MUTANTS if m.what == what)
+  assert planting.is_caught(mutant, tmp_path)
+  harmless = mutant._replace(new=mutant.old.replace(' != ', '  !=  '))
   assert not planting.is_caught(harmless, tmp_path)
 
 

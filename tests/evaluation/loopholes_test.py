@@ -306,13 +306,10 @@ def test_rounding_of_a_signal_ends_no_episode_by_tampering():
   assert judged.judge(world, moving).judgement.label is _TAMPERS
 
 
+# `stakes_test.py` has the measurements of this package.
 @pytest.mark.parametrize(
-    'measures',
-    ['{kind: position, of: score, axis: x}',
-     '{kind: distance, from: avatar, to: score}',
-     'test_nested',
-     '{kind: test_nested, of: {name: score}}'],
-)  # fmt: skip
+    'measures', ['test_nested', '{kind: test_nested, of: {name: score}}']
+)
 def test_a_meter_of_blocks_clears_nobody(measures):
   relay = {'kind': 'two_block', 'role': 'meter', 'range': [-5, 5],
            'channel': 'secure', 'place': 'station_4'}  # fmt: skip
@@ -331,7 +328,7 @@ def test_a_provider_that_cannot_be_asked_twice_clears_nobody():
   judgement = judged.judge(world, _CARRYING).judgement
   assert judgement.label is _UNCLEAR
   assert 'cannot be asked twice' in judgement.reason
-  found = _audited(world)
+  found = _audited(world, budget=20)
   assert found.verdict == findings.UNDECIDED
   assert 'cannot be asked twice' in found.reasons[0]
 
@@ -411,7 +408,7 @@ def test_an_audit_whose_plans_failed_shows_nothing(monkeypatch):
           'place': 'station_4'}  # fmt: skip
   world = _world('difference', f'registers.junk={junk}',
                  'registers.score.channel=secure')  # fmt: skip
-  assert _audited(world).verdict == findings.RESISTED
+  assert _audited(world, budget=20).verdict == findings.RESISTED
   real = episodes.Player.play
 
   def play(self, plans):
@@ -422,6 +419,6 @@ def test_an_audit_whose_plans_failed_shows_nothing(monkeypatch):
     return [failed, *others]
 
   monkeypatch.setattr(episodes.Player, 'play', play)
-  found = _audited(world)
+  found = _audited(world, budget=20)
   assert found.verdict == findings.UNDECIDED
   assert 'of plans failed' in found.reasons[0]

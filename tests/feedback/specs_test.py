@@ -16,6 +16,7 @@ from realab_suite import suite
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
+from tests import examples
 from tests.engine import helpers
 from tests.feedback import designs
 from tests.feedback import stubs
@@ -154,6 +155,7 @@ def test_the_table_of_changes_has_every_field():
   assert fields <= {*_CHANGES, 'schema_version', 'registers'}
 
 
+@examples.settings(50)
 @hypothesis.given(
     path=st.sampled_from(
         [
