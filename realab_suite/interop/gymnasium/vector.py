@@ -7,6 +7,7 @@ from gymnasium.vector import utils
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import trees
 from realab_suite.config import messages
 from realab_suite.engine import agent_view
 from realab_suite.engine import batch_environment
@@ -148,10 +149,13 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     if self.autoreset_mode is AutoresetMode.SAME_STEP and self._is_over.any():
       worlds = np.flatnonzero(self._is_over)
       for world in worlds.tolist():
-        final = {'final_obs': _row(observations, world), 'final_info': {}}
+        final = {
+            'final_obs': trees.taken(observations, world),
+            'final_info': {},
+        }
         infos = self._add_info(infos, final, world)
       first = self._encode(self._reset_some(self._is_over))
-      _replace(observations, worlds, first)
+      observations = trees.put(observations, worlds, first)
     return observations, rewards, terminated, truncated, infos
 
   def render(self) -> tuple[np.ndarray, ...] | None:
@@ -181,7 +185,7 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
     if len(worlds) == self.num_envs:
       self._present = first.observation
     else:
-      _replace(self._present, worlds, first.observation)
+      self._present = trees.put(self._present, worlds, first.observation)
     return first
 
   def _encode(
@@ -197,21 +201,6 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
       return np.zeros(self.num_envs)
     readings = time_step.observation[key]
     return np.where(time_step.first(), 0.0, readings)
-
-
-def _row(observations: codecs.Observation, world: int) -> Any:
-  if isinstance(observations, dict):
-    return {key: value[world].copy() for key, value in observations.items()}
-  return observations[world].copy()
-
-
-def _replace(observations: Any, worlds: np.ndarray, by: Any) -> None:
-  """Replaces the observations of some worlds in a batch of observations."""
-  if isinstance(observations, dict):
-    for key, value in observations.items():
-      value[worlds] = by[key]
-  else:
-    observations[worlds] = by
 
 
 def _checked_mode(given: Any) -> AutoresetMode:

@@ -1,5 +1,6 @@
-"""Wrappers that Gymnasium lacks. See `docs/gymnasium.md` for the others."""
+"""Wrapper that Gymnasium lacks. See `docs/gymnasium.md` for the others."""
 
+import collections
 from typing import Any, final
 
 import gymnasium as gym
@@ -7,56 +8,8 @@ from gymnasium import spaces
 from gymnasium.vector import utils
 import numpy as np
 
-from realab_suite import errors
+from realab_suite import trees
 from realab_suite.config import integers
-from realab_suite.config import messages
-
-_CAMERA = 'senses_camera'
-# Key of an observation that is one array.
-_WHOLE = ''
-
-
-@final
-class PixelsOnly(gym.ObservationWrapper):
-  """An environment whose observation is the image of the agent's camera."""
-
-  def __init__(self, env: gym.Env) -> None:
-    """Wraps an environment.
-
-    Args:
-      env: Environment with the sense `camera`.
-
-    Raises:
-      SpecError: If observations have no image.
-    """
-    super().__init__(env)
-    self.observation_space = _image_space(env.observation_space)
-
-  def observation(self, observation: Any) -> Any:
-    """Returns the image, `(height, width, 3)` uint8."""
-    return observation[_CAMERA]
-
-
-@final
-class VectorPixelsOnly(gym.vector.VectorObservationWrapper):
-  """As `PixelsOnly`, for a vector environment."""
-
-  def __init__(self, env: gym.vector.VectorEnv) -> None:
-    """Wraps a vector environment.
-
-    Args:
-      env: Environment with the sense `camera`.
-
-    Raises:
-      SpecError: If observations have no image.
-    """
-    super().__init__(env)
-    self._single_observation_space = _image_space(env.single_observation_space)
-    self._observation_space = _image_space(env.observation_space)
-
-  def observations(self, observations: Any) -> Any:
-    """Returns the images, `(worlds, height, width, 3)` uint8."""
-    return observations[_CAMERA]
 
 
 @final
@@ -85,7 +38,9 @@ class VectorFrameStack(gym.vector.VectorWrapper):
     self._observation_space = utils.batch_space(
         self._single_observation_space, env.num_envs
     )
-    self._stacks: dict[str, np.ndarray] = {}
+    self._frames: collections.deque[Any] = collections.deque(
+        maxlen=self._stack_size
+    )
     self._was_over = np.zeros(env.num_envs, bool)
 
   def reset(
@@ -96,8 +51,10 @@ class VectorFrameStack(gym.vector.VectorWrapper):
     observations, infos = self.env.reset(seed=seed, options=options)
     begins = np.ones(self.num_envs, bool) if mask is None else np.array(mask)
     self._was_over = self._was_over & ~begins
+    if not self._frames:
+      self._frames.extend([observations] * self._stack_size)
     self._fill(observations, begins)
-    return self._stacked(observations), infos
+    return self._stacked(), infos
 
   def step(
       self, actions: Any
@@ -112,46 +69,32 @@ class VectorFrameStack(gym.vector.VectorWrapper):
     if mode is gym.vector.AutoresetMode.SAME_STEP:
       begins = is_over
       for world in np.flatnonzero(is_over).tolist():
-        infos['final_obs'][world] = self._final(
-            infos['final_obs'][world], world
+        earlier = [trees.taken(frame, world) for frame in self._frames]
+        infos['final_obs'][world] = _stack(
+            self.env.single_observation_space,
+            [*earlier[1:], infos['final_obs'][world]],
         )
     self._was_over = is_over
-    for key, value in _parts(observations).items():
-      stack = self._stacks[key]
-      stack[:, :-1] = stack[:, 1:].copy()
-      stack[:, -1] = value
+    self._frames.append(observations)
     self._fill(observations, begins)
-    return self._stacked(observations), rewards, terminated, truncated, infos
+    return self._stacked(), rewards, terminated, truncated, infos
 
   def _fill(self, observations: Any, begins: np.ndarray) -> None:
     """Fills the stacks of worlds in which an episode begins."""
-    for key, value in _parts(observations).items():
-      repeated = np.repeat(value[:, np.newaxis], self._stack_size, axis=1)
-      if key not in self._stacks:
-        self._stacks[key] = repeated
-      self._stacks[key][begins] = repeated[begins]
+    if begins.any():
+      worlds = np.flatnonzero(begins)
+      first = trees.taken(observations, worlds)
+      self._frames.extend(
+          [trees.put(frame, worlds, first) for frame in self._frames]
+      )
 
-  def _final(self, observation: Any, world: int) -> Any:
-    """Returns the stack at the end of an episode."""
-    stacks = {
-        key: np.concatenate([self._stacks[key][world, 1:], value[np.newaxis]])
-        for key, value in _parts(observation).items()
-    }
-    return stacks if isinstance(observation, dict) else stacks[_WHOLE]
-
-  def _stacked(self, observations: Any) -> Any:
-    copies = {key: stack.copy() for key, stack in self._stacks.items()}
-    return copies if isinstance(observations, dict) else copies[_WHOLE]
+  def _stacked(self) -> Any:
+    """Returns the stack of each world."""
+    stacks = _stack(self.env.observation_space, list(self._frames))
+    return trees.mapped(lambda stack: stack.swapaxes(0, 1).copy(), stacks)
 
 
-def _parts(observation: Any) -> dict[str, np.ndarray]:
-  return observation if isinstance(observation, dict) else {_WHOLE: observation}
-
-
-def _image_space(space: Any) -> spaces.Space[Any]:
-  if not isinstance(space, spaces.Dict) or _CAMERA not in space.spaces:
-    raise errors.SpecError(
-        f'observation_space: {messages.quote(str(space))}; allowed is a Dict'
-        f' with {_CAMERA!r}: select the sense camera'
-    )
-  return space[_CAMERA]
+def _stack(space: spaces.Space[Any], frames: list[Any]) -> Any:
+  """Returns elements of a space, stacked along a new first axis."""
+  empty = utils.create_empty_array(space, len(frames))
+  return utils.concatenate(space, frames, empty)
