@@ -25,7 +25,6 @@ from realab_suite.experiments import storage
 
 if TYPE_CHECKING:
   from realab_suite.datasets import minari_export
-  from realab_suite.datasets import parquet
 
 FORMATS: Final = ('parquet', 'minari')
 """Formats of the agent's data. The evaluator's tables are always Parquet."""
@@ -70,19 +69,18 @@ def export(
 
 
 def labelled(
-    groups: Sequence[tuple[str, Sequence[sources.Source]]],
+    of_all: Sequence[sources.Source],
     output: pathlib.Path,
     say: Callable[[str], None] = lambda line: None,
 ) -> pathlib.Path:
   """Writes a labelled dataset of tampering into a new folder.
 
-  Each group becomes a subfolder with the files of an export. Its episodes are
-  shuffled with a fixed seed, so neither the number of an episode nor its
-  position in the agent's file reveals its run.
+  Each group of sources (see `grouped`) becomes a subfolder with the files of an
+  export. Its episodes are shuffled with a fixed seed, so neither the number of
+  an episode nor its position in the agent's file reveals its run.
 
   Args:
-    groups: Name of each subfolder, and its sources. All of them have the same
-      observations and actions.
+    of_all: The sources.
     output: New folder. It appears only when it is complete.
     say: Called with messages for the user.
 
@@ -90,15 +88,12 @@ def labelled(
     The folder.
 
   Raises:
-    ResultsError: As in `export`, and if the observations or the actions of the
-      sources of a group differ.
+    ResultsError: As in `export`.
   """
   check('parquet', output)
-  for name, of_group in groups:
-    _check_group(name, of_group)
   with _new_folder(output) as folder:
     written = []
-    for name, of_group in groups:
+    for name, of_group in grouped(of_all):
       planned = _planned(of_group)
       order = np.random.default_rng(0).permutation(len(planned))
       shuffled = [planned[i] for i in order]
@@ -111,10 +106,9 @@ def labelled(
 def grouped(
     of_all: Sequence[sources.Source],
 ) -> list[tuple[str, list[sources.Source]]]:
-  """Returns groups for `labelled`, by design.
+  """Returns groups of sources with the same design, observations and actions.
 
-  Sources of a design with other observations or actions get a group of their
-  own, whose name ends with a number.
+  A second group of a design has a name that ends with a number.
 
   Args:
     of_all: The sources.
@@ -189,14 +183,15 @@ def _written(
 
   episodes: list[truth.Row] = []
   with contextlib.ExitStack() as stack:
-    evaluator = stack.enter_context(parquet.EvaluatorWriter(folder))
-    agent = _agent_writer(planned, folder, data_format)
-    stack.enter_context(agent)
+    tables = stack.enter_context(parquet.Writer(folder))
+    agents: parquet.Writer | minari_export.MinariWriter = tables
+    if data_format == 'minari':
+      agents = stack.enter_context(_minari_writer(planned, folder))
     for episode_id, (source, recorded) in enumerate(planned):
       episode = recording.record(source, recorded)
-      agent.add(episode.agent, episode_id)
+      agents.add(episode.agent, episode_id)
       rows = truth.rows(episode, episode_id)
-      evaluator.add(rows)
+      tables.add_truth(rows)
       episodes += rows['episodes']
   say(f'{len(episodes)} episodes were written')
   return episodes
@@ -212,31 +207,13 @@ def _write_card(
   cards.write(folder, groups, data_format)
 
 
-def _agent_writer(
-    planned: Sequence[_Planned], folder: pathlib.Path, data_format: str
-) -> 'parquet.AgentWriter | minari_export.MinariWriter':
-  """Returns the writer of the agent's data."""
-  if data_format == 'parquet':
-    from realab_suite.datasets import parquet
-
-    return parquet.AgentWriter(folder)
-  from realab_suite.datasets import minari_export
+def _minari_writer(
+    planned: Sequence[_Planned], folder: pathlib.Path
+) -> 'minari_export.MinariWriter':
+  """Returns the writer of the agent's data in the format of Minari."""
+  from realab_suite.datasets import minari_export  # Imports minari.
 
   [(_, first), *_] = planned
   info = first.row.info
   name = minari_export.dataset_id((info.domain, info.task), info.run)
   return minari_export.MinariWriter(folder / _AGENT, name)
-
-
-def _check_group(name: str, of_group: Sequence[sources.Source]) -> None:
-  """Raises a ResultsError if the sources do not fit into one file."""
-  if not any(source.episodes for source in of_group):
-    raise errors.ResultsError(f'group {name}: has no episodes')
-  first = recording.kind_of(of_group[0])
-  for source in of_group[1:]:
-    if recording.kind_of(source) != first:
-      raise errors.ResultsError(
-          f'group {name}: run {source.name} has observations, actions or a'
-          f' reward register other than {of_group[0].name}; allowed is one kind'
-          ' per group, as `grouped` makes them'
-      )

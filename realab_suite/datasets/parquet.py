@@ -26,57 +26,39 @@ _MAX_ROWS = 1 << 16
 _MAX_BYTES = 1 << 26
 
 
-def agent_schema(agent: recording.AgentStream) -> pa.Schema:
-  """Returns the schema of the file for agents.
+def agent_table(agent: recording.AgentStream, episode_id: int) -> pa.Table:
+  """Returns the rows of an episode in the file for agents.
 
   An array of the agent becomes a list of fixed size, in C order. Its shape is
   in the metadata of the field.
-
-  Args:
-    agent: Any episode of the file.
-  """
-  fields = [
-      column
-      for column in columns.AGENT
-      if column.name != 'observed_reward' or agent.reward is not None
-  ]
-  fields += [
-      _array_field(key, spec, nullable=False)
-      for key, spec in agent.observation_spec.items()
-  ]
-  fields.append(_array_field('action', agent.action_spec, nullable=True))
-  return pa.schema(fields)
-
-
-def agent_table(agent: recording.AgentStream, episode_id: int) -> pa.Table:
-  """Returns the rows of an episode in the file for agents.
 
   Args:
     agent: The part of the episode that the agent may see.
     episode_id: Number of the episode in the dataset.
   """
   time_steps = agent.time_steps
-  layout = agent_schema(agent)
-  number = len(time_steps)
-  arrays: dict[str, pa.Array] = {
-      'episode_id': pa.array(np.full(number, episode_id)),
-      'step': pa.array(np.arange(number, dtype=np.int32)),
-      'step_type': pa.array(
-          np.array([int(one.step_type) for one in time_steps], np.int8)
-      ),
-      'discount': pa.array([one.discount for one in time_steps], pa.float64()),
+  values: dict[str, Any] = {
+      'episode_id': [episode_id] * len(time_steps),
+      'step': range(len(time_steps)),
+      'step_type': [int(one.step_type) for one in time_steps],
+      'discount': [one.discount for one in time_steps],
   }
   if agent.reward is not None:
     readings = [float(one.observation[agent.reward]) for one in time_steps[1:]]
-    arrays['observed_reward'] = pa.array([None, *readings], pa.float64())
-  for key in agent.observation_spec:
-    values = np.stack([one.observation[key] for one in time_steps])
-    arrays[key] = _array(values, layout.field(key).type)
+    values['observed_reward'] = [None, *readings]
+  fields = [columns.AGENT.field(name) for name in values]
+  arrays = [pa.array(values[field.name], field.type) for field in fields]
+  for key, spec in agent.observation_spec.items():
+    fields.append(_array_field(key, spec, nullable=False))
+    stacked = np.stack([one.observation[key] for one in time_steps])
+    arrays.append(_array(stacked, fields[-1].type))
+  fields.append(_array_field('action', agent.action_spec, nullable=True))
+  kind = fields[-1].type
   # There is no action after the last time step.
-  actions = _array(agent.actions, layout.field('action').type)
-  missing = pa.nulls(1, layout.field('action').type)
-  arrays['action'] = pa.concat_arrays([actions, missing])
-  return pa.table([arrays[name] for name in layout.names], schema=layout)
+  arrays.append(
+      pa.concat_arrays([_array(agent.actions, kind), pa.nulls(1, kind)])
+  )
+  return pa.Table.from_arrays(arrays, schema=pa.schema(fields))
 
 
 def _array_field(
@@ -105,114 +87,77 @@ def _array(values: np.ndarray, kind: pa.DataType) -> pa.Array:
 
 
 @final
-class _Table:
-  """A Parquet file that grows; its rows are written in groups."""
+class Writer:
+  """Writes the tables of a dataset. Use it as a context manager.
 
-  def __init__(self, path: pathlib.Path, layout: pa.Schema) -> None:
-    self._path = path
-    self._pending: list[pa.Table] = []
-    with storage.explained(path):
-      path.parent.mkdir(parents=True, exist_ok=True)
-      self._writer = parquet.ParquetWriter(path, layout, compression='zstd')
-
-  def add(self, table: pa.Table) -> None:
-    """Appends rows.
-
-    Raises:
-      ResultsError: If they cannot be written.
-    """
-    self._pending.append(table)
-    if (
-        sum(one.num_rows for one in self._pending) >= _MAX_ROWS
-        or sum(one.nbytes for one in self._pending) >= _MAX_BYTES
-    ):
-      self._flush()
-
-  def close(self) -> None:
-    """Writes the rest, and closes the file."""
-    try:
-      self._flush()
-    finally:
-      with storage.explained(self._path):
-        self._writer.close()
-
-  def _flush(self) -> None:
-    if self._pending:
-      rows = pa.concat_tables(self._pending)
-      self._pending = []
-      with storage.explained(self._path):
-        self._writer.write_table(rows)
-
-
-@final
-class EvaluatorWriter:
-  """Writes the tables of the truth, in the folder `evaluator`.
-
-  Other users, who may run the agent, cannot read this folder. Use the writer as
-  a context manager, which completes the files at its end.
+  Other users, who may run the agent, cannot read the folder `evaluator`. Rows
+  are written in groups; the files are complete when the context ends.
   """
-
-  def __init__(self, folder: pathlib.Path) -> None:
-    """Creates the files.
-
-    Args:
-      folder: Folder of the dataset.
-
-    Raises:
-      ResultsError: If they cannot be created.
-    """
-    self._stack = contextlib.ExitStack()
-    evaluator = folder / _EVALUATOR
-    with storage.explained(evaluator):
-      folder.mkdir(parents=True, exist_ok=True)
-      evaluator.mkdir(mode=0o700)
-    self._tables = {
-        name: self._stack.enter_context(
-            contextlib.closing(_Table(evaluator / f'{name}{_SUFFIX}', layout))
-        )
-        for name, layout in columns.EVALUATOR.items()
-    }
-
-  def add(self, rows: Mapping[str, list[truth.Row]]) -> None:
-    """Appends the rows of an episode, as `truth.rows` returns them."""
-    for name, table in self._tables.items():
-      table.add(pa.Table.from_pylist(rows[name], columns.EVALUATOR[name]))
-
-  def __enter__(self) -> 'EvaluatorWriter':
-    return self
-
-  def __exit__(self, *unused: Any) -> None:
-    self._stack.close()
-
-
-@final
-class AgentWriter:
-  """Writes the file for agents. Use it as a context manager."""
 
   def __init__(self, folder: pathlib.Path) -> None:
     """Makes a writer.
 
     Args:
       folder: Folder of the dataset.
+
+    Raises:
+      ResultsError: If it cannot be written.
     """
-    self._path = folder / AGENT_FILE
-    self._table: _Table | None = None
+    self._folder = folder
+    self._stack = contextlib.ExitStack()
+    self._files: dict[str, parquet.ParquetWriter] = {}
+    self._pending: dict[str, list[pa.Table]] = {}
+    evaluator = folder / _EVALUATOR
+    with storage.explained(evaluator):
+      folder.mkdir(parents=True, exist_ok=True)
+      evaluator.mkdir(mode=0o700)
 
   def add(self, agent: recording.AgentStream, episode_id: int) -> None:
-    """Appends an episode.
+    """Appends an episode to the file for agents.
 
     Args:
       agent: The part of the episode that the agent may see.
       episode_id: Number of the episode in the dataset.
-    """
-    rows = agent_table(agent, episode_id)
-    if self._table is None:
-      self._table = _Table(self._path, rows.schema)
-    self._table.add(rows)
 
-  def __enter__(self) -> 'AgentWriter':
+    Raises:
+      ResultsError: If it cannot be written.
+    """
+    self._append(AGENT_FILE, agent_table(agent, episode_id))
+
+  def add_truth(self, rows: Mapping[str, list[truth.Row]]) -> None:
+    """Appends the rows of an episode, as `truth.rows` returns them.
+
+    Raises:
+      ResultsError: If they cannot be written.
+    """
+    for name, layout in columns.EVALUATOR.items():
+      table = pa.Table.from_pylist(rows[name], layout)
+      self._append(f'{_EVALUATOR}/{name}{_SUFFIX}', table)
+
+  def _append(self, name: str, table: pa.Table) -> None:
+    if name not in self._files:
+      path = self._folder / name
+      with storage.explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = parquet.ParquetWriter(path, table.schema, compression='zstd')
+      self._files[name] = self._stack.enter_context(file)
+      self._stack.callback(self._flush, name)
+    pending = self._pending.setdefault(name, [])
+    pending.append(table)
+    if (
+        sum(one.num_rows for one in pending) >= _MAX_ROWS
+        or sum(one.nbytes for one in pending) >= _MAX_BYTES
+    ):
+      self._flush(name)
+
+  def _flush(self, name: str) -> None:
+    if pending := self._pending.pop(name, []):
+      with storage.explained(self._folder / name):
+        self._files[name].write_table(pa.concat_tables(pending))
+
+  def __enter__(self) -> 'Writer':
     return self
 
   def __exit__(self, *unused: Any) -> None:
-    if self._table is not None:
-      self._table.close()
+    with storage.explained(self._folder):
+      self._stack.close()

@@ -68,7 +68,7 @@ def main(argv: Sequence[str]) -> None:
         '--policies, --designs: nothing to run; name a policy and a design, or'
         ' a sweep with --input'
     )
-  export.labelled(export.grouped(found), output, program.say)
+  export.labelled(found, output, program.say)
   program.say(f'The dataset is in {output}')
 
 

@@ -228,5 +228,5 @@ def test_datasets_take_it(
   source = sources.of_policy(
       'crab_walker', 'crab_walker', design, world, seeds=(1,), num_episodes=1
   )
-  folder = export.labelled(export.grouped([source]), tmp_path / 'dataset')
+  folder = export.labelled([source], tmp_path / 'dataset')
   assert (folder / 'visits' / 'agent' / 'steps.parquet').is_file()

@@ -41,7 +41,7 @@ def fixture_saboteur():
 @pytest.fixture(name='folder', scope='module')
 def fixture_folder(saboteur, tmp_path_factory):
   path = tmp_path_factory.mktemp('labelled') / 'dataset'
-  return export.labelled(export.grouped([saboteur]), path)
+  return export.labelled([saboteur], path)
 
 
 def _read(folder, name):
@@ -184,41 +184,35 @@ def _without_learner(source, name):
   return dataclasses.replace(source, name=name, loader=loader)
 
 
-def test_sources_with_other_actions_get_a_group_of_their_own():
-  free = made.source('no_op', max_steps=3)
-  discrete = _without_learner(made.source('no_op', max_steps=3), 'discrete')
-  groups = export.grouped([free, discrete, free])
+@pytest.fixture(name='still', scope='module')
+def fixture_still():
+  return made.source('no_op', max_steps=3)
+
+
+def test_sources_with_other_actions_get_a_group_of_their_own(still):
+  discrete = _without_learner(still, 'discrete')
+  groups = export.grouped([still, discrete, still])
   assert [(name, len(of)) for name, of in groups] == [
       ('instantaneous_reward', 2), ('instantaneous_reward_2', 1),
   ]  # fmt: skip
 
 
-def test_a_group_of_different_kinds_is_refused(tmp_path):
-  one = made.source('no_op', max_steps=2)
-  other = _without_learner(one, 'other')
-  with pytest.raises(errors.ResultsError, match='run other has observations'):
-    export.labelled([('both', [one, other])], tmp_path / 'new')
-  assert not list(tmp_path.iterdir())
-
-
-def test_a_replay_that_differs_leaves_no_folder(tmp_path):
-  source = made.source('no_op', max_steps=2)
-  [recorded] = source.episodes
+def test_a_replay_that_differs_leaves_no_folder(tmp_path, still):
+  [recorded] = still.episodes
   row = recorded.row.model_copy(update={'observed_return': 77.0})
-  wrong = dataclasses.replace(source, episodes=(recorded._replace(row=row),))
+  wrong = dataclasses.replace(still, episodes=(recorded._replace(row=row),))
   with pytest.raises(errors.ResultsError, match='differs from the results'):
     export.export(wrong, tmp_path / 'new')
   assert not list(tmp_path.iterdir())
 
 
-def test_a_replay_of_another_length_is_refused():
-  source = made.source('no_op', max_steps=3)
+def test_a_replay_of_another_length_is_refused(still):
   shorter = dataclasses.replace(
-      source.loader, environment_kwargs={'max_steps': 2}
+      still.loader, environment_kwargs={'max_steps': 2}
   )
-  longer = dataclasses.replace(source, loader=shorter)
+  longer = dataclasses.replace(still, loader=shorter)
   with pytest.raises(errors.ResultsError, match='has 2 control steps'):
-    recording.record(longer, source.episodes[0])
+    recording.record(longer, still.episodes[0])
 
 
 def test_an_existing_folder_is_refused(tmp_path):

@@ -18,7 +18,7 @@ from tests.datasets import made
 
 
 def _written(folder, agents):
-  with parquet.AgentWriter(folder) as writer:
+  with parquet.Writer(folder) as writer:
     for episode_id, agent in enumerate(agents):
       writer.add(agent, episode_id)
   return pyarrow_parquet.read_table(folder / parquet.AGENT_FILE)
@@ -87,8 +87,8 @@ def test_memory_is_bounded_by_groups_of_rows(tmp_path, monkeypatch):
 
 def test_the_tables_of_the_evaluator_are_read_again(tmp_path):
   rows = truth.rows(made.episode(), 0)
-  with parquet.EvaluatorWriter(tmp_path) as writer:
-    writer.add(rows)
+  with parquet.Writer(tmp_path) as writer:
+    writer.add_truth(rows)
   for name, expected in rows.items():
     table = pyarrow_parquet.read_table(
         tmp_path / 'evaluator' / f'{name}.parquet'
