@@ -217,13 +217,18 @@ def _begins_clean(following: served.RawStream, address: str) -> bool:
 
 def _time_of_refusal(address: str) -> float:
   with served.Client(address) as second:
-    grpc.channel_ready_future(second.channel).result(patience.SECONDS)
-    start = time.monotonic()
-    try:
-      second.join()
-    except grpc.RpcError as error:
-      if error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED:
-        return time.monotonic() - start
+    call = second.channel.stream_stream(served.METHOD)
+    for _ in range(2):  # The first one connects.
+      start = time.monotonic()
+      try:
+        next(call(iter([served.JOIN])))
+      except grpc.RpcError as error:
+        if error.code() is not grpc.StatusCode.RESOURCE_EXHAUSTED:
+          break
+      else:
+        break
+    else:
+      return time.monotonic() - start
   return float('inf')
 
 

@@ -4,7 +4,6 @@ import dm_env
 from dm_env import specs
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
-from google.protobuf import any_pb2
 from google.rpc import code_pb2
 import numpy as np
 import pytest
@@ -65,61 +64,6 @@ def _running(port):
   return port
 
 
-_TENSOR = tensor_utils.pack_tensor(1.0)
-_NOT_FOR_AGENTS = [
-    dict(create_world=pb.CreateWorldRequest()),
-    dict(create_world=pb.CreateWorldRequest(settings={'seed': _TENSOR})),
-    dict(destroy_world=pb.DestroyWorldRequest(world_name='world')),
-    dict(reset_world=pb.ResetWorldRequest(world_name='world')),
-    dict(extension=any_pb2.Any(type_url='dm_env_rpc.v1.PropertyRequest')),
-    dict(reset=pb.ResetRequest(settings={'seed': _TENSOR})),
-]
-
-
-@pytest.mark.parametrize('payload', _NOT_FOR_AGENTS, ids=str)
-@pytest.mark.parametrize('is_running', [False, True])
-def test_requests_that_agents_may_not_make_are_denied(
-    payload, is_running, port
-):
-  _join(port)
-  if is_running:
-    _step(port)
-  assert _ask(port, **payload).error.code == _DENIED
-
-
-def test_there_is_one_world(port):
-  join = pb.JoinWorldRequest(world_name='another')
-  assert _ask(port, join_world=join).error.code == _INVALID
-
-
-@pytest.mark.parametrize('data', [b'\xff' * 9, b'\x0a\xff', b'\x08'])
-def test_unreadable_messages_are_refused(data, port):
-  error = pb.EnvironmentResponse.FromString(port.answer(data)).error
-  assert (error.code, error.message) == (
-      _INVALID, 'R01: the message cannot be read'
-  )  # fmt: skip
-
-
-def test_an_empty_message_is_refused(port):
-  answer = pb.EnvironmentResponse.FromString(port.answer(b''))
-  assert answer.error.code == _INVALID
-
-
-def test_requests_before_joining_are_refused(port):
-  assert _step(port).error.code == _TOO_EARLY
-  assert _ask(port, reset=pb.ResetRequest()).error.code == _TOO_EARLY
-  left = _ask(port, leave_world=pb.LeaveWorldRequest())
-  assert left.WhichOneof('payload') == 'leave_world'
-
-
-def test_joining_twice_is_refused(running):
-  assert _join(running).error.code == _TOO_EARLY
-
-
-def test_a_reset_in_mid_episode_is_refused(running):
-  assert _ask(running, reset=pb.ResetRequest()).error.code == _TOO_EARLY
-
-
 def test_leaving_abandons_the_episode():
   env, port = _make()
   sink = helpers.RecordingSink()
@@ -132,13 +76,6 @@ def test_leaving_abandons_the_episode():
   assert _step(port).step.state == pb.RUNNING
   assert [start.episode for start in sink.starts] == [0, 1]
   env.close()
-
-
-def test_an_unknown_observation_is_refused_by_number(running):
-  error = _step(running, _no_op(), [1, 77]).error
-  assert (error.code, error.message) == (
-      _INVALID, 'R09: observation 77 is unknown'
-  )  # fmt: skip
 
 
 def _no_op():

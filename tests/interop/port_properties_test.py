@@ -8,7 +8,6 @@ from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
 from dm_env_rpc.v1.extensions import properties_pb2
 from google.protobuf import any_pb2
-from google.rpc import code_pb2
 import hypothesis
 from hypothesis import strategies as st
 import numpy as np
@@ -22,6 +21,7 @@ from tests.interop import served
 
 _MAX_STEPS = 20
 _MAX_UINT64 = 2**64 - 1
+_Reason = refusals.Reason
 _FAILED = refusals.Reason.FAILED.value[0]
 _TEXTS = [
     re.compile(re.escape(f'{id_}: {text}').replace(r'\{\}', r'\d+'))
@@ -46,9 +46,11 @@ def _properties() -> Iterator[bytes]:
     yield served.request(extension=packed)
 
 
+_SETTINGS = {'seed': tensor_utils.pack_tensor(1)}
 # Messages that agents may not send.
 _OUTSIDE = [
     served.request(create_world=pb.CreateWorldRequest()),
+    served.request(create_world=pb.CreateWorldRequest(settings=_SETTINGS)),
     served.request(destroy_world=pb.DestroyWorldRequest(world_name='world')),
     served.request(reset_world=pb.ResetWorldRequest(world_name='world')),
     served.request(extension=any_pb2.Any(type_url='a/b', value=b'c')),
@@ -155,26 +157,6 @@ def test_observations_of_the_spec_are_all_that_there_is(
     assert answer.error.message == f'R09: observation {uid} is unknown'
 
 
-@examples.settings(50)
-@hypothesis.given(
-    key=st.sampled_from(['seed', 'task', 'true_reward', 'debug', 'world'])
-    | st.text(max_size=8)
-)
-def test_agents_choose_no_settings(port: agent_port.AgentPort, key: str):
-  value = {key: tensor_utils.pack_tensor(1)}
-  port.answer(served.JOIN)
-  for request in (
-      served.request(reset=pb.ResetRequest(settings=value)),
-      served.request(
-          join_world=pb.JoinWorldRequest(world_name='world', settings=value)
-      ),
-      served.request(create_world=pb.CreateWorldRequest(settings=value)),
-  ):
-    answer = _ask(port, request)
-    assert answer.WhichOneof('payload') == 'error'
-    _check(answer)
-
-
 _HOSTILE: dict[str, bytes] = {
     'join': served.JOIN,
     'reset': served.RESET,
@@ -187,52 +169,63 @@ _HOSTILE: dict[str, bytes] = {
         )
     ),
     'outside': _OUTSIDE[0],
-    'property': _OUTSIDE[4],
-    'settings': served.request(
-        reset=pb.ResetRequest(settings={'seed': tensor_utils.pack_tensor(1)})
+    'property': _OUTSIDE[-1],
+    'join another world': served.request(
+        join_world=pb.JoinWorldRequest(world_name='another')
+    ),
+    'join with settings': served.request(
+        join_world=pb.JoinWorldRequest(world_name='world', settings=_SETTINGS)
+    ),
+    'reset with settings': served.request(
+        reset=pb.ResetRequest(settings=_SETTINGS)
     ),
     'empty': b'',
     'noise': b'\xff' * 40,
 }
-_NO_ERROR = 0
 
 
 class _Model:
-  """Predicts the code of each answer in a sequence of requests."""
+  """Predicts the refusal of each request in a sequence, or `None`."""
 
   def __init__(self) -> None:
     self._is_joined = False
     self._steps_left = 0
 
-  def code(self, what: str) -> int:
-    """Returns the code of the next answer."""
-    if what in ('outside', 'property'):
-      return code_pb2.PERMISSION_DENIED
-    if what in ('empty', 'noise'):
-      return code_pb2.INVALID_ARGUMENT
+  def refusal(self, what: str) -> _Reason | None:
+    """Returns the reason to refuse the next request, or `None`."""
+    fixed = {
+        'outside': _Reason.NOT_FOR_AGENTS,
+        'property': _Reason.NOT_FOR_AGENTS,
+        'empty': _Reason.EMPTY,
+        'noise': _Reason.UNREADABLE,
+    }
+    if what in fixed:
+      return fixed[what]
     if what == 'leave':
       self._is_joined = False
-      return _NO_ERROR
-    if what == 'join':
-      was_joined, self._is_joined = self._is_joined, True
-      if not was_joined:
-        self._steps_left = 0
-      return code_pb2.FAILED_PRECONDITION if was_joined else _NO_ERROR
+      return None
+    if what in ('join', 'join another world', 'join with settings'):
+      if self._is_joined:
+        return _Reason.JOINED
+      if what != 'join':
+        return _Reason.WORLD if 'another' in what else _Reason.SETTINGS
+      self._is_joined, self._steps_left = True, 0
+      return None
     if not self._is_joined:
-      return code_pb2.FAILED_PRECONDITION
-    if what == 'settings':
-      return code_pb2.PERMISSION_DENIED
+      return _Reason.NOT_JOINED
+    if what == 'reset with settings':
+      return _Reason.SETTINGS
     if what == 'reset':
-      return code_pb2.FAILED_PRECONDITION if self._steps_left else _NO_ERROR
+      return _Reason.MID_EPISODE if self._steps_left else None
     if what == 'strange uid':
-      return code_pb2.INVALID_ARGUMENT
+      return _Reason.OBSERVATION
     if not self._steps_left:
       self._steps_left = _MAX_STEPS
-      return _NO_ERROR
+      return None
     if what == 'bare step':
-      return code_pb2.INVALID_ARGUMENT
+      return _Reason.NO_ACTION
     self._steps_left -= 1
-    return _NO_ERROR
+    return None
 
 
 _LIKELY = st.sampled_from(['step', 'step', 'join'])
@@ -249,8 +242,14 @@ def test_a_hostile_sequence_is_answered_as_predicted(
   model = _Model()
   for what in sequence:
     answer = _ask(port, _HOSTILE[what])
-    assert answer.error.code == model.code(what)
     _check(answer)
+    reason = model.refusal(what)
+    if reason is None:
+      assert answer.WhichOneof('payload') != 'error'
+    else:
+      id_, code, _ = reason.value
+      assert answer.error.message.startswith(f'{id_}: ')
+      assert answer.error.code == code
 
 
 def test_an_answer_that_names_a_file_is_not_allowed():
