@@ -373,7 +373,7 @@ def expose() -> Exposure:
         [
             sys.executable, '-m', 'realab_suite.launchers.serve',
             '--task=unlock_door.near', f'--max_steps={_MAX_STEPS}',
-            f'--output={output}',
+            f'--output={output}', '--set=learner=null',
             f'--agent_command=env ALONE=1 {command}',
         ],
         cwd=served.ROOT,

@@ -1,5 +1,6 @@
 """Tests that a served world cannot be cloned without its secret salt."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -17,6 +18,7 @@ from realab_suite.engine import seeding
 from realab_suite.evaluation import results
 from realab_suite.experiments import served_evaluation
 from realab_suite.experiments import storage
+from realab_suite.feedback import specs
 from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import sockets
 from realab_suite.launchers import serve
@@ -29,6 +31,7 @@ _NOBODY = 65534
 _SEED = 7
 _FLAGS = (
     f'--seed={_SEED}',
+    '--set=learner=null',  # Without a learner, no stakes are measured.
     f'--max_steps={clones.MAX_STEPS}',
     f'--episodes={clones.NUM_EPISODES}',
 )
@@ -55,15 +58,6 @@ def _check_that_only_the_salt_is_missing(output, episodes):
   assert _num_right(predictions) == _num_time_steps(episodes)
   returns = [row.true_return for row in _rows(output)]
   assert [prediction.true_return for prediction in predictions] == returns
-
-
-def _serve(output, *flags):
-  """Serves a world to an agent that plays; returns the episodes."""
-  with served.in_process(output, *flags) as program:
-    with served.Client(program.address) as client:
-      episodes = clones.play(client.env())
-    assert program.process.wait(patience.SECONDS) == 0
-  return episodes
 
 
 class _Run(NamedTuple):
@@ -138,13 +132,16 @@ def test_a_seed_without_a_salt_can_be_found():
   assert max(true_returns) > 0.0
 
 
-def test_runs_of_one_seed_differ(run, tmp_path):
-  other = _serve(tmp_path / 'other', *_FLAGS)
-  assert [e.position for e in run.episodes] != [e.position for e in other]
-  outputs = (run.output, tmp_path / 'other')
-  digests = [row.info.salt_digest for o in outputs for row in _rows(o)]
-  assert len(set(digests)) == 2
-  assert None not in digests
+def test_runs_of_one_seed_differ(run):
+  settings = dataclasses.replace(_settings(None), seed=_SEED)
+  _, _, seed = served_evaluation._chosen(settings)
+  assert seed == _SEED
+  with contextlib.closing(clones.make(seed)) as other:
+    position = other.reset().observation['senses/position']
+  assert position.tolist() != run.episodes[0].position
+  digests = {row.info.salt_digest for row in _rows(run.output)}
+  assert digests == {clones.seed_in(run.output).salt_digest}
+  assert seed.salt_digest not in digests
 
 
 # The salt is the evaluator's alone.
@@ -197,38 +194,56 @@ def test_a_folder_of_another_user_is_refused(tmp_path):
   output.mkdir()
   os.chown(output, _NOBODY, _NOBODY)
   output.chmod(0o777)
-  with pytest.raises(RuntimeError, match='belongs to user 65534; allowed is'):
-    _serve(output, *_FLAGS)
+  with pytest.raises(errors.SpecError, match='belongs to user 65534; allowed'):
+    served_evaluation._make_private_folder(str(output))
   assert not [*output.iterdir()]
 
 
 # A run that is repeated.
 
 
-def test_a_record_repeats_a_run(tmp_path):
-  first, second = tmp_path / 'first', tmp_path / 'second'
-  design = ('--design=online_imitation', '--set=providers.0.policy=random')
-  episodes = _serve(first, *_FLAGS, *design)
+def _readings(salt):
+  """Returns readings of what a random provider writes, in some steps."""
+  seed = seeding.SaltedSeed(_SEED, salt)
+  design = specs.load('online_imitation', ['providers.0.policy=random'])
+  with contextlib.closing(clones.make(seed, design)) as env:
+    env.reset()
+    return [
+        float(env.step(0).observation['registers/demonstration'])
+        for _ in range(9)
+    ]
+
+
+def test_the_random_numbers_of_providers_depend_on_the_salt():
+  salts = [bytes(seeding.NUM_SALT_BYTES), small.SALT]
+  assert _readings(salts[0]) == _readings(salts[0]) != _readings(salts[1])
+
+
+def test_a_record_repeats_a_run(run, tmp_path):
+  again = tmp_path / 'again'
   with served.in_process(
-      second,
-      f'--repeat={first / "run.json"}',
+      again,
+      f'--repeat={run.output / "run.json"}',
       f'--episodes={clones.NUM_EPISODES}',
       task=(),
   ) as program:
     with served.Client(program.address) as client:
-      assert clones.play(client.env()) == episodes
+      assert clones.play(client.env()) == run.episodes
     assert program.process.wait(patience.SECONDS) == 0
-  rows = [[r.model_dump_json() for r in _rows(o)] for o in (first, second)]
+  rows = [
+      [row.model_dump_json() for row in _rows(output)]
+      for output in (run.output, again)
+  ]
   assert rows[0] == rows[1]
-  assert clones.seed_in(second).salt == clones.seed_in(first).salt
+  assert clones.seed_in(again).salt == clones.seed_in(run.output).salt
 
 
 def _settings(record):
   """Returns the settings that `serve` makes of --repeat."""
   return served_evaluation.Settings(
       domain='collect_apples', task='standard', design='none', overrides=(),
-      seed=0, max_steps=250, repeat=str(record), num_episodes=2, name='agent',
-      address=None, idle_seconds=patience.SECONDS,
+      seed=0, max_steps=250, repeat=record and str(record), num_episodes=2,
+      name='agent', address=None, idle_seconds=patience.SECONDS,
       provider_seconds=patience.SECONDS, agent_command=None,
       agent_folder=None, agent_user=None, output='results',
   )  # fmt: skip

@@ -4,6 +4,7 @@ Small parts of the campaign `served_secrets`, and the leaks of channels L32 to
 L37 (docs/reliability_figures.md).
 """
 
+import ctypes
 import itertools
 import os
 import pathlib
@@ -20,10 +21,15 @@ import pytest
 from campaigns import searches
 from campaigns import served_secrets_campaign as secrets
 from realab_suite.entities import registers
+from realab_suite.experiments import served_evaluation
 from realab_suite.interop.rpc import agent_process
+from tests import patience
 from tests.engine import helpers
 from tests.interop import clones
 from tests.interop import served
+
+_is_root = pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
+_is_linux = pytest.mark.skipif(sys.platform != 'linux', reason='needs Linux')
 
 
 def _unchanged(world: Any) -> None:
@@ -72,21 +78,49 @@ def test_answers_that_are_longer_with_a_reward_are_found():
 # Other channels.
 
 
-def test_the_process_of_a_world_cannot_be_inspected():
+_READ_MEMORY = """
+import ctypes, os, sys
+is_hidden = sys.argv[1] == 'hide'
+if is_hidden:
+  from realab_suite.experiments import served_evaluation
+os.setuid(65534)  # Root could read everything.
+ctypes.CDLL(None).prctl(4, 1, 0, 0, 0)  # A change of user has hidden it.
+if is_hidden:
+  served_evaluation.hide_from_debuggers()
+child = os.fork()
+if not child:
+  ctypes.CDLL(None).prctl(4, 1, 0, 0, 0)
+  try:
+    open(f'/proc/{os.getppid()}/mem', 'rb')
+  except PermissionError:
+    os._exit(13)
+  os._exit(0)
+os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@_is_linux
+def test_the_process_of_a_world_is_not_dumpable():
   # L32: it would be open to other processes of the same user.
-  program = (
-      'import ctypes, sys\n'
-      'from realab_suite.experiments import served_evaluation\n'
-      'if sys.argv[1] == "hide": served_evaluation.hide_from_debuggers()\n'
-      'sys.exit(ctypes.CDLL(None).prctl(3, 0, 0, 0, 0))\n'  # PR_GET_DUMPABLE
-  )
-  found = [
-      subprocess.run(
-          [sys.executable, '-c', program, how], cwd=served.ROOT, check=False
-      ).returncode
-      for how in ('hide', 'show')
-  ]
-  assert found == [0, 1]
+  prctl = ctypes.CDLL(None).prctl
+  get_dumpable, set_dumpable = 3, 4
+  assert prctl(get_dumpable, 0, 0, 0, 0) == 1
+  try:
+    served_evaluation.hide_from_debuggers()
+    assert prctl(get_dumpable, 0, 0, 0, 0) == 0
+  finally:
+    prctl(set_dumpable, 1, 0, 0, 0)
+
+
+@_is_linux
+@_is_root
+@pytest.mark.parametrize(('how', 'status'), [('hide', 13), ('show', 0)])
+def test_the_memory_of_a_world_is_closed_to_the_same_user(how, status):
+  ran = subprocess.run(
+      [sys.executable, '-W', 'ignore', '-c', _READ_MEMORY, how],
+      cwd=served.ROOT, timeout=patience.SECONDS, check=False,
+  )  # fmt: skip
+  assert ran.returncode == status
 
 
 def test_an_agent_inherits_no_variable_of_its_evaluator():
@@ -205,7 +239,7 @@ def test_a_canary_is_nowhere_except_at_the_evaluator():
   assert 'salt: bytes' in found.in_evaluator
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason='needs root')
+@_is_root
 def test_files_that_are_open_to_other_users_are_found():
   with tempfile.TemporaryDirectory() as folder:
     os.chmod(folder, 0o755)
