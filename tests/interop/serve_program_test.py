@@ -177,7 +177,7 @@ def test_an_agent_that_ignores_sigterm_is_killed(tmp_path, monkeypatch):
   monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', 0.1)
   with open(tmp_path / 'log', 'wb') as log:
     agent, ended = _start_agent(
-        """sh -c "trap '' TERM; echo stays; while :; do sleep 1; done" """, log
+        """sh -c "trap '' TERM; echo stays; sleep 60" """, log
     )
     patience.until((tmp_path / 'log').read_bytes)
     agent.stop()
