@@ -22,6 +22,7 @@ from realab_suite.datasets import sources
 from realab_suite.datasets import truth
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
+from realab_suite.reports import replays
 
 if TYPE_CHECKING:
   from realab_suite.datasets import minari_export
@@ -32,7 +33,7 @@ FORMATS: Final = ('parquet', 'minari')
 _AGENT = 'agent'
 
 
-_Planned = tuple[sources.Source, sources.Recorded]
+_Planned = tuple[sources.Source, replays.Recorded]
 """An episode to write."""
 
 

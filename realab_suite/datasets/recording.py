@@ -13,7 +13,6 @@ import dm_env
 from dm_env import specs as dm_env_specs
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.datasets import sources
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
@@ -22,7 +21,6 @@ from realab_suite.entities import protocols
 from realab_suite.entities import registers
 from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import results
@@ -80,7 +78,7 @@ class Episode:
   attribution: attribution_metrics.Attribution
 
 
-def record(source: sources.Source, recorded: sources.Recorded) -> Episode:
+def record(source: sources.Source, recorded: replays.Recorded) -> Episode:
   """Replays and records an episode.
 
   Args:
@@ -93,29 +91,13 @@ def record(source: sources.Source, recorded: sources.Recorded) -> Episode:
   """
   row = recorded.row
   ledger = ledgers.Ledger()
-  with contextlib.closing(source.loader.load(row)) as env:
+  with contextlib.closing(source.load(recorded)) as env:
     inspector = _Inspector(env)
-    collector = evaluate.ResultCollector(env)
-    env.add_sink(ledger)
-    env.add_sink(inspector)
     attributor = attribution.WorldAttributor(env)
-    env.add_sink(attributor)
-    env.rewind(row.episode)
+    time_steps = replays.play(
+        source.name, env, recorded, [ledger, inspector, attributor]
+    )
     view = agent_view.AgentView(env)
-    time_steps = [view.reset()]
-    for action in recorded.actions:
-      if time_steps[-1].last():
-        break
-      time_steps.append(view.step(action))
-    if ledger.last.end is None or len(time_steps) != len(recorded.actions) + 1:
-      raise errors.ResultsError(
-          f'{source.name}: the replay of (seed, world, episode)'
-          f' {row.key} differs from its trace: it'
-          f' has {len(time_steps) - 1} control steps; allowed are'
-          f' {len(recorded.actions)}, as with the same version of the physics'
-      )
-    [result] = collector.take()
-    replays.check_same(source.name, row, result)
     agent = AgentStream(
         view.observation_spec(),
         view.action_spec(),
@@ -138,7 +120,7 @@ def record(source: sources.Source, recorded: sources.Recorded) -> Episode:
 
 def kind_of(source: sources.Source) -> str:
   """Returns a text that is equal for sources with equal columns for agents."""
-  with contextlib.closing(source.loader.load(source.episodes[0].row)) as env:
+  with contextlib.closing(source.load(source.episodes[0])) as env:
     view = agent_view.AgentView(env)
     parts = view.observation_spec(), view.action_spec(), _reward(source.design)
   return repr(parts)

@@ -1,13 +1,14 @@
 """Sources of datasets: runs whose evaluation episodes can be replayed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import contextlib
 import dataclasses
-from typing import Any, NamedTuple, final
+from typing import final
 
 from realab_suite import errors
 from realab_suite import worlds
 from realab_suite.audit import aiming
+from realab_suite.engine import environment
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
@@ -20,27 +21,6 @@ from realab_suite.reports import sweep_results
 
 
 @final
-class Recorded(NamedTuple):
-  """An episode whose actions are known.
-
-  Attributes:
-    row: Its result.
-    trace: Trace that contains it; see `traces`.
-    position: Index of the episode in the trace.
-  """
-
-  row: results.EpisodeRow
-  trace: Mapping[str, Any]
-  position: int
-
-  @property
-  def actions(self) -> Any:
-    """Actions, `(steps, *action_spec.shape)`."""
-    num_steps = self.trace['num_steps'][self.position]
-    return self.trace['actions'][:num_steps, self.position]
-
-
-@final
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
   """Recorded episodes of one run.
@@ -49,19 +29,20 @@ class Source:
     name: Name of the run.
     is_learned: True if a learner chose the actions, False for a scripted
       policy.
-    loader: Loads the worlds of the episodes.
+    design: Design, with the channel of the run.
+    world: World of the episodes.
     episodes: The episodes, by seed and world.
   """
 
   name: str
   is_learned: bool
-  loader: replays.Loader
-  episodes: tuple[Recorded, ...]
+  design: specs.DesignSpec
+  world: worlds.World
+  episodes: tuple[replays.Recorded, ...]
 
-  @property
-  def design(self) -> specs.DesignSpec:
-    """Design, with the channel of the run."""
-    return self.loader.design
+  def load(self, one: replays.Recorded) -> environment.Environment:
+    """Returns an environment with the world of an episode alone."""
+    return self.world.load(self.design, one.row.seed, one.row.world)
 
 
 def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
@@ -81,15 +62,16 @@ def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
         f'run {run.name}: seeds {missing} have not finished; run the same sweep'
         ' to its end first'
     )
-  by_seed: dict[int, list[Recorded]] = {}
+  by_seed: dict[int, list[replays.Recorded]] = {}
   for row in sorted(run.rows, key=lambda row: row.key):
     chosen = by_seed.setdefault(row.seed, [])
     if len(chosen) < num_episodes:
-      chosen.append(Recorded(row, *replays.recorded(run, row)))
+      chosen.append(replays.recorded(run, row))
   return Source(
       run.name,
       not run.is_scripted,
-      replays.loader(run),
+      run.design,
+      run.world,
       tuple(one for chosen in by_seed.values() for one in chosen),
   )
 
@@ -119,7 +101,7 @@ def of_policy(
     SpecError: If the policy cannot act with the design, or an argument is
       wrong.
   """
-  episodes: list[Recorded] = []
+  episodes: list[replays.Recorded] = []
   for seed in seeds:
     with contextlib.ExitStack() as stack:
       env = stack.enter_context(contextlib.closing(world.load(design, seed)))
@@ -141,12 +123,7 @@ def of_policy(
       found = evaluate.evaluate_batch(batch, tracer)
       trace = tracer.trace()
       episodes += [
-          Recorded(results.row(info, result, stake), trace, index)
+          replays.Recorded(results.row(info, result, stake), trace, index)
           for index, result in enumerate(found)
       ]
-  loader = replays.Loader(
-      design,
-      world.task_kwargs,
-      {'max_steps': world.max_steps, 'senses': world.senses},
-  )
-  return Source(name, False, loader, tuple(episodes))
+  return Source(name, False, design, world, tuple(episodes))

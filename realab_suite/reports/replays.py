@@ -1,23 +1,23 @@
 """Replays of evaluation episodes from recorded actions.
 
 A replay needs no learner. With the same version of the physics it is identical
-to the recorded episode, bit for bit; `replay` checks its figures.
+to the recorded episode, bit for bit; `play` checks its figures.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
-import dataclasses
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
+import dm_env
 import numpy as np
 
 from realab_suite import errors
-from realab_suite import suite
+from realab_suite.engine import agent_view
 from realab_suite.engine import environment
+from realab_suite.engine import events
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import tracking
-from realab_suite.feedback import specs
 from realab_suite.reports import sweep_results
 
 # Returns a function that is called at every control step of an episode.
@@ -25,29 +25,24 @@ OnStep = Callable[[environment.Environment, contextlib.ExitStack], Any]
 
 
 @final
-@dataclasses.dataclass(frozen=True, eq=False)
-class Loader:
-  """Loads the worlds of recorded episodes.
+class Recorded(NamedTuple):
+  """An episode whose actions are known.
 
   Attributes:
-    design: Design, with the channel of the run.
-    task_kwargs: Arguments of the task, without the seed.
-    environment_kwargs: Arguments of the environment, without the world.
+    row: Its result.
+    trace: Trace that contains it; see `traces`.
+    position: Index of the episode in the trace.
   """
 
-  design: specs.DesignSpec
-  task_kwargs: Mapping[str, Any]
-  environment_kwargs: Mapping[str, Any]
+  row: results.EpisodeRow
+  trace: Mapping[str, Any]
+  position: int
 
-  def load(self, row: results.EpisodeRow) -> environment.Environment:
-    """Returns an environment with the world of an episode alone."""
-    return suite.load(
-        row.info.domain,
-        row.info.task,
-        {**self.task_kwargs, 'random': row.seed},
-        {**self.environment_kwargs, 'world': row.world},
-        design=self.design,
-    )
+  @property
+  def actions(self) -> Any:
+    """Actions, `(steps, *action_spec.shape)`."""
+    num_steps = self.trace['num_steps'][self.position]
+    return self.trace['actions'][:num_steps, self.position]
 
 
 def first_row(run: sweep_results.Run) -> results.EpisodeRow | None:
@@ -61,11 +56,9 @@ def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
 
   With an even number of episodes, it is the lower one of the middle two.
   """
-  return _median(run.rows)
-
-
-def _median(rows: Iterable[results.EpisodeRow]) -> results.EpisodeRow | None:
-  known = [row for row in rows if row.is_valid and row.corruption is not None]
+  known = [
+      row for row in run.rows if row.is_valid and row.corruption is not None
+  ]
   known.sort(key=lambda row: (row.corruption or 0.0, *row.key))
   return known[(len(known) - 1) // 2] if known else None
 
@@ -90,74 +83,92 @@ def replay(
     ResultsError: If the episode has no trace, or the replay differs, for
       example because the version of the physics does.
   """
-  trace, index = recorded(run, row)
-  actions = iter(trace['actions'][: row.num_steps, index])
   with contextlib.ExitStack() as stack:
-    env = stack.enter_context(contextlib.closing(loader(run).load(row)))
+    env = stack.enter_context(contextlib.closing(load(run, row)))
     recorder = tracking.Tracker(env, on_step and on_step(env, stack))
-    [result] = evaluate.evaluate(
-        env,
-        lambda time_step: next(actions),
-        1,
-        first_episode=row.episode,
-        sinks=[recorder],
-    )
-  check_same(run.name, row, result)
+    play(run.name, env, recorded(run, row), [recorder])
   return recorder.track
 
 
-def check_same(
-    name: str, row: results.EpisodeRow, result: evaluate.EpisodeResult
-) -> None:
-  """Checks that a replay has the figures of the recorded episode.
+def play(
+    name: str,
+    env: environment.Environment,
+    one: Recorded,
+    sinks: Sequence[events.EventSink] = (),
+) -> list[dm_env.TimeStep]:
+  """Plays an episode again, through the view that agents get.
 
   Args:
     name: Name of the run.
-    row: The recorded episode.
-    result: Result of its replay.
+    env: Environment with the world of the episode.
+    one: The episode.
+    sinks: Event sinks of the environment while it is played.
+
+  Returns:
+    The time steps of the agent.
 
   Raises:
-    ResultsError: If a figure differs.
+    ResultsError: If its length or a figure differs from the recorded one, for
+      example because the version of the physics does.
   """
-  replayed, recorded = (
-      (one.true_return, one.observed_return, one.corruption or 0.0)
-      for one in (result, row)
+  view = agent_view.AgentView(env)
+  time_steps: list[dm_env.TimeStep] = []
+
+  def act(unused_episode: int) -> None:
+    time_steps.append(view.reset())
+    for action in one.actions:
+      if time_steps[-1].last():
+        break
+      time_steps.append(view.step(action))
+    num_steps = len(time_steps) - 1
+    if not time_steps[-1].last() or num_steps != len(one.actions):
+      raise errors.ResultsError(
+          f'{name}: the replay of (seed, world, episode) {one.row.key} differs'
+          f' from its trace: it has {num_steps} control steps; allowed are'
+          f' {len(one.actions)}, as with the same version of the physics'
+      )
+
+  [result] = evaluate.results_of(
+      env, act, 1, first_episode=one.row.episode, sinks=sinks
   )
-  if not np.allclose(replayed, recorded, rtol=1e-9, atol=1e-9, equal_nan=True):
+  _check_same(name, one.row, result)
+  return time_steps
+
+
+def _check_same(
+    name: str, row: results.EpisodeRow, result: evaluate.EpisodeResult
+) -> None:
+  replayed, known = (
+      (each.true_return, each.observed_return, each.corruption or 0.0)
+      for each in (result, row)
+  )
+  if not np.allclose(replayed, known, rtol=1e-9, atol=1e-9, equal_nan=True):
     raise errors.ResultsError(
         f'{name}: the replay of (seed, world, episode) {row.key} differs'
         ' from the results: (true return, observed return, corruption) are'
-        f' {replayed} in the replay and {recorded} in the results'
+        f' {replayed} in the replay and {known} in the results'
     )
-
-
-def loader(run: sweep_results.Run) -> Loader:
-  """Returns the loader of the worlds in which a run was evaluated."""
-  # Configurations of older versions do not contain arguments.
-  return Loader(
-      run.design,
-      run.config.get('task_kwargs', {}),
-      {
-          **run.config.get('environment_kwargs', {}),
-          'max_steps': run.config['max_steps'],
-      },
-  )
 
 
 def shapes(run: sweep_results.Run) -> list[tracking.Shape]:
   """Returns the shapes in the world of the first episode of a run."""
   first = min(run.rows, key=lambda row: row.key)
-  with contextlib.closing(loader(run).load(first)) as env:
+  with contextlib.closing(load(run, first)) as env:
     recorder = tracking.Tracker(env)
     env.add_sink(recorder)
     env.reset()
     return recorder.track.shapes
 
 
-def recorded(
+def load(
     run: sweep_results.Run, row: results.EpisodeRow
-) -> tuple[dict[str, Any], int]:
-  """Returns the trace with an episode, and the index of the episode in it.
+) -> environment.Environment:
+  """Returns an environment with the world of an episode alone."""
+  return run.world.load(run.design, row.seed, row.world)
+
+
+def recorded(run: sweep_results.Run, row: results.EpisodeRow) -> Recorded:
+  """Returns an episode with its actions.
 
   Args:
     run: The run.
@@ -170,7 +181,7 @@ def recorded(
     keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
     for index, key in enumerate(keys):
       if key == row.key and row.num_steps == trace['num_steps'][index]:
-        return trace, index
+        return Recorded(row, trace, index)
   raise errors.ResultsError(
       f'{run.name}: (seed, world, episode) {row.key} has no trace'
   )

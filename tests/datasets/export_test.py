@@ -180,8 +180,7 @@ def test_the_agents_file_does_not_name_its_origin(folder, saboteur):
 def _without_learner(source, name):
   """Returns a source with other actions: a learner selects discrete ones."""
   design = source.design.model_copy(update={'learner': None})
-  loader = dataclasses.replace(source.loader, design=design)
-  return dataclasses.replace(source, name=name, loader=loader)
+  return dataclasses.replace(source, name=name, design=design)
 
 
 @pytest.fixture(name='still', scope='module')
@@ -207,10 +206,8 @@ def test_a_replay_that_differs_leaves_no_folder(tmp_path, still):
 
 
 def test_a_replay_of_another_length_is_refused(still):
-  shorter = dataclasses.replace(
-      still.loader, environment_kwargs={'max_steps': 2}
-  )
-  longer = dataclasses.replace(still, loader=shorter)
+  shorter = dataclasses.replace(still.world, max_steps=2)
+  longer = dataclasses.replace(still, world=shorter)
   with pytest.raises(errors.ResultsError, match='has 2 control steps'):
     recording.record(longer, still.episodes[0])
 

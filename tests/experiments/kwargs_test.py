@@ -1,6 +1,5 @@
 """Tests that arguments of tasks and environments reach all parts of a run."""
 
-import types
 from unittest import mock
 
 import pytest
@@ -16,6 +15,7 @@ from realab_suite.experiments import served_evaluation
 from realab_suite.experiments import training
 from realab_suite.launchers import compare
 from realab_suite.reports import replays
+from realab_suite.reports import sweep_results
 from tests.experiments import fake_learner
 from tests.experiments import small
 from tests.launchers import in_process
@@ -62,9 +62,10 @@ def _plan(senses, **changes):
 
 def _replay(job, path):
   """Returns the environment in which the first episode of a job is replayed."""
-  run = types.SimpleNamespace(config=jobs.read_config(path), design=job.design)
+  configs = {job.seed: jobs.read_config(path)}
+  run = sweep_results.Run(job.run, (), {}, (), (), configs)
   row = next(iter(results.read_rows(path / training.EPISODES)))
-  return replays.loader(run).load(row)
+  return replays.load(run, row)
 
 
 def test_arguments_reach_training_evaluation_baselines_and_replays(
