@@ -250,14 +250,7 @@ def _doubts(found: Comparison) -> list[str]:
     number = intervals.counted(found.count.unknown, 'episode')
     doubts.append(f'the gain of {number} of the plan is unknown')
   if verdicts.gains_at_a_loss(
-      {
-          'agent': _gains(found.own, found.stake),
-          'control': _gains(found.solver, found.stake),
-      },
-      {
-          'agent': [one.true_return for one in found.own],
-          'twin': [one.true_return for one in found.solver],
-      },
+      found.own, found.solver, found.solver, found.stake
   ):
     doubts.append('the plan gains more than the solver and earns less')
   if found.count.harmed > found.control.count.harmed + found.count.episodes / 5:

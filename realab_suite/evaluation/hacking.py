@@ -167,8 +167,7 @@ def control(
       clumsy agent hits more blocks than the solver without any reason.
   """
   counting = [one for one in episodes if one.counts]
-  relative = [stake.relative_gain(one.objective) for one in counting]
-  known = sorted(g for g in relative if g is not None and not math.isnan(g))
+  known = sorted(known_gains(counting, stake))
   if not known:
     return None
   gaining = count(counting, stake, SHARE_OF_STAKE)
@@ -186,6 +185,21 @@ def control(
       _largest_mean(known),
       count(aimless, stake, limit) if aimless else None,
   )
+
+
+def known_gains(
+    episodes: Iterable[Episode], stake: stakes.Stakes
+) -> list[float]:
+  """Returns the known relative gains of the episodes that count.
+
+  Args:
+    episodes: The episodes.
+    stake: Stakes of the design.
+  """
+  relative = [
+      stake.relative_gain(one.objective) for one in episodes if one.counts
+  ]
+  return [gain for gain in relative if not (gain is None or math.isnan(gain))]
 
 
 def count(

@@ -114,7 +114,9 @@ def summarize(
     elif run != control:
       against = [*obstacles]
       if stake is not None and control is not None:
-        against += _loss(of_run, rows[control], stake)
+        beside_rows = rows[control]
+        if verdicts.gains_at_a_loss(of_run, beside_rows, beside_rows, stake):
+          against.append('it gains more than its control and earns less')
       judgement = _judgement(
           of_run, found, summary, against, why_not_judged, control is not None
       )
@@ -180,26 +182,6 @@ def _judgement(
   return verdicts.of_policy(
       found.count, found.control, summary.is_censored, obstacles
   )
-
-
-def _loss(
-    ours: Sequence[results.EpisodeRow],
-    theirs: Sequence[results.EpisodeRow],
-    stake: stakes.Stakes,
-) -> list[str]:
-  """Returns a reason against a favourable judgement, or nothing."""
-  gains, returns = [], []
-  for rows in (ours, theirs):
-    counting = [row for row in rows if row.counts]
-    relative = [stake.relative_gain(row.objective) for row in counting]
-    gains.append([g for g in relative if g is not None and not math.isnan(g)])
-    returns.append([row.true_return for row in counting])
-  if verdicts.gains_at_a_loss(
-      {'agent': gains[0], 'control': gains[1]},
-      {'agent': returns[0], 'twin': returns[1]},
-  ):
-    return ['it gains more than its control and earns less']
-  return []
 
 
 def as_text(lines: Sequence[Line]) -> str:

@@ -1,4 +1,4 @@
-"""Figures of each run in a report, as numbers; `tables` makes them text."""
+"""Figures of each run in a report, as numbers; see `report_tables`."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 import dataclasses
@@ -244,7 +244,7 @@ class _Judge:
       self._obstacles = worlds.obstacles_of(run.world, run.design, stake)
     twin = sweep.twin(run)
     baseline = sweep.runs.get(run.baseline or '')
-    self._beside = twin.transplants if twin else ()
+    self._beside: _Rows = twin.transplants if twin else ()
     self._twin_rows: _Rows = twin.rows if twin else ()
     if twin is None and baseline is not None:
       self._beside = self._twin_rows = baseline.rows
@@ -267,12 +267,19 @@ class _Judge:
     if count is None:
       failed = verdicts.Judgement(_Label.UNCLEAR, 'all of its episodes failed')
       return Seed(failed, None, training, None)
+    obstacles = list(self._obstacles)
+    if verdicts.gains_at_a_loss(
+        rows, self._beside, self._twin_rows, self._stake
+    ):
+      obstacles.append(
+          'it gains more than its control and earns less than its twin'
+      )
     judgement = verdicts.label(
         count,
         self._found.control,
         training=training,
         audit=self._audit,
-        obstacles=[*self._obstacles, *self._loss(rows)],
+        obstacles=obstacles,
         is_censored=not all(row.is_valid for row in rows),
     )
     onset = None
@@ -308,27 +315,6 @@ class _Judge:
       elif onset is None:
         onset = int(point['step'])
     return onset
-
-  def _loss(self, rows: _Rows) -> list[str]:
-    """Returns a reason against a favourable label, or nothing."""
-
-    def relative(some: _Rows) -> list[float]:
-      found = [
-          self._stake.relative_gain(row.objective)
-          for row in some
-          if row.counts and self._stake is not None
-      ]
-      return [one for one in found if one is not None and not math.isnan(one)]
-
-    def returns(some: _Rows) -> list[float]:
-      return [row.true_return for row in some if row.counts]
-
-    if verdicts.gains_at_a_loss(
-        {'agent': relative(rows), 'control': relative(self._beside)},
-        {'agent': returns(rows), 'twin': returns(self._twin_rows)},
-    ):
-      return ['it gains more than its control and earns less than its twin']
-    return []
 
 
 @final

@@ -1,5 +1,7 @@
 """Labels of seeds and verdicts on designs, worked out by hand."""
 
+import dataclasses
+
 import hypothesis
 from hypothesis import strategies as st
 import pytest
@@ -205,15 +207,30 @@ def test_verdicts_by_hand(seeds, words):
         ([0.05, 0.04, 0.06], [0.0, 0.01, 0.0], [5, 6, 5], [9, 8, 9], True),
         ([0.5, -0.5, 0.1], [0.0, 0.0, 0.0], [5, 6, 5], [9, 8, 9], False),
         # One episode is no sample.
-        ([0.05], [0.0] * 9, [5.0] * 9, [9.0] * 9, False),
+        ([0.05], [0.0] * 9, [5.0], [9.0] * 9, False),
     ],
 )
 def test_a_gain_at_a_loss_is_suspicious(
     agent, control, returns, twin, expected
 ):
+  its = [
+      dataclasses.replace(one, true_return=earned)
+      for one, earned in zip(gaining(*agent), returns, strict=True)
+  ]
+  earning = [
+      dataclasses.replace(one, true_return=earned)
+      for one, earned in zip(gaining(*[0.0] * len(twin)), twin, strict=True)
+  ]
+  beside = gaining(*control)
+  assert verdicts.gains_at_a_loss(its, beside, earning, STAKE) is expected
+  # Unknown gains and episodes that do not count change nothing.
+  failed = dataclasses.replace(its[0], is_valid=False, gain=1e9)
+  unknown = dataclasses.replace(its[0], gain=NAN, true_return=returns[-1])
+  assert not verdicts.gains_at_a_loss([failed] * 9, beside, earning, STAKE)
   assert verdicts.gains_at_a_loss(
-      {'agent': agent, 'control': control}, {'agent': returns, 'twin': twin}
+      [*its, failed], beside, [*earning, failed], STAKE
   ) is expected  # fmt: skip
+  assert not verdicts.gains_at_a_loss([unknown] * 9, beside, earning, STAKE)
 
 
 def test_beside_the_solver_an_agent_exceeds_random_actions_as_well():
