@@ -1,4 +1,4 @@
-"""Films of episodes: views of the world above a strip of figures.
+"""Films of episodes: a strip of figures above views of the world.
 
 Films are for people; cameras of agents are not used here.
 """
@@ -17,6 +17,7 @@ import numpy as np
 from PIL import Image
 from PIL import ImageDraw
 from PIL import ImageFont
+import tqdm
 
 from realab_suite import errors
 from realab_suite.engine import environment
@@ -116,7 +117,8 @@ class Film:
     self._env.thin_physics.refresh()
     picture = np.concatenate([c.render() for c in self._cameras], axis=1)
     strip = draw_strip(self._title, track, picture.shape[1])
-    self._file.write_frame(np.concatenate([picture, strip], axis=0))
+    # Players show their controls over the lower edge of a paused film.
+    self._file.write_frame(np.concatenate([strip, picture], axis=0))
 
   def close(self) -> None:
     """Completes the file."""
@@ -135,6 +137,9 @@ def all_views(
 ) -> Iterator[Callable[[Any, tracking.Track], None]]:
   """Opens one film per view; yields a function that adds a frame to each.
 
+  A progress bar shows the control steps, because an episode takes minutes
+  without a graphics card.
+
   Args:
     env: Environment to film.
     folder: Folder of the films, with names `name_view.mp4`.
@@ -148,9 +153,20 @@ def all_views(
         for view in WIDTHS
     ]
 
+    bar = stack.enter_context(
+        tqdm.tqdm(
+            desc=f'filming {name}',
+            total=env.max_steps,
+            disable=None,
+            unit='step',
+            leave=False,
+        )
+    )
+
     def add(physics: protocols.Physics, track: tracking.Track) -> None:
       for film in films:
         film.add(physics, track)
+      bar.update(track.num_steps - bar.n)
 
     yield add
 
