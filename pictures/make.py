@@ -11,23 +11,19 @@ agents. The same versions and results give the same pictures.
 from collections.abc import Sequence
 import pathlib
 
-from absl import flags
-
 from realab_suite import errors
 from realab_suite.experiments import requirements
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import input_flag
-from realab_suite.launchers.flags import output_flag
 
-flags.adopt_module_key_flags(input_flag)
-flags.adopt_module_key_flags(output_flag)
+flags.take(flags.INPUT, flags.OUTPUT)
 
 
 def main(argv: Sequence[str]) -> None:
   """Writes the pictures; existing ones are replaced."""
   del argv
-  folder = pathlib.Path(program.required(output_flag.OUTPUT))
+  folder = pathlib.Path(flags.required(flags.OUTPUT))
   problem = (
       requirements.missing('matplotlib', 'PIL') or renderers.choose_renderer()
   )
@@ -46,12 +42,10 @@ def main(argv: Sequence[str]) -> None:
   worlds.draw(folder / 'worlds')
   (folder / 'gallery').mkdir(exist_ok=True)
   reacher.draw(folder / 'gallery' / 'reacher.webp')
-  if input_flag.INPUT.value is None:
+  if flags.INPUT.value is None:
     program.say('tampering.gif is left out: --input names no sweep')
   else:
-    tampering.draw(
-        folder / 'tampering.gif', pathlib.Path(input_flag.INPUT.value)
-    )
+    tampering.draw(folder / 'tampering.gif', pathlib.Path(flags.INPUT.value))
   program.say(f'The pictures are in {folder}')
 
 

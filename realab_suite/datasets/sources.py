@@ -14,7 +14,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import traces
-from realab_suite.experiments import run_infos
+from realab_suite.experiments import evaluations
 from realab_suite.feedback import specs
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
@@ -106,12 +106,8 @@ def of_policy(
     with contextlib.ExitStack() as stack:
       env = stack.enter_context(contextlib.closing(world.load(design, seed)))
       actor = aiming.make_policy(policy, env, None, 0)
-      info = run_infos.of(
-          env,
-          (world.domain, world.task),
-          policy=policy,
-          run=name,
-          baseline=None,
+      info = evaluations.info_of(
+          env, world, policy=policy, run=name, baseline=None
       )
       batch = stack.enter_context(
           contextlib.closing(world.load_batch(design, num_episodes, seed))

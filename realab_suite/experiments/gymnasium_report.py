@@ -10,12 +10,11 @@ the design.
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 import contextlib
+import functools
 import importlib
-import pathlib
 from typing import Any, NamedTuple, final
 
 import gymnasium as gym
-import yaml
 
 from realab_suite import errors
 from realab_suite import suite
@@ -25,19 +24,17 @@ from realab_suite.config import integers
 from realab_suite.config import messages
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import gains
-from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import machines
+from realab_suite.experiments import evaluations
 from realab_suite.experiments import result_tables
-from realab_suite.experiments import run_infos
-from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
-from realab_suite.interop.gymnasium import evaluation
+from realab_suite.interop.gymnasium import evaluation as gymnasium_evaluation
+from realab_suite.interop.gymnasium import registration
 from realab_suite.interop.gymnasium import single
+from realab_suite.tasks import registry
 
 FIRST_SEED = 10_000
 """First seed of the evaluation episodes by default."""
@@ -62,7 +59,7 @@ class Report(NamedTuple):
 
 def write(
     name: str,
-    agents: Mapping[str, Sequence[evaluation.Policy]],
+    agents: Mapping[str, Sequence[gymnasium_evaluation.Policy]],
     output: str,
     *,
     num_episodes: int = 20,
@@ -80,7 +77,9 @@ def write(
 
   Args:
     name: Id of a world, such as
-      `'realab/UnlockDoor-near-InstantaneousReward-v3'`.
+      `'realab/UnlockDoor-near-InstantaneousReward-v3'`; or a task with its
+      domain, such as `'unlock_door.near'`, which needs no registered id. The
+      option `design` then names the design.
     agents: Policies by the name of the agent: one for each seed of training,
       equally many for each agent. Policy i acts in the episodes of seed
       `first_seed + i`. A verdict needs five.
@@ -98,168 +97,120 @@ def write(
     ResultsError: If the folder is not empty or cannot be created.
     SpecError: If an argument is invalid. Nothing has been written.
   """
-  job = _Job(name, agents, num_episodes, first_seed, wrap, baselines, options)
-  folder = scripted.make_folder(output)
-  stake = job.measure()
-  job.describe(folder)
-  with results.RowWriter(folder / 'episodes.jsonl') as writer:
-    lines = job.run(writer, stake)
-  text = '\n\n'.join(
-      [
-          f'# {name}',
-          f'Seeds: {job.num_seeds}; episodes per seed: {num_episodes}; means'
-          ' with 95 % intervals.',
-          result_tables.as_text(lines),
-      ]
-  )
-  storage.write_whole(folder / 'summary.md', f'{text}\n'.encode())
-  with storage.explained(folder):
-    result_tables.write_csv(lines, folder / 'summary.csv')
-  of_agents = {line.run: line.labels for line in lines if line.run in agents}
-  return Report(lines, of_agents, text)
-
-
-@final
-class _Job:
-  """Execution of an evaluation."""
-
-  def __init__(
-      self,
-      name: str,
-      agents: Mapping[str, Sequence[evaluation.Policy]],
-      num_episodes: int,
-      first_seed: int,
-      wrap: _Wrap,
-      baselines: Sequence[str] | None,
-      options: Mapping[str, Any],
-  ) -> None:
-    self._name = name
-    self._agents = agents
-    self._num_episodes = integers.check('num_episodes', num_episodes, 1)
-    self._first_seed = integers.check('first_seed', first_seed, 0)
-    self._wrap = wrap
-    self._options = dict(options)
-    self.num_seeds = _num_seeds(agents)
-    self._settings = {**_spec(name).kwargs, **self._options}
-    if 'domain_name' not in self._settings:
-      raise errors.SpecError(
-          f'name: {name!r}; allowed are ids of realab_suite.interop.gymnasium'
-      )
-    with self._open(first_seed) as env:
-      loaded = single.environment_of(env)
-      self._design = loaded.mechanism.design
-      self._world = self._world_of(loaded)
-      self._baselines = _baselines(baselines, self._world.solver, agents)
-      for policy in self._baselines:
-        aiming.make_policy(policy, loaded, None, 0)
-    self._judged = _judged_design(
-        self._design, self._settings.get('reward_register')
+  integers.check('num_episodes', num_episodes, 1)
+  integers.check('first_seed', first_seed, 0)
+  num_seeds = _num_seeds(agents)
+  make, settings = _maker(name, options)
+  with _opened(make, settings, first_seed, wrap) as env:
+    loaded = single.environment_of(env)
+    world, design = _world_of(loaded, settings), loaded.mechanism.design
+    chosen = _baselines(baselines, world.solver, agents)
+    for run in chosen:
+      aiming.make_policy(run, loaded, None, 0)
+  judged = _judged_design(design, settings.get('reward_register'))
+  objective = judged.objective
+  with evaluations.Evaluation(
+      world,
+      judged,
+      storage.new_folder(output),
+      lambda line: None,
+      control=chosen[0],
+  ) as evaluation:
+    evaluation.measure()
+    evaluation.describe(
+        {'design': design},
+        id=name,
+        objective=objective and objective.to_mapping(),
+        settings={k: v for k, v in settings.items() if k != 'design'},
+        agents={agent: len(of) for agent, of in agents.items()},
+        baselines=list(chosen),
+        num_episodes=num_episodes,
+        first_seed=first_seed,
     )
-
-  def _world_of(self, loaded: environment.Environment) -> worlds.World:
-    """Returns the world of the episodes."""
-    kwargs = dict(self._settings.get('task_kwargs') or {})
-    kwargs.pop('random', None)
-    senses = (self._settings.get('environment_kwargs') or {}).get('senses')
-    return worlds.World(
-        str(self._settings['domain_name']),
-        str(self._settings['task_name']),
-        loaded.max_steps or suite.MAX_STEPS,
-        kwargs,
-        None if senses is None else tuple(senses),
-    )
-
-  @contextlib.contextmanager
-  def _open(self, seed: int) -> Iterator[gym.Env]:
-    """Loads the world with a seed, wrapped for agents, and closes it."""
-    task_kwargs = {**(self._options.get('task_kwargs') or {}), 'random': seed}
-    options = {**self._options, 'task_kwargs': task_kwargs}
-    with contextlib.closing(gym.make(self._name, **options)) as env:
-      yield self._wrap(env)
-
-  def describe(self, folder: pathlib.Path) -> None:
-    """Writes the files that are needed to repeat the evaluation."""
-    text = yaml.safe_dump(self._design.to_mapping(), sort_keys=False)
-    storage.write_whole(folder / 'design.yaml', text.encode())
-    version, digest = suite.dynamics(self._world.domain, self._world.task)
-    settings = {k: v for k, v in self._settings.items() if k != 'design'}
-    objective = self._judged.objective
-    description = {
-        'id': self._name,
-        'objective': objective and objective.to_mapping(),
-        'settings': settings,
-        'agents': {name: len(of) for name, of in self._agents.items()},
-        'baselines': list(self._baselines),
-        'num_episodes': self._num_episodes,
-        'first_seed': self._first_seed,
-        'dynamics': {'version': version, 'digest': digest},
-        'versions': results.versions(),
-        'machine': machines.here(),
-    }
-    storage.write_json(folder / 'run.json', description)
-
-  def measure(self) -> stakes.Stakes | None:
-    """Returns the stakes of the objective that agents are judged on."""
-    return worlds.stakes_of(self._world, self._judged)
-
-  def run(
-      self, writer: results.RowWriter, stake: stakes.Stakes | None
-  ) -> list[result_tables.Line]:
-    """Runs all episodes, writes their rows, and returns the summaries.
-
-    Args:
-      writer: Writer of the rows.
-      stake: Result of `measure`.
-    """
-    rows: dict[str, list[results.EpisodeRow]] = {}
-    control = self._baselines[0]
-    for i in range(self.num_seeds):
-      with self._open(self._first_seed + i) as env:
+    for i in range(num_seeds):
+      with _opened(make, settings, first_seed + i, wrap) as env:
         loaded = single.environment_of(env)
-        for run, found in self._results(env, loaded, i):
-          info = run_infos.of(
-              loaded,
-              (self._world.domain, self._world.task),
-              policy=run,
-              run=run,
-              baseline=None if run == control else control,
-          )
-          row = results.row(info, found, stake)
-          writer.write(row)
-          rows.setdefault(run, []).append(row)
-    return result_tables.summarize(
-        rows,
-        control,
-        gains.consumed(self._judged),
-        stake,
-        worlds.why_no_stakes(self._world, self._judged),
-        self._agents,
-        worlds.obstacles_of(self._world, self._judged, stake),
+        for run in chosen:
+          info = evaluation.info(loaded, run, run)
+          for episode in range(num_episodes):
+            policy = aiming.make_policy(run, loaded, None, episode)
+            [found] = evaluate.evaluate(
+                loaded, policy, 1, first_episode=episode, objective=objective
+            )
+            evaluation.add(info, found)
+        for run, policies in agents.items():
+          info = evaluation.info(loaded, run, run)
+          for found in gymnasium_evaluation.evaluate(
+              env, policies[i], num_episodes, objective=objective
+          ):
+            evaluation.add(info, found)
+    title = (
+        f'# {name}\n\nSeeds: {num_seeds}; episodes per seed: {num_episodes};'
+        ' means with 95 % intervals.'
     )
+    lines, text = evaluation.summarize(title, agents)
+  labels = {line.run: line.labels for line in lines if line.run in agents}
+  return Report(lines, labels, f'{title}\n\n{text}')
 
-  def _results(
-      self, env: gym.Env, loaded: environment.Environment, i: int
-  ) -> Iterator[tuple[str, evaluate.EpisodeResult]]:
-    """Yields the name of a run and the result of an episode, for one seed."""
-    for name in self._baselines:
-      for episode in range(self._num_episodes):
-        policy = aiming.make_policy(name, loaded, None, episode)
-        [found] = evaluate.evaluate(
-            loaded,
-            policy,
-            1,
-            first_episode=episode,
-            objective=self._judged.objective,
-        )
-        yield name, found
-    for name, policies in self._agents.items():
-      for found in evaluation.evaluate(
-          env,
-          policies[i],
-          self._num_episodes,
-          objective=self._judged.objective,
-      ):
-        yield name, found
+
+def _maker(
+    name: str, options: Mapping[str, Any]
+) -> tuple[Callable[..., gym.Env], dict[str, Any]]:
+  """Returns the function that loads a world, and all of its arguments.
+
+  Args:
+    name: Id of a world, which may begin with its module; or a task with its
+      domain.
+    options: Arguments of the caller.
+
+  Raises:
+    SpecError: If it is the id of another package.
+  """
+  domain, dot, task = name.partition('.')
+  if dot and (domain, task) in registry.names():
+    named = {'domain_name': domain, 'task_name': task}
+    return registration.make, {**named, **options}
+  module, _, registered = name.rpartition(':')
+  if module:
+    importlib.import_module(module)
+  settings = {**gym.spec(registered).kwargs, **options}
+  if 'domain_name' not in settings:
+    raise errors.SpecError(
+        f'name: {name!r}; allowed are ids of realab_suite.interop.gymnasium,'
+        ' and tasks such as unlock_door.near'
+    )
+  return functools.partial(gym.make, name), settings
+
+
+@contextlib.contextmanager
+def _opened(
+    make: Callable[..., gym.Env],
+    settings: Mapping[str, Any],
+    seed: int,
+    wrap: _Wrap,
+) -> Iterator[gym.Env]:
+  """Loads a world with a seed, wrapped for agents, and closes it."""
+  task_kwargs = {**(settings.get('task_kwargs') or {}), 'random': seed}
+  with contextlib.closing(
+      make(**{**settings, 'task_kwargs': task_kwargs})
+  ) as env:
+    yield wrap(env)
+
+
+def _world_of(
+    loaded: environment.Environment, settings: Mapping[str, Any]
+) -> worlds.World:
+  """Returns the world of the episodes."""
+  kwargs = dict(settings.get('task_kwargs') or {})
+  kwargs.pop('random', None)
+  senses = (settings.get('environment_kwargs') or {}).get('senses')
+  return worlds.World(
+      str(settings['domain_name']),
+      str(settings['task_name']),
+      loaded.max_steps or suite.MAX_STEPS,
+      kwargs,
+      None if senses is None else tuple(senses),
+  )
 
 
 def _judged_design(
@@ -278,15 +229,9 @@ def _judged_design(
   return specs.load({**design.to_mapping(), 'learner': learner})
 
 
-def _spec(name: str) -> Any:
-  """Returns the registered spec of an id, which may begin with its module."""
-  module, _, registered = name.rpartition(':')
-  if module:
-    importlib.import_module(module)
-  return gym.spec(registered)
-
-
-def _num_seeds(agents: Mapping[str, Sequence[evaluation.Policy]]) -> int:
+def _num_seeds(
+    agents: Mapping[str, Sequence[gymnasium_evaluation.Policy]],
+) -> int:
   """Returns the number of policies of each agent.
 
   Raises:

@@ -4,11 +4,11 @@ The person acts by keyboard and sees the view of the avatar, as well as the
 observed and the true return. The actions are those of `dmlab_like`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import contextlib
 import dataclasses
+import functools
 import math
-import pathlib
 import time
 from typing import Any, final
 
@@ -17,13 +17,9 @@ from realab_suite import worlds
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import gains
-from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
-from realab_suite.experiments import machines
+from realab_suite.experiments import evaluations
 from realab_suite.experiments import result_tables
-from realab_suite.experiments import run_infos
-from realab_suite.experiments import scripted
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
@@ -44,25 +40,19 @@ class Settings:
   """Settings of episodes to play.
 
   Attributes:
-    domain: Domain of the task.
-    task: Name of the task in its domain.
+    world: World of the episodes.
     design: The design.
     seed: Seed of the episodes.
     num_episodes: Number of episodes.
-    max_steps: Maximum length of an episode, in control steps.
     rate: Largest number of control steps per second.
-    task_kwargs: Arguments of the task, without the seed.
     output: New folder for the results, or `None`.
   """
 
-  domain: str
-  task: str
+  world: worlds.World
   design: specs.DesignSpec
   seed: int
   num_episodes: int
-  max_steps: int
   rate: float
-  task_kwargs: Mapping[str, Any]
   output: str | None
 
 
@@ -85,16 +75,11 @@ def play(
   Raises:
     RealabError: If the settings are invalid, before anything is written.
   """
-  world = worlds.World(
-      settings.domain,
-      settings.task,
-      settings.max_steps,
-      settings.task_kwargs,
-  )
+  world, design = settings.world, settings.design
   control = world.solver or stakes.RANDOM
   with contextlib.ExitStack() as stack:
     env = stack.enter_context(
-        contextlib.closing(world.load(settings.design, settings.seed))
+        contextlib.closing(world.load(design, settings.seed))
     )
     session = _Session(env, server, settings)
     stack.callback(session.close)
@@ -102,62 +87,35 @@ def play(
     baseline = policies.make(control)
     for policy in (keyboard, baseline):
       actors.make(policy, env)  # Raises errors before anything is written.
-    why_not_judged = worlds.why_no_stakes(world, settings.design)
-    if not why_not_judged:
-      say('Measuring the stakes of the design; the page begins afterwards')
+    folder = None
     if settings.output is not None:
-      folder = scripted.make_folder(settings.output)
-    stake = worlds.stakes_of(world, settings.design)
-    writer = None
-    if settings.output is not None:
-      _describe(settings, folder)
-      path = folder / 'episodes.jsonl'
-      writer = stack.enter_context(results.RowWriter(path))
-    rows: dict[str, list[results.EpisodeRow]] = {PERSON: [], control: []}
-    for name, policy in ((PERSON, keyboard), (control, baseline)):
+      folder = storage.new_folder(settings.output)
+    evaluation = stack.enter_context(
+        evaluations.Evaluation(world, design, folder, say, control=control)
+    )
+    evaluation.measure()
+    described = dataclasses.asdict(settings)
+    described['design'] = design.to_mapping()
+    evaluation.describe({}, **described)
+    recorder = tracking.Tracker(env, session.on_step)
+    for name, policy, sinks in (
+        (PERSON, keyboard, [recorder]),
+        (control, baseline, []),
+    ):
       if name == control:
         server.send({'type': 'working', 'text': 'The control acts'})
-      info = run_infos.of(
+      info = evaluation.info(env, name, name)
+      evaluate.evaluate(
           env,
-          (settings.domain, settings.task),
-          policy=name,
-          run=name,
-          baseline=None if name == control else control,
+          policy,
+          settings.num_episodes,
+          sinks=sinks,
+          on_episode=functools.partial(evaluation.add, info),
       )
-      for episode in range(settings.num_episodes):
-        sinks = []
-        if name == PERSON:
-          sinks.append(tracking.Tracker(env, session.on_step))
-        [result] = evaluate.evaluate(
-            env, policy, 1, first_episode=episode, sinks=sinks
-        )
-        row = results.row(info, result, stake)
-        rows[name].append(row)
-        if writer is not None:
-          writer.write(row)
-    lines = result_tables.summarize(
-        rows,
-        control,
-        gains.consumed(settings.design),
-        stake,
-        why_not_judged,
-        obstacles=worlds.obstacles_of(world, settings.design, stake),
-    )
-    text = result_tables.as_text(lines)
+    lines, text = evaluation.summarize(f'# {session.title}')
     server.send({'type': 'summary', 'text': text})
     say(f'{text}\n\n{session.speed()}')
-    if settings.output is not None:
-      storage.write_whole(folder / 'summary.md', f'{text}\n'.encode())
   return lines
-
-
-def _describe(settings: Settings, folder: pathlib.Path) -> None:
-  """Writes what is needed to repeat the episodes of the control."""
-  described = dataclasses.asdict(settings)
-  described['design'] = settings.design.to_mapping()
-  described['machine'] = machines.here()
-  described['versions'] = results.versions()
-  storage.write_json(folder / 'run.json', described)
 
 
 def state(
@@ -216,7 +174,8 @@ class _Session:
     self._keys = keyboards.Keys()
     self._action_set = env.action_set
     self._period = 1.0 / settings.rate
-    self._title = f'{settings.domain}.{settings.task}, {settings.design.name}'
+    world = settings.world
+    self.title = f'{world.domain}.{world.task}, {settings.design.name}'
     self._is_running = False
     self._deadline = 0.0
     self._action: str | None = None
@@ -250,7 +209,7 @@ class _Session:
   def _show(self) -> None:
     """Shows the present state."""
     if self._track is not None:
-      self._server.send(state(self._track, self._title, self._action))
+      self._server.send(state(self._track, self.title, self._action))
       self._server.send_picture(0, self._view.draw())
 
   def speed(self) -> str:

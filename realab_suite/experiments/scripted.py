@@ -13,22 +13,17 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 import tqdm
-import yaml
 
 from realab_suite import errors
 from realab_suite import policies
-from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.audit import aiming
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
-from realab_suite.experiments import machines
+from realab_suite.experiments import evaluations
 from realab_suite.experiments import result_tables
-from realab_suite.experiments import run_infos
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
@@ -40,8 +35,7 @@ class Settings:
   """Settings of a scripted comparison.
 
   Attributes:
-    domain: Domain of the task.
-    task: Name of the task in its domain.
+    world: World of the episodes.
     design: Agent design, by name or path.
     overrides: Dotted overrides of the design.
     policies: Names of policies, each of which acts in every channel.
@@ -51,14 +45,10 @@ class Settings:
       register.
     seeds: Seeds of the episodes.
     num_episodes: Number of episodes per seed.
-    max_steps: Maximum length of an episode, in control steps.
     output: New folder for the results.
-    task_kwargs: Arguments of the task, without the seed.
-    senses: Names of the agent's senses, or `None` for those of the task.
   """
 
-  domain: str
-  task: str
+  world: worlds.World
   design: str
   overrides: tuple[str, ...]
   policies: tuple[str, ...]
@@ -67,10 +57,7 @@ class Settings:
   target: str | None
   seeds: tuple[int, ...]
   num_episodes: int
-  max_steps: int
   output: str
-  task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-  senses: tuple[str, ...] | None = None
 
 
 OnStep = Callable[[Any, tracking.Track], None]
@@ -138,33 +125,33 @@ def run(
     RealabError: If the settings are invalid, before anything is written.
   """
   runs = plan(settings)
-  baseline = _baseline(settings, runs)
+  control = _control(settings, runs)
   _check_runs(settings, runs)
-  folder = make_folder(settings.output)
-  design = runs[0].design
-  world = _world(settings)
-  why_not_judged = worlds.why_no_stakes(world, design)
-  if not why_not_judged:
-    say('Measuring the stakes of the design')
-  stake = worlds.stakes_of(world, design)
-  _describe(settings, runs, baseline, folder, pictures)
-  job = _Job(settings, baseline, stake, folder, say, pictures)
-  job.run(runs)
-  if pictures.draw is not None:
-    pictures.draw(job.tracks, folder / 'plots')
-  lines = result_tables.summarize(
-      job.rows,
-      baseline,
-      gains.consumed(design),
-      stake,
-      why_not_judged,
-      obstacles=worlds.obstacles_of(world, design, stake),
-  )
-  text = result_tables.as_text(lines)
-  summary = f'{_title(settings)}\n\n{text}\n'
-  storage.write_whole(folder / 'summary.md', summary.encode())
-  with storage.explained(folder):
-    result_tables.write_csv(lines, folder / 'summary.csv')
+  folder = storage.new_folder(settings.output)
+  world = settings.world
+  with evaluations.Evaluation(
+      world, runs[0].design, folder, say, control=control
+  ) as evaluation:
+    evaluation.measure()
+    evaluation.describe(
+        {f'design_{run.design.channel}': run.design for run in runs},
+        settings={
+            **dataclasses.asdict(settings),
+            'plots': pictures.draw is not None,
+            'videos': pictures.film is not None,
+        },
+        runs=[run.name for run in runs],
+        baseline=control,
+    )
+    job = _Job(settings, evaluation, folder, say, pictures)
+    job.run(runs)
+    if pictures.draw is not None:
+      pictures.draw(job.tracks, folder / 'plots')
+    lines, text = evaluation.summarize(
+        f'# {world.domain}.{world.task}, design {settings.design}\n\n'
+        f'{len(settings.seeds)} seeds of {settings.num_episodes} episodes;'
+        ' means with 95 % intervals.'
+    )
   say(f'\n{text}\n\nResults are in {folder}')
   return lines
 
@@ -212,10 +199,10 @@ def _designs(settings: Settings) -> list[specs.DesignSpec]:
   ]
 
 
-def _baseline(settings: Settings, runs: Sequence[Run]) -> str:
+def _control(settings: Settings, runs: Sequence[Run]) -> str:
   names = [run.name for run in runs]
   if settings.baseline is None:
-    solver = _world(settings).solver
+    solver = settings.world.solver
     return solver if solver in names else names[0]
   if settings.baseline not in names:
     raise errors.SpecError(
@@ -224,74 +211,14 @@ def _baseline(settings: Settings, runs: Sequence[Run]) -> str:
   return settings.baseline
 
 
-def _world(settings: Settings) -> worlds.World:
-  return worlds.World(
-      settings.domain,
-      settings.task,
-      settings.max_steps,
-      settings.task_kwargs,
-      settings.senses,
-  )
-
-
 def _check_runs(settings: Settings, runs: Sequence[Run]) -> None:
   """Loads each run once, to raise errors before anything is written."""
   for run in runs:
     with contextlib.closing(
-        _world(settings).load(run.design, settings.seeds[0])
+        settings.world.load(run.design, settings.seeds[0])
     ) as env:
       policy = aiming.make_policy(run.policy, env, settings.target, 0)
       actors.make(policy, env)
-
-
-def make_folder(output: str) -> pathlib.Path:
-  """Creates a folder for results, or accepts an empty one.
-
-  Raises:
-    ResultsError: If the folder is not empty or cannot be created.
-  """
-  folder = pathlib.Path(output)
-  try:
-    folder.mkdir(parents=True, exist_ok=True)
-    is_empty = not any(folder.iterdir())
-  except OSError as error:
-    raise errors.ResultsError(
-        f'cannot create folder {output}: {error.strerror}'
-    ) from error
-  if not is_empty:
-    raise errors.ResultsError(
-        f'folder {output} is not empty, and results are never overwritten; name'
-        ' another folder'
-    )
-  return folder
-
-
-def _describe(
-    settings: Settings,
-    runs: Sequence[Run],
-    baseline: str,
-    folder: pathlib.Path,
-    pictures: Pictures,
-) -> None:
-  """Writes the files that are needed to repeat the comparison."""
-  for design in {run.design.channel: run.design for run in runs}.values():
-    text = yaml.safe_dump(design.to_mapping(), sort_keys=False)
-    path = folder / f'design_{design.channel}.yaml'
-    storage.write_whole(path, text.encode())
-  version, digest = suite.dynamics(settings.domain, settings.task)
-  description = {
-      'settings': {
-          **dataclasses.asdict(settings),
-          'plots': pictures.draw is not None,
-          'videos': pictures.film is not None,
-      },
-      'runs': [run.name for run in runs],
-      'baseline': baseline,
-      'dynamics': {'version': version, 'digest': digest},
-      'versions': results.versions(),
-      'machine': machines.here(),
-  }
-  storage.write_json(folder / 'run.json', description)
 
 
 @final
@@ -301,19 +228,16 @@ class _Job:
   def __init__(
       self,
       settings: Settings,
-      baseline: str,
-      stake: stakes.Stakes | None,
+      evaluation: evaluations.Evaluation,
       folder: pathlib.Path,
       say: Callable[[str], None],
       pictures: Pictures,
   ) -> None:
     self._settings = settings
-    self._baseline = baseline
-    self._stake = stake
+    self._evaluation = evaluation
     self._folder = folder
     self._say = say
     self._pictures = pictures
-    self.rows: dict[str, list[results.EpisodeRow]] = {}
     # The first episode of each run.
     self.tracks: dict[str, tracking.Track] = {}
 
@@ -322,33 +246,27 @@ class _Job:
     settings = self._settings
     total = len(runs) * len(settings.seeds) * settings.num_episodes
     # Without a terminal, a line per run replaces the progress bar.
-    bar = tqdm.tqdm(total=total, disable=None, unit='episode', leave=False)
-    with bar, results.RowWriter(self._folder / 'episodes.jsonl') as writer:
+    with tqdm.tqdm(
+        total=total, disable=None, unit='episode', leave=False
+    ) as bar:
       for run in runs:
         bar.set_description(run.name)
-        self.rows[run.name] = []
-        for row in self._episodes(run):
-          writer.write(row)
-          self.rows[run.name].append(row)
-          bar.set_postfix_str(_means(self.rows[run.name]), refresh=False)
+        for means in self._episodes(run):
+          bar.set_postfix_str(means, refresh=False)
           bar.update()
         if bar.disable:
-          self._say(f'{run.name}: {_means(self.rows[run.name])}')
+          self._say(f'{run.name}: {means}')
 
-  def _episodes(self, run: Run) -> Iterator[results.EpisodeRow]:
+  def _episodes(self, run: Run) -> Iterator[str]:
+    """Runs the episodes of a run, and yields the mean returns so far."""
     for seed in self._settings.seeds:
       with contextlib.closing(
-          _world(self._settings).load(run.design, seed)
+          self._settings.world.load(run.design, seed)
       ) as env:
-        info = run_infos.of(
-            env,
-            (self._settings.domain, self._settings.task),
-            policy=run.policy,
-            run=run.name,
-            baseline=None if run.name == self._baseline else self._baseline,
-        )
+        info = self._evaluation.info(env, run.name, run.policy)
         for episode in range(self._settings.num_episodes):
-          yield results.row(info, self._episode(run, env, episode), self._stake)
+          self._evaluation.add(info, self._episode(run, env, episode))
+          yield _means(self._evaluation.rows[run.name])
 
   def _episode(
       self, run: Run, env: environment.Environment, episode: int
@@ -383,11 +301,3 @@ def _means(rows: Sequence[results.EpisodeRow]) -> str:
   true_return = np.mean([row.true_return for row in rows])
   observed = np.mean([row.observed_return for row in rows])
   return f'true return {true_return:.1f}, observed {observed:.1f}'
-
-
-def _title(settings: Settings) -> str:
-  return (
-      f'# {settings.domain}.{settings.task}, design {settings.design}\n\n'
-      f'{len(settings.seeds)} seeds of {settings.num_episodes} episodes; means'
-      ' with 95 % intervals.'
-  )

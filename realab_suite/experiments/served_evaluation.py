@@ -1,6 +1,6 @@
 """Evaluation of an agent in another process, which the world is served to."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 import contextlib
 import ctypes
 import dataclasses
@@ -16,15 +16,10 @@ from absl import logging
 
 from realab_suite import errors
 from realab_suite import worlds
-from realab_suite.engine import environment
 from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import gains
 from realab_suite.evaluation import results
-from realab_suite.evaluation import stakes
-from realab_suite.experiments import result_tables
-from realab_suite.experiments import run_infos
-from realab_suite.experiments import scripted
+from realab_suite.experiments import evaluations
 from realab_suite.experiments import served_run
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
@@ -52,15 +47,13 @@ class Settings:
   """Settings of a served run.
 
   Attributes:
-    domain: Domain of the task.
-    task: Name of the task in its domain.
+    world: World of the episodes.
     design: Agent design, by name or path.
     overrides: Dotted overrides of the design.
     seed: Seed of the episodes.
-    max_steps: Maximum length of an episode, in control steps.
     repeat: Path of the record of a run to repeat, or `None` for a new run with
-      a new salt. The task, its arguments, design, seed, maximum length and
-      senses in the record replace those here; `overrides` apply to its design.
+      a new salt. The world, the design and the seed in the record replace those
+      here; `overrides` apply to its design.
     num_episodes: Number of episodes, including invalid ones.
     name: Name of the agent in the results.
     address: Address to listen on, or `None` for a socket in a new folder.
@@ -71,16 +64,12 @@ class Settings:
     agent_folder: Working directory of the agent, or `None` for a new folder.
     agent_user: User that the agent runs as, or `None` for that of this process.
     output: New folder for the results.
-    task_kwargs: Arguments of the task, without the seed.
-    senses: Names of the agent's senses, or `None` for those of the task.
   """
 
-  domain: str
-  task: str
+  world: worlds.World
   design: str
   overrides: tuple[str, ...]
   seed: int
-  max_steps: int
   repeat: str | None
   num_episodes: int
   name: str
@@ -91,8 +80,6 @@ class Settings:
   agent_folder: str | None
   agent_user: str | None
   output: str
-  task_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-  senses: tuple[str, ...] | None = None
 
 
 def serve(settings: Settings, say: Callable[[str], None]) -> None:
@@ -118,7 +105,8 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
     logging.warning(_WARNING, results.SERVED)
   with contextlib.ExitStack() as stack:
     settings, design, seed = _chosen(settings)
-    env = stack.enter_context(contextlib.closing(_load(settings, design, seed)))
+    world = settings.world
+    env = stack.enter_context(contextlib.closing(world.load(design, seed)))
     env.mechanism.guard_providers(lambda: deadline(settings.provider_seconds))
     address = settings.address
     if address is None:
@@ -126,27 +114,37 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
       stack.callback(shutil.rmtree, folder, ignore_errors=True)
       address = f'unix:{folder}/socket'
     output = _make_private_folder(settings.output)
+    described = dataclasses.asdict(settings)
     served_run.write(
         output,
-        dataclasses.asdict(settings),
+        {**described.pop('world'), **described},
         design.to_mapping(),
         seed.salt,
         results.versions(),
     )
-    writer = stack.enter_context(results.RowWriter(output / 'episodes.jsonl'))
-    info = run_infos.of(
-        env,
-        (settings.domain, settings.task),
-        policy=settings.name,
-        run=settings.name,
-        baseline=None,
-        salt_digest=seed.salt_digest,
+    evaluation = stack.enter_context(
+        evaluations.Evaluation(
+            world, design, output, say, control=None, why_no_control=_NO_CONTROL
+        )
     )
-    evaluator = _Evaluator(info, writer, say)
-    world = served_world.ServedWorld(
-        env, address, settings.num_episodes, evaluator.write
+    info = evaluation.info(
+        env, settings.name, settings.name, salt_digest=seed.salt_digest
     )
-    listener = agent_server.Server(world, address, settings.idle_seconds, owner)
+
+    def add(result: evaluate.EpisodeResult, isolation: str) -> None:
+      of_episode = info.model_copy(update={'isolation': isolation})
+      evaluation.add(of_episode, result)
+      say(
+          f'episode {result.episode}: {result.end.value}, true return'
+          f' {result.true_return:.1f}, observed {result.observed_return:.1f}'
+      )
+
+    listener = agent_server.Server(
+        served_world.ServedWorld(env, address, settings.num_episodes, add),
+        address,
+        settings.idle_seconds,
+        owner,
+    )
     agent = None
     with _removed_on_error(output):
       listener.start()
@@ -163,22 +161,16 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
             on_exit=listener.stop,
         )
         stack.callback(agent.stop)
-      say(f'serving {settings.domain}.{settings.task} at {listener.address}')
+      say(f'serving {world.domain}.{world.task} at {listener.address}')
       signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
       # Takes half a minute, in which the agent starts and its requests wait.
-      why_not_judged = worlds.why_no_stakes(_world(settings), design)
-      evaluator.stake = worlds.stakes_of(_world(settings), design)
+      evaluation.measure()
     listener.run()
-    _check_all_written(len(evaluator.rows), settings, agent, output)
-    if any(row.counts for row in evaluator.rows):
-      lines = result_tables.summarize(
-          {settings.name: evaluator.rows},
-          None,
-          gains.consumed(design),
-          evaluator.stake,
-          why_not_judged or _NO_CONTROL,
-      )
-      say(result_tables.as_text(lines))
+    rows = evaluation.rows.get(settings.name, [])
+    _check_all_written(len(rows), settings, agent, output)
+    if any(row.counts for row in rows):
+      _, text = evaluation.summarize(f'# {world.domain}.{world.task}')
+      say(text)
     say(f'Results are in {settings.output}')
 
 
@@ -233,34 +225,6 @@ def deadline(seconds: float) -> Iterator[None]:
     signal.signal(signal.SIGALRM, old_handler)
 
 
-@final
-class _Evaluator:
-  """Writer of the rows of episodes."""
-
-  def __init__(
-      self,
-      info: results.RunInfo,
-      writer: results.RowWriter,
-      say: Callable[[str], None],
-  ) -> None:
-    self._info = info
-    self._writer = writer
-    self._say = say
-    self.stake: stakes.Stakes | None = None
-    self.rows: list[results.EpisodeRow] = []
-
-  def write(self, result: evaluate.EpisodeResult, isolation: str) -> None:
-    """Writes the row of an episode."""
-    info = self._info.model_copy(update={'isolation': isolation})
-    row = results.row(info, result, self.stake)
-    self._writer.write(row)
-    self.rows.append(row)
-    self._say(
-        f'episode {result.episode}: {result.end.value}, true return'
-        f' {result.true_return:.1f}, observed {result.observed_return:.1f}'
-    )
-
-
 def _chosen(
     settings: Settings,
 ) -> tuple[Settings, specs.DesignSpec, seeding.SaltedSeed]:
@@ -278,25 +242,14 @@ def _chosen(
         storage.difference(record.versions, here, 'versions'),
     )
   design = specs.load(record.design, settings.overrides)
-  world = record.settings.model_dump()
-  world['overrides'] = (*world['overrides'], *settings.overrides)
-  return dataclasses.replace(settings, **world), design, record.seed
-
-
-def _load(
-    settings: Settings, design: specs.DesignSpec, seed: seeding.SaltedSeed
-) -> environment.Environment:
-  return _world(settings).load(design, seed)
-
-
-def _world(settings: Settings) -> worlds.World:
-  return worlds.World(
-      settings.domain,
-      settings.task,
-      settings.max_steps,
-      settings.task_kwargs,
-      settings.senses,
+  chosen = dataclasses.replace(
+      settings,
+      world=record.settings.world,
+      design=record.settings.design,
+      overrides=(*record.settings.overrides, *settings.overrides),
+      seed=record.settings.seed,
   )
+  return chosen, design, record.seed
 
 
 def _make_private_folder(output: str) -> pathlib.Path:
@@ -306,7 +259,7 @@ def _make_private_folder(output: str) -> pathlib.Path:
     ResultsError: If it cannot be created or is not empty.
     SpecError: If it belongs to another user, who could replace its contents.
   """
-  folder = scripted.make_folder(output)
+  folder = storage.new_folder(output)
   with storage.explained(folder):
     owner = folder.stat().st_uid
     if owner != os.geteuid():

@@ -13,6 +13,7 @@ from typing import Any, final
 import pydantic
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.config import validation
 from realab_suite.engine import seeding
 from realab_suite.experiments import storage
@@ -49,6 +50,14 @@ class EpisodeSettings(pydantic.BaseModel):
   max_steps: int = pydantic.Field(ge=1)
   task_kwargs: dict[str, Any] = pydantic.Field(default_factory=dict)
   senses: list[str] | None = None
+
+  @property
+  def world(self) -> worlds.World:
+    """World of the episodes."""
+    senses = None if self.senses is None else tuple(self.senses)
+    return worlds.World(
+        self.domain, self.task, self.max_steps, self.task_kwargs, senses
+    )
 
 
 @final

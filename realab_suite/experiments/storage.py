@@ -52,6 +52,24 @@ def explained(path: str | os.PathLike[str]) -> Iterator[None]:
     ) from error
 
 
+def new_folder(output: str) -> pathlib.Path:
+  """Creates a folder for results, or accepts an empty one.
+
+  Raises:
+    ResultsError: If the folder is not empty or cannot be created.
+  """
+  folder = pathlib.Path(output)
+  with explained(folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    is_empty = not any(folder.iterdir())
+  if not is_empty:
+    raise errors.ResultsError(
+        f'folder {output} is not empty, and results are never overwritten; name'
+        ' another folder'
+    )
+  return folder
+
+
 def lock(folder: pathlib.Path) -> int:
   """Locks a folder, and returns the descriptor whose closing unlocks it.
 

@@ -5,7 +5,7 @@ are logged as a dataset, which the source `recorded` replays.
 """
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 import json
 import pathlib
 import time
@@ -14,13 +14,11 @@ from typing import Any, final
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.engine import environment
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import gains
-from realab_suite.evaluation import results
-from realab_suite.experiments import result_tables
-from realab_suite.experiments import run_infos
+from realab_suite.experiments import evaluations
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
 from realab_suite.feedback.providers import answer_sources
@@ -303,51 +301,44 @@ class Supervision:
 
 def run(
     supervision: Supervision,
-    world: tuple[str, str],
+    world: worlds.World,
     name: str,
     policy: Any,
     num_episodes: int,
-) -> str:
-  """Runs supervised episodes, and writes their rows.
+    say: Callable[[str], None],
+) -> None:
+  """Runs supervised episodes, and writes their rows and their summary.
 
   Args:
     supervision: Supervision of the environment.
-    world: Names of the domain and the task of the environment.
+    world: World of the environment.
     name: Name of the policy.
     policy: Policy of the agent.
     num_episodes: Number of episodes.
-
-  Returns:
-    Summary for the person, in Markdown.
+    say: Called with messages for the user.
 
   Raises:
     ResultsError: If the rows cannot be written, or all episodes have failed.
   """
-  design = supervision.env.mechanism.design
-  info = run_infos.of(
-      supervision.env, world, policy=name, run=_RUN, baseline=None
-  )
-  rows = []
-  with results.RowWriter(supervision.folder / 'episodes.jsonl') as writer:
+  env, folder = supervision.env, supervision.folder
+  design = env.mechanism.design
+  with evaluations.Evaluation(
+      world, design, folder, say, control=None, why_no_control=_NO_CONTROL
+  ) as evaluation:
+    evaluation.describe({'design': design}, policy=name, seed=env.seed)
+    info = evaluation.info(env, _RUN, name)
     for episode in range(num_episodes):
-      rows.append(results.row(info, supervision.run(policy, episode)))
-      writer.write(rows[-1])
-  lines = result_tables.summarize(
-      {_RUN: rows},
-      None,
-      gains.consumed(design),
-      None,
-      design.why_not_judged or _NO_CONTROL,
-  )
+      evaluation.add(info, supervision.run(policy, episode))
+    _, summary = evaluation.summarize(f'# {world.domain}.{world.task}')
   text = '\n\n'.join(
       (
-          result_tables.as_text(lines),
+          summary,
           delays_text(supervision.delays),
-          f'The answers are in {supervision.folder / ANSWERS}',
+          f'The answers are in {folder / ANSWERS}',
       )
   )
   supervision.finish(text)
-  return text
+  say(text)
 
 
 def delays_text(delays: list[float]) -> str:

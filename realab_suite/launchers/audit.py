@@ -18,22 +18,15 @@ import pathlib
 import shlex
 from typing import Any
 
-from absl import flags
+from absl import flags as absl_flags
 import tqdm
 
-from realab_suite.experiments import requirements
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import output_flag
-from realab_suite.launchers.flags import seed_flag
-from realab_suite.launchers.flags import world_flags
 
-flags.adopt_module_key_flags(world_flags)
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(output_flag)
-flags.adopt_module_key_flags(seed_flag)
-_BUDGET = flags.DEFINE_integer(
+flags.take(*flags.WORLD, flags.TARGET, flags.IMPORT, flags.OUTPUT, flags.SEED)
+_BUDGET = absl_flags.DEFINE_integer(
     'budget',
     None,
     'Largest number of episodes of the search. Default: 1200, or more if the'
@@ -41,7 +34,9 @@ _BUDGET = flags.DEFINE_integer(
     lower_bound=10,
     upper_bound=1_000_000,
 )
-_FILM = flags.DEFINE_boolean('film', True, 'Films an exploit that was found.')
+_FILM = absl_flags.DEFINE_boolean(
+    'film', True, 'Films an exploit that was found.'
+)
 
 REPORT = 'audit.json'
 _FILM_NAME = 'exploit.mp4'
@@ -60,33 +55,24 @@ def main(argv: Sequence[str]) -> int:
   if not has_film:
     renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite import worlds
   from realab_suite.audit import audits
   from realab_suite.audit import findings
   from realab_suite.evaluation import results
-  from realab_suite.experiments import scripted
   from realab_suite.experiments import storage
-  from realab_suite.feedback import specs
 
-  imports_flag.load()
-  world = worlds.World(
-      *world_flags.world(),
-      world_flags.MAX_STEPS.value,
-      world_flags.task_kwargs(),
-      world_flags.senses(),
-  )
+  flags.load_imports()
   settings = audits.Settings(
-      world=world,
-      design=specs.load(world_flags.DESIGN.value, world_flags.SET.value),
-      seed=seed_flag.SEED.value,
+      world=flags.world(),
+      design=flags.design(),
+      seed=flags.SEED.value,
       budget=_BUDGET.value,
-      target=world_flags.TARGET.value,
+      target=flags.TARGET.value,
   )
   with _progress() as on_progress:
     auditor = audits.Auditor(settings, on_progress)
-    output, folder = output_flag.OUTPUT.value, None
+    output, folder = flags.OUTPUT.value, None
     if output is not None:
-      folder = scripted.make_folder(output)
+      folder = storage.new_folder(output)
     found = auditor.run()
   program.say(findings.words(found, _command()))
   if folder is not None:
@@ -98,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
     content = {
         'kind': 'audit',
         'schema': 2,
-        'world': dataclasses.asdict(world),
+        'world': dataclasses.asdict(settings.world),
         'design': settings.design.to_mapping(),
         'seed': settings.seed,
         'target': settings.target,
@@ -117,12 +103,9 @@ def main(argv: Sequence[str]) -> int:
 
 def _has_film() -> bool:
   """Returns True if a film is wanted and possible."""
-  if not (_FILM.value and output_flag.OUTPUT.value):
+  if not (_FILM.value and flags.OUTPUT.value):
     return False
-  problem = (
-      requirements.missing('imageio', 'av', 'PIL')
-      or renderers.choose_renderer()
-  )
+  problem = renderers.why_no_film()
   if problem is not None:
     program.say(f'the film is skipped: {problem}')
   return problem is None
@@ -146,8 +129,8 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
 def _command() -> str:
   """Returns a command that repeats the audit."""
   words = ['python', '-m', 'realab_suite.launchers.audit']
-  for name in flags.FLAGS:
-    flag = flags.FLAGS[name]
+  for name in absl_flags.FLAGS:
+    flag = absl_flags.FLAGS[name]
     if flag.present and name not in _NOT_REPEATED:
       words += flag.serialize().splitlines()
   return shlex.join(words)

@@ -13,31 +13,25 @@ all of them.
 
 from collections.abc import Sequence
 
-from absl import flags
+from absl import flags as absl_flags
 
 from realab_suite.experiments import requirements
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import episodes_flag
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import output_flag
-from realab_suite.launchers.flags import scripted_flags
-from realab_suite.launchers.flags import world_flags
 
-flags.adopt_module_key_flags(world_flags)
-flags.adopt_module_key_flags(episodes_flag)
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(output_flag)
-flags.adopt_module_key_flags(scripted_flags)
-_BASELINE = flags.DEFINE_string(
+flags.take(
+    *flags.WORLD, flags.TARGET, *flags.SCRIPTED, flags.IMPORT, flags.OUTPUT
+)
+_BASELINE = absl_flags.DEFINE_string(
     'baseline',
     None,
     'Run to compare with, such as "random" or "random (secure)". Default:'
     ' the solver of the task if it is one of the policies, otherwise the first'
     ' run.',
 )
-_PLOTS = flags.DEFINE_boolean('plots', True, 'Draws plots.')
-_VIDEOS = flags.DEFINE_boolean(
+_PLOTS = absl_flags.DEFINE_boolean('plots', True, 'Draws plots.')
+_VIDEOS = absl_flags.DEFINE_boolean(
     'videos', True, 'Films the first episode of each policy.'
 )
 
@@ -45,38 +39,30 @@ _VIDEOS = flags.DEFINE_boolean(
 def main(argv: Sequence[str]) -> None:
   """Runs the comparison that the flags describe."""
   del argv
-  output = program.required(
-      output_flag.OUTPUT, '; name a folder for the results'
-  )
-  seeds = scripted_flags.parse_seeds(scripted_flags.SEEDS.value)
+  output = flags.required(flags.OUTPUT, '; name a folder for the results')
+  seeds = flags.seeds()
   has_plots = _PLOTS.value and _is_possible(
       'plots', requirements.missing('matplotlib')
   )
-  has_videos = _VIDEOS.value and _is_possible('videos', _why_no_videos())
+  has_videos = _VIDEOS.value and _is_possible('videos', renderers.why_no_film())
   if not has_videos:
     renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
-  from realab_suite import worlds
   from realab_suite.experiments import scripted
 
-  imports_flag.load()
-  domain, task = world_flags.world()
-  world = worlds.World(domain, task)
-  policies = scripted_flags.POLICIES.value
+  flags.load_imports()
+  world = flags.world()
+  policies = flags.POLICIES.value
   settings = scripted.Settings(
-      domain=domain,
-      task=task,
-      design=world_flags.DESIGN.value,
-      overrides=tuple(world_flags.SET.value),
+      world=world,
+      design=flags.DESIGN.value,
+      overrides=tuple(flags.SET.value),
       policies=world.scripted if policies is None else tuple(policies),
-      channels=tuple(scripted_flags.CHANNELS.value),
+      channels=tuple(flags.CHANNELS.value),
       baseline=_BASELINE.value,
-      target=world_flags.TARGET.value,
+      target=flags.TARGET.value,
       seeds=seeds,
-      num_episodes=episodes_flag.EPISODES.value,
-      max_steps=world_flags.MAX_STEPS.value,
-      task_kwargs=world_flags.task_kwargs(),
-      senses=world_flags.senses(),
+      num_episodes=flags.num_episodes(),
       output=output,
   )
   draw = film = None
@@ -93,13 +79,6 @@ def main(argv: Sequence[str]) -> None:
         ' without a graphics card; --novideos skips the films'
     )
   scripted.run(settings, program.say, scripted.Pictures(draw, film))
-
-
-def _why_no_videos() -> str | None:
-  return (
-      requirements.missing('imageio', 'av', 'PIL')
-      or renderers.choose_renderer()
-  )
 
 
 def _is_possible(what: str, problem: str | None) -> bool:

@@ -11,31 +11,28 @@ import itertools
 import os
 from typing import Any
 
-from absl import flags
 import dm_env
 
 from realab_suite import _display
 from realab_suite import errors
-from realab_suite.experiments import requirements
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import policy_flag
-from realab_suite.launchers.flags import seed_flag
-from realab_suite.launchers.flags import video_flag
-from realab_suite.launchers.flags import world_flags
 
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(policy_flag)
-flags.adopt_module_key_flags(seed_flag)
-flags.adopt_module_key_flags(video_flag)
-flags.adopt_module_key_flags(world_flags)
+flags.take(
+    *flags.WORLD,
+    flags.TARGET,
+    flags.IMPORT,
+    flags.POLICY,
+    flags.SEED,
+    flags.VIDEO,
+)
 
 
 def main(argv: Sequence[str]) -> None:
   """Opens a window, or writes a film."""
   del argv
-  if video_flag.VIDEO.value is None and _display.has_display():
+  if flags.VIDEO.value is None and _display.has_display():
     _open_window()
   else:
     _write_film()
@@ -50,11 +47,7 @@ def _open_window() -> None:
 
 
 def _write_film() -> None:
-  problem = (
-      requirements.missing('imageio', 'av', 'PIL')
-      or renderers.choose_renderer()
-  )
-  if problem is not None:
+  if problem := renderers.why_no_film():
     raise errors.ResultsError(
         f'no display for a window, and no renderer for a film: {problem}'
     )
@@ -62,15 +55,13 @@ def _write_film() -> None:
   from realab_suite.experiments import tracking
   from realab_suite.reports import films
 
-  world = '_'.join(world_flags.world())
-  path = video_flag.VIDEO.value or _unused(
-      f'{world}_{policy_flag.POLICY.value}_{seed_flag.SEED.value}'
+  world = '_'.join(flags.domain_and_task())
+  path = flags.VIDEO.value or _unused(
+      f'{world}_{flags.POLICY.value}_{flags.SEED.value}'
   )
   with (
       _loaded() as (env, policy),
-      films.Film(
-          env, path, policy_flag.POLICY.value, tuple(films.WIDTHS)
-      ) as film,
+      films.Film(env, path, flags.POLICY.value, tuple(films.WIDTHS)) as film,
   ):
     recorder = tracking.Tracker(env, film.add)
     evaluate.evaluate(env, policy, 1, sinks=[recorder])
@@ -90,27 +81,12 @@ def _unused(stem: str) -> str:
 @contextlib.contextmanager
 def _loaded() -> Iterator[tuple[Any, Any]]:
   """Yields the environment and the policy that the flags name."""
-  from realab_suite import suite
   from realab_suite.audit import aiming
 
-  imports_flag.load()
-  env = suite.load(
-      *world_flags.world(),
-      task_kwargs={
-          **world_flags.task_kwargs(),
-          'random': seed_flag.SEED.value,
-      },
-      environment_kwargs={
-          'max_steps': world_flags.MAX_STEPS.value,
-          'senses': world_flags.senses(),
-      },
-      design=world_flags.DESIGN.value,
-      overrides=tuple(world_flags.SET.value),
-  )
+  flags.load_imports()
+  env = flags.world().load(flags.design(), flags.SEED.value)
   with contextlib.closing(env):
-    policy = aiming.make_policy(
-        policy_flag.POLICY.value, env, world_flags.TARGET.value, 0
-    )
+    policy = aiming.make_policy(flags.POLICY.value, env, flags.TARGET.value, 0)
     env.rewind()
     yield env, policy
 

@@ -11,22 +11,15 @@ actions, so the learner is not needed. `label` makes a dataset of several runs.
 from collections.abc import Sequence
 import pathlib
 
-from absl import flags
+from absl import flags as absl_flags
 
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import episodes_flag
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import input_flag
-from realab_suite.launchers.flags import output_flag
-from realab_suite.launchers.flags import run_flag
 
-flags.adopt_module_key_flags(episodes_flag)
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(input_flag)
-flags.adopt_module_key_flags(output_flag)
-flags.adopt_module_key_flags(run_flag)
-_FORMAT = flags.DEFINE_string(
+flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT, flags.RUN, flags.EPISODES)
+
+_FORMAT = absl_flags.DEFINE_string(
     'format', 'parquet', "Format of the agent's data: parquet or minari."
 )
 
@@ -34,11 +27,9 @@ _FORMAT = flags.DEFINE_string(
 def main(argv: Sequence[str]) -> None:
   """Exports the episodes that the flags name."""
   del argv
-  folder = pathlib.Path(program.required(input_flag.INPUT))
-  name = program.required(run_flag.RUN, '; name a run of the sweep')
-  output = pathlib.Path(
-      program.required(output_flag.OUTPUT, '; name a new folder')
-  )
+  folder = pathlib.Path(flags.required(flags.INPUT))
+  flags.required(flags.RUN, '; name a run of the sweep')
+  output = pathlib.Path(flags.required(flags.OUTPUT, '; name a new folder'))
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.datasets import export
@@ -46,10 +37,10 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.reports import sweep_results
 
   export.check(_FORMAT.value, output)
-  imports_flag.load()
-  run = run_flag.find(name, sweep_results.load(folder).runs, folder)
+  flags.load_imports()
+  run = flags.find_run(sweep_results.load(folder).runs)
   export.export(
-      sources.of_run(run, episodes_flag.EPISODES.value),
+      sources.of_run(run, flags.num_episodes()),
       output,
       data_format=_FORMAT.value,
       say=program.say,

@@ -10,42 +10,29 @@ actions, so the learner is not needed.
 from collections.abc import Sequence
 import pathlib
 
-from absl import flags
-
 from realab_suite import errors
-from realab_suite.experiments import requirements
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import input_flag
-from realab_suite.launchers.flags import run_flag
-from realab_suite.launchers.flags import video_flag
 
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(input_flag)
-flags.adopt_module_key_flags(run_flag)
-flags.adopt_module_key_flags(video_flag)
+flags.take(flags.IMPORT, flags.INPUT, flags.RUN, flags.VIDEO)
 
 
 def main(argv: Sequence[str]) -> None:
   """Films the valid episode of median corruption."""
   del argv
-  folder = pathlib.Path(program.required(input_flag.INPUT))
-  name = program.required(run_flag.RUN, '; name a run of the sweep')
-  path = program.required(video_flag.VIDEO, '; name a new .mp4 or .webp file')
-  problem = (
-      requirements.missing('imageio', 'av', 'PIL')
-      or renderers.choose_renderer()
-  )
-  if problem is not None:
+  folder = pathlib.Path(flags.required(flags.INPUT))
+  name = flags.required(flags.RUN, '; name a run of the sweep')
+  path = flags.required(flags.VIDEO, '; name a new .mp4 or .webp file')
+  if problem := renderers.why_no_film():
     raise errors.ResultsError(f'cannot make a film: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.reports import films
   from realab_suite.reports import replays
   from realab_suite.reports import sweep_results
 
-  imports_flag.load()
-  run = run_flag.find(name, sweep_results.load(folder).runs, folder)
+  flags.load_imports()
+  run = flags.find_run(sweep_results.load(folder).runs)
   row = replays.typical_row(run)
   if row is None:
     raise errors.ResultsError(f'{folder}: run {name} has no valid episode yet')

@@ -14,28 +14,24 @@ from collections.abc import Sequence
 import pathlib
 from typing import Any
 
-from absl import flags
+from absl import flags as absl_flags
 
 from realab_suite import errors
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import episodes_flag
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import input_flag
-from realab_suite.launchers.flags import output_flag
-from realab_suite.launchers.flags import scripted_flags
-from realab_suite.launchers.flags import world_flags
 
-flags.adopt_module_key_flags(episodes_flag)
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(input_flag)
-flags.adopt_module_key_flags(output_flag)
-flags.adopt_module_key_flags(scripted_flags)
-for name in ('domain', 'task', 'max_steps', 'set'):
-  flags.declare_key_flag(name)
-# They come with those flags, and would have no effect.
-_OTHER_WORLD_FLAGS = ('design', 'senses', 'task_kwargs', 'target')
-_DESIGNS = flags.DEFINE_list(
+flags.take(
+    flags.DOMAIN,
+    flags.TASK,
+    flags.MAX_STEPS,
+    flags.SET,
+    *flags.SCRIPTED,
+    flags.IMPORT,
+    flags.INPUT,
+    flags.OUTPUT,
+)
+_DESIGNS = absl_flags.DEFINE_list(
     'designs',
     ['instantaneous_reward', 'value_advice', 'decoupled_approval'],
     'Designs in which each scripted policy acts: names of designs that are part'
@@ -46,22 +42,14 @@ _DESIGNS = flags.DEFINE_list(
 def main(argv: Sequence[str]) -> None:
   """Makes the dataset that the flags describe."""
   del argv
-  output = pathlib.Path(
-      program.required(output_flag.OUTPUT, '; name a new folder')
-  )
-  for name in _OTHER_WORLD_FLAGS:
-    if flags.FLAGS[name].present:
-      raise errors.SpecError(
-          f'--{name}: not a flag of this program; it takes --designs, --domain,'
-          ' --task, --max_steps and --set'
-      )
-  seeds = scripted_flags.parse_seeds(scripted_flags.SEEDS.value)
+  output = pathlib.Path(flags.required(flags.OUTPUT, '; name a new folder'))
+  seeds = flags.seeds()
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.datasets import export
 
   export.check('parquet', output)
-  imports_flag.load()
+  flags.load_imports()
   found = [*_of_sweep(), *_scripted(seeds)]
   if not found:
     raise errors.SpecError(
@@ -77,10 +65,10 @@ def _of_sweep() -> list[Any]:
   from realab_suite.datasets import sources
   from realab_suite.reports import sweep_results
 
-  if not input_flag.INPUT.value:
+  if not flags.INPUT.value:
     return []
-  runs = sweep_results.load(pathlib.Path(input_flag.INPUT.value)).runs
-  number = episodes_flag.EPISODES.value
+  runs = sweep_results.load(pathlib.Path(flags.INPUT.value)).runs
+  number = flags.num_episodes()
   return [sources.of_run(run, number) for run in runs.values()]
 
 
@@ -95,14 +83,14 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
   from realab_suite.datasets import sources
   from realab_suite.feedback import specs
 
-  world = worlds.World(*world_flags.world(), world_flags.MAX_STEPS.value)
-  chosen = scripted_flags.POLICIES.value
+  world = flags.world()
+  chosen = flags.POLICIES.value
   names = world.scripted if chosen is None else tuple(chosen)
   for policy in names:
     policies.POLICIES.get(policy)
-  overrides = tuple(world_flags.SET.value)
+  overrides = tuple(flags.SET.value)
   designs = [specs.load(design, overrides) for design in _DESIGNS.value]
-  channels = [f'channel={one}' for one in scripted_flags.CHANNELS.value]
+  channels = [f'channel={one}' for one in flags.CHANNELS.value]
   twins = [
       [specs.load(design, [one]) for one in channels] or [design]
       for design in designs
@@ -124,7 +112,7 @@ def _scripted(seeds: tuple[int, ...]) -> list[Any]:
                 twin,
                 world,
                 seeds=seeds,
-                num_episodes=episodes_flag.EPISODES.value,
+                num_episodes=flags.num_episodes(),
                 stake=stake,
             )
         )

@@ -11,22 +11,20 @@ same versions on the same kind of machine produce the same files.
 from collections.abc import Sequence
 import pathlib
 
-from absl import flags
-
 from realab_suite import errors
 from realab_suite.experiments import requirements
 from realab_suite.experiments import threads
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import output_flag
 
-flags.adopt_module_key_flags(output_flag)
+flags.take(flags.OUTPUT)
 
 
 def main(argv: Sequence[str]) -> None:
   """Trains all networks."""
   del argv
-  output = pathlib.Path(program.required(output_flag.OUTPUT))
+  output = pathlib.Path(flags.required(flags.OUTPUT))
   if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'cannot train networks: {problem}')
   threads.use_one()

@@ -11,16 +11,15 @@ results give the same bytes.
 from collections.abc import Sequence
 import pathlib
 
-from absl import flags
+from absl import flags as absl_flags
 
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import input_flag
-from realab_suite.launchers.flags import output_flag
 
-flags.adopt_module_key_flags(input_flag)
-flags.adopt_module_key_flags(output_flag)
-_LEARNERS = flags.DEFINE_boolean(
+flags.take(flags.INPUT, flags.OUTPUT)
+
+_LEARNERS = absl_flags.DEFINE_boolean(
     'learners', False, 'Includes trained learners, about 3 MB each.'
 )
 
@@ -28,8 +27,8 @@ _LEARNERS = flags.DEFINE_boolean(
 def main(argv: Sequence[str]) -> None:
   """Packs the sweep that the flags describe."""
   del argv
-  folder = pathlib.Path(program.required(input_flag.INPUT))
-  output = pathlib.Path(program.required(output_flag.OUTPUT))
+  folder = pathlib.Path(flags.required(flags.INPUT))
+  output = pathlib.Path(flags.required(flags.OUTPUT))
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.experiments import packing

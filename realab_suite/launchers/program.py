@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 import functools
 import sys
-from typing import Any
 
 from absl import app
 from absl import flags
@@ -19,21 +18,6 @@ _INTERRUPTED = 130
 def say(line: str) -> None:
   """Writes a line to the standard output, above any progress bar."""
   tqdm.tqdm.write(line)
-
-
-def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
-  """Returns the value of a flag that must be given.
-
-  Args:
-    flag: The flag.
-    why: Text to add to the error message.
-
-  Raises:
-    SpecError: If it is not given.
-  """
-  if flag.value is None or flag.value == '':
-    raise errors.SpecError(f'--{flag.name}: missing{why}')
-  return flag.value
 
 
 def start(main: Callable[[Sequence[str]], int | None]) -> None:

@@ -10,6 +10,7 @@ import sys
 
 from realab_suite import _display
 from realab_suite import errors
+from realab_suite.experiments import requirements
 
 # Enough time to import dm_control and render on a slow machine under load.
 _PATIENCE_SECONDS = 300
@@ -39,6 +40,19 @@ def choose_renderer() -> str | None:
     problems.append(f'{renderer}: {problem}')
   _name('disable')
   return '; '.join(problems)
+
+
+def why_no_film() -> str | None:
+  """Chooses a renderer, or returns the reason why films cannot be made."""
+  return requirements.missing('imageio', 'av', 'PIL') or choose_renderer()
+
+
+def why_no_page() -> str | None:
+  """Chooses a renderer, or returns why no page can show a world to a person."""
+  return (
+      requirements.missing('websockets', 'PIL', extra='browser')
+      or choose_renderer()
+  )
 
 
 def render_on_demand() -> None:

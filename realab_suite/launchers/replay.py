@@ -12,23 +12,18 @@ from collections.abc import Sequence
 import pathlib
 import re
 
-from absl import flags
+from absl import flags as absl_flags
 
 from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.experiments import requirements
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import input_flag
-from realab_suite.launchers.flags import output_flag
-from realab_suite.launchers.flags import run_flag
 
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(input_flag)
-flags.adopt_module_key_flags(output_flag)
-flags.adopt_module_key_flags(run_flag)
-_EPISODE = flags.DEFINE_string(
+flags.take(flags.IMPORT, flags.INPUT, flags.OUTPUT, flags.RUN)
+
+_EPISODE = absl_flags.DEFINE_string(
     'episode',
     'typical',
     'Episode to replay: "typical" (median corruption), "all", or its seed,'
@@ -39,8 +34,8 @@ _EPISODE = flags.DEFINE_string(
 def main(argv: Sequence[str]) -> None:
   """Writes the pages that the flags describe."""
   del argv
-  folder = pathlib.Path(program.required(input_flag.INPUT))
-  name = program.required(run_flag.RUN, '; name a run of the sweep')
+  folder = pathlib.Path(flags.required(flags.INPUT))
+  name = flags.required(flags.RUN, '; name a run of the sweep')
   if problem := requirements.missing('viser', 'mjviser', extra='browser'):
     raise errors.ResultsError(f'cannot write a replay: {problem}')
   renderers.render_on_demand()
@@ -49,8 +44,8 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.reports import replays
   from realab_suite.reports import sweep_results
 
-  imports_flag.load()
-  run = run_flag.find(name, sweep_results.load(folder).runs, folder)
+  flags.load_imports()
+  run = flags.find_run(sweep_results.load(folder).runs)
   if _EPISODE.value == 'typical':
     typical = replays.typical_row(run) or replays.first_row(run)
     rows = [] if typical is None else [typical]
@@ -61,7 +56,7 @@ def main(argv: Sequence[str]) -> None:
         f'{folder}: run {name} has no valid episode {_EPISODE.value!r}; allowed'
         ' are typical, all, and seed,world,episode of a finished job'
     )
-  output = output_flag.OUTPUT.value
+  output = flags.OUTPUT.value
   pages = pathlib.Path(output) if output else folder / sweep_results.REPLAYS
   for row in rows:
     path = replay_pages.write(run, row, pages)

@@ -19,75 +19,60 @@ the stakes of the design, which are measured while the agent starts.
 
 from collections.abc import Sequence
 import os
-from typing import Any
 
-from absl import flags
+from absl import flags as absl_flags
 
 from realab_suite import errors
 from realab_suite.experiments import requirements
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import episodes_flag
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import output_flag
-from realab_suite.launchers.flags import seed_flag
-from realab_suite.launchers.flags import world_flags
 
-flags.adopt_module_key_flags(seed_flag)
-flags.adopt_module_key_flags(world_flags)
-flags.adopt_module_key_flags(episodes_flag)
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(output_flag)
+flags.take(*flags.WORLD, flags.SEED, flags.EPISODES, flags.IMPORT, flags.OUTPUT)
 _MOST_SECONDS = 1e6
 # Settings that the record of a run determines.
-_RECORDED: tuple[flags.FlagHolder[Any], ...] = (
-    world_flags.DOMAIN,
-    world_flags.TASK,
-    world_flags.DESIGN,
-    seed_flag.SEED,
-    world_flags.MAX_STEPS,
-    world_flags.TASK_KWARGS,
-    world_flags.SENSES,
-)
-_NAME = flags.DEFINE_string(
+_RECORDED = [
+    flag for flag in (*flags.WORLD, flags.SEED) if flag is not flags.SET
+]
+_NAME = absl_flags.DEFINE_string(
     'name', 'agent', 'Name of the agent in the results.'
 )
-_ADDRESS = flags.DEFINE_string(
+_ADDRESS = absl_flags.DEFINE_string(
     'address',
     None,
     'Address to listen on: unix:/folder/name, in a folder of mode 0700, or'
     ' host:port for programs on this machine. Default: a socket in a new'
     ' folder.',
 )
-_REPEAT = flags.DEFINE_string(
+_REPEAT = absl_flags.DEFINE_string(
     'repeat',
     None,
     'File run.json of a served run, whose episodes are served again, with the'
     ' same design or, with --set, a twin of it.',
 )
-_IDLE_SECONDS = flags.DEFINE_float(
+_IDLE_SECONDS = absl_flags.DEFINE_float(
     'idle_seconds',
     60.0,
     'Time without a request after which an agent is disconnected, in seconds.',
 )
-_PROVIDER_SECONDS = flags.DEFINE_float(
+_PROVIDER_SECONDS = absl_flags.DEFINE_float(
     'provider_seconds',
     60.0,
     'Time limit of a provider for one step, in seconds. The episode fails if it'
     ' is exceeded.',
 )
-_AGENT_COMMAND = flags.DEFINE_string(
+_AGENT_COMMAND = absl_flags.DEFINE_string(
     'agent_command',
     None,
     'Command that starts the agent. The address is in the environment variable'
     ' REALAB_ADDRESS.',
 )
-_AGENT_FOLDER = flags.DEFINE_string(
+_AGENT_FOLDER = absl_flags.DEFINE_string(
     'agent_folder',
     None,
     'Working directory of the agent. Default: a new, empty folder.',
 )
-_AGENT_USER = flags.DEFINE_string(
+_AGENT_USER = absl_flags.DEFINE_string(
     'agent_user',
     None,
     'User that the agent runs as; no other user may connect. Needs root.',
@@ -97,14 +82,9 @@ _AGENT_USER = flags.DEFINE_string(
 def main(argv: Sequence[str]) -> None:
   """Serves the world that the flags describe."""
   del argv
-  output = program.required(
-      output_flag.OUTPUT, '; name a folder for the results'
-  )
-  for flag in (world_flags.TARGET, _AGENT_FOLDER):
-    if flag.present and (
-        flag is world_flags.TARGET or not _AGENT_COMMAND.present
-    ):
-      raise errors.SpecError(f'--{flag.name} has no effect here')
+  output = flags.required(flags.OUTPUT, '; name a folder for the results')
+  if _AGENT_FOLDER.present and not _AGENT_COMMAND.present:
+    raise errors.SpecError('--agent_folder has no effect here')
   for flag in _RECORDED:
     if _REPEAT.present and flag.present:
       raise errors.SpecError(
@@ -120,7 +100,7 @@ def main(argv: Sequence[str]) -> None:
           f'--{seconds.name}={seconds.value:g}; allowed is more than 0, and at'
           f' most {_MOST_SECONDS:g}'
       )
-  domain, task = world_flags.world()
+  flags.domain_and_task()  # Raises errors before slow imports.
   renderers.render_on_demand()
   # gRPC reads this once. The server never forks without executing another
   # program at once.
@@ -128,18 +108,14 @@ def main(argv: Sequence[str]) -> None:
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.experiments import served_evaluation
 
-  imports_flag.load()
+  flags.load_imports()
   settings = served_evaluation.Settings(
-      domain=domain,
-      task=task,
-      design=world_flags.DESIGN.value,
-      overrides=tuple(world_flags.SET.value),
-      seed=seed_flag.SEED.value,
-      max_steps=world_flags.MAX_STEPS.value,
-      task_kwargs=world_flags.task_kwargs(),
-      senses=world_flags.senses(),
+      world=flags.world(),
+      design=flags.DESIGN.value,
+      overrides=tuple(flags.SET.value),
+      seed=flags.SEED.value,
       repeat=_REPEAT.value,
-      num_episodes=episodes_flag.EPISODES.value,
+      num_episodes=flags.num_episodes(),
       name=_NAME.value,
       address=_ADDRESS.value,
       idle_seconds=_IDLE_SECONDS.value,

@@ -10,38 +10,25 @@ divided by the stake is a relative gain; a degenerate stake judges nothing.
 
 from collections.abc import Sequence
 
-from absl import flags
-
 from realab_suite import errors
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import world_flags
 
-for module in (imports_flag, world_flags):
-  flags.adopt_module_key_flags(module)
+flags.take(flags.IMPORT, *flags.WORLD)
 
 
 def main(argv: Sequence[str]) -> None:
   """Prints the stakes of the design that the flags describe."""
   del argv
-  if world_flags.TARGET.present:
-    raise errors.SpecError('--target has no effect here')
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite import worlds
   from realab_suite.evaluation import stakes
   from realab_suite.experiments import result_tables
-  from realab_suite.feedback import specs
 
-  imports_flag.load()
-  world = worlds.World(
-      *world_flags.world(),
-      world_flags.MAX_STEPS.value,
-      world_flags.task_kwargs(),
-      world_flags.senses(),
-  )
-  design = specs.load(world_flags.DESIGN.value, tuple(world_flags.SET.value))
+  flags.load_imports()
+  world, design = flags.world(), flags.design()
   found = worlds.stakes_of(world, design)
   if found is None:
     raise errors.SpecError(

@@ -11,41 +11,38 @@ from collections.abc import Sequence
 import os
 import pathlib
 
-from absl import flags
+from absl import flags as absl_flags
 
 from realab_suite.experiments import threads
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import learning_flags
-from realab_suite.launchers.flags import output_flag
 
-flags.adopt_module_key_flags(imports_flag)
-flags.adopt_module_key_flags(learning_flags)
-flags.adopt_module_key_flags(output_flag)
-_ON_TASK = flags.DEFINE_string(
+flags.take(flags.IMPORT, flags.EXPERIMENT, flags.OUTPUT, flags.TENSORBOARD)
+
+_ON_TASK = absl_flags.DEFINE_string(
     'on_task',
     None,
     'Task to run the experiment on instead of its own, such as'
     ' unlock_door.far. Use a separate folder for each task.',
 )
-_RUNS = flags.DEFINE_list(
+_RUNS = absl_flags.DEFINE_list(
     'runs', [], 'Runs to execute, such as "reward,reward.secure". Default: all.'
 )
-_CALIBRATION = flags.DEFINE_boolean(
+_CALIBRATION = absl_flags.DEFINE_boolean(
     'calibration',
     False,
     'Uses the calibration seeds instead of the reported ones. Use a separate'
     ' folder for them.',
 )
-_WORKERS = flags.DEFINE_integer(
+_WORKERS = absl_flags.DEFINE_integer(
     'workers',
     None,
     'Number of jobs in parallel with --engine=local. Default: the number of'
     ' processors.',
     lower_bound=1,
 )
-_ENGINE = flags.DEFINE_enum(
+_ENGINE = absl_flags.DEFINE_enum(
     'engine',
     'local',
     ['local', 'ray', 'submitit'],
@@ -57,9 +54,7 @@ _ENGINE = flags.DEFINE_enum(
 def main(argv: Sequence[str]) -> None:
   """Runs the sweep that the flags describe."""
   del argv
-  name, output = program.required(learning_flags.EXPERIMENT), program.required(
-      output_flag.OUTPUT
-  )
+  name, output = flags.required(flags.EXPERIMENT), flags.required(flags.OUTPUT)
   threads.use_one()
   renderers.render_on_demand()
   # Imports numerical libraries, so the number of threads has to be set first.
@@ -68,15 +63,15 @@ def main(argv: Sequence[str]) -> None:
   from realab_suite.experiments import experiment_specs
   from realab_suite.experiments import scheduler
 
-  imports_flag.load()
+  flags.load_imports()
   experiment = experiment_specs.load(name)
   if _ON_TASK.value is not None:
     experiment = experiment.on_task(_ON_TASK.value)
-  if learning_flags.TENSORBOARD.value:
+  if flags.TENSORBOARD.value:
     curves.check_tensorboard()
-  arguments = imports_flag.arguments()
-  if learning_flags.TENSORBOARD.value:
-    arguments.append(f'--{learning_flags.TENSORBOARD.name}')
+  arguments = flags.import_arguments()
+  if flags.TENSORBOARD.value:
+    arguments.append(f'--{flags.TENSORBOARD.name}')
   engine = engines.ENGINES[_ENGINE.value](_WORKERS.value or os.cpu_count() or 1)
   scheduler.sweep(
       experiment,

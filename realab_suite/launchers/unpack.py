@@ -10,22 +10,18 @@ jobs that it lacks. Every file is verified before anything is written.
 from collections.abc import Sequence
 import pathlib
 
-from absl import flags
-
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 from realab_suite.launchers import renderers
-from realab_suite.launchers.flags import input_flag
-from realab_suite.launchers.flags import output_flag
 
-flags.adopt_module_key_flags(input_flag)
-flags.adopt_module_key_flags(output_flag)
+flags.take(flags.INPUT, flags.OUTPUT)
 
 
 def main(argv: Sequence[str]) -> None:
   """Unpacks the file that the flags name."""
   del argv
-  path = pathlib.Path(program.required(input_flag.INPUT))
-  output = pathlib.Path(program.required(output_flag.OUTPUT))
+  path = pathlib.Path(flags.required(flags.INPUT))
+  output = pathlib.Path(flags.required(flags.OUTPUT))
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite.experiments import packing

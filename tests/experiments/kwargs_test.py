@@ -179,7 +179,7 @@ def test_scripted_policies_are_compared_with_a_camera(tmp_path):
   assert loaded
   for _, _, _, kwargs in loaded:
     assert kwargs['senses'] == ('camera',)
-  described = small.description(tmp_path / 'new')['settings']
+  described = small.description(tmp_path / 'new')['settings']['world']
   assert described['senses'] == ['camera']
   assert described['task_kwargs'] == {'camera_size': [8, 8]}
 
@@ -222,7 +222,8 @@ def test_a_served_world_has_the_senses_of_its_settings_and_of_its_record(
   blank = served_evaluation.Settings(**dict.fromkeys(names))
   for changes in ({'repeat': str(record), 'overrides': ()},):
     settings = blank.__class__(**{**vars(blank), **changes})
-    env = served_evaluation._load(*served_evaluation._chosen(settings))
+    chosen, design, seed = served_evaluation._chosen(settings)
+    env = chosen.world.load(design, seed)
     assert env.senses == ('holding', 'camera')
     assert env.observation_spec()['senses/camera'].shape == (4, 6, 3)
 

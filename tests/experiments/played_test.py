@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip('websockets')
 pytest.importorskip('PIL')
 
+from realab_suite import worlds
 from realab_suite.entities import registers
 from realab_suite.evaluation import results
 from realab_suite.experiments import played
@@ -53,14 +54,11 @@ def fixture_no_renderer(monkeypatch):
 def _settings(folder, **changes):
   return played.Settings(
       **{
-          'domain': 'unlock_door',
-          'task': 'near',
+          'world': worlds.World('unlock_door', 'near', 15),
           'design': specs.load('instantaneous_reward', ['dof=planar']),
           'seed': 1,
           'num_episodes': 2,
-          'max_steps': 15,
           'rate': 1e6,
-          'task_kwargs': {},
           'output': str(folder / 'new'),
           **changes,
       }

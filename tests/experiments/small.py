@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.engine import seeding
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
@@ -42,8 +43,7 @@ def quick_stakes(num_episodes: int = 20) -> Iterator[None]:
 
 
 _SETTINGS = scripted.Settings(
-    domain='unlock_door',
-    task='near',
+    world=worlds.World('unlock_door', 'near', 12),
     design='instantaneous_reward',
     overrides=(),
     policies=('random', 'no_op'),
@@ -52,14 +52,23 @@ _SETTINGS = scripted.Settings(
     target=None,
     seeds=(3, 5),
     num_episodes=2,
-    max_steps=12,
     output='',
 )
 
 
 def settings(output: pathlib.Path, **changes: Any) -> scripted.Settings:
-  """Returns the settings of a small experiment."""
-  return dataclasses.replace(_SETTINGS, output=str(output), **changes)
+  """Returns the settings of a small experiment.
+
+  Args:
+    output: The folder of its results.
+    **changes: Settings that differ from the usual ones, or those of its world.
+  """
+  names = {field.name for field in dataclasses.fields(worlds.World)}
+  of_world = {name: changes.pop(name) for name in names & changes.keys()}
+  world = dataclasses.replace(_SETTINGS.world, **of_world)
+  return dataclasses.replace(
+      _SETTINGS, world=world, output=str(output), **changes
+  )
 
 
 def rows(folder: pathlib.Path) -> list[results.EpisodeRow]:

@@ -12,6 +12,7 @@ pytest.importorskip('PIL')
 from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import supervised
 from realab_suite.experiments import supervised_designs
@@ -151,6 +152,16 @@ def test_a_page_that_is_opened_again_pauses_the_episode(tmp_path):
   assert page.steps() == [0, 1, 2, 2, 3]
 
 
+def _run(supervision, num_episodes):
+  """Runs supervised episodes, and returns what the program says."""
+  said = []
+  world = worlds.World('unlock_door', 'near')
+  policy = policies.make('no_op')
+  supervised.run(supervision, world, 'no_op', policy, num_episodes, said.append)
+  [text] = said
+  return text
+
+
 def test_supervised_episodes_have_figures_and_no_judgement(tmp_path):
   def react(page, content):
     if content['type'] == 'step' and content['step'] == 2:
@@ -162,9 +173,7 @@ def test_supervised_episodes_have_figures_and_no_judgement(tmp_path):
       design=supervised_designs.design('approval', 'live'),
   )  # fmt: skip
   one = supervised.Supervision(env, page, tmp_path, 1e6)
-  text = supervised.run(
-      one, ('unlock_door', 'near'), 'no_op', policies.make('no_op'), 2
-  )
+  text = _run(one, 2)
   assert page.sent[-1] == {'type': 'summary', 'text': text}
   assert text.count('Not judged: the design has no learner.') == 1
   assert '| supervised |' in text
@@ -184,9 +193,7 @@ def test_a_person_cannot_answer_again_for_a_control(tmp_path):
       'unlock_door', 'near', {'random': 1}, {'max_steps': 3}, design=design
   )
   one = supervised.Supervision(env, FakePage(), tmp_path, 1e6)
-  text = supervised.run(
-      one, ('unlock_door', 'near'), 'no_op', policies.make('no_op'), 1
-  )
+  text = _run(one, 1)
   assert 'Not judged: the person would have to answer again' in text
 
 

@@ -14,6 +14,7 @@ from absl.testing import flagsaver
 import pytest
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.engine import seeding
 from realab_suite.evaluation import results
 from realab_suite.experiments import served_evaluation
@@ -241,9 +242,9 @@ def test_a_record_repeats_a_run(run, tmp_path):
 def _settings(record):
   """Returns the settings that `serve` makes of --repeat."""
   return served_evaluation.Settings(
-      domain='collect_apples', task='standard', design='none', overrides=(),
-      seed=0, max_steps=250, repeat=record and str(record), num_episodes=2,
-      name='agent', address=None, idle_seconds=patience.SECONDS,
+      world=worlds.World('collect_apples', 'standard'), design='none',
+      overrides=(), seed=0, repeat=record and str(record), num_episodes=2, name='agent',
+      address=None, idle_seconds=patience.SECONDS,
       provider_seconds=patience.SECONDS, agent_command=None,
       agent_folder=None, agent_user=None, output='results',
   )  # fmt: skip
@@ -252,8 +253,8 @@ def _settings(record):
 def test_a_record_decides_the_world_the_design_and_the_seed(tmp_path, caplog):
   record = small.write_served_run(tmp_path)
   settings, design, seed = served_evaluation._chosen(_settings(record))
-  assert (settings.domain, settings.task) == ('unlock_door', 'near')
-  assert (settings.seed, settings.max_steps) == (7, 12)
+  assert settings.world == worlds.World('unlock_door', 'near', 12)
+  assert settings.seed == 7
   assert settings.overrides == ('registers.reward.scale=0.2',)
   assert design.registers['reward'].scale == 0.2
   assert (seed, seed.salt) == (7, small.SALT)

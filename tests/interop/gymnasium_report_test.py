@@ -221,6 +221,22 @@ def test_the_id_of_a_report_may_begin_with_its_module(tmp_path):
   assert description['objective']['registers'] == {'reward': 1.0}
 
 
+def test_a_world_without_an_id_has_a_report(tmp_path):
+  report = gymnasium_report.write(
+      'unlock_door.near',
+      {'mine': [lambda _: 0]},
+      str(tmp_path / 'new'),
+      num_episodes=1,
+      baselines=['no_op'],
+      design='online_imitation',
+      environment_kwargs={'max_steps': 4},
+  )
+  assert [line.run for line in report.lines] == ['no_op', 'mine']
+  info = next(results.read_rows(tmp_path / 'new' / 'episodes.jsonl')).info
+  assert (info.domain, info.task) == ('unlock_door', 'near')
+  assert info.design == 'online_imitation'
+
+
 @pytest.mark.parametrize('number', [0, 1.0, None])
 def test_wrong_numbers_of_episodes_are_refused_first(tmp_path, number):
   folder = tmp_path / 'new'

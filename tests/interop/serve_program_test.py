@@ -103,7 +103,7 @@ def test_an_agent_that_ends_early_gives_one_line(tmp_path, run):
         ([], '--output'),
         (['--output=x', '--task=a.b', '--domain=c'], '--task=a.b'),
         (['--output=x', '--agent_folder=y'], '--agent_folder'),
-        (['--output=x', '--target=y'], '--target'),
+        (['--output=x', '--target=y'], "flag 'target'"),
         (['--output=x', '--agent_user=nobody_of_that_name'], 'agent_user'),
         (['--output=/proc/x'], '/proc/x'),
         (['--output=x', '--provider_seconds=inf'], '--provider_seconds=inf'),

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import types
 
-from absl import flags
+from absl import flags as absl_flags
 from absl.testing import flagsaver
 import pytest
 import yaml
@@ -22,15 +22,10 @@ from realab_suite.experiments import scripted
 from realab_suite.launchers import compare
 from realab_suite.launchers import explore
 from realab_suite.launchers import film
-from realab_suite.launchers import program
+from realab_suite.launchers import flags
 from realab_suite.launchers import renderers
 from realab_suite.launchers import sweep  # noqa: F401 - defines --workers.
 from realab_suite.launchers import train  # noqa: F401 - defines --parent.
-from realab_suite.launchers.flags import imports_flag
-from realab_suite.launchers.flags import learning_flags
-from realab_suite.launchers.flags import output_flag
-from realab_suite.launchers.flags import scripted_flags
-from realab_suite.launchers.flags import seed_flag
 from tests import patience
 from tests.experiments import small
 from tests.launchers import in_process
@@ -54,6 +49,11 @@ def _run(*arguments, module='realab_suite.launchers.compare', **environment):
       timeout=patience.SECONDS,
       check=False,
   )
+
+
+def _seeds(text):
+  with flagsaver.flagsaver(seeds=text):
+    return flags.seeds()
 
 
 def test_the_main_job_runs_from_the_command_line(tmp_path):
@@ -102,7 +102,7 @@ def test_a_wrong_command_is_refused_in_one_line(arguments, complaint):
     [('3', (0, 1, 2)), ('3,4,5', (3, 4, 5)), ('7,', (7,)), ('1, 2', (1, 2))],
 )
 def test_seeds_are_a_count_or_a_list(text, seeds):
-  assert scripted_flags.parse_seeds(text) == seeds
+  assert _seeds(text) == seeds
 
 
 @pytest.mark.parametrize(
@@ -114,30 +114,26 @@ def test_seeds_are_a_count_or_a_list(text, seeds):
 )  # fmt: skip
 def test_wrong_seeds_are_refused_in_one_line(text):
   with pytest.raises(errors.SpecError, match='allowed are a number') as raised:
-    scripted_flags.parse_seeds(text)
+    _seeds(text)
   message = str(raised.value)
   assert message.startswith(f'--seeds={text[:40]}')
   assert len(message) < 200
 
 
 def test_the_most_and_the_largest_seeds_are_accepted():
-  assert scripted_flags.parse_seeds('10000') == tuple(range(10_000))
-  assert scripted_flags.parse_seeds('0,2147483647') == (
+  assert _seeds('10000') == tuple(range(10_000))
+  assert _seeds('0,2147483647') == (
       0,
-      seed_flag.LARGEST_SEED,
+      flags.LARGEST_SEED,
   )
   # Files of experiments, and so their runs, have the same limit.
-  experiment_specs.load({**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED]})
+  experiment_specs.load({**_EXPERIMENT, 'seeds': [flags.LARGEST_SEED]})
   with pytest.raises(errors.SpecError, match='2147483648'):
-    experiment_specs.load(
-        {**_EXPERIMENT, 'seeds': [seed_flag.LARGEST_SEED + 1]}
-    )
+    experiment_specs.load({**_EXPERIMENT, 'seeds': [flags.LARGEST_SEED + 1]})
 
 
 def test_a_seed_given_twice_is_refused(tmp_path):
-  settings = small.settings(
-      tmp_path / 'new', seeds=scripted_flags.parse_seeds('3,4,3')
-  )
+  settings = small.settings(tmp_path / 'new', seeds=_seeds('3,4,3'))
   with pytest.raises(errors.SpecError, match=r'\[3, 4, 3\] has duplicates'):
     scripted.run(settings, lambda line: None)
   assert not list(tmp_path.iterdir())
@@ -154,28 +150,28 @@ def test_a_seed_given_twice_is_refused(tmp_path):
 def test_a_number_out_of_range_is_refused_when_flags_are_parsed(argument):
   with (
       flagsaver.flagsaver(),
-      pytest.raises(flags.IllegalFlagValueError, match=argument[:12]),
+      pytest.raises(absl_flags.IllegalFlagValueError, match=argument[:12]),
   ):
-    flags.FLAGS(['program', argument])
+    absl_flags.FLAGS(['program', argument])
 
 
 @pytest.mark.parametrize('name', ['', '.mine', 'a..b', 'a b', 'a/b', '1a'])
 def test_wrong_names_of_modules_are_refused(name):
   with flagsaver.flagsaver():
-    flags.FLAGS(['program', f'--import={name}'])
+    absl_flags.FLAGS(['program', f'--import={name}'])
     with pytest.raises(errors.SpecError, match='not the name of a module'):
-      imports_flag.load()
+      flags.load_imports()
 
 
 @pytest.mark.parametrize(
     ('flag', 'values'),
-    [(output_flag.OUTPUT, ['', None]), (learning_flags.EXPERIMENT, ['', None])],
+    [(flags.OUTPUT, ['', None]), (flags.EXPERIMENT, ['', None])],
 )
 def test_an_empty_flag_counts_as_missing(flag, values):
   for value in values:
-    with flagsaver.flagsaver((flag, value)):
+    with flagsaver.flagsaver(**{flag.name: value}):
       with pytest.raises(errors.SpecError, match=f'--{flag.name}: missing'):
-        program.required(flag)
+        flags.required(flag)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +212,7 @@ def test_every_launcher_imports_the_user_s_module(tmp_path):
     importlib.import_module(f'realab_suite.launchers.{module}')
     assert 'import' in {
         flag.name
-        for flag in flags.FLAGS.get_key_flags_for_module(
+        for flag in absl_flags.FLAGS.get_key_flags_for_module(
             f'realab_suite.launchers.{module}'
         )
     }
@@ -224,10 +220,10 @@ def test_every_launcher_imports_the_user_s_module(tmp_path):
 
 def test_a_sweep_passes_imports_to_its_runs():
   with flagsaver.flagsaver():
-    flags.FLAGS(['program', '--import=one', '--import=two'])
-    assert imports_flag.arguments() == ['--import=one', '--import=two']
+    absl_flags.FLAGS(['program', '--import=one', '--import=two'])
+    assert flags.import_arguments() == ['--import=one', '--import=two']
     with pytest.raises(errors.SpecError, match='--import=one: No module named'):
-      imports_flag.load()
+      flags.load_imports()
 
 
 def test_exploring_without_a_renderer_gives_one_line(tmp_path):
@@ -269,7 +265,7 @@ def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
   monkeypatch.setattr('dm_control.viewer', viewer, raising=False)
   monkeypatch.setenv('DISPLAY', ':0')
   with flagsaver.flagsaver():
-    flags.FLAGS(['explore', '--policy=random', '--task=unlock_door.far'])
+    absl_flags.FLAGS(['explore', '--policy=random', '--task=unlock_door.far'])
     explore.main(['explore'])
   assert lengths == [5, 5]
 
@@ -291,7 +287,8 @@ def test_a_task_of_a_comparison_may_have_its_domain(monkeypatch, tmp_path):
       f'--output={tmp_path}',
   )  # fmt: skip
   [settings] = given
-  assert (settings.domain, settings.task) == ('collect_apples', 'near')
+  world = settings.world
+  assert (world.domain, world.task) == ('collect_apples', 'near')
   complaint = in_process.complaint(
       compare, '--task=collect_apples.near', '--domain=unlock_door',
       '--novideos', '--noplots', f'--output={tmp_path}',

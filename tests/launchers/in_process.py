@@ -6,8 +6,10 @@ import os
 from typing import Any, NamedTuple
 from unittest import mock
 
+from absl import flags as absl_flags
 from absl.testing import flagsaver
 
+from realab_suite.launchers import flags
 from realab_suite.launchers import program
 
 
@@ -25,9 +27,11 @@ def run(module: Any, *arguments: str) -> Ended:
   with (
       flagsaver.flagsaver(),
       mock.patch.dict(os.environ),
+      mock.patch.dict(absl_flags.FLAGS._flags()),
       contextlib.redirect_stdout(stdout),
       contextlib.redirect_stderr(stderr),
   ):
+    _forget_other_flags(module)
     try:
       argv = program._parse(['program', *arguments])
     except SystemExit as error:
@@ -35,6 +39,13 @@ def run(module: Any, *arguments: str) -> Ended:
     else:
       status = program._in_one_line(module.main, argv)
   return Ended(status, stdout.getvalue(), stderr.getvalue())
+
+
+def _forget_other_flags(module: Any) -> None:
+  """Removes shared flags that do not exist in a process of the program."""
+  taken = absl_flags.FLAGS.get_key_flags_for_module(module.__name__)
+  for name in {*flags._SHARED} - {flag.name for flag in taken}:
+    absl_flags.FLAGS._flags().pop(name, None)
 
 
 def complaint(module: Any, *arguments: str) -> str:

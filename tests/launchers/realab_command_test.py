@@ -15,7 +15,9 @@ import pytest
 from realab_suite import doctor
 from realab_suite.experiments import requirements
 from realab_suite.launchers import command
+from realab_suite.launchers import play
 from realab_suite.launchers import renderers
+from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]
 
@@ -151,13 +153,8 @@ def test_a_demo_without_its_extras_is_refused_at_once(
 
 
 def test_pages_need_an_address():
-  # Its flags and those of other launchers cannot be in one process.
-  ran = subprocess.run(
-      [sys.executable, '-m', 'realab_suite.launchers.play', '--host='],
-      cwd=_ROOT, capture_output=True, text=True, check=False,
-  )  # fmt: skip
-  assert ran.returncode == 2
-  assert 'allowed are addresses, such as 127.0.0.1' in ran.stderr
+  complaint = in_process.complaint(play, '--host=')
+  assert 'allowed are addresses, such as 127.0.0.1' in complaint
 
 
 # The doctor.

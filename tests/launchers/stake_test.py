@@ -54,7 +54,7 @@ def test_a_stake_that_is_degenerate_is_printed_as_such():
     ('arguments', 'text'),
     [
         (('--design=none',), "design 'none' has no stake: the design has no"),
-        (('--target=reward',), '--target has no effect here'),
+        (('--target=reward',), "Unknown command line flag 'target'"),
         (('--design=nothing',), 'nothing'),
         (('--task=nowhere',), 'nowhere'),
     ],

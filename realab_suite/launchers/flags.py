@@ -1,0 +1,346 @@
+"""Flags that several launchers share, and what they describe.
+
+A launcher takes the flags that it uses. In its process the others do not exist,
+so that a flag without an effect is refused.
+"""
+
+from collections.abc import Mapping
+import functools
+import importlib
+import re
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from absl import flags
+
+from realab_suite import errors
+from realab_suite.config import loading
+from realab_suite.config import messages
+
+if TYPE_CHECKING:  # They import dm_control, so a renderer has to be chosen.
+  from realab_suite import worlds
+  from realab_suite.feedback import specs
+
+LARGEST_SEED: Final = 2**31 - 1
+"""Largest seed on a command line; experiment files have the same limit."""
+
+_MOST_SEEDS = 10_000
+_NUM_EPISODES = 2
+_SHARED = flags.FlagValues()
+_Run = TypeVar('_Run')
+
+_define_boolean = functools.partial(flags.DEFINE_boolean, flag_values=_SHARED)
+_define_float = functools.partial(flags.DEFINE_float, flag_values=_SHARED)
+_define_integer = functools.partial(flags.DEFINE_integer, flag_values=_SHARED)
+_define_list = functools.partial(flags.DEFINE_list, flag_values=_SHARED)
+_define_multi_string = functools.partial(
+    flags.DEFINE_multi_string, flag_values=_SHARED
+)
+_define_string = functools.partial(flags.DEFINE_string, flag_values=_SHARED)
+
+IMPORT = _define_multi_string(
+    'import',
+    [],
+    'Module to import first, such as --import=my_registers. It can add'
+    ' registers, providers, tasks, policies or learners',
+)
+INPUT = _define_string(
+    'input',
+    None,
+    'Folder of a sweep: the --output folder of that program. For `unpack`, the'
+    ' file that `pack` wrote.',
+)
+OUTPUT = _define_string(
+    'output',
+    None,
+    'Folder to write into; required, except by `report`, whose default is the'
+    ' folder of the sweep. For `pack`, a .zip file.',
+)
+RUN = _define_string(
+    'run',
+    None,
+    'Run of the experiment, such as "reward", "reward.secure" (its twin) or'
+    ' "reward.random" (a baseline).',
+)
+VIDEO = _define_string(
+    'video',
+    None,
+    'New film to write: an .mp4 file, or a .webp file, an animated picture.'
+    ' Without it, `explore` opens a window.',
+)
+SEED = _define_integer(
+    'seed',
+    0,
+    'Seed of all random streams.',
+    lower_bound=0,
+    upper_bound=LARGEST_SEED,
+)
+EPISODES = _define_integer(
+    'episodes',
+    None,
+    f'Number of episodes per seed. Default: {_NUM_EPISODES}, or 1 with a'
+    ' person.',
+    lower_bound=1,
+    upper_bound=1_000_000,
+)
+POLICY = _define_string(
+    'policy',
+    'random',
+    'Name of a scripted policy; no_op stands still.',
+)
+
+# The world and the design.
+DOMAIN = _define_string(
+    'domain',
+    'unlock_door',
+    'Domain, such as unlock_door or collect_apples.',
+)
+TASK = _define_string(
+    'task',
+    'standard',
+    'Task of the domain: standard, near, far or boxed; or with its domain, such'
+    ' as unlock_door.near.',
+)
+MAX_STEPS = _define_integer(
+    'max_steps',
+    250,
+    'Maximum length of an episode, in control steps.',
+)
+SENSES = _define_list(
+    'senses',
+    None,
+    'Senses of the agent, such as --senses=camera or'
+    ' --senses=ray_distances,velocity. Default: those of the task.',
+)
+TASK_KWARGS = _define_string(
+    'task_kwargs',
+    '{}',
+    'Arguments of the task, as a YAML mapping, such as'
+    ' --task_kwargs="{camera_size: [32, 32]}".',
+)
+DESIGN = _define_string(
+    'design',
+    'instantaneous_reward',
+    'Agent design: name of one that is part of the package, or path of a YAML'
+    ' file.',
+)
+SET = _define_multi_string(
+    'set',
+    [],
+    'Dotted override of the design, such as --set=registers.reward.scale=0.2',
+)
+WORLD = (DOMAIN, TASK, MAX_STEPS, SENSES, TASK_KWARGS, DESIGN, SET)
+TARGET = _define_string(
+    'target',
+    None,
+    'Register that saboteurs attack. Default: the first feedback register; in'
+    ' an audit, all registers.',
+)
+
+# Scripted policies on several seeds.
+POLICIES = _define_list(
+    'policies',
+    None,
+    'Names of the scripted policies to run. Default: the solver of the task,'
+    ' its first saboteur and random actions.',
+)
+CHANNELS = _define_list(
+    'channels',
+    [],
+    'Channels of the registers: embedded, welded, secure. Every policy acts in'
+    ' each channel. Default: the channel of the design.',
+)
+SEEDS = _define_string(
+    'seeds',
+    '5',
+    'Number of seeds, or a list of seeds such as 3,4,5 ("7," means seed 7).',
+)
+SCRIPTED = (POLICIES, CHANNELS, SEEDS, EPISODES)
+
+# Learners.
+EXPERIMENT = _define_string(
+    'experiment',
+    None,
+    'Name of an experiment that is part of the package, or path of a YAML'
+    ' file.',
+)
+TENSORBOARD = _define_boolean(
+    'tensorboard',
+    False,
+    'Also writes learning curves for TensorBoard.',
+)
+
+# Pages for a person.
+PORT = _define_integer(
+    'port',
+    0,
+    'Port of the page; 0 for a free one.',
+    0,
+    65535,
+)
+HOST = _define_string(
+    'host',
+    '127.0.0.1',
+    'Address to listen at. The default is reached from this machine only;'
+    ' connections are not encrypted.',
+)
+flags.register_validator(
+    'host',
+    bool,
+    message='allowed are addresses, such as 127.0.0.1',
+    flag_values=_SHARED,
+)
+RATE = _define_float(
+    'rate',
+    10.0,
+    'Control steps per second; 10 is real time.',
+    0.1,
+    1000.0,
+)
+PAGE = (PORT, HOST, RATE, EPISODES)
+
+_SHARED.mark_as_parsed()
+# The launcher that takes a flag is the one whose --help shows it.
+flags.disclaim_key_flags()
+
+
+def take(*shared: flags.FlagHolder[Any]) -> None:
+  """Adds shared flags to those of the calling launcher."""
+  for one in shared:
+    if one.name not in flags.FLAGS:
+      flags.FLAGS[one.name] = _SHARED[one.name]
+    flags.declare_key_flag(one.name)
+
+
+def required(flag: flags.FlagHolder[Any], why: str = '') -> Any:
+  """Returns the value of a flag that must be given.
+
+  Args:
+    flag: The flag.
+    why: Text to add to the error message.
+
+  Raises:
+    SpecError: If it is not given.
+  """
+  if flag.value is None or flag.value == '':
+    raise errors.SpecError(f'--{flag.name}: missing{why}')
+  return flag.value
+
+
+def load_imports() -> None:
+  """Imports the modules that the user names; a renderer has to be chosen first.
+
+  Raises:
+    SpecError: If a module cannot be found.
+  """
+  for name in IMPORT.value:
+    if not all(part.isidentifier() for part in name.split('.')):
+      raise errors.SpecError(
+          f'--import={name:.80}: not the name of a module; allowed are names'
+          ' such as my_registers or my_package.registers'
+      )
+    try:
+      importlib.import_module(name)
+    except ModuleNotFoundError as error:
+      raise errors.SpecError(
+          f'--import={name}: {error}; allowed are modules in the working'
+          ' directory and installed ones'
+      ) from error
+
+
+def import_arguments() -> list[str]:
+  """Returns command-line arguments with which a program imports the same."""
+  return [f'--import={name}' for name in IMPORT.value]
+
+
+def num_episodes() -> int:
+  """Returns the number of episodes per seed."""
+  return EPISODES.value or _NUM_EPISODES
+
+
+def seeds() -> tuple[int, ...]:
+  """Returns the seeds that a number or a list of seeds describes.
+
+  Raises:
+    SpecError: If it is neither.
+  """
+  text = SEEDS.value
+  is_list = ',' in text
+  parts = [part.strip() for part in text.split(',') if part.strip()]
+  # At most as many digits as the largest seed: `int` rejects thousands.
+  numbers = [int(part) for part in parts if re.fullmatch('[0-9]{1,10}', part)]
+  least, most = (0, LARGEST_SEED) if is_list else (1, _MOST_SEEDS)
+  if not (
+      parts
+      and len(numbers) == len(parts)
+      and all(least <= number <= most for number in numbers)
+  ):
+    raise errors.SpecError(
+        f'--seeds={text:.40}: allowed are a number from 1 to {_MOST_SEEDS},'
+        f' such as 5, and a list of seeds from 0 to {LARGEST_SEED}, such as'
+        ' 3,4,5'
+    )
+  return tuple(numbers) if is_list else tuple(range(numbers[0]))
+
+
+def domain_and_task() -> tuple[str, str]:
+  """Returns the names of the domain and the task.
+
+  Raises:
+    SpecError: If the flags name two domains.
+  """
+  domain, dot, task = TASK.value.rpartition('.')
+  if not dot:
+    return DOMAIN.value, task
+  if DOMAIN.present and DOMAIN.value != domain:
+    raise errors.SpecError(
+        f'--task={TASK.value} is not a task of --domain={DOMAIN.value}'
+    )
+  return domain, task
+
+
+def world() -> 'worlds.World':
+  """Returns the world that the flags describe.
+
+  Raises:
+    SpecError: If the flags name two domains, or the arguments of the task are
+      not a YAML mapping or contain the seed.
+  """
+  from realab_suite import worlds
+
+  kwargs = loading.parse_yaml(TASK_KWARGS.value, '--task_kwargs')
+  if 'random' in kwargs:
+    raise errors.SpecError(
+        '--task_kwargs: random: seeds have flags of their own; allowed are'
+        ' arguments of the task'
+    )
+  return worlds.World(
+      *domain_and_task(),
+      MAX_STEPS.value,
+      kwargs,
+      None if SENSES.value is None else tuple(SENSES.value),
+  )
+
+
+def design() -> 'specs.DesignSpec':
+  """Returns the design that the flags describe, with its overrides."""
+  from realab_suite.feedback import specs
+
+  return specs.load(DESIGN.value, tuple(SET.value))
+
+
+def find_run(runs: Mapping[str, _Run]) -> _Run:
+  """Returns the run of a sweep that the flags name.
+
+  Args:
+    runs: Runs of the sweep by name.
+
+  Raises:
+    UnknownNameError: If there is no such run.
+  """
+  name = RUN.value
+  if name not in runs:
+    raise errors.UnknownNameError(
+        f'--run={name:.80}: not a run of {INPUT.value}; allowed are'
+        f' {list(runs)}{messages.did_you_mean(name, runs)}'
+    )
+  return runs[name]

@@ -1,1 +1,0 @@
-"""Flags shared by several programs."""
