@@ -110,11 +110,11 @@ def make(
       action_set_version=actions.version,
       features=seen,
       hidden=tuple(weight.shape[1] for weight in weights[:-1]),
-      made=network_files.Made(
+      made=dict(
           learner=dict(recipe.learner),
           task=f'{_DOMAIN}.{_VARIATION}',
           design=_DESIGN,
-          overrides=_OVERRIDES,
+          overrides=list(_OVERRIDES),
           design_digest=design.digest(),
           num_envs=num_envs,
           steps=recipe.steps,
@@ -225,7 +225,7 @@ def evaluate_policy(
 
 def _evaluate(
     network: network_files.Network, variation: str, num_episodes: int
-) -> network_files.Reached:
+) -> dict[str, Any]:
   """Returns the true return of the policy that takes the best actions."""
   policy = network_policies.NetworkDemonstrator(network)
   episodes = evaluate_policy(policy, variation, num_episodes, _EVALUATION_SEED)
@@ -233,7 +233,7 @@ def _evaluate(
       {_EVALUATION_SEED: [episode.true_return for episode in episodes]},
       bounds=comparison.return_bounds(episodes),
   )
-  return network_files.Reached(
+  return dict(
       task=f'{_DOMAIN}.{variation}',
       mean=interval.estimate,
       low=interval.low,

@@ -45,8 +45,9 @@ def main(argv: Sequence[str]) -> None:
     network = network_training.make(recipe)
     for reached in network.header.reached:
       program.say(
-          f'{name}: true return {reached.mean:.2f} [{reached.low:.2f},'
-          f' {reached.high:.2f}] in {reached.task}'
+          f'{name}: true return {reached["mean"]:.2f}'
+          f' [{reached["low"]:.2f}, {reached["high"]:.2f}] in'
+          f' {reached["task"]}'
       )
     storage.write_whole(paths[name], network.to_bytes())
     program.say(f'{paths[name]} written')

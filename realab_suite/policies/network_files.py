@@ -5,17 +5,17 @@ outputs of a network, its training and its true return. `network_policies`
 computes the outputs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import dataclasses
 import hashlib
 from importlib import resources
 import io
+import itertools
 import json
 import math
 import os
 from typing import Annotated, Any, Literal, final
 import zipfile
-import zlib
 
 import numpy as np
 import pydantic
@@ -29,7 +29,6 @@ _HEADER = 'header'
 _MAX_BYTES = 2**22
 _Count = Annotated[int, pydantic.Field(ge=1, le=2**16)]
 _Sizes = Annotated[tuple[_Count, ...], pydantic.Field(strict=False)]
-_Texts = Annotated[tuple[str, ...], pydantic.Field(strict=False)]
 _Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 
 
@@ -76,56 +75,6 @@ class Feature(_Part):
 
 
 @final
-class Reached(_Part):
-  """Mean true return with an interval over episodes.
-
-  Attributes:
-    task: Name of the task, as in `unlock_door.near`.
-    mean: Mean true return.
-    low: Lower bound of the interval.
-    high: Upper bound of the interval.
-    level: Confidence level of the interval.
-    episodes: Number of episodes, one in each world of a batch.
-    seed: Seed of the batch.
-  """
-
-  task: str
-  mean: _Finite
-  low: _Finite
-  high: _Finite
-  level: _Finite
-  episodes: _Count
-  seed: int
-
-
-@final
-class Made(_Part):
-  """Record of the training of a network.
-
-  Attributes:
-    learner: Options of the learner.
-    task: Name of the task.
-    design: Name of the agent design.
-    overrides: Overrides of the design.
-    design_digest: Digest of the design with its overrides.
-    num_envs: Number of worlds.
-    steps: Number of control steps in all worlds together.
-    seed: Seed of the learner and of the worlds.
-    versions: Versions of packages, by name.
-  """
-
-  learner: dict[str, Any]
-  task: str
-  design: str
-  overrides: _Texts
-  design_digest: str
-  num_envs: _Count
-  steps: int
-  seed: int
-  versions: dict[str, str]
-
-
-@final
 class Header(_Part):
   """Header of a file: description of a network.
 
@@ -138,8 +87,10 @@ class Header(_Part):
     action_set_version: Version of the action set.
     features: Encoded parts of the observation, in the order of the inputs.
     hidden: Widths of the hidden layers.
-    made: Record of the training.
-    reached: True returns of the policy that takes the best action.
+    made: Record of the training, as plain data: the learner, the task, the
+      design, the steps, the seed and the versions of packages.
+    reached: True returns of the policy that takes the best action, as plain
+      data: the task, the mean with its interval, and the episodes.
   """
 
   format: Literal[1] = 1
@@ -151,8 +102,8 @@ class Header(_Part):
       tuple[Feature, ...], pydantic.Field(strict=False, min_length=1)
   ]
   hidden: _Sizes
-  made: Made
-  reached: Annotated[tuple[Reached, ...], pydantic.Field(strict=False)]
+  made: dict[str, Any]
+  reached: Annotated[tuple[dict[str, Any], ...], pydantic.Field(strict=False)]
 
   @pydantic.model_validator(mode='after')
   def _known(self) -> 'Header':
@@ -269,7 +220,13 @@ def from_bytes(data: bytes, where: str) -> Network:
     raise location.error('not a network: header: must be a mapping')
   digest = content.pop('sha256', None)
   header = validation.validate(Header, content, where)
-  network = Network(header, *_layers(arrays, header.sizes(), location))
+  _check_arrays(arrays, header.sizes(), location)
+  layers = [_names(i) for i in range(len(arrays) // 2)]
+  network = Network(
+      header,
+      tuple(np.ascontiguousarray(arrays[weight]) for weight, _ in layers),
+      tuple(np.ascontiguousarray(arrays[bias]) for _, bias in layers),
+  )
   if network.digest() != digest:
     raise location.error(
         f'damaged: SHA-256 {network.digest()}; the header has {digest!r:.80}'
@@ -281,42 +238,29 @@ def _read_archive(
     data: bytes, location: messages.Location
 ) -> dict[str, np.ndarray]:
   """Returns the arrays of an archive of limited size."""
-  too_large = location.error(f'larger than the {_MAX_BYTES} bytes of a network')
-  if len(data) > _MAX_BYTES:
-    raise too_large
+  size = len(data)
   try:
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-      size = sum(info.file_size for info in archive.infolist())
-    if size > _MAX_BYTES:
-      raise too_large
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-      return {name: np.asarray(arrays[name]) for name in arrays.files}
-  except errors.SpecError:
-    raise
-  # A damaged archive may require more memory than there is, or a password.
-  except (
-      ValueError,
-      OSError,
-      EOFError,
-      MemoryError,
-      RuntimeError,
-      zipfile.BadZipFile,
-      zlib.error,
-  ) as error:
+    if size <= _MAX_BYTES:
+      with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        size = sum(info.file_size for info in archive.infolist())
+    if size <= _MAX_BYTES:
+      with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return {name: np.asarray(arrays[name]) for name in arrays.files}
+  except Exception as error:  # Damage raises errors of many libraries.
     raise location.error(f'not a network: {error}') from error
+  raise location.error(f'larger than the {_MAX_BYTES} bytes of a network')
 
 
-def _layers(
-    arrays: dict[str, np.ndarray],
+def _check_arrays(
+    arrays: Mapping[str, np.ndarray],
     sizes: Sequence[int],
     location: messages.Location,
-) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-  """Returns weights and biases after checking their shapes."""
-  num_layers = len(sizes) - 1
+) -> None:
+  """Checks the names, shapes and values of weights and biases."""
   expected: dict[str, tuple[int, ...]] = {}
-  for i in range(num_layers):
+  for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
     weight, bias = _names(i)
-    expected |= {weight: (sizes[i], sizes[i + 1]), bias: (sizes[i + 1],)}
+    expected |= {weight: (inputs, outputs), bias: (outputs,)}
   if arrays.keys() != expected.keys():
     raise location.error(
         f'contains {sorted(arrays)}; its header describes {sorted(expected)}'
@@ -330,12 +274,6 @@ def _layers(
       )
     if not np.isfinite(array).all():
       raise location.error(f'{name}: all numbers must be finite')
-  return tuple(
-      tuple(
-          np.ascontiguousarray(arrays[_names(i)[j]]) for i in range(num_layers)
-      )
-      for j in range(2)
-  )  # type: ignore[return-value]
 
 
 def _names(layer: int) -> tuple[str, str]:

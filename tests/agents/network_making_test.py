@@ -18,8 +18,8 @@ def test_every_shipped_network_matches_its_recipe():
   for name, recipe in network_training.RECIPES.items():
     header = network_files.load(name).header
     assert header.description == recipe.description
-    assert header.made.learner == recipe.learner
-    assert header.made.steps == recipe.steps
+    assert header.made['learner'] == recipe.learner
+    assert header.made['steps'] == recipe.steps
     assert list(header.hidden) == recipe.learner['hidden']
 
 
@@ -34,8 +34,9 @@ def test_a_made_network_can_be_loaded():
   net = network_files.from_bytes(made.to_bytes(), 'small.npz')
   assert net.digest() == made.digest()
   assert net.header.hidden == (8,)
-  assert (net.header.made.steps, net.header.made.num_envs) == (16, 2)
-  assert [reached.episodes for reached in net.header.reached] == [2, 2, 2]
+  made = net.header.made
+  assert (made['steps'], made['num_envs']) == (16, 2)
+  assert [reached['episodes'] for reached in net.header.reached] == [2, 2, 2]
   seen = {feature.name for feature in net.header.features}
   assert {'senses/ray_classes', 'senses/velocity'} <= seen
   assert not any(name.startswith('registers/') for name in seen)

@@ -96,23 +96,24 @@ def test_a_shipped_network_is_small_and_records_its_training(name):
   net = network_files.load(path)
   assert net.to_bytes() == network_files.load(name).to_bytes()
   made = net.header.made
-  design = specs.load(made.design, made.overrides)
+  design = specs.load(made['design'], made['overrides'])
   assert design.channel == 'secure'
   assert (design.action_set.name, design.action_set.version) == (
       net.header.action_set,
       net.header.action_set_version,
   )
-  assert made.steps >= 1_000_000
-  assert {'mujoco', 'numpy', 'jax'} <= made.versions.keys()
+  assert made['steps'] >= 1_000_000
+  assert {'mujoco', 'numpy', 'jax'} <= made['versions'].keys()
   for feature in net.header.features:
     assert feature.name.startswith('senses/')
-  assert [reached.task for reached in net.header.reached] == [
+  assert [reached['task'] for reached in net.header.reached] == [
       'unlock_door.near', 'unlock_door.standard', 'unlock_door.far',
   ]  # fmt: skip
   for reached in net.header.reached:
-    assert 16 <= reached.low <= reached.mean <= reached.high <= 18
-    assert reached.level == 0.95
-    assert reached.episodes >= 100
+    low, mean, high = (reached[name] for name in ('low', 'mean', 'high'))
+    assert 16 <= low <= mean <= high <= 18
+    assert reached['level'] == 0.95
+    assert reached['episodes'] >= 100
 
 
 def test_a_shipped_network_reaches_its_return(shipped):
