@@ -65,7 +65,7 @@ def sweep(
         f'experiment {experiment.name!r} has no calibration_seeds'
     )
   planned = jobs.plan(experiment, seeds)
-  wanted = jobs.plan(experiment, seeds, only)
+  wanted = jobs.plan(experiment, seeds, only) if only else planned
   with storage.explained(output):
     (output / LOGS).mkdir(parents=True, exist_ok=True)
   lock = storage.lock(output)

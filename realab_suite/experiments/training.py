@@ -301,10 +301,8 @@ class _Training:
     here = {**machines.here(), **learner.settings()}
     step = self._done * self._num_envs
     if saved is not None:
-      # Checkpoints of older versions do not contain machines.
-      self._machines = saved.get('machines', [])
-      there = self._machines[-1]['machine'] if self._machines else {}
-      differences = machines.differences(there, here)
+      self._machines = saved['machines']
+      differences = machines.differences(self._machines[-1]['machine'], here)
       if not differences:
         return
       logging.warning(

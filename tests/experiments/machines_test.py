@@ -110,14 +110,6 @@ def _machines(output: pathlib.Path) -> list[tuple[int, str]]:
   return [(e['step'], e['machine']['processor']) for e in done['machines']]
 
 
-def _files(folder: pathlib.Path) -> dict[pathlib.Path, bytes]:
-  return {
-      path: path.read_bytes()
-      for path in folder.rglob('*')
-      if path.is_file() and path.name != 'lock'
-  }
-
-
 def _warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
   return [one.message for one in caplog.records if one.levelname == 'WARNING']
 
@@ -165,34 +157,6 @@ def test_evaluation_on_another_machine_is_recorded(
   on('new', tmp_path)
   assert 'continues from step 80 on another' in _warnings(caplog)[0]
   assert _machines(tmp_path) == [(0, 'old'), (80, 'new')]
-
-
-def test_a_run_without_a_checkpoint_may_begin_anywhere(on, tmp_path, caplog):
-  on('old', tmp_path, kill_at=5)
-  on('new', tmp_path)
-  assert not _warnings(caplog)
-  assert _machines(tmp_path) == [(0, 'new')]
-
-
-def test_a_finished_run_is_finished_on_every_machine(on, tmp_path):
-  on('old', tmp_path)
-  before = _files(tmp_path)
-  [line] = on('new', tmp_path)
-  assert line.endswith('has finished already')
-  assert _files(tmp_path) == before
-
-
-def test_a_checkpoint_without_a_machine_counts_as_another(on, tmp_path, caplog):
-  on('old', tmp_path, kill_at=25)
-  folder = tmp_path / _job().folder()
-  header = training.header(_job().digest(), 'checkpoint')
-  for path in (folder / 'checkpoints').iterdir():
-    contents = storage.read_archive(path, header)
-    del contents['machines']
-    storage.write_archive(path, header, contents)
-  on('old', tmp_path)
-  assert "processor is None there, 'old' here" in _warnings(caplog)[0]
-  assert _machines(tmp_path) == [(40, 'old')]
 
 
 def test_settings_of_the_learner_are_part_of_the_machine(

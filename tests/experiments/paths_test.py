@@ -190,14 +190,6 @@ def test_a_design_within_the_working_directory_may_be_named(
     assert loaded.runs['one'].load(is_confined=True).name == 'd'
 
 
-def test_a_forged_done_file_leads_nowhere(tmp_path: pathlib.Path):
-  storage.write_done(tmp_path, {'files': {'../x': '0' * 64}})
-  with pytest.raises(
-      errors.ResultsError, match=r"'\.\./x' is not a file of a run"
-  ):
-    storage.is_done(tmp_path)
-
-
 def test_no_module_reads_a_model_from_a_file_or_a_text():
   # What a design or an experiment says never becomes MJCF, and no `.mjb` is
   # ever loaded: includes, meshes and entities cannot lead anywhere.

@@ -181,6 +181,7 @@ def test_a_folder_that_is_not_empty_is_refused(tmp_path):
         ({'policies': ()}, 'needs a policy'),
         ({'policies': ('no_op', 'no_op')}, 'duplicates'),
         ({'seeds': ()}, 'needs a policy, a seed'),
+        ({'seeds': (3, 4, 3)}, r'\[3, 4, 3\] has duplicates'),
         ({'num_episodes': 0}, '0 episodes'),
         ({'max_steps': 0}, 'max_steps'),
         ({'channels': ('safe',)}, "'safe'"),

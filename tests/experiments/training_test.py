@@ -6,13 +6,9 @@ import json
 import os
 import pathlib
 import shutil
-import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-import yaml
 
 from realab_suite import errors
 from realab_suite import suite
@@ -24,7 +20,6 @@ from realab_suite.experiments import jobs
 from realab_suite.experiments import kept_stakes
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
-from tests import patience
 from tests.experiments import fake_learner
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -320,33 +315,6 @@ def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
   for step in (20, 25):
     _kill(_job(sleep=True), tmp_path, monkeypatch, step)
   assert _results(_run(_job(sleep=True), tmp_path)[0]) == _results(path)
-
-
-def test_a_run_killed_by_sigkill_has_the_same_results(whole, tmp_path):
-  file = tmp_path / 'small.yaml'
-  file.write_text(yaml.safe_dump(_SMALL))
-  command = [
-      sys.executable, '-m', 'tests.experiments.fake_learner',
-      f'--experiment={file}', '--run=reward', '--seed=3',
-      f'--output={tmp_path / "killed"}',
-  ]  # fmt: skip
-  killed, again = (
-      subprocess.run(
-          command,
-          cwd=_ROOT,
-          env={**os.environ, **environment},
-          capture_output=True,
-          text=True,
-          timeout=patience.SECONDS,
-          check=False,
-      )
-      for environment in ({'KILL_AT': 'step:33'}, {})
-  )
-  assert killed.returncode == -signal.SIGKILL, killed.stderr
-  assert again.returncode == 0, again.stderr
-  path = tmp_path / 'killed' / whole.name
-  assert again.stdout.splitlines()[-1] == f'Results are in {path}'
-  assert _results(path) == _results(whole)
 
 
 def test_a_finished_run_is_not_repeated(whole, tmp_path):

@@ -132,13 +132,6 @@ def test_the_most_and_the_largest_seeds_are_accepted():
     experiment_specs.load({**_EXPERIMENT, 'seeds': [flags.LARGEST_SEED + 1]})
 
 
-def test_a_seed_given_twice_is_refused(tmp_path):
-  settings = small.settings(tmp_path / 'new', seeds=_seeds('3,4,3'))
-  with pytest.raises(errors.SpecError, match=r'\[3, 4, 3\] has duplicates'):
-    scripted.run(settings, lambda line: None)
-  assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
     'argument',
     [
@@ -161,28 +154,6 @@ def test_wrong_names_of_modules_are_refused(name):
     absl_flags.FLAGS(['program', f'--import={name}'])
     with pytest.raises(errors.SpecError, match='not the name of a module'):
       flags.load_imports()
-
-
-@pytest.mark.parametrize(
-    ('flag', 'values'),
-    [(flags.OUTPUT, ['', None]), (flags.EXPERIMENT, ['', None])],
-)
-def test_an_empty_flag_counts_as_missing(flag, values):
-  for value in values:
-    with flagsaver.flagsaver(**{flag.name: value}):
-      with pytest.raises(errors.SpecError, match=f'--{flag.name}: missing'):
-        flags.required(flag)
-
-
-@pytest.mark.parametrize(
-    'empty', ['policies', 'seeds', 'num_episodes', 'channels']
-)
-def test_empty_lists_are_refused(tmp_path, empty):
-  values = {'num_episodes': 0, 'channels': ('',)}
-  settings = small.settings(tmp_path / 'new', **{empty: values.get(empty, ())})
-  with pytest.raises(errors.SpecError):
-    scripted.run(settings, lambda line: None)
-  assert not list(tmp_path.iterdir())
 
 
 def test_every_launcher_imports_the_user_s_module(tmp_path):
