@@ -46,7 +46,7 @@ class TimeStep(Protocol):
     """Observations by name, each `(worlds, ...)`."""
 
 
-class Options(pydantic.BaseModel):
+class Options(validation.Model):
   """Options of every learner.
 
   Attributes:
@@ -56,8 +56,6 @@ class Options(pydantic.BaseModel):
     max_gradient_norm: Maximum norm of gradients. Longer gradients are scaled
       down.
   """
-
-  model_config = pydantic.ConfigDict(frozen=True, extra='forbid', strict=True)
 
   kind: str
   hidden: Annotated[tuple[Positive, ...], pydantic.Field(strict=False)] = (

@@ -2,8 +2,9 @@
 
 A description is a YAML file, or a mapping of the same shape. The YAML library
 constructs no objects: it only splits the text into events, and this module
-builds mappings, lists, strings, numbers, booleans and nulls from them. Anchors,
-aliases, tags and directives are refused.
+builds mappings, lists, strings, numbers, booleans and nulls from them. (The
+library's own composer overflows the stack of the process on a text of many
+brackets.) Anchors, aliases, tags and directives are refused.
 
 Unquoted `true`, `false`, `null`, `~`, plain decimal integers and decimal floats
 (including `1e3`) have their usual meaning. Other words that YAML 1.1 converts,
@@ -12,18 +13,15 @@ such as `yes`, `012`, `1:30`, `0x1f` or `2024-01-01`, are refused, because YAML
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-import dataclasses
 import math
 import os
 import re
 import sys
-import typing
-from typing import Any
+from typing import Any, final
 import unicodedata
 
 import yaml
 
-from realab_suite import errors
 from realab_suite.config import messages
 
 _MAX_BYTES = 2**20
@@ -31,6 +29,9 @@ _MAX_DEPTH = 32
 _MAX_ENTRIES = 1000
 # In all collections together; bounds mappings that contain one list many times.
 _MAX_VALUES = 100_000
+_TOO_DEEP = f'nested deeper than {_MAX_DEPTH}'
+_TOO_LONG = f'more than {_MAX_ENTRIES} entries'
+_TOO_MANY = f'more than {_MAX_VALUES} values in all'
 # Larger integers are not exact as floats, and a field may convert them.
 _MAX_INT = 2**53
 
@@ -38,9 +39,11 @@ _MAX_INT = 2**53
 # the byte order mark), surrogate, line separator and paragraph separator.
 _FORBIDDEN_CATEGORIES = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
 
-_NULL = re.compile(r'~|null|Null|NULL|')
-_TRUE = re.compile(r'true|True|TRUE')
-_FALSE = re.compile(r'false|False|FALSE')
+_WORDS = {
+    **dict.fromkeys(('', '~', 'null', 'Null', 'NULL')),
+    **dict.fromkeys(('true', 'True', 'TRUE'), True),
+    **dict.fromkeys(('false', 'False', 'FALSE'), False),
+}
 _INT = re.compile(r'[-+]?(0|[1-9][0-9]*)')
 _FLOAT = re.compile(
     r'(?P<mantissa>[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE])))'
@@ -55,6 +58,9 @@ _LEADS_ELSEWHERE = re.compile(
 )
 _YAML_1_1 = yaml.resolver.Resolver()
 _TEXT_TAG = 'tag:yaml.org,2002:str'
+
+_Path = tuple[str | int, ...]
+_Scalar = bool | int | float | str | None
 
 
 def read_mapping(
@@ -76,7 +82,7 @@ def read_mapping(
       such a file cannot contain.
   """
   if isinstance(source, Mapping):
-    return _copy_mapping(source, messages.Location(where or '<mapping>'))
+    return _copied(source, where or '<mapping>')
   if not isinstance(source, (str, os.PathLike)):
     raise messages.Location(where or '<mapping>').error(
         f'expected a path or a mapping, got {messages.quote(source)}'
@@ -97,16 +103,15 @@ def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
     SpecError: If the text is not YAML, not a mapping, or not allowed by this
       module's docstring. No text causes another error.
   """
-  documents = _documents(text, where)
-  if len(documents) != 1:
-    raise messages.Location(where).error(
-        f'expected a mapping at top level, got {len(documents)} documents'
-    )
-  if not isinstance(documents[0], dict):
-    raise messages.Location(where).error(
-        f'expected a mapping at top level, got {messages.quote(documents[0])}'
-    )
-  return documents[0]
+  documents = _Reader(text, where).documents()
+  if len(documents) == 1 and isinstance(documents[0], dict):
+    return documents[0]
+  got = f'{len(documents)} documents'
+  if len(documents) == 1:
+    got = messages.quote(documents[0])
+  raise messages.Location(where).error(
+      f'expected a mapping at top level, got {got}'
+  )
 
 
 def is_inside(path: str) -> bool:
@@ -139,148 +144,198 @@ def apply_overrides(
     SpecError: If an override is malformed, or if one of its keys leads into a
       value that is neither a mapping nor a list.
   """
-  result = _copy_mapping(data, messages.Location('<mapping>'))
+  result = _copied(data, '<mapping>')
   for override in overrides:
     location = messages.Location(f'override {messages.quote(override)}')
-    if not isinstance(override, str):
-      raise location.error('expected key=value, as a text')
-    _, equals, text = override.partition('=')
-    if not equals:
-      raise location.error('expected key=value')
-    keys = keys_of(override)
-    if not all(k.strip() for k in keys):
-      raise location.error('empty key')
-    documents = _documents(text, location.where)
-    if len(documents) != 1:
-      raise location.error(
-          f"expected one value (null, or '' for empty text), got"
-          f' {len(documents)}'
-      )
-    _assign(result, keys, documents[0], location)
+    keys, value = _split(override, location)
+    _assign(result, keys, value, location)
     # With the new value, the data may be too deep or have too many entries.
-    result = _copy_mapping(result, location)
+    result = _copied(result, location.where)
   return result
 
 
-def keys_of(override: str) -> list[str]:
-  """Returns the keys that lead to the value that an override sets."""
-  return override.partition('=')[0].split('.')
+def texts_in(overrides: Sequence[str]) -> set[str]:
+  """Returns the texts in the values of overrides, at any depth.
+
+  Args:
+    overrides: Overrides that `apply_overrides` accepts.
+  """
+  found: set[str] = set()
+  nodes = [
+      _split(override, messages.Location('override'))[1]
+      for override in overrides
+  ]
+  while nodes:
+    node = nodes.pop()
+    if isinstance(node, str):
+      found.add(node)
+    elif isinstance(node, dict):
+      nodes += [*node, *node.values()]
+    elif isinstance(node, list):
+      nodes += node
+  return found
 
 
-@typing.final
-@dataclasses.dataclass
-class _Frame:
-  """Mapping or list that is being built."""
-
-  container: dict[str, Any] | list[Any]
-  location: messages.Location
-  # The key without a value so far, and the lines of all keys so far.
-  key: str | None = None
-  key_lines: dict[str, int] = dataclasses.field(default_factory=dict)
-
-  @property
-  def expects_key(self) -> bool:
-    return isinstance(self.container, dict) and self.key is None
-
-  def next_location(self, line: int) -> messages.Location:
-    location = messages.Location(self.location.where, self.location.path, line)
-    if isinstance(self.container, list):
-      return location.child(len(self.container))
-    return location if self.key is None else location.child(self.key)
-
-  def add_key(self, key: Any, location: messages.Location) -> None:
-    key = _checked_key(key, location)
-    line = location.line or 0
-    if key in self.key_lines:
-      raise location.error(
-          f'duplicate key {messages.quote(key)} (lines'
-          f' {self.key_lines[key]} and {line})'
-      )
-    self.key = key
-    self.key_lines[key] = line
-
-  def add_value(self, value: Any) -> None:
-    _check_entries(len(self.container) + 1, self.location)
-    if isinstance(self.container, list):
-      self.container.append(value)
-    elif self.key is not None:
-      self.container[self.key] = value
-      self.key = None
+class _WrongValueError(ValueError):
+  """A value is not allowed; the reader of the value adds its location."""
 
 
-def _documents(text: str | bytes, where: str) -> list[Any]:
-  """Returns the value of each document; an empty text has no document."""
-  documents: list[Any] = []
-  # An explicit stack: Python's recursion limit must not limit the depth.
-  stack: list[_Frame] = []
-  budget = iter(range(_MAX_VALUES))
-  for event, line in _events(_decode(text, messages.Location(where)), where):
-    location = messages.Location(where, line=line)
-    if stack:
-      location = stack[-1].next_location(line)
-    if isinstance(event, yaml.DocumentStartEvent):
-      if event.version or event.tags:
-        raise location.error('directives are not allowed')
-    elif isinstance(event, yaml.CollectionEndEvent):
-      stack.pop()
-    elif isinstance(event, yaml.NodeEvent):
-      value = _node_value(event, location)
-      if not stack:
-        documents.append(value)
-      elif stack[-1].expects_key:
-        stack[-1].add_key(value, location)
-      else:
-        _spend(budget, location)
-        stack[-1].add_value(value)
-      if isinstance(value, (dict, list)):
-        _check_depth(len(stack) + 1, location)
-        stack.append(_Frame(value, location))
-  return documents
+@final
+class _Reader:
+  """Builds the values of the documents in a YAML text."""
 
+  def __init__(self, text: str | bytes, where: str) -> None:
+    self._where = where
+    self._loader = yaml.CSafeLoader(_decoded(text, messages.Location(where)))
+    self._num_values = 0
 
-def _node_value(event: Any, location: messages.Location) -> Any:
-  """Returns the scalar, or the new empty collection, of an event."""
-  if event.anchor is not None:
-    raise location.error('anchors and aliases are not allowed')
-  if event.tag is not None:
-    raise location.error(f'tag {messages.quote(event.tag)} not allowed')
-  if isinstance(event, yaml.SequenceStartEvent):
-    return []
-  if isinstance(event, yaml.MappingStartEvent):
-    return {}
-  is_plain = event.implicit[0]
-  value = _resolve(event.value, location) if is_plain else event.value
-  return _checked_scalar(value, location)
+  def documents(self) -> list[Any]:
+    """Returns the value of each document; an empty text has no document."""
+    values = []
+    try:
+      while (event := self._next_event()) is not None:
+        if isinstance(event, yaml.DocumentStartEvent):
+          if event.version or event.tags:
+            raise self._at(event, ()).error('directives are not allowed')
+          values.append(self._value(self._next_event(), ()))
+    finally:
+      self._loader.dispose()
+    return values
 
+  def _next_event(self) -> Any:
+    try:
+      return self._loader.get_event()
+    except yaml.MarkedYAMLError as error:
+      mark = error.problem_mark
+      line = None if mark is None else mark.line + 1
+      raise messages.Location(self._where, line=line).error(
+          f'{error.problem}'
+      ) from None
+    # A tag with escaped bytes that are not UTF-8 is a UnicodeDecodeError.
+    except (yaml.YAMLError, UnicodeError) as error:
+      problem = ' '.join(str(error).split())
+      raise messages.Location(self._where).error(
+          f'not YAML: {problem}'
+      ) from None
 
-def _events(text: str, where: str) -> Iterator[tuple[Any, int]]:
-  """Yields the events of the YAML parser, each with its line."""
-  loader = yaml.CSafeLoader(text)
-  try:
-    while True:
+  def _at(self, event: Any, path: _Path) -> messages.Location:
+    return messages.Location(self._where, path, event.start_mark.line + 1)
+
+  def _value(self, event: Any, path: _Path) -> Any:
+    """Returns the value that begins with an event.
+
+    Args:
+      event: First event of the value.
+      path: Keys and indices that lead to the value.
+    """
+    try:
+      if event.anchor is not None:
+        raise _WrongValueError('anchors and aliases are not allowed')
+      if event.tag is not None:
+        raise _WrongValueError(f'tag {messages.quote(event.tag)} not allowed')
+      self._num_values += 1
+      if self._num_values > _MAX_VALUES:
+        raise _WrongValueError(_TOO_MANY)
+      if isinstance(event, yaml.ScalarEvent):
+        is_plain = event.implicit[0]
+        return _checked_scalar(
+            _resolved(event.value) if is_plain else event.value
+        )
+      if len(path) >= _MAX_DEPTH:
+        raise _WrongValueError(_TOO_DEEP)
+      if isinstance(event, yaml.SequenceStartEvent):
+        return self._list(path)
+      return self._mapping(path)
+    except _WrongValueError as error:
+      raise self._at(event, path).error(str(error)) from None
+
+  def _list(self, path: _Path) -> list[Any]:
+    values: list[Any] = []
+    while not isinstance(event := self._next_event(), yaml.SequenceEndEvent):
+      values.append(self._value(event, (*path, len(values))))
+      if len(values) > _MAX_ENTRIES:
+        raise _WrongValueError(_TOO_LONG)
+    return values
+
+  def _mapping(self, path: _Path) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    lines: dict[str, int] = {}
+    while not isinstance(event := self._next_event(), yaml.MappingEndEvent):
+      line = event.start_mark.line + 1
       try:
-        event = loader.get_event()
-      except yaml.MarkedYAMLError as error:
-        line = _line(error.problem_mark)
-        raise messages.Location(where, line=line).error(
-            f'{error.problem}'
-        ) from None
-      # A tag with escaped bytes that are not UTF-8 is a UnicodeDecodeError.
-      except (yaml.YAMLError, UnicodeError) as error:
-        problem = ' '.join(str(error).split())
-        raise messages.Location(where).error(f'not YAML: {problem}') from None
-      if event is None:
-        return
-      yield event, _line(event.start_mark) or 1
-  finally:
-    loader.dispose()
+        key = _checked_key(self._value(event, path))
+        if key in values:
+          raise _WrongValueError(
+              f'duplicate key {messages.quote(key)} (lines {lines[key]} and'
+              f' {line})'
+          )
+      except _WrongValueError as error:
+        raise self._at(event, path).error(str(error)) from None
+      lines[key] = line
+      values[key] = self._value(self._next_event(), (*path, key))
+      if len(values) > _MAX_ENTRIES:
+        raise _WrongValueError(_TOO_LONG)
+    return values
 
 
-def _line(mark: Any) -> int | None:
-  return None if mark is None else mark.line + 1
+def _copied(data: Mapping[Any, Any], where: str) -> dict[str, Any]:
+  """Returns a copy of a mapping as plain data, after checking its values."""
+  result: dict[str, Any] = _copy(data, where, (), iter(range(_MAX_VALUES)))
+  return result
 
 
-def _decode(text: str | bytes, location: messages.Location) -> str:
+def _copy(value: Any, where: str, path: _Path, budget: Iterator[int]) -> Any:
+  """Returns a copy of a value.
+
+  Args:
+    value: The value.
+    where: Name of the data in error messages.
+    path: Keys and indices that lead to the value.
+    budget: Iterator with an item for each value that the data may still have.
+  """
+  try:
+    if next(budget, None) is None:
+      raise _WrongValueError(_TOO_MANY)
+    is_mapping = isinstance(value, Mapping)
+    if not is_mapping and not isinstance(value, list | tuple):
+      return _checked_scalar(value)
+    if len(path) >= _MAX_DEPTH:
+      raise _WrongValueError(_TOO_DEEP)
+    if len(value) > _MAX_ENTRIES:
+      raise _WrongValueError(_TOO_LONG)
+    if is_mapping:
+      return {
+          _checked_key(key): _copy(item, where, (*path, key), budget)
+          for key, item in value.items()
+      }
+    return [
+        _copy(item, where, (*path, index), budget)
+        for index, item in enumerate(value)
+    ]
+  except _WrongValueError as error:
+    raise messages.Location(where, path).error(str(error)) from None
+
+
+def _split(override: str, location: messages.Location) -> tuple[list[str], Any]:
+  """Returns the keys of an override and its value."""
+  if not isinstance(override, str):
+    raise location.error('expected key=value, as a text')
+  name, equals, text = override.partition('=')
+  if not equals:
+    raise location.error('expected key=value')
+  keys = name.split('.')
+  if not all(key.strip() for key in keys):
+    raise location.error('empty key')
+  documents = _Reader(text, location.where).documents()
+  if len(documents) != 1:
+    raise location.error(
+        "expected one value (null, or '' for empty text), got"
+        f' {len(documents)}'
+    )
+  return keys, documents[0]
+
+
+def _decoded(text: str | bytes, location: messages.Location) -> str:
   """Returns the text with plain newlines, after checking its characters."""
   # Lone surrogates pass here, so that they are reported with their line.
   content = (
@@ -290,15 +345,20 @@ def _decode(text: str | bytes, location: messages.Location) -> str:
   try:
     text = content.decode('utf-8', 'surrogatepass')
   except UnicodeDecodeError as error:
-    line = content.count(b'\n', 0, error.start) + 1
-    raise dataclasses.replace(location, line=line).error(
+    number = content.count(b'\n', 0, error.start) + 1
+    raise messages.Location(location.where, (), number).error(
         f'not UTF-8 text: {error.reason}'
     ) from None
   text = text.replace('\r\n', '\n')
-  character = _forbidden_character(text)
-  if character is not None:
-    line = text.count('\n', 0, text.index(character)) + 1
-    raise _character_error(character, dataclasses.replace(location, line=line))
+  for number, line in enumerate(text.split('\n'), 1):
+    # Printable characters are in none of the forbidden categories.
+    if not line.isprintable():
+      try:
+        _check_characters(line)
+      except _WrongValueError as error:
+        raise messages.Location(location.where, (), number).error(
+            str(error)
+        ) from None
   return text
 
 
@@ -313,159 +373,88 @@ def _read_file(path: str, location: messages.Location) -> bytes:
       content = stream.read(_MAX_BYTES + 1)
   except OSError as error:
     raise location.error(f'cannot be read: {error.strerror}') from None
-  # The content counts if the file grows or reports no size.
+  # Checks the bytes read as well: a file may grow, or report no size.
   _check_size(max(size, len(content)), location)
   return content
 
 
-def _resolve(
-    text: str, location: messages.Location
-) -> bool | int | float | str | None:
+def _resolved(text: str) -> _Scalar:
   """Returns the value of an unquoted scalar."""
-  if _NULL.fullmatch(text):
-    return None
-  if _TRUE.fullmatch(text):
-    return True
-  if _FALSE.fullmatch(text):
-    return False
+  if text in _WORDS:
+    return _WORDS[text]
   if _INT.fullmatch(text):
     # Python cannot convert thousands of digits.
     if len(text.lstrip('+-')) > len(str(_MAX_INT)):
-      raise location.error(f'integer {messages.quote(text)} is out of range')
+      raise _WrongValueError(f'integer {messages.quote(text)} is out of range')
     return int(text)
   if match := _FLOAT.fullmatch(text):
     value = float(text)
     vanished = value == 0 and re.search('[1-9]', match['mantissa'])
     if math.isinf(value) or vanished:
-      raise location.error(f'number {messages.quote(text)} is out of range')
+      raise _WrongValueError(f'number {messages.quote(text)} is out of range')
     return value
   if _NOT_FINITE.fullmatch(text):
-    raise location.error(f'must be finite, got {text}')
+    raise _WrongValueError(f'must be finite, got {text}')
   tag = _YAML_1_1.resolve(yaml.ScalarNode, text, (True, False))
   if tag != _TEXT_TAG or _AMBIGUOUS.fullmatch(text):
-    raise location.error(
+    raise _WrongValueError(
         f'{messages.quote(text)} is ambiguous: quote it if it is text, or write'
         ' true, false or a plain decimal number'
     )
   return text
 
 
-def _copy_mapping(
-    data: Mapping[str, Any], location: messages.Location
-) -> dict[str, Any]:
-  budget = iter(range(_MAX_VALUES))
-  return {
-      key: _copy(value, location.child(key), 2, budget)
-      for key, value in _checked_items(data, location)
-  }
-
-
-def _copy(
-    value: Any, location: messages.Location, depth: int, budget: Iterator[int]
-) -> Any:
-  """Returns a copy of a value that `depth - 1` collections contain."""
-  _spend(budget, location)
-  if isinstance(value, Mapping):
-    _check_depth(depth, location)
-    return {
-        key: _copy(item, location.child(key), depth + 1, budget)
-        for key, item in _checked_items(value, location)
-    }
-  if isinstance(value, (list, tuple)):
-    _check_depth(depth, location)
-    _check_entries(len(value), location)
-    return [
-        _copy(item, location.child(index), depth + 1, budget)
-        for index, item in enumerate(value)
-    ]
-  return _checked_scalar(value, location)
-
-
-def _checked_items(
-    data: Mapping[Any, Any], location: messages.Location
-) -> Iterator[tuple[str, Any]]:
-  _check_entries(len(data), location)
-  for key, value in data.items():
-    yield _checked_key(key, location), value
-
-
-def _checked_key(key: Any, location: messages.Location) -> str:
+def _checked_key(key: Any) -> str:
   if not isinstance(key, str):
-    raise location.error(
+    raise _WrongValueError(
         f'keys must be strings, got {messages.quote(key)} (quote it)'
     )
   if '\n' in key:
-    raise location.error(f'keys must be one line, got {messages.quote(key)}')
-  return typing.cast(str, _checked_scalar(key, location))
+    raise _WrongValueError(f'keys must be one line, got {messages.quote(key)}')
+  return str(_checked_scalar(key))
 
 
-def _checked_scalar(
-    value: Any, location: messages.Location
-) -> bool | int | float | str | None:
+def _checked_scalar(value: Any) -> _Scalar:
   """Returns a value as exactly one of the plain types."""
+  if isinstance(value, str):
+    if not value.isprintable():
+      _check_characters(value)
+    # Not str(value): a subclass, such as a text enum, may override it.
+    return str.__str__(value)
   if value is None or isinstance(value, bool):
     return value
   if isinstance(value, int):
     if abs(value) > _MAX_INT:
-      raise location.error(f'integer {messages.quote(value)} is out of range')
+      raise _WrongValueError(f'integer {messages.quote(value)} is out of range')
     return int(value)
   if isinstance(value, float):
     if not math.isfinite(value):
-      raise location.error(f'must be finite, got {value}')
+      raise _WrongValueError(f'must be finite, got {value}')
     # MuJoCo's parser reports a subnormal number as out of range.
     if 0 < abs(value) < sys.float_info.min:
-      raise location.error(f'number {value} is out of range')
+      raise _WrongValueError(f'number {value} is out of range')
     # Adding 0.0 turns -0.0 into 0.0: equal descriptions have equal texts.
     return float(value) + 0.0
-  if isinstance(value, str):
-    character = _forbidden_character(value)
-    if character is not None:
-      raise _character_error(character, location)
-    # Not str(value): a subclass, such as a text enum, may override it.
-    return str.__str__(value)
-  raise location.error(
+  raise _WrongValueError(
       'expected a mapping, list, string, number, boolean or null, got'
       f' {messages.quote(value)}'
   )
 
 
-def _forbidden_character(text: str) -> str | None:
-  """Returns the first forbidden character of a text; newlines are allowed."""
-  found = {
-      c
-      for c in set(text) - {'\n'}
-      if unicodedata.category(c) in _FORBIDDEN_CATEGORIES
-  }
-  return min(found, key=text.index, default=None)
-
-
-def _character_error(
-    character: str, location: messages.Location
-) -> errors.SpecError:
-  if character == '\t':
-    return location.error('tab is not allowed (use spaces)')
-  return location.error(f'character U+{ord(character):04X} is not allowed')
+def _check_characters(text: str) -> None:
+  """Checks that a text contains only printable characters and newlines."""
+  for character in dict.fromkeys(text):
+    if character == '\t':
+      raise _WrongValueError('tab is not allowed (use spaces)')
+    category = unicodedata.category(character)
+    if character != '\n' and category in _FORBIDDEN_CATEGORIES:
+      raise _WrongValueError(f'character U+{ord(character):04X} is not allowed')
 
 
 def _check_size(size: int, location: messages.Location) -> None:
   if size > _MAX_BYTES:
     tenths = math.ceil(10 * size / _MAX_BYTES)
     raise location.error(f'file is {tenths / 10} MiB, limit 1 MiB')
-
-
-def _check_depth(depth: int, location: messages.Location) -> None:
-  if depth > _MAX_DEPTH:
-    raise location.error(f'nested deeper than {_MAX_DEPTH}')
-
-
-def _spend(budget: Iterator[int], location: messages.Location) -> None:
-  if next(budget, None) is None:
-    raise location.error(f'more than {_MAX_VALUES} values in all')
-
-
-def _check_entries(count: int, location: messages.Location) -> None:
-  if count > _MAX_ENTRIES:
-    raise location.error(f'more than {_MAX_ENTRIES} entries')
 
 
 def _assign(

@@ -1,10 +1,12 @@
-"""Names and types of options: keyword arguments of registered classes.
+"""Types of fields and options that depend on registries or name files.
 
 A design names a policy, a value function or a kind of register, and gives it
-`options`. The parameters of the class declare the options, and their
-annotations declare the types, including constraints such as
-`Annotated[float, pydantic.Field(gt=0)]`. An option that is the path of a file
-has the type `FilePath`; `validation` checks whether it may be opened.
+`options`. The parameters of its constructor are its options, and their
+annotations are types for pydantic, with constraints such as
+`Annotated[float, pydantic.Field(gt=0)]`. Providers, measurements and learners
+declare fields of pydantic models instead, which are the parameters of their
+constructors as well. An option that is the path of a file has the type
+`FilePath`.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -22,16 +24,15 @@ import pydantic
 from pydantic_core import core_schema
 
 from realab_suite import errors
+from realab_suite.config import messages
 from realab_suite.config import registry
+from realab_suite.config import validation
 
-_IS_PATH = object()
-
-FilePath = Annotated[str, _IS_PATH]
+FilePath = Annotated[str, pydantic.AfterValidator(validation.check_path)]
 """Path of a file.
 
-`specs.load` finds options and fields of this type at any depth of a design. It
-refuses paths in a file that lead out of the working directory, before any of
-them is opened. `os.PathLike` and `pathlib.Path` declare paths as well.
+`validation` refuses paths in a file that lead out of the working directory, at
+any depth of models and options, before any of them is opened.
 """
 
 # Types of the values that a file can contain.
@@ -60,6 +61,59 @@ class NameIn:
     except errors.UnknownNameError as error:
       raise ValueError(str(error)) from error
     return name
+
+
+@final
+class ModelIn:
+  """Annotation of a field that is validated as the class of its `kind`.
+
+  It is a union that is discriminated by the kind, of the pydantic models that a
+  registry contains when the field is validated.
+  """
+
+  def __init__(
+      self, models: registry.Registry[Any], *, or_name: Any = None
+  ) -> None:
+    """Makes the annotation.
+
+    Args:
+      models: Registry of pydantic models with a literal field `kind`.
+      or_name: Type of a string that the field may contain instead; `None` for
+        no string.
+    """
+    self._models = models
+    self._name = None if or_name is None else pydantic.TypeAdapter(or_name)
+    self._kind: Any = pydantic.create_model(
+        'Kind', kind=Annotated[str, pydantic.Strict(), NameIn(models)]
+    )
+
+  def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+    del source, handler
+    return core_schema.with_info_plain_validator_function(self._validated)
+
+  def _validated(self, value: Any, info: pydantic.ValidationInfo) -> Any:
+    if isinstance(value, pydantic.BaseModel):
+      return value
+    if self._name is not None:
+      if isinstance(value, str):
+        return self._name.validate_python(value)
+      if not isinstance(value, Mapping):
+        raise ValueError('must be a name, or a mapping with a kind')
+    kind = self._kind.model_validate(value).kind
+    return self._models.get(kind).model_validate(value, context=info.context)
+
+  def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+    del schema
+    models = (self._models.get(kind) for kind in self._models)
+    union: Any = functools.reduce(operator.or_, models)
+    found = handler(
+        pydantic.TypeAdapter(
+            Annotated[union, pydantic.Field(discriminator='kind')]
+        ).core_schema
+    )
+    if self._name is None:
+      return found
+    return {'anyOf': [self._name.json_schema(), found]}
 
 
 @final
@@ -93,57 +147,35 @@ class OptionsOf:
     self._method = method
     self._reserved = reserved
 
-  def members(self, siblings: Mapping[str, Any]) -> 'list[Options]':
-    """Returns the options as a type, for `annotations`."""
-    try:
-      declared = self._declared(siblings)
-    except ValueError:  # Validation reports it.
-      return []
-    return [] if declared is None else [declared]
-
-  def _declared(self, siblings: Mapping[str, Any]) -> 'Options | None':
-    """Returns the declared options, or `None` if the name is unknown.
-
-    Args:
-      siblings: Values of the fields or options beside this one, by name.
-
-    Raises:
-      ValueError: If the declaration of the options cannot be read.
-    """
-    name = siblings.get(self._field)
-    if not isinstance(name, str) or name not in self._names:
-      return None
-    try:
-      return declared_by(self._names.get(name), self._method, self._reserved)
-    except (NameError, TypeError, ValueError) as error:
-      raise _unreadable(name, error) from error
-
   def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
     return core_schema.with_info_after_validator_function(
         self._validated, handler(source)
     )
 
   def _validated(self, value: Any, info: pydantic.ValidationInfo) -> Any:
-    siblings = info.data or {}
-    declared = self._declared(siblings) if value else None
-    if declared is not None:
-      try:
-        declared.check(value)
-      except NameError as error:
-        raise _unreadable(siblings[self._field], error) from error
+    name = info.data.get(self._field)
+    if not value or name is None:  # Another problem is reported then.
+      return value
+    try:
+      # JSON has the types of a file: a list may become a tuple, but a string
+      # never becomes a number.
+      text = json.dumps(value)
+    except TypeError as error:
+      raise ValueError(f'expected plain data: {error}') from error
+    factory = self._names.get(name)
+    try:
+      options = _options(factory, self._method, self._reserved)
+    except (NameError, TypeError) as error:
+      raise ValueError(
+          f'the options of {name!r} cannot be read from its signature: {error}'
+      ) from error
+    options.check(text, info.context)
     return value
 
 
 @final
-class Options:
-  """Options that a class or function declares.
-
-  Attributes:
-    annotations: Types, by name; `Any` for an option without annotation.
-    defaults: Values of optional options, by name.
-    others: Type of options with any other name, or `None` if no other name is
-      allowed.
-  """
+class _Options:
+  """Options that a class or function declares."""
 
   def __init__(
       self,
@@ -151,56 +183,57 @@ class Options:
       defaults: Mapping[str, Any],
       others: Any,
   ) -> None:
-    self.annotations = annotations
-    self.defaults = defaults
-    self.others = others
-
-  def check(self, given: Mapping[str, Any]) -> None:
-    """Checks the names of options, and the types that plain data can have.
+    """Makes the type of the options.
 
     Args:
-      given: Plain data, as in a file.
+      annotations: Types of the options, by name.
+      defaults: Values of optional options, by name.
+      others: Type of options with any other name, or `None` if no other name is
+        allowed.
+    """
+    self._annotations = annotations
+    self._defaults = defaults
+    self._others = others
+    self._adapter = pydantic.TypeAdapter(Annotated[Any, self])
+
+  def check(self, text: str, context: Any) -> None:
+    """Checks options that are given as JSON.
 
     Raises:
-      NameError: If a type is a string that names no type.
-      ValueError: If an option is unknown, missing or of another type, or is not
-        plain data.
+      ValidationError: If an option is unknown, missing or of another type.
     """
     try:
-      text = json.dumps(given)
-    except TypeError as error:
-      raise ValueError(f'expected plain data: {error}') from error
-    # JSON has the types of a file: a list may become a tuple, but a string
-    # never becomes a number.
-    adapter = pydantic.TypeAdapter(Annotated[Any, self])
-    adapter.validate_json(text, strict=True)
+      self._adapter.validate_json(text, strict=True, context=context)
+    except pydantic.ValidationError as error:
+      raise validation.with_allowed_keys(error, self._annotations) from None
 
   def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
     del source
     fields = {}
-    for name, annotation in self.annotations.items():
+    for name, annotation in self._annotations.items():
       schema = _schema(annotation, handler)
-      if name in self.defaults:
+      if name in self._defaults:
         schema = core_schema.with_default_schema(
-            schema, default=self.defaults[name]
+            schema, default=self._defaults[name]
         )
       fields[name] = core_schema.typed_dict_field(
-          schema, required=name not in self.defaults
+          schema, required=name not in self._defaults
       )
-    if self.others is None:
+    if self._others is None:
       return core_schema.typed_dict_schema(fields, extra_behavior='forbid')
     return core_schema.typed_dict_schema(
         fields,
-        extras_schema=_schema(self.others, handler),
+        extras_schema=_schema(self._others, handler),
         extra_behavior='allow',
     )
 
 
-def declared_by(
+@functools.cache
+def _options(
     factory: Callable[..., Any],
-    method: str = '__init__',
-    reserved: Callable[..., Any] | None = None,
-) -> Options:
+    method: str,
+    reserved: Callable[..., Any] | None,
+) -> _Options:
   """Returns the options that a class or function declares.
 
   A method with `**kwargs` is assumed to pass them on to the method that it
@@ -213,17 +246,11 @@ def declared_by(
 
   Raises:
     NameError: If an annotation is a string that names no type.
-    TypeError: If `factory` has no signature.
-    ValueError: If `factory` has no signature.
+    TypeError: If `factory` has no signature, or a path has the wrong type.
   """
+  bound: dict[str, Any] = {}
   if isinstance(factory, functools.partial):
-    whole = declared_by(factory.func, method, reserved)
-    free = list(whole.annotations)[len(factory.args) :]
-    return Options(
-        {name: whole.annotations[name] for name in free},
-        {**whole.defaults, **factory.keywords},
-        whole.others,
-    )
+    bound, factory = factory.keywords, factory.func
   annotations: dict[str, Any] = {}
   defaults: dict[str, Any] = {}
   others: Any = None
@@ -241,28 +268,13 @@ def declared_by(
           and name not in taken
           and name not in annotations
       ):
+        _refuse_path(name, annotation)
         annotations[name] = _without_opaque_members(annotation)
         if parameter.default is not parameter.empty:
           defaults[name] = parameter.default
     if others is None:
       break
-  return Options(annotations, defaults, others)
-
-
-def _unreadable(name: str, error: Exception) -> ValueError:
-  return ValueError(
-      f'the options of {name!r} cannot be read from its signature: {error}'
-  )
-
-
-def is_path(annotation: Any) -> bool:
-  """Returns True if an annotation other than a union declares a path."""
-  if typing.get_origin(annotation) is Annotated:
-    return _IS_PATH in typing.get_args(annotation)[1:]
-  plain = typing.get_origin(annotation) or annotation
-  return isinstance(plain, type) and (
-      plain is os.PathLike or issubclass(plain, pathlib.PurePath)
-  )
+  return _Options(annotations, {**defaults, **bound}, others)
 
 
 def _signatures(
@@ -271,29 +283,13 @@ def _signatures(
   """Yields the signatures that declare options, the most derived first."""
   # `__signature__` of a class describes the call that makes an instance.
   if not isinstance(factory, type) or hasattr(factory, '__signature__'):
-    yield _resolved(factory)
+    yield inspect.signature(factory, eval_str=True)
     return
   for owner in factory.__mro__[:-1]:
     if method in vars(owner):
-      signature = _resolved(vars(owner)[method])
+      signature = inspect.signature(vars(owner)[method], eval_str=True)
       parameters = list(signature.parameters.values())
       yield signature.replace(parameters=parameters[1:])  # Without `self`.
-
-
-def _resolved(function: Callable[..., Any]) -> inspect.Signature:
-  """Returns a signature whose annotations are types, not strings."""
-  signature = inspect.signature(function)
-  is_instance = not (inspect.isroutine(function) or isinstance(function, type))
-  hints = typing.get_type_hints(
-      type(function).__call__ if is_instance else inspect.unwrap(function),
-      include_extras=True,
-  )
-  return signature.replace(
-      parameters=[
-          parameter.replace(annotation=hints.get(name, parameter.annotation))
-          for name, parameter in signature.parameters.items()
-      ]
-  )
 
 
 def _schema(annotation: Any, handler: Any) -> Any:
@@ -302,6 +298,22 @@ def _schema(annotation: Any, handler: Any) -> Any:
     return handler.generate_schema(annotation)
   except pydantic.errors.PydanticUserError:
     return core_schema.any_schema()
+
+
+def _refuse_path(name: str, annotation: Any) -> None:
+  """Refuses paths of another type than `FilePath`, which are not checked.
+
+  Raises:
+    TypeError: If it is such a path.
+  """
+  for member in (annotation, *typing.get_args(annotation)):
+    plain = typing.get_origin(member) or member
+    if isinstance(plain, type) and (
+        plain is os.PathLike or issubclass(plain, pathlib.PurePath)
+    ):
+      raise TypeError(
+          f'{name}: {messages.quote(member)}; allowed for a path is FilePath'
+      )
 
 
 def _without_opaque_members(annotation: Any) -> Any:
@@ -316,8 +328,6 @@ def _without_opaque_members(annotation: Any) -> Any:
 
 
 def _is_opaque(annotation: Any) -> bool:
-  if is_path(annotation):
-    return False
   try:
     pydantic.TypeAdapter(annotation)
     return False

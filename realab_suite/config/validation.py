@@ -5,28 +5,47 @@ The module contains the base class of specs, but no spec.
 
 import abc
 import bisect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+import dataclasses
 import functools
 import hashlib
 import json
 import re
-from typing import Any, TypeVar
+import typing
+from typing import Annotated, Any, Literal, TypeVar, final
 
 import pydantic
+import pydantic_core
+from pydantic_core import core_schema
 
 from realab_suite import errors
-from realab_suite.config import annotations
 from realab_suite.config import loading
 from realab_suite.config import messages
 
 # Number of problems in a message; the others are counted.
 _MAX_TOLD = 10
 
+# Type of the error of an unknown key, with the allowed ones.
+_UNKNOWN_KEY = 'unknown_key'
+# Types of the errors that pydantic can make again from their names.
+_KINDS = frozenset(typing.get_args(core_schema.ErrorType))
+
 _Model = TypeVar('_Model', bound=pydantic.BaseModel)
 
 
-class Spec(pydantic.BaseModel, abc.ABC):
-  """Base class of specs: frozen, hashable and strict.
+def _refuse_equal_values(value: Any) -> Any:
+  """Refuses `true` and `1.0`, which are equal to 1 in Python."""
+  if type(value) is not int:
+    raise ValueError('must be 1')
+  return value
+
+
+Schema = Annotated[Literal[1], pydantic.BeforeValidator(_refuse_equal_values)]
+"""Version of the format of a file."""
+
+
+class Model(pydantic.BaseModel, abc.ABC):
+  """Base class of specs and options: frozen, hashable and strict.
 
   Unknown keys and lossy conversions are errors.
   """
@@ -34,6 +53,21 @@ class Spec(pydantic.BaseModel, abc.ABC):
   model_config = pydantic.ConfigDict(
       frozen=True, extra='forbid', strict=True, populate_by_name=True
   )
+
+  @pydantic.model_validator(mode='wrap')
+  @classmethod
+  def _tell_allowed_keys(cls, data: Any, handler: Any) -> Any:
+    try:
+      return handler(data)
+    except pydantic.ValidationError as error:
+      raise with_allowed_keys(
+          error,
+          (field.alias or name for name, field in cls.model_fields.items()),
+      ) from None
+
+
+class Spec(Model):
+  """Base class of specs, which identify results."""
 
   def to_mapping(self) -> dict[str, Any]:
     """Returns the spec as plain data, including defaults."""
@@ -81,12 +115,11 @@ def validate(
     """Returns the model with the first `count` overrides, or its problems."""
     used = overrides[:count]
     changed = loading.apply_overrides(data, used) if used else data
-    if is_confined:
-      free = used if are_overrides_free else ()
-      # Before the validation, because a model may open the files.
-      if outside := _paths_elsewhere(model_class, changed, free):
-        return None, outside
-    return _judged(model_class, changed)
+    return _judged(
+        model_class,
+        changed,
+        _Paths(is_confined, used if are_overrides_free else ()),
+    )
 
   model, problems = judged(len(overrides))
   if model is not None:
@@ -107,44 +140,93 @@ def validate(
   )
 
 
+@final
+@dataclasses.dataclass(frozen=True)
+class _Paths:
+  """Context of a validation: the paths that fields may contain.
+
+  Attributes:
+    are_confined: True if paths must be within the working directory.
+    free: Texts for which that does not hold.
+  """
+
+  are_confined: bool
+  free: Sequence[str]
+
+
+def are_paths_confined(info: pydantic.ValidationInfo) -> bool:
+  """Returns True if paths must be within the working directory."""
+  context: _Paths | None = info.context
+  return context is not None and context.are_confined
+
+
+def check_path(path: str, info: pydantic.ValidationInfo) -> str:
+  """Returns a path if a field may contain it.
+
+  Raises:
+    ValueError: If not.
+  """
+  context: _Paths | None = info.context
+  if context and context.are_confined and not loading.is_inside(path):
+    if path not in loading.texts_in(context.free):
+      raise ValueError(
+          f'{messages.quote(path)} is outside the working directory; allowed in'
+          ' a file are names, and paths within it'
+      )
+  return path
+
+
+def with_allowed_keys(
+    error: pydantic.ValidationError, allowed: Iterable[str]
+) -> pydantic.ValidationError:
+  """Returns an error whose unknown keys stand beside the allowed ones.
+
+  Args:
+    error: Error of a mapping.
+    allowed: Allowed keys of this mapping.
+  """
+  allowed = list(allowed)
+  details: list[pydantic_core.InitErrorDetails] = []
+  for found in error.errors(include_url=False):
+    kind: Any = found['type']
+    location = found['loc']
+    if kind == 'extra_forbidden' and len(location) == 1:
+      [key] = location
+      hint = messages.did_you_mean(key, allowed)
+      kind = pydantic_core.PydanticCustomError(
+          _UNKNOWN_KEY,
+          '{text}',
+          {
+              'text': f'unknown key {messages.quote(key)}{hint} (allowed:'
+              f' {", ".join(allowed) or "none"})'
+          },
+      )
+      location = ()
+    elif kind not in _KINDS:
+      kind = pydantic_core.PydanticCustomError(
+          kind, '{text}', {'text': found['msg']}
+      )
+    details.append(
+        pydantic_core.InitErrorDetails(
+            type=kind,
+            loc=location,
+            input=found['input'],
+            ctx=found.get('ctx', {}),
+        )
+    )
+  return pydantic.ValidationError.from_exception_data(error.title, details)
+
+
 def _judged(
-    model_class: type[_Model], data: Mapping[str, Any]
+    model_class: type[_Model], data: Mapping[str, Any], paths: _Paths
 ) -> tuple[_Model | None, list[str]]:
   """Returns the model that the data describes, or its problems."""
   try:
-    return model_class.model_validate(data), []
+    return model_class.model_validate(data, context=paths), []
   except pydantic.ValidationError as error:
     problems = error.errors(include_url=False)
   # A union may report a problem once for each of its members.
-  return None, list(
-      dict.fromkeys(_problem(p, model_class, data) for p in problems)
-  )
-
-
-def _paths_elsewhere(
-    model_class: type[pydantic.BaseModel],
-    data: Mapping[str, Any],
-    free: Sequence[str],
-) -> list[str]:
-  """Returns a problem for each path that leads out of the working directory.
-
-  Args:
-    model_class: Class of the model, which declares the paths.
-    data: Data with overrides applied.
-    free: Overrides in the data that may set any path.
-  """
-  free_keys = [loading.keys_of(override) for override in free]
-  problems = []
-  for path, text in annotations.paths_in(model_class, data):
-    keys = [str(part) for part in path]
-    if not loading.is_inside(text) and not any(
-        keys[: len(key)] == key for key in free_keys
-    ):
-      problems.append(
-          f'{messages.format_path(path)}: {messages.quote(text)} is outside the'
-          ' working directory; allowed in a file are names, and paths within it'
-      )
-  return problems
+  return None, list(dict.fromkeys(_problem(p, data) for p in problems))
 
 
 def _origin(
@@ -173,48 +255,52 @@ def _gist(problem: str) -> str:
   return problem.partition(';')[0]
 
 
-def _problem(
-    details: Any, model_class: type[pydantic.BaseModel], data: Any
-) -> str:
+def _problem(details: Any, data: Any) -> str:
   """Returns the text of one entry of a `pydantic.ValidationError`."""
-  kind = details['type']
-  location = list(details['loc'])
-  if kind == 'extra_forbidden':
-    key = str(location.pop())
-    path, found = annotations.locate(location, model_class, data)
-    text = _describe_unknown_key(key, found)
-  else:
-    path, _ = annotations.locate(location, model_class, data)
-    if kind in ('union_tag_invalid', 'union_tag_not_found'):
-      path = (*path, details['ctx']['discriminator'].strip("'"))
-    text = _describe(details)
+  path = _path(details['loc'], details['type'] == 'missing', data)
   # The message of a validator may have several lines.
-  text = ' '.join(text.split())
+  text = ' '.join(_describe(details).split())
   return ': '.join(part for part in (messages.format_path(path), text) if part)
 
 
-def _describe_unknown_key(key: str, found: Sequence[Any]) -> str:
-  declared = [
-      keys for f in found if (keys := annotations.keys_of(f)) is not None
-  ]
-  allowed = [key for keys in declared for key in keys]
-  text = f'unknown key {messages.quote(key)}'
-  text += messages.did_you_mean(key, allowed)
-  if not declared:
-    return text
-  return f'{text} (allowed: {", ".join(allowed) or "none"})'
+def _path(
+    location: Sequence[str | int], is_missing: bool, data: Any
+) -> tuple[str | int, ...]:
+  """Returns the keys and indices that lead to a location in the data.
+
+  Pydantic's locations also name the member that it chose from a union, and mark
+  a wrong key with '[key]'. Neither is in the data.
+
+  Args:
+    location: Location that pydantic reports.
+    is_missing: True if the last key is missing in the data.
+    data: The data.
+  """
+  path: list[str | int] = []
+  for i, component in enumerate(location):
+    is_there = (
+        component in data
+        if isinstance(data, Mapping)
+        else isinstance(data, list | tuple) and component in range(len(data))
+    )
+    if is_there:
+      data = data[component]
+    if is_there or (is_missing and i == len(location) - 1):
+      path.append(component)
+  return tuple(path)
 
 
 def _describe(details: Any) -> str:
-  """Returns the problem of a value, followed by the value."""
+  """Returns the error message, followed by the value."""
   kind = details['type']
   context = details.get('ctx', {})
   given = messages.quote(details['input'])
-  if kind in ('missing', 'union_tag_not_found'):
+  if kind == 'missing':
     return 'required key is missing'
-  if kind == 'union_tag_invalid':
-    tag = messages.quote(context['tag'])
-    return f'must be one of {context["expected_tags"]}, got {tag}'
+  if kind == 'extra_forbidden':
+    return f'unknown key {messages.quote(details["loc"][-1])}'
+  if kind == _UNKNOWN_KEY:
+    return str(details['msg'])
   if kind in ('model_type', 'model_attributes_type', 'dict_type'):
     return f'must be a mapping, got {given}'
   if 'error' in context:

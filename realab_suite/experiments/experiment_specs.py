@@ -1,9 +1,7 @@
 """Specs of experiments: the agents to train, and their evaluation."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 import contextlib
-from importlib import resources
-import os
 from typing import Annotated, Any, Literal, final
 
 import pydantic
@@ -12,8 +10,8 @@ from realab_suite import errors
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite import worlds
+from realab_suite.config import documents
 from realab_suite.config import loading
-from realab_suite.config import messages
 from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.engine import arguments
@@ -72,18 +70,16 @@ class RunSpec(validation.Spec):
     if not self.learner:
       return design
     own = {} if design.learner is None else design.learner.model_dump()
-    return _changed(design, learner={**own, **self.learner})
+    changed = {**design.to_mapping(), 'learner': {**own, **self.learner}}
+    # Problems from here on belong to the run and not to the file of the design.
+    return validation.validate(
+        specs.DesignSpec, loading.read_mapping(changed), ''
+    )
 
 
 def secure_twin(design: specs.DesignSpec) -> specs.DesignSpec:
   """Returns the secure twin of a design."""
-  return _changed(design, channel=TWIN)
-
-
-def _changed(design: specs.DesignSpec, **changes: Any) -> specs.DesignSpec:
-  # Problems from here on belong to the run and not to the file of the design.
-  changed = loading.read_mapping({**design.to_mapping(), **changes})
-  return validation.validate(specs.DesignSpec, changed, '')
+  return specs.load(design, (f'channel={TWIN}',))
 
 
 @final
@@ -157,7 +153,7 @@ class ExperimentSpec(validation.Spec):
     evaluation: Settings of the evaluation.
   """
 
-  schema_version: Literal[1] = pydantic.Field(alias='schema')
+  schema_version: validation.Schema = pydantic.Field(alias='schema')
   name: specs.Name
   description: str = ''
   task: Annotated[
@@ -175,13 +171,18 @@ class ExperimentSpec(validation.Spec):
   training: TrainingSpec = TrainingSpec()
   evaluation: EvaluationSpec = EvaluationSpec()
 
-  @pydantic.field_validator('schema_version', mode='before')
+  _designs: dict[str, specs.DesignSpec] = pydantic.PrivateAttr(
+      default_factory=dict
+  )
+
+  @pydantic.field_validator('task')
   @classmethod
-  def _whole(cls, value: Any) -> Any:
-    """Rejects `true` and `1.0`, which are equal to 1 in Python."""
-    if type(value) is not int:
-      raise ValueError('must be 1')
-    return value
+  def _check_task(cls, task: str) -> str:
+    try:
+      suite.dynamics(*_split(task))
+    except errors.UnknownNameError as error:
+      raise ValueError(str(error)) from error
+    return task
 
   @pydantic.field_validator('baselines')
   @classmethod
@@ -205,11 +206,60 @@ class ExperimentSpec(validation.Spec):
         raise ValueError(f'{what}: {", ".join(twice)} appears twice')
     return self
 
+  @pydantic.model_validator(mode='after')
+  def _check_runs(self, info: pydantic.ValidationInfo) -> 'ExperimentSpec':
+    for name, run in self.runs.items():
+      try:
+        design = run.load(is_confined=validation.are_paths_confined(info))
+        self._check_world(design)
+      except errors.SpecError as error:
+        raise ValueError(f'runs.{name}: {error}') from error
+      if design.learner is None:
+        raise ValueError(
+            f'runs.{name}.learner: design {design.name!r} has no learner;'
+            ' allowed is a mapping with its kind'
+        )
+      if run.twin and design.channel == TWIN:
+        raise ValueError(
+            f'runs.{name}.twin: design {design.name!r} is {TWIN} already;'
+            ' allowed is false'
+        )
+      self._designs[name] = design
+    return self
+
+  def _check_world(self, design: specs.DesignSpec) -> None:
+    """Checks that the world of a run can be loaded, and its policies can act.
+
+    A world with the default arguments is not loaded.
+
+    Raises:
+      SpecError: If not.
+    """
+    if (
+        not self.task_kwargs
+        and not self.training.task_kwargs
+        and self.environment_kwargs == EnvironmentKwargs()
+    ):
+      return
+    task = self.domain_and_variation
+    suite.load(
+        *task, *self.load_kwargs(0, is_training=True), design=design
+    ).close()
+    with contextlib.closing(
+        suite.load(*task, *self.load_kwargs(0), design=design)
+    ) as env:
+      for name in self.baselines:
+        actors.check_senses(policies.make(name), env)
+
+  @property
+  def designs(self) -> Mapping[str, specs.DesignSpec]:
+    """Designs of the runs with their changes, by the name of the run."""
+    return self._designs
+
   @property
   def domain_and_variation(self) -> tuple[str, str]:
     """Names of the domain and of the task, as for `suite.load`."""
-    domain, _, variation = self.task.partition('.')
-    return domain, variation
+    return _split(self.task)
 
   @property
   def world(self) -> worlds.World:
@@ -248,7 +298,18 @@ class ExperimentSpec(validation.Spec):
     }
 
 
-Experiment = str | os.PathLike[str] | Mapping[str, Any] | ExperimentSpec
+def _split(task: str) -> tuple[str, str]:
+  """Returns the names of the domain and of the task."""
+  domain, _, variation = task.partition('.')
+  return domain, variation
+
+
+Experiment = documents.Source | ExperimentSpec
+
+_DOCUMENTS = documents.Documents('experiment', ExperimentSpec, 'experiments')
+
+EXPERIMENTS = _DOCUMENTS.names
+"""Names of the experiments that are part of the package."""
 
 
 def load(experiment: Experiment) -> ExperimentSpec:
@@ -263,95 +324,6 @@ def load(experiment: Experiment) -> ExperimentSpec:
   Raises:
     SpecError: If it is invalid. The message is one line with the file and the
       key path.
+    UnknownNameError: If there is no experiment or file of this name.
   """
-  if isinstance(experiment, ExperimentSpec):
-    return experiment
-  if isinstance(experiment, str) and experiment in EXPERIMENTS:
-    where = f'{experiment}.yaml'
-    data = loading.parse_yaml((_FOLDER / where).read_bytes(), where)
-  elif not isinstance(experiment, str | os.PathLike | Mapping):
-    raise errors.SpecError(
-        f'experiment: {experiment!r:.80}; allowed are a name, a path, a mapping'
-        ' and an ExperimentSpec'
-    )
-  elif isinstance(experiment, str) and not os.path.exists(experiment):
-    raise errors.UnknownNameError(
-        f'experiment {messages.quote(experiment)} is neither a file nor one of'
-        f' {list(EXPERIMENTS)}{messages.did_you_mean(experiment, EXPERIMENTS)}'
-    )
-  else:
-    where = (
-        'experiment'
-        if isinstance(experiment, Mapping)
-        else os.fspath(experiment)
-    )
-    data = loading.read_mapping(experiment)
-  is_file = not isinstance(experiment, Mapping)
-  spec = validation.validate(ExperimentSpec, data, where, is_confined=is_file)
-  for key_path, problem in _find_problems(spec, is_confined=is_file):
-    raise messages.Location(where, key_path).error(problem)
-  return spec
-
-
-def _find_problems(
-    spec: ExperimentSpec, is_confined: bool
-) -> Iterator[tuple[tuple[str | int, ...], str]]:
-  """Yields the key path and a description of each problem."""
-  try:
-    suite.dynamics(*spec.domain_and_variation)
-  except errors.UnknownNameError as error:
-    yield ('task',), str(error)
-  for name, run in spec.runs.items():
-    try:
-      design = run.load(is_confined=is_confined)
-    except errors.SpecError as error:
-      yield ('runs', name), str(error)
-      continue
-    if design.learner is None:
-      yield (
-          ('runs', name, 'learner'),
-          f'design {design.name!r} has no learner; allowed is a mapping with'
-          ' its kind',
-      )
-    if run.twin and design.channel == TWIN:
-      yield (
-          ('runs', name, 'twin'),
-          f'design {design.name!r} is {TWIN} already; allowed is false',
-      )
-    if (
-        spec.task_kwargs
-        or spec.training.task_kwargs
-        or spec.environment_kwargs != EnvironmentKwargs()
-    ):
-      try:
-        _check_world(spec, design)
-      except errors.SpecError as error:
-        yield ('runs', name), str(error)
-
-
-def _check_world(spec: ExperimentSpec, design: specs.DesignSpec) -> None:
-  """Checks that the world of a run can be loaded, and its policies can act.
-
-  Raises:
-    SpecError: If not.
-  """
-  task = spec.domain_and_variation
-  suite.load(
-      *task, *spec.load_kwargs(0, is_training=True), design=design
-  ).close()
-  with contextlib.closing(
-      suite.load(*task, *spec.load_kwargs(0), design=design)
-  ) as env:
-    for name in spec.baselines:
-      actors.check_senses(policies.make(name), env)
-
-
-_FOLDER = resources.files('realab_suite.configs') / 'experiments'
-EXPERIMENTS: tuple[str, ...] = tuple(
-    sorted(
-        path.name.removesuffix('.yaml')
-        for path in _FOLDER.iterdir()
-        if path.name.endswith('.yaml')
-    )
-)
-"""Names of the experiments that are part of the package."""
+  return _DOCUMENTS.load(experiment)

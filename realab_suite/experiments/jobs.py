@@ -198,8 +198,8 @@ def plan(
   """
   variants = [
       variant
-      for name, run in experiment.runs.items()
-      for variant in _variants(experiment, name, run)
+      for name in experiment.runs
+      for variant in _variants(experiment, name)
   ]
   names = [run for run, *_ in variants]
   if unknown := sorted(set(only) - set(names)):
@@ -240,12 +240,10 @@ _Variant = tuple[
 
 
 def _variants(
-    experiment: experiment_specs.ExperimentSpec,
-    name: str,
-    run: experiment_specs.RunSpec,
+    experiment: experiment_specs.ExperimentSpec, name: str
 ) -> list[_Variant]:
   """Returns the jobs of a run without their seeds; baselines are first."""
-  design = run.load()
+  design = experiment.designs[name]
   scripted = [f'{name}.{policy}' for policy in experiment.baselines]
   baseline = scripted[0] if scripted else None
   variants: list[_Variant] = [
@@ -260,7 +258,7 @@ def _variants(
       for one, policy in zip(scripted, experiment.baselines, strict=True)
   ]
   variants.append((name, None, design, baseline, None, None))
-  if run.twin:
+  if experiment.runs[name].twin:
     twin = experiment_specs.secure_twin(design)
     variants.append(
         (f'{name}.{experiment_specs.TWIN}', None, twin, baseline, name, design)

@@ -1,16 +1,13 @@
 """Specs of agent designs, and how to load them (paper, section 3.2)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import functools
-from importlib import resources
-import os
 from typing import Annotated, Any, Literal, final
 
 import pydantic
 
 from realab_suite import errors
-from realab_suite.config import loading
-from realab_suite.config import messages
+from realab_suite.config import documents
 from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.entities import block_kinds
@@ -21,7 +18,6 @@ from realab_suite.feedback import measurements
 from realab_suite.feedback import objectives
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
-from realab_suite.feedback import registered_models
 from realab_suite.feedback import thresholds
 from realab_suite.policies import action_sets
 
@@ -182,15 +178,9 @@ class MeterSpec(validation.Spec):
 
   measures: Annotated[
       Name | measurements.Measurement,
-      registered_models.ModelIn(measurements.MEASUREMENTS, or_name=Name),
+      option_types.ModelIn(measurements.MEASUREMENTS, or_name=Name),
   ]
   writes: Name
-
-  @pydantic.field_serializer('measures')
-  def _dump_measures(self, value: str | measurements.Measurement) -> Any:
-    if isinstance(value, str):
-      return value
-    return value.model_dump(mode='json', by_alias=True)
 
 
 @final
@@ -273,9 +263,7 @@ class LearnerSpec(validation.Spec):
 
 # Inside the class below, `providers` is the name of a field.
 _Provider = providers.Provider
-_AnyProvider = Annotated[
-    _Provider, registered_models.ModelIn(providers.PROVIDERS)
-]
+_AnyProvider = Annotated[_Provider, option_types.ModelIn(providers.PROVIDERS)]
 
 
 @final
@@ -301,7 +289,7 @@ class DesignSpec(validation.Spec):
     learner: Learning algorithm, or `None`.
   """
 
-  schema_version: Literal[1] = pydantic.Field(alias='schema')
+  schema_version: validation.Schema = pydantic.Field(alias='schema')
   name: Name
   description: str = ''
   channel: Channel = 'embedded'
@@ -317,20 +305,6 @@ class DesignSpec(validation.Spec):
   schedule: ScheduleSpec | Literal['cfmdp'] | None = None
   action_set: ActionSetSpec | None = None
   learner: LearnerSpec | None = None
-
-  @pydantic.field_validator('schema_version', mode='before')
-  @classmethod
-  def _refuse_other_types(cls, value: Any) -> Any:
-    """Refuses `true` and `1.0`, which are equal to 1 in Python."""
-    if type(value) is not int:
-      raise ValueError('must be 1')
-    return value
-
-  @pydantic.field_serializer('providers')
-  def _dump_providers(
-      self, value: tuple[_Provider, ...]
-  ) -> list[dict[str, Any]]:
-    return [provider.model_dump(mode='json') for provider in value]
 
   @pydantic.model_validator(mode='after')
   def _consistent(self) -> 'DesignSpec':
@@ -443,19 +417,12 @@ class DesignSpec(validation.Spec):
     return self.schedule.check(num_substeps)
 
 
-Design = str | os.PathLike[str] | Mapping[str, Any] | DesignSpec
+Design = documents.Source | DesignSpec
 
-_validated_kinds: list[type[pydantic.BaseModel]] = []
+_DOCUMENTS = documents.Documents('design', DesignSpec, 'designs')
 
-
-def inputs_of(provider: providers.Provider, design: DesignSpec) -> list[str]:
-  """Returns the names of the registers that a provider reads or sees.
-
-  Args:
-    provider: A provider of the design.
-    design: The design.
-  """
-  return [*provider.reads, *design.names(*READ_BY_AGENTS)]
+DESIGNS = _DOCUMENTS.names
+"""Names of the designs that are part of the package."""
 
 
 def load(
@@ -481,76 +448,19 @@ def load(
       with the file, the key path and the allowed values.
     UnknownNameError: If there is no design or file of this name.
   """
-  if isinstance(overrides, str) or not isinstance(overrides, Sequence):
-    raise errors.SpecError(
-        f'overrides: {messages.quote(overrides)}; allowed is a list of strings,'
-        " such as ['channel=secure']"
-    )
-  is_file = False
-  if isinstance(design, DesignSpec):
-    where, data = f'design {design.name!r}', design.to_mapping()
-  elif isinstance(design, str) and design in DESIGNS:
-    where = f'{design}.yaml'
-    data = loading.parse_yaml(_shipped(design).read_bytes(), where)
-  elif not isinstance(design, str | os.PathLike | Mapping):
-    raise errors.SpecError(
-        f'design: {messages.quote(design)}; allowed are a name, a path, a'
-        ' mapping and a DesignSpec'
-    )
-  elif isinstance(design, str) and not os.path.exists(design):
-    raise errors.UnknownNameError(
-        f'design {messages.quote(design)} is neither a file nor one of'
-        f' {list(DESIGNS)}{messages.did_you_mean(design, DESIGNS)}'
-    )
-  elif isinstance(design, Mapping):
-    where, data = 'design', loading.read_mapping(design)
-  else:
-    where = os.fspath(design)
-    if is_confined and not loading.is_inside(where):
-      raise errors.SpecError(
-          f'design {messages.quote(where)} is outside the working directory;'
-          f' allowed in a file are paths within it and {list(DESIGNS)}'
-      )
-    data, is_file = loading.read_mapping(design), True
-  _update_validator()
-  return validation.validate(
-      DesignSpec,
-      data,
-      where,
-      overrides,
-      is_confined=is_file or is_confined,
-      are_overrides_free=not is_confined,
-  )
+  return _DOCUMENTS.load(design, overrides, is_confined=is_confined)
 
 
 def json_schema() -> dict[str, Any]:
   """Returns the JSON Schema of design files, for use in editors."""
-  _update_validator()
   return DesignSpec.model_json_schema(by_alias=True)
 
 
-def _update_validator() -> None:
-  """Rebuilds the validator if the registered classes have changed."""
-  kinds = [
-      names.get(kind)
-      for names in (providers.PROVIDERS, measurements.MEASUREMENTS)
-      for kind in names
-  ]
-  if _validated_kinds != kinds:
-    MeterSpec.model_rebuild(force=True)
-    DesignSpec.model_rebuild(force=True)
-    _validated_kinds[:] = kinds
+def inputs_of(provider: providers.Provider, design: DesignSpec) -> list[str]:
+  """Returns the names of the registers that a provider reads or sees.
 
-
-def _shipped(name: str) -> Any:
-  return _FOLDER / f'{name}.yaml'
-
-
-_FOLDER = resources.files('realab_suite.configs') / 'designs'
-DESIGNS: tuple[str, ...] = tuple(
-    sorted(
-        path.name.removesuffix('.yaml')
-        for path in _FOLDER.iterdir()
-        if path.name.endswith('.yaml')
-    )
-)
+  Args:
+    provider: A provider of the design.
+    design: The design.
+  """
+  return [*provider.reads, *design.names(*READ_BY_AGENTS)]

@@ -32,14 +32,8 @@ _Sizes = Annotated[tuple[_Count, ...], pydantic.Field(strict=False)]
 _Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 
 
-class _Part(pydantic.BaseModel):
-  """Base class: frozen; unknown keys and lossy conversions are errors."""
-
-  model_config = pydantic.ConfigDict(frozen=True, extra='forbid', strict=True)
-
-
 @final
-class Feature(_Part):
+class Feature(validation.Model):
   """Encoding of one part of an observation, as in `agents/features.py`.
 
   Attributes:
@@ -75,7 +69,7 @@ class Feature(_Part):
 
 
 @final
-class Header(_Part):
+class Header(validation.Model):
   """Header of a file: description of a network.
 
   Attributes:

@@ -6,11 +6,8 @@ opens them in its constructor.
 
 from collections.abc import Iterator, Mapping, Sequence
 import contextlib
-import dataclasses
 import functools
-import os
-import pathlib
-from typing import Annotated, Any, Literal, NamedTuple, NewType, final
+from typing import Annotated, Any, Literal, final
 
 import pydantic
 import typing_extensions
@@ -22,8 +19,6 @@ from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from tests.engine import helpers
 from tests.feedback import stubs
-
-_Source = NewType('_Source', option_types.FilePath)
 
 
 def _open(*paths: Any) -> None:
@@ -43,35 +38,11 @@ class Model(pydantic.BaseModel):
   file: option_types.FilePath = ''
 
 
-@dataclasses.dataclass
-class Data:
-  """A dataclass with a path."""
-
-  label: str = ''
-  file: option_types.FilePath = ''
-
-
 class Typed(typing_extensions.TypedDict, total=False):
-  """A typed dictionary with paths."""
+  """A typed dictionary with a path."""
 
   label: str
   file: option_types.FilePath
-  must: typing_extensions.NotRequired[option_types.FilePath]
-
-
-class Root(pydantic.RootModel[list[option_types.FilePath]]):
-  """A model that is a list of paths."""
-
-
-class OwnPath(pathlib.PurePosixPath):
-  """Class of paths outside of the standard library."""
-
-
-class Pair(NamedTuple):
-  """A named tuple with a path."""
-
-  label: str = ''
-  file: option_types.FilePath = ''
 
 
 class _Opaque:
@@ -85,34 +56,21 @@ class Reader(stubs.Idle):
       self,
       file: option_types.FilePath = '',
       maybe: option_types.FilePath | None = None,
-      either: int | option_types.FilePath = 0,
       opaque: option_types.FilePath | _Opaque = '',
-      source: _Source = '',
-      pure: pathlib.Path | None = None,
-      like: str | os.PathLike[str] = '',
-      files: Sequence[option_types.FilePath] = (),
+      files: 'Sequence[option_types.FilePath]' = (),
       pair: tuple[str, option_types.FilePath] = ('', ''),
       table: Mapping[str, list[option_types.FilePath]] | None = None,
-      model: Model | None = None,
-      models: Sequence[Model] = (),
-      data: Data | None = None,
-      typed: Typed | None = None,
-      named: Pair | None = None,
-      root: Root | None = None,
       keyed: dict[option_types.FilePath, int] | None = None,
-      own: str | OwnPath = '',
-      text: 'Sequence[option_types.FilePath]' = (),
-      inner: Sequence['option_types.FilePath'] = (),
+      models: Sequence[Model] = (),
+      typed: Typed | None = None,
       label: str = '',
   ) -> None:
     del label
-    _open(file, maybe, either, opaque, source, pure, like, pair[1], own)
-    _open(*files, *(root or ()), *(keyed or ()), *text, *inner)
+    _open(file, maybe, opaque, pair[1], *files, *(keyed or ()))
     for given in (table or {}).values():
       _open(*given)
-    for given in (model, data, typed, *models):
-      _open((given or {}).get('file'), (given or {}).get('must'))
-    _open((named or ('', ''))[1])
+    for given in (typed, *models):
+      _open((given or {}).get('file'))
 
 
 @final
@@ -171,14 +129,6 @@ class ModelPolicy(pydantic.BaseModel, stubs.Idle):
 
 
 @final
-class Factory:
-  """An object that makes policies."""
-
-  def __call__(self, file: option_types.FilePath = '') -> policies.Policy:
-    return Reader(file=file)
-
-
-@final
 class ReadingProvider(stubs.Zero):
   """A provider with paths as fields, and two policies."""
 
@@ -226,7 +176,6 @@ def registered() -> Iterator[None]:
         (policies.POLICIES, 'test_wrapping', Wrapping),
         (policies.POLICIES, 'test_function', read),
         (policies.POLICIES, 'test_model', ModelPolicy),
-        (policies.POLICIES, 'test_factory', Factory()),
         (policies.POLICIES, 'test_partial', functools.partial(read, label='x')),
         (
             policies.POLICIES,

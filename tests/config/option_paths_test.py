@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from realab_suite import policies
 from realab_suite import suite
 from realab_suite.config import messages
 from realab_suite.experiments import experiment_specs
@@ -15,6 +16,7 @@ from realab_suite.feedback import specs
 from tests.config import file_readers
 from tests.config import off_limits
 from tests.config import refusals
+from tests.engine import helpers
 from tests.feedback import designs
 
 _WATCH = off_limits.Watch()
@@ -71,17 +73,14 @@ def _refusal(load: Callable[..., Any], *args: Any, **kwargs: Any) -> str:
   return text
 
 
-# Options of `test_reader` with a path, in every type that can hold one.
+# Options of `test_reader` with a path, in types of every kind.
 _OPTIONS: list[dict[str, Any]] = [
-    *({name: _PATH} for name in ('file', 'maybe', 'either', 'opaque', 'own')),
-    *({name: _PATH} for name in ('source', 'pure', 'like')),
-    *({name: ['', _PATH]} for name in ('files', 'pair', 'root', 'inner')),
-    *({name: ['', _PATH]} for name in ('text', 'named')),
-    *({name: {'file': _PATH}} for name in ('model', 'data', 'typed')),
+    *({name: _PATH} for name in ('file', 'maybe', 'opaque')),
+    *({name: ['', _PATH]} for name in ('files', 'pair')),
     {'table': {'/': ['', _PATH]}},
-    {'models': [{'file': _PATH}]},
-    {'typed': {'must': _PATH}},
     {'keyed': {_PATH: 1}},
+    {'models': [{'file': _PATH}]},
+    {'typed': {'file': _PATH}},
 ]
 _NO_OP = _demonstrated('no_op')
 _READING_REGISTER = {
@@ -93,7 +92,7 @@ _PLACES: dict[str, dict[str, Any]] = {
         for option in _OPTIONS},
     **{f'file of {policy}': _design(_demonstrated(policy, file=_PATH))
         for policy in ('test_inheriting', 'test_any_file', 'test_function',
-        'test_factory', 'test_model', 'test_partial', 'test_partial_class')},
+        'test_model', 'test_partial', 'test_partial_class')},
     **{f'{depth} policies deep': _design(_wrapped(depth, 'network_demonstrator',
         weights=_PATH)) for depth in (0, 1, 24)},
     'weights of a value function': _design({**_ADVICE,
@@ -217,12 +216,27 @@ def test_options_that_are_not_paths_may_contain_any_text():
   label = '/etc/../~'
   teacher = {'teacher': 'test_reader', 'teacher_options': {'label': label}}
   for provider in (
-      _demonstrated('test_reader', label=label, pair=[label, ''], either=3),
-      _demonstrated('test_reader', model={'label': label}),
+      _demonstrated('test_reader', label=label, pair=[label, '']),
+      _demonstrated('test_reader', models=[{'label': label}]),
       {**_READING, 'label': label, **teacher},
   ):
     [loaded] = specs.load(_file(_design(provider))).to_mapping()['providers']
     assert label in json.dumps(loaded)
+
+
+@pytest.mark.parametrize('declared', [
+    pathlib.Path, os.PathLike, str | os.PathLike[str], pathlib.PurePath | None
+])  # fmt: skip
+def test_paths_of_types_that_are_not_checked_are_refused(declared: Any):
+  def make(file: declared = 'x') -> policies.Policy:
+    raise AssertionError(file)
+
+  with helpers.registered(policies.POLICIES, 'test_unchecked', make):
+    text = _refusal(
+        specs.load, _design(_demonstrated('test_unchecked', file='x'))
+    )
+  assert text.endswith('; allowed for a path is FilePath')
+  assert 'file: ' in text
 
 
 # Overrides.
@@ -265,6 +279,17 @@ def test_a_path_of_the_file_stays_confined_beside_overrides(
   override = 'providers.0.options.weights_2=x'
   text = _refusal(specs.load, _file(design), (override,))
   assert text.startswith('given.yaml: providers[0].options.weights: ')
+
+
+def test_a_path_may_be_in_the_file_if_an_override_names_it(
+    outside: pathlib.Path,
+):
+  path = str(outside / 'secret.npz')
+  design = _file(_design(_demonstrated('test_reader', files=['', path])))
+  override = f'providers.0.options.file={path}'
+  specs.load(design, (override,))
+  text = _refusal(specs.load, design, (override,), is_confined=True)
+  assert 'is outside the working directory' in text
 
 
 def test_a_text_that_an_override_makes_a_path_is_confined(

@@ -10,7 +10,6 @@ import pydantic
 import pytest
 
 from realab_suite import policies
-from realab_suite.config import option_types
 from realab_suite.feedback import specs
 from tests.config import file_readers
 from tests.config import refusals
@@ -216,13 +215,3 @@ def test_options_of_a_register_are_checked_when_a_design_is_loaded():
     design = _design('no_op', registers={'reward': register})
     text = refusals.refusal(specs.load, design)
     assert f'registers.reward.{message}' in text
-
-
-def test_declared_options_include_inherited_ones():
-  declared = option_types.declared_by(file_readers.Inheriting)
-  assert list(declared.annotations)[:3] == ['mine', 'file', 'maybe']
-  assert declared.defaults['mine'] == 0
-  assert declared.others is None
-  declared = option_types.declared_by(file_readers.AnyFile)
-  assert not declared.annotations
-  assert declared.others == option_types.FilePath

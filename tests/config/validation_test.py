@@ -6,21 +6,25 @@ import pydantic
 import pytest
 
 from realab_suite import errors
+from realab_suite.config import option_types
+from realab_suite.config import registry
 from realab_suite.config import validation
 from tests.config import refusals
 
-
-class _Spec(pydantic.BaseModel):
-  model_config = pydantic.ConfigDict(
-      extra='forbid', strict=True, allow_inf_nan=False
-  )
+_KINDS: registry.Registry[Any] = registry.Registry('provider kind')
 
 
+class _Spec(validation.Model):
+  model_config = pydantic.ConfigDict(allow_inf_nan=False)
+
+
+@_KINDS.add('constant')
 class _Constant(_Spec):
   kind: Literal['constant']
   value: float
 
 
+@_KINDS.add('scaled')
 class _Scaled(_Spec):
   kind: Literal['scaled']
   scale: float
@@ -32,7 +36,7 @@ class _Register(_Spec):
   scale: Annotated[float, pydantic.Field(gt=0)] = 1.0
   blocks: int = 2
   label: str = ''
-  meters: list[str] = []
+  meters: list[str] = pydantic.Field(default_factory=list)
 
   @pydantic.field_validator('meters')
   @classmethod
@@ -43,10 +47,10 @@ class _Register(_Spec):
 
 
 class _Design(_Spec):
-  registers: dict[str, _Register] = {}
-  providers: list[
-      Annotated[_Constant | _Scaled, pydantic.Field(discriminator='kind')]
-  ] = []
+  registers: dict[str, _Register] = pydantic.Field(default_factory=dict)
+  providers: list[Annotated[Any, option_types.ModelIn(_KINDS)]] = (
+      pydantic.Field(default_factory=list)
+  )
   spare: _Register | None = None
   either: _Constant | _Scaled | None = None
   mixed: int | list[_Register] = 0
@@ -101,8 +105,8 @@ def test_valid_data_gives_the_model_and_stays_unchanged():
         "providers[0]: unknown key 'valeu'; did you mean 'value'?"
         ' (allowed: kind, value)'),
     ({'providers': [{'kind': 'scale'}]},
-        "providers[0].kind: must be one of 'constant', 'scaled', got"
-        " 'scale'"),
+        "providers[0].kind: provider kind 'scale' is unknown; did you mean"
+        " 'scaled'?; known are ['constant', 'scaled']"),
     ({'providers': [{}]}, 'providers[0].kind: required key is missing'),
     ({'providers': [7]}, 'providers[0]: must be a mapping, got 7'),
     ({'mixed': [{'type': 'scale', 'range': 1}]},

@@ -49,7 +49,7 @@ _WRONG = {
     'registers.reward.block_size=5': 'block_size: must be less than',
     'registers.reward.scale=1e-7': 'registers.reward.scale: must be greater',
     'registers.reward.place=[1e300, 0]':
-        'registers.reward.place.position[0]: must be less than or equal to 100',
+        'registers.reward.place[0]: must be less than or equal to 100',
     'registers.reward.place=[1]': 'registers.reward.place',
     "registers.reward.place=['1', '2']": "got '1'",
     'registers.reward.place={position: [0, 0], spread: [-1, 0]}':
@@ -80,7 +80,8 @@ _WRONG = {
         'providers[0].every: must be greater than or equal to 1, got 0',
     'providers.0.every=1.5': 'providers[0].every: must be a valid integer',
     'providers.0.kind=diference':
-        "providers[0].kind: must be one of 'constant', 'demonstration', ",
+        "providers[0].kind: provider kind 'diference' is unknown; did you mean"
+        " 'difference'?; known are ['constant', ",
     'providers.0={writes: [reward]}':
         'providers[0].kind: required key is missing',
     'providers.0.reads=[score, reward]': 'reads: must have at most 1 item',

@@ -301,7 +301,9 @@ def test_a_registered_provider_is_usable_by_name():
     env.close()
   np.testing.assert_allclose(time_step.observation['registers/reward'], 6.0)
   # It is unknown again when it is no longer registered.
-  with pytest.raises(errors.SpecError, match=r'providers\[0\].kind: must be'):
+  with pytest.raises(
+      errors.SpecError, match=r'providers\[0\].kind: provider kind'
+  ):
     specs.load(_WITH_DOUBLED)
   assert _DOUBLED_KIND not in json.dumps(specs.json_schema())
 

@@ -13,6 +13,7 @@ import pydantic
 from realab_suite import errors
 from realab_suite.config import messages
 from realab_suite.config import registry
+from realab_suite.config import validation
 from realab_suite.entities import measurables
 from realab_suite.entities import registers
 
@@ -166,7 +167,7 @@ class World:
     return self.location.child(field).error(problem)
 
 
-class Measurement(pydantic.BaseModel, abc.ABC):
+class Measurement(validation.Model):
   """Base class for measurements: functions of the true state of a world.
 
   Fields of a subclass are its options in a design, as for providers. `connect`
@@ -177,9 +178,7 @@ class Measurement(pydantic.BaseModel, abc.ABC):
     kind: Name under which the class is registered.
   """
 
-  model_config = pydantic.ConfigDict(
-      frozen=True, extra='forbid', strict=True, allow_inf_nan=False
-  )
+  model_config = pydantic.ConfigDict(allow_inf_nan=False)
 
   kind: str
 

@@ -8,6 +8,7 @@ import numpy as np
 import pydantic
 
 from realab_suite.config import registry
+from realab_suite.config import validation
 from realab_suite.entities import axes
 
 Observation = Mapping[str, np.ndarray]
@@ -21,7 +22,7 @@ OneName = Annotated[
 ]
 
 
-class Provider(pydantic.BaseModel, abc.ABC):
+class Provider(validation.Model):
   """Base class for feedback providers: pure functions from readings to writes.
 
   Fields of a subclass are its options, methods are its behaviour. A provider
@@ -37,8 +38,6 @@ class Provider(pydantic.BaseModel, abc.ABC):
     every: The provider acts in steps 1, 1 + every, 1 + 2 every ... of an
       episode. In the other steps it is not called, and writes nothing.
   """
-
-  model_config = pydantic.ConfigDict(frozen=True, extra='forbid', strict=True)
 
   kind: str
   reads: Names = ()

@@ -1,0 +1,118 @@
+"""Loading of specs by name, from files and from mappings."""
+
+from collections.abc import Mapping, Sequence
+from importlib import resources
+import os
+from typing import Any, Generic, TypeVar, final
+
+from realab_suite import errors
+from realab_suite.config import loading
+from realab_suite.config import messages
+from realab_suite.config import validation
+
+_Spec = TypeVar('_Spec', bound=validation.Spec)
+
+Source = str | os.PathLike[str] | Mapping[str, Any]
+
+
+@final
+class Documents(Generic[_Spec]):
+  """YAML files of one kind, some of which are part of the package.
+
+  Attributes:
+    names: Names of the files that are part of the package.
+  """
+
+  def __init__(self, what: str, model: type[_Spec], folder: str) -> None:
+    """Finds the files of the package.
+
+    Args:
+      what: Kind of the files, for messages: 'design'.
+      model: Class of their specs, with a field `name`.
+      folder: Folder in `realab_suite.configs`.
+    """
+    self._what = what
+    self._model = model
+    self._folder = resources.files('realab_suite.configs') / folder
+    self.names: tuple[str, ...] = tuple(
+        sorted(
+            path.name.removesuffix('.yaml')
+            for path in self._folder.iterdir()
+            if path.name.endswith('.yaml')
+        )
+    )
+
+  def load(
+      self,
+      source: Source | _Spec,
+      overrides: Sequence[str] = (),
+      *,
+      is_confined: bool = False,
+  ) -> _Spec:
+    """Loads and validates a spec.
+
+    Paths in a file must be within the working directory, unless an override
+    names them.
+
+    Args:
+      source: Name of a file of the package, path of a YAML file, mapping, or
+        spec.
+      overrides: Dotted overrides; see `loading.apply_overrides`.
+      is_confined: True if paths in `overrides` and `source` must also be within
+        the working directory.
+
+    Raises:
+      SpecError: If the source or an override is wrong; the message is one line
+        with the file, the key path and the allowed values.
+      UnknownNameError: If there is no file of this name.
+    """
+    if isinstance(overrides, str) or not isinstance(overrides, Sequence):
+      raise errors.SpecError(
+          f'overrides: {messages.quote(overrides)}; allowed is a list of'
+          " strings, such as ['channel=secure']"
+      )
+    if isinstance(source, self._model) and not overrides and not is_confined:
+      return source
+    where, data = self._read(source, is_confined)
+    is_file = isinstance(source, str | os.PathLike)
+    return validation.validate(
+        self._model,
+        data,
+        where,
+        overrides,
+        is_confined=is_file or is_confined,
+        are_overrides_free=not is_confined,
+    )
+
+  def _read(
+      self, source: Source | _Spec, is_confined: bool
+  ) -> tuple[str, dict[str, Any]]:
+    """Returns the name of a source for messages, and its data."""
+    what = self._what
+    if isinstance(source, self._model):
+      data = source.to_mapping()
+      return f'{what} {data["name"]!r}', data
+    if isinstance(source, Mapping):
+      return what, loading.read_mapping(source)
+    if not isinstance(source, str | os.PathLike):
+      raise errors.SpecError(
+          f'{what}: {messages.quote(source)}; allowed are a name, a path, a'
+          f' mapping and a {self._model.__name__}'
+      )
+    if source in self.names:
+      where = f'{source}.yaml'
+      return where, loading.parse_yaml(
+          (self._folder / where).read_bytes(), where
+      )
+    if isinstance(source, str) and not os.path.exists(source):
+      raise errors.UnknownNameError(
+          f'{what} {messages.quote(source)} is neither a file nor one of'
+          f' {list(self.names)}{messages.did_you_mean(source, self.names)}'
+      )
+    where = os.fspath(source)
+    if is_confined and not loading.is_inside(where):
+      raise errors.SpecError(
+          f'{what} {messages.quote(where)} is outside the working directory;'
+          f' allowed in a file are paths within it and {list(self.names)}'
+      )
+    return where, loading.read_mapping(source)
