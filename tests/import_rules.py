@@ -34,7 +34,7 @@ _MAY_IMPORT = {
     '_versions': (),
     'configs': (),
     'config': ('configs',),
-    'entities': (),
+    'entities': ('config',),
     'policies': ('config', 'configs', 'entities'),
     'feedback': ('config', 'configs', 'entities', 'policies'),
     # A task must not know the feedback function, so no providers.

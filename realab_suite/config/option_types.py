@@ -255,7 +255,7 @@ def _options(
   defaults: dict[str, Any] = {}
   others: Any = None
   taken = inspect.signature(reserved).parameters if reserved else ()
-  for signature in _signatures(factory, method):
+  for signature in _signatures(factory, method, reserved):
     others = None
     for name, parameter in signature.parameters.items():
       annotation = parameter.annotation
@@ -278,7 +278,9 @@ def _options(
 
 
 def _signatures(
-    factory: Callable[..., Any], method: str
+    factory: Callable[..., Any],
+    method: str,
+    reserved: Callable[..., Any] | None,
 ) -> Iterator[inspect.Signature]:
   """Yields the signatures that declare options, the most derived first."""
   # `__signature__` of a class describes the call that makes an instance.
@@ -286,8 +288,11 @@ def _signatures(
     yield inspect.signature(factory, eval_str=True)
     return
   for owner in factory.__mro__[:-1]:
-    if method in vars(owner):
-      signature = inspect.signature(vars(owner)[method], eval_str=True)
+    if (function := vars(owner).get(method)) is reserved is not None:
+      yield inspect.Signature()
+      return
+    if function is not None:
+      signature = inspect.signature(function, eval_str=True)
       parameters = list(signature.parameters.values())
       yield signature.replace(parameters=parameters[1:])  # Without `self`.
 

@@ -28,21 +28,15 @@ def make_register(
     SpecError: If the register kind refuses its arguments.
   """
   kind = register_kinds.REGISTER_KINDS.get(spec.kind)
-  common = dict(
-      value_range=spec.range,
-      scale=spec.scale,
-      initial=spec.constant_initial,
-      role=spec.role,
-      channel=design.channel_of(name),
-      dof=spec.dof or design.dof,
-      on_overflow=spec.on_overflow,
-      write=spec.write,
-      block_size=spec.block_size,
-      mass=spec.mass,
+  arguments = spec.model_copy(
+      update={
+          'channel': design.channel_of(name),
+          'dof': spec.dof or design.dof,
+      }
   )
   location = messages.Location(f'design {design.name!r}', ('registers', name))
   try:
-    return kind(name, **common, **spec.options)
+    return kind(name, arguments=arguments, **spec.options)
   except errors.SpecError as error:
     raise location.error(str(error)) from error
   except Exception as error:  # Register kinds may raise any class.

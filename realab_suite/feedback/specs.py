@@ -10,8 +10,8 @@ from realab_suite import errors
 from realab_suite.config import documents
 from realab_suite.config import option_types
 from realab_suite.config import validation
-from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
+from realab_suite.entities.registers import arguments
 from realab_suite.entities.registers import ports
 from realab_suite.feedback import consistency
 from realab_suite.feedback import measurements
@@ -21,17 +21,10 @@ from realab_suite.feedback import register_kinds
 from realab_suite.feedback import thresholds
 from realab_suite.policies import action_sets
 
-_NAME = r'^[a-z][a-z0-9_]{0,63}$'
-Name = Annotated[str, pydantic.StringConstraints(pattern=_NAME)]
+Name = arguments.Name
 Finite = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 # Larger numbers make the arithmetic of a step overflow.
 Coordinate = Annotated[float, pydantic.Field(ge=-1e4, le=1e4)]
-Value = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
-Size = Annotated[float, pydantic.Field(ge=block_kinds.LEAST_SIZE, le=1.0)]
-Channel = Literal['embedded', 'welded', 'secure']
-Dof = Literal['free', 'planar']
-Role = Literal['feedback', 'meter', 'query', 'signal', 'memory']
-
 # Largest number of registers of a design. A hundred two-block registers load in
 # a second and take 10 ms for a control step; both times are linear in the
 # number. MuJoCo reserves 160 MB for their contacts, quadratic in the number.
@@ -76,28 +69,16 @@ class PlaceSpec(validation.Spec):
 
 
 @final
-class RegisterSpec(validation.Spec):
+class RegisterSpec(arguments.Arguments):
   """Spec of a register.
+
+  A welded or secure design overrides the channel. Without degrees of freedom, a
+  register has those of the design.
 
   Attributes:
     kind: Name of a registered register kind.
-    role: Role of the register. Agents read `feedback` and `signal` registers
-      and write `query` registers. Only providers read `meter` registers. Only
-      providers read and write `memory` registers.
+    role: See `Arguments`.
     place: Name of a place of the world, or coordinates.
-    range: Lowest and highest value that can be stored, in each port.
-    scale: Length in m (angle in rad for an orientation) per unit of value.
-    initial: Value at the start of an episode, in each port; or the name of a
-      function that the task offers to meters, which returns it.
-    on_overflow: `saturate` to saturate a value out of range, `error` to refuse
-      it.
-    write: `axis` for writes that set only the coordinate that carries the
-      value, `pose` for writes that restore the whole pose of the block.
-    channel: Channel of the register; `None` for `embedded`. A welded or secure
-      design overrides it.
-    dof: Degrees of freedom of the blocks; `None` for those of the design.
-    block_size: Edge length of each block, in m.
-    mass: Mass of each block, in kg.
     ends_episode: Threshold of a `signal` register: the episode ends with the
       first control step after which the agent's reading crosses it. `None` if
       the register does not end episodes.
@@ -105,18 +86,8 @@ class RegisterSpec(validation.Spec):
   """
 
   kind: Annotated[str, option_types.NameIn(register_kinds.REGISTER_KINDS)]
-  role: Role
+  role: arguments.Role
   place: Name | PlaceSpec
-  range: Annotated[tuple[Value, Value], pydantic.Field(strict=False)]
-  # With a smaller scale, readings are mostly numerical noise of positions.
-  scale: Annotated[float, pydantic.Field(ge=1e-6, le=10)] = 0.1
-  initial: Value | Name = 0.0
-  on_overflow: Literal['saturate', 'error'] = 'saturate'
-  write: Literal['axis', 'pose'] = 'axis'
-  channel: Channel | None = None
-  dof: Dof | None = None
-  block_size: Size = 0.2
-  mass: Annotated[float, pydantic.Field(ge=0.01, le=100)] = 1.0
   ends_episode: thresholds.ThresholdSpec | None = None
   options: Annotated[
       dict[str, Any],
@@ -136,22 +107,8 @@ class RegisterSpec(validation.Spec):
       return {'position': place}
     return place
 
-  @property
-  def constant_initial(self) -> float:
-    """Value of `initial`, or a value in the range in place of a function."""
-    if isinstance(self.initial, str):
-      return min(max(0.0, self.range[0]), self.range[1])
-    return self.initial
-
   @pydantic.model_validator(mode='after')
-  def _in_order(self) -> 'RegisterSpec':
-    low, high = self.range
-    if not low < high:
-      raise ValueError(f'range {list(self.range)} must have low < high')
-    if not low <= self.constant_initial <= high:
-      raise ValueError(
-          f'initial {self.initial} must be in range {list(self.range)}'
-      )
+  def _ends_episodes(self) -> 'RegisterSpec':
     if self.ends_episode is None:
       return self
     if self.role != 'signal':
@@ -292,8 +249,8 @@ class DesignSpec(validation.Spec):
   schema_version: validation.Schema = pydantic.Field(alias='schema')
   name: Name
   description: str = ''
-  channel: Channel = 'embedded'
-  dof: Dof = 'free'
+  channel: arguments.Channel = 'embedded'
+  dof: arguments.Dof = 'free'
   registers: dict[Name, RegisterSpec] = pydantic.Field(
       default_factory=dict, json_schema_extra={'maxProperties': MAX_REGISTERS}
   )
@@ -384,7 +341,7 @@ class DesignSpec(validation.Spec):
         and all(name in provider.action_queries for provider in readers)
     ]
 
-  def channel_of(self, name: str) -> Channel:
+  def channel_of(self, name: str) -> arguments.Channel:
     """Returns the channel of a register.
 
     A welded or secure design is the twin of another design, so its channel

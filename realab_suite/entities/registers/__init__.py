@@ -1,14 +1,15 @@
 """Registers: physical objects whose poses store values."""
 
+from realab_suite.entities.registers.arguments import CHANNELS
+from realab_suite.entities.registers.arguments import DOFS
+from realab_suite.entities.registers.arguments import OVERFLOWS
+from realab_suite.entities.registers.arguments import WRITES
+from realab_suite.entities.registers.arguments import Arguments
 from realab_suite.entities.registers.base import Register
 from realab_suite.entities.registers.block_orientation import (
     BlockOrientationRegister,
 )
 from realab_suite.entities.registers.block_position import BlockPositionRegister
-from realab_suite.entities.registers.checks import CHANNELS
-from realab_suite.entities.registers.checks import DOFS
-from realab_suite.entities.registers.checks import OVERFLOWS
-from realab_suite.entities.registers.checks import WRITES
 from realab_suite.entities.registers.footprints import Path
 from realab_suite.entities.registers.records import AGENT
 from realab_suite.entities.registers.records import EVALUATOR
@@ -27,6 +28,7 @@ __all__ = [
     'INITIAL',
     'OVERFLOWS',
     'WRITES',
+    'Arguments',
     'BlockOrientationRegister',
     'BlockPositionRegister',
     'Path',

@@ -16,12 +16,14 @@ from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import validation
 from realab_suite.entities import appearance
 from realab_suite.entities import axes
 from realab_suite.entities import block_kinds
 from realab_suite.entities import mocap_blocks
 from realab_suite.entities import protocols
 from realab_suite.entities import state
+from realab_suite.entities.registers import arguments as register_arguments
 from realab_suite.entities.registers import checks
 from realab_suite.entities.registers import footprints
 from realab_suite.entities.registers import records
@@ -72,65 +74,41 @@ class Register(composer.Entity):
       self,
       name: str,
       *,
-      value_range: Sequence[float],
-      scale: float = 0.1,
-      initial: float = 0.0,
-      role: str = 'feedback',
-      channel: str = 'embedded',
-      dof: str = 'free',
-      on_overflow: str = 'saturate',
-      write: str = 'axis',
-      block_size: float = 0.2,
-      mass: float = 1.0,
+      arguments: register_arguments.Arguments | None = None,
+      **options: Any,
   ) -> None:
     """Builds the register.
 
     Args:
       name: Name of the register, and of its model until it is attached to a
         model that has another one of that name.
-      value_range: Lowest and highest value that can be stored, in each port.
-      scale: Length in m (angle in rad for an orientation) per unit of value.
-      initial: Value at the start of an episode.
-      role: Role of the register, a key of `appearance.ROLE_COLOURS`.
-      channel: One of `CHANNELS`.
-      dof: One of `DOFS`: degrees of freedom of blocks that can be pushed.
-      on_overflow: One of `OVERFLOWS`: `saturate` to saturate a value out of
-        range, `error` to refuse it.
-      write: One of `WRITES`. `axis` for writes that set only the coordinate
-        that carries the value, so that an agent can carry or throw a block that
-        is written in each step; `pose` for writes that restore the whole pose,
-        upright and at rest, and release the block from every hand.
-      block_size: Edge length of each block, in m.
-      mass: Mass of each block, in kg.
+      arguments: Its arguments, as a design has validated them; or `None`.
+      **options: Otherwise its arguments by name; see `Arguments`. The range is
+        `value_range`.
 
     Raises:
       SpecError: If an argument has a value that is not allowed.
     """
-    checks.check(
-        name,
-        value_range,
-        scale,
-        initial,
-        role,
-        channel,
-        dof,
-        on_overflow,
-        write,
-        self.PORTS,
-    )
+    if arguments is None:
+      if 'value_range' in options:
+        options['range'] = options.pop('value_range')
+      arguments = validation.validate(
+          register_arguments.Arguments, options, f'register {name!r}'
+      )
+    checks.check_ports(name, self.PORTS)
     # Not the name of the model, which changes if the register is attached to a
     # model that has another one of that name.
     self._name = name
-    self._low, self._high = (float(bound) for bound in value_range)
-    self._scale = scale
-    self._initial = initial
-    self._role = role
-    self._channel = channel
-    self._dof = dof
-    self._on_overflow = on_overflow
-    self._write = write
-    self._block_size = block_size
-    self._mass = mass
+    self._low, self._high = arguments.range
+    self._scale = arguments.scale
+    self._initial = arguments.constant_initial
+    self._role = arguments.role
+    self._channel = arguments.channel or 'embedded'
+    self._dof = arguments.dof or 'free'
+    self._on_overflow = arguments.on_overflow
+    self._write = arguments.write
+    self._block_size = arguments.block_size
+    self._mass = arguments.mass
     self._spread = np.zeros(2)
     self._mjcf_root = mjcf.RootElement(model=name)
     size = len(self.PORTS) or None

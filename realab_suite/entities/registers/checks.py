@@ -1,4 +1,4 @@
-"""Allowed arguments and values of registers."""
+"""Refusals of values and of register kinds."""
 
 from collections.abc import Sequence
 import re
@@ -7,64 +7,14 @@ from typing import Any
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.entities import appearance
-
-# embedded: the poses of the blocks store the value; blocks can be pushed.
-# welded: the poses of the blocks store the value; only writes move the blocks.
-# secure: a slot of the state stores the value; the blocks are scenery.
-CHANNELS = ('embedded', 'welded', 'secure')
-DOFS = ('free', 'planar')
-OVERFLOWS = ('saturate', 'error')
-# axis: a write sets only the coordinate that carries the value.
-# pose: a write restores the whole pose of the written blocks.
-WRITES = ('axis', 'pose')
 
 
-def check(
-    name: str,
-    value_range: Sequence[float],
-    scale: float,
-    initial: float,
-    role: str,
-    channel: str,
-    dof: str,
-    on_overflow: str,
-    write: str,
-    ports: Sequence[str],
-) -> None:
-  """Checks the arguments of `Register`.
+def check_ports(name: str, ports: Sequence[str]) -> None:
+  """Checks the names of the ports of a register kind.
 
   Raises:
-    SpecError: If an argument has a value that is not allowed.
+    SpecError: If they cannot be names of registers.
   """
-  allowed = (
-      ('role', role, tuple(appearance.ROLE_COLOURS)),
-      ('channel', channel, CHANNELS),
-      ('dof', dof, DOFS),
-      ('on_overflow', on_overflow, OVERFLOWS),
-      ('write', write, WRITES),
-  )
-  for argument, value, choices in allowed:
-    if value not in choices:
-      raise errors.SpecError(
-          f'register {name!r}: {argument}: {value!r}; allowed are'
-          f' {list(choices)}'
-      )
-  if len(value_range) != 2 or not value_range[0] < value_range[1]:
-    raise errors.SpecError(
-        f'register {name!r}: value_range: {value_range!r}; allowed are two'
-        ' numbers, low < high'
-    )
-  low, high = value_range
-  if not (np.isfinite(low) and np.isfinite(high) and low <= initial <= high):
-    raise errors.SpecError(
-        f'register {name!r}: initial {initial!r} and value_range'
-        f' {value_range!r}; both must be finite, with initial in value_range'
-    )
-  if not (np.isfinite(scale) and scale > 0):
-    raise errors.SpecError(
-        f'register {name!r}: scale: {scale!r}; allowed are numbers above 0'
-    )
   # They become parts of names in YAML, observations, files and flags.
   is_legal = all(re.fullmatch('[a-z0-9_]+', port) for port in ports)
   if isinstance(ports, str) or not is_legal or len(set(ports)) < len(ports):
