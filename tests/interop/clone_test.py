@@ -243,8 +243,8 @@ def _settings(record):
   """Returns the settings that `serve` makes of --repeat."""
   return served_evaluation.Settings(
       world=worlds.World('collect_apples', 'standard'), design='none',
-      overrides=(), seed=0, repeat=record and str(record), num_episodes=2, name='agent',
-      address=None, idle_seconds=patience.SECONDS,
+      overrides=(), seed=0, repeat=record and str(record), num_episodes=2,
+      name='agent', address=None, idle_seconds=patience.SECONDS,
       provider_seconds=patience.SECONDS, agent_command=None,
       agent_folder=None, agent_user=None, output='results',
   )  # fmt: skip
