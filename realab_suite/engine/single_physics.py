@@ -36,6 +36,7 @@ class ThinPhysics(mjcf.Physics):
   """
 
   def _reload_from_data(self, data: Any) -> None:
+    self._compiled = data.model
     self._pointers = data.model.ptr, data.ptr
     self._num_warnings = data.ptr.warning.number
     self._has_old_poses = True
@@ -44,8 +45,9 @@ class ThinPhysics(mjcf.Physics):
     # One for each size of frames, (height, width).
     self._renderers: dict[Any, frame_renderer.FrameRenderer] = {}
 
-  # Read many times in a control step; dm_control's is a function in Python.
+  # Read many times in a control step; dm_control's are functions in Python.
   data = property(operator.attrgetter('_data'))
+  model = property(operator.attrgetter('_compiled'))
 
   def forward(self) -> None:
     """Updates the quantities derived from positions and velocities.
@@ -187,24 +189,15 @@ def _view(array: np.ndarray, index: Any) -> np.ndarray | None:
   return None
 
 
-def _state_property(name: str) -> property:
-  """Returns a property for a state attribute, which needs no computation."""
-
-  def get(self: '_ThinBinding') -> np.ndarray:
-    try:
-      return self._reads[name]
-    except KeyError:
-      return self._read(name)
-
-  return property(get)
-
-
 def _pose_property(name: str) -> property:
   """Returns a property for a pose, which is updated when it is read."""
 
   def get(self: '_ThinBinding') -> np.ndarray:
     self._physics.update_poses()
-    return self._read(name)
+    try:
+      return self._reads[name]
+    except KeyError:
+      return self._read(name)
 
   return property(get)
 
@@ -223,20 +216,15 @@ def _derived_property(name: str) -> property:
 class _ThinBinding(mjcf_physics.Binding):
   """A binding with fast access to the attributes that entities use.
 
+  Views of the state are in slots, so that reading one calls no Python function.
   Attributes that are not listed here work as in Composer.
   """
 
-  __slots__ = ('_reads', '_writes')
+  __slots__ = (*_STATE, '_reads', '_writes')
 
   _reads: dict[str, np.ndarray]
   _writes: dict[str, tuple[np.ndarray, Any]]
 
-  qpos = _state_property('qpos')
-  qvel = _state_property('qvel')
-  ctrl = _state_property('ctrl')
-  mocap_pos = _state_property('mocap_pos')
-  mocap_quat = _state_property('mocap_quat')
-  active = _state_property('active')
   xpos = _pose_property('xpos')
   xmat = _pose_property('xmat')
   cvel = _derived_property('cvel')
@@ -246,6 +234,11 @@ class _ThinBinding(mjcf_physics.Binding):
     object.__setattr__(self, '_reads', {})
     object.__setattr__(self, '_writes', {})
     super().__init__(physics, namespace, names)
+
+  def __getattr__(self, name: str) -> Any:
+    # Also called for a state attribute whose slot is empty: before it is read,
+    # and if no view of it is possible.
+    return self._read(name) if name in _STATE else super().__getattr__(name)
 
   def __setattr__(self, name: str, value: Any) -> None:
     if name not in _STATE:
@@ -267,6 +260,8 @@ class _ThinBinding(mjcf_physics.Binding):
       self._writes[name] = view, ...
       self._reads[name] = view.view()
       self._reads[name].flags.writeable = False
+      if name in _STATE:
+        object.__setattr__(self, name, self._reads[name])
     return self._writes[name]
 
   def _read(self, name: str) -> np.ndarray:

@@ -78,7 +78,9 @@ class Slot:
 
   def copy(self, physics: protocols.Physics) -> np.ndarray:
     """Returns a copy of the values; see `get`."""
-    value = self.get(physics)
+    if physics.data is not self._data:
+      self._resolve(physics)
+    value = self._view[()]
     return value.copy() if value.ndim else value  # A number cannot change.
 
   def set(
@@ -96,7 +98,9 @@ class Slot:
     """
     if physics.data is not self._data:
       self._resolve(physics)
-    self._view[...] = axes.merge(where, value, self._view)
+    if where is not None:
+      value = axes.merge(where, value, self._view)
+    self._view[...] = value
 
   def _resolve(self, physics: protocols.Physics) -> None:
     """Finds the slot in the data of a physics and caches the result."""
