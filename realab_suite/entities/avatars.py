@@ -156,6 +156,7 @@ class Avatar(measurables.MeasurableEntity):
         fromto=(0.08, 0, 0, 0.22, 0, 0), contype=0, conaffinity=0,
         rgba=(0.9, 0.3, 0.2, 1.0),
     )  # fmt: skip
+    self._joints = (*self._slides, self._yaw, self._pitch)
     self._camera = self._head.add(
         'camera', name='egocentric', fovy=80, pos=(0.1, 0, 0),
         xyaxes=(0, -1, 0, 0, 0, 1),
@@ -362,7 +363,7 @@ class Avatar(measurables.MeasurableEntity):
     """
     physics.bind(self._actuators).ctrl = action[..., : len(self._actuators)]
     if self._grasps:
-      grasp, throw = axes.component(action, -2), axes.component(action, -1)
+      *_, grasp, throw = action.T
       self._use_hand(physics, grasp, throw)
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
@@ -399,22 +400,23 @@ class Avatar(measurables.MeasurableEntity):
     Concatenates `velocity`, `position`, `direction`, `pitch` and `holding`;
     `PROPRIOCEPTION` has the indices of each.
     """
-    slides = physics.bind(self._slides)
-    x, y = (axes.component(slides.qvel, i) for i in range(2))
-    angle = axes.component(physics.bind(self._yaw).qpos, 0)
+    joints = physics.bind(self._joints)
+    x, y, angle, pitch = joints.qpos.T
+    speed_x, speed_y, turning, _ = joints.qvel.T
     cos, sin = np.cos(angle), np.sin(angle)
     body = np.empty((*angle.shape, 9))
-    body[..., 0] = cos * x + sin * y
-    body[..., 1] = cos * y - sin * x
-    body[..., 2:3] = physics.bind(self._yaw).qvel
-    body[..., 3:5] = slides.qpos
+    body[..., 0] = cos * speed_x + sin * speed_y
+    body[..., 1] = cos * speed_y - sin * speed_x
+    body[..., 2] = turning
+    body[..., 3] = x
+    body[..., 4] = y
     body[..., 5] = cos
     body[..., 6] = sin
-    body[..., 7:8] = physics.bind(self._pitch).qpos
+    body[..., 7] = pitch
     body[..., 8] = 0.0
     if self._constraints:
-      active = np.asarray(physics.bind(self._constraints).active)
-      body[..., 8] = active.any(axis=-1)
+      active = physics.bind(self._constraints).active
+      body[..., 8] = np.logical_or.reduce(active, axis=-1)
     return body
 
   def _use_hand(
@@ -467,14 +469,14 @@ class Avatar(measurables.MeasurableEntity):
 
   def _hand_position(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the position of the hand, `(..., 2)`, from the state alone."""
-    angle = axes.component(physics.bind(self._yaw).qpos, 0)
+    angle = physics.bind(self._yaw).qpos.T[0]
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return physics.bind(self._slides).qpos + _HAND_DISTANCE * direction
 
   def _hand_velocity(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the velocity of the hand in the world frame, `(..., 3)`."""
-    angle = axes.component(physics.bind(self._yaw).qpos, 0)
-    turning = _HAND_DISTANCE * axes.component(physics.bind(self._yaw).qvel, 0)
+    angle = physics.bind(self._yaw).qpos.T[0]
+    turning = _HAND_DISTANCE * physics.bind(self._yaw).qvel.T[0]
     walking = physics.bind(self._slides).qvel
     velocity = np.zeros((*walking.shape[:-1], 3))
     velocity[..., 0] = walking[..., 0] - turning * np.sin(angle)

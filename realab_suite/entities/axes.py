@@ -2,7 +2,8 @@
 
 A value of one world is a number (`np.float64`), a value of a batch is an array
 `(worlds,)`. NumPy calculates with numbers ten times as fast as with arrays
-without axes, so these helpers return numbers for one world.
+without axes, so these helpers return numbers for one world. So does unpacking a
+transpose: `x, y, z = position.T` for positions `(..., 3)`.
 
 A mask says in which worlds something happens: `(...)` bool, or `None` for all
 worlds.
@@ -14,11 +15,6 @@ from typing import Any
 import numpy as np
 
 Mask = np.ndarray | None
-
-
-def component(array: np.ndarray, index: int) -> np.ndarray:
-  """Returns `array[..., index]`; a number if `array` has one axis."""
-  return array[index] if array.ndim == 1 else array[..., index][()]
 
 
 def anywhere(condition: np.ndarray) -> bool:

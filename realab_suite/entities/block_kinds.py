@@ -119,11 +119,55 @@ class Block(abc.ABC):
 
   def along(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the x coordinate in the register's frame, `(...)`, in m."""
-    return axes.component(self.position(physics), 0)
+    return self.position(physics).T[0]
 
   @abc.abstractmethod
   def heading(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the angle about the vertical, `(...)`, in (-pi, pi]."""
+
+  def slide(
+      self,
+      physics: protocols.Physics,
+      along: np.ndarray,
+      where: axes.Mask = None,
+  ) -> np.ndarray:
+    """Sets the x coordinate in the register's frame, and nothing else.
+
+    The block keeps its other coordinates, its orientation and its velocity, and
+    a hand that holds it keeps hold. If the block would be inside an immovable
+    object, it gets the nearest free coordinate.
+
+    Args:
+      physics: One world or a batch of worlds.
+      along: Coordinate, `(...)`, in m.
+      where: As in `put`.
+
+    Returns:
+      Coordinate that the block got, `(...)`, in m; `along` itself if nothing
+      was in the way.
+
+    Raises:
+      TypeError: If the block has no joints; nothing but `put` moves it.
+    """
+    raise TypeError(f'{type(self).__name__} has no joints')
+
+  def turn(
+      self,
+      physics: protocols.Physics,
+      heading: np.ndarray,
+      where: axes.Mask = None,
+  ) -> None:
+    """Sets the angle about the vertical, and nothing else.
+
+    Args:
+      physics: One world or a batch of worlds.
+      heading: Angle about the vertical, `(...)`, in rad.
+      where: As in `put`.
+
+    Raises:
+      TypeError: If the block has no joints; nothing but `put` moves it.
+    """
+    raise TypeError(f'{type(self).__name__} has no joints')
 
   @abc.abstractmethod
   def put(
@@ -232,8 +276,7 @@ class JointedBlock(Block):
     return self._written_slot
 
   def along(self, physics: protocols.Physics) -> np.ndarray:
-    moved = physics.bind(self._slides).qpos
-    return self._rest[0] + axes.component(moved, 0)
+    return self._rest[0] + physics.bind(self._slides).qpos.T[0]
 
   def slide(
       self,
@@ -241,21 +284,6 @@ class JointedBlock(Block):
       along: np.ndarray,
       where: axes.Mask = None,
   ) -> np.ndarray:
-    """Sets the x coordinate in the register's frame, and nothing else.
-
-    The block keeps its other coordinates, its orientation and its velocity, and
-    a hand that holds it keeps hold. If the block would be inside an immovable
-    object, it gets the nearest free coordinate.
-
-    Args:
-      physics: One world or a batch of worlds.
-      along: Coordinate, `(...)`, in m.
-      where: As in `put`.
-
-    Returns:
-      Coordinate that the block got, `(...)`, in m; `along` itself if nothing
-      was in the way.
-    """
     position = self.position(physics)
     if not axes.everywhere(self._surroundings.are_far(physics, position)):
       along = self._free(physics, position, along)
@@ -264,21 +292,6 @@ class JointedBlock(Block):
     axes.assign(physics.bind(self._slides[0]), 'qpos', moved, where)
     self._adapt_grasps(physics, position, where)
     return along
-
-  @abc.abstractmethod
-  def turn(
-      self,
-      physics: protocols.Physics,
-      heading: np.ndarray,
-      where: axes.Mask = None,
-  ) -> None:
-    """Sets the angle about the vertical, and nothing else.
-
-    Args:
-      physics: One world or a batch of worlds.
-      heading: Angle about the vertical, `(...)`, in rad.
-      where: As in `put`.
-    """
 
   def _free(
       self,
@@ -477,13 +490,14 @@ class PlanarBlock(JointedBlock):
     self._site.pos = [0.0, 0.0, self._grip_offset - height]
 
   def position(self, physics: protocols.Physics) -> np.ndarray:
-    moved = np.asarray(physics.bind(self._slides).qpos)
-    planar = self._rest[:2] + moved
-    height = np.full((*planar.shape[:-1], 1), self._rest[2])
-    return np.concatenate([planar, height], axis=-1)
+    moved = physics.bind(self._slides).qpos
+    position = np.empty((*moved.shape[:-1], 3))
+    position[..., :2] = self._rest[:2] + moved
+    position[..., 2] = self._rest[2]
+    return position
 
   def heading(self, physics: protocols.Physics) -> np.ndarray:
-    angle = axes.component(physics.bind(self._hinge).qpos, 0)
+    angle = physics.bind(self._hinge).qpos.T[0]
     return np.arctan2(np.sin(angle), np.cos(angle))
 
   def _orientation(self, physics: protocols.Physics) -> np.ndarray:

@@ -87,7 +87,7 @@ class SlidingDoor(measurables.MeasurableEntity):
       seconds: Duration, in s.
     """
     leaf = physics.bind(self._leaf.frame).mocap_pos
-    x = axes.component(leaf, 0)
+    x = leaf.T[0]
     remaining = self._closed_x + self._travel * opening - x
     # In most steps the door is at its target already.
     if axes.anywhere(remaining):
@@ -98,5 +98,5 @@ class SlidingDoor(measurables.MeasurableEntity):
 
   def openness(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the open fraction of the door, from 0 to 1, `(...)`."""
-    x = axes.component(physics.bind(self._leaf.frame).mocap_pos, 0)
+    x = physics.bind(self._leaf.frame).mocap_pos.T[0]
     return (x - self._closed_x) / self._travel

@@ -156,7 +156,7 @@ class RaySense(composer.Entity):
     # The first column of the matrix is the direction of the middle of the fan.
     cos, sin = matrix[..., 0:1], matrix[..., 3:4]
     x, y = self._fan
-    directions = np.zeros((*np.shape(cos)[:-1], len(x), 3))
+    directions = np.zeros((*cos.shape[:-1], len(x), 3))
     directions[..., 0] = cos * x - sin * y
     directions[..., 1] = sin * x + cos * y
     distances, geoms = cast(physics, frame.xpos, directions, self._carrier)

@@ -4,8 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from realab_suite.entities import axes
-
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -38,7 +36,7 @@ def heading_of(quaternion: np.ndarray) -> np.ndarray:
   tilt: this one where the cube balances on an edge, not where it lies on a
   face, as the twist about the vertical would be for a cube upside down.
   """
-  w, x, y, z = (axes.component(quaternion, i) for i in range(4))
+  w, x, y, z = (quaternion[..., i][()] for i in range(4))
   east = w * w + x * x - y * y - z * z + 2.0 * (x * y - w * z)
   north = w * w - x * x + y * y - z * z + 2.0 * (x * y + w * z)
   # The diagonal of an unturned cube is at 45 degrees.

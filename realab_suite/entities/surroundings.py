@@ -13,7 +13,6 @@ from dm_control import mjcf
 import mujoco
 import numpy as np
 
-from realab_suite.entities import axes
 from realab_suite.entities import protocols
 from realab_suite.entities import rotations
 
@@ -143,7 +142,11 @@ class Boxes:
 
 @final
 class Movers:
-  """Solid mocap bodies, such as doors, in the frame of a register."""
+  """Solid mocap bodies, such as doors, in the frame of a register.
+
+  Attributes:
+    frames: The mocap bodies.
+  """
 
   def __init__(
       self,
@@ -163,21 +166,16 @@ class Movers:
     self._origin, self._rotation = origin, rotation
     carriers = model.body_weldid[model.geom_bodyid]
     is_solid = _are_obstacles(model)
-    self._frames: tuple[mjcf.Element, ...] = ()
+    self.frames: tuple[mjcf.Element, ...] = ()
     geoms, owners = [], []
     for frame in frames:
       body = model.name2id(frame.full_identifier, 'body')
       if found := np.flatnonzero(is_solid & (carriers == body)).tolist():
         geoms += found
-        owners += [len(self._frames)] * len(found)
-        self._frames += (frame,)
+        owners += [len(self.frames)] * len(found)
+        self.frames += (frame,)
     self._owners = np.array(owners, int)
     self._boxes = _collected(model, geoms, [], np.zeros(3), np.eye(3))
-
-  @property
-  def frames(self) -> tuple[mjcf.Element, ...]:
-    """The mocap bodies."""
-    return self._frames
 
   def at(self, positions: np.ndarray, quaternions: np.ndarray) -> Boxes:
     """Returns the boxes of the bodies.
@@ -272,7 +270,7 @@ class Surroundings:
     if self._movers is not None:
       self._follow(physics, self._movers)
     right, floor, left, ceiling = self._corridor
-    y, z = axes.component(position, 1), axes.component(position, 2)
+    _, y, z = position.T
     return (right < y) & (y < left) & (floor < z) & (z < ceiling)
 
   def nearest_free(

@@ -355,7 +355,7 @@ class FeedbackMechanism(composer.Entity):
       if target.register.PORTS:
         requested = values[..., target.columns]
       else:
-        requested = axes.component(values, target.columns[0])
+        requested = values[..., target.columns[0]][()]
       writers = (records.AGENT,) * len(target.ports)
       writes += _write(physics, target, writers, step, requested)
     return writes
@@ -757,10 +757,10 @@ def _write(
           name,
           writers[i],
           step,
-          axes.component(value, i),
-          axes.component(applied, i),
-          axes.component(obstruction, i),
-          axes.component(clean, i),
+          value[..., i][()],
+          applied[..., i][()],
+          obstruction[..., i][()],
+          clean[..., i][()],
           where,
       )
       for i, name in enumerate(target.names)

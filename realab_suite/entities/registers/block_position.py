@@ -38,11 +38,11 @@ class BlockPositionRegister(base.Register):
       value: np.ndarray,
       where: axes.Mask = None,
   ) -> np.ndarray:
-    start = axes.component(self._origin(physics), 0)
+    start = self._origin(physics).T[0]
     return moves.slide(physics, self._block, start, value, self._scale, where)
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
-    started = axes.component(self._origin(physics), 0)
+    started = self._origin(physics).T[0]
     return (self._block.along(physics) - started) / self._scale
 
   @property

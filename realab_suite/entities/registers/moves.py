@@ -30,7 +30,7 @@ def slide(
     immovable is in the way.
   """
   along = start + value * scale
-  placed = _jointed(block).slide(physics, along, where)
+  placed = block.slide(physics, along, where)
   if placed is along:
     return value
   return np.where(placed == along, value, (placed - start) / scale)[()]
@@ -47,7 +47,7 @@ def undisturbed(
     height: Height of the centre of a block at rest, in m.
   """
   position = np.array(start)
-  position[..., 0] = axes.component(position, 0) + along
+  position[..., 0] += along
   position[..., 2] = height
   return position
 
@@ -66,15 +66,4 @@ def turn(
     heading: Angle about the vertical, `(...)`, in rad.
     where: As in `slide`.
   """
-  _jointed(block).turn(physics, heading, where)
-
-
-def _jointed(block: block_kinds.Block) -> block_kinds.JointedBlock:
-  """Returns a block with joints.
-
-  Raises:
-    TypeError: If it has none; nothing but `put` moves such a block.
-  """
-  if not isinstance(block, block_kinds.JointedBlock):
-    raise TypeError(f'{type(block).__name__} has no joints')
-  return block
+  block.turn(physics, heading, where)

@@ -122,7 +122,7 @@ class Port:
 
   def _of(self, values: np.ndarray) -> np.ndarray:
     """Returns the part of values, `(..., ports)`, that belongs to the port."""
-    return axes.component(values, self._index)
+    return values[..., self._index][()]
 
 
 AnyPort = base.Register | Port

@@ -90,7 +90,7 @@ class TwoBlockRegister(base.Register):
       value: np.ndarray,
       where: axes.Mask = None,
   ) -> np.ndarray:
-    start = axes.component(self._origin(physics), 0)
+    start = self._origin(physics).T[0]
     return moves.slide(physics, self._offset, start, value, self._scale, where)
 
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
@@ -98,7 +98,7 @@ class TwoBlockRegister(base.Register):
     return distance / self._scale
 
   def _permanent(self, physics: protocols.Physics) -> np.ndarray:
-    started = axes.component(self._origin(physics), 0)
+    started = self._origin(physics).T[0]
     return (started - self._base.along(physics)) / self._scale
 
   @property
