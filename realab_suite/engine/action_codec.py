@@ -75,6 +75,9 @@ class ActionCodec:
     # An unbounded element accepts any finite number.
     self._is_bounded = bool(np.isfinite([self._low, self._high]).all())
     self._spec = self._make_spec(np.dtype(np.int32 if is_integer else float))
+    self._shape = self._spec.shape
+    # Floats are rejected where actions are integers, instead of rounded.
+    self._kinds = 'iu' if is_integer else 'iuf'
 
   def _make_spec(self, dtype: np.dtype) -> specs.Array:
     if self._table is not None and not self._num_queries:
@@ -113,7 +116,7 @@ class ActionCodec:
         of bounds or not finite.
     """
     values = self._cast(action)
-    expected = (*batch_shape, *self._spec.shape)
+    expected = (*batch_shape, *self._shape)
     if values.shape != expected:
       hint = (
           '; the number of an action needs a design or an override with an'
@@ -124,7 +127,7 @@ class ActionCodec:
       raise errors.ActionError(
           f'action: shape {values.shape}, expected {expected}{hint}'
       )
-    if not self._spec.shape:
+    if not self._shape:
       values = values[..., np.newaxis]
     is_valid = (values >= self._low) & (values <= self._high)  # False for NaN.
     if not self._is_bounded:
@@ -144,13 +147,11 @@ class ActionCodec:
       raise errors.ActionError(
           f'action: {type(action).__name__} is not an array of numbers'
       ) from error
-    # Floats are rejected where actions are integers, instead of rounded.
-    kinds = 'iuf' if self._spec.dtype.kind == 'f' else 'iu'
-    if values.dtype.kind not in kinds:
+    if values.dtype.kind not in self._kinds:
       raise errors.ActionError(
           f'action: dtype {values.dtype}; expected {self._spec.dtype}'
       )
-    if np.ma.isMaskedArray(action):
+    if isinstance(action, np.ma.MaskedArray):
       raise errors.ActionError('action: a masked array; expected plain numbers')
     if values.dtype == np.float64:
       return values.copy()
@@ -161,7 +162,7 @@ class ActionCodec:
   def _bounds_message(self, values: np.ndarray, bad: np.ndarray) -> str:
     where = tuple(np.argwhere(bad)[0])
     value, i = values[where], where[-1]
-    label = f'action{list(map(int, where))}' if self._spec.shape else 'action'
+    label = f'action{list(map(int, where))}' if self._shape else 'action'
     if np.isnan(value):
       return f'{label} ({self._names[i]}) is nan'
     low, high = self._low[i], self._high[i]

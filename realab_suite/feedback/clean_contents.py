@@ -122,8 +122,7 @@ def is_disturbed(reading: Any, applied: Any, clean: Any, most: float) -> Any:
     most: Largest displacement that counts as none; see `tolerance`.
   """
   # False for nan, so it is the opposite that is asked.
-  is_same = (abs(reading - applied) <= most) & (applied == clean)
-  return ~is_same if np.ndim(is_same) else not is_same
+  return np.logical_not((abs(reading - applied) <= most) & (applied == clean))
 
 
 def undisturbed(reading: Any, applied: Any, clean: Any, most: float) -> Any:

@@ -349,7 +349,7 @@ class FeedbackMechanism(composer.Entity):
     """
     if not self._queries:
       return []
-    step = self._this_step(physics)
+    step = self._whole_steps(physics) + 1
     writes = []
     for target in self._query_targets:
       if target.register.PORTS:
@@ -382,7 +382,7 @@ class FeedbackMechanism(composer.Entity):
     """
     if not self._meters:
       return []
-    step = self._this_step(physics)
+    step = self._whole_steps(physics) + 1
     where = axes.both(where, None)
     values = [meter.measure(physics) for _, meter, _ in self._meters]
     writes = []
@@ -454,7 +454,7 @@ class FeedbackMechanism(composer.Entity):
         returns other writes than it declares, or values of a wrong shape.
       RegisterValueError: If a register cannot store a value.
     """
-    step = self._this_step(physics)
+    step = self._whole_steps(physics) + 1
     is_start = np.asarray(step == 1)
     sight = self._sight(physics, observation)
     log: list[records.Record] = []
@@ -465,9 +465,10 @@ class FeedbackMechanism(composer.Entity):
         next_states.append(states[i])
         continue
       reads = [
-          port.inspect(physics, provider.title, step)._replace(where=acts)
-          for port in provider.reads
+          port.inspect(physics, provider.title, step) for port in provider.reads
       ]
+      if acts is not None:
+        reads = [read._replace(where=acts) for read in reads]
       inputs = clean_contents.Inputs(
           {key: observation[key] for key in provider.seen},
           {read.register: read.reading for read in reads},
@@ -529,7 +530,7 @@ class FeedbackMechanism(composer.Entity):
       ) from error
     try:
       values, following = provider_results.checked(
-          provider, returned, np.shape(step)
+          provider, returned, step.shape
       )
       if acts is not None:
         following = provider_results.merged('state', following, before, ~acts)
@@ -699,10 +700,6 @@ class FeedbackMechanism(composer.Entity):
     count = self._step_count.get(physics)
     return count.astype(int) if count.ndim else np.int64(count)
 
-  def _this_step(self, physics: protocols.Physics) -> Any:
-    """Returns the number of the current control step, from 1, `(...)` int."""
-    return self._whole_steps(physics) + 1
-
 
 def _joint(functions: Sequence[measurements.Measure]) -> measurements.Measure:
   """Returns a function with the values of several, `(..., functions)`.
@@ -738,7 +735,8 @@ def _write(
   register = target.register
   applied = register.write(physics, value, where)
   obstruction = register.obstruction(physics)
-  clean = register.clean(physics)
+  # What was written is clean for now.
+  clean = applied if where is None else register.clean(physics)
   if not register.PORTS:
     return [
         records.Write(

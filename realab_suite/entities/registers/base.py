@@ -661,8 +661,8 @@ class Register(composer.Entity):
     if self._channel == 'secure':
       permanent = np.zeros_like(reading)
     else:
-      permanent = np.asarray(self._permanent(physics))
-    obstruction = self.obstruction(physics)
+      permanent = np.asarray(self._permanent(physics))[()]
+    obstruction = self._obstruction_slot.copy(physics)
     if reading.shape != applied.shape or reading.dtype != np.float64:
       raise checks.misreading(self, '_read_blocks', reading, applied)
     if permanent.shape != applied.shape:
@@ -676,7 +676,7 @@ class Register(composer.Entity):
         obstruction,
         permanent,
         temporary,
-        self.clean(physics),
+        self._clean_slot.copy(physics),
     )
 
   def _origin(self, physics: protocols.Physics) -> np.ndarray:
