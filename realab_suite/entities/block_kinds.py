@@ -288,7 +288,7 @@ class JointedBlock(Block):
     if not axes.everywhere(self._surroundings.are_far(physics, position)):
       along = self._free(physics, position, along)
     position[..., 0] = along
-    moved = np.subtract(along, self._rest[0])[..., np.newaxis]
+    moved = position[..., :1] - self._rest[:1]
     axes.assign(physics.bind(self._slides[0]), 'qpos', moved, where)
     self._adapt_grasps(physics, position, where)
     return along

@@ -7,6 +7,7 @@ where they are at the moment of the write.
 """
 
 from collections.abc import Sequence
+import copy
 from typing import Any, Self, final
 
 from dm_control import mjcf
@@ -63,9 +64,9 @@ class Boxes:
     self.rotations = rotations
     self.halves = halves
     self.is_exact = is_exact
-    extent = np.einsum('...bij,bj->...bi', np.abs(rotations), halves)
-    self.low = centres - extent
-    self.high = centres + extent
+    self._extent = np.einsum('...bij,bj->...bi', np.abs(rotations), halves)
+    self.low = centres - self._extent
+    self.high = centres + self._extent
 
   @classmethod
   def none(cls) -> Self:
@@ -81,6 +82,14 @@ class Boxes:
         self.halves[mask],
         self.is_exact[mask],
     )
+
+  def moved(self, displacement: np.ndarray) -> 'Boxes':
+    """Returns the boxes after a displacement of each, `(..., boxes, 3)`."""
+    boxes = copy.copy(self)
+    boxes.centres = self.centres + displacement
+    boxes.low = boxes.centres - self._extent
+    boxes.high = boxes.centres + self._extent
+    return boxes
 
   def joined(self, others: 'Boxes') -> 'Boxes':
     """Returns these boxes and others."""
@@ -176,6 +185,10 @@ class Movers:
         self.frames += (frame,)
     self._owners = np.array(owners, int)
     self._boxes = _collected(model, geoms, [], np.zeros(3), np.eye(3))
+    # Doors slide without turning, so the boxes are kept with the orientations
+    # that they were turned by, as if the bodies were at the origin.
+    self._turned = self._boxes
+    self._turned_by: Any = None
 
   def at(self, positions: np.ndarray, quaternions: np.ndarray) -> Boxes:
     """Returns the boxes of the bodies.
@@ -184,16 +197,19 @@ class Movers:
       positions: Positions of the bodies, `(..., bodies, 3)`, in m.
       quaternions: Their orientations, `(..., bodies, 4)`.
     """
-    axes_of_bodies = self._rotation.T @ rotations.matrices(quaternions)
+    turned_by = quaternions.shape, quaternions.tobytes()
+    if turned_by != self._turned_by:
+      axes_of_bodies = self._rotation.T @ rotations.matrices(quaternions)
+      turned = axes_of_bodies[..., self._owners, :, :]
+      self._turned = Boxes(
+          np.einsum('...bij,bj->...bi', turned, self._boxes.centres),
+          turned @ self._boxes.rotations,
+          self._boxes.halves,
+          self._boxes.is_exact,
+      )
+      self._turned_by = turned_by
     places = (positions - self._origin) @ self._rotation
-    turned = axes_of_bodies[..., self._owners, :, :]
-    offsets = np.einsum('...bij,bj->...bi', turned, self._boxes.centres)
-    return Boxes(
-        places[..., self._owners, :] + offsets,
-        turned @ self._boxes.rotations,
-        self._boxes.halves,
-        self._boxes.is_exact,
-    )
+    return self._turned.moved(places[..., self._owners, :])
 
 
 @final
@@ -389,21 +405,12 @@ class Surroundings:
     # The placement check refuses boxes in the region, so most boxes are on one
     # side of it.
     gaps = np.concatenate([self._rest[1:] - high, low - self._rest[1:]], -1)
-    sides, bounds = gaps.argmax(axis=-1), np.concatenate([high, low], axis=-1)
-    on_side = [
-        np.where(
-            is_ahead & (sides == i),
-            bounds[..., i],
-            -np.inf if i < 2 else np.inf,
-        )
-        for i in range(4)
-    ]
-    right, floor = (
-        bound.max(axis=-1, initial=-np.inf) for bound in on_side[:2]
-    )
-    left, ceiling = (
-        bound.min(axis=-1, initial=np.inf) for bound in on_side[2:]
-    )
+    on_side = gaps.argmax(axis=-1)[..., np.newaxis] == np.arange(4)
+    on_side &= is_ahead[..., np.newaxis]
+    lower = np.where(on_side[..., :2], high, -np.inf)
+    upper = np.where(on_side[..., 2:], low, np.inf)
+    right, floor = lower.max(axis=-2, initial=-np.inf).T
+    left, ceiling = upper.min(axis=-2, initial=np.inf).T
     return right, floor, left, ceiling
 
   def _without_region(self, boxes: Boxes) -> Boxes:
