@@ -22,16 +22,13 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import control_sources
 from realab_suite.engine import control_tasks
 from realab_suite.engine import environment
+from realab_suite.engine import foreign
 from realab_suite.engine import forking
-from realab_suite.engine import placement
+from realab_suite.engine import hosts
 from realab_suite.engine import plain
 from realab_suite.engine import seeding
-from realab_suite.entities import avatars
-from realab_suite.entities import block_kinds
-from realab_suite.entities import measurables
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
-from realab_suite.tasks import base
 from realab_suite.tasks import registry
 
 MAX_STEPS = 250
@@ -302,11 +299,7 @@ def embed(
     )
   except BaseException:
     # Allows embedding a corrected design in the same task.
-    if isinstance(task, base.Task):
-      task.remove_registers([*mechanism.registers.values()])
-    else:
-      for avatar in _avatars_of(task):
-        avatar.forget(_blocks_of(mechanism))
+    foreign.make_host(task).remove_registers(mechanism)
     mechanism.detach_from_root()
     raise
 
@@ -339,13 +332,9 @@ def _connected(
     measurements: Mapping[str, Callable[[Any], Any]],
 ) -> environment.Environment:
   """Returns the environment of a task with an attached mechanism."""
-  _connect_meters(task, mechanism, measurements)
-  if isinstance(task, base.Task):
-    _check_blocks(task, mechanism)
-    task.add_registers([*mechanism.registers.values()])
-  else:
-    for avatar in _avatars_of(task):
-      avatar.make_graspable(_blocks_of(mechanism))
+  host = foreign.make_host(task)
+  _connect_meters(host, mechanism, measurements)
+  host.add_registers(mechanism)
   env = environment.Environment(
       task,
       mechanism,
@@ -356,39 +345,13 @@ def _connected(
   )
   with contextlib.ExitStack() as stack:
     stack.callback(env.close)
-    placement.check(env.physics, task.root_entity, mechanism)
-    if isinstance(task, base.Task):
-      placement.check_start(env.physics, task, mechanism)
+    host.check_placement(env.physics, mechanism)
     stack.pop_all()
   return env
 
 
-def _check_blocks(
-    task: base.Task, mechanism: mechanisms.FeedbackMechanism
-) -> None:
-  """Checks that the substeps of a task are short enough for all blocks.
-
-  The environment designer decides on the physics of a world. If the blocks of a
-  design changed the substeps, designs would not be compared in the same world.
-
-  Raises:
-    SpecError: If they are too long for a block.
-  """
-  for name, register in mechanism.registers.items():
-    for block in register.blocks:
-      misfit = block_kinds.find_misfit(block, task.physics_timestep)
-      if misfit is not None:
-        remedy = {'physics_timestep': block_kinds.SHORT_SUBSTEP}
-        raise errors.SpecError(
-            f'register {name!r}: {misfit.given}; the substeps of'
-            f' {1000 * task.physics_timestep:g} ms of the task {misfit.effect};'
-            f' allowed are {misfit.allowed}, and others if the task takes short'
-            f' substeps: task_kwargs={remedy}'
-        )
-
-
 def _connect_meters(
-    task: composer.Task,
+    host: hosts.Host,
     mechanism: mechanisms.FeedbackMechanism,
     added: Mapping[str, Callable[[Any], Any]],
 ) -> None:
@@ -398,18 +361,14 @@ def _connect_meters(
     SpecError: If a meter measures what this world does not offer, or if an
       added measurement has the name of another one.
   """
-  functions: dict[str, Callable[[Any], Any]] = {'score': mechanism.score}
-  parts: Mapping[str, measurables.Measurable] | None = None
-  if isinstance(task, base.Task):
-    functions |= task.measurements
-    parts = task.measurables
+  functions = {'score': mechanism.score, **host.functions}
   for name in added:
     if name in functions:
       raise errors.SpecError(
           f'measurements: {name!r} is measured by the task; allowed are names'
           f' other than {sorted(functions)}'
       )
-  mechanism.connect({**functions, **added}, parts)
+  mechanism.connect({**functions, **added}, host.parts)
 
 
 def _keywords(argument: str, value: Any) -> dict[str, Any]:
@@ -432,13 +391,3 @@ def _keywords(argument: str, value: Any) -> dict[str, Any]:
         ' strings as keys, and None'
     )
   return dict(value)
-
-
-def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
-  return [b for r in mechanism.registers.values() for b in r.own_blocks]
-
-
-def _avatars_of(task: composer.Task) -> list[avatars.Avatar]:
-  """Returns this package's avatars in the world of a foreign task."""
-  entities = task.root_entity.iter_entities()
-  return [one for one in entities if isinstance(one, avatars.Avatar)]

@@ -4,15 +4,14 @@ from collections.abc import Collection, Sequence
 import math
 from typing import Any, final
 
-from dm_control import composer
 from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.engine import hosts
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs as feedback_specs
 from realab_suite.policies import action_sets
-from realab_suite.tasks import base
 
 
 @final
@@ -191,19 +190,18 @@ def _element_names(control_spec: Any) -> list[str]:
 
 
 def action_set_of(
-    task: composer.Task, design: feedback_specs.DesignSpec
+    host: hosts.Host, design: feedback_specs.DesignSpec
 ) -> action_sets.ActionSet:
   """Returns the actions that policies choose from.
 
   Args:
-    task: The task.
+    host: Host of the task.
     design: Design whose action set counts; without one, that of the task.
   """
   chosen = design.action_set
   if chosen is not None:
     return action_sets.get(chosen.name, chosen.version)
-  is_ours = isinstance(task, base.Task)
-  return task.ACTION_SET if is_ours else action_sets.DMLAB_LIKE
+  return host.action_set
 
 
 def for_design(

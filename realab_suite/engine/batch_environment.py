@@ -70,7 +70,7 @@ class BatchEnvironment:
     self._num_envs = num_envs
     self._sleep = sleep
     self._entities = hooks.with_start(self._task)
-    self._host = hosts.WorldHost(self._task, self._task, None, (num_envs,))
+    self._host = hosts.WorldHost(self._task, (num_envs,))
     self._observer = observing.Observer(
         self._host, self._mechanism, single.max_steps, single.senses
     )
@@ -111,7 +111,7 @@ class BatchEnvironment:
   @property
   def action_set(self) -> action_sets.ActionSet:
     """Actions that policies choose from: the design's, or the task's."""
-    return action_codec.action_set_of(self._task, self._mechanism.design)
+    return self._single.action_set
 
   @property
   def task(self) -> base.Task:

@@ -46,6 +46,7 @@ class ControlStep:
       physics: hosts.SteppedPhysics,
       host: hosts.Host,
       mechanism: mechanisms.FeedbackMechanism,
+      view: Any = None,
   ) -> None:
     """Begins a control step, before anything has changed.
 
@@ -53,8 +54,11 @@ class ControlStep:
       physics: Physics of one world or of a batch.
       host: Host of the task.
       mechanism: Registers, meters and providers.
+      view: Physics through which registers are accessed; `None` for that of the
+        host.
     """
     self._physics = physics
+    self._view = host.view(physics) if view is None else view
     self._host = host
     self._mechanism = mechanism
     self._was_over = host.is_over(physics)
@@ -64,7 +68,7 @@ class ControlStep:
 
   def write_queries(self, queries: np.ndarray) -> None:
     """Writes the agent's queries, `(..., queries)`, after `before_step`."""
-    self._records += self._mechanism.write_queries(self._physics, queries)
+    self._records += self._mechanism.write_queries(self._view, queries)
 
   def update_meters(self, where: axes.Mask = None) -> None:
     """Measures and writes the meter registers, after `meter_substep` substeps.
@@ -73,7 +77,7 @@ class ControlStep:
       where: Worlds in which meters write; `None` for all worlds.
     """
     self._is_ending = self._host.is_over(self._physics)
-    self._records += self._mechanism.update_meters(self._physics, where)
+    self._records += self._mechanism.update_meters(self._view, where)
 
   def update_providers(
       self,
@@ -93,11 +97,7 @@ class ControlStep:
     """
     step = self._mechanism.step_count(self._physics)
     feedback, self._next_states = self._mechanism.update_providers(
-        self._physics,
-        observation,
-        random_keys.of_step(keys, step),
-        states,
-        where,
+        self._view, observation, random_keys.of_step(keys, step), states, where
     )
     self._records += feedback
 

@@ -21,17 +21,14 @@ from realab_suite.engine import control_step
 from realab_suite.engine import episodes
 from realab_suite.engine import events
 from realab_suite.engine import foreign
-from realab_suite.engine import hooks
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
 from realab_suite.engine import single_physics
 from realab_suite.engine import snapshots
-from realab_suite.engine import starts
 from realab_suite.entities import state
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
-from realab_suite.tasks import base
 
 
 @final
@@ -64,7 +61,7 @@ class Environment(composer.Environment):
       senses: Names of the agent's senses; `None` for the default ones.
     """
     self._selected_senses = senses
-    self._physics: single_physics.ThinPhysics | foreign.ForeignPhysics
+    self._physics: Any
     self._mechanism = mechanism
     mechanism.leave_phases()
     self._seed, self._world, self._episode = seed, world, -1
@@ -72,22 +69,18 @@ class Environment(composer.Environment):
     self._sinks: list[events.EventSink] = []
     self._closed = False
     self._has_extra_hooks = False
-    # Tasks of this package have no hooks in substeps.
-    self._is_ours = isinstance(task, base.Task)
-    if isinstance(task, base.Task):
-      hooks.refuse_uncalled(task)
+    self._host = host = foreign.make_host(task)
+    host.refuse_uncalled_hooks()
     super().__init__(
         task,
         random_state=seeding.random_state(seed, world, 0, 'construction'),
-        recompile_mjcf_every_episode=foreign.is_recompiled(task),
-        strip_singleton_obs_buffer_dim=True,
+        recompile_mjcf_every_episode=host.is_recompiled,
     )
-    self._host = host = foreign.make_host(
-        task,
+    host.start(
+        mechanism,
         self._hooks,
         self._random_state,
         lambda: self._observation_updater,
-        has_registers=bool(mechanism.registers),
     )
     self._observer = observing.Observer(host, mechanism, max_steps, senses)
     self._schedule = mechanism.design.schedule_for(self._n_sub_steps)
@@ -98,9 +91,7 @@ class Environment(composer.Environment):
     self._provider_keys = self._new_provider_keys()
     self._provider_states: list[Any] = []
     self._episode_is_open = False
-    self._start_check: starts.StartCheck | None = None
-    if isinstance(task, base.Task):
-      self._start_check = starts.StartCheck(self._physics, task, mechanism)
+    self._start_check = host.start_check(self._physics, mechanism)
 
   # The interface for evaluators and launchers. Agents do not get this object.
 
@@ -127,7 +118,7 @@ class Environment(composer.Environment):
   @property
   def action_set(self) -> action_sets.ActionSet:
     """Actions that policies choose from: the design's, or the task's."""
-    return action_codec.action_set_of(self._task, self._mechanism.design)
+    return action_codec.action_set_of(self._host, self._mechanism.design)
 
   @property
   def senses(self) -> tuple[str, ...]:
@@ -185,8 +176,7 @@ class Environment(composer.Environment):
       SpecError: If this environment never calls such a hook.
     """
     self._refuse_if_closed()
-    if isinstance(self._task, base.Task):
-      hooks.refuse_unused(self._task, hook_name)
+    self._host.refuse_extra_hook(hook_name)
     super().add_extra_hook(hook_name, hook_callable)
     self._has_extra_hooks = True
 
@@ -309,10 +299,7 @@ class Environment(composer.Environment):
     Raises:
       EpisodeInitializationError: If something is inside a register.
     """
-    if self._start_check is not None:
-      self._start_check(physics)
-    else:
-      foreign.check_start(physics, self._mechanism)
+    self._start_check(physics)
 
   def snapshot_header(self, model: Any = None) -> dict[str, Any]:
     """Returns the header that a snapshot needs to fit this environment.
@@ -324,16 +311,11 @@ class Environment(composer.Environment):
       SpecError: If the task is foreign, or if its bodies can sleep.
     """
     self._refuse_if_closed()
-    if not isinstance(self._task, base.Task):
-      raise errors.SpecError(
-          f'{type(self._task).__name__} cannot be saved or restored: only a'
-          ' realab_suite.tasks.base.Task is compiled once and keeps no state in'
-          ' Python'
-      )
+    dynamics = self._host.dynamics
     return {
         **snapshots.describe(self._physics.model if model is None else model),
         'task': type(self._task).__name__,
-        'dynamics': self._task.DYNAMICS_VERSION,
+        'dynamics': dynamics,
         'design': self._mechanism.design.digest(),
         'num_substeps': self._n_sub_steps,
         'max_steps': self._max_steps,
@@ -452,8 +434,7 @@ class Environment(composer.Environment):
       self, queries: np.ndarray, controls: np.ndarray
   ) -> control_step.Outcome:
     return control_step.run(
-        # Composer passes a proxy to its hooks.
-        self._physics if self._is_ours else self._physics_proxy,
+        self._physics,
         self._host,
         self._mechanism,
         self._schedule,
@@ -473,8 +454,8 @@ class Environment(composer.Environment):
 
   def _preserving_physics(self) -> contextlib.AbstractContextManager[None]:
     """Returns a context in which sinks may read the physics."""
-    if isinstance(self._physics, foreign.ForeignPhysics) and self._sinks:
-      return foreign.unchanged(self._physics)
+    if self._sinks:
+      return self._host.unchanged(self._physics)
     return contextlib.nullcontext()
 
   def _new_provider_keys(self) -> np.ndarray:
@@ -489,29 +470,22 @@ class Environment(composer.Environment):
     if self._recompile_mjcf_every_episode:
       self._hooks.initialize_episode_mjcf(self._random_state)
       self._recompile_physics_and_update_observables()
-    with foreign.initializing(self._physics, self._task, self._mechanism):
+    with self._host.initializing(self._physics, self._mechanism):
       self._hooks.initialize_episode(self._physics_proxy, self._random_state)
     self.check_start(self._physics)
-    if not self._is_ours:
-      self._observation_updater.reset(self._physics_proxy, self._random_state)
+    self._host.begin_observing(self._physics_proxy)
 
   def _make_observation_updater(self) -> Any:
-    if self._is_ours or self._selected_senses is None:
-      return super()._make_observation_updater()
-    return foreign.make_updater(self._task, self._selected_senses)
+    return self._host.make_updater(self._selected_senses)
 
   def _recompile_physics(self) -> None:
     """Compiles the model into a physics class of this engine."""
     if getattr(self, '_physics', None):
       self._physics.free()
-    kind: type[single_physics.ThinPhysics | foreign.ForeignPhysics] = (
-        single_physics.ThinPhysics if self._is_ours else foreign.ForeignPhysics
-    )
     model = self._task.root_entity.mjcf_model
     with state.room_for_slots(model):
-      self._physics = kind.from_mjcf_model(model)
-    # Steps of `ThinPhysics` begin from the state; see `ThinPhysics`.
-    self._physics.legacy_step = not self._is_ours
+      self._physics = self._host.physics_class.from_mjcf_model(model)
+    self._physics.legacy_step = self._host.LEGACY_STEP
 
   def _abandon(self, end: events.End = events.End.ABANDONED) -> None:
     if self._episode_is_open:

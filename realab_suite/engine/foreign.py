@@ -7,8 +7,9 @@ compiled for each episode, except a `control_tasks.ControlTask`. Batches and
 snapshots therefore do not support it.
 """
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 import contextlib
+import functools
 from typing import Any, final
 
 from dm_control import composer
@@ -18,54 +19,28 @@ from dm_env import specs
 import mujoco
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.engine import control_tasks
 from realab_suite.engine import gl_contexts
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
+from realab_suite.engine import placement
 from realab_suite.engine import replacement
 from realab_suite.engine import solids
+from realab_suite.entities import avatars
+from realab_suite.entities import views
 from realab_suite.feedback import mechanisms
+from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 
 @final
 class ForeignPhysics(mjcf.Physics):
-  """`mjcf.Physics` with the methods that the engine calls.
-
-  Composer recomputes accelerations, and the sensors that measure them, when a
-  bound attribute is read after a write. A write to a register must not cause
-  this, because the task would then observe other values. The registers are
-  therefore read and written between `pause` and `resume`.
-  """
-
-  _is_paused = False
-  _was_dirty = False
-
-  def pause(self) -> None:
-    """Ends a part of the task's control step."""
-    self._is_paused, self._was_dirty = True, self._dirty
-
-  def resume(self) -> None:
-    """Continues the task's control step after writes to registers."""
-    if self._is_paused:
-      self.refresh()
-      self._is_paused, self._dirty = False, self._was_dirty
-
-  def forward(self) -> None:
-    """Updates derived quantities; between `pause` and `resume`, only poses."""
-    if self._is_paused:
-      self.refresh()
-    else:
-      super().forward()
-
-  def reset(self, keyframe_id: int | None = None) -> None:
-    """Resets the state, also after an exception in a pause."""
-    self._is_paused = False
-    super().reset(keyframe_id)
+  """`mjcf.Physics` with the methods that the engine calls."""
 
   def refresh(self) -> None:
     """Updates the quantities derived from positions and velocities."""
-    refresh(self)
+    views.refresh(self)
     self._dirty = False
 
   def check(self) -> None:
@@ -104,23 +79,6 @@ def unchanged(physics: mjcf.Physics) -> Iterator[None]:
       physics.mark_as_dirty()
 
 
-def refresh(physics: mjcf.Physics) -> None:
-  """Updates the quantities derived from positions and velocities.
-
-  Composer begins a step with the derived quantities of the previous step, which
-  are wrong after a write to a register. Unlike `physics.forward`, this function
-  does not change accelerations and the solver's warm start.
-
-  Args:
-    physics: Physics of one world.
-
-  Raises:
-    PhysicsError: If MuJoCo issued a warning.
-  """
-  with physics.check_invalid_state():
-    mujoco.mj_step1(physics.model.ptr, physics.data.ptr)
-
-
 @final
 class ForeignHost(hosts.Host):
   """Host of a foreign task.
@@ -129,30 +87,163 @@ class ForeignHost(hosts.Host):
   was embedded. Observables that are enabled later are not observed.
   """
 
-  def __init__(
-      self,
-      task: composer.Task,
-      hooks: Any,
-      random_state: np.random.RandomState,
-      updater: Callable[[], composer_observation.Updater],
-      has_registers: bool,
-  ) -> None:
+  LEGACY_STEP = True
+
+  def __init__(self, task: composer.Task) -> None:
     """Initializes the host.
 
     Args:
       task: Foreign task.
-      hooks: All hooks of the `composer.Environment`.
-      random_state: Random generator for the hooks.
-      updater: Function that returns the observation updater of the present
-        compiled model.
-      has_registers: True if the design has registers.
     """
     self._task = task
-    self._hooks = hooks
+    self._hooks: Any = task
+    self._random_state: np.random.RandomState | None = None
+    self._updater: hosts.UpdaterOf = lambda: self.make_updater(None)
+    self._view: views.View | None = None
+    self._has_registers = False
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return action_sets.DMLAB_LIKE
+
+  @property
+  def functions(self) -> Mapping[str, Callable[[Any], Any]]:
+    return {}
+
+  @property
+  def parts(self) -> None:
+    """All parts and bodies of the world."""
+
+  def add_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
+    """Makes registers graspable for this package's avatars in the world."""
+    for avatar in self._avatars():
+      avatar.make_graspable(_blocks_of(mechanism))
+
+  def remove_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
+    for avatar in self._avatars():
+      avatar.forget(_blocks_of(mechanism))
+
+  def _avatars(self) -> list[avatars.Avatar]:
+    entities = self._task.root_entity.iter_entities()
+    return [one for one in entities if isinstance(one, avatars.Avatar)]
+
+  def refuse_uncalled_hooks(self) -> None:
+    """Does nothing, because all hooks are called as in Composer."""
+
+  def refuse_extra_hook(self, hook_name: str) -> None:
+    """Does nothing, because all hooks are called as in Composer."""
+
+  @property
+  def physics_class(self) -> type[mjcf.Physics]:
+    return ForeignPhysics
+
+  @property
+  def is_recompiled(self) -> bool:
+    return not isinstance(self._task, control_tasks.ControlTask)
+
+  @property
+  def dynamics(self) -> int:
+    raise errors.SpecError(
+        f'{type(self._task).__name__} cannot be saved or restored: only a'
+        ' realab_suite.tasks.base.Task is compiled once and keeps no state in'
+        ' Python'
+    )
+
+  def make_updater(
+      self, senses: Sequence[str] | None
+  ) -> composer_observation.Updater:
+    """Returns an updater of the selected observables.
+
+    Observables that are not selected are not computed.
+
+    Args:
+      senses: Names of the selected senses; `None` for all enabled observables.
+
+    Raises:
+      SpecError: If a name is not that of an enabled observable.
+    """
+    selected = {
+        name: observable
+        for name, observable in self._task.observables.items()
+        if observable.enabled
+    }
+    if senses is not None:
+      observing.refuse_unknown(senses, [*selected, observing.TIME_LEFT])
+      selected = {n: one for n, one in selected.items() if n in senses}
+    return composer_observation.Updater(
+        selected,
+        self._task.physics_steps_per_control_step,
+        strip_singleton_buffer_dim=True,
+    )
+
+  def check_placement(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> None:
+    placement.check(physics, self._task.root_entity, mechanism)
+
+  def start_check(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> Callable[[Any], None]:
+    del physics  # The model changes between episodes.
+    return functools.partial(check_start, mechanism=mechanism)
+
+  def start(
+      self,
+      mechanism: mechanisms.FeedbackMechanism,
+      step_hooks: Any,
+      random_state: np.random.RandomState | None,
+      updater: hosts.UpdaterOf,
+  ) -> None:
+    self._has_registers = bool(mechanism.registers)
+    self._hooks = step_hooks
     self._random_state = random_state
     self._updater = updater
-    self._has_registers = has_registers
     self._sense_spec = dict(updater().observation_spec())
+
+  @contextlib.contextmanager
+  def initializing(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> Iterator[None]:
+    """Returns the context in which an episode is initialized.
+
+    Foreign tasks look for positions without any contacts, and for directions
+    without walls. In the context, blocks of registers therefore touch nothing,
+    not even the floor they stand on, and rays pass through them. At the end,
+    the registers of a task that is recompiled are placed where nothing else is.
+
+    Args:
+      physics: Physics of one world.
+      mechanism: Registers, meters and providers.
+
+    Raises:
+      EpisodeInitializationError: If there is no clear place for a register. The
+        next attempt generates another world.
+    """
+    model = physics.model
+    with physics.reset_context():
+      geoms = [physics.bind(geom).element_id for geom in _geoms(mechanism)]
+      # Rays pass through geoms without opacity.
+      values = (
+          model.geom_contype,
+          model.geom_conaffinity,
+          model.geom_rgba[:, 3],
+      )
+      before = [value[geoms].copy() for value in values]
+      try:
+        for value in values:
+          value[geoms] = 0
+        yield
+      finally:
+        for value, old in zip(values, before, strict=True):
+          value[geoms] = old
+      if self.is_recompiled:
+        replacement.place(physics, mechanism)
+
+  def begin_observing(self, physics: Any) -> None:
+    self._updater().reset(physics, self._random_state)
+
+  def unchanged(self, physics: Any) -> contextlib.AbstractContextManager[None]:
+    return unchanged(physics)
 
   @property
   def sense_spec(self) -> dict[str, specs.Array]:
@@ -174,7 +265,7 @@ class ForeignHost(hosts.Host):
   ) -> None:
     self._hooks.before_step(physics, controls, self._random_state)
     self._updater().prepare_for_next_control_step()
-    self._pause(physics)
+    self._begin_access(physics)
 
   def advance(
       self,
@@ -185,7 +276,8 @@ class ForeignHost(hosts.Host):
   ) -> None:
     if not num_substeps:
       return
-    _foreign(physics).resume()
+    if self._has_registers:
+      self.view(physics).refresh()
     for i in range(num_substeps):
       self._hooks.before_substep(physics, controls, self._random_state)
       physics.advance(1)
@@ -197,11 +289,19 @@ class ForeignHost(hosts.Host):
       self._hooks.after_step(physics, self._random_state)
       self._updater().update()
     else:
-      self._pause(physics)
+      self._begin_access(physics)
 
-  def _pause(self, physics: hosts.SteppedPhysics) -> None:
+  def view(self, physics: Any) -> Any:
+    if not self._has_registers:
+      return physics
+    if self._view is None or self._view.data is not physics.data:
+      self._view = views.View(physics)
+    return self._view
+
+  def _begin_access(self, physics: Any) -> None:
+    """Begins a part of the step in which registers are accessed."""
     if self._has_registers:
-      _foreign(physics).pause()
+      self.view(physics).open(physics)
 
   def is_over(self, physics: hosts.SteppedPhysics) -> bool:
     del physics  # Composer checks only at the end of a step.
@@ -222,55 +322,8 @@ class ForeignHost(hosts.Host):
     )
 
 
-def _foreign(physics: Any) -> ForeignPhysics:
-  return physics
-
-
-def is_recompiled(task: composer.Task) -> bool:
-  """Returns True if the model of a task may change between episodes."""
-  return not isinstance(task, base.Task | control_tasks.ControlTask)
-
-
-@contextlib.contextmanager
-def initializing(
-    physics: mjcf.Physics,
-    task: composer.Task,
-    mechanism: mechanisms.FeedbackMechanism,
-) -> Iterator[None]:
-  """Returns the context in which an episode is initialized.
-
-  Foreign tasks look for positions without any contacts, and for directions
-  without walls. In the context, blocks of registers therefore touch nothing,
-  not even the floor they stand on, and rays pass through them. At the end, the
-  registers of a task that is recompiled are placed where nothing else is.
-
-  Args:
-    physics: Physics of one world.
-    task: Task of this package, or a foreign task.
-    mechanism: Registers, meters and providers.
-
-  Raises:
-    EpisodeInitializationError: If there is no clear place for a register. The
-      next attempt generates another world.
-  """
-  with physics.reset_context():
-    if not isinstance(physics, ForeignPhysics):
-      yield
-      return
-    model = physics.model
-    geoms = [physics.bind(geom).element_id for geom in _geoms(mechanism)]
-    # Rays pass through geoms without opacity.
-    values = model.geom_contype, model.geom_conaffinity, model.geom_rgba[:, 3]
-    before = [value[geoms].copy() for value in values]
-    try:
-      for value in values:
-        value[geoms] = 0
-      yield
-    finally:
-      for value, old in zip(values, before, strict=True):
-        value[geoms] = old
-    if is_recompiled(task):
-      replacement.place(physics, mechanism)
+def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
+  return [b for r in mechanism.registers.values() for b in r.blocks]
 
 
 def _geoms(mechanism: mechanisms.FeedbackMechanism) -> dict[Any, str]:
@@ -315,49 +368,12 @@ def check_start(
       )
 
 
-def make_host(
-    task: composer.Task,
-    hooks: Any,
-    random_state: np.random.RandomState,
-    updater: Callable[[], composer_observation.Updater],
-    has_registers: bool,
-) -> hosts.Host:
+def make_host(task: composer.Task) -> hosts.Host:
   """Returns the host of one world.
 
   Args:
     task: Task of this package, or a foreign task.
-    hooks: All hooks of the `composer.Environment`.
-    random_state: Random generator for the hooks.
-    updater: See `ForeignHost`.
-    has_registers: True if the design has registers.
   """
   if isinstance(task, base.Task):
-    return hosts.WorldHost(task, hooks, random_state, ())
-  return ForeignHost(task, hooks, random_state, updater, has_registers)
-
-
-def make_updater(
-    task: composer.Task, senses: Sequence[str]
-) -> composer_observation.Updater:
-  """Returns an updater of the selected observables of a foreign task.
-
-  Observables that are not selected are not computed.
-
-  Args:
-    task: Foreign task.
-    senses: Names of the selected senses.
-
-  Raises:
-    SpecError: If a name is not that of an enabled observable.
-  """
-  enabled = {
-      name: observable
-      for name, observable in task.observables.items()
-      if observable.enabled
-  }
-  observing.refuse_unknown(senses, [*enabled, observing.TIME_LEFT])
-  return composer_observation.Updater(
-      {name: enabled[name] for name in enabled if name in senses},
-      task.physics_steps_per_control_step,
-      strip_singleton_buffer_dim=True,
-  )
+    return hosts.WorldHost(task)
+  return ForeignHost(task)

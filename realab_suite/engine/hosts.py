@@ -1,24 +1,36 @@
-"""Hosts: the parts of a control step that depend on the kind of task.
+"""Hosts: everything that depends on the kind of task.
 
-`control_step` defines the order of events. A host advances the physics, detects
-the end of the episode and returns the senses. This module contains the
-interface and the host of this package's tasks; `foreign` contains the host of
-foreign tasks.
+`control_step` defines the order of events. A host compiles and advances the
+physics, detects the end of the episode and returns the senses, and it says what
+meters can measure. This module contains the interface and the host of this
+package's tasks; `foreign` contains the host of foreign tasks. No other module
+of the engine asks which kind a task is of.
 """
 
 import abc
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+import contextlib
 import traceback
-from typing import Any, NamedTuple, Protocol, final
+from typing import Any, ClassVar, NamedTuple, Protocol, final
 
+from dm_control import mjcf
+from dm_control.composer import observation as composer_observation
 from dm_control.rl import control
 from dm_env import specs
 import numpy as np
 
 from realab_suite import errors
 from realab_suite.config import messages
+from realab_suite.engine import hooks
+from realab_suite.engine import placement
+from realab_suite.engine import single_physics
+from realab_suite.engine import starts
 from realab_suite.entities import axes
+from realab_suite.entities import block_kinds
+from realab_suite.entities import measurables
 from realab_suite.entities import protocols
+from realab_suite.feedback import mechanisms
+from realab_suite.policies import action_sets
 from realab_suite.tasks import base
 
 
@@ -63,8 +75,183 @@ class SteppedPhysics(protocols.Physics, Protocol):
     """
 
 
+class StepHooks(Protocol):
+  """Hooks of a control step, of a task alone or with those of its entities."""
+
+  def before_step(
+      self, physics: SteppedPhysics, action: Any, random_state: Any
+  ) -> None:
+    """Runs before the first substep."""
+
+  def after_step(self, physics: SteppedPhysics, random_state: Any) -> None:
+    """Runs after the last substep."""
+
+
+UpdaterOf = Callable[[], composer_observation.Updater]
+"""Function that returns the observation updater of the compiled model."""
+
+
 class Host(abc.ABC):
-  """Interface between the control step and a task."""
+  """Interface between the engine and a task.
+
+  It is made before the physics is compiled. `start` completes it.
+
+  Attributes:
+    LEGACY_STEP: True if the physics is stepped as in Composer, from derived
+      quantities.
+  """
+
+  LEGACY_STEP: ClassVar[bool]
+
+  # What the world offers and takes, before it is compiled.
+
+  @property
+  @abc.abstractmethod
+  def action_set(self) -> action_sets.ActionSet:
+    """Actions of people, and of policies that act in any world."""
+
+  @property
+  @abc.abstractmethod
+  def functions(self) -> Mapping[str, Callable[[Any], Any]]:
+    """Functions of the task that meters can measure, by name."""
+
+  @property
+  @abc.abstractmethod
+  def parts(self) -> Mapping[str, measurables.Measurable] | None:
+    """Parts that meters can measure; see `FeedbackMechanism.connect`."""
+
+  @abc.abstractmethod
+  def add_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
+    """Adds registers that have been attached to the task's root entity.
+
+    Raises:
+      SpecError: If the task does not allow them.
+    """
+
+  @abc.abstractmethod
+  def remove_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
+    """Undoes `add_registers`."""
+
+  @abc.abstractmethod
+  def refuse_uncalled_hooks(self) -> None:
+    """Refuses a task with hooks that are never called.
+
+    Raises:
+      SpecError: If the task or one of its entities has such a hook.
+    """
+
+  @abc.abstractmethod
+  def refuse_extra_hook(self, hook_name: str) -> None:
+    """Refuses an extra hook that is never called.
+
+    Raises:
+      SpecError: If it is one of those.
+    """
+
+  # The compiled world.
+
+  @property
+  @abc.abstractmethod
+  def physics_class(self) -> type[mjcf.Physics]:
+    """Class of the physics of one world."""
+
+  @property
+  @abc.abstractmethod
+  def is_recompiled(self) -> bool:
+    """True if the model may change between episodes."""
+
+  @property
+  @abc.abstractmethod
+  def dynamics(self) -> int:
+    """Version of the task's dynamics, for snapshots.
+
+    Raises:
+      SpecError: If the state of the task cannot be saved.
+    """
+
+  @abc.abstractmethod
+  def make_updater(
+      self, senses: Sequence[str] | None
+  ) -> composer_observation.Updater:
+    """Returns an updater of the observables that senses are made of.
+
+    Args:
+      senses: Names of the selected senses; `None` for all of them.
+
+    Raises:
+      SpecError: If the task does not offer a sense.
+    """
+
+  @abc.abstractmethod
+  def check_placement(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> None:
+    """Checks the places of registers in a newly compiled world.
+
+    Raises:
+      SpecError: If something is in the way of a register.
+    """
+
+  @abc.abstractmethod
+  def start_check(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> Callable[[Any], None]:
+    """Returns a check of an episode that has just been initialized.
+
+    It takes the physics of one world, and raises an EpisodeInitializationError
+    if something is inside a register.
+
+    Args:
+      physics: Physics of one world, whose state is reset.
+      mechanism: Registers, meters and providers.
+    """
+
+  @abc.abstractmethod
+  def start(
+      self,
+      mechanism: mechanisms.FeedbackMechanism,
+      step_hooks: Any,
+      random_state: np.random.RandomState | None,
+      updater: UpdaterOf,
+  ) -> None:
+    """Completes the host of a compiled world.
+
+    Args:
+      mechanism: Registers, meters and providers.
+      step_hooks: The task itself, or all hooks of a `composer.Environment`.
+      random_state: Random generator for the hooks; `None` in a batch.
+      updater: Function that returns the present observation updater.
+    """
+
+  @abc.abstractmethod
+  def initializing(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> contextlib.AbstractContextManager[None]:
+    """Returns the context in which an episode is initialized.
+
+    Args:
+      physics: Physics of one world.
+      mechanism: Registers, meters and providers.
+    """
+
+  def begin_observing(self, physics: Any) -> None:
+    """Prepares the senses of an episode that has been initialized."""
+    del physics
+
+  def unchanged(self, physics: Any) -> contextlib.AbstractContextManager[None]:
+    """Returns a context in which reads do not change later steps."""
+    del physics
+    return contextlib.nullcontext()
+
+  # The control step.
+
+  def view(self, physics: Any) -> Any:
+    """Returns the physics through which the phases access registers."""
+    return physics
+
+  def latch_events(self, physics: Any) -> None:
+    """Records the events of the substeps so far, if the task does that."""
+    del physics
 
   @property
   @abc.abstractmethod
@@ -127,18 +314,6 @@ class Host(abc.ABC):
     """
 
 
-class StepHooks(Protocol):
-  """Hooks of a control step, of a task alone or with those of its entities."""
-
-  def before_step(
-      self, physics: SteppedPhysics, action: Any, random_state: Any
-  ) -> None:
-    """Runs before the first substep."""
-
-  def after_step(self, physics: SteppedPhysics, random_state: Any) -> None:
-    """Runs after the last substep."""
-
-
 @final
 class WorldHost(Host):
   """Host of a task of this package, for one world or a batch.
@@ -150,30 +325,113 @@ class WorldHost(Host):
   after the ending do not count.
   """
 
+  LEGACY_STEP = False  # Steps begin from the state; see `ThinPhysics`.
+
   def __init__(
-      self,
-      task: base.Task,
-      hooks: StepHooks,
-      random_state: np.random.RandomState | None,
-      batch_shape: tuple[int, ...],
+      self, task: base.Task, batch_shape: tuple[int, ...] = ()
   ) -> None:
     """Initializes the host.
 
     Args:
       task: Task of this package.
-      hooks: The task itself, or all hooks of a `composer.Environment`.
-      random_state: Random generator for the hooks; `None` in a batch.
       batch_shape: `()` for one world, `(worlds,)` for a batch.
     """
     self._task = task
-    self._hooks = hooks
-    self._random_state = random_state
+    self._hooks: StepHooks = task
+    self._random_state: np.random.RandomState | None = None
     self._batch_shape = batch_shape
     self._unknown_reward = self._per_world(np.nan, np.float64)
     self._expected = {
         name: ((*batch_shape, *spec.shape), spec.dtype)
         for name, spec in task.sense_spec.items()
     }
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self._task.ACTION_SET
+
+  @property
+  def functions(self) -> Mapping[str, Callable[[Any], Any]]:
+    return self._task.measurements
+
+  @property
+  def parts(self) -> Mapping[str, measurables.Measurable]:
+    return self._task.measurables
+
+  def add_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
+    """Adds registers whose blocks fit the substeps of the task.
+
+    The environment designer decides on the physics of a world. If the blocks of
+    a design changed the substeps, designs would not be compared in the same
+    world.
+
+    Args:
+      mechanism: Registers, meters and providers.
+
+    Raises:
+      SpecError: If the substeps are too long for a block, or if the task does
+        not allow the registers.
+    """
+    for name, register in mechanism.registers.items():
+      for block in register.blocks:
+        _refuse_misfit(name, block, self._task.physics_timestep)
+    self._task.add_registers([*mechanism.registers.values()])
+
+  def remove_registers(self, mechanism: mechanisms.FeedbackMechanism) -> None:
+    self._task.remove_registers([*mechanism.registers.values()])
+
+  def refuse_uncalled_hooks(self) -> None:
+    hooks.refuse_uncalled(self._task)
+
+  def refuse_extra_hook(self, hook_name: str) -> None:
+    hooks.refuse_unused(self._task, hook_name)
+
+  @property
+  def physics_class(self) -> type[mjcf.Physics]:
+    return single_physics.ThinPhysics
+
+  @property
+  def is_recompiled(self) -> bool:
+    return False
+
+  @property
+  def dynamics(self) -> int:
+    return self._task.DYNAMICS_VERSION
+
+  def make_updater(
+      self, senses: Sequence[str] | None
+  ) -> composer_observation.Updater:
+    del senses  # They are no observables.
+    return composer_observation.Updater({})
+
+  def check_placement(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> None:
+    placement.check(physics, self._task.root_entity, mechanism)
+    placement.check_start(physics, self._task, mechanism)
+
+  def start_check(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> Callable[[Any], None]:
+    return starts.StartCheck(physics, self._task, mechanism)
+
+  def start(
+      self,
+      mechanism: mechanisms.FeedbackMechanism,
+      step_hooks: Any,
+      random_state: np.random.RandomState | None,
+      updater: UpdaterOf,
+  ) -> None:
+    del mechanism, updater  # The task makes its senses itself.
+    self._hooks = step_hooks
+    self._random_state = random_state
+
+  def initializing(
+      self, physics: Any, mechanism: mechanisms.FeedbackMechanism
+  ) -> contextlib.AbstractContextManager[None]:
+    del mechanism
+    context: contextlib.AbstractContextManager[None] = physics.reset_context()
+    return context
 
   @property
   def sense_spec(self) -> dict[str, specs.Array]:
@@ -240,6 +498,9 @@ class WorldHost(Host):
     elif num_substeps:  # `after_step` latches the last events.
       self._task.latch_events(physics)
 
+  def latch_events(self, physics: Any) -> None:
+    self._task.latch_events(physics)
+
   def is_over(self, physics: SteppedPhysics) -> Any:
     return self._per_world(
         self._task.should_terminate_episode(physics), np.bool_
@@ -287,3 +548,18 @@ def true_reward(get: Callable[[], Any], unknown: Any) -> tuple[Any, str | None]:
     raise
   except Exception:
     return unknown, traceback.format_exc()
+
+
+def _refuse_misfit(
+    name: str, block: block_kinds.Block, physics_timestep: float
+) -> None:
+  """Raises a SpecError if the substeps of a task are too long for a block."""
+  misfit = block_kinds.find_misfit(block, physics_timestep)
+  if misfit is not None:
+    remedy = {'physics_timestep': block_kinds.SHORT_SUBSTEP}
+    raise errors.SpecError(
+        f'register {name!r}: {misfit.given}; the substeps of'
+        f' {1000 * physics_timestep:g} ms of the task {misfit.effect}; allowed'
+        f' are {misfit.allowed}, and others if the task takes short substeps:'
+        f' task_kwargs={remedy}'
+    )

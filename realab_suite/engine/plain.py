@@ -1,8 +1,9 @@
 """A task that runs a design in a plain `composer.Environment`.
 
-Composer's hooks of entities get neither the action nor the observation, and
-their order is that of attachment. The hooks of one task wrapper therefore run
-the phases of `control_step`, at the substeps that the schedule names.
+Composer passes neither the action nor the observation to entities. The hooks of
+a task wrapper therefore run the phases of `control_step`, at the substeps that
+the schedule names. A control step ends in the hook of the mechanism, which was
+attached after all other entities.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -10,7 +11,7 @@ import contextlib
 from typing import Any, final
 
 from dm_control import composer
-from dm_control.composer import observation as composer_observation
+from dm_control import mjcf
 from dm_control.composer.observation import observable
 from dm_control.rl import control
 from dm_env import specs
@@ -22,14 +23,12 @@ from realab_suite.engine import environment
 from realab_suite.engine import episodes
 from realab_suite.engine import events
 from realab_suite.engine import foreign
+from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
 from realab_suite.entities import state
+from realab_suite.entities import views
 from realab_suite.feedback import mechanisms
-from realab_suite.tasks import base
-
-# What an update of observables has to do first.
-_NOTHING, _COMPILED, _RESET, _STEPPED = range(4)
 
 
 @final
@@ -61,23 +60,21 @@ class PlainTask(composer.Task):
     self._codec, self._schedule = env.codec, env.schedule
     self._num_substeps = env.num_substeps
     self._senses = env.senses
-    self._is_ours = isinstance(env.task, base.Task)
     self._starts = {
         0,
         self._schedule.meter_substep,
         self._schedule.provider_substep,
     }
+    self._host: hosts.Host = foreign.make_host(env.task)
     self._random_state = seeding.random_state(
         env.seed, env.world, 0, 'construction'
     )
-    self._updater = self._make_updater()
+    # The observables of this task are what it returns, so that providers
+    # observe what agents do, and noise is drawn once.
+    self._updater = self._host.make_updater(self._senses)
     self._updater.reset(env.physics, self._random_state)
-    self._host = foreign.make_host(
-        env.task,
-        env.task,
-        self._random_state,
-        lambda: self._updater,
-        bool(env.mechanism.registers),
+    self._host.start(
+        env.mechanism, env.task, self._random_state, lambda: self._updater
     )
     self._observer = observing.Observer(
         self._host, self._mechanism, self._max_steps, self._senses or None
@@ -87,13 +84,15 @@ class PlainTask(composer.Task):
         for key, spec in self._observer.spec().items()
     }
     env.close()
+    env.mechanism.leave_phases(_LastHooks(self))
     state.make_room(env.task.root_entity.mjcf_model)
 
     self._sinks: list[events.EventSink] = []
     self._episode, self._attempt = -1, 0
     self._is_begun = self._has_failed_attempt = False
     self._is_open = False
-    self._due = _NOTHING
+    self._is_observed = True
+    self._view: views.View | None = None
     # The step that is running, a `control_step.ControlStep`.
     self._step: Any = None
     self._num_done = 0
@@ -163,21 +162,26 @@ class PlainTask(composer.Task):
       SpecError: If the environment has `legacy_step=False` and the task is a
         foreign task.
     """
-    if not (self._is_ours or physics.legacy_step):
+    if self._host.LEGACY_STEP and not physics.legacy_step:
       raise errors.SpecError(
           f'legacy_step: False; allowed for {type(self._task).__name__} is'
           ' True, as in suite.embed'
       )
-    if not self._is_ours:
-      # Composer chooses the class, whose attributes are the same. This one
-      # keeps the sensors of the task as they are while registers are written.
-      physics.__class__ = foreign.ForeignPhysics
     if self._episode < 0:
       seeding.reseed(random_state, self._seed, self._world, 0, 'construction')
     self._task.after_compile(physics, random_state)
     self._random_state = random_state
-    self._updater = self._make_updater()
-    self._due = _COMPILED
+    self._view = views.View(physics)
+
+  def after_compile_of_all(self, physics: Any, random_state: Any) -> None:
+    """Prepares the observables, after the hooks of all entities."""
+    self._updater = self._host.make_updater(self._senses)
+    self._updater.reset(physics, random_state)
+    self._is_observed = True
+    self._observation = {
+        key: np.zeros(spec.shape, spec.dtype)
+        for key, spec in self._observer.spec().items()
+    }
 
   def initialize_episode(self, physics: Any, random_state: Any) -> None:
     if not self._is_begun:
@@ -194,7 +198,7 @@ class PlainTask(composer.Task):
         len(self._mechanism.design.providers),
     )
     self._states = self._mechanism.initial_states(())
-    self._due = _RESET
+    self._is_observed = False
 
   def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
     """Checks an action and passes its controls to the task.
@@ -210,7 +214,9 @@ class PlainTask(composer.Task):
       )
     self._action = np.array(action)
     self._queries, self._controls = queries, controls
-    self._step = control_step.ControlStep(physics, self._host, self._mechanism)
+    self._step = control_step.ControlStep(
+        physics, self._host, self._mechanism, self._view
+    )
     self._num_done = 0
     self._task.before_step(physics, controls, random_state)
 
@@ -228,15 +234,14 @@ class PlainTask(composer.Task):
     self._num_done += 1
 
   def after_step(self, physics: Any, random_state: Any) -> None:
-    """Passes the hook to the task. The observation then ends the step."""
-    if self._is_ours and not physics.legacy_step:
-      foreign.refresh(physics)
+    """Passes the hook to the task; `after_step_of_all` then ends the step."""
+    if not physics.legacy_step:
+      views.refresh(physics)
     self._task.after_step(physics, random_state)
-    self._due = _STEPPED
 
   def get_reward(self, physics: Any) -> float:
     """Returns 0.0. Only event sinks get the true reward."""
-    self._observe(physics)  # Without observables, nothing else has done it.
+    del physics
     return 0.0
 
   def get_discount(self, physics: Any) -> float:
@@ -246,16 +251,6 @@ class PlainTask(composer.Task):
   def should_terminate_episode(self, physics: Any) -> bool:
     del physics
     return self._end is not None
-
-  def _make_updater(self) -> composer_observation.Updater:
-    """Returns an updater of the selected observables of a foreign task.
-
-    The observables of this task are what it returns, so that providers observe
-    what agents do, and noise is drawn once.
-    """
-    if self._is_ours:
-      return composer_observation.Updater({})
-    return foreign.make_updater(self._task, self._senses)
 
   def _begin_attempt(self, random_state: np.random.RandomState) -> None:
     """Begins an episode, or another attempt to begin the same episode."""
@@ -289,44 +284,35 @@ class PlainTask(composer.Task):
 
   def _run_phases(self, physics: Any) -> None:
     """Runs the phases at the present substep."""
-    now, step = self._num_done, self._step
+    now, step, view = self._num_done, self._step, self._view
     if now == 0:
       self._updater.prepare_for_next_control_step()
-    elif not self._is_ours:
+    else:
       self._updater.update()
-    if now not in self._starts:
+    if now not in self._starts or view is None:
       return
-    if now and self._is_ours:
-      if not physics.legacy_step:  # Poses are those before the last substep.
-        foreign.refresh(physics)
-      self._task.latch_events(physics)
-    if not self._is_ours and self._mechanism.registers:
-      physics.pause()
+    view.open(physics)
+    if now:
+      self._host.latch_events(view)
     if now == 0:
       step.write_queries(self._queries)
     if now == self._schedule.meter_substep:
       step.update_meters()
     if now == self._schedule.provider_substep:
       step.update_providers(self._observation, self._keys, self._states)
-    if self._is_ours:
-      foreign.refresh(physics)
-    else:
-      physics.resume()
+    if self._mechanism.registers or not self._host.LEGACY_STEP:
+      view.refresh()
 
   def _observe(self, physics: Any) -> Mapping[str, np.ndarray]:
-    """Returns the observation, which the first call after a change makes."""
-    due, self._due = self._due, _NOTHING
-    if due == _COMPILED:
-      self._updater.reset(physics, self._random_state)
-      self._observation = {
-          key: np.zeros(spec.shape, spec.dtype)
-          for key, spec in self._observer.spec().items()
-      }
-    elif due == _RESET:
+    """Returns the observation.
+
+    The first one of an episode is made here: Composer updates the derived
+    quantities after the last hook of a reset.
+    """
+    if not self._is_observed:
+      self._is_observed = True
       self._updater.reset(physics, self._random_state)
       self._start_episode(physics)
-    elif due == _STEPPED:
-      self._finish_step(physics)
     return self._observation
 
   def _start_episode(self, physics: Any) -> None:
@@ -339,14 +325,16 @@ class PlainTask(composer.Task):
     self._tell(physics, lambda sink: sink.episode_started(start, physics))
     self._end, self._is_open = None, True
 
-  def _finish_step(self, physics: Any) -> None:
-    """Ends a control step, makes its observation and notifies the sinks."""
+  def after_step_of_all(self, physics: Any) -> None:
+    """Ends a control step, after the hooks of all entities.
+
+    Makes the observation of the step and notifies the sinks.
+    """
     if self._num_done != self._num_substeps:
       self._end_early(physics)
       return
     with self._closing_on_failure():
-      if not self._is_ours:
-        self._updater.update()
+      self._updater.update()
       outcome = self._step.end()
       observation, reads = self._observer.observe(physics)
     self._step = None
@@ -391,7 +379,7 @@ class PlainTask(composer.Task):
   ) -> None:
     """Notifies the sinks, which may read the physics."""
     if self._sinks:
-      with foreign.unchanged(physics):
+      with self._host.unchanged(physics):
         for sink in self._sinks:
           notify(sink)
 
@@ -413,6 +401,25 @@ class PlainTask(composer.Task):
       self._is_open = False
       for sink in self._sinks:
         sink.episode_ended(end)
+
+
+@final
+class _LastHooks(composer.Entity):
+  """Hooks that Composer calls after those of all other entities."""
+
+  def _build(self, task: PlainTask) -> None:
+    self._task = task
+
+  @property
+  def mjcf_model(self) -> mjcf.RootElement:
+    return self._task.mechanism.mjcf_model
+
+  def after_compile(self, physics: Any, random_state: Any) -> None:
+    self._task.after_compile_of_all(physics, random_state)
+
+  def after_step(self, physics: Any, random_state: Any) -> None:
+    del random_state
+    self._task.after_step_of_all(physics)
 
 
 @final

@@ -53,7 +53,7 @@ class ComposerHooks(composer.Entity):
     self._num_done = 0
     # Of the current episode; the physics contains the rest of its state.
     self._episode = -1
-    self._keys: np.ndarray | None = None
+    self._keys: Any = None
     self._states: list[Any] = []
     self._observation: dict[str, np.ndarray] = {}
 

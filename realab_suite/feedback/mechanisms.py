@@ -121,8 +121,8 @@ class FeedbackMechanism(composer.Entity):
         for i, spec in enumerate(design.providers)
     ]
     self._guard: Guard = contextlib.nullcontext
-    self._hooks: composer_hooks.ComposerHooks | None = (
-        composer_hooks.ComposerHooks(self, num_substeps)
+    self._hooks: composer.Entity | None = composer_hooks.ComposerHooks(
+        self, num_substeps
     )
     for name, register in self._registers.items():
       place = assembly.own_place(design, name)
@@ -154,12 +154,14 @@ class FeedbackMechanism(composer.Entity):
     if self._hooks is not None:
       yield self._hooks
 
-  def leave_phases(self) -> None:
+  def leave_phases(self, hooks: composer.Entity | None = None) -> None:
     """Leaves the phases of control steps to the caller.
 
-    Composer's hooks then do nothing for the mechanism.
+    Args:
+      hooks: Entity whose hooks Composer calls after those of all entities that
+        were attached earlier; `None` for no hooks.
     """
-    self._hooks = None
+    self._hooks = hooks
 
   @property
   def mjcf_model(self) -> mjcf.RootElement:

@@ -9,6 +9,7 @@ Element = Any
 
 class Physics:
   legacy_step: bool
+  def __init__(self, data: Any) -> None: ...
   @classmethod
   def from_mjcf_model(cls, mjcf_model: Any) -> Self: ...
   @property
