@@ -5,7 +5,6 @@ They are those of dm_control 1.0.50, and a test fails when they change.
 """
 
 from collections.abc import Sequence
-import contextlib
 from typing import Any, final
 
 from dm_control import composer
@@ -23,6 +22,7 @@ from realab_suite.engine import events
 from realab_suite.engine import foreign
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
+from realab_suite.engine import session
 from realab_suite.engine import single_physics
 from realab_suite.engine import snapshots
 from realab_suite.entities import state
@@ -64,9 +64,7 @@ class Environment(composer.Environment):
     self._physics: Any
     self._mechanism = mechanism
     mechanism.leave_phases()
-    self._seed, self._world, self._episode = seed, world, -1
     self._max_steps = max_steps
-    self._sinks: list[events.EventSink] = []
     self._closed = False
     self._has_extra_hooks = False
     self._host = host = foreign.make_host(task)
@@ -87,10 +85,9 @@ class Environment(composer.Environment):
     self._codec = action_codec.for_design(
         task.action_spec(self._physics_proxy), mechanism
     )
-    self._observation: dict[str, np.ndarray] = {}
-    self._provider_keys = self._new_provider_keys()
-    self._provider_states: list[Any] = []
-    self._episode_is_open = False
+    self._session = session.Session(
+        mechanism, host, self._observer, max_steps, seed, world
+    )
     self._start_check = host.start_check(self._physics, mechanism)
 
   # The interface for evaluators and launchers. Agents do not get this object.
@@ -103,12 +100,12 @@ class Environment(composer.Environment):
   @property
   def seed(self) -> int:
     """Seed of every random stream."""
-    return self._seed
+    return self._session.seed
 
   @property
   def world(self) -> int:
     """Number of the world in a batch; 0 for a single world."""
-    return self._world
+    return self._session.world
 
   @property
   def max_steps(self) -> int | None:
@@ -183,13 +180,12 @@ class Environment(composer.Environment):
   def add_sink(self, sink: events.EventSink) -> None:
     """Abandons the current episode and notifies a sink of all later ones."""
     self._refuse_if_closed()
-    self._abandon()
-    self._sinks.append(sink)
+    self._session.add_sink(sink)
     self._reset_next_step = True
 
   def remove_sink(self, sink: events.EventSink) -> None:
     """Undoes `add_sink`."""
-    self._sinks.remove(sink)
+    self._session.remove_sink(sink)
 
   def rewind(self, episode: int = 0, random: Any = None) -> None:
     """Abandons the current episode and sets the number of the next one.
@@ -204,10 +200,9 @@ class Environment(composer.Environment):
     self._refuse_if_closed()
     episode = integers.check('episode', episode, 0)
     if random is not None:
-      self._seed = seeding.as_seed(random)
-    self._abandon()
-    self._episode = episode - 1
-    self._reset_next_step = True
+      self._session.seed = seeding.as_seed(random)
+    self.abandon()
+    self._session.episode = episode - 1
 
   def abandon(self, end: events.End = events.End.ABANDONED) -> None:
     """Ends the current episode, if there is one. The next step resets.
@@ -216,7 +211,7 @@ class Environment(composer.Environment):
       end: Reason that the sinks get.
     """
     self._refuse_if_closed()
-    self._abandon(end)
+    self._session.end(end)
     self._reset_next_step = True
 
   def save(self) -> snapshots.Snapshot:
@@ -229,18 +224,19 @@ class Environment(composer.Environment):
       StateLayoutError: If a provider's state is not plain data.
     """
     header = self.snapshot_header()
+    own = self._session
     worlds = snapshots.WorldStates(
         indices=None,
         physics=snapshots.get_state(self._physics)[np.newaxis],
-        seed=[self._seed],
-        world=[self._world],
-        episode=[self._episode],
+        seed=[own.seed],
+        world=[own.world],
+        episode=[own.episode],
         is_pending=[self._reset_next_step],
-        is_open=[self._episode_is_open],
-        provider_keys=[key[np.newaxis] for key in self._provider_keys],
-        provider_states=self._provider_states,
-        observation=snapshots.of_batch(self._observation),
-        sinks=[[sink.state_kind, [sink.state()]] for sink in self._sinks],
+        is_open=[own.is_open],
+        provider_keys=[key[np.newaxis] for key in own.keys],
+        provider_states=own.states,
+        observation=snapshots.of_batch(own.observation),
+        sinks=[[sink.state_kind, [sink.state()]] for sink in own.sinks],
         random_state=self._random_state.get_state(legacy=False),
     )
     return snapshots.Snapshot(header, worlds.to_data())
@@ -266,28 +262,27 @@ class Environment(composer.Environment):
           f'the snapshot has {len(saved.seed)} worlds; allowed here is one, as'
           ' in batch.save([3])'
       )
-    saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
-    self._abandon()
+    own = self._session
+    saved.refuse_other_sinks([sink.state_kind for sink in own.sinks])
     # If anything fails from here on, the next step starts with a reset.
-    self._reset_next_step = True
+    self.abandon()
     snapshots.set_state(self._physics, saved.physics[0])
-    (self._seed,), (self._world,) = saved.seed, saved.world
-    (self._episode,) = saved.episode
+    (own.seed,), (own.world,), (own.episode,) = (
+        saved.seed,
+        saved.world,
+        saved.episode,
+    )
     if saved.random_state is None:  # A world of a batch has no generator.
-      seeding.reseed(
-          self._random_state, self._seed, self._world, 0, 'construction'
-      )
+      seeding.reseed(self._random_state, own.seed, own.world, 0, 'construction')
     else:
       self._random_state.set_state(saved.random_state)
-    for key, saved_key in zip(
-        self._provider_keys, saved.provider_keys, strict=True
-    ):
+    for key, saved_key in zip(own.keys, saved.provider_keys, strict=True):
       key[:] = saved_key[0]
-    self._provider_states = saved.provider_states_of_world()
-    self._observation = observing.frozen(saved.observation_of_world())
-    for sink, (_, states) in zip(self._sinks, saved.sinks, strict=False):
+    own.states = saved.provider_states_of_world()
+    own.observation = observing.frozen(saved.observation_of_world())
+    for sink, (_, states) in zip(own.sinks, saved.sinks, strict=False):
       sink.set_state(states[0])
-    (self._episode_is_open,) = saved.is_open
+    (own.is_open,) = saved.is_open
     (self._reset_next_step,) = saved.is_pending
 
   def check_start(self, physics: Any) -> None:
@@ -346,30 +341,21 @@ class Environment(composer.Environment):
     Raises:
       EpisodeInitializationError: If every attempt of the task failed.
     """
-    self._refuse_if_closed()
-    self._abandon()
     # If anything fails from here on, the next step starts with a reset.
-    self._reset_next_step = True
-    self._episode += 1
+    self.abandon()
+    own = self._session
+    own.episode += 1
     episodes.begin(
         self._random_state,
-        self._seed,
-        self._world,
-        self._episode,
+        own.seed,
+        own.world,
+        own.episode,
         self._initialize_episode,
     )
-    self._provider_keys = self._new_provider_keys()
-    self._provider_states = self._mechanism.initial_states(())
-    records: list[Any] = [*self._mechanism.initial_writes(self._physics)]
-    records += self._observe()
-    start = events.Start(self._seed, self._world, self._episode, records)
-    with self._preserving_physics():
-      for sink in self._sinks:
-        sink.episode_started(start, self._physics_proxy)
-    # The episode is open only after every sink was notified without an error.
+    own.restart_providers()
+    own.start(self._physics)
     self._reset_next_step = False
-    self._episode_is_open = True
-    return dm_env.restart(observing.copied(self._observation))
+    return dm_env.restart(observing.copied(own.observation))
 
   def step(self, action: Any) -> dm_env.TimeStep:
     """Runs one control step and returns its time step.
@@ -386,41 +372,24 @@ class Environment(composer.Environment):
       return self.reset()
     # If anything fails here, the next step starts with a reset.
     self._reset_next_step = True
+    own = self._session
     try:
-      outcome = self._control_step(queries, controls)
-      reads = self._observe()
+      with own.ending_on_failure():
+        outcome = self._control_step(queries, controls)
+        reads = own.observe(self._physics)
     except control.PhysicsError:
-      self._end(events.End.DIVERGENCE)
       # MuJoCo has reset the state. The agent gets the previous observation.
-      return episodes.time_step(events.End.DIVERGENCE, 1.0, self._observation)
-    except Exception:
-      self._end(events.End.ERROR)
-      raise
-    ending = outcome.ending
-    self._provider_states = outcome.provider_states
-    if self._sinks:
-      step = events.Step(
-          outcome.records + reads,
-          np.array(action),
-          np.array(ending.true_reward),
-          ending.failure,
-      )
-      with self._preserving_physics():
-        for sink in self._sinks:
-          sink.step_ended(step, self._physics_proxy)
-    is_signalled = self._mechanism.ends_episode(reads)
-    is_late = self._mechanism.step_count(self._physics) == self._max_steps
-    end = episodes.end_of_step(False, ending.is_ending, is_signalled, is_late)
+      return episodes.time_step(events.End.DIVERGENCE, 1.0, own.observation)
+    end = own.finish_step(self._physics, outcome, reads, action)
     self._reset_next_step = end is not None
-    if end is not None:
-      self._end(end)
-    return episodes.time_step(end, float(ending.discount), self._observation)
+    discount = float(outcome.ending.discount)
+    return episodes.time_step(end, discount, own.observation)
 
   def close(self) -> None:
     """Frees the world. Closing it again has no effect."""
     if self._closed:
       return
-    self._abandon()
+    self.abandon()
     self._closed = True
     super().close()
 
@@ -441,29 +410,9 @@ class Environment(composer.Environment):
         self._n_sub_steps,
         queries=queries,
         controls=controls,
-        observation=self._observation,
-        provider_keys=self._provider_keys,
-        provider_states=self._provider_states,
-    )
-
-  def _observe(self) -> list[Any]:
-    """Updates the observation and returns the reads of registers for it."""
-    observation, reads = self._observer.observe(self._physics)
-    self._observation = observing.frozen(observation)
-    return list(reads)
-
-  def _preserving_physics(self) -> contextlib.AbstractContextManager[None]:
-    """Returns a context in which sinks may read the physics."""
-    if self._sinks:
-      return self._host.unchanged(self._physics)
-    return contextlib.nullcontext()
-
-  def _new_provider_keys(self) -> np.ndarray:
-    return episodes.provider_keys(
-        self._seed,
-        self._world,
-        max(self._episode, 0),
-        len(self._mechanism.design.providers),
+        observation=self._session.observation,
+        provider_keys=self._session.keys,
+        provider_states=self._session.states,
     )
 
   def _initialize_episode(self, unused_attempt: int) -> None:
@@ -486,15 +435,6 @@ class Environment(composer.Environment):
     with state.room_for_slots(model):
       self._physics = self._host.physics_class.from_mjcf_model(model)
     self._physics.legacy_step = self._host.LEGACY_STEP
-
-  def _abandon(self, end: events.End = events.End.ABANDONED) -> None:
-    if self._episode_is_open:
-      self._end(end)
-
-  def _end(self, end: events.End) -> None:
-    self._episode_is_open = False
-    for sink in self._sinks:
-      sink.episode_ended(end)
 
   def _refuse_if_closed(self) -> None:
     if self._closed:

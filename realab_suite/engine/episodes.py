@@ -111,6 +111,16 @@ def ends_of_step(
   }
 
 
+def discount_at(end: events.End | None, discount: float) -> float:
+  """Returns the discount of a control step.
+
+  Args:
+    end: Reason why the episode ends, or `None`.
+    discount: Discount that the task returned.
+  """
+  return discount if end is None else _DISCOUNTS.get(end, discount)
+
+
 def time_step(
     end: events.End | None,
     discount: float,
@@ -127,5 +137,5 @@ def time_step(
   if end is None:
     return dm_env.transition(0.0, copy, discount)
   return dm_env.TimeStep(
-      dm_env.StepType.LAST, 0.0, _DISCOUNTS.get(end, discount), copy
+      dm_env.StepType.LAST, 0.0, discount_at(end, discount), copy
   )

@@ -323,7 +323,7 @@ class ForeignHost(hosts.Host):
 
 
 def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
-  return [b for r in mechanism.registers.values() for b in r.blocks]
+  return [b for r in mechanism.registers.values() for b in r.own_blocks]
 
 
 def _geoms(mechanism: mechanisms.FeedbackMechanism) -> dict[Any, str]:

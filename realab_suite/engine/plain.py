@@ -6,14 +6,12 @@ the schedule names. A control step ends in the hook of the mechanism, which was
 attached after all other entities.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-import contextlib
+from collections.abc import Callable, Mapping
 from typing import Any, final
 
 from dm_control import composer
 from dm_control import mjcf
 from dm_control.composer.observation import observable
-from dm_control.rl import control
 from dm_env import specs
 import numpy as np
 
@@ -26,6 +24,7 @@ from realab_suite.engine import foreign
 from realab_suite.engine import hosts
 from realab_suite.engine import observing
 from realab_suite.engine import seeding
+from realab_suite.engine import session
 from realab_suite.entities import state
 from realab_suite.entities import views
 from realab_suite.feedback import mechanisms
@@ -52,11 +51,6 @@ class PlainTask(composer.Task):
     """
     self._task = env.task
     self._mechanism = env.mechanism
-    self._seed, self._world, self._max_steps = (
-        env.seed,
-        env.world,
-        env.max_steps,
-    )
     self._codec, self._schedule = env.codec, env.schedule
     self._num_substeps = env.num_substeps
     self._senses = env.senses
@@ -76,30 +70,33 @@ class PlainTask(composer.Task):
     self._host.start(
         env.mechanism, env.task, self._random_state, lambda: self._updater
     )
-    self._observer = observing.Observer(
-        self._host, self._mechanism, self._max_steps, self._senses or None
+    observer = observing.Observer(
+        self._host, env.mechanism, env.max_steps, self._senses or None
     )
+    self._spec = observer.spec()
     self._observables = {
-        key: _Part(spec, self._observe)
-        for key, spec in self._observer.spec().items()
+        key: _Part(spec, self._observe) for key, spec in self._spec.items()
     }
+    self._session = session.Session(
+        env.mechanism,
+        self._host,
+        observer,
+        env.max_steps,
+        env.seed,
+        env.world,
+    )
     env.close()
     env.mechanism.leave_phases(_LastHooks(self))
     state.make_room(env.task.root_entity.mjcf_model)
 
-    self._sinks: list[events.EventSink] = []
-    self._episode, self._attempt = -1, 0
+    self._attempt = 0
     self._is_begun = self._has_failed_attempt = False
-    self._is_open = False
     self._is_observed = True
     self._view: views.View | None = None
     # The step that is running, a `control_step.ControlStep`.
     self._step: Any = None
     self._num_done = 0
     self._action = self._queries = self._controls = np.zeros(0)
-    self._observation: dict[str, np.ndarray] = {}
-    self._keys = np.zeros(0)
-    self._states: list[Any] = []
     self._end: events.End | None = None
     self._discount = 1.0
 
@@ -115,8 +112,7 @@ class PlainTask(composer.Task):
 
   def add_sink(self, sink: events.EventSink) -> None:
     """Notifies a sink of all episodes that begin from now on."""
-    self._close_episode(events.End.ABANDONED)
-    self._sinks.append(sink)
+    self._session.add_sink(sink)
 
   # The interface of a Composer task.
 
@@ -167,8 +163,9 @@ class PlainTask(composer.Task):
           f'legacy_step: False; allowed for {type(self._task).__name__} is'
           ' True, as in suite.embed'
       )
-    if self._episode < 0:
-      seeding.reseed(random_state, self._seed, self._world, 0, 'construction')
+    own = self._session
+    if own.episode < 0:
+      seeding.reseed(random_state, own.seed, own.world, 0, 'construction')
     self._task.after_compile(physics, random_state)
     self._random_state = random_state
     self._view = views.View(physics)
@@ -178,9 +175,9 @@ class PlainTask(composer.Task):
     self._updater = self._host.make_updater(self._senses)
     self._updater.reset(physics, random_state)
     self._is_observed = True
-    self._observation = {
+    self._session.observation = {
         key: np.zeros(spec.shape, spec.dtype)
-        for key, spec in self._observer.spec().items()
+        for key, spec in self._spec.items()
     }
 
   def initialize_episode(self, physics: Any, random_state: Any) -> None:
@@ -191,13 +188,7 @@ class PlainTask(composer.Task):
         lambda: self._task.initialize_episode(physics, random_state)
     )
     self._random_state = random_state
-    self._keys = episodes.provider_keys(
-        self._seed,
-        self._world,
-        self._episode,
-        len(self._mechanism.design.providers),
-    )
-    self._states = self._mechanism.initial_states(())
+    self._session.restart_providers()
     self._is_observed = False
 
   def before_step(self, physics: Any, action: Any, random_state: Any) -> None:
@@ -208,7 +199,7 @@ class PlainTask(composer.Task):
       EpisodeError: If the last step failed.
     """
     queries, controls = self._codec.decode(action)
-    if self._step is not None or not self._is_open:
+    if self._step is not None or not self._session.is_open:
       raise errors.EpisodeError(
           'step: the last step or reset failed; call reset'
       )
@@ -225,7 +216,7 @@ class PlainTask(composer.Task):
   ) -> None:
     """Runs the phases of the control step that precede this substep."""
     del action  # Contains the queries as well.
-    with self._closing_on_failure():
+    with self._session.ending_on_failure():
       self._run_phases(physics)
     self._task.before_substep(physics, self._controls, random_state)
 
@@ -255,24 +246,18 @@ class PlainTask(composer.Task):
   def _begin_attempt(self, random_state: np.random.RandomState) -> None:
     """Begins an episode, or another attempt to begin the same episode."""
     # A step that did not end has failed, in the physics or in the task.
-    self._close_episode(
-        events.End.ABANDONED if self._step is None else events.End.ERROR
-    )
+    own = self._session
+    own.end(events.End.ABANDONED if self._step is None else events.End.ERROR)
     self._step = None
     self._is_begun = True
     is_retry = self._has_failed_attempt
     self._attempt = self._attempt + 1 if is_retry else 0
     if self._attempt == episodes.MAX_RESET_ATTEMPTS:
       is_retry, self._attempt = False, 0
-    self._episode += not is_retry
+    own.episode += not is_retry
     self._has_failed_attempt = False
-    seeding.reseed(
-        random_state,
-        self._seed,
-        self._world,
-        self._episode,
-        f'reset/{self._attempt}',
-    )
+    stream = f'reset/{self._attempt}'
+    seeding.reseed(random_state, own.seed, own.world, own.episode, stream)
 
   def _attempted(self, initialize: Callable[[], None]) -> None:
     """Calls a hook of the task and notes whether it fails to initialize."""
@@ -299,7 +284,8 @@ class PlainTask(composer.Task):
     if now == self._schedule.meter_substep:
       step.update_meters()
     if now == self._schedule.provider_substep:
-      step.update_providers(self._observation, self._keys, self._states)
+      own = self._session
+      step.update_providers(own.observation, own.keys, own.states)
     if self._mechanism.registers or not self._host.LEGACY_STEP:
       view.refresh()
 
@@ -312,18 +298,9 @@ class PlainTask(composer.Task):
     if not self._is_observed:
       self._is_observed = True
       self._updater.reset(physics, self._random_state)
-      self._start_episode(physics)
-    return self._observation
-
-  def _start_episode(self, physics: Any) -> None:
-    """Makes the first observation of an episode and notifies the sinks."""
-    records: list[Any] = [*self._mechanism.initial_writes(physics)]
-    observation, reads = self._observer.observe(physics)
-    self._observation = observing.frozen(observation)
-    records += reads
-    start = events.Start(self._seed, self._world, self._episode, records)
-    self._tell(physics, lambda sink: sink.episode_started(start, physics))
-    self._end, self._is_open = None, True
+      self._session.start(physics)
+      self._end = None
+    return self._session.observation
 
   def after_step_of_all(self, physics: Any) -> None:
     """Ends a control step, after the hooks of all entities.
@@ -333,32 +310,15 @@ class PlainTask(composer.Task):
     if self._num_done != self._num_substeps:
       self._end_early(physics)
       return
-    with self._closing_on_failure():
+    own = self._session
+    with own.ending_on_failure():
       self._updater.update()
       outcome = self._step.end()
-      observation, reads = self._observer.observe(physics)
+      reads = own.observe(physics)
     self._step = None
-    self._observation = observing.frozen(observation)
-    self._states = outcome.provider_states
-    ending = outcome.ending
-    step = events.Step(
-        [*outcome.records, *reads],
-        self._action,
-        np.array(ending.true_reward),
-        ending.failure,
-    )
-    self._tell(physics, lambda sink: sink.step_ended(step, physics))
-    self._end = episodes.end_of_step(
-        False,
-        ending.is_ending,
-        self._mechanism.ends_episode(reads),
-        self._mechanism.step_count(physics) == self._max_steps,
-    )
-    self._discount = episodes.time_step(
-        self._end, float(ending.discount), {}
-    ).discount
-    if self._end is not None:
-      self._close_episode(self._end)
+    self._end = own.finish_step(physics, outcome, reads, self._action)
+    discount = float(outcome.ending.discount)
+    self._discount = episodes.discount_at(self._end, discount)
 
   def _end_early(self, physics: Any) -> None:
     """Ends an episode whose physics failed; the observation stays the last.
@@ -372,35 +332,7 @@ class PlainTask(composer.Task):
           ' number that the task and its registers need'
       )
     self._step = None
-    self._close_episode(events.End.DIVERGENCE)
-
-  def _tell(
-      self, physics: Any, notify: Callable[[events.EventSink], None]
-  ) -> None:
-    """Notifies the sinks, which may read the physics."""
-    if self._sinks:
-      with self._host.unchanged(physics):
-        for sink in self._sinks:
-          notify(sink)
-
-  @contextlib.contextmanager
-  def _closing_on_failure(self) -> Iterator[None]:
-    """Returns a context in which an exception ends the episode."""
-    try:
-      yield
-    except control.PhysicsError:
-      self._close_episode(events.End.DIVERGENCE)
-      raise
-    except Exception:
-      self._close_episode(events.End.ERROR)
-      raise
-
-  def _close_episode(self, end: events.End) -> None:
-    """Notifies the sinks of the end of the episode, if there is one."""
-    if self._is_open:
-      self._is_open = False
-      for sink in self._sinks:
-        sink.episode_ended(end)
+    self._session.end(events.End.DIVERGENCE)
 
 
 @final

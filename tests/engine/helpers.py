@@ -230,10 +230,17 @@ def draw(
   return generator.uniform(spec.minimum, spec.maximum, size)
 
 
+def last_observation(env: Any) -> dict[str, np.ndarray]:
+  """Returns the observation that an environment or a batch keeps."""
+  own = getattr(env, '_session', None)
+  found: dict[str, np.ndarray] = own.observation if own else env._observation
+  return found
+
+
 def break_providers(env: environment.Environment) -> None:
   """Gives providers a state from which the next step fails."""
-  env._provider_states = [
-      {**state, 'actual': 'not a number'} for state in env._provider_states
+  env._session.states = [
+      {**state, 'actual': 'not a number'} for state in env._session.states
   ]
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.feedback import specs
+from tests.engine import helpers
 from tests.leaks import pairs
 
 # What the worlds of this package let an agent sense, by name.
@@ -156,7 +157,7 @@ def _complaints_about_steps(
       elif not np.isfinite(value).all():
         yield f'{key}: not finite'
       yield from _complaints_about_memory(key, value)
-      behind = env._observation.get(key)
+      behind = helpers.last_observation(env).get(key)
       if any(
           np.shares_memory(value, other)
           for other in (*before, behind)

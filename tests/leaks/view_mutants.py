@@ -11,6 +11,7 @@ from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import hosts
 from realab_suite.feedback import mechanisms
+from tests.engine import helpers
 from tests.leaks import contract
 from tests.leaks import planting
 
@@ -201,7 +202,7 @@ def _l9_buffer(patch: pytest.MonkeyPatch) -> None:
 
   def alias(env: Any, observation: dict[str, Any]) -> None:
     for key in observation:
-      observation[key] = env._observation[key]
+      observation[key] = helpers.last_observation(env)[key]
 
   planting.observing(patch, alias)
 
