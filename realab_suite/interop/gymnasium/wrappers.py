@@ -96,5 +96,5 @@ class VectorFrameStack(gym.vector.VectorWrapper):
 
 def _stack(space: spaces.Space[Any], frames: list[Any]) -> Any:
   """Returns elements of a space, stacked along a new first axis."""
-  empty = utils.create_empty_array(space, len(frames))
+  empty: Any = utils.create_empty_array(space, len(frames))
   return utils.concatenate(space, frames, empty)
