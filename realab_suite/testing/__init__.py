@@ -3,7 +3,7 @@
 from realab_suite.testing.contracts import ContractError
 from realab_suite.testing.learners import check_learner
 from realab_suite.testing.providers import check_provider
-from realab_suite.testing.registers import check_register
+from realab_suite.testing.register_contract import check_register
 from realab_suite.testing.worlds import check_world
 
 __all__ = [
