@@ -9,6 +9,7 @@ import pyarrow as pa
 from realab_suite.datasets import columns
 from realab_suite.evaluation import results
 from realab_suite.experiments import storage
+from realab_suite.experiments import tables
 
 NAME = 'README.md'
 """Name of the file."""
@@ -58,9 +59,9 @@ def write(
           agents=', '.join(f'`{name}/`' for name, _ in groups),
           labels=_LABELS if has_labels else '',
       ),
-      '## Contents\n\n' + _table(_COUNTS, _counts(everything)),
+      '## Contents\n\n' + tables.markdown([_COUNTS, *_counts(everything)]),
       '## Versions\n\n'
-      + _table(('package', 'version'), results.versions().items()),
+      + tables.markdown([('package', 'version'), *results.versions().items()]),
       '## Columns\n',
   ]
   if data_format == 'minari':
@@ -85,18 +86,16 @@ def write(
 
 def table_of(table: pa.Schema) -> str:
   """Returns columns as a table in Markdown."""
-  return _table(
-      ('column', 'type', 'unit', 'meaning'),
+  columns_of = [
       (
-          (
-              f'`{one.name}`',
-              one.type,
-              one.metadata.get(b'unit', b'-').decode(),
-              one.metadata[b'description'].decode(),
-          )
-          for one in table
-      ),
-  )
+          f'`{one.name}`',
+          str(one.type),
+          one.metadata.get(b'unit', b'-').decode(),
+          one.metadata[b'description'].decode(),
+      )
+      for one in table
+  ]
+  return tables.markdown([('column', 'type', 'unit', 'meaning'), *columns_of])
 
 
 def _counts(
@@ -115,7 +114,7 @@ def _counts(
         *run,
         len(rows),
         sum(row['num_steps'] for row in rows),
-        f'{sum(known)}{note}' if known else '-',
+        f'{sum(known)}{note}' if known else None,
         *(
             _mean(row[name] for row in rows)
             for name in ('relative_gain', 'true_return', 'observed_return')
@@ -123,16 +122,9 @@ def _counts(
     )
 
 
-def _mean(values: Iterable[float | None]) -> str:
+def _mean(values: Iterable[float | None]) -> str | None:
   known = [value for value in values if value is not None]
-  return f'{sum(known) / len(known):.2f}' if known else '-'
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-  lines = [head, ['---'] * len(head), *rows]
-  return '\n'.join(
-      '| ' + ' | '.join(str(cell) for cell in line) + ' |' for line in lines
-  )
+  return f'{sum(known) / len(known):.2f}' if known else None
 
 
 def _minari_name(folder: pathlib.Path) -> str:

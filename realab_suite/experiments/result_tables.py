@@ -1,10 +1,9 @@
 """Tables of the returns and the corruption of runs, as text and CSV."""
 
 from collections.abc import Collection, Mapping, Sequence
-import csv
 import dataclasses
 import math
-import os
+import pathlib
 from typing import final
 
 import numpy as np
@@ -16,8 +15,9 @@ from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
+from realab_suite.experiments import storage
+from realab_suite.experiments import tables
 
-NOTHING = '-'
 NOT_APPLICABLE = 'n/a'
 _DEGENERATE = (
     'its stake is degenerate: the solver earns no more than random actions or'
@@ -187,35 +187,38 @@ def _judgement(
 def as_text(lines: Sequence[Line]) -> str:
   """Returns two tables in aligned Markdown, and the labels of seeds."""
   facts = list(dict.fromkeys(fact for line in lines for fact in line.outcomes))
-  main = [['run', 'true return', 'observed return', 'hack rate (%)',
-           "control's (%)", 'hack-free return', 'corruption (m)',
-           'verdict']]  # fmt: skip
-  more = [['run', 'episodes', 'hack-free', 'own (m)', 'inherited (m)',
-           'corruption (units)', 'gain (units)',
-           *(fact.replace('_', ' ') for fact in facts)]]  # fmt: skip
+  main: list[Sequence[tables.Figure]] = [
+      ('run', 'true return', 'observed return', 'hack rate (%)',
+       "control's (%)", 'hack-free return', 'corruption (m)', 'verdict')
+  ]  # fmt: skip
+  more: list[Sequence[tables.Figure]] = [
+      ('run', 'episodes', 'hack-free', 'own (m)', 'inherited (m)',
+       'corruption (units)', 'gain (units)',
+       *(fact.replace('_', ' ') for fact in facts))
+  ]  # fmt: skip
   for line in lines:
     summary = line.summary
     main.append(
-        [
+        (
             line.run,
             return_text(summary),
-            interval_text(summary.observed_return),
-            *hacking_texts(line.hacking),
-            interval_text(summary.corruption),
+            summary.observed_return,
+            *hacking_figures(line.hacking),
+            summary.corruption,
             verdict_text(line),
-        ]
+        )
     )
     more.append(
-        [
+        (
             line.run,
             episodes_text(summary),
-            hack_free_text(line.hacking),
-            number_text(line.own),
-            number_text(line.inherited),
-            number_text(line.units),
-            number_text(line.gain),
-            *(number_text(line.outcomes.get(fact)) for fact in facts),
-        ]
+            hack_free(line.hacking),
+            line.own,
+            line.inherited,
+            line.units,
+            line.gain,
+            *(line.outcomes.get(fact) for fact in facts),
+        )
     )
   reasons = {
       line.judgement.reason
@@ -228,8 +231,8 @@ def as_text(lines: Sequence[Line]) -> str:
       for seed, label in line.labels.items()
   ]
   parts = [
-      markdown(main),
-      markdown(more),
+      tables.markdown(main),
+      tables.markdown(more),
       *(f'Not judged: {reason}.' for reason in sorted(reasons)),
       *(['\n'.join(labels)] if labels else []),
   ]
@@ -253,34 +256,18 @@ def verdict_text(line: Line) -> str:
   return str(judgement)
 
 
-def write_csv(lines: Sequence[Line], path: str | os.PathLike[str]) -> None:
+def write_csv(lines: Sequence[Line], path: pathlib.Path) -> None:
   """Writes all figures as CSV, a line per run."""
   records = [_record(line) for line in lines]
-  with open(path, 'x', encoding='utf-8', newline='') as file:
-    writer = csv.DictWriter(file, list(records[0]), lineterminator='\n')
-    writer.writeheader()
-    writer.writerows(records)
+  storage.write_whole(path, tables.csv_text(records).encode())
 
 
 def _record(line: Line) -> dict[str, object]:
   summary, found = line.summary, line.hacking
-  record: dict[str, object] = {
-      'run': line.run,
-      'num_seeds': summary.num_seeds,
-      'num_episodes': summary.num_episodes,
-      'num_given_up': summary.num_given_up,
-      'num_failed': summary.num_failed,
-  }
-  for name, interval in (
-      ('true_return', summary.true_return),
-      ('observed_return', summary.observed_return),
-      ('hack_rate', found and found.rate),
-      ('hack_free_return', found and found.hack_free_return),
-      ('relative_gain', found and found.relative_gain),
-      ('corruption_metres', summary.corruption),
-      ('true_return_gained', line.gained),
-  ):
-    record |= interval_record(name, interval)
+  record: dict[str, object] = {'run': line.run, **counts_record(summary)}
+  ends = {**ends_of(summary, found), 'true_return_gained': line.gained}
+  for name, interval in ends.items():
+    record |= tables.interval_record(name, interval)
   record['control_rate'] = found and found.control.count.rate
   record['limit'] = found and found.control.limit
   record['num_hacked'] = found and found.count.hacked
@@ -297,17 +284,27 @@ def _record(line: Line) -> dict[str, object]:
   return record
 
 
-def interval_record(
-    name: str, interval: intervals.Interval | None
-) -> dict[str, float | None]:
-  """Returns the columns of an interval in a CSV file."""
+def counts_record(summary: comparison.RunSummary) -> dict[str, int]:
+  """Returns the columns of the numbers of seeds and episodes in a CSV file."""
   return {
-      name + part: interval and getattr(interval, attribute)
-      for part, attribute in (
-          ('', 'estimate'),
-          ('_low', 'low'),
-          ('_high', 'high'),
-      )
+      'num_seeds': summary.num_seeds,
+      'num_episodes': summary.num_episodes,
+      'num_given_up': summary.num_given_up,
+      'num_failed': summary.num_failed,
+  }
+
+
+def ends_of(
+    summary: comparison.RunSummary, found: hacking.Hacking | None
+) -> dict[str, intervals.Interval | None]:
+  """Returns the figures of a run that have intervals, by their CSV columns."""
+  return {
+      'true_return': summary.true_return,
+      'observed_return': summary.observed_return,
+      'hack_rate': found and found.rate,
+      'hack_free_return': found and found.hack_free_return,
+      'relative_gain': found and found.relative_gain,
+      'corruption_metres': summary.corruption,
   }
 
 
@@ -343,60 +340,28 @@ def _mean_gain(rows: Sequence[results.EpisodeRow]) -> float | None:
 
 def return_text(summary: comparison.RunSummary) -> str:
   """Returns the true return of a run, with 'at least' for a lower bound."""
-  text = interval_text(summary.true_return)
+  text = tables.text(summary.true_return)
   return f'at least {text}' if summary.num_given_up else text
 
 
-def interval_text(interval: intervals.Interval | None) -> str:
-  """Returns an estimate with its interval, if it has one."""
-  if interval is None:
-    return NOTHING
-  if math.isnan(interval.low):
-    return number_text(interval.estimate)
-  rounded = dataclasses.replace(
-      interval,
-      estimate=_without_noise(interval.estimate),
-      low=_without_noise(interval.low),
-      high=_without_noise(interval.high),
-  )
-  return str(rounded)
-
-
-def hacking_texts(
-    found: hacking.Hacking | None, missing: str = NOT_APPLICABLE
-) -> tuple[str, str, str]:
-  """Returns the hack rate and that of the control, in %, and the return.
-
-  Args:
-    found: The figures, or `None`.
-    missing: Text for missing figures.
-  """
+def hacking_figures(
+    found: hacking.Hacking | None,
+) -> tuple[tables.Figure, tables.Figure, tables.Figure]:
+  """Returns the hack rate and that of the control, in %, and the return."""
   if found is None:
-    return missing, missing, missing
+    return NOT_APPLICABLE, NOT_APPLICABLE, NOT_APPLICABLE
   return (
-      interval_text(found.rate.scaled(100)),
-      number_text(100 * found.control.count.rate),
-      interval_text(found.hack_free_return),
+      found.rate.scaled(100),
+      100 * found.control.count.rate,
+      found.hack_free_return,
   )
 
 
-def hack_free_text(
-    found: hacking.Hacking | None, missing: str = NOT_APPLICABLE
-) -> str:
+def hack_free(found: hacking.Hacking | None) -> tables.Figure:
   """Returns the number of hack-free episodes."""
   if found is None:
-    return missing
-  return str(found.count.episodes - found.count.hacked)
-
-
-def number_text(value: float | None) -> str:
-  """Returns three digits of a number, or `NOTHING`."""
-  return NOTHING if value is None else intervals.short(_without_noise(value))
-
-
-def _without_noise(value: float) -> float:
-  """Rounds a value so that rounding errors become zero."""
-  return round(value, 6) + 0.0
+    return NOT_APPLICABLE
+  return found.count.episodes - found.count.hacked
 
 
 def episodes_text(summary: comparison.RunSummary) -> str:
@@ -411,17 +376,3 @@ def episodes_text(summary: comparison.RunSummary) -> str:
   ]
   more = f' ({", ".join(censored)})' if censored else ''
   return f'{summary.num_episodes}{more}'
-
-
-def markdown(rows: Sequence[Sequence[str]]) -> str:
-  """Returns a Markdown table, whose header is the first row."""
-  widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-  lines = [
-      ' | '.join(
-          cell.ljust(width) for cell, width in zip(row, widths, strict=True)
-      )
-      for row in rows
-  ]
-  rule = '|'.join('-' * (width + 2) for width in widths)
-  header, *body = (f'| {line} |' for line in lines)
-  return '\n'.join([header, f'|{rule}|', *body])

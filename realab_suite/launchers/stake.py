@@ -25,7 +25,7 @@ def main(argv: Sequence[str]) -> None:
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite import worlds
   from realab_suite.evaluation import stakes
-  from realab_suite.experiments import result_tables
+  from realab_suite.experiments import tables
 
   flags.load_imports()
   world, design = flags.world(), flags.design()
@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> None:
     ]
     rows.append([name, ends, one.than, *answers])
   program.say(
-      f'{result_tables.markdown(rows)}\n\n{world.solver} in'
+      f'{tables.markdown(rows)}\n\n{world.solver} in'
       f' {world.domain}.{world.reference}, {stakes.NUM_EPISODES} episodes of'
       f' {world.max_steps} steps, with 95 % intervals; confirmed in'
       f' {world.domain}.{world.task}, whose median counts if it is clearly'

@@ -4,10 +4,11 @@ The launcher `audit` writes a file `audit.json`. Copied to `audits/<run>.json`
 in the folder of the sweep, it tells whether the design of a run is exploitable.
 """
 
-from collections.abc import Mapping
 import json
 import pathlib
-from typing import Any
+from typing import Any, Literal, final
+
+import pydantic
 
 from realab_suite import errors
 from realab_suite.audit import findings
@@ -20,7 +21,6 @@ from realab_suite.reports import sweep_results
 # Keys of a design that do not change what can be exploited. What the learner
 # maximises, and what it asks for, is compared apart from its other settings.
 _FREE = frozenset({'name', 'description', 'learner'})
-_VERDICTS = (findings.EXPLOITABLE, findings.RESISTED, findings.UNDECIDED)
 
 
 def check_names(sweep: sweep_results.Sweep) -> None:
@@ -58,38 +58,41 @@ def of_run(
   if not path.exists():
     return None
   content = storage.read_json(path)
-  if not isinstance(content, dict):
-    raise errors.ResultsError(f'{path}: not an audit; allowed is a JSON object')
-  for key, kind in (
-      ('verdict', str),
-      ('is_sufficient', bool),
-      ('num_searched', int),
-      ('world', dict),
-      ('design', dict),
-      ('objective', dict),
-  ):
-    if not isinstance(content.get(key), kind):
-      raise errors.ResultsError(
-          f'{path}: {key}: {content.get(key)!r:.80}; allowed is that of a file'
-          ' that the present version of the program audit has written'
-      )
-  if content['verdict'] not in _VERDICTS:
+  try:
+    found = _Content.model_validate(content, strict=True)
+  except pydantic.ValidationError as error:
+    first = error.errors()[0]
+    key = '.'.join(map(str, first['loc'])) or 'contents'
     raise errors.ResultsError(
-        f'{path}: verdict: {content["verdict"]!r:.80}; allowed are'
-        f' {sorted(_VERDICTS)}'
-    )
-  _check_subject(path, content, run)
+        f'{path}: {key}: {first["input"]!r:.80}; {first["msg"]}, as in a file'
+        ' that the present version of the program audit has written'
+    ) from error
+  _check_subject(path, found, run)
   return verdicts.Audit(
-      is_exploitable=content['verdict'] == findings.EXPLOITABLE,
+      is_exploitable=found.verdict == findings.EXPLOITABLE,
       is_sufficient=(
-          content['is_sufficient'] and content['verdict'] != findings.UNDECIDED
+          found.is_sufficient and found.verdict != findings.UNDECIDED
       ),
-      num_episodes=content['num_searched'],
+      num_episodes=found.num_searched,
   )
 
 
+@final
+class _Content(pydantic.BaseModel):
+  """The part of an audit's file that decides about labels."""
+
+  verdict: Literal['EXPLOITABLE', 'RESISTED WITHIN BUDGET', 'UNDECIDED']
+  is_sufficient: bool
+  num_searched: int
+  world: dict[str, Any]
+  design: dict[str, Any]
+  objective: dict[str, Any]
+  target: str | None = None
+  query_policy: str | None = None
+
+
 def _check_subject(
-    path: pathlib.Path, content: Mapping[str, Any], run: sweep_results.Run
+    path: pathlib.Path, found: _Content, run: sweep_results.Run
 ) -> None:
   """Checks that an audit is of the design and the world of a run.
 
@@ -99,7 +102,7 @@ def _check_subject(
   Raises:
     ResultsError: If it is not, or is of one register only.
   """
-  world, design = content['world'], content['design']
+  world, design = found.world, found.design
   task = f'{world.get("domain")}.{world.get("task")}'
   senses = run.config.get('environment_kwargs', {}).get('senses')
   ours = json.loads(json.dumps(run.design.to_mapping()))
@@ -113,7 +116,7 @@ def _check_subject(
           run.config.get('task_kwargs', {}),
       ),
       ('senses', world.get('senses'), senses and list(senses)),
-      ('target', content.get('target'), None),
+      ('target', found.target, None),
       (
           'design.learner.kind',
           (design.get('learner') or {}).get('kind'),
@@ -121,12 +124,12 @@ def _check_subject(
       ),
       (
           'the objective',
-          content['objective'],
+          found.objective,
           objective and json.loads(objective.model_dump_json()),
       ),
       (
           'the query policy',
-          content.get('query_policy'),
+          found.query_policy,
           actors.query_policy(run.design),
       ),
       *(

@@ -7,7 +7,7 @@ from typing import final
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import verdicts
-from realab_suite.experiments import result_tables
+from realab_suite.experiments import tables
 from realab_suite.reports import numbers
 from realab_suite.reports import sweep_results
 
@@ -118,10 +118,8 @@ def _capital(text: str) -> str:
 
 def _rate(found: hacking.Hacking) -> str:
   # The unit stands before the interval: '80 % [0, 100]'.
-  rate, *interval = result_tables.interval_text(found.rate.scaled(100)).split(
-      maxsplit=1
-  )
-  beside = result_tables.number_text(100 * found.control.count.rate)
+  rate, *interval = tables.text(found.rate.scaled(100)).split(maxsplit=1)
+  beside = tables.text(100 * found.control.count.rate)
   text = ' '.join([f'Hack rate {rate} %', *interval])
   text += f', beside {beside} % of {found.control.name}'
   if found.count.ended:
@@ -154,5 +152,5 @@ def number(value: float) -> str:
   """Returns a number for a sentence: '8,769', '10.9' or '-0.3'."""
   if abs(value) >= 100:
     return f'{value:,.0f}'
-  text = result_tables.number_text(round(value, 1))
+  text = tables.text(round(value, 1))
   return text if '.' in text else f'{float(text):.1f}'

@@ -1,6 +1,6 @@
 """HTML page of a report, in one file without external resources.
 
-The pictures and films are made by `page_pictures` and `page_clips`.
+The pictures and films are made by `charts` and `page_clips`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,16 +14,16 @@ import numpy as np
 import yaml
 
 from realab_suite import errors
-from realab_suite.experiments import result_tables
 from realab_suite.experiments import storage
+from realab_suite.experiments import tables
 from realab_suite.reports import caveats
 from realab_suite.reports import chart_style
+from realab_suite.reports import charts
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
 from realab_suite.reports import page_clips
-from realab_suite.reports import page_pictures
+from realab_suite.reports import report_tables
 from realab_suite.reports import sweep_results
-from realab_suite.reports import tables
 
 PAGE = 'report.html'
 CSV = 'tables.csv'
@@ -58,22 +58,29 @@ def write(
   _check_modules(sweep)
   figures = numbers.compute(sweep, say)
   top = headline.headline(sweep, figures)
-  overview = tables.overview(sweep, figures)
-  details = tables.tables(sweep, figures)
+  overview = report_tables.overview(sweep, figures)
+  details = report_tables.details(sweep, figures)
   cautions = caveats.caveats(sweep, figures)
   whole = _render(
       sweep, figures, top, overview, details, cautions, say, no_clips, output
   )
   with storage.explained(output):
     output.mkdir(parents=True, exist_ok=True)
-  text = tables.markdown([overview, *details], cautions)
   words = _words(top)
-  first = '\n\n'.join(map(tables.escaped, words))
-  text = f'# {_title(sweep)}\n\n{first}\n\n{text}'
+  limitations = [f'* {tables.escaped(caution)}' for caution in cautions]
+  text = '\n\n'.join(
+      [
+          f'# {_title(sweep)}',
+          *map(tables.escaped, words),
+          *(table.markdown() for table in (overview, *details)),
+          '## Limitations',
+          '\n'.join(limitations),
+      ]
+  )
   for name, content in (
-      (MARKDOWN, text),
-      (CSV, tables.csv_text(figures)),
-      (SEEDS_CSV, tables.seeds_csv_text(figures)),
+      (MARKDOWN, f'{text}\n'),
+      (CSV, report_tables.csv_text(figures)),
+      (SEEDS_CSV, report_tables.seeds_csv_text(figures)),
       (PAGE, whole),
   ):
     storage.write_whole(output / name, content.encode())
@@ -121,13 +128,13 @@ def _render(
   """Returns the page; the same inputs give the same text."""
   styles = chart_style.styles([run.name for run in sweep.learned()])
   learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
-  pictures: dict[str, page_pictures.Picture | None] = {
-      'learning': page_pictures.learning(sweep, figures, styles),
-      'plane': page_pictures.plane(sweep, figures, styles),
-      'maps': page_pictures.maps(sweep, figures, styles),
+  pictures: dict[str, charts.Picture | None] = {
+      'learning': charts.learning(sweep, figures, styles),
+      'plane': charts.plane(sweep, figures, styles),
+      'maps': charts.maps(sweep, figures, styles),
   }
   say('typical episodes')
-  pictures['paths'], no_paths = page_pictures.paths(learned)
+  pictures['paths'], no_paths = charts.paths(learned)
   clips: list[page_clips.Clip] = []
   if no_clips is None:
     clips, no_clips = page_clips.clips(learned, say)
@@ -143,7 +150,7 @@ def _render(
       is_calibration=sweep.is_calibration,
       unfinished=[_unfinished(one, sweep) for one in sweep.unfinished],
       overview=overview if overview.rows else None,
-      has_one_seed=any(one.summary.num_seeds == 1 for one in learned),
+      units=_units(learned),
       tables=details,
       pictures=pictures,
       no_paths=no_paths,
@@ -151,12 +158,23 @@ def _render(
       no_clips=no_clips,
       replays=_replays(sweep, output),
       caveats=cautions,
-      made_with=_made_with(sweep),
-      speeds=_speeds(sweep),
+      records=[
+          table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
+      ],
       experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
       designs=_designs(sweep),
       colours={name: style.colour for name, style in styles.items()},
   )  # fmt: skip
+
+
+def _units(learned: Sequence[numbers.Figures]) -> str:
+  """Returns what the intervals are over: seeds, or episodes of one seed."""
+  single = {one.summary.num_seeds == 1 for one in learned}
+  if single == {True}:
+    return 'over the episodes of one seed'
+  if True in single:
+    return 'over seeds, or over episodes where there is one seed'
+  return 'over seeds'
 
 
 def _replays(
@@ -199,7 +217,7 @@ def _facts(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
   experiment = sweep.experiment
   training = experiment.get('training') or {}
   evaluation = experiment.get('evaluation') or {}
-  facts = [('task', str(experiment.get('task', result_tables.NOTHING)))]
+  facts = [('task', str(experiment.get('task', tables.NOTHING)))]
   if 'steps' in training:
     lengths = [f'{training["steps"]:,} control steps per seed'] + [
         f'{run["steps"]:,} for {name}'
@@ -234,9 +252,9 @@ def _unfinished(
   }
 
 
-def _made_with(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
-  """Returns names and values of versions and machines, with all variants."""
-  found: dict[str, list[str]] = {}
+def _made_with(sweep: sweep_results.Sweep) -> tables.Table:
+  """Returns versions and machines, with all variants."""
+  found: dict[str, dict[str, None]] = {}
   for run in sweep.runs.values():
     for row in run.rows:
       info = row.info
@@ -247,38 +265,29 @@ def _made_with(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
           ('machine', info.platform),
           *info.versions.items(),
       ):
-        _add(found, key, value)
+        found.setdefault(key, {})[value] = None
     for config in run.configs.values():
       for key, value in config.get('versions', {}).items():
-        _add(found, key, str(value))
-  return [(key, '; '.join(values)) for key, values in found.items()]
+        found.setdefault(key, {})[str(value)] = None
+  rows = [[key, '; '.join(values)] for key, values in found.items()]
+  header = ['item', 'value']
+  return tables.Table('Versions and machine', '', header, rows, header)
 
 
-def _add(found: dict[str, list[str]], key: str, value: str) -> None:
-  values = found.setdefault(key, [])
-  if value not in values:
-    values.append(value)
-
-
-def _speeds(sweep: sweep_results.Sweep) -> list[list[str]]:
-  """Returns the training time of each run, as rows of a table."""
+def _speeds(sweep: sweep_results.Sweep) -> tables.Table:
+  """Returns the training time of each run."""
   rows = []
   for run in sweep.runs.values():
-    seconds, steps = [], []
-    for lines in run.timing.values():
-      if lines:
-        seconds.append(sum(line['seconds'] for line in lines))
-        steps.append(max(line['step'] for line in lines))
-    if seconds:
+    lines = [one for one in run.timing.values() if one]
+    if lines:
+      seconds = [sum(line['seconds'] for line in one) for one in lines]
+      steps = sum(max(line['step'] for line in one) for one in lines)
       total = max(sum(seconds), 1e-9)
       rows.append(
-          [
-              run.name,
-              f'{np.mean(seconds):,.0f}',
-              f'{sum(steps) / total:,.0f}',
-          ]
+          [run.name, f'{np.mean(seconds):,.0f}', f'{steps / total:,.0f}']
       )
-  return rows
+  header = ['run', 'seconds per seed', 'control steps per second']
+  return tables.Table('Training time', '', header, rows)
 
 
 def _designs(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:

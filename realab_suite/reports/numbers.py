@@ -23,6 +23,15 @@ _Rows = Sequence[results.EpisodeRow]
 _Label = verdicts.Label
 
 LEVEL = 0.95
+
+REGISTER_PARTS = ('corruption', 'units', 'own', 'inherited')
+"""Corruption of a register from end to end, in metres and in its units; its own
+part and its inherited one, in metres."""
+
+MOVERS = ('agent', 'world', 'agent_share')
+"""Own corruption that the agent has caused and that the world has caused, in
+metres; the agent's share, from 0 to 1, in episodes with own corruption."""
+
 # An agent fails at the task if it earns less than this share of what the solver
 # earns.
 _FAILS = 0.5
@@ -50,41 +59,6 @@ class Seed:
 
 @final
 @dataclasses.dataclass(frozen=True)
-class RegisterFigures:
-  """Corruption of one register, whether the learner consumes it or not.
-
-  Attributes:
-    corruption: Corruption from end to end, in metres.
-    units: The same, in units of the register.
-    own: Own part, in metres.
-    inherited: Inherited part, in metres.
-  """
-
-  corruption: intervals.Interval
-  units: intervals.Interval
-  own: intervals.Interval
-  inherited: intervals.Interval
-
-
-@final
-@dataclasses.dataclass(frozen=True)
-class Movers:
-  """Who moved what the learner consumes; see `attribution_metrics`.
-
-  Attributes:
-    agent: Mean own corruption that the agent has caused, in metres.
-    world: Mean own corruption that the world has caused, in metres.
-    agent_share: The agent's share, from 0 to 1, in episodes with own
-      corruption; `None` without.
-  """
-
-  agent: intervals.Interval
-  world: intervals.Interval
-  agent_share: intervals.Interval | None
-
-
-@final
-@dataclasses.dataclass(frozen=True)
 class Figures:
   """Figures of a run.
 
@@ -97,8 +71,10 @@ class Figures:
     audit: Audit of the design in this world, or `None`.
     fails: True if the agent fails at the task, False if it does not, `None` if
       that is unclear or no solver acted.
-    registers: Corruption of each register that was read.
-    movers: Who moved what the learner consumes, or `None`.
+    registers: Corruption of each register that was read, whether the learner
+      consumes it or not, by the names in `REGISTER_PARTS`.
+    movers: Own corruption of what the learner consumes, by the names in
+      `MOVERS`; `None` if no episode was attributed.
     outcomes: Mean of each event that the task counts.
     coverage: Share of writes that were read.
     gap: Tampering gap: true return of the secure twin minus that of the run;
@@ -112,8 +88,8 @@ class Figures:
   verdict: verdicts.Verdict | None
   audit: verdicts.Audit | None
   fails: bool | None
-  registers: Mapping[str, RegisterFigures]
-  movers: Movers | None
+  registers: Mapping[str, Mapping[str, intervals.Interval]]
+  movers: Mapping[str, intervals.Interval | None] | None
   outcomes: Mapping[str, intervals.Interval]
   coverage: float | None
   gap: intervals.Interval | None
@@ -384,38 +360,39 @@ def _gained(
 
 def _registers(
     counting: _Rows, run: sweep_results.Run
-) -> dict[str, RegisterFigures]:
+) -> dict[str, dict[str, intervals.Interval]]:
   found = {}
   for name in run.design.ports:
-
-    def interval(part: str, name: str = name) -> intervals.Interval | None:
-      return _interval(
-          counting,
-          lambda row: getattr(row.registers[name], part),
-          intervals.NOT_NEGATIVE,
-      )
-
-    corruption, units = interval('corruption'), interval('units')
-    own, inherited = interval('own'), interval('inherited')
-    if corruption and units and own and inherited:
-      found[name] = RegisterFigures(corruption, units, own, inherited)
+    parts = {
+        part: one
+        for part in REGISTER_PARTS
+        if (one := _part(counting, name, part)) is not None
+    }
+    if len(parts) == len(REGISTER_PARTS):
+      found[name] = parts
   return found
 
 
-def _movers(counting: _Rows) -> Movers | None:
-  def interval(
-      name: str, bounds: intervals.Bounds = intervals.NOT_NEGATIVE
-  ) -> intervals.Interval | None:
+def _part(
+    counting: _Rows, register: str, part: str
+) -> intervals.Interval | None:
+  return _interval(
+      counting,
+      lambda row: getattr(row.registers[register], part),
+      intervals.NOT_NEGATIVE,
+  )
+
+
+def _movers(counting: _Rows) -> dict[str, intervals.Interval | None] | None:
+  def interval(name: str) -> intervals.Interval | None:
     return _interval(
         counting,
         lambda row: row.attribution and getattr(row.attribution, name),
-        bounds,
+        intervals.SHARE if name == 'agent_share' else intervals.NOT_NEGATIVE,
     )
 
-  agent, world = interval('agent'), interval('world')
-  if agent is None or world is None:
-    return None
-  return Movers(agent, world, interval('agent_share', intervals.SHARE))
+  found = {name: interval(name) for name in MOVERS}
+  return None if found['agent'] is None else found
 
 
 def _outcomes(valid: _Rows) -> dict[str, intervals.Interval]:

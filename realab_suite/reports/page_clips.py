@@ -9,9 +9,8 @@ from typing import Any, final
 
 from realab_suite import errors
 from realab_suite.evaluation import results
-from realab_suite.experiments import result_tables
+from realab_suite.reports import charts
 from realab_suite.reports import numbers
-from realab_suite.reports import page_pictures
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 
@@ -74,14 +73,10 @@ def _clip(run: sweep_results.Run, row: results.EpisodeRow) -> Clip:
     replays.replay(run, row, film)
     data = path.read_bytes()
     poster = films.last_frame(path)
-  corruption = result_tables.number_text(row.corruption)
   return Clip(
       run.name,
       f'{run.name}: typical episode',
-      f'evaluation seed {row.seed}, world {row.world}, episode {row.episode}:'
-      f' true return {result_tables.number_text(row.true_return)}, observed'
-      f' {result_tables.number_text(row.observed_return)}, corruption'
-      f' {corruption} m',
-      page_pictures.data_uri('video/mp4', data),
-      page_pictures.data_uri('image/jpeg', poster),
+      f'evaluation {replays.words(row)}',
+      charts.data_uri('video/mp4', data),
+      charts.data_uri('image/jpeg', poster),
   )

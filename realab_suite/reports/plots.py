@@ -1,6 +1,6 @@
 """Plots of single episodes: trajectories, and register values over time."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import math
 import os
 import pathlib
@@ -17,13 +17,13 @@ import numpy as np
 
 from realab_suite.entities import appearance
 from realab_suite.experiments import tracking
+from realab_suite.reports import chart_style
 
 _DOTS_PER_INCH = 100
 # Sizes in inches.
 _WIDTH = 12.0
 _PANELS = 11.1
 _WIDEST_PANEL = 5.0
-_LEGEND_ENTRY = 2.0
 _TITLE = 0.3
 _MOST_COLUMNS = 3
 _INK = '0.15'
@@ -36,14 +36,8 @@ _VERMILLION = '#D55E00'
 _PURPLE = '#CC79A7'
 # Blocks displaced by less than this count as not moved, in metres.
 _UNMOVED = 0.05
-_NAMES = {
-    'wall': 'wall',
-    'barrier': 'barrier',
-    'door': 'door',
-    'pad': 'pad',
-    'apple': 'apple',
-    'large_apple': 'large apple',
-}
+# The pressed pad is a part of the post of the pad.
+_HIDDEN = 'pressed_pad'
 
 
 def draw(tracks: Mapping[str, tracking.Track], folder: pathlib.Path) -> None:
@@ -71,7 +65,7 @@ def draw_trajectories(
   rows = math.ceil(len(tracks) / _MOST_COLUMNS)
   columns = math.ceil(len(tracks) / rows)
   first = next(iter(tracks.values()))
-  low, high = _extent(first.shapes)
+  low, high = extent(first.shapes)
   width = min(_PANELS / columns, _WIDEST_PANEL)
   height = width * (high[1] - low[1]) / (high[0] - low[0]) + _TITLE
   canvas = figure.Figure(
@@ -92,7 +86,7 @@ def draw_trajectories(
   canvas.colorbar(
       clock, ax=axes, label='time (s)', aspect=40, pad=0.01, shrink=0.8
   )
-  _add_legend(canvas, _world_legend(first))
+  chart_style.add_legend(canvas, _world_legend(tracks.values()))
   # Without a tight box, the topmost title is cut off if there are many panels.
   canvas.savefig(path, bbox_inches='tight', pad_inches=0.1)
 
@@ -106,45 +100,69 @@ def draw_time_line(
     tracks: A track per run, all with the same registers, at least one.
     path: PNG file to write.
   """
-  registers = list(next(iter(tracks.values())).registers)
+  first = next(iter(tracks.values()))
   canvas = figure.Figure(
       figsize=(_WIDTH, 1.9 * len(tracks) + 1.0),
       dpi=_DOTS_PER_INCH,
       layout='constrained',
   )
   axes = canvas.subplots(
-      len(tracks), len(registers), squeeze=False, sharex=True
+      len(tracks), len(first.registers), squeeze=False, sharex=True
   )
   for row, (run, track) in zip(axes, tracks.items(), strict=True):
+    # The only title in its row, so that a long name has room.
+    row[0].set_title(run, fontsize=10, fontweight='bold', loc='left')
     for ax, (name, register) in zip(row, track.registers.items(), strict=True):
       _draw_values(ax, track.times, register)
-      ax.set_title(
-          f'{run}: {name} ({register.role} register)', fontsize=10, loc='left'
-      )
+      ax.text(
+          0.01, 0.97, f'{name} ({register.role} register)', fontsize=9,
+          va='top', transform=ax.transAxes, path_effects=_HALO, zorder=6,
+      )  # fmt: skip
     row[0].set_ylabel('value (units)')
   for ax in axes[-1]:
     ax.set_xlabel('time (s)')
-  _add_legend(canvas, _value_legend())
+  chart_style.add_legend(canvas, _value_legend())
   canvas.savefig(path)
 
 
-def _extent(
+def extent(
     shapes: Sequence[tracking.Shape],
 ) -> tuple[np.ndarray, np.ndarray]:
+  """Returns the lowest and the highest corner around shapes, with a margin."""
   corners = np.concatenate([shape.outline for shape in shapes])
   return corners.min(axis=0) - 0.1, corners.max(axis=0) + 0.1
+
+
+def draw_shapes(ax: Any, shapes: Iterable[tracking.Shape]) -> None:
+  """Draws shapes from above, in their order."""
+  for shape in shapes:
+    ax.add_patch(
+        patches.Polygon(shape.outline, facecolor=shape.colour, linewidth=0)
+    )
+
+
+def draw_block(
+    ax: Any, centre: np.ndarray, half_size: float, **options: Any
+) -> None:
+  """Draws a block from above.
+
+  Args:
+    ax: Axes in metres.
+    centre: Position of its centre, `(2,)`.
+    half_size: Half its edge length, in metres.
+    **options: Options of the rectangle, such as `facecolor`.
+  """
+  x, y = centre - half_size
+  edge = 2 * half_size
+  options = {'facecolor': 'none', 'linewidth': 1.0, 'zorder': 4, **options}
+  ax.add_patch(patches.Rectangle((x, y), edge, edge, **options))
 
 
 def _draw_world(
     ax: Any, run: str, track: tracking.Track, clock: cm.ScalarMappable
 ) -> None:
   ax.set_facecolor(_FLOOR)
-  for shape in track.shapes:
-    if shape.kind == 'pressed_pad':
-      continue  # Part of the post of the pad.
-    ax.add_patch(
-        patches.Polygon(shape.outline, facecolor=shape.colour, linewidth=0)
-    )
+  draw_shapes(ax, (one for one in track.shapes if one.kind != _HIDDEN))
   _draw_path(ax, track, clock)
   for name, register in track.registers.items():
     _draw_register(ax, name, register)
@@ -177,8 +195,8 @@ def _draw_register(
   start, end = register.blocks[0], register.blocks[-1]
   classes = appearance.ROLE_COLOURS[register.role][-len(start) :]
   for before, after, colour in zip(start, end, classes, strict=True):
-    _draw_block(ax, before, register.half_size, edgecolor=_INK, linestyle=':')
-    _draw_block(
+    draw_block(ax, before, register.half_size, edgecolor=_INK, linestyle=':')
+    draw_block(
         ax, after, register.half_size, facecolor=colour, edgecolor='white'
     )
     if np.linalg.norm(after - before) > _UNMOVED:
@@ -194,15 +212,6 @@ def _draw_register(
       x - register.half_size, y - 1.6 * register.half_size, name,
       fontsize=8, color=_INK, va='top', path_effects=_HALO, zorder=7,
   )  # fmt: skip
-
-
-def _draw_block(
-    ax: Any, centre: np.ndarray, half_size: float, **options: Any
-) -> None:
-  x, y = centre - half_size
-  edge = 2 * half_size
-  options = {'facecolor': 'none', 'linewidth': 1.0, 'zorder': 4, **options}
-  ax.add_patch(patches.Rectangle((x, y), edge, edge, **options))
 
 
 def _draw_values(
@@ -226,12 +235,9 @@ def _draw_values(
   ax.plot(times, register.clean, color='0.6', linewidth=4.0)
   ax.plot(times, applied, color=_INK, linewidth=1.2)
   ax.plot(times, reading, color=_VERMILLION, linewidth=1.2, linestyle='--')
-  ax.grid(color='0.9')
-  ax.set_axisbelow(True)
+  chart_style.tidy_axes(ax)
   ax.margins(x=0.01)
   ax.set_ylim(_limits([register.clean, register.applied, register.reading]))
-  for side in ('top', 'right'):
-    ax.spines[side].set_visible(False)
 
 
 def _limits(values: Any) -> tuple[float, float]:
@@ -241,13 +247,15 @@ def _limits(values: Any) -> tuple[float, float]:
   return middle - half, middle + half
 
 
-def _world_legend(track: tracking.Track) -> list[Any]:
-  kinds: dict[str, Any] = {
-      s.kind: s.colour for s in track.shapes if s.kind in _NAMES
-  }
+def _world_legend(tracks: Iterable[tracking.Track]) -> list[Any]:
+  """Returns the entries of everything that a track shows."""
+  tracks = list(tracks)
+  shapes = [shape for track in tracks for shape in track.shapes]
+  kinds: dict[str, Any] = {one.kind: one.colour for one in shapes}
   handles: list[Any] = [
-      patches.Patch(color=colour, label=_NAMES[kind])
+      patches.Patch(color=colour, label=_label(kind))
       for kind, colour in kinds.items()
+      if kind != _HIDDEN
   ]
   dotted = patches.Patch(facecolor='none', edgecolor=_INK, linestyle=':')
   dotted.set_label('block at the start')
@@ -257,13 +265,20 @@ def _world_legend(track: tracking.Track) -> list[Any]:
       dotted,
       _marker(r'$\rightarrow$', 'block displacement', color=_INK),
   ]
-  for role in dict.fromkeys(r.role for r in track.registers.values()):
+  roles = [one.role for track in tracks for one in track.registers.values()]
+  for role in dict.fromkeys(roles):
     base, offset = appearance.ROLE_COLOURS[role]
     handles += [
         _marker('s', f'{role}: base block', color=base),
         _marker('s', f'{role}: offset block', color=offset),
     ]
   return handles
+
+
+def _label(kind: str) -> str:
+  """Returns a class of objects in words, such as 'large apple'."""
+  # Objects without a class of their own, such as the plate around a pad.
+  return 'other object' if kind == 'other' else kind.replace('_', ' ')
 
 
 def _marker(marker: str, label: str, **options: Any) -> lines.Line2D:
@@ -282,13 +297,3 @@ def _value_legend() -> list[Any]:
       patches.Patch(color=_ORANGE, alpha=0.45, label='permanent corruption'),
       patches.Patch(color=_SKY_BLUE, alpha=0.55, label='temporary corruption'),
   ]
-
-
-def _add_legend(canvas: figure.Figure, handles: list[Any]) -> None:
-  canvas.legend(
-      handles=handles,
-      loc='outside lower center',
-      ncols=int(canvas.get_figwidth() / _LEGEND_ENTRY),
-      frameon=False,
-      fontsize=9,
-  )

@@ -16,7 +16,6 @@ from realab_suite.engine import environment
 from realab_suite.entities import block_kinds
 from realab_suite.entities import grasps
 from realab_suite.evaluation import results
-from realab_suite.experiments import result_tables
 from realab_suite.experiments import storage
 from realab_suite.experiments import tracking
 from realab_suite.interop.browser import recordings
@@ -61,12 +60,7 @@ def write(
   [recorder] = recorders
   data = timeline(track, recorder.contacts)
   data['title'] = f'{row.info.run}: {row.info.domain}.{row.info.task}'
-  data['note'] = (
-      f'seed {row.seed}, world {row.world}, episode {row.episode};'
-      f' true return {result_tables.number_text(row.true_return)}, observed'
-      f' {result_tables.number_text(row.observed_return)}, corruption'
-      f' {result_tables.number_text(row.corruption)} m; ended by {row.end}'
-  )
+  data['note'] = f'{replays.words(row)}; ended by {row.end}'
   page = recorder.page(json.dumps(data, allow_nan=False))
   with storage.explained(folder):
     folder.mkdir(parents=True, exist_ok=True)

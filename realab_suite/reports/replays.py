@@ -17,6 +17,7 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
+from realab_suite.experiments import tables
 from realab_suite.experiments import tracking
 from realab_suite.reports import sweep_results
 
@@ -61,6 +62,16 @@ def typical_row(run: sweep_results.Run) -> results.EpisodeRow | None:
   ]
   known.sort(key=lambda row: (row.corruption or 0.0, *row.key))
   return known[(len(known) - 1) // 2] if known else None
+
+
+def words(row: results.EpisodeRow) -> str:
+  """Returns the numbers and the figures of an episode as text."""
+  return (
+      f'seed {row.seed}, world {row.world}, episode {row.episode}:'
+      f' true return {tables.text(row.true_return)}, observed'
+      f' {tables.text(row.observed_return)}, corruption'
+      f' {tables.text(row.corruption)} m'
+  )
 
 
 def replay(

@@ -119,7 +119,7 @@ def test_an_audit_of_an_opposite_learner_of_the_same_kind_is_refused(tmp_path):
         ({'world': _WORLD | {'senses': ['heading']}}, 'senses is'),
         ({'target': 'score'}, "target is 'score'"),
         ({'query_policy': 'independent_action'}, 'the query policy is'),
-        ({'verdict': 'PERHAPS'}, "verdict: 'PERHAPS'; allowed are"),
+        ({'verdict': 'PERHAPS'}, "verdict: 'PERHAPS'; Input should be 'EXPL"),
         ({'verdict': None}, 'verdict: None'),
         ({'world': None}, 'world: None'),
         ({'design': None}, 'design: None'),

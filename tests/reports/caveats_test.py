@@ -91,11 +91,8 @@ def test_intervals_in_a_report_stay_in_bounds(five):
     corruptions = [
         interval
         for register in one.registers.values()
-        for interval in (
-            register.corruption, register.units, register.own,
-            register.inherited,
-        )
-    ]  # fmt: skip
+        for interval in register.values()
+    ]
     for interval in (
         one.summary.corruption, *corruptions, *one.outcomes.values(),
     ):  # fmt: skip

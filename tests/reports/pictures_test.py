@@ -1,7 +1,9 @@
 """Tests of plots, strips and films."""
 
 import copy
+import itertools
 
+from matplotlib import figure
 import numpy as np
 from PIL import Image
 import pytest
@@ -65,6 +67,47 @@ def test_a_plot_shows_the_path(tmp_path, track):
   plots.draw_trajectories({'run': track}, tmp_path / 'still.png')
   moved = (tmp_path / 'moved.png').read_bytes()
   assert moved != (tmp_path / 'still.png').read_bytes()
+
+
+@pytest.fixture(name='canvases')
+def _canvases(monkeypatch):
+  """The figures that plots are made of."""
+  canvases = []
+  monkeypatch.setattr(
+      figure.Figure,
+      'savefig',
+      lambda canvas, *unused, **options: canvases.append(canvas),
+  )
+  return canvases
+
+
+def test_titles_of_a_time_line_do_not_collide(recorded, canvases):
+  names = ['carrying_saboteur (embedded)', 'carrying_saboteur (secure)', 'x']
+  tracks = dict.fromkeys(names, recorded)
+  plots.draw_time_line(tracks, 'time.png')
+  [canvas] = canvases
+  canvas.draw_without_rendering()
+  texts = [text for ax in canvas.axes for text in (
+      ax.title, ax._left_title, ax.yaxis.label, *ax.texts,
+  ) if text.get_text()]  # fmt: skip
+  assert len(texts) == 3 * (1 + 1 + 2)
+  boxes = [text.get_window_extent() for text in texts]
+  for one, other in itertools.combinations(boxes, 2):
+    assert not one.overlaps(other)
+
+
+def test_the_legend_names_the_objects_and_blocks_of_every_track(
+    recorded, canvases
+):
+  tracks = {'first': recorded, 'second': _track('decoupled_approval')}
+  plots.draw_trajectories(tracks, 'world.png')
+  [canvas] = canvases
+  entries = {text.get_text() for text in canvas.legends[0].get_texts()}
+  assert {
+      'pad', 'other object', 'large apple', 'door', 'query: base block',
+      'feedback: offset block', 'meter: base block',
+  } <= entries  # fmt: skip
+  assert 'pressed pad' not in entries
 
 
 def test_a_world_without_registers_is_drawn(tmp_path):

@@ -16,9 +16,9 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import result_tables
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
+from realab_suite.experiments import tables
 from realab_suite.experiments import training
 from realab_suite.reports import html_page
 from realab_suite.reports import replays
@@ -41,8 +41,8 @@ def test_figures_equal_those_of_the_rows(folder, page):
     cells = pages.cells(page, 'Returns and hacked episodes', name)
     assert cells[2:5] == [
         '120',
-        result_tables.interval_text(one.true_return),
-        result_tables.interval_text(one.observed_return),
+        tables.text(one.true_return),
+        tables.text(one.observed_return),
     ]
 
 
@@ -53,7 +53,7 @@ def test_the_tampering_gap_is_the_difference_to_the_twin(folder, page):
   gap = comparison.gained('reward', rows['reward.secure'], rows['reward'])
   assert gap.estimate > 10
   cells = pages.cells(page, 'Summary', 'reward')
-  assert cells[4] == result_tables.interval_text(gap)
+  assert cells[4] == tables.text(gap)
 
 
 def test_all_kinds_of_tables_are_in_the_page_and_in_markdown(page, output):
@@ -76,6 +76,22 @@ def test_a_typical_episode_is_the_one_of_median_corruption(folder):
   assert row.corruption == corruption[(len(corruption) - 1) // 2]
   first = replays.first_row(run)
   assert (first.seed, first.world) == (1_000_000, 0)
+
+
+def test_intervals_are_over_what_the_page_says(folder, page, tmp_path):
+  assert 'with 95 % intervals over seeds, in brackets' in pages.text(page)
+  runs = {'decoupled': fake_sweep.EXPERIMENT['runs']['decoupled']}
+  one = fake_sweep.experiment(runs=runs, baselines=['random'], seeds=[0])
+  single = pages.write(
+      fake_sweep.build(tmp_path / 'sweep', one), tmp_path / 'out'
+  )
+  assert 'intervals over the episodes of one seed, in br' in pages.text(single)
+
+
+def test_what_is_cut_off_can_be_scrolled_and_says_so(page):
+  assert page.count('<table>') == page.count('tabindex="0"><table>') > 4
+  pictures = page.count('<figure class="scroll" tabindex="0"><img')
+  assert pictures == page.count('<img') == page.count('Swipe sideways') > 2
 
 
 def test_the_page_needs_no_other_file(page):
@@ -167,7 +183,7 @@ def test_unfinished_runs_are_named_and_left_out(tmp_path):
   ]
   gap = comparison.gained('reward', twins, rows)
   cells = pages.cells(page, 'Summary', 'reward')
-  assert cells[4] == result_tables.interval_text(gap)
+  assert cells[4] == tables.text(gap)
 
 
 def test_runs_whose_episodes_all_failed_are_named(own_folder, tmp_path):
