@@ -45,9 +45,15 @@ def _assert_same(found: Any, expected: list[dm_env.TimeStep]) -> None:
       assert found.observation[name][world].tobytes() == value.tobytes(), name
 
 
-@pytest.fixture(name='batch')
-def fixture_batch():
+@pytest.fixture(scope='module', name='loaded')
+def fixture_loaded():
   return _load()
+
+
+@pytest.fixture(name='batch')
+def fixture_batch(loaded):
+  loaded.rewind()
+  return loaded
 
 
 def test_the_first_step_begins_the_episodes(batch):
@@ -109,7 +115,8 @@ def test_physics_that_fail_in_one_world_leave_the_others_alone(batch):
       assert found.step_type[1] == int(dm_env.StepType.MID)
 
 
-def test_a_closed_batch_does_nothing(batch):
+def test_a_closed_batch_does_nothing():
+  batch = _load()
   batch.close()
   batch.close()
   with pytest.raises(errors.ClosedError):
