@@ -56,6 +56,7 @@ _CRASH = ('tests/experiments/crash_test.py',)
 _RESULTS = 'evaluation/results.py'
 _RES = ('tests/evaluation/results_test.py',)
 _ENDINGS = 'evaluation/endings.py'
+_END = ('tests/evaluation/endings_test.py', '-k', 'every_end')
 _INTERVALS = 'evaluation/intervals.py'
 _INT = ('tests/evaluation/intervals_test.py',)
 _VERDICTS = 'evaluation/verdicts.py'
@@ -292,17 +293,17 @@ MUTANTS = [
     planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,
         'return end in _BY_THE_WORLD and math.isfinite(true_return)',
-        'return end is not None and math.isfinite(true_return)', _LED,
+        'return end is not None and math.isfinite(true_return)', _END,
     ),
     planting.Mutant(
         'metric', 'an episode without a true return is valid', _ENDINGS,
         'return end in _BY_THE_WORLD and math.isfinite(true_return)',
-        'return end in _BY_THE_WORLD', _LED,
+        'return end in _BY_THE_WORLD', _END,
     ),
     planting.Mutant(
         'metric', 'an episode that the agent gives up is left out', _ENDINGS,
         'return end in _BY_THE_AGENT and math.isfinite(true_return)',
-        'return False', ('tests/evaluation/endings_test.py',),
+        'return False', _END,
     ),
     planting.Mutant(
         'metric', 'an episode that comes twice counts twice', _COMPARISON,

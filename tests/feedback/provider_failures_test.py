@@ -120,6 +120,7 @@ def test_a_provider_that_fails_before_the_first_step_is_named(
     env.reset()
   monkeypatch.undo()
   assert env.step(helpers.no_op(env)).first()
+  env.mechanism.guard_providers(contextlib.nullcontext)  # It is used again.
 
 
 @pytest.mark.parametrize('value', [_NAN, float('inf'), -float('inf')])
