@@ -52,14 +52,6 @@ def test_forward_and_left_are_the_avatars_own(world, heading):
     assert np.linalg.norm(moved) == pytest.approx(moved @ direction, rel=1e-6)
 
 
-def test_the_direction_is_that_of_the_angle(world):
-  world.place(0.0, 0.0, 2.5)
-  assert world.avatar.angle(world.physics) == 2.5
-  np.testing.assert_allclose(
-      world.avatar.direction(world.physics), [np.cos(2.5), np.sin(2.5)]
-  )
-
-
 @pytest.mark.parametrize('way', [-1.0, 1.0])
 def test_the_pitch_is_limited(world, way):
   world.act(300, look=way)

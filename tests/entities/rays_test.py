@@ -192,14 +192,6 @@ def test_the_nearest_of_several_things_is_seen():
   assert distance == pytest.approx(0.9, abs=1e-5)
 
 
-def test_rays_do_not_hit_their_carrier():
-  world = _World(field_of_view=360.0)
-  # Elsewhere than at the origin, in case the body were looked for there.
-  world.avatar.place(world.physics, (-3.0, 2.0), 1.0)
-  _, names = world.sense()
-  assert set(names) == {'wall'}
-
-
 @pytest.mark.parametrize('dof', registers.DOFS)
 def test_a_carried_block_is_seen(dof):
   world = _World((_block(dof=dof), (0.6, 0.0)))
