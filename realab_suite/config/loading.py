@@ -65,8 +65,6 @@ _Scalar = bool | int | float | str | None
 
 def read_mapping(
     source: str | os.PathLike[str] | Mapping[str, Any],
-    *,
-    where: str | None = None,
 ) -> dict[str, Any]:
   """Returns a checked description that shares nothing with its source.
 
@@ -74,7 +72,6 @@ def read_mapping(
     source: Path of a YAML file, or a mapping of the same shape. Tuples in it
       become lists, -0.0 becomes 0.0, and subclasses of the plain types (such as
       NumPy's float64) become the plain types.
-    where: Name of the source in error messages. Default: the path.
 
   Raises:
     SpecError: If the file cannot be read, if it contains something that this
@@ -82,14 +79,13 @@ def read_mapping(
       such a file cannot contain.
   """
   if isinstance(source, Mapping):
-    return _copied(source, where or '<mapping>')
+    return _copied(source, '<mapping>')
   if not isinstance(source, (str, os.PathLike)):
-    raise messages.Location(where or '<mapping>').error(
+    raise messages.Location('<mapping>').error(
         f'expected a path or a mapping, got {messages.quote(source)}'
     )
   path = os.fsdecode(source)
-  where = where or path
-  return parse_yaml(_read_file(path, messages.Location(where)), where)
+  return parse_yaml(_read_file(path, messages.Location(path)), path)
 
 
 def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
@@ -263,6 +259,11 @@ class _Reader:
     while not isinstance(event := self._next_event(), yaml.MappingEndEvent):
       line = event.start_mark.line + 1
       try:
+        # A collection is not read here: it could be nested without end.
+        if isinstance(event, yaml.CollectionStartEvent):
+          raise _WrongValueError(
+              'keys must be strings, got a mapping or a list'
+          )
         key = _checked_key(self._value(event, path))
         if key in values:
           raise _WrongValueError(
