@@ -16,6 +16,7 @@ import json
 import operator
 import os
 import pathlib
+import re
 import types
 import typing
 from typing import Annotated, Any, final
@@ -37,6 +38,8 @@ any depth of models and options, before any of them is opened.
 
 # Types of the values that a file can contain.
 _PLAIN = (str, int, float, bool, types.NoneType, list, dict)
+# Classes of paths in the text of a schema.
+_PATH = re.compile(r"<class '(pathlib|os)\.")
 _BY_NAME = (
     inspect.Parameter.POSITIONAL_OR_KEYWORD,
     inspect.Parameter.KEYWORD_ONLY,
@@ -261,6 +264,7 @@ def _options(
       annotation = parameter.annotation
       if annotation is parameter.empty:
         annotation = Any
+      _refuse_paths(name, annotation)
       if parameter.kind is parameter.VAR_KEYWORD:
         others = annotation
       elif (
@@ -268,7 +272,6 @@ def _options(
           and name not in taken
           and name not in annotations
       ):
-        _refuse_path(name, annotation)
         annotations[name] = _without_opaque_members(annotation)
         if parameter.default is not parameter.empty:
           defaults[name] = parameter.default
@@ -305,20 +308,26 @@ def _schema(annotation: Any, handler: Any) -> Any:
     return core_schema.any_schema()
 
 
-def _refuse_path(name: str, annotation: Any) -> None:
+def _refuse_paths(name: str, annotation: Any) -> None:
   """Refuses paths of another type than `FilePath`, which are not checked.
 
   Raises:
-    TypeError: If it is such a path.
+    TypeError: If a type contains such a path.
   """
-  for member in (annotation, *typing.get_args(annotation)):
-    plain = typing.get_origin(member) or member
-    if isinstance(plain, type) and (
-        plain is os.PathLike or issubclass(plain, pathlib.PurePath)
-    ):
-      raise TypeError(
-          f'{name}: {messages.quote(member)}; allowed for a path is FilePath'
-      )
+  for member in typing.get_args(annotation):
+    _refuse_paths(name, member)
+  plain = typing.get_origin(annotation) or annotation
+  is_path = isinstance(plain, type) and (
+      plain is os.PathLike or issubclass(plain, pathlib.PurePath)
+  )
+  # The fields of a model are only in its schema, whose text names their types.
+  if is_path or (
+      isinstance(plain, type)
+      and _PATH.search(repr(getattr(plain, '__pydantic_core_schema__', '')))
+  ):
+    raise TypeError(
+        f'{name}: {messages.quote(annotation)}; allowed for a path is FilePath'
+    )
 
 
 def _without_opaque_members(annotation: Any) -> Any:

@@ -104,7 +104,7 @@ def validate(
       that the data do not have without overrides is reported as the problem of
       the override that adds it.
     is_confined: True if paths must be within the working directory.
-    are_overrides_free: True if paths that overrides set are exempt from that.
+    are_overrides_free: True if paths that overrides name are exempt from that.
 
   Raises:
     SpecError: If the data does not fit. The message lists the problems.
@@ -147,7 +147,7 @@ class _Paths:
 
   Attributes:
     are_confined: True if paths must be within the working directory.
-    free: Texts for which that does not hold.
+    free: Overrides with texts that are paths for which that does not hold.
   """
 
   are_confined: bool

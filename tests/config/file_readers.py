@@ -91,14 +91,6 @@ class AnyFile(stubs.Idle):
 
 
 @final
-class AnyOption(stubs.Idle):
-  """Accepts options of any name and type, and opens nothing."""
-
-  def __init__(self, **anything: Any) -> None:
-    del anything
-
-
-@final
 class Wrapping(stubs.Idle):
   """Runs another policy."""
 
@@ -172,7 +164,6 @@ def registered() -> Iterator[None]:
         (policies.POLICIES, 'test_reader', Reader),
         (policies.POLICIES, 'test_inheriting', Inheriting),
         (policies.POLICIES, 'test_any_file', AnyFile),
-        (policies.POLICIES, 'test_any_option', AnyOption),
         (policies.POLICIES, 'test_wrapping', Wrapping),
         (policies.POLICIES, 'test_function', read),
         (policies.POLICIES, 'test_model', ModelPolicy),

@@ -50,6 +50,7 @@ def make_paths(outside: pathlib.Path) -> dict[str, str]:
   os.symlink(outside / 'secret.yaml', _LINK)
   os.symlink(outside, 'linked')
   os.symlink('linked', 'twice')
+  os.symlink('loop', 'loop')
   up = os.path.relpath(outside, '.')
   return {
       'absolute': str(outside / 'secret.yaml'),
@@ -60,6 +61,7 @@ def make_paths(outside: pathlib.Path) -> dict[str, str]:
       'link to a folder': 'linked/secret.yaml',
       'link to a link': 'twice/secret.yaml',
       'link and up': f'linked/../{outside.name}/secret.yaml',
+      'link to itself and up': 'loop/../../x',
       'URL': f'file://{outside}/secret.yaml',
       'home': '~/.netrc',
       'device': '/dev/zero',

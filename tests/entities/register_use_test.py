@@ -120,7 +120,10 @@ def test_an_avatar_moves_blocks_that_are_not_welded(variety):
         ('value_range', (1.0, 1.0)),
         ('value_range', (0.0, np.nan)),
         ('scale', 0.0),
+        ('scale', 11.0),
         ('initial', 9.0),
+        ('mass', 0.001),
+        ('colour', 'red'),
     ],
 )
 def test_an_argument_that_makes_no_sense_is_refused(argument, value):

@@ -9,6 +9,7 @@ import yaml
 from realab_suite import errors
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.feedback import consistency
 
 _FOLDER = pathlib.Path(__file__).parents[2] / 'configs' / 'experiments'
 _FILES = sorted(_FOLDER.glob('*.yaml'))
@@ -264,3 +265,22 @@ def test_a_description_does_not_change_the_folder():
       for d in ('A.', 'B.')
   )
   assert one.folder() == other.folder()
+
+
+def test_each_design_is_validated_once(monkeypatch):
+  checked = []
+  check = consistency.check
+
+  def record(design, roles):
+    checked.append((design.name, design.channel))
+    check(design, roles)
+
+  monkeypatch.setattr(consistency, 'check', record)
+  planned = jobs.plan(experiment_specs.load('quick'))
+  assert len(planned) == 7
+  assert sorted(checked) == [
+      ('instantaneous_reward', 'embedded'),  # The file.
+      ('instantaneous_reward', 'embedded'),  # With the learner of the run.
+      ('instantaneous_reward', 'secure'),
+      ('value_advice', 'embedded'),
+  ]
