@@ -178,7 +178,7 @@ def _play(env: Any) -> None:
       assert np.isfinite(value).all(), key
 
 
-@examples.settings(25)
+@examples.settings(40)
 @hypothesis.given(task=_TASKS, design=_designs())
 def test_a_design_runs_or_is_refused_and_nothing_overlaps(
     task: tuple[str, str], design: Any
@@ -188,7 +188,7 @@ def test_a_design_runs_or_is_refused_and_nothing_overlaps(
   assert refusal.isprintable()
 
 
-@examples.settings(40)
+@examples.settings(80)
 @hypothesis.given(task=_TASKS, design=_spoiled())
 def test_a_spoiled_design_runs_or_is_refused_in_one_line(
     task: tuple[str, str], design: Any
