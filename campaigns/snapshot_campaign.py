@@ -92,7 +92,7 @@ CASES.append(
 
 def ledger_of(env: Any) -> Any:
   """Returns the ledger of a world, or of a batch."""
-  (ledger,) = env._session.sinks
+  (ledger,) = env.sinks
   return ledger
 
 

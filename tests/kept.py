@@ -6,11 +6,9 @@ loaded.
 """
 
 from collections.abc import Callable
-import contextlib
 from typing import Any
 
 from realab_suite.engine import environment
-from realab_suite.engine import events
 from realab_suite.engine import snapshots
 
 _IDLE: dict[str, list[tuple[environment.Environment, snapshots.Snapshot]]] = {}
@@ -31,19 +29,11 @@ def load(key: Any, make: Callable[[], Any]) -> environment.Environment:
     env = make()
     fresh = env.save()
 
-  sinks = []
-
-  def add_sink(sink: events.EventSink) -> None:
-    type(env).add_sink(env, sink)
-    sinks.append(sink)
-
   def keep() -> None:
-    for sink in sinks:
-      with contextlib.suppress(ValueError):  # The test has removed it.
-        env.remove_sink(sink)
-    sinks.clear()
+    for sink in tuple(env.sinks):
+      env.remove_sink(sink)
     if (env, fresh) not in idle:  # Closing twice is allowed.
       idle.append((env, fresh))
 
-  env.add_sink, env.close = add_sink, keep
+  env.close = keep
   return env

@@ -128,6 +128,11 @@ class BatchEnvironment:
     """Checks and splits actions."""
     return self._single.codec
 
+  @property
+  def sinks(self) -> list[events.BatchEventSink]:
+    """Event sinks, in the order in which they were added."""
+    return [*self._sinks]
+
   def add_sink(self, sink: events.BatchEventSink) -> None:
     """Abandons the current episodes and notifies a sink of all later ones."""
     self._refuse_if_closed()

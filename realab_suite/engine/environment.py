@@ -177,6 +177,11 @@ class Environment(composer.Environment):
     super().add_extra_hook(hook_name, hook_callable)
     self._has_extra_hooks = True
 
+  @property
+  def sinks(self) -> list[events.EventSink]:
+    """Event sinks, in the order in which they were added."""
+    return [*self._session.sinks]
+
   def add_sink(self, sink: events.EventSink) -> None:
     """Abandons the current episode and notifies a sink of all later ones."""
     self._refuse_if_closed()

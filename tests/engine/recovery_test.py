@@ -25,7 +25,7 @@ def _loaded() -> environment.Environment:
 def _load() -> tuple[Any, helpers.RecordingSink]:
   """Returns a world whose first episode is the next, and a new sink."""
   env, sink = _loaded(), helpers.RecordingSink()
-  for other in list(env._sinks):
+  for other in list(env.sinks):
     env.remove_sink(other)
   env.rewind()
   env.add_sink(sink)

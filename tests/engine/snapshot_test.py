@@ -286,12 +286,12 @@ def test_a_world_that_is_another_refuses_and_does_not_change(load, named):
   other = load()
   other.reset()
   other.step(helpers.no_op(other))
-  before = other.save().to_bytes() if other._session.sinks else None
+  before = other.save().to_bytes() if other.sinks else None
   state = worlds.state_bytes(other.physics)
   with pytest.raises(errors.StateLayoutError, match=named):
     other.restore(snapshot)
   assert worlds.state_bytes(other.physics) == state
-  assert not other._session.sinks or other.save().to_bytes() == before
+  assert not other.sinks or other.save().to_bytes() == before
 
 
 def test_another_version_of_mujoco_refuses(monkeypatch):

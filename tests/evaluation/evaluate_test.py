@@ -101,7 +101,7 @@ def test_fewer_than_one_episode_is_refused(number):
   env = rooms.load(design='none')
   with pytest.raises(errors.ResultsError, match=f'num_episodes: {number}'):
     evaluate.evaluate(env, rooms.still(env), number)
-  assert env._session.sinks == []
+  assert env.sinks == []
   env.close()
 
 
@@ -186,7 +186,7 @@ def test_sinks_are_removed_after_an_exception(who):
     evaluate.evaluate(
         env, rooms.raising(env, step), 2, sinks=[guest], on_episode=_raise
     )
-  assert env._session.sinks == [outsider]
+  assert env.sinks == [outsider]
   heard = len(guest.heard)
   env.reset()
   env.step(helpers.no_op(env))
@@ -204,7 +204,7 @@ def test_sinks_are_removed_after_the_last_episode():
   env = rooms.load(max_steps=2)
   guest = helpers.RecordingSink()
   evaluate.evaluate(env, rooms.still(env), 1, sinks=[guest])
-  assert env._session.sinks == []
+  assert env.sinks == []
   heard = list(guest.ends)
   env.reset()
   env.close()
@@ -215,7 +215,7 @@ def test_no_sink_is_added_for_a_policy_that_does_not_fit():
   env = suite.embed(helpers.PointTask(), 'none')
   with pytest.raises(errors.SpecError, match='this world has'):
     evaluate.evaluate(env, policies.make('random'), 1)
-  assert env._session.sinks == []
+  assert env.sinks == []
   env.close()
 
 
