@@ -87,7 +87,11 @@ class RegisterSpec(arguments.Arguments):
 
   kind: Annotated[str, option_types.NameIn(register_kinds.REGISTER_KINDS)]
   role: arguments.Role
-  place: Name | PlaceSpec
+  place: Annotated[
+      Annotated[Name, pydantic.Tag('name')]
+      | Annotated[PlaceSpec, pydantic.Tag('other')],
+      arguments.TextOrOther,
+  ]
   ends_episode: thresholds.ThresholdSpec | None = None
   options: Annotated[
       dict[str, Any],

@@ -191,7 +191,7 @@ def test_registers_overlap_only_at_the_same_height():
 
 
 def test_a_register_below_the_floor_or_above_the_ceiling_is_refused():
-  assert 'registers.r.place.position: z must be' in _problem([0, 2.2, -0.1])
+  assert 'registers.r.place: z must be' in _problem([0, 2.2, -0.1])
   task = _Furnished()
   task.root_entity.mjcf_model.worldbody.add(
       'geom', type='box', size=(1, 1, 0.05), pos=(0, 0, 2.8)

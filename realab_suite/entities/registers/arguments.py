@@ -25,8 +25,17 @@ WRITES: tuple[Write, ...] = typing.get_args(Write)
 Name = Annotated[
     str, pydantic.StringConstraints(pattern=r'^[a-z][a-z0-9_]{0,63}$')
 ]
+# A text is a name, even one that no name looks like.
+TextOrOther = pydantic.Discriminator(
+    lambda value: 'name' if isinstance(value, str) else 'other'
+)
 # Larger numbers make the arithmetic of a step overflow.
 Value = Annotated[float, pydantic.Field(ge=-1e9, le=1e9)]
+Initial = Annotated[
+    Annotated[Name, pydantic.Tag('name')]
+    | Annotated[Value, pydantic.Tag('other')],
+    TextOrOther,
+]
 Size = Annotated[float, pydantic.Field(ge=block_kinds.LEAST_SIZE, le=1.0)]
 
 
@@ -56,7 +65,7 @@ class Arguments(validation.Spec):
   range: Annotated[tuple[Value, Value], pydantic.Field(strict=False)]
   # With a smaller scale, readings are mostly numerical noise of positions.
   scale: Annotated[float, pydantic.Field(ge=1e-6, le=10)] = 0.1
-  initial: Value | Name = 0.0
+  initial: Initial = 0.0
   role: Role = 'feedback'
   channel: Channel | None = None
   dof: Dof | None = None
