@@ -20,6 +20,7 @@ from campaigns import planting
 from tests.leaks import mutants as leaks
 
 _ENVIRONMENT = 'engine/environment.py'
+_SESSION = 'engine/session.py'
 _CONTROL_STEP = 'engine/control_step.py'
 _HANDS = 'tests/entities/moving_test.py', 'tests/entities/carrying_test.py'
 _EPISODES = 'engine/episodes.py'
@@ -68,10 +69,10 @@ MUTANTS = [
         'contract', 'finding 3: after a physics error the episode continues',
         _ENVIRONMENT,
         '''    self._reset_next_step = True
-    try:
-      outcome''',
-        '''    try:
-      outcome''',
+    own = self._session
+    try:''',
+        '''    own = self._session
+    try:''',
         _ENV,
     ),
     planting.Mutant(
@@ -81,8 +82,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'finding 4: a divergence is an ordinary end',
-        _ENVIRONMENT,
-        'self._end(events.End.DIVERGENCE)', 'self._end(events.End.TIMEOUT)',
+        _SESSION,
+        'self.end(events.End.DIVERGENCE)', 'self.end(events.End.TIMEOUT)',
         _ENV,
     ),
     planting.Mutant(
@@ -107,7 +108,7 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'an action of booleans is accepted', _ACTIONS,
-        "kinds = 'iuf' if", "kinds = 'biuf' if", _ENV,
+        "else 'iuf'\n\n", "else 'biuf'\n\n", _ENV,
     ),
     planting.Mutant(
         'contract', 'finding 6: discounts may be anything', _HOSTS,
@@ -122,18 +123,19 @@ MUTANTS = [
     planting.Mutant(
         'contract', 'finding 7: a step after a failed reset is not FIRST',
         _ENVIRONMENT,
-        '''    self._reset_next_step = True
-    self._episode += 1
+        '''    self.abandon()
+    own = self._session
 ''',
-        '''    self._reset_next_step = False
-    self._episode += 1
+        '''    self.abandon()
+    self._reset_next_step = False
+    own = self._session
 ''', _ENV,
     ),
     planting.Mutant(
         'contract', 'finding 8: the two blocks of a register collide',
         _TWO_BLOCK,
-        "self._mjcf_root.contact.add('exclude', body1='base', body2='offset')",
-        'lateral = 0.0', _TWO,
+        "'exclude', body1='base', body2='offset'",
+        "'exclude', body1='base', body2='base'", _TWO,
     ),
     planting.Mutant(
         'contract', 'finding 9: a snapshot lacks time and warm start',
@@ -162,9 +164,9 @@ MUTANTS = [
       raise errors.ClosedError(''', _ENV,
     ),
     planting.Mutant(
-        'contract', 'an episode is one step too long', _ENVIRONMENT,
-        'self._mechanism.step_count(self._physics) == self._max_steps',
-        'self._mechanism.step_count(self._physics) - 1 == self._max_steps',
+        'contract', 'an episode is one step too long', _SESSION,
+        'self._mechanism.step_count(physics) == self._max_steps',
+        'self._mechanism.step_count(physics) - 1 == self._max_steps',
         _ENV,
     ),
     planting.Mutant(
@@ -190,9 +192,9 @@ MUTANTS = [
     ),
     planting.Mutant(
         'contract', 'a provider that raises leaves the episode open',
-        _ENVIRONMENT,
+        _SESSION,
         '''    except Exception:
-      self._end(events.End.ERROR)
+      self.end(events.End.ERROR)
       raise
 ''',
         '''    except Exception:
