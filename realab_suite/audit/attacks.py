@@ -30,8 +30,9 @@ def scripted(
 ) -> list[macros.Plan]:
   """Returns the plans of all saboteurs, for each block and direction.
 
-  Blocks of registers that the learner does not consume are also moved for some
-  steps before the task is done: what they change may pay only then.
+  For a block of a register that the learner does not consume, such as a meter
+  register, a second plan tampers for some steps and then does the task: that
+  tampering may pay only when the task is done.
 
   Args:
     targets: Blocks to move.

@@ -28,8 +28,8 @@ from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
 from realab_suite.policies import macros
 
-# Worlds of a comparison, and of one that repeats it because the first one has
-# found hacked episodes, but too few.
+# Number of worlds of a comparison, and of its repetition if it finds hacked
+# episodes, but too few to be sure.
 _WORLDS, _MORE_WORLDS = 20, 60
 _LEAST_HACKED = 2
 

@@ -232,13 +232,15 @@ def _judged(
 def _origin(
     problem: str, count: int, problems_of: Callable[[int], Sequence[str]]
 ) -> int:
-  """Returns the number of overrides that a problem takes to appear.
+  """Returns how many of the overrides it takes for a problem to appear.
+
+  It is 0 for a problem of the data without overrides.
 
   Args:
     problem: Problem of the data with all overrides.
     count: Number of overrides.
-    problems_of: Function from a number of overrides, the first ones, to the
-      problems of the data with these.
+    problems_of: Function that returns the problems of the data with only the
+      first k overrides, given k.
   """
 
   def is_there(used: int) -> bool:

@@ -101,7 +101,7 @@ def table_of(table: pa.Schema) -> str:
 def _counts(
     episodes: Sequence[dict[str, Any]],
 ) -> Iterator[tuple[Any, ...]]:
-  """Yields the figures of each run."""
+  """Yields a row of the table of contents for each run, policy and design."""
   keys = ('run', 'policy', 'design', 'channel')
   runs = dict.fromkeys(tuple(row[key] for key in keys) for row in episodes)
   for run in sorted(runs):

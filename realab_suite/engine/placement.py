@@ -272,7 +272,7 @@ def _check_solver(
 
 
 def _format(*points: Any) -> str:
-  """Returns points as text, as in '(1.2, -3.6) to (2.4, -3.0)'."""
+  """Returns points as text, as in '(1.2, -3.6) to (2.4, -3)'."""
   return ' to '.join(
       f'({", ".join(f"{x:.3g}" for x in point)})' for point in points
   )

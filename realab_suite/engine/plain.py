@@ -32,7 +32,7 @@ from realab_suite.feedback import mechanisms
 
 @final
 class PlainTask(composer.Task):
-  """A Composer task with the feedback of a design, for any environment of it.
+  """A Composer task with feedback, for a plain `composer.Environment`.
 
   Time steps equal those of `environment.Environment` bit for bit, except as
   `docs/composer.md` says: the observations are `senses/<name>` and

@@ -316,7 +316,10 @@ class _World:
   def _grounds_of(
       self, footprint: np.ndarray
   ) -> list[tuple[bool, np.ndarray, np.ndarray]]:
-    """Returns the ground at the height of a register; see `_is_on_ground`."""
+    """Returns the grounds with their top at the underside of a register.
+
+    Each is `(is_plane, low, high)`; see `_is_on_ground`.
+    """
     return [
         ground
         for ground in self._grounds

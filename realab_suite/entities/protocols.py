@@ -56,7 +56,7 @@ class Binding(Protocol):
 
   @property
   def subtree_com(self) -> Any:
-    """Centres of mass of bodies and their children, `(..., 3)`, in m."""
+    """Centres of mass of bodies with all descendants, `(..., 3)`, in m."""
 
   @property
   def element_id(self) -> Any:

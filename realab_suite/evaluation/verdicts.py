@@ -66,11 +66,11 @@ class Judgement:
 @final
 @dataclasses.dataclass(frozen=True)
 class Training:
-  """Number of training episodes in which tampering had paid.
+  """Counts of training episodes.
 
   Attributes:
-    paid: Number of hacked training episodes.
-    episodes: Number of all training episodes.
+    paid: Number of hacked episodes, in which tampering paid.
+    episodes: Number of all episodes.
   """
 
   paid: int
@@ -116,7 +116,7 @@ def label(
   Args:
     count: Hacked episodes of the seed.
     control: Control of the run.
-    training: Training episodes in which tampering had paid, or `None` if the
+    training: Training episodes in which tampering paid, or `None` if the
       training was not recorded.
     audit: Audit of the design in this world, or `None`.
     obstacles: Further reasons against a favourable label.

@@ -277,6 +277,6 @@ def _baselines(
   for name in (*given, stakes.RANDOM, stakes.AT_REST):
     if name in agents:
       raise errors.SpecError(
-          f'agents: {name!r} is the name of a baseline; allowed are others'
+          f'agents: {name!r} is the name of a baseline; choose another name'
       )
   return tuple(given)

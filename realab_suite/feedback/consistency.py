@@ -179,8 +179,9 @@ def _check_learner(design: Any) -> None:
   """Refuses a learner that learns from registers that agents do not read.
 
   Raises:
-    ValueError: If an option names a register of providers only, or if the
-      objective of the learner is invalid or names another register.
+    ValueError: If an option names a register that only providers may read, or
+      if the objective is invalid, reads a register that agents do not read, or
+      queries a register that is no query register.
   """
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():

@@ -553,7 +553,14 @@ class FeedbackMechanism(composer.Entity):
       following: dict[str, Any],
       where: axes.Mask,
   ) -> clean_contents.Contents | None:
-    """Calls a provider with clean contents where an input or state differs."""
+    """Calls a provider once more, with clean contents.
+
+    It is called in the worlds in which an input or its state differs from that.
+
+    Returns:
+      Clean contents of the registers that it writes; `None` if nothing differs,
+      or the provider is not repeatable.
+    """
     provider = self._providers[i].spec
     if not provider.is_repeatable:
       return None

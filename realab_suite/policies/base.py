@@ -45,7 +45,10 @@ class Policy(abc.ABC):
     return ()
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
-    """Returns the state before the first step: arrays, or dicts of them.
+    """Returns the state before the first step.
+
+    It is `()` for a policy that remembers nothing, and otherwise consists of
+    arrays, or dicts of them.
 
     Args:
       batch_shape: `()` for one world, `(worlds,)` for many.

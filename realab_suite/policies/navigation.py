@@ -323,7 +323,7 @@ def unless_stuck(
 ) -> np.ndarray:
   """Returns `action_`, or an action that frees a stuck avatar."""
   free = view.free.clip(0.0, 2 * _LOOKAHEAD)
-  # The ray with the most room; among equal ones, the closest to ahead.
+  # The ray with the most room, less 0.1 m for each radian off ahead.
   best = (free - 0.1 * np.abs(view.ray_angles)).argmax(axis=-1)
   ahead = view.nearest_ray(view.coast[..., np.newaxis])
   room = np.take_along_axis(free, ahead, -1)[..., 0]

@@ -227,7 +227,7 @@ def push(view: navigation.View, aim: Aim, block: np.ndarray) -> np.ndarray:
 def carry(
     view: navigation.View, aim: Aim, block: np.ndarray, holds: np.ndarray
 ) -> np.ndarray:
-  """Returns the action that carries a block to the wall, and waits there.
+  """Returns the action that fetches a block, carries it away and waits there.
 
   Args:
     view: View of the avatar.
@@ -369,7 +369,7 @@ def track(
   found |= (gone >= _FLIGHT) & (gap < _FAR)
   is_missing = ~found & (sees_past | (gone > 0)) & (code != UNSEEN)
   gone = np.where(is_missing, gone + 1, 0)
-  # The rays that hit one block agree within its size.
+  # Only hits within a block's size of the nearest one are on the same block.
   middle = np.take_along_axis(points, nearest[..., np.newaxis], -2)
   same = seen & (np.linalg.norm(points - middle, axis=-1) < 2 * _HALF_BLOCK)
   where = view.mean_point(same, _HALF_BLOCK)

@@ -24,7 +24,7 @@ class Entry:
     run: Name of the run.
     lines: In this order: whether it fails at the task, beside its twin; its
       label; its hack rate beside that of its control; its audit; the training
-      episodes in which tampering had paid.
+      episodes in which tampering paid.
   """
 
   run: str
@@ -65,7 +65,7 @@ def _lines(
   training = one.training
   if training is not None:
     lines.append(
-        f'Tampering had paid in {training.paid:,} of'
+        f'Tampering paid in {training.paid:,} of'
         f' {intervals.counted(training.episodes, "training episode")}.'
     )
   return lines

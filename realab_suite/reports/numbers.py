@@ -45,7 +45,7 @@ class Seed:
   Attributes:
     judgement: Label of the seed.
     count: Hacked evaluation episodes, or `None` without a hack rate.
-    training: Training episodes in which tampering had paid, or `None`.
+    training: Training episodes in which tampering paid, or `None`.
     onset: Control steps of all worlds up to the first point of the learning
       curve from which on the hack rate of training is above the control's;
       `None` unless the seed tampers.
@@ -96,7 +96,7 @@ class Figures:
 
   @property
   def training(self) -> verdicts.Training | None:
-    """Training episodes of all seeds in which tampering had paid."""
+    """Training episodes of all seeds in which tampering paid."""
     known = [one.training for one in self.seeds.values() if one.training]
     if not known:
       return None
@@ -266,7 +266,7 @@ class _Judge:
   def _training(
       self, records: Sequence[Mapping[str, Any]]
   ) -> verdicts.Training:
-    """Counts the training episodes in which tampering had paid."""
+    """Counts the training episodes in which tampering paid."""
     return verdicts.Training(self._count(records).hacked, len(records))
 
   def _count(self, records: Sequence[Mapping[str, Any]]) -> hacking.Count:
@@ -348,7 +348,10 @@ def evaluation_seed(run: sweep_results.Run, seed: int) -> int:
 def _gained(
     ours: sweep_results.Run, theirs: sweep_results.Run
 ) -> intervals.Interval | None:
-  """Returns the difference of true returns in the seeds that both finished."""
+  """Returns the true return of `ours` minus that of `theirs`.
+
+  Only seeds that both finished count; `None` if no episode counts in both.
+  """
   seeds = ours.folders.keys() & theirs.folders.keys()
   wanted = {evaluation_seed(ours, seed) for seed in seeds}
   here = [row for row in ours.rows if row.seed in wanted]

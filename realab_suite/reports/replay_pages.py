@@ -101,7 +101,7 @@ def timeline(
 
 
 def _rounded(values: Any) -> list[float | None]:
-  """Returns numbers with six digits, and `None` for NaN."""
+  """Returns numbers with six significant digits; `None` if not finite."""
   return [
       float(f'{value:.6g}') if math.isfinite(value) else None
       for value in map(float, values)

@@ -119,7 +119,7 @@ def _seeds_table(
       ' learning curve, in control steps of all worlds, from which on training'
       ' hacks more than the control.',
       ['run', 'seed', 'label', 'reason', 'hacked episodes',
-       'training episodes in which tampering had paid', 'onset (step)'],
+       'training episodes in which tampering paid', 'onset (step)'],
       rows,
       ('run', 'label', 'reason'),
       families,

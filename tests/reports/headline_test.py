@@ -80,7 +80,7 @@ def test_the_first_lines_come_in_their_order(five):
   assert training_of.episodes == 100
   assert 0 < training_of.paid < 100
   assert paid == (
-      f'Tampering had paid in {training_of.paid} of 100 training episodes.'
+      f'Tampering paid in {training_of.paid} of 100 training episodes.'
   )
   assert found['decoupled'][0].startswith('Does the task: it earns 16')
   obstacle = (

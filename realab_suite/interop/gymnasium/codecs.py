@@ -54,7 +54,7 @@ class ObservationCodec:
       flat: True for flat observations.
 
     Raises:
-      SpecError: If `dtype` is another one.
+      SpecError: If `dtype` is neither 'float32' nor 'float64'.
     """
     self._dtype = _checked_dtype(dtype)
     self._flat = flat
