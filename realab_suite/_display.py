@@ -44,9 +44,10 @@ def prepare() -> None:
   """Prepares the import of dm_control, without choosing a renderer for it.
 
   If `MUJOCO_GL` names a renderer that dm_control starts when it is imported,
-  libraries with an LLVM of their own are loaded first. If none is named and there is no display, a warning
-  of GLFW is suppressed, because worlds are then drawn with EGL. This function
-  has no effect if dm_control has chosen a renderer already.
+  libraries with an LLVM of their own are loaded first. If none is named and
+  there is no display, a warning of GLFW is suppressed, because worlds are then
+  drawn with EGL. This function has no effect if dm_control has chosen a
+  renderer already.
   """
   if 'dm_control._render' in sys.modules:
     return

@@ -160,9 +160,8 @@ def test_a_write_carries_no_energy(dof):
 
 
 def test_unknown_kinds_of_writes_are_refused():
-  with pytest.raises(
-      errors.SpecError, match=r"write: must be 'axis' or 'pose', got 'x'"
-  ):
+  expected = "write: must be 'axis' or 'pose', got 'x'"
+  with pytest.raises(errors.SpecError, match=expected):
     registers.TwoBlockRegister('r', value_range=(0, 1), write='x')
 
 
