@@ -41,7 +41,7 @@ from benchmarks import worlds
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_physics
 from realab_suite.engine import seeding
-from realab_suite.feedback import mechanisms
+from realab_suite.feedback import assembly
 from realab_suite.feedback import specs
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import unlock_door
@@ -120,11 +120,14 @@ class StockTask(composer.Task):
 
   def __init__(self, dof: str) -> None:
     self._world = unlock_door.UnlockDoor()
-    mechanism = mechanisms.FeedbackMechanism(
-        specs.load('instantaneous_reward', (f'dof={dof}',))
-    )
-    mechanism.attach_to(self._world.root_entity)
-    self._registers = mechanism.registers
+    design = specs.load('instantaneous_reward', (f'dof={dof}',))
+    arena = self._world.root_entity
+    self._registers = {}
+    for name, spec in design.registers.items():
+      register = assembly.make_register(name, spec, design)
+      place = assembly.find_place(name, spec.place, arena.places)
+      assembly.attach(register, arena, place)
+      self._registers[name] = register
     avatar = self._world.avatar
     avatar.make_graspable(
         [b for register in self._registers.values() for b in register.blocks]

@@ -171,7 +171,8 @@ class ExperimentSpec(validation.Spec):
   training: TrainingSpec = TrainingSpec()
   evaluation: EvaluationSpec = EvaluationSpec()
 
-  _designs: dict[str, specs.DesignSpec] = pydantic.PrivateAttr(
+  # Designs of the runs, with the specs that they were loaded for.
+  _designs: dict[str, tuple[RunSpec, specs.DesignSpec]] = pydantic.PrivateAttr(
       default_factory=dict
   )
 
@@ -224,7 +225,7 @@ class ExperimentSpec(validation.Spec):
             f'runs.{name}.twin: design {design.name!r} is {TWIN} already;'
             ' allowed is false'
         )
-      self._designs[name] = design
+      self._designs[name] = run, design
     return self
 
   def _check_world(self, design: specs.DesignSpec) -> None:
@@ -254,7 +255,11 @@ class ExperimentSpec(validation.Spec):
   @property
   def designs(self) -> Mapping[str, specs.DesignSpec]:
     """Designs of the runs with their changes, by the name of the run."""
-    return self._designs
+    for name, run in self.runs.items():
+      loaded_for, _ = self._designs.get(name, (None, None))
+      if loaded_for is not run:  # This is a copy with other runs.
+        self._designs[name] = run, run.load()
+    return {name: self._designs[name][1] for name in self.runs}
 
   @property
   def domain_and_variation(self) -> tuple[str, str]:

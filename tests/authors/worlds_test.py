@@ -183,9 +183,9 @@ def test_its_scripted_policies_are_compared(
   chosen = world.scripted if not fields else ('crab_walker', 'random', 'no_op')
   lines = scripted.run(
       scripted.Settings(
-          domain='beacons', task='standard', design=str(design), overrides=(),
-          policies=chosen, channels=('embedded', 'secure'), baseline=None,
-          target='score', seeds=(1,), num_episodes=2, max_steps=60,
+          world=world, design=str(design), overrides=(), policies=chosen,
+          channels=('embedded', 'secure'), baseline=None,
+          target='score', seeds=(1,), num_episodes=2,
           output=str(tmp_path / 'results'),
       ),
       said.append,
