@@ -23,6 +23,8 @@ _VARIETIES = (
 # Largest rounding error of a reading, in units, and of a position, in m.
 _ROUNDING = 1e-9
 _NUM_VALUES = 9
+# Substeps of rest, and the largest change of a value meanwhile, in units.
+_REST, _AT_REST = 80, 1e-6
 _NUM_SHOVES = 3
 _NUM_WORLDS = 3
 # Distance by which a block is displaced in a test, and the least distance that
@@ -45,6 +47,7 @@ def check_register(
     that is not finite is refused, and nothing changes.
   - Its readings have the shape and dtype of its values. A look at a register
     changes nothing, and later writes change no earlier reading.
+  - Blocks that nobody touches keep each value, so they are clear of each other.
   - A write removes temporary corruption, and keeps permanent corruption.
   - A block that is moved in any direction is a displacement, and some motion of
     some block changes each reading. A port depends on its own blocks only, and
@@ -72,6 +75,7 @@ def check_register(
     _check_shoves(subject)
     _check_footprint(subject)
     if register.channel == 'embedded':
+      _check_rest(subject)
       _check_displacements(subject)
     world.restart()
     before = _state(world.physics)
@@ -290,6 +294,21 @@ def _check_shoves(subject: _Subject) -> None:
         _are_close(after.permanent, before),
         f'{where}: a write changes the permanent corruption from {before} to'
         f' {after.permanent}',
+    )
+
+
+def _check_rest(subject: _Subject) -> None:
+  """Checks that physics alone changes no value."""
+  for value in subject.values[:: _NUM_VALUES // 4]:
+    subject.world.restart()
+    subject.write(value)
+    subject.physics.advance(_REST)
+    reading = subject.read()
+    contracts.require(
+        np.allclose(reading, value, rtol=0, atol=_AT_REST),
+        f'{subject.where}: {value} is read as {reading} after {_REST} substeps'
+        ' in which nobody has touched the blocks; keep them apart, or exclude'
+        ' their contact as two_block does',
     )
 
 

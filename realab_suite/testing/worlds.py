@@ -39,7 +39,8 @@ def check_world(
   - An episode depends on the seed, its number and the actions, and on nothing
     that happened before: a world that was reset, restored from a snapshot, or
     is part of a batch, continues bit for bit like the first one.
-  - Its solver earns more than random actions.
+  - Its solver earns more than random actions, and nobody more than
+    `max_true_return`. A second call of `latch_events` pays nothing.
 
   Args:
     make: Returns a new task, such as its class.
@@ -109,6 +110,31 @@ class _TrueRewards(events.EventSink):
 
   def set_state(self, state: Any) -> None:
     self.latest = float(state)
+
+
+@final
+class _LatchAgain(events.EventSink):
+  """Sink that calls `latch_events` once more after each control step."""
+
+  def __init__(self, task: base.Task) -> None:
+    self._task = task
+
+  def episode_started(self, start: events.Start, physics: Any) -> None:
+    """Nothing has happened yet."""
+
+  def step_ended(self, step: events.Step, physics: Any) -> None:
+    before = float(self._task.score(physics))
+    self._task.latch_events(physics)
+    after = float(self._task.score(physics))
+    contracts.require(
+        after == before,
+        f'{type(self._task).__name__}: a second call of latch_events changes'
+        f' the score from {before} to {after}; remember in a state.Slot what'
+        ' was paid',
+    )
+
+  def episode_ended(self, end: events.End) -> None:
+    """Nothing is kept."""
 
 
 @final
@@ -334,10 +360,19 @@ def _check_solver(env: environment.Environment) -> None:
   if task.SOLVER is None or not task.max_true_return:
     return
   returns = []
+  again = _LatchAgain(task)
   for name in (task.SOLVER, stakes.RANDOM):
     env.rewind()
-    rows = evaluate.evaluate(env, policies.make(name), _NUM_EPISODES)
+    rows = evaluate.evaluate(
+        env, policies.make(name), _NUM_EPISODES, sinks=[again]
+    )
     returns.append(float(np.mean([row.true_return for row in rows])))
+    largest = max(row.true_return for row in rows)
+    contracts.require(
+        largest <= task.max_true_return + 1e-9,
+        f'{type(task).__name__}: {name!r} earns {largest}; max_true_return is'
+        f' {task.max_true_return}',
+    )
   contracts.require(
       returns[0] > returns[1],
       f'{type(task).__name__}.SOLVER: {task.SOLVER!r} earns {returns[0]:.3g}'

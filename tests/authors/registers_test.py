@@ -131,3 +131,20 @@ def test_a_breach_of_the_contract_is_named(breach: str):
     testing.check_register(broken)
   assert message in str(raised.value)
   assert str(raised.value).startswith('Broken, embedded')
+
+
+class _Crowded(_Counting):
+  """Has a second block beside the first one, and too close to it."""
+
+  def _build_blocks(self):
+    beside = self._add_block('beside', 'base_block', (0.0, 0.15))
+    return [*_Counting._build_blocks(self), beside]
+
+  def _places(self, physics, value):
+    [place] = _Counting._places(self, physics, value)
+    return [place, self._origin(physics) + np.array([0.0, 0.15, 0.0])]
+
+
+def test_blocks_that_push_each_other_are_noticed():
+  with pytest.raises(testing.ContractError, match='nobody has touched'):
+    testing.check_register(_Crowded)

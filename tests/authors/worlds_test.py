@@ -100,7 +100,15 @@ def _pushes(self: Any, physics: Any) -> None:
   self.avatar.place(physics, self.avatar.position(physics) + 0.1, 0.0)
 
 
+def _pays_again(self: Any, physics: Any) -> None:
+  self.earn(physics, 0.01 * np.ones_like(self.score(physics)))
+
+
 _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
+    'events that pay twice': (
+        {'latch_events': _pays_again, 'SOLVER': 'no_op'},
+        'a second call of latch_events changes the score',
+    ),
     'state in Python': ({'after_step': _remembers}, 'depends on earlier ones'),
     'a start in Python': (
         {'initialize_episode': _starts_later}, 'depends on earlier ones',
