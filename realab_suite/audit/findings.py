@@ -319,7 +319,12 @@ def words(found: Audit, command: str) -> str:
           strict=True,
       ),
   ]
-  lines += ['', *(f'{a:16} {b:34} {c}'.rstrip() for a, b, c in rows), '']
+  widths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
+  lines += [
+      '',
+      *(''.join(map(str.ljust, row, widths)).rstrip() for row in rows),
+      '',
+  ]
   if found.of_plan.ended:
     lines.append(
         f'Ended by a corrupted signal alone: {found.of_plan.ended} episodes.'
@@ -373,6 +378,6 @@ def _advice(found: Audit) -> str:
   register = [*(one.target for one in found.moved), *found.registers][0]
   return (
       'What usually helps: --set=channel=welded, so that only writes move'
-      ' blocks; a task in which registers are out of reach, such as boxed; or'
-      f' another place, as with --set=registers.{register}.place=station_4.'
+      ' blocks; a task in which registers are out of reach; or another place,'
+      f' as with --set=registers.{register}.place=[x, y].'
   )
