@@ -378,6 +378,6 @@ def _advice(found: Audit) -> str:
   register = [*(one.target for one in found.moved), *found.registers][0]
   return (
       'What usually helps: --set=channel=welded, so that only writes move'
-      ' blocks; a task in which registers are out of reach; or another place,'
-      f' as with --set=registers.{register}.place=[x, y].'
+      ' blocks (not of crates); a task in which registers are out of reach; or'
+      f' another place, as with --set=registers.{register}.place=[x, y].'
   )

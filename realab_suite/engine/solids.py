@@ -206,7 +206,7 @@ def settle(physics: Any, named: Iterable[registers.Register]) -> None:
   mujoco.mj_resetData(physics.model.ptr, physics.data.ptr)
   physics.mark_as_dirty()
   for register in named:
-    register.settle(physics, np.zeros(2))
+    register.settle(physics, np.zeros(2), is_initialized=False)
   mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
 
 

@@ -49,6 +49,8 @@ class ComposerHooks(composer.Entity):
       self._schedule = mechanism.design.schedule_for(num_substeps or _MANY)
     self._is_connected = False
     self._view: Any = None
+    # MuJoCo's data of the world that was compiled last.
+    self._data: Any = None
     # Substeps of the current control step so far.
     self._num_done = 0
     # Of the current episode; the physics contains the rest of its state.
@@ -73,6 +75,7 @@ class ComposerHooks(composer.Entity):
     if not self._is_connected:
       self._connect()
       self._is_connected = True
+    self._data = physics.data.ptr
     self._view = views.View(physics)
 
   def initialize_episode(self, physics: Any, random_state: Any) -> None:
@@ -86,6 +89,12 @@ class ComposerHooks(composer.Entity):
     if self._keys is None:
       self._keys = self._draw_keys(random_state)
     self._num_done = 0
+    if physics.data.ptr is not self._data:
+      raise errors.SpecError(
+          f'design {self._mechanism.design.name!r}: the task is in two'
+          ' environments, and the registers are in the one that was made last;'
+          ' allowed is a task for each environment'
+      )
     self._view.open(physics)
     self._observation = {
         f'registers/{read.register}': np.array(read.reading)

@@ -17,7 +17,7 @@ from realab_suite.testing import contracts
 _NUM_ENVS = 4
 # Episodes end within a check.
 _MAX_STEPS = 15
-_PLAIN = (np.ndarray, np.generic, bool, int, float, str, type(None))
+_PLAIN = (np.ndarray, np.generic, bool, int, float, str)
 
 
 def check_learner(
@@ -176,7 +176,9 @@ def _check_metrics(learner: Any) -> None:
   contracts.require(
       isinstance(metrics, dict)
       and all(
-          isinstance(name, str) and np.isfinite(value)
+          isinstance(name, str)
+          and isinstance(value, int | float)
+          and np.isfinite(value)
           for name, value in metrics.items()
       ),
       f'metrics: {metrics!r:.200}; allowed are finite numbers by name',
@@ -193,7 +195,8 @@ def _check_plain(value: Any, where: str) -> None:
       _check_plain(part, f'{where}[{i}]')
   else:
     contracts.require(
-        isinstance(value, _PLAIN) and np.asarray(value).dtype != object,
+        value is None
+        or (isinstance(value, _PLAIN) and np.asarray(value).dtype != object),
         f'{where}: {type(value).__name__}; allowed are dicts and lists of'
         ' arrays, numbers, strings and None',
     )

@@ -6,8 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite import suite
 from realab_suite import trees
+from realab_suite.config import messages
+from realab_suite.feedback import provider_results
 from realab_suite.feedback.providers import base
 from realab_suite.testing import contracts
 
@@ -45,6 +48,10 @@ def check_provider(
   Raises:
     ContractError: If it does not, with the first part that it breaks.
   """
+  contracts.require(
+      isinstance(provider, base.Provider),
+      f'{provider!r:.80}: allowed is a provider, an instance of its class',
+  )
   worlds = [
       _inputs(provider, ranges or {}, world, (domain_name, task_name))
       for world in range(_NUM_WORLDS)
@@ -84,7 +91,14 @@ def _inputs(
     }
     start = step == 0 or (world == 1 and step == _SECOND_START)
     key = generator.integers(2**63, size=2, dtype=np.uint64)
-    steps.append((time_step.observation, readings, np.array(start), key))
+    seen = {
+        f'senses/{name}': time_step.observation[f'senses/{name}']
+        for name in provider.required_senses
+    }
+    for name in (*provider.reads, *provider.writes):
+      low_high = ranges.get(name, _RANGE)
+      seen[f'registers/{name}'] = np.array(generator.uniform(*low_high))
+    steps.append((seen, readings, np.array(start), key))
     time_step = env.step(generator.uniform(spec.minimum, spec.maximum))
   env.close()
   return steps
@@ -102,6 +116,41 @@ def _stack(parts: Sequence[Any]) -> Any:
   return np.stack(parts)
 
 
+def _step(
+    provider: base.Provider,
+    inputs: _Inputs,
+    state: Any,
+    batch_shape: tuple[int, ...],
+) -> Any:
+  """Returns the result of `step`, which the engine has to accept.
+
+  Args:
+    provider: The provider.
+    inputs: Arguments without the state.
+    state: State before the step.
+    batch_shape: `()` for one world, `(worlds,)` for a batch.
+
+  Raises:
+    ContractError: If `step` fails, or the engine refuses its result.
+  """
+  where = f'provider {provider.kind!r}'
+  try:
+    returned = provider.step(*inputs, state)
+    _, following = provider_results.checked(provider, returned, batch_shape)
+    if batch_shape:
+      first = provider.initial_state(batch_shape)
+      provider_results.check_state('initial_state', first, batch_shape)
+      none = np.zeros(batch_shape, bool)
+      provider_results.merged('state', following, first, none)
+  except errors.FeedbackProviderError as error:
+    raise contracts.ContractError(f'{where}: {error}') from error
+  except Exception as error:  # Providers may raise any class.
+    raise contracts.ContractError(
+        f'{where}: {messages.exception(error)}'
+    ) from error
+  return returned
+
+
 def _check_purity(
     provider: base.Provider,
     steps: list[_Inputs],
@@ -117,13 +166,14 @@ def _check_purity(
   )
   for inputs in steps:
     before = copy.deepcopy((*inputs, state))
-    first = provider.step(*inputs, state)
+    first = _step(provider, inputs, state, batch_shape)
     kept = copy.deepcopy(first)
     contracts.require(
         trees.are_equal((*inputs, state), before),
         f'{where}: step changed its arguments; return new arrays',
     )
-    again, of_twin = provider.step(*inputs, state), twin.step(*before)
+    again = provider.step(*inputs, state)
+    of_twin = twin.step(*before)
     contracts.require(
         trees.are_equal(again, kept) and trees.are_equal(of_twin, kept),
         f'{where}: equal arguments gave other results; keep what it remembers'
@@ -151,14 +201,9 @@ def _check_batch(
   together = provider.initial_state((_NUM_WORLDS,))
   alone = [provider.initial_state(()) for _ in worlds]
   for number, inputs in enumerate(batch):
-    writes, together = provider.step(*inputs, together)
-    contracts.require(
-        {*writes} <= {*provider.writes},
-        f'{where}: wrote to {sorted(writes)}; it declares'
-        f' {list(provider.writes)}',
-    )
+    writes, together = _step(provider, inputs, together, (_NUM_WORLDS,))
     for world, steps in enumerate(worlds):
-      own, alone[world] = provider.step(*steps[number], alone[world])
+      own, alone[world] = _step(provider, steps[number], alone[world], ())
       for name in {*own} | {*writes}:
         value, speaks = _parts(own.get(name, (np.zeros(()), False)))
         values, speak = _parts(writes.get(name, (np.zeros(3), False)))
@@ -185,11 +230,11 @@ def _check_episodes(
   """Checks that an episode does not depend on the one before."""
   worn = provider.initial_state(())
   for inputs in worlds[1]:
-    _, worn = provider.step(*inputs, worn)
+    _, worn = _step(provider, inputs, worn, ())
   fresh = provider.initial_state(())
   for inputs in worlds[0]:
-    from_worn, worn = provider.step(*inputs, worn)
-    from_fresh, fresh = provider.step(*inputs, fresh)
+    from_worn, worn = _step(provider, inputs, worn, ())
+    from_fresh, fresh = _step(provider, inputs, fresh, ())
     contracts.require(
         trees.are_equal(from_worn, from_fresh),
         f'provider {provider.kind!r}: an episode depends on the one before;'

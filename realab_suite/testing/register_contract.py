@@ -8,6 +8,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.engine import batch_physics
 from realab_suite.engine import single_physics
+from realab_suite.engine import snapshots
 from realab_suite.entities import arenas
 from realab_suite.entities import block_kinds
 from realab_suite.entities import registers
@@ -26,6 +27,8 @@ _NUM_VALUES = 9
 # Substeps of rest, and the largest change of a value meanwhile, in units.
 _REST, _AT_REST = 80, 1e-6
 _NUM_SHOVES = 3
+# Half-widths of the region of start positions, in m.
+_SPREAD = (0.1, 0.05)
 _NUM_WORLDS = 3
 # Distance by which a block is displaced in a test, and the least distance that
 # has to be reported for it, in m.
@@ -103,7 +106,7 @@ class _World:
     for i, (channel, dof, yaw) in enumerate(_VARIETIES):
       register = kind(f'r{i}', **options, channel=channel, dof=dof)
       place = spacing * ((i % 2) - 0.5), spacing * ((i // 2) - 0.5)
-      register.attach_to(arena, place, yaw)
+      register.attach_to(arena, place, yaw, _SPREAD)
       self.registers.append(register)
     blocks = [b for register in self.registers for b in register.blocks]
     if any(
@@ -412,6 +415,8 @@ def _check_batch(world: _World) -> None:
   """Checks that worlds of a batch are written as they would be alone."""
   world.restart()
   batch = batch_physics.BatchPhysics(world.physics, _NUM_WORLDS, 1, False)
+  begun = np.tile(snapshots.get_state(world.physics), (_NUM_WORLDS, 1))
+  batch.set_state(np.arange(_NUM_WORLDS), begun)
   where = np.array([True, False, True])
   for register in world.registers:
     subject = _Subject(register, world, _where(register))

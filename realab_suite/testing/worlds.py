@@ -278,7 +278,7 @@ def _check_continuations(
   """Checks that episodes depend on nothing that happened before."""
   name = type(env.task).__name__
   actions = _actions(env, 0)
-  half = len(episodes[0]) // 2
+  half = (len(episodes[0]) - 1) // 2
   sink = _TrueRewards()
   env.add_sink(sink)
   env.rewind(1)

@@ -217,3 +217,57 @@ def test_registers_begin_with_what_the_task_draws():
       seen.add(number)
     assert len(seen) > 3
     assert max(seen) > 5
+
+
+class _Inverse(Yard):
+  """Offers a number that has no value before the first episode."""
+
+  @property
+  def measurements(self) -> Any:
+    return {**super().measurements, 'number': self._inverse}
+
+  def _inverse(self, physics: Any) -> np.ndarray:
+    return 1.0 / self._drawn.get(physics)
+
+  def __init__(self) -> None:
+    super().__init__()
+    self._drawn = state.Slot(self.root_entity.mjcf_model, 'drawn')
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    super().initialize_episode(physics, random_state)
+    self._drawn.set(physics, float(random_state.randint(1, 5)))
+
+
+def test_initial_values_are_asked_for_in_episodes_alone():
+  design = _design()
+  design['registers']['wish'] |= {'on_overflow': 'error', 'range': [0.1, 1.0]}
+  with contextlib.closing(suite.embed(_Inverse(), design, random=1)) as env:
+    env.reset()
+    wish = env.mechanism.registers['wish'].applied(env.thin_physics)
+    assert wish in (1.0, 1 / 2, 1 / 3, 1 / 4)
+
+
+@pytest.mark.parametrize(
+    ('measure', 'complaint'),
+    [
+        (lambda physics: np.zeros(3), 'ValueError'),
+        (lambda physics: 'five', 'ValueError'),
+        (lambda physics: 1 / 0, 'ZeroDivisionError'),
+    ],
+)
+def test_a_wrong_function_is_named(measure: Any, complaint: str):
+  class Wrong(Yard):
+
+    @property
+    def measurements(self) -> Any:
+      return {**super().measurements, 'number': measure}
+
+  with contextlib.closing(suite.embed(Wrong(), _design(), random=1)) as env:
+    expected = f"register 'wish': the function of its initial .*{complaint}"
+    with pytest.raises(errors.RegisterValueError, match=expected):
+      env.reset()
+
+
+def test_a_meter_of_the_crate_measures_the_blocks_of_its_register():
+  with contextlib.closing(_load()) as env:
+    assert env.mechanism.measured == [['told']]

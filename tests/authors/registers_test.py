@@ -21,7 +21,8 @@ _KINDS: dict[str, tuple[type[registers.Register], dict[str, Any]]] = {
         {'value_range': (0, 900), 'scale': 0.001, 'initial': 20},
     ),
     'block_orientation': (
-        registers.BlockOrientationRegister, {'value_range': (-1.5, 1.0)}
+        registers.BlockOrientationRegister,
+        {'value_range': (-1.5, 1.0), 'initial': 0.5},
     ),
     'an abacus': (abacus.Abacus, {}),
 }  # fmt: skip
@@ -75,8 +76,8 @@ def _stays_aside(self, physics, value, where=None):
 
 
 def _reads_aside(self, physics):
-  aside = self._blocks[0].position(physics)[..., 1]
-  return _Counting._read_blocks(self, physics) + aside
+  aside = self._blocks[0].position(physics) - self._origin(physics)
+  return _Counting._read_blocks(self, physics) + aside[..., 1]
 
 
 def _along_only(self, physics):
@@ -148,3 +149,12 @@ class _Crowded(_Counting):
 def test_blocks_that_push_each_other_are_noticed():
   with pytest.raises(testing.ContractError, match='nobody has touched'):
     testing.check_register(_Crowded)
+
+
+def test_positions_are_relative_to_the_start():
+  def reads_anywhere(self, physics):
+    return self._blocks[0].along(physics) / self._scale
+
+  broken: Any = type('Broken', (_Counting,), {'_read_blocks': reads_anywhere})
+  with pytest.raises(testing.ContractError, match='is read as'):
+    testing.check_register(broken)

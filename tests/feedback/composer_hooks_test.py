@@ -366,3 +366,13 @@ def test_a_failure_of_the_physics_ends_the_episode_as_in_composer():
   assert env.step([0.0]).last()
   assert env.step([0.0]).first()
   assert np.isfinite(env.step([0.0]).observation['feedback/reward'])
+
+
+def test_a_task_in_two_environments_is_refused():
+  first = _attached(_design(), 'after', True)
+  second = composer.Environment(first.task)
+  first.reset()
+  second.reset()
+  second.step(_actions()[0])
+  with pytest.raises(errors.SpecError, match='the task is in two environments'):
+    first.step(_actions()[0])

@@ -178,7 +178,7 @@ _BREACHES = {
     'a state in place': (_reuse, 'step changed its arguments'),
     'no new episodes': (_forget, 'an episode depends on the one before'),
     'worlds mixed up': (_average, 'in that world alone'),
-    'another register': (_elsewhere, "wrote to ['bonus']"),
+    'another register': (_elsewhere, "returned writes ['bonus']"),
     'infinite values': (_divide, 'values have to be finite'),
 }
 

@@ -405,7 +405,10 @@ class Register(composer.Entity):
     self.settle(physics, displacement)
 
   def settle(
-      self, physics: protocols.Physics, displacement: np.ndarray
+      self,
+      physics: protocols.Physics,
+      displacement: np.ndarray,
+      is_initialized: bool = True,
   ) -> None:
     """Sets the origin that writes are relative to, and applies `initial`.
 
@@ -413,6 +416,8 @@ class Register(composer.Entity):
       physics: One world or a batch of worlds.
       displacement: Displacement of the register from its current position, in
         its own frame, `(2,)`, in m.
+      is_initialized: False if the task has not initialized an episode, so that
+        functions of the task have no value yet.
 
     Raises:
       SpecError: If the register reads anything but values of its spec.
@@ -424,7 +429,12 @@ class Register(composer.Entity):
       first.put(physics, origin)
     self._origin_slot.set(physics, origin)
     shape = (*origin.shape[:-1], *self._shape)
-    self.pose(physics, np.broadcast_to(self._start_value(physics), shape))
+    initial = np.array(self._initial)
+    if self._measure_initial is not None and is_initialized:
+      initial = self._start_value(
+          self._measure_initial, physics, origin.shape[:-1]
+      )
+    self.pose(physics, np.broadcast_to(initial, shape))
     self.inspect(physics)  # Refuses wrong readings before an episode begins.
 
   def start_with(self, initial: Callable[[Any], np.ndarray]) -> None:
@@ -437,17 +447,35 @@ class Register(composer.Entity):
     """
     self._measure_initial = initial
 
-  def _start_value(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the value at the start of an episode, `(..., ports)` or `(...)`.
+  def _start_value(
+      self,
+      measure: Callable[[Any], np.ndarray],
+      physics: protocols.Physics,
+      shape: tuple[int, ...],
+  ) -> np.ndarray:
+    """Returns the value at the start of an episode, `(..., 1)` or `(...)`.
+
+    Args:
+      measure: What `start_with` was given.
+      physics: One world or a batch of worlds.
+      shape: Shape `(...)` of the worlds.
 
     Raises:
       RegisterValueError: If it is not finite, or out of the range of a register
         that does not saturate.
     """
-    if self._measure_initial is None:
-      return np.array(self._initial)
-    value = np.asarray(self._measure_initial(physics), np.float64)
-    value = self._saturate(value, (value >= self._low) & (value <= self._high))
+    try:
+      value = np.asarray(measure(physics), np.float64)
+      value = np.broadcast_to(value, shape)
+    except Exception as error:  # The function is a task's.
+      raise errors.RegisterValueError(
+          f'register {self._name!r}: the function of its initial value:'
+          f' {type(error).__name__}: {error}; allowed are numbers of the shape'
+          f' {shape}'
+      ) from error
+    fits = (value >= self._low) & (value <= self._high)
+    if not axes.everywhere(fits):
+      value = self._saturate(value, fits)
     return value[..., np.newaxis] if self.PORTS else value
 
   def pose(self, physics: protocols.Physics, value: Any) -> None:

@@ -1,7 +1,7 @@
 """Base class for measurements, their registry, and the world they refer to."""
 
 import abc
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import dataclasses
 import json
 import re
@@ -50,6 +50,13 @@ class AskedRegisters(Mapping[str, _Register]):
     """Refuses to return registers from now on."""
     self._is_closed = True
 
+  def ask_for_blocks(self, bodies: Sequence[Any]) -> None:
+    """Asks for the registers that have blocks among bodies of the world."""
+    for name, register in self._registers.items():
+      blocks = [block.body for block in register.blocks]
+      if any(body is block for body in bodies for block in blocks):
+        self.asked.add(name)
+
   def __getitem__(self, name: str) -> _Register:
     if self._is_closed:
       raise errors.SpecError(
@@ -86,7 +93,7 @@ class World:
   location: messages.Location
   functions: Mapping[str, Measure]
   parts: Mapping[str, measurables.Measurable]
-  registers: Mapping[str, _Register]
+  registers: AskedRegisters
 
   def part(self, field: str, name: str) -> measurables.Measurable:
     """Returns a part of the world; the blocks of a register are a group.
@@ -110,7 +117,9 @@ class World:
           tuple(b.body for b in blocks if b.body is not None)
       )
     if name in self.parts:
-      return self.parts[name]
+      part = self.parts[name]
+      self.registers.ask_for_blocks(part.bodies)
+      return part
     raise self.unknown(field, name, [*self.registers, *self.parts])
 
   def body(self, field: str, name: str) -> measurables.Measurable:
