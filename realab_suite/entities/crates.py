@@ -7,11 +7,15 @@ from dm_control import composer
 from dm_control import mjcf
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import block_kinds
 from realab_suite.entities import measurables
 from realab_suite.entities import protocols
+
+# Largest edge length of a block, in m.
+_LARGEST = 1.0
 
 CRATE = appearance.register('crate', code=11, rgba=(0.72, 0.55, 0.33, 1.0))
 
@@ -40,7 +44,19 @@ class Crate(measurables.MeasurableEntity):
       mass: Mass, in kg.
       is_planar: True for a crate that slides along the floor and is never
         lifted.
+
+    Raises:
+      SpecError: If the size or the mass is none of a block.
     """
+    for what, given, least, most in (
+        ('size', size, block_kinds.LEAST_SIZE, _LARGEST),
+        ('mass', mass, 0.01, 100.0),
+    ):
+      if not isinstance(given, int | float) or not least <= given <= most:
+        raise errors.SpecError(
+            f'crate {name!r}: {what} {given!r:.40}; allowed are {least:g} to'
+            f' {most:g}'
+        )
     self._mjcf_root = mjcf.RootElement(model=name)
     kind = block_kinds.PlanarBlock if is_planar else block_kinds.FreeBlock
     style = appearance.geom_style(CRATE)

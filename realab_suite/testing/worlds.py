@@ -81,7 +81,8 @@ class _Moment(NamedTuple):
   """Result of a control step.
 
   Attributes:
-    arrays: Observation of the agent, type of the step and true reward.
+    arrays: Observation of the agent, type and discount of the step, and true
+      reward.
     reward: The constant reward, or `None` in the first step.
   """
 
@@ -238,6 +239,9 @@ def _moment(time_step: dm_env.TimeStep, sink: _TrueRewards) -> _Moment:
   return _Moment(
       {
           'step_type': np.asarray(int(time_step.step_type)),
+          'discount': np.asarray(
+              1.0 if time_step.first() else time_step.discount
+          ),
           'true_reward': np.asarray(sink.latest),
           **time_step.observation,
       },
@@ -257,6 +261,11 @@ def _check_rewards(
         one.validate(moment.arrays[key])
       contracts.require(
           not moment.reward, f'{name}: the agent got {moment.reward!r}'
+      )
+      discount = float(moment.arrays['discount'])
+      contracts.require(
+          0 <= discount <= 1,
+          f'{name}: get_discount returned {discount}; allowed are 0 to 1',
       )
   total = sum(float(one.arrays['true_reward']) for one in episodes[-1])
   score = float(task.score(env.physics))
@@ -329,6 +338,7 @@ def _check_batch(
         if number < len(episodes[0]):
           found = {
               'step_type': np.asarray(int(time_step.step_type[world])),
+              'discount': np.asarray(time_step.discount[world]),
               'true_reward': np.asarray(float(sink.latest[world])),
           }
           for key, value in time_step.observation.items():

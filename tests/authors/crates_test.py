@@ -271,3 +271,19 @@ def test_a_wrong_function_is_named(measure: Any, complaint: str):
 def test_a_meter_of_the_crate_measures_the_blocks_of_its_register():
   with contextlib.closing(_load()) as env:
     assert env.mechanism.measured == [['told']]
+
+
+@pytest.mark.parametrize(
+    ('fields', 'complaint'),
+    [
+        ({'size': 0.01}, 'size 0.01; allowed are 0.06 to 1'),
+        ({'size': np.nan}, 'size nan; allowed'),
+        ({'size': 'big'}, "size 'big'; allowed"),
+        ({'mass': 0}, 'mass 0; allowed are 0.01 to 100'),
+    ],
+)
+def test_crates_are_as_large_and_heavy_as_blocks(
+    fields: dict[str, Any], complaint: str
+):
+  with pytest.raises(errors.SpecError, match=f"crate 'box': {complaint}"):
+    crates.Crate('box', **fields)

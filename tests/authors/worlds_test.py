@@ -105,6 +105,15 @@ def _pays_again(self: Any, physics: Any) -> None:
 
 
 _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
+    'a discount of more than 1': (
+        {
+            'get_discount': lambda self, physics: 2.0 + self.score(physics) * 0,
+            'should_terminate_episode': lambda self, physics: (
+                self.score(physics) > 3
+            ),
+        },
+        'get_discount returned 2',
+    ),
     'events that pay twice': (
         {'latch_events': _pays_again, 'SOLVER': 'no_op'},
         'a second call of latch_events changes the score',
