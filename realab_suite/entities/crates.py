@@ -46,7 +46,7 @@ class Crate(measurables.MeasurableEntity):
         lifted.
 
     Raises:
-      SpecError: If the size or the mass is none of a block.
+      SpecError: If the size or the mass is outside the limits of blocks.
     """
     for what, given, least, most in (
         ('size', size, block_kinds.LEAST_SIZE, _LARGEST),

@@ -50,7 +50,7 @@ def check_register(
     that is not finite is refused, and nothing changes.
   - Its readings have the shape and dtype of its values. A look at a register
     changes nothing, and later writes change no earlier reading.
-  - Blocks that nobody touches keep each value, so they are clear of each other.
+  - Undisturbed blocks keep each value, so they are clear of each other.
   - A write removes temporary corruption, and keeps permanent corruption.
   - A block that is moved in any direction is a displacement, and some motion of
     some block changes each reading. A port depends on its own blocks only, and

@@ -39,7 +39,7 @@ def check_world(
   - An episode depends on the seed, its number and the actions, and on nothing
     that happened before: a world that was reset, restored from a snapshot, or
     is part of a batch, continues bit for bit like the first one.
-  - Its solver earns more than random actions, and nobody more than
+  - Its solver earns more than random actions, and neither earns more than
     `max_true_return`. A second call of `latch_events` pays nothing.
 
   Args:
