@@ -285,8 +285,9 @@ class JointedBlock(Block):
       where: axes.Mask = None,
   ) -> np.ndarray:
     position = self.position(physics)
-    if not axes.everywhere(self._surroundings.are_far(physics, position)):
-      along = self._free(physics, position, along)
+    is_far = self._surroundings.are_far(physics, position)
+    if not axes.everywhere(is_far):
+      along = self._free(physics, position, along, is_far)
     position[..., 0] = along
     moved = position[..., :1] - self._rest[:1]
     axes.assign(physics.bind(self._slides[0]), 'qpos', moved, where)
@@ -298,6 +299,7 @@ class JointedBlock(Block):
       physics: protocols.Physics,
       position: np.ndarray,
       along: np.ndarray,
+      is_far: Any,
   ) -> np.ndarray:
     """Returns the free x coordinates nearest to wanted ones, `(...)`, in m.
 
@@ -305,10 +307,10 @@ class JointedBlock(Block):
       physics: One world or a batch of worlds.
       position: Present position in the register's frame, `(..., 3)`, in m.
       along: Wanted x coordinate, `(...)`, in m.
+      is_far: True where no obstacle is near, `(...)` bool.
     """
     free = np.array(np.broadcast_to(along, position.shape[:-1]))
     orientation = self._orientation(physics)
-    is_far = self._surroundings.are_far(physics, position)
     for world in np.argwhere(~np.asarray(is_far)):
       index = tuple(world)
       free[index] = self._surroundings.nearest_free(

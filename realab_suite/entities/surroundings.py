@@ -31,6 +31,8 @@ _TOLERANCE, _DEEPEST = 0.5, 0.05
 _PARALLEL = 1e-9
 # Distance to an obstacle at which blocks are put, in m.
 _GAP = 1e-6
+# Writes that move a block by at most this much, in m, are rounding errors.
+_SAME_PLACE = 1e-12
 _Corridor = tuple[Any, Any, Any, Any]
 # MuJoCo computes no bounding boxes of planes. Height fields are the ground.
 _IGNORED_TYPES = (
@@ -311,17 +313,18 @@ class Surroundings:
       before: Present x coordinate of the block, in m.
     """
     along = float(position[0])
-    boxes = self._boxes
+    if abs(along - before) <= _SAME_PLACE:
+      return along
+    boxes = self._beside(self._boxes, position)
     if self._movers is not None:
       bound = physics.bind(self._movers.frames)
       moving = self._movers.at(bound.mocap_pos[world], bound.mocap_quat[world])
+      moving = self._beside(moving, position)
       boxes = boxes.joined(self._without_region(moving))
-    low, high = boxes.low - self._radius, boxes.high + self._radius
-    beside = (low[:, 1:] < position[1:]) & (position[1:] < high[:, 1:])
-    is_near = beside.all(axis=1)
-    if not (is_near & (low[:, 0] < along) & (along < high[:, 0])).any():
+    low, high = boxes.low[:, 0] - self._radius, boxes.high[:, 0] + self._radius
+    if not ((low < along) & (along < high)).any():
       return along
-    taken = boxes.taken(position, rotation, self._half_size)[is_near]
+    taken = boxes.taken(position, rotation, self._half_size)
     taken = taken[(before <= taken[:, 0]) | (taken[:, 1] <= before)]
     if not _is_taken(along, taken):
       return along
@@ -413,12 +416,25 @@ class Surroundings:
     left, ceiling = upper.min(axis=-2, initial=np.inf).T
     return right, floor, left, ceiling
 
+  def _beside(self, boxes: Boxes, position: np.ndarray) -> Boxes:
+    """Returns the boxes that a block may hit on its way along x.
+
+    Args:
+      boxes: Boxes of one world.
+      position: Position of the block, `(3,)`, in m.
+    """
+    low, high = boxes.low - self._radius, boxes.high + self._radius
+    is_beside = (low[:, 1:] < position[1:]) & (position[1:] < high[:, 1:])
+    return boxes.only(is_beside.all(axis=1))
+
   def _without_region(self, boxes: Boxes) -> Boxes:
     """Returns boxes without those that undisturbed blocks are in.
 
     The placement check refuses obstacles there. The obstacles in these boxes
     are round or hollow, and beside the blocks.
     """
+    if not len(boxes.centres):
+      return boxes
     margin = np.array([0.0, self._sideways, 0.0])
     taken = boxes.taken(self._rest, np.eye(3), self._half_size + margin)
     low, high = self._reach
