@@ -34,6 +34,13 @@ class FeedbackProvider(composer.Entity):
 
   The mechanism decides when it acts. It has no state: the state of a provider
   belongs to the episode, not to the world.
+
+  Attributes:
+    title: Name of the provider in records, such as `providers[0]:difference`.
+    spec: Specification and pure function of the provider.
+    reads: Ports that the provider reads, in the order of the design.
+    targets: Registers that the provider may write.
+    seen: Keys of the observation that the provider gets.
   """
 
   def _build(
@@ -55,12 +62,12 @@ class FeedbackProvider(composer.Entity):
       targets: Registers that it may write.
       read_by_agent: Names of the ports whose readings the agent observes.
     """
-    self._title = title
-    self._spec = spec
+    self.title = title
+    self.spec = spec
     self._mjcf_root = mjcf_model
-    self._reads = reads
-    self._targets = targets
-    self._seen = [
+    self.reads = reads
+    self.targets = targets
+    self.seen = [
         *(f'senses/{name}' for name in spec.required_senses),
         *(f'registers/{name}' for name in read_by_agent),
     ]
@@ -68,28 +75,3 @@ class FeedbackProvider(composer.Entity):
   @property
   def mjcf_model(self) -> mjcf.RootElement:
     return self._mjcf_root
-
-  @property
-  def title(self) -> str:
-    """Name of the provider in records, such as `providers[0]:difference`."""
-    return self._title
-
-  @property
-  def spec(self) -> providers.Provider:
-    """Specification and pure function of the provider."""
-    return self._spec
-
-  @property
-  def reads(self) -> Sequence[ports.AnyPort]:
-    """Ports that the provider reads, in the order of the design."""
-    return self._reads
-
-  @property
-  def targets(self) -> Sequence[Target]:
-    """Registers that the provider may write."""
-    return self._targets
-
-  @property
-  def seen(self) -> Sequence[str]:
-    """Keys of the observation that the provider gets."""
-    return self._seen
