@@ -176,10 +176,9 @@ class _Part:
   def has_moved(self, physics: Any) -> bool:
     """Returns True if the part is not where the compiled model has it."""
     bound = physics.bind(self._frame)
-    return not (
-        np.array_equal(bound.mocap_pos, self._position)
-        and np.array_equal(bound.mocap_quat, self._quaternion)
-    )
+    shifted = bound.mocap_pos != self._position
+    turned = bound.mocap_quat != self._quaternion
+    return bool(np.count_nonzero(shifted) or np.count_nonzero(turned))
 
   def solids(self, physics: Any, space: solids.Space) -> list[solids.Solid]:
     """Returns the geoms in their present poses."""

@@ -434,7 +434,7 @@ class Register(composer.Entity):
       initial = self._start_value(
           self._measure_initial, physics, origin.shape[:-1]
       )
-    self.pose(physics, np.broadcast_to(initial, shape))
+    self.pose(physics, np.full(shape, initial))
     self.inspect(physics)  # Refuses wrong readings before an episode begins.
 
   def start_with(self, initial: Callable[[Any], np.ndarray]) -> None:
