@@ -34,7 +34,11 @@ class Registry(Generic[T]):
 
     def decorate(entry: T) -> T:
       if name in self._entries:
-        raise errors.SpecError(f'{self._what} {name!r} is registered already')
+        raise errors.SpecError(
+            f'{self._what} {name!r} is registered already, as'
+            f' {messages.quote(self._entries[name])}; allowed is another name;'
+            ' in a notebook, run the cell that registers it once'
+        )
       self._entries[name] = entry
       return entry
 

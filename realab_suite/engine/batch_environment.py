@@ -342,7 +342,7 @@ class BatchEnvironment:
       StateLayoutError: If the snapshot does not fit. The state is unchanged.
     """
     header = self._single.snapshot_header(self._physics.model)
-    saved = snapshots.WorldStates.from_data(snapshot.contents_for(header))
+    saved = snapshots.WorldStates.from_snapshot(snapshot, header)
     indices = saved.indices_for(worlds, self._num_envs)
     saved.refuse_other_sinks([sink.state_kind for sink in self._sinks])
     self._put(saved, indices)

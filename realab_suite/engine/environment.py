@@ -261,7 +261,7 @@ class Environment(composer.Environment):
       StateLayoutError: If the snapshot does not fit. The state is unchanged.
     """
     header = self.snapshot_header()
-    saved = snapshots.WorldStates.from_data(snapshot.contents_for(header))
+    saved = snapshots.WorldStates.from_snapshot(snapshot, header)
     if len(saved.seed) != 1:
       raise errors.StateLayoutError(
           f'the snapshot has {len(saved.seed)} worlds; allowed here is one, as'

@@ -16,6 +16,7 @@ import numpy as np
 from realab_suite import archive
 from realab_suite import errors
 from realab_suite import trees
+from realab_suite.config import messages
 from realab_suite.engine import arguments
 from realab_suite.engine import seeding
 from realab_suite.entities import state
@@ -126,6 +127,24 @@ class WorldStates(NamedTuple):
   observation: dict[str, np.ndarray]
   sinks: list[Any]
   random_state: dict[str, Any] | None
+
+  @classmethod
+  def from_snapshot(cls, snapshot: Any, header: Mapping[str, Any]) -> Self:
+    """Returns the states of worlds from a snapshot that fits an environment.
+
+    Args:
+      snapshot: What a caller wants to restore.
+      header: Header of the environment.
+
+    Raises:
+      StateLayoutError: If it is no snapshot, or the headers differ.
+    """
+    if not isinstance(snapshot, Snapshot):
+      raise errors.StateLayoutError(
+          f'snapshot: {messages.quote(snapshot)}; allowed is a Snapshot, as'
+          ' from `save` or `Snapshot.from_bytes`'
+      )
+    return cls.from_data(snapshot.contents_for(header))
 
   @classmethod
   def from_data(cls, data: Mapping[str, Any]) -> Self:

@@ -17,6 +17,7 @@ from dm_control.composer.observation import observable
 import numpy as np
 
 from realab_suite import errors
+from realab_suite.config import integers
 from realab_suite.config import messages
 from realab_suite.entities import arenas
 from realab_suite.entities import axes
@@ -83,8 +84,16 @@ class FeedbackMechanism(composer.Entity):
         needs it for designs without a `schedule`.
 
     Raises:
-      SpecError: If a register kind refuses its arguments.
+      SpecError: If `design` is no `DesignSpec`, if `num_substeps` is not a
+        positive integer or `None`, or if a register kind refuses its arguments.
     """
+    if not isinstance(design, specs.DesignSpec):
+      raise errors.SpecError(
+          f'design: {messages.quote(design)}; allowed is a DesignSpec, as from'
+          ' specs.load(name_or_file_or_dict)'
+      )
+    if num_substeps is not None:
+      num_substeps = integers.check('num_substeps', num_substeps, 1)
     self._design = design
     self._mjcf_root = mjcf.RootElement(model='feedback')
     self._step_count = state.Slot(self._mjcf_root, 'step_count')

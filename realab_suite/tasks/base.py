@@ -76,10 +76,10 @@ class Task(composer.Task):
         larger than 40 cm need the short one, with 2.5 times as many substeps.
 
     Raises:
-      SpecError: If an argument has a value that is not allowed, or the class
-        has no version of its dynamics.
+      SpecError: If an argument or an attribute of the class has a value that is
+        not allowed, or the class has no version of its dynamics.
     """
-    _check_version(type(self))
+    _check_class(type(self))
     self._arena = arena
     size = _checked_size(camera_size)
     self._has_camera_by_default = size is not None
@@ -234,17 +234,35 @@ def _blocks_of(
   return [block for register in registers for block in register.own_blocks]
 
 
-def _check_version(task_class: type[Task]) -> None:
-  """Checks that a class has a version of its dynamics.
+def _check_class(task_class: type[Task]) -> None:
+  """Checks the class attributes of a task.
 
   Raises:
-    SpecError: If it has none. Snapshots and results are compared by it.
+    SpecError: If one has a wrong type. Snapshots and results are compared by
+      the version of the dynamics, so each class needs one.
   """
   version = getattr(task_class, 'DYNAMICS_VERSION', None)
+  solver, saboteurs = task_class.SOLVER, task_class.SABOTEURS
+  actions = task_class.ACTION_SET
+  attribute = given = allowed = None
   if type(version) is not int or version < 1:
+    attribute, given = 'DYNAMICS_VERSION', version
+    allowed = 'integers from 1, increased with every change of the trajectories'
+  elif not isinstance(solver, str | None):
+    attribute, given = 'SOLVER', solver
+    allowed = 'the name of a registered policy, and None'
+  elif not isinstance(saboteurs, tuple) or not all(
+      isinstance(name, str) for name in saboteurs
+  ):
+    attribute, given = 'SABOTEURS', saboteurs
+    allowed = 'tuples of names of registered policies'
+  elif not isinstance(actions, action_sets.ActionSet):
+    attribute, given = 'ACTION_SET', actions
+    allowed = 'instances of action_sets.ActionSet'
+  if attribute:
     raise errors.SpecError(
-        f'{task_class.__name__}.DYNAMICS_VERSION: {version!r:.80}; allowed are'
-        ' integers from 1, increased with every change of the trajectories'
+        f'{task_class.__name__}.{attribute}: {given!r:.80}; allowed are'
+        f' {allowed}'
     )
 
 

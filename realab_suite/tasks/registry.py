@@ -42,7 +42,8 @@ def register_task(
   def decorate(factory: _Factory) -> _Factory:
     if (domain_name, task_name) in _TASKS:
       raise errors.SpecError(
-          f'task {domain_name}.{task_name} is registered already'
+          f'task {domain_name}.{task_name} is registered already; allowed is'
+          ' another name; in a notebook, run the cell that registers it once'
       )
     _TASKS[domain_name, task_name] = factory, frozenset(tags)
     return factory

@@ -66,6 +66,13 @@ def _register(**changes: Any) -> dict[str, Any]:
   return {'registers': {'reward': register}}
 
 
+def test_a_name_that_is_taken_is_refused_with_its_owner():
+  with pytest.raises(
+      errors.SpecError, match=r"'scaled' is .*_Scaled.*notebook"
+  ):
+    _KINDS.add('scaled')(_Constant)
+
+
 def test_valid_data_gives_the_model_and_stays_unchanged():
   data = {
       **_register(scale=2),

@@ -313,6 +313,14 @@ def test_other_slots_are_named():
     snapshot.contents_for(_header(slots={'a': 0, 'b': 2, 'c': 3}))
 
 
+@pytest.mark.parametrize('given', ['x', b'x', None])
+def test_only_a_snapshot_can_be_restored(given: Any):
+  batch = suite.load_batch('unlock_door', 'near', num_envs=2)
+  for env in (_REWARD.load(), batch):
+    with pytest.raises(errors.StateLayoutError, match='allowed is a Snapshot'):
+      env.restore(given)
+
+
 def test_foreign_tasks_cannot_be_saved_or_restored():
   env = suite.embed(helpers.PointTask(), 'none', random=7)
   env.reset()

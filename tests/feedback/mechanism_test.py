@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite.engine import environment
 from realab_suite.entities import registers
+from realab_suite.feedback import mechanisms
+from realab_suite.feedback import specs
 from tests import worlds
 from tests.engine import helpers
 from tests.feedback import scripted
@@ -388,3 +391,17 @@ def test_reading_registers_does_not_change_the_world(made: scripted.Worlds):
     assert helpers.to_bytes(looked) == helpers.to_bytes(twin.step(action))
     assert worlds.state_bytes(env.physics) == worlds.state_bytes(twin.physics)
   twin.close()
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'named'),
+    [
+        (['instantaneous_reward'], 'design: .*specs.load'),
+        ([None], 'design: None'),
+        ([specs.load('instantaneous_reward'), {}], 'num_substeps: {}'),
+        ([specs.load('instantaneous_reward'), 0], 'num_substeps: 0'),
+    ],
+)
+def test_arguments_of_other_types_are_refused(arguments: Any, named: str):
+  with pytest.raises(errors.SpecError, match=named):
+    mechanisms.FeedbackMechanism(*arguments)

@@ -13,6 +13,7 @@ from realab_suite.engine import environment
 from realab_suite.entities import arenas
 from realab_suite.tasks import apple_rooms
 from realab_suite.tasks import collect_apples
+from realab_suite.tasks import registry
 from realab_suite.tasks import rooms
 from realab_suite.tasks import unlock_door
 from tests.engine import helpers
@@ -298,6 +299,27 @@ def test_a_task_needs_a_version_of_its_dynamics(version: Any):
       stay(arenas.OpenRoom())
   versioned: Any = type('Stay', (unversioned,), {'DYNAMICS_VERSION': 1})
   assert versioned(arenas.OpenRoom()).physics_timestep == 0.025
+
+
+@pytest.mark.parametrize(
+    'fault',
+    [
+        {'SOLVER': unlock_door.UnlockDoor},
+        {'SABOTEURS': 'pushing_saboteur'},
+        {'SABOTEURS': (1,)},
+        {'ACTION_SET': 'dmlab_like'},
+    ],
+)
+def test_attributes_of_a_task_have_the_types_that_they_need(fault: Any):
+  odd: Any = type('Odd', (collect_apples.CollectApples,), fault)
+  [name] = fault
+  with pytest.raises(errors.SpecError, match=rf'Odd\.{name}: .*allowed'):
+    odd('near')
+
+
+def test_a_second_task_of_the_same_name_is_refused_with_a_hint():
+  with pytest.raises(errors.SpecError, match=r'unlock_door\.near .*notebook'):
+    registry.register_task('unlock_door', 'near')(unlock_door.UnlockDoor)
 
 
 def test_an_unknown_variation_is_refused_with_the_known_ones():
