@@ -55,6 +55,7 @@ def test_a_stake_that_is_degenerate_is_printed_as_such():
     [
         (('--design=none',), "design 'none' has no stake: the design has no"),
         (('--target=reward',), "Unknown command line flag 'target'"),
+        (('--senses=camera',), "Unknown command line flag 'senses'"),
         (('--design=nothing',), 'nothing'),
         (('--task=nowhere',), 'nowhere'),
     ],
