@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import block_kinds
 from realab_suite.entities import crates
@@ -97,7 +98,19 @@ class RoomTask(base.Task):
       crate: The crate.
       position: Centre of the region of its start positions, `(x, y)`, in m.
       spread: Half-widths of that region, `(x, y)`, in m.
+
+    Raises:
+      SpecError: If a part of the crate may be outside every room.
     """
+    extent, half = self._arena.extent, crate.block.half_size
+    for sign in (-1.0, 1.0):
+      corner = np.array(position) + sign * np.array(spread)
+      if not extent.contains(corner, half):
+        raise errors.SpecError(
+            f'crate {crate.mjcf_model.model!r}: position {tuple(position)} and'
+            f' spread {tuple(spread)}; allowed are places at least {half:g} m'
+            f' from the sides of {extent}'
+        )
     crate.attach_to(self._arena, position, spread)
     self._arena.offer({crate.mjcf_model.model: crate.place})
     self._avatar.make_graspable([crate.block])

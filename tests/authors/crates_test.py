@@ -287,3 +287,17 @@ def test_crates_are_as_large_and_heavy_as_blocks(
 ):
   with pytest.raises(errors.SpecError, match=f"crate 'box': {complaint}"):
     crates.Crate('box', **fields)
+
+
+@pytest.mark.parametrize(
+    ('position', 'spread'),
+    [
+        ((9.0, 0.0), (0.0, 0.0)),
+        ((0.0, -3.9), (0.0, 0.0)),
+        ((3.0, 0.0), (2.0, 0.0)),
+    ],
+)
+def test_a_crate_outside_of_the_rooms_is_refused(position: Any, spread: Any):
+  yard = Yard()
+  with pytest.raises(errors.SpecError, match=r"crate 'far': pos.*allowed"):
+    yard.add_crate(crates.Crate('far'), position, spread)
