@@ -105,7 +105,7 @@ class RoomTask(base.Task):
     extent, half = self._arena.extent, crate.block.half_size
     for sign in (-1.0, 1.0):
       corner = np.array(position) + sign * np.array(spread)
-      if not extent.contains(corner, half):
+      if not extent.contains(corner.tolist(), half):
         raise errors.SpecError(
             f'crate {crate.mjcf_model.model!r}: position {tuple(position)} and'
             f' spread {tuple(spread)}; allowed are places at least {half:g} m'

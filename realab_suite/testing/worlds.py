@@ -34,46 +34,48 @@ def check_world(
   """Checks that a task keeps the contract of tasks.
 
   - Its members have the types and shapes that `tasks.base.Task` demands.
+  - Its solver earns more than random actions, and neither earns more than
+    `max_true_return`. A second call of `latch_events` pays nothing.
   - Observations match their spec, the reward is always 0.0, and the true
     rewards sum to the score, which is at most `max_true_return`.
   - An episode depends on the seed, its number and the actions, and on nothing
     that happened before: a world that was reset, restored from a snapshot, or
-    is part of a batch, continues bit for bit like the first one.
-  - Its solver earns more than random actions, and neither earns more than
-    `max_true_return`. A second call of `latch_events` pays nothing.
+    is part of a batch, continues bit for bit like the first one, with the same
+    facts and measurements. One of its worlds takes the actions of the solver.
 
   Args:
     make: Returns a new task, such as its class.
     design: Name of a design of this package, path of a design file, mapping, or
       spec, for example one with coordinates instead of stations.
-    max_steps: Length of the solver's episodes, in control steps.
-    num_steps: Length of the episodes with random actions.
+    max_steps: Length of episodes, in control steps.
+    num_steps: Length of episodes of a task without a solver.
 
   Raises:
     ContractError: If it does not, with the first part that it breaks.
     SpecError: If the design does not fit the task.
   """
 
-  def load(world: int = 0, steps: int = num_steps) -> environment.Environment:
+  def load(steps: int, world: int = 0) -> environment.Environment:
     return suite.embed(
         make(), design, random=_SEED, world=world, max_steps=steps
     )
 
+  with contextlib.closing(load(max_steps)) as env:
+    _check_members(env)
+    _check_hooks(env)
+    taken = _check_solver(env)
+    plans = [_actions(env, world) for world in range(_NUM_ENVS)]
+    plans[0][: len(taken)] = taken
+  steps = max_steps if len(taken) else min(num_steps, max_steps)
   alone = []
   for world in range(_NUM_ENVS):
-    with contextlib.closing(load(world)) as env:
-      if not world:
-        _check_members(env)
-        _check_hooks(env)
-        env.rewind()
-      alone.append(_episodes(env, world))
+    with contextlib.closing(load(steps, world)) as env:
+      alone.append(_episodes(env, plans[world]))
       if not world:
         _check_rewards(env, alone[0])
-        _check_continuations(env, alone[0])
-  with contextlib.closing(load()) as env:
-    _check_batch(env, alone)
-  with contextlib.closing(load(steps=max_steps)) as env:
-    _check_solver(env)
+        _check_continuations(env, alone[0], plans[0])
+  with contextlib.closing(load(steps)) as env:
+    _check_batch(env, alone, np.stack(plans, axis=1)[:steps])
 
 
 @final
@@ -81,8 +83,8 @@ class _Moment(NamedTuple):
   """Result of a control step.
 
   Attributes:
-    arrays: Observation of the agent, type and discount of the step, and true
-      reward.
+    arrays: Observation of the agent, type and discount of the step, true
+      reward, facts and measurements.
     reward: The constant reward, or `None` in the first step.
   """
 
@@ -111,6 +113,25 @@ class _TrueRewards(events.EventSink):
 
   def set_state(self, state: Any) -> None:
     self.latest = float(state)
+
+
+@final
+class _FirstActions(events.EventSink):
+  """Sink that keeps the actions of the first episode."""
+
+  def __init__(self) -> None:
+    self.actions: list[np.ndarray] = []
+    self._num_episodes = 0
+
+  def episode_started(self, start: events.Start, physics: Any) -> None:
+    self._num_episodes += 1
+
+  def step_ended(self, step: events.Step, physics: Any) -> None:
+    if self._num_episodes == 1:
+      self.actions.append(step.action)
+
+  def episode_ended(self, end: events.End) -> None:
+    """The actions stay."""
 
 
 @final
@@ -171,14 +192,7 @@ def _check_members(env: environment.Environment) -> None:
       ' finite number',
   )
   env.reset()
-  for kind in ('facts', 'measurements'):
-    for key, function in getattr(task, kind).items():
-      value = np.asarray(function(env.physics))
-      contracts.require(
-          value.shape == () and np.isfinite(value),
-          f'{name}.{kind}[{key!r}] returned {value!r:.80}; it has to return a'
-          ' finite number for each world',
-      )
+  _figures(task, env.physics, ())
 
 
 def _check_hooks(env: environment.Environment) -> None:
@@ -208,13 +222,32 @@ def _actions(env: Any, world: int) -> np.ndarray:
   return random_state.uniform(spec.minimum, spec.maximum, shape)
 
 
-def _episodes(env: environment.Environment, world: int) -> list[list[_Moment]]:
+def _figures(
+    task: base.Task, physics: Any, shape: tuple[int, ...]
+) -> dict[str, np.ndarray]:
+  """Returns facts and measurements, each of shape `(...)`."""
+  figures = {}
+  for kind in ('facts', 'measurements'):
+    for key, function in getattr(task, kind).items():
+      value = np.array(function(physics))
+      name = f'{kind}[{key!r}]'
+      contracts.require(
+          value.shape == shape and np.all(np.isfinite(value)),
+          f'{type(task).__name__}.{name} returned {value!r:.80}; it has to'
+          f' return finite numbers of shape {shape}',
+      )
+      figures[name] = value
+  return figures
+
+
+def _episodes(
+    env: environment.Environment, actions: np.ndarray
+) -> list[list[_Moment]]:
   """Returns the moments of the next episodes of one world."""
   sink = _TrueRewards()
   env.add_sink(sink)
   episodes = [
-      [*_moments(env, sink, env.reset(), _actions(env, world))]
-      for _ in range(_NUM_EPISODES)
+      [*_moments(env, sink, env.reset(), actions)] for _ in range(_NUM_EPISODES)
   ]
   env.remove_sink(sink)
   return episodes
@@ -227,15 +260,17 @@ def _moments(
     actions: np.ndarray,
 ) -> Iterator[_Moment]:
   """Yields the moments of an episode, from a time step on."""
-  yield _moment(time_step, sink)
+  yield _moment(env, time_step, sink)
   for action in actions:
     if time_step.last():
       return
     time_step = env.step(action)
-    yield _moment(time_step, sink)
+    yield _moment(env, time_step, sink)
 
 
-def _moment(time_step: dm_env.TimeStep, sink: _TrueRewards) -> _Moment:
+def _moment(
+    env: environment.Environment, time_step: dm_env.TimeStep, sink: _TrueRewards
+) -> _Moment:
   return _Moment(
       {
           'step_type': np.asarray(int(time_step.step_type)),
@@ -244,6 +279,7 @@ def _moment(time_step: dm_env.TimeStep, sink: _TrueRewards) -> _Moment:
           ),
           'true_reward': np.asarray(sink.latest),
           **time_step.observation,
+          **_figures(env.task, env.physics, ()),
       },
       time_step.reward,
   )
@@ -282,32 +318,32 @@ def _check_rewards(
 
 
 def _check_continuations(
-    env: environment.Environment, episodes: list[list[_Moment]]
+    env: environment.Environment,
+    episodes: list[list[_Moment]],
+    actions: np.ndarray,
 ) -> None:
   """Checks that episodes depend on nothing that happened before."""
   name = type(env.task).__name__
-  actions = _actions(env, 0)
   half = (len(episodes[0]) - 1) // 2
   sink = _TrueRewards()
   env.add_sink(sink)
   env.rewind(1)
-  _compare(
-      [*_moments(env, sink, env.reset(), actions)],
-      episodes[1],
+  breach = (
       f'{name}: an episode depends on earlier ones; keep what it changes in'
-      ' the physics, for example in a state.Slot',
+      ' the physics, for example in a state.Slot'
   )
+  _compare([*_moments(env, sink, env.reset(), actions)], episodes[1], breach)
   env.rewind(0)
   moments = _moments(env, sink, env.reset(), actions)
-  for _ in range(half + 1):
-    next(moments)
+  again = [next(moments) for _ in range(half + 1)]
+  _compare(again, episodes[0][: half + 1], breach)
   snapshot = env.save()
   [*_] = moments
   env.reset()
   env.restore(snapshot)
   found = []
   for action in actions[half:]:
-    found.append(_moment(env.step(action), sink))
+    found.append(_moment(env, env.step(action), sink))
     if found[-1].arrays['step_type'] == dm_env.StepType.LAST:
       break
   _compare(
@@ -320,7 +356,9 @@ def _check_continuations(
 
 
 def _check_batch(
-    env: environment.Environment, alone: list[list[list[_Moment]]]
+    env: environment.Environment,
+    alone: list[list[list[_Moment]]],
+    actions: np.ndarray,
 ) -> None:
   """Checks that worlds of a batch equal single worlds."""
   name = type(env.task).__name__
@@ -329,11 +367,9 @@ def _check_batch(
       batch_environment.BatchEnvironment(env, _NUM_ENVS, 1)
   ) as batch:
     batch.add_sink(sink)
-    actions = np.stack(
-        [_actions(env, world) for world in range(_NUM_ENVS)], axis=1
-    )
     time_step = batch.reset()
     for number in range(len(actions)):
+      figures = _figures(env.task, batch.physics, (_NUM_ENVS,))
       for world, episodes in enumerate(alone):
         if number < len(episodes[0]):
           found = {
@@ -341,7 +377,7 @@ def _check_batch(
               'discount': np.asarray(time_step.discount[world]),
               'true_reward': np.asarray(float(sink.latest[world])),
           }
-          for key, value in time_step.observation.items():
+          for key, value in {**time_step.observation, **figures}.items():
             found[key] = value[world]
           contracts.require_same(
               found,
@@ -364,17 +400,25 @@ def _compare(
     contracts.require_same(one.arrays, other.arrays, breach)
 
 
-def _check_solver(env: environment.Environment) -> None:
-  """Checks that the solver earns more than random actions."""
+def _check_solver(env: environment.Environment) -> np.ndarray:
+  """Checks that the solver earns more than random actions.
+
+  Returns:
+    The actions of its first episode, `(steps, *action_spec.shape)`, without
+    steps if there is no solver.
+  """
   task: base.Task = env.task
   if task.SOLVER is None or not task.max_true_return:
-    return
-  returns = []
-  again = _LatchAgain(task)
+    return _actions(env, 0)[:0]
+  returns: list[float] = []
+  taken = _FirstActions()
   for name in (task.SOLVER, stakes.RANDOM):
     env.rewind()
     rows = evaluate.evaluate(
-        env, policies.make(name), _NUM_EPISODES, sinks=[again]
+        env,
+        policies.make(name),
+        _NUM_EPISODES,
+        sinks=[_LatchAgain(task)] if returns else [_LatchAgain(task), taken],
     )
     returns.append(float(np.mean([row.true_return for row in rows])))
     largest = max(row.true_return for row in rows)
@@ -388,3 +432,4 @@ def _check_solver(env: environment.Environment) -> None:
       f'{type(task).__name__}.SOLVER: {task.SOLVER!r} earns {returns[0]:.3g}'
       f' per episode, and random actions {returns[1]:.3g}',
   )
+  return np.array(taken.actions)

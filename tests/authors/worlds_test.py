@@ -104,6 +104,18 @@ def _pays_again(self: Any, physics: Any) -> None:
   self.earn(physics, 0.01 * np.ones_like(self.score(physics)))
 
 
+def _sum_of_positions(self: Any) -> Any:
+  return {'place': lambda physics: np.sum(self.avatar.position(physics))}
+
+
+def _number_of_calls(self: Any) -> Any:
+  def measure(physics: Any) -> Any:
+    self.count += 1
+    return self.score(physics) * 0 + self.count
+
+  return {**super(_Plain, self).measurements, 'calls': measure}
+
+
 _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'a discount of more than 1': (
         {
@@ -137,6 +149,13 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
         {'facts': {'two': lambda unused_physics: np.zeros(2)}},
         "facts['two'] returned",
     ),
+    'a measurement of one world': (
+        {'measurements': property(_sum_of_positions)},
+        "measurements['place'] returned",
+    ),
+    'a measurement in Python': (
+        {'measurements': property(_number_of_calls)}, 'depends on earlier ones',
+    ),
 }  # fmt: skip
 
 
@@ -152,6 +171,27 @@ def test_a_breach_of_the_contract_is_named(breach: str):
     testing.check_world(broken, max_steps=20, num_steps=20)
   assert message in str(raised.value)
   assert str(raised.value).startswith('Broken')
+
+
+class Gourmet(collect_apples.CollectApples):
+  """Remembers only in Python that three apples were eaten."""
+
+  is_sated = False
+
+  @property
+  def facts(self) -> Any:
+    return {'sated': self._sated}
+
+  def _sated(self, physics: Any) -> Any:
+    self.is_sated |= bool(np.any(self.score(physics) > 2))
+    return np.full_like(self.score(physics), self.is_sated)
+
+
+def test_a_breach_that_only_the_solver_reaches_is_named():
+  with pytest.raises(testing.ContractError, match=r'^Gourmet: an episode dep'):
+    testing.check_world(Gourmet, max_steps=60)
+  Gourmet.SOLVER = None
+  testing.check_world(Gourmet, max_steps=60, num_steps=20)
 
 
 # The rest of the package.
