@@ -231,18 +231,19 @@ def measure(
   twin = specs.load(design, ['channel=secure'])
   queries = design.objective.queries
 
-  def play(
-      load: LoadBatch, played: specs.DesignSpec, name: str
-  ) -> list[evaluate.EpisodeResult]:
+  def play(load: LoadBatch, played: specs.DesignSpec) -> Played:
+    results = []
     with contextlib.closing(load(played, NUM_EPISODES, SEED)) as batch:
-      actor = batch_actors.BatchPolicyActor(
-          policies.make(name), batch, SEED, queries=queries
-      )
-      return evaluate.evaluate_batch(batch, actor)
+      for name in (solver, RANDOM, AT_REST):
+        actor = batch_actors.BatchPolicyActor(
+            policies.make(name), batch, SEED, queries=queries
+        )
+        results.append(evaluate.evaluate_batch(batch, actor))
+        batch.rewind()
+    return Played(*results)
 
-  names = solver, RANDOM, AT_REST
-  reference = Played(*(play(load_reference, twin, name) for name in names))
-  judged = Played(*(play(load_judged, design, name) for name in names))
+  reference = play(load_reference, twin)
+  judged = play(load_judged, design)
   return of_results(reference, judged, key)
 
 

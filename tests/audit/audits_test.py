@@ -12,18 +12,19 @@ from realab_suite.audit import findings
 from realab_suite.audit import searches
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import hacking
-from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.feedback import specs
 from realab_suite.tasks import unlock_door
 from tests.audit import designs
+from tests.experiments import small
 
 _FIGURES = ('relative_gain', 'observed_return', 'true_return')
 
 
 @pytest.fixture(autouse=True)
-def fixture_quick_stakes(monkeypatch):
-  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
+def fixture_quick_stakes():
+  with small.quick_stakes():
+    yield
 
 
 def _auditor(
@@ -112,8 +113,9 @@ def test_ending_the_episode_by_a_switch_is_counted_by_itself():
   assert 'Ended by a corrupted signal alone' in findings.words(found, '')
 
 
-@pytest.mark.parametrize('index', [0, 1])
-@pytest.mark.parametrize('kind', ['three_blocks', 'three_silent_blocks'])
+@pytest.mark.parametrize(
+    ('index', 'kind'), [(0, 'three_blocks'), (1, 'three_silent_blocks')]
+)
 def test_blocks_of_a_kind_with_three_are_attacked(index, kind, monkeypatch):
   real = aiming.targets
 

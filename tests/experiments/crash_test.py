@@ -61,7 +61,7 @@ def test_no_acknowledged_row_is_lost(nursery, killer, tmp_path):
   rows = killer.rows(3)
   found = [
       crashes.kill_writer(nursery, tmp_path, rows, number, way)
-      for number in (1, 3, 4, 6)
+      for number in (3, 6)
       for way in crashes.WAYS
   ]
   assert any(acknowledged for acknowledged, _ in found)

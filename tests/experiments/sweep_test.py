@@ -20,6 +20,7 @@ from realab_suite.experiments import training
 from realab_suite.launchers import sweep
 from realab_suite.launchers import train
 from tests import patience
+from tests.experiments import fake_sweep
 from tests.launchers import in_process
 
 _ROOT = pathlib.Path(__file__).parents[2]
@@ -354,13 +355,23 @@ def test_a_wrong_command_is_refused_in_one_line(
   assert not list(tmp_path.iterdir())
 
 
+_ONE_EPISODE = {
+    **fake_sweep.EXPERIMENT,
+    'max_steps': 5,
+    'runs': {'reward': {'design': 'instantaneous_reward'}},
+    'baselines': ['random'],
+    'seeds': [0],
+    'evaluation': {'episodes': 1},
+}
+
+
 def test_a_scripted_job_does_not_import_jax(tmp_path):
   program = (
       'import sys\n'
       'from realab_suite.experiments import scheduler, training, jobs\n'
       'from realab_suite.experiments import experiment_specs\n'
       'import pathlib\n'
-      'experiment = experiment_specs.load("quick")\n'
+      f'experiment = experiment_specs.load({_ONE_EPISODE})\n'
       '[job] = jobs.plan(experiment, only=["reward.random"])\n'
       f'training.run(job, pathlib.Path({str(tmp_path)!r}),'
       ' training.Options(print))\n'

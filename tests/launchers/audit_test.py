@@ -6,14 +6,15 @@ import shlex
 import pytest
 
 from realab_suite.audit import findings
-from realab_suite.evaluation import stakes
 from realab_suite.launchers import audit
+from tests.experiments import small
 from tests.launchers import in_process
 
 
 @pytest.fixture(autouse=True)
-def fixture_quick_stakes(monkeypatch):
-  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
+def fixture_quick_stakes():
+  with small.quick_stakes():
+    yield
 
 
 def _run(*arguments):
