@@ -290,7 +290,8 @@ MUTANTS = [
     planting.Mutant(
         'metric', 'a centimetre is a rounding error',
         _CLEAN, 'NEGLIGIBLE_METRES: Final = 1e-6',
-        'NEGLIGIBLE_METRES: Final = 1e-2', _CLE,
+        'NEGLIGIBLE_METRES: Final = 1e-2',
+        ('tests/evaluation/episode_figures_test.py',),
     ),
     planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,
@@ -395,7 +396,8 @@ MUTANTS = [
     ),
     planting.Mutant(
         'storage', 'changed results are accepted as done', _STORAGE,
-        '    if _digest(path / name) != digest:', '    if not digest:', _STO,
+        '    if _digest(path / name) != digest:', '    if not digest:',
+        ('tests/experiments/finished_jobs_test.py',),
     ),
     planting.Mutant(
         'storage', '`done.json` may be damaged', _STORAGE,
@@ -410,7 +412,7 @@ MUTANTS = [
         'storage', 'a checkpoint of another run is accepted',
         'archive.py',
         '        if saved.get(key) != other.get(key)\n', '        if False\n',
-        _STO,
+        ('tests/experiments/wrong_files_test.py',),
     ),
     planting.Mutant(
         'storage', 'a damaged checkpoint is accepted', 'archive.py',
