@@ -23,13 +23,8 @@ from campaigns import figure_lines
 
 _ROOT = pathlib.Path(__file__).parents[1]
 TESTS = (
-    'tests/entities/register_contract_test.py',
-    'tests/entities/register_use_test.py',
-    'tests/entities/two_block_register_test.py',
-    'tests/entities/axes_test.py',
-    'tests/entities/meters_test.py',
-    'tests/entities/moving_test.py',
-    'tests/entities/foreign_task_test.py',
+    'tests/entities',
+    'tests/authors',
     'tests/config',
     'tests/policies',
     'tests/feedback',
@@ -42,9 +37,11 @@ TESTS = (
     'tests/evaluation/episodes_by_hand_test.py',
     'tests/evaluation/independence_test.py',
     'tests/evaluation/results_test.py',
+    'tests/experiments/damaged_files_test.py',
     'tests/experiments/finished_jobs_test.py',
     'tests/experiments/storage_test.py',
     'tests/experiments/training_test.py',
+    'tests/experiments/wrong_files_test.py',
     'tests/engine/snapshot_test.py',
     'tests/engine/batch_snapshot_test.py',
     'tests/engine/batch_environment_test.py',
