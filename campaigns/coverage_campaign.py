@@ -39,12 +39,18 @@ TESTS = (
     'tests/evaluation/results_test.py',
     'tests/experiments/damaged_files_test.py',
     'tests/experiments/finished_jobs_test.py',
+    'tests/experiments/packing_test.py',
     'tests/experiments/storage_test.py',
     'tests/experiments/training_test.py',
     'tests/experiments/wrong_files_test.py',
     'tests/engine/snapshot_test.py',
     'tests/engine/batch_snapshot_test.py',
     'tests/engine/batch_environment_test.py',
+    'tests/engine/foreign_feedback_test.py',
+    'tests/engine/many_registers_test.py',
+    'tests/engine/placement_test.py',
+    'tests/engine/signals_test.py',
+    'tests/engine/substeps_test.py',
 )
 # Counting lines is several times slower, and this test has a limit.
 _TIMED = (

@@ -53,7 +53,7 @@ def jpeg(frame: np.ndarray) -> bytes:
   return file.getvalue()
 
 
-def first_person(env: Any, height: int = 360, width: int = 480) -> View:
+def first_person(env: Any, height: int = 480, width: int = 640) -> View:
   """Returns the view of the avatar."""
   camera = env.task.avatar.camera.full_identifier
   return View(env, camera, height, width)

@@ -26,13 +26,14 @@ def needed():
 
 
 @contextlib.contextmanager
-def page(width=1040, height=720, offline=False):
+def page(width=1040, height=720, offline=False, has_touch=False):
   """Yields a page, and a list of the addresses that it has requested.
 
   Args:
     width: Width of the window, in pixels.
     height: Height of the window, in pixels.
     offline: True for a browser without a network.
+    has_touch: True for a screen that is touched, such as that of a phone.
   """
   from playwright import sync_api
 
@@ -42,7 +43,10 @@ def page(width=1040, height=720, offline=False):
     )
     try:
       one = browser.new_page(
-          viewport={'width': width, 'height': height}, offline=offline
+          viewport={'width': width, 'height': height},
+          offline=offline,
+          has_touch=has_touch,
+          is_mobile=has_touch,
       )
       one.set_default_timeout(1000 * patience.SECONDS)
       problems, requests = [], []

@@ -16,11 +16,13 @@ import pytest
 
 from realab_suite import policies
 from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.evaluation import evaluate
 from realab_suite.experiments import supervised_designs
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
 from tests import patience
+from tests.experiments import small
 from tests.interop.browser import chromium
 
 pytestmark = [
@@ -33,6 +35,8 @@ pytestmark = [
 @pytest.fixture(autouse=True)
 def fixture_chromium():
   chromium.needed()
+  with small.quick_stakes():
+    yield
 
 
 def _save(page, name):
@@ -103,22 +107,16 @@ def _step(page):
   return int(words[1]) if words else -1
 
 
-def _settings(**changes):
+def _settings(max_steps=60, rate=20.0, output=None):
   from realab_suite.experiments import played
 
   return played.Settings(
-      **{
-          'domain': 'unlock_door',
-          'task': 'near',
-          'design': specs.load('instantaneous_reward'),
-          'seed': 1,
-          'num_episodes': 1,
-          'max_steps': 60,
-          'rate': 20.0,
-          'task_kwargs': {},
-          'output': None,
-          **changes,
-      }
+      worlds.World('unlock_door', 'near', max_steps),
+      specs.load('instantaneous_reward'),
+      seed=1,
+      num_episodes=1,
+      rate=rate,
+      output=output,
   )
 
 
@@ -138,7 +136,7 @@ def test_a_person_plays_and_gets_the_summary_of_any_agent(tmp_path):
     page.wait_for_selector('text=Press any key')
     page.keyboard.press('Enter')
     page.keyboard.down('KeyW')
-    page.wait_for_selector('text=forward')
+    page.wait_for_selector('#clock:has-text("forward")')
     page.keyboard.down('KeyD')
     page.wait_for_selector('#summary:not([hidden])')
     _save(page, 'play_summary')
@@ -151,6 +149,34 @@ def test_a_person_plays_and_gets_the_summary_of_any_agent(tmp_path):
   }
   rate = float(said[-1].split('acted in ')[1].split(' ')[0])
   assert rate >= 10.0
+
+
+@pytest.mark.parametrize('width', [360, 768, 1280])
+def test_a_person_without_a_keyboard_plays_by_touch(width):
+  from realab_suite.experiments import played
+  from realab_suite.interop.browser import servers
+
+  settings = _settings(max_steps=20, rate=3.0)
+  with (
+      concurrent.futures.ThreadPoolExecutor() as pool,
+      servers.PageServer('play') as server,
+      chromium.page(width, 800, has_touch=True) as (page, _),
+  ):
+    playing = pool.submit(played.play, settings, server, lambda text: None)
+    page.goto(server.url)
+    page.tap('text=Press any key')
+    for code, action in (('KeyW', 'forward'), ('KeyG', 'grasp')):
+      page.tap(f'[data-code={code}]')
+      page.wait_for_selector(f'#clock:has-text("{action}")')
+    page.tap('[data-code=KeyP]')
+    page.wait_for_selector('text=Paused')
+    page.evaluate("document.getElementById('cover').hidden = true")
+    _save(page, f'play_{width}')
+    is_wide = 'document.documentElement.scrollWidth > innerWidth'
+    assert not page.evaluate(is_wide)
+    page.evaluate("document.getElementById('cover').hidden = false")
+    page.tap('#cover')
+    playing.result()
 
 
 def test_the_page_tells_both_returns_apart_while_a_block_is_displaced(
