@@ -187,7 +187,7 @@ def test_the_page_tells_both_returns_apart_while_a_block_is_displaced(
   from realab_suite.interop.browser import servers
 
   saboteur = policies.make('carrying_saboteur')
-  monkeypatch.setattr(keyboards, 'Keyboard', lambda take: saboteur)
+  monkeypatch.setattr(keyboards, 'Keyboard', lambda *unused: saboteur)
   settings = _settings(max_steps=40, rate=5.0)
   with (
       concurrent.futures.ThreadPoolExecutor() as pool,
