@@ -266,7 +266,10 @@ class Surroundings:
       displacement: Displacement in the frame of the register, `(2,)`, in m.
     """
     along, aside = displacement
-    self._rest = self._home + np.array([along, aside, 0.0])
+    rest = self._home + np.array([along, aside, 0.0])
+    if np.array_equal(rest, self._rest):
+      return
+    self._rest = rest
     low, high = self._limits
     self._reach = low + along, high + along
     self._model = None
