@@ -147,7 +147,10 @@ def of_learner(learner: Any) -> tuple[ObjectiveSpec | None, str]:
   declared = options.pop('objective', None)
   if learner.kind not in OBJECTIVES:
     if declared is None:
-      return None, f'learner {learner.kind!r} declares no objective'
+      return None, (
+          f'learner {learner.kind!r} declares no objective ("An objective" in'
+          ' docs/your_own.md)'
+      )
     where = 'learner.objective'
   elif declared is not None:
     raise ValueError(

@@ -59,12 +59,17 @@ def test_the_learner_determines_the_registers(learner, registers, discount):
   assert gains.consumed(design) == tuple(registers)
 
 
+_UNDECLARED = (
+    'learner \'own\' declares no objective ("An objective" in docs/your_own.md)'
+)
+
+
 @pytest.mark.parametrize(
     ('learner', 'why'),
     [
         ('null', 'the design has no learner'),
-        ('{kind: own}', "learner 'own' declares no objective"),
-        ('{kind: own, reward: decoy}', "learner 'own' declares no objective"),
+        ('{kind: own}', _UNDECLARED),
+        ('{kind: own, reward: decoy}', _UNDECLARED),
         ('{kind: own, objective: {kind: agreement, registers: {reward: 1}}}',
          'an agreement needs actions with indices: an action_set'),
     ],
