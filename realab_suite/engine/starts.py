@@ -103,8 +103,10 @@ class StartCheck:
       EpisodeInitializationError: If something is inside a register. The next
         attempt may draw other positions.
     """
+    if not self._registers or not (self._parts or self._bodies):
+      return
     moved = [part for part in self._parts if part.has_moved(physics)]
-    if not self._registers or not (moved or self._bodies):
+    if not (moved or self._bodies):
       return
     if self._space is None:
       self._space = solids.Space(self._model)
@@ -176,9 +178,11 @@ class _Part:
   def has_moved(self, physics: Any) -> bool:
     """Returns True if the part is not where the compiled model has it."""
     bound = physics.bind(self._frame)
-    shifted = bound.mocap_pos != self._position
-    turned = bound.mocap_quat != self._quaternion
-    return bool(np.count_nonzero(shifted) or np.count_nonzero(turned))
+    # A comparison of bytes takes a fifth of the time of one of arrays.
+    return (
+        bound.mocap_pos.tobytes() != self._position.tobytes()
+        or bound.mocap_quat.tobytes() != self._quaternion.tobytes()
+    )
 
   def solids(self, physics: Any, space: solids.Space) -> list[solids.Solid]:
     """Returns the geoms in their present poses."""

@@ -417,7 +417,8 @@ class Register(composer.Entity):
       displacement: Displacement of the register from its current position, in
         its own frame, `(2,)`, in m.
       is_initialized: False if the task has not initialized an episode, so that
-        functions of the task have no value yet.
+        functions of the task have no value yet; what the kind reads is checked
+        then, and by each later `inspect`.
 
     Raises:
       SpecError: If the register reads anything but values of its spec.
@@ -435,7 +436,8 @@ class Register(composer.Entity):
           self._measure_initial, physics, origin.shape[:-1]
       )
     self.pose(physics, np.full(shape, initial))
-    self.inspect(physics)  # Refuses wrong readings before an episode begins.
+    if not is_initialized:
+      self.inspect(physics)  # Refuses a wrong kind before any episode.
 
   def start_with(self, initial: Callable[[Any], np.ndarray]) -> None:
     """Sets a function that returns the value at the start of each episode.
