@@ -193,6 +193,13 @@ class Machine(stateful.RuleBasedStateMachine):
       _COUNTS['writes'] += 1
     _DICTATION.clear()
 
+  @stateful.rule(
+      value=st.sampled_from([math.nan, math.inf, -2.1, 1e300]), seed=_SEEDS
+  )
+  def write_out_of_range(self, value: float, seed: int) -> None:
+    """Writes to the register that refuses such values."""
+    self.write('strict', value, seed)
+
   @stateful.rule(action=st.sampled_from(
       [None, 'x', math.nan, [math.nan] * 7, [1e9] * 7, [0.0] * 6, [True] * 7]
   ))  # fmt: skip

@@ -12,11 +12,12 @@ from tests.reports import pages
 
 
 @pytest.fixture(autouse=True, scope='module')
-def _cached_dynamics():
-  """Builds each world once to find its dynamics."""
+def _planned_quickly():
+  """Builds each world once to find its dynamics, and measures few stakes."""
   with pytest.MonkeyPatch.context() as patch:
     patch.setattr(suite, 'dynamics', small.dynamics)
-    yield
+    with small.quick_stakes():
+      yield
 
 
 @pytest.fixture(scope='session')
