@@ -34,6 +34,7 @@ lint: .venv/dev
 
 docs: .venv/dev
 	$(INSTALL) -e '.[docs]'
+	@echo 'Building the site; this takes about a minute.'
 	$(PY) -m sphinx -j auto -W --keep-going -q -c docs/site . build/site
 	@echo 'The site is build/site/docs/site/index.html'
 

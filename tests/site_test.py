@@ -6,6 +6,7 @@ import pathlib
 import pytest
 
 from realab_suite import suite
+from realab_suite.entities import apple_group
 
 _ROOT = pathlib.Path(__file__).parents[1]
 
@@ -58,3 +59,20 @@ def test_absolute_values_in_docstrings_are_escaped(catalogue):
   lines = ['Mean of |a - b|, in m.', 'Either int | None.']
   catalogue._mark_bars(None, '', '', None, None, lines)
   assert lines == ['Mean of \\|a - b\\|, in m.', 'Either int | None.']
+
+
+def test_modules_are_listed_by_package_with_descriptions(catalogue):
+  tasks = 'realab_suite.tasks'
+  text = catalogue._index(['realab_suite.suite', tasks, f'{tasks}.base'])
+  first, second = text.split('## realab_suite.tasks\n')
+  assert '[realab_suite.suite](../../build/catalogue/api/' in first
+  assert '| Base class for tasks: a world with an avatar and a hidden' in second
+
+
+def test_the_arguments_of_an_entity_are_shown(catalogue):
+  lines = ['A group of apples.']
+  shown = catalogue._show_build(None, '', '', apple_group.Apples, None, '', '')
+  catalogue._add_arguments(None, '', '', apple_group.Apples, None, lines)
+  assert shown[0].startswith("(name: str = 'apples', number: int = 8")
+  assert '  number: Number of apples, at least 1.' in lines
+  assert catalogue._show_build(None, '', '', int, None, '', '') is None

@@ -4,14 +4,17 @@ The tables of a page come from the world or the design itself, so they belong to
 the code beside them.
 """
 
+import ast
 from collections.abc import Iterable, Sequence
 import contextlib
+import importlib.util
 import inspect
 import pathlib
 import pkgutil
 import re
 from typing import Any
 
+from dm_control import composer
 import numpy as np
 
 import realab_suite
@@ -36,7 +39,9 @@ _READERS = {
 def setup(app: Any) -> dict[str, bool]:
   """Connects the extension."""
   app.connect('builder-inited', _write_all)
+  app.connect('autodoc-process-signature', _show_build)
   # Before napoleon, which has the usual priority of 500.
+  app.connect('autodoc-process-docstring', _add_arguments, priority=300)
   app.connect('autodoc-process-docstring', _mark_code, priority=400)
   app.connect('autodoc-process-docstring', _mark_bars, priority=400)
   return {'parallel_read_safe': True}
@@ -49,21 +54,53 @@ def _write_all(app: Any) -> None:
     _write(root / 'worlds' / f'{name}.md', _world(domain, task))
   for name in suite.DESIGNS:
     _write(root / 'designs' / f'{name}.md', _design(name))
-  for name in _modules():
+  names = _modules()
+  for name in names:
     _write(root / 'api' / f'{name}.rst', _module(name))
+  _write(root / 'modules.txt', _index(names))
+
+
+def _show_build(
+    app: Any, what: str, name: str, obj: Any, options: Any, *signature: Any
+) -> tuple[str, str] | None:
+  """Shows the arguments of an entity of Composer, not `*args, **kwargs`."""
+  del app, what, name, options, signature
+  if not (inspect.isclass(obj) and issubclass(obj, composer.Entity)):
+    return None
+  shown = inspect.signature(obj._build)
+  parameters = list(shown.parameters.values())[1:]
+  return str(shown.replace(parameters=parameters, return_annotation=())), ''
+
+
+def _add_arguments(
+    app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]
+) -> None:
+  """Adds the description of the arguments of a class to its docstring."""
+  del app, what, name, options
+  if not inspect.isclass(obj):
+    return
+  own = vars(obj)
+  text = inspect.getdoc(own.get('_build') or own.get('__init__'))
+  # Classes that generate their constructors describe attributes.
+  if text and 'Args:' in text:
+    lines += ['', *text.splitlines(), '']
 
 
 def _mark_code(
     app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]
 ) -> None:
-  """Makes an indented block after a colon a literal block, as in Markdown."""
+  """Makes an indented block a literal block, as in Markdown."""
   del app, what, name, obj, options
-  for i, line in enumerate(lines[:-2]):
+  for i in reversed(range(len(lines) - 2)):
+    line, between, block = lines[i : i + 3]
     indent = len(line) - len(line.lstrip())
-    block = lines[i + 2]
-    is_block = block.strip() and block.startswith(' ' * (indent + 2))
-    if line.endswith(':') and not lines[i + 1].strip() and is_block:
-      lines[i] = f'{line}:'
+    if not line.strip() or between.strip() or not block.strip():
+      continue
+    if block.startswith(' ' * (indent + 2)):
+      if line.endswith(':'):
+        lines[i] = f'{line}:'
+      else:
+        lines[i + 1 : i + 2] = ['', f'{" " * indent}::', '']
 
 
 def _mark_bars(
@@ -225,6 +262,31 @@ def _modules() -> list[str]:
       )
   ]
   return ['realab_suite', *names]
+
+
+def _index(names: Sequence[str]) -> str:
+  """Returns tables of all modules, by package, relative to `docs/site`."""
+  packages: dict[str, list[str]] = {}
+  for name in names:
+    packages.setdefault('.'.join(name.split('.')[:2]), []).append(name)
+  alone = [name for name, modules in packages.items() if len(modules) == 1]
+  parts = [_modules_table(alone)]
+  for name, modules in packages.items():
+    if len(modules) > 1:
+      parts += [f'## {name}', _modules_table(modules)]
+  return '\n\n'.join(parts) + '\n'
+
+
+def _modules_table(names: Sequence[str]) -> str:
+  rows = []
+  for name in names:
+    # Not imported: some modules need packages of extras.
+    found = importlib.util.find_spec(name)
+    source = pathlib.Path(found.origin).read_text(encoding='utf-8')
+    text = ast.get_docstring(ast.parse(source)) or ''
+    link = f'[{name}](../../{_FOLDER}/api/{name}.rst)'
+    rows.append((link, ' '.join(text.split('\n\n')[0].split())))
+  return _table(['module', 'what it holds'], rows)
 
 
 def _module(name: str) -> str:
