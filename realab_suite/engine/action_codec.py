@@ -13,6 +13,9 @@ from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs as feedback_specs
 from realab_suite.policies import action_sets
 
+# Types of the number of an action; bool is another type than int.
+_INTEGERS = int, np.int32, np.int64
+
 
 @final
 class ActionCodec:
@@ -75,6 +78,9 @@ class ActionCodec:
     self._is_bounded = bool(np.isfinite([self._low, self._high]).all())
     self._spec = self._make_spec(np.dtype(np.int32 if is_integer else float))
     self._shape = self._spec.shape
+    # None if actions are not just the number of an action.
+    is_index = isinstance(self._spec, specs.DiscreteArray)
+    self._table_of_indices = self._table if is_index else None
     # Floats are rejected where actions are integers, instead of rounded.
     self._kinds = 'iu' if is_integer else 'iuf'
 
@@ -114,6 +120,11 @@ class ActionCodec:
       ActionError: If the dtype or the shape is wrong, or if an element is out
         of bounds or not finite.
     """
+    table = self._table_of_indices
+    if table is not None and type(action) in _INTEGERS and not batch_shape:
+      # The usual case of one world, without the time of the other checks.
+      if 0 <= action < len(table):
+        return np.zeros(0), table[action].copy()
     values = self._cast(action)
     expected = (*batch_shape, *self._shape)
     if values.shape != expected:

@@ -11,7 +11,7 @@ import abc
 from collections.abc import Callable, Collection, Mapping, Sequence
 import contextlib
 import traceback
-from typing import Any, ClassVar, NamedTuple, Protocol, final
+from typing import Any, ClassVar, NamedTuple, NoReturn, Protocol, final
 
 from dm_control import mjcf
 from dm_control.composer import observation as composer_observation
@@ -450,32 +450,35 @@ class WorldHost(Host):
       SpecError: If they do not fit the task's `sense_spec`.
     """
     sensed = self._task.senses(physics, names)
-    found = {
-        name: (getattr(value, 'shape', None), getattr(value, 'dtype', None))
-        for name, value in sensed.items()
-    }
-    expected = {name: self._expected[name] for name in names}
-    if found != expected:
-      self._refuse(sensed, found, expected)
+    expected = self._expected
+    if len(sensed) != len(names):
+      self._refuse(sensed, names)
+    for name in names:
+      value = sensed.get(name)
+      shape, dtype = expected[name]
+      if (
+          not isinstance(value, np.ndarray | np.generic)
+          or value.shape != shape
+          or value.dtype != dtype
+      ):
+        self._refuse(sensed, names)
     return sensed
 
-  def _refuse(
-      self,
-      sensed: dict[str, Any],
-      found: dict[str, Any],
-      expected: dict[str, Any],
-  ) -> None:
+  def _refuse(self, sensed: dict[str, Any], names: Collection[str]) -> NoReturn:
     """Raises a SpecError for senses that differ from `sense_spec`."""
     where = f'{type(self._task).__name__}.senses'
-    if found.keys() != expected.keys():
+    if sensed.keys() != set(names):
       raise errors.SpecError(
           f'{where}: keys {sorted(sensed)}; allowed are the selected keys of'
-          f' sense_spec, {sorted(expected)}'
+          f' sense_spec, {sorted(names)}'
       )
-    name = next(name for name in found if found[name] != expected[name])
-    shape, dtype = expected[name]
+    for name, value in sensed.items():
+      shape, dtype = self._expected[name]
+      given = getattr(value, 'shape', None), getattr(value, 'dtype', None)
+      if given != (shape, dtype):
+        break
     raise errors.SpecError(
-        f'{where}: {name!r} is {messages.quote(sensed[name])}; allowed is'
+        f'{where}: {name!r} is {messages.quote(value)}; allowed is'
         f' {dtype} of shape {shape}'
     )
 
