@@ -15,7 +15,6 @@ from realab_suite.entities import axes
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
-from realab_suite.policies import random_keys
 
 
 @final
@@ -95,9 +94,8 @@ class ControlStep:
       states: State of each provider.
       where: Worlds in which providers write; `None` for all worlds.
     """
-    step = self._mechanism.step_count(self._physics)
     feedback, self._next_states = self._mechanism.update_providers(
-        self._view, observation, random_keys.of_step(keys, step), states, where
+        self._view, observation, keys, states, where
     )
     self._records += feedback
 

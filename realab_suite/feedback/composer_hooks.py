@@ -19,7 +19,6 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.entities import views
 from realab_suite.feedback import specs
-from realab_suite.policies import random_keys
 
 # Measurement of the true return, which only the task's environment gets.
 _SCORE = 'score'
@@ -112,9 +111,8 @@ class ComposerHooks(composer.Entity):
     if now == meter_substep:
       mechanism.update_meters(view)
     if now == provider_substep:
-      keys = random_keys.of_step(self._keys, mechanism.step_count(view))
       _, self._states = mechanism.update_providers(
-          view, self._observation, keys, self._states
+          view, self._observation, self._keys, self._states
       )
     view.refresh()
 

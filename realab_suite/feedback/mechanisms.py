@@ -36,6 +36,7 @@ from realab_suite.feedback import provider_entities
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
+from realab_suite.policies import random_keys
 
 # Inside the mechanism, `ports` is the name of a property.
 _Port = ports.AnyPort
@@ -439,7 +440,7 @@ class FeedbackMechanism(composer.Entity):
       self,
       physics: protocols.Physics,
       observation: providers.Observation,
-      keys: Sequence[np.ndarray] | np.ndarray,
+      keys: np.ndarray,
       states: Sequence[Any],
       where: axes.Mask = None,
   ) -> tuple[list[records.Record], list[Any]]:
@@ -452,7 +453,8 @@ class FeedbackMechanism(composer.Entity):
     Args:
       physics: One world or a batch of worlds.
       observation: Observation that the agent's action responds to.
-      keys: Random key of each provider, `(..., 2)` uint64.
+      keys: Random key of each provider in this episode, `(providers, ..., 2)`
+        uint64.
       states: State of each provider.
       where: Worlds whose registers may be written, `(...)` bool; `None` for all
         worlds.
@@ -465,8 +467,10 @@ class FeedbackMechanism(composer.Entity):
         returns other writes than it declares, or values of a wrong shape.
       RegisterValueError: If a register cannot store a value.
     """
-    step = self._whole_steps(physics) + 1
+    before = self._whole_steps(physics)
+    step = before + 1
     is_start = np.asarray(step == 1)
+    keys_of_step = random_keys.of_step(keys, before)
     sight = self._sight(physics, observation)
     log: list[records.Record] = []
     next_states = []
@@ -484,7 +488,7 @@ class FeedbackMechanism(composer.Entity):
           {key: observation[key] for key in provider.seen},
           {read.register: read.reading for read in reads},
           is_start,
-          keys[i],
+          keys_of_step[i],
       )
       values, state = self._call(i, step, inputs, states[i], acts)
       may_write = axes.both(where, acts)
