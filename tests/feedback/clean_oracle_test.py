@@ -86,11 +86,12 @@ class _Simulation:
     seen = {f'registers/{n}': np.array(clean[n])
             for n in self._mechanism.read_by_agent}  # fmt: skip
     result = self._update(physics, observation, keys, states, where)
+    keys_of_step = random_keys.of_step(keys, np.asarray(step) - 1)
     for i, one in enumerate(self._providers):
       acts = np.asarray((step - 1) % one.every == 0)
       writes, following = one.step(
           seen, {name: np.array(clean[name]) for name in one.reads},
-          np.asarray(step == 1), keys[i], self._states[i],
+          np.asarray(step == 1), keys_of_step[i], self._states[i],
       )  # fmt: skip
       self._states[i] = _merged(acts, following, self._states[i])
       for name, write in writes.items():
