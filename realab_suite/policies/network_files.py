@@ -101,10 +101,7 @@ class Header(validation.Model):
 
   @pydantic.model_validator(mode='after')
   def _known(self) -> 'Header':
-    try:
-      self.actions()
-    except errors.UnknownNameError as error:
-      raise ValueError(str(error)) from error
+    self.actions()
     return self
 
   def actions(self) -> action_sets.ActionSet:

@@ -83,14 +83,6 @@ class Inheriting(Reader):
 
 
 @final
-class AnyFile(stubs.Idle):
-  """Accepts files as options of any name."""
-
-  def __init__(self, **files: option_types.FilePath) -> None:
-    _open(*files.values())
-
-
-@final
 class Wrapping(stubs.Idle):
   """Runs another policy."""
 
@@ -163,16 +155,10 @@ def registered() -> Iterator[None]:
     for names, name, entry in (
         (policies.POLICIES, 'test_reader', Reader),
         (policies.POLICIES, 'test_inheriting', Inheriting),
-        (policies.POLICIES, 'test_any_file', AnyFile),
         (policies.POLICIES, 'test_wrapping', Wrapping),
         (policies.POLICIES, 'test_function', read),
         (policies.POLICIES, 'test_model', ModelPolicy),
         (policies.POLICIES, 'test_partial', functools.partial(read, label='x')),
-        (
-            policies.POLICIES,
-            'test_partial_class',
-            functools.partial(Inheriting, mine=1),
-        ),
         (providers.PROVIDERS, 'test_reading', ReadingProvider),
         (register_kinds.REGISTER_KINDS, 'test_reading', ReadingRegister),
     ):

@@ -49,7 +49,7 @@ def test_a_file_is_read_and_named_in_errors(tmp_path):
   assert loading.read_mapping(str(path)) == {'a': 1}
   path.write_text('a: 1\nb: yes', encoding='utf-8')
   message = refusals.refusal(loading.read_mapping, path)
-  assert message.startswith(f'{path}:2: b: ')
+  assert message.startswith(f'{path}:2: ')
 
 
 @pytest.mark.parametrize(
@@ -73,10 +73,10 @@ def test_an_unreadable_file_is_refused(tmp_path, monkeypatch):
   path.write_text('a: 1', encoding='utf-8')
 
   # A superuser can read a file without permissions, so chmod is no use.
-  def refuse(path: str) -> int:
+  def refuse(path: str, mode: str) -> None:
     raise PermissionError(13, 'Permission denied', path)
 
-  monkeypatch.setattr(os.path, 'getsize', refuse)
+  monkeypatch.setattr('builtins.open', refuse)
   with pytest.raises(errors.SpecError, match='cannot be read: Permission'):
     loading.read_mapping(path)
 
@@ -85,14 +85,8 @@ def test_a_huge_file_is_refused_by_its_size(tmp_path):
   path = tmp_path / 'huge.yaml'
   with open(path, 'wb') as stream:
     stream.truncate(3 * 2**30)
-  with pytest.raises(errors.SpecError, match=r'file is 3072\.0 MiB, limit 1'):
+  with pytest.raises(errors.SpecError, match='larger than 1 MiB'):
     loading.read_mapping(path)
-
-
-@pytest.mark.parametrize('source', [None, 5, b'design.yaml', ['a'], object])
-def test_a_source_that_is_neither_path_nor_mapping_is_refused(source):
-  with pytest.raises(errors.SpecError, match='expected a path or a mapping'):
-    loading.read_mapping(source)
 
 
 # Mappings.
@@ -134,7 +128,6 @@ def test_values_of_a_mapping_become_plain():
         ({'a': 2**53 + 1}, 'a: integer 9007199254740993 is out of range'),
         ({'a': 10**5000}, 'a: integer <int> is out of range'),
         ({'a': {1: 2}}, 'a: keys must be strings, got 1'),
-        ({'a': {'b\nc': 2}}, 'a: keys must be one line'),
         ({'a\0': 2}, 'character U+0000 is not allowed'),
         ({'a': 'x\u202e'}, 'a: character U+202E is not allowed'),
         ({'a': '\ud800'}, 'a: character U+D800 is not allowed'),
@@ -159,16 +152,11 @@ def test_a_mapping_may_be_as_deep_as_a_file():
   assert loading.read_mapping(_nested(32)) == _nested(32)
 
 
-def test_mappings_without_end_are_refused():
+def test_a_mapping_without_end_is_refused():
   endless: dict[str, Any] = {}
   endless['a'] = endless
   with pytest.raises(errors.SpecError, match='nested deeper than 32'):
     loading.read_mapping(endless)
-  value: list[Any] = []
-  for _ in range(30):
-    value = [value, value]
-  with pytest.raises(errors.SpecError, match='more than 100000 values'):
-    loading.read_mapping({'a': value})
 
 
 # Overrides.
@@ -227,20 +215,19 @@ def test_the_last_override_wins():
     ('a..b=1', 'empty key'),
     ('a. .b=1', 'empty key'),
     ('registers.reward.scale.x=1',
-        "'registers.reward.scale' is 1.0, not a mapping or list"),
-    ('nothing.x=1', "'nothing' is None, not a mapping or list"),
+        "'x' is not in 'registers.reward.scale', which is 1.0; allowed are"),
+    ('nothing.x=1', "'x' is not in 'nothing', which is None; allowed"),
     ('providers.2.kind=x',
-        "index '2' is not one of the 2 entries of 'providers'"),
-    ('providers.-1.kind=x', "index '-1' is not one of the 2 entries"),
-    ('providers.kind=x', "index 'kind' is not one of the 2 entries"),
-    ('providers.01.kind=x', "index '01' is not one of the 2 entries"),
-    ('providers.' + '1' * 5000 + '=x', 'is not one of the 2 entries'),
+        "'2' is not in 'providers'"),
+    ('providers.-1.kind=x', "'-1' is not in 'providers'"),
+    ('providers.kind=x', "'kind' is not in 'providers'"),
+    ('providers.01.kind=x', "'01' is not in 'providers'"),
+    ('providers.' + '1' * 5000 + '=x', "is not in 'providers'"),
     ('nothing=', 'expected one value'),
     ('nothing=1\n---\n2', 'expected one value'),
     ('nothing=yes', "'yes' is ambiguous"),
     ('nothing=[', 'did not find expected node content'),
     ('noth\ting=1', 'tab is not allowed'),
-    ('nothing\n=1', 'keys must be one line'),
     ('\u202e=1', 'character U+202E is not allowed'),
     ('a.' * 5000 + 'a=1', 'nested deeper than 32'),
     ('a.b=' + '[' * 31 + ']' * 31, 'nested deeper than 32')

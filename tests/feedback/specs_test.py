@@ -219,7 +219,7 @@ def test_overrides_reach_every_depth():
 
 def test_a_wrong_override_is_refused():
   # `tests/config/overrides_test.py` has the rest.
-  with pytest.raises(errors.SpecError, match=r"^override .*index '3' is not"):
+  with pytest.raises(errors.SpecError, match=r"^override .*'3' is not"):
     specs.load('instantaneous_reward', ('providers.3.initial=1',))
 
 
