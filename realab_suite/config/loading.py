@@ -72,6 +72,15 @@ def read_mapping(
   if isinstance(source, Mapping):
     return dict(_plain(source, '<mapping>'))
   path = os.fsdecode(source)
+  return parse_yaml(read_file(path, _MAX_BYTES), path)
+
+
+def read_file(path: str, max_bytes: int) -> bytes:
+  """Returns the contents of a file of limited size.
+
+  Raises:
+    SpecError: If the file is larger or cannot be read.
+  """
   location = messages.Location(path)
   # Opening a named pipe would block, so the type is checked first.
   if not os.path.isfile(path):
@@ -79,10 +88,11 @@ def read_mapping(
     raise location.error('not a file' if exists else 'no such file')
   try:
     with open(path, 'rb') as stream:
-      content = stream.read(_MAX_BYTES + 1)
+      content = stream.read(max_bytes + 1)
   except OSError as error:
     raise location.error(f'cannot be read: {error.strerror}') from None
-  return parse_yaml(content, path)
+  _check_size(len(content), max_bytes, location)
+  return content
 
 
 def parse_yaml(text: str | bytes, where: str) -> dict[str, Any]:
@@ -209,13 +219,17 @@ def _split(override: str) -> tuple[list[str], Any]:
   return keys, documents[0]
 
 
+def _check_size(size: int, max_bytes: int, location: messages.Location) -> None:
+  if size > max_bytes:
+    raise location.error(f'larger than {max_bytes} bytes, the largest size')
+
+
 def _documents(text: str | bytes, where: str) -> list[Any]:
   """Returns the value of each document in a YAML text; there may be none."""
   location = messages.Location(where)
   try:
     content = text.encode() if isinstance(text, str) else text
-    if len(content) > _MAX_BYTES:
-      raise location.error('larger than 1 MiB, the largest size of a file')
+    _check_size(len(content), _MAX_BYTES, location)
     text = content.decode().replace('\r\n', '\n')
     for number, line in enumerate(text.split('\n'), 1):
       if not line.isprintable() and (problem := _forbidden_character(line)):

@@ -28,7 +28,7 @@ HAZARDS: dict[str, tuple[str | bytes, str]] = {
     'deep flow': ('a: ' + '[' * 1000, 'nested deeper than 32'),
     'deep block': ('\n'.join(' ' * depth + 'a:' for depth in range(40)),
         'f.yaml:33: nested deeper'),
-    'too large': ('#' * (2**20 + 1), 'larger than 1 MiB'),
+    'too large': ('#' * (2**20 + 1), 'larger than 1048576 bytes'),
     'long list': ('a: 1\nb: [' + '1,' * 1001 + ']',
         'b: more than 1000 entries'),
     'long mapping': ('\n'.join(f'k{index}: 1' for index in range(1001)),

@@ -85,7 +85,7 @@ def test_a_huge_file_is_refused_by_its_size(tmp_path):
   path = tmp_path / 'huge.yaml'
   with open(path, 'wb') as stream:
     stream.truncate(3 * 2**30)
-  with pytest.raises(errors.SpecError, match='larger than 1 MiB'):
+  with pytest.raises(errors.SpecError, match='larger than 1048576 bytes'):
     loading.read_mapping(path)
 
 
