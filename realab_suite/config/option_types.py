@@ -215,8 +215,7 @@ def _functions(
     factory: Callable[..., Any], method: str
 ) -> list[Callable[..., Any]]:
   """Returns the functions that declare options, the most derived first."""
-  # `__signature__` of a class describes the call that makes an instance.
-  if not isinstance(factory, type) or hasattr(factory, '__signature__'):
+  if not isinstance(factory, type):
     return [factory]
   return [
       vars(owner)[method] for owner in factory.__mro__ if method in vars(owner)

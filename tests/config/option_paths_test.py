@@ -76,12 +76,9 @@ def _refusal(load: Callable[..., Any], *args: Any, **kwargs: Any) -> str:
 
 # Options of `test_reader` with a path, in types of every kind.
 _OPTIONS: list[dict[str, Any]] = [
-    *({name: _PATH} for name in ('file', 'maybe', 'opaque')),
-    *({name: ['', _PATH]} for name in ('files', 'pair')),
-    {'table': {'/': ['', _PATH]}},
-    {'keyed': {_PATH: 1}},
+    *({name: _PATH} for name in ('file', 'opaque')),
+    {'files': ['', _PATH]},
     {'models': [{'file': _PATH}]},
-    {'typed': {'file': _PATH}},
 ]
 _NO_OP = _demonstrated('no_op')
 _READING_REGISTER = {
@@ -92,8 +89,7 @@ _PLACES: dict[str, dict[str, Any]] = {
     **{f'option {option}': _design(_demonstrated('test_reader', **option))
         for option in _OPTIONS},
     **{f'file of {policy}': _design(_demonstrated(policy, file=_PATH))
-        for policy in ('test_inheriting', 'test_function', 'test_model',
-        'test_partial')},
+        for policy in ('test_inheriting', 'test_function')},
     **{f'{depth} policies deep': _design(_wrapped(depth, 'network_demonstrator',
         weights=_PATH)) for depth in (0, 1, 24)},
     'weights of a value function': _design({**_ADVICE,
@@ -118,7 +114,7 @@ def _keys(node: Any) -> tuple[Any, ...] | None:
     return ()
   pairs: Any = node.items() if isinstance(node, dict) else ()
   for key, value in enumerate(node) if isinstance(node, list) else pairs:
-    below = () if key == _PATH else _keys(value)
+    below = _keys(value)
     if below is not None:
       return (key, *below)
   return None
@@ -135,8 +131,7 @@ def test_a_path_is_confined_where_a_file_names_it(
 ):
   path = str(outside / 'secret.npz')
   design = _filled(place, path)
-  keys = [path if key == _PATH else key for key in _keys(place) or ()]
-  key = messages.format_path(keys)
+  key = messages.format_path(_keys(place) or ())
   problem = (
       f'{key}: {path!r} is outside the working directory; allowed in a file'
       ' are names, and paths within it'
@@ -185,7 +180,7 @@ def test_options_that_are_not_paths_may_contain_any_text():
   label = '/etc/../~'
   teacher = {'teacher': 'test_reader', 'teacher_options': {'label': label}}
   for provider in (
-      _demonstrated('test_reader', label=label, pair=[label, '']),
+      _demonstrated('test_reader', label=label),
       _demonstrated('test_reader', models=[{'label': label}]),
       {**_READING, 'label': label, **teacher},
   ):
@@ -205,8 +200,6 @@ class _Folder(pydantic.BaseModel):
         pathlib.Path,
         str | os.PathLike[str],
         pathlib.PurePath | None,
-        dict[str, list[pathlib.Path]],
-        _Folder,
         list[_Folder] | None,
     ],
 )
