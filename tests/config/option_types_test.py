@@ -102,20 +102,13 @@ def _typed() -> Iterator[None]:
         '.half_width: must be a valid number, got None'),
     ('apple_seeker', {'half_width': -1},
         '.half_width: must be greater than 0, got -1'),
-    ('apple_seeker', {'half_width': 1e9},
-        '.half_width: must be less than or equal to 100, got 1000000000.0'),
     ('network_demonstrator', {'weights': ['demonstrator_v1']},
         ".weights: must be a valid string, got ['demonstrator_v1']"),
     ('pushing_saboteur', {'target': [1, 2, 3]},
         '.target: must have at most 2 items'),
     ('pushing_saboteur', {'target': [1]},
         '.target[1]: required key is missing'),
-    ('pushing_saboteur', {'target': [1e300, 0]},
-        '.target[0]: must be less than or equal to 10000, got 1e+300'),
     ('test_typed', {'flag': False}, '.needed: required key is missing'),
-    ('test_typed', {'needed': 1.5}, '.needed: must be a valid integer, g'),
-    ('test_typed', {'needed': 1, 'flag': 'no'},
-        ".flag: must be a valid boolean, got 'no'"),
     ('test_typed', {'needed': 1, 'mapping': {'a': 'x'}},
         ".mapping.a: must be a valid integer, got 'x'"),
     ('test_typed', {'needed': 1, 'odd': ['x', 3]},
@@ -192,16 +185,3 @@ def test_a_constructor_that_fails_is_a_spec_error():
         text = refusals.refusal(load)
         assert type(error).__name__ in text
         assert "policy 'test_failing'" in text
-
-
-def test_options_of_a_register_are_checked_when_a_design_is_loaded():
-  for options, message in (
-      ({'name': 'x'}, "options: unknown key 'name' (allowed: file, label)"),
-      ({'scale': 1}, "options: unknown key 'scale' (allowed: file, label)"),
-      ({'file': 1}, 'options.file: must be a valid string, got 1'),
-      ({'labl': 'x'}, "options: unknown key 'labl'; did you mean 'label'?"),
-  ):
-    register = {**_REGISTER, 'kind': 'test_reading', 'options': options}
-    design = _design('no_op', registers={'reward': register})
-    text = refusals.refusal(specs.load, design)
-    assert f'registers.reward.{message}' in text
