@@ -10,6 +10,7 @@ constructors as well. An option that is the path of a file has the type
 """
 
 from collections.abc import Callable, Mapping
+import dataclasses
 import functools
 import inspect
 import json
@@ -149,17 +150,19 @@ class OptionsOf:
     if not value or name is None:  # Another problem is reported then.
       return value
     try:
-      options = _options_of(self._names.get(name), self._method, self._reserved)
-    except (NameError, TypeError) as error:
+      allowed, options = _options_of(
+          self._names.get(name), self._method, self._reserved
+      )
+    except (NameError, TypeError, pydantic.PydanticUserError) as error:
       raise ValueError(
           f'the options of {name!r} cannot be read from its signature: {error}'
       ) from error
-    validation.check_keys(value, list(options.model_fields))
+    validation.check_keys(value, allowed)
     # JSON has the types of a file: a list may become a tuple, but a string
     # never becomes a number.
     text = json.dumps(value)
     try:
-      options.model_validate_json(text, strict=True, context=info.context)
+      options.validate_json(text, strict=True, context=info.context)
     except pydantic.ValidationError as error:
       # Classes check options that no file can contain, such as arrays.
       if {one['type'] for one in error.errors()} != {'needs_python_object'}:
@@ -172,8 +175,8 @@ def _options_of(
     factory: Callable[..., Any],
     method: str,
     reserved: Callable[..., Any] | None,
-) -> type[pydantic.BaseModel]:
-  """Returns a model of the options that a class or function declares.
+) -> tuple[list[str], pydantic.TypeAdapter[Any]]:
+  """Returns the names and the type of the options that a class declares.
 
   A method with `**kwargs` is assumed to pass them on to the method that it
   overrides, so the options of base classes are included.
@@ -191,6 +194,7 @@ def _options_of(
       'self',
       *(inspect.signature(reserved).parameters if reserved else ()),
   }
+  # A dataclass, because options of a model could hide its methods.
   fields: dict[str, Any] = {}
   for function in _functions(factory, method):
     if function is reserved:
@@ -199,16 +203,24 @@ def _options_of(
     for one in parameters:
       if one.kind in _BY_NAME and one.name not in (*taken, *fields):
         fields[one.name] = (
+            one.name,
             Any if one.annotation is one.empty else one.annotation,
-            ... if one.default is one.empty else one.default,
+            pydantic.Field(... if one.default is one.empty else one.default),
         )
     if all(one.kind is not one.VAR_KEYWORD for one in parameters):
       break
   config = pydantic.ConfigDict(arbitrary_types_allowed=True)
-  model = pydantic.create_model('Options', __config__=config, **fields)
-  if path := _PATH.search(repr(model.__pydantic_core_schema__)):
+  options: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(
+      dataclasses.make_dataclass(
+          'Options',
+          fields.values(),
+          kw_only=True,
+          namespace={'__pydantic_config__': config},
+      )
+  )
+  if path := _PATH.search(repr(options.core_schema)):
     raise TypeError(f'{path[0]}; allowed for a path is FilePath')
-  return model
+  return list(fields), options
 
 
 def _functions(

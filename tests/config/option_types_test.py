@@ -70,9 +70,11 @@ class _Typed(stubs.Idle):
       ndarray: np.ndarray | None = None,
       untyped=None,
       odd: 'list[str]' = (),  # type: ignore[assignment]
+      copy: bool = True,
+      model_config: int = 0,
   ) -> None:
     self.given = needed, number, flag, pair, sequence, mapping
-    self.more = ndarray, untyped, odd
+    self.more = ndarray, untyped, odd, copy, model_config
 
 
 @final
@@ -154,6 +156,8 @@ def test_wrong_options_of_inner_policies_are_refused(depth: int):
         ('test_typed', {'needed': 3, 'mapping': {'a': 1}, 'untyped': {'b': 0}}),
         # Arrays are converted by the class, not by the validation.
         ('test_typed', {'needed': 3, 'ndarray': [1, 2]}),
+        # Names that a pydantic model uses itself.
+        ('test_typed', {'needed': 3, 'copy': False, 'model_config': 1}),
         ('test_unreadable', {}),
         ('test_wrapping', {'inner_options': None}),
     ],
