@@ -13,6 +13,7 @@ such as `yes`, `012`, `1:30`, `0x1f` or `2024-01-01`, are refused, because YAML
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+import copy
 import math
 import os
 import re
@@ -147,7 +148,7 @@ def apply_overrides(
     SpecError: If an override is malformed, or if one of its keys leads into a
       value that is neither a mapping nor a list.
   """
-  result: dict[str, Any] = _plain(data, '<mapping>')
+  result: dict[str, Any] = copy.deepcopy(dict(data))
   for override in overrides:
     keys, value = _split(override)
     where = override_name(override)
@@ -340,7 +341,8 @@ def _plain(value: Any, where: str, path: tuple[str | int, ...] = ()) -> Any:
           for key, item in value.items()
       }
   elif isinstance(value, str):
-    problem = _forbidden_character(value)
+    # Printable characters are in none of the forbidden categories.
+    problem = '' if value.isprintable() else _forbidden_character(value)
     # Not str(value): a subclass, such as a text enum, may override it.
     value = str.__str__(value)
   elif isinstance(value, float):
@@ -367,12 +369,10 @@ def _plain(value: Any, where: str, path: tuple[str | int, ...] = ()) -> Any:
 
 def _forbidden_character(text: str) -> str:
   """Returns the problem with the characters of a text, or ''."""
-  # Printable characters are in none of the forbidden categories.
-  if not text.isprintable():
-    for character in dict.fromkeys(text):
-      if character == '\t':
-        return 'tab is not allowed (use spaces)'
-      category = unicodedata.category(character)
-      if character != '\n' and category in _FORBIDDEN_CATEGORIES:
-        return f'character U+{ord(character):04X} is not allowed'
+  for character in dict.fromkeys(text):
+    if character == '\t':
+      return 'tab is not allowed (use spaces)'
+    category = unicodedata.category(character)
+    if character != '\n' and category in _FORBIDDEN_CATEGORIES:
+      return f'character U+{ord(character):04X} is not allowed'
   return ''

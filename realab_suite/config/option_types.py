@@ -76,9 +76,8 @@ class ModelIn:
     """
     self._models = models
     self._name = None if or_name is None else pydantic.TypeAdapter(or_name)
-    self._kind: Any = pydantic.create_model(
-        'Kind', kind=Annotated[str, pydantic.Strict(), NameIn(models)]
-    )
+    kind = Annotated[str, pydantic.Strict(), NameIn(models)]
+    self._kind: Any = pydantic.create_model('Kind', kind=(kind, ...))
 
   def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
     del source, handler
