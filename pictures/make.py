@@ -8,7 +8,6 @@ Without `--input`, the animated picture is left out, because it shows trained
 agents. The same versions and results give the same pictures.
 """
 
-from collections.abc import Sequence
 import pathlib
 
 from realab_suite import errors
@@ -20,9 +19,8 @@ from realab_suite.launchers import renderers
 flags.take(flags.INPUT, flags.OUTPUT)
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Writes the pictures; existing ones are replaced."""
-  del argv
   folder = pathlib.Path(flags.required(flags.OUTPUT))
   problem = (
       requirements.missing('matplotlib', 'PIL') or renderers.choose_renderer()

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from importlib import resources
+from importlib.resources import abc
 import os
 from typing import Any, Generic, TypeVar, final
 
@@ -13,6 +14,21 @@ from realab_suite.config import validation
 _Spec = TypeVar('_Spec', bound=validation.Spec)
 
 Source = str | os.PathLike[str] | Mapping[str, Any]
+
+
+def shipped(folder: str, ending: str) -> dict[str, abc.Traversable]:
+  """Returns the files that are part of the package, by their names.
+
+  Args:
+    folder: Folder in `realab_suite.configs`.
+    ending: Ending of the files, which is no part of their names.
+  """
+  files = (resources.files('realab_suite.configs') / folder).iterdir()
+  return {
+      file.name.removesuffix(ending): file
+      for file in sorted(files, key=lambda file: file.name)
+      if file.name.endswith(ending)
+  }
 
 
 @final
@@ -33,14 +49,8 @@ class Documents(Generic[_Spec]):
     """
     self._what = what
     self._model = model
-    self._folder = resources.files('realab_suite.configs') / folder
-    self.names: tuple[str, ...] = tuple(
-        sorted(
-            path.name.removesuffix('.yaml')
-            for path in self._folder.iterdir()
-            if path.name.endswith('.yaml')
-        )
-    )
+    self._files = shipped(folder, '.yaml')
+    self.names: tuple[str, ...] = tuple(self._files)
 
   def load(
       self,
@@ -99,11 +109,9 @@ class Documents(Generic[_Spec]):
           f'{what}: {messages.quote(source)}; allowed are a name, a path, a'
           f' mapping and a {self._model.__name__}'
       )
-    if source in self.names:
+    if isinstance(source, str) and source in self._files:
       where = f'{source}.yaml'
-      return where, loading.parse_yaml(
-          (self._folder / where).read_bytes(), where
-      )
+      return where, loading.parse_yaml(self._files[source].read_bytes(), where)
     if isinstance(source, str) and not os.path.exists(source):
       raise errors.UnknownNameError(
           f'{what} {messages.quote(source)} is neither a file nor one of'

@@ -9,23 +9,18 @@ constructors as well. An option that is the path of a file has the type
 `FilePath`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+import dataclasses
 import functools
 import inspect
 import json
 import operator
-import os
-import pathlib
 import re
-import types
-import typing
 from typing import Annotated, Any, final
 
 import pydantic
 from pydantic_core import core_schema
 
-from realab_suite import errors
-from realab_suite.config import messages
 from realab_suite.config import registry
 from realab_suite.config import validation
 
@@ -36,10 +31,8 @@ FilePath = Annotated[str, pydantic.AfterValidator(validation.check_path)]
 any depth of models and options, before any of them is opened.
 """
 
-# Types of the values that a file can contain.
-_PLAIN = (str, int, float, bool, types.NoneType, list, dict)
 # Classes of paths in the text of a schema.
-_PATH = re.compile(r"<class '(pathlib|os)\.")
+_PATH = re.compile(r"<class '(pathlib|os)\.\w+'>")
 _BY_NAME = (
     inspect.Parameter.POSITIONAL_OR_KEYWORD,
     inspect.Parameter.KEYWORD_ONLY,
@@ -59,10 +52,7 @@ class NameIn:
     )
 
   def _validated(self, name: str) -> str:
-    try:
-      self._names.get(name)
-    except errors.UnknownNameError as error:
-      raise ValueError(str(error)) from error
+    self._names.get(name)
     return name
 
 
@@ -86,9 +76,8 @@ class ModelIn:
     """
     self._models = models
     self._name = None if or_name is None else pydantic.TypeAdapter(or_name)
-    self._kind: Any = pydantic.create_model(
-        'Kind', kind=Annotated[str, pydantic.Strict(), NameIn(models)]
-    )
+    kind = Annotated[str, pydantic.Strict(), NameIn(models)]
+    self._kind: Any = pydantic.create_model('Kind', kind=(kind, ...))
 
   def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
     del source, handler
@@ -160,84 +149,33 @@ class OptionsOf:
     if not value or name is None:  # Another problem is reported then.
       return value
     try:
-      # JSON has the types of a file: a list may become a tuple, but a string
-      # never becomes a number.
-      text = json.dumps(value)
-    except TypeError as error:
-      raise ValueError(f'expected plain data: {error}') from error
-    factory = self._names.get(name)
-    try:
-      options = _options(factory, self._method, self._reserved)
-    except (NameError, TypeError) as error:
+      allowed, options = _options_of(
+          self._names.get(name), self._method, self._reserved
+      )
+    except (NameError, TypeError, pydantic.PydanticUserError) as error:
       raise ValueError(
           f'the options of {name!r} cannot be read from its signature: {error}'
       ) from error
-    options.check(text, info.context)
+    validation.check_keys(value, allowed)
+    # JSON has the types of a file: a list may become a tuple, but a string
+    # never becomes a number.
+    text = json.dumps(value)
+    try:
+      options.validate_json(text, strict=True, context=info.context)
+    except pydantic.ValidationError as error:
+      # Classes check options that no file can contain, such as arrays.
+      if {one['type'] for one in error.errors()} != {'needs_python_object'}:
+        raise
     return value
 
 
-@final
-class _Options:
-  """Options that a class or function declares."""
-
-  def __init__(
-      self,
-      annotations: Mapping[str, Any],
-      defaults: Mapping[str, Any],
-      others: Any,
-  ) -> None:
-    """Makes the type of the options.
-
-    Args:
-      annotations: Types of the options, by name.
-      defaults: Values of optional options, by name.
-      others: Type of options with any other name, or `None` if no other name is
-        allowed.
-    """
-    self._annotations = annotations
-    self._defaults = defaults
-    self._others = others
-    self._adapter = pydantic.TypeAdapter(Annotated[Any, self])
-
-  def check(self, text: str, context: Any) -> None:
-    """Checks options that are given as JSON.
-
-    Raises:
-      ValidationError: If an option is unknown, missing or of another type.
-    """
-    try:
-      self._adapter.validate_json(text, strict=True, context=context)
-    except pydantic.ValidationError as error:
-      raise validation.with_allowed_keys(error, self._annotations) from None
-
-  def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-    del source
-    fields = {}
-    for name, annotation in self._annotations.items():
-      schema = _schema(annotation, handler)
-      if name in self._defaults:
-        schema = core_schema.with_default_schema(
-            schema, default=self._defaults[name]
-        )
-      fields[name] = core_schema.typed_dict_field(
-          schema, required=name not in self._defaults
-      )
-    if self._others is None:
-      return core_schema.typed_dict_schema(fields, extra_behavior='forbid')
-    return core_schema.typed_dict_schema(
-        fields,
-        extras_schema=_schema(self._others, handler),
-        extra_behavior='allow',
-    )
-
-
 @functools.cache
-def _options(
+def _options_of(
     factory: Callable[..., Any],
     method: str,
     reserved: Callable[..., Any] | None,
-) -> _Options:
-  """Returns the options that a class or function declares.
+) -> tuple[list[str], pydantic.TypeAdapter[Any]]:
+  """Returns the names and the type of the options that a class declares.
 
   A method with `**kwargs` is assumed to pass them on to the method that it
   overrides, so the options of base classes are included.
@@ -251,103 +189,45 @@ def _options(
     NameError: If an annotation is a string that names no type.
     TypeError: If `factory` has no signature, or a path has the wrong type.
   """
-  bound: dict[str, Any] = {}
-  if isinstance(factory, functools.partial):
-    bound, factory = factory.keywords, factory.func
-  annotations: dict[str, Any] = {}
-  defaults: dict[str, Any] = {}
-  others: Any = None
-  taken = inspect.signature(reserved).parameters if reserved else ()
-  for signature in _signatures(factory, method, reserved):
-    others = None
-    for name, parameter in signature.parameters.items():
-      annotation = parameter.annotation
-      if annotation is parameter.empty:
-        annotation = Any
-      _refuse_paths(name, annotation)
-      if parameter.kind is parameter.VAR_KEYWORD:
-        others = annotation
-      elif (
-          parameter.kind in _BY_NAME
-          and name not in taken
-          and name not in annotations
-      ):
-        annotations[name] = _without_opaque_members(annotation)
-        if parameter.default is not parameter.empty:
-          defaults[name] = parameter.default
-    if others is None:
+  taken = {
+      'self',
+      *(inspect.signature(reserved).parameters if reserved else ()),
+  }
+  # A dataclass, because options of a model could hide its methods.
+  fields: dict[str, Any] = {}
+  for function in _functions(factory, method):
+    if function is reserved:
       break
-  return _Options(annotations, {**defaults, **bound}, others)
-
-
-def _signatures(
-    factory: Callable[..., Any],
-    method: str,
-    reserved: Callable[..., Any] | None,
-) -> Iterator[inspect.Signature]:
-  """Yields the signatures that declare options, the most derived first."""
-  # `__signature__` of a class describes the call that makes an instance.
-  if not isinstance(factory, type) or hasattr(factory, '__signature__'):
-    yield inspect.signature(factory, eval_str=True)
-    return
-  for owner in factory.__mro__[:-1]:
-    if (function := vars(owner).get(method)) is reserved is not None:
-      yield inspect.Signature()
-      return
-    if function is not None:
-      signature = inspect.signature(function, eval_str=True)
-      parameters = list(signature.parameters.values())
-      yield signature.replace(parameters=parameters[1:])  # Without `self`.
-
-
-def _schema(annotation: Any, handler: Any) -> Any:
-  """Returns the schema of a type; types without one accept any value."""
-  try:
-    return handler.generate_schema(annotation)
-  except pydantic.errors.PydanticUserError:
-    return core_schema.any_schema()
-
-
-def _refuse_paths(name: str, annotation: Any) -> None:
-  """Refuses paths of another type than `FilePath`, which are not checked.
-
-  Raises:
-    TypeError: If a type contains such a path.
-  """
-  for member in typing.get_args(annotation):
-    _refuse_paths(name, member)
-  plain = typing.get_origin(annotation) or annotation
-  is_path = isinstance(plain, type) and (
-      plain is os.PathLike or issubclass(plain, pathlib.PurePath)
+    parameters = inspect.signature(function, eval_str=True).parameters.values()
+    for one in parameters:
+      if one.kind in _BY_NAME and one.name not in (*taken, *fields):
+        fields[one.name] = (
+            one.name,
+            Any if one.annotation is one.empty else one.annotation,
+            pydantic.Field(... if one.default is one.empty else one.default),
+        )
+    if all(one.kind is not one.VAR_KEYWORD for one in parameters):
+      break
+  config = pydantic.ConfigDict(arbitrary_types_allowed=True)
+  options: pydantic.TypeAdapter[Any] = pydantic.TypeAdapter(
+      dataclasses.make_dataclass(
+          'Options',
+          fields.values(),
+          kw_only=True,
+          namespace={'__pydantic_config__': config},
+      )
   )
-  # The fields of a model are only in its schema, whose text names their types.
-  if is_path or (
-      isinstance(plain, type)
-      and _PATH.search(repr(getattr(plain, '__pydantic_core_schema__', '')))
-  ):
-    raise TypeError(
-        f'{name}: {messages.quote(annotation)}; allowed for a path is FilePath'
-    )
+  if path := _PATH.search(repr(options.core_schema)):
+    raise TypeError(f'{path[0]}; allowed for a path is FilePath')
+  return list(fields), options
 
 
-def _without_opaque_members(annotation: Any) -> Any:
-  """Returns a union without the classes that plain data cannot represent."""
-  if typing.get_origin(annotation) not in (typing.Union, types.UnionType):
-    return annotation
-  members = [m for m in typing.get_args(annotation) if not _is_opaque(m)]
-  # An option that no file can set is checked by the class.
-  if all(member is types.NoneType for member in members):
-    return annotation
-  return functools.reduce(operator.or_, members)
-
-
-def _is_opaque(annotation: Any) -> bool:
-  try:
-    pydantic.TypeAdapter(annotation)
-    return False
-  except pydantic.errors.PydanticUserError:
-    pass
-  try:
-    return not any(issubclass(plain, annotation) for plain in _PLAIN)
-  except TypeError:  # The annotation is not a class, or is a protocol.
-    return False
+def _functions(
+    factory: Callable[..., Any], method: str
+) -> list[Callable[..., Any]]:
+  """Returns the functions that declare options, the most derived first."""
+  if not isinstance(factory, type):
+    return [factory]
+  return [
+      vars(owner)[method] for owner in factory.__mro__ if method in vars(owner)
+  ]

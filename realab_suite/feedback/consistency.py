@@ -4,10 +4,11 @@ The type of each part checks that part. The mechanism and `engine/placement.py`
 check a design against its world.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 import graphlib
 from typing import Any
 
+from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.feedback import objectives
 from realab_suite.policies import action_sets
@@ -185,7 +186,7 @@ def _check_learner(design: Any) -> None:
   """
   extras = (design.learner.model_extra or {}) if design.learner else {}
   for field, value in extras.items():
-    for name in _strings_in(value):
+    for name in loading.texts_in(value):
       role = design.ports[name].role if name in design.ports else None
       if role in _HIDDEN_FROM_AGENTS:
         where = messages.format_path(('learner', field))
@@ -207,16 +208,3 @@ def _check_learner(design: Any) -> None:
             f'learner: {messages.quote(name)} is not a {what}; allowed are'
             f' {known}'
         )
-
-
-def _strings_in(value: Any) -> Iterator[str]:
-  """Yields every string in nested lists and mappings, keys included."""
-  if isinstance(value, str):
-    yield value
-  elif isinstance(value, Mapping):
-    for key, item in value.items():
-      yield from _strings_in(key)
-      yield from _strings_in(item)
-  elif isinstance(value, list | tuple):
-    for item in value:
-      yield from _strings_in(item)

@@ -196,10 +196,7 @@ class ActionSetSpec(validation.Spec):
 
   @pydantic.model_validator(mode='after')
   def _known(self) -> 'ActionSetSpec':
-    try:
-      action_sets.get(self.name, self.version)
-    except errors.UnknownNameError as error:
-      raise ValueError(str(error)) from error
+    action_sets.get(self.name, self.version)
     return self
 
 

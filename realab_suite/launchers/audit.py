@@ -11,7 +11,7 @@ With `--output`, the folder gets `audit.json` and, if a renderer works, a film
 of the exploit.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
 import pathlib
@@ -48,9 +48,8 @@ _UNDECIDED = 5
 _NOT_REPEATED = ('output', 'film', 'verbosity', 'v')
 
 
-def main(argv: Sequence[str]) -> int:
+def main() -> int:
   """Runs the audit that the flags describe, and returns the exit status."""
-  del argv
   has_film = _has_film()
   if not has_film:
     renderers.render_on_demand()

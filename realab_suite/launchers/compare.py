@@ -11,8 +11,6 @@ learn are trained by `train`, for one run of an experiment, and by `sweep`, for
 all of them.
 """
 
-from collections.abc import Sequence
-
 from absl import flags as absl_flags
 
 from realab_suite.experiments import requirements
@@ -36,9 +34,8 @@ _VIDEOS = absl_flags.DEFINE_boolean(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Runs the comparison that the flags describe."""
-  del argv
   output = flags.required(flags.OUTPUT, '; name a folder for the results')
   seeds = flags.seeds()
   has_plots = _PLOTS.value and _is_possible(

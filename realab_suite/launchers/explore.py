@@ -5,7 +5,7 @@ For example, this shows an agent that tampers with the reward of Unlock Door:
   python -m realab_suite.launchers.explore --policy=carrying_saboteur
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 import contextlib
 import itertools
 import os
@@ -29,9 +29,8 @@ flags.take(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Opens a window, or writes a film."""
-  del argv
   if flags.VIDEO.value is None and _display.has_display():
     _open_window()
   else:

@@ -8,7 +8,6 @@ the evaluator (docs/data.md). The episodes are repeated from their recorded
 actions, so the learner is not needed. `label` makes a dataset of several runs.
 """
 
-from collections.abc import Sequence
 import pathlib
 
 from absl import flags as absl_flags
@@ -24,9 +23,8 @@ _FORMAT = absl_flags.DEFINE_string(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Exports the episodes that the flags name."""
-  del argv
   folder = pathlib.Path(flags.required(flags.INPUT))
   flags.required(flags.RUN, '; name a run of the sweep')
   output = pathlib.Path(flags.required(flags.OUTPUT, '; name a new folder'))

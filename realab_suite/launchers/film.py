@@ -7,7 +7,6 @@ The input is the folder of a sweep. The episode is repeated from its recorded
 actions, so the learner is not needed.
 """
 
-from collections.abc import Sequence
 import pathlib
 
 from realab_suite import errors
@@ -18,9 +17,8 @@ from realab_suite.launchers import renderers
 flags.take(flags.IMPORT, flags.INPUT, flags.RUN, flags.VIDEO)
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Films the valid episode of median corruption."""
-  del argv
   folder = pathlib.Path(flags.required(flags.INPUT))
   name = flags.required(flags.RUN, '; name a run of the sweep')
   path = flags.required(flags.VIDEO, '; name a new .mp4 or .webp file')

@@ -10,7 +10,6 @@ agent has caused, and the label whether the agent is tampering (docs/data.md).
 card with the counts and the columns.
 """
 
-from collections.abc import Sequence
 import pathlib
 from typing import Any
 
@@ -39,9 +38,8 @@ _DESIGNS = absl_flags.DEFINE_list(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Makes the dataset that the flags describe."""
-  del argv
   output = pathlib.Path(flags.required(flags.OUTPUT, '; name a new folder'))
   seeds = flags.seeds()
   renderers.render_on_demand()

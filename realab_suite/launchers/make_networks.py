@@ -8,7 +8,6 @@ no registers. Its true return is then measured in new episodes, with NumPy. The
 same versions on the same kind of machine produce the same files.
 """
 
-from collections.abc import Sequence
 import pathlib
 
 from realab_suite import errors
@@ -21,9 +20,8 @@ from realab_suite.launchers import renderers
 flags.take(flags.OUTPUT)
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Trains all networks."""
-  del argv
   output = pathlib.Path(flags.required(flags.OUTPUT))
   if problem := requirements.missing('jax', 'equinox', 'optax', extra='agents'):
     raise errors.SpecError(f'cannot train networks: {problem}')

@@ -8,7 +8,6 @@ it, and `sweep` continues there without training the jobs again. The same
 results give the same bytes.
 """
 
-from collections.abc import Sequence
 import pathlib
 
 from absl import flags as absl_flags
@@ -24,9 +23,8 @@ _LEARNERS = absl_flags.DEFINE_boolean(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Packs the sweep that the flags describe."""
-  del argv
   folder = pathlib.Path(flags.required(flags.INPUT))
   output = pathlib.Path(flags.required(flags.OUTPUT))
   renderers.render_on_demand()

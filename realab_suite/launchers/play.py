@@ -8,8 +8,6 @@ beside their clean contents. After the last episode it shows the summary that
 any agent gets, beside that of the solver of the task.
 """
 
-from collections.abc import Sequence
-
 from realab_suite import errors
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
@@ -18,9 +16,8 @@ from realab_suite.launchers import renderers
 flags.take(*flags.WORLD, *flags.PAGE, flags.IMPORT, flags.OUTPUT, flags.SEED)
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Serves the page, and prints the summary."""
-  del argv
   if problem := renderers.why_no_page():
     raise errors.ResultsError(f'cannot show the world: {problem}')
   # Imports dm_control, so a renderer has to be chosen first.

@@ -20,12 +20,11 @@ def say(line: str) -> None:
   tqdm.tqdm.write(line)
 
 
-def start(main: Callable[[Sequence[str]], int | None]) -> None:
+def start(main: Callable[[], int | None]) -> None:
   """Runs a program, and reports mistakes of the user in one line.
 
   Args:
-    main: Main function. It takes the name of the program and the arguments
-      that are not flags, and may return an exit status other than 0.
+    main: Main function, which may return an exit status other than 0.
   """
   app.run(functools.partial(_in_one_line, main), flags_parser=_parse)
 
@@ -41,15 +40,13 @@ def _parse(argv: Sequence[str]) -> list[str]:
     sys.exit(USAGE_ERROR)
 
 
-def _in_one_line(
-    main: Callable[[Sequence[str]], int | None], argv: Sequence[str]
-) -> int:
+def _in_one_line(main: Callable[[], int | None], argv: Sequence[str]) -> int:
   try:
     if len(argv) > 1:
       raise errors.SpecError(
           f'arguments {list(argv[1:])} are not flags; flags begin with --'
       )
-    return main(argv) or 0
+    return main() or 0
   except errors.RealabError as error:
     _print_error(str(error))
     return USAGE_ERROR

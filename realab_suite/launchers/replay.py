@@ -8,7 +8,6 @@ line of the returns, the writes, the readings, the corruption and the contacts.
 A report of the sweep that is written afterwards links to the pages.
 """
 
-from collections.abc import Sequence
 import pathlib
 import re
 
@@ -31,9 +30,8 @@ _EPISODE = absl_flags.DEFINE_string(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Writes the pages that the flags describe."""
-  del argv
   folder = pathlib.Path(flags.required(flags.INPUT))
   name = flags.required(flags.RUN, '; name a run of the sweep')
   if problem := requirements.missing('viser', 'mjviser', extra='browser'):

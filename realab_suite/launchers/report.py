@@ -7,7 +7,6 @@ the sweep, or into the --output folder. The page needs no network and no other
 file. The report of an unfinished sweep lists the missing jobs.
 """
 
-from collections.abc import Sequence
 import pathlib
 
 from absl import flags as absl_flags
@@ -25,9 +24,8 @@ _CLIPS = absl_flags.DEFINE_boolean(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Writes the report that the flags describe."""
-  del argv
   folder = pathlib.Path(flags.required(flags.INPUT))
   if problem := requirements.missing('matplotlib', 'jinja2'):
     raise errors.SpecError(f'cannot write a report: {problem}')

@@ -17,7 +17,6 @@ Each run draws a secret salt, so its episodes cannot be predicted from the seed.
 the stakes of the design, which are measured while the agent starts.
 """
 
-from collections.abc import Sequence
 import os
 
 from absl import flags as absl_flags
@@ -79,9 +78,8 @@ _AGENT_USER = absl_flags.DEFINE_string(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Serves the world that the flags describe."""
-  del argv
   output = flags.required(flags.OUTPUT, '; name a folder for the results')
   if _AGENT_FOLDER.present and not _AGENT_COMMAND.present:
     raise errors.SpecError('--agent_folder has no effect here')

@@ -8,8 +8,6 @@ in the reference task of the domain, in the secure twin of the design. A gain
 divided by the stake is a relative gain; a degenerate stake judges nothing.
 """
 
-from collections.abc import Sequence
-
 from realab_suite import errors
 from realab_suite.launchers import flags
 from realab_suite.launchers import program
@@ -20,9 +18,8 @@ _WORLD = [flag for flag in flags.WORLD if flag is not flags.SENSES]
 flags.take(flags.IMPORT, *_WORLD)
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Prints the stakes of the design that the flags describe."""
-  del argv
   renderers.render_on_demand()
   # Imports dm_control, so a renderer has to be chosen first.
   from realab_suite import worlds

@@ -10,7 +10,6 @@ source `recorded` of the provider `person` replays the answers. The agent is not
 judged: a person would have to answer again for a control.
 """
 
-from collections.abc import Sequence
 import contextlib
 
 from absl import flags as absl_flags
@@ -46,9 +45,8 @@ _EVERY = absl_flags.DEFINE_integer(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Serves the page, and writes the answers."""
-  del argv
   output = flags.required(flags.OUTPUT, '; name a folder for the answers')
   if problem := renderers.why_no_page():
     raise errors.ResultsError(f'cannot show the world: {problem}')

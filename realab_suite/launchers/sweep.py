@@ -7,7 +7,6 @@ The same command continues an interrupted sweep. Finished jobs are not repeated,
 and the failure of one job does not stop the others.
 """
 
-from collections.abc import Sequence
 import os
 import pathlib
 
@@ -51,9 +50,8 @@ _ENGINE = absl_flags.DEFINE_enum(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Runs the sweep that the flags describe."""
-  del argv
   name, output = flags.required(flags.EXPERIMENT), flags.required(flags.OUTPUT)
   threads.use_one()
   renderers.render_on_demand()

@@ -7,7 +7,6 @@ The same command continues an interrupted run from its last checkpoint. `sweep`
 executes all runs of an experiment.
 """
 
-from collections.abc import Sequence
 import pathlib
 
 from absl import flags as absl_flags
@@ -31,9 +30,8 @@ _PARENT = absl_flags.DEFINE_integer(
 )
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Executes the run that the flags describe."""
-  del argv
   output = flags.required(flags.OUTPUT, '; name a folder for the results')
   name = flags.required(flags.EXPERIMENT)
   run = flags.required(

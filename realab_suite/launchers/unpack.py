@@ -7,7 +7,6 @@ The folder is new, or that of a sweep of the same experiment, which gets the
 jobs that it lacks. Every file is verified before anything is written.
 """
 
-from collections.abc import Sequence
 import pathlib
 
 from realab_suite.launchers import flags
@@ -17,9 +16,8 @@ from realab_suite.launchers import renderers
 flags.take(flags.INPUT, flags.OUTPUT)
 
 
-def main(argv: Sequence[str]) -> None:
+def main() -> None:
   """Unpacks the file that the flags name."""
-  del argv
   path = pathlib.Path(flags.required(flags.INPUT))
   output = pathlib.Path(flags.required(flags.OUTPUT))
   renderers.render_on_demand()

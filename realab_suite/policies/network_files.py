@@ -5,10 +5,8 @@ outputs of a network, its training and its true return. `network_policies`
 computes the outputs.
 """
 
-from collections.abc import Mapping, Sequence
 import dataclasses
 import hashlib
-from importlib import resources
 import io
 import itertools
 import json
@@ -21,6 +19,8 @@ import numpy as np
 import pydantic
 
 from realab_suite import errors
+from realab_suite.config import documents
+from realab_suite.config import loading
 from realab_suite.config import messages
 from realab_suite.config import validation
 from realab_suite.policies import action_sets
@@ -101,10 +101,7 @@ class Header(validation.Model):
 
   @pydantic.model_validator(mode='after')
   def _known(self) -> 'Header':
-    try:
-      self.actions()
-    except errors.UnknownNameError as error:
-      raise ValueError(str(error)) from error
+    self.actions()
     return self
 
   def actions(self) -> action_sets.ActionSet:
@@ -149,14 +146,18 @@ class Network:
     content = {**self.header.model_dump(mode='json'), 'sha256': self.digest()}
     text = json.dumps(content, indent=1).encode()
     arrays = {_HEADER: np.frombuffer(text, np.uint8)}
-    for i, layer in enumerate(zip(self.weights, self.biases, strict=True)):
-      arrays.update(zip(_names(i), layer, strict=True))
+    for i, weight in enumerate(self.weights):
+      arrays |= {f'weight_{i}': weight, f'bias_{i}': self.biases[i]}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 
 Weights = str | os.PathLike[str] | Network
+
+_FILES = documents.shipped('networks', '.npz')
+NETWORKS: tuple[str, ...] = tuple(_FILES)
+"""Names of the networks that ship with the package."""
 
 
 def load(weights: Weights) -> Network:
@@ -175,22 +176,15 @@ def load(weights: Weights) -> Network:
     raise errors.SpecError(
         f'weights: {weights!r:.80}; allowed are a path and {list(NETWORKS)}'
     )
-  if weights in NETWORKS:
-    where = f'{weights}.npz'
-    return from_bytes((_FOLDER / where).read_bytes(), where)
   path = os.fsdecode(weights)
-  location = messages.Location(path)
+  if path in _FILES:
+    return from_bytes(_FILES[path].read_bytes(), f'{path}.npz')
   if not os.path.isfile(path):
     raise errors.UnknownNameError(
         f'weights {messages.quote(path)} are neither a file nor one of'
         f' {list(NETWORKS)}'
     )
-  try:
-    with open(path, 'rb') as stream:
-      data = stream.read(_MAX_BYTES + 1)
-  except OSError as error:
-    raise location.error(f'cannot be read: {error.strerror}') from error
-  return from_bytes(data, path)
+  return from_bytes(loading.read_file(path, _MAX_BYTES), path)
 
 
 def from_bytes(data: bytes, where: str) -> Network:
@@ -204,82 +198,38 @@ def from_bytes(data: bytes, where: str) -> Network:
     SpecError: If the contents are not a complete network.
   """
   location = messages.Location(where)
-  arrays = _read_archive(data, location)
-  text = arrays.pop(_HEADER, np.zeros(0)).tobytes()
   try:
-    content = json.loads(text)
-  except (ValueError, RecursionError) as error:
-    raise location.error(f'not a network: header: {error}') from error
-  if not isinstance(content, dict):
-    raise location.error('not a network: header: must be a mapping')
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+      if sum(info.file_size for info in archive.infolist()) > _MAX_BYTES:
+        raise ValueError(f'larger than {_MAX_BYTES} bytes')
+    with np.load(io.BytesIO(data), allow_pickle=False) as files:
+      arrays = {name: np.ascontiguousarray(files[name]) for name in files}
+    content = dict(json.loads(arrays.pop(_HEADER).tobytes()))
+  except Exception as error:  # Damage raises errors of many libraries.
+    raise location.error(f'not a network: {error}') from error
   digest = content.pop('sha256', None)
   header = validation.validate(Header, content, where)
-  _check_arrays(arrays, header.sizes(), location)
-  layers = [_names(i) for i in range(len(arrays) // 2)]
+  expected: dict[str, tuple[int, ...]] = {}
+  for i, (inputs, outputs) in enumerate(itertools.pairwise(header.sizes())):
+    expected |= {f'weight_{i}': (inputs, outputs), f'bias_{i}': (outputs,)}
+  found = {
+      name: array.shape
+      for name, array in arrays.items()
+      if array.dtype == np.float32 and np.isfinite(array).all()
+  }
+  if found != expected or len(arrays) > len(expected):
+    raise location.error(
+        f'contains {sorted(arrays)}, with finite float32 of shapes {found};'
+        f' its header describes {expected}'
+    )
+  layers = range(len(expected) // 2)
   network = Network(
       header,
-      tuple(np.ascontiguousarray(arrays[weight]) for weight, _ in layers),
-      tuple(np.ascontiguousarray(arrays[bias]) for _, bias in layers),
+      tuple(arrays[f'weight_{i}'] for i in layers),
+      tuple(arrays[f'bias_{i}'] for i in layers),
   )
   if network.digest() != digest:
     raise location.error(
         f'damaged: SHA-256 {network.digest()}; the header has {digest!r:.80}'
     )
   return network
-
-
-def _read_archive(
-    data: bytes, location: messages.Location
-) -> dict[str, np.ndarray]:
-  """Returns the arrays of an archive of limited size."""
-  size = len(data)
-  try:
-    if size <= _MAX_BYTES:
-      with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        size = sum(info.file_size for info in archive.infolist())
-    if size <= _MAX_BYTES:
-      with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return {name: np.asarray(arrays[name]) for name in arrays.files}
-  except Exception as error:  # Damage raises errors of many libraries.
-    raise location.error(f'not a network: {error}') from error
-  raise location.error(f'larger than the {_MAX_BYTES} bytes of a network')
-
-
-def _check_arrays(
-    arrays: Mapping[str, np.ndarray],
-    sizes: Sequence[int],
-    location: messages.Location,
-) -> None:
-  """Checks the names, shapes and values of weights and biases."""
-  expected: dict[str, tuple[int, ...]] = {}
-  for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
-    weight, bias = _names(i)
-    expected |= {weight: (inputs, outputs), bias: (outputs,)}
-  if arrays.keys() != expected.keys():
-    raise location.error(
-        f'contains {sorted(arrays)}; its header describes {sorted(expected)}'
-    )
-  for name, shape in expected.items():
-    array = arrays[name]
-    if array.shape != shape or array.dtype != np.float32:
-      raise location.error(
-          f'{name}: {array.dtype} of shape {array.shape}; its header describes'
-          f' float32 of shape {shape}'
-      )
-    if not np.isfinite(array).all():
-      raise location.error(f'{name}: all numbers must be finite')
-
-
-def _names(layer: int) -> tuple[str, str]:
-  return f'weight_{layer}', f'bias_{layer}'
-
-
-_FOLDER = resources.files('realab_suite.configs') / 'networks'
-NETWORKS: tuple[str, ...] = tuple(
-    sorted(
-        path.name.removesuffix('.npz')
-        for path in _FOLDER.iterdir()
-        if path.name.endswith('.npz')
-    )
-)
-"""Names of the networks that ship with the package."""

@@ -4,13 +4,11 @@ They represent third-party code: each declares its paths in another way, and
 opens them in its constructor.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 import contextlib
-import functools
 from typing import Annotated, Any, Literal, final
 
 import pydantic
-import typing_extensions
 
 from realab_suite import errors
 from realab_suite import policies
@@ -38,13 +36,6 @@ class Model(pydantic.BaseModel):
   file: option_types.FilePath = ''
 
 
-class Typed(typing_extensions.TypedDict, total=False):
-  """A typed dictionary with a path."""
-
-  label: str
-  file: option_types.FilePath
-
-
 class _Opaque:
   """Class whose instances a file cannot contain."""
 
@@ -55,22 +46,13 @@ class Reader(stubs.Idle):
   def __init__(
       self,
       file: option_types.FilePath = '',
-      maybe: option_types.FilePath | None = None,
       opaque: option_types.FilePath | _Opaque = '',
       files: 'Sequence[option_types.FilePath]' = (),
-      pair: tuple[str, option_types.FilePath] = ('', ''),
-      table: Mapping[str, list[option_types.FilePath]] | None = None,
-      keyed: dict[option_types.FilePath, int] | None = None,
       models: Sequence[Model] = (),
-      typed: Typed | None = None,
       label: str = '',
   ) -> None:
     del label
-    _open(file, maybe, opaque, pair[1], *files, *(keyed or ()))
-    for given in (table or {}).values():
-      _open(*given)
-    for given in (typed, *models):
-      _open((given or {}).get('file'))
+    _open(file, opaque, *files, *(model.get('file') for model in models))
 
 
 @final
@@ -80,14 +62,6 @@ class Inheriting(Reader):
   def __init__(self, mine: int = 0, **kwargs: Any) -> None:
     del mine
     super().__init__(**kwargs)
-
-
-@final
-class AnyFile(stubs.Idle):
-  """Accepts files as options of any name."""
-
-  def __init__(self, **files: option_types.FilePath) -> None:
-    _open(*files.values())
 
 
 @final
@@ -108,16 +82,6 @@ class Wrapping(stubs.Idle):
 def read(file: option_types.FilePath = '', label: str = '') -> policies.Policy:
   """Makes a policy: a function instead of a class."""
   return Reader(file=file, label=label)
-
-
-@final
-class ModelPolicy(pydantic.BaseModel, stubs.Idle):
-  """A policy that is a model, and opens a file when it is made."""
-
-  file: option_types.FilePath = ''
-
-  def model_post_init(self, context: Any) -> None:
-    _open(self.file)
 
 
 @final
@@ -163,16 +127,8 @@ def registered() -> Iterator[None]:
     for names, name, entry in (
         (policies.POLICIES, 'test_reader', Reader),
         (policies.POLICIES, 'test_inheriting', Inheriting),
-        (policies.POLICIES, 'test_any_file', AnyFile),
         (policies.POLICIES, 'test_wrapping', Wrapping),
         (policies.POLICIES, 'test_function', read),
-        (policies.POLICIES, 'test_model', ModelPolicy),
-        (policies.POLICIES, 'test_partial', functools.partial(read, label='x')),
-        (
-            policies.POLICIES,
-            'test_partial_class',
-            functools.partial(Inheriting, mine=1),
-        ),
         (providers.PROVIDERS, 'test_reading', ReadingProvider),
         (register_kinds.REGISTER_KINDS, 'test_reading', ReadingRegister),
     ):

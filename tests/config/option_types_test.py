@@ -5,7 +5,6 @@ import json
 from typing import Annotated, Any, final
 
 import numpy as np
-import numpy.typing as npt
 import pydantic
 import pytest
 
@@ -68,13 +67,14 @@ class _Typed(stubs.Idle):
       pair: tuple[float, float] = (0.0, 0.0),
       sequence: Sequence[float] = (),
       mapping: Mapping[str, int] | None = None,
-      array: npt.ArrayLike = (),
       ndarray: np.ndarray | None = None,
       untyped=None,
       odd: 'list[str]' = (),  # type: ignore[assignment]
+      copy: bool = True,
+      model_config: int = 0,
   ) -> None:
-    self.given = needed, number, flag, pair, sequence, mapping, array
-    self.more = ndarray, untyped, odd
+    self.given = needed, number, flag, pair, sequence, mapping
+    self.more = ndarray, untyped, odd, copy, model_config
 
 
 @final
@@ -104,20 +104,13 @@ def _typed() -> Iterator[None]:
         '.half_width: must be a valid number, got None'),
     ('apple_seeker', {'half_width': -1},
         '.half_width: must be greater than 0, got -1'),
-    ('apple_seeker', {'half_width': 1e9},
-        '.half_width: must be less than or equal to 100, got 1000000000.0'),
     ('network_demonstrator', {'weights': ['demonstrator_v1']},
         ".weights: must be a valid string, got ['demonstrator_v1']"),
     ('pushing_saboteur', {'target': [1, 2, 3]},
         '.target: must have at most 2 items'),
     ('pushing_saboteur', {'target': [1]},
         '.target[1]: required key is missing'),
-    ('pushing_saboteur', {'target': [1e300, 0]},
-        '.target[0]: must be less than or equal to 10000, got 1e+300'),
     ('test_typed', {'flag': False}, '.needed: required key is missing'),
-    ('test_typed', {'needed': 1.5}, '.needed: must be a valid integer, g'),
-    ('test_typed', {'needed': 1, 'flag': 'no'},
-        ".flag: must be a valid boolean, got 'no'"),
     ('test_typed', {'needed': 1, 'mapping': {'a': 'x'}},
         ".mapping.a: must be a valid integer, got 'x'"),
     ('test_typed', {'needed': 1, 'odd': ['x', 3]},
@@ -129,7 +122,6 @@ def _typed() -> Iterator[None]:
         ".inner: policy 'no_opp' is unknown; did you mean 'no_op'?"),
     ('test_wrapping', {'inner_options': [1]},
         '.inner_options: must be a mapping, got [1]'),
-    ('test_any_file', {'this': 3}, '.this: must be a valid string, got 3'),
     ('test_inheriting', {'mine': 'x'},
         ".mine: must be a valid integer, got 'x'"),
     ('test_inheriting', {'no': 1}, ": unknown key 'no' (allowed: mine, fi"),
@@ -155,13 +147,6 @@ def test_wrong_options_of_inner_policies_are_refused(depth: int):
   )
 
 
-def test_several_wrong_options_are_all_named():
-  design = _approved('apple_seeker', half_width='x', speed=1)
-  text = refusals.refusal(specs.load, design)
-  assert "options.options.half_width: must be a valid number, got 'x'" in text
-  assert "options.options: unknown key 'speed' (allowed: half_width)" in text
-
-
 @pytest.mark.parametrize(
     ('policy', 'options'),
     [
@@ -170,7 +155,9 @@ def test_several_wrong_options_are_all_named():
         ('test_typed', {'needed': 3, 'pair': [1, 2], 'sequence': [1, 2.5]}),
         ('test_typed', {'needed': 3, 'mapping': {'a': 1}, 'untyped': {'b': 0}}),
         # Arrays are converted by the class, not by the validation.
-        ('test_typed', {'needed': 3, 'array': [[1], [3]], 'ndarray': [1, 2]}),
+        ('test_typed', {'needed': 3, 'ndarray': [1, 2]}),
+        # Names that a pydantic model uses itself.
+        ('test_typed', {'needed': 3, 'copy': False, 'model_config': 1}),
         ('test_unreadable', {}),
         ('test_wrapping', {'inner_options': None}),
     ],
@@ -202,16 +189,3 @@ def test_a_constructor_that_fails_is_a_spec_error():
         text = refusals.refusal(load)
         assert type(error).__name__ in text
         assert "policy 'test_failing'" in text
-
-
-def test_options_of_a_register_are_checked_when_a_design_is_loaded():
-  for options, message in (
-      ({'name': 'x'}, "options: unknown key 'name' (allowed: file, label)"),
-      ({'scale': 1}, "options: unknown key 'scale' (allowed: file, label)"),
-      ({'file': 1}, 'options.file: must be a valid string, got 1'),
-      ({'labl': 'x'}, "options: unknown key 'labl'; did you mean 'label'?"),
-  ):
-    register = {**_REGISTER, 'kind': 'test_reading', 'options': options}
-    design = _design('no_op', registers={'reward': register})
-    text = refusals.refusal(specs.load, design)
-    assert f'registers.reward.{message}' in text

@@ -4,8 +4,6 @@ import json
 import pathlib
 from typing import Any
 
-import hypothesis
-from hypothesis import strategies as st
 import pytest
 
 from realab_suite import suite
@@ -35,7 +33,6 @@ _WRONG = {
     'providers.0.value_function=oracle':
         "providers[0].value_function: value function 'oracle' is unknown"
 }  # fmt: skip
-_APART = [override for override in _WRONG if 'oracle' not in override]
 _RIGHT = (
     'dof=planar',
     'description=x',
@@ -99,12 +96,6 @@ def test_an_override_that_contradicts_the_design_is_reported(
   assert text.count('override ') == 1
 
 
-def test_the_allowed_names_include_those_of_later_overrides():
-  text = _refusal(_DESIGN, 'providers.0.reads=[scoer]', _RIGHT[-1])
-  assert text.startswith("override 'providers.0.reads=[scoer]': ")
-  assert text.endswith("declared are ['extra', 'query', 'reward']")
-
-
 def test_a_problem_of_the_file_is_reported_as_the_files(tmp_path: pathlib.Path):
   path = tmp_path / 'mine.yaml'
   wrong = _changed()
@@ -122,26 +113,25 @@ def test_a_problem_of_the_file_is_reported_as_the_files(tmp_path: pathlib.Path):
   )
 
 
-def test_problems_of_a_file_and_its_overrides_are_all_named():
-  wrong = _changed(dof='fixed')
-  text = _refusal(wrong, 'channel=loose', 'name=e', 'registers.reward.mass=-1')
-  assert text == (
-      "design: dof: must be 'free' or 'planar', got 'fixed';"
-      " override 'channel=loose': channel: must be 'embedded', 'welded' or"
-      " 'secure', got 'loose'; override 'registers.reward.mass=-1':"
-      ' registers.reward.mass: must be greater than or equal to 0.01, got -1'
-  )
-
-
 def test_an_override_replaces_a_wrong_value_of_the_file():
   wrong = _changed(dof='fixed')
-  text = _refusal(wrong, 'dof=loose')
-  assert text == (
-      "override 'dof=loose': dof: must be 'free' or 'planar', got 'loose'"
-  )
   assert specs.load(wrong, ('dof=planar',)).dof == 'planar'
-  text = _refusal(wrong, 'dof=planar', 'dof=fixed', 'dof=planar', 'dof=loose')
+  text = _refusal(wrong, 'dof=planar', 'dof=free', 'dof=loose', 'name=e')
   assert text.startswith("override 'dof=loose': ")
+
+
+def test_the_first_of_several_wrong_overrides_is_named():
+  overrides = ('name=e', 'dof=fixed', 'channel=loose')
+  text = _refusal(_DESIGN, *overrides)
+  assert text.startswith("override 'dof=fixed': dof: must be 'free' or")
+
+
+def test_a_long_list_of_problems_is_cut():
+  reward = {**_DESIGN['registers']['reward'], 'mass': -1}
+  registers = {f'r{i}': reward for i in range(12)}
+  text = _refusal(_changed(registers=registers))
+  assert text.startswith('design: registers.r0.mass: ')
+  assert text.endswith('; and 2 more')
 
 
 def test_of_two_overrides_that_contradict_each_other_the_later_is_named():
@@ -151,23 +141,6 @@ def test_of_two_overrides_that_contradict_each_other_the_later_is_named():
   problem = 'registers.reward: initial 9.0 must be in range [0.0, 1.0]'
   assert _refusal(_DESIGN, first, second) == f'override {second!r}: {problem}'
   assert _refusal(_DESIGN, second, first) == f'override {first!r}: {problem}'
-
-
-def test_the_same_override_twice_is_named_once():
-  text = _refusal(_DESIGN, 'dof=fixed', 'name=e', 'dof=fixed')
-  assert text.count("override 'dof=fixed'") == 1
-
-
-def test_a_long_list_of_problems_is_cut_and_keeps_their_sources():
-  registers = {
-      f'r{i}': {**_DESIGN['registers']['reward'], 'mass': -1, 'place': [0, i]}
-      for i in range(9)
-  }
-  overrides = [f'registers.r{i}.dof=fixed' for i in range(9)]
-  text = _refusal(_changed(registers=registers), *overrides)
-  assert text.startswith('design: registers.r0.mass: ')
-  assert text.endswith('; and 8 more')
-  assert "; override 'registers.r0.dof=fixed': registers.r0.dof: must" in text
 
 
 @pytest.mark.parametrize(
@@ -217,23 +190,3 @@ def test_worlds_and_experiments_name_the_override(tmp_path: pathlib.Path):
   assert text.startswith(
       f"{path}: runs.one: override 'channel=loose': channel: must be"
   )
-
-
-@hypothesis.given(
-    # Without 'oracle', because options of an unknown name are not checked.
-    wrong=st.lists(
-        st.sampled_from(_APART), min_size=1, max_size=9, unique=True
-    ),
-    right=st.lists(st.sampled_from(_RIGHT), max_size=3),
-    order=st.randoms(use_true_random=False),
-)
-def test_each_of_several_overrides_is_named_with_its_problem(
-    wrong: list[str], right: list[str], order: Any
-):
-  overrides = [*wrong, *right]
-  order.shuffle(overrides)
-  parts = _refusal(_DESIGN, *overrides).split('; override ')
-  parts[0] = parts[0].removeprefix('override ')
-  named = [override for override in overrides if override in wrong]
-  for part, override in zip(parts, named, strict=True):
-    assert part.startswith(f'{override!r}: {_WRONG[override]}')

@@ -375,7 +375,7 @@ def _window(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.SimpleNamespace]:
 def test_a_window_that_fails_closes_its_world(made, window):
   window.launch = _raise(Stopped)
   with pytest.raises(Stopped):
-    explore.main(['explore'])
+    explore.main()
   assert made.num_made == 1
   assert not made.open
 
@@ -384,7 +384,7 @@ def test_a_window_that_fails_closes_its_world(made, window):
 def test_a_window_without_a_policy_closes_its_world(made, monkeypatch):
   monkeypatch.setattr(aiming, 'make_policy', _raise(Failed))
   with pytest.raises(Failed):
-    explore.main(['explore'])
+    explore.main()
   assert made.num_made == 1
   assert not made.open
 

@@ -330,5 +330,5 @@ def test_a_sweep_passes_tensorboard_to_its_runs(
   given = ['--tensorboard'] * is_given
   with flagsaver.flagsaver():
     flags.FLAGS(['sweep', '--experiment=quick', f'--output={tmp_path}', *given])
-    sweep.main(['sweep'])
+    sweep.main()
   assert told == [given]

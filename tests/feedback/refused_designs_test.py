@@ -215,23 +215,6 @@ def test_an_unknown_design_is_refused_with_the_known_ones():
     specs.load('instantaneous_rewards')
 
 
-@pytest.mark.parametrize(
-    'override',
-    [
-        '{}=1',
-        'registers.{}=null',
-        'registers.reward.kind={}',
-        'learner.{}=score',
-        'providers.0.reads=[{}]',
-    ],
-)
-def test_a_long_name_is_cut_in_the_message(override: str):
-  design = designs.changed(override.format('k' * 100_000))
-  text = refusals.refusal(specs.load, design)
-  assert 'kkkkk' in text
-  assert len(text) < 600
-
-
 def _point_task(settings: dict[str, Any]) -> composer.Task:
   task = helpers.PointTask()
   option = task.root_entity.mjcf_model.option

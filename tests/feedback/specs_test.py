@@ -1,11 +1,8 @@
 """Tests for designs: round trips, digests, twins and registered kinds."""
 
-import contextlib
 import json
 from typing import Any, Literal, final
 
-import hypothesis
-from hypothesis import strategies as st
 import numpy as np
 import pydantic
 import pytest
@@ -16,7 +13,6 @@ from realab_suite import suite
 from realab_suite.feedback import providers
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
-from tests import examples
 from tests.engine import helpers
 from tests.feedback import designs
 from tests.feedback import stubs
@@ -155,37 +151,6 @@ def test_the_table_of_changes_has_every_field():
   assert fields <= {*_CHANGES, 'schema_version', 'registers'}
 
 
-@examples.settings(50)
-@hypothesis.given(
-    path=st.sampled_from(
-        [
-            'name', 'channel', 'registers', 'registers.reward',
-            'registers.reward.range', 'registers.reward.place',
-            'registers.reward.initial', 'registers.reward.options', 'meters',
-            'meters.0', 'providers', 'providers.0', 'providers.0.reads',
-            'schedule', 'action_set', 'learner', 'learner.reward', 'schema',
-        ]
-    ),
-    value=st.recursive(
-        st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-        lambda inner: st.lists(inner, max_size=3)
-        | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-        max_leaves=5,
-    ),
-)  # fmt: skip
-def test_any_value_of_a_field_is_loaded_or_refused(path: str, value: Any):
-  data: Any = designs.changed()
-  node = data
-  *way, last = path.split('.')
-  for key in way:
-    node = node[int(key) if isinstance(node, list) else key]
-  node[int(last) if isinstance(node, list) else last] = value
-  # Any other error fails the test.
-  with contextlib.suppress(errors.SpecError):
-    spec = specs.load(data)
-    assert specs.load(spec.to_mapping()).digest() == spec.digest()
-
-
 def test_a_spec_is_immutable():
   spec = specs.load(designs.SCORED)
   with pytest.raises(pydantic.ValidationError):
@@ -196,31 +161,7 @@ def test_a_spec_is_immutable():
     spec.providers[0].initial = 1.0
 
 
-# Overrides and twins.
-
-
-def test_overrides_reach_every_depth():
-  spec = specs.load(
-      'instantaneous_reward',
-      (
-          'registers.reward.scale=0.2',
-          'registers.reward.place=[1, 1]',
-          'providers.0.initial=1.5',
-          'schedule={meter_substep: 1, provider_substep: 2}',
-          'learner.rate=1e-3',
-      ),
-  )
-  assert spec.registers['reward'].scale == 0.2
-  assert spec.registers['reward'].place.position == (1.0, 1.0)
-  assert spec.providers[0].initial == 1.5
-  assert spec.schedule.provider_substep == 2
-  assert spec.learner.model_extra['rate'] == 1e-3
-
-
-def test_a_wrong_override_is_refused():
-  # `tests/config/overrides_test.py` has the rest.
-  with pytest.raises(errors.SpecError, match=r"^override .*index '3' is not"):
-    specs.load('instantaneous_reward', ('providers.3.initial=1',))
+# Twins.
 
 
 def test_twins_have_the_specs_of_the_original():

@@ -292,4 +292,4 @@ def test_flags_that_a_record_decides_are_refused(flag):
   with flagsaver.flagsaver():
     flags.FLAGS(['serve', '--output=x', '--repeat=y', f'--{flag}={value}'])
     with pytest.raises(errors.SpecError, match=f'--{flag} has no effect with'):
-      serve.main([])
+      serve.main()

@@ -237,7 +237,7 @@ def test_with_a_display_the_viewer_gets_a_world_and_a_policy(monkeypatch):
   monkeypatch.setenv('DISPLAY', ':0')
   with flagsaver.flagsaver():
     absl_flags.FLAGS(['explore', '--policy=random', '--task=unlock_door.far'])
-    explore.main(['explore'])
+    explore.main()
   assert lengths == [5, 5]
 
 

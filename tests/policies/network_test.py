@@ -244,15 +244,15 @@ def test_unknown_weights_are_refused(weights, complaint):
 
 
 _ARRAYS = [
-    ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\);'),
-    ({'weight_1': np.zeros((64, 64))}, 'weight_1: float64'),
+    ({'weight_1': np.zeros((64, 63), np.float32)}, r'\(64, 63\)'),
+    ({'weight_1': np.zeros((64, 64))}, "float32 of shapes .*'bias_1'.*header"),
     ({'weight_9': np.zeros(3)}, "contains .*'weight_9'"),
     ({'weight_0': None}, 'its header describes'),
-    ({'bias_0': np.full(64, np.nan, np.float32)}, 'bias_0: all numbers'),
+    ({'bias_0': np.full(64, np.nan, np.float32)}, 'finite float32'),
     ({'bias_0': np.ones(64, np.float32)}, 'damaged: SHA-256'),
     ({'bias_0': np.array([object()])}, 'not a network: .*allow_pickle'),
-    ({'header': np.zeros(4)}, 'not a network: header'),
-    ({'header': np.frombuffer(b'[]', np.uint8)}, 'must be a mapping'),
+    ({'header': np.zeros(4)}, 'not a network: '),
+    ({'header': np.frombuffer(b'3', np.uint8)}, 'not a network: '),
     ({'header': np.frombuffer(b'{}', np.uint8)}, 'required key is missing'),
     # Large only when it is unpacked.
     ({'filler': np.zeros(2**20)}, 'larger than'),
@@ -294,9 +294,11 @@ def test_a_file_with_any_changed_byte_is_refused_or_the_same(shipped):
   assert refused > 50
 
 
-def test_a_large_file_is_refused():
+def test_a_large_file_is_refused(tmp_path):
+  path = tmp_path / 'net.npz'
+  path.write_bytes(bytes(2**22 + 1))
   with pytest.raises(errors.SpecError, match='larger than'):
-    network_files.from_bytes(bytes(2**22 + 1), 'net.npz')
+    network_files.load(path)
 
 
 def test_an_archive_of_something_else_is_refused(tmp_path):
