@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from realab_suite.policies import random_keys
 from tests import examples
 from tests.feedback import tampered
 
