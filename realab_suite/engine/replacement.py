@@ -9,6 +9,7 @@ moves, so the episodes of the task stay what they are.
 from collections.abc import Iterator
 import contextlib
 import copy
+import itertools
 from typing import NamedTuple, final
 
 from dm_control import composer
@@ -26,8 +27,6 @@ from realab_suite.feedback import mechanisms
 _FARTHEST = 10.0
 # Distance that a register that was moved has from everything else, in m.
 _CLEARANCE = 0.01
-# Half the width of a plane that is drawn without an end, in m.
-_ENDLESS = 1e6
 _PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 
 
@@ -44,24 +43,21 @@ class _Blocks(NamedTuple):
   reach: list[solids.Solid]
 
   @property
-  def footprint(self) -> np.ndarray:
-    """Bounds of all blocks for all values, `(2, 3)`, in m."""
+  def corners(self) -> np.ndarray:
+    """Corners under all blocks for all values, `(4, 3)`, in m."""
     bounds = np.array([solid.bounds for solid in self.reach])
-    return np.array([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
+    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    sides = itertools.product(*zip(low[:2], high[:2], strict=True))
+    return np.array([(*side, low[2]) for side in sides])
 
   def moved(self, shift: np.ndarray) -> '_Blocks':
-    """Returns the blocks, with a margin, `(2,)`, in m from this place."""
-    there = np.array([*shift, 0.0])
+    """Returns the blocks, with a margin, `(3,)`, in m from this place."""
     margin = np.array([_CLEARANCE, _CLEARANCE, 0.0])
-    return _Blocks(
-        *(
-            [
-                s._replace(centre=s.centre + there, half=s.half + margin)
-                for s in all_
-            ]
-            for all_ in self
-        )
+    starts, reach = (
+        [s.moved(shift)._replace(half=s.half + margin) for s in found]
+        for found in self
     )
+    return _Blocks(starts, reach)
 
 
 def place(
@@ -97,7 +93,7 @@ def place(
       world.occupy(each)
     else:
       blocked.append(name)
-  shifts = dict.fromkeys(blocks, np.zeros(2))
+  shifts = dict.fromkeys(blocks, np.zeros(3))
   for name in blocked:
     shift = world.nearest_clear_place(blocks[name])
     if shift is None:
@@ -116,10 +112,10 @@ def place(
 def _move(
     physics: mjcf.Physics, register: registers.Register, shift: np.ndarray
 ) -> None:
-  """Moves a register in the plane of the floor, `(2,)`, in m."""
+  """Moves a register in the plane of the floor, `(3,)`, in m."""
   frame = physics.bind(mjcf.get_attachment_frame(register.mjcf_model))
   rotation = surroundings.matrix(physics.model.body_quat[frame.element_id])
-  displacement = ([*shift, 0.0] @ rotation)[:2]
+  displacement = (shift @ rotation)[:2]
   if shift.any():
     register.settle(physics, displacement)
   for block in register.blocks:
@@ -171,15 +167,11 @@ class _World:
     movable = space.solids(physics, is_other & ~space.is_fixed)
     self._fixed = solids.Crowd(space, fixed)
     self._movable = solids.Crowd(space, movable)
-    self._is_plane = np.array(
-        [model.geom_type[solid.geom] == _PLANE for solid in fixed], bool
-    )
-    # Bounds of all that can be ground, with planes as large as they are drawn.
-    for i in np.flatnonzero(self._is_plane).tolist():
-      size = np.array(model.geom_size[fixed[i].geom])
-      drawn = np.array([*np.where(size[:2] > 0.0, size[:2], _ENDLESS), 0.0])
-      fixed[i] = fixed[i]._replace(half=drawn)
-    self._grounds = np.reshape([solid.bounds for solid in fixed], (-1, 2, 3))
+    is_plane = [model.geom_type[solid.geom] == _PLANE for solid in fixed]
+    self._is_plane = np.array(is_plane, bool)
+    tops = [solid.bounds[1, 2] for solid in fixed]
+    heights = [solid.centre[2] for solid in fixed]
+    self._tops = np.where(is_plane, heights, tops)
 
   def occupy(self, blocks: _Blocks) -> None:
     """Adds the blocks of a register as obstacles."""
@@ -188,29 +180,24 @@ class _World:
   def is_clear(self, blocks: _Blocks) -> bool:
     """Returns True if a register can stay where it is. Planes are endless."""
     is_below = self._is_below(blocks)
-    return (
+    is_on_ground = (
         not is_below.any()
         or bool((is_below & self._is_plane).any())
-        or self._is_carried(blocks)
-    ) and self._is_free(blocks)
+        or self._is_carried(blocks.corners)
+    )
+    return is_on_ground and self._is_free(blocks)
 
   def nearest_clear_place(self, blocks: _Blocks) -> np.ndarray | None:
-    """Returns the shift to the nearest clear place, `(2,)`, in m, or `None`."""
+    """Returns the shift to the nearest clear place, `(3,)`, in m, or `None`."""
     step = float(blocks.starts[0].half.min())
     along = step * np.arange(-(_FARTHEST // step), _FARTHEST // step + 1)
-    shifts = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
-    low, high = blocks.footprint[:, :2]
-    is_below = self._is_below(blocks)
-    is_over = np.full(len(shifts), not is_below.any())
-    for first, last in self._grounds[is_below, :, :2]:
-      is_over |= ((first <= low + shifts) & (high + shifts <= last)).all(axis=1)
-    shifts = shifts[is_over]
-    distance = np.hypot(*shifts.T).round(6)
+    shifts = np.stack(np.meshgrid(along, along, 0.0), axis=-1).reshape(-1, 3)
+    distance = np.linalg.norm(shifts, axis=1).round(6)
+    needs_ground, corners = self._is_below(blocks).any(), blocks.corners
     for shift in shifts[np.lexsort((*shifts.T, distance))]:
-      there = blocks.moved(shift)
-      if self._is_free(there) and (
-          not is_below.any() or self._is_carried(there)
-      ):
+      if needs_ground and not self._is_carried(corners + shift):
+        continue
+      if self._is_free(blocks.moved(shift)):
         return shift
     return None
 
@@ -219,16 +206,14 @@ class _World:
 
     Surfaces above the floor are checked when a task is embedded.
     """
-    bottom = blocks.footprint[0, 2]
-    is_below = np.abs(self._grounds[:, 1, 2] - bottom) <= solids.GAP
+    bottom = blocks.corners[0, 2]
+    is_below = np.abs(self._tops - bottom) <= solids.GAP
     return is_below & (bottom <= solids.GAP)
 
-  def _is_carried(self, blocks: _Blocks) -> bool:
+  def _is_carried(self, corners: np.ndarray) -> bool:
     """Returns True if one geom is under all corners of a register."""
-    (x0, y0, z0), (x1, y1, _) = blocks.footprint
-    z = z0 + 2 * solids.GAP
-    corners = np.array([[x, y, z] for x in (x0, x1) for y in (y0, y1)])
-    return self._space.uncarried(corners, 3 * solids.GAP) is None
+    above = corners + np.array([0.0, 0.0, solids.GAP])
+    return self._space.uncarried(above, 2 * solids.GAP) is None
 
   def _is_free(self, blocks: _Blocks) -> bool:
     """Returns True if no block can be inside something."""
