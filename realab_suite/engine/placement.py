@@ -43,13 +43,12 @@ def check(
   _check_solver(physics, mechanism)
   space = solids.Space(physics.model.ptr)
   solids.settle(physics, mechanism.registers.values())
+  owners = solids.owners(physics, mechanism.registers)
+  obstacles = solids.Crowd(space, _obstacles(physics, root, space, owners))
   reachable = {
       name: solids.regions(physics, register, register.spread)
       for name, register in mechanism.registers.items()
   }
-  owners = solids.owners(physics, mechanism.registers)
-  solids.settle(physics, mechanism.registers.values())
-  obstacles = solids.Crowd(space, _obstacles(physics, root, space, owners))
   blocks = solids.Crowd(space)
   for name, regions in reachable.items():
     for region in regions:
