@@ -62,7 +62,12 @@ def check(
             ' range'
         )
       if (found := blocks.meeting(region.solid)) is not None:
-        other = owners[found[0].geom]
+        # Not by its geom: two registers may share a block of the world.
+        other = next(
+            owner
+            for owner, others in reachable.items()
+            if any(one.solid is found[0] for one in others)
+        )
         raise errors.SpecError(
             f"registers {other!r} and {name!r} would be in each other's way:"
             f' {_filled(reachable[other])} and {_filled(regions)}; place them'
