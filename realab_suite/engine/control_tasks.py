@@ -53,18 +53,6 @@ _SEEN = 1e-6
 
 
 @final
-class ControlArena(composer.Entity):
-  """Root entity of the joint world: the MJCF source of a task."""
-
-  def _build(self, mjcf_model: mjcf.RootElement) -> None:
-    self._mjcf_root = mjcf_model
-
-  @property
-  def mjcf_model(self) -> mjcf.RootElement:
-    return self._mjcf_root
-
-
-@final
 class ControlTask(composer.Task):
   """A task of `dm_control.suite` as a Composer task.
 
@@ -98,7 +86,8 @@ class ControlTask(composer.Task):
       )
     model = control_sources.find(env)
     _prepare(model, self._own.model.ptr)
-    self._root = ControlArena(model)
+    # Root entity of the joint world: the MJCF source of the task.
+    self._root = composer.ModelWrapperEntity(model)
     self.set_timesteps(env.control_timestep(), self._own.timestep())
     self._kinds = np.zeros(0, int)
     self._is_touched = False
@@ -114,7 +103,7 @@ class ControlTask(composer.Task):
       one.enabled = True
 
   @property
-  def root_entity(self) -> ControlArena:
+  def root_entity(self) -> composer.Entity:
     return self._root
 
   @property

@@ -221,7 +221,7 @@ class ForeignHost(hosts.Host):
     """
     model = physics.model
     with physics.reset_context():
-      geoms = [physics.bind(geom).element_id for geom in _geoms(mechanism)]
+      geoms = list(solids.owners(physics, mechanism.registers))
       # Rays pass through geoms without opacity.
       values = (
           model.geom_contype,
@@ -326,15 +326,6 @@ def _blocks_of(mechanism: mechanisms.FeedbackMechanism) -> list[Any]:
   return [b for r in mechanism.registers.values() for b in r.own_blocks]
 
 
-def _geoms(mechanism: mechanisms.FeedbackMechanism) -> dict[Any, str]:
-  """Returns the names of registers by the geoms of their blocks."""
-  return {
-      block.geom: name
-      for name, register in mechanism.registers.items()
-      for block in register.blocks
-  }
-
-
 def check_start(
     physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
 ) -> None:
@@ -348,10 +339,7 @@ def check_start(
     EpisodeInitializationError: If something is. The next attempt draws other
       positions.
   """
-  owners = {
-      int(physics.bind(geom).element_id): name
-      for geom, name in _geoms(mechanism).items()
-  }
+  owners = solids.owners(physics, mechanism.registers)
   model, contacts = physics.model, physics.data.ptr.contact
   for (one, other), depth in zip(contacts.geom, -contacts.dist, strict=True):
     block, body = (one, other) if one in owners else (other, one)

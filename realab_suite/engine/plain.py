@@ -89,8 +89,9 @@ class PlainTask(composer.Task):
     env.mechanism.leave_phases(_LastHooks(self))
     state.make_room(env.task.root_entity.mjcf_model)
 
-    self._attempt = 0
-    self._is_begun = self._has_failed_attempt = False
+    # Attempts to begin the episode so far; 0 once it has been initialized.
+    self._num_attempts = 0
+    self._is_begun = False
     self._is_observed = True
     self._view: views.View | None = None
     # The step that is running, a `control_step.ControlStep`.
@@ -149,7 +150,7 @@ class PlainTask(composer.Task):
 
   def initialize_episode_mjcf(self, random_state: Any) -> None:
     self._begin_attempt(random_state)
-    self._attempted(lambda: self._task.initialize_episode_mjcf(random_state))
+    self._task.initialize_episode_mjcf(random_state)
 
   def after_compile(self, physics: Any, random_state: Any) -> None:
     """Prepares the observables of a newly compiled model.
@@ -184,9 +185,8 @@ class PlainTask(composer.Task):
     if not self._is_begun:
       self._begin_attempt(random_state)
     self._is_begun = False
-    self._attempted(
-        lambda: self._task.initialize_episode(physics, random_state)
-    )
+    self._task.initialize_episode(physics, random_state)
+    self._num_attempts = 0
     self._random_state = random_state
     self._session.restart_providers()
     self._is_observed = False
@@ -250,22 +250,11 @@ class PlainTask(composer.Task):
     own.end(events.End.ABANDONED if self._step is None else events.End.ERROR)
     self._step = None
     self._is_begun = True
-    is_retry = self._has_failed_attempt
-    self._attempt = self._attempt + 1 if is_retry else 0
-    if self._attempt == episodes.MAX_RESET_ATTEMPTS:
-      is_retry, self._attempt = False, 0
-    own.episode += not is_retry
-    self._has_failed_attempt = False
-    stream = f'reset/{self._attempt}'
+    attempt = self._num_attempts % episodes.MAX_RESET_ATTEMPTS
+    self._num_attempts += 1
+    own.episode += attempt == 0
+    stream = f'reset/{attempt}'
     seeding.reseed(random_state, own.seed, own.world, own.episode, stream)
-
-  def _attempted(self, initialize: Callable[[], None]) -> None:
-    """Calls a hook of the task and notes whether it fails to initialize."""
-    try:
-      initialize()
-    except composer.EpisodeInitializationError:
-      self._is_begun, self._has_failed_attempt = False, True
-      raise
 
   def _run_phases(self, physics: Any) -> None:
     """Runs the phases at the present substep."""
@@ -355,7 +344,7 @@ class _LastHooks(composer.Entity):
 
 
 @final
-class _Part(observable.Observable):
+class _Part(observable.Generic):
   """Part of an observation."""
 
   def __init__(
@@ -369,14 +358,10 @@ class _Part(observable.Observable):
       spec: Spec of the part, whose name is the key.
       observe: Function that returns the observation.
     """
-    super().__init__(1, None, None, None, None)
+    super().__init__(lambda physics: observe(physics)[spec.name])
     self._spec = spec
-    self._observe = observe
     self.enabled = True
 
   @property
   def array_spec(self) -> specs.Array:
     return self._spec
-
-  def _callable(self, physics: Any) -> Callable[[], np.ndarray]:
-    return lambda: self._observe(physics)[self._spec.name]

@@ -9,7 +9,8 @@ moves, so the episodes of the task stay what they are.
 from collections.abc import Iterator
 import contextlib
 import copy
-from typing import Any, NamedTuple, final
+import itertools
+from typing import NamedTuple, final
 
 from dm_control import composer
 from dm_control import mjcf
@@ -26,21 +27,7 @@ from realab_suite.feedback import mechanisms
 _FARTHEST = 10.0
 # Distance that a register that was moved has from everything else, in m.
 _CLEARANCE = 0.01
-# Largest difference in height between a register and its ground, in m. It
-# exceeds the gap under a planar block.
-_GAP = 0.01
-# Number of places that are checked at once.
-_CHUNK = 4096
 _PLANE = mujoco.mjtGeom.mjGEOM_PLANE
-# Ground of any shape.
-_UNEVEN = (
-    mujoco.mjtGeom.mjGEOM_HFIELD,
-    mujoco.mjtGeom.mjGEOM_MESH,
-    mujoco.mjtGeom.mjGEOM_SDF,
-)
-# MuJoCo computes no distances of these.
-_IGNORED_TYPES = (_PLANE, _UNEVEN[0], _UNEVEN[2])
-_PARALLEL = 1e-6
 
 
 @final
@@ -49,22 +36,28 @@ class _Blocks(NamedTuple):
 
   Attributes:
     starts: Each block, where the episode begins with it.
-    paths: Solids that contain the poses of the blocks for all values.
-    start: Bounds of each of `starts`, `(blocks, 2, 3)`, in m.
-    reach: Bounds of each of `paths`, `(paths, 2, 3)`, in m.
+    reach: All poses of each block, for all values.
   """
 
-  starts: list[list[solids.Solid]]
-  paths: list[list[solids.Solid]]
-  start: np.ndarray
-  reach: np.ndarray
+  starts: list[solids.Solid]
+  reach: list[solids.Solid]
 
   @property
-  def footprint(self) -> np.ndarray:
-    """Bounds of all blocks for all values, `(2, 3)`, in m."""
-    return np.array(
-        [self.reach[:, 0].min(axis=0), self.reach[:, 1].max(axis=0)]
+  def corners(self) -> np.ndarray:
+    """Corners under all blocks for all values, `(4, 3)`, in m."""
+    bounds = np.array([solid.bounds for solid in self.reach])
+    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    sides = itertools.product(*zip(low[:2], high[:2], strict=True))
+    return np.array([(*side, low[2]) for side in sides])
+
+  def moved(self, shift: np.ndarray) -> '_Blocks':
+    """Returns the blocks, with a margin, `(3,)`, in m from this place."""
+    margin = np.array([_CLEARANCE, _CLEARANCE, 0.0])
+    starts, reach = (
+        [s.moved(shift)._replace(half=s.half + margin) for s in found]
+        for found in self
     )
+    return _Blocks(starts, reach)
 
 
 def place(
@@ -87,35 +80,31 @@ def place(
   if not mechanism.registers:
     return
   with _unchanged(physics):
-    space = solids.Space(physics.model.ptr)
+    mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
+    world = _World(physics, mechanism)
     blocks = {
-        name: _find_blocks(physics, register, space)
+        name: _find_blocks(physics, register)
         for name, register in mechanism.registers.items()
     }
-    own = {one.geom for each in blocks.values() for one, *_ in each.starts}
-  with _unchanged(physics):
-    mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
-    world = _World(physics, space, own)
-    # A register in a clear place does not make way for another one.
-    blocked = []
-    for name, each in blocks.items():
-      if world.is_clear(each):
-        world.occupy(each.reach)
-      else:
-        blocked.append(name)
-    shifts = dict.fromkeys(blocks, np.zeros(2))
-    for name in blocked:
-      shift = world.nearest_clear_place(blocks[name])
-      if shift is None:
-        x, y = blocks[name].footprint[:, :2].mean(axis=0)
-        raise composer.EpisodeInitializationError(
-            f'design {mechanism.design.name!r}: register {name!r} has no clear'
-            f' place within {_FARTHEST:g} m of ({x:.3g}, {y:.3g}); place it'
-            ' where there is more room, or reduce its range, scale or'
-            ' block_size'
-        )
-      world.occupy(blocks[name].reach + np.array([*shift, 0.0]))
-      shifts[name] = shift
+  # A register in a clear place does not make way for another one.
+  blocked = []
+  for name, each in blocks.items():
+    if world.is_clear(each):
+      world.occupy(each)
+    else:
+      blocked.append(name)
+  shifts = dict.fromkeys(blocks, np.zeros(3))
+  for name in blocked:
+    shift = world.nearest_clear_place(blocks[name])
+    if shift is None:
+      x, y, _ = blocks[name].starts[0].centre
+      raise composer.EpisodeInitializationError(
+          f'design {mechanism.design.name!r}: register {name!r} has no clear'
+          f' place within {_FARTHEST:g} m of ({x:.3g}, {y:.3g}); place it'
+          ' where there is more room, or reduce its range, scale or block_size'
+      )
+    world.occupy(blocks[name].moved(shift))
+    shifts[name] = shift
   for name, register in mechanism.registers.items():
     _move(physics, register, shifts[name])
 
@@ -123,10 +112,10 @@ def place(
 def _move(
     physics: mjcf.Physics, register: registers.Register, shift: np.ndarray
 ) -> None:
-  """Moves a register in the plane of the floor, `(2,)`, in m."""
+  """Moves a register in the plane of the floor, `(3,)`, in m."""
   frame = physics.bind(mjcf.get_attachment_frame(register.mjcf_model))
   rotation = surroundings.matrix(physics.model.body_quat[frame.element_id])
-  displacement = ([*shift, 0.0] @ rotation)[:2]
+  displacement = (shift @ rotation)[:2]
   if shift.any():
     register.settle(physics, displacement)
   for block in register.blocks:
@@ -148,25 +137,18 @@ def _unchanged(physics: mjcf.Physics) -> Iterator[None]:
 
 
 def _find_blocks(
-    physics: mjcf.Physics, register: registers.Register, space: solids.Space
+    physics: mjcf.Physics, register: registers.Register
 ) -> _Blocks:
   """Returns where the blocks of a register are, and can be written to.
 
   Args:
     physics: Physics; its state is changed.
     register: The register.
-    space: Space of the model.
   """
   still = np.zeros(2)
-  regions = solids.initial_regions(physics, register, still)
-  starts = [region.hulls for region in regions]
-  paths = [one.hulls for one in solids.regions(physics, register, still)]
-  return _Blocks(
-      starts,
-      paths,
-      np.array([space.bounds(hull) for hull, *_ in starts]),
-      np.array([space.bounds(hull) for hull, *_ in paths]),
-  )
+  starts = solids.initial_regions(physics, register, still)
+  reach = solids.regions(physics, register, still)
+  return _Blocks([r.solid for r in starts], [r.solid for r in reach])
 
 
 @final
@@ -174,190 +156,68 @@ class _World:
   """Everything solid in a world, except the registers that are to be placed."""
 
   def __init__(
-      self, physics: mjcf.Physics, space: solids.Space, own: set[int]
+      self, physics: mjcf.Physics, mechanism: mechanisms.FeedbackMechanism
   ) -> None:
-    """Collects the geoms of a physics in its present state.
+    """Collects the geoms of a physics in its present state."""
+    model = physics.model
+    self._space = space = solids.Space(model.ptr)
+    is_other = np.ones_like(space.is_fixed)
+    is_other[list(solids.owners(physics, mechanism.registers))] = False
+    fixed = space.solids(physics, is_other & space.is_fixed)
+    movable = space.solids(physics, is_other & ~space.is_fixed)
+    self._fixed = solids.Crowd(space, fixed)
+    self._movable = solids.Crowd(space, movable)
+    is_plane = [model.geom_type[solid.geom] == _PLANE for solid in fixed]
+    self._is_plane = np.array(is_plane, bool)
+    tops = [solid.bounds[1, 2] for solid in fixed]
+    heights = [solid.centre[2] for solid in fixed]
+    self._tops = np.where(is_plane, heights, tops)
 
-    Args:
-      physics: Physics of one world.
-      space: Space of its model.
-      own: Geoms of registers.
-    """
-    model, data = physics.model, physics.data.ptr
-    self._space = space
-    solid = (model.geom_contype | model.geom_conaffinity) != 0
-    solid[list(own)] = False
-    carriers = model.body_weldid[model.geom_bodyid]
-    fixed = (carriers == 0) | (model.body_mocapid[carriers] >= 0)
-    matrices = np.reshape(data.geom_xmat, (-1, 3, 3)).copy()
-    is_plane = model.geom_type == _PLANE
-    planes = np.flatnonzero(solid & is_plane)
-    self._normals = matrices[planes, :, 2]
-    self._offsets = (self._normals * data.geom_xpos[planes]).sum(axis=1)
-    measured = solid & ~np.isin(model.geom_type, _IGNORED_TYPES)
-    self._fixed, self._movable = (
-        [
-            space.solid(geom, np.array(data.geom_xpos[geom]), matrices[geom])
-            for geom in np.flatnonzero(mask).tolist()
-        ]
-        for mask in (measured & fixed, measured & ~fixed)
-    )
-    self._fixed_bounds = self._bounds_of(self._fixed)
-    self._movable_bounds = self._bounds_of(self._movable)
-    # Ground: planes that face up, and tops of upright boxes.
-    self._has_uneven = bool(
-        (solid & fixed & np.isin(model.geom_type, _UNEVEN)).any()
-    )
-    is_upright = np.abs(matrices[:, 2, 2] - 1.0) < _PARALLEL
-    is_aligned = np.isclose(np.abs(matrices[:, :2, :2]).max(axis=1), 1.0).all(1)
-    is_box = model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
-    ground = solid & fixed & is_upright & (is_plane | (is_box & is_aligned))
-    self._grounds = []
-    for geom in np.flatnonzero(ground).tolist():
-      half = np.array(model.geom_size[geom])
-      half[:2] = np.abs(matrices[geom, :2, :2]) @ half[:2]
-      if is_plane[geom]:
-        half[2] = 0.0
-        # Without a size, planes are drawn without an end.
-        half[:2][model.geom_size[geom][:2] == 0.0] = np.inf
-      centre = data.geom_xpos[geom]
-      self._grounds.append((bool(is_plane[geom]), centre - half, centre + half))
-
-  def occupy(self, reach: np.ndarray) -> None:
-    """Adds the bounds of a register, `(blocks, 2, 3)`, as obstacles."""
-    self._fixed_bounds = np.concatenate([self._fixed_bounds, reach])
+  def occupy(self, blocks: _Blocks) -> None:
+    """Adds the blocks of a register as obstacles."""
+    self._fixed = self._fixed.joined(blocks.reach)
 
   def is_clear(self, blocks: _Blocks) -> bool:
-    """Returns True if a register can stay where it is."""
-    footprint = blocks.footprint
-    if not self._is_on_ground(footprint):
-      return False
-    if self._is_behind_plane(blocks.reach, np.zeros((1, 2))).any():
-      return False
-    # Registers come after the geoms of the world.
-    taken = self._fixed_bounds[len(self._fixed) :]
-    if any(_overlap(one, taken).any() for one in blocks.reach):
-      return False
-    return not (
-        self._meets(blocks.paths, self._fixed, self._fixed_bounds)
-        or self._meets(blocks.starts, self._movable, self._movable_bounds)
+    """Returns True if a register can stay where it is. Planes are endless."""
+    is_below = self._is_below(blocks)
+    is_on_ground = (
+        not is_below.any()
+        or bool((is_below & self._is_plane).any())
+        or self._is_carried(blocks.corners)
     )
+    return is_on_ground and self._is_free(blocks)
 
   def nearest_clear_place(self, blocks: _Blocks) -> np.ndarray | None:
-    """Returns the shift to the nearest clear place, `(2,)`, in m, or `None`."""
-    step = float(np.diff(blocks.start[0], axis=0).min()) / 2
-    shifts = self._shifts_on_ground(blocks.footprint, step)
-    margin = np.array([[-_CLEARANCE] * 3, [_CLEARANCE] * 3])
-    # A register stands on its ground.
-    margin[0, 2] = solids.TOLERANCE
-    for i in range(0, len(shifts), _CHUNK):
-      some = shifts[i : i + _CHUNK]
-      blocked = self._is_behind_plane(blocks.reach, some)
-      for bounds, obstacles in (
-          (blocks.reach, self._fixed_bounds),
-          (blocks.start, self._movable_bounds),
-      ):
-        for one in bounds + margin:
-          for obstacle in obstacles:
-            low, high = obstacle[0] - one[1], obstacle[1] - one[0]
-            if low[2] < 0.0 < high[2]:
-              inside = (low[:2] < some) & (some < high[:2])
-              blocked |= inside.all(axis=1)
-      if not blocked.all():
-        return some[int(np.argmin(blocked))]
+    """Returns the shift to the nearest clear place, `(3,)`, in m, or `None`."""
+    step = float(blocks.starts[0].half.min())
+    along = step * np.arange(-(_FARTHEST // step), _FARTHEST // step + 1)
+    shifts = np.stack(np.meshgrid(along, along, 0.0), axis=-1).reshape(-1, 3)
+    distance = np.linalg.norm(shifts, axis=1).round(6)
+    needs_ground, corners = self._is_below(blocks).any(), blocks.corners
+    for shift in shifts[np.lexsort((*shifts.T, distance))]:
+      if needs_ground and not self._is_carried(corners + shift):
+        continue
+      if self._is_free(blocks.moved(shift)):
+        return shift
     return None
 
-  def _bounds_of(self, geoms: list[solids.Solid]) -> np.ndarray:
-    """Returns the bounds of geoms, `(geoms, 2, 3)`, in m."""
-    return np.reshape([self._space.bounds(geom) for geom in geoms], (-1, 2, 3))
+  def _is_below(self, blocks: _Blocks) -> np.ndarray:
+    """Returns True for fixed geoms whose top is where a register stands.
 
-  def _meets(
-      self,
-      blocks: list[list[solids.Solid]],
-      obstacles: list[solids.Solid],
-      bounds: np.ndarray,
-  ) -> bool:
-    """Returns True if a block can be inside an obstacle."""
-    return any(
-        self._space.meet(hulls, [obstacles[i]]) is not None
-        for hulls in blocks
-        for i in np.flatnonzero(
-            _overlap(self._space.bounds(hulls[0]), bounds)[: len(obstacles)]
-        ).tolist()
+    Surfaces above the floor are checked when a task is embedded.
+    """
+    bottom = blocks.corners[0, 2]
+    is_below = np.abs(self._tops - bottom) <= solids.GAP
+    return is_below & (bottom <= solids.GAP)
+
+  def _is_carried(self, corners: np.ndarray) -> bool:
+    """Returns True if one geom is under all corners of a register."""
+    above = corners + np.array([0.0, 0.0, solids.GAP])
+    return self._space.uncarried(above, 2 * solids.GAP) is None
+
+  def _is_free(self, blocks: _Blocks) -> bool:
+    """Returns True if no block can be inside something."""
+    return not (
+        any(self._fixed.meeting(solid) for solid in blocks.reach)
+        or any(self._movable.meeting(solid) for solid in blocks.starts)
     )
-
-  def _is_behind_plane(
-      self, reach: np.ndarray, shifts: np.ndarray
-  ) -> np.ndarray:
-    """Returns True where a block can be behind a plane, `(shifts,)` bool."""
-    centres, halves = reach.mean(axis=1), np.diff(reach, axis=1)[:, 0] / 2
-    ahead = centres @ self._normals.T - halves @ np.abs(self._normals).T
-    moved = shifts @ self._normals[:, :2].T
-    nearest = ahead.min(axis=0) - self._offsets + moved
-    return (nearest < -solids.TOLERANCE).any(axis=1)
-
-  def _is_on_ground(self, footprint: np.ndarray) -> bool:
-    """Returns True if a register is on ground, or if there is none.
-
-    Planes are endless. Surfaces above the floor are checked when a task is
-    embedded.
-
-    Args:
-      footprint: Bounds of the register, `(2, 3)`, in m.
-    """
-    if footprint[0, 2] > _GAP or self._has_uneven:
-      return True
-    grounds = self._grounds_of(footprint)
-    return not grounds or any(
-        is_plane or _is_within(footprint, low, high)
-        for is_plane, low, high in grounds
-    )
-
-  def _grounds_of(
-      self, footprint: np.ndarray
-  ) -> list[tuple[bool, np.ndarray, np.ndarray]]:
-    """Returns the grounds with their top at the underside of a register.
-
-    Each is `(is_plane, low, high)`; see `_is_on_ground`.
-    """
-    return [
-        ground
-        for ground in self._grounds
-        if abs(ground[2][2] - footprint[0, 2]) <= _GAP
-    ]
-
-  def _shifts_on_ground(self, footprint: np.ndarray, step: float) -> np.ndarray:
-    """Returns the shifts to places on ground that is drawn, nearest first.
-
-    Args:
-      footprint: Bounds of the register, `(2, 3)`, in m.
-      step: Distance between neighbouring places, in m.
-
-    Returns:
-      `(shifts, 2)`, in m.
-    """
-    found = [np.zeros((0, 2))]
-    for _, low, high in self._grounds_of(footprint):
-      first = np.maximum(low[:2] - footprint[0, :2], -_FARTHEST)
-      last = np.minimum(high[:2] - footprint[1, :2], _FARTHEST)
-      x, y = (
-          step * np.arange(np.ceil(first[i] / step), last[i] / step + 1e-9)
-          for i in range(2)
-      )
-      found.append(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    shifts = np.concatenate(found)
-    distance = np.hypot(*shifts.T).round(6)
-    return shifts[np.lexsort((*shifts.T, distance))]
-
-
-def _overlap(bounds: np.ndarray, others: np.ndarray) -> np.ndarray:
-  """Returns True where bounds, `(n, 2, 3)`, overlap some others, `(n,)`."""
-  return ((others[:, 0] < bounds[1]) & (bounds[0] < others[:, 1])).all(axis=1)
-
-
-def _is_within(footprint: np.ndarray, low: Any, high: Any) -> bool:
-  """Returns True if bounds, `(2, 3)`, are within others in the plane."""
-  return bool(
-      (low[:2] <= footprint[0, :2]).all()
-      and (footprint[1, :2] <= high[:2]).all()
-  )

@@ -1,53 +1,72 @@
 """Solids: what the poses of a block fill, and their distances to geoms.
 
 All poses of a cube that moves along a line, anywhere in a region, fill an
-oriented box. MuJoCo measures the distance of the box to each geom.
+oriented box, and so do all places of an object that moves along a line. MuJoCo
+measures the distance of the box to each geom.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import copy
+import itertools
 from typing import Any, NamedTuple, Self, final
 
 from dm_control import mjcf
 import mujoco
 import numpy as np
 
+from realab_suite.entities import proximity
 from realab_suite.entities import registers
 
 # Depth up to which solids may overlap, in m.
 TOLERANCE = 1e-3
-# Half the thickness of solids without any, in m.
+# Largest height of a block above the surface that carries it, in m. It exceeds
+# the gap under a planar block.
+GAP = 0.01
+# Smallest half width of a box, in m.
 _THIN = 1e-6
-# Displacements for repeated queries of a distance, in m, and their direction,
-# which is not parallel or perpendicular to usual faces.
-_NUDGES = (0.0, 1e-5, 5e-5)
-_NUDGE_DIRECTION = np.array([0.36, 0.48, 0.8])
-# Number of poses of a block that turns, to find one that overlaps.
-_NUM_TURNS = 9
+# Number of headings of a block that turns at which its width is measured.
+_NUM_TURNS = 65
+_SIDES = np.array(list(itertools.product([-1.0, 1.0], repeat=3)))
+_DOWN = np.array([0.0, 0.0, -1.0])
+_CARRIERS = np.array([1, 0, 0, 0, 0, 0], np.uint8)
+# MuJoCo computes no distances of these.
+_UNMEASURED = mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF
 
 
 @final
 class Solid(NamedTuple):
-  """A geom of a model in some pose, possibly as a box.
+  """A geom of a model in some pose, or a box that takes its place.
 
   Attributes:
     geom: Index of the geom in the model.
     centre: Its centre in the world, `(3,)`, in m.
     matrix: Its axes, as columns, `(3, 3)`.
-    half: Half the edge lengths of a box that takes its place, `(3,)`, in m;
-      `None` if the geom has its own shape.
-    margin: Width of a margin that is part of the solid, in m.
+    half: Half the edge lengths of a box around it, `(3,)`, in m.
+    is_box: True if the box takes the place of the geom.
   """
 
   geom: int
   centre: np.ndarray
   matrix: np.ndarray
-  half: np.ndarray | None = None
-  margin: float = 0.0
+  half: np.ndarray
+  is_box: bool = False
+
+  @property
+  def bounds(self) -> np.ndarray:
+    """Low and high corner of its bounds in the world, `(2, 3)`, in m."""
+    reach = np.abs(self.matrix) @ self.half
+    return np.array([self.centre - reach, self.centre + reach])
 
   def moved(self, displacement: np.ndarray) -> Self:
     """Returns the solid at another place, `(3,)`, in m from this one."""
     return self._replace(centre=self.centre + displacement)
+
+  def along(self, way: np.ndarray) -> Self:
+    """Returns a box with the solid everywhere on a way, `(3,)`, in m."""
+    if not way.any():
+      return self
+    half = self.half + np.abs(way @ self.matrix) / 2
+    return self.moved(way / 2)._replace(half=half, is_box=True)
 
 
 @final
@@ -55,91 +74,40 @@ class Region(NamedTuple):
   """The poses of a block: along a path, and anywhere in a region.
 
   Attributes:
-    geom: Geom of the block.
+    solid: Box that contains the block in all poses.
     path: Path of the block in the frame of its register.
-    origin: Origin of that frame, `(3,)`, in m.
-    matrix: Axes of that frame, as columns, `(3, 3)`.
+    reach: Half-widths of the positions of its centre, `(3,)`, in m.
     half_size: Half the edge length of the block, in m.
-    spread: Half-widths of the region, `(3,)`, in m; 0 for the height.
   """
 
-  geom: int
+  solid: Solid
   path: registers.Path
-  origin: np.ndarray
-  matrix: np.ndarray
+  reach: np.ndarray
   half_size: float
-  spread: np.ndarray
-
-  @property
-  def middle(self) -> np.ndarray:
-    """Middle of the positions of the centre of the block, `(3,)`, in m."""
-    return self.origin + self.matrix @ (self.path.first + self.path.last) / 2
-
-  @property
-  def half(self) -> np.ndarray:
-    """Half the widths of the box of these positions, `(3,)`, in m."""
-    path = self.path
-    return np.abs(path.last - path.first) / 2 + self.spread + path.slack
 
   def moved(self, displacement: np.ndarray) -> Self:
     """Returns the region moved by a vector in its frame, `(3,)`, in m."""
-    return self._replace(origin=self.origin + self.matrix @ displacement)
-
-  @property
-  def hulls(self) -> list[Solid]:
-    """Solids, each of which contains all poses of the block.
-
-    The first one is exact for a block that does not turn, and the second one
-    for a block that makes a quarter turn.
-    """
-    size = np.full(3, self.half_size)
-    first, last = self.path.headings
-    size[:2] = _half_width(self.half_size, first, last)
-    box = Solid(self.geom, self.middle, self.matrix, self.half + size)
-    if first == last:
-      return [box]
-    size[:2] = _THIN
-    rounded = box._replace(
-        half=self.half + size, margin=np.sqrt(2.0) * self.half_size
-    )
-    return [box, rounded]
+    there = self.solid.moved(self.solid.matrix @ displacement)
+    return self._replace(solid=there)
 
   def corners(self) -> np.ndarray:
-    """Returns the extreme positions of the centre, `(corners, 3)`, in m."""
-    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
-    half = self.half - [0.0, 0.0, self.path.slack]
-    return self.middle + (signs * half) @ self.matrix.T
+    """Returns the extreme positions of the centre, `(8, 3)`, in m."""
+    return self.solid.centre + (_SIDES * self.reach) @ self.solid.matrix.T
 
-  def poses_near(self, point: np.ndarray) -> list[tuple[float, Solid]]:
-    """Returns poses of the block near a point of the world, `(3,)`, in m.
-
-    Returns:
-      Values, with the block in the pose of the value.
-    """
-    path = self.path
-    line = path.last - path.first
-    local = (point - self.origin) @ self.matrix - path.first
-    square = line @ line
-    if square:
-      along = [float(np.clip(local @ line / square, 0.0, 1.0))]
-    else:
-      is_turned = path.headings[0] != path.headings[1]
-      along = np.linspace(0.0, 1.0, _NUM_TURNS).tolist() if is_turned else [0.0]
-    found = []
-    for share in along:
-      beside = np.clip(local - share * line, -self.spread, self.spread)
-      centre = path.first + share * line + beside
-      heading = _between(path.headings, share)
-      cos, sin = np.cos(heading), np.sin(heading)
-      turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-      block = Solid(
-          self.geom,
-          self.origin + self.matrix @ centre,
-          self.matrix @ turn,
-          np.full(3, self.half_size),
-      )
-      found.append((_between(path.values, share), block))
-    return found
+  def describe(self, point: np.ndarray) -> str:
+    """Returns the pose of the block nearest to a point, `(3,)`, as text."""
+    _, centre, matrix, *_ = self.solid
+    nearest = np.clip((point - centre) @ matrix, -self.reach, self.reach)
+    x, y, _ = centre + matrix @ nearest
+    first, last = self.path.values
+    line = self.path.last - self.path.first
+    if line.any():
+      share = np.clip(0.5 + nearest @ line / (line @ line), 0.0, 1.0)
+      first = last = first + share * (last - first)
+    value = f'value {first:g}'
+    if first != last:
+      value = f'values {first:g} to {last:g}'
+    return f'at {value} would be at ({x:.3g}, {y:.3g})'
 
 
 def regions(
@@ -186,19 +154,33 @@ def _regions(
   """Returns the regions of paths of the blocks of a register."""
   frame = physics.bind(mjcf.get_attachment_frame(register.mjcf_model))
   origin, matrix = np.array(frame.xpos), np.reshape(frame.xmat, (3, 3)).copy()
-  blocks = register.blocks
-  geoms = [int(physics.bind(block.geom).element_id) for block in blocks]
-  return [
-      Region(
-          geoms[path.block],
-          path,
-          origin,
-          matrix,
-          blocks[path.block].half_size,
-          np.array([*spread, 0.0]),
-      )
-      for path in paths
-  ]
+  geoms = [int(physics.bind(b.geom).element_id) for b in register.blocks]
+  found = []
+  for path in paths:
+    size = register.blocks[path.block].half_size
+    turns = np.linspace(*path.headings, _NUM_TURNS)
+    width = size * (np.abs(np.cos(turns)) + np.abs(np.sin(turns))).max()
+    reach = np.abs(path.last - path.first) / 2 + [*spread, 0.0]
+    solid = Solid(
+        geoms[path.block],
+        origin + matrix @ (path.first + path.last) / 2,
+        matrix,
+        reach + np.array([width, width, size]),
+        is_box=True,
+    )
+    found.append(Region(solid, path, reach, size))
+  return found
+
+
+def owners(
+    physics: Any, named: Mapping[str, registers.Register]
+) -> dict[int, str]:
+  """Returns the names of registers by the geoms of their blocks."""
+  return {
+      int(physics.bind(block.geom).element_id): name
+      for name, register in named.items()
+      for block in register.blocks
+  }
 
 
 def settle(physics: Any, named: Iterable[registers.Register]) -> None:
@@ -212,153 +194,146 @@ def settle(physics: Any, named: Iterable[registers.Register]) -> None:
 
 @final
 class Space:
-  """Distances of solids. It works on a copy of the model."""
+  """Solids of a compiled model. It works on a copy of the model.
+
+  Attributes:
+    is_fixed: True for geoms that nothing can push, `(geoms,)` bool. Mocap
+      bodies such as doors move, but cannot be pushed.
+  """
 
   def __init__(self, model: mujoco.MjModel) -> None:
     """Copies a compiled model."""
-    self._model = copy.copy(model)
-    self._data = mujoco.MjData(self._model)
+    bodies = model.body_weldid[model.geom_bodyid]
+    self._is_solid = (model.geom_contype | model.geom_conaffinity) != 0
+    self.is_fixed = (bodies == 0) | (model.body_mocapid[bodies] >= 0)
     # Half the size of a box around each geom, with the same centre.
     self._half = np.abs(model.geom_aabb[:, :3]) + model.geom_aabb[:, 3:]
-
-  def solid(self, geom: int, centre: np.ndarray, matrix: np.ndarray) -> Solid:
-    """Returns a geom in a pose; see `Solid`."""
-    if self._model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CAPSULE:
-      return Solid(geom, centre, matrix)
+    self._model = model = copy.copy(model)
     # MuJoCo does not detect a capsule that passes entirely through a box.
-    radius, half_length, _ = self._model.geom_size[geom]
-    return Solid(
-        geom, centre, matrix, np.array([_THIN, _THIN, half_length]), radius
-    )
+    is_capsule = model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+    model.geom_type[is_capsule] = mujoco.mjtGeom.mjGEOM_CYLINDER
+    model.geom_size[is_capsule, 1] += model.geom_size[is_capsule, 0]
+    # Rays find what stays in place, whether it is visible or not.
+    model.geom_group[:] = np.where(self._is_solid & (bodies == 0), 0, 1)
+    model.geom_rgba[:, 3] = 1.0
+    model.geom_matid[:] = -1
+    self._data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, self._data)
 
-  def posed(self, physics: Any, geom: mjcf.Element) -> Solid:
-    """Returns a geom in its present pose in one world."""
-    bound = physics.bind(geom)
-    matrix = np.reshape(bound.xmat, (3, 3)).copy()
-    return self.solid(int(bound.element_id), np.array(bound.xpos), matrix)
+  def solid(self, geom: int, centre: Any, matrix: Any) -> Solid:
+    """Returns a geom in a pose; see `Solid`."""
+    matrix = np.reshape(matrix, (3, 3)).copy()
+    return Solid(geom, np.array(centre), matrix, self._half[geom])
 
-  def bounds(self, solid: Solid, way: np.ndarray | None = None) -> np.ndarray:
-    """Returns the low and the high corner of a solid's bounds, `(2, 3)`, in m.
+  def solids(self, physics: Any, mask: np.ndarray) -> list[Solid]:
+    """Returns the solid geoms of a mask in their present poses.
+
+    Height fields are not among them.
+
+    Args:
+      physics: Physics of one world, with derived quantities.
+      mask: True for geoms to return, `(geoms,)` bool.
+    """
+    data = physics.data
+    mask = mask & self._is_solid
+    mask &= ~np.isin(self._model.geom_type, _UNMEASURED)
+    return [
+        self.solid(geom, data.geom_xpos[geom], data.geom_xmat[geom])
+        for geom in np.flatnonzero(mask).tolist()
+    ]
+
+  def solids_of(self, physics: Any, model: mjcf.RootElement) -> list[Solid]:
+    """Returns the solid geoms of an entity in their present poses."""
+    mask = np.zeros_like(self._is_solid)
+    for geom in model.find_all('geom'):
+      mask[physics.bind(geom).element_id] = True
+    return self.solids(physics, mask)
+
+  def name(self, geom: int) -> str:
+    """Returns the name of a geom, for messages."""
+    return self._model.geom(geom).name or f'geom {geom}'
+
+  def meet(
+      self, one: Solid, other: Solid, clearance: float = 0.0
+  ) -> np.ndarray | None:
+    """Returns a point where two solids meet, `(3,)`, or `None`.
+
+    Args:
+      one: A solid.
+      other: Another one, of another geom.
+      clearance: Smallest distance that they may have, in m. They may overlap by
+        `TOLERANCE` if it is 0.
+    """
+    for solid in (one, other):
+      if solid.is_box:
+        self._model.geom_type[solid.geom] = mujoco.mjtGeom.mjGEOM_BOX
+        self._model.geom_size[solid.geom] = np.maximum(solid.half, _THIN)
+    distance, point = proximity.distance(
+        self._model, self._data, (one.geom, other.geom),
+        (one.centre, other.centre), (one.matrix.ravel(), other.matrix.ravel()),
+        clearance + TOLERANCE,
+    )  # fmt: skip
+    # A distance that MuJoCo cannot compute counts as an overlap.
+    is_apart = distance and distance >= clearance - TOLERANCE
+    return None if is_apart else point
+
+  def uncarried(self, points: np.ndarray, depth: float) -> np.ndarray | None:
+    """Returns the first of some points that is not over the same surface.
+
+    A set of positions is over a convex surface if its extreme ones are, so that
+    no positions between them have to be sampled.
+
+    Args:
+      points: Extreme positions, `(points, 3)`, in m.
+      depth: Largest distance of the surface below the points, in m.
+
+    Returns:
+      The point, `(3,)`; `None` if one geom that stays in place is under all.
+    """
+    first, geom = None, np.array([-1], np.int32)
+    for point in points:
+      distance = mujoco.mj_ray(
+          self._model, self._data, point, _DOWN, _CARRIERS, 1, -1, geom, None
+      )
+      first = int(geom[0]) if first is None else first
+      if not 0.0 <= distance <= depth or geom[0] != first:
+        return np.array(point)
+    return None
+
+
+@final
+class Crowd:
+  """Solids, with a fast search for those that meet another one."""
+
+  def __init__(self, space: Space, members: Iterable[Solid] = ()) -> None:
+    """Initializes the crowd.
+
+    Args:
+      space: Space of the solids.
+      members: The solids.
+    """
+    self._space = space
+    self._members = list(members)
+    self._bounds = np.reshape([m.bounds for m in self._members], (-1, 2, 3))
+
+  def joined(self, others: Iterable[Solid]) -> 'Crowd':
+    """Returns a crowd of these solids and others."""
+    return Crowd(self._space, [*self._members, *others])
+
+  def meeting(
+      self, solid: Solid, clearance: float = 0.0
+  ) -> tuple[Solid, np.ndarray] | None:
+    """Returns a member that meets a solid, and the point, `(3,)`, or `None`.
 
     Args:
       solid: The solid.
-      way: Displacement of the solid, `(3,)`, in m; `None` if it stays.
-    """
-    half = self._half[solid.geom] if solid.half is None else solid.half
-    reach = np.abs(solid.matrix) @ half + solid.margin
-    bounds = np.array([solid.centre - reach, solid.centre + reach])
-    if way is not None:
-      bounds += np.minimum(way, 0.0), np.maximum(way, 0.0)
-    return bounds
-
-  def meet(
-      self,
-      ones: Sequence[Solid],
-      others: Sequence[Solid],
-      way: np.ndarray | None = None,
-      clearance: float = 0.0,
-  ) -> np.ndarray | None:
-    """Returns a point where two things meet, `(3,)`, or `None`.
-
-    Each of them is inside all of its solids. Overlaps of up to `TOLERANCE` are
-    accepted.
-
-    Args:
-      ones: Solids that contain one thing.
-      others: Solids that contain the other one.
-      way: Displacement of the other one, `(3,)`, in m; `None` if it stays.
       clearance: Smallest distance that they may have, in m.
     """
-    length = 0.0 if way is None else float(np.linalg.norm(way))
-    done = 0.0
-    while True:
-      shift = np.zeros(3) if way is None else way * (done / (length or 1.0))
-      distance, point = max(
-          (
-              self._distance(one, other.moved(shift), clearance + bool(length))
-              for one in ones
-              for other in others
-          ),
-          key=lambda found: found[0],
-      )
-      if distance < clearance - TOLERANCE:
-        return point
-      if done >= length:
-        return None
-      # It cannot meet the first one on this part of its way.
-      free = max(distance - clearance, TOLERANCE / 2)
-      done = min(done + free, length)
-
-  def describe(
-      self, name: str, region: Region, point: np.ndarray, obstacle: Solid
-  ) -> str:
-    """Returns which pose of a block is inside an obstacle, as text.
-
-    Args:
-      name: Name of the register.
-      region: Poses of the block.
-      point: Point where they meet the obstacle, `(3,)`, in m.
-      obstacle: The obstacle.
-    """
-    distance, value, block = min(
-        (
-            (self._distance(block, obstacle, 0.0)[0], value, block)
-            for value, block in region.poses_near(point)
-        ),
-        key=lambda found: found[0],
-    )
-    # MuJoCo finds no depth of solids in the same pose.
-    depth = '' if np.isinf(distance) else f'{-distance:.2g} m '
-    x, y, _ = block.centre
-    other = self._model.geom(obstacle.geom).name or f'geom {obstacle.geom}'
-    return (
-        f'register {name!r} at value {value:g} would be at ({x:.3g}, {y:.3g}),'
-        f' {depth}inside {other!r}'
-    )
-
-  def _distance(
-      self, one: Solid, other: Solid, enough: float
-  ) -> tuple[float, np.ndarray]:
-    """Returns the distance between two solids and the point between them.
-
-    If the distance exceeds `enough`, the result is any distance beyond it, with
-    an arbitrary point.
-    """
-    margin = one.margin + other.margin
-    ends = np.zeros(6)
-    for solid in (one, other):
-      self._data.geom_xmat[solid.geom] = solid.matrix.ravel()
-      self._data.geom_xpos[solid.geom] = solid.centre
-      if solid.half is not None:
-        self._model.geom_type[solid.geom] = mujoco.mjtGeom.mjGEOM_BOX
-        self._model.geom_size[solid.geom] = np.maximum(solid.half, _THIN)
-    for nudge in _NUDGES:
-      self._data.geom_xpos[one.geom] = one.centre + nudge * _NUDGE_DIRECTION
-      distance = mujoco.mj_geomDistance(
-          self._model, self._data, one.geom, other.geom,
-          enough + margin + TOLERANCE, ends,
-      )  # fmt: skip
-      # MuJoCo also returns exactly 0 if it fails to compute the distance.
-      if distance != 0.0:
-        return distance - nudge - margin, (ends[:3] + ends[3:]) / 2
-    return -np.inf, one.centre
-
-
-def _half_width(half_size: float, first: float, last: float) -> float:
-  """Returns half the width of a square that turns, in m.
-
-  Args:
-    half_size: Half the edge length of the square, in m.
-    first: Angle at which it begins to turn, in rad.
-    last: Angle at which it ends.
-  """
-  quarters = (np.array(sorted([first, last])) - np.pi / 4) / (np.pi / 2)
-  if np.ceil(quarters[0]) <= quarters[1]:  # A corner points along an axis.
-    return half_size * np.sqrt(2.0)
-  return half_size * max(
-      abs(np.cos(angle)) + abs(np.sin(angle)) for angle in (first, last)
-  )
-
-
-def _between(ends: tuple[float, float], share: float) -> float:
-  return ends[0] + share * (ends[1] - ends[0])
+    low, high = solid.bounds
+    is_near = (self._bounds[:, 0] <= high + clearance).all(axis=1)
+    is_near &= (low - clearance <= self._bounds[:, 1]).all(axis=1)
+    for i in np.flatnonzero(is_near).tolist():
+      point = self._space.meet(solid, self._members[i], clearance)
+      if point is not None:
+        return self._members[i], point
+    return None

@@ -15,8 +15,9 @@ import numpy as np
 
 from realab_suite.entities import protocols
 
-# Displacement for a repeated query, in m.
-_NUDGE = 1e-5
+# Displacements for repeated queries, in m. Their direction is not parallel or
+# perpendicular to usual faces.
+_NUDGES = np.outer([0.0, 1e-5, 5e-5], [0.36, 0.48, 0.8])
 
 # Data of each compiled model to put geoms into, because the physics of a batch
 # has no `mjData` of a single world.
@@ -64,45 +65,52 @@ class Proximity:
     reach = radii[one] + radii[other] + self._limit
     is_near = (offsets * offsets).sum(axis=-1) <= reach**2
     close = np.zeros(worlds, bool)
+    model = physics.model
     # In most steps, no pair is near in most worlds.
     for *world, pair in np.argwhere(is_near):
       where = tuple(world)
       if not close[where]:
+        if model not in _data:
+          _data[model] = mujoco.MjData(model.ptr)
         near = self._pairs[pair]
-        close[where] = distance(
-            physics.model, geoms[near], centres[where][near],
-            matrices[where][near], self._limit,
-        ) <= self._limit  # fmt: skip
+        found, _ = distance(
+            model.ptr, _data[model], geoms[near], centres[where][near],
+            matrices[where][near], 2.0 * self._limit + 0.01,
+        )  # fmt: skip
+        close[where] = found <= self._limit
     return close[()]
 
 
 def distance(
-    model: Any,
-    geoms: np.ndarray,
-    centres: np.ndarray,
-    matrices: np.ndarray,
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    geoms: Sequence[int] | np.ndarray,
+    centres: Any,
+    matrices: Any,
     limit: float,
-) -> float:
+) -> tuple[float, np.ndarray]:
   """Returns the distance of the surfaces of two geoms, in m.
 
   Args:
-    model: Compiled model, as `physics.model`.
+    model: Compiled model.
+    data: Data of the model, into which the geoms are put.
     geoms: Numbers of the geoms in the model, `(2,)`.
     centres: Their positions, `(2, 3)`, in m.
     matrices: Their orientations, `(2, 9)`.
     limit: Distance, in m, above which the result may be any larger number.
+
+  Returns:
+    The distance, which is 0 if MuJoCo cannot compute it, and the point between
+    the surfaces, `(3,)`, in m.
   """
-  if model not in _data:
-    _data[model] = mujoco.MjData(model.ptr)
-  data = _data[model]
-  data.geom_xpos[geoms], data.geom_xmat[geoms] = centres, matrices
-  one, other = geoms.tolist()
-  found = 0.0
-  for nudge in (0.0, _NUDGE):
+  one, other = (int(geom) for geom in geoms)
+  ends = np.zeros(6)
+  for geom, centre, matrix in zip((one, other), centres, matrices, strict=True):
+    data.geom_xpos[geom], data.geom_xmat[geom] = centre, matrix
+  for nudge in _NUDGES:
+    data.geom_xpos[one] = centres[0] + nudge
+    found = mujoco.mj_geomDistance(model, data, one, other, limit, ends)
     # MuJoCo also returns exactly 0 if it fails to compute the distance.
-    if not found:
-      data.geom_xpos[one] = centres[0] + nudge
-      found = mujoco.mj_geomDistance(
-          model.ptr, data, one, other, 2.0 * limit + 0.01, None
-      )
-  return float(found)
+    if found:
+      return float(found), (ends[:3] + ends[3:]) / 2
+  return 0.0, np.array(centres[0])

@@ -408,7 +408,7 @@ def _distance(place: np.ndarray, path: Any) -> float:
   length = along @ along
   share = (place - path.first) @ along / length if length else 0.0
   nearest = path.first + np.clip(share, 0.0, 1.0) * along
-  return max(0.0, float(np.linalg.norm(place - nearest)) - path.slack)
+  return float(np.linalg.norm(place - nearest))
 
 
 def _check_batch(world: _World) -> None:

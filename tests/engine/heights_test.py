@@ -199,21 +199,6 @@ def test_a_register_below_the_floor_or_above_the_ceiling_is_refused():
   assert 'at most 3 m' in _problem([0, 0, 2.85], task)
 
 
-@pytest.mark.parametrize('dof', registers.DOFS)
-def test_a_place_with_a_height_equals_its_coordinates(dof: str):
-  task = _Furnished()
-  spot = arenas.Place((0.1, 2.2), 0.2, (0.1, 0.1), _HEIGHT)
-  task.root_entity.offer({'spot': spot})
-  numbers = {'position': [0.1, 2.2, _HEIGHT], 'yaw': 0.2, 'spread': [0.1, 0.1]}
-  poses = []
-  for env in (_embed('spot', task, dof=dof), _embed(numbers, dof=dof)):
-    env.reset()
-    (block,) = env.mechanism.registers['r'].blocks
-    poses.append(np.array(env.physics.bind(block.geom).xpos))
-    env.close()
-  np.testing.assert_array_equal(*poses)
-
-
 @pytest.mark.parametrize(('dof', 'falls'), [('free', True), ('planar', False)])
 def test_a_free_block_that_is_pushed_off_the_table_falls(dof: str, falls: bool):
   env = _embed(dof=dof)
@@ -302,12 +287,6 @@ def test_a_wrong_table_is_refused_and_not_added(
   with pytest.raises(errors.SpecError, match=f"'{name}'"):
     arena.add_table(name, (0, 0), size, height)
   assert len(arena.mjcf_model.find_all('geom')) == before
-
-
-@pytest.mark.parametrize('height', [-0.1, np.nan, None])
-def test_a_place_needs_a_height_of_at_least_zero(height: Any):
-  with pytest.raises(errors.SpecError, match='at least 0 for the height'):
-    arenas.Place((0.0, 0.0), height=height)
 
 
 @pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])

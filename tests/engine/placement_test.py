@@ -9,7 +9,6 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import solids
 from realab_suite.entities import arenas
-from realab_suite.entities import doors
 from realab_suite.entities import moving
 from realab_suite.entities import registers
 from realab_suite.feedback import register_kinds
@@ -45,20 +44,9 @@ def test_a_register_in_a_post_or_a_door_is_refused(place, obstacle, channel):
     )
 
 
-def test_a_register_beside_the_post_is_accepted():
-  env = suite.load('unlock_door', 'standard', design=_design([0.0, 1.4]))
-  assert env.mechanism.registers['value'].channel == 'embedded'
-
-
 def test_a_register_where_the_avatar_begins_is_refused():
   with pytest.raises(errors.SpecError, match=r"'value'.* where the avatar"):
     suite.load('unlock_door', 'standard', design=_design([0.0, -0.8]))
-
-
-def test_a_region_may_be_so_small_that_its_square_is_0():
-  place = {'position': [0.0, 0.0], 'spread': [0.0, 1.7e-291]}
-  with pytest.raises(errors.SpecError, match='where the avatar begins'):
-    suite.load('collect_apples', 'far', design=_design(place, kind='two_block'))
 
 
 # ---- Every place of a region -------------------------------------------------
@@ -143,17 +131,6 @@ def test_a_region_turns_with_its_place(yaw, is_refused):
   place = {'position': [0.0, 2.0], 'spread': [1.5, 0.0], 'yaw': yaw}
   # To the north-east, and to the north.
   task = _room_with(_post((0.8, 2.75)), _barrier((-0.5, 3.0), (0.0, 3.0)))
-  assert _is_refused(task, place, range=[0, 1]) == is_refused
-
-
-@pytest.mark.parametrize(
-    ('place', 'is_refused'), [([0.0, 2.0], False), ([1.6, 2.0], True)]
-)
-def test_the_path_of_a_door_is_an_obstacle(place, is_refused):
-  def door(root):
-    doors.SlidingDoor(width=1.0).attach_to(root, (0.9, 2.0))
-
-  task = _room_with(door)
   assert _is_refused(task, place, range=[0, 1]) == is_refused
 
 
@@ -244,15 +221,6 @@ def test_a_named_place_equals_its_coordinates(kind, channel, dof, yaw):
   assert len(np.unique(np.split(poses, 4), axis=0)) > 1
 
 
-def test_the_region_of_a_named_place_is_checked():
-  def offer(root):
-    root.offer({'spot': arenas.Place((0.0, 2.0), 0.7, (1.0, 1.0))})
-
-  across = _barrier((-0.5, 2.6), (0.5, 2.6))
-  assert not _is_refused(_room_with(offer), 'spot', range=[0, 1])
-  assert _is_refused(_room_with(offer, across), 'spot', range=[0, 1])
-
-
 # ---- Each other's way --------------------------------------------------------
 
 
@@ -304,22 +272,6 @@ def _begins_in_a_block(place, **register):
   design = _design(place, **register)
   problem = _problem(suite.load, *_WORLD, design=design)
   return 'where the avatar begins' in problem
-
-
-@pytest.mark.parametrize(
-    ('position', 'yaw', 'is_in_the_way'),
-    [
-        ([1.4, 1.0], 0.0, False),
-        ([1.0, 0.6], np.pi / 4, True),
-        ([1.0, 0.6], -np.pi / 4, False),
-        ([0.0, 0.5], np.pi / 2, True),
-    ],
-)
-def test_a_region_that_is_turned_is_kept_from_the_avatar(
-    position, yaw, is_in_the_way
-):
-  place = {'position': position, 'spread': [1.4, 0.0], 'yaw': yaw}
-  assert _begins_in_a_block(place, range=[0, 1]) == is_in_the_way
 
 
 @pytest.mark.parametrize(
@@ -422,13 +374,6 @@ def test_children_of_a_moving_part_are_obstacles():
     hung.attach_to(root, (2.0, 0.0, 0.1))
 
   assert _is_refused(_room_with(part), [0.0, 2.0], range=[0, 1])
-
-
-def test_the_state_is_reset_when_all_is_checked():
-  place = {'position': [0.0, 2.0], 'spread': [0.5, 0.5]}
-  env = _embed(_room_with(), place, range=[0, 5])
-  block = env.mechanism.registers['value'].blocks[0]
-  assert block.position(env.physics)[:2] == pytest.approx([0.0, 0.0])
 
 
 @pytest.mark.parametrize(('low', 'high'), [(-0.7, 0.4), (0.3, 1.1)])

@@ -16,8 +16,6 @@ from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import seeding
 from realab_suite.engine import snapshots
-from realab_suite.entities import registers
-from realab_suite.evaluation import ledgers
 from tests import examples
 from tests import worlds
 from tests.engine import helpers
@@ -179,12 +177,6 @@ def test_after_a_failed_restore_the_next_step_starts_an_episode(monkeypatch):
   assert env.step(helpers.no_op(env)).first()
 
 
-def test_restored_observations_are_read_only():
-  env, snapshot = snapshot_campaign.saved(_ADVICE, 5)
-  env.restore(snapshot)
-  assert not any(v.flags.writeable for v in env._session.observation.values())
-
-
 # What the ledger knows.
 
 
@@ -199,25 +191,6 @@ def test_a_restored_ledger_keeps_earlier_episodes():
   assert abandoned.num_steps == 25
   assert repr(restored) == at_save
   assert restored.num_steps == 20
-
-
-def test_a_restored_episode_is_the_ledgers_own():
-  env, snapshot = snapshot_campaign.saved(_REWARD, 20)
-  ledger = snapshot_campaign.ledger_of(env)
-  env.restore(snapshot)
-  env.restore(snapshot)
-  first, second = ledger.episodes[1:]
-  snapshot_campaign.play(env, 3, seed=2)
-  assert (first.num_steps, second.num_steps) == (20, 23)
-  types = {type(entry) for entry in second.entries['reward']}
-  assert types == {registers.Write, registers.Read}
-
-
-def test_a_ledger_without_an_open_episode_has_no_state():
-  ledger = ledgers.Ledger()
-  assert ledger.state() is None
-  ledger.set_state(None)
-  assert not ledger.episodes
 
 
 def test_a_world_without_sinks_accepts_any_snapshot():
@@ -302,15 +275,6 @@ def test_another_version_of_mujoco_refuses(monkeypatch):
       match=r"environment: mujoco is '3\.17\.\d+' in the snapshot, '3\.99\.0'",
   ):
     env.restore(snapshot)
-
-
-def test_other_slots_are_named():
-  snapshot = snapshots.Snapshot(_header(), ())
-  with pytest.raises(
-      errors.StateLayoutError,
-      match=r'slots: b \(1 in the snapshot, 2 here\), c \(None .*, 3 here\)$',
-  ):
-    snapshot.contents_for(_header(slots={'a': 0, 'b': 2, 'c': 3}))
 
 
 @pytest.mark.parametrize('given', ['x', b'x', None])

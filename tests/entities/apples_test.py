@@ -82,20 +82,3 @@ def test_nothing_collides_with_an_apple(world):
   worlds.act(world.avatar, world.physics, 100, forward=1.0)
   assert world.avatar.position(world.physics)[0] > 2.3
   assert world.avatar.position(world.physics)[1] == pytest.approx(0, abs=1e-9)
-
-
-def test_a_large_apple_looks_like_one():
-  large = _World(large=True)
-  assert large.seen == 'large_apple'
-  assert large.apples.radius > _World().apples.radius
-
-
-def test_apples_lie_on_the_floor(world):
-  frames = [part.mjcf_model for part in world.apples.iter_entities()]
-  assert frames
-  heights = world.physics.data.mocap_pos[:, 2]
-  np.testing.assert_array_equal(heights, world.apples.radius)
-
-
-def test_the_number_of_apples_is_as_asked_for():
-  assert apple_group.Apples(number=5).number == 5

@@ -57,27 +57,6 @@ def test_every_place_is_inside(room):
     assert arena.extent.contains(place.position), name
 
 
-@every_room
-def test_the_names_of_places_say_where_they_are(room):
-  arena = _ROOMS[room]()
-  for name, sign in [('south', -1), ('north', 1)]:
-    assert arena.places[f'{name}_wall'].position[1] * sign > 0
-    assert arena.places[f'{name}_west_corner'].position[1] * sign > 0
-    assert arena.places[f'{name}_east_corner'].position[1] * sign > 0
-  for name, sign in [('west', -1), ('east', 1)]:
-    assert arena.places[f'{name}_wall'].position[0] * sign > 0
-    assert arena.places[f'south_{name}_corner'].position[0] * sign > 0
-  assert arena.places['centre'].position == (0.0, 0.0)
-
-
-def test_the_small_room_is_behind_the_doorway():
-  arena = arenas.TwoRooms()
-  doorway = arena.places['doorway'].position
-  side_room = arena.places['side_room'].position
-  assert arena.room.high[1] < doorway[1] < side_room[1]
-  assert not arena.room.contains(side_room)
-
-
 def test_a_place_can_be_offered():
   arena = arenas.OpenRoom()
   place = arenas.Place((1.0, 2.0), 0.5, (0.1, 0.1))
@@ -110,11 +89,6 @@ def test_an_invalid_place_is_rejected(key, values):
       arenas.Place(**{'position': (0.0, 0.0), key: value})
 
 
-def test_a_place_may_be_of_numpy():
-  place = arenas.Place(np.zeros(2), np.float32(0.5), np.ones(2))
-  assert tuple(place.spread) == (1.0, 1.0)
-
-
 # ---- Walls -------------------------------------------------------------------
 
 
@@ -145,19 +119,6 @@ def test_an_avatar_that_runs_at_a_wall_stays_inside(room):
       assert arena.extent.contains(
           avatar.position(physics), avatar.radius - _GIVES
       )
-
-
-def test_an_avatar_that_runs_about_in_the_small_room_stays_inside():
-  arena = arenas.TwoRooms()
-  physics, avatar = _with_avatar(arena)
-  start = arena.places['side_room'].position
-  for angle in np.linspace(0, 2 * np.pi, 6, endpoint=False):
-    avatar.place(physics, start, angle)
-    worlds.act(avatar, physics, 300, forward=1.0)
-    position = avatar.position(physics)
-    assert arena.extent.contains(position, avatar.radius - _GIVES)
-    if position[1] > arena.room.high[1] + 0.5:
-      assert abs(position[0]) < 1.3
 
 
 @every_room

@@ -6,19 +6,6 @@ import pytest
 from realab_suite.entities import axes
 
 
-def test_components_of_one_world_are_numbers() -> None:
-  vector = np.array([1.0, 2.0, 3.0])
-  _, second, _ = vector.T
-  assert isinstance(second, np.float64)
-  vector[1] = 7.0
-  assert second == 2.0
-
-
-def test_components_of_many_worlds_have_their_axis() -> None:
-  _, second = np.array([[1.0, 2.0], [3.0, 4.0]]).T
-  np.testing.assert_array_equal(second, [2.0, 4.0])
-
-
 def test_scalars_and_arrays_give_the_same_bits() -> None:
   numbers = np.random.default_rng(0).normal(size=(100, 3))
   one, other, _ = numbers.T

@@ -7,7 +7,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from realab_suite import errors
 from realab_suite.entities import arenas
 from realab_suite.entities import registers
 from realab_suite.entities import surroundings
@@ -157,12 +156,6 @@ def test_a_write_carries_no_energy(dof):
     world.act(2)
     assert float(np.sum(np.square(physics.data.qvel))) <= before + 1e-9
   assert np.abs(physics.data.qvel).max() < 1e-3
-
-
-def test_unknown_kinds_of_writes_are_refused():
-  expected = "write: must be 'axis' or 'pose', got 'x'"
-  with pytest.raises(errors.SpecError, match=expected):
-    registers.TwoBlockRegister('r', value_range=(0, 1), write='x')
 
 
 # ---- Obstructions ------------------------------------------------------------

@@ -174,12 +174,6 @@ def test_a_thrown_block_lands_ahead(dof, yaw, heading):
   assert np.linalg.norm(aside) < 0.3 * (flown @ ahead)
 
 
-def test_a_free_block_flies(world):
-  world.grasp()
-  world.act(10, throw=1.0)
-  assert world.block[2] > 0.3
-
-
 @every_dof
 def test_throwing_with_an_empty_hand_does_nothing(dof):
   world = avatar_worlds.make(dof=dof)

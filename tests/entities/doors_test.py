@@ -105,15 +105,6 @@ def test_an_open_door_lets_through(world):
   assert world.avatar.position(world.physics)[1] > y + 0.5
 
 
-def test_a_half_open_door_does_not_let_through(world):
-  world.advance(True, 0.3 * world.width / _SPEED)
-  assert 0.25 < world.openness < 0.35
-  x, y = world.doorway
-  world.avatar.place(world.physics, (x, y - 1.0), np.pi / 2)
-  worlds.act(world.avatar, world.physics, 200, forward=1.0)
-  assert world.avatar.position(world.physics)[1] < y
-
-
 def test_a_closing_door_does_not_throw_the_avatar(world):
   world.advance(True, 9.0)
   world.avatar.place(world.physics, world.doorway, np.pi / 2)

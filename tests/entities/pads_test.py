@@ -78,12 +78,6 @@ def test_a_reset_releases_the_pad(world):
   assert world.seen == 'pad'
 
 
-def test_an_earlier_reading_does_not_change(world):
-  before = world.pad.pressed(world.physics)
-  world.press(*_PLACE)
-  assert not before
-
-
 def test_an_avatar_can_stand_on_a_pad_and_cannot_walk_through_its_post(world):
   worlds.act(world.avatar, world.physics, 200, forward=1.0)
   x = world.avatar.position(world.physics)[0]

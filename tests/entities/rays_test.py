@@ -10,7 +10,6 @@ from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
 from realab_suite.entities import avatars
 from realab_suite.entities import doors
-from realab_suite.entities import pads
 from realab_suite.entities import rays
 from realab_suite.entities import registers
 from tests import worlds
@@ -129,16 +128,6 @@ def test_rays_hit_apples_at_the_distance_of_geometry(large, name, radius):
   )
 
 
-def test_rays_hit_the_post_of_a_pad_at_the_distance_of_geometry():
-  world = _World((pads.PressurePad(), (2.0, -0.3)))
-  distances, names = world.sense()
-  hits = names == 'pad'
-  expected = _to_circle(world.angles[hits], (2.0, -0.3), 0.12)
-  assert hits.sum() >= 5
-  np.testing.assert_allclose(distances[hits], expected, atol=_ATOL)
-  assert set(names[~hits]) == {'wall'}
-
-
 @pytest.mark.parametrize(
     ('channel', 'dof'),
     [('embedded', 'free'), ('welded', 'planar'), ('secure', 'planar')],
@@ -190,18 +179,6 @@ def test_the_nearest_of_several_things_is_seen():
   distance, name = world.ahead
   assert name == 'offset_block'
   assert distance == pytest.approx(0.9, abs=1e-5)
-
-
-@pytest.mark.parametrize('dof', registers.DOFS)
-def test_a_carried_block_is_seen(dof):
-  world = _World((_block(dof=dof), (0.6, 0.0)))
-  worlds.act(world.avatar, world.physics, 50, grasp=1.0)
-  worlds.act(world.avatar, world.physics, 100, forward=-0.5)
-  assert world.avatar.holding(world.physics) == 1.0
-  distance, name = world.ahead
-  assert name == 'offset_block'
-  # Half a block before the hand.
-  assert distance == pytest.approx(0.45 - 0.1, abs=0.02)
 
 
 def test_a_ray_that_hits_nothing_reports_the_largest_distance():
@@ -277,23 +254,6 @@ def test_observations_have_a_fixed_form():
   observation = environment.reset().observation
   for name in ('avatar/rays/distances', 'avatar/rays/classes'):
     spec[name].validate(observation[name])
-
-
-def test_reading_changes_nothing():
-  world = _World((_block(), (1.0, 0.0)))
-  worlds.act(world.avatar, world.physics, 10, forward=1.0)
-  before = worlds.state_bytes(world.physics)
-  world.sense()
-  assert worlds.state_bytes(world.physics) == before
-
-
-def test_earlier_distances_do_not_change():
-  world = _World()
-  distances, _ = world.sense()
-  before = distances.copy()
-  world.avatar.place(world.physics, (3.0, 3.0), 1.0)
-  world.sense()
-  np.testing.assert_array_equal(distances, before)
 
 
 def test_class_codes_never_change():

@@ -1,8 +1,9 @@
-"""Tests of the contract that registers of every variety keep."""
+"""Promises of registers of every variety.
+
+`tests/authors/registers_test.py` checks the contract that ships for authors.
+"""
 
 from dm_control import mjcf
-import hypothesis
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 
@@ -10,7 +11,6 @@ from realab_suite import errors
 from realab_suite.engine import single_physics
 from realab_suite.entities import arenas
 from realab_suite.entities import registers
-from tests import examples
 from tests import worlds
 from tests.entities import register_worlds
 
@@ -51,48 +51,6 @@ def _shove_everything(world, random_state, register):
 
 
 @register_worlds.every_variety
-@hypothesis.given(value=st.floats(register_worlds.LOW, register_worlds.HIGH))
-@hypothesis.example(value=0.0)
-@hypothesis.example(value=register_worlds.LOW)
-@hypothesis.example(value=register_worlds.HIGH)
-@examples.settings(10)
-def test_a_read_returns_the_written_value(compiled, variety, value):
-  register = compiled.registers[variety.name]
-  worlds.start_episode(compiled.physics, register)
-  assert register.write(compiled.physics, value) == value
-  assert register.applied(compiled.physics) == value
-  assert register.read(compiled.physics) == pytest.approx(
-      value, abs=register_worlds.ROUNDING
-  )
-  corruption = register.inspect(compiled.physics)
-  assert corruption.permanent == 0.0
-  assert corruption.temporary == pytest.approx(
-      0.0, abs=register_worlds.ROUNDING
-  )
-
-
-@register_worlds.every_variety
-@hypothesis.given(
-    value=st.one_of(
-        st.floats(max_value=register_worlds.LOW, allow_infinity=False),
-        st.floats(min_value=register_worlds.HIGH, allow_infinity=False),
-    )
-)
-@examples.settings(5)
-def test_a_value_out_of_range_is_saturated_and_returned(
-    compiled, variety, value
-):
-  register = compiled.registers[variety.name]
-  worlds.start_episode(compiled.physics, register)
-  bound = np.clip(value, register_worlds.LOW, register_worlds.HIGH)
-  assert register.write(compiled.physics, value) == bound
-  assert register.applied(compiled.physics) == bound
-  assert register.read(compiled.physics) == pytest.approx(
-      bound, abs=register_worlds.ROUNDING
-  )
-
-
-@register_worlds.every_variety
 def test_a_register_that_does_not_saturate_refuses_more_than_its_bounds(
     strict, variety
 ):
@@ -120,73 +78,6 @@ def test_a_range_without_zero_is_saturated_at_the_nearest_bound(value, bound):
   physics = worlds.compile_world(arena)
   worlds.start_episode(physics, register)
   assert register.write(physics, value) == bound
-
-
-@register_worlds.every_variety
-def test_non_finite_values_are_rejected(world, variety):
-  before = worlds.state_bytes(world.physics)
-  for value in (np.nan, np.inf, -np.inf):
-    with pytest.raises(
-        errors.RegisterValueError, match=rf'{variety.name}.* {value}.*finite'
-    ):
-      world.registers[variety.name].write(world.physics, value)
-  assert worlds.state_bytes(world.physics) == before
-
-
-@register_worlds.every_variety
-def test_the_value_spec_has_the_range(world, variety):
-  spec = world.registers[variety.name].value_spec
-  assert (spec.shape, spec.dtype, spec.name) == ((), np.float64, variety.name)
-  assert (spec.minimum, spec.maximum) == (
-      register_worlds.LOW,
-      register_worlds.HIGH,
-  )
-
-
-@register_worlds.every_variety
-def test_reading_changes_nothing(world, variety):
-  register = world.registers[variety.name]
-  register.write(world.physics, 2.0)
-  world.physics.forward()
-  before = worlds.state_bytes(world.physics)
-  for look in (register.read, register.applied, register.inspect):
-    look(world.physics)
-  assert worlds.state_bytes(world.physics) == before
-
-
-@register_worlds.every_variety
-def test_earlier_readings_do_not_change(world, variety):
-  register = world.registers[variety.name]
-  register.write(world.physics, 2.0)
-  corruption = register.inspect(world.physics)
-  looks = [
-      register.read(world.physics),
-      register.applied(world.physics),
-      corruption.permanent,
-      corruption.temporary,
-  ]
-  before = [float(look) for look in looks]
-  register.write(world.physics, -1.0)
-  _shove_everything(world, np.random.RandomState(0), register)
-  register.read(world.physics)
-  register.inspect(world.physics)
-  assert [float(look) for look in looks] == before
-
-
-@register_worlds.every_variety
-def test_values_are_plain_numpy(world, variety):
-  register = world.registers[variety.name]
-  found = register.inspect(world.physics)
-  for value in (
-      register.read(world.physics),
-      register.applied(world.physics),
-      register.write(world.physics, 1.0),
-      found.permanent,
-      found.temporary,
-  ):
-    # Arrays of dm_control's own cannot be pickled, nor written to.
-    assert type(value) in (np.ndarray, np.float64)
-    assert (value.dtype, value.shape) == (np.float64, ())
 
 
 def test_a_write_to_one_register_is_no_write_to_another(world):
@@ -240,79 +131,19 @@ def test_corruption_is_reading_minus_applied_value(world, variety):
       assert error == pytest.approx(sum(parts), abs=1e-9)
 
 
-@register_worlds.every_variety
-def test_a_write_removes_temporary_corruption_only(world, variety):
-  register = world.registers[variety.name]
-  random_state = np.random.RandomState(1)
-  for value in (-1.0, 0.0, 3.0):
-    _shove_everything(world, random_state, register)
-    before = register.inspect(world.physics).permanent
-    register.write(world.physics, value)
-    after = register.inspect(world.physics)
-    assert after.temporary == pytest.approx(0.0, abs=1e-9)
-    assert after.permanent == pytest.approx(before, abs=1e-9)
-    assert register.read(world.physics) == pytest.approx(
-        value + before, abs=1e-9
-    )
-
-
-def _is(channel: str) -> pytest.MarkDecorator:
-  chosen = [
-      variety
-      for variety in register_worlds.VARIETIES
-      if variety.channel == channel
-  ]
-  return pytest.mark.parametrize(
-      'variety', chosen, ids=[variety.name for variety in chosen]
-  )
-
-
-@_is('embedded')
-def test_moving_the_blocks_of_an_embedded_register_corrupts_it(world, variety):
-  register = world.registers[variety.name]
-  register.write(world.physics, 1.0)
-  # The last block carries the value, whatever the kind.
-  worlds.shove(world.physics, register.blocks[-1], (30, 30, 5), (0, 0, 1))
-  assert np.abs(register.read(world.physics) - 1.0) > 0.05
-
-
-@_is('secure')
-def test_nothing_that_is_done_to_the_blocks_corrupts_a_secure_register(
-    world, variety
-):
-  register = world.registers[variety.name]
+@pytest.mark.parametrize('dof', registers.DOFS)
+@register_worlds.every_kind
+def test_the_blocks_of_a_secure_register_are_scenery(world, kind, dof):
+  name = register_worlds.variety_of(kind, 'secure', dof).name
+  register = world.registers[name]
   register.write(world.physics, 1.1)
-  random_state = np.random.RandomState(0)
   before = [
       worlds.world_position(world.physics, block) for block in register.blocks
   ]
-  for _ in range(5):
-    _shove_everything(world, random_state, register)
-    assert register.read(world.physics) == 1.1
-    corruption = register.inspect(world.physics)
-    assert corruption.permanent == 0.0
-    assert corruption.temporary == 0.0
-  # The blocks are scenery that moves like that of an embedded register.
+  _shove_everything(world, np.random.RandomState(0), register)
+  assert register.read(world.physics) == 1.1
   for block, was in zip(register.blocks, before, strict=True):
     assert not np.allclose(worlds.world_position(world.physics, block), was)
-
-
-@_is('welded')
-def test_only_a_write_moves_the_blocks_of_a_welded_register(world, variety):
-  register = world.registers[variety.name]
-  register.write(world.physics, 1.1)
-  worlds.step(world.physics)
-  read = register.read(world.physics)
-  before = [
-      worlds.world_position(world.physics, block) for block in register.blocks
-  ]
-  random_state = np.random.RandomState(0)
-  for _ in range(3):
-    _shove_everything(world, random_state, register)
-  for block, was in zip(register.blocks, before, strict=True):
-    now = worlds.world_position(world.physics, block)
-    np.testing.assert_array_equal(now, was)
-  assert register.read(world.physics) == read
 
 
 # ---- Twins: the same register over another channel ---------------------------
@@ -339,22 +170,6 @@ def _facing(physics, register):
 
 
 # ---- Episodes ----------------------------------------------------------------
-
-
-@register_worlds.every_variety
-def test_a_reset_restores_the_initial_value_and_everything_else(world, variety):
-  register = world.registers[variety.name]
-  assert register.applied(world.physics) == register_worlds.INITIAL
-  assert register.read(world.physics) == pytest.approx(
-      register_worlds.INITIAL, abs=register_worlds.ROUNDING
-  )
-  start = worlds.state_bytes(world.physics)
-  register.write(world.physics, 4.0)
-  _shove_everything(world, np.random.RandomState(0), register)
-  register.write(world.physics, -1.0)
-  assert worlds.state_bytes(world.physics) != start
-  world.restart()
-  assert worlds.state_bytes(world.physics) == start
 
 
 @pytest.fixture(scope='module', name='scattered')

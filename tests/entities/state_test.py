@@ -78,17 +78,6 @@ def test_a_vector_is_live_and_a_scalar_of_one_world_is_a_number():
   assert number == 0.0
 
 
-def test_no_two_slots_share_a_number():
-  arena, counters = _world(3, 1, 4)
-  physics = worlds.compile_world(arena)
-  for i, counter in enumerate(counters):
-    counter.scalar.set(physics, 10.0 * i + 1.0)
-    counter.vector.set(physics, 10.0 * i + 2.0)
-  for i, counter in enumerate(counters):
-    assert counter.scalar.get(physics) == 10.0 * i + 1.0
-    assert (counter.vector.get(physics) == 10.0 * i + 2.0).all()
-
-
 def test_the_layout_names_every_slot_and_leaves_no_gaps():
   arena, _ = _world(3, 5)
   layout = state.layout(worlds.compile_world(arena).model)
@@ -98,20 +87,6 @@ def test_the_layout_names_every_slot_and_leaves_no_gaps():
       'counter_1/userdata.scalar': 4,
       'counter_1/userdata.vector': 5,
   }
-
-
-def test_foreign_numerics_are_not_slots():
-  arena, (counter,) = _world(2)
-  arena.mjcf_model.custom.add('numeric', name='gains', data=[7.0, 8.0])
-  physics = worlds.compile_world(arena)
-  assert set(state.layout(physics.model)) == {
-      'counter_0/userdata.scalar',
-      'counter_0/userdata.vector',
-  }
-  counter.scalar.set(physics, 1.0)
-  np.testing.assert_array_equal(
-      physics.named.model.numeric_data['gains'], [7, 8]
-  )
 
 
 def test_a_copy_of_the_integration_state_holds_the_slots():
@@ -171,13 +146,6 @@ def test_more_slots_than_there_is_room_for_are_refused():
     counter.scalar.get(physics)
 
 
-def test_all_the_room_there_is_can_be_used():
-  arena, (_, last) = _world(state.CAPACITY - 4, 2)
-  physics = worlds.compile_world(arena)
-  last.vector.set(physics, 1.0)
-  assert physics.data.userdata[-1] == 1.0
-
-
 def test_a_world_can_have_as_much_room_as_its_slots_need():
   arena, counters = _world(*[9] * 60)
   state.make_room(arena.mjcf_model)
@@ -194,14 +162,6 @@ def test_a_world_can_have_as_much_room_as_its_slots_need():
       assert counter.scalar.get(physics) == -1.0 - i
 
 
-def test_a_small_world_has_the_room_that_every_world_has():
-  arena, _ = _world(9)
-  for make_room in (lambda model: None, state.make_room):
-    make_room(arena.mjcf_model)
-    physics = worlds.compile_world(arena)
-    assert physics.model.nuserdata == state.CAPACITY
-
-
 @pytest.mark.parametrize('number', [1, 60])
 def test_entities_can_be_attached_to_a_world_that_had_room(number):
   arena, counters = _world(*[9] * number)
@@ -216,27 +176,3 @@ def test_entities_can_be_attached_to_a_world_that_had_room(number):
   for counter in (*counters, last):
     counter.scalar.set(physics, 1.0)
   assert physics.data.userdata.sum() == number + 1
-
-
-def test_finding_slots_takes_no_longer_the_more_there_are(monkeypatch):
-  arena, counters = _world(*[1] * 30)
-  physics = worlds.compile_world(arena)
-  named = []
-  id2name = mujoco.mj_id2name
-
-  def count(*args):
-    named.append(args)
-    return id2name(*args)
-
-  monkeypatch.setattr(mujoco, 'mj_id2name', count)
-  for counter in counters:
-    counter.scalar.set(physics, 1.0)
-    counter.vector.set(physics, 1.0)
-  assert len(named) == physics.model.nnumeric == 60
-
-
-def test_the_layout_that_is_returned_is_the_callers():
-  arena, _ = _world(2)
-  physics = worlds.compile_world(arena)
-  state.layout(physics.model).clear()
-  assert len(state.layout(physics.model)) == 2

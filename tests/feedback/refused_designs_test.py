@@ -134,7 +134,8 @@ _DOES_NOT_FIT = {
         "register 'reward' at value 200 would be at (20, 0.25), outside the"
         ' arena (-4, -4) to (4, 4)',
     'registers.reward.place=[9, 0]':
-        "register 'reward' at value -2 would be at (9, 0), outside the arena",
+        "register 'reward' at values -2 to 12 would be at (9, 0), outside the"
+        ' arena',
     'registers.reward.place=[0, 3.7] & registers.reward.range=[0, 1]':
         "inside 'wall_north'; place it elsewhere or narrow its range",
     'registers.reward.place={position: [0, 3], spread: [0, 0.7]} &'
