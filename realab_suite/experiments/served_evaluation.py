@@ -162,7 +162,7 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
         )
         stack.callback(agent.stop)
       say(f'serving {world.domain}.{world.task} at {listener.address}')
-      signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
+      listener.stop_on(signal.SIGTERM)
       # Takes half a minute, in which the agent starts and its requests wait.
       evaluation.measure()
     listener.run()

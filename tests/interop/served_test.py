@@ -1,6 +1,5 @@
 """Tests of served worlds over a socket: clients, and how their episodes end."""
 
-from concurrent import futures
 import contextlib
 import signal
 import threading
@@ -54,33 +53,11 @@ def test_a_stock_client_gets_what_an_agent_in_the_process_gets(serving):
   assert serving.ends()[before : before + 2] == ['timeout', 'timeout']
 
 
-def test_a_second_client_is_refused_at_once():
-  is_asked, may_answer = threading.Event(), threading.Event()
-
-  def hold(world):
-    answer = world.answer
-
-    def answer_later(request):
-      is_asked.set()
-      may_answer.wait(patience.SECONDS)
-      return answer(request)
-
-    world.answer = answer_later
-
-  with (
-      served.in_thread(alter=hold) as serving,
-      served.Client(serving.address) as first,
-      futures.ThreadPoolExecutor(1) as pool,
-  ):
-    joined = pool.submit(first.join)
-    is_asked.wait(patience.SECONDS)
-    # While the world is busy with the first one's request.
+def test_a_second_client_is_refused_at_once(serving):
+  with served.join_eventually(serving.address) as first:
     with served.Client(serving.address) as second:
       with pytest.raises(grpc.RpcError) as caught:
         second.join()
-    assert not joined.done()
-    may_answer.set()
-    joined.result()
     assert caught.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
     assert caught.value.details() == 'R17: another agent is connected'
     assert first.step().state == pb.RUNNING

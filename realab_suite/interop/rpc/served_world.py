@@ -13,7 +13,6 @@ from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.interop.rpc import agent_port
-from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import sockets
 
 OnEpisode = Callable[[evaluate.EpisodeResult, str], None]
@@ -22,8 +21,11 @@ _ROOT = 0
 
 
 @final
-class ServedWorld(agent_server.Service):
-  """Service that answers an agent's requests and reports episode results."""
+class ServedWorld:
+  """World that answers an agent's requests and reports episode results.
+
+  All calls come from the thread that runs the server.
+  """
 
   def __init__(
       self,
@@ -54,6 +56,7 @@ class ServedWorld(agent_server.Service):
     self._isolation = results.SERVED
 
   def connect(self) -> None:
+    """Handles a new connection; no other agent connects until `disconnect`."""
     users = sockets.users_connected_to(self._address)
     # Root can read everything, and the same user can read this process. Without
     # a salt, the episodes can be computed from the public seed.
@@ -67,15 +70,18 @@ class ServedWorld(agent_server.Service):
     )
 
   def answer(self, request: bytes) -> bytes:
+    """Returns the answer to a request of the agent."""
     if self._num_left <= 0:
       self._port.finish()
     return self._port.answer(request)
 
   def disconnect(self) -> None:
+    """Handles the end of a connection, by the agent or by its timeout."""
     self._port.disconnect()
     self._env.abandon(events.End.DISCONNECT)
 
   def settle(self) -> bool:
+    """Reports ended episodes; returns True if there are more to serve."""
     for failure in self._failures:
       logging.error('the episode failed', exc_info=failure)
     self._failures.clear()
