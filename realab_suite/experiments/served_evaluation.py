@@ -151,15 +151,14 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
       stack.callback(listener.close)
       if settings.agent_command is not None:
         with storage.explained(output):
-          log = stack.enter_context(open(output / 'agent.log', 'wb'))
-        agent = agent_process.AgentProcess(
-            settings.agent_command,
-            listener.address,
-            log,
-            folder=settings.agent_folder,
-            owner=owner,
-            on_exit=listener.stop,
-        )
+          agent = agent_process.AgentProcess(
+              settings.agent_command,
+              listener.address,
+              output / 'agent.log',
+              folder=settings.agent_folder,
+              owner=owner,
+              on_exit=listener.stop,
+          )
         stack.callback(agent.stop)
       say(f'serving {world.domain}.{world.task} at {listener.address}')
       listener.stop_on(signal.SIGTERM)

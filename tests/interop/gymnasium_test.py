@@ -50,14 +50,7 @@ def test_worlds_are_not_copied_because_copies_expose_the_environment():
   single_world = _make()
   many = gym.make_vec(_NEAR, num_envs=2, **_SHORT).unwrapped
   for env in (single_world, many):
-    for take in (
-        copy.copy,
-        copy.deepcopy,
-        pickle.dumps,
-        lambda one: one.__getstate__(),
-        lambda one: one.__reduce__(),
-        lambda one: one.__reduce_ex__(2),
-    ):
+    for take in (copy.copy, copy.deepcopy, pickle.dumps):
       with pytest.raises(TypeError, match='cannot be pickled or copied'):
         take(env)
     env.close()
@@ -195,9 +188,10 @@ def test_actions_of_another_shape_or_type_are_refused(action):
     ('options', 'message'),
     [
         ({'reward_register': 'score'}, r"allowed are None .*\['reward'\]"),
-        ({'dtype': 'float16'}, "allowed are 'float32' and 'float64'"),
+        ({'dtype': 'float16'}, "must be 'float32' or 'float64'"),
         ({'render_mode': 'human'}, 'rgb_array'),
         ({'camera_name': 'nowhere'}, 'camera'),
+        ({'colour': 'red'}, "unknown key 'colour'"),
     ],
 )
 def test_wrong_options_are_refused(options, message):
