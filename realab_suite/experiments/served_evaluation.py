@@ -115,13 +115,13 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
       address = f'unix:{folder}/socket'
     output = _make_private_folder(settings.output)
     described = dataclasses.asdict(settings)
-    served_run.write(
-        output,
-        {**described.pop('world'), **described},
-        design.to_mapping(),
-        seed.salt,
-        results.versions(),
-    )
+    record = {
+        'settings': {**described.pop('world'), **described},
+        'design': design.to_mapping(),
+        'versions': results.versions(),
+        'salt': seed.salt.hex(),
+    }
+    storage.write_sealed(output / served_run.NAME, record)
     evaluation = stack.enter_context(
         evaluations.Evaluation(
             world, design, output, say, control=None, why_no_control=_NO_CONTROL
