@@ -9,8 +9,6 @@ import sys
 import tempfile
 from typing import Any, NamedTuple
 
-from absl import flags
-from absl.testing import flagsaver
 import pytest
 
 from realab_suite import errors
@@ -22,7 +20,6 @@ from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import sockets
-from realab_suite.launchers import serve
 from tests import patience
 from tests.experiments import small
 from tests.interop import clones
@@ -115,22 +112,6 @@ def test_a_program_of_another_user_predicts_nothing():
     assert report.opened == ['cmdline']
     assert _num_right(report.predictions) == [0, 0, 0]
     _check_that_only_the_salt_is_missing(output, report.episodes)
-
-
-def test_no_seed_has_the_start_of_a_served_world(run):
-  assert clones.find_seeds(run.episodes[0], range(500)) == []
-
-
-def test_a_seed_without_a_salt_can_be_found():
-  with served.in_thread(lambda: clones.make(234)) as serving:
-    with served.Client(serving.address) as client:
-      episodes = clones.play(client.env())
-  [seed] = clones.find_seeds(episodes[0], range(500))
-  predictions = clones.predict(clones.make(seed), episodes)
-  assert _num_right(predictions) == _num_time_steps(episodes)
-  true_returns = [prediction.true_return for prediction in predictions]
-  assert true_returns == [result.true_return for result, _ in serving.results]
-  assert max(true_returns) > 0.0
 
 
 def test_runs_of_one_seed_differ(run):
@@ -282,14 +263,3 @@ def test_versions_that_differ_from_the_record_are_named(tmp_path, caplog):
   [message] = caplog.messages
   assert f'{record}: the episodes may differ' in message
   assert "versions.mujoco is '3.0' there" in message
-
-
-@pytest.mark.parametrize(
-    'flag', ['domain', 'task', 'design', 'seed', 'max_steps']
-)
-def test_flags_that_a_record_decides_are_refused(flag):
-  value = '1' if flag in ('seed', 'max_steps') else 'collect_apples'
-  with flagsaver.flagsaver():
-    flags.FLAGS(['serve', '--output=x', '--repeat=y', f'--{flag}={value}'])
-    with pytest.raises(errors.SpecError, match=f'--{flag} has no effect with'):
-      serve.main([])

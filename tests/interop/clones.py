@@ -35,8 +35,6 @@ MAX_STEPS = 40
 NUM_EPISODES = 3
 # An action is held for so long, so that the avatar gets somewhere.
 _HELD = 10
-# In metres; the sense is a float32.
-_TOLERANCE = 1e-5
 
 
 class Episode(NamedTuple):
@@ -173,25 +171,6 @@ def predict(
       num_right = sum(here == there for here, there in pairs)
       predictions.append(Prediction(num_right, sink.true_return()))
   return predictions
-
-
-def find_seeds(episode: Episode, seeds: Iterable[int]) -> list[int]:
-  """Returns the seeds with which the first episode begins as this one does.
-
-  Args:
-    episode: The first episode of a served world.
-    seeds: The seeds to try.
-  """
-  with contextlib.closing(make(0)) as clone:
-    low, high = np.array(clone.task.start.low), np.array(clone.task.start.high)
-  middle, spread = (low + high) / 2, (high - low)[0] / 2
-  found = []
-  for seed in seeds:
-    stream = seeding.random_state(seed, 0, 0, 'reset/0')
-    guess = middle + stream.uniform(-spread, spread, 2)
-    if np.abs(guess - episode.position).max() < _TOLERANCE:
-      found.append(seed)
-  return found
 
 
 def attack(program: served.Program, user: int) -> Report:

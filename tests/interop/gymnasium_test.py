@@ -167,13 +167,6 @@ def test_an_end_of_the_task_terminates():
   assert (terminated, truncated) == (True, False)
 
 
-def test_actions_outside_the_space_are_refused():
-  env = _make()
-  env.reset()
-  with pytest.raises(errors.ActionError, match='outside'):
-    env.step(np.full(6, 1.1, np.float32))
-
-
 @pytest.mark.parametrize(
     'action', [0.5, [0.5], 'forward', [[0.0], [0.0, 0.0]], np.zeros(6, bool)]
 )
@@ -335,13 +328,6 @@ def test_wrong_masks_are_refused(mask):
   envs.reset()
   with pytest.raises(errors.SpecError, match='reset_mask'):
     envs.reset(options={'reset_mask': mask})
-
-
-def test_an_unknown_autoreset_mode_is_refused():
-  with pytest.raises(errors.SpecError, match='SameStep'):
-    registration.make_vector(
-        2, 'unlock_door', 'near', autoreset_mode='sometimes'
-    )
 
 
 def test_a_batch_takes_seeds_of_single_worlds():

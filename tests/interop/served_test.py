@@ -189,14 +189,6 @@ def test_compressed_messages_are_refused(serving):
   channel.close()
 
 
-def test_other_methods_are_unknown(serving):
-  with grpc.insecure_channel(serving.address) as channel:
-    call = channel.unary_unary('/grpc.reflection.v1.ServerReflection/Info')
-    with pytest.raises(grpc.RpcError) as caught:
-      call(b'')
-  assert caught.value.code() is grpc.StatusCode.UNIMPLEMENTED
-
-
 def test_after_the_last_episode_the_server_ends():
   with served.in_thread(num_episodes=1) as serving:
     with served.Client(serving.address) as client:
