@@ -1,6 +1,5 @@
 """Tests of the requests of agents, message by message, without a socket."""
 
-import dm_env
 from dm_env import specs
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
@@ -9,9 +8,7 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite.engine import agent_view
 from realab_suite.engine import events
-from realab_suite.interop.rpc import agent_port
 from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import tensors
 from tests.engine import helpers
@@ -24,8 +21,11 @@ _INVALID = code_pb2.INVALID_ARGUMENT
 
 def _make(design='instantaneous_reward', max_steps=20):
   env = served.load(design, max_steps)
-  port = agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
-  return env, port
+  return env, _serve(env)
+
+
+def _serve(env):
+  return served_world.ServedWorld(env, 'x', 10**6, lambda *unused: None)
 
 
 def _ask(port, **payload):
@@ -53,7 +53,7 @@ def _env():
 @pytest.fixture(name='port')
 def _port(env):
   env.abandon()
-  return agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
+  return _serve(env)
 
 
 @pytest.fixture(name='running')
@@ -143,39 +143,6 @@ def test_the_index_of_an_action_is_an_integer():
   index = np.array([0, 1], np.int32)
   assert _step(port, tensor_utils.pack_tensor(index)).step.state == pb.RUNNING
   env.close()
-
-
-class _Fails(dm_env.Environment):
-  """Ends with a discount, or raises an exception."""
-
-  def __init__(self, end):
-    self._end = end
-
-  def reset(self):
-    return dm_env.restart({'x': np.zeros(1)})
-
-  def step(self, action):
-    if isinstance(self._end, Exception):
-      raise self._end
-    return dm_env.TimeStep(
-        dm_env.StepType.LAST, 0.0, self._end, {'x': np.zeros(1)}
-    )
-
-  def observation_spec(self):
-    return {'x': specs.Array((1,), np.float64)}
-
-  def action_spec(self):
-    return specs.BoundedArray((1,), np.float64, -1, 1, name='a')
-
-
-@pytest.mark.parametrize(
-    ('discount', 'state'), [(0.0, pb.TERMINATED), (1.0, pb.INTERRUPTED)]
-)
-def test_the_discount_of_a_last_step_decides_its_state(discount, state):
-  port = agent_port.AgentPort(_Fails(discount), lambda: None)
-  _join(port)
-  _step(port)
-  assert _step(port, tensor_utils.pack_tensor([0.0])).step.state == state
 
 
 def test_a_served_episode_that_a_signal_ends_is_terminated_and_valid():
