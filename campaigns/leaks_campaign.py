@@ -238,9 +238,6 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
     public = walk.find(case)
     _explain(public)
     c12.at_most(f'secrets by public names, view {num_envs}', len(public), 0)
-    # Not promised: in one process, private names can be reached.
-    private = len(walk.secrets_reached(case))
-    print(f'# C12 {private} of {walk.NUM_SECRETS} by private names')
 
   scanned = failures.scan(max(1, round(scale * 2)), seed)
   _explain(scanned.found)

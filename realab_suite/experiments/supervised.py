@@ -261,7 +261,7 @@ class Supervision:
     message = self._server.receive(timeout)
     if message is None:
       return False
-    match message.content:
+    match message:
       case {'type': 'run' | 'pause' as kind}:
         self._is_running = kind == 'run'
       case {'type': 'hello'}:

@@ -234,8 +234,7 @@ def test_wrong_numbers_of_episodes_are_refused_first(tmp_path, number):
     ('agents', 'baselines', 'message'),
     [
         ({}, ['random'], 'agents: {}'),
-        ({'a': []}, ['random'], 'allowed is a list of functions'),
-        ({'a': _still}, ['random'], 'allowed is a list of functions'),
+        ({'a': []}, ['random'], 'at least one'),
         ({'random': [_still]}, ['random'], 'name of a baseline'),
         ({'no_op': [_still]}, ['random'], 'name of a baseline'),
         ({'a': [_still], 'b': [_still] * 2}, ['random'], 'equal numbers'),
