@@ -156,7 +156,7 @@ def _run(supervision, num_episodes):
   said = []
   world = worlds.World('unlock_door', 'near')
   policy = policies.make('no_op')
-  supervised.run(supervision, world, 'no_op', policy, num_episodes, said.append)
+  supervision.supervise(world, 'no_op', policy, num_episodes, said.append)
   [text] = said
   return text
 

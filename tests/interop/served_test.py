@@ -63,22 +63,6 @@ def test_a_second_client_is_refused_at_once(serving):
     assert first.step().state == pb.RUNNING
 
 
-def test_a_disconnect_ends_the_episode_and_frees_the_world(serving):
-  first = served.join_eventually(serving.address)
-  before = len(serving.results)
-  first.step()
-  first.step(np.zeros(6))
-  first.close()
-  second = served.join_eventually(serving.address)
-  assert second.step().state == pb.RUNNING
-  second.close()
-  patience.until(lambda: len(serving.results) == before + 2)
-  ended = [result for result, _ in serving.results[before:]]
-  assert [result.end.value for result in ended] == ['disconnect'] * 2
-  assert [result.num_steps for result in ended] == [1, 0]
-  assert not any(result.is_valid for result in ended)
-
-
 _STEPS_OF_TAMPERING = 80
 
 
