@@ -110,7 +110,9 @@ def test_a_program_of_another_user_predicts_nothing():
     assert isolation == {results.SERVED_TO_ANOTHER_USER}
     assert report.arguments['seed'] == str(_SEED)
     assert report.opened == ['cmdline']
-    assert _num_right(report.predictions) == [0, 0, 0]
+    clone = clones.make(int(report.arguments['seed']))
+    predictions = clones.predict(clone, report.episodes)
+    assert _num_right(predictions) == [0, 0, 0]
     _check_that_only_the_salt_is_missing(output, report.episodes)
 
 
