@@ -165,43 +165,48 @@ class Server:
     try:
       try:
         self._world.connect()
-        is_idle = await self._answer_all(context)
+        await self._answer_all(context)
       finally:  # Also if the client has cancelled the call.
         self._is_busy = False
         self._world.disconnect()
         self._settle()
         if not self._has_more:
           self._finish()
+    except TimeoutError:
+      if self._has_more:
+        logging.warning(
+            'no request from the agent for %g s; its connection ends',
+            self._idle_seconds,
+        )
+      # It fails if an answer is still on its way to an agent that reads none.
+      with contextlib.suppress(aio.InternalError):
+        await context.abort(grpc.StatusCode.CANCELLED, _OVER)
+    except aio.BaseError as error:
+      logging.info('the connection is broken: %s', error)
     except Exception as error:  # `run` raises it.
       self._finish(error)
-      return
-    if is_idle:
-      await context.abort(grpc.StatusCode.CANCELLED, _OVER)
 
-  async def _answer_all(self, context: Any) -> bool:
-    """Answers requests; returns True if the agent has been idle."""
+  async def _answer_all(self, context: Any) -> None:
+    """Answers requests until there are no more.
+
+    Raises:
+      TimeoutError: If the agent is idle, or does not read an answer.
+    """
     deadline = self._loop.time() + self._idle_seconds
     while True:
-      try:
-        async with asyncio.timeout_at(deadline):
-          request = await context.read()
-      except TimeoutError:
-        if self._has_more:
-          logging.warning(
-              'no request from the agent for %g s; its connection ends',
-              self._idle_seconds,
-          )
-        return True
+      async with asyncio.timeout_at(deadline):
+        request = await context.read()
       if request is aio.EOF:
-        return False
-      await context.write(self._world.answer(request))
-      # The agent does not wait for this.
-      had_more = self._has_more
-      self._settle()
+        return
+      answer = self._world.answer(request)
       if self._has_more:
         deadline = self._loop.time() + self._idle_seconds
-      elif had_more:
-        deadline = self._loop.time() + _LINGER_SECONDS
+      async with asyncio.timeout_at(deadline):
+        await context.write(answer)
+      if self._has_more:
+        self._settle()  # The agent does not wait for this.
+        if not self._has_more:
+          deadline = self._loop.time() + _LINGER_SECONDS
 
   def _settle(self) -> None:
     self._has_more = self._world.settle()
