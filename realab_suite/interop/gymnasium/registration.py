@@ -57,6 +57,10 @@ def make(
     raise
 
 
+make_vector = make
+"""Vector entry point: `gymnasium.make_vec` adds `num_envs`."""
+
+
 def id_of(domain_name: str, task_name: str, design: str) -> str:
   """Returns the id of a shipped world with a shipped design.
 
@@ -94,7 +98,7 @@ def register_all() -> None:
       gym.register(
           name,
           entry_point=f'{__name__}:make',
-          vector_entry_point=f'{__name__}:make',
+          vector_entry_point=f'{__name__}:make_vector',
           kwargs={
               'domain_name': domain_name,
               'task_name': task_name,
