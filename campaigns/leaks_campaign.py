@@ -1,4 +1,4 @@
-"""Campaigns C01, C05, C06, C08, C09, C11, C12, C17: an agent learns no secret.
+"""Campaigns C01, C05, C06, C08, C11, C12, C17: an agent learns no secret.
 
 Run from the root of the repository, about twelve minutes on one processor:
 
@@ -6,9 +6,8 @@ Run from the root of the repository, about twelve minutes on one processor:
 
 C01: the contract of `AgentView` and `BatchAgentView`, for every task and
 design. C08: pairs of runs that differ in a secret; in C05 the secret is the set
-of event sinks. C06: worlds stepped in turns. C09: planted leaks are found. C11:
-all observables are enabled. C12: paths from a view to secrets. C17: failures
-are provoked, and scanned.
+of event sinks. C06: worlds stepped in turns. C11: all observables are enabled.
+C12: paths from a view to secrets. C17: failures are provoked, and scanned.
 
 Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
 """
@@ -28,7 +27,6 @@ import numpy as np
 from campaigns import figure_lines
 from tests.leaks import contract
 from tests.leaks import failures
-from tests.leaks import mutants
 from tests.leaks import pairs
 from tests.leaks import secrets
 from tests.leaks import walk
@@ -187,21 +185,6 @@ def interleave(schedules: int, seed: int) -> Interleaving:
   return Interleaving(num_differing, num_changes)
 
 
-def uncaught(chosen: list[mutants.Mutant]) -> list[str]:
-  """Returns the planted leaks that no check finds."""
-  return [
-      f'{mutant.channel} {mutant.what}'
-      for mutant in chosen
-      if not mutants.found_by(mutant)
-  ]
-
-
-def false_alarms(chosen: list[mutants.Mutant]) -> list[str]:
-  """Returns the findings of checks without a planted leak."""
-  checks = dict.fromkeys(mutant.check for mutant in chosen)
-  return [complaint for check in checks for complaint in check()[:3]]
-
-
 def main(scale: float = 1.0, seed: int = 0) -> int:
   """Prints figures and returns the number of targets missed."""
   printed = []
@@ -241,20 +224,6 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
   c08.at_most(f'differing of {counts.num_pairs} pairs', counts.num_differing, 0)
   c08.at_most('of which the evaluator heard nothing', counts.num_silent, 0)
 
-  chosen = mutants.MUTANTS[:: max(1, round(0.1 / scale))]
-  c09 = lines('C09')
-  missed = uncaught(chosen)
-  _explain(missed)
-  c09.at_least(
-      f'leaks found of {len(chosen)}', len(chosen) - len(missed), len(chosen)
-  )
-  is_whole = len(chosen) == len(mutants.MUTANTS)
-  channels = {mutant.channel for mutant in chosen}
-  c09.at_least('channels', len(channels), 36 if is_whole else 1)
-  alarms = false_alarms(chosen)
-  _explain(alarms)
-  c09.at_most('found where nothing was planted', len(alarms), 0)
-
   found = [
       complaint
       for case in contract.all_cases()[:: max(1, round(1 / scale))]
@@ -269,9 +238,6 @@ def main(scale: float = 1.0, seed: int = 0) -> int:
     public = walk.find(case)
     _explain(public)
     c12.at_most(f'secrets by public names, view {num_envs}', len(public), 0)
-    # Not promised: in one process, private names can be reached.
-    private = len(walk.secrets_reached(case))
-    print(f'# C12 {private} of {walk.NUM_SECRETS} by private names')
 
   scanned = failures.scan(max(1, round(scale * 2)), seed)
   _explain(scanned.found)

@@ -37,12 +37,6 @@ class Uncopied(abc.ABC):  # noqa: B024 - It only refuses.
   def __reduce_ex__(self, protocol: Any) -> Any:
     raise TypeError(f'{type(self).__name__} cannot be pickled or copied')
 
-  def __reduce__(self) -> Any:
-    return self.__reduce_ex__(0)
-
-  def __getstate__(self) -> Any:
-    return self.__reduce_ex__(0)
-
 
 class _View(Uncopied):
   """Base class of the views of one world and of a batch.
@@ -223,11 +217,7 @@ class AgentView(_View, dm_env.Environment):
       env: Environment of one world.
       failures: List of the caller, to which the exceptions behind each
         `WorldError` are appended: error n is element n.
-
-    Raises:
-      SpecError: If `env` is not an `Environment`.
     """
-    _check_kind(env, environment.Environment)
     super().__init__(env, (), failures)
 
   def _restate(self, time_step: dm_env.TimeStep) -> dm_env.TimeStep:
@@ -261,11 +251,7 @@ class BatchAgentView(_View):
     Args:
       batch: Batch of worlds.
       failures: As in `AgentView`.
-
-    Raises:
-      SpecError: If `batch` is not a `BatchEnvironment`.
     """
-    _check_kind(batch, batch_environment.BatchEnvironment)
     super().__init__(batch, (batch.num_envs,), failures)
     self.__num_envs = batch.num_envs
 
@@ -299,13 +285,6 @@ class BatchAgentView(_View):
         np.zeros(len(is_last)),
         np.where(is_last, time_step.discount, 1.0),
         self._filtered(time_step.observation),
-    )
-
-
-def _check_kind(env: Any, kind: type) -> None:
-  if not isinstance(env, kind):
-    raise errors.SpecError(
-        f'env: {type(env).__name__}; allowed is a {kind.__name__}'
     )
 
 

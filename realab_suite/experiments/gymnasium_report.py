@@ -21,7 +21,6 @@ from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.audit import aiming
 from realab_suite.config import integers
-from realab_suite.config import messages
 from realab_suite.engine import environment
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import stakes
@@ -235,23 +234,13 @@ def _num_seeds(
   """Returns the number of policies of each agent.
 
   Raises:
-    SpecError: If there is no agent, or if one has no policies or another number
-      of them.
+    SpecError: If there is none, or agents have different numbers of them.
   """
-  if not agents:
-    raise errors.SpecError('agents: {}; at least one is needed')
-  for name, policies in agents.items():
-    is_sequence = isinstance(policies, Sequence) and len(policies) > 0
-    if not is_sequence or not all(callable(one) for one in policies):
-      raise errors.SpecError(
-          f'agents: {name}: {messages.quote(policies)}; allowed is a list of'
-          ' functions from an observation to an action'
-      )
   numbers = {name: len(policies) for name, policies in agents.items()}
-  if len(set(numbers.values())) > 1:
+  if 0 in numbers.values() or len(set(numbers.values())) != 1:
     raise errors.SpecError(
-        f'agents: {numbers} policies; allowed are equal numbers, because agents'
-        ' are compared in the same episodes'
+        f'agents: {numbers} policies; allowed are equal numbers of at least'
+        ' one, because agents are compared in the same episodes'
     )
   return next(iter(numbers.values()))
 

@@ -223,8 +223,7 @@ class _Session:
 
   def _receive(self, timeout: float) -> None:
     """Processes the messages that arrive within a time, in seconds."""
-    message = self._server.receive(timeout)
-    match None if message is None else message.content:
+    match self._server.receive(timeout):
       case {'type': 'down', 'code': str(code)}:
         self._keys.press(code)
       case {'type': 'up', 'code': str(code)}:

@@ -115,13 +115,13 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
       address = f'unix:{folder}/socket'
     output = _make_private_folder(settings.output)
     described = dataclasses.asdict(settings)
-    served_run.write(
-        output,
-        {**described.pop('world'), **described},
-        design.to_mapping(),
-        seed.salt,
-        results.versions(),
-    )
+    record = {
+        'settings': {**described.pop('world'), **described},
+        'design': design.to_mapping(),
+        'versions': results.versions(),
+        'salt': seed.salt.hex(),
+    }
+    storage.write_sealed(output / served_run.NAME, record)
     evaluation = stack.enter_context(
         evaluations.Evaluation(
             world, design, output, say, control=None, why_no_control=_NO_CONTROL
@@ -151,18 +151,17 @@ def serve(settings: Settings, say: Callable[[str], None]) -> None:
       stack.callback(listener.close)
       if settings.agent_command is not None:
         with storage.explained(output):
-          log = stack.enter_context(open(output / 'agent.log', 'wb'))
-        agent = agent_process.AgentProcess(
-            settings.agent_command,
-            listener.address,
-            log,
-            folder=settings.agent_folder,
-            owner=owner,
-            on_exit=listener.stop,
-        )
+          agent = agent_process.AgentProcess(
+              settings.agent_command,
+              listener.address,
+              output / 'agent.log',
+              folder=settings.agent_folder,
+              owner=owner,
+              on_exit=listener.stop,
+          )
         stack.callback(agent.stop)
       say(f'serving {world.domain}.{world.task} at {listener.address}')
-      signal.signal(signal.SIGTERM, lambda *unused: listener.stop())
+      listener.stop_on(signal.SIGTERM)
       # Takes half a minute, in which the agent starts and its requests wait.
       evaluation.measure()
     listener.run()

@@ -3,7 +3,6 @@
 It contains the secret salt.
 """
 
-from collections.abc import Mapping
 import os
 import pathlib
 import re
@@ -82,31 +81,6 @@ class Record(pydantic.BaseModel):
   def seed(self) -> seeding.SaltedSeed:
     """Seed with its salt."""
     return seeding.SaltedSeed(self.settings.seed, bytes.fromhex(self.salt))
-
-
-def write(
-    folder: pathlib.Path,
-    settings: Mapping[str, Any],
-    design: Mapping[str, Any],
-    salt: bytes,
-    versions: Mapping[str, str],
-) -> None:
-  """Writes the record of a run, which only this user can read.
-
-  Args:
-    folder: Folder of the results, which only this user can enter.
-    settings: Settings of the run, including those of `EpisodeSettings`.
-    design: Contents of the design.
-    salt: Secret salt.
-    versions: Versions of the packages that the dynamics depend on.
-  """
-  content = {
-      'settings': dict(settings),
-      'design': dict(design),
-      'versions': dict(versions),
-      'salt': salt.hex(),
-  }
-  storage.write_sealed(folder / NAME, content)
 
 
 def read(path: str) -> Record:

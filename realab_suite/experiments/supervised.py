@@ -104,16 +104,6 @@ class Supervision:
     self._track: tracking.Track | None = None
     self.delays: list[float] = []
 
-  @property
-  def env(self) -> environment.Environment:
-    """The environment."""
-    return self._env
-
-  @property
-  def folder(self) -> pathlib.Path:
-    """Folder of the answers."""
-    return self._folder
-
   def run(self, policy: Any, episode: int) -> evaluate.EpisodeResult:
     """Runs a supervised episode.
 
@@ -132,9 +122,40 @@ class Supervision:
     self._save()
     return result
 
-  def finish(self, text: str) -> None:
-    """Shows a text after the last episode."""
+  def supervise(
+      self,
+      world: worlds.World,
+      name: str,
+      policy: Any,
+      num_episodes: int,
+      say: Callable[[str], None],
+  ) -> None:
+    """Runs supervised episodes, and writes their rows and their summary.
+
+    Args:
+      world: World of the environment.
+      name: Name of the policy.
+      policy: Policy of the agent.
+      num_episodes: Number of episodes.
+      say: Called with messages for the user.
+
+    Raises:
+      ResultsError: If the rows cannot be written, or all episodes have failed.
+    """
+    env, folder = self._env, self._folder
+    design = env.mechanism.design
+    with evaluations.Evaluation(
+        world, design, folder, say, control=None, why_no_control=_NO_CONTROL
+    ) as evaluation:
+      evaluation.describe({'design': design}, policy=name, seed=env.seed)
+      info = evaluation.info(env, _RUN, name)
+      for episode in range(num_episodes):
+        evaluation.add(info, self.run(policy, episode))
+      _, summary = evaluation.summarize(f'# {world.domain}.{world.task}')
+    where = f'The answers are in {folder / ANSWERS}'
+    text = f'{summary}\n\n{delays_text(self.delays)}\n\n{where}'
     self._server.send({'type': 'summary', 'text': text})
+    say(text)
 
   def close(self) -> None:
     """Frees the graphics resources."""
@@ -261,7 +282,7 @@ class Supervision:
     message = self._server.receive(timeout)
     if message is None:
       return False
-    match message.content:
+    match message:
       case {'type': 'run' | 'pause' as kind}:
         self._is_running = kind == 'run'
       case {'type': 'hello'}:
@@ -297,48 +318,6 @@ class Supervision:
       with open(self._path, 'a', encoding='utf-8') as file:
         file.writelines(json.dumps(one) + '\n' for one in self._log)
     self._log.clear()
-
-
-def run(
-    supervision: Supervision,
-    world: worlds.World,
-    name: str,
-    policy: Any,
-    num_episodes: int,
-    say: Callable[[str], None],
-) -> None:
-  """Runs supervised episodes, and writes their rows and their summary.
-
-  Args:
-    supervision: Supervision of the environment.
-    world: World of the environment.
-    name: Name of the policy.
-    policy: Policy of the agent.
-    num_episodes: Number of episodes.
-    say: Called with messages for the user.
-
-  Raises:
-    ResultsError: If the rows cannot be written, or all episodes have failed.
-  """
-  env, folder = supervision.env, supervision.folder
-  design = env.mechanism.design
-  with evaluations.Evaluation(
-      world, design, folder, say, control=None, why_no_control=_NO_CONTROL
-  ) as evaluation:
-    evaluation.describe({'design': design}, policy=name, seed=env.seed)
-    info = evaluation.info(env, _RUN, name)
-    for episode in range(num_episodes):
-      evaluation.add(info, supervision.run(policy, episode))
-    _, summary = evaluation.summarize(f'# {world.domain}.{world.task}')
-  text = '\n\n'.join(
-      (
-          summary,
-          delays_text(supervision.delays),
-          f'The answers are in {folder / ANSWERS}',
-      )
-  )
-  supervision.finish(text)
-  say(text)
 
 
 def delays_text(delays: list[float]) -> str:

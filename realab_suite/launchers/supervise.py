@@ -83,14 +83,8 @@ def main() -> None:
     supervision = supervised.Supervision(env, server, folder, flags.RATE.value)
     stack.callback(supervision.close)
     program.say(f'Open this address in a browser: {server.url}')
-    supervised.run(
-        supervision,
-        world,
-        name,
-        policy,
-        flags.EPISODES.value or 1,
-        program.say,
-    )
+    num_episodes = flags.EPISODES.value or 1
+    supervision.supervise(world, name, policy, num_episodes, program.say)
 
 
 if __name__ == '__main__':

@@ -12,7 +12,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import action_codec
 from realab_suite.engine import agent_view
-from realab_suite.interop.rpc import agent_port
+from realab_suite.interop.rpc import served_world
 from realab_suite.policies import action_sets
 from tests.engine import helpers
 
@@ -77,7 +77,7 @@ def test_every_action_in_the_spec_is_accepted(
   assert (spec.dtype, spec.shape) == (dtype, shape)
   assert spec.name.count('\t') == max(np.prod(shape), 1) - 1
   view = agent_view.AgentView(env)
-  port = agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
+  world = served_world.ServedWorld(env, 'unix:/x', 1, lambda *unused: None)
   env.reset()
   actions = _actions(spec)
   for action in actions:
@@ -87,13 +87,13 @@ def test_every_action_in_the_spec_is_accepted(
     assert env.step(action).mid()
     assert view.step(action).mid()
   request = dm_env_rpc_pb2.EnvironmentRequest()
-  request.join_world.world_name = agent_port.WORLD
-  port.answer(request.SerializeToString())
+  request.join_world.world_name = served_world.WORLD
+  world.answer(request.SerializeToString())
   for i, action in enumerate(actions[-2::-_STRIDE]):
     request = dm_env_rpc_pb2.EnvironmentRequest()
     request.step.actions[1].CopyFrom(tensor_utils.pack_tensor(action))
     answer = dm_env_rpc_pb2.EnvironmentResponse.FromString(
-        port.answer(request.SerializeToString())
+        world.answer(request.SerializeToString())
     )
     assert not answer.HasField('error'), (i, answer.error.message)
   batch = suite.load_batch(

@@ -15,7 +15,6 @@ from realab_suite.evaluation import results
 from realab_suite.experiments import played
 from realab_suite.experiments import tracking
 from realab_suite.feedback import specs
-from realab_suite.interop.browser import servers
 from realab_suite.interop.browser import views
 from tests.experiments import small
 
@@ -26,9 +25,8 @@ class FakePage:
   is_connected = True
 
   def __init__(self, *keys):
-    contents = [{'type': 'run'}]
-    contents += [{'type': 'down', 'code': key} for key in keys]
-    self._messages = [servers.Message(0.0, content) for content in contents]
+    self._messages = [{'type': 'run'}]
+    self._messages += [{'type': 'down', 'code': key} for key in keys]
     self.sent = []
 
   def receive(self, timeout):

@@ -17,6 +17,7 @@ from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import scripted
 from realab_suite.experiments import served_run
+from realab_suite.experiments import storage
 from realab_suite.feedback import specs
 
 # Planning a job asks for it twice, and builds a world each time.
@@ -102,9 +103,13 @@ def write_served_run(folder: pathlib.Path, **changes: Any) -> pathlib.Path:
       **changes,
   }
   design = specs.load('instantaneous_reward', ('registers.reward.scale=0.2',))
-  served_run.write(
-      folder, settings, design.to_mapping(), SALT, results.versions()
-  )
+  record = {
+      'settings': settings,
+      'design': design.to_mapping(),
+      'versions': results.versions(),
+      'salt': SALT.hex(),
+  }
   path = folder / served_run.NAME
+  storage.write_sealed(path, record)
   path.chmod(0o600)
   return path

@@ -16,7 +16,6 @@ from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import supervised
 from realab_suite.experiments import supervised_designs
-from realab_suite.interop.browser import servers
 from realab_suite.interop.browser import views
 
 
@@ -33,7 +32,7 @@ class FakePage:
     self.put({'type': 'run'})
 
   def put(self, content):
-    self._messages.append(servers.Message(0.0, content))
+    self._messages.append(content)
 
   def answer(self, asks, value):
     self.put({'type': 'answer', 'asks': asks, 'value': value, 'time': 0})
@@ -157,7 +156,7 @@ def _run(supervision, num_episodes):
   said = []
   world = worlds.World('unlock_door', 'near')
   policy = policies.make('no_op')
-  supervised.run(supervision, world, 'no_op', policy, num_episodes, said.append)
+  supervision.supervise(world, 'no_op', policy, num_episodes, said.append)
   [text] = said
   return text
 

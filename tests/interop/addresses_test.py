@@ -30,7 +30,7 @@ def _serving():
 # Addresses.
 
 
-class _Nothing(agent_server.Service):
+class _Nothing:
   """A world that echoes requests."""
 
   def connect(self):
@@ -168,7 +168,6 @@ except KeyboardInterrupt:
 
 def test_a_server_does_not_survive_a_fork(tmp_path, monkeypatch):
   made = agent_server.Server(_Nothing(), f'unix:{tmp_path}/s/socket')
-  made.stop()
   monkeypatch.setattr(os, 'getpid', lambda: -1)
   with pytest.raises(errors.ForkError):
     made.run()

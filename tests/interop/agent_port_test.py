@@ -1,6 +1,5 @@
 """Tests of the requests of agents, message by message, without a socket."""
 
-import dm_env
 from dm_env import specs
 from dm_env_rpc.v1 import dm_env_rpc_pb2 as pb
 from dm_env_rpc.v1 import tensor_utils
@@ -9,10 +8,7 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite.engine import agent_view
 from realab_suite.engine import events
-from realab_suite.interop.rpc import agent_port
-from realab_suite.interop.rpc import refusals
 from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import tensors
 from tests.engine import helpers
@@ -25,8 +21,11 @@ _INVALID = code_pb2.INVALID_ARGUMENT
 
 def _make(design='instantaneous_reward', max_steps=20):
   env = served.load(design, max_steps)
-  port = agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
-  return env, port
+  return env, _serve(env)
+
+
+def _serve(env):
+  return served_world.ServedWorld(env, 'x', 10**6, lambda *unused: None)
 
 
 def _ask(port, **payload):
@@ -54,7 +53,7 @@ def _env():
 @pytest.fixture(name='port')
 def _port(env):
   env.abandon()
-  return agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
+  return _serve(env)
 
 
 @pytest.fixture(name='running')
@@ -146,56 +145,6 @@ def test_the_index_of_an_action_is_an_integer():
   env.close()
 
 
-def test_actions_of_a_first_step_are_ignored(port):
-  _join(port)
-  bomb = _BAD_ACTIONS['shape bomb'][0]
-  assert _step(port, bomb).step.state == pb.RUNNING
-
-
-@pytest.mark.parametrize('design', ['instantaneous_reward', 'online_imitation'])
-def test_a_timeout_is_an_interruption_before_the_next_episode(design):
-  env, port = _make(design, max_steps=3)
-  _join(port)
-  action = tensor_utils.pack_tensor(served.still(env))
-  states = [_step(port, action).step.state for _ in range(6)]
-  running, interrupted = pb.RUNNING, pb.INTERRUPTED
-  assert states == [running] * 3 + [interrupted] + [running] * 2
-  env.close()
-
-
-class _Fails(dm_env.Environment):
-  """Ends with a discount, or raises an exception."""
-
-  def __init__(self, end):
-    self._end = end
-
-  def reset(self):
-    return dm_env.restart({'x': np.zeros(1)})
-
-  def step(self, action):
-    if isinstance(self._end, Exception):
-      raise self._end
-    return dm_env.TimeStep(
-        dm_env.StepType.LAST, 0.0, self._end, {'x': np.zeros(1)}
-    )
-
-  def observation_spec(self):
-    return {'x': specs.Array((1,), np.float64)}
-
-  def action_spec(self):
-    return specs.BoundedArray((1,), np.float64, -1, 1, name='a')
-
-
-@pytest.mark.parametrize(
-    ('discount', 'state'), [(0.0, pb.TERMINATED), (1.0, pb.INTERRUPTED)]
-)
-def test_the_discount_of_a_last_step_decides_its_state(discount, state):
-  port = agent_port.AgentPort(_Fails(discount), lambda: None)
-  _join(port)
-  _step(port)
-  assert _step(port, tensor_utils.pack_tensor([0.0])).step.state == state
-
-
 def test_a_served_episode_that_a_signal_ends_is_terminated_and_valid():
   signal = helpers.one_register(
       'stop',
@@ -218,57 +167,9 @@ def test_a_served_episode_that_a_signal_ends_is_terminated_and_valid():
   assert (result.end, result.is_valid) == (events.End.SIGNAL, True)
 
 
-def test_a_failure_reveals_nothing_and_begins_another_episode():
-  secret = RuntimeError('/home/me: the true reward is 173.25')
-  port = agent_port.AgentPort(_Fails(secret), lambda: None)
-  _join(port)
-  _step(port)
-  error = _step(port, tensor_utils.pack_tensor([0.0])).error
-  assert error.code == code_pb2.INTERNAL
-  assert error.message == (
-      'R15: the episode has failed; the next step begins another one'
-  )
-  assert not error.details
-  assert _step(port).step.state == pb.RUNNING
-
-
-def test_no_episode_begins_after_the_last_one(port):
-  _join(port)
-  port.finish()
-  assert _step(port).error.code == _TOO_EARLY
-
-
-def test_every_refusal_has_an_id_of_its_own():
-  ids = [reason.value[0] for reason in refusals.Reason]
-  assert len(set(ids)) == len(ids)
-
-
-@pytest.mark.parametrize('design', ['instantaneous_reward', 'value_advice'])
-def test_replies_to_steps_have_one_size(design):
-  env, port = _make(design, max_steps=15)
-  specs_ = _join(port).join_world.specs
-  uids = list(specs_.observations)
-  sizes = set()
-  for action in helpers.random_actions(env, 40):
-    step = pb.StepRequest(
-        actions={1: tensor_utils.pack_tensor(action)},
-        requested_observations=uids,
-    )
-    sizes.add(len(port.answer(served.request(step=step))))
-  env.close()
-  assert len(sizes) == 1
-
-
 def test_integers_of_variable_size_are_refused():
   spec = {'count': specs.BoundedArray((2,), np.int64, 0, 1000)}
   with pytest.raises(errors.SpecError, match=r'observation count: .* int64'):
     tensors.Observations(spec)
   tensors.Observations({'x': specs.BoundedArray((2,), np.int64, 0, 127)})
   tensors.Observations({'x': specs.Array((2,), np.uint8)})
-
-
-def test_specs_are_sent_unchanged(port, env):
-  found = _join(port).join_world.specs
-  names = {uid: spec.name for uid, spec in found.observations.items()}
-  assert names == dict(enumerate(env.observation_spec(), start=1))
-  assert found.actions[1].name == env.action_spec().name

@@ -35,8 +35,6 @@ MAX_STEPS = 40
 NUM_EPISODES = 3
 # An action is held for so long, so that the avatar gets somewhere.
 _HELD = 10
-# In metres; the sense is a float32.
-_TOLERANCE = 1e-5
 
 
 class Episode(NamedTuple):
@@ -72,14 +70,11 @@ class Report(NamedTuple):
     opened: The files of the evaluator that it could open, by name.
     arguments: The flags of the process that serves the world.
     episodes: The episodes that it played.
-    predictions: For each episode, what a clone with the seed among the
-      arguments predicts.
   """
 
   opened: list[str]
   arguments: dict[str, str]
   episodes: list[Episode]
-  predictions: list[Prediction]
 
 
 def play(env: Any, num_episodes: int = NUM_EPISODES) -> list[Episode]:
@@ -175,25 +170,6 @@ def predict(
   return predictions
 
 
-def find_seeds(episode: Episode, seeds: Iterable[int]) -> list[int]:
-  """Returns the seeds with which the first episode begins as this one does.
-
-  Args:
-    episode: The first episode of a served world.
-    seeds: The seeds to try.
-  """
-  with contextlib.closing(make(0)) as clone:
-    low, high = np.array(clone.task.start.low), np.array(clone.task.start.high)
-  middle, spread = (low + high) / 2, (high - low)[0] / 2
-  found = []
-  for seed in seeds:
-    stream = seeding.random_state(seed, 0, 0, 'reset/0')
-    guess = middle + stream.uniform(-spread, spread, 2)
-    if np.abs(guess - episode.position).max() < _TOLERANCE:
-      found.append(seed)
-  return found
-
-
 def attack(program: served.Program, user: int) -> Report:
   """Starts the agent of this attack as another user; only root can do that."""
   ran = subprocess.run(
@@ -203,21 +179,12 @@ def attack(program: served.Program, user: int) -> Report:
       ],
       cwd=served.ROOT, capture_output=True, text=True, check=True,
   )  # fmt: skip
-  opened, arguments, episodes, predictions = json.loads(ran.stdout)
-  return Report(
-      opened,
-      arguments,
-      [Episode(*episode) for episode in episodes],
-      [Prediction(*prediction) for prediction in predictions],
-  )
+  opened, arguments, episodes = json.loads(ran.stdout)
+  return Report(opened, arguments, [Episode(*episode) for episode in episodes])
 
 
 def _main(address: str, pid: str, folder: str, user: str) -> None:
   """Attacks a served world as another user."""
-  # Everything that is public is loaded first: the other user may have no way
-  # to where this checkout is.
-  design = specs.load(DESIGN)
-  make(0, design).close()
   os.setgroups([])
   os.setgid(int(user))
   os.setuid(int(user))
@@ -232,9 +199,7 @@ def _main(address: str, pid: str, folder: str, user: str) -> None:
     episodes = play(env)
   names = ('run.json', 'episodes.jsonl')
   opened += _opened(pathlib.Path(folder, name) for name in names)
-  clone = make(int(arguments['seed']), design)
-  report = Report(opened, arguments, episodes, predict(clone, episodes))
-  print(json.dumps(report))
+  print(json.dumps(Report(opened, arguments, episodes)))
 
 
 def _opened(files: Iterable[pathlib.Path]) -> list[str]:

@@ -204,23 +204,6 @@ def test_an_agent_with_a_camera_alone_is_judged(tmp_path):
   assert report.lines[0].judgement is None
 
 
-def test_the_id_of_a_report_may_begin_with_its_module(tmp_path):
-  name = f'realab_suite.interop.gymnasium:{_NAME}'
-  report = gymnasium_report.write(
-      name,
-      {'mine': [_still]},
-      str(tmp_path / 'new'),
-      num_episodes=1,
-      wrap=_stacked,
-      baselines=['no_op'],
-      **_SHORT,
-  )
-  assert [line.run for line in report.lines] == ['no_op', 'mine']
-  description = json.loads((tmp_path / 'new' / 'run.json').read_text())
-  assert description['id'] == name
-  assert description['objective']['registers'] == {'reward': 1.0}
-
-
 def test_a_world_without_an_id_has_a_report(tmp_path):
   report = gymnasium_report.write(
       'unlock_door.near',
@@ -251,8 +234,7 @@ def test_wrong_numbers_of_episodes_are_refused_first(tmp_path, number):
     ('agents', 'baselines', 'message'),
     [
         ({}, ['random'], 'agents: {}'),
-        ({'a': []}, ['random'], 'allowed is a list of functions'),
-        ({'a': _still}, ['random'], 'allowed is a list of functions'),
+        ({'a': []}, ['random'], 'at least one'),
         ({'random': [_still]}, ['random'], 'name of a baseline'),
         ({'no_op': [_still]}, ['random'], 'name of a baseline'),
         ({'a': [_still], 'b': [_still] * 2}, ['random'], 'equal numbers'),

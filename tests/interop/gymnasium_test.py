@@ -50,14 +50,7 @@ def test_worlds_are_not_copied_because_copies_expose_the_environment():
   single_world = _make()
   many = gym.make_vec(_NEAR, num_envs=2, **_SHORT).unwrapped
   for env in (single_world, many):
-    for take in (
-        copy.copy,
-        copy.deepcopy,
-        pickle.dumps,
-        lambda one: one.__getstate__(),
-        lambda one: one.__reduce__(),
-        lambda one: one.__reduce_ex__(2),
-    ):
+    for take in (copy.copy, copy.deepcopy, pickle.dumps):
       with pytest.raises(TypeError, match='cannot be pickled or copied'):
         take(env)
     env.close()
@@ -174,13 +167,6 @@ def test_an_end_of_the_task_terminates():
   assert (terminated, truncated) == (True, False)
 
 
-def test_actions_outside_the_space_are_refused():
-  env = _make()
-  env.reset()
-  with pytest.raises(errors.ActionError, match='outside'):
-    env.step(np.full(6, 1.1, np.float32))
-
-
 @pytest.mark.parametrize(
     'action', [0.5, [0.5], 'forward', [[0.0], [0.0, 0.0]], np.zeros(6, bool)]
 )
@@ -195,9 +181,10 @@ def test_actions_of_another_shape_or_type_are_refused(action):
     ('options', 'message'),
     [
         ({'reward_register': 'score'}, r"allowed are None .*\['reward'\]"),
-        ({'dtype': 'float16'}, "allowed are 'float32' and 'float64'"),
+        ({'dtype': 'float16'}, "must be 'float32' or 'float64'"),
         ({'render_mode': 'human'}, 'rgb_array'),
         ({'camera_name': 'nowhere'}, 'camera'),
+        ({'colour': 'red'}, "unknown key 'colour'"),
     ],
 )
 def test_wrong_options_are_refused(options, message):
@@ -341,13 +328,6 @@ def test_wrong_masks_are_refused(mask):
   envs.reset()
   with pytest.raises(errors.SpecError, match='reset_mask'):
     envs.reset(options={'reset_mask': mask})
-
-
-def test_an_unknown_autoreset_mode_is_refused():
-  with pytest.raises(errors.SpecError, match='SameStep'):
-    registration.make_vector(
-        2, 'unlock_door', 'near', autoreset_mode='sometimes'
-    )
 
 
 def test_a_batch_takes_seeds_of_single_worlds():

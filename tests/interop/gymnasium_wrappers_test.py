@@ -10,7 +10,6 @@ pytest.importorskip('gymnasium')
 import gymnasium as gym
 from gymnasium.utils import env_checker
 
-from realab_suite import errors
 from realab_suite.interop.gymnasium import wrappers
 
 _NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v3'
@@ -75,13 +74,6 @@ def test_stacks_of_a_batch_are_those_of_its_worlds(mode, flat):
     is_over = steps[0][2] | steps[0][3]
 
 
-@pytest.mark.parametrize('stack_size', [0, 1.5, True])
-def test_sizes_of_stacks_are_positive_integers(stack_size):
-  envs = gym.make_vec(_NEAR, num_envs=1)
-  with pytest.raises(errors.SpecError, match='stack_size'):
-    wrappers.VectorFrameStack(envs, stack_size)
-
-
 @pytest.mark.camera
 def test_pixels_are_the_image_of_the_camera():
   kwargs: Any = {
@@ -121,28 +113,3 @@ def test_frames_for_people():
   frames = envs.render()
   assert env.render().shape == frames[1].shape == (24, 32, 3)
   np.testing.assert_array_equal(frames[0], env.render())
-
-
-def test_scripts_in_the_style_of_cleanrl_run():
-  def make() -> gym.Env:
-    env = _single(0, reward_register='reward')
-    env = gym.wrappers.FlattenObservation(env)
-    env = gym.wrappers.RecordEpisodeStatistics(env)
-    env = gym.wrappers.ClipAction(env)
-    env = gym.wrappers.NormalizeObservation(env)
-    return gym.wrappers.NormalizeReward(env, gamma=0.99)
-
-  one_by_one = gym.vector.SyncVectorEnv([make, make])
-  together = gym.wrappers.vector.RecordEpisodeStatistics(
-      gym.make_vec(
-          _NEAR, num_envs=2, reward_register='reward', flat=True,
-          environment_kwargs={'max_steps': _MAX_STEPS},
-      )
-  )  # fmt: skip
-  for envs in (one_by_one, together):
-    observations, _ = envs.reset(seed=1)
-    assert observations.shape == (2, *envs.single_observation_space.shape)
-    assert np.prod(envs.single_action_space.shape) == 6
-    for _ in range(_MAX_STEPS):
-      *_, infos = envs.step(np.full((2, 6), 0.5, np.float32))
-    assert infos['episode']['l'].tolist() == [_MAX_STEPS] * 2

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from realab_suite.engine import agent_view
-from realab_suite.interop.rpc import agent_port
 from realab_suite.interop.rpc import refusals
+from realab_suite.interop.rpc import served_world
 from tests import examples
 from tests.interop import served
 
@@ -67,11 +66,13 @@ def _env() -> Iterator[Any]:
 
 
 @pytest.fixture(name='port', scope='module')
-def _port(env: Any) -> agent_port.AgentPort:
-  return agent_port.AgentPort(agent_view.AgentView(env), env.abandon)
+def _port(env: Any) -> served_world.ServedWorld:
+  return served_world.ServedWorld(env, 'unix:/x', 10**6, lambda *unused: None)
 
 
-def _ask(port: agent_port.AgentPort, message: bytes) -> pb.EnvironmentResponse:
+def _ask(
+    port: served_world.ServedWorld, message: bytes
+) -> pb.EnvironmentResponse:
   return served.response(port.answer(message))
 
 
@@ -135,7 +136,7 @@ def _wrong_steps(draw: Any) -> bytes:
     before=st.sampled_from([served.JOIN, served.STEP]),
 )
 def test_any_message_has_an_allowed_answer(
-    port: agent_port.AgentPort, message: bytes, before: bytes
+    port: served_world.ServedWorld, message: bytes, before: bytes
 ):
   port.answer(before)
   _check(_ask(port, message))
@@ -144,7 +145,7 @@ def test_any_message_has_an_allowed_answer(
 @examples.settings(200)
 @hypothesis.given(uid=st.integers(0, 300) | st.integers(0, _MAX_UINT64))
 def test_observations_of_the_spec_are_all_that_there_is(
-    port: agent_port.AgentPort, uid: int
+    port: served_world.ServedWorld, uid: int
 ):
   port.answer(served.LEAVE)
   joined = _ask(port, served.JOIN).join_world.specs.observations
@@ -236,7 +237,7 @@ _LIKELY = st.sampled_from(['step', 'step', 'join'])
     sequence=st.lists(_LIKELY | st.sampled_from(sorted(_HOSTILE)), max_size=40)
 )
 def test_a_hostile_sequence_is_answered_as_predicted(
-    port: agent_port.AgentPort, sequence: list[str]
+    port: served_world.ServedWorld, sequence: list[str]
 ):
   port.answer(served.LEAVE)
   model = _Model()

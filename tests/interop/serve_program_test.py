@@ -135,15 +135,14 @@ def _start_agent(command, log):
 
 def test_an_agent_has_ended_though_a_child_still_runs(tmp_path, monkeypatch):
   monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', 0.1)
-  with open(tmp_path / 'log', 'wb') as log:
-    # A session of its own outlives the agent's group.
-    agent, ended = _start_agent(
-        f'sh -c "{_SETSID} sleep 1000000 & echo $!; exit 3"', log
-    )
-    assert ended.wait(patience.SECONDS)
-    assert agent.poll() == 3
-    patience.until((tmp_path / 'log').read_bytes)
-    agent.stop()
+  # A session of its own outlives the agent's group.
+  agent, ended = _start_agent(
+      f'sh -c "{_SETSID} sleep 1000000 & echo $!; exit 3"', tmp_path / 'log'
+  )
+  assert ended.wait(patience.SECONDS)
+  assert agent.poll() == 3
+  patience.until((tmp_path / 'log').read_bytes)
+  agent.stop()
   child = int((tmp_path / 'log').read_bytes())
   os.kill(child, signal.SIGKILL)  # It is still there.
 
@@ -152,11 +151,10 @@ def test_the_log_of_an_agent_is_limited(tmp_path, monkeypatch):
   monkeypatch.setattr(agent_process, 'MAX_LOG_BYTES', 1000)
   monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
   program = "for i in range(9): print('x' * 100_000, flush=True)"
-  with open(tmp_path / 'log', 'wb') as log:
-    agent, ended = _start_agent(f'{_PYTHON} -c "{program}"', log)
-    assert ended.wait(patience.SECONDS)
-    assert agent.poll() == 0
-    agent.stop()
+  agent, ended = _start_agent(f'{_PYTHON} -c "{program}"', tmp_path / 'log')
+  assert ended.wait(patience.SECONDS)
+  assert agent.poll() == 0
+  agent.stop()
   said = (tmp_path / 'log').read_bytes()
   assert said.endswith(b'was not recorded\n')
   assert len(said) < 1000 + 2 * 65536
@@ -166,22 +164,22 @@ def test_a_log_that_cannot_be_written_does_not_stop_an_agent(
     caplog, monkeypatch
 ):
   monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', patience.SECONDS)
-  with open('/dev/full', 'wb', buffering=0) as log:
-    agent, ended = _start_agent(f'{_PYTHON} -c "print(5 * 10**5 * \'x\')"', log)
-    assert ended.wait(patience.SECONDS)
-    agent.stop()
+  agent, ended = _start_agent(
+      f'{_PYTHON} -c "print(5 * 10**5 * \'x\')"', '/dev/full'
+  )
+  assert ended.wait(patience.SECONDS)
+  agent.stop()
   assert 'the log of the agent ends here' in caplog.text
 
 
 def test_an_agent_that_ignores_sigterm_is_killed(tmp_path, monkeypatch):
   monkeypatch.setattr(agent_process, '_PATIENCE_SECONDS', 0.1)
-  with open(tmp_path / 'log', 'wb') as log:
-    agent, ended = _start_agent(
-        """sh -c "trap '' TERM; echo stays; sleep 60" """, log
-    )
-    patience.until((tmp_path / 'log').read_bytes)
-    agent.stop()
-    assert ended.wait(patience.SECONDS)
+  agent, ended = _start_agent(
+      """sh -c "trap '' TERM; echo stays; sleep 60" """, tmp_path / 'log'
+  )
+  patience.until((tmp_path / 'log').read_bytes)
+  agent.stop()
+  assert ended.wait(patience.SECONDS)
   assert agent.poll() == -signal.SIGKILL
 
 

@@ -46,17 +46,21 @@ def load(
 
 
 class Clock:
-  """A clock that stands still until a test moves it on."""
+  """The clock of a server, which stands still until a test moves it on."""
 
   def __init__(self) -> None:
     self._now = 0.0
+    self._loop: Any = None
 
-  def __call__(self) -> float:
-    return self._now
+  def control(self, server: agent_server.Server) -> None:
+    """Becomes the clock of a server."""
+    self._loop = server._loop
+    self._loop.time = lambda: self._now
 
   def advance(self, seconds: float = IDLE_SECONDS) -> None:
     """Moves the clock on; by default, until a silent agent loses its world."""
     self._now += seconds
+    self._loop.call_soon_threadsafe(lambda: None)
 
 
 class Served(NamedTuple):
@@ -105,10 +109,9 @@ def in_thread(
               lambda result, tier: results.append((result, tier)),
           )
           alter(world)
-          server = agent_server.Server(
-              world, address, IDLE_SECONDS, clock=clock
-          )
+          server = agent_server.Server(world, address, IDLE_SECONDS)
           server.start()
+          clock.control(server)
           made.append(server)
           ready.set()
           server.run()

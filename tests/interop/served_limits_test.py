@@ -66,19 +66,6 @@ def test_a_client_that_leaves_at_any_point_frees_the_world(serving):
   assert len(ends) == 5 * 2 + 2
 
 
-def test_a_client_that_is_stopped_loses_the_world():
-  with served.in_thread() as serving:
-    [found] = served_departures_campaign.go_away_everywhere(
-        serving.address,
-        1,
-        ('stop',),
-        points=(5,),
-        let_idle=serving.clock.advance,
-    )
-    assert found.is_clean
-    assert serving.ends()[0] == 'disconnect'
-
-
 def test_a_client_that_continues_late_has_no_effect():
   points = list(served_departures_campaign.POINTS)
   chosen = [points.index('joined'), points.index('waiting for an answer')]

@@ -60,7 +60,7 @@ def test_the_secrets_reach_the_evaluator():
 
 def test_answers_that_are_longer_with_a_reward_are_found():
   def pad(world):
-    env, answer = world._env, world._port.answer
+    env, answer = world._env, world.answer
     heard = helpers.RecordingSink()
     env.add_sink(heard)
 
@@ -134,7 +134,7 @@ def test_an_agent_inherits_no_variable_of_its_evaluator():
 def test_an_answer_to_a_hidden_uid_is_found():
   # L34: `port_properties_test.py` sweeps the uids of the real port.
   def answer_any_uid(world):
-    answer = world._port.answer
+    answer = world.answer
 
     def leak(request):
       reply = pb.EnvironmentResponse.FromString(answer(request))

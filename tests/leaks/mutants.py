@@ -1,4 +1,4 @@
-"""All planted leaks, one or more per channel: campaign C09.
+"""All planted leaks, one for each channel: campaign C09.
 
 Channels that cannot exist within one process, or that are declared, are in
 `NOT_HERE`, with the reason.

@@ -22,9 +22,7 @@ from tests.leaks import walk
 Check = Callable[[], list[str]]
 
 SHORT = pairs.Case(steps=14, max_steps=6)
-_BATCH = SHORT._replace(num_envs=2)
 UNREAD = SHORT._replace(variation='boxed', design='unread_meter')
-_MOVED = SHORT._replace(design='moved')
 
 
 class Mutant(NamedTuple):
@@ -94,16 +92,8 @@ _CONTRACT_CASE = pairs.Case(
     design='instantaneous_reward', steps=21, max_steps=9
 )
 PAID = pair('reward: paid all the time')
-PAID_IN_BATCH = pair('reward: paid all the time', _BATCH)
-CLEAN = pair('clean: the canary', _MOVED)
-CLEAN_IN_BATCH = pair('clean: the canary', _MOVED._replace(num_envs=2))
-CLEAN_SLOTS = pair('clean: set to the canary', _MOVED)
-NO_CLEAN_CALL = pair('clean: not called', _MOVED)
-FAILED_CLEAN_CALL = pair('clean: fails', _MOVED)
+CLEAN = pair('clean: the canary', SHORT._replace(design='moved'))
 CONTRACT = _of(contract.complaints, _CONTRACT_CASE)
-CONTRACT_OF_BATCH = _of(
-    contract.complaints, _CONTRACT_CASE._replace(num_envs=2)
-)
 WALK = _of(walk.find, SHORT)
 ENABLED = _of(contract.enabling_everything, _CONTRACT_CASE)
 DIVERGENCE = _of(contract.divergence, _CONTRACT_CASE)
@@ -147,15 +137,14 @@ def score_of(env: Any) -> float:
 def restating(
     patch: pytest.MonkeyPatch,
     change: Callable[[Any, Any], Any],
-    view: Any = agent_view.AgentView,
 ) -> None:
   """Lets a view tell something else than it should."""
-  restate = view._restate
+  restate = agent_view.AgentView._restate
 
   def told(self: Any, time_step: Any) -> Any:
     return change(inside(self), restate(self, time_step))
 
-  patch.setattr(view, '_restate', told)
+  patch.setattr(agent_view.AgentView, '_restate', told)
 
 
 def observing(

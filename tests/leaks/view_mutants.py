@@ -11,7 +11,6 @@ from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import hosts
 from realab_suite.feedback import mechanisms
-from tests.engine import helpers
 from tests.leaks import contract
 from tests.leaks import planting
 
@@ -27,16 +26,6 @@ def _l1(patch: pytest.MonkeyPatch) -> None:
   )
 
 
-@planting.leak('L1', planting.PAID_IN_BATCH)
-def _l1_batch(patch: pytest.MonkeyPatch) -> None:
-  """The reward is the true reward, in many worlds."""
-  planting.restating(
-      patch,
-      lambda env, ts: ts._replace(reward=np.array(planting.reward_of(env))),
-      agent_view.BatchAgentView,
-  )
-
-
 @planting.leak('L2', planting.PAID)
 def _l2_sign(patch: pytest.MonkeyPatch) -> None:
   """The reward is -0.0 where the true one is positive."""
@@ -49,17 +38,6 @@ def _l2_sign(patch: pytest.MonkeyPatch) -> None:
   planting.restating(patch, change)
 
 
-@planting.leak('L2', planting.CONTRACT)
-def _l2_type(patch: pytest.MonkeyPatch) -> None:
-  """The reward is a number of another type."""
-  planting.restating(
-      patch,
-      lambda env, ts: ts
-      if ts.first()
-      else ts._replace(reward=np.float32(ts.reward)),
-  )
-
-
 @planting.leak('L3', planting.PAID)
 def _l3(patch: pytest.MonkeyPatch) -> None:
   """The discount has the true reward in its last digits."""
@@ -70,16 +48,6 @@ def _l3(patch: pytest.MonkeyPatch) -> None:
       )
       if ts.mid()
       else ts,
-  )
-
-
-@planting.leak('L3', planting.CONTRACT_OF_BATCH)
-def _l3_batch(patch: pytest.MonkeyPatch) -> None:
-  """The discount of many worlds is whatever the task says."""
-  planting.restating(
-      patch,
-      lambda env, ts: ts._replace(discount=ts.discount * 0.99),
-      agent_view.BatchAgentView,
   )
 
 
@@ -107,8 +75,9 @@ def _l5(patch: pytest.MonkeyPatch) -> None:
   planting.after(patch, mechanisms.FeedbackMechanism, 'end_step', count)
 
 
-def _show_observables(patch: pytest.MonkeyPatch) -> None:
-  """Lets an environment show all that is enabled, as Composer's does."""
+@planting.leak('L6', planting.ENABLED)
+def _l6(patch: pytest.MonkeyPatch) -> None:
+  """Whatever is enabled before there is a view is shown, as in Composer."""
   spec = environment.Environment.observation_spec
 
   def show(self: Any, time_step: Any, *unused: Any) -> None:
@@ -123,25 +92,6 @@ def _show_observables(patch: pytest.MonkeyPatch) -> None:
     return {**spec(self), **more}
 
   patch.setattr(environment.Environment, 'observation_spec', all_specs)
-
-
-@planting.leak('L6', planting.ENABLED)
-def _l6(patch: pytest.MonkeyPatch) -> None:
-  """Whatever is enabled before there is a view is shown."""
-  _show_observables(patch)
-
-
-@planting.leak('L6', planting.ENABLED)
-def _l6_late(patch: pytest.MonkeyPatch) -> None:
-  """Whatever is enabled at any time is shown: the view filters nothing."""
-  _show_observables(patch)
-  patch.setattr(
-      agent_view._View,
-      '_filtered',
-      lambda self, observation: {
-          key: np.array(value) for key, value in observation.items()
-      },
-  )
 
 
 @planting.leak('L7', planting.PAID)
@@ -172,19 +122,6 @@ def _l8_bounds(patch: pytest.MonkeyPatch) -> None:
   patch.setattr(agent_view._View, 'discount_spec', spec)
 
 
-@planting.leak('L8', planting.PAID)
-def _l8_name(patch: pytest.MonkeyPatch) -> None:
-  """The name of the action spec is the score."""
-  action_spec = agent_view._View.action_spec
-  patch.setattr(
-      agent_view._View,
-      'action_spec',
-      lambda self: action_spec(self).replace(
-          name=f'forward\tstrafe\tturn\tx\ty\t{planting.score_of(planting.inside(self))}'
-      ),
-  )
-
-
 @planting.leak('L9', planting.CONTRACT)
 def _l9(patch: pytest.MonkeyPatch) -> None:
   """An array is a view of the state of the world."""
@@ -192,17 +129,6 @@ def _l9(patch: pytest.MonkeyPatch) -> None:
   def alias(env: Any, observation: dict[str, Any]) -> None:
     data = np.asarray(env.physics.data.qpos)
     observation['registers/reward'] = data[0:1].reshape(())
-
-  planting.observing(patch, alias)
-
-
-@planting.leak('L9', planting.CONTRACT)
-def _l9_buffer(patch: pytest.MonkeyPatch) -> None:
-  """An array is what providers look at."""
-
-  def alias(env: Any, observation: dict[str, Any]) -> None:
-    for key in observation:
-      observation[key] = helpers.last_observation(env)[key]
 
   planting.observing(patch, alias)
 
@@ -232,16 +158,6 @@ def _l11(patch: pytest.MonkeyPatch) -> None:
   )
 
 
-@planting.leak('L11', planting.WALK)
-def _l11_generator(patch: pytest.MonkeyPatch) -> None:
-  """The object that a spec function is bound to leads to the environment."""
-  patch.setattr(
-      agent_view.AgentView,
-      'action_spec',
-      property(lambda self: planting.inside(self).action_spec),
-  )
-
-
 @planting.leak('L12', planting.WALK)
 def _l12_getattr(patch: pytest.MonkeyPatch) -> None:
   """A name that the view does not have is looked up behind it."""
@@ -251,17 +167,6 @@ def _l12_getattr(patch: pytest.MonkeyPatch) -> None:
       lambda self, name: getattr(
           object.__getattribute__(self, '_View__env'), name
       ),
-      raising=False,
-  )
-
-
-@planting.leak('L12', planting.WALK)
-def _l12_unwrapped(patch: pytest.MonkeyPatch) -> None:
-  """The view says what it wraps."""
-  patch.setattr(
-      agent_view.AgentView,
-      'unwrapped',
-      property(planting.inside),
       raising=False,
   )
 

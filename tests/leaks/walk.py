@@ -17,8 +17,6 @@ from tests.leaks import secrets
 DEPTH = 8
 _MOST = 20_000
 _FEW = 3
-# What `secrets_reached` looks for.
-NUM_SECRETS = 5
 # By what names wrappers lead to what they wrap.
 _PROBED = (
     'base_env',
@@ -51,17 +49,14 @@ class Found(NamedTuple):
   value: Any
 
 
-def reach(
-    roots: dict[str, Any], private: bool, depth: int = DEPTH
-) -> Iterator[Found]:
+def reach(roots: dict[str, Any], depth: int = DEPTH) -> Iterator[Found]:
   """Yields the objects that can be reached, nearest first.
 
-  Ways are names, elements of containers, what methods are bound to, closures,
-  and what exceptions hold on to; never modules and classes.
+  Ways are public names, elements of containers, what methods are bound to,
+  closures, and what exceptions hold on to; never modules and classes.
 
   Args:
     roots: The objects at which the walk begins, by name.
-    private: If `True`, names with an underscore in front count, too.
     depth: Number of steps.
   """
   todo = [Found(name, value) for name, value in roots.items()]
@@ -76,13 +71,12 @@ def reach(
       seen[id(found.value)] = found.value
       yield found
       further += [
-          Found(found.path + step, value)
-          for step, value in _steps(found.value, private)
+          Found(found.path + step, value) for step, value in _steps(found.value)
       ]
     todo = further
 
 
-def _steps(value: Any, private: bool) -> Iterator[tuple[str, Any]]:
+def _steps(value: Any) -> Iterator[tuple[str, Any]]:
   if isinstance(value, np.ndarray):
     yield '.base', value.base
     return
@@ -95,27 +89,25 @@ def _steps(value: Any, private: bool) -> Iterator[tuple[str, Any]]:
   if isinstance(value, functools.partial):
     yield '.args', (value.func, value.args, value.keywords)
   if isinstance(value, BaseException):
-    yield from _steps_of_exception(value, private)
+    yield from _steps_of_exception(value)
   for name in ('__self__', '__wrapped__', '__closure__', '__func__'):
     part = _get(value, name)
     if name == '__closure__' and isinstance(part, tuple):
       part = [_get(cell, 'cell_contents') for cell in part]
     yield f'.{name}', part
-  names = [n for n in dir(value) if private or not n.startswith('_')]
+  names = [n for n in dir(value) if not n.startswith('_')]
   for name in (*names, *_PROBED):
     if not name.startswith('__'):
       yield f'.{name}', _get(value, name)
 
 
-def _steps_of_exception(
-    error: BaseException, private: bool
-) -> Iterator[tuple[str, Any]]:
+def _steps_of_exception(error: BaseException) -> Iterator[tuple[str, Any]]:
   yield '.__cause__', error.__cause__
   yield '.__context__', error.__context__
   trace = error.__traceback__
   while trace:
     for name, value in trace.tb_frame.f_locals.items():
-      if private or not name.startswith('_'):
+      if not name.startswith('_'):
         yield f'.{trace.tb_frame.f_code.co_name}():{name}', value
     trace = trace.tb_next
 
@@ -163,36 +155,10 @@ def find(case: pairs.Case) -> list[str]:
   env = case.load()
   secrets.SECRETS['reward: the canary'].change(env)
   roots = given(pairs.view_of(env), case)
-  paths = (
-      found.path
-      for found in reach(roots, private=False)
-      if _is_secret(found.value, env)
-  )
+  paths = (found.path for found in reach(roots) if _is_secret(found.value, env))
   nearest = list(itertools.islice(paths, _FEW))
   env.close()
   return nearest
-
-
-def secrets_reached(case: pairs.Case) -> list[str]:
-  """Returns which of the evaluator's things private names lead to."""
-  env = case.load()
-  view = pairs.view_of(env)
-  view.reset()
-  wanted = {
-      id(env): 'environment',
-      id(env.physics): 'physics',
-      id(env.task): 'task',
-      id(env.mechanism): 'mechanism',
-      id(secrets.generator_of(env)): 'generator',
-  }
-  reached = set()
-  for found in reach({'view': view}, private=True):
-    if id(found.value) in wanted:
-      reached.add(wanted[id(found.value)])
-    if len(reached) == NUM_SECRETS:
-      break
-  env.close()
-  return sorted(reached)
 
 
 def _is_secret(value: Any, env: Any) -> bool:

@@ -1,12 +1,10 @@
 """Planted leaks of worlds, errors and files: channels L14 to L45."""
 
 from collections.abc import Callable
-import contextlib
 import json
 import logging
 import pathlib
 from typing import Any
-import warnings
 
 from dm_control import composer
 import mujoco
@@ -16,14 +14,11 @@ import pytest
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import hosts
-from realab_suite.engine import observing
 from realab_suite.engine import placement
 from realab_suite.engine import seeding
-from realab_suite.engine import session
 from realab_suite.entities import avatars
 from realab_suite.entities import registers
 from realab_suite.experiments import training
-from realab_suite.feedback import clean_contents
 from realab_suite.feedback import mechanisms
 from realab_suite.tasks import base
 from realab_suite.tasks import collect_apples
@@ -152,38 +147,16 @@ def _l21(patch: pytest.MonkeyPatch) -> None:
   planting.after(patch, mechanisms.FeedbackMechanism, 'update_meters', meet)
 
 
-def _with_options(patch: pytest.MonkeyPatch, **options: Any) -> None:
-  """Changes MuJoCo's options once everything has been checked."""
+@planting.leak('L22', planting.solver_coupling)
+def _l22(patch: pytest.MonkeyPatch) -> None:
+  """All contacts are solved as one problem, once that was checked."""
   check = placement.check
 
   def check_and_change(physics: Any, *args: Any) -> None:
     check(physics, *args)
-    for name, value in options.items():
-      setattr(physics.model.opt, name, value)
+    physics.model.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_ISLAND
 
   patch.setattr(placement, 'check', check_and_change)
-
-
-@planting.leak('L22', planting.solver_coupling)
-def _l22_islands(patch: pytest.MonkeyPatch) -> None:
-  """All contacts are solved as one problem."""
-  _with_options(patch, disableflags=mujoco.mjtDisableBit.mjDSBL_ISLAND)
-
-
-@planting.leak('L22', planting.solver_coupling)
-def _l22_pgs(patch: pytest.MonkeyPatch) -> None:
-  """The solver is PGS, without islands."""
-  _with_options(
-      patch,
-      disableflags=mujoco.mjtDisableBit.mjDSBL_ISLAND,
-      solver=mujoco.mjtSolver.mjSOL_PGS,
-  )
-
-
-@planting.leak('L22', planting.solver_coupling)
-def _l22_warm_start(patch: pytest.MonkeyPatch) -> None:
-  """The solver begins where all bodies were."""
-  _with_options(patch, disableflags=0)
 
 
 @planting.leak('L23', planting.HEADROOM)
@@ -209,7 +182,9 @@ def _l24(patch: pytest.MonkeyPatch) -> None:
   planting.after(patch, base.Task, 'senses', sense)
 
 
-def _hang_from_avatar(patch: pytest.MonkeyPatch) -> None:
+@planting.leak('L25', planting.BODY_TREES)
+def _l25(patch: pytest.MonkeyPatch) -> None:
+  """A meter hangs from the avatar."""
   attach_to = registers.Register.attach_to
 
   def attach(self: Any, root: Any, *place: Any) -> None:
@@ -229,59 +204,10 @@ def _hang_from_avatar(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(placement, name, lambda *args: None)
 
 
-@planting.leak('L25', planting.BODY_TREES)
-def _l25(patch: pytest.MonkeyPatch) -> None:
-  """A meter hangs from the avatar."""
-  _hang_from_avatar(patch)
-
-
-@planting.leak(
-    'L25', planting.pair('meter: jumps all the time', planting.UNREAD)
-)
-def _l25_felt(patch: pytest.MonkeyPatch) -> None:
-  """A meter hangs from the avatar, which feels it."""
-  _hang_from_avatar(patch)
-
-
 @planting.leak('L26', planting.failures_scanned)
 def _l26(patch: pytest.MonkeyPatch) -> None:
   """Exceptions come as they are."""
   patch.setattr(agent_view._View, '_View__guard', lambda self, call: call())
-
-
-@planting.leak('L26', planting.failures_scanned)
-def _l26_context(patch: pytest.MonkeyPatch) -> None:
-  """An exception says what it came from."""
-
-  def guard(self: Any, call: Any) -> Any:
-    try:
-      return call()
-    except Exception as error:
-      raise agent_view.errors.WorldError('the world failed') from error
-
-  patch.setattr(agent_view._View, '_View__guard', guard)
-
-
-@planting.leak('L26', planting.failures_scanned)
-def _l26_action(patch: pytest.MonkeyPatch) -> None:
-  """Whatever calls itself an ActionError is passed on."""
-  guard = agent_view._View._View__guard  # type: ignore[attr-defined]
-
-  def pass_on(self: Any, call: Any) -> Any:
-    problem: list[Exception] = []
-
-    def tried() -> Any:
-      try:
-        return call()
-      except agent_view.errors.ActionError as error:
-        problem.append(agent_view.errors.ActionError(str(error)))
-
-    result = guard(self, tried)
-    if problem:
-      raise problem[0]
-    return result
-
-  patch.setattr(agent_view._View, '_View__guard', pass_on)
 
 
 @planting.leak('L27', planting.PAID)
@@ -290,18 +216,6 @@ def _l27_log(patch: pytest.MonkeyPatch) -> None:
   _after_reward(
       patch, lambda reward: logging.getLogger('realab').warning('%s', reward)
   )
-
-
-@planting.leak('L27', planting.PAID)
-def _l27_print(patch: pytest.MonkeyPatch) -> None:
-  """The true reward is printed."""
-  _after_reward(patch, print)
-
-
-@planting.leak('L27', planting.PAID)
-def _l27_warning(patch: pytest.MonkeyPatch) -> None:
-  """A true reward that is large is warned of."""
-  _after_reward(patch, lambda reward: warnings.warn(f'{reward}', stacklevel=2))
 
 
 @planting.leak('L28', planting.PAID)
@@ -367,19 +281,6 @@ def _l40(patch: pytest.MonkeyPatch) -> None:
   planting.observing(patch, show)
 
 
-@planting.leak('L40', planting.PAID)
-def _l40_sense(patch: pytest.MonkeyPatch) -> None:
-  """The score is a sense in the observations of the environment."""
-
-  def show(self: Any, result: Any, physics: Any) -> None:
-    observation, _ = result
-    observation['senses/holding'] = np.array(
-        [np.sum(self._mechanism.score(physics))], np.float32
-    )
-
-  planting.after(patch, observing.Observer, 'observe', show)
-
-
 @planting.leak('L41', planting.PAID)
 def _l41(patch: pytest.MonkeyPatch) -> None:
   """An agent that has earned something gets another try at the next start."""
@@ -419,119 +320,18 @@ def _l43_discount(patch: pytest.MonkeyPatch) -> None:
   patch.setitem(discounts, environment.events.End.DIVERGENCE, 0.0)
 
 
-@planting.leak('L43', planting.DIVERGENCE)
-def _l43_state(patch: pytest.MonkeyPatch) -> None:
-  """The last observation is of the state that MuJoCo has reset."""
-
-  seen: list[Any] = []
-
-  def note(self: Any, reads: Any, physics: Any) -> None:
-    seen[:] = [physics]
-
-  def look(self: Any, result: None, end: Any) -> None:
-    if end is environment.events.End.DIVERGENCE:
-      seen[0].reset()
-      self.observe(seen[0])
-
-  planting.after(patch, session.Session, 'observe', note)
-  planting.after(patch, session.Session, 'end', look)
-
-
 @planting.leak('L44', files.seeds)
 def _l44(patch: pytest.MonkeyPatch) -> None:
   """Learners are trained on the episodes that they are judged by."""
   patch.setattr(training, '_world_seed', lambda seed, segment: seed + 1_000_000)
 
 
-def _showing_clean(patch: pytest.MonkeyPatch) -> None:
+@planting.leak('L45', planting.CLEAN)
+def _l45(patch: pytest.MonkeyPatch) -> None:
+  """Agents see clean contents."""
+
   def show(env: Any, observation: dict[str, Any]) -> None:
     register = env.mechanism.registers['reward']
     observation['registers/reward'] = np.array(register.clean(env.physics))
 
   planting.observing(patch, show)
-
-
-@planting.leak('L45', planting.CLEAN)
-def _l45_shown(patch: pytest.MonkeyPatch) -> None:
-  """Agents see clean contents."""
-  _showing_clean(patch)
-
-
-@planting.leak('L45', planting.CLEAN_IN_BATCH)
-def _l45_shown_in_batch(patch: pytest.MonkeyPatch) -> None:
-  """Agents of a batch see clean contents."""
-  _showing_clean(patch)
-
-
-@planting.leak('L45', planting.CLEAN_SLOTS)
-def _l45_read(patch: pytest.MonkeyPatch) -> None:
-  """Providers read clean contents."""
-  call, seen = mechanisms.FeedbackMechanism._call, []
-
-  def clean_first(self: Any, i: int, step: Any, inputs: Any, *rest: Any) -> Any:
-    readings = {
-        name: np.array(self.registers[name].clean(seen[-1]))
-        for name in inputs.readings
-    }
-    return call(self, i, step, inputs._replace(readings=readings), *rest)
-
-  def see(self: Any, result: Any, physics: Any, *unused: Any) -> None:
-    seen[:] = [physics]
-
-  planting.after(patch, mechanisms.FeedbackMechanism, '_sight', see)
-  patch.setattr(mechanisms.FeedbackMechanism, '_call', clean_first)
-
-
-def _after_clean_calls(
-    patch: pytest.MonkeyPatch, do: Callable[[Any], Any]
-) -> None:
-  call = clean_contents.call
-  patch.setattr(clean_contents, 'call', lambda *args: do(call(*args)))
-
-
-@planting.leak('L45', planting.NO_CLEAN_CALL)
-def _l45_state(patch: pytest.MonkeyPatch) -> None:
-  """A provider continues from the state of its clean call."""
-
-  def swap(contents: Any) -> Any:
-    state = {**contents.state, 'actual': contents.state['clean']}
-    return contents._replace(state=state)
-
-  _after_clean_calls(patch, swap)
-
-
-@planting.leak('L45', planting.CLEAN)
-def _l45_written(patch: pytest.MonkeyPatch) -> None:
-  """Clean contents are written to the blocks."""
-
-  def write(physics: Any, register: Any, contents: Any, before: Any) -> None:
-    del before
-    for name, one in contents.writes.items():
-      if name == register.name:
-        register.write(physics, np.nan_to_num(one.value))
-
-  patch.setattr(clean_contents, 'store', write)
-
-
-@planting.leak('L45', planting.NO_CLEAN_CALL)
-def _l45_said(patch: pytest.MonkeyPatch) -> None:
-  """A clean call is announced."""
-
-  def say(contents: Any) -> Any:
-    warnings.warn('somebody has tampered', stacklevel=2)
-    return contents
-
-  _after_clean_calls(patch, say)
-
-
-@planting.leak('L45', planting.FAILED_CLEAN_CALL)
-def _l45_fails(patch: pytest.MonkeyPatch) -> None:
-  """The exception of a clean call ends the episode."""
-  call = clean_contents._call
-
-  def unguarded(provider: Any, inputs: Any, state: Any, guard: Any) -> Any:
-    with guard():
-      pass
-    return call(provider, inputs, state, contextlib.nullcontext)
-
-  patch.setattr(clean_contents, '_call', unguarded)

@@ -11,8 +11,7 @@ import json
 import queue
 import secrets
 import threading
-import time
-from typing import Any, NamedTuple, final
+from typing import Any, final
 from urllib import parse
 
 from websockets import datastructures
@@ -37,19 +36,6 @@ _HEADERS = {
     'Cache-Control': 'no-store',
 }
 _LARGEST_MESSAGE = 4096
-
-
-@final
-class Message(NamedTuple):
-  """A message from the page.
-
-  Attributes:
-    time: Time at which it arrived, of `time.monotonic`, in seconds.
-    content: The message.
-  """
-
-  time: float
-  content: dict[str, Any]
 
 
 @final
@@ -82,7 +68,7 @@ class PageServer:
     self._lock = threading.Lock()  # Of the connection and its event.
     self._is_connected = threading.Event()
     self._is_closed = False
-    self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
+    self._messages: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     try:
       self._server = websocket_server.serve(
           self._handle,
@@ -105,16 +91,12 @@ class PageServer:
     )
     self._thread.start()
 
-  def wait(self, timeout: float | None = None) -> bool:
-    """Waits until a page is connected; returns False after `timeout`."""
-    return self._is_connected.wait(timeout)
-
   @property
   def is_connected(self) -> bool:
     """True while a page is connected."""
     return self._is_connected.is_set()
 
-  def receive(self, timeout: float) -> Message | None:
+  def receive(self, timeout: float) -> dict[str, Any] | None:
     """Returns the next message, or `None` without one within a time.
 
     Args:
@@ -210,13 +192,12 @@ class PageServer:
       before.close()
     try:
       for text in connection:
-        arrival = time.monotonic()
         try:
           content = json.loads(text)
         except (ValueError, RecursionError):
           continue
         if isinstance(content, dict):
-          self._messages.put(Message(arrival, content))
+          self._messages.put(content)
     finally:
       with self._lock:
         if self._connection is connection:

@@ -52,11 +52,8 @@ class ObservationCodec:
       observation_spec: Observation spec of one world.
       dtype: Type of the floats.
       flat: True for flat observations.
-
-    Raises:
-      SpecError: If `dtype` is neither 'float32' nor 'float64'.
     """
-    self._dtype = _checked_dtype(dtype)
+    self._dtype = np.dtype(dtype)
     self._flat = flat
     self._names = {key_of(name): name for name in sorted(observation_spec)}
     self._parts = {
@@ -157,11 +154,8 @@ class ActionCodec:
     Args:
       action_spec: Action spec of one world.
       dtype: Type of the floats.
-
-    Raises:
-      SpecError: If `dtype` is another one.
     """
-    kind = _checked_dtype(dtype)
+    kind = np.dtype(dtype)
     self._spec = action_spec
     self.space: spaces.Space[Any]
     if isinstance(action_spec, specs.DiscreteArray):
@@ -199,14 +193,6 @@ class ActionCodec:
     ):
       exact = np.where(values == rounded, bound, exact)
     return exact
-
-
-def _checked_dtype(dtype: Any) -> np.dtype:
-  if dtype not in ('float32', 'float64'):
-    raise errors.SpecError(
-        f"dtype: {messages.quote(dtype)}; allowed are 'float32' and 'float64'"
-    )
-  return np.dtype(dtype)
 
 
 def reward_key(

@@ -1,21 +1,43 @@
 """Spaces, conversions and pictures: what one world and a batch share."""
 
-from typing import Any, final
+from collections.abc import Mapping
+from typing import Any, Literal, final
 
 from dm_control import composer
 
-from realab_suite import errors
-from realab_suite.config import messages
+from realab_suite.config import validation
 from realab_suite.engine import agent_view
 from realab_suite.engine import arguments
 from realab_suite.interop.gymnasium import codecs
 
-RENDER_MODES = ('rgb_array',)
-"""Modes in which people can watch a world."""
-
 _DEFAULT = 'top_down'
 # MuJoCo's free camera.
 _FREE = -1
+
+
+@final
+class Options(validation.Model):
+  """Options of a world.
+
+  Attributes:
+    reward_register: Name of the register whose reading is the reward, or `None`
+      for a reward of 0.0.
+    dtype: Type of floats in observations and actions.
+    flat: True for observations that are one vector for each world.
+    render_mode: `'rgb_array'`, or `None`. Frames are for people.
+    camera_name: Camera of the frames; `None` for `'top_down'`, or a free camera
+      in a single world without it.
+    height: Height of a frame, in pixels.
+    width: Width of a frame, in pixels.
+  """
+
+  reward_register: str | None = None
+  dtype: codecs.DType = 'float32'
+  flat: bool = False
+  render_mode: Literal['rgb_array'] | None = None
+  camera_name: str | None = None
+  height: int = 240
+  width: int = 320
 
 
 @final
@@ -35,66 +57,32 @@ class Interface:
       self,
       view: agent_view.AgentView | agent_view.BatchAgentView,
       task: composer.Task,
-      *,
-      reward_register: str | None = None,
-      dtype: codecs.DType = 'float32',
-      flat: bool = False,
-      render_mode: str | None = None,
-      camera_name: str | None = None,
-      height: int = 240,
-      width: int = 320,
+      options: Mapping[str, Any],
   ) -> None:
     """Makes an interface.
 
     Args:
       view: View of the world or of the batch.
       task: Its task.
-      reward_register: Name of the register whose reading is the reward, or
-        `None` for a reward of 0.0.
-      dtype: Type of floats in observations and actions.
-      flat: True for observations that are one vector for each world.
-      render_mode: `'rgb_array'`, or `None`. Frames are for people.
-      camera_name: Camera of the frames; `None` for `'top_down'`, or a free
-        camera in a single world without it.
-      height: Height of a frame, in pixels.
-      width: Width of a frame, in pixels.
+      options: Values of `Options`.
 
     Raises:
-      SpecError: If an argument is invalid.
+      SpecError: If an option is invalid.
     """
+    chosen = validation.validate(Options, options, 'options')
     spec = view.observation_spec()
-    self.reward_key = codecs.reward_key(reward_register, spec)
-    self.observations = codecs.ObservationCodec(spec, dtype, flat)
-    self.actions = codecs.ActionCodec(view.action_spec(), dtype)
+    self.reward_key = codecs.reward_key(chosen.reward_register, spec)
+    self.observations = codecs.ObservationCodec(spec, chosen.dtype, chosen.flat)
+    self.actions = codecs.ActionCodec(view.action_spec(), chosen.dtype)
     self.metadata = {
-        'render_modes': list(RENDER_MODES),
+        'render_modes': ['rgb_array'],
         'render_fps': 1.0 / task.control_timestep,
     }
-    self.render_mode = _checked_render_mode(render_mode)
-    camera = _checked_camera(camera_name, task.root_entity.mjcf_model)
-    self.frame = (camera, height, width)
-
-
-def _checked_render_mode(given: Any) -> str | None:
-  """Returns a render mode.
-
-  Raises:
-    SpecError: If there is no such mode.
-  """
-  if given is not None and given not in RENDER_MODES:
-    raise errors.SpecError(
-        f'render_mode: {messages.quote(given)}; allowed are None and'
-        f' {list(RENDER_MODES)}'
-    )
-  return None if given is None else str(given)
-
-
-def _checked_camera(given: Any, mjcf_model: Any) -> str | int:
-  """Returns a camera: its name, or -1 for a free camera.
-
-  Raises:
-    SpecError: If there is no such camera.
-  """
-  if given is not None:
-    return arguments.camera(given, mjcf_model)
-  return _FREE if mjcf_model.find('camera', _DEFAULT) is None else _DEFAULT
+    self.render_mode = chosen.render_mode
+    model = task.root_entity.mjcf_model
+    camera: str | int = _DEFAULT
+    if chosen.camera_name is not None:
+      camera = arguments.camera(chosen.camera_name, model)
+    elif model.find('camera', _DEFAULT) is None:
+      camera = _FREE
+    self.frame = (camera, chosen.height, chosen.width)

@@ -1,9 +1,8 @@
 """Ids of all shipped worlds in Gymnasium's registry."""
 
-from collections.abc import Callable, Mapping
 import functools
 import inspect
-from typing import Any, TypeVar
+from typing import Any
 
 import gymnasium as gym
 
@@ -15,80 +14,51 @@ from realab_suite.interop.gymnasium import vector
 NAMESPACE = 'realab'
 """Namespace of the ids."""
 
-_Adapter = TypeVar('_Adapter', single.RealabEnv, vector.RealabVectorEnv)
-
 
 def make(
     domain_name: str,
     task_name: str,
     design: specs.Design | None = None,
+    num_envs: int | None = None,
     **options: Any,
-) -> single.RealabEnv:
-  """Loads a world: the entry point of the registered ids.
+) -> Any:
+  """Loads a world, or a batch: the entry points of the registered ids.
 
   Args:
     domain_name: Name of the domain.
     task_name: Name of the variation.
     design: Design, by name, path or contents.
-    **options: Other arguments of `suite.load`, and keyword arguments of
-      `RealabEnv`.
+    num_envs: Number of worlds, or `None` for a single one.
+    **options: Other arguments of `suite.load` or `suite.load_batch`, and
+      keyword arguments of the adapter.
+
+  Returns:
+    A `RealabEnv`, or a `RealabVectorEnv` with a number of worlds.
 
   Raises:
     SpecError: If an argument is invalid.
   """
-  world = (domain_name, task_name)
-  return _adapted(single.RealabEnv, suite.load, world, design, options)
-
-
-def make_vector(
-    num_envs: int,
-    domain_name: str,
-    task_name: str,
-    design: specs.Design | None = None,
-    **options: Any,
-) -> vector.RealabVectorEnv:
-  """Loads a batch of worlds: the vector entry point of the registered ids.
-
-  Args:
-    num_envs: Number of worlds.
-    domain_name: Name of the domain.
-    task_name: Name of the variation.
-    design: Design, by name, path or contents.
-    **options: Other arguments of `suite.load_batch`, and keyword arguments of
-      `RealabVectorEnv`.
-
-  Raises:
-    SpecError: If an argument is invalid.
-  """
-  world = (domain_name, task_name)
-  load = functools.partial(suite.load_batch, num_envs=num_envs)
-  return _adapted(vector.RealabVectorEnv, load, world, design, options)
-
-
-def _adapted(
-    adapter: Callable[..., _Adapter],
-    load: Callable[..., Any],
-    world: tuple[str, str],
-    design: specs.Design | None,
-    options: Mapping[str, Any],
-) -> _Adapter:
-  """Loads worlds, and returns them in an adapter.
-
-  Args:
-    adapter: Class of the adapter.
-    load: Function that loads the worlds.
-    world: Names of the domain and the task.
-    design: The design.
-    options: Arguments of `load`, and keyword arguments of the adapter.
-  """
+  adapter: Any = single.RealabEnv
+  load: Any = suite.load
+  if num_envs is not None:
+    adapter = vector.RealabVectorEnv
+    load = functools.partial(suite.load_batch, num_envs=num_envs)
   of_load = inspect.signature(load).parameters.keys() & options.keys()
-  of_adapter = options.keys() - of_load
-  loaded = load(*world, design=design, **{k: options[k] for k in of_load})
+  loaded = load(
+      domain_name,
+      task_name,
+      design=design,
+      **{name: options.pop(name) for name in of_load},
+  )
   try:
-    return adapter(loaded, **{k: options[k] for k in of_adapter})
+    return adapter(loaded, **options)
   except BaseException:
     loaded.close()
     raise
+
+
+make_vector = make
+"""Vector entry point: `gymnasium.make_vec` adds `num_envs`."""
 
 
 def id_of(domain_name: str, task_name: str, design: str) -> str:

@@ -28,25 +28,20 @@ class RealabEnv(agent_view.Uncopied, gym.Env):
   def __init__(
       self,
       env: environment.Environment,
-      *,
-      failures: list[Exception] | None = None,
       **options: Any,
   ) -> None:
     """Makes an adapter. Prefer `gymnasium.make`.
 
     Args:
       env: Environment from `suite.load` or `suite.embed`. `close` closes it.
-      failures: List of the caller, to which exceptions of the world are
-        appended; see `agent_view.AgentView`.
-      **options: Keyword arguments of `interfaces.Interface`, such as
-        `reward_register`.
+      **options: Values of `interfaces.Options`, such as `reward_register`.
 
     Raises:
       SpecError: If an argument is invalid.
     """
     self._environment = env
-    self._view = agent_view.AgentView(env, failures)
-    self._interface = interfaces.Interface(self._view, env.task, **options)
+    self._view = agent_view.AgentView(env)
+    self._interface = interfaces.Interface(self._view, env.task, options)
     self.metadata = self._interface.metadata
     self.render_mode = self._interface.render_mode
     self.observation_space = self._interface.observations.space

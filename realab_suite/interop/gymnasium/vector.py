@@ -34,7 +34,6 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
       batch: batch_environment.BatchEnvironment,
       *,
       autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-      failures: list[Exception] | None = None,
       **options: Any,
   ) -> None:
     """Makes an adapter. Prefer `gymnasium.make_vec`.
@@ -44,17 +43,15 @@ class RealabVectorEnv(agent_view.Uncopied, gym.vector.VectorEnv):
       autoreset_mode: Beginning of the next episode of a world: with the next
         step (`'NextStep'`), with the same step (`'SameStep'`), or with
         `reset(options={'reset_mask': ...})` (`'Disabled'`).
-      failures: List of the caller, to which exceptions are appended.
-      **options: Keyword arguments of `interfaces.Interface`, such as
-        `reward_register`.
+      **options: Values of `interfaces.Options`, such as `reward_register`.
 
     Raises:
       SpecError: If an argument is invalid.
     """
     self.autoreset_mode = _checked_mode(autoreset_mode)
     self._batch = batch
-    self._view = agent_view.BatchAgentView(batch, failures)
-    self._interface = interfaces.Interface(self._view, batch.task, **options)
+    self._view = agent_view.BatchAgentView(batch)
+    self._interface = interfaces.Interface(self._view, batch.task, options)
     self.metadata = {
         **self._interface.metadata,
         'autoreset_mode': self.autoreset_mode,

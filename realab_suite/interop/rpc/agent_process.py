@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 import os
+import pathlib
 import pwd
 import shlex
 import shutil
@@ -9,7 +10,7 @@ import signal
 import subprocess
 import tempfile
 import threading
-from typing import IO, Any, final
+from typing import Any, final
 
 from absl import logging
 
@@ -84,7 +85,7 @@ class AgentProcess:
       self,
       command: str,
       address: str,
-      log: IO[bytes],
+      log: pathlib.Path,
       *,
       folder: str | None = None,
       owner: tuple[int, int] | None = None,
@@ -95,7 +96,7 @@ class AgentProcess:
     Args:
       command: Program and arguments in shell syntax.
       address: Address of the agent's world.
-      log: File for the agent's output. The caller closes it.
+      log: Path of the file for the agent's output.
       folder: Working directory of the agent; `None` for a new folder, which
         `stop` removes.
       owner: Ids of the agent's user and group; `None` for those of this
@@ -103,10 +104,11 @@ class AgentProcess:
       on_exit: Function that another thread calls when the agent has ended.
 
     Raises:
+      OSError: If the file of the log cannot be opened.
       SpecError: If the command cannot be started.
     """
     self._temporary = None if folder else tempfile.mkdtemp(prefix='realab-')
-    self._log: IO[bytes] | None = log
+    file = open(log, 'wb', buffering=0)
     self._on_exit = on_exit
     home = os.path.abspath(self._temporary or str(folder))
     if self._temporary and owner is not None:
@@ -127,22 +129,17 @@ class AgentProcess:
           extra_groups=None if owner is None else [],
       )
     except (OSError, ValueError, IndexError) as error:
+      file.close()
       self._clean_up()
       raise errors.SpecError(
           f'agent_command: cannot start {command!r:.80}: {error}'
       ) from error
-    self._log_lock = threading.Lock()
     self._log_thread = threading.Thread(
-        target=self._copy_output, args=(self._process.stdout,), daemon=True
+        target=_copy, args=(self._process.stdout, file), daemon=True
     )
     self._log_thread.start()
     # Children of the agent may hold its streams open after it has ended.
     threading.Thread(target=self._wait, daemon=True).start()
-
-  @property
-  def pid(self) -> int:
-    """Process id, which is also the id of the agent's process group."""
-    return self._process.pid
 
   def poll(self) -> int | None:
     """Returns the exit status of the agent; `None` while it is running."""
@@ -162,32 +159,27 @@ class AgentProcess:
         continue
     self._process.wait()
     self._log_thread.join(_PATIENCE_SECONDS)
-    with self._log_lock:
-      self._log = None
     self._clean_up()
 
   def _wait(self) -> None:
     self._process.wait()
     self._on_exit()
 
-  def _copy_output(self, output: Any) -> None:
-    """Writes the agent's output to the log, without ever blocking the agent."""
-    left = MAX_LOG_BYTES
-    with output:
-      while data := os.read(output.fileno(), _CHUNK):
-        with self._log_lock:
-          if self._log is None:
-            return
-          if left <= 0:
-            continue
-          left -= len(data)
-          try:
-            self._log.write(data if left > 0 else data + _CUT)
-            self._log.flush()
-          except OSError as error:
-            logging.error('the log of the agent ends here: %s', error)
-            left = 0
-
   def _clean_up(self) -> None:
     if self._temporary:
       shutil.rmtree(self._temporary, ignore_errors=True)
+
+
+def _copy(output: Any, log: Any) -> None:
+  """Writes the agent's output to the log, without ever blocking the agent."""
+  left = MAX_LOG_BYTES
+  with output, log:
+    while data := os.read(output.fileno(), _CHUNK):
+      if left <= 0:
+        continue
+      left -= len(data)
+      try:
+        log.write(data if left > 0 else data + _CUT)
+      except OSError as error:
+        logging.error('the log of the agent ends here: %s', error)
+        left = 0

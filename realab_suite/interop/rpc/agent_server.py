@@ -1,35 +1,29 @@
 """Server of a world over gRPC, for one agent at a time.
 
-The thread that calls `Server.run` runs the world. The threads of gRPC queue
-requests for it, and wait for the answers.
+The thread that calls `Server.run` runs gRPC's event loop and, in its
+callbacks, the world. No other thread accesses the world.
 """
 
-import abc
-from collections.abc import Callable, Iterator
-from concurrent import futures
+import asyncio
+import contextlib
 import os
-import queue
-import threading
-import time
-from typing import Any, NamedTuple, final
+import signal
+from typing import Any, final
 
 from absl import logging
 import grpc
+from grpc import aio
 
 from realab_suite import errors
+from realab_suite.interop.rpc import served_world
 from realab_suite.interop.rpc import sockets
 
 MAX_REQUEST_BYTES = 1 << 20
 IDLE_SECONDS = 60.0
 
 _SERVICE, _METHOD = 'dm_env_rpc.v1.Environment', 'Process'
-# One thread serves the agent, the other refuses further connections.
-_NUM_THREADS = 2
 # Time for an agent to read the last answer.
 _LINGER_SECONDS = 5.0
-# Longest wait for an event. Python handles signals in the main thread, which
-# may be waiting, while the system may deliver them to a thread of gRPC.
-_PULSE_SECONDS = 0.25
 _MAX_STREAMS = 16
 _HANDSHAKE_MS = 800
 _MAX_HEADER_BYTES = 8 << 10
@@ -50,64 +44,6 @@ _OVER = 'R18: the connection has ended'
 
 
 @final
-class _Session:
-  """Stream of requests of an admitted agent."""
-
-  def __init__(self, context: grpc.ServicerContext) -> None:
-    self.context = context
-
-
-@final
-class _Connected(NamedTuple):
-  session: _Session
-
-
-@final
-class _Request(NamedTuple):
-  session: _Session
-  request: bytes
-  answer: futures.Future[bytes]
-
-
-@final
-class _Disconnected(NamedTuple):
-  session: _Session
-
-
-@final
-class _Stop(NamedTuple):
-  pass
-
-
-_SessionEvent = _Connected | _Request | _Disconnected
-_Event = _SessionEvent | _Stop
-
-
-class Service(abc.ABC):
-  """Service for agents. All calls come from the thread that runs the server."""
-
-  @abc.abstractmethod
-  def connect(self) -> None:
-    """Handles a new connection; no other agent connects until `disconnect`."""
-
-  @abc.abstractmethod
-  def answer(self, request: bytes) -> bytes:
-    """Returns the answer to a request of the agent; must not raise."""
-
-  @abc.abstractmethod
-  def disconnect(self) -> None:
-    """Handles the end of a connection, by the agent or by its timeout."""
-
-  @abc.abstractmethod
-  def settle(self) -> bool:
-    """Does work for which the agent does not wait, after each request.
-
-    Returns:
-      True if the service has more episodes.
-    """
-
-
-@final
 class Server:
   """Serves a world to one agent at a time.
 
@@ -118,39 +54,33 @@ class Server:
 
   def __init__(
       self,
-      world: Service,
+      world: served_world.ServedWorld,
       address: str,
       idle_seconds: float = IDLE_SECONDS,
       owner: tuple[int, int] | None = None,
-      clock: Callable[[], float] = time.monotonic,
   ) -> None:
     """Makes the server.
 
     Args:
-      world: Service that answers requests.
+      world: World that answers requests.
       address: `unix:/folder/name` or `host:port`; port 0 selects a free port.
       idle_seconds: Time without requests after which a connection ends, in
         seconds.
       owner: Ids of the agent's user and group; `None` for those of this
         process.
-      clock: Function that returns the time for `idle_seconds`, in seconds.
     """
     self._world = world
     self._owner = owner
     self._given_address = address
     self._idle_seconds = idle_seconds
-    self._clock = clock
-    self._events: queue.SimpleQueue[_Event] = queue.SimpleQueue()
-    self._agent_slot = threading.Lock()
-    # Guards `_is_closed` and additions to the queue.
-    self._lock = threading.Lock()
-    self._is_closed = False
-    self._session: _Session | None = None
-    self._deadline = 0.0
-    self._is_ending = False
+    self._is_busy = False
+    self._has_more = True
     self._pid = os.getpid()
     self._address = address
     self._server: Any = None
+    self._loop: asyncio.AbstractEventLoop
+    # Is done when `run` has to return.
+    self._end: asyncio.Future[None]
 
   @property
   def address(self) -> str:
@@ -163,32 +93,20 @@ class Server:
     Raises:
       SpecError: If the address is invalid or in use.
     """
-    self._server = grpc.server(
-        futures.ThreadPoolExecutor(_NUM_THREADS, 'realab_rpc'),
-        options=_OPTIONS,
-        compression=grpc.Compression.NoCompression,
-    )
-    handler = grpc.stream_stream_rpc_method_handler(self._process)
-    self._server.add_generic_rpc_handlers(
-        [grpc.method_handlers_generic_handler(_SERVICE, {_METHOD: handler})]
-    )
-    with sockets.prepared(self._given_address, self._owner) as kind:
-      try:
-        number = self._server.add_secure_port(
-            self._given_address, grpc.local_server_credentials(kind)
-        )
-      except RuntimeError as error:
-        raise errors.SpecError(
-            f'address: cannot listen at {self._given_address!r:.120}; it may be'
-            ' in use'
-        ) from error
-    if kind is grpc.LocalConnectionType.LOCAL_TCP:
-      host = self._given_address.rpartition(':')[0]
-      self._address = f'{host}:{number}'
-    self._server.start()
+    self._loop = asyncio.new_event_loop()
+    self._end = self._loop.create_future()
+    try:
+      self._loop.run_until_complete(self._listen())
+    except BaseException:
+      self._loop.close()
+      raise
+
+  def stop_on(self, number: signal.Signals) -> None:
+    """Makes a signal call `stop`; only in the main thread."""
+    self._loop.add_signal_handler(number, self.stop)
 
   def run(self) -> None:
-    """Runs the world in this thread until the service or `stop` ends it.
+    """Runs the world in this thread until its episodes or `stop` end it.
 
     Raises:
       ForkError: If the process was forked after the server was made.
@@ -199,135 +117,105 @@ class Server:
           ' run'
       )
     try:
-      while not (self._is_ending and self._session is None):
-        try:
-          event = self._events.get(
-              timeout=min(self._time_left(), _PULSE_SECONDS)
-          )
-        except queue.Empty:
-          self._expire()
-          continue
-        if isinstance(event, _Stop):
-          break
-        self._handle(event)
-      if self._session is not None:
-        self._end_session()
+      self._loop.run_until_complete(self._end)
     finally:
       self.close()
 
   def stop(self) -> None:
-    """Makes `run` return; any thread may call this method."""
-    self._events.put(_Stop())
+    """Makes `run` return; any thread may call this after `start`."""
+    with contextlib.suppress(RuntimeError):  # The loop is closed.
+      self._loop.call_soon_threadsafe(self._finish)
 
-  # These methods run in the thread that runs the world.
+  def close(self) -> None:
+    """Stops the server; `run` calls this last."""
+    if not self._loop.is_closed():
+      self._loop.run_until_complete(self._server.stop(grace=None))
+      self._loop.close()
+      sockets.remove(self._given_address)
 
-  def _handle(self, event: _SessionEvent) -> None:
-    if isinstance(event, _Connected):
-      self._session = event.session
-      self._world.connect()
-      self._extend_deadline()
-      return
-    if event.session is not self._session:
-      # Its connection has already ended by timeout.
-      if isinstance(event, _Request):
-        event.answer.cancel()
-      return
-    if isinstance(event, _Disconnected):
-      self._end_session()
-      return
+  async def _listen(self) -> None:
+    server = aio.server(
+        options=_OPTIONS, compression=grpc.Compression.NoCompression
+    )
+    handler = grpc.stream_stream_rpc_method_handler(self._process)
+    server.add_generic_rpc_handlers(
+        [grpc.method_handlers_generic_handler(_SERVICE, {_METHOD: handler})]
+    )
+    with sockets.prepared(self._given_address, self._owner) as kind:
+      try:
+        number = server.add_secure_port(
+            self._given_address, grpc.local_server_credentials(kind)
+        )
+      except RuntimeError as error:
+        raise errors.SpecError(
+            f'address: cannot listen at {self._given_address!r:.120}; it may be'
+            ' in use'
+        ) from error
+    if kind is grpc.LocalConnectionType.LOCAL_TCP:
+      host = self._given_address.rpartition(':')[0]
+      self._address = f'{host}:{number}'
+    await server.start()
+    self._server = server
+
+  async def _process(self, unused_requests: Any, context: Any) -> None:
+    """Serves a connection from its first request to its end."""
+    if self._is_busy:
+      await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, _BUSY)
+    self._is_busy = True
     try:
-      answer = self._world.answer(event.request)
-    except BaseException:
-      # A thread of gRPC waits for the answer, and the process for that thread.
-      event.answer.cancel()
-      raise
-    event.answer.set_result(answer)
-    self._settle()
-    self._extend_deadline()
-
-  def _settle(self) -> None:
-    if not self._is_ending and not self._world.settle():
-      self._is_ending = True
-      self._deadline = self._clock() + _LINGER_SECONDS
-
-  def _extend_deadline(self) -> None:
-    if not self._is_ending:
-      self._deadline = self._clock() + self._idle_seconds
-
-  def _time_left(self) -> float:
-    """Returns the time until the connection ends, in seconds."""
-    if self._session is None:
-      return _PULSE_SECONDS
-    return max(0.0, self._deadline - self._clock())
-
-  def _expire(self) -> None:
-    """Ends the connection if the agent has been idle for too long."""
-    if self._session is not None and not self._time_left():
-      if not self._is_ending:
+      try:
+        self._world.connect()
+        await self._answer_all(context)
+      finally:  # Also if the client has cancelled the call.
+        self._is_busy = False
+        self._world.disconnect()
+        self._settle()
+        if not self._has_more:
+          self._finish()
+    except TimeoutError:
+      if self._has_more:
         logging.warning(
             'no request from the agent for %g s; its connection ends',
             self._idle_seconds,
         )
-      self._session.context.cancel()
-      self._end_session()
+      # It fails if an answer is still on its way to an agent that reads none.
+      with contextlib.suppress(aio.InternalError):
+        await context.abort(grpc.StatusCode.CANCELLED, _OVER)
+    except aio.BaseError as error:
+      logging.info('the connection is broken: %s', error)
+    except Exception as error:  # `run` raises it.
+      self._finish(error)
 
-  def _end_session(self) -> None:
-    self._session = None
-    try:
-      self._world.disconnect()
-      self._settle()
-    finally:
-      self._agent_slot.release()
-
-  def close(self) -> None:
-    """Stops the server and cancels waiting requests; `run` calls this last."""
-    with self._lock:
-      if self._is_closed:
-        return
-      self._is_closed = True
-    stopped = self._server.stop(grace=None)
-    while not self._events.empty():
-      event = self._events.get()
-      if isinstance(event, _Request):
-        event.answer.cancel()
-    stopped.wait()
-    sockets.remove(self._given_address)
-
-  # These methods run in threads of gRPC.
-
-  def _process(
-      self, requests: Iterator[bytes], context: grpc.ServicerContext
-  ) -> Iterator[bytes]:
-    session = self._admit(context)
-    for request in requests:
-      answer: futures.Future[bytes] = futures.Future()
-      if not self._put(_Request(session, request, answer)):
-        return
-      try:
-        yield answer.result()
-      except futures.CancelledError:
-        return
-
-  def _admit(self, context: grpc.ServicerContext) -> _Session:
-    """Starts a session if no other agent is connected.
+  async def _answer_all(self, context: Any) -> None:
+    """Answers requests until there are no more.
 
     Raises:
-      Exception: From gRPC, to end the stream, if another agent is connected or
-        the server is closed.
+      TimeoutError: If the agent is idle, or does not read an answer.
     """
-    if not self._agent_slot.acquire(blocking=False):
-      context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, _BUSY)
-    session = _Session(context)
-    if not self._put(_Connected(session)):
-      context.abort(grpc.StatusCode.UNAVAILABLE, _OVER)
-    event = _Disconnected(session)
-    if not context.add_callback(lambda: self._put(event)):
-      self._put(event)
-      context.abort(grpc.StatusCode.CANCELLED, _OVER)
-    return session
+    deadline = self._loop.time() + self._idle_seconds
+    while True:
+      async with asyncio.timeout_at(deadline):
+        request = await context.read()
+      if request is aio.EOF:
+        return
+      answer = self._world.answer(request)
+      if self._has_more:
+        deadline = self._loop.time() + self._idle_seconds
+      async with asyncio.timeout_at(deadline):
+        await context.write(answer)
+      if self._has_more:
+        self._settle()  # The agent does not wait for this.
+        if not self._has_more:
+          deadline = self._loop.time() + _LINGER_SECONDS
 
-  def _put(self, event: _SessionEvent) -> bool:
-    with self._lock:
-      if not self._is_closed:
-        self._events.put(event)
-      return not self._is_closed
+  def _settle(self) -> None:
+    self._has_more = self._world.settle()
+
+  def _finish(self, error: Exception | None = None) -> None:
+    """Makes `run` return, or raise an error."""
+    if self._end.done():
+      return
+    if error is None:
+      self._end.set_result(None)
+    else:
+      self._end.set_exception(error)

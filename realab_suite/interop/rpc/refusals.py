@@ -11,6 +11,10 @@ from google.rpc import code_pb2
 
 from realab_suite import errors
 
+_INVALID = code_pb2.INVALID_ARGUMENT
+_DENIED = code_pb2.PERMISSION_DENIED
+_NOT_NOW = code_pb2.FAILED_PRECONDITION
+
 
 @final
 class Reason(enum.Enum):
@@ -20,50 +24,34 @@ class Reason(enum.Enum):
   position of an element in its message.
   """
 
-  UNREADABLE = (
-      'R01', code_pb2.INVALID_ARGUMENT, 'the message cannot be read'
-  )  # fmt: skip
-  EMPTY = 'R02', code_pb2.INVALID_ARGUMENT, 'the request has no payload'
-  NOT_FOR_AGENTS = (
-      'R03',
-      code_pb2.PERMISSION_DENIED,
-      'agents may join, step, reset and leave',
-  )
-  SETTINGS = 'R04', code_pb2.PERMISSION_DENIED, 'agents cannot set settings'
-  WORLD = 'R05', code_pb2.INVALID_ARGUMENT, "the world's name is 'world'"
-  NOT_JOINED = 'R06', code_pb2.FAILED_PRECONDITION, 'join the world first'
-  JOINED = 'R07', code_pb2.FAILED_PRECONDITION, 'the world was already joined'
+  UNREADABLE = 'R01', _INVALID, 'the message cannot be read'
+  EMPTY = 'R02', _INVALID, 'the request has no payload'
+  NOT_FOR_AGENTS = 'R03', _DENIED, 'agents may join, step, reset and leave'
+  SETTINGS = 'R04', _DENIED, 'agents cannot set settings'
+  WORLD = 'R05', _INVALID, "the world's name is 'world'"
+  NOT_JOINED = 'R06', _NOT_NOW, 'join the world first'
+  JOINED = 'R07', _NOT_NOW, 'the world was already joined'
   MID_EPISODE = (
-      'R08',
-      code_pb2.FAILED_PRECONDITION,
-      'an episode is running; step to its end, or leave the world',
-  )
-  OBSERVATION = (
-      'R09', code_pb2.INVALID_ARGUMENT, 'observation {} is unknown'
+      'R08', _NOT_NOW, 'an episode is running; step to its end, or leave the'
+      ' world',
   )  # fmt: skip
-  ACTION = 'R10', code_pb2.INVALID_ARGUMENT, 'action {} is unknown'
-  NO_ACTION = 'R11', code_pb2.INVALID_ARGUMENT, 'action {} is missing'
-  TYPE = (
-      'R12', code_pb2.INVALID_ARGUMENT, 'action {}: type differs from its spec'
-  )  # fmt: skip
+  OBSERVATION = 'R09', _INVALID, 'observation {} is unknown'
+  ACTION = 'R10', _INVALID, 'action {} is unknown'
+  NO_ACTION = 'R11', _INVALID, 'action {} is missing'
+  TYPE = 'R12', _INVALID, 'action {}: type differs from its spec'
   SHAPE = (
-      'R13',
-      code_pb2.INVALID_ARGUMENT,
-      'action {}: shape or number of elements differs from its spec',
-  )
-  VALUE = (
-      'R14',
-      code_pb2.INVALID_ARGUMENT,
-      'action {}: element {} is not a number within the bounds of its spec',
-  )
-  FAILED = (
-      'R15',
-      code_pb2.INTERNAL,
-      'the episode has failed; the next step begins another one',
-  )
-  FINISHED = (
-      'R16', code_pb2.FAILED_PRECONDITION, 'there are no more episodes'
+      'R13', _INVALID, 'action {}: shape or number of elements differs from its'
+      ' spec',
   )  # fmt: skip
+  VALUE = (
+      'R14', _INVALID, 'action {}: element {} is not a number within the bounds'
+      ' of its spec',
+  )  # fmt: skip
+  FAILED = (
+      'R15', code_pb2.INTERNAL, 'the episode has failed; the next step begins'
+      ' another one',
+  )  # fmt: skip
+  FINISHED = 'R16', _NOT_NOW, 'there are no more episodes'
 
 
 @final

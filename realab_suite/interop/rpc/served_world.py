@@ -1,10 +1,16 @@
-"""Served world, which connects the agent's port with the evaluator."""
+"""Served world: answers the requests of an agent, and reports its episodes.
+
+Connections are in `agent_server`.
+"""
 
 from collections.abc import Callable
 import os
 from typing import final
 
 from absl import logging
+import dm_env
+from dm_env_rpc.v1 import dm_env_rpc_pb2
+from google.protobuf import message
 
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
@@ -12,18 +18,28 @@ from realab_suite.engine import events
 from realab_suite.engine import seeding
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
-from realab_suite.interop.rpc import agent_port
-from realab_suite.interop.rpc import agent_server
+from realab_suite.interop.rpc import refusals
 from realab_suite.interop.rpc import sockets
+from realab_suite.interop.rpc import tensors
+
+WORLD = 'world'
+"""Name of the world in requests; every server has exactly one world."""
 
 OnEpisode = Callable[[evaluate.EpisodeResult, str], None]
 
 _ROOT = 0
+_Reason = refusals.Reason
+_REFUSED = refusals.RequestRefused
 
 
 @final
-class ServedWorld(agent_server.Service):
-  """Service that answers an agent's requests and reports episode results."""
+class ServedWorld:
+  """World that answers an agent's requests and reports episode results.
+
+  Agents may join, step, reset and leave; all other requests are refused. Every
+  request gets one answer, even if its bytes are invalid. All calls come from
+  the thread that runs the server. Requests reach a view of the world alone.
+  """
 
   def __init__(
       self,
@@ -48,12 +64,18 @@ class ServedWorld(agent_server.Service):
     self._on_episode = on_episode
     self._failures: list[Exception] = []
     self._collector = evaluate.ResultCollector(env)
-    self._port = agent_port.AgentPort(
-        agent_view.AgentView(env, self._failures), env.abandon
-    )
     self._isolation = results.SERVED
+    self._view = agent_view.AgentView(env, self._failures)
+    self._observations = tensors.Observations(self._view.observation_spec())
+    self._actions = tensors.Actions(self._view.action_spec())
+    self._specs = dm_env_rpc_pb2.ActionObservationSpecs(
+        actions=self._actions.specs, observations=self._observations.specs
+    )
+    self._is_joined = False
+    self._is_mid_episode = False
 
   def connect(self) -> None:
+    """Handles a new connection; no other agent connects until `disconnect`."""
     users = sockets.users_connected_to(self._address)
     # Root can read everything, and the same user can read this process. Without
     # a salt, the episodes can be computed from the public seed.
@@ -67,15 +89,21 @@ class ServedWorld(agent_server.Service):
     )
 
   def answer(self, request: bytes) -> bytes:
-    if self._num_left <= 0:
-      self._port.finish()
-    return self._port.answer(request)
+    """Returns the serialised answer to a serialised request."""
+    try:
+      response = self._answer(_parse(request))
+    except refusals.RequestRefused as refusal:
+      logging.info('refused: %s', refusal)
+      response = refusal.response()
+    return response.SerializeToString(deterministic=True)
 
   def disconnect(self) -> None:
-    self._port.disconnect()
+    """Handles the end of a connection, by the agent or by its timeout."""
+    self._is_joined = self._is_mid_episode = False
     self._env.abandon(events.End.DISCONNECT)
 
   def settle(self) -> bool:
+    """Reports ended episodes; returns True if there are more to serve."""
     for failure in self._failures:
       logging.error('the episode failed', exc_info=failure)
     self._failures.clear()
@@ -83,3 +111,96 @@ class ServedWorld(agent_server.Service):
       self._num_left -= 1
       self._on_episode(result, self._isolation)
     return self._num_left > 0
+
+  def _answer(
+      self, request: dm_env_rpc_pb2.EnvironmentRequest
+  ) -> dm_env_rpc_pb2.EnvironmentResponse:
+    kind = request.WhichOneof('payload')
+    match kind:
+      case 'step':
+        return dm_env_rpc_pb2.EnvironmentResponse(step=self._step(request.step))
+      case 'join_world':
+        return dm_env_rpc_pb2.EnvironmentResponse(
+            join_world=self._join(request.join_world)
+        )
+      case 'reset':
+        return dm_env_rpc_pb2.EnvironmentResponse(
+            reset=self._reset(request.reset)
+        )
+      case 'leave_world':
+        return dm_env_rpc_pb2.EnvironmentResponse(leave_world=self._leave())
+      case None:
+        raise _REFUSED(_Reason.EMPTY)
+    raise _REFUSED(_Reason.NOT_FOR_AGENTS, details=f'({kind})')
+
+  def _join(
+      self, request: dm_env_rpc_pb2.JoinWorldRequest
+  ) -> dm_env_rpc_pb2.JoinWorldResponse:
+    if self._is_joined:
+      raise _REFUSED(_Reason.JOINED)
+    if request.world_name != WORLD:
+      raise _REFUSED(_Reason.WORLD)
+    if request.settings:
+      raise _REFUSED(_Reason.SETTINGS)
+    self._is_joined = True
+    return dm_env_rpc_pb2.JoinWorldResponse(specs=self._specs)
+
+  def _reset(
+      self, request: dm_env_rpc_pb2.ResetRequest
+  ) -> dm_env_rpc_pb2.ResetResponse:
+    """Accepts a reset between episodes; the next step begins one anyway."""
+    if not self._is_joined:
+      raise _REFUSED(_Reason.NOT_JOINED)
+    if request.settings:
+      raise _REFUSED(_Reason.SETTINGS)
+    if self._is_mid_episode:
+      raise _REFUSED(_Reason.MID_EPISODE)
+    return dm_env_rpc_pb2.ResetResponse(specs=self._specs)
+
+  def _leave(self) -> dm_env_rpc_pb2.LeaveWorldResponse:
+    if self._is_mid_episode:
+      self._env.abandon()
+    self._is_joined = self._is_mid_episode = False
+    return dm_env_rpc_pb2.LeaveWorldResponse()
+
+  def _step(
+      self, request: dm_env_rpc_pb2.StepRequest
+  ) -> dm_env_rpc_pb2.StepResponse:
+    if not self._is_joined:
+      raise _REFUSED(_Reason.NOT_JOINED)
+    uids = self._observations.check(request.requested_observations)
+    if self._is_mid_episode:
+      action = self._actions.read(request.actions)
+    elif self._num_left <= 0:
+      raise _REFUSED(_Reason.FINISHED)
+    try:
+      # A step that begins an episode ignores its action.
+      time_step = (
+          self._view.step(action)
+          if self._is_mid_episode
+          else self._view.reset()
+      )
+    except Exception as error:
+      self._is_mid_episode = False
+      raise _REFUSED(_Reason.FAILED) from error
+    self._is_mid_episode = not time_step.last()
+    return dm_env_rpc_pb2.StepResponse(
+        state=_state(time_step),
+        observations=self._observations.pack(time_step.observation, uids),
+    )
+
+
+def _parse(request: bytes) -> dm_env_rpc_pb2.EnvironmentRequest:
+  try:
+    return dm_env_rpc_pb2.EnvironmentRequest.FromString(request)
+  except message.DecodeError as error:
+    raise _REFUSED(_Reason.UNREADABLE) from error
+
+
+def _state(time_step: dm_env.TimeStep) -> int:
+  """Returns the state that clients convert to the time step's discount."""
+  if not time_step.last():
+    return dm_env_rpc_pb2.EnvironmentStateType.RUNNING
+  if time_step.discount:
+    return dm_env_rpc_pb2.EnvironmentStateType.INTERRUPTED
+  return dm_env_rpc_pb2.EnvironmentStateType.TERMINATED

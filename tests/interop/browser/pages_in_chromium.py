@@ -224,7 +224,7 @@ def test_a_person_supervises_a_whole_episode_by_clicks(tmp_path, asks):
   def supervise(server):
     supervision = supervised.Supervision(env, server, tmp_path, 1000.0)
     result = supervision.run(policies.make('apple_seeker'), 0)
-    supervision.finish('The end')
+    server.send({'type': 'summary', 'text': 'The end'})
     return result, supervision.delays
 
   with (

@@ -68,12 +68,10 @@ def test_a_page_of_another_address_cannot_connect(server):
 
 def test_messages_go_both_ways_and_others_are_dropped(server):
   with _connect(server) as connection:
-    assert server.wait(patience.SECONDS)
     for text in ('not json', '[1]', '{"type": "run"}'):
       connection.send(text)
     message = server.receive(patience.SECONDS)
-    assert message.content == {'type': 'run'}
-    assert message.time > 0
+    assert message == {'type': 'run'}
     server.send({'type': 'state'})
     assert connection.recv(timeout=patience.SECONDS) == '{"type": "state"}'
     server.send_picture(2, b'jpeg')
@@ -98,7 +96,7 @@ def test_a_message_that_cannot_be_parsed_is_dropped(server, text):
     connection.send(text)
     connection.send('{"type": "run"}')
     message = server.receive(60.0)  # Not longer: a failure never answers.
-  assert message.content == {'type': 'run'}
+  assert message == {'type': 'run'}
 
 
 def test_a_port_in_use_is_refused(server):
