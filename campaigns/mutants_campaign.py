@@ -375,7 +375,7 @@ MUTANTS = [
     ),
     planting.Mutant(
         'storage', 'lines behind the checkpoint stay', _STORAGE,
-        '    self._file.truncate(size)\n', '', _STO,
+        '      self._file.truncate(size)\n', '', _STO,
     ),
     planting.Mutant(
         'storage', 'lines are not synchronised before a checkpoint', _STORAGE,
@@ -383,8 +383,7 @@ MUTANTS = [
     ),
     planting.Mutant(
         'storage', 'changed lines are accepted', _STORAGE,
-        "elif self._hash.hexdigest() != mark['sha256']:", 'elif False:',
-        _STO,
+        "self._hash.hexdigest() != mark['sha256']:", 'False:', _STO,
     ),
     planting.Mutant(
         'storage', 'a second launcher is admitted', _STORAGE,

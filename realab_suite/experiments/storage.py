@@ -18,17 +18,10 @@ from realab_suite.config import validation
 CONFIG = 'config.json'
 DONE = 'done.json'
 LEFT_OUT = 'left_out.json'
-LEARNER = 'learner.bin'
-TRAINING_EPISODES = 'training_episodes.jsonl'
-# In packed sweeps, instead of TRAINING_EPISODES.
-TRAINING_GAINS = 'training_gains.jsonl'
-# Results that packed sweeps may leave out.
-LEAVABLE = frozenset({LEARNER, TRAINING_EPISODES})
 _LOCK = 'lock'
 _CHECKPOINTS = 'checkpoints'
 _SUFFIX = '.ckpt'
 _KEPT = 2  # Number of checkpoints to keep.
-_CHUNK = 1 << 20
 
 
 @contextlib.contextmanager
@@ -144,24 +137,30 @@ def write_archive(
   write_whole(path, archive.Archive(header, contents).to_bytes())
 
 
-def read_archive(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
+def read_archive(
+    path: pathlib.Path, header: Mapping[str, Any], advice: str = ''
+) -> Any:
   """Returns the contents of an archive.
 
   Args:
     path: Path of the archive.
     header: Header that the archive must have.
+    advice: Advice to add to the message if the archive is refused.
 
   Raises:
     ResultsError: If it cannot be read, is damaged or has another header. The
       message contains the contents of the file and the expected ones.
   """
-  with naming(path):
-    return _contents(path, header)
+  with explained(path):
+    data = path.read_bytes()
+  with naming(path, advice):
+    expected = repr(archive.name_of(header))
+    return archive.Archive.from_bytes(data, expected).contents_for(header)
 
 
 @contextlib.contextmanager
-def naming(path: pathlib.Path) -> Iterator[None]:
-  """Adds the name of a file to errors about saved state that does not fit.
+def naming(path: pathlib.Path, advice: str = '') -> Iterator[None]:
+  """Adds the name of a file, and advice, to errors about state that is unfit.
 
   Raises:
     ResultsError: Instead of a `StateLayoutError`.
@@ -169,14 +168,7 @@ def naming(path: pathlib.Path) -> Iterator[None]:
   try:
     yield
   except errors.StateLayoutError as error:
-    raise errors.ResultsError(f'{path}: {error}') from error
-
-
-def _contents(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
-  with explained(path):
-    data = path.read_bytes()
-  expected = repr(archive.name_of(header))
-  return archive.Archive.from_bytes(data, expected).contents_for(header)
+    raise errors.ResultsError(f'{path}: {error}{advice}') from error
 
 
 def is_done(path: pathlib.Path) -> bool:
@@ -189,10 +181,9 @@ def is_done(path: pathlib.Path) -> bool:
   """
   if not (path / DONE).exists():
     return False
-  missing = left_out(path)
-  recorded = {**read_done(path / DONE), **_added(path)}
-  for name, digest in recorded.items():
-    if missing.get(name) == digest and not os.path.lexists(path / name):
+  packed = _packed(path)
+  for name, digest in {**read_done(path / DONE), **packed['added']}.items():
+    if name in packed['files'] and not (path / name).exists():
       continue
     if _digest(path / name) != digest:
       raise errors.ResultsError(
@@ -258,33 +249,18 @@ def left_out(path: pathlib.Path) -> dict[str, str]:
   """Returns the SHA-256 of each result that a packed sweep left out.
 
   Raises:
-    ResultsError: If the list is damaged or names results that are never left
-      out.
+    ResultsError: If the list is damaged.
   """
-  if not os.path.lexists(path / LEFT_OUT):
-    return {}
-  advice = f'remove {path} to run it again'
-  files = read_sealed(path / LEFT_OUT, advice).get('files')
-  if not isinstance(files, dict) or not files or files.keys() - LEAVABLE:
-    raise errors.ResultsError(
-        f'{path / LEFT_OUT}: files is {files!r:.80}; allowed are'
-        f' {", ".join(sorted(LEAVABLE))}; {advice}'
-    )
+  files: dict[str, str] = _packed(path)['files']
   return files
 
 
-def _added(path: pathlib.Path) -> dict[str, str]:
-  """Returns the SHA-256 of files that a packed sweep has instead of results."""
-  if not os.path.lexists(path / LEFT_OUT):
-    return {}
-  advice = f'remove {path} to run it again'
-  added = read_sealed(path / LEFT_OUT, advice).get('added', {})
-  if not isinstance(added, dict) or added.keys() - {TRAINING_GAINS}:
-    raise errors.ResultsError(
-        f'{path / LEFT_OUT}: added is {added!r:.80}; allowed is'
-        f' {TRAINING_GAINS}; {advice}'
-    )
-  return added
+def _packed(path: pathlib.Path) -> dict[str, Any]:
+  """Returns the files that a packed sweep left out, and those that it added."""
+  file = path / LEFT_OUT
+  if not file.exists():
+    return {'files': {}, 'added': {}}
+  return {'added': {}, **read_sealed(file, f'remove {path} to run it again')}
 
 
 def result_path(path: pathlib.Path, name: str) -> pathlib.Path:
@@ -294,7 +270,7 @@ def result_path(path: pathlib.Path, name: str) -> pathlib.Path:
     ResultsError: If it was left out of a packed sweep, and is still missing.
   """
   file = path / name
-  if name in left_out(path) and not os.path.lexists(file):
+  if name in left_out(path) and not file.exists():
     raise errors.ResultsError(
         f'{file}: left out when the sweep was packed; copy it from the folder'
         ' of that sweep, unpack a sweep that was packed with --learners, or run'
@@ -383,28 +359,19 @@ class RunFolder:
     checkpoints = self._checkpoints()
     if not checkpoints:
       return None
-    with self.naming_checkpoint():
-      contents = _contents(checkpoints[-1], header)
+    contents = read_archive(checkpoints[-1], header, self._advice())
     # The process that wrote it may have been killed before the removal.
     self._remove_old()
     return contents
 
-  @contextlib.contextmanager
-  def naming_checkpoint(self) -> Iterator[None]:
-    """Adds the last checkpoint to errors about state that does not fit.
+  def naming_checkpoint(self) -> contextlib.AbstractContextManager[None]:
+    """Adds the last checkpoint to errors about state that does not fit."""
+    return naming(self._checkpoints()[-1], self._advice())
 
-    Raises:
-      ResultsError: Instead of a `StateLayoutError`, with advice.
-    """
-    try:
-      yield
-    except errors.StateLayoutError as error:
-      *older, path = self._checkpoints()
-      where = f'from {older[-1].name}' if older else 'from the beginning'
-      raise errors.ResultsError(
-          f'{path}: not a checkpoint of this run: {error}; remove this file,'
-          f' then the same command continues {where}'
-      ) from error
+  def _advice(self) -> str:
+    *older, _ = self._checkpoints()
+    where = f'from {older[-1].name}' if older else 'from the beginning'
+    return f'; remove this file, then the same command continues {where}'
 
   def _remove_old(self) -> None:
     for old in self._checkpoints()[:-_KEPT]:
@@ -438,36 +405,17 @@ class JsonLines:
         changed.
     """
     self._path = path
-    self._hash = hashlib.sha256()
-    with explained(path), contextlib.ExitStack() as stack:
-      self._file = stack.enter_context(open(path, 'a+b', buffering=0))
-      self._cut_back(mark)
-      stack.pop_all()
-
-  def _cut_back(self, mark: Mark | None) -> None:
-    """Removes lines after the mark, or an incomplete line."""
-    self._file.seek(0)
-    if mark is None:
-      whole = self._file.read().rfind(b'\n') + 1
-      self._file.truncate(whole)
-      return
-    size = mark['size']
-    while rest := size - self._file.tell():
-      data = self._file.read(min(rest, _CHUNK))
-      if not data:
-        break
-      self._hash.update(data)
-    here = self._file.tell()
-    problem = ''
-    if here < size:
-      problem = f'has {here} bytes, but the checkpoint expects {size}'
-    elif self._hash.hexdigest() != mark['sha256']:
-      problem = 'changed since the checkpoint was written'
-    if problem:
-      raise errors.ResultsError(
-          f'{self._path}: {problem}; remove {self._path.parent} to run it again'
-      )
-    self._file.truncate(size)
+    with explained(path):
+      data = path.read_bytes() if path.exists() else b''
+      size = data.rfind(b'\n') + 1 if mark is None else mark['size']
+      self._hash = hashlib.sha256(data[:size])
+      if mark is not None and self._hash.hexdigest() != mark['sha256']:
+        raise errors.ResultsError(
+            f'{path}: changed since the checkpoint was written; remove'
+            f' {path.parent} to run it again'
+        )
+      self._file = open(path, 'ab', buffering=0)
+      self._file.truncate(size)
 
   def append(self, records: Sequence[Mapping[str, Any]]) -> None:
     """Adds a line for each record.
@@ -490,7 +438,7 @@ class JsonLines:
     """
     with explained(self._path):
       os.fsync(self._file.fileno())
-      size = self._file.tell()
+      size = os.fstat(self._file.fileno()).st_size
     return {'size': size, 'sha256': self._hash.hexdigest()}
 
   def close(self) -> None:

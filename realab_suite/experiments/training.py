@@ -10,12 +10,11 @@ import contextlib
 import dataclasses
 import os
 import pathlib
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from absl import logging
 import dm_env
 import numpy as np
-import tqdm
 
 from realab_suite import errors
 from realab_suite import policies
@@ -33,18 +32,21 @@ from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
 from realab_suite.experiments import jobs
 from realab_suite.experiments import kept_stakes
-from realab_suite.experiments import learners
 from realab_suite.experiments import machines
 from realab_suite.experiments import progress
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
 
+if TYPE_CHECKING:
+  from realab_suite import agents
+
 EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
 TIMING = 'timing.jsonl'
-TRAINING_EPISODES = storage.TRAINING_EPISODES
-TRAINING_GAINS = storage.TRAINING_GAINS
-LEARNER = storage.LEARNER
+TRAINING_EPISODES = 'training_episodes.jsonl'
+# In packed sweeps, instead of TRAINING_EPISODES.
+TRAINING_GAINS = 'training_gains.jsonl'
+LEARNER = 'learner.bin'
 TRACE = 'trace.bin'
 TRANSPLANT = 'transplant.jsonl'
 TENSORBOARD = 'tensorboard'
@@ -86,7 +88,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
       checkpoint is damaged or the disk is full.
   """
   if options.tensorboard:
-    curves.check_tensorboard()
+    progress.check_tensorboard()
   path = output / job.folder()
   with storage.RunFolder(path, job.config()) as folder:
     if storage.is_done(path):
@@ -102,7 +104,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
 
 def make_learner(
     job: jobs.Job, batch: batch_environment.BatchEnvironment
-) -> learners.Learner:
+) -> 'agents.Learner':
   """Returns the untrained learner of a job.
 
   Raises:
@@ -126,7 +128,7 @@ def load_learner(
     job: jobs.Job,
     path: pathlib.Path,
     batch: batch_environment.BatchEnvironment,
-) -> learners.Learner:
+) -> 'agents.Learner':
   """Returns the trained learner of a finished job, for further analysis.
 
   Args:
@@ -254,6 +256,7 @@ class _Training:
     self._done = 0
     self._segment = 0
     self._pending: list[dict[str, Any]] = []
+    self._files: dict[str, storage.JsonLines] = {}
     # Machines that have run this job, with the control step at their start.
     self._machines: list[dict[str, Any]] = []
 
@@ -275,24 +278,22 @@ class _Training:
       else:
         with self._folder.naming_checkpoint():
           time_step = self._restore(learner, saved)
-      self._files = {
-          name: stack.enter_context(
-              contextlib.closing(
-                  storage.JsonLines(
-                      path / name, marks.get(name, storage.NOTHING)
-                  )
-              )
-          )
-          for name in (CURVE, TRAINING_EPISODES)
-      }
-      self._timing = stack.enter_context(
-          contextlib.closing(storage.JsonLines(path / TIMING))
-      )
-      self._learn(learner, time_step, stack)
+      for name in (CURVE, TRAINING_EPISODES, TIMING):
+        mark = marks.get(name, None if name == TIMING else storage.NOTHING)
+        self._files[name] = storage.JsonLines(path / name, mark)
+        stack.callback(self._files[name].close)
+      step = self._done * self._num_envs
+      total = self._total * self._num_envs
+      name = f'{job.run}, seed {job.seed}'
+      display = progress.Display(name, step, total, self._options.say)
+      stack.callback(display.close)
+      if self._options.tensorboard:
+        display.write_tensorboard(path / TENSORBOARD)
+      self._learn(learner, time_step, display)
     self._evaluate_learner(learner)
 
   def _add_machine(
-      self, learner: learners.Learner, saved: Mapping[str, Any] | None
+      self, learner: 'agents.Learner', saved: Mapping[str, Any] | None
   ) -> None:
     """Records the machine, unless it is that of the last checkpoint.
 
@@ -313,7 +314,7 @@ class _Training:
     self._machines = [*self._machines, {'step': step, 'machine': here}]
 
   def _restore(
-      self, learner: learners.Learner, saved: Mapping[str, Any]
+      self, learner: 'agents.Learner', saved: Mapping[str, Any]
   ) -> batch_time_steps.BatchTimeStep:
     """Restores a checkpoint, and returns the next time step."""
     learner.set_state(saved['learner'])
@@ -342,46 +343,23 @@ class _Training:
 
   def _learn(
       self,
-      learner: learners.Learner,
+      learner: 'agents.Learner',
       time_step: batch_time_steps.BatchTimeStep,
-      stack: contextlib.ExitStack,
+      display: progress.Display,
   ) -> None:
-    job, num_envs = self._job, self._num_envs
-    board: curves.Board = curves.NoBoard()
-    if self._options.tensorboard:
-      board = curves.TensorBoard(
-          self._folder.path / TENSORBOARD, self._done * num_envs + 1
-      )
-    stack.callback(board.close)
-    # Without a terminal, a line per point replaces the progress bar.
-    bar = stack.enter_context(
-        tqdm.tqdm(
-            total=self._total * num_envs,
-            initial=self._done * num_envs,
-            desc=f'{job.run}, seed {job.seed}',
-            unit='step',
-            unit_scale=True,
-            disable=None,
-        )
-    )
-    clock = progress.Clock(self._done * num_envs)
     while self._done < self._total:
       self._check_parent()
       time_step = self._batch.step(learner.step(time_step))
       self._done += 1
       self._record_episodes()
-      bar.update(num_envs)
+      display.advance(self._num_envs)
       is_over = self._done == self._total
       if is_over or self._done % self._point_every == 0:
-        point = self._add_point(learner)
-        board.add(point)
-        timing = clock.tell(point['step'])
-        self._timing.append([timing])
-        bar.set_postfix_str(progress.summary(point), refresh=False)
-        if bar.disable:
-          self._options.say(
-              progress.line(job, point, timing, self._total * num_envs)
-          )
+        step = self._done * self._num_envs
+        point = curves.point(step, self._pending, learner.metrics())
+        self._pending = []
+        self._files[CURVE].append([point])
+        self._files[TIMING].append([display.show(point)])
       if is_over or self._done % self._save_every == 0:
         time_step = self._save(learner, time_step)
 
@@ -393,16 +371,9 @@ class _Training:
       self._files[TRAINING_EPISODES].append(records)
       self._pending += records
 
-  def _add_point(self, learner: learners.Learner) -> dict[str, Any]:
-    step = self._done * self._num_envs
-    point = curves.point(step, self._pending, learner.metrics())
-    self._pending = []
-    self._files[CURVE].append([point])
-    return point
-
   def _save(
       self,
-      learner: learners.Learner,
+      learner: 'agents.Learner',
       time_step: batch_time_steps.BatchTimeStep,
   ) -> batch_time_steps.BatchTimeStep:
     """Writes a checkpoint.
@@ -428,7 +399,10 @@ class _Training:
             'segment': self._segment,
             'pending': self._pending,
             'machines': self._machines,
-            'marks': {name: f.sync() for name, f in self._files.items()},
+            'marks': {
+                name: self._files[name].sync()
+                for name in (CURVE, TRAINING_EPISODES)
+            },
             'learner': learner.state(),
             'time_step': time_step._asdict(),
             'batch': world,
@@ -438,7 +412,7 @@ class _Training:
       self._begin_segment()
     return time_step
 
-  def _evaluate_learner(self, learner: learners.Learner) -> None:
+  def _evaluate_learner(self, learner: 'agents.Learner') -> None:
     job = self._job
     storage.write_archive(
         self._folder.path / LEARNER,
@@ -462,17 +436,13 @@ class _Training:
 
   @contextlib.contextmanager
   def _acting(
-      self, job: jobs.Job, learner: learners.Learner
-  ) -> Iterator[
-      tuple[batch_environment.BatchEnvironment, learners.BatchLearnerActor]
-  ]:
+      self, job: jobs.Job, learner: 'agents.Learner'
+  ) -> Iterator[tuple[batch_environment.BatchEnvironment, '_LearnerActor']]:
     """Loads the worlds of an evaluation, and yields them with the actor."""
-    evaluation = job.experiment.evaluation
-    actor = learners.BatchLearnerActor(
-        learner, job.evaluation_seed, evaluation.actions == 'greedy'
-    )
+    evaluation, seed = job.experiment.evaluation, job.evaluation_seed
+    actor = _LearnerActor(learner, seed, evaluation.actions == 'greedy')
     with contextlib.closing(
-        load_batch(job, evaluation.episodes, job.evaluation_seed)
+        load_batch(job, evaluation.episodes, seed)
     ) as batch:
       yield batch, actor
 
@@ -483,6 +453,26 @@ class _Training:
           f'process {parent}, which started this run, has ended; the same'
           ' command continues the run from its last checkpoint'
       )
+
+
+@final
+class _LearnerActor:
+  """A trained learner acting in a batch, without further updates."""
+
+  def __init__(
+      self, learner: 'agents.Learner', seed: int, greedy: bool
+  ) -> None:
+    self._learner = learner
+    self._seed = seed
+    self._greedy = greedy
+    self._step = 0
+
+  def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
+    sequence = seeding.sequence(self._seed, 0, self._step, 'act')
+    self._step += 1
+    return self._learner.act(
+        time_step.observation, sequence.generate_state(2), self._greedy
+    )
 
 
 def _world_seed(seed: int, segment: int) -> int:

@@ -14,11 +14,11 @@ import pytest
 import yaml
 
 from realab_suite import errors
-from realab_suite.experiments import curves
 from realab_suite.experiments import engines
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import machines
+from realab_suite.experiments import progress
 from realab_suite.experiments import scheduler
 from realab_suite.experiments import storage
 from realab_suite.experiments import threads
@@ -325,7 +325,7 @@ def test_a_sweep_passes_tensorboard_to_its_runs(
 
   monkeypatch.setattr(scheduler, 'sweep', note)
   monkeypatch.setattr(threads, 'use_one', lambda: None)
-  monkeypatch.setattr(curves, 'check_tensorboard', lambda: None)
+  monkeypatch.setattr(progress, 'check_tensorboard', lambda: None)
   monkeypatch.setitem(engines.ENGINES, 'local', lambda workers: None)
   given = ['--tensorboard'] * is_given
   with flagsaver.flagsaver():

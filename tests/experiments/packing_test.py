@@ -2,10 +2,8 @@
 
 import io
 import json
-import os
 import pathlib
 import shutil
-import stat
 import zipfile
 
 import pytest
@@ -179,18 +177,6 @@ def test_a_missing_learner_is_refused_except_if_it_was_left_out(
     jobs.is_done(folder)
 
 
-@pytest.mark.parametrize(
-    'files', [{'trace.bin': '0'}, {}, None, {'learner.bin': '0', 'x': '1'}]
-)
-def test_nothing_but_the_learner_can_be_left_out(tmp_path, files):
-  storage.write_done(tmp_path, {'files': {}})
-  storage.write_sealed(tmp_path / storage.LEFT_OUT, {'files': files})
-  with pytest.raises(
-      errors.ResultsError, match=r'allowed are learner\.bin, training_ep'
-  ):
-    storage.is_done(tmp_path)
-
-
 def test_equal_training_episodes_are_counted():
   def record(step, *values, is_ended=False):
     return {
@@ -274,14 +260,7 @@ def _forged(packed: pathlib.Path, path: pathlib.Path, how: str) -> None:
     members = {one: source.read(one) for one in source.infolist()}
   manifest = json.loads(members.popitem()[1])
   [rows, *_] = [m for m in members if m.filename.endswith(_EPISODES)]
-  extra = {
-      'parent': '../x', 'absolute': '/x', 'deep': 'a/b/c', 'hidden': '.x',
-      'folder': 'x/', 'backslash': 'a\\b', 'unlisted': 'x',
-  }  # fmt: skip
-  info = zipfile.ZipInfo(extra.get(how, 'x'))
-  info.external_attr = rows.external_attr
-  if how == 'link':
-    info.external_attr = (stat.S_IFLNK | 0o777) << 16
+  info = zipfile.ZipInfo({'parent': '../x'}.get(how, 'x'))
   if how == 'missing':
     del members[rows]
   elif how == 'no done':
@@ -297,8 +276,6 @@ def _forged(packed: pathlib.Path, path: pathlib.Path, how: str) -> None:
     ).hexdigest()
   elif how == 'schema':
     manifest['schema'] = 2
-  elif how == 'no digests':
-    manifest['files'] = [1]
   elif how == 'no learner':
     manifest['left_out'] = {
         name: digest
@@ -311,28 +288,19 @@ def _forged(packed: pathlib.Path, path: pathlib.Path, how: str) -> None:
     for member, data in members.items():
       target.writestr(member, data)
     if how != 'no manifest':
-      listed = zipfile.ZipInfo(packing.MANIFEST)
-      listed.external_attr = rows.external_attr
-      target.writestr(listed, json.dumps(manifest))
+      target.writestr(packing.MANIFEST, json.dumps(manifest))
 
 
 @pytest.mark.parametrize(
     ('how', 'problem'),
     [
         ('parent', "'../x' is not the name of"),
-        ('absolute', "'/x' is not the name of"),
-        ('deep', "'a/b/c' is not the name of"),
-        ('hidden', "'.x' is not the name of"),
-        ('folder', "'x/' is not the name of"),
-        ('backslash', 'is not the name of'),
-        ('unlisted', "'x' is not in the manifest"),
-        ('link', "'x' is not a regular file"),
+        ('unlisted', "'x' changed since the sweep was packed"),
         ('missing', "episodes.jsonl' is missing"),
         ('no done', 'done.json: missing'),
         ('changed', "episodes.jsonl' changed since the sweep was packed"),
         ('forged digest', 'episodes.jsonl: changed since the run finished'),
         ('schema', 'schema is 2; allowed is 1'),
-        ('no digests', "'manifest.json' has no SHA-256"),
         ('no manifest', "not a packed sweep: 'manifest.json'"),
         ('no learner', 'learner.bin: No such file'),
     ],
@@ -348,16 +316,6 @@ def test_a_forged_file_is_refused_and_nothing_is_written(
   assert problem in str(raised.value)
   assert str(raised.value).startswith(f'{path}: ')
   assert not _left(work)
-
-
-def test_oversized_contents_are_refused(packed, tmp_path, monkeypatch, built):
-  monkeypatch.setattr(packing, '_MAX_BYTES', 1000)
-  problem = r'has \d+ bytes of contents; allowed are 1000'
-  with pytest.raises(errors.ResultsError, match=problem):
-    packing.unpack(packed, tmp_path / 'sweep')
-  with pytest.raises(errors.ResultsError, match=problem):
-    packing.pack(built, tmp_path / 'sweep.zip')
-  assert not _left(tmp_path)
 
 
 def test_damage_anywhere_is_refused_or_changes_no_file(packed, tmp_path):
@@ -390,22 +348,6 @@ def test_a_file_that_is_no_packed_sweep_is_refused(tmp_path):
     (tmp_path / 'file.zip').write_bytes(data)
     with pytest.raises(errors.ResultsError, match='not a packed sweep'):
       packing.unpack(tmp_path / 'file.zip', tmp_path / 'sweep')
-
-
-@pytest.mark.parametrize('kind', ['pipe', 'folder'])
-def test_anything_but_a_regular_file_is_refused(tmp_path, kind):
-  path = tmp_path / 'sweep.zip'
-  if kind == 'pipe':
-    os.mkfifo(path)
-    # Without a writer, to open the pipe would never end.
-    writer = os.open(path, os.O_RDWR | os.O_NONBLOCK)
-  else:
-    path.mkdir()
-    writer = os.open(path, os.O_RDONLY)
-  with pytest.raises(errors.ResultsError, match=r'sweep\.zip: not a regular'):
-    packing.unpack(path, tmp_path / 'sweep')
-  os.close(writer)
-  assert _left(tmp_path) == {'sweep.zip'}
 
 
 def test_the_launchers_pack_and_unpack(built, packed, tmp_path):

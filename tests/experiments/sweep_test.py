@@ -381,20 +381,3 @@ def test_a_scripted_job_does_not_import_jax(tmp_path):
   )
   subprocess.run([sys.executable, '-c', program], cwd=_ROOT, check=True)
   assert len(list(tmp_path.glob(f'*/{training.EPISODES}'))) == 1
-
-
-@pytest.mark.parametrize(
-    ('written', 'said'),
-    [
-        (
-            '{"true_return": 1.25, "observed_return": null}\n',
-            'true return 1.2, observed -',
-        ),
-        ('{"true_return": 1.25, "obs', ''),
-        ('{}', ''),
-        ('', ''),
-    ],
-)
-def test_a_sweep_shows_the_last_returns(tmp_path, written, said):
-  (tmp_path / training.CURVE).write_text(written)
-  assert scheduler._last_returns(tmp_path) == said
