@@ -411,7 +411,7 @@ MUTANTS = [
         'storage', 'a checkpoint of another run is accepted',
         'archive.py',
         '        if saved.get(key) != other.get(key)\n', '        if False\n',
-        ('tests/experiments/wrong_files_test.py',),
+        ('tests/archive_test.py', *_TRA),
     ),
     planting.Mutant(
         'storage', 'a damaged checkpoint is accepted', 'archive.py',

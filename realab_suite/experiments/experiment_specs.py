@@ -179,20 +179,14 @@ class ExperimentSpec(validation.Spec):
   @pydantic.field_validator('task')
   @classmethod
   def _check_task(cls, task: str) -> str:
-    try:
-      suite.dynamics(*_split(task))
-    except errors.UnknownNameError as error:
-      raise ValueError(str(error)) from error
+    suite.dynamics(*_split(task))
     return task
 
   @pydantic.field_validator('baselines')
   @classmethod
   def _check_baselines(cls, names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
-      try:
-        policies.make(name)
-      except errors.SpecError as error:
-        raise ValueError(str(error)) from error
+      policies.make(name)
     return names
 
   @pydantic.model_validator(mode='after')

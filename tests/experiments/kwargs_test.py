@@ -10,14 +10,11 @@ from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import scripted
-from realab_suite.experiments import served_evaluation
 from realab_suite.experiments import training
 from realab_suite.launchers import compare
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 from tests.experiments import fake_learner
-from tests.experiments import small
 from tests.launchers import in_process
 
 _SENSES = ('ray_distances', 'ray_classes', 'velocity', 'position', 'heading',
@@ -167,23 +164,6 @@ def test_a_learner_that_has_only_a_camera_is_trained_and_evaluated(tmp_path):
   assert env.reset().observation['senses/camera'].any()
 
 
-@pytest.mark.camera
-def test_scripted_policies_are_compared_with_a_camera(tmp_path):
-  settings = small.settings(
-      tmp_path / 'new', policies=('random',), senses=('camera',),
-      task_kwargs={'camera_size': [8, 8]}, seeds=(3,),
-  )  # fmt: skip
-  with mock.patch.object(suite, 'load', side_effect=suite.load) as load:
-    scripted.run(settings, lambda line: None)
-  loaded = [call.args for call in load.call_args_list if len(call.args) == 4]
-  assert loaded
-  for _, _, _, kwargs in loaded:
-    assert kwargs['senses'] == ('camera',)
-  described = small.description(tmp_path / 'new')['settings']['world']
-  assert described['senses'] == ['camera']
-  assert described['task_kwargs'] == {'camera_size': [8, 8]}
-
-
 def test_a_flag_selects_the_substeps_of_scripted_comparisons(tmp_path):
   output = f'--output={tmp_path / "new"}'
   arguments = (
@@ -197,35 +177,6 @@ def test_a_flag_selects_the_substeps_of_scripted_comparisons(tmp_path):
   assert ended.status == 0, ended.stderr
   [row] = results.read_rows(tmp_path / 'new' / 'episodes.jsonl')
   assert row.num_substeps == 20
-
-
-def test_a_policy_without_its_senses_is_refused_before_anything_is_written(
-    tmp_path,
-):
-  settings = small.settings(
-      tmp_path / 'new', policies=('random', 'apple_seeker'), senses=('pitch',)
-  )
-  with pytest.raises(errors.SpecError, match='AppleSeeker needs the senses'):
-    scripted.run(settings, lambda line: None)
-  assert not (tmp_path / 'new').exists()
-
-
-def test_a_served_world_has_the_senses_of_its_settings_and_of_its_record(
-    tmp_path,
-):
-  given = {
-      'senses': ['holding', 'camera'],
-      'task_kwargs': {'camera_size': [4, 6]},
-  }
-  record = small.write_served_run(tmp_path, **given)
-  names = served_evaluation.Settings.__dataclass_fields__
-  blank = served_evaluation.Settings(**dict.fromkeys(names))
-  for changes in ({'repeat': str(record), 'overrides': ()},):
-    settings = blank.__class__(**{**vars(blank), **changes})
-    chosen, design, seed = served_evaluation._chosen(settings)
-    env = chosen.world.load(design, seed)
-    assert env.senses == ('holding', 'camera')
-    assert env.observation_spec()['senses/camera'].shape == (4, 6, 3)
 
 
 @pytest.mark.parametrize(

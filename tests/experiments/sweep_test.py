@@ -205,27 +205,6 @@ def test_a_job_whose_process_survived_is_done_once(
 
 
 @pytest.mark.usefixtures('no_wait')
-def test_a_job_without_results_has_failed(tmp_path, monkeypatch):
-  engine = Pretender()
-  monkeypatch.setattr(engine, 'poll', lambda task: 0)
-  with pytest.raises(errors.ResultsError, match='2 of 2 jobs failed'):
-    _sweep(_SMALL, tmp_path, engine)
-
-
-@pytest.mark.usefixtures('no_wait')
-def test_an_interruption_stops_running_jobs(tmp_path, monkeypatch):
-  engine = Pretender()
-
-  def interrupt(task):
-    raise KeyboardInterrupt
-
-  monkeypatch.setattr(engine, 'poll', interrupt)
-  with pytest.raises(KeyboardInterrupt):
-    _sweep(_SMALL, tmp_path, engine)
-  assert len(engine.stopped) == 2
-
-
-@pytest.mark.usefixtures('no_wait')
 def test_the_description_lists_all_runs_when_some_are_chosen(tmp_path):
   engine = Pretender()
   _sweep(_SMALL, tmp_path, engine, only=['good'])

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import suite
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
@@ -219,45 +217,12 @@ def test_a_curve_has_the_means_of_finished_episodes(whole):
   assert [line['step'] for line in timing] == steps
 
 
-def test_runs_of_an_experiment_can_be_compared_in_pairs(whole, tmp_path):
-  planned = {job.run: job for job in jobs.plan(experiment_specs.load(_SMALL))}
-  paths = {'reward': whole}
-  for name in ('reward.apple_seeker', 'reward.secure'):
-    paths[name], _ = _run(planned[name], tmp_path)
-  rows = {
-      name: list(results.read_rows(path / training.EPISODES))
-      for name, path in paths.items()
-  }
-  twin = comparison.summary('reward.secure', rows['reward.secure'])
-  assert twin.corruption.estimate == 0.0
-  for name in ('reward', 'reward.secure'):
-    comparison.gained(name, rows[name], rows['reward.apple_seeker'])
-
-
 def test_training_and_evaluation_use_different_seeds(whole):
   job = _job()
   trained = {e['seed'] for e in _lines(whole, training.TRAINING_EPISODES)}
   assert trained == {training._world_seed(3, 0)}
   assert training._world_seed(4, 0) not in trained
   assert job.evaluation_seed not in trained
-
-
-def test_the_learner_gets_no_true_reward(tmp_path, monkeypatch):
-  seen = []
-
-  def make(job, batch):
-    learner = fake_learner.make(job, batch)
-    step = learner.step
-    learner.step = lambda time_step: seen.append(time_step) or step(time_step)
-    return learner
-
-  monkeypatch.setattr(training, 'make_learner', make)
-  _run(_job(), tmp_path)
-  with suite.load('unlock_door', 'near', design='instantaneous_reward') as env:
-    allowed = set(env.observation_spec())
-  for time_step in seen:
-    assert set(time_step.observation) == allowed
-    assert not np.any(time_step.reward)
 
 
 def test_a_trained_learner_can_be_loaded(whole, tmp_path):
@@ -365,7 +330,6 @@ def _checkpoints(path):
   return sorted((path / 'checkpoints').iterdir())
 
 
-# `wrong_files_test` has the other ways in which a checkpoint may be wrong.
 def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
     whole, tmp_path, monkeypatch
 ):
@@ -398,51 +362,45 @@ def test_a_run_without_an_older_checkpoint_restarts(tmp_path, monkeypatch):
     _run(job, tmp_path)
 
 
-@pytest.mark.parametrize('where', ['checkpoint', 'lines', 'episodes'])
 def test_a_full_disk_is_reported_and_nothing_is_lost(
-    whole, tmp_path, monkeypatch, where
+    whole, tmp_path, monkeypatch
 ):
   job = _job()
   path = tmp_path / job.folder()
-  full = OSError(errno.ENOSPC, 'No space left on device')
+  fsync, calls = os.fsync, iter(range(100))
+
+  def failing(descriptor):
+    name = os.readlink(f'/proc/self/fd/{descriptor}')
+    if '.ckpt.partial' in name and next(calls) == 1:
+      raise OSError(errno.ENOSPC, 'No space left on device')
+    fsync(descriptor)
+
   with monkeypatch.context() as patch:
-    if where == 'lines':
-      write = storage.JsonLines.append
-
-      def append(self, records):
-        if self._path.name == training.CURVE and self._file.tell() > 1000:
-          self._file.write(b'{"st')
-          with storage.explained(self._path):
-            raise full
-        write(self, records)
-
-      patch.setattr(storage.JsonLines, 'append', append)
-    else:
-      fsync, calls = os.fsync, iter(range(100))
-      names = {'checkpoint': '.ckpt.partial', 'episodes': 'episodes.jsonl.part'}
-
-      def failing(descriptor):
-        name = os.readlink(f'/proc/self/fd/{descriptor}')
-        if names[where] in name and (where == 'episodes' or next(calls) == 1):
-          raise full
-        fsync(descriptor)
-
-      patch.setattr(storage.os, 'fsync', failing)
+    patch.setattr(storage.os, 'fsync', failing)
     with pytest.raises(
         errors.ResultsError, match=r'No space left .*; complete results are'
     ):
       _run(job, tmp_path)
   assert not list(path.rglob('*.partial'))
   assert _checkpoints(path)
-  if where == 'lines':
-    _run(job, tmp_path)
-    assert _results(path) == _results(whole)
+  _run(job, tmp_path)
+  assert _results(path) == _results(whole)
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
-  (tmp_path / 'file').write_text('')
-  with pytest.raises(errors.ResultsError, match=r'file/reward.*: Not a dir'):
-    _run(_job(), tmp_path / 'file')
+def test_files_of_another_run_are_refused_by_name(whole, tmp_path, monkeypatch):
+  job, other = _job(), _job(num_envs=2)
+  _kill(other, tmp_path, monkeypatch, 45)
+  theirs = _checkpoints(tmp_path / other.folder())[-1].read_bytes()
+  _kill(job, tmp_path, monkeypatch, 45)
+  path = _checkpoints(tmp_path / job.folder())[-1]
+  for data, problem in (
+      (theirs, "holds 'checkpoint' with another header: configuration is"),
+      ((whole / training.LEARNER).read_bytes(), "holds 'learner.bin'; expec"),
+  ):
+    path.write_bytes(data)
+    with pytest.raises(errors.ResultsError) as raised:
+      _run(job, tmp_path)
+    assert str(raised.value).startswith(f'{path}: {problem}')
 
 
 def test_tensorboard_gets_the_points(tmp_path):
