@@ -63,34 +63,29 @@ def pack(
     raise errors.ResultsError(f'{folder}: no job has finished yet')
   paths = [folder / scheduler.SWEEP, folder / scheduler.EXPERIMENT]
   paths += (folder / scheduler.AUDITS).glob('*.json')
-  dropped = {training.TRAINING_EPISODES}
-  if not learners:
-    dropped.add(training.LEARNER)
-  files, left_out = {}, {}
+  files = {}
   for job in finished:
     done = storage.read_done(folder / job / storage.DONE)
-    for name in (storage.CONFIG, storage.DONE, *done):
-      if name in dropped:
-        left_out[f'{job}/{name}'] = done[name]
-      else:
-        paths.append(storage.result_path(folder / job, name))
     if training.TRAINING_EPISODES in done:
       files[f'{job}/{training.TRAINING_GAINS}'] = _gains(folder / job)
+    kept = done.keys() - {training.TRAINING_EPISODES}
+    if not learners:
+      kept.discard(training.LEARNER)
+    paths += (folder / job / name for name in (storage.CONFIG, *kept))
   for path in paths:
     with storage.explained(path):
       files[path.relative_to(folder).as_posix()] = path.read_bytes()
+  for job in finished:
+    files[f'{job}/{storage.DONE}'] = _done(folder / job, job, files)
   with storage.explained(output.parent):
     output.parent.mkdir(parents=True, exist_ok=True)
-  files = dict(sorted(files.items()))
-  storage.write_whole(output, _zipped(files, left_out))
+  storage.write_whole(output, _zipped(dict(sorted(files.items()))))
   return len(finished), len(planned) - len(finished)
 
 
 def _gains(path: pathlib.Path) -> bytes:
   """Returns the training episodes of a job as reports need them."""
   with storage.explained(path):
-    if (path / training.TRAINING_GAINS).exists():  # From a packed sweep.
-      return (path / training.TRAINING_GAINS).read_bytes()
     episodes, curve = (
         [json.loads(line) for line in (path / name).read_text().splitlines()]
         for name in (training.TRAINING_EPISODES, training.CURVE)
@@ -99,10 +94,28 @@ def _gains(path: pathlib.Path) -> bytes:
   return ''.join(f'{line}\n' for line in lines).encode()
 
 
-def _zipped(files: Mapping[str, bytes], left_out: Mapping[str, str]) -> bytes:
-  """Returns a packed sweep with files, and with the digests of others."""
+def _done(path: pathlib.Path, job: str, files: Mapping[str, bytes]) -> bytes:
+  """Returns the record of a finished job without results that are not packed.
+
+  Args:
+    path: Folder of the job, with the record of all results.
+    job: Name of the folder.
+    files: Packed files of all jobs.
+  """
+  done = storage.read_sealed(path / storage.DONE, f'remove {path}')
+  gains = files.get(f'{job}/{training.TRAINING_GAINS}')
+  for name in (training.TRAINING_EPISODES, training.LEARNER):
+    if f'{job}/{name}' not in files:
+      done['files'].pop(name, None)
+  if gains is not None:
+    done['files'][training.TRAINING_GAINS] = _digest(gains)
+  return storage.sealed(done)
+
+
+def _zipped(files: Mapping[str, bytes]) -> bytes:
+  """Returns a packed sweep with files."""
   digests = {name: _digest(data) for name, data in files.items()}
-  manifest = {'schema': _SCHEMA, 'files': digests, 'left_out': left_out}
+  manifest = {'schema': _SCHEMA, 'files': digests}
   text = json.dumps(manifest, indent=2, sort_keys=True)
   file = io.BytesIO()
   with zipfile.ZipFile(file, 'w') as target:
@@ -140,13 +153,13 @@ def unpack(path: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
           f'{output}: not empty, and not the folder of a sweep; name a new'
           ' folder'
       )
-    files, left_out = _read(path)
+    files = _read(path)
     parent = target.parent if is_new else target
     parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='.unpacking-', dir=parent) as name:
       staged = pathlib.Path(name) / 'sweep'
       try:
-        found = _stage(files, left_out, staged)
+        found = _stage(files, staged)
       except errors.RealabError as error:
         # The temporary folder means nothing to the user.
         problem = str(error).replace(f'{staged}{os.sep}', '')
@@ -157,11 +170,8 @@ def unpack(path: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
   return len(found), 0
 
 
-def _read(path: pathlib.Path) -> tuple[dict[str, bytes], dict[str, str]]:
-  """Reads and verifies a packed sweep.
-
-  Returns:
-    The contents of its files, and the SHA-256 of those that were left out.
+def _read(path: pathlib.Path) -> dict[str, bytes]:
+  """Returns the contents of the files of a packed sweep.
 
   Raises:
     ResultsError: If it is not a packed sweep, or is damaged.
@@ -171,7 +181,6 @@ def _read(path: pathlib.Path) -> tuple[dict[str, bytes], dict[str, str]]:
       files = {name: source.read(name) for name in source.namelist()}
     manifest = json.loads(files.pop(MANIFEST))
     schema, digests = manifest['schema'], dict(manifest['files'])
-    left_out = dict(manifest['left_out'])
   except errors.RealabError:
     raise
   except Exception as error:  # Damage raises errors of many libraries.
@@ -192,14 +201,10 @@ def _read(path: pathlib.Path) -> tuple[dict[str, bytes], dict[str, str]]:
       problem = 'changed since the sweep was packed'
     if problem:
       raise errors.ResultsError(f'{path}: {name!r:.80} {problem}')
-  return files, left_out
+  return files
 
 
-def _stage(
-    files: Mapping[str, bytes],
-    left_out: Mapping[str, str],
-    folder: pathlib.Path,
-) -> list[str]:
+def _stage(files: Mapping[str, bytes], folder: pathlib.Path) -> list[str]:
   """Writes files into a new folder, and returns the names of its jobs.
 
   Raises:
@@ -210,19 +215,11 @@ def _stage(
     (folder / name).write_bytes(data)
   found = [name for name in _folders(folder) if (folder / name).is_dir()]
   for job in found:
-    missing = {
-        name.removeprefix(f'{job}/'): digest
-        for name, digest in sorted(left_out.items())
-        if name.startswith(f'{job}/')
-    }
-    gains = files.get(f'{job}/{training.TRAINING_GAINS}')
-    added = {} if gains is None else {training.TRAINING_GAINS: _digest(gains)}
-    if missing:
-      storage.write_sealed(
-          folder / job / storage.LEFT_OUT, {'files': missing, 'added': added}
-      )
-    if not jobs.is_done(folder / job):
-      raise errors.ResultsError(f'{folder / job / storage.DONE}: missing')
+    # Until version 0.2, records listed results that had not been packed.
+    storage.write_whole(
+        folder / job / storage.DONE, _done(folder / job, job, files)
+    )
+    jobs.is_done(folder / job)  # Verifies its results.
   return found
 
 

@@ -17,7 +17,6 @@ from realab_suite.config import validation
 
 CONFIG = 'config.json'
 DONE = 'done.json'
-LEFT_OUT = 'left_out.json'
 _LOCK = 'lock'
 _CHECKPOINTS = 'checkpoints'
 _SUFFIX = '.ckpt'
@@ -113,7 +112,11 @@ def write_whole(path: pathlib.Path, data: bytes) -> None:
 
 def write_json(path: pathlib.Path, content: Any) -> None:
   """Writes a JSON file atomically."""
-  write_whole(path, (json.dumps(content, indent=2) + '\n').encode())
+  write_whole(path, _json(content))
+
+
+def _json(content: Any) -> bytes:
+  return (json.dumps(content, indent=2) + '\n').encode()
 
 
 def read_json(path: pathlib.Path) -> Any:
@@ -175,16 +178,11 @@ def is_done(path: pathlib.Path) -> bool:
   """Returns True if the run of a folder has finished.
 
   Raises:
-    ResultsError: If a result, or a file that a packed sweep has instead, was
-      changed or removed after that. Only results that `left_out` lists may be
-      missing.
+    ResultsError: If a result was changed or removed after that.
   """
   if not (path / DONE).exists():
     return False
-  packed = _packed(path)
-  for name, digest in {**read_done(path / DONE), **packed['added']}.items():
-    if name in packed['files'] and not (path / name).exists():
-      continue
+  for name, digest in read_done(path / DONE).items():
     if _digest(path / name) != digest:
       raise errors.ResultsError(
           f'{path / name}: changed since the run finished; remove {path} to run'
@@ -193,19 +191,14 @@ def is_done(path: pathlib.Path) -> bool:
   return True
 
 
-def write_done(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-  """Marks the run of a folder as finished.
-
-  Args:
-    path: Folder of the run.
-    content: Facts about the run. `files` maps the results to their SHA-256.
-  """
-  write_sealed(path / DONE, content)
+def sealed(content: Mapping[str, Any]) -> bytes:
+  """Returns a JSON file with a checksum."""
+  return _json({**content, 'checksum': validation.digest_of(content)})
 
 
 def write_sealed(path: pathlib.Path, content: Mapping[str, Any]) -> None:
   """Writes a JSON file with a checksum, atomically."""
-  write_json(path, {**content, 'checksum': validation.digest_of(content)})
+  write_whole(path, sealed(content))
 
 
 def read_sealed(path: pathlib.Path, advice: str) -> dict[str, Any]:
@@ -243,40 +236,6 @@ def read_done(path: pathlib.Path) -> dict[str, str]:
           f'{path}: {name!r:.80} is not a file of a run; {advice}'
       )
   return files
-
-
-def left_out(path: pathlib.Path) -> dict[str, str]:
-  """Returns the SHA-256 of each result that a packed sweep left out.
-
-  Raises:
-    ResultsError: If the list is damaged.
-  """
-  files: dict[str, str] = _packed(path)['files']
-  return files
-
-
-def _packed(path: pathlib.Path) -> dict[str, Any]:
-  """Returns the files that a packed sweep left out, and those that it added."""
-  file = path / LEFT_OUT
-  if not file.exists():
-    return {'files': {}, 'added': {}}
-  return {'added': {}, **read_sealed(file, f'remove {path} to run it again')}
-
-
-def result_path(path: pathlib.Path, name: str) -> pathlib.Path:
-  """Returns the path of a result in the folder of a run.
-
-  Raises:
-    ResultsError: If it was left out of a packed sweep, and is still missing.
-  """
-  file = path / name
-  if name in left_out(path) and not file.exists():
-    raise errors.ResultsError(
-        f'{file}: left out when the sweep was packed; copy it from the folder'
-        ' of that sweep, unpack a sweep that was packed with --learners, or run'
-        ' the job again in another folder'
-    )
-  return file
 
 
 @final
@@ -326,7 +285,7 @@ class RunFolder:
       facts: Further facts to record.
     """
     files = {name: _digest(self.path / name) for name in names}
-    write_done(self.path, {**facts, 'files': files})
+    write_sealed(self.path / DONE, {**facts, 'files': files})
     for checkpoint in self._checkpoints():
       with explained(checkpoint):
         checkpoint.unlink()

@@ -139,7 +139,12 @@ def load_learner(
   Raises:
     ResultsError: If the learner is missing, damaged or belongs to another job.
   """
-  file = storage.result_path(path, LEARNER)
+  file = path / LEARNER
+  if not file.exists():
+    raise errors.ResultsError(
+        f'{file}: missing; a packed sweep has the learners only if it was'
+        ' packed with --learners'
+    )
   state = storage.read_archive(file, header(job.digest(), LEARNER))
   learner = make_learner(job, batch)
   with storage.naming(file):

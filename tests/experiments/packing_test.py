@@ -24,6 +24,7 @@ from tests.experiments import fake_sweep
 from tests.experiments import finished_jobs_test
 from tests.launchers import in_process
 
+_RESULTS = pathlib.Path(__file__).parents[2] / 'docs' / 'results'
 _UNFINISHED = ('reward.random', 1)
 _RUNS = {'reward': {'design': 'instantaneous_reward'}}
 
@@ -86,9 +87,8 @@ def test_an_unpacked_sweep_has_the_verified_files_and_no_others(
   output = tmp_path / 'new' / 'sweep'
   assert packing.unpack(packed, output) == (3, 0)
   there, before = _files(output), _files(built)
-  new = (storage.LEFT_OUT, training.TRAINING_GAINS)
-  added = {name for name in there if name.endswith(new)}
-  assert len(added) == 4  # Two for each finished learner.
+  added = {name for name in there if name.endswith(training.TRAINING_GAINS)}
+  assert len(added) == 2  # One for each finished learner.
   expected = {
       name
       for name in before
@@ -97,7 +97,11 @@ def test_an_unpacked_sweep_has_the_verified_files_and_no_others(
       not in (training.LEARNER, training.TIMING, training.TRAINING_EPISODES)
   }
   assert there.keys() - added == expected
-  assert all(there[name] == before[name] for name in expected)
+  assert all(
+      there[name] == before[name]
+      for name in expected
+      if not name.endswith(storage.DONE)
+  )
   assert _left(output.parent) == {'sweep'}
 
 
@@ -155,26 +159,19 @@ def test_a_sweep_continues_without_the_jobs_that_are_there(
   assert {'--run=reward.random', '--seed=1'} <= {*command}
 
 
-def test_a_missing_learner_is_refused_except_if_it_was_left_out(
-    built, packed, tmp_path
-):
+def test_a_learner_that_was_not_packed_is_missing(packed, tmp_path):
   packing.unpack(packed, tmp_path / 'sweep')
   job = _job('reward', 0)
-  folder = tmp_path / 'sweep' / job.folder()
-  with pytest.raises(errors.ResultsError, match=r'learner\.bin: left out .*--'):
-    training.load_learner(job, folder, None)
-  with pytest.raises(errors.ResultsError, match=r'learner\.bin: left out'):
-    packing.pack(tmp_path / 'sweep', tmp_path / 'x.zip', learners=True)
-  learner = folder / training.LEARNER
-  learner.write_bytes(b'another one')
-  with pytest.raises(errors.ResultsError, match='changed since the run'):
-    jobs.is_done(folder)
-  shutil.copy(built / job.folder() / training.LEARNER, learner)
-  assert jobs.is_done(folder)
-  learner.unlink()
-  (folder / storage.LEFT_OUT).unlink()
-  with pytest.raises(errors.ResultsError, match=r'jsonl: No such file'):
-    jobs.is_done(folder)
+  with pytest.raises(errors.ResultsError, match=r'learner\.bin: missing; .*--'):
+    training.load_learner(job, tmp_path / 'sweep' / job.folder(), None)
+
+
+def test_a_committed_sweep_of_an_earlier_version_is_unpacked(tmp_path):
+  path = _RESULTS / 'meter_only_near.zip'
+  assert packing.unpack(path, tmp_path / 'sweep') == (20, 0)
+  run = sweep_results.load(tmp_path / 'sweep').runs['reward']
+  assert run.is_done
+  assert run.training_episodes()
 
 
 def test_equal_training_episodes_are_counted():
@@ -204,7 +201,7 @@ def test_learners_are_packed_on_request(built, tmp_path):
   packing.unpack(tmp_path / 'all.zip', tmp_path / 'sweep')
   folder = tmp_path / 'sweep' / _job('reward', 0).folder()
   assert (folder / training.LEARNER).exists()
-  assert set(storage.left_out(folder)) == {training.TRAINING_EPISODES}
+  assert not (folder / training.TRAINING_EPISODES).exists()
 
 
 def test_only_missing_jobs_are_added_to_a_folder(built, packed, tmp_path):
@@ -276,12 +273,6 @@ def _forged(packed: pathlib.Path, path: pathlib.Path, how: str) -> None:
     ).hexdigest()
   elif how == 'schema':
     manifest['schema'] = 2
-  elif how == 'no learner':
-    manifest['left_out'] = {
-        name: digest
-        for name, digest in manifest['left_out'].items()
-        if not name.endswith(training.LEARNER)
-    }
   elif how != 'no manifest':
     members[info] = b''
   with zipfile.ZipFile(path, 'w') as target:
@@ -297,12 +288,11 @@ def _forged(packed: pathlib.Path, path: pathlib.Path, how: str) -> None:
         ('parent', "'../x' is not the name of"),
         ('unlisted', "'x' changed since the sweep was packed"),
         ('missing', "episodes.jsonl' is missing"),
-        ('no done', 'done.json: missing'),
+        ('no done', 'done.json: No such file'),
         ('changed', "episodes.jsonl' changed since the sweep was packed"),
         ('forged digest', 'episodes.jsonl: changed since the run finished'),
         ('schema', 'schema is 2; allowed is 1'),
         ('no manifest', "not a packed sweep: 'manifest.json'"),
-        ('no learner', 'learner.bin: No such file'),
     ],
 )
 def test_a_forged_file_is_refused_and_nothing_is_written(

@@ -97,7 +97,7 @@ def _load_sweep(folder: str) -> Any:
 def _load_done(name: str) -> Any:
   folder = pathlib.Path('done')
   folder.mkdir(exist_ok=True)
-  storage.write_done(folder, {'files': {name: '0' * 64}})
+  storage.write_sealed(folder / storage.DONE, {'files': {name: '0' * 64}})
   return storage.is_done(folder)
 
 

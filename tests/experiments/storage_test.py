@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import pathlib
 
 import pytest
@@ -65,7 +66,7 @@ def test_a_changed_fact_in_a_done_file_is_refused(tmp_path):
 
 @pytest.mark.parametrize('name', ['../x', '/x', '.x', ''])
 def test_a_done_file_names_only_files_of_its_folder(tmp_path, name):
-  storage.write_done(tmp_path, {'files': {name: '0' * 64}})
+  storage.write_sealed(tmp_path / storage.DONE, {'files': {name: '0' * 64}})
   with pytest.raises(
       errors.ResultsError, match='is not a file of a run; remove'
   ):
@@ -100,6 +101,25 @@ def test_the_first_difference_is_named_by_its_place():
   assert storage.difference({'a': {'b': None}}, {'a': {}}) == (
       "a is {'b': None} there, {} here"
   )
+
+
+def test_a_file_is_synchronised_before_it_is_renamed(tmp_path, monkeypatch):
+  done = []
+  fsync, replace = os.fsync, os.replace
+
+  def note_fsync(descriptor):
+    done.append(os.readlink(f'/proc/self/fd/{descriptor}'))
+    fsync(descriptor)
+
+  def note_replace(source, target):
+    done.append('renamed')
+    replace(source, target)
+
+  monkeypatch.setattr(storage.os, 'fsync', note_fsync)
+  monkeypatch.setattr(storage.os, 'replace', note_replace)
+  storage.write_whole(tmp_path / 'file', b'all of it')
+  assert done == [f'{tmp_path}/file.partial', 'renamed', str(tmp_path)]
+  assert (tmp_path / 'file').read_bytes() == b'all of it'
 
 
 def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
