@@ -5,7 +5,7 @@ A checkpoint contains the full state; lines that were written after it are
 removed.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import contextlib
 import dataclasses
 import os
@@ -94,10 +94,23 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
     if storage.is_done(path):
       options.say(f'{path} has finished already')
       return path
+    learner = None
+    files = [EPISODES, TRACE]
+    facts: dict[str, Any] = {
+        'machines': [{'step': 0, 'machine': machines.here()}]
+    }
     if job.policy is None:
-      _Training(job, folder, options, output).run()
-    else:
-      _evaluate_policy(job, folder, output)
+      learner, facts = _Training(job, folder, options).run()
+      state = learner.state()
+      storage.write_archive(
+          path / LEARNER, header(job.digest(), LEARNER), state
+      )
+      files += [CURVE, TRAINING_EPISODES, LEARNER]
+    _evaluate(job, learner, path / EPISODES, path / TRACE, output)
+    if job.embedded is not None:
+      _evaluate(job.transplant, learner, path / TRANSPLANT, None, output)
+      files.append(TRANSPLANT)
+    folder.finish(files, facts)
   options.say(f'Results are in {path}')
   return path
 
@@ -189,49 +202,46 @@ def header(digest: str, what: str) -> dict[str, Any]:
   return {'configuration': digest, 'what': what}
 
 
-def _evaluate_policy(
-    job: jobs.Job, folder: storage.RunFolder, output: pathlib.Path
-) -> None:
-  seed, episodes = job.evaluation_seed, job.experiment.evaluation.episodes
-  with contextlib.closing(load_batch(job, episodes, seed)) as batch:
-    policy = policies.make(job.kind)
-    actor = batch_actors.BatchPolicyActor(policy, batch, seed)
-    _evaluate(job, folder, batch, actor, output)
-  machine = {'step': 0, 'machine': machines.here()}
-  folder.finish([EPISODES, TRACE], {'machines': [machine]})
-
-
 def _evaluate(
     job: jobs.Job,
-    folder: storage.RunFolder,
-    batch: batch_environment.BatchEnvironment,
-    actor: batch_actors.BatchActor,
-    output: pathlib.Path,
-) -> None:
-  """Evaluates an actor, and writes the rows of its episodes and a trace."""
-  tracer = traces.Tracer(batch, actor)
-  attributor = attribution.Attributor(batch)
-  batch.add_sink(tracer)
-  batch.add_sink(attributor)
-  found = [
-      dataclasses.replace(result, attribution=attributor.metrics(world))
-      for world, result in enumerate(evaluate.evaluate_batch(batch, tracer))
-  ]
-  trace = tracer.trace()
-  storage.write_archive(folder.path / TRACE, header(job.digest(), TRACE), trace)
-  _write_rows(job, folder.path / EPISODES, batch, found, output)
-
-
-def _write_rows(
-    job: jobs.Job,
+    learner: 'agents.Learner | None',
     path: pathlib.Path,
-    batch: batch_environment.BatchEnvironment,
-    found: Sequence[evaluate.EpisodeResult],
+    trace: pathlib.Path | None,
     output: pathlib.Path,
 ) -> None:
-  """Writes the rows of episodes, with the stakes of the design."""
-  stake = kept_stakes.stakes_of(job.experiment.world, job.design, output)
-  info = job.info(batch.task.control_timestep)
+  """Evaluates the learner or the scripted policy of a job.
+
+  Args:
+    job: The job.
+    learner: Trained learner, or `None` for the policy.
+    path: File to write the rows of the episodes to.
+    trace: File to write a trace to; `None` for neither a trace nor an
+      attribution.
+    output: Folder of the experiment.
+  """
+  evaluation, seed = job.experiment.evaluation, job.evaluation_seed
+  with contextlib.closing(load_batch(job, evaluation.episodes, seed)) as batch:
+    actor: batch_actors.BatchActor
+    if learner is None:
+      policy = policies.make(job.kind)
+      actor = batch_actors.BatchPolicyActor(policy, batch, seed)
+    else:
+      actor = _LearnerActor(learner, seed, evaluation.actions == 'greedy')
+    if trace is None:
+      found = evaluate.evaluate_batch(batch, actor)
+    else:
+      tracer = traces.Tracer(batch, actor)
+      attributor = attribution.Attributor(batch)
+      batch.add_sink(tracer)
+      batch.add_sink(attributor)
+      found = [
+          dataclasses.replace(result, attribution=attributor.metrics(world))
+          for world, result in enumerate(evaluate.evaluate_batch(batch, tracer))
+      ]
+      of_trace = header(job.digest(), TRACE)
+      storage.write_archive(trace, of_trace, tracer.trace())
+    stake = kept_stakes.stakes_of(job.experiment.world, job.design, output)
+    info = job.info(batch.task.control_timestep)
   lines = [results.line(results.row(info, one, stake)) for one in found]
   storage.write_whole(path, b''.join(lines))
 
@@ -245,12 +255,10 @@ class _Training:
       job: jobs.Job,
       folder: storage.RunFolder,
       options: Options,
-      output: pathlib.Path,
   ) -> None:
     self._job = job
     self._folder = folder
     self._options = options
-    self._output = output
     training = job.training
     self._sleep = training.sleep
     self._num_envs = training.num_envs
@@ -265,8 +273,12 @@ class _Training:
     # Machines that have run this job, with the control step at their start.
     self._machines: list[dict[str, Any]] = []
 
-  def run(self) -> None:
-    """Trains the learner, from a checkpoint if there is one; evaluates it."""
+  def run(self) -> tuple['agents.Learner', dict[str, Any]]:
+    """Trains the learner, from a checkpoint if there is one.
+
+    Returns:
+      The learner, and facts about its training.
+    """
     job, path = self._job, self._folder.path
     saved = self._folder.load(header(job.digest(), _CHECKPOINT))
     marks = (saved or {}).get('marks', {})
@@ -287,15 +299,14 @@ class _Training:
         mark = marks.get(name, None if name == TIMING else storage.NOTHING)
         self._files[name] = storage.JsonLines(path / name, mark)
         stack.callback(self._files[name].close)
-      step = self._done * self._num_envs
-      total = self._total * self._num_envs
+      step, total = (n * self._num_envs for n in (self._done, self._total))
       name = f'{job.run}, seed {job.seed}'
       display = progress.Display(name, step, total, self._options.say)
       stack.callback(display.close)
       if self._options.tensorboard:
         display.write_tensorboard(path / TENSORBOARD)
       self._learn(learner, time_step, display)
-    self._evaluate_learner(learner)
+    return learner, {'steps': total, 'machines': self._machines}
 
   def _add_machine(
       self, learner: 'agents.Learner', saved: Mapping[str, Any] | None
@@ -332,19 +343,12 @@ class _Training:
   def _begin_segment(self) -> None:
     """Loads new worlds."""
     seed = _world_seed(self._job.seed, self._segment)
-    with contextlib.ExitStack() as stack:
-      batch = load_batch(
-          self._job,
-          self._num_envs,
-          seed,
-          is_training=True,
-          sleep=self._sleep,
-      )
-      stack.callback(batch.close)
-      monitor = monitors.BatchMonitor(batch.mechanism.design, self._num_envs)
-      batch.add_sink(monitor)
-      stack.pop_all()
-    self._batch, self._monitor = batch, monitor
+    self._batch = load_batch(
+        self._job, self._num_envs, seed, is_training=True, sleep=self._sleep
+    )
+    design = self._batch.mechanism.design
+    self._monitor = monitors.BatchMonitor(design, self._num_envs)
+    self._batch.add_sink(self._monitor)
 
   def _learn(
       self,
@@ -416,40 +420,6 @@ class _Training:
     if self._sleep and self._done < self._total:
       self._begin_segment()
     return time_step
-
-  def _evaluate_learner(self, learner: 'agents.Learner') -> None:
-    job = self._job
-    storage.write_archive(
-        self._folder.path / LEARNER,
-        header(job.digest(), LEARNER),
-        learner.state(),
-    )
-    files = [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER]
-    with self._acting(job, learner) as (batch, actor):
-      _evaluate(job, self._folder, batch, actor, self._output)
-    if job.embedded is not None:
-      with self._acting(job.transplant, learner) as (batch, actor):
-        found = evaluate.evaluate_batch(batch, actor)
-        path = self._folder.path / TRANSPLANT
-        _write_rows(job.transplant, path, batch, found, self._output)
-      files.append(TRANSPLANT)
-    facts = {
-        'steps': self._done * self._num_envs,
-        'machines': self._machines,
-    }
-    self._folder.finish(files, facts)
-
-  @contextlib.contextmanager
-  def _acting(
-      self, job: jobs.Job, learner: 'agents.Learner'
-  ) -> Iterator[tuple[batch_environment.BatchEnvironment, '_LearnerActor']]:
-    """Loads the worlds of an evaluation, and yields them with the actor."""
-    evaluation, seed = job.experiment.evaluation, job.evaluation_seed
-    actor = _LearnerActor(learner, seed, evaluation.actions == 'greedy')
-    with contextlib.closing(
-        load_batch(job, evaluation.episodes, seed)
-    ) as batch:
-      yield batch, actor
 
   def _check_parent(self) -> None:
     parent = self._options.parent
