@@ -47,12 +47,10 @@ _DAMAGES: dict[str, Callable[[pathlib.Path], Any]] = {
 class _Idle(engines.Engine):
   """An engine for jobs that are all done."""
 
+  capacity = 1
+
   def __init__(self) -> None:
     self.commands: list[Any] = []
-
-  @property
-  def capacity(self) -> int:
-    return 1
 
   def start(self, command: Any, log: pathlib.Path) -> Any:
     self.commands.append(command)

@@ -4,7 +4,6 @@ from unittest import mock
 
 import pytest
 
-from realab_suite import errors
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import results
@@ -106,43 +105,6 @@ def test_arguments_of_training_apply_in_training_only(tmp_path, monkeypatch):
     path = training.run(job, tmp_path, training.Options(lambda line: None))
   assert sizes == [(2, (8, 8)), (3, (12, 16))]
   assert _replay(job, path).task.camera_size == (12, 16)
-
-
-def test_short_substeps_reach_training_evaluation_and_replays(
-    tmp_path, monkeypatch
-):
-  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
-  real, substeps = suite.load_batch, []
-
-  def load_batch(*arguments, **options):
-    batch = real(*arguments, **options)
-    substeps.append(batch.original.num_substeps)
-    return batch
-
-  run = _EXPERIMENT['runs']['reward']
-  light = [*run['overrides'], 'registers.reward.mass=0.01']
-  runs = {'reward': {**run, 'overrides': light}}
-  with pytest.raises(errors.SpecError, match=r'reward: .* mass 0\.01 kg; the '):
-    _plan(_SENSES, runs=runs)
-  short = {'physics_timestep': 0.01}
-  job = _plan(_SENSES, runs=runs, task_kwargs=short)[-1]
-  with mock.patch.object(suite, 'load_batch', load_batch):
-    path = training.run(job, tmp_path, training.Options(lambda line: None))
-  assert substeps == [10, 10]
-  assert _replay(job, path).num_substeps == 10
-
-
-@pytest.mark.parametrize(
-    ('task_kwargs', 'message'),
-    [
-        ({'random': 1}, 'random: the seeds of an experiment'),
-        ({'starts_beside_registers': 2}, 'starts_beside_registers: 2; allowed'),
-    ],
-)
-def test_wrong_arguments_of_training_are_refused(task_kwargs, message):
-  more = {**_EXPERIMENT['training'], 'task_kwargs': task_kwargs}
-  with pytest.raises(errors.SpecError, match=message):
-    _plan(_SENSES, training=more)
 
 
 @pytest.mark.camera

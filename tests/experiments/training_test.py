@@ -352,16 +352,6 @@ def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
   assert _results(path) == _results(whole)
 
 
-def test_a_run_without_an_older_checkpoint_restarts(tmp_path, monkeypatch):
-  job = _job()
-  _kill(job, tmp_path, monkeypatch, 25)
-  path = tmp_path / job.folder()
-  [only] = _checkpoints(path)
-  only.write_bytes(b'')
-  with pytest.raises(errors.ResultsError, match='continues from the beginning'):
-    _run(job, tmp_path)
-
-
 def test_a_full_disk_is_reported_and_nothing_is_lost(
     whole, tmp_path, monkeypatch
 ):
