@@ -9,12 +9,11 @@ from dm_env import specs as dm_env_specs
 import numpy as np
 import tqdm
 
-from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.agents import action_encoding
 from realab_suite.agents import base
 from realab_suite.agents import features
 from realab_suite.config import validation
-from realab_suite.engine import batch_environment
 from realab_suite.entities import appearance
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import comparison
@@ -139,8 +138,10 @@ def _train(
   options = validation.validate(
       learner_class.OPTIONS, recipe.learner, 'learner'
   )
+  world = worlds.World(_DOMAIN, _VARIATION)
+  design = specs.load(_DESIGN, _OVERRIDES)
   with contextlib.closing(
-      _load(_VARIATION, num_envs, _SEED, sleep=True)
+      world.load_batch(design, num_envs, _SEED, sleep=True)
   ) as batch:
     # The output of a supervisor must not depend on the state of registers.
     senses = {
@@ -181,29 +182,15 @@ def _without_gaps(spec: dm_env_specs.Array) -> dm_env_specs.Array:
   )
 
 
-def _load(
-    variation: str, num_envs: int, seed: int, *, sleep: bool = False
-) -> batch_environment.BatchEnvironment:
-  """Returns the worlds in which networks learn or are evaluated."""
-  return suite.load_batch(
-      _DOMAIN,
-      variation,
-      {'random': seed},
-      num_envs=num_envs,
-      num_threads=1,
-      sleep=sleep,
-      design=_DESIGN,
-      overrides=_OVERRIDES,
-  )
-
-
 def _evaluate(
     network: network_files.Network, variation: str, num_episodes: int
 ) -> dict[str, Any]:
   """Returns the true return of the policy that takes the best actions."""
   policy = network_policies.NetworkDemonstrator(network)
+  design = specs.load(_DESIGN, _OVERRIDES)
+  world = worlds.World(_DOMAIN, variation)
   with contextlib.closing(
-      _load(variation, num_episodes, _EVALUATION_SEED)
+      world.load_batch(design, num_episodes, _EVALUATION_SEED)
   ) as batch:
     actor = batch_actors.BatchPolicyActor(policy, batch, _EVALUATION_SEED)
     found = evaluate.evaluate_batch(batch, actor)

@@ -18,7 +18,6 @@ import numpy as np
 
 from realab_suite import errors
 from realab_suite import policies
-from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
@@ -165,33 +164,6 @@ def load_learner(
   return learner
 
 
-def load_batch(
-    job: jobs.Job,
-    num_envs: int,
-    seed: int,
-    *,
-    is_training: bool = False,
-    sleep: bool = False,
-) -> batch_environment.BatchEnvironment:
-  """Returns worlds with the design of a job, stepped by one thread.
-
-  Args:
-    job: The job.
-    num_envs: Number of worlds.
-    seed: Seed of the worlds.
-    is_training: True for the worlds of training, False for evaluation.
-    sleep: True if blocks at rest fall asleep; see `suite.load_batch`.
-  """
-  return suite.load_batch(
-      *job.experiment.domain_and_variation,
-      *job.experiment.load_kwargs(seed, is_training=is_training),
-      num_envs=num_envs,
-      num_threads=1,
-      sleep=sleep,
-      design=job.design,
-  )
-
-
 def header(digest: str, what: str) -> dict[str, Any]:
   """Returns the header of an archive of a job.
 
@@ -220,7 +192,10 @@ def _evaluate(
     output: Folder of the experiment.
   """
   evaluation, seed = job.experiment.evaluation, job.evaluation_seed
-  with contextlib.closing(load_batch(job, evaluation.episodes, seed)) as batch:
+  world = job.experiment.world
+  with contextlib.closing(
+      world.load_batch(job.design, evaluation.episodes, seed)
+  ) as batch:
     actor: batch_actors.BatchActor
     if learner is None:
       policy = policies.make(job.kind)
@@ -235,12 +210,12 @@ def _evaluate(
       batch.add_sink(tracer)
       batch.add_sink(attributor)
       found = [
-          dataclasses.replace(result, attribution=attributor.metrics(world))
-          for world, result in enumerate(evaluate.evaluate_batch(batch, tracer))
+          dataclasses.replace(result, attribution=attributor.metrics(i))
+          for i, result in enumerate(evaluate.evaluate_batch(batch, tracer))
       ]
       of_trace = header(job.digest(), TRACE)
       storage.write_archive(trace, of_trace, tracer.trace())
-    stake = kept_stakes.stakes_of(job.experiment.world, job.design, output)
+    stake = kept_stakes.stakes_of(world, job.design, output)
     info = job.info(batch.task.control_timestep)
   lines = [results.line(results.row(info, one, stake)) for one in found]
   storage.write_whole(path, b''.join(lines))
@@ -343,8 +318,8 @@ class _Training:
   def _begin_segment(self) -> None:
     """Loads new worlds."""
     seed = _world_seed(self._job.seed, self._segment)
-    self._batch = load_batch(
-        self._job, self._num_envs, seed, is_training=True, sleep=self._sleep
+    self._batch = self._job.experiment.training_world.load_batch(
+        self._job.design, self._num_envs, seed, sleep=self._sleep
     )
     design = self._batch.mechanism.design
     self._monitor = monitors.BatchMonitor(design, self._num_envs)

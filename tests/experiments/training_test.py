@@ -228,7 +228,7 @@ def test_training_and_evaluation_use_different_seeds(whole):
 def test_a_trained_learner_can_be_loaded(whole, tmp_path):
   job = _job()
   path = shutil.copytree(whole, tmp_path / 'copy')
-  batch = training.load_batch(job, 2, 0)
+  batch = job.experiment.world.load_batch(job.design, 2, 0)
   learner = training.load_learner(job, path, batch)
   assert learner.state()['num_steps'] == _STEPS
   data = bytearray((path / training.LEARNER).read_bytes())
