@@ -427,7 +427,7 @@ MUTANTS = [
         'storage', 'a run continues on another machine unrecorded',
         'experiments/training.py',
         '      if not differences:\n', '      if differences:\n',
-        ('tests/experiments/machines_test.py',),
+        _TRA,
     ),
     planting.Mutant(
         'storage', 'the configuration of a finished job is not checked',

@@ -142,31 +142,7 @@ def test_a_fork_that_fails_is_closed_and_the_original_is_not(
 
 # ---- Jobs -------------------------------------------------------------------
 
-_NUM_ENVS = 2
-_SMALL = {
-    'schema': 1,
-    'name': 'small',
-    'task': 'unlock_door.near',
-    'max_steps': 30,
-    'runs': {
-        'reward': {
-            'design': 'instantaneous_reward',
-            'overrides': [
-                'dof=planar',
-                'action_set={name: dmlab_like, version: 1}',
-            ],
-        }
-    },
-    'baselines': ['random'],
-    'seeds': [3],
-    'training': {
-        'num_envs': _NUM_ENVS,
-        'steps': 20 * _NUM_ENVS,
-        'checkpoint_every': 8 * _NUM_ENVS,
-        'curve_every': 5 * _NUM_ENVS,
-    },
-    'evaluation': {'episodes': 2},
-}
+_SMALL = {**small.EXPERIMENT, 'max_steps': 30}
 
 
 @functools.cache

@@ -26,28 +26,20 @@ from realab_suite.launchers import program
 from realab_suite.launchers import train
 from tests import zygote
 from tests.experiments import fake_learner
+from tests.experiments import small
 
 _RUN = 'reward'
 _SEED = 3
 _EXPERIMENT = {
-    'schema': 1,
-    'name': 'victim',
-    'task': 'unlock_door.near',
+    **small.EXPERIMENT,
     'max_steps': 5,
-    'runs': {
-        _RUN: {
-            'design': 'instantaneous_reward',
-            'overrides': ['dof=planar'],
-        },
-    },
-    'seeds': [_SEED],
+    'baselines': [],
     'training': {
         'num_envs': 2,
         'steps': 48,
         'checkpoint_every': 16,
         'curve_every': 8,
     },
-    'evaluation': {'episodes': 2},
 }
 _NAMES = (
     storage.CONFIG,

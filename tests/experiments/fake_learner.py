@@ -2,16 +2,10 @@
 
 Every observation changes all later actions, so a run that does not resume
 exactly where it was gives other results. As a program, it is
-`realab_suite.launchers.train` with this learner, and dies when told to:
-
-    KILL_AT=57 python -m tests.experiments.fake_learner --experiment=...
-
-`KILL_AT` is the number of the learner's last step in this process.
+`realab_suite.launchers.train` with this learner.
 """
 
 from collections.abc import Callable
-import os
-import signal
 from typing import Any
 
 import numpy as np
@@ -87,17 +81,6 @@ def make(job: Any, batch: Any) -> FakeLearner:
   )
 
 
-def _make_mortal(job: Any, batch: Any) -> FakeLearner:
-  learner = make(job, batch)
-
-  def on_step(step: int) -> None:
-    if step == int(os.environ['KILL_AT']):
-      os.kill(os.getpid(), signal.SIGKILL)
-
-  learner.on_step = on_step
-  return learner
-
-
 if __name__ == '__main__':
-  training.make_learner = _make_mortal if 'KILL_AT' in os.environ else make
+  training.make_learner = make
   program.start(train.main)

@@ -160,30 +160,3 @@ def test_the_timing_file_may_change(folder):
   )
   assert not _sweep(folder).commands
   _report(folder)
-
-
-def _edit(path: pathlib.Path, old: str, new: str) -> None:
-  text = path.read_text(encoding='utf-8')
-  assert old in text
-  path.write_text(text.replace(old, new, 1), encoding='utf-8')
-
-
-def test_a_changed_experiment_of_a_sweep_is_refused(folder):
-  _edit(folder / scheduler.EXPERIMENT, '250', '251')
-  with pytest.raises(errors.ResultsError, match='since the sweep began'):
-    _report(folder)
-
-
-def test_a_changed_configuration_of_a_run_is_refused(folder):
-  config = _job_folder(folder) / storage.CONFIG
-  _edit(config, '"max_steps": 250', '"max_steps": 251')
-  with pytest.raises(errors.ResultsError, match='name of its folder'):
-    _report(folder)
-
-
-def test_a_job_folder_outside_the_sweep_is_refused(folder):
-  content: Any = scheduler.read_description(folder)
-  content['jobs'][0]['folder'] = '../elsewhere'
-  storage.write_sealed(folder / scheduler.SWEEP, content)
-  with pytest.raises(errors.ResultsError, match=r'jobs\.0\.folder'):
-    _report(folder)

@@ -16,6 +16,7 @@ from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import kept_stakes
+from realab_suite.experiments import machines
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from tests.experiments import fake_learner
@@ -249,6 +250,51 @@ def test_a_run_may_be_killed_again_and_again(whole, tmp_path, monkeypatch):
     _kill(job, tmp_path, monkeypatch, step)
   path, _ = _run(job, tmp_path)
   assert _results(path) == _results(whole)
+
+
+def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch, caplog):
+  job = _job()
+
+  def use(processor):
+    here = {'processor': processor, 'libc': 'glibc 2.36'}
+    monkeypatch.setattr(machines, 'here', lambda: here)
+
+  # The second kill is before a checkpoint, and leaves nothing.
+  for processor, step in (('b', 25), ('c', 24), ('b', 26), ('a', 45)):
+    use(processor)
+    _kill(job, tmp_path, monkeypatch, step)
+  caplog.clear()
+  use('b')
+  path, _ = _run(job, tmp_path)
+  [warning] = [one.message for one in caplog.records]
+  assert warning == (
+      'reward, seed 3: continues from step 160 on another machine or with other'
+      " settings, and its results depend on both: processor is 'a' there, 'b'"
+      ' here'
+  )
+  done = json.loads((path / storage.DONE).read_text())
+  found = [
+      (one['step'], one['machine']['processor']) for one in done['machines']
+  ]
+  assert found == [(0, 'b'), (80, 'a'), (160, 'b')]
+
+
+def test_settings_of_the_learner_are_part_of_the_machine(
+    tmp_path, monkeypatch, caplog
+):
+  _kill(_job(), tmp_path, monkeypatch, 25)
+  monkeypatch.setattr(
+      fake_learner.FakeLearner, 'settings', lambda self: {'device': 'gpu'}
+  )
+  _run(_job(), tmp_path)
+  assert "device is None there, 'gpu' here" in caplog.text
+
+
+def test_the_machine_of_a_scripted_policy_is_recorded(tmp_path, monkeypatch):
+  monkeypatch.setattr(machines, 'here', lambda: {'processor': 'mine'})
+  path, _ = _run(_job('reward.random'), tmp_path)
+  done = json.loads((path / storage.DONE).read_text())
+  assert done['machines'] == [{'step': 0, 'machine': {'processor': 'mine'}}]
 
 
 def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
