@@ -390,8 +390,10 @@ MUTANTS = [
         'fcntl.LOCK_EX | fcntl.LOCK_NB', 'fcntl.LOCK_SH | fcntl.LOCK_NB', _STO,
     ),
     planting.Mutant(
-        'storage', 'a folder of another configuration is accepted', _STORAGE,
-        '  if there != config:\n', '  if there is None:\n', _STO,
+        'storage', 'a folder of another configuration is accepted',
+        'experiments/training.py',
+        '    jobs.read_config(path)  # Refuses another configuration.\n', '',
+        _TRA,
     ),
     planting.Mutant(
         'storage', 'changed results are accepted as done', _STORAGE,

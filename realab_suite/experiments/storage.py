@@ -247,25 +247,21 @@ class RunFolder:
   """
 
   def __init__(self, path: pathlib.Path, config: Mapping[str, Any]) -> None:
-    """Creates the folder, or opens one with the same configuration.
+    """Creates the folder, or opens an existing one.
 
     Args:
       path: Path of the folder.
-      config: Configuration that the results depend on, as JSON.
+      config: Configuration to write into a new folder, as JSON.
 
     Raises:
-      ResultsError: If it cannot be created, another process holds its lock, or
-        it belongs to another configuration.
+      ResultsError: If it cannot be created, or another process holds its lock.
     """
     self.path = path
     with explained(path):
       path.mkdir(parents=True, exist_ok=True)
     self._lock = lock(path)
-    try:
-      _check_config(path / CONFIG, json.loads(json.dumps(config)))
-    except BaseException:
-      self.close()
-      raise
+    if not (path / CONFIG).exists():
+      write_json(path / CONFIG, config)
 
   def close(self) -> None:
     """Releases the lock."""
@@ -403,19 +399,6 @@ class JsonLines:
   def close(self) -> None:
     """Closes the file."""
     self._file.close()
-
-
-def _check_config(path: pathlib.Path, config: dict[str, Any]) -> None:
-  """Writes a configuration, or compares it with the existing one."""
-  if not path.exists():
-    write_json(path, config)
-    return
-  there = read_json(path)
-  if there != config:
-    raise errors.ResultsError(
-        f'folder {path.parent} belongs to another configuration:'
-        f' {difference(there, config)}; name another folder'
-    )
 
 
 def difference(there: Any, here: Any, key_path: str = '') -> str:

@@ -90,6 +90,7 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
     progress.check_tensorboard()
   path = output / job.folder()
   with storage.RunFolder(path, job.config()) as folder:
+    jobs.read_config(path)  # Refuses another configuration.
     if storage.is_done(path):
       options.say(f'{path} has finished already')
       return path
