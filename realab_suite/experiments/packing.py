@@ -213,7 +213,9 @@ def _stage(files: Mapping[str, bytes], folder: pathlib.Path) -> list[str]:
   for name, data in files.items():
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_bytes(data)
-  found = [name for name in _folders(folder) if (folder / name).is_dir()]
+  found = [
+      name for name in _folders(folder) if f'{name}/{storage.CONFIG}' in files
+  ]
   for job in found:
     # Until version 0.2, records listed results that had not been packed.
     storage.write_whole(

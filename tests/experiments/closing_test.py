@@ -233,7 +233,7 @@ def test_a_scripted_job_that_fails_closes_its_worlds(
   assert not made.open
 
 
-# ---- Comparisons and films --------------------------------------------------
+# ---- Comparisons ------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -248,43 +248,3 @@ def test_a_comparison_that_fails_closes_its_worlds(
     scripted.run(small.settings(tmp_path / 'new'), lambda line: None)
   assert made.num_made > 0
   assert not made.open
-
-
-class _FakeFilm:
-  """A file of imageio's that has no streams."""
-
-  def __init__(self, path: pathlib.Path, kind: type[BaseException]) -> None:
-    path.write_bytes(b'begun')
-    self.is_open = True
-    self.init_video_stream = _raise(kind)
-
-  def close(self) -> None:
-    self.is_open = False
-
-
-@pytest.mark.parametrize(
-    ('place', 'kind'),
-    [('Camera', Failed), ('imopen', Stopped), ('init_video_stream', Stopped)],
-)
-def test_a_film_that_fails_leaves_no_file(tmp_path, monkeypatch, place, kind):
-  videos = pytest.importorskip('realab_suite.reports.films')
-  path = tmp_path / 'film.mp4'
-  files = []
-
-  def imopen(*unused: Any, **unused_too: Any) -> _FakeFilm:
-    files.append(_FakeFilm(path, kind))
-    return files[-1]
-
-  monkeypatch.setattr(videos.engine, 'Camera', lambda *unused: None)
-  monkeypatch.setattr(videos.imageio, 'imopen', imopen)
-  if place == 'Camera':
-    monkeypatch.setattr(videos.engine, 'Camera', _raise(kind))
-  elif place == 'imopen':
-    monkeypatch.setattr(videos.imageio, 'imopen', _raise(kind))
-  env = _load()
-  for _ in range(2):  # Nothing is in the way of another attempt.
-    with pytest.raises(kind):
-      videos.Film(env, path, 'title')
-  assert not any(file.is_open for file in files)
-  assert not list(tmp_path.iterdir())
-  env.close()

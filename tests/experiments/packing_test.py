@@ -105,21 +105,6 @@ def test_an_unpacked_sweep_has_the_verified_files_and_no_others(
   assert _left(output.parent) == {'sweep'}
 
 
-@pytest.mark.parametrize('is_removed', [False, True])
-def test_changed_gains_of_an_unpacked_sweep_are_refused(
-    packed, tmp_path, is_removed
-):
-  packing.unpack(packed, tmp_path / 'sweep')
-  path, *_ = (tmp_path / 'sweep').glob(f'*/{training.TRAINING_GAINS}')
-  assert storage.is_done(path.parent)
-  if is_removed:
-    path.unlink()
-  else:
-    path.write_bytes(path.read_bytes().replace(b'1', b'2', 1))
-  with pytest.raises(errors.ResultsError, match=training.TRAINING_GAINS):
-    storage.is_done(path.parent)
-
-
 def test_packing_again_gives_the_same_bytes_also_after_unpacking(
     built, packed, tmp_path
 ):
