@@ -50,7 +50,6 @@ _NAMES = (
     training.TRAINING_EPISODES,
     training.LEARNER,
 )
-_KEPT = 'kept'
 # Ways to die at an operation on a file: before it, in the middle of a write, or
 # by a loss of power, which takes back all that was not synchronised, with the
 # new names of files or without.
@@ -78,7 +77,6 @@ def run_training(
     way: Way to die.
     count: File to write the number of operations to.
   """
-  _keep_last_checkpoints()
   training.make_learner = fake_learner.make
   shim = _Shim(die_at, way)
   shim.install()
@@ -110,19 +108,6 @@ def write_rows(
     for row in parsed:
       writer.write(row)
       os.write(said, b'.')
-
-
-def _keep_last_checkpoints() -> None:
-  """Copies the checkpoints before a finished run removes them."""
-  finish = storage.RunFolder.finish
-
-  def finish_with_a_copy(self: Any, *arguments: Any) -> None:
-    kept = self.path / _KEPT
-    shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(self.path / 'checkpoints', kept)
-    finish(self, *arguments)
-
-  storage.RunFolder.finish = finish_with_a_copy
 
 
 # ---- Operations on files -----------------------------------------------------
@@ -297,9 +282,7 @@ class Killer:
 
   def _results(self, output: pathlib.Path) -> dict[str, bytes]:
     folder = output / self._job.folder()
-    kept = sorted((folder / _KEPT).iterdir())
-    paths = [*(folder / name for name in _NAMES), *kept]
-    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+    return {name: (folder / name).read_bytes() for name in _NAMES}
 
 
 def kill_writer(
