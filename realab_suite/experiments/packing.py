@@ -258,13 +258,10 @@ def _merge(
       for audit in staged.glob(f'{scheduler.AUDITS}/*')
       if not (target / (name := f'{scheduler.AUDITS}/{audit.name}')).exists()
   ]
-  lock = storage.lock(target)
-  try:
+  with storage.locked(target):
     for name in (*missing, *audits):
       (target / name).parent.mkdir(exist_ok=True)
       os.rename(staged / name, target / name)
-  finally:
-    os.close(lock)
   return len(missing), len(found) - len(missing)
 
 

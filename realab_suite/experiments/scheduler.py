@@ -66,14 +66,10 @@ def sweep(
     )
   planned = jobs.plan(experiment, seeds)
   wanted = jobs.plan(experiment, seeds, only) if only else planned
-  with storage.explained(output):
-    (output / LOGS).mkdir(parents=True, exist_ok=True)
-  lock = storage.lock(output)
-  try:
+  with storage.locked(output):
+    (output / LOGS).mkdir(exist_ok=True)
     _describe(experiment, planned, calibration, output)
     _Sweep(wanted, engine, output, say, arguments).run()
-  finally:
-    os.close(lock)
 
 
 def _describe(
@@ -194,7 +190,8 @@ class _Run:
     """Message on the process that writes to the folder, or ''."""
     if self.folder.exists() and not (self.folder / storage.DONE).exists():
       try:
-        os.close(storage.lock(self.folder))
+        with storage.locked(self.folder):
+          return ''
       except errors.InUseError as error:
         return str(error)
     return ''

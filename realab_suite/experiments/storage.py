@@ -62,31 +62,33 @@ def new_folder(output: str) -> pathlib.Path:
   return folder
 
 
-def lock(folder: pathlib.Path) -> int:
-  """Locks a folder, and returns the descriptor whose closing unlocks it.
+@contextlib.contextmanager
+def locked(folder: pathlib.Path) -> Iterator[None]:
+  """Locks a folder, and creates it if it does not exist.
+
+  If the process is killed, the operating system releases the lock.
 
   Raises:
     InUseError: If another process holds the lock.
     ResultsError: If the folder cannot be written to.
   """
   path = folder / _LOCK
-  with explained(path):
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-      fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+  with contextlib.ExitStack() as stack:
+    with explained(path):
+      folder.mkdir(parents=True, exist_ok=True)
+      descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+      stack.callback(os.close, descriptor)
+      try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+      except BlockingIOError as error:
+        holder = os.pread(descriptor, 20, 0).decode(errors='replace').strip()
+        raise errors.InUseError(
+            f'folder {folder} is being written to by process'
+            f' {holder or "(unknown)"}; wait until it ends, or stop it'
+        ) from error
       os.truncate(descriptor, 0)
       os.write(descriptor, f'{os.getpid()}\n'.encode())
-      return descriptor
-    except BlockingIOError:
-      holder = os.pread(descriptor, 20, 0).decode(errors='replace').strip()
-      os.close(descriptor)
-    except OSError:
-      os.close(descriptor)
-      raise
-  raise errors.InUseError(
-      f'folder {folder} is being written to by process'
-      f' {holder or "(unknown)"}; wait until it ends, or stop it'
-  )
+    yield
 
 
 def write_whole(path: pathlib.Path, data: bytes) -> None:
@@ -240,38 +242,18 @@ def read_done(path: pathlib.Path) -> dict[str, str]:
 
 @final
 class RunFolder:
-  """Locked folder of one run.
-
-  Use it as a context manager, which releases the lock at its end. If the
-  process is killed, the operating system releases it.
-  """
+  """Folder of one run, which only one process may use; see `locked`."""
 
   def __init__(self, path: pathlib.Path, config: Mapping[str, Any]) -> None:
-    """Creates the folder, or opens an existing one.
+    """Opens the folder.
 
     Args:
       path: Path of the folder.
       config: Configuration to write into a new folder, as JSON.
-
-    Raises:
-      ResultsError: If it cannot be created, or another process holds its lock.
     """
     self.path = path
-    with explained(path):
-      path.mkdir(parents=True, exist_ok=True)
-    self._lock = lock(path)
     if not (path / CONFIG).exists():
       write_json(path / CONFIG, config)
-
-  def close(self) -> None:
-    """Releases the lock."""
-    os.close(self._lock)
-
-  def __enter__(self) -> 'RunFolder':
-    return self
-
-  def __exit__(self, *unused: Any) -> None:
-    self.close()
 
   def finish(self, names: Sequence[str], facts: Mapping[str, Any]) -> None:
     """Marks the run as finished, and removes its checkpoints.

@@ -89,7 +89,8 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
   if options.tensorboard:
     progress.check_tensorboard()
   path = output / job.folder()
-  with storage.RunFolder(path, job.config()) as folder:
+  with storage.locked(path):
+    folder = storage.RunFolder(path, job.config())
     jobs.read_config(path)  # Refuses another configuration.
     if storage.is_done(path):
       options.say(f'{path} has finished already')

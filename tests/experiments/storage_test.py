@@ -46,9 +46,9 @@ def test_changed_lines_are_refused(tmp_path, change):
 
 
 def _finished(folder: pathlib.Path) -> pathlib.Path:
-  with storage.RunFolder(folder, {}) as run:
-    (folder / 'result').write_text('all is well')
-    run.finish(['result'], {'steps': 4})
+  run = storage.RunFolder(folder, {})
+  (folder / 'result').write_text('all is well')
+  run.finish(['result'], {'steps': 4})
   return folder
 
 
@@ -81,13 +81,13 @@ def test_wrong_json_is_named(tmp_path):
 
 
 def test_all_checkpoints_but_two_are_removed_and_the_last_is_loaded(tmp_path):
-  with storage.RunFolder(tmp_path, {}) as run:
-    assert run.load(_HEADER) is None
-    for step in (1, 2, 3):
-      run.save(step, _HEADER, {'step': step})
-    assert run.load(_HEADER) == {'step': 3}
-    names = sorted(p.name for p in (tmp_path / 'checkpoints').iterdir())
-    assert names == ['000000000002.ckpt', '000000000003.ckpt']
+  run = storage.RunFolder(tmp_path, {})
+  assert run.load(_HEADER) is None
+  for step in (1, 2, 3):
+    run.save(step, _HEADER, {'step': step})
+  assert run.load(_HEADER) == {'step': 3}
+  names = sorted(p.name for p in (tmp_path / 'checkpoints').iterdir())
+  assert names == ['000000000002.ckpt', '000000000003.ckpt']
 
 
 def test_the_first_difference_is_named_by_its_place():

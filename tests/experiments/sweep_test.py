@@ -1,5 +1,6 @@
 """Tests of sweeps: each job runs once, and a failing one stops no other."""
 
+import contextlib
 import json
 import os
 import pathlib
@@ -72,8 +73,8 @@ class Pretender(engines.Engine):
       seed = int(_flag(task, 'seed'))
       [job] = jobs.plan(experiment, [seed], [_flag(task, 'run')])
       folder = pathlib.Path(_flag(task, 'output')) / job.folder()
-      with storage.RunFolder(folder, job.config()) as run:
-        run.finish([], {})
+      with storage.locked(folder):
+        storage.RunFolder(folder, job.config()).finish([], {})
     return status
 
   def stop(self, tasks):
@@ -163,10 +164,10 @@ def test_a_job_whose_process_survived_is_done_once(
 ):
   # The process survives its worker, or an earlier sweep.
   [job] = jobs.plan(experiment_specs.load(_SMALL), only=['bad'])
-  survivors = []
+  survivors = contextlib.ExitStack()
 
   def begin():
-    survivors.append(storage.RunFolder(tmp_path / job.folder(), job.config()))
+    survivors.enter_context(storage.locked(tmp_path / job.folder()))
 
   def lose():
     begin()
@@ -181,8 +182,8 @@ def test_a_job_whose_process_survived_is_done_once(
     nonlocal num_pauses
     num_pauses += 1
     if num_pauses == 5:
-      with survivors[0] as run:
-        run.finish([], {})
+      with survivors:
+        storage.RunFolder(tmp_path / job.folder(), job.config()).finish([], {})
 
   monkeypatch.setattr(scheduler.time, 'sleep', sleep)
   said = _sweep(_SMALL, tmp_path, engine)
@@ -236,10 +237,11 @@ def test_seeds_may_be_added_and_other_changes_are_refused(tmp_path):
 
 
 def test_a_second_sweep_on_one_folder_is_refused(tmp_path):
-  lock = storage.lock(tmp_path)
-  with pytest.raises(errors.ResultsError, match=f'by process {os.getpid()}'):
+  with (
+      storage.locked(tmp_path),
+      pytest.raises(errors.ResultsError, match=f'by process {os.getpid()}'),
+  ):
     _sweep(_SMALL, tmp_path, Pretender())
-  os.close(lock)
 
 
 def test_one_of_two_parallel_processes_may_fail(tmp_path, monkeypatch):

@@ -351,7 +351,7 @@ def test_a_second_launcher_is_refused_with_the_process_of_the_first(tmp_path):
   job = _job()
   path = tmp_path / job.folder()
   pid = os.getpid()
-  with storage.RunFolder(path, job.config()):
+  with storage.locked(path):
     with pytest.raises(errors.ResultsError, match=f'by process {pid};'):
       _run(job, tmp_path)
   _run(job, tmp_path)
