@@ -70,7 +70,9 @@ class _Trainee:
         }
     )
     (job,) = jobs.plan(experiment)
-    self.batch = training.load_batch(job, num_envs, seed, sleep=sleep)
+    self.batch = job.experiment.world.load_batch(
+        job.design, num_envs, seed, sleep=sleep
+    )
     self.batch.add_sink(
         monitors.BatchMonitor(self.batch.mechanism.design, num_envs)
     )

@@ -42,7 +42,7 @@ TESTS = (
     'tests/experiments/packing_test.py',
     'tests/experiments/storage_test.py',
     'tests/experiments/training_test.py',
-    'tests/experiments/wrong_files_test.py',
+    'tests/archive_test.py',
     'tests/engine/snapshot_test.py',
     'tests/engine/batch_snapshot_test.py',
     'tests/engine/batch_environment_test.py',

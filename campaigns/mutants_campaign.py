@@ -375,7 +375,7 @@ MUTANTS = [
     ),
     planting.Mutant(
         'storage', 'lines behind the checkpoint stay', _STORAGE,
-        '    self._file.truncate(size)\n', '', _STO,
+        '      self._file.truncate(size)\n', '', _STO,
     ),
     planting.Mutant(
         'storage', 'lines are not synchronised before a checkpoint', _STORAGE,
@@ -383,16 +383,17 @@ MUTANTS = [
     ),
     planting.Mutant(
         'storage', 'changed lines are accepted', _STORAGE,
-        "elif self._hash.hexdigest() != mark['sha256']:", 'elif False:',
-        _STO,
+        "self._hash.hexdigest() != mark['sha256']:", 'False:', _STO,
     ),
     planting.Mutant(
         'storage', 'a second launcher is admitted', _STORAGE,
         'fcntl.LOCK_EX | fcntl.LOCK_NB', 'fcntl.LOCK_SH | fcntl.LOCK_NB', _STO,
     ),
     planting.Mutant(
-        'storage', 'a folder of another configuration is accepted', _STORAGE,
-        '  if there != config:\n', '  if there is None:\n', _STO,
+        'storage', 'a folder of another configuration is accepted',
+        'experiments/training.py',
+        '    jobs.read_config(path)  # Refuses another configuration.\n', '',
+        _TRA,
     ),
     planting.Mutant(
         'storage', 'changed results are accepted as done', _STORAGE,
@@ -412,7 +413,7 @@ MUTANTS = [
         'storage', 'a checkpoint of another run is accepted',
         'archive.py',
         '        if saved.get(key) != other.get(key)\n', '        if False\n',
-        ('tests/experiments/wrong_files_test.py',),
+        ('tests/archive_test.py', *_TRA),
     ),
     planting.Mutant(
         'storage', 'a damaged checkpoint is accepted', 'archive.py',
@@ -428,7 +429,7 @@ MUTANTS = [
         'storage', 'a run continues on another machine unrecorded',
         'experiments/training.py',
         '      if not differences:\n', '      if differences:\n',
-        ('tests/experiments/machines_test.py',),
+        _TRA,
     ),
     planting.Mutant(
         'storage', 'the configuration of a finished job is not checked',

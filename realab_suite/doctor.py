@@ -6,7 +6,7 @@ The exit status is 0 if worlds can be loaded and stepped, and 1 if not. Extras
 and rendering are optional.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import metadata
 import os
 import platform
@@ -35,6 +35,10 @@ env = suite.load('unlock_door', 'near', {'random': 0},
 env.reset()
 env.step(0.0 * env.action_spec().minimum)
 """
+_CORE_REMEDY = (
+    'python -m pip install --force-reinstall -e . -c constraints.txt, in the'
+    ' clone'
+)
 _RENDERING_REMEDY = (
     'without a display, install EGL (Debian, Ubuntu: sudo apt install libegl1'
     ' libgl1-mesa-dri) and set MUJOCO_GL=egl; or install OSMesa (libosmesa6)'
@@ -84,25 +88,6 @@ EXTRAS: Mapping[str, Extra] = {
 }
 
 
-@final
-class Finding(NamedTuple):
-  """Result of a check.
-
-  Attributes:
-    name: What was checked.
-    works: False if it does not work.
-    text: Description of the result.
-    remedy: How to repair it, if it does not work.
-    is_core: True if nothing works without it.
-  """
-
-  name: str
-  works: bool
-  text: str
-  remedy: str = ''
-  is_core: bool = False
-
-
 def versions() -> str:
   """Returns the versions of this package, Python and the main packages."""
   found = [f'Python {platform.python_version()}']
@@ -114,31 +99,12 @@ def versions() -> str:
   return ', '.join(found)
 
 
-def findings() -> Iterator[Finding]:
-  """Runs the checks, the slow ones in processes of their own."""
-  yield _core()
-  problem = renderers.choose_renderer()
-  if problem is None:
-    renderer = os.environ['MUJOCO_GL']
-    yield Finding('rendering', True, f'works with MUJOCO_GL={renderer}')
-  else:
-    yield Finding(
-        'rendering',
-        False,
-        f'no camera works: {problem}',
-        _RENDERING_REMEDY,
-    )
-  for name, extra in EXTRAS.items():
-    problem = requirements.missing(*extra.modules, extra=name)
-    if problem is None:
-      yield Finding(name, True, f'installed, for {extra.purpose}')
-    else:
-      absent, _, command = problem.partition('; run: ')
-      yield Finding(name, False, f'{absent}, for {extra.purpose}', command)
+def _core_problem() -> str:
+  """Loads and steps a world in a process that may crash.
 
-
-def _core() -> Finding:
-  """Loads and steps a world, in a process that may crash."""
+  Returns:
+    The problem, or '' if there is none.
+  """
   try:
     ran = subprocess.run(
         [sys.executable, '-c', _STEPS_A_WORLD],
@@ -148,41 +114,43 @@ def _core() -> Finding:
         check=False,
     )
   except subprocess.TimeoutExpired:
-    problem = f'no step within {_PATIENCE_SECONDS} s'
-  else:
-    if not ran.returncode:
-      return Finding(
-          'core', True, 'works: a world was loaded and stepped', is_core=True
-      )
-    complaint = ran.stderr.strip().splitlines()
-    problem = complaint[-1] if complaint else f'exit status {ran.returncode}'
-  return Finding(
-      'core',
-      False,
-      f'cannot step a world: {problem}',
-      'python -m pip install --force-reinstall -e . -c constraints.txt, in the'
-      ' clone',
-      is_core=True,
-  )
+    return f'no step within {_PATIENCE_SECONDS} s'
+  if not ran.returncode:
+    return ''
+  complaint = ran.stderr.strip().splitlines()
+  return complaint[-1] if complaint else f'exit status {ran.returncode}'
+
+
+def _tell(name: str, text: str, remedy: str = '') -> None:
+  """Prints the result of a check, with a remedy if something does not work."""
+  sys.stdout.write(f'{"--" if remedy else "ok"}  {name:10} {text}\n')
+  if remedy:
+    sys.stdout.write(f'{"":14} to repair: {remedy}\n')
+  sys.stdout.flush()
 
 
 def main() -> int:
-  """Prints the findings.
+  """Runs the checks and prints their results.
 
   Returns:
     0 if the core works, otherwise 1.
   """
   sys.stdout.write(f'{versions()}\n')
-  status = 0
-  for finding in findings():
-    mark = 'ok  ' if finding.works else '--  '
-    sys.stdout.write(f'{mark}{finding.name:10} {finding.text}\n')
-    if finding.remedy:
-      sys.stdout.write(f'{"":14} to repair: {finding.remedy}\n')
-    if finding.is_core and not finding.works:
-      status = 1
-    sys.stdout.flush()
-  return status
+  core = _core_problem()
+  if core:
+    _tell('core', f'cannot step a world: {core}', _CORE_REMEDY)
+  else:
+    _tell('core', 'works: a world was loaded and stepped')
+  problem = renderers.choose_renderer()
+  if problem is None:
+    _tell('rendering', f'works with MUJOCO_GL={os.environ["MUJOCO_GL"]}')
+  else:
+    _tell('rendering', f'no camera works: {problem}', _RENDERING_REMEDY)
+  for name, extra in EXTRAS.items():
+    problem = requirements.missing(*extra.modules, extra=name)
+    absent, _, remedy = (problem or 'installed').partition('; run: ')
+    _tell(name, f'{absent}, for {extra.purpose}', remedy)
+  return 1 if core else 0
 
 
 if __name__ == '__main__':

@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 from typing import Any
-import zipfile
 import zlib
 
 import hypothesis
@@ -138,16 +137,6 @@ def test_random_bytes_are_refused(data: bytes):
     archive.Archive.from_bytes(data)
 
 
-@hypothesis.given(at=st.integers(0, 2**20), byte=st.integers(1, 255))
-def test_a_forged_checksum_gives_an_error_or_an_archive(at: int, byte: int):
-  payload = bytearray(_BYTES[len(_MAGIC) + 32 :])
-  payload[at % len(payload)] ^= byte
-  try:
-    archive.Archive.from_bytes(_signed(bytes(payload)))
-  except errors.StateLayoutError as error:
-    assert '\n' not in str(error)  # noqa: PT017 - either is fine.
-
-
 def _archive(structure: Any, **arrays: Any) -> bytes:
   file = io.BytesIO()
   text = json.dumps(structure).encode()
@@ -189,26 +178,6 @@ def test_arrays_keep_their_order_in_memory():
 def test_floats_keep_their_last_bit():
   for value in (0.1 + 0.2, 5e-324, 1.7976931348623157e308, -0.0):
     assert _through_bytes(value).hex() == value.hex()
-
-
-@pytest.mark.parametrize('shape', [(10**15,), (2, 10**9), (3,)])
-def test_an_array_with_a_false_size_is_rejected(shape):
-  whole = archive.Archive({}, np.arange(4.0)).to_bytes()
-  start = len(_MAGIC) + 32
-  with zipfile.ZipFile(io.BytesIO(whole[start:])) as zipped:
-    members = {name: zipped.read(name) for name in zipped.namelist()}
-  header = io.BytesIO()
-  np.lib.format.write_array_header_1_0(
-      header, {'descr': '<f8', 'fortran_order': False, 'shape': shape}
-  )
-  members['0.npy'] = header.getvalue() + members['0.npy'][-32:]
-  forged = io.BytesIO()
-  with zipfile.ZipFile(forged, 'w') as zipped:
-    for name, data in members.items():
-      zipped.writestr(name, data)
-  payload = forged.getvalue()
-  with pytest.raises(errors.StateLayoutError, match='declares'):
-    archive.Archive.from_bytes(_signed(payload))
 
 
 def test_archives_of_earlier_versions_can_be_read():

@@ -6,12 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import json
 import math
 import operator
-import pathlib
-from typing import Any, Protocol, final
+from typing import Any
 
-from realab_suite import errors
 from realab_suite.evaluation import monitors
-from realab_suite.experiments import requirements
 
 # Gains below this share of the values are rounding errors.
 _ROUNDING = 1e-6
@@ -125,70 +122,6 @@ def _rounded_gain(observed: float | None, clean: float | None) -> float | None:
   if abs(gain) <= _ROUNDING * max(abs(observed), abs(clean)):
     return 0.0
   return float(f'{gain:.3g}')
-
-
-class Board(Protocol):
-  """Display of a learning curve during training."""
-
-  def add(self, point: Mapping[str, Any]) -> None:
-    """Adds a point."""
-
-  def close(self) -> None:
-    """Completes its files."""
-
-
-@final
-class NoBoard:
-  """A board without a display."""
-
-  def add(self, point: Mapping[str, Any]) -> None:
-    """Does nothing."""
-
-  def close(self) -> None:
-    """Does nothing."""
-
-
-@final
-class TensorBoard:
-  """Writes points to event files of TensorBoard; needs the extra `tb`."""
-
-  def __init__(self, folder: pathlib.Path, step: int) -> None:
-    """Opens the folder.
-
-    Args:
-      folder: Folder of the event files.
-      step: First step to write. Later points of an interrupted run are hidden.
-
-    Raises:
-      SpecError: If tensorboardX is not installed.
-    """
-    check_tensorboard()
-    import tensorboardX
-
-    self._writer = tensorboardX.SummaryWriter(str(folder), purge_step=step)
-
-  def add(self, point: Mapping[str, Any]) -> None:
-    for name, value in _flat(point):
-      if value is not None and name != 'step':
-        self._writer.add_scalar(name, value, point['step'])
-    self._writer.flush()
-
-  def close(self) -> None:
-    self._writer.close()
-
-
-def check_tensorboard() -> None:
-  """Raises a `SpecError` if tensorboardX is not installed."""
-  if problem := requirements.missing('tensorboardX', extra='tb'):
-    raise errors.SpecError(f'--tensorboard: {problem}')
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = '') -> Iterable[Any]:
-  for key, value in tree.items():
-    if isinstance(value, Mapping):
-      yield from _flat(value, f'{prefix}{key}/')
-    else:
-      yield f'{prefix}{key}', value
 
 
 def _gain(record: Mapping[str, Any]) -> float | None:

@@ -21,12 +21,13 @@ _MAX_MINUTES = 24 * 60
 
 
 class Engine(abc.ABC):
-  """Runs commands as tasks."""
+  """Runs commands as tasks.
 
-  @property
-  @abc.abstractmethod
-  def capacity(self) -> int:
-    """Maximum number of tasks at a time."""
+  Attributes:
+    capacity: Maximum number of tasks at a time.
+  """
+
+  capacity: int = sys.maxsize
 
   @abc.abstractmethod
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
@@ -62,17 +63,13 @@ class Local(Engine):
 
   def __init__(self, workers: int) -> None:
     """Makes an engine for this number of parallel processes."""
-    self._workers = workers
-
-  @property
-  def capacity(self) -> int:
-    return self._workers
+    self.capacity = workers
 
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
     with open(log, 'ab') as file:
       # In a new session, only `stop` ends the process, not the terminal.
       return subprocess.Popen(
-          [*command, _ends_with_this_process()],
+          [*command, f'--parent={os.getpid()}'],
           stdin=subprocess.DEVNULL,
           stdout=file,
           stderr=subprocess.STDOUT,
@@ -106,10 +103,6 @@ class Ray(Engine):
       self._ray.init(ignore_reinit_error=True, log_to_driver=False)
       self._execute = self._ray.remote(num_cpus=1, max_retries=0)(execute)
 
-  @property
-  def capacity(self) -> int:
-    return sys.maxsize
-
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
     with _errors_in_one_line('ray'):
       return self._execute.remote(
@@ -137,10 +130,6 @@ class Submitit(Engine):
     """Makes an engine. Without Slurm, submitit runs jobs on this machine."""
     del workers  # Slurm determines the number of processors.
     self._submitit = _import('submitit')
-
-  @property
-  def capacity(self) -> int:
-    return sys.maxsize
 
   def start(self, command: Sequence[str], log: pathlib.Path) -> Any:
     with _errors_in_one_line('submitit'):
@@ -173,18 +162,13 @@ def execute(command: Sequence[str], log: str, folder: str) -> int:
   """Runs a command in a folder, and returns its exit status."""
   with open(log, 'ab') as file:
     return subprocess.run(
-        [*command, _ends_with_this_process()],
+        [*command, f'--parent={os.getpid()}'],
         cwd=folder,
         stdin=subprocess.DEVNULL,
         stdout=file,
         stderr=subprocess.STDOUT,
         check=False,
     ).returncode
-
-
-def _ends_with_this_process() -> str:
-  """Returns the flag for a command that shall not outlive its worker."""
-  return f'--parent={os.getpid()}'
 
 
 def _import(name: str) -> Any:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 import contextlib
+import dataclasses
 from typing import Annotated, Any, Literal, final
 
 import pydantic
@@ -236,13 +237,8 @@ class ExperimentSpec(validation.Spec):
         and self.environment_kwargs == EnvironmentKwargs()
     ):
       return
-    task = self.domain_and_variation
-    suite.load(
-        *task, *self.load_kwargs(0, is_training=True), design=design
-    ).close()
-    with contextlib.closing(
-        suite.load(*task, *self.load_kwargs(0), design=design)
-    ) as env:
+    self.training_world.load(design, 0).close()
+    with contextlib.closing(self.world.load(design, 0)) as env:
       for name in self.baselines:
         actors.check_senses(policies.make(name), env)
 
@@ -270,6 +266,12 @@ class ExperimentSpec(validation.Spec):
         self.environment_kwargs.senses,
     )
 
+  @property
+  def training_world(self) -> worlds.World:
+    """World in which learners are trained."""
+    kwargs = {**self.task_kwargs, **self.training.task_kwargs}
+    return dataclasses.replace(self.world, task_kwargs=kwargs)
+
   def on_task(self, task: str) -> 'ExperimentSpec':
     """Returns the same experiment on another task.
 
@@ -280,21 +282,6 @@ class ExperimentSpec(validation.Spec):
       SpecError: If the experiment cannot be run on this task.
     """
     return load({**self.to_mapping(), 'task': task})
-
-  def load_kwargs(
-      self, seed: int, *, is_training: bool = False
-  ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns `task_kwargs` and `environment_kwargs` for `suite.load`.
-
-    Args:
-      seed: Seed of the worlds.
-      is_training: True for the worlds of training, False for evaluation.
-    """
-    more = self.training.task_kwargs if is_training else {}
-    return {**self.task_kwargs, **more, 'random': seed}, {
-        'max_steps': self.max_steps,
-        **self.environment_kwargs.model_dump(),
-    }
 
 
 def _split(task: str) -> tuple[str, str]:

@@ -6,6 +6,7 @@ its results depend on, and a hash of it is part of the name of its folder.
 """
 
 from collections.abc import Mapping, Sequence
+import contextlib
 import dataclasses
 from importlib import metadata
 import math
@@ -62,20 +63,21 @@ class Job:
   @property
   def kind(self) -> str:
     """Kind of the learner, or name of the scripted policy."""
-    if self.policy is not None:
-      return self.policy
-    if self.design.learner is None:
-      raise errors.SpecError(f'run {self.run!r}: its design has no learner')
-    return self.design.learner.kind
+    learner: Any = self.design.learner  # No run is without one.
+    return self.policy or str(learner.kind)
 
   @property
   def training(self) -> experiment_specs.TrainingSpec:
     """Settings of training, for a learner."""
     training = self.experiment.training
-    steps = _spec(self.experiment, self.run).steps
-    if steps is None:
+    if self.spec.steps is None:
       return training
-    return training.model_copy(update={'steps': steps})
+    return training.model_copy(update={'steps': self.spec.steps})
+
+  @property
+  def spec(self) -> experiment_specs.RunSpec:
+    """Spec of the run, of its twin or of its baseline."""
+    return self.experiment.runs[self.run.partition('.')[0]]
 
   @property
   def evaluation_seed(self) -> int:
@@ -107,7 +109,7 @@ class Job:
     }
     if self.policy is None:
       config['training'] = self.training.model_dump()
-      depends_on.update(_installed(_LEARNER_PACKAGES))
+      depends_on.update(versions_of_learners())
     return config
 
   def digest(self) -> str:
@@ -196,82 +198,71 @@ def plan(
   Raises:
     SpecError: If a run does not exist.
   """
+  dynamics = suite.dynamics(*experiment.domain_and_variation)
   variants = [
-      variant
+      job
       for name in experiment.runs
-      for variant in _variants(experiment, name)
+      for job in _variants(experiment, name, dynamics)
   ]
-  names = [run for run, *_ in variants]
+  names = [job.run for job in variants]
   if unknown := sorted(set(only) - set(names)):
     raise errors.UnknownNameError(
         f'experiment {experiment.name!r} has no run {unknown[0]!r}; it has'
         f' {names}{messages.did_you_mean(unknown[0], names)}'
     )
-  dynamics = suite.dynamics(*experiment.domain_and_variation)
   return [
-      Job(
-          run, seed, policy, design, baseline, twin_of, embedded, dynamics,
-          experiment,
-      )
+      dataclasses.replace(job, seed=seed)
       for i, seed in enumerate(experiment.seeds if seeds is None else seeds)
-      for run, policy, design, baseline, twin_of, embedded in variants
-      if not only or run in only
-      if i < (_spec(experiment, run).num_seeds or math.inf)
-  ]  # fmt: skip
-
-
-def _spec(
-    experiment: experiment_specs.ExperimentSpec, run: str
-) -> experiment_specs.RunSpec:
-  """Returns the spec of a run, of its twin or of its baseline."""
-  name, _, _ = run.partition('.')
-  return experiment.runs[name]
-
-
-# Run, policy, design, baseline, twin_of and embedded of a job.
-_Variant = tuple[
-    str,
-    str | None,
-    specs.DesignSpec,
-    str | None,
-    str | None,
-    specs.DesignSpec | None,
-]
+      for job in variants
+      if not only or job.run in only
+      if i < (job.spec.num_seeds or math.inf)
+  ]
 
 
 def _variants(
-    experiment: experiment_specs.ExperimentSpec, name: str
-) -> list[_Variant]:
-  """Returns the jobs of a run without their seeds; baselines are first."""
-  design = experiment.designs[name]
-  scripted = [f'{name}.{policy}' for policy in experiment.baselines]
-  baseline = scripted[0] if scripted else None
-  variants: list[_Variant] = [
-      (
-          one,
-          policy,
-          design,
-          baseline if one != baseline else None,
-          None,
-          None,
+    experiment: experiment_specs.ExperimentSpec,
+    name: str,
+    dynamics: tuple[int, str | None],
+) -> list[Job]:
+  """Returns the jobs of a run with one seed; baselines are first."""
+  names = [f'{name}.{policy}' for policy in experiment.baselines]
+  learner = Job(
+      run=name,
+      seed=experiment.seeds[0],
+      policy=None,
+      design=experiment.designs[name],
+      baseline=names[0] if names else None,
+      twin_of=None,
+      embedded=None,
+      dynamics=dynamics,
+      experiment=experiment,
+  )
+  found = [
+      dataclasses.replace(
+          learner,
+          run=run,
+          policy=policy,
+          baseline=None if run == learner.baseline else learner.baseline,
       )
-      for one, policy in zip(scripted, experiment.baselines, strict=True)
+      for run, policy in zip(names, experiment.baselines, strict=True)
   ]
-  variants.append((name, None, design, baseline, None, None))
+  found.append(learner)
   if experiment.runs[name].twin:
-    twin = experiment_specs.secure_twin(design)
-    variants.append(
-        (f'{name}.{experiment_specs.TWIN}', None, twin, baseline, name, design)
+    twin = dataclasses.replace(
+        learner,
+        run=f'{name}.{experiment_specs.TWIN}',
+        design=experiment_specs.secure_twin(learner.design),
+        twin_of=name,
+        embedded=learner.design,
     )
-  return variants
+    found.append(twin)
+  return found
 
 
-def _installed(names: Sequence[str]) -> dict[str, str]:
-  """Returns versions of the installed packages, without importing them."""
+def versions_of_learners() -> dict[str, str]:
+  """Returns versions of the packages of learners that are installed."""
   versions = {}
-  for name in names:
-    try:
+  for name in _LEARNER_PACKAGES:
+    with contextlib.suppress(metadata.PackageNotFoundError):
       versions[name] = metadata.version(name)
-    except metadata.PackageNotFoundError:
-      continue
   return versions

@@ -3,15 +3,13 @@
 from collections.abc import Mapping
 import contextlib
 import dataclasses
-from importlib import metadata
 from typing import Any, final
 
 from dm_env import specs as dm_env_specs
 import numpy as np
 import tqdm
 
-from realab_suite import policies
-from realab_suite import suite
+from realab_suite import worlds
 from realab_suite.agents import action_encoding
 from realab_suite.agents import base
 from realab_suite.agents import features
@@ -22,6 +20,7 @@ from realab_suite.evaluation import comparison
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import results
+from realab_suite.experiments import jobs
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
 from realab_suite.policies import network_files
@@ -119,7 +118,7 @@ def make(
           num_envs=num_envs,
           steps=recipe.steps,
           seed=_SEED,
-          versions=_versions(),
+          versions={**results.versions(), **jobs.versions_of_learners()},
       ),
       reached=(),
   )
@@ -139,17 +138,11 @@ def _train(
   options = validation.validate(
       learner_class.OPTIONS, recipe.learner, 'learner'
   )
-  batch = suite.load_batch(
-      _DOMAIN,
-      _VARIATION,
-      {'random': _SEED},
-      num_envs=num_envs,
-      num_threads=1,
-      sleep=True,
-      design=_DESIGN,
-      overrides=_OVERRIDES,
-  )
-  with contextlib.closing(batch):
+  world = worlds.World(_DOMAIN, _VARIATION)
+  design = specs.load(_DESIGN, _OVERRIDES)
+  with contextlib.closing(
+      world.load_batch(design, num_envs, _SEED, sleep=True)
+  ) as batch:
     # The output of a supervisor must not depend on the state of registers.
     senses = {
         name: _without_gaps(spec)
@@ -189,46 +182,19 @@ def _without_gaps(spec: dm_env_specs.Array) -> dm_env_specs.Array:
   )
 
 
-def _versions() -> dict[str, str]:
-  learners = ('jax', 'jaxlib', 'equinox', 'optax')
-  return {
-      **results.versions(),
-      **{name: metadata.version(name) for name in learners},
-  }
-
-
-def evaluate_policy(
-    policy: policies.Policy, variation: str, num_episodes: int, seed: int
-) -> list[evaluate.EpisodeResult]:
-  """Returns the valid first episodes of a policy in a batch of worlds.
-
-  Args:
-    policy: Policy to evaluate.
-    variation: Task of the domain that the network was trained in.
-    num_episodes: Number of worlds.
-    seed: Seed of the worlds.
-  """
-  batch = suite.load_batch(
-      _DOMAIN,
-      variation,
-      {'random': seed},
-      num_envs=num_episodes,
-      num_threads=1,
-      design=_DESIGN,
-      overrides=_OVERRIDES,
-  )
-  with contextlib.closing(batch):
-    actor = batch_actors.BatchPolicyActor(policy, batch, seed)
-    episodes = evaluate.evaluate_batch(batch, actor)
-  return [episode for episode in episodes if episode.is_valid]
-
-
 def _evaluate(
     network: network_files.Network, variation: str, num_episodes: int
 ) -> dict[str, Any]:
   """Returns the true return of the policy that takes the best actions."""
   policy = network_policies.NetworkDemonstrator(network)
-  episodes = evaluate_policy(policy, variation, num_episodes, _EVALUATION_SEED)
+  design = specs.load(_DESIGN, _OVERRIDES)
+  world = worlds.World(_DOMAIN, variation)
+  with contextlib.closing(
+      world.load_batch(design, num_episodes, _EVALUATION_SEED)
+  ) as batch:
+    actor = batch_actors.BatchPolicyActor(policy, batch, _EVALUATION_SEED)
+    found = evaluate.evaluate_batch(batch, actor)
+  episodes = [episode for episode in found if episode.is_valid]
   interval = intervals.mean_interval(
       {_EVALUATION_SEED: [episode.true_return for episode in episodes]},
       bounds=comparison.return_bounds(episodes),

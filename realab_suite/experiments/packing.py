@@ -1,13 +1,12 @@
 """Packed sweeps: the finished jobs of a sweep in one file.
 
 A packed sweep is a zip file without dates, so the same results give the same
-bytes. Its last member is a manifest with the SHA-256 of all others. Packed
-sweeps may come from anywhere: `unpack` writes no file before it has checked the
-names, the sizes and the contents of all members, and then moves whole folders
-to their places.
+bytes. Its last member is a manifest with the SHA-256 of all others. `unpack`
+verifies all members in a temporary folder, and then moves whole folders to
+their places.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 import hashlib
 import io
 import json
@@ -16,7 +15,7 @@ import pathlib
 import re
 import stat
 import tempfile
-from typing import Any, Final, NamedTuple, final
+from typing import Final
 import zipfile
 
 from realab_suite import errors
@@ -33,29 +32,12 @@ _SUFFIX = '.zip'
 _NAME = r'\w[\w.-]*'
 # Files of the sweep, of a job or of an audit. No name leads elsewhere.
 _MEMBER = re.compile(rf'{_NAME}(/{_NAME})?', re.ASCII)
-# Contents are held in memory.
-_MAX_BYTES = 1 << 30
-# The decompressor has no limit on its output, so it gets small parts.
-_CHUNK = 1 << 12
 _UNIX = 3
-
-
-@final
-class Counts(NamedTuple):
-  """Numbers of jobs.
-
-  Attributes:
-    done: Number of jobs that were packed, or added by unpacking.
-    others: Number of unfinished jobs, or of jobs that were there already.
-  """
-
-  done: int
-  others: int
 
 
 def pack(
     folder: pathlib.Path, output: pathlib.Path, *, learners: bool = False
-) -> Counts:
+) -> tuple[int, int]:
   """Writes the finished jobs of a sweep into a file, and replaces the file.
 
   Checkpoints, logs and times are left out, and by default trained learners. Of
@@ -66,59 +48,74 @@ def pack(
     output: File to write, with the suffix `.zip`.
     learners: True to include trained learners.
 
+  Returns:
+    The numbers of packed and of unfinished jobs.
+
   Raises:
     ResultsError: If no job has finished, a file of the sweep is missing or
       damaged, or the output cannot be written.
   """
   if output.suffix != _SUFFIX:
     raise errors.ResultsError(f'{output}: allowed are names with {_SUFFIX}')
-  planned, audits = _read_sweep(folder)
+  planned = _folders(folder)
   finished = [name for name in planned if jobs.is_done(folder / name)]
   if not finished:
     raise errors.ResultsError(f'{folder}: no job has finished yet')
-  names = [scheduler.SWEEP, scheduler.EXPERIMENT]
-  names += [name for name in audits if (folder / name).exists()]
-  files, left_out = {}, {}
+  paths = [folder / scheduler.SWEEP, folder / scheduler.EXPERIMENT]
+  paths += (folder / scheduler.AUDITS).glob('*.json')
+  files = {}
   for job in finished:
     done = storage.read_done(folder / job / storage.DONE)
-    for name in {storage.CONFIG, storage.DONE, *done}:
-      if name == storage.TRAINING_EPISODES or (
-          name == storage.LEARNER and not learners
-      ):
-        left_out[f'{job}/{name}'] = done[name]
-      else:
-        storage.result_path(folder / job, name)
-        names.append(f'{job}/{name}')
-    if storage.TRAINING_EPISODES in done:
-      files[f'{job}/{storage.TRAINING_GAINS}'] = _gains(folder / job)
-  for name in sorted(names):
-    with storage.explained(folder / name):
-      files[name] = (folder / name).read_bytes()
-  _refuse_size(folder, map(len, files.values()))
+    if training.TRAINING_EPISODES in done:
+      files[f'{job}/{training.TRAINING_GAINS}'] = _gains(folder / job)
+    kept = done.keys() - {training.TRAINING_EPISODES}
+    if not learners:
+      kept.discard(training.LEARNER)
+    paths += (folder / job / name for name in (storage.CONFIG, *kept))
+  for path in paths:
+    with storage.explained(path):
+      files[path.relative_to(folder).as_posix()] = path.read_bytes()
+  for job in finished:
+    files[f'{job}/{storage.DONE}'] = _done(folder / job, job, files)
   with storage.explained(output.parent):
     output.parent.mkdir(parents=True, exist_ok=True)
-  files = dict(sorted(files.items()))
-  storage.write_whole(output, _zipped(files, left_out))
-  return Counts(len(finished), len(planned) - len(finished))
+  storage.write_whole(output, _zipped(dict(sorted(files.items()))))
+  return len(finished), len(planned) - len(finished)
 
 
 def _gains(path: pathlib.Path) -> bytes:
   """Returns the training episodes of a job as reports need them."""
   with storage.explained(path):
-    if (path / storage.TRAINING_GAINS).exists():  # From a packed sweep.
-      return (path / storage.TRAINING_GAINS).read_bytes()
     episodes, curve = (
         [json.loads(line) for line in (path / name).read_text().splitlines()]
-        for name in (storage.TRAINING_EPISODES, training.CURVE)
+        for name in (training.TRAINING_EPISODES, training.CURVE)
     )
   lines = [json.dumps(one) for one in curves.condensed(episodes, curve)]
   return ''.join(f'{line}\n' for line in lines).encode()
 
 
-def _zipped(files: Mapping[str, bytes], left_out: Mapping[str, str]) -> bytes:
-  """Returns a packed sweep with files, and with the digests of others."""
+def _done(path: pathlib.Path, job: str, files: Mapping[str, bytes]) -> bytes:
+  """Returns the record of a finished job without results that are not packed.
+
+  Args:
+    path: Folder of the job, with the record of all results.
+    job: Name of the folder.
+    files: Packed files of all jobs.
+  """
+  done = storage.read_sealed(path / storage.DONE, f'remove {path}')
+  gains = files.get(f'{job}/{training.TRAINING_GAINS}')
+  for name in (training.TRAINING_EPISODES, training.LEARNER):
+    if f'{job}/{name}' not in files:
+      done['files'].pop(name, None)
+  if gains is not None:
+    done['files'][training.TRAINING_GAINS] = _digest(gains)
+  return storage.sealed(done)
+
+
+def _zipped(files: Mapping[str, bytes]) -> bytes:
+  """Returns a packed sweep with files."""
   digests = {name: _digest(data) for name, data in files.items()}
-  manifest = {'schema': _SCHEMA, 'files': digests, 'left_out': left_out}
+  manifest = {'schema': _SCHEMA, 'files': digests}
   text = json.dumps(manifest, indent=2, sort_keys=True)
   file = io.BytesIO()
   with zipfile.ZipFile(file, 'w') as target:
@@ -131,7 +128,7 @@ def _zipped(files: Mapping[str, bytes], left_out: Mapping[str, str]) -> bytes:
   return file.getvalue()
 
 
-def unpack(path: pathlib.Path, output: pathlib.Path) -> Counts:
+def unpack(path: pathlib.Path, output: pathlib.Path) -> tuple[int, int]:
   """Writes the jobs of a packed sweep into the folder of a sweep.
 
   The folder is new, or belongs to the same experiment. In the second case only
@@ -141,11 +138,13 @@ def unpack(path: pathlib.Path, output: pathlib.Path) -> Counts:
     path: Packed sweep.
     output: Folder of the sweep.
 
+  Returns:
+    The numbers of jobs that were added, and of those that were there already.
+
   Raises:
     ResultsError: If the file is damaged or is not a packed sweep, or the folder
       contains anything else or an unfinished job of the file. Nothing changes.
   """
-  files, left_out = _read(path)
   with storage.explained(output):
     target = pathlib.Path(os.path.realpath(output))
     is_new = not target.exists() or not any(target.iterdir())
@@ -154,12 +153,13 @@ def unpack(path: pathlib.Path, output: pathlib.Path) -> Counts:
           f'{output}: not empty, and not the folder of a sweep; name a new'
           ' folder'
       )
+    files = _read(path)
     parent = target.parent if is_new else target
     parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='.unpacking-', dir=parent) as name:
       staged = pathlib.Path(name) / 'sweep'
       try:
-        found = _stage(files, left_out, staged)
+        found = _stage(files, staged)
       except errors.RealabError as error:
         # The temporary folder means nothing to the user.
         problem = str(error).replace(f'{staged}{os.sep}', '')
@@ -167,140 +167,20 @@ def unpack(path: pathlib.Path, output: pathlib.Path) -> Counts:
       if not is_new:
         return _merge(path, staged, found, target)
       os.rename(staged, target)
-  return Counts(len(found), 0)
+  return len(found), 0
 
 
-def _stage(
-    files: Mapping[str, bytes],
-    left_out: Mapping[str, str],
-    folder: pathlib.Path,
-) -> list[str]:
-  """Writes files into a new folder, and returns the names of its jobs.
-
-  Raises:
-    ResultsError: If the folder is not that of a sweep with finished jobs.
-  """
-  for name, data in files.items():
-    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_bytes(data)
-  planned, _ = _read_sweep(folder)
-  found = [name for name in planned if (folder / name).is_dir()]
-  for job in found:
-    missing = {
-        name: left_out[f'{job}/{name}']
-        for name in sorted(storage.LEAVABLE)
-        if f'{job}/{name}' in left_out
-    }
-    if missing:
-      gains = f'{job}/{storage.TRAINING_GAINS}'
-      added = (
-          {storage.TRAINING_GAINS: _digest(files[gains])}
-          if gains in files
-          else {}
-      )
-      storage.write_sealed(
-          folder / job / storage.LEFT_OUT, {'files': missing, 'added': added}
-      )
-    if not jobs.is_done(folder / job):
-      raise errors.ResultsError(f'{folder / job / storage.DONE}: missing')
-  return found
-
-
-def _merge(
-    path: pathlib.Path,
-    staged: pathlib.Path,
-    found: list[str],
-    target: pathlib.Path,
-) -> Counts:
-  """Moves missing jobs and audits into the folder of a sweep."""
-  scheduler.check_experiment(
-      target,
-      loading.read_mapping(staged / scheduler.EXPERIMENT),
-      scheduler.read_description(staged)['calibration'],
-  )
-  planned, _ = _read_sweep(target)
-  missing = []
-  for name in found:
-    if name not in planned:
-      raise errors.ResultsError(
-          f'{target / scheduler.SWEEP}: has no job {name}, which {path}'
-          ' contains; name another folder'
-      )
-    if jobs.is_done(target / name):
-      continue
-    if os.path.lexists(target / name):
-      raise errors.ResultsError(
-          f'{target / name}: an unfinished job, which {path} contains as a'
-          ' finished one; remove this folder, or name another one'
-      )
-    missing.append(name)
-  audits = [
-      audit.relative_to(staged)
-      for audit in staged.glob(f'{scheduler.AUDITS}/*')
-      if not (target / audit.relative_to(staged)).exists()
-  ]
-  if missing or audits:
-    lock = storage.lock(target)
-    try:
-      for moved in [*map(pathlib.Path, missing), *audits]:
-        with storage.explained(target / moved):
-          (target / moved).parent.mkdir(exist_ok=True)
-          os.rename(staged / moved, target / moved)
-    finally:
-      os.close(lock)
-  return Counts(len(missing), len(found) - len(missing))
-
-
-def _read_sweep(folder: pathlib.Path) -> tuple[list[str], list[str]]:
-  """Reads and verifies the description of a sweep.
-
-  Returns:
-    The folders of all jobs, and the files of possible audits, by their names
-    in the folder of the sweep.
-
-  Raises:
-    ResultsError: If it is damaged, or a name leads out of the folder.
-  """
-  description: Any = scheduler.read_description(folder)
-  scheduler.read_experiment(folder, description)
-  try:
-    folders = [str(job['folder']) for job in description['jobs']]
-    runs = {str(job['run']): None for job in description['jobs']}
-  except (LookupError, TypeError) as error:
-    raise errors.ResultsError(
-        f'{folder / scheduler.SWEEP}: jobs: malformed: {error!r:.80}'
-    ) from error
-  for name in [*folders, *runs]:
-    if not _MEMBER.fullmatch(name) or '/' in name:
-      raise errors.ResultsError(
-          f'{folder / scheduler.SWEEP}: {name!r:.80} is not the name of a job'
-      )
-  return folders, [f'{scheduler.AUDITS}/{run}.json' for run in runs]
-
-
-def _read(path: pathlib.Path) -> tuple[dict[str, bytes], dict[str, str]]:
-  """Reads and verifies a packed sweep.
-
-  Returns:
-    The contents of its files, and the SHA-256 of those that were left out.
+def _read(path: pathlib.Path) -> dict[str, bytes]:
+  """Returns the contents of the files of a packed sweep.
 
   Raises:
     ResultsError: If it is not a packed sweep, or is damaged.
   """
   try:
-    with storage.explained(path):
-      # To open a pipe may take for ever, and so may to read a device.
-      if not path.is_file() and path.exists():
-        raise errors.ResultsError(
-            f'{path}: not a regular file; allowed is a packed sweep'
-        )
-      with zipfile.ZipFile(path) as source:
-        _check_members(path, source.infolist())
-        files = {name: _contents(source, name) for name in source.namelist()}
+    with storage.explained(path), zipfile.ZipFile(path) as source:
+      files = {name: source.read(name) for name in source.namelist()}
     manifest = json.loads(files.pop(MANIFEST))
-    schema, digests, left_out = (
-        manifest.get(key) for key in ('schema', 'files', 'left_out')
-    )
+    schema, digests = manifest['schema'], dict(manifest['files'])
   except errors.RealabError:
     raise
   except Exception as error:  # Damage raises errors of many libraries.
@@ -311,42 +191,89 @@ def _read(path: pathlib.Path) -> tuple[dict[str, bytes], dict[str, str]]:
     raise errors.ResultsError(
         f'{path}: {MANIFEST!r} schema is {schema!r:.40}; allowed is {_SCHEMA}'
     )
-  if not isinstance(digests, dict) or not isinstance(left_out, dict):
-    raise errors.ResultsError(f'{path}: {MANIFEST!r} has no SHA-256 of files')
   for name in sorted(files.keys() | digests.keys()):
-    if name not in files or name not in digests:
-      problem = 'is not in the manifest' if name in files else 'is missing'
-      raise errors.ResultsError(f'{path}: {name!r:.80} {problem}')
-    if _digest(files[name]) != digests[name]:
-      raise errors.ResultsError(
-          f'{path}: {name!r} changed since the sweep was packed'
-      )
-  return files, left_out
-
-
-def _check_members(path: pathlib.Path, members: list[zipfile.ZipInfo]) -> None:
-  """Checks the names, kinds and sizes of the members of a zip file."""
-  for member in members:
-    name, problem = member.orig_filename, ''
-    if member.filename != name or not _MEMBER.fullmatch(name):
+    problem = ''
+    if not _MEMBER.fullmatch(name):
       problem = 'is not the name of a file of a sweep'
-    elif not stat.S_ISREG(member.external_attr >> 16):
-      problem = 'is not a regular file'
+    elif name not in files:
+      problem = 'is missing'
+    elif _digest(files[name]) != digests.get(name):
+      problem = 'changed since the sweep was packed'
     if problem:
       raise errors.ResultsError(f'{path}: {name!r:.80} {problem}')
-  _refuse_size(path, (member.file_size for member in members))
+  return files
 
 
-def _refuse_size(path: pathlib.Path, sizes: Iterable[int]) -> None:
-  if (size := sum(sizes)) > _MAX_BYTES:
-    raise errors.ResultsError(
-        f'{path}: has {size} bytes of contents; allowed are {_MAX_BYTES}'
+def _stage(files: Mapping[str, bytes], folder: pathlib.Path) -> list[str]:
+  """Writes files into a new folder, and returns the names of its jobs.
+
+  Raises:
+    ResultsError: If the folder is not that of a sweep with finished jobs.
+  """
+  for name, data in files.items():
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(data)
+  found = [
+      name for name in _folders(folder) if f'{name}/{storage.CONFIG}' in files
+  ]
+  for job in found:
+    # Until version 0.2, records listed results that had not been packed.
+    storage.write_whole(
+        folder / job / storage.DONE, _done(folder / job, job, files)
     )
+    jobs.is_done(folder / job)  # Verifies its results.
+  return found
 
 
-def _contents(source: zipfile.ZipFile, name: str) -> bytes:
-  with source.open(name) as file:
-    return b''.join(iter(lambda: file.read(_CHUNK), b''))
+def _merge(
+    path: pathlib.Path,
+    staged: pathlib.Path,
+    found: list[str],
+    target: pathlib.Path,
+) -> tuple[int, int]:
+  """Moves missing jobs and audits into the folder of a sweep."""
+  scheduler.check_experiment(
+      target,
+      loading.read_mapping(staged / scheduler.EXPERIMENT),
+      scheduler.read_description(staged)['calibration'],
+  )
+  planned = _folders(target)
+  missing = []
+  for name in found:
+    if name not in planned:
+      raise errors.ResultsError(
+          f'{target / scheduler.SWEEP}: has no job {name}, which {path}'
+          ' contains; name another folder'
+      )
+    if jobs.is_done(target / name):
+      continue
+    if (target / name).exists():
+      raise errors.ResultsError(
+          f'{target / name}: an unfinished job, which {path} contains as a'
+          ' finished one; remove this folder, or name another one'
+      )
+    missing.append(name)
+  audits = [
+      name
+      for audit in staged.glob(f'{scheduler.AUDITS}/*')
+      if not (target / (name := f'{scheduler.AUDITS}/{audit.name}')).exists()
+  ]
+  with storage.locked(target):
+    for name in (*missing, *audits):
+      (target / name).parent.mkdir(exist_ok=True)
+      os.rename(staged / name, target / name)
+  return len(missing), len(found) - len(missing)
+
+
+def _folders(folder: pathlib.Path) -> list[str]:
+  """Returns the names of the folders of all jobs of a sweep.
+
+  Raises:
+    ResultsError: If the description of the sweep is damaged.
+  """
+  description = scheduler.read_description(folder)
+  scheduler.read_experiment(folder, description)
+  return [job['folder'] for job in description['jobs']]
 
 
 def _digest(data: bytes) -> str:

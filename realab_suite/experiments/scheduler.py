@@ -1,13 +1,14 @@
 """Scheduler of sweeps, which runs all jobs of an experiment on an engine."""
 
 from collections.abc import Callable, Mapping, Sequence
+import dataclasses
 import hashlib
 import json
 import os
 import pathlib
 import sys
 import time
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import tqdm
 import yaml
@@ -17,7 +18,6 @@ from realab_suite.config import loading
 from realab_suite.experiments import engines
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import progress
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 
@@ -66,14 +66,10 @@ def sweep(
     )
   planned = jobs.plan(experiment, seeds)
   wanted = jobs.plan(experiment, seeds, only) if only else planned
-  with storage.explained(output):
-    (output / LOGS).mkdir(parents=True, exist_ok=True)
-  lock = storage.lock(output)
-  try:
+  with storage.locked(output):
+    (output / LOGS).mkdir(exist_ok=True)
     _describe(experiment, planned, calibration, output)
     _Sweep(wanted, engine, output, say, arguments).run()
-  finally:
-    os.close(lock)
 
 
 def _describe(
@@ -176,22 +172,41 @@ def _advice(folder: pathlib.Path) -> str:
 
 
 @final
-class _Waiting(NamedTuple):
-  """A job that is to be started."""
-
-  job: jobs.Job
-  num_restarts: int = 0
-
-
-@final
-class _Running(NamedTuple):
-  """A running job."""
+@dataclasses.dataclass
+class _Run:
+  """A job of a sweep, which may be started several times."""
 
   job: jobs.Job
   folder: pathlib.Path
   log: pathlib.Path
-  task: Any
-  num_restarts: int
+  task: Any = None
+  num_restarts: int = 0
+
+  def __str__(self) -> str:
+    return f'{self.job.run}, seed {self.job.seed}'
+
+  @property
+  def user(self) -> str:
+    """Message on the process that writes to the folder, or ''."""
+    if self.folder.exists() and not (self.folder / storage.DONE).exists():
+      try:
+        with storage.locked(self.folder):
+          return ''
+      except errors.InUseError as error:
+        return str(error)
+    return ''
+
+  @property
+  def num_steps(self) -> int:
+    """Number of control steps of training so far."""
+    if self.job.policy is not None:
+      return 0
+    if (self.folder / storage.DONE).exists():
+      return self.job.training.steps
+    try:
+      return int(json.loads(_last_line(self.folder / training.TIMING))['step'])
+    except ValueError:  # No line yet, or an incomplete one.
+      return 0
 
 
 @final
@@ -206,163 +221,119 @@ class _Sweep:
       say: Callable[[str], None],
       arguments: Sequence[str],
   ) -> None:
-    self._jobs = list(wanted)
     self._engine = engine
     self._output = output
     self._say = say
-    self._arguments = list(arguments)
-    self._waiting = [_Waiting(job) for job in wanted]
-    self._running: list[_Running] = []
+    self._arguments = arguments
+    self._all = [
+        _Run(
+            job,
+            output / job.folder(),
+            output / LOGS / f'{job.folder()}.log',
+        )
+        for job in wanted
+    ]
+    self._waiting = list(self._all)
+    self._running: list[_Run] = []
     self._failures: list[str] = []
     self._said: set[str] = set()
     self._num_finished = 0
-    self._steps: dict[str, int] = {}
 
   def run(self) -> None:
     """Runs all jobs; see `sweep`."""
-    lengths = [job.training.steps for job in self._jobs if job.policy is None]
-    total = sum(lengths)
+    count = len(self._all)
+    total = sum(r.job.training.steps for r in self._all if not r.job.policy)
     bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
     with bar:
       try:
         while self._waiting or self._running:
           self._start_waiting()
           self._poll()
-          bar.update(min(sum(self._steps.values()), total) - bar.n)
-          bar.set_postfix_str(self._progress(), refresh=False)
+          steps = sum(run.num_steps for run in self._all)
+          bar.update(min(steps, total) - bar.n)
+          failed = f', {len(self._failures)} failed' if self._failures else ''
+          bar.set_postfix_str(
+              f'{self._num_finished} of {count} jobs{failed}', refresh=False
+          )
           if self._waiting or self._running:
             time.sleep(_POLL_SECONDS)
       finally:
-        self._engine.stop([running.task for running in self._running])
+        self._engine.stop([run.task for run in self._running])
     if self._failures:
       raise errors.ResultsError(
-          f'{len(self._failures)} of {len(self._jobs)} jobs failed:'
+          f'{len(self._failures)} of {count} jobs failed:'
           f' {"; ".join(self._failures)}; results of the others are in'
           f' {self._output}'
       )
-    self._say(f'{len(self._jobs)} jobs finished; results are in {self._output}')
+    self._say(f'{count} jobs finished; results are in {self._output}')
 
   def _start_waiting(self) -> None:
-    for waiting in list(self._waiting):
+    for run in list(self._waiting):
       if len(self._running) == self._engine.capacity:
         return
-      if problem := _user(self._output / waiting.job.folder()):
+      if user := run.user:
         # A process may survive its worker, and jobs of a cluster their sweep.
-        self._say_once(f'{_name(waiting.job)}: {problem}')
+        if user not in self._said:
+          self._said.add(user)
+          self._say(f'{run}: {user}')
         continue
-      self._waiting.remove(waiting)
-      self._start(*waiting)
+      self._waiting.remove(run)
+      self._start(run)
 
-  def _start(self, job: jobs.Job, num_restarts: int) -> None:
-    folder = self._output / job.folder()
-    log = self._output / LOGS / f'{folder.name}.log'
+  def _start(self, run: _Run) -> None:
     try:
-      if jobs.is_done(folder):
-        self._finish(job, folder, None)
+      if jobs.is_done(run.folder):
+        self._finish(run, '')
         return
     except errors.ResultsError as error:
-      self._finish(job, folder, str(error))
+      self._finish(run, str(error))
       return
     command = [
         sys.executable,
         '-m',
         _MODULE,
         f'--experiment={self._output / EXPERIMENT}',
-        f'--run={job.run}',
-        f'--seed={job.seed}',
+        f'--run={run.job.run}',
+        f'--seed={run.job.seed}',
         f'--output={self._output}',
         *self._arguments,
     ]
-    task = self._engine.start(command, log)
-    self._running.append(_Running(job, folder, log, task, num_restarts))
+    run.task = self._engine.start(command, run.log)
+    self._running.append(run)
 
   def _poll(self) -> None:
-    for running in list(self._running):
-      lost = None
+    for run in list(self._running):
+      problem = ''
       try:
-        status = self._engine.poll(running.task)
+        status = self._engine.poll(run.task)
       except errors.ResultsError as error:
         # A machine of a cluster may be lost; the other jobs continue.
-        status, lost = -1, str(error)
-      if running.job.policy is None:
-        self._steps[running.folder.name] = _last_step(running.folder)
+        status, problem = -1, str(error)
       if status is None:
         continue
-      self._running.remove(running)
-      problem = None
+      self._running.remove(run)
       if status < 0:
-        problem = lost or f'killed by signal {-status}'
-        if running.num_restarts < _MOST_RESTARTS:
-          self._restart(running, problem)
+        problem = problem or f'killed by signal {-status}'
+        if run.num_restarts < _MOST_RESTARTS:
+          run.num_restarts += 1
+          self._waiting.append(run)
+          self._say(
+              f'{run}: {problem}; is started again'
+              f' ({run.num_restarts} of {_MOST_RESTARTS})'
+          )
           continue
-      elif status or not (running.folder / storage.DONE).exists():
-        problem = _last_line(running.log) or f'exit status {status}'
-      self._finish(running.job, running.folder, problem)
+      elif status or not (run.folder / storage.DONE).exists():
+        problem = _last_line(run.log) or f'exit status {status}'
+      self._finish(run, problem)
 
-  def _say_once(self, line: str) -> None:
-    if line not in self._said:
-      self._said.add(line)
-      self._say(line)
-
-  def _restart(self, running: _Running, problem: str) -> None:
-    again = _Waiting(running.job, running.num_restarts + 1)
-    self._waiting.append(again)
-    self._say(
-        f'{_name(running.job)}: {problem}; is started again'
-        f' ({again.num_restarts} of {_MOST_RESTARTS})'
-    )
-
-  def _finish(
-      self, job: jobs.Job, folder: pathlib.Path, problem: str | None
-  ) -> None:
+  def _finish(self, run: _Run, problem: str) -> None:
     self._num_finished += 1
-    name = _name(job)
-    if job.policy is None and problem is None:
-      self._steps[folder.name] = job.training.steps
-    if problem is not None:
-      self._failures.append(f'{name}: {problem}')
+    if problem:
+      self._failures.append(f'{run}: {problem}')
     self._say(
-        f'[{self._num_finished}/{len(self._jobs)}] {name}:'
-        f' {problem or f"finished, results in {folder}"}'
+        f'[{self._num_finished}/{len(self._all)}] {run}:'
+        f' {problem or f"finished, results in {run.folder}"}'
     )
-
-  def _progress(self) -> str:
-    failed = f', {len(self._failures)} failed' if self._failures else ''
-    parts = [f'{self._num_finished} of {len(self._jobs)} jobs{failed}']
-    for running in self._running:
-      if returns := _last_returns(running.folder):
-        parts.append(f'{running.job.run}: {returns}')
-    return '; '.join(parts)
-
-
-def _name(job: jobs.Job) -> str:
-  return f'{job.run}, seed {job.seed}'
-
-
-def _user(folder: pathlib.Path) -> str | None:
-  """Returns a message on the process that runs the job of a folder, if any."""
-  if folder.exists() and not (folder / storage.DONE).exists():
-    try:
-      os.close(storage.lock(folder))
-    except errors.InUseError as error:
-      return str(error)
-  return None
-
-
-def _last_step(folder: pathlib.Path) -> int:
-  """Returns the last recorded step of a run, or 0."""
-  try:
-    return int(json.loads(_last_line(folder / training.TIMING))['step'])
-  except ValueError:  # No line yet, or an incomplete one.
-    return 0
-
-
-def _last_returns(folder: pathlib.Path) -> str:
-  """Returns the last recorded returns of a run as text, or ''."""
-  try:
-    return progress.summary(json.loads(_last_line(folder / training.CURVE)))
-  except (ValueError, KeyError):  # No line yet, or an incomplete one.
-    return ''
 
 
 def _last_line(path: pathlib.Path) -> str:

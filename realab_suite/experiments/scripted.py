@@ -63,30 +63,15 @@ class Settings:
 OnStep = Callable[[Any, tracking.Track], None]
 """Called with the physics and the track, at the start and after every step."""
 
+Draw = Callable[[Mapping[str, tracking.Track], pathlib.Path], None]
+"""Draws plots of the first episode of each run into a new folder."""
 
-@final
-class Pictures(NamedTuple):
-  """Functions that make the pictures of a comparison.
-
-  Attributes:
-    draw: Draws plots of the first episode of each run into a new folder, or
-      `None` for no plots.
-    film: Opens the films of an episode, given its environment, a folder and the
-      name of the run, and yields a function that adds a control step; or `None`
-      for no films.
-  """
-
-  draw: Callable[[Mapping[str, tracking.Track], pathlib.Path], None] | None
-  film: (
-      Callable[
-          [environment.Environment, pathlib.Path, str],
-          contextlib.AbstractContextManager[OnStep],
-      ]
-      | None
-  )
-
-
-NO_PICTURES = Pictures(None, None)
+Film = Callable[
+    [environment.Environment, pathlib.Path, str],
+    contextlib.AbstractContextManager[OnStep],
+]
+"""Opens the films of an episode, given its environment, a folder and the name
+of the run, and yields a function that adds a control step."""
 
 
 @final
@@ -94,29 +79,30 @@ class Run(NamedTuple):
   """One policy in one channel.
 
   Attributes:
-    name: Name of the run in the results.
+    name: Name of the run in the results. In the first channel, whose episode is
+      filmed, it is the name of the policy.
     policy: Name of the policy.
     design: Design, with the channel of the run.
-    is_first: True for the first run of the policy, which is filmed.
   """
 
   name: str
   policy: str
   design: specs.DesignSpec
-  is_first: bool
 
 
 def run(
     settings: Settings,
     say: Callable[[str], None],
-    pictures: Pictures = NO_PICTURES,
+    draw: Draw | None = None,
+    film: Film | None = None,
 ) -> list[result_tables.Line]:
   """Runs a scripted comparison, and writes its results into a new folder.
 
   Args:
     settings: Settings of the comparison.
     say: Called with messages for the user.
-    pictures: Functions that make its pictures.
+    draw: Draws its plots, or `None` for no plots.
+    film: Opens the films of an episode, or `None` for no films.
 
   Returns:
     The summary of each run.
@@ -125,10 +111,13 @@ def run(
     RealabError: If the settings are invalid, before anything is written.
   """
   runs = plan(settings)
-  control = _control(settings, runs)
-  _check_runs(settings, runs)
-  folder = storage.new_folder(settings.output)
+  control = _control(settings, [run.name for run in runs])
   world = settings.world
+  for one in runs:  # Raises errors before anything is written.
+    with contextlib.closing(world.load(one.design, settings.seeds[0])) as env:
+      actors.make(aiming.make_policy(one.policy, env, settings.target, 0), env)
+  folder = storage.new_folder(settings.output)
+  tracks: dict[str, tracking.Track] = {}
   with evaluations.Evaluation(
       world, runs[0].design, folder, say, control=control
   ) as evaluation:
@@ -137,16 +126,27 @@ def run(
         {f'design_{run.design.channel}': run.design for run in runs},
         settings={
             **dataclasses.asdict(settings),
-            'plots': pictures.draw is not None,
-            'videos': pictures.film is not None,
+            'plots': draw is not None,
+            'videos': film is not None,
         },
         runs=[run.name for run in runs],
         baseline=control,
     )
-    job = _Job(settings, evaluation, folder, say, pictures)
-    job.run(runs)
-    if pictures.draw is not None:
-      pictures.draw(job.tracks, folder / 'plots')
+    total = len(runs) * len(settings.seeds) * settings.num_episodes
+    # Without a terminal, a line per run replaces the progress bar.
+    bar = tqdm.tqdm(total=total, disable=None, unit='episode', leave=False)
+    with bar:
+      for one in runs:
+        bar.set_description(one.name)
+        for info, result in _episodes(settings, one, evaluation, tracks, film):
+          evaluation.add(info, result)
+          means = _means(evaluation.rows[one.name])
+          bar.set_postfix_str(means, refresh=False)
+          bar.update()
+        if bar.disable:
+          say(f'{one.name}: {means}')
+    if draw is not None:
+      draw(tracks, folder / 'plots')
     lines, text = evaluation.summarize(
         f'# {world.domain}.{world.task}, design {settings.design}\n\n'
         f'{len(settings.seeds)} seeds of {settings.num_episodes} episodes;'
@@ -177,30 +177,22 @@ def plan(settings: Settings) -> list[Run]:
     )
   for policy in settings.policies:
     policies.POLICIES.get(policy)
-  designs = _designs(settings)
+  channels: list[tuple[str, ...]] = [
+      (f'channel={channel}',) for channel in settings.channels
+  ]
+  designs = [
+      specs.load(settings.design, (*settings.overrides, *channel))
+      for channel in channels or [()]
+  ]
   return [
-      Run(
-          policy if i == 0 else f'{policy} ({design.channel})',
-          policy,
-          design,
-          i == 0,
-      )
+      Run(policy if i == 0 else f'{policy} ({design.channel})', policy, design)
       for policy in settings.policies
       for i, design in enumerate(designs)
   ]
 
 
-def _designs(settings: Settings) -> list[specs.DesignSpec]:
-  if not settings.channels:
-    return [specs.load(settings.design, settings.overrides)]
-  return [
-      specs.load(settings.design, (*settings.overrides, f'channel={channel}'))
-      for channel in settings.channels
-  ]
-
-
-def _control(settings: Settings, runs: Sequence[Run]) -> str:
-  names = [run.name for run in runs]
+def _control(settings: Settings, names: list[str]) -> str:
+  """Returns the name of the run to compare with."""
   if settings.baseline is None:
     solver = settings.world.solver
     return solver if solver in names else names[0]
@@ -211,90 +203,34 @@ def _control(settings: Settings, runs: Sequence[Run]) -> str:
   return settings.baseline
 
 
-def _check_runs(settings: Settings, runs: Sequence[Run]) -> None:
-  """Loads each run once, to raise errors before anything is written."""
-  for run in runs:
-    with contextlib.closing(
-        settings.world.load(run.design, settings.seeds[0])
-    ) as env:
-      policy = aiming.make_policy(run.policy, env, settings.target, 0)
-      actors.make(policy, env)
-
-
-@final
-class _Job:
-  """Execution of a scripted comparison, which writes its episodes."""
-
-  def __init__(
-      self,
-      settings: Settings,
-      evaluation: evaluations.Evaluation,
-      folder: pathlib.Path,
-      say: Callable[[str], None],
-      pictures: Pictures,
-  ) -> None:
-    self._settings = settings
-    self._evaluation = evaluation
-    self._folder = folder
-    self._say = say
-    self._pictures = pictures
-    # The first episode of each run.
-    self.tracks: dict[str, tracking.Track] = {}
-
-  def run(self, runs: Sequence[Run]) -> None:
-    """Runs all episodes of all runs."""
-    settings = self._settings
-    total = len(runs) * len(settings.seeds) * settings.num_episodes
-    # Without a terminal, a line per run replaces the progress bar.
-    with tqdm.tqdm(
-        total=total, disable=None, unit='episode', leave=False
-    ) as bar:
-      for run in runs:
-        bar.set_description(run.name)
-        for means in self._episodes(run):
-          bar.set_postfix_str(means, refresh=False)
-          bar.update()
-        if bar.disable:
-          self._say(f'{run.name}: {means}')
-
-  def _episodes(self, run: Run) -> Iterator[str]:
-    """Runs the episodes of a run, and yields the mean returns so far."""
-    for seed in self._settings.seeds:
-      with contextlib.closing(
-          self._settings.world.load(run.design, seed)
-      ) as env:
-        info = self._evaluation.info(env, run.name, run.policy)
-        for episode in range(self._settings.num_episodes):
-          self._evaluation.add(info, self._episode(run, env, episode))
-          yield _means(self._evaluation.rows[run.name])
-
-  def _episode(
-      self, run: Run, env: environment.Environment, episode: int
-  ) -> evaluate.EpisodeResult:
-    policy = aiming.make_policy(run.policy, env, self._settings.target, episode)
-    with contextlib.ExitStack() as stack:
-      trackers = []
-      if run.name not in self.tracks:
-        trackers.append(tracking.Tracker(env, self._film(run, env, stack)))
-      [result] = evaluate.evaluate(
-          env, policy, 1, first_episode=episode, sinks=trackers
-      )
-    for tracker in trackers:
-      self.tracks[run.name] = tracker.track
-    return result
-
-  def _film(
-      self,
-      run: Run,
-      env: environment.Environment,
-      stack: contextlib.ExitStack,
-  ) -> OnStep | None:
-    """Opens the films of an episode, or returns `None`."""
-    if self._pictures.film is None or not run.is_first:
-      return None
-    folder = self._folder / 'videos'
-    folder.mkdir(exist_ok=True)
-    return stack.enter_context(self._pictures.film(env, folder, run.name))
+def _episodes(
+    settings: Settings,
+    run: Run,
+    evaluation: evaluations.Evaluation,
+    tracks: dict[str, tracking.Track],
+    film: Film | None,
+) -> Iterator[tuple[results.RunInfo, evaluate.EpisodeResult]]:
+  """Runs the episodes of a run, and adds the track of the first one."""
+  for seed in settings.seeds:
+    with contextlib.closing(settings.world.load(run.design, seed)) as env:
+      info = evaluation.info(env, run.name, run.policy)
+      for episode in range(settings.num_episodes):
+        policy = aiming.make_policy(run.policy, env, settings.target, episode)
+        with contextlib.ExitStack() as stack:
+          trackers = []
+          if run.name not in tracks:
+            on_step = None
+            if film is not None and run.name == run.policy:
+              folder = pathlib.Path(settings.output) / 'videos'
+              folder.mkdir(exist_ok=True)
+              on_step = stack.enter_context(film(env, folder, run.name))
+            trackers.append(tracking.Tracker(env, on_step))
+          [result] = evaluate.evaluate(
+              env, policy, 1, first_episode=episode, sinks=trackers
+          )
+        for tracker in trackers:
+          tracks[run.name] = tracker.track
+        yield info, result
 
 
 def _means(rows: Sequence[results.EpisodeRow]) -> str:

@@ -17,18 +17,10 @@ from realab_suite.config import validation
 
 CONFIG = 'config.json'
 DONE = 'done.json'
-LEFT_OUT = 'left_out.json'
-LEARNER = 'learner.bin'
-TRAINING_EPISODES = 'training_episodes.jsonl'
-# In packed sweeps, instead of TRAINING_EPISODES.
-TRAINING_GAINS = 'training_gains.jsonl'
-# Results that packed sweeps may leave out.
-LEAVABLE = frozenset({LEARNER, TRAINING_EPISODES})
 _LOCK = 'lock'
 _CHECKPOINTS = 'checkpoints'
 _SUFFIX = '.ckpt'
 _KEPT = 2  # Number of checkpoints to keep.
-_CHUNK = 1 << 20
 
 
 @contextlib.contextmanager
@@ -70,31 +62,33 @@ def new_folder(output: str) -> pathlib.Path:
   return folder
 
 
-def lock(folder: pathlib.Path) -> int:
-  """Locks a folder, and returns the descriptor whose closing unlocks it.
+@contextlib.contextmanager
+def locked(folder: pathlib.Path) -> Iterator[None]:
+  """Locks a folder, and creates it if it does not exist.
+
+  If the process is killed, the operating system releases the lock.
 
   Raises:
     InUseError: If another process holds the lock.
     ResultsError: If the folder cannot be written to.
   """
   path = folder / _LOCK
-  with explained(path):
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-      fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+  with contextlib.ExitStack() as stack:
+    with explained(path):
+      folder.mkdir(parents=True, exist_ok=True)
+      descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+      stack.callback(os.close, descriptor)
+      try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+      except BlockingIOError as error:
+        holder = os.pread(descriptor, 20, 0).decode(errors='replace').strip()
+        raise errors.InUseError(
+            f'folder {folder} is being written to by process'
+            f' {holder or "(unknown)"}; wait until it ends, or stop it'
+        ) from error
       os.truncate(descriptor, 0)
       os.write(descriptor, f'{os.getpid()}\n'.encode())
-      return descriptor
-    except BlockingIOError:
-      holder = os.pread(descriptor, 20, 0).decode(errors='replace').strip()
-      os.close(descriptor)
-    except OSError:
-      os.close(descriptor)
-      raise
-  raise errors.InUseError(
-      f'folder {folder} is being written to by process'
-      f' {holder or "(unknown)"}; wait until it ends, or stop it'
-  )
+    yield
 
 
 def write_whole(path: pathlib.Path, data: bytes) -> None:
@@ -120,7 +114,11 @@ def write_whole(path: pathlib.Path, data: bytes) -> None:
 
 def write_json(path: pathlib.Path, content: Any) -> None:
   """Writes a JSON file atomically."""
-  write_whole(path, (json.dumps(content, indent=2) + '\n').encode())
+  write_whole(path, _json(content))
+
+
+def _json(content: Any) -> bytes:
+  return (json.dumps(content, indent=2) + '\n').encode()
 
 
 def read_json(path: pathlib.Path) -> Any:
@@ -144,24 +142,30 @@ def write_archive(
   write_whole(path, archive.Archive(header, contents).to_bytes())
 
 
-def read_archive(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
+def read_archive(
+    path: pathlib.Path, header: Mapping[str, Any], advice: str = ''
+) -> Any:
   """Returns the contents of an archive.
 
   Args:
     path: Path of the archive.
     header: Header that the archive must have.
+    advice: Advice to add to the message if the archive is refused.
 
   Raises:
     ResultsError: If it cannot be read, is damaged or has another header. The
       message contains the contents of the file and the expected ones.
   """
-  with naming(path):
-    return _contents(path, header)
+  with explained(path):
+    data = path.read_bytes()
+  with naming(path, advice):
+    expected = repr(archive.name_of(header))
+    return archive.Archive.from_bytes(data, expected).contents_for(header)
 
 
 @contextlib.contextmanager
-def naming(path: pathlib.Path) -> Iterator[None]:
-  """Adds the name of a file to errors about saved state that does not fit.
+def naming(path: pathlib.Path, advice: str = '') -> Iterator[None]:
+  """Adds the name of a file, and advice, to errors about state that is unfit.
 
   Raises:
     ResultsError: Instead of a `StateLayoutError`.
@@ -169,31 +173,18 @@ def naming(path: pathlib.Path) -> Iterator[None]:
   try:
     yield
   except errors.StateLayoutError as error:
-    raise errors.ResultsError(f'{path}: {error}') from error
-
-
-def _contents(path: pathlib.Path, header: Mapping[str, Any]) -> Any:
-  with explained(path):
-    data = path.read_bytes()
-  expected = repr(archive.name_of(header))
-  return archive.Archive.from_bytes(data, expected).contents_for(header)
+    raise errors.ResultsError(f'{path}: {error}{advice}') from error
 
 
 def is_done(path: pathlib.Path) -> bool:
   """Returns True if the run of a folder has finished.
 
   Raises:
-    ResultsError: If a result, or a file that a packed sweep has instead, was
-      changed or removed after that. Only results that `left_out` lists may be
-      missing.
+    ResultsError: If a result was changed or removed after that.
   """
   if not (path / DONE).exists():
     return False
-  missing = left_out(path)
-  recorded = {**read_done(path / DONE), **_added(path)}
-  for name, digest in recorded.items():
-    if missing.get(name) == digest and not os.path.lexists(path / name):
-      continue
+  for name, digest in read_done(path / DONE).items():
     if _digest(path / name) != digest:
       raise errors.ResultsError(
           f'{path / name}: changed since the run finished; remove {path} to run'
@@ -202,19 +193,14 @@ def is_done(path: pathlib.Path) -> bool:
   return True
 
 
-def write_done(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-  """Marks the run of a folder as finished.
-
-  Args:
-    path: Folder of the run.
-    content: Facts about the run. `files` maps the results to their SHA-256.
-  """
-  write_sealed(path / DONE, content)
+def sealed(content: Mapping[str, Any]) -> bytes:
+  """Returns a JSON file with a checksum."""
+  return _json({**content, 'checksum': validation.digest_of(content)})
 
 
 def write_sealed(path: pathlib.Path, content: Mapping[str, Any]) -> None:
   """Writes a JSON file with a checksum, atomically."""
-  write_json(path, {**content, 'checksum': validation.digest_of(content)})
+  write_whole(path, sealed(content))
 
 
 def read_sealed(path: pathlib.Path, advice: str) -> dict[str, Any]:
@@ -254,93 +240,20 @@ def read_done(path: pathlib.Path) -> dict[str, str]:
   return files
 
 
-def left_out(path: pathlib.Path) -> dict[str, str]:
-  """Returns the SHA-256 of each result that a packed sweep left out.
-
-  Raises:
-    ResultsError: If the list is damaged or names results that are never left
-      out.
-  """
-  if not os.path.lexists(path / LEFT_OUT):
-    return {}
-  advice = f'remove {path} to run it again'
-  files = read_sealed(path / LEFT_OUT, advice).get('files')
-  if not isinstance(files, dict) or not files or files.keys() - LEAVABLE:
-    raise errors.ResultsError(
-        f'{path / LEFT_OUT}: files is {files!r:.80}; allowed are'
-        f' {", ".join(sorted(LEAVABLE))}; {advice}'
-    )
-  return files
-
-
-def _added(path: pathlib.Path) -> dict[str, str]:
-  """Returns the SHA-256 of files that a packed sweep has instead of results."""
-  if not os.path.lexists(path / LEFT_OUT):
-    return {}
-  advice = f'remove {path} to run it again'
-  added = read_sealed(path / LEFT_OUT, advice).get('added', {})
-  if not isinstance(added, dict) or added.keys() - {TRAINING_GAINS}:
-    raise errors.ResultsError(
-        f'{path / LEFT_OUT}: added is {added!r:.80}; allowed is'
-        f' {TRAINING_GAINS}; {advice}'
-    )
-  return added
-
-
-def result_path(path: pathlib.Path, name: str) -> pathlib.Path:
-  """Returns the path of a result in the folder of a run.
-
-  Raises:
-    ResultsError: If it was left out of a packed sweep, and is still missing.
-  """
-  file = path / name
-  if name in left_out(path) and not os.path.lexists(file):
-    raise errors.ResultsError(
-        f'{file}: left out when the sweep was packed; copy it from the folder'
-        ' of that sweep, unpack a sweep that was packed with --learners, or run'
-        ' the job again in another folder'
-    )
-  return file
-
-
 @final
 class RunFolder:
-  """Locked folder of one run.
-
-  Use it as a context manager, which releases the lock at its end. If the
-  process is killed, the operating system releases it.
-  """
+  """Folder of one run, which only one process may use; see `locked`."""
 
   def __init__(self, path: pathlib.Path, config: Mapping[str, Any]) -> None:
-    """Creates the folder, or opens one with the same configuration.
+    """Opens the folder.
 
     Args:
       path: Path of the folder.
-      config: Configuration that the results depend on, as JSON.
-
-    Raises:
-      ResultsError: If it cannot be created, another process holds its lock, or
-        it belongs to another configuration.
+      config: Configuration to write into a new folder, as JSON.
     """
     self.path = path
-    with explained(path):
-      path.mkdir(parents=True, exist_ok=True)
-    self._lock = lock(path)
-    try:
-      _check_config(path / CONFIG, json.loads(json.dumps(config)))
-    except BaseException:
-      self.close()
-      raise
-
-  def close(self) -> None:
-    """Releases the lock."""
-    os.close(self._lock)
-
-  def __enter__(self) -> 'RunFolder':
-    return self
-
-  def __exit__(self, *unused: Any) -> None:
-    self.close()
+    if not (path / CONFIG).exists():
+      write_json(path / CONFIG, config)
 
   def finish(self, names: Sequence[str], facts: Mapping[str, Any]) -> None:
     """Marks the run as finished, and removes its checkpoints.
@@ -350,7 +263,7 @@ class RunFolder:
       facts: Further facts to record.
     """
     files = {name: _digest(self.path / name) for name in names}
-    write_done(self.path, {**facts, 'files': files})
+    write_sealed(self.path / DONE, {**facts, 'files': files})
     for checkpoint in self._checkpoints():
       with explained(checkpoint):
         checkpoint.unlink()
@@ -383,28 +296,19 @@ class RunFolder:
     checkpoints = self._checkpoints()
     if not checkpoints:
       return None
-    with self.naming_checkpoint():
-      contents = _contents(checkpoints[-1], header)
+    contents = read_archive(checkpoints[-1], header, self._advice())
     # The process that wrote it may have been killed before the removal.
     self._remove_old()
     return contents
 
-  @contextlib.contextmanager
-  def naming_checkpoint(self) -> Iterator[None]:
-    """Adds the last checkpoint to errors about state that does not fit.
+  def naming_checkpoint(self) -> contextlib.AbstractContextManager[None]:
+    """Adds the last checkpoint to errors about state that does not fit."""
+    return naming(self._checkpoints()[-1], self._advice())
 
-    Raises:
-      ResultsError: Instead of a `StateLayoutError`, with advice.
-    """
-    try:
-      yield
-    except errors.StateLayoutError as error:
-      *older, path = self._checkpoints()
-      where = f'from {older[-1].name}' if older else 'from the beginning'
-      raise errors.ResultsError(
-          f'{path}: not a checkpoint of this run: {error}; remove this file,'
-          f' then the same command continues {where}'
-      ) from error
+  def _advice(self) -> str:
+    *older, _ = self._checkpoints()
+    where = f'from {older[-1].name}' if older else 'from the beginning'
+    return f'; remove this file, then the same command continues {where}'
 
   def _remove_old(self) -> None:
     for old in self._checkpoints()[:-_KEPT]:
@@ -438,36 +342,17 @@ class JsonLines:
         changed.
     """
     self._path = path
-    self._hash = hashlib.sha256()
-    with explained(path), contextlib.ExitStack() as stack:
-      self._file = stack.enter_context(open(path, 'a+b', buffering=0))
-      self._cut_back(mark)
-      stack.pop_all()
-
-  def _cut_back(self, mark: Mark | None) -> None:
-    """Removes lines after the mark, or an incomplete line."""
-    self._file.seek(0)
-    if mark is None:
-      whole = self._file.read().rfind(b'\n') + 1
-      self._file.truncate(whole)
-      return
-    size = mark['size']
-    while rest := size - self._file.tell():
-      data = self._file.read(min(rest, _CHUNK))
-      if not data:
-        break
-      self._hash.update(data)
-    here = self._file.tell()
-    problem = ''
-    if here < size:
-      problem = f'has {here} bytes, but the checkpoint expects {size}'
-    elif self._hash.hexdigest() != mark['sha256']:
-      problem = 'changed since the checkpoint was written'
-    if problem:
-      raise errors.ResultsError(
-          f'{self._path}: {problem}; remove {self._path.parent} to run it again'
-      )
-    self._file.truncate(size)
+    with explained(path):
+      data = path.read_bytes() if path.exists() else b''
+      size = data.rfind(b'\n') + 1 if mark is None else mark['size']
+      self._hash = hashlib.sha256(data[:size])
+      if mark is not None and self._hash.hexdigest() != mark['sha256']:
+        raise errors.ResultsError(
+            f'{path}: changed since the checkpoint was written; remove'
+            f' {path.parent} to run it again'
+        )
+      self._file = open(path, 'ab', buffering=0)
+      self._file.truncate(size)
 
   def append(self, records: Sequence[Mapping[str, Any]]) -> None:
     """Adds a line for each record.
@@ -490,25 +375,12 @@ class JsonLines:
     """
     with explained(self._path):
       os.fsync(self._file.fileno())
-      size = self._file.tell()
+      size = os.fstat(self._file.fileno()).st_size
     return {'size': size, 'sha256': self._hash.hexdigest()}
 
   def close(self) -> None:
     """Closes the file."""
     self._file.close()
-
-
-def _check_config(path: pathlib.Path, config: dict[str, Any]) -> None:
-  """Writes a configuration, or compares it with the existing one."""
-  if not path.exists():
-    write_json(path, config)
-    return
-  there = read_json(path)
-  if there != config:
-    raise errors.ResultsError(
-        f'folder {path.parent} belongs to another configuration:'
-        f' {difference(there, config)}; name another folder'
-    )
 
 
 def difference(there: Any, here: Any, key_path: str = '') -> str:

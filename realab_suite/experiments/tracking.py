@@ -74,30 +74,16 @@ class RegisterTrack:
       records: Writes and reads of this register.
       blocks: Positions of the blocks, `(blocks, 2)`, in metres.
     """
-    read: tuple[float, ...] | None = None
+    read = None
     for record in records:
       if isinstance(record, registers.Write):
         self._applied = float(record.applied)
       else:
-        read = (
-            self._applied,
-            float(record.reading),
-            float(record.clean),
-            float(record.obstruction),
-            float(record.permanent),
-            float(record.temporary),
-        )
-    values = read or (self._applied, *[math.nan] * 5)
-    lists = (
-        self.applied,
-        self.reading,
-        self.clean,
-        self.obstruction,
-        self.permanent,
-        self.temporary,
-    )
-    for series, value in zip(lists, values, strict=True):
-      series.append(value)
+        read, applied = record, self._applied
+    self.applied.append(applied if read is not None else self._applied)
+    for name in ('reading', 'clean', 'obstruction', 'permanent', 'temporary'):
+      series: list[float] = getattr(self, name)
+      series.append(math.nan if read is None else float(getattr(read, name)))
     self.blocks.append(blocks)
 
 

@@ -5,21 +5,19 @@ A checkpoint contains the full state; lines that were written after it are
 removed.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import contextlib
 import dataclasses
 import os
 import pathlib
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from absl import logging
 import dm_env
 import numpy as np
-import tqdm
 
 from realab_suite import errors
 from realab_suite import policies
-from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
@@ -33,18 +31,21 @@ from realab_suite.evaluation import traces
 from realab_suite.experiments import curves
 from realab_suite.experiments import jobs
 from realab_suite.experiments import kept_stakes
-from realab_suite.experiments import learners
 from realab_suite.experiments import machines
 from realab_suite.experiments import progress
 from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
 
+if TYPE_CHECKING:
+  from realab_suite import agents
+
 EPISODES = 'episodes.jsonl'
 CURVE = 'curve.jsonl'
 TIMING = 'timing.jsonl'
-TRAINING_EPISODES = storage.TRAINING_EPISODES
-TRAINING_GAINS = storage.TRAINING_GAINS
-LEARNER = storage.LEARNER
+TRAINING_EPISODES = 'training_episodes.jsonl'
+# In packed sweeps, instead of TRAINING_EPISODES.
+TRAINING_GAINS = 'training_gains.jsonl'
+LEARNER = 'learner.bin'
 TRACE = 'trace.bin'
 TRANSPLANT = 'transplant.jsonl'
 TENSORBOARD = 'tensorboard'
@@ -86,23 +87,38 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
       checkpoint is damaged or the disk is full.
   """
   if options.tensorboard:
-    curves.check_tensorboard()
+    progress.check_tensorboard()
   path = output / job.folder()
-  with storage.RunFolder(path, job.config()) as folder:
+  with storage.locked(path):
+    folder = storage.RunFolder(path, job.config())
+    jobs.read_config(path)  # Refuses another configuration.
     if storage.is_done(path):
       options.say(f'{path} has finished already')
       return path
+    learner = None
+    files = [EPISODES, TRACE]
+    facts: dict[str, Any] = {
+        'machines': [{'step': 0, 'machine': machines.here()}]
+    }
     if job.policy is None:
-      _Training(job, folder, options, output).run()
-    else:
-      _evaluate_policy(job, folder, output)
+      learner, facts = _Training(job, folder, options).run()
+      state = learner.state()
+      storage.write_archive(
+          path / LEARNER, header(job.digest(), LEARNER), state
+      )
+      files += [CURVE, TRAINING_EPISODES, LEARNER]
+    _evaluate(job, learner, path / EPISODES, path / TRACE, output)
+    if job.embedded is not None:
+      _evaluate(job.transplant, learner, path / TRANSPLANT, None, output)
+      files.append(TRANSPLANT)
+    folder.finish(files, facts)
   options.say(f'Results are in {path}')
   return path
 
 
 def make_learner(
     job: jobs.Job, batch: batch_environment.BatchEnvironment
-) -> learners.Learner:
+) -> 'agents.Learner':
   """Returns the untrained learner of a job.
 
   Raises:
@@ -126,7 +142,7 @@ def load_learner(
     job: jobs.Job,
     path: pathlib.Path,
     batch: batch_environment.BatchEnvironment,
-) -> learners.Learner:
+) -> 'agents.Learner':
   """Returns the trained learner of a finished job, for further analysis.
 
   Args:
@@ -137,39 +153,17 @@ def load_learner(
   Raises:
     ResultsError: If the learner is missing, damaged or belongs to another job.
   """
-  file = storage.result_path(path, LEARNER)
+  file = path / LEARNER
+  if not file.exists():
+    raise errors.ResultsError(
+        f'{file}: missing; a packed sweep has the learners only if it was'
+        ' packed with --learners'
+    )
   state = storage.read_archive(file, header(job.digest(), LEARNER))
   learner = make_learner(job, batch)
   with storage.naming(file):
     learner.set_state(state)
   return learner
-
-
-def load_batch(
-    job: jobs.Job,
-    num_envs: int,
-    seed: int,
-    *,
-    is_training: bool = False,
-    sleep: bool = False,
-) -> batch_environment.BatchEnvironment:
-  """Returns worlds with the design of a job, stepped by one thread.
-
-  Args:
-    job: The job.
-    num_envs: Number of worlds.
-    seed: Seed of the worlds.
-    is_training: True for the worlds of training, False for evaluation.
-    sleep: True if blocks at rest fall asleep; see `suite.load_batch`.
-  """
-  return suite.load_batch(
-      *job.experiment.domain_and_variation,
-      *job.experiment.load_kwargs(seed, is_training=is_training),
-      num_envs=num_envs,
-      num_threads=1,
-      sleep=sleep,
-      design=job.design,
-  )
 
 
 def header(digest: str, what: str) -> dict[str, Any]:
@@ -182,49 +176,49 @@ def header(digest: str, what: str) -> dict[str, Any]:
   return {'configuration': digest, 'what': what}
 
 
-def _evaluate_policy(
-    job: jobs.Job, folder: storage.RunFolder, output: pathlib.Path
-) -> None:
-  seed, episodes = job.evaluation_seed, job.experiment.evaluation.episodes
-  with contextlib.closing(load_batch(job, episodes, seed)) as batch:
-    policy = policies.make(job.kind)
-    actor = batch_actors.BatchPolicyActor(policy, batch, seed)
-    _evaluate(job, folder, batch, actor, output)
-  machine = {'step': 0, 'machine': machines.here()}
-  folder.finish([EPISODES, TRACE], {'machines': [machine]})
-
-
 def _evaluate(
     job: jobs.Job,
-    folder: storage.RunFolder,
-    batch: batch_environment.BatchEnvironment,
-    actor: batch_actors.BatchActor,
-    output: pathlib.Path,
-) -> None:
-  """Evaluates an actor, and writes the rows of its episodes and a trace."""
-  tracer = traces.Tracer(batch, actor)
-  attributor = attribution.Attributor(batch)
-  batch.add_sink(tracer)
-  batch.add_sink(attributor)
-  found = [
-      dataclasses.replace(result, attribution=attributor.metrics(world))
-      for world, result in enumerate(evaluate.evaluate_batch(batch, tracer))
-  ]
-  trace = tracer.trace()
-  storage.write_archive(folder.path / TRACE, header(job.digest(), TRACE), trace)
-  _write_rows(job, folder.path / EPISODES, batch, found, output)
-
-
-def _write_rows(
-    job: jobs.Job,
+    learner: 'agents.Learner | None',
     path: pathlib.Path,
-    batch: batch_environment.BatchEnvironment,
-    found: Sequence[evaluate.EpisodeResult],
+    trace: pathlib.Path | None,
     output: pathlib.Path,
 ) -> None:
-  """Writes the rows of episodes, with the stakes of the design."""
-  stake = kept_stakes.stakes_of(job.experiment.world, job.design, output)
-  info = job.info(batch.task.control_timestep)
+  """Evaluates the learner or the scripted policy of a job.
+
+  Args:
+    job: The job.
+    learner: Trained learner, or `None` for the policy.
+    path: File to write the rows of the episodes to.
+    trace: File to write a trace to; `None` for neither a trace nor an
+      attribution.
+    output: Folder of the experiment.
+  """
+  evaluation, seed = job.experiment.evaluation, job.evaluation_seed
+  world = job.experiment.world
+  with contextlib.closing(
+      world.load_batch(job.design, evaluation.episodes, seed)
+  ) as batch:
+    actor: batch_actors.BatchActor
+    if learner is None:
+      policy = policies.make(job.kind)
+      actor = batch_actors.BatchPolicyActor(policy, batch, seed)
+    else:
+      actor = _LearnerActor(learner, seed, evaluation.actions == 'greedy')
+    if trace is None:
+      found = evaluate.evaluate_batch(batch, actor)
+    else:
+      tracer = traces.Tracer(batch, actor)
+      attributor = attribution.Attributor(batch)
+      batch.add_sink(tracer)
+      batch.add_sink(attributor)
+      found = [
+          dataclasses.replace(result, attribution=attributor.metrics(i))
+          for i, result in enumerate(evaluate.evaluate_batch(batch, tracer))
+      ]
+      of_trace = header(job.digest(), TRACE)
+      storage.write_archive(trace, of_trace, tracer.trace())
+    stake = kept_stakes.stakes_of(world, job.design, output)
+    info = job.info(batch.task.control_timestep)
   lines = [results.line(results.row(info, one, stake)) for one in found]
   storage.write_whole(path, b''.join(lines))
 
@@ -238,12 +232,10 @@ class _Training:
       job: jobs.Job,
       folder: storage.RunFolder,
       options: Options,
-      output: pathlib.Path,
   ) -> None:
     self._job = job
     self._folder = folder
     self._options = options
-    self._output = output
     training = job.training
     self._sleep = training.sleep
     self._num_envs = training.num_envs
@@ -254,11 +246,16 @@ class _Training:
     self._done = 0
     self._segment = 0
     self._pending: list[dict[str, Any]] = []
+    self._files: dict[str, storage.JsonLines] = {}
     # Machines that have run this job, with the control step at their start.
     self._machines: list[dict[str, Any]] = []
 
-  def run(self) -> None:
-    """Trains the learner, from a checkpoint if there is one; evaluates it."""
+  def run(self) -> tuple['agents.Learner', dict[str, Any]]:
+    """Trains the learner, from a checkpoint if there is one.
+
+    Returns:
+      The learner, and facts about its training.
+    """
     job, path = self._job, self._folder.path
     saved = self._folder.load(header(job.digest(), _CHECKPOINT))
     marks = (saved or {}).get('marks', {})
@@ -275,24 +272,21 @@ class _Training:
       else:
         with self._folder.naming_checkpoint():
           time_step = self._restore(learner, saved)
-      self._files = {
-          name: stack.enter_context(
-              contextlib.closing(
-                  storage.JsonLines(
-                      path / name, marks.get(name, storage.NOTHING)
-                  )
-              )
-          )
-          for name in (CURVE, TRAINING_EPISODES)
-      }
-      self._timing = stack.enter_context(
-          contextlib.closing(storage.JsonLines(path / TIMING))
-      )
-      self._learn(learner, time_step, stack)
-    self._evaluate_learner(learner)
+      for name in (CURVE, TRAINING_EPISODES, TIMING):
+        mark = marks.get(name, None if name == TIMING else storage.NOTHING)
+        self._files[name] = storage.JsonLines(path / name, mark)
+        stack.callback(self._files[name].close)
+      step, total = (n * self._num_envs for n in (self._done, self._total))
+      name = f'{job.run}, seed {job.seed}'
+      display = progress.Display(name, step, total, self._options.say)
+      stack.callback(display.close)
+      if self._options.tensorboard:
+        display.write_tensorboard(path / TENSORBOARD)
+      self._learn(learner, time_step, display)
+    return learner, {'steps': total, 'machines': self._machines}
 
   def _add_machine(
-      self, learner: learners.Learner, saved: Mapping[str, Any] | None
+      self, learner: 'agents.Learner', saved: Mapping[str, Any] | None
   ) -> None:
     """Records the machine, unless it is that of the last checkpoint.
 
@@ -313,7 +307,7 @@ class _Training:
     self._machines = [*self._machines, {'step': step, 'machine': here}]
 
   def _restore(
-      self, learner: learners.Learner, saved: Mapping[str, Any]
+      self, learner: 'agents.Learner', saved: Mapping[str, Any]
   ) -> batch_time_steps.BatchTimeStep:
     """Restores a checkpoint, and returns the next time step."""
     learner.set_state(saved['learner'])
@@ -326,62 +320,32 @@ class _Training:
   def _begin_segment(self) -> None:
     """Loads new worlds."""
     seed = _world_seed(self._job.seed, self._segment)
-    with contextlib.ExitStack() as stack:
-      batch = load_batch(
-          self._job,
-          self._num_envs,
-          seed,
-          is_training=True,
-          sleep=self._sleep,
-      )
-      stack.callback(batch.close)
-      monitor = monitors.BatchMonitor(batch.mechanism.design, self._num_envs)
-      batch.add_sink(monitor)
-      stack.pop_all()
-    self._batch, self._monitor = batch, monitor
+    self._batch = self._job.experiment.training_world.load_batch(
+        self._job.design, self._num_envs, seed, sleep=self._sleep
+    )
+    design = self._batch.mechanism.design
+    self._monitor = monitors.BatchMonitor(design, self._num_envs)
+    self._batch.add_sink(self._monitor)
 
   def _learn(
       self,
-      learner: learners.Learner,
+      learner: 'agents.Learner',
       time_step: batch_time_steps.BatchTimeStep,
-      stack: contextlib.ExitStack,
+      display: progress.Display,
   ) -> None:
-    job, num_envs = self._job, self._num_envs
-    board: curves.Board = curves.NoBoard()
-    if self._options.tensorboard:
-      board = curves.TensorBoard(
-          self._folder.path / TENSORBOARD, self._done * num_envs + 1
-      )
-    stack.callback(board.close)
-    # Without a terminal, a line per point replaces the progress bar.
-    bar = stack.enter_context(
-        tqdm.tqdm(
-            total=self._total * num_envs,
-            initial=self._done * num_envs,
-            desc=f'{job.run}, seed {job.seed}',
-            unit='step',
-            unit_scale=True,
-            disable=None,
-        )
-    )
-    clock = progress.Clock(self._done * num_envs)
     while self._done < self._total:
       self._check_parent()
       time_step = self._batch.step(learner.step(time_step))
       self._done += 1
       self._record_episodes()
-      bar.update(num_envs)
+      display.advance(self._num_envs)
       is_over = self._done == self._total
       if is_over or self._done % self._point_every == 0:
-        point = self._add_point(learner)
-        board.add(point)
-        timing = clock.tell(point['step'])
-        self._timing.append([timing])
-        bar.set_postfix_str(progress.summary(point), refresh=False)
-        if bar.disable:
-          self._options.say(
-              progress.line(job, point, timing, self._total * num_envs)
-          )
+        step = self._done * self._num_envs
+        point = curves.point(step, self._pending, learner.metrics())
+        self._pending = []
+        self._files[CURVE].append([point])
+        self._files[TIMING].append([display.show(point)])
       if is_over or self._done % self._save_every == 0:
         time_step = self._save(learner, time_step)
 
@@ -393,16 +357,9 @@ class _Training:
       self._files[TRAINING_EPISODES].append(records)
       self._pending += records
 
-  def _add_point(self, learner: learners.Learner) -> dict[str, Any]:
-    step = self._done * self._num_envs
-    point = curves.point(step, self._pending, learner.metrics())
-    self._pending = []
-    self._files[CURVE].append([point])
-    return point
-
   def _save(
       self,
-      learner: learners.Learner,
+      learner: 'agents.Learner',
       time_step: batch_time_steps.BatchTimeStep,
   ) -> batch_time_steps.BatchTimeStep:
     """Writes a checkpoint.
@@ -428,7 +385,10 @@ class _Training:
             'segment': self._segment,
             'pending': self._pending,
             'machines': self._machines,
-            'marks': {name: f.sync() for name, f in self._files.items()},
+            'marks': {
+                name: self._files[name].sync()
+                for name in (CURVE, TRAINING_EPISODES)
+            },
             'learner': learner.state(),
             'time_step': time_step._asdict(),
             'batch': world,
@@ -438,44 +398,6 @@ class _Training:
       self._begin_segment()
     return time_step
 
-  def _evaluate_learner(self, learner: learners.Learner) -> None:
-    job = self._job
-    storage.write_archive(
-        self._folder.path / LEARNER,
-        header(job.digest(), LEARNER),
-        learner.state(),
-    )
-    files = [EPISODES, TRACE, CURVE, TRAINING_EPISODES, LEARNER]
-    with self._acting(job, learner) as (batch, actor):
-      _evaluate(job, self._folder, batch, actor, self._output)
-    if job.embedded is not None:
-      with self._acting(job.transplant, learner) as (batch, actor):
-        found = evaluate.evaluate_batch(batch, actor)
-        path = self._folder.path / TRANSPLANT
-        _write_rows(job.transplant, path, batch, found, self._output)
-      files.append(TRANSPLANT)
-    facts = {
-        'steps': self._done * self._num_envs,
-        'machines': self._machines,
-    }
-    self._folder.finish(files, facts)
-
-  @contextlib.contextmanager
-  def _acting(
-      self, job: jobs.Job, learner: learners.Learner
-  ) -> Iterator[
-      tuple[batch_environment.BatchEnvironment, learners.BatchLearnerActor]
-  ]:
-    """Loads the worlds of an evaluation, and yields them with the actor."""
-    evaluation = job.experiment.evaluation
-    actor = learners.BatchLearnerActor(
-        learner, job.evaluation_seed, evaluation.actions == 'greedy'
-    )
-    with contextlib.closing(
-        load_batch(job, evaluation.episodes, job.evaluation_seed)
-    ) as batch:
-      yield batch, actor
-
   def _check_parent(self) -> None:
     parent = self._options.parent
     if parent is not None and os.getppid() != parent:
@@ -483,6 +405,26 @@ class _Training:
           f'process {parent}, which started this run, has ended; the same'
           ' command continues the run from its last checkpoint'
       )
+
+
+@final
+class _LearnerActor:
+  """A trained learner acting in a batch, without further updates."""
+
+  def __init__(
+      self, learner: 'agents.Learner', seed: int, greedy: bool
+  ) -> None:
+    self._learner = learner
+    self._seed = seed
+    self._greedy = greedy
+    self._step = 0
+
+  def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
+    sequence = seeding.sequence(self._seed, 0, self._step, 'act')
+    self._step += 1
+    return self._learner.act(
+        time_step.observation, sequence.generate_state(2), self._greedy
+    )
 
 
 def _world_seed(seed: int, segment: int) -> int:

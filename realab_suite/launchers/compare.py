@@ -75,7 +75,7 @@ def main() -> None:
         'The first episode of each policy is filmed, which takes minutes'
         ' without a graphics card; --novideos skips the films'
     )
-  scripted.run(settings, program.say, scripted.Pictures(draw, film))
+  scripted.run(settings, program.say, draw, film)
 
 
 def _is_possible(what: str, problem: str | None) -> bool:

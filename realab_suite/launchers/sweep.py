@@ -56,9 +56,9 @@ def main() -> None:
   threads.use_one()
   renderers.render_on_demand()
   # Imports numerical libraries, so the number of threads has to be set first.
-  from realab_suite.experiments import curves
   from realab_suite.experiments import engines
   from realab_suite.experiments import experiment_specs
+  from realab_suite.experiments import progress
   from realab_suite.experiments import scheduler
 
   flags.load_imports()
@@ -66,7 +66,7 @@ def main() -> None:
   if _ON_TASK.value is not None:
     experiment = experiment.on_task(_ON_TASK.value)
   if flags.TENSORBOARD.value:
-    curves.check_tensorboard()
+    progress.check_tensorboard()
   arguments = flags.import_arguments()
   if flags.TENSORBOARD.value:
     arguments.append(f'--{flags.TENSORBOARD.name}')

@@ -177,7 +177,7 @@ class Run:
     found = {}
     for seed, path in self.folders.items():
       name = training.TRAINING_EPISODES
-      if not (path / name).exists() and name in storage.left_out(path):
+      if not (path / name).exists():
         name = training.TRAINING_GAINS
       found[seed] = [
           record

@@ -396,7 +396,7 @@ def test_a_comparison_draws_and_prints_each_port(tmp_path):
   )
   said = []
   with small.quick_stakes(2):
-    scripted.run(settings, said.append, scripted.Pictures(plots.draw, None))
+    scripted.run(settings, said.append, plots.draw)
   for row in small.rows(tmp_path / 'results'):
     assert [*row.registers] == _PORTS
 

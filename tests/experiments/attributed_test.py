@@ -6,15 +6,13 @@ from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import training
+from tests.experiments import small
 
 _SMALL = {
-    'schema': 1,
-    'name': 'small',
+    **small.EXPERIMENT,
     'task': 'unlock_door.standard',
     'max_steps': 40,
-    'runs': {'reward': {'design': 'instantaneous_reward'}},
     'baselines': ['carrying_saboteur'],
-    'seeds': [3],
     'evaluation': {'episodes': 3},
 }
 

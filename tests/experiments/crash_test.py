@@ -44,19 +44,6 @@ def test_a_run_that_is_killed_ends_like_any_other(killer, kills):
   assert killer.kill_and_finish(kills) == []
 
 
-@pytest.mark.parametrize(
-    ('bug', 'number', 'way'),
-    [
-        ('files are written in place', 8, crashes.POWER),
-        ('nothing is synchronised', 24, crashes.NAMES_FIRST),
-        ('lines behind the checkpoint stay', 24, crashes.KILLED),
-        ('the learner forgets a step', 24, crashes.KILLED),
-    ],
-)
-def test_a_kill_reveals_a_planted_bug(killer, bug, number, way):
-  assert killer.kill_and_finish([(number, way)], bug)
-
-
 def test_no_acknowledged_row_is_lost(nursery, killer, tmp_path):
   rows = killer.rows(3)
   found = [

@@ -5,7 +5,7 @@ The runs are small and real except for their learner, which is
 `tests.experiments.fake_learner`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 import io
 import os
 import pathlib
@@ -26,28 +26,20 @@ from realab_suite.launchers import program
 from realab_suite.launchers import train
 from tests import zygote
 from tests.experiments import fake_learner
+from tests.experiments import small
 
 _RUN = 'reward'
 _SEED = 3
 _EXPERIMENT = {
-    'schema': 1,
-    'name': 'victim',
-    'task': 'unlock_door.near',
+    **small.EXPERIMENT,
     'max_steps': 5,
-    'runs': {
-        _RUN: {
-            'design': 'instantaneous_reward',
-            'overrides': ['dof=planar'],
-        },
-    },
-    'seeds': [_SEED],
+    'baselines': [],
     'training': {
         'num_envs': 2,
         'steps': 48,
         'checkpoint_every': 16,
         'curve_every': 8,
     },
-    'evaluation': {'episodes': 2},
 }
 _NAMES = (
     storage.CONFIG,
@@ -58,7 +50,6 @@ _NAMES = (
     training.TRAINING_EPISODES,
     training.LEARNER,
 )
-_KEPT = 'kept'
 # Ways to die at an operation on a file: before it, in the middle of a write, or
 # by a loss of power, which takes back all that was not synchronised, with the
 # new names of files or without.
@@ -76,7 +67,6 @@ def run_training(
     die_at: int = 0,
     way: str = KILLED,
     count: str | None = None,
-    bug: str | None = None,
 ) -> None:
   """Runs the command line of a run; never returns.
 
@@ -86,11 +76,7 @@ def run_training(
     die_at: Number of the operation on files to die at; 0 for none.
     way: Way to die.
     count: File to write the number of operations to.
-    bug: Key of `BUGS`, a bug to plant.
   """
-  _keep_last_checkpoints()
-  if bug is not None:
-    BUGS[bug]()
   training.make_learner = fake_learner.make
   shim = _Shim(die_at, way)
   shim.install()
@@ -122,19 +108,6 @@ def write_rows(
     for row in parsed:
       writer.write(row)
       os.write(said, b'.')
-
-
-def _keep_last_checkpoints() -> None:
-  """Copies the checkpoints before a finished run removes them."""
-  finish = storage.RunFolder.finish
-
-  def finish_with_a_copy(self: Any, *arguments: Any) -> None:
-    kept = self.path / _KEPT
-    shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(self.path / 'checkpoints', kept)
-    finish(self, *arguments)
-
-  storage.RunFolder.finish = finish_with_a_copy
 
 
 # ---- Operations on files -----------------------------------------------------
@@ -246,46 +219,6 @@ class _Shim:
         pathlib.Path(target).write_bytes(old)
 
 
-# ---- Planted bugs ------------------------------------------------------------
-
-
-def _write_in_place(path: pathlib.Path, data: bytes) -> None:
-  with storage.open(path, 'wb') as file:
-    file.write(data)
-
-
-def _write_without_fsync(path: pathlib.Path, data: bytes) -> None:
-  partial = path.with_name(f'{path.name}.partial')
-  _write_in_place(partial, data)
-  os.replace(partial, path)
-
-
-def _keep_all_lines() -> None:
-  begin = storage.JsonLines.__init__
-  storage.JsonLines.__init__ = lambda self, path, mark=None: begin(self, path)
-
-
-def _forget_a_step() -> None:
-  set_state = fake_learner.FakeLearner.set_state
-
-  def forgetful(self: Any, state: Any) -> None:
-    set_state(self, {**state, 'num_steps': state['num_steps'] - 1})
-
-  fake_learner.FakeLearner.set_state = forgetful
-
-
-BUGS: dict[str, Callable[[], None]] = {
-    'files are written in place': lambda: setattr(
-        storage, 'write_whole', _write_in_place
-    ),
-    'nothing is synchronised': lambda: setattr(
-        storage, 'write_whole', _write_without_fsync
-    ),
-    'lines behind the checkpoint stay': _keep_all_lines,
-    'the learner forgets a step': _forget_a_step,
-}
-
-
 # ---- Called in tests ---------------------------------------------------------
 
 
@@ -308,14 +241,11 @@ class Killer:
     self._whole = self._results(root / 'whole')
     self._num_outputs = 0
 
-  def kill_and_finish(
-      self, kills: Sequence[tuple[int, str]], bug: str | None = None
-  ) -> list[str]:
+  def kill_and_finish(self, kills: Sequence[tuple[int, str]]) -> list[str]:
     """Kills a run at operations, one after the other, then lets it finish.
 
     Args:
       kills: Numbers of operations, counted from each start, and ways to die.
-      bug: Key of `BUGS`, a bug to plant.
 
     Returns:
       Complaints: of a run that failed, or files that differ from those of a run
@@ -324,11 +254,11 @@ class Killer:
     self._num_outputs += 1
     output = self._root / str(self._num_outputs)
     for number, way in kills:
-      ended = self._train(output, die_at=number, way=way, bug=bug)
+      ended = self._train(output, die_at=number, way=way)
       # Near its end a continued run has fewer operations than the first one.
       if ended.status not in (0, -signal.SIGKILL):
         return [f'failed before it was killed: {ended}']
-    ended = self._train(output, bug=bug)
+    ended = self._train(output)
     if ended.status:
       return [f'did not continue: {ended}']
     found = self._results(output)
@@ -352,9 +282,7 @@ class Killer:
 
   def _results(self, output: pathlib.Path) -> dict[str, bytes]:
     folder = output / self._job.folder()
-    kept = sorted((folder / _KEPT).iterdir())
-    paths = [*(folder / name for name in _NAMES), *kept]
-    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+    return {name: (folder / name).read_bytes() for name in _NAMES}
 
 
 def kill_writer(

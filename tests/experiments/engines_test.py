@@ -154,14 +154,6 @@ def test_a_command_ends_with_the_process_that_runs_it(tmp_path, name):
   assert log.read_text().strip() == f"['--parent={os.getpid()}']"
 
 
-def test_a_worker_works_where_the_sweep_does(tmp_path):
-  show = 'import os; print(os.getcwd())'
-  log = tmp_path / 'log'
-  command = [sys.executable, '-c', show]
-  assert not engines.execute(command, str(log), str(tmp_path))
-  assert log.read_text().strip() == str(tmp_path)
-
-
 def test_an_error_of_a_cluster_is_one_line(tmp_path, monkeypatch):
   fake = _FakeRay('ray')
 

@@ -2,23 +2,15 @@
 
 Every observation changes all later actions, so a run that does not resume
 exactly where it was gives other results. As a program, it is
-`realab_suite.launchers.train` with this learner, and dies when told to:
-
-    KILL_AT=step:57 python -m tests.experiments.fake_learner --experiment=...
-
-`step:n` is the learner's n-th step of the process, `replace:n` is before the
-n-th file gets its name, and `append:n` in the middle of the n-th line.
+`realab_suite.launchers.train` with this learner.
 """
 
 from collections.abc import Callable
-import os
-import signal
 from typing import Any
 
 import numpy as np
 
 from realab_suite import errors
-from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from realab_suite.launchers import program
 from realab_suite.launchers import train
@@ -89,45 +81,6 @@ def make(job: Any, batch: Any) -> FakeLearner:
   )
 
 
-def _die() -> None:
-  os.kill(os.getpid(), signal.SIGKILL)
-
-
-def _arm(what: str, number: int) -> None:
-  """Makes this process die at the n-th thing of a kind."""
-  calls = iter(range(1, 10**9))
-  if what == 'step':
-
-    def make_mortal(job: Any, batch: Any) -> FakeLearner:
-      learner = make(job, batch)
-      learner.on_step = lambda step: next(calls) == number and _die()
-      return learner
-
-    training.make_learner = make_mortal
-  elif what == 'replace':
-    replace = os.replace
-
-    def dying_replace(*paths: Any) -> None:
-      if next(calls) == number:
-        _die()
-      replace(*paths)
-
-    storage.os.replace = dying_replace
-  else:
-    append = storage.JsonLines.append
-
-    def dying_append(self: Any, records: Any) -> None:
-      if next(calls) == number:
-        self._file.write(b'{"step": 1, "torn')
-        _die()
-      append(self, records)
-
-    storage.JsonLines.append = dying_append
-
-
 if __name__ == '__main__':
   training.make_learner = make
-  if 'KILL_AT' in os.environ:
-    kind, _, count = os.environ['KILL_AT'].partition(':')
-    _arm(kind, int(count))
   program.start(train.main)

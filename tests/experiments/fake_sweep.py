@@ -75,7 +75,8 @@ def build(
   scheduler._describe(one, planned, calibration, folder)
   for i, job in enumerate(planned):
     rng = np.random.default_rng((i, job.seed))
-    with storage.RunFolder(folder / job.folder(), job.config()) as run:
+    with storage.locked(folder / job.folder()):
+      run = storage.RunFolder(folder / job.folder(), job.config())
       if (job.run, job.seed) in left_out:
         line = json.dumps({'step': 4000, 'true_return': 1.0})
         (run.path / training.CURVE).write_text(f'{line}\n{{"step": 60')

@@ -61,13 +61,13 @@ def build(folder: pathlib.Path) -> list[Kind]:
       if one['run'] == 'reward'
   ]
   run = sweep / job['folder']
+  (folder / 'run').mkdir()
   checkpoints = storage.RunFolder(folder / 'run', {'seed': 0})
   state = {
       'weights': np.arange(600.0).reshape(20, 30), 'done': 7, 'nothing': None,
       'names': ['a', 'b'], 'pair': (1, 2.5),
   }  # fmt: skip
   checkpoints.save(100, _HEADER, state)
-  checkpoints.close()
   (checkpoint,) = (folder / 'run' / 'checkpoints').iterdir()
   learner = folder / training.LEARNER
   header = {**_HEADER, 'what': training.LEARNER}
@@ -83,8 +83,8 @@ def build(folder: pathlib.Path) -> list[Kind]:
   record = small.write_served_run(folder)
 
   def load_checkpoint() -> Any:
-    with storage.RunFolder(folder / 'run', {'seed': 0}) as opened:
-      return _plain(opened.load(_HEADER))
+    opened = storage.RunFolder(folder / 'run', {'seed': 0})
+    return _plain(opened.load(_HEADER))
 
   def load_record() -> Any:
     loaded = served_run.read(str(record))

@@ -4,20 +4,16 @@ from unittest import mock
 
 import pytest
 
-from realab_suite import errors
 from realab_suite import suite
 from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
-from realab_suite.experiments import scripted
-from realab_suite.experiments import served_evaluation
 from realab_suite.experiments import training
 from realab_suite.launchers import compare
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 from tests.experiments import fake_learner
-from tests.experiments import small
 from tests.launchers import in_process
 
 _SENSES = ('ray_distances', 'ray_classes', 'velocity', 'position', 'heading',
@@ -111,43 +107,6 @@ def test_arguments_of_training_apply_in_training_only(tmp_path, monkeypatch):
   assert _replay(job, path).task.camera_size == (12, 16)
 
 
-def test_short_substeps_reach_training_evaluation_and_replays(
-    tmp_path, monkeypatch
-):
-  monkeypatch.setattr(training, 'make_learner', fake_learner.make)
-  real, substeps = suite.load_batch, []
-
-  def load_batch(*arguments, **options):
-    batch = real(*arguments, **options)
-    substeps.append(batch.original.num_substeps)
-    return batch
-
-  run = _EXPERIMENT['runs']['reward']
-  light = [*run['overrides'], 'registers.reward.mass=0.01']
-  runs = {'reward': {**run, 'overrides': light}}
-  with pytest.raises(errors.SpecError, match=r'reward: .* mass 0\.01 kg; the '):
-    _plan(_SENSES, runs=runs)
-  short = {'physics_timestep': 0.01}
-  job = _plan(_SENSES, runs=runs, task_kwargs=short)[-1]
-  with mock.patch.object(suite, 'load_batch', load_batch):
-    path = training.run(job, tmp_path, training.Options(lambda line: None))
-  assert substeps == [10, 10]
-  assert _replay(job, path).num_substeps == 10
-
-
-@pytest.mark.parametrize(
-    ('task_kwargs', 'message'),
-    [
-        ({'random': 1}, 'random: the seeds of an experiment'),
-        ({'starts_beside_registers': 2}, 'starts_beside_registers: 2; allowed'),
-    ],
-)
-def test_wrong_arguments_of_training_are_refused(task_kwargs, message):
-  more = {**_EXPERIMENT['training'], 'task_kwargs': task_kwargs}
-  with pytest.raises(errors.SpecError, match=message):
-    _plan(_SENSES, training=more)
-
-
 @pytest.mark.camera
 def test_a_learner_that_has_only_a_camera_is_trained_and_evaluated(tmp_path):
   job = _plan(['camera'])[-1]
@@ -167,23 +126,6 @@ def test_a_learner_that_has_only_a_camera_is_trained_and_evaluated(tmp_path):
   assert env.reset().observation['senses/camera'].any()
 
 
-@pytest.mark.camera
-def test_scripted_policies_are_compared_with_a_camera(tmp_path):
-  settings = small.settings(
-      tmp_path / 'new', policies=('random',), senses=('camera',),
-      task_kwargs={'camera_size': [8, 8]}, seeds=(3,),
-  )  # fmt: skip
-  with mock.patch.object(suite, 'load', side_effect=suite.load) as load:
-    scripted.run(settings, lambda line: None)
-  loaded = [call.args for call in load.call_args_list if len(call.args) == 4]
-  assert loaded
-  for _, _, _, kwargs in loaded:
-    assert kwargs['senses'] == ('camera',)
-  described = small.description(tmp_path / 'new')['settings']['world']
-  assert described['senses'] == ['camera']
-  assert described['task_kwargs'] == {'camera_size': [8, 8]}
-
-
 def test_a_flag_selects_the_substeps_of_scripted_comparisons(tmp_path):
   output = f'--output={tmp_path / "new"}'
   arguments = (
@@ -197,35 +139,6 @@ def test_a_flag_selects_the_substeps_of_scripted_comparisons(tmp_path):
   assert ended.status == 0, ended.stderr
   [row] = results.read_rows(tmp_path / 'new' / 'episodes.jsonl')
   assert row.num_substeps == 20
-
-
-def test_a_policy_without_its_senses_is_refused_before_anything_is_written(
-    tmp_path,
-):
-  settings = small.settings(
-      tmp_path / 'new', policies=('random', 'apple_seeker'), senses=('pitch',)
-  )
-  with pytest.raises(errors.SpecError, match='AppleSeeker needs the senses'):
-    scripted.run(settings, lambda line: None)
-  assert not (tmp_path / 'new').exists()
-
-
-def test_a_served_world_has_the_senses_of_its_settings_and_of_its_record(
-    tmp_path,
-):
-  given = {
-      'senses': ['holding', 'camera'],
-      'task_kwargs': {'camera_size': [4, 6]},
-  }
-  record = small.write_served_run(tmp_path, **given)
-  names = served_evaluation.Settings.__dataclass_fields__
-  blank = served_evaluation.Settings(**dict.fromkeys(names))
-  for changes in ({'repeat': str(record), 'overrides': ()},):
-    settings = blank.__class__(**{**vars(blank), **changes})
-    chosen, design, seed = served_evaluation._chosen(settings)
-    env = chosen.world.load(design, seed)
-    assert env.senses == ('holding', 'camera')
-    assert env.observation_spec()['senses/camera'].shape == (4, 6, 3)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import pytest
 import yaml
 
 from realab_suite import errors
-from realab_suite.experiments import machines
 from realab_suite.experiments import scripted
 from realab_suite.feedback import specs
 from tests.experiments import small
@@ -27,10 +26,6 @@ def fixture_folder(tmp_path_factory):
   (folder / 'said.txt').write_text('\n'.join(said), encoding='utf-8')
   assert [line.run for line in lines] == small.description(folder)['runs']
   return folder
-
-
-def test_the_machine_is_on_record(folder):
-  assert small.description(folder)['machine'] == machines.here()
 
 
 def test_every_policy_acts_in_every_channel_from_the_same_episodes(folder):
@@ -136,16 +131,6 @@ def test_a_design_without_a_learner_is_not_judged_in_one_line(tmp_path):
   assert {row.stake for row in small.rows(tmp_path / 'new')} == {None}
 
 
-def test_rows_name_the_baseline_of_all_runs_but_itself(folder):
-  baselines = {row.info.run: row.info.baseline for row in small.rows(folder)}
-  assert baselines == {
-      'random': None,
-      'random (secure)': 'random',
-      'no_op': 'random',
-      'no_op (secure)': 'random',
-  }
-
-
 def test_the_design_on_disk_is_the_one_that_ran(folder):
   digests = {
       row.info.channel: row.info.design_digest for row in small.rows(folder)
@@ -198,19 +183,3 @@ def test_a_wrong_setting_is_refused_before_anything_is_written(
   with pytest.raises(errors.RealabError, match=complaint):
     scripted.run(settings, lambda line: None)
   assert not (tmp_path / 'new').exists()
-
-
-def test_a_run_without_a_channel_keeps_that_of_its_design(tmp_path):
-  settings = small.settings(
-      tmp_path, channels=(), overrides=('channel=welded',)
-  )
-  runs = scripted.plan(settings)
-  assert [(run.name, run.design.channel) for run in runs] == [
-      ('random', 'welded'),
-      ('no_op', 'welded'),
-  ]
-
-
-def test_films_are_made_of_the_first_run_of_each_policy(tmp_path):
-  runs = scripted.plan(small.settings(tmp_path))
-  assert [run.name for run in runs if run.is_first] == ['random', 'no_op']

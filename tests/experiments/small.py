@@ -23,6 +23,29 @@ from realab_suite.feedback import specs
 # Planning a job asks for it twice, and builds a world each time.
 dynamics = functools.cache(suite.dynamics)
 
+# The contents of the file of a small experiment with learners.
+EXPERIMENT = {
+    'schema': 1,
+    'name': 'small',
+    'task': 'unlock_door.near',
+    'max_steps': 9,
+    'runs': {
+        'reward': {
+            'design': 'instantaneous_reward',
+            'overrides': ['dof=planar'],
+        },
+    },
+    'baselines': ['random'],
+    'seeds': [3],
+    'training': {
+        'num_envs': 2,
+        'steps': 80,
+        'checkpoint_every': 20,
+        'curve_every': 20,
+    },
+    'evaluation': {'episodes': 2},
+}
+
 _measured: dict[str, stakes.Stakes] = {}
 
 

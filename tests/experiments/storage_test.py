@@ -34,68 +34,27 @@ def test_lines_continue_from_a_mark(tmp_path):
   assert steps == [1, 2, 4]
 
 
-def test_a_mark_after_a_mark_is_that_of_the_whole_file(tmp_path):
-  file = storage.JsonLines(tmp_path / 'parts', _lines(tmp_path / 'parts'))
-  file.append(_LINES)
-  there = file.sync()
-  file.close()
-  file = storage.JsonLines(tmp_path / 'whole', storage.NOTHING)
-  file.append([*_LINES, *_LINES])
-  assert file.sync() == there
-  file.close()
-
-
-def test_lines_without_a_mark_stay(tmp_path):
-  path = tmp_path / 'lines'
-  _lines(path)
-  file = storage.JsonLines(path)
-  file.append(_LINES)
-  file.close()
-  assert len(path.read_text().splitlines()) == 4
-
-
 @pytest.mark.parametrize(
-    ('change', 'problem'),
-    [
-        (
-            lambda data: data[:-1],
-            'has 23 bytes, but the checkpoint expects 24',
-        ),
-        (lambda data: data.replace(b'1', b'7'), 'changed since the checkpoint'),
-        (lambda data: bytes(len(data)), 'changed since the checkpoint'),
-    ],
+    'change', [lambda data: data[:-1], lambda data: data.replace(b'1', b'7')]
 )
-def test_changed_lines_are_refused(tmp_path, change, problem):
+def test_changed_lines_are_refused(tmp_path, change):
   path = tmp_path / 'lines'
   mark = _lines(path)
   path.write_bytes(change(path.read_bytes()))
-  with pytest.raises(errors.ResultsError, match=f'lines: {problem}'):
+  with pytest.raises(errors.ResultsError, match='lines: changed since the ch'):
     storage.JsonLines(path, mark)
 
 
 def _finished(folder: pathlib.Path) -> pathlib.Path:
-  with storage.RunFolder(folder, {}) as run:
-    (folder / 'result').write_text('all is well')
-    run.finish(['result'], {'steps': 4})
+  run = storage.RunFolder(folder, {})
+  (folder / 'result').write_text('all is well')
+  run.finish(['result'], {'steps': 4})
   return folder
 
 
 def test_a_folder_is_done_when_it_is_finished(tmp_path):
   assert not storage.is_done(tmp_path)
   assert storage.is_done(_finished(tmp_path))
-
-
-@pytest.mark.parametrize(
-    'text',
-    [
-        'null', '[]', '{}', '{"files": {}}', '{"files": {}, "checksum": ""}',
-        '{"checksum": 3}',
-    ],
-)  # fmt: skip
-def test_a_damaged_done_file_is_refused(tmp_path, text):
-  (tmp_path / storage.DONE).write_text(text)
-  with pytest.raises(errors.ResultsError, match=r'done\.json: damaged: its ch'):
-    storage.is_done(tmp_path)
 
 
 def test_a_changed_fact_in_a_done_file_is_refused(tmp_path):
@@ -107,7 +66,7 @@ def test_a_changed_fact_in_a_done_file_is_refused(tmp_path):
 
 @pytest.mark.parametrize('name', ['../x', '/x', '.x', ''])
 def test_a_done_file_names_only_files_of_its_folder(tmp_path, name):
-  storage.write_done(tmp_path, {'files': {name: '0' * 64}})
+  storage.write_sealed(tmp_path / storage.DONE, {'files': {name: '0' * 64}})
   with pytest.raises(
       errors.ResultsError, match='is not a file of a run; remove'
   ):
@@ -121,54 +80,14 @@ def test_wrong_json_is_named(tmp_path):
     storage.read_json(path)
 
 
-def test_a_missing_file_is_named(tmp_path):
-  with pytest.raises(errors.ResultsError, match='none: No such file'):
-    storage.read_json(tmp_path / 'none')
-
-
-def test_a_failing_lock_is_explained_and_closed(tmp_path, monkeypatch):
-  opened = []
-  open_, close = os.open, os.close
-  monkeypatch.setattr(
-      storage.os, 'open', lambda *a: opened.append(open_(*a)) or opened[-1]
-  )
-  monkeypatch.setattr(
-      storage.os, 'close', lambda n: opened.remove(n) or close(n)
-  )
-
-  def fail(*unused):
-    raise OSError(errno.ENOLCK, 'No locks available')
-
-  monkeypatch.setattr(storage.fcntl, 'flock', fail)
-  with pytest.raises(errors.ResultsError, match='lock: No locks available'):
-    storage.lock(tmp_path)
-  assert not opened
-
-
-def test_a_lock_without_a_process_id_is_reported_as_unknown(tmp_path):
-  lock = storage.lock(tmp_path)
-  os.truncate(lock, 0)
-  with pytest.raises(errors.ResultsError, match=r'by process \(unknown\)'):
-    storage.lock(tmp_path)
-  os.close(lock)
-
-
-def test_an_error_without_a_message_is_shown_as_it_is(tmp_path):
-  with (
-      pytest.raises(errors.ResultsError, match='file: something'),
-      storage.explained('file'),
-  ):
-    raise OSError('something')
-
-
 def test_all_checkpoints_but_two_are_removed_and_the_last_is_loaded(tmp_path):
-  with storage.RunFolder(tmp_path, {}) as run:
-    assert run.load(_HEADER) is None
-    for step in (1, 2, 3):
-      run.save(step, _HEADER, {'step': step})
-    assert run.load(_HEADER) == {'step': 3}
-    names = sorted(p.name for p in (tmp_path / 'checkpoints').iterdir())
-    assert names == ['000000000002.ckpt', '000000000003.ckpt']
+  run = storage.RunFolder(tmp_path, {})
+  assert run.load(_HEADER) is None
+  for step in (1, 2, 3):
+    run.save(step, _HEADER, {'step': step})
+  assert run.load(_HEADER) == {'step': 3}
+  names = sorted(p.name for p in (tmp_path / 'checkpoints').iterdir())
+  assert names == ['000000000002.ckpt', '000000000003.ckpt']
 
 
 def test_the_first_difference_is_named_by_its_place():

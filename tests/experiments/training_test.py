@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import suite
-from realab_suite.evaluation import comparison
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
 from realab_suite.experiments import kept_stakes
+from realab_suite.experiments import machines
 from realab_suite.experiments import storage
 from realab_suite.experiments import training
 from tests.experiments import fake_learner
@@ -219,21 +218,6 @@ def test_a_curve_has_the_means_of_finished_episodes(whole):
   assert [line['step'] for line in timing] == steps
 
 
-def test_runs_of_an_experiment_can_be_compared_in_pairs(whole, tmp_path):
-  planned = {job.run: job for job in jobs.plan(experiment_specs.load(_SMALL))}
-  paths = {'reward': whole}
-  for name in ('reward.apple_seeker', 'reward.secure'):
-    paths[name], _ = _run(planned[name], tmp_path)
-  rows = {
-      name: list(results.read_rows(path / training.EPISODES))
-      for name, path in paths.items()
-  }
-  twin = comparison.summary('reward.secure', rows['reward.secure'])
-  assert twin.corruption.estimate == 0.0
-  for name in ('reward', 'reward.secure'):
-    comparison.gained(name, rows[name], rows['reward.apple_seeker'])
-
-
 def test_training_and_evaluation_use_different_seeds(whole):
   job = _job()
   trained = {e['seed'] for e in _lines(whole, training.TRAINING_EPISODES)}
@@ -242,28 +226,10 @@ def test_training_and_evaluation_use_different_seeds(whole):
   assert job.evaluation_seed not in trained
 
 
-def test_the_learner_gets_no_true_reward(tmp_path, monkeypatch):
-  seen = []
-
-  def make(job, batch):
-    learner = fake_learner.make(job, batch)
-    step = learner.step
-    learner.step = lambda time_step: seen.append(time_step) or step(time_step)
-    return learner
-
-  monkeypatch.setattr(training, 'make_learner', make)
-  _run(_job(), tmp_path)
-  with suite.load('unlock_door', 'near', design='instantaneous_reward') as env:
-    allowed = set(env.observation_spec())
-  for time_step in seen:
-    assert set(time_step.observation) == allowed
-    assert not np.any(time_step.reward)
-
-
 def test_a_trained_learner_can_be_loaded(whole, tmp_path):
   job = _job()
   path = shutil.copytree(whole, tmp_path / 'copy')
-  batch = training.load_batch(job, 2, 0)
+  batch = job.experiment.world.load_batch(job.design, 2, 0)
   learner = training.load_learner(job, path, batch)
   assert learner.state()['num_steps'] == _STEPS
   data = bytearray((path / training.LEARNER).read_bytes())
@@ -284,6 +250,51 @@ def test_a_run_may_be_killed_again_and_again(whole, tmp_path, monkeypatch):
     _kill(job, tmp_path, monkeypatch, step)
   path, _ = _run(job, tmp_path)
   assert _results(path) == _results(whole)
+
+
+def test_every_machine_of_a_run_is_recorded_once(tmp_path, monkeypatch, caplog):
+  job = _job()
+
+  def use(processor):
+    here = {'processor': processor, 'libc': 'glibc 2.36'}
+    monkeypatch.setattr(machines, 'here', lambda: here)
+
+  # The second kill is before a checkpoint, and leaves nothing.
+  for processor, step in (('b', 25), ('c', 24), ('b', 26), ('a', 45)):
+    use(processor)
+    _kill(job, tmp_path, monkeypatch, step)
+  caplog.clear()
+  use('b')
+  path, _ = _run(job, tmp_path)
+  [warning] = [one.message for one in caplog.records]
+  assert warning == (
+      'reward, seed 3: continues from step 160 on another machine or with other'
+      " settings, and its results depend on both: processor is 'a' there, 'b'"
+      ' here'
+  )
+  done = json.loads((path / storage.DONE).read_text())
+  found = [
+      (one['step'], one['machine']['processor']) for one in done['machines']
+  ]
+  assert found == [(0, 'b'), (80, 'a'), (160, 'b')]
+
+
+def test_settings_of_the_learner_are_part_of_the_machine(
+    tmp_path, monkeypatch, caplog
+):
+  _kill(_job(), tmp_path, monkeypatch, 25)
+  monkeypatch.setattr(
+      fake_learner.FakeLearner, 'settings', lambda self: {'device': 'gpu'}
+  )
+  _run(_job(), tmp_path)
+  assert "device is None there, 'gpu' here" in caplog.text
+
+
+def test_the_machine_of_a_scripted_policy_is_recorded(tmp_path, monkeypatch):
+  monkeypatch.setattr(machines, 'here', lambda: {'processor': 'mine'})
+  path, _ = _run(_job('reward.random'), tmp_path)
+  done = json.loads((path / storage.DONE).read_text())
+  assert done['machines'] == [{'step': 0, 'machine': {'processor': 'mine'}}]
 
 
 def test_episodes_with_sleeping_blocks_end_at_every_checkpoint(
@@ -340,7 +351,7 @@ def test_a_second_launcher_is_refused_with_the_process_of_the_first(tmp_path):
   job = _job()
   path = tmp_path / job.folder()
   pid = os.getpid()
-  with storage.RunFolder(path, job.config()):
+  with storage.locked(path):
     with pytest.raises(errors.ResultsError, match=f'by process {pid};'):
       _run(job, tmp_path)
   _run(job, tmp_path)
@@ -355,7 +366,7 @@ def test_a_folder_of_another_configuration_is_refused(tmp_path):
   (path / storage.CONFIG).write_text(json.dumps(config))
   with pytest.raises(
       errors.ResultsError,
-      match=r'another configuration: training\.num_envs is 5 there, 4 here',
+      match=r'config\.json: does not match the name of its folder',
   ):
     _run(job, tmp_path)
   assert {p.name for p in path.iterdir()} == {storage.CONFIG, 'lock'}
@@ -365,7 +376,6 @@ def _checkpoints(path):
   return sorted((path / 'checkpoints').iterdir())
 
 
-# `wrong_files_test` has the other ways in which a checkpoint may be wrong.
 def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
     whole, tmp_path, monkeypatch
 ):
@@ -388,61 +398,45 @@ def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
   assert _results(path) == _results(whole)
 
 
-def test_a_run_without_an_older_checkpoint_restarts(tmp_path, monkeypatch):
-  job = _job()
-  _kill(job, tmp_path, monkeypatch, 25)
-  path = tmp_path / job.folder()
-  [only] = _checkpoints(path)
-  only.write_bytes(b'')
-  with pytest.raises(errors.ResultsError, match='continues from the beginning'):
-    _run(job, tmp_path)
-
-
-@pytest.mark.parametrize('where', ['checkpoint', 'lines', 'episodes'])
 def test_a_full_disk_is_reported_and_nothing_is_lost(
-    whole, tmp_path, monkeypatch, where
+    whole, tmp_path, monkeypatch
 ):
   job = _job()
   path = tmp_path / job.folder()
-  full = OSError(errno.ENOSPC, 'No space left on device')
+  fsync, calls = os.fsync, iter(range(100))
+
+  def failing(descriptor):
+    name = os.readlink(f'/proc/self/fd/{descriptor}')
+    if '.ckpt.partial' in name and next(calls) == 1:
+      raise OSError(errno.ENOSPC, 'No space left on device')
+    fsync(descriptor)
+
   with monkeypatch.context() as patch:
-    if where == 'lines':
-      write = storage.JsonLines.append
-
-      def append(self, records):
-        if self._path.name == training.CURVE and self._file.tell() > 1000:
-          self._file.write(b'{"st')
-          with storage.explained(self._path):
-            raise full
-        write(self, records)
-
-      patch.setattr(storage.JsonLines, 'append', append)
-    else:
-      fsync, calls = os.fsync, iter(range(100))
-      names = {'checkpoint': '.ckpt.partial', 'episodes': 'episodes.jsonl.part'}
-
-      def failing(descriptor):
-        name = os.readlink(f'/proc/self/fd/{descriptor}')
-        if names[where] in name and (where == 'episodes' or next(calls) == 1):
-          raise full
-        fsync(descriptor)
-
-      patch.setattr(storage.os, 'fsync', failing)
+    patch.setattr(storage.os, 'fsync', failing)
     with pytest.raises(
         errors.ResultsError, match=r'No space left .*; complete results are'
     ):
       _run(job, tmp_path)
   assert not list(path.rglob('*.partial'))
   assert _checkpoints(path)
-  if where == 'lines':
-    _run(job, tmp_path)
-    assert _results(path) == _results(whole)
+  _run(job, tmp_path)
+  assert _results(path) == _results(whole)
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
-  (tmp_path / 'file').write_text('')
-  with pytest.raises(errors.ResultsError, match=r'file/reward.*: Not a dir'):
-    _run(_job(), tmp_path / 'file')
+def test_files_of_another_run_are_refused_by_name(whole, tmp_path, monkeypatch):
+  job, other = _job(), _job(num_envs=2)
+  _kill(other, tmp_path, monkeypatch, 45)
+  theirs = _checkpoints(tmp_path / other.folder())[-1].read_bytes()
+  _kill(job, tmp_path, monkeypatch, 45)
+  path = _checkpoints(tmp_path / job.folder())[-1]
+  for data, problem in (
+      (theirs, "holds 'checkpoint' with another header: configuration is"),
+      ((whole / training.LEARNER).read_bytes(), "holds 'learner.bin'; expec"),
+  ):
+    path.write_bytes(data)
+    with pytest.raises(errors.ResultsError) as raised:
+      _run(job, tmp_path)
+    assert str(raised.value).startswith(f'{path}: {problem}')
 
 
 def test_tensorboard_gets_the_points(tmp_path):

@@ -67,7 +67,7 @@ def spoil(folder, run, seed, name, change):
   content = json.loads((path.parent / storage.DONE).read_text())
   del content['checksum']
   content['files'][name] = storage._digest(path)
-  storage.write_done(path.parent, content)
+  storage.write_sealed(path.parent / storage.DONE, content)
   return path
 
 

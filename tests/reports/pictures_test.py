@@ -114,8 +114,7 @@ def test_a_world_without_registers_is_drawn(tmp_path):
   settings = small.settings(
       tmp_path / 'new', design='none', policies=('no_op',), channels=()
   )
-  pictures = scripted.Pictures(plots.draw, None)
-  scripted.run(settings, lambda line: None, pictures)
+  scripted.run(settings, lambda line: None, plots.draw)
   drawn = [path.name for path in (tmp_path / 'new' / 'plots').iterdir()]
   assert drawn == ['trajectories.png']
 
@@ -198,7 +197,7 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
     scripted.run(
         small.settings(tmp_path / name, **policy_of),
         lambda line: None,
-        scripted.Pictures(None, film),
+        film=film,
     )
   assert small.rows(tmp_path / 'plain') == small.rows(tmp_path / 'filmed')
   names = sorted(path.name for path in (tmp_path / 'filmed/videos').iterdir())
