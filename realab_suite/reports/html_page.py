@@ -17,7 +17,6 @@ from realab_suite import errors
 from realab_suite.experiments import storage
 from realab_suite.experiments import tables
 from realab_suite.reports import caveats
-from realab_suite.reports import chart_style
 from realab_suite.reports import charts
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
@@ -126,7 +125,7 @@ def _render(
     output: pathlib.Path,
 ) -> str:
   """Returns the page; the same inputs give the same text."""
-  styles = chart_style.styles([run.name for run in sweep.learned()])
+  styles = charts.styles([run.name for run in sweep.learned()])
   learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
   pictures: dict[str, charts.Picture | None] = {
       'learning': charts.learning(sweep, figures, styles),
