@@ -3,8 +3,7 @@
 The pictures and films are made by `charts` and `page_clips`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from importlib import resources
+from collections.abc import Callable, Sequence
 import os
 import pathlib
 from urllib import parse
@@ -28,7 +27,6 @@ PAGE = 'report.html'
 CSV = 'tables.csv'
 MARKDOWN = 'tables.md'
 SEEDS_CSV = 'seeds.csv'
-_TEMPLATE = 'report.html.j2'
 _Say = Callable[[str], None]
 
 
@@ -58,14 +56,55 @@ def write(
   figures = numbers.compute(sweep, say)
   top = headline.headline(sweep, figures)
   overview = report_tables.overview(sweep, figures)
-  details = report_tables.details(sweep, figures)
+  details = report_tables.details(figures)
   cautions = caveats.caveats(sweep, figures)
-  whole = _render(
-      sweep, figures, top, overview, details, cautions, say, no_clips, output
+  learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
+  styles = charts.styles([run.name for run in sweep.learned()])
+  pictures: dict[str, charts.Picture | None] = {
+      'learning': charts.learning(sweep, figures, styles),
+      'plane': charts.plane(sweep, figures, styles),
+      'maps': charts.maps(sweep, figures, styles),
+  }
+  say('typical episodes')
+  pictures['paths'], no_paths = charts.paths(learned)
+  clips: list[page_clips.Clip] = []
+  if no_clips is None:
+    clips, no_clips = page_clips.clips(learned, say)
+  film = next((clip for clip in clips if clip.run == next(iter(top))), None)
+  page = _template().render(
+      title=_title(sweep),
+      description=str(sweep.experiment.get('description', '')),
+      headline=top,
+      film=film,
+      facts=_facts(sweep),
+      is_calibration=sweep.is_calibration,
+      unfinished=[_unfinished(one, sweep) for one in sweep.unfinished],
+      overview=overview if overview.rows else None,
+      units=_units(learned),
+      tables=details,
+      pictures=pictures,
+      no_paths=no_paths,
+      clips=[clip for clip in clips if clip is not film],
+      no_clips=no_clips,
+      replays=_replays(sweep, output),
+      caveats=cautions,
+      records=[
+          table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
+      ],
+      experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
+      designs={
+          name: yaml.safe_dump(dict(run.config), sort_keys=False)
+          for name, run in sweep.runs.items()
+          if run.is_done
+      },
+      colours={
+          name: styles[sweep.family(run)].colour
+          for name, run in sweep.runs.items()
+          if sweep.family(run) in styles
+      },
   )
-  with storage.explained(output):
-    output.mkdir(parents=True, exist_ok=True)
-  words = _words(top)
+  words = [f'{run}: {" ".join(lines)}' for run, lines in top.items()]
+  words = words or ['No learned agent has results yet.']
   limitations = [f'* {tables.escaped(caution)}' for caution in cautions]
   text = '\n\n'.join(
       [
@@ -76,11 +115,13 @@ def write(
           '\n'.join(limitations),
       ]
   )
+  with storage.explained(output):
+    output.mkdir(parents=True, exist_ok=True)
   for name, content in (
       (MARKDOWN, f'{text}\n'),
       (CSV, report_tables.csv_text(figures)),
       (SEEDS_CSV, report_tables.seeds_csv_text(figures)),
-      (PAGE, whole),
+      (PAGE, page),
   ):
     storage.write_whole(output / name, content.encode())
   for line in words:
@@ -104,66 +145,6 @@ def _check_modules(sweep: sweep_results.Sweep) -> None:
             f'{sweep.folder}: run {run.name}: {error}; import modules of your'
             ' own with --import'
         ) from error
-
-
-def _words(top: Sequence[headline.Entry]) -> list[str]:
-  """Returns the first lines of a report as texts."""
-  if not top:
-    return ['No learned agent has results yet.']
-  return [f'{one.run}: {" ".join(one.lines)}' for one in top]
-
-
-def _render(
-    sweep: sweep_results.Sweep,
-    figures: Mapping[str, numbers.Figures],
-    top: Sequence[headline.Entry],
-    overview: tables.Table,
-    details: Sequence[tables.Table],
-    cautions: Sequence[str],
-    say: _Say,
-    no_clips: str | None,
-    output: pathlib.Path,
-) -> str:
-  """Returns the page; the same inputs give the same text."""
-  styles = charts.styles([run.name for run in sweep.learned()])
-  learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
-  pictures: dict[str, charts.Picture | None] = {
-      'learning': charts.learning(sweep, figures, styles),
-      'plane': charts.plane(sweep, figures, styles),
-      'maps': charts.maps(sweep, figures, styles),
-  }
-  say('typical episodes')
-  pictures['paths'], no_paths = charts.paths(learned)
-  clips: list[page_clips.Clip] = []
-  if no_clips is None:
-    clips, no_clips = page_clips.clips(learned, say)
-  film = None
-  if top:
-    film = next((c for c in clips if c.family == top[0].run), None)
-  return _environment().get_template(_TEMPLATE).render(
-      title=_title(sweep),
-      description=str(sweep.experiment.get('description', '')),
-      headline=top,
-      film=film,
-      facts=_facts(sweep),
-      is_calibration=sweep.is_calibration,
-      unfinished=[_unfinished(one, sweep) for one in sweep.unfinished],
-      overview=overview if overview.rows else None,
-      units=_units(learned),
-      tables=details,
-      pictures=pictures,
-      no_paths=no_paths,
-      clips=[clip for clip in clips if clip is not film],
-      no_clips=no_clips,
-      replays=_replays(sweep, output),
-      caveats=cautions,
-      records=[
-          table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
-      ],
-      experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
-      designs=_designs(sweep),
-      colours={name: style.colour for name, style in styles.items()},
-  )  # fmt: skip
 
 
 def _units(learned: Sequence[numbers.Figures]) -> str:
@@ -191,19 +172,14 @@ def _replays(
   ]
 
 
-def _environment() -> jinja2.Environment:
-  folder = resources.files('realab_suite.reports') / 'templates'
-
-  def load(name: str) -> str:
-    return (folder / name).read_text(encoding='utf-8')
-
+def _template() -> jinja2.Template:
   return jinja2.Environment(
-      loader=jinja2.FunctionLoader(load),
+      loader=jinja2.PackageLoader('realab_suite.reports'),
       autoescape=True,
       undefined=jinja2.StrictUndefined,
       trim_blocks=True,
       lstrip_blocks=True,
-  )
+  ).get_template('report.html.j2')
 
 
 def _title(sweep: sweep_results.Sweep) -> str:
@@ -287,11 +263,3 @@ def _speeds(sweep: sweep_results.Sweep) -> tables.Table:
       )
   header = ['run', 'seconds per seed', 'control steps per second']
   return tables.Table('Training time', '', header, rows)
-
-
-def _designs(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
-  return [
-      (name, yaml.safe_dump(dict(run.config), sort_keys=False))
-      for name, run in sweep.runs.items()
-      if run.is_done
-  ]

@@ -21,14 +21,14 @@ class Clip:
   """A film in the page.
 
   Attributes:
-    family: Design that the film belongs to.
+    run: Run that the film shows.
     title: Title of the film.
     note: Figures of the episode.
     uri: Data URI of the film.
     poster: Data URI of its last frame, for printed pages.
   """
 
-  family: str
+  run: str
   title: str
   note: str
   uri: str
