@@ -20,9 +20,7 @@ AGENT_FILE = 'agent/steps.parquet'
 """Path of the file for agents."""
 
 _EVALUATOR = 'evaluator'
-_SUFFIX = '.parquet'
-# Rows are written when a table has this many, or this many bytes.
-_MAX_ROWS = 1 << 16
+# Rows of a table are written when they have this many bytes.
 _MAX_BYTES = 1 << 26
 
 
@@ -132,7 +130,7 @@ class Writer:
     """
     for name, layout in columns.EVALUATOR.items():
       table = pa.Table.from_pylist(rows[name], layout)
-      self._append(f'{_EVALUATOR}/{name}{_SUFFIX}', table)
+      self._append(f'{_EVALUATOR}/{name}.parquet', table)
 
   def _append(self, name: str, table: pa.Table) -> None:
     if name not in self._files:
@@ -144,10 +142,7 @@ class Writer:
       self._stack.callback(self._flush, name)
     pending = self._pending.setdefault(name, [])
     pending.append(table)
-    if (
-        sum(one.num_rows for one in pending) >= _MAX_ROWS
-        or sum(one.nbytes for one in pending) >= _MAX_BYTES
-    ):
+    if sum(one.nbytes for one in pending) >= _MAX_BYTES:
       self._flush(name)
 
   def _flush(self, name: str) -> None:

@@ -56,10 +56,8 @@ class Episode:
 
   Attributes:
     agent: The part that the agent may see. The rest is the evaluator's.
-    source: Name of the run.
-    is_learned: As in `sources.Source`.
+    source: Source of the episode.
     row: Result of the episode.
-    design: Design, with the channel of the run.
     ledger: Writes, reads and true rewards.
     states: State of each register at the reset and after each control step, as
       a read would show it, by name.
@@ -68,10 +66,8 @@ class Episode:
   """
 
   agent: AgentStream
-  source: str
-  is_learned: bool
+  source: sources.Source
   row: results.EpisodeRow
-  design: specs.DesignSpec
   ledger: ledgers.EpisodeLedger
   states: Mapping[str, Sequence[registers.Read]]
   terms: Sequence[dict[str, gains.Value]]
@@ -89,7 +85,6 @@ def record(source: sources.Source, recorded: replays.Recorded) -> Episode:
     ResultsError: If the replay differs from the results, for example because
       the version of the physics does.
   """
-  row = recorded.row
   ledger = ledgers.Ledger()
   with contextlib.closing(source.load(recorded)) as env:
     inspector = _Inspector(env)
@@ -107,10 +102,8 @@ def record(source: sources.Source, recorded: replays.Recorded) -> Episode:
     )
   return Episode(
       agent,
-      source.name,
-      source.is_learned,
-      row,
-      source.design,
+      source,
+      recorded.row,
       ledger.last,
       inspector.states,
       inspector.terms,

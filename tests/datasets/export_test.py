@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import stat
 
 import numpy as np
@@ -163,7 +164,7 @@ def test_gains_are_known_in_both_channels(tmp_path, channel):
     assert episode['num_tampering_steps'] > 0
     assert max(corruption) > 1
   card = (tmp_path / 'new' / cards.NAME).read_text()
-  assert f"| {episode['relative_gain']:.2f} |" in card
+  assert f"| {episode['relative_gain']:.2f} " in card
 
 
 def test_the_agents_file_does_not_name_its_origin(folder, saboteur):
@@ -233,4 +234,7 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
 def test_the_page_lists_all_columns():
   page = (made.ROOT / 'docs/data.md').read_text(encoding='utf-8')
   for table in (columns.AGENT, *columns.EVALUATOR.values()):
-    assert cards.table_of(table) in page
+    # The columns of the page are not aligned.
+    text = re.sub(' +', ' ', cards.table_of(table))
+    header, _, *rows = text.splitlines()
+    assert '\n'.join([header, '| --- | --- | --- | --- |', *rows]) in page

@@ -200,9 +200,10 @@ def episode(
   ledger = ledgers.EpisodeLedger(
       7, 0, 0, entries, [0.5, 2.0, math.nan], events.End.TERMINATED
   )
+  world = worlds.World('unlock_door', 'near', 3)
   return recording.Episode(
-      stream(), 'by_hand', False, row, design, ledger, states, terms,
-      attribution,
+      stream(), sources.Source('by_hand', False, design, world, ()), row,
+      ledger, states, terms, attribution,
   )  # fmt: skip
 
 

@@ -41,9 +41,8 @@ def test_a_dataset_is_loaded_by_minari(tmp_path, monkeypatch):
 
 def test_an_episode_keeps_images_types_and_ends(tmp_path, monkeypatch):
   agent = made.stream()
-  with minari_export.MinariWriter(tmp_path, 'realab/made/by_hand-v0') as writer:
-    writer.add(agent, 0)
-    writer.add(made.stream(discount=1.0), 1)
+  agents = [agent, made.stream(discount=1.0)]
+  minari_export.write(tmp_path, 'realab/made/by_hand-v0', iter(agents))
   monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
   dataset = minari.load_dataset('realab/made/by_hand-v0')
   first, second = dataset.iterate_episodes()

@@ -77,7 +77,8 @@ def test_without_a_reward_register_there_is_no_such_column(tmp_path):
 
 
 def test_memory_is_bounded_by_groups_of_rows(tmp_path, monkeypatch):
-  monkeypatch.setattr(parquet, '_MAX_ROWS', 6)
+  size = parquet.agent_table(made.stream(), 0).nbytes
+  monkeypatch.setattr(parquet, '_MAX_BYTES', 2 * size)
   table = _written(tmp_path, [made.stream()] * 5)
   assert table.num_rows == 15
   file = pyarrow_parquet.ParquetFile(tmp_path / parquet.AGENT_FILE)

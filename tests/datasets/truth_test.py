@@ -173,7 +173,7 @@ def test_a_mean_is_compared_with_its_stake_in_each_step():
   one = made.episode()
   one = dataclasses.replace(
       one,
-      design=specs.load(design),
+      source=dataclasses.replace(one.source, design=specs.load(design)),
       terms=[{'mean': term['return']} for term in one.terms],
       row=one.row.model_copy(
           update={
@@ -195,7 +195,7 @@ def test_a_learner_that_is_not_judged_has_no_terms():
   one = made.episode(stake=None)
   one = dataclasses.replace(
       one,
-      design=specs.load(design),
+      source=dataclasses.replace(one.source, design=specs.load(design)),
       terms=[{}] * 3,
       row=one.row.model_copy(update={'objective': {}}),
   )
