@@ -78,7 +78,7 @@ def write(
       film=film,
       facts=_facts(sweep),
       is_calibration=sweep.is_calibration,
-      unfinished=[_unfinished(one, sweep) for one in sweep.unfinished],
+      unfinished=sweep.unfinished,
       overview=overview if overview.rows else None,
       units=_units(learned),
       tables=details,
@@ -186,44 +186,21 @@ def _title(sweep: sweep_results.Sweep) -> str:
   return f'Tampering report: {sweep.experiment.get("name", sweep.folder.name)}'
 
 
-def _facts(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
-  """Returns names and values of the facts at the top of the page."""
+def _facts(sweep: sweep_results.Sweep) -> dict[str, str]:
+  """Returns the facts at the top of the page, by their names."""
   total = sum(len(run.jobs) for run in sweep.runs.values())
   experiment = sweep.experiment
-  training = experiment.get('training') or {}
-  evaluation = experiment.get('evaluation') or {}
-  facts = [('task', str(experiment.get('task', tables.NOTHING)))]
-  if 'steps' in training:
-    lengths = [f'{training["steps"]:,} control steps per seed'] + [
-        f'{run["steps"]:,} for {name}'
-        for name, run in (experiment.get('runs') or {}).items()
-        if run.get('steps')
-    ]
-    facts.append(('training', '; '.join(lengths)))
-  if 'episodes' in evaluation:
-    facts.append(('evaluation', f'{evaluation["episodes"]} episodes per seed'))
-  facts.append(('seeds', ', '.join(map(str, sweep.seeds))))
-  facts.append(('jobs', f'{total - len(sweep.unfinished)} of {total} finished'))
-  return facts
-
-
-def _unfinished(
-    one: sweep_results.Unfinished, sweep: sweep_results.Sweep
-) -> dict[str, str]:
-  total = (sweep.experiment.get('training') or {}).get('steps')
-  runs = sweep.experiment.get('runs') or {}
-  own = (runs.get(one.job.twin_of or one.job.run) or {}).get('steps')
-  total = own or total
-  how_far = 'not started'
-  if one.has_begun:
-    how_far = 'started, not finished'
-    if one.steps:
-      of = f' of {total:,}' if isinstance(total, int) else ''
-      how_far = f'at {one.steps:,}{of} control steps'
+  lengths = [f'{experiment["training"]["steps"]:,} control steps per seed'] + [
+      f'{run["steps"]:,} for {name}'
+      for name, run in experiment['runs'].items()
+      if run.get('steps')
+  ]
   return {
-      'run': one.job.run,
-      'seed': str(one.job.seed),
-      'how_far': how_far,
+      'task': experiment['task'],
+      'training': '; '.join(lengths),
+      'evaluation': f'{experiment["evaluation"]["episodes"]} episodes per seed',
+      'seeds': ', '.join(map(str, sweep.seeds)),
+      'jobs': f'{total - len(sweep.unfinished)} of {total} finished',
   }
 
 
