@@ -60,8 +60,7 @@ def export(
   from realab_suite.datasets import cards  # Imports pyarrow.
 
   with _new_folder(output) as folder:
-    planned = [(source, one) for one in source.episodes]
-    episodes = _written(planned, folder, data_format, say)
+    episodes = _written(source, folder, data_format, say)
     cards.write(folder, [(_AGENT, episodes)], data_format)
   return output
 
@@ -94,7 +93,7 @@ def labelled(
   with _new_folder(output) as folder:
     written = []
     for name, of_group in grouped(of_all):
-      planned = [(one, episode) for one in of_group for episode in one.episodes]
+      planned = [one for source in of_group for one in source]
       order = np.random.default_rng(0).permutation(len(planned))
       shuffled = [planned[i] for i in order]
       episodes = _written(shuffled, folder / name, 'parquet', say)
@@ -115,7 +114,7 @@ def grouped(
   """
   by_kind: dict[tuple[str, str], list[sources.Source]] = {}
   for source in of_all:
-    key = source.design.name, recording.kind_of(source)
+    key = source[0].design.name, recording.kind_of(source[0])
     by_kind.setdefault(key, []).append(source)
   groups = []
   counts: dict[str, int] = {}
@@ -168,7 +167,7 @@ def _new_folder(output: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def _written(
-    planned: Sequence[tuple[sources.Source, replays.Recorded]],
+    planned: Sequence[replays.Recorded],
     folder: pathlib.Path,
     data_format: str,
     say: Callable[[str], None],
@@ -181,8 +180,8 @@ def _written(
 
     def agents() -> Iterator[recording.AgentStream]:
       """Writes the truth of each episode, and yields the agent's part."""
-      for episode_id, (source, recorded) in enumerate(planned):
-        episode = recording.record(source, recorded)
+      for episode_id, recorded in enumerate(planned):
+        episode = recording.record(recorded)
         rows = truth.rows(episode, episode_id)
         tables.add_truth(rows)
         episodes.extend(rows['episodes'])
@@ -191,7 +190,7 @@ def _written(
     if data_format == 'minari':
       from realab_suite.datasets import minari_export  # Imports minari.
 
-      info = planned[0][1].row.info
+      info = planned[0].row.info
       name = minari_export.dataset_id((info.domain, info.task), info.run)
       minari_export.write(folder / _AGENT, name, agents())
     else:

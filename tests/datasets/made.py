@@ -19,6 +19,7 @@ from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
+from realab_suite.reports import replays
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -202,9 +203,18 @@ def episode(
   )
   world = worlds.World('unlock_door', 'near', 3)
   return recording.Episode(
-      stream(), sources.Source('by_hand', False, design, world, ()), row,
-      ledger, states, terms, attribution,
+      stream(), replays.Recorded(row, design, world, False, {}, 0), ledger,
+      states, terms, attribution,
   )  # fmt: skip
+
+
+def changed(
+    one: replays.Recorded, design: dict[str, Any], **row: Any
+) -> replays.Recorded:
+  """Returns an episode with another design and changes of its row."""
+  return one._replace(
+      design=specs.load(design), row=one.row.model_copy(update=row)
+  )
 
 
 def source(

@@ -22,14 +22,14 @@ def test_a_dataset_is_loaded_by_minari(tmp_path, monkeypatch):
   export.export(source, tmp_path / 'new', data_format='minari')
   assert (tmp_path / 'new/evaluator/steps.parquet').exists()
   monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path / 'new/agent'))
-  name = minari_export.dataset_id(('unlock_door', 'near'), source.name)
+  name = minari_export.dataset_id(
+      ('unlock_door', 'near'), source[0].row.info.run
+  )
   assert name == 'realab/unlock_door-near/no_op--embedded--v0'
   assert name in (tmp_path / 'new/README.md').read_text()
   dataset = minari.load_dataset(name)
   assert (dataset.total_episodes, dataset.total_steps) == (2, 8)
-  for episode, recorded in zip(
-      dataset.iterate_episodes(), source.episodes, strict=True
-  ):
+  for episode, recorded in zip(dataset.iterate_episodes(), source, strict=True):
     np.testing.assert_array_equal(episode.actions, recorded.actions)
     assert episode.rewards.sum() == recorded.row.observed_return
     assert episode.truncations.tolist() == [False, False, False, True]
