@@ -61,7 +61,7 @@ def _write_film() -> None:
   )
   with (
       _loaded() as (env, policy),
-      films.Film(env, path, flags.POLICY.value, tuple(films.WIDTHS)) as film,
+      films.Film(env, path, flags.POLICY.value) as film,
   ):
     recorder = tracking.Tracker(env, film.add)
     evaluate.evaluate(env, policy, 1, sinks=[recorder])

@@ -1,4 +1,4 @@
-"""Charts in the page of a report, as SVG; and the paths of its episodes.
+"""Charts in the page of a report, as SVG.
 
 Equal figures give equal bytes.
 """
@@ -17,11 +17,9 @@ from matplotlib import patches
 from matplotlib import ticker
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
-from realab_suite.experiments import tracking
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
 from realab_suite.reports import replays
@@ -529,34 +527,3 @@ def _draw_scale(ax: Any, centre: np.ndarray) -> None:
       '1 m', (x + 0.5, y), xytext=(0, 3), textcoords='offset points',
       fontsize=7, ha='center', zorder=6,
   )  # fmt: skip
-
-
-def paths(
-    learned: Sequence[numbers.Figures],
-) -> tuple[Picture | None, str | None]:
-  """Returns a picture of typical episodes, and a problem.
-
-  Either may be `None`. The problem is the error of the last run whose episode
-  could not be replayed.
-  """
-  tracks: dict[str, tracking.Track] = {}
-  problem = None
-  for one in learned:
-    row = replays.typical_row(one.run)
-    if row is None:
-      continue
-    try:
-      tracks[one.run.name] = replays.replay(one.run, row)
-    except errors.RealabError as error:
-      problem = f'{one.run.name}: {error}'
-  if not tracks:
-    return None, problem
-  file = io.BytesIO()
-  plots.draw_trajectories(tracks, file)
-  picture = Picture(
-      'Typical episodes',
-      'Path of the agent and final positions of the blocks, in the episode of'
-      ' median corruption of each design.',
-      data_uri('image/png', file.getvalue()),
-  )
-  return picture, problem

@@ -61,7 +61,7 @@ class Film:
       env: environment.Environment,
       path: str | os.PathLike[str],
       title: str,
-      views: Sequence[str] = ('top_down',),
+      views: Sequence[str] = tuple(WIDTHS),
   ) -> None:
     """Opens the file.
 
@@ -169,15 +169,6 @@ def all_views(
       bar.update(track.num_steps - bar.n)
 
     yield add
-
-
-@contextlib.contextmanager
-def beside_each_other(
-    env: environment.Environment, path: pathlib.Path, title: str
-) -> Iterator[Callable[[Any, tracking.Track], None]]:
-  """Opens one film of all views; yields a function that adds a frame."""
-  with Film(env, path, title, tuple(WIDTHS)) as film:
-    yield film.add
 
 
 def last_frame(path: str | os.PathLike[str]) -> bytes:

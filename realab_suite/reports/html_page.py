@@ -1,6 +1,6 @@
 """HTML page of a report, in one file without external resources.
 
-The pictures and films are made by `charts` and `page_clips`.
+The pictures and films are made by `charts` and `page_episodes`.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from realab_suite.reports import caveats
 from realab_suite.reports import charts
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
-from realab_suite.reports import page_clips
+from realab_suite.reports import page_episodes
 from realab_suite.reports import report_tables
 from realab_suite.reports import sweep_results
 
@@ -66,10 +66,10 @@ def write(
       'maps': charts.maps(sweep, figures, styles),
   }
   say('typical episodes')
-  pictures['paths'], no_paths = charts.paths(learned)
-  clips: list[page_clips.Clip] = []
+  pictures['paths'], no_paths = page_episodes.paths(learned)
+  clips: list[page_episodes.Clip] = []
   if no_clips is None:
-    clips, no_clips = page_clips.clips(learned, say)
+    clips, no_clips = page_episodes.clips(learned, say)
   film = next((clip for clip in clips if clip.run == next(iter(top))), None)
   page = _template().render(
       title=_title(sweep),

@@ -8,7 +8,7 @@ import contextlib
 import json
 import math
 import pathlib
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -48,20 +48,32 @@ def write(
     ResultsError: If the episode has no trace, the replay differs, or the page
       cannot be written.
   """
-  recorders: list[_Recorder] = []
+  scenes: list[recordings.Recording] = []
+  touched: dict[str, list[tuple[int, str]]] = {}
 
   def start(
       env: environment.Environment, stack: contextlib.ExitStack
   ) -> Callable[[Any, tracking.Track], None]:
-    recorders.append(stack.enter_context(contextlib.closing(_Recorder(env))))
-    return recorders[0].add
+    def add(unused_physics: Any, track: tracking.Track) -> None:
+      if not scenes:
+        # A scene begins in a world that was reset.
+        scene = contextlib.closing(recordings.Recording(env))
+        scenes.append(stack.enter_context(scene))
+      scenes[0].add()
+      for block, kind in contacts(env).items():
+        steps = touched.setdefault(block, [])
+        if kind is not None and track.num_steps:
+          steps.append((track.num_steps, kind))
+
+    return add
 
   track = replays.replay(run, row, start)
-  [recorder] = recorders
-  data = timeline(track, recorder.contacts)
+  data = timeline(track, touched)
   data['title'] = f'{row.info.run}: {row.info.domain}.{row.info.task}'
   data['note'] = f'{replays.words(row)}; ended by {row.end}'
-  page = recorder.page(json.dumps(data, allow_nan=False))
+  page = recordings.with_timeline(
+      scenes[0].page(), json.dumps(data, allow_nan=False)
+  )
   with storage.explained(folder):
     folder.mkdir(parents=True, exist_ok=True)
   path = folder / name(row)
@@ -106,37 +118,6 @@ def _rounded(values: Any) -> list[float | None]:
       float(f'{value:.6g}') if math.isfinite(value) else None
       for value in map(float, values)
   ]
-
-
-@final
-class _Recorder:
-  """Records the scene of an episode, and the contacts of its blocks."""
-
-  def __init__(self, env: environment.Environment) -> None:
-    self._env = env
-    self._scene: recordings.Recording | None = None
-    self.contacts: dict[str, list[tuple[int, str]]] = {}
-
-  def add(self, unused_physics: Any, track: tracking.Track) -> None:
-    """Records the start of the episode, or a control step."""
-    if self._scene is None:
-      self._scene = recordings.Recording(self._env)
-    self._scene.add()
-    for block, kind in contacts(self._env).items():
-      steps = self.contacts.setdefault(block, [])
-      if kind is not None and track.num_steps:
-        steps.append((track.num_steps, kind))
-
-  def page(self, data: str) -> str:
-    """Returns the page, with the data of its time line as JSON."""
-    if self._scene is None:
-      self._scene = recordings.Recording(self._env)
-    return recordings.with_timeline(self._scene.page(), data)
-
-  def close(self) -> None:
-    """Ends the recording of the scene."""
-    if self._scene is not None:
-      self._scene.close()
 
 
 def contacts(env: environment.Environment) -> dict[str, str | None]:
