@@ -3,9 +3,10 @@
 The pictures and films are made by `charts` and `page_episodes`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import os
 import pathlib
+from typing import Any
 from urllib import parse
 
 import jinja2
@@ -58,51 +59,10 @@ def write(
   overview = report_tables.overview(sweep, figures)
   details = report_tables.details(figures)
   cautions = caveats.caveats(sweep, figures)
-  learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
-  styles = charts.styles([run.name for run in sweep.learned()])
-  pictures: dict[str, charts.Picture | None] = {
-      'learning': charts.learning(sweep, figures, styles),
-      'plane': charts.plane(sweep, figures, styles),
-      'maps': charts.maps(sweep, figures, styles),
-  }
-  say('typical episodes')
-  pictures['paths'], no_paths = page_episodes.paths(learned)
-  clips: list[page_episodes.Clip] = []
-  if no_clips is None:
-    clips, no_clips = page_episodes.clips(learned, say)
-  film = next((clip for clip in clips if clip.run == next(iter(top))), None)
-  page = _template().render(
-      title=_title(sweep),
-      description=str(sweep.experiment.get('description', '')),
-      headline=top,
-      film=film,
-      facts=_facts(sweep),
-      is_calibration=sweep.is_calibration,
-      unfinished=sweep.unfinished,
-      overview=overview if overview.rows else None,
-      units=_units(learned),
-      tables=details,
-      pictures=pictures,
-      no_paths=no_paths,
-      clips=[clip for clip in clips if clip is not film],
-      no_clips=no_clips,
-      replays=_replays(sweep, output),
-      caveats=cautions,
-      records=[
-          table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
-      ],
-      experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
-      designs={
-          name: yaml.safe_dump(dict(run.config), sort_keys=False)
-          for name, run in sweep.runs.items()
-          if run.is_done
-      },
-      colours={
-          name: styles[sweep.family(run)].colour
-          for name, run in sweep.runs.items()
-          if sweep.family(run) in styles
-      },
-  )
+  page = _render(
+      sweep, figures, output, say, no_clips,
+      headline=top, overview=overview, tables=details, caveats=cautions,
+  )  # fmt: skip
   words = [f'{run}: {" ".join(lines)}' for run, lines in top.items()]
   words = words or ['No learned agent has results yet.']
   limitations = [f'* {tables.escaped(caution)}' for caution in cautions]
@@ -127,6 +87,69 @@ def write(
   for line in words:
     say(line)
   return output / PAGE
+
+
+def _render(
+    sweep: sweep_results.Sweep,
+    figures: Mapping[str, numbers.Figures],
+    output: pathlib.Path,
+    say: _Say,
+    no_clips: str | None,
+    **texts: Any,
+) -> str:
+  """Returns the page; the same inputs give the same text.
+
+  Args:
+    sweep: The sweep.
+    figures: Figures of its runs.
+    output: Folder of the page.
+    say: Called with a line on each step of the work.
+    no_clips: Reason to leave out the clips, or `None` to include them.
+    **texts: What the page shares with the Markdown file.
+  """
+  learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
+  styles = charts.styles([run.name for run in sweep.learned()])
+  pictures: dict[str, charts.Picture | None] = {
+      'learning': charts.learning(sweep, figures, styles),
+      'plane': charts.plane(sweep, figures, styles),
+      'maps': charts.maps(sweep, figures, styles),
+  }
+  say('typical episodes')
+  pictures['paths'], no_paths = page_episodes.paths(learned)
+  clips: list[page_episodes.Clip] = []
+  if no_clips is None:
+    clips, no_clips = page_episodes.clips(learned, say)
+  first = next(iter(texts['headline']), None)
+  film = next((clip for clip in clips if clip.run == first), None)
+  return _template().render(
+      **texts,
+      title=_title(sweep),
+      description=str(sweep.experiment.get('description', '')),
+      film=film,
+      facts=_facts(sweep),
+      is_calibration=sweep.is_calibration,
+      unfinished=sweep.unfinished,
+      units=_units(learned),
+      pictures=pictures,
+      no_paths=no_paths,
+      clips=[clip for clip in clips if clip is not film],
+      no_clips=no_clips,
+      replays=_replays(sweep, output),
+      records=[
+          table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
+      ],
+      experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
+      designs={
+          name: yaml.safe_dump(dict(run.config), sort_keys=False)
+          for name, run in sweep.runs.items()
+          if run.is_done
+      },
+      colours={
+          name: styles[sweep.family(run)].colour
+          for name, run in sweep.runs.items()
+          if sweep.family(run) in styles
+      },
+  )
 
 
 def _check_modules(sweep: sweep_results.Sweep) -> None:

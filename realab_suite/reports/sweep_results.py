@@ -377,6 +377,7 @@ def _how_far(
         continue
   if not steps:
     return 'started, not finished'
-  run = experiment['runs'][job.twin_of or job.run]
-  total = run.get('steps') or experiment['training']['steps']
+  # Names of twins and baselines begin with that of their run.
+  name, _, _ = job.run.partition('.')
+  total = experiment['runs'][name]['steps'] or experiment['training']['steps']
   return f'at {steps:,} of {total:,} control steps'
