@@ -176,14 +176,15 @@ def _written(
   from realab_suite.datasets import parquet  # Imports pyarrow.
 
   episodes: list[truth.Row] = []
-  with parquet.Writer(folder) as tables:
+  with parquet.appending(folder) as append:
 
     def agents() -> Iterator[recording.AgentStream]:
       """Writes the truth of each episode, and yields the agent's part."""
       for episode_id, recorded in enumerate(planned):
         episode = recording.record(recorded)
         rows = truth.rows(episode, episode_id)
-        tables.add_truth(rows)
+        for path, table in parquet.truth_tables(rows):
+          append(path, table)
         episodes.extend(rows['episodes'])
         yield episode.agent
 
@@ -195,6 +196,6 @@ def _written(
       minari_export.write(folder / _AGENT, name, agents())
     else:
       for episode_id, agent in enumerate(agents()):
-        tables.add(agent, episode_id)
+        append(parquet.AGENT_FILE, parquet.agent_table(agent, episode_id))
   say(f'{len(episodes)} episodes were written')
   return episodes

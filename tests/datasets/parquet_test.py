@@ -18,9 +18,9 @@ from tests.datasets import made
 
 
 def _written(folder, agents):
-  with parquet.Writer(folder) as writer:
+  with parquet.appending(folder) as append:
     for episode_id, agent in enumerate(agents):
-      writer.add(agent, episode_id)
+      append(parquet.AGENT_FILE, parquet.agent_table(agent, episode_id))
   return pyarrow_parquet.read_table(folder / parquet.AGENT_FILE)
 
 
@@ -88,8 +88,9 @@ def test_memory_is_bounded_by_groups_of_rows(tmp_path, monkeypatch):
 
 def test_the_tables_of_the_evaluator_are_read_again(tmp_path):
   rows = truth.rows(made.episode(), 0)
-  with parquet.Writer(tmp_path) as writer:
-    writer.add_truth(rows)
+  with parquet.appending(tmp_path) as append:
+    for path, table in parquet.truth_tables(rows):
+      append(path, table)
   for name, expected in rows.items():
     table = pyarrow_parquet.read_table(
         tmp_path / 'evaluator' / f'{name}.parquet'
