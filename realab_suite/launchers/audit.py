@@ -145,9 +145,8 @@ def _write_film(
   from realab_suite.reports import films
 
   with auditor.repeated(found) as (env, policy):
-    with films.Film(env, path, f'{title}: exploit') as film:
-      recorder = tracking.Tracker(env, film.add)
-      evaluate.evaluate(env, policy, 1, sinks=[recorder])
+    with films.film(env, path, f'{title}: exploit') as add:
+      evaluate.evaluate(env, policy, 1, sinks=[tracking.Tracker(env, add)])
 
 
 if __name__ == '__main__':

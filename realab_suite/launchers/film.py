@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> None:
   replays.replay(
       run,
       row,
-      lambda env, stack: stack.enter_context(films.Film(env, path, name)).add,
+      lambda env, stack: stack.enter_context(films.film(env, path, name)),
   )
   program.say(
       f'The film of seed {row.seed}, world {row.world}, episode {row.episode}'

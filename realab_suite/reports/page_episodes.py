@@ -96,7 +96,7 @@ def _clip(run: sweep_results.Run, row: results.EpisodeRow) -> Clip:
     def film(env: Any, stack: contextlib.ExitStack) -> Any:
       # Halves the time per frame, without a visible difference in a clip.
       env.physics.model.vis.quality.offsamples = 0
-      return stack.enter_context(films.Film(env, path, run.name)).add
+      return stack.enter_context(films.film(env, path, run.name, ['top_down']))
 
     replays.replay(run, row, film)
     data = path.read_bytes()

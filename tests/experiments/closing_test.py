@@ -423,7 +423,8 @@ def test_a_film_that_fails_leaves_no_file(tmp_path, monkeypatch, place, kind):
   env = _load()
   for _ in range(2):  # Nothing is in the way of another attempt.
     with pytest.raises(kind):
-      videos.Film(env, path, 'title')
+      with videos.film(env, path, 'title'):
+        pass
   assert not any(file.is_open for file in files)
   assert not list(tmp_path.iterdir())
   env.close()
