@@ -132,25 +132,11 @@ def _picture(
   return Picture(title, note, data_uri('image/svg+xml', to_svg(canvas)))
 
 
-def _new_figure(
-    rows: int,
-    columns: int,
-    height: float,
-    width: float = _WIDTH,
-    **options: Any,
+def _subplots(
+    rows: int, columns: int, size: tuple[float, float], **options: Any
 ) -> tuple[figure.Figure, Any]:
-  """Returns a figure and its array of axes, `(rows, columns)`.
-
-  Args:
-    rows: Number of rows.
-    columns: Number of columns.
-    height: Height of a row, in inches.
-    width: Width of the figure, in inches.
-    **options: Options of `Figure.subplots`.
-  """
-  canvas = figure.Figure(
-      figsize=(width, rows * height + 0.6), layout='constrained'
-  )
+  """Returns a figure of a size in inches, and its array of axes."""
+  canvas = figure.Figure(figsize=size, layout='constrained')
   return canvas, canvas.subplots(rows, columns, squeeze=False, **options)
 
 
@@ -260,8 +246,9 @@ def learning(
     return None
   every: list[Band] = []
   with matplotlib.rc_context(_STYLE):
-    canvas, axes = _new_figure(
-        len(rows), len(_COLUMNS), _ROW, sharex=True, sharey='col'
+    size = _WIDTH, len(rows) * _ROW + 0.6
+    canvas, axes = _subplots(
+        len(rows), len(_COLUMNS), size, sharex=True, sharey='col'
     )
     largest = [0.0] * len(_COLUMNS)
     for row, runs in zip(axes, rows, strict=True):
@@ -395,7 +382,7 @@ def plane(
   if not drawn:
     return None
   with matplotlib.rc_context(_STYLE):
-    canvas, [[ax]] = _new_figure(1, 1, 4.6, 8.6)
+    canvas, [[ax]] = _subplots(1, 1, (8.6, 5.2))
     for one, found in drawn:
       colour, marker = styles[sweep.family(one.run)]
       if one.run.is_scripted:
@@ -456,8 +443,9 @@ def maps(
   columns = min(len(drawn), _MAP_COLUMNS)
   rows = math.ceil(len(drawn) / columns)
   height = _MAP * (high[1] - low[1]) / (high[0] - low[0]) + 0.2
+  size = columns * _MAP + 0.3, rows * height + 0.6
   with matplotlib.rc_context(_STYLE):
-    canvas, axes = _new_figure(rows, columns, height, columns * _MAP + 0.3)
+    canvas, axes = _subplots(rows, columns, size)
     for ax in axes.flat[len(drawn) :]:
       ax.set_axis_off()
     for ax, run in zip(axes.flat, drawn, strict=False):

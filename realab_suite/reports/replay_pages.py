@@ -131,36 +131,32 @@ def contacts(env: environment.Environment) -> dict[str, str | None]:
     another register, or `None`.
   """
   physics = env.thin_physics
-  touching = np.asarray(physics.data.ptr.contact.geom).reshape(-1, 2)
-  torso = env.task.avatar.mjcf_model.find_all('geom')
-  avatar = set(np.ravel(physics.bind(torso).element_id).tolist())
+  pairs = np.asarray(physics.data.ptr.contact.geom).reshape(-1, 2)
+
+  def ids(elements: Any) -> set[int]:
+    return set(np.ravel(physics.bind(elements).element_id).tolist())
+
+  avatar = ids(env.task.avatar.mjcf_model.find_all('geom'))
   blocks = {
       f'{register_name}/{block.body.name}': block
       for register_name, register in env.mechanism.registers.items()
       for block in register.blocks
       if isinstance(block, block_kinds.JointedBlock)
   }
-  ids = {
-      block_name: int(np.ravel(physics.bind(block.geom).element_id)[0])
-      for block_name, block in blocks.items()
-  }
-  found: dict[str, str | None] = {}
-  for block_name, block in blocks.items():
-    own = ids[block_name]
-    pairs = touching[(touching == own).any(axis=1)]
-    others = set(pairs[pairs != own].tolist())
+  geoms = {one: ids(block.geom) for one, block in blocks.items()}
+  others = set().union(*geoms.values())
+  found: dict[str, str | None] = dict.fromkeys(blocks)
+  for one, block in blocks.items():
+    own = np.isin(pairs, list(geoms[one])).any(axis=1)
+    touching = set(pairs[own].ravel().tolist()) - geoms[one]
     constraints = [c for grasp in block.grasps for c in grasp.constraints]
-    is_held = (
-        bool(constraints)
+    if (
+        constraints
         and grasps.held(np.asarray(physics.bind(constraints).active)).any()
-    )
-    found[block_name] = (
-        'held'
-        if is_held
-        else 'touched'
-        if others & avatar
-        else 'hit'
-        if others & set(ids.values())
-        else None
-    )
+    ):
+      found[one] = 'held'
+    elif touching & avatar:
+      found[one] = 'touched'
+    elif touching & others:
+      found[one] = 'hit'
   return found
