@@ -28,7 +28,6 @@ FORMATS: Final = ('parquet', 'minari')
 """Formats of the agent's data. The evaluator's tables are always Parquet."""
 
 _AGENT = 'agent'
-_Planned = Sequence[tuple[sources.Source, replays.Recorded]]
 
 
 def export(
