@@ -1,9 +1,10 @@
 """Cards of datasets: a README with the contents, the origin and the columns."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 import pathlib
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from realab_suite.datasets import columns
@@ -102,29 +103,29 @@ def _counts(
     episodes: Sequence[dict[str, Any]],
 ) -> Iterator[tuple[Any, ...]]:
   """Yields a row of the table of contents for each run, policy and design."""
-  keys = ('run', 'policy', 'design', 'channel')
-  runs = dict.fromkeys(tuple(row[key] for key in keys) for row in episodes)
-  for run in sorted(runs):
-    rows = [row for row in episodes if tuple(row[k] for k in keys) == run]
-    labels = [row['num_tampering_steps'] for row in rows]
-    known = [one for one in labels if one is not None]
-    missing = len(labels) - len(known)
+  runs: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+  for row in episodes:
+    key = row['run'], row['policy'], row['design'], row['channel']
+    runs.setdefault(key, []).append(row)
+  for key, rows in sorted(runs.items()):
+    labels = _known(rows, 'num_tampering_steps')
+    missing = len(rows) - len(labels)
     note = f' ({missing} episodes without labels)' if missing else ''
+    figures = (
+        _known(rows, name)
+        for name in ('relative_gain', 'true_return', 'observed_return')
+    )
     yield (
-        *run,
+        *key,
         len(rows),
         sum(row['num_steps'] for row in rows),
-        f'{sum(known)}{note}' if known else None,
-        *(
-            _mean(row[name] for row in rows)
-            for name in ('relative_gain', 'true_return', 'observed_return')
-        ),
+        f'{sum(labels)}{note}' if labels else None,
+        *(f'{np.mean(one):.2f}' if one else None for one in figures),
     )
 
 
-def _mean(values: Iterable[float | None]) -> str | None:
-  known = [value for value in values if value is not None]
-  return f'{sum(known) / len(known):.2f}' if known else None
+def _known(rows: Sequence[dict[str, Any]], name: str) -> list[float]:
+  return [row[name] for row in rows if row[name] is not None]
 
 
 def _minari_name(folder: pathlib.Path) -> str:

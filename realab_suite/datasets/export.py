@@ -12,7 +12,7 @@ import contextlib
 import os
 import pathlib
 import tempfile
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -24,17 +24,10 @@ from realab_suite.experiments import requirements
 from realab_suite.experiments import storage
 from realab_suite.reports import replays
 
-if TYPE_CHECKING:
-  from realab_suite.datasets import minari_export
-
 FORMATS: Final = ('parquet', 'minari')
 """Formats of the agent's data. The evaluator's tables are always Parquet."""
 
 _AGENT = 'agent'
-
-
-_Planned = tuple[sources.Source, replays.Recorded]
-"""An episode to write."""
 
 
 def export(
@@ -63,9 +56,11 @@ def export(
       written, or a replay differs from the results.
   """
   check(data_format, output)
+  from realab_suite.datasets import cards  # Imports pyarrow.
+
   with _new_folder(output) as folder:
-    episodes = _written(_planned([source]), folder, data_format, say)
-    _write_card(folder, [(_AGENT, episodes)], data_format)
+    episodes = _written(source, folder, data_format, say)
+    cards.write(folder, [(_AGENT, episodes)], data_format)
   return output
 
 
@@ -92,15 +87,17 @@ def labelled(
     ResultsError: As in `export`.
   """
   check('parquet', output)
+  from realab_suite.datasets import cards  # Imports pyarrow.
+
   with _new_folder(output) as folder:
     written = []
     for name, of_group in grouped(of_all):
-      planned = _planned(of_group)
+      planned = [one for source in of_group for one in source]
       order = np.random.default_rng(0).permutation(len(planned))
       shuffled = [planned[i] for i in order]
       episodes = _written(shuffled, folder / name, 'parquet', say)
       written.append((f'{name}/{_AGENT}', episodes))
-    _write_card(folder, written, 'parquet')
+    cards.write(folder, written, 'parquet')
   return output
 
 
@@ -116,7 +113,7 @@ def grouped(
   """
   by_kind: dict[tuple[str, str], list[sources.Source]] = {}
   for source in of_all:
-    key = source.design.name, recording.kind_of(source)
+    key = source[0].design.name, recording.kind_of(source[0])
     by_kind.setdefault(key, []).append(source)
   groups = []
   counts: dict[str, int] = {}
@@ -168,13 +165,8 @@ def _new_folder(output: pathlib.Path) -> Iterator[pathlib.Path]:
       os.rename(folder, output)
 
 
-def _planned(of_group: Sequence[sources.Source]) -> list[_Planned]:
-  """Returns the episodes of sources."""
-  return [(source, one) for source in of_group for one in source.episodes]
-
-
 def _written(
-    planned: Sequence[_Planned],
+    planned: Sequence[replays.Recorded],
     folder: pathlib.Path,
     data_format: str,
     say: Callable[[str], None],
@@ -183,38 +175,26 @@ def _written(
   from realab_suite.datasets import parquet  # Imports pyarrow.
 
   episodes: list[truth.Row] = []
-  with contextlib.ExitStack() as stack:
-    tables = stack.enter_context(parquet.Writer(folder))
-    agents: parquet.Writer | minari_export.MinariWriter = tables
+  with parquet.appending(folder) as append:
+
+    def agents() -> Iterator[recording.AgentStream]:
+      """Writes the truth of each episode, and yields the agent's part."""
+      for episode_id, recorded in enumerate(planned):
+        episode = recording.record(recorded)
+        rows = truth.rows(episode, episode_id)
+        for path, table in parquet.truth_tables(rows):
+          append(path, table)
+        episodes.extend(rows['episodes'])
+        yield episode.agent
+
     if data_format == 'minari':
-      agents = stack.enter_context(_minari_writer(planned, folder))
-    for episode_id, (source, recorded) in enumerate(planned):
-      episode = recording.record(source, recorded)
-      agents.add(episode.agent, episode_id)
-      rows = truth.rows(episode, episode_id)
-      tables.add_truth(rows)
-      episodes += rows['episodes']
+      from realab_suite.datasets import minari_export  # Imports minari.
+
+      info = planned[0].row.info
+      name = minari_export.dataset_id((info.domain, info.task), info.run)
+      minari_export.write(folder / _AGENT, name, agents())
+    else:
+      for episode_id, agent in enumerate(agents()):
+        append(parquet.AGENT_FILE, parquet.agent_table(agent, episode_id))
   say(f'{len(episodes)} episodes were written')
   return episodes
-
-
-def _write_card(
-    folder: pathlib.Path,
-    groups: Sequence[tuple[str, Sequence[truth.Row]]],
-    data_format: str,
-) -> None:
-  from realab_suite.datasets import cards  # Imports pyarrow.
-
-  cards.write(folder, groups, data_format)
-
-
-def _minari_writer(
-    planned: Sequence[_Planned], folder: pathlib.Path
-) -> 'minari_export.MinariWriter':
-  """Returns the writer of the agent's data in the format of Minari."""
-  from realab_suite.datasets import minari_export  # Imports minari.
-
-  [(_, first), *_] = planned
-  info = first.row.info
-  name = minari_export.dataset_id((info.domain, info.task), info.run)
-  return minari_export.MinariWriter(folder / _AGENT, name)

@@ -7,10 +7,11 @@ there is none.
 
 from collections.abc import Iterator, Mapping
 import contextlib
+import itertools
 import os
 import pathlib
 import re
-from typing import Any, final
+from typing import Any
 import warnings
 
 from dm_env import specs as dm_env_specs
@@ -71,9 +72,8 @@ def observation_space(
   Args:
     observation_spec: Spec of each entry, by a key such as `senses/position`.
   """
-  return _dict_space(
-      _nested({key: space_of(spec) for key, spec in observation_spec.items()})
-  )
+  groups = _nested({k: space_of(spec) for k, spec in observation_spec.items()})
+  return spaces.Dict({k: spaces.Dict(entries) for k, entries in groups.items()})
 
 
 def buffer_of(agent: recording.AgentStream) -> data_collector.EpisodeBuffer:
@@ -102,82 +102,47 @@ def buffer_of(agent: recording.AgentStream) -> data_collector.EpisodeBuffer:
   )
 
 
-def _nested(entries: Mapping[str, Any]) -> dict[str, Any]:
+def _nested(entries: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
   """Returns entries by group and name; Minari's files use '/' for groups."""
-  groups: dict[str, Any] = {}
+  groups: dict[str, dict[str, Any]] = {}
   for key, entry in entries.items():
-    *path, name = key.split('/')
-    group = groups
-    for part in path:
-      group = group.setdefault(part, {})
-    group[name] = entry
+    group, name = key.split('/', 1)
+    groups.setdefault(group, {})[name] = entry
   return groups
 
 
-def _dict_space(groups: Mapping[str, Any]) -> spaces.Dict:
-  """Returns the space of nested dictionaries of spaces."""
-  return spaces.Dict(
-      {
-          key: _dict_space(entry) if isinstance(entry, dict) else entry
-          for key, entry in groups.items()
-      }
-  )
+def write(
+    root: pathlib.Path, name: str, agents: Iterator[recording.AgentStream]
+) -> None:
+  """Writes a Minari dataset.
 
+  Args:
+    root: Folder for `MINARI_DATASETS_PATH`.
+    name: Name of the dataset; see `dataset_id`.
+    agents: The part of each episode that the agent may see; at least one.
 
-@final
-class MinariWriter:
-  """Writes a Minari dataset. Use it as a context manager."""
-
-  def __init__(self, root: pathlib.Path, name: str) -> None:
-    """Makes a writer.
-
-    Args:
-      root: Folder for `MINARI_DATASETS_PATH`.
-      name: Name of the dataset; see `dataset_id`.
-    """
-    # Minari fails on relative paths.
-    self._root = pathlib.Path(os.path.abspath(root))
-    self._name = name
-    self._storage: Any = None
-
-  def add(self, agent: recording.AgentStream, episode_id: int) -> None:
-    """Appends an episode.
-
-    Args:
-      agent: The part of the episode that the agent may see.
-      episode_id: Number of the episode in the dataset: one more than that of
-        the episode before.
-
-    Raises:
-      ResultsError: If it cannot be written.
-    """
-    del episode_id  # Minari counts as well.
-    with storage.explained(self._root):
-      if self._storage is None:
-        self._root.mkdir(parents=True, exist_ok=True)
-        self._storage = self._create(agent)
-      self._storage.update_episodes([buffer_of(agent)])
-
-  def __enter__(self) -> 'MinariWriter':
-    return self
-
-  def __exit__(self, *unused: Any) -> None:
-    self._storage = None
-
-  def _create(self, agent: recording.AgentStream) -> Any:
-    with _root_is(self._root), warnings.catch_warnings():
+  Raises:
+    ResultsError: If the dataset cannot be written.
+  """
+  first = next(agents)
+  # Minari fails on relative paths.
+  root = pathlib.Path(os.path.abspath(root))
+  with storage.explained(root):
+    root.mkdir(parents=True, exist_ok=True)
+    with _root_is(root), warnings.catch_warnings():
       # Warns that there is no environment and no author to ask.
       warnings.simplefilter('ignore', UserWarning)
       dataset = minari.create_dataset_from_buffers(
-          self._name,
+          name,
           [],
-          observation_space=observation_space(agent.observation_spec),
-          action_space=space_of(agent.action_spec),
+          observation_space=observation_space(first.observation_spec),
+          action_space=space_of(first.action_spec),
           description=_DESCRIPTION,
           # The default would compress images, with losses.
           jpeg_encoding=False,
       )
-    return dataset.storage
+    every = itertools.chain([first], agents)
+    dataset.storage.update_episodes(map(buffer_of, every))
 
 
 @contextlib.contextmanager

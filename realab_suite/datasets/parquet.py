@@ -1,10 +1,10 @@
 """Parquet files of a dataset: one file for agents, and tables of the truth."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import json
 import pathlib
-from typing import Any, final
+from typing import Any
 
 from dm_env import specs as dm_env_specs
 import numpy as np
@@ -19,10 +19,7 @@ from realab_suite.experiments import storage
 AGENT_FILE = 'agent/steps.parquet'
 """Path of the file for agents."""
 
-_EVALUATOR = 'evaluator'
-_SUFFIX = '.parquet'
-# Rows are written when a table has this many, or this many bytes.
-_MAX_ROWS = 1 << 16
+# Rows of a table are written when they have this many bytes.
 _MAX_BYTES = 1 << 26
 
 
@@ -86,78 +83,54 @@ def _array(values: np.ndarray, kind: pa.DataType) -> pa.Array:
   )
 
 
-@final
-class Writer:
-  """Writes the tables of a dataset. Use it as a context manager.
+def truth_tables(
+    rows: Mapping[str, list[truth.Row]],
+) -> Iterator[tuple[str, pa.Table]]:
+  """Yields the path and the rows of each table of the evaluator.
+
+  Args:
+    rows: Rows of an episode, as `truth.rows` returns them.
+  """
+  for name, layout in columns.EVALUATOR.items():
+    yield f'evaluator/{name}.parquet', pa.Table.from_pylist(rows[name], layout)
+
+
+@contextlib.contextmanager
+def appending(
+    folder: pathlib.Path,
+) -> Iterator[Callable[[str, pa.Table], None]]:
+  """Yields a function that appends rows to a file with a path in a folder.
 
   Other users, who may run the agent, cannot read the folder `evaluator`. Rows
   are written in groups; the files are complete when the context ends.
+
+  Args:
+    folder: Folder of the dataset.
+
+  Raises:
+    ResultsError: If a file cannot be written.
   """
+  files: dict[str, parquet.ParquetWriter] = {}
+  pending: dict[str, list[pa.Table]] = {}
 
-  def __init__(self, folder: pathlib.Path) -> None:
-    """Makes a writer.
+  def flush(name: str) -> None:
+    with storage.explained(folder / name):
+      files[name].write_table(pa.concat_tables(pending.pop(name)))
 
-    Args:
-      folder: Folder of the dataset.
-
-    Raises:
-      ResultsError: If it cannot be written.
-    """
-    self._folder = folder
-    self._stack = contextlib.ExitStack()
-    self._files: dict[str, parquet.ParquetWriter] = {}
-    self._pending: dict[str, list[pa.Table]] = {}
-    evaluator = folder / _EVALUATOR
-    with storage.explained(evaluator):
-      folder.mkdir(parents=True, exist_ok=True)
-      evaluator.mkdir(mode=0o700)
-
-  def add(self, agent: recording.AgentStream, episode_id: int) -> None:
-    """Appends an episode to the file for agents.
-
-    Args:
-      agent: The part of the episode that the agent may see.
-      episode_id: Number of the episode in the dataset.
-
-    Raises:
-      ResultsError: If it cannot be written.
-    """
-    self._append(AGENT_FILE, agent_table(agent, episode_id))
-
-  def add_truth(self, rows: Mapping[str, list[truth.Row]]) -> None:
-    """Appends the rows of an episode, as `truth.rows` returns them.
-
-    Raises:
-      ResultsError: If they cannot be written.
-    """
-    for name, layout in columns.EVALUATOR.items():
-      table = pa.Table.from_pylist(rows[name], layout)
-      self._append(f'{_EVALUATOR}/{name}{_SUFFIX}', table)
-
-  def _append(self, name: str, table: pa.Table) -> None:
-    if name not in self._files:
-      path = self._folder / name
+  def append(name: str, table: pa.Table) -> None:
+    path = folder / name
+    if name not in files:
       with storage.explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = parquet.ParquetWriter(path, table.schema, compression='zstd')
-      self._files[name] = self._stack.enter_context(file)
-      self._stack.callback(self._flush, name)
-    pending = self._pending.setdefault(name, [])
-    pending.append(table)
-    if (
-        sum(one.num_rows for one in pending) >= _MAX_ROWS
-        or sum(one.nbytes for one in pending) >= _MAX_BYTES
-    ):
-      self._flush(name)
+      files[name] = stack.enter_context(file)
+    pending.setdefault(name, []).append(table)
+    if sum(one.nbytes for one in pending[name]) >= _MAX_BYTES:
+      flush(name)
 
-  def _flush(self, name: str) -> None:
-    if pending := self._pending.pop(name, []):
-      with storage.explained(self._folder / name):
-        self._files[name].write_table(pa.concat_tables(pending))
-
-  def __enter__(self) -> 'Writer':
-    return self
-
-  def __exit__(self, *unused: Any) -> None:
-    with storage.explained(self._folder):
-      self._stack.close()
+  with storage.explained(folder), contextlib.ExitStack() as stack:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / 'evaluator').mkdir(mode=0o700)
+    yield append
+    for name in list(pending):
+      flush(name)

@@ -13,7 +13,6 @@ import dm_env
 from dm_env import specs as dm_env_specs
 import numpy as np
 
-from realab_suite.datasets import sources
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -23,7 +22,6 @@ from realab_suite.evaluation import attribution
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import results
 from realab_suite.feedback import specs
 from realab_suite.reports import replays
 
@@ -56,10 +54,7 @@ class Episode:
 
   Attributes:
     agent: The part that the agent may see. The rest is the evaluator's.
-    source: Name of the run.
-    is_learned: As in `sources.Source`.
-    row: Result of the episode.
-    design: Design, with the channel of the run.
+    recorded: Its result, its design and its world.
     ledger: Writes, reads and true rewards.
     states: State of each register at the reset and after each control step, as
       a read would show it, by name.
@@ -68,49 +63,39 @@ class Episode:
   """
 
   agent: AgentStream
-  source: str
-  is_learned: bool
-  row: results.EpisodeRow
-  design: specs.DesignSpec
+  recorded: replays.Recorded
   ledger: ledgers.EpisodeLedger
   states: Mapping[str, Sequence[registers.Read]]
   terms: Sequence[dict[str, gains.Value]]
   attribution: attribution_metrics.Attribution
 
 
-def record(source: sources.Source, recorded: replays.Recorded) -> Episode:
+def record(recorded: replays.Recorded) -> Episode:
   """Replays and records an episode.
 
   Args:
-    source: Source of the episode.
     recorded: The episode.
 
   Raises:
     ResultsError: If the replay differs from the results, for example because
       the version of the physics does.
   """
-  row = recorded.row
   ledger = ledgers.Ledger()
-  with contextlib.closing(source.load(recorded)) as env:
+  with contextlib.closing(recorded.load()) as env:
     inspector = _Inspector(env)
     attributor = attribution.WorldAttributor(env)
-    time_steps = replays.play(
-        source.name, env, recorded, [ledger, inspector, attributor]
-    )
+    time_steps = replays.play(env, recorded, [ledger, inspector, attributor])
     view = agent_view.AgentView(env)
     agent = AgentStream(
         view.observation_spec(),
         view.action_spec(),
         time_steps,
         np.array(recorded.actions),
-        _reward(source.design),
+        _reward(recorded.design),
     )
   return Episode(
       agent,
-      source.name,
-      source.is_learned,
-      row,
-      source.design,
+      recorded,
       ledger.last,
       inspector.states,
       inspector.terms,
@@ -118,11 +103,11 @@ def record(source: sources.Source, recorded: replays.Recorded) -> Episode:
   )
 
 
-def kind_of(source: sources.Source) -> str:
-  """Returns a text that is equal for sources with equal columns for agents."""
-  with contextlib.closing(source.load(source.episodes[0])) as env:
+def kind_of(one: replays.Recorded) -> str:
+  """Returns a text that is equal for episodes with equal agent's columns."""
+  with contextlib.closing(one.load()) as env:
     view = agent_view.AgentView(env)
-    parts = view.observation_spec(), view.action_spec(), _reward(source.design)
+    parts = view.observation_spec(), view.action_spec(), _reward(one.design)
   return repr(parts)
 
 

@@ -2,13 +2,10 @@
 
 from collections.abc import Sequence
 import contextlib
-import dataclasses
-from typing import final
 
 from realab_suite import errors
 from realab_suite import worlds
 from realab_suite.audit import aiming
-from realab_suite.engine import environment
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
@@ -19,30 +16,8 @@ from realab_suite.feedback import specs
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 
-
-@final
-@dataclasses.dataclass(frozen=True, eq=False)
-class Source:
-  """Recorded episodes of one run.
-
-  Attributes:
-    name: Name of the run.
-    is_learned: True if a learner chose the actions, False for a scripted
-      policy.
-    design: Design, with the channel of the run.
-    world: World of the episodes.
-    episodes: The episodes, by seed and world.
-  """
-
-  name: str
-  is_learned: bool
-  design: specs.DesignSpec
-  world: worlds.World
-  episodes: tuple[replays.Recorded, ...]
-
-  def load(self, one: replays.Recorded) -> environment.Environment:
-    """Returns an environment with the world of an episode alone."""
-    return self.world.load(self.design, one.row.seed, one.row.world)
+Source = Sequence[replays.Recorded]
+"""Recorded episodes of one run, at least one, by seed and world."""
 
 
 def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
@@ -67,13 +42,7 @@ def of_run(run: sweep_results.Run, num_episodes: int) -> Source:
     chosen = by_seed.setdefault(row.seed, [])
     if len(chosen) < num_episodes:
       chosen.append(replays.recorded(run, row))
-  return Source(
-      run.name,
-      not run.is_scripted,
-      run.design,
-      run.world,
-      tuple(one for chosen in by_seed.values() for one in chosen),
-  )
+  return [one for chosen in by_seed.values() for one in chosen]
 
 
 def of_policy(
@@ -119,7 +88,14 @@ def of_policy(
       found = evaluate.evaluate_batch(batch, tracer)
       trace = tracer.trace()
       episodes += [
-          replays.Recorded(results.row(info, result, stake), trace, index)
+          replays.Recorded(
+              results.row(info, result, stake),
+              design,
+              world,
+              False,
+              trace,
+              index,
+          )
           for index, result in enumerate(found)
       ]
-  return Source(name, False, design, world, tuple(episodes))
+  return episodes

@@ -43,14 +43,15 @@ def rows(episode: recording.Episode, episode_id: int) -> dict[str, list[Row]]:
 
 
 def _episode(episode: recording.Episode, steps: list[Row]) -> Row:
-  row, info = episode.row, episode.row.info
+  row = episode.recorded.row
+  info = row.info
   labels = [step['is_tampering'] for step in steps[1:]]
   objective = next(iter(row.objective.values()), None)
   stake = row.stake
   return {
-      'run': episode.source,
+      'run': info.run,
       'policy': info.policy,
-      'is_learned': episode.is_learned,
+      'is_learned': episode.recorded.is_learned,
       'domain': info.domain,
       'task': info.task,
       'design': info.design,
@@ -79,7 +80,7 @@ def _steps(
     episode: recording.Episode, by_step: list[tuple[Row, ...]]
 ) -> Iterator[Row]:
   """Yields the figures of the reset and of each control step."""
-  relevant = gains.relevant(episode.design)
+  relevant = gains.relevant(episode.recorded.design)
   true_return = 0.0
   is_agents = True
   for step, true_reward in enumerate([0.0, *episode.ledger.true_rewards]):
@@ -123,12 +124,13 @@ def _relative(
     episode: The episode.
     terms: Terms of the step, by part of the objective.
   """
-  stake = episode.row.stake
+  design, row = episode.recorded.design, episode.recorded.row
+  stake = row.stake
   found = [
       terms[part.name].gain
-      * (episode.row.num_steps if part.kind == objectives.RETURN else 1)
+      * (row.num_steps if part.kind == objectives.RETURN else 1)
       / stake.parts[part.name].estimate
-      for part in gains.parts(episode.design.objective)
+      for part in gains.parts(design.objective)
       if stake is not None
       and part.name in terms
       and part.discount == 1
@@ -158,7 +160,7 @@ def _largest(rows_of_step: tuple[Row, ...]) -> Row:
 
 def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
   """Yields the rows of a register, of the reset and of each control step."""
-  spec = episode.design.ports[name]
+  spec = episode.recorded.design.ports[name]
   moved = episode.attribution.registers[name]
   everything = episode.ledger.entries[name]
   # Every register is written at the reset.
@@ -182,7 +184,7 @@ def _register(episode: recording.Episode, name: str) -> Iterator[Row]:
         'step': step,
         'register': name,
         'role': spec.role,
-        'is_consumed': name in gains.consumed(episode.design),
+        'is_consumed': name in gains.consumed(episode.recorded.design),
         'scale': spec.scale,
         'requested': write.requested,
         'applied': write.applied,

@@ -1,6 +1,6 @@
 """Tables of the returns and the corruption of runs, as text and CSV."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 import dataclasses
 import math
 import pathlib
@@ -104,37 +104,51 @@ def summarize(
   lines = []
   for run, of_run in rows.items():
     summary = comparison.summary(run, of_run)
-    found = None
+    found, gained = None, None
+    judgement: verdicts.Judgement | verdicts.Verdict | None = None
+    labels: dict[int, verdicts.Judgement] = {}
     if stake is not None and beside is not None:
       found = hacking.hacking(of_run, beside, stake)
-    labels = _labels(found, of_run) if found and run in agents else {}
-    judgement: verdicts.Judgement | verdicts.Verdict | None = None
-    if labels:
+    if found is not None and run in agents:
+      labels = _labels(found, of_run)
       judgement = verdicts.verdict(list(labels.values()))
     elif run != control:
-      against = [*obstacles]
-      if stake is not None and control is not None:
-        beside_rows = rows[control]
-        if verdicts.gains_at_a_loss(of_run, beside_rows, beside_rows, stake):
-          against.append('it gains more than its control and earns less')
-      judgement = _judgement(
-          of_run, found, summary, against, why_not_judged, control is not None
+      judgement = verdicts.Judgement(
+          _Label.NOT_JUDGED, why_not_judged or 'no gain is known'
       )
+      its = rows.get(control or '', ())
+      if its and {row.info.policy for row in of_run}.issubset(_CONTROLS):
+        judgement = verdicts.Judgement(_Label.CONTROL)
+      elif found is not None and stake is not None:
+        against = [*obstacles]
+        if verdicts.gains_at_a_loss(of_run, its, its, stake):
+          against.append('it gains more than its control and earns less')
+        judgement = verdicts.of_policy(
+            found.count, found.control, summary.is_censored, against
+        )
+    if control is not None and run != control:
+      gained = comparison.gained(run, of_run, rows[control])
+    own, inherited, units = (
+        _mean(_largest(row, consumed, part) for row in of_run)
+        for part in ('own', 'inherited', 'units')
+    )
     facts = [row.facts for row in of_run if row.is_valid]
     lines.append(
         Line(
             run,
             summary,
             found,
-            None
-            if control is None or run == control
-            else comparison.gained(run, of_run, rows[control]),
+            gained,
             judgement,
             labels,
-            _mean_of(of_run, consumed, 'own'),
-            _mean_of(of_run, consumed, 'inherited'),
-            _mean_of(of_run, consumed, 'units'),
-            _mean_gain(of_run),
+            own,
+            inherited,
+            units,
+            _mean(
+                next(iter(row.objective.values())).gain
+                for row in of_run
+                if row.counts and row.objective
+            ),
             {
                 fact: float(np.mean([one[fact] for one in facts]))
                 for fact in (facts[0] if facts else ())
@@ -163,25 +177,19 @@ def _labels(
   return labels
 
 
-def _judgement(
-    rows: Sequence[results.EpisodeRow],
-    found: hacking.Hacking | None,
-    summary: comparison.RunSummary,
-    obstacles: Sequence[str],
-    why_not_judged: str,
-    has_control: bool,
-) -> verdicts.Judgement:
-  """Returns the judgement of a run without labels, other than the control."""
-  is_control = {row.info.policy for row in rows}.issubset(_CONTROLS)
-  if is_control and has_control:
-    return verdicts.Judgement(_Label.CONTROL)
-  if found is None:
-    return verdicts.Judgement(
-        _Label.NOT_JUDGED, why_not_judged or 'no gain is known'
-    )
-  return verdicts.of_policy(
-      found.count, found.control, summary.is_censored, obstacles
-  )
+def _largest(
+    row: results.EpisodeRow, consumed: Sequence[str], part: str
+) -> float:
+  """Returns a part of the corruption of consumed registers, NaN if unknown."""
+  parts = [getattr(row.registers[name], part) for name in consumed]
+  known = [value for value in parts if value is not None]
+  return max(known) if known and row.counts else math.nan
+
+
+def _mean(values: Iterable[float]) -> float | None:
+  """Returns the mean of known values, which are not NaN."""
+  known = [value for value in values if not math.isnan(value)]
+  return float(np.mean(known)) if known else None
 
 
 def as_text(lines: Sequence[Line]) -> str:
@@ -306,36 +314,6 @@ def ends_of(
       'relative_gain': found and found.relative_gain,
       'corruption_metres': summary.corruption,
   }
-
-
-def _mean_of(
-    rows: Sequence[results.EpisodeRow], consumed: Sequence[str], part: str
-) -> float | None:
-  """Returns the mean over episodes of a part of the corruption, in metres."""
-  largest = [
-      max(known)
-      for row in rows
-      if row.counts
-      if (
-          known := [
-              value
-              for name in consumed
-              if (value := getattr(row.registers[name], part)) is not None
-          ]
-      )
-  ]
-  return float(np.mean(largest)) if largest else None
-
-
-def _mean_gain(rows: Sequence[results.EpisodeRow]) -> float | None:
-  """Returns the mean over episodes of the known gains of the objective."""
-  known = [
-      gain
-      for row in rows
-      if row.counts and row.objective
-      if not math.isnan(gain := next(iter(row.objective.values())).gain)
-  ]
-  return float(np.mean(known)) if known else None
 
 
 def return_text(summary: comparison.RunSummary) -> str:

@@ -26,7 +26,6 @@ class Table:
     header: Names of the columns.
     rows: Figures of each row, one per column.
     words: Names of the columns that contain words instead of numbers.
-    families: Design that each row belongs to; empty if there are none.
   """
 
   title: str
@@ -34,7 +33,6 @@ class Table:
   header: Sequence[str]
   rows: Sequence[Sequence[Figure]]
   words: Sequence[str] = ('run',)
-  families: Sequence[str] = ()
 
   @property
   def texts(self) -> list[list[str]]:

@@ -144,7 +144,7 @@ def _write_film(
   from realab_suite.reports import films
 
   with auditor.repeated(found) as (env, policy):
-    with films.beside_each_other(env, path, f'{title}: exploit') as add:
+    with films.film(env, path, f'{title}: exploit') as add:
       evaluate.evaluate(env, policy, 1, sinks=[tracking.Tracker(env, add)])
 
 

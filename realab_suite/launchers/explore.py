@@ -60,9 +60,9 @@ def _write_film() -> None:
   )
   with (
       _loaded() as (env, policy),
-      films.Film(env, path, flags.POLICY.value, tuple(films.WIDTHS)) as film,
+      films.film(env, path, flags.POLICY.value) as add,
   ):
-    recorder = tracking.Tracker(env, film.add)
+    recorder = tracking.Tracker(env, add)
     evaluate.evaluate(env, policy, 1, sinks=[recorder])
   program.say(f'The film is {path}')
 

@@ -37,9 +37,7 @@ def main() -> None:
   replays.replay(
       run,
       row,
-      lambda env, stack: stack.enter_context(
-          films.Film(env, path, name, tuple(films.WIDTHS))
-      ).add,
+      lambda env, stack: stack.enter_context(films.film(env, path, name)),
   )
   program.say(
       f'The film of seed {row.seed}, world {row.world}, episode {row.episode}'

@@ -4,6 +4,7 @@ The launcher `audit` writes a file `audit.json`. Copied to `audits/<run>.json`
 in the folder of the sweep, it tells whether the design of a run is exploitable.
 """
 
+from collections.abc import Mapping
 import json
 import pathlib
 from typing import Any, Literal, final
@@ -21,6 +22,7 @@ from realab_suite.reports import sweep_results
 # Keys of a design that do not change what can be exploited. What the learner
 # maximises, and what it asks for, is compared apart from its other settings.
 _FREE = frozenset({'name', 'description', 'learner'})
+_OF_WORLD = ('max_steps', 'task_kwargs', 'senses')
 
 
 def check_names(sweep: sweep_results.Sweep) -> None:
@@ -102,44 +104,38 @@ def _check_subject(
   Raises:
     ResultsError: If it is not, or is of one register only.
   """
-  world, design = found.world, found.design
-  task = f'{world.get("domain")}.{world.get("task")}'
-  senses = run.config.get('environment_kwargs', {}).get('senses')
-  ours = json.loads(json.dumps(run.design.to_mapping()))
-  objective = run.design.objective
-  pairs = [
-      ('task', task, run.config['task']),
-      ('max_steps', world.get('max_steps'), run.config['max_steps']),
-      (
-          'task_kwargs',
-          world.get('task_kwargs'),
-          run.config.get('task_kwargs', {}),
-      ),
-      ('senses', world.get('senses'), senses and list(senses)),
-      ('target', found.target, None),
-      (
-          'design.learner.kind',
-          (design.get('learner') or {}).get('kind'),
-          (ours.get('learner') or {}).get('kind'),
-      ),
-      (
-          'the objective',
-          found.objective,
-          objective and json.loads(objective.model_dump_json()),
-      ),
-      (
-          'the query policy',
-          found.query_policy,
-          actors.query_policy(run.design),
-      ),
-      *(
-          (f'design.{key}', design.get(key), ours.get(key))
-          for key in sorted({*ours, *design} - _FREE)
-      ),
-  ]
-  for what, theirs, own in pairs:
+  config, design = run.config, run.design
+  senses = config.get('environment_kwargs', {}).get('senses')
+  objective = design.objective and design.objective.model_dump(mode='json')
+  audited = {
+      'task': f'{found.world.get("domain")}.{found.world.get("task")}',
+      **{key: found.world.get(key) for key in _OF_WORLD},
+      'target': found.target,
+      **_of_design(found.design),
+      'the objective': found.objective,
+      'the query policy': found.query_policy,
+  }
+  ours = {
+      'task': config['task'],
+      'max_steps': config['max_steps'],
+      'task_kwargs': config.get('task_kwargs', {}),
+      'senses': senses and list(senses),
+      'target': None,
+      **_of_design(json.loads(json.dumps(design.to_mapping()))),
+      'the objective': objective,
+      'the query policy': actors.query_policy(design),
+  }
+  for key in {**ours, **audited}:
+    theirs, own = audited.get(key), ours.get(key)
     if theirs != own:
       raise errors.ResultsError(
-          f'{path}: the audit is not of run {run.name!r}: {what} is'
+          f'{path}: the audit is not of run {run.name!r}: {key} is'
           f' {theirs!r:.120}, and {own!r:.120} in the run'
       )
+
+
+def _of_design(design: Mapping[str, Any]) -> dict[str, Any]:
+  """Returns the part of a design that an audit depends on."""
+  kind = (design.get('learner') or {}).get('kind')
+  kept = {f'design.{k}': v for k, v in design.items() if k not in _FREE}
+  return {'design.learner.kind': kind, **kept}

@@ -40,10 +40,12 @@ def _on_completeness(
         ' not report them as results.'
     )
   if sweep.unfinished:
+    found: dict[str, list[str]] = {}
+    for one in sweep.unfinished:
+      found.setdefault(one.job.run, []).append(str(one.job.seed))
     missing = ', '.join(
-        f'{name} (seed{"s" if len(seeds) > 1 else ""}'
-        f' {", ".join(map(str, seeds))})'
-        for name, seeds in _unfinished_by_run(sweep).items()
+        f'{name} (seed{"s" if len(seeds) > 1 else ""} {", ".join(seeds)})'
+        for name, seeds in found.items()
     )
     yield (
         f'{len(sweep.unfinished)} of'
@@ -56,13 +58,6 @@ def _on_completeness(
       if run.is_done:
         why = f'all of its {len(run.rows)} episodes failed'
       yield f'There are no figures for {name}: {why}.'
-
-
-def _unfinished_by_run(sweep: sweep_results.Sweep) -> dict[str, list[int]]:
-  found: dict[str, list[int]] = {}
-  for one in sweep.unfinished:
-    found.setdefault(one.job.run, []).append(one.job.seed)
-  return found
 
 
 def _on_seeds(figures: Mapping[str, numbers.Figures]) -> Iterable[str]:

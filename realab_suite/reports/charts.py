@@ -1,40 +1,89 @@
-"""Pictures in the page of a report, except its films: SVG charts and paths."""
+"""Charts in the page of a report, as SVG.
+
+Equal figures give equal bytes.
+"""
 
 import base64
 from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
+import io
 import math
-import pathlib
-import tempfile
 from typing import Any, NamedTuple, final
 
+import matplotlib
+from matplotlib import figure
 from matplotlib import lines
 from matplotlib import patches
 from matplotlib import ticker
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.evaluation import comparison
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
-from realab_suite.experiments import tracking
-from realab_suite.reports import chart_style
 from realab_suite.reports import numbers
 from realab_suite.reports import plots
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 
 _Figures = Mapping[str, numbers.Figures]
-_Styles = Mapping[str, chart_style.Style]
+_Styles = Mapping[str, 'Style']
 
+# Palette of Okabe and Ito, for readers with and without colour blindness.
+# Yellow is left out because it is hard to see on white. Markers distinguish
+# runs without colour.
+_COLOURS = (
+    '#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000',
+)  # fmt: skip
+_MARKERS = ('o', 's', '^', 'D', 'v', 'P', 'X')
+_GREY = '#767676'
+_INK = '#222222'
+_PALE = 0.55
+_DOOR = (0.71, 0.396, 0.114, 1.0)
+_WALL = (0.769, 0.784, 0.812, 1.0)
 # Sizes in inches.
+_WIDTH = 11.4
 _ROW = 1.7
 _MAP = 2.8
 _MAP_COLUMNS = 4
+# Longest name that is drawn in full, in characters.
+_LONGEST_NAME = 24
 # The axis of a figure is symlog above this ratio to its reference value.
 _LARGEST_RATIO = 20.0
-_DOOR = (0.71, 0.396, 0.114, 1.0)
-_WALL = (0.769, 0.784, 0.812, 1.0)
+_STYLE: Any = {
+    **plots.TIDY_AXES,
+    'svg.fonttype': 'none',  # Text stays small and searchable.
+    'svg.hashsalt': 'realab_suite',
+    'font.family': 'sans-serif',
+    'font.size': 9,
+    'axes.titlesize': 9,
+    'axes.edgecolor': '#888888',
+    'axes.labelcolor': _INK,
+    'text.color': _INK,
+    'text.parse_math': False,  # Names may contain dollar signs.
+    'xtick.color': '#555555',
+    'ytick.color': '#555555',
+    'axes.unicode_minus': True,
+}
+
+
+@final
+class Style(NamedTuple):
+  """Colour and marker of a design, its twin and its baselines."""
+
+  colour: str
+  marker: str
+
+
+def styles(names: Sequence[str]) -> dict[str, Style]:
+  """Returns a distinct style for each name; it depends on their order only."""
+  return {
+      name: Style(
+          _COLOURS[i % len(_COLOURS)],
+          # With more designs than colours, markers make new pairs.
+          _MARKERS[(i + i // len(_COLOURS)) % len(_MARKERS)],
+      )
+      for i, name in enumerate(names)
+  }
 
 
 @final
@@ -58,26 +107,47 @@ def data_uri(kind: str, data: bytes) -> str:
   return f'data:{kind};base64,{base64.b64encode(data).decode()}'
 
 
-def _svg(canvas: Any) -> str:
-  return data_uri('image/svg+xml', chart_style.to_svg(canvas))
+def to_svg(canvas: figure.Figure) -> bytes:
+  """Returns a figure as SVG; equal figures give equal bytes."""
+  file = io.BytesIO()
+  # Dates and versions would make equal figures differ.
+  no_metadata = {key: None for key in ('Date', 'Creator', 'Format', 'Type')}
+  canvas.savefig(
+      file,
+      format='svg',
+      metadata=no_metadata,
+      bbox_inches='tight',
+      pad_inches=0.05,
+  )
+  data = file.getvalue()
+  # The document type before this contains a web address.
+  return data[data.index(b'<svg') :]
 
 
-@final
-@dataclasses.dataclass(frozen=True)
-class Band:
-  """Mean curve over seeds, with intervals.
+def _picture(
+    title: str, note: str, canvas: figure.Figure, handles: list[Any]
+) -> Picture:
+  """Returns a figure with a legend as a picture of the page."""
+  plots.add_legend(canvas, handles)
+  return Picture(title, note, data_uri('image/svg+xml', to_svg(canvas)))
 
-  Attributes:
-    steps: Numbers of control steps of training.
-    mean: Mean over seeds at each of them.
-    low: Lower bounds of the intervals; NaN with one seed.
-    high: Upper bounds of the intervals.
-  """
 
-  steps: np.ndarray
-  mean: np.ndarray
-  low: np.ndarray
-  high: np.ndarray
+def _subplots(
+    rows: int, columns: int, size: tuple[float, float], **options: Any
+) -> tuple[figure.Figure, Any]:
+  """Returns a figure of a size in inches, and its array of axes."""
+  canvas = figure.Figure(figsize=size, layout='constrained')
+  return canvas, canvas.subplots(rows, columns, squeeze=False, **options)
+
+
+def _handle(label: str, **options: Any) -> lines.Line2D:
+  """Returns an entry of a legend that is a line or a marker."""
+  return lines.Line2D([], [], label=label, **{'color': _INK, **options})
+
+
+def _shorten(name: str) -> str:
+  """Shortens a name to the width of a chart."""
+  return name if len(name) <= _LONGEST_NAME else f'{name[: _LONGEST_NAME - 1]}…'
 
 
 def curve(
@@ -97,28 +167,38 @@ def curve(
   Returns:
     The mean of each window, by the step at which the window ends.
   """
-  parts: list[list[tuple[int, float]]] = [[]]
-  ends, done, last = [0], 0, 0
-  for step, number, value in points:
-    if value is not None and number:
-      parts[-1].append((number, value))
-    last = step
-    if step - done >= width:
-      ends[-1] = done = step
-      parts.append([])
+  points = list(points)
+  ends: list[int] = []
+  for step, *_ in points:
+    if step - (ends[-1] if ends else 0) >= width:
       ends.append(step)
-  rest = parts.pop()
-  ends.pop()
-  if rest and parts:
-    parts[-1] += rest
-    ends[-1] = last
-  elif rest:
-    parts, ends = [rest], [last]
-  return {
-      end: float(np.average([p[1] for p in part], weights=[p[0] for p in part]))
-      for end, part in zip(ends, parts, strict=True)
-      if sum(p[0] for p in part) >= fewest
-  }
+  known = [(s, n, value) for s, n, value in points if n and value is not None]
+  if known and (not ends or ends[-1] < known[-1][0]):
+    ends[-1:] = [points[-1][0]]
+  means = {}
+  for begin, end in zip([0, *ends], ends, strict=False):
+    counts = [n for s, n, _ in known if begin < s <= end]
+    values = [value for s, _, value in known if begin < s <= end]
+    if sum(counts) >= fewest:
+      means[end] = float(np.average(values, weights=counts))
+  return means
+
+
+@final
+class Band(NamedTuple):
+  """Mean curve over seeds, with intervals.
+
+  Attributes:
+    steps: Numbers of control steps of training.
+    mean: Mean over seeds at each of them.
+    low: Lower bounds of the intervals; NaN with one seed.
+    high: Upper bounds of the intervals.
+  """
+
+  steps: np.ndarray
+  mean: np.ndarray
+  low: np.ndarray
+  high: np.ndarray
 
 
 def band(
@@ -135,46 +215,21 @@ def band(
     bounds: Bounds of the possible values.
   """
   known = {seed: c for seed, c in curves.items() if c}
-  steps = [
-      step
-      for step in sorted({step for c in known.values() for step in c})
-      if all(step in c or max(c) < step for c in known.values())
-  ]
-  found = [
-      intervals.mean_interval(
-          {seed: [c[step]] for seed, c in known.items() if step in c},
-          bounds=bounds,
-      )
-      for step in steps
-  ]
-  return Band(
-      np.array(steps, float),
-      *(
-          np.array([getattr(i, part) for i in found])
-          for part in ('estimate', 'low', 'high')
-      ),
-  )
+  rows = []
+  for step in sorted({step for c in known.values() for step in c}):
+    if all(step in c or max(c) < step for c in known.values()):
+      values = {seed: [c[step]] for seed, c in known.items() if step in c}
+      mean = intervals.mean_interval(values, bounds=bounds)
+      rows.append([step, mean.estimate, mean.low, mean.high])
+  return Band(*np.array(rows, float).reshape(-1, 4).T)
 
 
-@final
-class _Column(NamedTuple):
-  """Column of the learning curves.
-
-  Attributes:
-    title: Name of the figure.
-    key: Its key in a point of a curve.
-    linear: Range in which a symlog axis is linear.
-  """
-
-  title: str
-  key: str
-  linear: float
-
-
+# Title of each column of the learning curves, its key in a point of a curve,
+# and the range in which a symlog axis is linear.
 _COLUMNS = (
-    _Column('true return', 'true_return', 1.0),
-    _Column('observed return (units)', 'observed_return', 10.0),
-    _Column('relative gain', 'gain', hacking.SHARE_OF_STAKE),
+    ('true return', 'true_return', 1.0),
+    ('observed return (units)', 'observed_return', 10.0),
+    ('relative gain', 'gain', hacking.SHARE_OF_STAKE),
 )
 
 
@@ -182,77 +237,87 @@ def learning(
     sweep: sweep_results.Sweep, figures: _Figures, styles: _Styles
 ) -> Picture | None:
   """Returns the chart of returns and relative gain over training."""
-  rows: dict[str, list[sweep_results.Run]] = {}
-  for run in sweep.learned():
-    # The twin is the last one.
-    done = [one for one in (run, sweep.twin(run)) if one and one.is_done]
-    if done:
-      rows[run.name] = done
+  rows = [
+      done
+      for run in sweep.learned()
+      if (done := [r for r in (run, sweep.twin(run)) if r and r.is_done])
+  ]
   if not rows:
     return None
-  with chart_style.style_context():
-    canvas, axes = chart_style.new_figure(
-        len(rows), len(_COLUMNS), _ROW, sharex=True, sharey='col'
+  every: list[Band] = []
+  with matplotlib.rc_context(_STYLE):
+    size = _WIDTH, len(rows) * _ROW + 0.6
+    canvas, axes = _subplots(
+        len(rows), len(_COLUMNS), size, sharex=True, sharey='col'
     )
-    bands = {
-        (name, column.key): [_band(run, column.key) for run in runs]
-        for name, runs in rows.items()
-        for column in _COLUMNS
-    }
-    for row, (name, runs) in zip(axes, rows.items(), strict=True):
+    largest = [0.0] * len(_COLUMNS)
+    for row, runs in zip(axes, rows, strict=True):
+      name = sweep.family(runs[0])
       colour = styles[name].colour
-      for ax, column in zip(row, _COLUMNS, strict=True):
-        for run, one in zip(runs, bands[name, column.key], strict=True):
-          _draw_band(ax, one, colour, is_twin=run.twin_of is not None)
-        chart_style.tidy_axes(ax)
+      for i, (_, key, _) in enumerate(_COLUMNS):
+        for run in runs:
+          one = _band(run, key)
+          _draw_band(row[i], one, colour, is_twin=run.twin_of is not None)
+          largest[i] = max([largest[i], *np.abs(one.mean)])
+          every.append(one)
       baseline = figures.get(runs[0].baseline or '')
       if baseline is not None:
         row[0].axhline(
             baseline.summary.true_return.estimate,
-            color=chart_style.GREY, linestyle=':', zorder=1,
+            color=_GREY, linestyle=':', zorder=1,
         )  # fmt: skip
       row[-1].axhline(0.0, color='#bbbbbb', linewidth=0.8, zorder=0)
-      row[0].set_ylabel(
-          chart_style.shorten(name), color=colour, fontweight='bold'
-      )
-    true, observed, gain = (
-        _largest(bands[name, column.key] for name in rows)
-        for column in _COLUMNS
-    )
-    is_symlog = (
-        False,
-        observed > _LARGEST_RATIO * max(true, 1.0),
-        gain > _LARGEST_RATIO * hacking.SHARE_OF_STAKE,
-    )
-    for ax, column, is_so in zip(axes[0], _COLUMNS, is_symlog, strict=True):
-      if is_so:
-        chart_style.set_symlog(ax.yaxis, ax.set_yscale, column.linear)
-      title = f'{column.title}, symlog' if is_so else column.title
+      row[0].set_ylabel(_shorten(name), color=colour, fontweight='bold')
+    references = (math.inf, max(largest[0], 1.0), hacking.SHARE_OF_STAKE)
+    for ax, (title, _, linear), most, reference in zip(
+        axes[0], _COLUMNS, largest, references, strict=True
+    ):
+      if most > _LARGEST_RATIO * reference:
+        _set_symlog(ax, linear)
+        title += ', symlog'
       ax.set_title(title, fontsize=10)
     for ax in axes.flat:
       # Chooses limits again: lines above have fixed those of the former scale.
       ax.margins(y=0.1)
     for ax in axes[-1]:
-      ax.xaxis.set_major_formatter(ticker.FuncFormatter(_format_count))
+      ax.xaxis.set_major_formatter(ticker.EngFormatter())
       ax.xaxis.set_major_locator(ticker.MaxNLocator(5))
       ax.set_xlabel('control steps of training')
-    chart_style.add_legend(canvas, _learning_legend(rows, figures, bands))
-    uri = _svg(canvas)
-  return Picture(
-      'Learning curves',
-      'Each point is a mean over the training episodes that ended since the'
-      ' previous point; the interval is long enough for an episode in every'
-      " world. The relative gain is what corruption adds to the learner's"
-      ' objective, in units of the stake; episodes above'
-      f' {hacking.SHARE_OF_STAKE:g} may be hacked. Observed returns are in the'
-      ' units of each register. Points with episodes from fewer than half of'
-      ' the worlds are omitted.',
-      uri,
-  )
+    handles: list[Any] = [_handle('design')]
+    if any(len(runs) > 1 for runs in rows):
+      handles.append(_handle('its secure twin', ls='--'))
+    if any(run.baseline in figures for runs in rows for run in runs):
+      handles.append(_handle('its baseline', color=_GREY, ls=':'))
+    # A single seed has no interval.
+    if any(np.isfinite(one.low).any() for one in every):
+      label = '95 % interval over seeds'
+      handles.append(patches.Patch(color=_INK, alpha=0.15, label=label))
+    return _picture(
+        'Learning curves',
+        'Each point is a mean over the training episodes that ended since the'
+        ' previous point; the interval is long enough for an episode in every'
+        " world. The relative gain is what corruption adds to the learner's"
+        ' objective, in units of the stake; episodes above'
+        f' {hacking.SHARE_OF_STAKE:g} may be hacked. Observed returns are in'
+        ' the units of each register. Points with episodes from fewer than half'
+        ' of the worlds are omitted.',
+        canvas,
+        handles,
+    )
 
 
 def _band(run: sweep_results.Run, key: str) -> Band:
   """Returns the mean curve of a run for the key of a point."""
+
+  def value(point: Mapping[str, Any]) -> float | None:
+    """Returns a figure of a point, with gains in units of the stake."""
+    found, stake = point[key], run.stake
+    if key != 'gain' or found is None:
+      return found
+    if stake is None or stake.main.is_degenerate:
+      return None
+    return float(found) / stake.main.estimate
+
   # All worlds begin together, so at first their episodes also end together.
   # The reset takes one step more.
   num_envs = run.config['training']['num_envs']
@@ -260,11 +325,11 @@ def _band(run: sweep_results.Run, key: str) -> Band:
       seed: curve(
           [
               (
-                  point['step'],
-                  point['num_episodes'] - point['num_invalid'],
-                  _value(run, point, key),
+                  one['step'],
+                  one['num_episodes'] - one['num_invalid'],
+                  value(one),
               )
-              for point in points
+              for one in points
           ],
           width=num_envs * (run.config['max_steps'] + 1),
           fewest=-(-num_envs // 2),
@@ -276,18 +341,6 @@ def _band(run: sweep_results.Run, key: str) -> Band:
     means = [value for one in curves.values() for value in one.values()]
     bounds = comparison.return_bounds(run.rows, means)
   return band(curves, bounds)
-
-
-def _value(
-    run: sweep_results.Run, point: Mapping[str, Any], key: str
-) -> float | None:
-  """Returns a figure of a point, with gains in units of the stake."""
-  if key != 'gain':
-    return point[key]
-  gain, stake = point['gain'], run.stake
-  if gain is None or stake is None or stake.main.is_degenerate:
-    return None
-  return float(gain) / stake.main.estimate
 
 
 def _draw_band(ax: Any, one: Band, colour: str, *, is_twin: bool) -> None:
@@ -302,50 +355,16 @@ def _draw_band(ax: Any, one: Band, colour: str, *, is_twin: bool) -> None:
   )  # fmt: skip
 
 
-def _largest(bands: Iterable[Sequence[Band]]) -> float:
-  values = [
-      float(np.abs(one.mean).max())
-      for of_design in bands
-      for one in of_design
-      if one.mean.size
-  ]
-  return max(values, default=0.0)
-
-
-def _learning_legend(
-    rows: Mapping[str, Sequence[sweep_results.Run]],
-    figures: _Figures,
-    bands: Mapping[tuple[str, str], Sequence[Band]],
-) -> list[Any]:
-  """Returns the entries of what the learning curves show."""
-  runs = [run for of_design in rows.values() for run in of_design]
-  ink = chart_style.INK
-  handles: list[Any] = [lines.Line2D([], [], color=ink, label='design')]
-  if any(run.twin_of is not None for run in runs):
-    handles.append(
-        lines.Line2D([], [], color=ink, ls='--', label='its secure twin')
-    )
-  if any(run.baseline in figures for run in runs):
-    handles.append(
-        lines.Line2D(
-            [], [], color=chart_style.GREY, ls=':', label='its baseline'
-        )
-    )
-  # A single seed has no interval.
-  every = [one for of_design in bands.values() for one in of_design]
-  if any(np.isfinite(one.low).any() for one in every):
-    handles.append(
-        patches.Patch(color=ink, alpha=0.15, label='95 % interval over seeds')
-    )
-  return handles
-
-
-def _format_count(value: float, position: int | None = None) -> str:
-  del position
-  for size, letter in ((1e6, 'M'), (1e3, 'k')):
-    if abs(value) >= size:
-      return f'{value / size:g} {letter}'
-  return f'{value:g}'
+def _set_symlog(ax: Any, threshold: float) -> None:
+  """Makes the y axis logarithmic, and linear near zero, with few ticks."""
+  ax.set_yscale('symlog', linthresh=threshold, linscale=0.6)
+  # Powers of ten within the linear part would overlap.
+  lowest = 10.0 ** math.ceil(math.log10(threshold))
+  ax.yaxis.set_major_locator(
+      ticker.SymmetricalLogLocator(base=10, linthresh=lowest)
+  )
+  ax.yaxis.set_minor_locator(ticker.NullLocator())
+  ax.yaxis.set_major_formatter(ticker.StrMethodFormatter('{x:,.5g}'))
 
 
 def plane(
@@ -362,13 +381,12 @@ def plane(
   ]
   if not drawn:
     return None
-  with chart_style.style_context():
-    canvas, [[ax]] = chart_style.new_figure(1, 1, 4.6, 8.6)
+  with matplotlib.rc_context(_STYLE):
+    canvas, [[ax]] = _subplots(1, 1, (8.6, 5.2))
     for one, found in drawn:
-      own = styles[sweep.family(one.run)]
-      colour, marker = own.colour, own.marker
+      colour, marker = styles[sweep.family(one.run)]
       if one.run.is_scripted:
-        colour, marker = chart_style.GREY, 'd'
+        colour, marker = _GREY, 'd'
       look = {
           'linestyle': '',
           'marker': marker,
@@ -381,7 +399,7 @@ def plane(
       ax.plot(
           [100 * count.rate for count in found.by_seed.values()],
           [np.mean(returns[seed]) for seed in found.by_seed],
-          markersize=3.5, alpha=chart_style.PALE, zorder=3, **look,
+          markersize=3.5, alpha=_PALE, zorder=3, **look,
       )  # fmt: skip
       x, y = found.rate.scaled(100), one.summary.true_return
       if math.isfinite(x.low):
@@ -390,29 +408,22 @@ def plane(
         ax.plot([x.estimate] * 2, [y.low, y.high], color=colour, lw=1.2)
       ax.plot(x.estimate, y.estimate, markersize=9, zorder=4, **look)
     ax.set(xlabel='hack rate (%)', ylabel='true return', xlim=(-3, 103))
-    chart_style.tidy_axes(ax)
     handles = [
-        lines.Line2D(
-            [], [], linestyle='', marker=own.marker, color=own.colour,
-            label=name, markersize=7,
-        )
+        _handle(name, ls='', marker=own.marker, color=own.colour, markersize=7)
         for name, own in styles.items()
-    ]  # fmt: skip
+    ]
     handles += [
-        lines.Line2D([], [], linestyle='', marker='o', mfc='white',
-                     color=chart_style.INK, label='hollow: secure twin'),
-        lines.Line2D([], [], linestyle='', marker='d', color=chart_style.GREY,
-                     label='scripted baseline'),
-    ]  # fmt: skip
-    chart_style.add_legend(canvas, handles)
-    uri = _svg(canvas)
-  return Picture(
-      'True return against hack rate',
-      'Small marks are seeds; large marks are means with 95 % intervals. Top'
-      ' left: the design works as intended. Bottom right: it tampers. Bottom'
-      ' left: it fails at the task without tampering.',
-      uri,
-  )
+        _handle('hollow: secure twin', ls='', marker='o', mfc='white'),
+        _handle('scripted baseline', ls='', marker='d', color=_GREY),
+    ]
+    return _picture(
+        'True return against hack rate',
+        'Small marks are seeds; large marks are means with 95 % intervals. Top'
+        ' left: the design works as intended. Bottom right: it tampers. Bottom'
+        ' left: it fails at the task without tampering.',
+        canvas,
+        handles,
+    )
 
 
 def maps(
@@ -424,7 +435,7 @@ def maps(
   if not drawn:
     return None
   walls = [
-      shape
+      shape._replace(colour=_DOOR if shape.kind == 'door' else _WALL)
       for shape in replays.shapes(learned[0])
       if shape.kind in ('wall', 'barrier', 'door')
   ]
@@ -432,53 +443,38 @@ def maps(
   columns = min(len(drawn), _MAP_COLUMNS)
   rows = math.ceil(len(drawn) / columns)
   height = _MAP * (high[1] - low[1]) / (high[0] - low[0]) + 0.2
-  with chart_style.style_context():
-    canvas, axes = chart_style.new_figure(
-        rows, columns, height, columns * _MAP + 0.3
-    )
+  size = columns * _MAP + 0.3, rows * height + 0.6
+  with matplotlib.rc_context(_STYLE):
+    canvas, axes = _subplots(rows, columns, size)
     for ax in axes.flat[len(drawn) :]:
       ax.set_axis_off()
     for ax, run in zip(axes.flat, drawn, strict=False):
       own = styles[sweep.family(run)]
-      plots.draw_shapes(
-          ax,
-          [
-              shape._replace(colour=_DOOR if shape.kind == 'door' else _WALL)
-              for shape in walls
-          ],
-      )
+      plots.draw_shapes(ax, walls)
       _draw_blocks(ax, run, own)
       ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect='equal')
       ax.set(xticks=[], yticks=[])
       ax.set_title(
-          chart_style.shorten(run.name),
-          loc='left', color=own.colour, fontweight='bold',
-      )  # fmt: skip
-      for spine in ax.spines.values():
-        spine.set_visible(False)
+          _shorten(run.name), loc='left', color=own.colour, fontweight='bold'
+      )
+      ax.spines[:].set_visible(False)
     _draw_scale(axes.flat[0], np.array([low[0] + 0.3, high[1] - 0.5]))
-    ink = chart_style.INK
-    handles = [
-        patches.Patch(facecolor='none', edgecolor=ink, linestyle=':',
-                      label='base block at the start'),
-        lines.Line2D([], [], linestyle='', marker='o', color=ink,
-                     alpha=chart_style.PALE,
-                     label='base block at the end of an episode'),
-        patches.Patch(color=_DOOR, label='door'),
-    ]  # fmt: skip
-    chart_style.add_legend(canvas, handles)
-    uri = _svg(canvas)
-  return Picture(
-      'Final positions of registers',
-      'The room from above. Each mark is the position of the base block of a'
-      ' register at the end of an episode, for all seeds.',
-      uri,
-  )
+    base, end = 'base block at the start', 'base block at the end of an episode'
+    dotted: Any = {'facecolor': 'none', 'edgecolor': _INK, 'linestyle': ':'}
+    return _picture(
+        'Final positions of registers',
+        'The room from above. Each mark is the position of the base block of a'
+        ' register at the end of an episode, for all seeds.',
+        canvas,
+        [
+            patches.Patch(label=base, **dotted),
+            _handle(end, ls='', marker='o', alpha=_PALE),
+            patches.Patch(color=_DOOR, label='door'),
+        ],
+    )
 
 
-def _draw_blocks(
-    ax: Any, run: sweep_results.Run, style: chart_style.Style
-) -> None:
+def _draw_blocks(ax: Any, run: sweep_results.Run, style: Style) -> None:
   """Draws the base block of each register, over all seeds of a run."""
   size = max(one.block_size for one in run.design.registers.values())
   traces = list(run.traces.values())
@@ -490,9 +486,7 @@ def _draw_blocks(
     starts = np.unique(start.round(3), axis=0)
     middle = starts.mean(axis=0)
     if len(starts) == 1:
-      plots.draw_block(
-          ax, middle, size / 2, edgecolor=chart_style.INK, linestyle=':'
-      )
+      plots.draw_block(ax, middle, size / 2, edgecolor=_INK, linestyle=':')
     # Equal displacements are drawn once, and all of them as one line with gaps:
     # thousands of separate lines would make the page large.
     moves = np.unique(np.concatenate([start, end], axis=1).round(2), axis=0)
@@ -504,7 +498,7 @@ def _draw_blocks(
     )  # fmt: skip
     ax.plot(
         *end.T, linestyle='', marker=style.marker, markersize=3,
-        color=style.colour, alpha=chart_style.PALE, markeredgewidth=0.6,
+        color=style.colour, alpha=_PALE, markeredgewidth=0.6,
         mfc='white' if run.twin_of is not None else style.colour, zorder=3,
     )  # fmt: skip
     ax.annotate(
@@ -516,41 +510,8 @@ def _draw_blocks(
 def _draw_scale(ax: Any, centre: np.ndarray) -> None:
   """Draws a scale of one metre."""
   x, y = centre
-  ax.plot([x, x + 1.0], [y, y], color=chart_style.INK, linewidth=2, zorder=6)
+  ax.plot([x, x + 1.0], [y, y], color=_INK, linewidth=2, zorder=6)
   ax.annotate(
       '1 m', (x + 0.5, y), xytext=(0, 3), textcoords='offset points',
       fontsize=7, ha='center', zorder=6,
   )  # fmt: skip
-
-
-def paths(
-    learned: Sequence[numbers.Figures],
-) -> tuple[Picture | None, str | None]:
-  """Returns a picture of typical episodes, and a problem.
-
-  Either may be `None`. The problem is the error of the last run whose episode
-  could not be replayed.
-  """
-  tracks: dict[str, tracking.Track] = {}
-  problem = None
-  for one in learned:
-    row = replays.typical_row(one.run)
-    if row is None:
-      continue
-    try:
-      tracks[one.run.name] = replays.replay(one.run, row)
-    except errors.RealabError as error:
-      problem = f'{one.run.name}: {error}'
-  if not tracks:
-    return None, problem
-  with tempfile.TemporaryDirectory() as folder:
-    path = pathlib.Path(folder) / 'paths.png'
-    plots.draw_trajectories(tracks, path)
-    data = path.read_bytes()
-  picture = Picture(
-      'Typical episodes',
-      'Path of the agent and final positions of the blocks, in the episode of'
-      ' median corruption of each design.',
-      data_uri('image/png', data),
-  )
-  return picture, problem

@@ -8,7 +8,7 @@ import contextlib
 import io
 import os
 import pathlib
-from typing import Any, final
+from typing import Any
 
 from dm_control.mujoco import engine
 from imageio import v3 as imageio
@@ -30,6 +30,9 @@ HEIGHT = 480
 WIDTHS = {'top_down': 480, 'first_person': 640}
 """Width of each view, in pixels."""
 
+OnStep = Callable[[Any, tracking.Track], None]
+"""Function that is called with the physics and the track at each step."""
+
 # Codec of each kind of file, and options of its container.
 _CODECS: dict[str, tuple[str, dict[str, str]]] = {
     '.mp4': ('libx264', {}),
@@ -49,92 +52,77 @@ _LABELS = 160
 _LARGE, _SMALL = 18, 16
 
 
-@final
-class Film:
-  """A film with one frame per control step, played in real time.
+@contextlib.contextmanager
+def film(
+    env: environment.Environment,
+    path: str | os.PathLike[str],
+    title: str,
+    views: Sequence[str] = tuple(WIDTHS),
+) -> Iterator[OnStep]:
+  """Opens a film; yields a function for `tracking.Tracker`, which adds a frame.
 
-  It is an H.264 film or an animated picture in WebP, which repeats.
+  The film has one frame per control step, and is played in real time. It is an
+  H.264 film or an animated picture in WebP, which repeats.
+
+  Args:
+    env: Environment to film.
+    path: New file, whose name ends in `.mp4` or `.webp`.
+    title: Title in the strip.
+    views: Keys of `WIDTHS`, shown side by side.
+
+  Raises:
+    ResultsError: If the name has another end, or the file exists or cannot be
+      created.
   """
+  suffix = pathlib.Path(path).suffix
+  if suffix not in _CODECS:
+    raise errors.ResultsError(
+        f'film {os.fspath(path)}: the name ends in {suffix!r}; allowed are'
+        f' {list(_CODECS)}'
+    )
+  codec, options = _CODECS[suffix]
+  try:
+    # The video library would overwrite an existing file.
+    open(path, 'x', encoding='utf-8').close()
+  except OSError as error:
+    raise errors.ResultsError(
+        f'cannot create {os.fspath(path)}: {error.strerror}'
+    ) from error
+  identifiers = {
+      'top_down': 'top_down',
+      'first_person': env.task.avatar.camera.full_identifier,
+  }
+  with contextlib.ExitStack() as stack:
+    # A leftover empty file would prevent a rerun of the same command.
+    stack.callback(os.remove, path)
+    cameras = [
+        engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
+        for view in views
+    ]
+    file = imageio.imopen(
+        pathlib.Path(path), 'w', plugin=pyav.PyAVPlugin, options=options
+    )
+    stack.callback(file.close)
+    file.init_video_stream(
+        codec, fps=1 / env.control_timestep(), pixel_format='yuv420p'
+    )
+    stack.pop_all()
 
-  def __init__(
-      self,
-      env: environment.Environment,
-      path: str | os.PathLike[str],
-      title: str,
-      views: Sequence[str] = ('top_down',),
-  ) -> None:
-    """Opens the file.
-
-    Args:
-      env: Environment to film.
-      path: New file, whose name ends in `.mp4` or `.webp`.
-      title: Title in the strip.
-      views: Keys of `WIDTHS`, shown side by side.
-
-    Raises:
-      ResultsError: If the name has another end, or the file exists or cannot
-        be created.
-    """
-    suffix = pathlib.Path(path).suffix
-    if suffix not in _CODECS:
-      raise errors.ResultsError(
-          f'film {os.fspath(path)}: the name ends in {suffix!r}; allowed are'
-          f' {list(_CODECS)}'
-      )
-    codec, options = _CODECS[suffix]
-    try:
-      # The video library would overwrite an existing file.
-      open(path, 'x', encoding='utf-8').close()
-    except OSError as error:
-      raise errors.ResultsError(
-          f'cannot create {os.fspath(path)}: {error.strerror}'
-      ) from error
-    self._title = title
-    self._env = env
-    identifiers = {
-        'top_down': 'top_down',
-        'first_person': env.task.avatar.camera.full_identifier,
-    }
-    with contextlib.ExitStack() as stack:
-      # A leftover empty file would prevent a rerun of the same command.
-      stack.callback(os.remove, path)
-      self._cameras = [
-          engine.Camera(env.physics, HEIGHT, WIDTHS[view], identifiers[view])
-          for view in views
-      ]
-      self._file = imageio.imopen(
-          pathlib.Path(path), 'w', plugin=pyav.PyAVPlugin, options=options
-      )
-      stack.callback(self._file.close)
-      self._file.init_video_stream(
-          codec, fps=1 / env.control_timestep(), pixel_format='yuv420p'
-      )
-      stack.pop_all()
-
-  def add(self, physics: protocols.Physics, track: tracking.Track) -> None:
-    """Adds a frame; `tracking.Tracker` calls this."""
-    del physics  # The cameras refer to it.
-    self._env.thin_physics.refresh()
-    picture = np.concatenate([c.render() for c in self._cameras], axis=1)
-    strip = draw_strip(self._title, track, picture.shape[1])
+  def add(unused_physics: protocols.Physics, track: tracking.Track) -> None:
+    env.thin_physics.refresh()
+    picture = np.concatenate([one.render() for one in cameras], axis=1)
+    strip = draw_strip(title, track, picture.shape[1])
     # Players show their controls over the lower edge of a paused film.
-    self._file.write_frame(np.concatenate([strip, picture], axis=0))
+    file.write_frame(np.concatenate([strip, picture], axis=0))
 
-  def close(self) -> None:
-    """Completes the file."""
-    self._file.close()
-
-  def __enter__(self) -> 'Film':
-    return self
-
-  def __exit__(self, *unused: Any) -> None:
-    self.close()
+  with contextlib.closing(file):
+    yield add
 
 
 @contextlib.contextmanager
 def all_views(
     env: environment.Environment, folder: pathlib.Path, name: str
-) -> Iterator[Callable[[Any, tracking.Track], None]]:
+) -> Iterator[OnStep]:
   """Opens one film per view; yields a function that adds a frame to each.
 
   A progress bar shows the control steps, because an episode takes minutes
@@ -146,13 +134,12 @@ def all_views(
     name: Title of the films.
   """
   with contextlib.ExitStack() as stack:
-    films = [
+    adders = [
         stack.enter_context(
-            Film(env, folder / f'{name}_{view}.mp4', name, [view])
+            film(env, folder / f'{name}_{view}.mp4', name, [view])
         )
         for view in WIDTHS
     ]
-
     bar = stack.enter_context(
         tqdm.tqdm(
             desc=f'filming {name}',
@@ -164,20 +151,11 @@ def all_views(
     )
 
     def add(physics: protocols.Physics, track: tracking.Track) -> None:
-      for film in films:
-        film.add(physics, track)
+      for adder in adders:
+        adder(physics, track)
       bar.update(track.num_steps - bar.n)
 
     yield add
-
-
-@contextlib.contextmanager
-def beside_each_other(
-    env: environment.Environment, path: pathlib.Path, title: str
-) -> Iterator[Callable[[Any, tracking.Track], None]]:
-  """Opens one film of all views; yields a function that adds a frame."""
-  with Film(env, path, title, tuple(WIDTHS)) as film:
-    yield film.add
 
 
 def last_frame(path: str | os.PathLike[str]) -> bytes:

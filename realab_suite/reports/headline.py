@@ -1,8 +1,6 @@
 """First lines of a report: what each learned agent does, and how sure it is."""
 
-from collections.abc import Mapping, Sequence
-import dataclasses
-from typing import final
+from collections.abc import Mapping
 
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
@@ -12,29 +10,16 @@ from realab_suite.reports import numbers
 from realab_suite.reports import sweep_results
 
 _Label = verdicts.Label
-_NOT_AUDITED = 'not audited'
-
-
-@final
-@dataclasses.dataclass(frozen=True)
-class Entry:
-  """First lines on one learned run.
-
-  Attributes:
-    run: Name of the run.
-    lines: In this order: whether it fails at the task, beside its twin; its
-      label; its hack rate beside that of its control; its audit; the training
-      episodes in which tampering paid.
-  """
-
-  run: str
-  lines: Sequence[str]
 
 
 def headline(
     sweep: sweep_results.Sweep, figures: Mapping[str, numbers.Figures]
-) -> list[Entry]:
+) -> dict[str, list[str]]:
   """Returns the first lines on each learned run, those that tamper first.
+
+  The lines are, in this order: whether the run fails at the task, beside its
+  twin; its label; its hack rate beside that of its control; its audit; the
+  training episodes in which tampering paid.
 
   Args:
     sweep: The sweep.
@@ -43,9 +28,7 @@ def headline(
   runs = [run for run in sweep.learned() if run.name in figures]
   # Sorting keeps the order of the experiment otherwise.
   runs.sort(key=lambda run: -_share(figures[run.name]))
-  return [
-      Entry(run.name, _lines(sweep, figures, figures[run.name])) for run in runs
-  ]
+  return {run.name: _lines(sweep, figures, figures[run.name]) for run in runs}
 
 
 def _share(one: numbers.Figures) -> float:
@@ -132,7 +115,7 @@ def _rate(found: hacking.Hacking) -> str:
 
 def _audit(audit: verdicts.Audit | None) -> str:
   if audit is None:
-    return _NOT_AUDITED
+    return 'not audited'
   if audit.is_exploitable:
     return f'EXPLOITABLE, found within {audit.num_episodes:,} episodes'
   small = '' if audit.is_sufficient else ', a budget that is too small'

@@ -1,12 +1,12 @@
 """HTML page of a report, in one file without external resources.
 
-The pictures and films are made by `charts` and `page_clips`.
+The pictures and films are made by `charts` and `page_episodes`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib import resources
 import os
 import pathlib
+from typing import Any
 from urllib import parse
 
 import jinja2
@@ -17,11 +17,10 @@ from realab_suite import errors
 from realab_suite.experiments import storage
 from realab_suite.experiments import tables
 from realab_suite.reports import caveats
-from realab_suite.reports import chart_style
 from realab_suite.reports import charts
 from realab_suite.reports import headline
 from realab_suite.reports import numbers
-from realab_suite.reports import page_clips
+from realab_suite.reports import page_episodes
 from realab_suite.reports import report_tables
 from realab_suite.reports import sweep_results
 
@@ -29,7 +28,6 @@ PAGE = 'report.html'
 CSV = 'tables.csv'
 MARKDOWN = 'tables.md'
 SEEDS_CSV = 'seeds.csv'
-_TEMPLATE = 'report.html.j2'
 _Say = Callable[[str], None]
 
 
@@ -59,14 +57,14 @@ def write(
   figures = numbers.compute(sweep, say)
   top = headline.headline(sweep, figures)
   overview = report_tables.overview(sweep, figures)
-  details = report_tables.details(sweep, figures)
+  details = report_tables.details(figures)
   cautions = caveats.caveats(sweep, figures)
-  whole = _render(
-      sweep, figures, top, overview, details, cautions, say, no_clips, output
-  )
-  with storage.explained(output):
-    output.mkdir(parents=True, exist_ok=True)
-  words = _words(top)
+  page = _render(
+      sweep, figures, output, say, no_clips,
+      headline=top, overview=overview, tables=details, caveats=cautions,
+  )  # fmt: skip
+  words = [f'{run}: {" ".join(lines)}' for run, lines in top.items()]
+  words = words or ['No learned agent has results yet.']
   limitations = [f'* {tables.escaped(caution)}' for caution in cautions]
   text = '\n\n'.join(
       [
@@ -77,16 +75,81 @@ def write(
           '\n'.join(limitations),
       ]
   )
+  with storage.explained(output):
+    output.mkdir(parents=True, exist_ok=True)
   for name, content in (
       (MARKDOWN, f'{text}\n'),
       (CSV, report_tables.csv_text(figures)),
       (SEEDS_CSV, report_tables.seeds_csv_text(figures)),
-      (PAGE, whole),
+      (PAGE, page),
   ):
     storage.write_whole(output / name, content.encode())
   for line in words:
     say(line)
   return output / PAGE
+
+
+def _render(
+    sweep: sweep_results.Sweep,
+    figures: Mapping[str, numbers.Figures],
+    output: pathlib.Path,
+    say: _Say,
+    no_clips: str | None,
+    **texts: Any,
+) -> str:
+  """Returns the page; the same inputs give the same text.
+
+  Args:
+    sweep: The sweep.
+    figures: Figures of its runs.
+    output: Folder of the page.
+    say: Called with a line on each step of the work.
+    no_clips: Reason to leave out the clips, or `None` to include them.
+    **texts: What the page shares with the Markdown file.
+  """
+  learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
+  styles = charts.styles([run.name for run in sweep.learned()])
+  pictures: dict[str, charts.Picture | None] = {
+      'learning': charts.learning(sweep, figures, styles),
+      'plane': charts.plane(sweep, figures, styles),
+      'maps': charts.maps(sweep, figures, styles),
+  }
+  say('typical episodes')
+  pictures['paths'], no_paths = page_episodes.paths(learned)
+  clips: list[page_episodes.Clip] = []
+  if no_clips is None:
+    clips, no_clips = page_episodes.clips(learned, say)
+  first = next(iter(texts['headline']), None)
+  film = next((clip for clip in clips if clip.run == first), None)
+  return _template().render(
+      **texts,
+      title=_title(sweep),
+      description=str(sweep.experiment.get('description', '')),
+      film=film,
+      facts=_facts(sweep),
+      is_calibration=sweep.is_calibration,
+      unfinished=sweep.unfinished,
+      units=_units(learned),
+      pictures=pictures,
+      no_paths=no_paths,
+      clips=[clip for clip in clips if clip is not film],
+      no_clips=no_clips,
+      replays=_replays(sweep, output),
+      records=[
+          table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
+      ],
+      experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
+      designs={
+          name: yaml.safe_dump(dict(run.config), sort_keys=False)
+          for name, run in sweep.runs.items()
+          if run.is_done
+      },
+      colours={
+          name: styles[sweep.family(run)].colour
+          for name, run in sweep.runs.items()
+          if sweep.family(run) in styles
+      },
+  )
 
 
 def _check_modules(sweep: sweep_results.Sweep) -> None:
@@ -105,66 +168,6 @@ def _check_modules(sweep: sweep_results.Sweep) -> None:
             f'{sweep.folder}: run {run.name}: {error}; import modules of your'
             ' own with --import'
         ) from error
-
-
-def _words(top: Sequence[headline.Entry]) -> list[str]:
-  """Returns the first lines of a report as texts."""
-  if not top:
-    return ['No learned agent has results yet.']
-  return [f'{one.run}: {" ".join(one.lines)}' for one in top]
-
-
-def _render(
-    sweep: sweep_results.Sweep,
-    figures: Mapping[str, numbers.Figures],
-    top: Sequence[headline.Entry],
-    overview: tables.Table,
-    details: Sequence[tables.Table],
-    cautions: Sequence[str],
-    say: _Say,
-    no_clips: str | None,
-    output: pathlib.Path,
-) -> str:
-  """Returns the page; the same inputs give the same text."""
-  styles = chart_style.styles([run.name for run in sweep.learned()])
-  learned = [figures[r.name] for r in sweep.learned() if r.name in figures]
-  pictures: dict[str, charts.Picture | None] = {
-      'learning': charts.learning(sweep, figures, styles),
-      'plane': charts.plane(sweep, figures, styles),
-      'maps': charts.maps(sweep, figures, styles),
-  }
-  say('typical episodes')
-  pictures['paths'], no_paths = charts.paths(learned)
-  clips: list[page_clips.Clip] = []
-  if no_clips is None:
-    clips, no_clips = page_clips.clips(learned, say)
-  film = None
-  if top:
-    film = next((c for c in clips if c.family == top[0].run), None)
-  return _environment().get_template(_TEMPLATE).render(
-      title=_title(sweep),
-      description=str(sweep.experiment.get('description', '')),
-      headline=top,
-      film=film,
-      facts=_facts(sweep),
-      is_calibration=sweep.is_calibration,
-      unfinished=[_unfinished(one, sweep) for one in sweep.unfinished],
-      overview=overview if overview.rows else None,
-      units=_units(learned),
-      tables=details,
-      pictures=pictures,
-      no_paths=no_paths,
-      clips=[clip for clip in clips if clip is not film],
-      no_clips=no_clips,
-      replays=_replays(sweep, output),
-      caveats=cautions,
-      records=[
-          table for table in (_made_with(sweep), _speeds(sweep)) if table.rows
-      ],
-      experiment=yaml.safe_dump(dict(sweep.experiment), sort_keys=False),
-      designs=_designs(sweep),
-      colours={name: style.colour for name, style in styles.items()},
-  )  # fmt: skip
 
 
 def _units(learned: Sequence[numbers.Figures]) -> str:
@@ -192,63 +195,35 @@ def _replays(
   ]
 
 
-def _environment() -> jinja2.Environment:
-  folder = resources.files('realab_suite.reports') / 'templates'
-
-  def load(name: str) -> str:
-    return (folder / name).read_text(encoding='utf-8')
-
+def _template() -> jinja2.Template:
   return jinja2.Environment(
-      loader=jinja2.FunctionLoader(load),
+      loader=jinja2.PackageLoader('realab_suite.reports'),
       autoescape=True,
       undefined=jinja2.StrictUndefined,
       trim_blocks=True,
       lstrip_blocks=True,
-  )
+  ).get_template('report.html.j2')
 
 
 def _title(sweep: sweep_results.Sweep) -> str:
   return f'Tampering report: {sweep.experiment.get("name", sweep.folder.name)}'
 
 
-def _facts(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
-  """Returns names and values of the facts at the top of the page."""
+def _facts(sweep: sweep_results.Sweep) -> dict[str, str]:
+  """Returns the facts at the top of the page, by their names."""
   total = sum(len(run.jobs) for run in sweep.runs.values())
   experiment = sweep.experiment
-  training = experiment.get('training') or {}
-  evaluation = experiment.get('evaluation') or {}
-  facts = [('task', str(experiment.get('task', tables.NOTHING)))]
-  if 'steps' in training:
-    lengths = [f'{training["steps"]:,} control steps per seed'] + [
-        f'{run["steps"]:,} for {name}'
-        for name, run in (experiment.get('runs') or {}).items()
-        if run.get('steps')
-    ]
-    facts.append(('training', '; '.join(lengths)))
-  if 'episodes' in evaluation:
-    facts.append(('evaluation', f'{evaluation["episodes"]} episodes per seed'))
-  facts.append(('seeds', ', '.join(map(str, sweep.seeds))))
-  facts.append(('jobs', f'{total - len(sweep.unfinished)} of {total} finished'))
-  return facts
-
-
-def _unfinished(
-    one: sweep_results.Unfinished, sweep: sweep_results.Sweep
-) -> dict[str, str]:
-  total = (sweep.experiment.get('training') or {}).get('steps')
-  runs = sweep.experiment.get('runs') or {}
-  own = (runs.get(one.job.twin_of or one.job.run) or {}).get('steps')
-  total = own or total
-  how_far = 'not started'
-  if one.has_begun:
-    how_far = 'started, not finished'
-    if one.steps:
-      of = f' of {total:,}' if isinstance(total, int) else ''
-      how_far = f'at {one.steps:,}{of} control steps'
+  lengths = [f'{experiment["training"]["steps"]:,} control steps per seed'] + [
+      f'{run["steps"]:,} for {name}'
+      for name, run in experiment['runs'].items()
+      if run.get('steps')
+  ]
   return {
-      'run': one.job.run,
-      'seed': str(one.job.seed),
-      'how_far': how_far,
+      'task': experiment['task'],
+      'training': '; '.join(lengths),
+      'evaluation': f'{experiment["evaluation"]["episodes"]} episodes per seed',
+      'seeds': ', '.join(map(str, sweep.seeds)),
+      'jobs': f'{total - len(sweep.unfinished)} of {total} finished',
   }
 
 
@@ -288,11 +263,3 @@ def _speeds(sweep: sweep_results.Sweep) -> tables.Table:
       )
   header = ['run', 'seconds per seed', 'control steps per second']
   return tables.Table('Training time', '', header, rows)
-
-
-def _designs(sweep: sweep_results.Sweep) -> list[tuple[str, str]]:
-  return [
-      (name, yaml.safe_dump(dict(run.config), sort_keys=False))
-      for name, run in sweep.runs.items()
-      if run.is_done
-  ]

@@ -4,8 +4,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import math
 import os
 import pathlib
-from typing import Any
+from typing import IO, Any, Final
 
+import matplotlib
 from matplotlib import cm
 from matplotlib import collections
 from matplotlib import colors
@@ -17,7 +18,16 @@ import numpy as np
 
 from realab_suite.entities import appearance
 from realab_suite.experiments import tracking
-from realab_suite.reports import chart_style
+
+TIDY_AXES: Final[Any] = {
+    'axes.grid': True,
+    'axes.axisbelow': True,
+    'axes.spines.top': False,
+    'axes.spines.right': False,
+    'grid.color': '#e6e6e6',
+    'grid.linewidth': 0.6,
+}
+"""Settings of Matplotlib for axes with a pale grid and two borders."""
 
 _DOTS_PER_INCH = 100
 # Sizes in inches.
@@ -54,13 +64,14 @@ def draw(tracks: Mapping[str, tracking.Track], folder: pathlib.Path) -> None:
 
 
 def draw_trajectories(
-    tracks: Mapping[str, tracking.Track], path: str | os.PathLike[str]
+    tracks: Mapping[str, tracking.Track],
+    path: str | os.PathLike[str] | IO[bytes],
 ) -> None:
   """Draws the trajectories of some runs from above, side by side.
 
   Args:
     tracks: A track per run, all with the same world.
-    path: PNG file to write.
+    path: PNG file to write, or a file that is open.
   """
   rows = math.ceil(len(tracks) / _MOST_COLUMNS)
   columns = math.ceil(len(tracks) / rows)
@@ -86,7 +97,7 @@ def draw_trajectories(
   canvas.colorbar(
       clock, ax=axes, label='time (s)', aspect=40, pad=0.01, shrink=0.8
   )
-  chart_style.add_legend(canvas, _world_legend(tracks.values()))
+  add_legend(canvas, _world_legend(tracks.values()))
   # Without a tight box, the topmost title is cut off if there are many panels.
   canvas.savefig(path, bbox_inches='tight', pad_inches=0.1)
 
@@ -106,9 +117,10 @@ def draw_time_line(
       dpi=_DOTS_PER_INCH,
       layout='constrained',
   )
-  axes = canvas.subplots(
-      len(tracks), len(first.registers), squeeze=False, sharex=True
-  )
+  with matplotlib.rc_context(TIDY_AXES):
+    axes = canvas.subplots(
+        len(tracks), len(first.registers), squeeze=False, sharex=True
+    )
   for row, (run, track) in zip(axes, tracks.items(), strict=True):
     # The only title in its row, so that a long name has room.
     row[0].set_title(run, fontsize=10, fontweight='bold', loc='left')
@@ -121,8 +133,22 @@ def draw_time_line(
     row[0].set_ylabel('value (units)')
   for ax in axes[-1]:
     ax.set_xlabel('time (s)')
-  chart_style.add_legend(canvas, _value_legend())
+  add_legend(canvas, axes[0, 0].get_legend_handles_labels()[0])
   canvas.savefig(path)
+
+
+def add_legend(canvas: figure.Figure, handles: list[Any]) -> None:
+  """Adds a legend below a figure, in as many columns as fit."""
+  longest = max(len(handle.get_label()) for handle in handles)
+  # Approximate widths of a marker and of a letter, in inches.
+  fit = int(canvas.get_figwidth() / (0.6 + 0.07 * longest))
+  canvas.legend(
+      handles=handles,
+      loc='outside lower center',
+      ncols=max(1, min(len(handles), fit)),
+      frameon=False,
+      fontsize=8.5,
+  )
 
 
 def extent(
@@ -217,25 +243,30 @@ def _draw_register(
 def _draw_values(
     ax: Any, times: np.ndarray, register: tracking.RegisterTrack
 ) -> None:
-  applied = np.array(register.applied)
-  obstruction = np.array(register.obstruction)
-  permanent = np.array(register.permanent)
-  reading = np.array(register.reading)
-  written = applied + obstruction
-  repaired = written + permanent
-  ax.fill_between(
-      times, applied, written, color=_PURPLE, alpha=0.45, linewidth=0
-  )
-  ax.fill_between(
-      times, written, repaired, color=_ORANGE, alpha=0.45, linewidth=0
-  )
-  ax.fill_between(
-      times, repaired, reading, color=_SKY_BLUE, alpha=0.55, linewidth=0
-  )
-  ax.plot(times, register.clean, color='0.6', linewidth=4.0)
-  ax.plot(times, applied, color=_INK, linewidth=1.2)
-  ax.plot(times, reading, color=_VERMILLION, linewidth=1.2, linestyle='--')
-  chart_style.tidy_axes(ax)
+  applied, obstruction, permanent, reading = np.array(
+      [
+          register.applied, register.obstruction, register.permanent,
+          register.reading,
+      ]
+  )  # fmt: skip
+  ax.plot(times, register.clean, color='0.6', linewidth=4.0, label='clean')
+  ax.plot(times, applied, color=_INK, linewidth=1.2, label='applied')
+  ax.plot(
+      times, reading, color=_VERMILLION, linewidth=1.2, linestyle='--',
+      label='reading',
+  )  # fmt: skip
+  ends = (applied, applied + obstruction, applied + obstruction + permanent)
+  for low, high, colour, alpha, label in zip(
+      ends,
+      (*ends[1:], reading),
+      (_PURPLE, _ORANGE, _SKY_BLUE),
+      (0.45, 0.45, 0.55),
+      ('obstruction', 'permanent corruption', 'temporary corruption'),
+      strict=True,
+  ):
+    ax.fill_between(
+        times, low, high, color=colour, alpha=alpha, linewidth=0, label=label
+    )
   ax.margins(x=0.01)
   ax.set_ylim(_limits([register.clean, register.applied, register.reading]))
 
@@ -286,14 +317,3 @@ def _marker(marker: str, label: str, **options: Any) -> lines.Line2D:
   return lines.Line2D(
       [], [], marker=marker, linestyle='', label=label, markersize=8, **options
   )
-
-
-def _value_legend() -> list[Any]:
-  return [
-      lines.Line2D([], [], color='0.6', linewidth=4.0, label='clean'),
-      lines.Line2D([], [], color=_INK, label='applied'),
-      lines.Line2D([], [], color=_VERMILLION, linestyle='--', label='reading'),
-      patches.Patch(color=_PURPLE, alpha=0.45, label='obstruction'),
-      patches.Patch(color=_ORANGE, alpha=0.45, label='permanent corruption'),
-      patches.Patch(color=_SKY_BLUE, alpha=0.55, label='temporary corruption'),
-  ]

@@ -8,7 +8,7 @@ import contextlib
 import json
 import math
 import pathlib
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -48,20 +48,32 @@ def write(
     ResultsError: If the episode has no trace, the replay differs, or the page
       cannot be written.
   """
-  recorders: list[_Recorder] = []
+  scenes: list[recordings.Recording] = []
+  touched: dict[str, list[tuple[int, str]]] = {}
 
   def start(
       env: environment.Environment, stack: contextlib.ExitStack
   ) -> Callable[[Any, tracking.Track], None]:
-    recorders.append(stack.enter_context(contextlib.closing(_Recorder(env))))
-    return recorders[0].add
+    def add(unused_physics: Any, track: tracking.Track) -> None:
+      if not scenes:
+        # A scene begins in a world that was reset.
+        scene = contextlib.closing(recordings.Recording(env))
+        scenes.append(stack.enter_context(scene))
+      scenes[0].add()
+      for block, kind in contacts(env).items():
+        steps = touched.setdefault(block, [])
+        if kind is not None and track.num_steps:
+          steps.append((track.num_steps, kind))
+
+    return add
 
   track = replays.replay(run, row, start)
-  [recorder] = recorders
-  data = timeline(track, recorder.contacts)
+  data = timeline(track, touched)
   data['title'] = f'{row.info.run}: {row.info.domain}.{row.info.task}'
   data['note'] = f'{replays.words(row)}; ended by {row.end}'
-  page = recorder.page(json.dumps(data, allow_nan=False))
+  page = recordings.with_timeline(
+      scenes[0].page(), json.dumps(data, allow_nan=False)
+  )
   with storage.explained(folder):
     folder.mkdir(parents=True, exist_ok=True)
   path = folder / name(row)
@@ -108,37 +120,6 @@ def _rounded(values: Any) -> list[float | None]:
   ]
 
 
-@final
-class _Recorder:
-  """Records the scene of an episode, and the contacts of its blocks."""
-
-  def __init__(self, env: environment.Environment) -> None:
-    self._env = env
-    self._scene: recordings.Recording | None = None
-    self.contacts: dict[str, list[tuple[int, str]]] = {}
-
-  def add(self, unused_physics: Any, track: tracking.Track) -> None:
-    """Records the start of the episode, or a control step."""
-    if self._scene is None:
-      self._scene = recordings.Recording(self._env)
-    self._scene.add()
-    for block, kind in contacts(self._env).items():
-      steps = self.contacts.setdefault(block, [])
-      if kind is not None and track.num_steps:
-        steps.append((track.num_steps, kind))
-
-  def page(self, data: str) -> str:
-    """Returns the page, with the data of its time line as JSON."""
-    if self._scene is None:
-      self._scene = recordings.Recording(self._env)
-    return recordings.with_timeline(self._scene.page(), data)
-
-  def close(self) -> None:
-    """Ends the recording of the scene."""
-    if self._scene is not None:
-      self._scene.close()
-
-
 def contacts(env: environment.Environment) -> dict[str, str | None]:
   """Returns the contact of each block that can be pushed, by its name.
 
@@ -150,36 +131,32 @@ def contacts(env: environment.Environment) -> dict[str, str | None]:
     another register, or `None`.
   """
   physics = env.thin_physics
-  touching = np.asarray(physics.data.ptr.contact.geom).reshape(-1, 2)
-  torso = env.task.avatar.mjcf_model.find_all('geom')
-  avatar = set(np.ravel(physics.bind(torso).element_id).tolist())
+  pairs = np.asarray(physics.data.ptr.contact.geom).reshape(-1, 2)
+
+  def ids(elements: Any) -> set[int]:
+    return set(np.ravel(physics.bind(elements).element_id).tolist())
+
+  avatar = ids(env.task.avatar.mjcf_model.find_all('geom'))
   blocks = {
       f'{register_name}/{block.body.name}': block
       for register_name, register in env.mechanism.registers.items()
       for block in register.blocks
       if isinstance(block, block_kinds.JointedBlock)
   }
-  ids = {
-      block_name: int(np.ravel(physics.bind(block.geom).element_id)[0])
-      for block_name, block in blocks.items()
-  }
-  found: dict[str, str | None] = {}
-  for block_name, block in blocks.items():
-    own = ids[block_name]
-    pairs = touching[(touching == own).any(axis=1)]
-    others = set(pairs[pairs != own].tolist())
+  geoms = {one: ids(block.geom) for one, block in blocks.items()}
+  others = set().union(*geoms.values())
+  found: dict[str, str | None] = dict.fromkeys(blocks)
+  for one, block in blocks.items():
+    own = np.isin(pairs, list(geoms[one])).any(axis=1)
+    touching = set(pairs[own].ravel().tolist()) - geoms[one]
     constraints = [c for grasp in block.grasps for c in grasp.constraints]
-    is_held = (
-        bool(constraints)
+    if (
+        constraints
         and grasps.held(np.asarray(physics.bind(constraints).active)).any()
-    )
-    found[block_name] = (
-        'held'
-        if is_held
-        else 'touched'
-        if others & avatar
-        else 'hit'
-        if others & set(ids.values())
-        else None
-    )
+    ):
+      found[one] = 'held'
+    elif touching & avatar:
+      found[one] = 'touched'
+    elif touching & others:
+      found[one] = 'hit'
   return found

@@ -12,6 +12,7 @@ import dm_env
 import numpy as np
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import events
@@ -19,6 +20,7 @@ from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import results
 from realab_suite.experiments import tables
 from realab_suite.experiments import tracking
+from realab_suite.feedback import specs
 from realab_suite.reports import sweep_results
 
 # Returns a function that is called at every control step of an episode.
@@ -31,11 +33,18 @@ class Recorded(NamedTuple):
 
   Attributes:
     row: Its result.
+    design: Design, with the channel of the run.
+    world: World of the run.
+    is_learned: True if a learner chose the actions, False for a scripted
+      policy.
     trace: Trace that contains it; see `traces`.
     position: Index of the episode in the trace.
   """
 
   row: results.EpisodeRow
+  design: specs.DesignSpec
+  world: worlds.World
+  is_learned: bool
   trace: Mapping[str, Any]
   position: int
 
@@ -44,6 +53,10 @@ class Recorded(NamedTuple):
     """Actions, `(steps, *action_spec.shape)`."""
     num_steps = self.trace['num_steps'][self.position]
     return self.trace['actions'][:num_steps, self.position]
+
+  def load(self) -> environment.Environment:
+    """Returns an environment with the world of the episode alone."""
+    return self.world.load(self.design, self.row.seed, self.row.world)
 
 
 def first_row(run: sweep_results.Run) -> results.EpisodeRow | None:
@@ -94,23 +107,22 @@ def replay(
     ResultsError: If the episode has no trace, or the replay differs, for
       example because the version of the physics does.
   """
+  one = recorded(run, row)
   with contextlib.ExitStack() as stack:
-    env = stack.enter_context(contextlib.closing(load(run, row)))
+    env = stack.enter_context(contextlib.closing(one.load()))
     recorder = tracking.Tracker(env, on_step and on_step(env, stack))
-    play(run.name, env, recorded(run, row), [recorder])
+    play(env, one, [recorder])
   return recorder.track
 
 
 def play(
-    name: str,
     env: environment.Environment,
     one: Recorded,
-    sinks: Sequence[events.EventSink] = (),
+    sinks: Sequence[events.EventSink],
 ) -> list[dm_env.TimeStep]:
   """Plays an episode again, through the view that agents get.
 
   Args:
-    name: Name of the run.
     env: Environment with the world of the episode.
     one: The episode.
     sinks: Event sinks of the environment while it is played.
@@ -122,6 +134,10 @@ def play(
     ResultsError: If its length or a figure differs from the recorded one, for
       example because the version of the physics does.
   """
+  row = one.row
+  differs = (
+      f'{row.info.run}: the replay of (seed, world, episode) {row.key} differs'
+  )
   view = agent_view.AgentView(env)
   time_steps: list[dm_env.TimeStep] = []
 
@@ -134,48 +150,34 @@ def play(
     num_steps = len(time_steps) - 1
     if not time_steps[-1].last() or num_steps != len(one.actions):
       raise errors.ResultsError(
-          f'{name}: the replay of (seed, world, episode) {one.row.key} differs'
-          f' from its trace: it has {num_steps} control steps; allowed are'
-          f' {len(one.actions)}, as with the same version of the physics'
+          f'{differs} from its trace: it has {num_steps} control steps; allowed'
+          f' are {len(one.actions)}, as with the same version of the physics'
       )
 
   [result] = evaluate.results_of(
-      env, act, 1, first_episode=one.row.episode, sinks=sinks
+      env, act, 1, first_episode=row.episode, sinks=sinks
   )
-  _check_same(name, one.row, result)
-  return time_steps
-
-
-def _check_same(
-    name: str, row: results.EpisodeRow, result: evaluate.EpisodeResult
-) -> None:
   replayed, known = (
       (each.true_return, each.observed_return, each.corruption or 0.0)
       for each in (result, row)
   )
   if not np.allclose(replayed, known, rtol=1e-9, atol=1e-9, equal_nan=True):
     raise errors.ResultsError(
-        f'{name}: the replay of (seed, world, episode) {row.key} differs'
-        ' from the results: (true return, observed return, corruption) are'
-        f' {replayed} in the replay and {known} in the results'
+        f'{differs} from the results: (true return, observed return,'
+        f' corruption) are {replayed} in the replay and {known} in the results'
     )
+  return time_steps
 
 
 def shapes(run: sweep_results.Run) -> list[tracking.Shape]:
   """Returns the shapes in the world of the first episode of a run."""
   first = min(run.rows, key=lambda row: row.key)
-  with contextlib.closing(load(run, first)) as env:
+  env = run.world.load(run.design, first.seed, first.world)
+  with contextlib.closing(env):
     recorder = tracking.Tracker(env)
     env.add_sink(recorder)
     env.reset()
     return recorder.track.shapes
-
-
-def load(
-    run: sweep_results.Run, row: results.EpisodeRow
-) -> environment.Environment:
-  """Returns an environment with the world of an episode alone."""
-  return run.world.load(run.design, row.seed, row.world)
 
 
 def recorded(run: sweep_results.Run, row: results.EpisodeRow) -> Recorded:
@@ -192,7 +194,8 @@ def recorded(run: sweep_results.Run, row: results.EpisodeRow) -> Recorded:
     keys = zip(trace['seed'], trace['world'], trace['episode'], strict=True)
     for index, key in enumerate(keys):
       if key == row.key and row.num_steps == trace['num_steps'][index]:
-        return Recorded(row, trace, index)
+        learned = not run.is_scripted
+        return Recorded(row, run.design, run.world, learned, trace, index)
   raise errors.ResultsError(
       f'{run.name}: (seed, world, episode) {row.key} has no trace'
   )

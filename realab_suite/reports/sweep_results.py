@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import json
 import pathlib
-from typing import Annotated, Any, final
+from typing import Annotated, Any, NamedTuple, final
 
 import pydantic
 
@@ -25,13 +25,6 @@ from realab_suite.feedback import specs
 
 REPLAYS = 'replays'
 """Folder of the pages with replays, in the folder of a sweep."""
-
-_CURVE_KEYS = (
-    'step', 'num_episodes', 'num_invalid', 'true_return', 'observed_return',
-    'gain',
-)  # fmt: skip
-_EPISODE_KEYS = ('step', 'objective', 'is_ended_by_tampering')
-_TIMING_KEYS = ('step', 'seconds')
 
 
 @final
@@ -64,19 +57,11 @@ class _Description(pydantic.BaseModel):
 
 
 @final
-@dataclasses.dataclass(frozen=True)
-class Unfinished:
-  """A job without results.
-
-  Attributes:
-    job: The job.
-    steps: Number of control steps of training in its last complete record.
-    has_begun: True if it has a folder.
-  """
+class Unfinished(NamedTuple):
+  """A job without results, and how far it is, as text."""
 
   job: Job
-  steps: int
-  has_begun: bool
+  how_far: str
 
 
 @final
@@ -152,7 +137,12 @@ class Run:
   @functools.cached_property
   def curves(self) -> dict[int, list[dict[str, Any]]]:
     """Learning curve of each seed; empty for a scripted policy."""
-    return self._lines(training.CURVE, _CURVE_KEYS)
+    if self.is_scripted:
+      return {}
+    return {
+        seed: read_lines(path / training.CURVE)
+        for seed, path in self.folders.items()
+    }
 
   @functools.cached_property
   def timing(self) -> dict[int, list[dict[str, Any]]]:
@@ -161,7 +151,7 @@ class Run:
     Empty for a scripted policy, and without the seeds of a packed sweep.
     """
     return {
-        seed: read_lines(path / training.TIMING, _TIMING_KEYS)
+        seed: read_lines(path / training.TIMING)
         for seed, path in self.folders.items()
         if (path / training.TIMING).exists()
     }
@@ -181,7 +171,7 @@ class Run:
         name = training.TRAINING_GAINS
       found[seed] = [
           record
-          for record in read_lines(path / name, _EPISODE_KEYS)
+          for record in read_lines(path / name)
           for _ in range(record.get('num_episodes', 1))
       ]
     return found
@@ -198,16 +188,6 @@ class Run:
             path / training.TRACE,
             training.header(jobs.digest_of(self.configs[seed]), training.TRACE),
         )
-        for seed, path in self.folders.items()
-    }
-
-  def _lines(
-      self, name: str, keys: Sequence[str]
-  ) -> dict[int, list[dict[str, Any]]]:
-    if self.is_scripted:
-      return {}
-    return {
-        seed: read_lines(path / name, keys)
         for seed, path in self.folders.items()
     }
 
@@ -284,31 +264,30 @@ def load(folder: pathlib.Path) -> Sweep:
     raise errors.ResultsError(
         f'{path}: {key_path or "contents"}: {first["msg"]}'
     ) from error
-  unfinished: list[Unfinished] = []
+  experiment = scheduler.read_experiment(folder, content)
   planned: dict[str, list[Job]] = {}
   for job in description.jobs:
     planned.setdefault(job.run, []).append(job)
-  runs = {
-      name: _run(folder, name, of, unfinished) for name, of in planned.items()
-  }
+  unfinished = tuple(
+      Unfinished(job, _how_far(job, folder / job.folder, experiment))
+      for of_run in planned.values()
+      for job in of_run
+      if not (folder / job.folder / storage.DONE).exists()
+  )
   return Sweep(
       folder,
-      scheduler.read_experiment(folder, content),
+      experiment,
       description.calibration,
-      runs,
-      tuple(unfinished),
+      {name: _run(folder, name, of_run) for name, of_run in planned.items()},
+      unfinished,
   )
 
 
-def read_lines(path: pathlib.Path, keys: Sequence[str]) -> list[dict[str, Any]]:
+def read_lines(path: pathlib.Path) -> list[dict[str, Any]]:
   """Reads a file with a JSON mapping in each line.
 
-  Args:
-    path: Path of the file.
-    keys: Keys that each line must have.
-
   Raises:
-    ResultsError: If the file cannot be read or a line is invalid. The message
+    ResultsError: If the file cannot be read or a line is not JSON. The message
       names the line.
   """
   with storage.explained(path):
@@ -316,26 +295,15 @@ def read_lines(path: pathlib.Path, keys: Sequence[str]) -> list[dict[str, Any]]:
   records = []
   for number, line in enumerate(text.splitlines(), start=1):
     try:
-      record = json.loads(line)
+      records.append(json.loads(line))
     except (ValueError, RecursionError) as error:
       raise errors.ResultsError(
           f'{path}:{number}: not JSON: {error}'
       ) from error
-    missing = [
-        key for key in keys if not isinstance(record, dict) or key not in record
-    ]
-    if missing:
-      raise errors.ResultsError(f'{path}:{number}: has no {missing[0]!r}')
-    records.append(record)
   return records
 
 
-def _run(
-    folder: pathlib.Path,
-    name: str,
-    planned: Sequence[Job],
-    unfinished: list[Unfinished],
-) -> Run:
+def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
   folders, configs = {}, {}
   rows: list[results.EpisodeRow] = []
   transplants: list[results.EpisodeRow] = []
@@ -346,7 +314,6 @@ def _run(
           f'{path}: a symbolic link; allowed are folders of the sweep'
       )
     if not (path / storage.DONE).exists():
-      unfinished.append(_unfinished(job, path))
       continue
     # Rows first: their errors name the damaged line.
     rows += _rows(path / training.EPISODES, job.run)
@@ -393,16 +360,24 @@ def _check_stakes(
     )
 
 
-def _unfinished(job: Job, path: pathlib.Path) -> Unfinished:
+def _how_far(
+    job: Job, path: pathlib.Path, experiment: Mapping[str, Any]
+) -> str:
   """Returns the progress of a job, according to its complete records."""
+  if not path.exists():
+    return 'not started'
   steps = 0
-  curve = path / training.CURVE
-  if curve.exists():
-    with storage.explained(curve):
-      lines = curve.read_bytes().splitlines()
+  if (path / training.CURVE).exists():
+    with storage.explained(path / training.CURVE):
+      lines = (path / training.CURVE).read_bytes().splitlines()
     for line in lines[-2:]:  # The last line of a running job may be incomplete.
       try:
         steps = int(json.loads(line)['step'])
       except (ValueError, KeyError, TypeError):
         continue
-  return Unfinished(job, steps, path.exists())
+  if not steps:
+    return 'started, not finished'
+  # Names of twins and baselines begin with that of their run.
+  name, _, _ = job.run.partition('.')
+  total = experiment['runs'][name]['steps'] or experiment['training']['steps']
+  return f'at {steps:,} of {total:,} control steps'

@@ -376,8 +376,8 @@ def test_gymnasium_has_a_number_for_each_port():
 
 
 def test_a_dataset_has_rows_for_each_port():
-  source = made.source(design=abacus.DESIGN, max_steps=_MAX_STEPS)
-  episode = recording.record(source, source.episodes[0])
+  [recorded] = made.source(design=abacus.DESIGN, max_steps=_MAX_STEPS)
+  episode = recording.record(recorded)
   rows = truth.rows(episode, 0)['registers']
   assert len(rows) == len(_PORTS) * (_MAX_STEPS + 1)
   assert {row['register'] for row in rows} == set(_PORTS)

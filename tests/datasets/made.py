@@ -19,6 +19,7 @@ from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
+from realab_suite.reports import replays
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -200,10 +201,20 @@ def episode(
   ledger = ledgers.EpisodeLedger(
       7, 0, 0, entries, [0.5, 2.0, math.nan], events.End.TERMINATED
   )
+  world = worlds.World('unlock_door', 'near', 3)
   return recording.Episode(
-      stream(), 'by_hand', False, row, design, ledger, states, terms,
-      attribution,
+      stream(), replays.Recorded(row, design, world, False, {}, 0), ledger,
+      states, terms, attribution,
   )  # fmt: skip
+
+
+def changed(
+    one: replays.Recorded, design: dict[str, Any], **row: Any
+) -> replays.Recorded:
+  """Returns an episode with another design and changes of its row."""
+  return one._replace(
+      design=specs.load(design), row=one.row.model_copy(update=row)
+  )
 
 
 def source(

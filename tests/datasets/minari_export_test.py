@@ -22,14 +22,14 @@ def test_a_dataset_is_loaded_by_minari(tmp_path, monkeypatch):
   export.export(source, tmp_path / 'new', data_format='minari')
   assert (tmp_path / 'new/evaluator/steps.parquet').exists()
   monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path / 'new/agent'))
-  name = minari_export.dataset_id(('unlock_door', 'near'), source.name)
+  name = minari_export.dataset_id(
+      ('unlock_door', 'near'), source[0].row.info.run
+  )
   assert name == 'realab/unlock_door-near/no_op--embedded--v0'
   assert name in (tmp_path / 'new/README.md').read_text()
   dataset = minari.load_dataset(name)
   assert (dataset.total_episodes, dataset.total_steps) == (2, 8)
-  for episode, recorded in zip(
-      dataset.iterate_episodes(), source.episodes, strict=True
-  ):
+  for episode, recorded in zip(dataset.iterate_episodes(), source, strict=True):
     np.testing.assert_array_equal(episode.actions, recorded.actions)
     assert episode.rewards.sum() == recorded.row.observed_return
     assert episode.truncations.tolist() == [False, False, False, True]
@@ -41,9 +41,8 @@ def test_a_dataset_is_loaded_by_minari(tmp_path, monkeypatch):
 
 def test_an_episode_keeps_images_types_and_ends(tmp_path, monkeypatch):
   agent = made.stream()
-  with minari_export.MinariWriter(tmp_path, 'realab/made/by_hand-v0') as writer:
-    writer.add(agent, 0)
-    writer.add(made.stream(discount=1.0), 1)
+  agents = [agent, made.stream(discount=1.0)]
+  minari_export.write(tmp_path, 'realab/made/by_hand-v0', iter(agents))
   monkeypatch.setenv('MINARI_DATASETS_PATH', str(tmp_path))
   dataset = minari.load_dataset('realab/made/by_hand-v0')
   first, second = dataset.iterate_episodes()

@@ -18,9 +18,9 @@ from tests.datasets import made
 
 
 def _written(folder, agents):
-  with parquet.Writer(folder) as writer:
+  with parquet.appending(folder) as append:
     for episode_id, agent in enumerate(agents):
-      writer.add(agent, episode_id)
+      append(parquet.AGENT_FILE, parquet.agent_table(agent, episode_id))
   return pyarrow_parquet.read_table(folder / parquet.AGENT_FILE)
 
 
@@ -77,7 +77,8 @@ def test_without_a_reward_register_there_is_no_such_column(tmp_path):
 
 
 def test_memory_is_bounded_by_groups_of_rows(tmp_path, monkeypatch):
-  monkeypatch.setattr(parquet, '_MAX_ROWS', 6)
+  size = parquet.agent_table(made.stream(), 0).nbytes
+  monkeypatch.setattr(parquet, '_MAX_BYTES', 2 * size)
   table = _written(tmp_path, [made.stream()] * 5)
   assert table.num_rows == 15
   file = pyarrow_parquet.ParquetFile(tmp_path / parquet.AGENT_FILE)
@@ -87,8 +88,9 @@ def test_memory_is_bounded_by_groups_of_rows(tmp_path, monkeypatch):
 
 def test_the_tables_of_the_evaluator_are_read_again(tmp_path):
   rows = truth.rows(made.episode(), 0)
-  with parquet.Writer(tmp_path) as writer:
-    writer.add_truth(rows)
+  with parquet.appending(tmp_path) as append:
+    for path, table in parquet.truth_tables(rows):
+      append(path, table)
   for name, expected in rows.items():
     table = pyarrow_parquet.read_table(
         tmp_path / 'evaluator' / f'{name}.parquet'

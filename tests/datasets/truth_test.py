@@ -7,7 +7,6 @@ import pytest
 
 from realab_suite.datasets import truth
 from realab_suite.evaluation import stakes
-from realab_suite.feedback import specs
 from tests.datasets import made
 
 pytest.importorskip('pyarrow')
@@ -173,14 +172,13 @@ def test_a_mean_is_compared_with_its_stake_in_each_step():
   one = made.episode()
   one = dataclasses.replace(
       one,
-      design=specs.load(design),
-      terms=[{'mean': term['return']} for term in one.terms],
-      row=one.row.model_copy(
-          update={
-              'objective': {'mean': one.row.objective['return']},
-              'stake': stakes.Stakes(key='', parts={'mean': made.STAKE.main}),
-          }
+      recorded=made.changed(
+          one.recorded,
+          design,
+          objective={'mean': one.recorded.row.objective['return']},
+          stake=stakes.Stakes(key='', parts={'mean': made.STAKE.main}),
       ),
+      terms=[{'mean': term['return']} for term in one.terms],
   )
   found = truth.rows(one, 0)['steps']
   assert [row['relative_gain'] for row in found[1:]] == [
@@ -195,9 +193,8 @@ def test_a_learner_that_is_not_judged_has_no_terms():
   one = made.episode(stake=None)
   one = dataclasses.replace(
       one,
-      design=specs.load(design),
+      recorded=made.changed(one.recorded, design, objective={}),
       terms=[{}] * 3,
-      row=one.row.model_copy(update={'objective': {}}),
   )
   tables = truth.rows(one, 0)
   assert {row['objective'] for row in tables['steps']} == {None}

@@ -61,7 +61,7 @@ def _replay(job, path):
   configs = {job.seed: jobs.read_config(path)}
   run = sweep_results.Run(job.run, (), {}, (), (), configs)
   row = next(iter(results.read_rows(path / training.EPISODES)))
-  return replays.load(run, row)
+  return replays.Recorded(row, run.design, run.world, False, {}, 0).load()
 
 
 def test_arguments_reach_training_evaluation_baselines_and_replays(

@@ -119,7 +119,7 @@ def test_the_tables_of_a_report_are_the_same_byte_for_byte(
 ):
   packing.unpack(packed, tmp_path / 'sweep')
   # The page also draws charts, and prints the times if they are there.
-  monkeypatch.setattr(html_page, '_render', lambda *unused: '')
+  monkeypatch.setattr(html_page, '_render', lambda *unused, **texts: '')
   assert not sweep_results.load(tmp_path / 'sweep').runs['reward'].timing
   for folder, name in ((built, 'before'), (tmp_path / 'sweep', 'after')):
     html_page.write(folder, tmp_path / name, lambda line: None, 'no clips')

@@ -7,7 +7,7 @@ from realab_suite.experiments import training
 from realab_suite.reports import caveats
 from realab_suite.reports import html_page
 from realab_suite.reports import numbers
-from realab_suite.reports import page_clips
+from realab_suite.reports import page_episodes
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 from tests.reports import pages
@@ -65,7 +65,7 @@ def test_a_run_whose_episodes_are_all_given_up_has_figures(own_five, tmp_path):
   assert replays.first_row(run) is None
   figures = numbers.compute(sweep_results.load(own_five))
   assert figures['decoupled'].outcomes == {}
-  assert page_clips.clips([figures['decoupled']], pages.quiet) == ([], None)
+  assert page_episodes.clips([figures['decoupled']], pages.quiet) == ([], None)
 
 
 def test_failed_episodes_are_left_out_and_forbid_a_favourable_label(

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from realab_suite.reports import chart_style
 from realab_suite.reports import charts
 from realab_suite.reports import numbers
 from realab_suite.reports import sweep_results
@@ -14,9 +13,9 @@ from tests.experiments import fake_sweep
 def _canvases(monkeypatch):
   """The figures that charts are made of."""
   canvases = []
-  to_svg = chart_style.to_svg
+  to_svg = charts.to_svg
   monkeypatch.setattr(
-      chart_style,
+      charts,
       'to_svg',
       lambda canvas: canvases.append(canvas) or to_svg(canvas),
   )
@@ -36,7 +35,7 @@ def _drawn(folder, chart, canvases, run=None):
   if run is not None:
     runs = {name: one for name, one in sweep.runs.items() if name == run}
     sweep = sweep_results.Sweep(folder, {}, False, runs, ())
-  styles = chart_style.styles([one.name for one in sweep.learned()])
+  styles = charts.styles([one.name for one in sweep.learned()])
   picture = chart(sweep, figures, styles)
   assert picture.uri.startswith('data:image/svg+xml;base64,')
   [canvas] = canvases
@@ -123,7 +122,7 @@ def test_a_band_is_the_interval_over_seeds():
 
 def test_thirty_designs_have_thirty_styles():
   names = [f'design {i}' for i in range(30)]
-  looks = chart_style.styles(names)
+  looks = charts.styles(names)
   assert len(set(looks.values())) == 30
 
 

@@ -29,8 +29,7 @@ def fixture_one_seed(tmp_path_factory):
 def _lines(folder):
   sweep = sweep_results.load(folder)
   figures = numbers.compute(sweep)
-  found = headline.headline(sweep, figures)
-  return {entry.run: entry.lines for entry in found}, figures
+  return headline.headline(sweep, figures), figures
 
 
 def _change_rows(folder, run, seed, **changes):

@@ -151,7 +151,8 @@ def test_pictures_show_corruption_that_a_meter_passed_on(tmp_path, track):
 
 def test_a_film_of_another_kind_is_refused(tmp_path):
   with pytest.raises(errors.ResultsError, match=r"'\.gif'; allowed.*webp"):
-    films.Film(None, tmp_path / 'film.gif', 'run')
+    with films.film(None, tmp_path / 'film.gif', 'run'):
+      pass
   assert not list(tmp_path.iterdir())
 
 
@@ -161,8 +162,8 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
   from imageio import v3 as imageio
 
   env = _load()
-  with films.Film(env, tmp_path / 'film.mp4', 'run', ['top_down']) as film:
-    recorder = tracking.Tracker(env, film.add)
+  with films.film(env, tmp_path / 'film.mp4', 'run', ['top_down']) as add:
+    recorder = tracking.Tracker(env, add)
     evaluate.evaluate(env, policies.make('random'), 1, sinks=[recorder])
   frames = imageio.imread(tmp_path / 'film.mp4', plugin='pyav')
   assert len(frames) == 41
@@ -176,8 +177,8 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
   assert np.ptp(view[0]) > 100
   assert np.abs(view[0].astype(int) - view[-1]).max() > 50
   # An animated picture shows the same, and repeats.
-  with films.Film(env, tmp_path / 'film.webp', 'run', ['top_down']) as film:
-    recorder = tracking.Tracker(env, film.add)
+  with films.film(env, tmp_path / 'film.webp', 'run', ['top_down']) as add:
+    recorder = tracking.Tracker(env, add)
     env.add_sink(recorder)
     env.reset()
     env.step(env.action_spec().minimum)
@@ -189,7 +190,8 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
   # A film is never overwritten.
   before = (tmp_path / 'film.mp4').read_bytes()
   with pytest.raises(errors.ResultsError, match='exists'):
-    films.Film(env, tmp_path / 'film.mp4', 'run')
+    with films.film(env, tmp_path / 'film.mp4', 'run'):
+      pass
   assert (tmp_path / 'film.mp4').read_bytes() == before
   # Filming does not change what happens.
   policy_of = {'policies': ('random',), 'channels': (), 'seeds': (3,)}

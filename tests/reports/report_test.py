@@ -288,20 +288,13 @@ def test_changed_results_are_refused(own_folder):
     sweep_results.load(own_folder)
 
 
-@pytest.mark.parametrize(
-    ('line', 'problem'),
-    [
-        (b'{"step": 1', ':11: not JSON'),
-        (b'{"step": 1}', ":11: has no 'num_episodes"),
-    ],
-)
-def test_a_corrupt_point_of_a_curve_is_named(own_folder, line, problem):
+def test_a_corrupt_point_of_a_curve_is_named(own_folder):
   pages.spoil(
       own_folder, 'reward', 1, training.CURVE,
-      lambda data: data + line + b'\n',
+      lambda data: data + b'{"step": 1\n',
   )  # fmt: skip
   run = sweep_results.load(own_folder).runs['reward']
-  with pytest.raises(errors.ResultsError, match=re.escape(problem)):
+  with pytest.raises(errors.ResultsError, match=':11: not JSON'):
     _ = run.curves
 
 

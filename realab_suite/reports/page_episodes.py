@@ -1,8 +1,9 @@
-"""Films in the page of a report."""
+"""Typical episodes in the page of a report: their paths, and films."""
 
 from collections.abc import Callable, Sequence
 import contextlib
 import dataclasses
+import io
 import pathlib
 import tempfile
 from typing import Any, final
@@ -11,6 +12,7 @@ from realab_suite import errors
 from realab_suite.evaluation import results
 from realab_suite.reports import charts
 from realab_suite.reports import numbers
+from realab_suite.reports import plots
 from realab_suite.reports import replays
 from realab_suite.reports import sweep_results
 
@@ -21,18 +23,44 @@ class Clip:
   """A film in the page.
 
   Attributes:
-    family: Design that the film belongs to.
-    title: Title of the film.
+    run: Run that the film shows.
     note: Figures of the episode.
     uri: Data URI of the film.
     poster: Data URI of its last frame, for printed pages.
   """
 
-  family: str
-  title: str
+  run: str
   note: str
   uri: str
   poster: str
+
+
+def paths(
+    learned: Sequence[numbers.Figures],
+) -> tuple[charts.Picture | None, str | None]:
+  """Returns a picture of typical episodes, and a problem.
+
+  Either may be `None`. The problem is the error of the last run whose episode
+  could not be replayed.
+  """
+  tracks, problem = {}, None
+  for one in learned:
+    if row := replays.typical_row(one.run):
+      try:
+        tracks[one.run.name] = replays.replay(one.run, row)
+      except errors.RealabError as error:
+        problem = f'{one.run.name}: {error}'
+  if not tracks:
+    return None, problem
+  file = io.BytesIO()
+  plots.draw_trajectories(tracks, file)
+  picture = charts.Picture(
+      'Typical episodes',
+      'Path of the agent and final positions of the blocks, in the episode of'
+      ' median corruption of each design.',
+      charts.data_uri('image/png', file.getvalue()),
+  )
+  return picture, problem
 
 
 def clips(
@@ -68,14 +96,13 @@ def _clip(run: sweep_results.Run, row: results.EpisodeRow) -> Clip:
     def film(env: Any, stack: contextlib.ExitStack) -> Any:
       # Halves the time per frame, without a visible difference in a clip.
       env.physics.model.vis.quality.offsamples = 0
-      return stack.enter_context(films.Film(env, path, run.name)).add
+      return stack.enter_context(films.film(env, path, run.name, ['top_down']))
 
     replays.replay(run, row, film)
     data = path.read_bytes()
     poster = films.last_frame(path)
   return Clip(
       run.name,
-      f'{run.name}: typical episode',
       f'evaluation {replays.words(row)}',
       charts.data_uri('video/mp4', data),
       charts.data_uri('image/jpeg', poster),
