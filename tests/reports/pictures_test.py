@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+from unittest import mock
 
 from matplotlib import figure
 import numpy as np
@@ -204,3 +205,35 @@ def test_a_film_shows_every_step_and_filming_changes_nothing(tmp_path):
   assert small.rows(tmp_path / 'plain') == small.rows(tmp_path / 'filmed')
   names = sorted(path.name for path in (tmp_path / 'filmed/videos').iterdir())
   assert names == ['random_first_person.mp4', 'random_top_down.mp4']
+
+
+class _Stopped(BaseException):
+  """An interruption."""
+
+
+@pytest.mark.parametrize('place', ['Camera', 'imopen', 'init_video_stream'])
+def test_a_film_that_fails_leaves_no_file(tmp_path, monkeypatch, place):
+  path = tmp_path / 'film.mp4'
+  files = []
+
+  def stop(*unused, **unused_too):
+    raise _Stopped
+
+  def imopen(*unused, **unused_too):
+    path.write_bytes(b'begun')
+    files.append(mock.Mock(init_video_stream=stop))
+    return files[-1]
+
+  monkeypatch.setattr(films.engine, 'Camera', lambda *unused: None)
+  monkeypatch.setattr(films.imageio, 'imopen', imopen)
+  if place == 'Camera':
+    monkeypatch.setattr(films.engine, 'Camera', stop)
+  elif place == 'imopen':
+    monkeypatch.setattr(films.imageio, 'imopen', stop)
+  env = _load()
+  for _ in range(2):  # Nothing is in the way of another attempt.
+    with pytest.raises(_Stopped), films.film(env, path, 'title'):
+      raise AssertionError('the film has begun')
+  assert all(file.close.called for file in files)
+  assert not list(tmp_path.iterdir())
+  env.close()
