@@ -1,10 +1,9 @@
-"""Tests for the campaigns on planted bugs and on coverage."""
+"""Tests for the campaign on planted bugs, and the list of all campaigns."""
 
 import re
 
 import pytest
 
-from campaigns import coverage_campaign
 from campaigns import figure_lines
 from campaigns import mutants_campaign
 from campaigns import planting
@@ -25,9 +24,9 @@ def test_a_bug_can_be_planted_and_its_tests_exist(mutant):
 
 
 def test_an_argument_that_is_not_a_number_gives_the_usage(monkeypatch):
-  monkeypatch.setattr('sys.argv', ['coverage_campaign', '--help'])
+  monkeypatch.setattr('sys.argv', ['mutants_campaign', '--help'])
   with pytest.raises(SystemExit, match='usage: python -m campaigns'):
-    figure_lines.run(coverage_campaign.main)
+    figure_lines.run(mutants_campaign.main)
 
 
 def test_a_bug_that_cannot_be_planted_is_named():
@@ -57,30 +56,6 @@ def test_tests_fail_with_a_bug_and_pass_without_it(tmp_path):
   assert planting.is_caught(mutant, tmp_path)
   harmless = mutant._replace(new=mutant.old.replace(' != ', '  !=  '))
   assert not planting.is_caught(harmless, tmp_path)
-
-
-def test_what_tests_did_not_go_through_is_counted_and_named():
-  one = {
-      'summary': {
-          'num_statements': 6, 'num_branches': 4,
-          'covered_lines': 5, 'covered_branches': 3,
-      },
-      'missing_lines': [7], 'missing_branches': [[6, 7]],
-  }  # fmt: skip
-  files = {'feedback/a.py': one, 'engine/b.py': one}
-  reached, missed = coverage_campaign.share(files, ['feedback/'])
-  assert reached == 0.75
-  assert missed == ['feedback/a.py: 7, 6->7']
-  with pytest.raises(RuntimeError, match='have not been measured'):
-    coverage_campaign.share(files, ['nothing/'])
-
-
-def test_targets_of_coverage_exist():
-  for places, _ in coverage_campaign.TARGETS.values():
-    for place in places:
-      assert (planting.ROOT / 'realab_suite' / place).exists()
-  for tests in coverage_campaign.TESTS:
-    assert (planting.ROOT / tests).exists()
 
 
 def test_the_figures_list_exactly_the_campaigns():

@@ -3,6 +3,8 @@
 import hypothesis
 
 _USUAL = 100
+# Whether tests may take minutes.
+IS_LONG = hypothesis.settings.default.max_examples > _USUAL
 
 
 def settings(number: int) -> hypothesis.settings:

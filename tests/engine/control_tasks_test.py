@@ -12,6 +12,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import seeding
 from realab_suite.evaluation import ledgers
+from tests import examples
 from tests.engine import embedded
 from tests.engine import helpers
 
@@ -24,15 +25,21 @@ _TOTAL_MASS = (
 # Each of them has what the ones before lack: contacts that are disabled;
 # contacts; a fluid without gravity and constraints; equalities, and walls that
 # are planes; a model that an episode changes; a terrain and activations. The
-# campaign `embedding` plays all of `embedded.CONTROL_TASKS`.
+# profile `long` plays all.
 _NAMES = [
     ('cartpole', 'two_poles'),
-    pytest.param('cheetah', 'run', marks=pytest.mark.mujoco_warns(_TOTAL_MASS)),
+    ('cheetah', 'run'),
     ('fish', 'swim'),
     ('manipulator', 'bring_ball'),
     ('point_mass', 'hard'),
     ('quadruped', 'fetch'),
 ]
+if examples.IS_LONG:
+  _NAMES = [
+      (domain, task)
+      for domain, tasks in embedded.CONTROL_TASKS.items()
+      for task in tasks
+  ]
 
 
 def _stock(domain: str, task: str) -> tuple[control.Environment, Any]:
@@ -55,6 +62,7 @@ def _bytes(observation: Any) -> dict[str, tuple[str, tuple[int, ...], bytes]]:
   }
 
 
+@pytest.mark.mujoco_warns(_TOTAL_MASS)
 @pytest.mark.parametrize(('domain', 'task'), _NAMES)
 def test_a_task_beside_registers_equals_the_original_bit_for_bit(
     domain: str, task: str

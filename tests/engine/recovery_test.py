@@ -4,6 +4,7 @@ import functools
 from typing import Any
 
 from dm_control import composer
+import mujoco
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ from realab_suite.engine import events
 from tests.engine import helpers
 
 _NAN, _INF = float('nan'), float('inf')
-_BREAKS = pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC')
+_BREAKS = pytest.mark.mujoco_warns('BADQPOS', 'BADQVEL', 'BADQACC', 'BADCTRL')
 _NO_OP = np.zeros(1)  # Of `PointTask`.
 
 
@@ -44,6 +45,11 @@ def _break_now(env: environment.Environment, how: str) -> None:
     data.qpos[0] = _INF
   elif how == 'far':
     data.qpos[0] = 1e11
+  elif how == 'control':  # MuJoCo clamps all other values.
+    data.ctrl[0] = _NAN
+  elif how == 'contacts':  # MuJoCo drops some, and counts a warning.
+    full = int(mujoco.mjtWarning.mjWARN_CONTACTFULL)
+    data.ptr.warning[full].number = 1
   else:
     data.qfrc_applied[0] = 1e30
 
@@ -90,7 +96,8 @@ def test_physics_that_fail_end_the_episode_and_nothing_else(
 
 
 @pytest.mark.parametrize(
-    ('phase', 'how'), [(1, 'qvel'), (2, 'qpos'), (3, 'far')]
+    ('phase', 'how'),
+    [(1, 'qvel'), (1, 'control'), (2, 'qpos'), (2, 'contacts'), (3, 'far')],
 )
 @_BREAKS
 def test_physics_that_fail_within_a_step_are_noticed_in_that_step(

@@ -4,7 +4,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from campaigns import bulldozers_campaign
 from realab_suite import errors
 from realab_suite.entities import appearance
 from realab_suite.entities import arenas
@@ -155,8 +154,7 @@ def test_no_block_flies_out_of_the_room(room, size, mass, is_guarded):
       worlds.step(physics)
       position = worlds.world_position(physics, block)
       highest = max(highest, position[2])
-      is_outside = bulldozers_campaign.is_outside(arena, position[:2])
-      num_outside += int(is_outside)
+      num_outside += not arena.extent.contains(position[:2], -_GIVES)
   assert highest > 1.0 + size
   assert (num_outside == 0) is is_guarded
 
@@ -238,7 +236,7 @@ def test_the_size_of_the_room_is_as_asked_for(room):
 
 @every_room
 def test_walls_are_too_thick_to_tunnel_through(room):
-  # Campaign C30's rule: at least 5 cm.
+  # At least 5 cm.
   arena = _ROOMS[room]()
   arena.add_barrier('barrier', (0.0, 0.0), (1.0, 0.0))
   model = worlds.compile_world(arena).model
