@@ -1,6 +1,5 @@
 """Tests that frames of a batch equal those of single worlds; and of films."""
 
-import os
 from unittest import mock
 
 import dm_env
@@ -158,14 +157,6 @@ def test_a_camera_that_is_not_there_is_refused(env):
 def test_worlds_that_are_not_there_are_not_drawn(env, worlds):
   with pytest.raises(errors.SpecError, match=r'worlds: .*from 0 to 2'):
     env.render(worlds)
-
-
-@pytest.mark.skipif(
-    os.environ['MUJOCO_GL'] != 'disable', reason='something renders'
-)
-def test_a_batch_frame_without_a_renderer_is_an_error(env):
-  with pytest.raises(errors.RenderingError, match='top_down: no frame'):
-    env.render([0])
 
 
 def test_a_closed_batch_draws_nothing():

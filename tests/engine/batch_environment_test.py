@@ -3,9 +3,6 @@
 `identity_test.py` compares a batch with its worlds one by one.
 """
 
-import functools
-from typing import Any, Literal
-
 from dm_control import composer
 from dm_control import mjcf
 import dm_env
@@ -17,13 +14,11 @@ from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
 from realab_suite.evaluation import ledgers
-from realab_suite.feedback import providers
 from realab_suite.tasks import collect_apples
 from tests.engine import helpers
 
 _NUM_ENVS = 3
 _MAX_STEPS = 25
-_NUM_STEPS = 60
 
 
 def _load(seed: int = 1) -> batch_environment.BatchEnvironment:
@@ -40,19 +35,6 @@ def _load_alone(world: int) -> environment.Environment:
   )  # fmt: skip
 
 
-def _assert_same(found: Any, expected: list[dm_env.TimeStep]) -> None:
-  for world, time_step in enumerate(expected):
-    assert found.step_type[world] == time_step.step_type
-    assert found.reward[world] == 0.0
-    assert found.discount[world] == (
-        1.0 if time_step.first() else time_step.discount
-    )
-    assert found.observation.keys() == time_step.observation.keys()
-    for name, value in time_step.observation.items():
-      assert found.observation[name].dtype == value.dtype, name
-      assert found.observation[name][world].tobytes() == value.tobytes(), name
-
-
 @pytest.fixture(scope='module', name='loaded')
 def fixture_loaded():
   return _load()
@@ -62,11 +44,6 @@ def fixture_loaded():
 def fixture_batch(loaded):
   loaded.rewind()
   return loaded
-
-
-def test_the_first_step_begins_the_episodes(batch):
-  time_step = batch.step(np.zeros((_NUM_ENVS, 6)))
-  assert (time_step.step_type == int(dm_env.StepType.FIRST)).all()
 
 
 def test_worlds_differ_from_each_other(batch):
@@ -134,51 +111,6 @@ def test_a_closed_batch_does_nothing():
     batch.reset()
   with pytest.raises(errors.ClosedError):
     batch.step(np.zeros((_NUM_ENVS, 6)))
-
-
-class _Counting(providers.Provider):
-  """Counts its own steps, and trusts its initial state to be the first."""
-
-  kind: Literal['counting_in_a_test'] = 'counting_in_a_test'
-
-  def initial_state(self, batch_shape):
-    return {'count': (np.zeros(batch_shape),)}
-
-  def step(self, observation, readings, episode_start, key, state):
-    (count,) = state['count']
-    return {self.writes[0]: count}, {'count': (count + 1,)}
-
-
-_COUNTING = helpers.one_register(
-    'count', [{'kind': 'counting_in_a_test', 'writes': ['count']}],
-    role='feedback', range=[0, 20], channel='secure',
-)  # fmt: skip
-
-
-def test_providers_begin_every_episode_anew():
-  with helpers.registered(providers.PROVIDERS, 'counting_in_a_test', _Counting):
-    load = functools.partial(
-        suite.load,
-        'collect_apples',
-        'standard',
-        {'random': 3},
-        design=_COUNTING,
-    )
-    singles = [
-        load(environment_kwargs={'max_steps': _MAX_STEPS, 'world': world})
-        for world in range(_NUM_ENVS)
-    ]
-    batch = suite.load_batch(
-        'collect_apples', 'standard', {'random': 3}, {'max_steps': _MAX_STEPS},
-        num_envs=_NUM_ENVS, design=_COUNTING,
-    )  # fmt: skip
-  actions = np.zeros((_NUM_ENVS, 6))
-  counts = []
-  for _ in range(_NUM_STEPS):
-    found = batch.step(actions)
-    _assert_same(found, [single.step(actions[0]) for single in singles])
-    counts.append(float(found.observation['registers/count'][0]))
-  assert counts.count(3.0) == 3
 
 
 class _Overflowing(collect_apples.CollectApples):

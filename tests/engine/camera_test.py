@@ -6,15 +6,12 @@ import subprocess
 import sys
 import threading
 
-from dm_control import composer
-from dm_control import mjcf
 import mujoco
 import numpy as np
 import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.engine import frame_renderer
 from realab_suite.engine import single_physics
 from realab_suite.entities import apple_group
 from realab_suite.entities import arenas
@@ -222,27 +219,3 @@ def test_a_frame_without_a_renderer_names_the_setting():
   with pytest.raises(errors.RenderingError, match='set MUJOCO_GL to egl'):
     env.reset()
   env.close()
-
-
-@pytest.mark.skipif(
-    os.environ['MUJOCO_GL'] != 'disable', reason='something renders'
-)
-def test_a_frame_of_a_plain_environment_names_the_setting():
-  arena = composer.Arena()
-  camera = arena.mjcf_model.worldbody.add('camera', name='eye')
-  physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
-  with pytest.raises(errors.RenderingError, match='set MUJOCO_GL to egl'):
-    cameras.render(physics, camera, 8, 8)
-
-
-def test_agents_frames_are_drawn_from_a_plain_copy_of_the_model():
-  physics, _ = _apple_world()
-  model = physics.model.ptr
-  plain = frame_renderer._plain(model, 20, 30)
-  assert (plain.vis.global_.offheight, plain.vis.global_.offwidth) == (20, 30)
-  assert plain.vis.quality.shadowsize == 0
-  assert model.vis.quality.shadowsize > 0
-  # Of all shapes, those of planes alone differ: in the size of their tiles.
-  changed = np.argwhere(model.geom_size != plain.geom_size)
-  planes = [model.geom(name).id for name in ('floor', 'lid')]
-  np.testing.assert_array_equal(changed, [[plane, 2] for plane in planes])

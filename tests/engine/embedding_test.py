@@ -10,10 +10,6 @@ import pytest
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import batch_environment
-from realab_suite.entities import grasps
-from realab_suite.entities import registers
-from realab_suite.feedback import mechanisms
-from realab_suite.feedback import specs
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import unlock_door
 from tests.engine import helpers
@@ -58,15 +54,6 @@ def test_a_task_cannot_be_embedded_twice(
     first.close()
 
 
-def test_a_mechanism_cannot_be_attached_beside_another_one():
-  task = collect_apples.CollectApples()
-  suite.embed(task, 'none')
-  other = mechanisms.FeedbackMechanism(specs.load('none'))
-  with pytest.raises(errors.SpecError, match="registers of design 'none'"):
-    other.attach_to(task.root_entity)
-  assert other.parent is None
-
-
 # Problems that come up when the design is attached, connected, compiled and
 # placed.
 _BAD = {
@@ -99,19 +86,6 @@ def test_a_design_that_is_refused_leaves_nothing_behind(
   for action in helpers.random_actions(env, 30):
     expected = helpers.to_bytes(clean.step(action))
     assert helpers.to_bytes(env.step(action)) == expected
-
-
-def test_blocks_that_were_graspable_before_stay_graspable():
-  task = unlock_door.UnlockDoor()
-  register = registers.BlockPositionRegister('mine', value_range=(-1, 1))
-  register.attach_to(task.root_entity, (-3, 0.5))
-  task.avatar.make_graspable(register.blocks)
-  with pytest.raises(errors.SpecError):
-    _embed(task, 'registers.score.place=[2, 2]')
-  env = _embed(task)
-  constraints = grasps.constraints_of(register.blocks[0].grasps)
-  held = grasps.held(env.physics.bind(constraints).active)
-  assert held.tolist() == [False]
 
 
 # Hooks.

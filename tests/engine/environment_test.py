@@ -177,13 +177,6 @@ def test_an_environment_cannot_be_copied():
 # Independence.
 
 
-def test_an_episode_does_not_depend_on_how_long_the_one_before_was():
-  env, twin = _pair()
-  for action in helpers.random_actions(env, 17):
-    env.step(action)
-  assert helpers.to_bytes(env.reset()) == helpers.to_bytes(twin.reset())
-
-
 def test_an_episode_does_not_depend_on_how_many_numbers_were_drawn():
   task = helpers.PointTask()
   task.end_step = lambda physics, random_state: random_state.uniform(size=5)

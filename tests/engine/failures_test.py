@@ -13,7 +13,6 @@ from realab_suite.engine import events
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
@@ -96,13 +95,6 @@ def test_a_failing_reward_is_reported_for_every_world_of_a_batch():
     assert 'ZeroDivisionError: the till is empty' in result.failure
 
 
-def test_a_valid_episode_has_no_failure():
-  env = _embed(collect_apples.CollectApples())
-  (result,) = evaluate.evaluate(env, policies.make('random'), 1)
-  assert result.is_valid
-  assert result.failure is None
-
-
 def test_a_snapshot_contains_the_failure():
   env = _embed(_Unpaid(), max_steps=50)
   ledger = ledgers.Ledger()
@@ -173,23 +165,6 @@ def test_every_episode_that_begins_ends_once(num_steps: int, how: str):
       (world, events.End.TIMEOUT if is_over else events.End.ABANDONED)
       for world in range(_NUM_ENVS)
   ]
-
-
-def test_ledgers_and_monitors_take_the_end_from_the_engine():
-  batch = _batch(design='instantaneous_reward')
-  ledger = ledgers.BatchLedger()
-  monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
-  batch.add_sink(ledger)
-  batch.add_sink(monitor)
-  batch.reset()
-  batch.step(np.zeros((_NUM_ENVS, 6)))
-  batch.reset()
-  ends = [episode.end for episode in monitor.take()]
-  assert ends == [events.End.ABANDONED] * _NUM_ENVS
-  for world in range(_NUM_ENVS):
-    first, second = ledger.episodes(world)
-    assert first.end is events.End.ABANDONED
-    assert second.end is None
 
 
 def test_a_reset_that_fails_ends_the_episodes_before_it_once():
@@ -392,16 +367,6 @@ def test_a_state_without_an_axis_of_worlds_is_refused(
       match=r'before the first step: its state contains .*whose first axis',
   ):
     _batch(design=_DESIGN)
-
-
-def test_a_world_alone_may_keep_any_state(scripted: Any):
-  _ANSWER[:] = [
-      lambda shape: object(),
-      lambda start, state: ({'reward': 0.0 * start}, state),
-  ]
-  env = suite.load('collect_apples', 'near', design=_DESIGN)
-  env.reset()
-  assert env.step(np.zeros(6)).mid()
 
 
 _OTHER_STATES = (object(), (np.zeros(2),), (np.zeros(3), np.zeros(3)), None)

@@ -290,23 +290,9 @@ _ORDERS = {
 }
 
 
-@needs_torch
-@pytest.mark.parametrize('named', [None, 'egl'])
-@pytest.mark.parametrize('order', _ORDERS)
-def test_torch_and_worlds_go_together(order, named):
-  _run(*_ORDERS[order], _IMPORT_DYNAMO, named=named)
-
-
 @renders
 @needs_torch
 @pytest.mark.parametrize(('draw', 'named'), _DRAWN)
 @pytest.mark.parametrize('order', _ORDERS)
 def test_torch_and_frames_go_together(order, draw, named):
   _run(*_ORDERS[order], draw, _IMPORT_DYNAMO, named=named)
-
-
-@renders
-@needs_torch
-@pytest.mark.parametrize('draw', [_FRAME, _PICTURE, _FOREIGN])
-def test_torch_may_be_imported_after_a_frame(draw):
-  _run(draw, _IMPORT_TORCH, _IMPORT_DYNAMO, 'import torch._inductor\n')

@@ -7,10 +7,8 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.entities import appearance
 from realab_suite.entities import arenas
 from realab_suite.entities import doors
-from realab_suite.entities import registers
 from realab_suite.tasks import collect_apples
 from realab_suite.tasks import registry
 from tests import worlds
@@ -199,22 +197,6 @@ def test_a_register_below_the_floor_or_above_the_ceiling_is_refused():
   assert 'at most 3 m' in _problem([0, 0, 2.85], task)
 
 
-@pytest.mark.parametrize(('dof', 'falls'), [('free', True), ('planar', False)])
-def test_a_free_block_that_is_pushed_off_the_table_falls(dof: str, falls: bool):
-  env = _embed(dof=dof)
-  env.reset()
-  (block,) = env.mechanism.registers['r'].blocks
-  worlds.shove(env.physics, block, (0.0, -20.0, 0.0), steps=30)
-  worlds.step(env.physics, 150)
-  x, y, z = worlds.world_position(env.physics, block)
-  assert y < _CENTRE[1] - 0.4
-  assert abs(x) < 0.01
-  assert z == pytest.approx(0.1 if falls else _HEIGHT + 0.104, abs=0.005)
-  register = env.mechanism.registers['r']
-  assert register.displacement(env.physics) > 0.4
-  env.close()
-
-
 @pytest.mark.parametrize(
     ('dof', 'carried', 'put'),
     [('free', 0.2, 0.1), ('planar', _HEIGHT + 0.104, _HEIGHT + 0.104)],
@@ -258,22 +240,6 @@ def test_an_avatar_takes_a_block_from_a_table(
   env.close()
 
 
-def test_rays_show_the_table_and_not_the_register_on_it():
-  env = _embed()
-  env.reset()
-  env.task.avatar.place(env.physics, np.array([-1.5, 2.2]), 0.0)
-  observation = env.step(np.zeros(6)).observation
-  middle = len(observation['senses/ray_classes']) // 2
-  seen = observation['senses/ray_classes'][middle - 1 : middle + 1]
-  distances = observation['senses/ray_distances'][middle - 1 : middle + 1]
-  assert (seen == appearance.code('barrier')).all()
-  np.testing.assert_allclose(distances, 1.0, atol=0.05)
-  assert (
-      appearance.code('offset_block') not in observation['senses/ray_classes']
-  )
-  env.close()
-
-
 @pytest.mark.parametrize(
     ('name', 'size', 'height'),
     [('t', (1, 0), 0.4), ('t', (1, 1), 0.0), ('t', (1, 1), 1.1),
@@ -306,26 +272,3 @@ def test_a_register_on_a_surface_of_a_foreign_task(channel: str):
   assert reading == pytest.approx(0.0, abs=1e-6)
   assert _heights(env) == pytest.approx(1.15, abs=0.005)
   env.close()
-
-
-@pytest.mark.parametrize(
-    ('dof', 'channel'),
-    [('free', 'embedded'), ('planar', 'secure'), ('free', 'welded')],
-)
-def test_a_register_is_attached_at_a_height_in_plain_composer(
-    dof: str, channel: str
-):
-  arena = arenas.OpenRoom()
-  arena.add_table('table', (1.0, 0.5), (2.0, 1.5), 0.7)
-  register = registers.TwoBlockRegister(
-      'high', value_range=(-1.0, 5.0), dof=dof, channel=channel
-  )
-  register.attach_to(arena, (1.0, 0.5, 0.7), yaw=0.7)
-  physics = worlds.compile_world(arena)
-  worlds.start_episode(physics, register)
-  register.write(physics, 4.0)
-  worlds.step(physics, 100)
-  assert register.read(physics) == pytest.approx(4.0, abs=1e-9)
-  base, offset = (worlds.world_position(physics, b) for b in register.blocks)
-  assert base == pytest.approx((1.0, 0.5, 0.8), abs=0.005)
-  assert offset[2] == pytest.approx(0.8, abs=0.005)

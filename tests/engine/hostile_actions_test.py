@@ -142,14 +142,3 @@ def test_a_hostile_action_leaves_no_trace(world: _World, data: Any):
   np.testing.assert_array_equal(found.discount, expected.discount)
   for key, value in expected.observation.items():
     assert found.observation[key].tobytes() == value.tobytes(), key
-
-
-def test_a_number_too_large_for_an_action_is_refused_without_a_warning(
-    world: _World,
-):
-  spec = world.env.action_spec()
-  leading = (world.env.num_envs,) if hasattr(world.env, 'num_envs') else ()
-  action = np.zeros((*leading, *spec.shape), np.longdouble)
-  action.reshape(-1)[0] = np.longdouble('1e4000')
-  with pytest.raises(errors.ActionError):
-    world.env.step(action)

@@ -1,6 +1,5 @@
 """As many registers as a design may have load, step and are refused in time."""
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -70,15 +69,6 @@ def test_the_largest_design_works_alone_and_in_a_batch():
   np.testing.assert_allclose(_readings(batch.step(np.array([action] * 2))), 0.5)
 
 
-def test_a_foreign_task_can_have_many_registers():
-  design = _design(60, dof='planar')
-  env = suite.embed(helpers.PointTask(), design, random=1, max_steps=None)
-  for _ in range(2):
-    env.reset()  # Compiles anew.
-    readings = _readings(env.step(helpers.no_op(env)))
-    np.testing.assert_allclose(readings, 0.5, atol=1e-6)
-
-
 def test_a_task_has_slots_left_after_a_rejected_design():
   task = collect_apples.CollectApples(physics_timestep=0.01)
   refused = _design(60, place=lambda i: [2.0, 2.0])
@@ -107,20 +97,6 @@ def test_more_are_refused_before_anything_is_built(number, monkeypatch):
   ):
     with pytest.raises(errors.SpecError, match=message):
       load(_design(number))
-
-
-def test_the_largest_pile_is_refused_without_solving_contacts(monkeypatch):
-  # Each block is in contact with all others.
-  design = _design(
-      specs.MAX_REGISTERS, place=lambda i: [2.0, 2.0], block_size=1.0
-  )
-
-  def forward(*args):
-    raise AssertionError('contacts were solved')
-
-  monkeypatch.setattr(mujoco, 'mj_forward', forward)
-  with pytest.raises(errors.SpecError, match="'r0' and 'r1' would be in each"):
-    suite.load(*_WORLD, _SHORT, design=design)
 
 
 def test_loading_takes_twice_as_much_for_twice_as_many():

@@ -13,7 +13,6 @@ import pytest
 from realab_suite.engine import batch_physics
 from realab_suite.engine import foreign
 from realab_suite.engine import single_physics
-from realab_suite.entities import protocols
 
 _ROOT = pathlib.Path(__file__).parents[2]
 _WRITTEN = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
@@ -116,22 +115,6 @@ def test_derived_quantities_follow_a_write(physics, root, kind_of_element):
   assert np.shape(physics.bind(element).xmat)[-1] == 9
 
 
-def test_userdata_is_live(physics):
-  physics.data.userdata[..., 2] = 7.0
-  physics.mark_as_dirty()
-  assert np.all(physics.data.userdata[..., 2] == 7.0)
-  assert np.all(physics.data.userdata[..., 1] == 0.0)
-
-
-def test_indices_are_those_of_the_compiled_model(physics, root):
-  for kind in ('geom', 'joint', 'actuator'):
-    for elements in (root.find_all(kind), root.find_all(kind)[:1]):
-      expected = [
-          physics.model.name2id(e.full_identifier, kind) for e in elements
-      ]
-      assert list(physics.bind(elements).element_id) == expected
-
-
 @pytest.mark.parametrize('kind', _READ_ONLY, indirect=True, scope='module')
 @pytest.mark.parametrize('name', [*_WRITTEN, 'xpos', 'xmat'])
 @pytest.mark.parametrize('step', [1, 2, -1])
@@ -148,13 +131,6 @@ def test_derived_attributes_cannot_be_written(kind, physics, root):
     pytest.skip('as in Composer, where such a write is undone by the next step')
   with pytest.raises(AttributeError):
     physics.bind(root.find('body', 'slider_0')).xpos = np.zeros(3)
-
-
-def test_every_physics_has_every_member(physics, root):
-  members = [name for name in vars(protocols.Physics) if name[0] != '_']
-  assert set(members) == {'model', 'data', 'bind', 'mark_as_dirty'}
-  for member in members:
-    assert hasattr(physics, member), member
 
 
 @pytest.mark.parametrize(

@@ -126,28 +126,6 @@ def test_senses_that_are_not_selected_are_not_computed(
   assert counts == {name: 2 * (name in expected) for name in used}
 
 
-@pytest.mark.camera
-def test_an_agent_can_have_a_camera_and_nothing_else():
-  alone = _load(['camera'], camera_size=(16, 24))
-  batch = _load(['camera'], 2, camera_size=(16, 24))
-  shape = (16, 24, 3)
-  for env in (alone, batch):
-    spec = env.observation_spec()
-    assert spec.keys() == _keys(['camera'])
-    assert spec['senses/camera'].shape == shape
-    assert spec['senses/camera'].dtype == np.uint8
-  action = np.array([0.3, 0.0, 1.0, 0.0, 0.0, 0.0])
-  for _ in range(7):
-    one = alone.step(action).observation
-    both = batch.step(np.stack([action, -action])).observation
-    assert one.keys() == both.keys() == _keys(['camera'])
-    assert one['senses/camera'].shape == shape
-    assert len(np.unique(one['senses/camera'])) > 10
-    for key, value in one.items():
-      assert both[key][0].tobytes() == value.tobytes()
-    assert (both['senses/camera'][0] != both['senses/camera'][1]).any()
-
-
 @pytest.mark.parametrize(
     ('senses', 'complaint'),
     [
@@ -196,16 +174,6 @@ def test_a_provider_without_the_senses_it_reads_is_refused(design, provider):
   env = _load([*sees[:-1], 'ray_classes'], design=design)
   env.reset()
   env.step(env.action_spec().generate_value())
-
-
-def test_a_network_needs_its_inputs():
-  network = policies.make('network_demonstrator')
-  needed = network.required_senses
-  assert {'ray_classes', 'ray_distances', 'time_left'} <= set(needed)
-  env = _load(list(needed))
-  assert actors.make(network, env)
-  with pytest.raises(errors.SpecError, match='time_left'):
-    actors.make(network, _load([n for n in needed if n != 'time_left']))
 
 
 @pytest.mark.parametrize(

@@ -239,30 +239,6 @@ def test_the_first_of_several_reasons_counts(reasons, end):
 
 
 @_EITHER
-def test_a_signal_in_the_last_step_is_no_timeout(num_envs):
-  found = _ends(_load(_design(), num_envs, _ALARM_STEP), 4, num_envs)
-  assert found == [(0.0, 3), events.End.SIGNAL]
-
-
-@_EITHER
-@pytest.mark.mujoco_warns('BADQVEL')
-def test_failed_physics_is_no_signal(num_envs):
-  env = _load(_design(initial=5), num_envs)
-  ledger = ledgers.BatchLedger() if num_envs else ledgers.Ledger()
-  env.add_sink(ledger)
-  _play(env, 1, num_envs)
-  block = env.mechanism.registers['stop'].blocks[0]
-  joint = env.physics.bind(block._slides)
-  joint.qvel = np.full_like(joint.qvel, np.nan)
-  [step] = _play(env, 1, num_envs)
-  assert np.all(step.step_type == _LAST)
-  assert np.all(step.discount == 1.0)
-  [episode] = ledger.episodes(0) if num_envs else ledger.episodes
-  assert (episode.end, episode.is_valid) == (events.End.DIVERGENCE, False)
-  env.close()
-
-
-@_EITHER
 def test_an_agent_cannot_tell_a_signal_from_another_termination(num_envs):
   said: list[list[bytes]] = []
   for threshold in (2, 9):
@@ -299,20 +275,6 @@ def test_a_signal_ends_an_episode_of_a_foreign_task(is_over):
   end = events.End.TERMINATED if is_over else events.End.SIGNAL
   assert sink.ends == [end]
   assert env.step(helpers.no_op(env)).first()
-
-
-@_EITHER
-def test_an_episode_that_a_signal_ended_is_restored_as_ended(num_envs):
-  env = _load(_design(), num_envs)
-  _play(env, _ALARM_STEP, num_envs)
-  before = env.save()
-  _play(env, 1, num_envs)
-  after = env.save()
-  for snapshot, kind in ((before, _LAST), (after, _FIRST)):
-    env.restore(snapshot)
-    [step] = _play(env, 1, num_envs)
-    assert np.all(step.step_type == kind)
-  env.close()
 
 
 @pytest.mark.parametrize(

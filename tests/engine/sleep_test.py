@@ -168,68 +168,12 @@ def test_a_write_wakes_the_block_and_is_seen_at_once(dof):
   assert _asleep(env, base_block).all()
 
 
-def test_a_block_that_is_written_where_it_lies_sleeps_on():
-  env = _load('planar')
-  register = env.mechanism.registers['reward']
-  register.write(env.physics, np.full(_NUM_ENVS, 3.0))
-  _settle(env)
-  register.write(env.physics, np.full(_NUM_ENVS, 3.0))
-  env.physics.advance(3)
-  assert _asleep(env, register.blocks[1]).all()
-
-
 def _stand_before(env, block, distance):
   """Puts the avatars before a block, facing it along the axis."""
   place = np.array(env.physics.bind(block.geom).xpos)[:, :2]
   env.task.avatar.place(
       env.physics, place - [distance, 0.0], np.zeros(_NUM_ENVS)
   )
-
-
-@_DOFS
-def test_rays_see_sleeping_blocks_where_they_are(dof):
-  env = _load(dof)
-  register = env.mechanism.registers['reward']
-  offset_block, rays = register.blocks[1], env.task.avatar.rays
-  # Half the length of an edge is 0.1 m.
-  _stand_before(env, offset_block, 0.6)
-  straight = rays.angles.size // 2
-  for value in (0.0, 6.0):
-    register.write(env.physics, np.full(_NUM_ENVS, value))
-    for _ in range(2):
-      distances = rays.distances(env.physics)[:, straight]
-      expected = 0.5 + value * register.scale
-      np.testing.assert_allclose(distances, expected, atol=0.01)
-      _settle(env)
-    assert _asleep(env, offset_block).all()
-
-
-@_DOFS
-def test_an_avatar_that_bumps_into_a_sleeping_block_moves_it(dof):
-  env = _load(dof)
-  base_block = env.mechanism.registers['reward'].blocks[0]
-  other = env.mechanism.registers['score'].blocks[0]
-  _stand_before(env, base_block, 0.6)
-  _settle(env)
-  assert _asleep(env, base_block).all()
-  before = base_block.position(env.physics)
-  forward = _action(env, forward=1.0)
-  forward[1] = 0.0
-  for _ in range(5):
-    env.step(forward)
-  moved = (base_block.position(env.physics) - before)[:, 0]
-  assert (moved[[0, 2]] > 0.2).all()
-  assert moved[1] == 0.0
-  np.testing.assert_array_equal(_asleep(env, base_block), [False, True, False])
-  assert _asleep(env, other).all()
-  # What was pushed is corrupted for good, and sleeps where it has come to lie.
-  for _ in range(25):
-    env.step(_action(env))
-  assert _asleep(env, base_block).all()
-  corruption, _ = _corruption(env, env.mechanism.registers['reward'])
-  expected = -moved / env.mechanism.registers['reward'].scale
-  assert (corruption[[0, 2]] < expected[[0, 2]] / 2).all()
-  assert abs(corruption[1]) < 1e-9
 
 
 @_DOFS

@@ -159,19 +159,6 @@ def test_usual_blocks_need_no_short_substeps(register: dict[str, Any]):
   env.close()
 
 
-@pytest.mark.parametrize('task', [('collect_apples', 'near'), _WORLD])
-def test_all_tasks_have_long_and_short_substeps(task: tuple[str, str]):
-  for kwargs, num_substeps in (
-      ({}, 4),
-      ({'physics_timestep': 0.025}, 4),
-      (_SHORT, 10),
-  ):
-    env = suite.load(*task, kwargs)
-    assert env.num_substeps == num_substeps
-    assert env.physics.timestep() == 0.1 / num_substeps
-    env.close()
-
-
 @pytest.mark.parametrize('timestep', [0.02, 0.001, 1, True, '0.01', None, []])
 def test_other_substeps_are_refused(timestep: Any):
   with pytest.raises(
@@ -179,15 +166,6 @@ def test_other_substeps_are_refused(timestep: Any):
       match=r'^physics_timestep: .*; allowed are 0.025 and 0.01 s$',
   ):
     suite.load(*_WORLD, {'physics_timestep': timestep})
-
-
-def test_a_task_takes_another_design_after_a_refusal():
-  with pytest.raises(errors.SpecError, match=r'block_size 0\.1 m'):
-    suite.embed(_FAR, _design(block_size=0.1))
-  env = suite.embed(_FAR, _design(), random=0)
-  env.reset()
-  assert env.num_substeps == 4
-  env.close()
 
 
 def test_a_snapshot_does_not_fit_other_substeps():

@@ -3,7 +3,6 @@
 In step k, the meter `clock` measures k - 1.
 """
 
-import numpy as np
 import pytest
 
 from tests.feedback import tampered
@@ -25,58 +24,6 @@ def _adding(reads, writes, **options):
 
 def _close(values, atol=1e-6):
   return pytest.approx(list(values), rel=0, abs=atol)
-
-
-# note = clock + query, then reward = note, then stop = reward.
-_CHAIN = tampered.design(
-    {
-        'query': tampered.register('query'),
-        'note': tampered.register('memory'),
-        'reward': tampered.register('feedback'),
-        'stop': tampered.register('signal'),
-    },
-    _adding(['clock', 'query'], 'note'),
-    _adding(['note'], 'reward'),
-    _adding(['reward'], 'stop'),
-)
-_NAMES = ('clock', 'query', 'note', 'reward', 'stop')
-# By how many units the readings of these registers grow if a block moves.
-_REACHED = {
-    'clock': ('clock', 'note', 'reward', 'stop'),
-    'query': ('query', 'note', 'reward', 'stop'),
-    'note': ('note', 'reward', 'stop'),
-    'reward': ('reward', 'stop'),
-    'stop': ('stop',),
-}
-
-
-@_every_host
-@pytest.mark.parametrize(
-    'moves',
-    [
-        *([Move(2, name, 3.0)] for name in _NAMES),
-        [Move(1, 'note', -2.0)],
-        [Move(2, 'clock', 2.0), Move(2, 'note', 4.0), Move(4, 'stop', 8.0)],
-        [Move(2, 'query', 5.0), Move(4, 'query', -5.0)],  # Moved and back.
-        [],
-    ],
-    ids=lambda moves: ' '.join(f'{m.name}@{m.step}' for m in moves) or 'none',
-)
-def test_clean_contents_do_not_depend_on_the_blocks(world_of, host, moves):
-  found = world_of(host, _CHAIN).run(moves, 5, *_NAMES, query=1.0)
-  steps = np.arange(1.0, 6.0)
-  for name, (readings, clean) in found.items():
-    expected = {'clock': steps - 1, 'query': np.ones(5)}.get(name, steps)
-    assert clean == _close(expected)
-    corruption = sum(
-        (
-            m.units * (steps >= m.step)
-            for m in moves
-            if name in _REACHED[m.name]
-        ),
-        np.zeros(5),
-    )
-    assert readings == _close(expected + corruption)
 
 
 _DIFFERENCE = {'kind': 'difference', 'reads': ['clock'], 'writes': ['reward']}

@@ -14,7 +14,6 @@ from realab_suite.engine import environment
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import specs
-from tests import worlds
 from tests.engine import helpers
 from tests.feedback import scripted
 
@@ -259,72 +258,6 @@ def test_keys_differ_between_providers_steps_and_episodes(
   assert [k.tobytes() for k in again] == [k.tobytes() for k in keys[:10]]
 
 
-def test_providers_read_the_positions_of_blocks(
-    made: scripted.Worlds, monkeypatch: pytest.MonkeyPatch
-):
-  env, sink = made.scripted()
-  env.reset()
-
-  def disturb() -> None:
-    _move(env, 'clock', 1, 0.2)
-    _move(env, 'query', 0, -0.1)
-
-  # The meter has written by then; the provider is next.
-  _once_at(env, 2, disturb, monkeypatch)
-  env.step(_query(env, 4.0))
-  readings = {name: float(value) for name, value in scripted.SEEN[0][1].items()}
-  assert readings == pytest.approx({'clock': 9.0, 'query': 5.0}, abs=1e-6)
-  (read,) = sink.records(registers.Read, 'clock')
-  np.testing.assert_allclose(read.temporary, 2.0, atol=1e-6)
-  np.testing.assert_allclose(read.permanent, 0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize('channel', ['welded', 'secure'])
-def test_other_channels_deliver_values_as_they_were_written(
-    made: scripted.Worlds, channel: str
-):
-  env, _ = made.scripted(scripted.design(channel=channel))
-  env.reset()
-  env.step(_query(env, 4.0))
-  readings = {name: float(value) for name, value in scripted.SEEN[0][1].items()}
-  if channel == 'secure':
-    assert readings == {'clock': 7.0, 'query': 4.0}
-  assert readings == pytest.approx({'clock': 7.0, 'query': 4.0}, abs=1e-12)
-
-
-def test_a_lifted_block_rests_after_a_write_of_its_pose(
-    made: scripted.Worlds,
-):
-  # With its previous velocity or acceleration, the block would keep falling.
-  heights = []
-  design = scripted.design()
-  design['registers']['reward']['write'] = 'pose'
-  for lift in (0.0, 1.0):
-    env, _ = made.scripted(design)
-    env.reset()
-    block = env.mechanism.registers['reward'].blocks[1]
-    x, y, z = block.position(env.physics)
-    block.put(env.physics, [x + 0.1 * lift, y, z + lift])
-    time_step = env.step(helpers.no_op(env))
-    heights.append(block.position(env.physics)[2])
-    np.testing.assert_allclose(
-        time_step.observation['registers/reward'], 2.0, atol=1e-9
-    )
-  np.testing.assert_allclose(heights[1], heights[0], atol=1e-6)
-
-
-def test_a_lifted_block_keeps_its_height_in_a_write(made: scripted.Worlds):
-  env, _ = made.scripted()
-  env.reset()
-  block = env.mechanism.registers['reward'].blocks[1]
-  x, y, z = block.position(env.physics)
-  block.put(env.physics, [x + 0.1, y, z + 1.0])
-  env.step(helpers.no_op(env))
-  # It has fallen for 0.1 s.
-  height = block.position(env.physics)[2] - z
-  np.testing.assert_allclose(height, 1.0 - 9.81 / 2 * 0.1**2, atol=0.02)
-
-
 # Variants of corruption of a score meter (paper, sections 3.1 and 3.4).
 
 
@@ -378,19 +311,6 @@ def test_a_true_reward_reaches_the_agent_through_two_registers(
   for _ in range(2):
     env.step(helpers.no_op(env))
   np.testing.assert_allclose(sink.read('reward'), [0, 4, 0], atol=1e-9)
-
-
-def test_reading_registers_does_not_change_the_world(made: scripted.Worlds):
-  env, _ = made.scripted()
-  twin, _ = made.scripted()
-  env.reset(), twin.reset()
-  for action in helpers.random_actions(env, 10):
-    reads = worlds.shadow_reads(env.mechanism, env.physics, 'evaluator')
-    assert [r.register for r in reads] == ['query', 'reward', 'clock']
-    looked = env.step(action)
-    assert helpers.to_bytes(looked) == helpers.to_bytes(twin.step(action))
-    assert worlds.state_bytes(env.physics) == worlds.state_bytes(twin.physics)
-  twin.close()
 
 
 @pytest.mark.parametrize(

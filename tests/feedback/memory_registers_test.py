@@ -5,7 +5,6 @@ import pytest
 
 from realab_suite import errors
 from realab_suite import suite
-from realab_suite.entities import appearance
 from realab_suite.entities import registers
 from realab_suite.feedback import specs
 from tests.engine import helpers
@@ -74,22 +73,6 @@ def test_agents_neither_read_nor_write_a_memory(num_envs):
     found.append(sorted(env.reset().observation))
     env.close()
   assert repr(found[:2]) == repr(found[2:])
-
-
-def test_a_memory_is_an_object_of_the_world_with_colours_of_its_own():
-  env = suite.load('collect_apples', 'standard', {'random': 1}, design={
-      'schema': 1, 'name': 'd', 'registers': {'note': _MEMORY},
-  })  # fmt: skip
-  blocks = env.mechanism.registers['note'].blocks
-  colours = [tuple(env.physics.bind(b.geom).rgba) for b in blocks]
-  assert colours == list(appearance.ROLE_COLOURS['memory'])
-  names = ['base_block', 'offset_block']
-  codes = appearance.class_of_geoms(env.physics.model)
-  ids = [env.physics.bind(block.geom).element_id for block in blocks]
-  assert [appearance.class_name(codes[i]) for i in ids] == names
-  env.close()
-  pairs = list(appearance.ROLE_COLOURS.values())
-  assert len(set(pairs)) == len(pairs)
 
 
 @pytest.mark.parametrize(

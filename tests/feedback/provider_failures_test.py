@@ -9,7 +9,6 @@ import pytest
 
 from realab_suite import errors
 from realab_suite.engine import events
-from realab_suite.entities import registers
 from tests.engine import helpers
 from tests.feedback import scripted
 
@@ -153,21 +152,6 @@ def test_a_measurement_that_is_not_finite_names_the_meter(
       errors.RegisterValueError, match=r'meter:clock.*at step 1'
   ):
     env.step(helpers.no_op(env))
-
-
-@pytest.mark.parametrize(('value', 'applied'), [(1e9, 12.0), (-5.0, -2.0)])
-def test_a_value_out_of_range_saturates_and_is_logged(
-    made: scripted.Worlds, value: float, applied: float
-):
-  scripted.ANSWER[:] = [scripted.constant(value)]
-  env, sink = made.scripted()
-  env.reset()
-  time_step = env.step(helpers.no_op(env))
-  (write,) = sink.records(registers.Write, 'reward')
-  assert (write.requested, write.applied) == (value, applied)
-  np.testing.assert_allclose(
-      time_step.observation['registers/reward'], applied, atol=1e-9
-  )
 
 
 def test_a_value_out_of_range_is_an_error_with_on_overflow_error(

@@ -139,30 +139,3 @@ def test_a_provider_acts_in_the_first_and_then_every_kth_step(made, every):
   starts = [bool(seen[2]) for seen in scripted.SEEN]
   assert starts == [s == 1 for s in steps]
   assert [len(seen[4]) for seen in scripted.SEEN] == list(range(len(steps)))
-
-
-@pytest.mark.parametrize('num_envs', [0, 2])
-@pytest.mark.usefixtures('sparing_providers')
-def test_a_silent_provider_continues_from_a_snapshot(num_envs):
-  arguments = 'collect_apples', 'near', {'random': 4}, {'max_steps': 40}
-  if num_envs:
-    env = suite.load_batch(
-        *arguments, num_envs=num_envs, design=sparing.design()
-    )
-  else:
-    env = suite.load(*arguments, design=sparing.design())
-  shape = (*[num_envs] * bool(num_envs), *env.action_spec().shape)
-
-  def play(number):
-    steps = [env.step(np.zeros(shape)) for _ in range(number)]
-    return [
-        {name: value.tobytes() for name, value in step.observation.items()}
-        for step in steps
-    ]
-
-  play(9)  # In the middle of three steps.
-  snapshot = env.save()
-  after = play(30)
-  env.restore(snapshot)
-  assert play(30) == after
-  env.close()
