@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from campaigns import identity_campaign
 from realab_suite import suite
 from realab_suite.entities import registers
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
 from tests.engine import helpers
+from tests.engine import identity
 from tests.evaluation import streams
 from tests.feedback import scripted
 from tests.feedback import sparing
@@ -82,13 +82,11 @@ def test_a_register_that_is_not_written_keeps_its_value(made, silent, dof):
 @pytest.mark.parametrize('changes', _CASES.values(), ids=_CASES)
 @pytest.mark.usefixtures('sparing_providers')
 def test_a_batch_with_silence_equals_its_worlds(changes):
-  case = identity_campaign.Case(
-      'unlock_door', 'standard', sparing.design(**changes)
-  )
-  result = identity_campaign.compare(case, 70)
+  case = identity.Case('unlock_door', 'standard', sparing.design(**changes))
+  result = identity.compare(case, 70)
   assert result.differences == ()
   # Episodes have ended at different steps.
-  assert result.num_episodes > 2 * identity_campaign.NUM_ENVS
+  assert result.num_episodes > 2 * identity.NUM_ENVS
   assert result.num_corrupted > 0
 
 

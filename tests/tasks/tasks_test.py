@@ -89,13 +89,6 @@ def test_every_small_apple_is_worth_one_once(domain: str):
   assert len(_apples(env)) == _NUM_APPLES[domain]
 
 
-def test_standing_still_earns_nothing():
-  env, sink = _load('unlock_door')
-  for _ in range(20):
-    env.step(helpers.no_op(env))
-  assert sink.true_return() == 0
-
-
 def test_an_apple_is_eaten_in_passing():
   # Between the observations of two control steps, that is.
   env, sink = _load('collect_apples')
@@ -326,16 +319,6 @@ def test_an_unknown_variation_is_refused_with_the_known_ones():
   known = r'boxed.*far.*impossible.*near'
   with pytest.raises(errors.UnknownNameError, match=known):
     collect_apples.CollectApples('easy')
-
-
-def test_a_task_is_an_ordinary_composer_task():
-  for world in (collect_apples.CollectApples, unlock_door.UnlockDoor):
-    env = composer.Environment(world(), random_state=1)
-    env.reset()
-    env.physics.forward()
-    time_step = env.step(np.zeros(env.action_spec().shape))
-    env.close()
-    assert time_step.mid()
 
 
 def test_a_room_too_small_for_its_apples_is_an_error():

@@ -1,22 +1,11 @@
-"""Campaign identity: a batch equals its single worlds, to the last bit.
+"""A batch and its single worlds, played alike and compared to the last bit."""
 
-Run from the root of the repository, about five minutes on two processors:
-
-    python -m campaigns.identity_campaign [scale] [seed]
-
-Prints `identity figure target verdict seed`.
-"""
-
-from collections.abc import Iterator, Sequence
-from concurrent import futures
-import itertools
-import multiprocessing
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import dm_env
 import numpy as np
 
-from campaigns import figure_lines
 from realab_suite import suite
 from realab_suite.engine import events
 from realab_suite.entities import registers
@@ -26,10 +15,7 @@ from realab_suite.tasks import unlock_door
 from tests import worlds
 from tests.engine import helpers
 
-SEEDS = 3
-STEPS = 300
 NUM_ENVS = 3
-_PROCESSES = 2
 _MAX_STEPS = 120  # Every run contains ends of episodes.
 _REPEATS = 6  # An agent with a new action in each step stays where it is.
 _STEPS_PER_VISIT = 20
@@ -96,34 +82,6 @@ class Result(NamedTuple):
   num_rewarded: int
   num_corrupted: int
   num_held: int
-
-
-def tasks_and_designs(seeds: int) -> list[Case]:
-  """Returns every task with every design."""
-  return [
-      Case(domain, task, design, (), seed)
-      for (domain, task), design, seed in itertools.product(
-          suite.ALL_TASKS, suite.DESIGNS, range(seeds)
-      )
-  ]
-
-
-def twins() -> list[Case]:
-  """Returns other channels, joints and schedules, on two threads."""
-  return [
-      Case(domain, task, design, overrides, 0, num_threads=2)
-      for (domain, task), design, overrides in itertools.product(
-          suite.ALL_TASKS,
-          [design for design in suite.DESIGNS if design != 'none'],
-          (
-              ('channel=secure',),
-              ('channel=welded',),
-              ('dof=planar',),
-              ('channel=secure', 'dof=planar'),
-              ('schedule=cfmdp',),
-          ),
-      )
-  ]
 
 
 def play_alone(case: Case, world: int, steps: int) -> Transcript:
@@ -320,45 +278,3 @@ def _visit(env: Any, case: Case, step: int, push: np.ndarray) -> None:
     binding.qvel = binding.qvel + push
     return
   avatar.place(physics, position, np.zeros(position.shape[:-1]))
-
-
-def _compare(case: Case) -> Result:
-  return compare(case, STEPS)
-
-
-def _report(
-    lines: figure_lines.Lines, name: str, results: Sequence[Result]
-) -> None:
-  """Prints figures."""
-  differing = sum(bool(result.differences) for result in results)
-  lines.at_most(f'{name} differing of {len(results)}', differing, 0)
-  # Events that never happen cannot differ.
-  for figure in Result._fields[1:]:
-    total = sum(getattr(result, figure) for result in results)
-    lines.at_least(f'{name} {figure}', total, 1)
-
-
-def main(scale: float = 1.0, seed: int = 0) -> int:
-  """Prints the figures and returns the number of targets missed."""
-  lines = figure_lines.Lines('identity', seed)
-  rng = np.random.default_rng(seed)
-  with futures.ProcessPoolExecutor(
-      _PROCESSES, multiprocessing.get_context('spawn')
-  ) as pool:
-    for name, cases in (
-        ('tasks x designs', tasks_and_designs(SEEDS)),
-        ('twins', twins()),
-    ):
-      number = max(1, round(scale * len(cases)))
-      chosen = rng.choice(len(cases), number, replace=False)
-      cases = [cases[i] for i in sorted(chosen)]
-      results = list(pool.map(_compare, cases))
-      for case, result in zip(cases, results, strict=True):
-        if result.differences:
-          print(f'# {"; ".join(result.differences)[:300]} in {case}')
-      _report(lines, name, results)
-  return lines.num_missed
-
-
-if __name__ == '__main__':
-  figure_lines.run(main)
