@@ -17,12 +17,11 @@ against a stock environment with registers of the same kind. The target for the
 fastest of them, planar blocks that sleep, is 15 times the throughput of the
 stock environment.
 
-A third of the rounds measures how costs grow with the numbers of worlds,
-registers and apples.
+A third of the rounds measures how costs grow with the numbers of worlds and
+registers.
 """
 
 from collections.abc import Mapping, Sequence
-import contextlib
 import copy
 import dataclasses
 import functools
@@ -36,10 +35,10 @@ from mujoco import batch as mujoco_batch
 import numpy as np
 
 from benchmarks import batch_growth
+from benchmarks import recorded
 from benchmarks import timing
 from benchmarks import worlds
 from realab_suite.engine import batch_environment
-from realab_suite.engine import batch_physics
 from realab_suite.engine import seeding
 from realab_suite.feedback import assembly
 from realab_suite.feedback import specs
@@ -65,13 +64,7 @@ _MAX_LOST = 15.0
 _MAX_OF_STOCK = 100 / 15
 _RESET_TARGET_MS = 0.2
 
-# Fields that a world may write between substeps besides blocks and controls: of
-# the door, eaten apples, the grip of the hand, and thrown blocks.
-_OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')
 _STAGE = int(mujoco.mjtStage.mjSTAGE_POS)
-
-Phase = tuple[list[tuple[np.ndarray, np.ndarray]], int]
-"""Writes, each a view and its new value, and the number of substeps after."""
 
 Rays = tuple[np.ndarray, np.ndarray, int]
 """Origins, directions and the body that rays pass through."""
@@ -93,7 +86,7 @@ class RawSteps:
   batch: mujoco_batch.Batch
   ray_batch: mujoco_batch.Batch
   start: np.ndarray
-  steps: list[list[Phase]]
+  steps: list[list[recorded.Phase]]
   rays: list[Rays]
 
   def replay(self) -> float:
@@ -215,64 +208,22 @@ def _record(
   )
   start = true.state.copy()
   raw.state[:] = start
-  # The meter and the provider write the offset blocks.
-  meter, provider = (env.mechanism.registers[n] for n in ('score', 'reward'))
-  routine = [
-      [(raw.bind('ctrl'), true.bind('ctrl'))],
-      _pose_views(physics, meter, raw, true),
-      _pose_views(physics, provider, raw, true),
-  ]
-  phases: list[Phase] = []
   rays: list[Rays] = []
-  advance, cast = physics.advance, physics.cast_rays
-
-  def advance_both(num_substeps: int) -> None:
-    writes = [(view, value.copy()) for view, value in routine[len(phases)]]
-    for view, value in writes:
-      view[:] = value
-    for name in _OCCASIONAL:
-      view, value = raw.bind(name), true.bind(name)
-      if not np.array_equal(view, value):
-        writes.append((view, value.copy()))
-        view[:] = value
-    phases.append((writes, num_substeps))
-    raw.step(nstep=num_substeps)
-    advance(num_substeps)
+  cast = physics.cast_rays
 
   def cast_both(origins: Any, directions: Any, carrier: int) -> Any:
     rays.append((origins[:, np.newaxis, :].copy(), directions.copy(), carrier))
     return cast(origins, directions, carrier)
 
-  steps = []
-  with (
-      mock.patch.object(physics, 'advance', advance_both),
-      mock.patch.object(physics, 'cast_rays', cast_both),
-  ):
-    for action in actions:
-      env.step(action)
-      steps.append(phases.copy())
-      phases.clear()
+  with mock.patch.object(physics, 'cast_rays', cast_both):
+    steps = recorded.record(
+        env,
+        actions,
+        raw.bind,
+        true.bind,
+        lambda num_substeps: raw.step(nstep=num_substeps),
+    )
   return RawSteps(raw, ray_batch, start, steps, rays)
-
-
-def _pose_views(
-    physics: batch_physics.BatchPhysics,
-    register: Any,
-    raw: mujoco_batch.Batch,
-    true: mujoco_batch.Batch,
-) -> list[tuple[np.ndarray, np.ndarray]]:
-  """Returns views of the pose of a two-block register's offset block."""
-  model = physics.model
-  joints = physics.bind(register.blocks[1].body.joint).element_id
-  first, last = min(joints), max(joints)
-  views = []
-  for name, starts, size in (
-      ('qpos', model.jnt_qposadr, 4),
-      ('qvel', model.jnt_dofadr, 3),
-  ):
-    part = slice(starts[first], starts[last] + size)  # The last one is a ball.
-    views.append((raw.bind(name)[:, part], true.bind(name)[:, part]))
-  return views
 
 
 def _check_same(env: batch_environment.BatchEnvironment, raw: RawSteps) -> None:
@@ -314,7 +265,7 @@ def _break_down_step(
     for action in actions:
       env.step(action)
 
-  split = _split(parts, play)
+  split = timing.split(parts, play)
   unit = len(actions) * env.num_envs
   return [
       timing.Figure(
@@ -343,31 +294,13 @@ def _break_down_reset(
       ('observations', env, '_observe'),
       ('the rest', env, 'reset'),
   )
-  split = _split(parts, env.reset)
+  split = timing.split(parts, env.reset)
   return [
       timing.Figure(
           f'  {label}', np.array([1e3 * seconds / env.num_envs]), 'ms'
       )
       for label, (seconds, _) in split.items()
   ]
-
-
-def _split(
-    parts: Sequence[tuple[str, Any, str]], work: Any
-) -> dict[str, tuple[float, int]]:
-  """Returns the seconds and the number of calls of each part, by label.
-
-  Args:
-    parts: Label, owner and name of each method.
-    work: Function to time.
-  """
-  watch = timing.Stopwatch()
-  with contextlib.ExitStack() as stack:
-    for label, owner, name in parts:
-      timed = watch.watch(label, getattr(owner, name))
-      stack.enter_context(mock.patch.object(owner, name, timed))
-    work()
-  return {label: (s, watch.calls[label]) for label, s in watch.seconds.items()}
 
 
 def _compare_to_stock(
@@ -449,7 +382,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
       *memory,
       *batch_growth.grow_worlds(max(1, rounds // 3)),
       *batch_growth.grow_registers(max(1, rounds // 3)),
-      *batch_growth.grow_apples(max(1, rounds // 3)),
   ])  # fmt: skip
   for each in envs.values():
     each.close()

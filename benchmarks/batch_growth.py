@@ -1,4 +1,4 @@
-"""Growth of costs with the numbers of worlds, registers and apples, and memory.
+"""Growth of costs with the numbers of worlds and registers, and memory.
 
 Part of `python -m benchmarks.batch`.
 """
@@ -9,20 +9,17 @@ import pathlib
 import subprocess
 import sys
 from typing import Any
-from unittest import mock
 
 import numpy as np
 
 from benchmarks import timing
 from benchmarks import worlds
 from realab_suite import suite
-from realab_suite.tasks import unlock_door
 
 # Numbers of steps by numbers of worlds.
 _SIZES = {1: 64, 16: 16, 64: 8, 256: 4, 1024: 4}
 _REGISTERS = (1, 2, 4)
 _REGISTER_STEPS = 4
-_APPLES = (4, 8, 16)
 _MEMORY_WORLDS = 1024
 _MEMORY_TARGET_MIB = 1.0
 
@@ -97,42 +94,6 @@ def grow_registers(rounds: int) -> list[timing.Figure]:
         )
     )
   return figures
-
-
-def grow_apples(rounds: int) -> list[timing.Figure]:
-  """Measures the cost of apples, whose state is read in each phase."""
-  playing = {}
-  for number in _APPLES:
-    with mock.patch.object(unlock_door, '_NUM_APPLES', number):
-      env = worlds.load(worlds.NUM_ENVS)
-      playing[number] = (env, worlds.draw(env, _REGISTER_STEPS))
-
-  def play(number: int) -> float:
-    with mock.patch.object(unlock_door, '_NUM_APPLES', number):
-      return worlds.play(*playing[number])
-
-  seconds = timing.time_rounds(
-      {str(n): functools.partial(play, n) for n in playing}, rounds
-  )
-  for env, _ in playing.values():
-    env.close()
-  most, half = _APPLES[-1], _APPLES[-2]
-  return [
-      *(
-          timing.Figure(
-              f'step, small apples: {n}',
-              1e6 * seconds[str(n)] / worlds.NUM_ENVS,
-              'us',
-          )
-          for n in _APPLES
-      ),
-      timing.Figure(
-          f'{most} apples to {half}',
-          seconds[str(most)] / seconds[str(half)],
-          'x',
-          most / half,
-      ),
-  ]
 
 
 def _resident_mib() -> float:

@@ -19,6 +19,7 @@ from unittest import mock
 import mujoco
 import numpy as np
 
+from benchmarks import recorded
 from benchmarks import timing
 from realab_suite import suite
 from realab_suite.engine import environment
@@ -29,12 +30,6 @@ _ROUNDS = 25
 _SEED = 0
 # Not reached yet; README.md lists the attempts.
 _TARGET = 1.3
-# Fields that a world may write between substeps besides blocks and controls: of
-# the door, eaten apples, the grip of the hand, and thrown blocks.
-_OCCASIONAL = ('mocap_pos', 'eq_active', 'qvel')
-
-Phase = tuple[list[tuple[np.ndarray, np.ndarray]], int]
-"""Writes, each a view and its new value, and the number of substeps after."""
 
 
 @final
@@ -52,7 +47,7 @@ class RawEpisode:
   model: Any
   data: Any
   start: Any
-  steps: list[list[Phase]]
+  steps: list[list[recorded.Phase]]
 
   def replay(self) -> float:
     """Runs the episode and returns the seconds per control step."""
@@ -86,53 +81,14 @@ def _record(env: environment.Environment, actions: np.ndarray) -> RawEpisode:
   model, true = physics.model.ptr, physics.data.ptr
   start = copy.copy(true)
   raw = copy.copy(true)
-  # The meter and the provider write the offset blocks.
-  meter, provider = (env.mechanism.registers[n] for n in ('score', 'reward'))
-  routine = [
-      [(raw.ctrl, true.ctrl)],
-      _pose_views(physics, meter, raw, true),
-      _pose_views(physics, provider, raw, true),
-  ]
-  phases: list[Phase] = []
-  advance = physics.advance
-
-  def advance_both(num_substeps: int) -> None:
-    writes = [(view, value.copy()) for view, value in routine[len(phases)]]
-    for view, value in writes:
-      view[:] = value
-    for name in _OCCASIONAL:
-      view, value = getattr(raw, name), getattr(true, name)
-      if not np.array_equal(view, value):
-        writes.append((view, value.copy()))
-        view[:] = value
-    phases.append((writes, num_substeps))
-    mujoco.mj_step(model, raw, num_substeps)
-    advance(num_substeps)
-
-  steps = []
-  with mock.patch.object(physics, 'advance', advance_both):
-    for action in actions:
-      env.step(action)
-      steps.append(phases.copy())
-      phases.clear()
+  steps = recorded.record(
+      env,
+      actions,
+      lambda name: getattr(raw, name),
+      lambda name: getattr(true, name),
+      lambda num_substeps: mujoco.mj_step(model, raw, num_substeps),
+  )
   return RawEpisode(model, raw, start, steps)
-
-
-def _pose_views(
-    physics: Any, register: Any, raw: Any, true: Any
-) -> list[tuple[np.ndarray, np.ndarray]]:
-  """Returns views of the pose of a two-block register's offset block."""
-  model = physics.model
-  joints = physics.bind(register.blocks[1].body.joint).element_id
-  first, last = min(joints), max(joints)
-  views = []
-  for name, starts, size in (
-      ('qpos', model.jnt_qposadr, 4),
-      ('qvel', model.jnt_dofadr, 3),
-  ):
-    part = slice(starts[first], starts[last] + size)  # The last one is a ball.
-    views.append((getattr(raw, name)[part], getattr(true, name)[part]))
-  return views
 
 
 def _check_same(env: environment.Environment, raw: RawEpisode) -> None:
@@ -199,7 +155,6 @@ def _break_down(
     env: environment.Environment, actions: np.ndarray, raw_us: float
 ) -> list[timing.Figure]:
   """Returns the time of each part of a step, including the timers."""
-  watch = timing.Stopwatch()
   task, mechanism = env.task, env.mechanism
   parts = (
       ('substeps', env.physics, 'advance'),
@@ -215,16 +170,15 @@ def _break_down(
   )
   env.rewind()
   env.reset()
-  with contextlib.ExitStack() as stack:
-    for label, owner, name in parts:
-      timed = watch.watch(label, getattr(owner, name))
-      stack.enter_context(mock.patch.object(owner, name, timed))
+
+  def play() -> None:
     for action in actions:
       env.step(action)
+
   figures = []
-  for label, seconds in watch.seconds.items():
+  for label, (seconds, number) in timing.split(parts, play).items():
     us = np.array([1e6 * seconds / len(actions)])
-    calls = f'{watch.calls[label] / len(actions):g} a step'
+    calls = f'{number / len(actions):g} a step'
     figures.append(
         timing.Figure(f'  {label}, {calls}', us, 'us', ratios=us / raw_us)
     )

@@ -2,11 +2,13 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+import contextlib
 import dataclasses
 import functools
 import os
 import time
 from typing import Any, final
+from unittest import mock
 
 import mujoco
 import numpy as np
@@ -83,6 +85,27 @@ class Stopwatch:
     if self._running:
       self.seconds[self._running[-1]] += now - self._since
     self._since = now
+
+
+def split(
+    parts: Sequence[tuple[str, Any, str]],
+    work: Callable[[], object],
+    clock: Callable[[], float] | None = None,
+) -> dict[str, tuple[float, int]]:
+  """Returns the seconds and the number of calls of each part, by label.
+
+  Args:
+    parts: Label, owner and name of each method.
+    work: Function to time.
+    clock: Function that returns the time in seconds; `None` for wall time.
+  """
+  watch = Stopwatch(clock)
+  with contextlib.ExitStack() as stack:
+    for label, owner, name in parts:
+      timed = watch.watch(label, getattr(owner, name))
+      stack.enter_context(mock.patch.object(owner, name, timed))
+    work()
+  return {label: (s, watch.calls[label]) for label, s in watch.seconds.items()}
 
 
 @final

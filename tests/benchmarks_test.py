@@ -9,7 +9,6 @@ import pytest
 from benchmarks import attribution
 from benchmarks import batch
 from benchmarks import batch_growth
-from benchmarks import clean_contents
 from benchmarks import reset
 from benchmarks import step
 from benchmarks import timing
@@ -53,7 +52,10 @@ def test_each_benchmark_prints_a_line_per_figure(
 
 _FEW_WORLDS = {
     worlds: {'NUM_ENVS': 2},
-    batch: {'_STEPS': 2, '_STOCK_STEPS': 2},
+    batch: {
+        '_STEPS': 2, '_STOCK_STEPS': 2,
+        '_KINDS': {'free': ('free', False), 'planar, asleep': ('planar', True)},
+    },
     batch_growth: {
         '_SIZES': {1: 1, 2: 1}, '_REGISTERS': (1, 2), '_REGISTER_STEPS': 1,
         '_MEMORY_WORLDS': 2,
@@ -89,6 +91,8 @@ def test_the_benchmark_of_attribution_prints_a_line_per_figure(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
   monkeypatch.setattr(attribution, '_EPISODES', (2,))
+  policies = 'apple_seeker', 'throwing_saboteur'
+  monkeypatch.setattr(attribution, '_POLICIES', policies)
   monkeypatch.setattr(attribution, '_STEPS', 3)
   attribution.main(['--rounds=1'])
   expected = {
@@ -98,34 +102,15 @@ def test_the_benchmark_of_attribution_prints_a_line_per_figure(
   _assert_lines(capsys.readouterr().out, expected)
 
 
-def test_the_benchmark_of_clean_contents_prints_a_line_per_figure(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-  monkeypatch.setattr(clean_contents, '_NUM_ENVS', 2)
-  monkeypatch.setattr(clean_contents, '_STEPS', 2)
-  clean_contents.main(['--rounds=1'])
-  out = capsys.readouterr().out
-  expected = {
-      'step, reward, one, honest': '<= 1.05 x raw',
-      'step, advice, 2, tampering': '<= 1.15 x raw',
-  }
-  _assert_lines(out, expected)
-  calls = {
-      line[:34].rstrip(): float(line[34:].split()[0])
-      for line in out.splitlines()
-      if line.startswith('calls')
-  }
-  assert [time > 0 for time in calls.values()] == [False, True] * 4
-
-
 def test_the_benchmark_of_training_prints_a_line_per_figure(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
   for module in ('jax', 'optax', 'equinox'):
     pytest.importorskip(module, reason=f'{module} is in the extra `agents`')
+  monkeypatch.setattr(train, '_PROCESSES', 1)
   monkeypatch.setattr(train, '_WORLDS', 2)
   monkeypatch.setattr(train, '_STEPS', 33)  # One update.
-  kinds = {'planar, asleep': ('planar', True), 'free': ('free', False)}
+  kinds = {'planar, asleep': ('planar', True)}
   monkeypatch.setattr(train, '_KINDS', kinds)
   train.main(['--rounds=1'])
   figures = {}
@@ -133,7 +118,6 @@ def test_the_benchmark_of_training_prints_a_line_per_figure(
     figures[line[:34].rstrip()] = line[34:].split()
   assert figures['control steps, planar, asleep'][2:5] == ['>=', '15', '/ms']
   assert figures['control steps, planar, asleep'][6] in ('met', 'missed')
-  assert figures['control steps, free'][2] == '-'
   for kind in kinds:
     for part in ('physics', 'rays', 'network', 'update', 'the rest'):
       assert float(figures[f'  {part}, {kind}'][0]) >= 0
@@ -155,6 +139,7 @@ def test_the_training_benchmark_names_missing_packages(
 def test_a_worker_that_fails_ends_the_benchmark(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+  monkeypatch.setattr(train, '_PROCESSES', 1)
   monkeypatch.setattr(train, '_KINDS', {'wrong': ('sideways', True)})
   with pytest.raises(EOFError):
     train.main(['--rounds=1'])
@@ -248,24 +233,3 @@ def test_a_stopwatch_attributes_time_to_the_innermost_call(
   watch.watch('outer', outer)()
   assert watch.seconds == {'inner': 20.0, 'outer': 3.0}
   assert watch.calls == {'inner': 2, 'outer': 1}
-
-
-def test_the_benchmark_of_gymnasium_prints_a_line_per_adapter(
-    monkeypatch, capsys
-):
-  pytest.importorskip('gymnasium')
-  from benchmarks import gymnasium_vector
-
-  monkeypatch.setattr(gymnasium_vector, 'NUM_ENVS', 2)
-  monkeypatch.setattr(gymnasium_vector, '_STEPS', 2)
-  gymnasium_vector.main(['--rounds=1'])
-  target = '<= 1.1 x raw'
-  _assert_lines(
-      capsys.readouterr().out,
-      {
-          'load_batch, 2 worlds': '-',
-          'make_vec, next-step': target,
-          'make_vec, next-step, flat': target,
-          'make_vec, same-step, flat': target,
-      },
-  )

@@ -57,7 +57,6 @@ def test_the_largest_design_works_alone_and_in_a_batch():
   alone = suite.load(*_WORLD, _SHORT, design=design)
   assert (_readings(alone.reset()) == 0.0).all()
   batch = suite.fork(alone, 2)
-  saved = batch.save()
   action = np.zeros(alone.action_spec().shape)
   for _ in range(2):
     readings = _readings(alone.step(action))
@@ -65,8 +64,6 @@ def test_the_largest_design_works_alone_and_in_a_batch():
     np.testing.assert_allclose(readings, 0.5, atol=1e-6)
     together = _readings(batch.step(np.array([action] * 2)))
     np.testing.assert_array_equal(together[:, 0], readings)
-  batch.restore(saved)
-  np.testing.assert_allclose(_readings(batch.step(np.array([action] * 2))), 0.5)
 
 
 def test_a_task_has_slots_left_after_a_rejected_design():
@@ -102,6 +99,6 @@ def test_more_are_refused_before_anything_is_built(number, monkeypatch):
 def test_loading_takes_twice_as_much_for_twice_as_many():
   few, some, many = (
       work.num_calls(lambda n=n: suite.load(*_WORLD, _SHORT, design=_design(n)))
-      for n in (1, 16, 31)
+      for n in (1, 8, 15)
   )
   assert many - few < 2.2 * (some - few)

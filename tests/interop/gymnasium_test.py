@@ -27,6 +27,7 @@ from realab_suite.interop.gymnasium import evaluation
 from realab_suite.interop.gymnasium import registration
 from realab_suite.interop.gymnasium import single
 from realab_suite.interop.gymnasium import vector
+from tests import examples
 
 _NEAR = 'realab/UnlockDoor-near-InstantaneousReward-v3'
 _DISCRETE = {'overrides': ['action_set={name: dmlab_like, version: 1}']}
@@ -61,13 +62,14 @@ def test_an_id_may_name_the_module_that_registers_it():
   assert isinstance(env.unwrapped, single.RealabEnv)
 
 
-# `campaigns.gymnasium_campaign` checks all ids.
+# The profile `long` checks all ids.
 @pytest.mark.parametrize(
     'name',
     [
         _NEAR,
         'realab/CollectApples-boxed-OnlineImitation-v3',
         'realab/UnlockDoor-impossible-PairedDecoupledApproval-v3',
+        *(registration.ids() if examples.IS_LONG else ()),
     ],
 )
 def test_the_checker_of_gymnasium_has_no_warnings(name):
