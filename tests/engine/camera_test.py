@@ -116,16 +116,6 @@ def test_frames_for_agents_equal_films_except_at_edges():
 
 
 @pytest.mark.camera
-def test_frames_show_the_current_positions():
-  env = _load()
-  before = _frame(env.reset())
-  action = np.zeros(env.action_spec().shape)
-  action[2] = 1.0  # Turn.
-  assert np.abs(_frame(env.step(action)).astype(int) - before).max() > 20
-  env.close()
-
-
-@pytest.mark.camera
 def test_environments_of_different_sizes_draw_by_turns():
   sizes = [(64, 64), (32, 96)]
   alone = []

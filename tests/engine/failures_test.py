@@ -285,23 +285,6 @@ _ANSWERS = {
         lambda start, state: 1 / 0,
         'at step 1 in a batch of 3 worlds: ZeroDivisionError',
     ),
-    'nothing': (
-        lambda start, state: None,
-        'at step 1 in a batch of 3 worlds returned None; allowed is (writes,'
-        ' state)',
-    ),
-    'no state': (
-        lambda start, state: {'reward': np.zeros(3)},
-        'at step 1 in a batch of 3 worlds returned {',
-    ),
-    'three things': (
-        lambda start, state: ({'reward': np.zeros(3)}, state, 0),
-        'allowed is (writes, state)',
-    ),
-    'a list': (
-        lambda start, state: [{'reward': np.zeros(3)}, state],
-        'allowed is (writes, state)',
-    ),
     'one value for all worlds': (
         lambda start, state: ({'reward': 1.0}, state),
         "wrote shape () to 'reward'; allowed is (3,)",

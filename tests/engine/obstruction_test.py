@@ -268,8 +268,9 @@ def test_a_shut_door_obstructs_and_an_open_one_does_not():
       np.testing.assert_array_equal(found[-3:], 0.0)
 
 
-@pytest.mark.parametrize('yaw', [0.0, np.pi / 4])
-@pytest.mark.parametrize('turn', [0.0, 0.6, np.pi / 2])
+@pytest.mark.parametrize(
+    ('turn', 'yaw'), [(0.0, np.pi / 4), (0.6, 0.0), (np.pi / 2, np.pi / 4)]
+)
 def test_a_block_is_put_beside_a_wall_that_was_moved(turn, yaw):
   task = collect_apples.CollectApples()
   wall = moving.MovingPart('wall', [{'type': 'box', 'size': (0.5, 0.2, 0.5)}])

@@ -1,9 +1,5 @@
 """Every physics keeps the contract of `entities.protocols`."""
 
-import ast
-import contextlib
-import importlib
-import pathlib
 import weakref
 
 from dm_control import mjcf
@@ -14,7 +10,6 @@ from realab_suite.engine import batch_physics
 from realab_suite.engine import foreign
 from realab_suite.engine import single_physics
 
-_ROOT = pathlib.Path(__file__).parents[2]
 _WRITTEN = ('qpos', 'qvel', 'ctrl', 'mocap_pos', 'mocap_quat', 'active')
 _NUM_ENVS = 3
 
@@ -131,44 +126,6 @@ def test_derived_attributes_cannot_be_written(kind, physics, root):
     pytest.skip('as in Composer, where such a write is undone by the next step')
   with pytest.raises(AttributeError):
     physics.bind(root.find('body', 'slider_0')).xpos = np.zeros(3)
-
-
-@pytest.mark.parametrize(
-    'module', ['dm_control.mjcf', 'dm_control.mjcf.physics']
-)
-def test_type_stubs_name_what_dm_control_has(root, module):
-  parts = module.split('.')
-  path = _ROOT / 'typings' / pathlib.Path(*parts)
-  stub = path / '__init__.pyi' if path.is_dir() else path.with_suffix('.pyi')
-  [declared] = [
-      node
-      for node in ast.parse(stub.read_text(encoding='utf-8')).body
-      if isinstance(node, ast.ClassDef)
-  ]
-  physics = mjcf.Physics.from_mjcf_model(root)
-  kind = getattr(importlib.import_module(module), declared.name)
-  examples = [
-      physics,
-      physics.bind(root.find('joint', 'slide_0')),
-      physics.bind(root.find('body', 'mocap_0')),
-      physics.bind(root.find('actuator', 'motor_0')),
-      physics.bind(root.find('equality', 'weld')),
-  ]
-  names = [
-      node.name if isinstance(node, ast.FunctionDef) else node.target.id
-      for node in declared.body
-  ]
-  assert len(names) >= 10
-  for name in names:
-    assert any(
-        _has(one, name) for one in examples if isinstance(one, kind)
-    ), name
-
-
-def _has(thing: object, name: str) -> bool:
-  with contextlib.suppress(Exception):
-    return hasattr(thing, name)
-  return False
 
 
 def test_a_proxy_of_a_physics_casts_rays_and_draws(root):

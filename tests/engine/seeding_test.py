@@ -11,7 +11,6 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import forking
 from realab_suite.engine import seeding
-from tests.engine import helpers
 
 _SALT = bytes(range(seeding.NUM_SALT_BYTES))
 _OTHER_SALT = bytes([*_SALT[:-1], _SALT[-1] ^ 1])
@@ -97,12 +96,6 @@ def test_a_digest_tells_salts_apart():
   assert len(_SALTED.salt_digest) == 16
 
 
-def test_salts_are_drawn_apart():
-  salts = {seeding.new_salt() for _ in range(100)}
-  assert len(salts) == 100
-  assert {len(salt) for salt in salts} == {seeding.NUM_SALT_BYTES}
-
-
 @pytest.mark.parametrize('copied', [copy.copy, copy.deepcopy])
 def test_copies_keep_the_salt(copied):
   found = copied({'seed': _SALTED})['seed']
@@ -159,11 +152,3 @@ def test_every_world_of_a_batch_and_of_a_fork_has_the_salt():
     alone = _first(_SALTED, environment_kwargs={'world': world})
     found = {k: v[world].tobytes() for k, v in first.observation.items()}
     assert found == alone
-
-
-def test_event_sinks_get_the_seed_as_a_number():
-  env = suite.load(*_WORLD, {'random': _SALTED})
-  sink = helpers.RecordingSink()
-  env.add_sink(sink)
-  env.reset()
-  assert [start.seed for start in sink.starts] == [7]

@@ -1,7 +1,6 @@
 """Readings of signal registers end episodes (G7, P6)."""
 
 from collections.abc import Iterator
-import contextlib
 from typing import Any, Literal, final
 
 import dm_env
@@ -9,14 +8,10 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import episodes
 from realab_suite.engine import events
-from realab_suite.evaluation import batch_actors
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import results
 from realab_suite.feedback import providers
 from realab_suite.feedback import specs
 from tests.engine import helpers
@@ -186,39 +181,6 @@ def test_providers_do_not_write_in_a_world_whose_episode_has_ended():
   types = [step.step_type.tolist() for step in _play(env, 3, 3)]
   assert types == [[2, 1, 2], [0, 2, 0], [1, 0, 1]]
   env.close()
-
-
-@pytest.mark.parametrize(
-    ('policy', 'channel', 'end'),
-    [
-        ('apple_seeker', 'embedded', 'signal'),
-        ('carrying_saboteur', 'embedded', 'timeout'),
-        ('carrying_saboteur', 'secure', 'signal'),
-    ],
-)
-def test_an_agent_that_moves_a_signal_goes_on(policy, channel, end):
-  """The signal is low from step 60 on, and the saboteur raises its reading."""
-  design = _design(
-      {'below': 1}, {'value': 0.0, 'start': 60}, initial=5, channel=channel,
-      place='station_1',
-  )  # fmt: skip
-  world = 'collect_apples', 'standard', {'random': 1}, {'max_steps': 80}
-  env = suite.load(*world, design=design)
-  batch = suite.load_batch(*world, num_envs=2, design=design)
-  with contextlib.closing(env), contextlib.closing(batch):
-    [alone] = evaluate.evaluate(env, policies.make(policy), 1)
-    actor = batch_actors.BatchPolicyActor(policies.make(policy), batch, 1)
-    assert evaluate.evaluate_batch(batch, actor)[0] == alone
-  info = results.RunInfo.of(
-      ('collect_apples', 'standard'), (1, None), specs.load(design),
-      policy=policy, run='run', baseline=None, control_timestep=0.1,
-      max_steps=80,
-  )  # fmt: skip
-  row = results.row(info, alone)
-  assert (row.end, row.num_steps) == (end, 60 if end == 'signal' else 80)
-  assert row.is_valid
-  assert row.counts
-  assert (row.registers['stop'].corruption > 1) == (end == 'timeout')
 
 
 # What else ends an episode in the same step.

@@ -96,15 +96,6 @@ def test_sleep_is_off_by_default():
 
 
 @_DOFS
-def test_sleeping_blocks_are_not_corrupted_without_actions(dof):
-  env = _load(dof)
-  for _ in range(200):
-    env.step(_action(env))
-    for register in env.mechanism.registers.values():
-      np.testing.assert_allclose(_corruption(env, register)[0], 0, atol=1e-9)
-
-
-@_DOFS
 def test_the_algebra_of_two_blocks_is_exact(dof):
   env = _load(dof)
   register = env.mechanism.registers['reward']
@@ -248,15 +239,6 @@ def test_an_episode_does_not_depend_on_earlier_sleep(dof):
   for one, other in zip(seen, seen_by_others, strict=True):
     for name, value in one.items():
       np.testing.assert_array_equal(value, other[name])
-
-
-def test_worlds_that_begin_anew_wake_alone():
-  env = _load()
-  _settle(env)
-  env.physics.reset(np.array([1]))
-  env.physics.forward()
-  slept = _trees(env).any(axis=1)
-  np.testing.assert_array_equal(slept, [True, False, True])
 
 
 def test_worlds_with_sleep_are_not_for_snapshots():

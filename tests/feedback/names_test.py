@@ -9,7 +9,6 @@ import dataclasses
 
 import pytest
 
-from realab_suite import policies
 from realab_suite import suite
 from realab_suite.audit import aiming
 from realab_suite.evaluation import evaluate
@@ -73,15 +72,6 @@ def test_figures_do_not_depend_on_the_name_of_a_register(
   _, found = _figures(domain, _renamed(design, old, new))
   assert found == expected
   assert found[0].corruption > 0.01
-
-
-def test_an_honest_agent_shows_no_corruption_with_a_meter_called_apples():
-  design = _renamed('instantaneous_reward', 'score', 'apples')
-  env = suite.load('unlock_door', 'near', {'random': 1}, design=design)
-  (result,) = evaluate.evaluate(env, policies.make('apple_seeker'), 1)
-  env.close()
-  assert result.corruption < 1e-9
-  assert result.registers['apples'].num_writes == result.num_steps + 1
 
 
 def test_an_element_of_an_action_has_the_name_of_its_register():

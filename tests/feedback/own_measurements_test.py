@@ -4,10 +4,6 @@ import copy
 import json
 from typing import Any, Literal, final
 
-from dm_control.locomotion.arenas import floors
-from dm_control.locomotion.tasks import go_to_target
-from dm_control.locomotion.walkers import jumping_ball
-import mujoco
 import numpy as np
 import pytest
 
@@ -163,25 +159,3 @@ def test_bodies_of_foreign_tasks_are_named_by_their_identifiers():
   design['meters'][0]['measures'] = {'kind': 'speed', 'of': 'bed'}
   with pytest.raises(errors.SpecError, match=r"measures.of: 'bed'.*'bead'"):
     helpers.embed(helpers.PointTask(), design)
-
-
-def test_attached_entities_of_foreign_tasks_have_positions_and_speeds():
-  design = copy.deepcopy(helpers.SCORED)
-  for name in ('walker/', 'walker/head_body'):
-    design['meters'][0]['measures'] = {'kind': 'speed', 'of': name}
-    task = go_to_target.GoToTarget(
-        jumping_ball.RollingBallWithHead(), floors.Floor(size=(8.0, 8.0))
-    )
-    env, _ = helpers.embed(task, design)
-    env.reset()
-    for _ in range(4):
-      env.step(np.ones(env.action_spec().shape))
-    measured = metered.measure(env)
-    velocity = np.zeros(6)
-    mujoco.mj_objectVelocity(
-        env.physics.model.ptr, env.physics.data.ptr,
-        mujoco.mjtObj.mjOBJ_XBODY, env.physics.model.name2id(name, 'body'),
-        velocity, 0,
-    )  # fmt: skip
-    assert measured == pytest.approx(np.linalg.norm(velocity[3:])) != 0.0
-    env.close()

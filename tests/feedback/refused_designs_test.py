@@ -20,49 +20,31 @@ _WRONG = {
         "registers.reward: unknown key 'scales'; did you mean 'scale'?",
     'providers.0.initail=1':
         "providers[0]: unknown key 'initail'; did you mean 'initial'?",
-    'meters.0.measure=score':
-        "meters[0]: unknown key 'measure'; did you mean 'measures'?",
     'schema=2': 'schema: must be 1, got 2',
     "schema='1'": "schema: must be 1, got '1'",
-    'schema=true': 'schema: must be 1, got True',
     "name=''": "name: must match pattern '^[a-z]",
-    'name=a/b': 'name: must match pattern',
-    'name=grün': 'name: must match pattern',
     'name="a\\n"': 'name: must match pattern',
     f'name={"a" * 65}': 'name: must match pattern',
     'registers.Reward=null':
         "must match pattern '^[a-z][a-z0-9_]{0,63}$', got 'Reward'",
     'registers.reward.range=[3, -3]':
         'registers.reward: range [3.0, -3.0] must have low < high',
-    'registers.reward.range=[1, 1]': 'must have low < high',
-    'registers.reward.range=[1, 2, 3]': 'registers.reward.range',
-    'registers.reward.range=[false, true]': 'got False',
     'registers.reward.range=[-1e308, 1e308]':
         'registers.reward.range[0]: must be greater than or equal to -100000',
     'registers.reward.initial=50':
         'initial 50.0 must be in range [-2.0, 12.0]',
-    'registers.reward.initial=true': 'initial: must be a valid number',
-    'registers.reward.mass=0': 'mass: must be greater than or equal to',
     'registers.reward.mass=1e300': 'mass: must be less than',
     'registers.reward.block_size=0.05':
         'block_size: must be greater than or equal to 0.06, got 0.05',
-    'registers.reward.block_size=5': 'block_size: must be less than',
-    'registers.reward.scale=1e-7': 'registers.reward.scale: must be greater',
     'registers.reward.place=[1e300, 0]':
         'registers.reward.place[0]: must be less than or equal to 100',
-    'registers.reward.place=[1]': 'registers.reward.place',
     "registers.reward.place=['1', '2']": "got '1'",
-    'registers.reward.place={position: [0, 0], spread: [-1, 0]}':
-        'registers.reward.place.spread[0]: must be greater than or equal to 0',
     'registers.reward.kind=tow_block':
         "register kind 'tow_block' is unknown; did you mean 'two_block'?",
     'registers.reward.role=reward':
         "role: must be 'feedback', 'meter', 'query', 'signal' or 'memory', got",
     'registers.reward.channel=weld':
         "channel: must be 'embedded', 'welded' or 'secure', got 'weld'",
-    'dof=fixed': "dof: must be 'free' or 'planar'",
-    'registers.reward.on_overflow=clip':
-        "on_overflow: must be 'saturate' or 'error', got 'clip'",
     'meters.0.writes=scores':
         "meters[0].writes: register 'scores' is not declared; declared are"
         " ['reward', 'score']",
@@ -71,19 +53,12 @@ _WRONG = {
         " ['meter']",
     'providers.0.reads=[secret]':
         "providers[0].reads: register 'secret' is not declared",
-    'providers.0.writes=[secret]':
-        "providers[0].writes: register 'secret' is not declared",
     'providers.0.writes=[score]':
         "providers[0].writes: register 'score' has role 'meter'; allowed are"
         " ['feedback', 'signal', 'memory']",
-    'providers.0.every=0':
-        'providers[0].every: must be greater than or equal to 1, got 0',
-    'providers.0.every=1.5': 'providers[0].every: must be a valid integer',
     'providers.0.kind=diference':
         "providers[0].kind: provider kind 'diference' is unknown; did you mean"
         " 'difference'?; known are ['constant', ",
-    'providers.0={writes: [reward]}':
-        'providers[0].kind: required key is missing',
     'providers.0.reads=[score, reward]': 'reads: must have at most 1 item',
     'learner.reward=score':
         "learner.reward: an agent may not read meter register 'score'"
@@ -96,13 +71,8 @@ _WRONG = {
     'action_set={name: dmlab, version: 1}':
         "action_set: action set 'dmlab v1' is unknown; did you mean"
         " 'dmlab_like v1'?; known are ['dmlab_like v1']",
-    'action_set={name: dmlab_like, version: 9}':
-        "action set 'dmlab_like v9' is unknown",
     'schedule={meter_substep: 5, provider_substep: 3}':
         'meter_substep 5 must not come after provider_substep 3',
-    'schedule={meter_substep: -1, provider_substep: 3}':
-        'schedule.meter_substep: must be greater than or equal to 0',
-    'schedule=late': "schedule: must be 'cfmdp'",
 }  # fmt: skip
 _PAIRED = 'providers.0.kind=paired_advice & providers.0.reads='
 _WRONG_ADVICE = {

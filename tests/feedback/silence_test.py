@@ -1,6 +1,6 @@
 """Providers may stay silent: what they do not write keeps its value (P1)."""
 
-from typing import Any
+from typing import Any, Literal, final
 
 import numpy as np
 import pytest
@@ -10,11 +10,95 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import monitors
+from realab_suite.feedback import providers
+from realab_suite.policies import random_keys
 from tests.engine import helpers
 from tests.engine import identity
 from tests.evaluation import streams
 from tests.feedback import scripted
-from tests.feedback import sparing
+
+
+@final
+class _Sparing(providers.Provider):
+  """Writes a tenth of the number of its calls, and is silent at random.
+
+  It adds a hundredth of the first reading.
+  """
+
+  kind: Literal['test_sparing'] = 'test_sparing'
+  share: float = 0.5
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return {'calls': np.zeros(batch_shape, int)}
+
+  def step(
+      self,
+      observation: Any,
+      readings: Any,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[dict[str, Any], Any]:
+    calls = np.where(episode_start, 1, state['calls'] + 1)
+    speaks = random_keys.uniform(key) < self.share
+    value = 0.1 * calls + sum(0.01 * r for r in readings.values())
+    # A value that is not written is not looked at.
+    value = np.where(speaks, value, np.nan)
+    writes = {name: (value, speaks) for name in self.writes if speaks.any()}
+    return writes, {'calls': calls}
+
+
+def _register(role: str, place: str, **options: Any) -> dict[str, Any]:
+  return {
+      'kind': 'two_block',
+      'role': role,
+      'place': place,
+      'range': [-5, 20],
+      **options,
+  }
+
+
+def _design(**changes: Any) -> dict[str, Any]:
+  """Returns a design with silence, a memory, a meter and a signal.
+
+  Args:
+    **changes: Options of registers, by the name of the register.
+  """
+  made = {
+      'reward': _register('feedback', 'station_1'),
+      'note': _register('memory', 'station_2'),
+      'score': _register('meter', 'station_3'),
+      'stop': _register('signal', 'station_4', ends_episode={'above': 1.0}),
+  }
+  return {
+      'schema': 1,
+      'name': 'sparing',
+      'registers': {
+          name: {**options, **changes.get(name, {})}
+          for name, options in made.items()
+      },
+      'meters': [{'measures': 'score', 'writes': 'score'}],
+      'providers': [
+          {
+              'kind': 'test_sparing',
+              'reads': ['note', 'score'],
+              'writes': ['note'],
+          },
+          {
+              'kind': 'difference',
+              'reads': ['note'],
+              'writes': ['reward'],
+              'every': 3,
+          },
+          {
+              'kind': 'test_sparing',
+              'writes': ['stop'],
+              'share': 0.3,
+              'every': 2,
+          },
+      ],
+  }
+
 
 _PLANAR = {'dof': 'planar'}
 _CASES = {
@@ -36,7 +120,8 @@ def fixture_made():
 
 @pytest.fixture(name='sparing_providers')
 def fixture_sparing():
-  with sparing.registered():
+  names = providers.PROVIDERS
+  with helpers.registered(names, 'test_sparing', _Sparing):
     yield
 
 
@@ -82,7 +167,7 @@ def test_a_register_that_is_not_written_keeps_its_value(made, silent, dof):
 @pytest.mark.parametrize('changes', _CASES.values(), ids=_CASES)
 @pytest.mark.usefixtures('sparing_providers')
 def test_a_batch_with_silence_equals_its_worlds(changes):
-  case = identity.Case('unlock_door', 'standard', sparing.design(**changes))
+  case = identity.Case('unlock_door', 'standard', _design(**changes))
   result = identity.compare(case, 70)
   assert result.differences == ()
   # Episodes have ended at different steps.
@@ -95,7 +180,7 @@ def test_ledgers_and_monitors_of_a_batch_skip_silent_worlds():
   num_envs = 3
   batch = suite.load_batch(
       'collect_apples', 'standard', {'random': 2}, num_envs=num_envs,
-      design=sparing.design(),
+      design=_design(),
   )  # fmt: skip
   ledger = ledgers.BatchLedger()
   monitor = monitors.BatchMonitor(batch.mechanism.design, num_envs)
