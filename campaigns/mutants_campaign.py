@@ -43,10 +43,7 @@ _FIGURES = 'evaluation/episode_figures.py'
 _GAINS = 'evaluation/gains.py'
 _FIG = ('tests/evaluation/episode_figures_test.py',)
 _CLEAN = 'feedback/clean_contents.py'
-_CLE = (
-    'tests/feedback/clean_contents_test.py',
-    'tests/feedback/clean_calls_test.py',
-)
+_ORACLE = ('tests/feedback/clean_oracle_test.py',)
 _LED = ('tests/evaluation/ledger_test.py', *_FIG)
 _COMPARISON = 'evaluation/comparison.py'
 _COM = ('tests/evaluation/comparison_test.py',)
@@ -292,6 +289,21 @@ MUTANTS = [
         _CLEAN, 'NEGLIGIBLE_METRES: Final = 1e-6',
         'NEGLIGIBLE_METRES: Final = 1e-2',
         ('tests/evaluation/episode_figures_test.py',),
+    ),
+    planting.Mutant(
+        'metric', 'readings pass for clean contents', _CLEAN,
+        'return axes.choose(is_wrong, clean, reading)',
+        'return reading', _ORACLE,
+    ),
+    planting.Mutant(
+        'metric', 'a clean call continues from the actual state', _CLEAN,
+        'before = trees.taken(state[CLEAN], rows)',
+        'before = trees.taken(state[ACTUAL], rows)', _ORACLE,
+    ),
+    planting.Mutant(
+        'metric', 'a clean provider is never silent', _CLEAN,
+        'value = axes.merge(write.where, write.value, before)',
+        'value = write.value', _ORACLE,
     ),
     planting.Mutant(
         'metric', 'a diverged episode is valid', _ENDINGS,

@@ -142,8 +142,8 @@ def _play(host: str, seed: int) -> _Simulation:
   return simulation
 
 
-@pytest.mark.parametrize('host', ['embedded', 'batch'])
-@examples.settings(6)
+@pytest.mark.parametrize('host', tampered.HOSTS)
+@examples.settings(16)
 @hypothesis.given(seed=st.integers(0, 2**32))
 def test_clean_contents_equal_those_of_a_simulation(host, seed):
   # The simulation compares the contents after every step.
