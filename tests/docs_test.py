@@ -80,7 +80,7 @@ def test_python_blocks_of_a_page_run_in_order(page, registries, capsys):
 
 
 def test_the_commands_of_the_page_on_audits_are_accepted(monkeypatch):
-  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 6)
   page = (_ROOT / 'docs/audit.md').read_text()
   [block] = re.findall(r'```bash\n(.*?)```', page, re.DOTALL)
   commands = block.replace('\\\n', ' ').strip().splitlines()
@@ -103,7 +103,7 @@ def test_the_tutorial_of_a_world_can_be_followed(
     registries, monkeypatch, capsys
 ):
   monkeypatch.syspath_prepend(str(_ROOT / 'examples'))
-  monkeypatch.setattr(stakes, 'NUM_EPISODES', 20)
+  monkeypatch.setattr(stakes, 'NUM_EPISODES', 6)
   world = importlib.import_module('gate_world')
   try:
     world.main()

@@ -8,6 +8,7 @@ import abc
 import ast
 from collections.abc import Iterator
 import enum
+import functools
 import importlib
 import inspect
 import pathlib
@@ -95,12 +96,15 @@ _MAY_IMPORT = {
 _ALLOWED_GETATTR = (_PACKAGE, f'{_PACKAGE}.engine.single_physics')
 
 
-def _modules() -> Iterator[tuple[str, ast.Module]]:
-  """Yields the name and the tree of every module of the package."""
+@functools.cache
+def _modules() -> list[tuple[str, ast.Module]]:
+  """Returns the name and the tree of every module of the package."""
+  found = []
   for path in sorted((_ROOT / _PACKAGE).rglob('*.py')):
     parts = path.relative_to(_ROOT).with_suffix('').parts
     name = '.'.join(part for part in parts if part != '__init__')
-    yield name, ast.parse(path.read_text(encoding='utf-8'))
+    found.append((name, ast.parse(path.read_text(encoding='utf-8'))))
+  return found
 
 
 def _layers(name: str, tree: ast.Module) -> list[str]:
@@ -128,8 +132,8 @@ def _targets(node: Any) -> list[str]:
     # Names that begin with dots are complaints.
     source = '.' * node.level + (node.module or '')
     return [f'{source}.{alias.name}' for alias in node.names]
-  is_call = isinstance(node, ast.Call)
-  if is_call and ast.unparse(node.func) == 'importlib.import_module':
+  function = node.func if isinstance(node, ast.Call) else None
+  if isinstance(function, ast.Attribute) and function.attr == 'import_module':
     return [one.value for one in node.args[:1] if isinstance(one, ast.Constant)]
   return []
 
@@ -158,7 +162,7 @@ def _forwards(name: str, tree: ast.Module) -> list[str]:
 
 @pytest.mark.parametrize('rule', [_layers, _pickles, _forwards])
 def test_our_code_keeps_the_rule(rule: Any):
-  modules = list(_modules())
+  modules = _modules()
   assert {'realab_suite', 'realab_suite.errors'} <= {
       name for name, _ in modules
   }
