@@ -31,7 +31,7 @@ def run(main: Callable[..., int]) -> NoReturn:
 class Lines:
   """Prints a line per figure, and counts the targets that were missed.
 
-  lines = Lines('C13', seed)
+  lines = Lines('C43', seed)
   lines.at_most('state changes', num_changes, 0)
   sys.exit(lines.num_missed)
   """

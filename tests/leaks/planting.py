@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from campaigns import solver_coupling_campaign
 from realab_suite.engine import agent_view
 from tests.leaks import contract
+from tests.leaks import coupling
 from tests.leaks import failures
 from tests.leaks import pairs
 from tests.leaks import secrets
@@ -107,16 +107,14 @@ def failures_scanned() -> list[str]:
 
 
 def contacts_of_meters() -> list[str]:
-  """Campaign C15, in small."""
-  number = solver_coupling_campaign.contacts('collect_apples', 30, 0)
+  """Claim C15."""
+  number = coupling.contacts('collect_apples', 30, 0)
   return [f'{number} contacts'] * bool(number)
 
 
 def solver_coupling() -> list[str]:
-  """Campaign C13, in small."""
-  return [
-      'a meter that moves is felt'
-  ] * solver_coupling_campaign.is_felt_as_loaded(1)
+  """Claim C13."""
+  return ['a meter that moves is felt'] * coupling.is_felt_as_loaded(1)
 
 
 # How mutants get at things.

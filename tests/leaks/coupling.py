@@ -1,41 +1,29 @@
-"""Campaigns C13 and C15: a meter out of reach does not affect the agent.
-
-Run from the root of the repository, about four minutes:
-
-    python -m campaigns.solver_coupling_campaign
+"""Worlds in which a meter out of reach might affect the agent.
 
 C13: an agent pushes its register while a meter block, metres away, is moved,
 lifted, dropped or written to. Everything that it can feel is compared bit for
 bit; with solvers that are refused, it differs. C15: contacts of meter blocks
 behind a barrier with anything except the floor, while an agent acts at random.
-
-Prints `Cxx figure target verdict seed`. Arguments are the scale and the seed.
 """
 
-from collections.abc import Callable, Iterator
-import itertools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from dm_control import composer
 import mujoco
 import numpy as np
 
-from campaigns import figure_lines
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import placement
 from realab_suite.tasks import collect_apples
-from realab_suite.tasks import unlock_door
 from tests import worlds
 from tests.engine import helpers
 from tests.leaks import pairs
 from tests.leaks import secrets
 
-PAIRS = 200
-CONTACT_STEPS = 100_000
 STEPS = 50
-_VALUES = 50
 _EPISODE = 200
 _REPEATS = 6  # An agent with a new action in each step stays where it is.
 
@@ -99,7 +87,6 @@ REFUSED = {
         'disableflags': mujoco.mjtDisableBit.mjDSBL_ISLAND,
     },
 }
-_TASKS = (collect_apples.CollectApples, unlock_door.UnlockDoor)
 
 
 class World(NamedTuple):
@@ -165,58 +152,6 @@ def play(
   if abs(shoved) < 0.1:
     raise AssertionError('nothing was shoved, so there was little to solve')
   return felt
-
-
-def cases(number: int, seed: int) -> Iterator[tuple[World, _Move, Any]]:
-  """Yields worlds, and the moves of their meters."""
-  kinds = itertools.cycle(
-      itertools.product(SOLVERS.values(), _TASKS, ('free', 'planar'))
-  )
-  for i in range(number):
-    options, task, dof = next(kinds)
-    world = World(task, seed + i // 40, dof, tuple(options.items()))
-    moves = list(MOVES.values())
-    # Half are moved, half write one of 50 values.
-    if i // 8 % 2:
-      yield world, moves[i // 16 % len(moves)], None
-    else:
-      value = 20.0 * (i % _VALUES) / (_VALUES - 1)
-      yield world, leave, value
-
-
-def differing(number: int, seed: int) -> tuple[int, int]:
-  """Returns the number of pairs that differ, and of all pairs."""
-  count = num_pairs = 0
-  still: dict[World, list[bytes]] = {}
-  for world, move, value in cases(number, seed):
-    if world not in still:
-      still[world] = play(world)
-    if value is None:
-      if move is turn_over and world.dof == 'planar':
-        move = drop  # Planar blocks do not roll.
-      found = play(world, move)
-    else:
-      found = play(world, measure=lambda physics, value=value: value)
-    num_pairs += 1
-    count += found != still[world]
-  return count, num_pairs
-
-
-def differing_where_refused(seed: int) -> dict[str, int]:
-  """Returns the number of steps, of four runs, that feel a lifted meter."""
-  found = {}
-  for name, options in REFUSED.items():
-    number = 0
-    for task in _TASKS:
-      world = World(task, seed, 'free', tuple(options.items()))
-      expected = play(world)
-      for move in (lift, drop):
-        number += sum(
-            one != other
-            for one, other in zip(expected, play(world, move), strict=True)
-        )
-    found[name] = number
-  return found
 
 
 def refused_by_loader() -> list[str]:
@@ -301,23 +236,3 @@ def num_contacts_of_meters(env: environment.Environment) -> int:
       is_floor = model.geom_type[thing] == mujoco.mjtGeom.mjGEOM_PLANE
       count += int(touches and not is_floor)
   return count
-
-
-def main(scale: float = 1.0, seed: int = 0) -> int:
-  """Prints figures and returns the number of targets missed."""
-  lines = figure_lines.Lines('C13', seed)
-  count, num_pairs = differing(max(8, int(scale * PAIRS)), seed)
-  lines.at_most(f'differing of {num_pairs} pairs', count, 0)
-  for name, number in differing_where_refused(seed).items():
-    lines.at_least(f'steps felt with {name} (control)', number, 1)
-  lines.at_least('wrong options refused of 5', len(refused_by_loader()), 5)
-  touched = figure_lines.Lines('C15', seed)
-  steps = max(100, int(scale * CONTACT_STEPS)) // len(suite.TASKS_BY_DOMAIN)
-  for domain in suite.TASKS_BY_DOMAIN:
-    number = contacts(domain, steps, seed)
-    touched.at_most(f'contacts in {steps} steps of {domain}', number, 0)
-  return lines.num_missed + touched.num_missed
-
-
-if __name__ == '__main__':
-  figure_lines.run(main)
