@@ -12,7 +12,6 @@ from realab_suite.engine import batch_environment
 from realab_suite.engine import events
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
-from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import results
 from realab_suite.feedback import provider_results
 from realab_suite.feedback import providers
@@ -74,18 +73,6 @@ def test_a_row_contains_the_traceback(tmp_path: Any):
   assert row.failure == result.failure
 
 
-def test_a_failing_reward_changes_nothing_for_the_agent():
-  def play(make: Any) -> list[bytes]:
-    env = _embed(make())
-    actions = helpers.random_actions(env, 9)
-    found = [helpers.to_bytes(env.step(action)) for action in actions]
-    env.close()
-    return found
-
-  assert play(_Unpaid) == play(collect_apples.CollectApples)
-  assert play(_failing_point) == play(helpers.PointTask)
-
-
 def test_a_failing_reward_is_reported_for_every_world_of_a_batch():
   batch = batch_environment.BatchEnvironment(_embed(_Unpaid()), _NUM_ENVS)
   actor = batch_actors.BatchPolicyActor(policies.make('random'), batch, 1)
@@ -93,19 +80,6 @@ def test_a_failing_reward_is_reported_for_every_world_of_a_batch():
   for result in found:
     assert not result.is_valid
     assert 'ZeroDivisionError: the till is empty' in result.failure
-
-
-def test_a_snapshot_contains_the_failure():
-  env = _embed(_Unpaid(), max_steps=50)
-  ledger = ledgers.Ledger()
-  env.add_sink(ledger)
-  env.reset()
-  for _ in range(3):
-    env.step(helpers.no_op(env))
-  other = ledgers.Ledger()
-  other.set_state(ledger.state())
-  assert other.last.failure == ledger.last.failure
-  assert 'till' in other.last.failure
 
 
 # Ends that the engine tells, once.

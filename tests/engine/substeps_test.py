@@ -143,22 +143,6 @@ def test_short_substeps_fit_all_blocks(register: dict[str, Any]):
   env.close()
 
 
-@pytest.mark.parametrize(
-    'register',
-    [
-        {'block_size': 0.15},
-        {'block_size': 0.4},
-        {'mass': 0.1},
-        {'mass': 0.01, 'channel': 'welded'},
-    ],
-)
-def test_usual_blocks_need_no_short_substeps(register: dict[str, Any]):
-  env = suite.load(*_WORLD, design=_design(**register))
-  assert env.num_substeps == 4
-  assert env.physics.timestep() == 0.025
-  env.close()
-
-
 @pytest.mark.parametrize('timestep', [0.02, 0.001, 1, True, '0.01', None, []])
 def test_other_substeps_are_refused(timestep: Any):
   with pytest.raises(
