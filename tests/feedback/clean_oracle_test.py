@@ -81,7 +81,6 @@ class _Simulation:
     registers = self._mechanism.registers
     clean = self._clean
     step = np.asarray(self._mechanism.step_count(physics)).astype(int) + 1
-    keys_of_step = random_keys.of_step(keys, step - 1)
     for name, one in registers.items():
       if one.role in ('meter', 'query'):
         clean[name] = one.applied(physics)
