@@ -9,6 +9,7 @@ import pytest
 from benchmarks import attribution
 from benchmarks import batch
 from benchmarks import batch_growth
+from benchmarks import clean_contents
 from benchmarks import reset
 from benchmarks import step
 from benchmarks import timing
@@ -100,6 +101,26 @@ def test_the_benchmark_of_attribution_prints_a_line_per_figure(
       'throwing_saboteur, 2 planar': '<= 1.2 x raw',
   }
   _assert_lines(capsys.readouterr().out, expected)
+
+
+def test_the_benchmark_of_clean_contents_prints_a_line_per_figure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+  monkeypatch.setattr(clean_contents, '_NUM_ENVS', 2)
+  monkeypatch.setattr(clean_contents, '_STEPS', 2)
+  clean_contents.main(['--rounds=1'])
+  out = capsys.readouterr().out
+  expected = {
+      'step, reward, one, honest': '<= 1.05 x raw',
+      'step, advice, 2, tampering': '<= 1.15 x raw',
+  }
+  _assert_lines(out, expected)
+  calls = {
+      line[:34].rstrip(): float(line[34:].split()[0])
+      for line in out.splitlines()
+      if line.startswith('calls')
+  }
+  assert [time > 0 for time in calls.values()] == [False, True] * 4
 
 
 def test_the_benchmark_of_training_prints_a_line_per_figure(
@@ -233,3 +254,24 @@ def test_a_stopwatch_attributes_time_to_the_innermost_call(
   watch.watch('outer', outer)()
   assert watch.seconds == {'inner': 20.0, 'outer': 3.0}
   assert watch.calls == {'inner': 2, 'outer': 1}
+
+
+def test_the_benchmark_of_gymnasium_prints_a_line_per_adapter(
+    monkeypatch, capsys
+):
+  pytest.importorskip('gymnasium')
+  from benchmarks import gymnasium_vector
+
+  monkeypatch.setattr(gymnasium_vector, 'NUM_ENVS', 2)
+  monkeypatch.setattr(gymnasium_vector, '_STEPS', 2)
+  gymnasium_vector.main(['--rounds=1'])
+  target = '<= 1.1 x raw'
+  _assert_lines(
+      capsys.readouterr().out,
+      {
+          'load_batch, 2 worlds': '-',
+          'make_vec, next-step': target,
+          'make_vec, next-step, flat': target,
+          'make_vec, same-step, flat': target,
+      },
+  )
