@@ -13,6 +13,7 @@ from typing import Final, final
 import numpy as np
 from scipy import stats
 
+from realab_suite.evaluation import comparison
 from realab_suite.evaluation import hacking
 from realab_suite.evaluation import intervals
 from realab_suite.evaluation import stakes
@@ -313,9 +314,9 @@ def of_policy(
 
 
 def gains_at_a_loss(
-    agent: Sequence[hacking.Episode],
-    control: Sequence[hacking.Episode],
-    twin: Sequence[hacking.Episode],
+    agent: Sequence[comparison.Episode],
+    control: Sequence[comparison.Episode],
+    twin: Sequence[comparison.Episode],
     stake: stakes.Stakes,
 ) -> bool:
   """Returns True if an agent gains more than its control and earns less.
@@ -330,7 +331,7 @@ def gains_at_a_loss(
     stake: Stakes of the design.
   """
 
-  def returns(episodes: Sequence[hacking.Episode]) -> list[float]:
+  def returns(episodes: Sequence[comparison.Episode]) -> list[float]:
     return [one.true_return for one in episodes if one.counts]
 
   return is_larger(

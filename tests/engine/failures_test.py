@@ -178,7 +178,7 @@ def test_every_episode_that_begins_ends_once(num_steps: int, how: str):
 def test_ledgers_and_monitors_take_the_end_from_the_engine():
   batch = _batch(design='instantaneous_reward')
   ledger = ledgers.BatchLedger()
-  monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
+  monitor = monitors.BatchMonitor(batch)
   batch.add_sink(ledger)
   batch.add_sink(monitor)
   batch.reset()

@@ -17,6 +17,7 @@ from realab_suite.engine import events
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
@@ -50,7 +51,8 @@ def _tamper_and_give_up(seed: int) -> list[evaluate.EpisodeResult]:
   with _world(seed) as env:
     actor = _saboteur(env)
     env.rewind()
-    listener = evaluate.ResultCollector(env)
+    listener = monitors.Monitor(env)
+    env.add_sink(listener)
     view = agent_view.AgentView(env)
     for episode in range(_NUM_EPISODES):
       actor.begin(episode)

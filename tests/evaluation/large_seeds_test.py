@@ -61,7 +61,7 @@ def test_traces_keep_large_seeds(seed):
 def test_snapshots_ledgers_and_monitors_keep_large_seeds():
   with _batch(_SEED) as batch:
     ledger = ledgers.BatchLedger()
-    monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
+    monitor = monitors.BatchMonitor(batch)
     batch.add_sink(ledger)
     batch.add_sink(monitor)
     batch.reset()

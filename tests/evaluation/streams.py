@@ -6,6 +6,7 @@ what the definitions say, in loops and without sums that are kept up to date.
 
 from collections.abc import Iterator, Mapping, Sequence
 import math
+import types
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import monitors
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
@@ -78,6 +80,18 @@ def tell(
     sink.step_ended(events.Step(records, action, np.array(true_reward)), None)
   if end is not None:
     sink.episode_ended(end)
+
+
+def monitor(
+    design: specs.DesignSpec,
+    objective: objectives.ObjectiveSpec | None = None,
+) -> monitors.Monitor:
+  """Returns a monitor of a world that is nothing but its design."""
+  mechanism = types.SimpleNamespace(design=design, queries=[])
+  env = types.SimpleNamespace(
+      mechanism=mechanism, task=None, physics=None, num_substeps=1
+  )
+  return monitors.Monitor(env, objective)
 
 
 def pairs(
@@ -156,7 +170,7 @@ def figures(
     actions: Sequence[Any] = (),
     objective: objectives.ObjectiveSpec | None = None,
 ) -> dict[str, Any]:
-  """Returns the fields of `episode_figures.EpisodeFigures`."""
+  """Returns figures of `monitors.EpisodeResult`, by name."""
   objective = objective or design.objective
   found = {
       name: _of_register(episode, name, spec.scale, spec.role)
