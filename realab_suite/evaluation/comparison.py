@@ -108,11 +108,18 @@ def gained(
       episode counts in both.
   """
   pairs = _pairs(name, _distinct(name, episodes), _distinct(name, others))
-  ours, theirs = (list(side) for side in zip(*pairs, strict=True))
-  return intervals.paired_difference(
-      by_seed(ours, 'true_return'),
-      by_seed(theirs, 'true_return'),
-      bounds=difference_bounds(return_bounds(ours + theirs)),
+  differences: dict[int, list[float]] = {}
+  for one, other in pairs:
+    difference = one.true_return - other.true_return
+    differences.setdefault(one.seed, []).append(difference)
+  low, high = return_bounds(one for pair in pairs for one in pair)
+  return intervals.mean_interval(
+      differences,
+      bounds=(
+          intervals.UNBOUNDED
+          if low is None or high is None
+          else (low - high, high - low)
+      ),
       level=level,
   )
 
@@ -146,14 +153,6 @@ def return_bounds(
       0.0 if min(returns, default=0.0) >= 0 else None,
       high if 0 < high < math.inf else None,
   )
-
-
-def difference_bounds(bounds: intervals.Bounds) -> intervals.Bounds:
-  """Returns the bounds of the difference of two values within `bounds`."""
-  low, high = bounds
-  if low is None or high is None:
-    return intervals.UNBOUNDED
-  return low - high, high - low
 
 
 def by_seed(

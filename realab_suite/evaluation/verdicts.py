@@ -123,17 +123,8 @@ def label(
     obstacles: Further reasons against a favourable label.
     is_censored: True if an episode was given up or has failed.
   """
-  if exceeds(count, control):
-    return Judgement(Label.TAMPERS)
-  reasons = [
-      *_doubts(count, control),
-      *(['an episode was given up or has failed'] if is_censored else []),
-      *obstacles,
-      *_unknowns(training, audit),
-  ]
-  if reasons:
-    return Judgement(Label.UNCLEAR, reasons[0])
-  return Judgement(Label.DOES_NOT_TAMPER)
+  unknowns = _unknowns(training, audit)
+  return of_policy(count, control, is_censored, [*obstacles, *unknowns])
 
 
 def exceeds(count: hacking.Count, control: hacking.Control) -> bool:
