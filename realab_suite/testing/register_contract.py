@@ -332,7 +332,7 @@ def _check_displacements(subject: _Subject) -> None:
         [block in register.blocks_of(port) for port in register.PORTS] or True
     )
     for x, y in (*_DIRECTIONS, *([direction] if direction else [])):
-      difference = _moved(subject, block, (x, y))
+      difference = _displaced(subject, block, (x, y))
       reported = register.displacements(physics)[i]
       contracts.require(
           reported >= _LEAST,
@@ -350,7 +350,7 @@ def _check_displacements(subject: _Subject) -> None:
           f'{where}: block {i} was moved in its direction {direction}, and the'
           f' reading changed by {difference}; directions raise a reading',
       )
-    changed |= np.abs(_turned(subject, block)) > _ROUNDING
+    changed |= np.abs(_displaced(subject, block, turn=0.1)) > _ROUNDING
   contracts.require(
       changed.all(),
       f'{where}: no motion of a single block changes'
@@ -358,26 +358,19 @@ def _check_displacements(subject: _Subject) -> None:
   )
 
 
-def _moved(
-    subject: _Subject, block: block_kinds.Block, direction: tuple[float, float]
+def _displaced(
+    subject: _Subject,
+    block: block_kinds.Block,
+    direction: tuple[float, float] = (0.0, 0.0),
+    turn: float = 0.0,
 ) -> np.ndarray:
-  """Moves a block after a write; returns the change of the reading."""
+  """Displaces a block after a write; returns the change of the reading."""
   subject.world.restart()
   subject.write(subject.values[2])
   reading = subject.read()
   place = np.array(block.position(subject.physics))
   place[:2] += _MOVED * np.array(direction)
-  block.put(subject.physics, place, block.heading(subject.physics))
-  return np.asarray(subject.read() - reading)
-
-
-def _turned(subject: _Subject, block: block_kinds.Block) -> np.ndarray:
-  """Turns a block after a write; returns the change of the reading."""
-  subject.world.restart()
-  subject.write(subject.values[2])
-  reading = subject.read()
-  place = np.array(block.position(subject.physics))
-  block.put(subject.physics, place, block.heading(subject.physics) + 0.1)
+  block.put(subject.physics, place, block.heading(subject.physics) + turn)
   return np.asarray(subject.read() - reading)
 
 

@@ -251,7 +251,6 @@ def test_the_plan_is_repeated_bit_by_bit():
 
 def test_a_task_without_a_solver_is_refused(monkeypatch):
   monkeypatch.setattr(unlock_door.UnlockDoor, 'SOLVER', None)
-  monkeypatch.setattr(worlds, '_traits', worlds._traits.__wrapped__)
   with pytest.raises(errors.SpecError, match=r'no audit.*names no solver'):
     _audit('instantaneous_reward')
 
