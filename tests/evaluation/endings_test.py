@@ -216,18 +216,3 @@ def test_every_end_is_valid_given_up_or_failed(end, is_valid, is_given_up):
   for unknown in (math.nan, math.inf, -math.inf):
     assert endings.is_valid(end, unknown) is False
     assert endings.is_given_up(end, unknown) is False
-
-
-def test_these_are_all_the_ends():
-  ends = {events.End(value) for value in (
-      'terminated', 'signal', 'timeout', 'abandoned', 'disconnect',
-      'divergence', 'error',
-  )}  # fmt: skip
-  assert set(events.End) == ends
-
-
-def test_foreign_tasks_have_no_largest_return():
-  env = suite.embed(helpers.PointTask(), 'none', random=7, max_steps=3)
-  with contextlib.closing(env):
-    [result] = evaluate.evaluate(env, lambda time_step: helpers.no_op(env), 1)
-  assert result.max_true_return is None

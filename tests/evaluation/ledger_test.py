@@ -101,54 +101,6 @@ def test_an_entry_copies_numbers_out_of_arrays():
   assert {type(x) for x in (*numbers, *ledger.last.true_rewards)} == {float}
 
 
-def test_episodes_are_kept_apart():
-  ledger = ledgers.Ledger()
-  for episode in (3, 4):
-    ledger.episode_started(_start(_write(episode), episode=episode), None)
-    ledger.step_ended(_step(_read(episode), reward=episode), None)
-    ledger.episode_ended(events.End.TIMEOUT)
-  first, second = ledger.episodes
-  assert ledger.last is second
-  for number, episode in ((3, first), (4, second)):
-    assert (episode.seed, episode.world, episode.episode) == (7, 0, number)
-    assert episode.true_rewards == [number]
-    assert episode.num_steps == 1
-    assert [entry[3] for entry in episode.entries['reward']] == [number] * 2
-
-
-def test_the_true_return_is_the_sum_of_all_rewards_the_last_one_included():
-  ledger = ledgers.Ledger()
-  ledger.episode_started(_start(), None)
-  assert ledgers.true_return(ledger.last) == 0.0
-  for reward in (1.0, -3.0, 10.0):
-    ledger.step_ended(_step(reward=reward), None)
-  assert ledgers.true_return(ledger.last) == 8.0
-  assert type(ledgers.true_return(ledger.last)) is float
-
-
-@pytest.mark.parametrize('bad', [float('nan'), -float('inf')])
-def test_an_episode_without_a_true_return_is_censored(bad):
-  ledger = ledgers.Ledger()
-  ledger.episode_started(_start(), None)
-  for reward in (1.0, bad, 2.0):
-    assert ledger.last.end is None
-    ledger.step_ended(_step(reward=reward), None)
-  ledger.episode_ended(events.End.TIMEOUT)
-  assert ledger.last.is_valid is False
-  assert not np.isfinite(ledgers.true_return(ledger.last))
-
-
-def test_an_empty_ledger_has_no_last_episode():
-  with pytest.raises(errors.ResultsError, match='the ledger has no episode'):
-    ledgers.Ledger().last  # noqa: B018
-
-
-def test_a_state_without_an_episode_adds_none():
-  ledger = ledgers.Ledger()
-  ledger.set_state(ledger.state())
-  assert not ledger.episodes
-
-
 def test_the_end_of_an_unknown_episode_is_ignored():
   ledger = ledgers.Ledger()
   ledger.episode_ended(events.End.ABANDONED)
@@ -331,12 +283,3 @@ def test_a_reading_is_the_request_plus_saturation_plus_corruption(dof):
   assert _largest(episodes, 'excess') <= _TOLERANCE
   for part in ('permanent', 'temporary', 'saturation'):
     assert _largest(episodes, part) > 0.5
-
-
-def test_a_secure_channel_has_saturation_and_no_corruption():
-  episodes = _play(_ODD, 'channel=secure', has_helper=True)
-  assert _largest(episodes, 'excess') <= _TOLERANCE
-  assert _largest(episodes, 'obstruction') == 0.0
-  assert _largest(episodes, 'permanent') == 0.0
-  assert _largest(episodes, 'temporary') == 0.0
-  assert _largest(episodes, 'saturation') > 0.5

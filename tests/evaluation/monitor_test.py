@@ -111,25 +111,6 @@ def test_figures_equal_those_of_the_ledger(design, channel):
     assert set(corruption) == {0.0}
 
 
-@pytest.mark.mujoco_warns('BADQVEL')
-def test_the_episode_of_a_diverged_world_is_invalid():
-  with contextlib.closing(_load()) as batch:
-    monitor = _monitored(batch)
-    rng = np.random.default_rng(0)
-    batch.reset()
-    batch.step(_actions(batch, rng))
-    joint = batch.task.avatar.body.find_all('joint')[0]
-    batch.physics.world(1).bind((joint,)).qvel = np.nan
-    batch.step(_actions(batch, rng))
-    [one] = monitor.take()
-    later, _ = _play(batch, rng, 24, monitor)
-  assert (one.world, one.end) == (1, events.End.DIVERGENCE)
-  assert not one.is_valid
-  assert one.num_steps == 1
-  assert [o.is_valid for o in later] == [True] * _NUM_ENVS
-  assert {o.num_steps for o in later} == {20}
-
-
 def test_a_monitor_continues_from_a_snapshot():
   def text(episodes):
     return repr(sorted(episodes, key=lambda one: (one.episode, one.world)))
