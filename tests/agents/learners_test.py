@@ -220,24 +220,6 @@ def test_vectors_have_no_probabilities():
     learner.probabilities({'number': np.zeros((2, 1))})
 
 
-def test_an_actor_acts_in_one_world_without_learning():
-  env = toys.Bandit(1)
-  learner = _make(env, 'policy_gradient', reward='feedback')
-  before = learner.state()
-  batch = env.reset()
-  one = toys.ToyStep(1, 1.0, {k: v[0] for k, v in batch.observation.items()})
-
-  def actions(seed: int) -> list[int]:
-    actor = agents.LearnerActor(learner, seed)
-    actor.begin(3)
-    return [int(actor.act(one)) for _ in range(40)]
-
-  assert actions(1) == actions(1)
-  assert actions(1) != actions(2)
-  assert set(actions(1)) == {0, 1, 2}
-  _assert_same(learner.state(), before)
-
-
 def test_the_decoupled_query_is_independent_of_the_action():
   env = toys.Bandit(4000, _ACTIONS, queries=_PAIR)
   for other_query in (None, 'other'):
