@@ -48,21 +48,6 @@ _DESIGNS = [
 ]  # fmt: skip
 
 
-def _alike(found, expected):
-  """Compares figures of which one adds in another order."""
-  found, other = (
-      one.model_dump() if hasattr(one, 'model_dump') else one
-      for one in (found, expected)
-  )
-  if isinstance(found, dict):
-    for name, value in found.items():
-      _alike(value, other[name])
-  elif found is None or isinstance(found, bool):
-    assert found == other
-  else:
-    assert found == pytest.approx(other, rel=1e-12, abs=1e-12)
-
-
 @pytest.mark.parametrize('design', _DESIGNS, ids=range(len(_DESIGNS)))
 @hypothesis.settings(max_examples=40)
 @hypothesis.given(seed=st.integers(0, 2**32), end=_ENDS)
@@ -75,7 +60,9 @@ def test_figures_equal_those_of_the_oracle(design, seed, end):
   [episode] = monitor.take()
   assert episode.end is end
   expected = streams.figures(ledger.last, design, actions)
-  _alike({name: getattr(episode, name) for name in expected}, expected)
+  streams.check_alike(
+      {name: getattr(episode, name) for name in expected}, expected
+  )
   assert episode.num_steps == len(steps) - 1
 
 

@@ -2,20 +2,14 @@
 
 from typing import Any
 
-import dm_env
 import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import policies
 from realab_suite import suite
-from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.evaluation import actors
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
-from tests import worlds
 from tests.engine import helpers
 from tests.evaluation import streams
 
@@ -159,127 +153,3 @@ def test_the_step_in_which_something_raises_is_not_counted(failing):
 
 
 _APART = ('registers.reward.place=[2, 2]', 'registers.score.place=[2, -3]')
-
-
-# Each reading is a sum of its parts.
-
-
-class _Everybody(events.EventSink):
-  """Reads every register as an evaluator."""
-
-  def __init__(self, ledger: ledgers.Ledger, feedback: Any) -> None:
-    self._ledger = ledger
-    self._feedback = feedback
-
-  def episode_started(self, start: events.Start, physics: Any) -> None:
-    self._read(physics)
-
-  def step_ended(self, step: events.Step, physics: Any) -> None:
-    self._read(physics)
-
-  def episode_ended(self, end: events.End) -> None:
-    pass
-
-  def _read(self, physics: Any) -> None:
-    reads = worlds.shadow_reads(self._feedback, physics, 'evaluator')
-    self._ledger.last.add(reads)
-
-
-def _shoving(env: environment.Environment) -> actors.PlainPolicy:
-  """Returns the random policy, which also moves blocks at random."""
-  actor = actors.make(policies.make('random'), env)
-  random = np.random.default_rng(0)
-  blocks = [b for r in env.mechanism.registers.values() for b in r.blocks]
-
-  def act(time_step: dm_env.TimeStep) -> Any:
-    if random.uniform() < 0.2:
-      block = blocks[random.integers(len(blocks))]
-      position = np.array(block.position(env.physics))
-      position[:2] += random.uniform(-0.2, 0.2, 2)
-      block.put(env.physics, position, heading=random.uniform(-0.5, 0.5))
-    return actor.act(time_step)
-
-  return act
-
-
-# Feedback that is always too large for its registers, two providers for one of
-# them, every kind of register, and one that is never written.
-_ODD = {
-    'schema': 1,
-    'name': 'odd',
-    'registers': {
-        'reward': {
-            'kind': 'two_block',
-            'role': 'feedback',
-            'place': 'station_1',
-            'range': [-2, 4],
-        },
-        'turned': {
-            'kind': 'block_orientation',
-            'role': 'feedback',
-            'place': [0.9, -1.6],
-            'range': [-2, 2],
-            'scale': 0.5,
-        },
-        'untouched': {
-            'kind': 'two_block',
-            'role': 'signal',
-            'place': {'position': [-3, 0.5], 'yaw': 1.0},
-            'range': [-1, 1],
-        },
-        'score': {
-            'kind': 'block_position',
-            'role': 'meter',
-            'place': [-0.9, -0.3],
-            'range': [-1, 0.5],
-        },
-    },
-    'meters': [{'measures': 'score', 'writes': 'score'}],
-    'providers': [
-        {'kind': 'constant', 'value': 7.0, 'writes': ['reward']},
-        {'kind': 'difference', 'reads': ['score'], 'writes': ['turned']},
-    ],
-}
-
-
-def _play(
-    design: Any, *overrides: str, has_helper: bool
-) -> list[ledgers.EpisodeLedger]:
-  env = suite.load(
-      'unlock_door',
-      'near',
-      {'random': 3},
-      {'max_steps': 100},
-      design=design,
-      overrides=overrides,
-  )
-  ledger = ledgers.Ledger()
-  listeners = (ledger, _Everybody(ledger, env.mechanism))
-  policy = _shoving(env) if has_helper else policies.make('random')
-  evaluate.evaluate(env, policy, 2, sinks=listeners)
-  env.close()
-  # Every register is read by the evaluator after every step.
-  pairs = list(streams.pairs(ledger.episodes))
-  assert len(pairs) > 2 * 101 * len(env.mechanism.registers)
-  return ledger.episodes
-
-
-def _largest(episodes: list[ledgers.EpisodeLedger], part: str) -> float:
-  parts = {
-      'excess': lambda write, read: (read.reading - write.requested)
-      - (write.applied - write.requested)
-      - (read.obstruction + read.permanent + read.temporary),
-      'obstruction': lambda write, read: read.obstruction,
-      'permanent': lambda write, read: read.permanent,
-      'temporary': lambda write, read: read.temporary,
-      'saturation': lambda write, read: write.applied - write.requested,
-  }
-  return max(abs(parts[part](*pair)) for pair in streams.pairs(episodes))
-
-
-@pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_a_reading_is_the_request_plus_saturation_plus_corruption(dof):
-  episodes = _play(_ODD, f'dof={dof}', has_helper=True)
-  assert _largest(episodes, 'excess') <= _TOLERANCE
-  for part in ('permanent', 'temporary', 'saturation'):
-    assert _largest(episodes, part) > 0.5

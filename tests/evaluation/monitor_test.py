@@ -86,22 +86,7 @@ def test_figures_equal_those_of_the_ledger(design, channel):
     first = 1 + 21 * one.episode
     played = [row[one.world] for row in actions[first:]]
     expected = streams.figures(episode, spec, played)
-    for key, value in expected.items():
-      ours = getattr(one, key)
-      if key == 'registers':
-        for name, row in value.items():
-          assert ours[name].model_dump() == pytest.approx(
-              row.model_dump(), rel=1e-9, abs=1e-12
-          )
-      elif key == 'objective':
-        assert list(ours) == list(value)
-        for name, pair in value.items():
-          assert ours[name].observed == pytest.approx(pair.observed, rel=1e-9)
-          assert ours[name].clean == pytest.approx(pair.clean, rel=1e-9)
-      elif value is None:
-        assert ours is None
-      else:
-        assert ours == pytest.approx(value, rel=1e-9, abs=1e-12)
+    streams.check_alike({key: getattr(one, key) for key in expected}, expected)
   corruption = [one.corruption for one in found]
   if not spec.registers:
     assert set(corruption) == {None}

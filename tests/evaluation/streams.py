@@ -4,12 +4,13 @@ The oracle takes a whole episode from a ledger, and asks of every step and read
 what the definitions say, in loops and without sums that are kept up to date.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import math
 import types
 from typing import Any
 
 import numpy as np
+import pytest
 
 from realab_suite.engine import events
 from realab_suite.entities import registers
@@ -92,20 +93,6 @@ def monitor(
       mechanism=mechanism, task=None, physics=None, num_substeps=1
   )
   return monitors.Monitor(env, objective)
-
-
-def pairs(
-    episodes: Sequence[ledgers.EpisodeLedger],
-) -> Iterator[tuple[registers.Write, registers.Read]]:
-  """Yields each read with the write before it in the same episode."""
-  for episode in episodes:
-    for entries in episode.entries.values():
-      last = None
-      for entry in entries:
-        if isinstance(entry, registers.Write):
-          last = entry
-        elif last is not None:
-          yield last, entry
 
 
 class Made:
@@ -324,3 +311,18 @@ def _objective(
       )
       for name, part in parts.items()
   }
+
+
+def check_alike(found: Any, expected: Any) -> None:
+  """Compares figures of which one adds in another order."""
+  found, other = (
+      one.model_dump() if hasattr(one, 'model_dump') else one
+      for one in (found, expected)
+  )
+  if isinstance(found, dict):
+    for name, value in found.items():
+      check_alike(value, other[name])
+  elif found is None or isinstance(found, bool):
+    assert found == other
+  else:
+    assert found == pytest.approx(other, rel=1e-12, abs=1e-12)
