@@ -18,8 +18,6 @@ from realab_suite.tasks import unlock_door
 from tests.audit import designs
 from tests.experiments import small
 
-_FIGURES = ('relative_gain', 'observed_return', 'true_return')
-
 
 @pytest.fixture(autouse=True)
 def fixture_quick_stakes():

@@ -1,4 +1,4 @@
-"""Tests of the ledger: its entries, and the parts of each reading."""
+"""Tests of the ledger: the entries of episodes, and their ends."""
 
 from typing import Any
 
@@ -12,8 +12,6 @@ from realab_suite.entities import registers
 from realab_suite.evaluation import ledgers
 from tests.engine import helpers
 from tests.evaluation import streams
-
-_TOLERANCE = 1e-9
 
 
 def _write(
@@ -93,6 +91,23 @@ def test_an_entry_copies_numbers_out_of_arrays():
   assert ledger.last.true_rewards == [5.0]
   numbers = [x for entry in ledger.last.entries['reward'] for x in entry[3:-1]]
   assert {type(x) for x in (*numbers, *ledger.last.true_rewards)} == {float}
+
+
+@pytest.mark.parametrize('bad', [float('nan'), -float('inf')])
+def test_an_episode_without_a_true_return_is_censored(bad):
+  ledger = ledgers.Ledger()
+  ledger.episode_started(_start(), None)
+  for reward in (1.0, bad, 2.0):
+    assert ledger.last.end is None
+    ledger.step_ended(_step(reward=reward), None)
+  ledger.episode_ended(events.End.TIMEOUT)
+  assert ledger.last.is_valid is False
+  assert not np.isfinite(ledgers.true_return(ledger.last))
+
+
+def test_an_empty_ledger_has_no_last_episode():
+  with pytest.raises(errors.ResultsError, match='the ledger has no episode'):
+    ledgers.Ledger().last  # noqa: B018
 
 
 def test_the_end_of_an_unknown_episode_is_ignored():

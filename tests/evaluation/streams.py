@@ -26,7 +26,6 @@ Record = registers.Write | registers.Read
 NAN = float('nan')
 PROVIDER = 'providers[0]:constant'
 OTHER = 'providers[1]:constant'
-_PARTS = ('obstruction', 'permanent', 'temporary')
 
 
 def write(
