@@ -15,7 +15,6 @@ from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import movers
-from tests.evaluation import disturbed
 from tests.evaluation import staged
 
 _AHEAD, _LEFT = 0.0, np.pi / 2
@@ -370,43 +369,6 @@ def test_one_world_alone_has_the_same_attribution(name, dof):
   env.close()
 
 
-@pytest.mark.parametrize(
-    ('disturbance', 'design', 'channel'),
-    [
-        ('ball', 'instantaneous_reward', 'embedded'),
-        ('ball', disturbed.five('planar'), 'embedded'),
-        ('wind', disturbed.five('free'), 'embedded'),
-        ('wind', 'value_advice', 'embedded'),
-        ('none', disturbed.five('free'), 'embedded'),
-        ('wind', 'instantaneous_reward', 'welded'),
-        ('ball', 'instantaneous_reward', 'secure'),
-    ],
-    ids=['meter', 'planar', 'free', 'myopic', 'calm', 'welded', 'secure'],
-)
-def test_nothing_is_the_part_of_an_agent_that_does_nothing(
-    disturbance, design, channel
-):
-  batch = disturbed.load_batch(
-      2, disturbance, design, f'channel={channel}', max_steps=25
-  )
-  attributor = attribution.Attributor(batch)
-  batch.add_sink(attributor)
-  act = disturbed.still(batch)
-  batch.reset()
-  for _ in range(25):
-    batch.step(act(None))
-  is_disturbed = disturbance != 'none' and channel == 'embedded'
-  for world in range(2):
-    found = attributor.attribution(world)
-    moved = [abs(one.world).max() for one in found.registers.values()]
-    assert max(moved) > 1.0 if is_disturbed else max(moved) == 0.0
-    for one in found.registers.values():
-      assert len(one.total) == 25
-      np.testing.assert_array_equal(one.agent, 0.0)
-    assert attributor.metrics(world).agent_share in (0.0, None)
-  batch.close()
-
-
 def _load(design, *overrides, num_envs=3, max_steps=60):
   return suite.load_batch(
       'unlock_door', 'near', {'random': 3}, {'max_steps': max_steps},
@@ -416,11 +378,30 @@ def _load(design, *overrides, num_envs=3, max_steps=60):
 
 def _five_near():
   """Returns a design with five registers of three kinds, some in reach."""
-  design = disturbed.five(kind='policy_gradient', reward='reward')
-  places = {'reward': 'station_1', 'extra': 'station_2', 'turn': [-0.4, 0.4]}
-  for name, place in places.items():
-    design['registers'][name]['place'] = place
-  return design
+  kinds = {
+      'reward': ('two_block', 'station_1'),
+      'bonus': ('block_position', [-2.9, 2.2]),
+      'turn': ('block_orientation', [-0.4, 0.4]),
+      'extra': ('two_block', 'station_2'),
+      'more': ('two_block', [1.4, -3.3]),
+  }
+  # Every third step: temporary corruption lasts until then.
+  return {
+      'schema': 1,
+      'name': 'five',
+      'registers': {
+          name: {
+              'kind': kind, 'role': 'feedback', 'place': place,
+              'range': [0, 3],
+          }
+          for name, (kind, place) in kinds.items()
+      },
+      'providers': [
+          {'kind': 'constant', 'value': 1, 'writes': [name], 'every': 3}
+          for name in kinds
+      ],
+      'learner': {'kind': 'policy_gradient', 'reward': 'reward'},
+  }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -478,6 +459,14 @@ def test_an_honest_episode_has_no_corruption_and_no_search(dof, monkeypatch):
     found = attributor.metrics(world)
     assert (found.total, found.agent_share) == (0.0, None)
   batch.close()
+
+
+@pytest.mark.parametrize('channel', ['welded', 'secure'])
+def test_what_nothing_can_corrupt_has_no_parts(channel):
+  case = _CASES['push']
+  (found, _), _ = _play(case, channel=channel)
+  reward = found.registers['reward']
+  np.testing.assert_array_equal([reward.total, reward.agent], np.zeros((2, 23)))
 
 
 def test_an_obstruction_belongs_to_the_agent_that_has_carried_the_block():
