@@ -197,12 +197,6 @@ def test_the_state_of_another_learner_is_refused():
   assert trees.are_equal(learner.state(), before)
 
 
-def test_vectors_have_no_probabilities():
-  learner = _make(toys.Aim(2), 'policy_gradient', reward='reward')
-  with pytest.raises(errors.SpecError, match='actions are vectors of 1'):
-    learner.probabilities({'number': np.zeros((2, 1))})
-
-
 def test_the_decoupled_query_is_independent_of_the_action():
   env = toys.Bandit(4000, _ACTIONS, queries=_PAIR)
   for other_query in (None, 'other'):
@@ -294,22 +288,6 @@ def test_a_query_register_has_to_hold_every_action():
   env = toys.Bandit(2, _ACTIONS - 1, queries=('query',))
   with pytest.raises(errors.SpecError, match=r"'query' holds \[0, 12\]"):
     _make(env, 'value_advice', advice='feedback', query='query')
-
-
-@pytest.mark.parametrize(
-    ('num_envs', 'seed', 'problem'),
-    [(0, 1, 'num_envs: 0'), (2, -1, 'seed: -1'), (2, 1.0, 'seed: 1.0')],
-)
-def test_wrong_numbers_are_refused(num_envs, seed, problem):
-  env = toys.Bandit(2)
-  with pytest.raises(errors.SpecError, match=problem):
-    agents.make(
-        {'kind': 'policy_gradient', 'reward': 'feedback'},
-        env.observation_spec(),
-        env.action_spec(),
-        num_envs,
-        seed,
-    )
 
 
 def test_other_specs_are_refused():
