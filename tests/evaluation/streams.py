@@ -4,7 +4,7 @@ The oracle takes a whole episode from a ledger, and asks of every step and read
 what the definitions say, in loops and without sums that are kept up to date.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import math
 import types
 from typing import Any
@@ -92,6 +92,20 @@ def monitor(
       mechanism=mechanism, task=None, physics=None, num_substeps=1
   )
   return monitors.Monitor(env, objective)
+
+
+def pairs(
+    episodes: Sequence[ledgers.EpisodeLedger],
+) -> Iterator[tuple[registers.Write, registers.Read]]:
+  """Yields each read with the write before it in the same episode."""
+  for episode in episodes:
+    for entries in episode.entries.values():
+      last = None
+      for entry in entries:
+        if isinstance(entry, registers.Write):
+          last = entry
+        elif last is not None:
+          yield last, entry
 
 
 class Made:
