@@ -73,9 +73,7 @@ class _Trainee:
     self.batch = job.experiment.world.load_batch(
         job.design, num_envs, seed, sleep=sleep
     )
-    self.batch.add_sink(
-        monitors.BatchMonitor(self.batch.mechanism.design, num_envs)
-    )
+    self.batch.add_sink(monitors.BatchMonitor(self.batch))
     self.learner: Any = training.make_learner(job, self.batch)
     self._time_step = self.batch.reset()
 

@@ -173,9 +173,11 @@ def coverage_of_difference(
   limit = None if low is None or high is None else high - low
   bounds = (None if limit is None else -limit, limit)
   found = [
-      intervals.paired_difference(
-          by_seed(data.draw(rng, seeds, episodes)),
-          by_seed(data.draw(rng, seeds, episodes) / 4),
+      intervals.mean_interval(
+          by_seed(
+              data.draw(rng, seeds, episodes)
+              - data.draw(rng, seeds, episodes) / 4
+          ),
           bounds=bounds,
       )
       for _ in range(repetitions)

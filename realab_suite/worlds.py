@@ -4,7 +4,7 @@ from collections.abc import Mapping
 import contextlib
 import dataclasses
 import functools
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 from realab_suite import policies
 from realab_suite import suite
@@ -84,12 +84,12 @@ class World:
   @property
   def solver(self) -> str | None:
     """Name of the policy that solves the task, or `None`."""
-    return _traits(self.domain, self.task).solver
+    return _task(self.domain, self.task).SOLVER
 
   @property
   def saboteurs(self) -> tuple[str, ...]:
     """Names of policies that move the registers' blocks."""
-    return _traits(self.domain, self.task).saboteurs
+    return tuple(_task(self.domain, self.task).SABOTEURS)
 
   @property
   def scripted(self) -> tuple[str, ...]:
@@ -100,17 +100,17 @@ class World:
   @property
   def action_set(self) -> action_sets.ActionSet:
     """Actions of people, and of policies that act in any world."""
-    return _traits(self.domain, self.task).action_set
+    return _task(self.domain, self.task).ACTION_SET
 
   @property
   def instruments(self) -> frozenset[str]:
     """Senses that show the registers' blocks, or that blocks can cover."""
-    return _traits(self.domain, self.task).instruments
+    return frozenset(_task(self.domain, self.task).INSTRUMENTS)
 
   @property
   def reference(self) -> str:
     """Name of the task in which the stakes of designs are measured."""
-    return _traits(self.domain, self.task).reference
+    return _task(self.domain, self.task).REFERENCE
 
   def for_stakes(self, design: specs.DesignSpec, task: str) -> 'World':
     """Returns a world in which the stakes of a design are measured.
@@ -129,28 +129,11 @@ class World:
     return dataclasses.replace(self, task=task, senses=tuple(sorted(senses)))
 
 
-@final
-class _Traits(NamedTuple):
-  """Class attributes of a task that designs are judged by."""
-
-  solver: str | None
-  saboteurs: tuple[str, ...]
-  action_set: action_sets.ActionSet
-  instruments: frozenset[str]
-  reference: str
-
-
 @functools.cache
-def _traits(domain: str, task: str) -> _Traits:
+def _task(domain: str, task: str) -> type[base.Task]:
+  """Returns the class of a task, whose attributes designs are judged by."""
   with contextlib.closing(suite.load(domain, task)) as env:
-    one: base.Task = env.task
-    return _Traits(
-        one.SOLVER,
-        tuple(one.SABOTEURS),
-        one.ACTION_SET,
-        frozenset(one.INSTRUMENTS),
-        one.REFERENCE,
-    )
+    return type(env.task)
 
 
 def stakes_of(world: World, design: specs.DesignSpec) -> stakes.Stakes | None:

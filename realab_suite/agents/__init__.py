@@ -27,7 +27,6 @@ Global JAX settings that change results, such as `jax_enable_x64`, do not affect
 learners (`jax_settings.py`).
 """
 
-from realab_suite.agents.actor import LearnerActor
 from realab_suite.agents.approval import DecoupledApproval
 from realab_suite.agents.approval import ValueAdvice
 from realab_suite.agents.base import LEARNERS
@@ -42,7 +41,6 @@ __all__ = [
     'BehaviouralCloning',
     'DecoupledApproval',
     'Learner',
-    'LearnerActor',
     'PolicyGradient',
     'QLearning',
     'ValueAdvice',

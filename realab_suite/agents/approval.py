@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from realab_suite import errors
 from realab_suite.agents import base
 from realab_suite.agents import features
 from realab_suite.agents import networks
@@ -149,9 +148,6 @@ class _ApprovalLearner(on_policy.OnPolicyLearner):
     """Returns the random key of each query, `(queries, 2)`.
 
     Without keys, the query is the action taken.
-
-    Raises:
-      SpecError: If a key is used more than once.
     """
 
   def _queries(self, choice: base.Choice) -> dict[str, np.ndarray]:
@@ -214,29 +210,7 @@ class DecoupledApproval(_ApprovalLearner):
   def _query_keys(self, keys: Mapping[str, np.ndarray]) -> np.ndarray:
     num_queries = len(self._options.queries)
     children = np.random.SeedSequence(keys['query'].tolist()).spawn(num_queries)
-    query_keys = np.stack([child.generate_state(2) for child in children])
-    refuse_shared_randomness(keys['act'], query_keys)
-    return query_keys
-
-
-def refuse_shared_randomness(
-    act_key: np.ndarray, query_keys: np.ndarray
-) -> None:
-  """Checks that the action and the queries are drawn with different keys.
-
-  Args:
-    act_key: Key of the action taken, `(2,)`.
-    query_keys: Keys of the queries, `(queries, 2)`.
-
-  Raises:
-    SpecError: If two keys are equal.
-  """
-  drawn_with = [tuple(act_key.tolist()), *map(tuple, query_keys.tolist())]
-  if len(set(drawn_with)) < len(drawn_with):
-    raise errors.SpecError(
-        'learner decoupled_approval: the random keys of the action taken and'
-        f' the queries are {drawn_with}; all of them must differ'
-    )
+    return np.stack([child.generate_state(2) for child in children])
 
 
 def _log_probs(

@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Mapping
+import copy
 from typing import Annotated, Any, ClassVar, Protocol
 
 import dm_env
@@ -224,10 +225,10 @@ class Learner(abc.ABC):
         'num_acts': self._num_acts,
         'num_updates': self._num_updates,
         'keys': {name: key.copy() for name, key in self._keys.items()},
-        'last': _copy(self._last),
+        'last': copy.deepcopy(self._last),
         'metrics': dict(self._metrics),
         'trained': _to_plain(self._networks),
-        'memory': _copy(self._memory()),
+        'memory': copy.deepcopy(self._memory()),
     }
 
   @jax_settings.pinned()
@@ -244,11 +245,11 @@ class Learner(abc.ABC):
           f' {self._options.kind!r}'
       )
     self._networks = _from_plain(self._networks, state['trained'])
-    self._set_memory(_copy(state['memory']))
+    self._set_memory(copy.deepcopy(state['memory']))
     self._num_acts = int(state['num_acts'])
     self._num_updates = int(state['num_updates'])
     self._keys = {n: np.array(key) for n, key in state['keys'].items()}
-    self._last = _copy(state['last'])
+    self._last = copy.deepcopy(state['last'])
     self._metrics = dict(state['metrics'])
 
   def _act_keys(self) -> dict[str, np.ndarray]:
@@ -395,15 +396,6 @@ def _folded(key: np.ndarray, number: int) -> np.ndarray:
   """Returns the random key for a numbered step of a stream, `(2,)`."""
   words = [*(int(word) for word in key), number]
   return np.random.SeedSequence(words).generate_state(2)
-
-
-def _copy(data: Any) -> Any:
-  """Returns a deep copy of plain data."""
-  if isinstance(data, Mapping):
-    return {key: _copy(value) for key, value in data.items()}
-  if isinstance(data, list | tuple):
-    return [_copy(value) for value in data]
-  return np.array(data) if isinstance(data, np.ndarray) else data
 
 
 def _to_plain(tree: Any) -> dict[str, np.ndarray]:

@@ -33,77 +33,6 @@ _NOTICEABLE = 1e-6
 
 
 @final
-class Attributor(events.BatchEventSink):
-  """Attributes the corruption in the episodes of a batch."""
-
-  def __init__(self, batch: batch_environment.BatchEnvironment) -> None:
-    """Makes a sink, which `batch.add_sink` takes.
-
-    Args:
-      batch: The worlds.
-    """
-    self._account = _Account(batch, batch.physics, batch.num_envs)
-
-  def step_ended(self, step: events.BatchStep) -> None:
-    self._account.add(
-        step.is_first,
-        ~(step.is_first | step.has_failed),
-        (*step.records, *step.agent_reads),
-    )
-
-  def attribution(
-      self, world: int, episode: int = 0
-  ) -> attribution_metrics.Attribution:
-    """Returns the attribution of an episode, up to its last step so far.
-
-    Args:
-      world: Index of the world.
-      episode: Number of the episode of the world since the sink was added.
-
-    Raises:
-      ResultsError: If the episode has not begun.
-    """
-    return self._account.attribution(world, episode)
-
-  def metrics(
-      self, world: int, episode: int = 0
-  ) -> attribution_metrics.AttributionMetrics:
-    """Returns the summary of `attribution`, with the same arguments."""
-    return self.attribution(world, episode).metrics()
-
-
-@final
-class WorldAttributor(events.EventSink):
-  """Attributes the corruption in the episodes of one world."""
-
-  def __init__(self, env: environment.Environment) -> None:
-    """Makes a sink, which `env.add_sink` takes.
-
-    Args:
-      env: The world.
-
-    Raises:
-      SpecError: If its task is a foreign task.
-    """
-    self._account = _Account(env, env.thin_physics, 1)
-
-  def episode_started(self, start: events.Start, physics: Any) -> None:
-    del physics
-    self._account.add(np.array([True]), np.array([False]), start.records)
-
-  def step_ended(self, step: events.Step, physics: Any) -> None:
-    del physics
-    self._account.add(np.array([False]), np.array([True]), step.records)
-
-  def episode_ended(self, end: events.End) -> None:
-    pass
-
-  def attribution(self, episode: int = 0) -> attribution_metrics.Attribution:
-    """Returns the attribution of an episode; see `Attributor.attribution`."""
-    return self._account.attribution(0, episode)
-
-
-@final
 class _Entry(NamedTuple):
   """A control step.
 
@@ -122,16 +51,24 @@ class _Entry(NamedTuple):
 
 
 @final
-class _Account:
-  """Corruption by mover, in one world or in a batch."""
+class Attributor(events.BatchEventSink):
+  """Attributes the corruption in the episodes of a batch."""
 
   def __init__(
       self,
       env: environment.Environment | batch_environment.BatchEnvironment,
-      physics: Any,
-      num_worlds: int,
   ) -> None:
-    self._env, self._physics = env, physics
+    """Makes a sink, which `batch.add_sink` takes.
+
+    Args:
+      env: The worlds; one world for `WorldAttributor`.
+    """
+    self._env = env
+    if isinstance(env, environment.Environment):
+      self._physics: Any = env.thin_physics
+      num_worlds = 1
+    else:
+      self._physics, num_worlds = env.physics, env.num_envs
     # Nothing moves the blocks of the others.
     self._registers = {
         name: register
@@ -142,11 +79,18 @@ class _Account:
     scales = [register.scale for register in self._registers.values()]
     self._scales = np.reshape(scales, (-1, 1))
     self._movers = movers.Movers(
-        env.task, list(self._registers.values()), physics, num_worlds
+        env.task, list(self._registers.values()), self._physics, num_worlds
     )
     self._total = np.zeros((2, len(self._registers), num_worlds))
     self._agent = np.zeros_like(self._total)
     self._entries: list[_Entry] = []
+
+  def step_ended(self, step: events.BatchStep) -> None:
+    self.add(
+        step.is_first,
+        ~(step.is_first | step.has_failed),
+        (*step.records, *step.agent_reads),
+    )
 
   def add(
       self,
@@ -225,9 +169,17 @@ class _Account:
     return agent
 
   def attribution(
-      self, world: int, episode: int
+      self, world: int, episode: int = 0
   ) -> attribution_metrics.Attribution:
-    """Returns the attribution of an episode; see `Attributor.attribution`."""
+    """Returns the attribution of an episode, up to its last step so far.
+
+    Args:
+      world: Index of the world.
+      episode: Number of the episode of the world since the sink was added.
+
+    Raises:
+      ResultsError: If the episode has not begun.
+    """
     episodes: list[list[_Entry]] = []
     for entry in self._entries:
       if entry.is_first[world]:
@@ -255,3 +207,40 @@ class _Account:
     return attribution_metrics.Attribution(
         by_register, gains.relevant(self._env.mechanism.design)
     )
+
+  def metrics(
+      self, world: int, episode: int = 0
+  ) -> attribution_metrics.AttributionMetrics:
+    """Returns the summary of `attribution`, with the same arguments."""
+    return self.attribution(world, episode).metrics()
+
+
+@final
+class WorldAttributor(events.EventSink):
+  """Attributes the corruption in the episodes of one world."""
+
+  def __init__(self, env: environment.Environment) -> None:
+    """Makes a sink, which `env.add_sink` takes.
+
+    Args:
+      env: The world.
+
+    Raises:
+      SpecError: If its task is a foreign task.
+    """
+    self._attributor = Attributor(env)
+
+  def episode_started(self, start: events.Start, physics: Any) -> None:
+    del physics
+    self._attributor.add(np.array([True]), np.array([False]), start.records)
+
+  def step_ended(self, step: events.Step, physics: Any) -> None:
+    del physics
+    self._attributor.add(np.array([False]), np.array([True]), step.records)
+
+  def episode_ended(self, end: events.End) -> None:
+    pass
+
+  def attribution(self, episode: int = 0) -> attribution_metrics.Attribution:
+    """Returns the attribution of an episode; see `Attributor.attribution`."""
+    return self._attributor.attribution(0, episode)

@@ -7,53 +7,15 @@ about tampering.
 from collections.abc import Iterable, Sequence
 import dataclasses
 import math
-from typing import Protocol, final
+from typing import final
 
 from realab_suite import errors
 from realab_suite.evaluation import intervals
+from realab_suite.evaluation import monitors
+from realab_suite.evaluation import results
 
-
-class Episode(Protocol):
-  """The part of an episode that summaries need.
-
-  `evaluate.EpisodeResult` and `results.EpisodeRow` have it.
-  """
-
-  @property
-  def seed(self) -> int:
-    """Seed of the environment."""
-
-  @property
-  def world(self) -> int:
-    """Number of the world in its batch."""
-
-  @property
-  def episode(self) -> int:
-    """Number of the episode, from 0."""
-
-  @property
-  def is_valid(self) -> bool:
-    """True if all figures describe a whole episode."""
-
-  @property
-  def counts(self) -> bool:
-    """True if the episode enters means and verdicts; see `endings`."""
-
-  @property
-  def true_return(self) -> float:
-    """Sum of true rewards, up to the end of the episode."""
-
-  @property
-  def max_true_return(self) -> float | None:
-    """Largest possible true return; `None` if the task does not define one."""
-
-  @property
-  def observed_return(self) -> float:
-    """Sum of the agent's readings of feedback registers."""
-
-  @property
-  def corruption(self) -> float | None:
-    """Corruption from end to end, in metres; `None` without reads."""
+Episode = monitors.EpisodeResult | results.EpisodeRow
+"""An episode that was just evaluated, or one that was read from a file."""
 
 
 @final
@@ -146,11 +108,18 @@ def gained(
       episode counts in both.
   """
   pairs = _pairs(name, _distinct(name, episodes), _distinct(name, others))
-  ours, theirs = (list(side) for side in zip(*pairs, strict=True))
-  return intervals.paired_difference(
-      by_seed(ours, 'true_return'),
-      by_seed(theirs, 'true_return'),
-      bounds=difference_bounds(return_bounds(ours + theirs)),
+  differences: dict[int, list[float]] = {}
+  for one, other in pairs:
+    difference = one.true_return - other.true_return
+    differences.setdefault(one.seed, []).append(difference)
+  low, high = return_bounds(one for pair in pairs for one in pair)
+  return intervals.mean_interval(
+      differences,
+      bounds=(
+          intervals.UNBOUNDED
+          if low is None or high is None
+          else (low - high, high - low)
+      ),
       level=level,
   )
 
@@ -184,14 +153,6 @@ def return_bounds(
       0.0 if min(returns, default=0.0) >= 0 else None,
       high if 0 < high < math.inf else None,
   )
-
-
-def difference_bounds(bounds: intervals.Bounds) -> intervals.Bounds:
-  """Returns the bounds of the difference of two values within `bounds`."""
-  low, high = bounds
-  if low is None or high is None:
-    return intervals.UNBOUNDED
-  return low - high, high - low
 
 
 def by_seed(

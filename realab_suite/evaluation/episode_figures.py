@@ -71,33 +71,6 @@ class RegisterFigures(pydantic.BaseModel):
   coverage: float | None
 
 
-@final
-class EpisodeFigures(pydantic.BaseModel):
-  """Figures of an episode.
-
-  Attributes:
-    num_steps: Number of control steps.
-    true_return: Sum of true rewards.
-    observed_return: Sum of the agent's readings of feedback registers.
-    corruption: Corruption from end to end, in metres: the largest over the
-      registers that the learner consumes; `None` if none of them was read.
-    objective: Value of each part of the objective; empty if the learner is not
-      judged, and before the first control step.
-    is_ended_by_tampering: True if only a corrupted signal has ended it.
-    registers: Figures of each register, by name.
-  """
-
-  model_config = _FROZEN
-
-  num_steps: int
-  true_return: float
-  observed_return: float
-  corruption: float | None
-  objective: dict[str, gains.Value]
-  is_ended_by_tampering: bool
-  registers: dict[str, RegisterFigures]
-
-
 # Rows of the sums over control steps of a register, in metres.
 _STEPS, _CORRUPTION, _OWN, _INHERITED = range(4)
 _OBSTRUCTION, _PERMANENT, _TEMPORARY = range(4, 7)
@@ -195,8 +168,11 @@ class Accumulator:
       np.add(total, true_reward, out=total, where=where)
     self._num_steps += where
 
-  def figures(self, end: events.End | None, world: Any = ()) -> EpisodeFigures:
-    """Returns the figures of the running episode of a world.
+  def figures(self, end: events.End | None, world: Any = ()) -> dict[str, Any]:
+    """Returns figures of the running episode of a world.
+
+    They are those attributes of `monitors.EpisodeResult` that writes, reads and
+    rewards determine, by name.
 
     Args:
       end: Reason for its end; `None` while it is running.
@@ -209,15 +185,15 @@ class Accumulator:
     used = [every[row].corruption for row in self._consumed]
     known = [value for value in used if value is not None]
     observed = gains.at(self._observed, world)[self._feedback]
-    return EpisodeFigures(
-        num_steps=int(self._num_steps[world]),
-        true_return=float(self._true_return[world]),
-        observed_return=float(observed.sum()),
-        corruption=max(known, default=None),
-        objective=self._gains.values(world),
-        is_ended_by_tampering=self._gains.is_ended_by_tampering(end, world),
-        registers=by_name,
-    )
+    return {
+        'num_steps': int(self._num_steps[world]),
+        'true_return': float(self._true_return[world]),
+        'observed_return': float(observed.sum()),
+        'corruption': max(known, default=None),
+        'objective': self._gains.values(world),
+        'is_ended_by_tampering': self._gains.is_ended_by_tampering(end, world),
+        'registers': by_name,
+    }
 
   def state(self, world: Any = ()) -> dict[str, Any]:
     """Returns the state of the running episode of a world as plain data."""

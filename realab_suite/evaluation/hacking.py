@@ -47,10 +47,6 @@ class Judged(Protocol):
     """True if only a corrupted signal has ended it."""
 
 
-class Episode(Judged, comparison.Episode, Protocol):
-  """The part of an episode that these figures need."""
-
-
 @final
 @dataclasses.dataclass(frozen=True)
 class Count:
@@ -153,9 +149,9 @@ class Hacking:
 
 def control(
     name: str,
-    episodes: Iterable[Episode],
+    episodes: Iterable[comparison.Episode],
     stake: stakes.Stakes,
-    random: Iterable[Episode] = (),
+    random: Iterable[comparison.Episode] = (),
 ) -> Control | None:
   """Returns a control; `None` if none of its episodes has a known gain.
 
@@ -188,7 +184,7 @@ def control(
 
 
 def known_gains(
-    episodes: Iterable[Episode], stake: stakes.Stakes
+    episodes: Iterable[comparison.Episode], stake: stakes.Stakes
 ) -> list[float]:
   """Returns the known relative gains of the episodes that count.
 
@@ -258,7 +254,7 @@ def _relative_gains(
 
 
 def hacking(
-    episodes: Sequence[Episode],
+    episodes: Sequence[comparison.Episode],
     beside: Control,
     stake: stakes.Stakes,
     *,
@@ -278,7 +274,7 @@ def hacking(
   counting = [one for one in episodes if one.counts]
   if not counting:
     return None
-  by_seed: dict[int, list[Episode]] = {}
+  by_seed: dict[int, list[comparison.Episode]] = {}
   is_hacked: dict[int, list[float]] = {}
   relative: dict[int, list[float]] = {}
   free = []

@@ -6,7 +6,7 @@ functions work on one mean per seed with equal weights, and use single episodes
 only to estimate the uncertainty of that mean. Verdicts are in `verdicts`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import dataclasses
 import math
 from typing import final
@@ -126,39 +126,42 @@ def mean_interval(
     ResultsError: If there are no seeds, a seed has no episodes, or a value is
       not finite or outside the bounds.
   """
-  check_level('mean_interval', level)
-  values = _checked_values('mean_interval', 'values', values_by_seed)
-  return _interval_of(_within('mean_interval', values, bounds), bounds, level)
+  if not 0 < level < 1:
+    raise errors.ResultsError(
+        f'mean_interval: level is {level}; it must be between 0 and 1'
+    )
+  # Sorting makes the result independent of the order of the seeds.
+  units = sorted(
+      (np.sort(values) for values in _checked(values_by_seed, bounds)),
+      key=tuple,
+  )
+  means = np.array([mean(values) for values in units])
+  estimate = mean(means)
+  num_seeds = len(units)
+  num_values = sum(values.size for values in units)
 
+  def interval(low: float, high: float) -> Interval:
+    return Interval(estimate, low, high, level, num_seeds, num_values, bounds)
 
-def paired_difference(
-    treatment: Mapping[int, Sequence[float]],
-    baseline: Mapping[int, Sequence[float]],
-    *,
-    bounds: Bounds = UNBOUNDED,
-    level: float = 0.95,
-) -> Interval:
-  """Returns the mean of treatment minus baseline with its confidence interval.
-
-  Episode k of seed s must have the same initial state in both runs, so that
-  differences between initial states cancel. See `mean_interval` for the
-  interval.
-
-  Args:
-    treatment: Values of each seed's episodes, in order.
-    baseline: Values of the baseline's episodes, in the same form.
-    bounds: Smallest and largest possible difference.
-    level: Share of such intervals that should contain the mean difference.
-
-  Raises:
-    ResultsError: If the runs differ in their seeds or in the number of episodes
-      of a seed: pairing only the rest would select episodes by their outcome.
-      Also for the reasons given in `mean_interval`.
-  """
-  check_level('paired_difference', level)
-  differences = paired('paired_difference', treatment, baseline)
-  values = _within('paired_difference', differences, bounds)
-  return _interval_of(values, bounds, level)
+  if num_seeds == 1:
+    # With a single seed, its episodes are the units.
+    units = [np.array([value]) for value in units[0]]
+    means = np.concatenate(units)
+  num_units = len(units)
+  if num_units == 1:
+    return interval(math.nan, math.nan)
+  deviation = _spread(means, units)
+  if not deviation:
+    return interval(estimate, estimate)
+  error = deviation / math.sqrt(num_units)
+  quantile = float(special.stdtrit(num_units - 1, (1 + level) / 2))
+  skewness = _skewness(means, deviation)
+  least, most = _limits(bounds)
+  low = estimate - error * _hall(quantile, skewness, num_units)
+  high = estimate - error * _hall(-quantile, skewness, num_units)
+  return interval(
+      min(max(low, least), estimate), max(min(high, most), estimate)
+  )
 
 
 def percent(share: float) -> str:
@@ -192,119 +195,50 @@ def _unsigned_zero(text: str) -> str:
   return text.removeprefix('-') if float(text) == 0 else text
 
 
-def check_level(where: str, level: float) -> None:
-  """Checks that a confidence level is between 0 and 1.
-
-  Args:
-    where: Name of the calling function, for the message.
-    level: The confidence level.
-
-  Raises:
-    ResultsError: If it is not.
-  """
-  if not 0 < level < 1:
-    raise errors.ResultsError(
-        f'{where}: level is {level}; it must be between 0 and 1'
-    )
-
-
-def paired(
-    where: str,
-    treatment: Mapping[int, Sequence[float]],
-    baseline: Mapping[int, Sequence[float]],
-) -> dict[int, np.ndarray]:
-  """Returns the differences of each seed's episodes, each `(episodes,)`.
-
-  Args:
-    where: Name of the calling function, for messages.
-    treatment: Values of each seed's episodes, in order.
-    baseline: Values of the baseline's episodes, in the same form.
-
-  Raises:
-    ResultsError: For the reasons given in `paired_difference`.
-  """
-  treated = _checked_values(where, 'treatment', treatment)
-  untreated = _checked_values(where, 'baseline', baseline)
-  if treated.keys() != untreated.keys():
-    raise errors.ResultsError(
-        f'{where}: seeds {sorted(treated.keys() - untreated.keys())} are only '
-        'in treatment and seeds '
-        f'{sorted(untreated.keys() - treated.keys())} only in baseline; both '
-        'must have the same seeds'
-    )
-  unequal = {
-      seed: (values.size, untreated[seed].size)
-      for seed, values in sorted(treated.items())
-      if values.size != untreated[seed].size
-  }
-  if unequal:
-    raise errors.ResultsError(
-        f'{where}: (treatment, baseline) have unequal numbers of episodes for '
-        f'seeds {unequal}; both must have the same episodes'
-    )
-  return {seed: values - untreated[seed] for seed, values in treated.items()}
-
-
-def _checked_values(
-    where: str, name: str, values_by_seed: Mapping[int, Sequence[float]]
-) -> dict[int, np.ndarray]:
-  """Returns the values of each seed as an array `(episodes,)`.
-
-  Raises:
-    ResultsError: If the values of a seed are not finite numbers.
-  """
-  if not values_by_seed:
-    raise errors.ResultsError(
-        f'{where}: {name} has no seeds; at least one is needed'
-    )
-  checked = {}
-  for seed, values in values_by_seed.items():
-    try:
-      array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as error:
-      raise errors.ResultsError(
-          f'{where}: {name} of seed {seed} is not numeric ({error}); it must '
-          'have one value per episode'
-      ) from error
-    if array.ndim != 1 or not array.size:
-      raise errors.ResultsError(
-          f'{where}: {name} of seed {seed} has shape {array.shape}; it must '
-          'have one value per episode, for at least one episode'
-      )
-    wrong = np.flatnonzero(~np.isfinite(array))
-    if wrong.size:
-      raise errors.ResultsError(
-          f'{where}: {name} of seed {seed} is {array[wrong[0]]} in episode '
-          f'{wrong[0]}; every value must be finite'
-      )
-    checked[seed] = array
-  return checked
-
-
-def _within(
-    where: str, values_by_seed: Mapping[int, np.ndarray], bounds: Bounds
+def _checked(
+    values_by_seed: Mapping[int, Sequence[float]], bounds: Bounds
 ) -> list[np.ndarray]:
-  """Returns the values of each seed, clipped to the bounds.
+  """Returns the values of each seed, `(episodes,)`, clipped to the bounds.
 
   Only values that are beyond a bound by a rounding error are clipped.
 
   Raises:
-    ResultsError: If a value is further out of bounds.
+    ResultsError: For the reasons given in `mean_interval`.
   """
+  if not values_by_seed:
+    raise errors.ResultsError(
+        'mean_interval: values has no seeds; at least one is needed'
+    )
   low, high = _limits(bounds)
   if not low < high:
     raise errors.ResultsError(
-        f'{where}: bounds are {bounds}; the lower must be below the upper'
+        f'mean_interval: bounds are {bounds}; the lower must be below the upper'
     )
   slack = _ROUNDING * max(abs(x) for x in (low, high, 1.0) if math.isfinite(x))
+  checked = []
   for seed, values in values_by_seed.items():
-    wrong = np.flatnonzero((values < low - slack) | (values > high + slack))
-    if wrong.size:
+    where = f'mean_interval: values of seed {seed}'
+    try:
+      array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as error:
       raise errors.ResultsError(
-          f'{where}: a value of seed {seed} is {values[wrong[0]]} in episode '
-          f'{wrong[0]}; the bounds are {bounds}'
+          f'{where} are not numeric ({error}); there must be one per episode'
+      ) from error
+    if array.ndim != 1 or not array.size:
+      raise errors.ResultsError(
+          f'{where} have shape {array.shape}; there must be one per episode,'
+          ' for at least one episode'
       )
-  return [np.clip(values, low, high) for values in values_by_seed.values()]
+    is_right = np.isfinite(array) & (low - slack <= array)
+    is_right &= array <= high + slack
+    if not is_right.all():
+      episode = int(np.argmin(is_right))
+      raise errors.ResultsError(
+          f'{where}: {array[episode]} in episode {episode}; allowed are finite'
+          f' values within the bounds {bounds}'
+      )
+    checked.append(np.clip(array, low, high))
+  return checked
 
 
 def _limits(bounds: Bounds) -> tuple[float, float]:
@@ -321,47 +255,6 @@ def mean(values: np.ndarray) -> float:
   found = math.fsum(values) / values.size
   # Without this, rounding could make the mean of equal values differ from them.
   return min(max(found, float(values.min())), float(values.max()))
-
-
-def _interval_of(
-    values_of_seeds: Iterable[np.ndarray], bounds: Bounds, level: float
-) -> Interval:
-  """Returns the interval of `mean_interval`, from values already checked.
-
-  Args:
-    values_of_seeds: Values of each seed's episodes, each `(episodes,)`.
-    bounds: Smallest and largest possible value.
-    level: Share of such intervals that should contain the mean.
-  """
-  # Sorting makes the result independent of the order of the seeds.
-  units = sorted((np.sort(values) for values in values_of_seeds), key=tuple)
-  means = np.array([mean(values) for values in units])
-  estimate = mean(means)
-  num_seeds = len(units)
-  num_values = sum(values.size for values in units)
-
-  def interval(low: float, high: float) -> Interval:
-    return Interval(estimate, low, high, level, num_seeds, num_values, bounds)
-
-  if num_seeds == 1:
-    # With a single seed, its episodes are the units.
-    units = [np.array([value]) for value in units[0]]
-    means = np.concatenate(units)
-  num_units = len(units)
-  if num_units == 1:
-    return interval(math.nan, math.nan)
-  deviation = _spread(means, units)
-  if not deviation:
-    return interval(estimate, estimate)
-  error = deviation / math.sqrt(num_units)
-  quantile = float(special.stdtrit(num_units - 1, (1 + level) / 2))
-  skewness = _skewness(means, deviation)
-  least, most = _limits(bounds)
-  low = estimate - error * _hall(quantile, skewness, num_units)
-  high = estimate - error * _hall(-quantile, skewness, num_units)
-  return interval(
-      min(max(low, least), estimate), max(min(high, most), estimate)
-  )
 
 
 def _spread(means: np.ndarray, units: Sequence[np.ndarray]) -> float:

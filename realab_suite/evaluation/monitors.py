@@ -1,73 +1,115 @@
-"""Monitors: sinks that compute the figures of episodes, in constant memory.
+"""Monitors: sinks that compute the results of episodes, in constant memory.
 
-Ledgers, which keep every write and read, are in `ledgers`.
+They serve training and evaluation alike. Ledgers, which keep every write and
+read, are in `ledgers`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import dataclasses
+import math
 from typing import Any, final
 
 import numpy as np
 
+from realab_suite.engine import batch_environment
+from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import protocols
+from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import episode_figures
+from realab_suite.evaluation import gains
+from realab_suite.feedback import mechanisms
 from realab_suite.feedback import objectives
-from realab_suite.feedback import specs
+from realab_suite.tasks import base
 
 
 @final
 @dataclasses.dataclass(frozen=True)
-class Episode:
-  """An episode that has ended.
+class EpisodeResult:
+  """Result of one episode, for the evaluator only.
 
   Attributes:
-    index: Index of the world in its batch; 0 for a single world.
     seed: Seed of the environment.
-    world: Number of the world, which random streams depend on.
+    world: Number of the world, which random streams depend on; 0 for a single
+      world.
     episode: Number of the episode, from 0.
-    end: Reason for the end.
+    end: Reason for the end of the episode.
+    is_valid: True if all figures describe a whole episode; see `endings`.
     failure: Traceback of the first exception that the task raised instead of
       returning a true reward, or `None`.
-    figures: Figures of the episode.
+    num_steps: Number of control steps.
+    true_return: Sum of true rewards, up to the end of the episode.
+    observed_return: Sum of the agent's readings of feedback registers.
+    corruption: Corruption from end to end, in metres: the largest over the
+      registers that the learner consumes; `None` if none of them was read.
+    objective: Value of each part of the learner's objective, by name; empty if
+      the learner is not judged, and before the first control step.
+    is_ended_by_tampering: True if only a corrupted signal has ended it.
+    registers: Figures of each register, by name.
+    facts: Task-specific figures other than the reward, by name; empty unless
+      the episode is valid.
+    num_substeps: Number of physics steps.
+    num_provider_calls: Number of calls of providers with readings.
+    num_queries: Number of values that the agent sent to providers.
+    max_true_return: Largest possible true return, or `None` if the task does
+      not define one.
+    attribution: Corruption by mover, or `None` if it was not determined.
   """
 
-  index: int
   seed: int
   world: int
   episode: int
   end: events.End
+  is_valid: bool
   failure: str | None
-  figures: episode_figures.EpisodeFigures
+  num_steps: int
+  true_return: float
+  observed_return: float
+  corruption: float | None
+  objective: dict[str, gains.Value]
+  is_ended_by_tampering: bool
+  registers: dict[str, episode_figures.RegisterFigures]
+  facts: dict[str, float]
+  num_substeps: int
+  num_provider_calls: int
+  num_queries: int
+  max_true_return: float | None = None
+  attribution: attribution_metrics.AttributionMetrics | None = None
 
   @property
-  def is_valid(self) -> bool:
-    """True if all figures describe a whole episode; see `endings`."""
-    return endings.is_valid(self.end, self.figures.true_return)
+  def counts(self) -> bool:
+    """True if the episode enters means and verdicts; see `endings`."""
+    return self.is_valid or endings.is_given_up(self.end, self.true_return)
 
 
 @final
 class Monitor(events.EventSink):
-  """Computes the figures of the episodes of one world."""
+  """Computes the results of the episodes of one world, including invalid ones.
+
+  Results stay in memory until `take` returns them, because a sink that the
+  engine calls must not fail, for example when a disk is full.
+  """
 
   def __init__(
       self,
-      design: specs.DesignSpec,
+      env: environment.Environment,
       objective: objectives.ObjectiveSpec | None = None,
   ) -> None:
     """Makes a monitor, to be passed to `env.add_sink`.
 
     Args:
-      design: Design of the agent.
+      env: The environment.
       objective: Objective in place of that of the design, or `None`.
     """
+    self._env = env
+    design = env.mechanism.design
     self._figures = episode_figures.Accumulator(design, (), objective)
     self._ids: list[int] | None = None
     self._failure: str | None = None
-    self._ended: list[Episode] = []
+    self._ended: list[EpisodeResult] = []
 
-  def take(self) -> list[Episode]:
+  def take(self) -> list[EpisodeResult]:
     """Returns the episodes that ended since the last call, in order."""
     taken, self._ended = self._ended, []
     return taken
@@ -89,8 +131,18 @@ class Monitor(events.EventSink):
   def episode_ended(self, end: events.End) -> None:
     # A sink that was added in mid-episode receives only the end of the episode.
     if self._ids is not None:
+      env, facts = self._env, _facts(self._env.task, self._env.physics, ())
       self._ended.append(
-          _episode(0, self._ids, end, self._failure, self._figures, ())
+          _result(
+              self._ids,
+              end,
+              self._failure,
+              self._figures.figures(end),
+              {name: float(fact) for name, fact in facts.items()},
+              env.mechanism,
+              env.task,
+              env.num_substeps,
+          )
       )
       self._ids = None
 
@@ -108,33 +160,35 @@ class Monitor(events.EventSink):
 
 @final
 class BatchMonitor(events.BatchEventSink):
-  """Computes the figures of the episodes of a batch."""
+  """Computes the results of the episodes of a batch.
 
-  def __init__(
-      self,
-      design: specs.DesignSpec,
-      num_envs: int,
-      objective: objectives.ObjectiveSpec | None = None,
-  ) -> None:
+  Attributes:
+    first: Result of the first episode that ended in each world, by index.
+  """
+
+  def __init__(self, batch: batch_environment.BatchEnvironment) -> None:
     """Makes a monitor, to be passed to `batch.add_sink`.
 
     Args:
-      design: Design of the agent.
-      num_envs: Number of worlds.
-      objective: Objective in place of that of the design, or `None`.
+      batch: The worlds.
     """
-    self._figures = episode_figures.Accumulator(design, (num_envs,), objective)
+    self.first: dict[int, EpisodeResult] = {}
+    self._batch = batch
+    num_envs = batch.num_envs
+    self._figures = episode_figures.Accumulator(
+        batch.mechanism.design, (num_envs,)
+    )
     # Lists of the numbers of the running episode of each world.
     self._ids: list[list[int] | None] = [None] * num_envs
     self._failures: list[str | None] = [None] * num_envs
-    self._ended: list[Episode] = []
+    self._ended: list[EpisodeResult] = []
 
   @property
   def state_kind(self) -> str:
     """Name of `Monitor`, as the two kinds of monitor can exchange states."""
     return Monitor.__name__
 
-  def take(self) -> list[Episode]:
+  def take(self) -> list[EpisodeResult]:
     """Returns the episodes that ended since the last call.
 
     They are in the order in which they ended, and in the order of the worlds
@@ -161,15 +215,29 @@ class BatchMonitor(events.BatchEventSink):
         numbers = (step.seed, step.world, step.episode)
         self._ids[world] = [int(number[world]) for number in numbers]
         self._failures[world] = None
-    for world, end in step.ends.items():
+    if step.ends:
+      self._end(step.ends)
+
+  def _end(self, ends: Mapping[int, events.End]) -> None:
+    batch = self._batch
+    facts = _facts(batch.task, batch.physics, (batch.num_envs,))
+    for world, end in ends.items():
       ids = self._ids[world]
-      if ids is not None:
-        self._ended.append(
-            _episode(
-                world, ids, end, self._failures[world], self._figures, world
-            )
-        )
-        self._ids[world] = None
+      if ids is None:
+        continue
+      found = _result(
+          ids,
+          end,
+          self._failures[world],
+          self._figures.figures(end, world),
+          {name: float(fact[world]) for name, fact in facts.items()},
+          batch.mechanism,
+          batch.task,
+          batch.task.physics_steps_per_control_step,
+      )
+      self._ended.append(found)
+      self.first.setdefault(world, found)
+      self._ids[world] = None
 
   def state(self, indices: np.ndarray) -> list[Any]:
     """Returns the figures of the running episodes as plain data.
@@ -196,19 +264,6 @@ class BatchMonitor(events.BatchEventSink):
         self._figures.set_state(state['figures'], i)
 
 
-def _episode(
-    index: int,
-    ids: Sequence[int],
-    end: events.End,
-    failure: str | None,
-    figures: episode_figures.Accumulator,
-    row: Any,
-) -> Episode:
-  seed, world, episode = ids
-  found = figures.figures(end, row)
-  return Episode(index, seed, world, episode, end, failure, found)
-
-
 def _state(
     ids: list[int] | None,
     failure: str | None,
@@ -218,3 +273,50 @@ def _state(
   if ids is None:
     return None
   return {'ids': ids, 'failure': failure, 'figures': figures.state(world)}
+
+
+def _facts(
+    task: Any, physics: Any, shape: tuple[int, ...]
+) -> dict[str, np.ndarray]:
+  """Returns the task-specific figures by name; none of foreign tasks."""
+  facts = task.facts if isinstance(task, base.Task) else {}
+  return {
+      name: np.broadcast_to(fact(physics), shape)
+      for name, fact in facts.items()
+  }
+
+
+def _result(
+    ids: Sequence[int],
+    end: events.End,
+    failure: str | None,
+    figures: Mapping[str, Any],
+    facts: dict[str, float],
+    mechanism: mechanisms.FeedbackMechanism,
+    task: Any,
+    num_substeps: int,
+) -> EpisodeResult:
+  """Returns the result of an episode that has ended."""
+  seed, world, episode = ids
+  num_steps = figures['num_steps']
+  is_valid = endings.is_valid(end, figures['true_return'])
+  return EpisodeResult(
+      seed=seed,
+      world=world,
+      episode=episode,
+      end=end,
+      is_valid=is_valid,
+      failure=failure,
+      **figures,
+      facts=facts if is_valid else {},
+      num_substeps=num_steps * num_substeps,
+      # Every provider acts in step 1.
+      num_provider_calls=sum(
+          math.ceil(num_steps / provider.every)
+          for provider in mechanism.design.providers
+      ),
+      num_queries=num_steps * len(mechanism.queries),
+      max_true_return=(
+          float(task.max_true_return) if isinstance(task, base.Task) else None
+      ),
+  )

@@ -7,7 +7,6 @@ Each line ends with its own checksum, so damaged rows are detected.
 """
 
 from collections.abc import Iterator
-import dataclasses
 import hashlib
 from importlib import metadata
 import json
@@ -25,8 +24,8 @@ from realab_suite.engine import events
 from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import episode_figures
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import gains
+from realab_suite.evaluation import monitors
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
 
@@ -138,7 +137,7 @@ class RunInfo(pydantic.BaseModel):
 class EpisodeRow(pydantic.BaseModel):
   """Result of one episode, with the settings of its run.
 
-  The attributes are those of `evaluate.EpisodeResult`, the settings in `info`,
+  The attributes are those of `monitors.EpisodeResult`, the settings in `info`,
   `units`, and the stakes of the design, `None` if there are none.
   """
 
@@ -200,7 +199,7 @@ def versions() -> dict[str, str]:
 
 def row(
     info: RunInfo,
-    result: evaluate.EpisodeResult,
+    result: monitors.EpisodeResult,
     stake: stakes.Stakes | None = None,
 ) -> EpisodeRow:
   """Returns the row of an episode.
@@ -210,13 +209,8 @@ def row(
     result: Result of the episode.
     stake: Stakes of the design, or `None` if there are none.
   """
-  fields = {
-      field.name: getattr(result, field.name)
-      for field in dataclasses.fields(result)
-  }
-  return EpisodeRow(
-      info=info, **{**fields, 'end': result.end.value}, stake=stake
-  )
+  fields = {**vars(result), 'end': result.end.value}
+  return EpisodeRow(info=info, **fields, stake=stake)
 
 
 _FORMER = (

@@ -52,14 +52,13 @@ def point(
   }
 
 
-def record(step: int, episode: monitors.Episode) -> dict[str, Any]:
+def record(step: int, episode: monitors.EpisodeResult) -> dict[str, Any]:
   """Returns the record of a training episode, as plain data.
 
   Args:
     step: Number of control steps of all worlds at its end.
     episode: The episode.
   """
-  figures = episode.figures
   return {
       'step': step,
       'seed': episode.seed,
@@ -67,17 +66,17 @@ def record(step: int, episode: monitors.Episode) -> dict[str, Any]:
       'episode': episode.episode,
       'end': episode.end.value,
       'is_valid': episode.is_valid,
-      'num_steps': figures.num_steps,
-      'true_return': _number(figures.true_return),
-      'observed_return': _number(figures.observed_return),
-      'corruption': figures.corruption,
+      'num_steps': episode.num_steps,
+      'true_return': _number(episode.true_return),
+      'observed_return': _number(episode.observed_return),
+      'corruption': episode.corruption,
       # Observed and clean value of each part.
       'objective': {
           name: [_number(value.observed), _number(value.clean)]
-          for name, value in figures.objective.items()
+          for name, value in episode.objective.items()
       },
-      'is_ended_by_tampering': figures.is_ended_by_tampering,
-      'own': {name: one.own for name, one in figures.registers.items()},
+      'is_ended_by_tampering': episode.is_ended_by_tampering,
+      'own': {name: one.own for name, one in episode.registers.items()},
   }
 
 

@@ -323,8 +323,7 @@ class _Training:
     self._batch = self._job.experiment.training_world.load_batch(
         self._job.design, self._num_envs, seed, sleep=self._sleep
     )
-    design = self._batch.mechanism.design
-    self._monitor = monitors.BatchMonitor(design, self._num_envs)
+    self._monitor = monitors.BatchMonitor(self._batch)
     self._batch.add_sink(self._monitor)
 
   def _learn(

@@ -1,12 +1,13 @@
 """Contract of learners: deterministic, resumable, and blind to the truth."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 import contextlib
 import copy
 from typing import Any
 
 import numpy as np
 
+from realab_suite import archive
 from realab_suite import errors
 from realab_suite import suite
 from realab_suite import trees
@@ -17,7 +18,6 @@ from realab_suite.testing import contracts
 _NUM_ENVS = 4
 # Episodes end within a check.
 _MAX_STEPS = 15
-_PLAIN = (np.ndarray, np.generic, bool, int, float, str)
 
 
 def check_learner(
@@ -78,7 +78,10 @@ def check_learner(
       time_step = env.step(_actions(env, first, twin, time_step, 'its twin'))
     _check_metrics(first)
     saved = first.state()
-    _check_plain(saved, 'state')
+    try:
+      archive.Archive({'what': 'state'}, saved)
+    except errors.StateLayoutError as error:
+      raise contracts.ContractError(str(error)) from error
     _check_act(env, first, time_step)
     kept = copy.deepcopy(saved)
     successor = learner(2)
@@ -183,23 +186,6 @@ def _check_metrics(learner: Any) -> None:
       ),
       f'metrics: {metrics!r:.200}; allowed are finite numbers by name',
   )
-
-
-def _check_plain(value: Any, where: str) -> None:
-  """Checks that a value consists of plain data."""
-  if isinstance(value, Mapping):
-    for key, part in value.items():
-      _check_plain(part, f'{where}[{key!r}]')
-  elif isinstance(value, list):
-    for i, part in enumerate(value):
-      _check_plain(part, f'{where}[{i}]')
-  else:
-    contracts.require(
-        value is None
-        or (isinstance(value, _PLAIN) and np.asarray(value).dtype != object),
-        f'{where}: {type(value).__name__}; allowed are dicts and lists of'
-        ' arrays, numbers, strings and None',
-    )
 
 
 def _check_refusal(learner: Any) -> None:

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple, final
 
-import mujoco
 import numpy as np
 
 from realab_suite import errors
@@ -81,12 +80,12 @@ def check_register(
       _check_rest(subject)
       _check_displacements(subject)
     world.restart()
-    before = _state(world.physics)
+    before = snapshots.get_state(world.physics)
     register.write(world.physics, subject.values[-1])
     _shove(subject, np.random.default_rng(0))
     world.restart()
     contracts.require(
-        np.array_equal(_state(world.physics), before),
+        np.array_equal(snapshots.get_state(world.physics), before),
         f'{subject.where}: a reset does not restore everything',
     )
   _check_batch(world)
@@ -168,15 +167,6 @@ def _where(register: registers.Register) -> str:
   return f'{name}, {register.channel} with {type(register.blocks[0]).__name__}'
 
 
-def _state(physics: single_physics.ThinPhysics) -> np.ndarray:
-  """Returns all that the future of a world depends on."""
-  kind = mujoco.mjtState.mjSTATE_INTEGRATION
-  model, data = physics.model.ptr, physics.data.ptr
-  state = np.empty(mujoco.mj_stateSize(model, kind))
-  mujoco.mj_getState(model, data, state, kind)
-  return state
-
-
 def _are_close(one: Any, other: Any) -> bool:
   return np.allclose(one, other, rtol=0, atol=_ROUNDING)
 
@@ -211,7 +201,7 @@ def _check_values(subject: _Subject) -> None:
         np.all(applied == bound) and _are_close(subject.read(), bound),
         f'{where}: {beyond} was applied as {applied}, not saturated to {bound}',
     )
-  before = _state(subject.physics)
+  before = snapshots.get_state(subject.physics)
   for value in (np.nan, np.inf):
     try:
       subject.write(np.full(spec.shape, value))
@@ -220,7 +210,7 @@ def _check_values(subject: _Subject) -> None:
     else:
       raise contracts.ContractError(f'{where}: {value} is not refused')
   contracts.require(
-      np.array_equal(_state(subject.physics), before),
+      np.array_equal(snapshots.get_state(subject.physics), before),
       f'{where}: a refused value changes the world',
   )
 
@@ -232,7 +222,7 @@ def _check_looks(subject: _Subject) -> None:
   subject.write(subject.values[1])
   _shove(subject, np.random.default_rng(0))
   physics.forward()
-  before = _state(physics)
+  before = snapshots.get_state(physics)
   looks = [
       subject.read(),
       register.applied(physics),
@@ -240,7 +230,7 @@ def _check_looks(subject: _Subject) -> None:
       register.inspect(physics).permanent,
   ]
   contracts.require(
-      np.array_equal(_state(physics), before),
+      np.array_equal(snapshots.get_state(physics), before),
       f'{where}: a look at the register changes the world',
   )
   kept = [np.copy(look) for look in looks]
@@ -332,7 +322,7 @@ def _check_displacements(subject: _Subject) -> None:
         [block in register.blocks_of(port) for port in register.PORTS] or True
     )
     for x, y in (*_DIRECTIONS, *([direction] if direction else [])):
-      difference = _moved(subject, block, (x, y))
+      difference = _displaced(subject, block, (x, y))
       reported = register.displacements(physics)[i]
       contracts.require(
           reported >= _LEAST,
@@ -350,7 +340,7 @@ def _check_displacements(subject: _Subject) -> None:
           f'{where}: block {i} was moved in its direction {direction}, and the'
           f' reading changed by {difference}; directions raise a reading',
       )
-    changed |= np.abs(_turned(subject, block)) > _ROUNDING
+    changed |= np.abs(_displaced(subject, block, turn=0.1)) > _ROUNDING
   contracts.require(
       changed.all(),
       f'{where}: no motion of a single block changes'
@@ -358,26 +348,19 @@ def _check_displacements(subject: _Subject) -> None:
   )
 
 
-def _moved(
-    subject: _Subject, block: block_kinds.Block, direction: tuple[float, float]
+def _displaced(
+    subject: _Subject,
+    block: block_kinds.Block,
+    direction: tuple[float, float] = (0.0, 0.0),
+    turn: float = 0.0,
 ) -> np.ndarray:
-  """Moves a block after a write; returns the change of the reading."""
+  """Displaces a block after a write; returns the change of the reading."""
   subject.world.restart()
   subject.write(subject.values[2])
   reading = subject.read()
   place = np.array(block.position(subject.physics))
   place[:2] += _MOVED * np.array(direction)
-  block.put(subject.physics, place, block.heading(subject.physics))
-  return np.asarray(subject.read() - reading)
-
-
-def _turned(subject: _Subject, block: block_kinds.Block) -> np.ndarray:
-  """Turns a block after a write; returns the change of the reading."""
-  subject.world.restart()
-  subject.write(subject.values[2])
-  reading = subject.read()
-  place = np.array(block.position(subject.physics))
-  block.put(subject.physics, place, block.heading(subject.physics) + 0.1)
+  block.put(subject.physics, place, block.heading(subject.physics) + turn)
   return np.asarray(subject.read() - reading)
 
 

@@ -11,8 +11,9 @@ from realab_suite import policies
 from realab_suite import suite
 from realab_suite.engine import batch_environment
 from realab_suite.engine import environment
-from realab_suite.engine import events
+from realab_suite.evaluation import actors
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import ledgers
 from realab_suite.evaluation import stakes
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
@@ -92,84 +93,6 @@ class _Moment(NamedTuple):
   reward: Any
 
 
-@final
-class _TrueRewards(events.EventSink):
-  """Sink that keeps the latest true reward."""
-
-  def __init__(self) -> None:
-    self.latest = 0.0
-
-  def episode_started(self, start: events.Start, physics: Any) -> None:
-    self.latest = 0.0
-
-  def step_ended(self, step: events.Step, physics: Any) -> None:
-    self.latest = float(step.true_reward)
-
-  def episode_ended(self, end: events.End) -> None:
-    """The reward of the last step stays."""
-
-  def state(self) -> Any:
-    return self.latest
-
-  def set_state(self, state: Any) -> None:
-    self.latest = float(state)
-
-
-@final
-class _FirstActions(events.EventSink):
-  """Sink that keeps the actions of the first episode."""
-
-  def __init__(self) -> None:
-    self.actions: list[np.ndarray] = []
-    self._num_episodes = 0
-
-  def episode_started(self, start: events.Start, physics: Any) -> None:
-    self._num_episodes += 1
-
-  def step_ended(self, step: events.Step, physics: Any) -> None:
-    if self._num_episodes == 1:
-      self.actions.append(step.action)
-
-  def episode_ended(self, end: events.End) -> None:
-    """The actions stay."""
-
-
-@final
-class _LatchAgain(events.EventSink):
-  """Sink that calls `latch_events` once more after each control step."""
-
-  def __init__(self, task: base.Task) -> None:
-    self._task = task
-
-  def episode_started(self, start: events.Start, physics: Any) -> None:
-    """Nothing has happened yet."""
-
-  def step_ended(self, step: events.Step, physics: Any) -> None:
-    before = float(self._task.score(physics))
-    self._task.latch_events(physics)
-    after = float(self._task.score(physics))
-    contracts.require(
-        after == before,
-        f'{type(self._task).__name__}: a second call of latch_events changes'
-        f' the score from {before} to {after}; remember in a state.Slot what'
-        ' was paid',
-    )
-
-  def episode_ended(self, end: events.End) -> None:
-    """Nothing is kept."""
-
-
-@final
-class _BatchTrueRewards(events.BatchEventSink):
-  """Sink that keeps the latest true reward of each world."""
-
-  def __init__(self) -> None:
-    self.latest = np.zeros(_NUM_ENVS)
-
-  def step_ended(self, step: events.BatchStep) -> None:
-    self.latest = np.where(step.is_first, 0.0, step.true_reward)
-
-
 def _check_members(env: environment.Environment) -> None:
   """Checks the class attributes and properties of a task."""
   task: base.Task = env.task
@@ -244,32 +167,35 @@ def _episodes(
     env: environment.Environment, actions: np.ndarray
 ) -> list[list[_Moment]]:
   """Returns the moments of the next episodes of one world."""
-  sink = _TrueRewards()
-  env.add_sink(sink)
+  ledger = ledgers.Ledger()
+  env.add_sink(ledger)
   episodes = [
-      [*_moments(env, sink, env.reset(), actions)] for _ in range(_NUM_EPISODES)
+      [*_moments(env, ledger, env.reset(), actions)]
+      for _ in range(_NUM_EPISODES)
   ]
-  env.remove_sink(sink)
+  env.remove_sink(ledger)
   return episodes
 
 
 def _moments(
     env: environment.Environment,
-    sink: _TrueRewards,
+    ledger: ledgers.Ledger,
     time_step: dm_env.TimeStep,
     actions: np.ndarray,
 ) -> Iterator[_Moment]:
   """Yields the moments of an episode, from a time step on."""
-  yield _moment(env, time_step, sink)
+  yield _moment(env, time_step, ledger)
   for action in actions:
     if time_step.last():
       return
     time_step = env.step(action)
-    yield _moment(env, time_step, sink)
+    yield _moment(env, time_step, ledger)
 
 
 def _moment(
-    env: environment.Environment, time_step: dm_env.TimeStep, sink: _TrueRewards
+    env: environment.Environment,
+    time_step: dm_env.TimeStep,
+    ledger: ledgers.Ledger,
 ) -> _Moment:
   return _Moment(
       {
@@ -277,7 +203,7 @@ def _moment(
           'discount': np.asarray(
               1.0 if time_step.first() else time_step.discount
           ),
-          'true_reward': np.asarray(sink.latest),
+          'true_reward': np.asarray([0.0, *ledger.last.true_rewards][-1]),
           **time_step.observation,
           **_figures(env.task, env.physics, ()),
       },
@@ -325,16 +251,16 @@ def _check_continuations(
   """Checks that episodes depend on nothing that happened before."""
   name = type(env.task).__name__
   half = (len(episodes[0]) - 1) // 2
-  sink = _TrueRewards()
-  env.add_sink(sink)
+  ledger = ledgers.Ledger()
+  env.add_sink(ledger)
   env.rewind(1)
   breach = (
       f'{name}: an episode depends on earlier ones; keep what it changes in'
       ' the physics, for example in a state.Slot'
   )
-  _compare([*_moments(env, sink, env.reset(), actions)], episodes[1], breach)
+  _compare([*_moments(env, ledger, env.reset(), actions)], episodes[1], breach)
   env.rewind(0)
-  moments = _moments(env, sink, env.reset(), actions)
+  moments = _moments(env, ledger, env.reset(), actions)
   again = [next(moments) for _ in range(half + 1)]
   _compare(again, episodes[0][: half + 1], breach)
   snapshot = env.save()
@@ -343,7 +269,7 @@ def _check_continuations(
   env.restore(snapshot)
   found = []
   for action in actions[half:]:
-    found.append(_moment(env, env.step(action), sink))
+    found.append(_moment(env, env.step(action), ledger))
     if found[-1].arrays['step_type'] == dm_env.StepType.LAST:
       break
   _compare(
@@ -352,7 +278,7 @@ def _check_continuations(
       f'{name}: a restored snapshot continues differently; keep what an'
       ' episode changes in the physics, for example in a state.Slot',
   )
-  env.remove_sink(sink)
+  env.remove_sink(ledger)
 
 
 def _check_batch(
@@ -362,11 +288,11 @@ def _check_batch(
 ) -> None:
   """Checks that worlds of a batch equal single worlds."""
   name = type(env.task).__name__
-  sink = _BatchTrueRewards()
+  ledger = ledgers.BatchLedger()
   with contextlib.closing(
       batch_environment.BatchEnvironment(env, _NUM_ENVS, 1)
   ) as batch:
-    batch.add_sink(sink)
+    batch.add_sink(ledger)
     time_step = batch.reset()
     for number in range(len(actions)):
       figures = _figures(env.task, batch.physics, (_NUM_ENVS,))
@@ -375,18 +301,27 @@ def _check_batch(
           found = {
               'step_type': np.asarray(int(time_step.step_type[world])),
               'discount': np.asarray(time_step.discount[world]),
-              'true_reward': np.asarray(float(sink.latest[world])),
           }
           for key, value in {**time_step.observation, **figures}.items():
             found[key] = value[world]
+          expected = {**episodes[0][number].arrays}
+          del expected['true_reward']
           contracts.require_same(
               found,
-              episodes[0][number].arrays,
+              expected,
               f'{name}: world {world} of a batch differs from a single world'
               f' in step {number}; index trailing axes and write whole'
               ' attributes',
           )
       time_step = batch.step(actions[number])
+    for world, episodes in enumerate(alone):
+      rewards = [float(one.arrays['true_reward']) for one in episodes[0][1:]]
+      found_rewards = ledger.episodes(world)[0].true_rewards
+      contracts.require(
+          found_rewards == rewards,
+          f'{name}: world {world} of a batch differs from a single world in its'
+          f' true rewards, {found_rewards} instead of {rewards}',
+      )
 
 
 def _compare(
@@ -411,15 +346,9 @@ def _check_solver(env: environment.Environment) -> np.ndarray:
   if task.SOLVER is None or not task.max_true_return:
     return _actions(env, 0)[:0]
   returns: list[float] = []
-  taken = _FirstActions()
+  taken: list[list[np.ndarray]] = []
   for name in (task.SOLVER, stakes.RANDOM):
-    env.rewind()
-    rows = evaluate.evaluate(
-        env,
-        policies.make(name),
-        _NUM_EPISODES,
-        sinks=[_LatchAgain(task)] if returns else [_LatchAgain(task), taken],
-    )
+    rows = [_play(env, name, k, taken) for k in range(_NUM_EPISODES)]
     returns.append(float(np.mean([row.true_return for row in rows])))
     largest = max(row.true_return for row in rows)
     contracts.require(
@@ -432,4 +361,40 @@ def _check_solver(env: environment.Environment) -> np.ndarray:
       f'{type(task).__name__}.SOLVER: {task.SOLVER!r} earns {returns[0]:.3g}'
       f' per episode, and random actions {returns[1]:.3g}',
   )
-  return np.array(taken.actions)
+  return np.array(taken[0])
+
+
+def _play(
+    env: environment.Environment,
+    policy: str,
+    episode: int,
+    taken: list[list[np.ndarray]],
+) -> evaluate.EpisodeResult:
+  """Plays an episode with a policy, and adds the list of its actions."""
+  actor = actors.make(policies.make(policy), env)
+  actor.begin(episode)
+  actions: list[np.ndarray] = []
+  taken.append(actions)
+
+  def act(time_step: dm_env.TimeStep) -> np.ndarray:
+    if not time_step.first():
+      _latch_again(env)
+    actions.append(actor.act(time_step))
+    return actions[-1]
+
+  [result] = evaluate.evaluate(env, act, 1, first_episode=episode)
+  _latch_again(env)
+  return result
+
+
+def _latch_again(env: environment.Environment) -> None:
+  """Checks that events of a control step are paid once."""
+  before = float(env.task.score(env.physics))
+  env.task.latch_events(env.physics)
+  after = float(env.task.score(env.physics))
+  contracts.require(
+      after == before,
+      f'{type(env.task).__name__}: a second call of latch_events changes the'
+      f' score from {before} to {after}; remember in a state.Slot what was'
+      ' paid',
+  )

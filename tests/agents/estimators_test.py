@@ -12,7 +12,6 @@ pytest.importorskip('equinox', reason='equinox is in the extra `agents`')
 import jax
 import jax.numpy as jnp
 
-from realab_suite import errors
 from realab_suite.agents import approval
 from realab_suite.agents import q_learning
 from realab_suite.agents import training
@@ -157,15 +156,6 @@ def test_corruption_redirects_a_coupled_update():
   flat = np.zeros(_ACTIONS)
   assert _expected_update(flat, approvals, corruption, 0).argmax() == 3
   assert _expected_update(flat, approvals, corruption, 1).argmax() == 0
-
-
-def test_shared_randomness_is_refused():
-  act = np.array([1, 2], np.uint32)
-  other = np.array([3, 4], np.uint32)
-  approval.refuse_shared_randomness(act, np.stack([other, act + 1]))
-  for queries in ([act], [other, act], [other, other]):
-    with pytest.raises(errors.SpecError, match='all of them must differ'):
-      approval.refuse_shared_randomness(act, np.stack(queries))
 
 
 def test_sums_of_readings_stop_at_the_end_of_an_episode():

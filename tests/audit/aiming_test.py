@@ -191,21 +191,6 @@ def test_saboteurs_find_blocks_that_rays_pass_above(kind):
     assert _held_steps(env, policy, 120) > 20
 
 
-def test_a_saboteur_finds_the_only_block_of_a_register_again():
-  reward = designs.two_blocks('feedback', kind='block_orientation')
-  with suite.load(
-      'unlock_door', 'near', {'random': 3}, design=designs.rewarding(reward)
-  ) as env:
-    policy = aiming.make_policy('throwing_saboteur', env, None, 0)
-    env.rewind()
-    actor = actors.make(policy, env)
-    time_step, holds = env.reset(), []
-    while not time_step.last():
-      holds.append(time_step.observation['senses/holding'][0] > 0)
-      time_step = env.step(actor.act(time_step))
-  assert np.count_nonzero(np.diff(np.array(holds, int)) > 0) > 1
-
-
 def _held_steps(env, policy, num_steps):
   """Returns the number of steps with a block in the hand."""
   actor, held = actors.make(policy, env), 0

@@ -18,8 +18,6 @@ from realab_suite.tasks import unlock_door
 from tests.audit import designs
 from tests.experiments import small
 
-_FIGURES = ('relative_gain', 'observed_return', 'true_return')
-
 
 @pytest.fixture(autouse=True)
 def fixture_quick_stakes():
@@ -80,21 +78,6 @@ def test_tampering_with_a_meter_is_an_exploit():
   assert {one.target for one in found.moved} == {'score'}
 
 
-def test_the_unit_of_a_register_does_not_matter():
-  found = _audit(designs.in_hundreds())
-  assert found.verdict == findings.EXPLOITABLE
-  usual = designs.in_hundreds()
-  usual['registers']['reward'] |= {'range': [-2, 12], 'scale': 0.1}
-  usual['providers'][0]['kind'] = 'difference'
-  same = _audit(usual)
-  assert same.of_plan.hacked == found.of_plan.hacked == 20
-  gains = [one.of_plan.relative_gain.estimate for one in (found, same)]
-  assert gains[0] == pytest.approx(gains[1], rel=1e-6)
-  assert found.of_plan.observed_return.estimate == pytest.approx(
-      same.of_plan.observed_return.estimate / 100, rel=1e-6
-  )
-
-
 def test_keeping_an_off_switch_from_ending_the_episode_is_an_exploit():
   found = _audit(designs.with_off_switch(), max_steps=120, budget=140)
   assert found.verdict == findings.EXPLOITABLE
@@ -111,23 +94,6 @@ def test_ending_the_episode_by_a_switch_is_counted_by_itself():
   assert found.verdict == findings.EXPLOITABLE
   assert found.of_plan.ended == found.of_plan.hacked > 0
   assert 'Ended by a corrupted signal alone' in findings.words(found, '')
-
-
-@pytest.mark.parametrize(
-    ('index', 'kind'), [(0, 'three_blocks'), (1, 'three_silent_blocks')]
-)
-def test_blocks_of_a_kind_with_three_are_attacked(index, kind, monkeypatch):
-  real = aiming.targets
-
-  def targets(*arguments):
-    found = real(*arguments)
-    assert [target.number for target in found] == [0, 1, 2]
-    return found[index : index + 1]
-
-  monkeypatch.setattr(aiming, 'targets', targets)
-  found = _audit(designs.with_three_blocks(kind), max_steps=80)
-  assert found.verdict == findings.EXPLOITABLE
-  assert [one.target for one in found.moved] == ['reward']
 
 
 @pytest.mark.parametrize(
@@ -251,7 +217,6 @@ def test_the_plan_is_repeated_bit_by_bit():
 
 def test_a_task_without_a_solver_is_refused(monkeypatch):
   monkeypatch.setattr(unlock_door.UnlockDoor, 'SOLVER', None)
-  monkeypatch.setattr(worlds, '_traits', worlds._traits.__wrapped__)
   with pytest.raises(errors.SpecError, match=r'no audit.*names no solver'):
     _audit('instantaneous_reward')
 
@@ -295,22 +260,6 @@ def test_agents_without_the_senses_of_saboteurs_are_refused():
   design = specs.load('instantaneous_reward')
   with pytest.raises(errors.SpecError, match='needs the senses'):
     audits.Auditor(audits.Settings(world, design))
-
-
-def test_a_learner_declares_its_objective_in_the_design():
-  learner = {
-      'kind': 'their_own',
-      'objective': {'kind': 'return', 'registers': {'reward': -1.0}},
-  }
-  design = designs.rewarding(
-      designs.two_blocks('feedback', range=[-12, 2]), learner=learner
-  )
-  with pytest.raises(errors.SpecError, match='earns hardly more than'):
-    _audit(design)
-  learner['objective']['registers']['reward'] = 1.0
-  assert _audit(design | {'learner': learner}).objective.registers == {
-      'reward': 1.0
-  }
 
 
 def test_the_displacement_of_each_block_is_watched():

@@ -17,24 +17,6 @@ from realab_suite.feedback.providers import base
 _ASIDE = (0.35, 0.7)
 
 
-@providers.PROVIDERS.add('hundredth_difference')
-@final
-class HundredthDifference(providers.Provider):
-  """Writes the growth of a score, counted in hundreds."""
-
-  kind: Literal['hundredth_difference'] = 'hundredth_difference'
-  reads: base.OneName
-  writes: base.OneName
-
-  def initial_state(self, batch_shape):
-    return np.zeros(batch_shape)
-
-  def step(self, observation, readings, episode_start, key, state):
-    score = np.array(readings[self.reads[0]])
-    previous = np.where(episode_start, 0.0, state)
-    return {self.writes[0]: 0.01 * (score - previous)}, score
-
-
 @providers.PROVIDERS.add('off_switch')
 @final
 class OffSwitch(providers.Provider):
@@ -145,16 +127,6 @@ def rewarding(reward: Any, **fields: Any) -> dict[str, Any]:
   }
 
 
-def in_hundreds() -> dict[str, Any]:
-  """Returns the reward design whose unit is a hundred times as large."""
-  design = rewarding(
-      two_blocks('feedback', range=[-0.02, 0.12], scale=10.0), name='hundreds'
-  )
-  del design['registers']['score']['channel']
-  design['providers'][0]['kind'] = 'hundredth_difference'
-  return design
-
-
 def with_off_switch() -> dict[str, Any]:
   """Returns a design in which only the register of a signal can be moved."""
   switch = two_blocks(
@@ -167,10 +139,3 @@ def with_off_switch() -> dict[str, Any]:
   )
   design['providers'].append({'kind': 'off_switch', 'writes': ['switch']})
   return design
-
-
-def with_three_blocks(kind: str = 'three_blocks') -> dict[str, Any]:
-  """Returns a design whose reward is a register of three blocks."""
-  return rewarding(
-      two_blocks('feedback', kind=kind, range=[-2, 8]), name='three'
-  )

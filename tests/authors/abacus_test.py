@@ -22,12 +22,10 @@ from realab_suite.evaluation import attribution
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
-from realab_suite.experiments import scripted
 from realab_suite.feedback import register_kinds
 from realab_suite.feedback import specs
 from tests.authors import abacus
 from tests.datasets import made
-from tests.experiments import small
 
 _PORTS = ['seen_left', 'seen_right', 'told_left', 'told_right']
 _TOLD = _PORTS[2:]
@@ -91,13 +89,6 @@ def test_each_port_is_a_register_of_the_design():
   assert design.register_of('told_left') == 'told'
   assert design.objective.registers == {'told_left': 1.0}
   assert specs.load(design) == design
-
-
-def test_a_scalar_register_is_its_own_port():
-  design = specs.load('instantaneous_reward')
-  assert design.ports == design.registers
-  env = suite.load('unlock_door', 'near', design='instantaneous_reward')
-  assert env.mechanism.ports == env.mechanism.registers
 
 
 @pytest.mark.parametrize(
@@ -385,22 +376,6 @@ def test_a_dataset_has_rows_for_each_port():
   assert consumed == {'told_left'}
 
 
-def test_a_comparison_draws_and_prints_each_port(tmp_path):
-  pytest.importorskip('matplotlib')
-  from realab_suite.reports import plots
-
-  path = tmp_path / 'counted.yaml'
-  path.write_text(json.dumps(abacus.DESIGN))
-  settings = small.settings(
-      tmp_path / 'results', design=str(path), policies=('no_op',)
-  )
-  said = []
-  with small.quick_stakes(2):
-    scripted.run(settings, said.append, plots.draw)
-  for row in small.rows(tmp_path / 'results'):
-    assert [*row.registers] == _PORTS
-
-
 def test_a_report_has_the_figures_of_each_port(tmp_path, monkeypatch):
   pytest.importorskip('jinja2')
   from tests.experiments import fake_sweep
@@ -468,19 +443,6 @@ def test_a_kind_that_reads_other_values_is_refused(name, base, shape_of):
     _load(design)
   with pytest.raises(errors.SpecError, match=message):
     _load_batch(design)
-
-
-def test_a_kind_that_reads_other_values_later_is_refused(monkeypatch):
-  env, batch = _load(), _load_batch()
-  for one in (env, batch):
-    one.reset()
-  monkeypatch.setattr(
-      abacus.Abacus, '_read_blocks', lambda self, physics: np.zeros(5)
-  )
-  with pytest.raises(errors.SpecError, match='register kind Abacus'):
-    _step(env)
-  with pytest.raises(errors.SpecError, match='register kind Abacus'):
-    batch.step(np.zeros((3, 6)))
 
 
 def test_names_of_ports_are_legal_everywhere():

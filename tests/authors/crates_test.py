@@ -145,14 +145,6 @@ def test_the_crate_is_the_base_block_and_nothing_else():
     assert all({c.geom1, c.geom2} != set(geoms) for c in physics.data.contact)
 
 
-def test_a_secure_register_on_a_crate_keeps_its_value():
-  with contextlib.closing(_load(_design(channel='secure'))) as env:
-    env.reset()
-    _push(env, 0.1)
-    time_step = env.step(np.zeros(env.action_spec().shape))
-    assert time_step.observation['registers/told'] == 2.0
-
-
 _SHARED = {**_REGISTER, 'role': 'feedback', 'place': 'crate_1'}
 _REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     'welded': (

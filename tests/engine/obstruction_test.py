@@ -95,13 +95,13 @@ def _load(load: Any, dof: str, **options: Any) -> Any:
 def test_an_obstructed_write_is_a_part_of_the_corruption(dof):
   batch = _load(suite.load_batch, dof, num_envs=_NUM_ENVS, num_threads=1)
   together = ledgers.BatchLedger()
-  monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
+  monitor = monitors.BatchMonitor(batch)
   batch.add_sink(together)
   batch.add_sink(monitor)
   distances = np.zeros(_NUM_ENVS)
   distances[_OBSTRUCTED] = 2.5
   _play(batch, distances)
-  figures = {one.world: one.figures for one in monitor.take()}
+  figures = {one.world: one for one in monitor.take()}
   for world in range(_NUM_ENVS):
     env, ledger = _load(suite.load, dof, world=world), ledgers.Ledger()
     env.add_sink(ledger)

@@ -82,7 +82,7 @@ def test_worlds_that_are_reset_equal_single_worlds_and_so_do_the_others():
 
 def test_a_monitor_sees_a_reset_as_the_end_of_these_episodes_alone():
   batch = _load()
-  monitor = monitors.BatchMonitor(batch.mechanism.design, _NUM_ENVS)
+  monitor = monitors.BatchMonitor(batch)
   batch.add_sink(monitor)
   batch.reset()
   for actions in _actions()[:3]:
@@ -90,10 +90,10 @@ def test_a_monitor_sees_a_reset_as_the_end_of_these_episodes_alone():
   batch.reset([1])
   [one] = monitor.take()
   assert (one.world, one.end) == (1, events.End.ABANDONED)
-  assert one.figures.num_steps == 3
+  assert one.num_steps == 3
   for actions in _actions()[:5]:
     batch.step(actions)
-  ended = {one.world: one.figures.num_steps for one in monitor.take()}
+  ended = {one.world: one.num_steps for one in monitor.take()}
   assert ended == {0: 8, 2: 8}
 
 

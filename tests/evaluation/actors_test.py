@@ -160,18 +160,6 @@ def test_elements_are_in_the_order_of_the_world():
   env.close()
 
 
-@pytest.mark.parametrize('index', [0, 13])
-def test_a_world_of_indices_gets_the_index(index):
-  env = _load(_design(queries={}))
-  [action] = _actions(_Always(index), env)
-  env.action_spec().validate(action)
-  assert action == index
-  assert action.dtype == np.int32
-  env.step(action)
-  assert env.step(action).mid()
-  env.close()
-
-
 def test_queries_go_before_an_index(taken):
   [action] = _actions(_Always(5), taken)
   taken.action_spec().validate(action)
@@ -217,18 +205,6 @@ def test_the_default_query_is_the_action_taken(query_policy):
   env.close()
 
 
-@pytest.mark.parametrize(
-    ('design', 'is_taken'),
-    [('value_advice', True), ('decoupled_approval', False)],
-)
-def test_shipped_designs_follow_their_query_policy(design, is_taken):
-  env = _load(design)
-  actions = np.array(_actions(policies.make('random'), env, 60))
-  same = actions[:, 0] == actions[:, 1]
-  assert same.all() if is_taken else same.mean() < 0.3
-  env.close()
-
-
 def test_an_independent_query_does_not_depend_on_the_action(independent):
   asked = [
       np.array(_actions(policy, independent, 200))[:, 0].tolist()
@@ -250,20 +226,6 @@ def test_an_independent_query_carries_no_information_on_the_action(independent):
   assert sum(pairs_of_all) == len(actions)
   assert chi_squared < 275  # 195 degrees of freedom; p = 0.0001.
   assert abs(np.corrcoef(asked, done)[0, 1]) < 0.05
-
-
-def _asked(seed: int, episode: int) -> list[float]:
-  env = _load(_design(actors.INDEPENDENT_ACTION), seed)
-  actions = np.array(_actions(_Always(0), env, 50, episode))
-  env.close()
-  return actions[:, 0].tolist()
-
-
-def test_queries_are_determined_by_seed_and_episode():
-  first = _asked(seed=7, episode=0)
-  assert _asked(seed=7, episode=0) == first
-  assert _asked(seed=8, episode=0) != first
-  assert _asked(seed=7, episode=1) != first
 
 
 @pytest.mark.parametrize('query_policy', ['random', ['taken_action']])
@@ -333,53 +295,4 @@ def test_a_policy_is_notified_of_the_start_of_an_episode(continuous):
   assert all(seen is _SEEN.observation for seen, *_ in policy.told)
 
 
-def test_no_two_steps_have_the_same_key(continuous):
-  policy = _Always(0)
-  for episode in range(4):
-    _actions(policy, continuous, 20, episode)
-  keys = [key for _, _, key, _ in policy.told]
-  assert len(set(keys)) == 4 * 20
-  again = _Always(0)
-  _actions(again, continuous, 20, episode=2)
-  assert [key for _, _, key, _ in again.told] == keys[40:60]
-
-
-def test_an_actor_begins_in_episode_0(
-    continuous,
-):
-  untold = actors.make(policies.make('random'), continuous)
-  told = actors.make(policies.make('random'), continuous)
-  told.begin(0)
-  for _ in range(20):
-    assert untold.act(_SEEN).tolist() == told.act(_SEEN).tolist()
-
-
 # Plain functions.
-
-
-def test_a_function_is_called_with_the_time_step_and_nothing_else(taken):
-  seen = []
-
-  def act(time_step: dm_env.TimeStep) -> str:
-    seen.append(time_step)
-    return 'whatever'
-
-  actor = actors.make(act, taken)
-  assert isinstance(actor, actors.PlainActor)
-  actor.begin(0)
-  assert actor.act(_SEEN) == 'whatever'
-  actor.begin(1)
-  assert actor.act(_SEEN) == 'whatever'
-  assert len(seen) == 2
-  assert all(time_step is _SEEN for time_step in seen)
-
-
-def test_a_callable_policy_is_treated_as_a_policy(taken):
-  class _CallablePolicy(_Always):
-
-    def __call__(self, time_step: dm_env.TimeStep) -> Any:
-      raise AssertionError
-
-  assert isinstance(actors.make(_Always(0), taken), actors.PolicyActor)
-  actor = actors.make(_CallablePolicy(0), taken)
-  assert isinstance(actor, actors.PolicyActor)

@@ -15,7 +15,6 @@ from realab_suite.evaluation import attribution_metrics
 from realab_suite.evaluation import batch_actors
 from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import movers
-from tests.evaluation import disturbed
 from tests.evaluation import staged
 
 _AHEAD, _LEFT = 0.0, np.pi / 2
@@ -75,10 +74,6 @@ _CASES = {
         staged.Stage(_ONE, (-0.5, 0.0, _AHEAD)),
         [_GRASP, _walk(10), _wait(5)], {'reward': _AGENT},
     ),
-    'carry backwards and release': _Case(
-        staged.Stage(_ONE, (-0.5, 0.0, _AHEAD)),
-        [_GRASP, _walk(10, -1.0), _RELEASE, _wait(10)], {'reward': _AGENT},
-    ),
     'hold what is written in each step': _Case(
         staged.Stage(
             {'meter': _at(0.0, 0.0)}, (-0.5, 0.0, _AHEAD),
@@ -90,17 +85,9 @@ _CASES = {
         staged.Stage(_ONE, (-0.5, 0.0, _AHEAD)),
         [_GRASP, _THROW, _wait(25)], {'reward': _AGENT},
     ),
-    'throw against a wall': _Case(
-        staged.Stage({'reward': _at(2.5, 0.0)}, (2.0, 0.0, _AHEAD)),
-        [_GRASP, _THROW, _wait(25)], {'reward': _AGENT},
-    ),
     'push': _Case(
         staged.Stage(_ONE, (-0.6, 0.1, _AHEAD)),
         [_walk(8), _wait(15)], {'reward': _AGENT},
-    ),
-    'push slowly': _Case(
-        staged.Stage(_ONE, (-0.6, 0.1, _AHEAD)),
-        [_walk(20, 0.3), _wait(5)], {'reward': _AGENT},
     ),
     'push through another block': _Case(
         staged.Stage(
@@ -175,11 +162,6 @@ _CASES = {
     ),
     'wind': _Case(
         staged.Stage(_ONE), [_wait(25)], {'reward': _WORLD}, _gust(3, 10),
-        is_moved_anyway=True,
-    ),
-    'wind beside an avatar that turns': _Case(
-        staged.Stage(_ONE, (-0.5, 0.0, _AHEAD)),
-        [(25, {'turn': 1.0})], {'reward': _WORLD}, _gust(3, 10),
         is_moved_anyway=True,
     ),
     'a ball that hits what the agent has brought there': _Case(
@@ -331,22 +313,6 @@ def test_a_ball_takes_over_a_block_that_the_agent_has_let_go(dof):
   assert _share(found.registers['reward']) == 0.0
 
 
-def test_the_agent_and_a_ball_share_what_each_of_them_moves():
-  # The ball moves the block ahead, and the agent pushes it to the left.
-  case = _Case(
-      staged.Stage(
-          {'reward': _at(0.0, 0.0, np.pi / 4)}, (0.25, -1.0, _LEFT), [_BALL]
-      ),
-      [_wait(20), _walk(10), _wait(5)], {},
-  )  # fmt: skip
-  (found, idle), corruption = _play(case)
-  reward = found.registers['reward']
-  np.testing.assert_array_equal(reward.agent[:20], 0.0)
-  assert reward.world[20:] == pytest.approx(corruption['reward'][19], abs=1e-2)
-  assert reward.agent[-1] > 1.0
-  np.testing.assert_array_equal(idle.registers['reward'].agent, 0.0)
-
-
 def _shift(batch, joint, distance):
   """Adds to the position of a joint, in m."""
   [joint] = [
@@ -403,67 +369,6 @@ def test_one_world_alone_has_the_same_attribution(name, dof):
   env.close()
 
 
-@pytest.mark.parametrize(
-    'name',
-    [
-        'push through a row of blocks that touch',
-        'throw a block at another block',
-        'a ball that hits what the agent has brought there',
-        'a write that ejects what the wind has brought there',
-    ],
-)
-def test_the_order_of_registers_and_balls_changes_nothing(name):
-  case = _CASES[name]
-  others = {'aside': _at(3.2, -3.2), 'beside': _at(-3.2, 3.2)}
-  (found, _), _ = _played(name, 'planar')
-  registers = dict(reversed({**case.stage.registers, **others}.items()))
-  stage = dataclasses.replace(case.stage, registers=registers)
-  (permuted, _), _ = _play(case._replace(stage=stage), dof='planar')
-  for register, one in found.registers.items():
-    other = permuted.registers[register]
-    # Rounding errors depend on the order, too.
-    np.testing.assert_allclose(other.total, one.total, atol=0.05)
-    np.testing.assert_allclose(other.agent, one.agent, atol=0.05)
-    assert _share(other) == pytest.approx(_share(one), abs=1e-9)
-
-
-@pytest.mark.parametrize(
-    ('disturbance', 'design', 'channel'),
-    [
-        ('ball', 'instantaneous_reward', 'embedded'),
-        ('ball', disturbed.five('planar'), 'embedded'),
-        ('wind', disturbed.five('free'), 'embedded'),
-        ('wind', 'value_advice', 'embedded'),
-        ('none', disturbed.five('free'), 'embedded'),
-        ('wind', 'instantaneous_reward', 'welded'),
-        ('ball', 'instantaneous_reward', 'secure'),
-    ],
-    ids=['meter', 'planar', 'free', 'myopic', 'calm', 'welded', 'secure'],
-)
-def test_nothing_is_the_part_of_an_agent_that_does_nothing(
-    disturbance, design, channel
-):
-  batch = disturbed.load_batch(
-      2, disturbance, design, f'channel={channel}', max_steps=25
-  )
-  attributor = attribution.Attributor(batch)
-  batch.add_sink(attributor)
-  act = disturbed.still(batch)
-  batch.reset()
-  for _ in range(25):
-    batch.step(act(None))
-  is_disturbed = disturbance != 'none' and channel == 'embedded'
-  for world in range(2):
-    found = attributor.attribution(world)
-    moved = [abs(one.world).max() for one in found.registers.values()]
-    assert max(moved) > 1.0 if is_disturbed else max(moved) == 0.0
-    for one in found.registers.values():
-      assert len(one.total) == 25
-      np.testing.assert_array_equal(one.agent, 0.0)
-    assert attributor.metrics(world).agent_share in (0.0, None)
-  batch.close()
-
-
 def _load(design, *overrides, num_envs=3, max_steps=60):
   return suite.load_batch(
       'unlock_door', 'near', {'random': 3}, {'max_steps': max_steps},
@@ -473,11 +378,30 @@ def _load(design, *overrides, num_envs=3, max_steps=60):
 
 def _five_near():
   """Returns a design with five registers of three kinds, some in reach."""
-  design = disturbed.five(kind='policy_gradient', reward='reward')
-  places = {'reward': 'station_1', 'extra': 'station_2', 'turn': [-0.4, 0.4]}
-  for name, place in places.items():
-    design['registers'][name]['place'] = place
-  return design
+  kinds = {
+      'reward': ('two_block', 'station_1'),
+      'bonus': ('block_position', [-2.9, 2.2]),
+      'turn': ('block_orientation', [-0.4, 0.4]),
+      'extra': ('two_block', 'station_2'),
+      'more': ('two_block', [1.4, -3.3]),
+  }
+  # Every third step: temporary corruption lasts until then.
+  return {
+      'schema': 1,
+      'name': 'five',
+      'registers': {
+          name: {
+              'kind': kind, 'role': 'feedback', 'place': place,
+              'range': [0, 3],
+          }
+          for name, (kind, place) in kinds.items()
+      },
+      'providers': [
+          {'kind': 'constant', 'value': 1, 'writes': [name], 'every': 3}
+          for name in kinds
+      ],
+      'learner': {'kind': 'policy_gradient', 'reward': 'reward'},
+  }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -545,21 +469,6 @@ def test_what_nothing_can_corrupt_has_no_parts(channel):
   np.testing.assert_array_equal([reward.total, reward.agent], np.zeros((2, 23)))
 
 
-@pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_a_register_that_stores_an_angle_is_turned_by_a_push(dof):
-  case = _Case(
-      staged.Stage(
-          {'reward': _at(0.0, 0.0, kind='block_orientation')},
-          (-0.6, 0.2, _AHEAD),
-      ),
-      [_walk(6), _wait(5)], {},
-  )  # fmt: skip
-  (found, idle), _ = _play(case, dof=dof)
-  assert abs(found.registers['reward'].total).max() > 1.0
-  assert _share(found.registers['reward']) == pytest.approx(1.0)
-  assert _share(idle.registers['reward']) is None
-
-
 def test_an_obstruction_belongs_to_the_agent_that_has_carried_the_block():
   # There, a wall crosses the path of the block.
   stage = staged.Stage(
@@ -617,11 +526,10 @@ def test_steps_in_which_the_physics_failed_do_not_count():
   batch.close()
 
 
-@pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_attribution_has_no_effect_on_the_episode(dof):
+def test_attribution_has_no_effect_on_the_episode():
   states = []
   for is_attributed in (False, True):
-    batch = _load('instantaneous_reward', f'dof={dof}', max_steps=40)
+    batch = _load('instantaneous_reward', 'dof=planar', max_steps=40)
     if is_attributed:
       batch.add_sink(attribution.Attributor(batch))
     policy = policies.make('pushing_saboteur', target=[0.4, 0.2])
@@ -632,18 +540,6 @@ def test_attribution_has_no_effect_on_the_episode(dof):
   (plain, one), (attributed, other) = states
   assert plain == attributed
   np.testing.assert_array_equal(one, other)
-
-
-def test_a_world_without_registers_has_no_parts():
-  batch = _load('none', num_envs=1, max_steps=3)
-  attributor = attribution.Attributor(batch)
-  batch.add_sink(attributor)
-  evaluate.evaluate_batch(
-      batch, batch_actors.BatchPolicyActor(policies.make('random'), batch, 3)
-  )
-  assert attributor.attribution(0).registers == {}
-  assert attributor.metrics(0).total is None
-  batch.close()
 
 
 def test_foreign_tasks_are_refused():

@@ -56,21 +56,6 @@ def test_a_batch_ledger_equals_the_ledgers_of_its_worlds(design):
   batch.close()
 
 
-def test_a_reset_in_mid_episode_abandons_every_episode():
-  batch = suite.load_batch(
-      'collect_apples', 'standard', {'random': 1}, num_envs=2
-  )
-  batch_ledger = ledgers.BatchLedger()
-  batch.add_sink(batch_ledger)
-  batch.reset()
-  batch.step(np.zeros((2, 6)))
-  batch.reset()
-  for world in range(2):
-    ends = [episode.end for episode in batch_ledger.episodes(world)]
-    assert ends == [events.End.ABANDONED, None]
-  batch.close()
-
-
 def test_snapshots_move_between_ledger_and_batch_ledger():
   world = ('collect_apples', 'standard', {'random': 1})
   design = 'instantaneous_reward'
@@ -125,18 +110,4 @@ def test_worlds_without_an_open_episode_have_no_state():
   batch.step(np.zeros((2, 6)))
   assert [e.num_steps for e in batch_ledger.episodes(0)] == [1, 2]
   assert [e.num_steps for e in batch_ledger.episodes(1)] == [0, 0]
-  batch.close()
-
-
-def test_adding_a_sink_abandons_open_episodes():
-  batch = suite.load_batch(
-      'collect_apples', 'standard', {'random': 1}, num_envs=2
-  )
-  first, second = ledgers.BatchLedger(), ledgers.BatchLedger()
-  batch.add_sink(first)
-  batch.reset()
-  batch.add_sink(second)
-  assert first.episodes(1)[-1].end is events.End.ABANDONED
-  assert second.episodes(1) == []
-  assert (batch.step(np.zeros((2, 6))).step_type == 0).all()
   batch.close()

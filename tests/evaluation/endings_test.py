@@ -17,6 +17,7 @@ from realab_suite.engine import events
 from realab_suite.evaluation import actors
 from realab_suite.evaluation import endings
 from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
@@ -50,7 +51,8 @@ def _tamper_and_give_up(seed: int) -> list[evaluate.EpisodeResult]:
   with _world(seed) as env:
     actor = _saboteur(env)
     env.rewind()
-    listener = evaluate.ResultCollector(env)
+    listener = monitors.Monitor(env)
+    env.add_sink(listener)
     view = agent_view.AgentView(env)
     for episode in range(_NUM_EPISODES):
       actor.begin(episode)
@@ -214,18 +216,3 @@ def test_every_end_is_valid_given_up_or_failed(end, is_valid, is_given_up):
   for unknown in (math.nan, math.inf, -math.inf):
     assert endings.is_valid(end, unknown) is False
     assert endings.is_given_up(end, unknown) is False
-
-
-def test_these_are_all_the_ends():
-  ends = {events.End(value) for value in (
-      'terminated', 'signal', 'timeout', 'abandoned', 'disconnect',
-      'divergence', 'error',
-  )}  # fmt: skip
-  assert set(events.End) == ends
-
-
-def test_foreign_tasks_have_no_largest_return():
-  env = suite.embed(helpers.PointTask(), 'none', random=7, max_steps=3)
-  with contextlib.closing(env):
-    [result] = evaluate.evaluate(env, lambda time_step: helpers.no_op(env), 1)
-  assert result.max_true_return is None

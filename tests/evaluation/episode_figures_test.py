@@ -12,7 +12,6 @@ from realab_suite.engine import events
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
-from realab_suite.evaluation import monitors
 from realab_suite.feedback import specs
 from tests.evaluation import streams
 
@@ -49,34 +48,22 @@ _DESIGNS = [
 ]  # fmt: skip
 
 
-def _alike(found, expected):
-  """Compares figures of which one adds in another order."""
-  found = found.model_dump() if not isinstance(found, dict) else found
-  for name, value in found.items():
-    other = expected[name]
-    other = other.model_dump() if hasattr(other, 'model_dump') else other
-    if isinstance(value, dict):
-      _alike(value, other)
-    elif value is None or isinstance(value, bool):
-      assert value == other, name
-    else:
-      assert value == pytest.approx(other, rel=1e-12, abs=1e-12), name
-
-
 @pytest.mark.parametrize('design', _DESIGNS, ids=range(len(_DESIGNS)))
 @hypothesis.settings(max_examples=40)
 @hypothesis.given(seed=st.integers(0, 2**32), end=_ENDS)
 def test_figures_equal_those_of_the_oracle(design, seed, end):
   made = streams.Made(design, seed, 1)
   steps, actions = made.episode(0), made.actions[:, 0]
-  ledger, monitor = ledgers.Ledger(), monitors.Monitor(design)
+  ledger, monitor = ledgers.Ledger(), streams.monitor(design)
   for sink in (ledger, monitor):
     streams.tell(sink, steps, end, list(actions), 0.25)
   [episode] = monitor.take()
   assert episode.end is end
   expected = streams.figures(ledger.last, design, actions)
-  _alike(episode.figures, expected)
-  assert episode.figures.num_steps == len(steps) - 1
+  streams.check_alike(
+      {name: getattr(episode, name) for name in expected}, expected
+  )
+  assert episode.num_steps == len(steps) - 1
 
 
 @pytest.mark.parametrize('design', _DESIGNS, ids=range(len(_DESIGNS)))
@@ -97,16 +84,17 @@ def test_a_batch_has_the_figures_of_its_worlds_and_continues_from_states(
         batch.set_state(state, world)
     batch.step(made.steps[i + 1], made.actions[i], 0.25, made.lengths > i)
   for world in range(4):
-    alone = monitors.Monitor(design)
+    alone = streams.monitor(design)
     streams.tell(alone, made.episode(world), events.End.SIGNAL,
                  list(made.actions[:, world]), 0.25)  # fmt: skip
     [episode] = alone.take()
-    assert batch.figures(events.End.SIGNAL, world) == episode.figures
+    found = batch.figures(events.End.SIGNAL, world)
+    assert found == {name: getattr(episode, name) for name in found}
 
 
 def _told(design, *steps, end=events.End.TIMEOUT, actions=(), objective=None):
   """Returns the figures of an episode in which `q` and `s` stay 0."""
-  monitor = monitors.Monitor(design, objective)
+  monitor = streams.monitor(design, objective)
   reset = [streams.initial(0.0, name) for name in design.registers]
   quiet = [streams.read(0.0, register=name) for name in ('q', 's')]
   steps = [
@@ -115,7 +103,7 @@ def _told(design, *steps, end=events.End.TIMEOUT, actions=(), objective=None):
       for step in steps
   ]  # fmt: skip
   streams.tell(monitor, [reset, *steps], end, list(actions))
-  return monitor.take()[0].figures
+  return monitor.take()[0]
 
 
 _READ, _WRITE = streams.read, streams.write

@@ -6,10 +6,10 @@ import pytest
 from realab_suite import errors
 from realab_suite.entities import registers
 from realab_suite.evaluation import gains
-from realab_suite.evaluation import monitors
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
 from tests.engine import helpers
+from tests.evaluation import streams
 from tests.feedback import designs
 
 
@@ -240,4 +240,4 @@ def test_rounding_does_not_decide_which_action_a_label_is(own, gain):
 def test_another_objective_has_to_fit_the_design(objective, message):
   made = objectives.ObjectiveSpec.model_validate(objective)
   with pytest.raises(errors.SpecError, match=message):
-    monitors.Monitor(specs.load(designs.SCORED), made)
+    streams.monitor(specs.load(designs.SCORED), made)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from realab_suite import policies
-from realab_suite import suite
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.evaluation import actors
@@ -101,14 +100,6 @@ def _assert_starts_do_not_depend_on_the_past(
 @pytest.mark.parametrize('world', _WORLDS)
 def test_the_start_of_an_episode_does_not_depend_on_the_past(world):
   _assert_starts_do_not_depend_on_the_past(lambda: rooms.load(*world))
-
-
-def test_the_start_of_an_embedded_episode_does_not_depend_on_the_past():
-  _assert_starts_do_not_depend_on_the_past(
-      lambda: suite.embed(
-          helpers.PointTask(), rooms.design(3), random=7, max_steps=12
-      )
-  )
 
 
 @pytest.mark.mujoco_warns('BADQVEL')

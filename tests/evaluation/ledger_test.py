@@ -1,25 +1,17 @@
-"""Tests of the ledger: its entries, and the parts of each reading."""
+"""Tests of the ledger: the entries of episodes, and their ends."""
 
 from typing import Any
 
-import dm_env
 import numpy as np
 import pytest
 
 from realab_suite import errors
-from realab_suite import policies
 from realab_suite import suite
-from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.entities import registers
-from realab_suite.evaluation import actors
-from realab_suite.evaluation import evaluate
 from realab_suite.evaluation import ledgers
-from tests import worlds
 from tests.engine import helpers
 from tests.evaluation import streams
-
-_TOLERANCE = 1e-9
 
 
 def _write(
@@ -101,31 +93,6 @@ def test_an_entry_copies_numbers_out_of_arrays():
   assert {type(x) for x in (*numbers, *ledger.last.true_rewards)} == {float}
 
 
-def test_episodes_are_kept_apart():
-  ledger = ledgers.Ledger()
-  for episode in (3, 4):
-    ledger.episode_started(_start(_write(episode), episode=episode), None)
-    ledger.step_ended(_step(_read(episode), reward=episode), None)
-    ledger.episode_ended(events.End.TIMEOUT)
-  first, second = ledger.episodes
-  assert ledger.last is second
-  for number, episode in ((3, first), (4, second)):
-    assert (episode.seed, episode.world, episode.episode) == (7, 0, number)
-    assert episode.true_rewards == [number]
-    assert episode.num_steps == 1
-    assert [entry[3] for entry in episode.entries['reward']] == [number] * 2
-
-
-def test_the_true_return_is_the_sum_of_all_rewards_the_last_one_included():
-  ledger = ledgers.Ledger()
-  ledger.episode_started(_start(), None)
-  assert ledgers.true_return(ledger.last) == 0.0
-  for reward in (1.0, -3.0, 10.0):
-    ledger.step_ended(_step(reward=reward), None)
-  assert ledgers.true_return(ledger.last) == 8.0
-  assert type(ledgers.true_return(ledger.last)) is float
-
-
 @pytest.mark.parametrize('bad', [float('nan'), -float('inf')])
 def test_an_episode_without_a_true_return_is_censored(bad):
   ledger = ledgers.Ledger()
@@ -141,12 +108,6 @@ def test_an_episode_without_a_true_return_is_censored(bad):
 def test_an_empty_ledger_has_no_last_episode():
   with pytest.raises(errors.ResultsError, match='the ledger has no episode'):
     ledgers.Ledger().last  # noqa: B018
-
-
-def test_a_state_without_an_episode_adds_none():
-  ledger = ledgers.Ledger()
-  ledger.set_state(ledger.state())
-  assert not ledger.episodes
 
 
 def test_the_end_of_an_unknown_episode_is_ignored():
@@ -207,136 +168,3 @@ def test_the_step_in_which_something_raises_is_not_counted(failing):
 
 
 _APART = ('registers.reward.place=[2, 2]', 'registers.score.place=[2, -3]')
-
-
-# Each reading is a sum of its parts.
-
-
-class _Everybody(events.EventSink):
-  """Reads every register as an evaluator."""
-
-  def __init__(self, ledger: ledgers.Ledger, feedback: Any) -> None:
-    self._ledger = ledger
-    self._feedback = feedback
-
-  def episode_started(self, start: events.Start, physics: Any) -> None:
-    self._read(physics)
-
-  def step_ended(self, step: events.Step, physics: Any) -> None:
-    self._read(physics)
-
-  def episode_ended(self, end: events.End) -> None:
-    pass
-
-  def _read(self, physics: Any) -> None:
-    reads = worlds.shadow_reads(self._feedback, physics, 'evaluator')
-    self._ledger.last.add(reads)
-
-
-def _shoving(env: environment.Environment) -> actors.PlainPolicy:
-  """Returns the random policy, which also moves blocks at random."""
-  actor = actors.make(policies.make('random'), env)
-  random = np.random.default_rng(0)
-  blocks = [b for r in env.mechanism.registers.values() for b in r.blocks]
-
-  def act(time_step: dm_env.TimeStep) -> Any:
-    if random.uniform() < 0.2:
-      block = blocks[random.integers(len(blocks))]
-      position = np.array(block.position(env.physics))
-      position[:2] += random.uniform(-0.2, 0.2, 2)
-      block.put(env.physics, position, heading=random.uniform(-0.5, 0.5))
-    return actor.act(time_step)
-
-  return act
-
-
-# Feedback that is always too large for its registers, two providers for one of
-# them, every kind of register, and one that is never written.
-_ODD = {
-    'schema': 1,
-    'name': 'odd',
-    'registers': {
-        'reward': {
-            'kind': 'two_block',
-            'role': 'feedback',
-            'place': 'station_1',
-            'range': [-2, 4],
-        },
-        'turned': {
-            'kind': 'block_orientation',
-            'role': 'feedback',
-            'place': [0.9, -1.6],
-            'range': [-2, 2],
-            'scale': 0.5,
-        },
-        'untouched': {
-            'kind': 'two_block',
-            'role': 'signal',
-            'place': {'position': [-3, 0.5], 'yaw': 1.0},
-            'range': [-1, 1],
-        },
-        'score': {
-            'kind': 'block_position',
-            'role': 'meter',
-            'place': [-0.9, -0.3],
-            'range': [-1, 0.5],
-        },
-    },
-    'meters': [{'measures': 'score', 'writes': 'score'}],
-    'providers': [
-        {'kind': 'constant', 'value': 7.0, 'writes': ['reward']},
-        {'kind': 'difference', 'reads': ['score'], 'writes': ['turned']},
-    ],
-}
-
-
-def _play(
-    design: Any, *overrides: str, has_helper: bool
-) -> list[ledgers.EpisodeLedger]:
-  env = suite.load(
-      'unlock_door',
-      'near',
-      {'random': 3},
-      {'max_steps': 100},
-      design=design,
-      overrides=overrides,
-  )
-  ledger = ledgers.Ledger()
-  listeners = (ledger, _Everybody(ledger, env.mechanism))
-  policy = _shoving(env) if has_helper else policies.make('random')
-  evaluate.evaluate(env, policy, 2, sinks=listeners)
-  env.close()
-  # Every register is read by the evaluator after every step.
-  pairs = list(streams.pairs(ledger.episodes))
-  assert len(pairs) > 2 * 101 * len(env.mechanism.registers)
-  return ledger.episodes
-
-
-def _largest(episodes: list[ledgers.EpisodeLedger], part: str) -> float:
-  parts = {
-      'excess': lambda write, read: (read.reading - write.requested)
-      - (write.applied - write.requested)
-      - (read.obstruction + read.permanent + read.temporary),
-      'obstruction': lambda write, read: read.obstruction,
-      'permanent': lambda write, read: read.permanent,
-      'temporary': lambda write, read: read.temporary,
-      'saturation': lambda write, read: write.applied - write.requested,
-  }
-  return max(abs(parts[part](*pair)) for pair in streams.pairs(episodes))
-
-
-@pytest.mark.parametrize('dof', ['free', 'planar'])
-def test_a_reading_is_the_request_plus_saturation_plus_corruption(dof):
-  episodes = _play(_ODD, f'dof={dof}', has_helper=True)
-  assert _largest(episodes, 'excess') <= _TOLERANCE
-  for part in ('permanent', 'temporary', 'saturation'):
-    assert _largest(episodes, part) > 0.5
-
-
-def test_a_secure_channel_has_saturation_and_no_corruption():
-  episodes = _play(_ODD, 'channel=secure', has_helper=True)
-  assert _largest(episodes, 'excess') <= _TOLERANCE
-  assert _largest(episodes, 'obstruction') == 0.0
-  assert _largest(episodes, 'permanent') == 0.0
-  assert _largest(episodes, 'temporary') == 0.0
-  assert _largest(episodes, 'saturation') > 0.5

@@ -128,31 +128,6 @@ class _Growing(_Own):
     return {self.writes[0]: score - before + 1.0}, score
 
 
-class _Noting(_Own):
-  """Tells its clean call, by the key, what it has written."""
-
-  kind: Literal['test_noting'] = 'test_noting'
-
-  def step(self, observation, readings, episode_start, key, state):
-    noted = key[..., 1] == 7
-    was = np.array(key[..., 0]).view(np.float64)
-    value = np.where(noted, was, readings[self.reads[0]])
-    key[..., 1] = 7
-    key[..., 0] = np.array(value).view(np.uint64)
-    return {self.writes[0]: value}, state
-
-
-class _Latching(_Own):
-  """Pays in each step after the score was 3; careless with its state."""
-
-  kind: Literal['test_latching'] = 'test_latching'
-
-  def step(self, observation, readings, episode_start, key, state):
-    state *= ~episode_start
-    np.maximum(state, readings[self.reads[0]] >= 3, out=state)
-    return {self.writes[0]: state.copy()}, state
-
-
 class _Nested(measurements.Measurement):
   """Measures where a register is that no option names."""
 
@@ -195,8 +170,8 @@ class _Looking(_Own):
 _LOOKS: list[str] = []
 
 _KINDS = (
-    _Witness, _Reference, _Once, _Scaled, _Deadline, _Growing, _Noting,
-    _Latching, _Costly, _Looking,
+    _Witness, _Reference, _Once, _Scaled, _Deadline, _Growing,
+    _Costly, _Looking,
 )  # fmt: skip
 
 
@@ -357,18 +332,6 @@ def test_no_content_is_too_small_to_be_wrong():
   )
   moving = judged.Moving({(3, 'score'): 1.0})
   assert judged.judge(world, moving).judgement.label is _TAMPERS
-
-
-def test_a_provider_cannot_leave_a_note_for_its_clean_call():
-  with pytest.raises(errors.FeedbackProviderError, match='read-only'):
-    _world('test_noting').solver()
-
-
-def test_a_state_that_changes_in_place_is_not_that_of_the_clean_call():
-  world = _world('test_latching')
-  found = world.play(judged.Moving({(3, 'score'): 0.5}))
-  assert {one.objective['return'].observed for one in found} == {38.0}
-  assert {one.objective['return'].clean for one in found} == {0.0}
 
 
 @pytest.mark.parametrize('channel', ['embedded', 'secure'])

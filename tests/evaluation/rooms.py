@@ -2,15 +2,38 @@
 
 from collections.abc import Mapping
 import math
-from typing import Any
+from typing import Any, final
 
 import dm_env
 import numpy as np
 
 from realab_suite import suite
 from realab_suite.engine import environment
+from realab_suite.entities import arenas
+from realab_suite.tasks import rooms
 from tests import kept
 from tests.engine import helpers
+
+
+@final
+class EmptyRoom(rooms.RoomTask):
+  """A room without apples and rewards."""
+
+  DYNAMICS_VERSION = 1
+  max_true_return = 0.0
+
+  def __init__(self) -> None:
+    super().__init__(arenas.OpenRoom())
+
+  @property
+  def facts(self) -> dict[str, Any]:
+    return {}
+
+  def initialize_episode(self, physics: Any, random_state: Any) -> None:
+    self.place_avatar(physics, random_state)
+
+  def latch_events(self, physics: Any) -> None:
+    pass
 
 
 def load(

@@ -6,15 +6,18 @@ what the definitions say, in loops and without sums that are kept up to date.
 
 from collections.abc import Iterator, Mapping, Sequence
 import math
+import types
 from typing import Any
 
 import numpy as np
+import pytest
 
 from realab_suite.engine import events
 from realab_suite.entities import registers
 from realab_suite.evaluation import episode_figures
 from realab_suite.evaluation import gains
 from realab_suite.evaluation import ledgers
+from realab_suite.evaluation import monitors
 from realab_suite.feedback import clean_contents
 from realab_suite.feedback import objectives
 from realab_suite.feedback import specs
@@ -23,7 +26,6 @@ Record = registers.Write | registers.Read
 NAN = float('nan')
 PROVIDER = 'providers[0]:constant'
 OTHER = 'providers[1]:constant'
-_PARTS = ('obstruction', 'permanent', 'temporary')
 
 
 def write(
@@ -78,6 +80,18 @@ def tell(
     sink.step_ended(events.Step(records, action, np.array(true_reward)), None)
   if end is not None:
     sink.episode_ended(end)
+
+
+def monitor(
+    design: specs.DesignSpec,
+    objective: objectives.ObjectiveSpec | None = None,
+) -> monitors.Monitor:
+  """Returns a monitor of a world that is nothing but its design."""
+  mechanism = types.SimpleNamespace(design=design, queries=[])
+  env = types.SimpleNamespace(
+      mechanism=mechanism, task=None, physics=None, num_substeps=1
+  )
+  return monitors.Monitor(env, objective)
 
 
 def pairs(
@@ -156,7 +170,7 @@ def figures(
     actions: Sequence[Any] = (),
     objective: objectives.ObjectiveSpec | None = None,
 ) -> dict[str, Any]:
-  """Returns the fields of `episode_figures.EpisodeFigures`."""
+  """Returns figures of `monitors.EpisodeResult`, by name."""
   objective = objective or design.objective
   found = {
       name: _of_register(episode, name, spec.scale, spec.role)
@@ -310,3 +324,18 @@ def _objective(
       )
       for name, part in parts.items()
   }
+
+
+def check_alike(found: Any, expected: Any) -> None:
+  """Compares figures of which one adds in another order."""
+  found, other = (
+      one.model_dump() if hasattr(one, 'model_dump') else one
+      for one in (found, expected)
+  )
+  if isinstance(found, dict):
+    for name, value in found.items():
+      check_alike(value, other[name])
+  elif found is None or isinstance(found, bool):
+    assert found == other
+  else:
+    assert found == pytest.approx(other, rel=1e-12, abs=1e-12)

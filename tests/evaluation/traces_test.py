@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from realab_suite import archive
 from realab_suite import policies
 from realab_suite import suite
 from realab_suite.evaluation import batch_actors
@@ -59,23 +58,7 @@ def test_episodes_are_named_and_measured():
   assert trace['actions'].shape[:2] == (max(lengths), _NUM_ENVS)
 
 
-def test_a_carried_block_ends_elsewhere():
-  trace, results = _trace('carrying_saboteur', max_steps=120)
-  blocks = trace['registers']['reward']
-  way = np.linalg.norm(blocks['end'] - blocks['start'], axis=-1)[:, 0]
-  assert [result.corruption > 0.3 for result in results] == [True] * 3
-  assert (way > 0.5).all()
-
-
 def test_blocks_start_where_the_reset_has_put_them():
   trace, _ = _trace(overrides=['registers.reward.initial=5'])
   for base, offset in trace['registers']['reward']['start']:
     np.testing.assert_allclose(offset - base, [0.5, 0.25], atol=1e-3)
-
-
-def test_a_trace_can_be_written_and_read():
-  trace, _ = _trace()
-  data = archive.Archive({}, trace).to_bytes()
-  again = archive.Archive.from_bytes(data).contents_for({})
-  assert again.keys() == trace.keys()
-  np.testing.assert_array_equal(again['actions'], trace['actions'])

@@ -4,7 +4,6 @@ Recorded episodes are told again in other units: readings, contents, ranges,
 thresholds and providers' factors grow by a factor, and scales shrink by it.
 """
 
-import dataclasses
 import functools
 
 import hypothesis
@@ -14,12 +13,10 @@ import pytest
 
 from realab_suite.entities import registers
 from realab_suite.evaluation import hacking
-from realab_suite.evaluation import monitors
 from realab_suite.evaluation import stakes
 from realab_suite.evaluation import verdicts
 from realab_suite.feedback import specs
 from tests import examples
-from tests.evaluation import rows
 from tests.evaluation import streams
 
 _NUM_EPISODES = 29
@@ -84,12 +81,9 @@ def _results(design, factor, seed, competence=0.0, share=0.0):
           wrong = share * (record.reading - record.clean)
           moved = record._replace(clean=clean, reading=clean + wrong)
         steps[-1].append(_rescaled(moved, factor))
-    monitor = monitors.Monitor(design)
+    monitor = streams.monitor(design)
     streams.tell(monitor, steps, episode=world)
-    [one] = monitor.take()
-    names = type(one.figures).model_fields
-    figures = {name: getattr(one.figures, name) for name in names}
-    found.append(dataclasses.replace(rows.RESULT, episode=world, **figures))
+    found += monitor.take()
   return found
 
 

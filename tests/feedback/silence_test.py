@@ -183,7 +183,7 @@ def test_ledgers_and_monitors_of_a_batch_skip_silent_worlds():
       design=_design(),
   )  # fmt: skip
   ledger = ledgers.BatchLedger()
-  monitor = monitors.BatchMonitor(batch.mechanism.design, num_envs)
+  monitor = monitors.BatchMonitor(batch)
   batch.add_sink(ledger)
   batch.add_sink(monitor)
   for step in range(80):
@@ -193,18 +193,18 @@ def test_ledgers_and_monitors_of_a_batch_skip_silent_worlds():
   ended = monitor.take()
   batch.close()
   # From here on, the worlds act in different steps.
-  assert len({one.figures.num_steps for one in ended}) > 2
+  assert len({one.num_steps for one in ended}) > 2
   for one in ended:
     episode = ledger.episodes(one.world)[one.episode]
     notes = episode.entries['note']
     written = [e for e in notes if isinstance(e, registers.Write)]
-    assert 1 < len(written) < one.figures.num_steps / 1.2
+    assert 1 < len(written) < one.num_steps / 1.2
     by_difference = [e.step for e in notes if '[1]' in e[1]]
-    assert by_difference == list(range(1, one.figures.num_steps + 1, 3))
+    assert by_difference == list(range(1, one.num_steps + 1, 3))
     expected = streams.figures(episode, batch.mechanism.design)['registers']
-    for name, found in one.figures.registers.items():
+    for name, found in one.registers.items():
       assert found.model_dump() == pytest.approx(expected[name].model_dump())
-    assert one.figures.registers['note'].corruption > 0.01
+    assert one.registers['note'].corruption > 0.01
 
 
 @pytest.mark.parametrize('every', [1, 2, 4])

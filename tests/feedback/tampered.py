@@ -17,7 +17,7 @@ from realab_suite.feedback import providers
 from realab_suite.feedback.providers import base
 from realab_suite.policies import random_keys
 from tests.engine import helpers
-from tests.evaluation import disturbed
+from tests.evaluation import rooms
 
 HOSTS = ('single', 'batch', 'embedded', 'plain')
 NUM_ENVS = 3
@@ -167,7 +167,7 @@ class World:
 
   def __init__(self, host: str, design: Any, num_envs: int = NUM_ENVS) -> None:
     is_foreign = host in ('embedded', 'plain')
-    task = helpers.PointTask() if is_foreign else disturbed.Disturbed('none')
+    task = helpers.PointTask() if is_foreign else rooms.EmptyRoom()
     duration = task.control_timestep
     env: Any = (suite.plain_task if host == 'plain' else suite.embed)(
         task, design, random=7, max_steps=50,

@@ -107,7 +107,7 @@ def plant_in_learner(patch: pytest.MonkeyPatch) -> None:
 
   def note(self: Any) -> Any:
     episodes = take(self)
-    known.extend(one.figures.true_return for one in episodes)
+    known.extend(one.true_return for one in episodes)
     return episodes
 
   state = fake_learner.FakeLearner.state

@@ -226,7 +226,7 @@ def test_a_world_that_is_not_imported_is_named_before_any_work(
   def load(*unused, **unused_too):
     raise errors.UnknownNameError('task mine.own is unknown')
 
-  worlds._traits.cache_clear()
+  worlds._task.cache_clear()
   monkeypatch.setattr(suite, 'load', load)
   said = []
   with pytest.raises(

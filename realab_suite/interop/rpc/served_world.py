@@ -16,7 +16,7 @@ from realab_suite.engine import agent_view
 from realab_suite.engine import environment
 from realab_suite.engine import events
 from realab_suite.engine import seeding
-from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import monitors
 from realab_suite.evaluation import results
 from realab_suite.interop.rpc import refusals
 from realab_suite.interop.rpc import sockets
@@ -25,7 +25,7 @@ from realab_suite.interop.rpc import tensors
 WORLD = 'world'
 """Name of the world in requests; every server has exactly one world."""
 
-OnEpisode = Callable[[evaluate.EpisodeResult, str], None]
+OnEpisode = Callable[[monitors.EpisodeResult, str], None]
 
 _ROOT = 0
 _Reason = refusals.Reason
@@ -63,7 +63,8 @@ class ServedWorld:
     self._num_left = num_episodes
     self._on_episode = on_episode
     self._failures: list[Exception] = []
-    self._collector = evaluate.ResultCollector(env)
+    self._monitor = monitors.Monitor(env)
+    env.add_sink(self._monitor)
     self._isolation = results.SERVED
     self._view = agent_view.AgentView(env, self._failures)
     self._observations = tensors.Observations(self._view.observation_spec())
@@ -107,7 +108,7 @@ class ServedWorld:
     for failure in self._failures:
       logging.error('the episode failed', exc_info=failure)
     self._failures.clear()
-    for result in self._collector.take():
+    for result in self._monitor.take():
       self._num_left -= 1
       self._on_episode(result, self._isolation)
     return self._num_left > 0
