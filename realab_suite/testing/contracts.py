@@ -49,4 +49,6 @@ def require_same(
         and one.dtype == other.dtype
         and one.tobytes() == other.tobytes()
     )
-    require(is_same, f'{breach}: {name!r} is {one}; it was {other}')
+    require(
+        is_same, f'{breach}: {name!r} is {one!s:.200}; it was {other!s:.200}'
+    )

@@ -1,5 +1,6 @@
 """Contract of registers: what every kind of register promises."""
 
+import itertools
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -370,7 +371,7 @@ def _check_footprint(subject: _Subject) -> None:
   where = subject.where
   subject.world.restart()
   paths = register.footprint(physics)
-  for value in np.linspace(*register.value_range, _NUM_VALUES):
+  for value in _values_everywhere(register):
     register.pose(physics, value)
     for i, block in enumerate(register.blocks):
       place = np.array(block.position(physics))
@@ -381,8 +382,20 @@ def _check_footprint(subject: _Subject) -> None:
       contracts.require(
           nearest <= _ROUNDING,
           f'{where}: {value} puts block {i} {nearest} m beside the paths of its'
+          ' footprint; if a block depends on more than one port, override'
           ' footprint',
       )
+
+
+def _values_everywhere(register: registers.Register) -> list[Any]:
+  """Returns values from the whole range, with ports also unequal ones."""
+  low, high = register.value_range
+  values: list[Any] = [*np.linspace(low, high, _NUM_VALUES)]
+  if shape := register.value_spec.shape:
+    ends = itertools.islice(itertools.product((low, high), repeat=shape[0]), 64)
+    values += [np.array(one) for one in ends]
+    values += [*np.random.default_rng(0).uniform(low, high, (32, *shape))]
+  return values
 
 
 def _distance(place: np.ndarray, path: Any) -> float:

@@ -76,7 +76,15 @@ def check_world(
         _check_rewards(env, alone[0])
         _check_continuations(env, alone[0], plans[0])
   with contextlib.closing(load(steps)) as env:
-    _check_batch(env, alone, np.stack(plans, axis=1)[:steps])
+    try:
+      _check_batch(env, alone, np.stack(plans, axis=1)[:steps])
+    except ValueError as error:
+      contracts.require(
+          'truth value' not in str(error),
+          f'{type(env.task).__name__}: {error}: in a batch, numbers are arrays'
+          ' with an axis of worlds; use np.where instead of if',
+      )
+      raise
 
 
 @final
@@ -152,8 +160,13 @@ def _figures(
   figures = {}
   for kind in ('facts', 'measurements'):
     for key, function in getattr(task, kind).items():
-      value = np.array(function(physics))
       name = f'{kind}[{key!r}]'
+      contracts.require(
+          callable(function),
+          f'{type(task).__name__}.{name} is {function!r:.80}; it has to be a'
+          ' function of the physics',
+      )
+      value = np.array(function(physics))
       contracts.require(
           value.shape == shape and np.all(np.isfinite(value)),
           f'{type(task).__name__}.{name} returned {value!r:.80}; it has to'
@@ -256,7 +269,7 @@ def _check_continuations(
   env.rewind(1)
   breach = (
       f'{name}: an episode depends on earlier ones; keep what it changes in'
-      ' the physics, for example in a state.Slot'
+      ' the physics, for example in a state.Slot, and draw from random_state'
   )
   _compare([*_moments(env, ledger, env.reset(), actions)], episodes[1], breach)
   env.rewind(0)
@@ -276,7 +289,8 @@ def _check_continuations(
       found,
       episodes[0][half + 1 :],
       f'{name}: a restored snapshot continues differently; keep what an'
-      ' episode changes in the physics, for example in a state.Slot',
+      ' episode changes in the physics, for example in a state.Slot, and draw'
+      ' from random_state',
   )
   env.remove_sink(ledger)
 

@@ -151,6 +151,38 @@ def test_blocks_that_push_each_other_are_noticed():
     testing.check_register(_Crowded)
 
 
+class _Rod(registers.Register):
+  """Has beads that depend on both of its ports, and no footprint."""
+
+  PORTS = 'middle', 'gap'
+
+  def _build_blocks(self):
+    return [
+        self._add_block(name, 'offset_block', (0.0, y))
+        for name, y in (('left', 0.0), ('right', 0.25))
+    ]
+
+  def _places(self, physics, value):
+    places = []
+    for y, sign in ((0.0, -1.0), (0.25, 1.0)):
+      place = np.array(self._origin(physics))
+      along = value[..., 0] + sign * value[..., 1] / 2
+      places.append(place + self._scale * along * np.eye(3)[0])
+      places[-1][..., 1] += y
+    return places
+
+  def _read_blocks(self, physics):
+    start = self._origin(physics)[..., 0]
+    left, right = (block.along(physics) - start for block in self._blocks)
+    both = [(left + right) / 2, right - left]
+    return np.stack(both, axis=-1) / self._scale
+
+
+def test_a_footprint_that_no_port_alone_reaches_is_noticed():
+  with pytest.raises(testing.ContractError, match='more than one port'):
+    testing.check_register(_Rod)
+
+
 def test_positions_are_relative_to_the_start():
   def reads_anywhere(self, physics):
     return self._blocks[0].along(physics) / self._scale

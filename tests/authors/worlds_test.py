@@ -91,6 +91,11 @@ def _starts_later(self: Any, physics: Any, random_state: Any) -> None:
   self.avatar.place(physics, np.array([0.01 * self.count, 0.0]), 0.0)
 
 
+def _branches(self: Any, physics: Any, random_state: Any) -> None:
+  if self.score(physics) < 1:
+    self.earn(physics, 1.0)
+
+
 def _counts_once(self: Any, physics: Any, random_state: Any) -> None:
   # The same for every world: forgets the leading axis.
   self.earn(physics, np.sum(self.avatar.position(physics)))
@@ -148,6 +153,12 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'a fact of many numbers': (
         {'facts': {'two': lambda unused_physics: np.zeros(2)}},
         "facts['two'] returned",
+    ),
+    'a fact that is no function': (
+        {'facts': {'three': 3}}, "facts['three'] is 3",
+    ),
+    'a branch on an array': (
+        {'after_step': _branches}, 'use np.where instead of if',
     ),
     'a measurement of one world': (
         {'measurements': property(_sum_of_positions)},
