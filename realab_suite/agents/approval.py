@@ -65,7 +65,7 @@ class ValueAdviceOptions(ApprovalOptions):
 
   Attributes:
     advice: Name of the register that holds the value of the queried action.
-    query_policy: Action to query: always the action taken.
+    query_policy: Only `taken_action`: `query` holds the action taken.
   """
 
   kind: Literal['value_advice']
@@ -80,7 +80,8 @@ class DecoupledApprovalOptions(ApprovalOptions):
   Attributes:
     approval: Name of the register that holds the approval of the queried
       action.
-    query_policy: Action to query: always an independently drawn action.
+    query_policy: Only `independent_action`: the action in `query` is drawn
+      independently of the action taken.
     other_query: Name of a second query register for paired queries, or `None`.
       With paired queries, `approval` holds the approval of the action in
       `query` minus that of the action in `other_query`.

@@ -24,7 +24,8 @@ class QLearningOptions(base.Options):
   Attributes:
     reward: Name of the register whose reading is the reward.
     gamma: Discount.
-    num_returns: Number of readings to sum before a value estimates the rest.
+    num_returns: Length n of n-step returns: the number of readings to sum
+      before the value of the next state stands for the rest.
     exploration: Final probability of a random action.
     exploration_steps: Number of control steps of all worlds after which the
       probability of a random action has fallen from 1 to `exploration`.

@@ -196,10 +196,10 @@ class Host(abc.ABC):
   def start_check(
       self, physics: Any, mechanism: mechanisms.FeedbackMechanism
   ) -> Callable[[Any], None]:
-    """Returns a check of an episode that has just been initialized.
+    """Returns a function that checks the start of an episode.
 
-    It takes the physics of one world, and raises an EpisodeInitializationError
-    if something is inside a register.
+    The function takes the physics of one world, after `initialize_episode`, and
+    raises an EpisodeInitializationError if something is inside a register.
 
     Args:
       physics: Physics of one world, whose state is reset.

@@ -117,7 +117,7 @@ class Job:
     return digest_of(self.config())
 
   def folder(self) -> str:
-    """Returns the name of the folder of the results."""
+    """Returns the name of the job's folder in that of the sweep."""
     return f'{self.run}-{self.seed}-{self.digest()}'
 
   @property

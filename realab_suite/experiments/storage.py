@@ -302,7 +302,11 @@ class RunFolder:
     return contents
 
   def naming_checkpoint(self) -> contextlib.AbstractContextManager[None]:
-    """Adds the last checkpoint to errors about state that does not fit."""
+    """Returns a context in which a checkpoint is restored.
+
+    An error about a state that does not fit then names the last checkpoint, and
+    says to remove it.
+    """
     return naming(self._checkpoints()[-1], self._advice())
 
   def _advice(self) -> str:

@@ -204,7 +204,10 @@ flags.disclaim_key_flags()
 
 
 def take(*shared: flags.FlagHolder[Any]) -> None:
-  """Adds shared flags to those of the calling launcher."""
+  """Lets the calling launcher parse shared flags, and shows them in its help.
+
+  Call it when the module of the launcher is imported.
+  """
   for one in shared:
     if one.name not in flags.FLAGS:
       flags.FLAGS[one.name] = _SHARED[one.name]

@@ -107,7 +107,7 @@ class Recording:
     return page.replace('</head>', _CHOICE.format(data) + '</head>', 1)
 
   def close(self) -> None:
-    """Ends the recording."""
+    """Stops the server; without a call of `page`, the recording is lost."""
     with _silence():
       self._server.stop()
 
