@@ -241,3 +241,12 @@ def test_another_objective_has_to_fit_the_design(objective, message):
   made = objectives.ObjectiveSpec.model_validate(objective)
   with pytest.raises(errors.SpecError, match=message):
     streams.monitor(specs.load(designs.SCORED), made)
+
+
+def test_registers_that_decide_nothing_about_the_objective_are_not_relevant():
+  beside = {'kind': 'constant', 'writes': ['beside'], 'value': 1.0}
+  spare = {'kind': 'two_block', 'role': 'memory', 'place': 'station_3'}
+  data = specs.load('instantaneous_reward').to_mapping()
+  data['registers']['beside'] = {**spare, 'range': [0, 2]}
+  data['providers'] = [*data['providers'], beside]
+  assert gains.relevant(specs.load(data)) == ('reward', 'score')

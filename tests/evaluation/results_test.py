@@ -274,3 +274,10 @@ def test_a_row_that_is_nested_too_deeply_is_refused(tmp_path):
   path.write_bytes(results.sealed(b'{"a":' + b'[' * 100_000 + b'}'))
   with pytest.raises(errors.ResultsError, match='nested too deeply'):
     list(results.read_rows(path))
+
+
+def test_a_last_row_without_its_newline_is_whole(tmp_path):
+  path = tmp_path / 'episodes.jsonl'
+  _write(path, _row(), _row(episode=6))
+  path.write_bytes(path.read_bytes().rstrip(b'\n'))
+  assert len([*results.read_rows(path)]) == 2

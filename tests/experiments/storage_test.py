@@ -153,3 +153,10 @@ def test_json_that_is_nested_too_deeply_is_refused(tmp_path):
   path.write_text('[' * 100_000)
   with pytest.raises(errors.ResultsError, match=r'deep\.json: not JSON'):
     storage.read_json(path)
+
+
+def test_a_folder_with_results_is_never_used_again(tmp_path):
+  assert storage.new_folder(str(tmp_path / 'new')).is_dir()
+  (tmp_path / 'new' / 'row').touch()
+  with pytest.raises(errors.ResultsError, match='never overwritten; name anot'):
+    storage.new_folder(str(tmp_path / 'new'))
