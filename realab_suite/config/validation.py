@@ -4,7 +4,9 @@ The module contains the base class of specs, but no spec.
 """
 
 import abc
+import bisect
 from collections.abc import Collection, Mapping, Sequence
+import functools
 import hashlib
 import json
 import re
@@ -110,7 +112,7 @@ def validate(
     data: Result of `loading.read_mapping`.
     where: Name of the data in error messages.
     overrides: Overrides of the data; see `loading.apply_overrides`. If one of
-      them makes the data invalid, the message names it in place of the data.
+      them makes valid data invalid, the message names it in place of the data.
     is_confined: True if paths must be within the working directory.
     are_overrides_free: True if paths that overrides name are exempt from that.
 
@@ -123,23 +125,32 @@ def validate(
     if are_overrides_free:
       free = loading.texts_in_overrides(overrides)
 
-  def judged(used: Sequence[str]) -> tuple[_Model | None, list[str]]:
-    """Returns the model of the data with some overrides, or its problems."""
+  @functools.cache
+  def judged(count: int) -> tuple[_Model | None, list[str]]:
+    """Returns the model with the first `count` overrides, or its problems."""
+    used = overrides[:count]
     changed = loading.apply_overrides(data, used) if used else data
     try:
       return model_class.model_validate(changed, context=free), []
     except pydantic.ValidationError as error:
       return None, _problems(error, changed)
 
-  model, problems = judged(overrides)
+  def is_worse(count: int) -> bool:
+    """Returns True if the data has problems that overrides add."""
+    return not set(judged(count)[1]) <= set(judged(0)[1])
+
+  model, _ = judged(len(overrides))
   if model is not None:
     return model
-  for count in reversed(range(len(overrides))):
-    earlier, earlier_problems = judged(overrides[:count])
-    if earlier is not None:
-      where = loading.override_name(overrides[count])
-      break
-    problems = earlier_problems
+  # A file may have many overrides, so not every number of them is tried.
+  count = 0
+  if is_worse(len(overrides)):
+    count = bisect.bisect(range(len(overrides)), False, lo=1, key=is_worse)
+    if judged(count - 1)[0] is None:
+      count = 0  # The data is wrong without the override, too.
+  if count:
+    where = loading.override_name(overrides[count - 1])
+  problems = judged(count)[1]
   told = problems[:_MAX_TOLD]
   if len(problems) > _MAX_TOLD:
     told.append(f'and {len(problems) - _MAX_TOLD} more')

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from realab_suite import suite
+from realab_suite.config import loading
 from realab_suite.experiments import experiment_specs
 from realab_suite.feedback import specs
 from tests.config import refusals
@@ -124,6 +125,25 @@ def test_the_first_of_several_wrong_overrides_is_named():
   overrides = ('name=e', 'dof=fixed', 'channel=loose')
   text = _refusal(_DESIGN, *overrides)
   assert text.startswith("override 'dof=fixed': dof: must be 'free' or")
+
+
+def test_few_of_many_overrides_are_judged_to_find_the_wrong_one(monkeypatch):
+  applied = []
+  apply = loading.apply_overrides
+
+  def counted(data, overrides):
+    applied.append(len(overrides))
+    return apply(data, overrides)
+
+  monkeypatch.setattr(loading, 'apply_overrides', counted)
+  right = ['dof=planar'] * 255
+  for position in (0, 100, 255):
+    overrides = [*right[:position], 'dof=loose', 'bad=1', *right[position:]]
+    text = _refusal(_DESIGN, *overrides)
+    assert text.startswith("override 'dof=loose': dof: must be")
+    wrong = _changed(dof='fixed', action_set='none')
+    assert _refusal(wrong, *overrides).startswith('design: dof: must be')
+  assert len(applied) <= 6 * 10
 
 
 def test_a_long_list_of_problems_is_cut():
