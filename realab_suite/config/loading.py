@@ -45,6 +45,8 @@ _INT = re.compile(r'[-+]?(0|[1-9][0-9]*)')
 _FLOAT = re.compile(
     r'[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?'
 )
+# They are numbers of YAML, so that a message names their keys.
+_NOT_FINITE = re.compile(r'[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)')
 # Words that are often meant as booleans, and octal numbers of YAML 1.2.
 _AMBIGUOUS = re.compile(r'(?i:yes|no|on|off)|[-+]?0[oO][0-7]+')
 # Paths that other programs or systems resolve outside of a directory.
@@ -304,6 +306,8 @@ def _resolved(event: yaml.ScalarEvent) -> bool | int | float | str | None:
     return int(text[:100])
   if _FLOAT.fullmatch(text):
     return float(text)
+  if _NOT_FINITE.fullmatch(text):
+    return float(text.replace('.', ''))
   tag = _YAML_1_1.resolve(yaml.ScalarNode, text, (True, False))
   if tag != _TEXT_TAG or _AMBIGUOUS.fullmatch(text):
     raise _refusal(
