@@ -159,6 +159,21 @@ def test_a_committed_sweep_of_an_earlier_version_is_unpacked(tmp_path):
   assert run.training_episodes()
 
 
+def test_a_folder_that_an_earlier_version_unpacked_is_refused(packed, tmp_path):
+  output = tmp_path / 'sweep'
+  packing.unpack(packed, output)
+  job = output / _job('reward', 0).folder()
+  (job / 'left_out.json').write_text('{}')
+  problem = rf'^{job}: unpacked by version 0\.2 .* again into a new folder$'
+  for use in (
+      lambda: sweep_results.load(output),
+      lambda: packing.pack(output, tmp_path / 'again.zip'),
+      lambda: packing.unpack(packed, output),
+  ):
+    with pytest.raises(errors.ResultsError, match=problem):
+      use()
+
+
 def test_equal_training_episodes_are_counted():
   def record(step, *values, is_ended=False):
     return {
