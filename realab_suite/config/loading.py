@@ -35,6 +35,8 @@ _MAX_INT = 2**53
 # Categories of Unicode: control, format (which includes bidirectional marks and
 # the byte order mark), surrogate, line separator and paragraph separator.
 _FORBIDDEN_CATEGORIES = frozenset({'Cc', 'Cf', 'Cs', 'Zl', 'Zp'})
+# Not characters of YAML.
+_NONCHARACTERS = '\ufffe\uffff'
 
 _WORDS = {
     **dict.fromkeys(('', '~', 'null', 'Null', 'NULL')),
@@ -231,9 +233,12 @@ def _documents(text: str | bytes, where: str) -> list[Any]:
   """Returns the value of each document in a YAML text; there may be none."""
   location = messages.Location(where)
   try:
-    content = text.encode() if isinstance(text, str) else text
+    content = text
+    if isinstance(content, str):
+      # Surrogates are refused below, with their line.
+      content = content.encode(errors='surrogatepass')
     _check_size(len(content), _MAX_BYTES, location)
-    text = content.decode().replace('\r\n', '\n')
+    text = _decoded(content, where).replace('\r\n', '\n')
     for number, line in enumerate(text.split('\n'), 1):
       if not line.isprintable() and (problem := _forbidden_character(line)):
         raise messages.Location(where, line=number).error(problem)
@@ -247,9 +252,19 @@ def _documents(text: str | bytes, where: str) -> list[Any]:
     mark = error.problem_mark
     at = messages.Location(where, line=None if mark is None else mark.line + 1)
     raise at.error(str(error.problem)) from None
-  # A text or a tag may contain bytes that are not UTF-8.
+  # A tag may contain bytes that are not UTF-8.
   except (yaml.YAMLError, UnicodeError) as error:
-    raise location.error(f'not YAML in UTF-8: {error}') from None
+    raise location.error(f'not YAML: {error}') from None
+
+
+def _decoded(content: bytes, where: str) -> str:
+  try:
+    return content.decode(errors='surrogatepass')
+  except UnicodeDecodeError as error:
+    line = content.count(b'\n', 0, error.start) + 1
+    raise messages.Location(where, line=line).error(
+        f'not UTF-8 text: {error.reason}'
+    ) from None
 
 
 def _value(events: Iterator[Any], event: Any, depth: int = 0) -> Any:
@@ -278,12 +293,16 @@ def _value(events: Iterator[Any], event: Any, depth: int = 0) -> Any:
       values.append(_value(events, event, depth + 1))
     return values
   mapping: dict[str, Any] = {}
+  lines: dict[str, int] = {}
   while not isinstance(event := next(events), yaml.MappingEndEvent):
     key = _value(events, event, depth + 1)
     if not isinstance(key, str):
       raise _refusal(event, _wrong_key(key))
+    line = event.start_mark.line + 1
     if key in mapping:
-      raise _refusal(event, f'duplicate key {messages.quote(key)}')
+      both = f'lines {lines[key]} and {line}'
+      raise _refusal(event, f'duplicate key {messages.quote(key)} ({both})')
+    lines[key] = line
     mapping[key] = _value(events, next(events), depth + 1)
   return mapping
 
@@ -377,6 +396,7 @@ def _forbidden_character(text: str) -> str:
     if character == '\t':
       return 'tab is not allowed (use spaces)'
     category = unicodedata.category(character)
-    if character != '\n' and category in _FORBIDDEN_CATEGORIES:
+    is_forbidden = category in _FORBIDDEN_CATEGORIES and character != '\n'
+    if is_forbidden or character in _NONCHARACTERS:
       return f'character U+{ord(character):04X} is not allowed'
   return ''
