@@ -197,7 +197,9 @@ def _read(path: pathlib.Path) -> dict[str, bytes]:
       problem = 'is not the name of a file of a sweep'
     elif name not in files:
       problem = 'is missing'
-    elif _digest(files[name]) != digests.get(name):
+    elif name not in digests:
+      problem = f'is not in {MANIFEST!r}'
+    elif _digest(files[name]) != digests[name]:
       problem = 'changed since the sweep was packed'
     if problem:
       raise errors.ResultsError(f'{path}: {name!r:.80} {problem}')

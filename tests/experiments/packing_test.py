@@ -286,7 +286,7 @@ def _forged(packed: pathlib.Path, path: pathlib.Path, how: str) -> None:
     ('how', 'problem'),
     [
         ('parent', "'../x' is not the name of"),
-        ('unlisted', "'x' changed since the sweep was packed"),
+        ('unlisted', "'x' is not in 'manifest.json'"),
         ('missing', "episodes.jsonl' is missing"),
         ('no done', 'done.json: No such file'),
         ('changed', "episodes.jsonl' changed since the sweep was packed"),
