@@ -14,6 +14,7 @@ import pytest
 from realab_suite.evaluation import results
 from realab_suite.experiments import served_evaluation
 from realab_suite.interop.rpc import agent_process
+from realab_suite.interop.rpc import agent_server
 from realab_suite.interop.rpc import sockets
 from realab_suite.launchers import serve
 from tests import patience
@@ -183,15 +184,63 @@ def test_an_agent_that_ignores_sigterm_is_killed(tmp_path, monkeypatch):
   assert agent.poll() == -signal.SIGKILL
 
 
-def test_a_terminated_server_writes_its_results(tmp_path):
+@pytest.mark.parametrize(
+    ('number', 'status', 'error'),
+    [
+        (signal.SIGTERM, 2, 'error: stopped after 1 of 2 episodes'),
+        (
+            signal.SIGINT,
+            130,
+            'error: interrupted; results up to this point are on disk',
+        ),
+    ],
+)
+def test_a_stopped_server_writes_its_results_and_one_line(
+    tmp_path, number, status, error
+):
   with served.in_process(
       tmp_path / 'results', '--max_steps=20', '--design=none'
   ) as program:
     with served.Client(program.address) as client:
       client.join()
       client.step()
-      program.process.send_signal(signal.SIGTERM)
-      assert program.process.wait(patience.SECONDS) == 2
+      program.process.send_signal(number)
+      said = program.process.stderr.read().splitlines()
+      assert program.process.wait(patience.SECONDS) == status
+  assert 'the agent may run as the same user' in said[0]
+  assert said[1:] == [error]
   [row] = results.read_rows(tmp_path / 'results' / 'episodes.jsonl')
   assert row.end == 'disconnect'
   assert not pathlib.Path(sockets.path_of(program.address)).exists()
+
+
+def test_an_interrupt_waits_for_the_answer_to_a_request(tmp_path, caplog):
+  is_interrupted = []
+
+  class World:
+    """A world that Ctrl-C interrupts in the middle of an answer."""
+
+    def connect(self):
+      pass
+
+    def answer(self, request):
+      signal.raise_signal(signal.SIGINT)
+      is_interrupted.append(False)
+      return request
+
+    def settle(self):
+      return True
+
+    disconnect = connect
+
+  path = tmp_path / 'folder'
+  path.mkdir(mode=0o700)
+  server = agent_server.Server(World(), f'unix:{path / "socket"}')
+  server.start()
+  stream = served.RawStream(server.address)
+  stream.tell(served.JOIN)
+  with pytest.raises(KeyboardInterrupt):
+    server.run()
+  stream.close()
+  assert is_interrupted == [False]
+  assert not caplog.records

@@ -5,9 +5,11 @@ callbacks, the world. No other thread accesses the world.
 """
 
 import asyncio
+from collections.abc import Iterator
 import contextlib
 import os
 import signal
+import threading
 from typing import Any, final
 
 from absl import logging
@@ -24,6 +26,8 @@ IDLE_SECONDS = 60.0
 _SERVICE, _METHOD = 'dm_env_rpc.v1.Environment', 'Process'
 # Time for an agent to read the last answer.
 _LINGER_SECONDS = 5.0
+# Time for the tasks of gRPC to end; they need a few milliseconds.
+_END_SECONDS = 2.0
 _MAX_STREAMS = 16
 _HANDSHAKE_MS = 800
 _MAX_HEADER_BYTES = 8 << 10
@@ -110,6 +114,7 @@ class Server:
 
     Raises:
       ForkError: If the process was forked after the server was made.
+      KeyboardInterrupt: After Ctrl-C, between two requests.
     """
     if os.getpid() != self._pid:
       raise errors.ForkError(
@@ -117,7 +122,8 @@ class Server:
           ' run'
       )
     try:
-      self._loop.run_until_complete(self._end)
+      with self._ended_by_interrupts():
+        self._loop.run_until_complete(self._end)
     finally:
       self.close()
 
@@ -129,9 +135,37 @@ class Server:
   def close(self) -> None:
     """Stops the server; `run` calls this last."""
     if not self._loop.is_closed():
-      self._loop.run_until_complete(self._server.stop(grace=None))
+      self._loop.run_until_complete(self._stop())
       self._loop.close()
       sockets.remove(self._given_address)
+
+  @contextlib.contextmanager
+  def _ended_by_interrupts(self) -> Iterator[None]:
+    """Makes Ctrl-C end `run` between two requests, and a second one at once.
+
+    An exception in the middle of a request would write tracebacks.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or handler is not signal.default_int_handler:
+      yield
+      return
+
+    is_interrupted = False
+
+    def on_interrupt(*unused: Any) -> None:
+      nonlocal is_interrupted
+      is_interrupted = True
+      signal.signal(signal.SIGINT, handler)
+      self.stop()
+
+    signal.signal(signal.SIGINT, on_interrupt)
+    try:
+      yield
+    finally:
+      signal.signal(signal.SIGINT, handler)
+    if is_interrupted:
+      raise KeyboardInterrupt
 
   async def _listen(self) -> None:
     server = aio.server(
@@ -156,6 +190,20 @@ class Server:
       self._address = f'{host}:{number}'
     await server.start()
     self._server = server
+
+  async def _stop(self) -> None:
+    """Stops gRPC's server, and ends its tasks.
+
+    Tasks that are pending when a loop closes write tracebacks.
+    """
+    await self._server.stop(grace=None)
+    pending = asyncio.all_tasks() - {asyncio.current_task()}
+    if pending:
+      _, pending = await asyncio.wait(pending, timeout=_END_SECONDS)
+    for task in pending:
+      task.cancel()
+    if pending:
+      await asyncio.wait(pending, timeout=_END_SECONDS)
 
   async def _process(self, unused_requests: Any, context: Any) -> None:
     """Serves a connection from its first request to its end."""
