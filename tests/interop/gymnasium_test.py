@@ -183,8 +183,12 @@ def test_actions_of_another_shape_or_type_are_refused(action):
     ('options', 'message'),
     [
         ({'reward_register': 'score'}, r"allowed are None .*\['reward'\]"),
+        ({'dtype': np.floating}, "got 'floating'"),
         ({'dtype': 'float16'}, "must be 'float32' or 'float64'"),
-        ({'render_mode': 'human'}, 'rgb_array'),
+        ({'reward_register': 3}, r"3; allowed are None .*\['reward'\]"),
+        ({'render_mode': 'human'}, "must be 'rgb_array' or None"),
+        ({'flat': 'yes'}, "flat: must be .*'yes'"),
+        ({'height': 1.5}, r'height: must be .*1\.5'),
         ({'camera_name': 'nowhere'}, 'camera'),
         ({'colour': 'red'}, "unknown key 'colour'"),
     ],
@@ -192,6 +196,54 @@ def test_actions_of_another_shape_or_type_are_refused(action):
 def test_wrong_options_are_refused(options, message):
   with pytest.raises(errors.SpecError, match=message):
     registration.make('unlock_door', 'near', 'instantaneous_reward', **options)
+
+
+@pytest.mark.parametrize('flat', [1, np.bool_(True)])
+@pytest.mark.parametrize('dtype', [np.dtype('float64'), np.float64])
+def test_options_may_be_values_of_numpy(flat, dtype):
+  env = _make(flat=flat, dtype=dtype, height=np.int64(32), width=np.int32(48))
+  assert isinstance(env.observation_space, gym.spaces.Box)
+  assert env.observation_space.dtype == np.float64
+  assert env._interface.frame[1:] == (32, 48)
+
+
+@pytest.mark.parametrize(
+    ('option', 'hint'),
+    [
+        ('overides', 'overrides'),
+        ('task_kwarg', 'task_kwargs'),
+        ('heigth', 'height'),
+        ('num_thread', 'num_threads'),
+        ('autoreset', 'autoreset_mode'),
+    ],
+)
+def test_a_wrong_option_is_told_all_options(option, hint):
+  of_batches = ('num_threads', 'sleep', 'autoreset_mode')
+  for make, options in ((gym.make, {}), (gym.make_vec, {'num_envs': 2})):
+    with pytest.raises(errors.SpecError, match=f"key '{option}'") as raised:
+      make(_NEAR, **options, **{option: 2})
+    hinted, listed = str(raised.value).split('(allowed: ')
+    allowed = listed.rstrip(')').split(', ')
+    assert {
+        'design', 'overrides', 'task_kwargs', 'environment_kwargs', 'flat',
+        'reward_register',
+    } < set(allowed)  # fmt: skip
+    is_batch = make is gym.make_vec
+    assert [name in allowed for name in of_batches] == [is_batch] * 3
+    if hint in allowed:
+      assert f'did you mean {hint!r}?' in hinted
+
+
+@pytest.mark.parametrize(
+    'option',
+    [{'num_envs': 2}, {'num_threads': 2}, {'autoreset_mode': 'SameStep'}],
+)
+def test_options_of_batches_point_single_worlds_to_make_vec(option):
+  [name] = option
+  with pytest.raises(
+      errors.SpecError, match=rf'^{name}: .*gymnasium\.make_vec'
+  ):
+    gym.make(_NEAR, **option)
 
 
 @pytest.mark.parametrize(

@@ -196,7 +196,7 @@ class ActionCodec:
 
 
 def reward_key(
-    reward_register: str | None, observation_spec: Mapping[str, specs.Array]
+    reward_register: Any, observation_spec: Mapping[str, specs.Array]
 ) -> str | None:
   """Returns the entry of the observation that is the reward, or `None`.
 
@@ -215,7 +215,7 @@ def reward_key(
       for name in observation_spec
       if name.startswith(prefix)
   ]
-  if reward_register not in readable:
+  if not isinstance(reward_register, str) or reward_register not in readable:
     raise errors.SpecError(
         f'reward_register: {messages.quote(reward_register)}; allowed are None'
         f' and the registers that the agent reads: {readable}'

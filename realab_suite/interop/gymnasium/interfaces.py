@@ -1,10 +1,13 @@
 """Spaces, conversions and pictures: what one world and a batch share."""
 
 from collections.abc import Mapping
-from typing import Any, Literal, final
+from typing import Annotated, Any, Literal, final
 
 from dm_control import composer
+import numpy as np
+import pydantic
 
+from realab_suite.config import integers
 from realab_suite.config import validation
 from realab_suite.engine import agent_view
 from realab_suite.engine import arguments
@@ -13,6 +16,30 @@ from realab_suite.interop.gymnasium import codecs
 _DEFAULT = 'top_down'
 # MuJoCo's free camera.
 _FREE = -1
+
+
+def _integer(given: Any) -> Any:
+  """Returns an integer of NumPy as one of Python."""
+  return int(given) if integers.is_integer(given) else given
+
+
+def _flag(given: Any) -> Any:
+  """Returns 0, 1 and Booleans of NumPy as Booleans of Python."""
+  is_number = integers.is_integer(given) and given in (0, 1)
+  return bool(given) if is_number or isinstance(given, np.bool_) else given
+
+
+def _dtype_name(given: Any) -> Any:
+  """Returns the name of a type of NumPy, such as `np.dtype('float64')`."""
+  if isinstance(given, np.dtype):
+    return given.name
+  is_scalar = isinstance(given, type) and issubclass(given, np.generic)
+  return given.__name__ if is_scalar else given
+
+
+_Integer = Annotated[int, pydantic.BeforeValidator(_integer)]
+_Flag = Annotated[bool, pydantic.BeforeValidator(_flag)]
+_DType = Annotated[codecs.DType, pydantic.BeforeValidator(_dtype_name)]
 
 
 @final
@@ -31,13 +58,15 @@ class Options(validation.Model):
     width: Width of a frame, in pixels.
   """
 
-  reward_register: str | None = None
-  dtype: codecs.DType = 'float32'
-  flat: bool = False
-  render_mode: Literal['rgb_array'] | None = None
+  # `codecs.reward_key` knows which registers there are.
+  reward_register: Any = None
+  dtype: _DType = 'float32'
+  flat: _Flag = False
+  # Not `| None`, which the error message would leave out.
+  render_mode: Literal['rgb_array', None] = None
   camera_name: str | None = None
-  height: int = 240
-  width: int = 320
+  height: _Integer = 240
+  width: _Integer = 320
 
 
 @final

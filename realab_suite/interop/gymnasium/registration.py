@@ -1,64 +1,87 @@
 """Ids of all shipped worlds in Gymnasium's registry."""
 
+from collections.abc import Callable
 import functools
 import inspect
 from typing import Any
 
 import gymnasium as gym
 
+from realab_suite import errors
 from realab_suite import suite
+from realab_suite.config import messages
+from realab_suite.config import validation
 from realab_suite.feedback import specs
+from realab_suite.interop.gymnasium import interfaces
 from realab_suite.interop.gymnasium import single
 from realab_suite.interop.gymnasium import vector
 
 NAMESPACE = 'realab'
 """Namespace of the ids."""
 
+# Options of batches alone.
+_OF_BATCHES = ('num_envs', 'num_threads', 'sleep', 'autoreset_mode')
+
 
 def make(
     domain_name: str,
     task_name: str,
     design: specs.Design | None = None,
-    num_envs: int | None = None,
     **options: Any,
 ) -> Any:
-  """Loads a world, or a batch: the entry points of the registered ids.
+  """Loads a world: the entry point of the registered ids.
 
   Args:
     domain_name: Name of the domain.
     task_name: Name of the variation.
     design: Design, by name, path or contents.
-    num_envs: Number of worlds, or `None` for a single one.
-    **options: Other arguments of `suite.load` or `suite.load_batch`, and
-      keyword arguments of the adapter.
+    **options: Other arguments of `suite.load`, and values of
+      `interfaces.Options`.
 
   Returns:
-    A `RealabEnv`, or a `RealabVectorEnv` with a number of worlds.
+    A `RealabEnv`.
 
   Raises:
     SpecError: If an argument is invalid.
   """
-  adapter: Any = single.RealabEnv
-  load: Any = suite.load
-  if num_envs is not None:
-    adapter = vector.RealabVectorEnv
-    load = functools.partial(suite.load_batch, num_envs=num_envs)
-  of_load = inspect.signature(load).parameters.keys() & options.keys()
-  loaded = load(
-      domain_name,
-      task_name,
-      design=design,
-      **{name: options.pop(name) for name in of_load},
+  for name in _OF_BATCHES:
+    if name in options:
+      raise errors.SpecError(
+          f'{name}: {messages.quote(options[name])}; allowed only in'
+          ' gymnasium.make_vec, which makes several worlds'
+      )
+  load = functools.partial(suite.load, domain_name, task_name)
+  return _adapted(load, single.RealabEnv, {'design': design, **options})
+
+
+def make_vector(
+    domain_name: str,
+    task_name: str,
+    design: specs.Design | None = None,
+    *,
+    num_envs: int,
+    **options: Any,
+) -> Any:
+  """Loads a batch of worlds: the vector entry point of the registered ids.
+
+  Args:
+    domain_name: Name of the domain.
+    task_name: Name of the variation.
+    design: Design, by name, path or contents.
+    num_envs: Number of worlds.
+    **options: Other arguments of `suite.load_batch`, `autoreset_mode`, and
+      values of `interfaces.Options`.
+
+  Returns:
+    A `RealabVectorEnv`.
+
+  Raises:
+    SpecError: If an argument is invalid.
+  """
+  load = functools.partial(
+      suite.load_batch, domain_name, task_name, num_envs=num_envs
   )
-  try:
-    return adapter(loaded, **options)
-  except BaseException:
-    loaded.close()
-    raise
-
-
-make_vector = make
-"""Vector entry point: `gymnasium.make_vec` adds `num_envs`."""
+  return _adapted(load, vector.RealabVectorEnv, {'design': design, **options})
 
 
 def id_of(domain_name: str, task_name: str, design: str) -> str:
@@ -105,6 +128,34 @@ def register_all() -> None:
               'design': design,
           },
       )
+
+
+def _adapted(
+    load: Callable[..., Any], adapter: Any, options: dict[str, Any]
+) -> Any:
+  """Returns the adapter of what a loader loads.
+
+  Raises:
+    SpecError: If an option is invalid.
+  """
+  of_load = inspect.signature(load).parameters
+  rest = {key: options[key] for key in options if key not in of_load}
+  allowed = [
+      # One has a single allowed value, and the other is set already.
+      *(key for key in of_load if key not in ('visualize_reward', 'num_envs')),
+      *(['autoreset_mode'] if adapter is vector.RealabVectorEnv else []),
+      *interfaces.Options.model_fields,
+  ]
+  try:
+    validation.check_keys(rest, allowed)
+  except ValueError as error:
+    raise messages.Location('options').error(str(error)) from error
+  loaded = load(**{key: options[key] for key in options if key in of_load})
+  try:
+    return adapter(loaded, **rest)
+  except BaseException:
+    loaded.close()
+    raise
 
 
 @functools.cache
