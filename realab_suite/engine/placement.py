@@ -147,7 +147,7 @@ def _obstacles(
       for solid in space.solids_of(physics, part.mjcf_model)
   }
   for solid in space.solids(physics, mask):
-    yield solid.along(ways.get(solid.geom, np.zeros(3)))
+    yield solid._replace(way=ways.get(solid.geom, np.zeros(3)))
 
 
 def _check_extent(

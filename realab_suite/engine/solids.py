@@ -1,8 +1,9 @@
 """Solids: what the poses of a block fill, and their distances to geoms.
 
 All poses of a cube that moves along a line, anywhere in a region, fill an
-oriented box, and so do all places of an object that moves along a line. MuJoCo
-measures the distance of the box to each geom.
+oriented box. MuJoCo measures the distance of the box to each geom. A geom that
+moves along a line is measured at so many places that it cannot meet the box
+between them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,6 +20,8 @@ from realab_suite.entities import registers
 
 # Depth up to which solids may overlap, in m.
 TOLERANCE = 1e-3
+# Smallest distance by which solids that move must keep from this depth, in m.
+_SLACK = 1e-4
 # Largest height of a block above the surface that carries it, in m. It exceeds
 # the gap under a planar block.
 GAP = 0.01
@@ -43,6 +46,7 @@ class Solid(NamedTuple):
     matrix: Its axes, as columns, `(3, 3)`.
     half: Half the edge lengths of a box around it, `(3,)`, in m.
     is_box: True if the box takes the place of the geom.
+    way: Displacement of the solid to the other end of its way, `(3,)`, in m.
   """
 
   geom: int
@@ -50,23 +54,18 @@ class Solid(NamedTuple):
   matrix: np.ndarray
   half: np.ndarray
   is_box: bool = False
+  way: np.ndarray = np.zeros(3)
 
   @property
   def bounds(self) -> np.ndarray:
     """Low and high corner of its bounds in the world, `(2, 3)`, in m."""
     reach = np.abs(self.matrix) @ self.half
-    return np.array([self.centre - reach, self.centre + reach])
+    low, high = np.minimum(self.way, 0.0), np.maximum(self.way, 0.0)
+    return np.array([self.centre - reach + low, self.centre + reach + high])
 
   def moved(self, displacement: np.ndarray) -> Self:
     """Returns the solid at another place, `(3,)`, in m from this one."""
     return self._replace(centre=self.centre + displacement)
-
-  def along(self, way: np.ndarray) -> Self:
-    """Returns a box with the solid everywhere on a way, `(3,)`, in m."""
-    if not way.any():
-      return self
-    half = self.half + np.abs(way @ self.matrix) / 2
-    return self.moved(way / 2)._replace(half=half, is_box=True)
 
 
 @final
@@ -259,10 +258,34 @@ class Space:
     """Returns a point where two solids meet, `(3,)`, or `None`.
 
     Args:
-      one: A solid.
-      other: Another one, of another geom.
+      one: A solid that stays where it is.
+      other: Another one, of another geom; it may move along its way.
       clearance: Smallest distance that they may have, in m. They may overlap by
         `TOLERANCE` if it is 0.
+    """
+    length, done = float(np.linalg.norm(other.way)), 0.0
+    direction = other.way / (length or 1.0)
+    least = _SLACK if length else 0.0
+    while True:
+      there = other.moved(done * direction)
+      distance, point = self._distance(one, there, clearance + length)
+      # How far it can move, in any direction, before they meet.
+      slack = distance - clearance + TOLERANCE
+      if slack < least:
+        return point
+      if done >= length:
+        return None
+      done = min(done + slack, length)
+
+  def _distance(
+      self, one: Solid, other: Solid, limit: float
+  ) -> tuple[float, np.ndarray]:
+    """Returns the distance of two solids and the point between them.
+
+    Args:
+      one: A solid.
+      other: Another one, of another geom.
+      limit: Distance, in m, above which the result may be any larger number.
     """
     for solid in (one, other):
       if solid.is_box:
@@ -271,11 +294,10 @@ class Space:
     distance, point = proximity.distance(
         self._model, self._data, (one.geom, other.geom),
         (one.centre, other.centre), (one.matrix.ravel(), other.matrix.ravel()),
-        clearance + TOLERANCE,
+        limit + TOLERANCE,
     )  # fmt: skip
     # A distance that MuJoCo cannot compute counts as an overlap.
-    is_apart = distance and distance >= clearance - TOLERANCE
-    return None if is_apart else point
+    return distance or -np.inf, point
 
   def uncarried(self, points: np.ndarray, depth: float) -> np.ndarray | None:
     """Returns the first of some points that is not over the same surface.

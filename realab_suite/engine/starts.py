@@ -133,8 +133,7 @@ class StartCheck:
       turn = rotations.matrices(new[3:]) @ rotations.matrices(old[3:]).T
       solid, way = self._parts[i]
       centre = new[:3] + turn @ (solid.centre - old[:3])
-      there = solid._replace(centre=centre, matrix=turn @ solid.matrix)
-      yield there.along(way)
+      yield solid._replace(centre=centre, matrix=turn @ solid.matrix, way=way)
 
   def _poses(self, physics: Any) -> np.ndarray:
     """Returns the poses of the mocap body of each geom, `(geoms, 7)`."""

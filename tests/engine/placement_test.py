@@ -135,16 +135,22 @@ def test_a_region_turns_with_its_place(yaw, is_refused):
 
 
 @pytest.mark.parametrize(
-    ('travel', 'is_refused'), [((1.2, 1.2, 0), True), ((-1.2, 1.2, 0), False)]
+    ('travel', 'place', 'is_refused'),
+    [
+        ((1.2, 1.2, 0), [2.0, 2.0], True),
+        ((-1.2, 1.2, 0), [2.0, 2.0], False),
+        # Beside the path, but inside of the rectangle about it.
+        ((1.2, 1.2, 0), [1.1, 2.1], False),
+    ],
 )
-def test_the_path_of_a_moving_part_is_an_obstacle(travel, is_refused):
+def test_the_path_of_a_moving_part_is_an_obstacle(travel, place, is_refused):
   ball = {'type': 'sphere', 'size': (0.1,)}
 
   def part(root):
     moving.MovingPart('part', [ball]).attach_to(root, (1.0, 1.0, 0.1), travel)
 
   task = _room_with(part)
-  assert _is_refused(task, [2.0, 2.0], range=[0, 1]) == is_refused
+  assert _is_refused(task, place, range=[0, 1]) == is_refused
 
 
 # Differential: what the loader says, and what episodes do.

@@ -62,12 +62,25 @@ _yaws = st.sampled_from([0.0, np.pi / 2]) | _floats(-3.0, 3.0)
 def test_what_is_said_to_keep_apart_does(place, geom, other, yaw, way):
   block, there = _solid(_BLOCK, place, 0.3), _solid(geom, other, yaw)
   way = np.array([*way, 0.0])
-  met = solids.Space(_MODEL).meet(block, there.along(way))
+  met = solids.Space(_MODEL).meet(block, there._replace(way=way))
   hypothesis.event('apart' if met is None else 'met')
   if met is None:
     for share in np.linspace(0.0, 1.0, 50):
       distance = _distance(block, there.moved(share * way))
       assert distance >= -solids.TOLERANCE - 1e-6
+
+
+@pytest.mark.parametrize('geom', range(2, 7))
+@pytest.mark.parametrize(
+    ('place', 'is_met'),
+    # In the corners of the bounds of the way, beside the way, and in it.
+    [((0.2, 1.8), False), ((1.6, 0.5), False), ((1.2, 1.4), True)],
+)
+def test_a_geom_that_moves_fills_its_way_alone(geom, place, is_met):
+  there = _solid(geom, (0.0, 0.0), np.pi / 4)
+  there = there._replace(way=np.array([2.0, 2.0, 0.0]))
+  met = solids.Space(_MODEL).meet(_solid(_BLOCK, place), there)
+  assert (met is not None) == is_met
 
 
 @pytest.mark.parametrize('clearance', [0.0, 0.3])
@@ -121,8 +134,8 @@ def test_no_pose_is_outside_its_region(kind, value_range):
       size, pose = region.half_size, physics.bind(block.geom)
       corners = size * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
       corners = pose.xpos + corners @ np.reshape(pose.xmat, (3, 3)).T
-      _, centre, matrix, half, _ = region.solid
-      beyond = np.abs((corners - centre) @ matrix) - half
+      solid = region.solid
+      beyond = np.abs((corners - solid.centre) @ solid.matrix) - solid.half
       assert beyond.max() <= solids.TOLERANCE
       widest = np.maximum(widest, beyond.max(axis=0) + 1.0)
   np.testing.assert_allclose(widest, 1.0, atol=0.01)  # The box is not larger.
