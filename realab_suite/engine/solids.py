@@ -340,7 +340,10 @@ class Crowd:
 
   def joined(self, others: Iterable[Solid]) -> 'Crowd':
     """Returns a crowd of these solids and others."""
-    return Crowd(self._space, [*self._members, *others])
+    joined, added = copy.copy(self), Crowd(self._space, others)
+    joined._members = self._members + added._members
+    joined._bounds = np.concatenate([self._bounds, added._bounds])
+    return joined
 
   def meeting(
       self, solid: Solid, clearance: float = 0.0

@@ -11,6 +11,9 @@ from realab_suite.entities import protocols
 
 # Number of values that are tried with a kind that declares no footprint.
 NUM_VALUES = 257
+# Largest difference of the steps of a block that moves evenly, in m or rad.
+# Over all values, it adds up to less than 10 micrometres.
+_ROUNDING = 1e-9
 
 
 @final
@@ -57,14 +60,39 @@ def sampled(
     for j, block in enumerate(blocks):
       centres[j, i] = block.position(physics)
       headings[j, i] = block.heading(physics)
-  headings = np.unwrap(headings)
-  return [
-      Path(
-          j,
-          centres[j, i],
-          centres[j, i + 1],
-          (float(values[i]), float(values[i + 1])),
-          (float(headings[j, i]), float(headings[j, i + 1])),
-      )
-      for j, i in itertools.product(range(len(blocks)), range(NUM_VALUES - 1))
-  ]
+  tracks = np.dstack([centres, np.unwrap(headings)])
+  paths = []
+  for j, track in enumerate(tracks):
+    ends = _ends(track)
+    paths += [
+        Path(
+            j,
+            track[first, :3],
+            track[last, :3],
+            (float(values[first]), float(values[last])),
+            (float(track[first, 3]), float(track[last, 3])),
+        )
+        for first, last in itertools.pairwise(ends)
+    ]
+  return paths
+
+
+def _ends(track: np.ndarray) -> np.ndarray:
+  """Returns the ends of the lines that the poses of a block are on.
+
+  Along a line, equal steps of the value move the block equally far, or turn it
+  equally far on the spot. A block that moves and turns at once has a line for
+  each step, because a longer one would contain poses that it does not have.
+
+  Args:
+    track: Positions and headings of the block, `(values, 4)`.
+
+  Returns:
+    Numbers of the values at the ends, in order, `(lines + 1,)`.
+  """
+  steps = np.diff(track, axis=0)
+  is_change = np.abs(steps) > _ROUNDING
+  is_curved = is_change[:, :3].any(axis=1) & is_change[:, 3]
+  is_end = (np.abs(np.diff(steps, axis=0)) > _ROUNDING).any(axis=1)
+  is_end |= is_curved[:-1] | is_curved[1:]
+  return np.array([0, *np.flatnonzero(is_end) + 1, len(track) - 1])
