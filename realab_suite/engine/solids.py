@@ -1,9 +1,9 @@
 """Solids: what the poses of a block fill, and their distances to geoms.
 
 All poses of a cube that moves along a line, anywhere in a region, fill an
-oriented box. MuJoCo measures the distance of the box to each geom. A geom that
-moves along a line is measured at so many places that it cannot meet the box
-between them.
+oriented box. MuJoCo measures the distance of the box to each geom. The edges of
+the box of a cube that turns are rounded. A geom that moves along a line is
+measured at so many places that it cannot meet the box between them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -47,6 +47,9 @@ class Solid(NamedTuple):
     half: Half the edge lengths of a box around it, `(3,)`, in m.
     is_box: True if the box takes the place of the geom.
     way: Displacement of the solid to the other end of its way, `(3,)`, in m.
+    radius: Radius of the upright edges of the box, in m.
+    inset: Distance of the axes of these edges from the sides of the box, in m.
+      It is less than the radius if a block makes less than a quarter turn.
   """
 
   geom: int
@@ -55,6 +58,8 @@ class Solid(NamedTuple):
   half: np.ndarray
   is_box: bool = False
   way: np.ndarray = np.zeros(3)
+  radius: float = 0.0
+  inset: float = 0.0
 
   @property
   def bounds(self) -> np.ndarray:
@@ -62,6 +67,14 @@ class Solid(NamedTuple):
     reach = np.abs(self.matrix) @ self.half
     low, high = np.minimum(self.way, 0.0), np.maximum(self.way, 0.0)
     return np.array([self.centre - reach + low, self.centre + reach + high])
+
+  @property
+  def hulls(self) -> list[tuple[Self, float]]:
+    """Solids with sharp edges, each of which contains it within a margin."""
+    if not self.radius:
+      return [(self, 0.0)]
+    core = self.half - [self.inset, self.inset, 0.0]
+    return [(self, 0.0), (self._replace(half=core), self.radius)]
 
   def moved(self, displacement: np.ndarray) -> Self:
     """Returns the solid at another place, `(3,)`, in m from this one."""
@@ -157,7 +170,10 @@ def _regions(
   found = []
   for path in paths:
     size = register.blocks[path.block].half_size
-    turns = np.linspace(*path.headings, _NUM_TURNS)
+    # The width is the same after each quarter turn.
+    first, last = path.headings
+    turn = np.clip(last - first, -np.pi / 2, np.pi / 2)
+    turns = first + np.linspace(0.0, turn, _NUM_TURNS)
     width = size * (np.abs(np.cos(turns)) + np.abs(np.sin(turns))).max()
     reach = np.abs(path.last - path.first) / 2 + [*spread, 0.0]
     solid = Solid(
@@ -166,6 +182,8 @@ def _regions(
         matrix,
         reach + np.array([width, width, size]),
         is_box=True,
+        radius=np.sqrt(2.0) * size if turn else 0.0,
+        inset=width,
     )
     found.append(Region(solid, path, reach, size))
   return found
@@ -287,6 +305,22 @@ class Space:
       other: Another one, of another geom.
       limit: Distance, in m, above which the result may be any larger number.
     """
+    found = -np.inf, one.centre
+    for (hull, margin), (around, beyond) in itertools.product(
+        one.hulls, other.hulls
+    ):
+      width = margin + beyond
+      distance, point = self._measure(hull, around, limit + width)
+      if distance - width > found[0]:
+        found = distance - width, point
+      if found[0] > limit:
+        break
+    return found
+
+  def _measure(
+      self, one: Solid, other: Solid, limit: float
+  ) -> tuple[float, np.ndarray]:
+    """Returns the distance of two solids, with sharp edges; or -inf."""
     for solid in (one, other):
       if solid.is_box:
         self._model.geom_type[solid.geom] = mujoco.mjtGeom.mjGEOM_BOX

@@ -1,5 +1,7 @@
 """Solids contain every pose of a block, and meet what a pose overlaps."""
 
+import functools
+
 import hypothesis
 from hypothesis import strategies as st
 import mujoco
@@ -8,6 +10,7 @@ import pytest
 
 from realab_suite.engine import solids
 from realab_suite.entities import arenas
+from realab_suite.entities import registers
 from tests import examples
 from tests import worlds
 from tests.entities import register_worlds
@@ -139,6 +142,77 @@ def test_no_pose_is_outside_its_region(kind, value_range):
       assert beyond.max() <= solids.TOLERANCE
       widest = np.maximum(widest, beyond.max(axis=0) + 1.0)
   np.testing.assert_allclose(widest, 1.0, atol=0.01)  # The box is not larger.
+
+
+@functools.cache
+def _orientation():
+  arena = arenas.OpenRoom()
+  register = registers.BlockOrientationRegister('r', value_range=(-1.0, 1.0))
+  register.attach_to(arena, (0.0, 0.0))
+  physics = worlds.compile_world(arena)
+  worlds.start_episode(physics, register)
+  return physics, register
+
+
+def _turning(monkeypatch, headings, spread, yaw):
+  """Returns the solid of a block that turns, and the solids of some poses."""
+  physics, register = _orientation()
+  middle = np.array([0.0, 0.0, 0.1])
+  path = registers.Path(0, middle, middle, (0.0, 1.0), headings)
+  monkeypatch.setattr(register, 'footprint', lambda physics: [path])
+  [region] = solids.regions(physics, register, np.array(spread))
+  there = {'geom': _BLOCK, 'matrix': _turned(yaw)}
+  region = region._replace(solid=region.solid._replace(**there))
+  block = _solid(_BLOCK, (0.0, 0.0))
+  poses = [
+      block._replace(centre=centre, matrix=_turned(yaw + turn))
+      for turn in np.linspace(*headings, 40)
+      for centre in region.corners()[::2]
+  ]
+  return region.solid, poses
+
+
+@examples.settings(60)
+@hypothesis.given(
+    st.tuples(_floats(-3.0, 0.0), _floats(0.0, 3.0) | st.just(98.0)),
+    st.tuples(_floats(0.0, 0.2), _floats(0.0, 0.2)),
+    _yaws,
+    st.integers(2, 6),
+    st.tuples(_floats(-0.8, 0.8), _floats(-0.8, 0.8)),
+    _yaws,
+)
+def test_what_keeps_apart_from_a_turning_block_does(
+    headings, spread, yaw, geom, place, turn
+):
+  with pytest.MonkeyPatch.context() as monkeypatch:
+    solid, poses = _turning(monkeypatch, headings, spread, yaw)
+  there = _solid(geom, place, turn)
+  is_apart = solids.Space(_MODEL).meet(solid, there) is None
+  hypothesis.event('apart' if is_apart else 'met')
+  if is_apart:
+    for pose in poses:
+      assert _distance(pose, there) >= -solids.TOLERANCE - 1e-6
+
+
+@pytest.mark.parametrize('last', [3.0, -3.0 + 32 * np.pi])
+@pytest.mark.parametrize(
+    ('spread', 'distance', 'is_met'),
+    [
+        (0.0, 0.138, True),
+        (0.0, 0.145, False),
+        (0.1, 0.28, True),
+        (0.1, 0.29, False),
+    ],
+)
+def test_a_block_that_turns_fills_a_circle_in_any_frame(
+    monkeypatch, spread, distance, is_met, last
+):
+  # The diagonals of the block and of the region are 0.141 m from the middle.
+  around = (spread, spread)
+  solid, _ = _turning(monkeypatch, (-3.0, last), around, np.pi / 4)
+  wall = _solid(_WALL, (0.0, distance + 0.1))
+  met = solids.Space(_MODEL).meet(solid, wall)
+  assert (met is not None) == is_met
 
 
 def test_the_model_stays_as_it_is():
