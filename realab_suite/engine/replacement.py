@@ -27,6 +27,8 @@ from realab_suite.feedback import mechanisms
 _FARTHEST = 10.0
 # Distance that a register that was moved has from everything else, in m.
 _CLEARANCE = 0.01
+# Number of places that are checked at once.
+_CHUNK = 4096
 _PLANE = mujoco.mjtGeom.mjGEOM_PLANE
 
 
@@ -194,11 +196,22 @@ class _World:
     shifts = np.stack(np.meshgrid(along, along, 0.0), axis=-1).reshape(-1, 3)
     distance = np.linalg.norm(shifts, axis=1).round(6)
     needs_ground, corners = self._is_below(blocks).any(), blocks.corners
-    for shift in shifts[np.lexsort((*shifts.T, distance))]:
-      if needs_ground and not self._is_carried(corners + shift):
-        continue
-      if self._is_free(blocks.moved(shift)):
-        return shift
+    shifts = shifts[np.lexsort((*shifts.T, distance))]
+    with_margin = blocks.moved(np.zeros(3))
+    for i in range(0, len(shifts), _CHUNK):
+      some = shifts[i : i + _CHUNK]
+      # Most places are excluded for many at once.
+      if needs_ground:
+        some = some[self._space.may_carry(corners, some)]
+      for each in with_margin.reach:
+        some = some[~self._fixed.is_surely_met(each, some)]
+      for each in with_margin.starts:
+        some = some[~self._movable.is_surely_met(each, some)]
+      for shift in some:
+        if needs_ground and not self._is_carried(corners + shift):
+          continue
+        if self._is_free(blocks.moved(shift)):
+          return shift
     return None
 
   def _is_below(self, blocks: _Blocks) -> np.ndarray:

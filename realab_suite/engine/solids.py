@@ -25,6 +25,12 @@ _SLACK = 1e-4
 # Largest height of a block above the surface that carries it, in m. It exceeds
 # the gap under a planar block.
 GAP = 0.01
+# Depth in m from which on boxes are certain to overlap.
+_SURE = 2 * TOLERANCE
+# Sine of the angle of lines that count as parallel.
+_PARALLEL = 1e-6
+# Half the size of a plane without end, in m.
+_ENDLESS = 1e6
 # Smallest half width of a box, in m.
 _THIN = 1e-6
 # Number of headings of a block that turns at which its width is measured.
@@ -34,6 +40,13 @@ _DOWN = np.array([0.0, 0.0, -1.0])
 _CARRIERS = np.array([1, 0, 0, 0, 0, 0], np.uint8)
 # MuJoCo computes no distances of these.
 _UNMEASURED = mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF
+# Half the size of a box inside of a geom: shares of numbers of the geom's size.
+_INNER = {
+    mujoco.mjtGeom.mjGEOM_BOX: ([0, 1, 2], [1.0, 1.0, 1.0]),
+    mujoco.mjtGeom.mjGEOM_SPHERE: ([0, 0, 0], [3**-0.5] * 3),
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: ([0, 1, 2], [3**-0.5] * 3),
+    mujoco.mjtGeom.mjGEOM_CYLINDER: ([0, 0, 1], [2**-0.5, 2**-0.5, 1.0]),
+}
 
 
 @final
@@ -75,6 +88,12 @@ class Solid(NamedTuple):
       return [(self, 0.0)]
     core = self.half - [self.inset, self.inset, 0.0]
     return [(self, 0.0), (self._replace(half=core), self.radius)]
+
+  @property
+  def inside(self) -> np.ndarray:
+    """Half the edge lengths of a box that is filled by poses, `(3,)`, in m."""
+    corner = self.inset - self.radius / 2 if self.radius else 0.0
+    return self.half - [corner, corner, 0.0]
 
   def moved(self, displacement: np.ndarray) -> Self:
     """Returns the solid at another place, `(3,)`, in m from this one."""
@@ -333,6 +352,76 @@ class Space:
     # A distance that MuJoCo cannot compute counts as an overlap.
     return distance or -np.inf, point
 
+  def is_surely_met(
+      self, one: Solid, other: Solid, shifts: np.ndarray
+  ) -> np.ndarray:
+    """Returns True where a box, moved, certainly meets a solid.
+
+    It compares boxes and planes, for many places at once. Where it is False,
+    only `meet` can tell.
+
+    Args:
+      one: A solid that is a box.
+      other: Another one that stays where it is.
+      shifts: Displacements of the first one, `(shifts, 3)`, in m.
+
+    Returns:
+      `(shifts,)` bool.
+    """
+    kind = mujoco.mjtGeom(self._model.geom_type[other.geom])
+    boxes = one.matrix * one.inside
+    offsets = one.centre + shifts - other.centre
+    if kind == mujoco.mjtGeom.mjGEOM_PLANE:
+      normal = other.matrix[:, 2]
+      return offsets @ normal - np.abs(normal @ boxes).sum() < -_SURE
+    if other.is_box:
+      half = other.inside
+    elif kind in _INNER:
+      numbers, shares = _INNER[kind]
+      half = self._model.geom_size[other.geom][numbers] * shares
+    else:
+      return np.zeros(len(shifts), bool)
+    others = other.matrix * half
+    # Boxes meet if no axis of a face, and none across two edges, is between.
+    across = np.cross(one.matrix.T[:, np.newaxis], other.matrix.T).reshape(
+        -1, 3
+    )
+    lengths = np.linalg.norm(across, axis=1)
+    is_axis = lengths > _PARALLEL
+    across = across[is_axis] / lengths[is_axis, np.newaxis]
+    axes = np.concatenate([one.matrix.T, other.matrix.T, across])
+    reach = np.abs(axes @ boxes).sum(axis=1) + np.abs(axes @ others).sum(axis=1)
+    return (np.abs(offsets @ axes.T) < reach - _SURE).all(axis=1)
+
+  def may_carry(self, points: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """Returns True where one geom that stays may be under all of some points.
+
+    Where it is True, only `uncarried` can tell.
+
+    Args:
+      points: Positions, `(points, 3)`, in m.
+      shifts: Displacements of the points, `(shifts, 3)`, in m.
+
+    Returns:
+      `(shifts,)` bool.
+    """
+    model = self._model
+    found = np.zeros(len(shifts), bool)
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    for geom in np.flatnonzero(model.geom_group == 0).tolist():
+      half = self._half[geom]
+      if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+        # A plane without a size has no end.
+        size = model.geom_size[geom]
+        half = np.where(size > 0.0, size, _ENDLESS)
+      matrix = np.reshape(self._data.geom_xmat[geom], (3, 3))
+      reach = (np.abs(matrix) @ half)[:2]
+      centre = self._data.geom_xpos[geom, :2]
+      is_within = low + shifts[:, :2] >= centre - reach
+      is_within &= high + shifts[:, :2] <= centre + reach
+      found |= is_within.all(axis=1)
+    return found
+
   def uncarried(self, points: np.ndarray, depth: float) -> np.ndarray | None:
     """Returns the first of some points that is not over the same surface.
 
@@ -378,6 +467,25 @@ class Crowd:
     joined._members = self._members + added._members
     joined._bounds = np.concatenate([self._bounds, added._bounds])
     return joined
+
+  def is_surely_met(self, solid: Solid, shifts: np.ndarray) -> np.ndarray:
+    """Returns True where a box, moved, certainly meets a member.
+
+    Args:
+      solid: The box.
+      shifts: Its displacements, `(shifts, 3)`, in m.
+
+    Returns:
+      `(shifts,)` bool; where it is False, only `meeting` can tell.
+    """
+    found = np.zeros(len(shifts), bool)
+    low, high = solid.bounds
+    for member, bounds in zip(self._members, self._bounds, strict=True):
+      is_near = (bounds[0] <= high + shifts) & (low + shifts <= bounds[1])
+      rest = np.flatnonzero(is_near.all(axis=1) & ~found)
+      if rest.size:
+        found[rest] = self._space.is_surely_met(solid, member, shifts[rest])
+    return found
 
   def meeting(
       self, solid: Solid, clearance: float = 0.0

@@ -191,6 +191,28 @@ def test_an_episode_without_a_clear_place_is_refused_with_the_remedy():
     env.reset()
 
 
+def test_few_of_the_places_in_the_way_are_measured(
+    monkeypatch: pytest.MonkeyPatch,
+):
+  # No two of the walls have room for the register between them.
+  across = [((x, 0.0, 0.5), (0.02, 1.9, 0.5)) for x in np.arange(-1.8, 2, 0.6)]
+  beside = [((0.0, y, 0.5), (1.9, 0.02, 0.5)) for y in np.arange(-1.8, 2, 0.15)]
+  env, _ = helpers.embed(
+      _Generated(*[[*across, *beside]] * 10), _design(), max_steps=3
+  )
+  measured = []
+  meet = solids.Space.meet
+
+  def count(self: Any, *args: Any) -> Any:
+    measured.append(args)
+    return meet(self, *args)
+
+  monkeypatch.setattr(solids.Space, 'meet', count)
+  with pytest.raises(composer.EpisodeInitializationError):
+    env.reset()
+  assert len(measured) < 200
+
+
 def test_another_attempt_may_find_a_clear_place():
   env, _ = helpers.embed(
       _Generated([_ALL_OVER], [_ACROSS]), _design(), max_steps=3

@@ -1,5 +1,6 @@
 """Solids contain every pose of a block, and meet what a pose overlaps."""
 
+import copy
 import functools
 
 import hypothesis
@@ -23,6 +24,8 @@ _XML = """<mujoco><worldbody>
   <geom type="capsule" size="0.1 0.4"/>
   <geom type="cylinder" size="0.2 0.4"/>
   <geom type="ellipsoid" size="0.1 0.3 0.4"/>
+  <geom type="plane" size="0.5 0.7 0.1"/>
+  <geom type="plane" size="0 0.4 0.1"/>
 </worldbody></mujoco>"""
 _MODEL = mujoco.MjModel.from_xml_string(_XML)
 _DATA = mujoco.MjData(_MODEL)
@@ -32,6 +35,14 @@ _BLOCK, _WALL = 0, 2
 def _turned(angle):
   cos, sin = np.cos(angle), np.sin(angle)
   return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _rotation(axis_angle):
+  quaternion, matrix = np.zeros(4), np.zeros(9)
+  length = np.linalg.norm(axis_angle) or 1.0
+  mujoco.mju_axisAngle2Quat(quaternion, np.array(axis_angle) / length, length)
+  mujoco.mju_quat2Mat(matrix, quaternion)
+  return matrix.reshape(3, 3)
 
 
 def _solid(geom, place, yaw=0.0):
@@ -57,6 +68,7 @@ def _floats(low, high):
 
 
 _places = st.tuples(_floats(-1.5, 1.5), _floats(-1.5, 1.5))
+_rotations = st.tuples(*[_floats(-1.0, 1.0)] * 3).map(_rotation)
 _yaws = st.sampled_from([0.0, np.pi / 2]) | _floats(-3.0, 3.0)
 
 
@@ -196,23 +208,72 @@ def test_what_keeps_apart_from_a_turning_block_does(
 
 @pytest.mark.parametrize('last', [3.0, -3.0 + 32 * np.pi])
 @pytest.mark.parametrize(
-    ('spread', 'distance', 'is_met'),
+    ('yaw', 'spread', 'distance', 'is_met'),
     [
-        (0.0, 0.138, True),
-        (0.0, 0.145, False),
-        (0.1, 0.28, True),
-        (0.1, 0.29, False),
+        (0.0, 0.0, 0.138, True),
+        (0.0, 0.0, 0.145, False),
+        (np.pi / 4, 0.0, 0.138, True),
+        (np.pi / 4, 0.0, 0.145, False),
+        (np.pi / 4, 0.1, 0.28, True),
+        (np.pi / 4, 0.1, 0.29, False),
     ],
 )
 def test_a_block_that_turns_fills_a_circle_in_any_frame(
-    monkeypatch, spread, distance, is_met, last
+    monkeypatch, yaw, spread, distance, is_met, last
 ):
   # The diagonals of the block and of the region are 0.141 m from the middle.
   around = (spread, spread)
-  solid, _ = _turning(monkeypatch, (-3.0, last), around, np.pi / 4)
+  solid, _ = _turning(monkeypatch, (-3.0, last), around, yaw)
   wall = _solid(_WALL, (0.0, distance + 0.1))
   met = solids.Space(_MODEL).meet(solid, wall)
   assert (met is not None) == is_met
+
+
+@examples.settings(60)
+@hypothesis.given(
+    st.integers(2, 8),
+    st.tuples(_floats(-1.5, 1.5), _floats(-1.5, 1.5), _floats(-0.5, 0.5)),
+    _rotations,
+    _floats(-3.0, 3.0),
+    st.sampled_from([0.0, 0.1]),
+)
+def test_what_is_said_to_meet_for_sure_does(geom, place, turn, yaw, radius):
+  box = _box(0.3)._replace(matrix=_turned(yaw), radius=radius, inset=radius)
+  space = solids.Space(_MODEL)
+  there = space.solid(geom, place, turn)
+  along = np.linspace(-2.0, 2.0, 9)
+  shifts = np.stack(np.meshgrid(along, along, 0.0), axis=-1).reshape(-1, 3)
+  sure = solids.Crowd(space, [there]).is_surely_met(box, shifts)
+  met = [space.meet(box.moved(shift), there) is not None for shift in shifts]
+  hypothesis.event(f'{sum(sure)} of {sum(met)}')
+  assert (np.array(met) | ~sure).all()
+
+
+def test_most_boxes_that_meet_do_so_for_sure():
+  space, wall = solids.Space(_MODEL), _solid(_WALL, (0.0, 0.0), 0.5)
+  shifts = np.random.default_rng(0).uniform(-1.5, 1.5, (1000, 3))
+  sure = solids.Crowd(space, [wall]).is_surely_met(_box(), shifts)
+  met = [space.meet(_box().moved(shift), wall) is not None for shift in shifts]
+  assert 0.95 * sum(met) < sum(sure) <= sum(met)
+
+
+@examples.settings(60)
+@hypothesis.given(st.integers(2, 8), _places, _rotations)
+def test_no_surface_is_missed(geom, place, turn):
+  # The geoms stand in the middle of the model.
+  model = copy.copy(_MODEL)
+  quaternion = np.zeros(4)
+  mujoco.mju_mat2Quat(quaternion, turn.ravel())
+  model.geom_quat[geom] = quaternion
+  model.geom_contype[:] = np.arange(model.ngeom) == geom
+  model.geom_conaffinity[:] = 0
+  space = solids.Space(model)
+  points = np.array([(*place, 1.5), (place[0] + 0.2, place[1], 1.5)])
+  shifts = np.array([[0.3 * x, 0.0, 0.0] for x in range(-6, 7)])
+  may = space.may_carry(points, shifts)
+  for shift, is_possible in zip(shifts, may, strict=True):
+    is_carried = space.uncarried(points + shift, 5.0) is None
+    assert is_possible or not is_carried
 
 
 def test_the_model_stays_as_it_is():
