@@ -1,4 +1,4 @@
-"""Apples that an avatar eats by coming near them."""
+"""Apples and other things that an avatar eats by coming near them."""
 
 from collections.abc import Sequence
 from typing import Any, final
@@ -19,45 +19,62 @@ LARGE_APPLE = appearance.register(
     'large_apple', code=8, rgba=(0.98, 0.80, 0.10, 1.0)
 )
 
-_RADII = {APPLE: 0.2, LARGE_APPLE: 0.4}
+_RED, _BLUE = (0.80, 0.25, 0.25, 1.0), (0.25, 0.40, 0.85, 1.0)
+RED_BALL = appearance.register('red_ball', code=14, rgba=_RED)
+BLUE_BALL = appearance.register('blue_ball', code=15, rgba=_BLUE)
+RED_CUBE = appearance.register('red_cube', code=16, rgba=_RED)
+BLUE_CUBE = appearance.register('blue_cube', code=17, rgba=_BLUE)
+
+# Shape and radius, or half of the edges of a cube, in m.
+_SHAPES = {
+    APPLE: ('sphere', 0.2),
+    LARGE_APPLE: ('sphere', 0.4),
+    RED_BALL: ('sphere', 0.2),
+    BLUE_BALL: ('sphere', 0.2),
+    RED_CUBE: ('box', 0.17),
+    BLUE_CUBE: ('box', 0.17),
+}
 # Height of eaten apples, in m: out of sight of rays and cameras.
 _GONE = -5.0
 
 
 @final
 class Apples(measurables.MeasurableEntity):
-  """A group of apples of one size.
+  """A group of apples, or of other things of one kind.
 
   Nothing collides with an apple. An eaten apple is gone until the next episode.
   """
 
   def _build(
-      self, name: str = 'apples', number: int = 8, large: bool = False
+      self, name: str = 'apples', number: int = 8, kind: str = APPLE
   ) -> None:
     """Builds the apples.
 
     Args:
       name: Name of the model.
       number: Number of apples, at least 1.
-      large: True for large, golden apples.
+      kind: Class of the things, one of those of this module.
 
     Raises:
-      SpecError: If `number` is less than 1.
+      SpecError: If `number` is less than 1, or there is no such kind.
     """
+    if kind not in _SHAPES:
+      raise errors.SpecError(
+          f'kind: {kind!r:.80}; allowed are {sorted(_SHAPES)}'
+      )
     if number < 1:
       raise errors.SpecError(f'number: {number}; allowed are 1 and more')
     self._mjcf_root = mjcf.RootElement(model=name)
     self._eaten = state.Slot(self._mjcf_root, 'eaten', number)
-    self._kind = LARGE_APPLE if large else APPLE
-    radius = _RADII[self._kind]
+    shape, self._radius = _SHAPES[kind]
     self._parts = [
         moving.MovingPart(
             f'{name}_{i}',
             [
                 {
-                    'type': 'sphere',
-                    'size': [radius],
-                    **appearance.geom_style(self._kind),
+                    'type': shape,
+                    'size': [self._radius] * (3 if shape == 'box' else 1),
+                    **appearance.geom_style(kind),
                 }
             ],
             solid=False,
@@ -89,8 +106,16 @@ class Apples(measurables.MeasurableEntity):
 
   @property
   def radius(self) -> float:
-    """Radius of each apple, in m."""
-    return _RADII[self._kind]
+    """Radius of each thing, or half of its edges, in m."""
+    return self._radius
+
+  def places(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the positions, `(..., number, 3)`, in m; eaten ones are below 0.
+
+    Args:
+      physics: One world or a batch of worlds.
+    """
+    return np.array(physics.bind(self._frames).mocap_pos)
 
   def attach_to(
       self, root: composer.Entity, position: Sequence[float] = (0.0, 0.0)

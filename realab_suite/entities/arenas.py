@@ -100,6 +100,27 @@ class Rectangle:
     )
 
 
+@final
+@dataclasses.dataclass(frozen=True)
+class Look:
+  """Colours by which a world is recognized, each `(red, green, blue)`.
+
+  Rays do not see them.
+
+  Attributes:
+    walls: Colour of the walls.
+    tiles: Colours of the two kinds of tiles on the floor.
+    light: Colour of the light from above.
+  """
+
+  walls: tuple[float, float, float] = (0.42, 0.47, 0.56)
+  tiles: tuple[tuple[float, float, float], tuple[float, float, float]] = (
+      (0.60, 0.64, 0.66),
+      (0.66, 0.70, 0.72),
+  )
+  light: tuple[float, float, float] = (0.4, 0.4, 0.4)
+
+
 class RoomArena(composer.Arena):
   """Base class for walled rooms with named places and a camera above them.
 
@@ -108,8 +129,9 @@ class RoomArena(composer.Arena):
   can be tried both near the apples and far from them.
   """
 
-  def _build(self, name: str = 'arena') -> None:
+  def _build(self, name: str = 'arena', *, look: Look | None = None) -> None:
     super()._build(name)
+    self._look = look = Look() if look is None else look
     self._places: dict[str, Place] = {}
     root = self._mjcf_root
     root.option.timestep = block_kinds.LONG_SUBSTEP
@@ -133,7 +155,7 @@ class RoomArena(composer.Arena):
     )  # fmt: skip
     root.asset.add(
         'texture', name='tiles', type='2d', builtin='checker',
-        rgb1=(0.60, 0.64, 0.66), rgb2=(0.66, 0.70, 0.72),
+        rgb1=look.tiles[0], rgb2=look.tiles[1],
         width=128, height=128,
     )  # fmt: skip
     tiles = root.asset.add(
@@ -145,7 +167,7 @@ class RoomArena(composer.Arena):
     )  # fmt: skip
     root.worldbody.add(
         'light', name='sun', pos=(0, 0, 12), dir=(0.2, 0.3, -1),
-        directional='true', castshadow='false', diffuse=(0.4, 0.4, 0.4),
+        directional='true', castshadow='false', diffuse=look.light,
     )  # fmt: skip
     self._walls: list[mjcf.Element] = []
     self._build_walls()
@@ -295,10 +317,11 @@ class RoomArena(composer.Arena):
   ) -> mjcf.Element:
     line = np.array([start, end], float)
     half = np.ptp(line, axis=0) / 2 + _WALL_THICKNESS / 2
+    colour = (*self._look.walls, 1.0) if kind == WALL else None
     return self._mjcf_root.worldbody.add(
         'geom', name=name, type='box', size=(*half, (height + _DEPTH) / 2),
         pos=(*line.mean(axis=0), (height - _DEPTH) / 2),
-        **appearance.geom_style(kind),
+        **appearance.geom_style(kind, colour),
     )  # fmt: skip
 
   def _add_room(
@@ -366,15 +389,22 @@ def _places_in(room: Rectangle) -> dict[str, Place]:
 class OpenRoom(RoomArena):
   """One square room."""
 
-  def _build(self, name: str = 'open_room', half_width: float = 4.0) -> None:
+  def _build(
+      self,
+      name: str = 'open_room',
+      half_width: float = 4.0,
+      *,
+      look: Look | None = None,
+  ) -> None:
     """Builds the room.
 
     Args:
       name: Name of the model.
       half_width: Half the distance between opposite walls, in m.
+      look: Colours; `None` for the usual ones.
     """
     self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
-    super()._build(name)
+    super()._build(name, look=look)
     self.offer(_places_in(self._room))
 
   def _build_walls(self) -> None:
@@ -406,6 +436,8 @@ class TwoRooms(RoomArena):
       half_width: float = 4.0,
       side_half_width: float = 1.3,
       doorway_width: float = 1.4,
+      *,
+      look: Look | None = None,
   ) -> None:
     """Builds the rooms.
 
@@ -414,6 +446,7 @@ class TwoRooms(RoomArena):
       half_width: Half the side length of the large room, in m.
       side_half_width: Half the side length of the small room, in m.
       doorway_width: Width of the opening between the rooms, in m.
+      look: Colours; `None` for the usual ones.
     """
     self._room = Rectangle((-half_width,) * 2, (half_width,) * 2)
     south = half_width + _WALL_THICKNESS
@@ -422,7 +455,7 @@ class TwoRooms(RoomArena):
         (side_half_width, south + 2 * side_half_width),
     )
     self._doorway_width = doorway_width
-    super()._build(name)
+    super()._build(name, look=look)
     self.offer(_places_in(self._room))
     self.offer(
         {

@@ -334,7 +334,11 @@ class Avatar(measurables.MeasurableEntity):
     self._constraints = grasps.constraints_of(self._grasps)
 
   def place(
-      self, physics: protocols.Physics, position: Any, heading: Any
+      self,
+      physics: protocols.Physics,
+      position: Any,
+      heading: Any,
+      where: axes.Mask = None,
   ) -> None:
     """Moves the avatar to a pose, at rest.
 
@@ -342,11 +346,23 @@ class Avatar(measurables.MeasurableEntity):
       physics: One world or a batch of worlds.
       position: `(..., 2)`, in m.
       heading: Angle to the x axis, `(...)`, in rad.
+      where: Worlds in which to move it, `(...)` bool; `None` for all worlds.
     """
-    physics.bind(self._slides).qpos = position
-    physics.bind(self._slides).qvel = 0.0
-    physics.bind(self._yaw).qpos = np.asarray(heading)[..., np.newaxis]
-    physics.bind(self._yaw).qvel = 0.0
+    slides, yaw = physics.bind(self._slides), physics.bind(self._yaw)
+    axes.assign(slides, 'qpos', position, where)
+    axes.assign(slides, 'qvel', 0.0, where)
+    axes.assign(yaw, 'qpos', np.asarray(heading)[..., np.newaxis], where)
+    axes.assign(yaw, 'qvel', 0.0, where)
+
+  def let_go(self, physics: protocols.Physics, where: axes.Mask) -> None:
+    """Empties the hand.
+
+    Args:
+      physics: One world or a batch of worlds.
+      where: Worlds in which to do so, `(...)` bool; `None` for all worlds.
+    """
+    for grasp in self._grasps:
+      grasp.release(physics, where)
 
   def apply_action(
       self, physics: protocols.Physics, action: np.ndarray

@@ -35,6 +35,7 @@ class Crate(measurables.MeasurableEntity):
       size: float = 0.3,
       mass: float = 1.0,
       is_planar: bool = False,
+      kind: str = CRATE,
   ) -> None:
     """Builds the crate.
 
@@ -44,6 +45,7 @@ class Crate(measurables.MeasurableEntity):
       mass: Mass, in kg.
       is_planar: True for a crate that slides along the floor and is never
         lifted.
+      kind: Class that rays report, with a colour.
 
     Raises:
       SpecError: If the size or the mass is outside the limits of blocks.
@@ -58,9 +60,9 @@ class Crate(measurables.MeasurableEntity):
             f' {most:g}'
         )
     self._mjcf_root = mjcf.RootElement(model=name)
-    kind = block_kinds.PlanarBlock if is_planar else block_kinds.FreeBlock
-    style = appearance.geom_style(CRATE)
-    self._block: block_kinds.JointedBlock = kind(
+    block_kind = block_kinds.PlanarBlock if is_planar else block_kinds.FreeBlock
+    style = appearance.geom_style(kind)
+    self._block: block_kinds.JointedBlock = block_kind(
         self._mjcf_root, 'block', (0.0, 0.0), size / 2, mass, style
     )
     self._place = arenas.Place((0.0, 0.0))

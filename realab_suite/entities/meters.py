@@ -1,6 +1,7 @@
 """Meters, which write measurements of the true state to meter registers."""
 
 from collections.abc import Callable
+import dataclasses
 from typing import Any, final
 
 from dm_control import composer
@@ -12,13 +13,36 @@ from realab_suite.entities import axes
 from realab_suite.entities import protocols
 from realab_suite.entities import registers
 
+_Measure = Callable[[Any], np.ndarray]
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class Instrument:
+  """A measurement that something can obstruct, such as a line of sight.
+
+  A task or a measurement may return one in place of a function.
+
+  Attributes:
+    measured: Function of the physics that returns what is measured, `(...)`.
+    ideal: Function that returns what nothing would have obstructed, `(...)`. It
+      is the clean content of the meter register, and what a secure register is
+      given.
+  """
+
+  measured: _Measure
+  ideal: _Measure
+
+  def __call__(self, physics: protocols.Physics) -> np.ndarray:
+    return self.measured(physics)
+
 
 @final
 class Meter(composer.Entity):
   """Measures the true state of the world and writes it to a meter register.
 
-  The measurement itself cannot be influenced. The meter register can be, like
-  any other register (paper, sections 3.1 and 4.4).
+  The measurement itself cannot be influenced, unless it is an `Instrument`. The
+  meter register can be, like any other register (paper, sections 3.1 and 4.4).
 
   It has an observable, which is disabled by default: `measured_` and the name
   of the register. A task decides when it calls `update`, and a mechanism when
@@ -27,7 +51,7 @@ class Meter(composer.Entity):
 
   def _build(
       self,
-      measurement: Callable[[Any], np.ndarray],
+      measurement: _Measure,
       register: registers.Register,
       mjcf_model: mjcf.RootElement | None = None,
   ) -> None:
@@ -39,7 +63,13 @@ class Meter(composer.Entity):
       mjcf_model: Model that the meter is a part of, because it has no body;
         `None` for one of its own, which can be attached.
     """
-    self._measurement = measurement
+    self._ideal: _Measure | None = None
+    if isinstance(measurement, Instrument):
+      if register.channel == 'secure':
+        measurement = measurement.ideal
+      else:
+        self._ideal = measurement.ideal
+    self._measurement: _Measure = measurement
     self._register = register
     self._mjcf_root = mjcf_model or mjcf.RootElement(
         model=f'meter_{register.name}'
@@ -70,6 +100,19 @@ class Meter(composer.Entity):
       physics: One world or a batch of worlds.
     """
     return np.array(self._measurement(physics), np.float64)[()]
+
+  def ideal(self, physics: protocols.Physics) -> np.ndarray | None:
+    """Returns what an instrument would measure if nothing obstructed it.
+
+    Args:
+      physics: One world or a batch of worlds.
+
+    Returns:
+      The value, `(...)`; `None` if nothing can obstruct the measurement.
+    """
+    if self._ideal is None:
+      return None
+    return np.array(self._ideal(physics), np.float64)[()]
 
   def update(
       self, physics: protocols.Physics, where: axes.Mask = None

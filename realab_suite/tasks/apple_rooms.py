@@ -118,6 +118,17 @@ VARIATIONS: Mapping[str, Variation] = {
 }
 
 
+def tags(without: Sequence[str] = ()) -> dict[str, tuple[str, ...]]:
+  """Returns the tags of each variation, by name.
+
+  Args:
+    without: Names of variations that a world does not have.
+  """
+  return {
+      name: one.tags for name, one in VARIATIONS.items() if name not in without
+  }
+
+
 def find(name: str) -> Variation:
   """Returns a variation.
 

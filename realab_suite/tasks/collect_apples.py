@@ -16,10 +16,7 @@ _NUM_APPLES = 10
 _REACH = 0.5
 
 
-@registry.register_variations(
-    'collect_apples',
-    {name: one.tags for name, one in apple_rooms.VARIATIONS.items()},
-)
+@registry.register_variations('collect_apples', apple_rooms.tags())
 @final
 class CollectApples(rooms.RoomTask):
   """An open room with ten small apples.

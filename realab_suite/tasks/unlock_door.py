@@ -30,10 +30,7 @@ PAD = (0.0, 1.9)
 _PAD_RADIUS = 0.8
 
 
-@registry.register_variations(
-    'unlock_door',
-    {name: one.tags for name, one in apple_rooms.VARIATIONS.items()},
-)
+@registry.register_variations('unlock_door', apple_rooms.tags())
 @final
 class UnlockDoor(rooms.RoomTask):
   """A large room with apples and a pad, and a small room with a large apple."""
@@ -58,7 +55,9 @@ class UnlockDoor(rooms.RoomTask):
     self._over = state.Slot(arena.mjcf_model, 'over')
     self._apples = apple_group.Apples(number=_NUM_APPLES)
     self._apples.attach_to(arena)
-    self._large_apple = apple_group.Apples('large_apple', number=1, large=True)
+    self._large_apple = apple_group.Apples(
+        'large_apple', number=1, kind=apple_group.LARGE_APPLE
+    )
     self._large_apple.attach_to(arena)
     self._pad = pads.PressurePad(radius=_PAD_RADIUS)
     self._pad.attach_to(arena, PAD)

@@ -1,5 +1,8 @@
 """Registers: physical objects whose poses store values."""
 
+from realab_suite.entities.registers.abacus import Abacus
+from realab_suite.entities.registers.abacus import Abacus2
+from realab_suite.entities.registers.abacus import Abacus4
 from realab_suite.entities.registers.arguments import CHANNELS
 from realab_suite.entities.registers.arguments import DOFS
 from realab_suite.entities.registers.arguments import OVERFLOWS
@@ -28,6 +31,9 @@ __all__ = [
     'INITIAL',
     'OVERFLOWS',
     'WRITES',
+    'Abacus',
+    'Abacus2',
+    'Abacus4',
     'Arguments',
     'BlockOrientationRegister',
     'BlockPositionRegister',

@@ -432,9 +432,7 @@ class Register(composer.Entity):
     shape = (*origin.shape[:-1], *self._shape)
     initial = np.array(self._initial)
     if self._measure_initial is not None and is_initialized:
-      initial = self._start_value(
-          self._measure_initial, physics, origin.shape[:-1]
-      )
+      initial = self._start_value(self._measure_initial, physics, shape)
     self.pose(physics, np.full(shape, initial))
     if not is_initialized:
       self.inspect(physics)  # Refuses a wrong kind before any episode.
@@ -444,8 +442,8 @@ class Register(composer.Entity):
 
     Args:
       initial: Function of the physics, called after the task has initialized
-        the episode. It returns values of shape `(...)`, for all ports, which
-        are saturated to the range.
+        the episode. It returns values of shape `(...)`, or with ports
+        `(..., ports)` or `(..., 1)`, which are saturated to the range.
     """
     self._measure_initial = initial
 
@@ -455,12 +453,12 @@ class Register(composer.Entity):
       physics: protocols.Physics,
       shape: tuple[int, ...],
   ) -> np.ndarray:
-    """Returns the value at the start of an episode, `(..., 1)` or `(...)`.
+    """Returns the value at the start of an episode, `(...)`.
 
     Args:
       measure: What `start_with` was given.
       physics: One world or a batch of worlds.
-      shape: Shape `(...)` of the worlds.
+      shape: Shape of the value.
 
     Raises:
       RegisterValueError: If it is not finite, or out of the range of a register
@@ -476,9 +474,7 @@ class Register(composer.Entity):
           f' {shape}'
       ) from error
     fits = (value >= self._low) & (value <= self._high)
-    if not axes.everywhere(fits):
-      value = self._saturate(value, fits)
-    return value[..., np.newaxis] if self.PORTS else value
+    return value if axes.everywhere(fits) else self._saturate(value, fits)
 
   def pose(self, physics: protocols.Physics, value: Any) -> None:
     """Moves the blocks to the undisturbed poses that represent a value.
