@@ -288,13 +288,20 @@ class FeedbackMechanism(composer.Entity):
     for name, register in self._registers.items():
       initial = self._design.registers[name].initial
       if isinstance(initial, str):
-        if initial not in functions:
+        # The same for all ports, or one for each.
+        of_ports = [f'{initial}_{port}' for port in register.PORTS]
+        if of_ports and initial not in functions:
+          names = of_ports
+        else:
+          names = [initial]
+        if any(name not in functions for name in names):
           raise errors.SpecError(
               f'design {self._design.name!r}: registers.{name}.initial: this'
               f' world does not offer {initial!r}; allowed are numbers and'
               f' {sorted(functions)}'
           )
-        register.start_with(functions[initial])
+        values = [functions[name] for name in names]
+        register.start_with(_stacked(values) if register.PORTS else values[0])
     found: dict[str, tuple[str, measurements.Measure]] = {}
     for i, spec in enumerate(self._design.meters):
       asked = measurements.AskedRegisters(self._registers)
@@ -396,12 +403,15 @@ class FeedbackMechanism(composer.Entity):
       return []
     step = self._whole_steps(physics) + 1
     where = axes.both(where, None)
-    values = [meter.measure(physics) for _, meter, _ in self._meters]
+    values = [
+        (meter.measure(physics), meter.ideal(physics))
+        for _, meter, _ in self._meters
+    ]
     writes = []
-    for one, measured in zip(self._meters, values, strict=True):
+    for one, (measured, ideal) in zip(self._meters, values, strict=True):
       writers, _, target = one
       try:
-        writes += _write(physics, target, writers, step, measured, where)
+        some = _write(physics, target, writers, step, measured, where)
       except errors.RegisterValueError as error:
         writer = ' and '.join(writers)
         raise errors.RegisterValueError(
@@ -409,6 +419,10 @@ class FeedbackMechanism(composer.Entity):
             f' {target.register.name!r} cannot store the measured value',
             error.world,
         ) from error
+      if ideal is not None:
+        target.register.set_clean(physics, ideal, where)
+        some = self._with_clean(physics, some)
+      writes += some
     return writes
 
   def initial_states(self, batch_shape: tuple[int, ...]) -> list[Any]:
@@ -637,12 +651,18 @@ class FeedbackMechanism(composer.Entity):
       if clean is not None and before is not None:
         for port, content in zip(target.ports, before, strict=True):
           clean_contents.store(physics, port, clean, content)
-        some = [
-            one._replace(clean=self._ports[one.register].clean(physics))
-            for one in some
-        ]
+        some = self._with_clean(physics, some)
       writes += some
     return writes
+
+  def _with_clean(
+      self, physics: protocols.Physics, writes: Sequence[records.Write]
+  ) -> list[records.Write]:
+    """Returns records with the present clean contents."""
+    return [
+        one._replace(clean=self._ports[one.register].clean(physics))
+        for one in writes
+    ]
 
   def restart_states(
       self, states: Sequence[Any], worlds: np.ndarray, num_envs: int
@@ -730,6 +750,16 @@ def _joint(functions: Sequence[measurements.Measure]) -> measurements.Measure:
   """
   if len(functions) == 1:
     return functions[0]
+  ideals = [
+      one.ideal if isinstance(one, meters.Instrument) else one
+      for one in functions
+  ]
+  if ideals == [*functions]:
+    return _stacked(functions)
+  return meters.Instrument(_stacked(functions), _stacked(ideals))
+
+
+def _stacked(functions: Sequence[measurements.Measure]) -> measurements.Measure:
   return lambda physics: np.stack([one(physics) for one in functions], axis=-1)
 
 

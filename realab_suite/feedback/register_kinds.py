@@ -9,3 +9,5 @@ REGISTER_KINDS: registry.Registry[type[registers.Register]] = registry.Registry(
 REGISTER_KINDS.add('two_block')(registers.TwoBlockRegister)
 REGISTER_KINDS.add('block_position')(registers.BlockPositionRegister)
 REGISTER_KINDS.add('block_orientation')(registers.BlockOrientationRegister)
+REGISTER_KINDS.add('abacus_2')(registers.Abacus2)
+REGISTER_KINDS.add('abacus_4')(registers.Abacus4)

@@ -40,6 +40,7 @@ class Demonstration(base.Provider):
     return policies.make(self.policy, **self.options)
 
   def check(self, design: Any) -> None:
+    policies.refuse_privileged(self.demonstrator, 'a demonstrator')
     policies.check_action_set(self.demonstrator.action_set, design, self.kind)
 
   @property
