@@ -52,6 +52,8 @@ _MAY_IMPORT = {
         'feedback.mechanisms',
         'policies.action_sets',
         'policies.base',
+        'policies.errands',
+        'policies.navigation',
     ),
     'engine': ('config', 'entities', 'policies', 'feedback', 'tasks'),
     'evaluation': (

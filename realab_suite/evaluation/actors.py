@@ -3,7 +3,7 @@
 Actors for batches are in `batch_actors`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, final
 
 import dm_env
@@ -78,7 +78,7 @@ class PolicyActor:
       SpecError: If the action sets of the policy and the environment differ, or
         if the policy needs other senses.
     """
-    check_senses(policy, env)
+    self._privileged = PrivilegedSenses(policy, env)
     self._policy = policy = policy.in_action_set(env.action_set)
     self._seed, self._world = env.seed, env.world
     design = env.mechanism.design
@@ -103,7 +103,7 @@ class PolicyActor:
 
   def act(self, time_step: dm_env.TimeStep) -> Any:
     chosen, self._state = self._policy.step(
-        time_step.observation,
+        self._privileged.added_to(time_step.observation),
         np.asarray(self._step == 0),
         random_keys.of_step(self._key, self._step),
         self._state,
@@ -126,25 +126,48 @@ class PolicyActor:
     return int(random_keys.uniform(key) * len(self._action_set))
 
 
-def check_senses(policy: policies.Policy, env: Any) -> None:
-  """Checks that observations contain the senses that a policy reads.
+@final
+class PrivilegedSenses:
+  """What a policy senses beside the observations of the agent in its place."""
 
-  Args:
-    policy: The policy.
-    env: Environment with one world or a batch.
+  def __init__(self, policy: policies.Policy, env: Any) -> None:
+    """Finds the senses of a policy.
 
-  Raises:
-    SpecError: If a sense is missing.
-  """
-  policies.check_senses(
-      f'policy {type(policy).__name__}',
-      policy.required_senses,
-      [
-          key.removeprefix(_SENSES)
-          for key in env.observation_spec()
-          if key.startswith(_SENSES)
-      ],
-  )
+    Args:
+      policy: The policy.
+      env: Environment with one world or a batch.
+
+    Raises:
+      SpecError: If observations lack a sense that the policy requires, or if
+        the task does not offer a privileged one.
+    """
+    self._env = env
+    name = f'policy {type(policy).__name__}'
+    selected = [
+        key.removeprefix(_SENSES)
+        for key in env.observation_spec()
+        if key.startswith(_SENSES)
+    ]
+    policies.check_senses(name, policy.required_senses, selected)
+    wanted = policy.privileged_senses
+    offered = getattr(env.task, 'privileged_senses', {})  # Not of foreign ones.
+    if missing := [sense for sense in wanted if sense not in offered]:
+      raise errors.SpecError(
+          f'{name} reads {missing} from the state of the world; this task'
+          f' offers {sorted(offered)}'
+      )
+    self._functions = {f'privileged/{one}': offered[one] for one in wanted}
+
+  def added_to(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Returns an observation of the current step with these senses."""
+    if not self._functions:
+      return observation
+    physics = self._env.physics
+    privileged = {
+        key: np.array(function(physics))
+        for key, function in self._functions.items()
+    }
+    return {**observation, **privileged}
 
 
 @final

@@ -54,7 +54,7 @@ class BatchPolicyActor:
       SpecError: If the action sets of the policy and the batch differ, or if
         the policy needs other senses.
     """
-    actors.check_senses(policy, batch)
+    self._privileged = actors.PrivilegedSenses(policy, batch)
     self._policy = policy = policy.in_action_set(batch.action_set)
     mechanism = batch.mechanism
     design = mechanism.design
@@ -81,7 +81,7 @@ class BatchPolicyActor:
   def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
     """Returns actions, `(worlds, *action_spec.shape)`."""
     chosen, self._state = self._policy.step(
-        time_step.observation,
+        self._privileged.added_to(time_step.observation),
         np.full(len(self._keys), self._step == 0),
         random_keys.of_step(self._keys, self._step),
         self._state,

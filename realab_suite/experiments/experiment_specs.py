@@ -240,7 +240,7 @@ class ExperimentSpec(validation.Spec):
     self.training_world.load(design, 0).close()
     with contextlib.closing(self.world.load(design, 0)) as env:
       for name in self.baselines:
-        actors.check_senses(policies.make(name), env)
+        actors.PrivilegedSenses(policies.make(name), env)
 
   @property
   def designs(self) -> Mapping[str, specs.DesignSpec]:

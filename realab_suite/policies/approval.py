@@ -37,6 +37,7 @@ class PolicyApproval(base.ValueFunction):
       options: Keyword arguments of the policy.
     """
     self._policy = base.make(policy, **(options or {}))
+    base.refuse_privileged(self._policy, 'an adviser')
     controls = self.action_set.table(avatars.ACTIONS)
     distances = np.linalg.norm(controls[:, np.newaxis] - controls, axis=-1)
     self._values = 1.0 - 2.0 * distances / distances.max()

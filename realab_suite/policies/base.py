@@ -44,6 +44,16 @@ class Policy(abc.ABC):
     """Names of the senses that the policy reads from observations."""
     return ()
 
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    """Names of functions of the task that the policy reads as well.
+
+    They are keys of `Task.privileged_senses`, and in observations
+    `privileged/<name>`. No agent has them, so a policy that reads them is a
+    solver or a reference.
+    """
+    return ()
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step.
 
@@ -173,6 +183,24 @@ def check_senses(
     raise errors.SpecError(
         f'{what} needs the senses {missing}, which are not selected; selected'
         f' are {list(selected)}'
+    )
+
+
+def refuse_privileged(policy: Policy, place: str) -> None:
+  """Refuses a policy that reads more than observations.
+
+  Args:
+    policy: The policy.
+    place: What the policy is to be, for messages.
+
+  Raises:
+    ValueError: If it declares `privileged_senses`.
+  """
+  if policy.privileged_senses:
+    raise ValueError(
+        f'{type(policy).__name__} reads {list(policy.privileged_senses)} from'
+        f' the state of the world; allowed as {place} are policies that read'
+        ' observations alone'
     )
 
 

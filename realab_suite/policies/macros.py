@@ -164,6 +164,10 @@ class MacroPolicy(base.Policy):
     own = (*navigation.SENSES, 'holding')
     return tuple(dict.fromkeys((*own, *self._solver.required_senses)))
 
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self._solver.privileged_senses
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     shape = (*batch_shape, *self._starts.shape[-2:])
     return {

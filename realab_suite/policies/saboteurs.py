@@ -244,7 +244,7 @@ def carry(
   carries = np.where(
       arrived, navigation.action('wait'), navigation.steer(view, bearing)
   )
-  return np.where(holds, carries, _fetch(view, aim, block))
+  return np.where(holds, carries, fetch(view, aim, block))
 
 
 def throw(
@@ -252,11 +252,11 @@ def throw(
 ) -> np.ndarray:
   """Returns the action that fetches a block and throws it; see `carry`."""
   throws = navigation.face(view, _onward(view, aim), navigation.action('throw'))
-  return np.where(holds, throws, _fetch(view, aim, block))
+  return np.where(holds, throws, fetch(view, aim, block))
 
 
-def _fetch(view: navigation.View, aim: Aim, block: np.ndarray) -> np.ndarray:
-  """Returns the action that goes to the block and grasps it."""
+def fetch(view: navigation.View, aim: Aim, block: np.ndarray) -> np.ndarray:
+  """Returns the action that goes to a block and grasps it; see `carry`."""
   distance, bearing = view.locate_one(block)
   away = (view.position - block) / distance.clip(1e-3)[..., np.newaxis]
   untouched = np.linalg.norm(block - aim.start, axis=-1) < 2 * _HALF_BLOCK

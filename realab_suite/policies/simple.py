@@ -92,6 +92,10 @@ class Distracted(base.Policy):
   def required_senses(self) -> tuple[str, ...]:
     return self._policy.required_senses
 
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self._policy.privileged_senses
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return self._policy.initial_state(batch_shape)
 

@@ -199,6 +199,15 @@ class Task(composer.Task):
     self.latch_events(physics)
 
   @property
+  def privileged_senses(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
+    """Functions of the physics that the solver may sense, by name.
+
+    Each returns numbers, `(..., *shape)`. They are never part of observations:
+    only policies that declare them get them, which are no agents.
+    """
+    return {}
+
+  @property
   def sense_spec(self) -> dict[str, specs.Array]:
     """Specs of the senses that this world offers, by name, for one world."""
     codes = appearance.listed_codes(self._arena.mjcf_model)

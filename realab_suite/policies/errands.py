@@ -1,0 +1,110 @@
+"""Errands of scripted policies: to go to the nearest place, to deliver a block.
+
+Solvers know the places of things; see `base.Policy.privileged_senses`.
+"""
+
+import abc
+from typing import Any
+
+import numpy as np
+
+from realab_suite.policies import base
+from realab_suite.policies import navigation
+from realab_suite.policies import saboteurs
+
+# Distance from the middle of the avatar to a held block, metres.
+_HAND = 0.45
+# Distance from its goal at which a block is put down, metres.
+_THERE = 0.12
+_ASTRAY = 0.25
+
+
+class Errand(base.Policy, abc.ABC):
+  """Base class of solvers that decide on an action from the present moment.
+
+  It remembers only for how long the avatar has been in a small area, and frees
+  it if that is too long.
+  """
+
+  required_senses = (*navigation.SENSES, 'holding')
+
+  @abc.abstractmethod
+  def act(
+      self, view: navigation.View, holds: np.ndarray, seen: base.Observation
+  ) -> np.ndarray:
+    """Returns the index of the action, `(...)`.
+
+    Args:
+      view: View of the avatar.
+      holds: True if the hand holds a block, `(...)`.
+      seen: Observation, with the privileged senses `privileged/<name>`.
+    """
+
+  def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
+    return navigation.initial_rest(batch_shape)
+
+  def step(
+      self,
+      observation: base.Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    del key
+    start = np.asarray(episode_start)
+    memory = navigation.restarted(start, self.initial_state(()), state)
+    view = navigation.view(observation)
+    holds = np.asarray(observation['senses/holding'])[..., 0] > 0
+    action = self.act(view, holds, observation)
+    is_content = action == navigation.action('wait')
+    memory = navigation.rest(view, memory, is_content)
+    return navigation.unless_stuck(view, memory['still'], action), memory
+
+
+def nearest(
+    view: navigation.View, places: np.ndarray, counts: np.ndarray
+) -> np.ndarray:
+  """Returns the nearest of some places, `(..., 2)`, metres.
+
+  Args:
+    view: View of the avatar.
+    places: Places, `(..., places, 2)`, metres.
+    counts: Which of them count, `(..., places)` bool. If none does, the result
+      is the first place.
+  """
+  distances = np.where(counts, view.locate(places)[0], np.inf)
+  index = distances.argmin(axis=-1)[..., np.newaxis, np.newaxis]
+  return np.take_along_axis(places, index, -2)[..., 0, :]
+
+
+def deliver(
+    view: navigation.View,
+    block: np.ndarray,
+    holds: np.ndarray,
+    goal: np.ndarray,
+) -> np.ndarray:
+  """Returns the action that brings a block to a place and lets go of it.
+
+  Args:
+    view: View of the avatar.
+    block: Position of the block, `(..., 2)`, metres.
+    holds: True if the hand holds a block, `(...)`.
+    goal: Place of the block, `(..., 2)`, metres.
+  """
+  away = view.position - block
+  side = away / np.linalg.norm(away, axis=-1).clip(1e-3)[..., np.newaxis]
+  # The start of the aim is far away, so any side of the block is as good.
+  nowhere = np.full(block.shape, 1e6)
+  aim = saboteurs.Aim(nowhere, side, side, np.array(saboteurs.UNSEEN))
+  distance, bearing = view.locate_one(goal)
+  action = navigation.action
+  brings = np.where(
+      distance < _HAND - _ASTRAY,
+      action('backward'),
+      np.where(
+          distance < _HAND + _THERE,
+          navigation.face(view, bearing, action('let_go')),
+          navigation.steer(view, bearing),
+      ),
+  )
+  return np.where(holds, brings, saboteurs.fetch(view, aim, block))
