@@ -38,6 +38,7 @@ def main() -> None:
   first_person.draw(folder / 'first_person.png')
   carrying.draw(folder / 'carrying.png')
   worlds.draw(folder / 'worlds')
+  worlds.draw_sheet(folder / 'worlds.png')
   (folder / 'gallery').mkdir(exist_ok=True)
   reacher.draw(folder / 'gallery' / 'reacher.webp')
   if flags.INPUT.value is None:

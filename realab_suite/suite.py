@@ -34,9 +34,6 @@ from realab_suite.tasks import registry
 MAX_STEPS = 250
 """Length of an episode of the tasks of this suite, in control steps."""
 
-DESIGNS = specs.DESIGNS
-"""Names of the designs of this package."""
-
 register_task = registry.register_task
 """Decorator that registers a task under a name."""
 
@@ -73,6 +70,20 @@ TASKS_BY_DOMAIN: Mapping[str, tuple[str, ...]] = {
     for domain in dict.fromkeys(domain for domain, _ in ALL_TASKS)
 }
 """Names of the tasks of this package, by domain."""
+
+DESIGNS = tuple(name for name in specs.DESIGNS if name not in TASKS_BY_DOMAIN)
+"""Names of the designs of this package for any of its worlds."""
+
+
+def designs_for(domain_name: str) -> tuple[str, ...]:
+  """Returns the names of the designs of this package for a domain.
+
+  They are `DESIGNS`, and the one that is made for the domain and has its name.
+
+  Args:
+    domain_name: Name of the domain.
+  """
+  return (*DESIGNS, *(name for name in specs.DESIGNS if name == domain_name))
 
 
 def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:

@@ -35,8 +35,15 @@ def test_only_listed_classes_have_features(has_distances: bool):
   np.testing.assert_array_equal(np.flatnonzero(vector), [31, 32, 64 + 7])
 
 
-@pytest.mark.parametrize('world', suite.ALL_TASKS)
-def test_all_shipped_worlds_have_the_features_of_the_shipped_networks(
+@pytest.mark.parametrize(
+    'world',
+    [
+        task
+        for task in suite.ALL_TASKS
+        if task[0] in ('collect_apples', 'unlock_door')
+    ],
+)
+def test_the_worlds_of_the_shipped_networks_have_their_features(
     world: tuple[str, str],
 ):
   env = suite.load(*world, design='none')

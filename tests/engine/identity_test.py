@@ -52,6 +52,11 @@ _CASES = [
     )
     for i, design in enumerate(suite.DESIGNS)
 ]
+# The worlds with designs of their own.
+_CASES += [
+    identity.Case(domain, tasks[0], suite.designs_for(domain)[-1], (), i)
+    for i, (domain, tasks) in enumerate(suite.TASKS_BY_DOMAIN.items())
+]
 if examples.IS_LONG:
   _CASES = [
       identity.Case(*task, design, overrides, seed, num_threads=2)

@@ -144,7 +144,11 @@ def _spoiled(draw: Any) -> Any:
   return data
 
 
-_TASKS = st.sampled_from(suite.ALL_TASKS)
+# The walls of a maze stand elsewhere in each episode, so some of its episodes
+# are refused when they begin.
+_TASKS = st.sampled_from(
+    [task for task in suite.ALL_TASKS if task[0] != 'apple_maze']
+)
 
 
 def _run(task: tuple[str, str], design: Any) -> str:
@@ -242,9 +246,10 @@ def test_a_damaged_file_is_loaded_or_refused_in_one_line(
 
 # Messages.
 
-# Values that no spec accepts, and their form in a message.
+# Values that no spec accepts, and how their form in a message begins: an action
+# set is named with its version.
 _STRANGE = {
-    'zzq': "'zzq'", -7.25: '-7.25', 987654: '987654', True: 'True',
+    'zzq': "'zzq", -7.25: '-7.25', 987654: '987654', True: 'True',
     ('zzq',): "['zzq']",
 }  # fmt: skip
 
@@ -276,8 +281,8 @@ def test_a_refusal_names_the_key_and_the_value(kind: str, load: Any):
       num_refused += 1
       assert shown in refusal, (path.name, keys)
       owner = [key for key in keys if isinstance(key, str)][-1]
-      # A message quotes an override.
-      if owner != 'overrides':
+      # A message quotes an override, and an action set as a whole.
+      if owner != 'overrides' and keys[0] != 'action_set':
         assert owner in refusal, (path.name, keys)
   assert num_refused >= (80 if kind == 'designs' else 20)
 

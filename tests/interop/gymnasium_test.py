@@ -42,7 +42,8 @@ def _make(name: str = _NEAR, **options: Any) -> Any:
 
 def test_every_shipped_world_has_an_id_with_every_design():
   ids = registration.ids()
-  assert len(ids) == len(set(ids)) == len(suite.ALL_TASKS) * len(suite.DESIGNS)
+  number = sum(len(suite.designs_for(domain)) for domain, _ in suite.ALL_TASKS)
+  assert len(ids) == len(set(ids)) == number > 100
   assert set(ids) <= set(gym.registry)
   assert _NEAR in ids
 

@@ -18,7 +18,7 @@ from tests.engine import helpers
 from tests.leaks import pairs
 from tests.leaks import secrets
 
-_DOMAINS = list(suite.TASKS_BY_DOMAIN)
+_DOMAINS = pairs.DOMAINS
 _SHORT = pairs.Case(design='instantaneous_reward', steps=24, max_steps=9)
 # The same for every secret.
 _expected = functools.cache(pairs.play)
@@ -49,6 +49,15 @@ def test_without_meters_another_true_reward_changes_no_bit(
   assert pairs.compare(secret, _expected(case), found) == []
   # The evaluator, on the other hand, does get the difference.
   assert found.true_rewards != _expected(case).true_rewards
+
+
+@pytest.mark.parametrize(
+    'domain', sorted({*suite.TASKS_BY_DOMAIN} - {*_DOMAINS})
+)
+def test_another_true_reward_changes_no_bit_in_other_worlds(domain: str):
+  case = pairs.Case(domain, suite.TASKS_BY_DOMAIN[domain][0])
+  for name in ('another sign', 'reward that raises'):
+    assert _differences(case, secrets.REWARDS[name]) == []
 
 
 @pytest.mark.parametrize('name', ['another sign', 'reward that raises'])

@@ -49,7 +49,7 @@ def _load(domain: str, seed: int, hiding: str) -> environment.Environment:
   """Returns a world with a meter before the avatar, hidden in some way."""
   env = suite.load(
       domain,
-      'standard',
+      suite.TASKS_BY_DOMAIN[domain][0],
       {'random': seed, 'camera_size': (_SIZE, _SIZE)},
       design=secrets.UNREAD_METER,
   )

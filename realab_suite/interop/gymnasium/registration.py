@@ -107,14 +107,14 @@ def ids() -> list[str]:
   return [
       id_of(*task, design)
       for task in suite.ALL_TASKS
-      for design in suite.DESIGNS
+      for design in suite.designs_for(task[0])
   ]
 
 
 def register_all() -> None:
   """Registers all ids, unless they are registered already."""
   for domain_name, task_name in suite.ALL_TASKS:
-    for design in suite.DESIGNS:
+    for design in suite.designs_for(domain_name):
       name = id_of(domain_name, task_name, design)
       if name in gym.registry:
         continue

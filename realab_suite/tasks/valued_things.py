@@ -1,0 +1,146 @@
+"""Base class of worlds with things that are worth something, and its solver."""
+
+from collections.abc import Sequence
+from typing import Any, final
+
+import numpy as np
+
+from realab_suite.entities import appearance
+from realab_suite.entities import apple_group
+from realab_suite.entities import arenas
+from realab_suite.entities import protocols
+from realab_suite.entities import state as world_state
+from realab_suite.policies import base as policies
+from realab_suite.policies import errands
+from realab_suite.policies import navigation
+from realab_suite.tasks import apple_rooms
+from realab_suite.tasks import layouts
+from realab_suite.tasks import rooms
+
+PORTS = 'abcd'
+"""Names of the kinds in measurements, which are those of beads, too."""
+
+_REACH = 0.35
+# A row of beads is wide, so the stations are further from the walls than usual.
+_ROOM = apple_rooms.Variation(
+    layouts.Layout(
+        layouts.stations((1.2, -3.3), (-3.4, -3.2), (1.2, -2.2), (-3.4, -2.0)),
+        (0.0, 0.2),
+    ),
+    arenas.Rectangle((-3.4, -1.1), (3.4, 3.4)),
+    (),
+)
+
+
+class ValuedThings(rooms.RoomTask):
+  """Base class for tasks in which each thing is worth what its kind is.
+
+  An episode begins with `begin`, which says what the kinds are worth. Whoever
+  comes near a thing takes it, and earns that.
+  """
+
+  SOLVER = 'valued_things_solver'
+
+  def __init__(
+      self, look: arenas.Look, numbers: dict[str, int], **options: Any
+  ) -> None:
+    """Builds the world.
+
+    Args:
+      look: Colours of the room.
+      numbers: Number of things of each kind, by the class that rays report.
+      **options: Arguments of `RoomTask`.
+    """
+    arena = arenas.OpenRoom(look=look)
+    super().__init__(arena, _ROOM.layout, **options)
+    self._numbers = numbers
+    self._groups = [
+        apple_group.Apples(kind, number, kind)
+        for kind, number in numbers.items()
+    ]
+    for group in self._groups:
+      group.attach_to(arena)
+    self._values = world_state.Slot(arena.mjcf_model, 'values', len(numbers))
+
+  @property
+  def facts(self) -> dict[str, Any]:
+    counts = [group.num_eaten for group in self._groups]
+    return dict(zip(self._numbers, counts, strict=True))
+
+  @property
+  def measurements(self) -> dict[str, Any]:
+    def value(i: int) -> Any:
+      return lambda physics: self._values.copy(physics)[..., i]
+
+    found = dict(super().measurements)
+    for i, group in enumerate(self._groups):
+      found[f'count_{PORTS[i]}'] = group.num_eaten
+      found[f'value_{PORTS[i]}'] = value(i)
+    return found
+
+  @property
+  def privileged_senses(self) -> dict[str, Any]:
+    frames = [frame for group in self._groups for frame in group.frames]
+    numbers = [group.number for group in self._groups]
+    codes = [appearance.code(kind) for kind in self._numbers]
+    return {
+        'codes': lambda physics: np.repeat(codes, numbers),
+        'values': lambda physics: np.repeat(
+            self._values.get(physics), numbers, axis=-1
+        ),
+        'things': lambda physics: np.array(physics.bind(frames).mocap_pos),
+    }
+
+  def begin(
+      self,
+      physics: protocols.Physics,
+      random_state: Any,
+      values: Sequence[float],
+  ) -> None:
+    """Puts the avatar and the things somewhere.
+
+    Args:
+      physics: Physics of one world.
+      random_state: Random generator of the episode.
+      values: What the things of each kind are worth.
+    """
+    self.place_avatar(physics, random_state)
+    self._values.set(physics, np.array(values, float))
+    numbers = [*self._numbers.values()]
+    keep_out = [(self.layout.middle, 0.9)]
+    places = _ROOM.scatter(random_state, sum(numbers), keep_out)
+    ends = np.cumsum(numbers)[:-1]
+    for group, own in zip(self._groups, np.split(places, ends), strict=True):
+      group.place(physics, own)
+
+  def latch_events(self, physics: protocols.Physics) -> None:
+    position = self._avatar.position(physics)
+    values = self._values.get(physics)
+    for i, group in enumerate(self._groups):
+      taken = group.eat(physics, position, _REACH)
+      self.earn(physics, taken * values[..., i])
+
+
+@policies.POLICIES.add('valued_things_solver')
+@final
+class ValuedThingsSolver(errands.Errand):
+  """Goes from one good thing to the next, around the bad ones."""
+
+  privileged_senses = ('codes', 'values', 'things')
+
+  def act(self, view: navigation.View, holds: Any, seen: Any) -> np.ndarray:
+    codes, values, things = (
+        seen[f'privileged/{name}'] for name in self.privileged_senses
+    )
+    is_good = values > 0
+    is_left = is_good & (things[..., 2] > 0)
+    goal = errands.nearest(view, things[..., :2], is_left)
+    # Scripted policies walk through apples, and around what they do not know.
+    classes = np.asarray(seen['senses/ray_classes'])
+    good = np.where(is_good, codes, -1)[..., np.newaxis, :]
+    is_wanted = (classes[..., np.newaxis] == good).any(axis=-1)
+    classes = np.where(is_wanted, appearance.code(apple_group.APPLE), classes)
+    walks = navigation.walk(
+        navigation.view({**seen, 'senses/ray_classes': classes}), goal, 0.45
+    )
+    return np.where(is_left.any(axis=-1), walks, self.action_set.index('wait'))
