@@ -189,7 +189,7 @@ def _refuse(call: Any, name: str, *args: Any) -> None:
   raised = re.search(r': \w+Error(: |$)', text)
   assert 'allowed' in text or 'known are' in text or raised
   assert '\n' not in text
-  assert len(text) < 500
+  assert len(text) < 1000
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ _REACH = 0.5
 
 class _World:
 
-  def __init__(self, large=False):
+  def __init__(self, kind=apple_group.APPLE):
     arena = arenas.OpenRoom()
-    self.apples = apple_group.Apples(number=len(_PLACES), large=large)
+    self.apples = apple_group.Apples(number=len(_PLACES), kind=kind)
     self.apples.attach_to(arena)
     self.avatar = avatars.Avatar(num_rays=33)
     arena.attach(self.avatar)

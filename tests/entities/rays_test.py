@@ -110,11 +110,11 @@ def test_rays_do_not_tilt_with_the_head():
 
 
 @pytest.mark.parametrize(
-    ('large', 'name', 'radius'),
-    [(False, 'apple', 0.2), (True, 'large_apple', 0.4)],
+    ('name', 'radius'),
+    [('apple', 0.2), ('large_apple', 0.4), ('red_ball', 0.2)],
 )
-def test_rays_hit_apples_at_the_distance_of_geometry(large, name, radius):
-  world = _World((apple_group.Apples(number=1, large=large), (2.0, 0.3)))
+def test_rays_hit_apples_at_the_distance_of_geometry(name, radius):
+  world = _World((apple_group.Apples(number=1, kind=name), (2.0, 0.3)))
   distances, names = world.sense()
   # A ray passes below the middle of the sphere.
   circle = np.sqrt(radius**2 - (radius - _HEIGHT) ** 2)

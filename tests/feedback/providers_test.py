@@ -71,6 +71,11 @@ _ADVICE = {**_REWARD, 'reads': ('query',)}
 _CASES: list[tuple[str, dict[str, Any]]] = [
     ('constant', {'writes': ('reward', 'other'), 'value': 1.5}),
     ('difference', {**_REWARD, 'reads': ('score',), 'initial': 2.0}),
+    ('growth', {**_REWARD, 'reads': ('score', 'fine'), 'weights': (1.0, -3.0)}),
+    ('appraisal', {**_REWARD, 'reads': ('count', 'value')}),
+    ('appraisal', {'reads': ('a', 'b', 'likes_a', 'likes_b'), 'drift': 0.2,
+        'writes': ('reward', 'likes_a', 'likes_b')}),
+    ('relay', {**_REWARD, 'reads': ('call',)}),
     *(('demonstration', {**_REWARD, 'policy': policy}) for policy in ('random',
         'apple_seeker', 'network_demonstrator')),
     ('value_advice', {**_ADVICE, 'value_function': 'test_counting'}),

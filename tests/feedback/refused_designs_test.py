@@ -58,7 +58,7 @@ _WRONG = {
         " ['feedback', 'signal', 'memory']",
     'providers.0.kind=diference':
         "providers[0].kind: provider kind 'diference' is unknown; did you mean"
-        " 'difference'?; known are ['constant', ",
+        " 'difference'?; known are ['appraisal', ",
     'providers.0.reads=[score, reward]': 'reads: must have at most 1 item',
     'learner.reward=score':
         "learner.reward: an agent may not read meter register 'score'"
