@@ -27,6 +27,7 @@ TESTS = (
     'tests/authors',
     'tests/config',
     'tests/policies',
+    'tests/tasks/worlds_test.py',
     'tests/feedback',
     'tests/evaluation/ledger_test.py',
     'tests/evaluation/batch_ledger_test.py',

@@ -25,6 +25,8 @@ _KINDS: dict[str, tuple[type[registers.Register], dict[str, Any]]] = {
         {'value_range': (-1.5, 1.0), 'initial': 0.5},
     ),
     'an abacus': (abacus.Abacus, {}),
+    'abacus_2': (registers.Abacus2, {}),
+    'abacus_4': (registers.Abacus4, {'value_range': (-1, 1), 'scale': 0.3}),
 }  # fmt: skip
 
 
