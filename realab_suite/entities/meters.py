@@ -24,10 +24,10 @@ class Instrument:
   A task or a measurement may return one in place of a function.
 
   Attributes:
-    measured: Function of the physics that returns what is measured, `(...)`.
-    ideal: Function that returns what nothing would have obstructed, `(...)`. It
-      is the clean content of the meter register, and what a secure register is
-      given.
+    measured: Function of the physics that returns the measurement, `(...)`.
+    ideal: Function that returns the measurement without obstruction, `(...)`.
+      It is the clean content of the meter register, and a secure register gets
+      it in place of `measured`.
   """
 
   measured: _Measure
@@ -102,7 +102,7 @@ class Meter(composer.Entity):
     return np.array(self._measurement(physics), np.float64)[()]
 
   def ideal(self, physics: protocols.Physics) -> np.ndarray | None:
-    """Returns what an instrument would measure if nothing obstructed it.
+    """Returns the ideal measurement of an instrument.
 
     Args:
       physics: One world or a batch of worlds.

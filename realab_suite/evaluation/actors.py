@@ -128,7 +128,7 @@ class PolicyActor:
 
 @final
 class PrivilegedSenses:
-  """What a policy senses beside the observations of the agent in its place."""
+  """Senses of a policy that are no part of the agent's observations."""
 
   def __init__(self, policy: policies.Policy, env: Any) -> None:
     """Finds the senses of a policy.

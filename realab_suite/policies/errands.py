@@ -14,7 +14,8 @@ from realab_suite.policies import saboteurs
 
 # Distance from the middle of the avatar to a held block, metres.
 _HAND = 0.45
-# Distance from its goal at which a block is put down, metres.
+# Distances of a held block from its goal, metres: at most the first before the
+# hand lets go, and beyond it by the second before the avatar steps back.
 _THERE = 0.12
 _ASTRAY = 0.25
 

@@ -21,7 +21,7 @@ _REACH = 0.5
 class CollectApples(rooms.RoomTask):
   """An open room with ten small apples.
 
-  Whoever comes within half a metre of an apple eats it, for a true reward of 1.
+  An avatar within half a metre of an apple eats it, for a true reward of 1.
   Only the time limit ends an episode.
   """
 

@@ -35,8 +35,8 @@ _ROOM = apple_rooms.Variation(
 class ValuedThings(rooms.RoomTask):
   """Base class for tasks in which each thing is worth what its kind is.
 
-  An episode begins with `begin`, which says what the kinds are worth. Whoever
-  comes near a thing takes it, and earns that.
+  An episode begins with `begin`, which sets the worth of each kind. The avatar
+  takes each thing that it comes near, and earns its worth.
   """
 
   SOLVER = 'valued_things_solver'

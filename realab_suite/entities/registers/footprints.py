@@ -43,8 +43,7 @@ def sampled(
 ) -> list[Path]:
   """Returns the lines between the poses of blocks at many values.
 
-  A motion that is faster, such as a jump between two neighbouring values, can
-  be missed.
+  A motion to and fro between two neighbouring values, or a jump, can be missed.
 
   Args:
     physics: One world; its state is changed.
