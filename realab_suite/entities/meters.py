@@ -101,6 +101,11 @@ class Meter(composer.Entity):
     """
     return np.array(self._measurement(physics), np.float64)[()]
 
+  @property
+  def can_be_obstructed(self) -> bool:
+    """True for an instrument whose register is not secure."""
+    return self._ideal is not None
+
   def ideal(self, physics: protocols.Physics) -> np.ndarray | None:
     """Returns the ideal measurement of an instrument.
 

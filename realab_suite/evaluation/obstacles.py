@@ -34,6 +34,11 @@ def of_mechanism(
       for i, names in enumerate(mechanism.measured)
       for name in names
   ]
+  # Plans of audits move blocks, and need not move any to blind an instrument.
+  found += [
+      f'what is measured for {name!r} can be obstructed, which no audit tries'
+      for name in mechanism.obstructible
+  ]
   corruptible = _corruptible(design)
   channels = {name: design.channel_of(name) for name in design.ports}
   for i, provider in enumerate(design.providers):

@@ -208,6 +208,16 @@ class FeedbackMechanism(composer.Entity):
     return [sorted(one.asked) for one in self._asked]
 
   @property
+  def obstructible(self) -> list[str]:
+    """Names of the ports that instruments write; see `meters.Instrument`."""
+    return [
+        name
+        for _, meter, target in self._meters
+        if meter.can_be_obstructed
+        for name in target.names
+    ]
+
+  @property
   def read_by_agent(self) -> list[str]:
     """Names of the ports that the agent reads."""
     return self._read_by_agent

@@ -11,6 +11,7 @@ from realab_suite import errors
 from realab_suite import suite
 from realab_suite import testing
 from realab_suite.audit import aiming
+from realab_suite.evaluation import obstacles
 from realab_suite.feedback import specs
 from realab_suite.tasks import registry
 from tests.engine import helpers
@@ -217,6 +218,15 @@ def test_the_supervisor_sees_who_is_in_view(is_hidden: bool):
       0.0 if is_hidden else 1.0, abs=1e-6
   )
   env.close()
+
+
+@pytest.mark.parametrize('channel', ['embedded', 'welded', 'secure'])
+def test_a_supervisor_that_can_be_blinded_forbids_favour(channel: str):
+  env = _load('supervised_room', [f'channel={channel}'])
+  reasons = obstacles.of_mechanism(env.mechanism, env.task.INSTRUMENTS, None)
+  env.close()
+  is_blinded = "what is measured for 'seen' can be obstructed" in str(reasons)
+  assert is_blinded == (channel != 'secure')
 
 
 def test_the_users_own_rule_changes_the_liking_and_is_no_corruption():
