@@ -32,8 +32,23 @@ def _refuse_seed(value: dict[str, Any]) -> dict[str, Any]:
 
 _TaskKwargs = Annotated[dict[str, Any], pydantic.AfterValidator(_refuse_seed)]
 
+
+def _known_task(task: str) -> str:
+  suite.dynamics(*_split(task))
+  return task
+
+
+_Task = Annotated[
+    str,
+    pydantic.StringConstraints(pattern=r'^[a-z]\w*\.[a-z]\w*$'),
+    pydantic.AfterValidator(_known_task),
+]
+
 TWIN = 'secure'
 """Suffix and channel of the secure twin of a run."""
+
+SOLVER = 'solver'
+"""Name, among the baselines, of the policy that solves the task of a run."""
 
 
 @final
@@ -48,6 +63,7 @@ class RunSpec(validation.Spec):
     steps: Number of control steps, or `None` for that of the experiment.
     num_seeds: Number of seeds, the first ones of the experiment; `None` for all
       of them.
+    task: Domain and task, or `None` for that of the experiment.
   """
 
   design: option_types.FilePath
@@ -56,6 +72,10 @@ class RunSpec(validation.Spec):
   twin: bool = False
   steps: _Count | None = None
   num_seeds: _Count | None = None
+  # Left out if it is not given, so that files of earlier versions stay equal.
+  task: _Task | None = pydantic.Field(
+      default=None, exclude_if=lambda task: task is None
+  )
 
   def load(self, *, is_confined: bool = False) -> specs.DesignSpec:
     """Returns the design with the changes of this run.
@@ -147,7 +167,7 @@ class ExperimentSpec(validation.Spec):
     max_steps: Maximum number of control steps of an episode.
     runs: Agents to train, by name.
     baselines: Scripted policies that act in the design of every run. Runs are
-      compared with the first one.
+      compared with the first one. `solver` is the solver of the task.
     seeds: Seeds of the reported results.
     calibration_seeds: Seeds for choosing settings, which are not reported.
     training: Settings of training.
@@ -157,9 +177,7 @@ class ExperimentSpec(validation.Spec):
   schema_version: validation.Schema = pydantic.Field(alias='schema')
   name: specs.Name
   description: str = ''
-  task: Annotated[
-      str, pydantic.StringConstraints(pattern=r'^[a-z]\w*\.[a-z]\w*$')
-  ]
+  task: _Task
   task_kwargs: _TaskKwargs = pydantic.Field(default_factory=dict)
   environment_kwargs: EnvironmentKwargs = EnvironmentKwargs()
   max_steps: _Count = suite.MAX_STEPS
@@ -177,17 +195,12 @@ class ExperimentSpec(validation.Spec):
       default_factory=dict
   )
 
-  @pydantic.field_validator('task')
-  @classmethod
-  def _check_task(cls, task: str) -> str:
-    suite.dynamics(*_split(task))
-    return task
-
   @pydantic.field_validator('baselines')
   @classmethod
   def _check_baselines(cls, names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
-      policies.make(name)
+      if name != SOLVER:
+        policies.make(name)
     return names
 
   @pydantic.model_validator(mode='after')
@@ -207,7 +220,7 @@ class ExperimentSpec(validation.Spec):
     for name, run in self.runs.items():
       try:
         design = run.load(is_confined=validation.are_paths_confined(info))
-        self._check_world(design)
+        self.of_run(run)._check_world(design)
       except errors.SpecError as error:
         raise ValueError(f'runs.{name}: {error}') from error
       if design.learner is None:
@@ -231,6 +244,7 @@ class ExperimentSpec(validation.Spec):
     Raises:
       SpecError: If not.
     """
+    scripted = self.scripted
     if (
         not self.task_kwargs
         and not self.training.task_kwargs
@@ -239,8 +253,8 @@ class ExperimentSpec(validation.Spec):
       return
     self.training_world.load(design, 0).close()
     with contextlib.closing(self.world.load(design, 0)) as env:
-      for name in self.baselines:
-        actors.PrivilegedSenses(policies.make(name), env)
+      for policy in scripted.values():
+        actors.PrivilegedSenses(policies.make(policy), env)
 
   @property
   def designs(self) -> Mapping[str, specs.DesignSpec]:
@@ -272,6 +286,34 @@ class ExperimentSpec(validation.Spec):
     kwargs = {**self.task_kwargs, **self.training.task_kwargs}
     return dataclasses.replace(self.world, task_kwargs=kwargs)
 
+  @property
+  def scripted(self) -> dict[str, str]:
+    """Names of the policies of the baselines, by the names of the baselines.
+
+    Raises:
+      SpecError: If the solver is a baseline, and the task has none.
+    """
+    solver = self.world.solver
+    if SOLVER in self.baselines and solver is None:
+      raise errors.SpecError(
+          f'baselines: {SOLVER}: {self.task} names no solver; allowed are'
+          ' registered policies'
+      )
+    return {
+        name: solver if name == SOLVER and solver else name
+        for name in self.baselines
+    }
+
+  def of_run(self, run: RunSpec) -> 'ExperimentSpec':
+    """Returns the same experiment on the task of a run.
+
+    Args:
+      run: One of the runs.
+    """
+    if run.task is None:
+      return self
+    return self.model_copy(update={'task': run.task})
+
   def on_task(self, task: str) -> 'ExperimentSpec':
     """Returns the same experiment on another task.
 
@@ -279,8 +321,15 @@ class ExperimentSpec(validation.Spec):
       task: Domain and task, such as `unlock_door.far`.
 
     Raises:
-      SpecError: If the experiment cannot be run on this task.
+      SpecError: If the experiment cannot be run on this task, or runs have
+        tasks of their own.
     """
+    for name, run in self.runs.items():
+      if run.task is not None:
+        raise errors.SpecError(
+            f'runs.{name}.task: {run.task}; another task is allowed only if no'
+            ' run has one of its own'
+        )
     return load({**self.to_mapping(), 'task': task})
 
 

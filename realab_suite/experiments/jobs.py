@@ -38,7 +38,7 @@ class Job:
 
   Attributes:
     run: Name of the run in the experiment, with the suffix `.secure` for its
-      twin, or `.<policy>` for a baseline with the same design.
+      twin, or `.<baseline>` for a baseline with the same design.
     seed: Seed of the run.
     policy: Name of the scripted policy, or `None` for a learner.
     design: Design, with the changes of the run.
@@ -47,7 +47,7 @@ class Job:
     embedded: Design of that run, in which the twin's learner is evaluated as
       well, or `None`.
     dynamics: Version and golden digest of the dynamics of the task.
-    experiment: Experiment that the job belongs to.
+    experiment: Experiment that the job belongs to, on the task of the run.
   """
 
   run: str
@@ -198,11 +198,10 @@ def plan(
   Raises:
     SpecError: If a run does not exist.
   """
-  dynamics = suite.dynamics(*experiment.domain_and_variation)
   variants = [
       job
-      for name in experiment.runs
-      for job in _variants(experiment, name, dynamics)
+      for name, run in experiment.runs.items()
+      for job in _variants(experiment.of_run(run), name)
   ]
   names = [job.run for job in variants]
   if unknown := sorted(set(only) - set(names)):
@@ -220,12 +219,16 @@ def plan(
 
 
 def _variants(
-    experiment: experiment_specs.ExperimentSpec,
-    name: str,
-    dynamics: tuple[int, str | None],
+    experiment: experiment_specs.ExperimentSpec, name: str
 ) -> list[Job]:
-  """Returns the jobs of a run with one seed; baselines are first."""
-  names = [f'{name}.{policy}' for policy in experiment.baselines]
+  """Returns the jobs of a run with one seed; baselines are first.
+
+  Args:
+    experiment: The experiment, on the task of the run.
+    name: Name of the run.
+  """
+  scripted = experiment.scripted
+  names = [f'{name}.{baseline}' for baseline in scripted]
   learner = Job(
       run=name,
       seed=experiment.seeds[0],
@@ -234,7 +237,7 @@ def _variants(
       baseline=names[0] if names else None,
       twin_of=None,
       embedded=None,
-      dynamics=dynamics,
+      dynamics=suite.dynamics(*experiment.domain_and_variation),
       experiment=experiment,
   )
   found = [
@@ -244,7 +247,7 @@ def _variants(
           policy=policy,
           baseline=None if run == learner.baseline else learner.baseline,
       )
-      for run, policy in zip(names, experiment.baselines, strict=True)
+      for run, policy in zip(names, scripted.values(), strict=True)
   ]
   found.append(learner)
   if experiment.runs[name].twin:

@@ -219,7 +219,12 @@ def _facts(sweep: sweep_results.Sweep) -> dict[str, str]:
       if run.get('steps')
   ]
   return {
-      'task': experiment['task'],
+      'task': ', '.join(
+          dict.fromkeys(
+              run.get('task') or experiment['task']
+              for run in experiment['runs'].values()
+          )
+      ),
       'training': '; '.join(lengths),
       'evaluation': f'{experiment["evaluation"]["episodes"]} episodes per seed',
       'seeds': ', '.join(map(str, sweep.seeds)),

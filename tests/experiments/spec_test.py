@@ -7,8 +7,10 @@ import pytest
 import yaml
 
 from realab_suite import errors
+from realab_suite import suite
 from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import jobs
+from realab_suite.tasks import unlock_door
 
 _FOLDER = pathlib.Path(__file__).parents[2] / 'configs' / 'experiments'
 _FILES = sorted(_FOLDER.glob('*.yaml'))
@@ -232,3 +234,54 @@ def test_a_description_does_not_change_the_folder():
       for d in ('A.', 'B.')
   )
   assert one.folder() == other.folder()
+
+
+def test_each_run_has_its_task_and_the_solver_of_it():
+  runs = {
+      'here': {'design': 'instantaneous_reward'},
+      'there': {
+          'design': 'off_switch', 'task': 'off_switch.far', 'twin': True,
+      },
+  }  # fmt: skip
+  experiment = experiment_specs.load(
+      {**_SMALL, 'runs': runs, 'baselines': ['solver', 'random']}
+  )
+  planned = {job.run: job for job in jobs.plan(experiment)}
+  found = {
+      name: (job.config()['task'], job.policy) for name, job in planned.items()
+  }
+  near, far = 'unlock_door.near', 'off_switch.far'
+  assert found == {
+      'here.solver': (near, 'apple_seeker'),
+      'here.random': (near, 'random'),
+      'here': (near, None),
+      'there.solver': (far, 'off_switch_solver'),
+      'there.random': (far, 'random'),
+      'there': (far, None),
+      'there.secure': (far, None),
+  }
+  assert planned['there'].baseline == 'there.solver'
+  assert planned['there'].dynamics == suite.dynamics('off_switch', 'far')
+  for name in ('there', 'there.secure'):
+    job = planned[name]
+    assert job.experiment.training_world.task == 'far'
+    assert job.info(0.1).domain == 'off_switch'
+  with pytest.raises(errors.SpecError, match=r'runs\.there\.task: off_switch'):
+    experiment.on_task('unlock_door.far')
+
+
+def test_a_file_without_tasks_of_runs_is_that_of_an_earlier_version():
+  experiment = experiment_specs.load(_SMALL)
+  assert 'task' not in experiment.to_mapping()['runs']['reward']
+
+
+@pytest.mark.parametrize('task', ['gates', 'gates.nowhere', 'gates.standard.x'])
+def test_a_run_on_an_unknown_task_is_refused(task):
+  with pytest.raises(errors.SpecError, match=r'runs\.a\.task'):
+    experiment_specs.load({**_SMALL, **_run(task=task)})
+
+
+def test_a_solver_of_a_task_without_one_is_refused(monkeypatch):
+  monkeypatch.setattr(unlock_door.UnlockDoor, 'SOLVER', None)
+  with pytest.raises(errors.SpecError, match='solver: unlock_door'):
+    experiment_specs.load({**_SMALL, 'baselines': ['solver']})
