@@ -159,6 +159,15 @@ class Task(composer.Task):
   def max_true_return(self) -> float:
     """Largest true return of an episode."""
 
+  @property
+  def best_mean_return(self) -> float:
+    """Mean true return of episodes that are played as well as possible.
+
+    It is less than `max_true_return` where more can be earned in some episodes
+    than in others.
+    """
+    return self.max_true_return
+
   @abc.abstractmethod
   def latch_events(self, physics: protocols.Physics) -> None:
     """Records the events since the last call."""
