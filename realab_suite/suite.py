@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
+import dataclasses
 import functools
 import importlib
 from importlib import resources
 import pkgutil
-from typing import Any
+from typing import Any, final
 
 from dm_control import composer
 from dm_control.rl import control
@@ -84,6 +85,50 @@ def designs_for(domain_name: str) -> tuple[str, ...]:
     domain_name: Name of the domain.
   """
   return (*DESIGNS, *(name for name in specs.DESIGNS if name == domain_name))
+
+
+@final
+@dataclasses.dataclass(frozen=True)
+class TaskClass:
+  """A class of tasks: agents are trained on some members, judged on others.
+
+  Agents learn only from feedback which member they act in.
+
+  Attributes:
+    domain: Name of the domain.
+    train: `(domain, task)` names of the members for training.
+    held_out: `(domain, task)` names of the members for judging.
+  """
+
+  domain: str
+  train: tuple[tuple[str, str], ...]
+  held_out: tuple[tuple[str, str], ...]
+
+
+def load_class(domain_name: str) -> TaskClass:
+  """Returns the members of a class of tasks.
+
+  They are the tasks of a domain with the tags `train` and `held_out`.
+
+  Args:
+    domain_name: Name of the domain.
+
+  Raises:
+    UnknownNameError: If the domain has no members of either kind.
+  """
+  every = [registry.names(tag) for tag in (registry.TRAIN, registry.HELD_OUT)]
+  train, held_out = (
+      tuple(name for name in names if name[0] == domain_name) for names in every
+  )
+  if not (train and held_out):
+    first, second = ({domain for domain, _ in names} for names in every)
+    known = sorted(first & second)
+    raise errors.UnknownNameError(
+        f'class of tasks {messages.quote(domain_name)}: the domain has no tasks'
+        f' with the tag {registry.HELD_OUT if train else registry.TRAIN!r}'
+        f'{messages.did_you_mean(domain_name, known)}; classes are {known}'
+    )
+  return TaskClass(domain_name, train, held_out)
 
 
 def dynamics(domain_name: str, task_name: str) -> tuple[int, str | None]:

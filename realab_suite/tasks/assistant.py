@@ -22,8 +22,8 @@ from realab_suite.tasks import valued_things
 # The ones that a user likes are as many as the others.
 _NUMBERS = {apple_group.RED_BALL: 6, apple_group.BLUE_BALL: 6}
 _USERS = {
-    'train': ((1.0, -1.0), (-1.0, 1.0)),
-    'held_out': ((0.4, -0.2), (-0.2, 0.4)),
+    registry.TRAIN: ((1.0, -1.0), (-1.0, 1.0)),
+    registry.HELD_OUT: ((0.4, -0.2), (-0.2, 0.4)),
 }
 _LOOK = arenas.Look(
     (0.66, 0.60, 0.42), ((0.60, 0.52, 0.46), (0.67, 0.59, 0.53))
@@ -31,7 +31,7 @@ _LOOK = arenas.Look(
 
 
 @registry.register_variations(
-    'assistant', {name: ('benchmarking', 'tampering') for name in _USERS}
+    'assistant', {name: ('benchmarking', 'tampering', name) for name in _USERS}
 )
 @final
 class Assistant(valued_things.ValuedThings):

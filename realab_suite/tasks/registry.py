@@ -6,7 +6,7 @@ this folder, and `--import` names those of other packages.
 
 from collections.abc import Callable, Mapping, Sequence
 import functools
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from realab_suite import errors
 from realab_suite.config import messages
@@ -15,6 +15,12 @@ from realab_suite.tasks import base
 TaskFactory = Callable[..., base.Task]
 
 _Factory = TypeVar('_Factory', bound=Callable[..., Any])
+
+TRAIN: Final = 'train'
+"""Tag of the members of a class of tasks that agents are trained on."""
+
+HELD_OUT: Final = 'held_out'
+"""Tag of the members of a class of tasks that agents are judged on."""
 
 _TASKS: dict[tuple[str, str], tuple[TaskFactory, frozenset[str]]] = {}
 
