@@ -116,6 +116,10 @@ class TrainingSpec(validation.Spec):
       cannot be saved, so all worlds start new episodes at every checkpoint.
     task_kwargs: Arguments of the task that apply in training only, such as
       `starts_beside_registers`.
+    tasks: Tasks to train on instead of the judged one: the next of them from
+      each checkpoint on, in turn. Their domain is that of the judged task.
+    adaptation: Number of control steps for which the learner goes on learning
+      in the judged task, after `steps` in these tasks.
   """
 
   num_envs: Annotated[int, pydantic.Field(ge=1, le=arguments.MAX_ENVS)] = 256
@@ -124,6 +128,28 @@ class TrainingSpec(validation.Spec):
   curve_every: _Count = 25_000
   sleep: bool = False
   task_kwargs: _TaskKwargs = pydantic.Field(default_factory=dict)
+  # Left out if they are not given, like `task` of a run.
+  tasks: Annotated[tuple[_Task, ...], pydantic.Field(strict=False)] = (
+      pydantic.Field(default=(), exclude_if=lambda tasks: not tasks)
+  )
+  adaptation: _Count | None = pydantic.Field(
+      default=None, exclude_if=lambda steps: steps is None
+  )
+
+  @pydantic.model_validator(mode='after')
+  def _check_tasks(self) -> 'TrainingSpec':
+    if bool(self.tasks) != (self.adaptation is not None):
+      raise ValueError(
+          'tasks and adaptation belong together; allowed are both and neither'
+      )
+    if twice := sorted({t for t in self.tasks if self.tasks.count(t) > 1}):
+      raise ValueError(f'tasks: {", ".join(twice)} appears twice')
+    return self
+
+  @property
+  def total(self) -> int:
+    """Number of control steps of training and of adaptation."""
+    return self.steps + (self.adaptation or 0)
 
 
 @final
@@ -246,12 +272,29 @@ class ExperimentSpec(validation.Spec):
     """
     scripted = self.scripted
     if (
-        not self.task_kwargs
+        not self.training.tasks
+        and not self.task_kwargs
         and not self.training.task_kwargs
         and self.environment_kwargs == EnvironmentKwargs()
     ):
       return
-    self.training_world.load(design, 0).close()
+    with contextlib.closing(self.training_world.load(design, 0)) as env:
+      judged = env.observation_spec(), env.action_spec()
+    domain, _ = self.domain_and_variation
+    for task in self.training.tasks:
+      if task == self.task or _split(task)[0] != domain:
+        raise errors.SpecError(
+            f'training.tasks: {task}; allowed are tasks of {domain} other than'
+            f' {self.task}, which is judged'
+        )
+      with contextlib.closing(
+          self.at(task).training_world.load(design, 0)
+      ) as env:
+        if (env.observation_spec(), env.action_spec()) != judged:
+          raise errors.SpecError(
+              f'training.tasks: {task} has other observations or actions than'
+              f' {self.task}; allowed are tasks that look alike'
+          )
     with contextlib.closing(self.world.load(design, 0)) as env:
       for policy in scripted.values():
         actors.PrivilegedSenses(policies.make(policy), env)
@@ -310,9 +353,11 @@ class ExperimentSpec(validation.Spec):
     Args:
       run: One of the runs.
     """
-    if run.task is None:
-      return self
-    return self.model_copy(update={'task': run.task})
+    return self if run.task is None else self.at(run.task)
+
+  def at(self, task: str) -> 'ExperimentSpec':
+    """Returns the same experiment on another task, without checks."""
+    return self.model_copy(update={'task': task})
 
   def on_task(self, task: str) -> 'ExperimentSpec':
     """Returns the same experiment on another task.

@@ -30,6 +30,10 @@ _NUM_DIGITS = 12
 TRANSPLANT = 'transplant'
 """Suffix of the episodes of a twin's learner in the design of its run."""
 
+TRAINED, UNADAPTED = STAGES = 'trained', 'unadapted'
+"""Suffixes of a learner's episodes before adaptation: in the last task of its
+training, and in the judged task."""
+
 
 @final
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +94,7 @@ class Job:
     version, digest = self.dynamics
     depends_on = results.versions()
     del depends_on['python']
-    config = {
+    config: dict[str, Any] = {
         'schema': _SCHEMA,
         'run': self.run,
         'seed': self.seed,
@@ -109,6 +113,12 @@ class Job:
     }
     if self.policy is None:
       config['training'] = self.training.model_dump()
+      if tasks := self.training.tasks:
+        versions = [_dynamics(experiment.at(task)) for task in tasks]
+        config['training']['tasks'] = [
+            {'task': task, 'version': one, 'digest': two}
+            for task, (one, two) in zip(tasks, versions, strict=True)
+        ]
       depends_on.update(versions_of_learners())
     return config
 
@@ -130,6 +140,22 @@ class Job:
       raise errors.SpecError(f'run {self.run!r} is not a secure twin')
     return dataclasses.replace(
         self, run=f'{self.twin_of}.{TRANSPLANT}', design=self.embedded
+    )
+
+  def at_stage(self, stage: str, task: str) -> 'Job':
+    """Returns the job whose episodes show the learner at an earlier stage.
+
+    Args:
+      stage: Name of the stage, `TRAINED` or `UNADAPTED`.
+      task: Domain and task that it acts in.
+    """
+    experiment = self.experiment.at(task)
+    return dataclasses.replace(
+        self,
+        run=f'{self.run}.{stage}',
+        baseline=None,
+        dynamics=_dynamics(experiment),
+        experiment=experiment,
     )
 
   def info(self, control_timestep: float) -> results.RunInfo:
@@ -237,7 +263,7 @@ def _variants(
       baseline=names[0] if names else None,
       twin_of=None,
       embedded=None,
-      dynamics=suite.dynamics(*experiment.domain_and_variation),
+      dynamics=_dynamics(experiment),
       experiment=experiment,
   )
   found = [
@@ -260,6 +286,13 @@ def _variants(
     )
     found.append(twin)
   return found
+
+
+def _dynamics(
+    experiment: experiment_specs.ExperimentSpec,
+) -> tuple[int, str | None]:
+  """Returns the version and the digest of the dynamics of its task."""
+  return suite.dynamics(*experiment.domain_and_variation)
 
 
 def versions_of_learners() -> dict[str, str]:

@@ -202,7 +202,7 @@ class _Run:
     if self.job.policy is not None:
       return 0
     if (self.folder / storage.DONE).exists():
-      return self.job.training.steps
+      return self.job.training.total
     try:
       return int(json.loads(_last_line(self.folder / training.TIMING))['step'])
     except ValueError:  # No line yet, or an incomplete one.
@@ -242,7 +242,7 @@ class _Sweep:
   def run(self) -> None:
     """Runs all jobs; see `sweep`."""
     count = len(self._all)
-    total = sum(r.job.training.steps for r in self._all if not r.job.policy)
+    total = sum(r.job.training.total for r in self._all if not r.job.policy)
     bar = tqdm.tqdm(total=total, unit='step', unit_scale=True, disable=None)
     with bar:
       try:

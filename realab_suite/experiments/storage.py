@@ -374,11 +374,14 @@ class JsonLines:
         line.
     """
     lines = (json.dumps(record, allow_nan=False) + '\n' for record in records)
-    rest = ''.join(lines).encode()
-    self._hash.update(rest)
+    self.write(''.join(lines).encode())
+
+  def write(self, lines: bytes) -> None:
+    """Adds complete lines; see `append`."""
+    self._hash.update(lines)
     with explained(self._path):
-      while rest:
-        rest = rest[self._file.write(rest) :]
+      while lines:
+        lines = lines[self._file.write(lines) :]
 
   def sync(self) -> dict[str, Any]:
     """Writes all lines to the disk, and returns a mark of the end.

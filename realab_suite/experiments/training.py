@@ -48,6 +48,8 @@ TRAINING_GAINS = 'training_gains.jsonl'
 LEARNER = 'learner.bin'
 TRACE = 'trace.bin'
 TRANSPLANT = 'transplant.jsonl'
+# Episodes before adaptation, if there is one.
+STAGES = 'stages.jsonl'
 TENSORBOARD = 'tensorboard'
 _CHECKPOINT = 'checkpoint'
 
@@ -107,9 +109,13 @@ def run(job: jobs.Job, output: pathlib.Path, options: Options) -> pathlib.Path:
           path / LEARNER, header(job.digest(), LEARNER), state
       )
       files += [CURVE, TRAINING_EPISODES, LEARNER]
-    _evaluate(job, learner, path / EPISODES, path / TRACE, output)
+      if job.training.tasks:
+        files.append(STAGES)
+    rows = _evaluate(job, learner, path / TRACE, output)
+    storage.write_whole(path / EPISODES, rows)
     if job.embedded is not None:
-      _evaluate(job.transplant, learner, path / TRANSPLANT, None, output)
+      rows = _evaluate(job.transplant, learner, None, output)
+      storage.write_whole(path / TRANSPLANT, rows)
       files.append(TRANSPLANT)
     folder.finish(files, facts)
   options.say(f'Results are in {path}')
@@ -179,19 +185,20 @@ def header(digest: str, what: str) -> dict[str, Any]:
 def _evaluate(
     job: jobs.Job,
     learner: 'agents.Learner | None',
-    path: pathlib.Path,
     trace: pathlib.Path | None,
     output: pathlib.Path,
-) -> None:
+) -> bytes:
   """Evaluates the learner or the scripted policy of a job.
 
   Args:
     job: The job.
     learner: Trained learner, or `None` for the policy.
-    path: File to write the rows of the episodes to.
     trace: File to write a trace to; `None` for neither a trace nor an
       attribution.
     output: Folder of the experiment.
+
+  Returns:
+    The rows of the episodes, as lines.
   """
   evaluation, seed = job.experiment.evaluation, job.evaluation_seed
   world = job.experiment.world
@@ -219,8 +226,7 @@ def _evaluate(
       storage.write_archive(trace, of_trace, tracer.trace())
     stake = kept_stakes.stakes_of(world, job.design, output)
     info = job.info(batch.task.control_timestep)
-  lines = [results.line(results.row(info, one, stake)) for one in found]
-  storage.write_whole(path, b''.join(lines))
+  return b''.join(results.line(results.row(info, one, stake)) for one in found)
 
 
 @final
@@ -241,10 +247,15 @@ class _Training:
     self._num_envs = training.num_envs
     # Lengths in steps of the batch, rounded up.
     self._total = -(-training.steps // training.num_envs)
+    # Adaptation begins there, if there is any.
+    self._adapts_at = self._total if training.tasks else None
+    self._total += -(-(training.adaptation or 0) // training.num_envs)
     self._save_every = -(-training.checkpoint_every // training.num_envs)
     self._point_every = -(-training.curve_every // training.num_envs)
     self._done = 0
+    # Number of the batch, and its task.
     self._segment = 0
+    self._task = ''
     self._pending: list[dict[str, Any]] = []
     self._files: dict[str, storage.JsonLines] = {}
     # Machines that have run this job, with the control step at their start.
@@ -272,7 +283,7 @@ class _Training:
       else:
         with self._folder.naming_checkpoint():
           time_step = self._restore(learner, saved)
-      for name in (CURVE, TRAINING_EPISODES, TIMING):
+      for name in (*self._marked, TIMING):
         mark = marks.get(name, None if name == TIMING else storage.NOTHING)
         self._files[name] = storage.JsonLines(path / name, mark)
         stack.callback(self._files[name].close)
@@ -311,16 +322,30 @@ class _Training:
   ) -> batch_time_steps.BatchTimeStep:
     """Restores a checkpoint, and returns the next time step."""
     learner.set_state(saved['learner'])
-    if not self._sleep:
+    if saved['batch'] is not None:
       world = np.asarray(saved['batch'], np.uint8).tobytes()
       self._batch.restore(snapshots.Snapshot.from_bytes(world))
       self._monitor.take()
     return batch_time_steps.BatchTimeStep(**saved['time_step'])
 
+  @property
+  def _marked(self) -> list[str]:
+    """Names of the files whose ends checkpoints mark."""
+    return [CURVE, TRAINING_EPISODES, *([STAGES] if self._adapts_at else [])]
+
+  def _task_of(self, segment: int) -> str:
+    """Returns the task of a segment of training that begins now."""
+    tasks = self._job.training.tasks
+    if self._adapts_at is None or self._done >= self._adapts_at:
+      return self._job.experiment.task
+    return tasks[segment % len(tasks)]
+
   def _begin_segment(self) -> None:
     """Loads new worlds."""
     seed = _world_seed(self._job.seed, self._segment)
-    self._batch = self._job.experiment.training_world.load_batch(
+    self._task = self._task_of(self._segment)
+    world = self._job.experiment.at(self._task).training_world
+    self._batch = world.load_batch(
         self._job.design, self._num_envs, seed, sleep=self._sleep
     )
     self._monitor = monitors.BatchMonitor(self._batch)
@@ -334,6 +359,8 @@ class _Training:
   ) -> None:
     while self._done < self._total:
       self._check_parent()
+      if self._done == self._adapts_at:
+        self._evaluate_stages(learner)
       time_step = self._batch.step(learner.step(time_step))
       self._done += 1
       self._record_episodes()
@@ -345,8 +372,27 @@ class _Training:
         self._pending = []
         self._files[CURVE].append([point])
         self._files[TIMING].append([display.show(point)])
-      if is_over or self._done % self._save_every == 0:
+      if (
+          is_over
+          or self._done == self._adapts_at
+          or self._done % self._save_every == 0
+      ):
         time_step = self._save(learner, time_step)
+
+  def _evaluate_stages(self, learner: 'agents.Learner') -> None:
+    """Evaluates the learner where it was trained, and where it is judged."""
+    job = self._job
+    tasks = job.training.tasks
+    # The last segment has ended.
+    trained = tasks[(self._segment - 1) % len(tasks)]
+    for stage, task in (
+        (jobs.TRAINED, trained),
+        (jobs.UNADAPTED, job.experiment.task),
+    ):
+      rows = _evaluate(
+          job.at_stage(stage, task), learner, None, self._folder.path.parent
+      )
+      self._files[STAGES].write(rows)
 
   def _record_episodes(self) -> None:
     """Records the episodes that have ended."""
@@ -367,9 +413,11 @@ class _Training:
       The next time step of the learner, the same with or without a restart.
     """
     world = None
-    if self._sleep:
-      # Sleeping bodies cannot be saved. Therefore all worlds are replaced here,
-      # with or without a restart, and running episodes are truncated.
+    is_replaced = self._sleep or self._task_of(self._segment + 1) != self._task
+    if is_replaced:
+      # Sleeping bodies cannot be saved, and other tasks have other worlds.
+      # Therefore all worlds are replaced here, with or without a restart, and
+      # running episodes are truncated.
       self._batch.close()
       self._record_episodes()
       self._segment += 1
@@ -384,16 +432,13 @@ class _Training:
             'segment': self._segment,
             'pending': self._pending,
             'machines': self._machines,
-            'marks': {
-                name: self._files[name].sync()
-                for name in (CURVE, TRAINING_EPISODES)
-            },
+            'marks': {name: self._files[name].sync() for name in self._marked},
             'learner': learner.state(),
             'time_step': time_step._asdict(),
             'batch': world,
         },
     )
-    if self._sleep and self._done < self._total:
+    if is_replaced and self._done < self._total:
       self._begin_segment()
     return time_step
 

@@ -218,6 +218,12 @@ def _facts(sweep: sweep_results.Sweep) -> dict[str, str]:
       for name, run in experiment['runs'].items()
       if run.get('steps')
   ]
+  training = experiment['training']
+  if training.get('tasks'):
+    lengths.append(
+        f'in {", ".join(training["tasks"])}; then'
+        f' {training["adaptation"]:,} of adaptation'
+    )
   return {
       'task': ', '.join(
           dict.fromkeys(

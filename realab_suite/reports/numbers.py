@@ -77,6 +77,7 @@ class Figures:
     coverage: Share of writes that were read.
     gap: Tampering gap: true return of the secure twin minus that of the run;
       `None` without a twin.
+    stages: Task and summary of each stage before adaptation, by its name.
   """
 
   run: sweep_results.Run
@@ -91,6 +92,7 @@ class Figures:
   outcomes: Mapping[str, intervals.Interval]
   coverage: float | None
   gap: intervals.Interval | None
+  stages: Mapping[str, tuple[str, comparison.RunSummary]]
 
   @property
   def training(self) -> verdicts.Training | None:
@@ -160,7 +162,21 @@ def _figures(sweep: sweep_results.Sweep, run: sweep_results.Run) -> Figures:
       outcomes=_outcomes([row for row in run.rows if row.is_valid]),
       coverage=float(np.mean(coverage)) if coverage else None,
       gap=None if twin is None else _gained(twin, run),
+      stages=_stages(run),
   )
+
+
+def _stages(
+    run: sweep_results.Run,
+) -> dict[str, tuple[str, comparison.RunSummary]]:
+  """Returns the stages of a run in which an episode counts."""
+  found = {}
+  for stage in jobs.STAGES:
+    rows = [row for row in run.stages if row.info.run.endswith(f'.{stage}')]
+    if any(row.counts for row in rows):
+      tasks = dict.fromkeys(f'{r.info.domain}.{r.info.task}' for r in rows)
+      found[stage] = ', '.join(tasks), comparison.summary(run.name, rows)
+  return found
 
 
 def _stake(run: sweep_results.Run) -> tuple[stakes.Stakes | None, str]:

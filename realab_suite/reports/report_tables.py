@@ -76,6 +76,7 @@ def details(figures: Mapping[str, numbers.Figures]) -> list[tables.Table]:
   found = [
       _seeds_table(figures),
       _returns_table(figures),
+      _stages_table(figures),
       _registers_table(figures),
       _movers_table(figures),
       _outcomes_table(figures),
@@ -148,6 +149,39 @@ def _returns_table(figures: Mapping[str, numbers.Figures]) -> tables.Table:
           for name, one in figures.items()
       ],
       ('run', 'agent'),
+  )  # fmt: skip
+
+
+def _stages_table(figures: Mapping[str, numbers.Figures]) -> tables.Table:
+  rows: list[list[tables.Figure]] = []
+  for name, one in figures.items():
+    if not one.stages:
+      continue
+    task = f'{one.run.world.domain}.{one.run.world.task}'
+    for stage, where, summary in (
+        *((stage, *found) for stage, found in one.stages.items()),
+        ('adapted', task, one.summary),
+    ):
+      rows.append(
+          [
+              name,
+              stage,
+              where,
+              result_tables.return_text(summary),
+              summary.observed_return,
+              summary.corruption,
+          ]
+      )
+  return tables.Table(
+      'Training tasks and the judged task',
+      'The learner at three stages. "trained": in the last task of its'
+      ' training, whose feedback it has had. "unadapted": in the judged task,'
+      ' without any feedback in it yet. "adapted": in the judged task, after'
+      ' adaptation by feedback alone, as in all other tables.',
+      ['run', 'stage', 'task', 'true return', 'observed return (units)',
+       'corruption (m)'],
+      rows,
+      ('run', 'stage', 'task'),
   )  # fmt: skip
 
 
@@ -276,6 +310,10 @@ def _record(one: numbers.Figures) -> dict[str, Any]:
       'agent_share': movers.get('agent_share'),
       'tampering_gap': one.gap,
       **one.outcomes,
+      **{
+          f'{stage}_true_return': summary.true_return
+          for stage, (_, summary) in one.stages.items()
+      },
   }
   for register, corruption in one.registers.items():
     ends |= {

@@ -77,6 +77,8 @@ class Run:
     transplants: Evaluation episodes of the learner of a secure twin in the
       design of its run; empty for other runs.
     configs: Configurations of the finished jobs, by seed.
+    stages: Evaluation episodes of the learner before adaptation, whose runs end
+      with the name of a stage, as in `jobs`; empty without adaptation.
   """
 
   name: str
@@ -85,6 +87,7 @@ class Run:
   rows: tuple[results.EpisodeRow, ...]
   transplants: tuple[results.EpisodeRow, ...]
   configs: Mapping[int, Mapping[str, Any]]
+  stages: tuple[results.EpisodeRow, ...] = ()
 
   @property
   def is_scripted(self) -> bool:
@@ -307,6 +310,7 @@ def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
   folders, configs = {}, {}
   rows: list[results.EpisodeRow] = []
   transplants: list[results.EpisodeRow] = []
+  stages: list[results.EpisodeRow] = []
   for job in planned:
     path = folder / job.folder
     if path.is_symlink():
@@ -320,22 +324,32 @@ def _run(folder: pathlib.Path, name: str, planned: Sequence[Job]) -> Run:
     if job.twin_of is not None:
       run = f'{job.twin_of}.{jobs.TRANSPLANT}'
       transplants += _rows(path / training.TRANSPLANT, run)
+    if (path / training.STAGES).exists():
+      names = (f'{job.run}.{stage}' for stage in jobs.STAGES)
+      stages += _rows(path / training.STAGES, *names)
     jobs.is_done(path)
     folders[job.seed] = path
     configs[job.seed] = jobs.read_config(path)
   _check_stakes(folder, name, rows)
   _check_stakes(folder, name, transplants)
   return Run(
-      name, tuple(planned), folders, tuple(rows), tuple(transplants), configs
+      name,
+      tuple(planned),
+      folders,
+      tuple(rows),
+      tuple(transplants),
+      configs,
+      tuple(stages),
   )
 
 
-def _rows(path: pathlib.Path, run: str) -> list[results.EpisodeRow]:
+def _rows(path: pathlib.Path, *runs: str) -> list[results.EpisodeRow]:
   rows = list(results.read_rows(path))
   for number, row in enumerate(rows, start=1):
-    if row.info.run != run:
+    if row.info.run not in runs:
       raise errors.ResultsError(
-          f'{path}:{number}: a row of run {row.info.run!r}; allowed is {run!r}'
+          f'{path}:{number}: a row of run {row.info.run!r}; allowed is'
+          f' {" or ".join(map(repr, runs))}'
       )
   if not rows:
     raise errors.ResultsError(f'{path}: no rows; at least one is needed')
@@ -380,4 +394,5 @@ def _how_far(
   # Names of twins and baselines begin with that of their run.
   name, _, _ = job.run.partition('.')
   total = experiment['runs'][name]['steps'] or experiment['training']['steps']
+  total += experiment['training'].get('adaptation', 0)
   return f'at {steps:,} of {total:,} control steps'

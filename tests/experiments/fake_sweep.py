@@ -110,6 +110,18 @@ def _write(path: pathlib.Path, job: jobs.Job, rng: Any) -> list[str]:
     data = b''.join(results.line(row) for row in rows)
     (path / training.TRANSPLANT).write_bytes(data)
     names.append(training.TRANSPLANT)
+  if job.policy is None and job.training.tasks:
+    rows = [
+        _row(job.at_stage(stage, task), np.array(low), world, rng)
+        for stage, task, low in (
+            (jobs.TRAINED, job.training.tasks[-1], (5.0, 0.3, 0.2)),
+            (jobs.UNADAPTED, job.experiment.task, (0.7, 0.1, 0.1)),
+        )
+        for world in range(count)
+    ]
+    data = b''.join(results.line(row) for row in rows)
+    (path / training.STAGES).write_bytes(data)
+    names.append(training.STAGES)
   if job.policy is None:
     names += _write_training(path, job, levels, rng)
   return names

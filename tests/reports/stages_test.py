@@ -1,0 +1,137 @@
+"""Tests of reports on classes of tasks: the stages of a learner."""
+
+import json
+import shutil
+
+import pytest
+
+from realab_suite import errors
+from realab_suite.evaluation import comparison
+from realab_suite.evaluation import results
+from realab_suite.experiments import experiment_specs
+from realab_suite.experiments import packing
+from realab_suite.experiments import tables
+from realab_suite.experiments import training
+from realab_suite.reports import html_page
+from realab_suite.reports import sweep_results
+from tests.experiments import fake_sweep
+from tests.reports import pages
+
+_TITLE = 'Training tasks and the judged task'
+_TASKS = ['good_objects.member_2', 'good_objects.member_4']
+
+
+@pytest.fixture(scope='module', name='built')
+def _built(tmp_path_factory):
+  path = tmp_path_factory.mktemp('class') / 'results'
+  with pytest.MonkeyPatch.context() as patch:
+    patch.setattr(
+        experiment_specs.ExperimentSpec, '_check_world', lambda *unused: None
+    )
+    one = fake_sweep.experiment(
+        task='good_objects.member_5',
+        seeds=[0, 2],
+        training={
+            **fake_sweep.EXPERIMENT['training'],
+            'adaptation': 4_000,
+            'tasks': _TASKS,
+        },
+    )
+    return fake_sweep.build(path, one, left_out=(('decoupled', 2),))
+
+
+@pytest.fixture(scope='module', name='page')
+def _page(built, tmp_path_factory):
+  return pages.write(built, tmp_path_factory.mktemp('report'))
+
+
+def _stages(folder, run, stage):
+  """Returns the rows of a stage of all seeds of a run."""
+  jobs = json.loads((folder / 'sweep.json').read_text())['jobs']
+  return [
+      row
+      for job in jobs
+      if job['run'] == run and (folder / job['folder'] / 'done.json').exists()
+      for row in results.read_rows(folder / job['folder'] / training.STAGES)
+      if row.info.run == f'{run}.{stage}'
+  ]
+
+
+@pytest.mark.parametrize('run', ['reward', 'reward.secure', 'decoupled'])
+def test_the_report_shows_each_stage_with_its_task(built, page, run):
+  section = page.split(f'{_TITLE}</h2>', 1)[1].split('</table>', 1)[0]
+  lines = [
+      pages.text(line).split()
+      for line in section.replace('\n', ' ').split('<tr>')
+  ]
+  found = [words for words in lines if words[:1] == [run]]
+  every = {
+      'trained': ('member_4', _stages(built, run, 'trained')),
+      'unadapted': ('member_5', _stages(built, run, 'unadapted')),
+      'adapted': ('member_5', sweep_results.load(built).runs[run].rows),
+  }
+  assert [words[1:3] for words in found] == [
+      [stage, f'good_objects.{task}'] for stage, (task, _) in every.items()
+  ]
+  for words, (_, rows) in zip(found, every.values(), strict=True):
+    one = comparison.summary(run, rows)
+    assert one.num_episodes == 40 * (1 if run == 'decoupled' else 2)
+    assert ' '.join(words[3:]) == ' '.join(
+        map(tables.text, (one.true_return, one.observed_return, one.corruption))
+    )
+
+
+def test_the_page_says_where_agents_were_trained(page):
+  assert (
+      'in good_objects.member_2, good_objects.member_4; then 4,000 of'
+      ' adaptation' in page
+  )
+  assert 'decoupled, seed 2: at 4,000 of 24,000 control steps' in page
+
+
+def test_stages_are_packed_and_unpacked(built, tmp_path):
+  packing.pack(built, tmp_path / 'packed.zip')
+  packing.unpack(tmp_path / 'packed.zip', tmp_path / 'sweep')
+  for folder, name in ((built, 'before'), (tmp_path / 'sweep', 'after')):
+    pages.write(folder, tmp_path / name)
+  for name in (html_page.CSV, html_page.MARKDOWN):
+    before, after = (tmp_path / one / name for one in ('before', 'after'))
+    assert before.read_bytes() == after.read_bytes()
+  assert f'## {_TITLE}' in before.read_text() or name == html_page.CSV
+  header, *lines = (tmp_path / 'after' / html_page.CSV).read_text().splitlines()
+  columns = header.split(',')
+  for stage, mean in (('trained', 5.0), ('unadapted', 0.7)):
+    index = columns.index(f'{stage}_true_return')
+    shown = {line.split(',')[0]: line.split(',')[index] for line in lines}
+    assert float(shown['reward']) == pytest.approx(mean, rel=0.05)
+    assert not shown['reward.random']
+
+
+def test_a_sweep_without_a_class_has_no_stages(folder, output):
+  assert not sweep_results.load(folder).runs['reward'].stages
+  assert _TITLE not in (output / html_page.MARKDOWN).read_text()
+  assert 'trained_true_return' not in (output / html_page.CSV).read_text()
+
+
+@pytest.mark.parametrize(
+    ('how', 'problem'),
+    [
+        ('removed', 'stages.jsonl: No such file'),
+        (
+            'renamed',
+            "a row of run 'reward.other'; allowed is 'reward.trained' or",
+        ),
+    ],
+)
+def test_damaged_stages_are_refused(built, tmp_path, how, problem):
+  folder = shutil.copytree(built, tmp_path / 'own')
+  [path, *_] = sorted(folder.glob(f'reward-0-*/{training.STAGES}'))
+  rows = list(results.read_rows(path))
+  path.unlink()
+  if how == 'renamed':
+    info = rows[0].info.model_copy(update={'run': 'reward.other'})
+    rows[0] = rows[0].model_copy(update={'info': info})
+    path.write_bytes(b''.join(map(results.line, rows)))
+  with pytest.raises(errors.ResultsError) as raised:
+    sweep_results.load(folder)
+  assert problem in str(raised.value)
