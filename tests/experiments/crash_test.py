@@ -44,6 +44,21 @@ def test_a_run_that_is_killed_ends_like_any_other(killer, kills):
   assert killer.kill_and_finish(kills) == []
 
 
+def test_a_run_that_is_killed_where_adaptation_begins_ends_like_any_other(
+    nursery, tmp_path
+):
+  killer = crashes.Killer(nursery, tmp_path, crashes.CLASS)
+  assert 70 < killer.num_operations <= _MOST_OPERATIONS
+  # Rows of both stages are written by operations 33 and 38, between checkpoints
+  # that are there after 28 and 50.
+  for kills in (
+      [(33, crashes.TORN)],
+      [(38, crashes.POWER), (10, crashes.KILLED)],
+      [(46, crashes.NAMES_FIRST)],
+  ):
+    assert killer.kill_and_finish(kills) == []
+
+
 def test_no_acknowledged_row_is_lost(nursery, killer, tmp_path):
   rows = killer.rows(3)
   found = [

@@ -5,7 +5,7 @@ The runs are small and real except for their learner, which is
 `tests.experiments.fake_learner`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import io
 import os
 import pathlib
@@ -39,6 +39,17 @@ _EXPERIMENT = {
         'steps': 48,
         'checkpoint_every': 16,
         'curve_every': 8,
+    },
+}
+# The same in a class of tasks: adaptation begins after a checkpoint of its own.
+CLASS = {
+    **_EXPERIMENT,
+    'task': 'assistant.held_out',
+    'training': {
+        **_EXPERIMENT['training'],
+        'steps': 20,
+        'adaptation': 16,
+        'tasks': ['assistant.train'],
     },
 }
 _NAMES = (
@@ -226,13 +237,21 @@ class _Shim:
 class Killer:
   """Starts runs, kills them, and continues them."""
 
-  def __init__(self, nursery: zygote.Zygote, root: pathlib.Path) -> None:
+  def __init__(
+      self,
+      nursery: zygote.Zygote,
+      root: pathlib.Path,
+      experiment: Mapping[str, Any] = _EXPERIMENT,
+  ) -> None:
     """Runs once without a kill, for comparison."""
     self._nursery = nursery
     self._root = root
     self._experiment = root / 'experiment.yaml'
-    self._experiment.write_text(yaml.safe_dump(_EXPERIMENT))
+    self._experiment.write_text(yaml.safe_dump(experiment))
     [self._job] = jobs.plan(experiment_specs.load(self._experiment))
+    self._names = _NAMES
+    if self._job.training.tasks:
+      self._names += (training.STAGES,)
     count = root / 'count'
     ended = self._train(root / 'whole', count=str(count))
     if ended.status:
@@ -282,7 +301,7 @@ class Killer:
 
   def _results(self, output: pathlib.Path) -> dict[str, bytes]:
     folder = output / self._job.folder()
-    return {name: (folder / name).read_bytes() for name in _NAMES}
+    return {name: (folder / name).read_bytes() for name in self._names}
 
 
 def kill_writer(
