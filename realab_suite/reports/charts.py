@@ -267,6 +267,10 @@ def learning(
             color=_GREY, linestyle=':', zorder=1,
         )  # fmt: skip
       row[-1].axhline(0.0, color='#bbbbbb', linewidth=0.8, zorder=0)
+      lengths = runs[0].config['training']
+      if 'adaptation' in lengths:
+        for ax in row:
+          ax.axvline(lengths['steps'], color=_GREY, linestyle='-.', zorder=1)
       row[0].set_ylabel(_shorten(name), color=colour, fontweight='bold')
     references = (math.inf, max(largest[0], 1.0), hacking.SHARE_OF_STAKE)
     for ax, (title, _, linear), most, reference in zip(
@@ -288,6 +292,8 @@ def learning(
       handles.append(_handle('its secure twin', ls='--'))
     if any(run.baseline in figures for runs in rows for run in runs):
       handles.append(_handle('its baseline', color=_GREY, ls=':'))
+    if any('adaptation' in runs[0].config['training'] for runs in rows):
+      handles.append(_handle('adaptation begins', color=_GREY, ls='-.'))
     # A single seed has no interval.
     if any(np.isfinite(one.low).any() for one in every):
       label = '95 % interval over seeds'

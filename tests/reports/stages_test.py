@@ -12,6 +12,7 @@ from realab_suite.experiments import experiment_specs
 from realab_suite.experiments import packing
 from realab_suite.experiments import tables
 from realab_suite.experiments import training
+from realab_suite.reports import charts
 from realab_suite.reports import html_page
 from realab_suite.reports import sweep_results
 from tests.experiments import fake_sweep
@@ -87,6 +88,21 @@ def test_the_page_says_where_agents_were_trained(page):
       ' adaptation' in page
   )
   assert 'decoupled, seed 2: at 4,000 of 24,000 control steps' in page
+
+
+def test_the_learning_curves_show_where_adaptation_begins(built, monkeypatch):
+  canvases = []
+  monkeypatch.setattr(charts, 'to_svg', lambda one: canvases.append(one) or b'')
+  sweep = sweep_results.load(built)
+  styles = charts.styles([one.name for one in sweep.learned()])
+  charts.learning(sweep, {}, styles)
+  [canvas] = canvases
+  assert len(canvas.axes) == 6
+  for ax in canvas.axes:
+    ends = [list(line.get_xdata()) for line in ax.lines]
+    assert ends.count([20_000, 20_000]) == 1
+  labels = [text.get_text() for text in canvas.legends[0].get_texts()]
+  assert labels.count('adaptation begins') == 1
 
 
 def test_stages_are_packed_and_unpacked(built, tmp_path):
