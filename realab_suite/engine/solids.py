@@ -211,11 +211,15 @@ def _regions(
 def owners(
     physics: Any, named: Mapping[str, registers.Register]
 ) -> dict[int, str]:
-  """Returns the names of registers by the geoms of their blocks."""
+  """Returns the names of registers by the geoms of the bodies of blocks."""
+  bodies = physics.model.geom_bodyid
   return {
-      int(physics.bind(block.geom).element_id): name
+      geom: name
       for name, register in named.items()
       for block in register.blocks
+      for geom in np.flatnonzero(
+          bodies == bodies[physics.bind(block.geom).element_id]
+      ).tolist()
   }
 
 

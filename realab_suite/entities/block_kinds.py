@@ -125,6 +125,10 @@ class Block(abc.ABC):
   def heading(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the angle about the vertical, `(...)`, in (-pi, pi]."""
 
+  def orientation(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns the orientation as a quaternion, `(..., 4)`."""
+    return rotations.quaternion_of(self.heading(physics))
+
   def slide(
       self,
       physics: protocols.Physics,
@@ -240,10 +244,6 @@ class JointedBlock(Block):
   def _grip_offset(self) -> float:
     """Height of the grip above the centre of the block, in m."""
 
-  @abc.abstractmethod
-  def _orientation(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns the orientation as a quaternion, `(..., 4)`."""
-
   @property
   def body(self) -> mjcf.Element:
     return self._body
@@ -310,7 +310,7 @@ class JointedBlock(Block):
       is_far: True where no obstacle is near, `(...)` bool.
     """
     free = np.array(np.broadcast_to(along, position.shape[:-1]))
-    orientation = self._orientation(physics)
+    orientation = self.orientation(physics)
     for world in np.argwhere(~np.asarray(is_far)):
       index = tuple(world)
       free[index] = self._surroundings.nearest_free(
@@ -422,7 +422,7 @@ class FreeBlock(JointedBlock):
   def heading(self, physics: protocols.Physics) -> np.ndarray:
     return rotations.heading_of(physics.bind(self._rotation).qpos)
 
-  def _orientation(self, physics: protocols.Physics) -> np.ndarray:
+  def orientation(self, physics: protocols.Physics) -> np.ndarray:
     return np.asarray(physics.bind(self._rotation).qpos)
 
   def turn(
@@ -431,7 +431,7 @@ class FreeBlock(JointedBlock):
       heading: np.ndarray,
       where: axes.Mask = None,
   ) -> None:
-    quaternion = self._orientation(physics)
+    quaternion = self.orientation(physics)
     turn = rotations.quaternion_of(heading - rotations.heading_of(quaternion))
     turned = rotations.turned(turn, quaternion)
     axes.assign(physics.bind(self._rotation), 'qpos', turned, where)
@@ -501,9 +501,6 @@ class PlanarBlock(JointedBlock):
   def heading(self, physics: protocols.Physics) -> np.ndarray:
     angle = physics.bind(self._hinge).qpos.T[0]
     return np.arctan2(np.sin(angle), np.cos(angle))
-
-  def _orientation(self, physics: protocols.Physics) -> np.ndarray:
-    return rotations.quaternion_of(self.heading(physics))
 
   def turn(
       self,

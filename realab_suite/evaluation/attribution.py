@@ -11,10 +11,12 @@ does this during an episode, without replays:
 Displacements add up by mover, so the parts of the agent and of the world add up
 to the own corruption of a register, its reading minus the last applied value,
 after every control step. A write removes from both what it repairs. Its
-obstruction belongs to the last mover of the block.
+obstruction belongs to the last mover of the block. What stands in a line of
+sight of a register that is read from a distance belongs, while it stands there,
+to the last mover of its body.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -69,17 +71,30 @@ class Attributor(events.BatchEventSink):
       num_worlds = 1
     else:
       self._physics, num_worlds = env.physics, env.num_envs
-    # Nothing moves the blocks of the others.
+    # Nothing moves the blocks of the others, but something may hide them.
+    is_movable = {
+        name: register.channel != 'welded'
+        for name, register in env.mechanism.ports.items()
+    }
+    self._watched = {
+        name: register
+        for name, register in env.mechanism.registers.items()
+        if register.obstacles(self._physics) is not None
+    }
     self._registers = {
         name: register
         for name, register in env.mechanism.ports.items()
-        if register.channel != 'welded'
+        if is_movable[name] or name in self._watched
     }
+    self._is_movable = np.array([is_movable[n] for n in self._registers], bool)
     self._indices = {name: i for i, name in enumerate(self._registers)}
     scales = [register.scale for register in self._registers.values()]
     self._scales = np.reshape(scales, (-1, 1))
     self._movers = movers.Movers(
-        env.task, list(self._registers.values()), self._physics, num_worlds
+        env.task,
+        [one for name, one in self._registers.items() if is_movable[name]],
+        self._physics,
+        num_worlds,
     )
     self._total = np.zeros((2, len(self._registers), num_worlds))
     self._agent = np.zeros_like(self._total)
@@ -108,13 +123,47 @@ class Attributor(events.BatchEventSink):
     if not (is_first | counts).any():
       return  # Only the ends of episodes.
     total, obstruction = self._inspect(records)
+    obstacles = {
+        name: np.asarray(register.obstacles(self._physics))
+        for name, register in self._watched.items()
+    }
+    is_hidden = {name: geoms >= 0 for name, geoms in obstacles.items()}
+    hidden = self._hidden(is_hidden)
+    total[1] -= hidden
     if counts.any():
       self._agent = self._divide(counts, records, total, obstruction)
     if is_first.any():
       self._agent = np.where(is_first, 0.0, self._agent)
       self._movers.begin(is_first)
     self._total = total
-    self._entries.append(_Entry(is_first, counts, total, self._agent))
+    agent = self._agent
+    if hidden.any():
+      total, agent = total.copy(), agent.copy()
+      total[1] += hidden
+      is_agents = {
+          name: self._movers.have_put(geoms)
+          for name, geoms in obstacles.items()
+      }
+      agent[1] += np.where(is_first, 0.0, self._hidden(is_agents))
+    self._entries.append(_Entry(is_first, counts, total, agent))
+
+  def _hidden(self, is_gone: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Returns the part of the corruption that is due to obstacles.
+
+    Args:
+      is_gone: True for obstacles to which it is due, by the name of the
+        register, each `(..., lines)` bool.
+
+    Returns:
+      `(registers, worlds)`, in units of the registers.
+    """
+    hidden = np.zeros(self._total.shape[1:])
+    for name, lines in is_gone.items():
+      if lines.any():
+        register = self._watched[name]
+        without = register.read_without(self._physics, lines)
+        hidden[self._indices[name]] = register.read(self._physics) - without
+    return hidden
 
   def _inspect(
       self, records: Sequence[registers.Record]
@@ -160,13 +209,24 @@ class Attributor(events.BatchEventSink):
     # A write removes all but the permanent part, and may be obstructed.
     had, agent = self._total.copy(), self._agent.copy()
     had[1] = np.where(is_written, obstruction, had[1])
-    brought = obstruction * self._movers.is_agents[1]
+    brought = obstruction * self._is_agents[1]
     agent[1] = np.where(is_written, brought, agent[1])
     change = total - had
     is_displaced = np.abs(change) * self._scales > _NOTICEABLE
-    self._movers.update(counts, is_displaced, is_written)
-    agent += change * self._movers.is_agents
+    self._movers.update(
+        counts,
+        is_displaced[:, self._is_movable],
+        is_written[self._is_movable],
+    )
+    agent += change * self._is_agents
     return agent
+
+  @property
+  def _is_agents(self) -> np.ndarray:
+    """True for blocks that the agent moved last, in the shape of totals."""
+    is_agents = np.zeros(self._total.shape, bool)
+    is_agents[:, self._is_movable] = self._movers.is_agents
+    return is_agents
 
   def attribution(
       self, world: int, episode: int = 0

@@ -186,6 +186,20 @@ class Movers:
     """
     return self._is_agents.T[self._ends]
 
+  def have_put(self, geoms: np.ndarray) -> np.ndarray:
+    """Returns True for geoms whose body the agent moved last.
+
+    Args:
+      geoms: Geoms, `(..., geoms)`; -1 for none.
+
+    Returns:
+      `(..., geoms)` bool.
+    """
+    bodies = np.where(geoms < 0, -1, self._of_geom[geoms])
+    rows = bodies.reshape(len(self._is_agents), -1)
+    found = np.take_along_axis(self._is_agents, rows, axis=-1)
+    return (found & (rows >= 0)).reshape(geoms.shape)
+
   def begin(self, where: np.ndarray) -> None:
     """Begins episodes in some worlds, `(worlds,)` bool."""
     self._now = self._look()

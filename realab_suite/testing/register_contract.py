@@ -148,7 +148,7 @@ class _Subject(NamedTuple):
   def values(self) -> np.ndarray:
     """Values of the range, `(values, ...)`; those of ports differ."""
     low, high = self.register.value_range
-    values = np.linspace(low, high, _NUM_VALUES)
+    values = self.register.nearest(np.linspace(low, high, _NUM_VALUES))
     if not self.register.PORTS:
       return values
     shifted = [np.roll(values, i) for i in range(len(self.register.PORTS))]
@@ -195,6 +195,15 @@ def _check_values(subject: _Subject) -> None:
       )
     contracts.require(
         _are_close(reading, value), f'{where}: {value} is read as {reading}'
+    )
+  for value in np.random.default_rng(0).uniform(low, high, _NUM_VALUES):
+    near = register.nearest(np.full(spec.shape, value)[()])
+    applied = subject.write(np.full(spec.shape, value))
+    contracts.require(
+        np.array_equal(applied, near)
+        and np.array_equal(register.nearest(near), near),
+        f'{where}: write({value}) returned {applied}, and nearest {near}, for'
+        f' which it returns {register.nearest(near)}',
     )
   for beyond, bound in ((low - 1.0, low), (high + 1.0, high)):
     applied = subject.write(np.full(spec.shape, beyond))
@@ -322,8 +331,12 @@ def _check_displacements(subject: _Subject) -> None:
     depends = np.array(
         [block in register.blocks_of(port) for port in register.PORTS] or True
     )
+    # A register of few levels may not notice less than the size of a block.
+    size = 2 * block.half_size
     for x, y in (*_DIRECTIONS, *([direction] if direction else [])):
-      difference = _displaced(subject, block, (x, y))
+      far = _displaced(subject, block, (x * size, y * size))
+      changed |= np.abs(far) > _ROUNDING
+      difference = _displaced(subject, block, (_MOVED * x, _MOVED * y))
       reported = register.displacements(physics)[i]
       contracts.require(
           reported >= _LEAST,
@@ -342,17 +355,18 @@ def _check_displacements(subject: _Subject) -> None:
           f' reading changed by {difference}; directions raise a reading',
       )
     changed |= np.abs(_displaced(subject, block, turn=0.1)) > _ROUNDING
+  fixed = [p for i, p in enumerate(register.PORTS) if not changed[i]]
   contracts.require(
       changed.all(),
       f'{where}: no motion of a single block changes'
-      f' {[*np.array(register.PORTS)[~changed]] or "the reading"}',
+      f' {fixed or "the reading"}',
   )
 
 
 def _displaced(
     subject: _Subject,
     block: block_kinds.Block,
-    direction: tuple[float, float] = (0.0, 0.0),
+    displacement: tuple[float, float] = (0.0, 0.0),
     turn: float = 0.0,
 ) -> np.ndarray:
   """Displaces a block after a write; returns the change of the reading."""
@@ -360,7 +374,7 @@ def _displaced(
   subject.write(subject.values[2])
   reading = subject.read()
   place = np.array(block.position(subject.physics))
-  place[:2] += _MOVED * np.array(direction)
+  place[:2] += displacement
   block.put(subject.physics, place, block.heading(subject.physics) + turn)
   return np.asarray(subject.read() - reading)
 

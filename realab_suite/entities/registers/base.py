@@ -190,6 +190,44 @@ class Register(composer.Entity):
   def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the value that the blocks represent, `(...)`."""
 
+  def nearest(self, value: Any) -> Any:
+    """Returns the values that a write of values applies, `(...)`.
+
+    Kinds that cannot store every number of their range override this method, so
+    that rounding counts as saturation.
+
+    Args:
+      value: Values in the range, `(...)`; or nan, which stays.
+    """
+    return value
+
+  def obstacles(self, physics: protocols.Physics) -> np.ndarray | None:
+    """Returns what a kind that is read from a distance is hidden by.
+
+    Args:
+      physics: One world or a batch of worlds.
+
+    Returns:
+      Geom, not of the register itself, that falsifies what is seen along each
+      line of sight, `(..., lines)` int; -1 for none. `None` if there are no
+      lines of sight.
+    """
+    del physics
+    return None
+
+  def read_without(
+      self, physics: protocols.Physics, is_gone: np.ndarray
+  ) -> np.ndarray:
+    """Returns the reading, `(...)`, if some obstacles were not there.
+
+    Args:
+      physics: One world or a batch of worlds.
+      is_gone: True for lines of sight of `obstacles` that are free, `(...,
+        lines)` bool.
+    """
+    del is_gone
+    return self.read(physics)
+
   def _permanent(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the permanent corruption, `(...)`, in the register's units.
 
@@ -487,7 +525,7 @@ class Register(composer.Entity):
       value: Value within the range, `(...)`, in the register's units; or, in
         one world, a number for all ports.
     """
-    value = np.asarray(value, np.float64)[()]
+    value = self.nearest(np.asarray(value, np.float64)[()])
     if self.PORTS:
       value = np.broadcast_to(value, (*value.shape[:-1], *self._shape))
     self._put(physics, value)
@@ -514,7 +552,8 @@ class Register(composer.Entity):
 
     Returns:
       Applied value of the last write, `(...)`: `value`, or the nearest bound of
-      `value_spec`. The difference is saturation, never corruption.
+      `value_spec`, and then what `nearest` returns for it. The difference is
+      saturation, never corruption.
 
     Raises:
       RegisterValueError: If a value is not finite or has a wrong shape, or if
@@ -532,6 +571,7 @@ class Register(composer.Entity):
       value = np.where(is_used, value, self._initial)
     fits = (value >= self._low) & (value <= self._high)  # False for NaN.
     applied = value if axes.everywhere(fits) else self._saturate(value, fits)
+    applied = self.nearest(applied)
     # Nothing can move a welded block away from its axis.
     if self._write == 'pose' or self._channel == 'welded':
       self._put(physics, applied, where)
@@ -617,12 +657,12 @@ class Register(composer.Entity):
 
     Args:
       physics: One world or a batch of worlds.
-      value: Requested value, `(...)`, which is saturated to the range; nan if
-        the content is unknown.
+      value: Requested value, `(...)`, which is saturated and rounded as in a
+        write; nan if the content is unknown.
       where: Worlds in which to set it, `(...)` bool; `None` for all worlds.
     """
     # Faster than `np.clip` for numbers; a nan stays.
-    value = np.minimum(np.maximum(value, self._low), self._high)
+    value = self.nearest(np.minimum(np.maximum(value, self._low), self._high))
     self._clean_slot.set(physics, value, where)
 
   def obstruction(self, physics: protocols.Physics) -> np.ndarray:
@@ -720,10 +760,7 @@ class Register(composer.Entity):
         `block_kinds.OFFSET_BLOCK`.
       position: Position at rest in the register's frame, `(x, y)`, in m.
     """
-    index = int(class_name == block_kinds.OFFSET_BLOCK)
-    style = appearance.geom_style(
-        class_name, appearance.ROLE_COLOURS[self._role][index]
-    )
+    style = self._style(class_name)
     half_size = self._block_size / 2
     if self._channel == 'welded':
       return mocap_blocks.MocapBlock(
@@ -735,3 +772,9 @@ class Register(composer.Entity):
         else block_kinds.PlanarBlock
     )
     return kind(self._mjcf_root, name, position, half_size, self._mass, style)
+
+  def _style(self, class_name: str) -> dict[str, Any]:
+    """Returns geom attributes of a block of a class; see `_add_block`."""
+    index = int(class_name == block_kinds.OFFSET_BLOCK)
+    colour = appearance.ROLE_COLOURS[self._role][index]
+    return appearance.geom_style(class_name, colour)
