@@ -46,10 +46,12 @@ def check_register(
 
   It is built with blocks of every kind, and in every channel.
 
-  - It stores each value of its range, and the nearest bound of others. A value
-    that is not finite is refused, and nothing changes.
+  - It stores each value of its range, or what `nearest` returns for it, and the
+    nearest bound of others. A value that is not finite is refused, and nothing
+    changes.
   - Its readings have the shape and dtype of its values. A look at a register
     changes nothing, and later writes change no earlier reading.
+  - If it is read from a distance, nothing is in the way in an empty world.
   - Undisturbed blocks keep each value, so they are clear of each other.
   - A write removes temporary corruption, and keeps permanent corruption.
   - A block that is moved in any direction is a displacement, and some motion of
@@ -233,6 +235,14 @@ def _check_looks(subject: _Subject) -> None:
   _shove(subject, np.random.default_rng(0))
   physics.forward()
   before = snapshots.get_state(physics)
+  obstacles = register.obstacles(physics)
+  if obstacles is not None:
+    without = register.read_without(physics, obstacles >= 0)
+    contracts.require(
+        (obstacles == -1).all() and np.array_equal(without, subject.read()),
+        f'{where}: obstacles are {obstacles} in an empty world, where it reads'
+        f' {subject.read()} and without them {without}',
+    )
   looks = [
       subject.read(),
       register.applied(physics),
