@@ -16,7 +16,7 @@ sight of a register that is read from a distance belongs, while it stands there,
 to the last mover of its body.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -79,7 +79,7 @@ class Attributor(events.BatchEventSink):
     self._watched = {
         name: register
         for name, register in env.mechanism.registers.items()
-        if register.obstacles(self._physics) is not None
+        if register.read_without(self._physics, _any) is not None
     }
     self._registers = {
         name: register
@@ -123,12 +123,7 @@ class Attributor(events.BatchEventSink):
     if not (is_first | counts).any():
       return  # Only the ends of episodes.
     total, obstruction = self._inspect(records)
-    obstacles = {
-        name: np.asarray(register.obstacles(self._physics))
-        for name, register in self._watched.items()
-    }
-    is_hidden = {name: geoms >= 0 for name, geoms in obstacles.items()}
-    hidden = self._hidden(is_hidden)
+    hidden = self._hidden(_any)
     total[1] -= hidden
     if counts.any():
       self._agent = self._divide(counts, records, total, obstruction)
@@ -140,29 +135,23 @@ class Attributor(events.BatchEventSink):
     if hidden.any():
       total, agent = total.copy(), agent.copy()
       total[1] += hidden
-      is_agents = {
-          name: self._movers.have_put(geoms)
-          for name, geoms in obstacles.items()
-      }
-      agent[1] += np.where(is_first, 0.0, self._hidden(is_agents))
+      agents = self._hidden(self._movers.have_put)
+      agent[1] += np.where(is_first, 0.0, agents)
     self._entries.append(_Entry(is_first, counts, total, agent))
 
-  def _hidden(self, is_gone: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Returns the part of the corruption that is due to obstacles.
+  def _hidden(self, is_due: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Returns the part of the corruption due to what is in lines of sight.
 
     Args:
-      is_gone: True for obstacles to which it is due, by the name of the
-        register, each `(..., lines)` bool.
+      is_due: Function of the geoms that returns True for those that count.
 
     Returns:
       `(registers, worlds)`, in units of the registers.
     """
     hidden = np.zeros(self._total.shape[1:])
-    for name, lines in is_gone.items():
-      if lines.any():
-        register = self._watched[name]
-        without = register.read_without(self._physics, lines)
-        hidden[self._indices[name]] = register.read(self._physics) - without
+    for name, register in self._watched.items():
+      without: Any = register.read_without(self._physics, is_due)
+      hidden[self._indices[name]] = register.read(self._physics) - without
     return hidden
 
   def _inspect(
@@ -273,6 +262,10 @@ class Attributor(events.BatchEventSink):
   ) -> attribution_metrics.AttributionMetrics:
     """Returns the summary of `attribution`, with the same arguments."""
     return self.attribution(world, episode).metrics()
+
+
+def _any(geoms: np.ndarray) -> np.ndarray:
+  return geoms >= 0
 
 
 @final

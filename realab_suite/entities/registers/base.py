@@ -201,32 +201,24 @@ class Register(composer.Entity):
     """
     return value
 
-  def obstacles(self, physics: protocols.Physics) -> np.ndarray | None:
-    """Returns what a kind that is read from a distance is hidden by.
+  def read_without(
+      self,
+      physics: protocols.Physics,
+      is_gone: Callable[[np.ndarray], np.ndarray],
+  ) -> np.ndarray | None:
+    """Returns the reading if some of what is in the way were not there.
 
     Args:
       physics: One world or a batch of worlds.
+      is_gone: Function of the geoms that hide something, `(..., lines)`; -1 for
+        none. It returns True for those that are not there.
 
     Returns:
-      Geom, not of the register itself, that falsifies what is seen along each
-      line of sight, `(..., lines)` int; -1 for none. `None` if there are no
-      lines of sight.
+      The reading, `(...)`; `None` for kinds that nothing can hide, such as
+      those that read the poses of their blocks.
     """
-    del physics
+    del physics, is_gone
     return None
-
-  def read_without(
-      self, physics: protocols.Physics, is_gone: np.ndarray
-  ) -> np.ndarray:
-    """Returns the reading, `(...)`, if some obstacles were not there.
-
-    Args:
-      physics: One world or a batch of worlds.
-      is_gone: True for lines of sight of `obstacles` that are free, `(...,
-        lines)` bool.
-    """
-    del is_gone
-    return self.read(physics)
 
   def _permanent(self, physics: protocols.Physics) -> np.ndarray:
     """Returns the permanent corruption, `(...)`, in the register's units.

@@ -1,6 +1,6 @@
 """The display: a number in a row of tiles that are looked at from a point."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, final
 
 from dm_control import mjcf
@@ -12,10 +12,10 @@ from realab_suite.entities import axes
 from realab_suite.entities import block_contacts
 from realab_suite.entities import block_kinds
 from realab_suite.entities import protocols
+from realab_suite.entities import rays
 from realab_suite.entities import rotations
 from realab_suite.entities.registers import base
 from realab_suite.entities.registers import footprints
-from realab_suite.entities.registers import sights
 
 _MOST_TILES = 16
 # Number of tiles with the same bit in a layout that corrects errors.
@@ -33,8 +33,8 @@ _PLANK = 0.01
 # Default distance of the reading point from the row, and its height, in m. From
 # there, lines of sight pass above an avatar that is 0.6 m from the row.
 _BEFORE, _ABOVE = 1.5, 1.8
-# A display that is nearer to its start, in m and in the numbers of a
-# quaternion, shows what it would show there; it sinks by 0.3 mm at rest.
+# A display that has moved by less, in m and in the numbers of a quaternion,
+# shows the same. It sinks by 0.3 mm at rest.
 _UNMOVED = 1e-3
 
 _Coordinate = Annotated[float, pydantic.Field(ge=-100, le=100)]
@@ -106,7 +106,7 @@ class Tile(block_kinds.Block):
     offset = self._offset + np.zeros((*self.heading(physics).shape, 3))
     offset[..., 2] += physics.bind(self._lift).qpos.T[0]
     turn = rotations.matrices(self._base.orientation(physics))
-    return self._base.position(physics) + sights.turned(turn, offset)
+    return self._base.position(physics) + _turned(turn, offset)
 
   def heading(self, physics: protocols.Physics) -> np.ndarray:
     return self._base.heading(physics)
@@ -122,7 +122,7 @@ class Tile(block_kinds.Block):
     position = np.array(position, float)
     turn = rotations.matrices(rotations.quaternion_of(heading))
     height = (position[..., 2] - self.rest_height).clip(0.0, self._half_size)
-    position[..., :2] -= sights.turned(turn, self._offset)[..., :2]
+    position[..., :2] -= _turned(turn, self._offset)[..., :2]
     position[..., 2] = self._base.rest_height
     self._base.put(physics, position, heading, where)
     lift = physics.bind(self._lift)
@@ -208,29 +208,26 @@ class Display(base.Register):
         tile.lift for tile in self._tiles if isinstance(tile, Tile)
     )
     half, length = self._block_size / 2, width * number
-    # Centres and half sizes of all parts in the frame of the base block.
-    self._centres = np.zeros((number + 2, 3))
-    self._centres[2:] = self._offsets
-    self._centres[1] = length / 2, 0.0, _PLANK - half
-    self._halves = np.full((number + 2, 3), half)
-    self._halves[1] = length / 2 + half, half, _PLANK
     # Without a plank, the base block would tremble under the row.
-    moves = {} if self._lifts else {'contype': 0, 'conaffinity': 0}
     plank = self._base.geom.parent.add(
         'geom', name='plank', type='box', mass=self._mass,
-        pos=self._centres[1], size=self._halves[1], **moves,
+        pos=(length / 2, 0, _PLANK - half),
+        size=(length / 2 + half, half, _PLANK),
+        **({} if self._lifts else {'contype': 0, 'conaffinity': 0}),
         **block_contacts.attributes(half),
         **self._style(block_kinds.BASE_BLOCK),
     )  # fmt: skip
-    self._geoms = (
-        self._base.geom, plank, *(tile.geom for tile in self._tiles)
-    )  # fmt: skip
+    self._geoms = self._base.geom, plank, *(tile.geom for tile in self._tiles)
     middle = (width * (number + 1) / 2, _BEFORE, _ABOVE)
-    x, y, z = self._reading_point or middle
-    height = self._base.rest_height
-    # Between the tops of a lowered and a raised tile.
-    places = self._offsets + np.array([0.0, 0.0, height + 1.5 * half])
-    self._sight = sights.Sight(self._mjcf_root, np.array([x, y, z]), places)
+    self._point = np.array(self._reading_point or middle)
+    self._site = self._mjcf_root.worldbody.add(
+        'site', name='reading_point', pos=self._point, size=[0.03], group=4
+    )
+    # Lines of sight end between the tops of lowered and raised tiles.
+    height = self._base.rest_height + 1.5 * half
+    ways = self._offsets + np.array([0.0, 0.0, height]) - self._point
+    self._lengths = np.linalg.norm(ways, axis=-1)
+    self._ways = ways / self._lengths[:, np.newaxis]
     return [self._base, *self._tiles]
 
   def _add_tile(self, name: str, offset: list[float]) -> block_kinds.Block:
@@ -279,81 +276,60 @@ class Display(base.Register):
       where: axes.Mask = None,
   ) -> None:
     if self._lifts:
-      self._shift(physics, value, where)
-      axes.assign(physics.bind(self._lifts), 'qvel', 0.0, where)
+      lifts = physics.bind(self._lifts)
+      axes.assign(lifts, 'qpos', self._heights(value), where)
+      axes.assign(lifts, 'qvel', 0.0, where)
       return
     _, *places = self._places(physics, value)
     for tile, place in zip(self._tiles, places, strict=True):
       tile.put(physics, place, where=where)
 
-  def _shift(
-      self,
-      physics: protocols.Physics,
-      value: np.ndarray,
-      where: axes.Mask = None,
-  ) -> np.ndarray:
-    lifts = physics.bind(self._lifts)
-    axes.assign(lifts, 'qpos', self._heights(value), where)
-    return value
-
-  def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
-    start = self._origin(physics)
-    return self.decode(self._sight.look(physics, start).seen)
-
-  def obstacles(self, physics: protocols.Physics) -> np.ndarray | None:
-    if self._channel == 'secure':
-      return None
-    look = self._sight.look(physics, self._origin(physics))
-    own = physics.bind(self._geoms).element_id
-    is_hidden = look.seen & ~np.isin(look.geoms, own)
-    if is_hidden.any():
-      heights = self._heights(self._applied_slot.get(physics))
-      if self._lifts:
-        heights = np.asarray(physics.bind(self._lifts).qpos)
-      is_hidden &= ~self._unobstructed(physics, heights)
-    return np.where(is_hidden, look.geoms, -1)
-
-  def read_without(
-      self, physics: protocols.Physics, is_gone: np.ndarray
-  ) -> np.ndarray:
-    look = self._sight.look(physics, self._origin(physics))
-    return self.decode(look.seen & ~is_gone)
-
-  def _permanent(self, physics: protocols.Physics) -> np.ndarray:
-    applied = self._applied_slot.get(physics)
-    if not self._is_moved(physics):
-      return np.zeros_like(applied)[()]
-    seen = self._unobstructed(physics, self._heights(applied))
-    return self.decode(seen) - applied
-
-  def _is_moved(self, physics: protocols.Physics) -> bool:
-    """Returns True if the base block is not where it began, in any world."""
-    shift = self._base.position(physics) - self._origin(physics)
-    turn = self._base.orientation(physics)[..., 1:]
-    return bool(max(np.abs(shift).max(), np.abs(turn).max()) > _UNMOVED)
-
-  def _unobstructed(
-      self, physics: protocols.Physics, heights: np.ndarray
-  ) -> np.ndarray:
-    """Returns which tiles would look raised if nothing were in the way.
+  def _look(self, physics: protocols.Physics) -> tuple[np.ndarray, np.ndarray]:
+    """Looks along the lines of sight.
 
     Args:
       physics: One world or a batch of worlds.
-      heights: Height of each tile above the lowered one, `(..., tiles)`, in m.
 
     Returns:
-      `(..., tiles)` bool.
+      True for each tile that looks raised, `(..., tiles)` bool, and the geoms
+      that the lines meet first.
     """
-    centres = self._centres + np.zeros((*heights.shape[:-1], 1, 3))
-    centres[..., 2:, 2] += heights
-    turn = rotations.matrices(self._base.orientation(physics))
-    return self._sight.meets(
-        self._origin(physics),
-        self._base.position(physics),
-        turn,
-        centres,
-        self._halves,
+    site = physics.bind(self._site)
+    turn = np.reshape(site.xmat, (*site.xmat.shape[:-1], 3, 3))
+    start = self._origin(physics) * [1.0, 1.0, 0.0]
+    distances, geoms = rays.cast(
+        physics,
+        site.xpos + _turned(turn, start),
+        self._ways @ np.swapaxes(turn, -1, -2),
+        -1,
     )
+    return (distances >= 0.0) & (distances <= self._lengths), geoms
+
+  def _read_blocks(self, physics: protocols.Physics) -> np.ndarray:
+    return self.decode(self._look(physics)[0])
+
+  def read_without(
+      self,
+      physics: protocols.Physics,
+      is_gone: Callable[[np.ndarray], np.ndarray],
+  ) -> np.ndarray | None:
+    if self._channel == 'secure':
+      return None
+    seen, geoms = self._look(physics)
+    own = physics.bind(self._geoms).element_id
+    is_lowered = self._heights(self._applied_slot.get(physics)) == 0.0
+    is_hidden = seen & is_lowered & ~np.isin(geoms, own)
+    return self.decode(seen & ~is_gone(np.where(is_hidden, geoms, -1)))
+
+  def _permanent(self, physics: protocols.Physics) -> np.ndarray:
+    applied = self._applied_slot.get(physics)
+    shift = self._base.position(physics) - self._origin(physics)
+    turn = self._base.orientation(physics)[..., 1:]
+    moved = np.maximum(np.abs(shift).max(-1), np.abs(turn).max(-1)) > _UNMOVED
+    if not axes.anywhere(moved):
+      return np.zeros_like(applied)[()]
+    unhidden = self.read_without(physics, lambda geoms: geoms >= 0)
+    return np.where(moved, unhidden - applied, 0.0)
 
   @property
   def directions(self) -> tuple[None, ...]:
@@ -367,3 +343,8 @@ class Display(base.Register):
       raised = place + np.array([0.0, 0.0, self._block_size / 2])
       paths.append(footprints.Path(i, place, raised, self.value_range))
     return paths
+
+
+def _turned(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:
+  """Returns vectors, `(..., 3)`, turned by matrices, `(..., 3, 3)`."""
+  return np.einsum('...ij,...j->...i', turn, vector)
