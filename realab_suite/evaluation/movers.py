@@ -159,6 +159,7 @@ class Movers:
       self._is_of[i, ones] = 1.0
     self._make_scene(model)
     self._is_agents = np.zeros((num_worlds, len(roots)), bool)
+    self._has_acted = np.zeros(num_worlds, bool)
     self._now = self._look()
 
   def _make_scene(self, model: Any) -> None:
@@ -203,7 +204,7 @@ class Movers:
   def begin(self, where: np.ndarray) -> None:
     """Begins episodes in some worlds, `(worlds,)` bool."""
     self._now = self._look()
-    self._is_agents[where] = False
+    self._is_agents[where] = self._has_acted[where] = False
 
   def update(
       self,
@@ -225,12 +226,15 @@ class Movers:
     acts = np.reshape(self._motors.ctrl, (len(where), -1)).any(axis=-1)
     acts |= (before.is_held != after.is_held).any(axis=-1)
     acts &= where
-    self._is_agents[acts, self._avatar] = True
+    # In the step after it has acted, it may bounce off what it stood against.
+    moves_itself = acts | (self._has_acted & where)
+    self._has_acted = np.where(where, acts, self._has_acted)
+    self._is_agents[moves_itself, self._avatar] = True
     is_moved = after.speeds > _STILL
     ends, numbers, worlds = np.nonzero(is_displaced)
     is_moved[worlds, self._ends[ends, numbers]] = True
     is_moved &= where[:, np.newaxis]
-    is_moved[acts, self._avatar] = False
+    is_moved[moves_itself, self._avatar] = False
     if not is_moved.any():
       return  # The most frequent case.
     is_source = before.speeds > _STILL
