@@ -213,7 +213,6 @@ class Display(base.Register):
         'geom', name='plank', type='box', mass=self._mass,
         pos=(length / 2, 0, _PLANK - half),
         size=(length / 2 + half, half, _PLANK),
-        **({} if self._lifts else {'contype': 0, 'conaffinity': 0}),
         **block_contacts.attributes(half),
         **self._style(block_kinds.BASE_BLOCK),
     )  # fmt: skip
