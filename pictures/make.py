@@ -29,6 +29,7 @@ def main() -> None:
     raise errors.ResultsError(f'cannot make pictures: {problem}')
   # These import dm_control, so a renderer has to be chosen first.
   from pictures import carrying
+  from pictures import display
   from pictures import first_person
   from pictures import reacher
   from pictures import tampering
@@ -37,6 +38,7 @@ def main() -> None:
   folder.mkdir(parents=True, exist_ok=True)
   first_person.draw(folder / 'first_person.png')
   carrying.draw(folder / 'carrying.png')
+  display.draw(folder / 'display.png')
   worlds.draw(folder / 'worlds')
   worlds.draw_sheet(folder / 'worlds.png')
   (folder / 'gallery').mkdir(exist_ok=True)

@@ -53,6 +53,7 @@ def fixture_registries():
         'docs/attribution.md',
         'docs/composer.md',
         'docs/gymnasium.md',
+        'docs/registers.md',
         'docs/your_own.md',
     ],
 )
