@@ -102,7 +102,7 @@ def attacked(design: specs.DesignSpec, target: str | None = None) -> list[str]:
 
 
 def targets(env: environment.Environment, names: Sequence[str]) -> list[Target]:
-  """Returns all blocks of registers.
+  """Returns all blocks of registers that can be moved by themselves.
 
   Args:
     env: Environment. An episode must have begun.
@@ -126,6 +126,8 @@ def _targets_of(
   kinds = appearance.class_of_geoms(physics.model)
   found = []
   for i, block in enumerate(register.blocks):
+    if not isinstance(block, block_kinds.JointedBlock):
+      continue  # It moves with another one, as the tiles of a display do.
     geom = physics.bind(block.geom)
     rotation = np.reshape(geom.xmat, (3, 3))
     # Angle of the register's x axis to that of the world.

@@ -92,6 +92,12 @@ class Block(abc.ABC):
 
   def __init__(self, half_size: float) -> None:
     self._half_size = half_size
+    self._grasps: list[grasps.Grasp] = []
+
+  @property
+  def grasps(self) -> list[grasps.Grasp]:
+    """Grasps by which hands can hold the block."""
+    return self._grasps
 
   @property
   def half_size(self) -> float:
@@ -223,7 +229,6 @@ class JointedBlock(Block):
       style: Geom attributes; see `appearance.geom_style`.
     """
     super().__init__(half_size)
-    self._grasps: list[grasps.Grasp] = []
     self._rest = np.array([*position, self.rest_height])
     self._body = mjcf_model.worldbody.add('body', name=name, pos=self._rest)
     self._geom = self._body.add(
@@ -256,11 +261,6 @@ class JointedBlock(Block):
   def site(self) -> mjcf.Element:
     """Site that a hand grasps."""
     return self._site
-
-  @property
-  def grasps(self) -> list[grasps.Grasp]:
-    """Grasps by which hands can hold the block."""
-    return self._grasps
 
   @property
   def surroundings(self) -> surroundings.Surroundings:

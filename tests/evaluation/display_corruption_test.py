@@ -9,6 +9,7 @@ from typing import NamedTuple, final
 import numpy as np
 import pytest
 
+from realab_suite import errors
 from realab_suite import suite
 from realab_suite.evaluation import attribution
 from realab_suite.evaluation import evaluate
@@ -289,7 +290,7 @@ def test_a_design_with_a_wrong_option_is_refused_in_one_line():
       ('{tile: 6}', "'tile'"),
       ('{reading_point: [0, .inf, 1]}', 'reading_point'),
   ):
-    with pytest.raises(Exception, match='registers.reward') as error:
+    with pytest.raises(errors.SpecError, match=r'registers\.reward') as error:
       suite.load(
           'unlock_door', 'near', design='instantaneous_reward',
           overrides=['registers.reward.kind=display',

@@ -94,11 +94,6 @@ class Tile(block_kinds.Block):
     return self._lift
 
   @property
-  def grasps(self) -> list[Any]:
-    """No hand holds a tile; it holds the base block."""
-    return []
-
-  @property
   def rest_height(self) -> float:
     return self._base.rest_height + float(self._offset[2])
 
@@ -145,9 +140,8 @@ class Display(base.Register):
 
   The range is divided into `2**bits` levels, from its lowest to its highest
   value; a write stores the nearest level. Neighbouring levels differ in one
-  tile (Gray code), so a wrong tile can be any other error, but a tile that is
-  read while it moves is not. The scale has no influence on the tiles. It says
-  to how many metres of a block's motion an error corresponds, in reports.
+  tile (Gray code). The scale moves no tile: it converts errors into metres for
+  reports.
   """
 
   def _build(
