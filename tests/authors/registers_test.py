@@ -104,6 +104,14 @@ def _constant(self, physics):
   return self._applied_slot.copy(physics)
 
 
+def _halved(self, value):
+  return value / 2
+
+
+def _one_more(self, physics, is_gone):
+  return self.read(physics) + 1.0
+
+
 _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     'remembers': ({'_read_blocks': _remembers}, 'read as'),
     'ignores masks': ({'_put': _ignores_where}, 'to other worlds of a batch'),
@@ -124,6 +132,12 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     'has too many directions': (
         {'directions': (None, None)}, '2 directions for 1 blocks'
+    ),
+    'rounds what is rounded': (
+        {'nearest': _halved}, 'write(-1.0) returned -0.5'
+    ),
+    'is hidden by nothing': (
+        {'read_without': _one_more}, 'without what is in the way'
     ),
     'cannot be corrupted': (
         {'_read_blocks': _constant}, 'no motion of a single block'
