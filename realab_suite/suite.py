@@ -347,7 +347,9 @@ def embed(
           f'measurements: {messages.quote(name)}: {messages.quote(measure)};'
           ' allowed is a function of the physics'
       )
-  mechanism = mechanisms.FeedbackMechanism(specs.load(design, overrides))
+  mechanism = mechanisms.FeedbackMechanism(
+      specs.load(design, overrides).in_world(getattr(task, 'SOLVER', None))
+  )
   mechanism.attach_to(task.root_entity)
   try:
     return _connected(

@@ -122,7 +122,11 @@ class World:
       design: The design.
       task: Name of the task in the domain.
     """
-    needed = [one.required_senses for one in design.providers]
+    needed = [
+        one.required_senses
+        for one in design.in_world(self.solver).providers
+        if one.senses != 'own'
+    ]
     if self.solver is not None:
       needed.append(policies.make(self.solver).required_senses)
     senses = {name for names in needed for name in names}

@@ -242,7 +242,10 @@ class BatchEnvironment:
           self._single.num_substeps,
           queries=queries,
           controls=controls,
-          observation=self._observation,
+          observation={
+              **self._observation,
+              **self._observer.added(self._physics),
+          },
           provider_keys=self._keys,
           provider_states=self._states,
           where=lambda: ~(is_first | self._physics.has_diverged()),

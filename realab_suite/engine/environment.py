@@ -415,7 +415,7 @@ class Environment(composer.Environment):
         self._n_sub_steps,
         queries=queries,
         controls=controls,
-        observation=self._session.observation,
+        observation=self._session.inputs(self._physics),
         provider_keys=self._session.keys,
         provider_states=self._session.states,
     )
@@ -430,7 +430,8 @@ class Environment(composer.Environment):
     self._host.begin_observing(self._physics_proxy)
 
   def _make_observation_updater(self) -> Any:
-    return self._host.make_updater(self._selected_senses)
+    own = self._mechanism.own_senses
+    return self._host.make_updater(self._selected_senses, own)
 
   def _recompile_physics(self) -> None:
     """Compiles the model into a physics class of this engine."""

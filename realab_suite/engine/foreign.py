@@ -150,7 +150,7 @@ class ForeignHost(hosts.Host):
     )
 
   def make_updater(
-      self, senses: Sequence[str] | None
+      self, senses: Sequence[str] | None, added: Collection[str] = ()
   ) -> composer_observation.Updater:
     """Returns an updater of the selected observables.
 
@@ -158,6 +158,7 @@ class ForeignHost(hosts.Host):
 
     Args:
       senses: Names of the selected senses; `None` for all enabled observables.
+      added: Names of senses that providers have as well, if they are offered.
 
     Raises:
       SpecError: If a name is not that of an enabled observable.
@@ -169,7 +170,8 @@ class ForeignHost(hosts.Host):
     }
     if senses is not None:
       observing.refuse_unknown(senses, [*selected, observing.TIME_LEFT])
-      selected = {n: one for n, one in selected.items() if n in senses}
+      wanted = {*senses, *added}
+      selected = {n: one for n, one in selected.items() if n in wanted}
     return composer_observation.Updater(
         selected,
         self._task.physics_steps_per_control_step,
@@ -252,6 +254,10 @@ class ForeignHost(hosts.Host):
   @property
   def default_senses(self) -> Sequence[str]:
     return tuple(self._sense_spec)
+
+  @property
+  def privileged_senses(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
+    return getattr(self._task, 'privileged_senses', {})
 
   def sense(
       self, physics: hosts.SteppedPhysics, names: Collection[str]

@@ -171,12 +171,13 @@ class Host(abc.ABC):
 
   @abc.abstractmethod
   def make_updater(
-      self, senses: Sequence[str] | None
+      self, senses: Sequence[str] | None, added: Collection[str] = ()
   ) -> composer_observation.Updater:
     """Returns an updater of the observables that senses are made of.
 
     Args:
       senses: Names of the selected senses; `None` for all of them.
+      added: Names of senses that providers have as well, if they are offered.
 
     Raises:
       SpecError: If the task does not offer a sense.
@@ -262,6 +263,11 @@ class Host(abc.ABC):
   @abc.abstractmethod
   def default_senses(self) -> Sequence[str]:
     """Names of the senses of an agent for which none are selected."""
+
+  @property
+  @abc.abstractmethod
+  def privileged_senses(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
+    """Functions of the physics that providers may sense; see `Task`."""
 
   @abc.abstractmethod
   def sense(
@@ -399,9 +405,9 @@ class WorldHost(Host):
     return self._task.DYNAMICS_VERSION
 
   def make_updater(
-      self, senses: Sequence[str] | None
+      self, senses: Sequence[str] | None, added: Collection[str] = ()
   ) -> composer_observation.Updater:
-    del senses  # They are no observables.
+    del senses, added  # They are no observables.
     return composer_observation.Updater({})
 
   def check_placement(
@@ -440,6 +446,10 @@ class WorldHost(Host):
   @property
   def default_senses(self) -> Sequence[str]:
     return self._task.default_senses
+
+  @property
+  def privileged_senses(self) -> Mapping[str, Callable[[Any], np.ndarray]]:
+    return self._task.privileged_senses
 
   def sense(
       self, physics: SteppedPhysics, names: Collection[str]

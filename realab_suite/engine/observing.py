@@ -11,6 +11,7 @@ from realab_suite.config import messages
 from realab_suite.engine import hosts
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
+from realab_suite.feedback import providers
 from realab_suite.policies import base as policies_base
 
 TIME_LEFT = 'time_left'
@@ -74,12 +75,27 @@ class Observer:
           'senses: none are selected, and the agent reads no register; allowed'
           f' are {list(offered)}'
       )
+    privileged = host.privileged_senses
     for i, provider in enumerate(mechanism.design.providers):
-      policies_base.check_senses(
-          f'design {mechanism.design.name!r}: providers[{i}]:{provider.kind}',
-          provider.required_senses,
-          self._specs,
-      )
+      where = f'design {mechanism.design.name!r}: providers[{i}]'
+      if provider.senses == providers.OWN:
+        _refuse_not_offered(
+            where,
+            [*offered, *(f'privileged/{name}' for name in privileged)],
+            provider,
+        )
+      else:
+        policies_base.check_senses(
+            f'{where}:{provider.kind}', provider.required_senses, self._specs
+        )
+    # Senses that providers have and the agent lacks.
+    added = [n for n in mechanism.own_senses if n not in self._specs]
+    self._added = {n: f'senses/{n}' for n in added if n in of_task}
+    self._adds_time_left = len(self._added) < len(added)
+    self._privileged = {
+        f'privileged/{name}': privileged[name]
+        for name in mechanism.privileged_senses
+    }
 
   @property
   def senses(self) -> tuple[str, ...]:
@@ -115,18 +131,62 @@ class Observer:
       The observation, with arrays of shape `(..., *spec.shape)` by key, and the
       reads of registers for it.
     """
-    keys = self._keys
-    observation = {
-        keys[name]: value
-        for name, value in self._host.sense(physics, keys).items()
-    }
-    if self._has_time_left:
-      spent = self._mechanism.step_count(physics) / self._max_steps
-      observation[f'senses/{TIME_LEFT}'] = np.asarray(1.0 - spent, np.float32)
+    observation = self._sense(physics, self._keys, self._has_time_left)
     reads = self._mechanism.read_for_agent(physics)
     for read in reads:
       observation[f'registers/{read.register}'] = np.array(read.reading)
     return observation, reads
+
+  def added(self, physics: hosts.SteppedPhysics) -> dict[str, np.ndarray]:
+    """Returns what providers sense beside the agent's observation, by key.
+
+    The state is that of the last observation, so that a provider responds to
+    what the agent does. It is never part of observations.
+
+    Args:
+      physics: Physics of one world or of a batch, before a control step.
+    """
+    found = self._sense(physics, self._added, self._adds_time_left)
+    for key, function in self._privileged.items():
+      found[key] = np.array(function(physics))
+    return found
+
+  def _sense(
+      self,
+      physics: hosts.SteppedPhysics,
+      keys: Mapping[str, str],
+      has_time_left: bool,
+  ) -> dict[str, np.ndarray]:
+    """Returns senses by key.
+
+    Args:
+      physics: Physics of one world or of a batch.
+      keys: Keys of senses of the task, by name.
+      has_time_left: True with the time that is left.
+    """
+    found = {}
+    if keys:
+      sensed = self._host.sense(physics, keys)
+      found = {keys[name]: value for name, value in sensed.items()}
+    if has_time_left:
+      spent = self._mechanism.step_count(physics) / self._max_steps
+      found[f'senses/{TIME_LEFT}'] = np.asarray(1.0 - spent, np.float32)
+    return found
+
+
+def _refuse_not_offered(
+    where: str, offered: Sequence[str], provider: providers.Provider
+) -> None:
+  """Raises a SpecError if a provider reads what its world does not offer."""
+  wanted = [
+      *provider.required_senses,
+      *(f'privileged/{name}' for name in provider.privileged_senses),
+  ]
+  if missing := [name for name in wanted if name not in offered]:
+    raise errors.SpecError(
+        f'{where}:{provider.kind} needs the senses {missing}; this world offers'
+        f' {list(offered)}'
+    )
 
 
 def refuse_unknown(selected: Sequence[str], offered: Collection[str]) -> None:

@@ -65,13 +65,17 @@ class PlainTask(composer.Task):
     )
     # The observables of this task are what it returns, so that providers
     # observe what agents do, and noise is drawn once.
-    self._updater = self._host.make_updater(self._senses)
+    self._updater = self._make_updater()
     self._updater.reset(env.physics, self._random_state)
     self._host.start(
         env.mechanism, env.task, self._random_state, lambda: self._updater
     )
+    has_parts = self._senses or env.mechanism.read_by_agent
     observer = observing.Observer(
-        self._host, env.mechanism, env.max_steps, self._senses or None
+        self._host,
+        env.mechanism,
+        env.max_steps,
+        self._senses if has_parts else None,
     )
     self._spec = observer.spec()
     self._observables = {
@@ -98,6 +102,7 @@ class PlainTask(composer.Task):
     self._step: Any = None
     self._num_done = 0
     self._action = self._queries = self._controls = np.zeros(0)
+    self._inputs: dict[str, np.ndarray] = {}
     self._end: events.End | None = None
     self._discount = 1.0
 
@@ -173,7 +178,7 @@ class PlainTask(composer.Task):
 
   def after_compile_of_all(self, physics: Any, random_state: Any) -> None:
     """Prepares the observables, after the hooks of all entities."""
-    self._updater = self._host.make_updater(self._senses)
+    self._updater = self._make_updater()
     self._updater.reset(physics, random_state)
     self._is_observed = True
     self._session.observation = {
@@ -209,6 +214,8 @@ class PlainTask(composer.Task):
         physics, self._host, self._mechanism, self._view
     )
     self._num_done = 0
+    with self._session.ending_on_failure():
+      self._inputs = self._session.inputs(physics)
     self._task.before_step(physics, controls, random_state)
 
   def before_substep(
@@ -243,6 +250,9 @@ class PlainTask(composer.Task):
     del physics
     return self._end is not None
 
+  def _make_updater(self) -> Any:
+    return self._host.make_updater(self._senses, self._mechanism.own_senses)
+
   def _begin_attempt(self, random_state: np.random.RandomState) -> None:
     """Begins an episode, or another attempt to begin the same episode."""
     # A step that did not end has failed, in the physics or in the task.
@@ -274,7 +284,7 @@ class PlainTask(composer.Task):
       step.update_meters()
     if now == self._schedule.provider_substep:
       own = self._session
-      step.update_providers(own.observation, own.keys, own.states)
+      step.update_providers(self._inputs, own.keys, own.states)
     if self._mechanism.registers or not self._host.LEGACY_STEP:
       view.refresh()
 

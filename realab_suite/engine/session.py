@@ -97,6 +97,10 @@ class Session:
     self.observation = observing.frozen(observation)
     return reads
 
+  def inputs(self, physics: Any) -> dict[str, np.ndarray]:
+    """Returns the observation with what providers alone sense, by key."""
+    return {**self.observation, **self._observer.added(physics)}
+
   def finish_step(
       self,
       physics: Any,

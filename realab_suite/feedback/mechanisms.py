@@ -218,6 +218,18 @@ class FeedbackMechanism(composer.Entity):
     ]
 
   @property
+  def own_senses(self) -> list[str]:
+    """Names of the senses that providers have, whatever the agent has."""
+    own = [p for p in self._design.providers if p.senses == providers.OWN]
+    return list(dict.fromkeys(n for p in own for n in p.required_senses))
+
+  @property
+  def privileged_senses(self) -> list[str]:
+    """Names of functions of the task that providers sense."""
+    names = [n for p in self._design.providers for n in p.privileged_senses]
+    return list(dict.fromkeys(names))
+
+  @property
   def read_by_agent(self) -> list[str]:
     """Names of the ports that the agent reads."""
     return self._read_by_agent

@@ -69,6 +69,7 @@ class FeedbackProvider(composer.Entity):
     self.targets = targets
     self.seen = [
         *(f'senses/{name}' for name in spec.required_senses),
+        *(f'privileged/{name}' for name in spec.privileged_senses),
         *(f'registers/{name}' for name in read_by_agent),
     ]
 

@@ -8,6 +8,7 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.config import documents
+from realab_suite.config import messages
 from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.entities import registers
@@ -341,6 +342,33 @@ class DesignSpec(validation.Spec):
         if (readers := [p for p in self.providers if name in p.reads])
         and all(name in provider.action_queries for provider in readers)
     ]
+
+  def in_world(self, solver: str | None) -> 'DesignSpec':
+    """Returns the design with the solver of a world in place of `solver`.
+
+    Args:
+      solver: Name of the policy that solves the task; `None` if there is none.
+
+    Raises:
+      SpecError: If a provider needs a solver and there is none, or if it does
+        not fit the design.
+    """
+    found = []
+    for i, provider in enumerate(self.providers):
+      location = messages.Location(f'design {self.name!r}', ('providers', i))
+      try:
+        found.append(provider.in_world(solver))
+      except errors.SpecError as error:
+        raise location.error(str(error)) from error
+    if tuple(found) == self.providers:
+      return self
+    design = self.model_copy(update={'providers': tuple(found)})
+    try:
+      consistency.check(design, WRITTEN_BY_PROVIDERS)
+    except ValueError as error:
+      where = messages.Location(f'design {self.name!r}')
+      raise where.error(str(error)) from error
+    return design
 
   def channel_of(self, name: str) -> arguments.Channel:
     """Returns the channel of a register.

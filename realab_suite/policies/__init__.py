@@ -10,7 +10,6 @@ from realab_suite.policies.base import check_action_set
 from realab_suite.policies.base import check_senses
 from realab_suite.policies.base import make
 from realab_suite.policies.base import make_value_function
-from realab_suite.policies.base import refuse_privileged
 from realab_suite.policies.network_policies import NetworkDemonstrator
 from realab_suite.policies.network_policies import NetworkValues
 from realab_suite.policies.saboteurs import CarryingSaboteur
@@ -39,5 +38,4 @@ __all__ = [
     'check_senses',
     'make',
     'make_value_function',
-    'refuse_privileged',
 ]

@@ -1,4 +1,4 @@
-"""Approval: a value function from the action that a policy would take."""
+"""Approval: value functions from the action that a policy would take."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, final
@@ -37,7 +37,6 @@ class PolicyApproval(base.ValueFunction):
       options: Keyword arguments of the policy.
     """
     self._policy = base.make(policy, **(options or {}))
-    base.refuse_privileged(self._policy, 'an adviser')
     controls = self.action_set.table(avatars.ACTIONS)
     distances = np.linalg.norm(controls[:, np.newaxis] - controls, axis=-1)
     self._values = 1.0 - 2.0 * distances / distances.max()
@@ -49,6 +48,10 @@ class PolicyApproval(base.ValueFunction):
   @property
   def required_senses(self) -> tuple[str, ...]:
     return self._policy.required_senses
+
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self._policy.privileged_senses
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return self._policy.initial_state(batch_shape)
@@ -62,3 +65,20 @@ class PolicyApproval(base.ValueFunction):
   ) -> tuple[np.ndarray, Any]:
     action, state = self._policy.step(observation, episode_start, key, state)
     return self._values[action], state
+
+
+@base.VALUE_FUNCTIONS.add(base.SOLVER_APPROVAL)
+def solver_approval(
+    policy: Annotated[str, option_types.NameIn(base.POLICIES)] = base.SOLVER,
+    options: Annotated[
+        Mapping[str, Any] | None,
+        option_types.OptionsOf(base.POLICIES, 'policy'),
+    ] = None,
+) -> PolicyApproval:
+  """Returns the approval of the solver of the world, in any world.
+
+  Args:
+    policy: The solver; a world puts the name of its own here.
+    options: Keyword arguments of the solver.
+  """
+  return PolicyApproval(policy, options)

@@ -7,7 +7,7 @@ advises). It gets the observation of an agent.
 
 import abc
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -17,6 +17,12 @@ from realab_suite.config import registry
 from realab_suite.policies import action_sets
 
 Observation = Mapping[str, np.ndarray]
+
+SOLVER = 'solver'
+"""Name that stands for the solver of the world in which a design is loaded."""
+
+SOLVER_APPROVAL = 'solver_approval'
+"""Value function of that solver."""
 
 
 class Policy(abc.ABC):
@@ -100,6 +106,11 @@ class ValueFunction(abc.ABC):
     """Names of the senses that the value function reads from observations."""
     return ()
 
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    """Names of functions of the task that it reads as well; see `Policy`."""
+    return ()
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     """Returns the state before the first step; see `Policy`."""
     del batch_shape
@@ -123,6 +134,28 @@ POLICIES: registry.Registry[Callable[..., Policy]] = registry.Registry('policy')
 VALUE_FUNCTIONS: registry.Registry[Callable[..., ValueFunction]] = (
     registry.Registry('value function')
 )
+
+
+@POLICIES.add(SOLVER)
+@final
+class TaskSolver(Policy):
+  """Stands for the solver of the world in which a design is loaded.
+
+  Designs are written and checked without a world. `Provider.in_world` puts the
+  policy of the world in its place.
+  """
+
+  def step(
+      self,
+      observation: Observation,
+      episode_start: np.ndarray,
+      key: np.ndarray,
+      state: Any,
+  ) -> tuple[np.ndarray, Any]:
+    raise errors.SpecError(
+        f'policy: {SOLVER!r} stands for the solver of a world in the providers'
+        ' of designs; allowed here is the name of that solver'
+    )
 
 
 def make(name: str, /, **options: Any) -> Policy:
@@ -183,24 +216,6 @@ def check_senses(
     raise errors.SpecError(
         f'{what} needs the senses {missing}, which are not selected; selected'
         f' are {list(selected)}'
-    )
-
-
-def refuse_privileged(policy: Policy, place: str) -> None:
-  """Refuses a policy that reads more than observations.
-
-  Args:
-    policy: The policy.
-    place: What the policy is to be, for messages.
-
-  Raises:
-    ValueError: If it declares `privileged_senses`.
-  """
-  if policy.privileged_senses:
-    raise ValueError(
-        f'{type(policy).__name__} reads {list(policy.privileged_senses)} from'
-        f' the state of the world; allowed as {place} are policies that read'
-        ' observations alone'
     )
 
 

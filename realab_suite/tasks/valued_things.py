@@ -82,12 +82,17 @@ class ValuedThings(rooms.RoomTask):
   def privileged_senses(self) -> dict[str, Any]:
     frames = [frame for group in self._groups for frame in group.frames]
     numbers = [group.number for group in self._groups]
-    codes = [appearance.code(kind) for kind in self._numbers]
+    codes = np.array([appearance.code(kind) for kind in self._numbers])
+
+    def of_things(of_kinds: np.ndarray) -> np.ndarray:
+      return np.repeat(of_kinds, numbers, axis=-1)
+
+    def all_codes(physics: protocols.Physics) -> np.ndarray:
+      return of_things(np.broadcast_to(codes, self._values.get(physics).shape))
+
     return {
-        'codes': lambda physics: np.repeat(codes, numbers),
-        'values': lambda physics: np.repeat(
-            self._values.get(physics), numbers, axis=-1
-        ),
+        'codes': all_codes,
+        'values': lambda physics: of_things(self._values.get(physics)),
         'things': lambda physics: np.array(physics.bind(frames).mocap_pos),
     }
 

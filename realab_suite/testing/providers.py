@@ -1,6 +1,7 @@
 """Contract of feedback providers: pure functions that serve whole batches."""
 
 from collections.abc import Mapping, Sequence
+import contextlib
 import copy
 from typing import Any
 
@@ -38,6 +39,8 @@ def check_provider(
   - Each world of a batch gets what it would get alone.
   - An episode does not depend on the one before.
 
+  Where it names the policy `solver`, it gets the solver of the world.
+
   Args:
     provider: The provider.
     ranges: Lowest and highest reading of the registers that it reads, by name;
@@ -52,6 +55,8 @@ def check_provider(
       isinstance(provider, base.Provider),
       f'{provider!r:.80}: allowed is a provider, an instance of its class',
   )
+  with contextlib.closing(suite.load(domain_name, task_name)) as env:
+    provider = provider.in_world(env.task.SOLVER)
   worlds = [
       _inputs(provider, ranges or {}, world, (domain_name, task_name))
       for world in range(_NUM_WORLDS)
@@ -95,6 +100,9 @@ def _inputs(
         f'senses/{name}': time_step.observation[f'senses/{name}']
         for name in provider.required_senses
     }
+    for name in provider.privileged_senses:
+      sensed = env.task.privileged_senses[name](env.physics)
+      seen[f'privileged/{name}'] = np.array(sensed)
     for name in (*provider.reads, *provider.writes):
       low_high = ranges.get(name, _RANGE)
       seen[f'registers/{name}'] = np.array(generator.uniform(*low_high))

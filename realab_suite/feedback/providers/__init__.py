@@ -1,6 +1,7 @@
 """Feedback providers; importing this package registers all of its providers."""
 
 from realab_suite.feedback.providers.appraisal import Appraisal
+from realab_suite.feedback.providers.base import OWN
 from realab_suite.feedback.providers.base import PROVIDERS
 from realab_suite.feedback.providers.base import Observation
 from realab_suite.feedback.providers.base import Provider
@@ -14,6 +15,7 @@ from realab_suite.feedback.providers.relay import Relay
 from realab_suite.feedback.providers.value_advice import ValueAdvice
 
 __all__ = [
+    'OWN',
     'PROVIDERS',
     'Appraisal',
     'Constant',

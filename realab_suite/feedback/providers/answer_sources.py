@@ -5,7 +5,7 @@ and the provider's readings, never the physics or the true reward.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import json
 from typing import Annotated, Any, NamedTuple, final
 
@@ -66,6 +66,11 @@ class Source(abc.ABC):
     return ()
 
   @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    """Names of functions of the task that it reads as well; see `Provider`."""
+    return ()
+
+  @property
   def action_set(self) -> action_sets.ActionSet | None:
     """Actions that the source judges; `None` for those of any set."""
     return None
@@ -112,6 +117,10 @@ class Simulated(Source):
       value_function: Annotated[
           str, option_types.NameIn(policies.VALUE_FUNCTIONS)
       ] = 'apple_seeker_approval',
+      options: Annotated[
+          Mapping[str, Any] | None,
+          option_types.OptionsOf(policies.VALUE_FUNCTIONS, 'value_function'),
+      ] = None,
       latency: Annotated[int, pydantic.Field(ge=0, le=1000)] = 3,
       noise: Annotated[float, pydantic.Field(ge=0, le=1)] = 0.05,
       fatigue: Annotated[float, pydantic.Field(ge=0, le=100)] = 0.002,
@@ -121,6 +130,7 @@ class Simulated(Source):
 
     Args:
       value_function: Name of a registered value function.
+      options: Keyword arguments of the value function.
       latency: Steps between a question and its answer. The person gets no other
         question meanwhile. There is no latency if the episode waits.
       noise: Probability that an answer is wrong.
@@ -129,7 +139,9 @@ class Simulated(Source):
         is rested at the start of each episode.
       patience: Number of disapproved actions in a row before a stop.
     """
-    self._adviser = policies.make_value_function(value_function)
+    self._adviser = policies.make_value_function(
+        value_function, **(options or {})
+    )
     self._latency, self._noise = latency, noise
     self._fatigue, self._patience = fatigue, patience
 
@@ -140,6 +152,10 @@ class Simulated(Source):
   @property
   def required_senses(self) -> tuple[str, ...]:
     return self._adviser.required_senses
+
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self._adviser.privileged_senses
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return {

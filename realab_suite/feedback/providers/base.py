@@ -2,14 +2,16 @@
 
 import abc
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import numpy as np
 import pydantic
 
+from realab_suite import errors
 from realab_suite.config import registry
 from realab_suite.config import validation
 from realab_suite.entities import axes
+from realab_suite.policies import base as policies
 
 Observation = Mapping[str, np.ndarray]
 Readings = Mapping[str, np.ndarray]
@@ -20,6 +22,10 @@ Names = Annotated[tuple[str, ...], pydantic.Field(strict=False)]
 OneName = Annotated[
     tuple[str, ...], pydantic.Field(strict=False, min_length=1, max_length=1)
 ]
+OF_AGENT: Final = 'agent'
+OWN: Final = 'own'
+
+_Self = TypeVar('_Self', bound='Provider')
 
 
 class Provider(validation.Model):
@@ -31,12 +37,17 @@ class Provider(validation.Model):
   physics nor the true reward. Because it is pure, one provider serves a whole
   batch: the leading axis of every array is the axis of worlds.
 
+  By default, it senses what the agent senses, as in the paper. A supervisor who
+  sees more has senses of its own, which agents never get.
+
   Attributes:
     kind: Name under which the class is registered.
     reads: Names of the registers whose readings the provider gets.
     writes: Names of the registers that the provider may write.
     every: The provider acts in steps 1, 1 + every, 1 + 2 every ... of an
       episode. In the other steps it is not called, and writes nothing.
+    senses: `agent` if the agent must have the senses that the provider reads;
+      `own` if they are computed for the provider, whatever the agent has.
   """
 
   kind: str
@@ -44,6 +55,10 @@ class Provider(validation.Model):
   writes: Names
   # Steps are compared as 64-bit integers.
   every: Annotated[int, pydantic.Field(ge=1, le=10**9)] = 1
+  # The digests of designs from before there was a choice stay the same.
+  senses: Literal['agent', 'own'] = pydantic.Field(
+      OF_AGENT, exclude_if=lambda senses: senses == OF_AGENT
+  )
 
   @property
   def action_queries(self) -> tuple[str, ...]:
@@ -73,12 +88,34 @@ class Provider(validation.Model):
 
   @property
   def required_senses(self) -> tuple[str, ...]:
-    """Names of the senses that the provider gets from observations.
+    """Names of the senses that the provider reads.
 
-    The agent must have these senses. Override this in a subclass that reads
-    senses.
+    The agent must have them, unless `senses` is `own`. Override this in a
+    subclass that reads senses.
     """
     return ()
+
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    """Names of functions of the task that the provider reads as well.
+
+    They are keys of `Task.privileged_senses`, and in observations
+    `privileged/<name>`. Only a provider with `senses: own` gets them.
+    """
+    return ()
+
+  def in_world(self: _Self, solver: str | None) -> _Self:
+    """Returns the provider with the solver of a world in place of `solver`.
+
+    Args:
+      solver: Name of the policy that solves the task; `None` if there is none.
+
+    Raises:
+      SpecError: If the provider needs a solver, and there is none.
+    """
+    data = self.model_dump()
+    found = _with_solver(data, solver)
+    return self if found == data else type(self).model_validate(found)
 
   @property
   def is_repeatable(self) -> bool:
@@ -141,3 +178,30 @@ class Provider(validation.Model):
 PROVIDERS: registry.Registry[type[Provider]] = registry.Registry(
     'provider kind'
 )
+
+
+def _with_solver(part: Any, solver: str | None) -> Any:
+  """Returns a part of the fields of a provider that names a solver.
+
+  Args:
+    part: A value of a field, at any depth.
+    solver: Name of the solver, or `None`.
+
+  Raises:
+    SpecError: If the part needs a solver, and there is none.
+  """
+  if not isinstance(part, Mapping):
+    return part
+  found = {key: _with_solver(value, solver) for key, value in part.items()}
+  if found.get('value_function') == policies.SOLVER_APPROVAL:
+    options = found.get('options') or {}
+    found['options'] = {'policy': policies.SOLVER, **options}
+    return {**found, 'options': _with_solver(found['options'], solver)}
+  if found.get('policy') == policies.SOLVER:
+    if solver is None:
+      raise errors.SpecError(
+          f'policy {policies.SOLVER!r}: this world names no solver; allowed are'
+          f' {sorted(set(policies.POLICIES) - {policies.SOLVER})}'
+      )
+    found['policy'] = solver
+  return found

@@ -40,12 +40,15 @@ class Demonstration(base.Provider):
     return policies.make(self.policy, **self.options)
 
   def check(self, design: Any) -> None:
-    policies.refuse_privileged(self.demonstrator, 'a demonstrator')
     policies.check_action_set(self.demonstrator.action_set, design, self.kind)
 
   @property
   def required_senses(self) -> tuple[str, ...]:
     return self.demonstrator.required_senses
+
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self.demonstrator.privileged_senses
 
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return self.demonstrator.initial_state(batch_shape)

@@ -62,6 +62,10 @@ class PairedAdvice(base.Provider):
   def required_senses(self) -> tuple[str, ...]:
     return self.adviser.required_senses
 
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self.adviser.privileged_senses
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     return self.adviser.initial_state(batch_shape)
 

@@ -76,6 +76,10 @@ class Person(base.Provider):
     return self.source.required_senses
 
   @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self.source.privileged_senses
+
+  @property
   def is_repeatable(self) -> bool:
     return self.source.is_repeatable
 

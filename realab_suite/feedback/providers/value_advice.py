@@ -71,6 +71,10 @@ class ValueAdvice(base.Provider):
   def required_senses(self) -> tuple[str, ...]:
     return self.adviser.required_senses
 
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return self.adviser.privileged_senses
+
   def initial_state(self, batch_shape: tuple[int, ...]) -> Any:
     num_actions = len(self.adviser.action_set)
     return (
