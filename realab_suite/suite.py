@@ -426,7 +426,7 @@ def _connect_meters(
           f'measurements: {name!r} is measured by the task; allowed are names'
           f' other than {sorted(functions)}'
       )
-  mechanism.connect({**functions, **added}, host.parts)
+  mechanism.connect({**functions, **added}, host.parts, host.privileged_senses)
 
 
 def _keywords(argument: str, value: Any) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 from realab_suite import errors
 from realab_suite.config import messages
 from realab_suite.engine import hosts
+from realab_suite.entities import meters
 from realab_suite.entities import registers
 from realab_suite.feedback import mechanisms
 from realab_suite.feedback import providers
@@ -16,6 +17,8 @@ from realab_suite.policies import base as policies_base
 
 TIME_LEFT = 'time_left'
 """Sense with the remaining share of the episode, from 1 to 0."""
+
+_REMEDY = "with 'senses: own', a provider gets them from the state of the world"
 
 
 @final
@@ -75,27 +78,23 @@ class Observer:
           'senses: none are selected, and the agent reads no register; allowed'
           f' are {list(offered)}'
       )
-    privileged = host.privileged_senses
+    privileged = {
+        f'privileged/{n}': f for n, f in host.privileged_senses.items()
+    }
     for i, provider in enumerate(mechanism.design.providers):
-      where = f'design {mechanism.design.name!r}: providers[{i}]'
-      if provider.senses == providers.OWN:
-        _refuse_not_offered(
-            where,
-            [*offered, *(f'privileged/{name}' for name in privileged)],
-            provider,
-        )
-      else:
-        policies_base.check_senses(
-            f'{where}:{provider.kind}', provider.required_senses, self._specs
-        )
-    # Senses that providers have and the agent lacks.
+      is_own = provider.senses == providers.OWN
+      policies_base.check_senses(
+          f'design {mechanism.design.name!r}: providers[{i}]:{provider.kind}',
+          provider.sensed,
+          [*offered, *privileged] if is_own else self._specs,
+          'offered by this world' if is_own else 'selected',
+          '' if is_own else f'; {_REMEDY}',
+      )
+    # What providers sense and the agent does not.
     added = [n for n in mechanism.own_senses if n not in self._specs]
     self._added = {n: f'senses/{n}' for n in added if n in of_task}
-    self._adds_time_left = len(self._added) < len(added)
-    self._privileged = {
-        f'privileged/{name}': privileged[name]
-        for name in mechanism.privileged_senses
-    }
+    self._adds_time_left = TIME_LEFT in added and TIME_LEFT not in of_task
+    self._privileged = {n: f for n, f in privileged.items() if n in added}
 
   @property
   def senses(self) -> tuple[str, ...]:
@@ -149,6 +148,8 @@ class Observer:
     found = self._sense(physics, self._added, self._adds_time_left)
     for key, function in self._privileged.items():
       found[key] = np.array(function(physics))
+      if isinstance(function, meters.Instrument):
+        found[mechanisms.IDEAL + key] = np.array(function.ideal(physics))
     return found
 
   def _sense(
@@ -162,7 +163,7 @@ class Observer:
     Args:
       physics: Physics of one world or of a batch.
       keys: Keys of senses of the task, by name.
-      has_time_left: True with the time that is left.
+      has_time_left: True with the time that is left, which is not one of them.
     """
     found = {}
     if keys:
@@ -172,21 +173,6 @@ class Observer:
       spent = self._mechanism.step_count(physics) / self._max_steps
       found[f'senses/{TIME_LEFT}'] = np.asarray(1.0 - spent, np.float32)
     return found
-
-
-def _refuse_not_offered(
-    where: str, offered: Sequence[str], provider: providers.Provider
-) -> None:
-  """Raises a SpecError if a provider reads what its world does not offer."""
-  wanted = [
-      *provider.required_senses,
-      *(f'privileged/{name}' for name in provider.privileged_senses),
-  ]
-  if missing := [name for name in wanted if name not in offered]:
-    raise errors.SpecError(
-        f'{where}:{provider.kind} needs the senses {missing}; this world offers'
-        f' {list(offered)}'
-    )
 
 
 def refuse_unknown(selected: Sequence[str], offered: Collection[str]) -> None:

@@ -43,12 +43,7 @@ def of_mechanism(
   channels = {name: design.channel_of(name) for name in design.ports}
   for i, provider in enumerate(design.providers):
     name = f'providers[{i}]:{provider.kind}'
-    privileged = [f'privileged/{one}' for one in provider.privileged_senses]
-    seen = [
-        one
-        for one in (*provider.required_senses, *privileged)
-        if one in instruments
-    ]
+    seen = [one for one in provider.sensed if one in instruments]
     # Only welded blocks cannot be carried before the eye of the avatar.
     if seen and set(channels.values()) != {'welded'}:
       found.append(

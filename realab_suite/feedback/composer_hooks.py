@@ -199,7 +199,7 @@ def _needs(mechanism: Any) -> list[str]:
   needs += [
       f'the sense {sense!r}'
       for provider in design.providers
-      for sense in (*provider.required_senses, *provider.privileged_senses)
+      for sense in provider.sensed
   ]
   needs += [
       f'the end of the episode by {name!r}'

@@ -42,7 +42,6 @@ def check(design: Any, written_by_providers: Sequence[str]) -> None:
     _refuse_duplicates(f'{where}.reads', provider.reads)
     _refuse_duplicates(f'{where}.writes', provider.writes)
     try:
-      _refuse_privileged(provider)
       provider.check(design)
     except ValueError as error:
       raise ValueError(f'{where}: {error}') from error
@@ -123,20 +122,6 @@ def _refuse_parts(design: Any) -> None:
             f'{where}: port {left_out[0]!r} of register {register!r} is left'
             f' out; allowed are all of {names}, or none'
         )
-
-
-def _refuse_privileged(provider: Any) -> None:
-  """Refuses a provider without senses of its own that reads more than agents.
-
-  Raises:
-    ValueError: If it declares `privileged_senses`.
-  """
-  if provider.privileged_senses and provider.senses != 'own':
-    raise ValueError(
-        f'senses: {provider.senses!r}; {provider.kind} reads'
-        f' {list(provider.privileged_senses)} from the state of the world, so'
-        " allowed is 'own'"
-    )
 
 
 def _refuse_second_writers(design: Any) -> None:

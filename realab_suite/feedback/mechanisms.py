@@ -43,6 +43,9 @@ _Port = ports.AnyPort
 
 Guard = clean_contents.Guard
 
+IDEAL = 'ideal/'
+"""Prefix of keys of ideal measurements of what providers sense."""
+
 
 @final
 class _Sight(NamedTuple):
@@ -118,6 +121,7 @@ class FeedbackMechanism(composer.Entity):
     self._read_by_agent = design.names(*specs.READ_BY_AGENTS)
     self._meters: list[tuple[tuple[str, ...], meters.Meter, _Target]] = []
     self._is_connected = False
+    self._instruments: set[str] = set()
     self._asked: list[measurements.AskedRegisters] = []
     self._providers = [
         provider_entities.FeedbackProvider(
@@ -209,25 +213,27 @@ class FeedbackMechanism(composer.Entity):
 
   @property
   def obstructible(self) -> list[str]:
-    """Names of the ports that instruments write; see `meters.Instrument`."""
+    """Names of the ports that depend on a `meters.Instrument`.
+
+    A meter writes them, or a provider that senses through it.
+    """
     return [
         name
         for _, meter, target in self._meters
         if meter.can_be_obstructed
         for name in target.names
+    ] + [
+        name
+        for provider in self._providers
+        if self._instruments & {*provider.seen} and not provider.is_secure
+        for name in provider.spec.writes
     ]
 
   @property
-  def own_senses(self) -> list[str]:
+  def own_senses(self) -> set[str]:
     """Names of the senses that providers have, whatever the agent has."""
     own = [p for p in self._design.providers if p.senses == providers.OWN]
-    return list(dict.fromkeys(n for p in own for n in p.required_senses))
-
-  @property
-  def privileged_senses(self) -> list[str]:
-    """Names of functions of the task that providers sense."""
-    names = [n for p in self._design.providers for n in p.privileged_senses]
-    return list(dict.fromkeys(names))
+    return {name for provider in own for name in provider.sensed}
 
   @property
   def read_by_agent(self) -> list[str]:
@@ -292,6 +298,7 @@ class FeedbackMechanism(composer.Entity):
       self,
       functions: Mapping[str, measurements.Measure],
       parts: Mapping[str, measurables.Measurable] | None = None,
+      privileged_senses: Mapping[str, measurements.Measure] | None = None,
   ) -> None:
     """Connects the meters to a world.
 
@@ -300,6 +307,8 @@ class FeedbackMechanism(composer.Entity):
       parts: Parts of the world that meters can measure, by name. `None` for
         those that its entities declare, and all bodies by their full MJCF
         identifiers, except the blocks of registers.
+      privileged_senses: Functions of the physics that providers can sense, by
+        name.
 
     Raises:
       SpecError: If a meter of the design measures, or a register begins with,
@@ -307,6 +316,11 @@ class FeedbackMechanism(composer.Entity):
     """
     if parts is None:
       parts = assembly.parts_beside(self)
+    self._instruments = {
+        f'privileged/{name}'
+        for name, function in (privileged_senses or {}).items()
+        if isinstance(function, meters.Instrument)
+    }
     for name, register in self._registers.items():
       initial = self._design.registers[name].initial
       if isinstance(initial, str):
@@ -520,8 +534,14 @@ class FeedbackMechanism(composer.Entity):
       ]
       if acts is not None:
         reads = [read._replace(where=acts) for read in reads]
+      ideal = {
+          key: observation[IDEAL + key]
+          for key in provider.seen
+          if IDEAL + key in observation
+      }
+      seen = {key: observation[key] for key in provider.seen}
       inputs = clean_contents.Inputs(
-          {key: observation[key] for key in provider.seen},
+          {**seen, **ideal} if provider.is_secure else seen,
           {read.register: read.reading for read in reads},
           is_start,
           keys_of_step[i],
@@ -529,7 +549,7 @@ class FeedbackMechanism(composer.Entity):
       values, state = self._call(i, step, inputs, states[i], acts)
       may_write = axes.both(where, acts)
       clean = self._clean_call(
-          physics, i, inputs, reads, sight, states[i], state, may_write
+          physics, i, inputs, reads, sight, ideal, states[i], state, may_write
       )
       log += reads
       log += self._write_all(physics, i, step, values, may_write, clean)
@@ -598,6 +618,7 @@ class FeedbackMechanism(composer.Entity):
       inputs: clean_contents.Inputs,
       reads: Sequence[records.Read],
       sight: _Sight,
+      ideal: Mapping[str, np.ndarray],
       state: Mapping[str, Any],
       following: dict[str, Any],
       where: axes.Mask,
@@ -614,6 +635,10 @@ class FeedbackMechanism(composer.Entity):
     if not provider.is_repeatable:
       return None
     needs = state[clean_contents.DIFFERS] | sight.is_disturbed
+    for key, value in ideal.items():
+      differs = np.asarray(inputs.observation[key] != value)
+      own_axes = tuple(range(np.ndim(inputs.episode_start), differs.ndim))
+      needs = needs | differs.any(axis=own_axes)
     seen = {}
     for read in reads:
       register = self._ports[read.register]
@@ -630,7 +655,7 @@ class FeedbackMechanism(composer.Entity):
         for some in (sight.seen, seen)
     )
     clean = clean_contents.Inputs(
-        {**inputs.observation, **shown},
+        {**inputs.observation, **shown, **ideal},
         readings,
         inputs.episode_start,
         inputs.key,

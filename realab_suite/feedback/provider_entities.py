@@ -41,6 +41,8 @@ class FeedbackProvider(composer.Entity):
     reads: Ports that the provider reads, in the order of the design.
     targets: Registers that the provider may write.
     seen: Keys of the observation that the provider gets.
+    is_secure: True if it writes secure registers only. It then senses without
+      obstruction, as meters of such registers measure.
   """
 
   def _build(
@@ -67,6 +69,7 @@ class FeedbackProvider(composer.Entity):
     self._mjcf_root = mjcf_model
     self.reads = reads
     self.targets = targets
+    self.is_secure = all(one.register.channel == 'secure' for one in targets)
     self.seen = [
         *(f'senses/{name}' for name in spec.required_senses),
         *(f'privileged/{name}' for name in spec.privileged_senses),

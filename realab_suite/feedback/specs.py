@@ -8,7 +8,6 @@ import pydantic
 
 from realab_suite import errors
 from realab_suite.config import documents
-from realab_suite.config import messages
 from realab_suite.config import option_types
 from realab_suite.config import validation
 from realab_suite.entities import registers
@@ -350,25 +349,18 @@ class DesignSpec(validation.Spec):
       solver: Name of the policy that solves the task; `None` if there is none.
 
     Raises:
-      SpecError: If a provider needs a solver and there is none, or if it does
-        not fit the design.
+      SpecError: If there is none, or if the solver does not fit the design.
     """
-    found = []
-    for i, provider in enumerate(self.providers):
-      location = messages.Location(f'design {self.name!r}', ('providers', i))
-      try:
-        found.append(provider.in_world(solver))
-      except errors.SpecError as error:
-        raise location.error(str(error)) from error
-    if tuple(found) == self.providers:
-      return self
-    design = self.model_copy(update={'providers': tuple(found)})
+    where = f'design {self.name!r}'
     try:
-      consistency.check(design, WRITTEN_BY_PROVIDERS)
-    except ValueError as error:
-      where = messages.Location(f'design {self.name!r}')
-      raise where.error(str(error)) from error
-    return design
+      found = tuple(one.in_world(solver) for one in self.providers)
+    except errors.SpecError as error:
+      raise errors.SpecError(f'{where}: {error}') from error
+    if found == self.providers:
+      return self
+    return validation.validate(
+        DesignSpec, {**self.to_mapping(), 'providers': found}, where
+    )
 
   def channel_of(self, name: str) -> arguments.Channel:
     """Returns the channel of a register.

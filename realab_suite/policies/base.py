@@ -200,7 +200,11 @@ def _make_registered(
 
 
 def check_senses(
-    what: str, required: Sequence[str], selected: Collection[str]
+    what: str,
+    required: Sequence[str],
+    selected: Collection[str],
+    how: str = 'selected',
+    remedy: str = '',
 ) -> None:
   """Checks that observations contain the senses that a policy reads.
 
@@ -208,14 +212,16 @@ def check_senses(
     what: Name of the policy or of another reader, for messages.
     required: Names of the senses that it reads.
     selected: Names of the senses in observations.
+    how: How they came to be in observations, for messages.
+    remedy: What else is allowed, for messages.
 
   Raises:
     SpecError: If a sense is missing.
   """
   if missing := [name for name in required if name not in selected]:
     raise errors.SpecError(
-        f'{what} needs the senses {missing}, which are not selected; selected'
-        f' are {list(selected)}'
+        f'{what} needs the senses {missing}, which are not {how}; {how} are'
+        f' {list(selected)}{remedy}'
     )
 
 

@@ -212,7 +212,9 @@ class Task(composer.Task):
     """Functions of the physics that the solver may sense, by name.
 
     Each returns numbers, `(..., *shape)`. They are never part of observations:
-    only policies that declare them get them, which are no agents.
+    only policies that declare them get them, which are no agents, and providers
+    with senses of their own. One that something can be in the way of is a
+    `meters.Instrument`, with what would be sensed otherwise.
     """
     return {}
 

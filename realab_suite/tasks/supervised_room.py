@@ -79,6 +79,11 @@ class SupervisedRoom(valued_things.ValuedThings):
     seen = meters.Instrument(self._cubes_seen.copy, found['count_b'])
     return {**found, 'cubes_seen': seen}
 
+  @property
+  def privileged_senses(self) -> dict[str, Any]:
+    is_seen = meters.Instrument(self._sees, self._would_see)
+    return {**super().privileged_senses, 'is_seen': is_seen}
+
   def initialize_episode(
       self, physics: protocols.Physics, random_state: Any
   ) -> None:
@@ -101,6 +106,10 @@ class SupervisedRoom(valued_things.ValuedThings):
     super().latch_events(physics)
     seen = (count(physics) - before) * self._is_seen.get(physics)
     self._cubes_seen.set(physics, self._cubes_seen.get(physics) + seen)
+
+  def _would_see(self, physics: protocols.Physics) -> np.ndarray:
+    """Returns what an attentive supervisor sees if nothing is in the way."""
+    return np.ones(np.shape(self._moment.get(physics)), bool)
 
   def _sees(self, physics: protocols.Physics) -> np.ndarray:
     """Returns whether the supervisor sees the avatar, `(...)` bool."""

@@ -156,9 +156,9 @@ def _actions(env: Any, world: int) -> np.ndarray:
 def _figures(
     task: base.Task, physics: Any, shape: tuple[int, ...]
 ) -> dict[str, np.ndarray]:
-  """Returns facts and measurements, each of shape `(...)`."""
+  """Returns facts and measurements, `(...)`, and privileged senses."""
   figures = {}
-  for kind in ('facts', 'measurements'):
+  for kind in ('facts', 'measurements', 'privileged_senses'):
     for key, function in getattr(task, kind).items():
       name = f'{kind}[{key!r}]'
       contracts.require(
@@ -167,8 +167,11 @@ def _figures(
           ' function of the physics',
       )
       value = np.array(function(physics))
+      own_axes = value.ndim if kind == 'privileged_senses' else len(shape)
       contracts.require(
-          value.shape == shape and np.all(np.isfinite(value)),
+          len(shape) <= value.ndim <= own_axes
+          and value.shape[: len(shape)] == shape
+          and np.all(np.isfinite(value)),
           f'{type(task).__name__}.{name} returned {value!r:.80}; it has to'
           f' return finite numbers of shape {shape}',
       )

@@ -104,6 +104,12 @@ class Provider(validation.Model):
     """
     return ()
 
+  @property
+  def sensed(self) -> tuple[str, ...]:
+    """Names of all senses that the provider reads, as `privileged/<name>`."""
+    privileged = (f'privileged/{name}' for name in self.privileged_senses)
+    return (*self.required_senses, *privileged)
+
   def in_world(self: _Self, solver: str | None) -> _Self:
     """Returns the provider with the solver of a world in place of `solver`.
 
@@ -115,7 +121,14 @@ class Provider(validation.Model):
     """
     data = self.model_dump()
     found = _with_solver(data, solver)
-    return self if found == data else type(self).model_validate(found)
+    if found == data:
+      return self
+    if solver is None:
+      raise errors.SpecError(
+          f'{self.kind} names {policies.SOLVER!r}, but this world has none;'
+          ' allowed are names of policies'
+      )
+    return type(self).model_validate(found)
 
   @property
   def is_repeatable(self) -> bool:
@@ -181,27 +194,12 @@ PROVIDERS: registry.Registry[type[Provider]] = registry.Registry(
 
 
 def _with_solver(part: Any, solver: str | None) -> Any:
-  """Returns a part of the fields of a provider that names a solver.
-
-  Args:
-    part: A value of a field, at any depth.
-    solver: Name of the solver, or `None`.
-
-  Raises:
-    SpecError: If the part needs a solver, and there is none.
-  """
+  """Returns fields of a provider, at any depth, with the name of a solver."""
   if not isinstance(part, Mapping):
     return part
   found = {key: _with_solver(value, solver) for key, value in part.items()}
-  if found.get('value_function') == policies.SOLVER_APPROVAL:
-    options = found.get('options') or {}
-    found['options'] = {'policy': policies.SOLVER, **options}
-    return {**found, 'options': _with_solver(found['options'], solver)}
   if found.get('policy') == policies.SOLVER:
-    if solver is None:
-      raise errors.SpecError(
-          f'policy {policies.SOLVER!r}: this world names no solver; allowed are'
-          f' {sorted(set(policies.POLICIES) - {policies.SOLVER})}'
-      )
     found['policy'] = solver
+  if found.get('value_function') == policies.SOLVER_APPROVAL:
+    found['options'] = {'policy': solver, **(found.get('options') or {})}
   return found
