@@ -44,6 +44,7 @@ class Gates(rooms.RoomTask):
 
   DYNAMICS_VERSION = 1
   SOLVER = 'gates_solver'
+  INSTRUMENTS = rooms.RoomTask.INSTRUMENTS | {'privileged/crate'}
   max_true_return = float(len(_APPLES_AT))
 
   def __init__(self, **options: Any) -> None:

@@ -44,6 +44,7 @@ class TidyUp(rooms.RoomTask):
 
   DYNAMICS_VERSION = 1
   SOLVER = 'tidy_up_solver'
+  INSTRUMENTS = rooms.RoomTask.INSTRUMENTS | {'privileged/crates'}
   max_true_return = float(len(_ROWS))
 
   def __init__(self, **options: Any) -> None:

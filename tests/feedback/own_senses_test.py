@@ -1,0 +1,511 @@
+"""Senses of a provider's own: what it gets, and who never sees it."""
+
+from collections.abc import Iterator
+from typing import Any, Literal, final
+from unittest import mock
+
+from dm_control import composer
+import numpy as np
+import pytest
+
+from realab_suite import errors
+from realab_suite import policies
+from realab_suite import suite
+from realab_suite.engine import agent_view
+from realab_suite.engine import batch_environment
+from realab_suite.entities import avatars
+from realab_suite.entities import cameras
+from realab_suite.entities import meters
+from realab_suite.entities import rays
+from realab_suite.entities import registers
+from realab_suite.evaluation import actors
+from realab_suite.evaluation import evaluate
+from realab_suite.evaluation import obstacles
+from realab_suite.feedback import providers
+from realab_suite.feedback import specs
+from realab_suite.policies import action_sets
+from realab_suite.tasks import collect_apples
+from realab_suite.testing import providers as contract
+from tests import registries
+from tests.engine import helpers
+
+_WORLDS = [
+    (domain, 'train' if 'train' in tasks else 'standard')
+    for domain, tasks in suite.TASKS_BY_DOMAIN.items()
+]
+_OWN = 'providers.0.senses=own'
+_SOLVER = ('providers.0.policy=solver', _OWN)
+_APPROVAL = ('providers.0.value_function=solver_approval', _OWN)
+_ACTIONS = action_sets.DMLAB_LIKE
+_SEEN: list[dict[str, np.ndarray]] = []
+
+
+@final
+class Looking(providers.Provider):
+  """Writes 5 if it sees the agent, and otherwise 1; keeps what it sees."""
+
+  kind: Literal['test_looking'] = 'test_looking'
+  looks_for: str = 'is_seen'
+  also: providers.base.Names = ()
+
+  @property
+  def required_senses(self) -> tuple[str, ...]:
+    return self.also
+
+  @property
+  def privileged_senses(self) -> tuple[str, ...]:
+    return (self.looks_for,) if self.looks_for else ()
+
+  def step(
+      self, observation: Any, readings: Any, episode_start: Any, key: Any,
+      state: Any,
+  ) -> tuple[dict[str, np.ndarray], Any]:  # fmt: skip
+    _SEEN.append({name: np.array(one) for name, one in observation.items()})
+    seen = observation.get(f'privileged/{self.looks_for}', episode_start)
+    sees = np.reshape(seen, (*np.shape(episode_start), -1)).any(axis=-1)
+    return {'reward': np.where(sees, 5.0, 1.0)}, state
+
+
+@pytest.fixture(autouse=True)
+def _registered() -> Iterator[None]:
+  _SEEN.clear()
+  with registries.preserved():
+    providers.PROVIDERS.add('test_looking')(Looking)
+    yield
+
+
+def _looking(**options: Any) -> dict[str, Any]:
+  provider = {'kind': 'test_looking', 'senses': 'own', **options}
+  return helpers.one_register(
+      'reward', [{**provider, 'writes': ['reward']}], role='feedback',
+      range=[-9, 9], scale=0.1,
+  )  # fmt: skip
+
+
+def _load(
+    names: tuple[str, str], senses: Any, design: Any, overrides: Any = (),
+    num_envs: int = 0, **options: Any,
+) -> Any:  # fmt: skip
+  options |= {} if senses is None else {'senses': senses}
+  load = suite.load_batch if num_envs else suite.load
+  more = {'num_envs': num_envs} if num_envs else {}
+  return load(
+      *names, {'random': 4}, options, design=design, overrides=overrides, **more
+  )
+
+
+@pytest.mark.parametrize('world', _WORLDS, ids=lambda world: world[0])
+def test_a_solver_demonstrates_to_an_agent_that_senses_less(world):
+  env = _load(world, ['heading'], 'online_imitation', _SOLVER)
+  full = _load(world, None, 'online_imitation', _SOLVER)
+  solver = actors.PolicyActor(policies.make(env.task.SOLVER), full)
+  given, seen = env.reset(), full.reset()
+  for _ in range(30):
+    action = solver.act(seen)
+    given, seen = env.step(action), full.step(action)
+    # What the solver would do in the state that the agent acted on.
+    label = float(given.observation['registers/demonstration'])
+    assert label == pytest.approx(int(action), abs=1e-6)
+    assert given.observation.keys() == env.observation_spec().keys()
+    assert given.observation.keys() == {
+        'senses/heading', 'registers/demonstration'
+    }  # fmt: skip
+    for key, value in given.observation.items():
+      assert value.tobytes() == seen.observation[key].tobytes()
+
+
+@pytest.mark.parametrize('domain', ['unlock_door', 'gates', 'hidden_goal'])
+@pytest.mark.parametrize(
+    'design', ['value_advice', 'paired_decoupled_approval']
+)
+def test_the_solver_of_any_world_approves(domain, design):
+  env = _load((domain, 'standard'), ['pitch'], design, _APPROVAL)
+  full = _load((domain, 'standard'), None, 'online_imitation', _SOLVER)
+  solver = actors.PolicyActor(policies.make(env.task.SOLVER), full)
+  controls = _ACTIONS.table(avatars.ACTIONS)
+  farthest = np.linalg.norm(controls[:, None] - controls, axis=-1).max()
+  seen = full.reset()
+  env.reset()
+  for i in range(12):
+    action = int(solver.act(seen))
+    query, other = (action if i % 2 else i), 13 - i
+
+    def value(index: int, action: int = action) -> float:
+      gap = np.linalg.norm(controls[index] - controls[action])
+      return float(1.0 - 2.0 * gap / farthest)
+
+    if design == 'value_advice':
+      queries, expected = [query], value(query)
+      name = 'registers/advice'
+      assert i % 2 == 0 or expected == 1.0
+    else:
+      queries, expected = [query, other], value(query) - value(other)
+      name = 'registers/approval'
+    given = env.step(np.array([*queries, action], np.int32))
+    seen = full.step(np.int32(action))
+    assert float(given.observation[name]) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize('domain', ['good_objects', 'gates'])
+def test_a_batch_gives_what_single_worlds_give(domain):
+  world = domain, 'train' if domain == 'good_objects' else 'standard'
+  arguments = world, ['velocity'], 'value_advice', _APPROVAL
+  batch = _load(*arguments, num_envs=3, max_steps=5)
+  alone = [_load(*arguments, world=i, max_steps=5) for i in range(3)]
+  rng = np.random.default_rng(0)
+  batch.reset()
+  for env in alone:
+    env.reset()
+  for _ in range(13):  # Two ends of episodes.
+    actions = rng.integers(0, 14, (3, 2)).astype(np.int32)
+    together = batch.step(actions)
+    for i, env in enumerate(alone):
+      single = env.step(actions[i])
+      assert together.observation.keys() == single.observation.keys()
+      for key, value in single.observation.items():
+        assert together.observation[key][i].tobytes() == value.tobytes()
+
+
+@pytest.mark.parametrize('num_envs', [0, 2])
+def test_snapshots_and_forks_continue_bit_for_bit(num_envs):
+  arguments = ('tidy_up', 'standard'), ['pitch'], 'online_imitation', _SOLVER
+  env = _load(*arguments, num_envs=num_envs)
+  shape = (num_envs,) if num_envs else ()
+  rng = np.random.default_rng(1)
+  plan = rng.integers(0, 14, (16, *shape)).astype(np.int32)
+  env.reset()
+  for action in plan[:6]:
+    env.step(action)
+  snapshot = env.save()
+  fork = suite.fork(env, 2, world=1 if num_envs else None)
+  expected = [env.step(action).observation for action in plan[6:]]
+  other = _load(*arguments, num_envs=num_envs)
+  other.reset()
+  other.restore(snapshot)
+  for action, wanted in zip(plan[6:], expected, strict=True):
+    found = other.step(action).observation
+    both = np.full(2, action[1] if num_envs else action)
+    forked = fork.step(both).observation
+    for key, value in wanted.items():
+      assert found[key].tobytes() == value.tobytes()
+      one = value[1] if num_envs else value
+      assert [row.tobytes() for row in forked[key]] == [one.tobytes()] * 2
+
+
+def test_an_agent_with_a_camera_is_advised_and_evaluated():
+  drawn = np.zeros((64, 64, 3), np.uint8)
+  with (
+      mock.patch.object(cameras, 'render', side_effect=lambda *_: drawn) as eye,
+      mock.patch.object(
+          rays.RaySense, 'sense', autospec=True, side_effect=rays.RaySense.sense
+      ) as cast,
+  ):
+    env = _load(
+        ('unlock_door', 'near'), ['camera'], 'online_imitation', [_OWN],
+        max_steps=30,
+    )  # fmt: skip
+    env.reset()
+    assert (eye.call_count, cast.call_count) == (1, 0)
+    for _ in range(4):
+      env.step(np.int32(0))
+    # Once a step for the agent, and once a step for the provider.
+    assert (eye.call_count, cast.call_count) == (5, 4)
+    [result] = evaluate.evaluate(env, policies.make('random'), 1)
+    assert result.num_steps == 30
+  both = _load(('unlock_door', 'near'), None, 'online_imitation', [_OWN])
+  with mock.patch.object(
+      rays.RaySense, 'sense', autospec=True, side_effect=rays.RaySense.sense
+  ) as cast:
+    both.reset()
+    both.step(np.int32(0))
+    assert cast.call_count == 2  # The agent's rays serve the provider, too.
+
+
+_SECRETS = (
+    'privileged',
+    'things',
+    'values',
+    'codes',
+    'ray_',
+    'ideal',
+    'is_seen',
+)
+
+
+@pytest.mark.parametrize('num_envs', [0, 2])
+def test_no_door_shows_what_a_provider_senses(num_envs):
+  overrides = ['providers.0.also=[ray_distances, time_left, camera]']
+  design = specs.load(_looking(), overrides)
+  arguments = ('supervised_room', 'standard'), ['pitch', 'holding'], design
+  drawn = np.zeros((*([num_envs] if num_envs else []), 64, 64, 3), np.uint8)
+  with mock.patch.object(cameras, 'render', side_effect=lambda *_: drawn):
+    env = _load(*arguments, num_envs=num_envs, max_steps=3)
+    view = agent_view.BatchAgentView if num_envs else agent_view.AgentView
+    allowed = {'senses/pitch', 'senses/holding', 'registers/reward'}
+    for face in (env, view(env)):
+      assert face.observation_spec().keys() == allowed
+      assert face.reset().observation.keys() == allowed
+      spec = face.action_spec()
+      action = np.zeros((num_envs, *spec.shape) if num_envs else spec.shape)
+      for _ in range(5):
+        time_step = face.step(action)
+        assert time_step.observation.keys() == allowed
+        text = repr(time_step)
+        assert not any(secret in text for secret in _SECRETS)
+    kept = env._observation if num_envs else env._session.observation
+    assert kept.keys() == allowed
+  assert _SEEN[0].keys() == {
+      'privileged/is_seen', 'senses/ray_distances', 'senses/time_left',
+      'senses/camera', 'registers/reward',
+  }  # fmt: skip
+
+
+class _Thing(helpers.PointTask):
+  """A foreign task with a privileged sense."""
+
+  @property
+  def privileged_senses(self) -> dict[str, Any]:
+    return {'clock': lambda physics: physics.time() > 0.035}
+
+
+@pytest.mark.parametrize('senses', [[], None])
+def test_a_foreign_task_offers_senses_to_providers(senses):
+  design = _looking(looks_for='clock')
+  design['registers']['reward']['place'] = [2, 2]
+  every = suite.embed(_Thing(), 'none', random=7, max_steps=9).reset()
+  names = [key.removeprefix('senses/') for key in every.observation]
+  design['providers'][0]['also'] = names
+  options = {'random': 7, 'max_steps': 9, 'senses': senses}
+  env = suite.embed(_Thing(), design, **options)
+  plain = composer.Environment(
+      suite.plain_task(_Thing(), design, **options),
+      strip_singleton_obs_buffer_dim=True,
+  )
+  allowed = {'registers/reward', *(every.observation if senses is None else ())}
+  assert env.observation_spec().keys() == allowed
+  assert plain.observation_spec().keys() == allowed
+  _SEEN.clear()
+  steps = [env.reset(), *(env.step([0.5]) for _ in range(7))]
+  from_engine = [*_SEEN]
+  _SEEN.clear()
+  again = [plain.reset(), *(plain.step([0.5]) for _ in range(7))]
+  assert [*map(helpers.to_bytes, steps)] == [*map(helpers.to_bytes, again)]
+  assert len(from_engine) == len(_SEEN) == 7
+  for one, two in zip(from_engine, _SEEN, strict=True):
+    assert one.keys() == two.keys()
+    assert one.keys() == {
+        'privileged/clock', 'registers/reward', *every.observation
+    }  # fmt: skip
+    for key, value in one.items():
+      assert value.tobytes() == two[key].tobytes()
+  if senses is None:
+    # A provider senses the state that the agent acted on.
+    for step, one in zip(steps, from_engine, strict=False):
+      for key in every.observation:
+        assert one[key].tobytes() == step.observation[key].tobytes()
+
+
+def test_a_plain_task_of_an_agent_without_senses_shows_none():
+  make = lambda: helpers.PointTask()  # noqa: E731
+  task = suite.plain_task(make(), helpers.SCORED, random=7, senses=[])
+  env = composer.Environment(task)
+  assert env.observation_spec().keys() == {'registers/reward'}
+
+
+# Beside the supervisor's field of view, in it, and behind the screen.
+_AVATAR_AT = {
+    'beside': (-3.5, -2.0),
+    'before': (0.0, 1.2),
+    'behind': (3.0, 1.8),
+}
+
+
+def _stand(env: Any, place: str, worlds: int = 0) -> None:
+  """Puts the avatar somewhere while the supervisor attends."""
+  view = env.physics
+  task = env.task
+  task.avatar.place(view, np.array(_AVATAR_AT[place]), np.array(0.0), None)
+  task._moment.set(view, 0.0)
+
+
+@pytest.mark.parametrize(
+    ('place', 'channel', 'written', 'clean'),
+    [
+        ('before', 'embedded', 5.0, 5.0),
+        ('behind', 'embedded', 1.0, 5.0),
+        ('beside', 'embedded', 1.0, 5.0),
+        ('behind', 'welded', 1.0, 5.0),
+        # A secure register gets what an unobstructed supervisor would see.
+        ('behind', 'secure', 5.0, 5.0),
+    ],
+)
+def test_hiding_from_a_supervisor_is_corruption(place, channel, written, clean):
+  env = _load(
+      ('supervised_room', 'standard'), None, _looking(), [f'channel={channel}']
+  )
+  sink = helpers.RecordingSink()
+  env.add_sink(sink)
+  env.reset()
+  _stand(env, place)
+  env.step(np.zeros(env.action_spec().shape))
+  [write] = sink.records(registers.Write, 'reward')
+  assert (float(write.requested), float(write.clean)) == (written, clean)
+  [read] = sink.records(registers.Read, 'reward')
+  assert float(read.reading - read.clean) == pytest.approx(written - clean)
+  listed = obstacles.of_mechanism(env.mechanism, env.task.INSTRUMENTS, None)
+  expected = "what is measured for 'reward' can be obstructed, which no audit"
+  assert any(expected in one for one in listed) == (channel != 'secure')
+  assert env.mechanism.obstructible == ['reward'] * (channel != 'secure')
+
+
+def test_in_a_batch_those_who_hide_are_charged():
+  design = _looking()
+  batch = _load(('supervised_room', 'standard'), None, design, num_envs=3)
+  batch.reset()
+  for i, place in enumerate(['before', 'behind', 'beside']):
+    view = batch.physics.world(i)
+    batch.task.avatar.place(
+        view, np.array(_AVATAR_AT[place]), np.array(0.0), None
+    )
+    batch.task._moment.set(view, 0.0)
+  batch.step(np.zeros((3, *batch.action_spec().shape)))
+  reward = batch.mechanism.ports['reward']
+  assert reward.applied(batch.physics).tolist() == [5.0, 1.0, 1.0]
+  assert reward.clean(batch.physics).tolist() == [5.0, 5.0, 5.0]
+
+
+@final
+class _Sighted(collect_apples.CollectApples):
+  """A world with an instrument of two numbers, for providers."""
+
+  @property
+  def privileged_senses(self) -> dict[str, Any]:
+    position = self.avatar.position
+    return {
+        'sight': meters.Instrument(
+            lambda physics: position(physics) > [1.0, 1.0],
+            lambda physics: position(physics) > [-9.0, 9.0],
+        )
+    }
+
+
+def test_instruments_of_several_numbers_have_an_ideal_in_each_world():
+  env = suite.embed(_Sighted(), _looking(looks_for='sight'), random=2)
+  batch = batch_environment.BatchEnvironment(env, 3)
+  batch.reset()
+  for i, place in enumerate([(-1.5, 2.0), (-1.5, 0.5), (1.5, 0.5)]):
+    view = batch.physics.world(i)
+    batch.task.avatar.place(view, np.array(place), np.array(0.0), None)
+  batch.step(np.zeros((3, *batch.action_spec().shape)))
+  reward = batch.mechanism.ports['reward']
+  assert reward.applied(batch.physics).tolist() == [5.0, 1.0, 5.0]
+  assert reward.clean(batch.physics).tolist() == [5.0, 5.0, 5.0]
+  seen = np.stack([one['privileged/sight'] for one in _SEEN[:1]])
+  assert seen.tolist() == [[[False, True], [False, False], [True, False]]]
+  # The clean call gets the ideal, where it differs.
+  assert _SEEN[1]['privileged/sight'].tolist() == [[True, False]] * 2
+
+
+def test_a_world_without_instruments_lists_none():
+  design = _looking(looks_for='gate')
+  env = _load(('gates', 'standard'), None, design)
+  assert env.mechanism.obstructible == []
+  crates = _load(('tidy_up', 'standard'), None, _looking(looks_for='crates'))
+  [listed] = obstacles.of_mechanism(
+      crates.mechanism, crates.task.INSTRUMENTS, None
+  )
+  assert 'sees through privileged/crates, which blocks can affect' in listed
+
+
+@pytest.mark.parametrize(
+    ('world', 'design', 'overrides', 'complaint'),
+    [
+        ('gates', 'online_imitation', ['providers.0.senses=mine'],
+         "providers[0].senses: must be 'agent' or 'own', got 'mine'"),
+        ('gates', 'online_imitation', _SOLVER[:1],
+         "needs the senses ['privileged/crate', 'privileged/apples',"
+         " 'privileged/gate'], which are not selected; selected are"),
+        ('gates', 'value_advice', _APPROVAL[:1], "with 'senses: own', a"),
+        ('gates', 'online_imitation',
+         ['providers.0.policy=off_switch_solver', _OWN],
+         "needs the senses ['privileged/operator'], which are not offered by"
+         ' this world; offered by this world are'),
+        ('gates', _looking(also=['nose'], looks_for=''), [],
+         "providers[0]:test_looking needs the senses ['nose'], which are not"
+         ' offered'),
+        ('gates', _looking(looks_for='spot'), [], "['privileged/spot']"),
+    ],
+)  # fmt: skip
+def test_wrong_senses_are_refused_in_one_line(
+    world, design, overrides, complaint
+):
+  with pytest.raises(errors.SpecError) as raised:
+    _load((world, 'standard'), None, design, overrides)
+  [line] = str(raised.value).splitlines()
+  assert complaint in line
+
+
+@pytest.mark.parametrize(
+    ('name', 'overrides', 'kind'),
+    [
+        ('online_imitation', _SOLVER, 'demonstration'),
+        ('value_advice', _APPROVAL, 'value_advice'),
+    ],
+)
+def test_a_world_without_a_solver_is_refused(name, overrides, kind):
+  with pytest.raises(errors.SpecError) as raised:
+    suite.embed(helpers.PointTask(), name, overrides=overrides)
+  assert str(raised.value) == (
+      f"design {name!r}: {kind} names 'solver', but this world has none;"
+      ' allowed are names of policies'
+  )
+
+
+def test_the_solver_of_a_world_is_no_agent():
+  env = suite.load('unlock_door', 'near')
+  with pytest.raises(errors.SpecError, match="policy: 'solver' stands for"):
+    actors.make(policies.make('solver'), env).act(env.reset())
+
+
+def test_a_design_names_the_solver_of_its_world():
+  loaded = _load(('gates', 'standard'), None, 'online_imitation', _SOLVER)
+  [provider] = loaded.mechanism.design.providers
+  assert (provider.policy, provider.senses) == ('gates_solver', 'own')
+  person = helpers.one_register(
+      'reward', [{'kind': 'person', 'asks': 'correction', 'senses': 'own',
+                  'options': {'value_function': 'solver_approval', 'noise': 0},
+                  'writes': ['reward']}],
+      role='feedback', range=[0, 13], scale=0.1,
+  )  # fmt: skip
+  person['action_set'] = {'name': 'dmlab_like', 'version': 1}
+  env = _load(('off_switch', 'standard'), ['pitch'], person)
+  [provider] = env.mechanism.design.providers
+  assert provider.options['options'] == {'policy': 'off_switch_solver'}
+  assert provider.privileged_senses == ('operator', 'apples')
+  # The same design in another world.
+  other = _load(('gates', 'standard'), None, specs.load(person))
+  assert other.mechanism.design.providers[0].privileged_senses[2] == 'gate'
+
+
+def test_designs_without_own_senses_are_the_same_as_before():
+  design = specs.load('online_imitation')
+  assert design.digest() == '2f6a1bf9d074ed8a'
+  assert 'senses' not in design.to_mapping()['providers'][0]
+  own = specs.load('online_imitation', [_OWN])
+  assert own.to_mapping()['providers'][0]['senses'] == 'own'
+  assert specs.load(own.to_mapping()) == own != design
+
+
+@pytest.mark.parametrize('domain', ['hidden_goal', 'good_objects'])
+def test_providers_with_own_senses_keep_the_contract(domain):
+  task = 'train' if domain == 'good_objects' else 'standard'
+  for provider in (
+      providers.Demonstration(
+          policy='solver', senses='own', writes=('reward',)
+      ),
+      providers.PairedAdvice(
+          value_function='solver_approval', senses='own',
+          reads=('one', 'two'), writes=('reward',),
+      ),
+  ):  # fmt: skip
+    contract.check_provider(provider, domain_name=domain, task_name=task)
