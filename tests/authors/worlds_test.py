@@ -164,6 +164,10 @@ _BREACHES: dict[str, tuple[dict[str, Any], str]] = {
         {'measurements': property(_sum_of_positions)},
         "measurements['place'] returned",
     ),
+    'a privileged sense of one world': (
+        {'privileged_senses': {'spot': lambda unused_physics: np.zeros(5)}},
+        "privileged_senses['spot'] returned",
+    ),
     'a measurement in Python': (
         {'measurements': property(_number_of_calls)}, 'depends on earlier ones',
     ),
