@@ -56,6 +56,8 @@ class Options(validation.Model):
     learning_rate: Learning rate of Adam.
     max_gradient_norm: Maximum norm of gradients. Longer gradients are scaled
       down.
+    frame_stack: Number of images to see at once: the last ones of the episode,
+      stacked on channels. Other entries of an observation are not stacked.
   """
 
   kind: str
@@ -65,6 +67,7 @@ class Options(validation.Model):
   )
   learning_rate: Rate = 5e-4
   max_gradient_norm: Weight = 0.5
+  frame_stack: Positive = 1
 
 
 class Learner(abc.ABC):
@@ -139,7 +142,10 @@ class Learner(abc.ABC):
     Raises:
       SpecError: If the observation does not match its spec.
     """
-    observation = self._encoder.pack(time_step.observation, self._num_envs)
+    # The last observation has the frames before this one, also in `state`.
+    earlier = self._last and self._last['observation']
+    stacked = self.stack(time_step, earlier)
+    observation = self._encoder.pack(stacked, self._num_envs)
     if self._last is not None:
       step_type = np.asarray(time_step.step_type)
       transition = {
@@ -156,6 +162,21 @@ class Learner(abc.ABC):
     self._num_acts += 1
     return self._encode(choice)
 
+  def stack(
+      self, time_step: TimeStep, earlier: Mapping[str, np.ndarray] | None
+  ) -> Mapping[str, np.ndarray]:
+    """Returns the observation for `act`, with images stacked if an option says.
+
+    `act` has no memory, so its caller keeps the images: each result is the
+    `earlier` of the next step.
+
+    Args:
+      time_step: Time step of any number of worlds.
+      earlier: Result for the step before, or `None` for the first one.
+    """
+    is_first = np.asarray(time_step.step_type) == int(dm_env.StepType.FIRST)
+    return self._encoder.stack(time_step.observation, is_first, earlier)
+
   @jax_settings.pinned()
   def act(
       self,
@@ -167,7 +188,7 @@ class Learner(abc.ABC):
 
     Args:
       observation: Observations by name, each `(worlds, ...)`, for any number of
-        worlds.
+        worlds; a result of `stack` if `frame_stack` is above 1.
       key: Random key, two numbers of dtype uint32.
       greedy: True to take the best action instead of drawing one.
 
@@ -188,8 +209,7 @@ class Learner(abc.ABC):
     """Returns the probability of each action, `(worlds, actions)`.
 
     Args:
-      observation: Observations by name, each `(worlds, ...)`, for any number of
-        worlds.
+      observation: Observations by name, as for `act`.
 
     Raises:
       SpecError: If the actions are vectors.
@@ -360,7 +380,7 @@ def make(
   return learner_class(
       options,
       _find_reading(options, learner_class.READS, observation_spec),
-      features.Encoder.from_spec(observation_spec),
+      features.Encoder.from_spec(observation_spec, options.frame_stack),
       action_encoding.Controls.from_spec(action_spec),
       num_envs,
       seed,

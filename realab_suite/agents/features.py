@@ -63,16 +63,25 @@ class Encoder:
 
   Attributes:
     entries: Encoding of each entry of the observation.
+    frame_stack: Number of images of an entry that are stacked on channels.
   """
 
   entries: tuple[_Entry, ...]
+  frame_stack: int = 1
 
   @classmethod
-  def from_spec(cls, observation_spec: Mapping[str, specs.Array]) -> 'Encoder':
+  def from_spec(
+      cls, observation_spec: Mapping[str, specs.Array], frame_stack: int = 1
+  ) -> 'Encoder':
     """Makes the encoder for observations of a spec.
 
+    Args:
+      observation_spec: Observation spec of one world.
+      frame_stack: Number of images to stack; observations must then have been
+        through `stack`.
+
     Raises:
-      SpecError: If an entry is not numeric.
+      SpecError: If an entry is not numeric, or there is no image to stack.
     """
     rays = {
         name: partner
@@ -80,15 +89,21 @@ class Encoder:
         if (partner := _partner(name, spec, observation_spec)) is not None
     }
     entries = [
-        _entry(name, spec, rays.get(name, ''))
+        _entry(name, spec, rays.get(name, ''), frame_stack)
         for name, spec in observation_spec.items()
         if name not in rays.values()
     ]
-    return cls(tuple(entries))
+    encoder = cls(tuple(entries), frame_stack)
+    if frame_stack > 1 and not encoder.image_shapes:
+      raise errors.SpecError(
+          f'learner.frame_stack: {frame_stack}; allowed is 1, because no entry'
+          f' of the observation is an image: {sorted(observation_spec)}'
+      )
+    return encoder
 
   @property
   def image_shapes(self) -> dict[str, tuple[int, ...]]:
-    """Height, width and channels of every image, by name."""
+    """Height, width and channels of every image, or of a stack, by name."""
     return {e.name: e.shape for e in self.entries if e.kind == 'image'}
 
   @property
@@ -99,6 +114,33 @@ class Encoder:
         for entry in self.entries
         if entry.kind != 'image'
     )
+
+  def stack(
+      self,
+      observation: Mapping[str, Any],
+      is_first: np.ndarray,
+      earlier: Mapping[str, Any] | None,
+  ) -> dict[str, Any]:
+    """Returns an observation with the last images stacked, the newest last.
+
+    Copies of the first image of an episode stand for those before it.
+
+    Args:
+      observation: Observations by name, each `(worlds, ...)`.
+      is_first: Whether each world's episode begins here, `(worlds,)` bool.
+      earlier: Result of the step before, or `None` to begin with this one.
+    """
+    stacked = dict(observation)
+    for name in self.image_shapes if self.frame_stack > 1 else ():
+      image = np.asarray(observation[name])
+      copies = np.concatenate([image] * self.frame_stack, axis=-1)
+      if earlier is not None:
+        kept = np.asarray(earlier[name])[..., image.shape[-1] :]
+        later = np.concatenate([kept, image], axis=-1)
+        is_new = np.asarray(is_first)[:, np.newaxis, np.newaxis, np.newaxis]
+        copies = np.where(is_new, copies, later)
+      stacked[name] = copies
+    return stacked
 
   def pack(self, observation: Mapping[str, Any], num_envs: int) -> Packed:
     """Checks an observation of a batch, and copies the entries to encode.
@@ -205,7 +247,9 @@ def _partner(
   return partner if other is not None and other.shape == spec.shape else None
 
 
-def _entry(name: str, spec: specs.Array, partner: str) -> _Entry:
+def _entry(
+    name: str, spec: specs.Array, partner: str, frame_stack: int
+) -> _Entry:
   """Returns the encoding of one entry of an observation spec.
 
   Raises:
@@ -217,7 +261,8 @@ def _entry(name: str, spec: specs.Array, partner: str) -> _Entry:
         f'observation_spec {name!r}: dtype {dtype}; allowed are numeric dtypes'
     )
   if dtype == np.uint8 and len(spec.shape) == 3:
-    return _Entry(name, 'image', spec.shape, 'uint8')
+    *size, channels = spec.shape
+    return _Entry(name, 'image', (*size, channels * frame_stack), 'uint8')
   if name.startswith('registers/'):
     return _Entry(name, 'reading', spec.shape, 'float32')
   low, high = _bounds(spec)

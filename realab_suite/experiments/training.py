@@ -462,12 +462,14 @@ class _LearnerActor:
     self._seed = seed
     self._greedy = greedy
     self._step = 0
+    self._observation: Mapping[str, np.ndarray] | None = None
 
   def act(self, time_step: batch_time_steps.BatchTimeStep) -> np.ndarray:
     sequence = seeding.sequence(self._seed, 0, self._step, 'act')
     self._step += 1
+    self._observation = self._learner.stack(time_step, self._observation)
     return self._learner.act(
-        time_step.observation, sequence.generate_state(2), self._greedy
+        self._observation, sequence.generate_state(2), self._greedy
     )
 
 

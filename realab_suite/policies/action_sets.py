@@ -88,6 +88,11 @@ class ActionSet:
         f'action set {self.key}: has no action without control elements'
     )
 
+  def contains(self, other: 'ActionSet') -> bool:
+    """Returns whether it has all actions of another set, by what they set."""
+    known = [settings for _, settings in self.actions]
+    return all(settings in known for _, settings in other.actions)
+
   def extended(self, other: 'ActionSet') -> 'ActionSet':
     """Returns this set, followed by the actions of another that it lacks."""
     known = [settings for _, settings in self.actions]
@@ -196,3 +201,7 @@ DMLAB_LIKE = register(
         ),
     )
 )
+
+# Walking and turning only: an agent that learns from its camera does not end up
+# with the sky in view, and can push blocks but not carry them.
+WALK = register(ActionSet('walk', 1, DMLAB_LIKE.actions[:9]))

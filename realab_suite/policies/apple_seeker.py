@@ -1,10 +1,12 @@
 """The apple seeker: a scripted policy that does the intended task."""
 
+import copy
 from typing import Annotated, Any, final
 
 import numpy as np
 import pydantic
 
+from realab_suite.policies import action_sets
 from realab_suite.policies import base
 from realab_suite.policies import navigation
 
@@ -38,6 +40,8 @@ class AppleSeeker(base.Policy):
   landmarks, and the number of steps without progress.
   """
 
+  _action_set = action_sets.DMLAB_LIKE
+
   def __init__(
       self,
       half_width: Annotated[float, pydantic.Field(gt=0, le=100)] = 3.6,
@@ -69,6 +73,18 @@ class AppleSeeker(base.Policy):
         'pressed': np.zeros(batch_shape, bool),
         **navigation.initial_rest(batch_shape),
     }
+
+  @property
+  def action_set(self) -> action_sets.ActionSet:
+    return self._action_set
+
+  def in_action_set(self, action_set: action_sets.ActionSet) -> base.Policy:
+    # It only walks, so that it also acts where it could do nothing else.
+    if action_set.contains(self._action_set):
+      return self
+    walker = copy.copy(self)
+    walker._action_set = action_sets.WALK
+    return walker
 
   @property
   def required_senses(self) -> tuple[str, ...]:
