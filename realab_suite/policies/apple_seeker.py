@@ -79,11 +79,12 @@ class AppleSeeker(base.Policy):
     return self._action_set
 
   def in_action_set(self, action_set: action_sets.ActionSet) -> base.Policy:
-    # It only walks, so that it also acts where it could do nothing else.
-    if action_set.contains(self._action_set):
+    walk = action_sets.WALK
+    if action_set.contains(self._action_set) or not action_set.contains(walk):
       return self
+    # It only walks, so it also acts where an agent can do nothing else.
     walker = copy.copy(self)
-    walker._action_set = action_sets.WALK
+    walker._action_set = walk
     return walker
 
   @property

@@ -156,10 +156,9 @@ def _check_act(
   """Checks that `act` is a function of its arguments and the networks."""
   before = learner.state()
   key = np.array([3, 4], np.uint32)
+  seen = learner.stack(time_step, None)
   for num_envs in (_NUM_ENVS, 1):
-    observation = {
-        name: value[:num_envs] for name, value in time_step.observation.items()
-    }
+    observation = {name: value[:num_envs] for name, value in seen.items()}
     for greedy in (False, True):
       actions = learner.act(observation, key, greedy)
       _check_actions(env, actions, num_envs, 'act')

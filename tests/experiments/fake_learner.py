@@ -43,6 +43,9 @@ class FakeLearner:
     rng = np.random.default_rng((self._seed, self._num_steps))
     return self._actions(rng.uniform(size=self._num_envs) + self._blend)
 
+  def stack(self, time_step: Any, earlier: Any) -> Any:
+    return time_step.observation
+
   def act(self, observation: Any, key: np.ndarray, greedy: bool) -> np.ndarray:
     count = len(next(iter(observation.values())))
     rng = np.random.default_rng(key)
