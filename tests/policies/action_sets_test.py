@@ -106,6 +106,57 @@ def test_policies_and_providers_need_the_actions_of_their_own_set():
     _load(1, design='value_advice')
 
 
+def test_a_set_contains_what_sets_the_same_elements():
+  others = (('stay', {}), ('ahead', {'forward': 1.0}))
+  first, second = _drive(), _drive(1, others, 'other')
+  assert not first.contains(second)
+  assert not second.contains(first)
+  assert first.extended(second).contains(second)
+  assert first.contains(_drive(5, (('ahead', {'forward': 1.0}),), 'third'))
+  assert not first.contains(_drive(5, (('ahead', {'forward': 0.5}),), 'third'))
+
+
+@pytest.mark.parametrize('num_envs', [0, 2])
+def test_the_apple_seeker_walks_where_it_can_only_walk(num_envs):
+  walk, everything = action_sets.WALK, action_sets.DMLAB_LIKE
+  assert len(walk) == 9
+  assert walk.rest == 0
+  used = {element for _, one in walk.actions for element in one}
+  assert used == {'forward', 'strafe', 'turn'}
+  # A set with the same actions in another order, and one of its own.
+  action_sets.register(_drive(6, (('up', {'look': 1.0}), *walk.actions[::-1])))
+  taken = []
+  for name, version in (('dmlab_like', 1), ('walk', 1), ('drive', 6)):
+    options = {
+        'design': 'instantaneous_reward',
+        'overrides': [f'action_set={{name: {name}, version: {version}}}'],
+    }
+    where = ('unlock_door', 'near', {'random': 1})
+    seeker = policies.make('apple_seeker')
+    if num_envs:
+      env = suite.load_batch(*where, num_envs=num_envs, **options)
+      actor = batch_actors.BatchPolicyActor(seeker, env, 1)
+    else:
+      env = suite.load(*where, **options)
+      actor = actors.make(seeker, env)
+    given = action_sets.get(name, version)
+    time_step, chosen = env.reset(), []
+    for _ in range(40):
+      action = actor.act(time_step)
+      chosen.append([given.actions[i][0] for i in np.ravel(action)])
+      time_step = env.step(action)
+    taken.append(chosen)
+    env.close()
+  assert taken[0] == taken[1] == taken[2]
+  assert len({one for step in taken[0] for one in step}) > 2
+  # Elsewhere it is what it was, and draws of the distracted one stay.
+  seeker = policies.make('apple_seeker')
+  assert seeker.in_action_set(everything) is seeker
+  assert seeker.action_set is everything
+  walker = policies.Distracted(seeker, 0.5).in_action_set(walk)
+  assert walker.action_set is walk
+
+
 def _controls(env, action):
   names = [n.rpartition('/')[2] for n in env.action_spec().name.split('\t')]
   return {n: x for n, x in zip(names, action.tolist(), strict=True) if x}
