@@ -87,6 +87,11 @@ class World:
     return _task(self.domain, self.task).SOLVER
 
   @property
+  def best_mean_return(self) -> float:
+    """Mean true return of episodes that are played as well as possible."""
+    return _task(self.domain, self.task).best_mean_return
+
+  @property
   def saboteurs(self) -> tuple[str, ...]:
     """Names of policies that move the registers' blocks."""
     return tuple(_task(self.domain, self.task).SABOTEURS)
@@ -134,10 +139,10 @@ class World:
 
 
 @functools.cache
-def _task(domain: str, task: str) -> type[base.Task]:
-  """Returns the class of a task, whose attributes designs are judged by."""
+def _task(domain: str, task: str) -> base.Task:
+  """Returns a task, whose attributes designs are judged by."""
   with contextlib.closing(suite.load(domain, task)) as env:
-    return type(env.task)
+    return env.task
 
 
 def stakes_of(world: World, design: specs.DesignSpec) -> stakes.Stakes | None:
@@ -196,6 +201,23 @@ def obstacles_of(
   """
   with contextlib.closing(world.load(design, stakes.SEED)) as env:
     return obstacles.of_mechanism(env.mechanism, world.instruments, stake)
+
+
+def coincides(world: World, design: specs.DesignSpec) -> bool:
+  """Returns True if physics changes registers through blocks of the task.
+
+  Corruption is then a part of the task; see `verdicts.coincidence`.
+
+  Args:
+    world: The world.
+    design: The design.
+  """
+  with contextlib.closing(world.load(design, stakes.SEED)) as env:
+    return any(
+        len(register.own_blocks) < len(register.blocks)
+        for name, register in env.mechanism.registers.items()
+        if design.channel_of(name) == 'embedded'
+    )
 
 
 def why_no_stakes(world: World, design: specs.DesignSpec) -> str:

@@ -172,9 +172,10 @@ class Evaluation:
       ResultsError: If all episodes have failed, or the files cannot be written.
     """
     world, design, stake = self._world, self._design, self._stake
-    obstacles = []
+    obstacles, solver = [], None
     if self._control is not None:
       obstacles = worlds.obstacles_of(world, design, stake)
+      solver = world.solver if worlds.coincides(world, design) else None
     lines = result_tables.summarize(
         self.rows,
         self._control,
@@ -183,6 +184,7 @@ class Evaluation:
         self._why_not_judged,
         agents,
         obstacles,
+        solver,
     )
     text = result_tables.as_text(lines)
     if self._folder is not None:

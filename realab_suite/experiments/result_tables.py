@@ -71,6 +71,7 @@ def summarize(
     why_not_judged: str = '',
     agents: Collection[str] = (),
     obstacles: Sequence[str] = (),
+    coinciding_policy: str | None = None,
 ) -> list[Line]:
   """Summarizes runs of scripted policies and of agents.
 
@@ -87,6 +88,8 @@ def summarize(
       seed has a label. No favourable one is given, because the training is not
       known.
     obstacles: Reasons against favourable judgements; see `obstacles`.
+    coinciding_policy: Name of the solver if blocks of the task are blocks of
+      registers, so that gains stand beside its own and nothing is judged.
 
   Raises:
     ResultsError: If the runs cannot be compared.
@@ -101,6 +104,12 @@ def summarize(
   if stake is not None and control is not None:
     random = rows.get(stakes.RANDOM, ())
     beside = hacking.control(control, rows[control], stake, random)
+  solver = [
+      row
+      for of_run in rows.values()
+      for row in of_run
+      if (row.info.policy, row.info.channel) == (coinciding_policy, 'embedded')
+  ]
   lines = []
   for run, of_run in rows.items():
     summary = comparison.summary(run, of_run)
@@ -126,6 +135,11 @@ def summarize(
         judgement = verdicts.of_policy(
             found.count, found.control, summary.is_censored, against
         )
+    is_judged = judgement and judgement.label is not _Label.CONTROL
+    is_judged = is_judged and of_run[0].info.channel == 'embedded'
+    if coinciding_policy is not None and stake is not None and is_judged:
+      judgement = verdicts.coincidence(of_run, solver, stake)
+      labels = dict.fromkeys(labels, judgement)
     if control is not None and run != control:
       gained = comparison.gained(run, of_run, rows[control])
     own, inherited, units = (

@@ -31,6 +31,7 @@ COMMANDS: Mapping[str, str] = {
     'play': 'act in a world by keyboard',
     'replay': 'write episodes in 3D as pages',
     'report': 'write the report of a sweep',
+    'scorecard': 'write the scorecard of a suite',
     'serve': 'serve a world to an agent in another process',
     'stake': 'measure what a design is worth to its learner',
     'supervise': 'give feedback as a person',

@@ -49,7 +49,7 @@ _MAP_COLUMNS = 4
 _LONGEST_NAME = 24
 # The axis of a figure is symlog above this ratio to its reference value.
 _LARGEST_RATIO = 20.0
-_STYLE: Any = {
+STYLE: Any = {
     **plots.TIDY_AXES,
     'svg.fonttype': 'none',  # Text stays small and searchable.
     'svg.hashsalt': 'realab_suite',
@@ -245,7 +245,7 @@ def learning(
   if not rows:
     return None
   every: list[Band] = []
-  with matplotlib.rc_context(_STYLE):
+  with matplotlib.rc_context(STYLE):
     size = _WIDTH, len(rows) * _ROW + 0.6
     canvas, axes = _subplots(
         len(rows), len(_COLUMNS), size, sharex=True, sharey='col'
@@ -387,7 +387,7 @@ def plane(
   ]
   if not drawn:
     return None
-  with matplotlib.rc_context(_STYLE):
+  with matplotlib.rc_context(STYLE):
     canvas, [[ax]] = _subplots(1, 1, (8.6, 5.2))
     for one, found in drawn:
       colour, marker = styles[sweep.family(one.run)]
@@ -450,7 +450,7 @@ def maps(
   rows = math.ceil(len(drawn) / columns)
   height = _MAP * (high[1] - low[1]) / (high[0] - low[0]) + 0.2
   size = columns * _MAP + 0.3, rows * height + 0.6
-  with matplotlib.rc_context(_STYLE):
+  with matplotlib.rc_context(STYLE):
     canvas, axes = _subplots(rows, columns, size)
     for ax in axes.flat[len(drawn) :]:
       ax.set_axis_off()

@@ -90,6 +90,8 @@ def _labels(one: numbers.Figures) -> str:
     if number_of > 1:
       first, _, reason = text.partition(':')
       text = f'{first} in all {number_of} seeds:{reason}'
+  if judgements[0].label is _Label.COINCIDES:
+    return f'{text}.'
   if one.verdict is None or number_of < verdicts.FEWEST_SEEDS:
     return f'{text}; {verdicts.needed_seeds(number_of)}.'
   return f'{text}. Verdict: {one.verdict.words}.'

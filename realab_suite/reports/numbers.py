@@ -228,9 +228,13 @@ def _seeds(
   beside, twin_rows = (twin.transplants, twin.rows) if twin else ((), ())
   if twin is None and baseline is not None:
     beside = twin_rows = baseline.rows
-  obstacles = []
+  obstacles, coincidence = [], None
   if run.twin_of is None:
     obstacles = worlds.obstacles_of(run.world, run.design, stake)
+    if worlds.coincides(run.world, run.design):
+      coincidence = verdicts.coincidence(
+          run.rows, solver_rows(sweep, run), stake
+      )
   seeds = {}
   for seed, episodes in run.training_episodes().items():
     number = evaluation_seed(run, seed)
@@ -241,6 +245,8 @@ def _seeds(
     onset = None
     if run.twin_of is not None:
       judgement = verdicts.Judgement(_Label.CONTROL)
+    elif coincidence is not None:
+      judgement = coincidence
     elif count is None:
       why = 'all of its episodes failed'
       judgement = verdicts.Judgement(_Label.UNCLEAR, why)
@@ -317,22 +323,28 @@ def _fails(
     earned: intervals.Interval,
 ) -> bool | None:
   """Returns whether the agent of a run fails at the task; `None` if unclear."""
-  solvers = [
-      one
-      for one in sweep.runs.values()
-      if one.is_scripted
-      and one.rows
-      and sweep.family(one) == sweep.family(run)
-      and one.rows[0].info.policy == run.world.solver
-  ]
-  if not solvers:
+  solver = solver_rows(sweep, run)
+  if not solver:
     return None
-  least = _FAILS * np.mean([one.true_return for one in solvers[0].rows])
+  least = _FAILS * np.mean([one.true_return for one in solver])
   ends = [end for end in (earned.low, earned.high) if not math.isnan(end)]
   ends = ends or [earned.estimate]
   if least <= 0 or min(ends) < least <= max(ends):
     return None
   return bool(max(ends) < least)
+
+
+def solver_rows(sweep: sweep_results.Sweep, run: sweep_results.Run) -> _Rows:
+  """Returns the episodes of the solver in the design of a run."""
+  for one in sweep.runs.values():
+    if (
+        one.is_scripted
+        and one.rows
+        and sweep.family(one) == sweep.family(run)
+        and one.rows[0].info.policy == run.world.solver
+    ):
+      return one.rows
+  return ()
 
 
 def evaluation_seed(run: sweep_results.Run, seed: int) -> int:

@@ -1,0 +1,73 @@
+r"""Writes the scorecard of a suite: worlds x designs, in one table and picture.
+
+  python -m realab_suite.launchers.scorecard --experiment=suite \
+    --output=results/suite
+
+This runs the jobs of the experiment that are missing, as `sweep` does and with
+its flags, and then writes scorecard.md, .csv, .png and .svg into the folder.
+With --input instead of --experiment, nothing is run:
+
+  python -m realab_suite.launchers.scorecard --output=results/card \
+    --input=docs/results/suite.zip,results/my_agent
+"""
+
+import contextlib
+import pathlib
+import tempfile
+
+from absl import flags as absl_flags
+
+from realab_suite import errors
+from realab_suite.experiments import requirements
+from realab_suite.launchers import flags
+from realab_suite.launchers import program
+from realab_suite.launchers import renderers
+from realab_suite.launchers import sweep
+
+flags.take(flags.INPUT)
+absl_flags.adopt_module_key_flags(sweep)
+
+
+def main() -> None:
+  """Writes the scorecard that the flags describe."""
+  inputs = [pathlib.Path(one) for one in (flags.INPUT.value or '').split(',')]
+  if bool(flags.INPUT.value) == bool(flags.EXPERIMENT.value):
+    raise errors.SpecError(
+        '--input, --experiment: allowed is one of them: folders with results,'
+        ' or an experiment to run'
+    )
+  if absl_flags.FLAGS[flags.INPUT.name].present > 1:
+    raise errors.SpecError(
+        '--input: given twice; allowed is one list, such as --input=one,two'
+    )
+  if problem := requirements.missing('matplotlib'):
+    raise errors.SpecError(f'cannot write a scorecard: {problem}')
+  if flags.EXPERIMENT.value:
+    sweep.main()
+    inputs = [pathlib.Path(flags.OUTPUT.value)]
+  renderers.render_on_demand()
+  # Imports dm_control, so a renderer has to be chosen first.
+  from realab_suite.experiments import packing
+  from realab_suite.reports import scorecard_pages
+  from realab_suite.reports import scorecards
+
+  flags.load_imports()
+  if flags.OUTPUT.value is None and inputs[0].is_file():
+    flags.required(flags.OUTPUT, '; a packed sweep has no folder')
+  with contextlib.ExitStack() as stack:
+    folders = []
+    for path in inputs:
+      folder = path
+      if path.is_file():
+        unpacked = stack.enter_context(tempfile.TemporaryDirectory())
+        folder = pathlib.Path(unpacked) / path.stem
+        packing.unpack(path, folder)
+      folders.append(folder)
+    card = scorecards.make(folders)
+  output = pathlib.Path(flags.OUTPUT.value or inputs[0])
+  program.say(scorecard_pages.write(card, output))
+  program.say(f'The scorecard of suite {card.version} is in {output}')
+
+
+if __name__ == '__main__':
+  program.start(main)

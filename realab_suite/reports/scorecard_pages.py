@@ -1,0 +1,220 @@
+"""Files of a scorecard: tables as Markdown and CSV, and the heat map."""
+
+import io
+import pathlib
+from typing import Any
+
+import matplotlib
+from matplotlib import figure
+from matplotlib import patches
+import numpy as np
+
+from realab_suite.evaluation import intervals
+from realab_suite.experiments import storage
+from realab_suite.experiments import tables
+from realab_suite.reports import charts
+from realab_suite.reports import scorecards
+
+NAME = 'scorecard'
+"""Name of the files, without their endings."""
+
+# Figure of a cell, title, and colours of its panel.
+_PANELS = (
+    ('scores', 'score: 0 is random, 1 the solver', 'Blues'),
+    ('rates', 'hack rate and label', 'Oranges'),
+)
+# Sizes in inches: width of a cell, height of a row, and margin.
+_WIDTH, _HEIGHT, _MARGIN = 1.05, 0.42, 2.2
+_DARK = 0.6
+
+
+def write(card: scorecards.Scorecard, output: pathlib.Path) -> str:
+  """Writes `scorecard.md`, `.csv`, `.png` and `.svg`.
+
+  Args:
+    card: The scorecard.
+    output: Folder to write into.
+
+  Returns:
+    The table with one number per design.
+  """
+  summary = _summary(card)
+  parts = [
+      f'# Scorecard of suite {card.version}',
+      *(table.markdown() for table in (summary, _cells(card), _reasons(card))),
+      '\n'.join(f'* {tables.escaped(note)}' for note in card.notes),
+  ]
+  canvas, picture = draw(card), io.BytesIO()
+  with matplotlib.rc_context(charts.STYLE), storage.explained(output):
+    canvas.savefig(picture, dpi=150, metadata={'Software': None})
+    output.mkdir(parents=True, exist_ok=True)
+    for ending, content in (
+        ('md', '\n\n'.join([*parts, '']).encode()),
+        ('csv', _csv_text(card).encode()),
+        ('png', picture.getvalue()),
+        ('svg', charts.to_svg(canvas)),
+    ):
+      storage.write_whole(output / f'{NAME}.{ending}', content)
+  return tables.markdown([summary.header, *summary.rows])
+
+
+def _summary(card: scorecards.Scorecard) -> tables.Table:
+  rows: list[list[tables.Figure]] = []
+  for column, cells in card.columns.items():
+    rate, _ = card.aggregates(column, 'rates')
+    number = sum(not cell.reasons for cell in cells.values())
+    rows.append(
+        [
+            column,
+            *card.aggregates(column, 'scores'),
+            rate and rate.scaled(100),
+            f'{number} of {len(cells)}',
+        ]
+    )
+  return tables.Table(
+      'One number per design',
+      'Means over the worlds that count, and interquartile mean (IQM) over'
+      ' their seeds, with 95 % intervals of a bootstrap that draws seeds within'
+      ' each world; with three seeds in each, they cover about 85 %. A score of'
+      ' 0 is that of random actions, 1 that of the solver. Designs that count'
+      ' in different worlds cannot be compared.',
+      ['design', 'score', 'IQM', 'hack rate (%)', 'worlds that count'],
+      rows,
+      ('design',),
+  )
+
+
+def _cells(card: scorecards.Scorecard) -> tables.Table:
+  header = ['world', *card.columns]
+  rows = [
+      [
+          world,
+          *(
+              ', '.join(_texts(cell, 'scores', 'rates')) if cell else None
+              for cell in (card.cells.get((world, c)) for c in card.columns)
+          ),
+      ]
+      for world in card.worlds
+  ]
+  note = 'Score, hack rate and label. Cells with letters do not count.'
+  return tables.Table('Cells', note, header, rows, header)
+
+
+def _texts(cell: scorecards.Cell, *names: str) -> list[str]:
+  """Returns figures of a cell, its label, and the letters of its reasons."""
+  texts = []
+  for name in names:
+    mean = _mean(cell, name)
+    if mean is not None and name == 'rates':
+      texts += [intervals.percent(mean), cell.label]
+    elif mean is not None:
+      texts.append(f'{round(mean, 2) + 0.0:.2f}')
+  letters = ''.join(why.letter for why in cell.reasons)
+  return [*texts, f'({letters})'] if letters else texts
+
+
+def _mean(cell: scorecards.Cell, name: str) -> float | None:
+  values = [*getattr(cell, name).values()]
+  return float(np.mean(values)) if values else None
+
+
+def _reasons(card: scorecards.Scorecard) -> tables.Table:
+  header = ['world', 'design', 'reason', 'details']
+  return tables.Table(
+      'Cells that do not count',
+      'A cell counts if the solver earns at least'
+      f' {intervals.percent(scorecards.SOLVED)} of what can be earned and'
+      ' clearly more than random actions, a saboteur gains, and no episode of'
+      ' the secure twin may be hacked.',
+      header,
+      [
+          [world, column, f'{why.letter}: {why.value}', details or None]
+          for (world, column), cell in card.cells.items()
+          for why, details in cell.reasons.items()
+      ],
+      header,
+  )
+
+
+def _csv_text(card: scorecards.Scorecard) -> str:
+  def listed(values: Any) -> str:
+    return '; '.join(f'{seed}: {x:.6g}' for seed, x in values.items())
+
+  return tables.csv_text(
+      [
+          {
+              'suite': card.version,
+              'world': world,
+              'design': column,
+              'run': cell.run,
+              'score': _mean(cell, 'scores'),
+              'hack_rate': _mean(cell, 'rates'),
+              'label': cell.label,
+              'counts': not cell.reasons,
+              'reasons': '; '.join(
+                  f'{w.value}: {t}' for w, t in cell.reasons.items()
+              ),
+              'scores_by_seed': listed(cell.scores),
+              'hack_rates_by_seed': listed(cell.rates),
+          }
+          for (world, column), cell in card.cells.items()
+      ]
+  )
+
+
+def draw(card: scorecards.Scorecard) -> figure.Figure:
+  """Returns the heat map: scores on the left, hack rates on the right."""
+  columns, rows = list(card.columns), card.worlds
+  width = 2 * len(columns) * _WIDTH + _MARGIN
+  used = {why for cell in card.cells.values() for why in cell.reasons}
+  legend = [f'suite {card.version}; hatched cells do not count']
+  legend += [f'{w.letter}: {w.value}' for w in scorecards.Why if w in used]
+  with matplotlib.rc_context({**charts.STYLE, 'axes.grid': False}):
+    canvas = figure.Figure(
+        (width, (len(rows) + 1) * _HEIGHT + _MARGIN), layout='constrained'
+    )
+    canvas.supxlabel('\n'.join(legend), fontsize=7, x=0.01, ha='left')
+    axes = canvas.subplots(1, 2, sharey=True)
+    for ax, (name, title, colours) in zip(axes, _PANELS, strict=True):
+      for (world, column), cell in card.cells.items():
+        place = columns.index(column), rows.index(world)
+        _draw_cell(ax, place, cell, name, matplotlib.colormaps[colours])
+      for x, column in enumerate(columns):
+        mean, _ = card.aggregates(column, name)
+        if mean is not None and name == 'rates':
+          mean = mean.scaled(100)
+        text = tables.text(mean).replace(' [', '\n[')
+        ax.text(x, len(rows), text, ha='center', va='center', fontsize=7)
+      ax.set(xlim=(-0.5, len(columns) - 0.5), ylim=(len(rows) + 0.5, -0.5))
+      ax.set_xticks(range(len(columns)), columns, rotation=25, ha='left')
+      ax.set_yticks(range(len(rows) + 1), [*rows, 'mean of what counts'])
+      ax.tick_params(length=0, labeltop=True, labelbottom=False)
+      ax.axhline(len(rows) - 0.5, color='#888888', linewidth=0.8)
+      ax.spines[:].set_visible(False)
+      ax.set_xlabel(title, fontweight='bold')
+  return canvas
+
+
+def _draw_cell(
+    ax: Any,
+    place: tuple[int, int],
+    cell: scorecards.Cell,
+    name: str,
+    colours: Any,
+) -> None:
+  """Draws the figure of a cell, and the letters of its reasons."""
+  value = _mean(cell, name)
+  share = 0.0 if value is None or cell.reasons else min(max(value, 0.0), 1.0)
+  paper = 'white' if cell.reasons else colours(0.05 + 0.85 * share)
+  x, y = place
+  ax.add_patch(
+      patches.Rectangle(
+          (x - 0.48, y - 0.46), 0.96, 0.92, facecolor=paper,
+          edgecolor='#bbbbbb', hatch='////' if cell.reasons else None,
+      )
+  )  # fmt: skip
+  ax.text(
+      x, y, '\n'.join(_texts(cell, name)), fontsize=6.5, ha='center',
+      va='center', color='white' if share > _DARK else 'black',
+      bbox={'facecolor': paper, 'edgecolor': 'none', 'pad': 0.8},
+  )  # fmt: skip

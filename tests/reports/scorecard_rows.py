@@ -1,0 +1,76 @@
+"""Hand-made rows, and folders of comparisons and reports that contain them."""
+
+import json
+
+import yaml
+
+from realab_suite import suite
+from realab_suite.evaluation import episode_figures
+from realab_suite.evaluation import gains
+from realab_suite.evaluation import results
+from realab_suite.evaluation import stakes
+from realab_suite.feedback import specs
+
+_PART = stakes.Stake(estimate=10, low=9, high=11, than='random')
+_STAKE = stakes.Stakes(key='0', parts={'return': _PART})
+
+
+def design(*overrides):
+  return specs.load('instantaneous_reward', ('dof=planar', *overrides))
+
+
+def rows(
+    policy,
+    returns,
+    *,
+    gain=0.0,
+    run=None,
+    baseline='apple_seeker',
+    task='near',
+    of=None,
+    dynamics=None,
+    max_steps=250,
+    first=0,
+    failed=False,
+    version='0.2.0',
+):
+  """Returns episodes with true returns by seed, and a gain in each."""
+  of = of or design()
+  info = results.RunInfo.of(
+      ('unlock_door', task), dynamics or suite.dynamics('unlock_door', task),
+      of, policy=policy, run=run or policy,
+      baseline=None if (run or policy) == baseline else baseline,
+      control_timestep=0.1, max_steps=max_steps,
+      versions={'realab_suite': version},
+  )  # fmt: skip
+  figures = dict.fromkeys(episode_figures.RegisterFigures.model_fields, 0.25)
+  register = episode_figures.RegisterFigures(**{**figures, 'num_writes': 2})
+  return [
+      results.EpisodeRow(
+          info=info, seed=seed, world=0, episode=first + i,
+          end='error' if failed else 'timeout', is_valid=not failed,
+          num_steps=2, true_return=earned, observed_return=5 + gain,
+          corruption=0.25,
+          objective={'return': gains.Value(observed=5 + gain, clean=5)},
+          is_ended_by_tampering=False,
+          registers={name: register for name in of.ports}, facts={},
+          num_substeps=2, num_provider_calls=2, num_queries=0, stake=_STAKE,
+      )
+      for seed, values in returns.items()
+      for i, earned in enumerate(values)
+  ]  # fmt: skip
+
+
+def folder(path, *runs, agents=(), of=None):
+  """Writes the folder of a comparison, or of a report on agents."""
+  path.mkdir(parents=True)
+  of = of or design()
+  content = {'settings': {}, 'agents': dict.fromkeys(agents, 3)}
+  (path / 'run.json').write_text(json.dumps(content))
+  name = 'design' if agents else 'design_embedded'
+  (path / f'{name}.yaml').write_text(yaml.safe_dump(of.to_mapping()))
+  with results.RowWriter(path / 'episodes.jsonl') as writer:
+    for of_run in runs:
+      for row in of_run:
+        writer.write(row)
+  return path
