@@ -78,6 +78,34 @@ def nearest(
   return np.take_along_axis(places, index, -2)[..., 0, :]
 
 
+def around(
+    view: navigation.View, goal: np.ndarray, ends: np.ndarray
+) -> np.ndarray:
+  """Returns the place to go to first, `(..., 2)`, metres.
+
+  It is the goal, or one end of a screen that stands between.
+
+  Args:
+    view: View of the avatar.
+    goal: Place to go to, `(..., 2)`, metres.
+    ends: Places beyond both ends of the screen, `(..., 2, 2)`, metres.
+  """
+
+  def side(start: np.ndarray, end: np.ndarray, place: np.ndarray) -> np.ndarray:
+    way, other = end - start, place - start
+    return way[..., 0] * other[..., 1] - way[..., 1] * other[..., 0] > 0
+
+  here, first, last = view.position, ends[..., 0, :], ends[..., 1, :]
+  is_between = (side(first, last, here) != side(first, last, goal)) & (
+      side(here, goal, first) != side(here, goal, last)
+  )
+  ways = view.locate(ends)[0]
+  ways = ways + np.linalg.norm(ends - goal[..., np.newaxis, :], axis=-1)
+  is_last = ways[..., 1] < ways[..., 0]
+  end = np.where(is_last[..., np.newaxis], last, first)
+  return np.where(is_between[..., np.newaxis], end, goal)
+
+
 def deliver(
     view: navigation.View,
     block: np.ndarray,

@@ -49,6 +49,7 @@ class SupervisedRoom(valued_things.ValuedThings):
   """An open room with a supervisor, a screen, and two kinds of things."""
 
   DYNAMICS_VERSION = 1
+  CORNERS = ((1.3, 0.3), (1.3, 3.3))
   max_true_return = 6.0
 
   def __init__(self, **options: Any) -> None:

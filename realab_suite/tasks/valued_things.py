@@ -40,6 +40,8 @@ class ValuedThings(rooms.RoomTask):
   """
 
   SOLVER = 'valued_things_solver'
+  # Places beyond both ends of a screen, if there is one, in m.
+  CORNERS: tuple[tuple[float, float], ...] = ()
 
   def __init__(
       self, look: arenas.Look, numbers: dict[str, int], **options: Any
@@ -94,6 +96,10 @@ class ValuedThings(rooms.RoomTask):
         'codes': all_codes,
         'values': lambda physics: of_things(self._values.get(physics)),
         'things': lambda physics: np.array(physics.bind(frames).mocap_pos),
+        'corners': lambda physics: np.broadcast_to(
+            np.reshape(self.CORNERS, (-1, 2)),
+            (*self._values.get(physics).shape[:-1], len(self.CORNERS), 2),
+        ),
     }
 
   def begin(
@@ -131,15 +137,17 @@ class ValuedThings(rooms.RoomTask):
 class ValuedThingsSolver(errands.Errand):
   """Goes from one good thing to the next, around the bad ones."""
 
-  privileged_senses = ('codes', 'values', 'things')
+  privileged_senses = ('codes', 'values', 'things', 'corners')
 
   def act(self, view: navigation.View, holds: Any, seen: Any) -> np.ndarray:
-    codes, values, things = (
+    codes, values, things, corners = (
         seen[f'privileged/{name}'] for name in self.privileged_senses
     )
     is_good = values > 0
     is_left = is_good & (things[..., 2] > 0)
     goal = errands.nearest(view, things[..., :2], is_left)
+    if corners.size:
+      goal = errands.around(view, goal, corners)
     # Scripted policies walk through apples, and around what they do not know.
     classes = np.asarray(seen['senses/ray_classes'])
     good = np.where(is_good, codes, -1)[..., np.newaxis, :]
