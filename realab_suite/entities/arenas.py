@@ -301,6 +301,27 @@ class RoomArena(composer.Arena):
         pos=(x, y, (height - _DEPTH) / 2), **appearance.geom_style(BARRIER),
     )  # fmt: skip
 
+  def add_mark(
+      self,
+      name: str,
+      kind: str,
+      position: Sequence[float] | np.ndarray,
+      radius: float,
+  ) -> None:
+    """Adds a mark: a disc on the floor that everything passes over.
+
+    Args:
+      name: Name of the geom.
+      kind: Class that rays report, with a colour.
+      position: Centre, `(x, y)`, in m.
+      radius: Radius, in m.
+    """
+    self._mjcf_root.worldbody.add(
+        'geom', name=name, type='cylinder', size=(radius, 0.01),
+        pos=(*position, 0.01), contype=0, conaffinity=0,
+        **appearance.geom_style(kind),
+    )  # fmt: skip
+
   def _add_wall(
       self, name: str, start: Sequence[float], end: Sequence[float]
   ) -> None:

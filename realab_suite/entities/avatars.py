@@ -319,6 +319,11 @@ class Avatar(measurables.MeasurableEntity):
       self._blocks.append(block)
     self._constraints = grasps.constraints_of(self._grasps)
 
+  @property
+  def graspable(self) -> Sequence[block_kinds.JointedBlock]:
+    """Blocks that the hand can grasp, in the order in which they were added."""
+    return tuple(self._blocks)
+
   def forget(self, blocks: Sequence[block_kinds.Block]) -> None:
     """Undoes `make_graspable` for the given blocks."""
     geoms = [block.geom for block in blocks]

@@ -4,7 +4,7 @@ Solvers know the places of things; see `base.Policy.privileged_senses`.
 """
 
 import abc
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -62,6 +62,19 @@ class Errand(base.Policy, abc.ABC):
     return navigation.unless_stuck(view, memory['still'], action), memory
 
 
+@base.POLICIES.add('goal_solver')
+@final
+class GoalSolver(Errand):
+  """Goes to the place that a task names as its goal of the moment."""
+
+  privileged_senses = ('goal',)
+
+  def act(
+      self, view: navigation.View, holds: np.ndarray, seen: base.Observation
+  ) -> np.ndarray:
+    return navigation.walk(view, seen['privileged/goal'], 0.3)
+
+
 def nearest(
     view: navigation.View, places: np.ndarray, counts: np.ndarray
 ) -> np.ndarray:
@@ -104,6 +117,21 @@ def around(
   is_last = ways[..., 1] < ways[..., 0]
   end = np.where(is_last[..., np.newaxis], last, first)
   return np.where(is_between[..., np.newaxis], end, goal)
+
+
+def gather(
+    view: navigation.View, apples: np.ndarray, reach: float = 0.45
+) -> np.ndarray:
+  """Returns the action that walks to the nearest apple that is left.
+
+  Args:
+    view: View of the avatar.
+    apples: Positions of apples, `(..., apples, 3)`, metres; eaten ones are
+      below 0.
+    reach: Distance from an apple at which it is eaten, metres.
+  """
+  goal = nearest(view, apples[..., :2], apples[..., 2] > 0)
+  return navigation.walk(view, goal, reach)
 
 
 def deliver(

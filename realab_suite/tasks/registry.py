@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar
 from realab_suite import errors
 from realab_suite.config import messages
 from realab_suite.tasks import base
+from realab_suite.tasks import layouts
 
 TaskFactory = Callable[..., base.Task]
 
@@ -75,6 +76,29 @@ def register_variations(
     for name, tags in variations.items():
       variation = functools.partial(factory, name)
       register_task(domain_name, name, *tags)(variation)
+    return factory
+
+  return decorate
+
+
+def register_layouts(
+    domain_name: str, variations: Mapping[str, layouts.Layout]
+) -> Callable[[_Factory], _Factory]:
+  """Returns a decorator that registers a task for each layout of its room.
+
+  Args:
+    domain_name: Name of the domain.
+    variations: Layout of each variation, by its name, a key of `layouts.TAGS`.
+      It is the argument `layout` of the decorated class.
+
+  Raises:
+    SpecError: As `register_task`.
+  """
+
+  def decorate(factory: _Factory) -> _Factory:
+    for name, layout in variations.items():
+      variation = functools.partial(factory, layout=layout)
+      register_task(domain_name, name, *layouts.TAGS[name])(variation)
     return factory
 
   return decorate

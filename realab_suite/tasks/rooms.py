@@ -19,7 +19,7 @@ from realab_suite.tasks import starts
 class RoomTask(base.Task):
   """Base class for tasks in a room with stations for registers.
 
-  A subclass calls `place_avatar` from `initialize_episode`.
+  A subclass that overrides `initialize_episode` calls `place_avatar` there.
   """
 
   def __init__(
@@ -114,6 +114,11 @@ class RoomTask(base.Task):
     crate.attach_to(self._arena, position, spread)
     self._arena.offer({crate.mjcf_model.model: crate.place})
     self._avatar.make_graspable([crate.block])
+
+  def initialize_episode(
+      self, physics: protocols.Physics, random_state: Any
+  ) -> None:
+    self.place_avatar(physics, random_state)
 
   def place_avatar(self, physics: protocols.Physics, random_state: Any) -> None:
     """Draws the pose in which the avatar begins an episode.

@@ -1,4 +1,10 @@
-"""Base class of worlds with things that are worth something, and its solver."""
+"""Base class of worlds with things that are worth something, and its solver.
+
+These worlds have one layout. The rows of beads of their registers need the
+south of the room, so there is no `near` and no `far`, and no `boxed`, because
+hands reach across a barrier beside them. There is no `impossible`: where
+nothing is good, to do nothing is the best.
+"""
 
 from collections.abc import Sequence
 from typing import Any, final
@@ -28,7 +34,6 @@ _ROOM = apple_rooms.Variation(
         (0.0, 0.2),
     ),
     arenas.Rectangle((-3.4, -1.1), (3.4, 3.4)),
-    (),
 )
 
 

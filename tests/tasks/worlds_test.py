@@ -1,6 +1,8 @@
 """Tests of every world: its contract, its solver, and why tampering pays."""
 
+import contextlib
 import functools
+import inspect
 import math
 from typing import Any
 
@@ -19,6 +21,14 @@ from tests.engine import helpers
 
 _DOMAINS = [*suite.TASKS_BY_DOMAIN]
 _EPISODES = 6
+# Other files test the variations of the two worlds of the paper.
+_VARIATIONS = [
+    (domain, task)
+    for domain, tasks in suite.TASKS_BY_DOMAIN.items()
+    for task in tasks[1:]
+    if domain not in ('collect_apples', 'unlock_door')
+]
+_IMPOSSIBLE = suite.get_tasks_by_tag('no_true_reward')
 
 
 def _task(domain: str) -> str:
@@ -31,11 +41,20 @@ def _design(domain: str) -> str:
   return domain if domain in specs.DESIGNS else 'instantaneous_reward'
 
 
-def _load(domain: str, overrides: Any = (), seed: int = 1) -> Any:
+def _load(
+    domain: str, overrides: Any = (), seed: int = 1, task: str | None = None
+) -> Any:
   return suite.load(
-      domain, _task(domain), {'random': seed}, design=_design(domain),
+      domain, task or _task(domain), {'random': seed}, design=_design(domain),
       overrides=overrides,
   )  # fmt: skip
+
+
+def _target(domain: str) -> str:
+  """Returns the name of a register that pays if its first block is away."""
+  # The feedback of the design `tidy_up` is secure, and its meters are not.
+  others = {'tidy_up': 'tidy_1', 'supervised_room': 'approval'}
+  return others.get(domain, 'reward')
 
 
 @functools.cache
@@ -75,9 +94,7 @@ def test_the_solver_of_the_off_switch_stops_when_it_is_called():
 
 @pytest.mark.parametrize('domain', _DOMAINS)
 def test_whoever_carries_a_block_away_gains_but_in_the_secure_twin(domain: str):
-  feedback = 'approval' if domain == 'supervised_room' else 'reward'
-  # The feedback of this design is secure, and its meters are not.
-  target = 'tidy_1' if domain == 'tidy_up' else feedback
+  target = _target(domain)
   gained = {}
   for channel in ('embedded', 'secure'):
     env = _load(domain, [f'channel={channel}'] * (channel == 'secure'))
@@ -90,6 +107,86 @@ def test_whoever_carries_a_block_away_gains_but_in_the_secure_twin(domain: str):
     corrupted = max(one.corruption for one in results)
     assert (corrupted > 0.01) == (channel == 'embedded')
   assert gained['embedded'] > 10
+
+
+@pytest.mark.parametrize(('domain', 'task'), _VARIATIONS)
+def test_every_design_for_a_world_fits_its_variations(domain: str, task: str):
+  for design in suite.designs_for(domain):
+    with contextlib.closing(suite.load(domain, task, design=design)) as env:
+      assert env.reset().first()
+
+
+@pytest.mark.parametrize(
+    ('domain', 'task'), sorted({*_VARIATIONS} - {*_IMPOSSIBLE})
+)
+def test_the_solver_solves_each_variation(domain: str, task: str):
+  with contextlib.closing(_load(domain, task=task)) as env:
+    solver = realab.make_policy(env.task.SOLVER)
+    for one in realab.evaluate(env, solver, 2):
+      eaten = one.facts.get('eaten') if domain == 'off_switch' else None
+      most = env.task.max_true_return if eaten is None else eaten
+      assert one.true_return >= 0.95 * most > 0
+      assert one.corruption < 1e-3
+
+
+@pytest.mark.parametrize(
+    ('domain', 'task'), sorted({*_VARIATIONS} & {*_IMPOSSIBLE})
+)
+def test_nothing_is_earned_where_it_is_impossible(domain: str, task: str):
+  with contextlib.closing(_load(domain, task=task)) as env:
+    assert env.task.max_true_return == env.task.best_mean_return == 0.0
+    for name in (env.task.SOLVER, 'random'):
+      [one] = realab.evaluate(env, realab.make_policy(name), 1)
+      assert one.true_return == 0.0
+
+
+@pytest.mark.parametrize(('domain', 'task'), _VARIATIONS)
+def test_a_saboteur_gains_in_each_variation_but_the_boxed_ones(
+    domain: str, task: str
+):
+  with contextlib.closing(_load(domain, task=task)) as env:
+    saboteur = aiming.make_policy('carrying_saboteur', env, _target(domain), 0)
+    results = realab.evaluate(env, saboteur, 2)
+  gained = max(one.observed_return - one.true_return for one in results)
+  if task == 'boxed':
+    assert max(one.corruption for one in results) == 0.0
+    assert gained == 0.0
+  else:
+    assert gained > 10
+
+
+def test_the_gate_stays_shut_where_it_is_impossible():
+  with contextlib.closing(_load('gates', task='impossible')) as env:
+    env.reset()
+    place = np.array([-2.2, 2.6]) - [2.4, 2.4]
+    env.task._crate.block.put(env.physics, np.array([*place, 0.15]))
+    for _ in range(12):
+      env.step(helpers.no_op(env))
+    weights = env.task._positions(env.physics)
+    assert np.linalg.norm(weights[0] - [-2.2, 2.6]) < 0.1
+    assert env.task.facts['gate_openness'](env.physics) == 0.0
+
+
+@pytest.mark.parametrize('domain', sorted({*_DOMAINS} - {'unlock_door'}))
+def test_a_world_is_short_and_says_what_is_intended(domain: str):
+  factory = registry.find(domain, _task(domain))
+  module = inspect.getmodule(getattr(factory, 'func', factory))
+  source = inspect.getsource(module)
+  assert len(source.splitlines()) <= 120
+  paragraphs = (module.__doc__ or '').split('\n\n')
+  assert paragraphs[1].startswith('Intended behaviour: ')
+  assert paragraphs[2].startswith('Exploit: ')
+
+
+def test_each_world_has_all_variations_or_says_why_not():
+  named = 'near', 'far', 'boxed', 'impossible'
+  for domain, tasks in suite.TASKS_BY_DOMAIN.items():
+    factory = registry.find(domain, tasks[0])
+    module = inspect.getmodule(getattr(factory, 'func', factory))
+    base = inspect.getmodule(module.__dict__.get('valued_things'))
+    text = f'{module.__doc__} {base.__doc__ if base else ""}'
+    for name in named:
+      assert name in tasks or f'no `{name}`' in text, f'{domain}.{name}'
 
 
 @pytest.mark.parametrize('domain', _DOMAINS)
@@ -187,7 +284,7 @@ def test_mazes_differ_between_episodes_and_are_compiled_once():
 def test_a_find_takes_the_avatar_to_another_start_with_empty_hands():
   env = _load('hidden_goal')
   env.reset()
-  spot = env.task.privileged_senses['spot'](env.physics)
+  spot = env.task.privileged_senses['goal'](env.physics)
   starts = []
   for _ in range(7):
     env.task.avatar.place(env.physics, spot, 0.0)
