@@ -32,6 +32,7 @@ def main() -> None:
   from pictures import display
   from pictures import first_person
   from pictures import reacher
+  from pictures import registers
   from pictures import tampering
   from pictures import worlds
 
@@ -41,6 +42,7 @@ def main() -> None:
   display.draw(folder / 'display.png')
   worlds.draw(folder / 'worlds')
   worlds.draw_sheet(folder / 'worlds.png')
+  registers.draw(folder / 'registers')
   (folder / 'gallery').mkdir(exist_ok=True)
   reacher.draw(folder / 'gallery' / 'reacher.webp')
   if flags.INPUT.value is None:

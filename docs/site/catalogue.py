@@ -21,7 +21,6 @@ import realab_suite
 from realab_suite import suite
 from realab_suite.feedback import specs
 from realab_suite.policies import action_sets
-from realab_suite.tasks import apple_rooms
 
 _FOLDER = pathlib.Path('build', 'catalogue')
 # Relative to the folders `worlds` and `designs`.
@@ -128,8 +127,7 @@ def _world(domain: str, task: str) -> str:
   env = suite.load(domain, task, {'random': 0})
   with contextlib.closing(env):
     kind = type(env.task)
-    variation = apple_rooms.VARIATIONS[task]
-    layout = variation.layout
+    layout = env.task.layout
     summary = inspect.getdoc(inspect.getmodule(kind)) or ''
     observations = [
         (
@@ -159,7 +157,7 @@ def _world(domain: str, task: str) -> str:
   if layout.barrier is not None:
     ends = ' to '.join(f'({x:g}, {y:g})' for x, y in layout.barrier)
     barrier = f' A barrier leads from {ends}.'
-  if variation.is_impossible:
+  if layout.is_impossible:
     barrier += ' No true reward can be earned.'
   return f"""# {domain}.{task}
 

@@ -129,6 +129,16 @@ def names(tag: str | None = None) -> tuple[tuple[str, str], ...]:
   )
 
 
+def tags(domain_name: str, task_name: str) -> frozenset[str]:
+  """Returns the tags of a task.
+
+  Raises:
+    UnknownNameError: If there is no such task.
+  """
+  find(domain_name, task_name)
+  return _TASKS[domain_name, task_name][1]
+
+
 def _format(name: Any) -> str:
   """Returns a name for messages, quoted unless it is short and one line."""
   is_plain = isinstance(name, str) and name.isprintable() and len(name) <= 80
