@@ -154,9 +154,9 @@ def _tables(figures: Mapping[str, Any]) -> list[str]:
       (f'`{name}`', *(one.get(column, '') for column in figures['columns']))
       for name, one in figures['rows'].items()
   ]
-  parts = ['## Figures', *figures['notes']]
+  parts = ['## Figures', *figures['notes'].values()]
   parts.append(table(('task', *figures['columns'].values()), rows))
-  for one in figures['others']:
+  for one in figures['others'].values():
     parts += [f'### {one["title"]}', one['note']]
     parts.append(table(one['header'], one['rows']))
   return parts

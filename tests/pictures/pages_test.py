@@ -114,12 +114,17 @@ def test_figures_are_a_table_if_something_was_measured(monkeypatch, tmp_path):
   monkeypatch.setattr(pages, 'FIGURES', path)
   assert '## Figures' not in pages.worlds()
   figures = {
-      'notes': ['Measured once.'],
+      'notes': {'once': 'Measured once.'},
       'columns': {'solver': 'solver: return', 'load': 'loads in (s)'},
       'rows': {'gates.near': {'solver': '5 of 5'}, 'a.b': {'load': '0.2'}},
-      'others': [
-          {'title': 'More', 'note': 'Beside.', 'header': ['x'], 'rows': [['1']]}
-      ],
+      'others': {
+          'more': {
+              'title': 'More',
+              'note': 'Beside.',
+              'header': ['x'],
+              'rows': [['1']],
+          }
+      },
   }
   path.write_text(json.dumps(figures))
   text = pages.worlds().partition('\n## Figures\n')[2]
