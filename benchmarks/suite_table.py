@@ -318,8 +318,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
   else:
     figures['notes']['outcomes'] = (
         f'Worlds with the tag `benchmarking`: means of {_EPISODES} episodes,'
-        f' and an audit with a budget of {_BUDGET} episodes, which can exploit a'
-        ' design but never clear it. Gains are in the units of the objective.'
+        f' and an audit with a budget of {_BUDGET} episodes, which can exploit'
+        ' a design but never clear it. Gains are in the units of the objective.'
         ' The saboteur carries the first block of the register by which it'
         ' gains most.'
     )

@@ -1,4 +1,4 @@
-r"""Writes the pages of worlds and registers, docs/worlds.md and registers.md.
+r"""Writes docs/worlds.md and docs/register_kinds.md.
 
   python -m pictures.pages
 
@@ -42,7 +42,7 @@ def write() -> None:
 
 def texts() -> dict[str, str]:
   """Returns the text of each page, by the name of its file."""
-  return {'worlds.md': worlds(), 'registers.md': register_page()}
+  return {'worlds.md': worlds(), 'register_kinds.md': register_page()}
 
 
 def worlds() -> str:
@@ -177,10 +177,11 @@ def register_page() -> str:
   ]
   parts = [
       _MADE_BY,
-      '# Registers',
+      '# Kinds of registers',
       'A register is a physical object that stores numbers in the poses of its'
       ' blocks, so whatever moves them changes the numbers. This page has a'
-      ' section for each kind that a design can name. [Your own](your_own.md)'
+      ' section for each kind that a design can name. [Registers](registers.md)'
+      ' has more on some of them. [Your own](your_own.md)'
       ' explains how to add one.',
       table(('option of every kind', 'default', 'meaning'), common),
       f'What can be done to a kind was tried: one of the range {_RANGE[0]:g} to'

@@ -16,7 +16,7 @@ def _texts() -> dict[str, str]:
   return pages.texts()
 
 
-@pytest.mark.parametrize('name', ['worlds.md', 'registers.md'])
+@pytest.mark.parametrize('name', ['worlds.md', 'register_kinds.md'])
 def test_a_page_is_up_to_date(texts, name):
   # If not: `python -m pictures.pages`, and look at what has changed.
   assert (pages.DOCS / name).read_text(encoding='utf-8') == texts[name]
@@ -42,7 +42,7 @@ def test_each_domain_has_a_section_and_each_task_a_row_and_a_picture(texts):
 
 def test_each_kind_of_register_has_a_section_and_a_picture(texts):
   for kind in register_kinds.REGISTER_KINDS:
-    assert f'\n## {kind}\n' in texts['registers.md']
+    assert f'\n## {kind}\n' in texts['register_kinds.md']
     assert (pages.DOCS / 'images' / 'registers' / f'{kind}.png').exists()
 
 
