@@ -1,5 +1,6 @@
 """Rooms with apples: their layouts, which are their variations, and a base."""
 
+import abc
 from collections.abc import Mapping, Sequence
 import dataclasses
 from typing import Any, final
@@ -132,7 +133,7 @@ def find(name: str) -> Variation:
   return VARIATIONS[name]
 
 
-class AppleRoom(rooms.RoomTask):
+class AppleRoom(rooms.RoomTask, abc.ABC):
   """Base class for tasks in rooms with apples, each worth 1 to who eats it.
 
   A subclass calls `add_apples` when it is built, and places them where an
