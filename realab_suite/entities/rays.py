@@ -41,6 +41,32 @@ def cast(
   raise NotImplementedError(f'{type(physics).__name__} cannot cast rays')
 
 
+def look(
+    physics: protocols.Physics,
+    eye: np.ndarray,
+    place: np.ndarray,
+    excluded_body: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+  """Looks from an eye towards a place, at the height of the eye.
+
+  Args:
+    physics: As for `cast`.
+    eye: Position of the eye, `(..., 3)`, in m.
+    place: Place to look at, `(..., 2)`, in m.
+    excluded_body: Index of the body of the eye, which does not hide anything.
+
+  Returns:
+    Direction of the place, a unit vector `(..., 2)`; its distance and that of
+    the nearest geom on the way, each `(...)`, in m.
+  """
+  way = np.zeros_like(eye)
+  way[..., :2] = place - eye[..., :2]
+  distance = np.linalg.norm(way, axis=-1)
+  way = way / distance[..., np.newaxis].clip(1e-6)
+  free, _ = cast(physics, eye, way[..., np.newaxis, :], excluded_body)
+  return way[..., :2], distance, free[..., 0]
+
+
 @cast.register
 def _(
     physics: mjcf.Physics,

@@ -56,15 +56,13 @@ class SupervisedRoom(valued_things.ValuedThings):
     super().__init__(_LOOK, _NUMBERS, **options)
     arena = self.root_entity
     arena.add_barrier('screen', (1.3, 0.9), (1.3, 2.7))
-    self._supervisor = crates.Crate(
-        'supervisor', _SIZE, mass=5.0, kind=SUPERVISOR
-    )
-    self._supervisor.block.body.add(
+    self._eyes = crates.Crate('supervisor', _SIZE, mass=5.0, kind=SUPERVISOR)
+    self._eyes.block.body.add(
         'geom', name='eye', type='box', size=(0.02, 0.12, 0.05), mass=0,
         pos=(_SIZE / 2, 0, 0.05), contype=0, conaffinity=0,
         **appearance.geom_style(SUPERVISOR, (0.1, 0.1, 0.1, 1.0)),
     )  # fmt: skip
-    self.add_crate(self._supervisor, _AT)
+    self.add_crate(self._eyes, _AT)
     names = ('moment', 'is_seen', 'unseen_steps', 'cubes_seen')
     self._moment, self._is_seen, self._unseen_steps, self._cubes_seen = (
         world_state.Slot(arena.mjcf_model, name) for name in names
@@ -82,7 +80,9 @@ class SupervisedRoom(valued_things.ValuedThings):
 
   @property
   def privileged_senses(self) -> dict[str, Any]:
-    is_seen = meters.Instrument(self._sees, self._would_see)
+    is_seen = meters.Instrument(
+        self._sees, lambda physics: np.ones_like(self._sees(physics))
+    )
     return {**super().privileged_senses, 'is_seen': is_seen}
 
   def initialize_episode(
@@ -108,21 +108,12 @@ class SupervisedRoom(valued_things.ValuedThings):
     seen = (count(physics) - before) * self._is_seen.get(physics)
     self._cubes_seen.set(physics, self._cubes_seen.get(physics) + seen)
 
-  def _would_see(self, physics: protocols.Physics) -> np.ndarray:
-    """Returns what an attentive supervisor sees if nothing is in the way."""
-    return np.ones(np.shape(self._moment.get(physics)), bool)
-
   def _sees(self, physics: protocols.Physics) -> np.ndarray:
     """Returns whether the supervisor sees the avatar, `(...)` bool."""
-    body = physics.bind(self._supervisor.block.body)
-    eye = np.array(body.xpos) + _EYE
-    way = np.zeros_like(eye)
-    way[..., :2] = self._avatar.position(physics) - eye[..., :2]
-    distance = np.linalg.norm(way, axis=-1)
-    way = way / distance[..., None].clip(1e-6)
-    ahead = np.array(body.xmat)[..., 0:6:3]
-    cosine = (ahead * way[..., :2]).sum(axis=-1)
-    sight, _ = rays.cast(physics, eye, way[..., None, :], body.element_id)
-    is_clear = sight[..., 0] > distance - 2 * self._avatar.radius
+    body = physics.bind(self._eyes.block.body)
+    eye, position = np.array(body.xpos) + _EYE, self._avatar.position(physics)
+    way, distance, free = rays.look(physics, eye, position, body.element_id)
+    cosine = (np.array(body.xmat)[..., 0:6:3] * way).sum(axis=-1)
+    is_clear = free > distance - 2 * self._avatar.radius
     attends = self._moment.get(physics) % _PERIOD < _ATTENDS
     return attends & is_clear & (cosine > np.cos(_HALF_VIEW))

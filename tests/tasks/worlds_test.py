@@ -172,9 +172,7 @@ def test_a_world_is_short_and_says_what_is_intended(domain: str):
   factory = registry.find(domain, _task(domain))
   module = inspect.getmodule(getattr(factory, 'func', factory))
   source = inspect.getsource(module)
-  # The target is 120 lines for all of them.
-  most = {'supervised_room': 127}.get(domain, 120)
-  assert len(source.splitlines()) <= most
+  assert len(source.splitlines()) <= 120
   paragraphs = (module.__doc__ or '').split('\n\n')
   assert paragraphs[1].startswith('Intended behaviour: ')
   assert paragraphs[2].startswith('Exploit: ')
