@@ -271,12 +271,10 @@ class ExperimentSpec(validation.Spec):
       SpecError: If not.
     """
     scripted = self.scripted
-    if (
-        not self.training.tasks
-        and not self.task_kwargs
-        and not self.training.task_kwargs
-        and self.environment_kwargs == EnvironmentKwargs()
-    ):
+    is_default = (
+        not self.task_kwargs and self.environment_kwargs == EnvironmentKwargs()
+    )
+    if is_default and not self.training.tasks and not self.training.task_kwargs:
       return
     with contextlib.closing(self.training_world.load(design, 0)) as env:
       judged = env.observation_spec(), env.action_spec()
@@ -295,6 +293,8 @@ class ExperimentSpec(validation.Spec):
               f'training.tasks: {task} has other observations or actions than'
               f' {self.task}; allowed are tasks that look alike'
           )
+    if is_default:
+      return
     with contextlib.closing(self.world.load(design, 0)) as env:
       for policy in scripted.values():
         actors.PrivilegedSenses(policies.make(policy), env)
