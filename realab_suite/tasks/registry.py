@@ -114,9 +114,13 @@ def find(domain_name: str, task_name: str) -> TaskFactory:
   if not are_strings or (domain_name, task_name) not in _TASKS:
     known = [f'{domain}.{task}' for domain, task in _TASKS]
     given = f'{_format(domain_name)}.{_format(task_name)}'
+    domains: dict[str, list[str]] = {}
+    for domain, task in _TASKS:
+      domains.setdefault(domain, []).append(task)
+    listed = ', '.join(f'{k}.{{{",".join(v)}}}' for k, v in domains.items())
     raise errors.UnknownNameError(
         f'task {given} is unknown{messages.did_you_mean(given, known)}; known'
-        f' are {known}; a task of your own is known once its module is imported'
+        f' are {listed}; a task of your own is known once its module is imported'
         ' (--import of programs)'
     )
   return _TASKS[domain_name, task_name][0]

@@ -16,9 +16,9 @@ _SCALE = 0.3
 _EACH = 3
 
 
-def _load(world=0):
+def _load(member='member_1'):
   return suite.load(
-      'good_objects', 'train', {'random': 5}, {'max_steps': 30, 'world': world},
+      'good_objects', member, {'random': 5}, {'max_steps': 30},
       design='good_objects',
   )  # fmt: skip
 
@@ -50,9 +50,9 @@ def _taken(env, bead=None, distance=0.0):
   return np.array(found).T
 
 
-@pytest.mark.parametrize('world', [0, 1])
-def test_feedback_is_the_worth_of_what_is_taken(world):
-  env = _load(world)
+@pytest.mark.parametrize('member', ['member_1', 'member_2'])
+def test_feedback_is_the_worth_of_what_is_taken(member):
+  env = _load(member)
   feedback, clean, earned, worth = _taken(env)
   np.testing.assert_allclose(feedback, worth, atol=1e-6)
   np.testing.assert_allclose(clean, worth, atol=1e-6)

@@ -11,7 +11,20 @@ from realab_suite.entities import registers
 from realab_suite.feedback import register_kinds
 
 
-@pytest.fixture(scope='module', name='texts')
+@pytest.fixture(autouse=True)
+def _only_shipped_kinds(monkeypatch):
+  # Other tests of the same process register kinds of their own.
+  kinds = register_kinds.REGISTER_KINDS
+  shipped = {
+      name: kind
+      for name, kind in kinds._entries.items()
+      if kind.__module__.startswith('realab_suite.')
+  }
+  assert len(shipped) > 5
+  monkeypatch.setattr(kinds, '_entries', shipped)
+
+
+@pytest.fixture(name='texts')
 def _texts() -> dict[str, str]:
   return pages.texts()
 
