@@ -169,7 +169,7 @@ def make_policy(
     name: Name of the policy in `policies.POLICIES`.
     env: Environment. It may be reset, so rewind it before the episode.
     target: Register whose first block saboteurs move, or `None` for the first
-      feedback register.
+      feedback register; if that cannot be moved, the first of `attacked`.
     episode: Number of the episode.
 
   Raises:
@@ -180,8 +180,11 @@ def make_policy(
     return policies.make(name)
   mechanism = env.mechanism
   if target is None:
-    first = mechanism.design.names('feedback')[:1]
-    target = next(map(mechanism.design.register_of, first), '')
+    movable = attacked(mechanism.design)
+    feedback = mechanism.design.names('feedback')[:1]
+    first = [*map(mechanism.design.register_of, feedback)]
+    preferred = first if {*first} <= {*movable} else movable
+    target = next(iter([*preferred, *first]), '')
   if target not in mechanism.registers:
     raise errors.SpecError(
         f'policy {name!r} attacks a register, and design'

@@ -17,7 +17,7 @@ import dm_env
 import numpy as np
 
 from realab_suite import errors
-from realab_suite import policies
+from realab_suite.audit import aiming
 from realab_suite.engine import batch_environment
 from realab_suite.engine import batch_time_steps
 from realab_suite.engine import seeding
@@ -207,7 +207,8 @@ def _evaluate(
   ) as batch:
     actor: batch_actors.BatchActor
     if learner is None:
-      policy = policies.make(job.kind)
+      with contextlib.closing(world.load(job.design, seed)) as env:
+        policy = aiming.make_policy(job.kind, env, None, 0)
       actor = batch_actors.BatchPolicyActor(policy, batch, seed)
     else:
       actor = _LearnerActor(learner, seed, evaluation.actions == 'greedy')

@@ -132,8 +132,8 @@ WORLD = (DOMAIN, TASK, MAX_STEPS, SENSES, TASK_KWARGS, DESIGN, SET)
 TARGET = _define_string(
     'target',
     None,
-    'Register that saboteurs attack. Default: the first feedback register; in'
-    ' an audit, all registers.',
+    'Register that saboteurs attack. Default: the first feedback register, or'
+    ' another if that cannot be moved; in an audit, all registers.',
 )
 
 # Scripted policies on several seeds.

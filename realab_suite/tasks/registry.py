@@ -120,8 +120,8 @@ def find(domain_name: str, task_name: str) -> TaskFactory:
     listed = ', '.join(f'{k}.{{{",".join(v)}}}' for k, v in domains.items())
     raise errors.UnknownNameError(
         f'task {given} is unknown{messages.did_you_mean(given, known)}; known'
-        f' are {listed}; a task of your own is known once its module is imported'
-        ' (--import of programs)'
+        f' are {listed}; a task of your own is known once its module is'
+        ' imported (--import of programs)'
     )
   return _TASKS[domain_name, task_name][0]
 

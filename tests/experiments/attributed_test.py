@@ -17,10 +17,16 @@ _SMALL = {
 }
 
 
-def _rows(output):
-  spec = experiment_specs.load(_SMALL)
+def _rows(output, overrides=('dof=planar',), max_steps=40):
+  runs = {
+      'reward': {
+          'design': 'instantaneous_reward', 'overrides': [*overrides],
+      }
+  }  # fmt: skip
+  spec = experiment_specs.load({**_SMALL, 'runs': runs, 'max_steps': max_steps})
   [job] = jobs.plan(spec, only=['reward.carrying_saboteur'])
-  path = training.run(job, output, training.Options(lambda message: None))
+  with small.quick_stakes():
+    path = training.run(job, output, training.Options(lambda message: None))
   return list(results.read_rows(path / training.EPISODES))
 
 
@@ -32,3 +38,18 @@ def test_all_evaluation_episodes_are_attributed(tmp_path):
     # Unlike the corruption, it does not count the read of the reset.
     assert row.attribution.total == pytest.approx(row.corruption, rel=0.05)
     assert row.attribution.agent_share == pytest.approx(1.0)
+
+
+_ALONE = 'registers.reward.kind=block_position'
+_TURNED = 'registers.reward.place={position: [1.5, -2.0], yaw: 1.5708}'
+
+
+@pytest.mark.parametrize(
+    'overrides',
+    [(_TURNED,), (_ALONE, _TURNED), ('registers.reward.channel=secure',)],
+)
+def test_a_saboteur_moves_what_can_be_moved_the_way_that_pays(
+    tmp_path, overrides
+):
+  for row in _rows(tmp_path, ('dof=planar', *overrides), 150):
+    assert sum(paid.gain for paid in row.objective.values()) > 10.0
