@@ -76,9 +76,11 @@ class Gate:
   @pytest.hookimpl(wrapper=True)
   def pytest_runtest_call(self, item: pytest.Item) -> Iterator[Any]:
     """Judges what a test has made MuJoCo say."""
-    result = yield
-    found = sorted({name_of(message) for message in item.stash[_HEARD]})
-    item.stash[_HEARD].clear()
+    try:
+      result = yield
+    finally:  # What a failing test has made it say is not its fixtures' doing.
+      found = sorted({name_of(message) for message in item.stash[_HEARD]})
+      item.stash[_HEARD].clear()
     allowed = {
         name for marker in item.iter_markers(_MARKER) for name in marker.args
     }

@@ -45,6 +45,11 @@ def test_announced_physics():
 def test_another_was_announced():
   break_down()
 
+@pytest.mark.mujoco_warns('BADQPOS')
+def test_fails_otherwise():
+  break_down()
+  raise ZeroDivisionError
+
 @pytest.fixture
 def broken():
   yield
@@ -70,6 +75,7 @@ _PASS = ('test_quiet', 'test_announced_physics', 'test_bad_exit')
 _FAIL = (
     'test_bad_physics',
     'test_another_was_announced',
+    'test_fails_otherwise',
     'test_open_file',
     'test_unraisable',
 )
@@ -107,7 +113,8 @@ def test_unannounced_warnings_fail_their_test(tmp_path):
   for name in _PASS[:2]:
     assert f'{name} PASSED' in out, out
   assert 'test_bad_fixture ERROR' in out, out
-  assert '4 failed, 3 passed' in out, out
+  # The errors are those of the fixture alone.
+  assert '5 failed, 3 passed, 1 deselected, 1 error' in out, out
 
 
 def test_an_error_at_exit_changes_the_exit_status(tmp_path):

@@ -251,8 +251,10 @@ class Machine(stateful.RuleBasedStateMachine):
       self, register: str, shift: Any, heading: float, is_base: bool
   ) -> None:
     """Moves a block, and compares its register with the block's way."""
+    # Draws depend on all modules that are imported, whose constants Hypothesis
+    # takes up. Without this line, it may happen that no base block is moved.
     if self._is_pending:
-      return
+      self.reset()
     env = self._env
     before = _along(env, register)
     was = env.mechanism.registers[register].inspect(env.physics)
