@@ -45,16 +45,23 @@ def check(
   solids.settle(physics, mechanism.registers.values())
   owners = solids.owners(physics, mechanism.registers)
   obstacles = solids.Crowd(space, _obstacles(physics, root, space, owners))
-  reachable = {
-      name: solids.regions(physics, register, register.spread)
-      for name, register in mechanism.registers.items()
-  }
+  reachable: dict[str, list[solids.Region]] = {}
+  sights: dict[str, list[solids.Region]] = {}
+  for name, register in mechanism.registers.items():
+    register.check_sight(physics)
+    reachable[name], sights[name] = [], []
+    for region in solids.regions(physics, register, register.spread):
+      (sights if region.path.is_sight else reachable)[name].append(region)
   blocks = solids.Crowd(space)
   for name, regions in reachable.items():
-    for region in regions:
-      _check_extent(name, region, root)
-      _check_support(name, region, space)
-      if (found := obstacles.meeting(region.solid)) is not None:
+    others = [r for o, some in reachable.items() if o != name for r in some]
+    around = obstacles.joined(other.solid for other in others)
+    for region in [*regions, *sights[name]]:
+      if not region.path.is_sight:
+        _check_extent(name, region, root)
+        _check_support(name, region, space)
+      crowd = around if region.path.is_sight else obstacles
+      if (found := crowd.meeting(region.solid)) is not None:
         obstacle, point = found
         raise errors.SpecError(
             f'register {name!r} {region.describe(point)}, inside'

@@ -38,7 +38,7 @@ class _Blocks(NamedTuple):
 
   Attributes:
     starts: Each block, where the episode begins with it.
-    reach: All poses of each block, for all values.
+    reach: All poses of each block, for all values, and lines of sight.
   """
 
   starts: list[solids.Solid]
@@ -47,7 +47,8 @@ class _Blocks(NamedTuple):
   @property
   def corners(self) -> np.ndarray:
     """Corners under all blocks for all values, `(4, 3)`, in m."""
-    bounds = np.array([solid.bounds for solid in self.reach])
+    blocks = (s for s in self.reach if s.half.min() > solids.SIGHT)
+    bounds = np.array([solid.bounds for solid in blocks])
     low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
     sides = itertools.product(*zip(low[:2], high[:2], strict=True))
     return np.array([(*side, low[2]) for side in sides])

@@ -27,6 +27,8 @@ _SLACK = 1e-4
 GAP = 0.01
 # Depth in m from which on boxes are certain to overlap.
 _SURE = 2 * TOLERANCE
+# Half width of the box around a line of sight, in m.
+SIGHT = _SURE
 # Sine of the angle of lines that count as parallel.
 _PARALLEL = 1e-6
 # Half the size of a plane without end, in m.
@@ -109,16 +111,18 @@ class Region(NamedTuple):
     path: Path of the block in the frame of its register.
     reach: Half-widths of the positions of its centre, `(3,)`, in m.
     half_size: Half the edge length of the block, in m.
+    frame: Axes of the register in the world, as columns, `(3, 3)`.
   """
 
   solid: Solid
   path: registers.Path
   reach: np.ndarray
   half_size: float
+  frame: np.ndarray
 
   def moved(self, displacement: np.ndarray) -> Self:
     """Returns the region moved by a vector in its frame, `(3,)`, in m."""
-    there = self.solid.moved(self.solid.matrix @ displacement)
+    there = self.solid.moved(self.frame @ displacement)
     return self._replace(solid=there)
 
   def corners(self) -> np.ndarray:
@@ -127,6 +131,9 @@ class Region(NamedTuple):
 
   def describe(self, point: np.ndarray) -> str:
     """Returns the pose of the block nearest to a point, `(3,)`, as text."""
+    if self.path.is_sight:
+      at = ', '.join(f'{x:.3g}' for x in point)
+      return f'would see its tile {self.path.block} through ({at})'
     _, centre, matrix, *_ = self.solid
     nearest = np.clip((point - centre) @ matrix, -self.reach, self.reach)
     x, y, _ = centre + matrix @ nearest
@@ -188,6 +195,16 @@ def _regions(
   geoms = [int(physics.bind(b.geom).element_id) for b in register.blocks]
   found = []
   for path in paths:
+    centre = origin + matrix @ (path.first + path.last) / 2
+    if path.is_sight:
+      way = matrix @ (path.last - path.first)
+      axes, _ = np.linalg.qr(np.column_stack([way, matrix[:, :2]]))
+      axes[:, 2] *= np.linalg.det(axes)
+      reach = np.abs(axes.T @ (matrix[:, :2] * spread)).sum(axis=1) + SIGHT
+      reach[0] += np.linalg.norm(way) / 2
+      solid = Solid(geoms[path.block], centre, axes, reach, is_box=True)
+      found.append(Region(solid, path, reach, 0.0, matrix))
+      continue
     size = register.blocks[path.block].half_size
     # The width is the same after each quarter turn.
     first, last = path.headings
@@ -197,14 +214,14 @@ def _regions(
     reach = np.abs(path.last - path.first) / 2 + [*spread, 0.0]
     solid = Solid(
         geoms[path.block],
-        origin + matrix @ (path.first + path.last) / 2,
+        centre,
         matrix,
         reach + np.array([width, width, size]),
         is_box=True,
         radius=np.sqrt(2.0) * size if turn else 0.0,
         inset=width,
     )
-    found.append(Region(solid, path, reach, size))
+    found.append(Region(solid, path, reach, size, matrix))
   return found
 
 

@@ -283,7 +283,7 @@ class Register(composer.Entity):
 
     Worlds in which something that nothing can push, or another register, is in
     the way of a path are refused. The paths must contain the poses of all
-    values of the range.
+    values of the range, and lines of sight if the kind looks along some.
 
     This base class tries 257 values. A kind whose blocks jump, or move to and
     fro between two of these values, has to override this method; a kind whose
@@ -300,6 +300,9 @@ class Register(composer.Entity):
         self.value_range,
         lambda value: self.pose(physics, value),
     )
+
+  def check_sight(self, physics: protocols.Physics) -> None:
+    """Refuses blocks that are not seen as they are placed, and moves them."""
 
   def blocks_of(self, port: str) -> list[block_kinds.Block]:
     """Returns the blocks whose poses store the value of a port.

@@ -36,6 +36,8 @@ _BEFORE, _ABOVE = 1.5, 1.8
 # A display that has moved by less, in m and in the numbers of a quaternion,
 # shows the same. It sinks by 0.3 mm at rest.
 _UNMOVED = 1e-3
+# Length of the line of sight of a reading point that is in a tile, in m.
+_TINY = 1e-9
 
 _Coordinate = Annotated[float, pydantic.Field(ge=-100, le=100)]
 
@@ -219,6 +221,7 @@ class Display(base.Register):
     # Lines of sight end between the tops of lowered and raised tiles.
     height = self._base.rest_height + 1.5 * half
     ways = self._offsets + np.array([0.0, 0.0, height]) - self._point
+    ways[~ways.any(axis=-1), 2] = -_TINY
     self._lengths = np.linalg.norm(ways, axis=-1)
     self._ways = ways / self._lengths[:, np.newaxis]
     return [self._base, *self._tiles]
@@ -331,11 +334,34 @@ class Display(base.Register):
   def footprint(self, physics: protocols.Physics) -> list[footprints.Path]:
     base_block, *lowered = self._places(physics, np.array(self._low))
     paths = [footprints.Path(0, base_block, base_block, self.value_range)]
+    point = self._point + base_block * [1.0, 1.0, 0.0]
     for i, place in enumerate(lowered, start=1):
-      place[2] = base_block[2] + _HOVER
       raised = place + np.array([0.0, 0.0, self._block_size / 2])
       paths.append(footprints.Path(i, place, raised, self.value_range))
+      if self._channel != 'secure':
+        end = point + self._ways[i - 1] * self._lengths[i - 1]
+        sight = footprints.Path(i, point, end, self.value_range, is_sight=True)
+        paths.append(sight)
     return paths
+
+  def check_sight(self, physics: protocols.Physics) -> None:
+    if self._channel == 'secure':
+      return
+    model, own = physics.model, physics.bind(self._geoms).element_id
+    # No tile is raised, then one (its copies as well), and then all.
+    for code in (0, *self._weights, self._weights.sum()):
+      self.pose(physics, self._low + self._levels[code] * self._step)
+      is_raised = self._heights(self._applied_slot.get(physics)) > 0.0
+      seen, geoms = self._look(physics)
+      stays = model.body_weldid[model.geom_bodyid[geoms]] == 0
+      stays |= np.isin(geoms, own) | (geoms < 0)
+      for i in np.flatnonzero(stays & (seen != is_raised)):
+        way = model.id2name(int(geoms[i]), 'geom') if seen[i] else 'nothing'
+        raise errors.SpecError(
+            f'register {self._name!r}: {way!r} is seen from its reading point'
+            f' instead of tile {i + 1}; allowed are points and places from'
+            ' which all tiles are seen'
+        )
 
 
 def _turned(turn: np.ndarray, vector: np.ndarray) -> np.ndarray:

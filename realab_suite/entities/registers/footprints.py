@@ -26,6 +26,7 @@ class Path(NamedTuple):
     last: Centre at the other end, `(3,)`, in m.
     values: Values at the two ends.
     headings: Angles about the vertical at the two ends, in rad.
+    is_sight: True for a line of sight, along which the block is looked at.
   """
 
   block: int
@@ -33,6 +34,7 @@ class Path(NamedTuple):
   last: np.ndarray
   values: tuple[float, float]
   headings: tuple[float, float] = (0.0, 0.0)
+  is_sight: bool = False
 
 
 def sampled(
