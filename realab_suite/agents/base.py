@@ -67,7 +67,7 @@ class Options(validation.Model):
   )
   learning_rate: Rate = 5e-4
   max_gradient_norm: Weight = 0.5
-  frame_stack: Positive = 1
+  frame_stack: Annotated[int, pydantic.Field(ge=1, le=16)] = 1
 
 
 class Learner(abc.ABC):

@@ -18,6 +18,7 @@ from realab_suite.config import validation
 from realab_suite.engine import arguments
 from realab_suite.evaluation import actors
 from realab_suite.feedback import specs
+from realab_suite.tasks import registry
 
 _Count = Annotated[int, pydantic.Field(ge=1, le=10**10)]
 _Seed = Annotated[int, pydantic.Field(ge=0, lt=2**31)]
@@ -117,7 +118,8 @@ class TrainingSpec(validation.Spec):
     task_kwargs: Arguments of the task that apply in training only, such as
       `starts_beside_registers`.
     tasks: Tasks to train on instead of the judged one: the next of them from
-      each checkpoint on, in turn. Their domain is that of the judged task.
+      each checkpoint on, in turn. Their domain is that of the judged task, and
+      none of them is held out.
     adaptation: Number of control steps for which the learner goes on learning
       in the judged task, after `steps` in these tasks.
   """
@@ -260,6 +262,12 @@ class ExperimentSpec(validation.Spec):
             ' allowed is false'
         )
       self._designs[name] = run, design
+    for task in self.training.tasks:
+      if registry.HELD_OUT in registry.tags(*_split(task)):
+        raise ValueError(
+            f'training.tasks: {task} is held out; allowed are tasks that'
+            f' lack the tag {registry.HELD_OUT!r}, which is for judging'
+        )
     return self
 
   def _check_world(self, design: specs.DesignSpec) -> None:

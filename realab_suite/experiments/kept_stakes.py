@@ -4,6 +4,7 @@ import pathlib
 from typing import Final
 
 from realab_suite import worlds
+from realab_suite.config import validation
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import storage
 from realab_suite.feedback import specs
@@ -26,14 +27,16 @@ def stakes_of(
     The stakes, or `None`; see `worlds.stakes_of`.
 
   Raises:
-    ResultsError: If a file is damaged or cannot be written.
+    ResultsError: If a file is not JSON or cannot be read or written.
+    SpecError: If it is damaged otherwise.
   """
   key = worlds.key_of_stakes(world, design)
   if key is None:
     return None
   path = folder / FOLDER / f'{key}.json'
   if path.exists():
-    kept = stakes.Stakes.model_validate(storage.read_json(path))
+    content = storage.read_json(path)
+    kept = validation.validate(stakes.Stakes, content, str(path))
     if kept.key == key:
       return kept
   found = worlds.stakes_of(world, design)

@@ -205,7 +205,7 @@ class _Run:
       return self.job.training.total
     try:
       return int(json.loads(_last_line(self.folder / training.TIMING))['step'])
-    except ValueError:  # No line yet, or an incomplete one.
+    except (ValueError, KeyError, TypeError):  # None yet, or an incomplete one.
       return 0
 
 

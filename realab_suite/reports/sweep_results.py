@@ -290,18 +290,18 @@ def read_lines(path: pathlib.Path) -> list[dict[str, Any]]:
   """Reads a file with a JSON mapping in each line.
 
   Raises:
-    ResultsError: If the file cannot be read or a line is not JSON. The message
-      names the line.
+    ResultsError: If the file cannot be read or a line is no JSON mapping. The
+      message names the line.
   """
   with storage.explained(path):
     text = path.read_bytes()
   records = []
   for number, line in enumerate(text.splitlines(), start=1):
     try:
-      records.append(json.loads(line))
-    except (ValueError, RecursionError) as error:
+      records.append(dict(json.loads(line)))
+    except (TypeError, ValueError, RecursionError) as error:
       raise errors.ResultsError(
-          f'{path}:{number}: not JSON: {error}'
+          f'{path}:{number}: not JSON of a mapping: {error}'
       ) from error
   return records
 

@@ -252,7 +252,7 @@ def test_what_cannot_be_stacked_is_refused_in_one_line():
         2,
         0,
     )
-  for given in (0, 1.5):
+  for given in (0, 1.5, 17, 10**9):
     with pytest.raises(errors.SpecError, match='frame_stack'):
       _make(Motion(2), 'policy_gradient', frame_stack=given)
   env = Motion(2)

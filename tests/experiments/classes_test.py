@@ -336,6 +336,14 @@ def test_without_tasks_nothing_is_added_to_files_and_digests():
             {'tasks': [f'{_DOMAIN}.member_6']},
             'runs.other: training.tasks: good_objects.member_6; allowed',
         ),
+        # A held-out task that no run is judged in.
+        (
+            {
+                'tasks': [f'{_DOMAIN}.member_1', f'{_DOMAIN}.member_6'],
+                '_runs': ['reward'],
+            },
+            'training.tasks: good_objects.member_6 is held out; allowed are',
+        ),
         (
             {'tasks': ['assistant.train']},
             'runs.reward: training.tasks: assistant.train; allowed are tasks',
@@ -344,9 +352,30 @@ def test_without_tasks_nothing_is_added_to_files_and_digests():
 )
 def test_wrong_tasks_are_refused_in_one_line(checked, changes, complaint):
   with pytest.raises(errors.SpecError) as raised:
-    experiment_specs.load(_changed(**changes))
+    _load_some(**changes)
   [line] = str(raised.value).splitlines()
   assert complaint in line
+
+
+def _load_some(_runs=('reward', 'other'), **changes):
+  runs = {name: _EXPERIMENT['runs'][name] for name in _runs}
+  return experiment_specs.load({**_changed(**changes), 'runs': runs})
+
+
+@pytest.mark.parametrize(
+    ('judged', 'trained'),
+    [
+        (f'{_DOMAIN}.member_4', f'{_DOMAIN}.member_1'),
+        (f'{_DOMAIN}.member_6', f'{_DOMAIN}.member_1'),
+        # Their domain is no class.
+        ('unlock_door.standard', 'unlock_door.near'),
+    ],
+)
+def test_any_task_is_judged_and_tasks_without_tags_are_for_training(
+    judged, trained
+):
+  spec = experiment_specs.load({**_changed(tasks=[trained]), 'task': judged})
+  assert (spec.task, spec.training.tasks) == (judged, (trained,))
 
 
 def test_members_that_do_not_look_alike_are_refused(checked, monkeypatch):

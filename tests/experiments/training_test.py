@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from realab_suite import errors
+from realab_suite import worlds
 from realab_suite.evaluation import results
 from realab_suite.evaluation import stakes
 from realab_suite.experiments import experiment_specs
@@ -164,6 +165,17 @@ def test_rows_have_the_stakes_of_the_design_which_are_measured_once(
   files = list((tmp_path / kept_stakes.FOLDER).iterdir())
   assert {file.stem for file in files} == keys
   assert len(keys) == 2
+
+
+@pytest.mark.parametrize('damaged', ['[]', '{}', '3', 'null', '{"key": 5}'])
+def test_damaged_stakes_are_refused_in_one_line(tmp_path, monkeypatch, damaged):
+  monkeypatch.setattr(worlds, 'key_of_stakes', lambda *unused: 'k')
+  path = tmp_path / kept_stakes.FOLDER / 'k.json'
+  path.parent.mkdir()
+  path.write_text(damaged)
+  with pytest.raises(errors.SpecError, match=r'k\.json: ') as raised:
+    kept_stakes.stakes_of(None, None, tmp_path)
+  assert len(str(raised.value).splitlines()) == 1
 
 
 def test_a_run_leaves_the_documented_files(whole):

@@ -288,10 +288,11 @@ def test_changed_results_are_refused(own_folder):
     sweep_results.load(own_folder)
 
 
-def test_a_corrupt_point_of_a_curve_is_named(own_folder):
+@pytest.mark.parametrize('line', [b'{"step": 1', b'3', b'"ab"', b'[1]'])
+def test_a_corrupt_point_of_a_curve_is_named(own_folder, line):
   pages.spoil(
       own_folder, 'reward', 1, training.CURVE,
-      lambda data: data + b'{"step": 1\n',
+      lambda data: data + line + b'\n',
   )  # fmt: skip
   run = sweep_results.load(own_folder).runs['reward']
   with pytest.raises(errors.ResultsError, match=':11: not JSON'):
